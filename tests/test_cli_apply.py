@@ -23,6 +23,15 @@ ADDED = [
     *("gx_g", "gy_g", "gz_g", "bx_nt", "by_nt", "bz_nt"),
     *("inclination_deg", "azimuth_deg", "toolface_deg", "gravity_g", "field_nt", "dip_deg"),
     "magnetic_toolface_deg",
+    *(
+        "sd_inclination_deg",
+        "sd_azimuth_deg",
+        "sd_toolface_deg",
+        "sd_gravity_g",
+        "sd_field_nt",
+        "sd_dip_deg",
+    ),
+    "sd_magnetic_toolface_deg",
 ]
 MAGNETIC = (
     "bx_nt",
@@ -32,6 +41,7 @@ MAGNETIC = (
     "field_nt",
     "dip_deg",
     "magnetic_toolface_deg",
+    *("sd_azimuth_deg", "sd_field_nt", "sd_dip_deg", "sd_magnetic_toolface_deg"),
 )
 TOOL = Tool.random(4, noise=(1e-12, 1e-7))
 SURVEYS = [  # inclination, azimuth, toolface

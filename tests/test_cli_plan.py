@@ -92,8 +92,27 @@ def test_the_fewest_stations_for_an_accuracy():
     reached = document["accuracy_by_inclination_deg"]
     assert max(reached["azimuth"]) <= 0.04
     assert max(reached["inclination"]) <= 0.02
-    fewer = mwdcal("plan", "--stations", document["stations"] - 1, "--tool", "servo", "--json").json
+    count = document["stations"]
+    assert document["fewest_stations"] <= count
+    said = {finding["id"] for finding in document["findings"]}
+    assert ("fewer-may-do" in said) is (document["fewest_stations"] < count)
+    fewer = mwdcal("plan", "--stations", count - 1, "--tool", "servo", "--json").json
     assert max(fewer["accuracy_by_inclination_deg"]["azimuth"]) > 0.04
+
+
+def test_a_plan_shows_its_redundancy(tmp_path):
+    """On the screen, in the document and on the sheet: 15 equations for 12 parameters are 3 degrees of freedom."""
+    arguments = ("plan", "--stations", 5, "--tool", "servo")
+    shown = mwdcal(*arguments, "--html", tmp_path / "sheet.html")
+    assert "degrees of freedom" in shown.out
+    assert "calibrate cannot trace" in shown.err
+    document = mwdcal(*arguments, "--json").json
+    assert document["accelerometer"]["degrees_of_freedom"] < 3
+    errors = {each["observable"]: each for each in document["detectable_errors"]}
+    assert set(errors) == {"inclination", "azimuth", "toolface", "gravity", "field", "dip"}
+    assert errors["inclination"]["named"] is None
+    assert errors["inclination"]["noticed"] > 0.05
+    assert "calibrate cannot trace" in (tmp_path / "sheet.html").read_text("utf-8")
 
 
 def test_a_search_keeps_to_what_the_stand_reaches(tmp_path):

@@ -76,11 +76,13 @@ def triad(calibration, name, kind, order, curved, rng, perfect=False):
 
 def changed(calibration, first, second, seed=0, perfect=False):
     rng = np.random.default_rng(seed)
+    triads = {
+        name: triad(calibration, name, *kind, rng, perfect)
+        for name, kind in (("accelerometer", first), ("magnetometer", second))
+    }
+    variance = 1e-8 * np.eye(sum(len(each.parameters) for each in triads.values()))
     return msgspec.structs.replace(
-        calibration,
-        accelerometer=triad(calibration, "accelerometer", *first, rng, perfect),
-        magnetometer=triad(calibration, "magnetometer", *second, rng, perfect),
-        temperature_c=(-10.0, 120.0),
+        calibration, **triads, temperature_c=(-10.0, 120.0), covariance_rows=variance.tolist()
     )
 
 

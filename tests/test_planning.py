@@ -13,6 +13,8 @@ from scipy.stats import chi2
 
 from cli_support import mwdcal, refused
 from mwdcal.calibration import results
+from mwdcal.calibration.diagnosis.detection import detections
+from mwdcal.calibration.diagnosis.plausibility import misfit_chances, stations_to_reshoot
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.prediction import accuracy_at, readings_at
 from mwdcal.errors import FitError, InputError
@@ -21,6 +23,7 @@ from mwdcal.files.profiles import built_in, load_profile
 from mwdcal.geometry.vectors import reference_vectors
 from mwdcal.planning import planned
 from mwdcal.planning.expected import expected, nominal_run, planned_earth, planned_fit
+from mwdcal.planning.fewest import least_count, least_worst
 from mwdcal.planning.moves import Stand, move_seconds, session_seconds, shortest_order
 from mwdcal.planning.optimal import Design, Information, best
 from mwdcal.planning.planned import WORKING_INCLINATIONS, best_plan, judged, smallest_plan
@@ -183,6 +186,74 @@ def test_kept_stations_stay():
     assert {0, 20} <= set(design.chosen.tolist())
 
 
+def worst(information, wanted, chosen):
+    """The largest variance of a choice, from the definition; infinite where it determines too little."""
+    rows = information.rows[list(chosen)].reshape(-1, information.rows.shape[-1])
+    whole = rows.T @ rows + information.prior
+    if np.linalg.cond(whole) > 1e12:
+        return np.inf
+    covariance = np.linalg.inv(whole)[: information.size, : information.size]
+    return max(np.trace(w @ covariance) for w in wanted)
+
+
+@pytest.mark.parametrize("shared", [0, 2])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_fewest_stations_are_those_of_all_choices(seed, shared):
+    """Within one of what the look at every choice finds, and the bound is never above it."""
+    rng = np.random.default_rng(seed)
+    prior = np.diag([0.0] * 3 + [1.0] * shared)
+    information = Information(rng.normal(size=(12, 2, 3 + shared)), prior, 3)
+    roots = rng.normal(size=(4, 2, 3))
+    wanted = roots.mT @ roots / worst(information, roots.mT @ roots, range(12)) / 1.8
+    every = {
+        n: min(worst(information, wanted, c) for c in combinations(range(12), n))
+        for n in range(2, 9)
+    }
+    fewest = min(n for n, value in every.items() if value <= 1)
+    none = np.zeros(12, bool)
+    assert fewest - 2 <= least_count(information, wanted, none, 12) <= fewest
+    for count in (fewest, fewest + 1):
+        members, value = least_worst(information, count, wanted, none)
+        assert np.count_nonzero(members) == count
+        assert value == pytest.approx(worst(information, wanted, np.flatnonzero(members)), rel=1e-9)
+        assert value <= 1 or value < 1.05 * every[count]
+
+
+def test_a_bound_counts_kept_stations():
+    rng = np.random.default_rng(5)
+    information = Information(rng.normal(size=(10, 2, 3)), np.zeros((3, 3)), 3)
+    wanted = np.eye(3)[None] / 0.3
+    kept = np.arange(10) < 3
+    every = {
+        n: min(worst(information, wanted, {0, 1, 2, *c}) for c in combinations(range(3, 10), n))
+        for n in range(7)
+    }
+    fewest = 3 + min(n for n, value in every.items() if value <= 1)
+    assert fewest > 4
+    assert fewest - 2 <= least_count(information, wanted, kept, 10) <= fewest
+    members, _ = least_worst(information, fewest, wanted, kept)
+    assert members[:3].all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_rounding_does_not_choose_between_equal_stations(seed):
+    """Other unknowns, turned, round every number otherwise: so do other numbers of threads."""
+    _, result = planned_fit(load_plan("candidates"), SERVO)
+    information, _ = Information.of_fit(result)
+    size = information.size
+    wanted = np.stack([np.eye(size), np.diag(np.linspace(0.2, 2, size))])
+    turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(size, size)))[0]
+    turned = replace(
+        information, rows=information.rows @ turn, prior=turn.T @ information.prior @ turn
+    )
+    none = np.zeros(information.count, bool)
+    first, again = (
+        least_worst(each, 7, w, none)[0]
+        for each, w in ((information, wanted), (turned, turn.T @ wanted @ turn))
+    )
+    assert np.flatnonzero(first).tolist() == np.flatnonzero(again).tolist()
+
+
 def test_the_efficiency_is_of_the_better_stations_larger():
     information, _ = regression([0, 1, 2], np.linspace(-1, 1, 21))
     even = np.isin(np.arange(21), [0, 5, 10, 15, 20])
@@ -337,6 +408,89 @@ def test_the_next_stations_are_at_the_place_and_the_temperatures_of_the_run():
     more = best_plan(None, 3, SERVO, None, "I", measured=measured).plan.columns
     assert more["ref_dip_deg"].tolist() == [-70] * 3
     assert more["temperature_c"].tolist() == [80] * 3
+
+
+def test_the_smallest_plan_is_redundant_and_says_what_it_costs():
+    """Five stations give 0.1° of azimuth, with three degrees of freedom."""
+    result = smallest_plan(None, {"azimuth": 0.1}, SERVO)
+    assert result.freedom.min() >= 8
+    assert not {"inclination", "azimuth", "toolface"} & set(result.hidden)
+    said = {finding.id: finding.text for finding in result.findings}
+    assert "4 stations give the accuracy" in said["redundancy"]
+    few = smallest_plan(None, {"azimuth": 0.1}, SERVO, count=5)
+    assert (
+        np.degrees(accuracy_at(few.calibration, WORKING_INCLINATIONS.tolist())["azimuth"]).max()
+        < 0.1
+    )
+    assert few.freedom.max() < 4
+    assert {"few-degrees-of-freedom", "hidden-errors"} <= {finding.id for finding in few.findings}
+
+
+@pytest.mark.parametrize(("wanted", "known"), [(0.05, 9), (0.04, 11)])
+def test_the_search_finds_plans_as_small_as_are_known(wanted, known):
+    result = smallest_plan(None, {"azimuth": wanted}, SERVO)
+    assert result.bound <= result.plan.count <= known
+    reached = accuracy_at(result.calibration, WORKING_INCLINATIONS.tolist())["azimuth"]
+    assert np.degrees(reached).max() <= wanted
+
+
+def test_a_plan_says_how_well_its_uncertainties_will_be_known():
+    """s of simulated runs scatters as the finding says, and `calibrate` reports the same of such a run."""
+    plan = load_plan("six-state")
+    planned_ = judged(plan, SERVO)
+    [text] = [f.text for f in planned_.findings if f.id == "few-degrees-of-freedom"]
+    stated = float(text.partition(" %")[0].rpartition(" ")[2])
+    fitted = noisy_runs(plan, SERVO, 4000)
+    scatter = 100 * np.std(np.sqrt(fitted.analysis.variance_factor), axis=0)
+    assert scatter.max() == pytest.approx(stated, rel=0.12)
+    assert [f.id for f in expected(plan, SERVO).findings] == ["few-degrees-of-freedom"]
+
+
+def noisy_runs(plan, profile, count, errors=(), seed=0):
+    """Fits of simulated runs by a plan, with errors (observable, station, size) of single stations."""
+    choice, _ = planned_fit(plan, profile)
+    readings, rng = choice.readings, np.random.default_rng(seed)
+    true = {
+        name: readings.known[name]
+        + readings.uncertainty(name) * rng.normal(size=(count, readings.count))
+        for name in ANGLES
+    } | {name: np.tile(readings.known[name], (count, 1)) for name in ("gravity", "field", "dip")}
+    for name, station, size in errors:
+        true[name][:, station] += size
+    vectors = attitude(*(true[n] for n in ANGLES))(
+        true["gravity"][..., None], true["field"][..., None], true["dip"]
+    )
+    read = {
+        kind: v + readings.sd[kind] * rng.normal(size=v.shape)
+        for kind, v in zip(readings.triads, vectors, strict=True)
+    }
+    return fit(replace(readings, **read), choice.options)
+
+
+@pytest.mark.parametrize("observable", ["inclination", "azimuth", "gravity", "field"])
+@pytest.mark.parametrize(
+    ("name", "profile"), [("six-state", SERVO), ("twelve-state", EXACT)], ids=["6", "12"]
+)
+def test_an_error_is_noticed_from_the_size_that_a_plan_says(name, profile, observable):
+    """In 80 % of simulated runs, and in few at a third of it; a station that is never named is not."""
+    plan = load_plan(name)
+    detection = detections(planned_fit(plan, profile)[1])[observable]
+    noticed, named = detection.noticed[0], detection.named[0]
+    station = int(np.argmax(noticed))
+
+    def shares(size):
+        result = noisy_runs(plan, profile, 500, [(observable, station, size)])
+        marked = stations_to_reshoot(result)
+        large = (misfit_chances(result) < 1e-3).any(-1)
+        return np.mean(marked.any(-1) | large), np.mean(marked[:, station])
+
+    assert 0.72 < shares(noticed[station])[0] < 0.95
+    assert shares(noticed[station] / 3)[0] < 0.3
+    if name == "six-state":
+        assert np.isinf(named).all()
+        assert shares(20 * noticed[station])[1] < 0.02
+    else:
+        assert 0.72 < shares(named[station])[1] < 0.95
 
 
 def test_a_search_computes_the_information_once(monkeypatch):

@@ -119,7 +119,7 @@ def test_covariance_of_two_angles_is_that_of_their_sensitivities(cal, rolltest):
     np.testing.assert_allclose(both, expected, rtol=1e-9)
     for index, name in enumerate(names):
         sd = np.sqrt(both[:, index, index])
-        np.testing.assert_array_equal(sd, cal.uncertainty(name, rolltest))
+        np.testing.assert_allclose(sd, cal.uncertainty(name, rolltest), rtol=1e-12)
     assert np.abs(both[:, 0, 1]).max() > 0
     with pytest.raises(mwdcal.InputError, match="`names` must be observables"):
         cal.covariance(("inclination", "yaw"), rolltest)

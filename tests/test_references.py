@@ -13,6 +13,7 @@ import pytest
 from cli_support import EXAMPLE, mwdcal, read_csv, refused, write_csv
 from mwdcal.errors import InputError
 from mwdcal.survey.place import earth
+from mwdcal.survey.place.grids import grid_convergence
 from mwdcal.survey.place.references import (
     MOMENT_SD,
     PLACE_SD,
@@ -198,33 +199,72 @@ def test_the_epoch_of_igrf_is_the_last_one_before_the_date():
         ("EPSG:32739", -20.0, 410.0 - 360.0),
         ("EPSG:3348", 55.0, -115.0),  # Canada, Lambert
         ("EPSG:27700", 57.0, -4.0),
+        ("EPSG:2276", 32.0, -97.0),  # Texas, feet
+        ("EPSG:27572", 48.5, 3.5),  # counts longitude from Paris
+        ("EPSG:21780", 46.9, 7.4),  # from Bern
+        ("EPSG:2062", 40.0, -4.0),  # from Madrid
+        ("EPSG:5555", 52.0, 10.0),  # with heights
     ],
 )
 def test_convergence_is_the_bearing_of_true_north_on_the_grid(crs, latitude, longitude):
     pyproj = pytest.importorskip("pyproj")
-    system = pyproj.CRS.from_user_input(crs)
-    onto = pyproj.Transformer.from_crs(system.geodetic_crs, system, always_xy=True)
+    onto = pyproj.Transformer.from_crs("EPSG:4326", crs, always_xy=True)
     (x0, y0), (x1, y1) = (onto.transform(longitude, latitude + d) for d in (-1e-4, 1e-4))
     bearing_of_true_north = np.degrees(np.arctan2(x1 - x0, y1 - y0))
-    grid = earth.grid_convergence(crs, latitude, longitude)
+    grid = grid_convergence(crs, latitude, longitude)
     assert grid.covered
     # A_grid = A_true - convergence, where A_true is zero
-    assert bearing_of_true_north == pytest.approx(-grid.convergence_deg, abs=1e-6)
+    assert bearing_of_true_north == pytest.approx(-grid.convergence_deg, abs=1e-5)
 
 
 def test_convergence_of_utm_is_positive_east_of_its_meridian_in_the_north():
-    grid = earth.grid_convergence("EPSG:23031", 60.0, 3.5)
+    grid = grid_convergence("EPSG:23031", 60.0, 3.5)
     assert grid.convergence_deg == pytest.approx(0.4330, abs=5e-5)  # published with the frame
     sphere = np.degrees(np.arctan(np.tan(np.radians(0.5)) * np.sin(np.radians(60))))
     assert grid.convergence_deg == pytest.approx(sphere, abs=1e-4)
-    assert earth.grid_convergence("EPSG:23031", 60.0, 363.5) == grid
+    assert grid_convergence("EPSG:23031", 60.0, 363.5) == grid
+
+
+@pytest.mark.parametrize(
+    ("crs", "latitude", "longitude", "by_formula"),
+    [
+        # Lambert's cone turns by the sine of its parallel, from the meridian of Paris
+        ("EPSG:27572", 48.5, 3.5, np.sin(np.radians(46.8)) * (3.5 - 2.33722917)),
+        # transverse Mercator in the south, axes west and south: of its north
+        ("EPSG:2053", -28.0, 30.0, np.sin(np.radians(-28.0))),
+        # the three ways to write Krovak's grid
+        *((crs, 50.0, 14.0, -8.158) for crs in ("EPSG:5513", "EPSG:5514", "EPSG:2065")),
+        # about the poles grid north is the axis of northings
+        ("EPSG:32661", 85.0, 20.0, 20.0),
+        ("EPSG:5041", 85.0, 20.0, 20.0),
+        ("EPSG:5042", -85.0, 20.0, -20.0),
+        ("EPSG:3031", -90.0, 30.0, -30.0),
+        ("EPSG:3413", 80.0, -30.0, 15.0),
+    ],
+)
+def test_convergence_follows_the_projection_whatever_its_axes(crs, latitude, longitude, by_formula):
+    grid = grid_convergence(crs, latitude, longitude)
+    assert grid.convergence_deg == pytest.approx(by_formula, abs=1e-3)
+
+
+def test_a_grid_that_does_not_keep_angles_is_reported():
+    reference = reference_at(52.0, 20.0, 0.0, PLACE[3], crs="EPSG:3035")
+    north, apart = np.radians(52.0), np.radians(10.0)
+    # equal area about 52°, 10°: scales cos(c/2) and its inverse at a distance c
+    cosine = np.sqrt((1 + np.sin(north) ** 2 + np.cos(north) ** 2 * np.cos(apart)) / 2)
+    largest = 2 * np.arcsin((1 - cosine**2) / (1 + cosine**2))
+    assert [finding.id for finding in reference.findings] == ["grid-not-conformal"]
+    grid = grid_convergence("EPSG:3035", 52.0, 20.0)
+    assert grid.distortion_deg == pytest.approx(np.degrees(largest), rel=0.01)
 
 
 @pytest.mark.parametrize(
     ("crs", "words"),
     [
-        ("EPSG:4326", "no grid"),
-        ("EPSG:2048", "axes south and west"),
+        ("EPSG:4326", "must name a map grid"),
+        ("EPSG:4979", "must name a map grid"),
+        ("EPSG:22300", "method Tunisia Mining Grid"),
+        ("EPSG:22700", "method Lambert Conic Near-Conformal"),
         ("EPSG:999999", "such as EPSG:32631"),
         ("+proj=utm +zone=31", "such as EPSG:32631"),
         ("/etc/passwd", "such as EPSG:32631"),
@@ -232,12 +272,21 @@ def test_convergence_of_utm_is_positive_east_of_its_meridian_in_the_north():
 )
 def test_what_is_no_grid_is_refused(crs, words):
     with pytest.raises(InputError, match=words):
-        earth.grid_convergence(crs, 60.0, 3.5)
+        grid_convergence(crs, 60.0, 3.5)
+
+
+def test_a_place_that_the_grid_does_not_show_is_refused():
+    with pytest.raises(InputError, match="Check `latitude_deg`"):
+        grid_convergence("EPSG:2154", -90.0, 3.5)
 
 
 def test_a_place_outside_the_zone_is_reported():
     reference = reference_at(60.0, 9.5, 0.0, PLACE[3], crs="EPSG:23031")
     assert [finding.id for finding in reference.findings] == ["outside-grid"]
+
+
+def test_a_system_without_bounds_covers_every_place():
+    assert grid_convergence("EPSG:31461", 54.0, 3.0).covered
 
 
 def test_azimuths_turn_by_declination_and_convergence():
@@ -273,6 +322,9 @@ def test_measured_values_stand_before_the_model():
     assert (reference.field_nt, reference.dip_deg, reference.gravity_g) == (50_500.0, 72.7, 1.0013)
     assert reference.gravity_ms2 == pytest.approx(1.0013 * 9.80665)
     assert (reference.sd_field_nt, reference.sd_dip_deg, reference.sd_gravity_g) == (30, 0, 1e-6)
+    bare = reference_at(*PLACE, measured={"declination": 1.0})
+    assert (bare.declination_deg, bare.sd_declination_deg) == (1.0, modelled.sd_declination_deg)
+    assert [f.id for f in bare.findings] == ["declination-uncertainty-assumed"]
     assert reference.declination_deg == modelled.declination_deg
     assert reference.measured == ["gravity", "field", "dip"]
     assert {n for n, s in reference.sources.items() if s == "measured"} == set(reference.measured)

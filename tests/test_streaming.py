@@ -29,7 +29,7 @@ from mwdcal.app.correction import apply_to_table
 from mwdcal.errors import InputError
 from mwdcal.files import documents, streams
 from mwdcal.files.formats import sinks, table
-from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS
+from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, UNCERTAINTIES
 from simulation import Tool
 
 arrow = pytest.importorskip("pyarrow")
@@ -59,6 +59,9 @@ def small_pieces(monkeypatch):
     """Every text table is long, and read in pieces of a few lines."""
     monkeypatch.setattr(streaming, "TABLE_SIZES", dict.fromkeys(streaming.TABLE_SIZES, 0))
     monkeypatch.setattr(streams, "PIECE", 3000)
+
+
+CORRECTED = (*RESULTS, *UNCERTAINTIES)
 
 
 def log(count=5000, seed=0, low=-5.0, high=55.0):
@@ -94,7 +97,7 @@ def assert_same(path, wanted):
     for name in wanted.columns:
         if name == EXTRAPOLATED:
             assert found.columns[name] == [str(mark).lower() for mark in wanted.columns[name]]
-        elif name in RESULTS or not isinstance(wanted.columns[name], list):
+        elif name in CORRECTED or not isinstance(wanted.columns[name], list):
             theirs, ours = table.numbers(wanted, name), table.numbers(found, name)
             np.testing.assert_array_equal(np.isnan(ours), np.isnan(theirs), err_msg=name)
             size = 1e5 if name.endswith("_nt") else 360.0
@@ -119,7 +122,7 @@ def test_parts_of_any_size_give_the_whole(tmp_path, warm, least, group):
     assert [f.id for f in findings] == ["outside-temperature"]
     assert seen[-1] == (5000, 5000)
     assert_same(out, wanted)
-    assert out.stat().st_size < 2 * 5000 * 8 * 21 + 50_000
+    assert out.stat().st_size < 2 * 5000 * 8 * 28 + 50_000
     assert parquet.read_table(out).schema.metadata[b"mwdcal"]  # for readers that are not ours
 
 
@@ -164,12 +167,12 @@ def test_columns_of_every_type_are_carried_through(tmp_path, cold):
         out = tmp_path / "out.parquet"
         streaming.apply_to_file(cold[1], source, out, "blank", rows=64, least=least)
         before, after = parquet.read_table(source), parquet.read_table(out)
-        assert after.schema.names == [*columns, *RESULTS]
+        assert after.schema.names == [*columns, *CORRECTED]
         for name in columns:
             assert after.schema.field(name).type == before.schema.field(name).type
             assert after.column(name).to_pylist() == before.column(name).to_pylist()
         wanted, _ = whole(cold[1], source)
-        for name in RESULTS:
+        for name in CORRECTED:
             np.testing.assert_allclose(after[name].to_numpy(), wanted.columns[name], atol=1e-6)
     text = tmp_path / "out.csv"
     streaming.apply_to_file(cold[1], source, text, "blank", rows=64)
@@ -316,7 +319,7 @@ def test_missing_readings_by_the_command(tmp_path, cold, suffix):
     assert [f["id"] for f in ran.json["findings"]] == ["missing-reading", "outside-temperature"]
     found = read_csv(tmp_path / "out.csv")
     np.testing.assert_array_equal(np.isnan(numbers(found["gz_g"])), ~sound)
-    assert list(found)[-2:] == ["magnetic_toolface_deg", "extrapolated"]
+    assert list(found)[-2:] == ["sd_magnetic_toolface_deg", "extrapolated"]
     low, high = cold[1].temperature_c
     beyond = 5.0  # °C: an order of 0 holds for its soak
     warmth = columns["temperature_c"]
@@ -587,7 +590,7 @@ def test_text_in_pieces_gives_the_whole(tmp_path, warm, small_pieces, change, su
     table.write(tmp_path / f"whole{suffix}", wanted)
     found = table.read(out)
     for name, cells in table.read(tmp_path / f"whole{suffix}").columns.items():
-        if name in ("station", "time_s") or (name in wanted.columns and name not in RESULTS):
+        if name in ("station", "time_s") or (name in wanted.columns and name not in CORRECTED):
             ours = found.columns[name]
             if isinstance(ours, list) == isinstance(cells, list):
                 np.testing.assert_array_equal(ours, cells)
@@ -669,7 +672,7 @@ def test_findings_of_a_long_text_table_stand_above_its_header(tmp_path, small_pi
     ]
     found = table.read(tmp_path / "out.csv")
     assert found.metadata["findings"] == [f["text"] for f in ran.json["findings"]]
-    assert list(found.columns)[-13:] == list(RESULTS)
+    assert list(found.columns)[-20:] == list(CORRECTED)
 
 
 @pytest.mark.parametrize("count", [5, 5000])

@@ -305,6 +305,68 @@ def test_reference_file_gives_norths_and_limits(example, tmp_path):
     assert document["reference_sha256"]
 
 
+@pytest.mark.parametrize(
+    ("stated", "sd", "finding"),
+    [
+        # 0.36°, and 5000° nT over the horizontal field, shared; 0.10° and 3000° nT of each station its own
+        ((), (0.36, 5000.0), True),
+        (("sd_declination_deg = 0.9",), (0.9, 0.0), False),
+    ],
+)
+def test_a_declination_is_never_exact(example, tmp_path, stated, sd, finding):
+    """Expected: OWSG set A Rev 5.1 at 48,000 nT and dip 63°, the example's field."""
+    told = ("declination_deg = 2.4", *stated)
+    columns, document = surveyed_file(example, tmp_path, {}, metadata=told)
+    horizontal = 48_000 * np.cos(np.radians(63))
+    shared = np.hypot(sd[0], sd[1] / horizontal)
+    declination = np.hypot(shared, np.hypot(0.10, 3000 / horizontal))
+    true, alone = (np.array(columns[f"sd_azimuth_{n}_deg"], float) for n in ("true", "magnetic"))
+    assert true == pytest.approx(np.hypot(alone, declination), rel=0.01)
+    assert document["sd_declination_deg"] == pytest.approx(shared, rel=0.01)
+    ids = {each["id"] for each in document["findings"]}
+    assert ("declination-uncertainty-assumed" in ids) is finding
+
+
+def test_a_table_and_a_reference_that_disagree_of_north_are_named(example, tmp_path):
+    place = tmp_path / "here.json"
+    made = cli(
+        *("reference", "--latitude", "60", "--longitude", "3.5", "--altitude-m", "0"),
+        *("--date", "2026-06-01", "--crs", "EPSG:23031", "-o", place, "--json"),
+    ).json  # fmt: skip
+    here, sd = made["declination_deg"], made["sd_declination_deg"]
+    for off, turn, expected in ((0.5, 0.0, set()), (4.0, 1.0, {"declination", "convergence"})):
+        told = (
+            f"declination_deg = {here + off * sd}",
+            f"sd_declination_deg = {sd / 2}",
+            f"convergence_deg = {made['convergence_deg'] + turn}",
+        )
+        _, document = surveyed_file(example, tmp_path, {}, "--reference", place, metadata=told)
+        named = {each["id"] for each in document["findings"] if "disagrees" in each["id"]}
+        assert named == {f"{name}-disagrees" for name in expected}
+
+
+@pytest.mark.parametrize("value", ["-1", '"a bit"', "true", "200"])
+def test_an_uncertainty_of_declination_that_cannot_be_is_refused(example, tmp_path, value):
+    source = write_csv(
+        tmp_path / "in.csv", read_csv(EXAMPLE / "well.csv"), f"sd_declination_deg = {value}",
+        "declination_deg = 1.0",
+    )  # fmt: skip
+    ran = cli("survey", example, source, "-o", tmp_path / "out.csv")
+    assert "sd_declination_deg" in refused(ran, 2)
+
+
+def test_nothing_states_an_uncertainty_without_what_it_leaves_out(example, tmp_path):
+    out, page = tmp_path / "out.csv", tmp_path / "s.html"
+    source = EXAMPLE / "well.csv"
+    ran = cli("survey", example, source, "-o", out, "--html", page)
+    left_out = ("interference of the drill string", "drift of the sensors", "sag", "measured depth")
+    document = cli("survey", example, source, "-o", out, "--json").json
+    for told in (ran.out, page.read_text("utf-8"), out.read_text("utf-8")):
+        assert all(name in " ".join(told.split()) for name in left_out)
+    assert document["error_terms"] == ["calibration", "noise", "declination"]
+    assert all(any(name in each for each in document["not_included"]) for name in left_out)
+
+
 def test_references_of_the_laboratory_do_not_count_in_a_well(example, tmp_path):
     """The stand's uncertainty of field and dip is that of the laboratory: limits are those of the model."""
     calibration = mwdcal.load(example)
@@ -559,7 +621,7 @@ def test_results_say_whether_interference_was_taken_off(example, tmp_path):
         shown = " ".join(page.read_text("utf-8").split())
         assert ("interference-corrected" in ids) is corrected
         assert ("corrected for interference" in out.read_text("utf-8")) is corrected
-        assert ("Interference of the drill string is not part of it" in shown) is not corrected
+        assert ("Not in it: interference of the drill string" in shown) is not corrected
         assert "judged by all three together" in shown
     cli("survey", example, source, "-o", out, "--html", page, "--limits", "fixed")
     assert "judged by all three together" not in " ".join(page.read_text("utf-8").split())

@@ -135,9 +135,16 @@ def percent(share: float) -> str:
     return f"{100 * share:.1f} %"
 
 
-def write(name: str, title: str, *parts: str, facts: Mapping[str, object] | None = None) -> None:
+def write(
+    name: str,
+    title: str,
+    *parts: str,
+    facts: Mapping[str, object] | None = None,
+    simulated: bool = True,
+) -> None:
     """Write one page of the study into the documentation; `facts` head it: number of runs, seed."""
     said = "".join(f"{key}: {value}. " for key, value in (facts or {}).items())
-    note = f"Written by `examples/coverage/{name}.py`. All data are simulated. {said}".strip()
+    data = "All data are simulated. " if simulated else ""
+    note = f"Written by `examples/coverage/{name}.py`. {data}{said}".strip()
     DOCS.mkdir(exist_ok=True)
     (DOCS / f"{name}.md").write_text(f"# {title}\n\n{note}\n\n" + "\n".join(parts), "utf-8")

@@ -49,6 +49,7 @@ def apply_to_any(
     outside: str,
     missing: str,
     decimal: str,
+    uncertainty: bool,
     advance: Callable[[int, int], None],
 ) -> tuple[RowCounts, list[Finding], str]:
     """Correct a file into another: part by part, or whole where it is short text or a workbook.
@@ -56,19 +57,20 @@ def apply_to_any(
     What was seen in the rows, what the reader should know, and the SHA-256 of the readings, empty
     where they were not read as a whole. `advance` gets how much of a long
     table is done, and the whole. An export as the calibration's profile describes it is taken whole, and
-    text that comes of it is written as it is.
+    text that comes of it is written as it is. With `uncertainty` columns of standard uncertainties.
     """
     profile = calibration.profile
     exported = _is_exported(readings, profile, decimal)
     if streaming.in_parts(readings, output) and not exported:
         streamed = streaming.apply_to_file(
-            calibration, readings, output, outside, advance, missing=missing, decimal=decimal
-        )
+            calibration, readings, output, outside, advance,
+            missing=missing, decimal=decimal, uncertainty=uncertainty,
+        )  # fmt: skip
         return *streamed, ""
     if readings.suffix.lower() in TEXT and (exported or output.suffix.lower() in WHOLE):
         _check_size(readings)
     source = read_export(readings, profile, decimal=decimal, rows=WHOLE_ROWS)
-    result, tally, findings = apply_to_table(calibration, source, outside, missing)
+    result, tally, findings = apply_to_table(calibration, source, outside, missing, uncertainty)
     if EXTRAPOLATED in result.columns and output.suffix.lower() != ".parquet":
         words = [as_text(bool(mark)) for mark in result.columns[EXTRAPOLATED]]
         result = replace(result, columns={**result.columns, EXTRAPOLATED: words})
@@ -104,7 +106,11 @@ def _check_size(readings: Path) -> None:
 
 
 def apply_to_table(
-    calibration: Calibration, source: Table, outside: str, missing: str = "refuse"
+    calibration: Calibration,
+    source: Table,
+    outside: str,
+    missing: str = "refuse",
+    uncertainty: bool = True,
 ) -> tuple[Table, RowCounts, list[Finding]]:
     """The input's columns and metadata, the results, and what the calibration was."""
     table = renamed(source, calibration.profile)
@@ -117,7 +123,9 @@ def apply_to_table(
         raise streaming.nothing(source.source)
     kept = streaming.chosen(table, whole)
     readings, _ = to_readings(kept, calibration.profile)
-    results, tally, findings = counted(calibration, readings, outside, source.count - kept.count)
+    results, tally, findings = counted(
+        calibration, readings, outside, source.count - kept.count, uncertainty
+    )
     streaming.check_free(source.columns, list(results), source.source)
     columns = {name: streaming.spread(values, whole) for name, values in results.items()}
     metadata = {**source.metadata, **streaming.described(calibration)}

@@ -35,10 +35,11 @@ from mwdcal.files.formats.sinks import ParquetSink, Sink, TextSink
 from mwdcal.files.formats.table import Table, cell_error
 from mwdcal.files.formats.table import numbers as as_numbers
 from mwdcal.files.streams import Part, StreamedTable
-from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS
+from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, UNCERTAINTIES
 from mwdcal.geometry.vectors import AnyArray, Array, Bools
-from mwdcal.use import correction, correction_numba, strengths
+from mwdcal.use import correction, correction_numba, scatter, strengths
 from mwdcal.use.correction import JUDGED, RowCounts
+from mwdcal.use.uncertainty import with_uncertainty
 
 TABLE_SIZES = {".csv": 1_000_000, ".tsv": 1_000_000, ".parquet": 8_000_000}
 """Bytes of a text table from which it is taken in parts, by what it becomes.
@@ -70,6 +71,8 @@ WORST_ROWS = RowCounts(
     serials=("\0" * LONGEST_SERIAL, "\1" * LONGEST_SERIAL, "…"),
     strengths=dict.fromkeys(strengths.JUDGED_STRENGTHS, _OFF),
     warmth=TEMPERATURE[:2],
+    valueless=_MOST,
+    scatter=dict.fromkeys(scatter.STEADY_CHANGES, scatter.Scatter(1, 1, -1.23e9, 1.23e9, 1.2e-100)),
 )
 """Rows whose findings take more room than those of any others."""
 
@@ -95,6 +98,7 @@ def apply_to_file(
     least: int = ROWS_FOR_LOOPS,
     missing: str = "refuse",
     decimal: str = ".",
+    uncertainty: bool = True,
 ) -> tuple[RowCounts, list[Finding]]:
     """Correct a file into another; what was seen in the rows, and what the reader should know.
 
@@ -103,12 +107,13 @@ def apply_to_file(
     """
     correction.check_outside(outside)
     source = _source(readings, output, rows, decimal)
-    _check_header(calibration, source, outside)
+    names = correction.result_names(outside, uncertainty)
+    _check_header(calibration, source, names)
     pieces = source.pieces()
     first = next((piece for piece in pieces if _table(source, piece).count), None)
     if first is None:
         raise no_stations(source.name)
-    worker = _Worker(calibration, source, first, outside, missing, source.rows >= least)
+    worker = _Worker(calibration, source, first, outside, missing, source.rows >= least, names)
     done, tallies = 0, []
     with atomic.replacing(output) as stream, closing(worker.sink(stream, output)) as sink:
         work = partial(_exactly_if_refused, source, partial(worker.corrected, sink))
@@ -154,11 +159,11 @@ def _source(readings: Path, output: Path, rows: int, decimal: str) -> StreamedTa
     return streams.open_text(readings, typed=typed, decimal=decimal)
 
 
-def _check_header(calibration: Calibration, source: StreamedTable, outside: str) -> None:
+def _check_header(calibration: Calibration, source: StreamedTable, results: Sequence[str]) -> None:
     """Refuse columns that are missing, doubtful, or have the name of a result."""
     check_names(source.names, source.name)
     contract.check_columns(source.names, source.name)
-    check_free(source.names, correction.result_names(outside), source.name)
+    check_free(source.names, results, source.name)
     check_warmth(calibration, source.names, source.name)
 
 
@@ -201,12 +206,14 @@ def _table(source: StreamedTable, piece: Any) -> Table:
 
 
 def _total(tallies: Sequence[RowCounts], moved: Collection[str]) -> RowCounts:
-    rows, beyond, lacking = np.sum([(t.rows, t.beyond, t.lacking) for t in tallies], 0).tolist()
+    counts = [(t.rows, t.beyond, t.lacking, t.valueless) for t in tallies]
+    rows, beyond, lacking, valueless = np.sum(counts, 0).tolist()
     serials = runs.serials({}, chain.from_iterable(tally.serials for tally in tallies))
     lows, highs = zip(*(tally.warmth for tally in tallies), strict=True)
     return RowCounts(
         rows, beyond, tuple(name for name in JUDGED if name in moved), lacking, tuple(serials),
-        strengths.total(tally.strengths for tally in tallies), (min(lows), max(highs)),
+        strengths.total(tally.strengths for tally in tallies), (min(lows), max(highs)), {}, valueless,
+        scatter.total(tally.scatter for tally in tallies),
     )  # fmt: skip
 
 
@@ -223,9 +230,10 @@ class _Worker:
 
     def __init__(
         self, calibration: Calibration, source: StreamedTable, first: Any, outside: str,
-        missing: str, many: bool,
+        missing: str, many: bool, names: Sequence[str],
     ) -> None:  # fmt: skip
-        """With the first piece that has rows, and whether there are `many` rows in all."""
+        """With the first piece that has rows, whether there are `many` rows in all, and the `names` of the results."""
+        self.names, self.stated = names, UNCERTAINTIES[0] in names
         self.calibration, self.source, self.first = calibration, source, first
         self.outside, self.missing = outside, missing
         self.moved: set[str] = set()
@@ -258,9 +266,8 @@ class _Worker:
         arrow, _ = parquet.modules(output.name)
         metadata = {**self.source.metadata, **described(self.calibration)}
         metadata.pop("findings", None)  # with those of the results, when these are known
-        kinds = {name: arrow.float64() for name in RESULTS} | {EXTRAPOLATED: arrow.bool_()}
-        names = correction.result_names(self.outside)
-        results = arrow.schema([(name, kinds[name]) for name in names])
+        kinds = dict.fromkeys(self.names, arrow.float64()) | {EXTRAPOLATED: arrow.bool_()}
+        results = arrow.schema([(name, kinds[name]) for name in self.names])
         if output.suffix.lower() == ".parquet":
             return ParquetSink(stream, self.source.schema, results, metadata)
         worst = WORST_ROWS._replace(
@@ -287,20 +294,38 @@ class _Worker:
         if any(name.startswith(("ref_", "sd_")) for name in table.columns):
             kinds = [kind for kind in TRIADS if kind in channels]
             known = runs.check_references(table, self.calibration.profile, kinds)
-        columns = dict(zip(RESULTS, corrected.columns, strict=True))
-        results: list[AnyArray] = [*columns.values()]
+        readings = replace(self._readings(channels, slice(None)), sd=self._noise(table, channels))
+        columns, valueless = with_uncertainty(
+            self.calibration,
+            readings,
+            dict(zip(RESULTS, corrected.columns, strict=True)),
+            self.stated,
+        )
+        results = [*columns.values()]
         if self.outside == "extrapolate":
-            results.append(self.calibration.outside(self._readings(channels, slice(None))))
+            results.append(self.calibration.outside(readings))
         if whole is not None:
             results = [spread(values, whole) for values in results]
-        rendered = sink.render(part.carried, results, bool(corrected.empty) or whole is not None)
+        empty = corrected.empty or valueless or (self.stated and np.isnan(results).any())
+        rendered = sink.render(part.carried, results, bool(empty) or whole is not None)
         self._judge(channels, table.count)
         tally = RowCounts(
             rows, corrected.beyond, (), rows - table.count, self._serials(part.carried),
             strengths.judged(self.calibration, columns, known),
-            correction.warmth(*channels.get("temperature", [None])),
+            correction.warmth(*channels.get("temperature", [None])), {}, valueless,
+            scatter.scatters(self.calibration, readings, columns),
         )  # fmt: skip
         return rendered, part.size, tally
+
+    def _noise(self, table: Table, channels: Channels) -> dict[str, Array]:
+        """What the table or the profile says of the noise of the readings along the tool axes."""
+        cells, noise = runs.columns_of(table), {}
+        for kind in set(TRIADS).intersection(channels):
+            triad = getattr(self.calibration.profile, kind)
+            sd = runs.reading_noise(cells, kind, triad, (table.count,), triad.scale or 1.0)
+            if sd is not None:
+                noise[kind] = sd
+        return noise
 
     def _serials(self, carried: Any) -> tuple[str, ...]:
         """The tools that a part names; names of others are cut, so that there is room for them."""

@@ -444,22 +444,24 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
             result[..., vector, vector] = slope * sd[..., None, :] ** 2 @ slope.mT
         return result
 
-    def _gradient(self, name: str, readings: Readings) -> Array:
-        """Gradient (…, n, 6) of an observable with respect to both vectors."""
-        gradient = OBSERVABLES[name].gradient(*self.fields(readings))
+    def _gradients(self, names: Sequence[str], readings: Readings) -> Array:
+        """Gradients (…, n, k, 6) of k observables with respect to both vectors."""
+        fields = self.fields(readings)
+        gradient = np.stack([OBSERVABLES[name].gradient(*fields) for name in names], -2)
         return np.where(np.isnan(gradient), 0.0, gradient) if not self.has_field else gradient
 
     def sensitivity(self, name: str, readings: Readings) -> Array:
         """Gradient (…, n, p) of an observable with respect to the parameters."""
-        gradient = self._gradient(name, readings)
-        return np.asarray(np.einsum("...ni,...nip->...np", gradient, self.jacobian(readings)))
+        gradient = self._gradients((name,), readings)
+        return np.asarray((gradient @ self.jacobian(readings))[..., 0, :])
 
     def uncertainty(self, name: str, readings: Readings, noise: bool = False) -> Array:
         """Standard uncertainty (…, n) of an observable: of the calibration, or of a reading too.
 
         Units: radians, g or nT. `noise` adds that of one reading.
-        NaN where no uncertainty can be stated: where the observable rests on a free direction, and where
-        that of azimuth or a toolface would exceed `LARGEST_ANGLE_SD`, as near vertical.
+        NaN where no uncertainty can be stated: where the observable rests on a free direction, where
+        that of azimuth or a toolface would exceed `LARGEST_ANGLE_SD`, as near vertical, and `outside` the
+        calibrated temperatures.
         """
         variance = self.covariance((name,), readings, noise)[..., 0, 0]
         return np.sqrt(np.maximum(variance, 0.0))  # below zero by rounding alone
@@ -484,16 +486,17 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
                     f"`names` must be observables ({', '.join(OBSERVABLES)}); got {name!r}. "
                     "Correct the name."
                 )
-        rows = np.stack([self._gradient(name, readings) for name in names], -2)
+        rows = self._gradients(names, readings)
         moved = self.jacobian(readings)
         vectors = moved @ self.parameter_covariance @ moved.mT
         if noise:
             vectors = vectors + self.noise_covariance(readings)
-        total = np.einsum("...ai,...ij,...bj->...ab", rows, vectors, rows)
+        total = rows @ vectors @ rows.mT
         lacking = () if self.has_field else MAGNETIC
         blank = np.stack([self.rests_on_free(n, readings) | (n in lacking) for n in names], -1)
         turns = np.array([OBSERVABLES[n].period > 0 for n in names])
         blank |= turns & (diagonal(total) > LARGEST_ANGLE_SD**2)
+        blank |= self.outside(readings)[..., None]
         return np.where(blank[..., :, None] | blank[..., None, :], np.nan, total)
 
     def expanded_uncertainty(

@@ -252,9 +252,9 @@ def convert(
         triad: TriadProfile = getattr(profile, kind)
         scales[kind] = triad.scale or _scale(raw, _strength(known, kind))
         triads[kind] = to_nominal(raw, triad, scales[kind])
-        noise = _noise(cells, kind, triad, shape)
+        noise = reading_noise(cells, kind, triad, shape, scales[kind])
         if noise is not None:
-            sd[kind] = (noise / scales[kind]) @ np.abs(triad.permutation.transpose())
+            sd[kind] = noise
     common = {n: np.full(shape, np.radians(v)) for n, v in profile.stand.common().items()}
     readings = Readings(
         accelerometer=triads["accelerometer"],
@@ -331,6 +331,14 @@ def _scale(raw: Array, strength: Array) -> Array:
     radius, still = (np.median(np.linalg.norm(v, axis=-1), -1) for v in (raw - midpoint, raw))
     radius = np.where(radius > 0, radius, np.where(still > 0, still, 1.0))
     return np.asarray(radius / strength)[..., None, None]
+
+
+def reading_noise(
+    cells: Cells, kind: str, triad: TriadProfile, shape: tuple[int, ...], scale: float | Array
+) -> Array | None:
+    """Standard uncertainty (..., n, 3) of readings along the tool axes, nominal; None where nothing is stated."""
+    noise = _noise(cells, kind, triad, shape)
+    return None if noise is None else (noise / scale) @ np.abs(triad.permutation.transpose())
 
 
 def _noise(cells: Cells, kind: str, triad: TriadProfile, shape: tuple[int, ...]) -> Array | None:

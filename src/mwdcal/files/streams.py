@@ -22,7 +22,7 @@ from mwdcal.files.contract import RANGES, RAW
 from mwdcal.files.formats import parquet, text
 from mwdcal.files.formats.columns import Column
 from mwdcal.files.formats.table import Table, check_decimal, numbers, pointed
-from mwdcal.geometry.observables import RESULTS
+from mwdcal.geometry.observables import RESULTS, UNCERTAINTIES
 from mwdcal.geometry.vectors import Ints
 
 PART_ROWS = 1 << 16
@@ -79,7 +79,7 @@ def open_parquet(path: Path, rows: int = 0, decimal: str = ".") -> StreamedTable
     count = file.metadata.num_rows
     names = [name for name in stored.names if not parquet.is_index(name)]
     metadata = parquet.metadata_of(file.metadata.metadata, path.name)
-    width = max(8 * len(names), parquet.row_size(file.metadata)) + 8 * len(RESULTS)
+    width = max(8 * len(names), parquet.row_size(file.metadata)) + 8 * len(RESULTS + UNCERTAINTIES)
     step = max(1, min(rows or PART_ROWS, PART // width))
 
     def pieces() -> Iterator[Any]:

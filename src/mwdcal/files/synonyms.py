@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from mwdcal.errors import InputError
 from mwdcal.files.formats.columns import shown
-from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS
+from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, UNCERTAINTIES
 
 _SPELLINGS = {
     "°": "deg degree degrees",
@@ -191,7 +191,7 @@ def unused(names: Sequence[str], used: Collection[str]) -> tuple[str, ...]:
 
 def _results(names: Collection[str]) -> set[str]:
     """The columns that are results of `mwdcal apply`: where all of them are there."""
-    return {*RESULTS, EXTRAPOLATED} if set(RESULTS) <= set(names) else set()
+    return {*RESULTS, *UNCERTAINTIES, EXTRAPOLATED} if set(RESULTS) <= set(names) else set()
 
 
 def check_evidence(

@@ -35,6 +35,8 @@ OUTPUTS = {
 VECTORS = ("gx_g", "gy_g", "gz_g", "bx_nt", "by_nt", "bz_nt")
 RESULTS = (*VECTORS, *OUTPUTS.values())
 """Columns of a corrected reading, in their order."""
+UNCERTAINTIES = tuple(f"sd_{column}" for column in OUTPUTS.values())
+"""Columns of their standard uncertainties, those of `OUTPUTS`."""
 EXTRAPOLATED = "extrapolated"
 """The column that says of each row whether it was extrapolated, where that is allowed."""
 VERTICAL = 1e-12

@@ -22,6 +22,8 @@ from mwdcal.geometry.vectors import Array, reference_vectors
 from mwdcal.planning.simulate import Earth
 from mwdcal.sensor.profile import Profile
 
+READING_FINDINGS = ("repeated-readings",)
+"""Findings that hold of readings without noise and not of real ones."""
 STILL = 1e-6
 """A channel that moves by no more than this share of gravity or field over a plan does not move."""
 
@@ -116,13 +118,24 @@ def expected(plan: Table, profile: Profile, options: Options | None = None) -> C
     """The calibration that a plan will give, but for its values: uncertainties, rank, accuracy to expect.
 
     Its parameters are those of a nominal tool, its residuals zero, and it is marked as simulated. What real
-    tools depart from nominal, a few per cent, their uncertainties depart from these.
+    tools depart from nominal, a few per cent, their uncertainties depart from these. Its findings are those of
+    `calibrate`.
 
     Raises:
         InputError: the plan does not state an attitude, or the profile not the noise.
         FitError: no calibration can come of the plan; the message says what to add.
     """
-    return recorded(*planned_fit(plan, profile, options))
+    return carried_out(plan, profile, options)[0]
+
+
+def carried_out(
+    plan: Table, profile: Profile, options: Options | None = None
+) -> tuple[Calibration, Fit]:
+    """The calibration that a plan will give, as `expected`, and the fit that it is the record of."""
+    choice, result = planned_fit(plan, profile, options)
+    calibration = recorded(choice, result)
+    said = [finding for finding in calibration.findings if finding.id not in READING_FINDINGS]
+    return msgspec.structs.replace(calibration, findings=said), result
 
 
 def left_undetermined(calibration: Calibration) -> list[Undetermined]:

@@ -10,7 +10,7 @@ bound; D. M. Titterington, "Algorithms for computing D-optimal designs" (1976), 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -23,7 +23,11 @@ WEIGHT_STEPS = 300
 CLOSE = 2e-3
 """The bound on the D-value per parameter is looked for to this share of it."""
 GAIN = 1e-9
-"""An exchange that improves the criterion by no more than this is none."""
+"""Smallest improvement of a criterion that counts."""
+LITTLE = 1e-6
+"""Weight of all candidates beside stations that are too few alone, for numbers to exist."""
+TIE = 1e-7
+"""Candidates whose gains differ by less than this share are equal: the first is taken."""
 
 
 @dataclass(frozen=True)
@@ -116,24 +120,47 @@ def best(
     """
     kept = np.zeros(information.count, bool) if kept is None else kept
     chosen = _added(information, count, wanted, kept)
-    while _exchange(information, chosen, wanted, kept):
+    return Design(information, exchanged(information, chosen, wanted, kept))
+
+
+def exchanged(
+    information: Information, chosen: Bools, wanted: Array | None, kept: Bools, limits: Array | None = None
+) -> Bools:  # fmt: skip
+    """The candidates (n,) after all exchanges that improve a criterion, those `kept` staying.
+
+    With `limits` (c, r, r) none is made that brings a variance tr(W V) above 1, W being one of these.
+    """
+    chosen = chosen.copy()
+    while _exchange(information, chosen, wanted, kept, limits):
         pass
-    return Design(information, chosen)
+    return chosen
 
 
 def _added(information: Information, count: int, wanted: Array | None, kept: Bools) -> Bools:
     """A start: to those kept the station that gains most, one after the other."""
     chosen = kept.copy()
-    little = 1e-6 * information.of(np.ones(information.count))
+    little = LITTLE * information.of(np.ones(information.count))
     for _ in range(count - np.count_nonzero(kept)):
-        gains = _Gains(
+        gains = Gains(
             information, information.of(chosen.astype(np.float64)) + little, wanted
         ).of_adding()
-        chosen[np.argmax(np.where(chosen, -np.inf, gains))] = True
+        chosen[first_best(np.where(chosen, -np.inf, gains))] = True
     return chosen
 
 
-def _exchange(information: Information, chosen: Bools, wanted: Array | None, kept: Bools) -> bool:
+def first_best(gains: Array) -> int:
+    """The first of the candidates that gain most, so that rounding does not choose between equals.
+
+    >>> first_best(np.array([1.0, 2.0 - 1e-12, 2.0]))
+    1
+    """
+    largest = gains.max()
+    return int(np.argmax(gains >= largest - TIE * abs(largest)))
+
+
+def _exchange(
+    information: Information, chosen: Bools, wanted: Array | None, kept: Bools, limits: Array | None
+) -> bool:
     """Replace each chosen station, but for `kept` ones, by what gains most, if that does; whether one was."""
     improved = False
     for place in np.flatnonzero(chosen & ~kept):
@@ -142,16 +169,27 @@ def _exchange(information: Information, chosen: Bools, wanted: Array | None, kep
         if np.linalg.cond(whole) > 1e14:  # without it nothing can be said
             chosen[place] = True
             continue
-        gains = np.where(chosen, -np.inf, _Gains(information, whole, wanted).of_adding())
-        other = int(np.argmax(gains))
-        better = gains[other] > gains[place] + GAIN
-        chosen[other if better else place] = True
-        improved |= bool(better)
+        gains = np.where(chosen, -np.inf, Gains(information, whole, wanted).of_adding())
+        least = gains[place] + max(GAIN, TIE * abs(gains[place]))
+        if limits is not None:
+            better = gains > least
+            some = replace(information, rows=information.rows[better])
+            gains[better] = np.where(_within(some, whole, limits), gains[better], -np.inf)
+        other = first_best(gains)
+        gained = bool(gains[other] > least)
+        chosen[other if gained else place] = True
+        improved |= gained
     return improved
 
 
+def _within(information: Information, whole: Array, limits: Array) -> Bools:
+    """With which candidates (n,), each added to `whole` (k, k), no variance is above 1."""
+    none = not information.count
+    return np.zeros(0, bool) if none else Gains(information, whole, limits).left().max(-1) <= 1
+
+
 @dataclass(frozen=True)
-class _Gains:
+class Gains:
     """What candidates add to a criterion where the information is `whole` (k, k)."""
 
     information: Information
@@ -168,6 +206,18 @@ class _Gains:
         inner = np.eye(rows.shape[1]) + moved @ rows.mT
         seen = moved[..., :size] @ self.wanted @ moved[..., :size].mT
         return np.asarray(np.trace(np.linalg.solve(inner, seen), axis1=-2, axis2=-1))
+
+    def left(self) -> Array:
+        """The variances tr(W V) (n, c) with each candidate added, W being several, `wanted` (c, r, r)."""
+        rows, size, wanted = self.information.rows, self.information.size, self.wanted
+        back = inverse(self.whole)
+        moved = rows @ back
+        inner = np.eye(rows.shape[1]) + moved @ rows.mT
+        fallen = np.linalg.solve(inner, moved[..., :size]).mT @ moved[..., :size]
+        flat = np.reshape(np.asarray(wanted), (-1, size * size))
+        return np.asarray(
+            flat @ back[:size, :size].ravel() - fallen.reshape(len(rows), -1) @ flat.mT
+        )
 
 
 def _log_gain(rows: Array, whole: Array) -> Array:

@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
+from msgspec.structs import replace as with_fields
 
 from mwdcal.calibration import results
 from mwdcal.calibration.automatic.auto import Choice
 from mwdcal.calibration.calibrate import recorded
+from mwdcal.calibration.diagnosis.detection import Detection, detections
+from mwdcal.calibration.diagnosis.findings import FEW_FREEDOM
 from mwdcal.calibration.diagnosis.flags import listed
+from mwdcal.calibration.diagnosis.plausibility import freedom_of
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import TWELFTHS, accuracy_at, angles, readings_at
-from mwdcal.calibration.record import Calibration
+from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.evidence import ANGLES
 from mwdcal.files.formats.table import Table, labels
-from mwdcal.geometry.vectors import Array
-from mwdcal.planning.expected import expected, left_undetermined, planned_fit
+from mwdcal.geometry.vectors import Array, Bools
+from mwdcal.planning.expected import carried_out, left_undetermined, planned_fit
+from mwdcal.planning.fewest import least_count, least_worst
 from mwdcal.planning.moves import USUAL_STAND, Stand, session_seconds, shortest_order
-from mwdcal.planning.optimal import Design, Information, best
+from mwdcal.planning.optimal import Design, Information, best, exchanged
 from mwdcal.planning.plans import (
     at_place,
     at_temperatures,
@@ -39,8 +44,10 @@ WORKING_INCLINATIONS = np.radians([5.0, 30.0, 60.0, 90.0, 120.0])
 """Inclinations over which an I-optimal plan makes the angles accurate."""
 WORKING_TEMPERATURES = 7
 """Temperatures, evenly from the coldest to the hottest soak, at which a wanted accuracy holds."""
-FEWEST_PLANNED = 8
-"""Stations with which the search for the smallest plan begins."""
+ACCURACY_MARGIN = 1e-6
+"""A search aims at wanted accuracies smaller by this share, for rounding not to decide."""
+LEAP = 50
+"""A search for the smallest plan adds one station at a time, beyond this many a share of one in as many."""
 MOST_SEARCHED = 1_000_000
 """Product of stations and candidates in a search: a minute."""
 OUT_NAMED = 5
@@ -54,13 +61,58 @@ class Planned:
     """A plan and the calibration that it will give.
 
     `efficiency` is at least the share of the best possible D-value, per parameter, that as many stations
-    could have; `seconds` the session at the stand.
+    could have; `seconds` the session at the stand. `freedom` (t,) are the degrees of freedom of each triad's s, and
+    `detections` (1, n) the errors of one station that `calibrate` will report, those `measured` already before the
+    plan's. No plan of fewer than `bound` stations gives the wanted accuracy, if one is; `search` says what the
+    search has to say.
     """
 
     plan: Table
     calibration: Calibration
     efficiency: float
     seconds: float
+    freedom: Array
+    detections: Mapping[str, Detection]
+    measured: int = 0
+    bound: int | None = None
+    search: list[Finding] = field(default_factory=list)
+
+    @classmethod
+    def of(
+        cls, plan: Table, carried: tuple[Calibration, Fit], efficiency: float, stand: Stand, measured: int = 0
+    ) -> Planned:  # fmt: skip
+        """A plan with the calibration and the fit that it will give."""
+        calibration, result = carried
+        seconds = session_seconds(attitudes(plan), soak_numbers(plan), stand)
+        freedom = freedom_of(result)[0]
+        return cls(plan, calibration, efficiency, seconds, freedom, detections(result), measured)
+
+    @property
+    def hidden(self) -> dict[str, list[int]]:
+        """Stations of the plan, from 0, an error of which is never traced to them, by observable."""
+        each = {n: np.isinf(d.named[0, self.measured :]) for n, d in self.detections.items()}
+        return {name: np.flatnonzero(some).tolist() for name, some in each.items() if some.any()}
+
+    @property
+    def is_redundant(self) -> bool:
+        """Whether s is known, and a wrong setting of any one station can be traced to it."""
+        return bool(np.all(self.freedom >= FEW_FREEDOM)) and not set(self.hidden) & set(ANGLES)
+
+    def hides(self) -> tuple[bool, int]:
+        """Whether it is not redundant, and how many errors hide."""
+        return not self.is_redundant, sum(map(len, self.hidden.values()))
+
+    @property
+    def findings(self) -> list[Finding]:
+        """What the calibration and the search will say, and which errors hide."""
+        stations = sorted({k for some in self.hidden.values() for k in some})
+        named = [station_names(self.plan)[k] for k in stations]
+        text = (
+            f"calibrate cannot trace a wrong {', '.join(self.hidden)} to station {listed(named, OUT_NAMED)}, however "
+            "wrong it is: the residuals of all stations grow alike. Add stations."
+        )
+        hidden = [Finding(id="hidden-errors", text=text)] if stations else []
+        return [*self.calibration.findings, *hidden, *self.search]
 
 
 def judged(
@@ -78,14 +130,12 @@ def judged(
         FitError: no calibration can come of the plan; the message says what to add.
     """
     _check_reached(plan, stand)
-    calibration = expected(plan, profile, options)
+    carried = carried_out(plan, profile, options)
     others = at_temperatures(_reached(candidates or load_plan("candidates"), stand), plan)
     whole = joined(plan, others)
-    information, _ = Information.of_fit(planned_fit(whole, profile, options)[1])
+    information, _ = Information.of_fit(planned_fit(whole, _set_anew(profile), options)[1])
     share = Design(information, np.arange(whole.count) < plan.count).efficiency
-    return Planned(
-        plan, calibration, share, session_seconds(attitudes(plan), soak_numbers(plan), stand)
-    )
+    return Planned.of(plan, carried, share, stand)
 
 
 def best_plan(
@@ -111,36 +161,69 @@ def smallest_plan(
     accuracy_deg: Mapping[str, float],
     profile: Profile,
     options: Options | None = None,
-    criterion: str = "I",
     stand: Stand = USUAL_STAND,
     measured: Table | None = None,
+    count: int | None = None,
 ) -> Planned:
-    """The best plan of the fewest stations that gives wanted accuracies, 1σ in degrees by angle.
+    """The plan of the fewest stations that gives wanted accuracies, 1σ in degrees by angle, and is redundant.
 
-    An accuracy holds at every one of `WORKING_INCLINATIONS`, from the coldest soak to the hottest. Raises as
-    `judged`, and `InputError` where all candidates together do not give it.
+    An accuracy holds at every one of `WORKING_INCLINATIONS`, from the coldest soak to the hottest. Redundant:
+    `Planned.is_redundant`. With a `count` the plan has so many stations, whatever they give. Raises as `judged`, and
+    `InputError` where all candidates together do not give the accuracy.
     """
-    search = Search.of(candidates, profile, options, criterion, stand, measured)
+    search = Search.of(candidates, profile, options, "I", stand, measured)
     _check_determined(search.calibration, accuracy_deg)
+    wanted = search.variances(accuracy_deg)
+    if count:
+        return search.least_worst(count, wanted)
     if not _reaches(search.calibration, accuracy_deg):
         raise InputError(
             f"all {search.most} candidates together do not give the wanted accuracy. Add candidates, "
             "average longer at each, or use a more exact stand."
         )
-    best = cache(search.best)
+    bound = least_count(search.information, wanted, search.kept, search.plan.count) - search.before
+    result, enough = _grown(search, max(bound, search.fewest(0)), wanted, accuracy_deg)
+    bound = max(bound, search.fewest(FEW_FREEDOM))
+    return replace(result, bound=bound, search=_of_search(bound, enough, result.plan.count))
 
-    def enough(count: int) -> bool:
+
+def _grown(
+    search: Search, count: int, wanted: Array, accuracy_deg: Mapping[str, float]
+) -> tuple[Planned, int]:
+    """The first plan from a `count` of stations on that is accurate and redundant, and how many are accurate."""
+    enough = 0
+    while True:
+        count = min(count, search.most)
         try:
-            return _reaches(search.given(best(count)), accuracy_deg)
+            result = search.least_worst(count, wanted)
         except FitError:  # too few for a calibration
-            return False
+            if count == search.most:
+                raise
+        else:
+            accurate = _reaches(result.calibration, accuracy_deg)
+            enough = enough or count * accurate
+            if (accurate and result.is_redundant) or count == search.most:
+                return result, enough or count
+        count += 1 + count // LEAP
+        count = max(count, search.fewest(FEW_FREEDOM)) if enough else count
 
-    high = min(FEWEST_PLANNED, search.most)
-    while high < search.most and not enough(high):
-        high = min(2 * high, search.most)
-    counts = range(1 if high == FEWEST_PLANNED else 1 + high // 2, high + 1)
-    least = counts[min(bisect_left(counts, True, key=enough), len(counts) - 1)]
-    return search.planned(best(least))
+
+def _of_search(bound: int, enough: int, count: int) -> list[Finding]:
+    """What a search that ends with a `count` of stations has to say: `enough` gave the accuracy."""
+    said = []
+    if count > bound:
+        text = (
+            f"fewer may do: a plan of {bound} stations is not ruled out, although the search found none. Fewer than "
+            f"{bound} cannot give the accuracy and {FEW_FREEDOM:.0f} degrees of freedom."
+        )
+        said.append(Finding(id="fewer-may-do", text=text))
+    if count > enough:
+        text = (
+            f"{enough} stations give the accuracy. {count} also give {FEW_FREEDOM:.0f} degrees of freedom and trace a "
+            f"wrong setting of any one station. For fewer add `stations` {enough}."
+        )
+        said.append(Finding(id="redundancy", text=text))
+    return said
 
 
 @dataclass(frozen=True)
@@ -177,7 +260,7 @@ class Search:
         if measured:
             inside = at_place(inside, measured) if candidates else at_temperatures(inside, measured)
             whole = replace(joined(measured, inside), source=inside.source)
-        choice, result = planned_fit(whole, profile, options)
+        choice, result = planned_fit(whole, _set_anew(profile), options)
         information, turn = Information.of_fit(result)
         to_file = results.to_file(result, choice.profile.reference_temperature_c)[0]
         before = whole.count - inside.count
@@ -191,32 +274,53 @@ class Search:
         return self.plan.count - self.before
 
     @cached_property
+    def kept(self) -> Bools:
+        """Which stations (n,) are measured already."""
+        return np.arange(self.plan.count) < self.before
+
+    @cached_property
     def calibration(self) -> Calibration:
         """The calibration that all candidates together give."""
         return recorded(self.choice, self.result)
 
     @cached_property
-    def wanted(self) -> Array | None:
-        """The weights W of `optimal.best` (r, r)."""
-        if self.criterion == "D":
-            return None
-        if self.criterion == "A":
-            sd = np.sqrt(np.sum(self.turn**2, -1))
-            scaled = self.turn / np.where(sd > 0, sd, np.inf)[:, None]
-            return np.asarray(scaled.mT @ scaled)
-        return self._of_angles()
+    def wanted(self) -> dict[str, Array | None]:
+        """The weights W of `optimal.best` (r, r) by criterion."""
+        sd = np.sqrt(np.sum(self.turn**2, -1))
+        scaled = self.turn / np.where(sd > 0, sd, np.inf)[:, None]
+        return {"D": None, "A": scaled.mT @ scaled, "I": self._of_angles()}
 
     def _of_angles(self) -> Array:
         """Mean variance of the angles over the working range, each in units of what all candidates give."""
-        grid = np.meshgrid(WORKING_INCLINATIONS, TWELFTHS, TWELFTHS, indexing="ij")
-        inclination, azimuth, toolface = (axis.ravel() for axis in grid)
         whole = np.zeros((self.turn.shape[1],) * 2)
         for temperature in self._temperatures():
-            readings = readings_at(self.calibration, inclination, azimuth, toolface, temperature)
             for name in angles(self.calibration):
-                moved = self.calibration.sensitivity(name, readings) @ self.turn
-                whole += moved.mT @ moved / np.sum(moved**2)
+                moved = self._moved(name, temperature)
+                whole += np.einsum("kai,kaj->ij", moved, moved) / np.sum(moved**2)
         return whole
+
+    def variances(self, accuracy_deg: Mapping[str, float]) -> Array:
+        """The variances (c, r, r) of wanted angles where `_reaches` looks at them, in units of their limits."""
+        span = self.calibration.temperature_c
+        each = []
+        for temperature in np.linspace(*span, WORKING_TEMPERATURES).tolist() if span else [None]:
+            for name, most in accuracy_deg.items():
+                moved = self._moved(name, temperature)
+                each.append(
+                    moved.mT
+                    @ moved
+                    / moved.shape[1]
+                    / (np.radians(most) * (1 - ACCURACY_MARGIN)) ** 2
+                )
+        return np.concatenate(each)
+
+    def _moved(self, name: str, temperature: float | None) -> Array:
+        """Changes (i, a, r) of an angle at `WORKING_INCLINATIONS` by the directions `turn`."""
+        grid = np.meshgrid(WORKING_INCLINATIONS, TWELFTHS, TWELFTHS, indexing="ij")
+        inclination, azimuth, toolface = (axis.ravel() for axis in grid)
+        readings = readings_at(self.calibration, inclination, azimuth, toolface, temperature)
+        moved = self.calibration.sensitivity(name, readings) @ self.turn
+        return np.reshape(moved, (len(WORKING_INCLINATIONS), -1, moved.shape[-1]))
 
     def _temperatures(self) -> list[float] | list[None]:
         """Over the calibrated range, more than its temperature terms could pass through."""
@@ -226,6 +330,34 @@ class Search:
 
     def best(self, count: int) -> Design:
         """The best so many stations beside those measured."""
+        self._check_size(count)
+        return best(self.information, self.before + count, self.wanted[self.criterion], self.kept)
+
+    def least_worst(self, count: int, wanted: Array) -> Planned:
+        """The best so many stations by the largest of variances.
+
+        Where all are within 1 there is freedom left: of plans that use it, each for another criterion, that is taken
+        which hides the fewest errors. Raises `FitError` where no calibration can come of so few.
+        """
+        self._check_size(count)
+        start, largest = least_worst(self.information, self.before + count, wanted, self.kept)
+        choices = [start]
+        if largest <= 1:
+            every = [self.wanted[criterion] for criterion in CRITERIA]
+            choices = [exchanged(self.information, start, w, self.kept, wanted) for w in every]
+        elif not np.isfinite(largest):
+            raise FitError(f"{count} stations cannot give a calibration. Add stations.")
+        plans = [self.planned(Design(self.information, members)) for members in choices]
+        return min(plans, key=Planned.hides)
+
+    def fewest(self, freedom: float) -> int:
+        """Fewer stations, beside those measured, cannot give a triad so many degrees of freedom."""
+        known = self.choice.options.knowledge is not None
+        unknowns = 0 if known else max(triad.rank for triad in self.calibration.triads)
+        return max(1, math.ceil((unknowns + freedom) / 3) - self.before)
+
+    def _check_size(self, count: int) -> None:
+        """Refuse more stations than candidates, and a search that would take hours."""
         if not 1 <= count <= self.most:
             raise InputError(
                 f"`stations` must be between 1 and the {self.most} candidates; got {count}."
@@ -235,24 +367,28 @@ class Search:
                 f"the best {count} of {self.most} candidates take too long to find: the product of both must not "
                 f"exceed {MOST_SEARCHED}. Take a coarser grid of candidates, or fewer `stations`."
             )
-        kept = np.arange(self.plan.count) < self.before
-        return best(self.information, self.before + count, self.wanted, kept)
-
-    def given(self, design: Design) -> Calibration:
-        """The calibration that chosen stations and those measured give."""
-        options = replace(self.options or Options(), order=self.choice.options.order)
-        return expected(taken(self.plan, design.chosen), self.profile, options)
 
     def planned(self, design: Design) -> Planned:
         """The chosen stations, but those measured, in an order of short moves."""
         new = design.chosen[self.before :]
         new = new[np.argsort(soak_numbers(taken(self.plan, new)), kind="stable")]
         some = taken(self.plan, new)
-        order = shortest_order(attitudes(some), soak_numbers(some), self.stand)
-        source = f"{len(new)} of {self.plan.source}"
-        plan = replace(taken(self.plan, new[order]), source=source)
-        seconds = session_seconds(attitudes(plan), soak_numbers(plan), self.stand)
-        return Planned(plan, self.given(design), design.efficiency, seconds)
+        new = new[shortest_order(attitudes(some), soak_numbers(some), self.stand)]
+        plan = replace(taken(self.plan, new), source=f"{len(new)} of {self.plan.source}")
+        whole = taken(self.plan, np.append(design.chosen[: self.before], new))
+        options = replace(self.options or Options(), order=self.choice.options.order)
+        carried = carried_out(whole, self.profile, options)
+        return Planned.of(plan, carried, design.efficiency, self.stand, self.before)
+
+
+def station_names(plan: Table) -> list[str]:
+    """The labels of the stations of a plan, their numbers where it has none."""
+    return labels(plan, "station") or [str(k + 1) for k in range(plan.count)]
+
+
+def _set_anew(profile: Profile) -> Profile:
+    """The profile with a stand that is set anew at every station: only an order says which ones share a setting."""
+    return with_fields(profile, stand=with_fields(profile.stand, settings="per-station"))
 
 
 def _check_reached(plan: Table, stand: Stand) -> None:
@@ -261,7 +397,7 @@ def _check_reached(plan: Table, stand: Stand) -> None:
     for name, reached in zip(ANGLES, inside.mT, strict=True):
         if not reached.all():
             low, high = stand.reach[name]
-            names = labels(plan, "station") or [str(k + 1) for k in range(plan.count)]
+            names = station_names(plan)
             out = listed([names[k] for k in np.flatnonzero(~reached)], OUT_NAMED)
             raise InputError(
                 f"{plan.source}: the stand reaches {name} {low:g}:{high:g}°, and station {out} lie outside. Leave "

@@ -17,6 +17,7 @@ from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, diagonal
+from mwdcal.use.uncertainty import without_value
 
 SURVEYED = ("inclination", "azimuth", "toolface", "north_toolface", "gravity", "field", "dip")
 """Observables of a survey, in the order of `Surveys.value`."""
@@ -34,7 +35,7 @@ STATIONS_AT_ONCE = 1 << 12
 class Surveys:
     """Observables (n, 7) in the order of `SURVEYED`, radians, g, nT, and their standard uncertainties (n, 7).
 
-    NaN: not there, such as azimuth and toolface at vertical, or without a stated uncertainty.
+    NaN: not there, such as azimuth and toolface within the uncertainty of vertical, or without a stated one.
     `strengths` (n, 3, 3): covariance of |g|, |b| and dip. `magnetic` (n,): the toolface counts from magnetic north.
     """
 
@@ -85,6 +86,8 @@ def surveyed(
         value[rows] = np.stack([OBSERVABLES[name].value(g, b) for name in SURVEYED], -1)
         covariance = calibration.covariance(SURVEYED, part, noise=True)
         sd[rows] = np.sqrt(np.maximum(diagonal(covariance), 0.0))
+        lost = without_value(calibration, part, SURVEYED, value[rows], sd[rows])
+        value[rows] = np.where(lost, np.nan, value[rows])
         strengths[rows] = covariance[:, STRENGTHS, STRENGTHS]
         done = rows.stop
         advance(done, readings.count)

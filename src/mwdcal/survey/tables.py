@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import replace
-from math import radians
 
 import numpy as np
 from msgspec.structs import replace as replace_struct
@@ -14,14 +13,15 @@ from mwdcal.calibration.readings import CONSTANTS, Readings, is_simulated
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
 from mwdcal.files import synonyms
-from mwdcal.files.contract import REFERENCES, check_columns, stated_norths
+from mwdcal.files.contract import REFERENCES, check_columns
 from mwdcal.files.formats.table import Table, cell_error, numbers
 from mwdcal.files.runs import renamed, to_readings
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import StandProfile
+from mwdcal.survey.norths import SD_KEY, North, norths_of
 from mwdcal.survey.place.references import MEASURABLE, EarthReference
 from mwdcal.survey.stations import RANDOM
-from mwdcal.survey.well import North, Well
+from mwdcal.survey.well import Well
 
 MEASURED_DEPTH = "md_m"
 """The column of measured depths, m."""
@@ -51,7 +51,7 @@ def survey_readings(
     readings, _ = to_readings(table, in_a_well)
     if reference is not None:
         readings = _referenced(readings, reference)
-    return readings, _depths(table), _norths(table, reference)
+    return readings, _depths(table), norths_of(table, readings, calibration, reference)
 
 
 def _referenced(readings: Readings, reference: EarthReference) -> Readings:
@@ -94,20 +94,6 @@ def _depths(table: Table) -> Array | None:
     return depths if there.size else None
 
 
-def _norths(table: Table, reference: EarthReference | None) -> North:
-    """What metadata and reference say of declination and convergence."""
-    stated = stated_norths(table.metadata, table.source)
-    convergence = stated.get("convergence_deg", reference.convergence_deg if reference else None)
-    sd, noise = 0.0, 0.0
-    if "declination_deg" in stated or reference is None:
-        declination = stated.get("declination_deg")
-    else:
-        declination = reference.declination_deg
-        sd, noise = reference.sd_declination_deg, reference.sd_random_declination_deg
-    north = (None if angle is None else radians(angle) for angle in (declination, convergence))
-    return North(next(north), radians(sd), next(north), radians(noise))
-
-
 def surveyed_table(table: Table, well: Well) -> Table:
     """The table with the results beside its columns.
 
@@ -137,9 +123,12 @@ def described(well: Well) -> Mapping[str, object]:
         "calibration_time": calibration.time,
         "survey_limits": well.limits.name,
         "north": north.name,
+        "error_terms": list(well.terms.included),
+        "not_included": list(well.terms.left_out),
     }
     for key, angle in (
         ("declination_deg", north.declination),
+        (SD_KEY, None if north.declination is None else north.declination_sd),
         ("convergence_deg", north.convergence),
     ):
         if angle is not None:

@@ -14,6 +14,8 @@ from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, VECTORS
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, diagonal, wrap
 from mwdcal.survey.acceptance import STRENGTH_NAMES, Judgement, SurveyLimits, judged
+from mwdcal.survey.error_terms import CORRECTED, DRIFTED, ErrorTerms, error_terms
+from mwdcal.survey.norths import North
 from mwdcal.survey.position import calibrated_path
 from mwdcal.survey.stations import TOOLFACE_SWITCH, Surveys, surveyed
 from mwdcal.use.correction import counted
@@ -38,39 +40,6 @@ WELL_FINDINGS = {
     "no-path": "no well path: no station has both a measured depth and a direction with azimuth.",
 }
 """What the findings about a well say, in their order."""
-CORRECTED = "interference-corrected"
-"""The finding of a calibration from which multi-station analysis has taken interference."""
-
-
-@dataclass(frozen=True)
-class North:
-    """The norths that azimuths may count from, radians: true = magnetic + declination, grid = true - convergence.
-
-    None: not known. `declination_sd`: standard uncertainty that the stations share, `declination_noise` that of
-    what changes from one to the next.
-    """
-
-    declination: float | None = None
-    declination_sd: float = 0.0
-    convergence: float | None = None
-    declination_noise: float = 0.0
-
-    @property
-    def name(self) -> str:
-        """The north of the well path: grid if it is known, else true, else magnetic."""
-        if self.declination is None:
-            return "magnetic"
-        return "true" if self.convergence is None else "grid"
-
-    @property
-    def declination_uncertainty(self) -> float:
-        """Standard uncertainty of the declination at one station."""
-        return float(np.hypot(self.declination_sd, self.declination_noise))
-
-    @property
-    def offset(self) -> float:
-        """What is added to magnetic azimuths to count from that north."""
-        return (self.declination or 0.0) - (self.convergence or 0.0)
 
 
 @dataclass(frozen=True)
@@ -118,8 +87,14 @@ class Well:
 
     @property
     def corrected(self) -> list[Finding]:
-        """The finding that interference of the drill string was taken off."""
-        return [finding for finding in self.calibration.findings if finding.id == CORRECTED]
+        """The findings that interference of the drill string was taken off, and drift allowed for."""
+        about = (CORRECTED, DRIFTED)
+        return [finding for finding in self.calibration.findings if finding.id in about]
+
+    @property
+    def terms(self) -> ErrorTerms:
+        """What the standard uncertainties hold, and what they leave out."""
+        return error_terms(self.calibration.findings, self.north.declination is not None)
 
     @property
     def blank(self) -> Bools:
@@ -305,7 +280,7 @@ def _findings(result: Well, from_first: bool) -> list[Finding]:
         "names": " and ".join(n for n, lacks in zip(STRENGTH_NAMES, absent, strict=True) if lacks),
         "partly": int(partly.sum()), "unjudged": int(unjudged.sum()), "count": int((~on_path).sum()),
     }  # fmt: skip
-    return result.corrected + [
+    return [*result.corrected, *result.north.findings] + [
         Finding(id=name, text=text.format(**words))
         for name, text in WELL_FINDINGS.items()
         if applies[name]

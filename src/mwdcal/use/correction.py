@@ -8,12 +8,21 @@ from typing import NamedTuple
 import numpy as np
 
 from mwdcal.calibration.readings import Readings
-from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.calibration.record import LARGEST_ANGLE_SD, Calibration, Finding
 from mwdcal.errors import InputError
-from mwdcal.geometry.observables import EXTRAPOLATED, OBSERVABLES, OUTPUTS, RESULTS, VECTORS
+from mwdcal.geometry.observables import (
+    EXTRAPOLATED,
+    OBSERVABLES,
+    OUTPUTS,
+    RESULTS,
+    UNCERTAINTIES,
+    VECTORS,
+)
 from mwdcal.geometry.vectors import AnyArray, Array
-from mwdcal.use import correction_numba, strengths
+from mwdcal.use import correction_numba, scatter, strengths
+from mwdcal.use.scatter import Scatter
 from mwdcal.use.strengths import Strengths
+from mwdcal.use.uncertainty import with_uncertainty
 
 OUTSIDE = ("blank", "refuse", "extrapolate")
 JUDGED = ("gravity", "inclination", "toolface", "azimuth", "field", "dip", "magnetic_toolface")
@@ -32,6 +41,10 @@ ROW_FINDINGS = {
     "how good the results are at the readings' {warmth} °C.",
     "implausible-gravity": "{off[gravity]}: the tool moved while it was read, or a reading is in another unit.",
     "implausible-field": "{off[field]}: iron or a current was near, or a reading is in another unit.",
+    "unsteady": "from row to row {unsteady} change more than any place does: are two axes swapped, or a sign wrong? A "
+    "tool that moves, iron nearby, and rows from several places look the same.",
+    "without-value": "azimuth or a toolface is blank in {tally.valueless} of {tally.rows} rows: within the uncertainty "
+    "the tool is vertical there, or the field is, and the angle would have a 1σ of more than {largest:.0f}°.",
     "field-relative": "the magnetometer is calibrated to field = 1: bx_nt, by_nt, bz_nt and field_nt are relative, "
     "not nT.",
     "undetermined": "{moved} rest on what the calibration leaves undetermined ({free}): no uncertainty can be stated.",
@@ -51,7 +64,7 @@ class RowCounts(NamedTuple):
 
     `beyond`: outside the calibrated temperatures; `moved`: outputs that rest on a free direction;
     `lacking`: without a reading; `warmth`: lowest and highest temperature, °C; `metadata`: what the
-    table says of itself.
+    table says of itself; `valueless`: with a direction that has no value.
     """
 
     rows: int
@@ -62,6 +75,8 @@ class RowCounts(NamedTuple):
     strengths: Mapping[str, Strengths] = {}
     warmth: tuple[float, float] = (np.inf, -np.inf)
     metadata: Mapping[str, object] = {}
+    valueless: int = 0
+    scatter: Mapping[str, Scatter] = {}
 
     def blank(self, outside: str) -> int:
         """Number of rows without results: without a reading, or `outside` the temperatures."""
@@ -69,34 +84,43 @@ class RowCounts(NamedTuple):
 
 
 def correct(
-    calibration: Calibration, readings: Readings, outside: str = "blank"
+    calibration: Calibration, readings: Readings, outside: str = "blank", uncertainty: bool = True
 ) -> tuple[dict[str, AnyArray], list[Finding]]:
     """Output columns (n,) by name, and the findings.
 
     Refuses readings most of which have a strength that no place on Earth has, or that is off their
     reference.
 
-    Singular: at exactly vertical attitudes azimuth and toolface are NaN (blank in files);
+    With `uncertainty` also the 1σ of each angle and strength, of the calibration and of one reading.
+    Singular: within the uncertainty of vertical azimuth and toolface are NaN (blank in files);
     `magnetic_toolface_deg` stands beside them. A strength of zero has no direction: NaN.
     Temperatures outside the calibrated range are blanked, refused or extrapolated as `outside` says.
     """
-    columns, _, about = counted(calibration, readings, outside)
+    columns, _, about = counted(calibration, readings, outside, uncertainty=uncertainty)
     return columns, about
 
 
 def counted(
-    calibration: Calibration, readings: Readings, outside: str, lacking: int = 0
+    calibration: Calibration,
+    readings: Readings,
+    outside: str,
+    lacking: int = 0,
+    uncertainty: bool = False,
 ) -> tuple[dict[str, AnyArray], RowCounts, list[Finding]]:
-    """Output columns, counts of the rows and findings; `lacking` more rows were left out unread."""
+    """Output columns, counts of the rows and findings; `lacking` more rows were left out unread.
+
+    With `uncertainty` the columns of standard uncertainties too.
+    """
     check_outside(outside)
     columns = compiled(calibration, readings) or reference(calibration, readings)
     beyond = calibration.outside(readings)
     if outside == "blank" and beyond.any():
         columns = {name: np.where(beyond, np.nan, value) for name, value in columns.items()}
+    columns, valueless = with_uncertainty(calibration, readings, columns, uncertainty)
     tally = RowCounts(
         readings.count + lacking, int(beyond.sum()), undetermined(calibration, readings), lacking, (),
         strengths.judged(calibration, columns, readings.known), warmth(readings.temperature),
-        readings.metadata,
+        readings.metadata, valueless, scatter.scatters(calibration, readings, columns),
     )  # fmt: skip
     about = findings(calibration, readings, tally, outside)
     strengths.check(calibration, tally.strengths, readings.name)
@@ -112,9 +136,10 @@ def warmth(temperature: Array | None) -> tuple[float, float]:
     return float(temperature.min(initial=np.inf)), float(temperature.max(initial=-np.inf))
 
 
-def result_names(outside: str) -> tuple[str, ...]:
+def result_names(outside: str, uncertainty: bool = True) -> tuple[str, ...]:
     """The columns of results, in their order."""
-    return (*RESULTS, EXTRAPOLATED) if outside == "extrapolate" else RESULTS
+    sd = UNCERTAINTIES if uncertainty else ()
+    return (*RESULTS, *sd, *([EXTRAPOLATED] if outside == "extrapolate" else []))
 
 
 def check_outside(outside: str) -> None:
@@ -183,6 +208,7 @@ def findings(
         advice = "Use `outside` blank or extrapolate, or calibrate over a wider range."
         raise InputError(f"{readings.source}: {beyond}. {advice}")
     off, tools = strengths.departures(tally.strengths), calibration.other_tool(readings)
+    unsteady = scatter.unsteady(tally.scatter)
     applies = {
         "no-magnetometer": calibration.has_field and readings.magnetometer is None,
         "other-tool": tools,
@@ -191,6 +217,8 @@ def findings(
         "no-temperature": calibration.unrecorded(readings),
         "implausible-gravity": "gravity" in off,
         "implausible-field": "field" in off,
+        "unsteady": unsteady,
+        "without-value": tally.valueless,
         "field-relative": calibration.relative,
         "undetermined": tally.moved,
     }
@@ -198,6 +226,8 @@ def findings(
         "beyond": beyond,
         "results": RESULTS_BEYOND[outside == "extrapolate"],
         "warmth": "…".join(dict.fromkeys(f"{end:.1f}" for end in tally.warmth)),
+        "unsteady": unsteady,
+        "largest": np.degrees(LARGEST_ANGLE_SD),
         "moved": ", ".join(tally.moved),
         "free": ", ".join(dict.fromkeys(u.id for u in calibration.undetermined())),
     }

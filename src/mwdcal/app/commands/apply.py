@@ -23,17 +23,22 @@ from mwdcal.errors import InputError
     default="refuse",
     help="Rows with a blank reading or temperature: refuse the file, or leave their results blank.",
 )
+@click.option(
+    "--uncertainty/--no-uncertainty",
+    default=True,
+    help="Columns with the standard uncertainty of each angle and strength. Without them long tables are faster.",
+)
 @options.DECIMAL
 @options.TRUSTED_KEYS
 @options.JSON
 def command(
-    calibration: Path, readings: Path, output: Path, outside: str, missing: str, decimal: str,
+    calibration: Path, readings: Path, output: Path, outside: str, missing: str, uncertainty: bool, decimal: str,
     key: tuple[Path, ...], as_json: bool,
 ) -> None:  # fmt: skip
     """Correct READINGS (CSV, TSV, Parquet, XLSX, WITSML or LAS) with the CALIBRATION of their tool.
 
     Writes the columns of READINGS as they are and, beside them: gravity and field along the tool
-    axes, inclination, azimuth (magnetic), toolface, dip and strengths.
+    axes, inclination, azimuth (magnetic), toolface, dip and strengths, and their standard uncertainties (sd_).
 
     \b
     Example: mwdcal apply tool.json surveys.csv -o corrected.csv
@@ -53,7 +58,7 @@ def command(
     try:
         with bar("correcting") as advance:
             tally, findings, readings_digest = apply_to_any(
-                fitted, readings, output, outside, missing, decimal, advance
+                fitted, readings, output, outside, missing, decimal, uncertainty, advance
             )
     except BlankReadingError as error:
         advice = "Or leave the results of such rows blank: --missing blank."

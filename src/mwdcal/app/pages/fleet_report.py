@@ -80,6 +80,7 @@ REMARKED = {
     "noise": "residuals of the {triad} are far below the declared noise",
     "residuals": "residuals of the {triad} are larger than the declared noise explains",
     "no-redundancy": "nothing in the run checks the fit",
+    "few-degrees-of-freedom": "the residuals are too few to know the uncertainties better than to a quarter",
     "hemisphere": "the dip is negative: a southern site, or a magnetometer with reversed signs",
     "scatter": "strengths, dip or directions vary from station to station beyond the noise",
     "repeated-readings": "some stations are copies of others",

@@ -9,7 +9,15 @@ import numpy as np
 
 from mwdcal import __version__
 from mwdcal.app.pages.page import banner, environment
-from mwdcal.app.screens.plan import PLACE, accuracy_rows, comparison_rows, facts, station_rows
+from mwdcal.app.screens.plan import (
+    DETECTABLE_TITLES,
+    PLACE,
+    accuracy_rows,
+    comparison_rows,
+    detectable_rows,
+    facts,
+    station_rows,
+)
 from mwdcal.app.text import plural, quantity
 from mwdcal.calibration.prediction import accuracy_at
 from mwdcal.files.contract import REFERENCES
@@ -37,7 +45,7 @@ def render(plans: Sequence[Planned]) -> str:
         profile=first.calibration.profile.name,
         summary=summaries[0],
         banner=_banner(first),
-        findings=left_undetermined(first.calibration),
+        findings=[*left_undetermined(first.calibration), *first.findings],
         simulated=True,
         place=_place(first),
         titles=station_rows(first.plan)[0],
@@ -45,6 +53,8 @@ def render(plans: Sequence[Planned]) -> str:
         compared=comparison_rows(summaries),
         plans=[each.plan for each in summaries],
         accuracy=accuracy_rows(summaries[0]),
+        detectable=detectable_rows(summaries[0]),
+        detectable_titles=DETECTABLE_TITLES,
         coverage=draw_coverage(plans),
         curves=draw_accuracy(plans),
         version=__version__,
@@ -73,7 +83,12 @@ def _banner(planned: Planned) -> dict[str, str]:
         f"{summary.rank} of {summary.size} parameters determined. Accuracy to expect ({PLACE}): "
         f"{expected or 'none can be stated'}."
     )
-    return banner("attention" if free else "open", "Planned – nothing measured", headline, after)
+    return banner(
+        "attention" if free or planned.findings else "open",
+        "Planned – nothing measured",
+        headline,
+        after,
+    )
 
 
 @plots.style()

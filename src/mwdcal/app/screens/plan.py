@@ -16,10 +16,11 @@ from mwdcal.app.text import one_line, quantity, table
 from mwdcal.calibration.prediction import accuracy_at, typical_accuracy
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.calibration.record import Calibration, Finding, TriadCalibration, Undetermined
+from mwdcal.calibration.residuals import shown_in
 from mwdcal.errors import InputError
 from mwdcal.files.formats.table import Table
 from mwdcal.planning.expected import left_undetermined
-from mwdcal.planning.planned import WORKING_INCLINATIONS, Planned
+from mwdcal.planning.planned import WORKING_INCLINATIONS, Planned, station_names
 
 PLACE = "1σ, calibration alone, at 45° inclination"
 """What the accuracy of a plan is of."""
@@ -37,7 +38,22 @@ class PlannedTriad(msgspec.Struct, frozen=True, kw_only=True):
     order: int
     rank: int
     size: int
+    degrees_of_freedom: float
     undetermined: list[Undetermined]
+
+
+class DetectableError(msgspec.Struct, frozen=True, kw_only=True):
+    """The error of one station from which `calibrate` reports it in 80 % of runs, at the worst station.
+
+    `noticed`: the station or the residuals are reported; `named`: the station is, None where it never is.
+    """
+
+    observable: str
+    unit: str
+    noticed: float
+    noticed_station: str
+    named: float | None
+    named_station: str
 
 
 class PlanSummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -45,7 +61,8 @@ class PlanSummary(msgspec.Struct, frozen=True, kw_only=True):
 
     `accuracy_deg` at 45° inclination, as `calibrate` states it; `accuracy_by_inclination_deg` by angle at
     `inclinations_deg`. `efficiency_bound`: at least this share of the best D-value per parameter. Without
-    `magnetometer` the profile says nothing of one.
+    `magnetometer` the profile says nothing of one. No plan of fewer than `fewest_stations` gives the wanted accuracy;
+    None where none is wanted.
     """
 
     plan: str
@@ -60,6 +77,9 @@ class PlanSummary(msgspec.Struct, frozen=True, kw_only=True):
     size: int
     undetermined: list[Undetermined]
     efficiency_bound: float
+    fewest_stations: int | None
+    detectable_errors: list[DetectableError]
+    findings: list[Finding]
 
 
 class PlanDocument(PlanSummary, frozen=True, kw_only=True):
@@ -107,7 +127,10 @@ def facts(each: Planned) -> PlanSummary:
 def _fields(each: Planned) -> dict[str, Any]:
     """The fields of a `PlanSummary`."""
     calibration = each.calibration
-    by_triad = {triad.name: _triad(triad) for triad in calibration.triads}
+    by_triad = {
+        triad.name: _triad(triad, float(freedom))
+        for triad, freedom in zip(calibration.triads, each.freedom, strict=True)
+    }
     free = {entry.id: entry for entry in left_undetermined(calibration)}
     return {
         "plan": each.plan.source,
@@ -121,16 +144,39 @@ def _fields(each: Planned) -> dict[str, Any]:
         "size": sum(triad.size for triad in calibration.triads),
         "undetermined": list(free.values()),
         "efficiency_bound": each.efficiency,
+        "fewest_stations": each.bound,
+        "detectable_errors": _detectable(each),
+        "findings": each.findings,
     }
 
 
-def _triad(triad: TriadCalibration) -> PlannedTriad:
+def _detectable(each: Planned) -> list[DetectableError]:
+    """The errors of one station that `calibrate` will report, at the plan's worst stations."""
+    names, rows = station_names(each.plan), []
+    for observable, detection in each.detections.items():
+        factor, unit = shown_in(observable)
+        sizes = [sd[0, each.measured :] for sd in (detection.noticed, detection.named)]
+        if np.isnan(sizes[0]).all():
+            continue
+        worst = [int(np.nanargmax(sd)) for sd in sizes]
+        noticed, named = (float(sd[k]) * factor for sd, k in zip(sizes, worst, strict=True))
+        rows.append(
+            DetectableError(
+                observable=observable, unit=unit, noticed=noticed, noticed_station=names[worst[0]],
+                named=named if np.isfinite(named) else None, named_station=names[worst[1]],
+            )
+        )  # fmt: skip
+    return rows
+
+
+def _triad(triad: TriadCalibration, freedom: float) -> PlannedTriad:
     names = dict(zip(triad.parameter_names, triad.standard_uncertainties, strict=True))
     return PlannedTriad(
         standard_uncertainties=names,
         order=triad.order,
         rank=triad.rank,
         size=triad.size,
+        degrees_of_freedom=freedom,
         undetermined=triad.undetermined,
     )
 
@@ -145,15 +191,18 @@ def _by_inclination(calibration: Calibration) -> dict[str, list[float | None]]:
 
 
 def findings(plans: Sequence[Planned]) -> list[Finding]:
-    """That the tool has no magnetometer, and what the plans leave undetermined."""
+    """That the tool has no magnetometer, what the plans leave undetermined, and what else is to be said of them."""
     profile = plans[0].calibration.profile
     text = f"the profile '{profile.name}' has no [magnetometer]: planned is a tool without one."
     without = [] if profile.has_magnetometer else [Finding(id="no-magnetometer", text=text)]
-    entries = [(each, free) for each in plans for free in left_undetermined(each.calibration)]
-    undetermined = [
-        Finding(id=free.id, text=f"{each.plan.source}: {free.text}") for each, free in entries
+    entries: list[tuple[Planned, Finding | Undetermined]] = []
+    for each in plans:
+        entries += [(each, entry) for entry in left_undetermined(each.calibration)]
+        entries += [(each, entry) for entry in each.findings]
+    said = [
+        Finding(id=entry.id, text=f"{each.plan.source}: {entry.text}") for each, entry in entries
     ]
-    return without + undetermined
+    return without + said
 
 
 def document(
@@ -181,7 +230,7 @@ def screen(
         table(comparison_rows(summaries), ["", *(one_line(each.plan) for each in summaries)]),
     ]
     if len(plans) == 1:
-        blocks += [accuracy(summaries[0]), stations(plans[0])]
+        blocks += [accuracy(summaries[0]), detectable(summaries[0]), stations(plans[0])]
     if output or html:
         blocks.append(written(**{"plan": output, "run sheet": html}))
     return "\n\n".join(blocks)
@@ -194,6 +243,7 @@ def comparison_rows(facts: Sequence[PlanSummary]) -> list[list[str]]:
         ["at the stand", *(f"{each.session_hours:.1f} h" for each in facts)],
         ["temperature order", *(_orders(each) for each in facts)],
         ["determined", *(f"{each.rank} of {each.size}" for each in facts)],
+        ["degrees of freedom", *(_freedom(each) for each in facts)],
         ["D-efficiency, at least", *(f"{100 * each.efficiency_bound:.0f} %" for each in facts)],
     ]
     for name in facts[0].accuracy_deg:
@@ -214,6 +264,33 @@ def accuracy_rows(each: PlanSummary) -> list[list[str]]:
 def accuracy(each: PlanSummary) -> str:
     """1σ of the angles at the working inclinations."""
     return table(accuracy_rows(each), ["1σ at inclination", *each.accuracy_by_inclination_deg])
+
+
+DETECTABLE_TITLES = ["error of one station (80 % of runs)", "noticed from", "station named from"]
+"""What heads the table of errors that `calibrate` will report."""
+
+
+def detectable_rows(each: PlanSummary) -> list[list[str]]:
+    """The errors of one station from which `calibrate` reports it, an observable in each row."""
+    return [
+        [
+            row.observable,
+            quantity(float(f"{row.noticed:.2g}"), row.unit),
+            "never" if row.named is None else quantity(float(f"{row.named:.2g}"), row.unit),
+        ]
+        for row in each.detectable_errors
+    ]
+
+
+def detectable(each: PlanSummary) -> str:
+    """The errors of one station from which `calibrate` reports it in 80 % of runs."""
+    return table(detectable_rows(each), DETECTABLE_TITLES)
+
+
+def _freedom(each: PlanSummary) -> str:
+    """Degrees of freedom of both triads."""
+    triads = [triad for triad in (each.accelerometer, each.magnetometer) if triad]
+    return " and ".join(dict.fromkeys(f"{triad.degrees_of_freedom:.0f}" for triad in triads))
 
 
 def _orders(each: PlanSummary) -> str:

@@ -35,6 +35,8 @@ CALM_FREEDOM = 12.0
 """Degrees of freedom from which residuals far below the declared noise are not a coincidence."""
 MISFIT_CHANCE = 1e-3
 """Chance of so large residuals, or of so large a departure from the prior, below which it is reported."""
+FEW_FREEDOM = 8.0
+"""Fewer degrees of freedom are reported: from them s is known no better than to a quarter."""
 LOW_WEIGHT = 0.1
 """A station of less weight than this in a robust fit is reported."""
 SCATTER_SHARE = 3e-4
@@ -71,6 +73,8 @@ REMARKS = {
     "The fit allows for the drift, and the uncertainty includes it. Let the tool warm up, and change inclination and "
     "azimuth in another order than from end to end.",
     "no-redundancy": "{triads}: no redundancy, so nothing in this run checks the fit. Add stations.",
+    "few-degrees-of-freedom": "the {few}: another run like this one may state {share:.0f} % more or less (1σ), and an "
+    "error of a single station is hard to see. Add stations.",
     "scatter": "beyond sensor noise, these vary from station to station: {what} (1σ, estimated; weights and "
     "uncertainties include it). Look for iron near the stand and play in the tool holder; or the model lacks "
     "something.",
@@ -138,6 +142,7 @@ def finding_flags(fitted: FittedRuns) -> Iterator[Flag]:
     yield from _noise(fitted)
     bare = unchecked(fitted.result)
     yield _remark("no-redundancy", np.any(bare, -1), triads=partial(_joined, bare))
+    yield _few_degrees(fitted)
     yield _hemisphere(fitted)
     yield from _drifts(fitted)
     yield from _structure(fitted)
@@ -192,6 +197,21 @@ def _noise(fitted: FittedRuns) -> Iterator[Flag]:
         for index, triad in enumerate(TRIADS[: factor.shape[-1]]):
             values = {"triad": triad, "times": times[:, index], "rare": partial(rare, index=index)}
             yield Flag(f"{triad}-{end}", holds[:, index], REMARKS[end], values)
+
+
+def _few_degrees(fitted: FittedRuns) -> Flag:
+    """Triads whose residuals are too few to know s from."""
+    freedom = fitted.freedom
+    few = (freedom < FEW_FREEDOM) & ~unchecked(fitted.result)
+
+    def named(place: int) -> str:
+        each = [f"{TRIADS[t]} has {freedom[place, t]:.0f}" for t in np.flatnonzero(few[place])]
+        return f"{' and the '.join(each)} degrees of freedom"
+
+    least = np.where(few, freedom, np.inf).min(-1)
+    return _remark(
+        "few-degrees-of-freedom", np.any(few, -1), few=named, share=100 / np.sqrt(2 * least)
+    )
 
 
 def _hemisphere(fitted: FittedRuns) -> Flag:

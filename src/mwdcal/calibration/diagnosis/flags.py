@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mwdcal.calibration.diagnosis.plausibility import misfit_chances
+from mwdcal.calibration.diagnosis.plausibility import freedom_of, misfit_chances
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
@@ -102,7 +102,12 @@ class FittedRuns:
     @cached_property
     def chances(self) -> Array:
         """`misfit_chances` (B, t) of the fit."""
-        return misfit_chances(self.result)
+        return misfit_chances(self.result, self.freedom)
+
+    @cached_property
+    def freedom(self) -> Array:
+        """`freedom_of` (B, t) the fit."""
+        return freedom_of(self.result)
 
     @cached_property
     def covariance(self) -> StatedCovariance:

@@ -157,18 +157,24 @@ def straying(result: Fit) -> Bools:
     return np.asarray(stray.any((-1, -2)))
 
 
-def misfit_chances(result: Fit) -> Array:
+def freedom_of(result: Fit) -> Array:
+    """Degrees of freedom (B, t) of the χ² that the s² of each triad follows."""
+    analysis = result.analysis
+    if closed_form.applies(result.problem) or analysis.influence is not None:
+        return analysis.freedom
+    return effective_freedom(result.problem, result.state, analysis)
+
+
+def misfit_chances(result: Fit, freedom: Array | None = None) -> Array:
     """Chance (B, t) of residuals as large as each triad's, if noise and stand are as declared.
 
     NaN where noise was estimated, nothing is redundant, or station weights hide what is large.
     """
-    problem, analysis = result.problem, result.analysis
-    freedom = analysis.freedom
-    if not closed_form.applies(problem) and analysis.influence is None:
-        freedom = effective_freedom(problem, result.state, analysis)
+    freedom = freedom_of(result) if freedom is None else freedom
     untested = np.isfinite(result.noise) | unchecked(result) | robust(result)[:, None]
     freedom = np.where(untested, 1.0, freedom)
-    return np.where(untested, np.nan, chi_chance(analysis.variance_factor * freedom, freedom))
+    square = result.analysis.variance_factor * freedom
+    return np.where(untested, np.nan, chi_chance(square, freedom))
 
 
 def robust(result: Fit) -> Bools:

@@ -17,6 +17,7 @@ from mwdcal.estimation.uncertainty import station_misfit
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, centred
 from mwdcal.survey.acceptance import SURVEY_UNITS
+from mwdcal.survey.error_terms import CORRECTED, ErrorTerms, error_terms
 from mwdcal.survey.multistation.interference_estimate import (
     USUAL_SD,
     Assumed,
@@ -27,7 +28,6 @@ from mwdcal.survey.multistation.interference_estimate import (
     varied,
 )
 from mwdcal.survey.multistation.separability import missing
-from mwdcal.survey.well import CORRECTED
 
 FEWEST_SURVEYS = 2
 """Surveys below which nothing can be said of several stations."""
@@ -134,6 +134,11 @@ class Interference:
     summary: MultiStationAnalysis
     calibration: Calibration
     readings: Readings
+
+    @property
+    def terms(self) -> ErrorTerms:
+        """What the standard uncertainties of magnetic azimuths hold, and what they leave out."""
+        return error_terms(self.calibration.findings, declination=False)
 
     def check(self) -> None:
         """Refuse to go on with what cannot be trusted; raises `FitError`."""

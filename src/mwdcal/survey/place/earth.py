@@ -1,12 +1,11 @@
-"""The Earth at a place and date: normal gravity, the main magnetic field, the convergence of a grid.
+"""The Earth at a place and date: normal gravity and the main magnetic field.
 
-Nothing is loaded from a network: coefficients and projections are those of the installed libraries.
+Nothing is loaded from a network: coefficients are those of the installed libraries.
 """
 
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Sequence
 from datetime import date
 from functools import cache
@@ -37,8 +36,6 @@ _WMM_FILE = "wmm/WMM_2025.COF"
 _IGRF_FILE = "IGRF14.shc"
 _HIGHEST_DEGREE = 133
 """Of pygeomag's high resolution. IGRF needs 13, one more than its usual one."""
-_CODE = re.compile(r"[A-Za-z]+:\w+")
-_GRID_AXES = {"east", "north", "up"}
 
 
 class MainField(NamedTuple):
@@ -61,14 +58,6 @@ class FieldModel(NamedTuple):
     coefficients: str
     sha256: str
     evaluate: Any
-
-
-class Grid(NamedTuple):
-    """North of a map projection: its convergence at a place, degrees, and whether it is made for that place."""
-
-    convergence_deg: float
-    name: str
-    covered: bool
 
 
 def normal_gravity(latitude_deg: ArrayLike, altitude_m: ArrayLike) -> Array:
@@ -158,7 +147,7 @@ def _epoch(year: float) -> float:
 @cache
 def _wmm() -> FieldModel:
     """WMM2025 of pygeomag."""
-    library = _library("pygeomag", "The World Magnetic Model")
+    library = optional_library("pygeomag", "The World Magnetic Model")
     model = library.GeoMag(coefficients_file=_WMM_FILE)
     _, sha256 = _coefficients("pygeomag", _WMM_FILE)
     first, last = FIELD_MODELS["wmm2025"]
@@ -171,7 +160,7 @@ def _wmm() -> FieldModel:
 @cache
 def _igrf(epoch: float) -> FieldModel:
     """IGRF-14 from an epoch to the next: coefficients of ppigrf, which is not imported (it needs pandas)."""
-    library = _library("pygeomag", "The geomagnetic reference field")
+    library = optional_library("pygeomag", "The geomagnetic reference field")
     text, sha256 = _coefficients("ppigrf", _IGRF_FILE)
     header, *rows = [line.split() for line in text.splitlines() if line and line[0] != "#"][1:]
     now = [float(year) for year in header].index(epoch)
@@ -195,52 +184,7 @@ def _with_rates(cosine: Sequence[float], sine: Sequence[float]) -> tuple[float, 
     return cosine[0], sine[0], *rates
 
 
-def grid_convergence(crs: str, latitude_deg: float, longitude_deg: float) -> Grid:
-    """Grid north of a map projection at a place: the angle from true to grid north, positive east.
-
-    Definition: A_grid = A_true - convergence.
-
-    Raises:
-        InputError: no such projection, one whose axes are not east and north, or a place it does not show.
-    """
-    library = _library("pyproj", "The convergence of a grid")
-    try:
-        system = library.CRS.from_user_input(crs if _CODE.fullmatch(crs) else "")
-    except library.exceptions.CRSError:
-        raise InputError(
-            f"`crs` must be the code of a projected coordinate system, such as EPSG:32631; got {crs!r}. "
-            "Name that of the well plan."
-        ) from None
-    axes = {axis.direction for axis in system.axis_info}
-    if not system.is_projected or not axes <= _GRID_AXES:
-        what = "axes " + " and ".join(sorted(axes)) if system.is_projected else "no grid"
-        raise InputError(
-            f"`crs` must name a grid that counts east and north; {crs} ({system.name}) has {what}. "
-            "Name the projected system of the well plan."
-        )
-    longitude = (longitude_deg + 180.0) % 360.0 - 180.0
-    factors = library.Proj(system).get_factors(longitude, latitude_deg)
-    convergence = float(factors.meridian_convergence)
-    if not np.isfinite(convergence):
-        raise InputError(
-            f"`crs` {crs} ({system.name}) does not show {latitude_deg:g}°, {longitude:g}°. "
-            "Check `latitude_deg`, `longitude_deg` and the zone."
-        )
-    name = f"{system.name}, pyproj {library.__version__}"
-    return Grid(convergence, name, _covers(system, longitude, latitude_deg))
-
-
-def _covers(system: Any, longitude: float, latitude: float) -> bool:
-    """Whether a place is in the area for which a coordinate system is made; all are where it states none."""
-    area = system.area_of_use
-    if area is None:
-        return True
-    beyond = (area.east - area.west) % 360.0 or 360.0
-    inside = area.south <= latitude <= area.north and (longitude - area.west) % 360.0 <= beyond
-    return bool(inside)
-
-
-def _library(name: str, what: str) -> Any:
+def optional_library(name: str, what: str) -> Any:
     """A library of the extra 'survey', or what to install."""
     try:
         return import_module(name)

@@ -21,6 +21,7 @@ from mwdcal.calibration.record import DOCUMENT_VERSION, Finding
 from mwdcal.errors import InputError, reason
 from mwdcal.files.contract import AZIMUTH_KEYS, REFERENCES, ROTATION, Range, magnetic_offset
 from mwdcal.survey.place import earth
+from mwdcal.survey.place.grids import LEAST_DISTORTION, Grid, grid_convergence
 from mwdcal.use.strengths import STANDARD_GRAVITY
 
 MEASURABLE = {
@@ -165,7 +166,8 @@ def reference_at(
     """The reference of a place and date.
 
     `measured` values by name of `MEASURABLE`, in the units of their keys, stand before those of the models,
-    with their standard `uncertainties`, zero where none is stated. The field model is not consulted where
+    with their standard `uncertainties`. Where none is stated it is zero, that of declination as of the model: no
+    residual would ever show its error. The field model is not consulted where
     field, dip and declination were all measured.
     """
     measured, uncertainties = measured or {}, uncertainties or {}
@@ -185,8 +187,12 @@ def reference_at(
     modelled, described = _modelled(place, day, model, measured)
     values: dict[str, Any] = {**modelled, **given}
     spread: dict[str, Any] = _uncertainties(values, altitude_m)
-    spread |= {f"sd_{MEASURABLE[name]}": uncertainties.get(name, 0.0) for name in measured}
-    grid = earth.grid_convergence(crs, latitude_deg, longitude_deg) if crs else None
+    spread |= {
+        f"sd_{MEASURABLE[name]}": uncertainties.get(name, 0.0)
+        for name in measured
+        if uncertainties.get(name) or name != "declination"
+    }
+    grid = grid_convergence(crs, latitude_deg, longitude_deg) if crs else None
     return EarthReference(
         **place,
         date=day,
@@ -227,20 +233,30 @@ def _uncertainties(values: Mapping[str, float], altitude_m: float) -> dict[str, 
     """Standard uncertainties of modelled values, and of what changes from station to station."""
     below = max(-altitude_m, 0.0)
     gravity = math.hypot(GRAVITY_ANOMALY, GRADIENT_IN_ROCK * below) / STANDARD_GRAVITY
-    horizontal = values["field_nt"] * math.cos(math.radians(values["dip_deg"]))
+    declinations = declination_sd(values["field_nt"] * math.cos(math.radians(values["dip_deg"])))
     spread = {"sd_gravity_g": gravity}
-    for prefix, sd in (("sd_", PLACE_SD), ("sd_random_", MOMENT_SD)):
-        declination = math.hypot(sd.declination_deg, sd.horizontal_deg_nt / max(horizontal, 1.0))
+    for prefix, sd, declination in zip(
+        ("sd_", "sd_random_"), (PLACE_SD, MOMENT_SD), declinations, strict=True
+    ):
         spread |= {
             f"{prefix}field_nt": sd.field_nt,
             f"{prefix}dip_deg": sd.dip_deg,
-            f"{prefix}declination_deg": min(declination, _SD["declination"].high),
+            f"{prefix}declination_deg": declination,
         }
     return spread
 
 
+def declination_sd(horizontal_nt: float) -> tuple[float, float]:
+    """1σ of a global model's declination, degrees: what all stations share, and of each its own."""
+    shared, alone = (
+        math.hypot(sd.declination_deg, sd.horizontal_deg_nt / max(horizontal_nt, 1.0))
+        for sd in (PLACE_SD, MOMENT_SD)
+    )
+    return min(shared, _SD["declination"].high), min(alone, _SD["declination"].high)
+
+
 def _sources(
-    coefficients: str | None, measured: Mapping[str, float], grid: earth.Grid | None
+    coefficients: str | None, measured: Mapping[str, float], grid: Grid | None
 ) -> dict[str, str]:
     """Where each value comes from, and the uncertainties of those that were not measured."""
     sources = dict.fromkeys(MEASURABLE, str(coefficients))
@@ -255,15 +271,18 @@ def _sources(
 
 def _findings(
     values: Mapping[str, float], altitude_m: float, measured: Mapping[str, float],
-    uncertainties: Mapping[str, float], grid: earth.Grid | None,
+    uncertainties: Mapping[str, float], grid: Grid | None,
 ) -> list[Finding]:  # fmt: skip
     """What the reader should know of a reference."""
     findings = []
     for name in measured:
         if not uncertainties.get(name):
             key = MEASURABLE[name]
-            text = f"`{key}` has no standard uncertainty and is taken as exact. State `sd_{key}`."
-            findings.append(Finding(id="exact-reference", text=text))
+            as_model = name == "declination"
+            taken = "that of a field model is taken" if as_model else "it is taken as exact"
+            text = f"`{key}` has no standard uncertainty: {taken}. State `sd_{key}`."
+            kind = "declination-uncertainty-assumed" if as_model else "exact-reference"
+            findings.append(Finding(id=kind, text=text))
     horizontal = values["field_nt"] * math.cos(math.radians(values["dip_deg"]))
     if horizontal < LEAST_HORIZONTAL:
         text = (
@@ -280,6 +299,12 @@ def _findings(
     if grid and not grid.covered:
         text = f"the place is outside the area of use of {grid.name}. Check `crs` and the zone."
         findings.append(Finding(id="outside-grid", text=text))
+    if grid and grid.distortion_deg > LEAST_DISTORTION:
+        text = (
+            f"{grid.name} does not keep angles: grid azimuths are off by up to {grid.distortion_deg:.2g}°, those "
+            "along the meridian by nothing. Use a conformal grid for the well plan."
+        )
+        findings.append(Finding(id="grid-not-conformal", text=text))
     return findings
 
 

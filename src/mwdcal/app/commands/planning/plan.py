@@ -25,13 +25,13 @@ from mwdcal.errors import InputError
     "--stations",
     type=click.IntRange(1),
     metavar="N",
-    help="The best N stations out of the candidates.",
+    help="The best N stations out of the candidates; with --accuracy the best for it.",
 )
 @click.option(
     "--accuracy",
     metavar="ANGLE=DEG",
     multiple=True,
-    help="The fewest stations that give an accuracy (1σ), such as azimuth=0.1; may be repeated.",
+    help="The fewest stations that give an accuracy (1σ), such as azimuth=0.1, and enough redundancy; may be repeated.",
 )
 @click.option(
     "--measured",
@@ -50,7 +50,7 @@ from mwdcal.errors import InputError
     "--criterion",
     type=click.Choice(["D", "A", "I"]),
     default="I",
-    help="What the best stations are best in. D: all parameters together. A: each of them. I: the angles "
+    help="What --stations optimises. D: all parameters together. A: each of them. I: the angles "
     "between 5 and 120° inclination.",
 )
 @options.preset(
@@ -107,13 +107,15 @@ def command(
     stand = Stand(speed, settle, soak, screen.reach(reach))
     tables = [load_plan(name) for name in plans]
     done = load_measured(str(measured), profile.has_magnetometer) if measured else None
-    search = profile, chosen, criterion, stand, done
     candidates = tables[0] if tables else None
     with progress.bar("planning") as show:
         if accuracy:
             wanted = screen.wanted_accuracy(accuracy)
-            result = [planned.smallest_plan(candidates, wanted, *search)]
+            result = [
+                planned.smallest_plan(candidates, wanted, profile, chosen, stand, done, stations)
+            ]
         elif stations or done:
+            search = profile, chosen, criterion, stand, done
             result = [planned.best_plan(candidates, stations or 1, *search)]
         else:
             result = []

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from mwdcal.geometry.vectors import Array
     from mwdcal.survey.acceptance import SurveyLimits
     from mwdcal.survey.multistation.interference import Interference
-    from mwdcal.survey.well import North, Well
+    from mwdcal.survey.norths import North
+    from mwdcal.survey.well import Well
 
 
 @options.command()

@@ -53,6 +53,7 @@ def render(result: Interference, sha256: Mapping[str, str]) -> str:
             directions=direction_rows(summary),
             direction_titles=DIRECTION_TITLES,
             misfit=misfit_in_words(summary),
+            terms=result.terms.sentence,
             strengths=draw_strengths(summary),
             azimuths=draw_azimuths(summary),
             titles=CORRECTED_TITLES,

@@ -7,7 +7,13 @@ from collections.abc import Mapping
 from mwdcal import __version__
 from mwdcal.app.pages.page import banner, environment
 from mwdcal.app.pages.surveys import survey_figures as figures
-from mwdcal.app.screens.surveys.survey import SurveySummary, end_in_words, summary, survey_rows
+from mwdcal.app.screens.surveys.survey import (
+    SurveySummary,
+    declination_in_words,
+    end_in_words,
+    summary,
+    survey_rows,
+)
 from mwdcal.app.text import plural
 from mwdcal.calibration.readings import is_simulated, serial_of
 from mwdcal.calibration.record import Finding
@@ -29,7 +35,6 @@ def render(well: Well, findings: list[Finding], sha256: Mapping[str, str]) -> st
         .render(
             facts=facts,
             modelled=well.limits.probability is not None,
-            corrected=bool(well.corrected),
             readings=well.readings.source,
             serial=next(filter(None, map(serial_of, stated)), None),
             simulated=any(map(is_simulated, stated)),
@@ -39,6 +44,8 @@ def render(well: Well, findings: list[Finding], sha256: Mapping[str, str]) -> st
             angles=figures.angles(well),
             path=figures.path(well) if has_path else None,
             enlarged=figures.enlargement(well.position) if has_path and well.position else 1.0,
+            terms=well.terms.sentence,
+            declination=declination_in_words(facts),
             end=end_in_words(facts.end, facts.north) if facts.end else "",
             header=header,
             rows=rows,

@@ -78,7 +78,7 @@ def screen(result: Interference, *metadata: Mapping[str, object]) -> str:
     ]  # fmt: skip
     lines = ["   ".join(heading), verdict(summary)]
     lines += [summary.missing] if summary.missing else []
-    lines.append(misfit_in_words(summary))
+    lines += [misfit_in_words(summary), result.terms.sentence]
     more = count - MOST_CORRECTED
     surveys = table(corrected_rows(summary, MOST_CORRECTED), CORRECTED_TITLES)
     parts = [

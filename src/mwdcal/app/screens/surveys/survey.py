@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import msgspec
 import numpy as np
 
-from mwdcal.app.screens.numbers import fixed, written
+from mwdcal.app.screens.numbers import fixed, signed, written
 from mwdcal.app.screens.records.signature import in_short
 from mwdcal.app.text import one_line, plural, table
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import Finding, stated
 from mwdcal.certificate.signature import SignatureCheck
 from mwdcal.survey.acceptance import SurveyLimits
+from mwdcal.survey.error_terms import ErrorTerms, error_terms
 from mwdcal.survey.multistation.interference import InterferenceSize, MultiStationAnalysis
-from mwdcal.survey.well import North, Well
+from mwdcal.survey.norths import North
+from mwdcal.survey.well import Well
 
 MOST_SURVEYS = 30
 """Surveys of a table on screen."""
@@ -40,6 +43,7 @@ class EndOfPath(msgspec.Struct, frozen=True, kw_only=True):
 class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
     """What `survey` prints: stations counted by outcome, what they were judged by, where the path ends.
 
+    `error_terms` are in the standard uncertainties of surveys and path, `not_included` are not.
     `msa` is the multi-station analysis, if one was asked for; `interference` and `separable` are of it.
     """
 
@@ -50,7 +54,10 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
     blank: int
     north: str
     declination_deg: float | None
+    sd_declination_deg: float | None
     convergence_deg: float | None
+    error_terms: list[str]
+    not_included: list[str]
     limits: str
     source: str
     end: EndOfPath | None
@@ -73,8 +80,7 @@ def refusal(
         not_judged=rows,
         blank=rows,
         north=north.name,
-        declination_deg=_degrees(north.declination),
-        convergence_deg=_degrees(north.convergence),
+        **_stated(north, error_terms((), north.declination is not None)),
         limits=limits.name,
         source=limits.source,
         end=None,
@@ -104,8 +110,7 @@ def summary(
         not_judged=int((~judged).sum()),
         blank=int(well.blank.sum()),
         north=north.name,
-        declination_deg=_degrees(north.declination),
-        convergence_deg=_degrees(north.convergence),
+        **_stated(north, well.terms),
         limits=well.limits.name,
         source=well.limits.source,
         end=end_of_path(well),
@@ -118,8 +123,22 @@ def summary(
     )
 
 
-def _degrees(angle: float | None) -> float | None:
-    return None if angle is None else float(np.degrees(angle))
+def _stated(north: North, terms: ErrorTerms) -> dict[str, Any]:
+    """What turns azimuths, degrees, and what their uncertainty holds."""
+    sd = None if north.declination is None else north.declination_sd
+    angles = {
+        "declination_deg": north.declination,
+        "sd_declination_deg": sd,
+        "convergence_deg": north.convergence,
+    }
+    return {
+        **{
+            key: None if angle is None else float(np.degrees(angle))
+            for key, angle in angles.items()
+        },
+        "error_terms": list(terms.included),
+        "not_included": list(terms.left_out),
+    }
 
 
 def end_of_path(well: Well) -> EndOfPath | None:
@@ -154,10 +173,11 @@ def screen(
     source = f" ({facts.source})" if facts.source else ""
     lines = [
         "   ".join(heading),
-        f"azimuths from {facts.north} north   limits {facts.limits}{source}",
+        f"azimuths from {facts.north} north{declination_in_words(facts)}   limits {facts.limits}{source}",
     ]
     if facts.end:
         lines.append(end_in_words(facts.end, facts.north))
+    lines.append(well.terms.sentence)
     return "\n".join(
         [
             *map(one_line, lines),
@@ -166,6 +186,14 @@ def screen(
             written(table=facts.output, page=facts.html),
         ]
     )
+
+
+def declination_in_words(facts: SurveySummary) -> str:
+    """The declination with its standard uncertainty, after the name of a north."""
+    if facts.declination_deg is None or facts.sd_declination_deg is None:
+        return ""
+    sd = fixed(facts.sd_declination_deg, 2)
+    return f" (declination {signed(facts.declination_deg, 2)}° ± {sd}°)"
 
 
 def end_in_words(end: EndOfPath, north: str) -> str:

@@ -1,0 +1,116 @@
+"""Standard uncertainties of corrected readings, and angles that have no value: one rule for readings and surveys.
+
+The uncertainty is that of the calibration and of the noise of one reading. Near vertical azimuth and toolface have
+no value, nor has azimuth where the field is vertical: a direction is then smaller than its own error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.calibration.record import Calibration
+from mwdcal.geometry.observables import OBSERVABLES, OUTPUTS, UNCERTAINTIES
+from mwdcal.geometry.vectors import AnyArray, Array, Bools, diagonal
+
+RESULT_OBSERVABLES = tuple(OUTPUTS)
+"""Observables of a corrected reading, in the order of their columns."""
+COVARIANCES_AT_ONCE = 1 << 12
+"""Rows whose covariances are computed at once, so that they stay in fast memory."""
+_FILE_UNITS = np.array(
+    [np.degrees(1.0) if OBSERVABLES[n].unit == "rad" else 1.0 for n in RESULT_OBSERVABLES]
+)
+DOUBTFUL = 3.0
+"""Degrees from vertical within which a direction may have no value, for any calibration that is of use."""
+
+
+def standard_uncertainties(
+    calibration: Calibration, readings: Readings, names: Sequence[str] = RESULT_OBSERVABLES
+) -> Array:
+    """1σ (…, n, k) of observables of one reading; NaN where none can be stated. Units: radians, g, nT."""
+    with np.errstate(invalid="ignore", divide="ignore"):  # a strength of zero, g along b
+        covariance = calibration.covariance(names, readings, noise=True)
+    return np.asarray(np.sqrt(np.maximum(diagonal(covariance), 0.0)))
+
+
+def without_value(
+    calibration: Calibration, readings: Readings, names: Sequence[str], value: Array, sd: Array
+) -> Bools:
+    """Where (…, n, k) a direction has no value: its 1σ would exceed `LARGEST_ANGLE_SD`.
+
+    Of `names`, with `value` and `sd` (…, n, k). What is not there, rests on a free direction or lies outside the
+    calibrated temperatures has no `sd` for other reasons.
+    """
+    turns = np.array([OBSERVABLES[name].period > 0 for name in names])
+    lost = turns & np.isnan(sd) & ~np.isnan(value)
+    lost &= ~calibration.outside(readings)[..., None]
+    if lost.any() and calibration.free:
+        lost &= ~np.stack([calibration.rests_on_free(name, readings) for name in names], -1)
+    return np.asarray(lost)
+
+
+def with_uncertainty(
+    calibration: Calibration, readings: Readings, columns: Mapping[str, AnyArray], stated: bool
+) -> tuple[dict[str, AnyArray], int]:
+    """Corrected columns (…, n) with directions that have no value blanked, and the number of rows with such.
+
+    With standard uncertainties after them where these are to be `stated`; without, only rows near vertical are
+    looked at.
+    """
+    result = {name: np.asarray(values, float) for name, values in columns.items()}
+    shape, outputs = readings.accelerometer.shape[:-1], [*OUTPUTS.values()]
+    sd = np.full((len(RESULT_OBSERVABLES), *shape), np.nan) if stated else None
+    places = np.arange(readings.count) if stated else np.flatnonzero(_doubtful(columns))
+    valueless = 0
+    for start in range(0, len(places), COVARIANCES_AT_ONCE):
+        block = places[start : start + COVARIANCES_AT_ONCE]
+        rows = slice(block[0], block[-1] + 1) if stated else block
+        some = rows_of(readings, rows)
+        value = np.stack([result[column][..., rows] for column in outputs], -1)
+        part = standard_uncertainties(calibration, some)
+        lost = without_value(calibration, some, RESULT_OBSERVABLES, value, part)
+        valueless += int(np.count_nonzero(lost.any(-1)))
+        for k in np.flatnonzero(lost.any(tuple(range(lost.ndim - 1)))).tolist():
+            if result[outputs[k]] is columns[outputs[k]]:
+                result[outputs[k]] = result[outputs[k]].copy()
+            result[outputs[k]][..., rows] = np.where(lost[..., k], np.nan, value[..., k])
+        if sd is not None:
+            sd[..., rows] = np.moveaxis(
+                np.where(np.isnan(value), np.nan, part * _FILE_UNITS), -1, 0
+            )
+    names = UNCERTAINTIES if stated else ()
+    return result | dict(zip(names, () if sd is None else sd, strict=True)), valueless
+
+
+def _doubtful(columns: Mapping[str, AnyArray]) -> Bools:
+    """Rows (n,) where the tool or the field is nearly vertical, or the field lies nearly along the tool."""
+    across = np.hypot(columns["bx_nt"], columns["by_nt"])
+    with np.errstate(invalid="ignore"):
+        near = np.abs(columns["inclination_deg"] - 90.0) > 90.0 - DOUBTFUL
+        near |= np.abs(columns["dip_deg"]) > 90.0 - DOUBTFUL
+        near |= across < np.sin(np.radians(DOUBTFUL)) * columns["field_nt"]
+    return np.asarray(near.reshape(-1, near.shape[-1]).any(0))
+
+
+def rows_of(readings: Readings, rows: AnyArray | slice) -> Readings:
+    """Some rows of readings (…, n), as far as corrections need them."""
+    shape = readings.accelerometer.shape
+    magnetometer, temperature = readings.magnetometer, readings.temperature
+    return replace(
+        readings,
+        accelerometer=readings.accelerometer[..., rows, :],
+        magnetometer=None if magnetometer is None else magnetometer[..., rows, :],
+        temperature=None if temperature is None else temperature[..., rows],
+        sd={
+            n: np.broadcast_to(readings.sd[n], shape)[..., rows, :]
+            for n in TRIADS
+            if n in readings.sd
+        },
+        known={},
+        group=None,
+        station=(),
+        digest=(),
+    )
