@@ -16,7 +16,7 @@ from mwdcal.calibration.diagnosis.findings import described, findings
 from mwdcal.calibration.diagnosis.flags import FittedRuns
 from mwdcal.calibration.diagnosis.refusals import UNSOUND_ADVICE, check, fit_refusals
 from mwdcal.calibration.diagnosis.soundness import inconsistency
-from mwdcal.calibration.drift import Drift
+from mwdcal.calibration.drift import Constant, Drift
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import accuracy
@@ -26,7 +26,6 @@ from mwdcal.calibration.record import (
     BudgetRow,
     Calibration,
     Choices,
-    Constant,
     StandErrors,
     TriadCalibration,
     Undetermined,

@@ -1,4 +1,4 @@
-"""Drifts within a run as a calibration file states them."""
+"""Constants of a run, and drifts within it, as a calibration file states them."""
 
 from __future__ import annotations
 
@@ -6,6 +6,15 @@ import msgspec
 
 SHOWN_DRIFT = 3.0
 """A drift is a finding if it is so many times its standard uncertainty; smaller ones are in the uncertainty too."""
+
+
+class Constant(msgspec.Struct, frozen=True, kw_only=True):
+    """A constant of the run that was estimated, with its standard uncertainty."""
+
+    name: str
+    value: float
+    standard_uncertainty: float
+    unit: str
 
 
 class Drift(msgspec.Struct, frozen=True, kw_only=True):

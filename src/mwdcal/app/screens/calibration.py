@@ -12,14 +12,13 @@ from mwdcal.app.messages import findings_as_typed
 from mwdcal.app.screens.numbers import written
 from mwdcal.app.text import chance, number, one_line, quantity, table
 from mwdcal.calibration.automatic.nonlinearity import CurveScore
-from mwdcal.calibration.drift import Drift
+from mwdcal.calibration.drift import Constant, Drift
 from mwdcal.calibration.prediction import typical_accuracy
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import (
     BudgetRow,
     Calibration,
     Choices,
-    Constant,
     ErrorRow,
     Finding,
     Measures,
