@@ -12,7 +12,6 @@ from dataclasses import replace
 import numpy as np
 
 from mwdcal.calibration.automatic.courses import f_test, terms_beyond
-from mwdcal.calibration.diagnosis.structure import effects
 from mwdcal.calibration.estimate import Fit, fit, refitted
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
@@ -86,9 +85,6 @@ def drifting(result: Fit, options: Options) -> Bools:
     drifted[sound] = (
         chances(result if sound.all() else take(result, np.flatnonzero(sound))) < ORDER_CHANCE
     )
-    for place in np.flatnonzero(drifted.any(-1)):
-        named = effects(take(result, np.array([place])))
-        drifted[place] &= not named or named[0].name.endswith("-drift")
     return drifted
 
 

@@ -66,11 +66,11 @@ REMARKS = {
     "residuals": "{triad}: residuals are {times:.2f} times the declared noise{rare}: the noise figure, a reference, or "
     "the model is wrong. The uncertainty is scaled up as if each station had an error of its own; an error that "
     "stations share may be larger than it says.",
-    "field-drift": "The field drifted by {change:.2g} {unit} (1σ {sd:.1g} {unit}) during the run. The fit allows for "
-    "the drift, and the uncertainty includes it. Give ref_field_nt and ref_dip_deg of each station from a reference "
+    "field-drift": "Readings follow the order of the stations as if the field drifted by {change:.2g} {unit} (1σ "
+    "{sd:.1g} {unit}) during the run. The fit allows for this drift, and the uncertainty includes it. Give ref_field_nt and ref_dip_deg of each station from a reference "
     "magnetometer, or repeat the run at a quiet time.",
-    "offset-drift": "The offsets of the {triad} drifted by {change:.2g} {unit} (1σ {sd:.1g} {unit}) during the run. "
-    "The fit allows for the drift, and the uncertainty includes it. Let the tool warm up, and change inclination and "
+    "offset-drift": "Readings follow the order of the stations as if the offsets of the {triad} drifted by {change:.2g} "
+    "{unit} (1σ {sd:.1g} {unit}) during the run. The fit allows for this drift, and the uncertainty includes it. Let the tool warm up, and change inclination and "
     "azimuth in another order than from end to end.",
     "no-redundancy": "{triads}: no redundancy, so nothing in this run checks the fit. Add stations.",
     "few-degrees-of-freedom": "the {few}: another run like this one may state {share:.0f} % more or less (1σ), and an "
@@ -87,6 +87,9 @@ REMARKS = {
     "over the range ({of[angle]:.2g}° across the field). The uncertainties here include it. {of[remedy]}.",
     "temperature-untested": "{triads}: {levels} temperatures are as many as a course of order {order} takes, so "
     "nothing tests it between them, and {unsaid}. Add a temperature between them.",
+    "prior-aged": "The prior ({source}) allows for what the tool may have changed since, {ageing}. State turn_on, "
+    "bias_walk and scale_walk under [accelerometer.datasheet] and [magnetometer.datasheet] of the profile if you "
+    "know better.",
     "prior-shared": "the prior ({source}) and this run both have {both} in their uncertainty, and count as independent "
     "there. On the same stand it is one error: what rests on it is then stated up to 1.4 times too small.",
     "prior-only": "this run does not determine {names}: there values and uncertainties rest on the prior ({source}).",
@@ -326,6 +329,9 @@ def _prior(fitted: FittedRuns) -> Iterator[Flag]:
     declared = {common_source(c.name) for c in constants if not c.unknown}
     both = ", ".join(name for name in prior.common if name in declared)
     every = np.ones(fitted.count, bool)
+    yield _remark(
+        "prior-aged", every & bool(prior.ageing), source=prior.source, ageing=prior.ageing
+    )
     yield _remark("prior-shared", every & bool(both), source=prior.source, both=both)
     only = np.array([", ".join(names) for names in _prior_only(fitted)])
     yield _remark("prior-only", only != "", source=prior.source, names=only)
