@@ -39,7 +39,8 @@ def cases() -> list[Case]:
         for shape in ("walk", "trend"):
             rows += [Case("field", size, shape, order) for size in (20, 40, 60)]
             rows += [Case("accelerometer", size, shape, order) for size in (0.1, 0.2, 0.3)]
-    return rows + [
+    return [
+        *rows,
         Case("field", 40, "walk", "one after the other", declared=True),
         Case("accelerometer", 0.2, "walk", "one after the other", declared=True),
     ]

@@ -67,11 +67,11 @@ REMARKS = {
     "the model is wrong. The uncertainty is scaled up as if each station had an error of its own; an error that "
     "stations share may be larger than it says.",
     "field-drift": "Readings follow the order of the stations as if the field drifted by {change:.2g} {unit} (1σ "
-    "{sd:.1g} {unit}) during the run. The fit allows for this drift, and the uncertainty includes it. Give ref_field_nt and ref_dip_deg of each station from a reference "
-    "magnetometer, or repeat the run at a quiet time.",
-    "offset-drift": "Readings follow the order of the stations as if the offsets of the {triad} drifted by {change:.2g} "
-    "{unit} (1σ {sd:.1g} {unit}) during the run. The fit allows for this drift, and the uncertainty includes it. Let the tool warm up, and change inclination and "
-    "azimuth in another order than from end to end.",
+    "{sd:.1g} {unit}) during the run. The fit allows for this drift, and the uncertainty includes it. Give "
+    "ref_field_nt and ref_dip_deg of each station from a reference magnetometer, or repeat the run at a quiet time.",
+    "offset-drift": "Readings follow the order of the stations as if the offsets of the {triad} drifted by "
+    "{change:.2g} {unit} (1σ {sd:.1g} {unit}) during the run. The fit allows for this drift, and the uncertainty "
+    "includes it. Let the tool warm up, and change inclination and azimuth in another order than from end to end.",
     "no-redundancy": "{triads}: no redundancy, so nothing in this run checks the fit. Add stations.",
     "few-degrees-of-freedom": "the {few}: another run like this one may state {share:.0f} % more or less (1σ), and an "
     "error of a single station is hard to see. Add stations.",
