@@ -419,7 +419,7 @@ def test_the_risk_of_the_customer_is_kept_by_the_guard_band():
     rng, limit, sd = np.random.default_rng(7), 0.1, 0.01
     true = rng.uniform(0.0, 0.2, 400_000)
     value = true + rng.normal(0, sd, true.size)
-    rule = decisions.Rule("guarded", "", 2.0, 2.0)
+    rule = decisions.Rule("guarded", "", 1.0, 2.0)
     edge = rule.decision(row(limit - 2 * sd - 1e-9))
     assert edge.passed
     near = np.abs(value - edge.quantity.value) < sd / 20
@@ -427,16 +427,27 @@ def test_the_risk_of_the_customer_is_kept_by_the_guard_band():
     assert np.mean(true[value <= limit - 2 * sd] > limit) < edge.risk
 
 
-def test_the_set_that_decides_is_the_worst_under_the_rule(servo):
-    sets = [
-        {"label": "A", "value": 0.09, "uncertainty": 0.001},
-        {"label": "B", "value": 0.08, "uncertainty": 0.02},
-    ]
-    both = [JudgedSet(**each, stations=[], coefficients=None, passed=True) for each in sets]
-    judged = replace(row(0.09, 0.001), sets=both)
-    assert decisions.Rule("simple", "", 0.0, 2.0).decision(judged).quantity.value == 0.09
-    guarded = decisions.Rule("guarded", "", 2.0, 2.0).decision(judged)
-    assert (guarded.quantity.value, guarded.passed, guarded.note) == (0.08, False, "B")
+def test_the_value_of_all_sets_together_decides(servo):
+    """The largest of three sets of 0.1 ± 0.01 is judged less what choosing it adds, not by that set alone."""
+    each = {"value": 0.101, "uncertainty": 0.01, "stations": [], "coefficients": None}
+    sets = [JudgedSet(label=label, passed=False, **each) for label in "ABC"]
+    judged = replace(row(0.093, 0.011), sets=sets, degrees_of_freedom=None)
+    assert decisions.Rule("simple", "", 0.0, 2.0).decision(judged).passed
+
+
+def test_few_degrees_of_freedom_widen_the_guard_band_the_coverage_and_the_risk(servo):
+    """Student's t of 3 degrees of freedom: 3.18 for 95 %, and beyond 1.638 lies a tenth (JCGM 100, table G.2)."""
+    judged = replace(row(0.1 - 1.638 * 0.01), degrees_of_freedom=3.0)
+    rule = decisions.rule_of(verification(servo, judged), 70.0, None)
+    assert rule.decision(judged).risk == pytest.approx(0.1, abs=1e-4)
+    assert rule.decision(judged).quantity.coverage_factor == pytest.approx(3.18, abs=0.005)
+    guarded = decisions.rule_of(
+        verification(servo, replace(judged, passed=False), rule="guarded"), 70.0, None
+    )
+    wide = guarded.decision(judged)
+    assert not wide.passed
+    edge = replace(judged, value=wide.acceptance_limit)
+    assert guarded.decision(edge).risk == pytest.approx(0.02275, abs=1e-5)
 
 
 def test_a_limit_that_cannot_be_judged_is_not_passed(servo):

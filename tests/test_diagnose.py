@@ -25,10 +25,17 @@ from simulation import Tool
 
 PLAN = simulate.grid([5, 45, 90, 135], 6, [0, 90, 180, 270], [20.0, 90.0])
 ROLL = simulate.grid([5, 45, 90], 4, [0, 120, 240], [90.0])
-NOISE = {
-    "accelerometer": np.full((ROLL.count, 3), 1e-4),
-    "magnetometer": np.full((ROLL.count, 3), 15.0),
-}
+SOAKS = simulate.grid([5, 45, 90], 4, [0, 120, 240], [30.0, 90.0])
+
+
+def noise(count):
+    return {
+        "accelerometer": np.full((count, 3), 1e-4),
+        "magnetometer": np.full((count, 3), 15.0),
+    }
+
+
+NOISE = noise(ROLL.count)
 ANGLES = ROLL.inclination, ROLL.azimuth, ROLL.toolface
 DIP = np.radians(63.0)
 
@@ -46,14 +53,14 @@ def tool(number):
     ), truth
 
 
-def later(number, seed=0, known=None, **fault):
+def later(number, seed=0, known=None, plan=ROLL, **fault):
     """A roll test of a tool that may be at fault."""
     _, truth = tool(number)
-    references = dict(zip(("inclination", "azimuth", "toolface"), ANGLES, strict=True))
-    references |= {"gravity": np.ones(ROLL.count), "field": np.full(ROLL.count, truth.field)}
-    references |= {"dip": np.full(ROLL.count, truth.dip)}
-    blank = np.zeros((ROLL.count, 3))
-    session = mwdcal.Readings(blank, blank, ROLL.temperature, references, NOISE)
+    references = {name: getattr(plan, name) for name in ("inclination", "azimuth", "toolface")}
+    references |= {"gravity": np.ones(plan.count), "field": np.full(plan.count, truth.field)}
+    references |= {"dip": np.full(plan.count, truth.dip)}
+    blank = np.zeros((plan.count, 3))
+    session = mwdcal.Readings(blank, blank, plan.temperature, references, noise(plan.count))
     rng, effects = np.random.default_rng([78, number, seed]), Effects(fault=FaultEffect(**fault))
     result = simulate.simulated(truth, session, rng, effects)
     kept = references if known is None else {name: references[name] for name in known}
@@ -63,22 +70,28 @@ def later(number, seed=0, known=None, **fault):
 # Physics
 
 
-def read(departures, raw, vectors, attitude, temperature):
-    """Readings of a tool of unit gains, with departures."""
+def read(departures, raw, vectors, attitude, temperature, gain=1.0):
+    """Readings of a tool with departures, whose channels have gains (6,) in their fields and no cross terms."""
     damage = Damage(departures, np.zeros(6, bool), np.zeros(6))
     field = physics.changed_field(damage, vectors[:, 3:], attitude)
     whole = np.concatenate([vectors[:, :3], field], -1)
-    return physics.changed_readings(damage, raw + whole - vectors, whole, temperature, 30.0)
+    return physics.changed_readings(
+        damage, raw + gain * (whole - vectors), whole, temperature, 30.0, gain
+    )
 
 
 def test_columns_are_derivatives_of_the_physics():
     vectors = np.concatenate(reference_vectors(*ANGLES, 1.0, 48_000.0, DIP), -1)
     attitude, raw = tool_from_earth(*ANGLES), 1.01 * vectors
-    warmth, gain = ROLL.temperature - 30.0, np.broadcast_to(np.eye(3), attitude.shape)
-    columns = physics.columns(raw, vectors, attitude, warmth, gain)
+    warmth, gain = ROLL.temperature - 30.0, np.array([1.02, 0.97, 1.1, 0.9, 1.05, 1.0])
+    gain, by_field = (
+        np.broadcast_to(gain, raw.shape),
+        np.broadcast_to(np.diag(gain[3:]), attitude.shape),
+    )
+    columns = physics.columns(raw, vectors, attitude, warmth, gain, by_field)
     for place in range(SIZE):
         step = 1e-6 * np.eye(SIZE)[place]
-        up, down = (read(s * step, raw, vectors, attitude, ROLL.temperature) for s in (1, -1))
+        up, down = (read(s * step, raw, vectors, attitude, ROLL.temperature, gain) for s in (1, -1))
         np.testing.assert_allclose((up - down) / 2e-6, columns[..., place], atol=2e-4, rtol=1e-6)
 
 
@@ -150,9 +163,13 @@ def test_the_evidence_is_that_of_a_normal_density():
         return multivariate_normal(cov=covariance / np.outer(scale, scale)).logpdf(difference)
 
     attitude = tool_from_earth(*ANGLES)
-    gain = np.linalg.inv(calibration.magnetometer.functions(30.0).slope(
-        np.array(calibration.magnetometer.parameters), mean[:, 3:], ROLL.temperature))  # fmt: skip
-    seen = physics.columns(mean, np.concatenate(vectors, -1), attitude, ROLL.temperature - 30, gain)
+    slopes = [
+        t.functions(30.0).slope(np.array(t.parameters), part, ROLL.temperature)
+        for t, part in zip(calibration.triads, np.split(mean, 2, -1), strict=True)
+    ]
+    gain = np.concatenate([1 / np.diagonal(s, axis1=-2, axis2=-1) for s in slopes], -1)
+    warmth, whole = ROLL.temperature - 30, np.concatenate(vectors, -1)
+    seen = physics.columns(mean, whole, attitude, warmth, gain, np.linalg.inv(slopes[1]))
     for form, evidence in zip(forms, best.evidence - none.evidence, strict=True):
         change = (seen @ form.mixing).reshape(-1, form.mixing.shape[1])
         expected = density(sound + change @ change.T) - density(sound)
@@ -175,7 +192,8 @@ def test_a_sound_tool_gives_an_alarm_no_more_often_than_stated():
 def test_faults_of_the_usual_size_are_named(kind):
     named, scores = [], []
     for number in range(6):
-        readings, damage = later(number, kind=kind, reading=0.2)
+        plan = SOAKS if kind == "heat" else ROLL  # one temperature shows no heat
+        readings, damage = later(number, plan=plan, kind=kind, reading=0.2)
         result = diagnose(tool(number)[0], readings, draws=199)
         named.append(result.fault)
         if kind in ("magnetised", "casing") and result.fault == kind:
@@ -209,18 +227,49 @@ def test_a_dead_channel_is_named_without_references_too():
         assert result.size == pytest.approx(12_345.0, abs=5 * result.size_uncertainty)
 
 
-def test_iron_and_a_bias_of_the_axial_channel_are_alike_in_principle():
-    """A field along the tool axis is a bias of mz at any attitude: their columns have one direction."""
-    calibration, truth = tool(3)
-    readings, _ = later(3)
-    gain = np.linalg.inv(truth.triads["magnetometer"][0].slope(truth.magnetometer, readings.magnetometer,
-                                                                ROLL.temperature))  # fmt: skip
-    moved = readings.magnetometer + gain @ np.array([0.0, 0.0, 200.0])
-    result = diagnose(calibration, replace(readings, magnetometer=moved))
-    assert result.fault == "magnetised"
-    assert result.confounded_with == ["impact"]
-    assert "collar" in result.tell_apart[0].reading
-    assert result.size == pytest.approx(200.0, abs=4 * result.size_uncertainty)
+def interfered(number, field, known=None, seed=0):
+    """A roll test of a sound tool in a field (3,) that is fixed in it, nT."""
+    _, truth = tool(number)
+    readings, _ = later(number, seed, known)
+    model = truth.triads["magnetometer"][0]
+    slope = model.slope(truth.magnetometer, readings.magnetometer, ROLL.temperature)
+    moved = readings.magnetometer + np.linalg.solve(slope, np.array(field, float))
+    return replace(readings, magnetometer=moved)
+
+
+@pytest.mark.parametrize("size", [-150.0, 800.0, 2000.0])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("known", [None, ("field", "dip")])
+def test_interference_of_the_string_and_a_bias_are_one_thing_at_any_attitude(axis, size, known):
+    """A field along a tool axis is a bias of that channel: both are reported, the one that condemns no sensor first,
+    each with the true size; and no attitude tells them apart, only the tool without its string."""
+    result = diagnose(tool(3)[0], interfered(3, size * np.eye(3)[axis], known, axis))
+    assert (result.fault, result.confounded_with) == ("magnetised", ["impact"])
+    (rival,) = result.rivals
+    assert (rival.fault, rival.channel) == ("impact", ("mx", "my", "mz")[axis])
+    assert "without string" in result.tell_apart[0].reading
+    for each in (result, rival):
+        assert each.size == pytest.approx(size, abs=4 * each.size_uncertainty)
+    assert result.surveys == (known is not None)
+
+
+def test_a_sensor_whose_axis_turned_is_no_interference():
+    """The shift turns with the field: no constant in the tool, however large, explains it."""
+    readings = interfered(3, (0.0, 0.0, 300.0))
+    field = reference_vectors(*ANGLES, 1.0, 48_000.0, DIP)[1]
+    knocked = readings.magnetometer + 4e-3 * field[:, :1] * np.array([0.0, 0.0, 1.0])
+    result = diagnose(tool(3)[0], replace(readings, magnetometer=knocked))
+    assert (result.fault, result.channel, result.confounded_with) == ("impact", "mz", [])
+
+
+def test_one_temperature_shows_no_heat():
+    """Bias and scale of every channel moved: at one temperature that is not heat, at two it is."""
+    one = diagnose(tool(0)[0], later(0, kind="heat")[0])
+    assert one.fault != "heat"
+    assert one.likelihoods["heat"] == 0
+    assert "heat" in one.unseen
+    assert {"one-temperature", "unexplained"} <= {finding.id for finding in one.findings}
+    assert diagnose(tool(0)[0], later(0, plan=SOAKS, kind="heat")[0]).fault == "heat"
 
 
 # Readings that say little
@@ -240,7 +289,7 @@ def test_an_accelerometer_alone_and_no_temperature():
     result = diagnose(tool(4)[0], replace(readings, magnetometer=None))
     assert (result.fault, result.channel) == ("impact", "ax")
     assert "no-magnetometer" in {finding.id for finding in result.findings}
-    assert result.likelihoods["casing"] == result.likelihoods[NONE]
+    assert result.likelihoods["casing"] == 0  # an accelerometer says nothing of it: no candidate
     with pytest.raises(mwdcal.InputError, match="temperature_c"):
         diagnose(tool(4)[0], replace(readings, temperature=None))
 
@@ -297,6 +346,25 @@ def test_the_command_names_a_fault_in_raw_units(files, tmp_path):
     assert command("diagnose", files / "tool.json", tmp_path / "knocked.csv").out.startswith(
         "impact on channel ay: bias moved by "
     )
+
+
+def test_the_command_condemns_no_tool_for_interference_of_its_string(files, tmp_path):
+    """Surveys in a hole, no attitude known: a constant of mz is interference or a bias."""
+    columns = read_csv(files / "demo" / "rolltest.csv")
+    columns["mz"] = [float(value) + 0.04 for value in columns["mz"]]  # 800 nT at 5e-5 V/nT
+    surveys = {
+        k: v for k, v in columns.items() if not k.startswith(("ref_inc", "ref_azi", "ref_too"))
+    }
+    for name, table, step in (
+        ("stand.csv", columns, "without string"),
+        ("well.csv", surveys, "--msa"),
+    ):
+        write_csv(tmp_path / name, table)
+        out = command("diagnose", files / "tool.json", tmp_path / name).out
+        assert out.startswith("cannot tell magnetised: field along z moved by ")
+        assert " from impact on channel mz: bias moved by " in out
+        assert "do not use" not in out
+        assert step in out[out.index("next: ") :]
 
 
 def test_the_command_refuses_what_says_nothing(files, tmp_path):
@@ -371,8 +439,11 @@ def test_a_run_of_the_tests_own_model_is_still_fine(tmp_path):
     fit = ("calibrate", tmp_path / "run.csv", "--tool", "servo", "-o", tmp_path / "cal.json")
     assert command(*fit).code == 0
     ran = command("diagnose", tmp_path / "cal.json", tmp_path / "later.csv")
-    assert (ran.code, ran.err) == (0, "")
+    assert (ran.code, ran.err.count("!")) == (0, 1)
+    assert ran.err.startswith("! all readings are at one temperature: ")
     write_csv(tmp_path / "other.csv", servo_run(2, (30, 80), 6))
     ran = command("diagnose", tmp_path / "cal.json", tmp_path / "other.csv")
     assert ran.code == 1
+    assert ran.out.startswith("no single fault explains these readings; closest: ")
+    assert "do not use" not in ran.out
     assert "no single fault explains" in ran.err

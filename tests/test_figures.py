@@ -340,11 +340,11 @@ def test_a_spread_lies_about_the_middle_of_its_curve():
         assert each.value == pytest.approx(np.ptp(values), abs=2 * each.uncertainty)
 
 
-def test_the_row_is_its_worst_set():
+def test_the_row_is_its_worst_set_less_what_choosing_it_adds():
+    """At most 1.27 σ, for six alike; next to nothing where one stands out."""
     for row in verdict("sets", 0.005).rows:
         worst = max(row.sets, key=lambda each: each.value)
-        assert (row.value, row.uncertainty) == (worst.value, worst.uncertainty)
-        assert row.passed == all(each.passed for each in row.sets)
+        assert 0 <= worst.value - row.value < 1.3 * worst.uncertainty
 
 
 @pytest.mark.usefixtures("without_pictures")
@@ -379,7 +379,8 @@ def test_stations_outside_of_roll_sets_are_drawn_without_a_curve():
         (only,) = row.sets
         assert (only.label, only.coefficients, len(only.stations)) == ("", None, 12)
         departures = [abs(station.departures[row.name]) for station in result.station_rows]
-        assert row.value == pytest.approx(max(departures))
+        assert only.value == pytest.approx(max(departures))
+        assert row.value < only.value  # the largest of twelve is too large by what noise adds
     figure = result.plot.toolface()
     assert "stations outside of roll sets" in curves(figure.axes[0])
 

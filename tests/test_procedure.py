@@ -13,7 +13,7 @@ from scipy import stats
 
 import mwdcal
 from cli_support import mwdcal as command
-from cli_support import process, refused
+from cli_support import process, refused, write_csv
 from mwdcal.calibration.options import Options
 from mwdcal.files.limits import load_limits
 from mwdcal.files.profiles import load_profile
@@ -286,13 +286,17 @@ def test_one_tool_again_and_again(tmp_path):
     [
         (("--truth", "t.json"), "the table holds what is true of each tool", 2),
         (("--rolltest", "seven"), "plan must be a built-in name", 2),
-        (("--rolltest", "six-state"), "cannot be passed", 2),
+        (("--rolltest", "still.csv"), "cannot be passed", 2),
         (("--limits", "none"), "limits profile must be a built-in name", 2),
         (("--method", "newton", "--plan", "moosavi-12"), "leaves a direction undetermined", 3),
         (("--order", "3"), "", 3),
     ],
 )
 def test_bad_procedures_end_in_a_sentence(tmp_path, options, word, code):
+    still = {"inclination": 45, "azimuth": 60, "toolface": 40}
+    columns = {f"ref_{name}_deg": np.full(6, value) for name, value in still.items()}
+    write_csv(tmp_path / "still.csv", columns)
+    options = [tmp_path / each if each == "still.csv" else each for each in options]
     ran, output = repeat(tmp_path, "a", *options, "--workers", 1)
     assert word in refused(ran, code)
     assert not output.exists()

@@ -340,8 +340,9 @@ def test_uncertainties_without_any_weight_are_refused(record, kind):
     """Settings of the stand so uncertain that their weights are zero: no curve, and no verdict."""
     sd = {**NOISE, "inclination": np.full(12, 1e200)}
     limits = Limits(name="i", **{kind: Bounds(inclination_deg=0.1)})
+    run = msgspec_replace(roll(45, sd=sd), settings="per-station")
     with pytest.raises(InputError, match=r"roll.csv: .* too far apart to judge its inclination"):
-        verify(record, roll(45, sd=sd), limits)
+        verify(record, run, limits)
 
 
 @pytest.mark.parametrize("ratio", [1e2, 1e3, 1e7, 1e9])
@@ -353,7 +354,7 @@ def test_uncertainties_too_far_apart_are_refused_and_others_judged(record, ratio
     sd = {**NOISE, "inclination": np.where(np.arange(12) % 3 == 0, 1.0, ratio) * 1e-4}
     limits = Limits(name="i", error=Bounds(inclination_deg=0.1))
     known = {**roll(45).known, "inclination": np.full(12, 45 * DEG)}
-    run = msgspec_replace(roll(45, sd=sd), known=known)
+    run = msgspec_replace(roll(45, sd=sd), known=known, settings="per-station")
     if ratio > 1e4:
         with pytest.raises(InputError, match="too far apart to judge its inclination"):
             verify(record, run, limits)
@@ -411,3 +412,121 @@ def test_common_errors_of_the_stand_count_in_errors_and_not_in_spreads(record):
         before = plain[f"error of {name}"].uncertainty
         after = shared[f"error of {name}"].uncertainty
         assert after == pytest.approx((before**2 + added) ** 0.5, rel=5e-3)
+
+
+# ------------------------------------------------------------------ settings, sets and degrees of freedom
+
+STAND = {"inclination": np.full(12, 0.1 * DEG), "azimuth": np.full(12, 0.3 * DEG)}
+ERRORS = Limits(name="errors", error=Bounds(inclination_deg=0.25, azimuth_deg=2))
+
+
+@pytest.mark.parametrize(
+    ("settings", "group", "share"),
+    [
+        ("", None, 1),
+        ("per-direction", None, 1),
+        ("per-station", None, 12),
+        ("", np.zeros(12, int), 1),
+    ],
+)
+def test_the_error_of_a_setting_does_not_average_down(record, settings, group, share):
+    """1σ of an error: √(σ²/share + noise), the noise of a mean and harmonics being small beside 0.1°."""
+    run = msgspec_replace(roll(45, sd={**NOISE, **STAND}), settings=settings, group=group)
+    result = verify(record, run, ERRORS)
+    for name, sd in (("inclination", 0.1), ("azimuth", 0.3)):
+        row = rows_of(result)[f"error of {name}"]
+        if share == 1:
+            assert row.uncertainty == pytest.approx(sd, rel=0.05)
+        else:  # the farthest point of a curve of which the mean has σ/√12, each part of a harmonic √2 times that
+            part = sd / np.sqrt(12) * np.random.default_rng(1).normal(size=(2000, 5))
+            turn = plan((45,), 180)[2]
+            waves = np.stack([f(k * turn) for k in (1, 2) for f in (np.cos, np.sin)])
+            farthest = np.abs(part[:, :1] + np.sqrt(2) * part[:, 1:] @ waves).max(-1)
+            assert sd / np.sqrt(12) < row.uncertainty < 1.05 * np.sqrt(np.mean(farthest**2))
+    assert result.settings == (settings or ("assumed" if group is None else ""))
+
+
+def test_a_direction_set_twice_has_two_settings(record):
+    """Two passes over one direction, another in between: the mean has σ/√2 of the setting."""
+    first = roll(45, sd={**NOISE, **STAND})
+    parts = [first, roll(60, 3, sd={**NOISE, **STAND}), roll(45, 5, sd={**NOISE, **STAND})]
+    known = {k: np.concatenate([each.known[k] for each in parts]) for k in first.known}
+    run = Readings(
+        np.concatenate([each.accelerometer for each in parts]),
+        np.concatenate([each.magnetometer for each in parts]),
+        known=known,
+        sd={**NOISE, "inclination": np.full(36, 0.1 * DEG)},
+        source="roll.csv",
+        settings="per-direction",
+    )
+    limits = Limits(name="errors", error=Bounds(inclination_deg=0.25))
+    (row,) = verify(record, run, limits).rows
+    by_label = {each.label.partition(",")[0]: each for each in row.sets}
+    assert by_label["inclination 45°"].uncertainty == pytest.approx(0.1 / np.sqrt(2), rel=0.1)
+    assert by_label["inclination 60°"].uncertainty == pytest.approx(0.1, rel=0.05)
+
+
+def test_a_scatter_that_contradicts_one_setting_is_named_and_counted(record):
+    """Each station set anew by a stand of 0.1°, and nobody says so."""
+    rng = np.random.default_rng(1)
+    inclination = (45 + 0.1 * rng.normal(size=12)) * DEG
+    face = plan((45,))[2]
+    a, m = Tool.random(7).readings(rng, 1, inclination, np.full(12, 1.0), face)
+    known = {"inclination": np.full(12, 45 * DEG), "azimuth": np.full(12, 1.0), "toolface": face}
+    run = Readings(a[0], m[0], known=known, sd={**NOISE, **STAND}, source="roll.csv")
+    result = verify(record, run, BOTH)
+    assert "settings-doubted" in ids(result)
+    assert "raw figure judged" not in rows_of(result)["spread of inclination"].note
+    once = verify(record, msgspec_replace(run, settings="per-direction"), BOTH)
+    assert "raw figure judged" in rows_of(once)["spread of inclination"].note
+    apart = verify(record, msgspec_replace(run, settings="per-station"), BOTH)
+    assert "settings-doubted" not in ids(apart)
+    single, both = (rows_of(each)["error of inclination"].uncertainty for each in (apart, result))
+    assert single < both
+
+
+def several(count, seed, size, record, toolfaces=12, sd=NOISE):
+    """Roll sets of one direction at 45°, each a group, of a tool knocked across its axis: a run."""
+    face = np.tile(np.arange(toolfaces) * 360 / toolfaces, count) * DEG
+    inc, azi = np.full(len(face), 45 * DEG), np.full(len(face), 1.0)
+    tool = knocked(size, 0.0)
+    a, m = tool.readings(np.random.default_rng(seed), 1, inc, azi, face)
+    group = np.repeat(np.arange(count), toolfaces)
+    return Readings(a[0], m[0], known={}, sd=sd, source="roll.csv", group=group)
+
+
+def test_equal_sets_at_the_limit_pass_in_half_of_the_tests(record):
+    """The limit is the true spread, by 360 toolfaces. By the largest set alone one in 64 would pass."""
+    quiet = several(1, 0, 8.0, record, 360)
+    true = rows_of(verify(record, quiet, SPREADS))["spread of inclination"].value
+    limits = Limits(name="i", spread=Bounds(inclination_deg=true))
+    verdicts = [verify(record, several(6, seed, 8.0, record), limits) for seed in range(60)]
+    passed = np.mean([each.passed for each in verdicts])
+    assert 0.25 < passed < 0.75
+    assert 0.15 < np.mean([each.risk for each in verdicts]) < 0.4
+    (row,) = verdicts[0].rows
+    assert row.value < max(each.value for each in row.sets)
+    assert "the largest of 6 roll sets" in row.note
+    again = verify(record, several(6, 0, 8.0, record), limits)
+    assert again == verdicts[0]
+
+
+def test_four_toolfaces_are_judged_by_a_mean_and_one_harmonic(record):
+    run = roll(45, tool=knocked(8.0, 0.0), toolfaces=np.arange(4) * 90 + 20)
+    result = verify(record, run, SPREADS)
+    row = rows_of(result)["spread of inclination"]
+    # 8 mg across the axis at 45°: an amplitude of 8e-3 cos 45° rad, twice that from end to end
+    assert row.value == pytest.approx(np.degrees(2 * 8e-3 * np.cos(45 * DEG)), abs=0.05)
+    assert "harmonic-unseen" in ids(result)
+    assert row.sets[0].harmonics == 1
+    assert row.sets[0].coefficients[2] == row.sets[0].coefficients[4] == 0
+
+
+def test_an_estimated_noise_has_degrees_of_freedom_and_its_risk_is_never_certain(record):
+    """Six toolfaces, noise not declared: those of the calibration and one for each curve."""
+    bare = calibrate(msgspec_replace(make(), sd={}), PROFILE)
+    run = roll(45, toolfaces=np.arange(6) * 60)
+    undeclared = msgspec_replace(run, sd={})
+    row = rows_of(verify(bare, undeclared, SPREADS))["spread of inclination"]
+    assert row.degrees_of_freedom == pytest.approx(bare.accelerometer.degrees_of_freedom + 1)
+    assert rows_of(verify(record, run, SPREADS))["spread of inclination"].degrees_of_freedom is None

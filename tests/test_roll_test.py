@@ -3,7 +3,17 @@
 import numpy as np
 import pytest
 
-from mwdcal.use.roll_test import Curve, coverage, ends, extent, fitted
+from mwdcal.use.roll_test import (
+    Curve,
+    coverage,
+    drawn,
+    ends,
+    extent,
+    figure,
+    fitted,
+    largest,
+    scatter,
+)
 from simulation import DEG
 
 TWELVE = np.arange(12) * 30 * DEG
@@ -82,32 +92,36 @@ def test_harmonics_and_ends_of_a_known_curve():
 
 
 LAYOUTS = {
-    "twelve": (np.arange(12) * 30, True),
-    "eight": (np.arange(8) * 45, True),
-    "five": (np.arange(5) * 72, True),
-    "twelve without two neighbours": (np.arange(10) * 30, True),
-    "twelve without three neighbours": (np.arange(9) * 30, False),
-    "half a circle": (np.arange(12) * 15, False),
-    "four at right angles, three times": (np.tile(np.arange(4) * 90, 3), False),
-    "the same, set by hand": (np.tile(np.arange(4) * 90, 3) + np.arange(12) % 5 - 2, False),
-    "three, four times": (np.tile(np.arange(3) * 120, 4), False),
-    "one": (np.full(12, 40), False),
-    "three close ones": (np.array([0, 5, 10]), False),
+    "twelve": (np.arange(12) * 30, 2),
+    "eight": (np.arange(8) * 45, 2),
+    "five": (np.arange(5) * 72, 2),
+    "twelve without two neighbours": (np.arange(10) * 30, 2),
+    "twelve without three neighbours": (np.arange(9) * 30, 0),
+    "half a circle": (np.arange(12) * 15, 0),
+    "four at right angles": (np.arange(4) * 90, 1),
+    "four at right angles, three times": (np.tile(np.arange(4) * 90, 3), 1),
+    "the same, set by hand": (np.tile(np.arange(4) * 90, 3) + np.arange(12) % 5 - 2, 1),
+    "three of four": (np.arange(3) * 90, 0),
+    "three": (np.arange(3) * 120, 0),
+    "three, four times": (np.tile(np.arange(3) * 120, 4), 0),
+    "one": (np.full(12, 40), 0),
+    "three close ones": (np.array([0, 5, 10]), 0),
 }
 
 
-@pytest.mark.parametrize(("toolface", "rolled"), LAYOUTS.values(), ids=LAYOUTS)
-def test_which_toolfaces_are_a_roll_test(toolface, rolled):
+@pytest.mark.parametrize(("toolface", "harmonics"), LAYOUTS.values(), ids=LAYOUTS)
+def test_which_toolfaces_are_a_roll_test(toolface, harmonics):
     turned = np.mod(toolface + 123.0, 360)
     for angles in (toolface * DEG, np.stack([toolface, turned[::-1]]) * DEG):
-        assert np.all(coverage(angles).rolled == rolled)
+        assert np.all(coverage(angles).harmonics == harmonics)
+        assert np.all(coverage(angles).rolled == (harmonics > 0))
 
 
 @pytest.mark.parametrize("count", [5, 6, 8, 12])
-def test_equal_steps_carry_the_noise_of_five_parameters(count):
-    """An orthogonal design of n readings knows every point of a curve of 5 terms to σ √(5/n)."""
+def test_equal_steps_carry_the_noise_of_their_parameters(count):
+    """An orthogonal design of n readings knows every point of a curve of k terms to σ √(k/n)."""
     found = coverage(np.arange(count) * 2 * np.pi / count)
-    assert found.carried == pytest.approx(np.sqrt(5 / count))
+    assert found.carried == pytest.approx([np.sqrt(3 / count), np.sqrt(5 / count)])
     assert found.gap == pytest.approx(2 * np.pi / count)
 
 
@@ -125,16 +139,16 @@ def test_how_much_of_a_harmonic_the_toolfaces_show(count, seen):
 def test_a_station_that_moved_is_not_smoothed_away():
     rng = np.random.default_rng(4)
     value, curve = rolls(rng, 1000, 0.08, 0.01)
-    assert curve.rough.mean() < 0.005
+    assert curve.rough().mean() < 0.005
     value[:, 5] += 0.1
     shape = np.full(value.shape, 0.01), np.broadcast_to(TWELVE, value.shape)
-    assert fitted(value, *shape).rough.mean() > 0.95
+    assert fitted(value, *shape).rough().mean() > 0.95
 
 
 def test_overstated_noise_does_not_shrink_a_spread():
     """A true spread of 0.12 with noise of 0.005, stated as 0.05: it stays over a limit of 0.1."""
     _, curve = rolls(np.random.default_rng(5), 1000, 0.12, 0.005, stated=0.05)
-    assert curve.calm.mean() > 0.99
+    assert scatter([curve]).calm.mean() > 0.99
     assert (extent(curve).range > 0.1).mean() > 0.98
 
 
@@ -144,3 +158,89 @@ def test_a_curve_without_a_covariance_has_no_range():
     curve = Curve(coefficients=np.zeros(5), covariance=nothing, square=np.array(0.0), freedom=7)
     with np.errstate(invalid="ignore"):
         assert np.isnan(extent(curve).range_sd)
+
+
+FOUR = np.arange(4) * 90 * DEG
+
+
+def test_four_toolfaces_give_the_mean_and_first_harmonic_whatever_the_second():
+    value = 0.3 + 0.2 * np.cos(FOUR - 1.0) + 0.05 * np.sin(2 * FOUR + 0.4)
+    curve = fitted(value, np.full(4, 0.01), FOUR, harmonics=1)
+    assert curve.amplitudes == pytest.approx([0.2, 0.0])
+    assert curve.coefficients[0] == pytest.approx(0.3)
+    assert curve.freedom == 1
+    # an orthogonal design of four: σ²/4 of the mean, σ²/2 of each part of the harmonic
+    assert np.diagonal(curve.covariance) == pytest.approx([2.5e-5, 5e-5, 0, 5e-5, 0])
+    assert curve.square == pytest.approx((0.05 * np.sin(0.4)) ** 2 * 4 / 0.01**2)
+
+
+def test_a_few_small_residuals_never_replace_a_stated_noise():
+    """Six toolfaces, one degree of freedom: whatever is left, the 1σ is that of the declared noise."""
+    rng = np.random.default_rng(6)
+    six = np.arange(6) * 60 * DEG
+    _, curve = rolls(rng, 3000, 0.1, 0.02, toolface=six)
+    noise = scatter([curve])
+    assert noise.scale == pytest.approx(1.0)
+    found = extent(curve, noise)
+    assert found.range_sd.min() > 0.6 * np.median(found.range_sd)
+
+
+def test_an_estimated_noise_is_pooled_by_degrees_of_freedom():
+    """10 of the calibration, and residuals of two curves: (10 + χ²) / (10 + ν), with ν more degrees of freedom."""
+    value = np.zeros(12)
+    value[::2] = 0.02
+    curve = fitted(value, np.full(12, 0.01), TWELVE)
+    noise = scatter([curve, curve], 10.0)
+    left = value - 0.01  # an alternation that no harmonic takes
+    square = np.sum((left / 0.01) ** 2)
+    assert noise.freedom == 24
+    assert noise.scale == pytest.approx(np.sqrt((10 + 2 * square) / 24))
+
+
+def test_residuals_against_a_noise_of_few_degrees_of_freedom_follow_fisher():
+    """F of 1 and 3 degrees of freedom: beyond 10.13 lies 5 %, beyond 167.03 a thousandth (tables)."""
+    curve = Curve(np.zeros(5), np.eye(5), np.array([160.0, 175.0, 11.0]), 1)
+    assert curve.rough(3.0).tolist() == [False, True, False]
+    assert curve.rough().tolist() == [True, True, True]
+
+
+@pytest.mark.parametrize("count", [2, 3, 6])
+def test_the_largest_of_equal_figures_has_little_bias_left(count):
+    """The largest of k normal values lies 0.56, 0.85, 1.27 σ above their common mean (d2 / 2 and so on)."""
+    rng = np.random.default_rng(7)
+    value = 1 + 0.05 * rng.normal(size=(1500, count))
+    half = rng.normal(size=(300, count))
+    errors = 0.05 * np.broadcast_to(np.concatenate([half, -half]), (1500, 600, count))
+    found = largest(value, np.full(value.shape, 0.05), errors)
+    bias = {2: 0.56, 3: 0.85, 6: 1.27}[count]
+    assert (value.max(-1).mean() - 1) / 0.05 == pytest.approx(bias, abs=0.06)
+    assert abs(found.value.mean() - 1) < 0.25 * bias * 0.05 + 0.003
+    assert 0.38 < (found.value <= 1).mean() < 0.55
+    departure = (found.value - 1) / found.uncertainty
+    assert 0.85 < np.sqrt(np.mean(departure**2)) < 1.15
+
+
+def test_the_largest_of_figures_far_apart_is_the_largest():
+    rng = np.random.default_rng(8)
+    errors = 0.01 * rng.normal(size=(1000, 3))
+    found = largest(np.array([0.5, 1.0, 0.2]), np.full(3, 0.01), errors - errors.mean(0))
+    assert found.value == pytest.approx(1.0, abs=1e-3)
+    assert found.uncertainty == pytest.approx(0.01, rel=0.1)
+    assert found.place == 1
+
+
+def test_stations_of_one_setting_share_its_error():
+    """Two passes of twelve, each set once: the mean has half the variance of a setting, and σ²/24 of noise."""
+    toolface, number = np.tile(TWELVE, 2), np.repeat([0, 1], 12)
+    shared = 0.1**2 * (number[:, None] == number)
+    curve = fitted(np.zeros(24), np.full(24, 0.01), toolface, shared=shared)
+    assert curve.covariance[0, 0] == pytest.approx(0.1**2 / 2 + 0.01**2 / 24, rel=1e-6)
+    assert curve.covariance[1, 1] == pytest.approx(0.01**2 / 12, rel=1e-6)
+
+
+def test_what_is_off_in_tests_like_this_one_has_the_stated_size():
+    value = 0.1 * np.cos(TWELVE)
+    curve = fitted(value, np.full(12, 0.005), TWELVE)
+    one = figure(value, curve, scatter([curve]), error=False, moved=drawn(curve, "inclination", 3))
+    assert one.errors.mean() == pytest.approx(0, abs=1e-12)
+    assert one.errors.std() == pytest.approx(one.uncertainty, rel=0.05)

@@ -156,8 +156,9 @@ def main() -> None:
     count = parser.parse_args().count
     rng = np.random.default_rng(20261124)
     first = [calibrated(rng) for _ in range(10)]
+    error = world.percent(np.sqrt(RISK * (1 - RISK) / count))
     heads = ["walk a year", "histories", "days to due, median", *LIMITS, "any limit"]
-    parts = [HEAD.format(risk=world.percent(RISK), **LIMITS)]
+    parts = [HEAD.format(risk=world.percent(RISK), count=count, error=error, **LIMITS)]
     for calibrations in COUNTS:
         rates = [rate for rate in RATES for _ in range(count)]
         histories = [
@@ -179,7 +180,8 @@ HEAD = """Stated: on the day that is given as due a tool is beyond its limit wit
 Measured: the share of tools whose largest error over azimuth and toolface, at 45° inclination, exceeds the limit on
 that day ({inclination}° in inclination, {azimuth}° in azimuth). σ is the standard uncertainty of the parameters of a
 kind in one calibration. Tools that are good for five years and more are due after five. Each history counts twice:
-with no other tool of its type to learn the walk from, and among tools that walk at all of these rates.
+with no other tool of its type to learn the walk from, and among tools that walk at all of these rates. Where the true
+risk is 5 %, a share of {count} histories has a standard error of {error}.
 """
 
 

@@ -22,6 +22,7 @@ from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import centred, reference_vectors
 from mwdcal.planning.simulate import grid, run, servo
 from mwdcal.sensor.profile import Profile
+from mwdcal.survey.acceptance import SensorTerms
 from mwdcal.survey.multistation.interference_estimate import Assumed, estimate
 
 FIELD, DIP = 50_000.0, np.radians(65.0)
@@ -101,7 +102,7 @@ def surveyed(
 def statistics(record: Calibration, hole: Hole) -> str:
     """One row of the table: errors before and after, coverage, and how many wells are refused."""
     readings = surveyed(record, hole, SEEDS, IRON)
-    whole = estimate(record, readings, Assumed(robust=None))
+    whole = estimate(record, readings, Assumed(drift=SensorTerms(), robust=None))
     azimuth, truth = OBSERVABLES["azimuth"].value, attitudes(hole)[1]
     g, b = whole.result.problem.fields(whole.result.state)
     before, after = (centred(azimuth(*pair) - truth) for pair in (record.fields(readings), (g, b)))
@@ -126,7 +127,11 @@ def left_in_azimuth(record: Calibration, inclination: float, azimuth: float) -> 
     """1σ of azimuth by what interference is left, degrees, for 30 surveys at one attitude and all toolfaces."""
     hole = Hole((inclination, inclination), (azimuth, azimuth))
     readings = surveyed(record, hole, 1, np.zeros(3), off=0.0)
-    return float(np.degrees(estimate(record, readings, Assumed(robust=None)).azimuth_sd.max()))
+    return float(
+        np.degrees(
+            estimate(record, readings, Assumed(drift=SensorTerms(), robust=None)).azimuth_sd.max()
+        )
+    )
 
 
 def main() -> None:

@@ -22,6 +22,8 @@ STATED_ANGLES = ("inclination", "toolface", "azimuth")
 """Angles whose accuracy is stated; the first two need no magnetometer."""
 TWELFTHS = np.arange(12) * np.pi / 6
 """Azimuths, and toolfaces, over which an uncertainty is averaged (root mean square)."""
+LATTICE = (89, 55)
+"""Numbers of Fibonacci: so many azimuths, and by how many times each the toolface, that cover both evenly."""
 TYPICAL = float(np.radians(45))
 """The inclination that stands for a tool's accuracy where one number must do."""
 UNKNOWN_GRAVITY = 0.0015
@@ -148,11 +150,10 @@ class CalibratedTools:
 
 
 def _gradients(
-    earth: Array, triads: int, inclination: float, azimuths: Array = TWELFTHS
+    earth: Array, triads: int, inclination: float, azimuth: Array, toolface: Array
 ) -> tuple[tuple[Array, Array], Array, dict[str, Array]]:
-    """Fields (E, a, 3) of both triads at azimuths and all toolfaces, those of `triads`, and gradients by angle."""
-    grid = np.meshgrid([inclination], azimuths, TWELFTHS, indexing="ij")
-    attitudes = [angle.reshape(1, -1) for angle in grid]
+    """Fields (E, a, 3) of both triads at attitudes (a,), those of `triads`, and gradients by angle."""
+    attitudes = (np.full((1, len(azimuth)), inclination), azimuth[None], toolface[None])
     both = reference_vectors(*attitudes, *(earth[:, i, None] for i in range(3)))
     vectors = np.stack(both[:triads], -2)
     gradients = {
@@ -163,12 +164,14 @@ def _gradients(
 
 
 def angle_changes(tools: CalibratedTools, inclination: float = TYPICAL) -> dict[str, Array]:
-    """Change (B, a, p) of each angle by all parameters, radians, at an inclination and a = 48 attitudes.
+    """Change (B, a, p) of each angle by all parameters, radians, at an inclination and a = 89 attitudes.
 
-    North, east, south and west, each with twelve toolfaces. Singular: NaN at exactly vertical for toolface and
-    azimuth.
+    These cover azimuth and toolface evenly (`LATTICE`). Singular: NaN at exactly vertical for toolface and azimuth.
     """
-    both, _, gradients = _gradients(tools.earth, len(tools.models), inclination, TWELFTHS[::3])
+    turns = 2 * np.pi * np.arange(LATTICE[0]) / LATTICE[0]
+    both, _, gradients = _gradients(
+        tools.earth, len(tools.models), inclination, turns, turns * LATTICE[1]
+    )
     change = tools.changes(both, noise=False)
     return {n: np.einsum("bati,btaip->bap", g, change) for n, g in gradients.items()}
 
@@ -188,7 +191,8 @@ def accuracy(
     curved = any(model.curved for model in tools.models)
     if not curved:
         earth, number = np.unique(earth, axis=0, return_inverse=True)
-    both, vectors, gradients = _gradients(earth, len(tools.models), inclination)
+    azimuth, toolface = (turn.ravel() for turn in np.meshgrid(TWELFTHS, TWELFTHS, indexing="ij"))
+    both, vectors, gradients = _gradients(earth, len(tools.models), inclination, azimuth, toolface)
     free = tools.free
     if noise:
         covariance, free = _with_noise(covariance, free, 3 * len(tools.models))

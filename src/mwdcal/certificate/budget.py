@@ -66,7 +66,8 @@ def budget(calibration: Calibration) -> Budget:
         **sums,
     )
     grown = {key: None if sd is None else largest * sd for key, sd in sums.items()}
-    basis = f"k = {largest:.3g}, {PROBABILITY:.0%}"
+    freedom = min(calibration.effective_freedom(name) for name in names)
+    basis = f"k = {largest:.3g}, {PROBABILITY:.0%}, {freedom:.3g} degrees of freedom"
     expanded = BudgetLine(
         id="expanded", source="expanded uncertainty", kind="B", basis=basis, **grown
     )

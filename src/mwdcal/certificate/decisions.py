@@ -7,20 +7,23 @@ Reference: JCGM 106:2012, 7 and 8; ILAC-G8:09/2019, 4.2 and 5.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
+
+from msgspec import UNSET
 
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.certificate.document import ConformityTest, LimitDecision, Quantity
 from mwdcal.certificate.laboratory import DecisionRule
 from mwdcal.files.documents import Verification
 from mwdcal.geometry.vectors import Array, ArrayLike
+from mwdcal.use.risk import COVERAGE, probability_within
 from mwdcal.use.verification import (
-    COVERAGE,
     RULES,
-    SPREAD_OF,
+    SETTING_PRACTICES,
     VerdictRow,
     fewest_degrees_of_freedom,
+    guard,
 )
 
 When: TypeAlias = Literal["as found", "as left"]
@@ -49,64 +52,60 @@ def student_factor(freedom: ArrayLike) -> Array:
     return np.asarray(stdtrit(np.maximum(freedom, 1.0), (1 + PROBABILITY) / 2))
 
 
-def probability_within(value: float, sd: float, limit: float, two_sided: bool) -> float:
-    """Probability that the true value is at most `limit`; `two_sided`: and at least its negative.
-
-    Definition: Φ((limit - value) / sd), for two sides less Φ((-limit - value) / sd). Singular: without
-    uncertainty 0 or 1. Reference: JCGM 106:2012, 7.2 and 7.4.
-    """
-    from scipy.special import ndtr
-
-    if sd == 0:
-        return float(value <= limit)
-    below = ndtr((-limit - value) / sd) if two_sided else 0.0
-    return float(ndtr((limit - value) / sd) - below)
+def coverage_of(freedom: float | None) -> float:
+    """Coverage factor of a value of a roll test: at least `COVERAGE`; None: unlimited degrees of freedom."""
+    return COVERAGE if freedom is None else max(COVERAGE, float(student_factor(freedom)))
 
 
 @dataclass(frozen=True)
 class Rule:
-    """A rule of decision: a guard band of `guard` standard uncertainties, none for simple acceptance."""
+    """A rule of decision: a guard band of some expanded uncertainties, none for simple acceptance.
+
+    `guard_factor` is in units of U, or None for that of `verify`. `coverage`: factor of the U of values that
+    do not state degrees of freedom of their own.
+    """
 
     name: Literal["simple", "guarded"]
     text: str
-    guard: float
+    guard_factor: float | None
     coverage: float
 
+    def factors(self, row: VerdictRow) -> tuple[float, float]:
+        """Standard uncertainties of the guard band, and of U, of the value of a row."""
+        coverage = self.coverage
+        if row.degrees_of_freedom is not UNSET:
+            coverage = coverage_of(row.freedom)
+        if self.guard_factor is None:
+            return guard(True, row.freedom), coverage
+        return self.guard_factor * coverage, coverage
+
     def decision(self, row: VerdictRow) -> LimitDecision:
-        """The decision on a limit, by the set of the test that exceeds it first."""
-        value, sd, note = self._worst(row)
-        spread, within, passed = row.name.startswith(SPREAD_OF), None, False
+        """The decision on a limit."""
+        value, sd, within, passed = row.value, row.uncertainty, None, False
+        band, coverage = self.factors(row)
         if value is not None and sd is not None:
-            within = probability_within(value, sd, row.limit, two_sided=not spread)
-            passed = value + self.guard * sd <= row.limit  # as `verify` decides, to the last digit
+            within = probability_within(value, sd, row.limit, row.two_sided, row.freedom)
+            passed = value + band * sd <= row.limit  # as `verify` decides, to the last digit
         quantity = Quantity(
             id=row.name.replace(" ", "-"),
             name=row.name,
             unit=row.unit,
             value=value,
             standard_uncertainty=sd,
-            expanded_uncertainty=None if sd is None else self.coverage * sd,
-            coverage_factor=None if sd is None else self.coverage,
+            expanded_uncertainty=None if sd is None else coverage * sd,
+            coverage_factor=None if sd is None else coverage,
             coverage_probability=None if sd is None else PROBABILITY,
         )
         return LimitDecision(
             quantity=quantity,
             limit=row.limit,
-            acceptance_limit=None if sd is None else row.limit - self.guard * sd,
+            acceptance_limit=None if sd is None else row.limit - band * sd,
             passed=passed,
             probability_within=within,
             risk=None if within is None else (1 - within if passed else within),
-            note=note,
+            note=row.note,
+            degrees_of_freedom=row.freedom,
         )
-
-    def _worst(self, row: VerdictRow) -> tuple[float | None, float | None, str]:
-        """Value and 1σ of the set that comes closest to the limit or exceeds it most, and where it is."""
-        if row.value is None or row.uncertainty is None or not row.sets:
-            return row.value, row.uncertainty, row.note
-        worst = max(row.sets, key=lambda each: each.value + self.guard * each.uncertainty)
-        if worst.value == row.value and worst.uncertainty == row.uncertainty:
-            return row.value, row.uncertainty, row.note
-        return worst.value, worst.uncertainty, worst.label or "stations outside of roll sets"
 
 
 def rule_of(verification: Verification, freedom: float | None, choice: DecisionRule | None) -> Rule:
@@ -115,16 +114,18 @@ def rule_of(verification: Verification, freedom: float | None, choice: DecisionR
     The coverage factor of its uncertainties is at least `COVERAGE`, and Student's for the degrees of
     `freedom` of the calibration that was tested; `COVERAGE` where they are not known.
     """
-    k = COVERAGE if freedom is None else max(COVERAGE, float(student_factor(freedom)))
+    k = coverage_of(freedom)
     if choice is not None and choice.rule == "guarded":
+        rule = Rule("guarded", "", choice.guard_factor, k)
+        factors = {f"{rule.factors(row)[1]:.3g}" for row in verification.rows}
         text = (
             f"guarded acceptance: noise-free value + {choice.guard_factor:g} U must not exceed the limit, "
-            f"U = {k:.3g} × its standard uncertainty"
+            f"U = {' or '.join(sorted(factors))} × its standard uncertainty"
         )
         text += f"; {choice.risk}" if choice.risk else ""
-        return Rule("guarded", text, choice.guard_factor * k, k)
+        return replace(rule, text=text)
     if verification.rule == RULES["guarded"]:
-        return Rule("guarded", f"{verification.rule}; {GUARDED_RISK}", COVERAGE, k)
+        return Rule("guarded", f"{verification.rule}; {GUARDED_RISK}", None, k)
     return Rule("simple", f"{verification.rule}; {SIMPLE_RISK}", 0.0, k)
 
 
@@ -144,9 +145,13 @@ def conformity(
         freedom = fewest_degrees_of_freedom(calibration)
     rule = rule_of(verification, freedom, choice)
     decisions = [rule.decision(row) for row in verification.rows]
+    passed = all(decision.passed for decision in decisions)
+    risk = verification.risk  # of the other verdict, if the laboratory's rule has led to it
+    if risk is not None and passed != verification.passed:
+        risk = 1 - risk
     test = ConformityTest(
         when=when,
-        passed=all(decision.passed for decision in decisions),
+        passed=passed,
         date=verification.date,
         run=verification.run,
         stations=verification.stations,
@@ -157,6 +162,8 @@ def conformity(
         calibration_sha256=verification.calibration_sha256,
         decisions=decisions,
         findings=verification.findings,
+        risk=risk,
+        settings=SETTING_PRACTICES.get(verification.settings, ""),
     )
     unknown = [UNKNOWN_FREEDOM] if freedom is None else []
     return test, unknown + _changed(when, verification, decisions)

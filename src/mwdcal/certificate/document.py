@@ -122,6 +122,7 @@ class LimitDecision(msgspec.Struct, frozen=True, kw_only=True):
     `acceptance_limit`: what the value must not exceed, the limit less the guard band.
     `probability_within`: that the true value is within the limit, given value and uncertainty; None where
     the uncertainty is not stated. `risk`: of the wrong decision that was taken, from it.
+    `degrees_of_freedom` of the uncertainty; None: unlimited, or not stated.
     """
 
     quantity: Quantity
@@ -131,10 +132,15 @@ class LimitDecision(msgspec.Struct, frozen=True, kw_only=True):
     probability_within: float | None
     risk: float | None
     note: str = ""
+    degrees_of_freedom: float | None = None
 
 
 class ConformityTest(msgspec.Struct, frozen=True, kw_only=True):
-    """A roll test as the certificate shows it: as found, or as left."""
+    """A roll test as the certificate shows it: as found, or as left.
+
+    `risk`: probability that the verdict is wrong, all limits and roll sets together; None: not stated.
+    `settings`: in words, how often the direction of the stand was set.
+    """
 
     when: Literal["as found", "as left"]
     passed: bool
@@ -148,6 +154,8 @@ class ConformityTest(msgspec.Struct, frozen=True, kw_only=True):
     calibration_sha256: str
     decisions: list[LimitDecision]
     findings: list[Finding] = []
+    risk: float | None = None
+    settings: str = ""
 
 
 class Method(msgspec.Struct, frozen=True, kw_only=True):

@@ -18,7 +18,7 @@ from mwdcal.calibration.prediction import CalibratedTools, accuracy, angle_chang
 from mwdcal.drift.comparable import DAYS_PER_YEAR, FACTOR_NAMES
 from mwdcal.drift.histories import ToolHistory
 from mwdcal.drift.walk import WALK_GROUPS, group_places
-from mwdcal.geometry.vectors import Array
+from mwdcal.geometry.vectors import AnyArray, Array
 from mwdcal.sensor.models import Basis, Factors
 
 ACCURACY_PROBABILITY = 0.95
@@ -31,6 +31,8 @@ LONGEST_INTERVAL = 5.0
 """No calibration is called good for longer, years."""
 DRAWN_PATHS = 2_000
 """Draws of what is not known of a tool: its rates, the error of its calibration, and where it walks."""
+LEAST_SPEED = np.float32(1e-12)
+"""Walk of an angle in a year, rad, that keeps any limit."""
 COVERAGE_FACTOR = float(ndtri((1 + ACCURACY_PROBABILITY) / 2))
 """Standard uncertainties within which that share of normal errors lies."""
 
@@ -59,9 +61,10 @@ class Growth:
         it does not come back, so that the share of paths that have left by t is the probability to be beyond at t.
         Units: radians.
         """
-        error, walk = paths.error @ self.changes.mT, paths.walk @ self.changes.mT
-        largest, speed = np.abs(error).max(-1), np.maximum(np.abs(walk), 1e-300)
-        span = np.min((limit - np.copysign(error, error * walk)) / speed, -1)
+        changes = self.changes.mT.astype(np.float32)
+        error, walk = paths.error @ changes, paths.walk @ changes
+        largest, speed = np.abs(error).max(-1), np.maximum(np.abs(walk), LEAST_SPEED)
+        span = np.min((np.float32(limit) - error * np.sign(walk)) / speed, -1)
         return np.where(largest > limit, 0.0, np.maximum(span, 0.0)) ** 2, largest
 
 
@@ -69,8 +72,8 @@ class Growth:
 class Paths:
     """Draws of what parameters (n, p) are wrong by: on the day of the calibration, and by the walk of a year."""
 
-    error: Array
-    walk: Array
+    error: AnyArray
+    walk: AnyArray
 
     @classmethod
     def of(
@@ -81,10 +84,10 @@ class Paths:
         values, vectors = np.linalg.eigh(covariance)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         size = len(next(iter(rates.values()))), len(covariance)
-        walk = rng.normal(size=size)
+        walk = rng.standard_normal(size, np.float32)
         for group, drawn in rates.items():
-            walk[:, places[group]] *= np.sqrt(drawn)[:, None]
-        return cls(rng.normal(size=size) @ root.mT, walk)
+            walk[:, places[group]] *= np.sqrt(drawn, dtype=np.float32)[:, None]
+        return cls(rng.standard_normal(size, np.float32) @ root.mT.astype(np.float32), walk)
 
 
 @dataclass(frozen=True)

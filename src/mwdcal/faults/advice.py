@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ from mwdcal.calibration.readings import CONSTANTS, TRIADS, Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.estimation.evidence import ANGLES
 from mwdcal.faults.likelihood import Suspect, explained
-from mwdcal.faults.physics import DEAD, DEPARTURES, FAULTS, NONE, SIZE
+from mwdcal.faults.physics import DEAD, DEPARTURES, FAULTS, NONE, SIZE, SURROUNDINGS
 from mwdcal.faults.weighing import DISTINCT, LIKELY, FaultEvidence, over_forms
 from mwdcal.geometry.vectors import Array, reference_vectors
 
@@ -43,6 +43,14 @@ class Further(NamedTuple):
     temperature: float | None = None
     without: tuple[str, ...] = ()
 
+    def __str__(self) -> str:
+        """What to measure, in words."""
+        inclination, azimuth = np.degrees(self.inclination), np.degrees(self.azimuth) % 360
+        return (
+            f"four stations {self.text}, at {inclination:.0f}° inclination, {azimuth:.0f}° azimuth and toolfaces of "
+            "0°, 90°, 180° and 270°,"
+        )
+
 
 def expected_ratios(evidence: FaultEvidence, information: Array, departures: Array) -> Array:
     """Log evidence (F,) over none that each form gains on average, the tool having `departures` (SIZE,)."""
@@ -63,17 +71,26 @@ def unseen(evidence: FaultEvidence) -> list[str]:
     Definition: the log evidence for the fault is tr(A) / 2 - log det(I + A) / 2 on average, A being the
     information on its sizes.
     """
-    gains = []
-    for form in evidence.forms:
+    seen = set()
+    for form in (each for each in evidence.forms if each.larger == 1):
         inner = form.mixing.transpose() @ evidence.information @ form.mixing
-        gains.append(0.5 * (np.trace(inner) - np.linalg.slogdet(np.eye(len(inner)) + inner)[1]))
-    kinds = dict.fromkeys(form.kind for form in evidence.forms)
-    best = {
-        kind: max(g for g, form in zip(gains, evidence.forms, strict=True) if form.kind == kind)
-        for kind in kinds
-    }
-    seen = {kind for kind, gain in best.items() if gain >= DISTINCT}
+        gain = 0.5 * (np.trace(inner) - np.linalg.slogdet(np.eye(len(inner)) + inner)[1])
+        seen |= {form.kind} if gain >= DISTINCT else set()
     return [kind for kind in FAULTS if kind not in seen and kind != DEAD]
+
+
+def innocent(fault: str, rivals: Sequence[str], shares: Mapping[str, float]) -> str:
+    """The fault, or where readings do not exclude that the tool is sound, what about it is at fault instead.
+
+    A field fixed in the tool or in the Earth is no fault of the sensors: none is condemned while one of these explains
+    as much.
+    """
+    outside = [name for name in rivals if name in SURROUNDINGS]
+    return (
+        max(outside, key=lambda name: shares[name])
+        if fault not in SURROUNDINGS and outside
+        else fault
+    )
 
 
 def apart(
@@ -139,19 +156,20 @@ def _offers(
     middle = float(problem.temperature.mean())
     far = high if abs(high - middle) > abs(low - middle) else low
     offers = [
-        Further(f"a roll at {np.degrees(level):.0f}° inclination, on a stand", level, azimuth),
-        Further("a roll at another azimuth, on a stand", here, azimuth + np.pi / 2),
-        Further("a roll after switching off and on", here, azimuth, without=("turn-on",)),
+        Further("on a stand", level, azimuth),
+        Further("on a stand", here, azimuth + np.pi / 2),
+        Further("after switching off and on", here, azimuth, without=("turn-on",)),
+        Further("elsewhere, away from casing and steel", here, azimuth, without=("disturbance",)),
         Further(
-            "a roll elsewhere, away from casing and steel", here, azimuth, without=("disturbance",)
-        ),
-        Further(
-            "a roll without the collar, or after demagnetising it", here, azimuth, without=("iron",)
+            "without string and collar, or after demagnetising them",
+            here,
+            azimuth,
+            without=("iron",),
         ),
     ]
     if readings.temperature is not None and abs(far - middle) > calibration.margin:
-        offers.append(Further(f"a roll at {far:.0f} °C", here, azimuth, far))
-    return {offer.text: _informed(calibration, readings, offer) for offer in offers}
+        offers.append(Further(f"at {far:.0f} °C", here, azimuth, far))
+    return {str(offer): _informed(calibration, readings, offer) for offer in offers}
 
 
 def _informed(calibration: Calibration, readings: Readings, offer: Further) -> Array:

@@ -9,10 +9,11 @@ import numpy as np
 
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.estimation.evidence import ANGLES
 from mwdcal.faults import advice, preparation
 from mwdcal.faults.advice import NextReading
 from mwdcal.faults.likelihood import Suspect, raw_of
-from mwdcal.faults.physics import DEAD, FAULTS, NONE, FaultForm, FaultTerm, faults
+from mwdcal.faults.physics import DEAD, FAULTS, HEAT, NONE, FaultForm, FaultTerm, faults, hypotheses
 from mwdcal.faults.weighing import DRAWS, FALSE_ALARMS, UNEXPLAINED, FaultEvidence
 from mwdcal.files.contract import CHANNELS
 from mwdcal.geometry.vectors import Array
@@ -31,13 +32,25 @@ class Moved(msgspec.Struct, frozen=True, kw_only=True):
     unit: str
 
 
+class Rival(msgspec.Struct, frozen=True, kw_only=True):
+    """What else explains the readings, as a `Diagnosis` has it: the cause, where, and its largest size."""
+
+    fault: str
+    channel: str | None
+    parameter: str | None
+    size: float | None
+    size_uncertainty: float | None
+    unit: str | None
+
+
 class Diagnosis(msgspec.Struct, frozen=True, kw_only=True):
     """The outcome: `fault` is "none" or one of `physics.FAULTS`, and the first of `parameters` its `size`.
 
     `channel`: "ax" …, a triad, or None for the whole tool. `probability` bounds the chance that a sound tool gives
     readings that speak so much for a fault. `likelihoods` are the shares of all faults, each as likely
-    beforehand. `confounded_with` are faults that these readings cannot tell from the one named, `tell_apart` what
-    would; `unseen` are faults of the usual size that they would not show.
+    beforehand. `confounded_with` are faults that these readings cannot tell from the one named, `rivals` their sizes,
+    `tell_apart` what would; `unseen` are faults of the usual size that they would not show. `surveys`: no station has
+    an attitude given, as in a hole.
     """
 
     fault: str
@@ -51,11 +64,13 @@ class Diagnosis(msgspec.Struct, frozen=True, kw_only=True):
     likelihoods: dict[str, float]
     parameters: list[Moved]
     confounded_with: list[str]
+    rivals: list[Rival]
     tell_apart: list[NextReading]
     unseen: list[str]
     calibration: str
     run: str
     stations: int
+    surveys: bool
     findings: list[Finding]
 
 
@@ -69,29 +84,30 @@ def diagnose(calibration: Calibration, readings: Readings, *, draws: int = DRAWS
     unit = 1.0
     if calibration.relative:
         unit = 1 / preparation.NOMINAL_FIELD
-    forms = [
-        form
-        for form in faults(calibration.profile, unit)
-        if prepared.magnetometer is not None or not _magnetic(form)
-    ]
-    evidence = FaultEvidence.of(Suspect.of(calibration, prepared), forms)
+    forms = [form for form in faults(calibration.profile, unit) if _can_show(form, prepared)]
+    evidence = FaultEvidence.of(Suspect.of(calibration, prepared), hypotheses(forms))
     probability = evidence.probability(preparation.freedom(calibration, prepared), draws)
     shares = evidence.likelihoods()
     fault = max(FAULTS, key=lambda name: shares[name]) if probability <= FALSE_ALARMS else NONE
     findings += _unexplained(evidence, fault, preparation.freedom(calibration, prepared))
-    named = _named(calibration, evidence, fault)
     confounded, remedies = advice.apart(calibration, prepared, evidence, fault, shares)
+    if (other := advice.innocent(fault, confounded, shares)) != fault:
+        fault = other
+        confounded, remedies = advice.apart(calibration, prepared, evidence, fault, shares)
+    named = _named(calibration, evidence, fault)
     return Diagnosis(
         fault=fault,
         **named,
         probability=probability,
         likelihoods=shares,
         confounded_with=confounded,
+        rivals=[_rival(calibration, evidence, name) for name in confounded],
         tell_apart=remedies,
         unseen=advice.unseen(evidence),
         calibration=calibration.run_name,
         run=readings.name,
         stations=prepared.count,
+        surveys=not any(np.isfinite(prepared.reference(name)).any() for name in ANGLES),
         findings=findings,
     )
 
@@ -112,6 +128,19 @@ def _unexplained(evidence: FaultEvidence, fault: str, freedom: float) -> list[Fi
     return [Finding(id="unexplained", text=text)]
 
 
+def _rival(calibration: Calibration, evidence: FaultEvidence, name: str) -> Rival:
+    """What a fault that is not named would be."""
+    sized = _named(calibration, evidence, name)
+    return Rival(fault=name, **{key: sized[key] for key in Rival.__struct_fields__[1:]})
+
+
+def _can_show(form: FaultForm, readings: Readings) -> bool:
+    """Whether a form can show in such readings at all."""
+    if form.kind == HEAT and not preparation.warmed(readings):
+        return False
+    return readings.magnetometer is not None or not _magnetic(form)
+
+
 def _magnetic(form: FaultForm) -> bool:
     """Whether a form needs a magnetometer to show at all."""
     if form.channel is None:
@@ -128,7 +157,7 @@ def _named(calibration: Calibration, evidence: FaultEvidence, fault: str) -> dic
         channel, moved, onset = _dead(calibration, evidence)
         extra = {"above_c": None if np.isinf(onset) else onset}
     else:
-        form, sizes, covariance = evidence.sizes(fault)
+        form, sizes, covariance = evidence.sizes(fault, whole=True)
         channel = channel_name(calibration, form.channel)
         moved, extra = _moved(calibration, form, sizes, covariance), {"above_c": None}
     sized: dict[str, Any] = {"parameters": moved, "channel": channel, **extra}

@@ -123,14 +123,14 @@ def departures_seen(suspect: Suspect, state: State) -> Array:
     problem = suspect.problem
     vectors = np.concatenate(problem.targets(state), -1)
     raw = raw_of(problem) - np.concatenate([p.misfit for p in problem.predictions(state)], -1)
-    count = raw.shape[-1]
-    gain = np.broadcast_to(np.eye(3), state.attitude.shape)
-    if count == 6:
-        triad, where = problem.triads[1], problem.slices()[1]
-        gain = inverse(triad.model.slope(state.params[:, where], triad.raw, problem.temperature))
-    whole = np.zeros((*raw.shape[:-1], 6))
+    count, by_field = raw.shape[-1], np.broadcast_to(np.eye(3), state.attitude.shape)
+    whole, gain = np.zeros((*raw.shape[:-1], 6)), np.ones((*raw.shape[:-1], 6))
     whole[..., :count] = raw
-    return columns(whole, vectors, state.attitude, suspect.warmth, gain)[..., :count, :]
+    for triad, where, start in zip(problem.triads, problem.slices(), (0, 3), strict=False):
+        slope = triad.model.slope(state.params[:, where], triad.raw, problem.temperature)
+        gain[..., start : start + 3] = 1 / diagonal(slope)
+        by_field = inverse(slope)
+    return columns(whole, vectors, state.attitude, suspect.warmth, gain, by_field)[..., :count, :]
 
 
 @dataclass(frozen=True)

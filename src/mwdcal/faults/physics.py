@@ -19,8 +19,11 @@ from mwdcal.sensor.datasheets import tolerance
 from mwdcal.sensor.profile import Profile
 
 DEAD = "dead-channel"
-FAULTS = ("impact", DEAD, "heat", "magnetised", "casing", "turn-on")
 NONE = "none"
+HEAT = "heat"
+SURROUNDINGS = ("magnetised", "casing")
+"""Causes outside the sensors, which may be as calibrated."""
+FAULTS = ("impact", DEAD, HEAT, *SURROUNDINGS, "turn-on")
 AXIS_NAMES = "xyz"
 _COUNTS = {
     "bias": 6, "turn": 12, "drift-bias": 6, "drift-scale": 6, "iron": 3, "disturbance": 3, "turn-on": 6,
@@ -41,6 +44,10 @@ DISTURBANCE = 1_000.0
 """Field of casing or steel nearby along each axis of the Earth, nT: 2 % of it."""
 TURN_ON = (4.08e-4, 70.0)
 """Bias that switching on may leave, g and nT: what the OWSG error model allows a sensor, ABXY and MBXY."""
+LARGER = (1.0, 10.0, 100.0)
+"""Times the usual size that a fault may have; an interference of some 1000 nT is ten times the usual one."""
+SIMPLER = {"impact": ((0,),), "magnetised": ((2,), (0,), (1,), (0, 1))}
+"""Sizes of a fault that it may have alone: the bias of a sensor; a field along the tool, across it."""
 SIZE_RANGE = (0.5, 1.5)
 """Sizes of simulated faults are uniform between these multiples of the usual one, of either sign."""
 
@@ -63,7 +70,7 @@ class FaultForm:
 
     `mixing` (SIZE, k) are the departures that its k sizes cause, each size in units of the usual one, which
     `usual` (k,) are in the units of `terms`. `channel` counts as of a `FaultTerm`; -1 and -2 are whole triads, None is
-    the tool.
+    the tool. `larger`: by how much these sizes exceed the usual ones of the fault.
     """
 
     kind: str
@@ -71,6 +78,30 @@ class FaultForm:
     mixing: Array
     terms: tuple[FaultTerm, ...]
     usual: Array
+    larger: float = 1.0
+
+    def part(self, columns: Sequence[int], larger: float) -> FaultForm:
+        """The fault with some of its sizes alone, and those so many times as large."""
+        some = list(columns)
+        return FaultForm(
+            self.kind, self.channel, larger * self.mixing[:, some],
+            tuple(self.terms[i] for i in some), larger * self.usual[some], larger,
+        )  # fmt: skip
+
+
+def hypotheses(forms: Sequence[FaultForm]) -> list[FaultForm]:
+    """All that may explain readings: each fault, its simpler forms, and all of these in any of the `LARGER` sizes.
+
+    A blow may move a bias alone, a magnetised string may have a field along one axis alone. Without these and the
+    larger sizes the prior alone would tell faults apart that do the same to readings.
+    """
+    result = []
+    for form in forms:
+        whole = range(form.mixing.shape[1])
+        simpler = () if (form.channel or 0) < 0 else SIMPLER.get(form.kind, ())
+        for larger in LARGER:
+            result += [form.part(columns, larger) for columns in (whole, *simpler)]
+    return result
 
 
 def faults(profile: Profile, field_unit: float = 1.0) -> list[FaultForm]:
@@ -83,7 +114,7 @@ def faults(profile: Profile, field_unit: float = 1.0) -> list[FaultForm]:
     result += [_turned(profile, triad) for triad in range(2)]
     heat = [("drift-bias", i, _drift(profile, "bias", i) * unit[i]) for i in range(6)]
     heat += [("drift-scale", i, _drift(profile, "scale", i)) for i in range(6)]
-    result.append(_fault("heat", None, heat, field_unit))
+    result.append(_fault(HEAT, None, heat, field_unit))
     iron = [("iron", i, size * field_unit) for i, size in enumerate(IRON)]
     result.append(_fault("magnetised", None, iron, field_unit))
     casing = [("disturbance", i, DISTURBANCE * field_unit) for i in range(3)]
@@ -200,17 +231,19 @@ def changed_field(damage: Damage, field: Array, attitude: Array) -> Array:
 
 
 def changed_readings(
-    damage: Damage, raw: Array, vectors: Array, temperature: Array, reference: float
-) -> Array:
+    damage: Damage, raw: Array, vectors: Array, temperature: Array, reference: float,
+    gain: Array | float = 1.0,
+) -> Array:  # fmt: skip
     """What channels (..., n, 6) read instead of `raw`, in nominal units, at `vectors` (..., n, 6).
 
     Definition: "bias" and "turn-on" add; "drift-…" add to bias and scale in proportion to T - `reference`; by
     "turn" an axis comes to lie along its old direction plus this share of another one, as a unit vector, and
-    reads the component there. Dead channels read what `damage` says.
+    reads the component there. Dead channels read what `damage` says. `gain` (..., n, 6): nominal units that a
+    channel reads for one true unit along its axis.
     """
     warm = (temperature - reference)[..., None]
-    result = (1 + damage.part("drift-scale") * warm) * raw + damage.part("drift-bias") * warm
-    result = result + damage.part("bias") + damage.part("turn-on")
+    result = (1 + damage.part("drift-scale") * warm) * raw
+    added = damage.part("drift-bias") * warm + damage.part("bias") + damage.part("turn-on")
     turn, axes = damage.part("turn"), np.zeros((*damage.departures.shape[:-1], 1, 6, 6))
     for place, (channel, towards) in enumerate(ACROSS):
         axes[..., channel, towards] = turn[..., place]
@@ -218,25 +251,29 @@ def changed_readings(
     axes = axes / np.linalg.norm(axes, axis=-1, keepdims=True)
     moved = np.einsum("...ij,...j->...i", axes - np.eye(6), vectors)
     broken = damage.dead[..., None, :] & (temperature[..., None] + 0 * raw > damage.above)
-    return np.where(broken, damage.reading[..., None, :], result + moved)
+    return np.where(broken, damage.reading[..., None, :], result + gain * (added + moved))
 
 
-def columns(raw: Array, vectors: Array, attitude: Array, warmth: Array, gain: Array) -> Array:
+def columns(
+    raw: Array, vectors: Array, attitude: Array, warmth: Array, gain: Array, by_field: Array
+) -> Array:
     """Change (..., n, 6, SIZE) of the readings by each departure, to first order.
 
-    `gain` (..., n, 3, 3): change of the magnetometer's readings by the field.
+    `gain` (..., n, 6): change of each channel by the field along its own axis; `by_field` (..., n, 3, 3) of the
+    magnetometer's by the field of the tool.
     """
     result = np.zeros((*raw.shape, SIZE))
     every = np.arange(6)
     for name, change in (
-        ("bias", np.ones(raw.shape)),
-        ("turn-on", np.ones(raw.shape)),
-        ("drift-bias", np.broadcast_to(warmth[..., None], raw.shape)),
+        ("bias", gain),
+        ("turn-on", gain),
+        ("drift-bias", gain * warmth[..., None]),
         ("drift-scale", raw * warmth[..., None]),
     ):
         result[..., every, DEPARTURES[name].start + every] = change
     for place, (channel, towards) in enumerate(ACROSS):
-        result[..., channel, DEPARTURES["turn"].start + place] = vectors[..., towards]
-    result[..., 3:, DEPARTURES["iron"]] = gain
-    result[..., 3:, DEPARTURES["disturbance"]] = gain @ attitude
+        turned = gain[..., channel] * vectors[..., towards]
+        result[..., channel, DEPARTURES["turn"].start + place] = turned
+    result[..., 3:, DEPARTURES["iron"]] = by_field
+    result[..., 3:, DEPARTURES["disturbance"]] = by_field @ attitude
     return result

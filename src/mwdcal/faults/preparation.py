@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.readings import LEAST_TEMPERATURE_SPAN, Readings
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 
@@ -46,6 +46,9 @@ def prepared(calibration: Calibration, readings: Readings) -> tuple[Readings, li
     if calibration.outside(readings).any():
         text = "some stations lie outside the calibrated temperature range: drift beyond it counts as a change."
         findings.append(_finding("outside-temperature", text))
+    if not warmed(readings):
+        text = "all readings are at one temperature: a fault of heat is no candidate. It needs two temperatures."
+        findings.append(_finding("one-temperature", text))
     if calibration.unrecorded(readings):
         findings.append(
             _finding("no-temperature", "the tool was calibrated at unrecorded temperatures.")
@@ -55,6 +58,12 @@ def prepared(calibration: Calibration, readings: Readings) -> tuple[Readings, li
             _finding("assumed-gravity", "no ref_gravity_g: gravity is taken to be exactly 1 g.")
         )
     return _with_field(calibration, readings, findings), findings
+
+
+def warmed(readings: Readings) -> bool:
+    """Whether readings are at temperatures far enough apart to show what changes with temperature."""
+    warmth = readings.temperature
+    return warmth is not None and float(np.ptp(warmth)) >= LEAST_TEMPERATURE_SPAN
 
 
 def _finding(name: str, text: str) -> Finding:

@@ -78,9 +78,22 @@ class FaultEvidence:
         where = [i for i, form in enumerate(self.forms) if form.kind == kind]
         return int(np.searchsorted(self.likely, max(where, key=lambda i: self.by_form[i])))
 
-    def sizes(self, kind: str) -> tuple[FaultForm, Array, Array]:
-        """The best form of a fault, its sizes (k,) and their covariance (k, k), in units of the usual ones."""
+    def _whole(self, place: int) -> int:
+        """The place of the fullest form of the same fault and channel as one among those at `likely`."""
+        chosen = self.forms[self.likely[place]]
+        same = (chosen.kind, chosen.channel, chosen.larger)
+        forms = [self.forms[i] for i in self.likely]
+        alike = [i for i, f in enumerate(forms) if (f.kind, f.channel, f.larger) == same]
+        return max(alike, key=lambda i: len(forms[i].terms))
+
+    def sizes(self, kind: str, whole: bool = False) -> tuple[FaultForm, Array, Array]:
+        """The best form of a fault, its sizes (k,) and their covariance (k, k), in units of the usual ones.
+
+        `whole`: with all sizes that such a fault may have, so that the uncertainty of each is not that of a simpler
+        form, in which the others are exactly zero.
+        """
         place = self._best(kind)
+        place = self._whole(place) if whole else place
         form = self.forms[self.likely[place]]
         count = form.mixing.shape[1]
         covariance = self.best.covariance[place, :count, :count]
@@ -93,9 +106,9 @@ class FaultEvidence:
 
     @cached_property
     def by_fault(self) -> dict[str, float]:
-        """Log evidence of each fault over none: the mean over its forms."""
+        """Log evidence of each fault over none: the mean over its forms; none for one that has no form here."""
         others = over_forms(self.forms, self.by_form) | {DEAD: log_mean(self.dead_ratios)}
-        return {name: float(others.get(name, 0.0)) for name in (NONE, *FAULTS)}
+        return {NONE: 0.0} | {name: float(others.get(name, -np.inf)) for name in FAULTS}
 
     def likelihoods(self) -> dict[str, float]:
         """Share of each fault, all being as likely beforehand."""

@@ -20,7 +20,7 @@ from mwdcal.calibration.record import DOCUMENT_VERSION, SCHEMA_VERSION, Calibrat
 from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import atomic, members
 from mwdcal.files.profiles import check_profile
-from mwdcal.use.verification import COVERAGE, RULES, Verdict
+from mwdcal.use.verification import RULES, Verdict, guard
 
 _DIGITS = 30
 """Digits of the longest whole number that a calibration file may have."""
@@ -166,12 +166,14 @@ def _contradiction(verification: Verification) -> str:
         return (
             f"the decision rule must be one of {', '.join(RULES)}; got {verification.rule[:80]!r}"
         )
-    guard = COVERAGE if verification.rule == RULES["guarded"] else 0.0
+    guarded = verification.rule == RULES["guarded"]
     for row in verification.rows:
         value, sd = row.value, row.uncertainty
         if row.limit <= 0 or (sd is not None and (sd < 0 or value is None)):
             return f"the limit of {row.name!r} must be positive, and an uncertainty needs a value"
-        within = value is not None and sd is not None and value + guard * sd <= row.limit
+        within = False
+        if value is not None and sd is not None:
+            within = value + guard(guarded, row.freedom) * sd <= row.limit
         if row.passed != within:
             return f"the decision on {row.name!r} does not follow from its value and limit"
     if not verification.rows or verification.passed != all(r.passed for r in verification.rows):

@@ -33,8 +33,9 @@ from mwdcal.planning.simulate import Truth, drawn
 from mwdcal.sensor.profile import Profile
 from mwdcal.use import roll_test
 from mwdcal.use.departures import LEVEL, UNDEFINED_AT_VERTICAL, RollTest
+from mwdcal.use.risk import COVERAGE
 from mwdcal.use.roll_sets import RollSet
-from mwdcal.use.verification import COVERAGE, Limits
+from mwdcal.use.verification import Limits
 
 TOOLS_AT_ONCE = 200
 """Tools that are simulated and fitted at once, with random numbers of their own."""
@@ -201,7 +202,7 @@ class Procedure:
         nominal = RollTest(self.calibration, self.testing.readings)
         seen, turned = _Seen(result, test, nominal), cache(partial(self._turned, tools, result))
         for limit in self.judged:
-            value, sd = seen.figure(limit, guard)
+            value, sd = seen.figure(limit)
             true = self._true_figure(limit, turned)
             passed &= value + guard * sd <= limit.limit
             good &= true <= limit.limit
@@ -384,21 +385,29 @@ class _Seen:
             square = square + np.sum((moved * self.test.sd[TRIADS[k]]) ** 2, -1)
         return np.asarray(np.sqrt(square))
 
-    def figure(self, limit: Judged, guard: float) -> tuple[Array, Array]:
-        """Noise-free figure (B,) of a limit and its standard uncertainty, of the worst set of each tool."""
+    def figure(self, limit: Judged) -> tuple[Array, Array]:
+        """Noise-free figure (B,) of a limit and its standard uncertainty, of all sets of each tool together."""
         name, error = limit.name, limit.kind == "error"
-        observable, figures = OBSERVABLES[name], []
-        value = observable.value(*self.fields)
+        value = OBSERVABLES[name].value(*self.fields)
         if error or name == "toolface":
-            value = observable.difference(value, self.test.known[name])
-        for each in limit.sets:
-            part = value[:, each.index]
-            part = part if error else _centred(part, name)
-            alone, shared = self.nominal.reference_sd(name, each, error)
-            sd = np.hypot(self.noise(name)[:, each.index], alone)
-            one = roll_test.figure(part, sd, self.toolface[:, each.index], error)
-            figures.append(np.stack([one.value, np.hypot(one.uncertainty, shared)]))
-        whole = np.stack(figures) * limit.factor
-        worst = np.argmax(whole[:, 0] + guard * whole[:, 1], 0)
-        value, sd = np.take_along_axis(whole, worst[None, None], 0)[0]
-        return value, sd
+            value = OBSERVABLES[name].difference(value, self.test.known[name])
+        parts = [value[:, each.index] for each in limit.sets]
+        parts = parts if error else [_centred(part, name) for part in parts]
+        references = [self.nominal.reference_errors(name, each, error) for each in limit.sets]
+        sd = self.noise(name)
+        curves = [
+            roll_test.fitted(
+                part, np.hypot(sd[:, each.index], reference.individual), self.toolface[:, each.index],
+                self.nominal.harmonics(each), reference.together,
+            )
+            for part, each, reference in zip(parts, limit.sets, references, strict=True)
+        ]  # fmt: skip
+        noise, figures = roll_test.scatter(curves), []
+        for k, (part, curve) in enumerate(zip(parts, curves, strict=True)):
+            first = int(limit.sets[k].index[0])
+            one = roll_test.figure(part, curve, noise, error, roll_test.drawn(curve, name, first))
+            common = self.nominal.common_errors(name, references[k], first)
+            errors = one.errors + one.side[:, None] * common
+            figures.append((one.value, np.hypot(one.uncertainty, references[k].shared), errors))
+        worst = roll_test.largest(*(np.stack(each, -1) for each in zip(*figures, strict=True)))
+        return worst.value * limit.factor, worst.uncertainty * limit.factor

@@ -14,10 +14,12 @@ import numpy as np
 
 from mwdcal.calibration.prediction import raw_reading
 from mwdcal.calibration.readings import CONSTANTS, TRIADS, Readings
+from mwdcal.calibration.settings import DIRECTION, settings_of
 from mwdcal.estimation.evidence import ANGLES
 from mwdcal.faults.physics import Damage, changed_field, changed_readings
 from mwdcal.geometry.vectors import (
     Array,
+    diagonal,
     earth_field,
     earth_gravity,
     reference_vectors,
@@ -267,7 +269,7 @@ def simulated(
     common = common_errors(rng, session, effects, lead) if common is None else common
     angles = {
         name: _settings(session, name, effects, common)
-        + session.uncertainty(name) * rng.normal(size=(*lead, count))
+        + session.uncertainty(name) * _alike(session, name, rng.normal(size=(*lead, count)))
         for name in ANGLES
     }
     damage = effects.fault.damage(rng, session.profile or Profile(name="servo"), lead)
@@ -290,10 +292,16 @@ def simulated(
         known=session.known,
         sd=session.sd,
         group=session.group,
+        settings=session.settings,
         station=session.station,
         metadata={**session.metadata, "simulated": True},
     )
     return Simulation(result, angles, warmth, turn_on, damage)
+
+
+def _alike(session: Readings, name: str, numbers: Array) -> Array:
+    """Random numbers (..., n), the same for stations of one setting of the stand; toolface is set at each."""
+    return numbers[..., settings_of(session)] if name in DIRECTION else numbers
 
 
 def _settings(session: Readings, name: str, effects: Effects, common: Mapping[str, Array]) -> Array:
@@ -335,7 +343,10 @@ def _read(
         return sound
     whole = [sound.get(name, 0 * vector) for name, vector in zip(TRIADS, vectors, strict=True)]
     raw, both = (np.concatenate(pair, -1) for pair in (whole, vectors))
-    changed = changed_readings(damage, raw, both, temperature, truth.reference)
+    gain = np.ones_like(raw)
+    for start, (name, (model, params)) in zip((0, 3), truth.triads.items(), strict=False):
+        gain[..., start : start + 3] = 1 / diagonal(model.slope(params, sound[name], temperature))
+    changed = changed_readings(damage, raw, both, temperature, truth.reference, gain)
     return {name: changed[..., 3 * i : 3 * i + 3] for i, name in enumerate(sound)}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import msgspec
@@ -11,14 +12,22 @@ import numpy as np
 from mwdcal.calibration.notebooks import html_table
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import MARGIN, Calibration, Finding, stated
+from mwdcal.calibration.settings import ASSUMED, is_assumed
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.geometry.vectors import Array
 from mwdcal.use.departures import LEVEL, Departures, RollTest, Statistic
+from mwdcal.use.risk import COVERAGE, guard_factor, probability_within, risk_of_all
+from mwdcal.use.roll_test import DEPARTURE_CHANCE, HARMONICS, Largest, largest
 
-COVERAGE = 2.0
-"""Coverage factor of the guard band and of the remark that a value is close to its limit."""
 SPREAD_OF = "spread of "
 """How the name of a limit on a spread begins."""
+SETTING_PRACTICES = {
+    "assumed": ASSUMED,
+    "per-direction": "The stand was set once per roll set: its error is common to the set.",
+    "per-station": "The stand was set at every station: its errors average down over a roll set.",
+}
+"""How often the stand's direction was set, in words."""
 WEAK = 0.5
 """A test whose 1σ is a larger share of the limit hardly distinguishes a good tool from a bad one."""
 NAMED_HARMONIC = 3.0
@@ -38,8 +47,13 @@ VERDICT_FINDINGS = {
     "temperature terms: drift over the difference counts as its error.",
     "not-judged": "not judged: {limits}.",
     "no-roll-set": "no roll set: spreads were not judged.",
-    "harmonic-unseen": "{title}: the toolfaces hardly show one of the two harmonics of a turn (four at right "
-    "angles do not show a misalignment of x and y): add toolfaces between them.",
+    "harmonic-unseen": "{title}: the toolfaces hardly show the second harmonic of a turn, a difference of scales or a "
+    "misalignment of x and y (four at right angles fit a mean and the first harmonic alone). The value may be "
+    "too small by it: add toolfaces between them.",
+    "little-scatter": "{title}: the readings scatter less about the curves than the stated noise explains (chance "
+    "below {chance:g}). It is overstated, or readings are repeated. The 1σ rests on the stated noise.",
+    "settings-doubted": "{title}: the readings scatter about the curves as if the stand was set at every station. Its "
+    "error is counted both ways. State [stand] settings in the profile.",
     "weak-test": "{row.name}: its 1σ of {row.uncertainty:.2g} {row.unit} is more than half of the limit: this "
     "test can hardly tell a good tool from a bad one. Average longer at each station, or take more toolfaces.",
     "roll-harmonics": "{row.name} over a turn of toolface: {causes}.",
@@ -82,7 +96,9 @@ class JudgedSet(msgspec.Struct, frozen=True, kw_only=True):
 
     `stations` are their places in `Verdict.station_rows`, from 0. `coefficients` of the curve that
     was judged: mean, cos t, cos 2t, sin t, sin 2t of toolface t, in the unit of the limit; None:
-    the set was not rolled, or the figure judged is the raw one of each station.
+    the set was not rolled, or the figure judged is the raw one of each station. With one of `harmonics`, as
+    of four toolfaces at right angles, the coefficients of 2t are zero. `passed`: by this set alone.
+    `degrees_of_freedom` of the uncertainty; None: unlimited, as the noise is declared.
     """
 
     label: str
@@ -91,6 +107,8 @@ class JudgedSet(msgspec.Struct, frozen=True, kw_only=True):
     value: float
     uncertainty: float
     passed: bool
+    harmonics: int = len(HARMONICS)
+    degrees_of_freedom: float | None = None
 
 
 class VerifiedStation(msgspec.Struct, frozen=True, kw_only=True):
@@ -114,6 +132,10 @@ class VerifiedStation(msgspec.Struct, frozen=True, kw_only=True):
 class VerdictRow(msgspec.Struct, frozen=True, kw_only=True):
     """One limit: the noise-free value, its standard uncertainty, and the decision.
 
+    `value` is that of the worst set or station; of several, less what choosing the largest adds.
+    `degrees_of_freedom` of `uncertainty`: None, unlimited, as the noise is declared; absent in documents of
+    earlier versions. `probability_within`: that the true value is within the limit.
+
     `raw` is the same figure with the noise in it: largest minus smallest value of a set as the
     papers define a spread, or the largest departure of any station. `harmonics` are the
     amplitudes of the first and second harmonic of toolface in the set that decided. None: it
@@ -130,18 +152,34 @@ class VerdictRow(msgspec.Struct, frozen=True, kw_only=True):
     raw: float | None = None
     harmonics: tuple[float, float] | None = None
     sets: list[JudgedSet] = []
+    degrees_of_freedom: float | msgspec.UnsetType | None = msgspec.UNSET
+    probability_within: float | None = None
+
+    @property
+    def freedom(self) -> float | None:
+        """Degrees of freedom of the uncertainty; None: unlimited, or not stated."""
+        stated = self.degrees_of_freedom
+        return None if isinstance(stated, msgspec.UnsetType) else stated
+
+    @property
+    def two_sided(self) -> bool:
+        """Whether a true value may lie beyond the limit on either side: an error, not a spread."""
+        return not self.name.startswith(SPREAD_OF)
 
     @property
     def bound(self) -> float:
         """What a departure may be, up or down: the limit on an error, half of that on a spread."""
-        return self.limit / 2 if self.name.startswith(SPREAD_OF) else self.limit
+        return self.limit if self.two_sided else self.limit / 2
 
 
 class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     """The outcome of a verification; `date` as the run states it.
 
-    `degrees_of_freedom`: of the triad of the calibration with the fewest, on which the standard
-    uncertainties rest. None: a document of an earlier version.
+    `degrees_of_freedom`: of the triad of the calibration with the fewest. None: a document of an earlier version.
+    `risk`: probability that the verdict is wrong, all sets and limits together: that a true value is beyond
+    its limit in a pass, that none is in a fail. None: a limit could not be judged.
+    `settings`: how often the stand's direction was set, "per-direction", "per-station", or "assumed" to be once
+    per direction; empty where nobody stated it and nothing rests on it.
     """
 
     passed: bool
@@ -155,6 +193,8 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     findings: list[Finding]
     station_rows: list[VerifiedStation] = []
     degrees_of_freedom: float | None = None
+    risk: float | None = None
+    settings: str = ""
 
     plot: ClassVar[Any]
     """Figures of the verdict, as `Calibration.plot`."""
@@ -181,6 +221,7 @@ RULES = {
     "simple": "simple acceptance: a noise-free value passes up to its limit; its 1σ is stated beside it",
     "guarded": "guarded acceptance: noise-free value + 2 × its 1σ must not exceed the limit",
 }
+"""Decision rules in words. Of a 1σ with few degrees of freedom Student's factor takes the place of 2."""
 
 
 def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verdict:
@@ -196,17 +237,17 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
     outcomes = [(SPREAD_OF + n, n, most, test.spread(n)) for n, most in limits.spread.items()]
     outcomes += [(f"error of {n}", n, most, test.error(n)) for n, most in limits.error.items()]
     skipped = _skipped({title: outcome.skipped for title, *_, outcome in outcomes})
-    guard = COVERAGE if limits.rule == "guarded" else 0.0
     outcomes = [outcome for outcome in outcomes if not outcome[-1].skipped]
-    judged = [_judged(*outcome, guard) for outcome in outcomes]
+    judged = [_judged(*outcome, limits.rule == "guarded") for outcome in outcomes]
     if not judged:
         raise InputError(
             f"{readings.name}: no limit of '{limits.name}' applies: {'; '.join(skipped)}. Add what "
             "is missing, or choose other `limits`."
         )
-    rows = [row for row, _ in judged]
+    rows = [each.row for each in judged]
+    passed = all(row.passed for row in rows)
     return Verdict(
-        passed=all(row.passed for row in rows),
+        passed=passed,
         rule=RULES[limits.rule],
         limits=limits.name,
         source=limits.source,
@@ -214,10 +255,31 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
         date=str(readings.metadata.get("date", "")),
         stations=readings.count,
         rows=rows,
-        findings=sum((about for _, about in judged), [*_findings(test, skipped)]),
+        findings=sum((each.findings for each in judged), [*_findings(test, skipped)]),
         station_rows=_station_rows(test, rows, [outcome[-1] for outcome in outcomes]),
         degrees_of_freedom=fewest_degrees_of_freedom(calibration),
+        risk=_risk(judged, passed),
+        settings="assumed" if is_assumed(readings) else readings.settings,
     )
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """A limit with its decision, the findings about it, and the `errors` (d,) of its value in tests like this one."""
+
+    row: VerdictRow
+    findings: list[Finding]
+    errors: Array | None = None
+
+
+def _risk(judged: Sequence[_Judged], passed: bool) -> float | None:
+    """Probability that the verdict on all limits is wrong; None where a limit could not be judged."""
+    within = [each.row.probability_within for each in judged]
+    errors = [each.errors for each in judged if each.errors is not None]
+    known = [chance for chance in within if chance is not None]
+    if not len(known) == len(errors) == len(judged):
+        return None
+    return risk_of_all(known, passed, np.stack(errors, -1))
 
 
 def fewest_degrees_of_freedom(calibration: Calibration) -> float:
@@ -319,36 +381,76 @@ def _check_temperature(calibration: Calibration, readings: Readings) -> None:
         )
 
 
-def _judged(
-    title: str, name: str, limit: float, outcome: Departures, guard: float
-) -> tuple[VerdictRow, list[Finding]]:
+def _judged(title: str, name: str, limit: float, outcome: Departures, guarded: bool) -> _Judged:
     """The decision on one limit, by the worst set or station, and the findings about it."""
     unit = OBSERVABLES[name].unit.replace("rad", "°")
     factor = _scale(unit)
-    findings = [Finding(id="partly-judged", text=f"{title}: {text}.") for text in outcome.apart]
-    if outcome.unseen:
-        findings.append(_finding("harmonic-unseen", title=title))
+    findings = _findings_about(title, outcome)
     most = max((each.raw * factor for each in outcome.statistics), default=None)
+    sets = _sets(outcome, factor, guarded, limit)
     if outcome.blocked:
         row = VerdictRow(
             name=title, unit=unit, value=None if outcome.unrolled else most, uncertainty=None,
             limit=limit, passed=False, note=f"cannot be passed: {outcome.blocked}", raw=most,
-            sets=_sets(outcome, factor, 0.0, -1.0),
+            sets=sets, degrees_of_freedom=None,
         )  # fmt: skip
-        return row, findings
-    worst = max(outcome.statistics, key=lambda each: each.value + guard * each.uncertainty)
-    value, sd = worst.value * factor, worst.uncertainty * factor
-    passed = value + guard * sd <= limit
+        return _Judged(row, findings)
+    overall = _largest(outcome)
+    worst = outcome.statistics[int(overall.place)]
+    value, sd, freedom = (
+        float(overall.value) * factor,
+        float(overall.uncertainty) * factor,
+        stated_freedom(worst.freedom),
+    )
+    passed = value + guard(guarded, freedom) * sd <= limit
+    note = worst.where + _choice(outcome, (worst.value - float(overall.value)) * factor, unit)
     row = VerdictRow(
         name=title, unit=unit, value=value, uncertainty=sd, limit=limit, passed=passed,
-        note=worst.where + _remark(value, sd, limit, passed), raw=most,
-        harmonics=_harmonics(worst, factor), sets=_sets(outcome, factor, guard, limit),
+        note=note + _remark(value, sd, limit, passed), raw=most,
+        harmonics=_harmonics(worst, factor), sets=sets, degrees_of_freedom=freedom,
     )  # fmt: skip
+    within = probability_within(value, sd, limit, row.two_sided, freedom)
+    row = msgspec.structs.replace(row, probability_within=within)
     if sd > WEAK * limit:
         findings.append(_finding("weak-test", row=row))
     if causes := _causes(row, name, worst):
         findings.append(_finding("roll-harmonics", row=row, causes="; ".join(causes)))
-    return row, findings
+    return _Judged(row, findings, overall.errors)
+
+
+def _findings_about(title: str, outcome: Departures) -> list[Finding]:
+    """Findings about the values behind a limit, whatever the decision."""
+    findings = [Finding(id="partly-judged", text=f"{title}: {text}.") for text in outcome.apart]
+    if outcome.unseen:
+        findings.append(_finding("harmonic-unseen", title=title))
+    remarks = (_finding(each, title=title, chance=DEPARTURE_CHANCE) for each in outcome.remarks)
+    return [*findings, *remarks]
+
+
+def guard(guarded: bool, freedom: float | None) -> float:
+    """Standard uncertainties by which a value must stay below its limit."""
+    return guard_factor(freedom) if guarded else 0.0
+
+
+def _largest(outcome: Departures) -> Largest:
+    """The largest of all statistics, without the bias of the choice."""
+    each = outcome.statistics
+    values, sds = (np.array([getattr(x, n) for x in each]) for n in ("value", "uncertainty"))
+    return largest(values, sds, np.stack([x.errors for x in each], -1))
+
+
+def stated_freedom(freedom: float) -> float | None:
+    """Degrees of freedom as a document has them: None where they are unlimited."""
+    return freedom if np.isfinite(freedom) else None
+
+
+def _choice(outcome: Departures, taken: float, unit: str) -> str:
+    """What was taken off the largest of several figures."""
+    count, single = len(outcome.statistics), any(not each.label for each in outcome.statistics)
+    if count == 1:
+        return ""
+    size = f"{taken:.2g}{'' if unit == '°' else ' '}{unit}"
+    return f"; the largest of {count} {'values' if single else 'roll sets'}: {size} taken off for the choice"
 
 
 def _scale(unit: str) -> float:
@@ -356,15 +458,16 @@ def _scale(unit: str) -> float:
     return float(np.degrees(1)) if unit == "°" else 1.0
 
 
-def _sets(outcome: Departures, factor: float, guard: float, limit: float) -> list[JudgedSet]:
-    """The roll sets behind a row, and the stations outside of them as one; none passes below zero."""
+def _sets(outcome: Departures, factor: float, guarded: bool, limit: float) -> list[JudgedSet]:
+    """The roll sets behind a row, and the stations outside of them as one; none passes where no limit can."""
     by_label: dict[str, list[Statistic]] = {}
     for each in outcome.statistics:
         by_label.setdefault(each.label, []).append(each)
     sets = []
     for label, members in by_label.items():
-        worst = max(members, key=lambda each: each.value + guard * each.uncertainty)
+        worst = max(members, key=lambda each: each.value)
         value, sd, curve = worst.value * factor, worst.uncertainty * factor, worst.curve
+        freedom = stated_freedom(worst.freedom)
         sets.append(
             JudgedSet(
                 label=label,
@@ -372,7 +475,9 @@ def _sets(outcome: Departures, factor: float, guard: float, limit: float) -> lis
                 coefficients=None if curve is None else (curve.coefficients * factor).tolist(),
                 value=value,
                 uncertainty=sd,
-                passed=value + guard * sd <= limit,
+                passed=not outcome.blocked and value + guard(guarded, freedom) * sd <= limit,
+                harmonics=len(HARMONICS) if curve is None else curve.harmonics,
+                degrees_of_freedom=freedom,
             )
         )
     return sets

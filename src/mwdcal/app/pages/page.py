@@ -7,7 +7,17 @@ from hashlib import sha256
 from typing import TYPE_CHECKING
 
 from mwdcal.app.pages import pictures
-from mwdcal.app.screens.numbers import capital, fixed, measured, number, signed, uncertainty, unit
+from mwdcal.app.screens.numbers import (
+    capital,
+    contribution,
+    fixed,
+    measured,
+    number,
+    root_sum_of_squares,
+    signed,
+    uncertainty,
+    unit,
+)
 from mwdcal.app.text import chance, harmless, plural, raised
 
 if TYPE_CHECKING:
@@ -47,5 +57,8 @@ def css(text: str) -> str:
     return "".join(c if c.isascii() and c.isalnum() else f"\\{ord(c):x} " for c in harmless(text))
 
 
-FILTERS = (number, signed, fixed, measured, uncertainty, unit, raised, chance, plural, capital, css)
+FILTERS = (
+    number, signed, fixed, measured, uncertainty, contribution, root_sum_of_squares, unit,
+    raised, chance, plural, capital, css,
+)  # fmt: skip
 """What the templates call."""

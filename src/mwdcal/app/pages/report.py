@@ -14,10 +14,11 @@ import numpy as np
 
 from mwdcal.app.messages import findings_as_typed
 from mwdcal.app.pages.page import banner, environment
-from mwdcal.app.screens.calibration import how, known_inclinations
+from mwdcal.app.screens.calibration import accuracy_in_words, how, known_inclinations
 from mwdcal.app.screens.numbers import HELD, capital, exponent, factor_places
-from mwdcal.app.text import plural, quantity, raised
-from mwdcal.calibration.prediction import accuracy_at, angles, middle_temperature, typical_accuracy
+from mwdcal.app.screens.verification import BETWEEN_SETS, freedom
+from mwdcal.app.text import plural, raised
+from mwdcal.calibration.prediction import accuracy_at, angles, middle_temperature
 from mwdcal.calibration.readings import is_simulated, soaks
 from mwdcal.calibration.record import MAGNETIC, Calibration, Finding, TriadCalibration
 from mwdcal.errors import InputError
@@ -26,6 +27,7 @@ from mwdcal.geometry.observables import TITLES
 from mwdcal.use import plots
 from mwdcal.use import verdict_plots as verdict_plots  # puts `plot` on verdicts
 from mwdcal.use.notation import Notation, convert
+from mwdcal.use.verification import SETTING_PRACTICES
 
 if TYPE_CHECKING:
     from mwdcal.use.verification import Verdict, VerdictRow
@@ -47,7 +49,9 @@ def render(
 
     `metadata` are those of the roll test behind the verdict.
     """
-    template = environment().get_template("report.html")
+    pages = environment()
+    pages.filters["freedom"] = freedom
+    template = pages.get_template("report.html")
     return template.render(
         cal=calibration,
         name=calibration.tool.get("serial") or calibration.profile.name,
@@ -66,6 +70,8 @@ def render(
         accuracy=_accuracy(calibration),
         soaked=_soaked(calibration),
         kinds=_kinds(verdict),
+        settings=SETTING_PRACTICES,
+        outside=BETWEEN_SETS,
         titles=TITLES,
         large=LARGE_RATIO,
         tolerance=RANK_TOLERANCE,
@@ -78,10 +84,7 @@ def outcome(calibration: Calibration, verdict: Verdict | None) -> dict[str, str]
     fit, level = _fit_outcome(calibration)
     word = "OK" if level == "good" else "Attention"
     if verdict is None:
-        each = typical_accuracy(calibration).items()
-        expected = ", ".join(
-            f"{name} {'undetermined' if sd is None else quantity(sd, '°')}" for name, sd in each
-        )
+        expected = ", ".join(accuracy_in_words(calibration))
         after = (
             f"{fit}. Accuracy to expect (1σ, calibration alone, typical): {expected or 'not stated'}. "
             "Verify by a roll test that was not used in the fit: mwdcal verify."

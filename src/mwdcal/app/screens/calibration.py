@@ -9,7 +9,7 @@ import msgspec
 
 from mwdcal.app.envelope import enveloped
 from mwdcal.app.messages import findings_as_typed
-from mwdcal.app.screens.numbers import written
+from mwdcal.app.screens.numbers import degrees_of_freedom, estimate, uncertainty, written
 from mwdcal.app.text import chance, number, one_line, quantity, table
 from mwdcal.calibration.automatic.nonlinearity import CurveScore
 from mwdcal.calibration.drift import Constant, Drift
@@ -50,6 +50,7 @@ class TriadSummary(msgspec.Struct, frozen=True, kw_only=True):
     size: int
     undetermined: list[Undetermined]
     variance_factor: float | None
+    degrees_of_freedom: float
     misfit_probability: float | None
 
 
@@ -133,14 +134,14 @@ def first_findings(calibration: Calibration) -> list[Finding]:
 
 def remarks(calibration: Calibration) -> list[str]:
     """Size of the residuals, accuracy to expect, what was taken as exact, and estimated constants."""
-    accuracy = [f"{name} {quantity(sd, '°')}" for name, sd in typical_accuracy(calibration).items()]
+    accuracy = accuracy_in_words(calibration)
     exact = ", ".join(calibration.assumed_exact)
     return [
         *residuals(calibration),
         f"accuracy to expect (1σ, calibration alone, typical): {'  '.join(accuracy)}",
         *([f"taken as exact, and no residual tests it: {exact}{PROFILE}"] if exact else []),
         *(
-            f"estimated constant of the run: {c.name} {c.value:.6g} ± {c.standard_uncertainty:.2g} {c.unit}"
+            f"estimated constant of the run: {c.name} {estimate(c.value, c.standard_uncertainty, c.unit)}"
             for c in calibration.constants
         ),
         *stand(calibration),
@@ -156,11 +157,20 @@ def heading(calibration: Calibration) -> str:
         parts.append("{:.1f}–{:.1f} °C".format(*calibration.temperature_c))
     parts.append(f"I {min(inclinations):.0f}–{max(inclinations):.0f}°")
     parts += simulated(calibration.tool)
-    ranks = [f"{t.name} {t.rank} of {t.size} determined" for t in calibration.triads]
+    ranks = [
+        f"{t.name} {t.rank} of {t.size} determined, {degrees_of_freedom(t.degrees_of_freedom)}"
+        for t in calibration.triads
+    ]
     lines = ["   ".join(parts), "   ".join([f"method {', '.join(how(calibration))}", *ranks])]
     if calibration.excluded:
         lines.append("left out by --exclude: station " + ", ".join(calibration.excluded))
     return "\n".join(map(one_line, lines))
+
+
+def accuracy_in_words(calibration: Calibration) -> list[str]:
+    """1σ to expect of the calibration alone, by angle."""
+    accuracy = typical_accuracy(calibration).items()
+    return [f"{name} {uncertainty(sd)}{'°' * (sd is not None)}" for name, sd in accuracy]
 
 
 def known_inclinations(calibration: Calibration) -> list[float]:
@@ -219,11 +229,11 @@ def stand(calibration: Calibration) -> list[str]:
     for name in ("azimuth", "inclination"):
         zero = getattr(errors, f"{name}_zero_deg")
         if zero is not None:
-            sd = number(getattr(errors, f"{name}_zero_uncertainty_deg"))
-            lines.append(f"stand: {name} zero {zero:+.4g}° ± {sd}°")
+            sd = getattr(errors, f"{name}_zero_uncertainty_deg")
+            lines.append(f"stand: {name} zero {estimate(zero, sd, '°')}")
     if errors.tilt_deg is not None:
-        lean = f"{errors.tilt_deg:.3g}° ± {number(errors.tilt_uncertainty_deg)}°"
-        azimuth = f"{errors.tilt_azimuth_deg:.0f}° ± {number(errors.tilt_azimuth_uncertainty_deg)}°"
+        lean = estimate(errors.tilt_deg, errors.tilt_uncertainty_deg, "°")
+        azimuth = estimate(errors.tilt_azimuth_deg or 0.0, errors.tilt_azimuth_uncertainty_deg, "°")
         lines.append(f"stand: its vertical leans by {lean} towards azimuth {azimuth}")
     return lines
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from mwdcal.app.text import chance, number, one_line, plural, quantity, table
+from mwdcal.app.screens.numbers import estimate, measured
+from mwdcal.app.text import chance, number, one_line, plural, table
 from mwdcal.calibration.readings import simulated
-from mwdcal.faults.diagnosis import Diagnosis
-from mwdcal.faults.physics import NONE
+from mwdcal.faults.diagnosis import Diagnosis, Rival
+from mwdcal.faults.physics import NONE, SURROUNDINGS
 from mwdcal.faults.weighing import FALSE_ALARMS
 
 MEANINGS = {
@@ -15,8 +16,8 @@ MEANINGS = {
     "impact": "a sensor, or a triad, that a blow has moved",
     "dead-channel": "a channel that stands still",
     "heat": "bias and scale drift with temperature beyond the calibration",
-    "magnetised": "a magnetised collar or package, fixed in the tool",
-    "casing": "casing or steel nearby, fixed in the Earth",
+    "magnetised": "interference of a string or collar, fixed in the tool",
+    "casing": "casing or steel nearby, or references that are off",
     "turn-on": "biases of all channels after switching on",
 }
 """Each fault in words."""
@@ -25,11 +26,15 @@ ADVICE = {
     "impact": "do not use the tool before it is calibrated again; look for a loose sensor or board",
     "dead-channel": "take the tool out of service: replace the sensor or its channel",
     "heat": "calibrate again over the whole range of temperatures; hold a suspect channel at the highest one",
-    "magnetised": "demagnetise or replace the collar, then verify; correct surveys for drillstring interference",
-    "casing": "the calibration may be sound: read again away from casing and steel",
+    "magnetised": "verify without string and collar, or demagnetise them; mwdcal survey --msa corrects surveys",
+    "casing": "the calibration may be sound: check the references, and measure again away from casing and steel",
     "turn-on": "switch off and on and read again; calibrate again if the biases come back",
 }
 """What to do about each."""
+CHECK_FIRST = "check tool, units and references, then repeat the readings on a stand"
+IN_HOLE = "run mwdcal survey --msa on these surveys: it estimates a field fixed in the tool and corrects for it"
+NOT_YET = "do not judge the tool by these readings alone"
+"""What to do where no single fault explains readings, of surveys, and where a sound tool is not excluded."""
 LEAST_LIKELIHOOD = 0.0005
 """Likelihoods below are shown as less than this."""
 
@@ -46,19 +51,33 @@ def screen(result: Diagnosis, *metadata: Mapping[str, object]) -> str:
 
 
 def verdict(result: Diagnosis) -> str:
-    """One sentence: still fine, or the fault, where, and by how much."""
+    """One sentence: still fine, or the fault, where, and by how much; and what else it may be."""
+    unexplained = any(finding.id == "unexplained" for finding in result.findings)
     if result.fault == NONE:
+        if unexplained:
+            return "no single fault explains these readings, and none is named"
         return "still fine: the readings are as the calibration says"
-    where = f" on {_place(result.channel)}" if result.channel else ""
-    if result.size is None:
-        return f"{result.fault}{where}"
-    size = _size(result.size, result.size_uncertainty, result.unit)
-    if result.fault == "dead-channel":
-        above = "" if result.above_c is None else f" from {number(result.above_c)} °C upwards"
-        return f"{result.fault}{where}: reads a constant {size}{above}"
-    first = result.parameters[0]
-    whose = f" of {first.channel}" if first.channel and not result.channel else ""
-    return f"{result.fault}{where}: {result.parameter}{whose} moved by {size}"
+    causes = [_cause(result), *map(_cause, result.rivals)]
+    if unexplained:
+        return f"no single fault explains these readings; closest: {' or '.join(causes)}"
+    if result.rivals:
+        return f"cannot tell {' from '.join(causes)}"
+    return causes[0]
+
+
+def _cause(cause: Diagnosis | Rival) -> str:
+    """A fault, where it shows, and its largest size."""
+    where = f" on {_place(cause.channel)}" if cause.channel else ""
+    if cause.size is None:
+        return f"{cause.fault}{where}"
+    size = _size(cause.size, cause.size_uncertainty, cause.unit)
+    if cause.fault == "dead-channel":
+        onset = cause.above_c if isinstance(cause, Diagnosis) else None
+        above = "" if onset is None else f" from {number(onset)} °C upwards"
+        return f"{cause.fault}{where}: reads a constant {size}{above}"
+    first = cause.parameters[0].channel if isinstance(cause, Diagnosis) else None
+    whose = f" of {first}" if first and not cause.channel else ""
+    return f"{cause.fault}{where}: {cause.parameter}{whose} moved by {size}"
 
 
 def _place(channel: str) -> str:
@@ -66,13 +85,13 @@ def _place(channel: str) -> str:
 
 
 def _size(size: float, uncertainty: float | None, unit: str | None) -> str:
-    return f"{quantity(size, unit or '')} ± {quantity(uncertainty, unit or '')}"
+    return estimate(size, uncertainty, unit or "")
 
 
 def _moved(result: Diagnosis) -> str:
     """Table of all sizes of the fault."""
     rows = [
-        [row.parameter, row.channel or "", number(row.size), number(row.uncertainty), row.unit]
+        [row.parameter, row.channel or "", *measured(row.size, row.uncertainty), row.unit]
         for row in result.parameters
     ]
     return table(rows, ["moved", "channel", "by", "1σ", "unit"])
@@ -101,6 +120,16 @@ def _last(result: Diagnosis) -> list[str]:
         lines.append(f"not shown by these readings, at its usual size: {', '.join(result.unseen)}")
     for name in result.confounded_with:
         texts = [row.reading for row in result.tell_apart if row.fault == name and row.reading]
-        tells = f"; {texts[0]} would tell" if texts else ""
+        tells = f"; {texts[0]} would tell" if texts else "; no further reading that was tried would"
         lines.append(f"cannot be told from {name} by these readings{tells}")
-    return [*lines, f"next: {ADVICE[result.fault]}"]
+    return [*lines, f"next: {next_step(result)}"]
+
+
+def next_step(result: Diagnosis) -> str:
+    """What to do: a tool is taken out of use only where readings exclude that it is sound."""
+    if any(finding.id == "unexplained" for finding in result.findings):
+        return CHECK_FIRST
+    steps = [IN_HOLE if result.fault == "magnetised" and result.surveys else ADVICE[result.fault]]
+    if result.fault in SURROUNDINGS and result.rivals:
+        steps.append(NOT_YET)
+    return "; ".join(steps)

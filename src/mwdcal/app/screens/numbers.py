@@ -1,8 +1,12 @@
-"""Numbers, units and names as screens and pages write them."""
+"""Numbers, units and names as screens and pages write them.
+
+An estimate and its uncertainty have two significant digits of the latter (`measured`, `estimate`), an uncertainty by
+itself has two (`uncertainty`), and what adds less than a thousandth to it is 0 (`contribution`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +17,8 @@ from mwdcal.geometry.vectors import Array
 
 HELD = "held"
 """In place of the uncertainty of a parameter that a model of 9 or 6 keeps at zero."""
+LEAST_CONTRIBUTION = 1e-3
+"""Share of a combined uncertainty below which a contribution is 0."""
 UNDETERMINED = "undetermined"
 """In place of an uncertainty that no reading determines."""
 
@@ -58,6 +64,39 @@ def measured(value: float, uncertainty: float | None) -> tuple[str, str]:
     return first, second
 
 
+def estimate(value: float, uncertainty: float | None, symbol: str = "") -> str:
+    """An estimate with its standard uncertainty and unit.
+
+    >>> [estimate(-4.5e-21, 2e-05, "g"), estimate(0.05216, 0.0034, "°"), estimate(3.2, None, "nT")]
+    ['0.000000 ± 0.000020 g', '0.0522 ± 0.0034°', '3.20000 nT, undetermined']
+    """
+    shown, sd = measured(value, uncertainty)
+    if sd == UNDETERMINED:
+        return f"{shown}{unit(symbol)}, {sd}"
+    return f"{shown} ± {sd}{unit(symbol)}"
+
+
+def contribution(value: float | None, combined: float | None) -> str:
+    """What one source adds to a combined uncertainty, to two digits; 0 below a thousandth of it.
+
+    >>> [contribution(v, 0.013) for v in (0.00402, 1.4e-05, 1.2e-05, 3.5e-17, None)]
+    ['0.0040', '0.000014', '0', '0', 'undetermined']
+    """
+    if value is None or combined is None:
+        return uncertainty(value)
+    if not value or abs(value) < LEAST_CONTRIBUTION * combined:
+        return "0"
+    plain_numbers = number(combined, 2) == fixed(combined, 1 - exponent(combined))
+    return fixed(value, 1 - exponent(value)) if plain_numbers else number(value, 2)
+
+
+def root_sum_of_squares(parts: Iterable[float | None]) -> float | None:
+    """The combined uncertainty of independent contributions; None where one is undetermined."""
+    values = [*parts]
+    known = [value for value in values if value is not None]
+    return float(np.linalg.norm(known)) if len(known) == len(values) else None
+
+
 def exponent(value: float) -> int:
     """The power of ten of a number rounded to two digits."""
     return int(f"{value:.1e}".split("e")[1])
@@ -82,6 +121,16 @@ def factor_places(
 def uncertainty(value: float | None) -> str:
     """A standard uncertainty to two digits, or that it is undetermined."""
     return UNDETERMINED if value is None or np.isnan(value) else number(value, 2)
+
+
+def degrees_of_freedom(value: float) -> str:
+    """Degrees of freedom in words; they need not be whole.
+
+    >>> [degrees_of_freedom(value) for value in (0.0, 1.0, 3.2, 132.4)]
+    ['0 degrees of freedom', '1 degree of freedom', '3.2 degrees of freedom', '132 degrees of freedom']
+    """
+    shown = number(value, 2 if value < 10 else 3).removesuffix(".0")
+    return f"{shown} degree{'' if shown == '1' else 's'} of freedom"
 
 
 def channels_of(names: Collection[str]) -> dict[str, list[str]]:

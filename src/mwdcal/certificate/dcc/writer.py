@@ -306,6 +306,9 @@ def _roll_test(test: ConformityTest, simulated: bool) -> ET.Element:
         f"Run {test.run}, {test.stations} stations. Limits: {test.limits} ({test.source}). "
         f"Calibration SHA-256 {test.calibration_sha256}."
     )
+    facts += f" {test.settings}" if test.settings else ""
+    if test.risk is not None:
+        facts += f" Probability that the verdict is wrong, all limits together: {test.risk:.2g}."
     return typed(
         "measurementResult",
         test.when,

@@ -16,8 +16,8 @@ from mwdcal.errors import FitError
 from mwdcal.estimation.uncertainty import station_misfit
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, centred
-from mwdcal.survey.acceptance import SURVEY_UNITS
-from mwdcal.survey.error_terms import CORRECTED, ErrorTerms, error_terms
+from mwdcal.survey.acceptance import SURVEY_UNITS, SensorTerms
+from mwdcal.survey.error_terms import CORRECTED, DRIFTED, ErrorTerms, error_terms
 from mwdcal.survey.multistation.interference_estimate import (
     USUAL_SD,
     Assumed,
@@ -28,9 +28,12 @@ from mwdcal.survey.multistation.interference_estimate import (
     varied,
 )
 from mwdcal.survey.multistation.separability import missing
+from mwdcal.use.strengths import STANDARD_GRAVITY
 
 FEWEST_SURVEYS = 2
 """Surveys below which nothing can be said of several stations."""
+LEAST_CHANCE = 1e-3
+"""Chance of as large a misfit below which the surveys do not fit."""
 LEAST_SEEN = 2.0
 """Interference below this many standard uncertainties in every direction is none that was seen."""
 FEWEST_AT_END = 2
@@ -223,9 +226,22 @@ def corrected_calibration(calibration: Calibration, whole: Estimate) -> Calibrat
         simulated=calibration.simulated or is_simulated(metadata),
         covariance_rows=covariance.tolist(),
         inherited=[*calibration.inherited, *whole.readings.digest],
-        findings=[*calibration.findings, Finding(id=CORRECTED, text=text)],
+        findings=[*calibration.findings, Finding(id=CORRECTED, text=text), *_drift(whole)],
     )
     return sealed(rounded(record))
+
+
+def _drift(whole: Estimate) -> list[Finding]:
+    """That the covariance allows for drift of the sensors."""
+    drift = whole.assumed.drift
+    if drift == SensorTerms():
+        return []
+    text = (
+        "1σ allows for sensors that have drifted since the laboratory by (1σ): accelerometer scale "
+        f"{drift.accelerometer_scale:g}, bias {1e3 * drift.accelerometer_bias_ms2 / STANDARD_GRAVITY:.2g} mg, "
+        f"magnetometer scale {drift.magnetometer_scale:g}, bias {drift.magnetometer_bias_nt:g} nT."
+    )
+    return [Finding(id=DRIFTED, text=text)]
 
 
 def _analysis(
@@ -363,8 +379,23 @@ def _findings(
             f"assumed ({USUAL_SD['field']:.0f} nT, {np.degrees(USUAL_SD['dip']):.1g}°). State sd_ref_field_nt and "
             "sd_ref_dip_deg."
         )
-    texts |= _doubtful_references(whole)
+    texts |= _misfit(calibration, whole) | _doubtful_references(whole)
     return [Finding(id=key, text=text) for key, text in texts.items()] + _doubtful(whole, rows)
+
+
+def _misfit(calibration: Calibration, whole: Estimate) -> dict[str, str]:
+    """That the surveys do not fit, by id, in a sentence."""
+    from scipy.special import chdtrc
+
+    chance = float(chdtrc(3 * whole.readings.count, misfits(calibration, whole)[1][0]))
+    if chance >= LEAST_CHANCE:
+        return {}
+    factor = float(np.sqrt(results.variance_scales(whole.result)[0].max()))
+    widened = f" Uncertainties are widened {factor:.2g} times." if factor > 1.05 else ""
+    return {
+        "surveys-do-not-fit": f"the surveys do not fit (chance {chance:.1g}): the sensors have changed by more than "
+        "`sensor_drift` allows, or field and dip are not those of the references." + widened
+    }
 
 
 def _doubtful_references(whole: Estimate) -> dict[str, str]:

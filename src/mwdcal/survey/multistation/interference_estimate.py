@@ -1,14 +1,15 @@
 """Interference of the drill string: multi-station analysis (MSA) by the estimator of the laboratory.
 
 Field surveys are the stations. Nobody knows their azimuth; gravity, field and dip of the place are
-known within their uncertainties, common to the run. The laboratory's calibration with its covariance
-is the prior, but for the magnetometer's offsets, and scales on request: the iron of the drill string
-adds to these, so their prior is as wide as interference can be.
+known within their uncertainties, common to the run. The laboratory's calibration is the prior, with its
+covariance and with what biases and scales have drifted since. The magnetometer's offsets, and scales on
+request, are released further: the iron of the drill string adds to these.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import os
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -24,8 +25,10 @@ from mwdcal.errors import InputError
 from mwdcal.estimation.uncertainty import TANGENT_STEP, analyse, tangent
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, diagonal
+from mwdcal.survey.acceptance import SensorTerms, load_survey_limits
 from mwdcal.survey.place.references import PLACE_SD
 from mwdcal.survey.stations import RANDOM
+from mwdcal.use.strengths import STANDARD_GRAVITY
 
 OFFSET_NAMES = ("cross-axial x", "cross-axial y", "axial")
 """Directions of interference, in the order of the tool axes x, y, z."""
@@ -41,21 +44,38 @@ DETERMINED_SHARE = 0.5
 """A direction is determined by the readings if they leave less than this share of what was assumed."""
 
 
+DRIFT_SOURCES = {"owsg": "owsg-mwd", "none": ""}
+"""Words for what sensors may have drifted by: limits of surveys whose sensor terms it is."""
+
+
+def sensor_drift(name_or_path: str | os.PathLike[str] = "owsg") -> SensorTerms:
+    """Drift of the sensors since the laboratory, 1σ of each axis: by a word of `DRIFT_SOURCES`, or the [sensor] of limits.
+
+    Raises:
+        InputError: no such limits.
+    """
+    name = os.fspath(name_or_path)
+    source = DRIFT_SOURCES.get(name, name)
+    return load_survey_limits(source)[0].sensor if source else SensorTerms()
+
+
 @dataclass(frozen=True)
 class Assumed:
-    """What interference can be before the surveys are seen, and when its estimate is of use.
+    """What interference and drift can be before the surveys are seen, and when the estimate is of use.
 
     Attributes:
         axial_nt: 1σ of the interference along the tool, nT.
         cross_axial_nt: 1σ of each of the two components across it, nT.
         scale: 1σ by which interference can change each magnetometer scale, as a share; 0: not at all.
+        drift: 1σ by which biases and scales of all axes have moved since the laboratory.
         robust: station weights, as of `Options`: one bad survey has little influence. None: all alike.
-        largest_azimuth_sd_deg: 1σ of the azimuth, of what interference is left, that is still of use.
+        largest_azimuth_sd_deg: 1σ of the azimuth, of interference and drift that are left, that is still of use.
     """
 
     axial_nt: float = 3000.0
     cross_axial_nt: float = 150.0
     scale: float = 0.0
+    drift: SensorTerms = field(default_factory=sensor_drift)
     robust: str | None = "student-t"
     largest_azimuth_sd_deg: float = 1.0
 
@@ -85,9 +105,10 @@ class Estimate:
 
     `parameters` (B, k) and `covariance` (B, k, k) are those of the corrected calibration; `size` (B, d) and
     `spread` (B, d, d) the interference by `Assumed.names` with its covariance. If field and dip also depart
-    from station to station, its covariance is `cautious_spread`, and `azimuth_sd` (B, n) the 1σ that it leaves
-    in the azimuths, rad. `open_azimuth` (B,): one rests on what neither laboratory nor surveys determine. `bound`
-    and `released` are the laboratory's knowledge without and with interference.
+    from station to station, its covariance is `cautious_spread`, and `azimuth_sd` (B, n) the 1σ that the
+    magnetometer, with interference and drift, leaves in the azimuths, rad. `open_azimuth` (B,): one rests on what
+    neither laboratory nor surveys determine. `bound` and `released` are what is known of the tool, with drift,
+    without and with interference.
     """
 
     readings: Readings
@@ -127,17 +148,15 @@ def estimate(
 ) -> Estimate:
     """The interference in surveys (..., n) of one tool in one or many wells.
 
-    Definition: with θ the parameters, θ₀ and Λ⁻¹ the laboratory's, and D what unit interference h does to
-    them, θ - θ₀ = e - D h. The prior of θ is N(θ₀, Λ⁻¹ + D W² Dᵀ), W being what is assumed of h; and h
-    given θ has mean -K (θ - θ₀), K = (W⁻² + DᵀΛD)⁻¹ DᵀΛ, and covariance (W⁻² + DᵀΛD)⁻¹.
+    Definition: with θ the parameters, θ₀ the laboratory's, Λ⁻¹ their covariance with that of drift, and D what
+    unit interference h does to them, θ - θ₀ = e - D h. The prior of θ is N(θ₀, Λ⁻¹ + D W² Dᵀ), W being what is
+    assumed of h; and h given θ has mean -K (θ - θ₀), K = (W⁻² + DᵀΛD)⁻¹ DᵀΛ, and covariance (W⁻² + DᵀΛD)⁻¹.
     Raises `InputError` where calibration and readings do not belong together, or lack a reference.
     """
     assumed, readings = assumed or Assumed(), surveys(calibration, readings)
-    known = for_run(calibration, readings)
-    directions = _directions(calibration, known, assumed)
-    weighed = known.precision @ directions
-    left = np.linalg.inv(np.diag(assumed.sd**-2) + directions.T @ weighed)
-    released = replace(known, precision=known.precision - weighed @ left @ weighed.T)
+    known = _drifted(calibration, for_run(calibration, readings), assumed.drift)
+    field_changes = _unit_changes(calibration, known, 1)
+    released, gain, left = _loosened(known, field_changes[:, : len(assumed.sd)], assumed.sd)
     options = _options(calibration, assumed)
     result = fit(readings, replace(options, prior=released))
     reference = calibration.reference_temperature
@@ -145,13 +164,13 @@ def estimate(
     parameters = np.einsum("bkp,bp->bk", maps, result.state.params)
     names = [f"{t.name} {name}" for t in calibration.triads for name in t.parameter_names]
     rows = [names.index(name) for name in known.names]
-    gain, inner = -left @ weighed.T, maps[:, rows]
+    inner = maps[:, rows]
     stated = results.StatedCovariance(_no_quieter(result))
+    uneven = _cautious(result)
     spread, cautious = (
         gain @ (inner @ covariance @ inner.mT) @ gain.T + left
-        for covariance in (stated.total, _cautious(result))
+        for covariance in (stated.total, uneven)
     )
-    moved = _by_interference(result, assumed)
     return Estimate(
         readings=readings,
         assumed=assumed,
@@ -161,7 +180,7 @@ def estimate(
         size=_unscaled((parameters[:, rows] - known.expected) @ gain.T),
         spread=spread,
         cautious_spread=cautious,
-        azimuth_sd=np.sqrt(np.einsum("bni,bij,bnj->bn", moved, cautious, moved)),
+        azimuth_sd=_azimuth_sd(result, uneven),
         open_azimuth=_open_azimuth(calibration, readings, result),
         bound=known,
         released=released,
@@ -234,28 +253,54 @@ def _options(calibration: Calibration, assumed: Assumed) -> Options:
     )
 
 
-def _directions(calibration: Calibration, known: Knowledge, assumed: Assumed) -> Array:
-    """Change (k, d) of the known parameters that adds each unit of interference to the field."""
-    triad = calibration.triads[-1]
+def _loosened(known: Knowledge, directions: Array, sd: Array) -> tuple[Knowledge, Array, Array]:
+    """Knowledge (k,) that also varies along directions (k, d) by `sd` (d,), and what it says of their sizes.
+
+    Their gain (d, k), by which a departure of the parameters is theirs, and their covariance (d, d) beside it.
+    """
+    weighed = known.precision @ directions
+    left = np.linalg.inv(np.diag(sd**-2) + directions.T @ weighed)
+    precision = known.precision - weighed @ left @ weighed.T
+    return replace(known, precision=precision), -left @ weighed.T, left
+
+
+def _drifted(calibration: Calibration, known: Knowledge, drift: SensorTerms) -> Knowledge:
+    """What is known of the tool once its biases and scales may have moved."""
+    sizes = (
+        (drift.accelerometer_bias_ms2 / STANDARD_GRAVITY, drift.accelerometer_scale),
+        (drift.magnetometer_bias_nt, drift.magnetometer_scale),
+    )
+    sd = np.repeat(np.ravel(sizes), 3)
+    changes = [_unit_changes(calibration, known, place) for place in range(len(sizes))]
+    moves = np.concatenate(changes, -1)[:, sd > 0]
+    return _loosened(known, moves, sd[sd > 0])[0]
+
+
+def _unit_changes(calibration: Calibration, known: Knowledge, place: int) -> Array:
+    """Changes (k, 6) of the known parameters that add one unit to each axis of a triad, and one to each scale."""
+    triad = calibration.triads[place]
     model, params = triad.functions(calibration.reference_temperature), np.array(triad.parameters)
-    steady = [place for place, name in enumerate(triad.parameter_names) if name in OFFSETS]
+    steady = [index for index, name in enumerate(triad.parameter_names) if name in OFFSETS]
     at = params, np.zeros((1, 3)), np.array([calibration.reference_temperature])
     shift = np.zeros((len(params), 3))
     shift[steady] = np.linalg.inv(model.jacobian(*at)[0][:, steady])
-    columns = [shift]
-    if assumed.scale:
-        stretches = np.eye(3) + TANGENT_STEP * np.eye(3)[:, :, None] * np.eye(3)[:, None]
-        columns.append(tangent(model, np.broadcast_to(params, (3, len(params))), stretches).T)
-    whole = np.concatenate(columns, -1)
+    stretches = np.eye(3) + TANGENT_STEP * np.eye(3)[:, :, None] * np.eye(3)[:, None]
+    stretched = tangent(model, np.broadcast_to(params, (3, len(params))), stretches).T
+    whole = np.concatenate([shift, stretched], -1)
     names = [f"{triad.name} {name}" for name in triad.parameter_names]
     return np.stack([whole[names.index(n)] if n in names else 0 * whole[0] for n in known.names])
 
 
-def _by_interference(result: Fit, assumed: Assumed) -> Array:
-    """Derivatives (B, n, d) of the azimuth by the directions of interference; zero at vertical."""
-    g, b = result.problem.fields(result.state)
-    azimuth = np.nan_to_num(OBSERVABLES["azimuth"].gradient(g, b)[..., 3:])
-    return np.concatenate([azimuth, azimuth * b], -1) if assumed.scale else azimuth
+def _azimuth_sd(result: Fit, covariance: Array) -> Array:
+    """1σ (B, n) of the azimuths by a covariance (B, p, p) of the magnetometer's parameters; zero at vertical."""
+    problem, state = result.problem, result.state
+    triad, where = problem.triads[-1], problem.slices()[-1]
+    gradient = np.nan_to_num(OBSERVABLES["azimuth"].gradient(*problem.fields(state))[..., 3:])
+    by_params = triad.model.jacobian(state.params[:, where], triad.raw, problem.temperature)
+    moved = np.einsum("bni,bnip->bnp", gradient, by_params)
+    return np.asarray(
+        np.sqrt(np.einsum("bnp,bpq,bnq->bn", moved, covariance[:, where, where], moved))
+    )
 
 
 def _unscaled(size: Array) -> Array:

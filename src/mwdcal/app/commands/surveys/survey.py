@@ -46,6 +46,12 @@ if TYPE_CHECKING:
 @click.option(
     "--msa-html", type=options.FILE, metavar="M.html", help="Also write a page of that analysis."
 )
+@click.option(
+    "--sensor-drift",
+    metavar="owsg|none|FILE",
+    help="For --msa: how far the sensors may have drifted since the calibration, 1σ: as the OWSG model (owsg, the "
+    "default), not at all (none), or as the [sensor] terms of a limits file.",
+)
 @options.preset(
     "--limits",
     default="owsg-mwd",
@@ -71,7 +77,7 @@ if TYPE_CHECKING:
 @options.JSON
 def command(
     calibration: Path, readings: Path, output: Path, reference: Path | None, msa: bool,
-    msa_html: Path | None, limits: str, switch: str, tie_in: str | None, outside: str,
+    msa_html: Path | None, sensor_drift: str | None, limits: str, switch: str, tie_in: str | None, outside: str,
     html: Path | None, decimal: str, key: tuple[Path, ...], as_json: bool,
 ) -> None:  # fmt: skip
     """Surveys of a well: READINGS in their order, corrected by the CALIBRATION of their tool.
@@ -92,6 +98,8 @@ def command(
 
     if msa_html and not msa:
         raise InputError("`msa_html` goes with `msa`. Leave it out, or add `msa`.")
+    if sensor_drift and not msa:
+        raise InputError("`sensor_drift` goes with `msa`. Leave it out, or add `msa`.")
     inputs = [calibration, readings, reference, limits, *key]
     options.check_outputs([output, msa_html], inputs, page=html)
     start, ends = _three("tie_in", tie_in), _switch(switch)
@@ -100,7 +108,7 @@ def command(
     fitted, analysis = scene.calibration, None
     pages: list[tuple[Path, bytes | str]] = []
     if msa:
-        analysis, pages = _analysed(scene, msa_html, as_json)
+        analysis, pages = _analysed(scene, msa_html, sensor_drift or "owsg", as_json)
         fitted = analysis.calibration
     result = well(fitted, scene.readings, scene.limits, scene.north, scene.md, start, ends, outside)
     result = replace(result, findings=loaded.findings + result.findings)
@@ -173,14 +181,16 @@ def _read(
 
 
 def _analysed(
-    scene: _WellInputs, page: Path | None, as_json: bool
+    scene: _WellInputs, page: Path | None, drift: str, as_json: bool
 ) -> tuple[Interference, list[tuple[Path, bytes | str]]]:
     """The multi-station analysis and its page; one that is not separable is printed and refused."""
     from mwdcal.app.screens.surveys.survey import refusal
     from mwdcal.files.formats import atomic
     from mwdcal.survey.multistation.interference import interference
+    from mwdcal.survey.multistation.interference_estimate import Assumed, sensor_drift
 
-    analysis = interference(scene.calibration, scene.readings, depth=scene.md)
+    assumed = Assumed(drift=sensor_drift(drift))
+    analysis = interference(scene.calibration, scene.readings, assumed, scene.md)
     pages: list[tuple[Path, bytes | str]] = []
     if page:
         from mwdcal.app.pages.surveys.interference import render

@@ -29,8 +29,8 @@ from mwdcal.app.pages.records.certificate_blocks import (
 from mwdcal.app.screens.numbers import (
     UNDETERMINED,
     capital,
+    contribution,
     measured,
-    number,
     unit,
 )
 from mwdcal.app.screens.records.quantities import (
@@ -196,6 +196,8 @@ def _test_facts(tests: Sequence[ConformityTest]) -> TableBlock:
         "Limits": lambda test: test.limits,
         "Source of the limits": lambda test: test.source,
         "Decision rule": lambda test: test.rule_text or test.rule,
+        "Setting of the stand": lambda test: test.settings,
+        "Risk of a wrong verdict": lambda test: "" if test.risk is None else chance(test.risk),
         digest: lambda test: test.calibration_sha256,
     }
     rows = {name: [fact(test) for test in tests] for name, fact in facts.items()}
@@ -328,12 +330,15 @@ def _budget(budget: Budget) -> TableBlock:
     columns = [Column("source"), Column("type"), Column("basis")]
     columns += [Column(f"u of {angle}", number=True) for angle in angles]
     rows = [
-        [Cell([line.source]), Cell([line.kind]), Cell([line.basis]), *_angles(line, angles)]
+        [
+            *(Cell([text]) for text in (line.source, line.kind, line.basis)),
+            *_angles(line, angles, budget.combined),
+        ]
         for line in budget.lines
     ]
     for line in every[-2:]:
         name = [Cell([line.source], "key"), Cell([""]), Cell([line.basis], "key")]
-        rows.append([*name, *_angles(line, angles, "key")])
+        rows.append([*name, *_angles(line, angles, line, "key")])
     coverage = _coverage(budget.coverage_factor, budget.coverage_probability)
     note = (
         "Standard uncertainties; type A by statistics of the readings, type B otherwise. The last line is the expanded "
@@ -342,10 +347,12 @@ def _budget(budget: Budget) -> TableBlock:
     return TableBlock(columns, rows, f"At {budget.at}" if budget.at else "", notes=[note])
 
 
-def _angles(line: BudgetLine, angles: Sequence[str], mark: Mark = "") -> Iterator[Cell]:
+def _angles(
+    line: BudgetLine, angles: Sequence[str], combined: BudgetLine, mark: Mark = ""
+) -> Iterator[Cell]:
     for angle in angles:
-        value = getattr(line, f"{angle}_deg")
-        yield _cell(UNDETERMINED if value is None else number(value, 2) + unit("°"), mark)
+        value, total = (getattr(each, f"{angle}_deg") for each in (line, combined))
+        yield _cell(contribution(value, total) + unit("°") * (value is not None), mark)
 
 
 def _method(certificate: Certificate) -> Iterator[Block]:

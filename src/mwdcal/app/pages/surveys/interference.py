@@ -10,6 +10,7 @@ import numpy as np
 from mwdcal import __version__
 from mwdcal.app.pages.page import banner, environment
 from mwdcal.app.pages.surveys.survey_figures import LARGEST_DRAWN_SD
+from mwdcal.app.screens.numbers import estimate
 from mwdcal.app.screens.surveys.interference import (
     CORRECTED_TITLES,
     DIRECTION_TITLES,
@@ -73,8 +74,8 @@ def _banner(summary: MultiStationAnalysis) -> dict[str, str]:
         headline = "Interference cannot be separated from azimuth"
         return banner("bad", "Refused", headline, f"Azimuth would be uncertain by {left}.")
     headline = (
-        f"Axial {size.axial_nt:.0f} ± {size.sd_axial_nt:.2g} nT, cross-axial {size.cross_axial_nt:.0f} ± "
-        f"{size.sd_cross_axial_nt:.2g} nT"
+        f"Axial {estimate(size.axial_nt, size.sd_axial_nt, 'nT')}, "
+        f"cross-axial {estimate(size.cross_axial_nt, size.sd_cross_axial_nt, 'nT')}"
     )
     surveys = plural(len(summary.station_rows), "survey")
     after = f"From {surveys}; what is left of it makes the azimuth uncertain by {left}."

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from mwdcal.app.screens.numbers import UNDETERMINED, number, written
+from mwdcal.app.screens.numbers import contribution, written
 from mwdcal.app.screens.records.quantities import quantity_numbers
+from mwdcal.app.screens.verification import VERDICT_RISK
 from mwdcal.app.text import NOT_STATED, chance, one_line, table
 from mwdcal.app.text import quantity as in_unit
 from mwdcal.calibration.prediction import STATED_ANGLES
@@ -55,6 +56,8 @@ def _test(test: ConformityTest) -> str:
     lines = [
         f"{outcome}   {test.when}   {test.run}   limits {test.limits}",
         f"rule: {test.rule_text}",
+        *([test.settings] if test.settings else []),
+        *([f"{VERDICT_RISK}: {chance(test.risk)}"] if test.risk is not None else []),
     ]
     header = ["", "value", "U", "limit", "accepted up to", "", "P within", "risk"]
     rows = [_decision(decision) for decision in test.decisions]
@@ -79,19 +82,20 @@ def _budget(budget: Budget) -> str:
         for n in STATED_ANGLES
         if n != "azimuth" or any(line.azimuth_deg is not None for line in lines)
     ]
-    rows = [_source(line, names) for line in lines]
+    rows = [_source(line, names, budget.combined) for line in lines]
     head = f"uncertainty budget (1σ), {budget.at}; k = {budget.coverage_factor:.3g}, {budget.coverage_probability:.0%}"
     return f"{one_line(head)}\n{table(rows, ['', 'kind', *names])}"
 
 
-def _source(line: BudgetLine, names: Sequence[str]) -> list[str]:
+def _source(line: BudgetLine, names: Sequence[str], combined: BudgetLine) -> list[str]:
     total = line.id in ("combined", "expanded")
-    shares = [_share(line, getattr(line, f"{name}_deg")) for name in names]
+    keys = [f"{name}_deg" for name in names]
+    shares = [_share(line, getattr(line, key), getattr(combined, key)) for key in keys]
     return [line.source, "" if total else line.kind, *shares]
 
 
-def _share(line: BudgetLine, value: float | None) -> str:
+def _share(line: BudgetLine, value: float | None, combined: float | None) -> str:
     """What a source adds to the uncertainty of an angle."""
     if line.basis.startswith("assumed exact"):
         return ASSUMED_EXACT
-    return UNDETERMINED if value is None else f"{number(value, 2)}°"
+    return contribution(value, combined) + "°" * (value is not None)

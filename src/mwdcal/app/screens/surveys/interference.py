@@ -55,8 +55,8 @@ def corrected_rows(summary: MultiStationAnalysis, most: int) -> list[list[str]]:
 def verdict(summary: MultiStationAnalysis) -> str:
     """Whether the correction may be used, in a sentence."""
     left = (
-        f"what is left of interference makes the azimuth uncertain by {summary.azimuth_sd_deg:.2g}° (1σ, worst survey; "
-        f"{summary.largest_azimuth_sd_deg:g}° allowed)"
+        f"interference and drift that are left make the azimuth uncertain by {summary.azimuth_sd_deg:.2g}° (1σ, worst "
+        f"survey; {summary.largest_azimuth_sd_deg:g}° allowed)"
     )
     return f"{'separable' if summary.separable else 'NOT separable from azimuth'}: {left}"
 
