@@ -183,7 +183,9 @@ def test_a_run_without_magnetometer_has_no_unit_that_could_differ_from_the_prior
     first, second = (documents.read(path) for path in (previous, made))
     assert second.magnetometer is None
     assert second.accelerometer.rank == 12
-    bare = tmp_path / "bare.json"  # the prior adds to what the run says alone, and ages as no date is stated
+    bare = (
+        tmp_path / "bare.json"
+    )  # the prior adds to what the run says alone, and ages as no date is stated
     assert mwdcal("calibrate", run, "--tool", "servo", "-o", bare).code == 0
     after, alone = (
         np.array(c.accelerometer.standard_uncertainties) for c in (second, documents.read(bare))

@@ -57,7 +57,7 @@ def path(rng: np.random.Generator, count: int, shape: str) -> Array:
 def simulated(
     rng: np.random.Generator, case: Case
 ) -> tuple[Readings, list[tuple[world.Triad, world.Triad]]]:
-    """Runs of 200 tools at four directions and twelve toolfaces."""
+    """Runs of so many tools at four directions and twelve toolfaces."""
     angles = world.grid()
     count = len(angles[0])
     if case.order == "mixed":
@@ -159,9 +159,10 @@ size is 1σ per axis of where a walk ends, or of the slope of a trend. The truth
 references, at the first station. "Drift fitted" counts the runs in which [a drift](../methods.md#drift-within-a-run)
 joined the fit. Shares are of 95 % intervals that hold the truth.
 
-Where directions follow each other, a drift hides in the gains, and small ones are seldom seen: those rows fall
-short for the accelerometer. Mixed directions cure that. Trends are covered too often, because a calibration cannot
-know at which moment of the run its tool will be used.
+**Shortfall.** Where directions follow each other, a drift of the accelerometer keeps step with the attitude and hides
+in gains and offsets: walks of 0.1 mg and trends of up to 0.3 mg are seldom seen there, and those intervals cover too
+little. No residual tells such a drift. Mix the directions, and repeat a station. Trends of the field are covered too
+often, because a calibration cannot know at which moment of the run its tool will be used.
 """
 
 if __name__ == "__main__":
