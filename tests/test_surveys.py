@@ -29,6 +29,7 @@ from mwdcal.survey.acceptance import (
     judged,
     load_survey_limits,
 )
+from mwdcal.survey.blindness import blindness
 from mwdcal.survey.path import well_path
 from mwdcal.survey.stations import STRENGTHS, SURVEYED, surveyed, switched
 
@@ -485,7 +486,7 @@ def test_a_relative_magnetometer_is_judged_by_dip_alone(example, relative, tmp_p
         by_ratio, first = surveyed_file(relative, tmp_path, shifted)
         _, second = surveyed_file(example, tmp_path / "absolute", shifted)
         assert first["accepted"] == second["accepted"] == accepted
-        assert not any("nT" in finding for finding in by_ratio["finding"])
+        assert not any("nT (at most" in finding for finding in by_ratio["finding"])
     blank = {"ref_field_nt": [""] * 36}
     _, document = surveyed_file(relative, tmp_path, blank)
     [text] = [f["text"] for f in document["findings"] if f["id"] == "partly-judged"]
@@ -625,6 +626,58 @@ def test_results_say_whether_interference_was_taken_off(example, tmp_path):
         assert "judged by all three together" in shown
     cli("survey", example, source, "-o", out, "--html", page, "--limits", "fixed")
     assert "judged by all three together" not in " ".join(page.read_text("utf-8").split())
+
+
+@pytest.mark.parametrize(
+    ("inclination", "azimuth", "limits", "along", "across"),
+    [
+        # horizontal east: |b|' = √(B² + h²), sin(dip)' = B sin(dip) / |b|', the azimuth turns by atan(h / B cos dip);
+        # 2034 nT move the dip by 0.1°, 5375 nT |b| by 300 nT
+        (90, 90, {"dip_deg": 0.1}, (2000, np.arctan(2000 / 21_791.5)), (0, 0.0)),
+        (90, 90, {"field_nt": 300.0}, (3000, np.arctan(3000 / 21_791.5)), (0, 0.0)),
+        # horizontal north: along the tool nothing turns, across it all of 300 nT east do
+        (90, 0, {"dip_deg": 0.1}, (None, 0.0), (300, np.arctan(300 / 21_791.5))),
+    ],
+)
+def test_interference_that_would_pass(inclination, azimuth, limits, along, across):
+    tool, calibration = laboratory()
+    inc, azi = np.radians([float(inclination)]), np.radians([float(azimuth)])
+    b = reference_vectors(inc, azi, 0.0, 1.0, 48_000.0, np.radians(63))
+    read = readings(tool, inc, azi, 0.0)
+    judgement = judged(surveyed(calibration, read), b, read, SurveyLimits(name="ours", **limits))
+    blind = blindness(judgement.tests, b)
+    for k, (size, turn) in enumerate((along, across)):
+        assert blind.turn[0, k] == pytest.approx(turn, abs=1e-3)
+        assert size in (None, 0) or blind.size[0, k] == pytest.approx(size)
+
+
+def test_what_is_accepted_is_what_the_tests_accept():
+    tool, calibration = laboratory()
+    rng = np.random.default_rng(4)
+    angles = (rng.uniform(0.1, 3, 50), rng.uniform(0, 6, 50), rng.uniform(0, 6, 50))
+    read = readings(tool, *angles, rng, shift=rng.normal(size=(50, 3)) * 400)
+    vectors = calibration.fields(read)
+    for limits in (load_survey_limits()[0], SurveyLimits(name="ours", field_nt=200.0)):
+        judgement = judged(surveyed(calibration, read), vectors, read, limits)
+        again = judgement.tests.accept(judgement.departure[:, None])[:, 0]
+        assert 5 < judgement.accepted.sum() < 45
+        assert (again == judgement.accepted).all()
+
+
+def test_acceptance_that_is_blind_says_so_by_survey(example, tmp_path):
+    source, out, page = (tmp_path / name for name in ("iron.csv", "out.csv", "s.html"))
+    with_iron(tmp_path, 600, np.radians(90), np.radians(90))
+    ran = cli("survey", example, source, "-o", out, "--html", page)
+    document = cli("survey", example, source, "-o", out, "--json").json
+    columns = read_csv(out)
+    assert document["accepted"] == document["blind"] == len(columns["accepted"]) == 30
+    assert all("along the tool by" in text for text in columns["finding"])
+    assert "blind-to-interference" in {finding["id"] for finding in document["findings"]}
+    assert "accepted, blind" in ran.out
+    assert "30 blind to interference" in page.read_text("utf-8")
+    north = with_iron(tmp_path, 0, np.radians(60), np.radians(10))
+    ran = cli("survey", example, north, "-o", out, "--msa", "--json")
+    assert ran.json["blind"] == 0
 
 
 def test_sensor_drift_is_for_msa_and_is_named(example, tmp_path):

@@ -29,6 +29,7 @@ from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files import carried, contract, runs, streams, synonyms
 from mwdcal.files.contract import CHANNELS, COLUMNS, RANGES, RAW, RAW_RANGE, TEMPERATURE
+from mwdcal.files.faults import columns_of
 from mwdcal.files.formats import atomic, parquet
 from mwdcal.files.formats.columns import check_names, no_stations
 from mwdcal.files.formats.sinks import ParquetSink, Sink, TextSink
@@ -319,7 +320,7 @@ class _Worker:
 
     def _noise(self, table: Table, channels: Channels) -> dict[str, Array]:
         """What the table or the profile says of the noise of the readings along the tool axes."""
-        cells, noise = runs.columns_of(table), {}
+        cells, noise = columns_of(table), {}
         for kind in set(TRIADS).intersection(channels):
             triad = getattr(self.calibration.profile, kind)
             sd = runs.reading_noise(cells, kind, triad, (table.count,), triad.scale or 1.0)

@@ -94,12 +94,44 @@ class SurveyLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 @dataclass(frozen=True)
+class AcceptanceTests:
+    """What surveys (n,) are judged by: fixed limits (3,), and a covariance (n, 3, 3) with the largest distance (n,).
+
+    `missing` (n, 3): not judged.
+    """
+
+    fixed: Array
+    covariance: Array
+    largest: Array
+    missing: Bools
+
+    def part(self, rows: slice) -> AcceptanceTests:
+        """Those of some surveys."""
+        return AcceptanceTests(
+            self.fixed, self.covariance[rows], self.largest[rows], self.missing[rows]
+        )
+
+    def accept(self, departure: Array) -> Bools:
+        """Which of departures (n, k, 3) are accepted; none where nothing is judged."""
+        blank = self.missing[:, :, None] | self.missing[:, None, :]
+        whole = np.where(blank, np.eye(len(STRENGTH_NAMES)), self.covariance)
+        sd = np.sqrt(diagonal(whole))
+        inverse = np.linalg.inv(whole / (sd[:, :, None] * sd[:, None, :]))
+        shift = np.where(self.missing[:, None], 0.0, departure)
+        scaled = shift / sd[:, None]
+        square = np.einsum("nki,nij,nkj->nk", scaled, inverse, scaled)
+        inside = (np.abs(shift) <= self.fixed).all(-1) & (square <= self.largest[:, None] ** 2)
+        return np.asarray(inside & (~self.missing).any(-1, keepdims=True))
+
+
+@dataclass(frozen=True)
 class Judgement:
     """Departures of |g|, |b| and dip (n, 3) from the references, g, nT, radians; NaN where not judged.
 
     `bound` (n, 3): what each may be by itself: the fixed limit, else that of the error model, infinite where
     neither is. `distance` (n,) of the three together and the `largest` that is accepted (n,), infinite without
-    an error model. `accepted` (n,): judged, and within all limits.
+    an error model. `accepted` (n,): judged, and within all limits, which says nothing of an error that moves none of
+    the three. `tests`: what decided.
     """
 
     departure: Array
@@ -107,6 +139,7 @@ class Judgement:
     distance: Array
     largest: Array
     accepted: Bools
+    tests: AcceptanceTests | None = None
 
     @property
     def judged(self) -> Bools:
@@ -193,7 +226,8 @@ def judged(
         bound = np.where(np.isfinite(fixed), fixed, alone)
     over = np.abs(departure) > fixed
     accepted = ~missing.all(-1) & ~over.any(-1) & (together <= largest)
-    return Judgement(departure, bound, together, largest, np.asarray(accepted))
+    tests = AcceptanceTests(fixed, covariance, largest, missing)
+    return Judgement(departure, bound, together, largest, np.asarray(accepted), tests)
 
 
 def distance(departure: Array, covariance: Array) -> Array:

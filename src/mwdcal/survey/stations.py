@@ -88,6 +88,7 @@ def surveyed(
         sd[rows] = np.sqrt(np.maximum(diagonal(covariance), 0.0))
         lost = without_value(calibration, part, SURVEYED, value[rows], sd[rows])
         value[rows] = np.where(lost, np.nan, value[rows])
+        sd[rows] = np.where(lost, np.nan, sd[rows])
         strengths[rows] = covariance[:, STRENGTHS, STRENGTHS]
         done = rows.stop
         advance(done, readings.count)

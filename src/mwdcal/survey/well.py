@@ -14,15 +14,20 @@ from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, VECTORS
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, diagonal, wrap
 from mwdcal.survey.acceptance import STRENGTH_NAMES, Judgement, SurveyLimits, judged
+from mwdcal.survey.blindness import Blindness, blindness
 from mwdcal.survey.error_terms import CORRECTED, DRIFTED, ErrorTerms, error_terms
 from mwdcal.survey.norths import North
 from mwdcal.survey.position import calibrated_path
 from mwdcal.survey.stations import TOOLFACE_SWITCH, Surveys, surveyed
 from mwdcal.use.correction import counted
 
+BLIND_FROM = 2.0
+"""Stated standard uncertainties of azimuth by which interference that would pass turns it where acceptance is blind."""
 AXES_OF_EARTH = ("north", "east", "tvd")
 WELL_FINDINGS = {
     "rejected": "{rejected} of {judged} surveys lie outside the limits '{limits}' (first: station {first}: {why}).",
+    "blind-to-interference": "acceptance is blind to interference of the drill string at {blind} of {accepted} "
+    "accepted surveys. At station {blindest} {worst}. Use `msa`, or measure a check azimuth.",
     "rejected-on-path": "surveys outside the limits are part of the well path. Leave them out of the table, or "
     "survey again.",
     "not-judged": "{unjudged} of {rows} surveys are not judged: no reference for |g|, |b| or dip. Give `reference`, or "
@@ -84,6 +89,21 @@ class Well:
     position: Position | None
     findings: list[Finding]
     extrapolated: Bools | None = None
+    blindness: Blindness | None = None
+
+    @property
+    def sd_azimuth(self) -> Array:
+        """Standard uncertainty (n,) of the azimuth from the north of the path, rad."""
+        turned = 0.0 if self.north.name == "magnetic" else self.north.declination_uncertainty
+        return np.asarray(np.hypot(self.surveys.of("azimuth")[1], turned))
+
+    @cached_property
+    def blind(self) -> Bools:
+        """Accepted surveys (n,) whose azimuth interference could turn by `BLIND_FROM` 1σ and still pass."""
+        if self.blindness is None:
+            return np.zeros(len(self.judgement.accepted), bool)
+        over = self.blindness.turn.max(-1) >= BLIND_FROM * self.sd_azimuth
+        return np.asarray(over & self.judgement.accepted)
 
     @property
     def corrected(self) -> list[Finding]:
@@ -119,10 +139,18 @@ class Well:
         remarks = zip(
             self.judgement.findings(), self.blank.tolist(), self.unstated.tolist(), strict=True
         )
-        return [
+        remarked = [
             "no result" if blank else "not judged: no statement of accuracy" if unstated else remark
             for remark, blank, unstated in remarks
         ]
+        for place in np.flatnonzero(self.blind).tolist():
+            remarked[place] = f"blind: {self.what_passes(place)}"
+        return remarked
+
+    def what_passes(self, place: int) -> str:
+        """Interference that would pass at a survey, in words."""
+        least = BLIND_FROM * float(self.sd_azimuth[place])
+        return "" if self.blindness is None else self.blindness.words(place, least)
 
     @cached_property
     def columns(self) -> dict[str, AnyArray]:
@@ -188,14 +216,14 @@ def well(
     beyond, blank = calibration.outside(readings), np.isnan(columns[RESULTS[0]])
     surveys = _without(surveyed(calibration, readings, switch, advance), blank, beyond)
     g, b = (np.stack([columns[name] for name in VECTORS[i : i + 3]], -1) for i in (0, 3))
-    judgement = judged(surveys, *_to_judge(calibration, readings, (g, b)), limits)
+    judgement, blind = _judged(calibration, readings, surveys, (g, b), limits)
     start = (0.0, 0.0, 0.0) if tie_in is None else tie_in
     position = None if md is None else _positions(calibration, readings, md, north, blank, start)
     if position is not None:
         position = position.without_accuracy(beyond)
     result = Well(
         calibration, readings, surveys, judgement, limits, north, (g, b), position, findings,
-        extrapolated=columns.get(EXTRAPOLATED),
+        extrapolated=columns.get(EXTRAPOLATED), blindness=blind,
     )  # fmt: skip
     return replace(result, findings=findings + _findings(result, tie_in is None))
 
@@ -208,6 +236,19 @@ def _without(surveys: Surveys, blank: Bools, beyond: Bools) -> Surveys:
         np.where((blank | beyond)[:, None, None], np.nan, surveys.strengths),
         surveys.magnetic & ~blank,
     )
+
+
+def _judged(
+    calibration: Calibration, readings: Readings, surveys: Surveys, vectors: tuple[Array, Array],
+    limits: SurveyLimits,
+) -> tuple[Judgement, Blindness | None]:  # fmt: skip
+    """Acceptance, and what it cannot see; nothing where interference was taken off, or there is no field."""
+    seen, known = _to_judge(calibration, readings, vectors)
+    judgement = judged(surveys, seen, known, limits)
+    taken = any(finding.id == CORRECTED for finding in calibration.findings)
+    if taken or not calibration.has_field or judgement.tests is None:
+        return judgement, None
+    return judgement, blindness(judgement.tests, seen)
 
 
 def _to_judge(
@@ -261,6 +302,7 @@ def _findings(result: Well, from_first: bool) -> list[Finding]:
     there, start = bool(on_path.any()), int(np.argmax(on_path))
     applies = {
         "rejected": rejected.any(),
+        "blind-to-interference": result.blind.any(),
         "rejected-on-path": (rejected & on_path).any(),
         "not-judged": unjudged.any(),
         "partly-judged": partly.any(),
@@ -272,12 +314,16 @@ def _findings(result: Well, from_first: bool) -> list[Finding]:
         "left-out": there and not on_path.all(),
         "no-path": position is not None and not there,
     }
+    turn = 0.0 if result.blindness is None else result.blindness.turn.max(-1)
+    blindest = int(np.argmax(np.where(result.blind, turn, -1.0)))
     first, labels = int(np.argmax(rejected)), result.readings.labels
     absent = np.asarray(result.lacking[partly].any(0)).tolist()
     words = {
         "rejected": int(rejected.sum()), "judged": int(judgement.judged.sum()), "limits": result.limits.name,
         "rows": len(rejected), "first": labels[first], "why": result.remarks[first], "start": labels[start],
         "names": " and ".join(n for n, lacks in zip(STRENGTH_NAMES, absent, strict=True) if lacks),
+        "blind": int(result.blind.sum()), "accepted": int(judgement.accepted.sum()), "blindest": labels[blindest],
+        "worst": result.what_passes(blindest) if result.blind.any() else "",
         "partly": int(partly.sum()), "unjudged": int(unjudged.sum()), "count": int((~on_path).sum()),
     }  # fmt: skip
     return [*result.corrected, *result.north.findings] + [

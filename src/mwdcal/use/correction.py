@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mwdcal.calibration.readings import Readings
-from mwdcal.calibration.record import LARGEST_ANGLE_SD, Calibration, Finding
+from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import (
     EXTRAPOLATED,
@@ -22,7 +22,7 @@ from mwdcal.geometry.vectors import AnyArray, Array
 from mwdcal.use import correction_numba, scatter, strengths
 from mwdcal.use.scatter import Scatter
 from mwdcal.use.strengths import Strengths
-from mwdcal.use.uncertainty import with_uncertainty
+from mwdcal.use.uncertainty import LARGEST_DIRECTION_SD, with_uncertainty
 
 OUTSIDE = ("blank", "refuse", "extrapolate")
 JUDGED = ("gravity", "inclination", "toolface", "azimuth", "field", "dip", "magnetic_toolface")
@@ -227,7 +227,7 @@ def findings(
         "results": RESULTS_BEYOND[outside == "extrapolate"],
         "warmth": "…".join(dict.fromkeys(f"{end:.1f}" for end in tally.warmth)),
         "unsteady": unsteady,
-        "largest": np.degrees(LARGEST_ANGLE_SD),
+        "largest": np.degrees(LARGEST_DIRECTION_SD),
         "moved": ", ".join(tally.moved),
         "free": ", ".join(dict.fromkeys(u.id for u in calibration.undetermined())),
     }

@@ -23,7 +23,11 @@ COVARIANCES_AT_ONCE = 1 << 12
 _FILE_UNITS = np.array(
     [np.degrees(1.0) if OBSERVABLES[n].unit == "rad" else 1.0 for n in RESULT_OBSERVABLES]
 )
-DOUBTFUL = 3.0
+LARGEST_DIRECTION_SD = 1 / 3
+"""Largest standard uncertainty, rad, of a direction that has a value: the tool is three of them off vertical.
+
+Noise alone puts a vertical tool farther off in one reading of ninety."""
+DOUBTFUL = 4.0
 """Degrees from vertical within which a direction may have no value, for any calibration that is of use."""
 
 
@@ -39,13 +43,13 @@ def standard_uncertainties(
 def without_value(
     calibration: Calibration, readings: Readings, names: Sequence[str], value: Array, sd: Array
 ) -> Bools:
-    """Where (…, n, k) a direction has no value: its 1σ would exceed `LARGEST_ANGLE_SD`.
+    """Where (…, n, k) a direction has no value: its 1σ would exceed `LARGEST_DIRECTION_SD`.
 
     Of `names`, with `value` and `sd` (…, n, k). What is not there, rests on a free direction or lies outside the
     calibrated temperatures has no `sd` for other reasons.
     """
     turns = np.array([OBSERVABLES[name].period > 0 for name in names])
-    lost = turns & np.isnan(sd) & ~np.isnan(value)
+    lost = turns & ~(sd <= LARGEST_DIRECTION_SD) & ~np.isnan(value)
     lost &= ~calibration.outside(readings)[..., None]
     if lost.any() and calibration.free:
         lost &= ~np.stack([calibration.rests_on_free(name, readings) for name in names], -1)
@@ -79,7 +83,7 @@ def with_uncertainty(
             result[outputs[k]][..., rows] = np.where(lost[..., k], np.nan, value[..., k])
         if sd is not None:
             sd[..., rows] = np.moveaxis(
-                np.where(np.isnan(value), np.nan, part * _FILE_UNITS), -1, 0
+                np.where(np.isnan(value) | lost, np.nan, part * _FILE_UNITS), -1, 0
             )
     names = UNCERTAINTIES if stated else ()
     return result | dict(zip(names, () if sd is None else sd, strict=True)), valueless

@@ -49,7 +49,7 @@ DRIFT_SOURCES = {"owsg": "owsg-mwd", "none": ""}
 
 
 def sensor_drift(name_or_path: str | os.PathLike[str] = "owsg") -> SensorTerms:
-    """Drift of the sensors since the laboratory, 1σ of each axis: by a word of `DRIFT_SOURCES`, or the [sensor] of limits.
+    """Drift of the sensors since the laboratory, 1σ of each axis: by a word of `DRIFT_SOURCES` or a limits file.
 
     Raises:
         InputError: no such limits.
@@ -261,7 +261,7 @@ def _loosened(known: Knowledge, directions: Array, sd: Array) -> tuple[Knowledge
     weighed = known.precision @ directions
     left = np.linalg.inv(np.diag(sd**-2) + directions.T @ weighed)
     precision = known.precision - weighed @ left @ weighed.T
-    return replace(known, precision=precision), -left @ weighed.T, left
+    return replace(known, precision=precision), -left @ weighed.T, np.asarray(left)
 
 
 def _drifted(calibration: Calibration, known: Knowledge, drift: SensorTerms) -> Knowledge:

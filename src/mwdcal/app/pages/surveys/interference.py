@@ -78,7 +78,7 @@ def _banner(summary: MultiStationAnalysis) -> dict[str, str]:
         f"cross-axial {estimate(size.cross_axial_nt, size.sd_cross_axial_nt, 'nT')}"
     )
     surveys = plural(len(summary.station_rows), "survey")
-    after = f"From {surveys}; what is left of it makes the azimuth uncertain by {left}."
+    after = f"From {surveys}; interference and drift that are left make the azimuth uncertain by {left}."
     doubtful = any(row.doubtful for row in summary.station_rows)
     if summary.missing or doubtful:
         return banner("attention", "Attention", headline, after)

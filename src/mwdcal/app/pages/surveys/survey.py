@@ -67,6 +67,10 @@ def _banner(facts: SurveySummary) -> dict[str, str]:
         return banner("bad", "Rejected", headline, f"{facts.rejected} outside. {north}")
     if facts.not_judged or facts.blank:
         return banner("attention", "Attention", headline, f"{facts.not_judged} not judged. {north}")
+    if facts.blind:
+        return banner(
+            "attention", "Attention", headline, f"{facts.blind} blind to interference. {north}"
+        )
     if any(finding.id == "partly-judged" for finding in facts.findings):
         return banner("attention", "Attention", headline, f"Judged in part. {north}")
     return banner("good", "Accepted", headline, north)

@@ -111,7 +111,7 @@ def angles(well: Well) -> Figure:
         well.surveys.of(n) for n in ("inclination", "azimuth", "toolface")
     )
     north = well.north.name
-    turned = np.degrees(wrap(azimuth[0] + well.north.offset)), np.degrees(azimuth[1])
+    turned = np.degrees(wrap(azimuth[0] + well.north.offset)), np.degrees(well.sd_azimuth)
     tracks = (
         (np.degrees(inclination[0]), np.degrees(inclination[1]), "inclination, °"),
         (*turned, f"azimuth from {north} north, °"),

@@ -43,6 +43,7 @@ class EndOfPath(msgspec.Struct, frozen=True, kw_only=True):
 class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
     """What `survey` prints: stations counted by outcome, what they were judged by, where the path ends.
 
+    `blind`: accepted ones whose azimuth interference could turn and still pass.
     `error_terms` are in the standard uncertainties of surveys and path, `not_included` are not.
     `msa` is the multi-station analysis, if one was asked for; `interference` and `separable` are of it.
     """
@@ -51,6 +52,7 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
     accepted: int
     rejected: int
     not_judged: int
+    blind: int
     blank: int
     north: str
     declination_deg: float | None
@@ -78,6 +80,7 @@ def refusal(
         accepted=0,
         rejected=0,
         not_judged=rows,
+        blind=0,
         blank=rows,
         north=north.name,
         **_stated(north, error_terms((), north.declination is not None)),
@@ -108,6 +111,7 @@ def summary(
         accepted=int(accepted.sum()),
         rejected=int((judged & ~accepted).sum()),
         not_judged=int((~judged).sum()),
+        blind=int(well.blind.sum()),
         blank=int(well.blank.sum()),
         north=north.name,
         **_stated(north, well.terms),
@@ -168,6 +172,8 @@ def screen(
     counts = [f"{facts.accepted} accepted", f"{facts.rejected} rejected"]
     if facts.not_judged:
         counts.append(f"{facts.not_judged} not judged")
+    if facts.blind:
+        counts.append(f"{facts.blind} blind to interference")
     heading = [well.readings.source, plural(facts.rows, "survey"), *counts]
     heading += [in_short(signature), *simulated(*metadata)]
     source = f" ({facts.source})" if facts.source else ""
@@ -239,5 +245,6 @@ def survey_rows(well: Well, most: int) -> tuple[list[str], list[list[str]]]:
         kind = str(columns["toolface_kind"][i])
         distance = well.judgement.distance[i]
         model = [fixed(distance, 1) if well.judgement.judged[i] else "–"] if modelled else []
-        rows.append([*row, kind, *model, OUTCOMES[str(columns["accepted"][i])]])
+        outcome = OUTCOMES[str(columns["accepted"][i])] + (", blind" if well.blind[i] else "")
+        rows.append([*row, kind, *model, outcome])
     return [*header, "from", *(["distance"] if modelled else []), ""], rows
