@@ -19,7 +19,8 @@ from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.datasheets import AGEING, ageing
 from mwdcal.sensor.profile import Profile
 
-DAYS_PER_YEAR = 365.25
+JULIAN_YEAR = 365.25
+"""Days."""
 UNSTATED_YEARS = 1.0
 """Time since the earlier calibration where a run does not state its date, years."""
 USUAL_FIELD = 50_000.0
@@ -72,7 +73,7 @@ def _elapsed(previous: Calibration, readings: Readings) -> tuple[float, str]:
     if day is None or stated_day(previous.tool) is None:
         return UNSTATED_YEARS, "a year, as not both runs state a date"
     days = abs((day - previous.day).days)
-    return days / DAYS_PER_YEAR, f"{days} day{'s' * (days != 1)}"
+    return days / JULIAN_YEAR, f"{days} day{'s' * (days != 1)}"
 
 
 def _widened(precision: Array, sd: Array) -> Array:
