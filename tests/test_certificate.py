@@ -222,7 +222,8 @@ def test_coverage_factors_are_those_of_the_table_of_student():
 
 
 def test_parameters_have_the_coverage_factor_of_their_degrees_of_freedom(servo):
-    few = replace(servo, accelerometer=replace(servo.accelerometer, degrees_of_freedom=5.0))
+    scarce = {"degrees_of_freedom": 5.0, "noise_source": "estimated from the residuals"}
+    few = replace(servo, accelerometer=replace(servo.accelerometer, **scarce))
     for quantity in table(issued(few), "accelerometer").values():
         assert quantity.coverage_factor == pytest.approx(2.57, abs=0.005)
         product = quantity.coverage_factor * quantity.standard_uncertainty
@@ -259,7 +260,8 @@ def test_the_coverage_factor_is_that_of_welch_and_satterthwaite(thermal):
             BudgetRow(source=source, inclination_deg=size, toolface_deg=size, azimuth_deg=size)
             for source, size in sizes.items()
         ]
-        first = replace(thermal.accelerometer, degrees_of_freedom=freedom)
+        scarce = {"degrees_of_freedom": freedom, "noise_source": "estimated from the residuals"}
+        first = replace(thermal.accelerometer, **scarce)
         odd = replace(thermal, budget=rows, accelerometer=first)
         return budget(odd).coverage_factor
 

@@ -102,7 +102,7 @@ def test_numbers_on_the_screen_have_two_digits_of_their_uncertainty(here):
     (line,) = (line for line in lines if line.startswith("spread of inclination"))
     assert line.split()[3:6] == ["0.021°", "0.025°", "0.1°"]
     (line,) = (line for line in lines if line.startswith("expanded uncertainty"))
-    assert line.split()[2:] == ["0.0045°", "0.0087°", "0.030°"]
+    assert line.split()[2:] == ["0.0046°", "0.0091°", "0.030°"]
 
 
 # ------------------------------------------------------------------ refusals

@@ -74,7 +74,7 @@ def test_typical_accuracy_is_the_root_mean_square_of_the_bound_at_45_degrees():
     known = {"inclination": inc, "azimuth": azi, "toolface": face}
     known |= {"field": np.full(len(inc), tool.field), "dip": np.full(len(inc), tool.dip)}
     record = calibrate(Readings(a, m, known=known, sd=NOISE), PROFILE)
-    found = np.sqrt([triad.variance_factor for triad in record.triads])
+    found = np.sqrt([max(triad.variance_factor, 1.0) for triad in record.triads])
     scale = np.concatenate([np.repeat(found, 9), np.repeat(found, 3)])
     limit = bound(tool, inc, azi, face) * scale[:, None] * scale
     turn = np.arange(0.0, 360.0, 15.0) * DEG

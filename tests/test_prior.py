@@ -58,7 +58,7 @@ def test_two_runs_in_turn_are_as_good_as_both_together(unknown):
     )
     before = fit(first)  # the file's covariance carries s² of its run: undone here
     record = calibrate(first, PROFILE)
-    scale = np.sqrt(np.repeat(before.analysis.variance_factor[0], 12))
+    scale = np.sqrt(np.repeat(np.maximum(before.analysis.variance_factor[0], 1.0), 12))
     bare = (record.parameter_covariance / np.outer(scale, scale)).tolist()
     record = msgspec.structs.replace(record, covariance_rows=bare)
     turned = fit(second, Options(prior=from_calibration(record)))

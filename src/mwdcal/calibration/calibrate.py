@@ -33,13 +33,14 @@ from mwdcal.calibration.record import (
     stated,
 )
 from mwdcal.calibration.residuals import error_rows, measure_rows
+from mwdcal.calibration.settings import ASSUMED_PRACTICE, DIRECTION, is_assumed
 from mwdcal.errors import FitError
 from mwdcal.estimation.batch import batch_of_one
 from mwdcal.estimation.evidence import STAND_ERRORS, WALKS
 from mwdcal.estimation.problem import WALK_AXES
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.models import Polynomial
-from mwdcal.sensor.profile import Profile
+from mwdcal.sensor.profile import PRACTICES, Profile
 
 IDENTITY = ("serial", "tool", "operator", "lab", "date", "stand", "simulated")
 
@@ -120,6 +121,7 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
         stand=StandErrors(**_first(results.stand_errors(result))),
         earth=_first(results.earth(result)),
         gravity_stated=readings.states("gravity"),
+        settings=_practice(fitted),
         budget=_budget(fitted),
         assumed_exact=results.assumed_exact(result, readings.relative),
         errors=error_rows(fitted.residuals(0)),
@@ -135,6 +137,17 @@ def _identity(readings: Readings, simulated: bool) -> dict[str, str]:
     """What the run says of the tool, of whom and where it was measured; `simulated`: so is its prior."""
     tool = {k: str(v) for k, v in readings.metadata.items() if k in IDENTITY}
     return {**tool, "simulated": str(True)} if simulated else tool
+
+
+def _practice(fitted: FittedRuns) -> str | msgspec.UnsetType:
+    """How often the stand's direction was taken to be set, where its errors count."""
+    evidence, readings = fitted.result.problem.evidence, fitted.alone(0)[0]
+    sd = [np.nan_to_num(evidence.sd[name] * evidence.is_known(name)) for name in DIRECTION]
+    if not np.any(sd):
+        return msgspec.UNSET
+    if is_assumed(readings):
+        return ASSUMED_PRACTICE
+    return PRACTICES[0] if evidence.set_together.any() else PRACTICES[1]
 
 
 def _budget(fitted: FittedRuns) -> list[BudgetRow]:

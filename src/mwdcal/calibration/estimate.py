@@ -16,6 +16,7 @@ from mwdcal.estimation.batch import put, take
 from mwdcal.estimation.evidence import ANGLES, Evidence
 from mwdcal.estimation.minimisers import closed_form
 from mwdcal.estimation.problem import Problem, State, Triad
+from mwdcal.estimation.resetting import set_apart, with_share
 from mwdcal.estimation.robust import LOSSES, consistency, inflation, weight, weighted
 from mwdcal.estimation.solvers import Determined, Status
 from mwdcal.estimation.start import start
@@ -198,6 +199,7 @@ def _general(problem: Problem, options: Options, finite: Bools) -> Fit:
     stage = _Stage(problem, solved, trust, np.zeros_like(iterations))
     if not _all_declared(problem):
         stage = _estimate_noise(stage, options)
+    stage = _set_apart(stage, options)
     if options.robust:
         stage = _downweigh(stage, options)
     return _finished(stage, options, finite, iterations)
@@ -281,6 +283,7 @@ def _robustly(
         covariance=wider.covariance,
         constants=wider.constants,
         effects=wider.effects,
+        of_settings=wider.of_settings,
         variance_factor=_bounded_factor(analysis, trust, loss, freedom),
     )
 
@@ -319,6 +322,22 @@ def _in_turn(stage: _Stage, rounds: int, turn: Callable[[_Stage], tuple[_Stage, 
     return stage if len(active) == len(whole.trust) else put(whole, active, stage)
 
 
+def _set_apart(stage: _Stage, options: Options) -> _Stage:
+    """The stage with stations of a setting set apart where residuals clearly show it, and noise anew."""
+    evidence = stage.problem.evidence
+    if options.separate_solver or not (evidence.assumed and evidence.set_together.any()):
+        return stage
+    problem, state = stage.problem, stage.solved.state
+    shown = np.flatnonzero(set_apart(problem, state, analyse(problem, state)))
+    if not shown.size:
+        return stage
+    part = take(stage, shown)
+    evidence = replace(part.problem.evidence, apart=np.ones(len(shown)))
+    problem = part.problem.of_other_noise(part.problem.triads, evidence)
+    part = replace(part, problem=problem, solved=solve(problem, part.solved.state, options))
+    return put(stage, shown, _estimate_noise(part, options))
+
+
 def _estimate_noise(stage: _Stage, options: Options) -> _Stage:
     """Variance per triad by restricted maximum likelihood, fit and estimate in turn.
 
@@ -326,7 +345,9 @@ def _estimate_noise(stage: _Stage, options: Options) -> _Stage:
     """
     free = [i for i, triad in enumerate(stage.problem.triads) if not triad.declared]
     scatter = stage.problem.evidence.scatter
-    rounds, least = (SCATTER_ROUNDS, SCATTER_SETTLED) if scatter else (NOISE_ROUNDS, SETTLED)
+    apart = stage.problem.evidence.apart.any()
+    slow = scatter or apart
+    rounds, least = (SCATTER_ROUNDS, SCATTER_SETTLED) if slow else (NOISE_ROUNDS, SETTLED)
 
     def turn(now: _Stage) -> tuple[_Stage, Bools]:
         analysis = analyse(now.problem, now.solved.state)
@@ -337,6 +358,10 @@ def _estimate_noise(stage: _Stage, options: Options) -> _Stage:
             ratios = scatter_ratios(now.problem, solved.state, analysis)
             problem = with_scatter(problem, solved.state, ratios)
             settled &= _steady(now.problem, problem)
+        if apart:
+            problem = with_share(problem, solved.state, analysis)
+            before, share = (p.evidence.apart for p in (now.problem, problem))
+            settled &= np.abs(share - before) <= SCATTER_SETTLED * before
         steps = now.steps
         if options.method != "swarm":
             solved = solve(problem, solved.state, options)
@@ -414,7 +439,8 @@ def _louder(problem: Problem, factor: Array) -> Problem:
     """The problem with the readings and angles of each station noisier by a factor (B, n)."""
     triads = tuple(replace(t, sd=t.sd * factor[..., None]) for t in problem.triads)
     evidence = problem.evidence
-    sd = {n: s * factor if n in ANGLES else s for n, s in evidence.sd.items()}
+    lone = {n: np.where(evidence.alone(n), factor, 1.0) for n in ANGLES}
+    sd = {n: s * lone.get(n, 1.0) for n, s in evidence.sd.items()}
     scatter = {n: s * factor for n, s in evidence.scatter.items()}
     return problem.of_other_noise(triads, replace(evidence, sd=sd, scatter=scatter))
 

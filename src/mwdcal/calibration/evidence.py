@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from mwdcal.calibration.readings import CONSTANTS, Readings
+from mwdcal.calibration.settings import DIRECTION, numbered
 from mwdcal.estimation.evidence import ANGLES, UNKNOWN, Evidence, SharedConstant
 from mwdcal.geometry.vectors import AnyArray, Array, Ints
 from mwdcal.sensor.profile import COMMON
@@ -34,9 +35,29 @@ def evidence_of(readings: Readings, include: Array) -> Evidence:
     if readings.magnetometer is None:  # unread: any value will do
         known |= {name: np.nan_to_num(known[name], nan=1.0) for name in ("field", "dip")}
         sd |= {name: np.zeros(group.shape) for name in ("field", "dip")}
-    bare = Evidence(known, sd, group, included, (), stand=_stand(readings, lead))
+    alone = np.full(group.shape, -1)
+    apart, stand = np.zeros(len(group)), _stand(readings, lead)
+    bare = Evidence(known, sd, group, alone, apart, included, (), stand=stand)
     known, sd = _share_known(bare)
-    return replace(bare, known=known, sd=sd, constants=constants(bare))
+    setting = _settings(readings, group, known, sd)
+    assumed = not readings.settings
+    bare = replace(bare, known=known, sd=sd, setting=setting, assumed=assumed)
+    return replace(bare, constants=constants(bare))
+
+
+def _settings(
+    readings: Readings, group: Ints, known: dict[str, Array], sd: dict[str, Array]
+) -> Ints:
+    """Number (B, n) of the setting of the stand that a station shares with others, -1 of its own.
+
+    Exact references have none.
+    """
+    angles = [known[name] for name in DIRECTION]
+    uncertain = np.any([sd[name] > 0 for name in DIRECTION], 0)
+    if not uncertain.any():
+        return np.full(group.shape, -1)
+    number = numbered(group, angles, readings.settings)
+    return _shared_groups(np.where(uncertain, number, -1))
 
 
 def _stand(readings: Readings, lead: tuple[int, ...]) -> dict[str, Array]:
@@ -74,8 +95,7 @@ def _shared_groups(group: Ints) -> Ints:
 def _share_known(evidence: Evidence) -> tuple[dict[str, Array], dict[str, Array]]:
     """References and their σ where blank angles of a group take the mean of its filled cells.
 
-    One error is then common to the group: every member gets a σ that leaves the group as
-    uncertain as the mean of its k filled cells, σ √(members / k).
+    One error is then common to the group: that of its filled cells, whose mean has no smaller one.
     """
     known, spread = dict(evidence.known), dict(evidence.sd)
     if (evidence.group < 0).all():
@@ -87,8 +107,8 @@ def _share_known(evidence: Evidence) -> tuple[dict[str, Array], dict[str, Array]
         turn = np.einsum("bnk,bn->bk", filled, np.exp(1j * np.nan_to_num(known[name])))
         square = np.einsum("bnk,bn->bk", filled, evidence.sd[name] ** 2)
         partly = (count > 0) & (count < total)
-        factor = np.where(partly, total / np.maximum(count, 1) ** 2, 0.0)
-        common = np.einsum("bnk,bk->bn", evidence.members, np.sqrt(square * factor))
+        common = np.sqrt(square / np.maximum(count, 1)) * partly
+        common = np.einsum("bnk,bk->bn", evidence.members, common)
         mean = np.einsum("bnk,bk->bn", evidence.members, np.angle(turn))
         within = np.einsum("bnk,bk->bn", evidence.members, partly) > 0
         known[name] = np.where(within & ~given, mean, known[name])

@@ -199,7 +199,8 @@ def _by_newton(problem: Problem, state: State, paper: bool) -> Solved:
     noise = np.sqrt(np.mean(triad.sd**2, -1))
     weights = np.full((*gravity.shape, 2), PAPER_WEIGHT)
     if not paper:
-        weights = propagated(gravity, noise, evidence.sd["inclination"])
+        lone = np.where(evidence.alone("inclination"), evidence.sd["inclination"], 0.0)
+        weights = propagated(gravity, noise, lone)
     weights = weights * evidence.include[..., None]
     minimum = newton(
         triad.model, nominal, triad.raw, problem.temperature, gravity,

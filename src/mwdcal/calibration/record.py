@@ -19,6 +19,7 @@ from mwdcal.calibration.canonical import Signature, document_sha256
 from mwdcal.calibration.drift import Constant, Drift
 from mwdcal.calibration.notebooks import html_table
 from mwdcal.calibration.readings import NANOTESLA, SOAK_GAP, Readings, simulated, stated_day
+from mwdcal.calibration.tilt import tilt_width
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, diagonal
@@ -37,6 +38,10 @@ MAGNETIC = ("azimuth", "field", "dip", "magnetic_toolface", "north_toolface", "b
 NOISE, SETTINGS = "noise of the readings", "settings of the stand"
 REPEATABILITY, ORDER = "repeatability of the readings", "order of the temperature terms"
 """Sources of a budget."""
+MOST_FREEDOM = 1e6
+"""Degrees of freedom that stand for infinitely many."""
+DOUBT = 0.05
+"""Chance of residuals so large, if all is as declared, from which on a declared noise counts as known."""
 SCALED = (NOISE, REPEATABILITY, SETTINGS)
 """Sources whose variance is scaled by that of the residuals."""
 AXES_OF_A_TERM = 3
@@ -210,6 +215,12 @@ class TriadCalibration(msgspec.Struct, frozen=True, kw_only=True):
     degrees_of_freedom: float
     misfit_probability: float | None = None
 
+    @property
+    def freedom_of_noise(self) -> float:
+        """Degrees of freedom of its noise: of the residuals, unless these agree with a declared one."""
+        agrees = (self.misfit_probability or 0.0) > DOUBT and self.noise_source == "declared"
+        return MOST_FREEDOM if agrees else self.degrees_of_freedom
+
     def functions(self, reference: float) -> Model:
         """The model that these parameters belong to."""
         basis = Basis(self.order, reference)
@@ -230,6 +241,8 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     `excluded` the labels of stations of the run that were left out of the fit on request.
     `serial` is that of the tool, absent where the run states none; `simulated`: of the run or the prior;
     `prior_sha256` of the file of the prior, absent where there was none.
+    `settings`: whether the errors of the stand's direction are "per-direction" or "per-station", or
+    "assumed" to be per direction; absent where the stand's direction is exact, and in earlier versions.
     `gravity_stated`: whether the run states gravity at any station; absent in earlier versions.
     `sha256` is `content_sha256` of the record as it was made; earlier versions have none.
     `signature` is absent until the file is signed, and in a record that is made from another.
@@ -264,6 +277,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     stand: StandErrors = StandErrors()
     earth: dict[str, float]
     gravity_stated: bool | msgspec.UnsetType = msgspec.UNSET
+    settings: str | msgspec.UnsetType = msgspec.UNSET
     budget: list[BudgetRow] = []
     assumed_exact: list[str] = []
     errors: list[ErrorRow]
@@ -497,7 +511,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
 
         Student's t with the `effective_freedom` of the observable; NaN as in `uncertainty`.
         Singular: near vertical an error across the tool axis tilts it whichever way it points, so
-        that of the inclination is the length of a vector; see `_tilt_width`.
+        that of the inclination is the length of a vector; see `tilt_width`.
         """
         from scipy.special import stdtrit
 
@@ -506,7 +520,10 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         width = np.asarray(sd * stdtrit(freedom, (1 + probability) / 2))
         if name != "inclination":
             return width
-        return self._tilt_width(readings, width, freedom, probability)
+        g, _ = self.fields(readings)
+        rows = self.jacobian(readings)[..., :2, :] / np.linalg.norm(g, axis=-1)[..., None, None]
+        spread = rows @ self.parameter_covariance @ rows.mT
+        return tilt_width(g, spread, width, freedom, probability)
 
     def effective_freedom(self, name: str) -> float:
         """Effective degrees of freedom of the uncertainty of an observable, one or more.
@@ -514,14 +531,15 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         Definition: Welch-Satterthwaite for the sources of the budget, which are independent; the
         triads are not, by the errors that they share. What the residuals scale has the degrees of
         freedom of the triad with the fewest, the order of the temperature terms those of the axes
-        that it is seen on, all else infinitely many. No more are counted than that triad has, as the
+        that it is seen on, all else infinitely many: a declared noise too that the residuals agree
+        with. No more are counted than that triad has, as the
         shares differ with attitude; an observable without a share has the fewest of any angle.
         Reference: JCGM 100:2008, G.4.
         """
         triads = self.triads if name in MAGNETIC else [self.accelerometer]
-        fewest = max(min(triad.degrees_of_freedom for triad in triads), 1.0)
+        fewest = max(min(triad.freedom_of_noise for triad in triads), 1.0)
         angles = [angle for angle in ANGLE_COLUMNS if angle == f"{name}_deg"] or ANGLE_COLUMNS
-        return min(self._freedom_by_source(angle, fewest) for angle in angles)
+        return min(min(self._freedom_by_source(angle, fewest) for angle in angles), MOST_FREEDOM)
 
     def _freedom_by_source(self, angle: str, fewest: float) -> float:
         """Welch-Satterthwaite for an angle of the budget; `fewest`: of what the residuals scale."""
@@ -529,27 +547,6 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         scaled = sum(variance.get(source, 0.0) for source in SCALED)
         spread = scaled**2 / fewest + variance.get(ORDER, 0.0) ** 2 / AXES_OF_A_TERM
         return min(sum(variance.values()) ** 2 / spread, fewest) if spread else fewest
-
-    def _tilt_width(
-        self, readings: Readings, width: Array, freedom: float, probability: float
-    ) -> Array:
-        """The half width (…, n) of inclination: `width` away from vertical, that of a tilt near it.
-
-        Definition: the tilt (gx, gy) / |g| has two errors, and with their larger uncertainty u its
-        error is below k u, k² = ν ((1 - p)^(-2/ν) - 1), Hotelling's for two. The one takes over from
-        the other between tilts of k u and 2 k u. Reference: JCGM 102, 7.
-        """
-        g, _ = self.fields(readings)
-        rows = self.jacobian(readings)[..., :2, :] / np.linalg.norm(g, axis=-1)[..., None, None]
-        spread = rows @ self.parameter_covariance @ rows.mT
-        half, odd = (spread[..., 0, 0] + spread[..., 1, 1]) / 2, spread[..., 0, 1]
-        largest = half + np.hypot((spread[..., 0, 0] - spread[..., 1, 1]) / 2, odd)
-        factor = freedom * np.expm1(-2 / freedom * np.log1p(-probability))
-        tilt_width = np.sqrt(np.maximum(largest, 0.0) * factor)
-        tilt = np.linalg.norm(g[..., :2], axis=-1) / np.linalg.norm(g, axis=-1)
-        share = np.clip(tilt / np.maximum(tilt_width, 1e-300) - 1, 0.0, 1.0)
-        share = share**2 * (3 - 2 * share)
-        return np.asarray(tilt_width + share * (width - tilt_width) + 0 * width)
 
     def rests_on_free(self, name: str, readings: Readings) -> Bools:
         """Where (…, n) an observable moves with a direction that no evidence determines."""

@@ -338,8 +338,8 @@ def tail(square: Array, freedom: Array) -> Array:
     return chance
 
 
-def chi_chance(square: Array, freedom: Array) -> Array:
-    """Chance of a larger χ² with any degrees of freedom, to a tenth of it from four on.
+def chi_chance(square: Array, freedom: Array, small: bool = False) -> Array:
+    """Chance of a larger χ², or a smaller one, with any degrees of freedom, to a tenth of it from four on.
 
     Reference: E. B. Wilson and M. M. Hilferty, Proc. Natl. Acad. Sci. 17, 684 (1931).
 
@@ -348,7 +348,7 @@ def chi_chance(square: Array, freedom: Array) -> Array:
     """
     spread = 2 / (9 * np.maximum(freedom, 1e-9))
     normal = (np.cbrt(square / np.maximum(freedom, 1e-9)) - 1 + spread) / np.sqrt(2 * spread)
-    return np.asarray(0.5 * np.vectorize(erfc, otypes=[float])(normal))
+    return np.asarray(0.5 * np.vectorize(erfc, otypes=[float])(-normal if small else normal))
 
 
 def _scaled(errors: dict[str, Array], factors: dict[str, float], index: int) -> dict[str, float]:

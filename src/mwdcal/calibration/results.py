@@ -1,11 +1,12 @@
 """What a fit states of its tools, as arrays: a calibration file is one row of them, a fleet table all.
 
 Parameters, their uncertainties, constants of the run, errors of the stand; and the covariance, by
-source of error. What the readings' noise and the settings of the stand do is independent from
-station to station and scales with s². Errors that all stations have in common (zeros and tilt of
-the stand, the references for gravity, field and dip) and a prior are as large as they were
-declared: no residual says how large they are. What the order of the temperature terms leaves out
-is added to both.
+source of error. What the readings' noise and angles that the stand sets at every station do is
+independent from station to station and scales with s² where that is above one: residuals smaller
+than declared are no evidence that a declaration was too cautious. Errors that stations have in
+common (settings of a direction, zeros and tilt of the stand, the references for gravity, field and
+dip) and a prior are as large as they were declared: no residual says how large they are. What the
+order of the temperature terms leaves out is added to both.
 """
 
 from __future__ import annotations
@@ -42,9 +43,14 @@ EVEN = 1e-6
 
 
 def variance_scales(result: Fit) -> Array:
-    """What scales each triad's variances (B, t): s², or 1 where there is no redundancy."""
+    """What scales each triad's variances (B, t): s², or 1 where there is no redundancy.
+
+    No less than 1 for declared noise, which residuals never shrink.
+    """
     usable = result.analysis.freedom >= 1
-    return np.where(usable, np.nan_to_num(result.analysis.variance_factor, nan=1.0), 1.0)
+    factor = np.nan_to_num(result.analysis.variance_factor, nan=1.0)
+    least = np.where(np.isnan(result.noise), 1.0, 0.0)
+    return np.where(usable, np.maximum(factor, least), 1.0)
 
 
 @dataclass(frozen=True)
@@ -62,13 +68,30 @@ class StatedCovariance:
         analysis, precision = self.result.analysis, self.result.problem.prior.precision
         effects, covariance = analysis.effects, analysis.covariance
         prior = covariance @ precision @ covariance if precision.any() else 0 * precision
-        shared = effects @ effects.mT + prior
-        independent = _scaled(self.result, covariance - shared)
-        return independent, shared, prior, misfit_covariance(self.result)
+        common = np.concatenate([effects, analysis.of_settings], -1)
+        shared = common @ common.mT + prior
+        noise = _scaled(self.result, covariance - shared - self._unscaled_settings)
+        return noise + self._lone_settings, shared, prior, misfit_covariance(self.result)
+
+    @cached_property
+    def _unscaled_settings(self) -> Array:
+        """From angles that the stand sets at every station, as they are declared."""
+        return _of_lone_settings(self.result)
+
+    @property
+    def _lone_settings(self) -> Array:
+        """The same as it is stated: times s² of both triads together if that is above one.
+
+        One turn of the stand moves both triads: one factor, so that what they share stays alike.
+        """
+        analysis = self.result.analysis
+        squares = np.nan_to_num(analysis.variance_factor * analysis.freedom).sum(-1)
+        together = np.maximum(squares / np.maximum(analysis.freedom.sum(-1), 1.0), 1.0)
+        return np.asarray(self._unscaled_settings * together[:, None, None])
 
     @cached_property
     def total(self) -> Array:
-        """Covariance (B, p, p): independent errors times s², others as they are."""
+        """Covariance (B, p, p): independent errors times s² if that is above one, others as they are."""
         independent, shared, _, order = self._parts
         return np.asarray(independent + shared + order)
 
@@ -91,9 +114,10 @@ class StatedCovariance:
         of the declared noise that comes under this name.
         """
         result, (independent, _, prior, order) = self.result, self._parts
-        settings = _scaled(result, _of_settings(result))
+        lone = self._lone_settings
         repeated = _scaled(result, _of_repeatability(result, repeatability))
-        noise = independent - settings - repeated
+        noise, together = independent - lone - repeated, result.analysis.of_settings
+        settings = lone + together @ together.mT
         shares = {NOISE: noise, REPEATABILITY: repeated, SETTINGS: settings}
         for index, constant in enumerate(result.problem.evidence.constants):
             name, effect = common_source(constant.name), result.analysis.effects[..., index]
@@ -103,7 +127,7 @@ class StatedCovariance:
 
 
 def constants_covariance(result: Fit) -> Array:
-    """Covariance (B, q, q) of the constants of the run; what the readings do to it is times s².
+    """Covariance (B, q, q) of the constants of the run; what the readings do to it is times s² above one.
 
     Errors of references and stand that were declared with a precision Λ do V Λ V to their covariance V, whatever
     the residuals are. None is more uncertain than it was declared.
@@ -188,13 +212,14 @@ def unconfirmed_dip(result: Fit) -> Array:
 
 
 def _scaled(result: Fit, covariance: Array) -> Array:
+    """A covariance (B, p, p) of independent errors of the readings times the `variance_scales`."""
     sizes = [t.model.size for t in result.problem.triads]
     grown = np.repeat(np.sqrt(variance_scales(result)), sizes, axis=-1)
     return np.asarray(covariance * outer(grown))
 
 
-def _of_settings(result: Fit) -> Array:
-    """Covariance (B, p, p) from independent errors of the stand's angles, before scaling.
+def _of_lone_settings(result: Fit) -> Array:
+    """Covariance (B, p, p) from errors of angles that the stand sets at every station, before scaling.
 
     A station's reading has the covariance C = I + GGᵀ in units of its noise, the columns of G being
     what its unknowns do; those of known angles are meant here.

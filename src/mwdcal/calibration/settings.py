@@ -6,6 +6,8 @@ down over the turn, and small scatter within the set is no evidence that it is s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from mwdcal.calibration.readings import Readings
@@ -17,7 +19,9 @@ ASSUMED = (
     "Assumed: direction set once per roll set; state [stand] settings in the profile, as "
     '"per-direction" or "per-station".'
 )
-"""The assumption where nobody states the practice of the stand."""
+"""The assumption where nobody states the practice of the stand…"""
+ASSUMED_PRACTICE = "assumed"
+"""…and what a calibration says of it."""
 EQUAL = 1e-6
 """References closer than this are one setting, radians: they differ by rounding alone."""
 
@@ -30,21 +34,23 @@ def settings_of(readings: Readings) -> Ints:
     group with equal references, wherever they are in the run. Returning to a direction later is a
     new setting. Stations without either angle have a setting of their own.
     """
-    shape = readings.accelerometer.shape[:-1]
-    group = np.broadcast_to(readings.groups, shape)
-    angles = [readings.reference(name) for name in DIRECTION]
-    next_to = [np.stack([x[..., 1:], x[..., :-1]]) for x in (group, *angles)]
-    shared = _equal(*next_to)
-    if readings.settings == "per-station":
+    group = np.broadcast_to(readings.groups, readings.accelerometer.shape[:-1])
+    return numbered(group, [readings.reference(name) for name in DIRECTION], readings.settings)
+
+
+def numbered(group: Ints, angles: Sequence[Array], practice: str) -> Ints:
+    """`settings_of` stations of groups (..., n) and reference inclination and azimuth (..., n), by a practice."""
+    pair = slice(1, None), slice(None, -1)
+    shared = _equal([group[..., k] for k in pair], [[x[..., k] for k in pair] for x in angles])
+    if practice == "per-station":
         shared &= group[..., 1:] >= 0
-    first = np.ones((*shape[:-1], 1), bool)
+    first = np.ones((*group.shape[:-1], 1), bool)
     number = np.cumsum(np.concatenate([first, ~shared], -1), -1) - 1
     if (group < 0).all():
         return np.asarray(number)
-    pairs = [
-        np.stack(np.broadcast_arrays(x[..., :, None], x[..., None, :])) for x in (group, *angles)
-    ]
-    earliest = np.argmax(_equal(*pairs), -1)
+    side = (..., slice(None), None), (..., None, slice(None))
+    equal = _equal([group[k] for k in side], [[x[k] for k in side] for x in angles])
+    earliest = np.argmax(equal, -1)
     grouped = (group >= 0) & ~np.all(np.isnan(angles), 0)
     return np.where(grouped, np.take_along_axis(number, earliest, -1), number)
 
@@ -59,9 +65,12 @@ def is_assumed(readings: Readings) -> bool:
     return not readings.settings and bool(together.any())
 
 
-def _equal(group: Ints, *angles: Array) -> Bools:
-    """Where two stations (2, ...) are of one group and have the same known reference direction."""
-    blank = [np.isnan(angle) for angle in angles]
-    same = [np.abs(centred(angle[0] - angle[1])) < EQUAL for angle in angles]
-    same = [each | none.all(0) for each, none in zip(same, blank, strict=True)]
-    return np.asarray(np.all(same, 0) & ~np.all(blank, (0, 1)) & (group[0] == group[1]))
+def _equal(group: Sequence[Ints], angles: Sequence[Sequence[Array]]) -> Bools:
+    """Where two stations are of one group and have the same known reference direction."""
+    first, second = group
+    equal, given = first == second, np.zeros((), bool)
+    for angle, other in angles:
+        blank = np.isnan(angle), np.isnan(other)
+        equal = equal & ((np.abs(centred(angle - other)) < EQUAL) | (blank[0] & blank[1]))
+        given = given | ~(blank[0] | blank[1])
+    return np.asarray(equal & given)

@@ -24,12 +24,14 @@ from mwdcal.calibration.record import (
     SETTINGS,
     BudgetRow,
     Calibration,
+    TriadCalibration,
     stated,
 )
 from mwdcal.calibration.results import PRIOR
 from mwdcal.certificate.decisions import PROBABILITY, student_factor
 from mwdcal.certificate.document import Budget, BudgetLine
 from mwdcal.geometry.vectors import Array
+from mwdcal.sensor.profile import PRACTICES
 
 STAND_ANGLES = ("inclination", "azimuth", "toolface")
 """Angles that a stand sets."""
@@ -170,9 +172,16 @@ def _basis(calibration: Calibration, source: str) -> str:
         apart = any(row.source == REPEATABILITY for row in calibration.budget)
         return each if apart else f"{each}; with the repeatability of the tool during the run"
     if source == REPEATABILITY:
-        return "declared in the tool profile; scaled by the residuals"
+        return "declared in the tool profile; no less than declared"
     if source == SETTINGS:
-        return f"declared for the stand{settings_in_words(calibration)}; scaled by the residuals"
+        common = {
+            PRACTICES[0]: "common to stations of one direction",
+            PRACTICES[1]: "set at every station",
+        }
+        practice = common.get(
+            str(calibration.settings), "assumed common to stations of one direction"
+        )
+        return f"declared for the stand{settings_in_words(calibration)}; {practice}"
     if source == ORDER:
         return "scatter of the soaks about the temperature terms"
     if source == PRIOR:
@@ -180,11 +189,13 @@ def _basis(calibration: Calibration, source: str) -> str:
     return "declared; common to all stations"
 
 
-def _scaled(triad: object) -> str:
-    factor, freedom = (getattr(triad, n) for n in ("variance_factor", "degrees_of_freedom"))
+def _scaled(triad: TriadCalibration) -> str:
+    factor = triad.variance_factor
     if factor is None:
         return ", not tested by residuals"
-    return f", scaled by the residuals (s = {factor**0.5:.3g}, {freedom:.0f} degrees of freedom)"
+    shown = f"s = {factor**0.5:.3g}, {triad.degrees_of_freedom:.0f} degrees of freedom"
+    confirmed = triad.noise_source == "declared" and factor <= 1.0
+    return f", {'not exceeded' if confirmed else 'scaled'} by the residuals ({shown})"
 
 
 def settings_in_words(calibration: Calibration) -> str:

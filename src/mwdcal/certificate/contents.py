@@ -19,6 +19,7 @@ from msgspec.structs import replace
 from mwdcal.calibration.canonical import canonical, rounded
 from mwdcal.calibration.readings import is_simulated, serial_of, stated_day
 from mwdcal.calibration.record import SOFTWARE, Calibration, Finding
+from mwdcal.calibration.settings import ASSUMED, ASSUMED_PRACTICE
 from mwdcal.certificate.budget import assumed_exact, budget
 from mwdcal.certificate.decisions import When, conformity
 from mwdcal.certificate.document import (
@@ -150,6 +151,8 @@ def _findings(contents: Certificate, calibration: Calibration) -> Iterator[Findi
     for standard in contents.traceability:
         yield from _out_of_date(standard, contents.calibrated)
     yield from _exact(calibration)
+    if calibration.settings == ASSUMED_PRACTICE:
+        yield Finding(id="settings-assumed", text=ASSUMED)
 
 
 def _unstated_day(day: date, order: Order) -> Finding:

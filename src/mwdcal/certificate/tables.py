@@ -151,7 +151,7 @@ def _accuracy(calibration: Calibration) -> ResultTable:
 
 def _parameters(calibration: Calibration, triad: TriadCalibration) -> ResultTable:
     """The parameters of a triad; none that the model holds at zero, and no value of an undetermined one."""
-    k = float(student_factor(triad.degrees_of_freedom))
+    k = float(student_factor(triad.freedom_of_noise))
     quantities, held = [], []
     columns = (triad.parameter_names, triad.parameters, triad.standard_uncertainties)
     for name, value, sd in zip(*columns, strict=True):

@@ -53,8 +53,11 @@ class SharedConstant:
 class Evidence:
     """What is known of the stations: arrays (B, n), radians, g, nT; NaN where unknown.
 
-    `sd` of the angles are independent per station. `group` shares a direction among
-    stations of the same number (-1: none). `include` is 1 for stations that count, 0 for
+    `sd` of the angles are independent per station, but for inclination and azimuth of stations of one
+    `setting` of the stand (-1: of their own): these have one error in common, and errors of their own by
+    a share `apart` (B,) of the σ, which is estimated where the practice of the stand is only `assumed`.
+    `group` shares a direction
+    among stations of the same number (-1: none). `include` is 1 for stations that count, 0 for
     those left out. `absent` names the strengths and the dip of which nothing may be used:
     each station then has its own. `stand` (B,) are the standard uncertainties of errors that all
     stations have in common, by name of `STAND_ERRORS`. `scatter` (B, n) is how far what should be
@@ -65,8 +68,11 @@ class Evidence:
     known: dict[str, Array]
     sd: dict[str, Array]
     group: Ints
+    setting: Ints
+    apart: Array
     include: Array
     constants: tuple[SharedConstant, ...]
+    assumed: bool = False
     absent: tuple[str, ...] = ()
     stand: Mapping[str, Array] = field(default_factory=dict)
     scatter: dict[str, Array] = field(default_factory=dict)
@@ -96,6 +102,23 @@ class Evidence:
         return {name: self.members * groups[:, None, :] for name, groups in unknown.items()}
 
     @cached_property
+    def set_together(self) -> Array:
+        """σ (B, n, 2 k) of inclination, then azimuth, that stations have from each of k settings."""
+        numbers = np.arange(int(self.setting.max(initial=-1)) + 1)
+        members = np.asarray(self.setting[..., None] == numbers, float)
+        each = [np.where(self.is_known(n), self.sd[n], 0.0)[..., None] for n in ANGLES[:2]]
+        return np.concatenate([members * sd for sd in each], -1)
+
+    @cached_property
+    def referenced(self) -> Bools:
+        """Where each angle (B, n, 3) has a reference."""
+        return np.stack([self.is_known(name) for name in ANGLES], -1)
+
+    def alone(self, name: str) -> Bools:
+        """Stations (B, n) whose error of an angle is not that of a setting."""
+        return np.asarray((self.setting < 0) | (name == "toolface"))
+
+    @cached_property
     def free(self) -> Bools:
         """Stations (B, n) of which neither direction nor toolface is known."""
         given = [self.is_known(name) for name in ANGLES]
@@ -104,7 +127,9 @@ class Evidence:
     @cached_property
     def turn_sd(self) -> Array:
         """Standard uncertainties (B, n, 3) of the angles that each station has for itself."""
-        return self._turn_sd(self.sd)
+        share = self.apart[:, None]
+        lone = {n: self.sd[n] * np.where(self.alone(n), 1.0, share) for n in ANGLES}
+        return self._turn_sd(lone)
 
     @cached_property
     def exact_turn_sd(self) -> Array:

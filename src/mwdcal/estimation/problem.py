@@ -29,11 +29,13 @@ from mwdcal.estimation.evidence import EARTH, STAND, STAND_ERRORS, UNKNOWN, WALK
 from mwdcal.estimation.solvers import Linear
 from mwdcal.geometry.vectors import (
     Array,
+    Bools,
     earth_field,
     earth_gravity,
     eigen,
     inverse,
     outer,
+    quotient,
     rotation,
     skew,
 )
@@ -51,7 +53,7 @@ WALK_AXES = {
     for axis, name in enumerate(names)
 }
 """Number of the walk and of its axis by the name of a constant."""
-NOISELESS = ("state", "predictions", "linear True")
+NOISELESS = ("state", "attitude", "predictions", "linear True")
 """What a problem's memo has that no noise enters."""
 
 
@@ -69,13 +71,18 @@ class Triad:
 class State:
     """Where a fit stands: parameters (B, p), attitudes (B, n, 3, 3), constants (B, q).
 
-    `departures` (B, n, a) are what each station's own strengths and dip add where they are absent.
+    `attitude` has known angles at their references: `errors` (B, n, 3), radians, are by what a station's own
+    inclination, azimuth and toolface differ from these, and `settings` (B, 2 k) by how many σ those of
+    each setting of the stand do. `departures` (B, n, a) are what each station's own strengths and dip
+    add where they are absent.
     """
 
     params: Array
     attitude: Array
     constants: Array
     departures: Array
+    errors: Array
+    settings: Array
 
 
 @dataclass(frozen=True)
@@ -135,6 +142,19 @@ class Problem:
         other.memo.update({name: self.memo[name] for name in NOISELESS if name in self.memo})
         return other
 
+    def start(self, params: Array, attitude: Array) -> State:
+        """A state at parameters (B, p) and attitudes (B, n, 3, 3), all else at its reference."""
+        shape, evidence = self.temperature.shape, self.evidence
+        constants = [constant.value for constant in evidence.constants]
+        return State(
+            params,
+            attitude,
+            np.stack(constants, -1) if constants else np.zeros((shape[0], 0)),
+            np.zeros((*shape, len(evidence.absent))),
+            np.zeros((*shape, 3)),
+            np.zeros((shape[0], evidence.set_together.shape[-1])),
+        )
+
     def slices(self) -> list[slice]:
         """Where each triad's parameters lie."""
         ends = np.cumsum([0] + [t.model.size for t in self.triads])
@@ -160,12 +180,40 @@ class Problem:
 
     def targets(self, state: State) -> list[Array]:
         """Vectors (B, n, 3) that perfect triads would read: gravity, then the field."""
-        return self._seen(state, *(self.constant(state, c) for c in EARTH))
+        return self._seen(self.attitude(state), *(self.constant(state, c) for c in EARTH))
 
     @staticmethod
-    def _seen(state: State, gravity: Array, field: Array, dip: Array) -> list[Array]:
+    def _seen(attitude: Array, gravity: Array, field: Array, dip: Array) -> list[Array]:
         earth = earth_gravity(gravity), earth_field(field, dip)
-        return [np.einsum("bnij,bnj->bni", state.attitude, vector) for vector in earth]
+        return [np.einsum("bnij,bnj->bni", attitude, vector) for vector in earth]
+
+    def attitude(self, state: State) -> Array:
+        """Attitudes (B, n, 3, 3) with the errors of known angles in."""
+        if not (state.errors.any() or state.settings.any()):
+            return state.attitude
+        return self.once("attitude", state, self._misaligned)
+
+    def _misaligned(self, state: State) -> Array:
+        """Base attitudes inclined, turned about down, and rolled by the errors of these angles."""
+        inclination, azimuth, _ = np.moveaxis(self._angle_errors(state), -1, 0)
+        tilt = rotation(inclination[..., None] * self._across(state))
+        turn = rotation(azimuth[..., None] * np.array([0.0, 0.0, 1.0]))
+        return np.asarray(self._rolled(state) @ tilt @ turn)
+
+    def _rolled(self, state: State) -> Array:
+        """Base attitudes rolled by the errors of toolfaces: what a turn of the base turns the tool about."""
+        if not state.errors[..., 2].any():
+            return state.attitude
+        roll = rotation(state.errors[..., 2:] * np.array([0.0, 0.0, 1.0]))
+        return np.asarray(roll @ state.attitude)
+
+    def _angle_errors(self, state: State) -> Array:
+        """Errors (B, n, 3) of known angles: the station's own and those of its setting."""
+        common = self.evidence.set_together * state.settings[:, None]
+        parts = np.split(common, 2, -1)
+        errors = state.errors.copy()
+        errors[..., :2] += np.stack([part.sum(-1) for part in parts], -1)
+        return errors
 
     def once(self, name: str, state: State, find: Callable[[State], _Result]) -> _Result:
         """What `find` finds at a state, kept under a name until something is asked at another."""
@@ -183,6 +231,7 @@ class Problem:
 
     def _predictions(self, state: State) -> list[Prediction]:
         gravity, field, dip = (self.constant(state, c) for c in EARTH)
+        attitude = self.attitude(state)
         one, zero = np.ones_like(gravity), np.zeros((*gravity.shape, 3))
         changes = (
             [earth_gravity(one), zero, zero],
@@ -192,7 +241,7 @@ class Problem:
         for triad, where, target, change in zip(
             self.triads,
             self.slices(),
-            self._seen(state, gravity, field, dip),
+            self._seen(attitude, gravity, field, dip),
             changes,
             strict=False,
         ):
@@ -200,7 +249,7 @@ class Problem:
             fields = triad.model.fields(params, triad.raw, self.temperature)
             back = inverse(triad.model.slope(params, triad.raw, self.temperature))
             misfit = np.einsum("bnij,bnj->bni", back, fields - target)
-            by_vector = -back @ state.attitude
+            by_vector = -back @ attitude
             by_params = triad.model.jacobian(params, triad.raw - misfit, self.temperature)
             result.append(
                 Prediction(
@@ -222,22 +271,38 @@ class Problem:
         return self.once(f"linear {geometry}", state, partial(self._linear, geometry))
 
     def _linear(self, geometry: bool, state: State) -> Linear:
+        if geometry and (state.errors.any() or state.settings.any()):
+            state = replace(state, errors=0 * state.errors, settings=0 * state.settings)
         residual, blocks, turns, by_earth = self._whitened(state, geometry)
+        angles = turns @ self._angle_axes(state)
+        residual = residual - np.einsum("bnmi,bni->bnm", angles, state.errors)
         constants = self._constant_columns(state, by_earth, turns, geometry)
         if not geometry and self.walks:
             drifted = constants[..., self.walks] @ state.constants[:, None, self.walks, None]
             residual = residual + drifted[..., 0]
-        shared = np.concatenate([constants, *self._group_turns(state, turns)], -1)
+        settings = self._setting_columns(angles, geometry)
+        shared = np.concatenate([constants, *self._group_turns(state, turns), settings], -1)
         departures = by_earth[..., [EARTH.index(name) for name in self.evidence.absent]]
         private = [
-            turns @ self._private_turns(state, geometry),
+            self._private_turns(angles, turns, geometry),
             departures * self._absent_scales(state)[..., None, :],
         ]
         if self.evidence.scatter and not geometry:
             columns, scatter = self.scatter_columns(state), self.evidence.scatter
             private += [c * scatter[name][..., None, None] for name, c in columns.items()]
         prior, pull = self._prior(state, blocks, shared.shape[-1], geometry)
-        return Linear(residual, blocks, shared, np.concatenate(private, -1), prior, pull)
+        whole = np.concatenate(private, -1)
+        held, loose = self._held(state, whole.shape[-1])
+        return Linear(residual, blocks, shared, whole, prior, pull, held, loose)
+
+    def _held(self, state: State, count: int) -> tuple[Array, Bools]:
+        """Errors of known angles in units of their σ, among `count` private unknowns, and which are none."""
+        held = np.zeros((*state.errors.shape[:2], count))
+        loose = np.ones(held.shape, bool)
+        sd = np.where(self.evidence.referenced, self.evidence.turn_sd, 0.0)
+        held[..., :3] = quotient(state.errors, sd, sd > 0)
+        loose[..., :3] = sd == 0
+        return held, loose
 
     def _whitened(
         self, state: State, geometry: bool
@@ -246,8 +311,9 @@ class Problem:
 
         Misfit (B, n, m), rows by the parameters of each triad, and the two of `station_columns`.
         """
-        result = []
-        for triad, p in zip(self.triads, self.predictions(state), strict=True):
+        result, known = [], self.memo.get("state") is state or not geometry
+        seen = self.predictions(state) if known else self._predictions(state)
+        for triad, p in zip(self.triads, seen, strict=True):
             noise = GEOMETRIC_NOISE * p.strength[..., None] + np.zeros(3) if geometry else triad.sd
             w = self.evidence.include[..., None] / noise
             row = w[..., None]
@@ -275,6 +341,13 @@ class Problem:
             size = 1.0 if name == "dip" else self.constant(state, name)[..., None, None]
             columns[name] = by_earth[..., [EARTH.index(name)]] * size
         return columns
+
+    def resetting_columns(self, state: State) -> Array:
+        """Whitened rows (B, n, m, 2) by one σ of inclination and azimuth at stations of a setting."""
+        turns, _ = self.station_columns(state)
+        sd = self.evidence.set_together
+        each = np.stack([part.sum(-1) for part in np.split(sd, 2, -1)], -1)
+        return np.asarray((turns @ self._angle_axes(state)[..., :2]) * each[..., None, :])
 
     def _constant_columns(
         self, state: State, by_earth: Array, turns: Array, geometry: bool
@@ -313,7 +386,7 @@ class Problem:
 
     def stand_column(self, state: State, name: str, turns: Array) -> Array:
         """Change (B, n, m) of the misfit by an error of the stand, from `turns` (B, n, m, 3)."""
-        axis = np.einsum("bnij,bnj->bni", state.attitude, self._stand_axis(state, name))
+        axis = np.einsum("bnij,bnj->bni", self._rolled(state), self._stand_axis(state, name))
         return np.asarray(np.einsum("bnmi,bni->bnm", turns, axis))
 
     def _stand_axis(self, state: State, name: str) -> Array:
@@ -346,6 +419,8 @@ class Problem:
             diagonal[:, p + index] = constant.sd**-2
             if not constant.unknown:
                 pull[:, p + index] = state.constants[:, index] - constant.value
+        settings = slice(pull.shape[-1] - state.settings.shape[-1], None)
+        pull[:, settings], diagonal[:, settings] = state.settings, 1.0
         precision = diagonal[..., None] * np.eye(diagonal.shape[-1])
         known = self.prior.precision
         if geometry and known.any():
@@ -354,17 +429,29 @@ class Problem:
         precision[:, :p, :p] = known
         return precision, pull
 
-    def _private_turns(self, state: State, geometry: bool) -> Array:
-        """Axes (B, n, 3, 3), as columns, of the station's private turns times their σ."""
-        across = np.einsum("bnij,bnj->bni", state.attitude, self._across(state))
-        natural = np.stack([across, state.attitude[..., :, 2], np.zeros_like(across)], -1)
-        natural[..., 2, 2] = 1.0
+    def _angle_axes(self, state: State) -> Array:
+        """Axes (B, n, 3, 3), as columns in the tool, about which inclination, azimuth and toolface turn it."""
+        axes = np.zeros(state.attitude.shape)
+        across = np.einsum("bnij,bnj->bni", self._rolled(state), self._across(state))
+        axes[..., 0], axes[..., 1], axes[..., 2, 2] = across, self.attitude(state)[..., :, 2], 1.0
+        return axes
+
+    def _private_turns(self, angles: Array, turns: Array, geometry: bool) -> Array:
+        """Columns (B, n, m, 3) of the station's private turns times their σ.
+
+        From those of its `angles` and of `turns` about the tool's axes, which free stations have.
+        """
         sd = self.evidence.exact_turn_sd if geometry else self.evidence.turn_sd
-        natural *= sd[..., None, :]
-        free = self.evidence.free
-        if not free.any():
-            return natural
-        return np.where(free[..., None, None], UNKNOWN * np.eye(3), natural)
+        natural, free = angles * sd[..., None, :], self.evidence.free
+        return np.where(free[..., None, None], UNKNOWN * turns, natural) if free.any() else natural
+
+    def _setting_columns(self, angles: Array, geometry: bool) -> Array:
+        """Columns (B, n, m, 2 k) of the settings' errors in units of their σ; none of exact references."""
+        sd = self.evidence.set_together
+        if geometry or not sd.shape[-1]:
+            return np.zeros((*angles.shape[:-1], sd.shape[-1]))
+        each = zip(np.moveaxis(angles[..., :2], -1, 0), np.split(sd, 2, -1), strict=True)
+        return np.concatenate([column[..., None] * size[..., None, :] for column, size in each], -1)
 
     def _across(self, state: State) -> Array:
         """Earth axis (B, n, 3) about which a station inclines: horizontal, across its azimuth.
@@ -409,23 +496,26 @@ class Problem:
         """Columns (B, n, m, k) of both shared turns of each group."""
         if not self.evidence.members.shape[-1]:
             return []
-        columns = []
-        for name, axis in self._group_axes(state).items():
-            tool = np.einsum("bnij,bkj->bnik", state.attitude, axis)
+        columns, base = [], (self._rolled(state), self.attitude(state))
+        for attitude, (name, axis) in zip(base, self._group_axes(state).items(), strict=True):
+            tool = np.einsum("bnij,bkj->bnik", attitude, axis)
             columns.append(turns @ tool * self.evidence.shared[name][..., None, :])
         return columns
 
     def move(self, state: State, linear: Linear, step: Array) -> State:
-        """The state after a step; unknown private angles follow, known ones stay at their reference."""
-        p, q = linear.size, len(self.evidence.constants)
+        """The state after a step; unknown private angles and the errors of known ones follow."""
+        p, q, evidence = linear.size, len(self.evidence.constants), self.evidence
+        first = step.shape[-1] - state.settings.shape[-1]
         private = linear.private_step(step)
         attitude = self._turn_stand(state, step[:, p : p + q])
-        attitude = self._turn_groups(replace(state, attitude=attitude), step[:, p + q :])
+        attitude = self._turn_groups(replace(state, attitude=attitude), step[:, p + q : first])
         attitude = self._turn_stations(state, attitude, private[..., :3])
         absent = private[..., 3 : 3 + state.departures.shape[-1]]
         departures = state.departures + absent * self._absent_scales(state)
         constants = state.constants + step[:, p : p + q]
-        return State(state.params + step[:, :p], attitude, constants, departures)
+        errors = private[..., :3] * evidence.turn_sd * evidence.referenced
+        settings = state.settings + step[:, first:]
+        return State(state.params + step[:, :p], attitude, constants, departures, errors, settings)
 
     def _turn_stand(self, state: State, constants: Array) -> Array:
         attitude = state.attitude
@@ -447,12 +537,16 @@ class Problem:
         return attitude
 
     def _turn_stations(self, state: State, attitude: Array, private: Array) -> Array:
-        axes = self._private_turns(state, geometry=True)
-        if not axes.any():
+        """Attitudes with unknown angles turned by private unknowns (B, n, 3) in units of their σ."""
+        sd = self.evidence.exact_turn_sd
+        if not sd.any():
             return attitude
-        turn = axes * private[..., None, :]
-        free = rotation(np.sum(turn, -1)) @ attitude
-        about_down = np.zeros_like(turn[..., 0])
-        about_down[..., 2] = np.einsum("bni,bni->bn", turn[..., 1], state.attitude[..., :, 2])
+        bare = replace(state, errors=0 * state.errors, settings=0 * state.settings)
+        free, turn = self.evidence.free, (sd * private)[..., None, :] * self._angle_axes(bare)
+        about_down = np.zeros(turn.shape[:-1])
+        about_down[..., 2] = sd[..., 1] * private[..., 1]
         natural = rotation(turn[..., 2]) @ rotation(turn[..., 0]) @ attitude @ rotation(about_down)
-        return np.where(self.evidence.free[..., None, None], free, natural)
+        if not free.any():
+            return np.asarray(natural)
+        whole = rotation(UNKNOWN * private) @ attitude
+        return np.where(free[..., None, None], whole, natural)

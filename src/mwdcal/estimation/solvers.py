@@ -13,7 +13,7 @@ Shared unknowns (field strength, dip, group directions) are eliminated by a Schu
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cached_property
 from typing import Any, Protocol
@@ -61,7 +61,8 @@ class Linear:
     X has the columns of each triad's parameters in `blocks`, (B, n, m_t, p_t) for the rows of that
     triad alone, then `shared` (B, n, m, s). `private` (B, n, m, a) are the private unknowns. `prior`
     (B, u, u) is the precision of X's unknowns, `pull` (B, u) their departure from the prior value
-    (zero where unknown).
+    (zero where unknown). `held` (B, n, a) are the values of private unknowns that a state holds, which ρ
+    is without, and `loose` (B, n, a) says which ones it does not hold.
     """
 
     residual: Array
@@ -70,6 +71,8 @@ class Linear:
     private: Array
     prior: Array
     pull: Array
+    held: Array
+    loose: Bools
 
     @property
     def size(self) -> int:
@@ -118,10 +121,21 @@ class Linear:
         return Determined.by(self.normal.reduced[0], self.norms)
 
     def cost(self, at: Linear) -> Array:
-        """ρᵀC⁻¹ρ over all stations, and the prior's part (B,), of residuals `at` a state; C is ours."""
-        weighed = self.weigh(at.residual[..., None])[..., 0]
-        pulled = np.einsum("...i,...ij,...j->...", at.pull, at.prior, at.pull)
-        return np.asarray(np.sum(at.residual * weighed, (-1, -2)) + pulled)
+        """ρᵀC⁻¹ρ over all stations, and the priors' part (B,), of residuals `at` a state; C is ours.
+
+        Unknowns that a state holds have their values there; C is of the others.
+        """
+        residual, pulled = (
+            at.residual,
+            np.einsum("...i,...ij,...j->...", at.pull, at.prior, at.pull),
+        )
+        weighed = self.weigh(residual[..., None])
+        if not self.loose.all():
+            residual = residual + (at.private @ at.held[..., None])[..., 0]
+            loose = replace(self, private=self.private * self.loose[..., None, :])
+            weighed = loose.weigh(residual[..., None])
+            pulled = pulled + np.sum(at.held**2, (-1, -2))
+        return np.asarray(np.sum(residual * weighed[..., 0], (-1, -2)) + pulled)
 
     @cached_property
     def core(self) -> Array:
@@ -264,10 +278,11 @@ class _Descent:
         trial = problem.move(self.state, linear, step)
         after = problem.linear(trial)
         # the gradient holds the weights fixed, and so must the cost that judges the step
+        before = normal.cost if linear.loose.all() else linear.cost(linear)
         cost = linear.cost(after)
         small = _small(linear, step, self.state.params)
         with np.errstate(invalid="ignore"):
-            better = (cost <= normal.cost * (1 + 1e-9) + 1e-9) | small
+            better = (cost <= before * (1 + 1e-9) + 1e-9) | small
         self._accept(trial, after, better)
         calmer = np.where(self.damping < 1e-6, 0.0, self.damping / 10)
         self.damping = np.where(better, calmer, np.maximum(10 * self.damping, 1e-3))

@@ -42,14 +42,9 @@ def start(problem: Problem) -> State:
     Singular: where neither known directions nor strengths determine a triad, the start is a sphere
     about the middle of its readings.
     """
-    constants = [c.value for c in problem.evidence.constants]
-    batch, count = problem.temperature.shape
-    empty = State(
-        np.zeros((batch, 0)),
-        np.broadcast_to(np.eye(3), (batch, count, 3, 3)),
-        np.stack(constants, -1) if constants else np.zeros((batch, 0)),
-        np.zeros((batch, count, len(problem.evidence.absent))),
-    )
+    shape = problem.temperature.shape
+    level = np.broadcast_to(np.eye(3), (*shape, 3, 3))
+    empty = problem.start(np.zeros((shape[0], 0)), level)
     params = []
     for index, where in enumerate(problem.slices()):
         known = diagonal(problem.prior.precision[:, where, where]) > 0

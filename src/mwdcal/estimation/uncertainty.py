@@ -67,7 +67,8 @@ class Analysis:
     `residual` (B, n, m) are whitened residuals C⁻¹ρ left on the readings, and `spread`
     (B, n, m, m) their expected covariance C⁻¹ - C⁻¹X V XᵀC⁻¹, so that residual · spread⁺ · residual is χ²;
     `constants` (B, q, q) is the covariance of the constants of the run; `effects` (B, p, q) is
-    what one standard uncertainty of each does to the parameters, zero for unknown constants.
+    what one standard uncertainty of each does to the parameters, zero for unknown constants, and
+    `of_settings` (B, p, s) what one of each setting of the stand does.
     `influence` (B, n, u, m) is how an error of a station's whitened reading moves X's unknowns,
     where that is not as the likelihood has it.
     """
@@ -80,6 +81,7 @@ class Analysis:
     spread: Array
     constants: Array
     effects: Array
+    of_settings: Array
     influence: Array | None = None
 
     @property
@@ -100,6 +102,7 @@ def analyse(problem: Problem, state: State, determined: Determined | None = None
     spread = spread * problem.evidence.include[..., None, None]
     factor, freedom = _variance_factors(residual, spread)
     p, q = linear.size, len(problem.evidence.constants)
+    settings = whole.shape[-1] - state.settings.shape[-1]
     return Analysis(
         whole[:, :p, :p],
         determined,
@@ -109,6 +112,7 @@ def analyse(problem: Problem, state: State, determined: Determined | None = None
         spread,
         whole[:, p : p + q, p : p + q],
         _effects(problem, whole[:, :p, p : p + q]),
+        whole[:, :p, settings:],
     )
 
 
@@ -162,8 +166,12 @@ def sandwich(
     covariance = np.einsum("bnim,bnmk,bnjk->bij", moved, noise, moved, optimize=True)
     independent = covariance
     p, constants, rest = linear.size, problem.evidence.constants, ~fixed
-    effects = np.zeros((len(moved), p, len(constants)))
-    for column in [p + i for i, c in enumerate(constants) if not c.unknown]:
+    effects = np.zeros((len(moved), p, u - p))
+    known, settings = (
+        [p + i for i, c in enumerate(constants) if not c.unknown],
+        u - state.settings.shape[-1],
+    )
+    for column in [*known, *range(settings, u)]:
         common = np.zeros((len(moved), u))
         common[:, fixed] = -np.einsum("bnim,bnm->bi", moved[:, :, fixed], design[..., column])
         pulled = np.einsum("bij,bj->bi", follow, common[:, fixed]) + linear.prior[:, rest, column]
@@ -185,7 +193,8 @@ def sandwich(
         freedom=freedom,
         spread=spread,
         constants=covariance[:, p : p + q, p : p + q],
-        effects=effects,
+        effects=effects[..., :q],
+        of_settings=effects[..., settings - p :],
         influence=moved,
     )
 

@@ -58,6 +58,8 @@ class Suspect:
             triads.append(Triad(model, raw[None], np.maximum(sd, floor)[None]))
         count = sum(triad.model.size for triad in triads)
         evidence = evidence_of(readings, np.ones(readings.count))
+        if evidence.assumed:  # nobody says that stations of one direction were set together
+            evidence = replace(evidence, apart=np.ones_like(evidence.apart))
         nothing = Prior(np.zeros((1, count, count)), np.zeros((1, count)))
         problem = Problem(tuple(triads), temperature[None], evidence, nothing)
         return cls(
@@ -78,14 +80,8 @@ class Suspect:
 
     def start(self, readable: Array | None = None) -> State:
         """Where the calibration sees the tools; `readable` (B, n, m) are readings to take for that instead."""
-        evidence, (batch, count) = self.problem.evidence, self.problem.temperature.shape
-        constants = [constant.value for constant in evidence.constants]
-        empty = State(
-            self.expected,
-            np.broadcast_to(np.eye(3), (batch, count, 3, 3)),
-            np.stack(constants, -1) if constants else np.zeros((batch, 0)),
-            np.zeros((batch, count, 0)),
-        )
+        level = np.broadcast_to(np.eye(3), (*self.problem.temperature.shape, 3, 3))
+        empty = self.problem.start(self.expected, level)
         problem = self.problem if readable is None else with_raw(self.problem, readable)
         return oriented(problem, empty)
 
@@ -130,7 +126,9 @@ def departures_seen(suspect: Suspect, state: State) -> Array:
         slope = triad.model.slope(state.params[:, where], triad.raw, problem.temperature)
         gain[..., start : start + 3] = 1 / diagonal(slope)
         by_field = inverse(slope)
-    return columns(whole, vectors, state.attitude, suspect.warmth, gain, by_field)[..., :count, :]
+    return columns(whole, vectors, problem.attitude(state), suspect.warmth, gain, by_field)[
+        ..., :count, :
+    ]
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from mwdcal.calibration.record import (
     StandErrors,
     Undetermined,
 )
+from mwdcal.calibration.settings import ASSUMED, ASSUMED_PRACTICE
 from mwdcal.geometry.observables import TITLES
 
 if TYPE_CHECKING:
@@ -140,6 +141,7 @@ def remarks(calibration: Calibration) -> list[str]:
         *residuals(calibration),
         f"accuracy to expect (1σ, calibration alone, typical): {'  '.join(accuracy)}",
         *([f"taken as exact, and no residual tests it: {exact}{PROFILE}"] if exact else []),
+        *([ASSUMED] if calibration.settings == ASSUMED_PRACTICE else []),
         *(
             f"estimated constant of the run: {c.name} {estimate(c.value, c.standard_uncertainty, c.unit)}"
             for c in calibration.constants

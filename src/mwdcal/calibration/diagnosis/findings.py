@@ -15,6 +15,7 @@ from mwdcal.calibration.diagnosis.plausibility import (
     NOISE_RATIO,
     departures,
     robust,
+    setting_chances,
     stations_to_reshoot,
     unchecked,
 )
@@ -26,15 +27,17 @@ from mwdcal.calibration.readings import EARTH_RANGES, HIGHEST, TRIADS
 from mwdcal.calibration.record import Finding
 from mwdcal.calibration.residuals import REASONS, shown_in, tail
 from mwdcal.calibration.results import common_source, drifts, unconfirmed_dip
+from mwdcal.calibration.settings import DIRECTION
 from mwdcal.estimation.problem import Prior
 from mwdcal.estimation.rank import free_directions
 from mwdcal.estimation.solvers import Determined
 from mwdcal.geometry.vectors import Bools
 
-CALM_FREEDOM = 12.0
-"""Degrees of freedom from which residuals far below the declared noise are not a coincidence."""
 MISFIT_CHANCE = 1e-3
-"""Chance of so large residuals, or of so large a departure from the prior, below which it is reported."""
+"""Chance of so large or so small residuals, or of so large a departure of what is declared, below which it is
+reported."""
+LEAST_SHOWN = 0.1
+"""A smaller share of the stand's σ by which stations of one setting scatter is no finding."""
 FEW_FREEDOM = 8.0
 """Fewer degrees of freedom are reported: from them s is known no better than to a quarter."""
 LOW_WEIGHT = 0.1
@@ -60,9 +63,13 @@ FREE_DIRECTIONS = {
 }
 
 REMARKS = {
-    "noise": "{triad}: residuals are only {times:.2f} of the declared noise: the noise of the profile, or the columns "
-    "sd_, are too large, and weigh the stations wrongly if not all by as much. Uncertainties are scaled down "
-    "accordingly.",
+    "noise": "{triad}: residuals are only {times:.2f} of what noise and stand as declared would leave (chance "
+    "{small:.0e}): the declared noise is too large, readings are copies of each other, or they were corrected by a "
+    "fit before. Uncertainties stay as declared; check the noise of the profile and the columns sd_.",
+    "settings": "the stand at {where}: {angle} is off by {size:.1f} σ of a setting ({value:+.3g}°). Check this "
+    "reference, or declare a larger σ.",
+    "settings-apart": "stations of one direction scatter by {share:.0%} of the stand's σ, as if the stand had been set "
+    'anew at each. If so, state settings = "per-station" in [stand] of the profile.',
     "residuals": "{triad}: residuals are {times:.2f} times the declared noise{rare}: the noise figure, a reference, or "
     "the model is wrong. The uncertainty is scaled up as if each station had an error of its own; an error that "
     "stations share may be larger than it says.",
@@ -146,6 +153,7 @@ def finding_flags(fitted: FittedRuns) -> Iterator[Flag]:
     bare = unchecked(fitted.result)
     yield _remark("no-redundancy", np.any(bare, -1), triads=partial(_joined, bare))
     yield _few_degrees(fitted)
+    yield from _settings(fitted)
     yield _hemisphere(fitted)
     yield from _drifts(fitted)
     yield from _structure(fitted)
@@ -186,7 +194,8 @@ def _noise(fitted: FittedRuns) -> Iterator[Flag]:
     """Residuals far below the declared noise, then those far beyond it."""
     result, analysis, chances = fitted.result, fitted.result.analysis, fitted.chances
     declared, factor = np.isnan(result.noise), analysis.variance_factor
-    calm = declared & (analysis.freedom >= CALM_FREEDOM) & (factor < NOISE_RATIO**-2)
+    small = fitted.small_chances
+    calm = declared & (small < MISFIT_CHANCE)
     weighed = robust(result)[:, None] & declared & ~unchecked(result)
     large = weighed & (factor > NOISE_RATIO**2) | (chances < MISFIT_CHANCE)
 
@@ -198,8 +207,38 @@ def _noise(fitted: FittedRuns) -> Iterator[Flag]:
 
     for end, holds in (("noise", calm), ("residuals", large)):
         for index, triad in enumerate(TRIADS[: factor.shape[-1]]):
-            values = {"triad": triad, "times": times[:, index], "rare": partial(rare, index=index)}
+            of_triad = {"times": times[:, index], "small": small[:, index]}
+            values = {"triad": triad, "rare": partial(rare, index=index), **of_triad}
             yield Flag(f"{triad}-{end}", holds[:, index], REMARKS[end], values)
+
+
+def _settings(fitted: FittedRuns) -> Iterator[Flag]:
+    """Settings of the stand that are off by far more than declared, and stations that were set one by one."""
+    result = fitted.result
+    chance = setting_chances(result)
+    for column in np.flatnonzero(
+        (chance < MISFIT_CHANCE / max(chance.shape[-1], 1)).any(0)
+    ).tolist():
+        members = chance[:, column] < MISFIT_CHANCE / chance.shape[-1]
+        words = partial(_setting, fitted, column)
+        yield Flag("settings", members, "{of}", {"of": words})
+    share = result.problem.evidence.apart
+    yield _remark("settings-apart", share > LEAST_SHOWN, share=share)
+
+
+def _setting(fitted: FittedRuns, column: int, place: int) -> str:
+    """What is said of one setting's angle, a column of the settings' unknowns."""
+    evidence, state = fitted.result.problem.evidence, fitted.result.state
+    sd = evidence.set_together[place, :, column]
+    second = column >= evidence.set_together.shape[-1] // 2
+    angle, sign = DIRECTION[second], -1 if second else 1
+    stations = np.flatnonzero(sd)
+    labels = fitted.alone(place)[0].labels
+    sigmas = float(state.settings[place, column])
+    return REMARKS["settings"].format(
+        where=f"stations {labels[stations[0]]} to {labels[stations[-1]]}",
+        angle=angle, size=abs(sigmas), value=sign * np.degrees(sigmas * sd.max()),
+    )  # fmt: skip
 
 
 def _few_degrees(fitted: FittedRuns) -> Flag:

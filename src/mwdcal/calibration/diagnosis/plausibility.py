@@ -11,12 +11,19 @@ from mwdcal.calibration.diagnosis.soundness import invertible, mirrored
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import EARTH_RANGES, Readings
 from mwdcal.calibration.residuals import RESHOOT, Residuals, chances, chi_chance, tail, to_reshoot
+from mwdcal.calibration.results import variance_scales
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.evidence import STAND_ERRORS, UNKNOWN
 from mwdcal.estimation.minimisers import closed_form
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.solvers import Determined
-from mwdcal.estimation.uncertainty import ROTATIONS, TESTED, effective_freedom, station_misfit
+from mwdcal.estimation.uncertainty import (
+    ROTATIONS,
+    TESTED,
+    effective_freedom,
+    station_misfit,
+    whole_covariance,
+)
 from mwdcal.geometry.vectors import Array, Bools, Ints, centred, diagonal, eigen, outer, quotient
 
 BENIGN_DIRECTIONS = (*ROTATIONS, "scale")
@@ -165,8 +172,8 @@ def freedom_of(result: Fit) -> Array:
     return effective_freedom(result.problem, result.state, analysis)
 
 
-def misfit_chances(result: Fit, freedom: Array | None = None) -> Array:
-    """Chance (B, t) of residuals as large as each triad's, if noise and stand are as declared.
+def misfit_chances(result: Fit, freedom: Array | None = None, small: bool = False) -> Array:
+    """Chance (B, t) of residuals as large as each triad's, or as `small`, if noise and stand are as declared.
 
     NaN where noise was estimated, nothing is redundant, or station weights hide what is large.
     """
@@ -174,7 +181,25 @@ def misfit_chances(result: Fit, freedom: Array | None = None) -> Array:
     untested = np.isfinite(result.noise) | unchecked(result) | robust(result)[:, None]
     freedom = np.where(untested, 1.0, freedom)
     square = result.analysis.variance_factor * freedom
-    return np.where(untested, np.nan, chi_chance(square, freedom))
+    return np.where(untested, np.nan, chi_chance(square, freedom, small))
+
+
+def setting_chances(result: Fit) -> Array:
+    """Chance (B, s) of so large an error of each setting of the stand as is estimated.
+
+    Definition: the estimate z of an error of unit variance, known to v, has the variance 1 - v where all is
+    as declared. Settings that nothing tests have a chance of 1.
+    """
+    settings = result.state.settings
+    if not settings.size:
+        return np.ones(settings.shape)
+    linear = result.problem.linear(result.state)
+    whole = whole_covariance(linear, result.analysis.determined)
+    expected = 1 - diagonal(whole)[:, -settings.shape[-1] :]
+    tested = expected > TESTED
+    scale = np.maximum(variance_scales(result).max(-1, keepdims=True), 1.0)
+    square = quotient(settings**2, expected * scale, tested)
+    return tail(square, np.where(tested, 1, 0))
 
 
 def robust(result: Fit) -> Bools:

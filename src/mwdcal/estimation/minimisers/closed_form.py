@@ -130,7 +130,7 @@ def start(problem: Problem) -> State:
     azimuth = known["azimuth"] if len(problem.triads) > 1 else np.zeros_like(known["azimuth"])
     attitude = tool_from_earth(known["inclination"], azimuth, known["toolface"])
     params = np.zeros((shape[0], problem.slices()[-1].stop))
-    return State(params, attitude, params[:, :0], np.zeros((*shape, 0)))
+    return problem.start(params, attitude)
 
 
 def solution(problem: Problem, at: State) -> tuple[State, Analysis, Bools]:
@@ -151,7 +151,8 @@ def solution(problem: Problem, at: State) -> tuple[State, Analysis, Bools]:
     factor = squares / np.where(freedom > 1e-9, freedom, np.nan)
     none = np.zeros((len(include), p, 0))
     known = determined(triads)
-    analysis = Analysis(covariance, known, factor, freedom, left, spread, none[:, :0], none)
+    nothing = none[:, :0], none, none
+    analysis = Analysis(covariance, known, factor, freedom, left, spread, *nothing)
     return state, analysis, np.all([triad.settled for triad in triads], axis=0)
 
 

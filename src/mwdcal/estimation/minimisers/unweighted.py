@@ -70,6 +70,8 @@ class Sums:
             np.zeros((*error.shape, 1)),
             np.zeros((len(error), size, size)),
             np.zeros((len(error), size)),
+            np.zeros((*error.shape[:-1], 1)),
+            np.ones((*error.shape[:-1], 1), bool),
         )
 
     def move(self, state: State, linear: Linear, step: Array) -> State:
