@@ -11,7 +11,7 @@ from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import readings_at
-from mwdcal.calibration.readings import Readings, soaks
+from mwdcal.calibration.readings import Readings, highest_order, soaks
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import FitError, InputError
 from mwdcal.geometry.observables import OBSERVABLES
@@ -315,6 +315,27 @@ def test_without_temperature_terms_a_calibration_holds_for_its_soak():
 
 def test_soaks_are_told_apart_by_gaps():
     assert soaks(np.array([100.0, 22.4, 22.6, 101.0, 60.0])).tolist() == [2, 0, 0, 2, 1]
+
+
+@pytest.mark.parametrize("step", [0.5, 1.0, 2.0, 4.0])
+def test_a_ramp_is_cut_into_parts_of_equal_width_that_count_as_soaks(step):
+    """A sixth of 120 °C is 20 °C, so that seven parts of 120/7 °C are narrower: by hand, without the program."""
+    ramp = np.random.default_rng(0).permutation(np.arange(25.0, 145.1, step))
+    assert soaks(ramp).tolist() == np.minimum((ramp - 25) // (120 / 7), 6).tolist()
+    assert highest_order(ramp) >= 3
+    both = soaks(np.stack([ramp, np.where(ramp > 85, 145.0, 25.0)]))
+    assert both[0].tolist() == soaks(ramp).tolist()
+    assert both[1].tolist() == (ramp > 85).astype(int).tolist()
+
+
+def test_what_wanders_around_one_temperature_is_one_soak():
+    """A room, a noisy thermometer, a soak that creeps: order 0, and no part of a soak is a soak."""
+    rng = np.random.default_rng(1)
+    assert highest_order(rng.uniform(20, 22, 48)) == 0
+    assert highest_order(rng.uniform(20, 29.9, 48)) == 0
+    two = np.repeat([25.0, 145.0], 24) + rng.uniform(-4, 4, 48)
+    assert soaks(two).tolist() == [0] * 24 + [1] * 24
+    assert highest_order(two) == 1
 
 
 def test_narrow_span_is_refused_for_a_high_order():

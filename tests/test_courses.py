@@ -2,7 +2,7 @@
 
 from collections import Counter
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -14,6 +14,7 @@ from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.errors import FitError
 from mwdcal.estimation.batch import mapped, take
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.planning.simulate import servo
@@ -50,11 +51,16 @@ def vectors_at(inc, azi, face):
 
 def runs(factors, temperatures, seed, declared=True, scatter=0.0, noise=NOISE):
     """A batch of runs, 24 stations at each temperature; `scatter` of gains and offsets by soak."""
-    rng = np.random.default_rng(seed)
     angles = [np.tile(a, len(temperatures)) for a in plan(toolfaces=6)]
     soak = np.repeat(np.arange(len(temperatures)), 24)
-    warmth, shape = np.array(temperatures)[soak], (len(factors), len(soak))
+    return read(factors, angles, np.array(temperatures)[soak], seed, declared, scatter, noise, soak)
+
+
+def read(factors, angles, warmth, seed, declared=True, scatter=0.0, noise=NOISE, soak=None):
+    """A batch of runs with stations at some attitudes and temperatures (n,)."""
+    rng, shape = np.random.default_rng(seed), (len(factors), len(warmth))
     field = np.broadcast_to(vectors_at(*angles), (*shape, 6))
+    soak = np.zeros(len(warmth), int) if soak is None else soak
     raw = factor_readings(factors, warmth, scattered(field, soak, scatter, rng))
     raw = raw + np.repeat(noise, 3) * rng.normal(size=raw.shape)
     names = ("inclination", "azimuth", "toolface", "gravity", "field", "dip")
@@ -237,3 +243,120 @@ def test_no_temperatures_leave_nothing_out():
 
 
 PROFILE = Profile(name="test tool")
+
+
+def bent(count, order):
+    """Tools whose gains and offsets have every power up to an order, 0.05 to 0.1 % of the field 60 °C away."""
+    rng, factors = np.random.default_rng(order), tools(count, 11, order)
+    for first, strength in zip((0, 30), EARTH[:2], strict=True):
+        course = factors[:, first : first + 24].reshape(count, 6, 4)
+        unit = np.repeat([1.0, strength], 3)[:, None] / 60.0 ** np.arange(1, order + 1)
+        size = (
+            1e-3 * rng.uniform(0.5, 1, (count, 6, order)) * rng.choice([-1, 1], (count, 6, order))
+        )
+        course[..., 1 : order + 1] = size * unit
+        factors[:, first : first + 24] = course.reshape(count, 24)
+    return factors
+
+
+def cooled():
+    """A cold and a hot tumble, and the tool cooling from one to the other at two attitudes."""
+    two = [np.tile(np.radians(pair), 24) for pair in ((40.0, 120.0), (30.0, 200.0), (50.0, 250.0))]
+    tumble = plan(toolfaces=6)
+    angles = [np.concatenate([a, a, b]) for a, b in zip(tumble, two, strict=True)]
+    return angles, np.concatenate([np.full(24, 25.0), np.full(24, 145.0), np.linspace(145, 25, 48)])
+
+
+def ramp(step, seed=3):
+    """A ladder of small steps, each attitude of a tumble in turn, shuffled in every round."""
+    levels = np.arange(25.0, 145.1, step)
+    warmth, rng = np.repeat(levels, -(-96 // len(levels))), np.random.default_rng(seed)
+    turns = np.concatenate([rng.permutation(24) for _ in range(6)])[: len(warmth)]
+    return [a[turns] for a in plan(toolfaces=6)], warmth
+
+
+@pytest.mark.parametrize("order", [1, 3])
+@pytest.mark.parametrize("declared", [True, False])
+@pytest.mark.parametrize("made", [partial(ramp, 1.0), partial(ramp, 4.0), cooled])
+def test_ramps_ladders_and_cooling_records_calibrate_as_soaks_do(made, declared, order):
+    """The order of the tool is found, and errors are as large as stated: no temperature stands apart."""
+    factors, seed = bent(12, order), 5
+    readings = read(factors, *made(), seed, declared)
+    orders = choose_orders(readings, Options())
+    assert np.mean(orders == order) > 0.8
+    assert orders.max() <= order
+    for name, ratio in error_ratios(factors, readings, orders, seed).items():
+        assert 0.7 < ratio < 1.35, name
+
+
+def single(readings):
+    """The first run of a batch."""
+    one = mapped(lambda value: value[0], readings)
+    count = one.count
+    return replace(one, sd={n: np.broadcast_to(v, (count, 3)) for n, v in one.sd.items()})
+
+
+def in_order():
+    """A ramp on which one inclination follows another, each at its own temperatures only."""
+    return plan(toolfaces=24), np.linspace(25.0, 145.0, 96)
+
+
+def test_attitudes_that_follow_the_temperature_are_a_finding_and_others_are_not():
+    """The next power of temperature is then told by nothing: the stations see it as a sensor error."""
+    factors = tools(1, 12, order=1)
+    for made, named in ((in_order, True), (partial(ramp, 1.0), False), (cooled, False)):
+        record = calibrate(single(read(factors, *made(), 6)), Profile(name="x"))
+        assert record.thermal
+        found = [f.text for f in record.findings if f.id == "temperature-aligned"]
+        assert bool(found) == named
+        assert all("power 2 of temperature" in text for text in found)
+
+
+def test_an_order_that_does_not_follow_the_run_is_refused_for_its_temperatures():
+    """Residuals that temperature explains are not those of columns that were mixed up."""
+    readings = single(read(tools(1, 13), *ramp(1.0), 7))
+    with pytest.raises(
+        FitError, match=r"vary with temperature more than `order` 0 follows.*120 °C.*`order` auto"
+    ):
+        calibrate(readings, Profile(name="x"), Options(order=0))
+    free = calibrate(replace(readings, sd={}), Profile(name="x"), Options(order=0))
+    assert {f.id for f in free.findings} >= {"accelerometer-temperature-misfit"}
+
+
+def unrecorded(seed, declared=False):
+    """A run over 120 °C whose temperature is in a column of no telling name, and what else its table has."""
+    angles, warmth = ramp(1.0)
+    one = single(read(tools(1, seed), angles, warmth, seed, declared))
+    rng, count = np.random.default_rng(seed), one.count
+    others = {
+        "X17": warmth,
+        "number": np.arange(1.0, count + 1),
+        "inclination of the tool": np.degrees(angles[0]) + 0.02 * rng.normal(size=count),
+        "battery": rng.uniform(size=count),
+        "wandering": np.cumsum(rng.normal(size=count)),
+    }
+    return replace(one, temperature=None, others=others)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_column_that_explains_the_residuals_is_named_and_others_are_not(seed):
+    """The tool drifts with the only column that is its temperature; the others have nothing to do with it."""
+    (found,) = [
+        f.text
+        for f in calibrate(unrecorded(seed), Profile(name="x")).findings
+        if f.id == "column-explains"
+    ]
+    assert found.startswith("Column 'X17' is not used, and explains 9")
+    assert "name it 'temperature_c'" in found
+    quiet = unrecorded(seed, declared=True)
+    quiet = replace(quiet, sd={name: value / 10 for name, value in quiet.sd.items()})
+    with pytest.raises(FitError, match="no sensor model explains.*Column 'X17' is not used"):
+        calibrate(quiet, Profile(name="x"))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_no_column_explains_the_residuals_of_a_tool_at_one_temperature(seed):
+    warm = unrecorded(seed)
+    still = single(read(tools(1, seed), ramp(1.0)[0], np.full(warm.count, 25.0), seed, False))
+    still = replace(still, temperature=None, others=warm.others)
+    assert "column-explains" not in {f.id for f in calibrate(still, Profile(name="x")).findings}

@@ -194,7 +194,9 @@ def test_a_calibration_without_temperatures_on_warm_readings_is_a_finding(tmp_pa
     assert "20.0…150.0 °C" in found["no-temperature"]
     del columns["temperature_c"]
     ran, _ = apply(made, written(tmp_path, columns, way), tmp_path, "--json")
-    assert ran.json["findings"] == []
+    (found,) = ran.json["findings"]
+    assert found["id"] == "no-temperature"
+    assert found["text"].endswith("its run recorded no temperature.")
 
 
 def test_python_refuses_what_the_command_refuses(tmp_path, calibration):

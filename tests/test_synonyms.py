@@ -8,11 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cli_support import calibrated, mwdcal, numbers, read_csv, refused, servo_run, write_csv
-from mwdcal.errors import InputError
+from mwdcal.errors import FitError, InputError
 from mwdcal.files import documents, synonyms
 from mwdcal.files.contract import COLUMNS
 from mwdcal.files.synonyms import CONVERSIONS, Resemblance, check_evidence, resembled, unused
 from mwdcal.geometry.observables import RESULTS
+from mwdcal.identification.columns import proposed
 from simulation import Tool
 
 ALIKE = {
@@ -28,7 +29,9 @@ ALIKE = {
     "ref_field_nt": "Btotal, BTotal, field_nt, B_total, ref_b, ref_field, total_field, Bt, Htotal, Field (µT), "
     "Btotal (nT), mag field, Total Magnetic Field [nT], Field [gauss]",
     "temperature_c": "temp, temperature, Temp, temp_f, temp_c, tempC, TempF, T_C, DegC, tool_temp, Temp 1, "
-    "board_temperature, Temp (°F), T (°C), Temperature (K), Tool Temp [degC], Temp ℉, TEMP ºC",
+    "board_temperature, T_sens, Oven temp, Chamber T, Temp 2, tmp, TBoard, ambient_temp, MWD Temp, Kanal 3 [°C], "
+    "PT100 (degC), Ofentemperatur, boardtemp, temp max, Temp (°F), T (°C), "
+    "Temperature (K), Tool Temp [degC], Temp ℉, TEMP ºC",
     "sd_ref_inclination_deg": "sd_inc, inclination_sd_deg, sigma Inc",
     "ax": "gx, gx_g, Acc X [V], accel_x",
     "mz": "bz, bz_nt, MagZ, Hz",
@@ -38,10 +41,10 @@ PAIRS = [(name, column) for column, names in ALIKE.items() for name in names.spl
 OTHERS = [
     name
     for line in (
-        "station comment operator date time md_m time_s depth_m field well rig ambient_temp inc_count",
+        "station comment operator date time md_m time_s depth_m field well rig inc_count",
         "pressure azimuth_error dls toolface_mode remarks samples drift_temperature_c mtf gain bias",
         "magnetic_toolface_deg index run b g t a az i voltage current x y z Datum group_2",
-        "declination_deg ref_notes sd_temp",
+        "declination_deg ref_notes sd_temp temp_notes temp_rate template attempt T1 mag_t total",
     )
     for name in line.split()
 ]
@@ -109,6 +112,26 @@ def test_what_may_not_be_missed_is_refused_only_where_the_column_is_absent(name,
         check_evidence(names, "run.csv")
     check_evidence([*names, column], "run.csv")
     assert f"(resembles '{column}')" in unused(names, COLUMNS)[0]
+
+
+def test_two_temperatures_are_asked_about_and_one_of_the_very_name_is_taken():
+    with pytest.raises(
+        InputError, match=r"'Temp 1'.*So does 'Temp 2': take the one nearest.*under \[columns\]"
+    ):
+        check_evidence(["ax", "ay", "az", "Temp 1", "Temp 2"], "run.csv")
+    check_evidence(["ax", "ay", "az", "Temp 1", "temperature_c"], "run.csv")
+    with pytest.raises(
+        FitError, match="'Temp 1' and 'Temp 2' may each be the temperature of the tool"
+    ):
+        profile_columns("Temp 1", "Temp 2")
+    assert profile_columns("Oven temp")["temperature_c"].name == "Oven temp"
+    assert profile_columns("Oven temp", "temperature_c")["temperature_c"].name == "temperature_c"
+
+
+def profile_columns(*temperatures):
+    """The columns that `mwdcal profile` takes of a table with these besides the channels."""
+    names = ["ax", "ay", "az", *temperatures]
+    return proposed(names, [""] * len(names), lambda _: np.array([20.0, 30.0]), "run.csv")[0]
 
 
 def test_results_of_apply_are_never_references():

@@ -98,13 +98,7 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
         prior_sha256=options.prior_sha256 or msgspec.UNSET,
         software=SOFTWARE,
         method=options.method,
-        options=Choices(
-            parameters=options.parameters,
-            ignore=list(options.ignore),
-            robust=options.robust,
-            paper_weights=options.paper_weights,
-            prior=prior.source if prior else None,
-        ),
+        options=_choices(options),
         seed=options.seed if options.method == "swarm" else None,
         time=datetime.now(UTC).isoformat(timespec="seconds"),
         field_unit=readings.field_unit,
@@ -148,6 +142,18 @@ def _practice(fitted: FittedRuns) -> str | msgspec.UnsetType:
     if is_assumed(readings):
         return ASSUMED_PRACTICE
     return PRACTICES[0] if evidence.set_together.any() else PRACTICES[1]
+
+
+def _choices(options: Options) -> Choices:
+    """What else was asked for."""
+    prior = options.knowledge
+    return Choices(
+        parameters=options.parameters,
+        ignore=list(options.ignore),
+        robust=options.robust,
+        paper_weights=options.paper_weights,
+        prior=prior.source if prior else None,
+    )
 
 
 def _budget(fitted: FittedRuns) -> list[BudgetRow]:

@@ -54,6 +54,11 @@ def middle_temperature(calibration: Calibration) -> float:
     return float(np.clip(calibration.reference_temperature, low, high))
 
 
+def without_temperature(calibration: Calibration) -> str:
+    """What headlines say of a calibration whose run recorded no temperature; empty if it did."""
+    return "" if calibration.temperature_c else "no temperature recorded"
+
+
 def readings_at(
     calibration: Calibration,
     inclination: ArrayLike,

@@ -30,6 +30,8 @@ RELATIVE = "relative (field = 1)"
 """Unit of the calibrated field where its strength is known at no station."""
 SOAK_GAP = 5.0
 """Temperatures closer than this belong to one soak, °C."""
+RAMP_PARTS = 6
+"""A ramp is judged in parts of about this share of the run's span: enough for every order and one more to test it."""
 LEAST_TEMPERATURE_SPAN = 10.0
 """A run that spans less has no temperature terms, °C. An order needs as much for each power."""
 HIGHEST = 3
@@ -115,6 +117,7 @@ class Readings:
         metadata: serial, date, operator, …, as the file states them.
         source: name of the file.
         unused: columns of the file that are not used, each with what it resembles.
+        others: the numbers (..., n) in those of them that have one at every station, by name.
         profile: the tool profile by which raw channels became these readings, if there was one.
         run_sha256, profile_sha256: of the files that both come from.
     """
@@ -131,6 +134,7 @@ class Readings:
     metadata: Mapping[str, object] = field(default_factory=dict)
     source: str = ""
     unused: tuple[str, ...] = ()
+    others: Mapping[str, Array] = field(default_factory=dict)
     profile: Profile | None = None
     run_sha256: str = ""
     profile_sha256: str = ""
@@ -241,18 +245,32 @@ class Readings:
             known={k: self.reference(k)[chosen] for k in self.known},
             sd={k: np.broadcast_to(v, shapes[k])[chosen] for k, v in self.sd.items()},
             group=rows(self.group),
+            others={name: rows(values) for name, values in self.others.items()},
             station=tuple(self.station[i] for i in chosen) if self.station else (),
             digest=tuple(self.digest[i] for i in chosen) if self.digest else (),
         )
 
 
 def soaks(temperature: Array) -> Ints:
-    """Number (..., n) of the soak that each station belongs to, coldest first."""
+    """Number (..., n) of the soak that each station belongs to, coldest first.
+
+    Soaks are more than `SOAK_GAP` apart. Temperatures without such a gap, a ramp, count as one soak up to
+    10 °C (`LEAST_TEMPERATURE_SPAN`) and a `RAMP_PARTS`th of the run's span, and are beyond that cut into
+    soaks of equal width.
+    """
     order = np.argsort(temperature, -1, kind="stable")
     ascending = np.take_along_axis(temperature, order, -1)
-    steps = np.cumsum(np.diff(ascending, prepend=ascending[..., :1], axis=-1) > SOAK_GAP, -1)
+    width = np.maximum(LEAST_TEMPERATURE_SPAN, np.ptp(ascending, -1)[..., None] / RAMP_PARTS)
+    apart = np.diff(ascending, prepend=-np.inf, append=np.inf, axis=-1) > SOAK_GAP
+    low = np.maximum.accumulate(np.where(apart[..., :-1], ascending, -np.inf), -1)
+    ends = np.flip(np.where(apart[..., 1:], ascending, np.inf), -1)
+    span = np.flip(np.minimum.accumulate(ends, -1), -1) - low
+    parts = np.floor(span / width) + 1
+    part = np.floor((ascending - low) * parts / np.where(span > 0, span, 1.0))
+    part = np.minimum(part, parts - 1)
+    new = apart[..., :-1] | (np.diff(part, prepend=0, axis=-1) != 0)
     numbers = np.empty(order.shape, int)
-    np.put_along_axis(numbers, order, steps, -1)
+    np.put_along_axis(numbers, order, np.cumsum(new, -1) - 1, -1)
     return numbers
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from mwdcal.calibration.prediction import without_temperature
 from mwdcal.calibration.record import Calibration, TriadCalibration
 from mwdcal.certificate.document import Method
 
@@ -48,6 +49,8 @@ def _model(triad: TriadCalibration) -> str:
 def _deviations(calibration: Calibration) -> Iterator[str]:
     """What was done other than the usual procedure, a phrase each."""
     options = calibration.options
+    if without_temperature(calibration):
+        yield f"{without_temperature(calibration)}: the results hold at the temperature of the calibration alone"
     if calibration.excluded:
         yield f"stations excluded from the fit: {', '.join(calibration.excluded)}"
     if options.robust:

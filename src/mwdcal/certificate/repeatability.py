@@ -9,11 +9,11 @@ import numpy as np
 from mwdcal.certificate.decisions import PROBABILITY, When, student_factor
 from mwdcal.certificate.document import Quantity, ResultTable
 from mwdcal.files.documents import Verification
-from mwdcal.use.roll_test import COEFFICIENTS, basis
+from mwdcal.use.roll_test import FITTED, basis
 from mwdcal.use.verification import VerdictRow
 
 ABOUT_THE_CURVE = (
-    "Standard deviation of one reading about the mean and two harmonics over a turn of toolface, noise of the "
+    "Standard deviation of one reading about the mean and harmonics over a turn of toolface, noise of the "
     "reading and setting of the stand included; by statistics of the roll test (type A)."
 )
 
@@ -53,17 +53,18 @@ def _of_test(when: When, test: Verification) -> Iterator[Quantity]:
 def scatter(test: Verification, row: VerdictRow) -> tuple[float, int]:
     """Sum of squares of a row's departures about the curves of its roll sets, and its degrees of freedom.
 
-    Definition: of a set of n stations n - 5. Reference: JCGM 100:2008, 4.2 and H.3.
+    Definition: of a set of n stations n - 5; n - 3 of a curve of one harmonic. Reference: JCGM 100:2008, 4.2 and H.3.
     """
     squares, freedom = 0.0, 0
     for each in row.sets:
         stations = [test.station_rows[place] for place in each.stations]
         known = [s for s in stations if s.toolface_deg is not None and row.name in s.departures]
-        if each.coefficients is None or len(known) <= COEFFICIENTS:
+        count = len(FITTED[each.harmonics])
+        if each.coefficients is None or len(known) <= count:
             continue
         turn = np.radians([s.toolface_deg for s in known if s.toolface_deg is not None])
         departures = np.array([s.departures[row.name] for s in known])
         left = departures - basis(turn) @ np.array(each.coefficients)
         squares += float(np.sum(left**2))
-        freedom += len(known) - COEFFICIENTS
+        freedom += len(known) - count
     return squares, freedom

@@ -41,6 +41,8 @@ ROWS_OF_LOG = 1000
 """Rows of a table with times from which it is a log."""
 MOST_ROWS = 1_000_000
 """Rows that a run may have at most, as many as a text table."""
+MOST_OTHERS = 20
+"""Unused columns of numbers that are kept to see whether they explain the residuals."""
 _TURN = 360.0
 
 
@@ -52,7 +54,19 @@ def read_run(
         source = read_export(source, profile, decimal=decimal, rows=MOST_ROWS)
     table = renamed(source, profile)
     check_run(table)
-    return to_readings(table, profile)
+    readings, profile = to_readings(table, profile)
+    return replace(readings, others=_other_numbers(table)), profile
+
+
+def _other_numbers(table: Table) -> dict[str, Array]:
+    """The numbers (n,) in columns that are not used and have one at every station."""
+    others: dict[str, Array] = {}
+    for name in table.columns:
+        if name not in (*COLUMNS, *synonyms.OURS) and len(others) < MOST_OTHERS:
+            with suppress(InputError):
+                values = tables.numbers(table, name)
+                others |= {name: values} if np.isfinite(values).all() else {}
+    return others
 
 
 def read_export(

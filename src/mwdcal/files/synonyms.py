@@ -11,6 +11,7 @@ import math
 import re
 import unicodedata
 from collections.abc import Collection, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 from mwdcal.errors import InputError
@@ -61,6 +62,7 @@ FACTORS = {
 """The same in numbers: factor, and what is added to the product."""
 _WARM = ("°C", "°F", "K")
 _MAGNETIC_UNITS = ("nT", "µT", "mT", "gauss")
+WARMTH = "temperature_c"
 _STATED = {"ref", "reference", "local"}
 """Words of columns that are known, not measured."""
 _BYWORDS = _STATED | {
@@ -86,6 +88,83 @@ _INSTEAD = {
     **{f"m{i}": f"mag{i} magnetometer{i} b{i} h{i} flux{i}" for i in "xyz"},
 }
 _SYNONYMS = {word: column for column, words in _INSTEAD.items() for word in words.split()}
+_WARMTH = {
+    *(
+        "temp",
+        "temps",
+        "temperature",
+        "temperatur",
+        "tmp",
+        "thermometer",
+        "thermistor",
+        "thermocouple",
+        "rtd",
+    ),
+    *("ntc", "degc", "degf", "celsius", "fahrenheit"),
+}
+"""Words that make a column a temperature, whatever it is the temperature of."""
+_PLACES = {
+    *(
+        "sens",
+        "sensor",
+        "oven",
+        "chamber",
+        "board",
+        "pcb",
+        "case",
+        "housing",
+        "ambient",
+        "amb",
+        "air",
+        "room",
+    ),
+    *(
+        "int",
+        "internal",
+        "probe",
+        "chip",
+        "cpu",
+        "mcu",
+        "bath",
+        "ofen",
+        "kammer",
+        "platine",
+        "umgebung",
+    ),
+}
+"""What a `t` may be the temperature of: T_sens, Chamber T."""
+_OF_TEMPERATURES = {
+    *(
+        "note",
+        "notes",
+        "comment",
+        "comments",
+        "remark",
+        "remarks",
+        "id",
+        "name",
+        "type",
+        "status",
+        "flag",
+        "ok",
+    ),
+    *(
+        "rate",
+        "drift",
+        "delta",
+        "diff",
+        "gradient",
+        "error",
+        "coef",
+        "coeff",
+        "coefficient",
+        "time",
+        "no",
+        "count",
+    ),
+    *("ppm", "per"),
+}
+"""Words of columns that say something about temperatures, and are none."""
 _NEVER = {"mtf", "magnetictoolface", "magtoolface"}
 """A magnetic toolface is not a reference of the contract."""
 NOTICED = {
@@ -118,12 +197,15 @@ def resembled(name: str) -> Resemblance | None:
     >>> [resembled(n) for n in ("Azi (°)", "Temp (°F)", "comment")]
     [Resemblance(column='ref_azimuth_deg', unit='°'), Resemblance(column='temperature_c', unit='°F'), None]
     """
-    words, unit = _without_unit(_words(name))
+    every = _words(name)
+    words, unit = _without_unit(every)
     spread = not _SPREADS.isdisjoint(words)
     words = [word for word in words if word not in _SPREADS]
     whole = "".join(words)
     bare = "".join(word for word in words if word not in _BYWORDS)
     column = _column(whole, bare, set(words), unit)
+    if column is None and _is_warmth(every, whole):
+        column = "temperature_c"
     if column is None:
         return None
     if not spread:
@@ -147,6 +229,21 @@ def _column(whole: str, bare: str, words: set[str], unit: str) -> str | None:
     short = (s.removeprefix("ref").removesuffix("deg") for s in (whole, bare))
     known = [_SYNONYMS[stem] for stem in (whole, bare, *short) if stem in _SYNONYMS]
     return next(iter([column for column, fits in rules.items() if fits] + known), None)
+
+
+def _is_warmth(words: Sequence[str], whole: str) -> bool:
+    """Whether a column is a temperature by its words, or by all of them `whole`: Oven temp, T_sens, boardtemp."""
+    if not _OF_TEMPERATURES.isdisjoint(words):
+        return False
+    degrees = any(word.startswith("deg") and unit in ("c", "f") for word, unit in pairwise(words))
+    return (
+        degrees
+        or not _WARMTH.isdisjoint(words)
+        or whole.endswith("temp")
+        or "temperat" in whole
+        or (whole.startswith("t") and whole[1:] in _PLACES)
+        or ("t" in words and whole.removesuffix("t") in _PLACES)
+    )
 
 
 def _words(name: str) -> list[str]:
@@ -204,12 +301,22 @@ def check_evidence(
     if not meant:
         return
     name, resemblance = meant[0]
-    others = [f"{shown(n)} ({other.column}, {NOTICED[other.column]})" for n, other in meant[1:6]]
+    rivals = [shown(n) for n, other in meant[1:] if other.column == resemblance.column]
+    others = [
+        f"{shown(n)} ({o.column}, {NOTICED[o.column]})"
+        for n, o in meant[1:6]
+        if shown(n) not in rivals
+    ]
     likewise = f" Likewise {', '.join(others)}." if others else ""
+    which = ""
+    if rivals and resemblance.column == WARMTH:
+        which = f" So does {' and '.join(rivals)}: take the one nearest to the sensors."
+    how = remedy(resemblance)
+    if resemblance.column == WARMTH:
+        how += ", or name it under [columns] of the tool profile"
     raise InputError(
         f"{source}: the column {shown(name)} resembles '{resemblance.column}', which is absent, and would not "
-        f"be used. {remedy(resemblance)}; if it is something else, give it a name that says so, or remove it."
-        f"{likewise}"
+        f"be used.{which} {how}; if it is something else, give it a name that says so, or remove it.{likewise}"
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from mwdcal.errors import FitError
 from mwdcal.files.contract import CHANNELS, MAPPED, RAW, REFERENCES, forms, units_of
 from mwdcal.files.formats.columns import shown
-from mwdcal.files.synonyms import Resemblance, resembled, unit_of
+from mwdcal.files.synonyms import WARMTH, Resemblance, resembled, unit_of
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import ColumnSource
 
@@ -84,14 +84,13 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     if name in MAPPED:
         return Resemblance(name, unit_of(unit) or "".join(units_of(name)[:1]))
     plain = spelled(f"{name} ({unit})" if unit else name)
-    if _MEASURED.search(plain):
+    alike = resembled(plain)
+    if _MEASURED.search(plain) and not (alike and alike.column == WARMTH):
         return None
     near = {form: column for column in MAPPED for form in forms(column)}
     spelt = next((near[form] for form in forms(plain) if form in near), None)
     stated = _IN_BRACKETS.search(plain)
-    return resembled(plain) or (
-        Resemblance(spelt, unit_of(stated[1]) if stated else "") if spelt else None
-    )
+    return alike or (Resemblance(spelt, unit_of(stated[1]) if stated else "") if spelt else None)
 
 
 def proposed(
@@ -170,7 +169,14 @@ def _check_north(name: str, above: Sequence[str], source: str) -> None:
 
 
 def _one(column: str, candidates: Sequence[str], source: str) -> str:
-    """The only candidate for a column, or the only one that is called a reference."""
+    """The only candidate for a column: of its very name, or the only one that is called a reference."""
+    if column in candidates:
+        return column
+    if column == WARMTH and len(candidates) > 1:
+        raise FitError(
+            f"{source}: {' and '.join(map(shown, candidates))} may each be the temperature of the tool. Rename the "
+            f"one nearest to the sensors to '{column}', or remove the others."
+        )
     stated = [name for name in candidates if _CALLED_REFERENCE.search(spelled(name))]
     if len(candidates) == 1 or len(stated) == 1:
         return (stated or candidates)[0]

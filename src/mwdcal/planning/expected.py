@@ -11,7 +11,8 @@ from mwdcal.calibration.automatic.auto import Choice, choose
 from mwdcal.calibration.calibrate import recorded
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.options import AUTO, Options
-from mwdcal.calibration.readings import HIGHEST, LEAST_TEMPERATURE_SPAN, SOAK_GAP, Readings
+from mwdcal.calibration.readings import HIGHEST, Readings
+from mwdcal.calibration.readings import highest_order as carried_order
 from mwdcal.calibration.record import Calibration, Undetermined
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.evidence import ANGLES, EARTH
@@ -74,11 +75,9 @@ def planned_earth(plan: Table) -> list[Array]:
     return earth
 
 
-def highest_order(temperature: Array) -> int:
-    """The highest order of temperature terms that soaks at temperatures (n,) carry, °C."""
-    steps = np.sort(temperature)
-    soaks = 1 + int(np.count_nonzero(np.diff(steps) > SOAK_GAP))
-    return min(HIGHEST, soaks - 1, int(np.ptp(steps) // LEAST_TEMPERATURE_SPAN))
+def highest_order(temperature: Array | None) -> int:
+    """The highest order of temperature terms that a plan's temperatures (n,) carry, °C; None: it states none."""
+    return 0 if temperature is None else min(HIGHEST, int(carried_order(temperature)))
 
 
 def planned_fit(
@@ -93,8 +92,7 @@ def planned_fit(
     readings, scaled = nominal_run(plan, profile)
     _check_moves(readings)
     if options.order == AUTO:
-        soaks = readings.temperature
-        options = replace(options, order=0 if soaks is None else highest_order(soaks))
+        options = replace(options, order=highest_order(readings.temperature))
     if options.nonlinearity == AUTO:
         options = replace(options, nonlinearity=())
     choice = choose(readings, scaled, options, lambda _: None)

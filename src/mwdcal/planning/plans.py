@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from mwdcal.calibration.readings import CONSTANTS, SOAK_GAP
+from mwdcal.calibration.readings import CONSTANTS, soaks
 from mwdcal.errors import InputError
 from mwdcal.estimation.evidence import ANGLES
 from mwdcal.files.contract import (
@@ -222,11 +222,13 @@ def at_place(plan: Table, other: Table) -> Table:
 
 
 def soak_temperatures(plan: Table) -> Array:
-    """The temperatures of the soaks of a plan, ascending: means of those closer than `SOAK_GAP`, °C."""
-    temperature = np.sort(np.asarray(plan.columns.get("temperature_c", ()), float))
+    """The mean temperatures of the soaks of a plan, ascending, °C."""
+    temperature = np.asarray(plan.columns.get("temperature_c", ()), float)
     temperature = temperature[~np.isnan(temperature)]
-    parts = np.split(temperature, 1 + np.flatnonzero(np.diff(temperature) > SOAK_GAP))
-    return np.array([part.mean() for part in parts if part.size])
+    soak = soaks(temperature) if temperature.size else np.zeros(0, int)
+    return np.array(
+        [temperature[soak == number].mean() for number in range(soak.max(initial=-1) + 1)]
+    )
 
 
 def soak_numbers(plan: Table) -> Ints:

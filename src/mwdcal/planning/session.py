@@ -53,8 +53,7 @@ class Session:
     @property
     def highest_order(self) -> int:
         """The highest order of temperature terms that its soaks carry."""
-        temperature = self.readings.temperature
-        return 0 if temperature is None else highest_order(temperature)
+        return highest_order(self.readings.temperature)
 
     def common(self, rng: np.random.Generator, lead: tuple[int, ...]) -> dict[str, Array]:
         """Errors (...,) that all stations of the stand have in common, drawn: see `common_errors`."""

@@ -37,8 +37,7 @@ ROW_FINDINGS = {
     "other-tool": "the readings are of tool {tools[1]}, the calibration of tool {tools[0]}: is it the right one?",
     "missing-reading": "{tally.lacking} of {tally.rows} rows lack a reading: their results are blank.",
     "outside-temperature": "{beyond}: their results are {results}.",
-    "no-temperature": "the calibration was made at unrecorded temperatures, without temperature terms: nothing says "
-    "how good the results are at the readings' {warmth} °C.",
+    "no-temperature": "the calibration has no temperature terms, and its run recorded no temperature{readings_at}.",
     "implausible-gravity": "{off[gravity]}: the tool moved while it was read, or a reading is in another unit.",
     "implausible-field": "{off[field]}: iron or a current was near, or a reading is in another unit.",
     "unsteady": "from row to row {unsteady} change more than any place does: are two axes swapped, or a sign wrong? A "
@@ -214,7 +213,7 @@ def findings(
         "other-tool": tools,
         "missing-reading": tally.lacking,
         "outside-temperature": tally.beyond,
-        "no-temperature": calibration.unrecorded(readings),
+        "no-temperature": calibration.temperature_c is None,
         "implausible-gravity": "gravity" in off,
         "implausible-field": "field" in off,
         "unsteady": unsteady,
@@ -222,10 +221,12 @@ def findings(
         "field-relative": calibration.relative,
         "undetermined": tally.moved,
     }
+    warm = "…".join(dict.fromkeys(f"{end:.1f}" for end in tally.warmth))
+    unknown = f": nothing says how good the results are at the readings' {warm} °C"
     words = {
         "beyond": beyond,
         "results": RESULTS_BEYOND[outside == "extrapolate"],
-        "warmth": "…".join(dict.fromkeys(f"{end:.1f}" for end in tally.warmth)),
+        "readings_at": unknown if calibration.unrecorded(readings) else "",
         "unsteady": unsteady,
         "largest": np.degrees(LARGEST_DIRECTION_SD),
         "moved": ", ".join(tally.moved),

@@ -191,7 +191,7 @@ class RollTest:
         """Why stations do not determine a curve of one harmonic or two; empty where they do."""
         if not index.size or np.isnan(self.toolface[index]).any():
             return NO_TOOLFACE
-        circle = roll_test.coverage(self.toolface[index])
+        circle = self._coverage(index)
         if circle.rolled:
             return ""
         return _gap(circle, roll_test.WIDEST_GAP) or (
@@ -201,7 +201,19 @@ class RollTest:
 
     def harmonics(self, roll_set: RollSet) -> int:
         """Harmonics of the curve that a rolled set determines, 1 or 2."""
-        return int(roll_test.coverage(self.toolface[roll_set.index]).harmonics)
+        return int(self._coverage(roll_set.index).harmonics)
+
+    def _coverage(self, index: Ints) -> Coverage:
+        """How the toolfaces of stations cover the circle."""
+        places = tuple(index.tolist())
+        if places not in self._coverages:
+            self._coverages[places] = roll_test.coverage(self.toolface[index])
+        return self._coverages[places]
+
+    @cached_property
+    def _coverages(self) -> dict[tuple[int, ...], Coverage]:
+        """Coverages by stations: a set is asked for again by every limit."""
+        return {}
 
     def unfit(self, name: str, roll_set: RollSet) -> str:
         """Why a roll set has no spread of an observable; empty where it has."""

@@ -40,13 +40,14 @@ def roll_sets(readings: Readings) -> list[RollSet]:
     Stations of different temperatures are never in one set. Equal inclinations without azimuth
     make a set that does not share an azimuth.
     """
-    warmth = readings.temperature
-    soak = np.zeros(readings.count, int) if warmth is None else soaks(warmth)
-    sets = []
+    warmth = np.zeros(readings.count) if readings.temperature is None else readings.temperature
+    several, sets = soaks(warmth).any(), []
     for label, members, declared, one_azimuth in _directions(readings):
-        for number in np.unique(soak[members]):
-            index = np.flatnonzero(members & (soak == number))
-            at = f", {warmth[index].mean():.1f} °C" if warmth is not None and soak.any() else ""
+        where = np.flatnonzero(members)
+        soak = soaks(warmth[where])
+        for number in np.unique(soak):
+            index = where[soak == number]
+            at = f", {warmth[index].mean():.1f} °C" if several else ""
             if len(index) >= ROLL_SET:
                 sets.append(RollSet(label + at, index, declared, one_azimuth))
     return sets

@@ -207,7 +207,7 @@ def _carried(toolface: Array, places: list[int]) -> Array:
     information = np.swapaxes(rows, -1, -2) @ rows / toolface.shape[-1]
     whole = np.linalg.eigvalsh(information)[..., 0] > 1e-9
     safe = np.where(whole[..., None, None], information, np.eye(len(places)))
-    variance = np.einsum("gi,...ij,gj->...g", circle, inverse(safe), circle).max(-1)
+    variance = np.sum((circle @ inverse(safe)) * circle, -1).max(-1)
     return np.where(whole, np.sqrt(variance / toolface.shape[-1]), np.inf)
 
 

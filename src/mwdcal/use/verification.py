@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any, ClassVar, Literal
 
 import msgspec
@@ -41,8 +42,8 @@ FIRST_HARMONIC = {
 SECOND_HARMONIC = "a difference in scale, or a misalignment, of "
 """What a second harmonic comes from."""
 VERDICT_FINDINGS = {
-    "no-temperature": "the tool was calibrated at unrecorded temperatures, and tested at {tested} °C: "
-    "the verdict holds for the temperatures of the test alone.",
+    "no-temperature": "the calibration has no temperature terms, and its run recorded no temperature: the verdict "
+    "holds at the temperature of the test alone{tested}.",
     "outside-temperature": "{where} lie outside the calibrated range {calibrated} °C. The calibration has no "
     "temperature terms: drift over the difference counts as its error.",
     "not-judged": "not judged: {limits}.",
@@ -255,7 +256,11 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
         date=str(readings.metadata.get("date", "")),
         stations=readings.count,
         rows=rows,
-        findings=sum((each.findings for each in judged), [*_findings(test, skipped)]),
+        findings=[
+            *_findings(test, skipped),
+            *_remarks(judged),
+            *chain(*(j.findings for j in judged)),
+        ],
         station_rows=_station_rows(test, rows, [outcome[-1] for outcome in outcomes]),
         degrees_of_freedom=fewest_degrees_of_freedom(calibration),
         risk=_risk(judged, passed),
@@ -265,11 +270,22 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
 
 @dataclass(frozen=True)
 class _Judged:
-    """A limit with its decision, the findings about it, and the `errors` (d,) of its value in tests like this one."""
+    """A limit with its decision, the findings about it, and the `errors` (d,) of its value in tests like this one.
+
+    `remarks`: ids of findings that several limits may share.
+    """
 
     row: VerdictRow
     findings: list[Finding]
+    remarks: tuple[str, ...]
     errors: Array | None = None
+
+
+def _remarks(judged: Sequence[_Judged]) -> Iterator[Finding]:
+    """Findings that several limits share, each once."""
+    for name in dict.fromkeys(chain(*(each.remarks for each in judged))):
+        titles = ", ".join(each.row.name for each in judged if name in each.remarks)
+        yield _finding(name, title=titles, chance=DEPARTURE_CHANCE)
 
 
 def _risk(judged: Sequence[_Judged], passed: bool) -> float | None:
@@ -330,8 +346,6 @@ def _findings(test: RollTest, skipped: Sequence[str]) -> Iterator[Finding]:
     warmth = readings.temperature
     tested = "" if warmth is None else _span(float(warmth.min()), float(warmth.max()))
     yield from calibration.change_findings()
-    if calibration.unrecorded(readings):
-        yield _finding("no-temperature", tested=tested)
     if beyond := int(calibration.outside(readings, MARGIN).sum()):
         where = f"{beyond} of {readings.count} stations ({tested} °C)"
         calibrated = _span(*calibration.temperature_c or (np.nan, np.nan))
@@ -342,6 +356,8 @@ def _findings(test: RollTest, skipped: Sequence[str]) -> Iterator[Finding]:
         yield _finding("not-judged", limits="; ".join(skipped))
     if not test.sets:
         yield _finding("no-roll-set")
+    if calibration.temperature_c is None:
+        yield _finding("no-temperature", tested=f", {tested} °C" if tested else "")
 
 
 def _finding(name: str, **values: object) -> Finding:
@@ -385,7 +401,8 @@ def _judged(title: str, name: str, limit: float, outcome: Departures, guarded: b
     """The decision on one limit, by the worst set or station, and the findings about it."""
     unit = OBSERVABLES[name].unit.replace("rad", "°")
     factor = _scale(unit)
-    findings = _findings_about(title, outcome)
+    findings = [Finding(id="partly-judged", text=f"{title}: {text}.") for text in outcome.apart]
+    remarks = (*(["harmonic-unseen"] if outcome.unseen else []), *outcome.remarks)
     most = max((each.raw * factor for each in outcome.statistics), default=None)
     sets = _sets(outcome, factor, guarded, limit)
     if outcome.blocked:
@@ -394,7 +411,7 @@ def _judged(title: str, name: str, limit: float, outcome: Departures, guarded: b
             limit=limit, passed=False, note=f"cannot be passed: {outcome.blocked}", raw=most,
             sets=sets, degrees_of_freedom=None,
         )  # fmt: skip
-        return _Judged(row, findings)
+        return _Judged(row, findings, remarks)
     overall = _largest(outcome)
     worst = outcome.statistics[int(overall.place)]
     value, sd, freedom = (
@@ -415,16 +432,7 @@ def _judged(title: str, name: str, limit: float, outcome: Departures, guarded: b
         findings.append(_finding("weak-test", row=row))
     if causes := _causes(row, name, worst):
         findings.append(_finding("roll-harmonics", row=row, causes="; ".join(causes)))
-    return _Judged(row, findings, overall.errors)
-
-
-def _findings_about(title: str, outcome: Departures) -> list[Finding]:
-    """Findings about the values behind a limit, whatever the decision."""
-    findings = [Finding(id="partly-judged", text=f"{title}: {text}.") for text in outcome.apart]
-    if outcome.unseen:
-        findings.append(_finding("harmonic-unseen", title=title))
-    remarks = (_finding(each, title=title, chance=DEPARTURE_CHANCE) for each in outcome.remarks)
-    return [*findings, *remarks]
+    return _Judged(row, findings, remarks, overall.errors)
 
 
 def guard(guarded: bool, freedom: float | None) -> float:

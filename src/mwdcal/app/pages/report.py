@@ -18,7 +18,12 @@ from mwdcal.app.screens.calibration import accuracy_in_words, how, known_inclina
 from mwdcal.app.screens.numbers import HELD, capital, exponent, factor_places
 from mwdcal.app.screens.verification import BETWEEN_SETS, freedom
 from mwdcal.app.text import plural, raised
-from mwdcal.calibration.prediction import accuracy_at, angles, middle_temperature
+from mwdcal.calibration.prediction import (
+    accuracy_at,
+    angles,
+    middle_temperature,
+    without_temperature,
+)
 from mwdcal.calibration.readings import is_simulated, soaks
 from mwdcal.calibration.record import MAGNETIC, Calibration, Finding, TriadCalibration
 from mwdcal.errors import InputError
@@ -114,9 +119,12 @@ def _fit_outcome(calibration: Calibration) -> tuple[str, str]:
     if again:
         parts.append(f"{plural(again, 'station')} to re-shoot")
     accepted = capital(undetermined) if free else "Fit accepted"
-    headline = "Fit doubtful" if doubts else accepted
-    text = f"{headline} – {'; '.join(parts)}" if parts else headline
-    return text, "attention" if parts or free else "good"
+    headline, level = (
+        "Fit doubtful" if doubts else accepted,
+        "attention" if parts or free else "good",
+    )
+    parts += filter(None, [without_temperature(calibration)])
+    return f"{headline} – {'; '.join(parts)}" if parts else headline, level
 
 
 def _findings(calibration: Calibration, verdict: Verdict | None) -> list[Finding]:

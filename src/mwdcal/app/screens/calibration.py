@@ -13,7 +13,7 @@ from mwdcal.app.screens.numbers import degrees_of_freedom, estimate, uncertainty
 from mwdcal.app.text import chance, number, one_line, quantity, table
 from mwdcal.calibration.automatic.nonlinearity import CurveScore
 from mwdcal.calibration.drift import Constant, Drift
-from mwdcal.calibration.prediction import typical_accuracy
+from mwdcal.calibration.prediction import typical_accuracy, without_temperature
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import (
     BudgetRow,
@@ -157,6 +157,8 @@ def heading(calibration: Calibration) -> str:
     parts = [calibration.run, serial, f"{calibration.stations} stations"]
     if calibration.temperature_c:
         parts.append("{:.1f}–{:.1f} °C".format(*calibration.temperature_c))
+    else:
+        parts.append(without_temperature(calibration))
     parts.append(f"I {min(inclinations):.0f}–{max(inclinations):.0f}°")
     parts += simulated(calibration.tool)
     ranks = [

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from mwdcal.calibration.ageing import aged
+from mwdcal.calibration.automatic.ageing import aged
 from mwdcal.calibration.automatic.nonlinearity import (
     CurveScore,
     choose_curves,

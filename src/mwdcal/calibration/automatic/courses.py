@@ -15,6 +15,7 @@ import numpy as np
 
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import HIGHEST, highest_order, usable_soaks
+from mwdcal.estimation.batch import take
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import TANGENT_STEP, tangent
 from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, eigen, inverse, outer, quotient
@@ -25,6 +26,10 @@ UNLIKELY = 1e-3
 """A term is there if noise alone gives one as large with a probability below this."""
 LEFT_TO_TERM = 1e-6
 """A direction of a term counts if the fit leaves this share of its information to it."""
+VISIBLE = 4e-4
+"""A direction of a term counts as visible to the attitudes with this share of the information."""
+ALIGNED = 0.05
+"""Attitudes and temperature go together where the fit leaves less of the information on its next power."""
 RIDGE = 1e-11
 """Added to the information of the fit's unknowns, so that it has an inverse: free ones stay free."""
 OFFSETS = tuple(f"{word}-{axis}" for word in ("offset", "bias") for axis in "xyz")
@@ -38,13 +43,16 @@ class OmittedTerms:
     """Powers 1…`TRIED` of temperature that a fit has not, by member and triad: arrays (B, t, k).
 
     `square` is χ² of a term, all lower ones being fitted, `freedom` its degrees of freedom: 0 where
-    the fit has it, or no soak shows it. `size` (B, t, k, 2) is the mean square of its coefficients,
-    gains and offsets, and `noise` what the declared noise adds to it. `scatter` (B, t) is the
-    variance of whitened residuals that no term explains, `rest` (B, t) its degrees of freedom.
+    the fit has it, or no soak shows it. `left` is the least share of the information on it that the fit
+    leaves, over its coefficients: little where attitudes and temperature go together. `size` (B, t, k, 2) is
+    the mean square of its coefficients, gains and offsets, and `noise` what the declared noise adds to it.
+    `scatter` (B, t) is the variance of whitened residuals that no term explains, `rest` (B, t) its degrees of
+    freedom.
     """
 
     square: Array
     freedom: Array
+    left: Array
     size: Array
     noise: Array
     scatter: Array
@@ -89,8 +97,8 @@ def orders_of(result: Fit) -> list[int]:
 def terms_beyond(result: Fit) -> OmittedTerms:
     """The powers of temperature that a fit has not."""
     each = result.problem.once("terms", result.state, lambda _: _every_term(result))
-    square, freedom = each[:2]
-    size, noise = (np.moveaxis(each[at : at + 2], 0, -1) for at in (2, 4))
+    square, freedom, left_over = each[:3]
+    size, noise = (np.moveaxis(each[at : at + 2], 0, -1) for at in (3, 5))
     factor, known = result.analysis.variance_factor, result.analysis.freedom
     rest = known - freedom.sum(-1)
     left = np.nan_to_num(factor * known) - square.sum(-1)
@@ -98,15 +106,25 @@ def terms_beyond(result: Fit) -> OmittedTerms:
     scatter = np.maximum(left / np.maximum(rest, 1.0), np.maximum(least, 1e-300))
     declared = np.isnan(result.noise) & (rest < 1)
     scatter, rest = np.where(declared, 1.0, scatter), np.where(declared, 1e9, rest)
-    return OmittedTerms(square, freedom, size, noise, scatter, rest)
+    return OmittedTerms(square, freedom, left_over, size, noise, scatter, rest)
+
+
+def share_beyond(result: Fit, index: int, members: Bools) -> Array:
+    """The share (B,) of a triad's residuals that further powers of temperature would leave `members` (B,)."""
+    share, factor = np.ones(len(members)), result.analysis.variance_factor[:, index]
+    places = np.flatnonzero(members & np.isfinite(factor))
+    if places.size:
+        left = terms_beyond(take(result, places)).scatter[:, index]
+        share[places] = np.sqrt(left / factor[places])
+    return share
 
 
 def _every_term(result: Fit) -> Array:
-    """What `_in_turn` says (6, B, t, k) of every power and triad."""
+    """What `_in_turn` says (7, B, t, k) of every power and triad."""
     highest = highest_order(result.problem.temperature)
     count = min(int(highest.max()), TRIED)
     triads, orders = len(result.problem.triads), orders_of(result)
-    each = np.zeros((6, len(highest), triads, TRIED))
+    each = np.zeros((7, len(highest), triads, TRIED))
     least = min(orders)
     if count <= least:
         return each
@@ -181,7 +199,7 @@ def temperature_powers(temperature: Array, count: int) -> Array:
 
 
 def _in_turn(whole: Array, pulled: Array, tested: Ints, fitted: Ints) -> Array:
-    """χ², degrees of freedom, size and noise (6, B, k) of powers in turn, six coefficients each.
+    """χ², degrees of freedom, share left, size and noise (7, B, k) of powers in turn, six coefficients each.
 
     Each is what it adds to the `fitted` unknowns, and to the powers before it.
     """
@@ -195,6 +213,7 @@ def _in_turn(whole: Array, pulled: Array, tested: Ints, fitted: Ints) -> Array:
     base = base + (RIDGE + absent[:, :, None]) * np.eye(len(fitted))
     right = np.concatenate([cross, pulled[:, fitted, None]], -1)
     both = np.concatenate([whole[:, tested][:, :, tested], pulled[:, tested, None]], -1)
+    alone = both
     both = both - cross.mT @ np.linalg.solve(base, right)
     terms = []
     for first in range(0, len(tested), 6):
@@ -208,9 +227,28 @@ def _in_turn(whole: Array, pulled: Array, tested: Ints, fitted: Ints) -> Array:
         scale = norm[:, tested[at]] ** 2
         sizes = [step[..., -1] ** 2, np.einsum("bii->bi", back)]
         means = [_mean(each / scale, worth * scale) for each in sizes]
-        terms.append(np.concatenate([np.stack([square, kept.sum(-1)]), *means]))
+        left = _share_left(alone[:, at, at], both[:, at, at])
+        terms.append(np.concatenate([np.stack([square, kept.sum(-1), left]), *means]))
         both = both - both[:, :, at] @ step
     return np.stack(terms, -1)
+
+
+def _share_left(alone: Array, left: Array) -> Array:
+    """The least share (B,) of information `alone` (B, c, c) that is `left` in any direction that it has."""
+    values, vectors = eigen(alone)
+    kept = values > VISIBLE
+    scaled = vectors * np.sqrt(quotient(np.ones_like(values), values, kept))[:, None]
+    share = scaled.mT @ left @ scaled
+    np.einsum("bii->bi", share)[...] += ~kept
+    return np.asarray(eigen(share)[0].min(-1))
+
+
+def aligned(result: Fit) -> Bools:
+    """Triads (B, t) whose next power of temperature other stations' attitudes hide: see `ALIGNED`."""
+    highest = np.minimum(highest_order(result.problem.temperature), HIGHEST)
+    orders, left = orders_of(result), terms_beyond(result).left
+    each = [left[:, t, order] < ALIGNED for t, order in enumerate(orders)]
+    return np.stack(each, -1) & (highest[:, None] > orders)
 
 
 def untested(result: Fit) -> Bools:

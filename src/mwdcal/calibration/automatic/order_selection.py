@@ -1,7 +1,7 @@
 """The temperature order: chosen by the terms that noise does not explain, judged at temperatures left out.
 
 Leaving one soak out can judge an order of two less than there are soaks; the terms of a fit to all soaks
-can be tested up to one less.
+can be tested up to one less. A ramp is cut into parts that count as soaks (`readings.soaks`).
 """
 
 from __future__ import annotations
@@ -12,15 +12,17 @@ from dataclasses import replace
 import numpy as np
 
 from mwdcal.calibration.automatic.courses import terms_beyond
-from mwdcal.calibration.estimate import fit
+from mwdcal.calibration.diagnosis.plausibility import is_bad
+from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.options import Options, Orders
 from mwdcal.calibration.readings import HIGHEST, TRIADS, Readings, highest_order, usable_soaks
 from mwdcal.calibration.record import OrderScore, stated
 from mwdcal.calibration.residuals import shown_in
 from mwdcal.estimation.batch import batch_of_one, mapped, take
 from mwdcal.estimation.problem import Problem, State
+from mwdcal.estimation.rank import free_directions
 from mwdcal.estimation.uncertainty import TESTED, marginal_rank, readjusted
-from mwdcal.geometry.vectors import Array, Ints
+from mwdcal.geometry.vectors import Array, Bools, Ints
 
 Progress = Callable[[str], None]
 """What gets a line for each trial."""
@@ -48,7 +50,7 @@ def choose_order(
             "two temperatures cannot be left out in turn: order 1 is taken where order 0 leaves "
             "residuals beyond the noise. A third temperature would test the course between."
         )
-    orders = [(order, order) for order in range(int(_highest(batch, options)[0]) + 1)]
+    orders = [(order, order) for order in range(_determined_order(batch, options) + 1)]
     batch = with_noise(batch, replace(options, order=orders[-1]))
     pair = (int(chosen[0, 0]), int(chosen[0, -1]))
     return pair, _scores(batch, options, orders, chosen[0], chance[0], progress)
@@ -80,14 +82,18 @@ def _judged_soaks(readings: Readings, options: Options) -> Ints:
 def _tested(readings: Readings, options: Options) -> tuple[Ints, Array]:
     """The lowest orders (B, t) that leave no term which is there, and the chance (B, t, k) of each term.
 
-    The chance is that of the term in a fit of the order below, or of the order chosen.
+    The chance is that of the term in a fit of the order below, or of the order chosen. An order that the
+    stations do not determine is not taken.
     """
     limit = _highest(readings, options)
     orders = np.full((len(limit), len(readings.triads)), -1)
     chance = np.full((*orders.shape, HIGHEST), np.nan)
     powers = np.arange(1, HIGHEST + 1)
     for order in range(int(limit.max()) + 1):
-        terms = terms_beyond(fit(readings, replace(options, order=order)))
+        result = fit(readings, replace(options, order=order))
+        limit = np.where(_too_weak(result) & (order > 0), np.minimum(limit, order - 1), limit)
+        orders = np.where((orders < 0) & (limit < order)[:, None], order - 1, orders)
+        terms = terms_beyond(result)
         within = (powers <= limit[:, None]) & (powers > order)
         open_ = (orders < 0)[..., None] & within[:, None]
         chance = np.where(open_, terms.chance[..., :HIGHEST], chance)
@@ -98,6 +104,17 @@ def _tested(readings: Readings, options: Options) -> tuple[Ints, Array]:
     return orders, chance
 
 
+def _too_weak(result: Fit) -> Bools:
+    """Fits (B,) of which the stations leave more undetermined than rotations and scales."""
+    weak = ~result.analysis.determined.keep.all(-1)
+    places = np.flatnonzero(weak)
+    if places.size:
+        part = take(result, places)
+        free = free_directions(part.problem, part.state, part.analysis.determined)
+        weak[places] = [any(map(is_bad, each)) for each in free]
+    return np.asarray(weak)
+
+
 def order_errors(readings: Readings, options: Options, progress: Progress) -> list[OrderScore]:
     """What an order that was given is worth at temperatures left out, one row per triad.
 
@@ -106,7 +123,7 @@ def order_errors(readings: Readings, options: Options, progress: Progress) -> li
     batch = batch_of_one(readings)
     if _judged_soaks(batch, options)[0] < _needed(options.orders):
         return []
-    highest = int(_highest(batch, options)[0])
+    highest = _determined_order(batch, options)
     yardstick = options if options.prior else replace(options, order=highest)
     chosen = np.array(options.orders[: len(readings.triads)])
     untested = np.full((len(chosen), HIGHEST), np.nan)
@@ -129,6 +146,14 @@ def _highest(readings: Readings, options: Options) -> Ints:
     """The highest order (B,) that the soaks can carry, with stations enough."""
     carried = highest_order(_temperature(readings))
     return np.minimum(carried, 0 if options.method == "swarm" else HIGHEST)
+
+
+def _determined_order(readings: Readings, options: Options) -> int:
+    """The highest order that soaks carry and stations determine, of a batch of one."""
+    order = int(_highest(readings, options)[0])
+    while order and _too_weak(fit(readings, replace(options, order=order)))[0]:
+        order -= 1
+    return order
 
 
 def _scores(

@@ -9,7 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from mwdcal.calibration.automatic.courses import misfit_size, orders_of, terms_beyond, untested
+from mwdcal.calibration.automatic.courses import (
+    aligned,
+    misfit_size,
+    orders_of,
+    terms_beyond,
+    untested,
+)
 from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag, listed, spaced
 from mwdcal.calibration.diagnosis.plausibility import (
     NOISE_RATIO,
@@ -20,8 +26,8 @@ from mwdcal.calibration.diagnosis.plausibility import (
     unchecked,
 )
 from mwdcal.calibration.diagnosis.repeats import copies
+from mwdcal.calibration.diagnosis.structure import COLUMN, suspected
 from mwdcal.calibration.diagnosis.structure import described as seen_as
-from mwdcal.calibration.diagnosis.structure import effects, suspected
 from mwdcal.calibration.drift import SHOWN_DRIFT
 from mwdcal.calibration.readings import EARTH_RANGES, HIGHEST, TRIADS
 from mwdcal.calibration.record import Finding
@@ -97,6 +103,9 @@ REMARKS = {
     "prior-aged": "The prior ({source}) allows for what the tool may have changed since, {ageing}. State turn_on, "
     "bias_walk and scale_walk under [accelerometer.datasheet] and [magnetometer.datasheet] of the profile if you "
     "know better.",
+    "temperature-aligned": "{triads}: this run cannot tell power {power} of temperature from the terms below it, and "
+    "no uncertainty here includes it: attitudes and temperature went together, or the attitudes are too few. Repeat "
+    "the same attitudes at other temperatures, on the way up and on the way down.",
     "prior-shared": "the prior ({source}) and this run both have {both} in their uncertainty, and count as independent "
     "there. On the same stand it is one error: what rests on it is then stated up to 1.4 times too small.",
     "prior-only": "this run does not determine {names}: there values and uncertainties rest on the prior ({source}).",
@@ -161,6 +170,7 @@ def finding_flags(fitted: FittedRuns) -> Iterator[Flag]:
     yield _repeated(fitted)
     yield from _beyond_order(fitted)
     yield _untested(fitted)
+    yield _aligned(fitted)
     yield from _undetermined(fitted)
     yield from _prior(fitted)
     yield from _model(fitted)
@@ -278,8 +288,10 @@ def _structure(fitted: FittedRuns) -> Iterator[Flag]:
     """What the residuals look like, where they are more than noise."""
     unit = shown_in("field", fitted.readings.relative)[1]
     for place in np.flatnonzero(suspected(fitted.result, fitted.chances)).tolist():
-        for effect in effects(fitted.member(place)):
-            yield _common(fitted, f"looks-like-{effect.name}", seen_as(effect, unit), [place])
+        for effect in fitted.effects(place):
+            column = effect.name.startswith(COLUMN)
+            name = "column-explains" if column else f"looks-like-{effect.name}"
+            yield _common(fitted, name, seen_as(effect, unit), [place])
 
 
 def _scatter(fitted: FittedRuns) -> Flag:
@@ -336,6 +348,8 @@ def _course(fitted: FittedRuns, index: int, present: Bools, place: int) -> dict[
         remedy = f"Use `order` auto, or `order` {min(int(powers.max()), HIGHEST)}"
         if fitted.options.method == "swarm":
             remedy = "Use another `method`: swarm has no temperature terms"
+        elif aligned(fitted.result)[place, index]:
+            remedy = "Repeat the same attitudes at other temperatures"
     size = {"rms": share * strength * scale, "unit": unit, "angle": np.degrees(share)}
     return {"cause": cause, "remedy": remedy, **size}
 
@@ -349,6 +363,14 @@ def _untested(fitted: FittedRuns) -> Flag:
     values = {"order": order, "levels": order + 1, "unsaid": unsaid}
     triads = partial(_joined, bare)
     return _remark("temperature-untested", np.any(bare, -1), triads=triads, **values)
+
+
+def _aligned(fitted: FittedRuns) -> Flag:
+    """Temperature terms that look like sensor errors at one temperature, because attitudes followed it."""
+    hidden = aligned(fitted.result)
+    power = np.where(hidden, orders_of(fitted.result), HIGHEST).min(-1) + 1
+    triads = partial(_joined, hidden)
+    return _remark("temperature-aligned", np.any(hidden, -1), triads=triads, power=power)
 
 
 def _undetermined(fitted: FittedRuns) -> Iterator[Flag]:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from mwdcal.calibration.diagnosis.plausibility import freedom_of, misfit_chances
+from mwdcal.calibration.diagnosis.structure import Effect, effects
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
@@ -131,6 +132,11 @@ class FittedRuns:
     def member(self, place: int) -> Fit:
         """The fit of one run, as a batch of one."""
         return self.result if self.count == 1 else take(self.result, np.array([place]))
+
+    def effects(self, place: int) -> list[Effect]:
+        """What the residuals of one run look like."""
+        others = {name: values[place, None] for name, values in self.readings.others.items()}
+        return effects(self.member(place), others)
 
     def residuals(self, place: int) -> Residuals:
         """The errors of one run."""

@@ -6,14 +6,14 @@ single run is refused by the first flag that holds, and so is each tool of a fle
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from mwdcal.calibration.diagnosis.axes import explaining
+from mwdcal.calibration.automatic.courses import orders_of, share_beyond
+from mwdcal.calibration.diagnosis.causes import ENDS, spanned
 from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag, listed, spaced
 from mwdcal.calibration.diagnosis.plausibility import (
     excessive_errors,
@@ -26,17 +26,23 @@ from mwdcal.calibration.diagnosis.plausibility import (
     straying,
 )
 from mwdcal.calibration.diagnosis.soundness import is_covariance
-from mwdcal.calibration.diagnosis.structure import described, effects
+from mwdcal.calibration.diagnosis.structure import described
 from mwdcal.calibration.methods import EVIDENCE
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.readings import CONSTANTS, EARTH_RANGES, TRIADS, Readings, soaks
+from mwdcal.calibration.readings import (
+    CONSTANTS,
+    EARTH_RANGES,
+    TRIADS,
+    Readings,
+    highest_order,
+    soaks,
+)
 from mwdcal.calibration.residuals import shown_in
 from mwdcal.calibration.results import temperature_range
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.batch import batch_of_one
 from mwdcal.estimation.robust import LOSSES
 from mwdcal.estimation.solvers import Status
-from mwdcal.estimation.uncertainty import station_misfit
 from mwdcal.geometry.vectors import Array, Bools
 from mwdcal.sensor.models import Basis, Factors, Polynomial, Whole, restricted
 from mwdcal.sensor.profile import COMMON
@@ -51,8 +57,6 @@ PARAMETERS_NAMED = 4
 """Most undetermined parameters that a message lists."""
 ABSURD_RATIO = 30.0
 """Residuals of more than this many times the declared noise mean that something is plain wrong."""
-CULPRIT_SHARE = 0.3
-"""Share of all misfit at which a single station is named as the cause."""
 COARSE_NOISE = 0.05
 """Estimated noise of more than this share of the field likewise."""
 BAD_INPUT = "bad-input"
@@ -131,10 +135,12 @@ OF_FITS = {
     "unsettled": "the fit failed: {message}.{axes}",
     "residuals": "the {triad}'s residuals are {much}: no sensor model explains these readings. Check that columns, "
     "reference angles and groups belong to the stations they stand at, and 'axes' and 'noise' in the tool "
-    "profile.{culprit}{axes}",
+    "profile.{column}{culprit}{axes}",
+    "temperature": "the {triad}'s residuals are {much}, because its readings vary with temperature more than `order` "
+    "{order} follows: this run spans {span:.0f} °C. {remedy}.",
     "weak-geometry": "the stations are too weak to fit the model: nothing determines {names}. Add stations at other "
     "inclinations (at least three, well apart, up and down) with six or more toolfaces each, or give more reference "
-    "angles.{axes}",
+    "angles{lower}.{axes}",
     "no-redundancy": "the {triad} has no redundancy ({freedom:.1f} degrees of freedom): its noise cannot be estimated. "
     "Add stations, or declare 'noise' in the tool profile.",
     "gain": "the {triad}'s gain on tool axis {axis} comes out at {gain:.3g} times nominal and {wrong} (accepted: "
@@ -307,7 +313,7 @@ def _temperatures(readings: Readings, order: int) -> Iterator[Flag]:
         yield Flag(BAD_INPUT, _all(readings, True), OF_READINGS["no temperature"], needs)
         return
     levels, span = soaks(readings.temperature).max(-1) + 1, np.ptp(readings.temperature, axis=-1)
-    few = (levels < order + 1) | (span < 10 * order)
+    few = highest_order(readings.temperature) < order
     values = {"span": span, "levels": levels, "plural": np.where(levels > 1, "s", "")}
     yield Flag("temperature-span", few, OF_READINGS["span"], needs | values)
 
@@ -353,7 +359,7 @@ def _by_arrays(fitted: FittedRuns) -> Iterator[Flag]:
         name = status.name.lower().replace("_", "-")
         yield refusal("unsettled", unsettled, name, message=status.message)
     for triad in triads:
-        yield _absurd(fitted, triad)
+        yield from _absurd(fitted, triad)
     yield _too_weak(fitted)
     for triad in triads:
         freedom = result.analysis.freedom[:, triad]
@@ -376,48 +382,34 @@ def _refusal(
 
     The words may end with the station to look at first, and with the axes with which the run would fit.
     """
-    ends = {"culprit": partial(_culprit, fitted), "axes": partial(_axes, fitted)}
+    ends = {word: partial(end, fitted) for word, end in ENDS.items()}
     return Flag(status or words, members, OF_FITS[words], ends | values)
 
 
-def _axes(fitted: FittedRuns, place: int) -> str:
-    """The axes with which a run would fit, in words; nothing if there are none."""
-    each = [
-        f"axes = {json.dumps(axes)} of [{name}]"
-        for name, axes in explaining(*fitted.alone(place)).items()
-    ]
-    return f" The run fits with {' and '.join(each)}." if each else ""
-
-
-def _culprit(fitted: FittedRuns, place: int) -> str:
-    """The station to look at first, if a single one has most of the misfit."""
-    square = station_misfit(fitted.member(place).analysis)[0][0]
-    worst = int(np.argmax(square))
-    share = square[worst] / max(float(square.sum()), 1e-300)
-    if share < CULPRIT_SHARE:
-        return ""
-    label = fitted.alone(place)[0].labels[worst]
-    return (
-        f" Station {label} alone has {share:.0%} of the misfit: `exclude` {label}, or fit with "
-        "`robust` student-t."
-    )
-
-
-def _absurd(fitted: FittedRuns, index: int) -> Flag:
+def _absurd(fitted: FittedRuns, index: int) -> Iterator[Flag]:
     """Residuals that no error of a sensor explains: columns, references or groups are mixed up."""
     result, raw = fitted.result, fitted.result.problem.triads[index].raw
     excess = np.sqrt(np.nan_to_num(result.analysis.variance_factor[:, index]))
     noise = result.noise[:, index]
     declared, signal = np.isnan(noise), np.minimum(_strength(raw), 2 * raw.std(axis=1).max(-1))
-    absurd = np.where(declared, excess > ABSURD_RATIO, noise > COARSE_NOISE * signal)
+
+    def is_absurd(share: Array | float) -> Bools:
+        return np.where(
+            declared, excess * share > ABSURD_RATIO, noise * share > COARSE_NOISE * signal
+        )
 
     def much(place: int) -> str:
         if declared[place]:
             return f"{excess[place]:.0f} times the declared noise"
         return f"{noise[place] / signal[place]:.0%} of the field"
 
-    absurd &= result.analysis.freedom[:, index] >= 1
-    return _refusal(fitted, "residuals", absurd, triad=TRIADS[index], much=much)
+    absurd = is_absurd(1.0) & (result.analysis.freedom[:, index] >= 1)
+    warmed = absurd & ~is_absurd(share_beyond(result, index, absurd))
+    words = {"triad": TRIADS[index], "much": much}
+    yield _refusal(
+        fitted, "temperature", warmed, "temperature-order", **words, **spanned(fitted, index)
+    )
+    yield _refusal(fitted, "residuals", absurd & ~warmed, **words)
 
 
 def _too_weak(fitted: FittedRuns) -> Flag:
@@ -428,7 +420,9 @@ def _too_weak(fitted: FittedRuns) -> Flag:
         each = [f"{TRIADS[t]} {e.id.removeprefix('weak-')}" for e in bad[place] for t in e.triads]
         return listed([*dict.fromkeys(each)], PARAMETERS_NAMED)
 
-    return _refusal(fitted, "weak-geometry", np.array([*map(bool, bad)]), names=names)
+    thermal = any(orders_of(fitted.result))
+    lower = ", or repeat attitudes at other temperatures, or lower `order`" if thermal else ""
+    return _refusal(fitted, "weak-geometry", np.array([*map(bool, bad)]), names=names, lower=lower)
 
 
 def _odd_gain(fitted: FittedRuns, index: int) -> Flag:
@@ -478,7 +472,7 @@ def _unexplained_errors(fitted: FittedRuns, sound: Bools) -> Flag:
         return {"name": name, "after": after, "expected": expected, "unit": spaced(unit)}
 
     def looks(place: int) -> str:
-        first = effects(fitted.member(place))[:1]
+        first = fitted.effects(place)[:1]
         return "".join(f" {described(each, shown_in('field', relative)[1])}" for each in first)
 
     return _refusal(fitted, "errors", flags, of=worst, looks=looks)

@@ -42,6 +42,20 @@ SMALLEST_SET = 3
 SET_TURNS = ("inclination-zero", "azimuth-zero")
 COURSE_SUFFIX = "-temperature"
 """What ends the names of the powers of temperature that the order of a triad leaves out."""
+COLUMN = "column "
+"""What the names of columns that the run does not use begin with."""
+COLUMN_EXPLAINS = (
+    "Column {name!r} is not used, and explains {effect.share:.0%} of the misfit. If it is the temperature of the tool, "
+    "name it 'temperature_c' (°C), or under [columns] of the tool profile; else find out what it stands for."
+)
+CLEAR_SHARE = 0.2
+"""A column is reported if it explains this share of the misfit…"""
+CLEAR_CHANCE = 1e-6
+"""…and would by chance less often than this."""
+FEWEST_TESTED = 20
+"""Stations from which columns are tested: fewer are explained by anything."""
+REPEATED = 0.02
+"""A column repeats the attitudes if they leave no more than this share of its variance."""
 ZEROS = ("azimuth-zero", "inclination-zero", "dip-reference")
 """Effects that are one angle."""
 EFFECTS = {
@@ -119,8 +133,11 @@ class _Scores:
         return value[kept], vector[:, kept], index
 
 
-def effects(result: Fit) -> list[Effect]:
-    """Effects that the residuals of one fit (B = 1) show, the largest first."""
+def effects(result: Fit, others: Mapping[str, Array] | None = None) -> list[Effect]:
+    """Effects that the residuals of one fit (B = 1) show, the largest first.
+
+    `others` (1, n) are numbers of columns that the fit does not use: each may explain the residuals too.
+    """
     if result.analysis.influence is not None:
         return []
     result = _without_bad_stations(result)
@@ -130,17 +147,42 @@ def effects(result: Fit) -> list[Effect]:
         for i, t in enumerate(result.problem.triads)
     ]
     problem = replace(result.problem, triads=tuple(triads))
-    scores = _scores(problem, result)
+    others = _testable(problem, result.state, others or {})
+    scores = _scores(problem, result, others)
     left = scores.misfit
     shown: dict[str, tuple[float, float]] = {}
     while True:
-        others = [name for name in scores.places if name not in shown]
-        trials = [(*_trial(scores, [*shown], name, left), name) for name in others]
+        open_ = [name for name in scores.places if name not in shown]
+        trials = [(*_trial(scores, [*shown], name, left), name) for name in open_]
         chance, change, best = min(trials, default=(1.0, 0.0, ""))
         if chance >= EFFECT_CHANCE:
-            return [e for e in _described(result, shown) if not e.name.endswith(COURSE_SUFFIX)]
+            return [e for e in _described(result, shown, others) if is_shown(e)]
         shown[best] = chance, -change / scores.misfit
         left += change
+
+
+def is_shown(effect: Effect) -> bool:
+    """Whether an effect is reported: powers of temperature by another finding, columns where they explain much."""
+    much = effect.share >= CLEAR_SHARE and effect.chance < CLEAR_CHANCE
+    return much if effect.name.startswith(COLUMN) else not effect.name.endswith(COURSE_SUFFIX)
+
+
+def _testable(problem: Problem, state: State, others: Mapping[str, Array]) -> dict[str, Array]:
+    """Columns (n,) that vary, count no stations, and do not merely repeat the attitudes; centred, of unit size."""
+    count = problem.temperature.shape[-1]
+    turns = state.attitude[0].reshape(count, 9)
+    basis = np.linalg.svd(np.column_stack([np.ones(count), turns]), full_matrices=False)[0]
+    columns = {}
+    for name, values in others.items():
+        steps, spread = np.diff(values[0]), np.std(values[0])
+        counter = np.all(steps == 1) and values[0, 0] in (0, 1)
+        if count < FEWEST_TESTED or counter or not spread > 1e-12 * np.abs(values[0]).max():
+            continue
+        unit = (values[0] - values[0].mean()) / spread
+        left = unit - basis @ (basis.transpose() @ unit)
+        if np.mean(left**2) > REPEATED:
+            columns[name] = unit
+    return columns
 
 
 def _without_bad_stations(result: Fit) -> Fit:
@@ -166,12 +208,14 @@ def _trial(scores: _Scores, chosen: list[str], name: str, left: float) -> tuple[
     return float(chance), -gain
 
 
-def _described(result: Fit, shown: Mapping[str, tuple[float, float]]) -> list[Effect]:
+def _described(
+    result: Fit, shown: Mapping[str, tuple[float, float]], others: Mapping[str, Array]
+) -> list[Effect]:
     """The effects, of chance and share, with their sizes: all together, with the noise that they leave."""
     if not shown:
         return []
     problem, names = result.problem, [*shown]
-    scores = _scores(problem, result)
+    scores = _scores(problem, result, others)
     gain, directions = scores.gain(names)
     scale = np.sqrt(max(scores.misfit - gain, 0.0) / max(scores.freedom - directions, 1.0))
     values, covariance = scores.solution(names)
@@ -188,9 +232,12 @@ def _described(result: Fit, shown: Mapping[str, tuple[float, float]]) -> list[Ef
     return sized
 
 
-def _scores(problem: Problem, result: Fit) -> _Scores:
+def _scores(problem: Problem, result: Fit, others: Mapping[str, Array]) -> _Scores:
     """Efficient scores of the columns (1, n, m, k) of all families: what the fit's unknowns cannot take up."""
     families = dict(_families(problem, result.state))
+    if others:
+        steady = steady_columns(problem, result.state)
+        families |= {COLUMN + n: _products(steady, v[:, None]) for n, v in others.items()}
     linear = problem.linear(result.state)
     whole, normal = whole_covariance(linear, result.analysis.determined)[0], linear.normal
     every = np.concatenate([*families.values()], -1)
@@ -336,6 +383,8 @@ def suspected(result: Fit, chance: Array) -> Bools:
 
 def described(effect: Effect, unit: str) -> str:
     """An effect in words; `unit` is that of the magnetometer."""
+    if effect.name.startswith(COLUMN):
+        return COLUMN_EXPLAINS.format(name=effect.name.removeprefix(COLUMN), effect=effect)
     triad, _, kind = effect.name.partition("-")
     of_triad = triad in TRIADS
     looks = EFFECTS[kind if of_triad else effect.name]

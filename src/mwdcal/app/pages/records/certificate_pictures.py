@@ -82,9 +82,7 @@ def _accuracy(calibration: Calibration) -> Iterator[Picture]:
 
 
 def _roll_tests(as_found: Verdict | None, as_left: Verdict | None) -> Iterator[Picture]:
-    note = (
-        "Markers: stations, noise included. Curves: mean and two harmonics over a turn of toolface."
-    )
+    note = "Markers: stations, noise included. Curves: mean and harmonics over a turn of toolface."
     for when, verdict in (("as found", as_found), ("as left", as_left)):
         if verdict is not None and any(row.sets for row in verdict.rows):
             title = f"Roll test {when}: departures over toolface"
