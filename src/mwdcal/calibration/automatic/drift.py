@@ -27,7 +27,7 @@ ORDER_CHANCE = 0.1
 
 A drift that is not there costs little: its size comes out small. One that is left out costs coverage.
 """
-LEAST_FREEDOM = 36.0
+REDUNDANCY = 36.0
 """Fewest degrees of freedom of a triad that can tell a drift from noise."""
 
 
@@ -78,7 +78,7 @@ def drifting(result: Fit, options: Options) -> Bools:
     if apart:
         return drifted
     sound = (result.status == int(Status.OK)) & result.analysis.finite
-    sound &= result.analysis.freedom.min(-1) >= LEAST_FREEDOM
+    sound &= result.analysis.freedom.min(-1) >= REDUNDANCY
     sound &= ~terms_beyond(result).present.any((1, 2))
     if not sound.any():
         return drifted
