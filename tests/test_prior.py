@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from cli_support import SERVO_NOISE, calibrated, mwdcal, servo_run, write_csv
+from mwdcal.calibration.automatic.ageing import aged
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
@@ -182,5 +183,57 @@ def test_a_run_without_magnetometer_has_no_unit_that_could_differ_from_the_prior
     first, second = (documents.read(path) for path in (previous, made))
     assert second.magnetometer is None
     assert second.accelerometer.rank == 12
-    before, after = (np.array(c.accelerometer.standard_uncertainties) for c in (first, second))
-    assert (after < before).all()
+    bare = (
+        tmp_path / "bare.json"
+    )  # the prior adds to what the run says alone, and ages as no date is stated
+    assert mwdcal("calibrate", run, "--tool", "servo", "-o", bare).code == 0
+    after, alone = (
+        np.array(c.accelerometer.standard_uncertainties) for c in (second, documents.read(bare))
+    )
+    assert (after < alone).all()
+    across = [1, 2, 5]  # misalignment does not age
+    assert first.accelerometer.parameter_names[1] == "gain-xy"
+    assert (after < np.array(first.accelerometer.standard_uncertainties))[across].all()
+
+
+def later(seed, turn_on, date):
+    """A run of a tool that was switched on again: offsets of both triads anew, g and nT."""
+    rng = np.random.default_rng(seed)
+    readings = make(seed, (20, 60, 110, 160))
+    return replace(
+        readings,
+        accelerometer=readings.accelerometer + turn_on[0] * rng.normal(size=3),
+        magnetometer=readings.magnetometer + turn_on[1] * rng.normal(size=3),
+        metadata={"date": date},
+    )
+
+
+def test_a_prior_allows_for_switching_on_and_for_time():
+    """Variance of an offset: that of the earlier run, twice that of a turn-on, and a year's walk times the years."""
+    sheet = {"turn_on": 3e-4, "bias_walk": 6e-4, "scale_walk": 1e-3}
+    profile = msgspec.structs.replace(
+        PROFILE,
+        accelerometer=msgspec.structs.replace(PROFILE.accelerometer, datasheet=Datasheet(**sheet)),
+    )
+    previous = calibrate(replace(make(1), metadata={"date": "2024-01-01"}), profile)
+    run = later(2, (0.0, 0.0), "2026-01-01")
+    known = aged(from_calibration(previous), previous, run, profile)
+    covariance = np.linalg.inv(known.precision)
+    years = 731 / 365.25
+    extra = np.diag(covariance) - np.diag(previous.parameter_covariance)
+    by_name = dict(zip(known.names, extra, strict=True))
+    offset = 2 * 3e-4**2 + 6e-4**2 * years
+    assert by_name["accelerometer offset-x"] == pytest.approx(offset, rel=1e-4)
+    assert by_name["accelerometer gain-xx"] == pytest.approx(1e-6 * years, rel=1e-3)
+    assert by_name["accelerometer gain-xy"] == pytest.approx(0.0, abs=1e-11)
+    assert by_name["magnetometer offset-z"] == pytest.approx(70.0**2 * (2 + years), rel=1e-4)
+
+
+def test_an_ordinary_turn_on_is_no_conflict_and_a_knock_is():
+    previous = calibrate(replace(make(1), metadata={"date": "2026-01-01"}), PROFILE)
+    usual = calibrate(later(2, (4e-4, 70.0), "2026-02-01"), PROFILE, Options(prior=previous))
+    names = {finding.id: finding.text for finding in usual.findings}
+    assert "prior-conflict" not in names
+    assert "31 days" in names["prior-aged"]
+    knocked = calibrate(later(2, (1e-2, 70.0), "2026-02-01"), PROFILE, Options(prior=previous))
+    assert "prior-conflict" in {finding.id for finding in knocked.findings}

@@ -18,7 +18,7 @@ from mwdcal.calibration.options import Options
 from mwdcal.files.limits import load_limits
 from mwdcal.files.profiles import load_profile
 from mwdcal.planning import procedure as procedures
-from mwdcal.planning.effects import Effects, StandEffects
+from mwdcal.planning.effects import Effects, SensorEffects, StandEffects
 from mwdcal.planning.plans import load_plan
 from mwdcal.planning.procedure import Procedure
 from mwdcal.planning.repetition import Share, summarised
@@ -317,3 +317,17 @@ def test_ten_thousand_calibrations_are_judged_by_the_shipped_limits():
         "error inclination",
         "error azimuth",
     ]
+
+
+def test_a_turn_on_is_no_error_of_the_calibration_and_is_one_of_the_roll_test():
+    """20 mg at each switching on: stated accuracy is met, true parameters hold it, and the roll test sees the next."""
+    wild = with_changes(Effects(), accelerometer=SensorEffects(turn_on=0.02))
+    calm = procedure(limits=LIMITS).repeated((0, 20))
+    shaken = procedure(limits=LIMITS, effects=wild).repeated((0, 20))
+    for name in ("inclination", "toolface"):
+        assert np.median(shaken[f"{name}_error_rms_deg"] / calm[f"{name}_error_rms_deg"]) < 2
+    assert shaken["good"].sum() < calm["good"].sum()
+    true = shaken["error_inclination_true_deg"]
+    assert np.median(true) > np.degrees(
+        0.02
+    )  # two switchings on, of which 20 mg each turn gravity by 1.1°

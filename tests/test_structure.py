@@ -125,10 +125,15 @@ def test_a_course_that_the_order_leaves_out_is_not_taken_for_a_drift():
 
 def test_findings_name_the_effect_and_what_to_do():
     record = calibrate(run("field-drift"), Profile(name="x"))
-    (finding,) = [f for f in record.findings if f.id.startswith("looks-like-")]
-    assert finding.id == "looks-like-field-drift"
+    (finding,) = [f for f in record.findings if "drift" in f.id or f.id.startswith("looks-like")]
+    assert finding.id == "field-drift"
     assert "reference magnetometer" in finding.text
-    assert "nT rms" in finding.text
+    (drift,) = [each for each in record.drift if each.name == "field"]
+    north, east, down = 60.0, 50.0, 80.0  # from end to end; 25 nT of bend cancel there
+    assert (
+        abs(drift.change - np.sqrt(north**2 + east**2 + down**2)) < 3 * drift.standard_uncertainty
+    )
+    assert f"{drift.change:.2g} nT" in finding.text
 
 
 def test_settings_that_a_roll_set_shares_are_not_taken_for_another_effect():

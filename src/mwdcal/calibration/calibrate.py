@@ -10,12 +10,14 @@ import numpy as np
 
 from mwdcal.calibration import results
 from mwdcal.calibration.automatic.auto import Choice, choose
+from mwdcal.calibration.automatic.drift import fit_run
 from mwdcal.calibration.canonical import rounded
 from mwdcal.calibration.diagnosis.findings import described, findings
 from mwdcal.calibration.diagnosis.flags import FittedRuns
 from mwdcal.calibration.diagnosis.refusals import UNSOUND_ADVICE, check, fit_refusals
 from mwdcal.calibration.diagnosis.soundness import inconsistency
-from mwdcal.calibration.estimate import Fit, fit
+from mwdcal.calibration.drift import Constant, Drift
+from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import accuracy
 from mwdcal.calibration.readings import TRIADS, Readings, is_simulated, serial_of
@@ -24,7 +26,6 @@ from mwdcal.calibration.record import (
     BudgetRow,
     Calibration,
     Choices,
-    Constant,
     StandErrors,
     TriadCalibration,
     Undetermined,
@@ -35,7 +36,8 @@ from mwdcal.calibration.residuals import error_rows, measure_rows
 from mwdcal.calibration.settings import ASSUMED_PRACTICE, DIRECTION, is_assumed
 from mwdcal.errors import FitError
 from mwdcal.estimation.batch import batch_of_one
-from mwdcal.estimation.evidence import STAND_ERRORS
+from mwdcal.estimation.evidence import STAND_ERRORS, WALKS
+from mwdcal.estimation.problem import WALK_AXES
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.models import Polynomial
 from mwdcal.sensor.profile import PRACTICES, Profile
@@ -58,7 +60,7 @@ def calibrate(
     calibration to be trusted.
     """
     choice = choose(readings, profile, options or Options(), progress)
-    return recorded(choice, fit(choice.readings, choice.options))
+    return recorded(choice, fit_run(choice.readings, choice.options))
 
 
 def recorded(choice: Choice, result: Fit) -> Calibration:
@@ -96,13 +98,7 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
         prior_sha256=options.prior_sha256 or msgspec.UNSET,
         software=SOFTWARE,
         method=options.method,
-        options=Choices(
-            parameters=options.parameters,
-            ignore=list(options.ignore),
-            robust=options.robust,
-            paper_weights=options.paper_weights,
-            prior=prior.source if prior else None,
-        ),
+        options=_choices(options),
         seed=options.seed if options.method == "swarm" else None,
         time=datetime.now(UTC).isoformat(timespec="seconds"),
         field_unit=readings.field_unit,
@@ -115,6 +111,7 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
         free=[(to_file @ entry.direction).tolist() for entry in fitted.free[0]],
         singular_values=result.analysis.determined.values[0].tolist(),
         constants=_constants(result),
+        drift=_drifts(result, readings.field_unit),
         stand=StandErrors(**_first(results.stand_errors(result))),
         earth=_first(results.earth(result)),
         gravity_stated=readings.states("gravity"),
@@ -147,6 +144,18 @@ def _practice(fitted: FittedRuns) -> str | msgspec.UnsetType:
     return PRACTICES[0] if evidence.set_together.any() else PRACTICES[1]
 
 
+def _choices(options: Options) -> Choices:
+    """What else was asked for."""
+    prior = options.knowledge
+    return Choices(
+        parameters=options.parameters,
+        ignore=list(options.ignore),
+        robust=options.robust,
+        paper_weights=options.paper_weights,
+        prior=prior.source if prior else None,
+    )
+
+
 def _budget(fitted: FittedRuns) -> list[BudgetRow]:
     """What each source of error adds to the accuracy to expect."""
     reference, prior = fitted.profile.reference_temperature_c, fitted.options.knowledge
@@ -169,7 +178,8 @@ def _constants(result: Fit) -> list[Constant]:
     triples = zip(result.state.constants[0], sd, problem.evidence.constants, strict=True)
     for value, uncertainty, constant in triples:
         lone = constant.name == "dip" and len(problem.triads) == 1
-        if lone or (constant.unknown and constant.name in STAND_ERRORS):  # those are in `stand`
+        in_stand = constant.unknown and constant.name in STAND_ERRORS
+        if lone or in_stand or constant.name in WALK_AXES:  # those are in `stand`, or `drift`
             continue
         unit = {"gravity": "g", "field": "nT"}.get(constant.name, "°")
         factor = float(np.degrees(1)) if unit == "°" else 1.0
@@ -182,6 +192,23 @@ def _constants(result: Fit) -> list[Constant]:
             )
         )
     return constants
+
+
+def _drifts(result: Fit, field_unit: str) -> list[Drift]:
+    """How far field and offsets drifted within the run."""
+    units = [(1e3, "mg"), (1.0, field_unit), (1.0, field_unit)]
+    changes = results.drifts(result)
+    return [
+        Drift(
+            name=name.removesuffix("-drift"),
+            change=float(change[0]) * factor,
+            standard_uncertainty=float(sd[0]) * factor,
+            unit=unit,
+        )
+        for (name, (change, sd)), (factor, unit) in zip(
+            changes.items(), [units[[*WALKS].index(n)] for n in changes], strict=True
+        )
+    ]
 
 
 def _triad(fitted: FittedRuns, index: int) -> TriadCalibration:

@@ -221,6 +221,20 @@ def _general(problem: Problem, options: Options, finite: Bools) -> Fit:
     stage = _set_apart(stage, options)
     if options.robust:
         stage = _downweigh(stage, options)
+    return _finished(stage, options, finite, iterations)
+
+
+def refitted(result: Fit, problem: Problem, state: State, scale: Array, options: Options) -> Fit:
+    """A fit of a problem that has more unknowns than that of `result`, the noise times `scale` (B, triads)."""
+    problem = _rescaled(problem, scale)
+    solved = solve(problem, state, options)
+    stage = _Stage(problem, solved, result.trust, solved.iterations)
+    finite = result.status != int(Status.NOT_FINITE)
+    return _finished(stage, options, finite, result.iterations + solved.iterations)
+
+
+def _finished(stage: _Stage, options: Options, finite: Bools, iterations: Ints) -> Fit:
+    """The fit at the end of all turns: gauge settled, and analysed."""
     problem, solved, trust = stage.problem, stage.solved, stage.trust
     trusted, state = _trusting(problem, trust), solved.state
     determined = _determined(trusted, state, solved)

@@ -36,7 +36,7 @@ class Knowledge:
     does not have are of no account; else they are an error. `stations` are the fingerprints of
     those that the knowledge comes from, `temperature` their range, °C; `common` names errors of the
     stand and of references that are part of its uncertainty, as `budget` of a calibration does.
-    `simulated`: it comes from simulated data.
+    `simulated`: it comes from simulated data. `ageing` says by how much the tool may have changed since.
     """
 
     source: str
@@ -49,6 +49,7 @@ class Knowledge:
     temperature: tuple[float, float] | None = None
     common: tuple[str, ...] = ()
     simulated: bool = False
+    ageing: str = ""
 
 
 def prior_of(knowledge: Knowledge | None, models: Sequence[Model], batch: int) -> Prior:

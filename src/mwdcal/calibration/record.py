@@ -16,6 +16,7 @@ import numpy as np
 
 from mwdcal import __version__
 from mwdcal.calibration.canonical import Signature, document_sha256
+from mwdcal.calibration.drift import Constant, Drift
 from mwdcal.calibration.notebooks import html_table
 from mwdcal.calibration.readings import NANOTESLA, SOAK_GAP, Readings, simulated, stated_day
 from mwdcal.calibration.tilt import tilt_width
@@ -66,15 +67,6 @@ class Undetermined(msgspec.Struct, frozen=True, kw_only=True):
 
     id: str
     text: str
-
-
-class Constant(msgspec.Struct, frozen=True, kw_only=True):
-    """A constant of the run that was estimated, with its standard uncertainty."""
-
-    name: str
-    value: float
-    standard_uncertainty: float
-    unit: str
 
 
 class BudgetRow(msgspec.Struct, frozen=True, kw_only=True):
@@ -281,6 +273,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     free: list[list[float]]
     singular_values: list[float]
     constants: list[Constant]
+    drift: list[Drift] = []
     stand: StandErrors = StandErrors()
     earth: dict[str, float]
     gravity_stated: bool | msgspec.UnsetType = msgspec.UNSET

@@ -22,7 +22,9 @@ from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.prediction import CalibratedTools
 from mwdcal.calibration.prior import Knowledge
 from mwdcal.calibration.record import FREE_SHARE, NOISE, ORDER, REPEATABILITY, SETTINGS
+from mwdcal.estimation import drift
 from mwdcal.estimation.batch import take
+from mwdcal.estimation.problem import WALK_AXES
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.solvers import Linear
 from mwdcal.estimation.uncertainty import marginal_rank
@@ -144,11 +146,15 @@ def constants_covariance(result: Fit) -> Array:
 
 
 def error_name(constant: str) -> str:
-    """What a common error is called: of a reference, or of the stand.
+    """What a common error is called: of a reference, of the stand, or a drift.
 
     >>> [error_name(name) for name in ("dip", "azimuth-zero", "stand-north")]
     ['dip reference error', 'azimuth zero of the stand', 'tilt of the stand about north']
+    >>> error_name("field-drift-north")
+    'drift of the field during the run'
     """
+    if constant in WALK_AXES:
+        return f"drift of the {constant.partition('-')[0]} during the run"
     if constant.endswith("-zero"):
         return f"{constant.replace('-', ' ')} of the stand"
     if constant.startswith("stand-"):
@@ -382,6 +388,27 @@ def earth(result: Fit) -> dict[str, Array]:
     gravity, field, dip = (problem.constant(state, n).mean(-1) for n in ("gravity", "field", "dip"))
     magnetic = {"field": field, "dip_deg": np.degrees(dip)} if len(problem.triads) > 1 else {}
     return {"gravity_g": gravity, **magnetic}
+
+
+def drifts(result: Fit) -> dict[str, tuple[Array, Array]]:
+    """How far each drift went within the run and the standard uncertainty of that (B,): g or nT.
+
+    Definition: the largest distance between two of its stations, along which its uncertainty is taken.
+    """
+    changes = {}
+    for name in drift.places(result.problem.evidence):
+        path, terms = drift.walk(result.problem, result.state, name)
+        apart = path[:, :, None] - path[:, None]
+        distance = np.linalg.norm(apart, axis=-1)
+        far = distance.reshape(len(path), -1).argmax(-1)
+        first, second = np.unravel_index(far, distance.shape[1:])
+        every = np.arange(len(path))
+        change = distance[every, first, second]
+        along = apart[every, first, second] / np.maximum(change, 1e-300)[:, None]
+        pull = outer(along, terms[first] - terms[second]).reshape(len(path), -1)
+        spread = drift.walk_covariance(result.problem, result.analysis, name)
+        changes[name] = change, np.sqrt(np.einsum("bi,bij,bj->b", pull, spread, pull))
+    return changes
 
 
 def stand_errors(result: Fit) -> dict[str, Array]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from mwdcal.calibration.automatic.auto import Choice, resolved, without
+from mwdcal.calibration.automatic.drift import fit_run
 from mwdcal.calibration.automatic.order_selection import Progress
 from mwdcal.calibration.calibrate import recorded
 from mwdcal.calibration.diagnosis.refusals import check_readings
@@ -168,7 +169,7 @@ def _calibrated(readings: Readings, profile: Profile, options: Options) -> _Cali
     try:
         check_readings(readings, options)
         started = time.perf_counter()
-        result = fit(readings, options)
+        result = fit_run(readings, options)
         seconds = time.perf_counter() - started
         record = recorded(Choice(readings, profile, options), result)
     except MwdcalError as error:  # what is wrong for all methods was refused before

@@ -20,16 +20,23 @@ STAND = {
 """Turns of the stand's frame, by the earth axis (north, east, down) they are about."""
 STAND_ERRORS = (*STAND, "inclination-zero", "toolface-zero")
 """All errors of the stand that are common to its stations: turns of its frame, zeros of its scales."""
+WALKS = {
+    "accelerometer-drift": tuple(f"accelerometer-drift-{axis}" for axis in "xyz"),
+    "magnetometer-drift": tuple(f"magnetometer-drift-{axis}" for axis in "xyz"),
+    "field-drift": tuple(f"field-drift-{axis}" for axis in ("north", "east", "down")),
+}
+"""Slow drifts within a run, with their axes: of the offsets of a triad, and of the field."""
 UNKNOWN = np.pi / np.sqrt(3)
 """Standard uncertainty of an angle about which nothing is known, rad."""
 
 
 @dataclass(frozen=True)
 class SharedConstant:
-    """A constant of the run that is estimated: gravity, field, dip, or an error.
+    """A constant of the run that is estimated: gravity, field, dip, an error, or a term of a drift.
 
     Errors are of one of these references, or of the stand: one of `STAND_ERRORS`, each a small
-    angle such that reading of the stand = value in the earth's frame + error.
+    angle such that reading of the stand = value in the earth's frame + error. A term of a drift
+    adds to an axis of `WALKS` in proportion to the mask.
 
     `mask` (B, n) says which stations it acts on; `value` (B,) is where it starts. `sd` (B,)
     is the standard uncertainty of the reference; for an unknown constant it is only a scale.

@@ -25,7 +25,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from mwdcal.estimation.evidence import EARTH, STAND, STAND_ERRORS, UNKNOWN, Evidence
+from mwdcal.estimation.evidence import EARTH, STAND, STAND_ERRORS, UNKNOWN, WALKS, Evidence
 from mwdcal.estimation.solvers import Linear
 from mwdcal.geometry.vectors import (
     Array,
@@ -47,6 +47,12 @@ INFORMED = 1e-13
 """A prior says something of a direction if its precision exceeds this share of the largest."""
 GEOMETRIC_NOISE = 1e-4
 """Noise, as a share of the field, at which rank is counted whatever the actual noise."""
+WALK_AXES = {
+    name: (walk, axis)
+    for walk, names in enumerate(WALKS.values())
+    for axis, name in enumerate(names)
+}
+"""Number of the walk and of its axis by the name of a constant."""
 NOISELESS = ("state", "attitude", "predictions", "linear True")
 """What a problem's memo has that no noise enters."""
 
@@ -84,14 +90,15 @@ class Prediction:
     """One triad at a state: misfit of the reading, its derivatives, and the size of the field.
 
     `misfit` (B, n, 3) raw; `by_params` (B, n, 3, p); `by_turn` (B, n, 3, 3) for a turn of the
-    station; `by_earth` (B, n, 3, 3) for its gravity, field and dip; `strength` (B, n) of the
-    field in raw units.
+    station; `by_earth` (B, n, 3, 3) for its gravity, field and dip; `by_vector` (B, n, 3, 3) for
+    the field's north, east and down; `strength` (B, n) of the field in raw units.
     """
 
     misfit: Array
     by_params: Array
     by_turn: Array
     by_earth: Array
+    by_vector: Array
     strength: Array
 
 
@@ -242,13 +249,15 @@ class Problem:
             fields = triad.model.fields(params, triad.raw, self.temperature)
             back = inverse(triad.model.slope(params, triad.raw, self.temperature))
             misfit = np.einsum("bnij,bnj->bni", back, fields - target)
+            by_vector = -back @ attitude
             by_params = triad.model.jacobian(params, triad.raw - misfit, self.temperature)
             result.append(
                 Prediction(
                     misfit,
                     back @ by_params,
                     back @ skew(target),
-                    -back @ attitude @ np.stack(change, -1),
+                    by_vector @ np.stack(change, -1),
+                    by_vector,
                     np.linalg.norm(np.einsum("bnij,bnj->bni", back, target), axis=-1),
                 )
             )
@@ -268,6 +277,9 @@ class Problem:
         angles = turns @ self._angle_axes(state)
         residual = residual - np.einsum("bnmi,bni->bnm", angles, state.errors)
         constants = self._constant_columns(state, by_earth, turns, geometry)
+        if not geometry and self.walks:
+            drifted = constants[..., self.walks] @ state.constants[:, None, self.walks, None]
+            residual = residual + drifted[..., 0]
         settings = self._setting_columns(angles, geometry)
         shared = np.concatenate([constants, *self._group_turns(state, turns), settings], -1)
         departures = by_earth[..., [EARTH.index(name) for name in self.evidence.absent]]
@@ -342,13 +354,34 @@ class Problem:
     ) -> Array:
         """Columns (B, n, m, q) of the constants; `geometry` takes references as exact."""
         columns = np.zeros((*by_earth.shape[:-1], len(self.evidence.constants)))
+        if self.walks and not geometry:
+            columns = self.walk_columns(state)
         for index, constant in enumerate(self.evidence.constants):
-            if constant.unknown or not geometry:
+            if constant.name not in WALK_AXES and (constant.unknown or not geometry):
                 if constant.name in STAND_ERRORS:
                     column = self.stand_column(state, constant.name, turns)
                 else:
                     column = by_earth[..., EARTH.index(constant.name)]
                 columns[..., index] = column * constant.mask[..., None]
+        return columns
+
+    @property
+    def walks(self) -> list[int]:
+        """Places of the constants that are terms of a drift."""
+        return [i for i, c in enumerate(self.evidence.constants) if c.name in WALK_AXES]
+
+    def walk_columns(self, state: State) -> Array:
+        """Columns (B, n, m, q) of the terms of a drift; zero for other constants."""
+        offset, size = np.eye(3), 3 * len(self.triads)
+        columns = np.zeros((*state.attitude.shape[:2], size, len(self.evidence.constants)))
+        predictions, constants = self.predictions(state), self.evidence.constants
+        for index in self.walks:
+            walk, axis = WALK_AXES[constants[index].name]
+            triad = min(walk, 1)
+            change = -offset[axis] if walk < 2 else predictions[1].by_vector[..., axis]
+            weight = self.evidence.include * constants[index].mask
+            rows = slice(3 * triad, 3 * triad + 3)
+            columns[..., rows, index] = change * weight[..., None] / self.triads[triad].sd
         return columns
 
     def stand_column(self, state: State, name: str, turns: Array) -> Array:

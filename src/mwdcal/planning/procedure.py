@@ -169,12 +169,15 @@ class Procedure:
             else _alike(self.tool, count)
         )
         common = self.calibrating.common(rng, (count,))
-        readings = self.calibrating.measured(tools, rng, common).readings
-        test = self.testing.measured(tools, rng, common).readings
+        calibrating = self.calibrating.measured(tools, rng, common)
+        testing = self.testing.measured(tools, rng, common)
+        readings, test = calibrating.readings, testing.readings
         result = fit(readings, self.options)
         columns: dict[str, AnyArray] = {"status": self._status(readings, result)}
         sound = columns["status"] == CALIBRATED
-        columns |= self._verdict(tools, result, test, sound)
+        tested = replace(tools, turn_on=testing.turn_on)  # the tool as the roll test has it
+        tools = replace(tools, turn_on=calibrating.turn_on)  # the tool that was calibrated
+        columns |= self._verdict(tested, result, test, sound)
         columns |= self._errors(tools, result) | self._parameters(result)
         return columns | _true_parameters(tools)
 
@@ -284,7 +287,7 @@ def column(triad: str, parameter: str) -> str:
 def _true_parameters(tools: Truth) -> dict[str, Array]:
     return {
         f"true_{column(triad, name)}": params[:, place]
-        for triad, (model, params) in tools.triads.items()
+        for triad, (model, params) in tools.parameters.items()
         for place, name in enumerate(model.finished(tools.reference)[0].names)
     }
 

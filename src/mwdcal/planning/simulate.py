@@ -5,6 +5,7 @@ Tools lead the axes, then stations (n,), the component axis is last. Always labe
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -80,7 +81,7 @@ class Truth:
 
     The parameters are factors (30 at order 3) unless `forms` gives the models of the triads. `curves` (..., 3, 2) of
     each triad, or None: own-axis quadratic and cubic error along each axis where gravity or field is all on it, as
-    shares of them.
+    shares of them. `turn_on` (..., 3) by triad is the bias of readings that the last switching on has left.
     """
 
     accelerometer: Array
@@ -92,6 +93,7 @@ class Truth:
     dip: float = np.radians(63.0)
     forms: tuple[Model, ...] = ()
     curves: tuple[Array | None, ...] = ()
+    turn_on: Mapping[str, Array] = dataclasses.field(default_factory=dict)
 
     @property
     def model(self) -> Factors:
@@ -119,6 +121,27 @@ class Truth:
                 share = result[name] / strength
                 square, cube = np.moveaxis(curve[..., None, :, :], -1, 0)
                 result[name] = result[name] + strength * (square + cube * share) * share**2
+        return {
+            name: exact + self.turn_on[name][..., None, :] if name in self.turn_on else exact
+            for name, exact in result.items()
+        }
+
+    @property
+    def parameters(self) -> dict[str, tuple[Model, Array]]:
+        """Model and parameters by triad with the bias of this switching on, at the reference temperature."""
+        result = {}
+        for name, (model, params) in self.triads.items():
+            params, names = params.copy(), model.finished(self.reference)[0].names
+            for axis, bias in zip(
+                "xyz", np.moveaxis(self.turn_on.get(name, np.zeros(3)), -1, 0), strict=True
+            ):
+                if f"bias-{axis}" in names:
+                    scale = params[..., names.index(f"scale-{axis}")]
+                    params[..., names.index(f"bias-{axis}")] += bias / scale
+                for row in (axis_ for axis_ in "xyz" if f"offset-{axis_}" in names):
+                    gain = params[..., names.index(f"gain-{row}{axis}")]
+                    params[..., names.index(f"offset-{row}")] -= gain * bias
+            result[name] = model, params
         return result
 
 

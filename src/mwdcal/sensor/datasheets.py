@@ -23,6 +23,23 @@ SERVO = {
 Scale ± 5 %, bias ± 10 mg, axis alignment ± 2 mrad, scale drift ± 180 ppm/°C, bias drift ± 100 µg/°C.
 The magnetometer: scale ± 2 %, hard iron ± 1 % of 50 µT, alignment ± 4 mrad.
 """
+AGEING = ("turn_on", "bias_walk", "scale_walk")
+"""What a tool changes by between calibrations."""
+USUAL_AGEING = {
+    "accelerometer": Datasheet(turn_on=4e-4, bias_walk=4e-4, scale_walk=5e-4),
+    "magnetometer": Datasheet(turn_on=70.0, bias_walk=70.0, scale_walk=1.6e-3),
+}
+"""What the OWSG error model (Rev 5.1, MWD) allows a sensor between calibrations, 1σ, taken as a year's walk.
+
+ABXY, ABXY, ASXY; MBXY, MBXY, MSXY.
+"""
+
+
+def ageing(profile: Profile, triad: str, name: str) -> float:
+    """Turn-on bias or walk in a year of a triad: as its profile states it, else that of `USUAL_AGEING`."""
+    sheet, usual = getattr(profile, triad).datasheet, USUAL_AGEING[triad]
+    stated = None if sheet is None else getattr(sheet, name)
+    return float(getattr(usual, name) if stated is None else stated)
 
 
 def tolerance(profile: Profile, triad: str, name: str) -> float:

@@ -29,6 +29,9 @@ class Datasheet(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
     `scale` as a share, `bias` in g or nT, `misalignment_deg`; `scale_per_c` and `bias_per_c`
     their drift per °C. What is not given is not known.
+    `turn_on` is the bias that each switching on leaves, `bias_walk` and `scale_walk` what bias and
+    scale change by in a year; they grow with the square root of time. They age the prior that an
+    earlier calibration is.
     """
 
     scale: float | None = None
@@ -36,6 +39,9 @@ class Datasheet(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     misalignment_deg: float | None = None
     scale_per_c: float | None = None
     bias_per_c: float | None = None
+    turn_on: float | None = None
+    bias_walk: float | None = None
+    scale_walk: float | None = None
 
 
 class TriadProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -12,13 +12,13 @@ from mwdcal.app.messages import findings_as_typed
 from mwdcal.app.screens.numbers import degrees_of_freedom, estimate, uncertainty, written
 from mwdcal.app.text import chance, number, one_line, quantity, table
 from mwdcal.calibration.automatic.nonlinearity import CurveScore
+from mwdcal.calibration.drift import Constant, Drift
 from mwdcal.calibration.prediction import typical_accuracy, without_temperature
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import (
     BudgetRow,
     Calibration,
     Choices,
-    Constant,
     ErrorRow,
     Finding,
     Measures,
@@ -72,6 +72,7 @@ class CalibrationSummary(msgspec.Struct, frozen=True, kw_only=True):
     budget: list[BudgetRow]
     assumed_exact: list[str]
     constants: list[Constant]
+    drift: list[Drift]
     stand: StandErrors
     findings: list[Finding]
     orders: list[OrderScore]

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from mwdcal.calibration.automatic.ageing import aged
 from mwdcal.calibration.automatic.nonlinearity import (
     CurveScore,
     choose_curves,
@@ -96,7 +97,7 @@ def known_before(options: Options, readings: Readings, profile: Profile) -> Opti
         model=options.model or (kinds.pop() if len(kinds) == 1 else None),
         order=order if options.order == AUTO else options.order,
         parameters=parameters,
-        prior=for_run(previous, readings),
+        prior=aged(for_run(previous, readings), previous, readings, profile),
     )
 
 

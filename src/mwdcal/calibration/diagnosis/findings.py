@@ -28,10 +28,11 @@ from mwdcal.calibration.diagnosis.plausibility import (
 from mwdcal.calibration.diagnosis.repeats import copies
 from mwdcal.calibration.diagnosis.structure import COLUMN, suspected
 from mwdcal.calibration.diagnosis.structure import described as seen_as
+from mwdcal.calibration.drift import SHOWN_DRIFT
 from mwdcal.calibration.readings import EARTH_RANGES, HIGHEST, TRIADS
 from mwdcal.calibration.record import Finding
 from mwdcal.calibration.residuals import REASONS, shown_in, tail
-from mwdcal.calibration.results import common_source, unconfirmed_dip
+from mwdcal.calibration.results import common_source, drifts, unconfirmed_dip
 from mwdcal.calibration.settings import DIRECTION
 from mwdcal.estimation.problem import Prior
 from mwdcal.estimation.rank import free_directions
@@ -76,7 +77,14 @@ REMARKS = {
     "settings-apart": "stations of one direction scatter by {share:.0%} of the stand's σ, as if the stand had been set "
     'anew at each. If so, state settings = "per-station" in [stand] of the profile.',
     "residuals": "{triad}: residuals are {times:.2f} times the declared noise{rare}: the noise figure, a reference, or "
-    "the model is wrong. Uncertainties are scaled up accordingly.",
+    "the model is wrong. The uncertainty is scaled up as if each station had an error of its own; an error that "
+    "stations share may be larger than it says.",
+    "field-drift": "Readings follow the order of the stations as if the field drifted by {change:.2g} {unit} (1σ "
+    "{sd:.1g} {unit}) during the run. The fit allows for this drift, and the uncertainty includes it. Give "
+    "ref_field_nt and ref_dip_deg of each station from a reference magnetometer, or repeat the run at a quiet time.",
+    "offset-drift": "Readings follow the order of the stations as if the offsets of the {triad} drifted by "
+    "{change:.2g} {unit} (1σ {sd:.1g} {unit}) during the run. The fit allows for this drift, and the uncertainty "
+    "includes it. Let the tool warm up, and change inclination and azimuth in another order than from end to end.",
     "no-redundancy": "{triads}: no redundancy, so nothing in this run checks the fit. Add stations.",
     "few-degrees-of-freedom": "the {few}: another run like this one may state {share:.0f} % more or less (1σ), and an "
     "error of a single station is hard to see. Add stations.",
@@ -92,6 +100,9 @@ REMARKS = {
     "over the range ({of[angle]:.2g}° across the field). The uncertainties here include it. {of[remedy]}.",
     "temperature-untested": "{triads}: {levels} temperatures are as many as a course of order {order} takes, so "
     "nothing tests it between them, and {unsaid}. Add a temperature between them.",
+    "prior-aged": "The prior ({source}) allows for what the tool may have changed since, {ageing}. State turn_on, "
+    "bias_walk and scale_walk under [accelerometer.datasheet] and [magnetometer.datasheet] of the profile if you "
+    "know better.",
     "temperature-aligned": "{triads}: this run cannot tell power {power} of temperature from the terms below it, and "
     "no uncertainty here includes it: attitudes and temperature went together, or the attitudes are too few. Repeat "
     "the same attitudes at other temperatures, on the way up and on the way down.",
@@ -153,6 +164,7 @@ def finding_flags(fitted: FittedRuns) -> Iterator[Flag]:
     yield _few_degrees(fitted)
     yield from _settings(fitted)
     yield _hemisphere(fitted)
+    yield from _drifts(fitted)
     yield from _structure(fitted)
     yield _scatter(fitted)
     yield _repeated(fitted)
@@ -258,6 +270,18 @@ def _hemisphere(fitted: FittedRuns) -> Flag:
     """A negative dip that only the signs of the magnetometer tell from a positive one."""
     dip = np.degrees(unconfirmed_dip(fitted.result))
     return _remark("hemisphere", dip < 0, dip=dip)
+
+
+def _drifts(fitted: FittedRuns) -> Iterator[Flag]:
+    """Drifts that are larger than what may be noise."""
+    for name, (change, sd) in drifts(fitted.result).items():
+        triad = name.removesuffix("-drift")
+        scale, unit = shown_in(
+            "gravity" if triad == TRIADS[0] else "field", fitted.readings.relative
+        )
+        words = REMARKS["offset-drift" if triad in TRIADS else name]
+        values = {"triad": triad, "change": change * scale, "sd": sd * scale, "unit": unit}
+        yield Flag(name, change > SHOWN_DRIFT * sd, words, values)
 
 
 def _structure(fitted: FittedRuns) -> Iterator[Flag]:
@@ -366,6 +390,9 @@ def _prior(fitted: FittedRuns) -> Iterator[Flag]:
     declared = {common_source(c.name) for c in constants if not c.unknown}
     both = ", ".join(name for name in prior.common if name in declared)
     every = np.ones(fitted.count, bool)
+    yield _remark(
+        "prior-aged", every & bool(prior.ageing), source=prior.source, ageing=prior.ageing
+    )
     yield _remark("prior-shared", every & bool(both), source=prior.source, both=both)
     only = np.array([", ".join(names) for names in _prior_only(fitted)])
     yield _remark("prior-only", only != "", source=prior.source, names=only)

@@ -288,7 +288,8 @@ def _families(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
             yield "dip-reference", (by_earth[..., 2] * given)[..., None]
         field = np.concatenate([by_earth[..., 1:], down[..., None]], -1)
         field[..., :3, :] = 0.0  # the declination of a field that turns does not turn gravity
-        yield "field-drift", _products(field, order)
+        if not problem.walks:
+            yield "field-drift", _products(field, order)
         yield "field-gradient", _products(field, state.attitude[0, :, 2, :])
     steps = _approach(problem)
     back = [known[n] * s for n, s in steps.items() if n in known and s.any()]
@@ -357,7 +358,7 @@ def _of_sensor(
     axes = np.zeros((*problem.temperature.shape, 3 * len(problem.triads), 3))
     weight = problem.evidence.include[..., None] / triad.sd
     axes[:, :, 3 * index : 3 * index + 3] = np.eye(3) * weight[..., None]
-    if index == 0:
+    if index == 0 and not problem.walks:
         yield f"{name}-drift", _products(axes, order)
     moved = np.diff(triad.raw[0], axis=0, prepend=triad.raw[0, :1])
     typical = np.abs(moved).max() or 1.0
@@ -400,5 +401,5 @@ def described(effect: Effect, unit: str) -> str:
     whose = f"{triad}: the" if of_triad else "The"
     return (
         f"{whose} residuals look like {looks}. Size {size}, {effect.share:.0%} of the misfit; chance in "
-        f"noise {effect.chance:.0e}."
+        f"noise {effect.chance:.0e}. The stated uncertainty does not include it."
     )

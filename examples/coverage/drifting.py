@@ -1,0 +1,169 @@
+"""Drift within a run: how often 95 % intervals hold the tool as it was when the run began."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import world
+from world import FIELD, Array
+
+from mwdcal.calibration.automatic.drift import by_drift
+from mwdcal.calibration.estimate import Fit, fit
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.results import StatedCovariance
+
+RUNS, SEED = 60, 20260
+NOISE = (1e-4, 15.0)
+PROBES = [np.array(a, float) for a in ([20, 60, 100, 150], [10, 100, 200, 300], [15, 75, 160, 301])]
+ANGLES = ("inclination", "azimuth", "toolface", "dip")
+STEP = 1e-6
+
+
+@dataclass(frozen=True)
+class Case:
+    """A drift of field (nT) or accelerometer (mg): 1σ per axis from end to end of a walk, or of a trend."""
+
+    kind: str
+    size: float
+    shape: str
+    order: str
+    declared: bool = False
+
+
+def cases() -> list[Case]:
+    """The rows of the table."""
+    rows = [Case("field", 0, "walk", "one after the other")]
+    for order in ("one after the other", "mixed"):
+        for shape in ("walk", "trend"):
+            rows += [Case("field", size, shape, order) for size in (20, 40, 60)]
+            rows += [Case("accelerometer", size, shape, order) for size in (0.1, 0.2, 0.3)]
+    return [
+        *rows,
+        Case("field", 40, "walk", "one after the other", declared=True),
+        Case("accelerometer", 0.2, "walk", "one after the other", declared=True),
+    ]
+
+
+def path(rng: np.random.Generator, count: int, shape: str) -> Array:
+    """A drift of three axes (count, 3) from zero on."""
+    if shape == "trend":
+        return np.linspace(0, 1, count)[:, None] * rng.normal(size=3)
+    steps = np.cumsum(rng.normal(size=(count, 3)), 0) / np.sqrt(count)
+    return steps - steps[0]
+
+
+def simulated(
+    rng: np.random.Generator, case: Case
+) -> tuple[Readings, list[tuple[world.Triad, world.Triad]]]:
+    """Runs of so many tools at four directions and twelve toolfaces."""
+    angles = world.grid()
+    count = len(angles[0])
+    if case.order == "mixed":
+        mixed = rng.permutation(count)
+        angles = tuple(each[mixed] for each in angles)
+    tools = [world.tool(rng) for _ in range(RUNS)]
+    turn = world.axes(*angles)
+    raw: list[list[Array]] = [[], []]
+    for first, second in tools:
+        g, b = world.vectors(*angles)
+        if case.kind == "field":
+            b = b + np.einsum("nij,nj->ni", turn, case.size * path(rng, count, case.shape))
+        a, m = first.raw(g), second.raw(b)
+        if case.kind == "accelerometer":
+            a = a + 1e-3 * case.size * path(rng, count, case.shape)
+        for store, values, noise in zip(raw, (a, m), NOISE, strict=True):
+            store.append(values + noise * rng.normal(size=values.shape))
+    known = dict(zip(("inclination", "azimuth", "toolface"), np.radians(angles), strict=True))
+    known |= {"gravity": np.ones(count), "field": np.full(count, FIELD)}
+    known |= {"dip": np.full(count, np.radians(world.DIP))}
+    sd = dict(zip(("accelerometer", "magnetometer"), NOISE, strict=True)) if case.declared else {}
+    sd = {name: np.full((count, 3), noise) for name, noise in sd.items()}
+    return Readings(np.array(raw[0]), np.array(raw[1]), known=known, sd=sd), tools
+
+
+def corrected(result: Fit, place: int, params: Array, raw: tuple[Array, Array]) -> dict[str, Array]:
+    """Angles that parameters (p,) give of noise-free raw readings."""
+    vectors = []
+    for triad, where, values in zip(
+        result.problem.triads, result.problem.slices(), raw, strict=True
+    ):
+        model = triad.model
+        one = type(model)(model.basis, model.centre[[place]], model.scale[[place]], model.curved)
+        vectors.append(one.fields(params[None, where], values[None], np.zeros((1, len(values))))[0])
+    return world.angles(*vectors)
+
+
+def scores(case: Case, rng: np.random.Generator) -> tuple[dict[str, float], float]:
+    """Shares of intervals that hold the truth, by quantity, and of runs in which a drift was fitted."""
+    readings, tools = simulated(rng, case)
+    options, hits, drifted = Options(order=0), {name: [] for name in ("parameters", *ANGLES)}, 0
+    g, b = world.vectors(*PROBES)
+    truth = world.angles(g, b)
+    for places, result in by_drift(fit(readings, options), options):
+        drifted += len(places) * bool(result.problem.walks)
+        covariance = StatedCovariance(result).total
+        for row, place in enumerate(places.tolist()):
+            pair = tools[place]
+            raw = pair[0].raw(g), pair[1].raw(b)
+            params = result.state.params[row]
+            true = exact(result, row, pair)
+            sd = np.sqrt(np.diag(covariance[row]))
+            hits["parameters"] += [np.abs(params - true) < 1.96 * sd]
+            middle = corrected(result, row, params, raw)
+            moved = [
+                corrected(result, row, params + STEP * sd * unit, raw) for unit in np.eye(len(sd))
+            ]
+            root = np.linalg.cholesky(covariance[row] / np.outer(sd, sd))
+            for name in ANGLES:
+                slope = (
+                    np.stack([world.turned(each[name] - middle[name]) for each in moved], -1) / STEP
+                )
+                spread = np.linalg.norm(slope @ root, axis=-1)
+                hits[name] += [np.abs(world.turned(middle[name] - truth[name])) < 1.96 * spread]
+    return {name: float(np.mean(each)) for name, each in hits.items()}, drifted / RUNS
+
+
+def exact(result: Fit, row: int, pair: tuple[world.Triad, world.Triad]) -> Array:
+    """True parameters (p,) of a tool in the terms of its fit: from readings of the axes."""
+    parts = []
+    for triad, tool in zip(result.problem.triads, pair, strict=True):
+        gain = (np.eye(3) - tool.cross) @ np.diag(1 / tool.scale[:, 0])
+        offset = -(np.eye(3) - tool.cross) @ tool.bias[:, 0]
+        batch = len(result.status)
+        whole = triad.model.start(np.tile(gain, (batch, 1, 1)), np.tile(offset, (batch, 1)))
+        parts.append(whole[row])
+    return np.concatenate(parts)
+
+
+def main() -> None:
+    """Simulate every row and write the page."""
+    rng, rows = np.random.default_rng(SEED), []
+    for case in cases():
+        shares, drifted = scores(case, rng)
+        unit = "nT" if case.kind == "field" else "mg"
+        what = f"{case.kind} {case.size:g} {unit}, {case.shape}" if case.size else "none"
+        noise = "declared" if case.declared else "estimated"
+        cells = [world.percent(share) for share in shares.values()]
+        rows.append([what, case.order, noise, f"{drifted:.0%}", *cells])
+        print(*rows[-1], sep="  ", flush=True)
+    heads = ["drift", "directions", "noise", "drift fitted", "parameters", *ANGLES]
+    world.write("drifting", "Drift within a run", INTRODUCTION, world.table(heads, rows),
+                facts={"Runs of each row": RUNS, "Seed": SEED})  # fmt: skip
+
+
+INTRODUCTION = """\
+Four directions of twelve toolfaces; noise 0.1 mg and 15 nT. The drift starts at zero with the first station; its
+size is 1σ per axis of where a walk ends, or of the slope of a trend. The truth is the tool, and the field of the
+references, at the first station. "Drift fitted" counts the runs in which [a drift](../methods.md#drift-within-a-run)
+joined the fit. Shares are of 95 % intervals that hold the truth.
+
+**Shortfall.** Where directions follow each other, a drift of the accelerometer keeps step with the attitude and hides
+in gains and offsets: walks of 0.1 mg and trends of up to 0.3 mg are seldom seen there, and those intervals cover too
+little. No residual tells such a drift. Mix the directions, and repeat a station. Trends of the field are covered too
+often, because a calibration cannot know at which moment of the run its tool will be used.
+"""
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,117 @@
+"""Slow drift within a run: seen in the residuals of a fit, and then part of its model.
+
+A run is fitted without drift first. Where its residuals follow the order of the stations more than noise
+does, walks of the field and of both triads' offsets are fitted with it, of sizes that the run itself tells.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from mwdcal.calibration.automatic.courses import f_test, terms_beyond
+from mwdcal.calibration.estimate import Fit, fit, refitted
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import Readings
+from mwdcal.estimation import drift
+from mwdcal.estimation.batch import take
+from mwdcal.estimation.minimisers import closed_form
+from mwdcal.estimation.problem import Problem
+from mwdcal.estimation.solvers import Status
+from mwdcal.geometry.vectors import Array, Bools, Ints
+
+ORDER_CHANCE = 0.1
+"""Chance of residuals that follow the order of stations as much in noise, below which a drift is fitted.
+
+A drift that is not there costs little: its size comes out small. One that is left out costs coverage.
+"""
+REDUNDANCY = 36.0
+"""Fewest degrees of freedom of a triad that can tell a drift from noise."""
+
+
+def chances(result: Fit) -> Array:
+    """Probability (B, t) that noise alone follows the order of stations as the residuals of a triad do.
+
+    The least of those of the walks that act on a triad, times their number.
+    """
+    scores, analysis = _scores(result), result.analysis
+    least = np.ones(analysis.freedom.shape)
+    for name, triad in drift.acting(scores.places).items():
+        scatter, rest = (x[:, triad] for x in (analysis.variance_factor, analysis.freedom))
+        total, mean, square = scores.of_walk(name)
+        ratio = np.where(square > 0, mean / np.where(square > 0, square, 1.0), 0.0)
+        one = f_test(total * ratio, mean * ratio, np.nan_to_num(scatter), rest)
+        one = np.nan_to_num(one, nan=1.0) * (1 + (triad > 0))
+        least[:, triad] = np.minimum(least[:, triad], one)
+    return least
+
+
+def _scores(result: Fit) -> drift.WalkScores:
+    problem, analysis = result.problem, result.analysis
+    if not (closed_form.applies(problem) and _one_plan(problem)):
+        return drift.walk_scores(problem, result.state, analysis)
+    nominal = take(result, np.arange(1))
+    triads = [replace(triad, sd=np.ones_like(triad.sd)) for triad in nominal.problem.triads]
+    params = [triad.model.start(np.eye(3)[None], np.zeros((1, 3))) for triad in triads]
+    return drift.walk_scores(
+        replace(nominal.problem, triads=tuple(triads)),
+        replace(nominal.state, params=np.concatenate(params, -1)),
+        replace(nominal.analysis, residual=analysis.residual),
+    )
+
+
+def _one_plan(problem: Problem) -> bool:
+    """Whether members differ in their readings alone: nominal sensors then stand for all of them."""
+    evidence = problem.evidence
+    if any(np.ptp(triad.sd, axis=(1, 2)).any() for triad in problem.triads):
+        return False
+    arrays = [*evidence.known.values(), evidence.include, problem.temperature]
+    return all(np.array_equal(a, np.broadcast_to(a[:1], a.shape), equal_nan=True) for a in arrays)
+
+
+def drifting(result: Fit, options: Options) -> Bools:
+    """Triads (B, t) whose readings drifted within the run."""
+    apart = options.robust or options.separate_solver or result.analysis.influence is not None
+    drifted = np.zeros(result.analysis.freedom.shape, bool)
+    if apart:
+        return drifted
+    sound = (result.status == int(Status.OK)) & result.analysis.finite
+    sound &= result.analysis.freedom.min(-1) >= REDUNDANCY
+    sound &= ~terms_beyond(result).present.any((1, 2))
+    if not sound.any():
+        return drifted
+    drifted[sound] = (
+        chances(result if sound.all() else take(result, np.flatnonzero(sound))) < ORDER_CHANCE
+    )
+    return drifted
+
+
+def fit_run(readings: Readings, options: Options) -> Fit:
+    """The fit of one run, with the drift that it shows."""
+    [(_, result)] = by_drift(fit(readings, options), options)
+    return result
+
+
+def by_drift(result: Fit, options: Options) -> Iterator[tuple[Ints, Fit]]:
+    """Members without drift, as they are, and those with a drift of some triads, which is fitted."""
+    drifted = drifting(result, options)
+    for triads in np.unique(drifted, axis=0):
+        places = np.flatnonzero((drifted == triads).all(-1))
+        part = result if len(places) == len(drifted) else take(result, places)
+        yield places, with_drift(part, options, triads) if triads.any() else part
+
+
+@np.errstate(invalid="ignore", divide="ignore", over="ignore")
+def with_drift(result: Fit, options: Options, triads: Bools) -> Fit:
+    """A fit with walks of estimated size that act on some triads (t,), from one without."""
+    problem, analysis = result.problem, result.analysis
+    declared = np.isnan(result.noise)
+    scores = drift.walk_scores(problem, result.state, analysis)
+    scores = scores.of([n for n, t in drift.acting(scores.places).items() if triads[t]])
+    theta, left = drift.walk_variances(scores, analysis.variance_factor, analysis.freedom, declared)
+    sizes = dict(zip(scores.places, np.sqrt(theta.T), strict=True))
+    sizes = {name: size * drift.noise(problem)[name] for name, size in sizes.items()}
+    walking, state = drift.with_walks(problem, result.state, sizes)
+    return refitted(result, walking, state, np.sqrt(left), options)
