@@ -71,7 +71,9 @@ def test_estimated_scatter_makes_directions_better_and_their_uncertainty_true(co
 def test_few_shots_have_no_scatter_estimated():
     """Of eight shots a scatter cannot be told from the noise; nor without groups."""
     batch, _, _ = hand_held(np.random.default_rng(0), 1, 0.0, 0.0)
-    readings = replace(batch, accelerometer=batch.accelerometer[0], magnetometer=batch.magnetometer[0])
+    readings = replace(
+        batch, accelerometer=batch.accelerometer[0], magnetometer=batch.magnetometer[0]
+    )
     assert not scattered(readings.select(np.arange(24) % 3 == 0), Options()).scatter
     assert not scattered(replace(readings, group=np.full(24, -1)), Options()).scatter
     declared = replace(readings, sd={"accelerometer": np.full(3, 3e-4)})

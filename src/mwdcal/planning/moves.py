@@ -95,17 +95,20 @@ def session_seconds(attitude: Array, soak: Ints, stand: Stand) -> float:
     return stand.settle_seconds + moves + 60.0 * stand.soak_minutes * soaks
 
 
-def shortest_order(attitude: Array, soak: Ints, stand: Stand) -> Ints:
-    """An order (n,) of the stations of each soak with short moves; the soaks keep theirs.
+def measuring_order(attitude: Array, soak: Ints, stand: Stand) -> Ints:
+    """An order (n,) of the stations of each soak with short moves that go there and back; the soaks keep theirs.
 
-    Method: the nearest station next, then any stretch turned round that this shortens (2-opt).
+    Method: a short path by the nearest station next and 2-opt, of which every other station is measured on
+    the way out and the rest on the way back. Neighbours on the path then lie alike before and after the
+    middle of the session, so that a slow drift does not keep step with the attitude.
     """
     order: list[int] = []
     for each in dict.fromkeys(soak.tolist()):
         some = np.flatnonzero(soak == each)
         if len(some) > MOST_ORDERED:
             return np.arange(len(soak))
-        order += some[_tour(move_seconds(attitude[some], stand))].tolist()
+        path = some[_tour(move_seconds(attitude[some], stand))]
+        order += [*path[::2].tolist(), *path[1::2][::-1].tolist()]
     return np.array(order)
 
 

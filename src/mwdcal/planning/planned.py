@@ -27,7 +27,7 @@ from mwdcal.files.formats.table import Table, labels
 from mwdcal.geometry.vectors import Array, Bools
 from mwdcal.planning.expected import carried_out, left_undetermined, planned_fit
 from mwdcal.planning.fewest import least_count, least_worst
-from mwdcal.planning.moves import USUAL_STAND, Stand, session_seconds, shortest_order
+from mwdcal.planning.moves import USUAL_STAND, Stand, session_seconds, measuring_order
 from mwdcal.planning.optimal import Design, Information, best, exchanged
 from mwdcal.planning.plans import (
     at_place,
@@ -369,11 +369,11 @@ class Search:
             )
 
     def planned(self, design: Design) -> Planned:
-        """The chosen stations, but those measured, in an order of short moves."""
+        """The chosen stations, but those measured, in an order of short moves, there and back."""
         new = design.chosen[self.before :]
         new = new[np.argsort(soak_numbers(taken(self.plan, new)), kind="stable")]
         some = taken(self.plan, new)
-        new = new[shortest_order(attitudes(some), soak_numbers(some), self.stand)]
+        new = new[measuring_order(attitudes(some), soak_numbers(some), self.stand)]
         plan = replace(taken(self.plan, new), source=f"{len(new)} of {self.plan.source}")
         whole = taken(self.plan, np.append(design.chosen[: self.before], new))
         options = replace(self.options or Options(), order=self.choice.options.order)

@@ -106,7 +106,7 @@ def _tested(readings: Readings, options: Options) -> tuple[Ints, Array]:
 
 def _too_weak(result: Fit) -> Bools:
     """Fits (B,) of which the stations leave more undetermined than rotations and scales."""
-    weak = ~result.analysis.determined.keep.all(-1)
+    weak = np.array(~result.analysis.determined.keep.all(-1))
     places = np.flatnonzero(weak)
     if places.size:
         part = take(result, places)

@@ -405,7 +405,7 @@ def _absurd(fitted: FittedRuns, index: int) -> Iterator[Flag]:
 
     absurd = is_absurd(1.0) & (result.analysis.freedom[:, index] >= 1)
     warmed = absurd & ~is_absurd(share_beyond(result, index, absurd))
-    words = {"triad": TRIADS[index], "much": much}
+    words: dict[str, Any] = {"triad": TRIADS[index], "much": much}
     yield _refusal(
         fitted, "temperature", warmed, "temperature-order", **words, **spanned(fitted, index)
     )
