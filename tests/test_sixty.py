@@ -99,8 +99,8 @@ def found(result, raw):
 
 
 def stated(result, fields, slopes):
-    """Half widths (tools, 6 x 60) of the 95 % intervals, the residuals' s² in them."""
-    spread = np.repeat(np.sqrt(result.analysis.variance_factor), 30, -1)
+    """Half widths (tools, 6 x 60) of the 95 % intervals, with the residuals' s² where it is above one."""
+    spread = np.repeat(np.sqrt(np.maximum(result.analysis.variance_factor, 1.0)), 30, -1)
     covariance = result.analysis.covariance * spread[:, :, None] * spread[:, None, :]
     widths = []
     for name in NAMES:
