@@ -27,7 +27,7 @@ from mwdcal.files.formats.table import Table, labels
 from mwdcal.geometry.vectors import Array, Bools
 from mwdcal.planning.expected import carried_out, left_undetermined, planned_fit
 from mwdcal.planning.fewest import least_count, least_worst
-from mwdcal.planning.moves import USUAL_STAND, Stand, session_seconds, measuring_order
+from mwdcal.planning.moves import USUAL_STAND, Stand, measuring_order, session_seconds
 from mwdcal.planning.optimal import Design, Information, best, exchanged
 from mwdcal.planning.plans import (
     at_place,

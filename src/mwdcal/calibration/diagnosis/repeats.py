@@ -50,14 +50,18 @@ def _noise(result: Fit) -> Array:
 
 def _copies(rows: Array) -> Bools:
     """Stations (n,) of one run that agree with an earlier one, of readings (n, k) in units of their noise."""
-    apart = np.max([np.abs(each[:, None] - each) for each in rows.T], 0)
-    earlier = np.tri(len(rows), k=-1, dtype=bool)
-    agree, near = (apart <= AGREEING) & earlier, (apart <= NEAR) & earlier
-    pairs = int(agree.sum())
+    from scipy.spatial import KDTree
+
+    tree = KDTree(rows)
+    within = tree.count_neighbors(tree, [AGREEING, NEAR], p=np.inf)
+    pairs, near = (int(count - len(rows)) // 2 for count in within)
     alone = float(np.prod([_agreement(resolution(each)) for each in rows.T]))
-    if not pairs or _at_least(pairs, int(near.sum()), alone) >= COINCIDENCE:
+    if not pairs or _at_least(pairs, near, alone) >= COINCIDENCE:
         return np.zeros(len(rows), bool)
-    return np.asarray(agree.any(-1))
+    distinct, first, which = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    tree = KDTree(distinct)
+    earliest = [first[tree.query_ball_point(row, AGREEING, p=np.inf)].min() for row in distinct]
+    return np.asarray(np.array(earliest)[which.ravel()] < np.arange(len(rows)))
 
 
 def _agreement(step: float) -> float:
