@@ -245,8 +245,8 @@ def test_clean_fit_says_so(words):
     page = words(calibrated(moved=False))
     assert '<p class="headline">Calibrated – not yet verified</p>' in page
     assert (
-        "<p>Fit accepted – no temperature recorded. Accuracy to expect (1σ, calibration alone, typical): inclination 0.0"
-        in page
+        "<p>Fit accepted – no temperature recorded. Accuracy to expect (1σ, calibration alone, typical): "
+        "inclination 0.0" in page
     )
     assert "No findings" in page
     assert 'class="over"' not in page
