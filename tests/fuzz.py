@@ -56,6 +56,7 @@ SAMPLES = {
     "runs": "fleet",
     "tool": "profile",
     "limits": "limits",
+    "sensor_drift": "limits",
     "prior": "calibration",
     "effects": "effects",
     "plan": "plan",

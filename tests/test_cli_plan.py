@@ -127,8 +127,14 @@ def test_a_search_keeps_to_what_the_stand_reaches(tmp_path):
     assert {float(row["ref_azimuth_deg"]) for row in rows} == {0.0}
     assert max(float(row["ref_inclination_deg"]) for row in rows) <= 90
     free = mwdcal("plan", "--stations", 12, "--tool", "servo", "--json").json
-    for angle, sd in limited["accuracy_by_inclination_deg"].items():
-        assert max(sd) > max(free["accuracy_by_inclination_deg"][angle])
+    squares = [
+        {angle: np.square(sd) for angle, sd in each["accuracy_by_inclination_deg"].items()}
+        for each in (limited, free)
+    ]
+    # The search minimises the mean of the angles' variances: one angle alone may gain by less reach.
+    assert np.mean([sd.mean() / squares[1][angle].mean() for angle, sd in squares[0].items()]) > 1
+    for angle in ("inclination", "azimuth"):
+        assert squares[0][angle].max() > squares[1][angle].max()
 
 
 def test_the_next_stations_of_a_run_are_better_than_others(tmp_path):

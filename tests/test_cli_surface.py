@@ -195,7 +195,7 @@ def test_json_of_calibrate_holds_the_numbers_of_the_text(tmp_path):
             f"{names.get(row['observable'], row['observable'])} error, rms {' '.join(cells)}"
             in lines
         )
-    accuracy = "  ".join(f"{n} {v:.3g}°" for n, v in told["accuracy_1sigma_deg"].items())
+    accuracy = "  ".join(f"{n} {v:.2g}°" for n, v in told["accuracy_1sigma_deg"].items())
     assert f"accuracy to expect (1σ, calibration alone, typical): {accuracy}" in said.out
     for name, triad in told["triads"].items():
         assert f"{name} {triad['rank']} of {triad['size']} determined" in said.out

@@ -243,14 +243,19 @@ def test_a_bound_counts_kept_stations():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_rounding_does_not_choose_between_equal_stations(seed):
-    """Other unknowns, turned, round every number otherwise: so do other numbers of threads."""
+    """Other unknowns, turned, round every number otherwise: so do other numbers of threads.
+
+    Those of the parameters among themselves, and those that stations share (settings of the stand) likewise.
+    """
     _, result = planned_fit(load_plan("candidates"), SERVO)
     information, _ = Information.of_fit(result)
-    size = information.size
+    size, shared = information.size, information.rows.shape[-1] - information.size
     wanted = np.stack([np.eye(size), np.diag(np.linspace(0.2, 2, size))])
-    turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(size, size)))[0]
+    rng = np.random.default_rng(seed)
+    turn, other = (np.linalg.qr(rng.normal(size=(n, n)))[0] for n in (size, shared))
+    whole = np.block([[turn, np.zeros((size, shared))], [np.zeros((shared, size)), other]])
     turned = replace(
-        information, rows=information.rows @ turn, prior=turn.T @ information.prior @ turn
+        information, rows=information.rows @ whole, prior=whole.T @ information.prior @ whole
     )
     none = np.zeros(information.count, bool)
     first, again = (

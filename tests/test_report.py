@@ -112,6 +112,7 @@ class Row:
     passed: bool = False
     note: str = "roll set 1; stations 3 to 9"
     sets: list = field(default_factory=list)
+    degrees_of_freedom: float | None = 8.0
 
 
 @dataclass
@@ -123,6 +124,8 @@ class Outcome:
     source: str = ""
     run: str = "roll.csv"
     stations: int = 12
+    risk: float | None = 0.02
+    settings: str = "assumed"
     findings: list = field(default_factory=list)
     station_rows: list = field(default_factory=list)
 
@@ -242,8 +245,8 @@ def test_clean_fit_says_so(words):
     page = words(calibrated(moved=False))
     assert '<p class="headline">Calibrated – not yet verified</p>' in page
     assert (
-        "<p>Fit accepted. Accuracy to expect (1σ, calibration alone, typical): inclination 0.0"
-        in page
+        "<p>Fit accepted – no temperature recorded. Accuracy to expect (1σ, calibration alone, typical): "
+        "inclination 0.0" in page
     )
     assert "No findings" in page
     assert 'class="over"' not in page
@@ -290,7 +293,7 @@ def test_station_labels_may_be_anything(whole):
 def test_undetermined_toolface_shows(words):
     page = words(calibrated(("toolface",), moved=False))
     assert '<p class="headline">Calibrated – not yet verified</p>' in page
-    assert "<p>Toolface zero undetermined. Accuracy to expect" in page
+    assert "<p>Toolface zero undetermined – no temperature recorded. Accuracy to expect" in page
     assert "11 of 12" in page
     assert '<td class="free">undetermined</td>' in page
     assert "Not shown, for want of a reference: toolface·sin I." in page
@@ -330,6 +333,8 @@ def test_verdict_comes_first(whole, words):
     assert failed.index("Verification failed") < failed.index("Fit accepted")
     assert "1.23°" in failed
     assert "1.45°" in failed
+    assert "0.040°</td><td>8</td>" in failed
+    assert "Risk of a wrong verdict, all roll sets and limits together: 0.02." in failed
     assert "&lt;b&gt;" in failed
     assert "Not verified" not in failed
     passed = words(whole, Outcome(True, [Row(passed=True, value=0.5, uncertainty=None)]))

@@ -26,7 +26,7 @@ UNLIKELY = 1e-3
 """A term is there if noise alone gives one as large with a probability below this."""
 LEFT_TO_TERM = 1e-6
 """A direction of a term counts if the fit leaves this share of its information to it."""
-VISIBLE = 4e-4
+SEEN_SHARE = 4e-4
 """A direction of a term counts as visible to the attitudes with this share of the information."""
 ALIGNED = 0.05
 """Attitudes and temperature go together where the fit leaves less of the information on its next power."""
@@ -236,7 +236,7 @@ def _in_turn(whole: Array, pulled: Array, tested: Ints, fitted: Ints) -> Array:
 def _share_left(alone: Array, left: Array) -> Array:
     """The least share (B,) of information `alone` (B, c, c) that is `left` in any direction that it has."""
     values, vectors = eigen(alone)
-    kept = values > VISIBLE
+    kept = values > SEEN_SHARE
     scaled = vectors * np.sqrt(quotient(np.ones_like(values), values, kept))[:, None]
     share = scaled.mT @ left @ scaled
     np.einsum("bii->bi", share)[...] += ~kept

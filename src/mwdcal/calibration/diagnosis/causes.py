@@ -51,7 +51,7 @@ def _column(fitted: FittedRuns, place: int) -> str:
     return "".join(f" {described(effect, unit)}" for effect in named[:1])
 
 
-ENDS = {"culprit": _culprit, "axes": _axes, "column": _column}
+REFUSAL_ENDINGS = {"culprit": _culprit, "axes": _axes, "column": _column}
 """What the words of a refusal may end with, for one run."""
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mwdcal.calibration.automatic.courses import orders_of, share_beyond
-from mwdcal.calibration.diagnosis.causes import ENDS, spanned
+from mwdcal.calibration.diagnosis.causes import REFUSAL_ENDINGS, spanned
 from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag, listed, spaced
 from mwdcal.calibration.diagnosis.plausibility import (
     excessive_errors,
@@ -382,7 +382,7 @@ def _refusal(
 
     The words may end with the station to look at first, and with the axes with which the run would fit.
     """
-    ends = {word: partial(end, fitted) for word, end in ENDS.items()}
+    ends = {word: partial(end, fitted) for word, end in REFUSAL_ENDINGS.items()}
     return Flag(status or words, members, OF_FITS[words], ends | values)
 
 
