@@ -262,6 +262,9 @@ def _scores(problem: Problem, result: Fit, others: Mapping[str, Array]) -> _Scor
 
 def _unknown(problem: Problem, result: Fit) -> int:
     """Number of unknowns that stations have to themselves; none where one is left out."""
+    evidence = problem.evidence
+    if not (evidence.exact_turn_sd.any() or evidence.free.any() or evidence.absent):
+        return 0
     private = problem.linear(result.state, geometry=True).private
     return int(np.sum(np.linalg.svd(private, compute_uv=False) > 1.0))
 
