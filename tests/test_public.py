@@ -512,14 +512,23 @@ def test_a_simulated_tool_is_the_one_of_its_factors():
 
 
 def test_a_simulated_stand_is_off_by_its_uncertainty():
+    """By one error for the only direction, unless the stand is set at every station."""
     angles = {"noise": (0.0, 0.0), "tool": TOOL, "seed": 8}
-    true, off = (
-        mwdcal.simulate([60], 2000, [0], stand_deg=stand, **angles)
-        for stand in ((0.0, 0.0, 0.0), (0.1, 0.0, 0.0))
+    exact, off, together = (
+        mwdcal.simulate([60], 2000, [0], stand_deg=stand, settings=settings, **angles)
+        for stand, settings in (
+            ((0.0, 0.0, 0.0), None),
+            ((0.1, 0.0, 0.0), "per-station"),
+            ((0.1, 0.0, 0.0), "per-direction"),
+        )
     )
-    change = off.accelerometer[:, 2] - true.accelerometer[:, 2]
+    change, shared = (
+        run.accelerometer[:, 2] - exact.accelerometer[:, 2] for run in (off, together)
+    )
     assert np.std(change) == pytest.approx(np.sin(np.radians(60)) * np.radians(0.1), rel=0.1)
-    assert (off.known["inclination"] == true.known["inclination"]).all()
+    assert abs(shared.mean()) > 1e-5
+    assert np.std(shared) < 0.01 * abs(shared.mean())
+    assert (off.known["inclination"] == exact.known["inclination"]).all()
 
 
 def test_the_bundled_example_is_what_its_script_writes(tmp_path):

@@ -99,9 +99,19 @@ def found(result, raw):
 
 
 def stated(result, fields, slopes):
-    """Half widths (tools, 6 x 60) of the 95 % intervals, the residuals' s² in them."""
-    spread = np.repeat(np.sqrt(result.analysis.variance_factor), 30, -1)
-    covariance = result.analysis.covariance * spread[:, :, None] * spread[:, None, :]
+    """Half widths (tools, 6 x 60) of the 95 % intervals, with the residuals' s² where it is above one.
+
+    What the stand does has that of both triads together, what noise does that of each.
+    """
+    squares, freedom = result.analysis.variance_factor, result.analysis.freedom
+    together = np.maximum((squares * freedom).sum(-1) / freedom.sum(-1), 1.0)
+    spread = np.repeat(np.sqrt(np.maximum(squares, 1.0)), 30, -1)
+    linear, whole = result.problem.linear(result.state), result.analysis.covariance
+    weighed = np.einsum("tpq,tnmq->tnpm", whole, linear.weigh(linear.design))
+    of_stand = weighed @ linear.private
+    of_stand = np.sum(of_stand @ of_stand.mT, 1)
+    covariance = (whole - of_stand) * spread[:, :, None] * spread[:, None, :]
+    covariance += of_stand * together[:, None, None]
     widths = []
     for name in NAMES:
         gradient = OBSERVABLES[name].gradient(fields[..., :3], fields[..., 3:])

@@ -35,6 +35,8 @@ from mwdcal.survey.stations import STRENGTHS, SURVEYED, surveyed, switched
 
 EARTH = Earth()
 NOISE = (1e-4, 15.0)
+STAND = 1e-4
+"""Uncertainty of each angle that the stand sets, radians."""
 
 
 @cache
@@ -43,7 +45,10 @@ def laboratory(seed=0):
     rng = np.random.default_rng(seed)
     tool = servo(rng)
     plan = grid([0, 45, 90, 135], 12, [0, 90, 180, 270], [30.0])
-    return tool, mwdcal.calibrate(run(tool, plan, rng, NOISE, (1e-4, 1e-4, 1e-4)))
+    sd = {name: np.full(plan.count, STAND) for name in ("inclination", "azimuth", "toolface")}
+    sd |= dict(zip(("accelerometer", "magnetometer"), map(np.array, NOISE), strict=True))
+    measured = run(tool, plan, rng, NOISE, (STAND, STAND, STAND))
+    return tool, mwdcal.calibrate(replace(measured, sd=sd))
 
 
 def readings(tool, inclination, azimuth, toolface, rng=None, shift=0.0):

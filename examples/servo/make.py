@@ -130,6 +130,7 @@ def main() -> None:
             *plan,
             tool=tool,
             stand_deg=(stand.inclination_deg, stand.azimuth_deg, stand.toolface_deg),
+            settings=stand.settings,
             drift=0.3,
             seed=rng,
         )

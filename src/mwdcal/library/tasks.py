@@ -114,6 +114,7 @@ def simulate(
     tool: int | tuple[ArrayLike, ArrayLike] | Truth = 0,
     noise: tuple[float, float] = (1e-4, 15.0),
     stand_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    settings: Literal["per-direction", "per-station"] | None = None,
     drift: float = 0.0,
     seed: int | np.random.Generator = 0,
 ) -> Readings:
@@ -122,7 +123,8 @@ def simulate(
     Azimuths come in turn, one to each inclination. `tool` is a number, the same one for the same
     tool; or the true factors (30,) of accelerometer and magnetometer, SF (3 × 4) and B (3 × 4) by
     power of T - 30 °C, then m (6). `noise` is of one reading, g and nT; `stand_deg` how far inclination,
-    azimuth and toolface are off their references; `drift` the temperature by which the tool warms
+    azimuth and toolface are off their references, the same for stations that follow each other with one
+    direction unless `settings` says that the stand is set at each; `drift` the temperature by which the tool warms
     during the run; `seed` that of noise and stand, or a generator.
     """
     if not all(0 <= angle <= 180 for angle in inclination_deg) or toolfaces < 1:
@@ -135,7 +137,8 @@ def simulate(
     plan = replace(plan, temperature=warmed)
     rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng([seed, 1])
     inclination, azimuth, toolface = np.radians(stand_deg)
-    return simulation.run(_truth(tool), plan, rng, noise, (inclination, azimuth, toolface))
+    off = inclination, azimuth, toolface
+    return simulation.run(_truth(tool), plan, rng, noise, off, settings or "")
 
 
 def _truth(tool: int | tuple[ArrayLike, ArrayLike] | Truth) -> Truth:

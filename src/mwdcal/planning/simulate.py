@@ -196,20 +196,22 @@ def run(
     rng: np.random.Generator,
     noise: tuple[float, float] = (1e-4, 15.0),
     stand: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    settings: str = "",
 ) -> Readings:
-    """Readings with noise (g, nT), at a stand whose angles are off by `stand` (radians, 1 σ)."""
+    """Readings with noise (g, nT), at a stand whose angles are off by `stand` (radians, 1 σ), and its practice."""
     known = {name: getattr(plan, name) for name in ANGLES}
     known |= {name: np.full(plan.count, getattr(truth, name)) for name in CONSTANTS}
     blank = np.zeros((plan.count, 3))
     sd = {name: size + blank for name, size in zip(TRIADS, noise, strict=True)}
     sd |= {name: np.asarray(size) for name, size in zip(ANGLES, stand, strict=True)}
-    session = Readings(blank, blank, plan.temperature, known, sd)
+    session = Readings(blank, blank, plan.temperature, known, sd, settings=settings)
     result = simulated(truth, session, rng).readings
     return Readings(
         result.accelerometer,
         result.magnetometer,
         plan.temperature,
         known,
+        settings=settings,
         station=tuple(str(i + 1) for i in range(plan.count)),
         metadata=result.metadata,
     )
