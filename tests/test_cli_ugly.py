@@ -1,5 +1,6 @@
 """Ugly runs through `mwdcal calibrate`: one clear refusal, no file; or a result that says what it lacks."""
 
+import re
 import time
 
 import numpy as np
@@ -283,7 +284,11 @@ def test_what_nothing_determines_is_said(tmp_path):
     angles = ("ref_inclination_deg", "ref_azimuth_deg", "ref_toolface_deg")
     made = ran(tmp_path, constant(np.nan, *angles, "ref_field_nt")(servo_run()))
     assert made.code == 0
-    assert "accelerometer 9 of 12 determined   magnetometer 9 of 12 determined" in made.out
+    each = ("accelerometer 9 of 12 determined, (.*)", "magnetometer 9 of 12 determined, (.*)")
+    freedom = re.search("   ".join(f"{words} degrees of freedom" for words in each), made.out)
+    assert (
+        sum(map(float, freedom.groups())) == 3 * 48 - 2 * 9 - 3
+    )  # strengths and dip; the mounting
     for words in ("rotation about the tool's x axis", "y axis", "toolface zero", "strength"):
         assert sum(words in s for s in made.err.splitlines() if s.startswith("! ")) == 1
 

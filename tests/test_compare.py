@@ -612,6 +612,7 @@ def test_errors_near_vertical_are_those_that_calibrate_states(blank):
     stated = {row.observable: row.after for row in made.errors}
     for name in ("toolface", "azimuth", "inclination"):
         rms = np.degrees(np.sqrt(np.nanmean(found[name] ** 2)))
+        # a record has 12 digits of each parameter: 1e-10° of a vector, by which the fit itself differs by 1e-12
         assert rms == pytest.approx(stated[name], rel=1e-9, abs=1e-10), name
     g, _ = made.fields(data)
     own = np.arctan2(np.hypot(g[:, 0], g[:, 1]), g[:, 2])

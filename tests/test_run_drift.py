@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from cli_support import calibrated, mwdcal, servo_run, write_csv
 from mwdcal.calibration.automatic.drift import by_drift, chances
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.estimate import fit
@@ -115,3 +116,26 @@ def test_a_member_of_a_batch_drifts_as_it_does_alone():
         [(_, result)] = by_drift(fit(one, options), options)
         alone = drifts(result).get("field-drift", (np.zeros(1),))[0]
         np.testing.assert_allclose(each[place], alone[0], rtol=1e-9)
+
+
+def test_a_large_drift_is_no_error_against_the_references():
+    """20 mg from end to end, two hundred times the noise: the errors of gravity are those of the drift."""
+    readings = runs(5, 1)
+    slope = 0.02 * np.linspace(0.0, 1.0, COUNT)[:, None] * np.array([0.0, 1.0, 0.0])
+    raw = readings.accelerometer[0] + slope
+    declared = {"accelerometer": np.array(1e-4), "magnetometer": np.array(15.0)}
+    one = Readings(raw, readings.magnetometer[0], known=readings.known, sd=declared)
+    record = calibrate(one, Profile(name="x"), Options(order=0))
+    assert {finding.id for finding in record.findings} >= {"accelerometer-drift"}
+
+
+def test_a_wrong_prior_is_no_drift(tmp_path):
+    """The calibration of another tool leaves residuals that go with attitude, and so with the order of stations."""
+    previous = calibrated(tmp_path, servo_run(1))
+    run = write_csv(tmp_path / "later.csv", servo_run(3))
+    given = ("--tool", "servo", "--prior", previous, "-o", tmp_path / "later.json")
+    made = mwdcal("calibrate", run, *given, "--json")
+    assert made.code == 0, made
+    found = {finding["id"] for finding in made.json["findings"]}
+    assert "prior-conflict" in found
+    assert not found & {"accelerometer-drift", "magnetometer-drift", "field-drift"}

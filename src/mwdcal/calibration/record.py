@@ -217,7 +217,7 @@ class TriadCalibration(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def freedom_of_noise(self) -> float:
-        """Degrees of freedom of its noise: of the residuals, unless these agree with a declared one."""
+        """Degrees of freedom of the residuals, or of a declared noise where these agree with it."""
         agrees = (self.misfit_probability or 0.0) > DOUBT and self.noise_source == "declared"
         return MOST_FREEDOM if agrees else self.degrees_of_freedom
 

@@ -109,6 +109,20 @@ class Residuals:
         return g[0], b[0]
 
     @cached_property
+    def undrifted(self) -> tuple[Array, Array]:
+        """Corrected vectors less the drifts within the run that are part of the fit."""
+        problem, state = self.fit.problem, self.fit.state
+        if not problem.walks:
+            return self.after
+        drift = (problem.walk_columns(state) @ state.constants[:, None, :, None])[0, ..., 0]
+        steady = [*self.after]
+        for index, (triad, where) in enumerate(zip(problem.triads, problem.slices(), strict=True)):
+            slope = triad.model.slope(state.params[:, where], triad.raw, problem.temperature)[0]
+            raw = drift[:, 3 * index : 3 * index + 3] * triad.sd[0]
+            steady[index] = steady[index] + np.einsum("nij,nj->ni", slope, raw)
+        return steady[0], steady[1]
+
+    @cached_property
     def targets(self) -> tuple[Array, Array]:
         """Vectors that a perfect tool would read at the fitted attitudes."""
         g, b = self.fit.problem.targets(self.fit.state)

@@ -80,6 +80,10 @@ REFUSED = {
 REMARKED = {
     "noise": "residuals of the {triad} are far below the declared noise",
     "residuals": "residuals of the {triad} are larger than the declared noise explains",
+    "settings": "the stand at one or more of its settings is off by far more than declared",
+    "settings-apart": "stations of one direction scatter as if the stand had been set anew at each",
+    "field-drift": "the field drifted during the run: fit and uncertainty include it",
+    "drift": "offsets of the {triad} drifted during the run: fit and uncertainty include it",
     "no-redundancy": "nothing in the run checks the fit",
     "few-degrees-of-freedom": "the residuals are too few to know the uncertainties better than to a quarter",
     "hemisphere": "the dip is negative: a southern site, or a magnetometer with reversed signs",
@@ -88,6 +92,7 @@ REMARKED = {
     "temperature-misfit": "the {triad} varies with temperature as its order does not follow",
     "temperature-untested": "nothing tests the terms of temperature between the temperatures of the run",
     "temperature-aligned": "attitudes followed the temperature: terms of temperature cannot be told apart",
+    "prior-aged": "the prior allows for what the tool may have changed since",
     "prior-shared": "run and prior count a common error as two",
     "prior-only": "some parameters rest on the prior alone",
     "prior-conflict": "the run departs from the prior",

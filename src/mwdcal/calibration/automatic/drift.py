@@ -12,13 +12,15 @@ from dataclasses import replace
 import numpy as np
 
 from mwdcal.calibration.automatic.courses import f_test, terms_beyond
+from mwdcal.calibration.diagnosis.plausibility import departures
 from mwdcal.calibration.estimate import Fit, fit, refitted
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.residuals import tail
 from mwdcal.estimation import drift
-from mwdcal.estimation.batch import take
+from mwdcal.estimation.batch import put, take
 from mwdcal.estimation.minimisers import closed_form
-from mwdcal.estimation.problem import Problem
+from mwdcal.estimation.problem import Prior, Problem
 from mwdcal.estimation.solvers import Status
 from mwdcal.geometry.vectors import Array, Bools, Ints
 
@@ -27,6 +29,8 @@ ORDER_CHANCE = 0.1
 
 A drift that is not there costs little: its size comes out small. One that is left out costs coverage.
 """
+PRIOR_CHANCE = 1e-3
+"""Chance of so large a departure from the prior, at which a drift is looked for in the run alone."""
 REDUNDANCY = 36.0
 """Fewest degrees of freedom of a triad that can tell a drift from noise."""
 
@@ -82,10 +86,27 @@ def drifting(result: Fit, options: Options) -> Bools:
     sound &= ~terms_beyond(result).present.any((1, 2))
     if not sound.any():
         return drifted
-    drifted[sound] = (
-        chances(result if sound.all() else take(result, np.flatnonzero(sound))) < ORDER_CHANCE
-    )
+    part = result if sound.all() else take(result, np.flatnonzero(sound))
+    drifted[sound] = chances(_undisputed(part, options)) < ORDER_CHANCE
     return drifted
+
+
+def _undisputed(result: Fit, options: Options) -> Fit:
+    """Fits without the prior where the run departs from it: it tests no drift then, and sizes none.
+
+    A wrong prior leaves residuals that go with attitude, and attitude may go with the order of the stations.
+    """
+    if options.knowledge is None:
+        return result
+    square, tested = departures(result)
+    disputed = np.flatnonzero(tail(square, np.maximum(tested, 1)) <= PRIOR_CHANCE)
+    if not disputed.size:
+        return result
+    part = take(result, disputed)
+    nothing = Prior(0 * part.problem.prior.precision, part.problem.prior.expected)
+    alone = replace(part.problem, prior=nothing)
+    same = np.ones(part.analysis.freedom.shape)
+    return put(result, disputed, refitted(part, alone, part.state, same, options))
 
 
 def fit_run(readings: Readings, options: Options) -> Fit:
@@ -106,9 +127,9 @@ def by_drift(result: Fit, options: Options) -> Iterator[tuple[Ints, Fit]]:
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def with_drift(result: Fit, options: Options, triads: Bools) -> Fit:
     """A fit with walks of estimated size that act on some triads (t,), from one without."""
-    problem, analysis = result.problem, result.analysis
-    declared = np.isnan(result.noise)
-    scores = drift.walk_scores(problem, result.state, analysis)
+    problem, alone = result.problem, _undisputed(result, options)
+    declared, analysis = np.isnan(result.noise), alone.analysis
+    scores = drift.walk_scores(alone.problem, alone.state, analysis)
     scores = scores.of([n for n, t in drift.acting(scores.places).items() if triads[t]])
     theta, left = drift.walk_variances(scores, analysis.variance_factor, analysis.freedom, declared)
     sizes = dict(zip(scores.places, np.sqrt(theta.T), strict=True))

@@ -82,7 +82,7 @@ REMARKS = {
     "field-drift": "Readings follow the order of the stations as if the field drifted by {change:.2g} {unit} (1σ "
     "{sd:.1g} {unit}) during the run. The fit allows for this drift, and the uncertainty includes it. Give "
     "ref_field_nt and ref_dip_deg of each station from a reference magnetometer, or repeat the run at a quiet time.",
-    "offset-drift": "Readings follow the order of the stations as if the offsets of the {triad} drifted by "
+    "drift": "Readings follow the order of the stations as if the offsets of the {triad} drifted by "
     "{change:.2g} {unit} (1σ {sd:.1g} {unit}) during the run. The fit allows for this drift, and the uncertainty "
     "includes it. Let the tool warm up, and change inclination and azimuth in another order than from end to end.",
     "no-redundancy": "{triads}: no redundancy, so nothing in this run checks the fit. Add stations.",
@@ -260,7 +260,7 @@ def _few_degrees(fitted: FittedRuns) -> Flag:
         each = [f"{TRIADS[t]} has {freedom[place, t]:.0f}" for t in np.flatnonzero(few[place])]
         return f"{' and the '.join(each)} degrees of freedom"
 
-    least = np.where(few, freedom, np.inf).min(-1)
+    least = np.where(few, np.maximum(freedom, 1.0), np.inf).min(-1)
     return _remark(
         "few-degrees-of-freedom", np.any(few, -1), few=named, share=100 / np.sqrt(2 * least)
     )
@@ -279,7 +279,7 @@ def _drifts(fitted: FittedRuns) -> Iterator[Flag]:
         scale, unit = shown_in(
             "gravity" if triad == TRIADS[0] else "field", fitted.readings.relative
         )
-        words = REMARKS["offset-drift" if triad in TRIADS else name]
+        words = REMARKS["drift" if triad in TRIADS else name]
         values = {"triad": triad, "change": change * scale, "sd": sd * scale, "unit": unit}
         yield Flag(name, change > SHOWN_DRIFT * sd, words, values)
 

@@ -137,14 +137,14 @@ def excessive_errors(readings: Readings, result: Fit) -> dict[str, tuple[float, 
 
     Definition: the expectation is that of noise and stand, times the root of the run's s² where
     that is above one: so are the uncertainties that a calibration states. In a robust fit stations
-    count with the pull that they have.
+    count with the pull that they have. A drift within the run that is part of the fit is no error here.
     """
     analysis = result.analysis
     squares = np.nan_to_num(analysis.variance_factor[0]) * np.maximum(analysis.freedom[0], 0)
     misfit = np.sqrt(max(squares.sum() / max(analysis.freedom[0].sum(), 1.0), 1.0))
     residuals, weight = Residuals(readings, result), result.trust[0]
     excessive = {}
-    for name, after in residuals.errors(residuals.after).items():
+    for name, after in residuals.errors(residuals.undrifted).items():
         expected = residuals.expected[name]
         known = ~np.isnan(after + expected) & (weight > 0)
         if not known.any():

@@ -337,8 +337,9 @@ def _first(run: Run, stations: Bools, place: int) -> str:
 def fit_refusals(fitted: FittedRuns) -> Iterator[Flag]:
     """Reasons not to trust a fit, in order of precedence.
 
-    A fit that explains nothing may have ended anywhere: its residuals are judged before its rank and
-    its gains. Refusals that a wrong axis may have caused name the axes with which the run fits.
+    A fit that explains nothing may have ended anywhere, or not at all: its residuals are judged before
+    its rank, its gains, and whether it settled. Refusals that a wrong axis may have caused name the axes
+    with which the run fits.
     """
     sound = np.ones(fitted.count, bool)
     for flag in _by_arrays(fitted):
@@ -354,12 +355,10 @@ def _by_arrays(fitted: FittedRuns) -> Iterator[Flag]:
     if fitted.options.estimate:
         errors = ",".join(fitted.options.estimate)
         yield refusal("inseparable", inseparable(result), errors=errors)
-    for status in (Status.NOT_CONVERGED, Status.NOT_FINITE):
-        unsettled = result.status == int(status)
-        name = status.name.lower().replace("_", "-")
-        yield refusal("unsettled", unsettled, name, message=status.message)
+    yield _unsettled(fitted, Status.NOT_FINITE)
     for triad in triads:
         yield from _absurd(fitted, triad)
+    yield _unsettled(fitted, Status.NOT_CONVERGED)
     yield _too_weak(fitted)
     for triad in triads:
         freedom = result.analysis.freedom[:, triad]
@@ -386,6 +385,13 @@ def _refusal(
     return Flag(status or words, members, OF_FITS[words], ends | values)
 
 
+def _unsettled(fitted: FittedRuns, status: Status) -> Flag:
+    """Fits that have ended with a status that is none of success."""
+    members = fitted.result.status == int(status)
+    name = status.name.lower().replace("_", "-")
+    return _refusal(fitted, "unsettled", members, name, message=status.message)
+
+
 def _absurd(fitted: FittedRuns, index: int) -> Iterator[Flag]:
     """Residuals that no error of a sensor explains: columns, references or groups are mixed up."""
     result, raw = fitted.result, fitted.result.problem.triads[index].raw
@@ -404,6 +410,7 @@ def _absurd(fitted: FittedRuns, index: int) -> Iterator[Flag]:
         return f"{noise[place] / signal[place]:.0%} of the field"
 
     absurd = is_absurd(1.0) & (result.analysis.freedom[:, index] >= 1)
+    absurd &= declared | (result.status == int(Status.OK))  # noise of a fit on its way is none
     warmed = absurd & ~is_absurd(share_beyond(result, index, absurd))
     words: dict[str, Any] = {"triad": TRIADS[index], "much": much}
     yield _refusal(
