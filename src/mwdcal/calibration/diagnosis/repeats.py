@@ -53,7 +53,7 @@ def _copies(rows: Array) -> Bools:
     from scipy.spatial import KDTree
 
     tree = KDTree(rows)
-    within = tree.count_neighbors(tree, [AGREEING, NEAR], p=np.inf)
+    within = np.asarray(tree.count_neighbors(tree, [AGREEING, NEAR], p=np.inf)).tolist()
     pairs, near = (int(count - len(rows)) // 2 for count in within)
     alone = float(np.prod([_agreement(resolution(each)) for each in rows.T]))
     if not pairs or _at_least(pairs, near, alone) >= COINCIDENCE:
