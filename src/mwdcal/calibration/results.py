@@ -38,6 +38,14 @@ SIGNS = (
     "signs of the magnetometer at a southern site",
 )
 """What is assumed where only the profile says which hemisphere the dip is of: northern, southern."""
+STEADY = {
+    "accelerometer-drift": "steady offsets of the accelerometer during the run",
+    "magnetometer-drift": "steady offsets of the magnetometer during the run",
+    "field-drift": "a steady field during the run",
+}
+"""What is assumed where a drift would not show."""
+LEAST_SHARE = 0.2
+"""A trend hides among the sensors' parameters where less than this share of its information is in the residuals."""
 EVEN = 1e-6
 """Departure of a correlation matrix from symmetry that is left as it is."""
 
@@ -178,7 +186,8 @@ def assumed_exact(result: Fit, relative: bool) -> list[str]:
 
     A toolface zero turns both triads, and a strength scales one, as sensors of other mounting or
     scale would have it. The field = 1 of a `relative` magnetometer is no reference. The signs of the magnetometer
-    are assumed where nothing confirms the hemisphere: see `unconfirmed_dip`.
+    are assumed where nothing confirms the hemisphere: see `unconfirmed_dip`. Offsets are taken as steady where
+    attitudes follow the order of the stations so closely that a trend would look like the sensors: see `unseen_drifts`.
     """
     evidence, quantities = result.problem.evidence, ("toolface", "gravity", "field")
     declared = {c.name.removesuffix("-zero") for c in evidence.constants} | set(evidence.absent)
@@ -191,7 +200,16 @@ def assumed_exact(result: Fit, relative: bool) -> list[str]:
     ]
     names = ["toolface zero of the stand" if n == "toolface" else f"{n} reference" for n in exact]
     dip = float(unconfirmed_dip(result)[0])
-    return names if np.isnan(dip) else [*names, SIGNS[dip < 0]]
+    signs = [] if np.isnan(dip) else [SIGNS[dip < 0]]
+    return [*names, *signs, *(STEADY[name] for name in unseen_drifts(result))]
+
+
+def unseen_drifts(result: Fit) -> list[str]:
+    """Drifts of a run whose trend the residuals would not show: less than `LEAST_SHARE` of it stays in them."""
+    if result.analysis.influence is not None:
+        return []
+    shares = drift.shown(result.problem, result.state, result.analysis)
+    return [name for name, share in shares.items() if share[0] < LEAST_SHARE]
 
 
 def unconfirmed_dip(result: Fit) -> Array:

@@ -1,9 +1,11 @@
-"""Slow drift within a run: a random walk of the field, or of a triad's offsets, over the order of stations.
+"""Slow drift within a run, of the field or of a triad's offsets, over the order of stations: trend and random walk.
 
 A walk W about its mean over the run is a sum of cosines, √2 cos(πkt) with independent coefficients of
 variance (s/πk)² (Karhunen-Loève), t being the place in the run, 0…1, and s the standard deviation of
-W(1) - W(0). The mean itself lies s/√3 from where the walk began, or ended. Each coefficient is a
-constant of the run with its variance as the prior; s² is estimated by restricted maximum likelihood.
+W(1) - W(0). The mean itself lies s/√3 from where the walk began, or ended. A trend r(t - ½) is a drift
+of its own, of standard deviation r, whose mean lies r/2 from where it began: a walk alone would take it for a
+smaller one, since it has no power beyond its first cosine. Each coefficient is a constant of the run with its
+variance as the prior; s² and r² are estimated by restricted maximum likelihood.
 
 Reference: K. Karhunen, Ann. Acad. Sci. Fenn. A 37 (1947); R. B. Schall, Biometrika 78, 719 (1991).
 """
@@ -18,7 +20,7 @@ import numpy as np
 from mwdcal.estimation.evidence import WALKS, Evidence, SharedConstant
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import Analysis, whole_covariance
-from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, inverse
+from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, finite, inverse
 
 MOST_TERMS = 8
 """Cosines of a walk: they hold 93 % of its variance; the rest looks like noise."""
@@ -33,17 +35,18 @@ VARIANCE_ROUNDS = 25
 
 
 def terms_of(count: int) -> tuple[Array, Array]:
-    """Values (n, K + 1) of the mean and the cosines at n stations, and their variances (K + 1,) for s = 1.
+    """Values (n, K + 2) of mean, trend and cosines at n stations; variances (2, K + 2) for r = 1 and for s = 1.
 
-    >>> values, variance = terms_of(48)
-    >>> values.shape, round(float(variance[1:].sum() * 6), 2)
-    ((48, 9), 0.93)
+    >>> values, (trend, walk) = terms_of(48)
+    >>> values.shape, round(float(walk[2:].sum() * 6), 2)
+    ((48, 10), 0.93)
     """
-    order = np.arange(min(MOST_TERMS, count // STATIONS_PER_TERM) + 1)
+    order = np.arange(1, min(MOST_TERMS, count // STATIONS_PER_TERM) + 1)
     place = (np.arange(count) + 0.5) / max(count, 1)
     cosines = np.sqrt(2.0) * np.cos(np.pi * order * place[:, None])
-    cosines[:, 0] = 1.0
-    return cosines, np.concatenate([[1 / 3], 1 / (np.pi * order[1:]) ** 2])
+    values = np.column_stack([np.ones(count), place - 0.5, cosines])
+    trend = np.concatenate([[1 / 4, 1], np.zeros(order.size)])
+    return values, np.stack([trend, np.concatenate([[1 / 3, 0], 1 / (np.pi * order) ** 2])])
 
 
 def families(problem: Problem) -> list[str]:
@@ -56,17 +59,22 @@ def acting(walks: Iterable[str]) -> dict[str, int]:
     return {name: min([*WALKS].index(name), 1) for name in walks}
 
 
-def with_walks(problem: Problem, state: State, sizes: dict[str, Array]) -> tuple[Problem, State]:
-    """The problem with walks of some sizes s (B,), g or nT, as constants of the run, and the state for it."""
+def with_walks(
+    problem: Problem, state: State, sizes: dict[str, Array]
+) -> tuple[Problem, State]:
+    """The problem with drifts as constants of the run, and the state for it.
+
+    `sizes` (B, 2) of each: r of its trend and s of its walk, g or nT.
+    """
     evidence, count = problem.evidence, problem.evidence.include.shape[-1]
     values, variance = terms_of(count)
     batch = len(evidence.include)
     zero, new = np.zeros(batch), list(evidence.constants)
     for name, size in sizes.items():
+        spread = np.sqrt(size**2 @ variance)
         for axis in WALKS[name]:
-            for value, share in zip(values.swapaxes(0, 1), variance, strict=True):
+            for value, sd in zip(values.T, spread.T, strict=True):
                 mask = np.broadcast_to(value, (batch, count))
-                sd = size * np.sqrt(share)
                 new.append(SharedConstant(axis, mask, zero, sd, unknown=False))
     more = np.zeros((batch, len(new) - len(evidence.constants)))
     walking = replace(problem, evidence=replace(evidence, constants=tuple(new)))
@@ -74,24 +82,13 @@ def with_walks(problem: Problem, state: State, sizes: dict[str, Array]) -> tuple
 
 
 def places(evidence: Evidence) -> dict[str, Ints]:
-    """Places of the constants that each walk of the evidence consists of, mean first for each axis."""
+    """Places (3, K + 2) of the constants that each drift of the evidence consists of: those of `terms_of` by axis."""
     names = [constant.name for constant in evidence.constants]
     each = {
         walk: np.array([i for i, name in enumerate(names) if name in axes], int)
         for walk, axes in WALKS.items()
     }
-    return {walk: index for walk, index in each.items() if index.size}
-
-
-def cosines(index: Ints, problem: Problem) -> Bools:
-    """Which of the constants of a walk are cosines: the others are means over the run."""
-    return np.arange(index.size) % terms_of(problem.evidence.include.shape[-1])[1].size > 0
-
-
-def sizes(problem: Problem) -> dict[str, Array]:
-    """Standard deviation s (B,) of each walk over the run, g or nT."""
-    first = {name: index[0] for name, index in places(problem.evidence).items()}
-    return {n: problem.evidence.constants[i].sd * np.sqrt(3.0) for n, i in first.items()}
+    return {walk: index.reshape(3, -1) for walk, index in each.items() if index.size}
 
 
 def noise(problem: Problem) -> dict[str, Array]:
@@ -102,10 +99,10 @@ def noise(problem: Problem) -> dict[str, Array]:
 
 @dataclass(frozen=True)
 class WalkScores:
-    """What the residuals of a fit without walks say of their cosines, in units of the noise.
+    """What the residuals of a fit without drift say of its terms, in units of the noise.
 
-    `score` (B, k) and its covariance `information` (B, k, k), for walks of s = 1 noise of a reading; `places`
-    of the columns of each walk.
+    `score` (B, k) and its covariance `information` (B, k, k), for drifts of r = s = 1 noise of a reading;
+    `places` of the columns of each drift, its three trends first.
     """
 
     score: Array
@@ -113,7 +110,7 @@ class WalkScores:
     places: dict[str, Ints]
 
     def of(self, walks: Sequence[str]) -> WalkScores:
-        """Those of some walks."""
+        """Those of some drifts."""
         index = np.concatenate([self.places[name] for name in walks])
         ends = np.cumsum([len(self.places[name]) for name in walks])
         each = np.split(np.arange(index.size), ends[:-1])
@@ -121,9 +118,13 @@ class WalkScores:
         places = dict(zip(walks, each, strict=True))
         return WalkScores(self.score[:, index], information, places)
 
-    def of_walk(self, name: str) -> tuple[Array, Array, Array]:
-        """Q = sᵀs of a walk, and what noise alone gives: its mean tr G and tr G², with G the covariance of s."""
-        index = self.places[name]
+    def components(self) -> dict[tuple[str, int], Ints]:
+        """Columns of the trend (0) and of the walk (1) of each drift."""
+        parts = {(n, i): p for n, c in self.places.items() for i, p in enumerate((c[:3], c[3:]))}
+        return {key: columns for key, columns in parts.items() if columns.size}
+
+    def square(self, index: Ints) -> tuple[Array, Array, Array]:
+        """Q = sᵀs of some columns, and what noise alone gives: its mean tr G and tr G², with G the covariance of s."""
         each = self.information[:, index[:, None], index]
         return (
             np.sum(self.score[:, index] ** 2, -1),
@@ -137,65 +138,90 @@ def walk_scores(problem: Problem, state: State, analysis: Analysis) -> WalkScore
 
     The problem may be of one member for the residuals (B, n, m) of many.
     """
-    columns = _cosine_columns(problem, state)
+    columns, places = _columns(problem, state, slice(1, None))
+    _, information = _information(problem, state, analysis, columns)
+    residual = analysis.residual
+    flat = columns.reshape(len(columns), -1, columns.shape[-1])
+    score = (flat.mT @ residual.reshape(len(residual), -1, 1))[..., 0]
+    return WalkScores(score, information, places)
+
+
+def shown(problem: Problem, state: State, analysis: Analysis) -> dict[str, Array]:
+    """Share (B,) of a trend that residuals keep: of the three trends of a drift the one that hides best.
+
+    Definition: the least eigenvalue of the information about the trends relative to that with all other unknowns
+    known. The rest of a trend looks like parameters and references. Drifts that are in the fit are left out.
+    """
+    if {*families(problem)} <= {*places(problem.evidence)}:
+        return {}
+    columns, each = _columns(problem, state, slice(1, 2))
+    alone, left = _information(problem, state, analysis, columns)
+    shares = {}
+    for name, index in each.items():
+        whole, rest = (matrix[:, index[:, None], index] for matrix in (alone, left))
+        shares[name] = np.linalg.eigvals(finite(inverse(whole) @ rest)).real.min(-1)
+    return shares
+
+
+def _information(
+    problem: Problem, state: State, analysis: Analysis, columns: Array
+) -> tuple[Array, Array]:
+    """Information (B, k, k) on columns (B, n, m, k), all else known, and what the fit's unknowns leave of it."""
     linear = problem.linear(state)
     whole = whole_covariance(linear, analysis.determined)
-    weighed = linear.weigh(columns)
-    rows = (len(columns), -1, columns.shape[-1])
-    crossed = linear.design.reshape(len(columns), -1, whole.shape[-1]).mT @ weighed.reshape(rows)
-    information = columns.reshape(rows).mT @ weighed.reshape(rows)
-    information = information - crossed.mT @ whole @ crossed
-    count = columns.shape[-1] // len(families(problem))
-    every = np.arange(columns.shape[-1]).reshape(-1, count)
-    residual = analysis.residual
-    score = (columns.reshape(rows).mT @ residual.reshape(len(residual), -1, 1))[..., 0]
-    return WalkScores(
-        score,
-        information,
-        dict(zip(families(problem), every, strict=True)),
-    )
+    flat = columns.reshape(len(columns), -1, columns.shape[-1])
+    weighed = linear.weigh(columns).reshape(flat.shape)
+    crossed = linear.design.reshape(len(columns), -1, whole.shape[-1]).mT @ weighed
+    alone = flat.mT @ weighed
+    return alone, alone - crossed.mT @ whole @ crossed
 
 
-def _cosine_columns(problem: Problem, state: State) -> Array:
-    """Whitened columns (B, n, m, k) of the cosines of all walks, of size s = 1 noise of a reading."""
-    sized = {name: size for name, size in noise(problem).items() if name in families(problem)}
-    walking, at = with_walks(problem, state, sized)
-    sd = np.stack([c.sd for c in walking.evidence.constants], -1)
-    kept = [
-        i for index in places(walking.evidence).values() for i in index[cosines(index, problem)]
-    ]
-    return np.asarray(walking.walk_columns(at)[..., kept] * sd[:, None, None, kept])
+def _columns(problem: Problem, state: State, terms: slice) -> tuple[Array, dict[str, Ints]]:
+    """Whitened columns (B, n, m, k) of some terms of all drifts, of r = s = 1 noise of a reading, and those of each."""
+    present, old = places(problem.evidence), problem.evidence.constants
+    sizes = {n: np.stack([noise(problem)[n]] * 2, -1) for n in families(problem) if n not in present}
+    walking, at = with_walks(problem, state, sizes)
+    kept, columns = [], {}
+    for name in sizes:
+        chosen = places(walking.evidence)[name][:, terms].T.ravel()
+        columns[name] = len(kept) + np.arange(chosen.size)
+        kept += [walking.evidence.constants[i] for i in chosen]
+    walking = replace(walking, evidence=replace(walking.evidence, constants=(*old, *kept)))
+    at = replace(at, constants=at.constants[:, : len(old) + len(kept)])
+    sd = np.stack([constant.sd for constant in kept], -1)
+    return walking.walk_columns(at)[..., len(old) :] * sd[:, None, None], columns
 
 
 def walk_variances(
     scores: WalkScores, variance: Array, freedom: Array, declared: Bools
 ) -> tuple[Array, Array]:
-    """Variances (B, w) of the walks in units of the noise, and of the noise (B, t): REML.
+    """Variances (B, c) of the components of the drifts in units of the noise, and of the noise (B, t): REML.
 
     `variance` (B, t) is s² of the fit without walks, of so many degrees of `freedom`; that of the noise
     stays 1 where it is `declared`.
     Definition: for the coefficients u of a walk, V their covariance given the readings: θ = Σu² / Σ(1 - V/θ);
     of the noise, misfit less what the walks explain over its degrees of freedom (Henderson).
     """
-    count = len(scores.places)
-    owner = np.array([*acting(scores.places).values()])
-    width = scores.score.shape[-1] // count
+    parts = scores.components()
+    triad = np.array([acting([name])[name] for name, _ in parts])
+    owner = np.zeros(scores.score.shape[-1], int)
+    for number, columns in enumerate(parts.values()):
+        owner[columns] = number
+    of = (owner == np.arange(len(parts))[:, None]).astype(float).T
     misfit = variance * freedom
     left = np.where(declared, 1.0, variance)
-    first = [scores.of_walk(name) for name in scores.places]
+    first = [scores.square(columns) for columns in parts.values()]
     theta = np.stack([np.maximum(q - m, 0.1 * m) / s for q, m, s in first], -1)
     for _ in range(VARIANCE_ROUNDS):
-        ratio = np.repeat(left[:, owner] / theta, width, -1)
-        whole = scores.information + ratio[..., None] * np.eye(ratio.shape[-1])
-        whole = inverse(whole)
+        ratio = (left[:, triad] / theta)[:, owner]
+        whole = inverse(scores.information + ratio[..., None] * np.eye(ratio.shape[-1]))
         value = (whole @ scores.score[..., None])[..., 0]
-        used = (1 - diagonal(whole) * ratio).reshape(-1, count, width).sum(-1)
-        square = (value**2).reshape(-1, count, width).sum(-1)
-        theta = np.maximum(square / np.maximum(used, 1e-9), LEAST_WALK**2)
-        explained = (value * scores.score).reshape(-1, count, width).sum(-1)
-        by_triad = np.stack([explained[:, owner == t].sum(-1) for t in range(misfit.shape[-1])], -1)
+        used = (1 - diagonal(whole) * ratio) @ of
+        theta = np.maximum(value**2 @ of / np.maximum(used, 1e-9), LEAST_WALK**2)
+        explained = (value * scores.score) @ of
+        by_triad = np.stack([explained[:, triad == t].sum(-1) for t in range(misfit.shape[-1])], -1)
         left = np.where(declared, 1.0, np.maximum((misfit - by_triad) / freedom, 1e-3 * variance))
-    return theta * _widened(used), left
+    return theta * np.where([part == 0 for _, part in parts], 1.0, _widened(used)), left
 
 
 def _widened(freedom: Array) -> Array:
@@ -206,21 +232,16 @@ def _widened(freedom: Array) -> Array:
 
 
 def walk(problem: Problem, state: State, name: str) -> tuple[Array, Array]:
-    """A fitted walk about its mean (B, n, 3), g or nT, and the cosines (n, K) that it is a sum of.
+    """A fitted drift about its mean (B, n, 3), g or nT, and the terms (n, K + 1) that it is a sum of.
 
     Its axes are those of a triad, or north, east, down.
     """
     terms = terms_of(problem.evidence.include.shape[-1])[0][:, 1:]
-    value = state.constants[:, _of_cosines(problem, name)].reshape(len(state.constants), 3, -1)
+    value = state.constants[:, places(problem.evidence)[name][:, 1:]]
     return np.einsum("bak,nk->bna", value, terms), terms
 
 
 def walk_covariance(problem: Problem, analysis: Analysis, name: str) -> Array:
-    """Covariance (B, 3K, 3K) of the coefficients of a fitted walk, axis by axis."""
-    index = _of_cosines(problem, name)
+    """Covariance (B, 3(K + 1), 3(K + 1)) of the coefficients of a fitted drift, axis by axis."""
+    index = places(problem.evidence)[name][:, 1:].ravel()
     return np.asarray(analysis.constants[:, index[:, None], index])
-
-
-def _of_cosines(problem: Problem, name: str) -> Ints:
-    index = places(problem.evidence)[name]
-    return np.asarray(index[cosines(index, problem)])

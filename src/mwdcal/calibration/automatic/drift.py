@@ -24,7 +24,7 @@ from mwdcal.estimation.problem import Prior, Problem
 from mwdcal.estimation.solvers import Status
 from mwdcal.geometry.vectors import Array, Bools, Ints
 
-ORDER_CHANCE = 0.1
+ORDER_CHANCE = 0.3
 """Chance of residuals that follow the order of stations as much in noise, below which a drift is fitted.
 
 A drift that is not there costs little: its size comes out small. One that is left out costs coverage.
@@ -44,7 +44,7 @@ def chances(result: Fit) -> Array:
     least = np.ones(analysis.freedom.shape)
     for name, triad in drift.acting(scores.places).items():
         scatter, rest = (x[:, triad] for x in (analysis.variance_factor, analysis.freedom))
-        total, mean, square = scores.of_walk(name)
+        total, mean, square = scores.square(scores.places[name])
         ratio = np.where(square > 0, mean / np.where(square > 0, square, 1.0), 0.0)
         one = f_test(total * ratio, mean * ratio, np.nan_to_num(scatter), rest)
         one = np.nan_to_num(one, nan=1.0) * (1 + (triad > 0))
@@ -132,7 +132,9 @@ def with_drift(result: Fit, options: Options, triads: Bools) -> Fit:
     scores = drift.walk_scores(alone.problem, alone.state, analysis)
     scores = scores.of([n for n, t in drift.acting(scores.places).items() if triads[t]])
     theta, left = drift.walk_variances(scores, analysis.variance_factor, analysis.freedom, declared)
-    sizes = dict(zip(scores.places, np.sqrt(theta.T), strict=True))
-    sizes = {name: size * drift.noise(problem)[name] for name, size in sizes.items()}
+    noise = drift.noise(problem)
+    sizes = {name: np.zeros((len(theta), 2)) for name in scores.places}
+    for (name, part), variance in zip(scores.components(), theta.T, strict=True):
+        sizes[name][:, part] = np.sqrt(variance) * noise[name]
     walking, state = drift.with_walks(problem, result.state, sizes)
     return refitted(result, walking, state, np.sqrt(left), options)
