@@ -10,7 +10,7 @@ from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.results import StatedCovariance, drifts
-from mwdcal.estimation.drift import terms_of
+from mwdcal.estimation.drift import shown, terms_of
 from mwdcal.geometry.vectors import earth_field, earth_gravity, tool_from_earth
 from mwdcal.sensor.profile import Profile
 
@@ -60,11 +60,11 @@ def covered(readings):
 
 def test_the_walk_is_that_of_brown():
     """Covariance of a walk less its mean: min(s, t) - s + s²/2 - t + t²/2 + 1/3."""
-    values, variance = terms_of(400)
+    values, (_, variance) = terms_of(400)
     place = (np.arange(400) + 0.5) / 400
     s, t = place[:, None], place
     exact = np.minimum(s, t) - s + s**2 / 2 - t + t**2 / 2 + 1 / 3
-    part = (values[:, 1:] * variance[1:]) @ values[:, 1:].T
+    part = (values[:, 2:] * variance[2:]) @ values[:, 2:].T
     assert np.abs(part - exact).max() < 0.026  # what cosines beyond the eighth hold: Σ 2/(πk)²
     assert variance[0] == pytest.approx(1 / 3)
 
@@ -127,6 +127,31 @@ def test_a_large_drift_is_no_error_against_the_references():
     one = Readings(raw, readings.magnetometer[0], known=readings.known, sd=declared)
     record = calibrate(one, Profile(name="x"), Options(order=0))
     assert {finding.id for finding in record.findings} >= {"accelerometer-drift"}
+
+
+@pytest.mark.parametrize(
+    ("places", "said"),
+    [(np.arange(COUNT), True), (np.r_[0:COUNT:2, COUNT - 1 : 0 : -2], False)],
+    ids=["one direction after the other", "there and back"],
+)
+def test_steadiness_that_no_residual_tests_is_said(places, said):
+    readings = runs(2, 1)
+    known = {name: value[places] for name, value in readings.known.items()}
+    raw = (values[0, places] for values in (readings.accelerometer, readings.magnetometer))
+    record = calibrate(Readings(*raw, known=known, sd={}), Profile(name="x"), Options(order=0))
+    assert ("steady offsets of the accelerometer during the run" in record.assumed_exact) == said
+
+
+def test_the_share_of_a_trend_is_that_of_a_regression():
+    """Second formula: regression of accelerometer trends on the sensors' parameters, at exact attitudes."""
+    result = fit(runs(2, 1), Options(order=0))
+    attitude = result.state.attitude[0]
+    g = attitude[..., 2]
+    trend = (np.arange(COUNT) + 0.5) / COUNT - 0.5
+    known = np.column_stack([g, np.ones(COUNT)])
+    left = trend - known @ np.linalg.lstsq(known, trend, rcond=None)[0]
+    share = shown(result.problem, result.state, result.analysis)["accelerometer-drift"][0]
+    assert share == pytest.approx(left @ left / (trend @ trend), rel=1e-3)
 
 
 def test_a_wrong_prior_is_no_drift(tmp_path):

@@ -59,9 +59,7 @@ def acting(walks: Iterable[str]) -> dict[str, int]:
     return {name: min([*WALKS].index(name), 1) for name in walks}
 
 
-def with_walks(
-    problem: Problem, state: State, sizes: dict[str, Array]
-) -> tuple[Problem, State]:
+def with_walks(problem: Problem, state: State, sizes: dict[str, Array]) -> tuple[Problem, State]:
     """The problem with drifts as constants of the run, and the state for it.
 
     `sizes` (B, 2) of each: r of its trend and s of its walk, g or nT.
@@ -179,7 +177,9 @@ def _information(
 def _columns(problem: Problem, state: State, terms: slice) -> tuple[Array, dict[str, Ints]]:
     """Whitened columns (B, n, m, k) of some terms of all drifts, of r = s = 1 noise of a reading, and those of each."""
     present, old = places(problem.evidence), problem.evidence.constants
-    sizes = {n: np.stack([noise(problem)[n]] * 2, -1) for n in families(problem) if n not in present}
+    sizes = {
+        n: np.stack([noise(problem)[n]] * 2, -1) for n in families(problem) if n not in present
+    }
     walking, at = with_walks(problem, state, sizes)
     kept, columns = [], {}
     for name in sizes:

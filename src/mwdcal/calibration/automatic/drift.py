@@ -31,6 +31,8 @@ A drift that is not there costs little: its size comes out small. One that is le
 """
 PRIOR_CHANCE = 1e-3
 """Chance of so large a departure from the prior, at which a drift is looked for in the run alone."""
+DISPUTED_CHANCE = 0.01
+"""The same chance where the run departs from its prior: a drift there would take up what is a conflict."""
 REDUNDANCY = 36.0
 """Fewest degrees of freedom of a triad that can tell a drift from noise."""
 
@@ -87,8 +89,17 @@ def drifting(result: Fit, options: Options) -> Bools:
     if not sound.any():
         return drifted
     part = result if sound.all() else take(result, np.flatnonzero(sound))
-    drifted[sound] = chances(_undisputed(part, options)) < ORDER_CHANCE
+    limit = np.where(_disputed(part, options), DISPUTED_CHANCE, ORDER_CHANCE)
+    drifted[sound] = chances(_undisputed(part, options)) < limit[:, None]
     return drifted
+
+
+def _disputed(result: Fit, options: Options) -> Bools:
+    """Members (B,) that depart from their prior."""
+    if options.knowledge is None:
+        return np.zeros(len(result.status), bool)
+    square, tested = departures(result)
+    return np.asarray(tail(square, np.maximum(tested, 1)) <= PRIOR_CHANCE)
 
 
 def _undisputed(result: Fit, options: Options) -> Fit:
@@ -96,10 +107,7 @@ def _undisputed(result: Fit, options: Options) -> Fit:
 
     A wrong prior leaves residuals that go with attitude, and attitude may go with the order of the stations.
     """
-    if options.knowledge is None:
-        return result
-    square, tested = departures(result)
-    disputed = np.flatnonzero(tail(square, np.maximum(tested, 1)) <= PRIOR_CHANCE)
+    disputed = np.flatnonzero(_disputed(result, options))
     if not disputed.size:
         return result
     part = take(result, disputed)
