@@ -20,7 +20,7 @@ import mwdcal
 from mwdcal.files.limits import load_limits
 from mwdcal.use.verification import Bounds, Limits, Verdict
 
-SEED, RUNS, TOOLS = 20261123, 200, 4
+SEED, RUNS, TOOLS = 20261123, 400, 4
 NOISE = (2e-4, 30.0)
 """Noise of one station, g and nT."""
 STAND = 0.05
@@ -61,10 +61,11 @@ def varied(sets: int, toolfaces: int, **more: bool) -> Case:
 
 
 CASES = (
-    *(equal(1, n) for n in (4, 6, 12, 24)),
-    equal(6, 6),
-    varied(6, 12),
+    *(equal(1, n) for n in (4, 6, 8, 12, 24)),
+    *(equal(sets, n) for sets, n in ((2, 8), (4, 12), (6, 6))),
+    *(varied(sets, n) for sets, n in ((2, 12), (3, 8), (5, 6), (6, 12), (6, 24))),
     *(equal(n, 6, declared=False) for n in (1, 6)),
+    varied(3, 8, declared=False),
     *(equal(n, 12, stand=True) for n in (1, 3)),
 )
 

@@ -181,7 +181,8 @@ def _columns(problem: Problem, state: State, terms: slice) -> tuple[Array, dict[
         n: np.stack([noise(problem)[n]] * 2, -1) for n in families(problem) if n not in present
     }
     walking, at = with_walks(problem, state, sizes)
-    kept, columns = [], {}
+    kept: list[SharedConstant] = []
+    columns = {}
     for name in sizes:
         chosen = places(walking.evidence)[name][:, terms].T.ravel()
         columns[name] = len(kept) + np.arange(chosen.size)
