@@ -38,13 +38,13 @@ SIGNS = (
     "signs of the magnetometer at a southern site",
 )
 """What is assumed where only the profile says which hemisphere the dip is of: northern, southern."""
-STEADY = {
+STEADINESS = {
     "accelerometer-drift": "steady offsets of the accelerometer during the run",
     "magnetometer-drift": "steady offsets of the magnetometer during the run",
     "field-drift": "a steady field during the run",
 }
 """What is assumed where a drift would not show."""
-LEAST_SHARE = 0.2
+LEAST_KEPT = 0.2
 """A trend hides among the sensors' parameters where less than this share of its information is in the residuals."""
 EVEN = 1e-6
 """Departure of a correlation matrix from symmetry that is left as it is."""
@@ -201,15 +201,15 @@ def assumed_exact(result: Fit, relative: bool) -> list[str]:
     names = ["toolface zero of the stand" if n == "toolface" else f"{n} reference" for n in exact]
     dip = float(unconfirmed_dip(result)[0])
     signs = [] if np.isnan(dip) else [SIGNS[dip < 0]]
-    return [*names, *signs, *(STEADY[name] for name in unseen_drifts(result))]
+    return [*names, *signs, *(STEADINESS[name] for name in unseen_drifts(result))]
 
 
 def unseen_drifts(result: Fit) -> list[str]:
-    """Drifts of a run whose trend the residuals would not show: less than `LEAST_SHARE` of it stays in them."""
+    """Drifts of a run whose trend the residuals would not show: less than `LEAST_KEPT` of it stays in them."""
     if result.analysis.influence is not None:
         return []
     shares = drift.shown(result.problem, result.state, result.analysis)
-    return [name for name, share in shares.items() if share[0] < LEAST_SHARE]
+    return [name for name, share in shares.items() if share[0] < LEAST_KEPT]
 
 
 def unconfirmed_dip(result: Fit) -> Array:

@@ -71,7 +71,7 @@ def with_walks(problem: Problem, state: State, sizes: dict[str, Array]) -> tuple
     for name, size in sizes.items():
         spread = np.sqrt(size**2 @ variance)
         for axis in WALKS[name]:
-            for value, sd in zip(values.T, spread.T, strict=True):
+            for value, sd in zip(values.mT, spread.mT, strict=True):
                 mask = np.broadcast_to(value, (batch, count))
                 new.append(SharedConstant(axis, mask, zero, sd, unknown=False))
     more = np.zeros((batch, len(new) - len(evidence.constants)))
@@ -184,7 +184,7 @@ def _columns(problem: Problem, state: State, terms: slice) -> tuple[Array, dict[
     kept: list[SharedConstant] = []
     columns = {}
     for name in sizes:
-        chosen = places(walking.evidence)[name][:, terms].T.ravel()
+        chosen = places(walking.evidence)[name][:, terms].mT.ravel()
         columns[name] = len(kept) + np.arange(chosen.size)
         kept += [walking.evidence.constants[i] for i in chosen]
     walking = replace(walking, evidence=replace(walking.evidence, constants=(*old, *kept)))
@@ -208,7 +208,7 @@ def walk_variances(
     owner = np.zeros(scores.score.shape[-1], int)
     for number, columns in enumerate(parts.values()):
         owner[columns] = number
-    of = (owner == np.arange(len(parts))[:, None]).astype(float).T
+    of = (owner == np.arange(len(parts))[:, None]).astype(float).mT
     misfit = variance * freedom
     left = np.where(declared, 1.0, variance)
     first = [scores.square(columns) for columns in parts.values()]

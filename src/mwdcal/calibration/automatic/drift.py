@@ -24,10 +24,12 @@ from mwdcal.estimation.problem import Prior, Problem
 from mwdcal.estimation.solvers import Status
 from mwdcal.geometry.vectors import Array, Bools, Ints
 
-ORDER_CHANCE = 0.3
+ORDER_CHANCE = 0.2
 """Chance of residuals that follow the order of stations as much in noise, below which a drift is fitted.
 
-A drift that is not there costs little: its size comes out small. One that is left out costs coverage.
+One that is left out costs coverage: of walks as large as the noise of a reading 95 % intervals hold 90 % at a chance
+of 0.1 and 93 % at 0.2. One that is not there costs width: 9 % on average over tools without drift whose directions
+are mixed, 37 % where each direction is measured in one go, so that hardly anything tells a drift from the sensors.
 """
 PRIOR_CHANCE = 1e-3
 """Chance of so large a departure from the prior, at which a drift is looked for in the run alone."""
