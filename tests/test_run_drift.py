@@ -10,7 +10,7 @@ from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.results import StatedCovariance, drifts
-from mwdcal.estimation.drift import shown, terms_of
+from mwdcal.estimation.drift import terms_of, walk_scores
 from mwdcal.geometry.vectors import earth_field, earth_gravity, tool_from_earth
 from mwdcal.sensor.profile import Profile
 
@@ -71,7 +71,7 @@ def test_the_walk_is_that_of_brown():
 
 def test_noise_is_seldom_taken_for_drift():
     result = fit(runs(0, 400), Options(order=0))
-    share = (chances(result) < 0.1).mean(0)
+    share = (chances(result)[0] < 0.1).mean(0)
     assert np.all(share < 0.1 + 3 * np.sqrt(0.09 / 400))
     assert np.all(share > 0.02)
 
@@ -150,7 +150,8 @@ def test_the_share_of_a_trend_is_that_of_a_regression():
     trend = (np.arange(COUNT) + 0.5) / COUNT - 0.5
     known = np.column_stack([g, np.ones(COUNT)])
     left = trend - known @ np.linalg.lstsq(known, trend, rcond=None)[0]
-    share = shown(result.problem, result.state, result.analysis)["accelerometer-drift"][0]
+    scores = walk_scores(result.problem, result.state, result.analysis)
+    share = scores.shown("accelerometer-drift")[0]
     assert share == pytest.approx(left @ left / (trend @ trend), rel=1e-3)
 
 

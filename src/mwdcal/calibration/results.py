@@ -44,8 +44,6 @@ STEADINESS = {
     "field-drift": "a steady field during the run",
 }
 """What is assumed where a drift would not show."""
-LEAST_KEPT = 0.2
-"""A trend hides among the sensors' parameters where less than this share of its information is in the residuals."""
 EVEN = 1e-6
 """Departure of a correlation matrix from symmetry that is left as it is."""
 
@@ -205,11 +203,12 @@ def assumed_exact(result: Fit, relative: bool) -> list[str]:
 
 
 def unseen_drifts(result: Fit) -> list[str]:
-    """Drifts of a run whose trend the residuals would not show: less than `LEAST_KEPT` of it stays in them."""
-    if result.analysis.influence is not None:
+    """Drifts that are not in the fit and whose trend residuals would not show, of a batch of one."""
+    present = drift.places(result.problem.evidence)
+    if result.analysis.influence is not None or {*drift.families(result.problem)} <= {*present}:
         return []
-    shares = drift.shown(result.problem, result.state, result.analysis)
-    return [name for name, share in shares.items() if share[0] < LEAST_KEPT]
+    scores = drift.walk_scores(result.problem, result.state, result.analysis)
+    return [name for name in scores.places if scores.shown(name)[0] < drift.LEAST_TREND]
 
 
 def unconfirmed_dip(result: Fit) -> Array:

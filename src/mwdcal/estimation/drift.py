@@ -26,6 +26,8 @@ MOST_TERMS = 8
 """Cosines of a walk: they hold 93 % of its variance; the rest looks like noise."""
 STATIONS_PER_TERM = 4
 """Fewest stations for each cosine."""
+LEAST_TREND = 0.2
+"""A trend does not show where residuals keep less than this share of its information."""
 LEAST_WALK = 1e-3
 """A walk over the run is at least this share of the noise of a reading: a smaller one is none."""
 FEWEST_USED = 2.0
@@ -99,12 +101,14 @@ def noise(problem: Problem) -> dict[str, Array]:
 class WalkScores:
     """What the residuals of a fit without drift say of its terms, in units of the noise.
 
-    `score` (B, k) and its covariance `information` (B, k, k), for drifts of r = s = 1 noise of a reading;
-    `places` of the columns of each drift, its three trends first.
+    `score` (B, k) and its covariance `information` (B, k, k), for drifts of r = s = 1 noise of a reading, and `alone`
+    (B, k, k), what that would be with all unknowns of the fit known; `places` of the columns of each drift, its three
+    trends first.
     """
 
     score: Array
     information: Array
+    alone: Array
     places: dict[str, Ints]
 
     def of(self, walks: Sequence[str]) -> WalkScores:
@@ -112,9 +116,19 @@ class WalkScores:
         index = np.concatenate([self.places[name] for name in walks])
         ends = np.cumsum([len(self.places[name]) for name in walks])
         each = np.split(np.arange(index.size), ends[:-1])
-        information = self.information[:, index[:, None], index]
+        information, alone = (m[:, index[:, None], index] for m in (self.information, self.alone))
         places = dict(zip(walks, each, strict=True))
-        return WalkScores(self.score[:, index], information, places)
+        return WalkScores(self.score[:, index], information, alone, places)
+
+    def shown(self, name: str) -> Array:
+        """Share (B,) of the information about a trend that residuals keep, of the axis along which it is least.
+
+        Definition: the least eigenvalue of the information about the three trends relative to that `alone`. The rest
+        of a trend looks like the parameters and references of the fit.
+        """
+        index = self.places[name][:3]
+        left, alone = (m[:, index[:, None], index] for m in (self.information, self.alone))
+        return np.asarray(np.linalg.eigvals(finite(inverse(alone) @ left)).real.min(-1))
 
     def components(self) -> dict[tuple[str, int], Ints]:
         """Columns of the trend (0) and of the walk (1) of each drift."""
@@ -136,46 +150,20 @@ def walk_scores(problem: Problem, state: State, analysis: Analysis) -> WalkScore
 
     The problem may be of one member for the residuals (B, n, m) of many.
     """
-    columns, places = _columns(problem, state, slice(1, None))
-    _, information = _information(problem, state, analysis, columns)
-    residual = analysis.residual
-    flat = columns.reshape(len(columns), -1, columns.shape[-1])
-    score = (flat.mT @ residual.reshape(len(residual), -1, 1))[..., 0]
-    return WalkScores(score, information, places)
-
-
-def shown(problem: Problem, state: State, analysis: Analysis) -> dict[str, Array]:
-    """Share (B,) of a trend that residuals keep: of the three trends of a drift the one that hides best.
-
-    Definition: the least eigenvalue of the information about the trends relative to that with all other unknowns
-    known. The rest of a trend looks like parameters and references. Drifts that are in the fit are left out.
-    """
-    if {*families(problem)} <= {*places(problem.evidence)}:
-        return {}
-    columns, each = _columns(problem, state, slice(1, 2))
-    alone, left = _information(problem, state, analysis, columns)
-    shares = {}
-    for name, index in each.items():
-        whole, rest = (matrix[:, index[:, None], index] for matrix in (alone, left))
-        shares[name] = np.linalg.eigvals(finite(inverse(whole) @ rest)).real.min(-1)
-    return shares
-
-
-def _information(
-    problem: Problem, state: State, analysis: Analysis, columns: Array
-) -> tuple[Array, Array]:
-    """Information (B, k, k) on columns (B, n, m, k), all else known, and what the fit's unknowns leave of it."""
+    columns, each = _columns(problem, state)
     linear = problem.linear(state)
     whole = whole_covariance(linear, analysis.determined)
     flat = columns.reshape(len(columns), -1, columns.shape[-1])
     weighed = linear.weigh(columns).reshape(flat.shape)
     crossed = linear.design.reshape(len(columns), -1, whole.shape[-1]).mT @ weighed
     alone = flat.mT @ weighed
-    return alone, alone - crossed.mT @ whole @ crossed
+    residual = analysis.residual
+    score = (flat.mT @ residual.reshape(len(residual), -1, 1))[..., 0]
+    return WalkScores(score, alone - crossed.mT @ whole @ crossed, alone, each)
 
 
-def _columns(problem: Problem, state: State, terms: slice) -> tuple[Array, dict[str, Ints]]:
-    """Whitened columns (B, n, m, k) of some terms of all drifts, of r = s = 1 noise of a reading, and those of each."""
+def _columns(problem: Problem, state: State) -> tuple[Array, dict[str, Ints]]:
+    """Whitened columns (B, n, m, k) of drifts that are not in the fit, of r = s = 1 noise of a reading, and of each."""
     present, old = places(problem.evidence), problem.evidence.constants
     sizes = {
         n: np.stack([noise(problem)[n]] * 2, -1) for n in families(problem) if n not in present
@@ -184,7 +172,7 @@ def _columns(problem: Problem, state: State, terms: slice) -> tuple[Array, dict[
     kept: list[SharedConstant] = []
     columns = {}
     for name in sizes:
-        chosen = places(walking.evidence)[name][:, terms].mT.ravel()
+        chosen = places(walking.evidence)[name][:, 1:].mT.ravel()
         columns[name] = len(kept) + np.arange(chosen.size)
         kept += [walking.evidence.constants[i] for i in chosen]
     walking = replace(walking, evidence=replace(walking.evidence, constants=(*old, *kept)))

@@ -28,9 +28,10 @@ ORDER_CHANCE = 0.2
 """Chance of residuals that follow the order of stations as much in noise, below which a drift is fitted.
 
 One that is left out costs coverage: of walks as large as the noise of a reading 95 % intervals hold 90 % at a chance
-of 0.1 and 93 % at 0.2. One that is not there costs width: 9 % on average over tools without drift whose directions
-are mixed, 37 % where each direction is measured in one go, so that hardly anything tells a drift from the sensors.
+of 0.1 and 93 % at 0.2. One that is not there costs width, 9 % on average over tools without drift.
 """
+HIDDEN_CHANCE = 0.1
+"""The same chance where a trend would not show: a drift then widens the uncertainty many times, on less evidence."""
 PRIOR_CHANCE = 1e-3
 """Chance of so large a departure from the prior, at which a drift is looked for in the run alone."""
 DISPUTED_CHANCE = 0.01
@@ -39,13 +40,13 @@ REDUNDANCY = 36.0
 """Fewest degrees of freedom of a triad that can tell a drift from noise."""
 
 
-def chances(result: Fit) -> Array:
+def chances(result: Fit) -> tuple[Array, Bools]:
     """Probability (B, t) that noise alone follows the order of stations as the residuals of a triad do.
 
-    The least of those of the walks that act on a triad, times their number.
+    The least of those of the walks that act on a triad, times their number; and whether a trend would not show (B, t).
     """
     scores, analysis = _scores(result), result.analysis
-    least = np.ones(analysis.freedom.shape)
+    least, hidden = np.ones(analysis.freedom.shape), np.zeros(analysis.freedom.shape, bool)
     for name, triad in drift.acting(scores.places).items():
         scatter, rest = (x[:, triad] for x in (analysis.variance_factor, analysis.freedom))
         total, mean, square = scores.square(scores.places[name])
@@ -53,7 +54,8 @@ def chances(result: Fit) -> Array:
         one = f_test(total * ratio, mean * ratio, np.nan_to_num(scatter), rest)
         one = np.nan_to_num(one, nan=1.0) * (1 + (triad > 0))
         least[:, triad] = np.minimum(least[:, triad], one)
-    return least
+        hidden[:, triad] |= scores.shown(name) < drift.LEAST_TREND
+    return least, hidden
 
 
 def _scores(result: Fit) -> drift.WalkScores:
@@ -91,8 +93,10 @@ def drifting(result: Fit, options: Options) -> Bools:
     if not sound.any():
         return drifted
     part = result if sound.all() else take(result, np.flatnonzero(sound))
-    limit = np.where(_disputed(part, options), DISPUTED_CHANCE, ORDER_CHANCE)
-    drifted[sound] = chances(_undisputed(part, options)) < limit[:, None]
+    chance, hidden = chances(_undisputed(part, options))
+    limit = np.where(hidden, HIDDEN_CHANCE, ORDER_CHANCE)
+    limit = np.where(_disputed(part, options)[:, None], DISPUTED_CHANCE, limit)
+    drifted[sound] = chance < limit
     return drifted
 
 
