@@ -484,8 +484,31 @@ def test_excluded_stations_are_named_wherever_the_calibration_is(tmp_path):
     shown = mwdcal("calibrate", run, "--tool", "servo", *options, "--json").json
     assert shown["excluded"] == ["7", "30"]
     whole = mwdcal("calibrate", run, "--tool", "servo", "-o", made)
-    assert "--exclude" not in whole.out
+    assert "left out" not in whole.out
     assert json.loads(made.read_bytes())["excluded"] == []
+
+
+@pytest.mark.usefixtures("without_pictures")
+def test_copies_are_named_like_excluded_stations_and_may_not_verify(tmp_path):
+    """Also copies with a digit that differs."""
+    whole = servo_run()
+    columns = {name: np.append(v, np.asarray(v)[12:24]) for name, v in whole.items()}
+    columns["ax"][48:] += 1e-9
+    run, made, page = (
+        write_csv(tmp_path / "run.csv", columns),
+        tmp_path / "c.json",
+        tmp_path / "c.html",
+    )
+    options = ("--tool", "servo", "--exclude", "7", "-o", made, "--report", page)
+    ran = mwdcal("calibrate", run, *options)
+    left = ", ".join(["7", *(f"{row - 36} (row {row})" for row in range(49, 61))])
+    assert f"left out of the fit: station {left}" in ran.out
+    assert "12 of 59 stations are copies of others" in ran.err
+    assert "! station 13 (row 49), 14 (row 50), " in ran.err
+    assert f"<dt>Excluded</dt><dd>{left}</dd>" in page.read_text("utf-8")
+    assert json.loads(made.read_bytes())["stations"] == 47
+    test = write_csv(tmp_path / "roll.csv", {name: v[48:] for name, v in columns.items()})
+    assert mwdcal("verify", made, test).code == 2
 
 
 def test_excluded_stations_may_verify_the_calibration(tmp_path):

@@ -198,6 +198,19 @@ def test_tools_of_different_evidence_are_calibrated_as_they_are_alone(tmp_path):
         check_same(rows[serial], alone(columns, "x"), 1e-8)
 
 
+def test_tools_with_fewer_settings_of_the_stand_than_those_refused_beside_them(tmp_path):
+    """Directions at which the first tool's stand serves two stations; the other's serves one everywhere."""
+    place = np.sort(np.append(np.arange(26), [3, 9]))
+    runs = {
+        "refused": {k: np.asarray(v)[place] for k, v in short_run(1).items()},
+        "fine": short_run(2),
+    }
+    runs["refused"]["ax"] = np.roll(runs["refused"]["ax"], 5)
+    rows = calibrated(write_fleet(tmp_path / "runs.parquet", runs))
+    assert rows["refused"]["status"] == "residuals"
+    check_same(rows["fine"], alone(runs["fine"], "x"))
+
+
 def test_a_profile_without_scale_or_noise_is_filled_in_per_tool(tmp_path):
     runs = {f"T{seed}": short_run(seed) for seed in range(3)}
     rows = calibrated(write_fleet(tmp_path / "runs.parquet", runs), tool="generic")

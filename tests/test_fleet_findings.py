@@ -8,7 +8,15 @@ from scipy.special import chdtrc
 
 from cli_support import mwdcal
 from mwdcal.calibration.residuals import tail
-from test_fleet import alone, calibrated, check_same, servo_run, short_run, write_fleet
+from test_fleet import (
+    alone,
+    calibrated,
+    check_same,
+    servo_run,
+    short_run,
+    warm_run,
+    write_fleet,
+)
 
 pq = pytest.importorskip("pyarrow.parquet")
 pytestmark = pytest.mark.usefixtures("without_pictures")
@@ -57,6 +65,54 @@ def test_findings_are_those_of_each_tool_alone(tmp_path, method, tool):
     assert ("accelerometer-residuals" in seen) == (tool == "servo")
     if rows["named"]["status"] == "ok":
         assert rows["named"]["reshoot"] == ["p7"]
+
+
+def with_copies(columns, *places):
+    """A run with copies of some stations at its end, all of the 31 stations labelled."""
+    every = np.append(np.arange(28), places)
+    columns = {name: np.asarray(values)[every] for name, values in columns.items()}
+    return {**columns, "station": [f"s{i}" for i in range(31)]}
+
+
+def copied():
+    """Runs of one kind with copies of the same and of other stations; one knows the field at a copy alone."""
+    front = {name: np.roll(v, 3) for name, v in with_copies(spoiled(4, 20), 0, 1, 2).items()}
+    field = np.where(np.arange(28) == 27, short_run(5)["ref_field_nt"], np.nan)
+    known = with_copies(short_run(5, ref_field_nt=field), 0, 0, 27)
+    lost = with_copies(short_run(7, ref_field_nt=np.full(28, np.nan)), 0, 0, 27)
+    lost["ref_field_nt"][28] = field[27]
+    return {
+        "none": with_copies(short_run(1), 0, 1, 2) | short_run(1, station=range(28)),
+        "three": with_copies(short_run(2), 3, 4, 5),
+        "same three": with_copies(spoiled(3), 3, 4, 5),
+        "in front": {**front, "station": [f"s{i}" for i in range(31)]},
+        "field at one": known,
+        "field at a copy": lost,
+    }
+
+
+def test_copies_are_left_out_as_of_each_tool_alone(tmp_path):
+    """Also where others of the batch have other copies."""
+    runs = copied()
+    rows = calibrated(write_fleet(tmp_path / "runs.parquet", runs))
+    for serial, columns in runs.items():
+        made = alone(columns, "x")
+        check_same(rows[serial], made, 1e-10)
+        assert made.stations == 28
+        assert ("repeated-readings" in rows[serial]["findings"]) == (serial != "none")
+    assert rows["in front"]["reshoot"] == ["s23"]
+
+
+def test_a_tool_that_cannot_do_without_its_copies_is_refused_as_alone(tmp_path):
+    warm = {seed: warm_run(seed) for seed in (1, 2)}
+    half = {name: np.asarray(v)[:48] for name, v in warm[2].items()}
+    half["temperature_c"] = np.full(48, 20.0)
+    warm[2] = {name: np.append(v, v) for name, v in half.items()}
+    warm[2]["temperature_c"] = np.repeat([20.0, 60.0], 48)
+    path = write_fleet(tmp_path / "runs.parquet", {str(k): v for k, v in warm.items()})
+    rows = calibrated(path, "--order", 1)
+    assert (rows["1"]["status"], rows["2"]["status"]) == ("ok", "temperature-span")
+    assert rows["2"]["message"] == str(alone(warm[2], "x", order=1))
 
 
 @pytest.mark.parametrize(

@@ -179,7 +179,7 @@ def test_tools_with_rows_in_several_folders_are_counted(folder):
     for year, serials in ((2024, "ABC"), (2025, "CBD")):
         part = folder / f"year={year}"
         part.mkdir()
-        write_fleet(part / "0.parquet", {s: short_run(ord(s)) for s in serials})
+        write_fleet(part / "0.parquet", {s: short_run(ord(s) + year) for s in serials})
     page = folder.parent / "fleet.html"
     said = ran(folder, "--report", page)
     for text in (said.err, page.read_text("utf-8")):

@@ -2,12 +2,15 @@
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.diagnosis.repeats import resolution
-from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import Readings, fingerprints
+from mwdcal.errors import FitError
 from mwdcal.sensor.profile import Profile
 from mwdcal.survey.well import unknown_gravity
 from simulation import DEG, Tool, plan
@@ -24,10 +27,12 @@ def run(
     toolfaces=12,
     sd=NOISE,
     inclinations=(5, 45, 90, 135),
+    turning=1.0,
 ):
     """A run, each of its attitudes measured `repeats` times, rounded to `counts` times the noise."""
     tool = Tool.random(seed + 3)
     inc, azi, face = (np.tile(each, repeats) for each in plan(inclinations, toolfaces))
+    azi = turning * azi
     rng = np.random.default_rng(seed)
     triads = [each[0] for each in tool.readings(rng, 1, inc, azi, face)]
     if counts:
@@ -76,6 +81,98 @@ def test_repeated_attitudes_are_no_copies(counts, times):
 def test_one_copied_station_in_counts_finer_than_the_noise_is_named():
     data = run(counts=0.3)
     assert "repeated-readings" in found(copied(data, 1, 0.0, of=slice(7, 8)))
+
+
+def repeating(data, place, step=0.0):
+    """A run whose stations are those of `place`, later ones of the same number off by `step` noises."""
+    again = np.array([n in place[:i] for i, n in enumerate(place)])[:, None]
+    triads = {n: getattr(data, n)[place] + again * step * float(NOISE[n]) for n in NOISE}
+    rows = {n: v[place] for n in ("group", "temperature") if (v := getattr(data, n)) is not None}
+    known, sd = (
+        {n: v[place] if np.ndim(v) else v for n, v in x.items()} for x in (data.known, data.sd)
+    )
+    return replace(
+        data, **triads, **rows, known=known, sd=sd, digest=fingerprints([*triads.values()])
+    )
+
+
+def drifting(data):
+    """The run with offsets that drift by twenty noises."""
+    course = np.linspace(0, 20, data.count)[:, None]
+    return replace(data, **{n: getattr(data, n) + course * NOISE[n] for n in NOISE})
+
+
+def warmed(seed):
+    """A run at three temperatures, whose offsets follow these."""
+    data = run(seed, repeats=3, toolfaces=8)
+    temperature = np.repeat([20.0, 60.0, 100.0], 32)
+    moved = {n: getattr(data, n) + 0.5 * temperature[:, None] * NOISE[n] for n in NOISE}
+    return replace(data, **moved, temperature=temperature)
+
+
+def on_stand(seed, practice):
+    """A run on a stand with errors, whose settings of inclination and azimuth serve twelve stations each."""
+    data = run(seed, turning=0.0)
+    sd = {name: np.full(48, 2e-3) for name in ("inclination", "azimuth")}
+    return replace(data, sd={**data.sd, **sd, "tilt": np.full(48, 1e-3)}, settings=practice)
+
+
+def partly_known(seed):
+    """Roll sets in directions that a few stations know, gravity stated at some."""
+    data = roll_sets(63, known=("azimuth", "dip"))
+    gravity = np.where(np.arange(48) % 5 == 0, 1 + np.arange(48) * 1e-5, np.nan)
+    return replace(data, known={**data.known, "gravity": gravity}, sd={})
+
+
+RUNS = {
+    "declared": (run, {}),
+    "estimated": (lambda seed: run(seed, sd={}), {}),
+    "robust": (run, {"robust": "huber"}),
+    "order": (warmed, {"exclude": ("5", "40")}),
+    "drift": (lambda seed: drifting(run(seed)), {}),
+    "drift, estimated": (lambda seed: drifting(run(seed, sd={})), {}),
+    "settings of directions": (lambda seed: on_stand(seed, "per-direction"), {}),
+    "settings, unstated": (lambda seed: on_stand(seed, ""), {}),
+    "stand": (run, {"estimate": ("azimuth-zero",)}),
+    "groups": (partly_known, {}),
+    "least squares": (run, {"method": "least-squares"}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("step", [0.0, 1e-5])
+@pytest.mark.parametrize("name", RUNS)
+def test_a_run_with_copies_is_calibrated_as_the_run_without_them(name, step):
+    """Copies of some stations behind these, or of all at the end: all figures of the record, to 12 digits."""
+    make, chosen = RUNS[name]
+    data, options = make(1), Options(**chosen)
+    digest = fingerprints([data.accelerometer, data.magnetometer])
+    data = replace(data, station=data.labels, digest=digest)
+    bare, every = calibrate(data, PROFILE, options), np.arange(data.count)
+    fitted = np.array([name not in options.exclude for name in data.labels])
+    for place in (np.sort(np.append(every, [3, 3, 20])), np.append(every, every[fitted])):
+        first = np.unique(place, return_index=True)[1]
+        label = [f"{n + 1}" if i in first else f"{n + 1} again, {i}" for i, n in enumerate(place)]
+        copied = replace(repeating(data, place, step), station=tuple(label))
+        made = calibrate(copied, PROFILE, options)
+        left = [name for name in label if "again" in name]
+        [said] = [f for f in made.findings if f.id == "repeated-readings"]
+        assert said.text.startswith(f"station {', '.join(left[:3])}")
+        assert f": {len(left)} of {len(label) - len(options.exclude)} stations" in said.text
+        assert made.excluded == [*options.exclude, *left]
+        assert made.used(copied.digest) == [name not in options.exclude for name in label]
+        same = {n: getattr(bare, n) for n in ("excluded", "copies", "time", "sha256")}
+        rest = [finding for finding in made.findings if finding != said]
+        assert msgspec.structs.replace(made, findings=rest, **same) == bare
+
+
+def test_a_run_that_cannot_do_without_its_copies_is_refused():
+    """Copies at another temperature, which alone make an order of 1."""
+    data, every = run(), np.arange(48)
+    warm = replace(data, temperature=np.full(48, 20.0))
+    twice = repeating(warm, np.append(every, every))
+    twice = replace(twice, temperature=np.repeat([20.0, 60.0], 48))
+    with pytest.raises(FitError, match="too little for `order` 1"):
+        calibrate(twice, PROFILE, Options(order=1))
 
 
 def test_resolution_is_the_step_of_counts_and_none_of_real_numbers():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from datetime import UTC, datetime
 
 import msgspec
@@ -11,10 +10,12 @@ import numpy as np
 from mwdcal.calibration import results
 from mwdcal.calibration.automatic.auto import Choice, choose
 from mwdcal.calibration.automatic.drift import fit_run
+from mwdcal.calibration.automatic.order_selection import Progress
 from mwdcal.calibration.canonical import rounded
 from mwdcal.calibration.diagnosis.findings import described, findings
 from mwdcal.calibration.diagnosis.flags import FittedRuns
 from mwdcal.calibration.diagnosis.refusals import UNSOUND_ADVICE, check, fit_refusals
+from mwdcal.calibration.diagnosis.repeats import copies
 from mwdcal.calibration.diagnosis.soundness import inconsistency
 from mwdcal.calibration.drift import Constant, Drift
 from mwdcal.calibration.estimate import Fit
@@ -50,7 +51,7 @@ def calibrate(
     profile: Profile,
     options: Options | None = None,
     *,
-    progress: Callable[[str], None] = lambda text: None,
+    progress: Progress = lambda text: None,
 ) -> Calibration:
     """Fit the sensor model to a run and state what it is worth.
 
@@ -59,8 +60,26 @@ def calibrate(
     Raises `InputError` for options that do not go together, `FitError` where the data cannot give a
     calibration to be trusted.
     """
-    choice = choose(readings, profile, options or Options(), progress)
-    return recorded(choice, fit_run(choice.readings, choice.options))
+    return recorded(*chosen_fit(readings, profile, options or Options(), progress))
+
+
+def chosen_fit(
+    readings: Readings, profile: Profile, options: Options, progress: Progress
+) -> tuple[Choice, Fit]:
+    """What a run is calibrated with, and its fit: as if stations that are copies of others were not in the run.
+
+    Raises as `calibrate`.
+    """
+    choice = choose(readings, profile, options, progress)
+    result = fit_run(choice.readings, choice.options)
+    repeated = copies(result)[0]
+    if not repeated.any():
+        return choice, result
+    check(fit_refusals(_one_run(choice, result)))
+    progress(f"{repeated.sum()} of {repeated.size} stations are copies of others: without them")
+    left = np.array([label not in options.exclude for label in readings.labels])
+    left[left] = repeated
+    return chosen_fit(readings.without_copies(left), profile, options, progress)
 
 
 def recorded(choice: Choice, result: Fit) -> Calibration:
@@ -68,15 +87,20 @@ def recorded(choice: Choice, result: Fit) -> Calibration:
 
     Raises `FitError` where the fit is not to be trusted.
     """
-    readings, profile = choice.readings, choice.profile
-    fitted = FittedRuns(
-        batch_of_one(readings), profile, choice.options, result, lambda _: (readings, profile)
-    )
+    fitted = _one_run(choice, result)
     check(fit_refusals(fitted))
     calibration = sealed(rounded(_record(choice, fitted)))
     if problem := inconsistency(calibration):
         raise FitError(f"the fit gives no usable calibration: {problem}. {UNSOUND_ADVICE}")
     return calibration
+
+
+def _one_run(choice: Choice, result: Fit) -> FittedRuns:
+    """The fit of a run as refusals and findings look at it: a batch of one."""
+    readings, profile = choice.readings, choice.profile
+    return FittedRuns(
+        batch_of_one(readings), profile, choice.options, result, lambda _: (readings, profile)
+    )
 
 
 def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
@@ -103,7 +127,8 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
         time=datetime.now(UTC).isoformat(timespec="seconds"),
         field_unit=readings.field_unit,
         stations=readings.count,
-        excluded=list(choice.excluded),
+        excluded=[*choice.excluded, *(label for label, _ in readings.copies)],
+        copies=[digest for _, digest in readings.copies] or msgspec.UNSET,
         temperature_c=None if readings.temperature is None else (float(low[0]), float(high[0])),
         accelerometer=triads[0],
         magnetometer=triads[1] if len(triads) > 1 else None,

@@ -40,8 +40,8 @@ def evidence_of(readings: Readings, include: Array) -> Evidence:
     bare = Evidence(known, sd, group, alone, apart, included, (), stand=stand)
     known, sd = _share_known(bare)
     setting = _settings(readings, group, known, sd)
-    assumed = not readings.settings
-    bare = replace(bare, known=known, sd=sd, setting=setting, assumed=assumed)
+    settings, assumed = int(setting.max(initial=-1)) + 1, not readings.settings
+    bare = replace(bare, known=known, sd=sd, setting=setting, settings=settings, assumed=assumed)
     return replace(bare, constants=constants(bare))
 
 

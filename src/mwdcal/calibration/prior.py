@@ -206,7 +206,7 @@ def from_calibration(previous: Calibration, relative: bool = False) -> Knowledge
         tuple(names[i] for i in moving),
         previous.parameters[moving],
         _precision(covariance[np.ix_(moving, moving)], previous.free_directions[:, moving]),
-        stations=(*(row.digest for row in previous.station_rows), *previous.inherited),
+        stations=tuple(previous.fingerprints),
         temperature=previous.temperature_c,
         common=tuple(row.source for row in previous.budget),
         simulated=is_simulated(previous.tool),

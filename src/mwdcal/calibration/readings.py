@@ -8,10 +8,11 @@ are °C. An unknown value is NaN, never zero.
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import date
-from itertools import pairwise
+from itertools import compress, pairwise
 from typing import Any
 
 import numpy as np
@@ -114,6 +115,7 @@ class Readings:
             or "per-station"; blank: not stated.
         station: labels, for messages and tables.
         digest: `fingerprints` of the raw readings: they tell verification data from the fit's.
+        copies: label and fingerprint of each station that was left out as a copy of an earlier one.
         metadata: serial, date, operator, …, as the file states them.
         source: name of the file.
         unused: columns of the file that are not used, each with what it resembles.
@@ -131,6 +133,7 @@ class Readings:
     settings: str = ""
     station: tuple[str, ...] = ()
     digest: tuple[str, ...] = ()
+    copies: tuple[tuple[str, str], ...] = ()
     metadata: Mapping[str, object] = field(default_factory=dict)
     source: str = ""
     unused: tuple[str, ...] = ()
@@ -229,26 +232,41 @@ class Readings:
         return whole if whole.shape == shape else np.broadcast_to(whole, shape)
 
     def select(self, keep: Bools) -> Readings:
-        """The stations where `keep` (n,) is true, of a run without leading axes."""
+        """The stations where `keep` (n,) is true."""
         chosen = np.flatnonzero(keep)
 
-        def rows(value: AnyArray | None) -> Any:
-            return None if value is None else np.asarray(value)[chosen]
+        def rows(value: AnyArray | None, axis: int = -1) -> Any:
+            return None if value is None else np.take(value, chosen, axis)
 
         whole = self.accelerometer.shape
-        shapes = {k: whole if k.endswith("meter") else whole[:-1] for k in self.sd}
+        shapes = {k: whole if k in TRIADS else whole[:-1] for k in self.sd}
         return replace(
             self,
-            accelerometer=self.accelerometer[chosen],
-            magnetometer=rows(self.magnetometer),
+            accelerometer=rows(self.accelerometer, -2),
+            magnetometer=rows(self.magnetometer, -2),
             temperature=rows(self.temperature),
-            known={k: self.reference(k)[chosen] for k in self.known},
-            sd={k: np.broadcast_to(v, shapes[k])[chosen] for k, v in self.sd.items()},
+            known={k: rows(self.reference(k)) for k in self.known},
+            sd={
+                k: rows(np.broadcast_to(v, shapes[k]), -2 if k in TRIADS else -1)
+                for k, v in self.sd.items()
+            },
             group=rows(self.group),
             others={name: rows(values) for name, values in self.others.items()},
             station=tuple(self.station[i] for i in chosen) if self.station else (),
             digest=tuple(self.digest[i] for i in chosen) if self.digest else (),
         )
+
+    def without_copies(self, repeated: Bools) -> Readings:
+        """The readings as if the stations where `repeated` (n,) is true were not in the run: `copies` has them.
+
+        A label that others have too is followed by the number of the row.
+        """
+        kept = replace(self, station=self.labels).select(~repeated)
+        known = {k: self._per_station(v)[..., ~repeated] for k, v in self.known.items()}
+        times, numbered = Counter(self.labels), enumerate(self.labels, 1)
+        names = [n if times[n] == 1 else f"{n} (row {i})" for i, n in numbered]
+        left = compress(zip(names, self.digest or [""] * self.count, strict=True), repeated)
+        return replace(kept, known=known, copies=(*self.copies, *left))
 
 
 def soaks(temperature: Array) -> Ints:

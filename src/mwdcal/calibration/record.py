@@ -238,7 +238,8 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     `budget` says what each source of error adds to the accuracy to expect; `assumed_exact` names
     references without a declared uncertainty whose error no residual would show.
     `inherited` are the fingerprints of the stations behind the prior, if there was one;
-    `excluded` the labels of stations of the run that were left out of the fit on request.
+    `excluded` the labels of stations of the run that were left out of the fit, on request or as copies of others;
+    `copies` the fingerprints of copies, absent where there are none.
     `serial` is that of the tool, absent where the run states none; `simulated`: of the run or the prior;
     `prior_sha256` of the file of the prior, absent where there was none.
     `settings`: whether the errors of the stand's direction are "per-direction" or "per-station", or
@@ -266,6 +267,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     field_unit: str
     stations: int
     excluded: list[str] = []
+    copies: list[str] | msgspec.UnsetType = msgspec.UNSET
     temperature_c: tuple[float, float] | None
     accelerometer: TriadCalibration
     magnetometer: TriadCalibration | None = None
@@ -333,9 +335,14 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         """The temperature τ = 0 of the model, °C."""
         return self.profile.reference_temperature_c
 
+    @property
+    def fingerprints(self) -> list[str]:
+        """Of the stations behind the fit: its own with their copies, and those of the prior."""
+        return [*(row.digest for row in self.station_rows), *self.inherited, *(self.copies or ())]
+
     def used(self, digests: Iterable[str]) -> list[bool]:
-        """Which stations, by their fingerprints, were in the fit; by the triads both have."""
-        fitted = {row.digest for row in self.station_rows} | set(self.inherited)
+        """Which stations, by their fingerprints, are behind the fit; by the triads both have."""
+        fitted = {*self.fingerprints}
         first = {digest.partition("-")[0] for digest in fitted}
         whole = self.has_field
         return [

@@ -56,7 +56,7 @@ class Evidence:
     `sd` of the angles are independent per station, but for inclination and azimuth of stations of one
     `setting` of the stand (-1: of their own): these have one error in common, and errors of their own by
     a share `apart` (B,) of the σ, which is estimated where the practice of the stand is only `assumed`.
-    `group` shares a direction
+    `settings` is the number of them, also where some members of a batch have fewer. `group` shares a direction
     among stations of the same number (-1: none). `include` is 1 for stations that count, 0 for
     those left out. `absent` names the strengths and the dip of which nothing may be used:
     each station then has its own. `stand` (B,) are the standard uncertainties of errors that all
@@ -72,6 +72,7 @@ class Evidence:
     apart: Array
     include: Array
     constants: tuple[SharedConstant, ...]
+    settings: int = 0
     assumed: bool = False
     absent: tuple[str, ...] = ()
     stand: Mapping[str, Array] = field(default_factory=dict)
@@ -104,7 +105,7 @@ class Evidence:
     @cached_property
     def set_together(self) -> Array:
         """σ (B, n, 2 k) of inclination, then azimuth, that stations have from each of k settings."""
-        numbers = np.arange(int(self.setting.max(initial=-1)) + 1)
+        numbers = np.arange(self.settings)
         members = np.asarray(self.setting[..., None] == numbers, float)
         each = [np.where(self.is_known(n), self.sd[n], 0.0)[..., None] for n in ANGLES[:2]]
         return np.concatenate([members * sd for sd in each], -1)

@@ -22,6 +22,7 @@ from mwdcal.calibration.automatic.nonlinearity import offered
 from mwdcal.calibration.diagnosis.findings import finding_flags
 from mwdcal.calibration.diagnosis.flags import Alone, FittedRuns, Flag
 from mwdcal.calibration.diagnosis.refusals import BAD_INPUT, fit_refusals, reading_refusals
+from mwdcal.calibration.diagnosis.repeats import copies
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.methods import ESTIMABLE
 from mwdcal.calibration.options import AUTO, Options
@@ -29,9 +30,9 @@ from mwdcal.calibration.prediction import STATED_ANGLES, accuracy
 from mwdcal.calibration.readings import HIGHEST, TRIADS, Readings
 from mwdcal.calibration.record import StandErrors
 from mwdcal.errors import MwdcalError
-from mwdcal.estimation.batch import take
-from mwdcal.fleet.choices import in_chunks, with_curves, with_orders
-from mwdcal.geometry.vectors import AnyArray, Array, Ints
+from mwdcal.estimation.batch import put, take
+from mwdcal.fleet.choices import alike, in_chunks, with_curves, with_orders
+from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints
 from mwdcal.sensor.models import Basis, Factors, Polynomial, Whole
 from mwdcal.sensor.profile import Profile
 
@@ -56,7 +57,8 @@ LISTS = ("findings", "reshoot", *(f"{triad}_undetermined" for triad in TRIADS))
 class Outcome:
     """What became of B tools: a status and a message each, and columns (B,) of results.
 
-    Where a tool has no result, there are NaN among `numbers`, and None among `lists` and units.
+    Where a tool has no result, there are NaN among `numbers`, and None among `lists` and units. `copies` (B,)
+    counts the stations that were left out as copies of others.
     """
 
     status: AnyArray
@@ -64,6 +66,7 @@ class Outcome:
     unit: AnyArray
     numbers: dict[str, Array]
     lists: dict[str, AnyArray]
+    copies: Ints
 
     @classmethod
     def blank(cls, count: int, numbers: Iterable[str]) -> Outcome:
@@ -74,6 +77,7 @@ class Outcome:
             unit=np.full(count, None, object),
             numbers={name: np.full(count, np.nan) for name in numbers},
             lists={name: np.full(count, None, object) for name in LISTS},
+            copies=np.zeros(count, int),
         )
 
     def sound(self, tools: Ints) -> Ints:
@@ -133,8 +137,31 @@ def calibrate_batch(
     are counted from 0.
     """
     outcome = Outcome.blank(len(readings.accelerometer), names(options, profile))
-    batch = _Batch(readings, _with_scales(profile), alone, outcome)
+    none = np.zeros(readings.accelerometer.shape[:-1], bool)
+    batch = _Batch(readings, _with_scales(profile), alone, outcome, none)
     batch.calibrate(known_before(options, readings, batch.profile))
+    repeated = np.flatnonzero(batch.repeated.any(-1))
+    blank = [np.isnan(readings.reference(name)[repeated]) for name in readings.known]
+    patterns = np.concatenate([batch.repeated[repeated], *blank], -1)
+    for pattern, tools in alike(repeated, patterns):
+        again = _without_copies(batch, tools, pattern[: readings.count], options)
+        outcome = put(outcome, tools, again)
+    return outcome
+
+
+def _without_copies(batch: _Batch, tools: Ints, repeated: Bools, options: Options) -> Outcome:
+    """Some tools of a batch as if the stations where `repeated` (n,) is true were not in their runs."""
+
+    def alone(place: int) -> tuple[Readings, Profile]:
+        readings, profile = batch.alone(int(tools[place]))
+        return readings.without_copies(repeated), profile
+
+    readings = take(batch.readings, tools).without_copies(repeated)
+    outcome = calibrate_batch(readings, options, batch.profile, alone)
+    outcome.copies[:] += np.count_nonzero(repeated)
+    stations = np.flatnonzero(~repeated)
+    for again in filter(None, outcome.lists["reshoot"]):
+        again[:] = stations[again].tolist()
     return outcome
 
 
@@ -147,12 +174,16 @@ def _with_scales(profile: Profile) -> Profile:
 
 @dataclass(frozen=True)
 class _Batch:
-    """Tools on their way: readings (B, n, ...), and the outcome that steps fill in for some of them."""
+    """Tools on their way: readings (B, n, ...), and the outcome that steps fill in for some of them.
+
+    `repeated` (B, n): the stations of sound fits that are copies of others.
+    """
 
     readings: Readings
     profile: Profile
     alone: Alone
     outcome: Outcome
+    repeated: Bools
 
     def calibrate(self, options: Options) -> None:
         """Choose what the options leave to the data, fit, and note what came of it."""
@@ -201,6 +232,7 @@ class _Batch:
             return
         if good.size < len(tools):
             fitted = fitted.take(good)
+        self.repeated[tools[good]] = copies(fitted.result)
         self._note_findings(tools[good], fitted)
         if readings.magnetometer is not None:
             self.outcome.unit[tools[good]] = readings.field_unit

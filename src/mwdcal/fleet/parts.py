@@ -136,7 +136,9 @@ def _table(rows: Rows, plan: Plan, whole: Outcome) -> Any:
             SERIAL: rows.serials,
             "status": arrow.array(whole.status, text),
             "message": arrow.array(whole.message, text),
-            "stations": arrow.array(np.where(rows.unread, 0, rows.counts), arrow.int32()),
+            "stations": arrow.array(
+                np.where(rows.unread, 0, rows.counts - whole.copies), arrow.int32()
+            ),
             "temperature_min_c": arrow.array(low, mask=np.isnan(low)),
             "temperature_max_c": arrow.array(high, mask=np.isnan(high)),
             **{name: lists[name] for name in LISTS[:2]},

@@ -23,8 +23,6 @@ from mwdcal.geometry.vectors import Array, reference_vectors
 from mwdcal.planning.simulate import Earth
 from mwdcal.sensor.profile import Profile
 
-READING_FINDINGS = ("repeated-readings",)
-"""Findings that hold of readings without noise and not of real ones."""
 STILL = 1e-6
 """A channel that moves by no more than this share of gravity or field over a plan does not move."""
 
@@ -131,9 +129,7 @@ def carried_out(
 ) -> tuple[Calibration, Fit]:
     """The calibration that a plan will give, as `expected`, and the fit that it is the record of."""
     choice, result = planned_fit(plan, profile, options)
-    calibration = recorded(choice, result)
-    said = [finding for finding in calibration.findings if finding.id not in READING_FINDINGS]
-    return msgspec.structs.replace(calibration, findings=said), result
+    return recorded(choice, result), result
 
 
 def left_undetermined(calibration: Calibration) -> list[Undetermined]:

@@ -39,17 +39,15 @@ def command(
     """
     from mwdcal.app.choices import load_run, options_of, prior_of
     from mwdcal.app.screens import calibration as screen
-    from mwdcal.calibration.automatic.auto import choose
-    from mwdcal.calibration.automatic.drift import fit_run
-    from mwdcal.calibration.calibrate import recorded
+    from mwdcal.calibration.calibrate import chosen_fit, recorded
     from mwdcal.files import documents
     from mwdcal.files.formats import atomic
 
     options.check_outputs([output], [run, tool, typed["prior"]], page=report)
     prior, digest = prior_of(typed["prior"])
     readings, profile = load_run(run, tool, decimal, prior)
-    choice = choose(readings, profile, options_of(typed, prior, exclude, digest), say)
-    calibration = recorded(choice, fit_run(choice.readings, choice.options))
+    choice, result = chosen_fit(readings, profile, options_of(typed, prior, exclude, digest), say)
+    calibration = recorded(choice, result)
     rendered = ""
     if report:
         from mwdcal.app.pages.report import render

@@ -88,7 +88,7 @@ REMARKED = {
     "few-degrees-of-freedom": "the residuals are too few to know the uncertainties better than to a quarter",
     "hemisphere": "the dip is negative: a southern site, or a magnetometer with reversed signs",
     "scatter": "strengths, dip or directions vary from station to station beyond the noise",
-    "repeated-readings": "some stations are copies of others",
+    "repeated-readings": "some stations are copies of others, and left out of the fit",
     "temperature-misfit": "the {triad} varies with temperature as its order does not follow",
     "temperature-untested": "nothing tests the terms of temperature between the temperatures of the run",
     "temperature-aligned": "attitudes followed the temperature: terms of temperature cannot be told apart",

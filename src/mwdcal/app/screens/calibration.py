@@ -12,6 +12,7 @@ from mwdcal.app.messages import findings_as_typed
 from mwdcal.app.screens.numbers import degrees_of_freedom, estimate, uncertainty, written
 from mwdcal.app.text import chance, number, one_line, quantity, table
 from mwdcal.calibration.automatic.nonlinearity import CurveScore
+from mwdcal.calibration.diagnosis.flags import listed
 from mwdcal.calibration.drift import Constant, Drift
 from mwdcal.calibration.prediction import typical_accuracy, without_temperature
 from mwdcal.calibration.readings import simulated
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
 
 MOST_RESHOOTS = 12
 """Most stations to re-shoot that messages name."""
+MOST_EXCLUDED = 20
+"""Most stations left out of the fit that the screen names."""
 PROFILE = " (see [stand] of the tool profile)"
 ORDERS = "error: rms per axis, with the noise; inside: interpolation, at the ends: extrapolation"
 COMPARED = """
@@ -167,7 +170,7 @@ def heading(calibration: Calibration) -> str:
     ]
     lines = ["   ".join(parts), "   ".join([f"method {', '.join(how(calibration))}", *ranks])]
     if calibration.excluded:
-        lines.append("left out by --exclude: station " + ", ".join(calibration.excluded))
+        lines.append(f"left out of the fit: station {listed(calibration.excluded, MOST_EXCLUDED)}")
     return "\n".join(map(one_line, lines))
 
 

@@ -25,7 +25,6 @@ from mwdcal.calibration.diagnosis.plausibility import (
     stations_to_reshoot,
     unchecked,
 )
-from mwdcal.calibration.diagnosis.repeats import copies
 from mwdcal.calibration.diagnosis.structure import COLUMN, suspected
 from mwdcal.calibration.diagnosis.structure import described as seen_as
 from mwdcal.calibration.drift import SHOWN_DRIFT
@@ -95,7 +94,8 @@ REMARKS = {
     "southern hemisphere, or all signs of the magnetometer are reversed and azimuths are wrong by 180°. "
     "Give ref_dip_deg, or ref_azimuth_deg at one direction.",
     "repeated-readings": "station {stations}: the same readings as an earlier station, closer than noise allows. "
-    "Copies count as measurements of their own, and uncertainties come out too small. Remove them.",
+    "Copies are no measurements of their own. Left out of the fit: {count} of {of} stations. Remove them from the run, "
+    "or measure anew.",
     "temperature-misfit": "{triad}: {of[cause]}, beyond what noise explains: {of[rms]:.2g} {of[unit]} rms per axis "
     "over the range ({of[angle]:.2g}° across the field). The uncertainties here include it. {of[remedy]}.",
     "temperature-untested": "{triads}: {levels} temperatures are as many as a course of order {order} takes, so "
@@ -311,14 +311,15 @@ def _scatter(fitted: FittedRuns) -> Flag:
 
 
 def _repeated(fitted: FittedRuns) -> Flag:
-    """Stations whose readings are those of another."""
-    repeated = copies(fitted.result)
+    """Stations that were left out because their readings are those of another."""
+    readings, count = fitted.readings, len(fitted.readings.copies)
 
     def stations(place: int) -> str:
-        labels = fitted.alone(place)[0].labels
-        return listed([labels[i] for i in np.flatnonzero(repeated[place])], STATIONS_NAMED)
+        return listed([label for label, _ in fitted.alone(place)[0].copies], STATIONS_NAMED)
 
-    return _remark("repeated-readings", np.any(repeated, -1), stations=stations)
+    members = np.full(fitted.count, count > 0)
+    values = {"count": count, "of": count + readings.count}
+    return _remark("repeated-readings", members, stations=stations, **values)
 
 
 def _beyond_order(fitted: FittedRuns) -> Iterator[Flag]:
