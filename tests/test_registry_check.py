@@ -1,5 +1,6 @@
 """`registry check`: whatever is changed, removed or added beside the program, it says so."""
 
+import hashlib
 import json
 import random
 import re
@@ -13,7 +14,7 @@ import pytest
 import sqlalchemy as sa
 
 from mwdcal.errors import InputError
-from mwdcal.registry import checking, store
+from mwdcal.registry import checking, stored
 from mwdcal.registry.setup import create
 from mwdcal.registry.store import Entry, open_registry
 from registry_support import calibration, drop_database, empty_database
@@ -270,12 +271,14 @@ def test_a_time_that_is_no_text_is_reported(original, tmp_path):
 
 
 def test_no_more_is_unpacked_than_a_registry_takes(monkeypatch):
-    monkeypatch.setattr(store, "LARGEST_OBJECT", 1000)
-    packed = zlib.compress(bytes(10_000_000), 9)
-    with pytest.raises(InputError, match="damaged"):  # not what it unpacks to
-        store.unpacked(packed, 10_000_000)
-    with pytest.raises(InputError, match="damaged"):
-        store.unpacked(packed, 2**62)
+    monkeypatch.setattr(stored, "LARGEST_OBJECT", 1000)
+    bomb, address = (
+        zlib.compress(bytes(10_000_000), 9),
+        hashlib.sha256(bytes(10_000_000)).hexdigest(),
+    )
+    for size in (10_000_000, 2**62, -1, -2, None, "1"):
+        with pytest.raises(stored.AlteredError, match="damaged"):
+            stored.unpacked(bomb, size, address)
 
 
 @pytest.mark.parametrize("table", ["objects", "records", "withdrawals", "history"])

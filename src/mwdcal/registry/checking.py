@@ -17,8 +17,9 @@ from mwdcal.registry.database import chain, migrating
 from mwdcal.registry.database.connections import OBJECTS_AT_ONCE, ROWS_AT_ONCE
 from mwdcal.registry.database.models import history, objects, records, tools, withdrawals
 from mwdcal.registry.database.tools import TOOL_KINDS, rows_of
-from mwdcal.registry.facts import FACTS_VERSION, content_address, facts
-from mwdcal.registry.store import Registry, record_digest, unpacked
+from mwdcal.registry.facts import FACTS_VERSION, facts
+from mwdcal.registry.store import Registry
+from mwdcal.registry.stored import AlteredError, record_digest, unpacked
 
 MOST_DISCREPANCIES = 1000
 """Discrepancies after which a check stops."""
@@ -210,10 +211,9 @@ def _bytes_of(record: Row, stored: Row | None) -> bytes | None:
     if stored is None or stored["sha256"] != record["sha256"]:
         return None
     try:
-        data = unpacked(stored["data"], stored["size"])
-    except InputError:
+        return unpacked(stored["data"], stored["size"], stored["sha256"])
+    except AlteredError:
         return None
-    return data if content_address(data) == stored["sha256"] else None
 
 
 def _other_facts(record: Row, data: bytes) -> list[str]:

@@ -18,7 +18,8 @@ from mwdcal.files.contract import CHANNELS
 from mwdcal.files.formats import members, parquet
 from mwdcal.files.formats import table as tables
 from mwdcal.files.profiles import decoded_profile
-from mwdcal.registry.store import LARGEST_OBJECT, Entry
+from mwdcal.registry.store import Entry
+from mwdcal.registry.stored import LARGEST_OBJECT
 from mwdcal.sensor.profile import MeasurementStandard
 
 TABLE_SUFFIXES = (*tables.SUFFIXES, *tables.EXCHANGED)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,10 @@ from mwdcal.calibration.record import SOFTWARE
 from mwdcal.errors import InputError, reason
 from mwdcal.files.formats.folders import file_name, whole
 from mwdcal.registry.database import chain
-from mwdcal.registry.database.models import history, objects, records, withdrawals
+from mwdcal.registry.database.models import history, records, withdrawals
 from mwdcal.registry.facts import content_address
-from mwdcal.registry.store import Registry, unpacked
+from mwdcal.registry.store import Registry
+from mwdcal.registry.stored import Stored, documents, with_objects
 
 EXPORT_MANIFEST = "manifest.json"
 """Name of the file of an export that names all others."""
@@ -59,15 +60,23 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True):
 def export(
     registry: Registry, folder: Path, progress: Callable[[int, int], None] = lambda done, all: None
 ) -> Manifest:
-    """Write all that a registry holds, in one state of it, into a new or empty folder: whole or not at all."""
-    with whole(folder) as unfinished, registry.reading() as connection:
+    """Write all that a registry holds, in one state of it, into a new or empty folder: whole or not at all.
+
+    Raises:
+        AlteredError: a document is not what was added; nothing is written.
+    """
+    with whole(folder) as unfinished, registry.reading_documents() as connection:
         events, head = chain.head(connection)
         lines = _written_history(connection, unfinished / HISTORY)
         files, simulated = [], False
-        for row in _rows(connection):
-            files.append(_written(row, unfinished))
-            simulated = simulated or bool(row.simulated)
-            progress(row.number, events)
+        query = with_objects(withdrawals.c.reason).outerjoin(
+            withdrawals, withdrawals.c.record == records.c.number
+        )
+        query = query.order_by(records.c.number)
+        for document in documents(connection, registry.name, query):
+            files.append(_written(document, unfinished))
+            simulated = simulated or bool(document.record["simulated"])
+            progress(document.record["number"], events)
         manifest = Manifest(
             simulated=simulated, events=events, head=head, history_sha256=lines, files=files
         )
@@ -76,39 +85,20 @@ def export(
     return manifest
 
 
-def _rows(connection: sa.Connection) -> Iterator[Any]:
-    """All records with their objects and events."""
-    query = (
-        sa.select(
-            *(records.c[n] for n in ("number", "sha256", "kind", "name", "serial", "simulated")),
-            *(objects.c.data, objects.c.size),
-            *(history.c.time, history.c.actor, withdrawals.c.reason),
-        )
-        .join(objects, objects.c.sha256 == records.c.sha256)
-        .join(history, history.c.number == records.c.number)
-        .outerjoin(withdrawals, withdrawals.c.record == records.c.number)
-        .order_by(records.c.number)
-    )
-    yield from connection.execute(query, execution_options={"yield_per": _RECORDS})
-
-
-def _written(row: Any, folder: Path) -> ExportedFile:
-    """Write the document of a record."""
-    name = Path(row.name)
+def _written(document: Stored, folder: Path) -> ExportedFile:
+    """Write a document."""
+    record, row = document.record, document.row
+    name = Path(record["name"])
     stem, suffix = file_name(name.stem), file_name(name.suffix.removeprefix("."))
-    path = Path(row.kind, f"{stem}-{row.sha256[:12]}.{suffix or 'json'}")
-    (folder / row.kind).mkdir(exist_ok=True)
-    (folder / path).write_bytes(unpacked(row.data, row.size))
+    path = Path(record["kind"], f"{stem}-{record['sha256'][:12]}.{suffix or 'json'}")
+    (folder / record["kind"]).mkdir(exist_ok=True)
+    (folder / path).write_bytes(document.data)
     return ExportedFile(
-        number=row.number,
         path=path.as_posix(),
-        sha256=row.sha256,
-        kind=row.kind,
-        name=row.name,
-        serial=row.serial,
-        added=row.time,
-        actor=row.actor,
-        reason=row.reason,
+        added=row[history.c.time],
+        actor=row[history.c.actor],
+        reason=row[withdrawals.c.reason],
+        **{name: record[name] for name in ("number", "sha256", "kind", "name", "serial")},
     )
 
 

@@ -138,14 +138,14 @@ def document(registry: Registry, word: str) -> tuple[Row, bytes]:
 
     Raises:
         InputError: there is none.
+        AlteredError: it is not what was added.
     """
     latest = queries.latest_calibration(registry, word)
     if latest:
         return latest
     if not _names_record(word):
         raise _unknown(registry, word)
-    row = one_record(registry, word)
-    return row, registry.content(row["sha256"])
+    return queries.document(registry, one_record(registry, word)["number"])
 
 
 def latest_file(registry: Registry, serial: str | None) -> Member:

@@ -7,11 +7,12 @@ from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 
-from mwdcal.registry.database.models import history, objects, records, tools, withdrawals
-from mwdcal.registry.store import Registry, unpacked
+from mwdcal.errors import InputError
+from mwdcal.registry.database.models import history, records, tools, withdrawals
+from mwdcal.registry.store import Registry
+from mwdcal.registry.stored import check_tool, documents, with_objects
 
 Row = Mapping[str, Any]
-_RECORD = [column.name for column in records.columns]
 TOOL_ORDERS = ("serial", "type", "next_due", "calibrated")
 """Columns by which tools can be sorted."""
 
@@ -127,35 +128,53 @@ def record(registry: Registry, number: int) -> Row | None:
         return dict(row) if row else None
 
 
+def document(registry: Registry, number: int) -> tuple[Row, bytes]:
+    """The record of a number and its file's bytes.
+
+    Raises:
+        InputError: there is no such record.
+        AlteredError: it is not what was added.
+    """
+    for stored in registry.documents(with_objects().where(records.c.number == number)):
+        return stored.record, stored.data
+    raise InputError(f"{registry.name}: there is no record {number}. Check the number.")
+
+
 def calibrations(registry: Registry, serial: str) -> Iterator[tuple[Row, bytes]]:
-    """The calibrations of a tool that were not withdrawn, oldest first, each with its file's bytes."""
-    query = (
-        sa.select(records, objects.c.data, objects.c.size)
-        .join(objects, objects.c.sha256 == records.c.sha256)
+    """The calibrations of a tool that were not withdrawn, oldest first, each with its file's bytes.
+
+    Raises:
+        AlteredError: one of them is not what was added.
+    """
+    query = _calibrations_of(serial).where(withdrawals.c.number.is_(None))
+    return ((stored.record, stored.data) for stored in registry.documents(query))
+
+
+def _calibrations_of(serial: str) -> sa.Select[Any]:
+    """All calibrations of a tool, oldest first."""
+    return (
+        with_objects()
         .outerjoin(withdrawals, withdrawals.c.record == records.c.number)
         .where(records.c.serial == serial, records.c.kind == "calibration")
-        .where(withdrawals.c.number.is_(None))
         .order_by(records.c.time, records.c.number)
     )
-    with registry.reading() as connection:
-        for row in connection.execute(query).mappings():
-            about = {name: row[name] for name in _RECORD}
-            yield about, unpacked(row["data"], row["size"])
 
 
 def latest_calibration(registry: Registry, serial: str) -> tuple[Row, bytes] | None:
-    """The newest calibration of a tool by its time, and its file's bytes; None where there is none."""
-    query = (
-        sa.select(records, objects.c.data, objects.c.size)
-        .join(tools, tools.c.latest == records.c.number)
-        .join(objects, objects.c.sha256 == records.c.sha256)
-        .where(tools.c.serial == serial)
-    )
-    with registry.reading() as connection:
-        row = connection.execute(query).mappings().first()
-    if row is None:
-        return None
-    return {name: row[name] for name in _RECORD}, unpacked(row["data"], row["size"])
+    """The newest calibration of a tool by its time, and its file's bytes; None where there is none.
+
+    Raises:
+        AlteredError: it, or a calibration that it was chosen from, is not what was added.
+    """
+    latest = sa.select(tools.c.latest).where(tools.c.serial == serial)
+    result = None
+    with registry.reading_documents() as connection:
+        check_tool(connection, registry.name, serial)
+        number = connection.scalar(latest)
+        for stored in documents(connection, registry.name, _calibrations_of(serial)):
+            if stored.record["number"] == number:
+                result = stored.record, stored.data
+    return result
 
 
 def events(registry: Registry, offset: int = 0, limit: int = 50) -> Page:

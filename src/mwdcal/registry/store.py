@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime
 from typing import Any, NamedTuple
 
@@ -18,9 +17,16 @@ from mwdcal.registry.database.connections import Database, connect
 from mwdcal.registry.database.models import objects, records, withdrawals
 from mwdcal.registry.database.tools import TOOL_KINDS, portions, refresh
 from mwdcal.registry.facts import FACTS_VERSION, LONGEST_NAME, content_address, facts, plain
+from mwdcal.registry.stored import (
+    LARGEST_OBJECT,
+    Stored,
+    check_complete,
+    documents,
+    packed,
+    record_digest,
+    with_objects,
+)
 
-LARGEST_OBJECT = 500_000_000
-"""Bytes of the largest file that a registry takes."""
 Draft = dict[str, Any]
 """What is inserted of an entry: see `draft`."""
 
@@ -52,6 +58,7 @@ class Registry:
 
     def __init__(self, database: Database) -> None:
         self.database = database
+        self._complete = False
 
     @property
     def name(self) -> str:
@@ -118,19 +125,39 @@ class Registry:
         with self.writing() as connection:
             _withdraw(connection, self.name, number, why, who, time)
 
+    @contextlib.contextmanager
+    def reading_documents(self) -> Iterator[sa.Connection]:
+        """The same, for documents: the first time it is checked that no row is missing by which they are selected.
+
+        Raises:
+            AlteredError: rows and history do not fit together.
+        """
+        with self.reading() as connection:
+            if not self._complete:
+                check_complete(connection, self.name)
+                self._complete = True
+            yield connection
+
+    def documents(self, query: sa.Select[Any]) -> Iterator[Stored]:
+        """The documents of a query made of `stored.with_objects`, as they were added.
+
+        Raises:
+            AlteredError: one of them is not what was added.
+        """
+        with self.reading_documents() as connection:
+            yield from documents(connection, self.name, query)
+
     def content(self, sha256: str) -> bytes:
         """The bytes of an object, as they were added.
 
         Raises:
             InputError: there is no such object.
+            AlteredError: it is not what was added.
         """
-        with self.reading() as connection:
-            row = connection.execute(
-                sa.select(objects).where(objects.c.sha256 == sha256)
-            ).one_or_none()
-        if row is None:
-            raise InputError(f"{self.name}: there is no object {sha256}. Check the SHA-256.")
-        return unpacked(row.data, row.size)
+        query = with_objects().where(records.c.sha256 == sha256).order_by(records.c.number)
+        for stored in self.documents(query.limit(1)):
+            return stored.data
+        raise InputError(f"{self.name}: there is no object {sha256}. Check the SHA-256.")
 
     def head(self) -> tuple[int, str]:
         """Number and hash of the newest event of the history."""
@@ -148,24 +175,6 @@ def person(actor: str) -> str:
     return name
 
 
-def unpacked(data: bytes, size: int) -> bytes:
-    """An object's bytes from those stored; at most one more than `size` of them.
-
-    Raises:
-        InputError: they are damaged.
-    """
-    unpacker = zlib.decompressobj()
-    try:
-        content = unpacker.decompress(data, min(size, LARGEST_OBJECT) + 1)
-    except (zlib.error, TypeError, ValueError, OverflowError):
-        content = b""
-    if len(content) != size or not unpacker.eof or unpacker.unused_data:
-        raise InputError(
-            "a file in the registry is damaged. Check the registry, and restore it from a backup."
-        )
-    return content
-
-
 def draft(entry: Entry) -> Draft:
     """The rows of an entry, without their number: columns of a record, and `object`."""
     if len(entry.data) > LARGEST_OBJECT:
@@ -180,7 +189,7 @@ def draft(entry: Entry) -> Draft:
             f"{entry.name}: it is of the tool {about.serial!r}, not {serial!r}. Correct `serial`."
         )
     address = content_address(entry.data)
-    stored = {"sha256": address, "size": len(entry.data), "data": zlib.compress(entry.data, 6)}
+    stored = {"sha256": address, "size": len(entry.data), "data": packed(entry.data)}
     return {
         "kind": entry.kind,
         "sha256": address,
@@ -190,14 +199,6 @@ def draft(entry: Entry) -> Draft:
         "facts_version": FACTS_VERSION,
         "object": stored,
     }
-
-
-def record_digest(record: Mapping[str, Any], stored: Mapping[str, Any] | None) -> str:
-    """The digest of a record, and of the object that came with it, whose bytes it covers as stored."""
-    if stored is None:
-        return chain.digest(record)
-    packed = {**stored, "data": content_address(stored["data"])}
-    return chain.digest({**record, "object": packed})
 
 
 def _insert(connection: sa.Connection, drafts: Sequence[Draft], who: str, time: str) -> list[Added]:

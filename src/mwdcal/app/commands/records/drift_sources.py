@@ -23,6 +23,7 @@ from mwdcal.files.formats.members import Member
 from mwdcal.files.limits import load_limits
 from mwdcal.registry import queries
 from mwdcal.registry.store import Registry
+from mwdcal.registry.stored import AlteredError
 from mwdcal.use.verification import Bounds, Verdict
 
 Advance = Callable[[int, int], None]
@@ -79,6 +80,8 @@ def of_registry(
         try:
             if tool := _measured(registry, row["serial"], level):
                 tools.append(tool)
+        except AlteredError:
+            raise
         except MwdcalError as error:
             refused[row["serial"]] = str(error)
     if not tools:
@@ -133,6 +136,8 @@ def _peers(
         advance(done, len(some))
         try:
             calibrations, _ = _calibrations(registry, row["serial"])
+        except AlteredError:
+            raise
         except MwdcalError:
             continue
         if len(calibrations) > 1:
@@ -169,8 +174,8 @@ def _tests(registry: Registry, serial: str) -> Iterator[ServiceTest]:
     days = {row["sha256"]: row["time"] for row in _records(registry, "run", where)}
     for row in _records(registry, "verification", where):
         day = row["time"] or days.get(row["run"]) or row["added"]
-        data = documents.in_utf8(registry.content(row["sha256"]))
-        document = msgspec.json.decode(data, type=dict[str, Any])
+        found = queries.document(registry, row["number"])
+        document = msgspec.json.decode(documents.in_utf8(found[1]), type=dict[str, Any])
         verdict = msgspec.convert(document, Verdict)
         yield ServiceTest(date.fromisoformat(day[:10]), row["calibration"] or "", verdict)
 
