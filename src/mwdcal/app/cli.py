@@ -13,7 +13,7 @@ from mwdcal import __version__
 from mwdcal.app import interruption
 from mwdcal.app.commands import Commands
 from mwdcal.app.messages import say, screens
-from mwdcal.app.text import harmless, laid_out
+from mwdcal.app.text import harmless, laid_out, without_passwords
 from mwdcal.errors import MwdcalError, reason
 
 INTERNAL = 70
@@ -76,7 +76,8 @@ def _status(arguments: list[str] | None) -> int:
             return cli.main(arguments, prog_name="mwdcal", standalone_mode=False) or 0
     except click.ClickException as error:
         error.show(usage := io.StringIO())
-        click.echo(laid_out(harmless(usage.getvalue()), sys.stderr), err=True, nl=False)
+        text = harmless(without_passwords(usage.getvalue()))
+        click.echo(laid_out(text, sys.stderr), err=True, nl=False)
         return error.exit_code
     except (click.Abort, KeyboardInterrupt) as stop:
         return _ended(*interruption.report(stop.__cause__ or stop))

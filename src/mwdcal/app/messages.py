@@ -18,7 +18,14 @@ from typing import IO, TYPE_CHECKING, Any
 
 import click
 
-from mwdcal.app.text import UNSAFE_BUT_LINES, fitting, harmless, laid_out, one_line
+from mwdcal.app.text import (
+    UNSAFE_BUT_LINES,
+    fitting,
+    harmless,
+    laid_out,
+    one_line,
+    without_passwords,
+)
 from mwdcal.errors import InputError, MwdcalError, reason
 
 if TYPE_CHECKING:
@@ -165,7 +172,7 @@ def say(text: str) -> None:
     """A message for people, on stderr, unless the command is quiet; of a very long one both ends."""
     if quiet():
         return
-    line = one_line(text)
+    line = one_line(without_passwords(text))
     if len(line) > LONGEST_MESSAGE:
         line = f"{line[: LONGEST_MESSAGE // 2]} … {line[-LONGEST_MESSAGE // 4 :]}"
     click.echo(_on_screen(line, sys.stderr), err=True)

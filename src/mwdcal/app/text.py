@@ -43,6 +43,11 @@ _CONTROL = rf"\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff{_BIDI}"
 _UNSAFE = re.compile(f"[{_CONTROL}]")
 UNSAFE_BUT_LINES = re.compile(f"(?!\n)[{_CONTROL}]")
 """Characters that control a terminal or the direction of writing, but for line breaks."""
+_PASSWORD = re.compile(
+    r"((?:[\w+.-]+:?)?//[^\s:@/]*:|\b[\w+.-]{2,}:(?!//))(?!password@)\S+@|(\bpassword *= *)[^\s&'\"]+",
+    re.IGNORECASE,
+)
+"""A password, from the colon behind a user to the last @ of the word, or behind its name, with what is before it."""
 
 
 def one_line(text: object) -> str:
@@ -60,6 +65,15 @@ def one_line(text: object) -> str:
 def harmless(text: str) -> str:
     """As `one_line`, but line breaks stay."""
     return UNSAFE_BUT_LINES.sub(_escape, text)
+
+
+def without_passwords(text: str) -> str:
+    """A message without the passwords of URLs in it, however these are mistyped.
+
+    >>> without_passwords("'postgresql//bob:s3cret@host/x': no such file. Is it host=h password=s3cret?")
+    "'postgresql//bob:***@host/x': no such file. Is it host=h password=***?"
+    """
+    return _PASSWORD.sub(lambda it: f"{it[1]}***@" if it[1] else f"{it[2]}***", text)
 
 
 def _escape(unsafe: re.Match[str]) -> str:

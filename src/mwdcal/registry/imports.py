@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from mwdcal.calibration.readings import stated_day
 from mwdcal.errors import InputError, MwdcalError
 from mwdcal.files.formats import members
-from mwdcal.files.formats.folders import visible_files
+from mwdcal.files.formats.folders import HIDDEN_BY_SYSTEMS, visible_files
 from mwdcal.registry import contents
 from mwdcal.registry.database.tools import TOOL_KINDS
 from mwdcal.registry.exports import read_manifest
@@ -84,10 +84,10 @@ def sources(paths: Iterable[Path]) -> list[Source]:
 
 
 def _of_folder(folder: Path) -> Iterator[Source]:
-    """The files of an export by its manifest, or all visible ones."""
+    """The files of an export by its manifest, or all that no system hides."""
     manifest = read_manifest(folder)
     if manifest is None:
-        for file in visible_files(folder):
+        for file in visible_files(folder, HIDDEN_BY_SYSTEMS):
             yield from _of_file(file)
         return
     for each in manifest.files:

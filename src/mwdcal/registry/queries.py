@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
+from functools import cache
 from typing import Any, NamedTuple
+from unicodedata import normalize
 
 import sqlalchemy as sa
 
@@ -13,6 +16,8 @@ from mwdcal.registry.store import Registry
 from mwdcal.registry.stored import check_tool, documents, with_objects
 
 Row = Mapping[str, Any]
+_CASED = 0x1F000
+"""Characters below which all are that have capitals."""
 TOOL_ORDERS = ("serial", "type", "next_due", "calibrated")
 """Columns by which tools can be sorted."""
 
@@ -54,7 +59,28 @@ def tools_page(
 
 
 def _contains(column: sa.Column[Any], text: str) -> sa.ColumnElement[bool]:
-    return sa.func.lower(column).contains(text.lower(), autoescape=True)
+    """Whether a text is in a column, whatever the case and the form of its letters.
+
+    The variants of each letter are named: what a database takes for the same letter depends on its locale.
+    """
+    return column.regexp_match("".join(map(_any_case, normalize("NFC", text))))
+
+
+def _any_case(letter: str) -> str:
+    """A regular expression for a letter, large or small, composed or not."""
+    folded = letter.casefold()
+    twins = {folded, folded.upper(), *_of_same_case().get(folded, ())}
+    forms = {normalize(form, twin) for twin in twins for form in ("NFC", "NFD")}
+    return f"(?:{'|'.join(map(re.escape, sorted(forms)))})"
+
+
+@cache
+def _of_same_case() -> dict[str, list[str]]:
+    """All characters by that which they are in small letters."""
+    twins: dict[str, list[str]] = {}
+    for letter in map(chr, range(_CASED)):
+        twins.setdefault(letter.casefold(), []).append(letter)
+    return twins
 
 
 def _page(registry: Registry, whole: sa.Select[Any], part: sa.Select[Any]) -> Page:

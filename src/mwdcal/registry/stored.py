@@ -21,7 +21,13 @@ LARGEST_OBJECT = 500_000_000
 UNSUSPICIOUS, DENSEST = 50_000_000, 200
 """Bytes to which any object may unpack; a larger one to so many times what is stored, as no readings do."""
 _WHAT_TO_DO = "Check the registry (mwdcal registry check), and restore it from a backup."
-_AFTER = history.alias("after")
+_next = history.alias("next")
+_AFTER = (
+    sa.select(_next.c.previous)
+    .where(_next.c.number == records.c.number + 1)
+    .scalar_subquery()
+    .label("after")
+)
 Row = Mapping[str, Any]
 
 
@@ -79,10 +85,9 @@ def record_digest(record: Row, stored: Row | None) -> str:
 def with_objects(*more: sa.ColumnElement[Any]) -> sa.Select[Any]:
     """The query of records for `documents`; those whose object or event is missing are in it, to be refused."""
     return (
-        sa.select(records, objects, history, _AFTER.c.previous, *more)
+        sa.select(records, objects, history, _AFTER, *more)
         .outerjoin(objects, objects.c.sha256 == records.c.sha256)
         .outerjoin(history, history.c.number == records.c.number)
-        .outerjoin(_AFTER, _AFTER.c.number == records.c.number + 1)
     )
 
 
@@ -101,7 +106,7 @@ def documents(connection: sa.Connection, name: str, query: sa.Select[Any]) -> It
             parts = (records, objects, history)
             record, stored, event = ({c.name: row[c] for c in part.columns} for part in parts)
             label = f"{name}: the {record['kind']} {record['name']!r} ({record['number']})"
-            if not _is_as_added(record, stored, event, row[_AFTER.c.previous]):
+            if not _is_as_added(record, stored, event, row["after"]):
                 raise AlteredError(f"{label} was changed after it was added. {_WHAT_TO_DO}")
             try:
                 data = unpacked(stored["data"], stored["size"], record["sha256"])

@@ -251,7 +251,7 @@ def _files(inputs: Iterable[str | Path | None]) -> set[tuple[int, int] | None]:
     """The files behind the names, whatever their spelling; of a folder all that are in it."""
     from mwdcal.files.formats import atomic, members
 
-    paths = [members.split(name)[0] for name in inputs if name]
+    paths = members.files_of(inputs)
     inside = [
         Path(folder, name) for path in paths for folder, _, names in os.walk(path) for name in names
     ]

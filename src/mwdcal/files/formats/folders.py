@@ -13,8 +13,10 @@ from urllib.parse import quote
 from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import atomic
 
-HIDDEN = ("_", ".", "~$")
-"""How names begin of files and folders that are left alone: notes of systems and programs."""
+HIDDEN_BY_SYSTEMS = (".", "~$")
+"""How names begin of files and folders that systems and programs hide."""
+HIDDEN = ("_", *HIDDEN_BY_SYSTEMS)
+"""How names begin of those that are no part of a table in many files: writers of such tables keep notes in them."""
 PLAIN = " ._-+,=@()"
 """Characters besides letters and digits that stay as they are in the name of a file."""
 LONGEST_FILE_NAME = 120
@@ -29,13 +31,13 @@ RESERVED = {
 """Names that Windows keeps for devices, whatever their suffix."""
 
 
-def visible_files(folder: Path) -> list[Path]:
+def visible_files(folder: Path, hidden: tuple[str, ...] = HIDDEN) -> list[Path]:
     """All files in a folder and in those below it, by name; hidden and temporary ones are left out."""
     return sorted(
         file
         for file in folder.rglob("*")
         if file.is_file()
-        and not any(part.startswith(HIDDEN) for part in file.relative_to(folder).parts)
+        and not any(part.startswith(hidden) for part in file.relative_to(folder).parts)
     )
 
 

@@ -20,8 +20,11 @@ RECORD = "calibration"
 MARK = "#"
 """What stands between the file of a fleet's table and a serial."""
 SUFFIX = ".parquet"
-NEARLY_URL = re.compile(r"postgres\w*(\+\w+)?:|\bpassword *=", re.IGNORECASE)
-"""What the URL of a database has, however mistyped, and no file's name: it may hold a password."""
+_NEARLY_URL = re.compile(
+    r"postgres\w*(\+\w+)?(:|//)|://|\bpassword *=|[/\\][^/\\]*:.*@|^[^/\\:]{2,}:.*@", re.IGNORECASE
+)
+"""What the URL of a database has, however mistyped, and hardly a file's name: it may hold a password."""
+_FILE_URL = "sqlite:///"
 _SHOWN = 5
 """Most serials that a message names."""
 _HEAD = ["serial", "status", "message"]
@@ -35,6 +38,20 @@ class Member(NamedTuple):
     digest: str
 
 
+def is_nearly_url(text: str) -> bool:
+    """Whether a text that names no file looks like a URL, however mistyped, and may hold a password."""
+    if text.startswith(_FILE_URL) or not _NEARLY_URL.search(text):
+        return False
+    parts = (text, text.partition(MARK)[0])
+    return not any(os.path.exists(part) for part in parts)  # noqa: PTH110 - any text, also too long a one
+
+
+def files_of(inputs: Iterable[str | os.PathLike[str] | None]) -> list[Path]:
+    """The files that inputs name, without serials; a database on a server is none."""
+    texts = [os.fspath(each) for each in inputs if each]
+    return [split(t.removeprefix(_FILE_URL))[0] for t in texts if not is_nearly_url(t)]
+
+
 def split(path: str | os.PathLike[str]) -> tuple[Path, str | None]:
     """The file that a path names, and the serial behind it; None where there is none.
 
@@ -44,9 +61,10 @@ def split(path: str | os.PathLike[str]) -> tuple[Path, str | None]:
         InputError: the path is the URL of a database.
     """
     text = os.fspath(path)
-    if NEARLY_URL.search(text):
+    if is_nearly_url(text):
         raise InputError(
-            "a calibration in a PostgreSQL database cannot be named here. Write it to a file: mwdcal registry get."
+            "a calibration must be a file, and this looks like the URL of a database. Write the calibration to a "
+            "file: mwdcal registry get."
         )
     places = [place for place, character in enumerate(text) if character == MARK]
     for place in [] if Path(text).exists() else places:

@@ -17,7 +17,7 @@ from urllib.parse import quote
 import sqlalchemy as sa
 
 from mwdcal.errors import InputError
-from mwdcal.files.formats.members import NEARLY_URL
+from mwdcal.files.formats.members import is_nearly_url
 from mwdcal.registry.database.places import on_network
 
 ROWS_AT_ONCE = 100
@@ -112,7 +112,7 @@ def is_url(database: str | os.PathLike[str]) -> bool:
 def connect(database: str | os.PathLike[str], new: bool = False, shared: bool = True) -> Database:
     """The database behind a path or a URL; a file that does not exist is refused unless `new`."""
     if not is_url(database):
-        if NEARLY_URL.search(os.fspath(database)):
+        if is_nearly_url(os.fspath(database)):
             raise _no_url()
         return _sqlite(Path(database), new, shared)
     url = _parsed(str(database))
@@ -178,17 +178,40 @@ def file_uri(path: PurePath) -> str:
 
 
 def _opened(path: Path, new: bool) -> sqlite3.Connection:
-    mode = "rwc" if new else "rw"
+    """A connection to a file: to read alone where it, or its folder, may not be written to.
+
+    Without the right to write to the folder SQLite cannot keep the log by which readers and writers share a file.
+    Where there is no log nobody writes, and it is read as it is.
+    """
+    try:
+        return _connected(path, "mode=rwc" if new else "mode=rw")
+    except sqlite3.OperationalError as error:
+        log = path.with_name(f"{path.name}-wal")
+        code = error.sqlite_errorcode & 0xFF
+        unwritable = code in (sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY)
+        if new or not unwritable or (log.exists() and log.stat().st_size):
+            raise
+    return _connected(path, "mode=ro&immutable=1")
+
+
+def _connected(path: Path, how: str) -> sqlite3.Connection:
     connection = sqlite3.connect(
-        f"{file_uri(path.absolute())}?mode={mode}",
+        f"{file_uri(path.absolute())}?{how}",
         uri=True,
         timeout=LONGEST_WAIT,
         isolation_level=None,
         check_same_thread=False,
     )
-    connection.execute("PRAGMA synchronous=EXTRA")
-    connection.execute("PRAGMA foreign_keys=ON")
-    connection.execute("PRAGMA trusted_schema=OFF")
+    try:
+        connection.execute(
+            "PRAGMA schema_version"
+        )  # reads: this fails where the file cannot be read
+        connection.execute("PRAGMA synchronous=EXTRA")
+        connection.execute("PRAGMA foreign_keys=ON")
+        connection.execute("PRAGMA trusted_schema=OFF")
+    except BaseException:
+        connection.close()
+        raise
     return connection
 
 

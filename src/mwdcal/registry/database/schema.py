@@ -7,12 +7,44 @@ import re
 import sqlalchemy as sa
 
 from mwdcal.errors import InputError
+from mwdcal.registry.database.models import metadata
 
 SCHEMA_VERSION_OF_REGISTRY = "0002"
 """The newest migration: the schema that this program works with."""
 VERSION_TABLE = "alembic_version"
 """Where Alembic keeps the version."""
 _STATED_VERSION = sa.text(f"SELECT version_num FROM {VERSION_TABLE}")
+
+
+_COMPUTED = {
+    "sqlite": sa.text(
+        "SELECT name FROM sqlite_master WHERE type = 'view' OR (type = 'table' AND rootpage = 0) "
+        "UNION ALL SELECT m.name FROM sqlite_master AS m, pragma_table_xinfo(m.name) AS c "
+        "WHERE m.type = 'table' AND c.hidden"
+    ),
+    "postgresql": sa.text(
+        "SELECT relname FROM unnest(CAST(:tables AS text[])) AS name "
+        "JOIN pg_class ON pg_class.oid = to_regclass(name) WHERE relkind <> 'r' "
+        "OR EXISTS (SELECT FROM pg_attribute WHERE attrelid = pg_class.oid AND attgenerated <> '')"
+    ),
+}
+"""What a database has that computes when it is read: views, virtual tables, generated columns."""
+
+
+def check_tables(connection: sa.Connection, name: str) -> None:
+    """Refuse, before it is read, a database with anything that is not stored: reading that may never end.
+
+    Raises:
+        InputError: one of its tables computes what it gives.
+    """
+    names = {"tables": [*metadata.tables, VERSION_TABLE]}
+    dialect = connection.dialect.name
+    computed = connection.scalar(_COMPUTED[dialect], names if dialect == "postgresql" else {})
+    if computed is not None:
+        raise InputError(
+            f"{name}: {computed!r} is a view or computes its values, and a registry has only tables that store them. "
+            "It is not a registry, or was altered: restore it from a backup."
+        )
 
 
 def stated_version(connection: sa.Connection) -> str:
@@ -27,6 +59,7 @@ def known_version(connection: sa.Connection, name: str) -> str:
     Raises:
         InputError: it is not a registry, or one of a newer program.
     """
+    check_tables(connection, name)
     tables = set(sa.inspect(connection).get_table_names())
     version = stated_version(connection) if {VERSION_TABLE, "history"} <= tables else ""
     if not re.fullmatch(r"\d{4}", version):
