@@ -362,6 +362,18 @@ def test_what_is_no_file_of_a_registry_is_named_and_stops_nothing(example, tmp_p
     assert "not added" in alone.err
 
 
+def test_no_file_of_a_folder_is_left_out_but_those_that_systems_hide(example, tmp_path):
+    folder = tmp_path / "mixed" / "_old"
+    folder.mkdir(parents=True)
+    for name in ("_SIM-0002.json", ".SIM-0002.json", "~$SIM-0002.json"):
+        shutil.copy(example.parent / "tools" / "SIM-0002.json", folder / name)
+    path = tmp_path / "r.sqlite"
+    registry(path, "init")
+    result = registry(path, "add", folder.parent)
+    assert result["new"] == {"calibration": 1}
+    assert [f["file"] for f in result["files"]] == [str(folder / "_SIM-0002.json")]
+
+
 def test_a_table_of_other_columns_is_a_run_if_a_calibration_was_made_of_it(example, tmp_path):
     exported = EXAMPLE / "export.csv"
     run("profile", exported, "-o", tmp_path / "tool.toml")

@@ -1,5 +1,6 @@
 """What a registry refuses, in one sentence that says what to do, and without passwords."""
 
+import contextlib
 import os
 import shutil
 import sqlite3
@@ -12,13 +13,24 @@ import sqlalchemy as sa
 
 from mwdcal.errors import InputError
 from mwdcal.files import documents
-from mwdcal.registry import copies
+from mwdcal.registry import checking, copies, lookup, queries
 from mwdcal.registry.database import connections, places
 from mwdcal.registry.setup import create, upgrade
 from mwdcal.registry.store import Entry, open_registry
+from cli_support import mwdcal
 from registry_support import calibration
 
 ENTRY = Entry("calibration", calibration("A-1"), "a.json")
+MISTYPED = [
+    "postgresql//ada:s3cret@localhost/tools",
+    "https://ada:s3cret@localhost/tools",
+    "postgesql:/ada:s3cret@localhost/tools",
+    "postgresql/ada:s3cret@localhost/tools",
+    "//ada:s3/s3cret@localhost/tools",
+    "ada:s3cret@localhost/tools",
+    "mysql://ada:k@s3cret@127.0.0.1/tools",
+]
+"""URLs that lack a sign, or are of another database."""
 
 
 @contextmanager
@@ -138,6 +150,30 @@ def test_a_registry_that_may_not_be_written(file, folder):
         shutil.rmtree(place)
 
 
+@pytest.mark.skipif(os.name == "nt", reason="permissions of folders are POSIX")
+@pytest.mark.parametrize("in_use", [False, True])
+@pytest.mark.parametrize(("file", "folder"), [(0o444, 0o777), (0o444, 0o555), (0o644, 0o555)])
+def test_a_registry_that_may_not_be_written_is_read(file, folder, in_use):
+    place = Path(tempfile.mkdtemp())
+    path = place / "tools.registry"
+    try:
+        create(path, "Ada")
+        opened(path)
+        with contextlib.ExitStack() as stack:
+            if in_use:  # with the log beside it that a writer keeps
+                other = stack.enter_context(closing(sqlite3.connect(path)))
+                other.execute("SELECT * FROM tools").fetchall()
+            path.chmod(file)
+            place.chmod(folder)
+            with another_user(), open_registry(path) as registry:
+                assert queries.tools_page(registry).total == 1
+                assert checking.check(registry) == []
+                assert lookup.document(registry, "A-1")[1] == ENTRY.data
+    finally:
+        place.chmod(0o755)
+        shutil.rmtree(place)
+
+
 def test_network_drives(registry_file, monkeypatch, tmp_path):
     mounts = tmp_path / "mounts"
     folder = str(tmp_path).replace(" ", "\\040")
@@ -202,12 +238,40 @@ def test_odd_names_of_files(tmp_path, name):
         " postgresql://ada:s3cret@127.0.0.1/tools",
         "jdbc:postgresql://ada:s3cret@127.0.0.1/tools",
         "host=127.0.0.1 user=ada password=s3cret",
+        *MISTYPED,
     ],
 )
 def test_urls_that_lead_nowhere(url):
     for call in (opened, lambda u: create(u, "Ada"), lambda u: upgrade(u, "Ada")):
         with refused():
             call(url)
+
+
+@pytest.mark.parametrize("url", MISTYPED)
+def test_no_command_prints_the_password_of_a_mistyped_url(url, tmp_path, monkeypatch):
+    readings = tmp_path / "s.csv"
+    readings.write_text("ax,ay,az,mx,my,mz\n0,0,1,0,0,1\n")
+    monkeypatch.chdir(tmp_path)
+    for words in (
+        ("registry", "--database", url, "list"),
+        ("registry", url, "list"),
+        ("registry", "--database", "r.sqlite", "restore", url),
+        ("registry", "--database", "r.sqlite", "add", url),
+        ("apply", f"{url}#S", readings, "-o", "o.csv"),
+        ("verify", f"{url}#S", readings),
+        ("calibrate", url, "--tool", "servo", "-o", "o.json"),
+        ("convert", url, "--notation", "forward"),
+    ):
+        ran = mwdcal(*words)
+        assert ran.code == 2
+        assert "s3cret" not in ran.out + ran.err, words
+
+
+def test_a_file_may_have_the_name_of_a_url(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    create("run:1", "Ada")
+    Path("run:1").rename("run:1@lab")
+    opened("run:1@lab")
 
 
 def test_a_calibration_is_not_read_from_a_server():

@@ -1,11 +1,18 @@
 """The registry's database: what goes in comes out, once, and is on the disk."""
 
+import sqlite3
+from contextlib import closing
+
 import pytest
+import sqlalchemy as sa
 
 from mwdcal.registry import checking, copies, queries
 from mwdcal.registry.setup import create
 from mwdcal.registry.store import Entry, open_registry
+from cli_support import mwdcal
+from mwdcal.registry.database.models import objects
 from registry_support import calibration, registry_database
+from test_registry_check import PostgresqlTables, without_triggers
 
 database = pytest.fixture(params=["sqlite", "postgresql"])(registry_database)
 
@@ -33,3 +40,41 @@ def test_a_backup_is_the_registry(database, tmp_path):
     with open_registry(tmp_path / "new.registry") as registry:
         assert checking.check(registry, head=head) == []
         assert queries.counts(registry)["calibration"] == 5
+
+
+def rot(database):
+    """Flip a bit of the file that was added first, past the triggers."""
+    with open_registry(database) as registry, registry.reading() as connection:
+        data = bytearray(connection.scalar(sa.select(objects.c.data).order_by(objects.c.number)))
+    data[len(data) // 2] ^= 4
+    if isinstance(database, str):
+        with closing(PostgresqlTables(database).connection) as connection:
+            connection.execute("UPDATE objects SET data = %s WHERE number = 2", (bytes(data),))
+            connection.commit()
+        return
+    with closing(sqlite3.connect(database)) as connection, without_triggers(connection):
+        connection.execute("UPDATE objects SET data = ? WHERE number = 2", (bytes(data),))
+
+
+def test_a_rotten_registry_never_replaces_a_good_backup(database, tmp_path):
+    """Thirty nights; the bit flips before the tenth."""
+    create(database, "Ada")
+    file, heads = tmp_path / "night.registry", []
+    for night in range(1, 31):
+        with open_registry(database) as registry:
+            registry.add([Entry("calibration", calibration(f"A-{night}"), "a.json")], "Ada")
+        if night == 10:
+            rot(database)
+            good = file.read_bytes()
+        ran = mwdcal("registry", "--database", database, "backup", file, "--json")
+        if night < 10:
+            heads.append(ran.json["head"])
+            continue
+        assert ran.code == 3
+        assert "was altered or is damaged (the calibration" in ran.err
+        assert "was not written" in ran.err
+        assert file.read_bytes() == good
+    copies.restore(file, tmp_path / "new.registry", "Ada")
+    with open_registry(tmp_path / "new.registry") as registry:
+        assert checking.check(registry, head=heads[-1]) == []
+        assert queries.counts(registry)["calibration"] == 9

@@ -15,7 +15,7 @@ from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError, reason
 from mwdcal.files import documents, runs
 from mwdcal.files.contract import CHANNELS
-from mwdcal.files.formats import members, parquet
+from mwdcal.files.formats import members
 from mwdcal.files.formats import table as tables
 from mwdcal.files.profiles import decoded_profile
 from mwdcal.registry.store import Entry
@@ -43,13 +43,6 @@ class UnlikeRunError(InputError):
     def __init__(self, message: str, entry: Entry) -> None:
         super().__init__(f"{message} Add it together with a calibration that was made of it.")
         self.entry = entry
-
-
-def is_fleet(file: Path) -> bool:
-    """Whether a file is a table of calibrations, as `mwdcal fleet` writes it."""
-    if file.suffix.lower() != members.SUFFIX:
-        return False
-    return members.RECORD in parquet.opened(file, file.name)[1].names
 
 
 def of_fleet(file: Path, group: int) -> Iterator[Entry]:

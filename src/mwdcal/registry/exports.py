@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,11 @@ from mwdcal.calibration.record import SOFTWARE
 from mwdcal.errors import InputError, reason
 from mwdcal.files.formats.folders import file_name, whole
 from mwdcal.registry.database import chain
+from mwdcal.registry.database.connections import ROWS_AT_ONCE
 from mwdcal.registry.database.models import history, records, withdrawals
 from mwdcal.registry.facts import content_address
 from mwdcal.registry.store import Registry
-from mwdcal.registry.stored import Stored, documents, with_objects
+from mwdcal.registry.stored import AlteredError, Stored, documents, with_objects
 
 EXPORT_MANIFEST = "manifest.json"
 """Name of the file of an export that names all others."""
@@ -24,7 +26,6 @@ HISTORY = "history.jsonl"
 """Name of the file with the events, one a line."""
 EXPORT_VERSION = 1
 """Version of the manifest: higher when a key goes, or changes its meaning."""
-_RECORDS = 100
 
 
 class ExportedFile(msgspec.Struct, frozen=True, kw_only=True):
@@ -67,7 +68,7 @@ def export(
     """
     with whole(folder) as unfinished, registry.reading_documents() as connection:
         events, head = chain.head(connection)
-        lines = _written_history(connection, unfinished / HISTORY)
+        lines = _written_history(connection, registry.name, unfinished / HISTORY)
         files, simulated = [], False
         query = with_objects(withdrawals.c.reason).outerjoin(
             withdrawals, withdrawals.c.record == records.c.number
@@ -102,12 +103,22 @@ def _written(document: Stored, folder: Path) -> ExportedFile:
     )
 
 
-def _written_history(connection: sa.Connection, path: Path) -> str:
+def _written_history(connection: sa.Connection, name: str, path: Path) -> str:
     """Write the history; the SHA-256 of the file."""
-    query = sa.select(history).order_by(history.c.number)
-    with path.open("wb") as stream:
-        for row in connection.execute(query, execution_options={"yield_per": _RECORDS}).mappings():
-            stream.write(msgspec.json.encode(dict(row)) + b"\n")
+    query, previous = sa.select(history).order_by(history.c.number), chain.GENESIS
+    options = {"yield_per": ROWS_AT_ONCE}
+    with (
+        path.open("wb") as stream,
+        closing(connection.execute(query, execution_options=options)) as result,
+    ):
+        for event in map(dict, result.mappings()):
+            if not chain.follows(event, previous):
+                raise AlteredError(
+                    f"{name}: event {event['number']} of the history was changed after it was written, or the one "
+                    "before"
+                )
+            stream.write(msgspec.json.encode(event) + b"\n")
+            previous = event["hash"]
     return content_address(path.read_bytes())
 
 

@@ -101,7 +101,7 @@ def _of_file(file: Path) -> Iterator[Source]:
         raise InputError(f"'{file}': no such file. Check the name and the folder.")
     groups: Iterable[int | None] = [None]
     with suppress(InputError):  # what cannot be read is reported where it is read
-        groups = members.groups(file) if contents.is_fleet(file) else groups
+        groups = members.groups(file) if members.is_fleet(file) else groups
     yield from (Source(file, group) for group in groups)
 
 

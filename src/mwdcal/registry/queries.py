@@ -16,7 +16,7 @@ from mwdcal.registry.store import Registry
 from mwdcal.registry.stored import check_tool, documents, with_objects
 
 Row = Mapping[str, Any]
-_CASED = 0x1F000
+_LETTERS = 0x1F000
 """Characters below which all are that have capitals."""
 TOOL_ORDERS = ("serial", "type", "next_due", "calibrated")
 """Columns by which tools can be sorted."""
@@ -78,7 +78,7 @@ def _any_case(letter: str) -> str:
 def _of_same_case() -> dict[str, list[str]]:
     """All characters by that which they are in small letters."""
     twins: dict[str, list[str]] = {}
-    for letter in map(chr, range(_CASED)):
+    for letter in map(chr, range(_LETTERS)):
         twins.setdefault(letter.casefold(), []).append(letter)
     return twins
 

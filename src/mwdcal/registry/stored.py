@@ -20,7 +20,6 @@ LARGEST_OBJECT = 500_000_000
 """Bytes of the largest file that a registry takes."""
 UNSUSPICIOUS, DENSEST = 50_000_000, 200
 """Bytes to which any object may unpack; a larger one to so many times what is stored, as no readings do."""
-_WHAT_TO_DO = "Check the registry (mwdcal registry check), and restore it from a backup."
 _next = history.alias("next")
 _AFTER = (
     sa.select(_next.c.previous)
@@ -32,7 +31,12 @@ Row = Mapping[str, Any]
 
 
 class AlteredError(FitError):
-    """What is stored in a registry is not what was added to it."""
+    """What is stored in a registry is not what was added to it: `what` is wrong."""
+
+    def __init__(self, what: str) -> None:
+        super().__init__(
+            f"{what}. Check the registry (mwdcal registry check), and restore it from a backup."
+        )
 
 
 class Stored(NamedTuple):
@@ -53,7 +57,7 @@ def _is_dense(size: int, stored: int) -> bool:
     return size > max(UNSUSPICIOUS, DENSEST * stored)
 
 
-def unpacked(data: bytes, size: int, sha256: str) -> bytes:
+def unpacked(data: bytes, size: int, sha256: str, label: str = "a file") -> bytes:
     """An object's bytes from those stored, which have this size and SHA-256.
 
     Raises:
@@ -66,11 +70,9 @@ def unpacked(data: bytes, size: int, sha256: str) -> bytes:
     except (zlib.error, TypeError, ValueError, OverflowError):
         pass
     if content is None or len(content) != size or not unpacker.eof or unpacker.unused_data:
-        raise AlteredError(f"a file in the registry is damaged. {_WHAT_TO_DO}")
+        raise AlteredError(f"{label}: the bytes stored are damaged")
     if content_address(content) != sha256:
-        raise AlteredError(
-            f"the bytes stored are not those with the SHA-256 {sha256}. {_WHAT_TO_DO}"
-        )
+        raise AlteredError(f"{label}: the bytes stored are not those with the SHA-256 {sha256}")
     return content
 
 
@@ -107,11 +109,8 @@ def documents(connection: sa.Connection, name: str, query: sa.Select[Any]) -> It
             record, stored, event = ({c.name: row[c] for c in part.columns} for part in parts)
             label = f"{name}: the {record['kind']} {record['name']!r} ({record['number']})"
             if not _is_as_added(record, stored, event, row["after"]):
-                raise AlteredError(f"{label} was changed after it was added. {_WHAT_TO_DO}")
-            try:
-                data = unpacked(stored["data"], stored["size"], record["sha256"])
-            except AlteredError as error:
-                raise AlteredError(f"{label}: {error}") from None
+                raise AlteredError(f"{label} was changed after it was added")
+            data = unpacked(stored["data"], stored["size"], record["sha256"], label)
             yield Stored(record, data, row)
 
 
@@ -121,7 +120,7 @@ def _is_as_added(record: Row, stored: Row, event: Row, after: str | None) -> boo
     try:
         return (
             event["row_sha256"] == record_digest(record, brought)
-            and event["hash"] == chain.event_hash(event)
+            and chain.follows(event, event["previous"])
             and after in (None, event["hash"])
         )
     except (TypeError, ValueError):  # no text or no number where one must be
@@ -156,12 +155,12 @@ def check_complete(connection: sa.Connection, name: str) -> None:
         number = next(_changed_withdrawals(connection), None)
     if number is not None:
         raise AlteredError(
-            f"{name}: what event {number} of the history added was changed or removed. {_WHAT_TO_DO}"
+            f"{name}: what event {number} of the history added was changed or removed"
         )
     serials = sa.select(sa.func.count(at.serial.distinct())).where(at.kind.in_(TOOL_KINDS))
     if connection.scalar(serials) != connection.scalar(sa.select(sa.func.count(tools.c.serial))):
         raise AlteredError(
-            f"{name}: the table of tools has more or fewer rows than there are tools. {_WHAT_TO_DO}"
+            f"{name}: the table of tools has more or fewer rows than there are tools"
         )
 
 
@@ -189,6 +188,4 @@ def check_tool(connection: sa.Connection, name: str, serial: str) -> None:
     row = connection.execute(sa.select(tools).where(tools.c.serial == serial)).mappings().first()
     expected = next(rows_of(connection, [serial]), None)
     if (row and dict(row)) != expected:
-        raise AlteredError(
-            f"{name}: the row of tool {serial!r} is not what its records give. {_WHAT_TO_DO}"
-        )
+        raise AlteredError(f"{name}: the row of tool {serial!r} is not what its records give")

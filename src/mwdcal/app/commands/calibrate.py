@@ -43,7 +43,7 @@ def command(
     from mwdcal.files import documents
     from mwdcal.files.formats import atomic
 
-    options.check_outputs([output], [run, tool, typed["prior"]], page=report)
+    options.check_outputs([output], [run, tool, typed["prior"]], page=report, calibration=True)
     prior, digest = prior_of(typed["prior"])
     readings, profile = load_run(run, tool, decimal, prior)
     choice, result = chosen_fit(readings, profile, options_of(typed, prior, exclude, digest), say)

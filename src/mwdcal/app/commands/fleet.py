@@ -70,7 +70,7 @@ def command(
         from mwdcal.files.formats import atomic, folders
         from mwdcal.fleet import calibration_files
 
-    options.check_outputs([output], [runs, tool], page=report)
+    options.check_outputs([output], [runs, tool], page=report, calibration=True)
     if calibrations:
         if records is False:
             raise InputError("`calibrations` needs the whole calibrations: leave out --no-records.")

@@ -209,16 +209,19 @@ def check_outputs(
     inputs: Iterable[str | Path | None],
     picture: Path | None = None,
     page: Path | None = None,
+    calibration: bool = False,
 ) -> None:
-    """Refuse, before any work, an output that cannot be made or written, or would replace an input.
+    """Refuse, before any work, an output that cannot be made or written, or would replace what must stay.
 
-    Every file in an input folder is an input.
+    That is an input, with every file in an input folder; a key; a file that a certificate lists; and a calibration,
+    which another `calibration` alone may replace.
     """
-    from mwdcal.files.formats import atomic
+    from mwdcal.files.formats import atomic, members
 
     named = list(filter(None, [*outputs, picture, page]))
     targets = [atomic.target(path) for path in named]
-    lost = _files(inputs) if any(target.exists() for target in targets) else set()
+    given = members.files_of(inputs)
+    lost = _files(given) if any(target.exists() for target in targets) else set()
     taken: set[object] = set()
     for path, target in zip(named, targets, strict=True):
         file = atomic.identity(target)
@@ -229,6 +232,11 @@ def check_outputs(
         names = {normalize("NFC", str(target)).casefold(), file} - {None}
         if names & taken:
             raise _refused(path, "it is named twice")
+        if file:
+            from mwdcal.files.precious import why_kept
+
+            if why := why_kept(target, given, calibration and path not in (picture, page)):
+                raise _refused(path, why)
         taken |= names
     if picture:
         from mwdcal.app.pages.pictures import require
@@ -247,15 +255,14 @@ def _refused(path: Path, why: str) -> InputError:
     return InputError(f"cannot write '{path}': {why}. Name another file.")
 
 
-def _files(inputs: Iterable[str | Path | None]) -> set[tuple[int, int] | None]:
+def _files(paths: Iterable[Path]) -> set[tuple[int, int] | None]:
     """The files behind the names, whatever their spelling; of a folder all that are in it."""
-    from mwdcal.files.formats import atomic, members
+    from mwdcal.files.formats import atomic
 
-    paths = members.files_of(inputs)
     inside = [
         Path(folder, name) for path in paths for folder, _, names in os.walk(path) for name in names
     ]
-    return {atomic.identity(path) for path in paths + inside} - {None}
+    return {atomic.identity(path) for path in [*paths, *inside]} - {None}
 
 
 def column_names(text: str) -> list[str]:

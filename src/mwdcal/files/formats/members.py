@@ -74,6 +74,13 @@ def split(path: str | os.PathLike[str]) -> tuple[Path, str | None]:
     return Path(text), None
 
 
+def is_fleet(file: Path) -> bool:
+    """Whether a file is a table of calibrations, as `mwdcal fleet` writes it."""
+    if file.suffix.lower() != SUFFIX:
+        return False
+    return RECORD in parquet.opened(file, file.name)[1].names
+
+
 def is_database(file: Path) -> bool:
     """Whether a file is a database, as a registry is."""
     try:

@@ -36,6 +36,14 @@ def event_hash(event: Mapping[str, Any]) -> str:
     return digest({name: value for name, value in event.items() if name != "hash"})
 
 
+def follows(event: Mapping[str, Any], previous: str) -> bool:
+    """Whether an event is as it was written, after one of the hash `previous`."""
+    try:
+        return bool(event["previous"] == previous and event["hash"] == event_hash(event))
+    except (TypeError, ValueError):  # no text or no number where one must be
+        return False
+
+
 def head(connection: sa.Connection) -> tuple[int, str]:
     """Number and hash of the newest event; 0 and `GENESIS` before the first."""
     newest = sa.select(history.c.number, history.c.hash).order_by(history.c.number.desc()).limit(1)

@@ -174,8 +174,8 @@ def _tests(registry: Registry, serial: str) -> Iterator[ServiceTest]:
     days = {row["sha256"]: row["time"] for row in _records(registry, "run", where)}
     for row in _records(registry, "verification", where):
         day = row["time"] or days.get(row["run"]) or row["added"]
-        found = queries.document(registry, row["number"])
-        document = msgspec.json.decode(documents.in_utf8(found[1]), type=dict[str, Any])
+        _, data = queries.document(registry, row["number"])
+        document = msgspec.json.decode(documents.in_utf8(data), type=dict[str, Any])
         verdict = msgspec.convert(document, Verdict)
         yield ServiceTest(date.fromisoformat(day[:10]), row["calibration"] or "", verdict)
 

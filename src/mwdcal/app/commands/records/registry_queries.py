@@ -94,7 +94,7 @@ def get(record: str, database: str, output: Path, as_json: bool) -> None:
     from mwdcal.registry import lookup
     from mwdcal.registry.store import open_registry
 
-    options.check_outputs([output], [database])
+    options.check_outputs([output], [database], calibration=True)
     with open_registry(database) as registry:
         row, data = lookup.document(registry, record)
         atomic.write(output, data)
