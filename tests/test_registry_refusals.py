@@ -11,13 +11,13 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 import pytest
 import sqlalchemy as sa
 
+from cli_support import mwdcal
 from mwdcal.errors import InputError
 from mwdcal.files import documents
 from mwdcal.registry import checking, copies, lookup, queries
 from mwdcal.registry.database import connections, places
 from mwdcal.registry.setup import create, upgrade
 from mwdcal.registry.store import Entry, open_registry
-from cli_support import mwdcal
 from registry_support import calibration
 
 ENTRY = Entry("calibration", calibration("A-1"), "a.json")

@@ -6,11 +6,11 @@ from contextlib import closing
 import pytest
 import sqlalchemy as sa
 
+from cli_support import mwdcal
 from mwdcal.registry import checking, copies, queries
+from mwdcal.registry.database.models import objects
 from mwdcal.registry.setup import create
 from mwdcal.registry.store import Entry, open_registry
-from cli_support import mwdcal
-from mwdcal.registry.database.models import objects
 from registry_support import calibration, registry_database
 from test_registry_check import PostgresqlTables, without_triggers
 

@@ -189,7 +189,7 @@ def _opened(path: Path, new: bool) -> sqlite3.Connection:
         log = path.with_name(f"{path.name}-wal")
         code = error.sqlite_errorcode & 0xFF
         unwritable = code in (sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY)
-        if new or not unwritable or (log.exists() and log.stat().st_size):
+        if new or not unwritable or log.exists():
             raise
     return _connected(path, "mode=ro&immutable=1")
 
