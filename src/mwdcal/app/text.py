@@ -70,8 +70,8 @@ def harmless(text: str) -> str:
 def without_passwords(text: str) -> str:
     """A message without the passwords of URLs in it, however these are mistyped.
 
-    >>> without_passwords("'postgresql//bob:s3cret@host/x': no such file. Is it host=h password=s3cret?")
-    "'postgresql//bob:***@host/x': no such file. Is it host=h password=***?"
+    >>> without_passwords("'postgresql//bob:s3cret@host/x': no such file. Or host=h password=s3cret")
+    "'postgresql//bob:***@host/x': no such file. Or host=h password=***"
     """
     return _PASSWORD.sub(lambda it: f"{it[1]}***@" if it[1] else f"{it[2]}***", text)
 

@@ -45,7 +45,7 @@ def tools_page(
     """
     query = sa.select(tools.c.serial)
     if search:
-        query = query.where(sa.or_(*(_contains(c, search) for c in (tools.c.serial, tools.c.type))))
+        query = query.where(_contains(search))
     for name, value in (where or {}).items():
         query = query.where(tools.c[name] == value)
     if due_before:
@@ -58,20 +58,21 @@ def tools_page(
     return _page(registry, query, rows)
 
 
-def _contains(column: sa.Column[Any], text: str) -> sa.ColumnElement[bool]:
-    """Whether a text is in a column, whatever the case and the form of its letters.
+def _contains(text: str) -> sa.ColumnElement[bool]:
+    """Whether a text is in serial or type of a tool, whatever the case and the form of its letters.
 
     The variants of each letter are named: what a database takes for the same letter depends on its locale.
     """
-    return column.regexp_match("".join(map(_any_case, normalize("NFC", text))))
+    both = tools.c.serial + "\n" + sa.func.coalesce(tools.c.type, "")
+    return both.regexp_match("".join(map(_any_case, normalize("NFC", text))))
 
 
 def _any_case(letter: str) -> str:
     """A regular expression for a letter, large or small, composed or not."""
     folded = letter.casefold()
     twins = {folded, folded.upper(), *_of_same_case().get(folded, ())}
-    forms = {normalize(form, twin) for twin in twins for form in ("NFC", "NFD")}
-    return f"(?:{'|'.join(map(re.escape, sorted(forms)))})"
+    forms = sorted({re.escape(normalize(f, twin)) for twin in twins for f in ("NFC", "NFD")})
+    return forms[0] if len(forms) == 1 else f"(?:{'|'.join(forms)})"
 
 
 @cache

@@ -68,8 +68,11 @@ class Database:
         options = {} if self.file else {"isolation_level": "REPEATABLE READ"}
         with explained(self), self.engine.connect() as plain:
             connection = plain.execution_options(**options)
-            with connection.begin():
-                yield connection
+            try:
+                with connection.begin():
+                    yield connection
+            finally:
+                _refuse_torn(self, plain.connection.dbapi_connection)
 
     @contextlib.contextmanager
     def writing(self) -> Iterator[sa.Connection]:
@@ -177,7 +180,25 @@ def file_uri(path: PurePath) -> str:
     return f"file://{'' if text.startswith('/') else '/'}{quote(os.fsencode(text), safe='/:')}"
 
 
-def _opened(path: Path, new: bool) -> sqlite3.Connection:
+class _Connection(sqlite3.Connection):
+    """A connection to a file; `unlocked`: its size and time, where it is read without locks."""
+
+    unlocked: tuple[int, int] | None = None
+
+
+def _state(path: Path) -> tuple[int, int]:
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns
+
+
+def _refuse_torn(database: Database, connection: object) -> None:
+    """Refuse what was read without locks while others wrote: it may be of two states of the registry."""
+    before = connection.unlocked if isinstance(connection, _Connection) else None
+    if before and database.file and before != _state(database.file):
+        raise InputError(f"{database.name}: it was written to while it was read. Try again.")
+
+
+def _opened(path: Path, new: bool) -> _Connection:
     """A connection to a file: to read alone where it, or its folder, may not be written to.
 
     Without the right to write to the folder SQLite cannot keep the log by which readers and writers share a file.
@@ -191,10 +212,13 @@ def _opened(path: Path, new: bool) -> sqlite3.Connection:
         unwritable = code in (sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY)
         if new or not unwritable or log.exists():
             raise
-    return _connected(path, "mode=ro&immutable=1")
+    state = _state(path)
+    connection = _connected(path, "mode=ro&immutable=1")
+    connection.unlocked = state
+    return connection
 
 
-def _connected(path: Path, how: str) -> sqlite3.Connection:
+def _connected(path: Path, how: str) -> _Connection:
     connection = sqlite3.connect(
         f"{file_uri(path.absolute())}?{how}",
         uri=True,

@@ -49,7 +49,7 @@ def command(
     \b
     Example: mwdcal registry drift SIM-0001 --html drift.html --database tools.sqlite
     Example: mwdcal registry drift --limit inclination_deg=0.1 --html fleet.html --database tools.sqlite
-    Exit: 0 compared, 2 there is no such tool, or the registry cannot be opened.
+    Exit: 0 compared, 2 there is no such tool, or the registry cannot be opened, 3 a document was altered.
     """
     from mwdcal.app.commands.records import drift_sources
     from mwdcal.app.pages.records import drift as pages

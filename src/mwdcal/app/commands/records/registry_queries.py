@@ -19,7 +19,10 @@ FIRST = options.preset("--offset", type=click.IntRange(0), default=0, help="Rows
 @options.DATABASE
 @click.option("--kind", metavar="KIND", help="Records of a kind, such as run, instead of tools.")
 @click.option(
-    "--search", default="", metavar="TEXT", help="Only tools with this in serial or type."
+    "--search",
+    default="",
+    metavar="TEXT",
+    help="Only tools with this in serial or type, in any case.",
 )
 @click.option(
     "--due",
@@ -87,7 +90,7 @@ def get(record: str, database: str, output: Path, as_json: bool) -> None:
 
     \b
     Example: mwdcal registry get SIM-0001 -o tool.json --database tools.sqlite
-    Exit: 0 written, 2 there is none, or it cannot be written.
+    Exit: 0 written, 2 there is none, or it cannot be written, 3 it was altered.
     """
     from mwdcal.app.screens.records import registry as screen
     from mwdcal.files.formats import atomic

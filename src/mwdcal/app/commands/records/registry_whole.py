@@ -106,7 +106,7 @@ def export(folder: Path, database: str, as_json: bool) -> None:
 
     \b
     Example: mwdcal registry export tools --database tools.sqlite
-    Exit: 0 written, 2 the folder is not empty, or cannot be written.
+    Exit: 0 written, 2 the folder is not empty, or cannot be written, 3 a document was altered.
     """
     from mwdcal.app.progress import bar
     from mwdcal.app.screens.records import registry as screen
@@ -132,11 +132,12 @@ def export(folder: Path, database: str, as_json: bool) -> None:
 def backup(output: Path, database: str, as_json: bool) -> None:
     """Write a backup of a registry into a FILE, while others go on writing to it.
 
+    The registry and the backup are checked first: a backup of before stays where either is not sound.
     Note the hash that it prints: `check --head` later tells whether all is still there.
 
     \b
     Example: mwdcal registry backup tools-backup.sqlite --database tools.sqlite
-    Exit: 0 written, 2 the registry cannot be opened, or the file cannot be written.
+    Exit: 0 written, 2 the registry cannot be opened, or the file cannot be written, 3 the registry was altered.
     """
     from mwdcal.app.screens.records import registry as screen
     from mwdcal.registry import copies
