@@ -174,6 +174,23 @@ def test_a_registry_that_may_not_be_written_is_read(file, folder, in_use):
         shutil.rmtree(place)
 
 
+@pytest.mark.skipif(os.name == "nt", reason="permissions of folders are POSIX")
+def test_what_others_write_to_while_it_is_read_without_locks_is_refused():
+    place = Path(tempfile.mkdtemp())
+    try:
+        create(place / "tools.registry", "Ada")
+        place.chmod(0o555)
+        with another_user(), open_registry(place / "tools.registry") as registry:
+            user = os.geteuid()
+            with refused("while it was read", "Try again"), registry.reading():
+                os.seteuid(os.getuid())
+                os.utime(place / "tools.registry", ns=(1, 1))
+                os.seteuid(user)
+    finally:
+        place.chmod(0o755)
+        shutil.rmtree(place)
+
+
 def test_network_drives(registry_file, monkeypatch, tmp_path):
     mounts = tmp_path / "mounts"
     folder = str(tmp_path).replace(" ", "\\040")

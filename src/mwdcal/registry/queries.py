@@ -70,7 +70,8 @@ def _contains(text: str) -> sa.ColumnElement[bool]:
 def _any_case(letter: str) -> str:
     """A regular expression for a letter, large or small, composed or not."""
     folded = letter.casefold()
-    twins = {folded, folded.upper(), *_of_same_case().get(folded, ())}
+    more = [] if letter.isascii() else _of_same_case().get(folded, [])
+    twins = {folded, folded.upper(), *more}
     forms = sorted({re.escape(normalize(f, twin)) for twin in twins for f in ("NFC", "NFD")})
     return forms[0] if len(forms) == 1 else f"(?:{'|'.join(forms)})"
 

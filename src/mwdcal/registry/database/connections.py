@@ -219,7 +219,8 @@ def _opened(path: Path, new: bool) -> _Connection:
 
 
 def _connected(path: Path, how: str) -> _Connection:
-    connection = sqlite3.connect(
+    """A connection to a file, opened with some parameters of its URI."""
+    connection = _Connection(
         f"{file_uri(path.absolute())}?{how}",
         uri=True,
         timeout=LONGEST_WAIT,
@@ -227,9 +228,7 @@ def _connected(path: Path, how: str) -> _Connection:
         check_same_thread=False,
     )
     try:
-        connection.execute(
-            "PRAGMA schema_version"
-        )  # reads: this fails where the file cannot be read
+        connection.execute("PRAGMA schema_version")  # fails where the file cannot be read
         connection.execute("PRAGMA synchronous=EXTRA")
         connection.execute("PRAGMA foreign_keys=ON")
         connection.execute("PRAGMA trusted_schema=OFF")
