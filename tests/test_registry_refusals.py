@@ -29,6 +29,7 @@ MISTYPED = [
     "//ada:s3/s3cret@localhost/tools",
     "ada:s3cret@localhost/tools",
     "mysql://ada:k@s3cret@127.0.0.1/tools",
+    "postgresql//ada:my s3cret@localhost/tools",
 ]
 """URLs that lack a sign, or are of another database."""
 

@@ -44,10 +44,10 @@ _UNSAFE = re.compile(f"[{_CONTROL}]")
 UNSAFE_BUT_LINES = re.compile(f"(?!\n)[{_CONTROL}]")
 """Characters that control a terminal or the direction of writing, but for line breaks."""
 _PASSWORD = re.compile(
-    r"((?:[\w+.-]+:?)?//[^\s:@/]*:|\b[\w+.-]{2,}:(?!//))(?!password@)\S+@|(\bpassword *= *)[^\s&'\"]+",
+    r"((?:[\w+.-]+:?)?//[^\s:@/]*:|\b[\w+.-]{2,}:(?!//))(?!password@)(?=\S)[^'\n]*@|(\bpassword *= *)[^\s&'\"]+",
     re.IGNORECASE,
 )
-"""A password, from the colon behind a user to the last @ of the word, or behind its name, with what is before it."""
+"""A password, from the colon behind a user to the last @ before a quote, or behind its name, with what is before it."""
 
 
 def one_line(text: object) -> str:
