@@ -9,7 +9,7 @@ import msgspec
 SHOWN_DRIFT = 3.0
 """A drift is a finding if it is so many times its standard uncertainty; smaller ones are in the uncertainty too."""
 
-STEADY = {
+STEADINESS = {
     "accelerometer-drift": "steady accelerometer offsets",
     "magnetometer-drift": "steady magnetometer offsets",
     "field-drift": "steady field",
@@ -23,7 +23,7 @@ def taken_as_steady(assumed: Sequence[str]) -> str:
     >>> taken_as_steady(["gravity reference", "steady field"])
     'taken as steady during the run, whose order of stations would hide a drift: field. Measure there and back'
     """
-    names = ", ".join(n.removeprefix("steady ") for n in assumed if n in STEADY.values())
+    names = ", ".join(n.removeprefix("steady ") for n in assumed if n in STEADINESS.values())
     words = "taken as steady during the run, whose order of stations would hide a drift"
     return f"{words}: {names}. Measure there and back" if names else ""
 

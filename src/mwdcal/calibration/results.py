@@ -18,7 +18,7 @@ from functools import cached_property
 import numpy as np
 
 from mwdcal.calibration.automatic.courses import misfit_covariance
-from mwdcal.calibration.drift import STEADY
+from mwdcal.calibration.drift import STEADINESS
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.prediction import CalibratedTools
 from mwdcal.calibration.prior import Knowledge
@@ -194,7 +194,7 @@ def assumed_exact(result: Fit, relative: bool) -> list[str]:
     names = ["toolface zero of the stand" if n == "toolface" else f"{n} reference" for n in exact]
     dip = float(unconfirmed_dip(result)[0])
     signs = [] if np.isnan(dip) else [SIGNS[dip < 0]]
-    return [*names, *signs, *(STEADY[name] for name in unseen_drifts(result))]
+    return [*names, *signs, *(STEADINESS[name] for name in unseen_drifts(result))]
 
 
 def unseen_drifts(result: Fit) -> list[str]:
