@@ -147,7 +147,7 @@ def test_every_source_that_is_declared_has_a_line_and_the_others_are_named_as_ex
     assert declared <= {*lines}
     assert lines["toolface-zero-of-the-stand"].toolface_deg == pytest.approx(0.02, rel=1e-3)
     exact = {key for key, line in lines.items() if line.basis.startswith("assumed exact")}
-    steady = {key for key in exact if key.endswith("during-the-run")}
+    steady = {key for key in exact if key.startswith("steady-")}
     assert exact - steady == {"inclination-zero-of-the-stand"}
     assert len(steady) == 3  # its soaks only become hotter: a drift looks like temperature
     assert lines["noise-of-the-readings"].kind == "A"

@@ -2,10 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import msgspec
 
 SHOWN_DRIFT = 3.0
 """A drift is a finding if it is so many times its standard uncertainty; smaller ones are in the uncertainty too."""
+
+STEADINESS = {
+    "accelerometer-drift": "steady accelerometer offsets",
+    "magnetometer-drift": "steady magnetometer offsets",
+    "field-drift": "steady field",
+}
+"""What is taken as exact of a run in which a drift would not show."""
+
+
+def taken_as_steady(assumed: Sequence[str]) -> str:
+    """What is said of the steadiness among things assumed exact: nothing where there is none.
+
+    >>> taken_as_steady(["gravity reference", "steady field"])
+    'taken as steady during the run, whose order of stations would hide a drift: field. Measure there and back'
+    """
+    names = ", ".join(n.removeprefix("steady ") for n in assumed if n in STEADINESS.values())
+    words = "taken as steady during the run, whose order of stations would hide a drift"
+    return f"{words}: {names}. Measure there and back" if names else ""
 
 
 class Constant(msgspec.Struct, frozen=True, kw_only=True):

@@ -236,7 +236,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     `covariance` is of the parameters of all triads in order, scaled by s² where that is
     estimated; `free` are directions (rows) of parameter space that no evidence determines.
     `budget` says what each source of error adds to the accuracy to expect; `assumed_exact` names
-    references without a declared uncertainty whose error no residual would show.
+    what is taken as exact though no residual would show its error: references, signs, steadiness during the run.
     `inherited` are the fingerprints of the stations behind the prior, if there was one;
     `excluded` the labels of stations of the run that were left out of the fit, on request or as copies of others;
     `copies` the fingerprints of copies, absent where there are none.

@@ -18,6 +18,7 @@ from functools import cached_property
 import numpy as np
 
 from mwdcal.calibration.automatic.courses import misfit_covariance
+from mwdcal.calibration.drift import STEADINESS
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.prediction import CalibratedTools
 from mwdcal.calibration.prior import Knowledge
@@ -38,12 +39,6 @@ SIGNS = (
     "signs of the magnetometer at a southern site",
 )
 """What is assumed where only the profile says which hemisphere the dip is of: northern, southern."""
-STEADINESS = {
-    "accelerometer-drift": "steady offsets of the accelerometer during the run",
-    "magnetometer-drift": "steady offsets of the magnetometer during the run",
-    "field-drift": "a steady field during the run",
-}
-"""What is assumed where a drift would not show."""
 EVEN = 1e-6
 """Departure of a correlation matrix from symmetry that is left as it is."""
 

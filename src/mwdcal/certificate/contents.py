@@ -17,6 +17,7 @@ import msgspec
 from msgspec.structs import replace
 
 from mwdcal.calibration.canonical import canonical, rounded
+from mwdcal.calibration.drift import STEADINESS, taken_as_steady
 from mwdcal.calibration.readings import is_simulated, serial_of, stated_day
 from mwdcal.calibration.record import SOFTWARE, Calibration, Finding
 from mwdcal.calibration.settings import ASSUMED, ASSUMED_PRACTICE
@@ -335,7 +336,10 @@ def _out_of_date(standard: TracedStandard, calibrated: str) -> Iterator[Finding]
 
 
 def _exact(calibration: Calibration) -> Iterator[Finding]:
-    if names := assumed_exact(calibration):
+    assumed = assumed_exact(calibration)
+    if steady := taken_as_steady(assumed):
+        yield Finding(id="assumed-steady", text=f"{steady}.")
+    if names := [name for name in assumed if name not in STEADINESS.values()]:
         text = (
             f"assumed exact in the budget: {', '.join(names)}. State their uncertainty in [stand] of the tool "
             "profile, and calibrate again."
