@@ -21,17 +21,21 @@ from mwdcal.calibration.drift import Constant, Drift
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import accuracy
-from mwdcal.calibration.readings import TRIADS, Readings, is_simulated, serial_of
+from mwdcal.calibration.prior import Knowledge
+from mwdcal.calibration.readings import TRIADS, WORDS, Readings, is_simulated, serial_of
 from mwdcal.calibration.record import (
     SOFTWARE,
     BudgetRow,
     Calibration,
     Choices,
+    Finding,
     StandErrors,
     TriadCalibration,
     Undetermined,
+    from_the_future,
     sealed,
     stated,
+    unidentified,
 )
 from mwdcal.calibration.residuals import error_rows, measure_rows
 from mwdcal.calibration.settings import ASSUMED_PRACTICE, DIRECTION, is_assumed
@@ -43,7 +47,7 @@ from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.models import Polynomial
 from mwdcal.sensor.profile import PRACTICES, Profile
 
-IDENTITY = ("serial", "tool", "operator", "lab", "date", "stand", "simulated")
+IDENTITY = (*WORDS, "simulated")
 
 
 def calibrate(
@@ -148,8 +152,15 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
         orders=list(choice.orders),
         station_rows=fitted.residuals(0).stations,
         inherited=list(prior.stations) if prior else [],
-        findings=findings(fitted),
+        findings=[*findings(fitted), *_doubts(readings, prior)],
     )
+
+
+def _doubts(readings: Readings, prior: Knowledge | None) -> list[Finding]:
+    """Findings on the identity of a run and its prior, and on its day."""
+    alone = unidentified({readings.name: serial_of(readings.metadata)})
+    doubts = [*prior.doubts] if prior and prior.doubts else alone
+    return doubts + from_the_future(readings.metadata, readings.name)
 
 
 def _identity(readings: Readings, simulated: bool) -> dict[str, str]:

@@ -24,7 +24,7 @@ def prepared(calibration: Calibration, readings: Readings) -> tuple[Readings, li
     """
     _check(calibration, readings)
     calibration.fields(readings)  # refuses readings that lack what the calibration needs
-    findings = []
+    findings = calibration.doubts(readings)
     if readings.magnetometer is not None and not calibration.has_field:
         readings = replace(readings, magnetometer=None)
     if calibration.has_field and readings.magnetometer is None:

@@ -346,6 +346,7 @@ def _findings(test: RollTest, skipped: Sequence[str]) -> Iterator[Finding]:
     warmth = readings.temperature
     tested = "" if warmth is None else _span(float(warmth.min()), float(warmth.max()))
     yield from calibration.change_findings()
+    yield from calibration.doubts(readings)
     if beyond := int(calibration.outside(readings, MARGIN).sum()):
         where = f"{beyond} of {readings.count} stations ({tested} °C)"
         calibrated = _span(*calibration.temperature_c or (np.nan, np.nan))
