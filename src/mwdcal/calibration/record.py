@@ -609,7 +609,10 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
 
     def doubts(self, readings: Readings) -> list[Finding]:
         """Findings on the identity of readings: a serial that is not stated, a day that is still to come."""
-        serials = {"the calibration": serial_of(self.tool), readings.name: serial_of(readings.metadata)}
+        serials = {
+            "the calibration": serial_of(self.tool),
+            readings.name: serial_of(readings.metadata),
+        }
         return unidentified(serials) + from_the_future(readings.metadata, readings.name)
 
     def undetermined(self) -> list[Undetermined]:

@@ -242,7 +242,10 @@ def _check_test(document: Verification, calibration: Calibration, order: Order) 
 def _doubts(document: Verification, calibration: Calibration, order: Order) -> list[Finding]:
     """What a roll test says of its identity, and whether it states that it is of the tool of the calibration."""
     said = [each for each in document.findings if each.id in (UNIDENTIFIED, FROM_THE_FUTURE)]
-    serials = {_argument(document, order): document.serial, "the calibration": serial_of(calibration.tool)}
+    serials = {
+        _argument(document, order): document.serial,
+        "the calibration": serial_of(calibration.tool),
+    }
     return said or unidentified(serials)
 
 

@@ -15,7 +15,13 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from mwdcal.calibration.readings import Readings, fingerprints, group_numbers, is_simulated, serial_of
+from mwdcal.calibration.readings import (
+    Readings,
+    fingerprints,
+    group_numbers,
+    is_simulated,
+    serial_of,
+)
 from mwdcal.errors import InputError
 from mwdcal.files import synonyms
 from mwdcal.files.contract import (
@@ -81,7 +87,8 @@ def read_export(
     if isinstance(form, msgspec.UnsetType):
         return tables.read(path, decimal=decimal, rows=rows)
     try:
-        table = tables.read(path, rows=rows, export=form)
+        serial = _sources(profile).get("serial", ColumnSource(name="serial")).name
+        table = tables.read(path, rows=rows, export=form, serial=serial)
         if is_export(table.columns, profile):
             _check_below_names(path, form, profile)
             return table

@@ -159,7 +159,9 @@ def _truth(tool: int | tuple[ArrayLike, ArrayLike] | Truth) -> Truth:
         return tool
     if isinstance(tool, int):
         return simulation.servo(np.random.default_rng(tool))
-    accelerometer, magnetometer = (without_mask(np.ma.array(factors, dtype=float)) for factors in tool)
+    accelerometer, magnetometer = (
+        without_mask(np.ma.array(factors, dtype=float)) for factors in tool
+    )
     for factors in (accelerometer, magnetometer):
         if factors.shape != (30,):
             raise InputError(

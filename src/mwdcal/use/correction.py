@@ -232,11 +232,15 @@ def findings(
         "moved": ", ".join(tally.moved),
         "free": ", ".join(dict.fromkeys(u.id for u in calibration.undetermined())),
     }
-    return calibration.change_findings() + calibration.doubts(readings) + [
-        Finding(id=name, text=text.format(tally=tally, tools=tools, off=off, **words))
-        for name, text in ROW_FINDINGS.items()
-        if applies[name]
-    ]
+    return (
+        calibration.change_findings()
+        + calibration.doubts(readings)
+        + [
+            Finding(id=name, text=text.format(tally=tally, tools=tools, off=off, **words))
+            for name, text in ROW_FINDINGS.items()
+            if applies[name]
+        ]
+    )
 
 
 def undetermined(

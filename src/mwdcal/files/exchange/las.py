@@ -181,8 +181,8 @@ def _entries(items: Sequence[Any]) -> dict[str, object]:
 def _serial(lines: Sequence[str], lasio: Any) -> dict[str, object]:
     """The serial as the header writes it: lasio makes a number of 12.10."""
     stated = [line for line in lines if re.match(r"SERIAL *\.", line)]
-    items = [lasio.reader.read_header_line(line) for line in stated]
-    return {"serial": item["value"] for item in items if item["value"]}
+    values = [lasio.reader.read_header_line(line)["value"] for line in stated]
+    return {"serial": values[-1]} if any(values) else {}
 
 
 def _rows(
