@@ -14,6 +14,7 @@ from mwdcal.calibration.automatic.order_selection import Progress
 from mwdcal.calibration.canonical import rounded
 from mwdcal.calibration.diagnosis.findings import described, findings
 from mwdcal.calibration.diagnosis.flags import FittedRuns
+from mwdcal.calibration.diagnosis.identity import from_the_future, unidentified
 from mwdcal.calibration.diagnosis.refusals import UNSOUND_ADVICE, check, fit_refusals
 from mwdcal.calibration.diagnosis.repeats import copies
 from mwdcal.calibration.diagnosis.soundness import inconsistency
@@ -32,10 +33,8 @@ from mwdcal.calibration.record import (
     StandErrors,
     TriadCalibration,
     Undetermined,
-    from_the_future,
     sealed,
     stated,
-    unidentified,
 )
 from mwdcal.calibration.residuals import error_rows, measure_rows
 from mwdcal.calibration.settings import ASSUMED_PRACTICE, DIRECTION, is_assumed

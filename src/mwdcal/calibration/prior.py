@@ -13,8 +13,9 @@ from typing import Literal
 import numpy as np
 from msgspec.structs import replace as replace_struct
 
+from mwdcal.calibration.diagnosis.identity import other_tool, unidentified
 from mwdcal.calibration.readings import HIGHEST, TRIADS, Readings, is_simulated, serial_of
-from mwdcal.calibration.record import Calibration, Finding, unidentified
+from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.problem import Prior
 from mwdcal.geometry.vectors import Array
@@ -158,7 +159,7 @@ def for_run(previous: Calibration, readings: Readings) -> Knowledge:
     Raises `InputError` for a run of another tool, or of stations that the calibration has used.
     """
     where = f"`prior`: the calibration of {previous.run_name}"
-    if other := previous.other_tool(readings):
+    if other := other_tool(previous, readings):
         raise InputError(
             f"{where} is of tool {other[0]}, the run is of {other[1]}. Give the previous calibration "
             "of the same tool."

@@ -41,7 +41,7 @@ HIGHEST = 3
 """The highest temperature order of a model."""
 WORDS = ("serial", "tool", "operator", "lab", "date", "stand")
 """Metadata that are text, whatever they look like: a serial 12.10 is not 12.1."""
-_DAY = re.compile(r"(\d{4}-?\d\d-?\d\d)([T ].*)?", re.ASCII | re.DOTALL)
+_ISO_DAY = re.compile(r"(\d{4}-?\d\d-?\d\d)([T ].*)?", re.ASCII | re.DOTALL)
 _FIRST_ON_EARTH = timedelta(hours=14)
 """By how much the clocks of the easternmost places are ahead of UTC."""
 
@@ -62,7 +62,7 @@ def stated_day(metadata: Mapping[str, object]) -> date | None:
 
     Returns None if there is no such date. Files and `mwdcal.readings` refuse other texts: `check_day`.
     """
-    day = _DAY.fullmatch(str(metadata.get("date")).strip())
+    day = _ISO_DAY.fullmatch(str(metadata.get("date")).strip())
     try:
         return date.fromisoformat(day[1]) if day else None
     except ValueError:

@@ -6,7 +6,7 @@ a calibration in memory and one read back give the same results.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import date, datetime
 from itertools import pairwise
 from typing import Any, ClassVar
@@ -18,15 +18,7 @@ from mwdcal import __version__
 from mwdcal.calibration.canonical import Signature, document_sha256
 from mwdcal.calibration.drift import Constant, Drift
 from mwdcal.calibration.notebooks import html_table
-from mwdcal.calibration.readings import (
-    NANOTESLA,
-    SOAK_GAP,
-    Readings,
-    future_day,
-    serial_of,
-    simulated,
-    stated_day,
-)
+from mwdcal.calibration.readings import NANOTESLA, SOAK_GAP, Readings, simulated, stated_day
 from mwdcal.calibration.tilt import tilt_width
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
@@ -68,32 +60,6 @@ class Finding(msgspec.Struct, frozen=True, kw_only=True):
     id: str
     text: str
     station: str | None = None
-
-
-UNIDENTIFIED, FROM_THE_FUTURE = "no-serial", "future-date"
-"""Findings on the identity of data: ids."""
-
-
-def unidentified(serials: Mapping[str, str | None]) -> list[Finding]:
-    """A finding if one of the things that are to be of one tool, by name, states no serial."""
-    lacking = [name for name, serial in serials.items() if serial is None]
-    if not lacking:
-        return []
-    states = "states" if len(lacking) == 1 else "state"
-    unknown = "that they are of the same tool" if len(serials) > 1 else "which tool it is of"
-    text = (
-        f"{' and '.join(lacking)} {states} no serial: nothing shows {unknown}. State it in the run, as in "
-        '# serial = "MWD-17".'
-    )
-    return [Finding(id=UNIDENTIFIED, text=text)]
-
-
-def from_the_future(metadata: Mapping[str, object], name: str) -> list[Finding]:
-    """A finding if metadata state a day that is still to come."""
-    if (day := future_day(metadata)) is None:
-        return []
-    text = f"{name} states the date {day}, which is still to come. Correct it, or the clock of this computer."
-    return [Finding(id=FROM_THE_FUTURE, text=text)]
 
 
 class Undetermined(msgspec.Struct, frozen=True, kw_only=True):
@@ -601,19 +567,6 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         scale = {"g": np.linalg.norm(g, axis=-1), "nT": np.linalg.norm(b, axis=-1)}
         limit = FREE_SHARE * scale.get(OBSERVABLES[name].unit, np.ones(shape))
         return np.asarray(np.any(change > np.nan_to_num(limit)[..., None], -1))
-
-    def other_tool(self, readings: Readings) -> tuple[str, str] | None:
-        """Our serial and the readings', where both are stated and differ."""
-        ours, theirs = serial_of(self.tool), serial_of(readings.metadata)
-        return None if ours is None or theirs is None or ours == theirs else (ours, theirs)
-
-    def doubts(self, readings: Readings) -> list[Finding]:
-        """Findings on the identity of readings: a serial that is not stated, a day that is still to come."""
-        serials = {
-            "the calibration": serial_of(self.tool),
-            readings.name: serial_of(readings.metadata),
-        }
-        return unidentified(serials) + from_the_future(readings.metadata, readings.name)
 
     def undetermined(self) -> list[Undetermined]:
         """Free directions of all triads, each once."""

@@ -17,16 +17,14 @@ import msgspec
 from msgspec.structs import replace
 
 from mwdcal.calibration.canonical import canonical, rounded
-from mwdcal.calibration.readings import check_day, is_simulated, serial_of, stated_day
-from mwdcal.calibration.record import (
+from mwdcal.calibration.diagnosis.identity import (
     FROM_THE_FUTURE,
-    SOFTWARE,
     UNIDENTIFIED,
-    Calibration,
-    Finding,
     from_the_future,
     unidentified,
 )
+from mwdcal.calibration.readings import check_day, is_simulated, serial_of, stated_day
+from mwdcal.calibration.record import SOFTWARE, Calibration, Finding
 from mwdcal.calibration.settings import ASSUMED, ASSUMED_PRACTICE
 from mwdcal.certificate.budget import assumed_exact, budget
 from mwdcal.certificate.decisions import When, conformity

@@ -182,7 +182,7 @@ OURS = ("time_s", "start_s", "end_s", "samples", "drifting", "serial", "simulate
 """Columns beyond the contract that mwdcal itself reads or writes in run files."""
 _COPIED = ("drift_", "witsml ")
 """What columns begin with that mwdcal writes of a log, and that a WITSML file has beyond a run's."""
-_IN_BRACKETS = re.compile(r"(.*\S)\s*[(\[{]([^(\[{]*)[)\]}]", re.DOTALL)
+_BRACKETED = re.compile(r"(.*\S)\s*[(\[{]([^(\[{]*)[)\]}]", re.DOTALL)
 _CASED = {
     "mV": " mv ",
     "nT": " nt ",
@@ -208,9 +208,9 @@ def resembled(name: str) -> Resemblance | None:
     >>> resembled("HX [ADC]")
     Resemblance(column='mx', unit='ADC')
     """
-    found, bracketed = _resembled(name), _IN_BRACKETS.fullmatch(name.strip())
-    if found or not bracketed or not (bare := _resembled(bracketed[1])):
-        return found
+    whole, bracketed = _resembled(name), _BRACKETED.fullmatch(name.strip())
+    if whole or not bracketed or not (bare := _resembled(bracketed[1])):
+        return whole
     return bare._replace(unit=bracketed[2].strip())
 
 

@@ -148,9 +148,9 @@ def _check_hidden(triad: str, channels: Sequence[str], others: Sequence[str], so
     hidden = [name for name in others if begins_as(name) in channels]
     if hidden:
         raise FitError(
-            f"{source}: {', '.join(map(shown, hidden[:6]))} begin as channels of the {triad} do, and end in what is no "
-            f"known unit. If they are the channels, put the unit in brackets, as in 'Bx (counts)'; if they are something "
-            "else, give them names that say so."
+            f"{source}: {', '.join(map(shown, hidden[:6]))} begin as channels of the {triad} do, and end in what is "
+            "no known unit. If they are the channels, put the unit in brackets, as in 'Bx (counts)'; if they are "
+            "something else, give them names that say so."
         )
 
 

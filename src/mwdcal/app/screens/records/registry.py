@@ -11,8 +11,9 @@ import msgspec
 from mwdcal.app.envelope import enveloped
 from mwdcal.app.screens.numbers import number
 from mwdcal.app.text import UNCUT, one_line, plural, table
+from mwdcal.calibration.diagnosis.identity import FROM_THE_FUTURE, UNIDENTIFIED
 from mwdcal.calibration.readings import SIMULATED
-from mwdcal.calibration.record import FROM_THE_FUTURE, UNIDENTIFIED, Finding
+from mwdcal.calibration.record import Finding
 from mwdcal.files.formats.columns import shown
 from mwdcal.registry.checking import Discrepancy
 from mwdcal.registry.imports import Adding, FileResult
