@@ -16,6 +16,7 @@ from scipy import stats
 
 import mwdcal
 from cli_support import EXAMPLE, servo_run, write_csv
+from mwdcal.calibration.record import Finding
 from mwdcal.certificate import contents, decisions
 from mwdcal.certificate.budget import budget
 from mwdcal.certificate.contents import Order, certificate
