@@ -197,7 +197,7 @@ def test_readings_outside_the_calibrated_temperatures_are_blank(tmp_path, warm):
 def test_readings_outside_may_be_extrapolated(tmp_path, warm):
     ran, path = applied(tmp_path, warm, surveys(OUTSIDE), "--outside", "extrapolate", "--json")
     assert all(numbers(read_csv(path)["inclination_deg"]) >= 0)
-    assert [f["id"] for f in ran.json["findings"]] == ["outside-temperature"]
+    assert [f["id"] for f in ran.json["findings"]] == ["no-serial", "outside-temperature"]
     assert "extrapolated, with no statement of accuracy" in ran.err
 
 

@@ -319,7 +319,9 @@ def test_a_test_of_the_same_soak_is_not_refused(tmp_path, fitted):
     assert ran.code == 0
     assert "12 of 12 stations (27.5 °C) lie outside the calibrated range 25.0 °C" in ran.err
     out = tmp_path / "o.csv"
-    assert mwdcal("apply", fitted[0], tmp_path / "r.csv", "-o", out).err == ""
+    warned = mwdcal("apply", fitted[0], tmp_path / "r.csv", "-o", out).err
+    assert warned.count("!") == 1
+    assert "state no serial" in warned
 
 
 def test_a_test_outside_the_calibrated_temperatures_is_refused(tmp_path, fitted):

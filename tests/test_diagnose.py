@@ -434,8 +434,8 @@ def test_effects_refuse_a_channel_that_the_fault_lacks(text, tmp_path):
 def test_a_run_of_the_tests_own_model_is_still_fine(tmp_path):
     """Readings by the formulas of the tests, not of the package; those of another tool are not explained."""
     sound = Tool.random(1, noise=SERVO_NOISE)
-    write_csv(tmp_path / "run.csv", servo_run(1, tool=sound))
-    write_csv(tmp_path / "later.csv", servo_run(2, (30, 80), 6, tool=sound))
+    write_csv(tmp_path / "run.csv", servo_run(1, tool=sound), "serial = A")
+    write_csv(tmp_path / "later.csv", servo_run(2, (30, 80), 6, tool=sound), "serial = A")
     fit = ("calibrate", tmp_path / "run.csv", "--tool", "servo", "-o", tmp_path / "cal.json")
     assert command(*fit).code == 0
     ran = command("diagnose", tmp_path / "cal.json", tmp_path / "later.csv")

@@ -400,10 +400,10 @@ def test_nested_metadata_of_a_parquet_file_are_refused(tmp_path):
 @pytest.mark.parametrize("digits", [30, 300])
 def test_long_whole_numbers_in_metadata_become_text(tmp_path, digits):
     number = "9" * digits
-    described = {b"mwdcal": f'{{"serial": {number}}}'.encode()}
+    described = {b"mwdcal": f'{{"code": {number}}}'.encode()}
     pq.write_table(table().replace_schema_metadata(described), tmp_path / "in.parquet")
-    assert read(tmp_path / "in.parquet").metadata == {"serial": number}
-    assert metadata.parse([(1, f"# serial = [{number}]")], "run.csv") == {"serial": [number]}
+    assert read(tmp_path / "in.parquet").metadata == {"code": number}
+    assert metadata.parse([(1, f"# code = [{number}]")], "run.csv") == {"code": [number]}
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes on this system")

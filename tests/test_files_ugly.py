@@ -388,3 +388,37 @@ def test_a_damaged_byte_gives_a_run_or_an_input_error(tmp_path, suffix, position
     data[int(position * len(data))] = byte
     path.write_bytes(data)
     read_or_refuse(path)
+
+
+CELLS = {
+    "no value": ('<c r="J2"><f>5+20*0</f></c>', True),
+    "an empty one": ('<c r="J2"><f>5+20*0</f><v></v></c>', True),
+    "of text": ('<c r="J2" t="str"><f>"a"</f><v></v></c>', False),  # its value is an empty text
+    "a number": ('<c r="J2"><f>5+20*0</f><v>5</v></c>', False),
+    "of others": ('<c r="J2"><f t="shared" si="0"/></c>', True),
+}
+
+
+@pytest.mark.parametrize("name", CELLS)
+def test_formulas_that_nobody_has_calculated_are_refused_by_their_cells(tmp_path, name):
+    """Programs that write workbooks leave the value out; read as blank, a reference would be unknown."""
+    cell, lost = CELLS[name]
+    cells = [*zip(HEADER.split(","), ROW.split(","), strict=True)]
+    columns = {name: [value] for name, value in cells if not name.startswith("sd_")}
+    write(tmp_path / "run.xlsx", Table(columns))
+    with zipfile.ZipFile(tmp_path / "run.xlsx") as book:
+        parts = {each: book.read(each) for each in book.namelist()}
+    sheet = "xl/worksheets/sheet1.xml"
+    text = parts[sheet].decode()
+    start = text.index('<c r="J2"')
+    end = text.index("</c>", start) + len("</c>")
+    parts[sheet] = (text[:start] + cell + text[end:]).encode()
+    with zipfile.ZipFile(tmp_path / "run.xlsx", "w") as book:
+        for each, content in parts.items():
+            book.writestr(each, content)
+    if lost:
+        assert "run.xlsx: formulas without a value, in the cells J2 (=" in refusal(
+            tmp_path / "run.xlsx"
+        )
+    else:
+        assert read_run(tmp_path / "run.xlsx", GENERIC)[0].count == 1

@@ -79,7 +79,7 @@ def test_header_names_and_units(tmp_path):
     assert table.metadata == {
         "las COMP": "ANY OIL COMPANY INC.",
         "well": "AAAAA_2",
-        "serial": 77,
+        "serial": "77",
         "las DECL (DEG)": -4.5,
         "accelerometer_unit": "g",
         "magnetometer_unit": "µT",
@@ -223,7 +223,7 @@ NAMES = [
     "MD",
 ]
 states = st.dictionaries(
-    st.sampled_from(["serial", "well", "accelerometer_unit"]) | st.text(min_size=1, max_size=8).filter(str.isprintable),
+    st.sampled_from(["code", "well", "accelerometer_unit"]) | st.text(min_size=1, max_size=8).filter(str.isprintable),
     st.sampled_from(["g", "m/s²", "A: b", "~A"]) | st.integers(-9, 9) | finite
     | st.text(max_size=9).filter(str.isprintable),
 )  # fmt: skip

@@ -490,3 +490,33 @@ def test_units_that_only_the_values_tell_are_said(tmp_path):
     assert mwdcal("profile", path, "-o", tmp_path / "tool.toml", "--json").json[
         "unit_by_values"
     ] == ["ref_field_nt"]
+
+
+@pytest.mark.parametrize("triad", ["A", "M"])
+@pytest.mark.parametrize("unit", ["(mV)", "[ADC]", "_mV", "(1e-3 V)", "_adc", " digits", " uV"])
+def test_no_unit_hides_a_channel(tmp_path, triad, unit):
+    """A unit that is known, or in brackets, is a note: the scale is told by the readings. Another is asked about."""
+    run = servo_run(seed=2)
+    names = {f"{t.lower()}{i}": f"{'GH'[t == 'M']}{i.upper()}" for t in "AM" for i in "xyz"}
+    names = {k: v + unit * (k[0] == triad.lower()) for k, v in names.items()}
+    columns = {names.get(name, name): cells for name, cells in run.items()}
+    path = write_csv(tmp_path / "run.csv", columns, 'serial = "A"')
+    ran = mwdcal("profile", path, "-o", tmp_path / "tool.toml")
+    if unit in ("_adc", " digits", " uV"):
+        message = refused(ran, 3)
+        assert all(repr(name) in message for name in columns if name.endswith(unit))
+        assert "no known unit" in message
+        return
+    assert ran.code == 0, ran.err
+    cal = mwdcal(
+        "calibrate", path, "--tool", tmp_path / "tool.toml", "-o", tmp_path / "c.json", "--json"
+    )
+    assert [name for name, each in cal.json["triads"].items() if each] == list(TRIADS)
+
+
+def test_a_channel_of_a_run_file_with_any_unit_is_not_left_out(tmp_path):
+    renamed = {f"m{i}": f"m{i} [ADC]" for i in "xyz"}
+    columns = {renamed.get(name, name): cells for name, cells in servo_run(seed=2).items()}
+    path = write_csv(tmp_path / "run.csv", columns)
+    message = refused(mwdcal("calibrate", path, "--tool", "servo", "-o", tmp_path / "c.json"), 2)
+    assert "'mx [ADC]' must be spelled exactly as documented. Did you mean 'mx'?" in message

@@ -335,7 +335,7 @@ def test_short_representations(cal, rolltest):
         assert len(repr(thing)) < 400
         assert "\n" not in repr(thing)
     assert "accelerometer 12 of 12" in repr(cal)
-    assert "findings none" in repr(cal)
+    assert "findings no-serial" in repr(cal)
     assert repr(verdict).startswith("<Verdict: passed, ")
     for html in (cal._repr_html_(), verdict._repr_html_()):
         assert html.startswith("<table>")
@@ -538,3 +538,60 @@ def test_the_bundled_example_is_what_its_script_writes(tmp_path):
     subprocess.run([sys.executable, tmp_path / "make.py"], check=True, env=os.environ)
     for name in CONTENTS:
         assert (tmp_path / name).read_bytes() == (folder / name).read_bytes()
+
+
+# ------------------------------------------------------------------ masks
+
+
+def hidden(values, where, wrong):
+    """Values with something wrong below the mask at some places, in the forms that masks come in."""
+    data, mask = np.array(values, float), np.zeros(np.shape(values), bool)
+    data[where], mask[where] = wrong, True
+    whole = np.ma.array(data, mask=mask)
+    return [whole, list(whole)] if data.ndim > 1 else [whole]
+
+
+def test_a_masked_reference_is_unknown(simulated):
+    known = {n: simulated.known[n] for n in ("inclination", "azimuth", "toolface")}
+    raw = simulated.accelerometer, simulated.magnetometer
+    for name, angles in known.items():
+        (masked,) = hidden(angles, [0, 3], 1.0)
+        blank = np.where(np.isin(np.arange(len(angles)), [0, 3]), np.nan, angles)
+        one, other = (
+            mwdcal.readings(*raw, field=48_000.0, **{**known, name: values})
+            for values in (masked, blank)
+        )
+        np.testing.assert_array_equal(one.known[name], other.known[name])
+        np.testing.assert_array_equal(np.flatnonzero(np.isnan(one.known[name])), [0, 3])
+
+
+def test_a_masked_reading_is_missing(simulated):
+    for place, values in enumerate((simulated.accelerometer, simulated.magnetometer)):
+        for masked in hidden(values, (5, 1), 0.5):
+            both = [simulated.accelerometer, simulated.magnetometer]
+            both[place] = masked
+            with pytest.raises(mwdcal.InputError, match="finite; got nan at station 6"):
+                mwdcal.readings(*both)
+    temperature = np.ma.array(np.full(simulated.count, 25.0), mask=np.arange(simulated.count) == 2)
+    with pytest.raises(mwdcal.InputError, match="`temperature` .*got nan at station 3"):
+        mwdcal.readings(simulated.accelerometer, temperature=temperature)
+
+
+def test_masked_labels_are_blank(simulated):
+    group = np.ma.array(np.arange(simulated.count) // 12, mask=np.arange(simulated.count) < 2)
+    assert mwdcal.readings(simulated.accelerometer, group=group).groups[:3].tolist() == [-1, -1, 0]
+
+
+def test_masked_cells_of_a_table_are_blank():
+    columns = {
+        name: numbers(cells) for name, cells in read_csv(EXAMPLE / "run.csv").items() if cells
+    }
+    name = "ref_inclination_deg"
+    (columns[name],) = hidden(columns[name], [0, 1], 90.0)
+    columns["serial"] = np.ma.array(["A"] * 48, mask=np.arange(48) < 3)
+    run = mwdcal.read_run(columns, EXAMPLE / "tool.toml")
+    assert np.flatnonzero(np.isnan(run.known["inclination"])).tolist() == [0, 1]
+    assert run.metadata["serial"] == "A"
+    (columns["ax"],) = hidden(columns["ax"], [4], 0.0)
+    with pytest.raises(mwdcal.InputError, match="row 5, column 'ax'"):
+        mwdcal.read_run(columns, EXAMPLE / "tool.toml")

@@ -282,7 +282,7 @@ def test_days_and_serials_that_people_write_otherwise_are_named(example, tmp_pat
     for number, serial in enumerate(("Ab-1", "AB -1", "ab\u20101", "AB-11", "AB-11b")):
         changed = text.replace("SIM-0001", serial)
         if number == 3:
-            changed = changed.replace("2022-03-01", "01.03.2022")
+            changed = changed.replace('date = "2022-03-01"', 'operator = "B"')
         (runs / f"{number}.csv").write_text(changed, "utf-8")
     tool = ("--tool", example / "tool.toml", "--workers", 1)
     run("fleet", runs, *tool, "-o", tmp_path / "all.parquet")

@@ -119,7 +119,7 @@ def test_parts_of_any_size_give_the_whole(tmp_path, warm, least, group):
         made, source, out, "blank", lambda *done: seen.append(done), rows=321, least=least
     )
     assert (told[0].rows, told[1]) == (5000, findings)
-    assert [f.id for f in findings] == ["outside-temperature"]
+    assert [f.id for f in findings] == ["no-serial", "outside-temperature"]
     assert seen[-1] == (5000, 5000)
     assert_same(out, wanted)
     assert out.stat().st_size < 2 * 5000 * 8 * 28 + 50_000
@@ -316,7 +316,9 @@ def test_missing_readings_by_the_command(tmp_path, cold, suffix):
     command = ("apply", cold[0], source, "-o", tmp_path / "out.csv")
     assert "column 'ay': must be filled in; got a blank cell." in refused(mwdcal(*command), 2)
     ran = mwdcal(*command, "--missing", "blank", "--outside", "extrapolate", "--json")
-    assert [f["id"] for f in ran.json["findings"]] == ["missing-reading", "outside-temperature"]
+    assert [f["id"] for f in ran.json["findings"]] == [
+        *("no-serial", "missing-reading", "outside-temperature"),
+    ]
     found = read_csv(tmp_path / "out.csv")
     np.testing.assert_array_equal(np.isnan(numbers(found["gz_g"])), ~sound)
     assert list(found)[-2:] == ["sd_magnetic_toolface_deg", "extrapolated"]
@@ -358,7 +360,7 @@ def test_wholly_blank_columns_are_absent_and_not_missing(tmp_path, cold):
     columns, _ = gappy(3000, dict.fromkeys(names, slice(0, 3000)))
     source, out = write_parquet(tmp_path / "log.parquet", columns), tmp_path / "out.parquet"
     ran = mwdcal("apply", cold[0], source, "-o", out, "--missing", "blank", "--json")
-    assert [f["id"] for f in ran.json["findings"]] == ["no-magnetometer"]
+    assert [f["id"] for f in ran.json["findings"]] == ["no-serial", "no-magnetometer"]
     assert_same(out, whole(cold[1], source)[0])
 
 
@@ -668,7 +670,7 @@ def test_findings_of_a_long_text_table_stand_above_its_header(tmp_path, small_pi
     source = write_csv(tmp_path / "log.csv", {k: v for k, v in log().items() if k[0] != "m"})
     ran = mwdcal("apply", calibration, source, "-o", tmp_path / "out.csv", "--json")
     assert [f["id"] for f in ran.json["findings"]] == [
-        *("no-magnetometer", "outside-temperature", "undetermined"),
+        *("no-serial", "no-magnetometer", "outside-temperature", "undetermined"),
     ]
     found = table.read(tmp_path / "out.csv")
     assert found.metadata["findings"] == [f["text"] for f in ran.json["findings"]]
@@ -684,7 +686,8 @@ def test_a_corrected_table_has_one_line_of_findings(tmp_path, warm, small_pieces
     written = (tmp_path / "out.csv").read_text().splitlines()
     assert sum(line.startswith("# findings = ") for line in written) == 1
     said = [finding["text"] for finding in ran.json["findings"]]
-    assert (said == []) == (low == 10.0)
+    assert [text for text in said if "no serial" in text] == said[:1]
+    assert (said[1:] == []) == (low == 10.0)
     found = table.read(tmp_path / "out.csv").metadata
     assert (found["findings"], found["lab"]) == (["old", *said], "B")
     assert_same(tmp_path / "out.csv", whole(warm[1], source)[0])

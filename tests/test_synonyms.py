@@ -256,8 +256,8 @@ def test_apply_lists_the_survey_s_own_angles_and_carries_them_through(
     out = tmp_path / "out.csv"
     ran = mwdcal("apply", calibration, source, "-o", out, "--json")
     assert ran.code == 0, ran.err
-    (found,) = ran.json["findings"]
-    assert found["id"] == "unused-columns"
+    anonymous, found = ran.json["findings"]
+    assert (anonymous["id"], found["id"]) == ("no-serial", "unused-columns")
     assert (
         "'Inc' (resembles 'ref_inclination_deg'), 'Azi' (resembles 'ref_azimuth_deg')"
         in found["text"]

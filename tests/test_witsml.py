@@ -288,7 +288,7 @@ LABELLED = [
     "note <&>",
 ]
 states = st.dictionaries(
-    st.sampled_from(["serial", "well", "accelerometer_unit", "magnetometer_unit", "field_unit", "witsml aziRef"])
+    st.sampled_from(["code", "well", "accelerometer_unit", "magnetometer_unit", "field_unit", "witsml aziRef"])
     | st.text(min_size=1, max_size=8).filter(lambda key: key.isprintable()),
     st.sampled_from(["g", "nT", "m/s²", "µT", "relative", "grid north"])
     | st.integers(-9, 9) | finite | st.booleans() | st.lists(st.integers(0, 9))

@@ -259,7 +259,8 @@ class _Worker:
 
     def findings(self, tally: RowCounts, outside: str) -> list[Finding]:
         """What the reader should know of rows with these counts."""
-        heard = replace(self.said, metadata=runs.identified(self.source.metadata, tally.serials))
+        metadata = runs.identified(self.source.metadata, tally.serials)
+        heard = replace(self.said, metadata=metadata, source=self.source.name)
         return correction.findings(self.calibration, heard, tally, outside)
 
     def sink(self, stream: IO[bytes], output: Path) -> Sink:
@@ -276,7 +277,9 @@ class _Worker:
             lacking=0 if self.missing == "refuse" else _MOST,
         )
         how = "extrapolate" if self.outside == "refuse" else self.outside
-        longest = stated(self.source.metadata, self.findings(worst, how))
+        anonymous = worst._replace(serials=())  # has a finding that named tools have not
+        remarks = self.findings(worst, how) + self.findings(anonymous, how)
+        longest = stated(self.source.metadata, remarks)
         delimiter = "," if output.suffix.lower() == ".csv" else "\t"
         return TextSink(stream, self.source.schema, results, metadata, longest, delimiter, RANGES)
 

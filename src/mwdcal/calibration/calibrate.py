@@ -14,6 +14,7 @@ from mwdcal.calibration.automatic.order_selection import Progress
 from mwdcal.calibration.canonical import rounded
 from mwdcal.calibration.diagnosis.findings import described, findings
 from mwdcal.calibration.diagnosis.flags import FittedRuns
+from mwdcal.calibration.diagnosis.identity import dated, unidentified
 from mwdcal.calibration.diagnosis.refusals import UNSOUND_ADVICE, check, fit_refusals
 from mwdcal.calibration.diagnosis.repeats import copies
 from mwdcal.calibration.diagnosis.soundness import inconsistency
@@ -21,12 +22,14 @@ from mwdcal.calibration.drift import Constant, Drift
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import accuracy
-from mwdcal.calibration.readings import TRIADS, Readings, is_simulated, serial_of
+from mwdcal.calibration.prior import Knowledge
+from mwdcal.calibration.readings import TRIADS, WORDS, Readings, is_simulated, serial_of
 from mwdcal.calibration.record import (
     SOFTWARE,
     BudgetRow,
     Calibration,
     Choices,
+    Finding,
     StandErrors,
     TriadCalibration,
     Undetermined,
@@ -43,7 +46,7 @@ from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.models import Polynomial
 from mwdcal.sensor.profile import PRACTICES, Profile
 
-IDENTITY = ("serial", "tool", "operator", "lab", "date", "stand", "simulated")
+IDENTITY = (*WORDS, "simulated")
 
 
 def calibrate(
@@ -148,8 +151,15 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
         orders=list(choice.orders),
         station_rows=fitted.residuals(0).stations,
         inherited=list(prior.stations) if prior else [],
-        findings=findings(fitted),
+        findings=[*findings(fitted), *_doubts(readings, prior)],
     )
+
+
+def _doubts(readings: Readings, prior: Knowledge | None) -> list[Finding]:
+    """Findings on the identity of a run and its prior, and on its day."""
+    alone = unidentified({readings.name: serial_of(readings.metadata)})
+    doubts = [*prior.doubts] if prior and prior.doubts else alone
+    return doubts + dated(readings.metadata, readings.name)
 
 
 def _identity(readings: Readings, simulated: bool) -> dict[str, str]:

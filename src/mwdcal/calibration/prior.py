@@ -13,8 +13,9 @@ from typing import Literal
 import numpy as np
 from msgspec.structs import replace as replace_struct
 
-from mwdcal.calibration.readings import HIGHEST, TRIADS, Readings, is_simulated
-from mwdcal.calibration.record import Calibration
+from mwdcal.calibration.diagnosis.identity import other_tool, unidentified
+from mwdcal.calibration.readings import HIGHEST, TRIADS, Readings, is_simulated, serial_of
+from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.problem import Prior
 from mwdcal.geometry.vectors import Array
@@ -36,7 +37,8 @@ class Knowledge:
     does not have are of no account; else they are an error. `stations` are the fingerprints of
     those that the knowledge comes from, `temperature` their range, °C; `common` names errors of the
     stand and of references that are part of its uncertainty, as `budget` of a calibration does.
-    `simulated`: it comes from simulated data. `ageing` says by how much the tool may have changed since.
+    `simulated`: it comes from simulated data. `ageing` says by how much the tool may have changed since, `doubts`
+    that nothing shows that it is of the run's tool.
     """
 
     source: str
@@ -50,6 +52,7 @@ class Knowledge:
     common: tuple[str, ...] = ()
     simulated: bool = False
     ageing: str = ""
+    doubts: tuple[Finding, ...] = ()
 
 
 def prior_of(knowledge: Knowledge | None, models: Sequence[Model], batch: int) -> Prior:
@@ -156,7 +159,7 @@ def for_run(previous: Calibration, readings: Readings) -> Knowledge:
     Raises `InputError` for a run of another tool, or of stations that the calibration has used.
     """
     where = f"`prior`: the calibration of {previous.run_name}"
-    if other := previous.other_tool(readings):
+    if other := other_tool(previous, readings):
         raise InputError(
             f"{where} is of tool {other[0]}, the run is of {other[1]}. Give the previous calibration "
             "of the same tool."
@@ -168,6 +171,8 @@ def for_run(previous: Calibration, readings: Readings) -> Knowledge:
         )
     alone = readings.magnetometer is None
     known = from_calibration(previous, previous.relative if alone else readings.relative)
+    serials = {where: serial_of(previous.tool), readings.name: serial_of(readings.metadata)}
+    known = replace(known, doubts=tuple(unidentified(serials)))
     if not alone or not previous.has_field:
         return known
     kept = [i for i, name in enumerate(known.names) if name.startswith(TRIADS[0])]

@@ -8,15 +8,17 @@ are °C. An unknown value is NaN, never zero.
 from __future__ import annotations
 
 import hashlib
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import date
+from datetime import UTC, date, datetime, timedelta
 from itertools import compress, pairwise
 from typing import Any
 
 import numpy as np
 
+from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import AnyArray, Array, ArrayLike, Bools, Ints
 from mwdcal.sensor.profile import Profile
 
@@ -37,6 +39,11 @@ LEAST_TEMPERATURE_SPAN = 10.0
 """A run that spans less has no temperature terms, °C. An order needs as much for each power."""
 HIGHEST = 3
 """The highest temperature order of a model."""
+WORDS = ("serial", "tool", "operator", "lab", "date", "stand")
+"""Metadata that are text, whatever they look like: a serial 12.10 is not 12.1."""
+_ISO_DAY = re.compile(r"(\d{4}-?\d\d-?\d\d)([T ].*)?", re.ASCII | re.DOTALL)
+_FIRST_ON_EARTH = timedelta(hours=14)
+"""By how much the clocks of the easternmost places are ahead of UTC."""
 
 
 def is_simulated(metadata: Mapping[str, object]) -> bool:
@@ -45,17 +52,44 @@ def is_simulated(metadata: Mapping[str, object]) -> bool:
 
 
 def serial_of(metadata: Mapping[str, object]) -> str | None:
-    """The serial of the tool that metadata state; None where they state none."""
+    """The serial of the tool that metadata state, as it is written there; None where they state none."""
     serial = metadata.get("serial")
-    return None if serial in (None, "") else str(serial)
+    return None if serial is None or not str(serial).strip() else str(serial)
 
 
 def stated_day(metadata: Mapping[str, object]) -> date | None:
-    """The day of a measurement as metadata state it; None where `date` does not begin with an ISO date."""
+    """The day of a measurement: the ISO date, with a time or without, that metadata state as `date`.
+
+    Returns None if there is no such date: `unread_day` says why.
+    """
+    day = _ISO_DAY.fullmatch(str(metadata.get("date")).strip())
     try:
-        return date.fromisoformat(str(metadata.get("date"))[: len("2026-01-31")])
+        return date.fromisoformat(day[1]) if day else None
     except ValueError:
         return None
+
+
+def unread_day(metadata: Mapping[str, object], where: str) -> str:
+    """What is wrong with a `date` that is not an ISO date of the calendar; nothing where it is one, or blank."""
+    text = metadata.get("date")
+    if text is None or not str(text).strip() or stated_day(metadata):
+        return ""
+    return (
+        f"{where}: 'date' must be a day of the calendar, written year-month-day such as 2026-01-31; got "
+        f"{str(text)[:40]!r}. Correct it: a day that cannot be read is not guessed, and counts as not stated."
+    )
+
+
+def check_day(metadata: Mapping[str, object], where: str) -> None:
+    """Refuse a `date` that is not an ISO date of the calendar."""
+    if problem := unread_day(metadata, where):
+        raise InputError(problem)
+
+
+def future_day(metadata: Mapping[str, object]) -> date | None:
+    """The day that metadata state, if it has not begun anywhere on Earth; else None."""
+    day = stated_day(metadata)
+    return day if day and day > (datetime.now(UTC) + _FIRST_ON_EARTH).date() else None
 
 
 def simulated(*metadata: Mapping[str, object]) -> list[str]:

@@ -568,13 +568,6 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         limit = FREE_SHARE * scale.get(OBSERVABLES[name].unit, np.ones(shape))
         return np.asarray(np.any(change > np.nan_to_num(limit)[..., None], -1))
 
-    def other_tool(self, readings: Readings) -> tuple[str, str] | None:
-        """Our serial and the readings', where both are stated and differ."""
-        ours, theirs = self.tool.get("serial"), readings.metadata.get("serial")
-        if ours is None or theirs is None or ours == str(theirs):
-            return None
-        return ours, str(theirs)
-
     def undetermined(self) -> list[Undetermined]:
         """Free directions of all triads, each once."""
         return [entry for triad in self.triads for entry in triad.undetermined]

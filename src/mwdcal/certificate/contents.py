@@ -17,8 +17,14 @@ import msgspec
 from msgspec.structs import replace
 
 from mwdcal.calibration.canonical import canonical, rounded
+from mwdcal.calibration.diagnosis.identity import (
+    FROM_THE_FUTURE,
+    UNIDENTIFIED,
+    dated,
+    unidentified,
+)
 from mwdcal.calibration.drift import STEADINESS, taken_as_steady
-from mwdcal.calibration.readings import is_simulated, serial_of, stated_day
+from mwdcal.calibration.readings import check_day, is_simulated, serial_of, stated_day
 from mwdcal.calibration.record import SOFTWARE, Calibration, Finding
 from mwdcal.calibration.settings import ASSUMED, ASSUMED_PRACTICE
 from mwdcal.certificate.budget import assumed_exact, budget
@@ -90,9 +96,9 @@ def certificate(
     The number is made of the serial, the date of issue and the SHA-256 of all else.
     """
     stated = laboratory or Laboratory()
+    check_day(calibration.tool, "the calibration")
     day, day_stated = calibration.day, stated_day(calibration.tool)
-    if day_stated:
-        _check_days(day, order, stated)
+    _check_days(day, order, stated)
     given: dict[When, Verification | None] = {
         "as found": order.as_found,
         "as left": order.verification,
@@ -119,11 +125,12 @@ def certificate(
         findings=[],
         files=list(order.files),
     )
-    unstated_day = [] if day_stated else [_unstated_day(day, order)]
+    unstated_day = [] if day_stated else [Finding(id="date-not-stated", text=DATE_OF_FIT)]
     findings = [
         *order.findings,
         *_findings(contents, calibration),
         *unstated_day,
+        *dated({"date": contents.issued}, "the certificate"),
         *(_order_of_days(tests, day) if day_stated else ()),
         *changed,
         *calibration.findings,
@@ -154,11 +161,6 @@ def _findings(contents: Certificate, calibration: Calibration) -> Iterator[Findi
     yield from _exact(calibration)
     if calibration.settings == ASSUMED_PRACTICE:
         yield Finding(id="settings-assumed", text=ASSUMED)
-
-
-def _unstated_day(day: date, order: Order) -> Finding:
-    before = f" The certificate is dated before it, {order.issued}: state the date in the run."
-    return Finding(id="date-not-stated", text=DATE_OF_FIT + (before if order.issued < day else ""))
 
 
 def _check_days(day: date, order: Order, laboratory: Laboratory) -> None:
@@ -209,15 +211,15 @@ def _tests(
             _check_test(document, calibration, order)
             _check_issued(document, order)
             tests[when], about = conformity(when, document, calibration, laboratory.decision)
-            findings += about
+            findings += about + _doubts(document, calibration, order)
     return tests, findings
 
 
 def _check_test(document: Verification, calibration: Calibration, order: Order) -> None:
     """Refuse a roll test of another tool, or with the wrong one of the two calibrations."""
     as_left = document is order.verification
-    argument = "`verification`" if as_left else "`as_found`"
-    serial = calibration.tool.get("serial")
+    argument = _argument(document, order)
+    serial = serial_of(calibration.tool)
     if serial and document.serial and document.serial != serial:
         raise InputError(
             f"{argument} is of tool {document.serial}, the calibration of tool {serial}. Name a roll test of the "
@@ -236,11 +238,26 @@ def _check_test(document: Verification, calibration: Calibration, order: Order) 
         )
 
 
+def _doubts(document: Verification, calibration: Calibration, order: Order) -> list[Finding]:
+    """What a roll test says of its identity, and whether it states that it is of the tool of the calibration."""
+    said = [each for each in document.findings if each.id in (UNIDENTIFIED, FROM_THE_FUTURE)]
+    serials = {
+        _argument(document, order): document.serial,
+        "the calibration": serial_of(calibration.tool),
+    }
+    return said or unidentified(serials)
+
+
+def _argument(document: Verification, order: Order) -> str:
+    return "`verification`" if document is order.verification else "`as_found`"
+
+
 def _check_issued(document: Verification, order: Order) -> None:
     """Refuse a certificate from before a roll test that it shows."""
-    test_day = stated_day({"date": document.date})
+    stated, argument = {"date": document.date}, _argument(document, order)
+    check_day(stated, argument)
+    test_day = stated_day(stated)
     if test_day and order.issued < test_day:
-        argument = "`verification`" if document is order.verification else "`as_found`"
         raise InputError(
             f"`date` must not be before the day of {argument}, {test_day}; got {order.issued}. Correct one of them."
         )

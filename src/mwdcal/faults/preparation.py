@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from mwdcal.calibration.diagnosis.identity import doubts, other_tool
 from mwdcal.calibration.readings import LEAST_TEMPERATURE_SPAN, Readings
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
@@ -24,7 +25,7 @@ def prepared(calibration: Calibration, readings: Readings) -> tuple[Readings, li
     """
     _check(calibration, readings)
     calibration.fields(readings)  # refuses readings that lack what the calibration needs
-    findings = []
+    findings = doubts(calibration, readings)
     if readings.magnetometer is not None and not calibration.has_field:
         readings = replace(readings, magnetometer=None)
     if calibration.has_field and readings.magnetometer is None:
@@ -72,7 +73,7 @@ def _finding(name: str, text: str) -> Finding:
 
 def _check(calibration: Calibration, readings: Readings) -> None:
     """Refuse readings that say nothing of this calibration."""
-    if other := calibration.other_tool(readings):
+    if other := other_tool(calibration, readings):
         raise InputError(
             f"{readings.name} is of tool {other[1]}, the calibration of tool {other[0]}. Give readings of the "
             "same tool, or correct 'serial' in the file."

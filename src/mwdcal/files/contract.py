@@ -107,7 +107,7 @@ _UNITS_BY_END = {
 """The units of a quantity by the end of its column's name, that of the contract first."""
 
 _UNIT = re.compile(
-    r"[\s_(\[-]+(°|°?c|deg|degc|degrees?|rad|f|k|m?g|m/?s2|[nµu]t|gauss|m?v|counts?|raw)[)\]]?$"
+    r"[\s_(\[-]+(°|°?c|deg|degc|degrees?|rad|f|k|m?g|m/?s2|[nµu]t|gauss|m?v|counts?|raw)[)\]]?$|\s*[(\[][^(\[]*[)\]]$"
 )
 
 

@@ -1,18 +1,21 @@
 """Metadata lines `# key = value`, with values in TOML, at the head of text tables and sheets.
 
-A bare word that is not a TOML value (`serial = MWD-123`) is taken as text. Dates become ISO
-text, so that every format holds the same values: text, numbers, booleans, lists, tables.
+A bare word that is not a TOML value (`operator = Borg`) is taken as text. Dates become ISO
+text, so that every format holds the same values: text, numbers, booleans, lists, tables. What
+names a tool, a person, a place or a day (`WORDS`) is text as it stands: a serial 12.10 is not 12.1.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import numbers
 import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from datetime import date, time
 
+from mwdcal.calibration.readings import WORDS
 from mwdcal.errors import InputError
 
 _BARE = re.compile(r"([A-Za-z0-9_-]+)\s*=\s*([^\s\"'\[{].*)")
@@ -43,7 +46,10 @@ def parse(lines: Iterable[tuple[int, str]], source: str, word: str = "line") -> 
 
 
 def plain(metadata: Mapping[str, object], source: str) -> dict[str, object]:
-    """The metadata in values that a line can hold; refuses what is nested more than `DEEPEST` deep."""
+    """The metadata in values that a line can hold; refuses what is nested more than `DEEPEST` deep.
+
+    Refuses `WORDS` that are not text, and a date that is none.
+    """
     values = {}
     for key, value in metadata.items():
         try:
@@ -53,7 +59,19 @@ def plain(metadata: Mapping[str, object], source: str) -> dict[str, object]:
                 f"{source}, metadata {_shown(key)}: values must be nested at most {DEEPEST} deep. "
                 "Simplify or remove it."
             ) from None
+        if key in WORDS and value is not None:
+            values[key] = _word(key, values[key], f"{source}, metadata")
     return values
+
+
+def _word(key: str, value: object, where: str) -> str:
+    """Text as it stands; a whole number loses nothing as text."""
+    if isinstance(value, bool) or not isinstance(value, str | numbers.Integral):
+        raise InputError(
+            f"{where}: '{key}' must be text; got {_shown(str(value))}, whose spelling is lost. Put it in quotes, as "
+            f'in {key} = "12.10".'
+        )
+    return str(value)
 
 
 def render(metadata: Mapping[str, object]) -> list[str]:
@@ -75,6 +93,8 @@ def _entry(text: str, where: str) -> tuple[str, object]:
             "Correct or remove the line."
         )
     ((key, value),) = pairs.items()
+    if bare and key in WORDS:
+        return key, _word(key, bare[2], where)
     return key, _plain(value, bare[2]) if bare else plain(pairs, where)[key]
 
 

@@ -15,7 +15,13 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from mwdcal.calibration.readings import Readings, fingerprints, group_numbers
+from mwdcal.calibration.readings import (
+    Readings,
+    fingerprints,
+    group_numbers,
+    is_simulated,
+    serial_of,
+)
 from mwdcal.errors import InputError
 from mwdcal.files import synonyms
 from mwdcal.files.contract import (
@@ -81,7 +87,8 @@ def read_export(
     if isinstance(form, msgspec.UnsetType):
         return tables.read(path, decimal=decimal, rows=rows)
     try:
-        table = tables.read(path, rows=rows, export=form)
+        serial = _sources(profile).get("serial", ColumnSource(name="serial")).name
+        table = tables.read(path, rows=rows, export=form, serial=serial)
         if is_export(table.columns, profile):
             _check_below_names(path, form, profile)
             return table
@@ -193,15 +200,21 @@ def check_run(table: Table) -> None:
 
 def serials(metadata: Mapping[str, object], cells: Iterable[str]) -> list[str]:
     """Serials of the tools, that of the metadata first; at most two, then '…' for the rest."""
-    stated = metadata.get("serial")
-    known = dict.fromkeys([*([] if stated is None else [str(stated)]), *filter(None, cells)])
+    known = dict.fromkeys(filter(None, [serial_of(metadata), *cells]))
     return [*[*known][:2], *["…"] * (len(known) > 2)]
 
 
 def identified(metadata: Mapping[str, object], cells: Sequence[str]) -> Mapping[str, object]:
-    """The metadata, with the serials of a column joined to its own."""
+    """The metadata, with the serials of a column joined to its own, each as it stands."""
     tools = serials(metadata, cells) if cells else []
     return {**metadata, "serial": ", ".join(tools)} if tools else metadata
+
+
+def _marked(table: Table) -> Mapping[str, object]:
+    """The metadata of a table, which is simulated if one of its rows says so in a column of that name."""
+    marks = labels(table, "simulated")
+    simulated = any(is_simulated({"simulated": mark}) for mark in marks)
+    return {**table.metadata, "simulated": True} if simulated else table.metadata
 
 
 def to_readings(table: Table, profile: Profile) -> tuple[Readings, Profile]:
@@ -221,7 +234,7 @@ def to_readings(table: Table, profile: Profile) -> tuple[Readings, Profile]:
         group=group_numbers(labels(table, "group")),
         station=_stations(table),
         digest=fingerprints([channels for channels in raw if channels is not None]),
-        metadata=identified(table.metadata, labels(table, "serial")),
+        metadata=identified(_marked(table), labels(table, "serial")),
         source=table.source,
         run_sha256=table.digest,
         unused=synonyms.unused(list(table.columns), COLUMNS),

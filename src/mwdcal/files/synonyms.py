@@ -88,6 +88,7 @@ _INSTEAD = {
     **{f"m{i}": f"mag{i} magnetometer{i} b{i} h{i} flux{i}" for i in "xyz"},
 }
 _SYNONYMS = {word: column for column, words in _INSTEAD.items() for word in words.split()}
+_CHANNELS = tuple(f"{letter}{axis}" for letter in "am" for axis in "xyz")
 _WARMTH = {
     *(
         "temp",
@@ -177,11 +178,19 @@ NOTICED = {
     "temperature_c": "°C",
 }
 """Columns that must not be overlooked, with their units."""
-OURS = ("time_s", "start_s", "end_s", "samples", "drifting", "serial", "md_m")
+OURS = ("time_s", "start_s", "end_s", "samples", "drifting", "serial", "simulated", "md_m")
 """Columns beyond the contract that mwdcal itself reads or writes in run files."""
 _COPIED = ("drift_", "witsml ")
 """What columns begin with that mwdcal writes of a log, and that a WITSML file has beyond a run's."""
-_CASED = {"nT": " nt ", "uT": " ut ", "mT": " millit ", "mG": " milligauss ", "mg": " millig "}
+_BRACKETED = re.compile(r"(.*\S)\s*[(\[{]([^(\[{]*)[)\]}]", re.DOTALL)
+_CASED = {
+    "mV": " mv ",
+    "nT": " nt ",
+    "uT": " ut ",
+    "mT": " millit ",
+    "mG": " milligauss ",
+    "mg": " millig ",
+}
 
 
 class Resemblance(NamedTuple):
@@ -192,11 +201,21 @@ class Resemblance(NamedTuple):
 
 
 def resembled(name: str) -> Resemblance | None:
-    """What a name resembles.
+    """What a name resembles, with a unit behind it that is known or, in brackets, is not.
 
     >>> [resembled(n) for n in ("Azi (°)", "Temp (°F)", "comment")]
     [Resemblance(column='ref_azimuth_deg', unit='°'), Resemblance(column='temperature_c', unit='°F'), None]
+    >>> resembled("HX [ADC]")
+    Resemblance(column='mx', unit='ADC')
     """
+    whole, bracketed = _resembled(name), _BRACKETED.fullmatch(name.strip())
+    if whole or not bracketed or not (bare := _resembled(bracketed[1])):
+        return whole
+    return bare._replace(unit=bracketed[2].strip())
+
+
+def _resembled(name: str) -> Resemblance | None:
+    """What a name resembles; nothing where it has words that are none of the field."""
     every = _words(name)
     words, unit = _without_unit(every)
     spread = not _SPREADS.isdisjoint(words)
@@ -255,6 +274,18 @@ def _words(name: str) -> list[str]:
     for cased, word in _CASED.items():
         text = re.sub(rf"(?<![A-Za-z]){cased}(?![A-Za-z])", word, text)
     return [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", text)]
+
+
+def begins_as(name: str) -> str:
+    """The raw channel that a name begins as, before words that are no unit; empty if it begins as none.
+
+    >>> begins_as("HX_adc"), begins_as("Mag Y digits"), begins_as("note")
+    ('mx', 'my', '')
+    """
+    words = _words(name)
+    stems = ["".join(words[:count]) for count in range(len(words) - 1, 0, -1)]
+    known = (stem if stem in _CHANNELS else _SYNONYMS.get(stem, "") for stem in stems)
+    return next((column for column in known if column in _CHANNELS), "")
 
 
 def unit_of(text: str) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from mwdcal.errors import FitError
 from mwdcal.files.contract import CHANNELS, MAPPED, RAW, REFERENCES, forms, units_of
 from mwdcal.files.formats.columns import shown
-from mwdcal.files.synonyms import WARMTH, Resemblance, resembled, unit_of
+from mwdcal.files.synonyms import WARMTH, Resemblance, begins_as, resembled, unit_of
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import ColumnSource
 
@@ -124,6 +124,9 @@ def proposed(
     azimuth = chosen.get(REFERENCES["azimuth"].column)
     if azimuth and not north_is_stated:
         _check_north(azimuth.name, above, source)
+    for triad, channels in CHANNELS.items():
+        if not {*channels} & {*chosen}:
+            _check_hidden(triad, channels, [n for n in names if n not in meanings], source)
     absent = [name for name in RAW[:3] if name not in chosen]
     if absent:
         raise FitError(
@@ -138,6 +141,17 @@ def proposed(
     _check_units_of_triads(chosen, source)
     by_value = {c for c, each in chosen.items() if each.unit and not meanings[each.name].unit}
     return _labels(names, chosen) | chosen, by_value
+
+
+def _check_hidden(triad: str, channels: Sequence[str], others: Sequence[str], source: str) -> None:
+    """Refuse a table without a triad of which columns that are not understood begin as its channels do."""
+    hidden = [name for name in others if begins_as(name) in channels]
+    if hidden:
+        raise FitError(
+            f"{source}: {', '.join(map(shown, hidden[:6]))} begin as channels of the {triad} do, and end in what is "
+            "no known unit. If they are the channels, put the unit in brackets, as in 'Bx (counts)'; if they are "
+            "something else, give them names that say so."
+        )
 
 
 def _check_units_of_triads(chosen: Mapping[str, ColumnSource], source: str) -> None:

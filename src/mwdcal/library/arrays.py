@@ -10,6 +10,7 @@ import numpy as np
 
 from mwdcal.calibration.readings import TRIADS, Readings, fingerprints, group_numbers
 from mwdcal.errors import InputError
+from mwdcal.files import metadata as meta
 from mwdcal.files.contract import RAW_SPREAD, REFERENCES, TEMPERATURE, Range
 from mwdcal.geometry.vectors import Array, ArrayLike, Bools, wrap
 from mwdcal.sensor.profile import COMMON, PRACTICES
@@ -52,6 +53,8 @@ def readings(
     Shapes: `accelerometer` and `magnetometer` (n, 3), stations by axes x, y, z; everything else (n,)
     or a scalar for all stations. Leading axes (repetitions) are kept.
 
+    NaN, None and what a mask hides are missing.
+
     Units: g and nT along the tool axes, °C, radians; `inclination_deg`, `azimuth_deg`, `toolface_deg`
     and `dip_deg` take degrees instead. Azimuths are magnetic.
 
@@ -69,12 +72,13 @@ def readings(
             equal inclination and azimuth ("per-direction"), or at every station ("per-station").
             Blank: not stated, once is assumed.
         station: labels, for messages and tables.
-        metadata: `serial`, `date`, `operator`, …; `simulated` marks data of no real tool.
+        metadata: `serial` as text, `date` as 2026-01-31, `operator`, …; `simulated` marks data of no real tool.
         references: `inclination`, `azimuth`, `toolface`, `gravity`, `field` and `dip`, where known.
 
     Raises:
-        InputError: an unknown name, a shape that does not fit, a value out of range, or NaN in a
-            reading; the message says which station.
+        InputError: an unknown name, a shape that does not fit, a value out of range, or a missing
+            reading; the message says which station. A serial that is a number with a point, or a `date` that is
+            not an ISO date.
     """
     g = _vectors("accelerometer", accelerometer)
     b = None if magnetometer is None else _vectors("magnetometer", magnetometer)
@@ -98,18 +102,23 @@ def readings(
         settings=settings,
         station=() if station is None else tuple(_labels("station", station, shape)),
         digest=fingerprints(triads) if len(shape) == 1 else (),
-        metadata=dict(metadata or {}),
+        metadata=meta.plain(metadata or {}, "the readings"),
     )
 
 
 def _numbers(name: str, values: ArrayLike) -> Array:
-    """Values as a new array; NaN where a table has a null."""
+    """Values as a new array; NaN where a table has a null, or an array a mask."""
     try:
         if np.asarray(values).dtype.kind in "bcmM":
             raise TypeError(f"got {np.asarray(values).dtype}")
-        return np.array(values, float)
+        return without_mask(np.ma.array(values, dtype=float, copy=True))
     except (TypeError, ValueError) as error:
         raise InputError(f"`{name}` must be numbers; {error}. Use NaN where unknown.") from None
+
+
+def without_mask(values: Any) -> Array:
+    """Numbers as a plain array, NaN where they are masked: what is below a mask is not a reading."""
+    return np.asarray(np.ma.filled(values, np.nan), float)
 
 
 def _vectors(name: str, values: ArrayLike) -> Array:
@@ -246,8 +255,8 @@ def _labels(name: str, values: Sequence[object], shape: tuple[int, ...]) -> list
 
 
 def _label(cell: Any, least: float) -> str:
-    """A label as text; blank for None, NaN and numbers below `least`; whole numbers without a point."""
-    if cell is None:
+    """A label as text; blank for None, what is masked, NaN and numbers below `least`; whole numbers without a point."""
+    if cell is None or cell is np.ma.masked:
         return ""
     if not isinstance(cell, int | float | np.number):
         return str(cell)

@@ -19,12 +19,13 @@ from mwdcal.errors import InputError
 from mwdcal.faults.diagnosis import Diagnosis
 from mwdcal.faults.diagnosis import diagnose as explain
 from mwdcal.files import documents, logs, profiles, runs
+from mwdcal.files import metadata as meta
 from mwdcal.files.formats import table as tables
-from mwdcal.files.formats.columns import LABELS, Column
+from mwdcal.files.formats.columns import LABELS, Column, as_text
 from mwdcal.files.formats.table import Table
 from mwdcal.files.limits import load_limits
 from mwdcal.geometry.vectors import AnyArray, Array, ArrayLike
-from mwdcal.library.arrays import nearest
+from mwdcal.library.arrays import nearest, without_mask
 from mwdcal.logs.noise import Noise, find_noise
 from mwdcal.logs.stations import Stations, find_stations
 from mwdcal.planning import simulate as simulation
@@ -55,13 +56,21 @@ def load_profile(name: Path = "generic") -> Profile:
 
 
 def read_run(
-    source: Tabular, profile: Path | Profile = "generic", *, decimal: str = "."
+    source: Tabular,
+    profile: Path | Profile = "generic",
+    *,
+    decimal: str = ".",
+    metadata: Mapping[str, object] | None = None,
 ) -> Readings:
     """The readings of a run: of a CSV, TSV, Parquet, XLSX, WITSML or LAS file, or of columns with the same names.
 
     `profile` says which tool axis each raw channel measures and in which unit; it goes with the
     readings to `calibrate`. Readings to be corrected or verified are read with the profile of their
     calibration: `read_run("survey.csv", calibration.profile)`.
+
+    `metadata` are those of the run, such as `serial`, `date` and `simulated`, beside those of a file or of the
+    `attrs` of a pandas table: a table in memory has none of the lines above a file's table. `serial` and
+    `simulated` may also be columns.
 
     Raises:
         InputError: a file that cannot be read, or a cell that is missing or out of range.
@@ -70,6 +79,8 @@ def read_run(
     if not isinstance(profile, Profile):
         profile, profile_sha256 = profiles.load_profile(os.fspath(profile))
     table = _table(source, "the run", lambda path: tables.read(path, decimal=decimal))
+    if metadata:
+        table = replace(table, metadata={**table.metadata, **meta.plain(metadata, table.source)})
     readings, profile = runs.read_run(table, profile)
     return replace(readings, profile=profile, profile_sha256=profile_sha256)
 
@@ -89,20 +100,21 @@ def _table(source: Tabular, name: str, read: Callable[[Path], Table]) -> Table:
                 f"{name}: column '{key}' has {len(column)} values; the longest has {count}. Give one "
                 "value for each row, blank or NaN where unknown."
             )
-    return Table(columns, source=name, lines=range(1, count + 1))
+    metadata = meta.plain(getattr(source, "attrs", {}), name)
+    return Table(columns, metadata, name, range(1, count + 1))
 
 
 def _column(name: str, values: Any) -> Column:
     """Numbers, or the text of a column of labels; other text stays text."""
-    array = np.asarray(values)
-    if array.ndim != 1 or array.dtype.kind in "bcmM":
+    array = np.ma.array(values)
+    if array.ndim != 1 or (array.dtype.kind in "bcmM" and name != "simulated"):
         raise InputError(
             f"column '{name}' must be numbers or text, one for each row; got {array.dtype} of shape "
             f"{array.shape}."
         )
     if name in LABELS or array.dtype.kind in "OUS":
-        return ["" if cell is None or cell != cell else str(cell) for cell in array.tolist()]
-    return np.asarray(array, float)
+        return ["" if cell is None or cell != cell else as_text(cell) for cell in array.tolist()]
+    return without_mask(array.astype(float))
 
 
 def simulate(
@@ -147,7 +159,9 @@ def _truth(tool: int | tuple[ArrayLike, ArrayLike] | Truth) -> Truth:
         return tool
     if isinstance(tool, int):
         return simulation.servo(np.random.default_rng(tool))
-    accelerometer, magnetometer = (np.asarray(factors, float) for factors in tool)
+    accelerometer, magnetometer = (
+        without_mask(np.ma.array(factors, dtype=float)) for factors in tool
+    )
     for factors in (accelerometer, magnetometer):
         if factors.shape != (30,):
             raise InputError(

@@ -16,6 +16,7 @@ from mwdcal.calibration.calibrate import recorded
 from mwdcal.calibration.diagnosis.detection import Detection, detections
 from mwdcal.calibration.diagnosis.findings import FEW_FREEDOM
 from mwdcal.calibration.diagnosis.flags import listed
+from mwdcal.calibration.diagnosis.identity import UNIDENTIFIED
 from mwdcal.calibration.diagnosis.plausibility import freedom_of
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import Options
@@ -112,7 +113,8 @@ class Planned:
             "wrong it is: the residuals of all stations grow alike. Add stations."
         )
         hidden = [Finding(id="hidden-errors", text=text)] if stations else []
-        return [*self.calibration.findings, *hidden, *self.search]
+        expected = [f for f in self.calibration.findings if f.id != UNIDENTIFIED]  # of no tool yet
+        return [*expected, *hidden, *self.search]
 
 
 def judged(

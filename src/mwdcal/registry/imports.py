@@ -13,7 +13,7 @@ from typing import NamedTuple
 import msgspec
 from msgspec.structs import replace
 
-from mwdcal.calibration.readings import stated_day
+from mwdcal.calibration.readings import future_day, stated_day
 from mwdcal.errors import InputError, MwdcalError
 from mwdcal.files.formats import members
 from mwdcal.files.formats.folders import HIDDEN_BY_SYSTEMS, visible_files
@@ -159,8 +159,9 @@ class Adding:
     """Files on their way into a registry, some hundred records in a transaction.
 
     `results` say what became of each file, `new` how many records of each kind are new, `serials` of which tools,
-    `undated` the names of new calibrations whose runs state no date, `changed` of those that were changed after
-    they were made, `simulated` whether one of the files rests on simulated data.
+    `unidentified` the names of new records of tools that state no serial, `future` of those of a day that is still
+    to come, `undated` of new calibrations whose runs state no date, `changed` of those that were changed after they
+    were made, `simulated` whether one of the files rests on simulated data.
     """
 
     def __init__(self, registry: Registry, actor: str) -> None:
@@ -173,6 +174,8 @@ class Adding:
         self._files: dict[Path, FileResult] = {}
         self.new: Counter[str] = Counter()
         self.serials: set[str] = set()
+        self.unidentified: list[str] = []
+        self.future: list[str] = []
         self.undated: list[str] = []
         self.changed: list[str] = []
         self.simulated = False
@@ -227,8 +230,13 @@ class Adding:
 
     def _note(self, new: Draft) -> None:
         """Remember the serial of a new record, and whether it is a calibration of an unknown day, or was changed."""
-        if new["serial"] and new["kind"] in TOOL_KINDS:
-            self.serials.add(new["serial"])
+        if new["kind"] in TOOL_KINDS:
+            if new["serial"]:
+                self.serials.add(new["serial"])
+            else:
+                self.unidentified.append(new["name"])
+            if future_day({"date": new["time"]}):
+                self.future.append(new["name"])
         if new["sha256"] in self._undated:
             self.undated.append(new["name"])
         if new["sha256"] in self._changed:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mwdcal.calibration.diagnosis.identity import doubts, other_tool
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
@@ -206,7 +207,7 @@ def findings(
     if tally.beyond and outside == "refuse":
         advice = "Use `outside` blank or extrapolate, or calibrate over a wider range."
         raise InputError(f"{readings.source}: {beyond}. {advice}")
-    off, tools = strengths.departures(tally.strengths), calibration.other_tool(readings)
+    off, tools = strengths.departures(tally.strengths), other_tool(calibration, readings)
     unsteady = scatter.unsteady(tally.scatter)
     applies = {
         "no-magnetometer": calibration.has_field and readings.magnetometer is None,
@@ -232,11 +233,15 @@ def findings(
         "moved": ", ".join(tally.moved),
         "free": ", ".join(dict.fromkeys(u.id for u in calibration.undetermined())),
     }
-    return calibration.change_findings() + [
-        Finding(id=name, text=text.format(tally=tally, tools=tools, off=off, **words))
-        for name, text in ROW_FINDINGS.items()
-        if applies[name]
-    ]
+    return (
+        calibration.change_findings()
+        + doubts(calibration, readings)
+        + [
+            Finding(id=name, text=text.format(tally=tally, tools=tools, off=off, **words))
+            for name, text in ROW_FINDINGS.items()
+            if applies[name]
+        ]
+    )
 
 
 def undetermined(

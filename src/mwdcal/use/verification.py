@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Literal
 import msgspec
 import numpy as np
 
+from mwdcal.calibration.diagnosis.identity import doubts, other_tool
 from mwdcal.calibration.notebooks import html_table
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import MARGIN, Calibration, Finding, stated
@@ -346,6 +347,7 @@ def _findings(test: RollTest, skipped: Sequence[str]) -> Iterator[Finding]:
     warmth = readings.temperature
     tested = "" if warmth is None else _span(float(warmth.min()), float(warmth.max()))
     yield from calibration.change_findings()
+    yield from doubts(calibration, readings)
     if beyond := int(calibration.outside(readings, MARGIN).sum()):
         where = f"{beyond} of {readings.count} stations ({tested} °C)"
         calibrated = _span(*calibration.temperature_c or (np.nan, np.nan))
@@ -369,7 +371,7 @@ def _span(low: float, high: float) -> str:
 
 
 def _check_tool(calibration: Calibration, readings: Readings) -> None:
-    if other := calibration.other_tool(readings):
+    if other := other_tool(calibration, readings):
         raise InputError(
             f"{readings.name} is of tool {other[1]}, the calibration of tool {other[0]}. Verify with a "
             "run of the same tool, or correct 'serial' in the file."

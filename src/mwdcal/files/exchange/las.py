@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mwdcal.errors import InputError
+from mwdcal.files import metadata as meta
 from mwdcal.files.exchange import description
 from mwdcal.files.exchange.description import TableDescription
 from mwdcal.files.formats import text as text_tables
@@ -152,6 +153,7 @@ def _header(lines: Sequence[str], source: str) -> _Header:
         null = file.well.NULL.value if "NULL" in file.well else None
         curves = [_Curve(curve.original_mnemonic.strip(), curve.unit) for curve in file.curves]
         items = [item for section in (file.well, file.params) for item in section]
+        entries = _entries(items) | _serial(lines, lasio)
     if version not in (1.2, 2.0):
         raise InputError(
             f"{source}: the file must be LAS 2.0 or 1.2; got version {shown(str(version))}. Export the log as "
@@ -160,7 +162,7 @@ def _header(lines: Sequence[str], source: str) -> _Header:
     names = [curve.name for curve in curves]
     check_names(names, f"{source}, section ~Curve")
     number = float(null) if isinstance(null, int | float | np.number) else np.nan
-    return _Header(curves, wrapped, number, _entries(items))
+    return _Header(curves, wrapped, number, meta.plain(entries, source))
 
 
 def _entries(items: Sequence[Any]) -> dict[str, object]:
@@ -168,12 +170,19 @@ def _entries(items: Sequence[Any]) -> dict[str, object]:
     entries: dict[str, object] = {}
     for item in items:
         value = item.value.item() if isinstance(item.value, np.generic) else item.value
-        if item.original_mnemonic in _LEFT_OUT or value is None or value == "":
+        if item.original_mnemonic in (*_LEFT_OUT, "SERIAL") or value is None or value == "":
             continue
         unit = f" ({item.unit})" if item.unit else ""
         entries[f"las {item.mnemonic}{unit}"] = value
-    renamed = {"las WELL": "well", "las SERIAL": "serial"}
+    renamed = {"las WELL": "well"}
     return {renamed.get(key, key): value for key, value in entries.items()}
+
+
+def _serial(lines: Sequence[str], lasio: Any) -> dict[str, object]:
+    """The serial as the header writes it: lasio makes a number of 12.10."""
+    stated = [line for line in lines if re.match(r"SERIAL *\.", line)]
+    values = [lasio.reader.read_header_line(line)["value"] for line in stated]
+    return {"serial": values[-1]} if any(values) else {}
 
 
 def _rows(

@@ -72,19 +72,28 @@ def read(
     decimal: str = ".",
     rows: int = 0,
     export: TableFormat | None = None,
+    serial: str = "serial",
 ) -> Table:
     """The table in a .csv, .tsv, .parquet, .xlsx, .xml (WITSML) or .las file.
 
     `decimal` is the decimal sign of text cells, '.' or ','. `rows`: the most that a Parquet table may
     have; text and workbooks have limits of their own. `export`: how another program has written it.
+    `serial`: the name of its column of serials.
     """
     check_decimal(decimal)
     file = Path(path)
-    return parsed(_content(file), file.name, decimal=decimal, rows=rows, export=export)
+    data = _content(file)
+    return parsed(data, file.name, decimal=decimal, rows=rows, export=export, serial=serial)
 
 
 def parsed(
-    data: bytes, name: str, *, decimal: str = ".", rows: int = 0, export: TableFormat | None = None
+    data: bytes,
+    name: str,
+    *,
+    decimal: str = ".",
+    rows: int = 0,
+    export: TableFormat | None = None,
+    serial: str = "serial",
 ) -> Table:
     """The table in the bytes of a file of that name: see `read`."""
     digest = hashlib.sha256(data).hexdigest()
@@ -92,8 +101,8 @@ def parsed(
     arguments: dict[str, Any] = {"most": rows} if form is parquet else {}
     if export and form is text:
         data, arguments = dialect.plain(data, export, name), {"delimiter": export.delimiter}
-    elif export and form is workbook:
-        arguments = {"form": export}
+    elif form is workbook:
+        arguments = {"form": export, "serial": serial}
     decimal = export.decimal if export else decimal
     parts: Parts = form.parse(data, name, **arguments)
     return Table(parts.columns, parts.metadata, name, parts.lines, digest, decimal)

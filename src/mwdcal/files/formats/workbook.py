@@ -10,6 +10,7 @@ import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import takewhile
 from typing import Any
+from xml.etree.ElementTree import iterparse
 
 from mwdcal.errors import InputError
 from mwdcal.files import metadata as meta
@@ -17,6 +18,7 @@ from mwdcal.files.formats import workbook_limits
 from mwdcal.files.formats.columns import (
     Column,
     Parts,
+    as_text,
     assemble,
     damaged_unless_read,
     number,
@@ -31,13 +33,21 @@ _EPOCH = datetime.datetime(1980, 1, 1)
 _TIMES = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ")
 LONGEST_CELL = 32_767
 _MOST_DIGITS = 15
+_FORMULA = re.compile(rb"<(\w+:)?f[\s/>]")
+_NAMED = 5
+"""Most cells that a message names."""
 _UNWRITABLE = re.compile(r"[\x00-\x08\x0b-\x1f\ufffe\uffff]")
 
 Row = tuple[int, Sequence[object]]
 
 
-def parse(data: bytes, source: str, form: TableFormat | None = None) -> Parts:
-    """The table on the first sheet of a workbook; `form` says in which row it begins."""
+def parse(
+    data: bytes, source: str, form: TableFormat | None = None, serial: str = "serial"
+) -> Parts:
+    """The table on the first sheet of a workbook; `form` says in which row it begins.
+
+    `serial` is the name of the column of serials, which are read as the workbook shows them.
+    """
     rows = [row for row in read_rows(data, source) if form is None or _belongs(*row, form)]
     comments = list(takewhile(_is_comment, rows))
     table = rows[len(comments) :]
@@ -46,7 +56,10 @@ def parse(data: bytes, source: str, form: TableFormat | None = None) -> Parts:
     metadata = meta.parse([(line, str(row[0]).strip()) for line, row in comments], source, "row")
     names, cells, lines = assemble(padded, source, "row")
     named = zip(names, zip(*cells, strict=True), strict=True)
-    return Parts({name: typed(name, column) for name, column in named}, metadata, lines)
+    columns = {name: typed(name, column) for name, column in named}
+    if serial in columns and not all(isinstance(row[names.index(serial)], str) for row in cells):
+        columns[serial] = _as_shown(data, source, serial, names.index(serial), lines)
+    return Parts(columns, metadata, lines)
 
 
 def _is_comment(row: Row) -> bool:
@@ -84,6 +97,75 @@ def _belongs(line: int, row: Sequence[object], form: TableFormat) -> bool:
     return metadata or line == form.header_line or line >= form.first_line
 
 
+def _as_shown(data: bytes, source: str, name: str, column: int, lines: Sequence[int]) -> list[str]:
+    """The cells of a column, at these rows, as the workbook shows them: 12.1 may be there for 12.10."""
+    page = (
+        _module(source)
+        .load_workbook(io.BytesIO(data), read_only=True, data_only=True)
+        .worksheets[0]
+    )
+    page.reset_dimensions()
+    wanted, shown = {*lines}, []
+    for line, (cell,) in enumerate(page.iter_rows(min_col=column + 1, max_col=column + 1), 1):
+        if line in wanted:
+            text = _shown(cell.value, cell.number_format if cell.value is not None else "General")
+            if text is None:
+                raise InputError(
+                    f"{source}, row {line}, column '{name}': a serial must be text; the cell is a value that the "
+                    f"workbook shows in the form {cell.number_format!r}. Format the column as text, and type the "
+                    "serials as they stand on the tools."
+                )
+            shown.append(text)
+    return shown
+
+
+def _shown(value: object, form: str) -> str | None:
+    """A cell as a number format shows it; None for a format that shows more than the digits of a number.
+
+    >>> [_shown(12.1, form) for form in ("General", "0.00", "00000.0", "0%")]
+    ['12.1', '12.10', '00012.1', None]
+    """
+    if value is None or isinstance(value, str):
+        return value or ""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    if form in ("General", "@"):
+        return as_text(value)
+    digits = re.fullmatch(r"(0+)(?:\.(0+))?", form)
+    if digits is None:
+        return None
+    whole, decimals = len(digits[1]), len(digits[2] or "")
+    return f"{value:0{whole + decimals + bool(decimals)}.{decimals}f}"
+
+
+def _check_formulas(archive: zipfile.ZipFile, sheet: str, source: str) -> None:
+    """Refuse formulas without a value: no spreadsheet program has calculated them, and the cells look blank.
+
+    One whose value is an empty text has one.
+    """
+    data = archive.read(sheet)
+    if not _FORMULA.search(data):
+        return
+    without = []
+    for _, cell in iterparse(io.BytesIO(data)):
+        parts = {part.tag.rpartition("}")[2]: part.text for part in cell}
+        if (
+            cell.tag.endswith("}c")
+            and "f" in parts
+            and not parts.get("v")
+            and cell.get("t") != "str"
+        ):
+            without.append(f"{cell.get('r', '?')} (={parts['f'] or '…'})")
+        if cell.tag.endswith("}row"):
+            cell.clear()
+    if without:
+        more = f" and {len(without) - _NAMED} more" if len(without) > _NAMED else ""
+        raise InputError(
+            f"{source}: formulas without a value, in the cells {', '.join(without[:_NAMED])}{more}. Open the workbook "
+            "in a spreadsheet program, let it calculate, and save it; or write numbers in place of the formulas."
+        )
+
+
 def read_rows(data: bytes, source: str) -> Iterator[Row]:
     """Row numbers and cells of the first sheet, without blank cells at the end and blank rows."""
     openpyxl = _module(source)
@@ -95,8 +177,9 @@ def read_rows(data: bytes, source: str) -> Iterator[Row]:
         warnings.simplefilter("ignore")
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             workbook_limits.check(archive, source)
-        book = openpyxl.load_workbook(io.BytesIO(data), read_only=True, data_only=True)
-        page = book.worksheets[0]
+            book = openpyxl.load_workbook(io.BytesIO(data), read_only=True, data_only=True)
+            page = book.worksheets[0]
+            _check_formulas(archive, page._worksheet_path, source)
         page.reset_dimensions()
         for line, row in enumerate(page.iter_rows(values_only=True), 1):
             cells = _trimmed([_read(value) for value in row])

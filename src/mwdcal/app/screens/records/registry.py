@@ -11,6 +11,7 @@ import msgspec
 from mwdcal.app.envelope import enveloped
 from mwdcal.app.screens.numbers import number
 from mwdcal.app.text import UNCUT, one_line, plural, table
+from mwdcal.calibration.diagnosis.identity import FROM_THE_FUTURE, UNIDENTIFIED
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.calibration.record import Finding
 from mwdcal.files.formats.columns import shown
@@ -163,6 +164,19 @@ def _refusal(group: Sequence[FileResult]) -> str:
 def _doubts(registry: Registry, adding: Adding) -> list[Finding]:
     """What was added, and may not be as it was meant."""
     findings = []
+    if adding.unidentified:
+        text = (
+            f"{plural(len(adding.unidentified), 'record')} without a serial, such as {adding.unidentified[0]}: nothing "
+            'shows of which tool, and no tool lists them. State it in the run, as in serial = "MWD-17", calibrate '
+            "again, and withdraw these."
+        )
+        findings.append(Finding(id=UNIDENTIFIED, text=text))
+    if adding.future:
+        text = (
+            f"{plural(len(adding.future), 'record')} of a day that is still to come, such as {adding.future[0]}: "
+            "correct the date in the run, or the clock of this computer."
+        )
+        findings.append(Finding(id=FROM_THE_FUTURE, text=text))
     if adding.undated:
         text = (
             f"{plural(len(adding.undated), 'calibration')} without a day of the measurement, such as "

@@ -1,0 +1,50 @@
+"""What shows that data are of one tool, and of a day that can be: one rule for every command."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from mwdcal.calibration.readings import Readings, future_day, serial_of, unread_day
+from mwdcal.calibration.record import Calibration, Finding
+
+UNIDENTIFIED, FROM_THE_FUTURE, UNREAD_DAY = "no-serial", "future-date", "unreadable-date"
+"""Findings on the identity of data: ids."""
+
+
+def unidentified(serials: Mapping[str, str | None]) -> list[Finding]:
+    """A finding if one of the things that are to be of one tool, by name, states no serial."""
+    lacking = [name for name, serial in serials.items() if serial is None]
+    if not lacking:
+        return []
+    states = "states" if len(lacking) == 1 else "state"
+    unknown = "that they are of the same tool" if len(serials) > 1 else "which tool it is of"
+    text = (
+        f"{' and '.join(lacking)} {states} no serial: nothing shows {unknown}. State it in the run, as in "
+        'serial = "MWD-17".'
+    )
+    return [Finding(id=UNIDENTIFIED, text=text)]
+
+
+def dated(metadata: Mapping[str, object], name: str) -> list[Finding]:
+    """A finding if metadata state a day that cannot be read, or one that is still to come."""
+    if problem := unread_day(metadata, name):
+        return [Finding(id=UNREAD_DAY, text=problem)]
+    if (day := future_day(metadata)) is None:
+        return []
+    text = f"{name} states the date {day}, which is still to come. Correct it, or the clock of this computer."
+    return [Finding(id=FROM_THE_FUTURE, text=text)]
+
+
+def other_tool(calibration: Calibration, readings: Readings) -> tuple[str, str] | None:
+    """Serials of a calibration and of readings, if both state one and they differ."""
+    ours, theirs = serial_of(calibration.tool), serial_of(readings.metadata)
+    return None if ours is None or theirs is None or ours == theirs else (ours, theirs)
+
+
+def doubts(calibration: Calibration, readings: Readings) -> list[Finding]:
+    """Findings on the identity of readings beside a calibration, and on their day."""
+    serials = {
+        "the calibration": serial_of(calibration.tool),
+        readings.name: serial_of(readings.metadata),
+    }
+    return unidentified(serials) + dated(readings.metadata, readings.name)
