@@ -100,7 +100,6 @@ def norths_of(
     sources["sd_declination"] = (
         FROM_TABLE if given else FROM_MODEL if reference is None else FROM_REFERENCE
     )
-    findings = []
     if "declination_deg" in stated and not given:
         source = "the reference" if reference else "a global field model"
         text = (
