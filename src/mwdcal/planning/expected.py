@@ -42,8 +42,8 @@ def _check_noise(profile: Profile, kind: str) -> None:
     if scale is not None and not least <= triad.noise / scale <= most:
         raise InputError(
             f"the profile '{profile.name}', [{kind}]: noise {triad.noise:g} with scale {scale:g} is "
-            f"{triad.noise / scale:.2g} {unit}; a sensor has from {least:g} to {most:g} {unit}. Scale is in raw units per "
-            f"{unit}: is it upside down ({1 / scale:.4g})?"
+            f"{triad.noise / scale:.2g} {unit}; a sensor has from {least:g} to {most:g} {unit}. Scale is in raw units "
+            f"per {unit}: is it upside down ({1 / scale:.4g})?"
         )
 
 
