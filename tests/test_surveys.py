@@ -233,6 +233,14 @@ def test_limits_that_are_none(tmp_path, text, message):
         load_survey_limits(path)
 
 
+def test_a_distance_of_readings_of_any_uncertainty_is_a_number():
+    """One axis so uncertain that strength and dip follow it alone: fully correlated, and yet a distance."""
+    along = np.array([3.0, 2.0, -1.0])
+    for size in (1e-6, 1.0, 1e15):
+        covariance = np.outer(along, along) * size**2 + 1e-24 * np.eye(3)
+        assert 0.9 < distance(along * size, covariance) < 1.1
+
+
 def test_strengths_lie_where_they_are_said_to():
     assert SURVEYED[STRENGTHS] == ("gravity", "field", "dip")
 
