@@ -12,6 +12,7 @@ import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from datetime import date, time
+from typing import Any
 
 from mwdcal.errors import InputError
 
@@ -49,7 +50,7 @@ def parse(lines: Iterable[tuple[int, str]], source: str, word: str = "line") -> 
     return metadata
 
 
-def load_toml(text: str) -> dict[str, object]:
+def load_toml(text: str) -> dict[str, Any]:
     """The values of TOML text, for all such text that enters: a key of many parts takes memory as their square.
 
     Raises:
