@@ -22,9 +22,9 @@ LARGEST_TOML = 1_000_000
 """Characters of TOML text."""
 DEEPEST = 20
 """Levels of lists and tables in a value, and parts of a key."""
-_PART = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
+_KEY_PART = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
 _LONG_KEY = re.compile(
-    rf"(?:^|[\[{{,])[ \t]*+(?:{_PART}[ \t]*+\.[ \t]*+){{{DEEPEST}}}", re.MULTILINE
+    rf"(?:^|[\[{{,])[ \t]*+(?:{_KEY_PART}[ \t]*+\.[ \t]*+){{{DEEPEST}}}", re.MULTILINE
 )
 """A key of more parts, where keys may stand."""
 

@@ -92,7 +92,7 @@ class VerdictPlots:
         label, (colour, marker, line) = self._look(each, worst)
         stations = [self.verdict.station_rows[i] for i in each.stations]
         toolface = np.array([station.toolface_deg for station in stations], float)
-        values = [station.departures[row.name] for station in stations]
+        values = [station.departures.get(row.name, np.nan) for station in stations]
         look: dict[str, Any] = {"color": colour, "lw": 1, "zorder": 2.5 if worst else 2}
         markers: dict[str, Any] = {"marker": marker, "mfc": "none", "mew": 0.8, "ms": 3.4}
         axes.plot(np.mod(toolface, 360), values, ls="", **markers, **look)
