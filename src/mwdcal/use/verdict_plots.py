@@ -66,7 +66,9 @@ class VerdictPlots:
         worst = max(row.sets, key=lambda each: each.value)
         for each in row.sets:
             self._draw_set(axes, row, each, each is worst)
-        shown = [self.verdict.station_rows[i].departures[row.name] for i in _stations(row)]
+        shown = [
+            self.verdict.station_rows[i].departures.get(row.name, np.nan) for i in _stations(row)
+        ]
         _limit_lines(axes, row, float(np.abs(shown).max()))
         axes.axhline(0, color="#4b5563", lw=0.6, zorder=1)
         axes.set(xlim=(-5, 365), xticks=range(0, 361, 90), xlabel="toolface, °")
