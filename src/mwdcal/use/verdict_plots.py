@@ -69,7 +69,7 @@ class VerdictPlots:
         shown = [
             self.verdict.station_rows[i].departures.get(row.name, np.nan) for i in _stations(row)
         ]
-        _limit_lines(axes, row, float(np.abs(shown).max()))
+        _limit_lines(axes, row, float(np.nanmax(np.abs([0.0, *shown]))))
         axes.axhline(0, color="#4b5563", lw=0.6, zorder=1)
         axes.set(xlim=(-5, 365), xticks=range(0, 361, 90), xlabel="toolface, °")
         axes.set_ylabel(f"{'departure' if row.bound < row.limit else 'error'}, {row.unit}")
