@@ -63,7 +63,7 @@ LOWEST_LAND = -500.0
 LARGEST_ANOMALY = 0.5
 """Departure of a measured field from that of a model, as a share of its strength, beyond which it is a mistake."""
 LARGEST_ANOMALY_G = 0.01
-"""The same of gravity, g: more than ten times the largest anomaly of the Earth."""
+"""Departure of measured gravity, g, beyond which it is a mistake. It is over ten times the largest anomaly."""
 LEAST_HORIZONTAL = 6000.0
 """Horizontal field below which magnetic azimuths need caution by the World Magnetic Model, nT."""
 ALTITUDES = Range(-15_000.0, 100_000.0, "m")
