@@ -23,6 +23,7 @@ import tempfile
 import time
 import traceback
 import warnings
+import zipfile
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -43,7 +44,7 @@ from test_fleet import roll_run
 
 LONGEST_SECONDS = 10
 """Of processor time; twelve times as long by the clock, on a machine that may be busy."""
-MOST_MEMORY = 1_500_000_000
+MOST_MEMORY = 1_000_000_000
 QUIET = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
 
 # ------------------------------------------------------------------ samples: sound files by kind
@@ -213,6 +214,58 @@ NAMES = (
     *("ref_azimuth_deg", "ref_gravity_g", "sd_ax", "sd_ref_field_nt", "gx_g", "azimuth_deg"),
     *("AX", "ax ", "Ax (mg)", "temp", "#", " #x", "", " ", "a\nb", "message", "status"),
 )
+DATES = (
+    *(
+        "2026-03-15",
+        "15.03.2026",
+        "03/15/26",
+        "2026-3-5",
+        "20260315",
+        "2026-W11-7",
+        "2026-074",
+        "March 15",
+    ),
+    *("0001-01-01", "9999-12-31", "10000-01-01", "-0044-03-15", "2026-02-30", "2026-03-15T25:00"),
+    *(
+        "2026-03-15T12:00:00+14:00",
+        "0001-01-01T00:00:00+14:00",
+        "9999-12-31T23:59:59-12:00",
+        "٢٠٢٦-٠٣-١٥",
+    ),
+)
+SERIALS = (
+    *(
+        "007",
+        "7",
+        "0x7",
+        "1e3",
+        "1E3",
+        "7.0",
+        " T1",
+        "T1 ",
+        "t1",
+        "Ｔ１",
+        "T\u200b1",
+        "e\u0301",
+        "\u00e9",
+        "A/B",
+    ),
+    *(
+        "..",
+        "A\\B",
+        "a#b",
+        "CON",
+        "NaN",
+        "null",
+        "2026-03-15",
+        "1_000",
+        "#1",
+        "-",
+        "9" * 30,
+        "T" * 300,
+    ),
+)
+ODD = NUMBERS + TEXTS + DATES + SERIALS
 
 
 class Columns:
@@ -233,13 +286,13 @@ class Columns:
             r.choice(changes)(self, r, r.choice(list(self.columns)))
 
     def one_cell(self, r: random.Random, name: str) -> None:
-        self.columns[name][r.randrange(self.count)] = r.choice(NUMBERS + TEXTS)
+        self.columns[name][r.randrange(self.count)] = r.choice(ODD)
 
     def whole_column(self, r: random.Random, name: str) -> None:
-        self.columns[name] = [r.choice(NUMBERS + TEXTS)] * self.count
+        self.columns[name] = [r.choice(ODD)] * self.count
 
     def every_cell(self, r: random.Random, name: str) -> None:
-        self.columns[name] = [r.choice(NUMBERS + TEXTS) for _ in range(self.count)]
+        self.columns[name] = [r.choice(ODD) for _ in range(self.count)]
 
     def numbers(self, r: random.Random, name: str) -> None:
         """Scaled, shifted, noisy, rounded or constant numbers."""
@@ -268,9 +321,7 @@ class Columns:
         self.columns = {new if k == name else k: v for k, v in self.columns.items()}
 
     def add(self, r: random.Random, name: str) -> None:
-        source = r.choice(
-            [self.columns[name], [r.choice(NUMBERS + TEXTS) for _ in range(self.count)]]
-        )
+        source = r.choice([self.columns[name], [r.choice(ODD) for _ in range(self.count)]])
         self.columns[r.choice(NAMES)] = list(source)
 
     def swap(self, r: random.Random, name: str) -> None:
@@ -299,9 +350,19 @@ class Columns:
         self.columns[name] = ["" if r.random() < share else v for v in self.columns[name]]
 
     def describe(self, r: random.Random, name: str) -> None:
-        key = r.choice(("serial", "sampling_hz", "simulated", "azimuth_reference", "x", "findings"))
+        key = r.choice(
+            ("serial", "date", "sampling_hz", "simulated", "azimuth_reference", "x", "findings")
+        )
         value = r.choice(
-            (*NUMBERS, *(json.dumps(t) for t in TEXTS), "[" * 500, "{a={b=1}}", "1979-05-27")
+            (
+                *NUMBERS,
+                *DATES,
+                *SERIALS,
+                *(json.dumps(t) for t in TEXTS + DATES + SERIALS),
+                "[" * 500,
+                "{a={b=1}}",
+                "1979-05-27",
+            )
         )
         self.metadata.append(f"{r.choice((key, key, r.choice(TEXTS)))} = {value}")
 
@@ -467,7 +528,8 @@ def document_file(r: random.Random, sample: str, stem: Path) -> Path:
         elif isinstance(node, dict) and r.random() < 0.3:
             del node[last]
         else:
-            node[last] = r.choice((None, True, 0, -1, 1e308, 10**400, [], {}, [old], *TEXTS[:-8]))
+            odd = (*TEXTS[:-8], *DATES, *SERIALS)
+            node[last] = r.choice((None, True, 0, -1, 1e308, 10**400, [], {}, [old], [None], *odd))
     path = stem.with_suffix(".json")
     text = json.dumps(document)
     if r.random() < 0.05:
@@ -483,11 +545,108 @@ def toml_file(r: random.Random, sample: str, stem: Path) -> Path:
         i = r.randrange(len(lines))
         key = lines[i].split("=")[0]
         value = r.choice(
-            (*NUMBERS, *(json.dumps(t) for t in TEXTS[:-8]), "[" * 3000, '["+x", "-y", "+z"]')
+            (
+                *NUMBERS,
+                *(json.dumps(t) for t in TEXTS[:-8] + DATES + SERIALS),
+                "[" * 3000,
+                '["+x", "-y", "+z"]',
+            )
         )
         lines[i] = r.choice((f"{key} = {value}", "", f"{key} = {value}", f"{lines[i]}\n{lines[i]}"))
     path = stem.with_suffix(".toml")
     path.write_text("\n".join(lines), "utf-8", "surrogatepass")
+    return path
+
+
+# --------------------------------------------------------- bombs: small files that take everything
+
+
+def toml_bomb(r: random.Random) -> str:
+    """Keys of many parts, values of many levels, many keys."""
+    many, few = r.choice((30, 3_000, 100_000)), r.choice((2, 20, 21, 200))
+    key, short = ".".join(["a"] * many), ".".join(["a"] * few)
+    line = r.choice(
+        (f"{key} = 1", f"[{key}]", f"x = {{{key} = 1}}", f"x = {'[' * many}", f"x = {'{a=' * many}")
+    )
+    lines = "\n".join(f"b{i}.{short} = 1" for i in range(900_000 // (2 * few + 12)))
+    return r.choice((line, line, lines))
+
+
+def las_bomb(r: random.Random) -> str:
+    """Equal or nearly equal mnemonics, many curves, many values of one wrapped row."""
+    entries = "\n".join(
+        (
+            r.choice(("X. 1 :", f"X{i % 60}. 1 :", " : ", ".M 1 :", f"X:{i}. 1 :", "X..1 :"))
+            * r.choice((1, 1, 50))
+        )[:1900]
+        for i in range(r.choice((60, 3_900, 5_000)))
+    )
+    if r.random() < 0.5:
+        entries = (r.choice(("X. 1 :", " : ", "x .1 :a", "#")) + "\n") * r.choice(
+            (60, 3_900, 30_000)
+        )
+    curves = " DEPT.M :\n" + "".join(f" {n}. :\n" for n in cli_support.RAW)
+    sections = [f"~W\n NULL. -999.25 :\n{entries}", f"~C\n{curves}{r.choice(('', entries))}"]
+    return "\n".join(
+        ["~V\n VERS. 2.0 :\n WRAP. YES :", *sections, "~A", "1 " * r.choice((7, 400_000))]
+    )
+
+
+def trajectory_bomb(r: random.Random) -> str:
+    """Encodings, entities, depth, floods of elements and attributes."""
+    encoding = r.choice(
+        ("utf-7", "utf-16-le", "utf-32", "big5", "idna", "rot13", "UTF-8", "UTF-8", "UTF-8")
+    )
+    inside = r.choice((
+        "<a>" * 150_000, "<a/>" * 200_000, "<a " + " ".join(f'b{i}=""' for i in range(60_000)) + "/>",
+        f"<a>{'x' * 900_000}</a>", "<trajectoryStation/>" * 40_000, "",
+    ))  # fmt: skip
+    types = r.choice(("", "", '<!DOCTYPE a [<!ENTITY b "c">]>'))
+    return (
+        f'<?xml version="1.0" encoding="{encoding}"?>{types}<trajectorys xmlns="http://www.witsml.org/schemas/1series">'
+        f"<trajectory>{inside}</trajectory></trajectorys>"
+    )
+
+
+def workbook_bomb(r: random.Random, path: Path) -> None:
+    """Long texts, texts of many parts, and cells that all point to them."""
+    openpyxl.Workbook().save(path)
+    with zipfile.ZipFile(path) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    text = r.choice((
+        "<t>" + "x" * 900_000 + "</t>", "<t>" + "x" * 30_000 + "</t>", "<r><t>x</t></r>" * 2_000_000,
+        "<rPr/>" * 3_000_000, "<t>x</t>" * 1_000_000, '<t>x</t><rPh sb="0" eb="1"><t>y</t></rPh>' * 500_000,
+    ))  # fmt: skip
+    names = "".join(f'<c t="inlineStr"><is><t>{n}</t></is></c>' for n in (*cli_support.RAW, "note"))
+    cell = r.choice(('<c t="s"><v>0</v></c>', f'<c t="inlineStr"><is>{text}</is></c>'))
+    row = f"<row>{'<c><v>1</v></c>' * 6}{cell}</row>"
+    sheet = f"<row>{names}</row>" + row * (2 if "inline" in cell else r.choice((2, 20_000)))
+    space = 'xmlns="http://schemas.openxmlformats.org/spreadsheetml/2006/main"'
+    parts["xl/sharedStrings.xml"] = f"<sst {space}><si>{text}</si></sst>".encode()
+    parts["xl/worksheets/sheet1.xml"] = (
+        f"<worksheet {space}><sheetData>{sheet}</sheetData></worksheet>".encode()
+    )
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in parts.items():
+            archive.writestr(name, content)
+
+
+def bomb(r: random.Random, kind: str, stem: Path) -> Path:
+    """A file of a kind that is small and takes much of whoever reads it without bounds."""
+    if kind not in ("run", "log", "fleet"):
+        path, text = stem.with_suffix(".toml"), toml_bomb(r)
+    else:
+        path = stem.with_suffix(r.choice((".csv", ".las", ".xml", ".xlsx")))
+        if path.suffix == ".xlsx":
+            workbook_bomb(r, path)
+            return path
+        header = ",".join(cli_support.RAW)
+        text = {
+            ".csv": lambda: f"# {toml_bomb(r)[:99_000]}\n{header}\n1,2,3,1,2,3\n",
+            ".las": lambda: las_bomb(r),
+            ".xml": lambda: trajectory_bomb(r),
+        }[path.suffix]()
+    path.write_text(text, "utf-8")
     return path
 
 
@@ -530,12 +689,20 @@ WORDS = {
     "repeat": ("1", "3", "20", "0"),
     "workers": ("1",),
     "word_bits": ("32", "24", "16", "11"),
-    "day": (*("2026-07-01",) * 6, "2025-01-01", "1950-06-30", "2024-02-30", "1.7.2026"),
-    "received": ("2026-07-01", "2025-01-01", "2024-02-30"),
-    "crs": ("EPSG:23031", "EPSG:4326", "EPSG:2048", "EPSG:1"),
+    "day": (*("2026-07-01",) * 20, "2025-01-01", "1950-06-30", *DATES),
+    "received": (*("2026-07-01",) * 9, *DATES),
+    "crs": (
+        "EPSG:23031",
+        "EPSG:4326",
+        "EPSG:2048",
+        "EPSG:22300",
+        "EPSG:5773",
+        "EPSG:4978",
+        "EPSG:1",
+    ),
     "field_nt": ("48000", "51000.5", "48"),
     "gravity_g": ("1.0013", "9.81"),
-    "serial": ("T0", "T1", "T9"),
+    "serial": (*("T0", "T1", "T9") * 5, *SERIALS),
     "record": ("T0", "T1", "1", "2", "900", "abcdef12"),
     "kind": ("calibration", "run", "tool", "standard", "x"),
     "due": ("2027-01-01", "2026-02-30", "x"),
@@ -578,6 +745,17 @@ def files(r: random.Random, kind: str, sound: dict[str, list[Any]], stem: Path) 
         kinds = ("calibration", "run", "profile", "limits", "verification", "laboratory", "signed")
         some = files(r, r.choice(kinds), sound, stem)
         return Path(str(some).partition("#")[0])
+    if r.random() < 0.02 and kind in (
+        "run",
+        "log",
+        "fleet",
+        "profile",
+        "limits",
+        "effects",
+        "plan",
+        "laboratory",
+    ):
+        return bomb(r, kind, stem)
     sample = r.choice(sound[kind])
     if kind in ("run", "log"):
         plain = (".txt",) if kind == "log" else ()
@@ -610,13 +788,35 @@ def folder_of_runs(r: random.Random, sound: dict[str, list[Any]], folder: Path) 
     return folder
 
 
+def occupy(r: random.Random, path: Path, sound: dict[str, list[Any]]) -> None:
+    """Put something where an output will be written: a file of any kind, a folder, a link."""
+    kind = r.choice(("file", "file", "file", "empty", "read-only", "folder", "link", "dangling"))
+    if kind == "folder":
+        path.mkdir()
+    elif kind in ("link", "dangling"):
+        elsewhere = path.with_name(f"out-elsewhere{path.suffix}")
+        path.symlink_to(elsewhere)
+        if kind == "link":
+            elsewhere.write_text("kept", "utf-8")
+    else:
+        sample = r.choice(
+            [each for some in sound.values() for each in some if isinstance(each, str | bytes)]
+        )
+        data = sample.encode() if isinstance(sample, str) else sample
+        path.write_bytes(b"" if kind == "empty" else data)
+        path.chmod(0o444 if kind == "read-only" else 0o644)
+
+
 def value(r: random.Random, p: click.Parameter, sound: dict[str, list[Any]], folder: Path) -> str:
     """A value of an argument or option."""
     name = str(p.name)
     metavar = str(getattr(p, "metavar", "") or "")
     if name in OUTPUTS:
         suffixes = re.findall(r"\.\w+", metavar) or sorted({*TABLE_SUFFIXES})
-        return str(folder / f"out-{name}{r.choice(suffixes)}")
+        path = folder / f"out-{name}{r.choice(suffixes)}"
+        if r.random() < 0.1:
+            occupy(r, path, sound)
+        return str(path)
     if name == "database" and r.random() < 0.2:
         return str(folder / "out-database.sqlite")
     if name in SAMPLES and (name not in WORDS or r.random() < 0.3):
@@ -716,11 +916,28 @@ def readable(line: list[str], path: Path) -> list[str]:
     return []
 
 
-def promises(line: list[str], ran: cli_support.Ran, folder: Path, before: set[Path]) -> list[str]:
+def contents(folder: Path) -> dict[Path, bytes | None]:
+    """What there is in a folder: files with their bytes, of those that a command may write."""
+    return {
+        path: path.read_bytes() if path.is_file() and path.name.startswith("out-") else None
+        for path in folder.rglob("*")
+    }
+
+
+def promises(
+    line: list[str], ran: cli_support.Ran, folder: Path, before: dict[Path, bytes | None]
+) -> list[str]:
     """What of the promises to every command is not kept."""
     broken = []
+    after = contents(folder)
+    lost = before.keys() - after.keys()
+    broken += [f"lost: {sorted(p.name for p in lost)}"] if lost else []
     journals = ("-wal", "-shm")  # which SQLite leaves beside a database that is damaged
-    written = {p for p in folder.rglob("*") if p not in before and not p.name.endswith(journals)}
+    written = {
+        p
+        for p, data in after.items()
+        if (p not in before or data != before[p]) and not p.name.endswith(journals)
+    }
     named = {p for p in written if p.relative_to(folder).parts[0].startswith("out-")}
     shown = {
         p for p in named if p.name.startswith(("out-plot", "out-report"))
@@ -759,7 +976,7 @@ def case(seed: int, sound: dict[str, list[Any]], folder: Path) -> tuple[str, int
     (name,) = r.choices(WITH_FILES, [RARE.get(n, 1.0) for n in WITH_FILES])
     line = command(r, name, sound, folder)
     (folder / "command").write_text(json.dumps(line))
-    before = set(folder.rglob("*"))
+    before = contents(folder)
     held, start, code, broken = memory(), time.process_time(), -1, []
     with warnings.catch_warnings(record=True) as warned, limited():
         warnings.simplefilter("always")
@@ -787,7 +1004,7 @@ def case(seed: int, sound: dict[str, list[Any]], folder: Path) -> tuple[str, int
 def repeated(line: list[str], folder: Path) -> list[str]:
     """Outputs that a second run writes otherwise; times apart."""
 
-    def contents() -> dict[str, bytes]:
+    def written() -> dict[str, bytes]:
         paths = (
             p for stem in folder.glob("out-*") for p in (stem, *stem.rglob("*")) if p.is_file()
         )
@@ -798,9 +1015,9 @@ def repeated(line: list[str], folder: Path) -> list[str]:
             for p in paths
         }
 
-    first = contents()
+    first = written()
     cli_support.mwdcal(*line)
-    again = contents()
+    again = written()
     return [f"differs when repeated: {name}" for name in first if first[name] != again.get(name)]
 
 

@@ -4,6 +4,7 @@ import hashlib
 import json
 import re
 import shlex
+import sys
 
 import msgspec
 import pytest
@@ -187,6 +188,14 @@ def test_a_day_of_issue_that_is_refused_is_named_as_it_was_typed(here, tmp_path)
     assert day, "the run states its day"
     line = ("certificate", "new.json", "-o", tmp_path / "C.json", "--date", "1999-01-01")
     assert "--date must not be before the day of the calibration" in refused(mwdcal(*line), 2)
+
+
+@pytest.mark.parametrize("name", ["c.pdf", "c.html"])
+def test_without_matplotlib_one_sentence_says_what_to_install(here, tmp_path, monkeypatch, name):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    ran = mwdcal("certificate", "new.json", "-o", tmp_path / name)
+    assert "needs matplotlib, which is not installed" in refused(ran, 2)
+    assert not (tmp_path / name).exists()
 
 
 def test_all_files_are_written_or_none(here, tmp_path, monkeypatch):

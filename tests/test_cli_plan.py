@@ -7,7 +7,7 @@ import csv
 import numpy as np
 import pytest
 
-from cli_support import RAW, SCALE, SERVO_NOISE, mwdcal, refused
+from cli_support import EXAMPLE, RAW, SCALE, SERVO_NOISE, mwdcal, refused, write_csv
 from simulation import DEG, Tool
 
 ATTITUDE = ("ref_inclination_deg", "ref_azimuth_deg", "ref_toolface_deg")
@@ -190,6 +190,41 @@ def test_what_cannot_be_planned_ends_in_one_sentence(tmp_path, monkeypatch, argu
     message = refused(mwdcal("plan", *arguments, "--tool", "servo", "-o", "plan.csv"), code)
     assert words in message
     assert not (tmp_path / "plan.csv").exists()
+
+
+@pytest.mark.parametrize(
+    "options", [("--stations", 24), ("--criterion", "D", "--json"), ("--parameters", 6)]
+)
+@pytest.mark.parametrize(
+    ("kind", "old", "new"),
+    [
+        ("magnetometer", "scale = 5e-5", "scale = 2e4"),
+        ("magnetometer", "noise = 7.5e-4", "noise = 1e9"),
+        ("accelerometer", "scale = 3.0", "scale = 1e12"),
+    ],
+)
+def test_noise_that_no_sensor_has_is_refused(tmp_path, options, kind, old, new):
+    """As where the scale is upside down: 7.5e-4 V at 2e4 V per nT are 4e-8 nT."""
+    text = (EXAMPLE / "tool.toml").read_text("utf-8")
+    assert old in text
+    tool = tmp_path / "tool.toml"
+    tool.write_text(text.replace(old, new), "utf-8")
+    message = refused(mwdcal("plan", "--tool", tool, *options), 2)
+    assert f"[{kind}]" in message
+    assert "is it upside down" in message
+
+
+@pytest.mark.parametrize("name", ["inclination", "azimuth", "toolface"])
+def test_a_plan_without_an_attitude_is_refused(tmp_path, name):
+    columns = {
+        f"ref_{each}_deg": [10.0 * k for k in range(8)]
+        for each in ("inclination", "azimuth", "toolface")
+        if each != name
+    }
+    plan = write_csv(tmp_path / "p.csv", {"station": list(range(8)), **columns})
+    for options in ((), ("--html", tmp_path / "p.html"), ("--stations", 6)):
+        ran = mwdcal("plan", "--plan", plan, "--tool", "servo", *options)
+        assert f"station 1 has no ref_{name}_deg" in refused(ran, 2)
 
 
 def test_a_profile_without_noise_cannot_be_planned_with():

@@ -7,6 +7,8 @@ import json
 import os
 import subprocess
 import sys
+import tomllib
+import tracemalloc
 import zipfile
 
 import numpy as np
@@ -22,6 +24,7 @@ from mwdcal.files.formats import workbook_limits
 from mwdcal.files.formats.columns import plain_names
 from mwdcal.files.formats.table import Table, numbers, read, write
 from mwdcal.files.limits import load_limits
+from mwdcal.planning.plans import load_plan
 
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
@@ -200,6 +203,9 @@ FLOOD = b"".join(b' a%d=""' % i for i in range(200_000))
         (b"".join(b"<n%d/>" % i for i in range(20_000)), "names"),
         (b"<n/>" * 600_000, "other elements"),
         (b'<row><c t="str"><v>' + b"x" * 2_000_000 + b"</v></c></row>", "characters in a cell"),
+        (b'<row><c><is>' + b"<r><t>xxx</t></r>" * 30_000 + b"</is></c></row>", "characters in a cell"),
+        (b"<row><c><is>" + b"<rPr/>" * 600_000 + b"</is></c></row>", "at most 500002 parts in 1 cells"),
+        (b"<row><c>" + b"<v/>" * 600_000 + b"</c></row>", "parts in 1 cells"),
         (b'<row r="1"/><row r="900000"/>', "blank rows"),
         (b'<row r="1048577"/>', "1048576 rows"),
         (b'<row><c t="s"><v>7</v></c></row>', "reading it failed"),
@@ -208,6 +214,50 @@ FLOOD = b"".join(b' a%d=""' % i for i in range(200_000))
 )  # fmt: skip
 def test_sheets_that_no_program_writes(tmp_path, sheet, part):
     assert part in refusal(workbook(tmp_path / "t.xlsx", sheet))
+
+
+LONG_KEYS = {
+    "dotted": ".".join(["a"] * 45_000) + " = 1",
+    "quoted": '."b c" . '.join(["a"] * 45_000) + " = 1",
+    "section": "[" + ".".join(["a"] * 45_000) + "]",
+    "within": "x = {" + ".".join(["a"] * 45_000) + " = 1}",
+}
+
+
+@pytest.mark.parametrize("text", LONG_KEYS.values(), ids=LONG_KEYS)
+@pytest.mark.parametrize("where", ["profile", "limits", "plan", "metadata"])
+def test_a_key_of_many_parts_is_refused_before_it_takes_memory(tmp_path, where, text):
+    """tomllib holds every beginning of such a key: 45,000 parts are 1e9 references, 8 GB."""
+    path = tmp_path / f"{where}.toml"
+    path.write_text(f'name = "x"\n{text}\n', encoding="utf-8")
+    load = {
+        "profile": lambda: profiles.load_profile(str(path)),
+        "limits": lambda: load_limits(str(path)),
+        "plan": lambda: load_plan(str(path)),
+        "metadata": lambda: metadata.parse([(1, f"# {text}")], "run.csv"),
+    }[where]
+    tracemalloc.start()
+    with pytest.raises(InputError) as refused:
+        load()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 50_000_000
+    assert len(str(refused.value)) < 400
+    assert where == "metadata" or "at most 20 parts" in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        ".".join(["a"] * 20) + " = 1",
+        'x = "' + "a." * 50 + '"',
+        "x = [" + "1.5, " * 50 + "]",
+        "# " + "a." * 50,
+        "x = '" + "." * 50 + "'",
+    ],
+)
+def test_dots_elsewhere_are_no_keys(text):
+    assert metadata.load_toml(text) == tomllib.loads(text)
 
 
 def test_parts_whose_names_have_commas_are_checked_too(tmp_path):

@@ -145,6 +145,8 @@ def test_a_value_that_is_no_number_is_refused_with_its_row(tmp_path):
             "4000 lines",
         ),
         (LAS.replace("AAAAA_2", "A" * 3000), "2000 characters"),
+        (LAS.replace("~PARAM", "~PARAM\n" + "X. 1 : x\n" * 3900), "at most 50 repeated mnemonics"),
+        (LAS.replace("~PARAM", "~PARAM\n" + " : x\n" * 3900), "at most 50 repeated mnemonics"),
         (LAS.replace("WELL  .   AAAAA_2 : WELL", "no item"), "header of a LAS"),
         ("LASF" + "\1" * 300, "no section ~Curve"),
         (b"LASF" + bytes(300), "NUL byte"),

@@ -328,7 +328,8 @@ def test_measured_values_stand_before_the_model():
     assert reference.declination_deg == modelled.declination_deg
     assert reference.measured == ["gravity", "field", "dip"]
     assert {n for n, s in reference.sources.items() if s == "measured"} == set(reference.measured)
-    assert [f.id for f in reference.findings] == ["exact-reference"]  # dip
+    # dip; and a field that is 800 nT off the model, whose 1σ is 140 nT
+    assert [f.id for f in reference.findings] == ["exact-reference", "field-disagrees"]
 
 
 def test_where_all_was_measured_no_model_is_needed(monkeypatch):
@@ -336,6 +337,55 @@ def test_where_all_was_measured_no_model_is_needed(monkeypatch):
     measured = {"field": 50_500.0, "dip": 72.7, "declination": 1.0}
     reference = reference_at(60.0, 3.5, 40.0, date(1850, 1, 1), measured=measured)
     assert (reference.model, reference.epoch, reference.coefficients) == (None, None, None)
+    assert "not-compared-with-model" in {finding.id for finding in reference.findings}
+
+
+SD_OF_MODEL = {
+    "gravity": "sd_gravity_g",
+    "field": "sd_field_nt",
+    "dip": "sd_dip_deg",
+    "declination": "sd_declination_deg",
+}
+
+
+@pytest.mark.parametrize("name", SD_OF_MODEL)
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_a_measured_value_is_compared_with_the_model(name, sign):
+    modelled, key = reference_at(*PLACE), SD_OF_MODEL[name].removeprefix("sd_")
+    of_model = np.hypot(getattr(modelled, f"sd_{key}"), getattr(modelled, f"sd_random_{key}", 0.0))
+    measured_sd = 0.7 * of_model
+    for off, named in ((1.9, False), (2.1, True)):
+        value = getattr(modelled, key) + sign * off * np.hypot(of_model, measured_sd)
+        found = reference_at(*PLACE, measured={name: value}, uncertainties={name: measured_sd})
+        texts = [each.text for each in found.findings if each.id == f"{name}-disagrees"]
+        assert bool(texts) is named
+        assert all("the model" in text for text in texts)
+
+
+@pytest.mark.parametrize(
+    ("measured", "words"),
+    [
+        ({"dip": 63.0}, "`dip_deg` must be those of the place; got 63 °, the model -63."),
+        (
+            {"field": 80_000.0, "dip": 20.0, "declination": 100.0},
+            "`field_nt`, `dip_deg`, `declination_deg`",
+        ),
+        ({"gravity": 1.05}, "`gravity_g` must be within 0.01 g of the model's"),
+    ],
+)
+def test_a_measured_value_that_cannot_be_there_is_refused(measured, words):
+    with pytest.raises(InputError) as refusal:
+        reference_at(-33.0, 151.0, 0.0, date(2026, 7, 1), measured=measured)
+    assert words in str(refusal.value)
+
+
+def test_the_north_of_a_run_that_contradicts_the_place_is_named(tmp_path):
+    here = reference_at(*PLACE, crs="EPSG:23031")
+    for off, named in ((0.0, False), (5.0, True)):
+        metadata = f"# declination_deg = {here.declination_deg + off}\n# convergence_deg = {here.convergence_deg - off}"
+        file = run_file(tmp_path, "ax,ay,az", "0,0,1", metadata=metadata)
+        ran, _ = filled(tmp_path, file, "--crs", "EPSG:23031")
+        assert ("declination:" in ran.err, "convergence:" in ran.err) == (named, named)
 
 
 @pytest.mark.parametrize(
@@ -499,7 +549,7 @@ def test_a_run_without_blank_references_stays_as_it_is(tmp_path):
     ran, output = filled(tmp_path, EXAMPLE / "run.csv")
     assert output.read_text("utf-8") == (EXAMPLE / "run.csv").read_text("utf-8")
     assert "Nothing was filled" in ran.err
-    assert "ref_field_nt is 48000 in the run and stays" in ran.err
+    assert "field: run.csv states 48000 nT" in ran.err
     assert "SIMULATED DATA" in ran.out
 
 

@@ -596,6 +596,8 @@ def test_files_lie_where_the_certificate_says_or_beside_it(tmp_path, files, key,
     [
         ("2000-01-01T00:00:00+00:00", "before the key was created"),
         ("2999-01-01T00:00:00+00:00", "in the future"),
+        ("0001-01-01T00:00:00+00:00", "before the key was created"),
+        ("9999-12-31T23:59:59+00:00", "in the future"),
         ("", "cannot be read"),
         (None, ""),
     ],
@@ -746,6 +748,28 @@ def test_cryptography_is_loaded_only_for_a_signature(tmp_path, files):
             [*command, *arguments], capture_output=True, encoding="utf-8", check=True
         )
         assert done.stderr.splitlines()[-1] == "False False"
+
+
+@pytest.mark.parametrize("created", ["0001-01-01T00:00:00+00:00", "9999-12-31T23:59:59-12:00"])
+def test_a_key_of_any_year_is_read(tmp_path, key, public, created):
+    other = tmp_path / "other.pub"
+    text = public.read_text("utf-8")
+    line = next(line for line in text.splitlines() if line.startswith("Created:"))
+    other.write_text(text.replace(line, f"Created: {created}"), "utf-8")
+    assert state(signed(certificate(tmp_path), key), "--key", other) == (0, "intact")
+
+
+@pytest.mark.parametrize("listed_files", [[None], [1], "x", {"a": 1}])
+@pytest.mark.parametrize("output", [True, False])
+def test_what_cannot_be_listed_is_refused_before_anything_is_written(
+    tmp_path, key, listed_files, output
+):
+    path = certificate(tmp_path, files=listed_files)
+    data, out = path.read_bytes(), tmp_path / "signed.json"
+    options = ("-o", out) if output else ()
+    refused(mwdcal("certificate", "sign", path, "--key", key, *options), 2)
+    assert path.read_bytes() == data
+    assert not out.exists()
 
 
 def test_an_interrupted_or_refused_signature_leaves_the_file(tmp_path, key, monkeypatch):

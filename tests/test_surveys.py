@@ -233,6 +233,14 @@ def test_limits_that_are_none(tmp_path, text, message):
         load_survey_limits(path)
 
 
+def test_a_distance_of_readings_of_any_uncertainty_is_a_number():
+    """One axis so uncertain that strength and dip follow it alone: fully correlated, and yet a distance."""
+    along = np.array([3.0, 2.0, -1.0])
+    for size in (1e-6, 1.0, 1e15):
+        covariance = np.outer(along, along) * size**2 + 1e-24 * np.eye(3)
+        assert 0.9 < distance(along * size, covariance) < 1.1
+
+
 def test_strengths_lie_where_they_are_said_to():
     assert SURVEYED[STRENGTHS] == ("gravity", "field", "dip")
 
@@ -347,8 +355,114 @@ def test_a_table_and_a_reference_that_disagree_of_north_are_named(example, tmp_p
             f"convergence_deg = {made['convergence_deg'] + turn}",
         )
         _, document = surveyed_file(example, tmp_path, {}, "--reference", place, metadata=told)
-        named = {each["id"] for each in document["findings"] if "disagrees" in each["id"]}
-        assert named == {f"{name}-disagrees" for name in expected}
+        norths = {"declination", "convergence"}
+        assert disagreements(document) & norths == expected
+
+
+def disagreements(document):
+    ids = (each["id"] for each in document["findings"])
+    return {name.removesuffix("-disagrees") for name in ids if name.endswith("-disagrees")}
+
+
+QUANTITIES = ("gravity", "field", "dip", "declination", "convergence")
+
+
+@pytest.fixture
+def place(tmp_path):
+    """A reference of the field and dip of the example's well, with uncertainties that are known here."""
+    file = tmp_path / "here.json"
+    made = cli(
+        *("reference", "--latitude", "60", "--longitude", "3.5", "--altitude-m", "0"),
+        *("--date", "2026-06-01", "--crs", "EPSG:23031", "--field-nt", "48000", "--sd-field-nt", "80"),
+        *("--dip-deg", "63", "--sd-dip-deg", "0.06", "--gravity-g", "1", "--sd-gravity-g", "0.0001"),
+        *("--declination-deg", "2", "--sd-declination-deg", "0.3", "-o", file, "--json"),
+    )  # fmt: skip
+    assert made.code == 0, made
+    return file, made.json
+
+
+def table_of(document, gravity=1.0, field=48_000.0, dip=63.0, sd=(0.0001, 60.0, 0.08)):
+    """Columns and metadata that state every quantity, with uncertainties."""
+    cells = {"ref_gravity_g": gravity, "ref_field_nt": field, "ref_dip_deg": dip}
+    columns = {name: [str(value)] * 36 for name, value in cells.items()}
+    columns |= {f"sd_{name}": [str(each)] * 36 for name, each in zip(cells, sd, strict=True)}
+    convergence = f"convergence_deg = {document['convergence_deg']}"
+    return columns, ("declination_deg = 2", "sd_declination_deg = 0.4", convergence)
+
+
+def test_a_reference_of_which_nothing_is_used_is_not_in_the_record(example, tmp_path, place):
+    file, document = place
+    columns, metadata = table_of(document)
+    with_file = surveyed_file(example, tmp_path, columns, "--reference", file, metadata=metadata)
+    without = surveyed_file(example, tmp_path, columns, metadata=metadata)
+    assert with_file[0] == without[0]
+    assert with_file[1]["reference_sha256"] is None
+    assert with_file[1]["reference_sources"] == {
+        **dict.fromkeys(QUANTITIES, "table"), "sd_declination": "table"
+    }  # fmt: skip
+    assert "reference-unused" in {each["id"] for each in with_file[1]["findings"]}
+    assert disagreements(with_file[1]) == set()
+
+
+def test_every_quantity_has_a_source_on_screen_page_table_and_in_json(example, tmp_path, place):
+    file, document = place
+    columns, _ = table_of(document)
+    columns["ref_field_nt"][3:7] = [""] * 4
+    columns["ref_dip_deg"] = [""] * 36
+    expected = {
+        "gravity": "table",
+        "field": "table at 32 of 36 rows, else reference",
+        "dip": "reference",
+        "declination": "table",
+        "sd_declination": "reference",
+        "convergence": "reference",
+    }
+    _, told = surveyed_file(
+        example, tmp_path, columns, "--reference", file, metadata=("declination_deg = 2",)
+    )
+    assert told["reference_sources"] == expected
+    assert told["reference_sha256"]
+    out, page = tmp_path / "again.csv", tmp_path / "s.html"
+    screen = cli(
+        "survey", example, tmp_path / "in.csv", "--reference", file, "-o", out, "--html", page
+    ).out
+    line = (
+        "gravity, declination: table   field: table at 32 of 36 rows, else reference   "
+        "dip, convergence, 1σ of declination: reference"
+    )
+    for text in (screen, page.read_text("utf-8")):
+        assert " ".join(line.split()) in " ".join(text.split())
+    assert "reference_sources" in out.read_text("utf-8").partition("station")[0]
+    _, alone = surveyed_file(example, tmp_path, dict.fromkeys(columns, [""] * 36))
+    assert set(alone["reference_sources"].values()) == {"none"}
+
+
+def test_an_uncertainty_belongs_to_the_value_beside_it(example, tmp_path, place):
+    file, document = place
+    told = ("sd_declination_deg = 9",)
+    _, survey = surveyed_file(example, tmp_path, {}, "--reference", file, metadata=told)
+    assert survey["sd_declination_deg"] == pytest.approx(document["sd_declination_deg"])
+    assert "declination-uncertainty-unused" in {each["id"] for each in survey["findings"]}
+
+
+@pytest.mark.parametrize("name", ["gravity", "field", "dip"])
+def test_a_table_and_a_reference_that_contradict_each_other_are_named(
+    example, tmp_path, place, name
+):
+    """Expected: named beyond what 36 readings of a sound table would show once in 22 tables, 3.2σ (Bonferroni)."""
+    file, document = place
+    at, random = {"gravity": (1.0, 0.0), "field": (48_000.0, 60.0), "dip": (63.0, 0.08)}[name]
+    keys = {"gravity": "gravity_g", "field": "field_nt", "dip": "dip_deg"}
+    sd = {"gravity": 0.0001, "field": 60.0, "dip": 0.08}[name]
+    together = np.sqrt(sd**2 + document[f"sd_{keys[name]}"] ** 2 + random**2)
+    for off, expected in ((2.9, set()), (3.5, {name})):
+        columns, metadata = table_of(document)
+        columns[f"ref_{keys[name]}"][20] = str(at - off * together)
+        _, told = surveyed_file(example, tmp_path, columns, "--reference", file, metadata=metadata)
+        assert disagreements(told) == expected
+        for finding in told["findings"]:
+            if expected and finding["id"] == f"{name}-disagrees":
+                assert "1 of 36 rows" in finding["text"]
 
 
 @pytest.mark.parametrize("value", ["-1", '"a bit"', "true", "200"])

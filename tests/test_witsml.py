@@ -116,6 +116,18 @@ def test_units_are_those_of_the_attribute_and_axes_those_of_the_tool(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "encoding", ["utf-7", "utf-16-le", "utf-32", "big5", "shift_jis", "idna", "rot13", "no-such"]
+)
+def test_an_encoding_that_xml_readers_lack_is_refused(tmp_path, encoding):
+    path = tmp_path / "t.xml"
+    path.write_bytes(
+        f'<?xml version="1.0" encoding="{encoding}"?>'.encode() + trajectory(station(""))
+    )
+    with pytest.raises(InputError, match=r"t\.xml: (XML must be UTF-8|expected well-formed XML)"):
+        read(path)
+
+
+@pytest.mark.parametrize(
     ("content", "part"),
     [
         (station('<rawData><gravAxialRaw uom="V">3</gravAxialRaw></rawData>'), "got 'V'"),

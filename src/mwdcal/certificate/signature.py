@@ -243,9 +243,9 @@ def _clock(key: TrustedKey | None, signature: Signature | None) -> str:
         created = moment(key.created) if key.created else signed_at
     except ValueError:
         return " One of the dates of key and signature cannot be read."
-    if signed_at > moment(now()) + CLOCKS_APART:
+    if signed_at - moment(now()) > CLOCKS_APART:
         return " That is in the future: a clock is wrong, or the date."
-    if signed_at < created - CLOCKS_APART:
+    if created - signed_at > CLOCKS_APART:
         return f" That is before the key was created, {key.created}: a clock is wrong, or the date."
     return ""
 

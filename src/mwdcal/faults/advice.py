@@ -202,7 +202,7 @@ def _extended(calibration: Calibration, readings: Readings, offer: Further) -> R
     inclination, azimuth, toolface = turns
     vectors = reference_vectors(inclination, azimuth, toolface, here["gravity"], here["field"], dip)
     raw, sd = _rolled(calibration, readings, vectors, np.full(4, usual))
-    for name in readings.sd.keys() - sd.keys() | set(ANGLES):
+    for name in readings.sd.keys() - {*TRIADS} | set(ANGLES):
         stated = readings.uncertainty(name)
         least = SETTING if name in ANGLES else 0.0
         sd[name] = np.append(stated, np.full(4, max(stated.max(), least)))

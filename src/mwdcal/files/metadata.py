@@ -14,14 +14,22 @@ import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from datetime import date, time
+from typing import Any
 
 from mwdcal.calibration.readings import WORDS
 from mwdcal.errors import InputError
 
 _BARE = re.compile(r"([A-Za-z0-9_-]+)\s*=\s*([^\s\"'\[{].*)")
 _LONGEST_VALUE = 60
+LARGEST_TOML = 1_000_000
+"""Characters of TOML text."""
 DEEPEST = 20
-"""Levels of lists and tables in a value."""
+"""Levels of lists and tables in a value, and parts of a key."""
+_KEY_PART = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
+_LONG_KEY = re.compile(
+    rf"(?:^|[\[{{,])[ \t]*+(?:{_KEY_PART}[ \t]*+\.[ \t]*+){{{DEEPEST}}}", re.MULTILINE
+)
+"""A key of more parts, where keys may stand."""
 
 
 def parse(lines: Iterable[tuple[int, str]], source: str, word: str = "line") -> dict[str, object]:
@@ -43,6 +51,23 @@ def parse(lines: Iterable[tuple[int, str]], source: str, word: str = "line") -> 
             )
         metadata[key] = value
     return metadata
+
+
+def load_toml(text: str) -> dict[str, Any]:
+    """The values of TOML text, for all such text that enters: a key of many parts takes memory as their square.
+
+    Raises:
+        ValueError: text that is not TOML, or a key of more than `DEEPEST` parts.
+        RecursionError: lists and tables nested beyond what Python can follow.
+    """
+    if len(text) > LARGEST_TOML:
+        raise ValueError(f"TOML text must have at most {LARGEST_TOML} characters; got {len(text)}")
+    if long := _LONG_KEY.search(text):
+        line = text.count("\n", 0, long.end()) + 1
+        raise ValueError(
+            f"a key must have at most {DEEPEST} parts with dots between them (line {line})"
+        )
+    return tomllib.loads(text)
 
 
 def plain(metadata: Mapping[str, object], source: str) -> dict[str, object]:
@@ -83,7 +108,7 @@ def _entry(text: str, where: str) -> tuple[str, object]:
     """Key and value of one line."""
     bare = _BARE.fullmatch(text)
     try:
-        pairs = {} if text.startswith("[") else tomllib.loads(text)
+        pairs = {} if text.startswith("[") else load_toml(text)
     except (ValueError, RecursionError):
         pairs = {bare[1]: bare[2]} if bare else {}
     if len(pairs) != 1:

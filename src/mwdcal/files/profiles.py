@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import difflib
 import hashlib
 import re
@@ -16,6 +17,7 @@ from mwdcal.calibration.readings import TRIADS
 from mwdcal.errors import InputError, reason
 from mwdcal.files.contract import MAPPED, TEMPERATURE, units_of
 from mwdcal.files.formats.table import shown
+from mwdcal.files.metadata import LARGEST_TOML, load_toml
 from mwdcal.sensor.profile import (
     ColumnSource,
     Datasheet,
@@ -27,7 +29,7 @@ from mwdcal.sensor.profile import (
 
 _Decoded = TypeVar("_Decoded", bound=msgspec.Struct)
 _SUFFIX = ".toml"
-_LARGEST = 1_000_000
+_DATES = (datetime.datetime, datetime.date, datetime.time)
 _SECTIONS: dict[str, type[msgspec.Struct]] = {
     **dict.fromkeys(TRIADS, TriadProfile),
     "datasheet": Datasheet,
@@ -104,8 +106,8 @@ def read_toml(name: str, folder: str, kind: str) -> tuple[bytes, str]:
     try:
         if path.is_file():
             with path.open("rb") as stream:
-                data = stream.read(_LARGEST + 1)
-            if len(data) <= _LARGEST:
+                data = stream.read(LARGEST_TOML + 1)
+            if len(data) <= LARGEST_TOML:
                 return data.removeprefix(b"\xef\xbb\xbf"), hashlib.sha256(data).hexdigest()
         exists = path.exists()
     except (OSError, ValueError) as error:
@@ -114,7 +116,7 @@ def read_toml(name: str, folder: str, kind: str) -> tuple[bytes, str]:
         ) from error
     if exists:
         raise InputError(
-            f"'{name}' is not a {kind}: expected a TOML file of at most {_LARGEST} bytes. "
+            f"'{name}' is not a {kind}: expected a TOML file of at most {LARGEST_TOML} bytes. "
             "Name a file such as tool.toml."
         )
     names = built_in(folder)
@@ -139,7 +141,7 @@ def decoded_toml(
     """
     data, digest = read_toml(name, folder, kind)
     try:
-        return msgspec.toml.decode(data, type=struct), digest
+        return _decoded(data, struct), digest
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
         names = ", ".join(built_in(folder))
         compared = (
@@ -150,10 +152,15 @@ def decoded_toml(
         ) from None
 
 
+def _decoded(data: bytes, struct: type[_Decoded]) -> _Decoded:
+    """The values of TOML text, checked, as a `struct`."""
+    return msgspec.convert(load_toml(data.decode()), struct, builtin_types=_DATES, str_keys=True)
+
+
 def decoded_profile(data: bytes, source: str) -> Profile:
     """The checked profile in the bytes of a TOML file, without a byte order mark."""
     try:
-        profile = msgspec.toml.decode(data, type=Profile)
+        profile = _decoded(data, Profile)
     except msgspec.ValidationError as error:
         raise _invalid(str(error), source) from None
     except UnicodeDecodeError as error:

@@ -20,11 +20,31 @@ from mwdcal.files.contract import REFERENCES, channels
 from mwdcal.files.formats.table import Table
 from mwdcal.files.runs import check_references, from_readings, to_readings
 from mwdcal.geometry.vectors import Array, reference_vectors
+from mwdcal.planning.plans import attitudes
 from mwdcal.planning.simulate import Earth
-from mwdcal.sensor.profile import Profile
+from mwdcal.sensor.profile import Profile, TriadProfile
 
 STILL = 1e-6
 """A channel that moves by no more than this share of gravity or field over a plan does not move."""
+NOISE_RANGE = {"accelerometer": (1e-9, 1.0, "g"), "magnetometer": (1e-4, 1e5, "nT")}
+"""Noise that a sensor of these can have, and its unit: not less than the best one, not more than what it measures."""
+
+
+def _check_noise(profile: Profile, kind: str) -> None:
+    """Refuse a triad without noise, or with one that no sensor has, as by a scale that is upside down."""
+    triad: TriadProfile = getattr(profile, kind)
+    if triad.noise is None:
+        raise InputError(
+            f"the profile '{profile.name}' does not state the noise of the {kind}, on which every "
+            f"uncertainty rests. Add 'noise' to its [{kind}]; mwdcal noise measures it."
+        )
+    (least, most, unit), scale = NOISE_RANGE[kind], triad.scale
+    if scale is not None and not least <= triad.noise / scale <= most:
+        raise InputError(
+            f"the profile '{profile.name}', [{kind}]: noise {triad.noise:g} with scale {scale:g} is "
+            f"{triad.noise / scale:.2g} {unit}; a sensor has from {least:g} to {most:g} {unit}. Scale is in raw units "
+            f"per {unit}: is it upside down ({1 / scale:.4g})?"
+        )
 
 
 def nominal_run(plan: Table, profile: Profile) -> tuple[Readings, Profile]:
@@ -37,19 +57,9 @@ def nominal_run(plan: Table, profile: Profile) -> tuple[Readings, Profile]:
         InputError: the plan does not state an attitude, or the profile not the noise of a triad.
     """
     for kind in channels(profile.has_magnetometer):
-        if getattr(profile, kind).noise is None:
-            raise InputError(
-                f"the profile '{profile.name}' does not state the noise of the {kind}, on which every "
-                f"uncertainty rests. Add 'noise' to its [{kind}]; mwdcal noise measures it."
-            )
+        _check_noise(profile, kind)
     known = check_references(plan, profile, [])
-    for name in ANGLES:
-        blank = np.isnan(known.get(name, np.array([np.nan])))
-        if blank.any():
-            raise InputError(
-                f"{plan.source}: station {int(np.argmax(blank)) + 1} has no {REFERENCES[name].column}. A plan "
-                "states the attitude of every station."
-            )
+    attitudes(plan)
     known |= dict(zip(EARTH, planned_earth(plan), strict=True))
     gravity, field = reference_vectors(*(known[name] for name in (*ANGLES, *EARTH)))
     read = Readings(gravity, field if profile.has_magnetometer else None, known=known)

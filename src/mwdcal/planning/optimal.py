@@ -57,8 +57,8 @@ class Information:
     def of_fit(cls, result: Fit) -> tuple[Information, Array]:
         """Of the fit of all candidates, and the directions (p, r) in which it is: parameters = T · unknowns."""
         linear = result.problem.linear(result.state)
-        weight = np.linalg.cholesky(linear.weight[0] + 1e-15 * np.eye(linear.weight.shape[-1]))
-        rows = weight.mT @ linear.design[0]
+        values, vectors = np.linalg.eigh(linear.weight[0])
+        rows = (vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]).mT @ linear.design[0]
         p, covariance = linear.size, result.analysis.covariance[0]
         determined = result.analysis.determined
         values, vectors = np.linalg.eigh(covariance / np.outer(*2 * [1 / determined.norms[0]]))

@@ -241,8 +241,19 @@ def soak_numbers(plan: Table) -> Ints:
 
 
 def attitudes(plan: Table) -> Array:
-    """Inclination, azimuth and toolface (n, 3) in degrees."""
-    return np.stack([np.asarray(plan.columns[REFERENCES[n].column], float) for n in ANGLES], -1)
+    """Inclination, azimuth and toolface (n, 3) in degrees.
+
+    Raises:
+        InputError: a station without one of them.
+    """
+    columns = [REFERENCES[name].column for name in ANGLES]
+    blank = np.full(plan.count, np.nan)
+    angles = np.stack([np.asarray(plan.columns.get(name, blank), float) for name in columns], -1)
+    for row, place in np.argwhere(np.isnan(angles))[:1].tolist():
+        raise InputError(
+            f"{plan.source}: station {row + 1} has no {columns[place]}. A plan states the attitude of every station."
+        )
+    return angles
 
 
 def run_sheet(plan: Table, magnetometer: bool = True) -> Table:

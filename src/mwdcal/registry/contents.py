@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -17,6 +16,7 @@ from mwdcal.files import documents, runs
 from mwdcal.files.contract import CHANNELS
 from mwdcal.files.formats import members
 from mwdcal.files.formats import table as tables
+from mwdcal.files.metadata import load_toml
 from mwdcal.files.profiles import decoded_profile
 from mwdcal.registry.store import Entry
 from mwdcal.registry.stored import LARGEST_OBJECT
@@ -133,7 +133,7 @@ def _run(data: bytes, name: str) -> Entry:
 def _of_toml(data: bytes, name: str) -> list[Entry]:
     """A tool profile, limits or a laboratory, with the people and standards that it names."""
     try:
-        fields = tomllib.loads(data.removeprefix(_BOM).decode())
+        fields = load_toml(data.removeprefix(_BOM).decode())
     except (ValueError, RecursionError):
         raise InputError(f"{name}: {_NOT_KEPT}") from None
     try:

@@ -7,7 +7,6 @@ import hashlib
 import json
 import math
 import re
-import tomllib
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from typing import Any
@@ -199,7 +198,7 @@ def _person(data: bytes, name: str) -> Facts:
 
 
 def _profile(data: bytes, name: str) -> Facts:
-    return Facts(type=_text(tomllib.loads(data.decode("utf-8-sig")).get("name")))
+    return Facts(type=_text(metadata.load_toml(data.decode("utf-8-sig")).get("name")))
 
 
 def _run(data: bytes, name: str) -> Facts:
@@ -222,11 +221,11 @@ def _run(data: bytes, name: str) -> Facts:
 
 
 def _limits(data: bytes, name: str) -> Facts:
-    return Facts(label=_text(tomllib.loads(data.decode("utf-8-sig")).get("name")))
+    return Facts(label=_text(metadata.load_toml(data.decode("utf-8-sig")).get("name")))
 
 
 def _laboratory(data: bytes, name: str) -> Facts:
-    fields = tomllib.loads(data.decode("utf-8-sig"))
+    fields = metadata.load_toml(data.decode("utf-8-sig"))
     return Facts(label=_text(fields.get("laboratory", {}).get("name")))
 
 

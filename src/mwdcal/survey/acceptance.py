@@ -23,6 +23,8 @@ from mwdcal.survey.stations import RANDOM, STRENGTHS, SURVEYED, Surveys
 from mwdcal.use.strengths import STANDARD_GRAVITY
 
 STRENGTH_NAMES = SURVEYED[STRENGTHS]
+LEAST_FREE = 1e-12
+"""Share of a variance that is of its quantity alone, at least: the rounding of a correlation."""
 SURVEY_UNITS = {
     "gravity": ("mg", 1e3, 2),
     "field": ("nT", 1.0, 0),
@@ -115,8 +117,8 @@ class AcceptanceTests:
         """Which of departures (n, k, 3) are accepted; none where nothing is judged."""
         blank = self.missing[:, :, None] | self.missing[:, None, :]
         whole = np.where(blank, np.eye(len(STRENGTH_NAMES)), self.covariance)
-        sd = np.sqrt(diagonal(whole))
-        inverse = np.linalg.inv(whole / (sd[:, :, None] * sd[:, None, :]))
+        sd, correlation = correlations(whole)
+        inverse = np.linalg.inv(correlation)
         shift = np.where(self.missing[:, None], 0.0, departure)
         scaled = shift / sd[:, None]
         square = np.einsum("nki,nij,nkj->nk", scaled, inverse, scaled)
@@ -235,11 +237,20 @@ def distance(departure: Array, covariance: Array) -> Array:
     missing = np.isnan(departure) | np.isnan(diagonal(covariance))
     blank = missing[..., :, None] | missing[..., None, :]
     whole = np.where(blank, np.eye(departure.shape[-1]), covariance)
-    sd = np.sqrt(diagonal(whole))
+    sd, correlation = correlations(whole)
     scaled = np.where(missing, 0.0, departure) / sd
-    correlation = whole / (sd[..., :, None] * sd[..., None, :])
     solved = np.linalg.solve(correlation, scaled[..., None])[..., 0]
     return np.asarray(np.sqrt(np.maximum(np.sum(scaled * solved, -1), 0.0)))
+
+
+def correlations(covariance: Array) -> tuple[Array, Array]:
+    """Standard uncertainties (..., k) of a covariance (..., k, k), and its correlations, by which one can divide.
+
+    Singular: quantities that depend on one uncertain reading alone are fully correlated; `LEAST_FREE` keeps that apart.
+    """
+    sd = np.sqrt(diagonal(covariance))
+    correlation = covariance / (sd[..., :, None] * sd[..., None, :])
+    return sd, correlation + LEAST_FREE * np.eye(covariance.shape[-1])
 
 
 def _covariance(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from math import hypot, radians
 
 import numpy as np
@@ -10,17 +11,19 @@ import numpy as np
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
-from mwdcal.files.contract import REFERENCES, check_near_misses, stated_norths
+from mwdcal.files.contract import AZIMUTH_KEYS, REFERENCES, check_near_misses, stated_norths
 from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.table import Table
-from mwdcal.survey.place.references import EarthReference, declination_sd
+from mwdcal.survey.place.precedence import (
+    FROM_MODEL,
+    FROM_REFERENCE,
+    FROM_TABLE,
+    NO_SOURCE,
+)
+from mwdcal.survey.place.references import EarthReference, declination_sd, north_contradictions
 
 SD_KEY = "sd_declination_deg"
 """Metadata key of a table: standard uncertainty (1σ) of its declination, degrees."""
-FARTHEST_NORTH = 2.0
-"""Standard uncertainties beyond which table and reference disagree."""
-LARGEST_TURN = 0.01
-"""Convergences of table and reference that differ by more disagree, degrees."""
 USUAL_HORIZONTAL = 20_000.0
 """Horizontal field where neither a reference nor a reading states one, nT."""
 
@@ -30,7 +33,8 @@ class North:
     """The norths that azimuths may count from, radians: true = magnetic + declination, grid = true - convergence.
 
     None: not known. `declination_sd`: standard uncertainty that the stations share, `declination_noise` that of
-    what changes from one to the next. `findings`: where they are assumed, or sources disagree.
+    what changes from one to the next. `findings`: where they are assumed, or sources disagree. `sources`: where each
+    comes from, by name.
     """
 
     declination: float | None = None
@@ -38,6 +42,7 @@ class North:
     convergence: float | None = None
     declination_noise: float = 0.0
     findings: tuple[Finding, ...] = ()
+    sources: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -71,44 +76,51 @@ def norths_of(
     of_place = {} if reference is None else {
         "declination_deg": reference.declination_deg, "convergence_deg": reference.convergence_deg
     }  # fmt: skip
-    both = {**of_place, **stated}
-    if both.get("declination_deg") is None:
-        return North(convergence=_radians(both.get("convergence_deg")))
-    shared, alone = _of_place(readings, calibration, reference)
-    given = _stated_sd(table)
-    sd = given or shared
-    findings = []
+    both = {key: value for key, value in {**of_place, **stated}.items() if value is not None}
+    sources = {
+        key.removesuffix("_deg"): FROM_TABLE
+        if key in stated
+        else FROM_REFERENCE
+        if key in both
+        else NO_SOURCE
+        for key in AZIMUTH_KEYS[1:]
+    }
+    given, findings = _stated_sd(table), []
+    if given and "declination_deg" not in stated:
+        text = f"{table.source}: {SD_KEY} is not used: no declination_deg is beside it. State both, or neither."
+        findings.append(Finding(id="declination-uncertainty-unused", text=text))
+        given = 0.0
+    if "declination_deg" not in both:
+        convergence = _radians(both.get("convergence_deg"))
+        return North(convergence=convergence, findings=tuple(findings), sources=sources)
+    if given or reference is None:
+        shared, alone = declination_sd(_horizontal(readings, calibration))
+    else:
+        shared, alone = reference.declination_spread_deg
+    sources["sd_declination"] = (
+        FROM_TABLE if given else FROM_MODEL if reference is None else FROM_REFERENCE
+    )
     if "declination_deg" in stated and not given:
         source = "the reference" if reference else "a global field model"
         text = (
-            f"{table.source} states a declination without uncertainty: {sd:.2f}° (1σ) of {source} is taken. State "
+            f"{table.source} states a declination without uncertainty: {shared:.2f}° (1σ) of {source} is taken. State "
             f"{SD_KEY}."
         )
         findings.append(Finding(id="declination-uncertainty-assumed", text=text))
     if reference is not None:
-        findings += _disagreements(table, stated, reference, hypot(given, shared))
+        findings += north_contradictions(table.source, stated, given, reference)
     return North(
         _radians(both["declination_deg"]),
-        radians(sd),
+        radians(given or shared),
         _radians(both.get("convergence_deg")),
         radians(alone),
         tuple(findings),
+        sources,
     )
 
 
 def _radians(angle: float | None) -> float | None:
     return None if angle is None else radians(angle)
-
-
-def _of_place(
-    readings: Readings, calibration: Calibration, reference: EarthReference | None
-) -> tuple[float, float]:
-    """1σ of the declination that all stations share, and of each its own, by reference or model, degrees."""
-    if reference is not None and reference.sd_declination_deg:
-        return reference.sd_declination_deg, reference.sd_random_declination_deg
-    if reference is not None:
-        return declination_sd(reference.field_nt * np.cos(radians(reference.dip_deg)))
-    return declination_sd(_horizontal(readings, calibration))
 
 
 def _horizontal(readings: Readings, calibration: Calibration) -> float:
@@ -133,25 +145,3 @@ def _stated_sd(table: Table) -> float:
             "uncertainty (1σ) of the declination."
         )
     return number
-
-
-def _disagreements(
-    table: Table, stated: dict[str, float], reference: EarthReference, sd: float
-) -> list[Finding]:
-    """Declination and convergence of the table that are not those of the reference, `sd` of their difference."""
-    findings = []
-    for key, allowed, plus_minus in (
-        ("declination_deg", FARTHEST_NORTH * sd, f" ± {sd:.2f}°"),
-        ("convergence_deg", LARGEST_TURN, ""),
-    ):
-        other, name = getattr(reference, key), key.removesuffix("_deg")
-        if key not in stated or other is None:
-            continue
-        off = (stated[key] - other + 180.0) % 360.0 - 180.0
-        if abs(off) > allowed:
-            text = (
-                f"{name}: {table.source} states {stated[key]:+.2f}°, the reference {other:+.2f}°: they differ by "
-                f"{off:+.2f}°{plus_minus}. The table's is used. Check sign, place and date."
-            )
-            findings.append(Finding(id=f"{name}-disagrees", text=text))
-    return findings

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from msgspec.structs import replace as replace_struct
 
 from mwdcal.calibration.readings import CONSTANTS, Readings, is_simulated
-from mwdcal.calibration.record import Calibration
+from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files import synonyms
 from mwdcal.files.contract import REFERENCES, check_columns
@@ -19,6 +19,13 @@ from mwdcal.files.runs import renamed, to_readings
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import StandProfile
 from mwdcal.survey.norths import SD_KEY, North, norths_of
+from mwdcal.survey.place.precedence import (
+    FROM_REFERENCE,
+    NO_SOURCE,
+    Claim,
+    contradictions,
+    source_of,
+)
 from mwdcal.survey.place.references import MEASURABLE, EarthReference
 from mwdcal.survey.stations import RANDOM
 from mwdcal.survey.well import Well
@@ -32,13 +39,33 @@ _DEPTH_NAMES = re.compile(
 )
 
 
-def survey_readings(
-    table: Table, calibration: Calibration, reference: EarthReference | None = None
-) -> tuple[Readings, Array | None, North]:
+@dataclass(frozen=True)
+class SurveyReadings:
     """The readings of a table, measured depths (n,) if it has them, and the norths that azimuths may count from.
 
+    `sources`: where gravity, field, dip, declination and convergence come from, by name. `findings`: what of the
+    reference contradicts the table, or is not used.
+    """
+
+    readings: Readings
+    md: Array | None
+    north: North
+    sources: Mapping[str, str]
+    findings: list[Finding]
+
+    @property
+    def uses_reference(self) -> bool:
+        """Whether anything of the reference of the place is used."""
+        return any(FROM_REFERENCE in source for source in self.sources.values())
+
+
+def survey_readings(
+    table: Table, calibration: Calibration, reference: EarthReference | None = None
+) -> SurveyReadings:
+    """The readings of a table of surveys, and the references they are judged and turned by.
+
     Uncertainties of the laboratory's stand and references do not count in a well.
-    What the table states of gravity, field, dip, declination and convergence stands before the `reference`.
+    What the table states counts before the `reference`, by `mwdcal.survey.place.precedence`.
 
     Raises:
         InputError: a table that cannot be read, depths under another name or in another unit.
@@ -49,9 +76,50 @@ def survey_readings(
         synonyms.check_evidence(list(table.columns), table.source, ("temperature_c",))
     in_a_well = replace_struct(calibration.profile, stand=StandProfile())
     readings, _ = to_readings(table, in_a_well)
+    north = norths_of(table, readings, calibration, reference)
+    names = (
+        CONSTANTS if calibration.has_field and readings.magnetometer is not None else CONSTANTS[:1]
+    )
+    sources, findings = {}, []
+    for name in names:
+        otherwise = NO_SOURCE if reference is None else FROM_REFERENCE
+        sources[name] = source_of(~np.isnan(_stated(readings, name)), otherwise)
+        if reference is not None:
+            findings += _contradictions(table.source, readings, reference, name)
+    if len(names) == len(CONSTANTS):
+        sources |= north.sources
     if reference is not None:
         readings = _referenced(readings, reference)
-    return readings, _depths(table), norths_of(table, readings, calibration, reference)
+    result = SurveyReadings(readings, _depths(table), north, sources, findings)
+    if reference is not None and not result.uses_reference:
+        text = f"nothing of `reference` is used: {table.source} states all of it itself. Leave one of the two out."
+        findings.append(Finding(id="reference-unused", text=text))
+    return result
+
+
+def _stated(readings: Readings, name: str) -> Array:
+    """Gravity, field or dip (n,) as the table states it, NaN where it does not."""
+    return np.broadcast_to(readings.known.get(name, np.nan), readings.count)
+
+
+def _of_place(reference: EarthReference, name: str) -> tuple[float, float, float]:
+    """A strength or dip of the place, its 1σ that all stations share, and that of each its own, as in `Readings`."""
+    key, factor = MEASURABLE[name], REFERENCES[name].factor
+    value, shared, alone = (getattr(reference, f"{p}{key}", 0.0) for p in ("", "sd_", "sd_random_"))
+    return value * factor, shared * factor, alone * factor
+
+
+def _contradictions(
+    source: str, readings: Readings, reference: EarthReference, name: str
+) -> list[Finding]:
+    """Where the table and the reference contradict each other."""
+    factor, (value, shared, alone) = REFERENCES[name].factor, _of_place(reference, name)
+    return contradictions(
+        name,
+        Claim(source, _stated(readings, name) / factor, readings.uncertainty(name) / factor),
+        Claim("the reference", [value / factor], np.hypot(shared, alone) / factor),
+        "Check unit, place and date.",
+    )
 
 
 def _referenced(readings: Readings, reference: EarthReference) -> Readings:
@@ -61,13 +129,12 @@ def _referenced(readings: Readings, reference: EarthReference) -> Readings:
     """
     known, sd = dict(readings.known), dict(readings.sd)
     for name in CONSTANTS:
-        key, factor = MEASURABLE[name], REFERENCES[name].factor
-        shared, alone = (getattr(reference, f"{p}{key}", 0.0) for p in ("sd_", "sd_random_"))
-        stated = np.broadcast_to(known.get(name, np.nan), readings.count)
+        value, shared, alone = _of_place(reference, name)
+        stated = _stated(readings, name)
         blank = np.isnan(stated)
-        known[name] = np.where(blank, getattr(reference, key) * factor, stated)
-        sd[name] = np.where(blank, shared * factor, readings.uncertainty(name))
-        sd[RANDOM + name] = np.where(blank, alone * factor, 0.0)
+        known[name] = np.where(blank, value, stated)
+        sd[name] = np.where(blank, shared, readings.uncertainty(name))
+        sd[RANDOM + name] = np.where(blank, alone, 0.0)
     return replace(readings, known=known, sd=sd)
 
 
@@ -133,6 +200,8 @@ def described(well: Well) -> Mapping[str, object]:
     ):
         if angle is not None:
             stated[key] = float(np.degrees(angle))
+    if well.sources:
+        stated["reference_sources"] = dict(well.sources)
     if is_simulated(calibration.tool) or is_simulated(well.readings.metadata):
         stated["simulated"] = True
     if well.findings:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -76,7 +76,7 @@ class Well:
     """Surveys of a well in the order of their table.
 
     `vectors` (n, 3) each as corrected; `extrapolated` (n,): stations without a statement of accuracy, None where
-    none may be. `position`: None without measured depths.
+    none may be. `position`: None without measured depths. `sources`: where references come from, by name.
     """
 
     calibration: Calibration
@@ -90,6 +90,7 @@ class Well:
     findings: list[Finding]
     extrapolated: Bools | None = None
     blindness: Blindness | None = None
+    sources: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def sd_azimuth(self) -> Array:

@@ -66,8 +66,10 @@ class VerdictPlots:
         worst = max(row.sets, key=lambda each: each.value)
         for each in row.sets:
             self._draw_set(axes, row, each, each is worst)
-        shown = [self.verdict.station_rows[i].departures[row.name] for i in _stations(row)]
-        _limit_lines(axes, row, float(np.abs(shown).max()))
+        shown = [
+            self.verdict.station_rows[i].departures.get(row.name, np.nan) for i in _stations(row)
+        ]
+        _limit_lines(axes, row, float(np.nanmax(np.abs([0.0, *shown]))))
         axes.axhline(0, color="#4b5563", lw=0.6, zorder=1)
         axes.set(xlim=(-5, 365), xticks=range(0, 361, 90), xlabel="toolface, °")
         axes.set_ylabel(f"{'departure' if row.bound < row.limit else 'error'}, {row.unit}")
@@ -92,7 +94,7 @@ class VerdictPlots:
         label, (colour, marker, line) = self._look(each, worst)
         stations = [self.verdict.station_rows[i] for i in each.stations]
         toolface = np.array([station.toolface_deg for station in stations], float)
-        values = [station.departures[row.name] for station in stations]
+        values = [station.departures.get(row.name, np.nan) for station in stations]
         look: dict[str, Any] = {"color": colour, "lw": 1, "zorder": 2.5 if worst else 2}
         markers: dict[str, Any] = {"marker": marker, "mfc": "none", "mew": 0.8, "ms": 3.4}
         axes.plot(np.mod(toolface, 360), values, ls="", **markers, **look)

@@ -47,6 +47,8 @@ _PARSED = "VWCP"
 """Sections of the header that lasio reads."""
 _MOST_LINES_OF_HEADER = 4000
 _LONGEST_LINE_OF_HEADER = 2000
+_MOST_REPEATS = 50
+"""Entries of a section whose mnemonic stands there already: lasio takes time as the cube of these."""
 _LEFT_OUT = ("STRT", "STOP", "STEP", "NULL")
 _NUMERIC = frozenset("0123456789+-eE.")
 
@@ -103,7 +105,7 @@ def _decoded(data: bytes, source: str) -> str:
 def _sections(text: str, source: str) -> _Sections:
     """The lines of the file by section."""
     result = _Sections([], [], [])
-    kind = ""
+    kind, seen, repeats = "", set[tuple[str, str]](), 0
     for number, line in enumerate(io.StringIO(text, newline=None), 1):
         line = line.strip()
         if line.startswith("~"):
@@ -118,6 +120,17 @@ def _sections(text: str, source: str) -> _Sections:
             what = f"{source}, line {number}"
             advice = "Is this a LAS file?"
             at_most(len(line), _LONGEST_LINE_OF_HEADER, what, "the line", "characters", advice)
+            entry = kind, re.split("[.:]", line, maxsplit=1)[0].strip()
+            repeats += entry in seen and not line.startswith("#") and line != ""
+            at_most(
+                repeats,
+                _MOST_REPEATS,
+                what,
+                "the header",
+                "repeated mnemonics",
+                "Give each its own.",
+            )
+            seen.add(entry)
             result.header.append(line)
     advice = "Remove sections that are not needed."
     at_most(len(result.header), _MOST_LINES_OF_HEADER, source, "the header", "lines", advice)

@@ -60,7 +60,7 @@ def read_trajectory(data: bytes, source: str) -> Trajectory:
         raise InputError(
             f"{source}: expected well-formed XML; {_problem(error)}. Export the file again."
         ) from None
-    except (forbidden, UnicodeError, LookupError) as error:
+    except (forbidden, ValueError, LookupError) as error:
         raise InputError(
             f"{source}: XML must be UTF-8 without a document type and entities of its own; got "
             f"{type(error).__name__}. Remove the DOCTYPE, and export the file as UTF-8."

@@ -23,8 +23,13 @@ MAX_COUNTS = {
     "row": (MAX_ROWS, "rows"),
     "": (500_000, "other elements"),
 }
-"""Most elements of a kind in a part; what cells and texts are made of does not count."""
+"""Most elements of a kind in a part."""
 _CONTENTS = frozenset(("v", "t", "is", "f", "r", "rPr", "rPh"))
+"""What cells and texts are made of: a few of each, as `_CONTENTS_OF_ONE`, and `_MOST_FORMATS` more in all."""
+_CONTENTS_OF_ONE = 2
+_MOST_FORMATS = 500_000
+_LONGEST_TEXT = 1 << 16
+"""Characters of a cell or text, all its parts together: twice what a spreadsheet program allows."""
 _LARGEST_UNPACKED = 200_000_000
 _LONGEST_ELEMENT = 1 << 20
 _MOST_NAMES = 10_000
@@ -52,7 +57,7 @@ class _PartCheck:
     def __init__(self, where: str) -> None:
         self._where = where
         self._counts: Counter[str] = Counter()
-        self._row = self._column = self._text = 0
+        self._row = self._column = self._text = self._contents = 0
 
     def check(self, stream: IO[bytes]) -> None:
         """Refuse what is beyond the limits; XML that is none is left to its reader."""
@@ -82,13 +87,20 @@ class _PartCheck:
 
     def _characters(self, text: str) -> None:
         self._text += len(text)
-        self._at_most(self._text, _LONGEST_ELEMENT, "characters in a cell")
+        self._at_most(self._text, _LONGEST_TEXT, "characters in a cell")
 
     def _start(self, tag: str, given: dict[str, str]) -> None:
-        self._text = 0
         tag = tag.rpartition(":")[2]
         if tag in _CONTENTS:
+            self._contents += 1
+            most = _CONTENTS_OF_ONE * (self._counts["c"] + self._counts["si"]) + _MOST_FORMATS
+            self._at_most(
+                self._contents,
+                most,
+                f"parts in {self._counts['c'] + self._counts['si']} cells and texts",
+            )
             return
+        self._text = 0
         kind = tag if tag in MAX_COUNTS else ""
         self._counts[kind] += 1
         if kind == "c":

@@ -6,6 +6,7 @@ Nothing is loaded from a network: coefficients are those of the installed librar
 from __future__ import annotations
 
 import hashlib
+from calendar import isleap
 from collections.abc import Sequence
 from datetime import date
 from functools import cache
@@ -108,8 +109,7 @@ def decimal_year(day: date) -> float:
     >>> decimal_year(date(2028, 1, 1)), decimal_year(date(2027, 7, 2))
     (2028.0, 2027.4986301369863)
     """
-    first, following = date(day.year, 1, 1), date(day.year + 1, 1, 1)
-    return day.year + (day - first).days / (following - first).days
+    return day.year + (day.timetuple().tm_yday - 1) / (366 if isleap(day.year) else 365)
 
 
 def main_field(

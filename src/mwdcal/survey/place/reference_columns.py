@@ -10,20 +10,18 @@ from typing import NamedTuple
 import numpy as np
 
 from mwdcal.calibration.record import Finding
-from mwdcal.files.contract import AZIMUTH_KEYS, REFERENCES, magnetic_offset
+from mwdcal.files.contract import AZIMUTH_KEYS, REFERENCES, magnetic_offset, stated_norths
 from mwdcal.files.formats.columns import Column, shown
 from mwdcal.files.formats.table import Table, numbers
 from mwdcal.files.runs import check_run
 from mwdcal.geometry.vectors import Array, Bools
-from mwdcal.survey.place.references import MEASURABLE, EarthReference
+from mwdcal.survey.place.precedence import Claim, contradictions
+from mwdcal.survey.place.references import MEASURABLE, EarthReference, north_contradictions
 
 FILLED = ("gravity", "field", "dip")
 """References of a run that are those of a place."""
 PLACE_KEY = "earth_reference"
 """Metadata key of a run in which references of a place were filled: where these come from."""
-
-FOREIGN = 4.0
-"""Standard uncertainties beyond which a value of a run is not that of the place."""
 
 
 class FilledRun(NamedTuple):
@@ -44,11 +42,18 @@ def fill(table: Table, reference: EarthReference) -> FilledRun:
     check_run(table)
     columns, counts = dict(table.columns), {}
     findings = _other_date(table, reference)
+    stated = stated_norths(table.metadata, table.source)
+    findings += north_contradictions(table.source, stated, 0.0, reference)
     for name in FILLED:
         column, value, sd = REFERENCES[name].column, *_of_run(reference, name)
         cells = numbers(table, column) if column in columns else np.full(table.count, np.nan)
         blank = np.isnan(cells)
-        findings += _other_values(column, cells[~blank], value, sd)
+        findings += contradictions(
+            name,
+            Claim(table.source, cells, _uncertainties(table, f"sd_{column}")),
+            Claim("the reference", [value], sd),
+            f"Check {column}, its unit, the place and the date.",
+        )
         counts[column] = int(blank.sum())
         if counts[column]:
             columns[column] = _filled(table, column, blank, value)
@@ -65,6 +70,13 @@ def _of_run(reference: EarthReference, name: str) -> tuple[float, float]:
     key = MEASURABLE[name]
     random = getattr(reference, f"sd_random_{key}", 0.0)
     return getattr(reference, key), math.hypot(getattr(reference, f"sd_{key}"), random)
+
+
+def _uncertainties(table: Table, column: str) -> Array:
+    """Standard uncertainties (n,) of a column, 0 where none is stated."""
+    return (
+        np.nan_to_num(numbers(table, column)) if column in table.columns else np.zeros(table.count)
+    )
 
 
 def _filled(table: Table, name: str, where: Bools, value: float) -> Column:
@@ -101,15 +113,3 @@ def _other_date(table: Table, reference: EarthReference) -> list[Finding]:
         return []
     text = f"{table.source} states the date {shown(stated)}, the reference is of {reference.date}. Check `day`."
     return [Finding(id="other-date", text=text)]
-
-
-def _other_values(column: str, given: Array, value: float, sd: float) -> list[Finding]:
-    """That given values are not those of the place by more than `FOREIGN` standard uncertainties."""
-    off = given[np.abs(given - value) > FOREIGN * sd]
-    if not off.size:
-        return []
-    text = (
-        f"{column} is {off[0]:g} in the run and stays; the reference is {value:.6g} ± {sd:.3g}. Check its unit, the "
-        "place and the date."
-    )
-    return [Finding(id="other-reference", text=text)]

@@ -22,6 +22,7 @@ from mwdcal.errors import InputError, reason
 from mwdcal.files.contract import AZIMUTH_KEYS, REFERENCES, ROTATION, Range, magnetic_offset
 from mwdcal.survey.place import earth
 from mwdcal.survey.place.grids import LEAST_DISTORTION, Grid, grid_convergence
+from mwdcal.survey.place.precedence import Claim, contradictions
 from mwdcal.use.strengths import STANDARD_GRAVITY
 
 MEASURABLE = {
@@ -59,6 +60,10 @@ MOMENT_SD = FieldSd(60.0, 0.08, 0.10, 3000.0)
 GEOMAGNETIC = {"field", "dip", "declination"}
 LOWEST_LAND = -500.0
 """Altitude below which there is no open ground, m."""
+LARGEST_ANOMALY = 0.5
+"""Departure of a measured field from that of a model, as a share of its strength, beyond which it is a mistake."""
+LARGEST_ANOMALY_G = 0.01
+"""Departure of measured gravity, g, beyond which it is a mistake. It is over ten times the largest anomaly."""
 LEAST_HORIZONTAL = 6000.0
 """Horizontal field below which magnetic azimuths need caution by the World Magnetic Model, nT."""
 ALTITUDES = Range(-15_000.0, 100_000.0, "m")
@@ -145,6 +150,13 @@ class EarthReference(msgspec.Struct, frozen=True, kw_only=True):
         """The norths that azimuths can be counted from."""
         return ("magnetic", "true", *(["grid"] if self.convergence_deg is not None else []))
 
+    @property
+    def declination_spread_deg(self) -> tuple[float, float]:
+        """1σ of the declination that all stations share, and of each its own; a global model's by default."""
+        if self.sd_declination_deg:
+            return self.sd_declination_deg, self.sd_random_declination_deg
+        return declination_sd(self.field_nt * math.cos(math.radians(self.dip_deg)))
+
     def offset_deg(self, north: str) -> float:
         """What is added to a magnetic azimuth to count it from a north, degrees."""
         stated = (north, self.declination_deg, self.convergence_deg)
@@ -167,8 +179,11 @@ def reference_at(
 
     `measured` values by name of `MEASURABLE`, in the units of their keys, stand before those of the models,
     with their standard `uncertainties`. Where none is stated it is zero, that of declination as of the model: no
-    residual would ever show its error. The field model is not consulted where
-    field, dip and declination were all measured.
+    residual would ever show its error. Measured values are compared with the models. Where field, dip and declination
+    were all measured that is all a field model does, and it need not be there.
+
+    Raises:
+        InputError: a value that no place on Earth has, or none so near; a model that is missing or does not hold.
     """
     measured, uncertainties = measured or {}, uncertainties or {}
     place: dict[str, Any] = {
@@ -187,6 +202,7 @@ def reference_at(
     modelled, described = _modelled(place, day, model, measured)
     values: dict[str, Any] = {**modelled, **given}
     spread: dict[str, Any] = _uncertainties(values, altitude_m)
+    doubtful = _against_model(modelled, given, stated, altitude_m)
     spread |= {
         f"sd_{MEASURABLE[name]}": uncertainties.get(name, 0.0)
         for name in measured
@@ -204,20 +220,27 @@ def reference_at(
         crs=crs or None,
         measured=[name for name in MEASURABLE if name in measured],
         sources=_sources(described.get("coefficients"), measured, grid),
-        findings=_findings(values, altitude_m, measured, uncertainties, grid),
+        findings=_findings(values, altitude_m, measured, uncertainties, grid) + doubtful,
     )
 
 
 def _modelled(
     place: Mapping[str, float], day: date, model: str, measured: Mapping[str, float]
 ) -> tuple[dict[str, float], dict[str, Any]]:
-    """Values of the models that the measured ones leave to them, by key, and what the field model is."""
+    """Values of the models by key, and what the field model is, if a value of it is used.
+
+    Without values of the field where all of them are measured, and no model can be had to compare them with.
+    """
     gravity = float(earth.normal_gravity(place["latitude_deg"], place["altitude_m"]))
     values = {"gravity_g": gravity / STANDARD_GRAVITY}
-    if measured.keys() >= GEOMAGNETIC:
-        return values, {}
-    year = earth.decimal_year(day)
-    coefficients = earth.field_model(model, year)
+    all_measured = measured.keys() >= GEOMAGNETIC
+    try:
+        year = earth.decimal_year(day)
+        coefficients = earth.field_model(model, year)
+    except InputError:
+        if all_measured:
+            return values, {}
+        raise
     field = earth.main_field(coefficients, **place, year=year)
     described = {
         "model": model,
@@ -226,7 +249,81 @@ def _modelled(
         "coefficients": coefficients.coefficients,
         "coefficients_sha256": coefficients.sha256,
     }
-    return {**values, **field._asdict()}, described
+    return {**values, **field._asdict()}, {} if all_measured else described
+
+
+def _against_model(
+    modelled: Mapping[str, float],
+    given: Mapping[str, float],
+    stated: Mapping[str, float],
+    altitude_m: float,
+) -> list[Finding]:
+    """Measured values that contradict the models.
+
+    Raises:
+        InputError: values that no place so near can have.
+    """
+    names = [name for name, key in MEASURABLE.items() if key in given]
+    missing = [f"`{MEASURABLE[name]}`" for name in names if MEASURABLE[name] not in modelled]
+    if missing:
+        text = f"{', '.join(missing)}: no model of the field to compare with at this date. Check sign and unit."
+        findings = [Finding(id="not-compared-with-model", text=text)]
+    else:
+        _check_possible(modelled, given)
+        findings = []
+    spread = _uncertainties({**given, **modelled}, altitude_m)
+    for name in names:
+        key = MEASURABLE[name]
+        sd = math.hypot(spread[f"sd_{key}"], spread.get(f"sd_random_{key}", 0.0))
+        findings += contradictions(
+            name,
+            Claim(f"`{key}`", [given[key]], stated.get(f"sd_{key}", 0.0)),
+            Claim("the model", [modelled.get(key, math.nan)], sd),
+            "Check sign, unit, place and date.",
+        )
+    return findings
+
+
+def _check_possible(modelled: Mapping[str, float], given: Mapping[str, float]) -> None:
+    """Refuse gravity and field that are too far from those of the models for any place there."""
+    values = {**modelled, **given}
+    off = given.get("gravity_g", modelled["gravity_g"]) - modelled["gravity_g"]
+    if abs(off) > LARGEST_ANOMALY_G:
+        raise InputError(
+            f"`gravity_g` must be within {LARGEST_ANOMALY_G:g} g of the model's {modelled['gravity_g']:.5f} g; got "
+            f"{given['gravity_g']:g} g, which no place there has. {_REMEDIES['gravity_g']}"
+        )
+    here, there = (_field_vector(each) for each in (modelled, values))
+    apart, most = math.dist(here, there), LARGEST_ANOMALY * modelled["field_nt"]
+    if apart > most:
+        keys = [
+            key
+            for key in map(MEASURABLE.__getitem__, MEASURABLE)
+            if key in given and key != "gravity_g"
+        ]
+        typed, model = (
+            ", ".join(f"{each[key]:g} {_unit(key)}" for key in keys) for each in (given, modelled)
+        )
+        raise InputError(
+            f"{', '.join(f'`{key}`' for key in keys)} must be those of the place; got {typed}, the model {model}: "
+            f"{apart:.0f} nT apart, which no place there has (at most {most:.0f} nT). Check sign, unit, "
+            "hemisphere and date."
+        )
+
+
+def _field_vector(values: Mapping[str, float]) -> tuple[float, float, float]:
+    """The field to the north, to the east and down, nT."""
+    dip, declination = (math.radians(values[key]) for key in ("dip_deg", "declination_deg"))
+    level = values["field_nt"] * math.cos(dip)
+    return (
+        level * math.cos(declination),
+        level * math.sin(declination),
+        values["field_nt"] * math.sin(dip),
+    )
+
+
+def _unit(key: str) -> str:
+    return {"nt": "nT", "deg": "°"}[key.rpartition("_")[2]]
 
 
 def _uncertainties(values: Mapping[str, float], altitude_m: float) -> dict[str, float]:
@@ -306,6 +403,30 @@ def _findings(
         )
         findings.append(Finding(id="grid-not-conformal", text=text))
     return findings
+
+
+def north_contradictions(
+    source: str, stated: Mapping[str, float], sd: float, reference: EarthReference
+) -> list[Finding]:
+    """Declination and convergence that a source has `stated`, in degrees, and that are not those of the reference.
+
+    `sd`: standard uncertainty of its declination.
+    """
+    of_place = {
+        "declination": (sd, reference.declination_deg, reference.declination_spread_deg[0]),
+        "convergence": (0.0, reference.convergence_deg, 0.0),
+    }
+    return [
+        finding
+        for name, (sd_stated, value, spread) in of_place.items()
+        if f"{name}_deg" in stated and value is not None
+        for finding in contradictions(
+            name,
+            Claim(source, [stated[f"{name}_deg"]], sd_stated),
+            Claim("the reference", [value], spread),
+            "Check sign, place and date.",
+        )
+    ]
 
 
 def check_ranges(values: Mapping[str, float], source: str = "") -> None:

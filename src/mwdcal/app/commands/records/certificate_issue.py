@@ -175,6 +175,9 @@ def _drift(registry: str, loaded: LoadedCalibration, today: date) -> ToolDrift |
 
 
 def _pictures(calibration: Calibration, order: Order, drift: ToolDrift | None) -> list[Picture]:
+    from mwdcal.app.pages.pictures import require
+
+    require("a certificate as page or PDF", "matplotlib")
     from mwdcal.app.pages.records.certificate_pictures import certificate_pictures
 
     return certificate_pictures(calibration, order.verification, order.as_found, drift)

@@ -49,7 +49,7 @@ def command(document: Path, key: Path, output: Path | None, replace: bool, as_js
     atomic.target(target)
     file = documents.whole_file(document)
     data = signed(file, read_private(key, known), replace)
-    atomic.write(target, data)
     result, fields = screens.signed_document(data, target, document.parent)
     shown = screens.for_machines("sign", result, fields, file.digest)
+    atomic.write(target, data)
     print_result(shown if as_json else screens.signed(result, fields), result.findings)

@@ -17,7 +17,7 @@ from mwdcal.errors import InputError
 if TYPE_CHECKING:
     from mwdcal.app.choices import LoadedCalibration
     from mwdcal.calibration.readings import Readings
-    from mwdcal.calibration.record import Calibration
+    from mwdcal.calibration.record import Calibration, Finding
     from mwdcal.certificate.signature import SignatureCheck
     from mwdcal.files.formats.table import Table
     from mwdcal.geometry.vectors import Array
@@ -111,7 +111,8 @@ def command(
         analysis, pages = _analysed(scene, msa_html, sensor_drift or "owsg", as_json)
         fitted = analysis.calibration
     result = well(fitted, scene.readings, scene.limits, scene.north, scene.md, start, ends, outside)
-    result = replace(result, findings=loaded.findings + result.findings)
+    findings = [*loaded.findings, *scene.findings, *result.findings]
+    result = replace(result, findings=findings, sources=scene.sources)
     if html:
         from mwdcal.app.pages.surveys.survey import render
 
@@ -133,6 +134,8 @@ class _WellInputs:
     md: Array | None
     north: North
     limits: SurveyLimits
+    sources: Mapping[str, str]
+    findings: list[Finding]
     digests: dict[str, str]
 
     @property
@@ -166,16 +169,19 @@ def _read(
     bounds, limits_digest = load_survey_limits(limits)
     source = read_export(readings, fitted.profile, decimal=decimal, rows=MOST_ROWS)
     place, place_digest = load_reference(reference) if reference else (None, "")
-    read, md, north = survey_readings(source, fitted, place)
-    digests = {"calibration": loaded.digest, "readings": source.digest, "reference": place_digest}
+    read = survey_readings(source, fitted, place)
+    digests = {"calibration": loaded.digest, "readings": source.digest}
+    digests |= {"reference": place_digest} if read.uses_reference else {}
     return _WellInputs(
         loaded.signature,
         fitted,
         source,
-        read,
-        md,
-        north,
+        read.readings,
+        read.md,
+        read.north,
         bounds,
+        read.sources,
+        read.findings,
         {**digests, "limits": limits_digest},
     )
 
@@ -199,7 +205,9 @@ def _analysed(
     if not analysis.summary.separable:
         atomic.write_all(pages)
         if as_json:
-            refused = refusal(analysis.summary, scene.limits, scene.north, scene.readings.count)
+            refused = refusal(
+                analysis.summary, scene.limits, scene.north, scene.sources, scene.readings.count
+            )
             print_result(scene.enveloped(refused), [])
         analysis.check()
     return analysis, pages

@@ -11,6 +11,7 @@ from mwdcal.app.screens.surveys.survey import (
     SurveySummary,
     declination_in_words,
     end_in_words,
+    sources_in_words,
     summary,
     survey_rows,
 )
@@ -46,6 +47,7 @@ def render(well: Well, findings: list[Finding], sha256: Mapping[str, str]) -> st
             enlarged=figures.enlargement(well.position) if has_path and well.position else 1.0,
             terms=well.terms.sentence,
             declination=declination_in_words(facts),
+            sources=sources_in_words(facts).partition("   ")[2],
             end=end_in_words(facts.end, facts.north) if facts.end else "",
             header=header,
             rows=rows,

@@ -44,6 +44,7 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
     """What `survey` prints: stations counted by outcome, what they were judged by, where the path ends.
 
     `blind`: accepted ones whose azimuth interference could turn and still pass.
+    `reference_sources`: where gravity, field, dip, declination and convergence come from, by name.
     `error_terms` are in the standard uncertainties of surveys and path, `not_included` are not.
     `msa` is the multi-station analysis, if one was asked for; `interference` and `separable` are of it.
     """
@@ -58,6 +59,7 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
     declination_deg: float | None
     sd_declination_deg: float | None
     convergence_deg: float | None
+    reference_sources: dict[str, str]
     error_terms: list[str]
     not_included: list[str]
     limits: str
@@ -72,7 +74,11 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def refusal(
-    msa: MultiStationAnalysis, limits: SurveyLimits, north: North, rows: int
+    msa: MultiStationAnalysis,
+    limits: SurveyLimits,
+    north: North,
+    sources: Mapping[str, str],
+    rows: int,
 ) -> SurveySummary:
     """What a multi-station analysis says that cannot be used: none of the `rows` is judged, nothing is written."""
     return SurveySummary(
@@ -84,6 +90,7 @@ def refusal(
         blank=rows,
         north=north.name,
         **_stated(north, error_terms((), north.declination is not None)),
+        reference_sources=dict(sources),
         limits=limits.name,
         source=limits.source,
         end=None,
@@ -115,6 +122,7 @@ def summary(
         blank=int(well.blank.sum()),
         north=north.name,
         **_stated(north, well.terms),
+        reference_sources=dict(well.sources),
         limits=well.limits.name,
         source=well.limits.source,
         end=end_of_path(well),
@@ -181,6 +189,8 @@ def screen(
         "   ".join(heading),
         f"azimuths from {facts.north} north{declination_in_words(facts)}   limits {facts.limits}{source}",
     ]
+    if facts.reference_sources:
+        lines.append(sources_in_words(facts))
     if facts.end:
         lines.append(end_in_words(facts.end, facts.north))
     lines.append(well.terms.sentence)
@@ -200,6 +210,15 @@ def declination_in_words(facts: SurveySummary) -> str:
         return ""
     sd = fixed(facts.sd_declination_deg, 2)
     return f" (declination {signed(facts.declination_deg, 2)}° ± {sd}°)"
+
+
+def sources_in_words(facts: SurveySummary) -> str:
+    """Where the references come from, those of one source together."""
+    names: dict[str, list[str]] = {}
+    for name, source in facts.reference_sources.items():
+        names.setdefault(source, []).append(name.replace("sd_", "1σ of "))
+    parts = [f"{', '.join(each)}: {source}" for source, each in names.items()]
+    return "   ".join(["references", *parts])
 
 
 def end_in_words(end: EndOfPath, north: str) -> str:
