@@ -191,9 +191,9 @@ def registry(folder):
 
 
 def undone(folder):
-    """Take back what a command has left: a new folder or registry, and what the registry was given."""
+    """Take back what a command has left: its output, a new folder or registry, and what the registry was given."""
     shutil.rmtree(folder / "new", ignore_errors=True)
-    for left in folder.glob("new.sqlite*"):
+    for left in (*folder.glob("new.sqlite*"), *folder.glob("made.*")):
         left.unlink()
     with suppress(FileNotFoundError):
         shutil.copy(folder / "unchanged.sqlite", folder / "tools.sqlite")
@@ -323,6 +323,7 @@ def test_every_command_has_a_screen():
 
 @pytest.mark.parametrize("name", SCREENS)
 def test_screens_are_the_stored_ones_and_nothing_is_lost_or_too_wide(work, name):
+    undone(Path())
     whole = screen(160, *SCREENS[name])
     for width in WIDTHS:
         undone(Path())
