@@ -159,7 +159,7 @@ def test_findings_stand_once_those_of_the_input_first(calibration, tmp_path, suf
     described = {b"mwdcal": json.dumps({"findings": stated}).encode()}
     pq.write_table(bare.replace_schema_metadata(described), tmp_path / "in.parquet")
     applied(calibration, tmp_path, tmp_path / "in.parquet", f"out{suffix}")
-    first, second = read(tmp_path / f"out{suffix}").metadata["findings"]
+    first, _, second = read(tmp_path / f"out{suffix}").metadata["findings"]
     assert first == "old"
     assert "no columns mx, my, mz" in second
 

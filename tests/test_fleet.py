@@ -100,7 +100,7 @@ def alone(columns, source, first=1, metadata=None, tool="servo", **options):
         for name, values in columns.items()
     }
     lines = range(first, first + len(columns["ax"]))
-    table = tables.Table(cells, metadata or {}, source, lines)
+    table = tables.Table(cells, {"serial": "alone"} | (metadata or {}), source, lines)
     try:
         readings, profile = to_readings(table, load_profile(tool)[0])
         return calibrate(readings, profile, Options(**{"order": 0, "nonlinearity": (), **options}))

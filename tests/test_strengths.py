@@ -120,7 +120,7 @@ def test_the_table_s_own_references_count_too(tmp_path, calibration, way):
     assert "5% off the table's own ref_field_nt" in message
     columns["ref_field_nt"] = np.full(COUNT, TOOL.field * 1.2)
     ran, _ = apply(calibration, written(tmp_path, columns, way), tmp_path, "--json")
-    assert [f["id"] for f in ran.json["findings"]] == []
+    assert [f["id"] for f in ran.json["findings"]] == ["no-serial"]
 
 
 def test_blank_results_are_not_judged(tmp_path, calibration, way):
@@ -128,7 +128,7 @@ def test_blank_results_are_not_judged(tmp_path, calibration, way):
     columns = surveys((2.0, 1.0), np.arange(30))
     columns["temperature_c"] = np.where(np.arange(COUNT) < 30, 90.0, 25.0)
     ran, _ = apply(calibration, written(tmp_path, columns, way), tmp_path, "--json")
-    assert [f["id"] for f in ran.json["findings"]] == ["outside-temperature"]
+    assert [f["id"] for f in ran.json["findings"]] == ["no-serial", "outside-temperature"]
 
 
 def stub(**changes):
@@ -190,13 +190,13 @@ def test_a_calibration_without_temperatures_on_warm_readings_is_a_finding(tmp_pa
     ran, _ = apply(made, written(tmp_path, columns, way), tmp_path, "--json")
     assert ran.code == 0, ran.err
     found = {f["id"]: f["text"] for f in ran.json["findings"]}
-    assert list(found) == ["no-temperature"]
+    assert list(found) == ["no-serial", "no-temperature"]
     assert "20.0…150.0 °C" in found["no-temperature"]
     del columns["temperature_c"]
     ran, _ = apply(made, written(tmp_path, columns, way), tmp_path, "--json")
-    (found,) = ran.json["findings"]
-    assert found["id"] == "no-temperature"
-    assert found["text"].endswith("its run recorded no temperature.")
+    found = {f["id"]: f["text"] for f in ran.json["findings"]}
+    assert list(found) == ["no-serial", "no-temperature"]
+    assert found["no-temperature"].endswith("its run recorded no temperature.")
 
 
 def test_python_refuses_what_the_command_refuses(tmp_path, calibration):

@@ -52,8 +52,8 @@ def test_azimuth_and_toolface_of_a_vertical_tool_are_blank_and_the_others_are_no
         np.testing.assert_array_equal(np.isnan(columns[name]), [True, False, False])
     for name in ("inclination_deg", "gravity_g", "field_nt", "dip_deg", "magnetic_toolface_deg"):
         assert np.isfinite(columns[name]).all()
-    assert [f.id for f in findings] == ["without-value"]
-    assert "in 1 of 3 rows" in findings[0].text
+    assert [f.id for f in findings] == ["no-serial", "without-value"]
+    assert "in 1 of 3 rows" in findings[1].text
     assert (SD["azimuth_deg"] in columns) == stated
 
 

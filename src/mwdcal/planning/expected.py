@@ -26,8 +26,8 @@ from mwdcal.sensor.profile import Profile, TriadProfile
 
 STILL = 1e-6
 """A channel that moves by no more than this share of gravity or field over a plan does not move."""
-NOISE_RANGE = {"accelerometer": (1e-9, 1.0, "g"), "magnetometer": (1e-4, 1e5, "nT")}
-"""Noise that a sensor of these can have, and its unit: not less than the best one, not more than what it measures."""
+NOISE_RANGE = {"accelerometer": (1e-15, 1.0, "g"), "magnetometer": (1e-10, 1e5, "nT")}
+"""Noise that a sensor of these can have, and its unit: not less than rounding, not more than what it measures."""
 
 
 def _check_noise(profile: Profile, kind: str) -> None:
