@@ -26,20 +26,25 @@ from mwdcal.sensor.profile import Profile, TriadProfile
 
 STILL = 1e-6
 """A channel that moves by no more than this share of gravity or field over a plan does not move."""
-NOISE_RANGE = {"accelerometer": (1e-15, 1.0, "g"), "magnetometer": (1e-10, 1e5, "nT")}
-"""Noise that a sensor of these can have, and its unit: not less than rounding, not more than what it measures."""
+NOISE_RANGE = {"accelerometer": (1e-9, 1.0, "g"), "magnetometer": (1e-4, 1e5, "nT")}
+"""Noise that a sensor of these can have, and its unit: not less than the best one, not more than what it measures."""
 
 
 def _check_noise(profile: Profile, kind: str) -> None:
-    """Refuse a triad without noise, or with one that no sensor has, as by a scale that is upside down."""
+    """Refuse a triad without noise."""
     triad: TriadProfile = getattr(profile, kind)
     if triad.noise is None:
         raise InputError(
             f"the profile '{profile.name}' does not state the noise of the {kind}, on which every "
             f"uncertainty rests. Add 'noise' to its [{kind}]; mwdcal noise measures it."
         )
+
+
+def _check_scale(profile: Profile, kind: str) -> None:
+    """Refuse noise that no sensor has, as by a scale that is upside down."""
+    triad: TriadProfile = getattr(profile, kind)
     (least, most, unit), scale = NOISE_RANGE[kind], triad.scale
-    if scale is not None and not least <= triad.noise / scale <= most:
+    if triad.noise and scale is not None and not least <= triad.noise / scale <= most:
         raise InputError(
             f"the profile '{profile.name}', [{kind}]: noise {triad.noise:g} with scale {scale:g} is "
             f"{triad.noise / scale:.2g} {unit}; a sensor has from {least:g} to {most:g} {unit}. Scale is in raw units "
@@ -98,6 +103,8 @@ def planned_fit(
     """
     options = options or Options()
     readings, scaled = nominal_run(plan, profile)
+    for kind in channels(profile.has_magnetometer):
+        _check_scale(profile, kind)
     _check_moves(readings)
     if options.order == AUTO:
         options = replace(options, order=highest_order(readings.temperature))
