@@ -69,7 +69,7 @@ def calibrate(
 def chosen_fit(
     readings: Readings, profile: Profile, options: Options, progress: Progress
 ) -> tuple[Choice, Fit]:
-    """What a run is calibrated with, and its fit: as if stations that are copies of others were not in the run.
+    """Choices and fit of a run, without the stations that are copies of others.
 
     Raises as `calibrate`.
     """

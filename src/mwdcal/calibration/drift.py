@@ -14,18 +14,19 @@ STEADINESS = {
     "magnetometer-drift": "steady magnetometer offsets",
     "field-drift": "steady field",
 }
-"""What is taken as exact of a run in which a drift would not show."""
+"""What a calibration assumes where the run could not show a drift, by the name of the drift."""
 
 
-def taken_as_steady(assumed: Sequence[str]) -> str:
-    """What is said of the steadiness among things assumed exact: nothing where there is none.
+def exact_and_steady(assumed: Sequence[str]) -> tuple[list[str], str]:
+    """The references among things assumed exact, and a sentence on the steadiness; blank if none is assumed.
 
-    >>> taken_as_steady(["gravity reference", "steady field"])
+    >>> exact_and_steady(["gravity reference", "steady field"])[1]
     'taken as steady during the run, whose order of stations would hide a drift: field. Measure there and back'
     """
-    names = ", ".join(n.removeprefix("steady ") for n in assumed if n in STEADINESS.values())
+    exact = [name for name in assumed if name not in STEADINESS.values()]
+    steady = ", ".join(n.removeprefix("steady ") for n in assumed if n not in exact)
     words = "taken as steady during the run, whose order of stations would hide a drift"
-    return f"{words}: {names}. Measure there and back" if names else ""
+    return exact, f"{words}: {steady}. Measure there and back" if steady else ""
 
 
 class Constant(msgspec.Struct, frozen=True, kw_only=True):

@@ -70,7 +70,7 @@ def stated_day(metadata: Mapping[str, object]) -> date | None:
 
 
 def unread_day(metadata: Mapping[str, object], where: str) -> str:
-    """What is wrong with a `date` that is not an ISO date of the calendar; nothing where it is one, or blank."""
+    """The problem with a `date` that is not a valid ISO date; empty if it is valid or blank."""
     text = metadata.get("date")
     if text is None or not str(text).strip() or stated_day(metadata):
         return ""

@@ -236,10 +236,10 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     `covariance` is of the parameters of all triads in order, scaled by s² where that is
     estimated; `free` are directions (rows) of parameter space that no evidence determines.
     `budget` says what each source of error adds to the accuracy to expect; `assumed_exact` names
-    what is taken as exact though no residual would show its error: references, signs, steadiness during the run.
+    what is assumed exact and no residual can test: references, signs, steadiness during the run.
     `inherited` are the fingerprints of the stations behind the prior, if there was one;
     `excluded` the labels of stations of the run that were left out of the fit, on request or as copies of others;
-    `copies` the fingerprints of copies, absent where there are none.
+    `copies` the fingerprints of copies, absent if no station is a copy.
     `serial` is that of the tool, absent where the run states none; `simulated`: of the run or the prior;
     `prior_sha256` of the file of the prior, absent where there was none.
     `settings`: whether the errors of the stand's direction are "per-direction" or "per-station", or

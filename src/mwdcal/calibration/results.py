@@ -175,7 +175,7 @@ def common_source(name: str) -> str:
 
 
 def assumed_exact(result: Fit, relative: bool) -> list[str]:
-    """What is taken as exact though its error moves no residual: it goes into the calibration whole.
+    """References and conditions assumed exact whose error moves no residual, and enters the calibration in full.
 
     A toolface zero turns both triads, and a strength scales one, as sensors of other mounting or
     scale would have it. The field = 1 of a `relative` magnetometer is no reference. The signs of the magnetometer

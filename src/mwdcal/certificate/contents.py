@@ -23,7 +23,7 @@ from mwdcal.calibration.diagnosis.identity import (
     dated,
     unidentified,
 )
-from mwdcal.calibration.drift import STEADINESS, taken_as_steady
+from mwdcal.calibration.drift import exact_and_steady
 from mwdcal.calibration.readings import check_day, is_simulated, serial_of, stated_day
 from mwdcal.calibration.record import SOFTWARE, Calibration, Finding
 from mwdcal.calibration.settings import ASSUMED, ASSUMED_PRACTICE
@@ -353,10 +353,10 @@ def _out_of_date(standard: TracedStandard, calibrated: str) -> Iterator[Finding]
 
 
 def _exact(calibration: Calibration) -> Iterator[Finding]:
-    assumed = assumed_exact(calibration)
-    if steady := taken_as_steady(assumed):
+    names, steady = exact_and_steady(assumed_exact(calibration))
+    if steady:
         yield Finding(id="assumed-steady", text=f"{steady}.")
-    if names := [name for name in assumed if name not in STEADINESS.values()]:
+    if names:
         text = (
             f"assumed exact in the budget: {', '.join(names)}. State their uncertainty in [stand] of the tool "
             "profile, and calibrate again."

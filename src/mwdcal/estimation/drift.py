@@ -166,7 +166,9 @@ def _columns(problem: Problem, state: State) -> tuple[Array, dict[str, Ints]]:
     """Whitened columns (B, n, m, k) of drifts that are not in the fit, of r = s = 1 noise of a reading, and of each."""
     present, old = places(problem.evidence), problem.evidence.constants
     sizes = {
-        n: np.stack([noise(problem)[n]] * 2, -1) for n in families(problem) if n not in present
+        name: np.stack([size, size], -1)
+        for name, size in noise(problem).items()
+        if name in families(problem) and name not in present
     }
     walking, at = with_walks(problem, state, sizes)
     kept: list[SharedConstant] = []
@@ -191,8 +193,8 @@ def walk_variances(
     Definition: for the coefficients u of a walk, V their covariance given the readings: θ = Σu² / Σ(1 - V/θ);
     of the noise, misfit less what the walks explain over its degrees of freedom (Henderson).
     """
-    parts = scores.components()
-    triad = np.array([acting([name])[name] for name, _ in parts])
+    parts, of_walk = scores.components(), acting(scores.places)
+    triad = np.array([of_walk[name] for name, _ in parts])
     owner = np.zeros(scores.score.shape[-1], int)
     for number, columns in enumerate(parts.values()):
         owner[columns] = number

@@ -73,7 +73,7 @@ def load_toml(text: str) -> dict[str, Any]:
 def plain(metadata: Mapping[str, object], source: str) -> dict[str, object]:
     """The metadata in values that a line can hold; refuses what is nested more than `DEEPEST` deep.
 
-    Refuses `WORDS` that are not text, and a date that is none.
+    Refuses `WORDS` that are not text.
     """
     values = {}
     for key, value in metadata.items():

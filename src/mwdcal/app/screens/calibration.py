@@ -13,7 +13,7 @@ from mwdcal.app.screens.numbers import degrees_of_freedom, estimate, uncertainty
 from mwdcal.app.text import chance, number, one_line, quantity, table
 from mwdcal.calibration.automatic.nonlinearity import CurveScore
 from mwdcal.calibration.diagnosis.flags import listed
-from mwdcal.calibration.drift import STEADINESS, Constant, Drift, taken_as_steady
+from mwdcal.calibration.drift import Constant, Drift, exact_and_steady
 from mwdcal.calibration.prediction import typical_accuracy, without_temperature
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import (
@@ -139,8 +139,8 @@ def first_findings(calibration: Calibration) -> list[Finding]:
 def remarks(calibration: Calibration) -> list[str]:
     """Size of the residuals, accuracy to expect, what was taken as exact, and estimated constants."""
     accuracy = accuracy_in_words(calibration)
-    exact = ", ".join(name for name in calibration.assumed_exact if name not in STEADINESS.values())
-    steady = taken_as_steady(calibration.assumed_exact)
+    names, steady = exact_and_steady(calibration.assumed_exact)
+    exact = ", ".join(names)
     return [
         *residuals(calibration),
         f"accuracy to expect (1σ, calibration alone, typical): {'  '.join(accuracy)}",

@@ -93,34 +93,31 @@ def drifting(result: Fit, options: Options) -> Bools:
     if not sound.any():
         return drifted
     part = result if sound.all() else take(result, np.flatnonzero(sound))
-    chance, hidden = chances(_undisputed(part, options))
+    alone, disputed = _undisputed(part, options)
+    chance, hidden = chances(alone)
     limit = np.where(hidden, HIDDEN_CHANCE, ORDER_CHANCE)
-    limit = np.where(_disputed(part, options)[:, None], DISPUTED_CHANCE, limit)
+    limit = np.where(disputed[:, None], DISPUTED_CHANCE, limit)
     drifted[sound] = chance < limit
     return drifted
 
 
-def _disputed(result: Fit, options: Options) -> Bools:
-    """Members (B,) that depart from their prior."""
-    if options.knowledge is None:
-        return np.zeros(len(result.status), bool)
-    square, tested = departures(result)
-    return np.asarray(tail(square, np.maximum(tested, 1)) <= PRIOR_CHANCE)
-
-
-def _undisputed(result: Fit, options: Options) -> Fit:
-    """Fits without the prior where the run departs from it: it tests no drift then, and sizes none.
+def _undisputed(result: Fit, options: Options) -> tuple[Fit, Bools]:
+    """Fits without the prior where the run departs from it (B,): it tests no drift then, and sizes none.
 
     A wrong prior leaves residuals that go with attitude, and attitude may go with the order of the stations.
     """
-    disputed = np.flatnonzero(_disputed(result, options))
-    if not disputed.size:
-        return result
-    part = take(result, disputed)
+    if options.knowledge is None:
+        return result, np.zeros(len(result.status), bool)
+    square, tested = departures(result)
+    disputed = np.asarray(tail(square, np.maximum(tested, 1)) <= PRIOR_CHANCE)
+    places = np.flatnonzero(disputed)
+    if not places.size:
+        return result, disputed
+    part = take(result, places)
     nothing = Prior(0 * part.problem.prior.precision, part.problem.prior.expected)
     alone = replace(part.problem, prior=nothing)
     same = np.ones(part.analysis.freedom.shape)
-    return put(result, disputed, refitted(part, alone, part.state, same, options))
+    return put(result, places, refitted(part, alone, part.state, same, options)), disputed
 
 
 def fit_run(readings: Readings, options: Options) -> Fit:
@@ -141,7 +138,7 @@ def by_drift(result: Fit, options: Options) -> Iterator[tuple[Ints, Fit]]:
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def with_drift(result: Fit, options: Options, triads: Bools) -> Fit:
     """A fit with walks of estimated size that act on some triads (t,), from one without."""
-    problem, alone = result.problem, _undisputed(result, options)
+    problem, (alone, _) = result.problem, _undisputed(result, options)
     declared, analysis = np.isnan(result.noise), alone.analysis
     scores = drift.walk_scores(alone.problem, alone.state, analysis)
     scores = scores.of([n for n, t in drift.acting(scores.places).items() if triads[t]])

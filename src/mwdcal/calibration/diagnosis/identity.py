@@ -1,4 +1,4 @@
-"""What shows that data are of one tool, and of a day that can be: one rule for every command."""
+"""Checks, for every command, that data belong to one tool and state a possible date."""
 
 from __future__ import annotations
 

@@ -386,7 +386,7 @@ def _refusal(
 
 
 def _unsettled(fitted: FittedRuns, status: Status) -> Flag:
-    """Fits that have ended with a status that is none of success."""
+    """Fits that ended with this status: they did not converge."""
     members = fitted.result.status == int(status)
     name = status.name.lower().replace("_", "-")
     return _refusal(fitted, "unsettled", members, name, message=status.message)
@@ -410,7 +410,7 @@ def _absurd(fitted: FittedRuns, index: int) -> Iterator[Flag]:
         return f"{noise[place] / signal[place]:.0%} of the field"
 
     absurd = is_absurd(1.0) & (result.analysis.freedom[:, index] >= 1)
-    absurd &= declared | (result.status == int(Status.OK))  # noise of a fit on its way is none
+    absurd &= declared | (result.status == int(Status.OK))  # an unfinished fit estimates no noise
     warmed = absurd & ~is_absurd(share_beyond(result, index, absurd))
     words: dict[str, Any] = {"triad": TRIADS[index], "much": much}
     yield _refusal(

@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtr, ndtri
 
 from mwdcal.calibration.record import Finding
 from mwdcal.geometry.vectors import Array, ArrayLike
@@ -56,6 +55,8 @@ def contradictions(name: str, counts: Claim, other: Claim, remedy: str) -> list[
     )
     if not values.size:
         return []
+    from scipy.special import ndtr, ndtri
+
     off = values - others
     if name in ("declination", "convergence"):
         off = (off + 180.0) % 360.0 - 180.0

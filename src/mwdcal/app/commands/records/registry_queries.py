@@ -90,7 +90,7 @@ def get(record: str, database: str, output: Path, as_json: bool) -> None:
 
     \b
     Example: mwdcal registry get SIM-0001 -o tool.json --database tools.sqlite
-    Exit: 0 written, 2 there is none, or it cannot be written, 3 it was altered.
+    Exit: 0 written, 2 no such record, or the file cannot be written, 3 the record was altered.
     """
     from mwdcal.app.screens.records import registry as screen
     from mwdcal.files.formats import atomic
