@@ -538,6 +538,13 @@ def failing(sampling_hz, start, log):
     raise InputError("`sampling_hz` and `start` of `log`; see `# key = value`, `order` and -o.")
 
 
+def test_a_wrong_value_of_any_length_stays_short():
+    """What a message repeats of a value that nobody can have meant is cut."""
+    result = mwdcal("registry", "drift", "tools.sqlite", "--today", "x" * 5_000)
+    assert result.returncode == 2 and "--today" in result.stderr and "%Y-%m-%d" in result.stderr
+    assert len(result.stderr) < 1_000
+
+
 def test_errors_name_options_as_they_are_typed():
     with pytest.raises(InputError) as refusal:
         failing.main(["run.csv"], standalone_mode=False)

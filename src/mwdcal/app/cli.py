@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import re
 import sys
 
 import click
@@ -41,6 +42,8 @@ COMMANDS = (
     "verify",
 )
 """Modules of `mwdcal.app.commands` with a command of their name."""
+_LONG = re.compile(r"([^'\n]{300})[^'\n]+")
+"""A value that a message about a wrong option repeats, where it is too long to be read."""
 
 
 @click.group(
@@ -76,7 +79,7 @@ def _status(arguments: list[str] | None) -> int:
             return cli.main(arguments, prog_name="mwdcal", standalone_mode=False) or 0
     except click.ClickException as error:
         error.show(usage := io.StringIO())
-        text = harmless(without_passwords(usage.getvalue()))
+        text = _LONG.sub(r"\1…", harmless(without_passwords(usage.getvalue())))
         click.echo(laid_out(text, sys.stderr), err=True, nl=False)
         return error.exit_code
     except (click.Abort, KeyboardInterrupt) as stop:
