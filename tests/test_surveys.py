@@ -778,7 +778,8 @@ def test_what_is_accepted_is_what_the_tests_accept():
     vectors = calibration.fields(read)
     for limits in (load_survey_limits()[0], SurveyLimits(name="ours", field_nt=200.0)):
         judgement = judged(surveyed(calibration, read), vectors, read, limits)
-        again = judgement.tests.accept(judgement.departure[:, None])[:, 0]
+        departure = judgement.departure.transpose()[:, :, None]
+        again = judgement.tests.accept(dict(zip(STRENGTH_NAMES, departure, strict=True)))[:, 0]
         assert 5 < judgement.accepted.sum() < 45
         assert (again == judgement.accepted).all()
 
