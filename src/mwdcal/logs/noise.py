@@ -238,12 +238,14 @@ def _channel(
     """The noise of one channel; samples are counted inside, seconds outside."""
     factors = allan.octaves(len(value))
     moments, requested = _moments(len(value), "overlapping"), _moments(len(value), kind)
-    centred = allan.variance(value, factors, centred=True)
+    plain, centred = allan.variances(value, factors)
+    if kind != "overlapping":
+        plain = allan.variance(value, factors, kind)
     slope = np.asarray(allan.drift(value))
     terms = noise_terms.fit(centred[None], slope[None], moments)
-    plain = allan.deviation(value, factors, kind)
     freedom = allan.freedom(requested, terms.bounded, terms.steady, terms.covariance)[0]
-    lower, upper = allan.band(plain, freedom)
+    deviation = np.sqrt(plain)
+    lower, upper = allan.band(deviation, freedom)
     fitted = terms.bounded @ np.swapaxes(requested.plain_mean, -1, -2)
     fitted = np.sqrt(fitted[0] + (terms.steady * moments.averaging) ** 2 / 2)
     named = _terms(terms, rate)
@@ -255,7 +257,7 @@ def _channel(
         sampling_hz=rate,
         mean=float(value.mean()),
         tau_s=(moments.averaging / rate).tolist(),
-        deviation=plain.tolist(),
+        deviation=deviation.tolist(),
         lower=lower.tolist(),
         upper=upper.tolist(),
         freedom=freedom.tolist(),
@@ -322,7 +324,9 @@ def _findings(
     name: str, value: Array, rate: float, station: float, moments: Moments, terms: NoiseTerms
 ) -> list[Finding]:
     """What the reader should know about a channel."""
-    step = float(np.diff(np.unique(value)).min())
+    apart = np.diff(np.sort(value))
+    step = float(np.min(apart, where=apart > 0, initial=np.inf))
+    del apart
     sample = float(np.std(np.diff(value)) / np.sqrt(2))
     coarse = sample < COARSE * step
     texts = {"event": _event(name, value, rate, COARSE * step, coarse)}
@@ -356,13 +360,16 @@ def _event(name: str, value: Array, rate: float, least: float, coarse: bool) -> 
     are `coarse` in averages.
     """
     for m in sorted({1, max(len(value) // EVENT_PARTS, 1)}):
-        size = np.abs(allan.differences(value, m))
-        usual = max(1.4826 * float(np.median(size)), least if coarse or m == 1 else 0.0)
+        size = allan.differences(value, m)
+        np.abs(size, out=size)
         worst = int(np.argmax(size))
-        if usual > 0 and size[worst] / usual > EVENT + STEP_ROUNDING:
+        largest = float(size[worst])
+        median = float(np.median(size, overwrite_input=True))
+        usual = max(1.4826 * median, least if coarse or m == 1 else 0.0)
+        if usual > 0 and largest / usual > EVENT + STEP_ROUNDING:
             return (
-                f"{name} changes by {size[worst]:.3g} about {(worst + m) / rate:.4g} s after the start, "
-                f"{size[worst] / usual:.0f} times what is usual within {m / rate:.2g} s: a spike or a move. "
+                f"{name} changes by {largest:.3g} about {(worst + m) / rate:.4g} s after the start, "
+                f"{largest / usual:.0f} times what is usual within {m / rate:.2g} s: a spike or a move. "
                 "Choose a quiet part by `start` and `end`."
             )
     return ""
