@@ -137,7 +137,9 @@ def _variances(phase: Array, m: int, kind: Kind) -> tuple[Array, Array]:
         raise ValueError(f"`averaging` must be from 1 to half of {count} readings; got {m}")
     if kind == "modified":
         sums = _sums(_differences(phase, m))
-        mean, square = _moments_of(lambda rows: sums[..., m:][..., rows] - sums[..., :-m][..., rows], count - 3 * m + 2)
+        mean, square = _moments_of(
+            lambda rows: sums[..., m:][..., rows] - sums[..., :-m][..., rows], count - 3 * m + 2
+        )
         mean, square = mean / m, square / (m * m)
     elif kind == "standard":
         ends = phase[..., ::m]
@@ -161,7 +163,11 @@ def _moments_of(step: Callable[[slice], Array], count: int) -> tuple[Array, Arra
         part = part - middle[..., None]
         apart = middle - mean
         mean = mean + apart * (size / (start + size))
-        square = square + np.einsum("...i,...i->...", part, part) + apart**2 * (start * size / (start + size))
+        square = (
+            square
+            + np.einsum("...i,...i->...", part, part)
+            + apart**2 * (start * size / (start + size))
+        )
     return mean, square / count
 
 

@@ -172,12 +172,13 @@ def find_noise(
     for name in (name for name in RAW if name in log.columns):
         say(f"Allan variances of {name}, {samples} samples")
         try:
-            taken = regular.samples(log, name, rows, rate, station, findings)
+            value, hertz = regular.samples(log, name, rows, rate, findings)
+            variances = _variances(name, value, hertz * station)
         except regular.UnusableChannelError as error:
             findings.append(Finding(id="channel-left-out", text=f"{error} It was left out."))
             continue
-        cells[name] = movement.cells_of(*taken)
-        channel = _channel(name, *taken, station, kind, remarks)
+        cells[name] = movement.cells_of(value, hertz)
+        channel = _channel(name, value, hertz, station, kind, variances, remarks)
         channels[name] = channel if profile is None else _physical(name, channel, profile)
     if not channels:
         reasons = " ".join(finding.text for finding in findings)
@@ -232,15 +233,26 @@ def _station_seconds(given: float | None, seconds: float, rate: float, source: s
     return given
 
 
-def _channel(
-    name: str, value: Array, rate: float, station: float, kind: Kind, findings: list[Finding]
-) -> ChannelNoise:
-    """The noise of one channel; samples are counted inside, seconds outside."""
-    factors = allan.octaves(len(value))
-    moments, requested = _moments(len(value), "overlapping"), _moments(len(value), kind)
+def _variances(name: str, value: Array, length: float) -> tuple[Array, Array]:
+    """Plain and centred Allan variances (m,) of a channel at all octaves; refused without noise there or in `length`.
+
+    Errors: `regular.UnusableChannelError`.
+    """
+    factors = [*allan.octaves(len(value)), max(round(length), 1)]
     plain, centred = allan.variances(value, factors)
+    regular.check_noise(name, value, factors, centred)
+    return plain[:-1], centred[:-1]
+
+
+def _channel(
+    name: str, value: Array, rate: float, station: float, kind: Kind, variances: tuple[Array, Array],
+    findings: list[Finding],
+) -> ChannelNoise:  # fmt: skip
+    """The noise of one channel with these `_variances`; samples are counted inside, seconds outside."""
+    plain, centred = variances
+    moments, requested = _moments(len(value), "overlapping"), _moments(len(value), kind)
     if kind != "overlapping":
-        plain = allan.variance(value, factors, kind)
+        plain = allan.variance(value, allan.octaves(len(value)), kind)
     slope = np.asarray(allan.drift(value))
     terms = noise_terms.fit(centred[None], slope[None], moments)
     freedom = allan.freedom(requested, terms.bounded, terms.steady, terms.covariance)[0]
