@@ -164,13 +164,12 @@ def find_noise(
     findings: list[Finding] = []
     remarks: list[Finding] = []
     rows, rate = regular.section(log, sampling_hz, between, findings)
-    samples = rows.stop - rows.start
-    seconds = samples / rate
+    seconds = (rows.stop - rows.start) / rate
     station = _station_seconds(station_seconds, seconds, rate, log.source)
     channels: dict[str, ChannelNoise] = {}
     cells: dict[str, Cells] = {}
     for name in (name for name in RAW if name in log.columns):
-        say(f"Allan variances of {name}, {samples} samples")
+        say(f"Allan variances of {name}, {rows.stop - rows.start} samples")
         try:
             value, hertz = regular.samples(log, name, rows, rate, findings)
             variances = _variances(name, value, hertz * station)
