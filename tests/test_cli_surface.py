@@ -124,6 +124,21 @@ def test_help_imports_neither_numpy_nor_scipy():
     assert done.stderr.strip() == "[]"
 
 
+def test_a_plain_calibration_loads_only_what_it_uses(tmp_path):
+    script = (
+        "import sys\nfrom mwdcal.app.cli import main\n"
+        "try:\n    main(sys.argv[1:])\nexcept SystemExit as end:\n    assert not end.code\n"
+        "unused = {'scipy', 'rich.console', 'mwdcal.certificate', 'mwdcal.use.verification',"
+        " 'mwdcal.files.formats.workbook', 'mwdcal.files.exchange'}\n"
+        "sys.exit(str(sorted(unused & set(sys.modules))))\n"
+    )
+    run = EXAMPLE / "run.csv"
+    command = [sys.executable, "-c", script, "calibrate", str(run), "--tool", "servo"]
+    command += ["-o", str(tmp_path / "tool.json")]
+    done = subprocess.run(command, capture_output=True, encoding="utf-8", check=False)
+    assert done.stderr.splitlines()[-1] == "[]"
+
+
 @pytest.mark.skipif(os.name == "nt", reason="POSIX pipes")
 @pytest.mark.parametrize("reader", ["head -1", "true"])
 def test_a_reader_that_leaves_early_sees_no_traceback(files, reader):
