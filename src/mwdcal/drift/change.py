@@ -26,7 +26,7 @@ NULL_DRAWS = 9_999
 """Histories without change that the test is judged by."""
 FIRST_DRAWS = 999
 """Of these, those that decide where they leave no doubt: see `change_test`."""
-DOUBT = 6.0
+DECIDED_BEYOND = 6.0
 """Standard deviations of the share of the first draws above the level within which all are drawn."""
 PAIR_DRAWS = 1_999
 """Of these, those that two calibrations alone are judged by."""
@@ -229,7 +229,7 @@ def change_test(history: History, level: float = CHANGE_LEVEL) -> ChangeTest:
     only where all draws call it so, and so with a probability of at most the level where nothing changed.
     """
     first = _test(history, level, FIRST_DRAWS)
-    doubtful = first.probability <= level + DOUBT * np.sqrt(level / FIRST_DRAWS)
+    doubtful = first.probability <= level + DECIDED_BEYOND * np.sqrt(level / FIRST_DRAWS)
     rare = (first.pair_probability <= 1 / (FIRST_DRAWS + 1)).any()
     return _test(history, level, NULL_DRAWS) if doubtful or rare else first
 

@@ -135,11 +135,9 @@ def _whole(name: str, advice: str, digits: str) -> None:
 
 
 def _unique(name: str, advice: str, pairs: list[tuple[str, Any]]) -> None:
-    for key, count in Counter(key for key, _ in pairs).items():
-        if count > 1:
-            raise InputError(
-                f"{name}: the key {key!r} stands {count} times in one object. {advice}"
-            )
+    if len(dict(pairs)) < len(pairs):
+        key, count = Counter(key for key, _ in pairs).most_common(1)[0]
+        raise InputError(f"{name}: the key {key!r} stands {count} times in one object. {advice}")
 
 
 def published_schema(command: str = "") -> dict[str, Any]:
