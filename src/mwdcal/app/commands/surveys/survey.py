@@ -16,9 +16,9 @@ from mwdcal.errors import InputError
 
 if TYPE_CHECKING:
     from mwdcal.app.choices import LoadedCalibration
+    from mwdcal.calibration.canonical import SignatureCheck
     from mwdcal.calibration.readings import Readings
     from mwdcal.calibration.record import Calibration, Finding
-    from mwdcal.certificate.signature import SignatureCheck
     from mwdcal.files.formats.table import Table
     from mwdcal.geometry.vectors import Array
     from mwdcal.survey.acceptance import SurveyLimits
