@@ -67,7 +67,7 @@ def without_pictures(monkeypatch):
     """Pages with empty pictures: drawing takes most of the time of a page that is read for its text."""
     from markupsafe import Markup
 
-    from mwdcal.app.pages import pictures
+    from mwdcal.pages import pictures
     from mwdcal.use.plots import Plots
 
     for name, method in vars(Plots).items():

@@ -11,8 +11,11 @@ import msgspec
 
 import mwdcal
 from mwdcal.app import correction
-from mwdcal.app.envelope import INPUTS, Envelope, ExampleDocument
-from mwdcal.app.screens import (
+from mwdcal.calibration.record import DOCUMENT_VERSION, SCHEMA_VERSION, Calibration
+from mwdcal.certificate.document import Certificate
+from mwdcal.faults.diagnosis import Diagnosis
+from mwdcal.registry.lookup import Listing
+from mwdcal.screens import (
     calibration,
     comparison,
     conversion,
@@ -23,12 +26,9 @@ from mwdcal.app.screens import (
     simulation,
     stations,
 )
-from mwdcal.app.screens.records import drift, registry, signature
-from mwdcal.app.screens.surveys import reference, survey
-from mwdcal.calibration.record import DOCUMENT_VERSION, SCHEMA_VERSION, Calibration
-from mwdcal.certificate.document import Certificate
-from mwdcal.faults.diagnosis import Diagnosis
-from mwdcal.registry.lookup import Listing
+from mwdcal.screens.envelope import INPUTS, Envelope, ExampleDocument
+from mwdcal.screens.records import drift, registry, signature
+from mwdcal.screens.surveys import reference, survey
 from mwdcal.use.verification import Verdict
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"

@@ -617,9 +617,9 @@ def test_a_run_without_gravity_is_no_change_of_the_tool(stated):
 @pytest.mark.usefixtures("without_layout")
 def test_pages_mark_simulated_data_and_escape_names(years):
     pytest.importorskip("matplotlib")
-    from mwdcal.app.pages.records.drift import render_fleet, render_tool
-    from mwdcal.app.pages.records.drift_figures import drift_picture
-    from mwdcal.app.screens.records.drift import fleet_screen, tool_screen
+    from mwdcal.pages.records.drift import render_fleet, render_tool
+    from mwdcal.pages.records.drift_figures import drift_picture
+    from mwdcal.screens.records.drift import fleet_screen, tool_screen
 
     name = "<script>alert(1)</script>\x1b[2J"
     tools = [measured(name, years["T-1"]), measured("T-2", years["T-2"])]
@@ -674,8 +674,8 @@ def test_a_calibration_with_a_prior_says_so_and_teaches_no_rate():
 @pytest.mark.usefixtures("without_pictures")
 def test_the_least_probability_that_is_drawn_is_a_bound(years):
     pytest.importorskip("matplotlib")
-    from mwdcal.app.pages.records.drift import render_fleet, render_tool
-    from mwdcal.app.screens.records.drift import fleet_screen, tool_screen
+    from mwdcal.pages.records.drift import render_fleet, render_tool
+    from mwdcal.screens.records.drift import fleet_screen, tool_screen
 
     fleet, (drift, _) = fleet_drift(
         [measured("T-1", years["T-1"]), measured("T-2", years["T-2"])], LIMITS, TODAY

@@ -9,11 +9,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from mwdcal.app.pages.report import render
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import readings_at
 from mwdcal.errors import InputError
+from mwdcal.pages.report import render
 from mwdcal.planning import simulate
 from mwdcal.sensor.profile import Profile, TriadProfile
 from mwdcal.use.verification import Bounds, Limits, verify

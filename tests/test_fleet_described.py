@@ -21,9 +21,9 @@ from test_fleet_page import table_of, worst_tools
 pq = pytest.importorskip("pyarrow.parquet")
 pytestmark = pytest.mark.usefixtures("without_pictures")
 
-from mwdcal.app.pages import fleet_figures, fleet_report  # noqa: E402
 from mwdcal.calibration.diagnosis.findings import REMARKS  # noqa: E402
 from mwdcal.files.formats import table as tables  # noqa: E402
+from mwdcal.pages import fleet_figures, fleet_report  # noqa: E402
 from mwdcal.use import plots  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]

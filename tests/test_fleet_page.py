@@ -13,7 +13,7 @@ from test_fleet_findings import said
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 
-from mwdcal.app.pages import fleet_columns, fleet_figures, pictures  # noqa: E402
+from mwdcal.pages import fleet_columns, fleet_figures, pictures  # noqa: E402
 
 
 def cells(row):

@@ -10,8 +10,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from mwdcal.app.pages.surveys.interference import render
-from mwdcal.app.screens.surveys.interference import screen
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
@@ -20,7 +18,9 @@ from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.batch import take
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import centred
+from mwdcal.pages.surveys.interference import render
 from mwdcal.planning.simulate import grid, run, servo
+from mwdcal.screens.surveys.interference import screen
 from mwdcal.survey.acceptance import SensorTerms
 from mwdcal.survey.error_terms import DRIFTED
 from mwdcal.survey.multistation.interference import deviations, interference

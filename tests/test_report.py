@@ -17,12 +17,6 @@ import pytest
 from markupsafe import Markup
 
 from mwdcal.app import text
-from mwdcal.app.pages import pictures, report
-from mwdcal.app.pages.page import css
-from mwdcal.app.pages.report import render
-from mwdcal.app.screens import calibration as screen
-from mwdcal.app.screens import conversion
-from mwdcal.app.screens.numbers import fixed, measured, number, signed
 from mwdcal.calibration.automatic.auto import Choice
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
@@ -35,7 +29,13 @@ from mwdcal.calibration.prediction import (
 from mwdcal.calibration.readings import Readings
 from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import reference_vectors
+from mwdcal.pages import pictures, report
+from mwdcal.pages.page import css
+from mwdcal.pages.report import render
 from mwdcal.planning import simulate
+from mwdcal.screens import calibration as screen
+from mwdcal.screens import conversion
+from mwdcal.screens.numbers import fixed, measured, number, signed
 from mwdcal.sensor.profile import Profile, TriadProfile
 from mwdcal.use import plots
 from mwdcal.use.notation import convert

@@ -7,14 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias, cast
 
-from mwdcal.app.commands.options import Typed
 from mwdcal.calibration.canonical import SignatureCheck
 from mwdcal.calibration.options import AUTO, Options
 from mwdcal.calibration.prior import DATASHEET, profile_for
 from mwdcal.calibration.readings import HIGHEST, Readings
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.files import documents, profiles, runs
-from mwdcal.files.formats import members
+from mwdcal.registry.calibration_source import calibration_file, calibration_of
+from mwdcal.screens.typed_options import Typed, names
 from mwdcal.sensor.profile import Profile
 
 
@@ -85,33 +85,7 @@ def prior_of(word: str | None) -> tuple[Prior, str]:
     return (DATASHEET, "") if word == DATASHEET else calibration_of(Path(word))
 
 
-def calibration_of(path: Path) -> tuple[Calibration, str]:
-    """The calibration in a file, and its SHA-256: see `calibration_file`."""
-    file = calibration_file(path)
-    return documents.decoded(file), file.digest
-
-
-def calibration_file(path: Path) -> members.Member:
-    """A calibration file, or one tool in the table of a fleet or in a registry; its name and SHA-256.
-
-    `registry.sqlite#SERIAL` is the latest calibration of that tool.
-    """
-    file, serial = members.split(path)
-    if not members.is_database(file):
-        return documents.contents(path)
-    from mwdcal.registry.lookup import latest_file
-    from mwdcal.registry.store import open_registry
-
-    with open_registry(file) as registry:
-        return latest_file(registry, serial)
-
-
 def order_of(word: str) -> int | Literal["auto"]:
     """An order as a number; what is none is left for `Options` to refuse."""
     orders = {str(order): order for order in range(HIGHEST + 1)}
     return orders.get(word, cast('Literal["auto"]', word))
-
-
-def names(text: str) -> tuple[str, ...]:
-    """The words of a list with commas."""
-    return tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))

@@ -14,8 +14,8 @@ from mwdcal import __version__
 from mwdcal.app import interruption
 from mwdcal.app.commands import Commands
 from mwdcal.app.messages import say, screens
-from mwdcal.app.text import harmless, laid_out, without_passwords
 from mwdcal.errors import MwdcalError, reason
+from mwdcal.screens.text import harmless, laid_out, without_passwords
 
 INTERNAL = 70
 """Exit status of a defect of the program."""

@@ -18,9 +18,6 @@ import msgspec
 from mwdcal.app import pool, progress
 from mwdcal.app.choices import options_of, prior_of
 from mwdcal.app.commands.options import Typed
-from mwdcal.app.envelope import enveloped
-from mwdcal.app.screens.fleet import FleetSummary, stated_options, summarise
-from mwdcal.app.text import plural
 from mwdcal.calibration.automatic.nonlinearity import with_strengths
 from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.diagnosis.refusals import check_options, no_temperature
@@ -42,6 +39,9 @@ from mwdcal.fleet.tables import (
     in_several_folders,
     partitions,
 )
+from mwdcal.screens.envelope import enveloped
+from mwdcal.screens.fleet import FleetSummary, stated_options, summarise
+from mwdcal.screens.text import plural
 from mwdcal.sensor.profile import Profile
 from mwdcal.use.correction_numba import cores
 

@@ -18,7 +18,8 @@ from typing import IO, TYPE_CHECKING, Any
 
 import click
 
-from mwdcal.app.text import (
+from mwdcal.errors import InputError, MwdcalError, reason
+from mwdcal.screens.text import (
     UNSAFE_BUT_LINES,
     fitting,
     harmless,
@@ -26,7 +27,7 @@ from mwdcal.app.text import (
     one_line,
     without_passwords,
 )
-from mwdcal.errors import InputError, MwdcalError, reason
+from mwdcal.screens.typed import as_typed
 
 if TYPE_CHECKING:
     from mwdcal.calibration.record import Finding
@@ -85,27 +86,6 @@ def quiet() -> bool:
     """Whether the command that runs was told to print nothing but errors and JSON."""
     context = click.get_current_context(silent=True)
     return bool(context and context.meta.get(ONLY_ERRORS))
-
-
-def as_typed(text: str) -> str:
-    """A message of the library with the options of the command that runs instead of its arguments.
-
-    The library names an argument in backticks, also in the files that it writes; the name stays as
-    it is where no option has it.
-    """
-    context = click.get_current_context(silent=True)
-    parameters = context.command.params if context else []
-    typed = [p for p in parameters if isinstance(p, click.Option)]
-    options = {p.opts[-1].lstrip("-").replace("-", "_"): p.opts[-1] for p in typed}
-    options |= {p.name: p.opts[-1] for p in typed if p.name}
-    return re.sub(r"`(\w+)`", lambda name: options.get(name[1], name[0]), text)
-
-
-def findings_as_typed(findings: Iterable[Finding]) -> list[Finding]:
-    """The findings in the words of the command that runs."""
-    from msgspec.structs import replace
-
-    return [replace(finding, text=as_typed(finding.text)) for finding in findings]
 
 
 class Screen:

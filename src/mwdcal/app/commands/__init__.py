@@ -12,7 +12,7 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
-from mwdcal.app.text import laid_out
+from mwdcal.screens.text import laid_out
 
 
 class Commands(UserDict[str, Any]):

@@ -8,8 +8,8 @@ import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result
-from mwdcal.app.text import one_line
 from mwdcal.errors import InputError
+from mwdcal.screens.text import one_line
 
 
 @options.command()
@@ -46,11 +46,11 @@ def command(
     """
     from mwdcal.app.choices import load_calibration
     from mwdcal.app.correction import Applied, apply_to_any
-    from mwdcal.app.envelope import enveloped, with_signature
     from mwdcal.app.progress import bar
-    from mwdcal.app.screens.records.signature import in_short
     from mwdcal.calibration.readings import simulated
     from mwdcal.files.runs import BlankReadingError
+    from mwdcal.screens.envelope import enveloped, with_signature
+    from mwdcal.screens.records.signature import in_short
 
     options.check_outputs([output], [calibration, readings, *key])
     loaded = load_calibration(calibration, key)

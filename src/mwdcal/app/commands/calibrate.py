@@ -38,10 +38,10 @@ def command(
     Exit: 0 calibrated, 2 input cannot be read, 3 fit failed or refused.
     """
     from mwdcal.app.choices import load_run, options_of, prior_of
-    from mwdcal.app.screens import calibration as screen
     from mwdcal.calibration.calibrate import chosen_fit, recorded
     from mwdcal.files import documents
     from mwdcal.files.formats import atomic
+    from mwdcal.screens import calibration as screen
 
     options.check_outputs([output], [run, tool, typed["prior"]], page=report, calibration=True)
     prior, digest = prior_of(typed["prior"])
@@ -50,7 +50,7 @@ def command(
     calibration = recorded(choice, result)
     rendered = ""
     if report:
-        from mwdcal.app.pages.report import render
+        from mwdcal.pages.report import render
 
         rendered = render(calibration)
     shown = (screen.summary if as_json else screen.screen)(calibration, choice, output, report)

@@ -10,9 +10,10 @@ from pathlib import Path
 import click
 
 from mwdcal.app.commands import options
-from mwdcal.app.messages import as_typed, print_result, say
-from mwdcal.app.text import one_line
+from mwdcal.app.messages import print_result, say
 from mwdcal.errors import FitError
+from mwdcal.screens.text import one_line
+from mwdcal.screens.typed import as_typed
 
 
 @options.command()
@@ -40,12 +41,12 @@ def command(
     Exit: 0 compared, 2 input cannot be read, 3 every method refused.
     """
     from mwdcal.app.choices import load_run, order_of
-    from mwdcal.app.envelope import enveloped
-    from mwdcal.app.screens import comparison as screen
     from mwdcal.calibration.diagnosis.findings import unused_columns
     from mwdcal.calibration.options import Options
     from mwdcal.comparison.compare import able, compare
     from mwdcal.files.formats import atomic
+    from mwdcal.screens import comparison as screen
+    from mwdcal.screens.envelope import enveloped
 
     options.check_outputs([], [run, tool], page=report)
     readings, profile = load_run(run, tool, decimal)
@@ -54,7 +55,7 @@ def command(
     rows = tuple(replace(row, refused=as_typed(row.refused)) for row in result.rows)
     result = replace(result, rows=rows)
     if report:
-        from mwdcal.app.pages.comparison import render
+        from mwdcal.pages.comparison import render
 
         sources = profile.name, readings.run_sha256, readings.profile_sha256
         time = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")

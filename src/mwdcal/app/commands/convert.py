@@ -8,8 +8,8 @@ import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result, to_json
-from mwdcal.app.text import one_line
 from mwdcal.errors import InputError
+from mwdcal.screens.text import one_line
 
 
 @options.command()
@@ -86,8 +86,8 @@ def _convert(
     calibration: Path, notation: str, temperature: str | None, output: Path | None, as_json: bool
 ) -> None:
     """Print a calibration in a notation, or write it as JSON."""
-    from mwdcal.app.screens import conversion
     from mwdcal.files.formats import atomic
+    from mwdcal.screens import conversion
 
     options.check_outputs([output], [calibration])
     converted = conversion.convert_file(calibration, notation, _temperature(temperature))
@@ -102,8 +102,8 @@ def _write_sources(
     calibration: Path, form: str, word_bits: int | None, folder: Path, as_json: bool
 ) -> None:
     """Write the C sources of a calibration into a folder, all or none."""
-    from mwdcal.app.screens import conversion
     from mwdcal.files.formats import atomic
+    from mwdcal.screens import conversion
 
     exported = conversion.export_file(calibration, form, word_bits)
     files = {folder / name: text for name, text in exported.sources.files.items()}
@@ -118,7 +118,7 @@ def _write_sources(
 
 def _write_model(calibration: Path, temperature: str | None, output: Path, as_json: bool) -> None:
     """Write the sensor terms of a calibration as a tool model, and print them."""
-    from mwdcal.app.screens import conversion
+    from mwdcal.screens import conversion
     from mwdcal.survey.tool_model import sensor_terms, write_tool_model
 
     options.check_outputs([output], [calibration])

@@ -40,10 +40,10 @@ def command(folder: Path, as_json: bool) -> None:
     Example: mwdcal example demo
     Exit: 0 written, 2 a file of the same name is there, or DIR cannot be written.
     """
-    from mwdcal.app.envelope import ExampleDocument, enveloped
-    from mwdcal.app.text import one_line, table
     from mwdcal.calibration.readings import SIMULATED
     from mwdcal.files.formats import atomic
+    from mwdcal.screens.envelope import ExampleDocument, enveloped
+    from mwdcal.screens.text import one_line, table
 
     if folder.exists() and not folder.is_dir():
         raise InputError(f"cannot write into '{folder}': it is not a folder. Name another one.")

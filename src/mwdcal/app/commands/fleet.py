@@ -64,11 +64,11 @@ def command(
 
     with pool.preparing(1 if scheduler else workers):  # these imports, in the workers too
         from mwdcal.app import fleet_table
-        from mwdcal.app.pages import fleet_report
-        from mwdcal.app.screens import fleet as screen
-        from mwdcal.app.text import plural
         from mwdcal.files.formats import atomic, folders
         from mwdcal.fleet import calibration_files
+        from mwdcal.pages import fleet_report
+        from mwdcal.screens import fleet as screen
+        from mwdcal.screens.text import plural
 
     options.check_outputs([output], [runs, tool], page=report, calibration=True)
     if calibrations:

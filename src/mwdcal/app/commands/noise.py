@@ -7,7 +7,8 @@ from pathlib import Path
 import click
 
 from mwdcal.app.commands import options
-from mwdcal.app.messages import findings_as_typed, print_result, say
+from mwdcal.app.messages import print_result, say
+from mwdcal.screens.typed import findings_as_typed
 
 
 @options.command()
@@ -40,10 +41,6 @@ def command(
     from msgspec.structs import replace
 
     from mwdcal.app import progress
-    from mwdcal.app.envelope import enveloped
-    from mwdcal.app.pages.noise import figure, render
-    from mwdcal.app.pages.pictures import picture
-    from mwdcal.app.screens import noise as screen
     from mwdcal.calibration.diagnosis.findings import unused_columns
     from mwdcal.files import logs, synonyms
     from mwdcal.files.contract import COLUMNS
@@ -51,6 +48,10 @@ def command(
     from mwdcal.files.profiles import load_profile
     from mwdcal.logs.allan import Kind
     from mwdcal.logs.noise import check, find_noise
+    from mwdcal.pages.noise import figure, render
+    from mwdcal.pages.pictures import picture
+    from mwdcal.screens import noise as screen
+    from mwdcal.screens.envelope import enveloped
 
     options.check_outputs([], [log, tool], picture=plot, page=report)
     between = (-np.inf if start is None else start, np.inf if end is None else end)

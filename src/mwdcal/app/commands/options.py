@@ -9,13 +9,14 @@ from contextlib import suppress
 from functools import partial
 from getpass import getuser
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any
 from unicodedata import normalize
 
 import click
 
 from mwdcal.app.messages import Command
 from mwdcal.errors import InputError
+from mwdcal.screens.typed_options import Typed as Typed
 
 Function = Callable[..., Any]
 Decorator = Callable[[Function], Function]
@@ -127,22 +128,6 @@ _FIT = (
 )  # fmt: skip
 
 
-class Typed(TypedDict):
-    """The options of `mwdcal calibrate` that say how to fit, as they come from the command line."""
-
-    method: str
-    model: str | None
-    order: str
-    parameters: str | None
-    nonlinearity: str
-    estimate: str
-    ignore: str
-    robust: str | None
-    paper_weights: bool
-    prior: str | None
-    seed: int
-
-
 def fit_options(order: str, nonlinearity: str, prior: str, known: str) -> Decorator:
     """The options that say how to fit, which the command gets as `Typed`.
 
@@ -239,14 +224,14 @@ def check_outputs(
                 raise _refused(path, why)
         taken |= names
     if picture:
-        from mwdcal.app.pages.pictures import require
+        from mwdcal.pages.pictures import require
 
         if picture.suffix.lower() not in PICTURES:
             allowed = ", ".join(PICTURES)
             raise InputError(f"`plot` {picture}: the suffix must be one of {allowed}. Rename it.")
         require("a picture", "matplotlib")
     if page:
-        from mwdcal.app.pages.page import environment
+        from mwdcal.pages.page import environment
 
         environment()
 

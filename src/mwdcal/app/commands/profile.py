@@ -23,10 +23,10 @@ def command(run: Path, output: Path, as_json: bool) -> None:
     Example: mwdcal profile export.csv -o tool.toml
     Exit: 0 written, 2 input cannot be read, 3 a choice is left open (nothing is written).
     """
-    from mwdcal.app.screens import proposal as screen
     from mwdcal.calibration.diagnosis.findings import unused_columns
     from mwdcal.files.formats import atomic
     from mwdcal.identification.proposal import as_toml, left_handed, propose
+    from mwdcal.screens import proposal as screen
 
     options.check_outputs([output], [run])
     proposal = propose(run)

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from mwdcal.app.commands import options
-from mwdcal.app.messages import as_typed, findings_as_typed, lines, print_result, say
+from mwdcal.app.messages import lines, print_result, say
+from mwdcal.screens.typed import as_typed, findings_as_typed
 
 
 @options.command()
@@ -41,13 +42,13 @@ def command(
     from dataclasses import replace
 
     from mwdcal.app import progress
-    from mwdcal.app.envelope import enveloped
-    from mwdcal.app.pages.pictures import picture
-    from mwdcal.app.pages.stations import figure, render
-    from mwdcal.app.screens import stations as screen
     from mwdcal.files import logs
     from mwdcal.files.formats import atomic, table
     from mwdcal.logs.stations import StandstillError, find_stations
+    from mwdcal.pages.pictures import picture
+    from mwdcal.pages.stations import figure, render
+    from mwdcal.screens import stations as screen
+    from mwdcal.screens.envelope import enveloped
 
     options.check_outputs([output], [log], picture=plot, page=report)
     slowly = progress.slowly(say)

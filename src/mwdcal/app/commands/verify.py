@@ -6,7 +6,8 @@ import sys
 from pathlib import Path
 
 from mwdcal.app.commands import options
-from mwdcal.app.messages import findings_as_typed, print_result
+from mwdcal.app.messages import print_result
+from mwdcal.screens.typed import findings_as_typed
 
 
 @options.command()
@@ -30,11 +31,11 @@ def command(
     from msgspec.structs import replace
 
     from mwdcal.app.choices import load_calibration
-    from mwdcal.app.envelope import enveloped, with_signature
-    from mwdcal.app.screens.verification import screen
     from mwdcal.calibration.diagnosis.findings import unused_columns
     from mwdcal.files import runs
     from mwdcal.files.limits import load_limits
+    from mwdcal.screens.envelope import enveloped, with_signature
+    from mwdcal.screens.verification import screen
     from mwdcal.use.verification import verify
 
     options.check_outputs([], [calibration, run, limits, *key], page=report)
@@ -52,8 +53,8 @@ def command(
     document = enveloped("verify", result, *stated, **digests)
     document = with_signature(document, loaded.signature)
     if report:
-        from mwdcal.app.pages.report import render
         from mwdcal.files.formats import atomic
+        from mwdcal.pages.report import render
 
         atomic.write(report, render(fitted, result, *stated))
     print_result(

@@ -6,7 +6,8 @@ import sys
 from pathlib import Path
 
 from mwdcal.app.commands import options
-from mwdcal.app.messages import findings_as_typed, print_result
+from mwdcal.app.messages import print_result
+from mwdcal.screens.typed import findings_as_typed
 
 
 @options.command()
@@ -25,13 +26,13 @@ def command(calibration: Path, readings: Path, decimal: str, as_json: bool) -> N
     """
     from msgspec.structs import replace
 
-    from mwdcal.app.choices import calibration_of
-    from mwdcal.app.envelope import enveloped
-    from mwdcal.app.screens.diagnosis import screen
     from mwdcal.calibration.diagnosis.findings import unused_columns
     from mwdcal.faults.diagnosis import diagnose
     from mwdcal.faults.physics import NONE
     from mwdcal.files import runs
+    from mwdcal.registry.calibration_source import calibration_of
+    from mwdcal.screens.diagnosis import screen
+    from mwdcal.screens.envelope import enveloped
 
     options.check_outputs([], [calibration, readings])
     fitted, digest = calibration_of(calibration)

@@ -91,12 +91,12 @@ def command(
     """
     from mwdcal.app import progress
     from mwdcal.app.choices import options_of, prior_of
-    from mwdcal.app.screens import plan as screen
     from mwdcal.files import profiles
     from mwdcal.files.formats import atomic, table
     from mwdcal.planning import planned
     from mwdcal.planning.moves import Stand
     from mwdcal.planning.plans import load_measured, load_plan, run_sheet
+    from mwdcal.screens import plan as screen
 
     options.check_outputs([output], [tool, measured, *plans], page=html)
     if len(plans) > 1 and (accuracy or stations or measured):
@@ -128,7 +128,7 @@ def command(
     if output:
         table.write(output, run_sheet(result[0].plan, profile.has_magnetometer))
     if html:
-        from mwdcal.app.pages.plan import render
+        from mwdcal.pages.plan import render
 
         atomic.write(html, render(result))
     print_result(text, screen.findings(result))

@@ -142,11 +142,12 @@ def _scene(
     typed: options.Typed,
 ) -> _Scene:  # fmt: skip
     """The files that the command names, read."""
-    from mwdcal.app.choices import calibration_of, options_of, prior_of
+    from mwdcal.app.choices import options_of, prior_of
     from mwdcal.files import profiles
     from mwdcal.planning.effects import load_effects
     from mwdcal.planning.plans import load_plan
     from mwdcal.planning.session import calibrated_tool
+    from mwdcal.registry.calibration_source import calibration_of
 
     chosen = options_of(typed, prior_of(typed["prior"])[0])
     table = load_plan(plan)
@@ -164,11 +165,11 @@ def _simulate(scene: _Scene, seed: int, output: Path, truth: Path | None, as_jso
     """One run."""
     import numpy as np
 
-    from mwdcal.app.screens import simulation as screen
     from mwdcal.calibration.readings import serial_of
     from mwdcal.files.formats import atomic, table
     from mwdcal.planning import session as sessions
     from mwdcal.planning.simulate import drawn
+    from mwdcal.screens import simulation as screen
 
     rng = np.random.default_rng([seed, 2])
     session = sessions.Session.of(scene.plan, scene.profile, scene.effects)
@@ -192,14 +193,14 @@ def _repeat(
     from mwdcal.app import pool
 
     with pool.preparing(workers):  # these imports, in the workers too
-        from mwdcal.app.pages.pictures import picture
-        from mwdcal.app.pages.repetition import figure
-        from mwdcal.app.screens import simulation as screen
         from mwdcal.files.formats import atomic, table
         from mwdcal.files.limits import load_limits
+        from mwdcal.pages.pictures import picture
+        from mwdcal.pages.repetition import figure
         from mwdcal.planning.plans import load_plan
         from mwdcal.planning.procedure import Procedure
         from mwdcal.planning.repetition import as_table, summarised
+        from mwdcal.screens import simulation as screen
 
     test, (bounds, digest) = load_plan(rolltest), load_limits(limits)
     procedure = Procedure.of(

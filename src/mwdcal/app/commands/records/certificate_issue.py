@@ -17,11 +17,11 @@ from mwdcal.errors import InputError
 
 if TYPE_CHECKING:
     from mwdcal.app.choices import LoadedCalibration
-    from mwdcal.app.pages.records.certificate_pictures import Picture
     from mwdcal.calibration.record import Calibration
     from mwdcal.certificate.contents import Order
     from mwdcal.certificate.document import Certificate, SourceFile
     from mwdcal.drift.document import ToolDrift
+    from mwdcal.pages.records.certificate_pictures import Picture
 
 Read = TypeVar("Read")
 CERTIFICATE_FORMS = (".json", ".html", ".pdf", ".xml")
@@ -92,11 +92,11 @@ def command(
     from msgspec import to_builtins
 
     from mwdcal.app.choices import load_calibration
-    from mwdcal.app.screens.records.certificate_issue import screen
     from mwdcal.certificate.contents import Order, certificate
     from mwdcal.certificate.laboratory import load_laboratory
     from mwdcal.files import verifications
     from mwdcal.files.formats import atomic
+    from mwdcal.screens.records.certificate_issue import screen
 
     _check_forms(output)
     paths = {"calibration": calibration, "verification": verification, "as-found": as_found}
@@ -175,10 +175,10 @@ def _drift(registry: str, loaded: LoadedCalibration, today: date) -> ToolDrift |
 
 
 def _pictures(calibration: Calibration, order: Order, drift: ToolDrift | None) -> list[Picture]:
-    from mwdcal.app.pages.pictures import require
+    from mwdcal.pages.pictures import require
 
     require("a certificate as page or PDF", "matplotlib")
-    from mwdcal.app.pages.records.certificate_pictures import certificate_pictures
+    from mwdcal.pages.records.certificate_pictures import certificate_pictures
 
     return certificate_pictures(calibration, order.verification, order.as_found, drift)
 
@@ -197,9 +197,9 @@ def _form(
 
         return to_xml(certificate)
     if suffix == ".pdf":
-        from mwdcal.app.pages.records.certificate_pdf import render_pdf
+        from mwdcal.pages.records.certificate_pdf import render_pdf
 
         return render_pdf(certificate, pictures())
-    from mwdcal.app.pages.records.certificate_page import render_page
+    from mwdcal.pages.records.certificate_page import render_page
 
     return render_page(certificate, pictures())

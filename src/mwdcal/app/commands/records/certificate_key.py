@@ -36,8 +36,8 @@ def subcommand(function: Callable[..., Any]) -> Any:
 
 def _print(name: str, file: Path, keys: list[TrustedKey], as_json: bool, **written: Path) -> None:
     """The keys in a file, and what was written."""
-    from mwdcal.app.envelope import enveloped
-    from mwdcal.app.screens.records import signature as screens
+    from mwdcal.screens.envelope import enveloped
+    from mwdcal.screens.records import signature as screens
 
     result = screens.KeysDocument(file=str(file), keys=keys)
     shown = enveloped(f"certificate key {name}", result)

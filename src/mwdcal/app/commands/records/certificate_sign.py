@@ -38,11 +38,11 @@ def command(document: Path, key: Path, output: Path | None, replace: bool, as_js
     Exit: 0 signed, 2 input cannot be read or is signed already, 3 it was changed before.
     """
     from mwdcal.app.commands.records.passphrase import known
-    from mwdcal.app.screens.records import signature as screens
     from mwdcal.certificate.keys import read_private
     from mwdcal.certificate.signature import signed
     from mwdcal.files import documents
     from mwdcal.files.formats import atomic
+    from mwdcal.screens.records import signature as screens
 
     options.check_outputs([output], [document, key])
     target = output or document

@@ -8,8 +8,9 @@ from pathlib import Path
 import click
 
 from mwdcal.app.commands import options
-from mwdcal.app.messages import findings_as_typed, print_result
+from mwdcal.app.messages import print_result
 from mwdcal.errors import InputError
+from mwdcal.screens.typed import findings_as_typed
 
 
 @options.command()
@@ -29,9 +30,9 @@ def command(document: Path, files: tuple[Path, ...], key: tuple[Path, ...], as_j
     """
     from msgspec.structs import replace
 
-    from mwdcal.app.screens.records import signature as screens
     from mwdcal.certificate.trusted_keys import trusted
     from mwdcal.files import documents
+    from mwdcal.screens.records import signature as screens
 
     if not key:
         raise InputError(

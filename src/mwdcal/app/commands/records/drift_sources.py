@@ -9,7 +9,6 @@ from typing import Any
 
 import msgspec
 
-from mwdcal.app.screens.records.drift import RegistryDrift
 from mwdcal.calibration.prediction import STATED_ANGLES
 from mwdcal.calibration.record import Calibration
 from mwdcal.drift.document import ToolDrift
@@ -24,6 +23,7 @@ from mwdcal.files.limits import load_limits
 from mwdcal.registry import queries
 from mwdcal.registry.store import Registry
 from mwdcal.registry.stored import AlteredError
+from mwdcal.screens.records.drift import RegistryDrift
 from mwdcal.use.verification import Bounds, Verdict
 
 Advance = Callable[[int, int], None]

@@ -10,8 +10,8 @@ import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import lines, print_result, say
-from mwdcal.app.text import one_line
 from mwdcal.errors import InputError
+from mwdcal.screens.text import one_line
 
 if TYPE_CHECKING:
     from mwdcal.registry.imports import Adding, Source
@@ -48,9 +48,9 @@ def command(
 
     alone = workers == 1 or all(file.is_file() and file.suffix != TABLE for file in files)
     with pool.preparing(1 if alone else workers):  # these imports, in the workers too
-        from mwdcal.app.screens.records import registry as screen
         from mwdcal.registry import imports
         from mwdcal.registry.store import open_registry
+        from mwdcal.screens.records import registry as screen
         from mwdcal.use.correction_numba import cores
 
     portions = imports.portions(imports.sources(files))
@@ -107,9 +107,9 @@ def withdraw(record: str, reason: str, database: str, actor: str, as_json: bool)
     Example: mwdcal registry withdraw 1207 --reason "wrong stand angles" --database tools.sqlite
     Exit: 0 withdrawn, 2 there is no such record, or it is withdrawn already.
     """
-    from mwdcal.app.screens.records import registry as screen
     from mwdcal.registry.lookup import one_record
     from mwdcal.registry.store import open_registry
+    from mwdcal.screens.records import registry as screen
 
     with open_registry(database) as registry:
         row = one_record(registry, record)

@@ -52,11 +52,11 @@ def command(
     Exit: 0 compared, 2 there is no such tool, or the registry cannot be opened, 3 a document was altered.
     """
     from mwdcal.app.commands.records import drift_sources
-    from mwdcal.app.pages.records import drift as pages
     from mwdcal.app.progress import bar
-    from mwdcal.app.screens.records import drift as screen
     from mwdcal.files.formats import atomic
+    from mwdcal.pages.records import drift as pages
     from mwdcal.registry.store import open_registry
+    from mwdcal.screens.records import drift as screen
 
     options.check_outputs([], [database], page=html)
     day = (today or datetime.now(UTC)).date()

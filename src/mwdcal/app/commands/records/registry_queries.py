@@ -9,7 +9,7 @@ import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result
-from mwdcal.app.text import one_line
+from mwdcal.screens.text import one_line
 
 ROWS = options.preset("--limit", type=click.IntRange(1), default=50, help="Most rows to print.")
 FIRST = options.preset("--offset", type=click.IntRange(0), default=0, help="Rows to leave out.")
@@ -45,9 +45,9 @@ def listing(
     Example: mwdcal registry list --kind certificate --database tools.sqlite
     Exit: 0 listed, 2 the registry cannot be opened.
     """
-    from mwdcal.app.screens.records import registry as screen
     from mwdcal.registry import lookup
     from mwdcal.registry.store import open_registry
+    from mwdcal.screens.records import registry as screen
 
     day = due.date().isoformat() if due else ""
     with open_registry(database) as registry:
@@ -68,9 +68,9 @@ def history(serial: str, database: str, limit: int, offset: int, as_json: bool) 
     Example: mwdcal registry history SIM-0001 --database tools.sqlite
     Exit: 0 shown, 2 there is no such tool, or the registry cannot be opened.
     """
-    from mwdcal.app.screens.records import registry as screen
     from mwdcal.registry import lookup
     from mwdcal.registry.store import open_registry
+    from mwdcal.screens.records import registry as screen
 
     with open_registry(database) as registry:
         result = lookup.past_of(registry, serial, offset, limit)
@@ -92,10 +92,10 @@ def get(record: str, database: str, output: Path, as_json: bool) -> None:
     Example: mwdcal registry get SIM-0001 -o tool.json --database tools.sqlite
     Exit: 0 written, 2 no such record, or the file cannot be written, 3 the record was altered.
     """
-    from mwdcal.app.screens.records import registry as screen
     from mwdcal.files.formats import atomic
     from mwdcal.registry import lookup
     from mwdcal.registry.store import open_registry
+    from mwdcal.screens.records import registry as screen
 
     options.check_outputs([output], [database], calibration=True)
     with open_registry(database) as registry:

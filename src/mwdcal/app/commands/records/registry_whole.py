@@ -9,7 +9,7 @@ import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result
-from mwdcal.app.text import one_line, plural
+from mwdcal.screens.text import one_line, plural
 
 
 @options.command()
@@ -23,9 +23,9 @@ def init(database: str, actor: str, as_json: bool) -> None:
     Example: mwdcal registry init --database tools.sqlite
     Exit: 0 created, 2 it exists already, or cannot be written.
     """
-    from mwdcal.app.screens.records import registry as screen
     from mwdcal.registry.setup import create
     from mwdcal.registry.store import open_registry
+    from mwdcal.screens.records import registry as screen
 
     create(database, actor)
     with open_registry(database) as registry:
@@ -48,8 +48,8 @@ def upgrade(database: str, actor: str, target: str | None, as_json: bool) -> Non
     Example: mwdcal registry upgrade --database tools.sqlite
     Exit: 0 as it should be, 2 it cannot be opened, or a newer program made it.
     """
-    from mwdcal.app.screens.records import registry as screen
     from mwdcal.registry import setup
+    from mwdcal.screens.records import registry as screen
 
     if target:
         before, after = setup.move_to(database, target, actor)
@@ -79,10 +79,10 @@ def check(database: str, head: str | None, as_json: bool) -> None:
     Exit: 0 sound, 1 altered, 2 it cannot be opened.
     """
     from mwdcal.app.progress import bar
-    from mwdcal.app.screens.records import registry as screen
     from mwdcal.calibration.record import Finding
     from mwdcal.registry import checking
     from mwdcal.registry.store import open_registry
+    from mwdcal.screens.records import registry as screen
 
     with open_registry(database) as registry:
         with bar("checking") as advance:
@@ -109,10 +109,10 @@ def export(folder: Path, database: str, as_json: bool) -> None:
     Exit: 0 written, 2 the folder is not empty, or cannot be written, 3 a document was altered.
     """
     from mwdcal.app.progress import bar
-    from mwdcal.app.screens.records import registry as screen
     from mwdcal.files.formats.folders import check_new
     from mwdcal.registry.exports import export as write
     from mwdcal.registry.store import open_registry
+    from mwdcal.screens.records import registry as screen
 
     check_new(folder)
     with open_registry(database) as registry, bar("exporting") as advance:
@@ -139,9 +139,9 @@ def backup(output: Path, database: str, as_json: bool) -> None:
     Example: mwdcal registry backup tools-backup.sqlite --database tools.sqlite
     Exit: 0 written, 2 the registry cannot be opened, or the file cannot be written, 3 the registry was altered.
     """
-    from mwdcal.app.screens.records import registry as screen
     from mwdcal.registry import copies
     from mwdcal.registry.store import open_registry
+    from mwdcal.screens.records import registry as screen
 
     options.check_outputs([output], [database])
     with open_registry(database) as registry:
@@ -162,8 +162,8 @@ def restore(source: Path, database: str, actor: str, as_json: bool) -> None:
     Example: mwdcal registry restore tools-backup.sqlite --database restored.sqlite
     Exit: 0 restored, 2 the registry is not empty or cannot be written, 3 the backup was altered.
     """
-    from mwdcal.app.screens.records import registry as screen
     from mwdcal.registry import copies
+    from mwdcal.screens.records import registry as screen
 
     head = copies.restore(source, database, actor)
     result = screen.RegistryCopied(file=str(source), head=head)

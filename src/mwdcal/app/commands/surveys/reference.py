@@ -103,8 +103,8 @@ def command(
                --fill run.csv -o filled.csv
     Exit: 0 done, 2 input cannot be read.
     """
-    from mwdcal.app.screens.surveys import reference as screen
     from mwdcal.files.formats import atomic, table
+    from mwdcal.screens.surveys import reference as screen
     from mwdcal.survey.place.reference_columns import fill
     from mwdcal.survey.place.references import MEASURABLE, reference_at
 

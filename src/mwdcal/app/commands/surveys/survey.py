@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from mwdcal.app.commands import options
-from mwdcal.app.messages import findings_as_typed, print_result
+from mwdcal.app.messages import print_result
 from mwdcal.errors import InputError
+from mwdcal.screens.typed import findings_as_typed
 
 if TYPE_CHECKING:
     from mwdcal.app.choices import LoadedCalibration
@@ -114,7 +115,7 @@ def command(
     findings = [*loaded.findings, *scene.findings, *result.findings]
     result = replace(result, findings=findings, sources=scene.sources)
     if html:
-        from mwdcal.app.pages.surveys.survey import render
+        from mwdcal.pages.surveys.survey import render
 
         findings = findings_as_typed(result.findings)
         pages.append((html, render(result, findings, scene.named)))
@@ -145,7 +146,7 @@ class _WellInputs:
 
     def enveloped(self, summary: object) -> dict[str, Any]:
         """The result for machines, with what all inputs say of themselves."""
-        from mwdcal.app.envelope import enveloped, with_signature
+        from mwdcal.screens.envelope import enveloped, with_signature
 
         document = enveloped("survey", summary, *self.stated, **self.digests)
         return with_signature(document, self.signature)
@@ -190,8 +191,8 @@ def _analysed(
     scene: _WellInputs, page: Path | None, drift: str, as_json: bool
 ) -> tuple[Interference, list[tuple[Path, bytes | str]]]:
     """The multi-station analysis and its page; one that is not separable is printed and refused."""
-    from mwdcal.app.screens.surveys.survey import refusal
     from mwdcal.files.formats import atomic
+    from mwdcal.screens.surveys.survey import refusal
     from mwdcal.survey.multistation.interference import interference
     from mwdcal.survey.multistation.interference_estimate import Assumed, sensor_drift
 
@@ -199,7 +200,7 @@ def _analysed(
     analysis = interference(scene.calibration, scene.readings, assumed, scene.md)
     pages: list[tuple[Path, bytes | str]] = []
     if page:
-        from mwdcal.app.pages.surveys.interference import render
+        from mwdcal.pages.surveys.interference import render
 
         pages.append((page, render(analysis, scene.named)))
     if not analysis.summary.separable:
@@ -221,9 +222,9 @@ def _print(
     as_json: bool,
 ) -> None:
     """What came of it."""
-    from mwdcal.app.screens.surveys import interference as screens_of_msa
-    from mwdcal.app.screens.surveys import survey as screens
     from mwdcal.calibration.diagnosis.findings import unused_columns
+    from mwdcal.screens.surveys import interference as screens_of_msa
+    from mwdcal.screens.surveys import survey as screens
 
     msa = analysis.summary if analysis else None
     unused = unused_columns(scene.readings.unused)
