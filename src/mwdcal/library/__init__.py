@@ -5,6 +5,8 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import FitError, InputError
 from mwdcal.library.arrays import readings
+from mwdcal.library.planning import plan, propose_profile
+from mwdcal.library.records import certificate, check_signature, fleet, registry, sign
 from mwdcal.library.tasks import (
     apply,
     calibrate,
@@ -19,6 +21,7 @@ from mwdcal.library.tasks import (
     stations,
     verify,
 )
+from mwdcal.library.wells import convert, export, reference, survey
 from mwdcal.sensor.profile import Profile
 from mwdcal.use import plots as plots  # puts `plot` on calibrations
 from mwdcal.use import verdict_plots as verdict_plots  # and on verdicts
@@ -32,15 +35,26 @@ __all__ = [
     "Readings",
     "apply",
     "calibrate",
+    "certificate",
+    "check_signature",
     "compare",
+    "convert",
     "diagnose",
+    "export",
+    "fleet",
     "load",
     "load_profile",
     "noise",
+    "plan",
+    "propose_profile",
     "read_run",
     "readings",
+    "reference",
+    "registry",
     "save",
+    "sign",
     "simulate",
     "stations",
+    "survey",
     "verify",
 ]
