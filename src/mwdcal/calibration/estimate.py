@@ -18,7 +18,7 @@ from mwdcal.estimation.minimisers import closed_form
 from mwdcal.estimation.problem import Problem, State, Triad
 from mwdcal.estimation.resetting import set_apart, with_share
 from mwdcal.estimation.robust import LOSSES, consistency, inflation, weight, weighted
-from mwdcal.estimation.solvers import Determined, Status
+from mwdcal.estimation.solvers import Determined, Status, stepped
 from mwdcal.estimation.start import start
 from mwdcal.estimation.uncertainty import (
     FIRST_SCATTER,
@@ -30,6 +30,7 @@ from mwdcal.estimation.uncertainty import (
     scatter_ratios,
     settle_gauge,
     station_misfit,
+    triad_squares,
     triad_sums,
     with_scatter,
 )
@@ -43,6 +44,8 @@ TEMPERATURE_STEP = 10.0
 ROBUST_ROUNDS = 40
 MOST_STEPS_IN_TURN = 200
 """Steps of all fits of a run after which weights or noise that have not settled never will."""
+MOST_AHEAD = 3.0
+"""Largest power of s² that an estimate of the noise takes at once."""
 NOISE_ROUNDS = 8
 """Most repetitions of fit and estimate of the noise."""
 SETTLED = 1e-3
@@ -215,7 +218,8 @@ def _general(problem: Problem, options: Options, finite: Bools) -> Fit:
     """The fit by the method's minimiser, with estimated noise and station weights in turn."""
     solved = solve(problem, start(problem), options)
     iterations, trust = solved.iterations, np.ones(problem.evidence.include.shape)
-    stage = _Stage(problem, solved, trust, np.zeros_like(iterations))
+    determined = Determined.of(problem, solved.state)
+    stage = _Stage(problem, solved, trust, np.zeros_like(iterations), determined)
     if not _all_declared(problem):
         stage = _estimate_noise(stage, options)
     stage = _set_apart(stage, options)
@@ -228,7 +232,8 @@ def refitted(result: Fit, problem: Problem, state: State, scale: Array, options:
     """A fit of a problem that has more unknowns than that of `result`, the noise times `scale` (B, triads)."""
     problem = _rescaled(problem, scale)
     solved = solve(problem, state, options)
-    stage = _Stage(problem, solved, result.trust, solved.iterations)
+    known = result.analysis.determined
+    stage = _Stage(problem, solved, result.trust, solved.iterations, known)
     finite = result.status != int(Status.NOT_FINITE)
     return _finished(stage, options, finite, result.iterations + solved.iterations)
 
@@ -318,13 +323,14 @@ def _bounded_factor(analysis: Analysis, trust: Array, loss: str, freedom: Array)
 class _Stage:
     """Where weighing and fitting in turn have come to: problem, solution, station weights (B, n).
 
-    `steps` (B,) counts the steps of all fits so far.
+    `steps` (B,) counts the steps of all fits so far; `determined` is known of a state nearby.
     """
 
     problem: Problem
     solved: Solved
     trust: Array
     steps: Ints
+    determined: Determined
 
 
 def _in_turn(stage: _Stage, rounds: int, turn: Callable[[_Stage], tuple[_Stage, Bools]]) -> _Stage:
@@ -358,7 +364,7 @@ def _set_apart(stage: _Stage, options: Options) -> _Stage:
 
 
 def _estimate_noise(stage: _Stage, options: Options) -> _Stage:
-    """Variance per triad by restricted maximum likelihood, fit and estimate in turn.
+    """Variance per triad by restricted maximum likelihood: a step of the fit with each estimate, then the rest.
 
     A triad without redundancy keeps its start: its residuals are rounding, and say nothing.
     """
@@ -369,26 +375,47 @@ def _estimate_noise(stage: _Stage, options: Options) -> _Stage:
     rounds, least = (SCATTER_ROUNDS, SCATTER_SETTLED) if slow else (NOISE_ROUNDS, SETTLED)
 
     def turn(now: _Stage) -> tuple[_Stage, Bools]:
-        analysis = analyse(now.problem, now.solved.state)
-        scale = np.sqrt(np.where(analysis.freedom >= 1, analysis.variance_factor, np.nan))
+        known, at = now.determined, now.solved.state
+        if not known.clear.all():
+            known = Determined.of(now.problem, at)
+        analysis = analyse(now.problem, at, known)
+        scale = _noise_scale(analysis, not slow)
         problem, solved = _rescaled(now.problem, scale), now.solved
         settled = ~np.any(np.abs(scale[:, free] - 1) >= least, -1)
         if scatter:
-            ratios = scatter_ratios(now.problem, solved.state, analysis)
-            problem = with_scatter(problem, solved.state, ratios)
+            ratios = scatter_ratios(now.problem, at, analysis)
+            problem = with_scatter(problem, at, ratios)
             settled &= _steady(now.problem, problem)
         if apart:
-            problem = with_share(problem, solved.state, analysis)
+            problem = with_share(problem, at, analysis)
             before, share = (p.evidence.apart for p in (now.problem, problem))
             settled &= np.abs(share - before) <= SCATTER_SETTLED * before
-        steps = now.steps
-        if options.method != "swarm":
-            solved = solve(problem, solved.state, options)
-            steps = steps + solved.iterations
+        steps = now.steps + 1
+        if not options.separate_solver:
+            solved = replace(solved, state=stepped(now.problem, at, known))
+        elif options.method != "swarm":
+            solved = solve(problem, at, options)
+            steps = now.steps + solved.iterations
             settled |= steps > MOST_STEPS_IN_TURN
-        return replace(now, problem=problem, solved=solved, steps=steps), settled
+        return replace(now, problem=problem, solved=solved, steps=steps, determined=known), settled
 
-    return _in_turn(stage, rounds, turn)
+    stage = _in_turn(stage, rounds, turn)
+    if options.separate_solver:
+        return stage
+    solved = solve(stage.problem, stage.solved.state, options)
+    return replace(stage, solved=solved, steps=stage.steps + solved.iterations)
+
+
+def _noise_scale(analysis: Analysis, ahead: bool) -> Array:
+    """The next estimate of the noise over the present one (B, t); NaN where nothing is left to tell it by.
+
+    Going `ahead` takes the step of Fisher's scoring, to first order: where uncertain angles take a share of the
+    residuals, s² alone comes closer only slowly. C⁻¹ is taken as that of each station by itself.
+    """
+    freedom, squares = analysis.freedom, triad_squares(analysis.spread)
+    factor = np.where(freedom >= 1, analysis.variance_factor, np.nan)
+    power = np.clip(freedom / np.maximum(squares, 1e-9), 1.0, MOST_AHEAD) if ahead else 1.0
+    return np.asarray(factor ** (power / 2))
 
 
 def _steady(old: Problem, new: Problem) -> Bools:
@@ -426,7 +453,8 @@ def _downweigh(stage: _Stage, options: Options) -> _Stage:
         solved = solve(_trusting(problem, trust), solved.state, options)
         steps = now.steps + solved.iterations
         settled = ~np.any(np.abs(trust / now.trust - 1) >= SETTLED, -1)
-        return _Stage(problem, solved, trust, steps), settled | (steps > MOST_STEPS_IN_TURN)
+        now = _Stage(problem, solved, trust, steps, now.determined)
+        return now, settled | (steps > MOST_STEPS_IN_TURN)
 
     return _in_turn(stage, ROBUST_ROUNDS, turn)
 

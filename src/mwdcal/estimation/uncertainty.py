@@ -270,6 +270,12 @@ def triad_sums(values: Array) -> Array:
     return np.asarray(np.sum(by_triad, (1, 3)))
 
 
+def triad_squares(spread: Array) -> Array:
+    """Sums (B, t) of the squares of each triad's own blocks of a spread (B, n, m, m)."""
+    blocks = [spread[..., k : k + 3, k : k + 3] for k in range(0, spread.shape[-1], 3)]
+    return np.stack([np.sum(block**2, (1, 2, 3)) for block in blocks], -1)
+
+
 def effective_freedom(problem: Problem, state: State, analysis: Analysis) -> Array:
     """Degrees of freedom (B, t) of the χ² that s² times them follows: tr(S)² / tr(S²).
 
