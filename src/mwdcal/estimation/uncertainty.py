@@ -311,6 +311,17 @@ def station_misfit(analysis: Analysis) -> tuple[Array, Array]:
     return quotient(along, values, tested).sum(-1), np.sum(tested, -1).astype(float)
 
 
+def left_out_residual(analysis: Analysis) -> Array:
+    """Whitened residual (B, n, m) of each station against the fit without it: spread⁺ C⁻¹ρ.
+
+    Exact for a linear problem. Directions of a station's readings that nothing else tests have none.
+    """
+    values, vectors = eigen(analysis.spread)
+    along = np.einsum("bnij,bni->bnj", vectors, analysis.residual)
+    along = quotient(along, values, values > TESTED)
+    return np.asarray(np.einsum("bnij,bnj->bni", vectors, along))
+
+
 def without_station(problem: Problem, state: State, analysis: Analysis) -> Array:
     """Change (B, n, p) of the parameters when one station is left out, for each station.
 
@@ -324,10 +335,7 @@ def without_station(problem: Problem, state: State, analysis: Analysis) -> Array
         stay = inverse(np.eye(leverage.shape[-1]) + leverage) @ linear.residual[..., None]
         return np.asarray(-(analysis.influence[:, :, :p] @ stay)[..., 0])
     whole = whole_covariance(linear, analysis.determined)[:, : linear.size]
-    values, vectors = eigen(analysis.spread)
-    along = np.einsum("bnij,bni->bnj", vectors, analysis.residual)
-    along = quotient(along, values, values > TESTED)
-    pulled = np.einsum("bnij,bnj->bni", vectors, along)
+    pulled = left_out_residual(analysis)
     pulled = np.einsum("bnmu,bnm->bnu", linear.weigh(linear.design), pulled)
     return np.asarray(np.einsum("bpu,bnu->bnp", whole, pulled))
 

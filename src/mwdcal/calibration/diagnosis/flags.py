@@ -148,7 +148,7 @@ class FittedRuns:
         """What the residuals of one run look like, with sizes, the largest first."""
         others = {name: values[place, None] for name, values in self.readings.others.items()}
         shown = self.shown(np.array([place]))[place]
-        return effects(self.member(place), shown, others) if shown else []
+        return effects(self.member(place), others, shown)
 
     def residuals(self, place: int) -> Residuals:
         """The errors of one run."""

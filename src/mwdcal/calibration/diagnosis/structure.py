@@ -194,8 +194,17 @@ def _searched(result: Fit, others: Mapping[str, Array]) -> list[Shown]:
     return shown
 
 
-def effects(result: Fit, shown: Shown, others: Mapping[str, Array]) -> list[Effect]:
-    """The effects that one fit (B = 1) shows, with their sizes, as far as they are reported."""
+def effects(
+    result: Fit, others: Mapping[str, Array] | None = None, shown: Shown | None = None
+) -> list[Effect]:
+    """The effects that one fit (B = 1) shows, with their sizes, as far as they are reported.
+
+    `shown` are those that `shown_effects` found, if it was asked before.
+    """
+    others = others or {}
+    shown = shown_effects(result, others)[0] if shown is None else shown
+    if not shown:
+        return []
     every = _described(_without_bad_stations(result), shown, others)
     return [effect for effect in every if is_shown(shown, effect.name)]
 
@@ -252,8 +261,6 @@ def _trials(
 
 def _described(result: Fit, shown: Shown, others: Mapping[str, Array]) -> list[Effect]:
     """The effects, of chance and share, with their sizes: all together, with the noise that they leave."""
-    if not shown:
-        return []
     problem, names = result.problem, [*shown]
     scores = _scores(problem, result, others)
     gain, directions = (float(each[0]) for each in scores.gain(names))
