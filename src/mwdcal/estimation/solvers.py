@@ -171,15 +171,13 @@ class Linear:
 
     def weigh(self, columns: Array) -> Array:
         """C⁻¹ times columns (B, n, m, k)."""
-        if self.bare:
-            return columns
-        return np.asarray(columns - self.private @ (self.core @ (self.private.mT @ columns)))
+        return columns if self.bare else self.weight @ columns
 
-    @property
+    @cached_property
     def weight(self) -> Array:
         """C⁻¹ (B, n, m, m)."""
-        shape = (*self.residual.shape, self.residual.shape[-1])
-        return self.weigh(np.broadcast_to(np.eye(shape[-1]), shape))
+        whole = np.eye(self.residual.shape[-1]) - self.private @ (self.core @ self.private.mT)
+        return np.asarray(whole)
 
     def private_step(self, step: Array) -> Array:
         """Private unknowns (B, n, a), in their prior's units, after a step of X's unknowns."""
