@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -333,18 +334,22 @@ class _Stage:
     determined: Determined
 
 
-def _in_turn(stage: _Stage, rounds: int, turn: Callable[[_Stage], tuple[_Stage, Bools]]) -> _Stage:
-    """The stage after turns that also say who has settled: each member ends as if it were alone."""
+def _in_turn(
+    stage: _Stage, rounds: int, turn: Callable[[_Stage], tuple[_Stage, Bools]]
+) -> tuple[_Stage, Bools]:
+    """The stage after turns that also say who has settled, and who did: each member ends as if it were alone."""
     whole, active = stage, np.arange(len(stage.trust))
+    ended = np.zeros(len(active), bool)
     for _ in range(rounds):
         stage, settled = turn(stage)
+        ended[active[settled]] = True
         if settled.all():
             break
         if settled.any():
             done, rest = np.flatnonzero(settled), np.flatnonzero(~settled)
             whole = put(whole, active[done], take(stage, done))
             stage, active = take(stage, rest), active[rest]
-    return stage if len(active) == len(whole.trust) else put(whole, active, stage)
+    return (stage if len(active) == len(ended) else put(whole, active, stage)), ended
 
 
 def _set_apart(stage: _Stage, options: Options) -> _Stage:
@@ -364,46 +369,47 @@ def _set_apart(stage: _Stage, options: Options) -> _Stage:
 
 
 def _estimate_noise(stage: _Stage, options: Options) -> _Stage:
-    """Variance per triad by restricted maximum likelihood: a step of the fit with each estimate, then the rest.
+    """Variance per triad by restricted maximum likelihood, fit and estimate in turn.
 
-    A triad without redundancy keeps its start: its residuals are rounding, and say nothing.
+    A triad without redundancy keeps its start: its residuals are rounding, and say nothing. Where every direction is
+    clearly determined, the first turns take one step of the fit each: whole fits then have little left to do.
     """
-    free = [i for i, triad in enumerate(stage.problem.triads) if not triad.declared]
-    scatter = stage.problem.evidence.scatter
-    apart = stage.problem.evidence.apart.any()
-    slow = scatter or apart
+    evidence = stage.problem.evidence
+    slow = bool(evidence.scatter) or bool(evidence.apart.any())
     rounds, least = (SCATTER_ROUNDS, SCATTER_SETTLED) if slow else (NOISE_ROUNDS, SETTLED)
+    clear = np.flatnonzero(stage.determined.clear)
+    if clear.size and not options.separate_solver:
+        turn = partial(_noise_turn, options=options, least=least, whole=False)
+        part, settled = _in_turn(take(stage, clear), rounds, turn)
+        if settled.any():
+            stage = put(stage, clear[settled], take(part, np.flatnonzero(settled)))
+    turn = partial(_noise_turn, options=options, least=least, whole=True)
+    return _in_turn(stage, rounds, turn)[0]
 
-    def turn(now: _Stage) -> tuple[_Stage, Bools]:
-        known, at = now.determined, now.solved.state
-        if not known.clear.all():
-            known = Determined.of(now.problem, at)
-        analysis = analyse(now.problem, at, known)
-        scale = _noise_scale(analysis, not slow)
-        problem, solved = _rescaled(now.problem, scale), now.solved
-        settled = ~np.any(np.abs(scale[:, free] - 1) >= least, -1)
-        if scatter:
-            ratios = scatter_ratios(now.problem, at, analysis)
-            problem = with_scatter(problem, at, ratios)
-            settled &= _steady(now.problem, problem)
-        if apart:
-            problem = with_share(problem, at, analysis)
-            before, share = (p.evidence.apart for p in (now.problem, problem))
-            settled &= np.abs(share - before) <= SCATTER_SETTLED * before
-        steps = now.steps + 1
-        if not options.separate_solver:
-            solved = replace(solved, state=stepped(now.problem, at, known))
-        elif options.method != "swarm":
-            solved = solve(problem, at, options)
-            steps = now.steps + solved.iterations
-            settled |= steps > MOST_STEPS_IN_TURN
-        return replace(now, problem=problem, solved=solved, steps=steps, determined=known), settled
 
-    stage = _in_turn(stage, rounds, turn)
-    if options.separate_solver:
-        return stage
-    solved = solve(stage.problem, stage.solved.state, options)
-    return replace(stage, solved=solved, steps=stage.steps + solved.iterations)
+def _noise_turn(now: _Stage, options: Options, least: float, whole: bool) -> tuple[_Stage, Bools]:
+    """The noise as residuals have it, then a fit with it, or a step; and who has settled."""
+    evidence, at = now.problem.evidence, now.solved.state
+    free = [i for i, triad in enumerate(now.problem.triads) if not triad.declared]
+    analysis = analyse(now.problem, at, None if whole else now.determined)
+    scale = _noise_scale(analysis, ahead=not (whole or evidence.scatter or evidence.apart.any()))
+    problem, solved, steps = _rescaled(now.problem, scale), now.solved, now.steps
+    settled = ~np.any(np.abs(scale[:, free] - 1) >= least, -1)
+    if evidence.scatter:
+        ratios = scatter_ratios(now.problem, at, analysis)
+        problem = with_scatter(problem, at, ratios)
+        settled &= _steady(now.problem, problem)
+    if evidence.apart.any():
+        problem = with_share(problem, at, analysis)
+        before, share = (p.evidence.apart for p in (now.problem, problem))
+        settled &= np.abs(share - before) <= SCATTER_SETTLED * before
+    if not whole:
+        solved = replace(solved, state=stepped(now.problem, at, now.determined))
+    elif options.method != "swarm":
+        solved = solve(problem, at, options)
+        steps = steps + solved.iterations
+        settled |= steps > MOST_STEPS_IN_TURN
+    return replace(now, problem=problem, solved=solved, steps=steps), settled
 
 
 def _noise_scale(analysis: Analysis, ahead: bool) -> Array:
@@ -456,7 +462,7 @@ def _downweigh(stage: _Stage, options: Options) -> _Stage:
         now = _Stage(problem, solved, trust, steps, now.determined)
         return now, settled | (steps > MOST_STEPS_IN_TURN)
 
-    return _in_turn(stage, ROBUST_ROUNDS, turn)
+    return _in_turn(stage, ROBUST_ROUNDS, turn)[0]
 
 
 def _typical(square: Array, freedom: Array) -> Array:
