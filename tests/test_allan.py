@@ -103,6 +103,25 @@ def test_an_offset_of_a_billion_noises_costs_no_digits():
     np.testing.assert_allclose(found, allan.deviation(values, [1, 16, 1024]), rtol=1e-5)
 
 
+@pytest.mark.parametrize("kind", ["standard", "overlapping", "modified"])
+def test_variances_of_blocks_are_those_of_the_whole(kind):
+    """Both variances by their definition, from averages of the readings, in a record of several blocks with a drift."""
+    count = 2 * allan.BLOCK_SAMPLES + 777
+    values = np.random.default_rng(3).normal(size=(2, count)) + 1e-3 * np.arange(count) + 5.0
+    plain, centred = allan.variances(values, [1, 4, 1000], kind)
+    for k, m in enumerate((1, 4, 1000)):
+        sums = np.cumsum(np.insert(values, 0, 0.0, -1), -1)
+        averages = (sums[:, m:] - sums[:, :-m]) / m
+        steps = averages[:, m:] - averages[:, :-m]
+        if kind == "standard":
+            steps = steps[:, ::m]
+        elif kind == "modified":
+            sums = np.cumsum(np.insert(steps, 0, 0.0, -1), -1)
+            steps = (sums[:, m:] - sums[:, :-m]) / m
+        np.testing.assert_allclose(plain[:, k], (steps**2).mean(-1) / 2, rtol=1e-7)
+        np.testing.assert_allclose(centred[:, k], steps.var(-1) / 2, rtol=1e-7)
+
+
 def test_nan_stays_nan_and_other_records_do_not_see_it():
     values = np.random.default_rng(1).normal(size=(2, 100))
     values[0, 50] = np.nan

@@ -27,7 +27,7 @@ from mwdcal.certificate.laboratory import (
     LaboratoryCondition,
     Recalibration,
 )
-from mwdcal.files import documents
+from mwdcal.files import verifications
 from mwdcal.sensor.profile import MeasurementStandard
 from mwdcal.use.verification import JudgedSet, VerdictRow
 
@@ -358,7 +358,7 @@ def verification(calibration, *rows, rule="simple", **values):
     chosen = list(rows) or fields["rows"]
     passed = all(each.passed for each in chosen)
     rule = decisions.RULES[rule]
-    return documents.Verification(**{**fields, "rows": chosen, "passed": passed, "rule": rule})
+    return verifications.Verification(**{**fields, "rows": chosen, "passed": passed, "rule": rule})
 
 
 def test_a_guard_band_shrinks_the_limit_and_a_changed_decision_is_a_finding(servo):

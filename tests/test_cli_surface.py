@@ -124,6 +124,21 @@ def test_help_imports_neither_numpy_nor_scipy():
     assert done.stderr.strip() == "[]"
 
 
+def test_a_plain_calibration_loads_only_what_it_uses(tmp_path):
+    script = (
+        "import sys\nfrom mwdcal.app.cli import main\n"
+        "try:\n    main(sys.argv[1:])\nexcept SystemExit as end:\n    assert not end.code\n"
+        "unused = {'scipy', 'rich.console', 'mwdcal.certificate', 'mwdcal.use.verification',"
+        " 'mwdcal.files.formats.workbook', 'mwdcal.files.exchange'}\n"
+        "sys.exit(str(sorted(unused & set(sys.modules))))\n"
+    )
+    run = EXAMPLE / "run.csv"
+    command = [sys.executable, "-c", script, "calibrate", str(run), "--tool", "servo"]
+    command += ["-o", str(tmp_path / "tool.json")]
+    done = subprocess.run(command, capture_output=True, encoding="utf-8", check=False)
+    assert done.stderr.splitlines()[-1] == "[]"
+
+
 @pytest.mark.skipif(os.name == "nt", reason="POSIX pipes")
 @pytest.mark.parametrize("reader", ["head -1", "true"])
 def test_a_reader_that_leaves_early_sees_no_traceback(files, reader):
@@ -540,11 +555,11 @@ def failing(sampling_hz, start, log):
 
 def test_a_wrong_value_of_any_length_stays_short():
     """What a message repeats of a value that nobody can have meant is cut."""
-    result = mwdcal("registry", "drift", "tools.sqlite", "--today", "x" * 5_000)
-    assert result.returncode == 2
-    assert "--today" in result.stderr
-    assert "%Y-%m-%d" in result.stderr
-    assert len(result.stderr) < 1_000
+    done = mwdcal("registry", "drift", "tools.sqlite", "--today", "x" * 5_000)
+    assert done.code == 2
+    assert "--today" in done.err
+    assert "%Y-%m-%d" in done.err
+    assert len(done.err) < 1_000
 
 
 def test_errors_name_options_as_they_are_typed():

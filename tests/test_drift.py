@@ -1,5 +1,6 @@
 """Drift: common parameters, the test of change, random walks and due dates, against other formulas and simulation."""
 
+import re
 from dataclasses import replace
 from datetime import date
 
@@ -12,6 +13,7 @@ from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import typical_accuracy
 from mwdcal.calibration.readings import TRIADS, fingerprints
+from mwdcal.drift import change
 from mwdcal.drift.change import NULL_DRAWS, Contrasts, change_test
 from mwdcal.drift.comparable import (
     FACTOR_NAMES,
@@ -26,6 +28,9 @@ from mwdcal.drift.histories import tool_history
 from mwdcal.drift.service import ServiceTest
 from mwdcal.drift.tool import TypeRates, measured, predicted
 from mwdcal.drift.walk import WALK_GROUPS, GroupRates, Increments, quantiles
+from mwdcal.errors import InputError
+from mwdcal.files import documents
+from mwdcal.files.formats.members import Member
 from mwdcal.files.profiles import load_profile
 from mwdcal.planning.plans import load_plan
 from mwdcal.planning.session import Session
@@ -279,6 +284,29 @@ def test_unchanged_tools_are_called_changed_at_the_stated_level(freedom):
     assert (low if np.isinf(freedom) else 0) <= called <= high
 
 
+@pytest.mark.parametrize("level", [0.01, 0.1])
+def test_few_draws_call_the_same_tools_changed(monkeypatch, level):
+    rng = np.random.default_rng(5)
+    covariance = random_covariance(rng)
+    root = np.linalg.cholesky(covariance)
+    tools = []
+    for size in np.linspace(0, 5, 12):
+        values = rng.normal(size=(3, SIZE)) @ root.T
+        values[1:, BIAS] += size * np.sqrt(covariance[BIAS, BIAS])
+        tools.append(history(values, covariance))
+    few = [change_test(each, level) for each in tools]
+    monkeypatch.setattr(change, "FIRST_DRAWS", NULL_DRAWS)
+    every = [change_test(each, level) for each in tools]
+    assert [each.changed for each in few] == [each.changed for each in every]
+    assert {each.changed for each in few} == {True, False}
+    for one, other in zip(few, every, strict=True):
+        sd = np.sqrt(other.probability * (1 - other.probability) / 999)
+        assert abs(one.probability - other.probability) <= 5 * sd + 0.005
+        if one.changed:
+            assert one.probability == other.probability
+            assert one.steps == other.steps
+
+
 def test_power_against_a_step_is_that_of_its_score():
     rng = np.random.default_rng(4)
     covariance, count, signal = random_covariance(rng), 30, 4.0
@@ -298,12 +326,25 @@ def test_power_against_a_step_is_that_of_its_score():
     assert 3.3 < critical < 3.9  # 24 independent scores at 0.8 %: 3.59
 
 
-def test_the_largest_of_independent_scores_has_its_known_distribution():
+def test_the_largest_of_independent_scores_has_its_known_distribution(monkeypatch):
+    monkeypatch.setattr(change, "FIRST_DRAWS", NULL_DRAWS)
     test = change_test(history(np.zeros((2, SIZE)), np.eye(SIZE)))
     none = change_test(history(np.zeros((2, SIZE)), np.eye(SIZE)), 0.2)
     for each, level in ((test, 0.01), (none, 0.2)):
         alarm = 1 - (1 - 2 * norm.sf(each.critical_score)) ** SIZE
         assert 0.7 * level < alarm < 1.25 * level  # STEP_SHARE of it, and where both alarms agree
+
+
+def test_a_proved_file_is_read_as_it_was_proved(years):
+    record = documents.encode(years["T-1"][0])
+    stored = Member(record, "T-1.json", "")
+    assert documents.proved(stored) == documents.decoded(stored)
+    for old, new in ((b'"schema_version": 1', b'"schema_version": 0'), (b"{", b"")):
+        damaged = Member(record.replace(old, new, 1), "T-1.json", "")
+        with pytest.raises(InputError) as refusal:
+            documents.decoded(damaged)
+        with pytest.raises(InputError, match=re.escape(str(refusal.value))):
+            documents.proved(damaged)
 
 
 def test_a_step_is_named_with_its_size(years):

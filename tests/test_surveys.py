@@ -18,6 +18,7 @@ from cli_support import EXAMPLE, read_csv, refused, write_csv
 from cli_support import mwdcal as cli
 from mwdcal.calibration.readings import Readings
 from mwdcal.errors import InputError
+from mwdcal.files.formats import table as tables
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import centred, reference_vectors
 from mwdcal.planning.simulate import Earth, Truth, grid, run, servo
@@ -32,6 +33,7 @@ from mwdcal.survey.acceptance import (
 from mwdcal.survey.blindness import blindness
 from mwdcal.survey.path import well_path
 from mwdcal.survey.stations import STRENGTHS, SURVEYED, surveyed, switched
+from mwdcal.survey.tables import survey_readings
 
 EARTH = Earth()
 NOISE = (1e-4, 15.0)
@@ -770,6 +772,49 @@ def test_interference_that_would_pass(inclination, azimuth, limits, along, acros
         assert size in (None, 0) or blind.size[0, k] == pytest.approx(size)
 
 
+@pytest.mark.parametrize("limits", ["owsg-mwd", "iscwsa-fixed"])
+def test_all_sizes_of_interference_are_tried(limits):
+    """What passes and turns the azimuth most is that of every size, tried with the observables themselves."""
+    tool, calibration = laboratory()
+    angles = np.random.default_rng(7).uniform([0.0, 0.0, 0.0], [np.pi, 6.28, 6.28], (300, 3))
+    angles[0] = 0.0
+    read = readings(tool, *angles.transpose())
+    known = {"gravity": 1.0, "field": 48_000.0, "dip": np.radians(63)}
+    known = {name: np.full(300, value) for name, value in known.items()}
+    known["dip"][5], known["field"][6], known["gravity"][7] = np.nan, np.nan, np.nan
+    read = replace(read, known=known)
+    g, b = vectors = calibration.fields(read)
+    tests = judged(surveyed(calibration, read), vectors, read, load_survey_limits(limits)[0]).tests
+    found = blindness(tests, vectors)
+    along = [(0.0, 0.0, sign * size) for sign in (1, -1) for size in range(50, 3001, 50)]
+    ways = [(np.cos(way), np.sin(way), 0.0) for way in np.radians(range(0, 360, 30))]
+    across = [np.multiply(way, size) for way in ways for size in range(50, 301, 50)]
+
+    def change(name, place, seen):
+        value = OBSERVABLES[name].value
+        return value(np.broadcast_to(g[place], seen.shape), seen) - value(g[place], b[place])
+
+    for k, fields in enumerate((along, across)):
+        for place, there in enumerate(~tests.missing):
+            seen = b[place] + np.array(fields)
+            off = np.stack([change(name, place, seen) for name in STRENGTH_NAMES], -1)[:, there]
+            square = (off @ np.linalg.inv(tests.covariance[place][np.ix_(there, there)]) * off).sum(
+                -1
+            )
+            passing = (np.abs(off) <= tests.fixed[there]).all(-1)
+            passing &= square <= tests.largest[place] ** 2
+            turn = np.abs(centred(np.nan_to_num(change("azimuth", place, seen))))
+            assert found.turn[place, k] == pytest.approx(np.max(turn * passing), abs=1e-9)
+    assert 20 < (found.turn[:, 0] > np.radians(1)).sum() < 300
+
+
+def test_only_multi_station_analysis_takes_fingerprints():
+    _, calibration = laboratory()
+    table = tables.read(EXAMPLE / "well.csv")
+    assert survey_readings(table, calibration, recognised=False).readings.digest == ()
+    assert len(survey_readings(table, calibration).readings.digest) == table.count
+
+
 def test_what_is_accepted_is_what_the_tests_accept():
     tool, calibration = laboratory()
     rng = np.random.default_rng(4)
@@ -778,7 +823,8 @@ def test_what_is_accepted_is_what_the_tests_accept():
     vectors = calibration.fields(read)
     for limits in (load_survey_limits()[0], SurveyLimits(name="ours", field_nt=200.0)):
         judgement = judged(surveyed(calibration, read), vectors, read, limits)
-        again = judgement.tests.accept(judgement.departure[:, None])[:, 0]
+        departure = judgement.departure.transpose()[:, :, None]
+        again = judgement.tests.accept(dict(zip(STRENGTH_NAMES, departure, strict=True)))[:, 0]
         assert 5 < judgement.accepted.sum() < 45
         assert (again == judgement.accepted).all()
 

@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias, cast
 
 from mwdcal.app.commands.options import Typed
+from mwdcal.calibration.canonical import SignatureCheck
 from mwdcal.calibration.options import AUTO, Options
 from mwdcal.calibration.prior import DATASHEET, profile_for
 from mwdcal.calibration.readings import HIGHEST, Readings
 from mwdcal.calibration.record import Calibration, Finding
-from mwdcal.certificate.signature import FINDING_OF_STATE, SignatureCheck, check
-from mwdcal.certificate.trusted_keys import trusted
 from mwdcal.files import documents, profiles, runs
 from mwdcal.files.formats import members
 from mwdcal.sensor.profile import Profile
@@ -37,6 +36,9 @@ def load_calibration(path: Path, keys: Sequence[Path]) -> LoadedCalibration:
 
     Where there are keys, an unsigned calibration is a finding too.
     """
+    from mwdcal.certificate.signature import FINDING_OF_STATE, check
+    from mwdcal.certificate.trusted_keys import trusted
+
     trust = trusted(keys)
     file = calibration_file(path)
     calibration, checked = documents.decoded(file), check(file.record, trust)

@@ -7,10 +7,9 @@ from typing import Any
 
 import msgspec
 
-from mwdcal.calibration.canonical import Signature
+from mwdcal.calibration.canonical import Signature, SignatureCheck
 from mwdcal.calibration.readings import is_simulated, serial_of
 from mwdcal.calibration.record import DOCUMENT_VERSION, SOFTWARE
-from mwdcal.certificate.signature import SignatureCheck
 
 INPUTS = {
     "apply": ("calibration", "readings"),

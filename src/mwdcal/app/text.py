@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import codecs
-import io
 import math
 import os
 import re
 import sys
 from collections.abc import Iterable, Sequence
+from itertools import zip_longest
 from typing import Any, TypeAlias
 
 NARROWEST, WIDEST = 80, 160
@@ -238,22 +238,41 @@ def _width(column: Iterable[str]) -> int:
 
 def _drawn(whole: Sequence[Column], width: int) -> str:
     """The columns of a table side by side; those with folded cells begin at the left."""
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    aligned = Table(box=box.SIMPLE, pad_edge=False, show_edge=False)
+    room = _shared_out([_width(column) for column in whole], width - BETWEEN * (len(whole) - 1))
     tallest = max(title.count("\n") for title, *_ in whole)
-    for index, (title, *cells) in enumerate(whole):
-        words = index == 0 or any("\n" in cell for cell in cells)
-        lowered = Text("\n" * (tallest - title.count("\n")) + title)
-        aligned.add_column(lowered, justify="left" if words else "right", no_wrap=True)
-    for row in zip(*(cells for _, *cells in whole), strict=True):
-        aligned.add_row(*map(Text, row))
-    shown = io.StringIO()  # not stdout, whose encoding would change the lines
-    Console(file=shown, width=width, color_system=None, legacy_windows=False).print(aligned)
-    return "\n".join(line.rstrip() for line in shown.getvalue().splitlines())
+    lowered = [("\n" * (tallest - title.count("\n")) + title, *cells) for title, *cells in whole]
+    left = [i == 0 or any("\n" in cell for cell in cells) for i, (_, *cells) in enumerate(whole)]
+    lines = []
+    for row in zip(*lowered, strict=True):
+        for parts in zip_longest(*(cell.split("\n") for cell in row), fillvalue=""):
+            cells = map(_aligned, parts, room, left)
+            lines.append((" " * BETWEEN).join(cells).rstrip())
+    rule = "─" * (sum(room) + BETWEEN * (len(room) - 1))
+    return "\n".join([*lines[: tallest + 1], rule, *lines[tallest + 1 :]])
+
+
+def _shared_out(widths: list[int], width: int) -> list[int]:
+    """The widths of columns, of which the widest are cut to one that leaves all together at most `width`.
+
+    >>> _shared_out([10, 40, 30], 60)
+    [10, 25, 25]
+    """
+    most = next(
+        most
+        for most in range(max(widths), -1, -1)
+        if sum(min(w, most) for w in widths) <= width or not most
+    )
+    return [min(each, most) for each in widths]
+
+
+def _aligned(cell: str, width: int, left: bool) -> str:
+    """A cell as wide as its column, cut where it is too long."""
+    from rich.cells import cell_len, set_cell_size
+
+    if cell_len(cell) > width:
+        cell = set_cell_size(cell, width - 1) + "…"
+    blanks = " " * (width - cell_len(cell))
+    return cell + blanks if left else blanks + cell
 
 
 def superscript(power: int) -> str:

@@ -29,6 +29,20 @@ class Signature(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     value: str
 
 
+class SignatureCheck(msgspec.Struct, frozen=True, kw_only=True):
+    """What the signature of a document says: `state` for machines, `text` for people.
+
+    `key`, `owner` and `time` (the signer's, UTC) as far as they are known. Only `intact` shows that the document is
+    as it was signed, with a key that is trusted; `unchecked`: cryptography is not installed.
+    """
+
+    state: Literal["unsigned", "intact", "altered", "unknown", "revoked", "retired", "unchecked"]
+    key: str | None = None
+    owner: str | None = None
+    time: str | None = None
+    text: str
+
+
 def canonical(fields: Mapping[str, Any]) -> bytes:
     """The one form in which fields are hashed and signed: compact JSON in ASCII with sorted keys."""
     return json.dumps(fields, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()

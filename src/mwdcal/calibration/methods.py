@@ -16,8 +16,6 @@ from mwdcal.calibration.evidence import STAND_TURNS, acts_on, constants
 from mwdcal.calibration.options import Options
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.evidence import ANGLES, UNKNOWN, Evidence, SharedConstant
-from mwdcal.estimation.minimisers.newton import newton, propagated
-from mwdcal.estimation.minimisers.swarm import swarm_forward
 from mwdcal.estimation.minimisers.unweighted import STRENGTH, Sums
 from mwdcal.estimation.problem import Prior, Problem, State
 from mwdcal.estimation.solvers import Status, gauss_newton
@@ -183,6 +181,8 @@ def _swarmed(problem: Problem, state: State, seed: int) -> Solved:
 
 def _swarm_forward(raw: Array, target: Array, include: Bools, seed: int) -> Array:
     """Forward parameters (B, 12); members that leave stations out fly one by one."""
+    from mwdcal.estimation.minimisers.swarm import swarm_forward
+
     fly = partial(swarm_forward, iterations=SWARM_ITERATIONS, seed=seed)
     if include.all():
         return fly(raw, target).position
@@ -192,6 +192,8 @@ def _swarm_forward(raw: Array, target: Array, include: Bools, seed: int) -> Arra
 
 def _by_newton(problem: Problem, state: State, paper: bool) -> Solved:
     """The accelerometer by Newton-Raphson from the datasheet, then the magnetometer against it."""
+    from mwdcal.estimation.minimisers.newton import newton, propagated
+
     triad, evidence = problem.triads[0], problem.evidence
     batch = len(state.params)
     nominal = triad.model.start(np.zeros((batch, 3, 3)) + np.eye(3), np.zeros((batch, 3)))

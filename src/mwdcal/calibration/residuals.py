@@ -13,6 +13,7 @@ from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import ErrorRow, Measures, StationRow, stated
 from mwdcal.estimation.evidence import ANGLES, STAND_ERRORS
+from mwdcal.estimation.tails import normal_quantile
 from mwdcal.estimation.uncertainty import Analysis, station_misfit, without_station
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools
@@ -233,12 +234,10 @@ class Residuals:
     @cached_property
     def stations(self) -> list[StationRow]:
         """Errors of every station, with the ones to take again."""
-        from scipy.special import ndtri
-
         readings, after = self.readings, self.errors(self.after)
         warmth = readings.temperature
         chance = chances(self.fit)[0]
-        again, deviation = to_reshoot(chance), -ndtri(np.maximum(chance, 1e-300) / 2)
+        again, deviation = to_reshoot(chance), normal_quantile(np.maximum(chance, 1e-300))
         ratio = {
             name: np.abs(after[name]) / np.maximum(np.nan_to_num(sd, nan=np.inf), 1e-30)
             for name, sd in self.expected.items()

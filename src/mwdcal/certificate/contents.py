@@ -44,7 +44,7 @@ from mwdcal.certificate.repeatability import repeatability
 from mwdcal.certificate.tables import conditions, result_tables
 from mwdcal.certificate.traceability import references_in_use, traced
 from mwdcal.errors import InputError
-from mwdcal.files.documents import Verification
+from mwdcal.files.verifications import Verification
 
 DIGEST_DIGITS = 12
 """Hexadecimal digits of the contents' SHA-256 in a certificate number."""

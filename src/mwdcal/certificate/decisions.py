@@ -15,7 +15,7 @@ from msgspec import UNSET
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.certificate.document import ConformityTest, LimitDecision, Quantity
 from mwdcal.certificate.laboratory import DecisionRule
-from mwdcal.files.documents import Verification
+from mwdcal.files.verifications import Verification
 from mwdcal.geometry.vectors import Array, ArrayLike
 from mwdcal.use.risk import COVERAGE, probability_within
 from mwdcal.use.verification import (

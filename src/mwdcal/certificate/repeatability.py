@@ -8,7 +8,7 @@ import numpy as np
 
 from mwdcal.certificate.decisions import PROBABILITY, When, student_factor
 from mwdcal.certificate.document import Quantity, ResultTable
-from mwdcal.files.documents import Verification
+from mwdcal.files.verifications import Verification
 from mwdcal.use.roll_test import FITTED, basis
 from mwdcal.use.verification import VerdictRow
 

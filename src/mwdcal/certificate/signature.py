@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from mwdcal.calibration.canonical import Signature, canonical, signed_form
+from mwdcal.calibration.canonical import Signature, SignatureCheck, canonical, signed_form
 from mwdcal.certificate.document import SourceFile
 from mwdcal.certificate.keys import PrivateKey, TrustedKey, available, now
 from mwdcal.certificate.trusted_keys import moment
@@ -28,20 +28,6 @@ from mwdcal.files.formats.members import Member
 
 SIGNATURE_KEY = "signature"
 """Key of a document under which its signature stands."""
-
-
-class SignatureCheck(msgspec.Struct, frozen=True, kw_only=True):
-    """What the signature of a document says: `state` for machines, `text` for people.
-
-    `key`, `owner` and `time` (the signer's, UTC) as far as they are known. Only `intact` shows that the document is
-    as it was signed, with a key that is trusted; `unchecked`: cryptography is not installed.
-    """
-
-    state: Literal["unsigned", "intact", "altered", "unknown", "revoked", "retired", "unchecked"]
-    key: str | None = None
-    owner: str | None = None
-    time: str | None = None
-    text: str
 
 
 class CheckedFile(msgspec.Struct, frozen=True, kw_only=True):

@@ -24,6 +24,10 @@ STEP_SHARE = 0.8
 """Share of the level that steps of one parameter have; the misfit has the rest."""
 NULL_DRAWS = 9_999
 """Histories without change that the test is judged by."""
+FIRST_DRAWS = 999
+"""Of these, those that decide where they leave no doubt: see `change_test`."""
+DECIDED_BEYOND = 6.0
+"""Standard deviations of the share of the first draws above the level within which all are drawn."""
 PAIR_DRAWS = 1_999
 """Of these, those that two calibrations alone are judged by."""
 LEAST_PROBABILITY = 1 / (NULL_DRAWS + 1)
@@ -193,18 +197,18 @@ def _each(matrices: Array, vectors: Array) -> Array:
 
 @lru_cache(maxsize=2)
 def _noise(count: int, size: int) -> AnyArray:
-    """Standard normal numbers (draws, n, p), the same for every tool."""
+    """Standard normal numbers (`NULL_DRAWS`, n, p), the same for every tool."""
     rng = np.random.default_rng([SEED_OF_DRAWS, count, size])
     return rng.standard_normal((NULL_DRAWS, count, size), np.float32)
 
 
-def stretches(history: History) -> AnyArray:
+def stretches(history: History, draws: int) -> AnyArray:
     """By how much errors (draws, n, p) exceed those of a known noise: Student's t of each noise estimate.
 
     Calibrations of a triad whose noise was estimated together (`pooled`) have one factor.
     """
     freedom = history.freedom
-    result = np.ones((NULL_DRAWS, *freedom.shape), np.float32)
+    result = np.ones((draws, *freedom.shape), np.float32)
     rng = np.random.default_rng([SEED_OF_DRAWS, *freedom.shape])
     for triad in TRIADS:
         columns = [place for place, name in enumerate(history.names) if name.startswith(triad)]
@@ -213,16 +217,29 @@ def stretches(history: History) -> AnyArray:
         degrees, together = freedom[:, columns[0]], history.pooled[:, columns[0]]
         groups = [np.flatnonzero(together), *np.flatnonzero(~together)[:, None]]
         for rows in (each for each in groups if each.size and np.isfinite(degrees[each[0]])):
-            grown = np.sqrt(degrees[rows[0]] / rng.chisquare(degrees[rows[0]], NULL_DRAWS))
+            grown = np.sqrt(degrees[rows[0]] / rng.chisquare(degrees[rows[0]], draws))
             result[:, rows[:, None], columns] = grown[:, None, None]
     return result
 
 
 def change_test(history: History, level: float = CHANGE_LEVEL) -> ChangeTest:
-    """The test of one tool with two calibrations or more: `History` of (n, p)."""
+    """The test of one tool with two calibrations or more: `History` of (n, p).
+
+    By `FIRST_DRAWS` where they show a tool to be unchanged, else by `NULL_DRAWS`. A tool is then called changed
+    only where all draws call it so, and so with a probability of at most the level where nothing changed.
+    """
+    first = _test(history, level, FIRST_DRAWS)
+    doubtful = first.probability <= level + DECIDED_BEYOND * np.sqrt(level / FIRST_DRAWS)
+    rare = (first.pair_probability <= 1 / (FIRST_DRAWS + 1)).any()
+    return _test(history, level, NULL_DRAWS) if doubtful or rare else first
+
+
+def _test(history: History, level: float, draws: int) -> ChangeTest:
+    """The test by so many draws."""
     contrasts, steady = Contrasts(history.precision), history.steady
     departures = contrasts.departures(history.values)
-    null = contrasts.drawn(_noise(*history.values.shape), stretches(history))
+    noise = _noise(*history.values.shape)[:draws]
+    null = contrasts.drawn(noise, stretches(history, draws))
     pull, null_pull = contrasts.pull(departures), contrasts.pull(null)
     scores = np.where(contrasts.known, contrasts.scores(pull), np.nan)
     largest = float(np.nanmax(np.abs(scores[:, steady]), initial=0.0))
@@ -237,7 +254,7 @@ def change_test(history: History, level: float = CHANGE_LEVEL) -> ChangeTest:
         for k in range(len(scores))
     ]
     result = ChangeTest(
-        level, float((1 + np.sum(evidence <= least)) / (NULL_DRAWS + 1)), scores, largest, critical,
+        level, float((1 + np.sum(evidence <= least)) / (draws + 1)), scores, largest, critical,
         by_step, misfit, contrasts.freedom, by_misfit,
         np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs]), np.array([p[2] for p in pairs]),
     )  # fmt: skip
@@ -248,8 +265,8 @@ def change_test(history: History, level: float = CHANGE_LEVEL) -> ChangeTest:
 def _ranks(drawn: Array, value: float) -> tuple[float, Array]:
     """Probability of as much as a value among draws of no change, and of as much as each of them."""
     ascending = np.sort(drawn)
-    above = NULL_DRAWS - np.searchsorted(ascending, [value, *drawn], "left")
-    return float((1 + above[0]) / (NULL_DRAWS + 1)), above[1:] / NULL_DRAWS
+    above = len(drawn) - np.searchsorted(ascending, np.append(value, drawn), "left")
+    return float((1 + above[0]) / (len(drawn) + 1)), above[1:] / len(drawn)
 
 
 def _pair(pair: Contrasts, departures: Array, null: Array) -> tuple[float, int, float]:

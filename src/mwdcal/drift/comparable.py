@@ -178,7 +178,7 @@ def one_noise(factors: Array, freedom: Array) -> tuple[Array, Array, Bools]:
     NaN where there is none. Ratios that differ by more than chance (`UNLIKE`) are kept apart.
     Reference: Bartlett's test of equal variances.
     """
-    from scipy.stats import chi2
+    from scipy.special import chdtrc
 
     known = np.isfinite(factors) & (factors > 0) & (freedom >= 1)
     degrees, square = np.where(known, freedom, 0.0), np.where(known, factors, 1.0)
@@ -189,7 +189,7 @@ def one_noise(factors: Array, freedom: Array) -> tuple[Array, Array, Bools]:
     spread = total * np.log(mean) - (degrees * np.log(square)).sum(-1, keepdims=True)
     inverse = np.where(known, 1 / np.maximum(degrees, 1.0), 0.0).sum(-1, keepdims=True)
     correction = 1 + (inverse - 1 / np.maximum(total, 1.0)) / (3 * np.maximum(count - 1, 1))
-    alike = known & (count > 1) & (chi2.sf(spread / correction, np.maximum(count - 1, 1)) > UNLIKE)
+    alike = known & (count > 1) & (chdtrc(np.maximum(count - 1, 1), spread / correction) > UNLIKE)
     ratio = np.where(alike, mean / square, 1.0)
     single = np.where(known, freedom, np.inf)
     return ratio, np.where(alike, total, single), alike

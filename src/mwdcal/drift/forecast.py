@@ -63,8 +63,10 @@ class Growth:
         """
         changes = self.changes.mT.astype(np.float32)
         error, walk = paths.error @ changes, paths.walk @ changes
-        largest, speed = np.abs(error).max(-1), np.maximum(np.abs(walk), LEAST_SPEED)
-        span = np.min((np.float32(limit) - error * np.sign(walk)) / speed, -1)
+        largest = np.maximum(error.max(-1), -error.min(-1))
+        error *= np.sign(walk)  # in place: no new array for each step
+        left, speed = np.subtract(np.float32(limit), error, out=error), np.abs(walk, out=walk)
+        span = np.min(np.divide(left, np.maximum(speed, LEAST_SPEED, out=speed), out=left), -1)
         return np.where(largest > limit, 0.0, np.maximum(span, 0.0)) ** 2, largest
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import date
+from functools import cached_property
 
 import numpy as np
 
@@ -278,7 +279,7 @@ class _Form:
         self, calibration: Calibration, triad: TriadCalibration, unit_ratio: float
     ) -> tuple[Array, Array]:
         """The same where the readings are in a unit of which the latest's is `unit_ratio`."""
-        x = self._points(triad.name)
+        x = self._points[triad.name]
         axes = unit_ratio * (
             _axes(calibration, triad.name)
             @ np.linalg.inv(_axes(self._last(triad.name), triad.name))
@@ -300,8 +301,13 @@ class _Form:
         """Whether a triad is calibrated to a field of unknown strength."""
         return triad == TRIADS[1] and calibration.relative
 
-    def _points(self, triad: str) -> Array:
-        """Readings (m, 3) of the latest calibration of a triad where its field points every way."""
+    @cached_property
+    def _points(self) -> dict[str, Array]:
+        """Readings (m, 3) of the latest calibration of each triad where its field points every way."""
+        return {name: self._readings(name) for name in self.orders}
+
+    def _readings(self, triad: str) -> Array:
+        """Those of one triad."""
         last = self._last(triad)
         strength = last.earth.get("field", 1.0) if triad == TRIADS[1] else last.earth["gravity_g"]
         model = getattr(last, triad).functions(last.reference_temperature)

@@ -217,12 +217,14 @@ def _marked(table: Table) -> Mapping[str, object]:
     return {**table.metadata, "simulated": True} if simulated else table.metadata
 
 
-def to_readings(table: Table, profile: Profile) -> tuple[Readings, Profile]:
+def to_readings(
+    table: Table, profile: Profile, recognised: bool = True
+) -> tuple[Readings, Profile]:
     """The readings of a table, and the profile with its nominal scales filled in.
 
     Uncertainties of stations and angles that the table leaves blank are the profile's.
     Azimuths are taken as magnetic unless the metadata `azimuth_reference` says otherwise,
-    also where the metadata state a declination.
+    also where the metadata state a declination. Fingerprints of the stations only where they are to be `recognised`.
     """
     check_columns(list(table.columns), table.source)
     cells = columns_of(table)
@@ -233,7 +235,9 @@ def to_readings(table: Table, profile: Profile) -> tuple[Readings, Profile]:
         readings,
         group=group_numbers(labels(table, "group")),
         station=_stations(table),
-        digest=fingerprints([channels for channels in raw if channels is not None]),
+        digest=fingerprints([channels for channels in raw if channels is not None])
+        if recognised
+        else (),
         metadata=identified(_marked(table), labels(table, "serial")),
         source=table.source,
         run_sha256=table.digest,

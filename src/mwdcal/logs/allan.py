@@ -46,6 +46,8 @@ REACH = 8
 """Lag in averaging factors beyond which covariances of second differences are left out."""
 APART = 128
 """Ratio of averaging factors above which only quantisation and random walk correlate variances."""
+BLOCK_SAMPLES = 1 << 14
+"""Samples that are taken at once, so that they stay in fast memory."""
 LONG_RECORD = 64
 """Averages in a record above which their centring no longer counts in covariances."""
 
@@ -97,9 +99,18 @@ def variance(
     values: Array, averaging: Sequence[int], kind: Kind = "overlapping", centred: bool = False
 ) -> Array:
     """Allan variance (..., m), see `deviation`; `centred` takes off the mean difference first."""
+    return variances(values, averaging, kind)[int(centred)]
+
+
+def variances(
+    values: Array, averaging: Sequence[int], kind: Kind = "overlapping"
+) -> tuple[Array, Array]:
+    """Allan variances (..., m), plain and centred: both of `variance` in one pass."""
     phase = _phase(values)
-    variances = [_variance(phase, int(m), kind, centred) for m in averaging]
-    return np.stack(variances, -1) if variances else np.zeros((*phase.shape[:-1], 0))
+    pairs = [_variances(phase, int(m), kind) for m in averaging]
+    whole = np.array(pairs).reshape(-1, 2, *phase.shape[:-1])
+    plain, centred = np.moveaxis(whole, (0, 1), (-1, 0))
+    return plain, centred
 
 
 def _phase(values: Array) -> Array:
@@ -107,30 +118,65 @@ def _phase(values: Array) -> Array:
 
     Without the mean, sums stay small: rounding is that of the noise, not that of the offset.
     """
-    return _sums(values - np.mean(values, -1, keepdims=True))
+    return _sums(values, np.mean(values, -1, keepdims=True))
 
 
-def _sums(values: Array) -> Array:
-    """Sums (..., n + 1) of the first 0, 1, … n values."""
-    return np.insert(np.cumsum(values, -1), 0, 0.0, -1)
+def _sums(values: Array, mean: ArrayLike = 0.0) -> Array:
+    """Sums (..., n + 1) of the first 0, 1, … n values less their `mean`."""
+    sums = np.empty((*values.shape[:-1], values.shape[-1] + 1))
+    sums[..., 0] = 0.0
+    np.subtract(values, mean, out=sums[..., 1:])
+    np.cumsum(sums[..., 1:], -1, out=sums[..., 1:])
+    return sums
 
 
-def _variance(phase: Array, m: int, kind: Kind, centred: bool) -> Array:
+def _variances(phase: Array, m: int, kind: Kind) -> tuple[Array, Array]:
+    """Variances (...), plain and centred, at one averaging factor."""
     count = phase.shape[-1] - 1
     if m < 1 or count < (3 * m - 1 if kind == "modified" else 2 * m):
         raise ValueError(f"`averaging` must be from 1 to half of {count} readings; got {m}")
-    step = _differences(phase[..., ::m], 1) if kind == "standard" else _differences(phase, m)
     if kind == "modified":
-        sums = _sums(step)
-        step = (sums[..., m:] - sums[..., :-m]) / m
-    if centred:
-        step = step - step.mean(-1, keepdims=True)
-    return np.asarray(np.mean(step**2, -1) / (2.0 * m * m))
+        sums = _sums(_differences(phase, m))
+        mean, square = _moments_of(
+            lambda rows: sums[..., m:][..., rows] - sums[..., :-m][..., rows], count - 3 * m + 2
+        )
+        mean, square = mean / m, square / (m * m)
+    elif kind == "standard":
+        ends = phase[..., ::m]
+        mean, square = _moments_of(lambda rows: _differences(ends, 1, rows), ends.shape[-1] - 2)
+    else:
+        mean, square = _moments_of(lambda rows: _differences(phase, m, rows), count - 2 * m + 1)
+    scale = 2.0 * m * m
+    return (square + mean**2) / scale, square / scale
+
+
+def _moments_of(step: Callable[[slice], Array], count: int) -> tuple[Array, Array]:
+    """Mean (...) of values, and their mean square about it; `step` gives those (..., m) at some of `count` places.
+
+    Values are taken a block at a time, which stays in fast memory, and blocks added up about their own means.
+    """
+    mean, square = np.zeros(1), np.zeros(1)
+    for start in range(0, count, BLOCK_SAMPLES):
+        part = step(slice(start, min(start + BLOCK_SAMPLES, count)))
+        size = part.shape[-1]
+        middle = part.mean(-1)
+        part = part - middle[..., None]
+        apart = middle - mean
+        mean = mean + apart * (size / (start + size))
+        square = (
+            square
+            + np.einsum("...i,...i->...", part, part)
+            + apart**2 * (start * size / (start + size))
+        )
+    return mean, square / count
 
 
 def rounding(values: Array, averaging: Sequence[int]) -> Array:
     """Allan deviation (..., m) that the rounding of numbers alone can make of a record (..., n)."""
-    sums, largest = (np.abs(v).max(-1, keepdims=True) for v in (_phase(values), values))
+    sums, largest = (
+        np.maximum(v.max(-1, keepdims=True), -v.min(-1, keepdims=True))
+        for v in (_phase(values), values)
+    )
     return np.asarray(np.finfo(float).eps * (sums / np.asarray(averaging, float) + largest))
 
 
@@ -139,9 +185,11 @@ def differences(values: Array, m: int) -> Array:
     return _differences(_phase(values), m) / m
 
 
-def _differences(phase: Array, m: int) -> Array:
-    """Second differences (..., n - 2m) over m samples."""
-    return np.asarray(phase[..., 2 * m :] - 2 * phase[..., m:-m] + phase[..., : -2 * m])
+def _differences(phase: Array, m: int, rows: slice = slice(None)) -> Array:
+    """Second differences (..., n - 2m) over m samples, or some of them."""
+    ends = (phase[..., 2 * m :], phase[..., m:-m], phase[..., : -2 * m])
+    last, middle, first = (end[..., rows] for end in ends)
+    return np.asarray(last - 2 * middle + first)
 
 
 def drift(values: Array) -> Array:

@@ -164,20 +164,20 @@ def find_noise(
     findings: list[Finding] = []
     remarks: list[Finding] = []
     rows, rate = regular.section(log, sampling_hz, between, findings)
-    samples = rows.stop - rows.start
-    seconds = samples / rate
+    seconds = (rows.stop - rows.start) / rate
     station = _station_seconds(station_seconds, seconds, rate, log.source)
     channels: dict[str, ChannelNoise] = {}
     cells: dict[str, Cells] = {}
     for name in (name for name in RAW if name in log.columns):
-        say(f"Allan variances of {name}, {samples} samples")
+        say(f"Allan variances of {name}, {rows.stop - rows.start} samples")
         try:
-            taken = regular.samples(log, name, rows, rate, station, findings)
+            value, hertz = regular.samples(log, name, rows, rate, findings)
+            variances = _variances(name, value, hertz * station)
         except regular.UnusableChannelError as error:
             findings.append(Finding(id="channel-left-out", text=f"{error} It was left out."))
             continue
-        cells[name] = movement.cells_of(*taken)
-        channel = _channel(name, *taken, station, kind, remarks)
+        cells[name] = movement.cells_of(value, hertz)
+        channel = _channel(name, value, hertz, station, kind, variances, remarks)
         channels[name] = channel if profile is None else _physical(name, channel, profile)
     if not channels:
         reasons = " ".join(finding.text for finding in findings)
@@ -232,18 +232,31 @@ def _station_seconds(given: float | None, seconds: float, rate: float, source: s
     return given
 
 
+def _variances(name: str, value: Array, length: float) -> tuple[Array, Array]:
+    """Plain and centred Allan variances (m,) of a channel at all octaves; refused without noise there or in `length`.
+
+    Errors: `regular.UnusableChannelError`.
+    """
+    factors = [*allan.octaves(len(value)), max(round(length), 1)]
+    plain, centred = allan.variances(value, factors)
+    regular.check_noise(name, value, factors, centred)
+    return plain[:-1], centred[:-1]
+
+
 def _channel(
-    name: str, value: Array, rate: float, station: float, kind: Kind, findings: list[Finding]
-) -> ChannelNoise:
-    """The noise of one channel; samples are counted inside, seconds outside."""
-    factors = allan.octaves(len(value))
+    name: str, value: Array, rate: float, station: float, kind: Kind, variances: tuple[Array, Array],
+    findings: list[Finding],
+) -> ChannelNoise:  # fmt: skip
+    """The noise of one channel with these `_variances`; samples are counted inside, seconds outside."""
+    plain, centred = variances
     moments, requested = _moments(len(value), "overlapping"), _moments(len(value), kind)
-    centred = allan.variance(value, factors, centred=True)
+    if kind != "overlapping":
+        plain = allan.variance(value, allan.octaves(len(value)), kind)
     slope = np.asarray(allan.drift(value))
     terms = noise_terms.fit(centred[None], slope[None], moments)
-    plain = allan.deviation(value, factors, kind)
     freedom = allan.freedom(requested, terms.bounded, terms.steady, terms.covariance)[0]
-    lower, upper = allan.band(plain, freedom)
+    deviation = np.sqrt(plain)
+    lower, upper = allan.band(deviation, freedom)
     fitted = terms.bounded @ np.swapaxes(requested.plain_mean, -1, -2)
     fitted = np.sqrt(fitted[0] + (terms.steady * moments.averaging) ** 2 / 2)
     named = _terms(terms, rate)
@@ -255,7 +268,7 @@ def _channel(
         sampling_hz=rate,
         mean=float(value.mean()),
         tau_s=(moments.averaging / rate).tolist(),
-        deviation=plain.tolist(),
+        deviation=deviation.tolist(),
         lower=lower.tolist(),
         upper=upper.tolist(),
         freedom=freedom.tolist(),
@@ -322,7 +335,9 @@ def _findings(
     name: str, value: Array, rate: float, station: float, moments: Moments, terms: NoiseTerms
 ) -> list[Finding]:
     """What the reader should know about a channel."""
-    step = float(np.diff(np.unique(value)).min())
+    apart = np.diff(np.sort(value))
+    step = float(np.min(apart, where=apart > 0, initial=np.inf))
+    del apart
     sample = float(np.std(np.diff(value)) / np.sqrt(2))
     coarse = sample < COARSE * step
     texts = {"event": _event(name, value, rate, COARSE * step, coarse)}
@@ -356,13 +371,16 @@ def _event(name: str, value: Array, rate: float, least: float, coarse: bool) -> 
     are `coarse` in averages.
     """
     for m in sorted({1, max(len(value) // EVENT_PARTS, 1)}):
-        size = np.abs(allan.differences(value, m))
-        usual = max(1.4826 * float(np.median(size)), least if coarse or m == 1 else 0.0)
+        size = allan.differences(value, m)
+        np.abs(size, out=size)
         worst = int(np.argmax(size))
-        if usual > 0 and size[worst] / usual > EVENT + STEP_ROUNDING:
+        largest = float(size[worst])
+        median = float(np.median(size, overwrite_input=True))
+        usual = max(1.4826 * median, least if coarse or m == 1 else 0.0)
+        if usual > 0 and largest / usual > EVENT + STEP_ROUNDING:
             return (
-                f"{name} changes by {size[worst]:.3g} about {(worst + m) / rate:.4g} s after the start, "
-                f"{size[worst] / usual:.0f} times what is usual within {m / rate:.2g} s: a spike or a move. "
+                f"{name} changes by {largest:.3g} about {(worst + m) / rate:.4g} s after the start, "
+                f"{largest / usual:.0f} times what is usual within {m / rate:.2g} s: a spike or a move. "
                 "Choose a quiet part by `start` and `end`."
             )
     return ""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from mwdcal.calibration.record import Finding
@@ -70,13 +72,16 @@ class UnusableChannelError(InputError):
 
 
 def samples(
-    log: Table, name: str, rows: slice, rate: float, station: float, findings: list[Finding]
+    log: Table, name: str, rows: slice, rate: float, findings: list[Finding]
 ) -> tuple[Array, float]:
-    """Values of a channel and samples a second; `station` seconds are averaged later.
+    """Values of a channel and samples a second.
 
     Errors: `UnusableChannelError` where these samples do not show the noise of the channel.
     """
     value = numbers(log, name)[rows]
+    if not np.isnan(value).any():
+        _check_changes(name, value)
+        return value, rate
     there = np.flatnonzero(~np.isnan(value))
     _check_changes(name, value[there])
     steps = np.diff(there)
@@ -94,9 +99,7 @@ def samples(
             "the mean of the two neighbours."
         )
         findings.append(Finding(id="filled", text=text))
-    filled = np.interp(places, there, value[there])
-    _check_noise(name, filled, max(round(station * rate / step), 1))
-    return filled, rate / step
+    return np.interp(places, there, value[there]), rate / step
 
 
 def _check_changes(name: str, value: Array) -> None:
@@ -111,10 +114,9 @@ def _check_changes(name: str, value: Array) -> None:
         raise UnusableChannelError(reads)
 
 
-def _check_noise(name: str, value: Array, station: int) -> None:
-    """Refuse samples (n,) without noise, or without any in means over so many of a `station`."""
-    factors = [*allan.octaves(len(value)), station]
-    size = np.sqrt(allan.variance(value, factors, centred=True))
+def check_noise(name: str, value: Array, factors: Sequence[int], centred: Array) -> None:
+    """Refuse samples (n,) without noise in means over some of the factors (m,), by their `centred` variances (m,)."""
+    size = np.sqrt(centred)
     for i in np.flatnonzero(size <= np.maximum(allan.rounding(value, factors), SMALLEST_NOISE))[:1]:
         raise UnusableChannelError(
             f"{name} has no noise above the rounding of numbers in averages over "

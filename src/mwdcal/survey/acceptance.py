@@ -9,6 +9,7 @@ Reference: S. Ekseth et al., "The reliability problem related to directional sur
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import msgspec
@@ -113,17 +114,28 @@ class AcceptanceTests:
             self.fixed, self.covariance[rows], self.largest[rows], self.missing[rows]
         )
 
-    def accept(self, departure: Array) -> Bools:
-        """Which of departures (n, k, 3) are accepted; none where nothing is judged."""
+    def accept(self, departures: Mapping[str, Array]) -> Bools:
+        """Which of departures (n, k) of |g|, |b| and dip are accepted; none where nothing is judged.
+
+        Those that are not named are zero.
+        """
         blank = self.missing[:, :, None] | self.missing[:, None, :]
         whole = np.where(blank, np.eye(len(STRENGTH_NAMES)), self.covariance)
         sd, correlation = correlations(whole)
-        inverse = np.linalg.inv(correlation)
-        shift = np.where(self.missing[:, None], 0.0, departure)
-        scaled = shift / sd[:, None]
-        square = np.einsum("nki,nij,nkj->nk", scaled, inverse, scaled)
-        inside = (np.abs(shift) <= self.fixed).all(-1) & (square <= self.largest[:, None] ** 2)
-        return np.asarray(inside & (~self.missing).any(-1, keepdims=True))
+        weights = np.linalg.inv(correlation) / (sd[:, :, None] * sd[:, None, :])
+        inside, square = (~self.missing).any(-1, keepdims=True), np.zeros(1)
+        shifts: list[tuple[int, Array]] = []
+        for name, departure in departures.items():
+            place = STRENGTH_NAMES.index(name)
+            missing = self.missing[:, [place]]
+            shift = np.where(missing, 0.0, departure) if missing.any() else departure
+            if np.isfinite(most := self.fixed[place]):
+                inside = inside & (np.abs(shift) <= most)
+            square = square + weights[:, place, [place]] * shift**2
+            for other, before in shifts:
+                square = square + 2.0 * weights[:, place, [other]] * shift * before
+            shifts.append((place, shift))
+        return np.asarray(inside & (square <= self.largest[:, None] ** 2))
 
 
 @dataclass(frozen=True)
@@ -157,7 +169,7 @@ class Judgement:
         ]
 
     def _finding(self, i: int) -> str:
-        off, most = self.departure[i], self.bound[i]
+        off, most = self.departure[i].tolist(), self.bound[i].tolist()
         parts = [
             f"{name} {off[k] * factor:+.{digits}f} {unit} (at most {most[k] * factor:.{digits}f})"
             for k, (name, (unit, factor, digits)) in enumerate(SURVEY_UNITS.items())

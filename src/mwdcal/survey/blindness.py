@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mwdcal.geometry.observables import OBSERVABLES
-from mwdcal.geometry.vectors import Array, centred
-from mwdcal.survey.acceptance import STRENGTH_NAMES, AcceptanceTests
-from mwdcal.survey.stations import STATIONS_AT_ONCE
+from mwdcal.geometry.observables import is_vertical
+from mwdcal.geometry.vectors import Array, Ints
+from mwdcal.survey.acceptance import AcceptanceTests
 
 AXIAL = np.arange(50.0, 3001.0, 50.0)
 """Sizes of interference along the tool that are tried, nT; more than the last is not usual."""
@@ -18,6 +17,8 @@ CROSS_AXIAL = np.arange(50.0, 301.0, 50.0)
 """Sizes across it: to twice what multi-station analysis assumes."""
 AROUND_TOOL = np.radians(np.arange(0.0, 360.0, 30.0))
 """Directions across it, rad."""
+SURVEYS_AT_ONCE = 1 << 8
+"""Surveys for which all sizes are tried at once, so that they stay in fast memory."""
 WHERE = ("along the tool", "across it")
 
 
@@ -31,16 +32,24 @@ class Blindness:
     size: Array
     turn: Array
 
-    def words(self, place: int, least: float) -> str:
-        """What would pass at one survey and turn its azimuth by at least so much, rad."""
-        parts = [
-            f"{size:.0f} nT{' or more' if size >= last else ''} {where} by {np.degrees(turn):.2g}°"
-            for size, turn, where, last in zip(
-                self.size[place], self.turn[place], WHERE, (AXIAL[-1], CROSS_AXIAL[-1]), strict=True
-            )
-            if turn >= least
+    def words(self, places: Ints, least: Array) -> list[str]:
+        """What would pass at some surveys (m,) and turn their azimuth by at least so much (m,), rad."""
+        parts: list[list[str]] = [[] for _ in places]
+        for k, (where, last) in enumerate(zip(WHERE, (AXIAL[-1], CROSS_AXIAL[-1]), strict=True)):
+            names = {
+                size: f"{size:.0f} nT{' or more' if size >= last else ''} {where} by "
+                for size in np.unique(self.size[places, k]).tolist()
+            }
+            turns = np.degrees(self.turn[places, k]).tolist()
+            enough = (self.turn[places, k] >= least).tolist()
+            for each, size, turn, is_enough in zip(
+                parts, self.size[places, k].tolist(), turns, enough, strict=True
+            ):
+                if is_enough:
+                    each.append(f"{names[size]}{turn:.2g}°")
+        return [
+            f"interference would pass and turn the azimuth: {', '.join(each)}" for each in parts
         ]
-        return f"interference would pass and turn the azimuth: {', '.join(parts)}"
 
 
 def blindness(tests: AcceptanceTests, vectors: tuple[Array, Array]) -> Blindness:
@@ -56,8 +65,8 @@ def blindness(tests: AcceptanceTests, vectors: tuple[Array, Array]) -> Blindness
 
 
 def _blocks(count: int) -> Iterator[slice]:
-    for start in range(0, max(count, 1), STATIONS_AT_ONCE):
-        yield slice(start, start + STATIONS_AT_ONCE)
+    for start in range(0, max(count, 1), SURVEYS_AT_ONCE):
+        yield slice(start, start + SURVEYS_AT_ONCE)
 
 
 def _candidates() -> tuple[Array, Array]:
@@ -69,23 +78,24 @@ def _candidates() -> tuple[Array, Array]:
 
 
 def _of(tests: AcceptanceTests, g: Array, b: Array) -> tuple[Array, Array]:
-    """Sizes and turns (m, 2) of some surveys."""
+    """Sizes and turns (m, 2) of some surveys.
+
+    Interference f makes the horizontal field h to h + f - (f·d) d, d down: the azimuth turns by the angle between them.
+    """
+    down = g / np.linalg.norm(g, axis=-1, keepdims=True)
+    side = np.where(is_vertical(g)[:, None], np.nan, np.cross(down, b))
+    strength, across = np.linalg.norm(b, axis=-1, keepdims=True), np.sum(side**2, -1, keepdims=True)
+    below = np.sum(down * b, -1, keepdims=True)
+    before = np.arctan2(below, np.linalg.norm(np.cross(down, b), axis=-1, keepdims=True))
     sizes, turns = [], []
     for fields in _candidates():
-        seen = g[:, None], b[:, None] + fields
-        passing = tests.accept(_change(tuple(STRENGTH_NAMES), g, b, seen))
-        turn = _change(("azimuth",), g, b, seen)
-        turn = np.where(passing, np.abs(np.nan_to_num(centred(turn[..., 0]))), 0.0)
+        size, along, fall = np.linalg.norm(fields, axis=-1), b @ fields.mT, down @ fields.mT
+        total = np.sqrt(strength**2 + 2 * along + size**2)
+        dip = np.arcsin(np.clip((below + fall) / total, -1.0, 1.0))
+        passing = tests.accept({"field": total - strength, "dip": dip - before})
+        turn = np.abs(np.arctan2(side @ fields.mT, across + along - below * fall))
+        turn = np.where(passing & (turn > 0), turn, 0.0)
         best = np.argmax(turn, -1)[:, None]
         turns.append(np.take_along_axis(turn, best, -1)[:, 0])
-        sizes.append(np.linalg.norm(fields, axis=-1)[best[:, 0]])
+        sizes.append(size[best[:, 0]])
     return np.stack(sizes, -1), np.stack(turns, -1)
-
-
-def _change(names: tuple[str, ...], g: Array, b: Array, seen: tuple[Array, Array]) -> Array:
-    """Changes (m, k, len(names)) of observables from (g, b) to what is seen."""
-    before, after = (
-        np.stack(np.broadcast_arrays(*(OBSERVABLES[name].value(*pair) for name in names)), -1)
-        for pair in ((g[:, None], b[:, None]), seen)
-    )
-    return np.asarray(after - before)

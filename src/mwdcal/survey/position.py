@@ -23,6 +23,7 @@ from mwdcal.geometry.observables import is_vertical
 from mwdcal.geometry.vectors import Array, ArrayLike, eigen, outer, wrap
 from mwdcal.survey.path import Arcs, arcs, hole_direction
 from mwdcal.survey.stations import STATIONS_AT_ONCE
+from mwdcal.use.uncertainty import rows_of
 
 
 @dataclass(frozen=True)
@@ -193,9 +194,7 @@ def calibrated_path(
         )
 
     def part(where: slice) -> tuple[Array, DirectionErrors]:
-        chosen = np.zeros(len(depth), bool)
-        chosen[where] = True
-        some = readings.select(chosen)
+        some = rows_of(readings, where)
         return depth[where], direction_errors(
             calibration, some, north, declination_sd, declination_noise
         )

@@ -17,7 +17,7 @@ from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, diagonal
-from mwdcal.use.uncertainty import without_value
+from mwdcal.use.uncertainty import rows_of, without_value
 
 SURVEYED = ("inclination", "azimuth", "toolface", "north_toolface", "gravity", "field", "dip")
 """Observables of a survey, in the order of `Surveys.value`."""
@@ -98,10 +98,9 @@ def surveyed(
 
 
 def blocks(readings: Readings) -> Iterator[Readings]:
-    """The readings in parts of `STATIONS_AT_ONCE`."""
-    places = np.arange(readings.count)
+    """The readings in parts of `STATIONS_AT_ONCE`, without references and labels."""
     for start in range(0, readings.count, STATIONS_AT_ONCE):
-        yield readings.select((places >= start) & (places < start + STATIONS_AT_ONCE))
+        yield rows_of(readings, slice(start, start + STATIONS_AT_ONCE))
 
 
 def switched(inclination: Array, low: float, high: float) -> Bools:

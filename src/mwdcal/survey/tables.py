@@ -60,11 +60,15 @@ class SurveyReadings:
 
 
 def survey_readings(
-    table: Table, calibration: Calibration, reference: EarthReference | None = None
+    table: Table,
+    calibration: Calibration,
+    reference: EarthReference | None = None,
+    recognised: bool = True,
 ) -> SurveyReadings:
     """The readings of a table of surveys, and the references they are judged and turned by.
 
     Uncertainties of the laboratory's stand and references do not count in a well.
+    Stations have fingerprints where they are to be `recognised`.
     What the table states counts before the `reference`, by `mwdcal.survey.place.precedence`.
 
     Raises:
@@ -75,7 +79,7 @@ def survey_readings(
     if calibration.thermal:
         synonyms.check_evidence(list(table.columns), table.source, ("temperature_c",))
     in_a_well = replace_struct(calibration.profile, stand=StandProfile())
-    readings, _ = to_readings(table, in_a_well)
+    readings, _ = to_readings(table, in_a_well, recognised)
     north = norths_of(table, readings, calibration, reference)
     names = (
         CONSTANTS if calibration.has_field and readings.magnetometer is not None else CONSTANTS[:1]

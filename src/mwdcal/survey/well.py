@@ -12,7 +12,7 @@ from mwdcal.calibration.prediction import UNKNOWN_GRAVITY, unknown_gravity
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, VECTORS
-from mwdcal.geometry.vectors import AnyArray, Array, Bools, diagonal, wrap
+from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints, diagonal, wrap
 from mwdcal.survey.acceptance import STRENGTH_NAMES, Judgement, SurveyLimits, judged
 from mwdcal.survey.blindness import Blindness, blindness
 from mwdcal.survey.error_terms import CORRECTED, DRIFTED, ErrorTerms, error_terms
@@ -92,7 +92,7 @@ class Well:
     blindness: Blindness | None = None
     sources: Mapping[str, str] = field(default_factory=dict)
 
-    @property
+    @cached_property
     def sd_azimuth(self) -> Array:
         """Standard uncertainty (n,) of the azimuth from the north of the path, rad."""
         turned = 0.0 if self.north.name == "magnetic" else self.north.declination_uncertainty
@@ -144,14 +144,16 @@ class Well:
             "no result" if blank else "not judged: no statement of accuracy" if unstated else remark
             for remark, blank, unstated in remarks
         ]
-        for place in np.flatnonzero(self.blind).tolist():
-            remarked[place] = f"blind: {self.what_passes(place)}"
+        places = np.flatnonzero(self.blind)
+        for place, words in zip(places.tolist(), self.what_passes(places), strict=True):
+            remarked[place] = f"blind: {words}"
         return remarked
 
-    def what_passes(self, place: int) -> str:
-        """Interference that would pass at a survey, in words."""
-        least = BLIND_FROM * float(self.sd_azimuth[place])
-        return "" if self.blindness is None else self.blindness.words(place, least)
+    def what_passes(self, places: Ints) -> list[str]:
+        """Interference that would pass at some surveys (m,), in words."""
+        if self.blindness is None:
+            return [""] * len(places)
+        return self.blindness.words(places, BLIND_FROM * self.sd_azimuth[places])
 
     @cached_property
     def columns(self) -> dict[str, AnyArray]:
@@ -324,7 +326,7 @@ def _findings(result: Well, from_first: bool) -> list[Finding]:
         "rows": len(rejected), "first": labels[first], "why": result.remarks[first], "start": labels[start],
         "names": " and ".join(n for n, lacks in zip(STRENGTH_NAMES, absent, strict=True) if lacks),
         "blind": int(result.blind.sum()), "accepted": int(judgement.accepted.sum()), "blindest": labels[blindest],
-        "worst": result.what_passes(blindest) if result.blind.any() else "",
+        "worst": result.what_passes(np.array([blindest]))[0] if result.blind.any() else "",
         "partly": int(partly.sum()), "unjudged": int(unjudged.sum()), "count": int((~on_path).sum()),
     }  # fmt: skip
     return [*result.corrected, *result.north.findings] + [

@@ -8,8 +8,8 @@ from msgspec import UNSET
 
 from mwdcal.app.screens.records.signature import in_short
 from mwdcal.app.text import NOT_STATED, WIDE, chance, one_line, quantity, table
+from mwdcal.calibration.canonical import SignatureCheck
 from mwdcal.calibration.readings import simulated
-from mwdcal.certificate.signature import SignatureCheck
 from mwdcal.use.verification import SETTING_PRACTICES, JudgedSet, Verdict, VerdictRow
 
 FREEDOM = "DoF"

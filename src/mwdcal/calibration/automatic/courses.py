@@ -17,6 +17,7 @@ from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import HIGHEST, highest_order, usable_soaks
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.problem import Problem, State
+from mwdcal.estimation.tails import fisher_tail
 from mwdcal.estimation.uncertainty import TANGENT_STEP, tangent
 from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, eigen, inverse, outer, quotient
 
@@ -81,12 +82,10 @@ def f_test(square: Array, freedom: Array, scatter: Array, rest: Array) -> Array:
 
     Against a `scatter` that `rest` degrees of freedom tell of. NaN where there is nothing to test.
     """
-    from scipy.special import fdtrc
-
     tested = (freedom > 0) & (rest >= 1)
     ratio = square / np.where(tested, freedom * scatter, 1.0)
     ratio, freedom = np.where(tested, ratio, 0.0), np.where(tested, freedom, 1.0)
-    return np.where(tested, fdtrc(freedom, np.maximum(rest, 1.0), ratio), np.nan)
+    return np.where(tested, fisher_tail(freedom, np.maximum(rest, 1.0), ratio), np.nan)
 
 
 def orders_of(result: Fit) -> list[int]:

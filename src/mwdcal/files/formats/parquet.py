@@ -52,10 +52,14 @@ def parse(data: bytes, source: str, most: int = 0) -> Parts:
             f"{len(names)} columns. Split the file."
         )
     with reading(source):
-        table = dense(file.read(use_pandas_metadata=False), schema, source, arrow)
-        columns = {
-            name: as_column(name, table.column(name), arrow) for name in names if not is_index(name)
-        }
+        floats = {field.name for field in schema if arrow.types.is_floating(field.type)}
+        others = [name for name in names if name not in floats]
+        table = dense(file.read(others, use_pandas_metadata=False), schema, source, arrow)
+        columns = {}
+        for name in (name for name in names if not is_index(name)):
+            # numbers one column at a time: a long table is not in memory twice
+            held = file.read([name], use_pandas_metadata=False) if name in floats else table
+            columns[name] = as_column(name, held.column(name), arrow)
     return Parts(columns, metadata_of(schema.metadata, source), range(1, rows + 1))
 
 
@@ -129,7 +133,7 @@ def row_size(metadata: Any) -> int:
 
 
 def dense(table: Any, schema: Any, source: str, arrow: Any, most: int = MAX_TEXT) -> Any:
-    """A table as read, its columns of the types of the schema; refuses more than `most` bytes of text."""
+    """Columns of a table as read, of the types of the schema; refuses more than `most` bytes of text."""
     size = sum(
         _size_of(chunk)
         for column in table.columns
@@ -141,7 +145,7 @@ def dense(table: Any, schema: Any, source: str, arrow: Any, most: int = MAX_TEXT
             f"{source}: texts of rows that are read at once must have at most {most} bytes; "
             f"got {size}. Shorten or remove the columns with long texts."
         )
-    return table.cast(schema.remove_metadata())
+    return table.cast(arrow.schema([schema.field(name) for name in table.column_names]))
 
 
 def _size_of(cells: Any) -> int:

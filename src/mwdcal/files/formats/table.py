@@ -7,14 +7,14 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mwdcal.errors import InputError, reason
-from mwdcal.files.exchange import las, witsml
-from mwdcal.files.formats import atomic, dialect, parquet, text, workbook
+from mwdcal.files.formats import atomic, dialect, text
 from mwdcal.files.formats.columns import (
     LABELS,
     Column,
@@ -28,8 +28,13 @@ from mwdcal.files.formats.columns import shown as shown
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import TableFormat
 
-_TABLES: dict[str, Any] = {".csv": text, ".tsv": text, ".parquet": parquet, ".xlsx": workbook}
-_FORMATS: dict[str, Any] = {**_TABLES, ".xml": witsml, ".las": las}
+_TABLES = {
+    ".csv": "formats.text",
+    ".tsv": "formats.text",
+    ".parquet": "formats.parquet",
+    ".xlsx": "formats.workbook",
+}
+_FORMATS = {**_TABLES, ".xml": "exchange.witsml", ".las": "exchange.las"}
 SUFFIXES = tuple(_TABLES)
 """Of tables as documented; those of other programs are `EXCHANGED`."""
 EXCHANGED = (".xml", ".las")
@@ -97,11 +102,12 @@ def parsed(
 ) -> Table:
     """The table in the bytes of a file of that name: see `read`."""
     digest = hashlib.sha256(data).hexdigest()
-    form = _FORMATS[_suffix(Path(name))]
-    arguments: dict[str, Any] = {"most": rows} if form is parquet else {}
+    suffix = _suffix(Path(name))
+    form = _format(suffix)
+    arguments: dict[str, Any] = {"most": rows} if suffix == ".parquet" else {}
     if export and form is text:
         data, arguments = dialect.plain(data, export, name), {"delimiter": export.delimiter}
-    elif form is workbook:
+    elif suffix == ".xlsx":
         arguments = {"form": export, "serial": serial}
     decimal = export.decimal if export else decimal
     parts: Parts = form.parse(data, name, **arguments)
@@ -127,7 +133,7 @@ def rendered(
     `export`: text with that delimiter, decimal sign and encoding.
     """
     file = Path(path)
-    form = _FORMATS[_suffix(file)]
+    form = _format(_suffix(file))
     check_names(list(table.columns), file.name)
     content: bytes | str
     if export and form is text:
@@ -174,11 +180,11 @@ def recognised(path: str | os.PathLike[str]) -> dialect.Export:
     file = Path(path)
     data, suffix = _content(file), _suffix(file)
     if suffix == ".xlsx":
-        rows = dict(workbook.read_rows(data, file.name))
+        rows = dict(_format(suffix).read_rows(data, file.name))
         cells = [[as_text(c) for c in rows.get(n, ())] for n in range(1, max(rows, default=0) + 1)]
         return dialect.recognised_rows(cells, TableFormat(), file.name)
-    if _FORMATS[suffix] is not text:
-        names = [*_FORMATS[suffix].parse(data, file.name).columns]
+    if (form := _format(suffix)) is not text:
+        names = [*form.parse(data, file.name).columns]
         return dialect.Export(TableFormat(), names, [""] * len(names))
     text.refuse_foreign(data, file.name, allowed=text.UTF_16)
     return dialect.recognised_text(data, file.name)
@@ -190,11 +196,16 @@ def below_names(path: str | os.PathLike[str], form: TableFormat) -> list[tuple[i
     data, suffix = _content(file), _suffix(file)
     places = range(form.header_line, form.first_line)
     if suffix == ".xlsx":
-        rows = dict(workbook.read_rows(data, file.name))
+        rows = dict(_format(suffix).read_rows(data, file.name))
         return [(place, [as_text(cell) for cell in rows.get(place, ())]) for place in places]
-    if _FORMATS[suffix] is not text:
+    if _format(suffix) is not text:
         return []
     return list(zip(places, dialect.below_names(data, form, file.name), strict=False))
+
+
+def _format(suffix: str) -> Any:
+    """The module that reads and writes a format."""
+    return import_module(f"mwdcal.files.{_FORMATS[suffix]}")
 
 
 def _suffix(path: Path) -> str:

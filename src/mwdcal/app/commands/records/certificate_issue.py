@@ -95,7 +95,7 @@ def command(
     from mwdcal.app.screens.records.certificate_issue import screen
     from mwdcal.certificate.contents import Order, certificate
     from mwdcal.certificate.laboratory import load_laboratory
-    from mwdcal.files import documents
+    from mwdcal.files import verifications
     from mwdcal.files.formats import atomic
 
     _check_forms(output)
@@ -103,8 +103,8 @@ def command(
     paths["laboratory"] = laboratory
     options.check_outputs(output, [*paths.values(), registry, *key])
     loaded = load_calibration(calibration, key)
-    as_left, left_digest = _read(documents.load_verification, verification)
-    before, before_digest = _read(documents.load_verification, as_found)
+    as_left, left_digest = _read(verifications.load_verification, verification)
+    before, before_digest = _read(verifications.load_verification, as_found)
     stated, laboratory_digest = _read(load_laboratory, laboratory)
     issued = day.date() if day else datetime.now(UTC).date()
     drift = _drift(registry, loaded, issued) if registry else None

@@ -162,7 +162,7 @@ def _calibrations(registry: Registry, serial: str) -> tuple[list[Calibration], d
     """The calibrations of a tool, and the SHA-256 of each file by that of its content."""
     read, digests = [], {}
     for row, data in queries.calibrations(registry, serial):
-        calibration = documents.decoded(Member(data, row["name"], row["sha256"]))
+        calibration = documents.proved(Member(data, row["name"], row["sha256"]))
         read.append(calibration)
         digests[str(calibration.sha256)] = row["sha256"]
     return read, digests
@@ -171,8 +171,10 @@ def _calibrations(registry: Registry, serial: str) -> tuple[list[Calibration], d
 def _tests(registry: Registry, serial: str) -> Iterator[ServiceTest]:
     """The roll tests of a tool that were not withdrawn, each on the day of its run or, unknown, when it was added."""
     where: dict[str, object] = {"serial": serial}
-    days = {row["sha256"]: row["time"] for row in _records(registry, "run", where)}
-    for row in _records(registry, "verification", where):
+    rows = list(_records(registry, "verification", where))
+    runs = _records(registry, "run", where) if rows else ()
+    days = {row["sha256"]: row["time"] for row in runs}
+    for row in rows:
         day = row["time"] or days.get(row["run"]) or row["added"]
         _, data = queries.document(registry, row["number"])
         document = msgspec.json.decode(documents.in_utf8(data), type=dict[str, Any])

@@ -16,9 +16,9 @@ from mwdcal.errors import InputError
 
 if TYPE_CHECKING:
     from mwdcal.app.choices import LoadedCalibration
+    from mwdcal.calibration.canonical import SignatureCheck
     from mwdcal.calibration.readings import Readings
     from mwdcal.calibration.record import Calibration, Finding
-    from mwdcal.certificate.signature import SignatureCheck
     from mwdcal.files.formats.table import Table
     from mwdcal.geometry.vectors import Array
     from mwdcal.survey.acceptance import SurveyLimits
@@ -104,7 +104,7 @@ def command(
     options.check_outputs([output, msa_html], inputs, page=html)
     start, ends = _three("tie_in", tie_in), _switch(switch)
     loaded = load_calibration(calibration, key)
-    scene = _read(loaded, readings, reference, limits, decimal)
+    scene = _read(loaded, readings, reference, limits, decimal, msa)
     fitted, analysis = scene.calibration, None
     pages: list[tuple[Path, bytes | str]] = []
     if msa:
@@ -157,9 +157,9 @@ class _WellInputs:
 
 
 def _read(
-    loaded: LoadedCalibration, readings: Path, reference: Path | None, limits: str, decimal: str
-) -> _WellInputs:
-    """The files read."""
+    loaded: LoadedCalibration, readings: Path, reference: Path | None, limits: str, decimal: str, msa: bool,
+) -> _WellInputs:  # fmt: skip
+    """The files read; stations that multi-station analysis puts into the record have fingerprints."""
     from mwdcal.files.runs import MOST_ROWS, read_export
     from mwdcal.survey.acceptance import load_survey_limits
     from mwdcal.survey.place.references import load_reference
@@ -169,7 +169,7 @@ def _read(
     bounds, limits_digest = load_survey_limits(limits)
     source = read_export(readings, fitted.profile, decimal=decimal, rows=MOST_ROWS)
     place, place_digest = load_reference(reference) if reference else (None, "")
-    read = survey_readings(source, fitted, place)
+    read = survey_readings(source, fitted, place, recognised=msa)
     digests = {"calibration": loaded.digest, "readings": source.digest}
     digests |= {"reference": place_digest} if read.uses_reference else {}
     return _WellInputs(

@@ -11,7 +11,7 @@ import msgspec
 from mwdcal.app.envelope import enveloped
 from mwdcal.app.screens.numbers import written
 from mwdcal.app.text import one_line, table
-from mwdcal.calibration.canonical import Signature
+from mwdcal.calibration.canonical import Signature, SignatureCheck
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import Finding
 from mwdcal.certificate.keys import TrustedKey
@@ -19,7 +19,6 @@ from mwdcal.certificate.signature import (
     FINDING_OF_STATE,
     SIGNATURE_KEY,
     CheckedFile,
-    SignatureCheck,
     check_files,
     document_of,
     fields_of,

@@ -11,9 +11,9 @@ import numpy as np
 from mwdcal.app.screens.numbers import fixed, signed, written
 from mwdcal.app.screens.records.signature import in_short
 from mwdcal.app.text import one_line, plural, table
+from mwdcal.calibration.canonical import SignatureCheck
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import Finding, stated
-from mwdcal.certificate.signature import SignatureCheck
 from mwdcal.survey.acceptance import SurveyLimits
 from mwdcal.survey.error_terms import ErrorTerms, error_terms
 from mwdcal.survey.multistation.interference import InterferenceSize, MultiStationAnalysis
