@@ -28,7 +28,7 @@ RANK_TOLERANCE = 2e-2
 NEGLIGIBLE = 1e-2
 """A member that is still on its way when iterations end has settled if a full step is a smaller
 share of the standard uncertainty than this."""
-CLEARLY = 5.0
+CLEAR_MARGIN = 5.0
 """A direction is clearly determined with a singular value so many times `RANK_TOLERANCE`."""
 SPANNED = 1e-6
 """Smallest eigenvalue of the normalised 4 × 4 information at which the vectors span space."""
@@ -253,7 +253,7 @@ class Determined:
     @property
     def clear(self) -> Bools:
         """Members (B,) of which every direction is determined, and no step of a fit changes that."""
-        return np.asarray((self.values > CLEARLY * RANK_TOLERANCE).all(-1))
+        return np.asarray((self.values > CLEAR_MARGIN * RANK_TOLERANCE).all(-1))
 
     @property
     def rank(self) -> Ints:

@@ -156,11 +156,11 @@ def shown_effects(result: Fit, others: Mapping[str, Array]) -> list[Shown]:
     """
     if result.analysis.influence is not None:
         return [{} for _ in result.status]
-    result, found = _without_bad_stations(result), []
+    result, every = _without_bad_stations(result), []
     for first in range(0, len(result.status), AT_ONCE):
         some = slice(first, first + AT_ONCE)
-        found += _searched(take(result, some), {n: v[some] for n, v in others.items()})
-    return found
+        every += _searched(take(result, some), {n: v[some] for n, v in others.items()})
+    return every
 
 
 def _searched(result: Fit, others: Mapping[str, Array]) -> list[Shown]:
