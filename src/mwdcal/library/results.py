@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
+from importlib import import_module
 from typing import Any
 
 from mwdcal.calibration.record import Finding
@@ -87,7 +88,7 @@ def frame(columns: Mapping[str, AnyArray]) -> Any:
         InputError: pandas is not installed.
     """
     try:
-        import pandas
+        pandas = import_module("pandas")
     except ModuleNotFoundError as error:
         raise InputError(
             "`to_pandas` needs pandas, which is not installed: pip install pandas."

@@ -7,9 +7,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, cast
 
+import msgspec
 import numpy as np
 
 from mwdcal.calibration.calibrate import calibrate as fit_and_judge
+from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration, Finding
@@ -26,6 +28,7 @@ from mwdcal.files.formats.table import Table
 from mwdcal.files.limits import load_limits
 from mwdcal.geometry.vectors import AnyArray, Array, ArrayLike
 from mwdcal.library.arrays import nearest, without_mask
+from mwdcal.library.shown import with_inputs
 from mwdcal.logs.noise import Noise, find_noise
 from mwdcal.logs.stations import Stations, find_stations
 from mwdcal.planning import simulate as simulation
@@ -244,7 +247,9 @@ def compare(
     """
     _check_readings(run)
     given = _options(options, choices)
-    return compare_methods(run, _profile(run, profile), given, progress=progress)
+    result = compare_methods(run, _profile(run, profile), given, progress=progress)
+    digests = {"run": run.run_sha256, "profile": run.profile_sha256}
+    return with_inputs(result, run.metadata, **digests)
 
 
 def verify(
@@ -259,9 +264,12 @@ def verify(
             which no limit applies.
     """
     _check_readings(rolltest, "rolltest")
-    return judge(
-        calibration, rolltest, limits if isinstance(limits, Limits) else load_limits(limits)[0]
-    )
+    bounds, digest = (limits, "") if isinstance(limits, Limits) else load_limits(limits)
+    verdict = judge(calibration, rolltest, bounds)
+    findings = [*verdict.findings, *unused_columns(rolltest.unused)]
+    verdict = msgspec.structs.replace(verdict, findings=findings)
+    stated, digests = (calibration.tool, rolltest.metadata), {"limits": digest}
+    return with_inputs(verdict, *stated, run=rolltest.run_sha256, **digests)
 
 
 def diagnose(calibration: Calibration, later: Readings) -> Diagnosis:
@@ -274,7 +282,10 @@ def diagnose(calibration: Calibration, later: Readings) -> Diagnosis:
         InputError: readings of another tool or of the fit itself, or none that can be used.
     """
     _check_readings(later, "later")
-    return explain(calibration, later)
+    result = explain(calibration, later)
+    findings = [*calibration.change_findings(), *result.findings, *unused_columns(later.unused)]
+    result = msgspec.structs.replace(result, findings=findings)
+    return with_inputs(result, calibration.tool, later.metadata, readings=later.run_sha256)
 
 
 @dataclass(frozen=True)
@@ -363,7 +374,8 @@ def stations(log: Tabular, **options: Any) -> Stations:
     `log` is a file, or columns by the names of log files: `time_s`, `ax`, …, `temperature_c`. `options`
     are those of `mwdcal.logs.stations.find_stations`.
     """
-    return find_stations(_log(log), **options)
+    table = _log(log)
+    return with_inputs(find_stations(table, **options), table.metadata, log=table.digest)
 
 
 def noise(log: Tabular, **options: Any) -> Noise:
@@ -372,7 +384,8 @@ def noise(log: Tabular, **options: Any) -> Noise:
     `log` is a file, or columns by the names of log files. `options` are those of
     `mwdcal.logs.noise.find_noise`.
     """
-    return find_noise(_log(log), **options)
+    table = _log(log)
+    return with_inputs(find_noise(table, **options), table.metadata, log=table.digest)
 
 
 def _log(source: Tabular) -> Table:
