@@ -10,13 +10,19 @@ from collections.abc import Callable, Mapping
 from html import escape
 from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
+
+from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.comparison.compare import Comparison
 from mwdcal.faults.diagnosis import Diagnosis
+from mwdcal.files import runs
 from mwdcal.files.formats import atomic
-from mwdcal.library.results import brief
+from mwdcal.geometry.vectors import AnyArray
+from mwdcal.library.results import brief, frame
 from mwdcal.logs.noise import Noise
 from mwdcal.logs.stations import Stations
+from mwdcal.sensor.profile import NOMINAL
 from mwdcal.use.verification import Verdict
 
 _Shown = TypeVar("_Shown")
@@ -142,6 +148,21 @@ def _stations_page(stations: Stations) -> str:
     return render(stations, _inputs(stations).digests.get("log", ""))
 
 
+def _columns(readings: Readings) -> Mapping[str, AnyArray]:
+    """All columns of the table that was read; of readings made otherwise those of a run file."""
+    if readings.table:
+        return readings.table
+    table = runs.from_readings(readings, readings.profile or NOMINAL)
+    return {name: np.asarray(cells) for name, cells in table.columns.items()}
+
+
+def _to_pandas(readings: Readings) -> Any:
+    """The columns as a table of pandas, with the metadata in `attrs`."""
+    made = frame(readings.columns)
+    made.attrs.update(readings.metadata)
+    return made
+
+
 def _show(
     kind: type,
     text: Callable[[Any], str],
@@ -176,6 +197,8 @@ def _show(
         setattr(kind, name, method)
 
 
+Readings.columns = property(_columns)  # type: ignore[assignment]
+Readings.to_pandas = _to_pandas  # type: ignore[attr-defined]
 _show(Calibration, _calibration_text, _calibration_document, _calibration_page)
 _show(Verdict, _verdict_text, _verdict_document, None)
 _show(Diagnosis, _diagnosis_text, _diagnosis_document, None)

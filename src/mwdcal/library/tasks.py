@@ -33,14 +33,11 @@ from mwdcal.logs.noise import Noise, find_noise
 from mwdcal.logs.stations import Stations, find_stations
 from mwdcal.planning import simulate as simulation
 from mwdcal.planning.simulate import Truth
-from mwdcal.sensor.profile import Profile, TriadProfile
+from mwdcal.sensor.profile import NOMINAL as NOMINAL
+from mwdcal.sensor.profile import Profile
 from mwdcal.use.correction import correct
 from mwdcal.use.verification import Limits, Verdict
 from mwdcal.use.verification import verify as judge
-
-_UNSCALED = TriadProfile(scale=1.0)
-NOMINAL = Profile(name="nominal", accelerometer=_UNSCALED, magnetometer=_UNSCALED)
-"""The profile of arrays: raw readings are nominal g and nT along the tool axes."""
 
 CORRECTED_ANGLES = ("inclination", "azimuth", "toolface", "dip", "magnetic_toolface")
 """Angles of corrected readings."""
@@ -85,7 +82,8 @@ def read_run(
     if metadata:
         table = replace(table, metadata={**table.metadata, **meta.plain(metadata, table.source)})
     readings, profile = runs.read_run(table, profile)
-    return replace(readings, profile=profile, profile_sha256=profile_sha256)
+    whole = {name: np.asarray(cells) for name, cells in table.columns.items()}
+    return replace(readings, profile=profile, profile_sha256=profile_sha256, table=whole)
 
 
 def _table(source: Tabular, name: str, read: Callable[[Path], Table]) -> Table:
