@@ -16,6 +16,7 @@ from mwdcal.certificate.document import Certificate
 from mwdcal.faults.diagnosis import Diagnosis
 from mwdcal.registry.lookup import Listing
 from mwdcal.screens import (
+    builtin,
     calibration,
     comparison,
     conversion,
@@ -45,6 +46,7 @@ CONTENTS: dict[str, type] = {
     "convert": conversion.ConversionSummary,
     "diagnose": Diagnosis,
     "example": ExampleDocument,
+    "list": builtin.BuiltInSummary,
     "fleet": fleet.FleetDocument,
     "noise": noise.NoiseSummary,
     "plan": plan.PlanDocument,

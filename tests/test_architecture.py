@@ -40,7 +40,7 @@ FLOORS = (
 ARRAY_ROOMS = ("geometry", "estimation", "sensor.models")
 
 MAX_ROOMS = 22
-MAX_MODULES = 16
+MAX_MODULES = 18
 MAX_FUNCTION_LINES = 50
 MAX_MODULE_LINES = 400
 

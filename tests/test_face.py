@@ -2,6 +2,7 @@
 
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,8 @@ import pytest
 import mwdcal
 from cli_support import EXAMPLE
 from cli_support import mwdcal as command
+from mwdcal.app.cli import SECTIONS, cli
+from mwdcal.calibration.methods import EVIDENCE
 
 PROFILE = EXAMPLE / "tool.toml"
 
@@ -96,3 +99,30 @@ def test_readings_have_the_columns_of_their_table_and_parts():
     assert list(frame) == list(made.columns)
     assert "simulated" in frame.attrs
     assert np.allclose(frame[["ax", "ay", "az"]], made.accelerometer)
+
+
+def test_verdicts_and_diagnoses_are_written_as_they_are_printed(calibrated, tmp_path):
+    _, path, _ = calibrated
+    for name in ("verify", "diagnose"):
+        words = (name, path, EXAMPLE / "rolltest.csv")
+        command(*words, "-o", tmp_path / f"{name}.json")
+        written = json.loads((tmp_path / f"{name}.json").read_text("utf-8"))
+        assert written == command(*words, "--json").json
+
+
+@pytest.mark.parametrize("kind", ["plans", "profiles", "limits", "methods"])
+def test_all_that_is_built_in_is_listed(kind):
+    shown, listed = command("list", kind), command("list", kind, "--json").json["entries"]
+    assert shown.code == 0
+    names = [entry["name"] for entry in listed]
+    folder = Path(mwdcal.__file__).parent / kind
+    wanted = {file.stem for file in folder.glob("*.toml")} if kind != "methods" else {*EVIDENCE}
+    assert wanted <= set(names)
+    assert all(entry["what"] and entry["name"] in shown.out for entry in listed)
+
+
+def test_the_help_shows_every_command_once():
+    shown = command("--help").out
+    assert sorted(name for names in SECTIONS.values() for name in names) == sorted(cli.commands)
+    for name in cli.commands:
+        assert len(re.findall(rf"^  {name} ", shown, re.M)) == 1

@@ -31,6 +31,7 @@ COMMANDS = (
     "planning.diagnose",
     "example",
     "fleet",
+    "list",
     "noise",
     "planning.plan",
     "profile",
@@ -42,11 +43,33 @@ COMMANDS = (
     "verify",
 )
 """Modules of `mwdcal.app.commands` with a command of their name."""
+SECTIONS = {
+    "Calibrate": ("profile", "stations", "noise", "calibrate", "verify", "compare", "fleet"),
+    "Use": ("apply", "convert", "diagnose"),
+    "Plan": ("plan", "simulate", "list", "example"),
+    "Well": ("reference", "survey"),
+    "Records": ("certificate", "registry"),
+    "Shell": ("completion",),
+}
+"""Commands in the order of the work, as the help shows them."""
 _LONG = re.compile(r"([^'\n]{300})[^'\n]+")
 """A value that a message about a wrong option repeats, where it is too long to be read."""
 
 
+class Sections(click.Group):
+    """The commands, shown by section."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the sections of the help, each command with its first sentence."""
+        width = formatter.width - 6 - max(map(len, self.commands))
+        for title, names in SECTIONS.items():
+            rows = [(name, self.commands[name].get_short_help_str(width)) for name in names]
+            with formatter.section(title):
+                formatter.write_dl(rows)
+
+
 @click.group(
+    cls=Sections,
     commands=Commands({module.rpartition(".")[2]: module for module in COMMANDS}),
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )

@@ -158,9 +158,9 @@ def _columns(readings: Readings) -> Mapping[str, AnyArray]:
 
 def _to_pandas(readings: Readings) -> Any:
     """The columns as a table of pandas, with the metadata in `attrs`."""
-    made = frame(readings.columns)
-    made.attrs.update(readings.metadata)
-    return made
+    whole = frame(readings.columns)
+    whole.attrs.update(readings.metadata)
+    return whole
 
 
 def _show(

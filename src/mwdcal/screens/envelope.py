@@ -23,6 +23,7 @@ INPUTS = {
     "diagnose": ("calibration", "readings"),
     "example": (),
     "fleet": ("runs", "profile"),
+    "list": (),
     "noise": ("log", "profile"),
     "plan": ("profile", "measured"),
     "profile": ("run",),

@@ -85,6 +85,11 @@ COLUMN_NAMES = click.option(
 )  # fmt: skip
 
 
+RESULT = output(
+    required=False, metavar="OUT.json", help="Also write the result as JSON, as --json prints it."
+)
+
+
 def number(name: str, metavar: str, text: str, *variable: str) -> Decorator:
     """An option with a number; `variable` where it is not named as the option."""
     return click.option(name, *variable, type=NUMBER, metavar=metavar, help=text)

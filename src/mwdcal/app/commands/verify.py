@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from mwdcal.app.commands import options
-from mwdcal.app.messages import print_result
+from mwdcal.app.messages import print_result, to_json
 from mwdcal.screens.typed import findings_as_typed
 
 
@@ -14,12 +14,13 @@ from mwdcal.screens.typed import findings_as_typed
 @options.CALIBRATION
 @options.RUN
 @options.preset("--limits", default="roll-test", metavar="NAME|FILE", help="Limits profile.")
+@options.RESULT
 @options.report(help="Also write the report, with this verdict.")
 @options.DECIMAL
 @options.TRUSTED_KEYS
 @options.JSON
 def command(
-    calibration: Path, run: Path, limits: str, report: Path | None, decimal: str,
+    calibration: Path, run: Path, limits: str, output: Path | None, report: Path | None, decimal: str,
     key: tuple[Path, ...], as_json: bool,
 ) -> None:  # fmt: skip
     """Verify a CALIBRATION by a roll test: a RUN whose stations were not in the fit.
@@ -33,12 +34,13 @@ def command(
     from mwdcal.app.choices import load_calibration
     from mwdcal.calibration.diagnosis.findings import unused_columns
     from mwdcal.files import runs
+    from mwdcal.files.formats import atomic
     from mwdcal.files.limits import load_limits
     from mwdcal.screens.envelope import enveloped, with_signature
     from mwdcal.screens.verification import screen
     from mwdcal.use.verification import verify
 
-    options.check_outputs([], [calibration, run, limits, *key], page=report)
+    options.check_outputs([output], [calibration, run, limits, *key], page=report)
     loaded = load_calibration(calibration, key)
     fitted = loaded.calibration
     readings, _ = runs.read_run(run, fitted.profile, decimal=decimal)
@@ -52,11 +54,12 @@ def command(
     digests = {"calibration": loaded.digest, "run": readings.run_sha256, "limits": limits_digest}
     document = enveloped("verify", result, *stated, **digests)
     document = with_signature(document, loaded.signature)
+    rendered = ""
     if report:
-        from mwdcal.files.formats import atomic
         from mwdcal.pages.report import render
 
-        atomic.write(report, render(fitted, result, *stated))
+        rendered = render(fitted, result, *stated)
+    atomic.write_all([(output, to_json(document) + "\n"), (report, rendered)])
     print_result(
         document if as_json else screen(result, loaded.signature, *stated), result.findings
     )

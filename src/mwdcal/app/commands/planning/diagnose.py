@@ -6,16 +6,19 @@ import sys
 from pathlib import Path
 
 from mwdcal.app.commands import options
-from mwdcal.app.messages import print_result
+from mwdcal.app.messages import print_result, to_json
 from mwdcal.screens.typed import findings_as_typed
 
 
 @options.command()
 @options.CALIBRATION
 @options.argument("readings")
+@options.RESULT
 @options.DECIMAL
 @options.JSON
-def command(calibration: Path, readings: Path, decimal: str, as_json: bool) -> None:
+def command(
+    calibration: Path, readings: Path, output: Path | None, decimal: str, as_json: bool
+) -> None:
     """Say which fault, if any, later READINGS of the tool of a CALIBRATION show.
 
     READINGS are a roll test or surveys, a run file with the references that are known, or none.
@@ -30,11 +33,12 @@ def command(calibration: Path, readings: Path, decimal: str, as_json: bool) -> N
     from mwdcal.faults.diagnosis import diagnose
     from mwdcal.faults.physics import NONE
     from mwdcal.files import runs
+    from mwdcal.files.formats import atomic
     from mwdcal.registry.calibration_source import calibration_of
     from mwdcal.screens.diagnosis import screen
     from mwdcal.screens.envelope import enveloped
 
-    options.check_outputs([], [calibration, readings])
+    options.check_outputs([output], [calibration, readings])
     fitted, digest = calibration_of(calibration)
     later, _ = runs.read_run(readings, fitted.profile, decimal=decimal)
     result = diagnose(fitted, later)
@@ -45,5 +49,6 @@ def command(calibration: Path, readings: Path, decimal: str, as_json: bool) -> N
     stated = fitted.tool, later.metadata
     digests = {"calibration": digest, "readings": later.run_sha256}
     document = enveloped("diagnose", result, *stated, **digests)
+    atomic.write_all([(output, to_json(document) + "\n")])
     print_result(document if as_json else screen(result, *stated), findings)
     sys.exit(0 if result.fault == NONE else 1)
