@@ -19,7 +19,7 @@ from mwdcal.calibration.results import StatedCovariance, triad_results
 from mwdcal.estimation.batch import take
 from mwdcal.geometry.observables import OBSERVABLES
 
-RUNS, BATCH, SEED = 50, 50, 24
+RUNS, BATCH, SEED = 200, 50, 24
 NOISE = {"accelerometer": 1e-4, "magnetometer": 15.0}
 STAND = {"inclination": 0.01, "azimuth": 0.05, "toolface": 0.02}
 COLD, HOT, STATIONS, JUDGED = 25.0, 145.0, 72, 20
