@@ -7,6 +7,7 @@ from mwdcal.errors import FitError, InputError
 from mwdcal.library.arrays import readings
 from mwdcal.library.planning import plan, propose_profile
 from mwdcal.library.records import certificate, check_signature, fleet, registry, sign
+from mwdcal.library.simulation import simulate
 from mwdcal.library.tasks import (
     apply,
     calibrate,
@@ -17,7 +18,6 @@ from mwdcal.library.tasks import (
     noise,
     read_run,
     save,
-    simulate,
     stations,
     verify,
 )
