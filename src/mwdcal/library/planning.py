@@ -178,7 +178,7 @@ def plan(
     >>> import mwdcal
     >>> sheet = mwdcal.plan("servo", plan="moosavi-12")
     >>> len(sheet.columns["ref_inclination_deg"])
-    12
+    48
     >>> sheet.accuracy_deg["azimuth"] < 0.1
     True
     """

@@ -221,7 +221,7 @@ def simulate(*arguments: Any, **choices: Any) -> Any:
     >>> import mwdcal
     >>> run = mwdcal.simulate("moosavi-12", "servo", seed=1)
     >>> run.count, run.truth["serial"]
-    (12, 'SIM-1')
+    (48, 'SIM-1')
     """
     first = arguments[0] if arguments else choices.get("plan")
     is_plan = isinstance(first, str | os.PathLike | PlanResult | Table | Mapping)

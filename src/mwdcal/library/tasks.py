@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -76,7 +77,8 @@ def read_run(
     profile_sha256 = ""
     if not isinstance(profile, Profile):
         profile, profile_sha256 = profiles.load_profile(os.fspath(profile))
-    table = table_of(source, "the run", lambda path: tables.read(path, decimal=decimal))
+    read = partial(runs.read_export, profile=profile, decimal=decimal)
+    table = table_of(source, "the run", read)
     if metadata:
         table = replace(table, metadata={**table.metadata, **meta.plain(metadata, table.source)})
     readings, profile = runs.read_run(table, profile)
