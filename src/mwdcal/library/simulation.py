@@ -89,7 +89,7 @@ class RepeatedProcedure(Result):
     """A whole procedure for many tools: a row of `columns` for each, and in `repetition` what they show."""
 
     procedure: Procedure
-    tools: Tools
+    rows: Tools
     repetition: Repetition
     digests: Mapping[str, str]
     files: dict[str, Path] = field(default_factory=dict)
@@ -97,7 +97,7 @@ class RepeatedProcedure(Result):
     @property
     def columns(self) -> Tools:
         """Figures, verdicts and parameters of the tools by the names of the command's table."""
-        return self.tools
+        return self.rows
 
     @property
     def risk(self) -> dict[str, Share]:
