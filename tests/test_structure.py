@@ -12,7 +12,8 @@ from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.estimation.batch import take
 from mwdcal.geometry.vectors import earth_field, earth_gravity, rotation, tool_from_earth
-from mwdcal.library.tasks import NOMINAL, simulate
+from mwdcal.library.simulation import simulate
+from mwdcal.library.tasks import NOMINAL
 from mwdcal.sensor.profile import Profile
 from simulation import DEG, Tool, plan
 

@@ -8,6 +8,7 @@ from mwdcal.library import shown as shown  # puts words, document and page on re
 from mwdcal.library.arrays import readings
 from mwdcal.library.planning import plan, propose_profile
 from mwdcal.library.records import certificate, check_signature, fleet, registry, sign
+from mwdcal.library.simulation import simulate
 from mwdcal.library.tasks import (
     apply,
     calibrate,
@@ -18,7 +19,6 @@ from mwdcal.library.tasks import (
     noise,
     read_run,
     save,
-    simulate,
     stations,
     verify,
 )

@@ -1,15 +1,364 @@
-"""Before a measurement: plans, simulated runs and procedures, profiles from tables as they come."""
+"""Before a measurement: plans, and profiles from tables as they come."""
 
 from __future__ import annotations
 
-from typing import Any
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack, cast
+
+import numpy as np
+
+from mwdcal.calibration.options import Options, Orders
+from mwdcal.calibration.prior import Knowledge
+from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.errors import InputError
+from mwdcal.files import profiles, runs
+from mwdcal.files.formats.table import Table
+from mwdcal.geometry.vectors import AnyArray
+from mwdcal.library.results import Result
+from mwdcal.library.tasks import NOMINAL, Tabular, table_of, with_choices
+from mwdcal.sensor.profile import Profile
+
+if TYPE_CHECKING:
+    from mwdcal.identification.proposal import Proposal
+    from mwdcal.planning.planned import Planned
+
+FilePath = str | os.PathLike[str]
+ToolSource = FilePath | Profile
+"""A tool profile: built in by name, a TOML file by path, or the profile itself."""
 
 
-def plan(*arguments: Any, **choices: Any) -> Any:
-    """To be written."""
-    raise NotImplementedError
+class SeedlessFitChoices(TypedDict, total=False):
+    """The attributes of `Options` but for the seed."""
+
+    method: str
+    model: str | None
+    order: Orders | Literal["auto"]
+    parameters: int
+    nonlinearity: Mapping[str, float] | tuple[str, ...] | Literal["auto"]
+    scatter: bool
+    estimate: tuple[str, ...]
+    ignore: tuple[str, ...]
+    robust: str | None
+    paper_weights: bool
+    prior: Knowledge | Calibration | Literal["datasheet"] | None
+    prior_sha256: str
+    exclude: tuple[str, ...]
 
 
-def propose_profile(*arguments: Any, **choices: Any) -> Any:
-    """To be written."""
-    raise NotImplementedError
+class FitChoices(SeedlessFitChoices, total=False):
+    """The attributes of `Options`, as keywords of what fits."""
+
+    seed: int
+
+
+def silent(done: int, total: int) -> None:
+    """Take no notice of progress."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PlanResult(Result):
+    """A plan and what a calibration from it will give: the first of `plans`; the others are compared with it.
+
+    `columns` are those of the plan's table, `accuracy_deg` 1σ by angle at 45° inclination (None: undetermined).
+    """
+
+    plans: Sequence[Planned]
+    digests: Mapping[str, str]
+    files: dict[str, Path] = field(default_factory=dict)
+
+    @property
+    def table(self) -> Table:
+        """The plan as the table of a run without readings."""
+        return self.plans[0].plan
+
+    @property
+    def columns(self) -> dict[str, AnyArray]:
+        """Stations, temperatures and references of the plan by the names of run files."""
+        return arrays_of(self.table)
+
+    @property
+    def calibration(self) -> Calibration:
+        """The calibration that the plan will give, of a nominal tool."""
+        return self.plans[0].calibration
+
+    @property
+    def accuracy_deg(self) -> dict[str, float | None]:
+        """Standard uncertainty of each angle at 45° inclination, as `calibrate` states it; None: undetermined."""
+        from mwdcal.calibration.prediction import typical_accuracy
+
+        return typical_accuracy(self.calibration)
+
+    @property
+    def findings(self) -> list[Finding]:
+        """What the plans leave undetermined, and what else there is to say of them."""
+        from mwdcal.screens.plan import findings
+
+        return findings(self.plans)
+
+    def save(self, path: FilePath) -> None:
+        """Write the plan to be filled in: a run file with blank readings (CSV, TSV, Parquet or XLSX).
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        from mwdcal.files.formats import table
+        from mwdcal.planning.plans import run_sheet
+
+        has_magnetometer = self.calibration.profile.has_magnetometer
+        table.write(path, run_sheet(self.table, has_magnetometer))
+        self.files["output"] = Path(path)
+
+    def report(self, path: FilePath) -> None:
+        """Write the run sheet to print and tick off: self-contained HTML.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        super().report(path)
+        self.files["html"] = Path(path)
+
+    def _named(self) -> tuple[Sequence[Planned], Mapping[str, str], Path | None, Path | None]:
+        return self.plans, self.digests, self.files.get("output"), self.files.get("html")
+
+    def _text(self) -> str:
+        from mwdcal.screens.plan import screen
+
+        return screen(*self._named())
+
+    def _document(self) -> dict[str, Any]:
+        from mwdcal.screens.plan import document
+
+        return document(*self._named())
+
+    def _page(self) -> str:
+        from mwdcal.pages.plan import render
+
+        return render(self.plans)
+
+
+PlanSource = Tabular | PlanResult
+"""A plan: built in by name, a file of attitudes or a run file, columns of a run, or what `plan` has given."""
+
+
+def plan(
+    tool: ToolSource,
+    *,
+    stations: int | None = None,
+    plan: PlanSource | Sequence[PlanSource] | None = None,
+    accuracy_deg: Mapping[str, float] | None = None,
+    measured: Tabular | Readings | None = None,
+    reach: Mapping[str, tuple[float, float]] | None = None,
+    criterion: Literal["D", "A", "I"] = "I",
+    speed: float = 5.0,
+    settle: float = 30.0,
+    soak: float = 90.0,
+    options: Options | None = None,
+    progress: Callable[[int, int], None] = silent,
+    **choices: Unpack[FitChoices],
+) -> PlanResult:
+    """State how accurate a calibration will be before anything is measured, or choose the stations for it.
+
+    Definition: the calibration of a nominal `tool` that reads without noise, at the stations of a `plan`; several
+    plans are compared. With `stations` the best so many out of the candidates in `plan`, with `accuracy_deg` (1σ)
+    the fewest that give it, with `measured` the best to add to a run that exists. `criterion` says what `stations`
+    are best in: "D", all parameters together; "A", each of them; "I", the angles. `options` and `choices` are those
+    of `calibrate`.
+
+    Units: degrees for accuracies and for `reach` of the stand, degrees per second for its `speed`; `settle` in
+    seconds from the end of a move to the reading, `soak` in minutes to reach a temperature.
+
+    Raises:
+        InputError: a plan, profile or keyword that cannot be read, or a profile that does not state the noise.
+        FitError: the stations cannot give a calibration; the message says what to add.
+
+    >>> import mwdcal
+    >>> sheet = mwdcal.plan("servo", plan="moosavi-12")
+    >>> len(sheet.columns["ref_inclination_deg"])
+    48
+    >>> sheet.accuracy_deg["azimuth"] < 0.1
+    True
+    """
+    from mwdcal.planning import planned
+    from mwdcal.planning.moves import Stand
+
+    several = plan if isinstance(plan, list | tuple) else [] if plan is None else [plan]
+    if len(several) > 1 and (accuracy_deg or stations or measured is not None):
+        raise InputError("`plan`: one plan holds the candidates to choose from. Name it alone.")
+    _check_wanted(stations, accuracy_deg or {})
+    planned.check_criterion(criterion)
+    profile, digest = profile_of(tool)
+    chosen, ends = with_choices(options, choices), _ends(reach or {})
+    stand = Stand(speed, settle, soak, ends)
+    tables = [plan_table(cast(PlanSource, each)) for each in several]
+    done = None if measured is None else _measured(measured, profile)
+    candidates = tables[0] if tables else None
+    if accuracy_deg:
+        result = [
+            planned.smallest_plan(candidates, accuracy_deg, profile, chosen, stand, done, stations)
+        ]
+    elif stations or done:
+        search = profile, chosen, criterion, stand, done
+        result = [planned.best_plan(candidates, stations or 1, *search)]
+    else:
+        result = []
+        for each in tables or [plan_table("twenty-four-state")]:
+            result.append(planned.judged(each, profile, chosen, stand))
+            progress(len(result), len(tables))
+    return PlanResult(result, {"profile": digest, "measured": done.digest if done else ""})
+
+
+def _check_wanted(stations: int | None, accuracy_deg: Mapping[str, float]) -> None:
+    """Refuse a number of stations or an accuracy that cannot be wanted."""
+    if stations is not None:
+        check_whole("stations", stations, 1)
+    for name, value in accuracy_deg.items():
+        if not (_is_number(value) and 0 < value < 180):
+            raise InputError(
+                f"`accuracy_deg` must be above 0 and below 180 degrees for each angle; got {value!r} for {name!r}. "
+                "Give it such as {'azimuth': 0.1}."
+            )
+
+
+def check_whole(name: str, value: object, least: int) -> None:
+    """Refuse what is not a whole number of at least so much."""
+    if not isinstance(value, int | np.integer) or value < least:
+        raise InputError(
+            f"`{name}` must be a whole number of {least} or more; got {value!r}. Correct it, or leave it out."
+        )
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float | np.number)
+
+
+def _ends(reach: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+    """The least and the largest setting of each angle as numbers."""
+    ends = {}
+    for name, pair in reach.items():
+        try:
+            low, high = map(float, pair)
+        except (TypeError, ValueError):
+            raise InputError(
+                f"`reach` must be the least and the largest setting of each angle, degrees; got {pair!r} for "
+                f"{name!r}. Give it such as {{'inclination': (0, 120)}}."
+            ) from None
+        ends[name] = low, high
+    return ends
+
+
+def profile_of(tool: object) -> tuple[Profile, str]:
+    """A profile and the SHA-256 of its file; without one for a profile in memory."""
+    if isinstance(tool, Profile):
+        return tool, ""
+    if not isinstance(tool, str | os.PathLike):
+        raise InputError(
+            f"`tool` must be a tool profile, or the name or file of one; got {type(tool).__name__}. Read one by "
+            "mwdcal.load_profile(…)."
+        )
+    return profiles.load_profile(os.fspath(tool))
+
+
+def plan_table(source: PlanSource) -> Table:
+    """A plan as the table of a run without readings."""
+    from mwdcal.planning.plans import load_plan
+
+    if isinstance(source, PlanResult):
+        return source.table
+    if isinstance(source, str | os.PathLike):
+        return load_plan(os.fspath(source))
+    return load_plan(table_of(source, "the plan", _unread))
+
+
+def _measured(run: Tabular | Readings, profile: Profile) -> Table:
+    """The stations of a run that is measured already."""
+    from mwdcal.planning.plans import load_measured
+
+    if isinstance(run, Readings):
+        run = runs.from_readings(run, run.profile or NOMINAL)
+    if isinstance(run, str | os.PathLike):
+        return load_measured(os.fspath(run), profile.has_magnetometer)
+    return load_measured(table_of(run, "the run", _unread), profile.has_magnetometer)
+
+
+def _unread(path: FilePath) -> Table:
+    raise AssertionError(f"{path} is a file, not columns")
+
+
+def arrays_of(table: Table) -> dict[str, AnyArray]:
+    """The columns of a table; labels as text."""
+    return {name: np.asarray(cells) for name, cells in table.columns.items()}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ProposedProfile(Result):
+    """A tool profile proposed for a table as it comes, and how sure it is."""
+
+    proposal: Proposal
+    path: Path
+    files: dict[str, Path] = field(default_factory=dict)
+
+    @property
+    def profile(self) -> Profile:
+        """The profile with which the table is a calibration run."""
+        return self.proposal.profile
+
+    @property
+    def findings(self) -> list[Finding]:
+        """Triads that are a left-handed set by the axes proposed, and columns that are not used."""
+        from mwdcal.calibration.diagnosis.findings import unused_columns
+        from mwdcal.identification.proposal import left_handed
+
+        return left_handed(self.proposal) + unused_columns(self.proposal.unused)
+
+    def to_toml(self) -> str:
+        """The text of the profile, with how its entries were recognised."""
+        from mwdcal.identification.proposal import as_toml
+
+        return as_toml(self.proposal, self.path.name)
+
+    def save(self, path: FilePath) -> None:
+        """Write the profile (TOML), to be checked and completed.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        from mwdcal.files.formats import atomic
+
+        atomic.write(os.fspath(path), self.to_toml())
+        self.files["output"] = Path(path)
+
+    def _text(self) -> str:
+        from mwdcal.screens.proposal import screen
+
+        return screen(self.proposal, self.path, self.files.get("output"))
+
+    def _document(self) -> dict[str, Any]:
+        from mwdcal.screens.proposal import summary
+
+        return summary(self.proposal, self.path, self.files.get("output"))
+
+
+def propose_profile(table_path: FilePath) -> ProposedProfile:
+    """Propose a tool profile for a table as a logger or spreadsheet program has written it.
+
+    Definition: encoding, delimiter and decimal sign, the meaning and unit of each column, and, from readings at
+    known attitudes, the axes and nominal scales of both triads. `read_run(table_path, proposed.profile)` then takes
+    the table as it is.
+
+    Raises:
+        InputError: the file cannot be read, or is not a table of stations.
+        FitError: names and readings leave columns, units or axes open; the message names the alternatives.
+
+    Example::
+
+        proposed = mwdcal.propose_profile("export.csv")
+        print(proposed.summary())
+        proposed.save("tool.toml")
+    """
+    from mwdcal.identification.proposal import propose
+
+    return ProposedProfile(propose(table_path), Path(table_path))

@@ -1,10 +1,11 @@
-"""One function for each task: simulate, read, calibrate, verify, correct, and logs."""
+"""One function for each task: read, calibrate, verify, correct, and logs."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any, Literal, cast
 
 import msgspec
@@ -26,13 +27,11 @@ from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, Column, as_text
 from mwdcal.files.formats.table import Table
 from mwdcal.files.limits import load_limits
-from mwdcal.geometry.vectors import AnyArray, Array, ArrayLike
+from mwdcal.geometry.vectors import AnyArray, Array
 from mwdcal.library.arrays import nearest, without_mask
 from mwdcal.library.shown import with_inputs
 from mwdcal.logs.noise import Noise, find_noise
 from mwdcal.logs.stations import Stations, find_stations
-from mwdcal.planning import simulate as simulation
-from mwdcal.planning.simulate import Truth
 from mwdcal.sensor.profile import NOMINAL as NOMINAL
 from mwdcal.sensor.profile import Profile
 from mwdcal.use.correction import correct
@@ -78,7 +77,8 @@ def read_run(
     profile_sha256 = ""
     if not isinstance(profile, Profile):
         profile, profile_sha256 = profiles.load_profile(os.fspath(profile))
-    table = _table(source, "the run", lambda path: tables.read(path, decimal=decimal))
+    read = partial(runs.read_export, profile=profile, decimal=decimal)
+    table = table_of(source, "the run", read)
     if metadata:
         table = replace(table, metadata={**table.metadata, **meta.plain(metadata, table.source)})
     readings, profile = runs.read_run(table, profile)
@@ -86,7 +86,7 @@ def read_run(
     return replace(readings, profile=profile, profile_sha256=profile_sha256, table=whole)
 
 
-def _table(source: Tabular, name: str, read: Callable[[Path], Table]) -> Table:
+def table_of(source: Tabular, name: str, read: Callable[[Path], Table]) -> Table:
     """The table of a file, or of columns that are in memory."""
     if isinstance(source, Table):
         return source
@@ -118,60 +118,6 @@ def _column(name: str, values: Any) -> Column:
     return without_mask(array.astype(float))
 
 
-def simulate(
-    inclination_deg: Sequence[float] = (5, 45, 90, 135),
-    toolfaces: int = 12,
-    azimuth_deg: Sequence[float] = (0, 90, 180, 270),
-    temperature: Sequence[float] = (25.0,),
-    *,
-    tool: int | tuple[ArrayLike, ArrayLike] | Truth = 0,
-    noise: tuple[float, float] = (1e-4, 15.0),
-    stand_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    settings: Literal["per-direction", "per-station"] | None = None,
-    drift: float = 0.0,
-    seed: int | np.random.Generator = 0,
-) -> Readings:
-    """A simulated run, marked as such: every toolface at every inclination and temperature.
-
-    Azimuths come in turn, one to each inclination. `tool` is a number, the same one for the same
-    tool; or the true factors (30,) of accelerometer and magnetometer, SF (3 × 4) and B (3 × 4) by
-    power of T - 30 °C, then m (6). `noise` is of one reading, g and nT; `stand_deg` how far inclination,
-    azimuth and toolface are off their references, the same for stations that follow each other with one
-    direction unless `settings` says that the stand is set at each; `drift` the temperature by which the tool warms
-    during the run; `seed` that of noise and stand, or a generator.
-    """
-    if not all(0 <= angle <= 180 for angle in inclination_deg) or toolfaces < 1:
-        raise InputError(
-            "`inclination_deg` must be between 0 and 180, and `toolfaces` 1 or more; got "
-            f"{list(inclination_deg)} and {toolfaces}."
-        )
-    plan = simulation.grid([*inclination_deg], toolfaces, [*azimuth_deg], [*temperature])
-    warmed = plan.temperature + drift * np.linspace(-0.5, 0.5, len(plan.temperature))
-    plan = replace(plan, temperature=warmed)
-    rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng([seed, 1])
-    inclination, azimuth, toolface = np.radians(stand_deg)
-    off = inclination, azimuth, toolface
-    return simulation.run(_truth(tool), plan, rng, noise, off, settings or "")
-
-
-def _truth(tool: int | tuple[ArrayLike, ArrayLike] | Truth) -> Truth:
-    """A tool to simulate: by its number, or by its factors."""
-    if isinstance(tool, Truth):
-        return tool
-    if isinstance(tool, int):
-        return simulation.servo(np.random.default_rng(tool))
-    accelerometer, magnetometer = (
-        without_mask(np.ma.array(factors, dtype=float)) for factors in tool
-    )
-    for factors in (accelerometer, magnetometer):
-        if factors.shape != (30,):
-            raise InputError(
-                f"`tool` must be a number, or 30 factors of each triad; got {factors.shape}. Give SF "
-                "(3 × 4), B (3 × 4) and m (6) in one row."
-            )
-    return Truth(accelerometer, magnetometer)
-
-
 def calibrate(
     run: Readings,
     profile: Path | Profile | None = None,
@@ -190,7 +136,7 @@ def calibrate(
     """
     _check_readings(run)
     whole = run if profile is None else replace(run, profile_sha256="")
-    return fit_and_judge(whole, _profile(run, profile), _options(options, choices))
+    return fit_and_judge(whole, _profile(run, profile), with_choices(options, choices))
 
 
 def _profile(run: Readings, profile: object) -> Profile:
@@ -219,7 +165,7 @@ def _check_readings(readings: object, name: str = "run", single: bool = True) ->
         )
 
 
-def _options(options: Options | None, choices: Mapping[str, Any]) -> Options | None:
+def with_choices(options: Options | None, choices: Mapping[str, Any]) -> Options | None:
     """Options with choices by name; None where nothing was chosen."""
     names = [field.name for field in fields(Options)]
     for name in choices:
@@ -244,7 +190,7 @@ def compare(
     count. `progress` is called with a sentence at each step.
     """
     _check_readings(run)
-    given = _options(options, choices)
+    given = with_choices(options, choices)
     result = compare_methods(run, _profile(run, profile), given, progress=progress)
     digests = {"run": run.run_sha256, "profile": run.profile_sha256}
     return with_inputs(result, run.metadata, **digests)
@@ -388,5 +334,5 @@ def noise(log: Tabular, **options: Any) -> Noise:
 
 def _log(source: Tabular) -> Table:
     """A log: a file, or columns that are checked like one."""
-    table = _table(source, "the log", logs.read)
+    table = table_of(source, "the log", logs.read)
     return table if isinstance(source, str | os.PathLike) else logs.check(table)

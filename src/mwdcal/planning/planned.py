@@ -253,10 +253,7 @@ class Search:
         measured: Table | None,
     ) -> Search:  # fmt: skip
         """The search among candidates, as far as the stand reaches. Raises as `judged`."""
-        if criterion not in CRITERIA:
-            raise InputError(
-                f"`criterion` must be one of {', '.join(CRITERIA)}; got {criterion!r}."
-            )
+        check_criterion(criterion)
         inside = _reached(candidates or load_plan("candidates"), stand)
         whole = inside
         if measured:
@@ -381,6 +378,14 @@ class Search:
         options = replace(self.options or Options(), order=self.choice.options.order)
         carried = carried_out(whole, self.profile, options)
         return Planned.of(plan, carried, design.efficiency, self.stand, self.before)
+
+
+def check_criterion(criterion: str) -> None:
+    """Refuse a criterion that is not one of `CRITERIA`."""
+    if criterion not in CRITERIA:
+        raise InputError(
+            f"`criterion` must be one of {', '.join(CRITERIA)}; got {criterion!r}. Choose one of them."
+        )
 
 
 def station_names(plan: Table) -> list[str]:

@@ -124,18 +124,18 @@ def check_count(count: int, source: str) -> None:
         )
 
 
-def load_plan(name_or_path: str) -> Table:
-    """A plan as a run file without readings: built in by name, a TOML file, or a run file.
+def load_plan(source: str | Table) -> Table:
+    """A plan as a run file without readings: built in by name, a TOML file, a run file, or the table of one.
 
-    Of a run file attitudes and temperatures count, and what is stated of their uncertainty; its
+    Of a run attitudes and temperatures count, and what is stated of their uncertainty; its
     readings and columns without a figure are left out.
 
     Raises:
         InputError: no such plan, or a file that is not one.
     """
-    path = Path(name_or_path)
-    if path.suffix.lower() in tables.SUFFIXES:
-        table = tables.read(path)
+    path = None if isinstance(source, Table) else Path(source)
+    if path is None or path.suffix.lower() in tables.SUFFIXES:
+        table = source if isinstance(source, Table) else tables.read(source)
         check_count(table.count, table.source)
         check_near_misses(list(table.columns), COLUMNS, f"{table.source}: column")
         check_evidence(list(table.columns), table.source)
@@ -144,7 +144,7 @@ def load_plan(name_or_path: str) -> Table:
             name: labels(table, name) if name in LABELS else numbers(table, name) for name in kept
         }
         return replace(table, columns={k: v for k, v in cells.items() if not _blank(v)})
-    plan, _ = decoded_toml(name_or_path, PlanFile, "plans", "plan", "Plans")
+    plan, _ = decoded_toml(str(source), PlanFile, "plans", "plan", "Plans")
     return plan.table(path.name)
 
 
@@ -153,13 +153,13 @@ def _blank(cells: Column) -> bool:
     return isinstance(cells, np.ndarray) and bool(np.isnan(cells).all())
 
 
-def load_measured(path: str, magnetometer: bool = True) -> Table:
-    """The stations of a run that is measured already, as a plan for one triad or both.
+def load_measured(source: str | Table, magnetometer: bool = True) -> Table:
+    """The stations of a run that is measured already, a file or a table, as a plan for one triad or both.
 
     Raises:
         InputError: it cannot be read, or does not hold the triads of the plan.
     """
-    table = tables.read(Path(path))
+    table = source if isinstance(source, Table) else tables.read(source)
     for triad, names in channels(magnetometer).items():
         missing = [name for name in names if name not in table.columns]
         if missing:
@@ -167,7 +167,7 @@ def load_measured(path: str, magnetometer: bool = True) -> Table:
                 f"{table.source}: no column {missing[0]}. The stations of a run without {triad} cannot be added to a "
                 "plan for both triads; plan without `measured`."
             )
-    return load_plan(path)
+    return load_plan(table)
 
 
 def joined(first: Table, second: Table) -> Table:

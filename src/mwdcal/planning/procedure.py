@@ -37,6 +37,10 @@ from mwdcal.use.risk import COVERAGE
 from mwdcal.use.roll_sets import RollSet
 from mwdcal.use.verification import Limits
 
+Part = tuple[int, int]
+"""Number and size of a part of all tools."""
+Tools = dict[str, AnyArray]
+"""What became of tools, by column: a row for each."""
 TOOLS_AT_ONCE = 200
 """Tools that are simulated and fitted at once, with random numbers of their own."""
 SIXTHS = np.arange(6) * np.pi / 3
@@ -151,14 +155,14 @@ class Procedure:
         """Standard uncertainties that a figure must stay away from its limit."""
         return COVERAGE if self.limits.rule == "guarded" else 0.0
 
-    def parts(self, count: int) -> list[tuple[int, int]]:
+    def parts(self, count: int) -> list[Part]:
         """Number and size of each part of so many tools."""
         return [
             (k, min(TOOLS_AT_ONCE, count - first))
             for k, first in enumerate(range(0, count, TOOLS_AT_ONCE))
         ]
 
-    def repeated(self, part: tuple[int, int]) -> dict[str, AnyArray]:
+    def repeated(self, part: Part) -> Tools:
         """What became of the tools of a part, by column: a row for each; the same for the same seed."""
         number, count = part
         rng = np.random.default_rng([self.seed, 3, number])
@@ -274,9 +278,9 @@ class Procedure:
         return columns
 
 
-def solved(procedure: Procedure, part: tuple[int, int]) -> bytes:
+def solved(repeated: Callable[[Part], Tools], part: Part) -> bytes:
     """`Procedure.repeated` in another process."""
-    return pickle.dumps(procedure.repeated(part))
+    return pickle.dumps(repeated(part))
 
 
 def column(triad: str, parameter: str) -> str:

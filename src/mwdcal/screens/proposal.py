@@ -36,14 +36,14 @@ class ProposalSummary(Profile, frozen=True, forbid_unknown_fields=True, kw_only=
     profile: str
 
 
-def summary(proposal: Proposal, run: Path, output: Path) -> dict[str, Any]:
+def summary(proposal: Proposal, run: Path, output: Path | None) -> dict[str, Any]:
     """The result for machines."""
     content = ProposalSummary(
         **{**asdict(proposal.profile), **{kind: _triad(proposal, kind) for kind in TRIADS}},
         run=run.name,
         stations=proposal.stations,
         unit_by_values=sorted(proposal.by_value),
-        profile=str(output),
+        profile=str(output or ""),
     )
     return enveloped("profile", content, proposal.metadata, run=proposal.run_sha256)
 
@@ -56,7 +56,7 @@ def _triad(proposal: Proposal, kind: str) -> ProposedTriad:
     return ProposedTriad(**triad, unexplained=result.unexplained, next_best=result.next_best)
 
 
-def screen(proposal: Proposal, run: Path, output: Path) -> str:
+def screen(proposal: Proposal, run: Path, output: Path | None) -> str:
     """The result for people."""
     profile = proposal.profile
     head = [run.name, profile.name, plural(proposal.stations, "station")]
@@ -83,8 +83,12 @@ def screen(proposal: Proposal, run: Path, output: Path) -> str:
     blocks.append(
         table(rows, ["triad", "axes", "nominal scale", "unexplained", "by the next best"])
     )
-    command = f"mwdcal calibrate {one_line(str(run))} --tool {one_line(str(output))} -o tool.json"
-    return "\n\n".join(blocks) + f"\n\n{written(profile=output)}   next: {command}"
+    if output:
+        command = (
+            f"mwdcal calibrate {one_line(str(run))} --tool {one_line(str(output))} -o tool.json"
+        )
+        blocks.append(f"{written(profile=output)}   next: {command}")
+    return "\n\n".join(blocks)
 
 
 def _scale(scale: float | None, unit: str) -> str:

@@ -97,9 +97,12 @@ def screen(document: Mapping[str, Any]) -> str:
         if rows
         else "no error common to the stations of the stand"
     )
-    follow = f"next: mwdcal calibrate {document['output']} --tool TOOL.toml -o CAL.json"
-    files = written(run=document["output"], truth=document["truth"])
-    return "\n\n".join([one_line("   ".join(head)), errors, f"{files}   {one_line(follow)}"])
+    blocks = [one_line("   ".join(head)), errors]
+    if document["output"]:
+        follow = f"next: mwdcal calibrate {document['output']} --tool TOOL.toml -o CAL.json"
+        files = written(run=document["output"], truth=document["truth"])
+        blocks.append(f"{files}   {one_line(follow)}")
+    return "\n\n".join(blocks)
 
 
 def repeated(document: Mapping[str, Any]) -> str:
@@ -118,7 +121,8 @@ def repeated(document: Mapping[str, Any]) -> str:
         [[name, str(share.count), *_percent(share)] for name, share in words.items()],
         ["of all tools", "tools", "share", "95 % interval"],
     )
-    files = written(tools=document["output"], picture=document["plot"])
+    named = {"tools": document["output"], "picture": document["plot"]}
+    files = [written(**named)] * any(named.values())
     refused = [f"refused: {', '.join(f'{k} {v}' for k, v in result.refused.items())}"] * bool(
         result.refused
     )
@@ -128,7 +132,7 @@ def repeated(document: Mapping[str, Any]) -> str:
         *refused,
         _errors(result),
         _limits(result),
-        files,
+        *files,
     ]
     return "\n\n".join(blocks)
 

@@ -136,6 +136,13 @@ def chance(probability: float | None) -> str:
     return "< 1e-9" if probability < 1e-9 else f"{probability:.2g}"
 
 
+def to_json(result: Any) -> str:
+    """A result for machines."""
+    import msgspec
+
+    return msgspec.json.format(msgspec.json.encode(result), indent=2).decode()
+
+
 def columns(stream: Any) -> int | None:
     """Columns to fill on the terminal that a stream is; None where it is none."""
     if not stream.isatty():

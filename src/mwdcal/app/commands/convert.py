@@ -7,9 +7,9 @@ from pathlib import Path
 import click
 
 from mwdcal.app.commands import options
-from mwdcal.app.messages import print_result, to_json
+from mwdcal.app.messages import print_result
 from mwdcal.errors import InputError
-from mwdcal.screens.text import one_line
+from mwdcal.screens.text import one_line, to_json
 
 
 @options.command()

@@ -23,13 +23,9 @@ def command(run: Path, output: Path, as_json: bool) -> None:
     Example: mwdcal profile export.csv -o tool.toml
     Exit: 0 written, 2 input cannot be read, 3 a choice is left open (nothing is written).
     """
-    from mwdcal.calibration.diagnosis.findings import unused_columns
-    from mwdcal.files.formats import atomic
-    from mwdcal.identification.proposal import as_toml, left_handed, propose
-    from mwdcal.screens import proposal as screen
+    from mwdcal.library import planning
 
     options.check_outputs([output], [run])
-    proposal = propose(run)
-    shown = (screen.summary if as_json else screen.screen)(proposal, run, output)
-    atomic.write(output, as_toml(proposal, run.name))
-    print_result(shown, left_handed(proposal) + unused_columns(proposal.unused))
+    result = planning.propose_profile(run)
+    result.save(output)
+    print_result(result.to_dict() if as_json else result.summary(), result.findings)

@@ -6,7 +6,8 @@ import sys
 from pathlib import Path
 
 from mwdcal.app.commands import options
-from mwdcal.app.messages import print_result, to_json
+from mwdcal.app.messages import print_result
+from mwdcal.screens.text import to_json
 from mwdcal.screens.typed import findings_as_typed
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Unpack
+from typing import Literal, Unpack
 
 import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result
-from mwdcal.errors import InputError
 
 
 @options.command()
@@ -78,8 +77,8 @@ from mwdcal.errors import InputError
 @options.JSON
 def command(
     plans: tuple[str, ...], stations: int | None, accuracy: tuple[str, ...], measured: Path | None,
-    reach: tuple[str, ...], criterion: str, speed: float, settle: float, soak: float, tool: str | None,
-    output: Path | None, html: Path | None, as_json: bool, **typed: Unpack[options.Typed],
+    reach: tuple[str, ...], criterion: Literal["D", "A", "I"], speed: float, settle: float, soak: float,
+    tool: str | None, output: Path | None, html: Path | None, as_json: bool, **typed: Unpack[options.Typed],
 ) -> None:  # fmt: skip
     """What a calibration from planned stations will give: uncertainty, rank, accuracy, hours at the stand.
 
@@ -91,44 +90,19 @@ def command(
     """
     from mwdcal.app import progress
     from mwdcal.app.choices import options_of, prior_of
-    from mwdcal.files import profiles
-    from mwdcal.files.formats import atomic, table
-    from mwdcal.planning import planned
-    from mwdcal.planning.moves import Stand
-    from mwdcal.planning.plans import load_measured, load_plan, run_sheet
+    from mwdcal.library import planning
     from mwdcal.screens import plan as screen
 
     options.check_outputs([output], [tool, measured, *plans], page=html)
-    if len(plans) > 1 and (accuracy or stations or measured):
-        raise InputError("`plan`: one plan holds the candidates to choose from. Name it alone.")
-    prior, _ = prior_of(typed["prior"])
-    profile, digest = profiles.load_profile(tool)
-    chosen = options_of(typed, prior)
-    stand = Stand(speed, settle, soak, screen.reach(reach))
-    tables = [load_plan(name) for name in plans]
-    done = load_measured(str(measured), profile.has_magnetometer) if measured else None
-    candidates = tables[0] if tables else None
     with progress.bar("planning") as show:
-        if accuracy:
-            wanted = screen.wanted_accuracy(accuracy)
-            result = [
-                planned.smallest_plan(candidates, wanted, profile, chosen, stand, done, stations)
-            ]
-        elif stations or done:
-            search = profile, chosen, criterion, stand, done
-            result = [planned.best_plan(candidates, stations or 1, *search)]
-        else:
-            result = []
-            for each in tables or [load_plan("twenty-four-state")]:
-                result.append(planned.judged(each, profile, chosen, stand))
-                show(len(result), len(tables))
-    shown = screen.document if as_json else screen.screen
-    digests = {"profile": digest, "measured": done.digest if done else ""}
-    text = shown(result, digests, output, html)
+        result = planning.plan(
+            tool or "generic", plan=plans, stations=stations, measured=measured,
+            accuracy_deg=screen.wanted_accuracy(accuracy), reach=screen.reach(reach), criterion=criterion,
+            speed=speed, settle=settle, soak=soak, options=options_of(typed, prior_of(typed["prior"])[0]),
+            progress=show,
+        )  # fmt: skip
     if output:
-        table.write(output, run_sheet(result[0].plan, profile.has_magnetometer))
+        result.save(output)
     if html:
-        from mwdcal.pages.plan import render
-
-        atomic.write(html, render(result))
-    print_result(text, screen.findings(result))
+        result.report(html)
+    print_result(result.to_dict() if as_json else result.summary(), result.findings)

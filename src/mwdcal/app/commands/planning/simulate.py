@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Unpack
 
@@ -10,18 +12,11 @@ import click
 from click.core import ParameterSource
 
 from mwdcal.app.commands import options
-from mwdcal.app.messages import print_result, to_json
+from mwdcal.app.messages import print_result
 from mwdcal.errors import InputError
 
 if TYPE_CHECKING:
-    from mwdcal.calibration.options import Options
-    from mwdcal.calibration.record import Calibration
-    from mwdcal.files.formats.table import Table
-    from mwdcal.geometry.vectors import AnyArray
-    from mwdcal.planning.effects import Effects
-    from mwdcal.planning.procedure import Procedure
-    from mwdcal.planning.simulate import Truth
-    from mwdcal.sensor.profile import Profile
+    from mwdcal.planning.procedure import Part, Tools
 
 MOST_TOOLS = 100_000
 """Repetitions of a procedure."""
@@ -85,15 +80,34 @@ def command(
     Example: mwdcal simulate --plan moosavi-12 --tool servo --repeat 1000 -o tools.parquet
     Exit: 0 written, 2 input cannot be read, 3 the plan cannot give a calibration.
     """
+    from mwdcal.app import pool
+
     _check(repeat, truth, calibration, tool)
     options.check_outputs(
         [output, truth], [plan, tool, calibration, effects, rolltest, limits], plot
     )
-    scene = _scene(plan, tool, calibration, effects, typed)
+    with pool.preparing(workers) if repeat else nullcontext():  # these imports, in the workers too
+        from mwdcal.app.choices import options_of, prior_of
+        from mwdcal.library import simulation
+    chosen = options_of(typed, prior_of(typed["prior"])[0])
+    result: simulation.RepeatedProcedure | simulation.SimulatedReadings
     if repeat:
-        _repeat(scene, typed["seed"], repeat, rolltest, limits, workers, output, plot, as_json)
+        result = simulation.simulate(
+            plan, tool, repeat=repeat, seed=typed["seed"], calibration=calibration, effects=effects,
+            rolltest=rolltest, limits=limits, options=chosen, mapper=partial(_by_workers, workers),
+        )  # fmt: skip
+        result.save(output, plot)
     else:
-        _simulate(scene, typed["seed"], output, truth, as_json)
+        result = simulation.simulate(
+            plan,
+            tool,
+            seed=typed["seed"],
+            calibration=calibration,
+            effects=effects,
+            order=chosen.order,
+        )
+        result.save(output, truth)
+    print_result(result.to_dict() if as_json else result.summary())
 
 
 def _check(
@@ -119,125 +133,19 @@ def _check(
         raise InputError(f"`{inert[0]}` goes with `repeat`. Leave it out, or add `repeat`.")
 
 
-@dataclass(frozen=True)
-class _Scene:
-    """What is simulated: plan, profile, effects, the tool of a calibration, the fit; digests of their files."""
-
-    plan: Table
-    profile: Profile
-    effects: Effects
-    options: Options
-    digests: dict[str, str]
-    record: Calibration | None = None
-    tool: Truth | None = None
-
-    @property
-    def order(self) -> int | None:
-        """The order of a tool drawn; None: as the plan allows."""
-        return None if self.options.order == "auto" else max(self.options.orders)
-
-
-def _scene(
-    plan: str, tool: str | None, calibration: Path | None, effects: str | None,
-    typed: options.Typed,
-) -> _Scene:  # fmt: skip
-    """The files that the command names, read."""
-    from mwdcal.app.choices import options_of, prior_of
-    from mwdcal.files import profiles
-    from mwdcal.planning.effects import load_effects
-    from mwdcal.planning.plans import load_plan
-    from mwdcal.planning.session import calibrated_tool
-    from mwdcal.registry.calibration_source import calibration_of
-
-    chosen = options_of(typed, prior_of(typed["prior"])[0])
-    table = load_plan(plan)
-    physics, digest = load_effects(effects or "none")
-    digests = {"plan": table.digest, "effects": digest if effects else ""}
-    if calibration:
-        record, digests["calibration"] = calibration_of(calibration)
-        true, profile = calibrated_tool(record)
-        return _Scene(table, profile, physics, chosen, digests, record, true)
-    profile, digests["profile"] = profiles.load_profile(tool or "servo")
-    return _Scene(table, profile, physics, chosen, digests)
-
-
-def _simulate(scene: _Scene, seed: int, output: Path, truth: Path | None, as_json: bool) -> None:
-    """One run."""
-    import numpy as np
-
-    from mwdcal.calibration.readings import serial_of
-    from mwdcal.files.formats import atomic, table
-    from mwdcal.planning import session as sessions
-    from mwdcal.planning.simulate import drawn
-    from mwdcal.screens import simulation as screen
-
-    rng = np.random.default_rng([seed, 2])
-    session = sessions.Session.of(scene.plan, scene.profile, scene.effects)
-    order = session.highest_order if scene.order is None else scene.order
-    tool = scene.tool or drawn(rng, scene.profile, order)
-    known = serial_of(scene.record.tool) if scene.record else None
-    serial = known or f"SIM-{seed}"
-    run, facts = sessions.simulated_run(session, tool, seed, rng, serial)
-    facts |= sessions.tool_facts(tool, session.profile, scene.record)
-    document = screen.document(session, facts, scene.digests, serial, output=output, truth=truth)
-    rendered = table.rendered(output, run)
-    atomic.write_all([(output, rendered), (truth, to_json(document) + "\n")])
-    print_result(document if as_json else screen.screen(document))
-
-
-def _repeat(
-    scene: _Scene, seed: int, count: int, rolltest: str, limits: str, workers: int | None, output: Path,
-    plot: Path | None, as_json: bool,
-) -> None:  # fmt: skip
-    """A whole procedure many times."""
-    from mwdcal.app import pool
-
-    with pool.preparing(workers):  # these imports, in the workers too
-        from mwdcal.files.formats import atomic, table
-        from mwdcal.files.limits import load_limits
-        from mwdcal.pages.pictures import picture
-        from mwdcal.pages.repetition import figure
-        from mwdcal.planning.plans import load_plan
-        from mwdcal.planning.procedure import Procedure
-        from mwdcal.planning.repetition import as_table, summarised
-        from mwdcal.screens import simulation as screen
-
-    test, (bounds, digest) = load_plan(rolltest), load_limits(limits)
-    procedure = Procedure.of(
-        scene.plan, test, scene.profile, scene.options, bounds,
-        seed, scene.effects, scene.order, scene.tool,
-    )  # fmt: skip
-    digests = {**scene.digests, "rolltest": test.digest, "limits": digest}
-    columns = _columns(procedure, count, workers)
-    summary = summarised(columns, procedure.judged, procedure.guard)
-    facts = {
-        "seed": seed, "order": procedure.order, "repetition": summary,
-        "reference_temperature_c": scene.profile.reference_temperature_c,
-    }  # fmt: skip
-    document = screen.document(
-        procedure.calibrating, facts, digests, None, output=output, plot=plot
-    )
-    rendered = table.rendered(output, as_table(columns, procedure))
-    title = scene.plan.source, procedure.guard
-    drawn = picture(figure(columns, procedure.judged, *title), plot.suffix) if plot else b""
-    atomic.write_all([(output, rendered), (plot, drawn)])
-    print_result(document if as_json else screen.repeated(document))
-
-
-def _columns(procedure: Procedure, count: int, workers: int | None) -> dict[str, AnyArray]:
-    """The columns of all tools, by all cores; they do not depend on how many these are."""
+def _by_workers(
+    workers: int | None, repeated: Callable[[Part], Tools], parts: Sequence[Part]
+) -> list[Tools]:
+    """The columns of all parts, by all cores; they do not depend on how many these are."""
     import pickle
-    from functools import partial
 
     from mwdcal.app import pool, progress
     from mwdcal.planning.procedure import solved
-    from mwdcal.planning.repetition import joined
     from mwdcal.use.correction_numba import cores
 
-    parts, done = procedure.parts(count), {}
-    steps = pool.Steps(tuple, partial(solved, procedure))
+    steps, done = pool.Steps(tuple, partial(solved, repeated)), {}
     with progress.bar("simulating") as show:
         for index, result in pool.results(steps, parts, workers or cores(), None):
             done[index] = pickle.loads(result)  # of our own workers
             show(len(done), len(parts))
-    return joined([done[index] for index in range(len(parts))])
+    return [done[index] for index in range(len(parts))]
