@@ -41,7 +41,7 @@ MWDCAL = (sys.executable, "-m", "mwdcal")
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 
-from mwdcal.app import pool  # noqa: E402
+from mwdcal import pool  # noqa: E402
 from mwdcal.files.formats import atomic  # noqa: E402
 from mwdcal.fleet import sources  # noqa: E402
 from mwdcal.fleet import tables as fleet_tables  # noqa: E402

@@ -15,7 +15,8 @@ from typing import Any
 
 import msgspec
 
-from mwdcal.app import pool, progress
+from mwdcal import pool
+from mwdcal.app import progress
 from mwdcal.app.choices import options_of, prior_of
 from mwdcal.app.commands.options import Typed
 from mwdcal.calibration.automatic.nonlinearity import with_strengths

@@ -4,27 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+from mwdcal.library.papers import certificate as certificate
+from mwdcal.library.papers import check_signature as check_signature
+from mwdcal.library.papers import sign as sign
+from mwdcal.library.registries import registry as registry
+
 
 def fleet(*arguments: Any, **choices: Any) -> Any:
-    """To be written."""
-    raise NotImplementedError
-
-
-def certificate(*arguments: Any, **choices: Any) -> Any:
-    """To be written."""
-    raise NotImplementedError
-
-
-def sign(*arguments: Any, **choices: Any) -> Any:
-    """To be written."""
-    raise NotImplementedError
-
-
-def check_signature(*arguments: Any, **choices: Any) -> Any:
-    """To be written."""
-    raise NotImplementedError
-
-
-def registry(*arguments: Any, **choices: Any) -> Any:
     """To be written."""
     raise NotImplementedError

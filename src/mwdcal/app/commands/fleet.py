@@ -60,7 +60,7 @@ def command(
     Example: mwdcal fleet folder -o cals.parquet --tool tool.toml --calibrations tools
     Exit: 0 at least one tool calibrated, 2 input cannot be read, 3 not a single one.
     """
-    from mwdcal.app import pool
+    from mwdcal import pool
 
     with pool.preparing(1 if scheduler else workers):  # these imports, in the workers too
         from mwdcal.app import fleet_table

@@ -190,7 +190,7 @@ def _repeat(
     plot: Path | None, as_json: bool,
 ) -> None:  # fmt: skip
     """A whole procedure many times."""
-    from mwdcal.app import pool
+    from mwdcal import pool
 
     with pool.preparing(workers):  # these imports, in the workers too
         from mwdcal.files.formats import atomic, table
@@ -229,7 +229,8 @@ def _columns(procedure: Procedure, count: int, workers: int | None) -> dict[str,
     import pickle
     from functools import partial
 
-    from mwdcal.app import pool, progress
+    from mwdcal import pool
+    from mwdcal.app import progress
     from mwdcal.planning.procedure import solved
     from mwdcal.planning.repetition import joined
     from mwdcal.use.correction_numba import cores
