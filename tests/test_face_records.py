@@ -1,13 +1,17 @@
 """Records from Python against the command line: the same text, JSON and table, and errors with a remedy."""
 
 import hashlib
+import importlib
 import json
+import subprocess
+import sys
+from types import ModuleType
 
 import msgspec
 import pytest
 
 import mwdcal
-from cli_support import EXAMPLE
+from cli_support import EXAMPLE, servo_run, write_csv
 from cli_support import mwdcal as command
 from mwdcal.errors import FitError, InputError
 from mwdcal.files import documents
@@ -368,3 +372,150 @@ def test_an_encrypted_key_needs_its_passphrase(here, tmp_path, monkeypatch):
     monkeypatch.setenv(keys.PASSPHRASE, "word")
     mwdcal.sign("new.json", tmp_path / "lab.key", output=tmp_path / "b.json")
     assert documents.read(tmp_path / "b.json").serial == "SIM-0001"
+
+
+# ------------------------------------------------------------------------------- many tools
+
+UNEQUAL = ("seconds", "tools_per_second", "parts_done_before")
+"""Facts of a fleet that no two calls have in common."""
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """A folder of runs of three tools, one of which cannot be calibrated."""
+    pytest.importorskip("pyarrow")
+    folder = tmp_path_factory.mktemp("fleet") / "runs"
+    folder.mkdir()
+    for seed in (1, 2):
+        write_csv(folder / f"T-{seed}.csv", servo_run(seed, (10, 60, 90, 130), 7))
+    few = {name: column[:3] for name, column in servo_run(3).items()}
+    write_csv(folder / "T-3.csv", few)
+    return folder
+
+
+def timeless(text):
+    """The text of a fleet without its rate."""
+    return text.rstrip("\n").rpartition("   ")[0]
+
+
+@pytest.mark.parametrize(
+    ("choices", "typed"),
+    [
+        ({}, ()),
+        ({"robust": "huber", "prior": "datasheet"}, ("--robust", "huber", "--prior", "datasheet")),
+        (
+            {"nonlinearity": ("magnetometer",), "order": "auto"},
+            ("--nonlinearity", "magnetometer", "--order", "auto"),
+        ),
+        (
+            {"estimate": ("azimuth-zero",), "ignore": ("dip",)},
+            ("--estimate", "azimuth-zero", "--ignore", "dip"),
+        ),
+    ],
+    ids=lambda value: "" if isinstance(value, dict) else "-".join(value) or "defaults",
+)
+def test_a_fleet_is_that_of_the_command(runs, tmp_path, choices, typed):
+    import pyarrow.parquet as pq
+
+    output = tmp_path / "cals.parquet"
+    line = ("fleet", runs, "-o", output, "--tool", "servo", "--workers", 1, *typed)
+    ran, said = command(*line, "--json"), command(*line)
+    theirs = pq.read_table(output)
+    fleet = mwdcal.fleet(runs, "servo", output=output, workers=1, **choices)
+    agrees(fleet, ran, without=UNEQUAL)
+    assert timeless(fleet.summary()) == timeless(said.out)
+    assert len(repr(fleet)) <= LONGEST_LINE
+    assert [f"! {each.text}" for each in fleet.findings] == [
+        line for line in said.err.splitlines() if line.startswith("! ")
+    ]
+    ours = pq.read_table(output)
+    assert ours.drop_columns(["calibration"]) == theirs.drop_columns(["calibration"])
+    assert (len(fleet), fleet.calibrated, [*fleet]) == (3, 2, ["T-1", "T-2", "T-3"])
+    for name in set(theirs.column_names) - {"calibration"}:
+        cells = [None if c != c else c for c in fleet.columns[name].tolist()]
+        assert cells == theirs.column(name).to_pylist(), name
+
+
+def test_a_fleet_in_memory_has_calibrations_and_goes_where_it_is_saved(runs, tmp_path):
+    profile = mwdcal.load_profile("servo")
+    heard = []
+    fleet = mwdcal.fleet(runs, profile, workers=1, progress=heard.append)
+    assert any("3 tools" in text for text in heard)
+    assert "in memory" in fleet.summary()
+    assert fleet.to_dict()["output"] == ""
+    assert "T-2" in fleet
+    cal = fleet["T-2"]
+    readings = mwdcal.read_run(runs / "T-2.csv", profile)
+    single = mwdcal.calibrate(readings, order=0, nonlinearity=())
+    assert cal.serial == "T-2"
+    assert cal.fields(readings)[0] == pytest.approx(single.fields(readings)[0], abs=1e-9)
+    fleet.save(tmp_path / "cals.parquet")
+    assert mwdcal.load(f"{tmp_path / 'cals.parquet'}#T-2") == cal
+    mwdcal.save(fleet, tmp_path / "again.parquet")
+    assert fleet.save_calibrations(tmp_path / "each") == 2
+    assert mwdcal.load(tmp_path / "each" / "T-1.json") == fleet["T-1"]
+    folder = fleet.path.parent
+    assert folder.exists()
+    del fleet
+    assert not folder.exists()
+
+
+def test_the_page_of_a_fleet_is_that_of_the_command(runs, tmp_path):
+    pytest.importorskip("matplotlib")
+    output, page = tmp_path / "cals.parquet", tmp_path / "page.html"
+    fleet = mwdcal.fleet(runs, "servo", output=output, workers=1)
+    fleet.report(page)
+    assert "<html" in page.read_text("utf-8")
+    assert f"{page} (report)" in fleet.summary()
+    assert fleet.to_dict()["report"] == str(page)
+
+
+def test_a_fleet_refuses_with_a_remedy(runs, tmp_path):
+    for wrong, words in (
+        ({"runs": tmp_path / "none"}, "no such|cannot be read"),
+        ({"tool": "none"}, "none"),
+        ({"workers": 0}, "`workers` must be 1 or more"),
+        ({"output": tmp_path / "cals.csv"}, r"ends in \.parquet"),
+        ({"output": runs / "cals.parquet"}, "part of the input folder"),
+        ({"robst": "huber"}, "unknown option 'robst'.*Did you mean 'robust'"),
+        ({"order": (0, 1)}, "`order` of a fleet must be"),
+        ({"prior": "cal.json"}, "must be 'datasheet'|prior of a fleet"),
+    ):
+        given = {"runs": runs, "tool": "servo", "workers": 1, **wrong}
+        with pytest.raises(InputError, match=words):
+            mwdcal.fleet(**given)
+    fleet = mwdcal.fleet(runs, "servo", workers=1)
+    for wrong, words in (
+        (lambda: fleet["T-3"], "was not calibrated"),
+        (lambda: fleet["T-9"], "has no tool"),
+        (lambda: fleet.save(tmp_path / "cals.csv"), r"ends in \.parquet"),
+        (
+            lambda: mwdcal.fleet(tmp_path / "a.parquet", output=tmp_path / "a.parquet"),
+            "no such|cannot",
+        ),
+    ):
+        with pytest.raises(InputError, match=words):
+            wrong()
+
+
+@pytest.mark.slow
+def test_workers_do_not_run_the_script_of_the_caller_again(runs, tmp_path):
+    """A script without a guard: three parts, by two processes."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import mwdcal\nfrom mwdcal import pool\nprint('once')\n"
+        "steps = pool.Steps(int, bytes)\n"
+        "print(sorted(pool.results(steps, [1, 2, 3], 2, None)))\n",
+        "utf-8",
+    )
+    ran = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+    assert ran.stdout.splitlines() == ["once", str([(n - 1, bytes(n)) for n in (1, 2, 3)])], ran
+
+
+def test_rooms_do_not_take_the_place_of_functions():
+    names = ("certificate", "fleet", "registry", "survey")
+    for name in names:
+        importlib.import_module(
+            f"mwdcal.{name}.document" if name == "certificate" else f"mwdcal.{name}"
+        )
+        assert not isinstance(getattr(mwdcal, name), ModuleType), name
