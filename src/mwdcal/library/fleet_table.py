@@ -39,8 +39,7 @@ from mwdcal.fleet.tables import (
 )
 from mwdcal.screens.envelope import enveloped
 from mwdcal.screens.fleet import FleetSummary, stated_options, summarise
-from mwdcal.screens.progress import slowly
-from mwdcal.screens.text import plural
+from mwdcal.screens.text import plural, slowly
 from mwdcal.screens.typed_options import Typed
 from mwdcal.sensor.profile import Profile
 from mwdcal.use.correction_numba import cores
