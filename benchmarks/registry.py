@@ -80,10 +80,9 @@ def renamed(record: Calibration, serial: str, year: int) -> str:
 
 def imported(registry: Registry, paths: list[Path], workers: int) -> None:
     """Add tables as `mwdcal registry add` does."""
-    from mwdcal.app.commands.records.registry_add import _add_all
-
     portions = imports.portions(imports.sources(paths))
-    _add_all(imports.Adding(registry, "bench"), portions, workers)
+    adding = imports.Adding(registry, "bench")
+    imports.add_all(adding, portions, workers, lambda done, total: None)
 
 
 def pages(registry: Registry, count: int) -> dict[str, Callable[[int], object]]:

@@ -19,6 +19,8 @@ SOURCE = ROOT / "src" / "mwdcal"
 # From the bottom up: a room imports from rooms below it. Rooms of one floor are strangers.
 FLOORS = (
     ("errors",),
+    ("signals",),
+    ("pool",),
     ("geometry",),
     ("sensor",),
     ("estimation",),

@@ -11,10 +11,10 @@ import msgspec
 import pytest
 
 from cli_support import EXAMPLE, ROOT, mwdcal, refused
-from mwdcal.app.commands.records import certificate_issue
 from mwdcal.certificate.document import Certificate
 from mwdcal.certificate.laboratory import load_laboratory
 from mwdcal.errors import InputError
+from mwdcal.library.papers import Paper
 from test_schemas import checked
 
 pytest.importorskip("jsonschema")
@@ -203,9 +203,9 @@ def test_all_files_are_written_or_none(here, tmp_path, monkeypatch):
     def fails(*_):
         raise InputError("`output` cannot be made. Try another form.")
 
-    whole = certificate_issue._form
+    whole = Paper.form
     monkeypatch.setattr(
-        certificate_issue, "_form", lambda p, *r: fails() if p.name == "D.json" else whole(p, *r)
+        Paper, "form", lambda paper, p: fails() if p.name == "D.json" else whole(paper, p)
     )
     line = ("certificate", "new.json", "-o", tmp_path / "C.json", "-o", tmp_path / "D.json")
     refused(mwdcal(*line), 2)

@@ -12,8 +12,8 @@ import time
 import pytest
 
 from cli_support import EXAMPLE, mwdcal, process
-from mwdcal.app import fleet_table
 from mwdcal.app.interruption import Ended, held, orderly_end, report
+from mwdcal.library import fleet_table
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 

@@ -689,8 +689,8 @@ def test_the_least_probability_that_is_drawn_is_a_bound(years):
 def test_comparing_reports_its_progress(years, tmp_path):
     pytest.importorskip("sqlalchemy")
     from cli_support import mwdcal
-    from mwdcal.app.commands.records.drift_sources import of_registry
     from mwdcal.files import documents
+    from mwdcal.library.drifts import of_registry
     from mwdcal.registry.store import open_registry
 
     (tmp_path / "files").mkdir()

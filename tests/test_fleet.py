@@ -1,5 +1,6 @@
 """Many tools in one table: as `calibrate` has each alone, bad ones too; parts, restart, cluster."""
 
+import importlib
 import json
 import os
 import shutil
@@ -41,7 +42,7 @@ MWDCAL = (sys.executable, "-m", "mwdcal")
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 
-from mwdcal.app import pool  # noqa: E402
+from mwdcal import pool  # noqa: E402
 from mwdcal.files.formats import atomic  # noqa: E402
 from mwdcal.fleet import sources  # noqa: E402
 from mwdcal.fleet import tables as fleet_tables  # noqa: E402
@@ -389,7 +390,7 @@ def test_one_member_that_stops_the_batch_does_not_stop_the_others(tmp_path, monk
             raise np.linalg.LinAlgError("no convergence")
         return fit(readings, options)
 
-    monkeypatch.setattr("mwdcal.fleet.calibrate.fit", fragile)
+    monkeypatch.setattr(importlib.import_module("mwdcal.fleet.calibrate"), "fit", fragile)
     runs = {f"T{seed}": short_run(seed) for seed in range(5)}
     runs["T3"]["ax"][0] = 50.0
     rows = calibrated(write_fleet(tmp_path / "runs.parquet", runs))

@@ -16,8 +16,8 @@ pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 openpyxl = pytest.importorskip("openpyxl")
 
-from mwdcal.app import fleet_table  # noqa: E402
 from mwdcal.files.formats import members, parquet  # noqa: E402
+from mwdcal.library import fleet_table  # noqa: E402
 
 FIT = ("--order", 0, "--nonlinearity", "none")
 """The options of `calibrate` that are the defaults of a fleet."""

@@ -8,7 +8,7 @@ import shutil
 import pytest
 
 from cli_support import mwdcal, refused
-from mwdcal.app import pool
+from mwdcal import pool
 from mwdcal.files.formats import atomic, parquet
 from mwdcal.fleet import kept
 from mwdcal.fleet import tables as fleet_tables

@@ -605,7 +605,7 @@ def test_files_lie_where_the_certificate_says_or_beside_it(tmp_path, files, key,
 def test_a_date_that_cannot_be_is_said(tmp_path, key, public, monkeypatch, time, said):
     """The date is the signer's claim: the signature is intact nevertheless."""
     if time is not None:
-        monkeypatch.setattr("mwdcal.certificate.signature.now", lambda: time)
+        monkeypatch.setattr(signature, "now", lambda: time)
     path = signed(certificate(tmp_path), key)
     monkeypatch.undo()
     ran = mwdcal("certificate", "verify", path, "--key", public, "--json")

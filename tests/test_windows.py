@@ -20,7 +20,8 @@ from types import SimpleNamespace
 import pytest
 
 from cli_support import EXAMPLE, mwdcal, refused, servo_run, write_csv
-from mwdcal.app import cli, interruption, messages, pool
+from mwdcal import pool
+from mwdcal.app import cli, interruption, messages
 from mwdcal.certificate import keys as key_files
 from mwdcal.errors import InputError
 from mwdcal.files.formats import atomic, sinks

@@ -36,16 +36,13 @@ def load_calibration(path: Path, keys: Sequence[Path]) -> LoadedCalibration:
 
     Where there are keys, an unsigned calibration is a finding too.
     """
-    from mwdcal.certificate.signature import FINDING_OF_STATE, check
+    from mwdcal.certificate.signature import check, signature_doubts
     from mwdcal.certificate.trusted_keys import trusted
 
     trust = trusted(keys)
     file = calibration_file(path)
     calibration, checked = documents.decoded(file), check(file.record, trust)
-    findings = [Finding(id=FINDING_OF_STATE[checked.state], text=checked.text)]
-    sound = checked.state == "intact" or (checked.state == "unsigned" and not keys)
-    if sound or (checked.state == "altered" and calibration.changed):  # which is a finding itself
-        findings = []
+    findings = signature_doubts(checked, calibration, bool(keys))
     return LoadedCalibration(calibration, file.digest, checked, findings)
 
 

@@ -6,10 +6,12 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from threading import Timer, current_thread, main_thread
-from typing import Any
+from threading import Timer, main_thread
+
+from mwdcal.signals import held as held
+from mwdcal.signals import replaced
 
 SIGNAL = 128
 """Exit status of a command ended by a signal, less the number of the signal."""
@@ -38,7 +40,7 @@ def orderly_end() -> Iterator[None]:
             os._exit(SIGNAL + number)
 
     defaults = (signal.SIG_DFL, signal.default_int_handler)
-    handlers = _replaced(end, lambda handler: handler in defaults)
+    handlers = replaced(end, lambda handler: handler in defaults)
     try:
         with _raised_again(received):
             yield
@@ -78,39 +80,11 @@ def _signal_main_thread(number: int) -> None:
         signal.pthread_kill(main_thread().ident or 0, number)
 
 
-@contextmanager
-def held() -> Iterator[None]:
-    """Signals to end wait until the block is over, as what it begins must not be left half begun."""
-    waiting: list[int] = []
-    handlers = _replaced(lambda number, frame: waiting.append(number), callable)
-    try:
-        yield
-    finally:
-        for each, handler in handlers.items():
-            signal.signal(each, handler)
-        if waiting:
-            signal.raise_signal(waiting[0])
-
-
 def _cause(error: BaseException | None) -> Ended | None:
     """The end that an error was raised for."""
     while error is not None and not isinstance(error, Ended):
         error = error.__cause__ or error.__context__
     return error
-
-
-def _replaced(
-    new: Callable[[int, object], None], replaceable: Callable[[Any], bool]
-) -> Mapping[signal.Signals, Any]:
-    """What handled the signals that ask a process to end, before `new` did; none outside the main thread."""
-    if current_thread() is not main_thread():
-        return {}
-    names = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")  # the last is Ctrl-Break of Windows
-    handlers = {s: signal.getsignal(s) for s in signal.Signals if s.name in names}
-    before = {each: handler for each, handler in handlers.items() if replaceable(handler)}
-    for each in before:
-        signal.signal(each, new)
-    return before
 
 
 def report(stop: BaseException) -> tuple[str, int]:

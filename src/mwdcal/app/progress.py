@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 from mwdcal.app.messages import quiet
+from mwdcal.screens.text import PATIENCE
+from mwdcal.screens.text import slowly as slowly
 
-PATIENCE = 2.0
-"""Seconds before there is anything to see."""
 MOMENT = 0.1
 """Seconds after which a bar moves."""
 
@@ -50,16 +49,3 @@ def _show(label: str, known: Mapping[str, Any], over: threading.Event) -> None:
         while not over.wait(MOMENT):
             shown.update(task, **known)
         shown.update(task, **known)
-
-
-def slowly(say: Callable[[str], None], every: float = PATIENCE) -> Callable[[str], None]:
-    """`say`, but silent for the first seconds and between two messages."""
-    last = time.monotonic()
-
-    def say_slowly(text: str) -> None:
-        nonlocal last
-        if time.monotonic() - last >= every:
-            last = time.monotonic()
-            say(text)
-
-    return say_slowly

@@ -19,6 +19,7 @@ from typing import Any, Literal
 import msgspec
 
 from mwdcal.calibration.canonical import Signature, SignatureCheck, canonical, signed_form
+from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.certificate.document import SourceFile
 from mwdcal.certificate.keys import PrivateKey, TrustedKey, available, now
 from mwdcal.certificate.trusted_keys import moment
@@ -173,6 +174,16 @@ def check(data: bytes, trusted: Mapping[str, TrustedKey]) -> SignatureCheck:
         return _said("unchecked", fields, signature, key)
     intact = key.verifies(value, message(fields, signature))
     return _said(_standing(key, signature) if intact else "altered", fields, signature, key)
+
+
+def signature_doubts(
+    checked: SignatureCheck, calibration: Calibration, wanted: bool
+) -> list[Finding]:
+    """What the signature of a calibration file is a finding of; that there is none, only where it is `wanted`."""
+    sound = checked.state == "intact" or (checked.state == "unsigned" and not wanted)
+    if sound or (checked.state == "altered" and calibration.changed):  # which is a finding itself
+        return []
+    return [Finding(id=FINDING_OF_STATE[checked.state], text=checked.text)]
 
 
 def _has_the_form(data: bytes, fields: Mapping[str, Any], signature: Signature) -> bool:

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import Any, Literal, cast
+from typing import Any, Literal, Protocol, cast, runtime_checkable
 
 import msgspec
 import numpy as np
@@ -275,8 +275,16 @@ def apply(
     )
 
 
+@runtime_checkable
+class Savable(Protocol):
+    """A result that writes itself, in the form that the suffix of a file names."""
+
+    def save(self, path: Path) -> None:
+        """Write the result."""
+
+
 def save(
-    result: Calibration | Readings,
+    result: Calibration | Readings | Savable,
     path: Path,
     profile: Path | Profile | None = None,
     *,
@@ -287,8 +295,12 @@ def save(
     A run is a CSV, TSV, Parquet or XLSX file, by the suffix. Its channels are raw: in the axes and
     units of the `profile`, by default the one that the run was read with, else g and nT along the
     tool axes. `decimals` are places after the point, by default as many as there are. A file is
-    written whole or not at all.
+    written whole or not at all. A result that has a form of its own for each suffix, such as a
+    certificate, writes itself.
     """
+    if isinstance(result, Savable):
+        result.save(path)
+        return
     if isinstance(result, Calibration):
         documents.write(path, result)
         return

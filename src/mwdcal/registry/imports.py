@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import NamedTuple
 import msgspec
 from msgspec.structs import replace
 
+from mwdcal import pool
 from mwdcal.calibration.readings import future_day, stated_day
 from mwdcal.errors import InputError, MwdcalError
 from mwdcal.files.formats import members
@@ -26,13 +27,18 @@ from mwdcal.registry.store import Draft, Entry, Registry, draft
 
 FILES_AT_ONCE = 50
 """Files of a portion."""
+FEWEST_PORTIONS = 3
+"""Portions of work from which workers of their own are worth their start."""
 RECORDS_AT_ONCE = 1000
 """Records that are added in one transaction."""
 COUNTS = ("new", "known", "refused")
 
 
 class Source(NamedTuple):
-    """A file to add, or a row group of the table of a fleet; of an export, what its manifest says of it."""
+    """A file to add, or a row group of the table of a fleet; of an export, what its manifest says of it.
+
+    `data`: the bytes of a file that is in memory alone, and has no path but a name.
+    """
 
     path: Path
     group: int | None = None
@@ -41,6 +47,7 @@ class Source(NamedTuple):
     serial: str | None = None
     sha256: str = ""
     reason: str | None = None
+    data: bytes = b""
 
 
 @dataclass
@@ -147,7 +154,7 @@ def _entries(source: Source) -> Iterable[Entry]:
     """The records that a source is said, or seen, to be."""
     if source.group is not None:
         return contents.of_fleet(source.path, source.group)
-    data = contents.content(source.path)
+    data = source.data or contents.content(source.path)
     if not source.kind:
         return contents.of_bytes(data, source.path.name)
     if content_address(data) != source.sha256:
@@ -249,3 +256,23 @@ class Adding:
         self._files[source.path] = replace(
             before, kind=before.kind or kind, message=before.message or message, **counts
         )
+
+
+def add_all(
+    adding: Adding,
+    portions: Sequence[Sequence[Source]],
+    workers: int,
+    advance: Callable[[int, int], None],
+) -> None:
+    """Add portions in their order, by workers if there are enough of them; `advance` hears how many are done."""
+    steps, ready, following = pool.Steps(list, solve), {}, 0
+    for index, result in pool.results(
+        steps, portions, workers if len(portions) >= FEWEST_PORTIONS else 1, None
+    ):
+        ready[index] = result
+        while following in ready:
+            for each in pickle.loads(ready.pop(following)):  # of our own workers
+                adding.take(each)
+            following += 1
+        advance(following, len(portions))
+    adding.finish()

@@ -263,7 +263,9 @@ def text(summary: FleetSummary, report: Path | None) -> str:
         orders = [[triad, *map(str, counts.values())] for triad, counts in summary.orders.items()]
         blocks.append(table(orders, ["tools of order", *map(str, range(HIGHEST + 1))]))
     rate = f"{summary.seconds:.1f} s, {summary.tools / summary.seconds:.0f} tools/s"
-    files = written(calibrations=summary.output, report=report)
+    files = "in memory"
+    if summary.output or report:
+        files = written(calibrations=summary.output, report=report)
     return "\n".join(["\n\n".join(blocks), *_remarks(summary), "", f"{files}   {rate}"])
 
 

@@ -7,10 +7,13 @@ import math
 import os
 import re
 import sys
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Callable, Iterable, Sequence
 from itertools import zip_longest
 from typing import Any, TypeAlias
 
+PATIENCE = 2.0
+"""Seconds before there is any progress to see."""
 NARROWEST, WIDEST = 80, 160
 """Columns for which a terminal gets its tables and lines, however many it has."""
 NOT_STATED = "not stated"
@@ -294,3 +297,16 @@ def raised(symbol: str, power: int) -> str:
     ['', 'τ', 'τ²']
     """
     return symbol + superscript(power) if power > 1 else symbol * power
+
+
+def slowly(say: Callable[[str], None], every: float = PATIENCE) -> Callable[[str], None]:
+    """`say`, but silent for the first seconds and between two messages."""
+    last = time.monotonic()
+
+    def say_slowly(text: str) -> None:
+        nonlocal last
+        if time.monotonic() - last >= every:
+            last = time.monotonic()
+            say(text)
+
+    return say_slowly

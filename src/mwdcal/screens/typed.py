@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import click
 from msgspec.structs import replace
 
-from mwdcal.calibration.record import Finding
+if TYPE_CHECKING:
+    from mwdcal.calibration.record import Finding
 
 
 def as_typed(text: str) -> str:

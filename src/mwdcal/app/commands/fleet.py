@@ -60,12 +60,13 @@ def command(
     Example: mwdcal fleet folder -o cals.parquet --tool tool.toml --calibrations tools
     Exit: 0 at least one tool calibrated, 2 input cannot be read, 3 not a single one.
     """
-    from mwdcal.app import pool
+    from mwdcal import pool
 
     with pool.preparing(1 if scheduler else workers):  # these imports, in the workers too
-        from mwdcal.app import fleet_table
+        from mwdcal.app.choices import options_of
         from mwdcal.files.formats import atomic, folders
         from mwdcal.fleet import calibration_files
+        from mwdcal.library import fleet_table
         from mwdcal.pages import fleet_report
         from mwdcal.screens import fleet as screen
         from mwdcal.screens.text import plural
@@ -76,9 +77,10 @@ def command(
             raise InputError("`calibrations` needs the whole calibrations: leave out --no-records.")
         folders.check_new(calibrations)
         records = True
+    fit = options_of(typed, fleet_table.prior_of_fleet(typed["prior"]))
     try:
         summary = fleet_table.calibrate_table(
-            runs, output, tool, typed, workers, scheduler, records, say
+            runs, output, tool, fit, typed, workers, scheduler, records, say
         )
         if calibrations:
             count = calibration_files.write(output, calibrations)

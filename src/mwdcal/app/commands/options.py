@@ -5,9 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from functools import partial
-from getpass import getuser
 from pathlib import Path
 from typing import Any
 from unicodedata import normalize
@@ -182,9 +180,9 @@ def _named_registry(context: click.Context, option: click.Parameter, typed: str 
 
 def _system_user() -> str:
     """The name under which the user is known to the system; empty where there is none."""
-    with suppress(KeyError, OSError, ImportError):
-        return getuser()
-    return ""
+    from mwdcal.registry.actor import system_user
+
+    return system_user()
 
 
 DATABASE = database(callback=_named_registry)

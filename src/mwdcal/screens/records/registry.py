@@ -223,6 +223,36 @@ def withdrawn(registry: Registry, row: Mapping[str, Any], reason: str) -> Regist
     return RegistryWithdrawn(**about, reason=reason, head=registry.head()[1])
 
 
+def withdrawn_text(result: RegistryWithdrawn) -> str:
+    """The same for people."""
+    return one_line(
+        f"withdrew record {result.number}, {result.kind} {result.name}: {result.reason}"
+    )
+
+
+def got_text(result: RegistryDocument) -> str:
+    """A document that was written to a file."""
+    return one_line(
+        f"wrote {result.output}   {result.kind} {result.name}   SHA-256 {result.sha256}"
+    )
+
+
+def exported_text(result: RegistryExported) -> str:
+    """How many documents were written."""
+    said = f"wrote {plural(result.files, 'document')} to {result.folder}"
+    return one_line(f"{said}   newest event {result.head}")
+
+
+def copied_text(result: RegistryCopied) -> str:
+    """A backup, and the hash to note of it."""
+    return one_line(f"wrote {result.file}   newest event {result.head}")
+
+
+def problems_of(result: RegistryChecked) -> list[Finding]:
+    """What a check found, as findings."""
+    return [Finding(id=each.id, text=f"{each.text}.") for each in result.discrepancies]
+
+
 def checked(registry: Registry, discrepancies: Sequence[Discrepancy]) -> RegistryChecked:
     """The outcome of a check."""
     problems = [RegistryProblem(id=d.id, text=d.text, number=d.number) for d in discrepancies]

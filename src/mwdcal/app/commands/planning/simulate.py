@@ -80,7 +80,7 @@ def command(
     Example: mwdcal simulate --plan moosavi-12 --tool servo --repeat 1000 -o tools.parquet
     Exit: 0 written, 2 input cannot be read, 3 the plan cannot give a calibration.
     """
-    from mwdcal.app import pool
+    from mwdcal import pool
 
     _check(repeat, truth, calibration, tool)
     options.check_outputs(
@@ -139,7 +139,8 @@ def _by_workers(
     """The columns of all parts, by all cores; they do not depend on how many these are."""
     import pickle
 
-    from mwdcal.app import pool, progress
+    from mwdcal import pool
+    from mwdcal.app import progress
     from mwdcal.planning.procedure import solved
     from mwdcal.use.correction_numba import cores
 

@@ -38,18 +38,8 @@ def command(document: Path, key: Path, output: Path | None, replace: bool, as_js
     Exit: 0 signed, 2 input cannot be read or is signed already, 3 it was changed before.
     """
     from mwdcal.app.commands.records.passphrase import known
-    from mwdcal.certificate.keys import read_private
-    from mwdcal.certificate.signature import signed
-    from mwdcal.files import documents
-    from mwdcal.files.formats import atomic
-    from mwdcal.screens.records import signature as screens
+    from mwdcal.library.papers import sign
 
     options.check_outputs([output], [document, key])
-    target = output or document
-    atomic.target(target)
-    file = documents.whole_file(document)
-    data = signed(file, read_private(key, known), replace)
-    result, fields = screens.signed_document(data, target, document.parent)
-    shown = screens.for_machines("sign", result, fields, file.digest)
-    atomic.write(target, data)
-    print_result(shown if as_json else screens.signed(result, fields), result.findings)
+    result = sign(document, key, output=output, replace=replace, passphrase=known)
+    print_result(result.to_dict() if as_json else result.summary(), result.findings)

@@ -30,18 +30,13 @@ def command(document: Path, files: tuple[Path, ...], key: tuple[Path, ...], as_j
     """
     from msgspec.structs import replace
 
-    from mwdcal.certificate.trusted_keys import trusted
-    from mwdcal.files import documents
-    from mwdcal.screens.records import signature as screens
+    from mwdcal.library.papers import check_signature
 
     if not key:
         raise InputError(
             "`key` is missing, and the variable MWDCAL_KEYS is not set. Name a public key."
         )
-    keys = trusted(key)
-    file = documents.whole_file(document)
-    result, fields = screens.checked_document(file, document, keys, files)
-    result = replace(result, findings=findings_as_typed(result.findings))
-    shown = screens.for_machines("verify", result, fields, file.digest)
-    print_result(shown if as_json else screens.checked(result, fields), result.findings)
+    result = check_signature(document, key, files=files)
+    result.content = replace(result.content, findings=findings_as_typed(result.findings))
+    print_result(result.to_dict() if as_json else result.summary(), result.findings)
     sys.exit(0 if result.passed else 1)

@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import lines, print_result, say
 from mwdcal.errors import InputError
-from mwdcal.screens.text import one_line
 
-if TYPE_CHECKING:
-    from mwdcal.registry.imports import Adding, Source
-
-FEWEST_PORTIONS = 3
-"""Portions of work from which workers of their own are worth their start."""
 TABLE = ".parquet"
 """Suffix of tables that may hold many tools."""
 
@@ -44,7 +36,8 @@ def command(
     Example: mwdcal registry add runs tool.toml cals.parquet --as "A. Borg" --database tools.sqlite
     Exit: 0 added, or there already; 2 a file is missing, or not one could be added.
     """
-    from mwdcal.app import pool
+    from mwdcal import pool
+    from mwdcal.app.progress import bar
 
     alone = workers == 1 or all(file.is_file() and file.suffix != TABLE for file in files)
     with pool.preparing(1 if alone else workers):  # these imports, in the workers too
@@ -57,7 +50,8 @@ def command(
     try:
         with open_registry(database) as registry:
             adding = imports.Adding(registry, actor)
-            _add_all(adding, portions, 1 if alone else workers or cores())
+            with bar("adding") as advance:
+                imports.add_all(adding, portions, 1 if alone else workers or cores(), advance)
             result = screen.added(registry, adding)
     except KeyboardInterrupt as stop:
         stop.add_note("What was added stays: the same command adds the rest.")
@@ -69,29 +63,6 @@ def command(
     document = screen.document("registry add", result, {"simulated": adding.simulated})
     shown = document if as_json else screen.added_text(result, adding.simulated)
     print_result(shown, result.findings)
-
-
-def _add_all(adding: Adding, portions: Sequence[Sequence[Source]], workers: int) -> None:
-    """Add portions in their order, by workers if there are enough of them."""
-    import pickle
-
-    from mwdcal.app import pool, progress
-    from mwdcal.registry import imports
-
-    steps = pool.Steps(list, imports.solve)
-    ready: dict[int, bytes] = {}
-    with progress.bar("adding") as advance:
-        following = 0
-        for index, result in pool.results(
-            steps, portions, workers if len(portions) >= FEWEST_PORTIONS else 1, None
-        ):
-            ready[index] = result
-            while following in ready:
-                for each in pickle.loads(ready.pop(following)):  # of our own workers
-                    adding.take(each)
-                following += 1
-            advance(following, len(portions))
-        adding.finish()
 
 
 @options.command()
@@ -115,5 +86,8 @@ def withdraw(record: str, reason: str, database: str, actor: str, as_json: bool)
         row = one_record(registry, record)
         registry.withdraw(row["number"], reason, actor)
         result = screen.withdrawn(registry, row, reason)
-    text = f"withdrew record {result.number}, {result.kind} {result.name}: {reason}"
-    print_result(screen.document("registry withdraw", result, row) if as_json else one_line(text))
+    print_result(
+        screen.document("registry withdraw", result, row)
+        if as_json
+        else screen.withdrawn_text(result)
+    )

@@ -51,18 +51,18 @@ def command(
     Example: mwdcal registry drift --limit inclination_deg=0.1 --html fleet.html --database tools.sqlite
     Exit: 0 compared, 2 there is no such tool, or the registry cannot be opened, 3 a document was altered.
     """
-    from mwdcal.app.commands.records import drift_sources
     from mwdcal.app.progress import bar
     from mwdcal.files.formats import atomic
+    from mwdcal.library import drifts
     from mwdcal.pages.records import drift as pages
     from mwdcal.registry.store import open_registry
     from mwdcal.screens.records import drift as screen
 
     options.check_outputs([], [database], page=html)
     day = (today or datetime.now(UTC)).date()
-    allowed = drift_sources.limits_of(limits)
+    allowed = drifts.limits_of(limits)
     with open_registry(database) as registry, bar("comparing") as advance:
-        result = drift_sources.of_registry(registry, serial, allowed, level, day, advance)
+        result = drifts.of_registry(registry, serial, allowed, level, day, advance)
     if html:
         atomic.write(html, pages.render(result.tool, result.fleet))
     shown = screen.document(result) if as_json else screen.text(result, html)

@@ -9,7 +9,6 @@ import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result
-from mwdcal.screens.text import one_line
 
 ROWS = options.preset("--limit", type=click.IntRange(1), default=50, help="Most rows to print.")
 FIRST = options.preset("--offset", type=click.IntRange(0), default=0, help="Rows to leave out.")
@@ -102,5 +101,5 @@ def get(record: str, database: str, output: Path, as_json: bool) -> None:
         row, data = lookup.document(registry, record)
         atomic.write(output, data)
     result = screen.RegistryDocument(**{k: row[k] for k in screen.KEYS}, output=str(output))
-    text = f"wrote {output}   {result.kind} {result.name}   SHA-256 {result.sha256}"
-    print_result(screen.document("registry get", result, row) if as_json else one_line(text))
+    shown = screen.document("registry get", result, row) if as_json else screen.got_text(result)
+    print_result(shown)

@@ -9,7 +9,7 @@ import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result
-from mwdcal.screens.text import one_line, plural
+from mwdcal.screens.text import one_line
 
 
 @options.command()
@@ -79,7 +79,6 @@ def check(database: str, head: str | None, as_json: bool) -> None:
     Exit: 0 sound, 1 altered, 2 it cannot be opened.
     """
     from mwdcal.app.progress import bar
-    from mwdcal.calibration.record import Finding
     from mwdcal.registry import checking
     from mwdcal.registry.store import open_registry
     from mwdcal.screens.records import registry as screen
@@ -89,8 +88,7 @@ def check(database: str, head: str | None, as_json: bool) -> None:
             discrepancies = checking.check(registry, head, advance)
         result = screen.checked(registry, discrepancies)
     shown = screen.document("registry check", result) if as_json else screen.check_text(result)
-    findings = [Finding(id=each.id, text=f"{each.text}.") for each in result.discrepancies]
-    print_result(shown, findings)
+    print_result(shown, screen.problems_of(result))
     sys.exit(0 if result.sound else 1)
 
 
@@ -120,9 +118,9 @@ def export(folder: Path, database: str, as_json: bool) -> None:
     result = screen.RegistryExported(
         folder=str(folder), files=len(manifest.files), events=manifest.events, head=manifest.head
     )
-    text = f"wrote {plural(result.files, 'document')} to {folder}   newest event {result.head}"
     about = {"simulated": manifest.simulated}
-    print_result(screen.document("registry export", result, about) if as_json else one_line(text))
+    document = screen.document("registry export", result, about)
+    print_result(document if as_json else screen.exported_text(result))
 
 
 @options.command()
@@ -146,8 +144,8 @@ def backup(output: Path, database: str, as_json: bool) -> None:
     options.check_outputs([output], [database])
     with open_registry(database) as registry:
         result = screen.RegistryCopied(file=str(output), head=copies.backup(registry, output))
-    text = f"wrote {output}   newest event {result.head}"
-    print_result(screen.document("registry backup", result) if as_json else one_line(text))
+    document = screen.document("registry backup", result)
+    print_result(document if as_json else screen.copied_text(result))
 
 
 @options.command()

@@ -11,13 +11,11 @@ from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 
-from mwdcal.app import pool, progress
-from mwdcal.app.choices import options_of, prior_of
-from mwdcal.app.commands.options import Typed
+from mwdcal import pool
 from mwdcal.calibration.automatic.nonlinearity import with_strengths
 from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.diagnosis.refusals import check_options, no_temperature
@@ -41,7 +39,8 @@ from mwdcal.fleet.tables import (
 )
 from mwdcal.screens.envelope import enveloped
 from mwdcal.screens.fleet import FleetSummary, stated_options, summarise
-from mwdcal.screens.text import plural
+from mwdcal.screens.text import plural, slowly
+from mwdcal.screens.typed_options import Typed
 from mwdcal.sensor.profile import Profile
 from mwdcal.use.correction_numba import cores
 
@@ -56,7 +55,8 @@ NEEDED_AT_THE_END = ("pyarrow.compute", "rich.console", "rich.table")
 def calibrate_table(
     runs: Path,
     output: Path,
-    tool: str | None,
+    tool: Profile | str | None,
+    options: Options,
     typed: Typed,
     workers: int | None,
     scheduler: str | None,
@@ -65,12 +65,14 @@ def calibrate_table(
 ) -> FleetSummary:
     """Calibrate every tool of the table; the output is written at the end, as a whole.
 
-    `records`: whether it holds the whole calibration of each tool; by default that of a few.
+    `tool`: its profile, or the name or file of one. `options` are those that were `typed`. `workers`: processes, one
+    per core if None, or else those of a Dask `scheduler`. `records`: whether the table holds the whole calibration
+    of each tool; by default that of a few. `say` hears how far it is.
     """
     begun = time.perf_counter()
-    profile, digest = profiles.load_profile(tool)
-    options = _options(typed, profile)
-    source = open_source(runs, profile, progress.slowly(say, EVERY))
+    profile, digest = (tool, "") if isinstance(tool, Profile) else profiles.load_profile(tool)
+    options = _checked(options, profile)
+    source = open_source(runs, profile, slowly(say, EVERY))
     if max(options.orders) and "temperature_c" not in source.columns:
         raise no_temperature(max(options.orders))
     unused = unused_columns(synonyms.unused(source.columns, source.used))
@@ -157,14 +159,19 @@ def _metadata(source: FleetTable, plan: Plan, typed: Typed, digest: str) -> dict
     return {**stated, **enveloped("fleet", content, stated, profile=digest)}
 
 
-def _options(typed: Typed, profile: Profile) -> Options:
-    """Options of the fleet; refuses what could be right for no tool, and the prior of a single one."""
-    if typed["prior"] not in (None, DATASHEET):
+def prior_of_fleet(word: str | None) -> Literal["datasheet"] | None:
+    """The prior of a fleet: the tolerances in the tool profile, or nothing; refuses that of a single tool."""
+    if word not in (None, DATASHEET):
         raise InputError(
-            f"`prior` {typed['prior']}: the prior of a fleet is 'datasheet', the tolerances in the tool "
+            f"`prior` {word}: the prior of a fleet is 'datasheet', the tolerances in the tool "
             "profile. A previous calibration is of one tool: use it with mwdcal calibrate."
         )
-    options = with_strengths(options_of(typed, prior_of(typed["prior"])[0]), profile)
+    return DATASHEET if word else None
+
+
+def _checked(options: Options, profile: Profile) -> Options:
+    """Options of the fleet with the strengths of the profile; refuses what could be right for no tool."""
+    options = with_strengths(options, profile)
     profile_for(options.prior, profile)
     check_stand_errors(options.estimate, options.method)
     check_options(options)
@@ -193,7 +200,7 @@ def _computed(
     """The parts that are missing, one by one as they are computed; each is kept when it is whole."""
     if not missing:
         return
-    begun, tools, slowly = time.perf_counter(), 0, progress.slowly(say, EVERY)
+    begun, tools, say_slowly = time.perf_counter(), 0, slowly(say, EVERY)
     paths, tasks = list(missing), list(missing.values())
     for name in NEEDED_AT_THE_END:  # while the workers start: later it would be waited for
         import_module(name)
@@ -205,7 +212,7 @@ def _computed(
             disk.submit(kept.to_disk, paths[index])
             tools += tasks[index].tools
             rate = tools / (time.perf_counter() - begun)
-            slowly(f"part {count} of {len(missing)}   {rate:.0f} tools/s")
+            say_slowly(f"part {count} of {len(missing)}   {rate:.0f} tools/s")
             yield paths[index]
     except InputError:
         check_unchanged(piece for task in tasks for piece in task.pieces)  # then that is the reason

@@ -14,6 +14,7 @@ import logging
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
@@ -24,10 +25,11 @@ from importlib import import_module
 from multiprocessing import forkserver, resource_tracker
 from multiprocessing.context import BaseContext
 from queue import Empty, SimpleQueue
+from types import ModuleType
 from typing import Any
 
-from mwdcal.app.interruption import held
 from mwdcal.errors import InputError, reason
+from mwdcal.signals import held
 
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 WORKER_SETTINGS = {
@@ -174,7 +176,7 @@ def _by_pool(
                 for index in waiting:
                     loaded = steps.load(tasks[index])
                     # a worker that nobody waits for would not find what it begins with
-                    with held():
+                    with held(), _without_main():
                         running[pool.submit(steps.solve, loaded)] = index
                     if len(running) >= 2 * workers:
                         break
@@ -185,6 +187,17 @@ def _by_pool(
                     yield index, done.result()
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
+
+
+@contextmanager
+def _without_main() -> Iterator[None]:
+    """Processes that are started here do not run the script of the caller again, which may have no guard."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
 
 
 def _ready(running: Iterable[Future[bytes]]) -> set[Future[bytes]]:

@@ -1,0 +1,454 @@
+"""Certificates of calibrations from Python: issued, written in any form, signed, and checked."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, date, datetime
+from functools import cached_property
+from hashlib import sha256
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.errors import InputError
+from mwdcal.files.formats.members import Member
+from mwdcal.library.registries import ToolRegistry, day_of
+from mwdcal.library.results import Result
+from mwdcal.use.verification import Verdict
+
+if TYPE_CHECKING:
+    from mwdcal.certificate.contents import Order
+    from mwdcal.certificate.document import Certificate, SourceFile
+    from mwdcal.drift.document import ToolDrift
+    from mwdcal.files.verifications import Verification
+    from mwdcal.pages.records.certificate_pictures import Picture
+    from mwdcal.screens.records.signature import CheckedDocument, SignedDocument
+
+CERTIFICATE_FORMS = (".json", ".html", ".pdf", ".xml")
+"""Suffixes of the forms of a certificate."""
+Place = str | os.PathLike[str]
+"""The path of a file."""
+SignatureState = Literal[
+    "unsigned", "intact", "altered", "unknown", "revoked", "retired", "unchecked"
+]
+"""What a signature says: `mwdcal.certificate.signature.STATES` has each in a sentence."""
+
+
+@dataclass(repr=False)
+class Paper(Result):
+    """A calibration certificate. `record` has all that it states; `save` writes it in any of its forms."""
+
+    record: Certificate
+    calibration: Calibration
+    order: Order
+    drift: ToolDrift | None = None
+    saved: list[Path] = field(default_factory=list)
+
+    @property
+    def number(self) -> str:
+        """The number of the certificate."""
+        return self.record.number
+
+    @property
+    def serial(self) -> str | None:
+        """The serial of the tool."""
+        return self.record.serial
+
+    @property
+    def findings(self) -> Sequence[Finding]:
+        """What the reader should know: gaps, overdue standards, doubts of the calibration."""
+        return self.record.findings
+
+    @cached_property
+    def pictures(self) -> list[Picture]:
+        """The figures of page and PDF; Matplotlib must be installed."""
+        from mwdcal.pages.pictures import require
+
+        require("a certificate as page or PDF", "matplotlib")
+        from mwdcal.pages.records.certificate_pictures import certificate_pictures
+
+        tests = self.order.verification, self.order.as_found
+        return certificate_pictures(self.calibration, *tests, self.drift)
+
+    def form(self, path: Place) -> bytes | str:
+        """The certificate in the form that the suffix of a file names.
+
+        Raises:
+            InputError: the suffix names no form.
+        """
+        check_form(path)
+        suffix = Path(path).suffix.lower()
+        if suffix == ".json":
+            from mwdcal.certificate.document import encode
+
+            return encode(self.record)
+        if suffix == ".xml":
+            from mwdcal.certificate.dcc import to_xml
+
+            return to_xml(self.record)
+        if suffix == ".pdf":
+            from mwdcal.pages.records.certificate_pdf import render_pdf
+
+            return render_pdf(self.record, self.pictures)
+        return self._page()
+
+    def save(self, path: Place) -> None:
+        """Write the certificate: JSON, a page, PDF, or PTB's DCC as XML, by the suffix.
+
+        Raises:
+            InputError: the suffix names no form, or the file cannot be written.
+        """
+        from mwdcal.files.formats import atomic
+
+        atomic.write(path, self.form(path))
+        self.saved.append(Path(path))
+
+    def _text(self) -> str:
+        from mwdcal.screens.records.certificate_issue import screen
+
+        return screen(self.record, list(dict.fromkeys(self.saved)))
+
+    def _document(self) -> dict[str, Any]:
+        from msgspec import to_builtins
+
+        document: dict[str, Any] = to_builtins(self.record)
+        return document
+
+    def _page(self) -> str:
+        from mwdcal.pages.records.certificate_page import render_page
+
+        return render_page(self.record, self.pictures)
+
+
+def check_form(path: Place) -> None:
+    """Refuse a file whose suffix names no form of a certificate."""
+    if Path(path).suffix.lower() not in CERTIFICATE_FORMS:
+        allowed = ", ".join(CERTIFICATE_FORMS)
+        raise InputError(
+            f"`output` '{os.fspath(path)}': the suffix must be one of {allowed}. Rename it."
+        )
+
+
+def certificate(
+    cal: Calibration | Place,
+    *,
+    verification: Verdict | Place | None = None,
+    as_found: Verdict | Place | None = None,
+    laboratory: Place | None = None,
+    registry: ToolRegistry | Place | None = None,
+    number: str = "",
+    customer: str = "",
+    condition: str = "",
+    received: date | str | None = None,
+    date: date | str | None = None,
+    keys: Sequence[Place] = (),
+    folder: Place = ".",
+) -> Paper:
+    """The certificate of a calibration: ISO/IEC 17025 contents, uncertainty budget, decisions with their risk.
+
+    `cal` is a calibration or its file. `verification` is a roll test with this calibration (as left), `as_found` one
+    with the calibration before: a verdict, or the file in which the JSON of `mwdcal verify` was saved. `laboratory`:
+    a TOML file with what the laboratory states. `registry`: with the earlier calibrations, whose drift is then shown.
+    `received` and `date` (of issue; today, UTC) are days, such as "2026-01-31". `keys`: public keys whose signatures
+    are trusted. `folder`: that of the certificate, from which its paths to other files are seen.
+
+    Raises:
+        InputError: a file cannot be read, a roll test is of another tool or calibration, or a day is impossible.
+
+    Example::
+
+        paper = mwdcal.certificate(cal, verification=test, laboratory="lab.toml")
+        mwdcal.save(paper, "C.pdf")
+    """
+    from mwdcal.certificate.contents import Order
+    from mwdcal.certificate.contents import certificate as contents
+    from mwdcal.certificate.laboratory import load_laboratory
+
+    files = _Sources(Path(folder).resolve())
+    calibration, digest, doubts = _loaded(cal, keys, files)
+    as_left = _verification(verification, "verification", calibration, digest, files)
+    before = _verification(as_found, "as-found", calibration, "", files)
+    stated = None
+    if laboratory is not None:
+        stated, laboratory_digest = load_laboratory(Path(laboratory))
+        files.add("laboratory", Path(laboratory), laboratory_digest)
+    issued = day_of(date, "date") or datetime.now(UTC).date()
+    drift = _drift(registry, calibration, digest, issued) if registry is not None else None
+    order = Order(
+        issued=issued,
+        number=number,
+        customer=customer,
+        condition=condition,
+        received=day_of(received, "received"),
+        verification=as_left,
+        as_found=before,
+        calibration_sha256=digest,
+        files=tuple(files.listed),
+        findings=(*doubts, *(drift.findings if drift else ())),
+    )
+    return Paper(contents(calibration, order, stated), calibration, order, drift)
+
+
+@dataclass
+class _Sources:
+    """The files behind a certificate, by their paths from its folder."""
+
+    folder: Path
+    listed: list[SourceFile] = field(default_factory=list)
+
+    def add(self, name: str, path: Path, digest: str) -> None:
+        """List a file; its path is whole where it is on another drive."""
+        from mwdcal.certificate.document import SourceFile
+
+        whole = path.resolve()
+        try:
+            seen = Path(os.path.relpath(whole, self.folder)).as_posix()
+        except ValueError:
+            seen = whole.as_posix()
+        self.listed.append(SourceFile(id=name, name=seen, sha256=digest))
+
+    def add_memory(self, name: str, file: str, digest: str) -> None:
+        """List what `save` would write under some name: its SHA-256 tells it."""
+        from mwdcal.certificate.document import SourceFile
+
+        self.listed.append(SourceFile(id=name, name=file, sha256=digest))
+
+
+def _loaded(
+    cal: Calibration | Place, keys: Sequence[Place], files: _Sources
+) -> tuple[Calibration, str, list[Finding]]:
+    """A calibration, the SHA-256 of its file, and doubts of its signature."""
+    from mwdcal.certificate.signature import check, signature_doubts
+    from mwdcal.certificate.trusted_keys import trusted
+    from mwdcal.files import documents
+    from mwdcal.registry.calibration_source import calibration_file
+
+    trust = trusted(map(Path, keys))
+    if isinstance(cal, Calibration):
+        data = documents.encode(cal)
+        file = Member(data, f"{cal.serial or 'calibration'}.json", sha256(data).hexdigest())
+        calibration = cal
+        files.add_memory("calibration", file.name, file.digest)
+    else:
+        file = calibration_file(Path(cal))
+        calibration = documents.decoded(file)
+        files.add("calibration", Path(cal), file.digest)
+    doubts = signature_doubts(check(file.record, trust), calibration, bool(keys))
+    return calibration, file.digest, doubts
+
+
+def _verification(
+    test: Verdict | Place | None, name: str, calibration: Calibration, digest: str, files: _Sources
+) -> Verification | None:
+    """A roll test that a certificate shows; a verdict in memory is one of the calibration with this SHA-256."""
+    from msgspec import convert, to_builtins
+
+    from mwdcal.calibration.record import DOCUMENT_VERSION, SOFTWARE
+    from mwdcal.files.verifications import Verification, load_verification
+
+    if test is None or isinstance(test, Verification):
+        return test
+    if not isinstance(test, Verdict):
+        read, file_digest = load_verification(test)
+        files.add(name, Path(test), file_digest)
+        return read
+    to_dict: Callable[[], dict[str, Any]] | None = getattr(test, "to_dict", None)
+    if to_dict is not None:
+        return convert(to_dict(), Verification)
+    head = {
+        "schema_version": DOCUMENT_VERSION,
+        "command": "verify",
+        "software": SOFTWARE,
+        "serial": calibration.serial,
+        "simulated": calibration.simulated,
+        "calibration_sha256": digest,
+        "run_sha256": None,
+        "limits_sha256": None,
+    }
+    return convert({**head, **to_builtins(test)}, Verification)
+
+
+def _drift(
+    registry: ToolRegistry | Place, calibration: Calibration, digest: str, today: date
+) -> ToolDrift | None:
+    """How the tool changed up to its calibration; None where the registry has no earlier one."""
+    from mwdcal.library.drifts import drift_of
+    from mwdcal.registry.store import open_registry
+
+    if isinstance(registry, ToolRegistry):
+        return drift_of(registry.opened, calibration, digest, today)
+    with open_registry(registry) as opened:
+        return drift_of(opened, calibration, digest, today)
+
+
+@dataclass(repr=False)
+class SignedPaper(Result):
+    """A document that was signed: its `file`, by which `key` and at what `time` (UTC)."""
+
+    content: SignedDocument
+    fields: Mapping[str, Any]
+    digest: str
+
+    @property
+    def file(self) -> str:
+        """The file that was written."""
+        return self.content.file
+
+    @property
+    def key(self) -> str:
+        """The digits of the key."""
+        return self.content.key
+
+    @property
+    def time(self) -> str:
+        """When it was signed, UTC, ISO 8601."""
+        return self.content.time
+
+    @property
+    def findings(self) -> Sequence[Finding]:
+        """Files of a certificate that have changed since it was issued."""
+        return self.content.findings
+
+    def _text(self) -> str:
+        from mwdcal.screens.records.signature import signed
+
+        return signed(self.content, self.fields)
+
+    def _document(self) -> dict[str, Any]:
+        from mwdcal.screens.records.signature import for_machines
+
+        return for_machines("sign", self.content, self.fields, self.digest)
+
+
+def sign(
+    document: Paper | Place,
+    private_key: Place,
+    *,
+    output: Place | None = None,
+    replace: bool = False,
+    passphrase: str | Callable[[], str] | None = None,
+) -> SignedPaper:
+    """Sign a document: a certificate, or the file of a calibration, a verification or a certificate.
+
+    `output` is the file to write. By default a file is replaced, and of a certificate in memory that was saved, its
+    JSON: `C.json` beside `C.pdf`. `replace` the signature of a document that is signed already. `passphrase`: of an
+    encrypted key; by default the value of the variable MWDCAL_KEY_PASSPHRASE.
+
+    Raises:
+        InputError: the document or the key cannot be read, or the document is signed already.
+        FitError: the document was changed since it was made.
+
+    Example: `mwdcal.sign("C.json", "laboratory.key")`
+    """
+    from mwdcal.certificate.keys import read_private
+    from mwdcal.certificate.signature import signed
+    from mwdcal.files import documents
+    from mwdcal.files.formats import atomic
+    from mwdcal.screens.records import signature as screens
+
+    if isinstance(document, Paper):
+        target = Path(output) if output is not None else _json_of(document)
+        data = document.form("C.json")
+        whole = data if isinstance(data, bytes) else data.encode()
+        file = Member(whole, target.name, sha256(whole).hexdigest())
+        if target in document.saved and target.exists():
+            file = documents.whole_file(target)
+        folder = target.parent
+    else:
+        target, folder = Path(output or document), Path(document).parent
+        file = documents.whole_file(Path(document))
+    atomic.target(target)
+    private = read_private(Path(private_key), lambda: _passphrase(passphrase))
+    signed_data = signed(file, private, replace)
+    result, fields = screens.signed_document(signed_data, target, folder)
+    atomic.write(target, signed_data)
+    if isinstance(document, Paper):
+        document.saved.append(target)
+    return SignedPaper(result, fields, file.digest)
+
+
+def _json_of(paper: Paper) -> Path:
+    """The JSON file of a certificate that was saved, or its place beside another form."""
+    saved = [path for path in paper.saved if path.suffix.lower() == ".json"] or paper.saved
+    if not saved:
+        raise InputError(
+            "`output` is missing: the certificate was not saved yet. Name a file such as C.json, or save it first."
+        )
+    return saved[-1].with_suffix(".json")
+
+
+def _passphrase(given: str | Callable[[], str] | None) -> str:
+    """The passphrase of a private key."""
+    from mwdcal.certificate.keys import PASSPHRASE
+
+    if callable(given):
+        return given()
+    word = given if given is not None else os.environ.get(PASSPHRASE)
+    if not word:
+        raise InputError(
+            f"the private key is encrypted. Give its `passphrase`, or set the variable {PASSPHRASE}."
+        )
+    return word
+
+
+@dataclass(repr=False)
+class SignatureVerdict(Result):
+    """Whether a document is as it was signed. `content` has the check of the signature, and of each file."""
+
+    content: CheckedDocument
+    fields: Mapping[str, Any]
+    digest: str
+
+    @property
+    def passed(self) -> bool:
+        """Whether the signature is intact, and no file of a certificate has changed."""
+        return self.content.passed
+
+    @property
+    def state(self) -> SignatureState:
+        """What the signature says, such as "intact", "altered", "unsigned", or "unknown": its key is not trusted."""
+        state: SignatureState = self.content.check.state
+        return state
+
+    @property
+    def findings(self) -> Sequence[Finding]:
+        """Why it did not pass."""
+        return self.content.findings
+
+    def _text(self) -> str:
+        from mwdcal.screens.records.signature import checked
+
+        return checked(self.content, self.fields)
+
+    def _document(self) -> dict[str, Any]:
+        from mwdcal.screens.records.signature import for_machines
+
+        return for_machines("verify", self.content, self.fields, self.digest)
+
+
+def check_signature(
+    document: Place, keys: Sequence[Place] | Place, *, files: Sequence[Place] = ()
+) -> SignatureVerdict:
+    """Whether a document is as it was signed, by public keys that are trusted; of a certificate also its files.
+
+    `document`: a calibration file, or the JSON of a verification or certificate. `keys`: public keys, or files of
+    trusted keys. `files`: those that the certificate rests on, where they do not lie as it says.
+
+    Raises:
+        InputError: a file cannot be read, or no key is named.
+
+    Example: `mwdcal.check_signature("C.json", keys=["laboratory.key.pub"]).state`
+    """
+    from mwdcal.certificate.trusted_keys import trusted
+    from mwdcal.files import documents
+    from mwdcal.screens.records import signature as screens
+
+    named = [Path(k) for k in ([keys] if isinstance(keys, str | os.PathLike) else keys)]
+    if not named:
+        raise InputError("`keys` must name a public key; got none. Name one that you trust.")
+    trust, path = trusted(named), Path(document)
+    file = documents.whole_file(path)
+    result, fields = screens.checked_document(file, path, trust, [Path(each) for each in files])
+    return SignatureVerdict(result, fields, file.digest)
