@@ -27,6 +27,9 @@ from mwdcal.screens.text import (
     one_line,
     without_passwords,
 )
+from mwdcal.screens.text import (
+    to_json as to_json,
+)
 from mwdcal.screens.typed import as_typed
 
 if TYPE_CHECKING:
@@ -169,13 +172,6 @@ def _on_screen(text: str, stream: Any) -> str:
 def lines(findings: Iterable[Finding]) -> list[str]:
     """Findings, one line each."""
     return [one_line(f"! {as_typed(finding.text)}") for finding in findings]
-
-
-def to_json(result: Any) -> str:
-    """A result for machines."""
-    import msgspec
-
-    return msgspec.json.format(msgspec.json.encode(result), indent=2).decode()
 
 
 def print_result(result: Any, findings: Iterable[Finding] = ()) -> None:

@@ -67,6 +67,13 @@ def harmless(text: str) -> str:
     return UNSAFE_BUT_LINES.sub(_escape, text)
 
 
+def to_json(result: Any) -> str:
+    """A result for machines."""
+    import msgspec
+
+    return msgspec.json.format(msgspec.json.encode(result), indent=2).decode()
+
+
 def without_passwords(text: str) -> str:
     """A message without the passwords of URLs in it, however these are mistyped.
 

@@ -16,12 +16,12 @@ from mwdcal.app.messages import print_result
 from mwdcal.errors import InputError
 
 if TYPE_CHECKING:
-    from mwdcal.app.choices import LoadedCalibration
     from mwdcal.calibration.record import Calibration
     from mwdcal.certificate.contents import Order
     from mwdcal.certificate.document import Certificate, SourceFile
     from mwdcal.drift.document import ToolDrift
     from mwdcal.pages.records.certificate_pictures import Picture
+    from mwdcal.screens.records.calibrations import LoadedCalibration
 
 Read = TypeVar("Read")
 CERTIFICATE_FORMS = (".json", ".html", ".pdf", ".xml")
@@ -91,11 +91,11 @@ def command(
     """
     from msgspec import to_builtins
 
-    from mwdcal.app.choices import load_calibration
     from mwdcal.certificate.contents import Order, certificate
     from mwdcal.certificate.laboratory import load_laboratory
     from mwdcal.files import verifications
     from mwdcal.files.formats import atomic
+    from mwdcal.screens.records.calibrations import load_calibration
     from mwdcal.screens.records.certificate_issue import screen
 
     _check_forms(output)

@@ -8,8 +8,9 @@ from pathlib import Path
 import click
 
 from mwdcal.app.commands import options
-from mwdcal.app.messages import print_result, to_json
+from mwdcal.app.messages import print_result
 from mwdcal.errors import InputError
+from mwdcal.screens.text import to_json
 
 MEASURED = {
     "gravity_g": ("G", "Measured gravity, in g of 9.80665 m/s²"),
