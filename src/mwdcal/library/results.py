@@ -58,6 +58,16 @@ class Result:
 
         atomic.write(os.fspath(path), self._page())
 
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the file of the command.
+
+        Raises:
+            InputError: there is no such file, or it cannot be written.
+        """
+        raise InputError(
+            f"a {type(self).__name__} has no file of its own; its `to_dict()` is JSON."
+        )
+
     def to_pandas(self) -> Any:
         """The columns as a table of pandas, with what is stated of them in `attrs`; pandas must be installed."""
         return frame(self.columns)

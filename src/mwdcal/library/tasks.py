@@ -26,6 +26,7 @@ from mwdcal.files.formats.table import Table
 from mwdcal.files.limits import load_limits
 from mwdcal.geometry.vectors import AnyArray, Array, ArrayLike
 from mwdcal.library.arrays import nearest, without_mask
+from mwdcal.library.results import Result
 from mwdcal.logs.noise import Noise, find_noise
 from mwdcal.logs.stations import Stations, find_stations
 from mwdcal.planning import simulate as simulation
@@ -321,13 +322,13 @@ def apply(
 
 
 def save(
-    result: Calibration | Readings,
+    result: Calibration | Readings | Result,
     path: Path,
     profile: Path | Profile | None = None,
     *,
     decimals: int | None = None,
 ) -> None:
-    """Write a calibration file (JSON), or the readings of a run as `read_run` reads them.
+    """Write a calibration file (JSON), the readings of a run as `read_run` reads them, or the file of a result.
 
     A run is a CSV, TSV, Parquet or XLSX file, by the suffix. Its channels are raw: in the axes and
     units of the `profile`, by default the one that the run was read with, else g and nT along the
@@ -336,6 +337,9 @@ def save(
     """
     if isinstance(result, Calibration):
         documents.write(path, result)
+        return
+    if isinstance(result, Result):
+        result.save(path)
         return
     _check_readings(result, "result")
     table = runs.from_readings(result, _profile(result, profile))
