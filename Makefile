@@ -4,7 +4,7 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: papers measured verification scatter coverage drift diagnosis mutations help demo test test-quick test-studies test-oldest \
-	test-versions fuzz kills registry-stress check bench docs clean
+	test-versions fuzz kills registry-stress check bench bench-guard docs clean
 
 PYTHON ?= python3
 PYTHONS ?= python3.12 python3.13
@@ -102,6 +102,9 @@ check: $(INSTALLED) ## lint, format, types, architecture, doctests, docs
 bench: $(MEASURED) ## time mwdcal against SciPy and other packages, write docs/benchmarks.md (QUICK=1: two minutes)
 	@$(CLOCK); $(ONE_THREAD) PYTHONPATH=tests $(BENCH)/python benchmarks/bench.py \
 		$(if $(QUICK),--quick --output build/benchmarks)
+
+bench-guard: $(INSTALLED) ## compare the speed of what users wait for with a reference and the last release (KEEP=1: store it)
+	@$(CLOCK); $(ONE_THREAD) PYTHONPATH=benchmarks $(BIN)/python benchmarks/guard.py $(if $(KEEP),--keep)
 
 measured: $(INSTALLED) ## calibrate the measured sets (MWDCAL_DATA) and rewrite docs/measured.md
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python examples/measured/measured.py

@@ -1,6 +1,7 @@
 """Own-axis terms taken where a run speaks for them, and scatter from shot to shot beside the noise."""
 
 import json
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -10,13 +11,16 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from cli_support import mwdcal
+from mwdcal.calibration.automatic import nonlinearity
 from mwdcal.calibration.automatic.nonlinearity import ODDS, choices_of, choose_curves
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
-from mwdcal.estimation.uncertainty import PIN, log_evidence
+from mwdcal.estimation.batch import batch_of_one
+from mwdcal.estimation.uncertainty import PIN, log_evidence, readjusted
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import centred
+from mwdcal.library.tasks import simulate
 
 nulls = pytest.importorskip("nulls")
 
@@ -54,6 +58,26 @@ def test_odds_of_straight_runs_are_against_the_terms():
     found = nulls.odds(straight)
     assert np.mean(found < 0) > 0.8
     assert np.mean(np.exp(found)) < 1.5  # expected value of a likelihood ratio: one
+
+
+@pytest.mark.parametrize("terms", [{}, {"accelerometer": 0.003, "magnetometer": 0.003}])
+@pytest.mark.parametrize("stand", [{}, {"inclination": 2e-4, "azimuth": 9e-4, "toolface": 4e-4}])
+def test_stations_are_judged_as_by_fits_without_them(terms, stand):
+    """As by a fit for each; to first order, so closely where the problem is not linear and its stations few."""
+    run = simulate((20, 70, 110), 12, seed=4)
+    noise = {"accelerometer": np.full((36, 3), 1e-4), "magnetometer": np.full((36, 3), 15.0)}
+    sd = noise | {name: np.full(36, each) for name, each in stand.items()}
+    run = replace(run, sd=sd, settings="per-station")
+    options = Options(nonlinearity=terms)
+    found = nonlinearity._left_out(batch_of_one(run), options)[0]
+    for station in range(36):
+        include = (np.arange(36) != station).astype(float)
+        result = fit(run, options, include)
+        everyone = replace(result.problem.evidence, include=np.ones((1, 36)))
+        problem = replace(result.problem, evidence=everyone)
+        linear = problem.linear(readjusted(problem, result.state))
+        square = (linear.residual * linear.weigh(linear.residual[..., None])[..., 0])[0, station]
+        assert found[station] == pytest.approx(square.mean(), rel=0.05 if terms or stand else 1e-6)
 
 
 def test_the_choice_of_one_run():

@@ -129,8 +129,7 @@ def test_findings_of_options(tmp_path, options):
         if isinstance(made, Exception):
             assert rows[serial]["message"].split(":")[-1] == str(made).split(":")[-1]
         else:
-            # A drift that stands in for parameters which are not fitted: trend and walk hardly tell apart.
-            check_same(rows[serial], made, 1e-3 if "parameters" in options else 1e-5)
+            check_same(rows[serial], made, 1e-5)
 
 
 def test_no_station_to_reshoot_escapes_the_bound(tmp_path):

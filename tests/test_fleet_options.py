@@ -292,8 +292,7 @@ def handful(curved):
 )
 def test_each_option_gives_what_it_gives_alone(tmp_path, tool, options):
     rows, alone = both(tmp_path, handful("--nonlinearity" in options), *options, tool=tool)
-    # A drift that stands in for parameters which are not fitted: trend and walk hardly tell apart.
-    check_all(rows, alone, 1e-3 if 6 in options else 1e-7)
+    check_all(rows, alone, 1e-7)
     assert rows["few"]["status"] in ("too-few-stations", "channel", "weak-geometry")
     assert rows["bad"]["status"] == "bad-input"
     assert rows["T0"]["status"] == "ok"

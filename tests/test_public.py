@@ -345,7 +345,7 @@ def test_short_representations(cal, rolltest):
 def test_accuracy_of_the_representation_is_the_typical_one(cal):
     from mwdcal.calibration.prediction import typical_accuracy
 
-    accuracy = cal.summary()["accuracy"]
+    accuracy = cal.glance()["accuracy"]
     for name, value in typical_accuracy(cal).items():
         assert f"{name} {value:.2g}°" in accuracy
 

@@ -1,5 +1,7 @@
 """Slow drift within a run: seen, of the right size, in the uncertainty, and not seen in noise."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -165,3 +167,14 @@ def test_a_wrong_prior_is_no_drift(tmp_path):
     found = {finding["id"] for finding in made.json["findings"]}
     assert "prior-conflict" in found
     assert not found & {"accelerometer-drift", "magnetometer-drift", "field-drift"}
+
+
+def test_what_held_parameters_leave_is_no_drift():
+    """A misaligned tool that is fitted with scales and biases alone: its residuals follow the attitudes."""
+    readings = runs(5, 1)
+    tilted = np.eye(3) + np.array([[0, 0.01, 0], [0, 0, -0.008], [0.005, 0, 0]])
+    bent = replace(readings, accelerometer=readings.accelerometer @ tilted)
+    options = Options(order=0, parameters=6)
+    [(_, result)] = by_drift(fit(bent, options), options)
+    assert not result.problem.walks
+    assert chances(result)[0][0, 0] < 1e-6

@@ -1,13 +1,16 @@
 """What residuals look like: simulated effects are named as what they are, and noise is not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mwdcal.calibration.calibrate import calibrate
-from mwdcal.calibration.diagnosis.structure import effects
+from mwdcal.calibration.diagnosis.structure import effects, shown_effects
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
+from mwdcal.estimation.batch import take
 from mwdcal.geometry.vectors import earth_field, earth_gravity, rotation, tool_from_earth
 from mwdcal.library.tasks import NOMINAL, simulate
 from mwdcal.sensor.profile import Profile
@@ -171,3 +174,41 @@ def test_readings_almost_without_noise_are_judged_without_a_warning_of_numpy(see
     readings = simulate(toolfaces=16, noise=(1e-8, 1e-3), seed=seed)
     calibration = calibrate(readings, NOMINAL, Options("scalar", order=0))
     assert calibration.accelerometer.noise == pytest.approx(1e-8, rel=0.3)
+
+
+def stacked(runs):
+    """Runs of one shape as a batch."""
+    each = {n: np.stack([getattr(r, n) for r in runs]) for n in ("accelerometer", "magnetometer")}
+    each |= {"temperature": np.stack([r.temperature for r in runs])}
+    for name in ("known", "sd"):
+        every = [{k: v for k, v in getattr(r, name).items() if np.ndim(v)} for r in runs]
+        each[name] = {k: np.stack([e[k] for e in every]) for k in every[0]}
+    return Readings(**each)
+
+
+@pytest.mark.parametrize("temperatures", [(25.0,), (25.0, 85.0, 55.0, 115.0)])
+def test_many_runs_together_show_what_each_shows_alone(temperatures):
+    names = ("", "field-drift", "backlash", "dip-reference", "accelerometer-thermal-lag")
+    runs = [run(name, seed, {}, temperatures=temperatures) for seed, name in enumerate(names)]
+    together = fit(stacked(runs))
+    every = shown_effects(together, {})
+    for place, shown in enumerate(every):
+        alone = shown_effects(take(together, np.array([place])), {})[0]
+        assert shown.keys() == alone.keys()
+        for name, (chance, share) in shown.items():
+            assert (chance, share) == pytest.approx(alone[name], rel=1e-6)
+    assert [bool(shown) for shown in every[:4]] == [False, True, True, True]
+
+
+def test_angles_that_are_read_off_have_no_side_from_their_noise():
+    """An encoder's noise at an angle that did not change is no move: its sign is part of the error itself."""
+    runs = []
+    for seed in range(60):
+        data, rng = run("", seed, {}), np.random.default_rng([5, seed])
+        error = {
+            k: v + SETTINGS[k] * rng.normal(size=len(v))
+            for k, v in data.known.items()
+            if k in SETTINGS
+        }
+        runs.append(replace(data, known={**data.known, **error}))
+    assert not [shown for shown in shown_effects(fit(stacked(runs)), {}) if "backlash" in shown]

@@ -21,6 +21,8 @@ A first script::
 
 from __future__ import annotations
 
+import sys
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -60,6 +62,17 @@ __all__ = [  # noqa: F405 - imported when first used: `import mwdcal` loads no N
     "survey",
     "verify",
 ]
+
+
+class _PublicNames(ModuleType):
+    """The package, whose rooms do not take the place of the functions of the same name, as `mwdcal.fleet`."""
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if not (name in __all__ and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _PublicNames
 
 
 def __getattr__(name: str) -> object:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from mwdcal.estimation.minimisers import closed_form
 from mwdcal.estimation.problem import Problem, State, Triad
 from mwdcal.estimation.resetting import set_apart, with_share
 from mwdcal.estimation.robust import LOSSES, consistency, inflation, weight, weighted
-from mwdcal.estimation.solvers import Determined, Status
+from mwdcal.estimation.solvers import Determined, Status, stepped
 from mwdcal.estimation.start import start
 from mwdcal.estimation.uncertainty import (
     FIRST_SCATTER,
@@ -30,6 +31,7 @@ from mwdcal.estimation.uncertainty import (
     scatter_ratios,
     settle_gauge,
     station_misfit,
+    triad_squares,
     triad_sums,
     with_scatter,
 )
@@ -43,6 +45,8 @@ TEMPERATURE_STEP = 10.0
 ROBUST_ROUNDS = 40
 MOST_STEPS_IN_TURN = 200
 """Steps of all fits of a run after which weights or noise that have not settled never will."""
+MOST_AHEAD = 3.0
+"""Largest power of s² that an estimate of the noise takes at once."""
 NOISE_ROUNDS = 8
 """Most repetitions of fit and estimate of the noise."""
 SETTLED = 1e-3
@@ -215,7 +219,8 @@ def _general(problem: Problem, options: Options, finite: Bools) -> Fit:
     """The fit by the method's minimiser, with estimated noise and station weights in turn."""
     solved = solve(problem, start(problem), options)
     iterations, trust = solved.iterations, np.ones(problem.evidence.include.shape)
-    stage = _Stage(problem, solved, trust, np.zeros_like(iterations))
+    determined = Determined.of(problem, solved.state)
+    stage = _Stage(problem, solved, trust, np.zeros_like(iterations), determined)
     if not _all_declared(problem):
         stage = _estimate_noise(stage, options)
     stage = _set_apart(stage, options)
@@ -228,7 +233,8 @@ def refitted(result: Fit, problem: Problem, state: State, scale: Array, options:
     """A fit of a problem that has more unknowns than that of `result`, the noise times `scale` (B, triads)."""
     problem = _rescaled(problem, scale)
     solved = solve(problem, state, options)
-    stage = _Stage(problem, solved, result.trust, solved.iterations)
+    known = result.analysis.determined
+    stage = _Stage(problem, solved, result.trust, solved.iterations, known)
     finite = result.status != int(Status.NOT_FINITE)
     return _finished(stage, options, finite, result.iterations + solved.iterations)
 
@@ -318,27 +324,32 @@ def _bounded_factor(analysis: Analysis, trust: Array, loss: str, freedom: Array)
 class _Stage:
     """Where weighing and fitting in turn have come to: problem, solution, station weights (B, n).
 
-    `steps` (B,) counts the steps of all fits so far.
+    `steps` (B,) counts the steps of all fits so far; `determined` is known of a state nearby.
     """
 
     problem: Problem
     solved: Solved
     trust: Array
     steps: Ints
+    determined: Determined
 
 
-def _in_turn(stage: _Stage, rounds: int, turn: Callable[[_Stage], tuple[_Stage, Bools]]) -> _Stage:
-    """The stage after turns that also say who has settled: each member ends as if it were alone."""
+def _in_turn(
+    stage: _Stage, rounds: int, turn: Callable[[_Stage], tuple[_Stage, Bools]]
+) -> tuple[_Stage, Bools]:
+    """The stage after turns that also say who has settled, and who did: each member ends as if it were alone."""
     whole, active = stage, np.arange(len(stage.trust))
+    ended = np.zeros(len(active), bool)
     for _ in range(rounds):
         stage, settled = turn(stage)
+        ended[active[settled]] = True
         if settled.all():
             break
         if settled.any():
             done, rest = np.flatnonzero(settled), np.flatnonzero(~settled)
             whole = put(whole, active[done], take(stage, done))
             stage, active = take(stage, rest), active[rest]
-    return stage if len(active) == len(whole.trust) else put(whole, active, stage)
+    return (stage if len(active) == len(ended) else put(whole, active, stage)), ended
 
 
 def _set_apart(stage: _Stage, options: Options) -> _Stage:
@@ -360,35 +371,57 @@ def _set_apart(stage: _Stage, options: Options) -> _Stage:
 def _estimate_noise(stage: _Stage, options: Options) -> _Stage:
     """Variance per triad by restricted maximum likelihood, fit and estimate in turn.
 
-    A triad without redundancy keeps its start: its residuals are rounding, and say nothing.
+    A triad without redundancy keeps its start: its residuals are rounding, and say nothing. Where every direction is
+    clearly determined, the first turns take one step of the fit each: whole fits then have little left to do.
     """
-    free = [i for i, triad in enumerate(stage.problem.triads) if not triad.declared]
-    scatter = stage.problem.evidence.scatter
-    apart = stage.problem.evidence.apart.any()
-    slow = scatter or apart
+    evidence = stage.problem.evidence
+    slow = bool(evidence.scatter) or bool(evidence.apart.any())
     rounds, least = (SCATTER_ROUNDS, SCATTER_SETTLED) if slow else (NOISE_ROUNDS, SETTLED)
+    clear = np.flatnonzero(stage.determined.clear)
+    if clear.size and not options.separate_solver:
+        turn = partial(_noise_turn, options=options, least=least, whole=False)
+        part, settled = _in_turn(take(stage, clear), rounds, turn)
+        if settled.any():
+            stage = put(stage, clear[settled], take(part, np.flatnonzero(settled)))
+    turn = partial(_noise_turn, options=options, least=least, whole=True)
+    return _in_turn(stage, rounds, turn)[0]
 
-    def turn(now: _Stage) -> tuple[_Stage, Bools]:
-        analysis = analyse(now.problem, now.solved.state)
-        scale = np.sqrt(np.where(analysis.freedom >= 1, analysis.variance_factor, np.nan))
-        problem, solved = _rescaled(now.problem, scale), now.solved
-        settled = ~np.any(np.abs(scale[:, free] - 1) >= least, -1)
-        if scatter:
-            ratios = scatter_ratios(now.problem, solved.state, analysis)
-            problem = with_scatter(problem, solved.state, ratios)
-            settled &= _steady(now.problem, problem)
-        if apart:
-            problem = with_share(problem, solved.state, analysis)
-            before, share = (p.evidence.apart for p in (now.problem, problem))
-            settled &= np.abs(share - before) <= SCATTER_SETTLED * before
-        steps = now.steps
-        if options.method != "swarm":
-            solved = solve(problem, solved.state, options)
-            steps = steps + solved.iterations
-            settled |= steps > MOST_STEPS_IN_TURN
-        return replace(now, problem=problem, solved=solved, steps=steps), settled
 
-    return _in_turn(stage, rounds, turn)
+def _noise_turn(now: _Stage, options: Options, least: float, whole: bool) -> tuple[_Stage, Bools]:
+    """The noise as residuals have it, then a fit with it, or a step; and who has settled."""
+    evidence, at = now.problem.evidence, now.solved.state
+    free = [i for i, triad in enumerate(now.problem.triads) if not triad.declared]
+    analysis = analyse(now.problem, at, None if whole else now.determined)
+    scale = _noise_scale(analysis, ahead=not (whole or evidence.scatter or evidence.apart.any()))
+    problem, solved, steps = _rescaled(now.problem, scale), now.solved, now.steps
+    settled = ~np.any(np.abs(scale[:, free] - 1) >= least, -1)
+    if evidence.scatter:
+        ratios = scatter_ratios(now.problem, at, analysis)
+        problem = with_scatter(problem, at, ratios)
+        settled &= _steady(now.problem, problem)
+    if evidence.apart.any():
+        problem = with_share(problem, at, analysis)
+        before, share = (p.evidence.apart for p in (now.problem, problem))
+        settled &= np.abs(share - before) <= SCATTER_SETTLED * before
+    if not whole:
+        solved = replace(solved, state=stepped(now.problem, at, now.determined))
+    elif options.method != "swarm":
+        solved = solve(problem, at, options)
+        steps = steps + solved.iterations
+        settled |= steps > MOST_STEPS_IN_TURN
+    return replace(now, problem=problem, solved=solved, steps=steps), settled
+
+
+def _noise_scale(analysis: Analysis, ahead: bool) -> Array:
+    """The next estimate of the noise over the present one (B, t); NaN where nothing is left to tell it by.
+
+    Going `ahead` takes the step of Fisher's scoring, to first order: where uncertain angles take a share of the
+    residuals, s² alone comes closer only slowly. C⁻¹ is taken as that of each station by itself.
+    """
+    freedom, squares = analysis.freedom, triad_squares(analysis.spread)
+    factor = np.where(freedom >= 1, analysis.variance_factor, np.nan)
+    power = np.clip(freedom / np.maximum(squares, 1e-9), 1.0, MOST_AHEAD) if ahead else 1.0
+    return np.asarray(factor ** (power / 2))
 
 
 def _steady(old: Problem, new: Problem) -> Bools:
@@ -426,9 +459,10 @@ def _downweigh(stage: _Stage, options: Options) -> _Stage:
         solved = solve(_trusting(problem, trust), solved.state, options)
         steps = now.steps + solved.iterations
         settled = ~np.any(np.abs(trust / now.trust - 1) >= SETTLED, -1)
-        return _Stage(problem, solved, trust, steps), settled | (steps > MOST_STEPS_IN_TURN)
+        now = _Stage(problem, solved, trust, steps, now.determined)
+        return now, settled | (steps > MOST_STEPS_IN_TURN)
 
-    return _in_turn(stage, ROBUST_ROUNDS, turn)
+    return _in_turn(stage, ROBUST_ROUNDS, turn)[0]
 
 
 def _typical(square: Array, freedom: Array) -> Array:

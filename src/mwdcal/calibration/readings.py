@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, date, datetime, timedelta
 from itertools import compress, pairwise
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -154,6 +154,7 @@ class Readings:
         source: name of the file.
         unused: columns of the file that are not used, each with what it resembles.
         others: the numbers (..., n) in those of them that have one at every station, by name.
+        table: all columns (n,) of the file or table that was read, as they stand there.
         profile: the tool profile by which raw channels became these readings, if there was one.
         run_sha256, profile_sha256: of the files that both come from.
     """
@@ -172,6 +173,9 @@ class Readings:
     source: str = ""
     unused: tuple[str, ...] = ()
     others: Mapping[str, Array] = field(default_factory=dict)
+    table: Mapping[str, AnyArray] = field(default_factory=dict)
+    columns: ClassVar[Mapping[str, AnyArray]]
+    """The table, or one made of the readings: `library.shown` puts it here."""
     profile: Profile | None = None
     run_sha256: str = ""
     profile_sha256: str = ""
@@ -265,9 +269,19 @@ class Readings:
         whole, shape = np.asarray(value, float), self.accelerometer.shape[:-1]
         return whole if whole.shape == shape else np.broadcast_to(whole, shape)
 
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, where: slice | Bools | Ints) -> Readings:
+        """The stations of a slice, a mask or places, in their order."""
+        return self._at(np.arange(self.count)[where])
+
     def select(self, keep: Bools) -> Readings:
         """The stations where `keep` (n,) is true."""
-        chosen = np.flatnonzero(keep)
+        return self._at(np.flatnonzero(keep))
+
+    def _at(self, chosen: Ints) -> Readings:
+        """The stations at some places."""
 
         def rows(value: AnyArray | None, axis: int = -1) -> Any:
             return None if value is None else np.take(value, chosen, axis)
@@ -286,6 +300,7 @@ class Readings:
             },
             group=rows(self.group),
             others={name: rows(values) for name, values in self.others.items()},
+            table={name: rows(values) for name, values in self.table.items()},
             station=tuple(self.station[i] for i in chosen) if self.station else (),
             digest=tuple(self.digest[i] for i in chosen) if self.digest else (),
         )

@@ -6,7 +6,7 @@ a calibration in memory and one read back give the same results.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import date, datetime
 from itertools import pairwise
 from typing import Any, ClassVar
@@ -293,17 +293,21 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
 
     plot: ClassVar[Any]
     """Figures of the calibration: `use.plots` puts them here, so that a record needs no drawing."""
+    summary: ClassVar[Callable[..., str]]
+    to_dict: ClassVar[Callable[..., dict[str, Any]]]
+    report: ClassVar[Callable[..., None]]
+    """What the command prints, its JSON and its page: `library.shown` puts them here."""
 
     def __hash__(self) -> int:
         return hash((self.run_sha256, self.software, self.time))
 
     def __repr__(self) -> str:
-        return f"<Calibration: {'; '.join(f'{k} {v}' for k, v in self.summary().items())}>"
+        return f"<Calibration: {'; '.join(f'{k} {v}' for k, v in self.glance().items())}>"
 
     def _repr_html_(self) -> str:
-        return html_table("Calibration", self.summary().items())
+        return html_table("Calibration", self.glance().items())
 
-    def summary(self) -> dict[str, str]:
+    def glance(self) -> dict[str, str]:
         """The calibration at a glance: tool, run, rank, accuracy and findings, in words."""
         rank = ", ".join(f"{t.name} {t.rank} of {t.size}" for t in self.triads)
         accuracy = ", ".join(f"{name} {text}" for name, text in self._accuracy().items())

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -79,6 +80,11 @@ class Comparison:
     `measures_before` are errors of the nominal readings; `gauge` names, by triad, the
     directions that some method leaves free and all are therefore stripped of.
     """
+
+    summary: ClassVar[Callable[..., str]]
+    to_dict: ClassVar[Callable[..., dict[str, Any]]]
+    report: ClassVar[Callable[..., None]]
+    """As of `Calibration`."""
 
     run: str
     stations: int

@@ -28,6 +28,8 @@ RANK_TOLERANCE = 2e-2
 NEGLIGIBLE = 1e-2
 """A member that is still on its way when iterations end has settled if a full step is a smaller
 share of the standard uncertainty than this."""
+CLEAR_MARGIN = 5.0
+"""A direction is clearly determined with a singular value so many times `RANK_TOLERANCE`."""
 SPANNED = 1e-6
 """Smallest eigenvalue of the normalised 4 × 4 information at which the vectors span space."""
 
@@ -106,14 +108,33 @@ class Linear:
     @cached_property
     def normal(self) -> Normal:
         """Its normal equations: the sum over stations, priors included."""
-        columns = np.concatenate([self.design, self.residual[..., None]], -1)
-        weighed = self.weigh(columns)
-        rows = (*columns.shape[:-3], -1, columns.shape[-1])
-        whole = columns.reshape(rows).mT @ weighed.reshape(rows)
+        whole = self._by_triad if self.bare else self._together
         pulled = (self.prior @ self.pull[..., None])[..., 0]
         information = whole[..., :-1, :-1] + self.prior
         cost = whole[..., -1, -1] + np.sum(self.pull * pulled, -1)
         return Normal(information, whole[..., :-1, -1] + pulled, cost, self.size)
+
+    @property
+    def _together(self) -> Array:
+        """(X ρ)ᵀ C⁻¹ (X ρ) (B, u + 1, u + 1)."""
+        columns = np.concatenate([self.design, self.residual[..., None]], -1)
+        weighed = self.weigh(columns)
+        rows = (*columns.shape[:-3], -1, columns.shape[-1])
+        return np.asarray(columns.reshape(rows).mT @ weighed.reshape(rows))
+
+    @property
+    def _by_triad(self) -> Array:
+        """The same where C is the identity: the sum over triads, each with the unknowns that its rows have."""
+        count, end = len(self.residual), self.size + self.shared.shape[-1]
+        whole = np.zeros((count, end + 1, end + 1))
+        for block, rows, columns in self.placed():
+            shared = self.shared[..., rows, :]
+            used = np.flatnonzero(shared.any((0, 1, 2)))
+            part = [block, shared[..., used], self.residual[..., rows, None]]
+            each = np.concatenate(part, -1).reshape(count, -1, block.shape[-1] + used.size + 1)
+            at = np.concatenate([np.arange(columns.start, columns.stop), self.size + used, [end]])
+            whole[:, at[:, None], at] += each.mT @ each
+        return whole
 
     @cached_property
     def determined(self) -> Determined:
@@ -143,15 +164,20 @@ class Linear:
         gram = self.private.mT @ self.private
         return np.asarray(inverse(np.eye(gram.shape[-1]) + gram))
 
+    @cached_property
+    def bare(self) -> bool:
+        """Whether no station has an unknown to itself: C is the identity."""
+        return not self.private.any()
+
     def weigh(self, columns: Array) -> Array:
         """C⁻¹ times columns (B, n, m, k)."""
-        return np.asarray(columns - self.private @ (self.core @ (self.private.mT @ columns)))
+        return columns if self.bare else self.weight @ columns
 
-    @property
+    @cached_property
     def weight(self) -> Array:
         """C⁻¹ (B, n, m, m)."""
-        shape = (*self.residual.shape, self.residual.shape[-1])
-        return self.weigh(np.broadcast_to(np.eye(shape[-1]), shape))
+        whole = np.eye(self.residual.shape[-1]) - self.private @ (self.core @ self.private.mT)
+        return np.asarray(whole)
 
     def private_step(self, step: Array) -> Array:
         """Private unknowns (B, n, a), in their prior's units, after a step of X's unknowns."""
@@ -223,6 +249,11 @@ class Determined:
     def of(cls, problem: Linearisable, state: Any) -> Determined:
         """Of a problem at a state."""
         return problem.linear(state, geometry=True).determined
+
+    @property
+    def clear(self) -> Bools:
+        """Members (B,) of which every direction is determined, and no step of a fit changes that."""
+        return np.asarray((self.values > CLEAR_MARGIN * RANK_TOLERANCE).all(-1))
 
     @property
     def rank(self) -> Ints:
@@ -311,11 +342,12 @@ class _Descent:
 
         The others go on, with the directions that are determined where they are now.
         """
-        if not converged.any():
+        doubtful = converged & ~self.determined.clear
+        if not doubtful.any():
             return converged
-        which = np.flatnonzero(converged)
+        which = np.flatnonzero(doubtful)
         here = self.problem, self.state
-        now = Determined.of(*(here if converged.all() else take(here, which)))
+        now = Determined.of(*(here if doubtful.all() else take(here, which)))
         same = now.rank == self.determined.rank[which]
         if not same.all():
             self.determined = put(self.determined, which, now)
@@ -344,6 +376,12 @@ def _small(linear: Linear, step: Array, params: Array) -> Bools:
     )
     near = _length(linear.normal, step) < 1e-12
     return np.asarray(near | np.all(moved <= 1e-12 * size, 0))
+
+
+def stepped(problem: Linearisable, state: Any, determined: Determined) -> Any:
+    """The state after one full step, whatever it does to the cost."""
+    linear = problem.linear(state)
+    return problem.move(state, linear, _step(linear.normal, determined))
 
 
 def gauss_newton(problem: Linearisable, state: Any, limit: int = 60) -> tuple[Any, Ints, Ints]:

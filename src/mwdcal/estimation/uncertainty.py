@@ -270,6 +270,12 @@ def triad_sums(values: Array) -> Array:
     return np.asarray(np.sum(by_triad, (1, 3)))
 
 
+def triad_squares(spread: Array) -> Array:
+    """Sums (B, t) of the squares of each triad's own blocks of a spread (B, n, m, m)."""
+    blocks = [spread[..., k : k + 3, k : k + 3] for k in range(0, spread.shape[-1], 3)]
+    return np.stack([np.sum(block**2, (1, 2, 3)) for block in blocks], -1)
+
+
 def effective_freedom(problem: Problem, state: State, analysis: Analysis) -> Array:
     """Degrees of freedom (B, t) of the χ² that s² times them follows: tr(S)² / tr(S²).
 
@@ -305,6 +311,17 @@ def station_misfit(analysis: Analysis) -> tuple[Array, Array]:
     return quotient(along, values, tested).sum(-1), np.sum(tested, -1).astype(float)
 
 
+def left_out_residual(analysis: Analysis) -> Array:
+    """Whitened residual (B, n, m) of each station against the fit without it: spread⁺ C⁻¹ρ.
+
+    Exact for a linear problem. Directions of a station's readings that nothing else tests have none.
+    """
+    values, vectors = eigen(analysis.spread)
+    along = np.einsum("bnij,bni->bnj", vectors, analysis.residual)
+    along = quotient(along, values, values > TESTED)
+    return np.asarray(np.einsum("bnij,bnj->bni", vectors, along))
+
+
 def without_station(problem: Problem, state: State, analysis: Analysis) -> Array:
     """Change (B, n, p) of the parameters when one station is left out, for each station.
 
@@ -318,10 +335,7 @@ def without_station(problem: Problem, state: State, analysis: Analysis) -> Array
         stay = inverse(np.eye(leverage.shape[-1]) + leverage) @ linear.residual[..., None]
         return np.asarray(-(analysis.influence[:, :, :p] @ stay)[..., 0])
     whole = whole_covariance(linear, analysis.determined)[:, : linear.size]
-    values, vectors = eigen(analysis.spread)
-    along = np.einsum("bnij,bni->bnj", vectors, analysis.residual)
-    along = quotient(along, values, values > TESTED)
-    pulled = np.einsum("bnij,bnj->bni", vectors, along)
+    pulled = left_out_residual(analysis)
     pulled = np.einsum("bnmu,bnm->bnu", linear.weigh(linear.design), pulled)
     return np.asarray(np.einsum("bpu,bnu->bnp", whole, pulled))
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 import msgspec
 import numpy as np
@@ -43,7 +44,7 @@ class Rival(msgspec.Struct, frozen=True, kw_only=True):
     unit: str | None
 
 
-class Diagnosis(msgspec.Struct, frozen=True, kw_only=True):
+class Diagnosis(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     """The outcome: `fault` is "none" or one of `physics.FAULTS`, and the first of `parameters` its `size`.
 
     `channel`: "ax" …, a triad, or None for the whole tool. `probability` bounds the chance that a sound tool gives
@@ -52,6 +53,10 @@ class Diagnosis(msgspec.Struct, frozen=True, kw_only=True):
     `tell_apart` what would; `unseen` are faults of the usual size that they would not show. `surveys`: no station has
     an attitude given, as in a hole.
     """
+
+    summary: ClassVar[Callable[..., str]]
+    to_dict: ClassVar[Callable[..., dict[str, Any]]]
+    """As of `Calibration`."""
 
     fault: str
     channel: str | None

@@ -12,7 +12,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from mwdcal.calibration.automatic.nonlinearity import MOST_PARTS, compare_curves, offered, scattered
+from mwdcal.calibration.automatic.nonlinearity import compare_curves, offered, scattered
 from mwdcal.calibration.automatic.order_selection import choose_orders
 from mwdcal.calibration.diagnosis.refusals import check_curves, check_options
 from mwdcal.calibration.estimate import temperature_ranges
@@ -69,7 +69,7 @@ def with_curves(
         curves = compare_curves(some, options, terms)
         return np.array([[n in names for n in terms] for names in curves.choices])[curves.chosen]
 
-    trials = in_chunks(readings, tools, shown, fail, TOOLS_PER_FIT // MOST_PARTS)
+    trials = in_chunks(readings, tools, shown, fail)
     for chosen, some in _by_choice(trials):
         yield some, replace(options, nonlinearity=dict(compress(terms.items(), chosen)))
 

@@ -4,6 +4,7 @@ from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import FitError, InputError
+from mwdcal.library import shown as shown  # puts words, document and page on results
 from mwdcal.library.arrays import readings
 from mwdcal.library.planning import plan, propose_profile
 from mwdcal.library.records import certificate, check_signature, fleet, registry, sign

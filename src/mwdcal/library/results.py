@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
+from importlib import import_module
 from typing import Any
 
 from mwdcal.calibration.record import Finding
@@ -58,16 +59,6 @@ class Result:
 
         atomic.write(os.fspath(path), self._page())
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the file of the command.
-
-        Raises:
-            InputError: there is no such file, or it cannot be written.
-        """
-        raise InputError(
-            f"a {type(self).__name__} has no file of its own; its `to_dict()` is JSON."
-        )
-
     def to_pandas(self) -> Any:
         """The columns as a table of pandas, with what is stated of them in `attrs`; pandas must be installed."""
         return frame(self.columns)
@@ -97,7 +88,7 @@ def frame(columns: Mapping[str, AnyArray]) -> Any:
         InputError: pandas is not installed.
     """
     try:
-        import pandas
+        pandas = import_module("pandas")
     except ModuleNotFoundError as error:
         raise InputError(
             "`to_pandas` needs pandas, which is not installed: pip install pandas."

@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal, cast
+from typing import Any, Literal, Protocol, cast, runtime_checkable
 
+import msgspec
 import numpy as np
 
 from mwdcal.calibration.calibrate import calibrate as fit_and_judge
+from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration, Finding
@@ -26,19 +28,16 @@ from mwdcal.files.formats.table import Table
 from mwdcal.files.limits import load_limits
 from mwdcal.geometry.vectors import AnyArray, Array, ArrayLike
 from mwdcal.library.arrays import nearest, without_mask
-from mwdcal.library.results import Result
+from mwdcal.library.shown import with_inputs
 from mwdcal.logs.noise import Noise, find_noise
 from mwdcal.logs.stations import Stations, find_stations
 from mwdcal.planning import simulate as simulation
 from mwdcal.planning.simulate import Truth
-from mwdcal.sensor.profile import Profile, TriadProfile
+from mwdcal.sensor.profile import NOMINAL as NOMINAL
+from mwdcal.sensor.profile import Profile
 from mwdcal.use.correction import correct
 from mwdcal.use.verification import Limits, Verdict
 from mwdcal.use.verification import verify as judge
-
-_UNSCALED = TriadProfile(scale=1.0)
-NOMINAL = Profile(name="nominal", accelerometer=_UNSCALED, magnetometer=_UNSCALED)
-"""The profile of arrays: raw readings are nominal g and nT along the tool axes."""
 
 CORRECTED_ANGLES = ("inclination", "azimuth", "toolface", "dip", "magnetic_toolface")
 """Angles of corrected readings."""
@@ -83,7 +82,8 @@ def read_run(
     if metadata:
         table = replace(table, metadata={**table.metadata, **meta.plain(metadata, table.source)})
     readings, profile = runs.read_run(table, profile)
-    return replace(readings, profile=profile, profile_sha256=profile_sha256)
+    whole = {name: np.asarray(cells) for name, cells in table.columns.items()}
+    return replace(readings, profile=profile, profile_sha256=profile_sha256, table=whole)
 
 
 def _table(source: Tabular, name: str, read: Callable[[Path], Table]) -> Table:
@@ -245,7 +245,9 @@ def compare(
     """
     _check_readings(run)
     given = _options(options, choices)
-    return compare_methods(run, _profile(run, profile), given, progress=progress)
+    result = compare_methods(run, _profile(run, profile), given, progress=progress)
+    digests = {"run": run.run_sha256, "profile": run.profile_sha256}
+    return with_inputs(result, run.metadata, **digests)
 
 
 def verify(
@@ -260,9 +262,12 @@ def verify(
             which no limit applies.
     """
     _check_readings(rolltest, "rolltest")
-    return judge(
-        calibration, rolltest, limits if isinstance(limits, Limits) else load_limits(limits)[0]
-    )
+    bounds, digest = (limits, "") if isinstance(limits, Limits) else load_limits(limits)
+    verdict = judge(calibration, rolltest, bounds)
+    findings = [*verdict.findings, *unused_columns(rolltest.unused)]
+    verdict = msgspec.structs.replace(verdict, findings=findings)
+    stated, digests = (calibration.tool, rolltest.metadata), {"limits": digest}
+    return with_inputs(verdict, *stated, run=rolltest.run_sha256, **digests)
 
 
 def diagnose(calibration: Calibration, later: Readings) -> Diagnosis:
@@ -275,7 +280,10 @@ def diagnose(calibration: Calibration, later: Readings) -> Diagnosis:
         InputError: readings of another tool or of the fit itself, or none that can be used.
     """
     _check_readings(later, "later")
-    return explain(calibration, later)
+    result = explain(calibration, later)
+    findings = [*calibration.change_findings(), *result.findings, *unused_columns(later.unused)]
+    result = msgspec.structs.replace(result, findings=findings)
+    return with_inputs(result, calibration.tool, later.metadata, readings=later.run_sha256)
 
 
 @dataclass(frozen=True)
@@ -321,25 +329,34 @@ def apply(
     )
 
 
+@runtime_checkable
+class Savable(Protocol):
+    """A result that writes itself, in the form that the suffix of a file names."""
+
+    def save(self, path: Path) -> None:
+        """Write the result."""
+
+
 def save(
-    result: Calibration | Readings | Result,
+    result: Calibration | Readings | Savable,
     path: Path,
     profile: Path | Profile | None = None,
     *,
     decimals: int | None = None,
 ) -> None:
-    """Write a calibration file (JSON), the readings of a run as `read_run` reads them, or the file of a result.
+    """Write a calibration file (JSON), or the readings of a run as `read_run` reads them.
 
     A run is a CSV, TSV, Parquet or XLSX file, by the suffix. Its channels are raw: in the axes and
     units of the `profile`, by default the one that the run was read with, else g and nT along the
     tool axes. `decimals` are places after the point, by default as many as there are. A file is
-    written whole or not at all.
+    written whole or not at all. A result that has a form of its own for each suffix, such as a
+    certificate, writes itself.
     """
+    if isinstance(result, Savable):
+        result.save(path)
+        return
     if isinstance(result, Calibration):
         documents.write(path, result)
-        return
-    if isinstance(result, Result):
-        result.save(path)
         return
     _check_readings(result, "result")
     table = runs.from_readings(result, _profile(result, profile))
@@ -367,7 +384,8 @@ def stations(log: Tabular, **options: Any) -> Stations:
     `log` is a file, or columns by the names of log files: `time_s`, `ax`, …, `temperature_c`. `options`
     are those of `mwdcal.logs.stations.find_stations`.
     """
-    return find_stations(_log(log), **options)
+    table = _log(log)
+    return with_inputs(find_stations(table, **options), table.metadata, log=table.digest)
 
 
 def noise(log: Tabular, **options: Any) -> Noise:
@@ -376,7 +394,8 @@ def noise(log: Tabular, **options: Any) -> Noise:
     `log` is a file, or columns by the names of log files. `options` are those of
     `mwdcal.logs.noise.find_noise`.
     """
-    return find_noise(_log(log), **options)
+    table = _log(log)
+    return with_inputs(find_noise(table, **options), table.metadata, log=table.digest)
 
 
 def _log(source: Tabular) -> Table:

@@ -16,14 +16,16 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files import runs
+from mwdcal.files.contract import COLUMNS
 from mwdcal.files.formats import atomic
 from mwdcal.files.formats import table as tables
-from mwdcal.files.formats.columns import LABELS
+from mwdcal.files.formats.columns import LABELS, as_text
 from mwdcal.files.formats.table import Table
 from mwdcal.geometry.vectors import AnyArray, Array, Bools
 from mwdcal.library.arrays import nearest
 from mwdcal.library.results import Result, frame
 from mwdcal.library.tasks import Tabular, _check_readings, _table
+from mwdcal.sensor.profile import Profile
 
 if TYPE_CHECKING:
     from mwdcal.calibration.canonical import SignatureCheck
@@ -594,13 +596,29 @@ def _survey_table(readings: Tabular | Readings, calibration: Calibration, decima
     profile = calibration.profile
     if isinstance(readings, Readings):
         _check_readings(readings, "readings")
-        table = runs.from_readings(readings, profile)
-        return replace(table, columns={**table.columns, **readings.others})
+        return _table_of(readings, profile)
+    if not isinstance(readings, str | os.PathLike | Mapping) and not hasattr(readings, "columns"):
+        raise InputError(
+            f"`readings` must be a file, columns by name, or readings; got {type(readings).__name__}. Make some by "
+            "mwdcal.read_run(…)."
+        )
     return _table(
         readings,
         "the readings",
         lambda path: runs.read_export(path, profile, decimal=decimal, rows=runs.MOST_ROWS),
     )
+
+
+def _table_of(readings: Readings, profile: Profile) -> Table:
+    """The table of readings in the raw units of a profile, with the columns of their own table that it lacks."""
+    table = runs.from_readings(readings, profile)
+    beside = {
+        name: [as_text(cell) for cell in values.tolist()] if values.dtype.kind in "OUS" else values
+        for name, values in readings.table.items()
+    }
+    there = runs.renamed(Table(beside, {}, table.source), readings.profile or profile).columns
+    others = {name: cells for name, cells in there.items() if name not in COLUMNS}
+    return replace(table, columns={**readings.others, **table.columns, **others})
 
 
 def _arrays(table: Table, words: Iterable[str]) -> dict[str, AnyArray]:

@@ -11,7 +11,9 @@ at T itself.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
+from typing import Any, ClassVar
 
 import msgspec
 import numpy as np
@@ -125,11 +127,16 @@ class ChannelNoise(msgspec.Struct, frozen=True, kw_only=True):
     scale: float | None = None
 
 
-class Noise(msgspec.Struct, frozen=True, kw_only=True):
+class Noise(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     """The noise of a log; `profile` is the recommended `noise` of each triad, raw units.
 
     `withheld` says why there is none for a triad whose channels do not hold.
     """
+
+    summary: ClassVar[Callable[..., str]]
+    to_dict: ClassVar[Callable[..., dict[str, Any]]]
+    report: ClassVar[Callable[..., None]]
+    """As of `Calibration`."""
 
     log: str
     seconds: float

@@ -6,8 +6,9 @@ slower still: it never decides what stands still. See `standstill` for the metho
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -58,6 +59,11 @@ class Stations:
         traces: the channels that have samples.
         findings: what is reported beside the stations.
     """
+
+    summary: ClassVar[Callable[..., str]]
+    to_dict: ClassVar[Callable[..., dict[str, Any]]]
+    report: ClassVar[Callable[..., None]]
+    """As of `Calibration`."""
 
     table: Table
     intervals: Standstills

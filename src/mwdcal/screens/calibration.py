@@ -31,7 +31,7 @@ from mwdcal.screens.text import chance, number, one_line, quantity, table
 from mwdcal.screens.typed import findings_as_typed
 
 if TYPE_CHECKING:
-    from mwdcal.calibration.automatic.auto import Choice
+    pass
 
 MOST_RESHOOTS = 12
 """Most stations to re-shoot that messages name."""
@@ -91,7 +91,7 @@ def _recorded(kind: type[msgspec.Struct], record: msgspec.Struct) -> dict[str, A
 
 
 def summary(
-    calibration: Calibration, choice: Choice, output: Path, report: Path | None
+    calibration: Calibration, tried: list[CurveScore], output: Path | None, report: Path | None
 ) -> dict[str, Any]:
     """The result for machines."""
     findings = findings_as_typed(calibration.findings)
@@ -99,8 +99,8 @@ def summary(
         **{**_recorded(CalibrationSummary, calibration), "findings": findings},
         triads={t.name: TriadSummary(**_recorded(TriadSummary, t)) for t in calibration.triads},
         accuracy_1sigma_deg=typical_accuracy(calibration),
-        nonlinearity=choice.curves,
-        calibration=str(output),
+        nonlinearity=tried,
+        calibration=str(output or ""),
         report=str(report or ""),
     )
     return enveloped(
@@ -113,18 +113,25 @@ def summary(
     )
 
 
-def screen(calibration: Calibration, choice: Choice, output: Path, report: Path | None) -> str:
-    """The result for people."""
+def body(calibration: Calibration, tried: list[CurveScore]) -> str:
+    """The calibration for people, with the own-axis terms that were tried."""
     blocks = [
         heading(calibration),
         *([orders(calibration.orders)] if calibration.orders else []),
-        *([curves(choice.curves)] if choice.curves else []),
+        *([curves(tried)] if tried else []),
         errors(calibration.errors),
         "\n".join(remarks(calibration)),
     ]
+    return "\n\n".join(blocks)
+
+
+def screen(
+    calibration: Calibration, tried: list[CurveScore], output: Path, report: Path | None
+) -> str:
+    """The result for people, with the files that were written, and what to do next."""
     files = written(calibration=output, report=report)
     after = f"{files}   next: mwdcal verify {one_line(output)} ROLLTEST.csv"
-    return "\n\n".join(blocks) + f"\n{after}"
+    return f"{body(calibration, tried)}\n{after}"
 
 
 def first_findings(calibration: Calibration) -> list[Finding]:

@@ -34,7 +34,7 @@ class NoiseSummary(Noise, frozen=True, kw_only=True):
     """What `noise` prints: the noise, and the files that were written."""
 
     plot: str
-    report: str
+    report: str  # type: ignore[assignment,misc]  # a file here, a page of the noise there
 
 
 def document(noise: Noise, plot: Path | None, report: Path | None) -> NoiseSummary:

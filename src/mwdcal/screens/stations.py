@@ -72,17 +72,16 @@ def _seconds(stations: Stations) -> float:
     return float(stations.time[-1] - stations.time[0])
 
 
-def screen(stations: Stations, files: dict[str, str]) -> str:
+def body(stations: Stations) -> str:
     """What was found, for people."""
+    lines = [one_line("   ".join(heading(stations))), "   ".join(search(stations)), ""]
+    return "\n".join([*lines, _stations_table(stations)])
+
+
+def screen(stations: Stations, files: dict[str, str]) -> str:
+    """What was found, the files that were written, and what to do next."""
     outputs = written(run=files["output"], picture=files["plot"], report=files["report"])
-    lines = [
-        one_line("   ".join(heading(stations))),
-        "   ".join(search(stations)),
-        "",
-        _stations_table(stations),
-        f"{outputs}   next: {one_line(next_command(files['output']))}",
-    ]
-    return "\n".join(lines)
+    return f"{body(stations)}\n{outputs}   next: {one_line(next_command(files['output']))}"
 
 
 def shown_in(plot: Path | None, report: Path | None) -> str:

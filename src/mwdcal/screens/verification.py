@@ -20,8 +20,13 @@ BETWEEN_SETS = "stations outside of roll sets"
 VERDICT_RISK = "risk of a wrong verdict, all roll sets and limits together"
 
 
-def screen(result: Verdict, signature: SignatureCheck, *metadata: Mapping[str, object]) -> str:
-    """The outcome first, then each limit; `signature` of the calibration, `metadata` of calibration and run."""
+def screen(
+    result: Verdict, signature: SignatureCheck | None, *metadata: Mapping[str, object]
+) -> str:
+    """The outcome first, then each limit.
+
+    `signature` of the calibration's file, if there is one, `metadata` of calibration and run.
+    """
     rows = []
     for row in result.rows:
         sd = uncertainty(row.uncertainty, row.unit)
@@ -29,7 +34,8 @@ def screen(result: Verdict, signature: SignatureCheck, *metadata: Mapping[str, o
         verdict = "pass" if row.passed else "FAIL"
         rows.append([row.name, raw, value, sd, freedom(row), limit, verdict, row.note])
     outcome = "PASS" if result.passed else "FAIL"
-    first = [outcome, result.run, f"{result.stations} stations", in_short(signature)]
+    first = [outcome, result.run, f"{result.stations} stations"]
+    first += [in_short(signature)] if signature else []
     first += simulated(*metadata)
     source = f" ({result.source})" if result.source else ""
     lines = ["   ".join(first), f"limits {result.limits}{source}", f"rule: {result.rule}"]

@@ -180,3 +180,8 @@ class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     def has_magnetometer(self) -> bool:
         """Whether it says anything of a magnetometer; with readings of one it may still say nothing."""
         return self.magnetometer != TriadProfile()
+
+
+_UNSCALED = TriadProfile(scale=1.0)
+NOMINAL = Profile(name="nominal", accelerometer=_UNSCALED, magnetometer=_UNSCALED)
+"""The profile of arrays: raw readings are nominal g and nT along the tool axes."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any, ClassVar, Literal
@@ -174,7 +174,7 @@ class VerdictRow(msgspec.Struct, frozen=True, kw_only=True):
         return self.limit if self.two_sided else self.limit / 2
 
 
-class Verdict(msgspec.Struct, frozen=True, kw_only=True):
+class Verdict(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     """The outcome of a verification; `date` as the run states it.
 
     `degrees_of_freedom`: of the triad of the calibration with the fewest. None: a document of an earlier version.
@@ -200,6 +200,9 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
 
     plot: ClassVar[Any]
     """Figures of the verdict, as `Calibration.plot`."""
+    summary: ClassVar[Callable[..., str]]
+    to_dict: ClassVar[Callable[..., dict[str, Any]]]
+    """As of `Calibration`."""
 
     def __repr__(self) -> str:
         failed = ", ".join(row.name for row in self.rows if not row.passed)

@@ -53,6 +53,8 @@ def command(
         from mwdcal.pages.report import render
 
         rendered = render(calibration)
-    shown = (screen.summary if as_json else screen.screen)(calibration, choice, output, report)
+    shown = (screen.summary if as_json else screen.screen)(
+        calibration, choice.curves, output, report
+    )
     atomic.write_all([(output, documents.encode(calibration)), (report, rendered)])
     print_result(shown, screen.first_findings(calibration))

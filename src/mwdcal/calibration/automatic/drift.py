@@ -36,6 +36,8 @@ PRIOR_CHANCE = 1e-3
 """Chance of so large a departure from the prior, at which a drift is looked for in the run alone."""
 DISPUTED_CHANCE = 0.01
 """The same chance where the run departs from its prior: a drift there would take up what is a conflict."""
+EVERY_PARAMETER = 12
+"""Parameters of a triad that are all fitted."""
 REDUNDANCY = 36.0
 """Fewest degrees of freedom of a triad that can tell a drift from noise."""
 
@@ -82,8 +84,12 @@ def _one_plan(problem: Problem) -> bool:
 
 
 def drifting(result: Fit, options: Options) -> Bools:
-    """Triads (B, t) whose readings drifted within the run."""
+    """Triads (B, t) whose readings drifted within the run.
+
+    None where parameters are held: what these would take up follows the attitudes, and so the order of stations.
+    """
     apart = options.robust or options.separate_solver or result.analysis.influence is not None
+    apart = apart or options.parameters < EVERY_PARAMETER
     drifted = np.zeros(result.analysis.freedom.shape, bool)
     if apart:
         return drifted

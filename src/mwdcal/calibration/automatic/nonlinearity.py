@@ -13,13 +13,13 @@ from itertools import combinations
 
 import numpy as np
 
-from mwdcal.calibration.automatic.order_selection import left_out, misfit, with_noise
+from mwdcal.calibration.automatic.order_selection import with_noise
 from mwdcal.calibration.estimate import fit, scatters
 from mwdcal.calibration.options import AUTO, USUAL, Options
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import stated
 from mwdcal.estimation.batch import batch_of_one
-from mwdcal.estimation.uncertainty import log_evidence
+from mwdcal.estimation.uncertainty import left_out_residual, log_evidence, without_station
 from mwdcal.geometry.directions import directions, group_scatter
 from mwdcal.geometry.vectors import Array, Ints
 from mwdcal.sensor.profile import Profile
@@ -28,8 +28,6 @@ BETTER_SHARE = 0.98
 """Left-out χ² must fall to this share before own-axis terms are taken…"""
 CLEAR_ERRORS = 2.0
 """…and by so many standard errors of its mean over the stations."""
-MOST_PARTS = 32
-"""Stations are left out one by one, or in so many parts where there are more."""
 ODDS = float(np.log(1000.0))
 """All offered terms are taken if they make the readings so many times (ln) as probable as none.
 
@@ -119,13 +117,16 @@ def choose_curves(
 
 
 def _group_scatter(readings: Readings, options: Options) -> float | None:
-    """How far directions within groups scatter, degrees, each station being corrected by a fit without its part."""
+    """How far directions within groups scatter, degrees, each station being corrected by the fit without it."""
     if readings.magnetometer is None or not (readings.groups >= 0).any():
         return None
-    every = np.arange(readings.count)
-    part = every % min(readings.count, MOST_PARTS)
-    problem, state, _ = left_out(batch_of_one(readings), options, part)
-    g, b = (vectors[part, every] for vectors in problem.fields(state))
+    result = fit(batch_of_one(readings), options)
+    problem, state = result.problem, result.state
+    params = state.params[0] + without_station(problem, state, result.analysis)[0]
+    g, b = (
+        t.model.fields(params[:, where], t.raw[0, :, None], problem.temperature[0, :, None])[:, 0]
+        for t, where in zip(problem.triads, problem.slices(), strict=True)
+    )
     return stated(np.degrees(group_scatter(directions(g, b), readings.groups)))
 
 
@@ -187,9 +188,8 @@ def _by_left_out(
 
 
 def _left_out(readings: Readings, options: Options) -> Array:
-    """χ² per reading (B, n) of stations, each judged by the fit without its part."""
-    parts = min(readings.count, MOST_PARTS)
-    part = np.arange(readings.count) % parts
-    problem, state, _ = left_out(readings, options, part)
-    square = misfit(problem, state).mean(-1).reshape(-1, parts, readings.count) / 3
-    return np.asarray(square[:, part, np.arange(readings.count)])
+    """χ² per reading (B, n) of stations, each judged by the fit without it."""
+    result = fit(readings, options)
+    left = left_out_residual(result.analysis)
+    weighed = result.problem.linear(result.state).weigh(left[..., None])[..., 0]
+    return np.asarray(np.mean(left * weighed, -1))

@@ -25,7 +25,7 @@ from mwdcal.calibration.diagnosis.plausibility import (
     stations_to_reshoot,
     unchecked,
 )
-from mwdcal.calibration.diagnosis.structure import COLUMN, suspected
+from mwdcal.calibration.diagnosis.structure import COLUMN, is_shown, suspected
 from mwdcal.calibration.diagnosis.structure import described as seen_as
 from mwdcal.calibration.drift import SHOWN_DRIFT
 from mwdcal.calibration.readings import EARTH_RANGES, HIGHEST, TRIADS
@@ -287,11 +287,19 @@ def _drifts(fitted: FittedRuns) -> Iterator[Flag]:
 def _structure(fitted: FittedRuns) -> Iterator[Flag]:
     """What the residuals look like, where they are more than noise."""
     unit = shown_in("field", fitted.readings.relative)[1]
-    for place in np.flatnonzero(suspected(fitted.result, fitted.chances)).tolist():
-        for effect in fitted.effects(place):
-            column = effect.name.startswith(COLUMN)
-            name = "column-explains" if column else f"looks-like-{effect.name}"
-            yield _common(fitted, name, seen_as(effect, unit), [place])
+    looked_at = np.flatnonzero(suspected(fitted.result, fitted.chances))
+    for place, shown in fitted.shown(looked_at).items():
+        for name in filter(partial(is_shown, shown), shown):
+            column = name.startswith(COLUMN)
+            words = partial(_looks, fitted, name, unit)
+            finding = "column-explains" if column else f"looks-like-{name}"
+            yield Flag(finding, np.arange(fitted.count) == place, "{looks}", {"looks": words})
+
+
+def _looks(fitted: FittedRuns, name: str, unit: str, place: int) -> str:
+    """An effect that the residuals of one run show, in words."""
+    [effect] = (each for each in fitted.effects(place) if each.name == name)
+    return seen_as(effect, unit)
 
 
 def _scatter(fitted: FittedRuns) -> Flag:

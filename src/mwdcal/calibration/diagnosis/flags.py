@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from mwdcal.calibration.diagnosis.plausibility import freedom_of, misfit_chances
-from mwdcal.calibration.diagnosis.structure import Effect, effects
+from mwdcal.calibration.diagnosis.structure import Effect, Shown, effects, shown_effects
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
@@ -88,6 +88,7 @@ class FittedRuns:
     result: Fit
     alone: Alone
     _residuals: dict[int, Residuals] = field(init=False, repr=False, default_factory=dict)
+    _shown: dict[int, Shown] = field(init=False, repr=False, default_factory=dict)
 
     @cached_property
     def free(self) -> list[list[Free]]:
@@ -133,10 +134,21 @@ class FittedRuns:
         """The fit of one run, as a batch of one."""
         return self.result if self.count == 1 else take(self.result, np.array([place]))
 
+    def shown(self, places: Ints) -> dict[int, Shown]:
+        """What the residuals of some runs look like: those that are looked at together take less time."""
+        new = np.array([place for place in places.tolist() if place not in self._shown], int)
+        if new.size:
+            others = {name: values[new] for name, values in self.readings.others.items()}
+            self._shown.update(
+                zip(new.tolist(), shown_effects(take(self.result, new), others), strict=True)
+            )
+        return {place: self._shown[place] for place in places.tolist()}
+
     def effects(self, place: int) -> list[Effect]:
-        """What the residuals of one run look like."""
+        """What the residuals of one run look like, with sizes, the largest first."""
         others = {name: values[place, None] for name, values in self.readings.others.items()}
-        return effects(self.member(place), others)
+        shown = self.shown(np.array([place]))[place]
+        return effects(self.member(place), others, shown)
 
     def residuals(self, place: int) -> Residuals:
         """The errors of one run."""

@@ -10,7 +10,7 @@ Reference: efficient scores, C. R. Rao, Proc. Camb. Phil. Soc. 44, 50 (1948).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,10 +22,11 @@ from mwdcal.calibration.methods import ESTIMABLE
 from mwdcal.calibration.readings import HIGHEST, LEAST_TEMPERATURE_SPAN, TRIADS, highest_order
 from mwdcal.calibration.residuals import chances, to_reshoot
 from mwdcal.calibration.results import variance_scales
+from mwdcal.estimation.batch import take
 from mwdcal.estimation.evidence import STAND_ERRORS
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import whole_covariance
-from mwdcal.geometry.vectors import Array, Bools, Ints, centred, eigen
+from mwdcal.geometry.vectors import Array, Bools, Ints, centred, eigen, outer, quotient
 
 EFFECT_CHANCE = 1e-4
 """Chance of so much common structure in noise, below which an effect is named."""
@@ -56,6 +57,10 @@ FEWEST_TESTED = 20
 """Stations from which columns are tested: fewer are explained by anything."""
 REPEATED = 0.02
 """A column repeats the attitudes if they leave no more than this share of its variance."""
+LEAST_MOVE = 0.05
+"""Moves below this share of the run's largest have no side: of angles that are read off, noise would choose it."""
+AT_ONCE = 32
+"""Fits that are looked at together: few enough for the cache."""
 ZEROS = ("azimuth-zero", "inclination-zero", "dip-reference")
 """Effects that are one angle."""
 EFFECTS = {
@@ -100,9 +105,9 @@ class Effect:
 
 @dataclass(frozen=True)
 class _Scores:
-    """Efficient scores (k,) and their covariance (k, k) for columns of unit length, with lengths.
+    """Efficient scores (B, k) and their covariance (B, k, k) for columns of unit length, with lengths (B, k).
 
-    `places` of the columns of each family; the `misfit` of all readings, with its degrees of freedom.
+    `places` of the columns of each family; the `misfit` (B,) of all readings, with its degrees of freedom.
     """
 
     score: Array
@@ -110,120 +115,163 @@ class _Scores:
     length: Array
     columns: Array
     places: dict[str, Ints]
-    misfit: float
-    freedom: float
+    misfit: Array
+    freedom: Array
 
-    def gain(self, names: list[str]) -> tuple[float, int]:
-        """By how much some families lower the cost, and how many directions they have."""
-        value, vector, index = self._spanned(names)
-        along = vector.transpose() @ self.score[index]
-        return float(np.sum(along**2 / value)), len(value)
+    def of(self, members: Ints) -> _Scores:
+        """Those of some fits."""
+        names = ("score", "information", "length", "columns", "misfit", "freedom")
+        return replace(self, **{name: getattr(self, name)[members] for name in names})
 
-    def solution(self, names: list[str]) -> tuple[Array, Array]:
-        """Values (k',) of the columns of some families, and their covariance (k', k')."""
-        value, vector, index = self._spanned(names)
-        inverse, length = (vector / value) @ vector.transpose(), self.length[index]
-        return -inverse @ self.score[index] / length, inverse / np.outer(length, length)
-
-    def _spanned(self, names: list[str]) -> tuple[Array, Array, Ints]:
-        """Eigenvalues and vectors of the directions that the fit leaves to some families."""
-        index = np.concatenate([self.places[name] for name in names])
-        value, vector = eigen(self.information[np.ix_(index, index)])
+    def gain(self, names: Sequence[str]) -> tuple[Array, Ints]:
+        """By how much (B,) some families lower the cost, and how many directions they have."""
+        if not names:
+            return 0.0 * self.misfit, np.zeros(self.misfit.shape, int)
+        index = self._columns(names)
+        value, vector = eigen(self.information[:, index[:, None], index])
+        along = (vector.mT @ self.score[:, index, None])[..., 0]
         kept = value > LEFT_BY_FIT
-        return value[kept], vector[:, kept], index
+        return quotient(along**2, value, kept).sum(-1), np.count_nonzero(kept, -1)
+
+    def solution(self, names: Sequence[str]) -> tuple[Array, Array]:
+        """Values (k',) of the columns of some families, and their covariance (k', k'), of a single fit."""
+        index = self._columns(names)
+        value, vector = eigen(self.information[0][np.ix_(index, index)])
+        kept, length = value > LEFT_BY_FIT, self.length[0, index]
+        inverse = (vector[:, kept] / value[kept]) @ vector[:, kept].transpose()
+        return -inverse @ self.score[0, index] / length, inverse / outer(length)
+
+    def _columns(self, names: Sequence[str]) -> Ints:
+        return np.concatenate([self.places[name] for name in names])
 
 
-def effects(result: Fit, others: Mapping[str, Array] | None = None) -> list[Effect]:
-    """Effects that the residuals of one fit (B = 1) show, the largest first.
+Shown = dict[str, tuple[float, float]]
+"""Chance and share of the misfit of each effect that a fit shows, by name."""
 
-    `others` (1, n) are numbers of columns that the fit does not use: each may explain the residuals too.
+
+def shown_effects(result: Fit, others: Mapping[str, Array]) -> list[Shown]:
+    """Effects that the residuals of each fit (B) show, in the order in which they are found.
+
+    `others` (B, n) are numbers of columns that the fit does not use: each may explain the residuals too.
     """
     if result.analysis.influence is not None:
-        return []
-    result = _without_bad_stations(result)
+        return [{} for _ in result.status]
+    result, every = _without_bad_stations(result), []
+    for first in range(0, len(result.status), AT_ONCE):
+        some = slice(first, first + AT_ONCE)
+        every += _searched(take(result, some), {n: v[some] for n, v in others.items()})
+    return every
+
+
+def _searched(result: Fit, others: Mapping[str, Array]) -> list[Shown]:
+    """Effects that residuals show: the least likely by chance first, then what its fit leaves, and so on."""
     scales = np.maximum(variance_scales(result), 1e-12)
     triads = [
         replace(t, sd=t.sd * np.sqrt(scales[:, i, None, None]))
         for i, t in enumerate(result.problem.triads)
     ]
     problem = replace(result.problem, triads=tuple(triads))
-    others = _testable(problem, result.state, others or {})
     scores = _scores(problem, result, others)
-    left = scores.misfit
-    shown: dict[str, tuple[float, float]] = {}
-    while True:
-        open_ = [name for name in scores.places if name not in shown]
-        trials = [(*_trial(scores, [*shown], name, left), name) for name in open_]
-        chance, change, best = min(trials, default=(1.0, 0.0, ""))
-        if chance >= EFFECT_CHANCE:
-            return [e for e in _described(result, shown, others) if is_shown(e)]
-        shown[best] = chance, -change / scores.misfit
-        left += change
+    shown: list[Shown] = [{} for _ in result.status]
+    left = scores.misfit.copy()
+    searched: dict[tuple[str, ...], Ints] = {(): np.arange(len(shown))}
+    while searched:
+        further: dict[tuple[str, ...], list[int]] = {}
+        for chosen, members in searched.items():
+            part = scores if len(members) == len(shown) else scores.of(members)
+            open_ = sorted(scores.places.keys() - chosen)
+            chance, change = _trials(part, chosen, open_, left[members])
+            best = np.lexsort((change, chance), axis=0)[0]
+            for place, number in enumerate(best.tolist()):
+                if chance[number, place] < EFFECT_CHANCE:
+                    member, taken = int(members[place]), -change[number, place]
+                    share = float(taken / scores.misfit[member])
+                    shown[member][open_[number]] = float(chance[number, place]), share
+                    left[member] -= taken
+                    further.setdefault((*chosen, open_[number]), []).append(member)
+        whole = len(scores.places)
+        searched = {names: np.array(m) for names, m in further.items() if len(names) < whole}
+    return shown
 
 
-def is_shown(effect: Effect) -> bool:
+def effects(
+    result: Fit, others: Mapping[str, Array] | None = None, shown: Shown | None = None
+) -> list[Effect]:
+    """The effects that one fit (B = 1) shows, with their sizes, as far as they are reported.
+
+    `shown` are those that `shown_effects` found, if it was asked before.
+    """
+    others = others or {}
+    shown = shown_effects(result, others)[0] if shown is None else shown
+    if not shown:
+        return []
+    every = _described(_without_bad_stations(result), shown, others)
+    return [effect for effect in every if is_shown(shown, effect.name)]
+
+
+def is_shown(shown: Shown, name: str) -> bool:
     """Whether an effect is reported: powers of temperature by another finding, columns where they explain much."""
-    much = effect.share >= CLEAR_SHARE and effect.chance < CLEAR_CHANCE
-    return much if effect.name.startswith(COLUMN) else not effect.name.endswith(COURSE_SUFFIX)
+    chance, share = shown[name]
+    much = share >= CLEAR_SHARE and chance < CLEAR_CHANCE
+    return much if name.startswith(COLUMN) else not name.endswith(COURSE_SUFFIX)
 
 
 def _testable(problem: Problem, state: State, others: Mapping[str, Array]) -> dict[str, Array]:
-    """Columns (n,) that vary, count no stations, and do not merely repeat the attitudes; centred, of unit size."""
-    count = problem.temperature.shape[-1]
-    turns = state.attitude[0].reshape(count, 9)
-    basis = np.linalg.svd(np.column_stack([np.ones(count), turns]), full_matrices=False)[0]
+    """Columns (B, n), centred and of unit size; zero for those that are constant, counters, or repeat the attitudes."""
+    shape = problem.temperature.shape
+    if not others or shape[-1] < FEWEST_TESTED:
+        return {}
+    turns = np.concatenate([np.ones((*shape, 1)), state.attitude.reshape(*shape, 9)], -1)
+    basis = np.linalg.svd(turns, full_matrices=False)[0]
     columns = {}
     for name, values in others.items():
-        steps, spread = np.diff(values[0]), np.std(values[0])
-        counter = np.all(steps == 1) and values[0, 0] in (0, 1)
-        if count < FEWEST_TESTED or counter or not spread > 1e-12 * np.abs(values[0]).max():
-            continue
-        unit = (values[0] - values[0].mean()) / spread
-        left = unit - basis @ (basis.transpose() @ unit)
-        if np.mean(left**2) > REPEATED:
-            columns[name] = unit
+        spread = np.std(values, -1, keepdims=True)
+        varies = spread > 1e-12 * np.abs(values).max(-1, keepdims=True)
+        counter = np.all(np.diff(values) == 1, -1) & np.isin(values[:, 0], (0, 1))
+        unit = quotient(values - values.mean(-1, keepdims=True), spread, varies)
+        left = unit - (basis @ (basis.mT @ unit[..., None]))[..., 0]
+        tested = ~counter & (np.mean(left**2, -1) > REPEATED)
+        columns[name] = unit * tested[:, None]
     return columns
 
 
 def _without_bad_stations(result: Fit) -> Fit:
-    """The fit less its stations to take again, if they are few: one bad station looks like anything."""
+    """The fits less their stations to take again, if they are few: one bad station looks like anything."""
     bad = to_reshoot(chances(result))
-    if bad.mean() > BAD_SHARE:
-        return result
+    bad &= bad.mean(-1, keepdims=True) <= BAD_SHARE
     evidence = result.problem.evidence
     fewer = replace(evidence, include=evidence.include * ~bad)
-    return replace(result, problem=replace(result.problem, evidence=fewer))
+    return replace(result, problem=replace(result.problem, evidence=fewer)) if bad.any() else result
 
 
-def _trial(scores: _Scores, chosen: list[str], name: str, left: float) -> tuple[float, float]:
-    """Chance in noise of one more family, and its change of the misfit `left` by those chosen."""
-    before = scores.gain(chosen) if chosen else (0.0, 0)
-    after = scores.gain([*chosen, name])
-    gain, directions = after[0] - before[0], after[1] - before[1]
-    rest = scores.freedom - before[1] - directions
-    if directions < 1 or rest < 1:
-        return 1.0, 0.0
-    gain = min(gain, left * (1 - 1e-9))
-    chance = f_test(*np.array([gain, directions, (left - gain) / rest, rest]))
-    return float(chance), -gain
+def _trials(
+    scores: _Scores, chosen: Sequence[str], names: Sequence[str], left: Array
+) -> tuple[Array, Array]:
+    """Chance (F, B) in noise of each of some families beside those chosen, and its change of the misfit `left`."""
+    before, taken = scores.gain(chosen)
+    each = [scores.gain([*chosen, name]) for name in names]
+    gain, directions = (np.stack(part) for part in zip(*each, strict=True))
+    gain, directions = np.minimum(gain - before, left * (1 - 1e-9)), directions - taken
+    rest = scores.freedom - taken - directions
+    tested = (directions >= 1) & (rest >= 1)
+    scatter = quotient(left - gain, rest, tested)
+    chance = f_test(gain, np.where(tested, directions, 0), scatter, rest)
+    return np.nan_to_num(chance, nan=1.0), np.where(tested, -gain, 0.0)
 
 
-def _described(
-    result: Fit, shown: Mapping[str, tuple[float, float]], others: Mapping[str, Array]
-) -> list[Effect]:
+def _described(result: Fit, shown: Shown, others: Mapping[str, Array]) -> list[Effect]:
     """The effects, of chance and share, with their sizes: all together, with the noise that they leave."""
-    if not shown:
-        return []
     problem, names = result.problem, [*shown]
     scores = _scores(problem, result, others)
-    gain, directions = scores.gain(names)
-    scale = np.sqrt(max(scores.misfit - gain, 0.0) / max(scores.freedom - directions, 1.0))
+    gain, directions = (float(each[0]) for each in scores.gain(names))
+    misfit, freedom = float(scores.misfit[0]), float(scores.freedom[0])
+    scale = np.sqrt(max(misfit - gain, 0.0) / max(freedom - directions, 1.0))
     values, covariance = scores.solution(names)
     spread, sized, end = np.sqrt(np.diag(covariance)) * scale, [], 0
     for name, (chance, share) in shown.items():
         where = scores.places[name]
         columns = slice(end, end := end + len(where))
-        change = (scores.columns[..., where] * scores.length[where]) @ values[columns]
+        change = (scores.columns[..., where] * scores.length[:, where]) @ values[columns]
         size = [
             np.sqrt(np.mean(np.sum((change[..., 3 * i : 3 * i + 3] * t.sd) ** 2, -1)))
             for i, t in enumerate(problem.triads)
@@ -233,44 +281,47 @@ def _described(
 
 
 def _scores(problem: Problem, result: Fit, others: Mapping[str, Array]) -> _Scores:
-    """Efficient scores of the columns (1, n, m, k) of all families: what the fit's unknowns cannot take up."""
+    """Efficient scores of the columns (B, n, m, k) of all families: what the fit's unknowns cannot take up."""
     families = dict(_families(problem, result.state))
-    if others:
+    if tested := _testable(problem, result.state, others):
         steady = steady_columns(problem, result.state)
-        families |= {COLUMN + n: _products(steady, v[:, None]) for n, v in others.items()}
+        families |= {COLUMN + n: _products(steady, v[..., None]) for n, v in tested.items()}
     linear = problem.linear(result.state)
-    whole, normal = whole_covariance(linear, result.analysis.determined)[0], linear.normal
+    whole, normal = whole_covariance(linear, result.analysis.determined), linear.normal
     every = np.concatenate([*families.values()], -1)
     ends = np.cumsum([column.shape[-1] for column in families.values()])
     places = dict(zip(families, np.split(np.arange(ends[-1]), ends[:-1]), strict=True))
-    square = np.einsum("bnmk,bnmk->k", every, linear.weigh(every))
+    flat = every.reshape(len(every), -1, every.shape[-1])
+    weighed = linear.weigh(every).reshape(flat.shape)
+    square = np.einsum("bik,bik->bk", flat, weighed)
     length = np.sqrt(np.maximum(square, 0.0))  # rounding may leave less where the noise is tiny
     length = np.where(length > 0, length, 1.0)
-    unit = every / length
-    weighed, gradient = linear.weigh(unit), normal.gradient[0]
-    crossed = np.einsum("bnmu,bnmk->uk", linear.design, weighed)
-    pull = np.einsum("bnmk,bnm->k", weighed, linear.residual)
-    score = pull - crossed.transpose() @ whole @ gradient
-    information = np.einsum("bnmk,bnml->kl", unit, weighed)
-    information = information - crossed.transpose() @ whole @ crossed
-    misfit = float(normal.cost[0] - gradient @ whole @ gradient)
-    fitted = np.sum(whole * (normal.information - linear.prior)[0])
-    count = float(problem.evidence.include.sum()) * linear.residual.shape[-1]
-    freedom = count - float(fitted + _unknown(problem, result))
-    return _Scores(score, information, length, unit, places, misfit, freedom)
+    crossed = linear.design.reshape(len(every), -1, whole.shape[-1]).mT @ weighed
+    pull = (weighed.mT @ linear.residual.reshape(len(every), -1, 1))[..., 0]
+    taken = whole @ np.concatenate([crossed, normal.gradient[..., None]], -1)
+    score = pull - (crossed.mT @ taken[..., -1:])[..., 0]
+    information = flat.mT @ weighed - crossed.mT @ taken[..., :-1]
+    misfit = normal.cost - np.sum(normal.gradient * taken[..., -1], -1)
+    fitted = np.sum(whole * (normal.information - linear.prior), (-1, -2))
+    count = problem.evidence.include.sum(-1) * linear.residual.shape[-1]
+    freedom = count - (fitted + _unknown(problem, result))
+    unit = every / length[:, None, None]
+    return _Scores(
+        score / length, information / outer(length), length, unit, places, misfit, freedom
+    )
 
 
-def _unknown(problem: Problem, result: Fit) -> int:
-    """Number of unknowns that stations have to themselves; none where one is left out."""
+def _unknown(problem: Problem, result: Fit) -> Ints:
+    """Number (B,) of unknowns that stations have to themselves; none where one is left out."""
     evidence = problem.evidence
     if not (evidence.exact_turn_sd.any() or evidence.free.any() or evidence.absent):
-        return 0
+        return np.zeros(len(result.status), int)
     private = problem.linear(result.state, geometry=True).private
-    return int(np.sum(np.linalg.svd(private, compute_uv=False) > 1.0))
+    return np.asarray(np.sum(np.linalg.svd(private, compute_uv=False) > 1.0, (-1, -2)))
 
 
 def _families(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
-    """Columns (1, n, m, k) of every effect that this run could show, whitened."""
+    """Columns (B, n, m, k) of every effect that these runs could show, whitened; zero where one could not."""
     turns, by_earth = problem.station_columns(state)
     known = _turns(problem, state, turns)
     for name, parts in ESTIMABLE.items():
@@ -281,8 +332,7 @@ def _families(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
     each = [known[n][..., None] * sets[..., None, :] for n in SET_TURNS if n in known]
     if each and sets.shape[-1] > 1:
         yield "settings", np.concatenate(each, -1)
-    count = state.attitude.shape[1]
-    place = np.linspace(-1, 1, count)
+    place = np.linspace(-1, 1, state.attitude.shape[1])
     order = np.asarray(np.polynomial.legendre.legvander(place, DRIFTS)[:, 1:], float)
     down = problem.stand_column(state, "azimuth-zero", turns)
     if len(problem.triads) > 1:
@@ -293,9 +343,9 @@ def _families(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
         field[..., :3, :] = 0.0  # the declination of a field that turns does not turn gravity
         if not problem.walks:
             yield "field-drift", _products(field, order)
-        yield "field-gradient", _products(field, state.attitude[0, :, 2, :])
+        yield "field-gradient", _products(field, state.attitude[..., 2, :])
     steps = _approach(problem)
-    back = [known[n] * s for n, s in steps.items() if n in known and s.any()]
+    back = [known[n] * s[..., None] for n, s in steps.items() if n in known and s.any()]
     if back:
         yield "backlash", np.stack(back, -1)
     yield from _courses(problem, state)
@@ -304,10 +354,20 @@ def _families(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
 
 
 def _sets(problem: Problem) -> Array:
-    """Membership (n, k) of stations in directions that several of them share by their references."""
+    """Membership (B, n, k) of stations in directions that several share by their references; none of a single one."""
     known = problem.evidence.known
-    pair = np.stack([known["inclination"][0], known["azimuth"][0]], -1)
-    key = np.round(np.nan_to_num(pair, nan=-1.0), 6)
+    pair = np.stack([known["inclination"], known["azimuth"]], -1)
+    keys = np.round(np.nan_to_num(pair, nan=-1.0), 6)
+    alike = bool((keys == keys[:1]).all())
+    each = [_sets_of(key) for key in keys[: 1 if alike else None]]
+    members = np.zeros((len(each), keys.shape[1], max(of.shape[-1] for of in each)))
+    for place, of in enumerate(each):
+        members[place, :, : of.shape[-1]] = of if of.shape[-1] > 1 else 0.0
+    return members
+
+
+def _sets_of(key: Array) -> Array:
+    """Membership (n, k) of one run's stations in the directions (n, 2) that are not too few, nor too many."""
     _, number, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
     usable = np.flatnonzero(count >= SMALLEST_SET)
     if len(usable) > len(key) / SMALLEST_SET:
@@ -317,40 +377,50 @@ def _sets(problem: Problem) -> Array:
 
 def _courses(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
     """Powers of temperature that a triad's order leaves out: another finding names these."""
-    if np.ptp(problem.temperature) < LEAST_TEMPERATURE_SPAN:
+    varied = np.ptp(problem.temperature, -1) >= LEAST_TEMPERATURE_SPAN
+    if not varied.any():
         return
-    highest = int(np.clip(highest_order(problem.temperature)[0], HIGHEST, TRIED))
-    columns = steady_columns(problem, state)
-    powers = temperature_powers(problem.temperature, highest)[0]
+    highest = np.clip(highest_order(problem.temperature), HIGHEST, TRIED)
+    columns, most = steady_columns(problem, state), int(highest.max())
+    tried = (np.arange(1, most + 1) <= highest[:, None]) & varied[:, None]
+    powers = temperature_powers(problem.temperature, most) * tried[:, None]
     for index, triad in enumerate(problem.triads):
         order = triad.model.basis.order
-        if order < highest:
+        if order < most:
             of_triad = columns[..., 6 * index : 6 * index + 6]
-            yield f"{TRIADS[index]}{COURSE_SUFFIX}", _products(of_triad, powers[:, order:])
+            yield f"{TRIADS[index]}{COURSE_SUFFIX}", _products(of_triad, powers[..., order:])
 
 
 def _turns(problem: Problem, state: State, turns: Array) -> dict[str, Array]:
-    """Columns (1, n, m) of errors of the stand that act on references, at stations that have them."""
+    """Columns (B, n, m) of errors of the stand that act on references, at stations that have them."""
     acting = {name: acts_on(problem.evidence, name)[..., None] for name in STAND_ERRORS}
     columns = {n: problem.stand_column(state, n, turns) * acts for n, acts in acting.items()}
     return {name: column for name, column in columns.items() if column.any()}
 
 
 def _products(columns: Array, factors: Array) -> Array:
-    """Columns (1, n, m, a) times factors (n, b) of their stations: (1, n, m, a b)."""
-    product = columns[..., :, None] * factors[:, None, None, :]
+    """Columns (B, n, m, a) times factors (n, b) or (B, n, b) of their stations: (B, n, m, a b)."""
+    product = columns[..., :, None] * factors[..., None, None, :]
     return np.asarray(product.reshape(*columns.shape[:-1], -1))
 
 
 def _approach(problem: Problem) -> dict[str, Array]:
-    """From which side (n, 1) each angle of the stand was reached: 1, -1, or 0 where it did not move."""
-    sides = {}
-    for name in ("inclination", "azimuth", "toolface"):
-        angle = problem.evidence.known[name][0]
-        step = np.diff(angle, prepend=angle[:1])
-        step = np.nan_to_num(centred(step))
-        sides[f"{name}-zero"] = np.where(np.abs(step) > 1e-6, np.sign(step), 0.0)[:, None]
-    return sides
+    """From which side (B, n) each angle of the stand was reached: 1, -1, or 0 where it did not move."""
+    known = problem.evidence.known
+    angles = {name: known[name][..., None] for name in ("inclination", "azimuth", "toolface")}
+    moves = {name: np.nan_to_num(centred(_moved(angle))) for name, angle in angles.items()}
+    return {f"{name}-zero": _side(moved)[..., 0] for name, moved in moves.items()}
+
+
+def _moved(values: Array) -> Array:
+    """Changes (B, n, k) of values from station to station, zero at the first."""
+    return np.diff(values, axis=1, prepend=values[:, :1])
+
+
+def _side(moved: Array) -> Array:
+    """The sign of each move (B, n, k), 0 for those too small to be more than the error of a statement."""
+    least = np.maximum(LEAST_MOVE * np.abs(moved).max((1, 2), keepdims=True), 1e-6)
+    return np.where(np.abs(moved) > least, np.sign(moved), 0.0)
 
 
 def _of_sensor(
@@ -363,16 +433,16 @@ def _of_sensor(
     axes[:, :, 3 * index : 3 * index + 3] = np.eye(3) * weight[..., None]
     if index == 0 and not problem.walks:
         yield f"{name}-drift", _products(axes, order)
-    moved = np.diff(triad.raw[0], axis=0, prepend=triad.raw[0, :1])
-    typical = np.abs(moved).max() or 1.0
-    side = np.where(np.abs(moved) > 0.05 * typical, np.sign(moved), 0.0)
-    yield f"{name}-hysteresis", axes * side[:, None, :]
-    rate = np.diff(problem.temperature[0], prepend=problem.temperature[0, :1])
-    if np.ptp(rate) > 1.0:
-        rate = rate / np.abs(rate).max()
-        reading = (triad.raw[0] - triad.raw[0].mean(0)) / np.std(triad.raw[0])
-        scale = axes * (rate[:, None] * reading)[:, None, :]
-        yield f"{name}-thermal-lag", np.concatenate([axes * rate[:, None, None], scale], -1)
+    yield f"{name}-hysteresis", axes * _side(_moved(triad.raw))[..., None, :]
+    rate = _moved(problem.temperature[..., None])
+    varied = np.ptp(rate, 1, keepdims=True) > 1.0
+    if varied.any():
+        rate = quotient(rate, np.abs(rate).max(1, keepdims=True), varied)
+        reading = (triad.raw - triad.raw.mean(1, keepdims=True)) / np.std(triad.raw, (1, 2))[
+            :, None, None
+        ]
+        scale = axes * (rate * reading)[..., None, :]
+        yield f"{name}-thermal-lag", np.concatenate([axes * rate[..., None, :], scale], -1)
 
 
 def suspected(result: Fit, chance: Array) -> Bools:

@@ -1,0 +1,207 @@
+"""Words, document and page on the results of tasks that are records of their own: what their commands print.
+
+They are put here on the classes, as `use.plots` puts figures there, so that a record needs no screen.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from html import escape
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+
+from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.record import Calibration
+from mwdcal.comparison.compare import Comparison
+from mwdcal.faults.diagnosis import Diagnosis
+from mwdcal.files import runs
+from mwdcal.files.formats import atomic
+from mwdcal.geometry.vectors import AnyArray
+from mwdcal.library.results import brief, frame
+from mwdcal.logs.noise import Noise
+from mwdcal.logs.stations import Stations
+from mwdcal.sensor.profile import NOMINAL
+from mwdcal.use.verification import Verdict
+
+_Shown = TypeVar("_Shown")
+_INPUTS = "_inputs"
+
+
+class Inputs(NamedTuple):
+    """What a result was made of: what inputs say of themselves, and the SHA-256 of those that are files."""
+
+    metadata: tuple[Mapping[str, object], ...] = ()
+    digests: Mapping[str, str] = {}
+
+
+def with_inputs(result: _Shown, *metadata: Mapping[str, object], **digests: str) -> _Shown:
+    """A result that knows what it was made of; equal to the one without."""
+    result.__dict__[_INPUTS] = Inputs(metadata, digests)
+    return result
+
+
+def _inputs(result: Any) -> Inputs:
+    inputs: Inputs = getattr(result, _INPUTS, Inputs())
+    return inputs
+
+
+def _enveloped(command: str, result: Any, content: object) -> dict[str, Any]:
+    from mwdcal.screens.envelope import enveloped
+
+    metadata, digests = _inputs(result)
+    return enveloped(command, content, *metadata, **digests)
+
+
+def _calibration_text(calibration: Calibration) -> str:
+    from mwdcal.screens.calibration import body
+
+    return body(calibration, [])
+
+
+def _calibration_document(calibration: Calibration) -> dict[str, Any]:
+    from mwdcal.screens.calibration import summary
+
+    return summary(calibration, [], None, None)
+
+
+def _calibration_page(calibration: Calibration) -> str:
+    from mwdcal.pages.report import render
+
+    return render(calibration)
+
+
+def _verdict_text(verdict: Verdict) -> str:
+    from mwdcal.screens.verification import screen
+
+    return screen(verdict, None, *_inputs(verdict).metadata)
+
+
+def _verdict_document(verdict: Verdict) -> dict[str, Any]:
+    return _enveloped("verify", verdict, verdict)
+
+
+def _diagnosis_text(diagnosis: Diagnosis) -> str:
+    from mwdcal.screens.diagnosis import screen
+
+    return screen(diagnosis, *_inputs(diagnosis).metadata)
+
+
+def _diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
+    return _enveloped("diagnose", diagnosis, diagnosis)
+
+
+def _comparison_text(comparison: Comparison) -> str:
+    from mwdcal.screens.comparison import text
+
+    return text(comparison)
+
+
+def _comparison_document(comparison: Comparison) -> dict[str, Any]:
+    from mwdcal.screens.comparison import document
+
+    return _enveloped("compare", comparison, document(comparison, [], None))
+
+
+def _comparison_page(comparison: Comparison) -> str:
+    from mwdcal.pages.comparison import render
+
+    return render(comparison)
+
+
+def _noise_text(noise: Noise) -> str:
+    from mwdcal.screens.noise import screen
+
+    return screen(noise, None, None)
+
+
+def _noise_document(noise: Noise) -> dict[str, Any]:
+    from mwdcal.screens.noise import document
+
+    return _enveloped("noise", noise, document(noise, None, None))
+
+
+def _noise_page(noise: Noise) -> str:
+    from mwdcal.pages.noise import render
+
+    return render(noise)
+
+
+def _stations_text(stations: Stations) -> str:
+    from mwdcal.screens.stations import body
+
+    return body(stations)
+
+
+def _stations_document(stations: Stations) -> dict[str, Any]:
+    from mwdcal.screens.stations import summary
+
+    return _enveloped(
+        "stations", stations, summary(stations, dict.fromkeys(("output", "plot", "report"), ""))
+    )
+
+
+def _stations_page(stations: Stations) -> str:
+    from mwdcal.pages.stations import render
+
+    return render(stations, _inputs(stations).digests.get("log", ""))
+
+
+def _columns(readings: Readings) -> Mapping[str, AnyArray]:
+    """All columns of the table that was read; of readings made otherwise those of a run file."""
+    if readings.table:
+        return readings.table
+    table = runs.from_readings(readings, readings.profile or NOMINAL)
+    return {name: np.asarray(cells) for name, cells in table.columns.items()}
+
+
+def _to_pandas(readings: Readings) -> Any:
+    """The columns as a table of pandas, with the metadata in `attrs`."""
+    made = frame(readings.columns)
+    made.attrs.update(readings.metadata)
+    return made
+
+
+def _show(
+    kind: type,
+    text: Callable[[Any], str],
+    document: Callable[[Any], dict[str, Any]],
+    page: Callable[[Any], str] | None,
+) -> None:
+    """Put `summary`, `to_dict`, `report` and a short `repr` on a class."""
+
+    def summary(self: object) -> str:
+        """The text that the command prints."""
+        return text(self)
+
+    def to_dict(self: object) -> dict[str, Any]:
+        """What the command prints as JSON, as a dictionary."""
+        return document(self)
+
+    def report(self: object, path: str | os.PathLike[str]) -> None:
+        """Write the page of the command: self-contained HTML."""
+        assert page
+        atomic.write(os.fspath(path), page(self))
+
+    def short(self: object) -> str:
+        return brief(self, lambda: text(self))
+
+    def html(self: object) -> str:
+        return f"<pre>{escape(text(self))}</pre>"
+
+    methods: dict[str, Callable[..., object]] = {"summary": summary, "to_dict": to_dict}
+    methods |= {"report": report} if page else {}
+    methods |= {} if "_repr_html_" in vars(kind) else {"__repr__": short, "_repr_html_": html}
+    for name, method in methods.items():
+        setattr(kind, name, method)
+
+
+Readings.columns = property(_columns)  # type: ignore[assignment]
+Readings.to_pandas = _to_pandas  # type: ignore[attr-defined]
+_show(Calibration, _calibration_text, _calibration_document, _calibration_page)
+_show(Verdict, _verdict_text, _verdict_document, None)
+_show(Diagnosis, _diagnosis_text, _diagnosis_document, None)
+_show(Comparison, _comparison_text, _comparison_document, _comparison_page)
+_show(Noise, _noise_text, _noise_document, _noise_page)
+_show(Stations, _stations_text, _stations_document, _stations_page)

@@ -1,0 +1,98 @@
+"""What `import mwdcal` offers for each command, and that its results say what the commands print."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+import mwdcal
+from cli_support import EXAMPLE
+from cli_support import mwdcal as command
+
+PROFILE = EXAMPLE / "tool.toml"
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    """The example's calibration, its file and what the command printed."""
+    folder = tmp_path_factory.mktemp("face")
+    path = folder / "tool.json"
+    done = command("calibrate", EXAMPLE / "run.csv", "--tool", PROFILE, "-o", path)
+    assert done.code == 0
+    run = mwdcal.read_run(EXAMPLE / "run.csv", PROFILE)
+    return mwdcal.calibrate(run), path, done
+
+
+def without_files(text):
+    """A screen without its last line, that names files and what comes next."""
+    return re.sub(r"\n(wrote .*)$", "", text.rstrip())
+
+
+def same(ours, theirs, but=()):
+    """Equal documents, but for what a file alone has."""
+    left = {key: value for key, value in ours.items() if key not in but}
+    right = {key: value for key, value in theirs.items() if key not in but}
+    assert json.loads(json.dumps(left, default=str)) == right
+
+
+def test_a_calibration_says_what_the_command_prints(calibrated, tmp_path):
+    made, path, done = calibrated
+    assert made.summary() == without_files(done.out)
+    printed = command(
+        "calibrate", EXAMPLE / "run.csv", "--tool", PROFILE, "-o", path, "--json"
+    ).json
+    same(made.to_dict(), printed, ("calibration", "report", "nonlinearity"))
+    made.report(tmp_path / "tool.html")
+    assert "<html" in (tmp_path / "tool.html").read_text("utf-8")
+
+
+def test_a_verdict_and_a_diagnosis_say_what_the_commands_print(calibrated):
+    _, path, _ = calibrated
+    made = mwdcal.load(path)
+    test = mwdcal.read_run(EXAMPLE / "rolltest.csv", made.profile)
+    for result, name in (
+        (mwdcal.verify(made, test), "verify"),
+        (mwdcal.diagnose(made, test), "diagnose"),
+    ):
+        shown = command(name, path, EXAMPLE / "rolltest.csv").out.rstrip()
+        assert result.summary() == shown.replace("   unsigned calibration", "")
+        printed = command(name, path, EXAMPLE / "rolltest.csv", "--json").json
+        same(result.to_dict(), printed, ("calibration_sha256", "calibration_signature"))
+
+
+def test_a_comparison_and_logs_say_what_the_commands_print(tmp_path):
+    run = mwdcal.read_run(EXAMPLE / "run.csv", PROFILE)
+    found = mwdcal.compare(run)
+    assert len(repr(found)) <= 300
+    printed = command("compare", EXAMPLE / "run.csv", "--tool", PROFILE).out.rstrip()
+    pairs = zip(found.summary().splitlines(), printed.splitlines(), strict=True)
+    other = [(ours, theirs) for ours, theirs in pairs if ours != theirs]  # seconds that they took
+    assert len(other) <= 1
+    assert all(re.sub(r"[\d.\s]", "", a) == re.sub(r"[\d.\s]", "", b) for a, b in other)
+    noise = mwdcal.noise(EXAMPLE / "static.csv")
+    assert noise.summary() == command("noise", EXAMPLE / "static.csv").out.rstrip()
+    same(noise.to_dict(), command("noise", EXAMPLE / "static.csv", "--json").json)
+    log = mwdcal.stations(EXAMPLE / "log.csv")
+    done = command("stations", EXAMPLE / "log.csv", "-o", tmp_path / "run.csv")
+    assert log.summary() == without_files(done.out)
+    for result in (found, noise, log):
+        result.report(tmp_path / "page.html")
+        assert "<pre>" in result._repr_html_()
+
+
+def test_readings_have_the_columns_of_their_table_and_parts():
+    run = mwdcal.read_run(EXAMPLE / "run.csv", PROFILE)
+    assert len(run) == run.count == len(run.columns["ax"])
+    assert {"ref_inclination_deg", "temperature_c"} <= run.columns.keys()
+    some = run[3:9:2]
+    assert len(some) == 3
+    assert some.columns["ax"].tolist() == run.columns["ax"][3:9:2].tolist()
+    assert some.station == run.station[3:9:2]
+    assert run[::-1].accelerometer.tolist() == run.accelerometer[::-1].tolist()
+    made = mwdcal.simulate((20, 70), 4, seed=3)
+    assert len(made.columns["mx"]) == 8
+    frame = made.to_pandas()
+    assert list(frame) == list(made.columns)
+    assert "simulated" in frame.attrs
+    assert np.allclose(frame[["ax", "ay", "az"]], made.accelerometer)
