@@ -89,8 +89,8 @@ def test_a_measured_reference_with_a_grid(tmp_path):
 
 
 def test_findings_name_arguments_of_python():
-    (finding,) = mc.reference(**PLACE, field_nt=51_000.0).findings
-    assert "State `sd_field_nt`" in finding.text
+    texts = [finding.text for finding in mc.reference(**PLACE, field_nt=51_000.0).findings]
+    assert any("State `sd_field_nt`" in text for text in texts)
 
 
 def test_a_run_is_filled_as_by_the_command(here, tmp_path):
@@ -315,8 +315,7 @@ def test_sources_are_those_of_the_command(folder, cal, tmp_path, form, typed):
     shown = ran(*to[:-1]).out.rstrip("\n").rpartition("\n")
     assert made.summary().rpartition("\n")[0] == shown[0]
     in_memory = mc.export(cal, "firmware", form=form)
-    header = next(text for name, text in in_memory.files.items() if name.endswith("d.h") or "e.h")
-    assert "SHA-256" not in header
+    assert not any("SHA-256" in text for text in in_memory.files.values())
 
 
 def test_a_tool_model_is_that_of_the_command(folder, cal, tmp_path):

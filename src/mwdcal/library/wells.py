@@ -43,8 +43,6 @@ FilePath = str | os.PathLike[str]
 KINDS_OF_EXPORT = ("firmware", "tool-model")
 FORMS_OF_FIRMWARE = {"c": "c-header", "c-header": "c-header", "fixed-point": "fixed-point"}
 """Forms of firmware sources, and what the command calls them."""
-_ARGUMENTS = {"latitude_deg": "latitude", "longitude_deg": "longitude", "day": "date"}
-"""Arguments of `reference` that have another name where it is computed."""
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -71,7 +69,7 @@ class PlaceReference(Result):
     @property
     def findings(self) -> list[Finding]:
         """What the reader should know of the reference."""
-        return [_in_python(finding) for finding in self.earth.findings]
+        return self.earth.findings
 
     def _text(self) -> str:
         from mwdcal.screens.surveys import reference as screen
@@ -121,7 +119,7 @@ class FilledReferences(Result):
     @property
     def findings(self) -> list[Finding]:
         """What the reader should know of the reference and of the run."""
-        return [_in_python(finding) for finding in [*self.earth.findings, *self.run.findings]]
+        return [*self.earth.findings, *self.run.findings]
 
     @property
     def columns(self) -> Mapping[str, AnyArray]:
@@ -416,17 +414,13 @@ def reference(
     values = {key: _number(key, value) for key, value in given.items() if value is not None}
     place = {"latitude": latitude, "longitude": longitude, "altitude_m": altitude_m}
     where = [_number(name, value) for name, value in place.items()]
-    day = _day(date)
-    try:
-        earth = reference_at(
-            where[0], where[1], where[2], day, model=model, crs=crs,
-            measured={n: values[key] for n, key in MEASURABLE.items() if key in values},
-            uncertainties={
-                n: values[f"sd_{key}"] for n, key in MEASURABLE.items() if f"sd_{key}" in values
-            },
-        )  # fmt: skip
-    except InputError as error:
-        raise InputError(_renamed(str(error))) from None
+    earth = reference_at(
+        where[0], where[1], where[2], _day(date), model=model, crs=crs,
+        measured={n: values[key] for n, key in MEASURABLE.items() if key in values},
+        uncertainties={
+            n: values[f"sd_{key}"] for n, key in MEASURABLE.items() if f"sd_{key}" in values
+        },
+    )  # fmt: skip
     names = [field.name for field in fields(PlaceReference) if field.name != "earth"]
     return PlaceReference(**{name: getattr(earth, name) for name in names}, earth=earth)
 
@@ -477,20 +471,17 @@ def survey(
     from mwdcal.survey.surveying import analysed, check_drift, survey_well, well_inputs
 
     check_drift(sensor_drift, msa)
-    low, high = _finite("switch", switch, 2)
-    start = None if tie_in is None else _finite("tie_in", tie_in, 3)
+    ends: Any = tuple(np.radians(_finite("switch", switch, 2)).tolist())
+    start: Any = None if tie_in is None else tuple(_finite("tie_in", tie_in, 3))
     loaded = load_calibration(_source(cal), [Path(key) for key in keys])
     table = _survey_table(readings, loaded.calibration, decimal)
-    place = _earth(reference)
     inputs = well_inputs(
-        loaded.calibration, table, place, limits, msa, loaded.digest, loaded.findings
+        loaded.calibration, table, _earth(reference), limits, msa, loaded.digest, loaded.findings
     )
     analysis = analysed(inputs, sensor_drift) if msa else None
     if analysis:
         analysis.check()
-    ends = float(np.radians(low)), float(np.radians(high))
-    begin = None if start is None else (start[0], start[1], start[2])
-    result = survey_well(inputs, analysis, tie_in=begin, switch=ends, outside=outside)
+    result = survey_well(inputs, analysis, tie_in=start, switch=ends, outside=outside)
     return WellSurvey(result, loaded.signature)
 
 
@@ -682,14 +673,3 @@ def _check_word(name: str, word: str, words: Iterable[str]) -> None:
         raise InputError(
             f"`{name}` must be one of {', '.join(words)}; got {word!r}.{nearest(str(word), words)}"
         )
-
-
-def _renamed(text: str) -> str:
-    """A message with the arguments of `reference` as they are named here."""
-    for inner, name in _ARGUMENTS.items():
-        text = text.replace(f"`{inner}`", f"`{name}`")
-    return text
-
-
-def _in_python(finding: Finding) -> Finding:
-    return Finding(id=finding.id, text=_renamed(finding.text))
