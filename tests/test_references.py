@@ -276,7 +276,7 @@ def test_what_is_no_grid_is_refused(crs, words):
 
 
 def test_a_place_that_the_grid_does_not_show_is_refused():
-    with pytest.raises(InputError, match="Check `latitude_deg`"):
+    with pytest.raises(InputError, match="Check `latitude`"):
         grid_convergence("EPSG:2154", -90.0, 3.5)
 
 

@@ -2,48 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeAlias, cast
+from typing import Any, Literal, TypeAlias, cast
 
-from mwdcal.calibration.canonical import SignatureCheck
 from mwdcal.calibration.options import AUTO, Options
 from mwdcal.calibration.prior import DATASHEET, profile_for
 from mwdcal.calibration.readings import HIGHEST, Readings
-from mwdcal.calibration.record import Calibration, Finding
-from mwdcal.files import documents, profiles, runs
-from mwdcal.registry.calibration_source import calibration_file, calibration_of
+from mwdcal.calibration.record import Calibration
+from mwdcal.files import profiles, runs
+from mwdcal.registry.calibration_source import calibration_of
 from mwdcal.screens.typed_options import Typed, names
 from mwdcal.sensor.profile import Profile
 
-
-class LoadedCalibration(NamedTuple):
-    """A calibration, the SHA-256 of its file, what its signature says, and what of that is a finding."""
-
-    calibration: Calibration
-    digest: str
-    signature: SignatureCheck
-    findings: list[Finding]
-
-
 Prior: TypeAlias = Calibration | Literal["datasheet"] | None
 """What is known before a fit: a calibration, the tolerances of the profile, or nothing."""
-
-
-def load_calibration(path: Path, keys: Sequence[Path]) -> LoadedCalibration:
-    """A calibration file, and what its signature says by the keys that are trusted.
-
-    Where there are keys, an unsigned calibration is a finding too.
-    """
-    from mwdcal.certificate.signature import check, signature_doubts
-    from mwdcal.certificate.trusted_keys import trusted
-
-    trust = trusted(keys)
-    file = calibration_file(path)
-    calibration, checked = documents.decoded(file), check(file.record, trust)
-    findings = signature_doubts(checked, calibration, bool(keys))
-    return LoadedCalibration(calibration, file.digest, checked, findings)
 
 
 def load_run(

@@ -24,7 +24,8 @@ from mwdcal.firmware.working_range import (
 from mwdcal.geometry.observables import VERTICAL
 from mwdcal.geometry.vectors import Array
 
-FORMS = ("c-header", "fixed-point")
+FIXED_POINT = "fixed-point"
+FORMS = ("c-header", FIXED_POINT)
 DEFAULT_BITS = 32
 _DOUBLE_ROUNDING = 4e-12
 """Share of the largest terms, and radians, by which results in double precision differ from `apply`."""
@@ -55,7 +56,7 @@ def export(
     """
     if form not in FORMS:
         raise InputError(f"`form` must be one of {', '.join(FORMS)}; got {form!r}.")
-    if form == "fixed-point":
+    if form == FIXED_POINT:
         return _fixed(calibration, sha256, word_bits)
     return _double(calibration, sha256)
 

@@ -23,13 +23,13 @@ def field_unit(calibration: Calibration) -> str:
 
 
 def origin(calibration: Calibration, sha256: str) -> list[str]:
-    """Whose calibration it is; the words of others cannot end a comment."""
+    """Whose calibration it is; the words of others cannot end a comment. One in memory has no `sha256`."""
     lines = {
         "tool": calibration.tool.get("serial", "without serial"),
         "profile": calibration.profile.name,
         "run": calibration.run_name,
         "calibrated": f"{calibration.time} by {calibration.software}, method {calibration.method}",
-        "calibration": f"SHA-256 {sha256}",
+        **({"calibration": f"SHA-256 {sha256}"} if sha256 else {}),
         "written by": f"mwdcal {__version__}",
     }
     simulated = [SIMULATED] if is_simulated(calibration.tool) else []

@@ -2,24 +2,674 @@
 
 from __future__ import annotations
 
-from typing import Any
+import datetime
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, overload
+
+import numpy as np
+
+from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.errors import InputError
+from mwdcal.files import runs
+from mwdcal.files.contract import COLUMNS
+from mwdcal.files.formats import atomic
+from mwdcal.files.formats import table as tables
+from mwdcal.files.formats.columns import LABELS, as_text
+from mwdcal.files.formats.table import Table
+from mwdcal.geometry.vectors import AnyArray, Array, Bools
+from mwdcal.library.arrays import nearest
+from mwdcal.library.results import Result, frame
+from mwdcal.library.tasks import Tabular, _check_readings, table_of
+from mwdcal.sensor.profile import Profile
+
+if TYPE_CHECKING:
+    from mwdcal.calibration.canonical import SignatureCheck
+    from mwdcal.screens.conversion import Converted, Exported
+    from mwdcal.screens.surveys.survey import SurveySummary
+    from mwdcal.survey.acceptance import SurveyLimits
+    from mwdcal.survey.multistation.interference import InterferenceSize, MultiStationAnalysis
+    from mwdcal.survey.place.reference_columns import FilledRun
+    from mwdcal.survey.place.references import EarthReference
+    from mwdcal.survey.surveying import SurveyedWell
+    from mwdcal.survey.tool_model import SensorTerm
+    from mwdcal.survey.well import Position
+
+FilePath = str | os.PathLike[str]
+KINDS_OF_EXPORT = ("firmware", "tool-model")
+FORMS_OF_FIRMWARE = {"c": "c-header", "c-header": "c-header", "fixed-point": "fixed-point"}
+"""Forms of firmware sources, and what the command calls them."""
 
 
-def reference(*arguments: Any, **choices: Any) -> Any:
-    """To be written."""
-    raise NotImplementedError
+@dataclass(frozen=True, repr=False, eq=False)
+class PlaceReference(Result):
+    """Gravity and magnetic field at a place and date, and what turns magnetic azimuths.
+
+    Definition: true azimuth = magnetic + declination; grid azimuth = true - convergence.
+    Units: as in the names; dip is positive down, declination and convergence are positive east. 1 g is 9.80665 m/s².
+    `convergence_deg` is None where no grid was named. `sd_…` is the standard uncertainty that all stations share.
+    `earth` is the whole record: `place`, model, sources and the uncertainty of each station alone.
+    """
+
+    gravity_g: float
+    field_nt: float
+    dip_deg: float
+    declination_deg: float
+    convergence_deg: float | None
+    sd_gravity_g: float
+    sd_field_nt: float
+    sd_dip_deg: float
+    sd_declination_deg: float
+    earth: EarthReference
+
+    @property
+    def findings(self) -> list[Finding]:
+        """What the reader should know of the reference."""
+        return self.earth.findings
+
+    def _text(self) -> str:
+        from mwdcal.screens.surveys import reference as screen
+
+        return screen.screen(self.earth, None, None)
+
+    def _document(self, output: Path | None = None) -> dict[str, Any]:
+        from mwdcal.screens.surveys import reference as screen
+
+        return _as_json(screen.document(self.earth, None, output))
+
+    def save(self, path: FilePath) -> None:
+        """Write the reference as JSON, the file that `survey` takes.
+
+        Raises:
+            InputError: the name does not end in .json, or the file cannot be written.
+        """
+        from mwdcal.screens.text import to_json
+
+        if Path(path).suffix.lower() != ".json":
+            raise InputError(
+                f"`path` '{path}': a reference is written as JSON. Name a file that ends in .json."
+            )
+        atomic.write(path, to_json(self._document(Path(path))) + "\n")
+
+    def fill(self, run: Tabular, *, decimal: str = ".") -> FilledReferences:
+        """The table of a run with blank gravity, field and dip filled; cells with a value keep it.
+
+        `run` is a file, or columns by name.
+
+        Raises:
+            InputError: the run cannot be read, or states a north that the reference lacks.
+        """
+        from mwdcal.survey.place.reference_columns import fill
+
+        table = table_of(run, "the run", lambda path: tables.read(path, decimal=decimal))
+        return FilledReferences(self.earth, fill(table, self.earth))
 
 
-def survey(*arguments: Any, **choices: Any) -> Any:
-    """To be written."""
-    raise NotImplementedError
+@dataclass(frozen=True, repr=False, eq=False)
+class FilledReferences(Result):
+    """A run with the references of a place: `columns` of its table, and `cells` filled by column."""
+
+    earth: EarthReference
+    run: FilledRun
+
+    @property
+    def findings(self) -> list[Finding]:
+        """What the reader should know of the reference and of the run."""
+        return [*self.earth.findings, *self.run.findings]
+
+    @property
+    def columns(self) -> Mapping[str, AnyArray]:
+        """All columns of the filled table."""
+        return _arrays(self.run.table, ())
+
+    @property
+    def cells(self) -> Mapping[str, int]:
+        """How many cells were filled in each column."""
+        return self.run.cells
+
+    def _text(self) -> str:
+        from mwdcal.screens.surveys import reference as screen
+
+        return screen.screen(self.earth, self.run, None)
+
+    def _document(self) -> dict[str, Any]:
+        from mwdcal.screens.surveys import reference as screen
+
+        return _as_json(screen.document(self.earth, self.run, None))
+
+    def save(self, path: FilePath) -> None:
+        """Write the filled table; the suffix is the format."""
+        tables.write(path, self.run.table)
 
 
-def convert(*arguments: Any, **choices: Any) -> Any:
-    """To be written."""
-    raise NotImplementedError
+@dataclass(frozen=True, repr=False, eq=False)
+class WellSurvey(Result):
+    """The surveys of a well: their directions with uncertainties, whether each is accepted, and the path of the hole.
+
+    `columns` has the names of the command's table; `signature` is what the signature of the calibration says.
+    """
+
+    surveyed: SurveyedWell
+    signature: SignatureCheck
+
+    @cached_property
+    def _facts(self) -> SurveySummary:
+        from mwdcal.screens.surveys.survey import result_summary
+
+        return result_summary(self.surveyed)
+
+    @cached_property
+    def _whole_table(self) -> Table:
+        return self.surveyed.table
+
+    @property
+    def findings(self) -> list[Finding]:
+        """What the reader should know: of the multi-station analysis, then of the surveys."""
+        from mwdcal.screens.surveys.survey import all_findings
+
+        return all_findings(self._facts)
+
+    @cached_property
+    def columns(self) -> Mapping[str, AnyArray]:
+        """All columns of the readings, then the results; `accepted` is "true", "false", or blank if not judged."""
+        results = self.surveyed.well.columns
+        words = [name for name, values in results.items() if values.dtype.kind != "f"]
+        return _arrays(self._whole_table, words)
+
+    @property
+    def accepted(self) -> Bools:
+        """Surveys (n,) that were judged and lie within the limits."""
+        judgement = self.surveyed.well.judgement
+        return np.asarray(judgement.judged & judgement.accepted)
+
+    @property
+    def interference(self) -> InterferenceSize | None:
+        """Axial and cross-axial interference, nT, with uncertainty; None without `msa`."""
+        return self._facts.interference
+
+    @property
+    def analysis(self) -> MultiStationAnalysis | None:
+        """The multi-station analysis, with a row for each survey; None without `msa`."""
+        return self._facts.msa
+
+    @property
+    def path(self) -> Position | None:
+        """Measured depth, and north, east and TVD (n, 3) with covariance, m; None without measured depths."""
+        return self.surveyed.well.position
+
+    def to_pandas(self) -> Any:
+        """The columns as a table of pandas, with what the command's table states of itself in `attrs`."""
+        table = frame(self.columns)
+        table.attrs = dict(self._whole_table.metadata)
+        return table
+
+    def _text(self) -> str:
+        from mwdcal.screens.surveys.survey import whole_screen
+
+        return whole_screen(self.surveyed, self._facts, self.signature)
+
+    def _document(self) -> dict[str, Any]:
+        from mwdcal.screens.surveys.survey import document
+
+        return _as_json(document(self.surveyed.inputs, self._facts, self.signature))
+
+    def _page(self) -> str:
+        from mwdcal.pages.surveys.survey import render
+
+        well = self.surveyed.well
+        return render(well, well.findings, self.surveyed.inputs.named)
+
+    def msa_report(self, path: FilePath) -> None:
+        """Write the page of the multi-station analysis.
+
+        Raises:
+            InputError: there is no such analysis.
+        """
+        from mwdcal.pages.surveys.interference import render
+
+        if self.surveyed.analysis is None:
+            raise InputError("the surveys have no multi-station analysis. Survey with msa=True.")
+        atomic.write(path, render(self.surveyed.analysis, self.surveyed.inputs.named))
+
+    def save(self, path: FilePath) -> None:
+        """Write the table of the command: the readings with the results beside them; the suffix is the format."""
+        tables.write(path, self._whole_table)
 
 
-def export(*arguments: Any, **choices: Any) -> Any:
-    """To be written."""
-    raise NotImplementedError
+@dataclass(frozen=True, repr=False, eq=False)
+class Conversion(Result):
+    """A calibration in another notation, in raw units: the arrays of each triad by name.
+
+    `accelerometer["S"]` and so on; `magnetometer` is empty where the calibration has none.
+    """
+
+    converted: Converted
+
+    @property
+    def findings(self) -> list[Finding]:
+        """What the reader should know, such as a temperature outside the calibrated range."""
+        return self.converted.findings
+
+    @property
+    def accelerometer(self) -> Mapping[str, Array]:
+        """Arrays of the accelerometer: S and o, M and b, or SF, B and m."""
+        return self._values("accelerometer")
+
+    @property
+    def magnetometer(self) -> Mapping[str, Array]:
+        """The same of the magnetometer."""
+        return self._values("magnetometer")
+
+    @property
+    def uncertainty(self) -> Mapping[str, Mapping[str, Array]]:
+        """Standard uncertainties of the arrays by triad and name; NaN: undetermined."""
+        return {name: triad.uncertainty for name, triad in self.converted.triads.items()}
+
+    @property
+    def covariance(self) -> Mapping[str, Array]:
+        """Covariance by triad of all its values in their order, row by row."""
+        return {name: triad.covariance for name, triad in self.converted.triads.items()}
+
+    def _values(self, triad: str) -> Mapping[str, Array]:
+        triads = self.converted.triads
+        return triads[triad].values if triad in triads else {}
+
+    def _text(self) -> str:
+        from mwdcal.screens.conversion import screen
+
+        return screen(self.converted)
+
+    def _document(self) -> dict[str, Any]:
+        from mwdcal.screens.conversion import document
+
+        return _as_json(document(self.converted))
+
+    def save(self, path: FilePath) -> None:
+        """Write what the command writes: JSON."""
+        from mwdcal.screens.text import to_json
+
+        atomic.write(path, to_json(self._document()) + "\n")
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class FirmwareExport(Result):
+    """A calibration as C sources with test vectors."""
+
+    exported: Exported
+
+    @property
+    def findings(self) -> list[Finding]:
+        """What the reader should know of the calibration."""
+        return self.exported.findings
+
+    @property
+    def files(self) -> Mapping[str, str]:
+        """The text of each file by its name."""
+        return self.exported.sources.files
+
+    @property
+    def errors(self) -> Mapping[str, float]:
+        """The largest differences from `apply`: vectors in g and the unit of the field, angles in degrees."""
+        return self.exported.sources.errors
+
+    def _text(self) -> str:
+        from mwdcal.screens.conversion import export_screen
+
+        return export_screen(self.exported)
+
+    def _document(self) -> dict[str, Any]:
+        from mwdcal.screens.conversion import export_document
+
+        return _as_json(export_document(self.exported))
+
+    def save(self, path: FilePath) -> None:
+        """Write the files into the folder `path`, all or none."""
+        with atomic.folder(Path(path)):
+            atomic.write_all([(Path(path) / name, text) for name, text in self.files.items()])
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class ToolModelExport(Result):
+    """The sensor terms of a calibrated tool, and its tool model for error-model programs: `text` is its JSON."""
+
+    converted: Converted
+    terms: Sequence[SensorTerm]
+    text: str
+
+    @property
+    def findings(self) -> list[Finding]:
+        """What the reader should know, such as a temperature outside the calibrated range."""
+        return self.converted.findings
+
+    def _text(self) -> str:
+        from mwdcal.screens.conversion import terms_screen
+
+        return terms_screen(self.converted, [*self.terms])
+
+    def _document(self) -> dict[str, Any]:
+        from mwdcal.screens.conversion import terms_document
+
+        return _as_json(terms_document(self.converted, [*self.terms]))
+
+    def save(self, path: FilePath) -> None:
+        """Write the tool model."""
+        atomic.write(path, self.text)
+
+
+def reference(
+    *,
+    latitude: float,
+    longitude: float,
+    altitude_m: float = 0.0,
+    date: str | datetime.date,
+    model: Literal["wmm2025", "igrf14"] = "wmm2025",
+    crs: str | None = None,
+    gravity_g: float | None = None,
+    field_nt: float | None = None,
+    dip_deg: float | None = None,
+    declination_deg: float | None = None,
+    sd_gravity_g: float | None = None,
+    sd_field_nt: float | None = None,
+    sd_dip_deg: float | None = None,
+    sd_declination_deg: float | None = None,
+) -> PlaceReference:
+    """Gravity, magnetic field and the norths of a place and date, each with its standard uncertainty.
+
+    Definition: normal gravity of WGS84; main field by WMM2025 or IGRF-14. A measured value stands before the model.
+    Units: degrees, metres above the ellipsoid, g of 9.80665 m/s², nT; north, east and down are positive.
+
+    Args:
+        latitude: geodetic.
+        longitude: east positive.
+        altitude_m: negative below the ellipsoid.
+        date: a day, or text such as 2026-11-23.
+        model: of the main field.
+        crs: grid of the well plan, such as EPSG:23031, for its convergence.
+        gravity_g: measured at the place; so are the three that follow.
+        field_nt: strength of the magnetic field.
+        dip_deg: positive down.
+        declination_deg: positive east.
+        sd_gravity_g: 1σ of the measured value; so are the three that follow.
+        sd_field_nt: as above.
+        sd_dip_deg: as above.
+        sd_declination_deg: as above.
+
+    Raises:
+        InputError: a value that no place on Earth has, a date that cannot be read, an unknown model or grid.
+
+    Example:
+        `mwdcal.reference(latitude=60.4, longitude=5.3, date="2026-11-23").declination_deg`
+    """
+    from mwdcal.survey.place.references import MEASURABLE, reference_at
+
+    given = {
+        "gravity_g": gravity_g, "field_nt": field_nt, "dip_deg": dip_deg, "declination_deg": declination_deg,
+        "sd_gravity_g": sd_gravity_g, "sd_field_nt": sd_field_nt, "sd_dip_deg": sd_dip_deg,
+        "sd_declination_deg": sd_declination_deg,
+    }  # fmt: skip
+    values = {key: _number(key, value) for key, value in given.items() if value is not None}
+    place = {"latitude": latitude, "longitude": longitude, "altitude_m": altitude_m}
+    where = [_number(name, value) for name, value in place.items()]
+    earth = reference_at(
+        where[0], where[1], where[2], _day(date), model=model, crs=crs,
+        measured={n: values[key] for n, key in MEASURABLE.items() if key in values},
+        uncertainties={
+            n: values[f"sd_{key}"] for n, key in MEASURABLE.items() if f"sd_{key}" in values
+        },
+    )  # fmt: skip
+    names = [field.name for field in fields(PlaceReference) if field.name != "earth"]
+    return PlaceReference(**{name: getattr(earth, name) for name in names}, earth=earth)
+
+
+def survey(
+    cal: Calibration | FilePath,
+    readings: Tabular | Readings,
+    *,
+    reference: PlaceReference | EarthReference | FilePath | None = None,
+    msa: bool = False,
+    limits: FilePath | SurveyLimits = "owsg-mwd",
+    sensor_drift: FilePath | None = None,
+    switch: tuple[float, float] = (3.0, 5.0),
+    tie_in: tuple[float, float, float] | None = None,
+    outside: Literal["blank", "refuse", "extrapolate"] = "blank",
+    decimal: str = ".",
+    keys: Iterable[FilePath] = (),
+) -> WellSurvey:
+    """The surveys of a well: readings in their order, corrected by the calibration of their tool.
+
+    Definition: inclination, azimuth, toolface, |g|, |b| and dip with standard uncertainties; whether each survey lies
+    within the limits; with measured depths (`md_m`) north, east and TVD by minimum curvature.
+    Singular: at vertical azimuth and gravity toolface are NaN.
+
+    Args:
+        cal: a calibration, or its file; `cals.parquet#SERIAL` and `tools.sqlite#SERIAL` too.
+        readings: a file, columns by name, a table of pandas or polars, or `Readings` (`md_m` among their columns).
+        reference: gravity, field, dip and declination of the place, from `reference` or its file.
+        msa: take the interference of the drill string off the magnetometer, by multi-station analysis.
+        limits: on |g|, |b| and dip: owsg-mwd, iscwsa-fixed, fixed, or a TOML file.
+        sensor_drift: with `msa`, drift of the sensors since the calibration, 1σ: owsg (the default), none, or a file.
+        switch: inclinations, degrees, below which the toolface counts from magnetic north, and above which from the
+            high side.
+        tie_in: north, east and TVD of the first station, m.
+        outside: what becomes of readings outside the calibrated temperatures.
+        decimal: decimal sign of a text file.
+        keys: files of public keys to trust, by which the signature of the calibration is checked.
+
+    Raises:
+        InputError: an input that cannot be read or does not belong to the calibration, or an unknown word.
+        FitError: with `msa`, the surveys do not separate interference from azimuth.
+
+    Example:
+        `well = mwdcal.survey(cal, "well.csv", reference=here, msa=True)`, then
+        `well.columns["azimuth_true_deg"]` and `well.interference.axial_nt`.
+    """
+    from mwdcal.screens.records.calibrations import load_calibration
+    from mwdcal.survey.surveying import analysed, check_drift, survey_well, well_inputs
+
+    check_drift(sensor_drift, msa)
+    ends: Any = tuple(np.radians(_finite("switch", switch, 2)).tolist())
+    start: Any = None if tie_in is None else tuple(_finite("tie_in", tie_in, 3))
+    loaded = load_calibration(_source(cal), [Path(key) for key in keys])
+    table = _survey_table(readings, loaded.calibration, decimal)
+    inputs = well_inputs(
+        loaded.calibration, table, _earth(reference), limits, msa, loaded.digest, loaded.findings
+    )
+    analysis = analysed(inputs, sensor_drift) if msa else None
+    if analysis:
+        analysis.check()
+    result = survey_well(inputs, analysis, tie_in=start, switch=ends, outside=outside)
+    return WellSurvey(result, loaded.signature)
+
+
+def convert(
+    cal: Calibration | FilePath,
+    notation: Literal["factors", "forward", "affine"],
+    *,
+    temperature: float | Literal["course"] | None = None,
+) -> Conversion:
+    """A calibration in another notation, in raw units, with covariance.
+
+    Definition: forward: raw = S · field + o; affine: field = M · raw + b; factors: SF, B and m (Moosavi).
+    Units: `temperature` in °C, by default the reference temperature; "course": coefficients by power of
+    T - reference.
+
+    Raises:
+        InputError: an unknown notation, a temperature that is not possible, or a course that is no polynomial.
+
+    Example:
+        `mwdcal.convert(cal, "forward").accelerometer["S"]`
+    """
+    from mwdcal.screens.conversion import converted
+
+    return Conversion(converted(_source(cal), notation, temperature))
+
+
+@overload
+def export(
+    cal: Calibration | FilePath,
+    kind: Literal["firmware"],
+    *,
+    form: Literal["c", "c-header", "fixed-point"] = "c",
+    word_bits: int | None = None,
+) -> FirmwareExport: ...
+
+
+@overload
+def export(
+    cal: Calibration | FilePath, kind: Literal["tool-model"], *, temperature: float | None = None
+) -> ToolModelExport: ...
+
+
+def export(
+    cal: Calibration | FilePath,
+    kind: str,
+    *,
+    form: str | None = None,
+    word_bits: int | None = None,
+    temperature: float | None = None,
+) -> FirmwareExport | ToolModelExport:
+    """A calibration for other programs: C sources for firmware, or a tool model for error-model programs.
+
+    `form` of firmware is c (double precision) or fixed-point, with whole numbers of `word_bits` (12 to 32, by default
+    32). `temperature`, °C, is that of a tool model, by default the middle of the calibrated range.
+
+    Raises:
+        InputError: an unknown kind or form, or an argument of the other kind.
+        FitError: a term of the tool model is undetermined.
+
+    Example:
+        `mwdcal.export(cal, "firmware", form="c").save("firmware")`
+    """
+    from mwdcal.screens import conversion
+
+    _check_word("kind", kind, KINDS_OF_EXPORT)
+    if kind == "tool-model":
+        for name, value in (("form", form), ("word_bits", word_bits)):
+            if value is not None:
+                raise InputError(f"`{name}` goes with the kind firmware. Leave it out.")
+        return ToolModelExport(*conversion.terms_at(_source(cal), temperature))
+    if temperature is not None:
+        raise InputError("`temperature`: sources hold for all temperatures. Leave it out.")
+    form = "c" if form is None else form
+    _check_word("form", form, FORMS_OF_FIRMWARE)
+    return FirmwareExport(conversion.exported(_source(cal), FORMS_OF_FIRMWARE[form], word_bits))
+
+
+def _source(cal: object) -> Calibration | FilePath:
+    """A calibration or its file; refuses anything else."""
+    if isinstance(cal, Calibration | str | os.PathLike):
+        return cal
+    raise InputError(
+        f"`cal` must be a calibration or its file; got {type(cal).__name__}. Make one by mwdcal.calibrate(…)."
+    )
+
+
+def _earth(reference: object) -> EarthReference | FilePath | None:
+    """The reference of a place, or its file."""
+    from mwdcal.survey.place.references import EarthReference
+
+    if isinstance(reference, PlaceReference):
+        return reference.earth
+    if reference is None or isinstance(reference, EarthReference | str | os.PathLike):
+        return reference
+    raise InputError(
+        f"`reference` must be that of a place, or its file; got {type(reference).__name__}. Make one by "
+        "mwdcal.reference(…)."
+    )
+
+
+def _survey_table(readings: Tabular | Readings, calibration: Calibration, decimal: str) -> Table:
+    """The table of readings, under its own names."""
+    profile = calibration.profile
+    if isinstance(readings, Readings):
+        _check_readings(readings, "readings")
+        return _table_of(readings, profile)
+    if not isinstance(readings, str | os.PathLike | Mapping) and not hasattr(readings, "columns"):
+        raise InputError(
+            f"`readings` must be a file, columns by name, or readings; got {type(readings).__name__}. Make some by "
+            "mwdcal.read_run(…)."
+        )
+    return table_of(
+        readings,
+        "the readings",
+        lambda path: runs.read_export(path, profile, decimal=decimal, rows=runs.MOST_ROWS),
+    )
+
+
+def _table_of(readings: Readings, profile: Profile) -> Table:
+    """The table of readings in the raw units of a profile, with the columns of their own table that it lacks."""
+    table = runs.from_readings(readings, profile)
+    beside = {
+        name: [as_text(cell) for cell in values.tolist()] if values.dtype.kind in "OUS" else values
+        for name, values in readings.table.items()
+    }
+    there = runs.renamed(Table(beside, {}, table.source), readings.profile or profile).columns
+    others = {name: cells for name, cells in there.items() if name not in COLUMNS}
+    return replace(table, columns={**readings.others, **table.columns, **others})
+
+
+def _arrays(table: Table, words: Iterable[str]) -> dict[str, AnyArray]:
+    """The columns of a table as arrays: numbers where all cells are, but labels and `words` as text."""
+    arrays: dict[str, AnyArray] = {}
+    for name, cells in table.columns.items():
+        if not isinstance(cells, list):
+            arrays[name] = cells
+            continue
+        arrays[name] = np.array(cells, dtype=object)
+        if name not in (*LABELS, *words):
+            try:
+                arrays[name] = tables.numbers(table, name)
+            except InputError:
+                continue
+    return arrays
+
+
+def _as_json(document: dict[str, Any]) -> dict[str, Any]:
+    """A document as its JSON reads: no NaN, no tuples."""
+    import msgspec
+
+    return msgspec.json.decode(msgspec.json.encode(document), type=dict[str, Any])
+
+
+def _number(name: str, value: object) -> float:
+    """A number; whether it can be is checked where it is used."""
+    try:
+        return float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        raise InputError(
+            f"`{name}` must be a number; got {value!r}. Give it without a unit."
+        ) from None
+
+
+def _finite(name: str, values: object, count: int) -> list[float]:
+    """So many finite numbers."""
+    numbers = [_number(name, value) for value in values] if isinstance(values, Iterable) else []
+    if len(numbers) != count or not all(abs(value) < 1e9 for value in numbers):
+        raise InputError(f"`{name}` must be {count} finite numbers; got {values!r}.")
+    return numbers
+
+
+def _day(date: object) -> datetime.date:
+    """A day, from its text too."""
+    if isinstance(date, datetime.datetime):
+        return date.date()
+    if isinstance(date, datetime.date):
+        return date
+    try:
+        return datetime.date.fromisoformat(str(date))
+    except ValueError:
+        raise InputError(
+            f"`date` must be a day, written year-month-day such as 2026-11-23; got {date!r}. Correct it."
+        ) from None
+
+
+def _check_word(name: str, word: str, words: Iterable[str]) -> None:
+    """Refuse a word that is not one of some."""
+    if word not in words:
+        raise InputError(
+            f"`{name}` must be one of {', '.join(words)}; got {word!r}.{nearest(str(word), words)}"
+        )

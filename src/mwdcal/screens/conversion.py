@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,8 +12,10 @@ import numpy as np
 from mwdcal.calibration.prediction import middle_temperature
 from mwdcal.calibration.readings import Readings, simulated
 from mwdcal.calibration.record import SOFTWARE, Calibration, Finding
+from mwdcal.errors import InputError
+from mwdcal.files.contract import TEMPERATURE
 from mwdcal.files.formats import members
-from mwdcal.firmware.export import DEFAULT_BITS, FirmwareSources, export
+from mwdcal.firmware.export import DEFAULT_BITS, FIXED_POINT, FirmwareSources, export
 from mwdcal.firmware.statements import stated_errors
 from mwdcal.firmware.working_range import SHARE_OF
 from mwdcal.registry.calibration_source import calibration_of
@@ -20,7 +23,7 @@ from mwdcal.screens.envelope import enveloped
 from mwdcal.screens.numbers import HELD, UNDETERMINED, number, written
 from mwdcal.screens.text import one_line, raised, table
 from mwdcal.sensor.profile import Axis
-from mwdcal.survey.tool_model import SensorTerm
+from mwdcal.survey.tool_model import SensorTerm, sensor_terms, tool_model_text
 from mwdcal.use.notation import COURSE, Notation, convert, powers
 
 UNRECORDED = (
@@ -36,10 +39,11 @@ OUTSIDE_RANGE = (
 class Converted(NamedTuple):
     """A calibration in one notation: where from, at which temperature, and what to know of it.
 
-    `sha256` is of the bytes of the calibration file; `temperature` is None where none was given.
+    `name` and `sha256` are of the calibration file, empty for a calibration in memory; `temperature` is None where
+    none was given.
     """
 
-    path: Path
+    name: str
     sha256: str
     calibration: Calibration
     notation: str
@@ -99,37 +103,78 @@ class ConversionSummary(msgspec.Struct, frozen=True, kw_only=True):
     terms: list[SensorTerm] | msgspec.UnsetType = msgspec.UNSET
 
 
-def convert_file(path: Path, notation: str, temperature: float | str | None) -> Converted:
-    """Read a calibration file and convert it."""
-    calibration, sha256 = calibration_of(path)
+def _identified(source: Calibration | PathLike[str] | str) -> tuple[str, str, Calibration]:
+    """Name and SHA-256 of the file of a calibration, both empty for one in memory, and the calibration."""
+    if isinstance(source, Calibration):
+        return "", "", source
+    calibration, sha256 = calibration_of(Path(source))
+    return members.name_of(source), sha256, calibration
+
+
+def converted(
+    source: Calibration | PathLike[str] | str,
+    notation: str,
+    temperature: float | str | None = None,
+) -> Converted:
+    """A calibration, from memory or a file, in a notation; `temperature` as of `notation.convert`.
+
+    Raises:
+        InputError: a temperature or a notation that is not possible, or a file that cannot be read.
+    """
+    name, sha256, calibration = _identified(source)
+    _check_temperature(temperature)
     triads = convert(calibration, notation, temperature)
     findings = temperature_findings(calibration, notation, temperature)
     findings += calibration.change_findings()
-    return Converted(path, sha256, calibration, notation, temperature, triads, findings)
+    return Converted(name, sha256, calibration, notation, temperature, triads, findings)
 
 
-def loaded(path: Path, temperature: float | None) -> Converted:
-    """A calibration file at a temperature, without values in any notation."""
-    calibration, sha256 = calibration_of(path)
+def terms_at(
+    source: Calibration | PathLike[str] | str, temperature: float | str | None
+) -> tuple[Converted, list[SensorTerm], str]:
+    """The sensor terms of a calibration at a temperature, and the text of its tool model.
+
+    Raises:
+        FitError: a term is undetermined.
+        InputError: a temperature that is not possible, or a file that cannot be read.
+    """
+    name, sha256, calibration = _identified(source)
+    _check_temperature(temperature)
+    if isinstance(temperature, str):
+        raise InputError(
+            f"`temperature` of a tool model must be a number in °C; got {temperature!r}."
+        )
     findings = [] if temperature is None else temperature_findings(calibration, "", temperature)
     findings += calibration.change_findings()
-    return Converted(path, sha256, calibration, "", temperature, {}, findings)
+    result = Converted(name, sha256, calibration, "", temperature, {}, findings)
+    terms = sensor_terms(calibration, temperature)
+    return result, terms, tool_model_text(calibration, temperature=temperature)
 
 
-def terms_document(converted: Converted, terms: list[SensorTerm], output: Path) -> dict[str, Any]:
+def _check_temperature(temperature: float | str | None) -> None:
+    """Refuse a temperature that no tool has; a word is left to the conversion."""
+    if temperature is None or isinstance(temperature, str):
+        return
+    if not TEMPERATURE.low <= temperature <= TEMPERATURE.high:
+        raise InputError(f"`temperature` must be {TEMPERATURE}; got {temperature:g}.")
+
+
+def terms_document(
+    converted: Converted, terms: list[SensorTerm], output: Path | None = None
+) -> dict[str, Any]:
     """The sensor terms for machines."""
     at = converted.temperature
     content = ConversionSummary(
         **_identity(converted),
         to="tool-model",
         temperature_c=middle_temperature(converted.calibration) if at is None else at,
-        files=[str(output)],
+        files=[str(output)] if output else [],
         terms=terms,
     )
     return _enveloped(converted, content)
 
 
-def terms_screen(converted: Converted, terms: list[SensorTerm], output: Path) -> str:
+def terms_screen(converted: Converted, terms: list[SensorTerm], output: Path | None = None) -> str:
     """The sensor terms for people."""
     rows = [
         [
@@ -142,7 +187,8 @@ def terms_screen(converted: Converted, terms: list[SensorTerm], output: Path) ->
     ]
     heading = "\n".join(one_line("   ".join(line)) for line in _heading(converted))
     shown = table(rows, ["term", "1σ", "OWSG MWD", "unit", "ratio"])
-    return f"{heading}\n\n{shown}\n{written(**{'tool model': output})}"
+    files = [written(**{"tool model": output})] if output else []
+    return "\n".join([heading, "", shown, *files])
 
 
 def temperature_findings(
@@ -195,7 +241,7 @@ def _identity(converted: Converted | Exported) -> dict[str, Any]:
         "tool": calibration.tool,
         "profile": calibration.profile.name,
         "run": calibration.run,
-        "calibration": members.name_of(converted.path),
+        "calibration": converted.name,
         "calibrated": calibration.time,
         "software": calibration.software,
         "converted_by": SOFTWARE,
@@ -241,16 +287,13 @@ def screen(converted: Converted) -> str:
 
 
 def _heading(converted: Converted | Exported) -> list[list[str]]:
-    """Whose calibration it is, in two lines."""
+    """Whose calibration it is, and the digest of its file."""
     calibration = converted.calibration
     serial = calibration.tool.get("serial", calibration.profile.name)
-    first = [
-        members.name_of(converted.path),
-        serial,
-        f"run {calibration.run}",
-        calibration.software,
-    ]
-    return [[*first, *simulated(calibration.tool)], [f"SHA-256 {converted.sha256}"]]
+    file = [converted.name] if converted.name else []
+    first = [*file, serial, f"run {calibration.run}", calibration.software]
+    digest = [[f"SHA-256 {converted.sha256}"]] if converted.sha256 else []
+    return [[*first, *simulated(calibration.tool)], *digest]
 
 
 def _calibrated(converted: Converted) -> str:
@@ -305,7 +348,7 @@ def _label(name: str, index: tuple[int, ...], power: int | None) -> str:
 class Exported(NamedTuple):
     """A calibration as C sources: where from, in which form, and what to know of it."""
 
-    path: Path
+    name: str
     sha256: str
     calibration: Calibration
     form: str
@@ -314,23 +357,36 @@ class Exported(NamedTuple):
     findings: list[Finding]
 
 
-def export_file(path: Path, form: str, word_bits: int | None) -> Exported:
-    """Read a calibration file and make its C sources."""
-    calibration, sha256 = calibration_of(path)
-    bits = (word_bits or DEFAULT_BITS) if form == "fixed-point" else None
+def check_bits(form: str | None, word_bits: int | None) -> None:
+    """Refuse bits of whole numbers for a form that has none."""
+    if word_bits is not None and form != FIXED_POINT:
+        raise InputError("`word_bits` goes with `form` fixed-point. Leave it out, or add that.")
+
+
+def exported(
+    source: Calibration | PathLike[str] | str, form: str, word_bits: int | None = None
+) -> Exported:
+    """The C sources of a calibration, from memory or a file; `form` as of `firmware.export`.
+
+    Raises:
+        InputError: an unknown form, bits of another form, or fixed-point numbers that cannot carry the calibration.
+    """
+    check_bits(form, word_bits)
+    name, sha256, calibration = _identified(source)
+    bits = (word_bits or DEFAULT_BITS) if form == FIXED_POINT else None
     sources = export(calibration, form, sha256, bits or DEFAULT_BITS)
     findings = calibration.change_findings()
-    return Exported(path, sha256, calibration, form, bits, sources, findings)
+    return Exported(name, sha256, calibration, form, bits, sources, findings)
 
 
-def export_document(exported: Exported, folder: Path) -> dict[str, Any]:
+def export_document(exported: Exported, folder: Path | None = None) -> dict[str, Any]:
     """The sources for machines: identity, files, and how exact they are."""
     sources = exported.sources
     content = ConversionSummary(
         **_identity(exported),
         to=exported.form,
         word_bits=exported.word_bits,
-        folder=str(folder),
+        folder=str(folder or ""),
         files=list(sources.files),
         errors={_error_names(exported)[name]: error for name, error in sources.errors.items()},
         multiplied_by_share_across_axis_of=dict(SHARE_OF),
@@ -348,11 +404,12 @@ def _error_names(exported: Exported) -> dict[str, str]:
     return angles | {"gravity": "gravity_g", "field": field}
 
 
-def export_screen(exported: Exported, folder: Path) -> str:
+def export_screen(exported: Exported, folder: Path | None = None) -> str:
     """The sources for people: whose calibration, how exact, and the files."""
     stated = stated_errors(exported.calibration, exported.sources.errors)
     heading = _heading(exported)
     words = [f"{exported.word_bits} bits"] if exported.word_bits else []
+    place = f"wrote {one_line(folder)}" if folder else "files"
     lines = [*heading, [exported.form, *words]]
     rows = [[_error_title(name), text.replace(" degrees", "°")] for name, text in stated.items()]
     return "\n".join(
@@ -361,7 +418,7 @@ def export_screen(exported: Exported, folder: Path) -> str:
             "",
             table(rows, ["", "largest difference from apply"]),
             "",
-            f"wrote {one_line(folder)}: {', '.join(exported.sources.files)}",
+            f"{place}: {', '.join(exported.sources.files)}",
         ]
     )
 

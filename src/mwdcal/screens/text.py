@@ -70,6 +70,13 @@ def harmless(text: str) -> str:
     return UNSAFE_BUT_LINES.sub(_escape, text)
 
 
+def to_json(result: Any) -> str:
+    """A result for machines."""
+    import msgspec
+
+    return msgspec.json.format(msgspec.json.encode(result), indent=2).decode()
+
+
 def without_passwords(text: str) -> str:
     """A message without the passwords of URLs in it, however these are mistyped.
 
@@ -137,13 +144,6 @@ def chance(probability: float | None) -> str:
     if probability is None:
         return number(probability)
     return "< 1e-9" if probability < 1e-9 else f"{probability:.2g}"
-
-
-def to_json(result: Any) -> str:
-    """A result for machines."""
-    import msgspec
-
-    return msgspec.json.format(msgspec.json.encode(result), indent=2).decode()
 
 
 def columns(stream: Any) -> int | None:

@@ -232,13 +232,10 @@ def _row(space: uuid.UUID, name: str, term: SensorTerm) -> dict[str, Any]:
     }
 
 
-def write_tool_model(
-    path: str | os.PathLike[str],
-    calibration: Calibration,
-    name: str = "",
-    temperature: float | None = None,
-) -> None:
-    """Write the sensor terms of a calibrated tool as a tool model, JSON; `name`: by default the tool's.
+def tool_model_text(
+    calibration: Calibration, name: str = "", temperature: float | None = None
+) -> str:
+    """The tool model of a calibrated tool as JSON; `name`: by default the tool's.
 
     Raises:
         FitError: a term is undetermined.
@@ -247,4 +244,14 @@ def write_tool_model(
     terms = sensor_terms(calibration, temperature)
     source = f"calibration of {calibration.run_name}, SHA-256 {calibration.run_sha256}"
     model = tool_model(terms, tool, source, calibration.time, calibration.simulated)
-    atomic.write(path, json.dumps(model, indent=1) + "\n")
+    return json.dumps(model, indent=1) + "\n"
+
+
+def write_tool_model(
+    path: str | os.PathLike[str],
+    calibration: Calibration,
+    name: str = "",
+    temperature: float | None = None,
+) -> None:
+    """Write `tool_model_text`, whole or not at all."""
+    atomic.write(path, tool_model_text(calibration, name, temperature))

@@ -44,12 +44,12 @@ def command(
     Example: mwdcal apply tool.json surveys.csv -o corrected.csv
     Exit: 0 written, 2 input cannot be read, or does not belong to the calibration.
     """
-    from mwdcal.app.choices import load_calibration
     from mwdcal.app.correction import Applied, apply_to_any
     from mwdcal.app.progress import bar
     from mwdcal.calibration.readings import simulated
     from mwdcal.files.runs import BlankReadingError
     from mwdcal.screens.envelope import enveloped, with_signature
+    from mwdcal.screens.records.calibrations import load_calibration
     from mwdcal.screens.records.signature import in_short
 
     options.check_outputs([output], [calibration, readings, *key])

@@ -56,7 +56,10 @@ def command(
     Example: mwdcal convert tool.json --to fixed-point --word-bits 24 -o firmware
     Example: mwdcal convert tool.json --to tool-model -o model.json
     """
-    _check_choice(notation, form, word_bits, temperature, output)
+    from mwdcal.screens.conversion import check_bits
+
+    _check_choice(notation, form, temperature, output)
+    check_bits(form, word_bits)
     if form == "tool-model" and output:
         _write_model(calibration, temperature, output, as_json)
     elif form and output:
@@ -66,9 +69,8 @@ def command(
 
 
 def _check_choice(
-    notation: str | None, form: str | None, word_bits: int | None, temperature: str | None,
-    output: Path | None,
-) -> None:  # fmt: skip
+    notation: str | None, form: str | None, temperature: str | None, output: Path | None
+) -> None:
     """Refuse options that do not go together."""
     if (notation is None) == (form is None):
         raise InputError("`notation` or `form` must be given, and not both. Choose one.")
@@ -78,8 +80,6 @@ def _check_choice(
         raise InputError(
             "`temperature` goes with `notation`: sources hold for all temperatures. Omit it."
         )
-    if word_bits is not None and form != "fixed-point":
-        raise InputError("`word_bits` goes with `form` fixed-point. Leave it out, or add that.")
 
 
 def _convert(
@@ -90,7 +90,7 @@ def _convert(
     from mwdcal.screens import conversion
 
     options.check_outputs([output], [calibration])
-    converted = conversion.convert_file(calibration, notation, _temperature(temperature))
+    converted = conversion.converted(calibration, notation, _temperature(temperature))
     document = conversion.document(converted)
     shown = f"wrote {one_line(output)}" if output else conversion.screen(converted)
     if output:
@@ -105,7 +105,7 @@ def _write_sources(
     from mwdcal.files.formats import atomic
     from mwdcal.screens import conversion
 
-    exported = conversion.export_file(calibration, form, word_bits)
+    exported = conversion.exported(calibration, form, word_bits)
     files = {folder / name: text for name, text in exported.sources.files.items()}
     with atomic.folder(folder):
         options.check_outputs(files, [calibration])
@@ -118,16 +118,12 @@ def _write_sources(
 
 def _write_model(calibration: Path, temperature: str | None, output: Path, as_json: bool) -> None:
     """Write the sensor terms of a calibration as a tool model, and print them."""
+    from mwdcal.files.formats import atomic
     from mwdcal.screens import conversion
-    from mwdcal.survey.tool_model import sensor_terms, write_tool_model
 
     options.check_outputs([output], [calibration])
-    at = _temperature(temperature)
-    if isinstance(at, str):
-        raise InputError(f"`temperature` of a tool model must be a number in °C; got {at!r}.")
-    converted = conversion.loaded(calibration, at)
-    terms = sensor_terms(converted.calibration, at)
-    write_tool_model(output, converted.calibration, temperature=at)
+    converted, terms, model = conversion.terms_at(calibration, _temperature(temperature))
+    atomic.write(output, model)
     document = conversion.terms_document(converted, terms, output)
     print_result(
         document if as_json else conversion.terms_screen(converted, terms, output),
@@ -136,13 +132,8 @@ def _write_model(calibration: Path, temperature: str | None, output: Path, as_js
 
 
 def _temperature(typed: str | None) -> float | str | None:
-    """A temperature in °C if it is a number; a word is left to the conversion."""
-    from mwdcal.files.contract import TEMPERATURE
-
+    """A temperature in °C if it is a number, else the word."""
     try:
-        value = float(typed or "")
+        return float(typed or "")
     except ValueError:
         return typed
-    if not TEMPERATURE.low <= value <= TEMPERATURE.high:
-        raise InputError(f"`temperature` must be {TEMPERATURE}; got {value:g}.")
-    return value

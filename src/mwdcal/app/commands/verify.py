@@ -32,12 +32,12 @@ def command(
     """
     from msgspec.structs import replace
 
-    from mwdcal.app.choices import load_calibration
     from mwdcal.calibration.diagnosis.findings import unused_columns
     from mwdcal.files import runs
     from mwdcal.files.formats import atomic
     from mwdcal.files.limits import load_limits
     from mwdcal.screens.envelope import enveloped, with_signature
+    from mwdcal.screens.records.calibrations import load_calibration
     from mwdcal.screens.verification import screen
     from mwdcal.use.verification import verify
 

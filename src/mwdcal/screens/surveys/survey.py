@@ -9,15 +9,18 @@ import msgspec
 import numpy as np
 
 from mwdcal.calibration.canonical import SignatureCheck
+from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import Finding, stated
+from mwdcal.screens.envelope import enveloped, with_signature
 from mwdcal.screens.numbers import fixed, signed, written
 from mwdcal.screens.records.signature import in_short
+from mwdcal.screens.surveys import interference
 from mwdcal.screens.text import one_line, plural, table
-from mwdcal.survey.acceptance import SurveyLimits
 from mwdcal.survey.error_terms import ErrorTerms, error_terms
 from mwdcal.survey.multistation.interference import InterferenceSize, MultiStationAnalysis
 from mwdcal.survey.norths import North
+from mwdcal.survey.surveying import SurveyedWell, WellInputs
 from mwdcal.survey.well import Well
 
 MOST_SURVEYS = 30
@@ -73,14 +76,9 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
     msa: MultiStationAnalysis | None = None
 
 
-def refusal(
-    msa: MultiStationAnalysis,
-    limits: SurveyLimits,
-    north: North,
-    sources: Mapping[str, str],
-    rows: int,
-) -> SurveySummary:
-    """What a multi-station analysis says that cannot be used: none of the `rows` is judged, nothing is written."""
+def refusal(inputs: WellInputs, msa: MultiStationAnalysis) -> SurveySummary:
+    """What a multi-station analysis says that cannot be used: none of the surveys is judged, nothing is written."""
+    rows, north = inputs.surveys.readings.count, inputs.surveys.north
     return SurveySummary(
         rows=rows,
         accepted=0,
@@ -90,9 +88,9 @@ def refusal(
         blank=rows,
         north=north.name,
         **_stated(north, error_terms((), north.declination is not None)),
-        reference_sources=dict(sources),
-        limits=limits.name,
-        source=limits.source,
+        reference_sources=dict(inputs.surveys.sources),
+        limits=inputs.limits.name,
+        source=inputs.limits.source,
         end=None,
         findings=msa.findings,
         output="",
@@ -101,6 +99,33 @@ def refusal(
         separable=msa.separable,
         msa=msa,
     )
+
+
+def result_summary(result: SurveyedWell, output: str = "", html: str = "") -> SurveySummary:
+    """The result for machines; `output` and `html` are the files that were written, if any."""
+    msa = result.analysis.summary if result.analysis else None
+    unused = unused_columns(result.inputs.surveys.readings.unused)
+    return summary(result.well, output, html, msa, unused)
+
+
+def document(inputs: WellInputs, facts: SurveySummary, signature: SignatureCheck) -> dict[str, Any]:
+    """The document of a result or of a refusal, with what all inputs say of themselves."""
+    whole = enveloped("survey", facts, *inputs.stated, **inputs.digests)
+    return with_signature(whole, signature)
+
+
+def whole_screen(result: SurveyedWell, facts: SurveySummary, signature: SignatureCheck) -> str:
+    """The result for people, behind the multi-station analysis if there is one."""
+    stated = result.inputs.stated
+    shown = screen(result.well, facts, signature, *stated)
+    return (
+        f"{interference.screen(result.analysis, *stated)}\n\n{shown}" if result.analysis else shown
+    )
+
+
+def all_findings(facts: SurveySummary) -> list[Finding]:
+    """The findings of the multi-station analysis, then those about the surveys."""
+    return [*(facts.msa.findings if facts.msa else []), *facts.findings]
 
 
 def summary(
@@ -199,7 +224,7 @@ def screen(
             *map(one_line, lines),
             "",
             survey_table(well),
-            written(table=facts.output, page=facts.html),
+            *([written(table=facts.output, page=facts.html)] if facts.output else []),
         ]
     )
 

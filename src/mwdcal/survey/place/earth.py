@@ -133,7 +133,7 @@ def field_model(name: str, year: float) -> FieldModel:
         others = [other for other, (low, high) in FIELD_MODELS.items() if low <= year <= high]
         advice = f"Use `model` {others[0]}" if others else "Give measured values"
         raise InputError(
-            f"`day`: {name} holds from {first:.1f} to {last:.1f}; got {year:.3f}. {advice}."
+            f"`date`: {name} holds from {first:.1f} to {last:.1f}; got {year:.3f}. {advice}."
         )
     return _wmm() if name == "wmm2025" else _igrf(_epoch(year))
 

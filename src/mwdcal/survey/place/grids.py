@@ -90,14 +90,14 @@ def _derivatives(pyproj: Any, crs: str, system: Any, latitude: float, longitude:
     except pyproj.exceptions.ProjError as error:
         raise InputError(
             f"`crs`: PROJ cannot transform {latitude:g}°, {longitude:g}° to {crs} ({system.name}): "
-            f"{str(error).rstrip('.')}. Check `latitude_deg`, `longitude_deg` and the zone."
+            f"{str(error).rstrip('.')}. Check `latitude`, `longitude` and the zone."
         ) from None
     off = np.abs(back - [latitudes, longitudes])
     off[1] = np.minimum(off[1], np.abs(off[1] - 360.0)) * cosine
     if not (off <= SAME_PLACE).all():
         raise InputError(
             f"`crs` {crs} ({system.name}) does not show {latitude:g}°, {longitude:g}°. "
-            "Check `latitude_deg`, `longitude_deg` and the zone."
+            "Check `latitude`, `longitude` and the zone."
         )
     units = [axis.unit_conversion_factor for axis in system.axis_info[:2]]
     west, east, first, last = points.T * units / units[0]

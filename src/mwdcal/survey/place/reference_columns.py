@@ -111,5 +111,5 @@ def _other_date(table: Table, reference: EarthReference) -> list[Finding]:
     stated = str(table.metadata.get("date", ""))
     if not stated or stated[: len("2026-01-01")] == str(reference.date):
         return []
-    text = f"{table.source} states the date {shown(stated)}, the reference is of {reference.date}. Check `day`."
+    text = f"{table.source} states the date {shown(stated)}, the reference is of {reference.date}. Check `date`."
     return [Finding(id="other-date", text=text)]

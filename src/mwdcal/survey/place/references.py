@@ -82,6 +82,8 @@ RANGES_OF_REFERENCE = {
     **{f"sd_random_{MEASURABLE[name]}": _SD[name] for name in sorted(GEOMAGNETIC)},
 }
 """Accepted values."""
+_ARGUMENT_NAMES = {"latitude_deg": "latitude", "longitude_deg": "longitude"}
+"""What keys are called where they are given, if not by their own name."""
 _REMEDIES = {
     "latitude_deg": "North is positive.",
     "longitude_deg": "East is positive.",
@@ -434,7 +436,7 @@ def check_ranges(values: Mapping[str, float], source: str = "") -> None:
     for key, value in values.items():
         limits = RANGES_OF_REFERENCE[key]
         if not limits.low <= value <= limits.high:
-            named = f"{source}: '{key}'" if source else f"`{key}`"
+            named = f"{source}: '{key}'" if source else f"`{_ARGUMENT_NAMES.get(key, key)}`"
             raise InputError(f"{named} must be {limits}; got {value:g}. {_remedy(key, values)}")
 
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
 from math import radians
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -16,16 +14,9 @@ from mwdcal.errors import InputError
 from mwdcal.screens.typed import findings_as_typed
 
 if TYPE_CHECKING:
-    from mwdcal.app.choices import LoadedCalibration
     from mwdcal.calibration.canonical import SignatureCheck
-    from mwdcal.calibration.readings import Readings
-    from mwdcal.calibration.record import Calibration, Finding
-    from mwdcal.files.formats.table import Table
-    from mwdcal.geometry.vectors import Array
-    from mwdcal.survey.acceptance import SurveyLimits
     from mwdcal.survey.multistation.interference import Interference
-    from mwdcal.survey.norths import North
-    from mwdcal.survey.well import Well
+    from mwdcal.survey.surveying import SurveyedWell, WellInputs
 
 
 @options.command()
@@ -91,150 +82,73 @@ def command(
     Exit: 0 written, 2 input cannot be read, or does not belong to the calibration, 3 with --msa: the surveys do not
     separate interference from azimuth.
     """
-    from mwdcal.app.choices import load_calibration
     from mwdcal.files.formats import atomic
     from mwdcal.files.formats import table as tables
-    from mwdcal.survey.tables import surveyed_table
-    from mwdcal.survey.well import well
+    from mwdcal.files.runs import MOST_ROWS, read_export
+    from mwdcal.screens.records.calibrations import load_calibration
+    from mwdcal.survey.surveying import analysed, check_drift, survey_well, well_inputs
 
     if msa_html and not msa:
         raise InputError("`msa_html` goes with `msa`. Leave it out, or add `msa`.")
-    if sensor_drift and not msa:
-        raise InputError("`sensor_drift` goes with `msa`. Leave it out, or add `msa`.")
-    inputs = [calibration, readings, reference, limits, *key]
-    options.check_outputs([output, msa_html], inputs, page=html)
+    check_drift(sensor_drift, msa)
+    given = [calibration, readings, reference, limits, *key]
+    options.check_outputs([output, msa_html], given, page=html)
     start, ends = _three("tie_in", tie_in), _switch(switch)
     loaded = load_calibration(calibration, key)
-    scene = _read(loaded, readings, reference, limits, decimal, msa)
-    fitted, analysis = scene.calibration, None
-    pages: list[tuple[Path, bytes | str]] = []
-    if msa:
-        analysis, pages = _analysed(scene, msa_html, sensor_drift or "owsg", as_json)
-        fitted = analysis.calibration
-    result = well(fitted, scene.readings, scene.limits, scene.north, scene.md, start, ends, outside)
-    findings = [*loaded.findings, *scene.findings, *result.findings]
-    result = replace(result, findings=findings, sources=scene.sources)
+    fitted = loaded.calibration
+    table = read_export(readings, fitted.profile, decimal=decimal, rows=MOST_ROWS)
+    inputs = well_inputs(fitted, table, reference, limits, msa, loaded.digest, loaded.findings)
+    analysis = analysed(inputs, sensor_drift) if msa else None
+    pages = _interference_page(inputs, analysis, msa_html)
+    if analysis and not analysis.summary.separable:
+        atomic.write_all(pages)
+        _refuse(inputs, analysis, loaded.signature, as_json)
+    result = survey_well(inputs, analysis, tie_in=start, switch=ends, outside=outside)
     if html:
         from mwdcal.pages.surveys.survey import render
 
-        findings = findings_as_typed(result.findings)
-        pages.append((html, render(result, findings, scene.named)))
-    content = tables.rendered(output, surveyed_table(scene.table, result))
-    atomic.write_all([(output, content), *pages])
-    _print(scene, result, analysis, (str(output), str(html or "")), as_json)
+        findings = findings_as_typed(result.well.findings)
+        pages.append((html, render(result.well, findings, inputs.named)))
+    atomic.write_all([(output, tables.rendered(output, result.table)), *pages])
+    _print(result, loaded.signature, (str(output), str(html or "")), as_json)
 
 
-@dataclass(frozen=True)
-class _WellInputs:
-    """What the command was given; digests of its files."""
+def _interference_page(
+    inputs: WellInputs, analysis: Interference | None, page: Path | None
+) -> list[tuple[Path, bytes | str]]:
+    """The page of a multi-station analysis, where one was asked for."""
+    if not analysis or not page:
+        return []
+    from mwdcal.pages.surveys.interference import render
 
-    signature: SignatureCheck
-    calibration: Calibration
-    table: Table
-    readings: Readings
-    md: Array | None
-    north: North
-    limits: SurveyLimits
-    sources: Mapping[str, str]
-    findings: list[Finding]
-    digests: dict[str, str]
-
-    @property
-    def stated(self) -> tuple[Mapping[str, object], Mapping[str, object]]:
-        """What calibration and readings say of themselves."""
-        return self.calibration.tool, self.readings.metadata
-
-    def enveloped(self, summary: object) -> dict[str, Any]:
-        """The result for machines, with what all inputs say of themselves."""
-        from mwdcal.screens.envelope import enveloped, with_signature
-
-        document = enveloped("survey", summary, *self.stated, **self.digests)
-        return with_signature(document, self.signature)
-
-    @property
-    def named(self) -> dict[str, str]:
-        """Digests of the files that there are."""
-        return {name: digest for name, digest in self.digests.items() if digest}
+    return [(page, render(analysis, inputs.named))]
 
 
-def _read(
-    loaded: LoadedCalibration, readings: Path, reference: Path | None, limits: str, decimal: str, msa: bool,
-) -> _WellInputs:  # fmt: skip
-    """The files read; stations that multi-station analysis puts into the record have fingerprints."""
-    from mwdcal.files.runs import MOST_ROWS, read_export
-    from mwdcal.survey.acceptance import load_survey_limits
-    from mwdcal.survey.place.references import load_reference
-    from mwdcal.survey.tables import survey_readings
+def _refuse(
+    inputs: WellInputs, analysis: Interference, signature: SignatureCheck, as_json: bool
+) -> None:
+    """Print an analysis that cannot be used where machines read it, and refuse it."""
+    from mwdcal.screens.surveys import survey as screens
 
-    fitted = loaded.calibration
-    bounds, limits_digest = load_survey_limits(limits)
-    source = read_export(readings, fitted.profile, decimal=decimal, rows=MOST_ROWS)
-    place, place_digest = load_reference(reference) if reference else (None, "")
-    read = survey_readings(source, fitted, place, recognised=msa)
-    digests = {"calibration": loaded.digest, "readings": source.digest}
-    digests |= {"reference": place_digest} if read.uses_reference else {}
-    return _WellInputs(
-        loaded.signature,
-        fitted,
-        source,
-        read.readings,
-        read.md,
-        read.north,
-        bounds,
-        read.sources,
-        read.findings,
-        {**digests, "limits": limits_digest},
-    )
-
-
-def _analysed(
-    scene: _WellInputs, page: Path | None, drift: str, as_json: bool
-) -> tuple[Interference, list[tuple[Path, bytes | str]]]:
-    """The multi-station analysis and its page; one that is not separable is printed and refused."""
-    from mwdcal.files.formats import atomic
-    from mwdcal.screens.surveys.survey import refusal
-    from mwdcal.survey.multistation.interference import interference
-    from mwdcal.survey.multistation.interference_estimate import Assumed, sensor_drift
-
-    assumed = Assumed(drift=sensor_drift(drift))
-    analysis = interference(scene.calibration, scene.readings, assumed, scene.md)
-    pages: list[tuple[Path, bytes | str]] = []
-    if page:
-        from mwdcal.pages.surveys.interference import render
-
-        pages.append((page, render(analysis, scene.named)))
-    if not analysis.summary.separable:
-        atomic.write_all(pages)
-        if as_json:
-            refused = refusal(
-                analysis.summary, scene.limits, scene.north, scene.sources, scene.readings.count
-            )
-            print_result(scene.enveloped(refused), [])
-        analysis.check()
-    return analysis, pages
+    if as_json:
+        facts = screens.refusal(inputs, analysis.summary)
+        print_result(screens.document(inputs, facts, signature), [])
+    analysis.check()
 
 
 def _print(
-    scene: _WellInputs,
-    result: Well,
-    analysis: Interference | None,
-    files: tuple[str, str],
-    as_json: bool,
+    result: SurveyedWell, signature: SignatureCheck, files: tuple[str, str], as_json: bool
 ) -> None:
-    """What came of it."""
-    from mwdcal.calibration.diagnosis.findings import unused_columns
-    from mwdcal.screens.surveys import interference as screens_of_msa
+    """Print the result, with the files that were written."""
     from mwdcal.screens.surveys import survey as screens
 
-    msa = analysis.summary if analysis else None
-    unused = unused_columns(scene.readings.unused)
-    summary = screens.summary(result, *files, msa, unused)
-    document = scene.enveloped(summary)
-    shown = screens.screen(result, summary, scene.signature, *scene.stated)
-    if analysis:
-        shown = f"{screens_of_msa.screen(analysis, *scene.stated)}\n\n{shown}"
-    findings = findings_as_typed([*(msa.findings if msa else []), *summary.findings])
-    print_result(document if as_json else shown, findings)
+    facts = screens.result_summary(result, *files)
+    shown: object = (
+        screens.document(result.inputs, facts, signature)
+        if as_json
+        else screens.whole_screen(result, facts, signature)
+    )
+    print_result(shown, findings_as_typed(screens.all_findings(facts)))
 
 
 def _numbers(name: str, text: str, count: int) -> list[float]:
