@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Unpack, overload
 
@@ -362,7 +362,7 @@ def _run(
     table, facts = sessions.simulated_run(session, true, seed, rng, serial)
     facts |= sessions.tool_facts(true, session.profile, scene.record)
     readings, profile = runs.read_run(table, session.profile)
-    read = {name: getattr(readings, name) for name in Readings.__dataclass_fields__}
+    read = {each.name: getattr(readings, each.name) for each in fields(Readings)}
     read |= {"profile": profile, "profile_sha256": scene.digests.get("profile", "")}
     read |= {"table": arrays_of(table)}
     return SimulatedReadings(
