@@ -168,8 +168,8 @@ def certificate(
 
     files = _Sources(Path(folder).resolve())
     calibration, digest, doubts = _loaded(cal, keys, files)
-    as_left = _verification(verification, "verification", calibration, digest, files)
-    before = _verification(as_found, "as-found", calibration, "", files)
+    as_left = _verification(verification, "verification", digest, files)
+    before = _verification(as_found, "as-found", "", files)
     stated = None
     if laboratory is not None:
         stated, laboratory_digest = load_laboratory(Path(laboratory))
@@ -240,12 +240,11 @@ def _loaded(
 
 
 def _verification(
-    test: Verdict | Place | None, name: str, calibration: Calibration, digest: str, files: _Sources
+    test: Verdict | Place | None, name: str, digest: str, files: _Sources
 ) -> Verification | None:
     """A roll test that a certificate shows; a verdict in memory is one of the calibration with this SHA-256."""
-    from msgspec import convert, to_builtins
+    from msgspec import convert
 
-    from mwdcal.calibration.record import DOCUMENT_VERSION, SOFTWARE
     from mwdcal.files.verifications import Verification, load_verification
 
     if test is None or isinstance(test, Verification):
@@ -254,20 +253,11 @@ def _verification(
         read, file_digest = load_verification(test)
         files.add(name, Path(test), file_digest)
         return read
-    to_dict: Callable[[], dict[str, Any]] | None = getattr(test, "to_dict", None)
-    if to_dict is not None:
-        return convert(to_dict(), Verification)
-    head = {
-        "schema_version": DOCUMENT_VERSION,
-        "command": "verify",
-        "software": SOFTWARE,
-        "serial": calibration.serial,
-        "simulated": calibration.simulated,
-        "calibration_sha256": digest,
-        "run_sha256": None,
-        "limits_sha256": None,
-    }
-    return convert({**head, **to_builtins(test)}, Verification)
+    document = test.to_dict()
+    unknown = document["calibration_sha256"] is None
+    return convert(
+        {**document, **({"calibration_sha256": digest} if unknown else {})}, Verification
+    )
 
 
 def _drift(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
+from hashlib import sha256
 from html import escape
 from typing import Any, NamedTuple, TypeVar
 
@@ -16,7 +17,7 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.comparison.compare import Comparison
 from mwdcal.faults.diagnosis import Diagnosis
-from mwdcal.files import runs
+from mwdcal.files import documents, runs
 from mwdcal.files.formats import atomic
 from mwdcal.geometry.vectors import AnyArray
 from mwdcal.library.results import brief, frame
@@ -40,6 +41,11 @@ def with_inputs(result: _Shown, *metadata: Mapping[str, object], **digests: str)
     """A result that knows what it was made of; equal to the one without."""
     result.__dict__[_INPUTS] = Inputs(metadata, digests)
     return result
+
+
+def digest_of(calibration: Calibration) -> str:
+    """The SHA-256 of a calibration's file, as it is or would be written."""
+    return sha256(documents.encode(calibration)).hexdigest()
 
 
 def _inputs(result: Any) -> Inputs:

@@ -29,7 +29,7 @@ from mwdcal.files.formats.table import Table
 from mwdcal.files.limits import load_limits
 from mwdcal.geometry.vectors import AnyArray, Array
 from mwdcal.library.arrays import nearest, without_mask
-from mwdcal.library.shown import with_inputs
+from mwdcal.library.shown import digest_of, with_inputs
 from mwdcal.logs.noise import Noise, find_noise
 from mwdcal.logs.stations import Stations, find_stations
 from mwdcal.sensor.profile import NOMINAL as NOMINAL
@@ -212,7 +212,8 @@ def verify(
     verdict = judge(calibration, rolltest, bounds)
     findings = [*verdict.findings, *unused_columns(rolltest.unused)]
     verdict = msgspec.structs.replace(verdict, findings=findings)
-    stated, digests = (calibration.tool, rolltest.metadata), {"limits": digest}
+    digests = {"calibration": digest_of(calibration), "limits": digest}
+    stated = calibration.tool, rolltest.metadata
     return with_inputs(verdict, *stated, run=rolltest.run_sha256, **digests)
 
 
@@ -229,7 +230,8 @@ def diagnose(calibration: Calibration, later: Readings) -> Diagnosis:
     result = explain(calibration, later)
     findings = [*calibration.change_findings(), *result.findings, *unused_columns(later.unused)]
     result = msgspec.structs.replace(result, findings=findings)
-    return with_inputs(result, calibration.tool, later.metadata, readings=later.run_sha256)
+    digests = {"calibration": digest_of(calibration), "readings": later.run_sha256}
+    return with_inputs(result, calibration.tool, later.metadata, **digests)
 
 
 @dataclass(frozen=True)
