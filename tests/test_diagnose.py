@@ -16,7 +16,7 @@ from mwdcal.faults import physics
 from mwdcal.faults.diagnosis import diagnose
 from mwdcal.faults.likelihood import Suspect, explained, raw_of, repeated
 from mwdcal.faults.physics import DEPARTURES, FAULTS, NONE, SIZE, Damage
-from mwdcal.faults.weighing import padded
+from mwdcal.faults.weighing import FaultEvidence, padded
 from mwdcal.geometry.vectors import reference_vectors, tool_from_earth
 from mwdcal.planning import simulate
 from mwdcal.planning.effects import Effects, FaultEffect, load_effects
@@ -65,6 +65,18 @@ def later(number, seed=0, known=None, plan=ROLL, **fault):
     result = simulate.simulated(truth, session, rng, effects)
     kept = references if known is None else {name: references[name] for name in known}
     return replace(result.readings, known=kept), result.damage
+
+
+def test_every_kind_of_fault_has_the_size_of_its_own_forms():
+    """Also those that are far behind the best one: a rival's size was that of another fault, or of none."""
+    calibration, _ = tool(0)
+    readings, _ = later(0, kind="magnetised", size=40.0)
+    forms = physics.hypotheses(physics.faults(calibration.profile))
+    evidence = FaultEvidence.of(Suspect.of(calibration, readings), forms)
+    for kind in {form.kind for form in forms}:
+        form, sizes, _ = evidence.sizes(kind)
+        assert form.kind == kind
+        assert np.isfinite(sizes).all()
 
 
 # Physics

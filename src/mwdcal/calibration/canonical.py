@@ -9,6 +9,8 @@ from typing import Any, Literal, TypeVar
 
 import msgspec
 
+from mwdcal.errors import InputError
+
 Record = TypeVar("Record", bound=msgspec.Struct)
 DIGITS = 12
 """Significant digits of every number in a calibration file."""
@@ -44,8 +46,19 @@ class SignatureCheck(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def canonical(fields: Mapping[str, Any]) -> bytes:
-    """The one form in which fields are hashed and signed: compact JSON in ASCII with sorted keys."""
-    return json.dumps(fields, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+    """The one form in which fields are hashed and signed: compact JSON in ASCII with sorted keys.
+
+    Raises:
+        InputError: a number is infinite or none.
+    """
+    try:
+        text = json.dumps(fields, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    except ValueError as error:
+        raise InputError(
+            "a number of the document is infinite, or none: values of extreme size make it so. Check the units and "
+            "uncertainties of the input."
+        ) from error
+    return text.encode()
 
 
 def signed_form(fields: Mapping[str, Any]) -> bytes:

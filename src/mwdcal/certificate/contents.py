@@ -14,6 +14,7 @@ from datetime import date
 from typing import Any
 
 import msgspec
+import numpy as np
 from msgspec.structs import replace
 
 from mwdcal.calibration.canonical import canonical, rounded
@@ -88,6 +89,7 @@ class Order(msgspec.Struct, frozen=True, kw_only=True):
     findings: tuple[Finding, ...] = ()
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what is infinite is refused when it is hashed
 def certificate(
     calibration: Calibration, order: Order, laboratory: Laboratory | None = None
 ) -> Certificate:

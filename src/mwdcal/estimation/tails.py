@@ -37,7 +37,7 @@ def fisher_tail(over: Array, under: Array, ratio: Array) -> Array:
 
 def _beta(a: Array, b: Array, ratio: Array) -> Array:
     """I_x(a, b) at x = a / (a + bF), for F from one to infinity."""
-    finite = np.minimum(ratio, 1e280)
+    finite = np.minimum(ratio, 1e280 / np.maximum(b, 1.0))
     whole = a + b * finite
     x, beyond = a / whole, a * (b * ((finite - 1) / whole))
     value = last = a * (beyond + 1) / (a + 1)

@@ -79,6 +79,7 @@ class Diagnosis(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     findings: list[Finding]
 
 
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # refused where it matters
 def diagnose(calibration: Calibration, readings: Readings, *, draws: int = DRAWS) -> Diagnosis:
     """Say which fault explains later readings of a calibrated tool best, against none.
 

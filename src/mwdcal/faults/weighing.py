@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from mwdcal.errors import InputError
 from mwdcal.estimation.batch import put, take
 from mwdcal.faults.dead import DeadChannels, dead_channels
 from mwdcal.faults.likelihood import Explanation, Suspect, explained, ratios, repeated
@@ -33,8 +34,9 @@ DISTINCT = float(np.log(1 / LIKELY))
 class FaultEvidence:
     """What readings of one tool say of all faults; `forms` are the ways in which faults show.
 
-    `none` explains the readings without a fault, `best` by each form that is not far behind, those at `likely`,
-    as a batch; `dead` are dead channels. `by_form` (F,) is the log evidence of each form over none.
+    `none` explains the readings without a fault, `best` by each form that is not far behind and by the first of
+    each kind, those at `likely`, as a batch; `dead` are dead channels. `by_form` (F,) is the log evidence of each
+    form over none.
     """
 
     suspect: Suspect
@@ -50,9 +52,13 @@ class FaultEvidence:
         """Of a batch of one."""
         none = explained(suspect, np.zeros((1, SIZE, 0)), suspect.start())
         roughly = by_form(forms, none.information[0], none.gradient[0])
-        likely = np.flatnonzero(
-            roughly >= roughly.max() - WITHIN - SHARE_WITHIN * abs(roughly.max())
-        )
+        if not np.isfinite(roughly).all():
+            raise InputError(
+                "faults cannot be weighed: values or uncertainties of the calibration and the readings are out of "
+                "all proportion. Check units, noise and standard uncertainties of both."
+            )
+        near_best = roughly >= roughly.max() - WITHIN - SHARE_WITHIN * abs(roughly.max())
+        likely = np.union1d(np.flatnonzero(near_best), _best_of_each(forms, roughly))
         near = take(none, 0 * likely)
         mixing = padded([forms[i] for i in likely])
         best = explained(repeated(suspect, 0 * likely), mixing, near.state, near)
@@ -75,7 +81,7 @@ class FaultEvidence:
 
     def _best(self, kind: str) -> int:
         """The place of the best form of a fault among those at `likely`."""
-        where = [i for i, form in enumerate(self.forms) if form.kind == kind]
+        where = [i for i in self.likely.tolist() if self.forms[i].kind == kind]
         return int(np.searchsorted(self.likely, max(where, key=lambda i: self.by_form[i])))
 
     def _whole(self, place: int) -> int:
@@ -135,6 +141,13 @@ class FaultEvidence:
         by_chance = (1 + np.count_nonzero(beyond)) / (draws + 1)
         dead = np.exp(min(0.0, -self.by_fault[DEAD]))
         return float(min(1.0, by_chance / (1 - DEAD_SHARE), dead / DEAD_SHARE))
+
+
+def _best_of_each(forms: list[FaultForm], evidence: Array) -> Ints:
+    """The places of the best form of each kind of fault."""
+    kinds = np.array([form.kind for form in forms])
+    places = [np.flatnonzero(kinds == kind) for kind in dict.fromkeys(kinds.tolist())]
+    return np.array([where[np.argmax(evidence[where])] for where in places], int)
 
 
 def padded(forms: list[FaultForm]) -> Array:

@@ -156,7 +156,8 @@ def _dial(axes: Any, well: Well, depth: Array, toolface: Array) -> None:
     axes.set_ylim(low - 0.5 * max(high - low, 1.0), high + 0.05 * max(high - low, 1.0))
     axes.set_yticklabels([])
     axes.set_title("toolface, ° (outwards: deeper)", pad=14)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=1)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=1)
 
 
 @style()
