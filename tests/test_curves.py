@@ -20,7 +20,7 @@ from mwdcal.estimation.batch import batch_of_one
 from mwdcal.estimation.uncertainty import PIN, log_evidence, readjusted
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import centred
-from mwdcal.library.tasks import simulate
+from mwdcal.library.simulation import simulate
 
 nulls = pytest.importorskip("nulls")
 

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from markupsafe import Markup
 
-from mwdcal.app import text
 from mwdcal.calibration.automatic.auto import Choice
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
@@ -34,7 +33,7 @@ from mwdcal.pages.page import css
 from mwdcal.pages.report import render
 from mwdcal.planning import simulate
 from mwdcal.screens import calibration as screen
-from mwdcal.screens import conversion
+from mwdcal.screens import conversion, text
 from mwdcal.screens.numbers import fixed, measured, number, signed
 from mwdcal.sensor.profile import Profile, TriadProfile
 from mwdcal.use import plots

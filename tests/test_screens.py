@@ -72,6 +72,7 @@ SCREENS = {
     "registry-backup": ("registry", "backup", "made.sqlite", *REGISTRY),
     "registry-restore": ("registry", "restore", "unchanged.sqlite", *NEW_REGISTRY),
     "registry-upgrade": ("registry", "upgrade", *REGISTRY),
+    "list": ("list", "limits"),
     "simulate": ("simulate", "--plan", "six-state", "--effects", "stand.toml", "-o", "made.csv"),
     "simulate-repeat": ("simulate", "--plan", "six-state", "--repeat", "20", "--limits", "tight.toml",
                         "--workers", "1", "-o", "made.parquet"),

@@ -21,6 +21,7 @@ import pytest
 
 from cli_support import EXAMPLE, mwdcal, refused, servo_run, write_csv
 from mwdcal import pool
+from mwdcal import signals as signals_to_end
 from mwdcal.app import cli, interruption, messages
 from mwdcal.certificate import keys as key_files
 from mwdcal.errors import InputError
@@ -225,6 +226,7 @@ def test_ctrl_break_ends_a_command_as_ctrl_c_does(monkeypatch):
         getsignal=handlers.get, signal=handlers.__setitem__,
     )  # fmt: skip
     monkeypatch.setattr(interruption, "signal", fake)
+    monkeypatch.setattr(signals_to_end, "signal", fake)
     with pytest.raises(interruption.Ended), interruption.orderly_end():
         handlers[signals.SIGBREAK](21, None)
 

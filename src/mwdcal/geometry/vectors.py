@@ -20,10 +20,6 @@ Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
 ArrayLike = npt.ArrayLike
 AnyArray = npt.NDArray[Any]
-LARGE = 2000
-"""Elements from which a stack of 3 × 3 matrices is inverted by cofactors."""
-FLAT = 1e-4
-"""Least share of the volume that the rows of such a matrix could span, at right angles, for that."""
 
 
 def wrap(angle: ArrayLike, period: float = 2 * np.pi) -> Array:
@@ -131,30 +127,7 @@ def nearest_rotation(matrix: Array) -> Array:
 
 def inverse(matrix: Array) -> Array:
     """Inverse (..., k, k) of every matrix of a stack; NaN for a singular one, never an exception."""
-    if matrix.shape[-1] == 3 and matrix.size > LARGE:
-        return _by_cofactors(matrix)
     return _each(np.linalg.inv, matrix)
-
-
-@np.errstate(all="ignore")
-def _by_cofactors(matrix: Array) -> Array:
-    """Inverse (..., 3, 3) by cofactors, a quarter of the time; by elimination where rows are almost in a plane."""
-    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(matrix, (-2, -1), (0, 1))
-    columns = (
-        (e * i - f * h, f * g - d * i, d * h - e * g),
-        (c * h - b * i, a * i - c * g, b * g - a * h),
-        (b * f - c * e, c * d - a * f, a * e - b * d),
-    )
-    volume = a * columns[0][0] + b * columns[0][1] + c * columns[0][2]
-    most = np.prod(np.sum(matrix * matrix, -1), -1)
-    result = np.empty(matrix.shape)
-    for column, cofactors in enumerate(columns):
-        for row, cofactor in enumerate(cofactors):
-            result[..., row, column] = cofactor / volume
-    flat = ~(volume * volume > FLAT**2 * most)
-    if flat.any():
-        result[flat] = _each(np.linalg.inv, matrix[flat])
-    return result
 
 
 def solved(matrix: Array, right: Array) -> Array:
