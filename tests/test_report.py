@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from markupsafe import Markup
 
-from mwdcal.calibration.automatic.auto import Choice
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import (
@@ -483,7 +482,7 @@ def test_zero_has_no_sign():
 
 def test_summary_says_what_was_asked_for(tmp_path):
     made = asked()
-    found = screen.summary(made, Choice(run(), SERVO, Options()), tmp_path / "tool.json", None)
+    found = screen.summary(made, [], tmp_path / "tool.json", None)
     found = msgspec.to_builtins(found)
     assert found["options"]["parameters"] == 9
     assert found["options"]["robust"] == "huber"
