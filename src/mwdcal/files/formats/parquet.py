@@ -60,6 +60,8 @@ def parse(data: bytes, source: str, most: int = 0) -> Parts:
             # numbers one column at a time: a long table is not in memory twice
             held = file.read([name], use_pandas_metadata=False) if name in floats else table
             columns[name] = as_column(name, held.column(name), arrow)
+        if any(len(column) != rows for column in columns.values()):
+            raise ValueError("columns of different lengths")
     return Parts(columns, metadata_of(schema.metadata, source), range(1, rows + 1))
 
 
