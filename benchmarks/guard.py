@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -168,6 +169,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--keep", action="store_true", help="store the ratios that are measured")
     keep = parser.parse_args().keep
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else every command compiles itself anew
     stored: dict[str, float] = json.loads(STORED.read_text()) if STORED.exists() else {}
     measured, lost = {}, []
     with TemporaryDirectory() as folder:
