@@ -43,7 +43,7 @@ Call = Callable[[], object]
 
 
 class Guarded(NamedTuple):
-    """What is measured, and beside what."""
+    """A path whose speed is guarded, and the reference that runs beside it."""
 
     name: str
     beside: str
@@ -157,7 +157,7 @@ def paths(folder: Path) -> list[Guarded]:
     ]
 
 
-def ratios(guarded: Guarded) -> float:
+def ratio(guarded: Guarded) -> float:
     """Processor time over that of the reference, the least of two turns each."""
     turns = [(processor_seconds(guarded.ours), processor_seconds(guarded.theirs)) for _ in range(2)]
     ours, theirs = (min(each) for each in zip(*turns, strict=True))
@@ -175,11 +175,11 @@ def main() -> None:
     with TemporaryDirectory() as folder:
         for guarded in paths(Path(folder)):
             limit = LOST * stored.get(guarded.name, np.inf)
-            found = ratios(guarded)
+            found = ratio(guarded)
             for _ in range(0 if keep else TRIES - 1):
                 if found <= limit:
                     break
-                found = min(found, ratios(guarded))
+                found = min(found, ratio(guarded))
             measured[guarded.name] = float(f"{found:.3g}")
             before = stored.get(guarded.name)
             verdict = "new" if before is None else "LOST" if found > limit else "ok"

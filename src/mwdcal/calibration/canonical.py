@@ -31,14 +31,20 @@ class Signature(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     value: str
 
 
+SignatureState = Literal[
+    "unsigned", "intact", "altered", "unknown", "revoked", "retired", "unchecked"
+]
+"""State of a document's signature: `mwdcal.certificate.signature.STATES` has a sentence for each."""
+
+
 class SignatureCheck(msgspec.Struct, frozen=True, kw_only=True):
-    """What the signature of a document says: `state` for machines, `text` for people.
+    """State of a document's signature: `state` for machines, `text` for people.
 
     `key`, `owner` and `time` (the signer's, UTC) as far as they are known. Only `intact` shows that the document is
     as it was signed, with a key that is trusted; `unchecked`: cryptography is not installed.
     """
 
-    state: Literal["unsigned", "intact", "altered", "unknown", "revoked", "retired", "unchecked"]
+    state: SignatureState
     key: str | None = None
     owner: str | None = None
     time: str | None = None

@@ -14,7 +14,7 @@ STEADINESS = {
     "magnetometer-drift": "steady magnetometer offsets",
     "field-drift": "steady field",
 }
-"""What a calibration assumes where the run could not show a drift, by the name of the drift."""
+"""Assumption of a calibration whose run could not show a drift, by the name of the drift."""
 
 
 def exact_and_steady(assumed: Sequence[str]) -> tuple[list[str], str]:

@@ -296,7 +296,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     summary: ClassVar[Callable[..., str]]
     to_dict: ClassVar[Callable[..., dict[str, Any]]]
     report: ClassVar[Callable[..., None]]
-    """What the command prints, its JSON and its page: `library.shown` puts them here."""
+    """Text, JSON and page of the command: `library.shown` puts them here."""
 
     def __hash__(self) -> int:
         return hash((self.run_sha256, self.software, self.time))

@@ -179,7 +179,7 @@ def check(data: bytes, trusted: Mapping[str, TrustedKey]) -> SignatureCheck:
 def signature_doubts(
     checked: SignatureCheck, calibration: Calibration, wanted: bool
 ) -> list[Finding]:
-    """What the signature of a calibration file is a finding of; that there is none, only where it is `wanted`."""
+    """Findings of the signature of a calibration file; that it is missing is one only where it is `wanted`."""
     sound = checked.state == "intact" or (checked.state == "unsigned" and not wanted)
     if sound or (checked.state == "altered" and calibration.changed):  # which is a finding itself
         return []

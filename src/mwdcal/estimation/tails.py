@@ -73,7 +73,7 @@ def _deviance(size: Array, excess: Array, log: Array) -> Array:
 
 
 def _stirling(z: Array) -> Array:
-    """What Stirling's formula for ln Γ(z) lacks."""
+    """Remainder of Stirling's formula for ln Γ(z)."""
     steps = z[..., None] + np.arange(EXACT_FROM)
     series = sum(c / (z + EXACT_FROM) ** (2 * k + 1) for k, c in enumerate(STIRLING))
     return np.asarray(series + ((steps + 0.5) * np.log1p(1 / steps) - 1).sum(-1))

@@ -1,4 +1,4 @@
-"""What `mwdcal verify` printed as JSON, read back."""
+"""Documents of `mwdcal verify`, read back."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Verification(Verdict, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 def load_verification(path: str | os.PathLike[str]) -> tuple[Verification, str]:
-    """What `mwdcal verify` printed as JSON, from the file that it was saved in, and the file's SHA-256.
+    """The document that `mwdcal verify` printed as JSON, from its file, and the SHA-256 of the file.
 
     Raises:
         InputError: the file holds something else, or decisions that do not follow from its values.
@@ -62,7 +62,7 @@ def load_verification(path: str | os.PathLike[str]) -> tuple[Verification, str]:
 
 
 def _contradiction(verification: Verification) -> str:
-    """What cannot be in a document of `verify`; empty where nothing contradicts."""
+    """A contradiction in a document of `verify`; empty where there is none."""
     if verification.rule not in RULES.values():
         return (
             f"the decision rule must be one of {', '.join(RULES)}; got {verification.rule[:80]!r}"

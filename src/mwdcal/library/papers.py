@@ -9,13 +9,15 @@ from datetime import UTC, date, datetime
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
+from mwdcal.calibration.canonical import SignatureState
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files.formats.members import Member
 from mwdcal.library.registries import ToolRegistry, day_of
 from mwdcal.library.results import Result
+from mwdcal.library.shown import digest_of
 from mwdcal.use.verification import Verdict
 
 if TYPE_CHECKING:
@@ -30,10 +32,6 @@ CERTIFICATE_FORMS = (".json", ".html", ".pdf", ".xml")
 """Suffixes of the forms of a certificate."""
 Place = str | os.PathLike[str]
 """The path of a file."""
-SignatureState = Literal[
-    "unsigned", "intact", "altered", "unknown", "revoked", "retired", "unchecked"
-]
-"""What a signature says: `mwdcal.certificate.signature.STATES` has each in a sentence."""
 
 
 @dataclass(repr=False)
@@ -220,23 +218,16 @@ def _loaded(
     cal: Calibration | Place, keys: Sequence[Place], files: _Sources
 ) -> tuple[Calibration, str, list[Finding]]:
     """A calibration, the SHA-256 of its file, and doubts of its signature."""
-    from mwdcal.certificate.signature import check, signature_doubts
-    from mwdcal.certificate.trusted_keys import trusted
-    from mwdcal.files import documents
-    from mwdcal.registry.calibration_source import calibration_file
+    from mwdcal.screens.records.calibrations import load_calibration
 
-    trust = trusted(map(Path, keys))
+    loaded = load_calibration(cal, [Path(key) for key in keys])
+    calibration, digest = loaded.calibration, loaded.digest
     if isinstance(cal, Calibration):
-        data = documents.encode(cal)
-        file = Member(data, f"{cal.serial or 'calibration'}.json", sha256(data).hexdigest())
-        calibration = cal
-        files.add_memory("calibration", file.name, file.digest)
+        digest = digest_of(cal)
+        files.add_memory("calibration", f"{cal.serial or 'calibration'}.json", digest)
     else:
-        file = calibration_file(Path(cal))
-        calibration = documents.decoded(file)
-        files.add("calibration", Path(cal), file.digest)
-    doubts = signature_doubts(check(file.record, trust), calibration, bool(keys))
-    return calibration, file.digest, doubts
+        files.add("calibration", Path(cal), digest)
+    return calibration, digest, loaded.findings
 
 
 def _verification(

@@ -18,7 +18,7 @@ from mwdcal.errors import InputError
 from mwdcal.files import profiles, runs
 from mwdcal.files.formats.table import Table
 from mwdcal.geometry.vectors import AnyArray
-from mwdcal.library.results import Result
+from mwdcal.library.results import Result, arrays_of
 from mwdcal.library.tasks import NOMINAL, Tabular, table_of, with_choices
 from mwdcal.sensor.profile import Profile
 
@@ -286,11 +286,6 @@ def _measured(run: Tabular | Readings, profile: Profile) -> Table:
 
 def _unread(path: FilePath) -> Table:
     raise AssertionError(f"{path} is a file, not columns")
-
-
-def arrays_of(table: Table) -> dict[str, AnyArray]:
-    """The columns of a table; labels as text."""
-    return {name: np.asarray(cells) for name, cells in table.columns.items()}
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -8,8 +8,11 @@ from html import escape
 from importlib import import_module
 from typing import Any
 
+import numpy as np
+
 from mwdcal.calibration.record import Finding
 from mwdcal.errors import InputError
+from mwdcal.files.formats.table import Table
 from mwdcal.geometry.vectors import AnyArray
 
 LONGEST_LINE = 300
@@ -81,8 +84,13 @@ def brief(result: object, text: Callable[[], str]) -> str:
     return f"{line[: LONGEST_LINE - 2]}…>" if len(line) >= LONGEST_LINE else f"{line}>"
 
 
-def frame(columns: Mapping[str, AnyArray]) -> Any:
-    """Columns as a table of pandas.
+def arrays_of(table: Table) -> dict[str, AnyArray]:
+    """The columns of a table; labels as text."""
+    return {name: np.asarray(cells) for name, cells in table.columns.items()}
+
+
+def frame(columns: Mapping[str, AnyArray], stated: Mapping[str, object] | None = None) -> Any:
+    """Columns as a table of pandas, with what is `stated` of them in its `attrs`.
 
     Raises:
         InputError: pandas is not installed.
@@ -93,4 +101,6 @@ def frame(columns: Mapping[str, AnyArray]) -> Any:
         raise InputError(
             "`to_pandas` needs pandas, which is not installed: pip install pandas."
         ) from error
-    return pandas.DataFrame(dict(columns))
+    whole = pandas.DataFrame(dict(columns))
+    whole.attrs.update(stated or {})
+    return whole

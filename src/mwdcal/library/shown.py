@@ -11,8 +11,6 @@ from hashlib import sha256
 from html import escape
 from typing import Any, NamedTuple, TypeVar
 
-import numpy as np
-
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.comparison.compare import Comparison
@@ -20,7 +18,7 @@ from mwdcal.faults.diagnosis import Diagnosis
 from mwdcal.files import documents, runs
 from mwdcal.files.formats import atomic
 from mwdcal.geometry.vectors import AnyArray
-from mwdcal.library.results import brief, frame
+from mwdcal.library.results import arrays_of, brief, frame
 from mwdcal.logs.noise import Noise
 from mwdcal.logs.stations import Stations
 from mwdcal.sensor.profile import NOMINAL
@@ -159,14 +157,12 @@ def _columns(readings: Readings) -> Mapping[str, AnyArray]:
     if readings.table:
         return readings.table
     table = runs.from_readings(readings, readings.profile or NOMINAL)
-    return {name: np.asarray(cells) for name, cells in table.columns.items()}
+    return arrays_of(table)
 
 
 def _to_pandas(readings: Readings) -> Any:
     """The columns as a table of pandas, with the metadata in `attrs`."""
-    whole = frame(readings.columns)
-    whole.attrs.update(readings.metadata)
-    return whole
+    return frame(readings.columns, readings.metadata)
 
 
 def _show(

@@ -25,13 +25,12 @@ from mwdcal.library.planning import (
     PlanSource,
     SeedlessFitChoices,
     ToolSource,
-    arrays_of,
     check_whole,
     plan_table,
     profile_of,
     silent,
 )
-from mwdcal.library.results import Result
+from mwdcal.library.results import Result, arrays_of
 from mwdcal.library.tasks import with_choices
 from mwdcal.planning import simulate as simulation
 from mwdcal.planning.simulate import Truth

@@ -29,6 +29,7 @@ from mwdcal.files.formats.table import Table
 from mwdcal.files.limits import load_limits
 from mwdcal.geometry.vectors import AnyArray, Array
 from mwdcal.library.arrays import nearest, without_mask
+from mwdcal.library.results import arrays_of
 from mwdcal.library.shown import digest_of, with_inputs
 from mwdcal.logs.noise import Noise, find_noise
 from mwdcal.logs.stations import Stations, find_stations
@@ -82,7 +83,7 @@ def read_run(
     if metadata:
         table = replace(table, metadata={**table.metadata, **meta.plain(metadata, table.source)})
     readings, profile = runs.read_run(table, profile)
-    whole = {name: np.asarray(cells) for name, cells in table.columns.items()}
+    whole = arrays_of(table)
     return replace(readings, profile=profile, profile_sha256=profile_sha256, table=whole)
 
 

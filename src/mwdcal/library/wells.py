@@ -203,9 +203,7 @@ class WellSurvey(Result):
 
     def to_pandas(self) -> Any:
         """The columns as a table of pandas, with what the command's table states of itself in `attrs`."""
-        table = frame(self.columns)
-        table.attrs = dict(self._whole_table.metadata)
-        return table
+        return frame(self.columns, self._whole_table.metadata)
 
     def _text(self) -> str:
         from mwdcal.screens.surveys.survey import whole_screen

@@ -135,7 +135,7 @@ class FittedRuns:
         return self.result if self.count == 1 else take(self.result, np.array([place]))
 
     def shown(self, places: Ints) -> dict[int, Shown]:
-        """What the residuals of some runs look like: those that are looked at together take less time."""
+        """Effects that the residuals of some runs show; many runs at once take less time than one by one."""
         new = np.array([place for place in places.tolist() if place not in self._shown], int)
         if new.size:
             others = {name: values[new] for name, values in self.readings.others.items()}
@@ -145,7 +145,7 @@ class FittedRuns:
         return {place: self._shown[place] for place in places.tolist()}
 
     def effects(self, place: int) -> list[Effect]:
-        """What the residuals of one run look like, with sizes, the largest first."""
+        """Effects that the residuals of one run show, with sizes, in the order in which they were found."""
         others = {name: values[place, None] for name, values in self.readings.others.items()}
         shown = self.shown(np.array([place]))[place]
         return effects(self.member(place), others, shown)
