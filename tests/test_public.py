@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -575,6 +576,14 @@ def test_a_masked_reading_is_missing(simulated):
     temperature = np.ma.array(np.full(simulated.count, 25.0), mask=np.arange(simulated.count) == 2)
     with pytest.raises(mwdcal.InputError, match="`temperature` .*got nan at station 3"):
         mwdcal.readings(simulated.accelerometer, temperature=temperature)
+
+
+def test_readings_that_keep_a_mask_are_refused(simulated):
+    for name in ("accelerometer", "temperature"):
+        values = np.full(simulated.count, 25.0) if name == "temperature" else getattr(simulated, name)
+        run = replace(simulated, **{name: hidden(values, (5,), 0.5)[0]})
+        with pytest.raises(mwdcal.InputError, match=r"mask.*mwdcal\.readings"):
+            mwdcal.calibrate(run)
 
 
 def test_masked_labels_are_blank(simulated):

@@ -158,6 +158,18 @@ def _check_readings(readings: object, name: str = "run", single: bool = True) ->
             f"`{name}` must be readings; got {type(readings).__name__}. Make them by "
             "mwdcal.readings(…), or mwdcal.read_run(…) of a file."
         )
+    values = (
+        readings.accelerometer,
+        readings.magnetometer,
+        readings.temperature,
+        *readings.known.values(),
+        *readings.sd.values(),
+    )
+    if any(map(np.ma.isMaskedArray, values)):
+        raise InputError(
+            f"`{name}` has arrays with a mask, below which values would count. Make it by "
+            "mwdcal.readings(…), which takes what is masked as unknown."
+        )
     shape = readings.accelerometer.shape
     if single and len(shape) != 2:
         raise InputError(
