@@ -462,7 +462,9 @@ def test_a_message_with_a_serial_of_any_length_stays_short(tmp_path):
     path = write_csv(tmp_path / "run.csv", run)
     before = time.process_time()
     ran = mwdcal("calibrate", path, "--tool", "servo", "-o", tmp_path / "c.json")
-    assert time.process_time() - before < 5  # a search for passwords once took the square of the length
+    assert (
+        time.process_time() - before < 5
+    )  # a search for passwords once took the square of the length
     message = ran.err.strip()
     assert ran.code == 2
     assert message.startswith("mwdcal: run.csv has rows of more than one tool")
