@@ -367,7 +367,8 @@ def test_a_log_of_many_pieces_is_that_of_one(tmp_path, monkeypatch):
     """Lines that grow shorter are more than there seemed to be room for."""
     rows = [(f"{k / 10:.{8 - k // 500}f}", k % 7 + 0.5) for k in range(3_000)]
     path = tmp_path / "log.csv"
-    path.write_text("time_s,ax\n" + "".join(f"{t},{x}\n" for t, x in rows), "utf-8")
+    lines = (f"{t},{x},{x},{x}\n" for t, x in rows)
+    path.write_text("time_s,ax,ay,az\n" + "".join(lines), "utf-8")
     whole = logs.read(path)
     monkeypatch.setattr(logs, "_PIECE", 1_000)
     in_pieces = logs.read(path)
