@@ -21,6 +21,9 @@ export MWDCAL_DATA := $(abspath ../shared/data)
 endif
 endif
 
+# Compiled once, not by each of the hundreds of processes that the tests start.
+unexport PYTHONDONTWRITEBYTECODE
+
 # One BLAS thread: repeatable last digits, and no contention between test workers.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 

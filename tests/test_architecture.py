@@ -8,8 +8,10 @@ import re
 import subprocess
 import tokenize
 from collections.abc import Callable
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -59,7 +61,17 @@ def module_name(path: Path) -> str:
 
 
 PATHS = {module_name(path): path for path in sorted(SOURCE.rglob("*.py"))}
-TREES = {name: ast.parse(path.read_text("utf-8"), str(path)) for name, path in PATHS.items()}
+
+
+class Trees(dict[str, ast.Module]):
+    """Syntax trees of the modules, each parsed when it is first looked at."""
+
+    def __missing__(self, name: str) -> ast.Module:
+        self[name] = ast.parse(PATHS[name].read_text("utf-8"), str(PATHS[name]))
+        return self[name]
+
+
+TREES = Trees()
 
 
 def floor(name: str) -> int:
@@ -102,22 +114,33 @@ def targets(name: str) -> set[str]:
     return found - {name}
 
 
-IMPORTS = {name: targets(name) for name in PATHS}
+@cache
+def imports() -> dict[str, set[str]]:
+    """Of each module, the modules of the package that it imports."""
+    return {name: targets(name) for name in PATHS}
 
 
-@pytest.mark.parametrize("name", PATHS)
-def test_every_room_lies_on_a_floor(name: str) -> None:
-    assert any(name.split(".", 1)[0] in rooms for rooms in FLOORS), (
-        f"mwdcal.{name}: enter its room in the floors above"
-    )
+def none(offences: dict[str, Any], advice: str) -> None:
+    """Every module that breaks a rule is named, with what breaks it."""
+    broken = [f"mwdcal.{name}: {offence}" for name, offence in offences.items() if offence]
+    assert not broken, "\n".join([advice, *broken])
 
 
-@pytest.mark.parametrize("name", PATHS)
-def test_imports_point_downwards(name: str) -> None:
+def test_every_room_lies_on_a_floor() -> None:
+    known = {room for rooms in FLOORS for room in rooms}
+    strange = {name for name in PATHS if name.split(".", 1)[0] not in known}
+    none(dict.fromkeys(strange, "its room"), "enter rooms in the floors above")
+
+
+def upward(name: str) -> list[str]:
+    """Modules that a module imports from a room above or beside its room."""
     room = name.split(".", 1)[0]
-    others = {target for target in IMPORTS[name] if target.split(".", 1)[0] != room}
-    upward = sorted(target for target in others if floor(target) >= floor(name))
-    assert not upward, f"mwdcal.{name} imports from a room above or beside it: {', '.join(upward)}"
+    others = {target for target in imports()[name] if target.split(".", 1)[0] != room}
+    return sorted(target for target in others if floor(target) >= floor(name))
+
+
+def test_imports_point_downwards() -> None:
+    none({name: upward(name) for name in PATHS}, "imports from a room above or beside it")
 
 
 ROOMS = sorted(name for name, path in PATHS.items() if path.name == "__init__.py" and name)
@@ -141,7 +164,7 @@ def test_contributing_lists_the_rooms_with_their_purpose() -> None:
 
 def test_no_import_cycle() -> None:
     try:
-        TopologicalSorter(IMPORTS).prepare()
+        TopologicalSorter(imports()).prepare()
     except CycleError as error:
         pytest.fail("import cycle: " + " <- ".join(error.args[1]))
 
@@ -158,11 +181,9 @@ def rank_questions(tree: ast.AST) -> list[tuple[int, str]]:
     return names + [(node.lineno, node.attr) for node in attributes]
 
 
-@pytest.mark.parametrize("name", [n for n in PATHS if n.startswith(ARRAY_ROOMS)])
-def test_array_code_asks_no_rank(name: str) -> None:
-    found = [f"line {line}: {word}" for line, word in rank_questions(TREES[name])]
-    advice = "broadcast over leading axes; use swapaxes(-1, -2) or [..., None]"
-    assert not found, f"mwdcal.{name}, {'; '.join(found)}. {advice}"
+def test_array_code_asks_no_rank() -> None:
+    questions = {n: rank_questions(TREES[n]) for n in PATHS if n.startswith(ARRAY_ROOMS)}
+    none(questions, "broadcast over leading axes; use swapaxes(-1, -2) or [..., None]")
 
 
 def docstring_lines(tree: ast.AST) -> set[int]:
@@ -193,20 +214,24 @@ def function_lines(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
     return total - ((first.end_lineno or first.lineno) - first.lineno + 1)
 
 
-@pytest.mark.parametrize("name", PATHS)
-def test_functions_are_short(name: str) -> None:
-    functions = (
-        n for n in ast.walk(TREES[name]) if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef)
-    )
+def long_functions(tree: ast.AST) -> dict[str, int]:
+    """Lines of each function that has too many."""
+    defined = ast.FunctionDef | ast.AsyncFunctionDef
+    functions = (node for node in ast.walk(tree) if isinstance(node, defined))
     sizes = {f"{node.name} (line {node.lineno})": function_lines(node) for node in functions}
-    long = {where: size for where, size in sizes.items() if size > MAX_FUNCTION_LINES}
-    assert not long, f"mwdcal.{name}: over {MAX_FUNCTION_LINES} lines: {long}"
+    return {where: size for where, size in sizes.items() if size > MAX_FUNCTION_LINES}
 
 
-@pytest.mark.parametrize("name", PATHS)
-def test_modules_are_short(name: str) -> None:
-    size = code_lines(name)
-    assert size <= MAX_MODULE_LINES, f"mwdcal.{name} has {size} lines of code; split it"
+def test_functions_are_short() -> None:
+    none({n: long_functions(TREES[n]) for n in PATHS}, f"lines over {MAX_FUNCTION_LINES}")
+
+
+def test_modules_are_short() -> None:
+    """Only of files that have more lines than that is it counted which are code."""
+    longest = {n: p for n, p in PATHS.items() if p.read_bytes().count(b"\n") > MAX_MODULE_LINES}
+    sizes = {name: code_lines(name) for name in longest}
+    long = {name: f"{size} lines" for name, size in sizes.items() if size > MAX_MODULE_LINES}
+    none(long, f"split modules of more than {MAX_MODULE_LINES} lines of code")
 
 
 def constants(tree: ast.Module) -> list[str]:
@@ -225,19 +250,22 @@ def classes(tree: ast.Module) -> list[str]:
 @pytest.mark.parametrize("names", [classes, constants], ids=["classes", "constants"])
 def test_a_name_means_one_thing(names: Callable[[ast.Module], list[str]]) -> None:
     places: dict[str, list[str]] = {}
-    for module, tree in TREES.items():
-        for name in names(tree):
+    for module in PATHS:
+        for name in names(TREES[module]):
             places.setdefault(name, []).append(module)
     assert {name: where for name, where in places.items() if len(where) > 1} == {}
 
 
-@pytest.mark.parametrize(
-    "name", [n for n in PATHS if n.split(".")[0] not in ("screens", "pages", "app", "__main__")]
-)
-def test_messages_of_the_library_name_arguments_not_options(name: str) -> None:
-    strings = (n for n in ast.walk(TREES[name]) if isinstance(n, ast.Constant))
-    typed = [(n.lineno, n.value) for n in strings if re.search(r"(?<![\w-])--[a-z]", str(n.value))]
-    assert not typed, f"mwdcal.{name}: write `order`, of which the command makes --order: {typed}"
+def options_in_words(tree: ast.AST) -> list[tuple[int, str]]:
+    """Line and text of each string that spells an option."""
+    strings = (n for n in ast.walk(tree) if isinstance(n, ast.Constant))
+    return [(n.lineno, n.value) for n in strings if re.search(r"(?<![\w-])--[a-z]", str(n.value))]
+
+
+def test_messages_of_the_library_name_arguments_not_options() -> None:
+    shown = ("screens", "pages", "app", "__main__")
+    typed = {n: options_in_words(TREES[n]) for n in PATHS if n.split(".")[0] not in shown}
+    none(typed, "write `order`, of which the command makes --order")
 
 
 def identifiers(tree: ast.Module) -> set[str]:
@@ -249,12 +277,11 @@ def identifiers(tree: ast.Module) -> set[str]:
     return names | {n.name for n in ast.walk(tree) if isinstance(n, defined)}
 
 
-@pytest.mark.parametrize("name", PATHS)
-def test_names_are_nouns_not_participles(name: str) -> None:
+def test_names_are_nouns_not_participles() -> None:
     """`as_found` is the term of calibration laboratories for a tool before it is adjusted."""
     vague = re.compile(r"(^|_)(own(?!_ax)|told|(?<!as_)found|made|asked)(_|$)", re.IGNORECASE)
-    odd = {word for word in identifiers(TREES[name]) if vague.search(word)}
-    assert not odd, f"mwdcal.{name}: name what it is, not what was done: {odd}"
+    odd = {name: set(filter(vague.search, identifiers(TREES[name]))) for name in PATHS}
+    none(odd, "name what it is, not what was done")
 
 
 def tracked_files() -> list[Path]:

@@ -288,12 +288,13 @@ def test_a_prior_of_the_same_stand_is_reported():
     assert not [f for f in record.findings if f.id == "prior-shared"]
 
 
-def test_intervals_hold_95_percent_where_the_triads_share_errors():
+@pytest.mark.parametrize("count", [40, pytest.param(120, marks=pytest.mark.study)])
+def test_intervals_hold_95_percent_where_the_triads_share_errors(count):
     """Their errors are correlated by those of the stand: Student's t is of the sources, not of the triads.
 
     Of the triads it would make k 4 and more, and hold 98.5 % or more of azimuths and dips.
     """
-    tool, data = runs("dip", SIZES["dip"], count=120)
+    tool, data = runs("dip", SIZES["dip"], count=count)
     rng, covered, ratios_to_student = np.random.default_rng(7), {"azimuth": [], "dip": []}, []
     for pair in zip(data.accelerometer, data.magnetometer, strict=True):
         record = calibrate(Readings(*pair, known=data.known, sd=data.sd), Profile(name="tool"))
@@ -311,4 +312,4 @@ def test_intervals_hold_95_percent_where_the_triads_share_errors():
             )
     np.testing.assert_allclose(ratios_to_student, 1.0, rtol=1e-9)
     for name, inside in covered.items():
-        assert 0.93 < np.mean(inside) < 0.975, name  # 0.95 with a deviation of 0.006
+        assert 0.93 < np.mean(inside) < 0.975, name  # 0.95 with a deviation of 0.01, or 0.006

@@ -40,6 +40,7 @@ def same(ours, theirs, but=()):
     assert json.loads(json.dumps(left, default=str)) == right
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_a_calibration_says_what_the_command_prints(calibrated, tmp_path):
     made, path, done = calibrated
     assert made.summary() == without_files(done.out)
@@ -65,6 +66,7 @@ def test_a_verdict_and_a_diagnosis_say_what_the_commands_print(calibrated):
         same(result.to_dict(), printed, ("calibration_signature",))
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_a_comparison_and_logs_say_what_the_commands_print(tmp_path):
     run = mwdcal.read_run(EXAMPLE / "run.csv", PROFILE)
     found = mwdcal.compare(run)

@@ -18,6 +18,7 @@ from mwdcal.library.results import LONGEST_LINE
 from mwdcal.planning import procedure
 
 LARGE = {"stations": 24, "plan": "candidates", "reach": {"inclination": (0, 90)}, "criterion": "D"}
+pytestmark = pytest.mark.usefixtures("computed_once")
 PLANS = {
     "built in": ({"plan": "moosavi-12"}, ("--plan", "moosavi-12")),
     "default": ({}, ()),

@@ -145,6 +145,7 @@ def without_files(document):
 
 
 @pytest.mark.parametrize("msa", [False, True])
+@pytest.mark.usefixtures("without_pictures")
 def test_surveys_are_those_of_the_command(folder, here, tmp_path, msa):
     mc.save(here, tmp_path / "here.json")
     out, page = tmp_path / "out.csv", tmp_path / "out.html"
@@ -264,6 +265,7 @@ def test_bad_arguments_of_surveys_are_refused(cal, options, message):
     assert message in str(refusal.value)
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_page_of_the_analysis(cal, here, tmp_path):
     well = mc.survey(cal, WELL, reference=here, msa=True, sensor_drift="none")
     assert well.interference.sd_axial_nt > 0

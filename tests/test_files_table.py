@@ -9,7 +9,18 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mwdcal.errors import InputError
-from mwdcal.files.formats.table import SUFFIXES, Table, labels, numbers, read, write
+from mwdcal.files.formats import atomic
+from mwdcal.files.formats import columns as columns_module
+from mwdcal.files.formats.table import (
+    SUFFIXES,
+    Table,
+    labels,
+    numbers,
+    read,
+    rendered,
+    streamed,
+    write,
+)
 
 quick = settings(
     max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -314,3 +325,20 @@ def test_numbers_as_printed_are_read_exactly(value, form):
     assert numbers(Table({"ax": [f" {text} "]}), "ax")[0] == value
     comma = Table({"ax": [text.replace(".", ",")]}, decimal=",")
     assert numbers(comma, "ax")[0] == value
+
+
+def test_text_in_pieces_is_the_text_at_once(tmp_path):
+    """A table of more rows than a piece, each number as alone, and no file where a cell cannot be written."""
+    values = np.random.default_rng(1).normal(size=10_000)
+    values[[0, 4096, 9_999]] = np.nan
+    columns = {"number": values, "text": [f"S{row}" for row in range(10_000)]}
+    table = Table(columns, {"serial": "T-1"}, "t.csv")
+    atomic.write_all([(tmp_path / "t.csv", streamed(tmp_path / "t.csv", table))])
+    rows = [f"{columns_module.number(v)},S{row}" for row, v in enumerate(values)]
+    expected = "\n".join(['# serial = "T-1"', "number,text", *rows, ""])
+    assert (tmp_path / "t.csv").read_text("utf-8") == expected
+    assert rendered(tmp_path / "t.csv", table) == expected
+    columns["text"][9_000] = "two\nlines"
+    with pytest.raises(InputError, match="must be one line"):
+        atomic.write_all([(tmp_path / "u.csv", streamed(tmp_path / "u.csv", table))])
+    assert [path.name for path in tmp_path.iterdir()] == ["t.csv"]

@@ -885,7 +885,7 @@ def cluster(folder, workers=2):
 
 @pytest.mark.slow
 def test_a_cluster_of_two_of_which_one_dies_half_way(tmp_path):
-    path = many(tmp_path / "runs.parquet", tools=2400)
+    path = many(tmp_path / "runs.parquet", tools=1500)
     output, folder = tmp_path / "cals.parquet", tmp_path / "cals.parquet.parts"
     with cluster(tmp_path) as (address, (_, *workers)):
         command = ["fleet", path, "-o", output, "--tool", "servo", "--scheduler", address]
@@ -894,7 +894,7 @@ def test_a_cluster_of_two_of_which_one_dies_half_way(tmp_path):
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
         limit = time.monotonic() + 120
-        while len(list(folder.glob("*.arrow"))) < 2 and time.monotonic() < limit:
+        while len(list(folder.glob("*.arrow"))) < 1 and time.monotonic() < limit:
             assert client.poll() is None, client.communicate()
             time.sleep(0.01)
         before = len(list(folder.glob("*.arrow")))
@@ -902,8 +902,8 @@ def test_a_cluster_of_two_of_which_one_dies_half_way(tmp_path):
         out, err = client.communicate(timeout=300)
     assert client.returncode == 0, err
     assert "Traceback" not in err
-    assert before < 8
-    assert "2400 tools" in out
+    assert before < 5
+    assert "1500 tools" in out
     local = tmp_path / "local.parquet"
     assert mwdcal("fleet", path, "-o", local, "--tool", "servo", "--workers", 1).code == 0
     assert output.read_bytes() == local.read_bytes()
@@ -951,7 +951,7 @@ def test_a_scheduler_that_falls_silent_ends_the_fleet_and_leaves_its_parts(
     tmp_path, monkeypatch, by
 ):
     monkeypatch.setattr(pool, "CLUSTER_TIMEOUT", 20.0)
-    path = many(tmp_path / "runs.parquet", tools=4800)
+    path = many(tmp_path / "runs.parquet", tools=2400)
     real = pool._finished
 
     def silenced(client, waiting):

@@ -168,10 +168,10 @@ def temperatures(odd=0, of=1):
     ("tool", "options", "odd"),
     [
         ("servo", (), (0, 1)),
-        ("quiet", ("--model", "polynomial"), (0, 3)),
-        ("generic", ("--method", "scalar"), (1, 3)),
-        ("servo", ("--method", "newton"), (2, 3)),
-        ("servo", ("--prior", "datasheet", "--parameters", 9), (0, 3)),
+        ("quiet", ("--model", "polynomial"), (0, 6)),
+        ("generic", ("--method", "scalar"), (1, 6)),
+        ("servo", ("--method", "newton"), (2, 6)),
+        ("servo", ("--prior", "datasheet", "--parameters", 9), (3, 6)),
     ],
     ids=str,
 )

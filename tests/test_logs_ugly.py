@@ -13,6 +13,7 @@ import pytest
 import mwdcal as mwdcal_library
 from cli_support import mwdcal, refused, write_csv
 from mwdcal.errors import InputError
+from mwdcal.files import logs
 from mwdcal.files.formats.table import Table
 from mwdcal.logs.noise import find_noise
 from mwdcal.logs.stations import find_stations
@@ -360,3 +361,17 @@ def test_wrong_names_of_columns_are_refused(tmp_path, names, words):
     path.write_text(path.read_text("utf-8").split("\n", 1)[1], "utf-8")
     told = refused(mwdcal("noise", path, "--columns", names), 2)
     assert words in told
+
+
+def test_a_log_of_many_pieces_is_that_of_one(tmp_path, monkeypatch):
+    """Lines that grow shorter are more than there seemed to be room for."""
+    rows = [(f"{k / 10:.{8 - k // 500}f}", k % 7 + 0.5) for k in range(3_000)]
+    path = tmp_path / "log.csv"
+    lines = (f"{t},{x},{x},{x}\n" for t, x in rows)
+    path.write_text("time_s,ax,ay,az\n" + "".join(lines), "utf-8")
+    whole = logs.read(path)
+    monkeypatch.setattr(logs, "_PIECE", 1_000)
+    in_pieces = logs.read(path)
+    for name, column in whole.columns.items():
+        np.testing.assert_array_equal(in_pieces.columns[name], column)
+    np.testing.assert_array_equal(whole.columns["ax"], [x for _, x in rows])

@@ -241,7 +241,7 @@ def test_a_bound_counts_kept_stations():
     assert members[:3].all()
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.study) for k in (1, 2))])
 def test_rounding_does_not_choose_between_equal_stations(seed):
     """Other unknowns, turned, round every number otherwise: so do other numbers of threads.
 
@@ -472,7 +472,7 @@ def test_a_plan_says_how_well_its_uncertainties_will_be_known():
     planned_ = judged(plan, SERVO)
     [text] = [f.text for f in planned_.findings if f.id == "few-degrees-of-freedom"]
     stated = float(text.partition(" %")[0].rpartition(" ")[2])
-    fitted = noisy_runs(plan, SERVO, 4000)
+    fitted = noisy_runs(plan, SERVO, 1500)
     scatter = 50 * np.std(fitted.analysis.variance_factor, axis=0)  # half of that of s²
     assert scatter.max() == pytest.approx(stated, rel=0.12)
     assert {f.id for f in expected(plan, SERVO).findings} == {"few-degrees-of-freedom", "no-serial"}

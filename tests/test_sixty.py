@@ -22,7 +22,6 @@ from simulation import (
 )
 from test_observables import complex_value
 
-SEEDS = 160
 NOISE = np.repeat([1e-4, 15.0], 3)
 FIELD, DIP = 50_000.0, 65 * DEG
 ANGLES = np.tile(np.stack(plan((0, 45, 90, 135), 9)), 5)
@@ -73,10 +72,10 @@ def predicted(tools, limit):
     return rows @ limit @ np.swapaxes(rows, -1, -2)
 
 
-def simulated(stand):
+def simulated(stand, count):
     rng = np.random.default_rng([16, int(stand.any())])
-    tools = factors_within_limits(rng, SEEDS)
-    true = ANGLES + stand[:, None] * rng.normal(size=(SEEDS, 3, len(WARMTH)))
+    tools = factors_within_limits(rng, count)
+    true = ANGLES + stand[:, None] * rng.normal(size=(count, 3, len(WARMTH)))
     pair = np.moveaxis(true, 1, 0)
     raw = factor_readings(tools, WARMTH, vectors(pair))
     raw = raw + NOISE * rng.normal(size=raw.shape)
@@ -132,11 +131,14 @@ def ratio(error, covariance):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("count", "within"), [(40, 0.06), pytest.param(160, 0.03, marks=pytest.mark.study)]
+)
 @pytest.mark.parametrize("name", STANDS)
-def test_errors_meet_the_bound_and_intervals_cover(name):
-    """Pooled within 3 %, more than three standard deviations; each observable within four of its."""
+def test_errors_meet_the_bound_and_intervals_cover(name, count, within):
+    """Pooled within 6 %, or 3 %, more than three standard deviations; each observable within four of its."""
     stand = np.array(STANDS[name]) * DEG
-    tools, readings = simulated(stand)
+    tools, readings = simulated(stand, count)
     result = fit(readings, OPTIONS)
     assert (result.status == 0).all()
     raw = factor_readings(tools, WARM, vectors(OTHER))
@@ -148,8 +150,8 @@ def test_errors_meet_the_bound_and_intervals_cover(name):
 
     covariance = predicted(tools, bound(tools, stand))
     print(f"{name}: pooled {ratio(error, covariance):.4f} ± {deviation(covariance):.4f}")
-    assert 3 * deviation(covariance) < 0.03
-    assert abs(ratio(error, covariance) - 1) < 0.03
+    assert 3 * deviation(covariance) < within
+    assert abs(ratio(error, covariance) - 1) < within
     half = stated(result, fields, slopes)
     for observable, own in zip(NAMES, np.split(np.arange(error.shape[-1]), 6), strict=True):
         block = covariance[:, own][:, :, own]
@@ -157,7 +159,7 @@ def test_errors_meet_the_bound_and_intervals_cover(name):
         print(f"{observable} {ratio(error[:, own], block):.3f}, covered {covered:.4f}")
         assert abs(ratio(error[:, own], block) - 1) < 4 * deviation(block)
         assert 0.93 < covered < 0.97
-    for tool in (0, 77):
+    for tool in (0, 37):
         _calibrate_states_the_same(readings, raw, half, tool)
 
 

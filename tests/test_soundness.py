@@ -310,6 +310,7 @@ def changed(ran):
     return [finding["id"] for finding in ran.json["findings"]].count("changed")
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_a_changed_file_says_so_wherever_it_is_used(tmp_path, files, document):
     edited_parameter(document)
     path = saved(tmp_path, document)
@@ -332,6 +333,7 @@ def test_what_does_not_change_the_contents_is_no_change(tmp_path, document):
     assert not mwdcal.load(path).changed
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_a_file_of_an_earlier_version_is_read_without_complaint(tmp_path, files, document):
     del document["sha256"]
     edited_parameter(document)

@@ -170,6 +170,7 @@ def test_one_station_leads_to_noise(tmp_path):
     assert "SIMULATED" not in page.text
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_what_is_left_out_and_what_drifts_is_on_the_page(tmp_path):
     table, starts, ends, _ = tumble(8, stations=8)
     time = table.columns["time_s"]
@@ -185,6 +186,7 @@ def test_what_is_left_out_and_what_drifts_is_on_the_page(tmp_path):
     assert ran.json["report"] == str(tmp_path / "log.html")
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_the_same_log_gives_the_same_page(tmp_path):
     table, *_ = tumble(3, stations=5)
     log = write_csv(tmp_path / "log.csv", table.columns, "date = 2026-03-04")
@@ -198,6 +200,7 @@ def test_the_same_log_gives_the_same_page(tmp_path):
     assert not re.search(rb"https?:|@import|<script[^>]|url\((?!#)", pages[0])
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_text_of_others_does_nothing(tmp_path):
     """Markup in every text that a log and its name can bring."""
     table, *_ = tumble(3, stations=4)

@@ -406,6 +406,7 @@ def test_a_reference_of_which_nothing_is_used_is_not_in_the_record(example, tmp_
     assert disagreements(with_file[1]) == set()
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_every_quantity_has_a_source_on_screen_page_table_and_in_json(example, tmp_path, place):
     file, document = place
     columns, _ = table_of(document)
@@ -477,6 +478,7 @@ def test_an_uncertainty_of_declination_that_cannot_be_is_refused(example, tmp_pa
     assert "sd_declination_deg" in refused(ran, 2)
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_nothing_states_an_uncertainty_without_what_it_leaves_out(example, tmp_path):
     out, page = tmp_path / "out.csv", tmp_path / "s.html"
     source = EXAMPLE / "well.csv"
@@ -735,6 +737,7 @@ def test_msa_takes_axial_interference_off(example, tmp_path):
     assert "SIMULATED" in (tmp_path / "m.html").read_text("utf-8")
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_results_say_whether_interference_was_taken_off(example, tmp_path):
     source, out, page = with_iron(tmp_path, 1500), tmp_path / "out.csv", tmp_path / "s.html"
     for options, corrected in (((), False), (("--msa",), True)):
@@ -829,6 +832,7 @@ def test_what_is_accepted_is_what_the_tests_accept():
         assert (again == judgement.accepted).all()
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_acceptance_that_is_blind_says_so_by_survey(example, tmp_path):
     source, out, page = (tmp_path / name for name in ("iron.csv", "out.csv", "s.html"))
     with_iron(tmp_path, 600, np.radians(90), np.radians(90))

@@ -98,6 +98,7 @@ def test_an_open_file_refuses_here_as_it_does_there(tmp_path, windows):
 
 
 @pytest.mark.parametrize("mixed", [False, True], ids=["in order", "dealt"])
+@pytest.mark.usefixtures("without_pictures")
 def test_a_fleet_is_written_and_leaves_nothing(tmp_path, windows, small_parts, mixed):  # noqa: F811
     path = small_fleet(tmp_path, mixed)
     for _ in range(2):  # the second one replaces the first

@@ -157,18 +157,40 @@ def _read_text(stream: BinaryIO, names: list[str], decimal: str, source: str, sa
     layout = _layout(first, number, names, decimal, source)
     size = os.fstat(stream.fileno()).st_size
     ahead, done = (first + "\n", number - 1) if names else ("", number)
-    pieces, lines = [], []
+    wanted, lines = _wanted(layout), []
+    numbers_read = _Growing(len(wanted))
     for piece in _pieces(stream, ahead, number, source):
         values, numbers, done = _piece(piece, done, layout)
-        pieces.append(values)
+        share = stream.tell() / size
+        numbers_read.add(values, share)
         lines.append(numbers)
-        say(f"reading {source}: {100 * stream.tell() / size:.0f} %")
+        say(f"reading {source}: {100 * share:.0f} %")
     if not sum(map(len, lines)):
         raise _empty(source)
-    whole = np.concatenate(pieces)
     columns: dict[str, Column] = {name: [] for name in layout.names if name not in READ}
-    columns |= {name: whole[:, i].copy() for i, name in enumerate(_wanted(layout))}
+    columns |= zip(wanted, numbers_read.whole(), strict=True)
     return Table(columns, metadata, source, _joined(lines), decimal=decimal)
+
+
+class _Growing:
+    """Columns that are filled piece by piece: a long log is in memory once, not as pieces and as a whole."""
+
+    def __init__(self, count: int) -> None:
+        self.columns = [np.empty(0) for _ in range(count)]
+        self.rows = 0
+
+    def add(self, values: Array, share: float) -> None:
+        """Append values (rows, columns), with which this share of the log is read."""
+        start, self.rows = self.rows, self.rows + len(values)
+        for i, column in enumerate(self.columns):
+            if self.rows > len(column):  # room for the whole as it looks from here
+                column = np.empty(int(self.rows * max(1.02 / share, 1.1)) + 1)
+                column[:start], self.columns[i] = self.columns[i][:start], column
+            column[start : self.rows] = values[:, i]
+
+    def whole(self) -> list[Array]:
+        """The columns, as long as what was added; the room that is left over was never touched."""
+        return [column[: self.rows] for column in self.columns]
 
 
 def _top(stream: BinaryIO, source: str) -> tuple[list[tuple[int, str]], str, int]:

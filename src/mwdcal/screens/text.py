@@ -47,7 +47,7 @@ _UNSAFE = re.compile(f"[{_CONTROL}]")
 UNSAFE_BUT_LINES = re.compile(f"(?!\n)[{_CONTROL}]")
 """Characters that control a terminal or the direction of writing, but for line breaks."""
 _PASSWORD = re.compile(
-    r"((?:[\w+.-]+:?)?//[^\s:@/]*:|\b[\w+.-]{2,}:(?!//))(?!password@)(?=\S)[^'\n]*@|(\bpassword *= *)[^\s&'\"]+",
+    r"(//[^\s:@/]*:|(?<![\w+.-])[\w+.-]{2,}+:(?!//))(?!password@)(?=\S)[^'\n]*@|(\bpassword *= *)[^\s&'\"]+",
     re.IGNORECASE,
 )
 """A password, from the colon behind a user to the last @ before a quote, or behind its name, with what is before it."""

@@ -178,8 +178,11 @@ def surveyed_table(table: Table, well: Well) -> Table:
             f"{table.source}: the column '{taken[0]}' is there already, and would be lost under the result of that "
             "name. Rename it."
         )
+    texts: dict[str, str] = {}  # few words stand in many rows: each is in memory once
     columns = {
-        name: values if values.dtype.kind == "f" else [str(cell) for cell in values]
+        name: values
+        if values.dtype.kind == "f"
+        else [texts.setdefault(cell, cell) for cell in map(str, values)]
         for name, values in results.items()
     }
     metadata = {**table.metadata, **described(well)}

@@ -40,13 +40,17 @@ _PAUSES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 """Seconds between attempts to rename a file that a virus scanner or an indexer holds open for a moment."""
 
 
-def write_all(files: Iterable[tuple[Path | None, bytes | str]]) -> None:
-    """Write several files, or none of them where one cannot be written; no path, no file."""
+def write_all(files: Iterable[tuple[Path | None, bytes | str | Iterable[str]]]) -> None:
+    """Write several files, or none of them where one cannot be written; no path, no file.
+
+    Text in pieces is made while it is written.
+    """
     with contextlib.ExitStack() as stack:
         for path, data in files:
             if path:
                 stream = stack.enter_context(replacing(path, durable=False))
-                stream.write(_encoded(data))
+                for piece in [data] if isinstance(data, bytes | str) else data:
+                    stream.write(_encoded(piece))
                 stream.flush()
                 os.fsync(stream.fileno())  # all are on the disk before the first is replaced
 

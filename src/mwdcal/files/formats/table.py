@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -141,13 +141,27 @@ def rendered(
         encoding = "utf-8-sig" if export.encoding == "utf-8" else export.encoding
         return content.encode(encoding, "replace")
     if form is text:
-        delimiter = "\t" if file.suffix.lower() == ".tsv" else ","
-        return text.render(pointed(table), table.metadata, delimiter)
+        return "".join(_lines(file, table))
     content = form.render(_typed(table), table.metadata, file.name)
     if file.suffix.lower() in EXCHANGED:  # what could not be read again
         advice = "Write Parquet."
         at_most(len(content), _LARGEST_TEXT, file.name, "the file", "bytes", advice)
     return content
+
+
+def streamed(path: str | os.PathLike[str], table: Table) -> bytes | str | Iterator[str]:
+    """What `rendered` makes of the table; as text in pieces, which are made while they are written."""
+    file = Path(path)
+    if _format(_suffix(file)) is not text:
+        return rendered(path, table)
+    check_names(list(table.columns), file.name)
+    return _lines(file, table)
+
+
+def _lines(file: Path, table: Table) -> Iterator[str]:
+    """The text of a table in pieces."""
+    delimiter = "\t" if file.suffix.lower() == ".tsv" else ","
+    return text.pieces(pointed(table), table.metadata, delimiter)
 
 
 def numbers(table: Table, name: str) -> Array:

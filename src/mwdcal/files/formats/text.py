@@ -9,6 +9,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain, takewhile
 from typing import NamedTuple
 
+import numpy as np
+
 from mwdcal.errors import InputError
 from mwdcal.files import metadata as meta
 from mwdcal.files.formats.columns import (
@@ -18,7 +20,6 @@ from mwdcal.files.formats.columns import (
     at_most,
     check_names,
     looks_numeric,
-    number,
     of_texts,
     plain_names,
 )
@@ -26,6 +27,7 @@ from mwdcal.files.formats.columns import (
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """What a cell begins with that spreadsheet programs run as a formula, unless it is a number."""
 _LONGEST_LINE = 100_000
+_ROWS_AT_ONCE = 1 << 12
 _MAX_LINES = 1_000_000
 _DELIMITING = re.compile(r'[",;\t]')
 _QUOTED = re.compile(r'"[^"]*"')
@@ -97,12 +99,24 @@ def render(
 
     `decimal` is the sign in numbers; cells of text stay as they are.
     """
-    stream = io.StringIO()
-    stream.writelines(f"{line}\n" for line in meta.render(metadata))
-    stream.write(header(list(columns), delimiter))
-    writer = csv.writer(stream, delimiter=delimiter, lineterminator="\n")
-    writer.writerows(zip(*(_cells(k, v, decimal) for k, v in columns.items()), strict=True))
-    return stream.getvalue()
+    return "".join(pieces(columns, metadata, delimiter, decimal))
+
+
+def pieces(
+    columns: Mapping[str, Column],
+    metadata: Mapping[str, object],
+    delimiter: str,
+    decimal: str = ".",
+) -> Iterator[str]:
+    """The text of `render` in pieces of `_ROWS_AT_ONCE`: of a long table never all of it is in memory."""
+    yield "".join(f"{line}\n" for line in meta.render(metadata)) + header(list(columns), delimiter)
+    for start in range(0, max(map(len, columns.values()), default=0), _ROWS_AT_ONCE):
+        rows = slice(start, start + _ROWS_AT_ONCE)
+        stream = io.StringIO()
+        writer = csv.writer(stream, delimiter=delimiter, lineterminator="\n")
+        cells = (_cells(name, column[rows], decimal) for name, column in columns.items())
+        writer.writerows(zip(*cells, strict=True))
+        yield stream.getvalue()
 
 
 def header(names: Sequence[str], delimiter: str) -> str:
@@ -123,7 +137,10 @@ def is_formula(cell: str) -> bool:
 
 def _cells(name: str, column: Column, decimal: str) -> list[str]:
     if not isinstance(column, list):
-        return [number(value).replace(".", decimal) for value in column]
+        plain = [
+            "" if value != value else repr(value) for value in np.asarray(column, float).tolist()
+        ]
+        return plain if decimal == "." else [cell.replace(".", decimal) for cell in plain]
     for cell in column:
         if any(mark in cell for mark in "\n\r\0"):
             raise InputError(

@@ -109,7 +109,7 @@ def command(
 
         findings = findings_as_typed(result.well.findings)
         pages.append((html, render(result.well, findings, inputs.named)))
-    atomic.write_all([(output, tables.rendered(output, result.table)), *pages])
+    atomic.write_all([(output, tables.streamed(output, result.table)), *pages])
     _print(result, loaded.signature, (str(output), str(html or "")), as_json)
 
 
