@@ -100,7 +100,7 @@ def analyse(problem: Problem, state: State, determined: Determined | None = None
     residual = linear.weigh(linear.residual[..., None])[..., 0]
     spread = linear.weight - weighed @ whole[:, None] @ weighed.mT
     spread = spread * problem.evidence.include[..., None, None]
-    factor, freedom = _variance_factors(residual, spread)
+    factor, freedom = variance_factors(residual, spread)
     p, q = linear.size, len(problem.evidence.constants)
     settings = whole.shape[-1] - state.settings.shape[-1]
     return Analysis(
@@ -184,7 +184,7 @@ def sandwich(
     left = left + crossed + crossed.mT
     weight = linear.weight
     spread = weight @ left @ weight * problem.evidence.include[..., None, None]
-    factor, freedom = _variance_factors(analysis.residual, spread)
+    factor, freedom = variance_factors(analysis.residual, spread)
     q = len(constants)
     return replace(
         analysis,
@@ -258,7 +258,7 @@ def whole_covariance(linear: Linear, determined: Determined) -> Array:
     return np.concatenate([top, np.concatenate([cross.mT, shared], -1)], -2)
 
 
-def _variance_factors(residual: Array, spread: Array) -> tuple[Array, Array]:
+def variance_factors(residual: Array, spread: Array) -> tuple[Array, Array]:
     """s² and degrees of freedom (B, t) of each triad: restricted maximum likelihood."""
     freedom = triad_sums(diagonal(spread))
     return triad_sums(residual**2) / np.where(freedom > 1e-9, freedom, np.nan), freedom

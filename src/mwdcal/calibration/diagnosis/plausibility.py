@@ -14,7 +14,7 @@ from mwdcal.calibration.residuals import RESHOOT, Residuals, chances, chi_chance
 from mwdcal.calibration.results import variance_scales
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.evidence import STAND_ERRORS, UNKNOWN
-from mwdcal.estimation.minimisers import closed_form
+from mwdcal.estimation.minimisers import closed_form, closed_form_drift
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.solvers import Determined
 from mwdcal.estimation.uncertainty import (
@@ -169,6 +169,8 @@ def freedom_of(result: Fit) -> Array:
     analysis = result.analysis
     if closed_form.applies(result.problem) or analysis.influence is not None:
         return analysis.freedom
+    if closed_form_drift.applies(result.problem):
+        return closed_form_drift.effective_freedom(result.problem, analysis)
     return effective_freedom(result.problem, result.state, analysis)
 
 
