@@ -1,5 +1,7 @@
 """What tools at the same exact references have in common gives what each of them gives by itself."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -13,6 +15,17 @@ from mwdcal.estimation.minimisers import closed_form_drift, common_columns
 from test_run_drift import runs
 
 OPTIONS = Options(order=0)
+
+
+def imperfect(readings):
+    """The readings of tools with gains, axes and offsets of their own."""
+    rng = np.random.default_rng(1)
+    size = len(readings.accelerometer)
+    raw = [
+        vectors @ (np.eye(3) + rng.uniform(-0.03, 0.03, (size, 3, 3))) + rng.uniform(-at, at, 3)
+        for vectors, at in ((readings.accelerometer, 0.01), (readings.magnetometer, 500.0))
+    ]
+    return replace(readings, accelerometer=raw[0], magnetometer=raw[1])
 
 
 @pytest.fixture
@@ -29,7 +42,7 @@ def apart(monkeypatch):
 
 @pytest.mark.parametrize("triads", [[True, False], [False, True], [True, True]], ids=str)
 def test_a_drift_in_closed_form_is_the_general_minimum(triads, apart):
-    result = fit(runs(3, 6, field=40.0, offset=1e-4), OPTIONS)
+    result = fit(imperfect(runs(3, 6, field=40.0, offset=1e-4)), OPTIONS)
     ours = with_drift(result, OPTIONS, np.array(triads))
     assert closed_form_drift.applies(ours.problem)
     freedom = freedom_of(ours)
@@ -47,7 +60,7 @@ def test_a_drift_in_closed_form_is_the_general_minimum(triads, apart):
 
 @pytest.mark.parametrize("error", [0.0, 2e-3, 4e-3])
 def test_the_first_look_leaves_out_no_effect(error, apart):
-    readings = runs(8, 40)
+    readings = imperfect(runs(8, 40))
     steps = np.sign(np.diff(readings.known["inclination"], prepend=0.0))
     readings.known["inclination"] = readings.known["inclination"] + error * steps
     result = fit(readings, OPTIONS)

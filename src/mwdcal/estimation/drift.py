@@ -104,8 +104,8 @@ class WalkScores:
     """What the residuals of a fit without drift say of its terms, in units of the noise.
 
     `score` (B, k) and its covariance `information` (B, k, k), for drifts of r = s = 1 noise of a reading, and `alone`
-    (B, k, k), what that would be with all unknowns of the fit known, if asked for; `places` of the columns of each drift, its three
-    trends first.
+    (B, k, k), what that would be with all unknowns of the fit known, if asked for; `places` of the columns of each drift,
+    its three trends first.
     """
 
     score: Array
@@ -158,7 +158,9 @@ def walk_scores(problem: Problem, state: State, analysis: Analysis) -> WalkScore
     if not old and closed_form_drift.applies(walking):
         score = closed_form_drift.scores(walking, at, residual) * sd
         information = partial(closed_form_drift.information, walking, at)
-        return WalkScores(score, information() * scale, lambda: information(alone=True) * scale, each)
+        return WalkScores(
+            score, information() * scale, lambda: information(alone=True) * scale, each
+        )
     columns = walking.walk_columns(at)[..., old:] * sd[:, None, None]
     linear = problem.linear(state)
     whole = whole_covariance(linear, analysis.determined)
@@ -220,7 +222,7 @@ class _Ridge:
         return cls(score, values, cross, rest, some, others)
 
     def at(self, ratio: Array) -> tuple[Array, Array]:
-        """Coefficients (B, k) with a `ratio` (B, k), one of a component, added to the information; and their variances."""
+        """Coefficients (B, k) and their variances, with a `ratio` (B, k) of each component added to the information."""
         variance, value = np.empty(self.score.shape), np.empty(self.score.shape)
         lone = 1 / (self.values + ratio[:, self.some])
         scaled = self.cross * lone[:, None]

@@ -1,4 +1,4 @@
-"""Which of many fits at the same exact references may show an effect: the first round of `structure` for all at once."""
+"""Which fits at the same exact references may show an effect: the first round of `structure` for all at once."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from mwdcal.calibration.diagnosis.families import families, moves, side
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.results import variance_scales
-from mwdcal.estimation.batch import take
 from mwdcal.estimation.minimisers import closed_form
 from mwdcal.estimation.minimisers.common_columns import (
     CommonColumns,
@@ -21,7 +20,7 @@ from mwdcal.estimation.minimisers.common_columns import (
     responses,
     sensor_terms,
 )
-from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, eigen, outer, quotient
+from mwdcal.geometry.vectors import Array, Bools, Ints, eigen, outer, quotient
 
 EFFECT_CHANCE = 1e-4
 """Chance of so much common structure in noise, below which an effect is named."""
@@ -71,14 +70,16 @@ def _gains(
             sides = sides * result.problem.evidence.include[..., None]
             yield _gain_of_sides(terms[index], sides, parts[index])
             continue
-        score, information, square = 0.0, 0.0, 0.0
+        count = family.shape[-1]
+        score, square = np.zeros((2, len(residual), count))
+        information = np.zeros((len(residual), count, count))
         for index, (term, part, reads) in enumerate(zip(terms, parts, response, strict=True)):
             rows = family[0, :, 3 * index : 3 * index + 3]
             if rows.any():
                 each = CommonColumns.of(term, rows, np.full(rows.shape[-1], triad in TRIADS))
-                score = score + each.score(reads, part)
-                information = information + each.information(reads)
-                square = square + each.squares(reads)
+                score += each.score(reads, part)
+                information += each.information(reads)
+                square += each.squares(reads)
         length = np.sqrt(np.where(square > 0, square, 1.0))
         value, vector = eigen(information / outer(length))
         along = (vector.mT @ (score / length)[..., None])[..., 0]

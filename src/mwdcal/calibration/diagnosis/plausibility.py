@@ -56,9 +56,7 @@ def gain_shares(result: Fit, index: int) -> tuple[Array, Array]:
     """
     problem = result.problem
     triad, params = problem.triads[index], result.state.params[:, problem.slices()[index]]
-    whole = getattr(triad.model, "whole", triad.model)
-    varies = bool(triad.model.basis.order) or getattr(whole, "curved", False)
-    some = slice(None if varies else 1)
+    some = slice(None if triad.model.varies else 1)
     slope = triad.model.slope(params, triad.raw[:, some], problem.temperature[:, some]).mean(1)
     gain = diagonal(slope)
     with np.errstate(over="ignore"):  # an infinite gain has no shares

@@ -10,7 +10,7 @@ Reference: efficient scores, C. R. Rao, Proc. Camb. Phil. Soc. 44, 50 (1948).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,16 +19,13 @@ from mwdcal.calibration.automatic.courses import f_test, steady_columns
 from mwdcal.calibration.diagnosis.families import COURSE_SUFFIX, families, products
 from mwdcal.calibration.diagnosis.first_look import EFFECT_CHANCE, LEFT_BY_FIT, may_show
 from mwdcal.calibration.estimate import Fit
-from mwdcal.calibration.evidence import acts_on
-from mwdcal.calibration.methods import ESTIMABLE
-from mwdcal.calibration.readings import HIGHEST, LEAST_TEMPERATURE_SPAN, TRIADS, highest_order
+from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.residuals import chances, to_reshoot
 from mwdcal.calibration.results import variance_scales
 from mwdcal.estimation.batch import take
-from mwdcal.estimation.evidence import STAND_ERRORS
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import whole_covariance
-from mwdcal.geometry.vectors import Array, Bools, Ints, centred, eigen, outer, quotient
+from mwdcal.geometry.vectors import Array, Bools, Ints, eigen, outer, quotient
 
 STRUCTURE_CHANCE = 0.01
 """Chance of residuals as large in declared noise, below which their structure is looked at."""

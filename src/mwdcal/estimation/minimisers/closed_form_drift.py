@@ -54,7 +54,10 @@ def walk_columns(problem: Problem, state: State, alone: bool = False) -> WalkCol
 
 def scores(problem: Problem, state: State, residual: Array) -> Array:
     """Scores (B, q) of the terms in whitened residuals (B, n, m) of a fit without them."""
-    reads, score = responses(problem, state), np.zeros((len(residual), len(problem.evidence.constants)))
+    reads, score = (
+        responses(problem, state),
+        np.zeros((len(residual), len(problem.evidence.constants))),
+    )
     for index, (places, each) in walk_columns(problem, state).items():
         score[:, places] = each.score(reads[index], residual[..., 3 * index : 3 * index + 3])
     return score
@@ -103,8 +106,8 @@ def solution(problem: Problem, at: State) -> tuple[State, Analysis, Bools]:
 def effective_freedom(problem: Problem, analysis: Analysis) -> Array:
     """Degrees of freedom (B, t) of the χ² that s² times them follows: tr(S)² / tr(S²), as in `uncertainty`.
 
-    With V the covariance of the terms of the drifts and Λ their precision before, 1 - ΛV is what the readings say of them:
-    tr(S²) is less than tr(S) by the trace of that, and more by the trace of its square.
+    With V the covariance of the terms of the drifts and Λ their precision before, 1 - ΛV is what the readings say of
+    them: tr(S²) is less than tr(S) by the trace of that, and more by the trace of its square.
     """
     precision, square = _precision(problem), analysis.freedom.copy()
     owner = np.array([min(WALK_AXES[c.name][0], 1) for c in problem.evidence.constants])
@@ -121,9 +124,7 @@ def _precision(problem: Problem) -> Array:
     return np.stack([constant.sd for constant in problem.evidence.constants], -1) ** -2.0
 
 
-def _covariances(
-    columns: WalkColumns, precision: Array, reads: list[Array]
-) -> dict[int, Array]:
+def _covariances(columns: WalkColumns, precision: Array, reads: list[Array]) -> dict[int, Array]:
     """Covariance (B, k, k) of the terms that act on each triad."""
     covariance = {}
     for index, (places, each) in columns.items():

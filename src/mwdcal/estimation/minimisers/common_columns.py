@@ -1,9 +1,9 @@
 """Effects on the readings of tools that were measured at the same exact references: what these have in common.
 
-Such a tool reads raw = S f + o + noise, and its parameters take up all that is linear in f̃ = [f 1]. An effect on what it
-should read, a column c (n, 3) in the frame of the field, is S c in its readings; one on the readings themselves is c in
-those of any tool. What the parameters leave of c is therefore the same for all tools, and all sums over the stations are
-linear in SᵀS, S and 1: they are formed once.
+Such a tool reads raw = S f + o + noise, and its parameters take up all that is linear in f̃ = [f 1]. An effect on what
+it should read, a column c (n, 3) in the frame of the field, is S c in its readings; one on the readings themselves is c
+in those of any tool. What the parameters leave of c is therefore the same for all tools, and all sums over the stations
+are linear in SᵀS, S and 1: they are formed once.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def perfect(problem: Problem, state: State) -> tuple[Problem, State]:
 
 
 def responses(problem: Problem, state: State) -> list[Array]:
-    """What a change of the field, and one of the readings, does to whitened readings: [S 1] / σ (B, 3, 6) of each triad."""
+    """What a change of the field, and one of the readings, does to each triad's whitened ones: [S 1] / σ (B, 3, 6)."""
     each = []
     for triad, where in zip(problem.triads, problem.slices(), strict=True):
         params, at = state.params[:, where], (triad.raw[:, :1], problem.temperature[:, :1])
@@ -98,7 +98,9 @@ class CommonColumns:
     def squares(self, response: Array) -> Array:
         """Squares (B, k) of the lengths of the columns in whitened readings."""
         each = np.einsum("nik,njk->ijk", self.whole, self.whole)
-        return np.asarray((_by_response(each[..., None]) @ _squares_of(response)[..., None])[..., 0])
+        return np.asarray(
+            (_by_response(each[..., None]) @ _squares_of(response)[..., None])[..., 0]
+        )
 
     def score(self, response: Array, residual: Array) -> Array:
         """Scores (B, k) of the effects in whitened residuals (B, n, 3) of a fit without them."""
