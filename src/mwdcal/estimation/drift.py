@@ -104,8 +104,8 @@ class WalkScores:
     """What the residuals of a fit without drift say of its terms, in units of the noise.
 
     `score` (B, k) and its covariance `information` (B, k, k), for drifts of r = s = 1 noise of a reading, and `alone`
-    (B, k, k), what that would be with all unknowns of the fit known, if asked for; `places` of the columns of each drift,
-    its three trends first.
+    (B, k, k), what that would be with all unknowns of the fit known, if asked for; `places` of the columns of each
+    drift, its three trends first.
     """
 
     score: Array
