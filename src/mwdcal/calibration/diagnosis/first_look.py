@@ -26,7 +26,7 @@ EFFECT_CHANCE = 1e-4
 """Chance of so much common structure in noise, below which an effect is named."""
 LEFT_BY_FIT = 1e-3
 """A column counts if the fit leaves this share of its square: what is left of others is rounding."""
-MARGIN = 0.99
+LOOK_MARGIN = 0.99
 """A fit is looked at from this share of the gain that would name an effect: rounding differs by far less."""
 GAINS = np.geomspace(1, 1e4, 1000)
 """Ratios of variances at which the chance of noise is worked out."""
@@ -50,7 +50,7 @@ def may_show(result: Fit) -> Bools:
     rest = np.sum(problem.evidence.include[0]) * residual.shape[-1] - result.state.params.shape[-1]
     for gain, directions in _gains(result, columns, residual, response):
         for count in np.unique(directions[directions > 0]).tolist():
-            least = least_gain(count, float(rest)) * MARGIN
+            least = least_gain(count, float(rest)) * LOOK_MARGIN
             shown |= (directions == count) & (gain > least * misfit)
     return np.asarray(shown)
 
