@@ -15,7 +15,7 @@ from mwdcal.calibration.prior import prior_of
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.estimation.batch import put, take
 from mwdcal.estimation.evidence import ANGLES, Evidence
-from mwdcal.estimation.minimisers import closed_form
+from mwdcal.estimation.minimisers import closed_form, closed_form_drift
 from mwdcal.estimation.problem import Problem, State, Triad
 from mwdcal.estimation.resetting import set_apart, with_share
 from mwdcal.estimation.robust import LOSSES, consistency, inflation, weight, weighted
@@ -232,10 +232,16 @@ def _general(problem: Problem, options: Options, finite: Bools) -> Fit:
 def refitted(result: Fit, problem: Problem, state: State, scale: Array, options: Options) -> Fit:
     """A fit of a problem that has more unknowns than that of `result`, the noise times `scale` (B, triads)."""
     problem = _rescaled(problem, scale)
+    finite = result.status != int(Status.NOT_FINITE)
+    if closed_form_drift.applies(problem):
+        there, analysis, good = closed_form_drift.solution(problem, state)
+        if (good & analysis.determined.keep.all(-1)).all():
+            once = result.iterations + 1
+            trust, status = result.trust, np.where(finite, result.status, int(Status.NOT_FINITE))
+            return Fit(problem, there, status, once, _noise(problem), trust, analysis)
     solved = solve(problem, state, options)
     known = result.analysis.determined
     stage = _Stage(problem, solved, result.trust, solved.iterations, known)
-    finite = result.status != int(Status.NOT_FINITE)
     return _finished(stage, options, finite, result.iterations + solved.iterations)
 
 

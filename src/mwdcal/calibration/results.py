@@ -264,7 +264,7 @@ def _moved(result: Fit, linear: Linear) -> Array:
     analysis, p = result.analysis, linear.size
     if analysis.influence is not None:
         return np.asarray(analysis.influence[:, :, :p])
-    rows, information = linear.weigh(linear.design).mT, linear.normal.information
+    rows, information = linear.weighed[..., :-1].mT, linear.normal.information
     cross = np.linalg.solve(information[:, p:, p:], information[:, p:, :p])
     return analysis.covariance[:, None] @ (rows[:, :, :p] - cross.mT[:, None] @ rows[:, :, p:])
 

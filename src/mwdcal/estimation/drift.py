@@ -12,15 +12,17 @@ Reference: K. Karhunen, Ann. Acad. Sci. Fenn. A 37 (1947); R. B. Schall, Biometr
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from mwdcal.estimation.evidence import WALKS, Evidence, SharedConstant
+from mwdcal.estimation.minimisers import closed_form_drift
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import Analysis, whole_covariance
-from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, finite, inverse
+from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, eigen, finite, inverse, outer
 
 MOST_TERMS = 8
 """Cosines of a walk: they hold 93 % of its variance; the rest looks like noise."""
@@ -102,13 +104,13 @@ class WalkScores:
     """What the residuals of a fit without drift say of its terms, in units of the noise.
 
     `score` (B, k) and its covariance `information` (B, k, k), for drifts of r = s = 1 noise of a reading, and `alone`
-    (B, k, k), what that would be with all unknowns of the fit known; `places` of the columns of each drift, its three
-    trends first.
+    (B, k, k), what that would be with all unknowns of the fit known, if asked for; `places` of the columns of each
+    drift, its three trends first.
     """
 
     score: Array
     information: Array
-    alone: Array
+    alone: Callable[[], Array]
     places: dict[str, Ints]
 
     def of(self, walks: Sequence[str]) -> WalkScores:
@@ -116,9 +118,10 @@ class WalkScores:
         index = np.concatenate([self.places[name] for name in walks])
         ends = np.cumsum([len(self.places[name]) for name in walks])
         each = np.split(np.arange(index.size), ends[:-1])
-        information, alone = (m[:, index[:, None], index] for m in (self.information, self.alone))
+        some = np.ix_(np.arange(len(self.information)), index, index)
         places = dict(zip(walks, each, strict=True))
-        return WalkScores(self.score[:, index], information, alone, places)
+        information = self.information[some]
+        return WalkScores(self.score[:, index], information, lambda: self.alone()[some], places)
 
     def shown(self, name: str) -> Array:
         """Share (B,) of the information about a trend that residuals keep, of the axis along which it is least.
@@ -127,7 +130,7 @@ class WalkScores:
         of a trend looks like the parameters and references of the fit.
         """
         index = self.places[name][:3]
-        left, alone = (m[:, index[:, None], index] for m in (self.information, self.alone))
+        left, alone = (m[:, index[:, None], index] for m in (self.information, self.alone()))
         return np.asarray(np.linalg.eigvals(finite(inverse(alone) @ left)).real.min(-1))
 
     def components(self) -> dict[tuple[str, int], Ints]:
@@ -150,20 +153,30 @@ def walk_scores(problem: Problem, state: State, analysis: Analysis) -> WalkScore
 
     The problem may be of one member for the residuals (B, n, m) of many.
     """
-    columns, each = _columns(problem, state)
+    walking, at, sd, each = _walking(problem, state)
+    old, residual, scale = len(problem.evidence.constants), analysis.residual, outer(sd)
+    if not old and closed_form_drift.applies(walking):
+        score = closed_form_drift.scores(walking, at, residual) * sd
+        information = partial(closed_form_drift.information, walking, at)
+        return WalkScores(
+            score, information() * scale, lambda: information(alone=True) * scale, each
+        )
+    columns = walking.walk_columns(at)[..., old:] * sd[:, None, None]
     linear = problem.linear(state)
     whole = whole_covariance(linear, analysis.determined)
     flat = columns.reshape(len(columns), -1, columns.shape[-1])
     weighed = linear.weigh(columns).reshape(flat.shape)
     crossed = linear.design.reshape(len(columns), -1, whole.shape[-1]).mT @ weighed
     alone = flat.mT @ weighed
-    residual = analysis.residual
     score = (flat.mT @ residual.reshape(len(residual), -1, 1))[..., 0]
-    return WalkScores(score, alone - crossed.mT @ whole @ crossed, alone, each)
+    return WalkScores(score, alone - crossed.mT @ whole @ crossed, lambda: alone, each)
 
 
-def _columns(problem: Problem, state: State) -> tuple[Array, dict[str, Ints]]:
-    """Whitened columns (B, n, m, k) of drifts that are not in the fit, of r = s = 1 noise of a reading, and of each."""
+def _walking(problem: Problem, state: State) -> tuple[Problem, State, Array, dict[str, Ints]]:
+    """The problem with drifts that are not in its fit, r = s = 1 noise of a reading, and without their means.
+
+    And the state for it, the standard deviations (B, k) of their terms, and the places of those of each drift.
+    """
     present, old = places(problem.evidence), problem.evidence.constants
     sizes = {
         name: np.stack([size, size], -1)
@@ -179,8 +192,49 @@ def _columns(problem: Problem, state: State) -> tuple[Array, dict[str, Ints]]:
         kept += [walking.evidence.constants[i] for i in chosen]
     walking = replace(walking, evidence=replace(walking.evidence, constants=(*old, *kept)))
     at = replace(at, constants=at.constants[:, : len(old) + len(kept)])
-    sd = np.stack([constant.sd for constant in kept], -1)
-    return walking.walk_columns(at)[..., len(old) :] * sd[:, None, None], columns
+    return walking, at, np.stack([constant.sd for constant in kept], -1), columns
+
+
+@dataclass(frozen=True)
+class _Ridge:
+    """Scores and information of walks in a basis in which those of one component, `some`, are independent.
+
+    `values` (B, m) are the eigenvalues of its information, `cross` (B, k - m, m) and `rest` (B, k - m, k - m) those
+    with and among the `others`.
+    """
+
+    score: Array
+    values: Array
+    cross: Array
+    rest: Array
+    some: Ints
+    others: Ints
+
+    @classmethod
+    def of(cls, scores: WalkScores, some: Ints) -> _Ridge:
+        """In the basis for a component of scores."""
+        others = np.setdiff1d(np.arange(scores.score.shape[-1]), some)
+        values, basis = eigen(scores.information[:, some[:, None], some])
+        score = scores.score.copy()
+        score[:, some] = (basis.mT @ scores.score[:, some, None])[..., 0]
+        cross = scores.information[:, others[:, None], some] @ basis
+        rest = scores.information[:, others[:, None], others]
+        return cls(score, values, cross, rest, some, others)
+
+    def at(self, ratio: Array) -> tuple[Array, Array]:
+        """Coefficients (B, k) and their variances, with a `ratio` (B, k) of each component added to the information."""
+        variance, value = np.empty(self.score.shape), np.empty(self.score.shape)
+        lone = 1 / (self.values + ratio[:, self.some])
+        scaled = self.cross * lone[:, None]
+        extra = ratio[:, self.others, None] * np.eye(len(self.others))
+        whole = inverse(self.rest + extra - scaled @ self.cross.mT)
+        pull = self.score[:, self.others, None] - scaled @ self.score[:, self.some, None]
+        shared = whole @ pull
+        value[:, self.others] = shared[..., 0]
+        value[:, self.some] = lone * self.score[:, self.some] - (scaled.mT @ shared)[..., 0]
+        variance[:, self.others] = diagonal(whole)
+        variance[:, self.some] = lone + np.sum(scaled * (whole @ scaled), 1)
+        return value, variance
 
 
 def walk_variances(
@@ -203,13 +257,13 @@ def walk_variances(
     left = np.where(declared, 1.0, variance)
     first = [scores.square(columns) for columns in parts.values()]
     theta = np.stack([np.maximum(q - m, 0.1 * m) / s for q, m, s in first], -1)
+    ridge = _Ridge.of(scores, max(parts.values(), key=len))
     for _ in range(VARIANCE_ROUNDS):
         ratio = (left[:, triad] / theta)[:, owner]
-        whole = inverse(scores.information + ratio[..., None] * np.eye(ratio.shape[-1]))
-        value = (whole @ scores.score[..., None])[..., 0]
-        used = (1 - diagonal(whole) * ratio) @ of
+        value, known = ridge.at(ratio)
+        used = (1 - known * ratio) @ of
         theta = np.maximum(value**2 @ of / np.maximum(used, 1e-9), LEAST_WALK**2)
-        explained = (value * scores.score) @ of
+        explained = (value * ridge.score) @ of
         by_triad = np.stack([explained[:, triad == t].sum(-1) for t in range(misfit.shape[-1])], -1)
         left = np.where(declared, 1.0, np.maximum((misfit - by_triad) / freedom, 1e-3 * variance))
     return theta * np.where([part == 0 for _, part in parts], 1.0, _widened(used)), left

@@ -247,7 +247,8 @@ class Problem:
         ):
             params = state.params[:, where]
             fields = triad.model.fields(params, triad.raw, self.temperature)
-            back = inverse(triad.model.slope(params, triad.raw, self.temperature))
+            some = slice(None if triad.model.varies else 1)
+            back = inverse(triad.model.slope(params, triad.raw[:, some], self.temperature[:, some]))
             misfit = np.einsum("bnij,bnj->bni", back, fields - target)
             by_vector = -back @ attitude
             by_params = triad.model.jacobian(params, triad.raw - misfit, self.temperature)

@@ -90,13 +90,23 @@ class Linear:
             row, column = below, right
 
     @cached_property
-    def design(self) -> Array:
-        """X (B, n, m, u) as one array."""
-        whole = np.zeros((*self.residual.shape, self.size + self.shared.shape[-1]))
+    def rows(self) -> Array:
+        """X and ρ (B, n, m, u + 1) as one array."""
+        whole = np.zeros((*self.residual.shape, self.size + self.shared.shape[-1] + 1))
         for block, rows, columns in self.placed():
             whole[..., rows, columns] = block
-        whole[..., self.size :] = self.shared
+        whole[..., self.size : -1], whole[..., -1] = self.shared, self.residual
         return whole
+
+    @cached_property
+    def weighed(self) -> Array:
+        """C⁻¹ times X and ρ (B, n, m, u + 1)."""
+        return self.weigh(self.rows)
+
+    @property
+    def design(self) -> Array:
+        """X (B, n, m, u)."""
+        return self.rows[..., :-1]
 
     @property
     def norms(self) -> Array:
@@ -117,10 +127,8 @@ class Linear:
     @property
     def _together(self) -> Array:
         """(X ρ)ᵀ C⁻¹ (X ρ) (B, u + 1, u + 1)."""
-        columns = np.concatenate([self.design, self.residual[..., None]], -1)
-        weighed = self.weigh(columns)
-        rows = (*columns.shape[:-3], -1, columns.shape[-1])
-        return np.asarray(columns.reshape(rows).mT @ weighed.reshape(rows))
+        flat = (*self.rows.shape[:-3], -1, self.rows.shape[-1])
+        return np.asarray(self.rows.reshape(flat).mT @ self.weighed.reshape(flat))
 
     @property
     def _by_triad(self) -> Array:

@@ -54,6 +54,8 @@ LEAST_SCATTER = 1e-5
 """Scatter below which there is none."""
 LARGEST_CHANGE = 20.0
 """A variance changes by this factor at most in one round."""
+AT_REST = 1e-12
+"""Stations and groups are at their best where no step turns them further, rad, or moves them by more σ."""
 PIN = 0.05
 """Parameters are known to this share of the field when runs are compared by their probability."""
 
@@ -96,11 +98,10 @@ def analyse(problem: Problem, state: State, determined: Determined | None = None
     linear = problem.linear(state)
     determined = determined or Determined.of(problem, state)
     whole = whole_covariance(linear, determined)
-    weighed = linear.weigh(linear.design)
-    residual = linear.weigh(linear.residual[..., None])[..., 0]
+    weighed, residual = linear.weighed[..., :-1], linear.weighed[..., -1].copy()
     spread = linear.weight - weighed @ whole[:, None] @ weighed.mT
     spread = spread * problem.evidence.include[..., None, None]
-    factor, freedom = _variance_factors(residual, spread)
+    factor, freedom = variance_factors(residual, spread)
     p, q = linear.size, len(problem.evidence.constants)
     settings = whole.shape[-1] - state.settings.shape[-1]
     return Analysis(
@@ -184,7 +185,7 @@ def sandwich(
     left = left + crossed + crossed.mT
     weight = linear.weight
     spread = weight @ left @ weight * problem.evidence.include[..., None, None]
-    factor, freedom = _variance_factors(analysis.residual, spread)
+    factor, freedom = variance_factors(analysis.residual, spread)
     q = len(constants)
     return replace(
         analysis,
@@ -207,7 +208,7 @@ def _followed(
     Also how the gradient of the others follows those, the inverse of their information, and which
     unknowns (u,) are fixed by pulls.
     """
-    design, weighed, u = linear.design, linear.weigh(linear.design), linear.prior.shape[-1]
+    design, weighed, u = linear.design, linear.weighed[..., :-1], linear.prior.shape[-1]
     moved = np.zeros((*design.shape[:2], u, design.shape[2]))
     fixed = np.zeros(u, bool)
     for index, pull in pulls.items():
@@ -258,7 +259,7 @@ def whole_covariance(linear: Linear, determined: Determined) -> Array:
     return np.concatenate([top, np.concatenate([cross.mT, shared], -1)], -2)
 
 
-def _variance_factors(residual: Array, spread: Array) -> tuple[Array, Array]:
+def variance_factors(residual: Array, spread: Array) -> tuple[Array, Array]:
     """s² and degrees of freedom (B, t) of each triad: restricted maximum likelihood."""
     freedom = triad_sums(diagonal(spread))
     return triad_sums(residual**2) / np.where(freedom > 1e-9, freedom, np.nan), freedom
@@ -286,7 +287,7 @@ def effective_freedom(problem: Problem, state: State, analysis: Analysis) -> Arr
     """
     linear = problem.linear(state)
     whole = whole_covariance(linear, analysis.determined)
-    weighed, count = linear.weigh(linear.design), linear.residual.shape[-1]
+    weighed, count = linear.weighed[..., :-1], linear.residual.shape[-1]
     inner = linear.weight * problem.evidence.include[..., None, None]
     each = []
     for first in range(0, count, 3):
@@ -336,7 +337,7 @@ def without_station(problem: Problem, state: State, analysis: Analysis) -> Array
         return np.asarray(-(analysis.influence[:, :, :p] @ stay)[..., 0])
     whole = whole_covariance(linear, analysis.determined)[:, : linear.size]
     pulled = left_out_residual(analysis)
-    pulled = np.einsum("bnmu,bnm->bnu", linear.weigh(linear.design), pulled)
+    pulled = np.einsum("bnmu,bnm->bnu", linear.weighed[..., :-1], pulled)
     return np.asarray(np.einsum("bpu,bnu->bnp", whole, pulled))
 
 
@@ -407,6 +408,9 @@ def readjusted(problem: Problem, state: State) -> State:
         groups = inverse(normal.information[:, fixed:, fixed:])
         step[:, fixed:] = -(groups @ normal.gradient[:, fixed:, None])[..., 0]
         state = problem.move(state, linear, step)
+        moved = np.abs(step).max(initial=0.0), np.abs(linear.private_step(step) * linear.loose)
+        if max(moved[0], moved[1].max(initial=0.0)) < AT_REST:
+            break
     return state
 
 

@@ -115,6 +115,11 @@ class Polynomial:
         """Number of parameters."""
         return self.affine + 6 * self.curved
 
+    @property
+    def varies(self) -> bool:
+        """Whether the slope differs from station to station."""
+        return self.basis.order > 0 or self.curved
+
     def _scaled(self, raw: Array) -> Array:
         return np.asarray((raw - self.centre) / self.scale)
 
@@ -232,6 +237,11 @@ class Factors:
         """Number of parameters, 12 at order 0 and 30 at order 3."""
         return 6 * (self.basis.order + 1) + 6
 
+    @property
+    def varies(self) -> bool:
+        """Whether the slope differs from station to station."""
+        return self.basis.order > 0
+
     def _split(self, params: Array, temperature: Array) -> tuple[Array, Array, Array]:
         """SF(T) and B(T) (..., n, 3), and I - m (..., 3, 3)."""
         values, (scale, bias, misalignment) = self.basis(temperature), factor_parts(params)
@@ -346,6 +356,11 @@ class Restricted:
     def curved(self) -> bool:
         """Whether the whole model has own-axis terms."""
         return self.whole.curved
+
+    @property
+    def varies(self) -> bool:
+        """Whether the whole model's slope differs from station to station."""
+        return self.whole.varies
 
     @property
     def basis(self) -> Basis:

@@ -20,7 +20,8 @@ from mwdcal.calibration.residuals import tail
 from mwdcal.estimation import drift
 from mwdcal.estimation.batch import put, take
 from mwdcal.estimation.minimisers import closed_form
-from mwdcal.estimation.problem import Prior, Problem
+from mwdcal.estimation.minimisers.common_columns import are_common, perfect
+from mwdcal.estimation.problem import Prior
 from mwdcal.estimation.solvers import Status
 from mwdcal.geometry.vectors import Array, Bools, Ints
 
@@ -62,25 +63,11 @@ def chances(result: Fit) -> tuple[Array, Bools]:
 
 def _scores(result: Fit) -> drift.WalkScores:
     problem, analysis = result.problem, result.analysis
-    if not (closed_form.applies(problem) and _one_plan(problem)):
+    if not (closed_form.applies(problem) and are_common(problem)):
         return drift.walk_scores(problem, result.state, analysis)
-    nominal = take(result, np.arange(1))
-    triads = [replace(triad, sd=np.ones_like(triad.sd)) for triad in nominal.problem.triads]
-    params = [triad.model.start(np.eye(3)[None], np.zeros((1, 3))) for triad in triads]
-    return drift.walk_scores(
-        replace(nominal.problem, triads=tuple(triads)),
-        replace(nominal.state, params=np.concatenate(params, -1)),
-        replace(nominal.analysis, residual=analysis.residual),
-    )
-
-
-def _one_plan(problem: Problem) -> bool:
-    """Whether members differ in their readings alone: nominal sensors then stand for all of them."""
-    evidence = problem.evidence
-    if any(np.ptp(triad.sd, axis=(1, 2)).any() for triad in problem.triads):
-        return False
-    arrays = [*evidence.known.values(), evidence.include, problem.temperature]
-    return all(np.array_equal(a, np.broadcast_to(a[:1], a.shape), equal_nan=True) for a in arrays)
+    one, state = perfect(problem, result.state)
+    nominal = replace(take(analysis, np.arange(1)), residual=analysis.residual)
+    return drift.walk_scores(one, state, nominal)
 
 
 def drifting(result: Fit, options: Options) -> Bools:

@@ -76,7 +76,7 @@ def detections(result: Fit) -> dict[str, Detection]:
 def _response(result: Fit, column: Array) -> _Response:
     """The response to errors by whose unit the whitened misfit moves by a `column` (B, n, m)."""
     linear, analysis = result.problem.linear(result.state), result.analysis
-    weighed = linear.weigh(linear.design)
+    weighed = linear.weighed[..., :-1]
     if analysis.influence is None:
         whole = whole_covariance(linear, analysis.determined)
         unknowns = -np.einsum("bpq,bnmq,bnm->bnp", whole, weighed, column, optimize=True)

@@ -139,9 +139,8 @@ class FittedRuns:
         new = np.array([place for place in places.tolist() if place not in self._shown], int)
         if new.size:
             others = {name: values[new] for name, values in self.readings.others.items()}
-            self._shown.update(
-                zip(new.tolist(), shown_effects(take(self.result, new), others), strict=True)
-            )
+            result = self.result if new.size == self.count else take(self.result, new)
+            self._shown.update(zip(new.tolist(), shown_effects(result, others), strict=True))
         return {place: self._shown[place] for place in places.tolist()}
 
     def effects(self, place: int) -> list[Effect]:

@@ -14,7 +14,7 @@ from mwdcal.calibration.residuals import RESHOOT, Residuals, chances, chi_chance
 from mwdcal.calibration.results import variance_scales
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.evidence import STAND_ERRORS, UNKNOWN
-from mwdcal.estimation.minimisers import closed_form
+from mwdcal.estimation.minimisers import closed_form, closed_form_drift
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.solvers import Determined
 from mwdcal.estimation.uncertainty import (
@@ -56,9 +56,7 @@ def gain_shares(result: Fit, index: int) -> tuple[Array, Array]:
     """
     problem = result.problem
     triad, params = problem.triads[index], result.state.params[:, problem.slices()[index]]
-    whole = getattr(triad.model, "whole", triad.model)
-    varies = bool(triad.model.basis.order) or getattr(whole, "curved", False)
-    some = slice(None if varies else 1)
+    some = slice(None if triad.model.varies else 1)
     slope = triad.model.slope(params, triad.raw[:, some], problem.temperature[:, some]).mean(1)
     gain = diagonal(slope)
     with np.errstate(over="ignore"):  # an infinite gain has no shares
@@ -169,6 +167,8 @@ def freedom_of(result: Fit) -> Array:
     analysis = result.analysis
     if closed_form.applies(result.problem) or analysis.influence is not None:
         return analysis.freedom
+    if closed_form_drift.applies(result.problem):
+        return closed_form_drift.effective_freedom(result.problem, analysis)
     return effective_freedom(result.problem, result.state, analysis)
 
 

@@ -10,39 +10,27 @@ Reference: efficient scores, C. R. Rao, Proc. Camb. Phil. Soc. 44, 50 (1948).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mwdcal.calibration.automatic.courses import TRIED, f_test, steady_columns, temperature_powers
+from mwdcal.calibration.automatic.courses import f_test, steady_columns
+from mwdcal.calibration.diagnosis.families import COURSE_SUFFIX, families, products
+from mwdcal.calibration.diagnosis.first_look import EFFECT_CHANCE, LEFT_BY_FIT, may_show
 from mwdcal.calibration.estimate import Fit
-from mwdcal.calibration.evidence import acts_on
-from mwdcal.calibration.methods import ESTIMABLE
-from mwdcal.calibration.readings import HIGHEST, LEAST_TEMPERATURE_SPAN, TRIADS, highest_order
+from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.residuals import chances, to_reshoot
 from mwdcal.calibration.results import variance_scales
 from mwdcal.estimation.batch import take
-from mwdcal.estimation.evidence import STAND_ERRORS
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import whole_covariance
-from mwdcal.geometry.vectors import Array, Bools, Ints, centred, eigen, outer, quotient
+from mwdcal.geometry.vectors import Array, Bools, Ints, eigen, outer, quotient
 
-EFFECT_CHANCE = 1e-4
-"""Chance of so much common structure in noise, below which an effect is named."""
 STRUCTURE_CHANCE = 0.01
 """Chance of residuals as large in declared noise, below which their structure is looked at."""
 BAD_SHARE = 0.1
 """Share of bad stations up to which they are left out."""
-LEFT_BY_FIT = 1e-3
-"""A column counts if the fit leaves this share of its square: what is left of others is rounding."""
-DRIFTS = 2
-"""Degree of the polynomial of order (or of the row) that a drift is looked for as."""
-SMALLEST_SET = 3
-"""Fewest stations of one direction that may share an error of its setting."""
-SET_TURNS = ("inclination-zero", "azimuth-zero")
-COURSE_SUFFIX = "-temperature"
-"""What ends the names of the powers of temperature that the order of a triad leaves out."""
 COLUMN = "column "
 """What the names of columns that the run does not use begin with."""
 COLUMN_EXPLAINS = (
@@ -57,8 +45,6 @@ FEWEST_TESTED = 20
 """Stations from which columns are tested: fewer are explained by anything."""
 REPEATED = 0.02
 """A column repeats the attitudes if they leave no more than this share of its variance."""
-LEAST_MOVE = 0.05
-"""Moves below this share of the run's largest have no side: of angles that are read off, noise would choose it."""
 AT_ONCE = 32
 """Fits that are looked at together: few enough for the cache."""
 ZEROS = ("azimuth-zero", "inclination-zero", "dip-reference")
@@ -156,10 +142,16 @@ def shown_effects(result: Fit, others: Mapping[str, Array]) -> list[Shown]:
     """
     if result.analysis.influence is not None:
         return [{} for _ in result.status]
-    result, every = _without_bad_stations(result), []
-    for first in range(0, len(result.status), AT_ONCE):
-        some = slice(first, first + AT_ONCE)
-        every += _searched(take(result, some), {n: v[some] for n, v in others.items()})
+    include = result.problem.evidence.include
+    every: list[Shown] = [{} for _ in result.status]
+    looked_at, result = may_show(result) | bool(others), _without_bad_stations(result)
+    looked_at |= (result.problem.evidence.include != include).any(-1)
+    places = np.flatnonzero(looked_at)
+    for first in range(0, len(places), AT_ONCE):
+        some = places[first : first + AT_ONCE]
+        shown = _searched(take(result, some), {n: v[some] for n, v in others.items()})
+        for place, each in zip(some.tolist(), shown, strict=True):
+            every[place] = each
     return every
 
 
@@ -282,15 +274,15 @@ def _described(result: Fit, shown: Shown, others: Mapping[str, Array]) -> list[E
 
 def _scores(problem: Problem, result: Fit, others: Mapping[str, Array]) -> _Scores:
     """Efficient scores of the columns (B, n, m, k) of all families: what the fit's unknowns cannot take up."""
-    families = dict(_families(problem, result.state))
+    columns = dict(families(problem, result.state))
     if tested := _testable(problem, result.state, others):
         steady = steady_columns(problem, result.state)
-        families |= {COLUMN + n: _products(steady, v[..., None]) for n, v in tested.items()}
+        columns |= {COLUMN + n: products(steady, v[..., None]) for n, v in tested.items()}
     linear = problem.linear(result.state)
     whole, normal = whole_covariance(linear, result.analysis.determined), linear.normal
-    every = np.concatenate([*families.values()], -1)
-    ends = np.cumsum([column.shape[-1] for column in families.values()])
-    places = dict(zip(families, np.split(np.arange(ends[-1]), ends[:-1]), strict=True))
+    every = np.concatenate([*columns.values()], -1)
+    ends = np.cumsum([each.shape[-1] for each in columns.values()])
+    places = dict(zip(columns, np.split(np.arange(ends[-1]), ends[:-1]), strict=True))
     flat = every.reshape(len(every), -1, every.shape[-1])
     weighed = linear.weigh(every).reshape(flat.shape)
     square = np.einsum("bik,bik->bk", flat, weighed)
@@ -318,131 +310,6 @@ def _unknown(problem: Problem, result: Fit) -> Ints:
         return np.zeros(len(result.status), int)
     private = problem.linear(result.state, geometry=True).private
     return np.asarray(np.sum(np.linalg.svd(private, compute_uv=False) > 1.0, (-1, -2)))
-
-
-def _families(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
-    """Columns (B, n, m, k) of every effect that these runs could show, whitened; zero where one could not."""
-    turns, by_earth = problem.station_columns(state)
-    known = _turns(problem, state, turns)
-    for name, parts in ESTIMABLE.items():
-        each = [known[turn] for turn in parts if turn in known]
-        if each:
-            yield name, np.stack(each, -1)
-    sets = _sets(problem)
-    each = [known[n][..., None] * sets[..., None, :] for n in SET_TURNS if n in known]
-    if each and sets.shape[-1] > 1:
-        yield "settings", np.concatenate(each, -1)
-    place = np.linspace(-1, 1, state.attitude.shape[1])
-    order = np.asarray(np.polynomial.legendre.legvander(place, DRIFTS)[:, 1:], float)
-    down = problem.stand_column(state, "azimuth-zero", turns)
-    if len(problem.triads) > 1:
-        given = problem.evidence.is_known("dip")[..., None]
-        if given.any() and "dip" not in problem.evidence.absent:
-            yield "dip-reference", (by_earth[..., 2] * given)[..., None]
-        field = np.concatenate([by_earth[..., 1:], down[..., None]], -1)
-        field[..., :3, :] = 0.0  # the declination of a field that turns does not turn gravity
-        if not problem.walks:
-            yield "field-drift", _products(field, order)
-        yield "field-gradient", _products(field, state.attitude[..., 2, :])
-    steps = _approach(problem)
-    back = [known[n] * s[..., None] for n, s in steps.items() if n in known and s.any()]
-    if back:
-        yield "backlash", np.stack(back, -1)
-    yield from _courses(problem, state)
-    for index, name in enumerate(TRIADS[: len(problem.triads)]):
-        yield from _of_sensor(problem, index, name, order)
-
-
-def _sets(problem: Problem) -> Array:
-    """Membership (B, n, k) of stations in directions that several share by their references; none of a single one."""
-    known = problem.evidence.known
-    pair = np.stack([known["inclination"], known["azimuth"]], -1)
-    keys = np.round(np.nan_to_num(pair, nan=-1.0), 6)
-    alike = bool((keys == keys[:1]).all())
-    each = [_sets_of(key) for key in keys[: 1 if alike else None]]
-    members = np.zeros((len(each), keys.shape[1], max(of.shape[-1] for of in each)))
-    for place, of in enumerate(each):
-        members[place, :, : of.shape[-1]] = of if of.shape[-1] > 1 else 0.0
-    return members
-
-
-def _sets_of(key: Array) -> Array:
-    """Membership (n, k) of one run's stations in the directions (n, 2) that are not too few, nor too many."""
-    _, number, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
-    usable = np.flatnonzero(count >= SMALLEST_SET)
-    if len(usable) > len(key) / SMALLEST_SET:
-        usable = usable[:0]
-    return np.asarray(number.reshape(-1)[:, None] == usable, float)
-
-
-def _courses(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
-    """Powers of temperature that a triad's order leaves out: another finding names these."""
-    varied = np.ptp(problem.temperature, -1) >= LEAST_TEMPERATURE_SPAN
-    if not varied.any():
-        return
-    highest = np.clip(highest_order(problem.temperature), HIGHEST, TRIED)
-    columns, most = steady_columns(problem, state), int(highest.max())
-    tried = (np.arange(1, most + 1) <= highest[:, None]) & varied[:, None]
-    powers = temperature_powers(problem.temperature, most) * tried[:, None]
-    for index, triad in enumerate(problem.triads):
-        order = triad.model.basis.order
-        if order < most:
-            of_triad = columns[..., 6 * index : 6 * index + 6]
-            yield f"{TRIADS[index]}{COURSE_SUFFIX}", _products(of_triad, powers[..., order:])
-
-
-def _turns(problem: Problem, state: State, turns: Array) -> dict[str, Array]:
-    """Columns (B, n, m) of errors of the stand that act on references, at stations that have them."""
-    acting = {name: acts_on(problem.evidence, name)[..., None] for name in STAND_ERRORS}
-    columns = {n: problem.stand_column(state, n, turns) * acts for n, acts in acting.items()}
-    return {name: column for name, column in columns.items() if column.any()}
-
-
-def _products(columns: Array, factors: Array) -> Array:
-    """Columns (B, n, m, a) times factors (n, b) or (B, n, b) of their stations: (B, n, m, a b)."""
-    product = columns[..., :, None] * factors[..., None, None, :]
-    return np.asarray(product.reshape(*columns.shape[:-1], -1))
-
-
-def _approach(problem: Problem) -> dict[str, Array]:
-    """From which side (B, n) each angle of the stand was reached: 1, -1, or 0 where it did not move."""
-    known = problem.evidence.known
-    angles = {name: known[name][..., None] for name in ("inclination", "azimuth", "toolface")}
-    moves = {name: np.nan_to_num(centred(_moved(angle))) for name, angle in angles.items()}
-    return {f"{name}-zero": _side(moved)[..., 0] for name, moved in moves.items()}
-
-
-def _moved(values: Array) -> Array:
-    """Changes (B, n, k) of values from station to station, zero at the first."""
-    return np.diff(values, axis=1, prepend=values[:, :1])
-
-
-def _side(moved: Array) -> Array:
-    """The sign of each move (B, n, k), 0 for those too small to be more than the error of a statement."""
-    least = np.maximum(LEAST_MOVE * np.abs(moved).max((1, 2), keepdims=True), 1e-6)
-    return np.where(np.abs(moved) > least, np.sign(moved), 0.0)
-
-
-def _of_sensor(
-    problem: Problem, index: int, name: str, order: Array
-) -> Iterator[tuple[str, Array]]:
-    """Drift with the order of stations, hysteresis and thermal lag of one triad's readings."""
-    triad = problem.triads[index]
-    axes = np.zeros((*problem.temperature.shape, 3 * len(problem.triads), 3))
-    weight = problem.evidence.include[..., None] / triad.sd
-    axes[:, :, 3 * index : 3 * index + 3] = np.eye(3) * weight[..., None]
-    if index == 0 and not problem.walks:
-        yield f"{name}-drift", _products(axes, order)
-    yield f"{name}-hysteresis", axes * _side(_moved(triad.raw))[..., None, :]
-    rate = _moved(problem.temperature[..., None])
-    varied = np.ptp(rate, 1, keepdims=True) > 1.0
-    if varied.any():
-        rate = quotient(rate, np.abs(rate).max(1, keepdims=True), varied)
-        reading = (triad.raw - triad.raw.mean(1, keepdims=True)) / np.std(triad.raw, (1, 2))[
-            :, None, None
-        ]
-        scale = axes * (rate * reading)[..., None, :]
-        yield f"{name}-thermal-lag", np.concatenate([axes * rate[..., None, :], scale], -1)
 
 
 def suspected(result: Fit, chance: Array) -> Bools:

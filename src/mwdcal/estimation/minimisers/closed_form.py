@@ -38,11 +38,15 @@ PLACES = affine_terms(_ELEMENTS[:, :3], _ELEMENTS[:, 3])
 
 def applies(problem: Problem) -> bool:
     """Whether all that the triads should read is exactly known, and the models come apart by axis."""
+    return not problem.evidence.constants and but_for_constants(problem)
+
+
+def but_for_constants(problem: Problem) -> bool:
+    """Whether the closed form would apply if the run had no constants."""
     evidence = problem.evidence
     angles = ("inclination", "toolface", "azimuth")[: 1 + len(problem.triads)]
     return (
         all(_is_closed(triad) for triad in problem.triads)
-        and not evidence.constants
         and not evidence.absent
         and all(evidence.is_known(name).all() for name in angles)
         and not any(evidence.sd[name].any() for name in angles)
@@ -131,6 +135,13 @@ def start(problem: Problem) -> State:
     attitude = tool_from_earth(known["inclination"], azimuth, known["toolface"])
     params = np.zeros((shape[0], problem.slices()[-1].stop))
     return problem.start(params, attitude)
+
+
+def minimum(problem: Problem, at: State) -> tuple[State, Array]:
+    """State and whitened residuals (B, n, m) at the minimum for the attitudes of a state."""
+    triads = minima(problem, at)
+    state = replace(at, params=np.concatenate([h.params for h in triads], -1))
+    return state, np.concatenate([h.left for h in triads], -1)
 
 
 def solution(problem: Problem, at: State) -> tuple[State, Analysis, Bools]:

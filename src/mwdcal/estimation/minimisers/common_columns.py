@@ -1,0 +1,135 @@
+"""Effects on the readings of tools that were measured at the same exact references: what these have in common.
+
+Such a tool reads raw = S f + o + noise, and its parameters take up all that is linear in f̃ = [f 1]. An effect on what
+it should read, a column c (n, 3) in the frame of the field, is S c in its readings; one on the readings themselves is c
+in those of any tool. What the parameters leave of c is therefore the same for all tools, and all sums over the stations
+are linear in SᵀS, S and 1: they are formed once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mwdcal.estimation.batch import take
+from mwdcal.estimation.minimisers import closed_form
+from mwdcal.estimation.problem import Problem, State
+from mwdcal.geometry.vectors import Array, Bools, inverse
+from mwdcal.sensor.models import Polynomial
+
+FIRST_AXES, SECOND_AXES = np.triu_indices(3)
+"""Pairs of axes of a symmetric matrix."""
+
+
+def are_common(problem: Problem) -> bool:
+    """Whether all references are exact, and members differ in their readings and the level of their noise alone."""
+    evidence = problem.evidence
+    if not closed_form.but_for_constants(problem):
+        return False
+    if not all(isinstance(triad.model, Polynomial) for triad in problem.triads):
+        return False
+    if any(np.ptp(triad.sd, axis=(1, 2)).any() for triad in problem.triads):
+        return False
+    arrays = [*evidence.known.values(), evidence.include, problem.temperature]
+    return all(np.array_equal(a, np.broadcast_to(a[:1], a.shape), equal_nan=True) for a in arrays)
+
+
+def perfect(problem: Problem, state: State) -> tuple[Problem, State]:
+    """The first member as sensors without error and with noise of one would read it."""
+    problem, state = take((problem, state), np.arange(1))
+    triads = [replace(triad, sd=np.ones_like(triad.sd)) for triad in problem.triads]
+    params = [triad.model.start(np.eye(3)[None], np.zeros((1, 3))) for triad in triads]
+    state = replace(state, params=np.concatenate(params, -1))
+    return replace(problem, triads=tuple(triads)), state
+
+
+def responses(problem: Problem, state: State) -> list[Array]:
+    """What a change of the field, and one of the readings, does to each triad's whitened ones: [S 1] / σ (B, 3, 6)."""
+    each = []
+    for triad, where in zip(problem.triads, problem.slices(), strict=True):
+        params, at = state.params[:, where], (triad.raw[:, :1], problem.temperature[:, :1])
+        gain = inverse(triad.model.slope(params, *at)[:, 0])
+        both = np.concatenate([gain, np.broadcast_to(np.eye(3), gain.shape)], -1)
+        each.append(both / triad.sd[:, :1, :1])
+    return each
+
+
+def sensor_terms(problem: Problem, state: State, index: int) -> Array:
+    """f̃ (n, 4) of a triad at the stations that count."""
+    vectors, include = problem.targets(state)[index][0], problem.evidence.include[0, :, None]
+    return np.concatenate([vectors, np.ones_like(include)], -1) * include
+
+
+@dataclass(frozen=True)
+class CommonColumns:
+    """Columns of k effects on the readings of one triad.
+
+    `whole` and `left` (n, 6, k), in the frame of the field and then in that of the readings: what an effect does, and
+    what the sensors' parameters do not take up. `taken` (4, 6, k) is what they take up, by element of f̃.
+    `products` (k k, 16): sums over the stations, by element of SᵀS, S and 1.
+    """
+
+    whole: Array
+    left: Array
+    taken: Array
+    products: Array
+
+    @classmethod
+    def of(cls, terms: Array, columns: Array, of_reading: Bools) -> CommonColumns:
+        """From f̃ (n, 4), or none of its elements, and columns (n, 3, k) of a perfect triad.
+
+        They act on the field or, where `of_reading` (k,), on the readings themselves.
+        """
+        whole = np.concatenate([columns * ~of_reading, columns * of_reading], 1)
+        basis, triangle = np.linalg.qr(terms)
+        taken = basis.transpose() @ whole.reshape(len(whole), -1)
+        left = whole - (basis @ taken).reshape(whole.shape)
+        taken = np.linalg.solve(triangle, taken).reshape(-1, *whole.shape[1:])
+        flat = np.moveaxis(left, 1, 0)
+        return cls(whole, left, taken, _by_response(np.moveaxis(flat, 2, 1)[:, None] @ flat))
+
+    def information(self, response: Array) -> Array:
+        """Information (B, k, k) on the effects, the sensors' parameters being unknown; of `responses` (B, 3, 6)."""
+        count = self.whole.shape[-1]
+        whole = self.products @ _squares_of(response)[..., None]
+        return np.asarray(whole.reshape(-1, count, count))
+
+    def squares(self, response: Array) -> Array:
+        """Squares (B, k) of the lengths of the columns in whitened readings."""
+        each = np.einsum("nik,njk->ijk", self.whole, self.whole)
+        return np.asarray(
+            (_by_response(each[..., None]) @ _squares_of(response)[..., None])[..., 0]
+        )
+
+    def score(self, response: Array, residual: Array) -> Array:
+        """Scores (B, k) of the effects in whitened residuals (B, n, 3) of a fit without them."""
+        flat = (residual @ response).reshape(len(residual), 1, -1)
+        return np.asarray((flat @ self.left.reshape(-1, self.left.shape[-1]))[:, 0])
+
+    def seen(self, response: Array) -> Array:
+        """What effects do to whitened residuals (B, n, 3, k)."""
+        return np.asarray(response[:, None] @ self.left)
+
+    def change(self, response: Array, value: Array) -> Array:
+        """Change (B, n, 3) of whitened readings by effects of some size (B, k)."""
+        both = (self.whole @ value[:, None, :, None])[..., 0]
+        return np.asarray(both @ response.mT)
+
+
+def _by_response(sums: Array) -> Array:
+    """Sums (6, 6, ...) over the stations of products of elements, flat, by the 16 `_squares_of` a response."""
+    field = sums[FIRST_AXES, SECOND_AXES] + sums[SECOND_AXES, FIRST_AXES]
+    field[FIRST_AXES == SECOND_AXES] /= 2
+    across = sums[3:, :3] + np.swapaxes(sums[:3, 3:], 0, 1)
+    reading = sums[3, 3] + sums[4, 4] + sums[5, 5]
+    count = reading.size
+    parts = [part.reshape(-1, count) for part in (field, across, reading)]
+    return np.concatenate(parts).transpose().copy()
+
+
+def _squares_of(response: Array) -> Array:
+    """Elements (B, 16) of SᵀS, S and 1, over σ², of responses (B, 3, 6)."""
+    gain, one = response[..., :3], response[:, :1, 3]
+    square = (gain.mT @ gain)[:, FIRST_AXES, SECOND_AXES]
+    return np.concatenate([square, gain.reshape(-1, 9) * one, one**2], -1)

@@ -1,0 +1,70 @@
+"""What tools at the same exact references have in common gives what each of them gives by itself."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mwdcal.calibration.automatic.drift import drifting, with_drift
+from mwdcal.calibration.diagnosis import structure
+from mwdcal.calibration.diagnosis.plausibility import freedom_of
+from mwdcal.calibration.estimate import fit
+from mwdcal.calibration.options import Options
+from mwdcal.estimation.batch import take
+from mwdcal.estimation.minimisers import closed_form_drift, common_columns
+from test_run_drift import runs
+
+OPTIONS = Options(order=0)
+
+
+def imperfect(readings):
+    """The readings of tools with gains, axes and offsets of their own."""
+    rng = np.random.default_rng(1)
+    size = len(readings.accelerometer)
+    raw = [
+        vectors @ (np.eye(3) + rng.uniform(-0.03, 0.03, (size, 3, 3))) + rng.uniform(-at, at, 3)
+        for vectors, at in ((readings.accelerometer, 0.01), (readings.magnetometer, 500.0))
+    ]
+    return replace(readings, accelerometer=raw[0], magnetometer=raw[1])
+
+
+@pytest.fixture
+def apart(monkeypatch):
+    """Lets every tool go the general way from now on."""
+
+    def general():
+        for module in (common_columns, closed_form_drift):
+            monkeypatch.setattr(module, "are_common", lambda problem: False)
+        monkeypatch.setattr(structure, "may_show", lambda result: np.ones(len(result.status), bool))
+
+    return general
+
+
+@pytest.mark.parametrize("triads", [[True, False], [False, True], [True, True]], ids=str)
+def test_a_drift_in_closed_form_is_the_general_minimum(triads, apart):
+    result = fit(imperfect(runs(3, 6, field=40.0, offset=1e-4)), OPTIONS)
+    ours = with_drift(result, OPTIONS, np.array(triads))
+    assert closed_form_drift.applies(ours.problem)
+    freedom = freedom_of(ours)
+    apart()
+    theirs = with_drift(result, OPTIONS, np.array(triads))
+    sd = np.sqrt(np.einsum("bii->bi", theirs.analysis.covariance))
+    np.testing.assert_allclose((ours.state.params - theirs.state.params) / sd, 0, atol=1e-7)
+    np.testing.assert_allclose(freedom, freedom_of(theirs), rtol=1e-7)
+    np.testing.assert_array_equal(ours.status, theirs.status)
+    for name in ("covariance", "variance_factor", "freedom", "residual", "spread", "effects"):
+        mine, other = (getattr(f.analysis, name) for f in (ours, theirs))
+        size = np.abs(other).max()
+        np.testing.assert_allclose(mine, other, atol=1e-7 * size, err_msg=name)
+
+
+@pytest.mark.parametrize("error", [0.0, 2e-3, 4e-3])
+def test_the_first_look_leaves_out_no_effect(error, apart):
+    readings = imperfect(runs(8, 40))
+    steps = np.sign(np.diff(readings.known["inclination"], prepend=0.0))
+    readings.known["inclination"] = readings.known["inclination"] + error * steps
+    result = fit(readings, OPTIONS)
+    some = take(result, np.flatnonzero(~drifting(result, OPTIONS).any(-1)))
+    ours = structure.shown_effects(some, {})
+    apart()
+    assert ours == structure.shown_effects(some, {})
