@@ -115,7 +115,7 @@ def results():
 def computed_once(results, monkeypatch):
     """What takes most of the time of a command is computed once for all tests of what it shows."""
     from mwdcal.comparison import compare
-    from mwdcal.logs import noise, noise_terms
+    from mwdcal.logs import allan, noise
     from mwdcal.planning import planned
 
     long = (
@@ -123,7 +123,7 @@ def computed_once(results, monkeypatch):
         (planned, "best_plan"),
         (compare, "compare"),
         (noise, "find_noise"),
-        (noise_terms, "fit"),
+        (allan, "fit"),
     )
     for module, name in long:
         monkeypatch.setattr(module, name, remembered(getattr(module, name), results))

@@ -17,12 +17,11 @@ from mwdcal.calibration.methods import EVIDENCE
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.comparison import compare as module
-from mwdcal.comparison.common_gauge import Gauge, in_gauge
-from mwdcal.comparison.compare import SCATTER, compare
+from mwdcal.comparison.compare import SCATTER, Gauge, compare, in_gauge
 from mwdcal.errors import InputError
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.uncertainty import unrotating
-from mwdcal.geometry.directions import group_scatter
+from mwdcal.geometry.vectors import group_scatter
 from mwdcal.pages.comparison import render
 from mwdcal.planning import simulate
 from mwdcal.screens import comparison as command

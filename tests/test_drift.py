@@ -15,19 +15,22 @@ from mwdcal.calibration.prediction import typical_accuracy
 from mwdcal.calibration.readings import TRIADS, fingerprints
 from mwdcal.drift import change
 from mwdcal.drift.change import NULL_DRAWS, Contrasts, change_test
-from mwdcal.drift.comparable import (
-    FACTOR_NAMES,
-    History,
-    one_noise,
-    parameter_names,
-    precision,
-)
 from mwdcal.drift.fleet import fleet_drift
 from mwdcal.drift.forecast import RISK, Paths, outlook
 from mwdcal.drift.histories import tool_history
-from mwdcal.drift.service import ServiceTest
+from mwdcal.drift.forecast import ServiceTest
 from mwdcal.drift.tool import TypeRates, measured, predicted
-from mwdcal.drift.walk import WALK_GROUPS, GroupRates, Increments, quantiles
+from mwdcal.drift.walk import (
+    FACTOR_NAMES,
+    WALK_GROUPS,
+    GroupRates,
+    History,
+    Increments,
+    one_noise,
+    parameter_names,
+    precision,
+    quantiles,
+)
 from mwdcal.errors import InputError
 from mwdcal.files import documents
 from mwdcal.files.formats.members import Member

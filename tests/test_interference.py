@@ -22,15 +22,8 @@ from mwdcal.pages.surveys.interference import render
 from mwdcal.planning.simulate import grid, run, servo
 from mwdcal.screens.surveys.interference import screen
 from mwdcal.survey.acceptance import SensorTerms
-from mwdcal.survey.error_terms import DRIFTED
-from mwdcal.survey.multistation.interference import deviations, interference
-from mwdcal.survey.multistation.interference_estimate import (
-    Assumed,
-    Estimate,
-    estimate,
-    misfits,
-    sensor_drift,
-)
+from mwdcal.survey.interference import DRIFTED, deviations, interference
+from mwdcal.survey.interference_estimate import Assumed, Estimate, estimate, misfits, sensor_drift
 from simulation import DEG, Tool, attitude
 from test_calibrate import PROFILE, make
 from wells import (

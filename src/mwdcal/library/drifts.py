@@ -13,7 +13,7 @@ from mwdcal.calibration.prediction import STATED_ANGLES
 from mwdcal.calibration.record import Calibration
 from mwdcal.drift.document import ToolDrift
 from mwdcal.drift.fleet import fleet_drift
-from mwdcal.drift.service import ServiceTest
+from mwdcal.drift.forecast import ServiceTest
 from mwdcal.drift.tool import MeasuredTool, TypeRates, measured, predicted
 from mwdcal.errors import InputError, MwdcalError
 from mwdcal.files import documents

@@ -422,7 +422,7 @@ def check_signature(
 
     Example: `mwdcal.check_signature("C.json", keys=["laboratory.key.pub"]).state`
     """
-    from mwdcal.certificate.trusted_keys import trusted
+    from mwdcal.certificate.keys import trusted
     from mwdcal.files import documents
     from mwdcal.screens.records import signature as screens
 

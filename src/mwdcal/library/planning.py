@@ -183,7 +183,7 @@ def plan(
     True
     """
     from mwdcal.planning import planned
-    from mwdcal.planning.moves import Stand
+    from mwdcal.planning.planned import Stand
 
     several = plan if isinstance(plan, list | tuple) else [] if plan is None else [plan]
     if len(several) > 1 and (accuracy_deg or stations or measured is not None):

@@ -38,9 +38,8 @@ from mwdcal.sensor.profile import Profile
 from mwdcal.use.verification import Limits
 
 if TYPE_CHECKING:
-    from mwdcal.planning.effects import Effects
-    from mwdcal.planning.procedure import Part, Procedure, Tools
-    from mwdcal.planning.repetition import Repetition, Share
+    from mwdcal.planning.procedure import Part, Procedure, Repetition, Share, Tools
+    from mwdcal.planning.simulate import Effects
 
     Mapper = Callable[[Callable[[Part], Tools], Sequence[Part]], Iterable[Tools]]
 
@@ -108,7 +107,7 @@ class RepeatedProcedure(Result):
             InputError: a file cannot be written, or Matplotlib is not installed.
         """
         from mwdcal.files.formats import atomic, table
-        from mwdcal.planning.repetition import as_table
+        from mwdcal.planning.procedure import as_table
 
         named = {"output": Path(path), "plot": None if plot is None else Path(plot)}
         rendered = table.rendered(Path(path), as_table(self.columns, self.procedure))
@@ -310,8 +309,8 @@ class _Scene:
         effects: FilePath | Effects | None, seed: int,
     ) -> _Scene:  # fmt: skip
         """All that is named, read."""
-        from mwdcal.planning.effects import Effects, load_effects
         from mwdcal.planning.session import calibrated_tool
+        from mwdcal.planning.simulate import Effects, load_effects
         from mwdcal.registry.calibration_source import calibration_of
 
         check_whole("seed", seed, 0)
@@ -386,8 +385,7 @@ def _repeated(
 ) -> RepeatedProcedure:
     """A whole procedure for many tools: see `simulate`."""
     from mwdcal.files.limits import load_limits
-    from mwdcal.planning.procedure import Procedure
-    from mwdcal.planning.repetition import joined, summarised
+    from mwdcal.planning.procedure import Procedure, joined, summarised
 
     check_whole("repeat", repeat, 1)
     chosen = replace(with_choices(options, choices) or Options(), seed=seed)

@@ -32,9 +32,8 @@ if TYPE_CHECKING:
     from mwdcal.screens.conversion import Converted, Exported
     from mwdcal.screens.surveys.survey import SurveySummary
     from mwdcal.survey.acceptance import SurveyLimits
-    from mwdcal.survey.multistation.interference import InterferenceSize, MultiStationAnalysis
-    from mwdcal.survey.place.reference_columns import FilledRun
-    from mwdcal.survey.place.references import EarthReference
+    from mwdcal.survey.interference import InterferenceSize, MultiStationAnalysis
+    from mwdcal.survey.references import EarthReference, FilledRun
     from mwdcal.survey.surveying import SurveyedWell
     from mwdcal.survey.tool_model import SensorTerm
     from mwdcal.survey.well import Position
@@ -103,7 +102,7 @@ class PlaceReference(Result):
         Raises:
             InputError: the run cannot be read, or states a north that the reference lacks.
         """
-        from mwdcal.survey.place.reference_columns import fill
+        from mwdcal.survey.references import fill
 
         table = table_of(run, "the run", lambda path: tables.read(path, decimal=decimal))
         return FilledReferences(self.earth, fill(table, self.earth))
@@ -402,7 +401,7 @@ def reference(
     Example:
         `mwdcal.reference(latitude=60.4, longitude=5.3, date="2026-11-23").declination_deg`
     """
-    from mwdcal.survey.place.references import MEASURABLE, reference_at
+    from mwdcal.survey.references import MEASURABLE, reference_at
 
     given = {
         "gravity_g": gravity_g, "field_nt": field_nt, "dip_deg": dip_deg, "declination_deg": declination_deg,
@@ -568,7 +567,7 @@ def _source(cal: object) -> Calibration | FilePath:
 
 def _earth(reference: object) -> EarthReference | FilePath | None:
     """The reference of a place, or its file."""
-    from mwdcal.survey.place.references import EarthReference
+    from mwdcal.survey.references import EarthReference
 
     if isinstance(reference, PlaceReference):
         return reference.earth

@@ -9,8 +9,8 @@ import numpy as np
 from mwdcal import __version__
 from mwdcal.calibration.diagnosis.findings import UNUSED
 from mwdcal.calibration.readings import SIMULATED
-from mwdcal.logs.movement import NOT_AT_REST
 from mwdcal.logs.noise import ChannelNoise, Noise
+from mwdcal.logs.regular import NOT_AT_REST
 from mwdcal.pages.page import banner, environment
 from mwdcal.screens.noise import heading, marked, profile_lines, rounded, scaled, tables
 from mwdcal.screens.numbers import channels_of, number

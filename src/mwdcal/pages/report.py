@@ -30,7 +30,6 @@ from mwdcal.screens.text import plural, raised
 from mwdcal.screens.typed import findings_as_typed
 from mwdcal.screens.verification import BETWEEN_SETS, freedom
 from mwdcal.use import plots
-from mwdcal.use import verdict_plots as verdict_plots  # puts `plot` on verdicts
 from mwdcal.use.notation import Notation, convert
 from mwdcal.use.verification import SETTING_PRACTICES
 

@@ -11,7 +11,7 @@ from mwdcal.calibration.diagnosis.findings import UNUSED
 from mwdcal.calibration.readings import is_simulated, serial_of
 from mwdcal.files.contract import RAW
 from mwdcal.geometry.vectors import Array
-from mwdcal.logs.station_findings import ALL_STILL
+from mwdcal.logs.station_means import ALL_STILL
 from mwdcal.logs.stations import Stations
 from mwdcal.pages.page import banner, environment
 from mwdcal.screens.numbers import capital, channels_of, fixed, measured

@@ -11,8 +11,7 @@ import numpy as np
 
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.calibration.record import Finding, Measures
-from mwdcal.comparison.common_gauge import SCALE
-from mwdcal.comparison.compare import Comparison, Row, able
+from mwdcal.comparison.compare import SCALE, Comparison, Row, able
 from mwdcal.estimation.uncertainty import ROTATIONS
 from mwdcal.geometry.observables import TITLES
 from mwdcal.screens.numbers import UNDETERMINED, factor_places, measured, number

@@ -15,9 +15,9 @@ from mwdcal.calibration.record import SOFTWARE, Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files.contract import TEMPERATURE
 from mwdcal.files.formats import members
+from mwdcal.firmware.c_source import stated_errors
 from mwdcal.firmware.export import DEFAULT_BITS, FIXED_POINT, FirmwareSources, export
-from mwdcal.firmware.statements import stated_errors
-from mwdcal.firmware.working_range import SHARE_OF
+from mwdcal.firmware.quantisation import SHARE_OF
 from mwdcal.registry.calibration_source import calibration_of
 from mwdcal.screens.envelope import enveloped
 from mwdcal.screens.numbers import HELD, UNDETERMINED, number, written

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 from mwdcal.calibration.readings import simulated
 from mwdcal.faults.diagnosis import Diagnosis, Rival
+from mwdcal.faults.likelihood import FALSE_ALARMS
 from mwdcal.faults.physics import NONE, SURROUNDINGS
-from mwdcal.faults.weighing import FALSE_ALARMS
 from mwdcal.screens.numbers import estimate, measured
 from mwdcal.screens.text import chance, number, one_line, plural, table
 

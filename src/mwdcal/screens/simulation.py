@@ -9,9 +9,9 @@ from typing import Any
 import msgspec
 
 from mwdcal.calibration.readings import SIMULATED
-from mwdcal.planning.effects import Effects
-from mwdcal.planning.repetition import PERCENTILES, Repetition, Share
+from mwdcal.planning.procedure import PERCENTILES, Repetition, Share
 from mwdcal.planning.session import Session
+from mwdcal.planning.simulate import Effects
 from mwdcal.screens.envelope import enveloped
 from mwdcal.screens.numbers import fixed, number, written
 from mwdcal.screens.text import one_line, plural, quantity, table

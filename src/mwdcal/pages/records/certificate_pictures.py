@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 from mwdcal.calibration.record import Calibration
 from mwdcal.geometry.observables import TITLES
 from mwdcal.use import plots as plots  # puts `plot` on calibrations
-from mwdcal.use import verdict_plots as verdict_plots  # puts `plot` on verdicts
 from mwdcal.use.verification import Verdict
 
 if TYPE_CHECKING:

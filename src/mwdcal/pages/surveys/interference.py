@@ -21,11 +21,7 @@ from mwdcal.screens.surveys.interference import (
     misfit_in_words,
 )
 from mwdcal.screens.text import plural
-from mwdcal.survey.multistation.interference import (
-    Interference,
-    InterferenceStation,
-    MultiStationAnalysis,
-)
+from mwdcal.survey.interference import Interference, InterferenceStation, MultiStationAnalysis
 from mwdcal.use import plots
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 from mwdcal.calibration.canonical import SignatureCheck
 from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.certificate.keys import trusted
 from mwdcal.certificate.signature import check, signature_doubts
-from mwdcal.certificate.trusted_keys import trusted
 from mwdcal.files import documents
 from mwdcal.files.formats.members import Member
 from mwdcal.registry.calibration_source import calibration_file

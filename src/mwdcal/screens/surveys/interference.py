@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from mwdcal.calibration.readings import simulated
 from mwdcal.screens.numbers import fixed, measured, number
 from mwdcal.screens.text import chance, one_line, plural, table
-from mwdcal.survey.multistation.interference import Interference, MultiStationAnalysis
+from mwdcal.survey.interference import Interference, MultiStationAnalysis
 
 MOST_CORRECTED = 30
 """Surveys of a table on screen."""

@@ -13,8 +13,7 @@ from mwdcal.screens.envelope import enveloped
 from mwdcal.screens.numbers import fixed, signed, written
 from mwdcal.screens.text import one_line, table
 from mwdcal.screens.typed import findings_as_typed
-from mwdcal.survey.place.reference_columns import FilledRun
-from mwdcal.survey.place.references import MEASURABLE, EarthReference
+from mwdcal.survey.references import MEASURABLE, EarthReference, FilledRun
 from mwdcal.use.strengths import STANDARD_GRAVITY
 
 DECIMALS = {"gravity": 6, "field": 1, "dip": 3, "declination": 3}

@@ -17,8 +17,12 @@ from mwdcal.screens.numbers import fixed, signed, written
 from mwdcal.screens.records.signature import in_short
 from mwdcal.screens.surveys import interference
 from mwdcal.screens.text import one_line, plural, table
-from mwdcal.survey.error_terms import ErrorTerms, error_terms
-from mwdcal.survey.multistation.interference import InterferenceSize, MultiStationAnalysis
+from mwdcal.survey.interference import (
+    ErrorTerms,
+    InterferenceSize,
+    MultiStationAnalysis,
+    error_terms,
+)
 from mwdcal.survey.norths import North
 from mwdcal.survey.surveying import SurveyedWell, WellInputs
 from mwdcal.survey.well import Well

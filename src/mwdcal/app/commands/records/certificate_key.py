@@ -82,10 +82,9 @@ def trust(keys: Path, public: Path, as_json: bool) -> None:
     \b
     Example: mwdcal certificate key trust keys.json laboratory.key.pub
     """
-    from mwdcal.certificate import trusted_keys
-    from mwdcal.certificate.keys import read_public
+    from mwdcal.certificate import keys as lists
 
-    _print("trust", keys, trusted_keys.trust(keys, read_public(public)).keys, as_json)
+    _print("trust", keys, lists.trust(keys, lists.read_public(public)).keys, as_json)
 
 
 @subcommand
@@ -100,9 +99,9 @@ def retire(keys: Path, name: str, at: str, as_json: bool) -> None:
     \b
     Example: mwdcal certificate key retire keys.json 3f9a --at 2027-01-01
     """
-    from mwdcal.certificate import trusted_keys
+    from mwdcal.certificate import keys as lists
 
-    _print("retire", keys, trusted_keys.retire(keys, name, at).keys, as_json)
+    _print("retire", keys, lists.retire(keys, name, at).keys, as_json)
 
 
 @subcommand
@@ -117,9 +116,9 @@ def revoke(keys: Path, name: str, reason: str, as_json: bool) -> None:
     \b
     Example: mwdcal certificate key revoke keys.json 3f9a --reason "laptop stolen"
     """
-    from mwdcal.certificate import trusted_keys
+    from mwdcal.certificate import keys as lists
 
-    _print("revoke", keys, trusted_keys.revoke(keys, name, reason).keys, as_json)
+    _print("revoke", keys, lists.revoke(keys, name, reason).keys, as_json)
 
 
 @subcommand
@@ -130,6 +129,6 @@ def list_keys(keys: Path, as_json: bool) -> None:
     \b
     Example: mwdcal certificate key list keys.json
     """
-    from mwdcal.certificate.trusted_keys import read_trusted
+    from mwdcal.certificate.keys import read_trusted
 
     _print("list", keys, read_trusted(keys), as_json)

@@ -106,8 +106,7 @@ def command(
     """
     from mwdcal.files.formats import atomic, table
     from mwdcal.screens.surveys import reference as screen
-    from mwdcal.survey.place.reference_columns import fill
-    from mwdcal.survey.place.references import MEASURABLE, reference_at
+    from mwdcal.survey.references import MEASURABLE, fill, reference_at
 
     options.check_outputs([output], [run])
     if run and not output:

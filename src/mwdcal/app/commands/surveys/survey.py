@@ -15,7 +15,7 @@ from mwdcal.screens.typed import findings_as_typed
 
 if TYPE_CHECKING:
     from mwdcal.calibration.canonical import SignatureCheck
-    from mwdcal.survey.multistation.interference import Interference
+    from mwdcal.survey.interference import Interference
     from mwdcal.survey.surveying import SurveyedWell, WellInputs
 
 

@@ -14,7 +14,7 @@ from mwdcal.calibration.record import Calibration
 from mwdcal.estimation.evidence import ANGLES
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import AnyArray, Array, tool_from_earth
-from mwdcal.survey.multistation.interference_estimate import DETERMINED_SHARE, Estimate, estimate
+from mwdcal.survey.interference_estimate import DETERMINED_SHARE, Estimate, estimate
 
 INCLINATIONS = np.radians(np.arange(5.0, 91.0, 10.0))
 """Inclinations of the surveys that are tried, rad."""

@@ -1,7 +1,15 @@
-"""What a survey is judged and turned by at a place and date: gravity, field, dip, declination, convergence.
+"""Which source counts where several state a quantity of a place, and where two of them contradict each other.
+
+One order for gravity, field, dip, declination and convergence: the table of the readings, as it was measured with
+them; then the reference of the place, in which a measured value comes before that of a model; then a model. The
+source that does not count is still compared with the one that does.
+
+What a survey is judged and turned by at a place and date: gravity, field, dip, declination, convergence.
 
 Values come from models of the Earth, or were measured there; a measured value always stands before a
 modelled one. Each has a standard uncertainty, and says where both come from.
+
+References of a place in the columns of a run: blank cells are filled, given ones stay.
 """
 
 from __future__ import annotations
@@ -10,20 +18,115 @@ import hashlib
 import math
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
 
 from mwdcal.calibration.readings import EARTH_RANGES
 from mwdcal.calibration.record import DOCUMENT_VERSION, Finding
 from mwdcal.errors import InputError, reason
-from mwdcal.files.contract import AZIMUTH_KEYS, REFERENCES, ROTATION, Range, magnetic_offset
-from mwdcal.survey.place import earth
-from mwdcal.survey.place.grids import LEAST_DISTORTION, Grid, grid_convergence
-from mwdcal.survey.place.precedence import Claim, contradictions
+from mwdcal.files.contract import (
+    AZIMUTH_KEYS,
+    REFERENCES,
+    ROTATION,
+    Range,
+    magnetic_offset,
+    stated_norths,
+)
+from mwdcal.files.formats.columns import Column, shown
+from mwdcal.files.formats.table import Table, numbers
+from mwdcal.files.runs import check_run
+from mwdcal.geometry.vectors import Array, ArrayLike, Bools
+from mwdcal.survey import earth
+from mwdcal.survey.earth import LEAST_DISTORTION, Grid, grid_convergence
 from mwdcal.use.strengths import STANDARD_GRAVITY
+
+FARTHEST = 2.0
+"""Combined standard uncertainties beyond which one value contradicts another."""
+LARGEST_TURN = 0.01
+"""Convergences that differ by no more agree, degrees: they have no uncertainty."""
+QUANTITIES = {
+    "gravity": ("g", 5),
+    "field": ("nT", 0),
+    "dip": ("°", 2),
+    "declination": ("°", 2),
+    "convergence": ("°", 2),
+}
+"""Unit of each quantity, and decimals of a message."""
+FROM_TABLE, FROM_REFERENCE, FROM_MODEL, NO_SOURCE = "table", "reference", "field model", "none"
+"""Sources, in their order."""
+_LEAST_SHARE = 1e-9
+
+
+class Claim(NamedTuple):
+    """What a source states of a quantity: values (n,) in the unit of `QUANTITIES`, with standard uncertainties.
+
+    NaN where it states none.
+    """
+
+    source: str
+    values: ArrayLike
+    sd: ArrayLike = 0.0
+
+
+def contradictions(name: str, counts: Claim, other: Claim, remedy: str) -> list[Finding]:
+    """The finding `NAME-disagrees` if two claims differ by more than their uncertainties; the first one counts.
+
+    Definition: at `FARTHEST` standard uncertainties for one value, farther for several, so that claims that agree are
+    named as seldom, however many they are.
+    """
+    there = ~np.isnan(np.asarray(counts.values, float)) & ~np.isnan(np.asarray(other.values, float))
+    values, others, sd = (
+        np.broadcast_to(array, there.shape)[there]
+        for array in (counts.values, other.values, np.hypot(counts.sd, other.sd))
+    )
+    if not values.size:
+        return []
+    from scipy.special import ndtr, ndtri
+
+    off = values - others
+    if name in ("declination", "convergence"):
+        off = (off + 180.0) % 360.0 - 180.0
+    limit = -ndtri(ndtr(-FARTHEST) / off.size) * sd + _LEAST_SHARE * np.abs(others)
+    excess = np.abs(off) - np.maximum(limit, LARGEST_TURN if name == "convergence" else 0.0)
+    if not (excess > 0).any():
+        return []
+    return [
+        Finding(
+            id=f"{name}-disagrees",
+            text=_text(name, counts, other, (values, off, sd, excess)) + f" {remedy}",
+        )
+    ]
+
+
+def _text(name: str, counts: Claim, other: Claim, parts: tuple[Array, Array, Array, Array]) -> str:
+    """Both values where they differ most, and what counts."""
+    values, off, sd, excess = parts
+    unit, decimals = QUANTITIES[name]
+    worst, gap = int(np.argmax(excess)), "" if unit == "°" else " "
+    rows = f" at {np.count_nonzero(excess > 0)} of {off.size} rows" if off.size > 1 else ""
+    first, second, apart = (
+        f"{number:+.{decimals}f}" if unit == "°" else f"{number:.{decimals}f}"
+        for number in (values[worst], values[worst] - off[worst], off[worst])
+    )
+    spread = f" ± {sd[worst]:.{decimals}f}" if sd[worst] else ""
+    return (
+        f"{name}: {counts.source} states {first}{gap}{unit}{rows}, {other.source} {second}{gap}{unit}: they differ by "
+        f"{apart}{spread}{gap}{unit}. The value of {counts.source} counts."
+    )
+
+
+def source_of(stated: Array, otherwise: str) -> str:
+    """Where the values of rows come from, of which the table has `stated` (n,) true, and the rest `otherwise`."""
+    count = int(np.count_nonzero(stated))
+    if count in (0, len(stated)):
+        return FROM_TABLE if count else otherwise
+    return f"{FROM_TABLE} at {count} of {len(stated)} rows, else {otherwise}"
+
 
 MEASURABLE = {
     "gravity": "gravity_g",
@@ -476,3 +579,100 @@ def load_reference(path: str | os.PathLike[str]) -> tuple[EarthReference, str]:
         )
     check_ranges({key: value for key, value in numbers.items() if value is not None}, file.name)
     return reference, hashlib.sha256(data).hexdigest()
+
+
+FILLED = ("gravity", "field", "dip")
+"""References of a run that are those of a place."""
+PLACE_KEY = "earth_reference"
+"""Metadata key of a run in which references of a place were filled: where these come from."""
+
+
+class FilledRun(NamedTuple):
+    """A run with the references of a place, how many cells of each column were filled, and findings."""
+
+    table: Table
+    cells: dict[str, int]
+    findings: list[Finding]
+
+
+def fill(table: Table, reference: EarthReference) -> FilledRun:
+    """A run with blank gravity, field and dip filled, and their uncertainties beside them.
+
+    A cell that holds a value keeps it, and its uncertainty as it is. Where the run counts its azimuths from
+    true or grid north, its metadata get the declination and the convergence that they do not state. An
+    uncertainty is that of the whole run: of the place, and of the field at the moment of the run.
+    """
+    check_run(table)
+    columns, counts = dict(table.columns), {}
+    findings = _other_date(table, reference)
+    stated = stated_norths(table.metadata, table.source)
+    findings += north_contradictions(table.source, stated, 0.0, reference)
+    for name in FILLED:
+        column, value, sd = REFERENCES[name].column, *_of_run(reference, name)
+        cells = numbers(table, column) if column in columns else np.full(table.count, np.nan)
+        blank = np.isnan(cells)
+        findings += contradictions(
+            name,
+            Claim(table.source, cells, _column_uncertainties(table, f"sd_{column}")),
+            Claim("the reference", [value], sd),
+            f"Check {column}, its unit, the place and the date.",
+        )
+        counts[column] = int(blank.sum())
+        if counts[column]:
+            columns[column] = _filled(table, column, blank, value)
+            columns[f"sd_{column}"] = _filled(table, f"sd_{column}", blank, sd)
+    if not any(counts.values()):
+        text = f"{table.source}: no cell of {', '.join(counts)} is blank. Nothing was filled."
+        return FilledRun(table, counts, [*findings, Finding(id="nothing-filled", text=text)])
+    filled = replace(table, columns=columns, metadata=_metadata(table, reference))
+    return FilledRun(filled, counts, findings)
+
+
+def _of_run(reference: EarthReference, name: str) -> tuple[float, float]:
+    """A value, and its standard uncertainty in a run."""
+    key = MEASURABLE[name]
+    random = getattr(reference, f"sd_random_{key}", 0.0)
+    return getattr(reference, key), math.hypot(getattr(reference, f"sd_{key}"), random)
+
+
+def _column_uncertainties(table: Table, column: str) -> Array:
+    """Standard uncertainties (n,) of a column, 0 where none is stated."""
+    return (
+        np.nan_to_num(numbers(table, column)) if column in table.columns else np.zeros(table.count)
+    )
+
+
+def _filled(table: Table, name: str, where: Bools, value: float) -> Column:
+    """A column with a value in the blank cells where that is true; a new one is blank elsewhere."""
+    cells = table.columns.get(name)
+    if cells is None:
+        return np.where(where, value, np.nan)
+    blank = where & np.isnan(numbers(table, name))
+    if isinstance(cells, list):
+        text = repr(value).replace(".", table.decimal)
+        return [text if new else cell for cell, new in zip(cells, blank.tolist(), strict=True)]
+    return np.where(blank, value, cells)
+
+
+def _metadata(table: Table, reference: EarthReference) -> Mapping[str, object]:
+    """The metadata of a run, with what turns its azimuths and where its references come from."""
+    metadata = dict(table.metadata)
+    north, *angles = AZIMUTH_KEYS
+    if REFERENCES["azimuth"].column in table.columns:
+        if metadata.get(north, "magnetic") != "magnetic":
+            known = {key: getattr(reference, key) for key in angles}
+            metadata = {k: v for k, v in known.items() if v is not None} | metadata
+        magnetic_offset(metadata, table.source)
+    model = reference.model or "measured"
+    place = f"latitude {reference.latitude_deg:g}°, longitude {reference.longitude_deg:g}°"
+    metadata[PLACE_KEY] = f"{model}, {place}, altitude {reference.altitude_m:g} m, {reference.date}"
+    return metadata
+
+
+def _other_date(table: Table, reference: EarthReference) -> list[Finding]:
+    """That the run states another day than the reference."""
+    stated = str(table.metadata.get("date", ""))
+    if not stated or stated[: len("2026-01-01")] == str(reference.date):
+        return []
+    text = f"{table.source} states the date {shown(stated)}, the reference is of {reference.date}. Check `date`."
+    return [Finding(id="other-date", text=text)]

@@ -26,7 +26,7 @@ from mwdcal.estimation.uncertainty import TANGENT_STEP, analyse, tangent
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, diagonal
 from mwdcal.survey.acceptance import SensorTerms, load_survey_limits
-from mwdcal.survey.place.references import PLACE_SD
+from mwdcal.survey.references import PLACE_SD
 from mwdcal.survey.stations import RANDOM
 from mwdcal.use.strengths import STANDARD_GRAVITY
 
