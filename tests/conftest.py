@@ -67,14 +67,14 @@ def without_pictures(monkeypatch):
     """Pages with empty pictures: drawing takes most of the time of a page that is read for its text."""
     from markupsafe import Markup
 
-    from mwdcal.pages import pictures
+    from mwdcal.presentation import page
     from mwdcal.use.plots import Plots
 
     for name, method in vars(Plots).items():
         if isfunction(method) and not name.startswith("_"):
             monkeypatch.setattr(Plots, name, lambda *given: "")
-    monkeypatch.setattr(pictures, "picture", lambda figure, suffix: b"<svg></svg>")
-    monkeypatch.setattr(pictures, "svg", lambda figure, key: Markup("<svg></svg>"))
+    monkeypatch.setattr(page, "picture", lambda figure, suffix: b"<svg></svg>")
+    monkeypatch.setattr(page, "svg", lambda figure, key: Markup("<svg></svg>"))
 
 
 @pytest.fixture

@@ -20,10 +20,10 @@ from mwdcal.files import documents
 from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.members import Member
 from mwdcal.files.limits import load_limits
+from mwdcal.presentation.drift import RegistryDrift
 from mwdcal.registry import queries
 from mwdcal.registry.store import Registry
 from mwdcal.registry.stored import AlteredError
-from mwdcal.screens.records.drift import RegistryDrift
 from mwdcal.use.verification import Bounds, Verdict
 
 Advance = Callable[[int, int], None]

@@ -61,7 +61,7 @@ class SimulatedReadings(Readings, Result):
             InputError: a file cannot be written.
         """
         from mwdcal.files.formats import atomic, table
-        from mwdcal.screens.text import to_json
+        from mwdcal.presentation.text import to_json
 
         output, rendered = Path(path), table.rendered(Path(path), self.run_table)
         facts = None if truth is None else Path(truth)
@@ -69,7 +69,7 @@ class SimulatedReadings(Readings, Result):
         atomic.write_all([(output, rendered), (facts, to_json(self.truth) + "\n")])
 
     def _text(self) -> str:
-        from mwdcal.screens.simulation import screen
+        from mwdcal.presentation.simulation import screen
 
         return screen(self.truth)
 
@@ -116,20 +116,20 @@ class RepeatedProcedure(Result):
         self.files.update({name: file for name, file in named.items() if file})
 
     def _picture(self, suffix: str) -> bytes:
-        from mwdcal.pages.pictures import picture
-        from mwdcal.pages.repetition import figure
+        from mwdcal.presentation.page import picture
+        from mwdcal.presentation.simulation_page import figure
 
         procedure = self.procedure
         title = procedure.calibrating.plan.source, procedure.guard
         return picture(figure(self.columns, procedure.judged, *title), suffix)
 
     def _text(self) -> str:
-        from mwdcal.screens.simulation import repeated
+        from mwdcal.presentation.simulation import repeated
 
         return repeated(self._document())
 
     def _document(self) -> dict[str, Any]:
-        from mwdcal.screens.simulation import document
+        from mwdcal.presentation.simulation import document
 
         procedure = self.procedure
         facts = {
@@ -349,7 +349,7 @@ def _run(
 ) -> SimulatedReadings:
     """One run of one tool: see `simulate`."""
     from mwdcal.planning import session as sessions
-    from mwdcal.screens.simulation import document
+    from mwdcal.presentation.simulation import document
 
     scene, wanted = _Scene.of(plan, tool, calibration, effects, seed), _order(Options(order=order))
     rng = np.random.default_rng([seed, 2])
