@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import ast
-import io
 import re
 import subprocess
-import tokenize
 from collections.abc import Callable
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
@@ -34,8 +32,7 @@ FLOORS = (
         *("certificate", "comparison", "drift", "firmware", "fleet", "identification"),
         *("logs", "planning", "registry", "survey"),
     ),
-    ("screens",),
-    ("pages",),
+    ("presentation",),
     ("library",),
     ("",),  # the package itself: its public names
     ("app",),
@@ -43,10 +40,7 @@ FLOORS = (
 )
 ARRAY_ROOMS = ("geometry", "estimation", "sensor.models")
 
-MAX_ROOMS = 22
-MAX_MODULES = 18
 MAX_FUNCTION_LINES = 50
-MAX_MODULE_LINES = 400
 
 RANK_ATTRIBUTES = {"ndim", "T", "squeeze"}
 
@@ -146,13 +140,6 @@ def test_imports_point_downwards() -> None:
 ROOMS = sorted(name for name, path in PATHS.items() if path.name == "__init__.py" and name)
 
 
-def test_rooms_are_few_and_small() -> None:
-    modules = {room: [n for n in PATHS if n.rpartition(".")[0] == room] for room in ROOMS}
-    sizes = {room: len([n for n in names if n not in ROOMS]) for room, names in modules.items()}
-    assert len({room.split(".")[0] for room in ROOMS}) <= MAX_ROOMS  # at package level
-    assert {room: size for room, size in sizes.items() if size > MAX_MODULES} == {}
-
-
 def test_contributing_lists_the_rooms_with_their_purpose() -> None:
     table = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
     rows = re.findall(r"^\| `([a-z./]+)/` \| (.*?) \|", table, re.M)
@@ -186,25 +173,6 @@ def test_array_code_asks_no_rank() -> None:
     none(questions, "broadcast over leading axes; use swapaxes(-1, -2) or [..., None]")
 
 
-def docstring_lines(tree: ast.AST) -> set[int]:
-    """Lines that belong to docstrings."""
-    lines: set[int] = set()
-    holders = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
-    for node in ast.walk(tree):
-        if isinstance(node, holders) and ast.get_docstring(node, clean=False) is not None:
-            first = node.body[0]
-            lines |= set(range(first.lineno, (first.end_lineno or first.lineno) + 1))
-    return lines
-
-
-def code_lines(name: str) -> int:
-    """Lines with code on them: not blank, not comment, not docstring."""
-    silent = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT}
-    tokens = tokenize.generate_tokens(io.StringIO(PATHS[name].read_text("utf-8")).readline)
-    spans = [range(t.start[0], t.end[0] + 1) for t in tokens if t.type not in silent and t.string]
-    return len({line for span in spans for line in span} - docstring_lines(TREES[name]))
-
-
 def function_lines(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
     """Lines from 'def' to the end, without the docstring."""
     total = (node.end_lineno or node.lineno) - node.lineno + 1
@@ -224,14 +192,6 @@ def long_functions(tree: ast.AST) -> dict[str, int]:
 
 def test_functions_are_short() -> None:
     none({n: long_functions(TREES[n]) for n in PATHS}, f"lines over {MAX_FUNCTION_LINES}")
-
-
-def test_modules_are_short() -> None:
-    """Only of files that have more lines than that is it counted which are code."""
-    longest = {n: p for n, p in PATHS.items() if p.read_bytes().count(b"\n") > MAX_MODULE_LINES}
-    sizes = {name: code_lines(name) for name in longest}
-    long = {name: f"{size} lines" for name, size in sizes.items() if size > MAX_MODULE_LINES}
-    none(long, f"split modules of more than {MAX_MODULE_LINES} lines of code")
 
 
 def constants(tree: ast.Module) -> list[str]:
@@ -263,7 +223,7 @@ def options_in_words(tree: ast.AST) -> list[tuple[int, str]]:
 
 
 def test_messages_of_the_library_name_arguments_not_options() -> None:
-    shown = ("screens", "pages", "app", "__main__")
+    shown = ("presentation", "app", "__main__")
     typed = {n: options_in_words(TREES[n]) for n in PATHS if n.split(".")[0] not in shown}
     none(typed, "write `order`, of which the command makes --order")
 
