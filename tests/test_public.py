@@ -580,7 +580,9 @@ def test_a_masked_reading_is_missing(simulated):
 
 def test_readings_that_keep_a_mask_are_refused(simulated):
     for name in ("accelerometer", "temperature"):
-        values = np.full(simulated.count, 25.0) if name == "temperature" else getattr(simulated, name)
+        values = (
+            np.full(simulated.count, 25.0) if name == "temperature" else getattr(simulated, name)
+        )
         run = replace(simulated, **{name: hidden(values, (5,), 0.5)[0]})
         with pytest.raises(mwdcal.InputError, match=r"mask.*mwdcal\.readings"):
             mwdcal.calibrate(run)

@@ -18,7 +18,7 @@ import numpy as np
 from mwdcal.errors import InputError
 from mwdcal.files.formats.columns import LABELS
 from mwdcal.files.formats.table import shown
-from mwdcal.files.synonyms import CONVERSIONS, resembled
+from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW, CONVERSIONS, resembled
 from mwdcal.geometry.vectors import Array, Bools
 
 CHANNELS = {"accelerometer": ("ax", "ay", "az"), "magnetometer": ("mx", "my", "mz")}
@@ -99,9 +99,9 @@ COLUMNS = ("station", "group", *RANGES)
 MAPPED = (*COLUMNS, "serial")
 """Columns that a table may have under another name."""
 _UNITS_BY_END = {
-    "deg": ("°", "rad"),
+    "deg": ("°", "rad", "gon"),
     "g": ("g", "mg", "m/s²"),
-    "nt": ("nT", "µT", "mT", "gauss"),
+    "nt": ("nT", "µT", "mT", "gauss", "mG"),
     "c": ("°C", "°F", "K"),
 }
 """The units of a quantity by the end of its column's name, that of the contract first."""
@@ -115,11 +115,15 @@ def units_of(column: str) -> tuple[str, ...]:
     """The units that a column may be given in, that of the contract first; any for a raw channel.
 
     >>> units_of("ref_field_nt")
-    ('nT', 'µT', 'mT', 'gauss')
+    ('nT', 'µT', 'mT', 'gauss', 'mG')
     >>> units_of("ax")
     ()
     """
     end = column.rpartition("_")[2]
+    if column == "ref_inclination_deg":
+        return (*_UNITS_BY_END[end], ABOVE, BELOW)
+    if column == "ref_toolface_deg":
+        return (*_UNITS_BY_END[end], ANTICLOCKWISE)
     return _UNITS_BY_END.get(end, ()) if column.removeprefix("sd_") not in (*RAW, *LABELS) else ()
 
 

@@ -22,7 +22,7 @@ from mwdcal.calibration.readings import (
     is_simulated,
     serial_of,
 )
-from mwdcal.errors import InputError
+from mwdcal.errors import FitError, InputError
 from mwdcal.files import synonyms
 from mwdcal.files.contract import (
     CHANNELS,
@@ -86,6 +86,8 @@ def read_export(
     form = profile.table
     if isinstance(form, msgspec.UnsetType):
         return tables.read(path, decimal=decimal, rows=rows)
+    if form.find:
+        return _looked_for(path, profile)
     try:
         serial = _sources(profile).get("serial", ColumnSource(name="serial")).name
         table = tables.read(path, rows=rows, export=form, serial=serial)
@@ -99,10 +101,49 @@ def read_export(
         table = tables.read(path, decimal=decimal, rows=rows)
         if set(CHANNELS["accelerometer"]) <= {*table.columns}:
             return table
+    if is_moved(path, profile):
+        return _looked_for(path, profile)
     raise InputError(
         f"{problem} If the table is laid out otherwise than the tool profile says, correct [table] there, "
         "or propose a profile for it: mwdcal profile."
     )
+
+
+def is_moved(path: str | os.PathLike[str], profile: Profile) -> bool:
+    """Whether a file holds the table of a profile elsewhere than the profile says."""
+    form = profile.table
+    assert not isinstance(form, msgspec.UnsetType)
+    with suppress(InputError, FitError):
+        where = tables.laid_out(path, wanted=_channels_of(profile))
+        return where is not None and (where.form, where.sheet) != (form, "")
+    return False
+
+
+def _channels_of(profile: Profile) -> list[str]:
+    return [each.name for column, each in _sources(profile).items() if column in RAW]
+
+
+def _looked_for(path: str | os.PathLike[str], profile: Profile) -> Table:
+    """The table in a file that has the channels of a profile, wherever it is.
+
+    Raises:
+        InputError: there is none, or a column is in another unit than the profile says.
+        FitError: there are several.
+    """
+    form = profile.table
+    assert not isinstance(form, msgspec.UnsetType)
+    decimal = "," if form.decimal == "," else ""
+    where = tables.laid_out(path, sheet=form.sheet, wanted=_channels_of(profile), decimal=decimal)
+    if where is None:
+        return tables.read(path)
+    named = {each.name: column for column, each in _sources(profile).items()}
+    for name, unit in zip(where.names, map(synonyms.unit_of, where.units), strict=True):
+        stated = _sources(profile)[named[name]].unit if name in named else ""
+        if unit and stated and unit != stated and not stated.startswith(f"{unit} "):
+            raise InputError(
+                f"{Path(path).name}: {shown(name)} is in {unit}, by the tool profile in {stated}."
+            )
+    return tables.of_layout(where, path, [n for n, column in named.items() if column in LABELS])
 
 
 def _check_below_names(path: str | os.PathLike[str], form: TableFormat, profile: Profile) -> None:

@@ -19,7 +19,7 @@ from mwdcal.files.formats.columns import shown
 from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, UNCERTAINTIES
 
 _SPELLINGS = {
-    "°": "deg degree degrees",
+    "°": "deg degree degrees grad",
     "rad": "rad radian radians",
     "°C": "c celsius",
     "°F": "f fahrenheit",
@@ -30,14 +30,18 @@ _SPELLINGS = {
     "nT": "nt gamma",
     "µT": "ut",
     "mT": "millit",
-    "gauss": "gauss",
+    "gauss": "gauss oersted",
+    "mG": "milligauss",
+    "gon": "gon gons",
     "V": "v",
     "mV": "mv",
-    "counts": "lsb counts",
+    "counts": "lsb counts count cnt cnts adc digits digit",
     "raw": "raw",
 }
 _UNITS = {word: unit for unit, words in _SPELLINGS.items() for word in words.split()}
 """Units by the words of names, as `_words` leaves them."""
+ABOVE, BELOW, ANTICLOCKWISE = "° above horizontal", "° below horizontal", "° anticlockwise"
+"""Units of angles that count otherwise: an elevation upwards or downwards from the horizontal, a toolface."""
 CONVERSIONS = {
     "°F": "°C = (°F - 32) · 5/9",
     "K": "°C = K - 273.15",
@@ -47,6 +51,11 @@ CONVERSIONS = {
     "µT": "nT = µT · 1000",
     "mT": "nT = mT · 1e6",
     "gauss": "nT = gauss · 1e5",
+    "mG": "nT = mG · 100",
+    "gon": "° = gon · 0.9",
+    ABOVE: "inclination = 90° + elevation",
+    BELOW: "inclination = 90° - elevation",
+    ANTICLOCKWISE: "toolface = -angle",
 }
 """How another unit is converted into that of the contract."""
 FACTORS = {
@@ -58,10 +67,15 @@ FACTORS = {
     "µT": (1e3, 0.0),
     "mT": (1e6, 0.0),
     "gauss": (1e5, 0.0),
+    "mG": (1e2, 0.0),
+    "gon": (0.9, 0.0),
+    ABOVE: (1.0, 90.0),
+    BELOW: (-1.0, 90.0),
+    ANTICLOCKWISE: (-1.0, 0.0),
 }
 """The same in numbers: factor, and what is added to the product."""
 _WARM = ("°C", "°F", "K")
-_MAGNETIC_UNITS = ("nT", "µT", "mT", "gauss")
+_MAGNETIC_UNITS = ("nT", "µT", "mT", "gauss", "mG")
 WARMTH = "temperature_c"
 _STATED = {"ref", "reference", "local"}
 """Words of columns that are known, not measured."""
@@ -69,23 +83,53 @@ _BYWORDS = _STATED | {
     *("true", "grid", "mag", "magnetic", "stand", "nominal", "target", "given", "set", "angle"),
     *("value", "tool", "mwd", "survey", "measured", "meas", "calc", "calculated", "computed"),
     *("corr", "corrected", "avg", "mean", "median", "sensor", "board", "internal", "electronics"),
-    *("probe", "chip"),
+    *(
+        "probe",
+        "chip",
+        "adc",
+        "cnt",
+        "cnts",
+        "count",
+        "counts",
+        "digits",
+        "output",
+        "out",
+        "channel",
+        "ch",
+        "axis",
+    ),
+    *(
+        "sens",
+        "reading",
+        "actual",
+        "stated",
+        "applied",
+        "ist",
+        "obs",
+        "observatory",
+        "table",
+        "ring",
+        "dial",
+    ),
 }
 """Words that do not change what a column resembles."""
 _SPREADS = {"sd", "sigma", "std", "stdev", "unc", "uncertainty"}
+_ACCELEROMETERS = "acc accel acceleration accelerometer g a gravity grav"
+_MAGNETOMETERS = "mag magnetometer b h flux fluxgate m magfield magneticfield magn fg"
 _INSTEAD = {
     "ref_inclination_deg": "inc incl incli inclin inclination",
     "ref_azimuth_deg": "azi azm azim azimut azimuth hdg heading bearing",
-    "ref_toolface_deg": "tf gtf hs hstf tface toolface highside highsidetoolface gravitytoolface",
-    "ref_gravity_g": "gravity gtotal gtot totalg totalgravity gravitytotal gravityfield tgf gt",
+    "ref_toolface_deg": "tf gtf hs hstf tface toolface highside highsidetoolface highsidetf "
+    "gravitytoolface roll rollangle hsg rotation",
+    "ref_gravity_g": "gravity gtotal gtot totalg totalgravity gravitytotal gravityfield tgf gt localg localgravity",
     "ref_field_nt": "btotal btot totalb htotal htot totalh bt tmf tfield bfield hfield totalfield "
-    "fieldtotal fieldstrength magtotal totalmag",
+    "fieldtotal fieldstrength magtotal totalmag tmi bref href fref",
     "ref_dip_deg": "dip magdip mdip",
     "temperature_c": "temp temperature temperatur tmp tempc tempf temperaturec temperaturef degc degf",
     "serial": "serial sn serialno serialnumber serialnr tool toolid toolserial toolsn",
     "group": "rollset",
-    **{f"a{i}": f"acc{i} accel{i} acceleration{i} accelerometer{i} g{i}" for i in "xyz"},
-    **{f"m{i}": f"mag{i} magnetometer{i} b{i} h{i} flux{i}" for i in "xyz"},
+    **{f"a{i}": " ".join(f"{w}{i} {i}{w}" for w in _ACCELEROMETERS.split()) for i in "xyz"},
+    **{f"m{i}": " ".join(f"{w}{i} {i}{w}" for w in _MAGNETOMETERS.split()) for i in "xyz"},
 }
 _SYNONYMS = {word: column for column, words in _INSTEAD.items() for word in words.split()}
 _CHANNELS = tuple(f"{letter}{axis}" for letter in "am" for axis in "xyz")
@@ -182,6 +226,10 @@ OURS = ("time_s", "start_s", "end_s", "samples", "drifting", "serial", "simulate
 """Columns beyond the contract that mwdcal itself reads or writes in run files."""
 _COPIED = ("drift_", "witsml ")
 """What columns begin with that mwdcal writes of a log, and that a WITSML file has beyond a run's."""
+_COMPUTED = re.compile(
+    r"(?<![A-Za-z])(calc|calculated|computed|berechnet)(?![A-Za-z])", re.IGNORECASE
+)
+"""Words of columns that a program has computed from the readings: no evidence."""
 _BRACKETED = re.compile(r"(.*\S)\s*[(\[{]([^(\[{]*)[)\]}]", re.DOTALL)
 _CASED = {
     "mV": " mv ",
@@ -246,6 +294,8 @@ def _column(whole: str, bare: str, words: set[str], unit: str) -> str | None:
         "ref_gravity_g": bare == "g" and stated,
     }
     short = (s.removeprefix("ref").removesuffix("deg") for s in (whole, bare))
+    if bare in ("tx", "ty", "tz") and unit in _MAGNETIC_UNITS:
+        return f"m{bare[1]}"
     known = [_SYNONYMS[stem] for stem in (whole, bare, *short) if stem in _SYNONYMS]
     return next(iter([column for column, fits in rules.items() if fits] + known), None)
 
@@ -327,7 +377,7 @@ def check_evidence(
 ) -> None:
     """Refuse a column that resembles one of those to be noticed, where that itself is absent."""
     results, absent = _results(names), {*noticed}.difference(names)
-    alike = {name: resembled(name) for name in names if name not in results}
+    alike = {n: resembled(n) for n in names if n not in results and not _COMPUTED.search(n)}
     meant = [(name, each) for name, each in alike.items() if each and each.column in absent]
     if not meant:
         return

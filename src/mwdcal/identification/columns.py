@@ -3,39 +3,31 @@
 from __future__ import annotations
 
 import re
-import unicodedata
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from mwdcal.errors import FitError
+from mwdcal.errors import FitError, InputError
 from mwdcal.files.contract import CHANNELS, MAPPED, RAW, REFERENCES, forms, units_of
 from mwdcal.files.formats.columns import shown
-from mwdcal.files.synonyms import WARMTH, Resemblance, begins_as, resembled, unit_of
+from mwdcal.files.synonyms import (
+    ABOVE,
+    ANTICLOCKWISE,
+    BELOW,
+    WARMTH,
+    Resemblance,
+    begins_as,
+    resembled,
+    unit_of,
+)
 from mwdcal.geometry.vectors import Array
+from mwdcal.identification.words import spelled
 from mwdcal.sensor.profile import ColumnSource
 
-_TRANSLATIONS = (
-    ("grav(?=axial|tran)", "acc "),
-    ("axial", "Z "),
-    ("tran(s|sverse|sversal)?[ _]*1", "X "),
-    ("tran(s|sverse|sversal)?[ _]*2", "Y "),
-    ("neigung|inklination|inclinaison|inclinacion", "inclination"),
-    ("azimut(?!h)|acimut", "azimuth"),
-    ("rollwinkel|roll angle|werkzeugwinkel", "toolface"),
-    ("beschleunigung", "acc"),
-    ("magnetfeld(?=[ _]*[xyz])", "mag"),
-    ("feldstarke|gesamtfeld|champ total", "total field"),
-    ("schwere|gravitation", "gravity"),
-    ("temperature?n?", "temperature"),
-    ("sollwert|soll|referenz|stand", "ref"),
-    ("seriennummer|seriennr", "serial"),
-    ("gerat|sonde", "tool"),
-    (r"magn\b\.?|magnetisch", "magnetic"),
-)
-"""Words of other languages and of WITSML, and the word of the field for each."""
 _LABELS = {
-    "station": "station stn stationnr stationno stationnumber position pos posnr messpunkt punkt point shot nr no",
+    "station": "station stn stationnr stationno stationnumber position pos posnr messpunkt punkt point shot nr no "
+    "stasjon estacion punto lage row id",
     "group": "group gruppe set rollset",
 }
 """Names of columns of labels; a column is one only where no other is."""
@@ -45,9 +37,28 @@ _MEASURED = re.compile(
     re.IGNORECASE,
 )
 """Words of angles that the tool itself has measured: no references."""
-_OTHER_NORTH = re.compile(r"true|grid|geogra|wahr|gitter|rechtweisend", re.IGNORECASE)
-_OF_NORTH = re.compile(r"north|nord|azi|azm|heading", re.IGNORECASE)
+_OTHER_NORTH = re.compile(
+    r"true|grid|geogra|wahr|gitter|rechtweisend|[qc]uadr[ií]cula|verdadero|verdadeiro|istinn|kartnord|истин|сетк|географ|真|坐标北|网格",
+    re.IGNORECASE,
+)
+_OF_NORTH = re.compile(r"north|nord|norte|azi|azm|heading|азим|север|北|方位", re.IGNORECASE)
 """Words of the north that azimuths count from."""
+_NUMBERED = re.compile(r"(.*?[A-Za-z])[ _-]*([123])((?:\W.*|_[A-Za-z]+)?)")
+_BARE_AZ = re.compile(r"az\W*(deg|°)?\W*", re.IGNORECASE)
+_BARE_AX = re.compile(r"a[xy]\b.*", re.IGNORECASE)
+_CCW = re.compile(
+    r"\(?(counter|anti)[ -]?clockwise\)?|\bccw\b|gegen (den )?uhrzeiger\w*|против час\w*",
+    re.IGNORECASE,
+)
+"""Words of angles that count anticlockwise."""
+_SPOKEN = {"rad": r"radian|радиан|\brad\b", "gon": r"\bgon\b"}
+"""Units of angles in a line above a table."""
+_SURROUNDINGS = re.compile(
+    r"oven|chamber|ambient|(?<![a-z])(air|room|bath|lab)(?![a-z])|ofen|kammer|umgebung|raum|ovn|rom|horno|ambiente|"
+    r"камер|печ|термостат|环境|烘箱|室温",
+    re.IGNORECASE,
+)
+"""What has a temperature of its own that is not the tool's."""
 _IN_BRACKETS = re.compile(r"[(\[]([^)\]]*)[)\]]\s*$")
 _BY_VALUE: dict[str, tuple[tuple[str, float, float], ...]] = {
     "ref_gravity_g": (("g", 0.9, 1.1), ("m/s²", 9.0, 10.5), ("mg", 990.0, 1010.0)),
@@ -56,6 +67,8 @@ _BY_VALUE: dict[str, tuple[tuple[str, float, float], ...]] = {
     ),
 }  # fmt: skip
 """Units of quantities of which the Earth has but one range of values; 980 may be milli-g or gal."""
+LEAST_ROLLS = 5
+"""Toolfaces from which on their unit is told by their range."""
 COOLEST_FAHRENHEIT = 45.0
 """Numbers below it are degrees Celsius: no tool is calibrated below 7 °C alone."""
 HOTTEST_CELSIUS = 200.0
@@ -65,25 +78,18 @@ Values = Callable[[str], Array | None]
 """The numbers of a column by its name; None where it holds no numbers."""
 
 
-def spelled(name: str) -> str:
-    """A name in plain letters, with the words of the field.
-
-    >>> spelled("Neigung Soll (°)"), spelled("gravTran1Raw")
-    ('inclination ref (°)', 'acc X Raw')
-    """
-    text = name.replace("°", "\0").replace("²", "\1")
-    text = unicodedata.normalize("NFKD", text)
-    text = "".join(c for c in text if not unicodedata.combining(c))
-    for pattern, word in _TRANSLATIONS:
-        text = re.sub(pattern, word, text, flags=re.IGNORECASE)
-    return text.replace("\0", "°").replace("\1", "²").strip()
-
-
 def meaning(name: str, unit: str = "") -> Resemblance | None:
     """What a column holds by its name, and its unit, stated beside the name or in it."""
     if name in MAPPED:
         return Resemblance(name, unit_of(unit) or "".join(units_of(name)[:1]))
     plain = spelled(f"{name} ({unit})" if unit else name)
+    if "elevation" in plain:
+        return Resemblance("ref_inclination_deg", BELOW if "below" in plain else ABOVE)
+    if _CCW.search(plain):
+        turned = resembled(_CCW.sub("", plain))
+        return turned and (
+            turned._replace(unit=ANTICLOCKWISE) if turned.column == "ref_toolface_deg" else turned
+        )
     alike = resembled(plain)
     if _MEASURED.search(plain) and not (alike and alike.column == WARMTH):
         return None
@@ -93,6 +99,85 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     return alike or (Resemblance(spelt, unit_of(stated[1]) if stated else "") if spelt else None)
 
 
+def meanings_of(names: Sequence[str], units: Sequence[str]) -> dict[str, Resemblance]:
+    """What columns hold by their names, those of the others considered.
+
+    Channels may be numbered: G1, G2, G3. `AZ` without `AX` and `AY` is the azimuth. Inklination is the dip where
+    there is a Neigung.
+    """
+    numbered = _numbered(names)
+    results = {
+        name: m
+        for name, unit in zip(names, units, strict=True)
+        if (m := meaning(numbered.get(name, name), unit))
+    }
+    lone = [n for n, m in results.items() if m.column == "az" and _BARE_AZ.fullmatch(n)]
+    if lone and not any(_BARE_AX.fullmatch(n) for n in names):
+        results[lone[0]] = Resemblance("ref_azimuth_deg", "°")
+    inclined = [n for n, m in results.items() if m.column == "ref_inclination_deg"]
+    dips = [n for n in inclined if re.search("inklination", n, re.IGNORECASE)]
+    if len(dips) == 1 and any(re.search("neigung", n, re.IGNORECASE) for n in inclined):
+        results[dips[0]] = results[dips[0]]._replace(column="ref_dip_deg")
+    return results
+
+
+def _numbered(names: Sequence[str]) -> dict[str, str]:
+    """Names that end in 1, 2 and 3, where all three are there, with x, y and z instead."""
+    parts = {name: match for name in names if (match := _NUMBERED.fullmatch(name))}
+    stems = {(m[1], m[3]) for m in parts.values()}
+    whole = {s for s in stems if {m[2] for m in parts.values() if (m[1], m[3]) == s} == {*"123"}}
+    return {
+        name: f"{m[1]} {'xyz'[int(m[2]) - 1]} {m[3]}".strip()
+        for name, m in parts.items()
+        if (m[1], m[3]) in whole
+    }
+
+
+def _answered(
+    answers: Mapping[str, str], names: Sequence[str], meanings: dict[str, Resemblance], source: str
+) -> None:
+    """Replace what columns hold by what the user says: the name of a column, with its unit in brackets behind it."""
+    for ours, theirs in answers.items():
+        if ours not in MAPPED:
+            raise InputError(
+                f"`column` {shown(ours)}: expected one of {', '.join(MAPPED[:14])} and their sd_…."
+            )
+        name, unit = theirs, ""
+        match = _IN_BRACKETS.search(theirs)
+        if theirs not in names and match:
+            name, unit = theirs[: match.start()].strip(), match[1].strip()
+        if name and name not in names:
+            raise InputError(
+                f"{source}: there is no column {shown(name)}; found {', '.join(map(shown, names[:24]))}."
+            )
+        stated = meanings[name].unit if name in meanings else ""
+        for other in [n for n, m in meanings.items() if m.column == ours or n == name]:
+            del meanings[other]
+        if name:
+            meanings[name] = Resemblance(ours, unit_of(unit) or unit or stated)
+
+
+class Questions(list[str]):
+    """What names and readings leave open, each with the option that answers it."""
+
+    def ask(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """What a function returns; None where it has a question."""
+        try:
+            return function(*arguments)
+        except FitError as question:
+            self.append(str(question))
+            return None
+
+    def raise_any(self, source: str) -> None:
+        """Raise all questions together."""
+        texts = [each.removeprefix(f"{source}: ") for each in dict.fromkeys(self)]
+        if len(texts) == 1:
+            raise FitError(f"{source}: {texts[0]}")
+        if texts:
+            listed = "\n".join(f"{n}. {text}" for n, text in enumerate(texts, 1))
+            raise FitError(f"{source}: {len(texts)} questions are open.\n{listed}")
+
+
 def proposed(
     names: Sequence[str],
     units: Sequence[str],
@@ -100,47 +185,99 @@ def proposed(
     source: str,
     above: Sequence[str] = (),
     north_is_stated: bool = False,
+    answers: Mapping[str, str] | None = None,
+    problems: Mapping[str, str] | None = None,
 ) -> tuple[dict[str, ColumnSource], set[str]]:
     """The columns of a table by the name that they have in a run file, and those with a unit by their values.
 
-    `above`: lines above the names. `north_is_stated`: the table's metadata say what azimuths count from.
+    `above`: lines above the names. `north_is_stated`: the table's metadata say what azimuths count from. `answers`:
+    columns of the table by the name of the run file, as the user says. `problems`: what is wrong with columns of
+    which `values` gave none although most of their cells are numbers.
 
     Raises:
-        FitError: two columns of which each may be one of the run file's, a unit that neither name nor
-            values tell, azimuths from true or grid north, or no accelerometer.
+        InputError: an answer that names no column.
+        FitError: columns of which each may be one of the run file's, a unit that neither name nor
+            values tell, azimuths from true or grid north, no accelerometer: all that is open.
     """
-    meanings = {
-        name: m for name, unit in zip(names, units, strict=True) if (m := meaning(name, unit))
-    }
+    meanings = meanings_of(names, units)
+    _answered(answers or {}, names, meanings, source)
+    spoken = _spoken(meanings, values, above)
+    questions = Questions()
     chosen: dict[str, ColumnSource] = {}
     for column in dict.fromkeys(m.column for m in meanings.values()):
         candidates = [name for name, m in meanings.items() if m.column == column]
-        candidates = [n for n in candidates if column == "serial" or values(n) is not None]
-        if candidates:
-            name = _one(column, candidates, source)
-            chosen[column] = ColumnSource(
-                name=name, unit=_unit(column, name, meanings[name].unit, values(name), source)
+        numbers = [n for n in candidates if column == "serial" or values(n) is not None]
+        damaged = [problems[n] for n in candidates if problems and n in problems]
+        if damaged and not _stated_among(numbers):
+            questions += damaged
+        candidates = numbers
+        name = questions.ask(_one, column, candidates, source) if candidates else None
+        if name:
+            unit = questions.ask(
+                _unit,
+                column,
+                name,
+                meanings[name].unit or _angles(column, spoken),
+                values(name),
+                source,
             )
+            chosen[column] = ColumnSource(name=name, unit=unit or "")
     azimuth = chosen.get(REFERENCES["azimuth"].column)
     if azimuth and not north_is_stated:
-        _check_north(azimuth.name, above, source)
+        questions.ask(_check_north, azimuth.name, above, source)
     for triad, channels in CHANNELS.items():
         if not {*channels} & {*chosen}:
-            _check_hidden(triad, channels, [n for n in names if n not in meanings], source)
+            others = [n for n in names if n not in meanings]
+            questions.ask(_check_hidden, triad, channels, others, source)
+    questions.ask(_check_triads, names, chosen, source)
+    questions.ask(_check_units_of_triads, chosen, source)
+    questions.raise_any(source)
+    by_value = {c for c, each in chosen.items() if each.unit and not meanings[each.name].unit}
+    return _labels(names, chosen) | chosen, by_value
+
+
+def _stated_among(names: Sequence[str]) -> bool:
+    """Whether one of the columns is called a reference, beside which damaged ones do not matter."""
+    return any(_CALLED_REFERENCE.search(spelled(name)) for name in names)
+
+
+def _spoken(meanings: Mapping[str, Resemblance], values: Values, above: Sequence[str]) -> str:
+    """The unit of angles that a line above the table states, or that toolfaces can only have.
+
+    A run needs rolls: toolfaces that are all below 6.3 are in radians.
+    """
+    text = " ".join(above)
+    stated = (unit for unit, words in _SPOKEN.items() if re.search(words, text, re.IGNORECASE))
+    if unit := next(stated, ""):
+        return unit
+    rolls = [
+        values(n) for n, m in meanings.items() if m.column == "ref_toolface_deg" and not m.unit
+    ]
+    known = [roll[np.isfinite(roll)] for roll in rolls if roll is not None]
+    return "rad" if any(r.size > LEAST_ROLLS and _maybe_radians(r) for r in known) else ""
+
+
+def _angles(column: str, unit: str) -> str:
+    """The unit of angles for a column of angles of the stand; empty for others."""
+    stand = column in [REFERENCES[name].column for name in ("inclination", "azimuth", "toolface")]
+    return unit if stand else ""
+
+
+def _check_triads(names: Sequence[str], chosen: Mapping[str, ColumnSource], source: str) -> None:
+    """Refuse a table without accelerometers, or with a part of the magnetometers."""
     absent = [name for name in RAW[:3] if name not in chosen]
     if absent:
+        answer = " ".join(f"{name}=NAME" for name in absent)
         raise FitError(
             f"{source}: no column says by its name that it is {', '.join(absent)}; the names are "
-            f"{', '.join(map(shown, names[:20]))}. Name the accelerometers such as Gx, Gy, Gz or ax, ay, az."
+            f"{', '.join(map(shown, names[:20]))}. Name the accelerometers such as Gx, Gy, Gz or ax, ay, az, or say "
+            f"which they are by `column` {answer}."
         )
     if 0 < sum(name in chosen for name in RAW[3:]) < 3:
         raise FitError(
             f"{source}: of the magnetometers only {', '.join(n for n in RAW[3:] if n in chosen)} can be told by "
-            "name. Name all three such as Bx, By, Bz or mx, my, mz."
+            "name. Name all three such as Bx, By, Bz or mx, my, mz, or say which they are by `column`."
         )
-    _check_units_of_triads(chosen, source)
-    by_value = {c for c, each in chosen.items() if each.unit and not meanings[each.name].unit}
-    return _labels(names, chosen) | chosen, by_value
 
 
 def _check_hidden(triad: str, channels: Sequence[str], others: Sequence[str], source: str) -> None:
@@ -172,7 +309,7 @@ def _check_north(name: str, above: Sequence[str], source: str) -> None:
     line = next(
         (each for each in above if _OTHER_NORTH.search(each) and _OF_NORTH.search(each)), ""
     )
-    if not line and not _OTHER_NORTH.search(name):
+    if not line and not _OTHER_NORTH.search(f"{name} {spelled(name)}"):
         return
     said = f"by the line {shown(line)}" if line else "by its name"
     raise FitError(
@@ -186,17 +323,19 @@ def _one(column: str, candidates: Sequence[str], source: str) -> str:
     """The only candidate for a column: of its very name, or the only one that is called a reference."""
     if column in candidates:
         return column
+    if column == WARMTH:
+        candidates = [n for n in candidates if not _SURROUNDINGS.search(n)] or candidates
     if column == WARMTH and len(candidates) > 1:
         raise FitError(
             f"{source}: {' and '.join(map(shown, candidates))} may each be the temperature of the tool. Rename the "
-            f"one nearest to the sensors to '{column}', or remove the others."
+            f"one nearest to the sensors to '{column}', or say which by `column` {column}=NAME."
         )
     stated = [name for name in candidates if _CALLED_REFERENCE.search(spelled(name))]
     if len(candidates) == 1 or len(stated) == 1:
         return (stated or candidates)[0]
     raise FitError(
         f"{source}: {' and '.join(map(shown, candidates))} may each be '{column}'. Call the one that the stand "
-        "shows a reference, such as 'Ref " + candidates[0] + "', or remove the other."
+        f"shows a reference, such as 'Ref {candidates[0]}', or say which by `column` {column}=NAME."
     )
 
 
@@ -235,7 +374,8 @@ def _maybe_fahrenheit(temperatures: Array) -> bool:
 def _open(name: str, column: str, allowed: Sequence[str], source: str) -> FitError:
     return FitError(
         f"{source}: {shown(name)} is '{column}', and neither its name nor its values say whether it is in "
-        f"{' or '.join(allowed)}. Write the unit behind the name, such as '{name} ({allowed[0]})'."
+        f"{' or '.join(allowed)}. Write the unit behind the name, such as '{name} ({allowed[0]})', or say it "
+        f"by `column` {column}='{name} ({allowed[0]})'."
     )
 
 

@@ -1,17 +1,11 @@
-"""A tool profile proposed for a table as it was exported.
-
-Which tool axis each channel measures, and its nominal scale, from readings at known attitudes.
-
-Each channel is a straight line of the component of the field along its tool axis, but for misalignment:
-raw = scale · component + offset. Of all 48 signed permutations of a triad the right one leaves a few
-per cent of the channels' variation, any other most of it, unless the attitudes do not tell them apart.
-"""
+"""A tool profile proposed for a table as it was exported."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from itertools import permutations, product
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,94 +17,19 @@ from mwdcal.calibration.record import Finding
 from mwdcal.errors import FitError, InputError
 from mwdcal.files.contract import CHANNELS, MAPPED, REFERENCES, units_of
 from mwdcal.files.formats import table as tables
-from mwdcal.files.formats.columns import shown
-from mwdcal.files.formats.dialect import Export
+from mwdcal.files.formats.columns import LABELS, shown
+from mwdcal.files.formats.figures import is_figure
+from mwdcal.files.formats.layout import Layout
 from mwdcal.files.formats.table import Table
+from mwdcal.files.formats.table import labels as labels_of
 from mwdcal.files.metadata import toml
 from mwdcal.files.runs import check_run, renamed, to_readings
+from mwdcal.files.synonyms import ABOVE, BELOW
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
-from mwdcal.identification.columns import proposed
-from mwdcal.sensor.profile import ColumnSource, Profile, TriadProfile
-
-EXPLAINED = 0.3
-"""Largest share of the channels' variation that the right axes leave: misalignment, noise, bias."""
-ALTERNATIVE = 0.2
-"""By how much less they leave than any others."""
-LEAST_WITHOUT, LEAST_RATIO = 0.1, 2.0
-"""A sign is told where without the component that tells it this share would be left, and so many times as much."""
-LEAST_STATIONS = 5
-
-
-class Wiring(NamedTuple):
-    """The axes and scale of a triad, the share that they leave, and others that fit about as well."""
-
-    axes: tuple[str, ...]
-    scale: float
-    unexplained: float
-    next_best: float
-    alternatives: list[tuple[str, ...]]
-
-
-def wiring(raw: Array, *parts: Array) -> Wiring:
-    """The axes of a triad by its raw readings (n, 3) and the field along the tool axes.
-
-    `parts` (n, 3) each: components of the field at right angles to each other, which may come in unknown
-    shares; the sign of the first is known. The scale is in raw units per unit of the field.
-    Singular: a channel or a component that hardly varies explains nothing; its axis and sign stay open. So does the
-    sign where the other component explains the readings as well, as at two inclinations and one azimuth.
-    """
-    shares, sizes = np.ones((2, 3, 3)), np.zeros((3, 3))
-    moved = raw - raw.mean(0)
-    spread = np.sqrt(np.mean(moved**2, 0))
-    for axis in range(3):
-        design = np.stack([part[:, axis] - part[:, axis].mean() for part in parts], -1)
-        size = np.sqrt(np.mean(design**2, 0))
-        seen = size > 0.02 * np.sqrt(np.mean(np.square(parts), (1, 2)))
-        if not seen[0]:
-            continue
-        columns = design[:, seen]
-        slope, share = _line(columns, moved)
-        sizes[:, axis] = np.linalg.norm(slope, axis=0)
-        alive = spread > 0.02 * spread.max()
-        bare = _line(columns[:, 1:], moved)[1]
-        signed = (bare > np.maximum(LEAST_WITHOUT, LEAST_RATIO * share)) | (columns.shape[1] == 1)
-        for sign in (0, 1):
-            right = slope[0] > 0 if sign == 0 else slope[0] < 0
-            shares[sign, :, axis] = np.where(alive & (right | ~signed), share, 1.0)
-    ranked = sorted(
-        (float(np.sqrt(np.mean(shares[signs, range(3), order] ** 2))), order, signs)
-        for order in permutations(range(3))
-        for signs in product((0, 1), repeat=3)
-    )
-    best, order, signs = ranked[0]
-    near = [each for each in ranked if each[0] < best + ALTERNATIVE]
-    scale = float(np.median(sizes[range(3), order]))
-    return Wiring(
-        _named(order, signs), scale, best, ranked[1][0], [_named(*each[1:]) for each in near]
-    )
-
-
-def _line(columns: Array, moved: Array) -> tuple[Array, Array]:
-    """Slopes (K, 3) of the channels on columns (n, K), and the share of their variation that is left (3,).
-
-    Per degree of freedom: few stations do not seem explained by many columns.
-    """
-    count, width = columns.shape
-    slope, *_ = np.linalg.lstsq(columns, moved, rcond=1e-9)
-    spread = np.sqrt(np.sum(moved**2, 0) / (count - 1))
-    left = np.sqrt(np.sum((moved - columns @ slope) ** 2, 0) / (count - 1 - width))
-    return np.asarray(slope), np.asarray(np.minimum(left / np.maximum(spread, 1e-300), 1.0))
-
-
-def _named(order: tuple[int, ...], signs: tuple[int, ...]) -> tuple[str, ...]:
-    return tuple("+-"[sign] + "xyz"[axis] for axis, sign in zip(order, signs, strict=True))
-
-
-def is_clear(result: Wiring) -> bool:
-    """Whether the readings leave no choice of axes."""
-    return len(result.alternatives) == 1 and result.unexplained < EXPLAINED
-
+from mwdcal.identification.columns import meanings_of, proposed
+from mwdcal.identification.wiring import LEAST_STATIONS, Wiring, is_clear, wiring
+from mwdcal.sensor.profile import ColumnSource, Profile, TableFormat, TriadProfile
 
 NEEDED = {
     "accelerometer": ("inclination", "toolface"),
@@ -145,33 +64,47 @@ class Proposal(NamedTuple):
     run_sha256: str
 
 
-def propose(path: str | os.PathLike[str]) -> Proposal:
+def propose(
+    path: str | os.PathLike[str],
+    *,
+    sheet: str = "",
+    header_row: int = 0,
+    decimal: str = "",
+    answers: Mapping[str, str] | None = None,
+    stated: Mapping[str, object] | None = None,
+) -> Proposal:
     """The profile with which a table of stations at known attitudes is a calibration run.
+
+    `sheet`, `header_row` and `decimal` say where the table is and how its numbers are written, `answers` which
+    column holds what, `stated` what the table does not say of the tool, as metadata.
 
     Raises:
         InputError: the file cannot be read, or is no table of stations.
         FitError: columns, units or axes that names and readings leave open.
     """
-    export = tables.recognised(path)
-    form = None if _is_documented(path, export) else export.form
-    table = tables.read(path, export=form)
+    where = tables.laid_out(path, sheet=sheet, header_row=header_row, decimal=decimal)
+    table, form = _as_written(path, where, bool(sheet or header_row or decimal))
+    table = replace(table, metadata={**table.metadata, **(stated or {})})
+    names = where.names if where else [*table.columns]
+    units = where.units if where else [""] * len(names)
+    above = where.above if where else ()
+
+    problems: dict[str, str] = {}
 
     def values(name: str) -> Array | None:
         try:
             return tables.numbers(table, name)
-        except InputError:
+        except InputError as error:
+            if 2 * sum(map(is_figure, labels_of(table, name))) > table.count:
+                problems[name] = str(error)
             return None
 
-    stated = "azimuth_reference" in table.metadata
+    north_stated = "azimuth_reference" in table.metadata
     columns, by_value = proposed(
-        export.names, export.units, values, table.source, export.above, stated
+        names, units, values, table.source, above, north_stated, answers, problems
     )
     profile = Profile(name=Path(path).stem, table=form or msgspec.UNSET, columns=columns)
-    run = renamed(table, profile)
-    check_run(run)
-    readings, _ = to_readings(run, profile)
-    _check_gravity(readings, columns)
-    wirings = _wirings(run, readings)
+    profile, readings, wirings = _wired(table, profile)
     scales = {kind: _rounded(result.scale) for kind, result in wirings.items()}
     if readings.relative:
         scales["magnetometer"] = None
@@ -192,17 +125,80 @@ def propose(path: str | os.PathLike[str]) -> Proposal:
     )
 
 
-def _is_documented(path: str | os.PathLike[str], export: Export) -> bool:
-    """Whether a table, but for the names of its columns, is written as a run file is."""
-    suffix, form = Path(path).suffix.lower(), export.form
-    if form.first_line != form.header_line + 1 and suffix != ".parquet":
+def _wired(table: Table, profile: Profile) -> tuple[Profile, Readings, dict[str, Wiring]]:
+    """The readings of a table by a profile, and the axes of its triads.
+
+    An elevation may count upwards or downwards: the sense is the one by which the channels are a right-handed set.
+    """
+    run = renamed(table, profile)
+    check_run(run)
+    readings, _ = to_readings(run, profile)
+    columns = profile.columns
+    assert not isinstance(columns, msgspec.UnsetType)
+    _check_gravity(readings, columns)
+    wirings = _wirings(run, readings)
+    inclination = columns.get(REFERENCES["inclination"].column)
+    if inclination and inclination.unit == ABOVE and all(map(_is_left_handed, wirings.values())):
+        below = {
+            **columns,
+            REFERENCES["inclination"].column: ColumnSource(name=inclination.name, unit=BELOW),
+        }
+        return _wired(table, msgspec.structs.replace(profile, columns=below))
+    return profile, readings, wirings
+
+
+def _is_left_handed(result: Wiring) -> bool:
+    permutation = TriadProfile(axes=result.axes).permutation  # type: ignore[arg-type]
+    return bool(np.linalg.det(permutation) < 0)
+
+
+def _as_written(
+    path: str | os.PathLike[str], where: Layout | None, told: bool
+) -> tuple[Table, TableFormat | None]:
+    """The table of a file, and how a profile says it is written: not at all where it is written as documented.
+
+    Where neither that nor a fixed place gives the table of the layout, it is to be looked for whenever it is read.
+    """
+    if where is None:
+        return tables.read(path), None
+    labels = {
+        name for name, m in meanings_of(where.names, where.units).items() if m.column in LABELS
+    }
+    table = tables.of_layout(where, path, labels)
+    for form in [] if told else [None, where.form]:
+        if form or _is_documented(path, where.form):
+            with suppress(InputError):
+                plain = tables.read(path, export=form)
+                if _same(plain, table):
+                    return plain, form
+    form = TableFormat(find=True)
+    if told:
+        form = msgspec.structs.replace(form, sheet=where.sheet, decimal=where.form.decimal)
+    return table, form
+
+
+def _is_documented(path: str | os.PathLike[str], form: TableFormat) -> bool:
+    """Whether a table, but for the names of its columns, may be written as a run file is."""
+    usual = {".csv": ",", ".tsv": "\t"}.get(Path(path).suffix.lower(), form.delimiter)
+    below = form.first_line == form.header_line + 1
+    return below and form.delimiter == usual and form.decimal == "."
+
+
+def _same(one: Table, other: Table) -> bool:
+    """Whether two tables have the same columns, rows and metadata."""
+    if [*one.columns] != [*other.columns] or [*one.lines] != [*other.lines]:
         return False
-    if suffix in (".csv", ".tsv") and form.delimiter != {".csv": ",", ".tsv": "\t"}[suffix]:
+    if not set(other.metadata) <= set(one.metadata):
         return False
+    return all(_cells(one, name) == _cells(other, name) for name in one.columns)
+
+
+def _cells(table: Table, name: str) -> list[str]:
+    """The cells of a column as numbers in their shortest form, or as they are."""
     try:
-        return [*tables.read(path).columns] == export.names and form.decimal == "."
+        return [repr(value) for value in tables.numbers(table, name).tolist()]
     except InputError:
-        return False
+        return labels_of(table, name)
 
 
 def _rounded(scale: float) -> float | None:
@@ -327,11 +323,7 @@ def _choice(kind: str, result: Wiring) -> str:
 
 def left_handed(proposal: Proposal) -> list[Finding]:
     """A finding on triads whose channels x, y, z are a left-handed set by the axes proposed."""
-    triads = [
-        kind
-        for kind, result in proposal.wirings.items()
-        if np.linalg.det(TriadProfile(axes=result.axes).permutation) < 0  # type: ignore[arg-type]
-    ]
+    triads = [kind for kind, result in proposal.wirings.items() if _is_left_handed(result)]
     if not triads:
         return []
     return [
@@ -365,8 +357,13 @@ def as_toml(proposal: Proposal, source: str) -> str:
     if not isinstance(profile.table, msgspec.UnsetType):
         lines += ["", "[table]"]
         fields = msgspec.structs.asdict(profile.table)
-        if source.lower().endswith(".xlsx"):
+        usual = msgspec.structs.asdict(TableFormat())
+        if profile.table.find:
+            fields = {key: value for key, value in fields.items() if value != usual[key]}
+        elif source.lower().endswith(".xlsx"):
             fields = {key: fields[key] for key in ("header_line", "first_line")}
+        else:
+            fields = {key: fields[key] for key in fields if key not in ("find", "sheet")}
         lines += [f"{key} = {toml(value)}" for key, value in fields.items()]
     if not isinstance(profile.columns, msgspec.UnsetType):
         lines += [

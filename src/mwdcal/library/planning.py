@@ -337,16 +337,30 @@ class ProposedProfile(Result):
         return summary(self.proposal, self.path, self.files.get("output"))
 
 
-def propose_profile(table_path: FilePath) -> ProposedProfile:
-    """Propose a tool profile for a table as a logger or spreadsheet program has written it.
+def propose_profile(
+    table_path: FilePath,
+    *,
+    sheet: str = "",
+    header_row: int = 0,
+    decimal: str = "",
+    serial: str = "",
+    date: str = "",
+    column: Mapping[str, str] | None = None,
+) -> ProposedProfile:
+    """Propose a tool profile for a table as a laboratory keeps it: text or workbook, of any layout.
 
-    Definition: encoding, delimiter and decimal sign, the meaning and unit of each column, and, from readings at
-    known attitudes, the axes and nominal scales of both triads. `read_run(table_path, proposed.profile)` then takes
-    the table as it is.
+    Definition: where the table is, how its numbers are written, the meaning and unit of each column, and, from
+    readings at known attitudes, the axes and nominal scales of both triads. `read_run(table_path, proposed.profile)`
+    then takes the table as it is.
+
+    `sheet`, `header_row` (of the column names) and `decimal` ("." or ",") say what is open about the table, `column`
+    which column holds what, by the name of the run file: {"ref_azimuth_deg": "Azi 2"}, with the unit in brackets
+    behind the name where the table does not state it; a blank name for a column that is none. `serial` and `date`
+    of the run where the table states none.
 
     Raises:
         InputError: the file cannot be read, or is not a table of stations.
-        FitError: names and readings leave columns, units or axes open; the message names the alternatives.
+        FitError: names and readings leave something open; the message has all questions, each with what answers it.
 
     Example::
 
@@ -356,4 +370,13 @@ def propose_profile(table_path: FilePath) -> ProposedProfile:
     """
     from mwdcal.identification.proposal import propose
 
-    return ProposedProfile(propose(table_path), Path(table_path))
+    stated = {"serial": serial, "date": date}
+    proposal = propose(
+        table_path,
+        sheet=sheet,
+        header_row=header_row,
+        decimal=decimal,
+        answers=column,
+        stated={key: value for key, value in stated.items() if value},
+    )
+    return ProposedProfile(proposal, Path(table_path))

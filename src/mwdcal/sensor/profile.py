@@ -125,14 +125,17 @@ class TableFormat(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """How the tables of a logger or a spreadsheet program are written.
 
     `header_line` holds the column names, `first_line` the first readings; what stands above and
-    between is not read. A workbook has only these two, which count its rows.
+    between is not read. A workbook has only these two, which count its rows. Where `find` is set, the table is
+    looked for by the names of its columns instead, on the sheet named, if any.
     """
 
-    encoding: Literal["utf-8", "utf-16", "cp1252"] = "utf-8"
+    encoding: Literal["utf-8", "utf-16", "cp1252", "cp1251", "gb18030"] = "utf-8"
     delimiter: Literal[",", ";", "\t", "|"] = ","
     decimal: Literal[".", ","] = "."
     header_line: int = 1
     first_line: int = 2
+    find: bool = False
+    sheet: str = ""
 
 
 class ColumnSource(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -5,16 +5,18 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mwdcal.errors import InputError, reason
-from mwdcal.files.formats import atomic, dialect, text
+from mwdcal.files import metadata as meta
+from mwdcal.files.formats import atomic, dialect, layout, sheets, text
 from mwdcal.files.formats.columns import (
     LABELS,
     Column,
@@ -25,18 +27,22 @@ from mwdcal.files.formats.columns import (
     looks_numeric,
 )
 from mwdcal.files.formats.columns import shown as shown
+from mwdcal.files.formats.titles import day_of_rows, titles
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import TableFormat
 
 _TABLES = {
     ".csv": "formats.text",
     ".tsv": "formats.text",
+    **dict.fromkeys((".txt", ".dat", ".lvm", ".asc", ".prn"), "formats.text"),
     ".parquet": "formats.parquet",
     ".xlsx": "formats.workbook",
 }
 _FORMATS = {**_TABLES, ".xml": "exchange.witsml", ".las": "exchange.las"}
-SUFFIXES = tuple(_TABLES)
+SUFFIXES = (".csv", ".tsv", ".txt", ".parquet", ".xlsx")
 """Of tables as documented; those of other programs are `EXCHANGED`."""
+LAID_OUT = (*(s for s in _TABLES if s != ".parquet"), *sheets.OTHER_WORKBOOKS)
+"""Suffixes of files in which a table is looked for."""
 EXCHANGED = (".xml", ".las")
 """Suffixes of WITSML and LAS, whose columns are taken from the format's own names."""
 
@@ -105,13 +111,29 @@ def parsed(
     suffix = _suffix(Path(name))
     form = _format(suffix)
     arguments: dict[str, Any] = {"most": rows} if suffix == ".parquet" else {}
+    stated = titles(_above(data, suffix, export, name)).metadata if export else {}
     if export and form is text:
         data, arguments = dialect.plain(data, export, name), {"delimiter": export.delimiter}
     elif suffix == ".xlsx":
         arguments = {"form": export, "serial": serial}
     decimal = export.decimal if export else decimal
     parts: Parts = form.parse(data, name, **arguments)
-    return Table(parts.columns, parts.metadata, name, parts.lines, digest, decimal)
+    metadata = {**stated, **parts.metadata}
+    if export and "date" not in metadata:
+        texts = ((n, c) for n, c in parts.columns.items() if isinstance(c, list))
+        day = next(filter(None, (day_of_rows(name, cells) for name, cells in texts)), "")
+        metadata |= {"date": day} if day else {}
+    return Table(parts.columns, metadata, name, parts.lines, digest, decimal)
+
+
+def _above(data: bytes, suffix: str, export: TableFormat, name: str) -> Sequence[Sequence[object]]:
+    """The rows above the column names of an export."""
+    if suffix == ".xlsx":
+        rows = takewhile(
+            lambda row: row[0] < export.header_line, _format(suffix).read_rows(data, name)
+        )
+        return [["" if cell is None else cell for cell in cells] for _, cells in rows]
+    return dialect.above(data, export, name) if _format(suffix) is text else []
 
 
 def check_decimal(decimal: str) -> None:
@@ -189,19 +211,44 @@ def cell_error(table: Table, name: str, row: int, problem: str) -> InputError:
     return InputError(f"{table.source}, {word} {number}, column '{name}': {problem}")
 
 
-def recognised(path: str | os.PathLike[str]) -> dialect.Export:
-    """How a file that another program has written holds its table."""
+def laid_out(
+    path: str | os.PathLike[str],
+    *,
+    sheet: str = "",
+    header_row: int = 0,
+    wanted: Collection[str] = (),
+    decimal: str = "",
+) -> layout.Layout | None:
+    """Where the table is in a text or workbook as a laboratory keeps it; None of a format without a layout.
+
+    Raises:
+        InputError: the file cannot be read, or holds no such table.
+        FitError: several tables that may be meant, or an open decimal sign.
+    """
     file = Path(path)
-    data, suffix = _content(file), _suffix(file)
-    if suffix == ".xlsx":
-        rows = dict(_format(suffix).read_rows(data, file.name))
-        cells = [[as_text(c) for c in rows.get(n, ())] for n in range(1, max(rows, default=0) + 1)]
-        return dialect.recognised_rows(cells, TableFormat(), file.name)
-    if (form := _format(suffix)) is not text:
-        names = [*form.parse(data, file.name).columns]
-        return dialect.Export(TableFormat(), names, [""] * len(names))
-    text.refuse_foreign(data, file.name, allowed=text.UTF_16)
-    return dialect.recognised_text(data, file.name)
+    if file.suffix.lower() not in LAID_OUT:
+        return None
+    return layout.laid_out(
+        sheets.sheets_of(_content(file), file.name),
+        file.name,
+        sheet=sheet,
+        header_line=header_row,
+        wanted=wanted,
+        decimal=decimal,
+    )
+
+
+def of_layout(where: layout.Layout, path: str | os.PathLike[str], kept: Collection[str]) -> Table:
+    """The table of a layout in a file; the cells of the columns `kept` as they stand, of labels and serials."""
+    own = [(n, line) for n, line in enumerate(where.above, 1) if dialect.is_metadata(line)]
+    stated = meta.parse(own, Path(path).name)
+    return Table(
+        layout.as_columns(where, kept),
+        {**where.titles.metadata, **stated},
+        Path(path).name,
+        where.lines,
+        hashlib.sha256(_content(Path(path))).hexdigest(),
+    )
 
 
 def below_names(path: str | os.PathLike[str], form: TableFormat) -> list[tuple[int, Sequence[str]]]:
@@ -219,12 +266,17 @@ def below_names(path: str | os.PathLike[str], form: TableFormat) -> list[tuple[i
 
 def _format(suffix: str) -> Any:
     """The module that reads and writes a format."""
+    if suffix in sheets.OTHER_WORKBOOKS:
+        raise InputError(
+            f"{suffix} files are read with a tool profile that mwdcal profile has made of one. Name it, or save the "
+            "sheet as .xlsx."
+        )
     return import_module(f"mwdcal.files.{_FORMATS[suffix]}")
 
 
 def _suffix(path: Path) -> str:
     suffix = path.suffix.lower()
-    if suffix not in _FORMATS:
+    if suffix not in _FORMATS and suffix not in sheets.OTHER_WORKBOOKS:
         raise InputError(
             f"'{path}': the suffix must be one of {', '.join(_FORMATS)}; got "
             f"'{suffix or 'none'}'. Convert or rename the file."

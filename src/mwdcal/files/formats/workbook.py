@@ -166,8 +166,8 @@ def _check_formulas(archive: zipfile.ZipFile, sheet: str, source: str) -> None:
         )
 
 
-def read_rows(data: bytes, source: str) -> Iterator[Row]:
-    """Row numbers and cells of the first sheet, without blank cells at the end and blank rows."""
+def read_rows(data: bytes, source: str, sheet: int = 0) -> Iterator[Row]:
+    """Row numbers and cells of a sheet, by default the first, without blank cells at the end and blank rows."""
     openpyxl = _module(source)
     advice = "Save it again as .xlsx, or as CSV UTF-8."
     with (
@@ -178,13 +178,23 @@ def read_rows(data: bytes, source: str) -> Iterator[Row]:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             workbook_limits.check(archive, source)
             book = openpyxl.load_workbook(io.BytesIO(data), read_only=True, data_only=True)
-            page = book.worksheets[0]
+            page = book.worksheets[sheet]
             _check_formulas(archive, page._worksheet_path, source)
         page.reset_dimensions()
         for line, row in enumerate(page.iter_rows(values_only=True), 1):
             cells = _trimmed([_read(value) for value in row])
             if cells:
                 yield line, cells
+
+
+def sheet_names(data: bytes, source: str) -> list[str]:
+    """The names of the sheets of a workbook."""
+    advice = "Save it again as .xlsx, or as CSV UTF-8."
+    with damaged_unless_read(source, "an Excel workbook (.xlsx)", advice):
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            workbook_limits.check(archive, source)
+        book = _module(source).load_workbook(io.BytesIO(data), read_only=True)
+        return [page.title for page in book.worksheets]
 
 
 def _read(value: object) -> object:

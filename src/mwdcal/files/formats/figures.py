@@ -1,0 +1,123 @@
+"""Numbers as people and programs write them in the cells of a table."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+from mwdcal.errors import FitError, InputError
+from mwdcal.files.formats.columns import as_text, looks_numeric
+
+_SPACES = re.compile(r"(?<=\d)[ '’\u00a0\u202f\u2009](?=\d{3}(\D|$))")
+"""What separates thousands and is never a decimal sign."""
+_NUMBER = r"[+\-−]?(?:\d+(?:[.,]\d+)*[.,]?|[.,]\d+)(?:[eE][+\-−]?\d+)?"
+_FIGURE = re.compile(rf"({_NUMBER})\s*([°º%]?\s?[A-Za-zµμ²/°º]{{0,6}})")
+_PLAIN = re.compile(_NUMBER)
+_DEGREES = re.compile(
+    r"([+\-−]?)(\d+)\s*[°º]\s*(\d+(?:[.,]\d+)?)\s*['′’]\s*(?:(\d+(?:[.,]\d+)?)\s*(?:[\"″”]|''))?"
+)
+"""Degrees, minutes and seconds."""
+_BEARING = re.compile(r"([NS])\s*(\d+(?:[.,]\d+)?)\s*°?\s*([EWO])", re.IGNORECASE)
+"""A bearing by quadrants, such as N45E."""
+_GROUPED = re.compile(r"[+\-−]?[1-9]\d{0,2}([.,]\d{3})+")
+_POINTED = {
+    ".": re.compile(r"[+\-−]?[1-9]\d{0,2}(,\d{3})+(\.\d*)?"),
+    ",": re.compile(r"[+\-−]?[1-9]\d{0,2}(\.\d{3})+(,\d*)?"),
+}
+"""Numbers with separators of thousands, by their decimal sign."""
+
+
+def is_figure(cell: object) -> bool:
+    """Whether a cell is a number, with separators or a unit behind it, or an angle in degrees and minutes.
+
+    >>> [is_figure(cell) for cell in (1.5, "1.234,5", "23.4 mV", "45°30'", "P1", "", True)]
+    [True, True, True, True, False, False, False]
+    """
+    if not isinstance(cell, str):
+        return isinstance(cell, int | float) and not isinstance(cell, bool)
+    text = _SPACES.sub("", cell)
+    return any(form.fullmatch(text) for form in (_FIGURE, _DEGREES, _BEARING))
+
+
+def decimal_sign(cells: Sequence[object], source: str) -> str:
+    """The decimal sign of the numbers in cells of text; the point where there are none.
+
+    Raises:
+        InputError: both signs are in use, and neither separates thousands.
+        FitError: the sign in all numbers may be either.
+    """
+    texts = [_SPACES.sub("", cell) for cell in cells if isinstance(cell, str) and is_figure(cell)]
+    found = [match[1] for match in map(_FIGURE.fullmatch, texts) if match]
+    commas = [cell for cell in found if "," in cell]
+    points = [cell for cell in found if "." in cell]
+    if not commas and not points:
+        return "."
+    fits = {
+        sign: all(
+            looks_numeric(c.replace("−", "-"), sign) or _POINTED[sign].fullmatch(c) for c in found
+        )
+        for sign in ".,"
+    }
+    if fits["."] != fits[","]:
+        return "." if fits["."] else ","
+    if not fits["."]:
+        raise InputError(
+            f"{source}: numbers with a comma ({(commas or found)[0]}) and with a point ({(points or found)[0]}) are "
+            "mixed. Export the table with one decimal sign."
+        )
+    if all(map(_GROUPED.fullmatch, commas + points)):
+        sign, marked = ("comma", commas) if commas else ("point", points)
+        raise FitError(
+            f"{source}: the {sign} in {marked[0]} may be a decimal sign or separate thousands. Say which by `decimal`."
+        )
+    return "," if commas else "."
+
+
+def column(cells: Sequence[object], sign: str) -> tuple[list[str], str]:
+    """The cells as text whose numbers have a decimal point, and the unit that stands behind all of them.
+
+    A column of which any cell is no number stays as it is, except where numbers stand in it.
+    """
+    texts = [cell.strip() if isinstance(cell, str) else as_text(cell) for cell in cells]
+    filled = [_SPACES.sub("", text) for text in texts if text]
+    if filled and all(map(_DEGREES.fullmatch, filled)):
+        return [_degrees(text, sign) for text in texts], "°"
+    if filled and all(map(_BEARING.fullmatch, filled)):
+        return [_azimuth(text, sign) for text in texts], "°"
+    units = {match[2].strip() for match in map(_FIGURE.fullmatch, filled) if match}
+    alike = len(units) == 1 and all(map(_FIGURE.fullmatch, filled))
+    unit = units.pop() if alike else ""
+    return [_pointed(text, sign, unit) for text in texts], unit
+
+
+def _pointed(text: str, sign: str, unit: str) -> str:
+    """A cell with the decimal point, without separators and its unit, if it is a number; else as it is."""
+    bare = _SPACES.sub("", text).replace("−", "-")
+    if unit:
+        bare = bare.removesuffix(unit).strip()
+    if not _PLAIN.fullmatch(bare) or (looks_numeric(bare) and sign == "."):
+        return bare if _PLAIN.fullmatch(bare) else text
+    if _POINTED[sign].fullmatch(bare) and not looks_numeric(bare, sign):
+        bare = bare.replace("." if sign == "," else ",", "")
+    return bare.replace(",", ".") if looks_numeric(bare, sign) else text
+
+
+def _azimuth(text: str, sign: str) -> str:
+    """A bearing by quadrants as an azimuth; blank stays blank."""
+    match = _BEARING.fullmatch(text)
+    if not match:
+        return text
+    pole, angle, side = match.groups()
+    east = float(angle.replace(sign, ".")) * (1 if side.upper() == "E" else -1)
+    return repr((east if pole.upper() == "N" else 180 - east) % 360)
+
+
+def _degrees(text: str, sign: str) -> str:
+    """Degrees, minutes and seconds in degrees; blank stays blank."""
+    match = _DEGREES.fullmatch(text)
+    if not match:
+        return text
+    minus, *parts = match.groups()
+    degrees, minutes, seconds = (float((part or "0").replace(sign, ".")) for part in parts)
+    value = degrees + minutes / 60 + seconds / 3600
+    return repr(-value if minus in ("-", "−") else value)

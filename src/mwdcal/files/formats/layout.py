@@ -1,0 +1,404 @@
+"""Where the table is in a file as a laboratory keeps it, and what it says above and below.
+
+A sheet may begin with a title block; names of columns stand in up to three rows, units in or below them; rows
+of means, remarks and signatures follow. `laid_out` finds the readings among them and says what it left out.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from mwdcal.errors import FitError, InputError
+from mwdcal.files.formats import figures
+from mwdcal.files.formats.columns import as_text, looks_numeric, plain_names, shown
+from mwdcal.files.formats.titles import Titles, day_of_rows, titles
+from mwdcal.files.synonyms import unit_of
+from mwdcal.geometry.vectors import Array
+from mwdcal.sensor.profile import TableFormat
+
+LEAST_COLUMNS = 4
+"""Columns that a table with three channels and a reference has at least."""
+_MOST_HEADER_ROWS = 3
+_BESIDES = 8
+"""Rows of readings from which another table in the file is one to be asked about."""
+_SUMMARY = re.compile(
+    r"\W*(mean|average|avg|median|std\w*|st\.?\s?dev\w*|standard deviation|rms|min(imum)?|max(imum)?|sum|total|range|"
+    r"span|mittel(wert)?|durchschnitt|stabw\w*|standardabw\w*\.?|summe|snitt|gjennomsnitt|standardavvik|media|"
+    r"promedio|desv\w*( est\w*)?|m[eé]dia|desvio( padr[aã]o)?|moyenne|[eé]cart[- ]type|среднее|ско|мин|макс|сумма|"
+    r"平均(值)?|标准差|最大值?|最小值?|合计|spread|σ|µ)\W*",
+    re.IGNORECASE,
+)
+"""What a row of statistics is called in its first cell."""
+_OF_LOGGERS = re.compile(
+    r"(avg|smp|min|max|std|tot|float|double|int\d*|real|string|-+|=+)", re.IGNORECASE
+)
+"""What loggers write below names and units: how a value was sampled, of what type it is, rules."""
+_UNIT_BEHIND = re.compile(r"(.*?)\s*([(\[][^)\]]*[)\]])")
+_AXIS = re.compile(r"\W*([xyz123])\W*([(\[].*)?", re.IGNORECASE)
+"""A name that is an axis alone, and says nothing without the title above it."""
+_DEGREES_OF = re.compile(
+    r"(.+?)[\s,(\[_]+(?:(?P<d>deg|grad|град|°|grados|graus|度)|(?P<m>min|мин|minutos|'|′|分))\W*",
+    re.IGNORECASE,
+)
+"""The name of a column of degrees, or of minutes."""
+_BRACKETS = re.compile(r"[(\[][^)\]]*[)\]]")
+
+Cells = Sequence[object]
+
+
+class Sheet(NamedTuple):
+    """The rows of a sheet that are not blank, by number, each without blank cells at its end.
+
+    `form`: encoding and delimiter of a text.
+    """
+
+    name: str
+    rows: list[tuple[int, Cells]]
+    form: TableFormat = TableFormat()
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A table in a sheet: names and units of its columns, their cells, and what was not read.
+
+    `form` says how the table is written, `cells` are text, numbers in it with a decimal point, and `texts` the same
+    as they stand there. `left_out` are lines below the names that are no readings, `above` the texts above them;
+    `titles` what the title block says of the tool and the day.
+    """
+
+    sheet: str
+    form: TableFormat
+    names: list[str]
+    units: list[str]
+    cells: list[list[str]]
+    texts: list[list[str]]
+    lines: list[int]
+    above: tuple[str, ...] = ()
+    titles: Titles = field(default_factory=lambda: Titles({}))
+    left_out: tuple[tuple[int, str], ...] = ()
+
+    @property
+    def size(self) -> int:
+        """Cells of readings."""
+        return len(self.lines) * len(self.names)
+
+
+def laid_out(
+    sheets: Sequence[Sheet],
+    source: str,
+    *,
+    sheet: str = "",
+    header_line: int = 0,
+    wanted: Collection[str] = (),
+    decimal: str = "",
+) -> Layout:
+    """The table of readings in the sheets of a file.
+
+    `sheet` and `header_line` say where it is, `wanted` what columns it has; otherwise the largest one is meant.
+
+    Raises:
+        InputError: no such sheet, row or columns, or no table.
+        FitError: two tables that may both be meant, or a decimal sign that the numbers leave open.
+    """
+    asked = [each for each in sheets if each.name == sheet] if sheet else list(sheets)
+    if not asked:
+        names = ", ".join(shown(each.name) for each in sheets)
+        raise InputError(f"{source}: there is no sheet {shown(sheet)}. The sheets are {names}.")
+    tables = [
+        layout
+        for each in asked
+        for layout in _tables(each, source, decimal)
+        if header_line in (0, layout.form.header_line) and {*wanted} <= {*layout.names}
+    ]
+    if not tables:
+        raise _no_table(source, header_line, wanted)
+    best = max(tables, key=lambda layout: layout.size)
+    alike = [t for t in tables if t is not best and _alike(t, best) and len(t.lines) >= _BESIDES]
+    if alike and not header_line:
+        raise _several([best, *alike], source, sheet)
+    return best
+
+
+def _alike(one: Layout, other: Layout) -> bool:
+    """Whether two tables have the same columns, in whatever case."""
+    return {n.casefold() for n in one.names} == {n.casefold() for n in other.names}
+
+
+def _no_table(source: str, header_line: int, wanted: Collection[str]) -> InputError:
+    if wanted:
+        names = ", ".join(shown(name) for name in [*wanted][:8])
+        return InputError(f"{source}: no table with the columns {names} was found.")
+    where = f" with column names in row {header_line}" if header_line else ""
+    return InputError(
+        f"{source}: no rows of numbers under column names were found{where}. A table needs one row per station, "
+        f"at least {LEAST_COLUMNS} columns, and names above them."
+    )
+
+
+def _several(tables: Sequence[Layout], source: str, sheet: str) -> FitError:
+    places = [
+        f"{f'sheet {shown(t.sheet)}, ' if t.sheet else ''}row {t.form.header_line} ({len(t.lines)} rows)"
+        for t in sorted(tables, key=lambda t: (t.sheet, t.form.header_line))
+    ]
+    sheets = {t.sheet for t in tables}
+    option = "`sheet`" if len(sheets) == len(tables) and not sheet else "`header_row`"
+    return FitError(
+        f"{source} holds {len(tables)} tables with the same columns: {'; '.join(places)}. Say which one is meant by "
+        f"{option}."
+    )
+
+
+def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
+    """The tables of a sheet, one below the other."""
+    rows = sheet.rows
+    heads = [k for k in range(len(rows)) if _is_head(rows, k)]
+    heads = [k for n, k in enumerate(heads) if n == 0 or not _repeats(rows, heads[0], k)]
+    for head, end in pairwise([*heads, len(rows)]):
+        if layout := _table(sheet, head, end, source, decimal):
+            yield layout
+
+
+def _is_head(rows: Sequence[tuple[int, Cells]], place: int) -> bool:
+    """Whether the readings begin below a row: it is not one, and the next one is."""
+    below = place + 1 < len(rows) and _is_reading(rows[place + 1][1])
+    return below and not _is_reading(rows[place][1]) and _texts(rows[place][1]) >= LEAST_COLUMNS
+
+
+def _repeats(rows: Sequence[tuple[int, Cells]], first: int, place: int) -> bool:
+    """Whether a row repeats the names, or the units, above the first readings."""
+    return any(rows[k][1] == rows[place][1] for k in range(max(0, first - 2), first + 1))
+
+
+def _texts(row: Cells) -> int:
+    return sum(isinstance(cell, str) and bool(cell) and not figures.is_figure(cell) for cell in row)
+
+
+def _is_reading(row: Cells) -> bool:
+    """Whether a row has numbers in at least half of its cells that are filled in, and in at least four."""
+    numbers = sum(map(figures.is_figure, row))
+    return numbers >= LEAST_COLUMNS and 2 * numbers >= sum(cell != "" for cell in row)
+
+
+def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layout | None:
+    """The table whose last row of names, or of units, is at a place, down to the row before `end`."""
+    rows = sheet.rows
+    names, units, top = _head(rows, head)
+    readings = [place for place in range(head + 1, end) if _is_reading(rows[place][1])]
+    kept = _without_summary([rows[place] for place in readings], names)
+    lines = {line for line, _ in kept}
+    others = (rows[k] for k in range(head + 1, end) if rows[k][0] not in lines)
+    _check_cut(
+        kept, [row for k in range(head + 1, end) if (row := rows[k])[0] not in lines], source
+    )
+    width = max(len(names), *(len(row) for _, row in kept)) if kept else 0
+    if width < LEAST_COLUMNS:
+        return None
+    names, units = ([*each, *[""] * (width - len(each))] for each in (names, units))
+    columns = [[row[k] if k < len(row) else "" for _, row in kept] for k in range(width)]
+    used = [k for k in range(width) if names[k] or any(cell != "" for cell in columns[k])]
+    columns = [columns[k] for k in used]
+    names = [names[k] for k in used]
+    units = [units[k] for k in used]
+    sign = decimal or figures.decimal_sign([c for column in columns for c in column], source)
+    read = [figures.column(column, sign) for column in columns]
+    above = [row for _, row in rows[:top]]
+    texts = [[as_text(cell).strip() for cell in column] for column in columns]
+    whole, joined = _with_minutes(names, [cells for cells, _ in read])
+    stated = {
+        name: unit or by_cells for name, unit, (_, by_cells) in zip(names, units, read, strict=True)
+    }
+    return Layout(
+        sheet=sheet.name,
+        form=msgspec.structs.replace(
+            sheet.form,
+            decimal=sign,
+            header_line=rows[head - any(units)][0],
+            first_line=kept[0][0],
+        ),
+        names=plain_names(list(whole)),
+        units=[stated.get(name, "") for name in whole],
+        cells=joined,
+        texts=[
+            texts[names.index(n)] if n in names else c for n, c in zip(whole, joined, strict=True)
+        ],
+        lines=[line for line, _ in kept],
+        above=tuple(" ".join(map(as_text, row)).strip() for row in above),
+        titles=_dated(titles(above), names, texts),
+        left_out=tuple((line, _words(row)) for line, row in others if not _same(row, rows, head)),
+    )
+
+
+def _check_cut(
+    kept: Sequence[tuple[int, Cells]], others: Sequence[tuple[int, Cells]], source: str
+) -> None:
+    """Refuse a row that begins as a station does and ends before the numbers that all others have."""
+    if len(kept) <= LEAST_COLUMNS:
+        return
+    form = _form(kept[0][1][0])
+    cut = [
+        r
+        for r in others
+        if r[1] and form and _form(r[1][0]) == form and any(map(figures.is_figure, r[1][1:]))
+    ]
+    *before, (last, row) = kept
+    width = min(len(cells) for _, cells in before)
+    if len(row) < width and all(figures.is_figure(cells[width - 1]) for _, cells in before):
+        cut.append((last, row))
+    if cut:
+        line, row = cut[0]
+        raise InputError(
+            f"{source}, row {line}: '{_words(row)}' begins as a station and ends before the numbers of the other "
+            "rows. Was the file cut? Complete the row, or remove it."
+        )
+
+
+def _form(cell: object) -> str:
+    """A cell with 9 for every number in it; empty for a blank one."""
+    return re.sub(r"\d+([.,]\d+)?", "9", as_text(cell))
+
+
+def _dated(stated: Titles, names: Sequence[str], texts: Sequence[Sequence[str]]) -> Titles:
+    """What a title block says, with the day of a column of times where it names none."""
+    days = (day_of_rows(name, column) for name, column in zip(names, texts, strict=True))
+    day = next(filter(None, days), "") if "date" not in stated.metadata else ""
+    return Titles({**stated.metadata, "date": day}) if day else stated
+
+
+def _with_minutes(
+    names: Sequence[str], cells: Sequence[list[str]]
+) -> tuple[list[str], list[list[str]]]:
+    """Names and cells; degrees and minutes in two columns of one name become one column of degrees."""
+    whole, joined, place = [], [], 0
+    while place < len(names):
+        name, column = names[place], cells[place]
+        one, two = (_DEGREES_OF.fullmatch(n) for n in (name, [*names, ""][place + 1]))
+        if one and two and one[1] == two[1] and one["d"] and two["m"]:
+            pairs = zip(column, cells[place + 1], strict=True)
+            name, column = f"{one[1]} (°)", [_sum(*pair) for pair in pairs]
+            place += 1
+        whole.append(name)
+        joined.append(column)
+        place += 1
+    return whole, joined
+
+
+def _sum(degrees: str, minutes: str) -> str:
+    """Degrees and minutes in degrees; as they stand where either is no number."""
+    if not looks_numeric(degrees) or not looks_numeric(minutes):
+        return f"{degrees} {minutes}".strip()
+    part = float(minutes) / 60
+    return repr(float(degrees) + (-part if degrees.startswith("-") else part))
+
+
+def _same(row: Cells, rows: Sequence[tuple[int, Cells]], head: int) -> bool:
+    return any(row == rows[k][1] for k in range(max(0, head - 2), head + 1))
+
+
+def _words(row: Cells) -> str:
+    return " ".join(filter(None, map(as_text, row)))[:60]
+
+
+def _head(rows: Sequence[tuple[int, Cells]], place: int) -> tuple[list[str], list[str], int]:
+    """Names and units of the columns above the readings, and the place of the first row of them."""
+    units: list[str] = []
+    if place and all(_OF_LOGGERS.fullmatch(as_text(c)) for c in rows[place][1] if c != ""):
+        place -= 1
+    if place and _is_units(rows[place][1]) and _texts(rows[place - 1][1]) >= LEAST_COLUMNS:
+        units = [as_text(cell).strip(" []()") for cell in rows[place][1]]
+        place -= 1
+    names = [" ".join(as_text(cell).split()) for cell in rows[place][1]]
+    top = place
+    while (
+        top
+        and place - top < _MOST_HEADER_ROWS - 1
+        and rows[top - 1][0] == rows[top][0] - 1
+        and _need_titles(names)
+        and _is_title(rows[top - 1][1])
+    ):
+        top -= 1
+        names = _joined(rows[top][1], names)
+    return names, [*units, *[""] * len(names)][: len(names)], top
+
+
+def _need_titles(names: Sequence[str]) -> bool:
+    """Whether names say nothing alone: axes only, or one name for several columns."""
+    bare = [_BRACKETS.sub("", name).strip().lower() for name in names if name]
+    return (
+        any(_AXIS.fullmatch(name) for name in names) or max(Counter(bare).values(), default=0) > 1
+    )
+
+
+def _is_title(row: Cells) -> bool:
+    """Whether a row may be titles of groups of columns: two texts or more, and no numbers."""
+    return _texts(row) >= 2 and not any(map(figures.is_figure, row))
+
+
+def _joined(row: Cells, names: Sequence[str]) -> list[str]:
+    """Names with the title above each: that of the column, or of the nearest column to the left that has one."""
+    above = [" ".join(as_text(cell).split()) for cell in row]
+    above += [""] * (len(names) - len(above))
+    title, joined = "", []
+    for upper, name in zip(above, [*names, *[""] * len(above)], strict=False):
+        title = upper or (title if name else "")
+        joined.append(_with_title(title, name) if title != name else name)
+    return joined[: max(len(names), len(above))]
+
+
+def _with_title(title: str, name: str) -> str:
+    """A name behind its title; a unit in brackets behind the title comes last."""
+    match = _UNIT_BEHIND.fullmatch(title) if "(" not in name and "[" not in name else None
+    return " ".join([match[1], name, match[2]]).strip() if match else f"{title} {name}".strip()
+
+
+def _is_units(row: Cells) -> bool:
+    """Whether a row holds units: of its cells that are filled in two or more are known, and all are short."""
+    cells = [as_text(cell).strip() for cell in row if cell != ""]
+    bare = [cell.strip("[]()").strip() for cell in cells]
+    known = [cell for cell in bare if unit_of(cell)]
+    short = all(len(cell) <= 8 and not re.search(r"[xyz]\b", cell, re.I) for cell in bare)
+    return len(known) >= 2 and short and 2 * len(known) >= len([c for c in bare if c.strip("-–")])
+
+
+def _without_summary(
+    rows: Sequence[tuple[int, Cells]], names: Sequence[str]
+) -> list[tuple[int, Cells]]:
+    """Rows of readings without those of statistics: called so, or equal to the means of those above."""
+    kept = [row for row in rows if not _is_summary(row[1])]
+    numbered = sum(bool(row) and figures.is_figure(row[0]) for _, row in kept)
+    if numbered >= 0.8 * len(kept):  # rows are numbered: one with a word instead is none of them
+        kept = [(n, row) for n, row in kept if row[0] == "" or figures.is_figure(row[0])]
+    while len(kept) > LEAST_COLUMNS and _is_mean(kept[-1][1], [row for _, row in kept[:-1]]):
+        kept.pop()
+    return kept
+
+
+def _is_summary(row: Cells) -> bool:
+    texts = [cell for cell in row[:3] if isinstance(cell, str) and not figures.is_figure(cell)]
+    return any(_SUMMARY.fullmatch(text) for text in texts if text)
+
+
+def _is_mean(row: Cells, above: Sequence[Cells]) -> bool:
+    """Whether numbers of a row are the means of the columns above, in four columns that vary or more."""
+    equal = varied = 0
+    for place, cell in enumerate(row):
+        column: Array = np.array(
+            [r[place] for r in above if place < len(r) and isinstance(r[place], float | int)], float
+        )
+        if isinstance(cell, float | int) and len(column) > 2 and np.ptp(column) > 0:
+            varied += 1
+            equal += bool(abs(cell - column.mean()) < 1e-6 * np.ptp(column))
+    return varied >= LEAST_COLUMNS and equal >= varied - 1
+
+
+def as_columns(layout: Layout, labels: Collection[str] = ()) -> dict[str, list[str]]:
+    """The cells by the names of the columns; `labels` are columns whose cells are kept as they stand."""
+    each = zip(layout.names, layout.cells, layout.texts, strict=True)
+    return {name: texts if name in labels else cells for name, cells, texts in each}

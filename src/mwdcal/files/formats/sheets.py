@@ -1,0 +1,152 @@
+"""The sheets of a file of any form that tables come in: text, workbooks of three kinds."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+import zipfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from mwdcal.errors import InputError
+from mwdcal.files.formats import dialect, figures, text, workbook
+from mwdcal.files.formats.columns import at_most, damaged_unless_read
+from mwdcal.files.formats.layout import Cells, Sheet
+from mwdcal.sensor.profile import TableFormat
+
+OTHER_WORKBOOKS = (".ods", ".xls")
+"""Suffixes of workbooks that only a layout that is looked for can be read from."""
+DELIMITERS = (";", "\t", ",", "|")
+_BLANKS = "blanks"
+_LOOKED_AT = 400
+"""Lines by which the delimiter of a text is told."""
+_LARGEST_UNPACKED = 100_000_000
+_REPEATED = re.compile(rb'number-(?:rows|columns)-repeated="(\d+)"')
+_MOST_REPEATED = 1_100_000
+_MOST_CELLS = 3_000_000
+
+
+def sheets_of(data: bytes, name: str) -> list[Sheet]:
+    """The sheets in the bytes of a file of that name.
+
+    Raises:
+        InputError: it is damaged, too large, or needs a package that is not installed.
+    """
+    suffix = Path(name).suffix.lower()
+    if suffix == ".xlsx":
+        names = workbook.sheet_names(data, name)
+        return [
+            Sheet(
+                title, [(line, _plain(row)) for line, row in workbook.read_rows(data, name, place)]
+            )
+            for place, title in enumerate(names)
+        ]
+    if suffix in OTHER_WORKBOOKS:
+        return list(_by_calamine(data, name))
+    text.refuse_foreign(data, name, allowed=text.UTF_16)
+    encoding = dialect.encoding_of(data)
+    lines = dialect.decoded(data, encoding, name).split("\n")
+    mark, rows = _delimited(lines, name)
+    form = TableFormat(encoding=encoding, delimiter=mark if mark in DELIMITERS else ",")  # type: ignore[arg-type]
+    return [Sheet("", rows, form)]
+
+
+def _plain(row: Cells) -> list[object]:
+    """Cells of a row, blank ones as empty text, and text without blanks around."""
+    return ["" if c is None else c.strip() if isinstance(c, str) else c for c in row]
+
+
+def _delimited(lines: Sequence[str], source: str) -> tuple[str, list[tuple[int, Cells]]]:
+    """The delimiter of a text by which most numbers show, and its rows by it."""
+    looked_at = lines[:_LOOKED_AT]
+    best = max((*DELIMITERS, _BLANKS), key=lambda mark: _numbers(_split(looked_at, mark, source)))
+    rows = enumerate(_split(lines, best, source), 1)
+    return best, [(line, _trimmed(row)) for line, row in rows if any(row)]
+
+
+def _numbers(rows: Sequence[Sequence[str]]) -> int:
+    """Numbers in the rows that have at least four."""
+    counts = (sum(map(figures.is_figure, row)) for row in rows)
+    return sum(count for count in counts if count >= 4)
+
+
+def _split(lines: Sequence[str], mark: str, source: str) -> list[list[str]]:
+    """The cells of each line, without blanks around."""
+    if mark == _BLANKS:
+        runs = r"\s{2,}|\t" if any(re.search(r"\S\s{2,}\S", line) for line in lines) else r"\s+"
+        return [re.split(runs, line.strip()) if line.strip() else [] for line in lines]
+    try:
+        return [
+            [
+                cell.strip()
+                for cell in next(
+                    csv.reader([line.rstrip("\r")], delimiter=mark, skipinitialspace=True), []
+                )
+            ]
+            for line in lines
+        ]
+    except csv.Error as error:
+        raise InputError(
+            f"{source}: the file is no table of text ({error}). Name the file with the readings."
+        ) from None
+
+
+def _trimmed(row: Sequence[object]) -> list[object]:
+    cells = list(row)
+    while cells and cells[-1] == "":
+        cells.pop()
+    return cells
+
+
+def _by_calamine(data: bytes, source: str) -> Iterator[Sheet]:
+    """The sheets of an OpenDocument or old Excel workbook."""
+    calamine = _module(source)
+    if source.lower().endswith(".ods"):
+        _check_ods(data, source)
+    with damaged_unless_read(source, "a workbook", "Save it again as .xlsx, or as CSV UTF-8."):
+        book = calamine.CalamineWorkbook.from_filelike(io.BytesIO(data))
+        for name in book.sheet_names:
+            page = book.get_sheet_by_name(name)
+            at_most(
+                page.total_height * page.total_width,
+                _MOST_CELLS,
+                f"{source}, sheet {name}",
+                "a sheet",
+                "cells",
+                "Save the sheet with the run alone.",
+            )
+            first = page.start[0] if page.start else 0
+            rows = enumerate(page.to_python(skip_empty_area=True), first + 1)
+            yield Sheet(
+                name, [(line, cells) for line, row in rows if (cells := _trimmed(_plain(row)))]
+            )
+
+
+def _check_ods(data: bytes, source: str) -> None:
+    """Refuse a small archive that holds a large table: rows and cells that are repeated very often."""
+    with (
+        damaged_unless_read(source, "an OpenDocument spreadsheet", "Save it again."),
+        zipfile.ZipFile(io.BytesIO(data)) as archive,
+    ):
+        size = sum(entry.file_size for entry in archive.infolist())
+        advice = "Save the sheet with the run alone."
+        at_most(size, _LARGEST_UNPACKED, source, "its contents", "bytes", advice)
+        content = archive.read("content.xml")
+    repeated = [int(each) for each in _REPEATED.findall(content)]
+    if repeated and max(repeated) > _MOST_REPEATED:
+        raise InputError(
+            f"{source}: cells are repeated {max(repeated)} times, as in no spreadsheet."
+        )
+
+
+def _module(source: str) -> Any:
+    try:
+        import python_calamine
+    except ImportError:
+        raise InputError(
+            f"{source}: .ods and .xls files need the extra 'xlsx'. "
+            'Install it with: pip install "mwdcal[xlsx]"'
+        ) from None
+    return python_calamine

@@ -1,0 +1,171 @@
+"""What the title block of a table says of the tool, the day and who measured."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+from typing import NamedTuple
+
+from mwdcal.files.formats.columns import as_text
+
+_KEYS = {
+    "serial": "serial sn s/n serialno serialnumber toolsn tools/n toolserial toolserialno toolserialnumber toolno "
+    "toolid probesn probeno 仪器号 探管号 sondesn sensorsn seriennummer "
+    "seriennr geratenummer geratenr sondennummer sondennr serienummer "
+    "serienr verktoynr instrumentnr numerodeserie nodeserie nserie numeroserie nsserie numserie ndeserie "
+    "заводскойномер серийныйномер зав№ серийный№ прибор№ 序列号 编号 仪器编号 出厂编号",
+    "date": "date testdate caldate calibrationdate measured datum prufdatum messdatum dato kalibreringsdato fecha "
+    "data дата датакалибровки 日期 校准日期 测试日期",
+    "operator": "operator technician measuredby testedby by bediener prufer operateur operador tecnico operatoer "
+    "utfortav оператор исполнитель 操作员 检定员",
+    "lab": "lab laboratory labor laboratorium laboratorio лаборатория 实验室",
+}
+_DAYS = (
+    "%Y-%m-%d",
+    "%Y/%m/%d",
+    "%Y.%m.%d",
+    "%d.%m.%Y",
+    "%d %b %Y",
+    "%d-%b-%Y",
+    "%d %B %Y",
+    "%Y年%m月%d日",
+)
+"""Forms of a day that can be read in one way only; in Germany, Norway and Russia a point stands behind the day."""
+_PARTS = re.compile(r"\s+/\s+|,\s+|;\s*|\s{3,}")
+"""What separates facts in one cell."""
+_TOOL = re.compile(
+    r"#?\s*(?:(?:tool|probe|sensor|sonde|instrument|herramienta|ferramenta|verktøy|gerät|прибор|зонд|датчик|инклинометр|仪器|探管)\s*"
+    r"(?P<mark>s/?n|serial( no)?|no\b|nr\b|зав\.?\s*№|№|#|号|编号)?|(?P<sn>sn|s/n|serial no))\s*[.:：|=]*\s*",
+    re.IGNORECASE,
+)
+_SERIAL = re.compile(r"(?=\S*\d)[^\W_][\w./-]*")
+_TELLING = re.compile(r"(?=.*\d).*[^\W\d_].*|\d+-\d+")
+"""A serial that shows by itself: letters beside digits, or a dash between them."""
+_ENGLISH_DATE = re.compile(
+    r"\W*(test|cal\w*)?\s*(date|day|time|utc|timestamp|measured)", re.IGNORECASE
+)
+_TRUE_NORTH = re.compile(
+    r"true\s+north|geographic north|nord géographique|rechtweisend", re.IGNORECASE
+)
+_DECLINATION = re.compile(
+    r"(declination|deklination|misvisning|declinaci[oó]n|склонение|磁偏角)\W*([+-]?\d+[.,]?\d*)\s*(?:°|deg\w*)?\s*([EWO])?",
+    re.IGNORECASE,
+)
+_LATIN = str.maketrans({"ø": "o", "Ø": "O", "ß": "ss", "º": "", "ª": "", "°": ""})
+
+
+class Titles(NamedTuple):
+    """Metadata by key, and a day that may be read in two ways, as it stands."""
+
+    metadata: Mapping[str, object]
+    unclear_day: str = ""
+
+
+def titles(rows: Sequence[Sequence[object]]) -> Titles:
+    """What rows above a table say: a key with a colon and its value, or a key and the cell to the right.
+
+    A serial may stand behind the word for the tool, if it has letters or a dash beside digits; a day alone is the
+    date where no other is named.
+
+    >>> titles([["Tool S/N:", "A-17", "", "Date", "14.03.2025"]]).metadata
+    {'serial': 'A-17', 'date': '2025-03-14'}
+    >>> titles([["Sensor M-0915, 06.03.2026"]]).metadata
+    {'serial': 'M-0915', 'date': '2026-03-06'}
+    """
+    metadata: dict[str, object] = {}
+    unclear, days, tools = "", dict[str, None](), dict[str, None]()
+    declination, true = None, False
+    for row in rows:
+        whole = [as_text(cell).strip() for cell in row]
+        cells = [part.strip() for cell in whole for part in _PARTS.split(cell)]
+        declination = _declination(" ".join(whole)) if declination is None else declination
+        true = true or bool(_TRUE_NORTH.search(" ".join(whole)))
+        for place, cell in enumerate(cells):
+            key, value = _pair(cell, cells[place + 1 :])
+            days |= dict.fromkeys(filter(None, [day_of(cell)]))
+            tools |= dict.fromkeys(filter(None, [_tool(cell, cells[place + 1 :])]))
+            if not value or key in metadata:
+                continue
+            if key == "date":
+                day = day_of(value, not _ENGLISH_DATE.match(cell))
+                unclear = unclear or ("" if day else value)
+                value = day
+            if value:
+                metadata[key] = value
+    for key, others in (("serial", tools), ("date", days)):
+        if key not in metadata and len(others) == 1 and not (key == "date" and unclear):
+            metadata[key] = next(iter(others))
+    if declination is not None:
+        metadata |= {"declination_deg": declination} | (
+            {"azimuth_reference": "true"} if true else {}
+        )
+    return Titles(metadata, "" if "date" in metadata else unclear)
+
+
+def _declination(text: str) -> float | None:
+    """The declination that a line states with its sense or sign, degrees east."""
+    match = _DECLINATION.search(text)
+    if not match:
+        return None
+    west = match[3].upper() in ("W", "O") if match[3] else False
+    value = float(match[2].replace(",", "."))
+    return -abs(value) if west else value
+
+
+def _tool(cell: str, right: Sequence[str]) -> str:
+    """The serial behind a word for the tool, in a cell or the next one; empty where that may be something else."""
+    match = _TOOL.match(cell)
+    if not match:
+        return ""
+    behind = cell[match.end() :].strip() or next((each for each in right[:2] if each), "")
+    number = _SERIAL.match(behind)
+    return (
+        number[0] if number and (match["mark"] or match["sn"] or _TELLING.search(number[0])) else ""
+    )
+
+
+def _pair(cell: str, right: Sequence[str]) -> tuple[str, str]:
+    """The key that a cell is, and its value behind a colon, a sign or in the next cell that is filled in."""
+    head, *tail = re.split(r"\s*[:：=|]\s*", cell, maxsplit=1)
+    key = _MEANT.get(_word(head.lstrip("#")), "")
+    if not key:
+        return "", ""
+    return key, "".join(tail).strip(' "') or next((each for each in right[:3] if each), "")
+
+
+def _word(text: str) -> str:
+    """Letters of a text in lower case without marks and blanks."""
+    plain = unicodedata.normalize("NFKD", text.translate(_LATIN).lower())
+    return re.sub(r"[^\w/№]|_", "", "".join(c for c in plain if not unicodedata.combining(c)))
+
+
+def day_of(text: str, day_first: bool = False) -> str:
+    """A day in ISO form; empty where it may be read in two ways, or is none. A time may stand behind it.
+
+    `day_first`: of 03/04/2025 the 3 is the day, as everywhere but in English. With AM or PM the month is first.
+    """
+    first, *time = re.split(r"[T ]+(?=\d\d?:)", text.strip(), maxsplit=1)
+    for form in _DAYS:
+        try:
+            return datetime.strptime(first, form).date().isoformat()
+        except ValueError:
+            continue
+    match = re.fullmatch(r"(\d\d?)([/.-])(\d\d?)\2(\d{4})", first)
+    if not match:
+        return ""
+    one, two = int(match[1]), int(match[3])
+    american = bool(time) and time[0].rstrip(".").upper().endswith(("AM", "PM"))
+    orders = [(one, two)] if day_first else [(two, one)] if american else [(one, two), (two, one)]
+    days = {f"{match[4]}-{m:02d}-{d:02d}" for d, m in orders if 0 < m <= 12 and 0 < d <= 31}
+    return days.pop() if len(days) == 1 else ""
+
+
+def day_of_rows(name: str, cells: Sequence[str]) -> str:
+    """The one day of all cells of a column of times; empty where it is none, or there are several days."""
+    days = {day_of(cell, not _ENGLISH_DATE.match(name)) for cell in cells if cell}
+    return days.pop() if len(days) == 1 else ""
+
+
+_MEANT = {_word(word): key for key, words in _KEYS.items() for word in words.split()}

@@ -1,0 +1,88 @@
+"""Words of other languages and programs for what the columns of a table hold, in the words of the field."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+
+_LATIN = str.maketrans({"ø": "o", "Ø": "O", "æ": "ae", "ß": "ss", "ł": "l"})
+"""Letters that do not come apart into a plain letter and a mark."""
+_ELEVATION = r"\b(elev(ation)?|elevacion|inc\w* (from|to|above|over) (the )?horiz\w*|pitch)\b"
+"""Names of angles that count from the horizontal."""
+TRANSLATIONS = (
+    (r"\|\s*b\s*\|", "Btotal"),
+    (r"\|\s*g\s*\|", "Gtotal"),
+    (r"pruf(?=stand)|mess(?=stand)", ""),
+    (r"grav(?=axial|tran)", "acc "),
+    (r"axial", "Z "),
+    (r"tran(s|sverse|sversal)?[ _]*1", "X "),
+    (r"tran(s|sverse|sversal)?[ _]*2", "Y "),
+    (
+        r"hoehenwinkel|hohenwinkel|elevasjon|neigung.*horizontal\w*|угол места|仰角|" + _ELEVATION,
+        "elevation ",
+    ),
+    (
+        r"магнитн\w* наклонен\w*|наклонение|磁倾角|inclina\w* magn\w*|magn\w* inklin\w*|echado|buzamiento",
+        "dip ",
+    ),
+    (
+        r"neigung|inklination|inclinaison|inclinaca?o|inclinacion|zenith( angle)?|drift angle|deviation angle|"
+        r"inklinasjon|helning|зенит\w*( угол)?|наклон(?!ен)|井斜角?",
+        "inclination ",
+    ),
+    (r"азимут|asimut|azimute?(?!h)|acimut|方位角?|rumbo", "azimuth "),
+    (
+        r"rollwinkel|roll angle|werkzeugwinkel|verdrehung|verdrehwinkel|drehwinkel|rotasjon|rulle?vinkel|"
+        r"verktoy(flate|vinkel)\w*|face d[ae] ferramenta|визир\w*( угол)?|"
+        r"angulo de giro|giro|rotacion|(угол установки )?отклонител\w*|визирн\w* угол|поворот|工具面角?|"
+        r"cara de (la )?herramienta|gravity tool ?face|h\.?s\.?[ _-]*tool ?face|tool[ _-]*face",
+        "toolface ",
+    ),
+    (
+        r"beschleunigung\w*|beschl\b\.?|akselerasjon|akselerometer|akselero|aceleracion|acelerometro|acel\b|"
+        r"aceleracao|ускорен\w*|акселерометр\w*|акс\b|\baks\b|加速度计?|加计|加表",
+        "acc ",
+    ),
+    (
+        r"magnetfeld(?=[ _]*[xyz])|magnetfelt(?=[ _]*[xyz])|magnetometro|magnetometer|магнитометр\w*|магн\b|"
+        r"феррозонд\w*|磁力计|磁通门|磁强计|campo magnetico(?=[ _]*[xyz])|campo mag(?=[ _]*[xyz])|"
+        r"flux[ _-]*gate|磁场(?=[ (（_]*[xyz])",
+        "mag ",
+    ),
+    (
+        r"feldstarke|gesamtfeld|totalfeld|totalfelt|champ total|campo total|intensidad total|полн\w* поле|"
+        r"модуль (магн\w*|поля)|总磁场(强度)?|磁场强度|总场|totalintensitat",
+        "total field ",
+    ),
+    (r"schwere|gravitation|tyngde\w*|gravedad|gravidade|сила тяжести|重力(加速度)?", "gravity "),
+    (r"нтл", "nT"),
+    (r"мктл", "uT"),
+    (r"(?<![a-zа-я])(градус\w*|град|grados|graus|grader|grad)(?![a-zа-я])|度(?=[)）]?$)", "deg"),
+    (r"код\w* ацп|ацп|отсч\w*|码值", "adc"),
+    (r"мв(?![а-я])", "mV"),
+    (r"temperatura|temperature?n?|температура|темп\b\.?|温度", "temperature "),
+    (
+        r"sollwert|soll|referenz|referanse|referencia|stand|эталон\w*|стенд|задан\w*|标准|参考|转台",
+        "ref ",
+    ),
+    (r"seriennummer|seriennr|serienummer|заводской номер|序列号|numero de serie", "serial "),
+    (r"gerat|sonde", "tool "),
+    (r"(de|da) [qc]uadr[ií]cula( utm)?|gitter|kartesisch", "grid "),
+    (r"achse|aksen?|eje|ось|轴", ""),
+    (r"magn\b\.?|magnetisch", "magnetic"),
+)
+"""Words of other languages and of WITSML, and the word of the field for each."""
+
+
+def spelled(name: str) -> str:
+    """A name in plain letters, with the words of the field.
+
+    >>> spelled("Neigung Soll (°)"), spelled("gravTran1Raw")
+    ('inclination ref (°)', 'acc X Raw')
+    """
+    text = name.translate(_LATIN).replace("°", "\0").replace("²", "\1")
+    text = unicodedata.normalize("NFKD", text)
+    text = "".join(c for c in text if not unicodedata.combining(c))
+    for pattern, word in TRANSLATIONS:
+        text = re.sub(pattern, word, text, flags=re.IGNORECASE)
+    return text.replace("\0", "°").replace("\1", "²").strip()
