@@ -236,7 +236,8 @@ def test_a_table_without_the_line_of_units_does_not_lose_a_station(with_units, t
     _, tool = with_units
     other = write_csv(tmp_path / "other.csv", renamed(servo_run(2), **THEIRS))
     ran = mwdcal("calibrate", other, "--tool", tool, "-o", tmp_path / "cal.json")
-    assert ran.code == 0 and "48 stations" in ran.out
+    assert ran.code == 0
+    assert "48 stations" in ran.out
 
 
 @pytest.mark.parametrize("unit", [{"Temp": "°F"}, {"Gx": "g"}])
@@ -424,7 +425,8 @@ def test_a_table_in_another_encoding_than_the_profile_says_is_read(german, tmp_p
     run, _, tool = german
     tool.write_text(tool.read_text("utf-8").replace("cp1252", "utf-8"), "utf-8")
     ran = mwdcal("calibrate", run, "--tool", tool, "-o", tmp_path / "cal.json")
-    assert ran.code == 0 and "48 stations" in ran.out
+    assert ran.code == 0
+    assert "48 stations" in ran.out
 
 
 def test_a_simulated_run_is_said_to_be_one(tmp_path):
