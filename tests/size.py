@@ -10,6 +10,7 @@ from collections import Counter
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+HOLDERS = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
 SILENT = {
     *(tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT),
     tokenize.ENDMARKER,
@@ -20,10 +21,9 @@ def docstring_lines(tree: ast.AST) -> set[int]:
     """Lines of docstrings."""
     lines: set[int] = set()
     for node in ast.walk(tree):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-            if ast.get_docstring(node, clean=False) is not None:
-                first = node.body[0]
-                lines |= set(range(first.lineno, (first.end_lineno or first.lineno) + 1))
+        body = getattr(node, "body", None)
+        if isinstance(node, HOLDERS) and ast.get_docstring(node, clean=False) is not None and body:
+            lines |= set(range(body[0].lineno, (body[0].end_lineno or body[0].lineno) + 1))
     return lines
 
 
