@@ -3,7 +3,7 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: papers measured verification scatter coverage drift diagnosis mutations help demo test test-quick test-studies test-oldest \
+.PHONY: papers measured verification scatter coverage drift diagnosis mutations help demo size test test-quick test-studies test-oldest \
 	test-versions fuzz kills registry-stress check bench bench-guard docs clean
 
 PYTHON ?= python3
@@ -37,6 +37,9 @@ SPHINX := $(BIN)/sphinx-build -q -W --keep-going -d build/doctrees
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 20
 	@echo "Another interpreter: make PYTHON=python3.12 test, after make clean"
+
+size: ## print code lines and modules by room
+	@$(PYTHON) tests/size.py
 
 demo: $(INSTALLED) ## calibrate the example tool, verify it, write its report
 	@$(CLOCK); mkdir -p build/demo; \

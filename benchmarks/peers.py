@@ -16,7 +16,7 @@ from measuring import Row, against
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
-from mwdcal.geometry.directions import directions
+from mwdcal.geometry.vectors import directions
 from simulation import DEG, Tool
 
 TOOL = Tool.random(7)

@@ -24,7 +24,7 @@ from mwdcal.files.profiles import load_profile
 from mwdcal.planning.plans import load_plan
 from mwdcal.planning.session import Session
 from mwdcal.planning.simulate import drawn
-from mwdcal.survey.position import calibrated_path, position_covariance
+from mwdcal.survey.path import calibrated_path, position_covariance
 from mwdcal.survey.tool_model import sensor_terms, term_shifts, tool_model
 
 STATIONS, SCALED = 1_000_000, 10_000

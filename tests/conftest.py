@@ -67,14 +67,14 @@ def without_pictures(monkeypatch):
     """Pages with empty pictures: drawing takes most of the time of a page that is read for its text."""
     from markupsafe import Markup
 
-    from mwdcal.pages import pictures
+    from mwdcal.presentation import page
     from mwdcal.use.plots import Plots
 
     for name, method in vars(Plots).items():
         if isfunction(method) and not name.startswith("_"):
             monkeypatch.setattr(Plots, name, lambda *given: "")
-    monkeypatch.setattr(pictures, "picture", lambda figure, suffix: b"<svg></svg>")
-    monkeypatch.setattr(pictures, "svg", lambda figure, key: Markup("<svg></svg>"))
+    monkeypatch.setattr(page, "picture", lambda figure, suffix: b"<svg></svg>")
+    monkeypatch.setattr(page, "svg", lambda figure, key: Markup("<svg></svg>"))
 
 
 @pytest.fixture
@@ -115,7 +115,7 @@ def results():
 def computed_once(results, monkeypatch):
     """What takes most of the time of a command is computed once for all tests of what it shows."""
     from mwdcal.comparison import compare
-    from mwdcal.logs import noise, noise_terms
+    from mwdcal.logs import allan, noise
     from mwdcal.planning import planned
 
     long = (
@@ -123,7 +123,7 @@ def computed_once(results, monkeypatch):
         (planned, "best_plan"),
         (compare, "compare"),
         (noise, "find_noise"),
-        (noise_terms, "fit"),
+        (allan, "fit"),
     )
     for module, name in long:
         monkeypatch.setattr(module, name, remembered(getattr(module, name), results))

@@ -14,22 +14,25 @@ from mwdcal.app import correction
 from mwdcal.calibration.record import DOCUMENT_VERSION, SCHEMA_VERSION, Calibration
 from mwdcal.certificate.document import Certificate
 from mwdcal.faults.diagnosis import Diagnosis
-from mwdcal.registry.lookup import Listing
-from mwdcal.screens import (
+from mwdcal.presentation import (
     builtin,
     calibration,
     comparison,
     conversion,
+    drift,
     fleet,
     noise,
     plan,
     proposal,
+    reference,
+    registry,
+    signature,
     simulation,
     stations,
+    survey,
 )
-from mwdcal.screens.envelope import INPUTS, Envelope, ExampleDocument
-from mwdcal.screens.records import drift, registry, signature
-from mwdcal.screens.surveys import reference, survey
+from mwdcal.presentation.envelope import INPUTS, Envelope, ExampleDocument
+from mwdcal.registry.lookup import Listing
 from mwdcal.use.verification import Verdict
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"

@@ -14,7 +14,7 @@ import pytest
 from cli_support import mwdcal, refused, write_csv
 from mwdcal.files import logs
 from mwdcal.files.profiles import load_profile
-from mwdcal.logs import allan, noise, noise_terms
+from mwdcal.logs import allan, noise
 from mwdcal.logs.noise import find_noise
 from test_stations import tumble
 
@@ -257,7 +257,7 @@ def fitted(name):
     factors = allan.octaves(COUNT)
     moments = allan.moments(COUNT, factors)
     centred = allan.variance(values, factors, centred=True)
-    terms = noise_terms.fit(centred, allan.drift(values), moments)
+    terms = allan.fit(centred, allan.drift(values), moments)
     return terms, moments, allan.deviation(values, factors)
 
 
@@ -347,8 +347,8 @@ def test_short_averages_are_left_out_as_seldom_as_stated(count, white, walk):
     alarms = 0
     for seed in range(10):
         values = simulated(seed, count, 0, white, 0, walk, 0)
-        terms = noise_terms.fit(*observed(values), moments_of(count))
-        alarms += np.sum((terms.start > 0) | (terms.chance < noise_terms.CONTRADICTED))
+        terms = allan.fit(*observed(values), moments_of(count))
+        alarms += np.sum((terms.start > 0) | (terms.chance < allan.CONTRADICTED))
     assert alarms < 8
 
 
@@ -357,7 +357,7 @@ def test_a_short_record_claims_no_term_that_is_absent():
     claimed = []
     for seed in range(10):
         values = simulated(seed, 200, 0, 1, 0, 0.3, 0)
-        terms = noise_terms.fit(*observed(values), moments_of(200))
+        terms = allan.fit(*observed(values), moments_of(200))
         claimed.append(terms.determined)
         inside = (terms.lower <= [0, 1, 0, 0.09]) & (terms.upper >= [0, 1, 0, 0.09])
         assert inside.mean() > 0.95
@@ -372,7 +372,7 @@ def test_correlated_noise_is_no_quantisation():
     for k in range(count):
         values[:, k] += state
         state = decay * state + np.sqrt(1 - decay**2) * rng.normal(size=60)
-    terms = noise_terms.fit(*observed(values), moments_of(count))
+    terms = allan.fit(*observed(values), moments_of(count))
     assert terms.determined[:, 0].mean() < 0.25
     assert not terms.determined[terms.start > 0, 0].any()
 
@@ -392,8 +392,8 @@ def test_the_interval_of_one_station_holds_at_any_drift(drift):
     inside = []
     for seed in range(3):
         values = simulated(100 + seed, COUNT, 0, white, 0, walk, drift / rate)
-        terms = noise_terms.fit(*observed(values), moments_of(COUNT))
-        noise, freedom, _ = noise_terms.single(values, seconds * rate, moments_of(COUNT), terms)
+        terms = allan.fit(*observed(values), moments_of(COUNT))
+        noise, freedom, _ = allan.single(values, seconds * rate, moments_of(COUNT), terms)
         lower, upper = allan.band(noise, freedom)
         inside.append((lower <= truth) & (truth <= upper))
     assert 0.925 < np.mean(inside) < 0.975
@@ -416,9 +416,7 @@ def test_filtered_noise_is_fitted_where_the_terms_describe_it():
     values = np.convolve(rng.normal(size=20_004), np.ones(5) / 5, "valid")[None]
     factors = allan.octaves(values.shape[-1])
     moments = allan.moments(values.shape[-1], factors)
-    terms = noise_terms.fit(
-        allan.variance(values, factors, centred=True), allan.drift(values), moments
-    )
+    terms = allan.fit(allan.variance(values, factors, centred=True), allan.drift(values), moments)
     assert terms.start[0] >= 2
     assert terms.chance[0] > 1e-3
     assert terms.lower[0, 1] < 1 < terms.upper[0, 1]
@@ -427,7 +425,7 @@ def test_filtered_noise_is_fitted_where_the_terms_describe_it():
 def test_too_few_factors_are_refused():
     moments = allan.moments(64, allan.octaves(64))
     with pytest.raises(ValueError, match="variance"):
-        noise_terms.fit(np.ones((1, 5)), np.zeros(1), moments)
+        allan.fit(np.ones((1, 5)), np.zeros(1), moments)
 
 
 # --- the command ------------------------------------------------------------------------------

@@ -24,11 +24,13 @@ pypdf = pytest.importorskip("pypdf", reason="pypdf is not installed")
 typst = pytest.importorskip("typst", reason="typst is not installed")
 pytest.importorskip("matplotlib", reason="matplotlib is not installed")
 
-from mwdcal.pages.records.certificate_page import render_page  # noqa: E402
-from mwdcal.pages.records.certificate_pdf import render_pdf  # noqa: E402
-from mwdcal.pages.records.certificate_pictures import certificate_pictures  # noqa: E402
-from mwdcal.pages.records.certificate_text import certificate_text  # noqa: E402
-from mwdcal.screens.records.quantities import probability, quantity_numbers  # noqa: E402
+from mwdcal.presentation.certificate import probability, quantity_numbers  # noqa: E402
+from mwdcal.presentation.certificate_page import (  # noqa: E402
+    certificate_pictures,
+    render_page,
+    render_pdf,
+)
+from mwdcal.presentation.certificate_text import certificate_text  # noqa: E402
 
 MM = 72 / 25.4
 HOSTILE = [

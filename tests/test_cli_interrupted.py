@@ -315,7 +315,7 @@ def test_the_same_input_gives_the_same_corrected_readings(tmp_path):
 
 
 def test_the_same_input_gives_the_same_calibration_and_report(tmp_path):
-    pytest.importorskip("mwdcal.pages.report")
+    pytest.importorskip("mwdcal.presentation.calibration_page")
     folders = twice(tmp_path, *CALIBRATE, "cal.json", "--report", suffixes=(".html",))
     first, second = (folder / "cal.json" for folder in folders)
     assert without_time(first) == without_time(second)

@@ -18,7 +18,7 @@ import pytest
 
 from cli_support import calibrated, mwdcal, refused, servo_run, write_csv
 from mwdcal.app import cli, progress
-from mwdcal.screens import text
+from mwdcal.presentation import text
 
 SOURCE = Path(cli.__file__).parents[1]
 ENCODINGS = ("cp1252", "cp850", "latin-1", "ascii")

@@ -17,15 +17,14 @@ from mwdcal.calibration.methods import EVIDENCE
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.comparison import compare as module
-from mwdcal.comparison.common_gauge import Gauge, in_gauge
-from mwdcal.comparison.compare import SCATTER, compare
+from mwdcal.comparison.compare import SCATTER, Gauge, compare, in_gauge
 from mwdcal.errors import InputError
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.uncertainty import unrotating
-from mwdcal.geometry.directions import group_scatter
-from mwdcal.pages.comparison import render
+from mwdcal.geometry.vectors import group_scatter
 from mwdcal.planning import simulate
-from mwdcal.screens import comparison as command
+from mwdcal.presentation import comparison as command
+from mwdcal.presentation.comparison_page import render
 from mwdcal.sensor.profile import Profile, TriadProfile
 from simulation import Tool, attitude, plan
 from test_calibrate import NOISE, PROFILE, make
@@ -426,7 +425,7 @@ def separate(figure):
 
 @pytest.mark.parametrize("method", ["joint", "scalar"])
 def test_a_method_far_worse_flattens_no_other(whole, method):
-    figures = pytest.importorskip("mwdcal.pages.comparison")
+    figures = pytest.importorskip("mwdcal.presentation.comparison_page")
     bad = worse(whole, method, 100)
     index = [row.method for row in whole.rows].index(method)
     others = [i for i in range(6) if i != index]
@@ -451,7 +450,7 @@ def test_a_method_far_worse_flattens_no_other(whole, method):
 
 @pytest.mark.parametrize("method", ["joint", "scalar"])
 def test_ratios_beyond_the_axis_have_their_value_at_its_edge(whole, method):
-    figures = pytest.importorskip("mwdcal.pages.comparison")
+    figures = pytest.importorskip("mwdcal.presentation.comparison_page")
     bad = worse(whole, method, 100)
     figure = figures.draw_errors(bad)
     (axes,) = figure.axes
@@ -475,7 +474,7 @@ def test_ratios_beyond_the_axis_have_their_value_at_its_edge(whole, method):
 
 @pytest.mark.usefixtures("without_layout")
 def test_parameters_beyond_the_axis_have_an_arrow_and_the_largest_its_value(whole):
-    figures = pytest.importorskip("mwdcal.pages.comparison")
+    figures = pytest.importorskip("mwdcal.presentation.comparison_page")
     rows = list(whole.rows)
     first, last = rows[0].parameters["accelerometer"], rows[-1].parameters["accelerometer"]
     values = {name: value.copy() for name, value in last.values.items()}
@@ -511,7 +510,7 @@ def test_a_relative_field_has_no_nanotesla_on_the_page():
 
 
 def test_long_runs_show_the_worst_of_each_part():
-    from mwdcal.pages.comparison import MOST_STATIONS, _largest
+    from mwdcal.presentation.comparison_page import MOST_STATIONS, _largest
 
     values = np.sin(np.arange(1000) ** 2) * 1e-3
     values[737] = 9.0

@@ -14,12 +14,11 @@ from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import raw_reading
 from mwdcal.faults import physics
 from mwdcal.faults.diagnosis import diagnose
-from mwdcal.faults.likelihood import Suspect, explained, raw_of, repeated
+from mwdcal.faults.likelihood import FaultEvidence, Suspect, explained, padded, raw_of, repeated
 from mwdcal.faults.physics import DEPARTURES, FAULTS, NONE, SIZE, Damage
-from mwdcal.faults.weighing import FaultEvidence, padded
 from mwdcal.geometry.vectors import reference_vectors, tool_from_earth
 from mwdcal.planning import simulate
-from mwdcal.planning.effects import Effects, FaultEffect, load_effects
+from mwdcal.planning.simulate import Effects, FaultEffect, load_effects
 from mwdcal.sensor.profile import Datasheet, Profile, TriadProfile
 from simulation import Tool
 

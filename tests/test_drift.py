@@ -15,19 +15,21 @@ from mwdcal.calibration.prediction import typical_accuracy
 from mwdcal.calibration.readings import TRIADS, fingerprints
 from mwdcal.drift import change
 from mwdcal.drift.change import NULL_DRAWS, Contrasts, change_test
-from mwdcal.drift.comparable import (
+from mwdcal.drift.fleet import fleet_drift
+from mwdcal.drift.forecast import RISK, Paths, ServiceTest, outlook
+from mwdcal.drift.histories import tool_history
+from mwdcal.drift.tool import TypeRates, measured, predicted
+from mwdcal.drift.walk import (
     FACTOR_NAMES,
+    WALK_GROUPS,
+    GroupRates,
     History,
+    Increments,
     one_noise,
     parameter_names,
     precision,
+    quantiles,
 )
-from mwdcal.drift.fleet import fleet_drift
-from mwdcal.drift.forecast import RISK, Paths, outlook
-from mwdcal.drift.histories import tool_history
-from mwdcal.drift.service import ServiceTest
-from mwdcal.drift.tool import TypeRates, measured, predicted
-from mwdcal.drift.walk import WALK_GROUPS, GroupRates, Increments, quantiles
 from mwdcal.errors import InputError
 from mwdcal.files import documents
 from mwdcal.files.formats.members import Member
@@ -617,9 +619,8 @@ def test_a_run_without_gravity_is_no_change_of_the_tool(stated):
 @pytest.mark.usefixtures("without_layout")
 def test_pages_mark_simulated_data_and_escape_names(years):
     pytest.importorskip("matplotlib")
-    from mwdcal.pages.records.drift import render_fleet, render_tool
-    from mwdcal.pages.records.drift_figures import drift_picture
-    from mwdcal.screens.records.drift import fleet_screen, tool_screen
+    from mwdcal.presentation.drift import fleet_screen, tool_screen
+    from mwdcal.presentation.drift_page import drift_picture, render_fleet, render_tool
 
     name = "<script>alert(1)</script>\x1b[2J"
     tools = [measured(name, years["T-1"]), measured("T-2", years["T-2"])]
@@ -674,8 +675,8 @@ def test_a_calibration_with_a_prior_says_so_and_teaches_no_rate():
 @pytest.mark.usefixtures("without_pictures")
 def test_the_least_probability_that_is_drawn_is_a_bound(years):
     pytest.importorskip("matplotlib")
-    from mwdcal.pages.records.drift import render_fleet, render_tool
-    from mwdcal.screens.records.drift import fleet_screen, tool_screen
+    from mwdcal.presentation.drift import fleet_screen, tool_screen
+    from mwdcal.presentation.drift_page import render_fleet, render_tool
 
     fleet, (drift, _) = fleet_drift(
         [measured("T-1", years["T-1"]), measured("T-2", years["T-2"])], LIMITS, TODAY

@@ -13,8 +13,8 @@ from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import readings_at
 from mwdcal.errors import InputError
-from mwdcal.pages.report import render
 from mwdcal.planning import simulate
+from mwdcal.presentation.calibration_page import render
 from mwdcal.sensor.profile import Profile, TriadProfile
 from mwdcal.use.verification import Bounds, Limits, verify
 from simulation import DEG

@@ -23,7 +23,10 @@ pytestmark = pytest.mark.usefixtures("without_pictures")
 
 from mwdcal.calibration.diagnosis.findings import REMARKS  # noqa: E402
 from mwdcal.files.formats import table as tables  # noqa: E402
-from mwdcal.pages import fleet_figures, fleet_report  # noqa: E402
+from mwdcal.presentation import (  # noqa: E402
+    fleet_figures,
+    fleet_page,
+)
 from mwdcal.use import plots  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -311,14 +314,14 @@ def test_the_page_has_its_dates_and_the_same_table_gives_the_same_bytes(tmp_path
     runs = {f"T{seed}": short_run(seed) for seed in range(2)}
     path = write_fleet(tmp_path / "runs.parquet", runs, {"date": "2026-03-04"})
     output, pages = tmp_path / "o.parquet", []
-    original = fleet_report.render
+    original = fleet_page.render
 
     def render(calibrations, summary):
         os.utime(calibrations, (0, 1_700_000_000))  # 2023-11-14 22:13:20 UTC
         pages.extend(original(calibrations, summary) for _ in range(2))
         return pages[0]
 
-    monkeypatch.setattr(fleet_report, "render", render)
+    monkeypatch.setattr(fleet_page, "render", render)
     given = ("--tool", "servo", "--workers", 1, "--report", tmp_path / "fleet.html")
     for _ in range(2):
         assert mwdcal("fleet", path, "-o", output, *given).code == 0
@@ -338,12 +341,12 @@ def test_every_status_and_every_finding_has_its_sentence():
         )
     )
     named = [re.findall(r"`([a-z-]+)`", row.split("|")[1]) for row in statuses.splitlines()[2:]]
-    assert {name for names in named for name in names} - {"ok"} == set(fleet_report.REFUSED)
-    assert set(REMARKS) <= set(fleet_report.REMARKED)
+    assert {name for names in named for name in names} - {"ok"} == set(fleet_page.REFUSED)
+    assert set(REMARKS) <= set(fleet_page.REMARKED)
     named = [re.findall(r"`([a-z-]+)`", row.split("|")[1]) for row in remarks.splitlines()[2:]]
     for name in (name for names in named for name in names):
-        assert " " in fleet_report.remark(name)
-        assert "{" not in fleet_report.remark(name)
+        assert " " in fleet_page.remark(name)
+        assert "{" not in fleet_page.remark(name)
 
 
 def test_a_fleet_that_determines_no_angle(tmp_path):

@@ -13,7 +13,10 @@ from test_fleet_findings import said
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 
-from mwdcal.pages import fleet_columns, fleet_figures, pictures  # noqa: E402
+from mwdcal.presentation import (  # noqa: E402
+    fleet_figures,
+    page,
+)
 
 
 def cells(row):
@@ -67,14 +70,14 @@ def test_units_of_a_relative_field_are_those_of_the_nominal_readings(
 
 
 def test_temperature_terms_are_per_degree():
-    assert fleet_columns._unit("scale_x_t1", "magnetometer", True, "nT") == ("nT/°C", 1.0)
-    assert fleet_columns._unit("gain_xy_t2", "magnetometer", True, "nT") == ("1/nT/°C²", 1.0)
-    assert fleet_columns._unit("gain_xy_t1", "magnetometer", True, "") == ("1/°C", 1.0)
-    assert fleet_columns._unit("scale_x", "magnetometer", False, "nT") == ("", 1.0)
+    assert fleet_figures._unit("scale_x_t1", "magnetometer", True, "nT") == ("nT/°C", 1.0)
+    assert fleet_figures._unit("gain_xy_t2", "magnetometer", True, "nT") == ("1/nT/°C²", 1.0)
+    assert fleet_figures._unit("gain_xy_t1", "magnetometer", True, "") == ("1/°C", 1.0)
+    assert fleet_figures._unit("scale_x", "magnetometer", False, "nT") == ("", 1.0)
 
 
 def parameter(values, name="gain xx"):
-    return fleet_columns.FleetParameter("accelerometer", "", name, "", values, 0 * values)
+    return fleet_figures.FleetParameter("accelerometer", "", name, "", values, 0 * values)
 
 
 def marks(axes):
@@ -99,8 +102,8 @@ def test_axes_leave_out_the_outliers_and_count_them():
     assert others.max() < high < others.max() + 0.3
     assert "◂ 1" in [text.get_text() for text in axes.texts]
     assert not any("▸" in text.get_text() for text in axes.texts)
-    assert list(np.flatnonzero(fleet_columns.distance(values) > fleet_columns.FAR)) == [5]
-    few = values[: fleet_columns.FEWEST_TOOLS - 1]
+    assert list(np.flatnonzero(fleet_figures.distance(values) > fleet_figures.FAR)) == [5]
+    few = values[: fleet_figures.FEWEST_TOOLS - 1]
     [axes] = fleet_figures.draw_parameters([parameter(few)]).axes
     assert axes.get_xlim()[0] < -9800.0  # too few to call one of them an outlier
     assert not axes.texts
@@ -115,7 +118,7 @@ def test_a_strip_has_one_mark_for_each_tool(count):
     figure = fleet_figures.draw_parameters(list(map(parameter, series, names)))
     for shown, values in zip(marks(figure.axes[0]), series, strict=True):
         np.testing.assert_array_equal(shown, np.sort(values[~np.isnan(values)]))
-    drawn = str(pictures.svg(figure, "x"))
+    drawn = str(page.svg(figure, "x"))
     paths = re.findall(r' d="((?:M [-\d.]+ [-\d.]+ ?L [-\d.]+ [-\d.]+ ?)+)"', drawn)
     assert max(path.count("M") for path in paths) >= count  # nothing lost on the way
 
@@ -178,13 +181,13 @@ def test_numbers_along_an_axis_do_not_run_into_each_other(monkeypatch):
     values = np.linspace(-0.0051, 0.0057, 40)
     figure = fleet_figures.draw_parameters(
         [
-            fleet_columns.FleetParameter(
+            fleet_figures.FleetParameter(
                 "magnetometer", "field = 1", name, "of the field", values, 0.0
             )
             for name in ("gain xx", "gain xy", "offset x")
         ]
     )
-    pictures.svg(figure, "parameters")
+    page.svg(figure, "parameters")
     assert len(panels) == 3
     for boxes in panels:
         assert len(boxes) >= 2

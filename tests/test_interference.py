@@ -18,19 +18,12 @@ from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.batch import take
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import centred
-from mwdcal.pages.surveys.interference import render
 from mwdcal.planning.simulate import grid, run, servo
-from mwdcal.screens.surveys.interference import screen
+from mwdcal.presentation.interference_page import render
+from mwdcal.presentation.survey import interference_screen
 from mwdcal.survey.acceptance import SensorTerms
-from mwdcal.survey.error_terms import DRIFTED
-from mwdcal.survey.multistation.interference import deviations, interference
-from mwdcal.survey.multistation.interference_estimate import (
-    Assumed,
-    Estimate,
-    estimate,
-    misfits,
-    sensor_drift,
-)
+from mwdcal.survey.interference import DRIFTED, deviations, interference
+from mwdcal.survey.interference_estimate import Assumed, Estimate, estimate, misfits, sensor_drift
 from simulation import DEG, Tool, attitude
 from test_calibrate import PROFILE, make
 from wells import (
@@ -509,7 +502,7 @@ def test_assumptions_that_cannot_be(name: str) -> None:
 
 def test_screen_says_what_the_analysis_says() -> None:
     result = interference(laboratory(), well())
-    text = screen(result, result.calibration.tool)
+    text = interference_screen(result, result.calibration.tool)
     assert "SIMULATED DATA" in text
     assert re.search(r"^separable: .* 1° allowed\)$", text, re.M)
     # 70 nT of drift cannot be told from interference
@@ -517,8 +510,8 @@ def test_screen_says_what_the_analysis_says() -> None:
     assert "Not in it: sag" in text
     assert text.count("\nS") == 30
     refused = interference(laboratory(), well(horizontal_east(7)))
-    assert "NOT separable from azimuth" in screen(refused)
-    assert "is missing: one at inclination" in screen(refused)
+    assert "NOT separable from azimuth" in interference_screen(refused)
+    assert "is missing: one at inclination" in interference_screen(refused)
 
 
 def test_page_shows_before_and_after_and_is_the_same_twice() -> None:

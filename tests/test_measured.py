@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mwdcal.calibration.estimate import fit
-from mwdcal.geometry.directions import directions, group_scatter
+from mwdcal.geometry.vectors import directions, group_scatter
 
 measured = pytest.importorskip("measured")
 

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mwdcal.screens.numbers import contribution, estimate
+from mwdcal.presentation.numbers import contribution, estimate
 
 
 def value_of(text):

@@ -24,7 +24,7 @@ pytest.importorskip("matplotlib", reason="matplotlib is not installed")
 from matplotlib.patheffects import withStroke  # noqa: E402
 from PIL import Image  # noqa: E402
 
-from mwdcal.pages.page import environment  # noqa: E402
+from mwdcal.presentation.page import environment  # noqa: E402
 from mwdcal.use import plots  # noqa: E402
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
@@ -275,7 +275,7 @@ def test_a_page_can_be_read_by_everybody(written, open_page, name):
 
 def test_only_colours_change_in_the_dark():
     """So faults of places are looked for in one scheme at each width."""
-    style = (files("mwdcal.pages") / "templates" / "style.css").read_text("utf-8")
+    style = (files("mwdcal.presentation") / "templates" / "style.css").read_text("utf-8")
     _, dark, _ = re.split(
         r"@media \(prefers-color-scheme: dark\) \{(.*?\n)\}\n", style, flags=re.DOTALL
     )

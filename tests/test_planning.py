@@ -23,10 +23,17 @@ from mwdcal.files.profiles import built_in, load_profile
 from mwdcal.geometry.vectors import reference_vectors
 from mwdcal.planning import planned
 from mwdcal.planning.expected import expected, nominal_run, planned_earth, planned_fit
-from mwdcal.planning.fewest import least_count, least_worst
-from mwdcal.planning.moves import Stand, measuring_order, move_seconds, session_seconds
-from mwdcal.planning.optimal import Design, Information, best
-from mwdcal.planning.planned import WORKING_INCLINATIONS, best_plan, judged, smallest_plan
+from mwdcal.planning.optimal import Design, Information, best, least_count, least_worst
+from mwdcal.planning.planned import (
+    WORKING_INCLINATIONS,
+    Stand,
+    best_plan,
+    judged,
+    measuring_order,
+    move_seconds,
+    session_seconds,
+    smallest_plan,
+)
 from mwdcal.planning.plans import load_plan, run_sheet, taken
 from mwdcal.sensor.profile import TriadProfile
 from simulation import DEG, attitude

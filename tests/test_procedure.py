@@ -18,11 +18,9 @@ from mwdcal.calibration.options import Options
 from mwdcal.files.limits import load_limits
 from mwdcal.files.profiles import load_profile
 from mwdcal.planning import procedure as procedures
-from mwdcal.planning.effects import Effects, SensorEffects, StandEffects
 from mwdcal.planning.plans import load_plan
-from mwdcal.planning.procedure import Procedure
-from mwdcal.planning.repetition import Share, summarised
-from mwdcal.planning.simulate import drawn
+from mwdcal.planning.procedure import Procedure, Share, summarised
+from mwdcal.planning.simulate import Effects, SensorEffects, StandEffects, drawn
 from mwdcal.sensor.profile import StandProfile
 from mwdcal.use.verification import Bounds, Limits
 

@@ -12,9 +12,9 @@ import pytest
 
 from cli_support import EXAMPLE, mwdcal, read_csv, refused, write_csv
 from mwdcal.errors import InputError
-from mwdcal.survey.place import earth
-from mwdcal.survey.place.grids import grid_convergence
-from mwdcal.survey.place.references import (
+from mwdcal.survey import earth
+from mwdcal.survey.earth import grid_convergence
+from mwdcal.survey.references import (
     MOMENT_SD,
     PLACE_SD,
     EarthReference,

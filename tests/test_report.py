@@ -27,13 +27,12 @@ from mwdcal.calibration.prediction import (
 from mwdcal.calibration.readings import Readings
 from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import reference_vectors
-from mwdcal.pages import pictures, report
-from mwdcal.pages.page import css
-from mwdcal.pages.report import render
 from mwdcal.planning import simulate
-from mwdcal.screens import calibration as screen
-from mwdcal.screens import conversion, text
-from mwdcal.screens.numbers import fixed, measured, number, signed
+from mwdcal.presentation import calibration as screen
+from mwdcal.presentation import calibration_page, conversion, text
+from mwdcal.presentation.calibration_page import render
+from mwdcal.presentation.numbers import fixed, measured, number, signed
+from mwdcal.presentation.page import css, svg
 from mwdcal.sensor.profile import Profile, TriadProfile
 from mwdcal.use import plots
 from mwdcal.use.notation import convert
@@ -141,7 +140,7 @@ def words(monkeypatch):
         *("accuracy_over_temperature", "errors_by_temperature"),
     ):
         monkeypatch.setattr(plots.Plots, name, lambda *arguments: "")
-    monkeypatch.setattr(pictures, "svg", lambda figure, key: Markup(figure))
+    monkeypatch.setattr("mwdcal.presentation.page.svg", lambda figure, key: Markup(figure))
     return render
 
 
@@ -200,19 +199,19 @@ def test_the_only_script_is_the_one_that_the_security_policy_allows(page):
 
 
 def test_points_have_the_names_and_values_of_their_stations(whole):
-    drawn = pictures.svg(whole.plot.deviations(), "k")
+    drawn = svg(whole.plot.deviations(), "k")
     names = re.findall(r"<title>station (\S+): (\S+) σ</title>", drawn)
     expected = {row.station: row.deviation for row in whole.station_rows}
     assert {name: float(value) for name, value in names} == pytest.approx(expected, rel=6e-3)
     assert len(names) == len(expected)
-    assert drawn == pictures.svg(whole.plot.deviations(), "k")
+    assert drawn == svg(whole.plot.deviations(), "k")
 
 
 def test_no_point_has_the_name_of_another(whole):
     figure = whole.plot.deviations()
     line = figure.findobj(lambda artist: artist.get_gid())[0]
     line.set_label(f"{line.get_label()}\none too many")
-    names = re.findall("<title>", pictures.svg(figure, "k"))
+    names = re.findall("<title>", svg(figure, "k"))
     assert len(names) == sum(row.reshoot for row in whole.station_rows)
 
 
@@ -229,7 +228,7 @@ def test_user_settings_of_matplotlib_change_nothing(whole, page):
     import matplotlib as mpl
 
     with mpl.rc_context({"font.size": 20, "axes.facecolor": "red", "svg.fonttype": "none"}):
-        assert pictures.svg(whole.plot.errors("gravity"), "error-gravity") in page
+        assert svg(whole.plot.errors("gravity"), "error-gravity") in page
         assert mpl.rcParams["font.size"] == 20
 
 
@@ -283,7 +282,7 @@ def test_station_labels_may_be_anything(whole):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         figures = {"a": odd.plot.errors("field"), "b": odd.plot.deviations()}
-        found = "".join(pictures.svg(figure, key) for key, figure in figures.items())
+        found = "".join(svg(figure, key) for key, figure in figures.items())
     assert "<script" not in found
     parsed(found)
 
@@ -398,11 +397,11 @@ def test_picture_of_the_orders_has_both_triads():
         return msgspec.structs.replace(made, orders=scores).plot.orders()
 
     both = drawn(made.orders)
-    parsed(pictures.svg(both, "orders"))
+    parsed(svg(both, "orders"))
     alone = drawn([s for s in made.orders if s.triad == "accelerometer"])
     assert (len(alone.axes), len(both.axes)) == (1, 2)
     blank = [msgspec.structs.replace(s, error_inside=None) for s in made.orders]
-    parsed(pictures.svg(drawn(blank), "orders"))
+    parsed(svg(drawn(blank), "orders"))
 
 
 @cache
@@ -436,7 +435,7 @@ def left_out_rows(page):
 def test_every_station_shows_its_error_left_out_and_what_it_does(words, whole):
     page = words(whole)
     assert parsed(page).ids.count("left-out") == 1
-    decimals = report._decimals(whole)
+    decimals = calibration_page._decimals(whole)
     names = [row.observable for row in whole.errors]
     rows = left_out_rows(page)
     assert len(rows) == 48

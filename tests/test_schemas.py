@@ -8,7 +8,7 @@ import pytest
 
 from cli_support import EXAMPLE, calibrated, commands, mwdcal, servo_run, write_csv
 from mwdcal.files import documents
-from mwdcal.screens.envelope import INPUTS
+from mwdcal.presentation.envelope import INPUTS
 from schemas import CONTENTS, of_command
 from test_allan import static
 from test_fleet import write_fleet

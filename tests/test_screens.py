@@ -23,7 +23,7 @@ import pytest
 from cli_support import called, commands, mwdcal, read_csv, servo_run, write_csv
 from mwdcal.app import cli, progress
 from mwdcal.certificate import keys, signature
-from mwdcal.screens import text
+from mwdcal.presentation import text
 
 STORED = Path(__file__).parent / "screens"
 WIDTHS = (80, 120)

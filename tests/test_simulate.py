@@ -17,17 +17,18 @@ from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.files.profiles import built_in, load_profile
-from mwdcal.planning.effects import (
+from mwdcal.planning.plans import load_plan
+from mwdcal.planning.session import Session, tool_facts
+from mwdcal.planning.simulate import (
     EarthEffects,
     Effects,
     SensorEffects,
     StandEffects,
     TemperatureEffects,
+    drawn,
     load_effects,
+    simulated,
 )
-from mwdcal.planning.plans import load_plan
-from mwdcal.planning.session import Session, tool_facts
-from mwdcal.planning.simulate import drawn, simulated
 from mwdcal.sensor.models import factor_parts
 from mwdcal.sensor.profile import StandProfile
 from simulation import DEG, attitude

@@ -10,7 +10,7 @@ from cli_support import mwdcal, refused, write_csv
 from mwdcal.errors import InputError
 from mwdcal.files.formats.table import Table
 from mwdcal.logs import standstill
-from mwdcal.logs.clock import unlikely_seconds
+from mwdcal.logs.regular import unlikely_seconds
 from mwdcal.logs.stations import StandstillError, find_stations
 from test_stations import ACC, MAG, means, multi_rate, tumble, without
 

@@ -16,7 +16,7 @@ from test_stations import ACC, tumble
 pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")
 
-from mwdcal.pages.stations import figure
+from mwdcal.presentation.stations_page import figure
 
 VOID = ("meta", "br", "use", "path")
 

@@ -26,14 +26,14 @@ from mwdcal.survey.acceptance import (
     STRENGTH_NAMES,
     Judgement,
     SurveyLimits,
+    blindness,
     distance,
     judged,
     load_survey_limits,
 )
-from mwdcal.survey.blindness import blindness
 from mwdcal.survey.path import well_path
 from mwdcal.survey.stations import STRENGTHS, SURVEYED, surveyed, switched
-from mwdcal.survey.tables import survey_readings
+from mwdcal.survey.surveying import survey_readings
 
 EARTH = Earth()
 NOISE = (1e-4, 15.0)
@@ -673,12 +673,12 @@ def test_bad_input_of_a_well(example, tmp_path, columns, options, message):
 
 def test_long_well_is_like_its_parts(example, tmp_path):
     """Results do not depend on how many stations are worked on at once."""
-    from mwdcal.survey import position, stations
+    from mwdcal.survey import path, stations
 
     whole, _ = surveyed_file(example, tmp_path)
     with (
         patch.object(stations, "STATIONS_AT_ONCE", 7),
-        patch.object(position, "STATIONS_AT_ONCE", 5),
+        patch.object(path, "STATIONS_AT_ONCE", 5),
     ):
         parts, _ = surveyed_file(example, tmp_path)
     for name in whole:

@@ -14,7 +14,7 @@ from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.errors import FitError
-from mwdcal.survey.position import position_covariance
+from mwdcal.survey.path import position_covariance
 from mwdcal.survey.tool_model import (
     FORMULAS,
     SENSOR_KINDS,

@@ -19,13 +19,15 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import reference_vectors, rotation
-from mwdcal.survey import position
-from mwdcal.survey.path import arcs, hole_direction, well_path
-from mwdcal.survey.position import (
+from mwdcal.survey import path
+from mwdcal.survey.path import (
+    arcs,
     calibrated_path,
     direction_errors,
     direction_gradient,
+    hole_direction,
     position_covariance,
+    well_path,
 )
 from simulation import Tool
 from test_calibrate import PROFILE, make, many_runs
@@ -118,7 +120,7 @@ def test_covariance_is_that_of_the_derivative_of_the_path(monkeypatch):
     causes = np.broadcast_to(causes, (len(md), *causes.shape))
     new = np.broadcast_to(np.eye(3), (*md.shape, 3, 3))
     for at_once in (4096, 5, 1):
-        monkeypatch.setattr(position, "STATIONS_AT_ONCE", at_once)
+        monkeypatch.setattr(path, "STATIONS_AT_ONCE", at_once)
         lasting = position_covariance(md, inclination, azimuth, causes)
         np.testing.assert_allclose(lasting, expected, rtol=1e-6, atol=1e-6)
         both = position_covariance(md, inclination, azimuth, causes, new)

@@ -13,8 +13,8 @@ import mwdcal
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.survey.acceptance import SensorTerms
-from mwdcal.survey.multistation.interference import corrected_calibration
-from mwdcal.survey.multistation.interference_estimate import Assumed, Estimate, estimate, misfits
+from mwdcal.survey.interference import corrected_calibration
+from mwdcal.survey.interference_estimate import Assumed, Estimate, estimate, misfits
 
 SEED = 11
 TOOLS, WELLS, SURVEYS = 6, 10, 60

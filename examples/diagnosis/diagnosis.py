@@ -25,10 +25,9 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.faults.diagnosis import diagnose
 from mwdcal.faults.physics import FAULTS, HEAT, NONE
 from mwdcal.files.profiles import load_profile
-from mwdcal.planning.effects import Effects, FaultEffect
 from mwdcal.planning.plans import load_plan
 from mwdcal.planning.session import Session
-from mwdcal.planning.simulate import StationPlan, drawn, grid, simulated
+from mwdcal.planning.simulate import Effects, FaultEffect, StationPlan, drawn, grid, simulated
 
 KINDS = (NONE, *FAULTS)
 SCENES = {

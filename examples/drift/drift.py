@@ -22,7 +22,7 @@ from mwdcal.calibration import results
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.drift.change import CHANGE_LEVEL, Contrasts, change_test
-from mwdcal.drift.comparable import (
+from mwdcal.drift.walk import (
     FIELD_DIRECTIONS,
     History,
     factored,

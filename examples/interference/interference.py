@@ -23,7 +23,7 @@ from mwdcal.geometry.vectors import centred, reference_vectors
 from mwdcal.planning.simulate import grid, run, servo
 from mwdcal.sensor.profile import Profile
 from mwdcal.survey.acceptance import SensorTerms
-from mwdcal.survey.multistation.interference_estimate import Assumed, estimate
+from mwdcal.survey.interference_estimate import Assumed, estimate
 
 FIELD, DIP = 50_000.0, np.radians(65.0)
 SD_FIELD, SD_DIP = 130.0, np.radians(0.2)

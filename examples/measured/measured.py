@@ -36,7 +36,7 @@ from mwdcal.files.datasets import fetch
 from mwdcal.files.formats.table import Table
 from mwdcal.files.profiles import load_profile
 from mwdcal.files.runs import read_run, to_readings
-from mwdcal.geometry.directions import directions, group_scatter
+from mwdcal.geometry.vectors import directions, group_scatter
 from mwdcal.sensor.profile import TriadProfile
 from mwdcal.use.notation import Notation, convert
 

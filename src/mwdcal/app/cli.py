@@ -15,34 +15,12 @@ from mwdcal.app import interruption
 from mwdcal.app.commands import Commands
 from mwdcal.app.messages import say, screens
 from mwdcal.errors import MwdcalError, reason
-from mwdcal.screens.text import harmless, laid_out, without_passwords
+from mwdcal.presentation.text import harmless, laid_out, without_passwords
 
 INTERNAL = 70
 """Exit status of a defect of the program."""
 COMPLETION = "_MWDCAL_COMPLETE"
 """Variable with which a shell asks for completions, which are bytes."""
-COMMANDS = (
-    "apply",
-    "calibrate",
-    "records.certificate",
-    "compare",
-    "completion",
-    "convert",
-    "planning.diagnose",
-    "example",
-    "fleet",
-    "list",
-    "noise",
-    "planning.plan",
-    "profile",
-    "surveys.reference",
-    "records.registry",
-    "planning.simulate",
-    "stations",
-    "surveys.survey",
-    "verify",
-)
-"""Modules of `mwdcal.app.commands` with a command of their name."""
 SECTIONS = {
     "Calibrate": ("profile", "stations", "noise", "calibrate", "verify", "compare", "fleet"),
     "Use": ("apply", "convert", "diagnose"),
@@ -51,7 +29,7 @@ SECTIONS = {
     "Records": ("certificate", "registry"),
     "Shell": ("completion",),
 }
-"""Commands in the order of the work, as the help shows them."""
+"""Modules of `mwdcal.app.commands` with a command of their name, in the order of the work, as the help shows them."""
 _LONG = re.compile(r"([^'\n]{300})[^'\n]+")
 """A value that a message about a wrong option repeats, where it is too long to be read."""
 
@@ -70,7 +48,7 @@ class Sections(click.Group):
 
 @click.group(
     cls=Sections,
-    commands=Commands({module.rpartition(".")[2]: module for module in COMMANDS}),
+    commands=Commands({name: name for names in SECTIONS.values() for name in names}),
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 @click.version_option(__version__, prog_name="mwdcal")

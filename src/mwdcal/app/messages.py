@@ -19,7 +19,7 @@ from typing import IO, TYPE_CHECKING, Any
 import click
 
 from mwdcal.errors import InputError, MwdcalError, reason
-from mwdcal.screens.text import (
+from mwdcal.presentation.text import (
     UNSAFE_BUT_LINES,
     fitting,
     harmless,
@@ -28,7 +28,7 @@ from mwdcal.screens.text import (
     to_json,
     without_passwords,
 )
-from mwdcal.screens.typed import as_typed
+from mwdcal.presentation.typed import as_typed
 
 if TYPE_CHECKING:
     from mwdcal.calibration.record import Finding

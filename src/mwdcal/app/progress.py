@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from typing import Any
 
 from mwdcal.app.messages import quiet
-from mwdcal.screens.text import PATIENCE
-from mwdcal.screens.text import slowly as slowly
+from mwdcal.presentation.text import PATIENCE
+from mwdcal.presentation.text import slowly as slowly
 
 MOMENT = 0.1
 """Seconds after which a bar moves."""

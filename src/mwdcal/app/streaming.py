@@ -38,7 +38,7 @@ from mwdcal.files.formats.table import numbers as as_numbers
 from mwdcal.files.streams import Part, StreamedTable
 from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, UNCERTAINTIES
 from mwdcal.geometry.vectors import AnyArray, Array, Bools
-from mwdcal.use import correction, correction_numba, scatter, strengths
+from mwdcal.use import correction, correction_numba, strengths
 from mwdcal.use.correction import JUDGED, RowCounts
 from mwdcal.use.uncertainty import with_uncertainty
 
@@ -73,7 +73,9 @@ WORST_ROWS = RowCounts(
     strengths=dict.fromkeys(strengths.JUDGED_STRENGTHS, _OFF),
     warmth=TEMPERATURE[:2],
     valueless=_MOST,
-    scatter=dict.fromkeys(scatter.STEADY_CHANGES, scatter.Scatter(1, 1, -1.23e9, 1.23e9, 1.2e-100)),
+    scatter=dict.fromkeys(
+        correction.STEADY_CHANGES, correction.Scatter(1, 1, -1.23e9, 1.23e9, 1.2e-100)
+    ),
 )
 """Rows whose findings take more room than those of any others."""
 
@@ -214,7 +216,7 @@ def _total(tallies: Sequence[RowCounts], moved: Collection[str]) -> RowCounts:
     return RowCounts(
         rows, beyond, tuple(name for name in JUDGED if name in moved), lacking, tuple(serials),
         strengths.total(tally.strengths for tally in tallies), (min(lows), max(highs)), {}, valueless,
-        scatter.total(tally.scatter for tally in tallies),
+        correction.total(tally.scatter for tally in tallies),
     )  # fmt: skip
 
 
@@ -317,7 +319,7 @@ class _Worker:
             rows, corrected.beyond, (), rows - table.count, self._serials(part.carried),
             strengths.judged(self.calibration, columns, known),
             correction.warmth(*channels.get("temperature", [None])), {}, valueless,
-            scatter.scatters(self.calibration, readings, columns),
+            correction.scatters(self.calibration, readings, columns),
         )  # fmt: skip
         return rendered, part.size, tally
 

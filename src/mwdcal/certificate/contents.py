@@ -1,6 +1,10 @@
 """`certificate`: the contents of a calibration certificate, from a calibration and what the laboratory states.
 
 Whatever ISO/IEC 17025:2017 asks for and nobody states becomes a finding in the certificate itself.
+
+How the tool was calibrated, in the words of a certificate.
+
+What the references of a calibration are traceable to, and whether that held on its day.
 """
 
 from __future__ import annotations
@@ -18,34 +22,94 @@ import numpy as np
 from msgspec.structs import replace
 
 from mwdcal.calibration.canonical import canonical, rounded
-from mwdcal.calibration.diagnosis.identity import (
-    FROM_THE_FUTURE,
-    UNIDENTIFIED,
-    dated,
-    unidentified,
-)
+from mwdcal.calibration.diagnosis.identity import FROM_THE_FUTURE, UNIDENTIFIED, dated, unidentified
 from mwdcal.calibration.drift import exact_and_steady
-from mwdcal.calibration.readings import check_day, is_simulated, serial_of, stated_day
-from mwdcal.calibration.record import SOFTWARE, Calibration, Finding
+from mwdcal.calibration.prediction import without_temperature
+from mwdcal.calibration.readings import CONSTANTS, check_day, is_simulated, serial_of, stated_day
+from mwdcal.calibration.record import SOFTWARE, Calibration, Finding, TriadCalibration
 from mwdcal.calibration.settings import ASSUMED, ASSUMED_PRACTICE
-from mwdcal.certificate.budget import assumed_exact, budget
+from mwdcal.certificate.budget import (
+    STAND_ANGLES,
+    assumed_exact,
+    budget,
+    repeatability,
+    settings_in_words,
+)
 from mwdcal.certificate.decisions import When, conformity
 from mwdcal.certificate.document import (
     Certificate,
     ConformityTest,
     Item,
+    Method,
     Party,
     Person,
     SourceFile,
     TracedStandard,
 )
 from mwdcal.certificate.laboratory import Laboratory, filled_pattern
-from mwdcal.certificate.methods import method
-from mwdcal.certificate.repeatability import repeatability
 from mwdcal.certificate.tables import conditions, result_tables
-from mwdcal.certificate.traceability import references_in_use, traced
 from mwdcal.errors import InputError
 from mwdcal.files.verifications import Verification
+from mwdcal.sensor.profile import MeasurementStandard
+
+DOCUMENTATION = "mwdcal documentation, Methods"
+MOOSAVI = "S. M. Seyed Moosavi et al., Error Analysis in Accelerometers Calibration of MWD Instruments (2016)"
+MORADI = "M. Moradi, I. Izadi, calibration of MWD sensors by particle swarm optimisation (2019)"
+PROCEDURE = (
+    "Readings of the tool at rest in many attitudes are taken, and the parameters of the sensor model "
+    "are fitted "
+)
+METHODS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "joint": ("to all references at once by weighted least squares.", ()),
+    "least-squares": ("to the reference vectors by least squares.", (MORADI,)),
+    "swarm": ("to the reference vectors by a particle swarm.", (MORADI,)),
+    "newton": ("to the strength of gravity and the inclination by Newton's method.", (MOOSAVI,)),
+    "toolface-inclination": ("to toolface and inclination alone.", ()),
+    "scalar": ("to the strengths of gravity and field alone.", ()),
+}
+"""What each method fits the parameters to, and where it is published."""
+
+
+def method(calibration: Calibration) -> Method:
+    """The method of a calibration, its model, and how it deviates from the usual procedure."""
+    text, papers = METHODS.get(calibration.method, (f"by the method {calibration.method}.", ()))
+    stand = calibration.tool.get("stand", "")
+    return Method(
+        name=calibration.method,
+        text=PROCEDURE + text,
+        software=calibration.software,
+        model="; ".join(map(_model, calibration.triads)),
+        stations=calibration.stations,
+        references=[DOCUMENTATION, *papers, *([f"stand: {stand}"] if stand else [])],
+        deviations=list(_deviations(calibration)),
+    )
+
+
+def _model(triad: TriadCalibration) -> str:
+    curved = ", with own-axis quadratic and cubic terms" if triad.curved else ""
+    return f"{triad.name}: {triad.model}, temperature order {triad.order}{curved}"
+
+
+def _deviations(calibration: Calibration) -> Iterator[str]:
+    """What was done other than the usual procedure, a phrase each."""
+    options = calibration.options
+    if without_temperature(calibration):
+        yield f"{without_temperature(calibration)}: the results hold at the temperature of the calibration alone"
+    if calibration.excluded:
+        yield f"stations excluded from the fit: {', '.join(calibration.excluded)}"
+    if options.robust:
+        yield f"robust fit ({options.robust}): stations that do not agree have less weight"
+    if options.ignore:
+        yield f"references not used: {', '.join(options.ignore)}"
+    if options.parameters != 12:
+        yield f"{options.parameters} parameters of each triad, the others held at zero"
+    if options.paper_weights:
+        yield "unweighted sums, as the method's paper has them"
+    if options.prior:
+        yield f"prior knowledge of the parameters: {options.prior}"
+    if calibration.relative:
+        yield "strength of the field unknown: the magnetometer is calibrated to a field of 1"
+
 
 DIGEST_DIGITS = 12
 """Hexadecimal digits of the contents' SHA-256 in a certificate number."""
@@ -377,3 +441,55 @@ def _number(contents: Certificate, pattern: str) -> str:
         year=contents.issued[:4],
         digest=digest[:DIGEST_DIGITS],
     )
+
+
+def references_in_use(calibration: Calibration) -> list[str]:
+    """Quantities whose references the results rest on: the stand, gravity, field, dip, temperature."""
+    known = {row.observable for row in calibration.errors}
+    estimated = {constant.name for constant in calibration.constants}
+    unused = (
+        estimated | {*calibration.options.ignore} | ({"field"} if calibration.relative else set())
+    )
+    return [
+        *(["stand"] if known.intersection(STAND_ANGLES) else []),
+        *(name for name in CONSTANTS if name in known - unused),
+        *(["temperature"] if calibration.thermal else []),
+    ]
+
+
+def traced(calibration: Calibration, laboratory: Laboratory, day: date) -> list[TracedStandard]:
+    """The standards of profile and laboratory, which replaces one of the same quantity and name."""
+    declared = calibration.profile.standards
+    standards = () if isinstance(declared, msgspec.UnsetType) else declared
+    named = {(each.quantity, each.name): each for each in (*standards, *laboratory.standards)}
+    return [_traced(calibration, standard, day) for standard in named.values()]
+
+
+def _traced(calibration: Calibration, standard: MeasurementStandard, day: date) -> TracedStandard:
+    issued, due = standard.issued, standard.due
+    return TracedStandard(
+        quantity=standard.quantity,
+        name=standard.name,
+        serial=standard.serial,
+        certificate=standard.certificate,
+        issuer=standard.issuer,
+        date=issued.isoformat() if issued else "",
+        due=due.isoformat() if due else "",
+        overdue=due is not None and due < day,
+        standard_uncertainty=_uncertainty(calibration, standard.quantity),
+    )
+
+
+def _uncertainty(calibration: Calibration, quantity: str) -> str:
+    """The declared 1σ of a reference in words; empty where none is."""
+    stand = calibration.profile.stand
+    if quantity == "stand":
+        return settings_in_words(calibration).removeprefix(": ")
+    units = {"gravity": "g", "field": "nT", "dip": "°"}
+    sd = getattr(
+        stand,
+        {"field": "field_nt", "gravity": "gravity_g", "dip": "dip_deg"}.get(quantity, ""),
+        0.0,
+    )
+    unit = units.get(quantity, "")
+    return f"{sd:.2g}{'' if unit == '°' else ' '}{unit}" if sd else ""

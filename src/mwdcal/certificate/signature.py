@@ -21,8 +21,7 @@ import msgspec
 from mwdcal.calibration.canonical import Signature, SignatureCheck, canonical, signed_form
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.certificate.document import SourceFile
-from mwdcal.certificate.keys import PrivateKey, TrustedKey, available, now
-from mwdcal.certificate.trusted_keys import moment
+from mwdcal.certificate.keys import PrivateKey, TrustedKey, available, moment, now
 from mwdcal.errors import FitError, InputError
 from mwdcal.files import documents
 from mwdcal.files.formats.members import Member

@@ -15,7 +15,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from mwdcal.calibration.readings import TRIADS
-from mwdcal.drift.comparable import DEPENDENT, History
+from mwdcal.drift.walk import DEPENDENT, History
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints, diagonal, outer
 
 CHANGE_LEVEL = 0.01

@@ -12,7 +12,7 @@ import numpy as np
 from mwdcal.calibration.prediction import UNKNOWN_GRAVITY, raw_reading, unknown_gravity
 from mwdcal.calibration.readings import NANOTESLA, SOAK_GAP, TRIADS
 from mwdcal.calibration.record import MARGIN, Calibration, TriadCalibration
-from mwdcal.drift.comparable import (
+from mwdcal.drift.walk import (
     ANY_TEMPERATURE,
     FIELD_DIRECTIONS,
     History,

@@ -28,15 +28,19 @@ from mwdcal.drift.forecast import (
     INTERVAL,
     LONGEST_INTERVAL,
     RISK,
+    Departure,
     Growth,
+    Left,
     Outlook,
     Paths,
+    ServiceTest,
     day_after,
+    departures,
+    failures,
     outlook,
+    service_rows,
 )
 from mwdcal.drift.histories import ToolHistory, factor, tool_history
-from mwdcal.drift.left import Departure, Left, departures, failures
-from mwdcal.drift.service import ServiceTest, service_rows
 from mwdcal.drift.walk import WALK_GROUPS, GroupRates, Increments, draws, group_places, quantiles
 from mwdcal.geometry.vectors import Array
 

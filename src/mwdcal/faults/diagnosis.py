@@ -1,23 +1,370 @@
-"""Which fault explains a change best: a calibration and later readings in, a `Diagnosis` out. Pure data."""
+"""Which fault explains a change best: a calibration and later readings in, a `Diagnosis` out. Pure data.
+
+Readings as a diagnosis takes them: checked, and with what is not stated made an honest uncertainty.
+
+Which faults readings cannot tell apart or do not show at all, and which further readings would.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, ClassVar
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar, NamedTuple
 
 import msgspec
 import numpy as np
 
-from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.diagnosis.identity import doubts, other_tool
+from mwdcal.calibration.prediction import raw_reading
+from mwdcal.calibration.readings import CONSTANTS, LEAST_TEMPERATURE_SPAN, TRIADS, Readings
 from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.errors import InputError
 from mwdcal.estimation.evidence import ANGLES
-from mwdcal.faults import advice, preparation
-from mwdcal.faults.advice import NextReading
-from mwdcal.faults.likelihood import Suspect, raw_of
-from mwdcal.faults.physics import DEAD, FAULTS, HEAT, NONE, FaultForm, FaultTerm, faults, hypotheses
-from mwdcal.faults.weighing import DRAWS, FALSE_ALARMS, UNEXPLAINED, FaultEvidence
+from mwdcal.faults.likelihood import (
+    DISTINCT,
+    DRAWS,
+    FALSE_ALARMS,
+    LIKELY,
+    UNEXPLAINED,
+    FaultEvidence,
+    Suspect,
+    explained,
+    over_forms,
+    raw_of,
+)
+from mwdcal.faults.physics import (
+    DEAD,
+    DEPARTURES,
+    FAULTS,
+    HEAT,
+    NONE,
+    SIZE,
+    SURROUNDINGS,
+    FaultForm,
+    FaultTerm,
+    faults,
+    hypotheses,
+)
 from mwdcal.files.contract import CHANNELS
-from mwdcal.geometry.vectors import Array
+from mwdcal.geometry.vectors import Array, reference_vectors
+
+NOMINAL_FIELD = 50_000.0
+"""Field of the Earth, nT, by which sizes in nT are taken for a magnetometer that is calibrated to a field of 1."""
+FIELD_SD = 0.3
+"""Standard uncertainty of a field strength that the readings do not state, as a share of the laboratory's."""
+
+
+def prepared(calibration: Calibration, readings: Readings) -> tuple[Readings, list[Finding]]:
+    """The stations that a diagnosis can use, and what the reader should know of them.
+
+    Raises:
+        InputError: readings of another tool or of the fit itself, or none that can be used.
+    """
+    _check(calibration, readings)
+    calibration.fields(readings)  # refuses readings that lack what the calibration needs
+    findings = doubts(calibration, readings)
+    if readings.magnetometer is not None and not calibration.has_field:
+        readings = replace(readings, magnetometer=None)
+    if calibration.has_field and readings.magnetometer is None:
+        findings.append(
+            _finding("no-magnetometer", "the readings have no magnetometer: nothing is said of it.")
+        )
+    whole = [getattr(readings, name) for name in readings.triads]
+    sound = np.isfinite(np.concatenate(whole, -1)).all(-1)
+    if not sound.any():
+        raise InputError(
+            f"{readings.name}: no station has all readings. Fill in the columns of raw readings."
+        )
+    if not sound.all():
+        lacking = np.count_nonzero(~sound)
+        findings.append(
+            _finding("missing-reading", f"{lacking} stations lack a reading, and are left out.")
+        )
+        readings = readings.select(sound)
+    if calibration.outside(readings).any():
+        text = "some stations lie outside the calibrated temperature range: drift beyond it counts as a change."
+        findings.append(_finding("outside-temperature", text))
+    if not warmed(readings):
+        text = "all readings are at one temperature: a fault of heat is no candidate. It needs two temperatures."
+        findings.append(_finding("one-temperature", text))
+    if calibration.unrecorded(readings):
+        findings.append(
+            _finding("no-temperature", "the tool was calibrated at unrecorded temperatures.")
+        )
+    if "gravity" not in readings.known:
+        findings.append(
+            _finding("assumed-gravity", "no ref_gravity_g: gravity is taken to be exactly 1 g.")
+        )
+    return _with_field(calibration, readings, findings), findings
+
+
+def warmed(readings: Readings) -> bool:
+    """Whether readings are at temperatures far enough apart to show what changes with temperature."""
+    warmth = readings.temperature
+    return warmth is not None and float(np.ptp(warmth)) >= LEAST_TEMPERATURE_SPAN
+
+
+def _finding(name: str, text: str) -> Finding:
+    return Finding(id=name, text=text)
+
+
+def _check(calibration: Calibration, readings: Readings) -> None:
+    """Refuse readings that say nothing of this calibration."""
+    if other := other_tool(calibration, readings):
+        raise InputError(
+            f"{readings.name} is of tool {other[1]}, the calibration of tool {other[0]}. Give readings of the "
+            "same tool, or correct 'serial' in the file."
+        )
+    if any(calibration.used(readings.digest)):
+        raise InputError(
+            f"{readings.name}: stations of the calibration's own fit cannot show what has changed since. Give "
+            "later readings."
+        )
+
+
+def _with_field(calibration: Calibration, readings: Readings, findings: list[Finding]) -> Readings:
+    """The readings with a field strength at every station, and an honest uncertainty where they state none."""
+    if readings.magnetometer is None:
+        return readings
+    field, sd = readings.reference("field"), readings.uncertainty("field")
+    if calibration.relative:
+        field = np.full(field.shape, np.nan)
+        text = "the magnetometer is calibrated to field = 1: sizes in nT are as if that were 50,000 nT."
+        findings.append(_finding("relative-field", text))
+    blank = np.isnan(field)
+    if blank.all():
+        earth = calibration.earth.get("field", 1.0)
+        known = {**readings.known, "field": np.full(field.shape, earth)}
+        return replace(
+            readings,
+            known=known,
+            sd={**readings.sd, "field": np.full(field.shape, FIELD_SD * earth)},
+        )
+    filled = np.where(blank, np.nanmean(field), field)
+    return replace(
+        readings, known={**readings.known, "field": filled}, sd={**readings.sd, "field": sd}
+    )
+
+
+def freedom(calibration: Calibration, readings: Readings) -> float:
+    """Degrees of freedom behind the noise of the readings: the fewest of any triad that states none."""
+    triads = calibration.triads[: len(readings.triads)]
+    estimated = [t.degrees_of_freedom for t in triads if t.name not in readings.sd]
+    return max(1.0, min(estimated)) if estimated else np.inf
+
+
+QUARTERS = np.arange(4) * np.pi / 2
+"""Toolfaces of a further roll."""
+SETTING = float(np.radians(0.02))
+"""Standard uncertainty of the angles of a further roll, where the readings do not state a larger one."""
+COLD, HOT = 20.0, 100.0
+"""Temperatures of further readings where the calibration states no range, °C."""
+
+
+class NextReading(msgspec.Struct, frozen=True, kw_only=True):
+    """What would tell the fault named from another: `evidence` is the logarithm of the ratio to be expected."""
+
+    fault: str
+    reading: str | None
+    evidence: float
+
+
+class Further(NamedTuple):
+    """A roll of four toolfaces that could be read as well: its inclination, temperature, and what it is without."""
+
+    text: str
+    inclination: float
+    azimuth: float
+    temperature: float | None = None
+    without: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        """What to measure, in words."""
+        inclination, azimuth = np.degrees(self.inclination), np.degrees(self.azimuth) % 360
+        return (
+            f"four stations {self.text}, at {inclination:.0f}° inclination, {azimuth:.0f}° azimuth and toolfaces of "
+            "0°, 90°, 180° and 270°,"
+        )
+
+
+def expected_ratios(evidence: FaultEvidence, information: Array, departures: Array) -> Array:
+    """Log evidence (F,) over none that each form gains on average, the tool having `departures` (SIZE,)."""
+    mean = information @ departures
+    result = []
+    for form in evidence.forms:
+        inner = form.mixing.transpose() @ information @ form.mixing
+        whole = np.eye(len(inner)) + inner
+        along = form.mixing.transpose() @ mean
+        gained = along @ np.linalg.solve(whole, along) + np.trace(np.linalg.solve(whole, inner))
+        result.append(0.5 * (gained - np.linalg.slogdet(whole)[1]))
+    return np.array(result)
+
+
+def unseen(evidence: FaultEvidence) -> list[str]:
+    """Faults that readings would not show, on average over faults of the usual size in their best form.
+
+    Definition: the log evidence for the fault is tr(A) / 2 - log det(I + A) / 2 on average, A being the
+    information on its sizes.
+    """
+    seen = set()
+    for form in (each for each in evidence.forms if each.larger == 1):
+        inner = form.mixing.transpose() @ evidence.information @ form.mixing
+        gain = 0.5 * (np.trace(inner) - np.linalg.slogdet(np.eye(len(inner)) + inner)[1])
+        seen |= {form.kind} if gain >= DISTINCT else set()
+    return [kind for kind in FAULTS if kind not in seen and kind != DEAD]
+
+
+def innocent(fault: str, rivals: Sequence[str], shares: Mapping[str, float]) -> str:
+    """The fault, or where readings do not exclude that the tool is sound, what about it is at fault instead.
+
+    A field fixed in the tool or in the Earth is no fault of the sensors: none is condemned while one of these explains
+    as much.
+    """
+    outside = [name for name in rivals if name in SURROUNDINGS]
+    return (
+        max(outside, key=lambda name: shares[name])
+        if fault not in SURROUNDINGS and outside
+        else fault
+    )
+
+
+def apart(
+    calibration: Calibration, readings: Readings, evidence: FaultEvidence, fault: str,
+    shares: Mapping[str, float],
+) -> tuple[list[str], list[NextReading]]:  # fmt: skip
+    """Faults that cannot be told from the one named, and for each the further reading that would tell."""
+    if fault == NONE:
+        return [], []
+    rivals = [
+        name for name, share in shares.items() if name not in (fault, NONE) and share > LIKELY
+    ]
+    if fault == DEAD:
+        return rivals, []
+    departures = _departures(evidence, fault)
+    expected = expected_ratios(evidence, evidence.information, departures)
+    margins = _margins(evidence, expected, fault)
+    rivals += [name for name, margin in margins.items() if margin < DISTINCT and name not in rivals]
+    if not rivals:
+        return [], []
+    offers = _offers(calibration, readings, evidence)
+    later = {
+        text: _margins(evidence, expected_ratios(evidence, whole, departures), fault)
+        for text, whole in offers.items()
+    }
+    return rivals, [_best(name, margins, later) for name in rivals if name in margins]
+
+
+def _departures(evidence: FaultEvidence, fault: str) -> Array:
+    """Departures (SIZE,) of the best form of a fault, of the sizes that were estimated."""
+    form, sizes, _ = evidence.sizes(fault)
+    return np.asarray(form.mixing @ sizes)
+
+
+def _margins(evidence: FaultEvidence, each: Array, fault: str) -> dict[str, float]:
+    """By how much the log evidence of a fault is expected to exceed that of each other."""
+    kinds = over_forms(evidence.forms, each)
+    return {name: float(kinds[fault] - value) for name, value in kinds.items() if name != fault}
+
+
+def _best(
+    rival: str, margins: Mapping[str, float], later: Mapping[str, Mapping[str, float]]
+) -> NextReading:
+    """The first further reading that tells a rival, else the best if it helps at all."""
+    enough = [text for text, each in later.items() if each[rival] >= DISTINCT]
+    text = enough[0] if enough else max(later, key=lambda name: later[name][rival])
+    gained = later[text][rival]
+    if not enough and gained < margins[rival] + 0.5 * DISTINCT:
+        return NextReading(fault=rival, reading=None, evidence=gained)
+    return NextReading(fault=rival, reading=text, evidence=gained)
+
+
+def _offers(
+    calibration: Calibration, readings: Readings, evidence: FaultEvidence
+) -> dict[str, Array]:
+    """Information (SIZE, SIZE) of the departures by the readings and each further roll, by its description."""
+    state, problem = evidence.none.state, evidence.suspect.problem
+    axis = state.attitude[0, :, 2, :].mean(0)
+    here = float(np.arctan2(np.hypot(axis[0], axis[1]), axis[2]))
+    azimuth = float(np.arctan2(axis[1], axis[0]))
+    level = min(np.radians([5.0, 90.0, 45.0, 135.0]), key=lambda angle: -abs(angle - here))
+    low, high = calibration.temperature_c or (COLD, HOT)
+    middle = float(problem.temperature.mean())
+    far = high if abs(high - middle) > abs(low - middle) else low
+    offers = [
+        Further("on a stand", level, azimuth),
+        Further("on a stand", here, azimuth + np.pi / 2),
+        Further("after switching off and on", here, azimuth, without=("turn-on",)),
+        Further("elsewhere, away from casing and steel", here, azimuth, without=("disturbance",)),
+        Further(
+            "without string and collar, or after demagnetising them",
+            here,
+            azimuth,
+            without=("iron",),
+        ),
+    ]
+    if readings.temperature is not None and abs(far - middle) > calibration.margin:
+        offers.append(Further(f"at {far:.0f} °C", here, azimuth, far))
+    return {str(offer): _informed(calibration, readings, offer) for offer in offers}
+
+
+def _informed(calibration: Calibration, readings: Readings, offer: Further) -> Array:
+    """Information (SIZE, SIZE) of the departures by the readings and a further roll."""
+    longer = _extended(calibration, readings, offer)
+    suspect = Suspect.of(calibration, longer)
+    held = np.ones((longer.count, 1, SIZE))
+    for name in offer.without:
+        held[readings.count :, :, DEPARTURES[name]] = 0.0
+    nothing = np.zeros((1, SIZE, 0))
+    return np.asarray(explained(suspect, nothing, suspect.start(), held=held).information[0])
+
+
+def _extended(calibration: Calibration, readings: Readings, offer: Further) -> Readings:
+    """The readings, and those of a sound tool in a further roll of known attitudes at the same place."""
+    known = {name: readings.reference(name) for name in (*ANGLES, *CONSTANTS)}
+    here = {
+        n: np.mean(known[n][np.isfinite(known[n])] if np.isfinite(known[n]).any() else np.nan)
+        for n in CONSTANTS
+    }
+    turns = np.broadcast_arrays(offer.inclination, offer.azimuth, QUARTERS)
+    more = dict(zip(ANGLES, turns, strict=True)) | {n: np.full(4, here[n]) for n in CONSTANTS}
+    warmth, usual = readings.temperature, calibration.reference_temperature
+    if warmth is not None:
+        usual = float(np.mean(warmth)) if offer.temperature is None else offer.temperature
+        warmth = np.append(warmth, np.full(4, usual))
+    dip = (
+        np.radians(calibration.earth.get("dip_deg", 0.0)) if np.isnan(here["dip"]) else here["dip"]
+    )
+    inclination, azimuth, toolface = turns
+    vectors = reference_vectors(inclination, azimuth, toolface, here["gravity"], here["field"], dip)
+    raw, sd = _rolled(calibration, readings, vectors, np.full(4, usual))
+    for name in readings.sd.keys() - {*TRIADS} | set(ANGLES):
+        stated = readings.uncertainty(name)
+        least = SETTING if name in ANGLES else 0.0
+        sd[name] = np.append(stated, np.full(4, max(stated.max(), least)))
+    return replace(
+        readings, accelerometer=raw[TRIADS[0]], magnetometer=raw.get(TRIADS[1]), temperature=warmth,
+        sd=sd, station=(), digest=(),
+        known={name: np.append(known[name], more[name]) for name in known},
+        group=np.append(readings.groups, np.full(4, -1)),
+    )  # fmt: skip
+
+
+def _rolled(
+    calibration: Calibration, readings: Readings, vectors: tuple[Array, Array], warmth: Array
+) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Readings and their noise (n + 4, 3) by triad, those of a sound tool at `vectors` (4, 3) after the others."""
+    raw, sd = {}, {}
+    for triad, vector in zip(calibration.triads[: len(readings.triads)], vectors, strict=False):
+        model, before = (
+            triad.functions(calibration.reference_temperature),
+            getattr(readings, triad.name),
+        )
+        added = raw_reading(model, np.array(triad.parameters), vector, warmth)
+        stated = np.broadcast_to(readings.sd.get(triad.name, triad.noise), before.shape)
+        raw[triad.name] = np.concatenate([before, added])
+        sd[triad.name] = np.concatenate([stated, np.tile(stated.mean(0), (4, 1))])
+    return raw, sd
+
 
 BLIND = 0.9
 """A size of which the readings leave so much of the uncertainty that it had beforehand is not stated."""
@@ -86,20 +433,20 @@ def diagnose(calibration: Calibration, readings: Readings, *, draws: int = DRAWS
     Raises:
         InputError: readings of another tool or of the fit itself, or none that can be used.
     """
-    prepared, findings = preparation.prepared(calibration, readings)
+    usable, findings = prepared(calibration, readings)
     unit = 1.0
     if calibration.relative:
-        unit = 1 / preparation.NOMINAL_FIELD
-    forms = [form for form in faults(calibration.profile, unit) if _can_show(form, prepared)]
-    evidence = FaultEvidence.of(Suspect.of(calibration, prepared), hypotheses(forms))
-    probability = evidence.probability(preparation.freedom(calibration, prepared), draws)
+        unit = 1 / NOMINAL_FIELD
+    forms = [form for form in faults(calibration.profile, unit) if _can_show(form, usable)]
+    evidence = FaultEvidence.of(Suspect.of(calibration, usable), hypotheses(forms))
+    probability = evidence.probability(freedom(calibration, usable), draws)
     shares = evidence.likelihoods()
     fault = max(FAULTS, key=lambda name: shares[name]) if probability <= FALSE_ALARMS else NONE
-    findings += _unexplained(evidence, fault, preparation.freedom(calibration, prepared))
-    confounded, remedies = advice.apart(calibration, prepared, evidence, fault, shares)
-    if (other := advice.innocent(fault, confounded, shares)) != fault:
+    findings += _unexplained(evidence, fault, freedom(calibration, usable))
+    confounded, remedies = apart(calibration, usable, evidence, fault, shares)
+    if (other := innocent(fault, confounded, shares)) != fault:
         fault = other
-        confounded, remedies = advice.apart(calibration, prepared, evidence, fault, shares)
+        confounded, remedies = apart(calibration, usable, evidence, fault, shares)
     named = _named(calibration, evidence, fault)
     return Diagnosis(
         fault=fault,
@@ -109,11 +456,11 @@ def diagnose(calibration: Calibration, readings: Readings, *, draws: int = DRAWS
         confounded_with=confounded,
         rivals=[_rival(calibration, evidence, name) for name in confounded],
         tell_apart=remedies,
-        unseen=advice.unseen(evidence),
+        unseen=unseen(evidence),
         calibration=calibration.run_name,
         run=readings.name,
-        stations=prepared.count,
-        surveys=not any(np.isfinite(prepared.reference(name)).any() for name in ANGLES),
+        stations=usable.count,
+        surveys=not any(np.isfinite(usable.reference(name)).any() for name in ANGLES),
         findings=findings,
     )
 
@@ -142,7 +489,7 @@ def _rival(calibration: Calibration, evidence: FaultEvidence, name: str) -> Riva
 
 def _can_show(form: FaultForm, readings: Readings) -> bool:
     """Whether a form can show in such readings at all."""
-    if form.kind == HEAT and not preparation.warmed(readings):
+    if form.kind == HEAT and not warmed(readings):
         return False
     return readings.magnetometer is not None or not _magnetic(form)
 

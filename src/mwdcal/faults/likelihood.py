@@ -2,23 +2,29 @@
 
 Members B of a batch lead the axes. Everything that is not known has a proper prior, so that the density of the
 readings under each fault is one Gaussian integral about the best explanation (Laplace), and comparable.
+
+Channels that stand at a constant: how well that explains readings, and what they then read.
+
+How much readings speak for each fault: evidence over none, shares, and the chance of as much from a sound tool.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from mwdcal.calibration.evidence import evidence_of
-from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.readings import LEAST_TEMPERATURE_SPAN, Readings, usable_soaks
 from mwdcal.calibration.record import Calibration
-from mwdcal.estimation.batch import batch_of_one, mapped, take
+from mwdcal.errors import InputError
+from mwdcal.estimation.batch import batch_of_one, mapped, put, take
 from mwdcal.estimation.problem import Prior, Problem, State, Triad
 from mwdcal.estimation.solvers import Linear
 from mwdcal.estimation.start import oriented
-from mwdcal.faults.physics import columns
-from mwdcal.geometry.vectors import Array, Ints, diagonal, inverse, outer
+from mwdcal.faults.physics import DEAD, FAULTS, NONE, SIZE, FaultForm, columns
+from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, inverse, outer
 
 FREE_SIZE = 0.3
 """Standard uncertainty of a direction that the calibration has left free: it turns or stretches by as much."""
@@ -282,3 +288,284 @@ def ratios(information: Array, gradient: Array, mixing: Array) -> Array:
 def repeated(suspect: Suspect, index: Ints) -> Suspect:
     """The members at `index`, as often as they stand there."""
     return take(suspect, index)
+
+
+UNSTEADY = 100.0
+"""Negative log density of readings, over the root of their number, at which they are no constant."""
+MOST_ONSETS = 12
+"""Temperatures that are tried as the one above which a channel is dead, where there are no distinct soaks."""
+
+
+@dataclass(frozen=True)
+class DeadChannels:
+    """Every channel at every onset, as a batch of explanations (C,).
+
+    `channel` (C,) counts components of both triads; `onset` (C,) is the coldest temperature at which it is dead,
+    -inf where it always is. `evidence` (C,) is the log density of the readings, `misfit` (C,) χ² of the others;
+    `value` and `sd` (C,) are of the constant.
+    """
+
+    channel: Ints
+    onset: Array
+    evidence: Array
+    misfit: Array
+    value: Array
+    sd: Array
+
+
+def dead_channels(suspect: Suspect) -> DeadChannels:
+    """The explanations by a dead channel of one tool.
+
+    The constant may be anything of the size of the field. A channel that stands still may do so from some soak
+    upwards, for heat breaks it.
+    """
+    raw, temperature = raw_of(suspect.problem)[0], suspect.problem.temperature[0]
+    sd = np.concatenate([triad.sd for triad in suspect.problem.triads], -1)[0]
+    onsets = _onsets(temperature)
+    channel = np.repeat(np.arange(raw.shape[-1]), len(onsets))
+    onset = np.tile(onsets, raw.shape[-1])
+    broken = (temperature >= onset[:, None])[..., None] & (
+        np.arange(raw.shape[-1]) == channel[:, None, None]
+    )
+    density, value, spread = _constant(raw, sd, broken, _strengths(suspect))
+    steady = np.flatnonzero(density > -UNSTEADY * np.sqrt(broken.sum((-1, -2))))
+    evidence, misfit = np.full((2, len(channel)), -np.inf)
+    if steady.size:
+        tools = repeated(suspect, np.zeros(len(steady), int))
+        sound = tools.without(broken[steady])
+        state = sound.start(_readable(tools, broken[steady]))
+        live = explained(sound, np.zeros((len(steady), SIZE, 0)), state)
+        evidence[steady], misfit[steady] = live.evidence + density[steady], live.misfit
+    return DeadChannels(channel, onset, evidence, misfit, value, spread)
+
+
+def _onsets(temperature: Array) -> Array:
+    """Where a channel may have died: always, or from one of at most `MOST_ONSETS` temperatures upwards, °C."""
+    warmer = np.unique(temperature)[1:]
+    if np.ptp(temperature) < LEAST_TEMPERATURE_SPAN:
+        warmer = warmer[:0]
+    if len(warmer) > MOST_ONSETS:
+        soak = usable_soaks(temperature)
+        starts = [temperature[soak == number].min() for number in range(1, soak.max() + 1)]
+        spread = np.quantile(warmer, np.linspace(0, 1, MOST_ONSETS), method="lower")
+        warmer = np.unique(np.concatenate([starts, spread]) if len(starts) < 2 else starts)
+    return np.concatenate([[-np.inf], warmer])
+
+
+def _strengths(suspect: Suspect) -> Array:
+    """Gravity and field (m,) of the stations, for each channel."""
+    evidence = suspect.problem.evidence
+    sizes = [np.mean(evidence.known[name]) for name in ("gravity", "field")]
+    return np.repeat(sizes[: len(suspect.problem.triads)], 3)
+
+
+def _constant(raw: Array, sd: Array, broken: Bools, strength: Array) -> tuple[Array, Array, Array]:
+    """Log density (C,) of readings that are a constant and noise, the constant, and its uncertainty.
+
+    The constant has the strength of the field as its standard uncertainty.
+    """
+    part = np.where(broken, 1 / sd**2, 0.0)
+    weight = part.sum((-1, -2))
+    prior = np.sum(broken.any(-2) / strength**2, -1)
+    total = np.sum(part * raw, (-1, -2))
+    value = total / (weight + prior)
+    square = np.sum(part * raw**2, (-1, -2)) - total * value
+    return -0.5 * (square + np.log1p(weight / prior)), value, 1 / np.sqrt(weight + prior)
+
+
+def _readable(tools: Suspect, broken: Bools) -> Array:
+    """Readings (C, n, m) with the dead ones replaced by what the strength of the field leaves for them.
+
+    Of the two signs that which suits the dip better: only a start, from which to find the attitudes.
+    """
+    raw, evidence = raw_of(tools.problem).copy(), tools.problem.evidence
+    best = None
+    for sign in (1.0, -1.0):
+        trial = raw.copy()
+        for start, name in zip(range(0, raw.shape[-1], 3), ("gravity", "field"), strict=False):
+            part, dead = trial[..., start : start + 3], broken[..., start : start + 3]
+            square = evidence.known[name] ** 2 - np.sum(np.where(dead, 0.0, part) ** 2, -1)
+            filled = sign * np.sqrt(np.maximum(square, 0.0))[..., None]
+            trial[..., start : start + 3] = np.where(dead, filled, part)
+        if best is None or raw.shape[-1] == 3:
+            best = trial if best is None else best
+            continue
+        error, other = (_dip_error(each, evidence.known) for each in (best, trial))
+        best = np.where((other < error)[..., None], trial, best)
+    return np.asarray(best)
+
+
+def _dip_error(raw: Array, known: dict[str, Array]) -> Array:
+    """How far (C, n) g·b is from what strengths and dip say."""
+    expected = known["gravity"] * known["field"] * np.sin(np.nan_to_num(known["dip"], nan=1.0))
+    return np.asarray(np.abs(np.sum(raw[..., :3] * raw[..., 3:], -1) - expected))
+
+
+FALSE_ALARMS = 0.01
+"""Probability that a fault is named where there is none."""
+DEAD_SHARE = 0.05
+"""Share of it that goes to dead channels, whose evidence has a bound and needs no simulation."""
+DRAWS = 9_999
+"""Simulated changes without a fault, by which the evidence is judged."""
+WITHIN, SHARE_WITHIN = 50.0, 0.2
+"""Log evidence, and share of the best one, by which the linearised evidence of a form may be behind to be refined."""
+UNEXPLAINED = 1e-4
+"""Probability of the misfit of the best explanation below which it explains too little."""
+LIKELY = 0.05
+"""A fault with a larger share of the likelihood than this is not excluded."""
+DISTINCT = float(np.log(1 / LIKELY))
+"""Logarithm of the evidence ratio that tells two faults apart."""
+
+
+@dataclass(frozen=True)
+class FaultEvidence:
+    """What readings of one tool say of all faults; `forms` are the ways in which faults show.
+
+    `none` explains the readings without a fault, `best` by each form that is not far behind and by the first of
+    each kind, those at `likely`, as a batch; `dead` are dead channels. `by_form` (F,) is the log evidence of each
+    form over none.
+    """
+
+    suspect: Suspect
+    forms: list[FaultForm]
+    none: Explanation
+    by_form: Array
+    likely: Ints
+    best: Explanation
+    dead: DeadChannels
+
+    @classmethod
+    def of(cls, suspect: Suspect, forms: list[FaultForm]) -> FaultEvidence:
+        """Of a batch of one."""
+        none = explained(suspect, np.zeros((1, SIZE, 0)), suspect.start())
+        roughly = by_form(forms, none.information[0], none.gradient[0])
+        if not np.isfinite(roughly).all():
+            raise InputError(
+                "faults cannot be weighed: values or uncertainties of the calibration and the readings are out of "
+                "all proportion. Check units, noise and standard uncertainties of both."
+            )
+        near_best = roughly >= roughly.max() - WITHIN - SHARE_WITHIN * abs(roughly.max())
+        likely = np.union1d(np.flatnonzero(near_best), _best_of_each(forms, roughly))
+        near = take(none, 0 * likely)
+        mixing = padded([forms[i] for i in likely])
+        best = explained(repeated(suspect, 0 * likely), mixing, near.state, near)
+        exactly = np.asarray(best.evidence - none.evidence)
+        exactly = put(np.minimum(roughly, exactly.max() - WITHIN), likely, exactly)
+        return cls(suspect, forms, none, exactly, likely, best, dead_channels(suspect))
+
+    @property
+    def information(self) -> Array:
+        """Information (SIZE, SIZE) of all departures of a sound tool."""
+        return np.asarray(self.none.information[0])
+
+    def misfit(self, kind: str) -> float:
+        """χ² of the readings as a fault, or none, explains them best."""
+        if kind == DEAD:
+            return float(self.dead.misfit[np.argmax(self.dead.evidence)])
+        if kind == NONE:
+            return float(self.none.misfit[0])
+        return float(self.best.misfit[self._best(kind)])
+
+    def _best(self, kind: str) -> int:
+        """The place of the best form of a fault among those at `likely`."""
+        where = [i for i in self.likely.tolist() if self.forms[i].kind == kind]
+        return int(np.searchsorted(self.likely, max(where, key=lambda i: self.by_form[i])))
+
+    def _whole(self, place: int) -> int:
+        """The place of the fullest form of the same fault and channel as one among those at `likely`."""
+        chosen = self.forms[self.likely[place]]
+        same = (chosen.kind, chosen.channel, chosen.larger)
+        forms = [self.forms[i] for i in self.likely]
+        alike = [i for i, f in enumerate(forms) if (f.kind, f.channel, f.larger) == same]
+        return max(alike, key=lambda i: len(forms[i].terms))
+
+    def sizes(self, kind: str, whole: bool = False) -> tuple[FaultForm, Array, Array]:
+        """The best form of a fault, its sizes (k,) and their covariance (k, k), in units of the usual ones.
+
+        `whole`: with all sizes that such a fault may have, so that the uncertainty of each is not that of a simpler
+        form, in which the others are exactly zero.
+        """
+        place = self._best(kind)
+        place = self._whole(place) if whole else place
+        form = self.forms[self.likely[place]]
+        count = form.mixing.shape[1]
+        covariance = self.best.covariance[place, :count, :count]
+        return form, self.best.sizes[place, :count], covariance
+
+    @cached_property
+    def dead_ratios(self) -> Array:
+        """Log evidence (C,) of each dead channel over none."""
+        return np.asarray(self.dead.evidence - self.none.evidence)
+
+    @cached_property
+    def by_fault(self) -> dict[str, float]:
+        """Log evidence of each fault over none: the mean over its forms; none for one that has no form here."""
+        others = over_forms(self.forms, self.by_form) | {DEAD: log_mean(self.dead_ratios)}
+        return {NONE: 0.0} | {name: float(others.get(name, -np.inf)) for name in FAULTS}
+
+    def likelihoods(self) -> dict[str, float]:
+        """Share of each fault, all being as likely beforehand."""
+        values = np.array(list(self.by_fault.values()))
+        shares = np.exp(values - values.max())
+        return dict(zip(self.by_fault, (shares / shares.sum()).tolist(), strict=True))
+
+    def probability(self, freedom: float, draws: int = DRAWS) -> float:
+        """Bound on the chance of so much evidence for any fault, from a sound tool.
+
+        Definition: a Monte Carlo test. Without a fault the gradient by all departures is Gaussian with their
+        information as covariance, so that the evidence of all faults can be drawn together; it is inflated by
+        Student's factor of `freedom` degrees of freedom behind the noise. An evidence ratio has the mean 1
+        under none, so that for dead channels Markov's inequality bounds it.
+        """
+        observed = log_mean(_linear(self.forms, self.information, self.none.gradient[0]))
+        rng = np.random.default_rng(0)
+        values, vectors = np.linalg.eigh(self.information)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        sound = rng.normal(size=(draws, SIZE)) @ root.transpose()
+        if np.isfinite(freedom):
+            sound *= np.sqrt(freedom / rng.chisquare(freedom, draws))[:, None]
+        beyond = log_mean(_linear(self.forms, self.information, sound)) >= observed
+        by_chance = (1 + np.count_nonzero(beyond)) / (draws + 1)
+        dead = np.exp(min(0.0, -self.by_fault[DEAD]))
+        return float(min(1.0, by_chance / (1 - DEAD_SHARE), dead / DEAD_SHARE))
+
+
+def _best_of_each(forms: list[FaultForm], evidence: Array) -> Ints:
+    """The places of the best form of each kind of fault."""
+    kinds = np.array([form.kind for form in forms])
+    places = [np.flatnonzero(kinds == kind) for kind in dict.fromkeys(kinds.tolist())]
+    return np.array([where[np.argmax(evidence[where])] for where in places], int)
+
+
+def padded(forms: list[FaultForm]) -> Array:
+    """Departures (F, SIZE, k) of each form, columns of zeros where it has fewer than k sizes."""
+    whole = np.zeros((len(forms), SIZE, max(form.mixing.shape[1] for form in forms)))
+    for place, form in enumerate(forms):
+        whole[place, :, : form.mixing.shape[1]] = form.mixing
+    return whole
+
+
+def _linear(forms: list[FaultForm], information: Array, gradient: Array) -> Array:
+    """Log evidence (..., faults) of faults over none, linearised at none, of gradients (..., SIZE)."""
+    each = by_form(forms, information, gradient)
+    return np.stack(list(over_forms(forms, each).values()), -1)
+
+
+def by_form(forms: list[FaultForm], information: Array, gradient: Array) -> Array:
+    """Log evidence (..., F) of each form over none, linearised at none, of gradients (..., SIZE)."""
+    return np.stack([ratios(information, gradient, form.mixing) for form in forms], -1)
+
+
+def over_forms(forms: list[FaultForm], each: Array) -> dict[str, Array]:
+    """Log evidence (...) of each fault, of those (..., F) of its forms, each as likely beforehand."""
+    kinds = dict.fromkeys(form.kind for form in forms)
+    places = {kind: [i for i, form in enumerate(forms) if form.kind == kind] for kind in kinds}
+    return {kind: log_mean(each[..., where]) for kind, where in places.items()}
+
+
+def log_mean(values: Array) -> Array:
+    """Logarithm (...,) of the mean of exp(values (..., k))."""
+    most = values.max(-1, keepdims=True)
+    most = np.where(np.isfinite(most), most, 0.0)
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(np.mean(np.exp(values - most), -1)) + most[..., 0])

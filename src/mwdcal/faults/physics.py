@@ -15,8 +15,7 @@ import numpy as np
 
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.geometry.vectors import Array, Bools
-from mwdcal.sensor.datasheets import tolerance
-from mwdcal.sensor.profile import Profile
+from mwdcal.sensor.profile import Profile, tolerance
 
 DEAD = "dead-channel"
 NONE = "none"

@@ -11,13 +11,21 @@ import numpy as np
 from mwdcal.calibration.readings import is_simulated
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
-from mwdcal.firmware import statements, vectors
-from mwdcal.firmware.c_text import comment, initialiser, literal, source
-from mwdcal.firmware.coefficients import double_initialiser, fixed_initialiser, order
-from mwdcal.firmware.quantisation import FixedCalibration, quantised
-from mwdcal.firmware.working_range import (
+from mwdcal.firmware import c_source
+from mwdcal.firmware.c_source import (
+    comment,
+    double_initialiser,
+    fixed_initialiser,
+    initialiser,
+    literal,
+    order,
+    source,
+)
+from mwdcal.firmware.quantisation import (
+    FixedCalibration,
     WorkingRange,
     angle_errors,
+    quantised,
     rounding_errors,
     working_range,
 )
@@ -73,7 +81,7 @@ def _double(calibration: Calibration, sha256: str) -> FirmwareSources:
         lowest=f"({initialiser(lowest)})",
         highest=f"({initialiser(highest)})",
         coefficients=double_initialiser(calibration),
-        field_unit=statements.field_unit(calibration),
+        field_unit=c_source.field_unit(calibration),
     )
     weak = VERTICAL, VERTICAL * calibration.earth.get("field", 1.0)
     return FirmwareSources(
@@ -90,8 +98,8 @@ def _fixed(calibration: Calibration, sha256: str, bits: int) -> FirmwareSources:
         **_common(calibration, sha256, fixed.work, errors, "FIXED"),
         bits=bits,
         storage=16 if bits <= 16 else 32,
-        formats=comment(statements.formats(calibration, fractions, bits)),
-        fractions=statements.fraction_macros(fractions),
+        formats=comment(c_source.formats(calibration, fractions, bits)),
+        fractions=c_source.fraction_macros(fractions),
         reference=f"({fixed.reference})",
         lowest=f"({fixed.lowest})",
         highest=f"({fixed.highest})",
@@ -112,8 +120,8 @@ def _check_north(calibration: Calibration, bits: int, weak: float) -> None:
     if not calibration.has_field:
         return
     level = calibration.earth["field"] * math.cos(math.radians(calibration.earth["dip_deg"]))
-    if level <= vectors.CLEARLY * weak:
-        unit = statements.field_unit(calibration)
+    if level <= c_source.CLEARLY * weak:
+        unit = c_source.field_unit(calibration)
         raise InputError(
             f"in words of {bits} bits a field below {weak:.3g} {unit} has no direction, so that the horizontal one, "
             f"{level:.3g} {unit}, has no azimuth. Use more `word_bits`, or form c-header."
@@ -129,20 +137,20 @@ def _common(
 ) -> dict[str, object]:
     """What both headers say."""
     return {
-        "about": comment(statements.head(calibration, sha256, work, errors)),
+        "about": comment(c_source.head(calibration, sha256, work, errors)),
         "serial": literal(calibration.tool.get("serial", "")),
         "sha256": literal(sha256),
         "triads": len(calibration.triads),
         "order": order(calibration),
-        "status": statements.status_macros(saturates=kind == "FIXED"),
-        "errors": statements.error_macros(kind, errors),
+        "status": c_source.status_macros(saturates=kind == "FIXED"),
+        "errors": c_source.error_macros(kind, errors),
     }
 
 
 def _fractions(fixed: FixedCalibration) -> dict[str, int]:
     """Powers of two of the words that go in and come out."""
     inputs = {triad.name: triad.raw for triad in fixed.triads}
-    outputs = zip(statements.VECTOR_NAMES, (triad.field for triad in fixed.triads), strict=False)
+    outputs = zip(c_source.VECTOR_NAMES, (triad.field for triad in fixed.triads), strict=False)
     return {**inputs, "temperature": fixed.temperature, **dict(outputs)}
 
 
@@ -150,9 +158,9 @@ def _errors(
     calibration: Calibration, off: Iterable[Array], angles: Mapping[str, float]
 ) -> dict[str, float]:
     """Errors by quantity, with that of the decimals of the test vectors, rounded up."""
-    names = zip(statements.VECTOR_NAMES, (float(np.max(each)) for each in off), strict=False)
+    names = zip(c_source.VECTOR_NAMES, (float(np.max(each)) for each in off), strict=False)
     return {
-        name: _rounded_up(value + 0.5 * 10.0 ** -vectors.decimals(calibration, name))
+        name: _rounded_up(value + 0.5 * 10.0 ** -c_source.decimals(calibration, name))
         for name, value in (*names, *angles.items())
     }
 
@@ -171,10 +179,10 @@ def _files(
     fractions: Mapping[str, int],
 ) -> dict[str, str]:
     """The sources and the test vectors, by file name; with `fractions` these are in words too."""
-    columns, stem = vectors.expected(calibration), f"mwdcal_{kind}"
-    clear = vectors.status(columns, weak) >= 0
+    columns, stem = c_source.expected(calibration), f"mwdcal_{kind}"
+    clear = c_source.status(columns, weak) >= 0
     columns = {name: column[clear] for name, column in columns.items()}
-    codes, words = vectors.status(columns, weak), vectors.words(columns, fractions)
+    codes, words = c_source.status(columns, weak), c_source.words(columns, fractions)
     metadata = {
         "serial": calibration.tool.get("serial"),
         "calibration_sha256": sha256 or None,
@@ -185,9 +193,9 @@ def _files(
         f"{stem}.c": source(f"{stem}.c"),
         f"{stem}_vectors.h": source(
             f"{stem}_vectors.h",
-            about=comment(statements.origin(calibration, sha256)),
-            vectors=vectors.initialisers(columns, words, codes),
+            about=comment(c_source.origin(calibration, sha256)),
+            vectors=c_source.initialisers(columns, words, codes),
         ),
         f"{stem}_test.c": source(f"{stem}_test.c"),
-        f"{stem}_vectors.csv": vectors.table(columns, words, codes, metadata),
+        f"{stem}_vectors.csv": c_source.table(columns, words, codes, metadata),
     }

@@ -24,8 +24,7 @@ from mwdcal.library.tasks import (
 )
 from mwdcal.library.wells import convert, export, reference, survey
 from mwdcal.sensor.profile import Profile
-from mwdcal.use import plots as plots  # puts `plot` on calibrations
-from mwdcal.use import verdict_plots as verdict_plots  # and on verdicts
+from mwdcal.use import plots as plots  # puts `plot` on calibrations and verdicts
 
 __all__ = [
     "Calibration",

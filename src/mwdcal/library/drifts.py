@@ -13,17 +13,17 @@ from mwdcal.calibration.prediction import STATED_ANGLES
 from mwdcal.calibration.record import Calibration
 from mwdcal.drift.document import ToolDrift
 from mwdcal.drift.fleet import fleet_drift
-from mwdcal.drift.service import ServiceTest
+from mwdcal.drift.forecast import ServiceTest
 from mwdcal.drift.tool import MeasuredTool, TypeRates, measured, predicted
 from mwdcal.errors import InputError, MwdcalError
 from mwdcal.files import documents
 from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.members import Member
 from mwdcal.files.limits import load_limits
+from mwdcal.presentation.drift import RegistryDrift
 from mwdcal.registry import queries
 from mwdcal.registry.store import Registry
 from mwdcal.registry.stored import AlteredError
-from mwdcal.screens.records.drift import RegistryDrift
 from mwdcal.use.verification import Bounds, Verdict
 
 Advance = Callable[[int, int], None]

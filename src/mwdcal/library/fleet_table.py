@@ -37,10 +37,10 @@ from mwdcal.fleet.tables import (
     in_several_folders,
     partitions,
 )
-from mwdcal.screens.envelope import enveloped
-from mwdcal.screens.fleet import FleetSummary, stated_options, summarise
-from mwdcal.screens.text import plural, slowly
-from mwdcal.screens.typed_options import Typed
+from mwdcal.presentation.envelope import enveloped
+from mwdcal.presentation.fleet import FleetSummary, stated_options, summarise
+from mwdcal.presentation.text import plural, slowly
+from mwdcal.presentation.typed import Typed
 from mwdcal.sensor.profile import Profile
 from mwdcal.use.correction_numba import cores
 

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from mwdcal.certificate.document import Certificate, SourceFile
     from mwdcal.drift.document import ToolDrift
     from mwdcal.files.verifications import Verification
-    from mwdcal.pages.records.certificate_pictures import Picture
-    from mwdcal.screens.records.signature import CheckedDocument, SignedDocument
+    from mwdcal.presentation.certificate_text import Picture
+    from mwdcal.presentation.signature import CheckedDocument, SignedDocument
 
 CERTIFICATE_FORMS = (".json", ".html", ".pdf", ".xml")
 """Suffixes of the forms of a certificate."""
@@ -62,10 +62,10 @@ class Paper(Result):
     @cached_property
     def pictures(self) -> list[Picture]:
         """The figures of page and PDF; Matplotlib must be installed."""
-        from mwdcal.pages.pictures import require
+        from mwdcal.presentation.page import require
 
         require("a certificate as page or PDF", "matplotlib")
-        from mwdcal.pages.records.certificate_pictures import certificate_pictures
+        from mwdcal.presentation.certificate_page import certificate_pictures
 
         tests = self.order.verification, self.order.as_found
         return certificate_pictures(self.calibration, *tests, self.drift)
@@ -87,7 +87,7 @@ class Paper(Result):
 
             return to_xml(self.record)
         if suffix == ".pdf":
-            from mwdcal.pages.records.certificate_pdf import render_pdf
+            from mwdcal.presentation.certificate_page import render_pdf
 
             return render_pdf(self.record, self.pictures)
         return self._page()
@@ -104,7 +104,7 @@ class Paper(Result):
         self.saved.append(Path(path))
 
     def _text(self) -> str:
-        from mwdcal.screens.records.certificate_issue import screen
+        from mwdcal.presentation.certificate import screen
 
         return screen(self.record, list(dict.fromkeys(self.saved)))
 
@@ -115,7 +115,7 @@ class Paper(Result):
         return document
 
     def _page(self) -> str:
-        from mwdcal.pages.records.certificate_page import render_page
+        from mwdcal.presentation.certificate_page import render_page
 
         return render_page(self.record, self.pictures)
 
@@ -218,7 +218,7 @@ def _loaded(
     cal: Calibration | Place, keys: Sequence[Place], files: _Sources
 ) -> tuple[Calibration, str, list[Finding]]:
     """A calibration, the SHA-256 of its file, and doubts of its signature."""
-    from mwdcal.screens.records.calibrations import load_calibration
+    from mwdcal.presentation.signature import load_calibration
 
     loaded = load_calibration(cal, [Path(key) for key in keys])
     calibration, digest = loaded.calibration, loaded.digest
@@ -293,12 +293,12 @@ class SignedPaper(Result):
         return self.content.findings
 
     def _text(self) -> str:
-        from mwdcal.screens.records.signature import signed
+        from mwdcal.presentation.signature import signed
 
         return signed(self.content, self.fields)
 
     def _document(self) -> dict[str, Any]:
-        from mwdcal.screens.records.signature import for_machines
+        from mwdcal.presentation.signature import for_machines
 
         return for_machines("sign", self.content, self.fields, self.digest)
 
@@ -327,7 +327,7 @@ def sign(
     from mwdcal.certificate.signature import signed
     from mwdcal.files import documents
     from mwdcal.files.formats import atomic
-    from mwdcal.screens.records import signature as screens
+    from mwdcal.presentation import signature as screens
 
     if isinstance(document, Paper):
         target = Path(output) if output is not None else _json_of(document)
@@ -399,12 +399,12 @@ class SignatureVerdict(Result):
         return self.content.findings
 
     def _text(self) -> str:
-        from mwdcal.screens.records.signature import checked
+        from mwdcal.presentation.signature import checked
 
         return checked(self.content, self.fields)
 
     def _document(self) -> dict[str, Any]:
-        from mwdcal.screens.records.signature import for_machines
+        from mwdcal.presentation.signature import for_machines
 
         return for_machines("verify", self.content, self.fields, self.digest)
 
@@ -422,9 +422,9 @@ def check_signature(
 
     Example: `mwdcal.check_signature("C.json", keys=["laboratory.key.pub"]).state`
     """
-    from mwdcal.certificate.trusted_keys import trusted
+    from mwdcal.certificate.keys import trusted
     from mwdcal.files import documents
-    from mwdcal.screens.records import signature as screens
+    from mwdcal.presentation import signature as screens
 
     named = [Path(k) for k in ([keys] if isinstance(keys, str | os.PathLike) else keys)]
     if not named:

@@ -95,7 +95,7 @@ class PlanResult(Result):
     @property
     def findings(self) -> list[Finding]:
         """What the plans leave undetermined, and what else there is to say of them."""
-        from mwdcal.screens.plan import findings
+        from mwdcal.presentation.plan import findings
 
         return findings(self.plans)
 
@@ -125,17 +125,17 @@ class PlanResult(Result):
         return self.plans, self.digests, self.files.get("output"), self.files.get("html")
 
     def _text(self) -> str:
-        from mwdcal.screens.plan import screen
+        from mwdcal.presentation.plan import screen
 
         return screen(*self._named())
 
     def _document(self) -> dict[str, Any]:
-        from mwdcal.screens.plan import document
+        from mwdcal.presentation.plan import document
 
         return document(*self._named())
 
     def _page(self) -> str:
-        from mwdcal.pages.plan import render
+        from mwdcal.presentation.plan_page import render
 
         return render(self.plans)
 
@@ -183,7 +183,7 @@ def plan(
     True
     """
     from mwdcal.planning import planned
-    from mwdcal.planning.moves import Stand
+    from mwdcal.planning.planned import Stand
 
     several = plan if isinstance(plan, list | tuple) else [] if plan is None else [plan]
     if len(several) > 1 and (accuracy_deg or stations or measured is not None):
@@ -327,12 +327,12 @@ class ProposedProfile(Result):
         self.files["output"] = Path(path)
 
     def _text(self) -> str:
-        from mwdcal.screens.proposal import screen
+        from mwdcal.presentation.proposal import screen
 
         return screen(self.proposal, self.path, self.files.get("output"))
 
     def _document(self) -> dict[str, Any]:
-        from mwdcal.screens.proposal import summary
+        from mwdcal.presentation.proposal import summary
 
         return summary(self.proposal, self.path, self.files.get("output"))
 

@@ -31,8 +31,8 @@ from mwdcal.library.results import Result
 from mwdcal.sensor.profile import Profile
 
 if TYPE_CHECKING:
-    from mwdcal.screens.fleet import FleetSummary
-    from mwdcal.screens.typed_options import Typed
+    from mwdcal.presentation.fleet import FleetSummary
+    from mwdcal.presentation.typed import Typed
 
 
 class FleetChoices(TypedDict, total=False):
@@ -66,7 +66,7 @@ class CalibratedFleet(Result):
     @property
     def findings(self) -> Sequence[Finding]:
         """Why tools were refused, findings of the others, and columns that are not used."""
-        from mwdcal.screens.fleet import findings
+        from mwdcal.presentation.fleet import findings
 
         return findings(self.content)
 
@@ -140,17 +140,17 @@ class CalibratedFleet(Result):
         self.page = Path(path)
 
     def _page(self) -> str:
-        from mwdcal.pages.fleet_report import render
+        from mwdcal.presentation.fleet_page import render
 
         return render(self.path, self.content)
 
     def _text(self) -> str:
-        from mwdcal.screens.fleet import text
+        from mwdcal.presentation.fleet import text
 
         return text(self.content, self.page)
 
     def _document(self) -> dict[str, Any]:
-        from mwdcal.screens.fleet import document
+        from mwdcal.presentation.fleet import document
 
         return document(self.content, self.page)
 

@@ -172,7 +172,7 @@ class DriftAnswer(RegistryAnswer):
         return min(filter(None, days), default=None)
 
     def _page(self) -> str:
-        from mwdcal.pages.records.drift import render
+        from mwdcal.presentation.drift_page import render
 
         return render(self.content.tool, self.content.fleet)
 
@@ -225,8 +225,8 @@ class ToolRegistry:
 
         Example: `tools.add("tool.json", cal, "runs").new` is `{"calibration": 2, "run": 12}`.
         """
+        from mwdcal.presentation import registry as screen
         from mwdcal.registry import imports
-        from mwdcal.screens.records import registry as screen
 
         sources: list[Source] = []
         for item in items:
@@ -263,8 +263,8 @@ class ToolRegistry:
         Raises:
             InputError: there is no such record, or the file cannot be written.
         """
+        from mwdcal.presentation import registry as screen
         from mwdcal.registry import lookup
-        from mwdcal.screens.records import registry as screen
 
         row, data = lookup.document(self.opened, str(record))
         about = {name: row[name] for name in screen.KEYS}
@@ -281,8 +281,8 @@ class ToolRegistry:
         Raises:
             InputError: there is no such tool.
         """
+        from mwdcal.presentation import registry as screen
         from mwdcal.registry import lookup
-        from mwdcal.screens.records import registry as screen
 
         result = lookup.past_of(self.opened, serial, offset, limit)
         document = screen.document("registry history", result, {"serial": serial})
@@ -308,7 +308,7 @@ class ToolRegistry:
             InputError: there is no calibration of such a tool, or a limit is of no angle.
         """
         from mwdcal.library import drifts
-        from mwdcal.screens.records import drift as screen
+        from mwdcal.presentation import drift as screen
 
         typed = [f"{name}={value}" for name, value in (limits or {}).items()]
         if not 0.001 <= level <= 0.2:
@@ -325,8 +325,8 @@ class ToolRegistry:
 
         `head`: the hash of an event that must be there, as an earlier check or a backup gave it.
         """
+        from mwdcal.presentation import registry as screen
         from mwdcal.registry import checking
-        from mwdcal.screens.records import registry as screen
 
         result = screen.checked(self.opened, checking.check(self.opened, head))
         document = screen.document("registry check", result)
@@ -341,8 +341,8 @@ class ToolRegistry:
             FitError: the registry was altered; an older backup stays.
             InputError: it cannot be written.
         """
+        from mwdcal.presentation import registry as screen
         from mwdcal.registry import copies
-        from mwdcal.screens.records import registry as screen
 
         head = copies.backup(self.opened, path)
         result = screen.RegistryCopied(file=os.fspath(path), head=head)
@@ -356,8 +356,8 @@ class ToolRegistry:
             InputError: the folder is not empty, or cannot be written.
         """
         from mwdcal.files.formats.folders import check_new
+        from mwdcal.presentation import registry as screen
         from mwdcal.registry.exports import export
-        from mwdcal.screens.records import registry as screen
 
         check_new(Path(folder))
         manifest = export(self.opened, Path(folder), lambda done, total: None)
@@ -376,8 +376,8 @@ class ToolRegistry:
         Raises:
             InputError: there is no such record, or it is withdrawn already.
         """
+        from mwdcal.presentation import registry as screen
         from mwdcal.registry.lookup import one_record
-        from mwdcal.screens.records import registry as screen
 
         row = one_record(self.opened, str(record))
         self.opened.withdraw(row["number"], reason, self._actor if actor is None else actor)
@@ -401,8 +401,8 @@ class ToolRegistry:
         Raises:
             InputError: there is no such kind of records.
         """
+        from mwdcal.presentation import registry as screen
         from mwdcal.registry import lookup
-        from mwdcal.screens.records import registry as screen
 
         day = day_of(due, "due")
         before = day.isoformat() if day else ""

@@ -52,32 +52,32 @@ def _inputs(result: Any) -> Inputs:
 
 
 def _enveloped(command: str, result: Any, content: object) -> dict[str, Any]:
-    from mwdcal.screens.envelope import enveloped
+    from mwdcal.presentation.envelope import enveloped
 
     metadata, digests = _inputs(result)
     return enveloped(command, content, *metadata, **digests)
 
 
 def _calibration_text(calibration: Calibration) -> str:
-    from mwdcal.screens.calibration import body
+    from mwdcal.presentation.calibration import body
 
     return body(calibration, [])
 
 
 def _calibration_document(calibration: Calibration) -> dict[str, Any]:
-    from mwdcal.screens.calibration import summary
+    from mwdcal.presentation.calibration import summary
 
     return summary(calibration, [], None, None)
 
 
 def _calibration_page(calibration: Calibration) -> str:
-    from mwdcal.pages.report import render
+    from mwdcal.presentation.calibration_page import render
 
     return render(calibration)
 
 
 def _verdict_text(verdict: Verdict) -> str:
-    from mwdcal.screens.verification import screen
+    from mwdcal.presentation.verification import screen
 
     return screen(verdict, None, *_inputs(verdict).metadata)
 
@@ -87,7 +87,7 @@ def _verdict_document(verdict: Verdict) -> dict[str, Any]:
 
 
 def _diagnosis_text(diagnosis: Diagnosis) -> str:
-    from mwdcal.screens.diagnosis import screen
+    from mwdcal.presentation.diagnosis import screen
 
     return screen(diagnosis, *_inputs(diagnosis).metadata)
 
@@ -97,49 +97,49 @@ def _diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def _comparison_text(comparison: Comparison) -> str:
-    from mwdcal.screens.comparison import text
+    from mwdcal.presentation.comparison import text
 
     return text(comparison)
 
 
 def _comparison_document(comparison: Comparison) -> dict[str, Any]:
-    from mwdcal.screens.comparison import document
+    from mwdcal.presentation.comparison import document
 
     return _enveloped("compare", comparison, document(comparison, [], None))
 
 
 def _comparison_page(comparison: Comparison) -> str:
-    from mwdcal.pages.comparison import render
+    from mwdcal.presentation.comparison_page import render
 
     return render(comparison)
 
 
 def _noise_text(noise: Noise) -> str:
-    from mwdcal.screens.noise import screen
+    from mwdcal.presentation.noise import screen
 
     return screen(noise, None, None)
 
 
 def _noise_document(noise: Noise) -> dict[str, Any]:
-    from mwdcal.screens.noise import document
+    from mwdcal.presentation.noise import document
 
     return _enveloped("noise", noise, document(noise, None, None))
 
 
 def _noise_page(noise: Noise) -> str:
-    from mwdcal.pages.noise import render
+    from mwdcal.presentation.noise_page import render
 
     return render(noise)
 
 
 def _stations_text(stations: Stations) -> str:
-    from mwdcal.screens.stations import body
+    from mwdcal.presentation.stations import body
 
     return body(stations)
 
 
 def _stations_document(stations: Stations) -> dict[str, Any]:
-    from mwdcal.screens.stations import summary
+    from mwdcal.presentation.stations import summary
 
     return _enveloped(
         "stations", stations, summary(stations, dict.fromkeys(("output", "plot", "report"), ""))
@@ -147,7 +147,7 @@ def _stations_document(stations: Stations) -> dict[str, Any]:
 
 
 def _stations_page(stations: Stations) -> str:
-    from mwdcal.pages.stations import render
+    from mwdcal.presentation.stations_page import render
 
     return render(stations, _inputs(stations).digests.get("log", ""))
 

@@ -38,9 +38,8 @@ from mwdcal.sensor.profile import Profile
 from mwdcal.use.verification import Limits
 
 if TYPE_CHECKING:
-    from mwdcal.planning.effects import Effects
-    from mwdcal.planning.procedure import Part, Procedure, Tools
-    from mwdcal.planning.repetition import Repetition, Share
+    from mwdcal.planning.procedure import Part, Procedure, Repetition, Share, Tools
+    from mwdcal.planning.simulate import Effects
 
     Mapper = Callable[[Callable[[Part], Tools], Sequence[Part]], Iterable[Tools]]
 
@@ -62,7 +61,7 @@ class SimulatedReadings(Readings, Result):
             InputError: a file cannot be written.
         """
         from mwdcal.files.formats import atomic, table
-        from mwdcal.screens.text import to_json
+        from mwdcal.presentation.text import to_json
 
         output, rendered = Path(path), table.rendered(Path(path), self.run_table)
         facts = None if truth is None else Path(truth)
@@ -70,7 +69,7 @@ class SimulatedReadings(Readings, Result):
         atomic.write_all([(output, rendered), (facts, to_json(self.truth) + "\n")])
 
     def _text(self) -> str:
-        from mwdcal.screens.simulation import screen
+        from mwdcal.presentation.simulation import screen
 
         return screen(self.truth)
 
@@ -108,7 +107,7 @@ class RepeatedProcedure(Result):
             InputError: a file cannot be written, or Matplotlib is not installed.
         """
         from mwdcal.files.formats import atomic, table
-        from mwdcal.planning.repetition import as_table
+        from mwdcal.planning.procedure import as_table
 
         named = {"output": Path(path), "plot": None if plot is None else Path(plot)}
         rendered = table.rendered(Path(path), as_table(self.columns, self.procedure))
@@ -117,20 +116,20 @@ class RepeatedProcedure(Result):
         self.files.update({name: file for name, file in named.items() if file})
 
     def _picture(self, suffix: str) -> bytes:
-        from mwdcal.pages.pictures import picture
-        from mwdcal.pages.repetition import figure
+        from mwdcal.presentation.page import picture
+        from mwdcal.presentation.simulation_page import figure
 
         procedure = self.procedure
         title = procedure.calibrating.plan.source, procedure.guard
         return picture(figure(self.columns, procedure.judged, *title), suffix)
 
     def _text(self) -> str:
-        from mwdcal.screens.simulation import repeated
+        from mwdcal.presentation.simulation import repeated
 
         return repeated(self._document())
 
     def _document(self) -> dict[str, Any]:
-        from mwdcal.screens.simulation import document
+        from mwdcal.presentation.simulation import document
 
         procedure = self.procedure
         facts = {
@@ -310,8 +309,8 @@ class _Scene:
         effects: FilePath | Effects | None, seed: int,
     ) -> _Scene:  # fmt: skip
         """All that is named, read."""
-        from mwdcal.planning.effects import Effects, load_effects
         from mwdcal.planning.session import calibrated_tool
+        from mwdcal.planning.simulate import Effects, load_effects
         from mwdcal.registry.calibration_source import calibration_of
 
         check_whole("seed", seed, 0)
@@ -350,7 +349,7 @@ def _run(
 ) -> SimulatedReadings:
     """One run of one tool: see `simulate`."""
     from mwdcal.planning import session as sessions
-    from mwdcal.screens.simulation import document
+    from mwdcal.presentation.simulation import document
 
     scene, wanted = _Scene.of(plan, tool, calibration, effects, seed), _order(Options(order=order))
     rng = np.random.default_rng([seed, 2])
@@ -386,8 +385,7 @@ def _repeated(
 ) -> RepeatedProcedure:
     """A whole procedure for many tools: see `simulate`."""
     from mwdcal.files.limits import load_limits
-    from mwdcal.planning.procedure import Procedure
-    from mwdcal.planning.repetition import joined, summarised
+    from mwdcal.planning.procedure import Procedure, joined, summarised
 
     check_whole("repeat", repeat, 1)
     chosen = replace(with_choices(options, choices) or Options(), seed=seed)

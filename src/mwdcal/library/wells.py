@@ -29,12 +29,11 @@ from mwdcal.sensor.profile import Profile
 
 if TYPE_CHECKING:
     from mwdcal.calibration.canonical import SignatureCheck
-    from mwdcal.screens.conversion import Converted, Exported
-    from mwdcal.screens.surveys.survey import SurveySummary
+    from mwdcal.presentation.conversion import Converted, Exported
+    from mwdcal.presentation.survey import SurveySummary
     from mwdcal.survey.acceptance import SurveyLimits
-    from mwdcal.survey.multistation.interference import InterferenceSize, MultiStationAnalysis
-    from mwdcal.survey.place.reference_columns import FilledRun
-    from mwdcal.survey.place.references import EarthReference
+    from mwdcal.survey.interference import InterferenceSize, MultiStationAnalysis
+    from mwdcal.survey.references import EarthReference, FilledRun
     from mwdcal.survey.surveying import SurveyedWell
     from mwdcal.survey.tool_model import SensorTerm
     from mwdcal.survey.well import Position
@@ -72,12 +71,12 @@ class PlaceReference(Result):
         return self.earth.findings
 
     def _text(self) -> str:
-        from mwdcal.screens.surveys import reference as screen
+        from mwdcal.presentation import reference as screen
 
         return screen.screen(self.earth, None, None)
 
     def _document(self, output: Path | None = None) -> dict[str, Any]:
-        from mwdcal.screens.surveys import reference as screen
+        from mwdcal.presentation import reference as screen
 
         return _as_json(screen.document(self.earth, None, output))
 
@@ -87,7 +86,7 @@ class PlaceReference(Result):
         Raises:
             InputError: the name does not end in .json, or the file cannot be written.
         """
-        from mwdcal.screens.text import to_json
+        from mwdcal.presentation.text import to_json
 
         if Path(path).suffix.lower() != ".json":
             raise InputError(
@@ -103,7 +102,7 @@ class PlaceReference(Result):
         Raises:
             InputError: the run cannot be read, or states a north that the reference lacks.
         """
-        from mwdcal.survey.place.reference_columns import fill
+        from mwdcal.survey.references import fill
 
         table = table_of(run, "the run", lambda path: tables.read(path, decimal=decimal))
         return FilledReferences(self.earth, fill(table, self.earth))
@@ -132,12 +131,12 @@ class FilledReferences(Result):
         return self.run.cells
 
     def _text(self) -> str:
-        from mwdcal.screens.surveys import reference as screen
+        from mwdcal.presentation import reference as screen
 
         return screen.screen(self.earth, self.run, None)
 
     def _document(self) -> dict[str, Any]:
-        from mwdcal.screens.surveys import reference as screen
+        from mwdcal.presentation import reference as screen
 
         return _as_json(screen.document(self.earth, self.run, None))
 
@@ -158,7 +157,7 @@ class WellSurvey(Result):
 
     @cached_property
     def _facts(self) -> SurveySummary:
-        from mwdcal.screens.surveys.survey import result_summary
+        from mwdcal.presentation.survey import result_summary
 
         return result_summary(self.surveyed)
 
@@ -169,7 +168,7 @@ class WellSurvey(Result):
     @property
     def findings(self) -> list[Finding]:
         """What the reader should know: of the multi-station analysis, then of the surveys."""
-        from mwdcal.screens.surveys.survey import all_findings
+        from mwdcal.presentation.survey import all_findings
 
         return all_findings(self._facts)
 
@@ -206,17 +205,17 @@ class WellSurvey(Result):
         return frame(self.columns, self._whole_table.metadata)
 
     def _text(self) -> str:
-        from mwdcal.screens.surveys.survey import whole_screen
+        from mwdcal.presentation.survey import whole_screen
 
         return whole_screen(self.surveyed, self._facts, self.signature)
 
     def _document(self) -> dict[str, Any]:
-        from mwdcal.screens.surveys.survey import document
+        from mwdcal.presentation.survey import document
 
         return _as_json(document(self.surveyed.inputs, self._facts, self.signature))
 
     def _page(self) -> str:
-        from mwdcal.pages.surveys.survey import render
+        from mwdcal.presentation.survey_page import render
 
         well = self.surveyed.well
         return render(well, well.findings, self.surveyed.inputs.named)
@@ -227,7 +226,7 @@ class WellSurvey(Result):
         Raises:
             InputError: there is no such analysis.
         """
-        from mwdcal.pages.surveys.interference import render
+        from mwdcal.presentation.interference_page import render
 
         if self.surveyed.analysis is None:
             raise InputError("the surveys have no multi-station analysis. Survey with msa=True.")
@@ -277,18 +276,18 @@ class Conversion(Result):
         return triads[triad].values if triad in triads else {}
 
     def _text(self) -> str:
-        from mwdcal.screens.conversion import screen
+        from mwdcal.presentation.conversion import screen
 
         return screen(self.converted)
 
     def _document(self) -> dict[str, Any]:
-        from mwdcal.screens.conversion import document
+        from mwdcal.presentation.conversion import document
 
         return _as_json(document(self.converted))
 
     def save(self, path: FilePath) -> None:
         """Write what the command writes: JSON."""
-        from mwdcal.screens.text import to_json
+        from mwdcal.presentation.text import to_json
 
         atomic.write(path, to_json(self._document()) + "\n")
 
@@ -315,12 +314,12 @@ class FirmwareExport(Result):
         return self.exported.sources.errors
 
     def _text(self) -> str:
-        from mwdcal.screens.conversion import export_screen
+        from mwdcal.presentation.conversion import export_screen
 
         return export_screen(self.exported)
 
     def _document(self) -> dict[str, Any]:
-        from mwdcal.screens.conversion import export_document
+        from mwdcal.presentation.conversion import export_document
 
         return _as_json(export_document(self.exported))
 
@@ -344,12 +343,12 @@ class ToolModelExport(Result):
         return self.converted.findings
 
     def _text(self) -> str:
-        from mwdcal.screens.conversion import terms_screen
+        from mwdcal.presentation.conversion import terms_screen
 
         return terms_screen(self.converted, [*self.terms])
 
     def _document(self) -> dict[str, Any]:
-        from mwdcal.screens.conversion import terms_document
+        from mwdcal.presentation.conversion import terms_document
 
         return _as_json(terms_document(self.converted, [*self.terms]))
 
@@ -402,7 +401,7 @@ def reference(
     Example:
         `mwdcal.reference(latitude=60.4, longitude=5.3, date="2026-11-23").declination_deg`
     """
-    from mwdcal.survey.place.references import MEASURABLE, reference_at
+    from mwdcal.survey.references import MEASURABLE, reference_at
 
     given = {
         "gravity_g": gravity_g, "field_nt": field_nt, "dip_deg": dip_deg, "declination_deg": declination_deg,
@@ -465,7 +464,7 @@ def survey(
         `well = mwdcal.survey(cal, "well.csv", reference=here, msa=True)`, then
         `well.columns["azimuth_true_deg"]` and `well.interference.axial_nt`.
     """
-    from mwdcal.screens.records.calibrations import load_calibration
+    from mwdcal.presentation.signature import load_calibration
     from mwdcal.survey.surveying import analysed, check_drift, survey_well, well_inputs
 
     check_drift(sensor_drift, msa)
@@ -501,7 +500,7 @@ def convert(
     Example:
         `mwdcal.convert(cal, "forward").accelerometer["S"]`
     """
-    from mwdcal.screens.conversion import converted
+    from mwdcal.presentation.conversion import converted
 
     return Conversion(converted(_source(cal), notation, temperature))
 
@@ -542,7 +541,7 @@ def export(
     Example:
         `mwdcal.export(cal, "firmware", form="c").save("firmware")`
     """
-    from mwdcal.screens import conversion
+    from mwdcal.presentation import conversion
 
     _check_word("kind", kind, KINDS_OF_EXPORT)
     if kind == "tool-model":
@@ -568,7 +567,7 @@ def _source(cal: object) -> Calibration | FilePath:
 
 def _earth(reference: object) -> EarthReference | FilePath | None:
     """The reference of a place, or its file."""
-    from mwdcal.survey.place.references import EarthReference
+    from mwdcal.survey.references import EarthReference
 
     if isinstance(reference, PlaceReference):
         return reference.earth

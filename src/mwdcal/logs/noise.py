@@ -28,10 +28,9 @@ from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.table import Table
 from mwdcal.files.logs import Say, silent
 from mwdcal.geometry.vectors import Array
-from mwdcal.logs import allan, movement, noise_terms, regular
-from mwdcal.logs.allan import Kind, Moments
-from mwdcal.logs.clock import ANY, DURATION, RATE, SAME_DURATION, check_argument, is_number
-from mwdcal.logs.noise_terms import NoiseTerms
+from mwdcal.logs import allan, regular
+from mwdcal.logs.allan import Kind, Moments, NoiseTerms
+from mwdcal.logs.regular import ANY, DURATION, RATE, SAME_DURATION, check_argument, is_number
 from mwdcal.logs.standstill import Cells
 from mwdcal.sensor.profile import Profile
 
@@ -54,7 +53,7 @@ UNEVEN = 2.0
 COARSE = 0.5
 """Noise of one sample, in steps of the converter, below which the steps hide it."""
 DOUBTS = {
-    movement.NOT_AT_REST: "the tool was not at rest",
+    regular.NOT_AT_REST: "the tool was not at rest",
     "event": "a spike or a move",
     "misfit": "noise that the five terms do not describe",
     "slow": "less than a sample in a station",
@@ -183,13 +182,13 @@ def find_noise(
         except regular.UnusableChannelError as error:
             findings.append(Finding(id="channel-left-out", text=f"{error} It was left out."))
             continue
-        cells[name] = movement.cells_of(value, hertz)
+        cells[name] = regular.cells_of(value, hertz)
         channel = _channel(name, value, hertz, station, kind, variances, remarks)
         channels[name] = channel if profile is None else _physical(name, channel, profile)
     if not channels:
         reasons = " ".join(finding.text for finding in findings)
         raise InputError(f"{log.source}: no channel that could be used. {reasons}")
-    moved = movement.movement(cells)
+    moved = regular.movement(cells)
     findings = moved + findings if moved else findings + remarks
     if moved:
         channels = {name: replace(c, doubts=[moved[0].id]) for name, c in channels.items()}
@@ -260,7 +259,7 @@ def _channel(
     if kind != "overlapping":
         plain = allan.variance(value, allan.octaves(len(value)), kind)
     slope = np.asarray(allan.drift(value))
-    terms = noise_terms.fit(centred[None], slope[None], moments)
+    terms = allan.fit(centred[None], slope[None], moments)
     freedom = allan.freedom(requested, terms.bounded, terms.steady, terms.covariance)[0]
     deviation = np.sqrt(plain)
     lower, upper = allan.band(deviation, freedom)
@@ -318,8 +317,8 @@ def _drift(terms: NoiseTerms, rate: float) -> Term:
     from scipy.special import ndtr, ndtri
 
     slope, sd = float(terms.slope[0]) * rate, float(terms.slope_sd[0]) * rate
-    tail = 1 - noise_terms.CONFIDENCE
-    shown = bool(2 * ndtr(-abs(terms.slope[0]) / terms.slope_sd[0]) < noise_terms.DETECTED)
+    tail = 1 - allan.CONFIDENCE
+    shown = bool(2 * ndtr(-abs(terms.slope[0]) / terms.slope_sd[0]) < allan.DETECTED)
     reach = float(ndtri(1 - tail / 2)) * sd
     return Term(
         value=slope if shown else None,
@@ -332,7 +331,7 @@ def _drift(terms: NoiseTerms, rate: float) -> Term:
 
 def _station(value: Array, length: float, moments: Moments, terms: NoiseTerms) -> StationNoise:
     """The noise of a mean over `length` samples, or of one."""
-    noise, freedom, measured = noise_terms.single(value[None], length, moments, terms)
+    noise, freedom, measured = allan.single(value[None], length, moments, terms)
     lower, upper = (float(limit[0]) for limit in allan.band(noise, freedom))
     source = "measured" if measured[0] else "terms"
     return StationNoise(noise=float(noise[0]), lower=lower, upper=upper, source=source)
@@ -354,7 +353,7 @@ def _findings(
             "are those of the rounding. Read it with more digits."
         )
     start = moments.averaging[terms.start[0]] / rate
-    if terms.chance[0] < noise_terms.CONTRADICTED:
+    if terms.chance[0] < allan.CONTRADICTED:
         texts["misfit"] = (
             f"{name}: the five terms do not describe the noise (χ² {terms.misfit[0]:.0f} for "
             f"{terms.freedom[0]}); their values and uncertainties do not hold, the Allan deviations do. Was the "

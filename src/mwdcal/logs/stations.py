@@ -22,10 +22,18 @@ from mwdcal.files.logs import READ, TIME, Say, silent
 from mwdcal.files.synonyms import unused
 from mwdcal.geometry.vectors import Array, Ints
 from mwdcal.logs import standstill
-from mwdcal.logs.clock import SECONDS, check_argument, row_times, unlikely_seconds
+from mwdcal.logs.regular import SECONDS, check_argument, row_times, unlikely_seconds
 from mwdcal.logs.standstill import Activity, Slow, Standstills, Trace, Traces
-from mwdcal.logs.station_findings import Rows, about, count, listed, noisy_rests
-from mwdcal.logs.station_means import correlated, summarise, widened
+from mwdcal.logs.station_means import (
+    Rows,
+    about,
+    correlated,
+    count,
+    listed,
+    noisy_rests,
+    summarise,
+    widened,
+)
 
 MIN_SECONDS, TRIM_SECONDS = 1.0, 1.0
 """Defaults for a fast log; one sampled slowly needs a window, and a cell, respectively."""

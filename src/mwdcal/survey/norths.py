@@ -14,13 +14,15 @@ from mwdcal.errors import InputError
 from mwdcal.files.contract import AZIMUTH_KEYS, REFERENCES, check_near_misses, stated_norths
 from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.table import Table
-from mwdcal.survey.place.precedence import (
+from mwdcal.survey.references import (
     FROM_MODEL,
     FROM_REFERENCE,
     FROM_TABLE,
     NO_SOURCE,
+    EarthReference,
+    declination_sd,
+    north_contradictions,
 )
-from mwdcal.survey.place.references import EarthReference, declination_sd, north_contradictions
 
 SD_KEY = "sd_declination_deg"
 """Metadata key of a table: standard uncertainty (1σ) of its declination, degrees."""

@@ -7,16 +7,32 @@ between them and course length L the arc leads from one station to the next by
 
 Positions are (north, east, down) from the start, m; north is that of the azimuths. Stations lie on the
 last axis of depths and angles, wells on those before.
+
+Uncertainty of position along a well, from errors that last and errors that are new at every station.
+
+An error of a survey station turns the direction of the hole there by two angles, rad: *upward*, which is the error of
+inclination, and *sideways*, which is sin(inclination) times the error of azimuth. Both stay finite at vertical,
+where azimuth itself does not exist. A third number, where there is one, is the error of measured depth, m.
+
+Errors reach the position through the derivative of minimum curvature at both ends of every arc. The shifts that one
+lasting cause makes along the well are added before they are squared; those of independent causes after.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from mwdcal.geometry.observables import VERTICAL
-from mwdcal.geometry.vectors import Array, ArrayLike, outer
+from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.record import FREE_SHARE, Calibration
+from mwdcal.errors import InputError
+from mwdcal.geometry.observables import VERTICAL, is_vertical
+from mwdcal.geometry.vectors import Array, ArrayLike, eigen, outer, wrap
+from mwdcal.survey.stations import STATIONS_AT_ONCE
+from mwdcal.use.uncertainty import rows_of
 
 _SHORT = 0.03
 """Dogleg, rad, below which a series has more digits than the closed form."""
@@ -127,3 +143,243 @@ def well_path(
     step = arcs(md, hole_direction(inc, azi)).displacement
     first = np.broadcast_to(np.asarray(start, float)[..., None, :], (*step.shape[:-2], 1, 3))
     return np.cumsum(np.concatenate([first, step], -2), -2)
+
+
+@dataclass(frozen=True)
+class DirectionErrors:
+    """The direction of the hole at survey stations (…, n), and its errors.
+
+    Attributes:
+        inclination: rad (…, n).
+        azimuth: rad (…, n); at vertical the direction that counts as upward there.
+        systematic: shifts (…, n, k, 2) upward and sideways, rad, by one standard deviation of each of k
+            independent causes that last over the well.
+        random: covariance (…, n, 2, 2) of the errors that are new at every station, rad².
+    """
+
+    inclination: Array
+    azimuth: Array
+    systematic: Array
+    random: Array
+
+
+class _Sums(NamedTuple):
+    """What has added up at the last station (…) of a part of a well.
+
+    `shift` (…, k, 3): of its position, by each lasting cause; `settled` (…, 3, 3): covariance by random errors of the
+    stations before it; `arrival` (…, m, 3): shift of its position by each of its own random errors.
+    """
+
+    position: Array
+    shift: Array
+    settled: Array
+    arrival: Array
+
+
+def tilts(inclination: ArrayLike, azimuth: ArrayLike) -> Array:
+    """Changes (…, 2, 3) of the hole's direction, north, east, down, by a turn upward and one sideways.
+
+    Units: radians. Singular: nowhere, but azimuth must be a number at vertical too.
+    """
+    inc, azi = np.broadcast_arrays(np.asarray(inclination, float), np.asarray(azimuth, float))
+    ci, ca, sa = np.cos(inc), np.cos(azi), np.sin(azi)
+    rows = [ci * ca, ci * sa, -np.sin(inc), -sa, ca, np.zeros_like(sa)]
+    return np.stack(rows, -1).reshape(*inc.shape, 2, 3)
+
+
+def direction_gradient(g: Array, b: Array) -> tuple[Array, Array]:
+    """Azimuth (…) of the tool axis, and the gradient (…, 2, 6) of its direction, upward and sideways, by (g, b).
+
+    Definition: with unit vectors in the tool's frame, d down, e magnetic east, h where the axis points on the map and
+    l = d × h to the right of it: upward -h·δg / |g|, sideways
+    (tan(dip) sin I e - cos I l)·δg / |g| - sin I e·δb / (|b| cos dip).
+    Units: rad per unit of g and of b. Singular: finite at vertical, where h is taken as at toolface zero and the
+    azimuth is the magnetic toolface; NaN where g and b are parallel.
+    """
+    strength, vertical = np.linalg.norm(g, axis=-1, keepdims=True), is_vertical(g)[..., None]
+    d = g / strength
+    normal = np.cross(d, b)
+    horizontal = np.linalg.norm(normal, axis=-1, keepdims=True)
+    e = normal / np.where(horizontal > 0, horizontal, np.nan)
+    cosine = d[..., 2:]
+    sine = np.where(vertical, 0.0, np.hypot(d[..., :1], d[..., 1:2]))
+    heading = np.where(vertical, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]) - cosine * d)
+    h = heading / np.linalg.norm(heading, axis=-1, keepdims=True)
+    along = np.sum(d * b, -1, keepdims=True) / horizontal
+    sideways = (along * sine * e - cosine * np.cross(d, h)) / strength
+    rows = [np.concatenate([-h / strength, np.zeros_like(b)], -1)]
+    rows.append(np.concatenate([sideways, -sine * e / horizontal], -1))
+    north = np.cross(e, d)
+    azimuth = np.arctan2(np.sum(h * e, -1), np.sum(h * north, -1))
+    return wrap(azimuth), np.stack(rows, -2)
+
+
+def direction_errors(
+    calibration: Calibration,
+    readings: Readings,
+    north: float = 0.0,
+    declination_sd: float = 0.0,
+    declination_noise: float = 0.0,
+) -> DirectionErrors:
+    """The direction of the hole at readings (…, n), with its errors from the calibration and from noise.
+
+    Errors of the calibration last over the well, with the uncertainty of north as one cause more; noise is new at every
+    station.
+    Units: radians. `north`: declination, for azimuths from true north, less convergence, for those from
+    grid north; `declination_sd`: its standard uncertainty, and `declination_noise` what is new at every station.
+    Singular: finite at vertical. NaN where the direction rests on what no evidence determines, and without a field.
+    """
+    g, b = calibration.fields(readings)
+    azimuth, gradient = direction_gradient(g, b)
+    change = gradient @ calibration.jacobian(readings)
+    free = np.abs(change @ calibration.free_directions.transpose()) > FREE_SHARE
+    shifts = change @ _factor(calibration.parameter_covariance)
+    shifts = np.where(np.any(free, (-1, -2), keepdims=True), np.nan, shifts.swapaxes(-1, -2))
+    inclination = np.arctan2(np.hypot(g[..., 0], g[..., 1]), g[..., 2])
+    turn = np.stack([np.zeros_like(inclination), np.sin(inclination)], -1)
+    return DirectionErrors(
+        inclination=inclination,
+        azimuth=wrap(azimuth + north),
+        systematic=np.concatenate([shifts, turn[..., None, :] * declination_sd], -2),
+        random=gradient @ calibration.noise_covariance(readings) @ gradient.mT
+        + declination_noise**2 * outer(turn),
+    )
+
+
+def _factor(covariance: Array) -> Array:
+    """A matrix (p, k) whose product with its transpose is a covariance (p, p): a column for each cause."""
+    scale = np.sqrt(np.diagonal(covariance))
+    whole = np.where(scale > 0, scale, 1.0)
+    values, vectors = eigen(covariance / whole[:, None] / whole)
+    kept = values > 0
+    return np.asarray(whole[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
+
+
+def position_covariance(
+    md: ArrayLike,
+    inclination: ArrayLike,
+    azimuth: ArrayLike,
+    systematic: ArrayLike | None = None,
+    random: ArrayLike | None = None,
+    balanced: bool = False,
+) -> Array:
+    """Covariance (…, n, 3, 3) of the positions (north, east, down) of survey stations, m².
+
+    `systematic` (…, n, k, 2 or 3): shifts upward, sideways and, where there is a third, in measured depth, by one
+    standard deviation of each of k independent causes that last over the well. `random` (…, n, 2, 2 or 3, 3):
+    covariance of the same of the errors that are new at every station.
+    `balanced`: by the balanced tangential method, as the numbers of published error models are.
+    The first station is where the path starts: its position is exact, its direction has the errors given for it.
+    Units: m, radians. Singular: finite at vertical, with any number for the azimuth that the shifts refer to.
+    Memory: of the result and of the causes given, however many stations there are.
+    """
+    md, inc, azi = (
+        np.asarray(each, float) for each in np.broadcast_arrays(md, inclination, azimuth)
+    )
+    lasting = np.zeros((*md.shape, 0, 2)) if systematic is None else np.asarray(systematic, float)
+    new = np.zeros((*md.shape, 2, 2)) if random is None else np.asarray(random, float)
+
+    def part(where: slice) -> tuple[Array, DirectionErrors]:
+        stations = (..., where, slice(None), slice(None))
+        errors = DirectionErrors(inc[..., where], azi[..., where], lasting[stations], new[stations])
+        return md[..., where], errors
+
+    return np.concatenate(
+        [covariance for _, covariance in _along(md.shape[-1], part, balanced=balanced)], -3
+    )
+
+
+def calibrated_path(
+    calibration: Calibration,
+    readings: Readings,
+    md: ArrayLike,
+    north: float = 0.0,
+    declination_sd: float = 0.0,
+    start: ArrayLike = (0.0, 0.0, 0.0),
+    declination_noise: float = 0.0,
+) -> tuple[Array, Array]:
+    """Positions (n, 3), north, east, true vertical depth, m, of readings in a well, and their covariance (n, 3, 3).
+
+    As `well_path` and `position_covariance` of `direction_errors`, in memory that the causes of error do not enter.
+    A station without a direction leaves none of the following ones a position: leave it out.
+
+    Raises:
+        InputError: the depths do not increase.
+    """
+    depth = np.asarray(md, float)
+    if not (np.diff(depth) > 0).all():
+        raise InputError(
+            "`md` must increase from station to station. Sort the stations by measured depth."
+        )
+
+    def part(where: slice) -> tuple[Array, DirectionErrors]:
+        some = rows_of(readings, where)
+        return depth[where], direction_errors(
+            calibration, some, north, declination_sd, declination_noise
+        )
+
+    both = list(_along(len(depth), part, start))
+    return np.concatenate([p for p, _ in both]), np.concatenate([c for _, c in both])
+
+
+def _along(
+    count: int,
+    part: Callable[[slice], tuple[Array, DirectionErrors]],
+    start: ArrayLike = (0.0, 0.0, 0.0),
+    balanced: bool = False,
+) -> Iterator[tuple[Array, Array]]:
+    """Positions (…, m, 3) and covariance (…, m, 3, 3) of all stations of a well, some at a time."""
+    sums = None
+    for first in range(0, max(count, 1), STATIONS_AT_ONCE):
+        # each part begins with the last station of the one before
+        where = slice(max(first - 1, 0), first + STATIONS_AT_ONCE)
+        md, errors = part(where)
+        sums = sums or _no_sums(md, errors, start)
+        position, covariance, sums = _part_of_path(md, errors, sums, balanced)
+        skipped = first - where.start
+        yield position[..., skipped:, :], covariance[..., skipped:, :, :]
+
+
+def _no_sums(md: Array, errors: DirectionErrors, start: ArrayLike) -> _Sums:
+    wells, causes = md.shape[:-1], errors.systematic.shape[-2]
+    position = np.broadcast_to(np.asarray(start, float), (*wells, 3))
+    arrival = np.zeros((*wells, errors.random.shape[-1], 3))
+    return _Sums(position, np.zeros((*wells, causes, 3)), np.zeros((*wells, 3, 3)), arrival)
+
+
+def _part_of_path(
+    md: Array, errors: DirectionErrors, before: _Sums, balanced: bool
+) -> tuple[Array, Array, _Sums]:
+    """Positions and covariance of stations the first of which has the sums `before`, and those of the last."""
+    arc = arcs(md, hole_direction(errors.inclination, errors.azimuth), balanced)
+    upper, lower = _reach(arc, tilts(errors.inclination, errors.azimuth))
+    shifts, random = errors.systematic, errors.random
+    rows = slice(shifts.shape[-1])
+    step = (
+        shifts[..., :-1, :, :] @ upper[..., rows, :] + shifts[..., 1:, :, :] @ lower[..., rows, :]
+    )
+    position = _sums_from(before.position, arc.displacement, -2)
+    shift = _sums_from(before.shift, step, -3)
+    rows = slice(random.shape[-1])
+    arrival = np.concatenate([before.arrival[..., None, :, :], lower[..., rows, :]], -3)
+    through = arrival[..., :-1, :, :] + upper[..., rows, :]
+    passed = through.mT @ random[..., :-1, :, :] @ through
+    settled = _sums_from(before.settled, passed, -3)
+    covariance = settled + arrival.mT @ random @ arrival + shift.mT @ shift
+    last = _Sums(position[..., -1, :], *(each[..., -1, :, :] for each in (shift, settled, arrival)))
+    return position, covariance, last
+
+
+def _reach(arc: Arcs, turns: Array) -> tuple[Array, Array]:
+    """Changes (…, n - 1, 3, 3) of each step by a shift upward, sideways and in depth at its upper and lower end."""
+    upper, lower = arc.by_directions()
+    along = arc.by_length[..., None, :]
+    return (
+        np.concatenate([turns[..., :-1, :, :] @ upper.mT, -along], -2),
+        np.concatenate([turns[..., 1:, :, :] @ lower.mT, along], -2),
+    )
+
+
+def _sums_from(first: Array, steps: Array, axis: int) -> Array:
+    """Running sums from a first value, without the axis of the stations, over what is added at each station."""
+    return np.cumsum(np.concatenate([np.expand_dims(first, axis), steps], axis), axis)

@@ -21,7 +21,7 @@ from mwdcal.errors import FitError
 from mwdcal.files.formats import atomic
 from mwdcal.geometry.vectors import Array, ArrayLike, reference_vectors
 from mwdcal.survey.acceptance import SensorTerms, load_survey_limits
-from mwdcal.survey.position import direction_gradient
+from mwdcal.survey.path import direction_gradient
 from mwdcal.use.strengths import STANDARD_GRAVITY
 
 

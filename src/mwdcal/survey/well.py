@@ -13,11 +13,17 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, VECTORS
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints, diagonal, wrap
-from mwdcal.survey.acceptance import STRENGTH_NAMES, Judgement, SurveyLimits, judged
-from mwdcal.survey.blindness import Blindness, blindness
-from mwdcal.survey.error_terms import CORRECTED, DRIFTED, ErrorTerms, error_terms
+from mwdcal.survey.acceptance import (
+    STRENGTH_NAMES,
+    Blindness,
+    Judgement,
+    SurveyLimits,
+    blindness,
+    judged,
+)
+from mwdcal.survey.interference import CORRECTED, DRIFTED, ErrorTerms, error_terms
 from mwdcal.survey.norths import North
-from mwdcal.survey.position import calibrated_path
+from mwdcal.survey.path import calibrated_path
 from mwdcal.survey.stations import TOOLFACE_SWITCH, Surveys, surveyed
 from mwdcal.use.correction import counted
 

@@ -21,8 +21,18 @@ from mwdcal.estimation.evidence import ANGLES
 from mwdcal.geometry.observables import OBSERVABLES, OUTPUTS
 from mwdcal.geometry.vectors import Array, Bools, Ints
 from mwdcal.use import roll_test
-from mwdcal.use.roll_sets import ROLL_SET, RollSet, near_vertical, roll_sets
-from mwdcal.use.roll_test import FITTED, UNLIMITED, Coverage, Curve, NoiseScale, draws
+from mwdcal.use.roll_test import (
+    FITTED,
+    ROLL_SET,
+    UNLIMITED,
+    Coverage,
+    Curve,
+    NoiseScale,
+    RollSet,
+    draws,
+    near_vertical,
+    roll_sets,
+)
 
 UNDEFINED_AT_VERTICAL = ("azimuth", "toolface")
 """Angles that do not exist at vertical."""

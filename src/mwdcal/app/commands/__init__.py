@@ -12,14 +12,14 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
-from mwdcal.screens.text import laid_out
+from mwdcal.presentation.text import laid_out
 
 
 class Commands(UserDict[str, Any]):
     """Commands by name, each imported only when it is used.
 
-    The values are modules below this one whose `command` it is: "surveys.survey", or with another
-    name in the module "records.keys:create".
+    The values are modules below this one whose `command` it is: "survey", or with another name in
+    the module "registry:add".
     """
 
     def __getitem__(self, name: str) -> Any:

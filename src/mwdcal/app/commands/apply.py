@@ -9,7 +9,7 @@ import click
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result
 from mwdcal.errors import InputError
-from mwdcal.screens.text import one_line
+from mwdcal.presentation.text import one_line
 
 
 @options.command()
@@ -48,9 +48,8 @@ def command(
     from mwdcal.app.progress import bar
     from mwdcal.calibration.readings import simulated
     from mwdcal.files.runs import BlankReadingError
-    from mwdcal.screens.envelope import enveloped, with_signature
-    from mwdcal.screens.records.calibrations import load_calibration
-    from mwdcal.screens.records.signature import in_short
+    from mwdcal.presentation.envelope import enveloped, with_signature
+    from mwdcal.presentation.signature import in_short, load_calibration
 
     options.check_outputs([output], [calibration, readings, *key])
     loaded = load_calibration(calibration, key)

@@ -41,7 +41,7 @@ def command(
     from mwdcal.calibration.calibrate import chosen_fit, recorded
     from mwdcal.files import documents
     from mwdcal.files.formats import atomic
-    from mwdcal.screens import calibration as screen
+    from mwdcal.presentation import calibration as screen
 
     options.check_outputs([output], [run, tool, typed["prior"]], page=report, calibration=True)
     prior, digest = prior_of(typed["prior"])
@@ -50,7 +50,7 @@ def command(
     calibration = recorded(choice, result)
     rendered = ""
     if report:
-        from mwdcal.pages.report import render
+        from mwdcal.presentation.calibration_page import render
 
         rendered = render(calibration)
     shown = (screen.summary if as_json else screen.screen)(

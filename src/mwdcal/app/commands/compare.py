@@ -12,8 +12,8 @@ import click
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result, say
 from mwdcal.errors import FitError
-from mwdcal.screens.text import one_line
-from mwdcal.screens.typed import as_typed
+from mwdcal.presentation.text import one_line
+from mwdcal.presentation.typed import as_typed
 
 
 @options.command()
@@ -45,8 +45,8 @@ def command(
     from mwdcal.calibration.options import Options
     from mwdcal.comparison.compare import able, compare
     from mwdcal.files.formats import atomic
-    from mwdcal.screens import comparison as screen
-    from mwdcal.screens.envelope import enveloped
+    from mwdcal.presentation import comparison as screen
+    from mwdcal.presentation.envelope import enveloped
 
     options.check_outputs([], [run, tool], page=report)
     readings, profile = load_run(run, tool, decimal)
@@ -55,7 +55,7 @@ def command(
     rows = tuple(replace(row, refused=as_typed(row.refused)) for row in result.rows)
     result = replace(result, rows=rows)
     if report:
-        from mwdcal.pages.comparison import render
+        from mwdcal.presentation.comparison_page import render
 
         sources = profile.name, readings.run_sha256, readings.profile_sha256
         time = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")

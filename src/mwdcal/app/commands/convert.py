@@ -9,7 +9,7 @@ import click
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result
 from mwdcal.errors import InputError
-from mwdcal.screens.text import one_line, to_json
+from mwdcal.presentation.text import one_line, to_json
 
 
 @options.command()
@@ -56,7 +56,7 @@ def command(
     Example: mwdcal convert tool.json --to fixed-point --word-bits 24 -o firmware
     Example: mwdcal convert tool.json --to tool-model -o model.json
     """
-    from mwdcal.screens.conversion import check_bits
+    from mwdcal.presentation.conversion import check_bits
 
     _check_choice(notation, form, temperature, output)
     check_bits(form, word_bits)
@@ -87,7 +87,7 @@ def _convert(
 ) -> None:
     """Print a calibration in a notation, or write it as JSON."""
     from mwdcal.files.formats import atomic
-    from mwdcal.screens import conversion
+    from mwdcal.presentation import conversion
 
     options.check_outputs([output], [calibration])
     converted = conversion.converted(calibration, notation, _temperature(temperature))
@@ -103,7 +103,7 @@ def _write_sources(
 ) -> None:
     """Write the C sources of a calibration into a folder, all or none."""
     from mwdcal.files.formats import atomic
-    from mwdcal.screens import conversion
+    from mwdcal.presentation import conversion
 
     exported = conversion.exported(calibration, form, word_bits)
     files = {folder / name: text for name, text in exported.sources.files.items()}
@@ -119,7 +119,7 @@ def _write_sources(
 def _write_model(calibration: Path, temperature: str | None, output: Path, as_json: bool) -> None:
     """Write the sensor terms of a calibration as a tool model, and print them."""
     from mwdcal.files.formats import atomic
-    from mwdcal.screens import conversion
+    from mwdcal.presentation import conversion
 
     options.check_outputs([output], [calibration])
     converted, terms, model = conversion.terms_at(calibration, _temperature(temperature))

@@ -42,8 +42,8 @@ def command(folder: Path, as_json: bool) -> None:
     """
     from mwdcal.calibration.readings import SIMULATED
     from mwdcal.files.formats import atomic
-    from mwdcal.screens.envelope import ExampleDocument, enveloped
-    from mwdcal.screens.text import one_line, table
+    from mwdcal.presentation.envelope import ExampleDocument, enveloped
+    from mwdcal.presentation.text import one_line, table
 
     if folder.exists() and not folder.is_dir():
         raise InputError(f"cannot write into '{folder}': it is not a folder. Name another one.")

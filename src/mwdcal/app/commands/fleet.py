@@ -67,9 +67,9 @@ def command(
         from mwdcal.files.formats import atomic, folders
         from mwdcal.fleet import calibration_files
         from mwdcal.library import fleet_table
-        from mwdcal.pages import fleet_report
-        from mwdcal.screens import fleet as screen
-        from mwdcal.screens.text import plural
+        from mwdcal.presentation import fleet as screen
+        from mwdcal.presentation import fleet_page
+        from mwdcal.presentation.text import plural
 
     options.check_outputs([output], [runs, tool], page=report, calibration=True)
     if calibrations:
@@ -86,7 +86,7 @@ def command(
             count = calibration_files.write(output, calibrations)
             say(f"wrote {plural(count, 'calibration file')} to {calibrations}")
         if report:
-            atomic.write(report, fleet_report.render(output, summary))
+            atomic.write(report, fleet_page.render(output, summary))
     except KeyboardInterrupt as stop:
         stop.add_note("Finished parts are kept: the same command goes on from there.")
         raise

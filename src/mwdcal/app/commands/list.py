@@ -17,7 +17,7 @@ def command(kind: str, as_json: bool) -> None:
     \b
     Example: mwdcal list profiles
     """
-    from mwdcal.screens import builtin as screen
+    from mwdcal.presentation import builtin as screen
 
     entries = screen.entries(kind)
     print_result(screen.document(kind, entries) if as_json else screen.screen(entries))

@@ -8,7 +8,7 @@ import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result, say
-from mwdcal.screens.typed import findings_as_typed
+from mwdcal.presentation.typed import findings_as_typed
 
 
 @options.command()
@@ -48,10 +48,10 @@ def command(
     from mwdcal.files.profiles import load_profile
     from mwdcal.logs.allan import Kind
     from mwdcal.logs.noise import check, find_noise
-    from mwdcal.pages.noise import figure, render
-    from mwdcal.pages.pictures import picture
-    from mwdcal.screens import noise as screen
-    from mwdcal.screens.envelope import enveloped
+    from mwdcal.presentation import noise as screen
+    from mwdcal.presentation.envelope import enveloped
+    from mwdcal.presentation.noise_page import figure, render
+    from mwdcal.presentation.page import picture
 
     options.check_outputs([], [log, tool], picture=plot, page=report)
     between = (-np.inf if start is None else start, np.inf if end is None else end)

@@ -14,7 +14,7 @@ import click
 
 from mwdcal.app.messages import Command
 from mwdcal.errors import InputError
-from mwdcal.screens.typed_options import Typed as Typed
+from mwdcal.presentation.typed import Typed as Typed
 
 Function = Callable[..., Any]
 Decorator = Callable[[Function], Function]
@@ -227,14 +227,14 @@ def check_outputs(
                 raise _refused(path, why)
         taken |= names
     if picture:
-        from mwdcal.pages.pictures import require
+        from mwdcal.presentation.page import require
 
         if picture.suffix.lower() not in PICTURES:
             allowed = ", ".join(PICTURES)
             raise InputError(f"`plot` {picture}: the suffix must be one of {allowed}. Rename it.")
         require("a picture", "matplotlib")
     if page:
-        from mwdcal.pages.page import environment
+        from mwdcal.presentation.page import environment
 
         environment()
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import lines, print_result, say
-from mwdcal.screens.typed import as_typed, findings_as_typed
+from mwdcal.presentation.typed import as_typed, findings_as_typed
 
 
 @options.command()
@@ -45,10 +45,10 @@ def command(
     from mwdcal.files import logs
     from mwdcal.files.formats import atomic, table
     from mwdcal.logs.stations import StandstillError, find_stations
-    from mwdcal.pages.pictures import picture
-    from mwdcal.pages.stations import figure, render
-    from mwdcal.screens import stations as screen
-    from mwdcal.screens.envelope import enveloped
+    from mwdcal.presentation import stations as screen
+    from mwdcal.presentation.envelope import enveloped
+    from mwdcal.presentation.page import picture
+    from mwdcal.presentation.stations_page import figure, render
 
     options.check_outputs([output], [log], picture=plot, page=report)
     slowly = progress.slowly(say)

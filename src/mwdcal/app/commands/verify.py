@@ -7,8 +7,8 @@ from pathlib import Path
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result
-from mwdcal.screens.text import to_json
-from mwdcal.screens.typed import findings_as_typed
+from mwdcal.presentation.text import to_json
+from mwdcal.presentation.typed import findings_as_typed
 
 
 @options.command()
@@ -36,9 +36,9 @@ def command(
     from mwdcal.files import runs
     from mwdcal.files.formats import atomic
     from mwdcal.files.limits import load_limits
-    from mwdcal.screens.envelope import enveloped, with_signature
-    from mwdcal.screens.records.calibrations import load_calibration
-    from mwdcal.screens.verification import screen
+    from mwdcal.presentation.envelope import enveloped, with_signature
+    from mwdcal.presentation.signature import load_calibration
+    from mwdcal.presentation.verification import screen
     from mwdcal.use.verification import verify
 
     options.check_outputs([output], [calibration, run, limits, *key], page=report)
@@ -57,7 +57,7 @@ def command(
     document = with_signature(document, loaded.signature)
     rendered = ""
     if report:
-        from mwdcal.pages.report import render
+        from mwdcal.presentation.calibration_page import render
 
         rendered = render(fitted, result, *stated)
     atomic.write_all([(output, to_json(document) + "\n"), (report, rendered)])

@@ -16,8 +16,7 @@ from mwdcal.calibration.prior import Knowledge
 from mwdcal.calibration.readings import TRIADS, Readings, stated_day
 from mwdcal.calibration.record import Calibration
 from mwdcal.geometry.vectors import Array
-from mwdcal.sensor.datasheets import AGEING, ageing
-from mwdcal.sensor.profile import Profile
+from mwdcal.sensor.profile import AGEING, Profile, ageing
 
 JULIAN_YEAR = 365.25
 """Days."""

@@ -20,8 +20,7 @@ from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import stated
 from mwdcal.estimation.batch import batch_of_one
 from mwdcal.estimation.uncertainty import left_out_residual, log_evidence, without_station
-from mwdcal.geometry.directions import directions, group_scatter
-from mwdcal.geometry.vectors import Array, Ints
+from mwdcal.geometry.vectors import Array, Ints, directions, group_scatter
 from mwdcal.sensor.profile import Profile
 
 BETTER_SHARE = 0.98

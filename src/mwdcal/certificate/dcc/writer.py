@@ -29,11 +29,11 @@ from mwdcal.certificate.dcc.elements import (
     content,
     leaf,
     node,
+    real,
     title,
     typed,
     words,
 )
-from mwdcal.certificate.dcc.quantities import real
 from mwdcal.certificate.document import (
     Budget,
     BudgetLine,

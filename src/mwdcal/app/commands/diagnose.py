@@ -1,0 +1,55 @@
+"""`mwdcal diagnose`: what has happened to a calibrated tool, by later readings."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from mwdcal.app.commands import options
+from mwdcal.app.messages import print_result
+from mwdcal.presentation.text import to_json
+from mwdcal.presentation.typed import findings_as_typed
+
+
+@options.command()
+@options.CALIBRATION
+@options.argument("readings")
+@options.RESULT
+@options.DECIMAL
+@options.JSON
+def command(
+    calibration: Path, readings: Path, output: Path | None, decimal: str, as_json: bool
+) -> None:
+    """Say which fault, if any, later READINGS of the tool of a CALIBRATION show.
+
+    READINGS are a roll test or surveys, a run file with the references that are known, or none.
+
+    \b
+    Example: mwdcal diagnose tool.json rolltest.csv
+    Exit: 0 still fine, 1 a fault is named, 2 input cannot be read or is of the fit itself.
+    """
+    from msgspec.structs import replace
+
+    from mwdcal.calibration.diagnosis.findings import unused_columns
+    from mwdcal.faults.diagnosis import diagnose
+    from mwdcal.faults.physics import NONE
+    from mwdcal.files import runs
+    from mwdcal.files.formats import atomic
+    from mwdcal.presentation.diagnosis import screen
+    from mwdcal.presentation.envelope import enveloped
+    from mwdcal.registry.calibration_source import calibration_of
+
+    options.check_outputs([output], [calibration, readings])
+    fitted, digest = calibration_of(calibration)
+    later, _ = runs.read_run(readings, fitted.profile, decimal=decimal)
+    result = diagnose(fitted, later)
+    findings = findings_as_typed(
+        [*fitted.change_findings(), *result.findings, *unused_columns(later.unused)]
+    )
+    result = replace(result, findings=findings)
+    stated = fitted.tool, later.metadata
+    digests = {"calibration": digest, "readings": later.run_sha256}
+    document = enveloped("diagnose", result, *stated, **digests)
+    atomic.write_all([(output, to_json(document) + "\n")])
+    print_result(document if as_json else screen(result, *stated), findings)
+    sys.exit(0 if result.fault == NONE else 1)

@@ -1,1 +1,0 @@
-"""Commands for what comes before a measurement."""

@@ -1,1 +1,0 @@
-"""Commands for certificates and for the registry of tools."""

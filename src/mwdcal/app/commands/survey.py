@@ -1,0 +1,177 @@
+"""`mwdcal survey`: surveys of a well, accepted or not, and the path of the hole."""
+
+from __future__ import annotations
+
+from math import radians
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from mwdcal.app.commands import options
+from mwdcal.app.messages import print_result
+from mwdcal.errors import InputError
+from mwdcal.presentation.typed import findings_as_typed
+
+if TYPE_CHECKING:
+    from mwdcal.calibration.canonical import SignatureCheck
+    from mwdcal.survey.interference import Interference
+    from mwdcal.survey.surveying import SurveyedWell, WellInputs
+
+
+@options.command()
+@options.CALIBRATION
+@options.argument("readings")
+@options.output(metavar="OUT", help="Table to write; format by suffix.")
+@click.option(
+    "--reference",
+    type=options.FILE,
+    metavar="REF.json",
+    help="Gravity, field, dip and declination of the place: what mwdcal reference --json prints.",
+)
+@click.option(
+    "--msa",
+    is_flag=True,
+    help="Multi-station analysis first: take the drill string's interference, as all surveys show it, off the "
+    "magnetometer.",
+)
+@click.option(
+    "--msa-html", type=options.FILE, metavar="M.html", help="Also write a page of that analysis."
+)
+@click.option(
+    "--sensor-drift",
+    metavar="owsg|none|FILE",
+    help="For --msa: how far the sensors may have drifted since the calibration, 1σ: as the OWSG model (owsg, the "
+    "default), not at all (none), or as the [sensor] terms of a limits file.",
+)
+@options.preset(
+    "--limits",
+    default="owsg-mwd",
+    metavar="NAME|FILE",
+    help="Limits on |g|, |b| and dip: an error model (owsg-mwd), fixed ones (iscwsa-fixed, fixed), or a TOML file.",
+)
+@options.preset(
+    "--switch",
+    default="3,5",
+    metavar="LOW,HIGH",
+    help="Inclinations, degrees: below LOW the toolface counts from magnetic north, above HIGH from the high "
+    "side; between them as at the station before.",
+)
+@click.option(
+    "--tie-in", metavar="N,E,TVD", help="Position of the first station, m. Default: 0,0,0."
+)
+@options.WHERE_OUTSIDE
+@click.option(
+    "--html", type=options.FILE, metavar="S.html", help="Also write a page with the pictures."
+)
+@options.DECIMAL
+@options.TRUSTED_KEYS
+@options.JSON
+def command(
+    calibration: Path, readings: Path, output: Path, reference: Path | None, msa: bool,
+    msa_html: Path | None, sensor_drift: str | None, limits: str, switch: str, tie_in: str | None, outside: str,
+    html: Path | None, decimal: str, key: tuple[Path, ...], as_json: bool,
+) -> None:  # fmt: skip
+    """Surveys of a well: READINGS in their order, corrected by the CALIBRATION of their tool.
+
+    Adds inclination, azimuth, toolface, |g|, |b| and dip with standard uncertainties to the columns of READINGS, and
+    whether each survey lies within the limits; with measured depths (md_m) north, east and TVD.
+
+    \b
+    Example: mwdcal survey tool.json surveys.csv --reference here.json -o well.csv --html well.html
+    Exit: 0 written, 2 input cannot be read, or does not belong to the calibration, 3 with --msa: the surveys do not
+    separate interference from azimuth.
+    """
+    from mwdcal.files.formats import atomic
+    from mwdcal.files.formats import table as tables
+    from mwdcal.files.runs import MOST_ROWS, read_export
+    from mwdcal.presentation.signature import load_calibration
+    from mwdcal.survey.surveying import analysed, check_drift, survey_well, well_inputs
+
+    if msa_html and not msa:
+        raise InputError("`msa_html` goes with `msa`. Leave it out, or add `msa`.")
+    check_drift(sensor_drift, msa)
+    given = [calibration, readings, reference, limits, *key]
+    options.check_outputs([output, msa_html], given, page=html)
+    start, ends = _three("tie_in", tie_in), _switch(switch)
+    loaded = load_calibration(calibration, key)
+    fitted = loaded.calibration
+    table = read_export(readings, fitted.profile, decimal=decimal, rows=MOST_ROWS)
+    inputs = well_inputs(fitted, table, reference, limits, msa, loaded.digest, loaded.findings)
+    analysis = analysed(inputs, sensor_drift) if msa else None
+    pages = _interference_page(inputs, analysis, msa_html)
+    if analysis and not analysis.summary.separable:
+        atomic.write_all(pages)
+        _refuse(inputs, analysis, loaded.signature, as_json)
+    result = survey_well(inputs, analysis, tie_in=start, switch=ends, outside=outside)
+    if html:
+        from mwdcal.presentation.survey_page import render
+
+        findings = findings_as_typed(result.well.findings)
+        pages.append((html, render(result.well, findings, inputs.named)))
+    atomic.write_all([(output, tables.rendered(output, result.table)), *pages])
+    _print(result, loaded.signature, (str(output), str(html or "")), as_json)
+
+
+def _interference_page(
+    inputs: WellInputs, analysis: Interference | None, page: Path | None
+) -> list[tuple[Path, bytes | str]]:
+    """The page of a multi-station analysis, where one was asked for."""
+    if not analysis or not page:
+        return []
+    from mwdcal.presentation.interference_page import render
+
+    return [(page, render(analysis, inputs.named))]
+
+
+def _refuse(
+    inputs: WellInputs, analysis: Interference, signature: SignatureCheck, as_json: bool
+) -> None:
+    """Print an analysis that cannot be used where machines read it, and refuse it."""
+    from mwdcal.presentation import survey as screens
+
+    if as_json:
+        facts = screens.refusal(inputs, analysis.summary)
+        print_result(screens.document(inputs, facts, signature), [])
+    analysis.check()
+
+
+def _print(
+    result: SurveyedWell, signature: SignatureCheck, files: tuple[str, str], as_json: bool
+) -> None:
+    """Print the result, with the files that were written."""
+    from mwdcal.presentation import survey as screens
+
+    facts = screens.result_summary(result, *files)
+    shown: object = (
+        screens.document(result.inputs, facts, signature)
+        if as_json
+        else screens.whole_screen(result, facts, signature)
+    )
+    print_result(shown, findings_as_typed(screens.all_findings(facts)))
+
+
+def _numbers(name: str, text: str, count: int) -> list[float]:
+    """Numbers with commas between them."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count or not all(abs(value) < 1e9 for value in values):
+        raise InputError(
+            f"`{name}` must be {count} numbers with commas between them; got {text!r}."
+        )
+    return values
+
+
+def _three(name: str, text: str | None) -> tuple[float, float, float] | None:
+    if text is None:
+        return None
+    first, second, third = _numbers(name, text, 3)
+    return first, second, third
+
+
+def _switch(text: str) -> tuple[float, float]:
+    """Both inclinations in radians."""
+    low, high = (radians(value) for value in _numbers("switch", text, 2))
+    return low, high

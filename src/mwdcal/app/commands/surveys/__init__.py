@@ -1,1 +1,0 @@
-"""Commands for surveys and the references they need."""

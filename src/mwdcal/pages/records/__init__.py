@@ -1,1 +1,0 @@
-"""Certificates as pages and PDF, and pages of the registry."""

@@ -1,1 +1,0 @@
-"""Pages of surveys in a well."""

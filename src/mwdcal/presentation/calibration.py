@@ -1,0 +1,282 @@
+"""A calibration on the screen and for machines: one screen that a technician can act on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from mwdcal.calibration.automatic.nonlinearity import CurveScore
+from mwdcal.calibration.diagnosis.flags import listed
+from mwdcal.calibration.drift import Constant, Drift, exact_and_steady
+from mwdcal.calibration.prediction import typical_accuracy, without_temperature
+from mwdcal.calibration.readings import simulated
+from mwdcal.calibration.record import (
+    BudgetRow,
+    Calibration,
+    Choices,
+    ErrorRow,
+    Finding,
+    Measures,
+    OrderScore,
+    StandErrors,
+    Undetermined,
+)
+from mwdcal.calibration.settings import ASSUMED, ASSUMED_PRACTICE
+from mwdcal.geometry.observables import TITLES
+from mwdcal.presentation.envelope import enveloped
+from mwdcal.presentation.numbers import degrees_of_freedom, estimate, uncertainty, written
+from mwdcal.presentation.text import chance, number, one_line, quantity, table
+from mwdcal.presentation.typed import findings_as_typed
+
+if TYPE_CHECKING:
+    pass
+
+MOST_RESHOOTS = 12
+"""Most stations to re-shoot that messages name."""
+MOST_EXCLUDED = 20
+"""Most stations left out of the fit that the screen names."""
+PROFILE = " (see [stand] of the tool profile)"
+ORDERS = "error: rms per axis, with the noise; inside: interpolation, at the ends: extrapolation"
+COMPARED = """
+by chance: probability that noise alone gives such a term; chosen: the lowest order above which \
+none is below 0.001"""
+"""What the table of orders means, and where orders were compared."""
+
+
+class TriadSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """A triad as the summary states it: the fields of `TriadCalibration` without its parameters."""
+
+    model: str
+    order: int
+    rank: int
+    size: int
+    undetermined: list[Undetermined]
+    variance_factor: float | None
+    degrees_of_freedom: float
+    misfit_probability: float | None
+
+
+class CalibrationSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """What `calibrate` prints: fields of `Calibration`, accuracy, comparisons, and the files written."""
+
+    run: str
+    stations: int
+    excluded: list[str]
+    temperature_c: tuple[float, float] | None
+    method: str
+    options: Choices
+    seed: int | None
+    triads: dict[str, TriadSummary]
+    errors: list[ErrorRow]
+    measures: list[Measures]
+    accuracy_1sigma_deg: dict[str, float | None]
+    budget: list[BudgetRow]
+    assumed_exact: list[str]
+    constants: list[Constant]
+    drift: list[Drift]
+    stand: StandErrors
+    findings: list[Finding]
+    orders: list[OrderScore]
+    nonlinearity: list[CurveScore]
+    calibration: str
+    report: str
+
+
+def _recorded(kind: type[msgspec.Struct], record: msgspec.Struct) -> dict[str, Any]:
+    """The fields of a summary that the record has too."""
+    names = {*kind.__struct_fields__} & {*record.__struct_fields__}
+    return {name: getattr(record, name) for name in names}
+
+
+def summary(
+    calibration: Calibration, tried: list[CurveScore], output: Path | None, report: Path | None
+) -> dict[str, Any]:
+    """The result for machines."""
+    findings = findings_as_typed(calibration.findings)
+    content = CalibrationSummary(
+        **{**_recorded(CalibrationSummary, calibration), "findings": findings},
+        triads={t.name: TriadSummary(**_recorded(TriadSummary, t)) for t in calibration.triads},
+        accuracy_1sigma_deg=typical_accuracy(calibration),
+        nonlinearity=tried,
+        calibration=str(output or ""),
+        report=str(report or ""),
+    )
+    return enveloped(
+        "calibrate",
+        content,
+        calibration.tool,
+        run=calibration.run_sha256,
+        profile=calibration.profile_sha256,
+        prior=calibration.prior_sha256 or "",
+    )
+
+
+def body(calibration: Calibration, tried: list[CurveScore]) -> str:
+    """The calibration for people, with the own-axis terms that were tried."""
+    blocks = [
+        heading(calibration),
+        *([orders(calibration.orders)] if calibration.orders else []),
+        *([curves(tried)] if tried else []),
+        errors(calibration.errors),
+        "\n".join(remarks(calibration)),
+    ]
+    return "\n\n".join(blocks)
+
+
+def screen(
+    calibration: Calibration, tried: list[CurveScore], output: Path, report: Path | None
+) -> str:
+    """The result for people, with the files that were written, and what to do next."""
+    files = written(calibration=output, report=report)
+    after = f"{files}   next: mwdcal verify {one_line(output)} ROLLTEST.csv"
+    return f"{body(calibration, tried)}\n{after}"
+
+
+def first_findings(calibration: Calibration) -> list[Finding]:
+    """The findings; of stations to re-shoot the first ones, and how many there are besides."""
+    again = [finding for finding in calibration.findings if finding.id == "reshoot"]
+    left = again[MOST_RESHOOTS:]
+    shown = [finding for finding in calibration.findings if finding not in left]
+    more = Finding(id="reshoot", text=f"… and {len(left)} more to re-shoot")
+    return shown + ([more] if left else [])
+
+
+def remarks(calibration: Calibration) -> list[str]:
+    """Size of the residuals, accuracy to expect, what was taken as exact, and estimated constants."""
+    accuracy = accuracy_in_words(calibration)
+    names, steady = exact_and_steady(calibration.assumed_exact)
+    exact = ", ".join(names)
+    return [
+        *residuals(calibration),
+        f"accuracy to expect (1σ, calibration alone, typical): {'  '.join(accuracy)}",
+        *([f"taken as exact, and no residual tests it: {exact}{PROFILE}"] if exact else []),
+        *([steady] if steady else []),
+        *([ASSUMED] if calibration.settings == ASSUMED_PRACTICE else []),
+        *(
+            f"estimated constant of the run: {c.name} {estimate(c.value, c.standard_uncertainty, c.unit)}"
+            for c in calibration.constants
+        ),
+        *stand(calibration),
+    ]
+
+
+def heading(calibration: Calibration) -> str:
+    """What was calibrated, from what, and how much of it is determined."""
+    serial = calibration.tool.get("serial", calibration.profile.name)
+    inclinations = known_inclinations(calibration)
+    parts = [calibration.run, serial, f"{calibration.stations} stations"]
+    if calibration.temperature_c:
+        parts.append("{:.1f}–{:.1f} °C".format(*calibration.temperature_c))
+    else:
+        parts.append(without_temperature(calibration))
+    parts.append(f"I {min(inclinations):.0f}–{max(inclinations):.0f}°")
+    parts += simulated(calibration.tool)
+    ranks = [
+        f"{t.name} {t.rank} of {t.size} determined, {degrees_of_freedom(t.degrees_of_freedom)}"
+        for t in calibration.triads
+    ]
+    lines = ["   ".join(parts), "   ".join([f"method {', '.join(how(calibration))}", *ranks])]
+    if calibration.excluded:
+        lines.append(f"left out of the fit: station {listed(calibration.excluded, MOST_EXCLUDED)}")
+    return "\n".join(map(one_line, lines))
+
+
+def accuracy_in_words(calibration: Calibration) -> list[str]:
+    """1σ to expect of the calibration alone, by angle."""
+    accuracy = typical_accuracy(calibration).items()
+    return [f"{name} {uncertainty(sd)}{'°' * (sd is not None)}" for name, sd in accuracy]
+
+
+def known_inclinations(calibration: Calibration) -> list[float]:
+    """Inclinations of the stations that have one, degrees."""
+    rows = calibration.station_rows
+    return [row.inclination_deg for row in rows if row.inclination_deg is not None]
+
+
+def how(calibration: Calibration) -> list[str]:
+    """Method, model, and what was asked for beyond them."""
+    return [calibration.method, model(calibration), *choices(calibration.options)]
+
+
+def model(calibration: Calibration) -> str:
+    """Model and temperature order, of each triad where they differ."""
+    models = {t.name: f"{t.model} of order {t.order}" for t in calibration.triads}
+    if len(set(models.values())) == 1:
+        return models["accelerometer"]
+    return ", ".join(f"{name}: {model}" for name, model in models.items())
+
+
+def choices(options: Choices) -> list[str]:
+    """What was asked for beyond method, model and order."""
+    return [
+        *([f"{options.parameters} parameters"] if options.parameters != 12 else []),
+        *([f"without {' and '.join(options.ignore)}"] if options.ignore else []),
+        *([f"robust ({options.robust})"] if options.robust else []),
+        *(["the paper's weights"] if options.paper_weights else []),
+        *([f"prior {options.prior}"] if options.prior else []),
+    ]
+
+
+def errors(rows: list[ErrorRow]) -> str:
+    """Errors before and after, with what was to be expected."""
+    cells = [
+        [f"{TITLES.get(row.observable, row.observable)} error, rms"]
+        + [quantity(value, row.unit) for value in (row.before, row.after, row.expected)]
+        for row in rows
+    ]
+    return table(cells, ["", "before", "after", "1σ expected"])
+
+
+def residuals(calibration: Calibration) -> list[str]:
+    """The size of the residuals over the declared noise, and how likely it is, where it is declared."""
+    each = [
+        f"{t.name} {number((t.variance_factor or 0.0) ** 0.5)} (chance {chance(t.misfit_probability)})"
+        for t in calibration.triads
+        if t.misfit_probability is not None
+    ]
+    return [f"residuals over declared noise, s: {'   '.join(each)}"] if each else []
+
+
+def stand(calibration: Calibration) -> list[str]:
+    """Estimated errors of the stand."""
+    errors, lines = calibration.stand, []
+    for name in ("azimuth", "inclination"):
+        zero = getattr(errors, f"{name}_zero_deg")
+        if zero is not None:
+            sd = getattr(errors, f"{name}_zero_uncertainty_deg")
+            lines.append(f"stand: {name} zero {estimate(zero, sd, '°')}")
+    if errors.tilt_deg is not None:
+        lean = estimate(errors.tilt_deg, errors.tilt_uncertainty_deg, "°")
+        azimuth = estimate(errors.tilt_azimuth_deg or 0.0, errors.tilt_azimuth_uncertainty_deg, "°")
+        lines.append(f"stand: its vertical leans by {lean} towards azimuth {azimuth}")
+    return lines
+
+
+def orders(scores: list[OrderScore]) -> str:
+    """Error at temperatures left out of the fit, by triad and order, and what chose the order."""
+    compared = not all(s.chosen for s in scores)
+    rows = []
+    for s in scores:
+        unit, chosen = s.unit.partition(" ")[0], "chosen" if compared and s.chosen else ""
+        errors = [quantity(value, unit) for value in (s.error_inside, s.error_ends, s.noise)]
+        each = [s.triad, str(s.order), number(s.inside), number(s.ends), *errors, chance(s.chance)]
+        rows.append([*each, chosen])
+    header = ["temperatures left out", "order", "χ² inside", "χ² ends", "error inside"]
+    header += ["at the ends", "noise", "by chance", ""]
+    return f"{table(rows, header, names=2)}\n{ORDERS}{COMPARED if compared else ''}"
+
+
+def curves(scores: list[CurveScore]) -> str:
+    """The table that took or left the own-axis terms."""
+    rows = []
+    for s in scores:
+        shown = number(s.left_out) if s.odds is None else f"{s.odds:+.1f}"
+        grouped = [] if s.group_scatter_deg is None else [quantity(s.group_scatter_deg, "°")]
+        names = " and ".join(s.triads) or "none"
+        rows.append([names, shown, *grouped, "chosen" if s.chosen else ""])
+    judged = any(s.odds is not None for s in scores)
+    measures = ["odds, powers of ten" if judged else "χ² left out"]
+    measures += ["scatter in groups, left out"] * (len(rows[0]) - 3)
+    return table(rows, ["own-axis nonlinearity of", *measures, ""])

@@ -1,0 +1,228 @@
+"""The report of a calibration: one HTML file that needs nothing else, to be read and signed.
+
+The pictures are drawn in `use.plots`, the wording of fixed text stands in `templates/`. Needs the
+extra `report` (jinja2, matplotlib).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import datetime
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mwdcal.calibration.prediction import (
+    accuracy_at,
+    angles,
+    middle_temperature,
+    without_temperature,
+)
+from mwdcal.calibration.readings import is_simulated, soaks
+from mwdcal.calibration.record import MAGNETIC, Calibration, Finding, TriadCalibration
+from mwdcal.errors import InputError
+from mwdcal.estimation.solvers import RANK_TOLERANCE
+from mwdcal.geometry.observables import TITLES
+from mwdcal.presentation.calibration import accuracy_in_words, how, known_inclinations
+from mwdcal.presentation.numbers import HELD, capital, exponent, factor_places
+from mwdcal.presentation.page import banner, environment
+from mwdcal.presentation.text import plural, raised
+from mwdcal.presentation.typed import findings_as_typed
+from mwdcal.presentation.verification import BETWEEN_SETS, freedom
+from mwdcal.use import plots
+from mwdcal.use.notation import Notation, convert
+from mwdcal.use.verification import SETTING_PRACTICES
+
+if TYPE_CHECKING:
+    from mwdcal.use.verification import Verdict, VerdictRow
+
+SHOWN_DEPARTURES = {"spread": "departure from the middle of the roll set", "error": "error"}
+"""What the stations of a roll test show of each kind of limit."""
+LONG_TABLE = 60
+"""A run of more stations has its station table at the end, as an annex."""
+LARGE_RATIO = 2.0
+"""Errors after the fit of more than this times what is expected are marked."""
+ACCURACY_INCLINATIONS = (5.0, 45.0, 90.0)
+"""Inclinations of the table of predicted accuracy, degrees."""
+
+
+def render(
+    calibration: Calibration, verdict: Verdict | None = None, *metadata: Mapping[str, object]
+) -> str:
+    """The report as HTML: the same input gives the same text, byte for byte.
+
+    `metadata` are those of the roll test behind the verdict.
+    """
+    pages = environment()
+    pages.filters["freedom"] = freedom
+    template = pages.get_template("report.html")
+    return template.render(
+        cal=calibration,
+        name=calibration.tool.get("serial") or calibration.profile.name,
+        verdict=verdict,
+        banner=outcome(calibration, verdict),
+        findings=_findings(calibration, verdict),
+        simulated=any(map(is_simulated, (calibration.tool, *metadata))),
+        inclinations=known_inclinations(calibration),
+        method="; ".join(how(calibration)),
+        magnetic=MAGNETIC,
+        limit=plots.reshoot_limit(calibration),
+        decimals=_decimals(calibration),
+        long_table=LONG_TABLE,
+        parameters=_parameters(calibration),
+        held=HELD,
+        accuracy=_accuracy(calibration),
+        soaked=_soaked(calibration),
+        kinds=_kinds(verdict),
+        settings=SETTING_PRACTICES,
+        outside=BETWEEN_SETS,
+        titles=TITLES,
+        large=LARGE_RATIO,
+        tolerance=RANK_TOLERANCE,
+        when=_when(calibration.time),
+    )
+
+
+def outcome(calibration: Calibration, verdict: Verdict | None) -> dict[str, str]:
+    """The banner: the verdict, if there is one, and what came of the fit."""
+    fit, level = _fit_outcome(calibration)
+    word = "OK" if level == "good" else "Attention"
+    if verdict is None:
+        expected = ", ".join(accuracy_in_words(calibration))
+        after = (
+            f"{fit}. Accuracy to expect (1σ, calibration alone, typical): {expected or 'not stated'}. "
+            "Verify by a roll test that was not used in the fit: mwdcal verify."
+        )
+        unverified = "Calibrated – not yet verified"
+        return banner("open" if level == "good" else level, "Not verified", unverified, after)
+    missed = [row.name for row in verdict.rows if not row.passed]
+    count = plural(len(verdict.rows), "limit")
+    if not verdict.passed:
+        headline = f"Verification failed – {len(missed)} of {count} not met"
+        return banner("bad", "Failed", headline, f"Not met: {', '.join(missed)}. {fit}.")
+    return banner(level, word, f"Verification passed – {count} met", fit)
+
+
+def _fit_outcome(calibration: Calibration) -> tuple[str, str]:
+    """What the fit came to, in one line, and its level."""
+    ids = [finding.id for finding in calibration.findings]
+    doubts = [i.removesuffix("-residuals") for i in ids if i.endswith("-residuals")]
+    parts = [f"{name} residuals exceed the declared noise" for name in doubts]
+    free = dict.fromkeys(entry.id.replace("-", " ") for entry in calibration.undetermined())
+    undetermined = f"{', '.join(free)} undetermined"
+    if free and doubts:
+        parts.append(undetermined)
+    if calibration.relative:
+        parts.append("magnetic field relative, not in nT")
+    again = sum(row.reshoot for row in calibration.station_rows)
+    if again:
+        parts.append(f"{plural(again, 'station')} to re-shoot")
+    accepted = capital(undetermined) if free else "Fit accepted"
+    headline, level = (
+        "Fit doubtful" if doubts else accepted,
+        "attention" if parts or free else "good",
+    )
+    parts += filter(None, [without_temperature(calibration)])
+    return f"{headline} – {'; '.join(parts)}" if parts else headline, level
+
+
+def _findings(calibration: Calibration, verdict: Verdict | None) -> list[Finding]:
+    """What to know and do, each thing once; stations to re-shoot first."""
+    findings = {f.text: f for f in calibration.findings}
+    ids = {f.id for f in calibration.findings}
+    for extra in verdict.findings if verdict else ():
+        if extra.id not in ids:
+            findings.setdefault(extra.text, extra)
+    return sorted(findings_as_typed(findings.values()), key=lambda f: f.id != "reshoot")
+
+
+def _when(time: str) -> str:
+    """A time of the record as people write it; of a tool in a fleet's table it is the day."""
+    if "T" not in time:
+        return time
+    try:
+        return datetime.fromisoformat(time).strftime("%Y-%m-%d %H:%M UTC")
+    except ValueError:
+        return time
+
+
+def _decimals(calibration: Calibration) -> dict[str, int]:
+    """Decimals of the station table: two significant digits of what is left after the fit."""
+    return {
+        row.observable: min(max(1 - exponent(row.after), 0), 9) if row.after > 0 else 3
+        for row in calibration.errors
+    }
+
+
+def _parameters(calibration: Calibration) -> dict[str, Any]:
+    """Parameters of each triad: as factors of the raw channels where there are any.
+
+    A row is name, axes, power of τ, value, 1σ and unit.
+    """
+    try:
+        notations = convert(calibration, "factors")
+    except InputError:
+        rows = {triad.name: _record_rows(triad) for triad in calibration.triads}
+        return {"notation": "record", "rows": rows}
+    rows = {triad.name: _factor_rows(triad, notations[triad.name]) for triad in calibration.triads}
+    return {"notation": "factors", "rows": rows}
+
+
+def _record_rows(triad: TriadCalibration) -> list[tuple[Any, ...]]:
+    """The parameters of the record: tool axes, nominal units."""
+    columns = (triad.parameter_names, triad.parameters, triad.standard_uncertainties)
+    rows = []
+    for full, value, sd in zip(*columns, strict=True):
+        base, _, power = full.partition("·")
+        name, _, axes = base.rpartition("-")
+        symbol = "1" if name in ("gain", "scale", "misalignment") else _unit(triad) or "1"
+        per = raised("/°C", int(power or 0))
+        rows.append((name, axes, int(power or 0), value, sd, symbol + per))
+    return rows
+
+
+def _factor_rows(triad: TriadCalibration, factors: Notation) -> list[tuple[Any, ...]]:
+    values, sd = factors.values, factors.uncertainty
+    return [
+        (name, axes, power, float(values[name][at]), float(sd[name][at]), symbol)
+        for name, at, axes, power, symbol in factor_places(values, _unit(triad), "1")
+    ]
+
+
+def _unit(triad: TriadCalibration) -> str:
+    """The unit of a triad's field, empty if it has none."""
+    return triad.unit if triad.unit in ("g", "nT") else ""
+
+
+def _kinds(verdict: Verdict | None) -> list[tuple[str, list[tuple[VerdictRow, int]]]]:
+    """Columns of the stations of a roll test: limits of each kind, with the decimals of their 1σ."""
+    kinds: dict[str, list[tuple[VerdictRow, int]]] = {}
+    for row in verdict.rows if verdict else ():
+        if row.sets:
+            places = min(max(1 - exponent(row.uncertainty or row.limit / 100), 0), 9)
+            kinds.setdefault(SHOWN_DEPARTURES[row.name.partition(" ")[0]], []).append((row, places))
+    return list(kinds.items())
+
+
+def _soaked(calibration: Calibration) -> bool:
+    """Whether stations of several soaks have errors to draw against temperature."""
+    warmth = [r.temperature_c for r in calibration.station_rows if r.temperature_c is not None]
+    return bool(calibration.errors and warmth and soaks(np.array(warmth)).any())
+
+
+def _accuracy(calibration: Calibration) -> dict[str, Any]:
+    """1σ in degrees by angle: of the calibration alone, and of one reading."""
+    middle = middle_temperature(calibration)
+    cases = [(inclination, middle) for inclination in ACCURACY_INCLINATIONS]
+    if calibration.thermal and calibration.temperature_c:
+        cases += [(45.0, t) for t in calibration.temperature_c]
+    names = angles(calibration)
+    rows = []
+    for inclination, temperature in cases:
+        at = [float(np.radians(inclination))]
+        both = [accuracy_at(calibration, at, noise, temperature) for noise in (False, True)]
+        sd = [float(np.degrees(each[name][0])) for name in names for each in both]
+        rows.append((inclination, temperature, sd))
+    pairs = [sd[2 * i] for *_, sd in rows for i in range(len(names))]
+    stated = [n for n, sd in zip(names * len(rows), pairs, strict=True) if not np.isnan(sd)]
+    return {"names": names, "rows": rows, "temperature": middle, "stated": stated}

@@ -1,0 +1,135 @@
+"""A diagnosis on the screen: the verdict, what moved, how likely each fault is, what to do next."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from mwdcal.calibration.readings import simulated
+from mwdcal.faults.diagnosis import Diagnosis, Rival
+from mwdcal.faults.likelihood import FALSE_ALARMS
+from mwdcal.faults.physics import NONE, SURROUNDINGS
+from mwdcal.presentation.numbers import estimate, measured
+from mwdcal.presentation.text import chance, number, one_line, plural, table
+
+MEANINGS = {
+    NONE: "as calibrated",
+    "impact": "a sensor, or a triad, that a blow has moved",
+    "dead-channel": "a channel that stands still",
+    "heat": "bias and scale drift with temperature beyond the calibration",
+    "magnetised": "interference of a string or collar, fixed in the tool",
+    "casing": "casing or steel nearby, or references that are off",
+    "turn-on": "biases of all channels after switching on",
+}
+"""Each fault in words."""
+ADVICE = {
+    NONE: "use the calibration as it is",
+    "impact": "do not use the tool before it is calibrated again; look for a loose sensor or board",
+    "dead-channel": "take the tool out of service: replace the sensor or its channel",
+    "heat": "calibrate again over the whole range of temperatures; hold a suspect channel at the highest one",
+    "magnetised": "verify without string and collar, or demagnetise them; mwdcal survey --msa corrects surveys",
+    "casing": "the calibration may be sound: check the references, and measure again away from casing and steel",
+    "turn-on": "switch off and on and read again; calibrate again if the biases come back",
+}
+"""What to do about each."""
+CHECK_FIRST = "check tool, units and references, then repeat the readings on a stand"
+IN_HOLE = "run mwdcal survey --msa on these surveys: it estimates a field fixed in the tool and corrects for it"
+NOT_YET = "do not judge the tool by these readings alone"
+"""What to do where no single fault explains readings, of surveys, and where a sound tool is not excluded."""
+LEAST_LIKELIHOOD = 0.0005
+"""Likelihoods below are shown as less than this."""
+
+
+def screen(result: Diagnosis, *metadata: Mapping[str, object]) -> str:
+    """The verdict first, then what moved, and the likelihoods; `metadata` of calibration and readings."""
+    head = [verdict(result), result.run, plural(result.stations, "station"), *simulated(*metadata)]
+    parts = ["   ".join(one_line(text) for text in head)]
+    if result.parameters:
+        parts.append(_moved(result))
+    parts.append(_likelihoods(result))
+    parts.append("\n".join(one_line(line) for line in _last(result)))
+    return "\n\n".join(parts)
+
+
+def verdict(result: Diagnosis) -> str:
+    """One sentence: still fine, or the fault, where, and by how much; and what else it may be."""
+    unexplained = any(finding.id == "unexplained" for finding in result.findings)
+    if result.fault == NONE:
+        if unexplained:
+            return "no single fault explains these readings, and none is named"
+        return "still fine: the readings are as the calibration says"
+    causes = [_cause(result), *map(_cause, result.rivals)]
+    if unexplained:
+        return f"no single fault explains these readings; closest: {' or '.join(causes)}"
+    if result.rivals:
+        return f"cannot tell {' from '.join(causes)}"
+    return causes[0]
+
+
+def _cause(cause: Diagnosis | Rival) -> str:
+    """A fault, where it shows, and its largest size."""
+    where = f" on {_place(cause.channel)}" if cause.channel else ""
+    if cause.size is None:
+        return f"{cause.fault}{where}"
+    size = _size(cause.size, cause.size_uncertainty, cause.unit)
+    if cause.fault == "dead-channel":
+        onset = cause.above_c if isinstance(cause, Diagnosis) else None
+        above = "" if onset is None else f" from {number(onset)} °C upwards"
+        return f"{cause.fault}{where}: reads a constant {size}{above}"
+    first = cause.parameters[0].channel if isinstance(cause, Diagnosis) else None
+    whose = f" of {first}" if first and not cause.channel else ""
+    return f"{cause.fault}{where}: {cause.parameter}{whose} moved by {size}"
+
+
+def _place(channel: str) -> str:
+    return f"the {channel}" if len(channel) > 2 else f"channel {channel}"
+
+
+def _size(size: float, uncertainty: float | None, unit: str | None) -> str:
+    return estimate(size, uncertainty, unit or "")
+
+
+def _moved(result: Diagnosis) -> str:
+    """Table of all sizes of the fault."""
+    rows = [
+        [row.parameter, row.channel or "", *measured(row.size, row.uncertainty), row.unit]
+        for row in result.parameters
+    ]
+    return table(rows, ["moved", "channel", "by", "1σ", "unit"])
+
+
+def _likelihoods(result: Diagnosis) -> str:
+    """Table of all faults, the most likely first."""
+    ordered = sorted(result.likelihoods.items(), key=lambda pair: -pair[1])
+    rows = [[f"{name}: {MEANINGS[name]}", _share(share)] for name, share in ordered]
+    return table(rows, ["", "likelihood"])
+
+
+def _share(share: float) -> str:
+    return (
+        f"{100 * share:.1f} %" if share >= LEAST_LIKELIHOOD else f"< {100 * LEAST_LIKELIHOOD:g} %"
+    )
+
+
+def _last(result: Diagnosis) -> list[str]:
+    """What it rests on, what these readings leave open, and what to do."""
+    lines = [
+        f"rule: a fault is named where a sound tool gives as much evidence for one with a probability of at most "
+        f"{100 * FALSE_ALARMS:g} %; here {chance(result.probability)}"
+    ]
+    if result.unseen:
+        lines.append(f"not shown by these readings, at its usual size: {', '.join(result.unseen)}")
+    for name in result.confounded_with:
+        texts = [row.reading for row in result.tell_apart if row.fault == name and row.reading]
+        tells = f"; {texts[0]} would tell" if texts else "; no further reading that was tried would"
+        lines.append(f"cannot be told from {name} by these readings{tells}")
+    return [*lines, f"next: {next_step(result)}"]
+
+
+def next_step(result: Diagnosis) -> str:
+    """What to do: a tool is taken out of use only where readings exclude that it is sound."""
+    if any(finding.id == "unexplained" for finding in result.findings):
+        return CHECK_FIRST
+    steps = [IN_HOLE if result.fault == "magnetised" and result.surveys else ADVICE[result.fault]]
+    if result.fault in SURROUNDINGS and result.rivals:
+        steps.append(NOT_YET)
+    return "; ".join(steps)

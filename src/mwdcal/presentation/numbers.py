@@ -1,0 +1,154 @@
+"""Numbers, units and names as screens and pages write them.
+
+An estimate and its uncertainty have two significant digits of the latter (`measured`, `estimate`), an uncertainty by
+itself has two (`uncertainty`), and what adds less than a thousandth to it is 0 (`contribution`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from mwdcal.files.contract import CHANNELS
+from mwdcal.geometry.vectors import Array
+from mwdcal.presentation.text import one_line, raised, superscript
+
+HELD = "held"
+"""In place of the uncertainty of a parameter that a model of 9 or 6 keeps at zero."""
+LEAST_CONTRIBUTION = 1e-3
+"""Share of a combined uncertainty below which a contribution is 0."""
+UNDETERMINED = "undetermined"
+"""In place of an uncertainty that no reading determines."""
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """A number to some significant digits, without E notation; a dash where there is none."""
+    if value is None or not np.isfinite(value):
+        return "–"
+    if value == 0:
+        return "0"
+    mantissa, _, digits_of_power = f"{value:.{digits - 1}e}".partition("e")
+    power = int(digits_of_power)
+    if not -5 < power < 7:
+        return f"{mantissa}×10{superscript(power)}".replace("-", "−")
+    return fixed(value, max(digits - 1 - power, 0))
+
+
+def fixed(value: float | None, decimals: int) -> str:
+    """A number to some decimals, with a true minus sign; a dash where there is none."""
+    if value is None or not np.isfinite(value):
+        return "–"
+    return f"{round(value, decimals) + 0.0:.{max(decimals, 0)}f}".replace("-", "−")
+
+
+def signed(value: float | None, decimals: int) -> str:
+    """As `fixed`, with a plus sign too."""
+    text = fixed(value, decimals)
+    return text if text[0] in "−–" or not float(text) else f"+{text}"
+
+
+def measured(value: float, uncertainty: float | None) -> tuple[str, str]:
+    """Value and standard uncertainty as text, both to two significant digits of the latter."""
+    if uncertainty is None or not np.isfinite(uncertainty):
+        return number(value, 6), UNDETERMINED
+    if uncertainty == 0:
+        return number(value, 9), "0"
+    decimals = 1 - exponent(uncertainty)
+    power = exponent(max(abs(value), uncertainty))
+    if power == 0 or (decimals <= 7 and power < 7):
+        return fixed(value, decimals), fixed(uncertainty, decimals)
+    scaled = (fixed(v * 10.0**-power, decimals + power) for v in (value, uncertainty))
+    first, second = (f"{text}×10{superscript(power)}" for text in scaled)
+    return first, second
+
+
+def estimate(value: float, uncertainty: float | None, symbol: str = "") -> str:
+    """An estimate with its standard uncertainty and unit.
+
+    >>> [estimate(-4.5e-21, 2e-05, "g"), estimate(0.05216, 0.0034, "°"), estimate(3.2, None, "nT")]
+    ['0.000000 ± 0.000020 g', '0.0522 ± 0.0034°', '3.20000 nT, undetermined']
+    """
+    shown, sd = measured(value, uncertainty)
+    if sd == UNDETERMINED:
+        return f"{shown}{unit(symbol)}, {sd}"
+    return f"{shown} ± {sd}{unit(symbol)}"
+
+
+def contribution(value: float | None, combined: float | None) -> str:
+    """What one source adds to a combined uncertainty, to two digits; 0 below a thousandth of it.
+
+    >>> [contribution(v, 0.013) for v in (0.00402, 1.4e-05, 1.2e-05, 3.5e-17, None)]
+    ['0.0040', '0.000014', '0', '0', 'undetermined']
+    """
+    if value is None or combined is None:
+        return uncertainty(value)
+    if not value or abs(value) < LEAST_CONTRIBUTION * combined:
+        return "0"
+    plain_numbers = number(combined, 2) == fixed(combined, 1 - exponent(combined))
+    return fixed(value, 1 - exponent(value)) if plain_numbers else number(value, 2)
+
+
+def root_sum_of_squares(parts: Iterable[float | None]) -> float | None:
+    """The combined uncertainty of independent contributions; None where one is undetermined."""
+    values = [*parts]
+    known = [value for value in values if value is not None]
+    return float(np.linalg.norm(known)) if len(known) == len(values) else None
+
+
+def exponent(value: float) -> int:
+    """The power of ten of a number rounded to two digits."""
+    return int(f"{value:.1e}".split("e")[1])
+
+
+def factor_places(
+    values: Mapping[str, Array], strength: str, one: str = ""
+) -> Iterator[tuple[str, tuple[int, int], str, int, str]]:
+    """Name, index, axes, power of τ and unit of each factor; the diagonal of m is not one.
+
+    `strength` is the unit of the field, empty if it has none, and `one` stands for no unit.
+    """
+    units = {"SF": f"raw/{strength}" if strength else "raw", "B": strength or one, "m": one}
+    for name, value in values.items():
+        for i, j in np.ndindex(value.shape):
+            if name != "m":
+                yield name, (i, j), "xyz"[i], j, units[name] + raised("/°C", j)
+            elif i != j:
+                yield name, (i, j), "xyz"[i] + "xyz"[j], 0, units[name]
+
+
+def uncertainty(value: float | None) -> str:
+    """A standard uncertainty to two digits, or that it is undetermined."""
+    return UNDETERMINED if value is None or np.isnan(value) else number(value, 2)
+
+
+def degrees_of_freedom(value: float) -> str:
+    """Degrees of freedom in words; they need not be whole.
+
+    >>> [degrees_of_freedom(value) for value in (0.0, 1.0, 3.2, 132.4)]
+    ['0 degrees of freedom', '1 degree of freedom', '3.2 degrees of freedom', '132 degrees of freedom']
+    """
+    shown = number(value, 2 if value < 10 else 3).removesuffix(".0")
+    return f"{shown} degree{'' if shown == '1' else 's'} of freedom"
+
+
+def channels_of(names: Collection[str]) -> dict[str, list[str]]:
+    """The channels among some names, by triad."""
+    triads = {kind: [n for n in channels if n in names] for kind, channels in CHANNELS.items()}
+    return {kind: channels for kind, channels in triads.items() if channels}
+
+
+def capital(text: str) -> str:
+    """Text as the start of a sentence."""
+    return text[:1].upper() + text[1:]
+
+
+def written(**files: Path | str | None) -> str:
+    """The files that were written, each with what it is."""
+    return one_line("wrote " + "   ".join(f"{p} ({what})" for what, p in files.items() if p))
+
+
+def unit(symbol: str) -> str:
+    """A unit as it follows a number: the degree sign without a space."""
+    return symbol if symbol in ("", "°") else f" {symbol}"

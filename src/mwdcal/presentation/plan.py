@@ -1,0 +1,319 @@
+"""Plans and what they will give, on the screen and for machines."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from mwdcal.calibration.prediction import accuracy_at, typical_accuracy
+from mwdcal.calibration.readings import SIMULATED
+from mwdcal.calibration.record import Calibration, Finding, TriadCalibration, Undetermined
+from mwdcal.calibration.residuals import shown_in
+from mwdcal.errors import InputError
+from mwdcal.files.formats.table import Table
+from mwdcal.planning.expected import left_undetermined
+from mwdcal.planning.planned import WORKING_INCLINATIONS, Planned, station_names
+from mwdcal.presentation.envelope import enveloped
+from mwdcal.presentation.numbers import written
+from mwdcal.presentation.stations import MOST_LINES
+from mwdcal.presentation.text import one_line, quantity, table
+
+PLACE = "1σ, calibration alone, at 45° inclination"
+"""What the accuracy of a plan is of."""
+STATION_TITLES = {
+    "station": "station", "temperature_c": "T, °C", "ref_inclination_deg": "inclination, °",
+    "ref_azimuth_deg": "azimuth, °", "ref_toolface_deg": "toolface, °",
+}  # fmt: skip
+"""Columns of the table of stations, and how they are headed."""
+
+
+class PlannedTriad(msgspec.Struct, frozen=True, kw_only=True):
+    """What a plan will give of a triad: uncertainties (1σ) by parameter of the calibration file."""
+
+    standard_uncertainties: dict[str, float | None]
+    order: int
+    rank: int
+    size: int
+    degrees_of_freedom: float
+    undetermined: list[Undetermined]
+
+
+class DetectableError(msgspec.Struct, frozen=True, kw_only=True):
+    """The error of one station from which `calibrate` reports it in 80 % of runs, at the worst station.
+
+    `noticed`: the station or the residuals are reported; `named`: the station is, None where it never is.
+    """
+
+    observable: str
+    unit: str
+    noticed: float
+    noticed_station: str
+    named: float | None
+    named_station: str
+
+
+class PlanSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """What `plan` prints of one plan.
+
+    `accuracy_deg` at 45° inclination, as `calibrate` states it; `accuracy_by_inclination_deg` by angle at
+    `inclinations_deg`. `efficiency_bound`: at least this share of the best D-value per parameter. Without
+    `magnetometer` the profile says nothing of one. No plan of fewer than `fewest_stations` gives the wanted accuracy;
+    None where none is wanted.
+    """
+
+    plan: str
+    stations: int
+    session_hours: float
+    accelerometer: PlannedTriad
+    magnetometer: PlannedTriad | None = None
+    accuracy_deg: dict[str, float | None]
+    inclinations_deg: list[float]
+    accuracy_by_inclination_deg: dict[str, list[float | None]]
+    rank: int
+    size: int
+    undetermined: list[Undetermined]
+    efficiency_bound: float
+    fewest_stations: int | None
+    detectable_errors: list[DetectableError]
+    findings: list[Finding]
+
+
+class PlanDocument(PlanSummary, frozen=True, kw_only=True):
+    """What `plan` prints: the first plan, the others that it was compared with, and the files written."""
+
+    others: list[PlanSummary]
+    output: str
+    html: str
+
+
+def wanted_accuracy(words: Sequence[str]) -> dict[str, float]:
+    """Accuracies such as azimuth=0.1 as numbers, degrees, by angle."""
+    wanted = {}
+    for word in words:
+        name, _, value = word.partition("=")
+        try:
+            wanted[name] = float(value)
+        except ValueError:
+            wanted[name] = np.nan
+        if not 0 < wanted[name] < 180:
+            raise InputError(f"`accuracy` must be such as azimuth=0.1, in degrees; got {word!r}.")
+    return wanted
+
+
+def reach(words: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """What a stand reaches, such as inclination=0:120, as the least and the largest setting by angle, degrees."""
+    ends = {}
+    for word in words:
+        name, _, limits = word.partition("=")
+        low, _, high = limits.partition(":")
+        try:
+            ends[name] = float(low), float(high)
+        except ValueError:
+            raise InputError(
+                f"`reach` must be such as inclination=0:120, in degrees; got {word!r}."
+            ) from None
+    return ends
+
+
+def facts(each: Planned) -> PlanSummary:
+    """What is said of a plan."""
+    return PlanSummary(**_fields(each))
+
+
+def _fields(each: Planned) -> dict[str, Any]:
+    """The fields of a `PlanSummary`."""
+    calibration = each.calibration
+    by_triad = {
+        triad.name: _triad(triad, float(freedom))
+        for triad, freedom in zip(calibration.triads, each.freedom, strict=True)
+    }
+    free = {entry.id: entry for entry in left_undetermined(calibration)}
+    return {
+        "plan": each.plan.source,
+        "stations": each.plan.count,
+        "session_hours": each.seconds / 3600,
+        **by_triad,
+        "accuracy_deg": typical_accuracy(calibration),
+        "inclinations_deg": np.degrees(WORKING_INCLINATIONS).round(9).tolist(),
+        "accuracy_by_inclination_deg": _by_inclination(calibration),
+        "rank": sum(triad.rank for triad in calibration.triads),
+        "size": sum(triad.size for triad in calibration.triads),
+        "undetermined": list(free.values()),
+        "efficiency_bound": each.efficiency,
+        "fewest_stations": each.bound,
+        "detectable_errors": _detectable(each),
+        "findings": each.findings,
+    }
+
+
+def _detectable(each: Planned) -> list[DetectableError]:
+    """The errors of one station that `calibrate` will report, at the plan's worst stations."""
+    names, rows = station_names(each.plan), []
+    for observable, detection in each.detections.items():
+        factor, unit = shown_in(observable)
+        sizes = [sd[0, each.measured :] for sd in (detection.noticed, detection.named)]
+        if np.isnan(sizes[0]).all():
+            continue
+        worst = [int(np.nanargmax(sd)) for sd in sizes]
+        noticed, named = (float(sd[k]) * factor for sd, k in zip(sizes, worst, strict=True))
+        rows.append(
+            DetectableError(
+                observable=observable, unit=unit, noticed=noticed, noticed_station=names[worst[0]],
+                named=named if np.isfinite(named) else None, named_station=names[worst[1]],
+            )
+        )  # fmt: skip
+    return rows
+
+
+def _triad(triad: TriadCalibration, freedom: float) -> PlannedTriad:
+    names = dict(zip(triad.parameter_names, triad.standard_uncertainties, strict=True))
+    return PlannedTriad(
+        standard_uncertainties=names,
+        order=triad.order,
+        rank=triad.rank,
+        size=triad.size,
+        degrees_of_freedom=freedom,
+        undetermined=triad.undetermined,
+    )
+
+
+def _by_inclination(calibration: Calibration) -> dict[str, list[float | None]]:
+    """1σ by angle at the working inclinations, degrees; None: undetermined."""
+    each = accuracy_at(calibration, WORKING_INCLINATIONS.tolist())
+    return {
+        name: [None if np.isnan(sd) else float(np.degrees(sd)) for sd in values]
+        for name, values in each.items()
+    }
+
+
+def findings(plans: Sequence[Planned]) -> list[Finding]:
+    """That the tool has no magnetometer, what the plans leave undetermined, and what else is to be said of them."""
+    profile = plans[0].calibration.profile
+    text = f"the profile '{profile.name}' has no [magnetometer]: planned is a tool without one."
+    without = [] if profile.has_magnetometer else [Finding(id="no-magnetometer", text=text)]
+    entries: list[tuple[Planned, Finding | Undetermined]] = []
+    for each in plans:
+        entries += [(each, entry) for entry in left_undetermined(each.calibration)]
+        entries += [(each, entry) for entry in each.findings]
+    said = [
+        Finding(id=entry.id, text=f"{each.plan.source}: {entry.text}") for each, entry in entries
+    ]
+    return without + said
+
+
+def document(
+    plans: Sequence[Planned], digests: Mapping[str, str], output: Path | None, html: Path | None
+) -> dict[str, Any]:
+    """The result for machines."""
+    first, *others = map(_fields, plans)
+    content = PlanDocument(
+        **first,
+        others=[PlanSummary(**other) for other in others],
+        output=str(output or ""),
+        html=str(html or ""),
+    )
+    return enveloped("plan", content, {"simulated": True}, **digests)
+
+
+def screen(
+    plans: Sequence[Planned], digests: Mapping[str, str], output: Path | None, html: Path | None
+) -> str:
+    """The result for people."""
+    summaries = [facts(each) for each in plans]
+    head = f"{plans[0].calibration.profile.name}   expected of a nominal tool, nothing measured   {SIMULATED}"
+    blocks = [
+        one_line(head),
+        table(comparison_rows(summaries), ["", *(one_line(each.plan) for each in summaries)]),
+    ]
+    if len(plans) == 1:
+        blocks += [accuracy(summaries[0]), detectable(summaries[0]), stations(plans[0])]
+    if output or html:
+        blocks.append(written(**{"plan": output, "run sheet": html}))
+    return "\n\n".join(blocks)
+
+
+def comparison_rows(facts: Sequence[PlanSummary]) -> list[list[str]]:
+    """What the plans give, a plan in each column."""
+    lines = [
+        ["stations", *(str(each.stations) for each in facts)],
+        ["at the stand", *(f"{each.session_hours:.1f} h" for each in facts)],
+        ["temperature order", *(_orders(each) for each in facts)],
+        ["determined", *(f"{each.rank} of {each.size}" for each in facts)],
+        ["degrees of freedom", *(_freedom(each) for each in facts)],
+        ["D-efficiency, at least", *(f"{100 * each.efficiency_bound:.0f} %" for each in facts)],
+    ]
+    for name in facts[0].accuracy_deg:
+        cells = [quantity(each.accuracy_deg[name], "°") for each in facts]
+        lines.append([f"{name}, 1σ at 45° inclination", *cells])
+    return lines
+
+
+def accuracy_rows(each: PlanSummary) -> list[list[str]]:
+    """1σ of the angles, a working inclination in each row."""
+    columns = each.accuracy_by_inclination_deg
+    return [
+        [f"{inclination:g}°", *(quantity(columns[name][place], "°") for name in columns)]
+        for place, inclination in enumerate(each.inclinations_deg)
+    ]
+
+
+def accuracy(each: PlanSummary) -> str:
+    """1σ of the angles at the working inclinations."""
+    return table(accuracy_rows(each), ["1σ at inclination", *each.accuracy_by_inclination_deg])
+
+
+DETECTABLE_TITLES = ["error of one station (80 % of runs)", "noticed from", "station named from"]
+"""What heads the table of errors that `calibrate` will report."""
+
+
+def detectable_rows(each: PlanSummary) -> list[list[str]]:
+    """The errors of one station from which `calibrate` reports it, an observable in each row."""
+    return [
+        [
+            row.observable,
+            quantity(float(f"{row.noticed:.2g}"), row.unit),
+            "never" if row.named is None else quantity(float(f"{row.named:.2g}"), row.unit),
+        ]
+        for row in each.detectable_errors
+    ]
+
+
+def detectable(each: PlanSummary) -> str:
+    """The errors of one station from which `calibrate` reports it in 80 % of runs."""
+    return table(detectable_rows(each), DETECTABLE_TITLES)
+
+
+def _freedom(each: PlanSummary) -> str:
+    """Degrees of freedom of both triads."""
+    triads = [triad for triad in (each.accelerometer, each.magnetometer) if triad]
+    return " and ".join(dict.fromkeys(f"{triad.degrees_of_freedom:.0f}" for triad in triads))
+
+
+def _orders(each: PlanSummary) -> str:
+    orders = dict.fromkeys(t.order for t in (each.accelerometer, each.magnetometer) if t)
+    return " and ".join(map(str, orders))
+
+
+def stations(planned: Planned) -> str:
+    """The stations of a plan, in order, up to `MOST_LINES`."""
+    titles, rows = station_rows(planned.plan)
+    more = len(rows) - MOST_LINES
+    ends = f"\n… and {more} more" if more > 0 else ""
+    return table([[*map(one_line, row)] for row in rows[:MOST_LINES]], titles) + ends
+
+
+def station_rows(plan: Table) -> tuple[list[str], list[list[str]]]:
+    """Titles and cells of the stations of a plan, in order."""
+    names = [name for name in STATION_TITLES if name in plan.columns]
+    columns = [[_cell(value) for value in plan.columns[name]] for name in names]
+    return [STATION_TITLES[name] for name in names], [
+        list(row) for row in zip(*columns, strict=True)
+    ]
+
+
+def _cell(value: str | float) -> str:
+    return value if isinstance(value, str) else f"{value:g}"

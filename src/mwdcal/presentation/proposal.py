@@ -1,0 +1,106 @@
+"""A proposed tool profile on the screen and for machines."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from msgspec.structs import asdict
+
+from mwdcal.calibration.readings import TRIADS, simulated
+from mwdcal.identification.proposal import Proposal, in_order
+from mwdcal.presentation.envelope import enveloped
+from mwdcal.presentation.numbers import written
+from mwdcal.presentation.text import one_line, plural, table
+from mwdcal.sensor.profile import Profile, TableFormat, TriadProfile
+
+SCALE_UNITS = {"accelerometer": "g", "magnetometer": "nT"}
+
+
+class ProposedTriad(TriadProfile, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A triad of the profile, and what its axes leave of the readings' variation, where there are any."""
+
+    unexplained: float | None = None
+    next_best: float | None = None
+
+
+class ProposalSummary(Profile, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What `profile` prints: the profile, how sure its axes are, and its file."""
+
+    run: str
+    stations: int
+    accelerometer: ProposedTriad
+    magnetometer: ProposedTriad
+    unit_by_values: list[str]
+    profile: str
+
+
+def summary(proposal: Proposal, run: Path, output: Path | None) -> dict[str, Any]:
+    """The result for machines."""
+    content = ProposalSummary(
+        **{**asdict(proposal.profile), **{kind: _triad(proposal, kind) for kind in TRIADS}},
+        run=run.name,
+        stations=proposal.stations,
+        unit_by_values=sorted(proposal.by_value),
+        profile=str(output or ""),
+    )
+    return enveloped("profile", content, proposal.metadata, run=proposal.run_sha256)
+
+
+def _triad(proposal: Proposal, kind: str) -> ProposedTriad:
+    """A triad as the profile has it, and how sure its axes are."""
+    triad, result = asdict(getattr(proposal.profile, kind)), proposal.wirings.get(kind)
+    if result is None:
+        return ProposedTriad(**triad)
+    return ProposedTriad(**triad, unexplained=result.unexplained, next_best=result.next_best)
+
+
+def screen(proposal: Proposal, run: Path, output: Path | None) -> str:
+    """The result for people."""
+    profile = proposal.profile
+    head = [run.name, profile.name, plural(proposal.stations, "station")]
+    blocks = ["   ".join(map(one_line, [*head, *simulated(proposal.metadata)]))]
+    if not isinstance(profile.table, msgspec.UnsetType):
+        blocks[0] += "\n" + _layout(profile.table, run.suffix.lower() == ".xlsx")
+    if not isinstance(profile.columns, msgspec.UnsetType):
+        guesses = dict.fromkeys(proposal.by_value, ", by its values")
+        rows = [
+            [c, each.name, (each.unit or "–") + guesses.get(c, "")]
+            for c, each in in_order(profile.columns)
+        ]
+        blocks.append(table(rows, ["column of a run file", "column here", "unit here"]))
+    rows = [
+        [
+            kind,
+            " ".join(result.axes),
+            _scale(getattr(profile, kind).scale, SCALE_UNITS[kind]),
+            f"{result.unexplained:.1%}",
+            f"{result.next_best:.0%}",
+        ]
+        for kind, result in proposal.wirings.items()
+    ]
+    blocks.append(
+        table(rows, ["triad", "axes", "nominal scale", "unexplained", "by the next best"])
+    )
+    if output:
+        command = (
+            f"mwdcal calibrate {one_line(str(run))} --tool {one_line(str(output))} -o tool.json"
+        )
+        blocks.append(f"{written(profile=output)}   next: {command}")
+    return "\n\n".join(blocks)
+
+
+def _scale(scale: float | None, unit: str) -> str:
+    return f"{scale:g} raw units per {unit}" if scale else "left open: no field strength"
+
+
+def _layout(form: TableFormat, workbook: bool) -> str:
+    """How a table is written."""
+    if workbook:
+        return f"names in row {form.header_line}, readings from row {form.first_line}"
+    sign = "tab" if form.delimiter == "\t" else f"'{form.delimiter}'"
+    return (
+        f"{form.encoding}, delimiter {sign}, decimal sign '{form.decimal}', names in line "
+        f"{form.header_line}, readings from line {form.first_line}"
+    )

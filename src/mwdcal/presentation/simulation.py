@@ -1,0 +1,170 @@
+"""A simulated run and its truth, on the screen and for machines."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from mwdcal.calibration.readings import SIMULATED
+from mwdcal.planning.procedure import PERCENTILES, Repetition, Share
+from mwdcal.planning.session import Session
+from mwdcal.planning.simulate import Effects
+from mwdcal.presentation.envelope import enveloped
+from mwdcal.presentation.numbers import fixed, number, written
+from mwdcal.presentation.text import one_line, plural, quantity, table
+
+SIZES = {
+    "inclination_zero_deg": ("inclination zero", "°"),
+    "azimuth_zero_deg": ("azimuth zero", "°"),
+    "toolface_zero_deg": ("toolface zero", "°"),
+    "tilt_deg": ("tilt", "°"),
+    "tilt_azimuth_deg": ("tilt towards azimuth", "°"),
+}
+"""Errors of the stand in words, and their unit."""
+
+
+class TrueAttitude(msgspec.Struct, frozen=True, kw_only=True):
+    """What is true of a station: angles that the stand has turned to, and the temperature of the sensors."""
+
+    station: str
+    inclination_deg: float
+    azimuth_deg: float
+    toolface_deg: float
+    temperature_c: float
+
+
+class SimulationSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """What `simulate` writes of the truth behind a run, and prints.
+
+    Parameters by triad in raw units, as `convert` prints them in this `notation`: factors (SF, B, m), or affine (M, b)
+    for a calibration that is linear in its parameters above order 0. `stand`: errors common to the session, such
+    that reading = value + zero. `turn_on`: bias of the channels along the tool axes, g or nT. `fault`: departures of
+    a tool at fault, by kind. Of many repetitions
+    `repetition` has what they show, and what is true of a single run is empty.
+    """
+
+    seed: int
+    plan: str
+    tool: str
+    order: int
+    reference_temperature_c: float
+    notation: str = "factors"
+    accelerometer: dict[str, Any] | None = None
+    magnetometer: dict[str, Any] | None = None
+    earth: dict[str, float] = {}
+    stand: dict[str, float] = {}
+    turn_on: dict[str, list[float]] = {}
+    fault: dict[str, list[float]] = {}
+    effects: Effects
+    stations: list[TrueAttitude] = []
+    repetition: Repetition | None = None
+    output: str
+    truth: str
+    plot: str
+
+
+def document(
+    session: Session,
+    facts: Mapping[str, Any],
+    digests: Mapping[str, str],
+    serial: str | None,
+    **files: Path | None,
+) -> dict[str, Any]:
+    """The result for machines: of a single run its truth file too."""
+    named = {name: str(files.get(name) or "") for name in ("output", "truth", "plot")}
+    fields = {"plan": session.plan.source, "tool": session.profile.name, "effects": session.effects}
+    content = msgspec.convert(msgspec.to_builtins({**fields, **facts, **named}), SimulationSummary)
+    labels = {"simulated": True, "serial": serial}
+    return enveloped("simulate", content, labels, **digests)
+
+
+def screen(document: Mapping[str, Any]) -> str:
+    """A single run for people."""
+    head = [
+        document["tool"], document["serial"], document["plan"], plural(len(document["stations"]), "station"),
+        f"order {document['order']}", f"seed {document['seed']}", SIMULATED,
+    ]  # fmt: skip
+    rows = [
+        [words, f"{number(document['stand'][name])}{unit}"]
+        for name, (words, unit) in SIZES.items()
+        if name in document["stand"]
+    ]
+    errors = (
+        table(rows, ["error of the stand", "true"])
+        if rows
+        else "no error common to the stations of the stand"
+    )
+    blocks = [one_line("   ".join(head)), errors]
+    if document["output"]:
+        follow = f"next: mwdcal calibrate {document['output']} --tool TOOL.toml -o CAL.json"
+        files = written(run=document["output"], truth=document["truth"])
+        blocks.append(f"{files}   {one_line(follow)}")
+    return "\n\n".join(blocks)
+
+
+def repeated(document: Mapping[str, Any]) -> str:
+    """Many repetitions for people: the verdicts first."""
+    result = msgspec.convert(document["repetition"], Repetition)
+    head = [
+        document["tool"], document["plan"], plural(result.tools, "tool"), f"order {document['order']}",
+        f"seed {document['seed']}", SIMULATED,
+    ]  # fmt: skip
+    words = {
+        "calibrated": result.calibrated, "passed": result.passed, "good": result.good,
+        "passed, not good (consumer's risk)": result.wrong_pass,
+        "good, not passed (producer's risk)": result.wrong_fail,
+    }  # fmt: skip
+    verdicts = table(
+        [[name, str(share.count), *_percent(share)] for name, share in words.items()],
+        ["of all tools", "tools", "share", "95 % interval"],
+    )
+    named = {"tools": document["output"], "picture": document["plot"]}
+    files = [written(**named)] * any(named.values())
+    refused = [f"refused: {', '.join(f'{k} {v}' for k, v in result.refused.items())}"] * bool(
+        result.refused
+    )
+    blocks = [
+        one_line("   ".join(head)),
+        verdicts,
+        *refused,
+        _errors(result),
+        _limits(result),
+        *files,
+    ]
+    return "\n\n".join(blocks)
+
+
+def _percent(share: Share) -> list[str]:
+    """A share and its interval, in percent."""
+    low, high = (fixed(100 * value, 2) for value in (share.low, share.high))
+    return [f"{number(100 * share.share, 3)} %", f"{low}…{high} %"]
+
+
+def _errors(result: Repetition) -> str:
+    """Percentiles over the tools of the errors of each angle."""
+    titles = {"rms": "rms error", "max": "largest error", "stated": "stated 1σ, 45°"}
+    rows = [
+        [f"{angle}, {title}", *(f"{number(value)}°" for value in each[word].values())]
+        for angle, each in result.errors_deg.items()
+        for word, title in titles.items()
+    ]
+    return table(rows, ["over the working range", *_titles()])
+
+
+def _limits(result: Repetition) -> str:
+    """Percentiles of the figures of the roll test, measured and true."""
+    rows = [
+        [f"{row.name}, {word}", *(quantity(v, row.unit) for v in values.values()), quantity(row.limit, row.unit), wrong]
+        for row in result.limits
+        for word, values, wrong in (
+            ("roll test", row.value, _percent(row.wrong)[0]), ("true", row.true, ""),
+        )
+    ]  # fmt: skip
+    return table(rows, ["roll test", *_titles(), "limit", "wrong"])
+
+
+def _titles() -> list[str]:
+    return [f"{percent} %" for percent in PERCENTILES]

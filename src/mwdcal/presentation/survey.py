@@ -1,0 +1,383 @@
+"""Multi-station analysis on the interference_screen: interference, what the surveys determine of it, and each survey.
+
+The surveys of a well, on the screen and for machines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from mwdcal.calibration.canonical import SignatureCheck
+from mwdcal.calibration.diagnosis.findings import unused_columns
+from mwdcal.calibration.readings import simulated
+from mwdcal.calibration.record import Finding, stated
+from mwdcal.presentation.envelope import enveloped, with_signature
+from mwdcal.presentation.numbers import fixed, measured, number, signed, written
+from mwdcal.presentation.signature import in_short
+from mwdcal.presentation.text import chance, one_line, plural, table
+from mwdcal.survey.interference import (
+    ErrorTerms,
+    Interference,
+    InterferenceSize,
+    MultiStationAnalysis,
+    error_terms,
+)
+from mwdcal.survey.norths import North
+from mwdcal.survey.surveying import SurveyedWell, WellInputs
+from mwdcal.survey.well import Well
+
+MOST_CORRECTED = 30
+"""Surveys of a table on interference_screen."""
+DIRECTION_TITLES = ["interference", "estimate", "1σ", "unit", "assumed 1σ", "from the surveys"]
+"""Titles of the table of directions."""
+CORRECTED_TITLES = [
+    "station", "inclination, °", "azimuth before, °", "after, °", "1σ, °", "change, °",
+    "|b| off before, nT", "after, nT", "dip off before, °", "after, °", "weight", "",
+]  # fmt: skip
+"""Titles of the table of surveys."""
+
+
+def direction_rows(summary: MultiStationAnalysis) -> list[list[str]]:
+    """A row for each direction of interference."""
+    rows = []
+    for each in summary.directions:
+        factor, unit = (1.0, each.unit) if each.unit else (100.0, "%")
+        value, sd = measured(factor * each.value, factor * each.standard_uncertainty)
+        assumed = number(factor * each.assumed)
+        rows.append([each.direction, value, sd, unit, assumed, "yes" if each.determined else "NO"])
+    return rows
+
+
+def corrected_rows(summary: MultiStationAnalysis, most: int) -> list[list[str]]:
+    """A row for each survey, before and after."""
+    return [
+        [
+            row.station,
+            fixed(row.inclination_deg, 2),
+            fixed(row.azimuth_before_deg, 2),
+            fixed(row.azimuth_after_deg, 2),
+            fixed(row.sd_azimuth_after_deg, 2),
+            fixed(row.azimuth_change_deg, 2),
+            fixed(row.field_before_nt - row.ref_field_nt, 0),
+            fixed(row.field_after_nt - row.ref_field_nt, 0),
+            fixed(row.dip_before_deg - row.ref_dip_deg, 2),
+            fixed(row.dip_after_deg - row.ref_dip_deg, 2),
+            fixed(row.weight, 2),
+            "doubtful" if row.doubtful else "",
+        ]
+        for row in summary.station_rows[:most]
+    ]
+
+
+def verdict(summary: MultiStationAnalysis) -> str:
+    """Whether the correction may be used, in a sentence."""
+    left = (
+        f"interference and drift that are left make the azimuth uncertain by {summary.azimuth_sd_deg:.2g}° (1σ, worst "
+        f"survey; {summary.largest_azimuth_sd_deg:g}° allowed)"
+    )
+    return f"{'separable' if summary.separable else 'NOT separable from azimuth'}: {left}"
+
+
+def misfit_in_words(summary: MultiStationAnalysis) -> str:
+    """χ² before and after, in words."""
+    return (
+        f"χ² of |g|, |b| and dip {number(summary.chi_square_before)} before, {number(summary.chi_square_after)} after, "
+        f"{summary.degrees_of_freedom} expected (probability after {chance(summary.chance_after)})"
+    )
+
+
+def interference_screen(result: Interference, *metadata: Mapping[str, object]) -> str:
+    """The analysis for people; `metadata` of calibration and readings."""
+    summary = result.summary
+    count = len(summary.station_rows)
+    heading = [
+        "multi-station analysis", result.readings.source, plural(count, "survey"), *simulated(*metadata)
+    ]  # fmt: skip
+    lines = ["   ".join(heading), verdict(summary)]
+    lines += [summary.missing] if summary.missing else []
+    lines += [misfit_in_words(summary), result.terms.sentence]
+    more = count - MOST_CORRECTED
+    surveys = table(corrected_rows(summary, MOST_CORRECTED), CORRECTED_TITLES)
+    parts = [
+        *map(one_line, lines),
+        "",
+        table(direction_rows(summary), DIRECTION_TITLES),
+        "",
+        surveys,
+    ]
+    return "\n".join([*parts, *([f"… and {more} more"] if more > 0 else [])])
+
+
+MOST_SURVEYS = 30
+"""Surveys of a table on screen."""
+OUTCOMES = {"true": "accepted", "false": "REJECTED", "": "not judged"}
+"""What the column `accepted` says, in words."""
+
+
+class EndOfPath(msgspec.Struct, frozen=True, kw_only=True):
+    """The last station on the well path: metres from where the path starts, with standard uncertainties."""
+
+    station: str
+    md_m: float
+    north_m: float
+    east_m: float
+    tvd_m: float
+    sd_north_m: float | None
+    sd_east_m: float | None
+    sd_tvd_m: float | None
+    covariance_m2: list[list[float | None]]
+
+
+class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
+    """What `survey` prints: stations counted by outcome, what they were judged by, where the path ends.
+
+    `blind`: accepted ones whose azimuth interference could turn and still pass.
+    `reference_sources`: where gravity, field, dip, declination and convergence come from, by name.
+    `error_terms` are in the standard uncertainties of surveys and path, `not_included` are not.
+    `msa` is the multi-station analysis, if one was asked for; `interference` and `separable` are of it.
+    """
+
+    rows: int
+    accepted: int
+    rejected: int
+    not_judged: int
+    blind: int
+    blank: int
+    north: str
+    declination_deg: float | None
+    sd_declination_deg: float | None
+    convergence_deg: float | None
+    reference_sources: dict[str, str]
+    error_terms: list[str]
+    not_included: list[str]
+    limits: str
+    source: str
+    end: EndOfPath | None
+    findings: list[Finding]
+    output: str
+    html: str
+    interference: InterferenceSize | None = None
+    separable: bool | None = None
+    msa: MultiStationAnalysis | None = None
+
+
+def refusal(inputs: WellInputs, msa: MultiStationAnalysis) -> SurveySummary:
+    """What a multi-station analysis says that cannot be used: none of the surveys is judged, nothing is written."""
+    rows, north = inputs.surveys.readings.count, inputs.surveys.north
+    return SurveySummary(
+        rows=rows,
+        accepted=0,
+        rejected=0,
+        not_judged=rows,
+        blind=0,
+        blank=rows,
+        north=north.name,
+        **_stated(north, error_terms((), north.declination is not None)),
+        reference_sources=dict(inputs.surveys.sources),
+        limits=inputs.limits.name,
+        source=inputs.limits.source,
+        end=None,
+        findings=msa.findings,
+        output="",
+        html="",
+        interference=msa.interference,
+        separable=msa.separable,
+        msa=msa,
+    )
+
+
+def result_summary(result: SurveyedWell, output: str = "", html: str = "") -> SurveySummary:
+    """The result for machines; `output` and `html` are the files that were written, if any."""
+    msa = result.analysis.summary if result.analysis else None
+    unused = unused_columns(result.inputs.surveys.readings.unused)
+    return summary(result.well, output, html, msa, unused)
+
+
+def document(inputs: WellInputs, facts: SurveySummary, signature: SignatureCheck) -> dict[str, Any]:
+    """The document of a result or of a refusal, with what all inputs say of themselves."""
+    whole = enveloped("survey", facts, *inputs.stated, **inputs.digests)
+    return with_signature(whole, signature)
+
+
+def whole_screen(result: SurveyedWell, facts: SurveySummary, signature: SignatureCheck) -> str:
+    """The result for people, behind the multi-station analysis if there is one."""
+    stated = result.inputs.stated
+    shown = screen(result.well, facts, signature, *stated)
+    return (
+        f"{interference_screen(result.analysis, *stated)}\n\n{shown}" if result.analysis else shown
+    )
+
+
+def all_findings(facts: SurveySummary) -> list[Finding]:
+    """The findings of the multi-station analysis, then those about the surveys."""
+    return [*(facts.msa.findings if facts.msa else []), *facts.findings]
+
+
+def summary(
+    well: Well,
+    output: str,
+    html: str,
+    msa: MultiStationAnalysis | None = None,
+    about_file: Sequence[Finding] = (),
+) -> SurveySummary:
+    """The result for machines; findings `about_file` come after those about the well."""
+    judged, accepted = well.judgement.judged, well.judgement.accepted
+    north = well.north
+    return SurveySummary(
+        rows=len(judged),
+        accepted=int(accepted.sum()),
+        rejected=int((judged & ~accepted).sum()),
+        not_judged=int((~judged).sum()),
+        blind=int(well.blind.sum()),
+        blank=int(well.blank.sum()),
+        north=north.name,
+        **_stated(north, well.terms),
+        reference_sources=dict(well.sources),
+        limits=well.limits.name,
+        source=well.limits.source,
+        end=end_of_path(well),
+        findings=[*well.findings, *about_file],
+        output=output,
+        html=html,
+        interference=msa.interference if msa else None,
+        separable=msa.separable if msa else None,
+        msa=msa,
+    )
+
+
+def _stated(north: North, terms: ErrorTerms) -> dict[str, Any]:
+    """What turns azimuths, degrees, and what their uncertainty holds."""
+    sd = None if north.declination is None else north.declination_sd
+    angles = {
+        "declination_deg": north.declination,
+        "sd_declination_deg": sd,
+        "convergence_deg": north.convergence,
+    }
+    return {
+        **{
+            key: None if angle is None else float(np.degrees(angle))
+            for key, angle in angles.items()
+        },
+        "error_terms": list(terms.included),
+        "not_included": list(terms.left_out),
+    }
+
+
+def end_of_path(well: Well) -> EndOfPath | None:
+    """The last station with a position."""
+    if well.position is None or np.isnan(well.position.place[:, 0]).all():
+        return None
+    last = int(np.flatnonzero(~np.isnan(well.position.place[:, 0]))[-1])
+    north, east, tvd = well.position.place[last].tolist()
+    sd_north, sd_east, sd_tvd = map(stated, well.position.sd[last].tolist())
+    return EndOfPath(
+        station=well.readings.labels[last],
+        md_m=float(well.position.md[last]),
+        north_m=north,
+        east_m=east,
+        tvd_m=tvd,
+        sd_north_m=sd_north,
+        sd_east_m=sd_east,
+        sd_tvd_m=sd_tvd,
+        covariance_m2=[[*map(stated, row)] for row in well.position.covariance[last].tolist()],
+    )
+
+
+def screen(
+    well: Well, facts: SurveySummary, signature: SignatureCheck, *metadata: Mapping[str, object]
+) -> str:
+    """The surveys for people; `signature` of the calibration, `metadata` of it and of the readings."""
+    counts = [f"{facts.accepted} accepted", f"{facts.rejected} rejected"]
+    if facts.not_judged:
+        counts.append(f"{facts.not_judged} not judged")
+    if facts.blind:
+        counts.append(f"{facts.blind} blind to interference")
+    heading = [well.readings.source, plural(facts.rows, "survey"), *counts]
+    heading += [in_short(signature), *simulated(*metadata)]
+    source = f" ({facts.source})" if facts.source else ""
+    lines = [
+        "   ".join(heading),
+        f"azimuths from {facts.north} north{declination_in_words(facts)}   limits {facts.limits}{source}",
+    ]
+    if facts.reference_sources:
+        lines.append(sources_in_words(facts))
+    if facts.end:
+        lines.append(end_in_words(facts.end, facts.north))
+    lines.append(well.terms.sentence)
+    return "\n".join(
+        [
+            *map(one_line, lines),
+            "",
+            survey_table(well),
+            *([written(table=facts.output, page=facts.html)] if facts.output else []),
+        ]
+    )
+
+
+def declination_in_words(facts: SurveySummary) -> str:
+    """The declination with its standard uncertainty, after the name of a north."""
+    if facts.declination_deg is None or facts.sd_declination_deg is None:
+        return ""
+    sd = fixed(facts.sd_declination_deg, 2)
+    return f" (declination {signed(facts.declination_deg, 2)}° ± {sd}°)"
+
+
+def sources_in_words(facts: SurveySummary) -> str:
+    """Where the references come from, those of one source together."""
+    names: dict[str, list[str]] = {}
+    for name, source in facts.reference_sources.items():
+        names.setdefault(source, []).append(name.replace("sd_", "1σ of "))
+    parts = [f"{', '.join(each)}: {source}" for source, each in names.items()]
+    return "   ".join(["references", *parts])
+
+
+def end_in_words(end: EndOfPath, north: str) -> str:
+    """Where the path ends, with standard uncertainties."""
+    parts = [
+        f"{title} {fixed(value, 2)} m (1σ {'not stated' if sd is None else fixed(sd, 2)})"
+        for title, value, sd in (
+            ("north", end.north_m, end.sd_north_m),
+            ("east", end.east_m, end.sd_east_m),
+            ("TVD", end.tvd_m, end.sd_tvd_m),
+        )
+    ]
+    return f"at {fixed(end.md_m, 2)} m MD, from {north} north: {', '.join(parts)}"
+
+
+def survey_table(well: Well, most: int = MOST_SURVEYS) -> str:
+    """The first surveys, each angle with its standard uncertainty."""
+    header, rows = survey_rows(well, most)
+    more = len(well.readings.labels) - len(rows)
+    return table(rows, header) + (f"\n… and {more} more" if more > 0 else "")
+
+
+def survey_rows(well: Well, most: int) -> tuple[list[str], list[list[str]]]:
+    """Header and cells of the first surveys."""
+    columns = well.columns
+    azimuth = f"azimuth_{well.north.name}_deg"
+    angles, relative = ["inclination_deg", azimuth, "toolface_deg"], well.calibration.relative
+    shown = {
+        "inclination_deg": "inc °", azimuth: f"azi {well.north.name} °", "toolface_deg": "toolface °",
+        "gravity_g": "|g| g", "field_nt": "|b| (relative)" if relative else "|b| nT", "dip_deg": "dip °",
+    }  # fmt: skip
+    digits = {"gravity_g": 5, "field_nt": 5 if relative else 0, "dip_deg": 2}
+    header = ["station", *(["md m"] if well.position else [])]
+    for name, title in shown.items():
+        header += [title, "1σ"] if name in angles else [title]
+    modelled, rows = well.limits.probability is not None, []
+    for i, label in enumerate(well.readings.labels[:most]):
+        row = [label, *([fixed(well.position.md[i], 2)] if well.position else [])]
+        for name in shown:
+            row.append(fixed(columns[name][i], digits.get(name, 2)))
+            if name in angles:
+                row.append(fixed(columns[f"sd_{name}"][i], 2))
+        kind = str(columns["toolface_kind"][i])
+        distance = well.judgement.distance[i]
+        model = [fixed(distance, 1) if well.judgement.judged[i] else "–"] if modelled else []
+        outcome = OUTCOMES[str(columns["accepted"][i])] + (", blind" if well.blind[i] else "")
+        rows.append([*row, kind, *model, outcome])
+    return [*header, "from", *(["distance"] if modelled else []), ""], rows

@@ -1,0 +1,294 @@
+"""Figures of a well: strengths against their limits, angles, toolface, and the path on the map and in section.
+
+The page of the surveys of a well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mwdcal import __version__
+from mwdcal.calibration.readings import is_simulated, serial_of
+from mwdcal.calibration.record import Finding
+from mwdcal.geometry.vectors import Array, wrap
+from mwdcal.presentation.page import banner, environment
+from mwdcal.presentation.survey import (
+    SurveySummary,
+    declination_in_words,
+    end_in_words,
+    sources_in_words,
+    summary,
+    survey_rows,
+)
+from mwdcal.presentation.text import plural
+from mwdcal.survey.acceptance import SURVEY_UNITS
+from mwdcal.survey.well import Position, Well
+from mwdcal.use.plots import AFTER, BAND, BEFORE, MARKED, SERIES, new_figure, style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+ELLIPSE_POINTS = np.linspace(0, 2 * np.pi, 73)
+ELLIPSE_SDS = 2.0
+"""Standard deviations of the ellipses of position."""
+ELLIPSE_SHARE = 0.08
+"""Largest half axis of an ellipse as a share of the path."""
+LARGEST_DRAWN_SD = 2.0
+"""Standard uncertainty up to which an angle is drawn, degrees: near vertical that of azimuth grows without end."""
+MOST_ELLIPSES = 12
+"""Ellipses of position on a map."""
+MOST_MARKS = 400
+"""Stations that are marked; of more only the line is drawn."""
+STRENGTH_TITLES = {
+    "gravity": "|g| less reference, mg",
+    "field": "|b| less reference, nT",
+    "dip": "dip less reference, °",
+}
+
+
+def along(well: Well) -> tuple[Array, str]:
+    """Where stations (n,) lie along a depth axis, and its title: measured depth, else their number."""
+    if well.position is None:
+        return np.arange(1.0, len(well.judgement.accepted) + 1), "station"
+    return well.position.md, "measured depth, m"
+
+
+@style()
+def strengths(well: Well) -> Figure:
+    """Departures of |g|, |b| and dip over depth, with the band of the limits; rejected stations marked."""
+    depth, title = along(well)
+    figure, panels = new_figure(
+        "Departures of |g|, |b| and dip from the references, over depth", 4.6, 1, 3, sharey=True
+    )
+    for k, (axes, (name, (_, factor, _))) in enumerate(
+        zip(panels[0], SURVEY_UNITS.items(), strict=True)
+    ):
+        _track(axes, well, depth, k, factor)
+        axes.set_xlabel(STRENGTH_TITLES[name])
+    panels[0, 0].set_ylabel(title)
+    _downwards(panels[0, 0], depth)
+    handles = {
+        label: handle
+        for axes in panels[0]
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    if handles:
+        figure.legend(handles.values(), handles, loc="outside upper left", ncols=3)
+    return figure
+
+
+def _track(axes: Axes, well: Well, depth: Array, k: int, factor: float) -> None:
+    """One strength over depth."""
+    judgement = well.judgement
+    value, bound = judgement.departure[:, k] * factor, judgement.bound[:, k] * factor
+    there = ~np.isnan(value) & ~np.isnan(depth)
+    if not there.any():
+        axes.annotate("not judged", (0.5, 0.5), xycoords="axes fraction", ha="center", color=BEFORE)
+        axes.set_xticks([])
+        return
+    limited = there & np.isfinite(bound)
+    if limited.any():
+        axes.fill_betweenx(
+            depth[limited], -bound[limited], bound[limited], color=BAND, lw=0, label="limits"
+        )
+    axes.axvline(0, color="#4b5563", lw=0.6)
+    axes.plot(
+        value[there],
+        depth[there],
+        color=AFTER,
+        marker="." if there.sum() <= MOST_MARKS else "",
+        lw=0.8,
+        label="surveys",
+    )
+    wrong = there & judgement.judged & ~judgement.accepted
+    if wrong.any():
+        axes.plot(
+            value[wrong], depth[wrong], ls="", marker="x", ms=5, color=MARKED, label="rejected"
+        )
+
+
+def _downwards(axes: Axes, depth: Array) -> None:
+    """Depth downwards, with room at both ends."""
+    known = depth[~np.isnan(depth)]
+    low, high = float(known.min(initial=0.0)), float(known.max(initial=1.0))
+    room = 0.03 * max(high - low, 1.0)
+    axes.set_ylim(high + room, low - room)
+
+
+@style()
+def angles(well: Well) -> Figure:
+    """Inclination and azimuth over depth with ±2σ, and the toolface as a dial: outwards is deeper."""
+    depth, title = along(well)
+    figure, panels = new_figure("Inclination, azimuth and toolface over depth", 4.0, 1, 3)
+    inclination, azimuth, toolface = (
+        well.surveys.of(n) for n in ("inclination", "azimuth", "toolface")
+    )
+    north = well.north.name
+    turned = np.degrees(wrap(azimuth[0] + well.north.offset)), np.degrees(well.sd_azimuth)
+    tracks = (
+        (np.degrees(inclination[0]), np.degrees(inclination[1]), "inclination, °"),
+        (*turned, f"azimuth from {north} north, °"),
+    )
+    for axes, (value, sd, name) in zip(panels[0, :2], tracks, strict=True):
+        _angle_track(axes, depth, value, sd)
+        axes.set_xlabel(name)
+    panels[0, 0].set_ylabel(title)
+    panels[0, 1].set_yticklabels([])
+    where = panels[0, 2].get_subplotspec()
+    panels[0, 2].remove()
+    _dial(figure.add_subplot(where, projection="polar"), well, depth, toolface[0])
+    return figure
+
+
+def _angle_track(axes: Axes, depth: Array, value: Array, sd: Array) -> None:
+    there = ~np.isnan(value) & ~np.isnan(depth) & (sd < LARGEST_DRAWN_SD)
+    marker = "." if there.sum() <= MOST_MARKS else ""
+    breaks = np.where(
+        np.abs(np.diff(value[there], prepend=value[there][:1])) > 180, np.nan, value[there]
+    )
+    axes.plot(breaks, depth[there], color=AFTER, marker=marker)
+    axes.fill_betweenx(
+        depth[there], (value - 2 * sd)[there], (value + 2 * sd)[there], color=BAND, lw=0
+    )
+    _downwards(axes, depth)
+
+
+def _dial(axes: Any, well: Well, depth: Array, toolface: Array) -> None:
+    """Toolfaces around a dial: from high side, or from magnetic north."""
+    axes.set_theta_zero_location("N")
+    axes.set_theta_direction(-1)
+    axes.set_thetagrids(range(0, 360, 45))
+    magnetic = well.surveys.magnetic
+    kinds = (("from high side", ~magnetic, SERIES[0]), ("from magnetic north", magnetic, SERIES[1]))
+    for label, some, (colour, marker, _) in kinds:
+        some = some & ~np.isnan(toolface)
+        if some.any():
+            axes.plot(toolface[some], depth[some], ls="", marker=marker, color=colour, label=label)
+    known = depth[~np.isnan(depth)]
+    low, high = float(known.min(initial=0.0)), float(known.max(initial=1.0))
+    axes.set_ylim(low - 0.5 * max(high - low, 1.0), high + 0.05 * max(high - low, 1.0))
+    axes.set_yticklabels([])
+    axes.set_title("toolface, ° (outwards: deeper)", pad=14)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=1)
+
+
+@style()
+def path(well: Well) -> Figure:
+    """The hole on the map, and in the vertical section towards its end, with ellipses of position."""
+    position = well.position
+    assert position is not None
+    there = ~np.isnan(position.place[:, 0])
+    figure, panels = new_figure("Well path on the map and in vertical section", 3.9, 1, 2)
+    place, covariance = position.place[there], position.covariance[there]
+    towards, enlarged = _section(place), enlargement(position)
+    plan = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    section = np.array([[np.cos(towards), np.sin(towards), 0.0], [0.0, 0.0, 1.0]])
+    for axes, view in zip(panels[0], (plan, section), strict=True):
+        _view(axes, place, covariance, view, enlarged)
+    panels[0, 0].set(xlabel="east, m", ylabel=f"north ({well.north.name}), m")
+    panels[0, 1].set(xlabel=f"along {np.degrees(wrap(towards)):.0f}°, m", ylabel="TVD, m")
+    panels[0, 1].invert_yaxis()
+    panels[0, 0].set_title("map")
+    panels[0, 1].set_title("vertical section")
+    for axes in panels[0]:
+        axes.set_aspect("equal", adjustable="datalim")
+    return figure
+
+
+def _section(place: Array) -> float:
+    """Azimuth from the first to the last position, radians."""
+    north, east, _ = place[-1] - place[0]
+    return float(np.arctan2(east, north))
+
+
+def _view(axes: Axes, place: Array, covariance: Array, view: Array, enlarged: float) -> None:
+    """Positions (n, 3) in a plane, `view` (2, 3), with some ellipses, `enlarged` times."""
+    points = place @ view.T
+    axes.plot(*points.T, color=AFTER, marker="." if len(points) <= MOST_MARKS else "", lw=1.0)
+    chosen = np.unique(np.linspace(0, len(points) - 1, MOST_ELLIPSES).round().astype(int))
+    circle = np.stack([np.cos(ELLIPSE_POINTS), np.sin(ELLIPSE_POINTS)])
+    for i in chosen:
+        spread = view @ covariance[i] @ view.T
+        if np.isfinite(spread).all():
+            values, vectors = np.linalg.eigh(spread)
+            ring = enlarged * ELLIPSE_SDS * (vectors * np.sqrt(np.maximum(values, 0.0))) @ circle
+            axes.plot(*(points[i][:, None] + ring), color=MARKED, lw=0.7)
+
+
+def enlargement(position: Position) -> float:
+    """By how much ellipses of position are drawn larger than they are, to be seen: 1, 2, 5, 10 and so on."""
+    extent = np.nanmax(np.ptp(position.place[~np.isnan(position.place[:, 0])], axis=0), initial=0.0)
+    largest = ELLIPSE_SDS * np.nanmax(position.sd, initial=0.0)
+    if not 0 < largest < ELLIPSE_SHARE * extent:
+        return 1.0
+    ratio = ELLIPSE_SHARE * extent / largest
+    decade = 10.0 ** np.floor(np.log10(ratio))
+    return float(decade * max(step for step in (1, 2, 5) if step * decade <= ratio))
+
+
+def has_path(position: Position | None) -> bool:
+    """Whether any station has a position."""
+    return position is not None and not np.isnan(position.place[:, 0]).all()
+
+
+MOST_ROWS_OF_PAGE = 2000
+"""Surveys in the table of a page."""
+
+
+def render(well: Well, findings: list[Finding], sha256: Mapping[str, str]) -> str:
+    """The surveys as HTML; `sha256` of the files they come from, by what these are."""
+    facts = summary(well, "", "")
+    stated = well.readings.metadata, well.calibration.tool
+    header, rows = survey_rows(well, MOST_ROWS_OF_PAGE)
+    located = has_path(well.position)
+    return (
+        environment()
+        .get_template("survey.html")
+        .render(
+            facts=facts,
+            modelled=well.limits.probability is not None,
+            readings=well.readings.source,
+            serial=next(filter(None, map(serial_of, stated)), None),
+            simulated=any(map(is_simulated, stated)),
+            banner=_banner(facts),
+            findings=findings,
+            strengths=strengths(well) if facts.not_judged < facts.rows else None,
+            angles=angles(well),
+            path=path(well) if located else None,
+            enlarged=enlargement(well.position) if located and well.position else 1.0,
+            terms=well.terms.sentence,
+            declination=declination_in_words(facts),
+            sources=sources_in_words(facts).partition("   ")[2],
+            end=end_in_words(facts.end, facts.north) if facts.end else "",
+            header=header,
+            rows=rows,
+            more=facts.rows - len(rows),
+            calibration=well.calibration.run_name,
+            sha256=sha256,
+            version=__version__,
+        )
+    )
+
+
+def _banner(facts: SurveySummary) -> dict[str, str]:
+    """How many surveys may be used."""
+    headline = (
+        f"{facts.accepted} of {plural(facts.rows, 'survey')} within the limits {facts.limits}"
+    )
+    north = f"Azimuths count from {facts.north} north"
+    if facts.rejected:
+        return banner("bad", "Rejected", headline, f"{facts.rejected} outside. {north}")
+    if facts.not_judged or facts.blank:
+        return banner("attention", "Attention", headline, f"{facts.not_judged} not judged. {north}")
+    if facts.blind:
+        return banner(
+            "attention", "Attention", headline, f"{facts.blind} blind to interference. {north}"
+        )
+    if any(finding.id == "partly-judged" for finding in facts.findings):
+        return banner("attention", "Attention", headline, f"Judged in part. {north}")
+    return banner("good", "Accepted", headline, north)

@@ -1,0 +1,56 @@
+"""Messages of the library in the words of the command that runs.
+
+The options of a fit as words, as a command line has them: it loads this without NumPy.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, TypedDict
+
+import click
+from msgspec.structs import replace
+
+if TYPE_CHECKING:
+    from mwdcal.calibration.record import Finding
+
+
+def as_typed(text: str) -> str:
+    """A message of the library with the options of the command that runs instead of its arguments.
+
+    The library names an argument in backticks, also in the files that it writes; the name stays as
+    it is where no option has it.
+    """
+    context = click.get_current_context(silent=True)
+    parameters = context.command.params if context else []
+    typed = [p for p in parameters if isinstance(p, click.Option)]
+    options = {p.opts[-1].lstrip("-").replace("-", "_"): p.opts[-1] for p in typed}
+    options |= {p.name: p.opts[-1] for p in typed if p.name}
+    return re.sub(r"`(\w+)`", lambda name: options.get(name[1], name[0]), text)
+
+
+def findings_as_typed(findings: Iterable[Finding]) -> list[Finding]:
+    """The findings in the words of the command that runs."""
+    return [replace(finding, text=as_typed(finding.text)) for finding in findings]
+
+
+class Typed(TypedDict):
+    """The options of `mwdcal calibrate` that say how to fit, as they come from the command line."""
+
+    method: str
+    model: str | None
+    order: str
+    parameters: str | None
+    nonlinearity: str
+    estimate: str
+    ignore: str
+    robust: str | None
+    paper_weights: bool
+    prior: str | None
+    seed: int
+
+
+def names(text: str) -> tuple[str, ...]:
+    """The words of a list with commas."""
+    return tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))

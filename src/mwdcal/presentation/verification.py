@@ -1,0 +1,80 @@
+"""A verdict on the screen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from msgspec import UNSET
+
+from mwdcal.calibration.canonical import SignatureCheck
+from mwdcal.calibration.readings import simulated
+from mwdcal.presentation.signature import in_short
+from mwdcal.presentation.text import NOT_STATED, WIDE, chance, one_line, quantity, table
+from mwdcal.use.verification import SETTING_PRACTICES, JudgedSet, Verdict, VerdictRow
+
+FREEDOM = "DoF"
+"""Title of a column of degrees of freedom."""
+MANY = 10_000
+"""As good as unlimited degrees of freedom."""
+BETWEEN_SETS = "stations outside of roll sets"
+VERDICT_RISK = "risk of a wrong verdict, all roll sets and limits together"
+
+
+def screen(
+    result: Verdict, signature: SignatureCheck | None, *metadata: Mapping[str, object]
+) -> str:
+    """The outcome first, then each limit.
+
+    `signature` of the calibration's file, if there is one, `metadata` of calibration and run.
+    """
+    rows = []
+    for row in result.rows:
+        sd = uncertainty(row.uncertainty, row.unit)
+        raw, value, limit = (quantity(v, row.unit) for v in (row.raw, row.value, row.limit))
+        verdict = "pass" if row.passed else "FAIL"
+        rows.append([row.name, raw, value, sd, freedom(row), limit, verdict, row.note])
+    outcome = "PASS" if result.passed else "FAIL"
+    first = [outcome, result.run, f"{result.stations} stations"]
+    first += [in_short(signature)] if signature else []
+    first += simulated(*metadata)
+    source = f" ({result.source})" if result.source else ""
+    lines = ["   ".join(first), f"limits {result.limits}{source}", f"rule: {result.rule}"]
+    lines += [SETTING_PRACTICES[result.settings]] if result.settings in SETTING_PRACTICES else []
+    if result.risk is not None:
+        lines.append(f"{VERDICT_RISK}: {chance(result.risk)}")
+    header = ["", "raw", "noise-free", "1σ", FREEDOM, "limit", "", "where"]
+    blocks = ["\n".join(map(one_line, lines)), table(rows, header, WIDE), *_sets(result)]
+    return "\n\n".join(blocks)
+
+
+def _sets(result: Verdict) -> list[str]:
+    """What each roll set shows of each limit, where there are several."""
+    rows = [
+        [row.name, one_line(each.label or BETWEEN_SETS), *map(str, cells)]
+        for row in result.rows
+        if len(row.sets) > 1 and row.uncertainty is not None
+        for each in row.sets
+        for cells in [
+            [
+                quantity(each.value, row.unit),
+                uncertainty(each.uncertainty, row.unit),
+                freedom(each),
+            ]
+        ]
+    ]
+    return (
+        [table(rows, ["each roll set by itself", "", "noise-free", "1σ", FREEDOM])] if rows else []
+    )
+
+
+def uncertainty(value: float | None, unit: str) -> str:
+    """A standard uncertainty, or that it is not stated."""
+    return NOT_STATED if value is None else quantity(value, unit)
+
+
+def freedom(judged: VerdictRow | JudgedSet) -> str:
+    """Degrees of freedom of the uncertainty of a limit or roll set: ∞ where the noise is declared."""
+    if judged.uncertainty is None or judged.degrees_of_freedom is UNSET:
+        return "–"
+    many = judged.degrees_of_freedom is None or judged.degrees_of_freedom >= MANY
+    return "∞" if many else f"{judged.degrees_of_freedom:.3g}"

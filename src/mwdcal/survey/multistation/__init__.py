@@ -1,1 +1,0 @@
-"""Multi-station analysis: interference of the drill string from the surveys themselves."""
