@@ -226,7 +226,7 @@ OURS = ("time_s", "start_s", "end_s", "samples", "drifting", "serial", "simulate
 """Columns beyond the contract that mwdcal itself reads or writes in run files."""
 _COPIED = ("drift_", "witsml ")
 """What columns begin with that mwdcal writes of a log, and that a WITSML file has beyond a run's."""
-_COMPUTED = re.compile(
+_CALCULATED = re.compile(
     r"(?<![A-Za-z])(calc|calculated|computed|berechnet)(?![A-Za-z])", re.IGNORECASE
 )
 """Words of columns that a program has computed from the readings: no evidence."""
@@ -253,8 +253,8 @@ def resembled(name: str) -> Resemblance | None:
 
     >>> [resembled(n) for n in ("Azi (°)", "Temp (°F)", "comment")]
     [Resemblance(column='ref_azimuth_deg', unit='°'), Resemblance(column='temperature_c', unit='°F'), None]
-    >>> resembled("HX [ADC]")
-    Resemblance(column='mx', unit='ADC')
+    >>> resembled("HX [steps]")
+    Resemblance(column='mx', unit='steps')
     """
     whole, bracketed = _resembled(name), _BRACKETED.fullmatch(name.strip())
     if whole or not bracketed or not (bare := _resembled(bracketed[1])):
@@ -377,7 +377,7 @@ def check_evidence(
 ) -> None:
     """Refuse a column that resembles one of those to be noticed, where that itself is absent."""
     results, absent = _results(names), {*noticed}.difference(names)
-    alike = {n: resembled(n) for n in names if n not in results and not _COMPUTED.search(n)}
+    alike = {n: resembled(n) for n in names if n not in results and not _CALCULATED.search(n)}
     meant = [(name, each) for name, each in alike.items() if each and each.column in absent]
     if not meant:
         return

@@ -153,7 +153,7 @@ def _is_left_handed(result: Wiring) -> bool:
 
 
 def _as_written(
-    path: str | os.PathLike[str], where: Layout | None, told: bool
+    path: str | os.PathLike[str], where: Layout | None, placed: bool
 ) -> tuple[Table, TableFormat | None]:
     """The table of a file, and how a profile says it is written: not at all where it is written as documented.
 
@@ -165,14 +165,14 @@ def _as_written(
         name for name, m in meanings_of(where.names, where.units).items() if m.column in LABELS
     }
     table = tables.of_layout(where, path, labels)
-    for form in [] if told else [None, where.form]:
+    for form in [] if placed else [None, where.form]:
         if form or _is_documented(path, where.form):
             with suppress(InputError):
                 plain = tables.read(path, export=form)
                 if _same(plain, table):
                     return plain, form
     form = TableFormat(find=True)
-    if told:
+    if placed:
         form = msgspec.structs.replace(form, sheet=where.sheet, decimal=where.form.decimal)
     return table, form
 

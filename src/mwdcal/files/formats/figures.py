@@ -10,9 +10,9 @@ from mwdcal.files.formats.columns import as_text, looks_numeric
 
 _SPACES = re.compile(r"(?<=\d)[ '’\u00a0\u202f\u2009](?=\d{3}(\D|$))")
 """What separates thousands and is never a decimal sign."""
-_NUMBER = r"[+\-−]?(?:\d+(?:[.,]\d+)*[.,]?|[.,]\d+)(?:[eE][+\-−]?\d+)?"
-_FIGURE = re.compile(rf"({_NUMBER})\s*([°º%]?\s?[A-Za-zµμ²/°º]{{0,6}})")
-_PLAIN = re.compile(_NUMBER)
+_WRITTEN = r"[+\-−]?(?:\d+(?:[.,]\d+)*[.,]?|[.,]\d+)(?:[eE][+\-−]?\d+)?"
+_FIGURE = re.compile(rf"({_WRITTEN})\s*([°º%]?\s?[A-Za-zµμ²/°º]{{0,6}})")
+_BARE_FIGURE = re.compile(_WRITTEN)
 _DEGREES = re.compile(
     r"([+\-−]?)(\d+)\s*[°º]\s*(\d+(?:[.,]\d+)?)\s*['′’]\s*(?:(\d+(?:[.,]\d+)?)\s*(?:[\"″”]|''))?"
 )
@@ -47,14 +47,14 @@ def decimal_sign(cells: Sequence[object], source: str) -> str:
         FitError: the sign in all numbers may be either.
     """
     texts = [_SPACES.sub("", cell) for cell in cells if isinstance(cell, str) and is_figure(cell)]
-    found = [match[1] for match in map(_FIGURE.fullmatch, texts) if match]
-    commas = [cell for cell in found if "," in cell]
-    points = [cell for cell in found if "." in cell]
+    figures = [match[1] for match in map(_FIGURE.fullmatch, texts) if match]
+    commas = [cell for cell in figures if "," in cell]
+    points = [cell for cell in figures if "." in cell]
     if not commas and not points:
         return "."
     fits = {
         sign: all(
-            looks_numeric(c.replace("−", "-"), sign) or _POINTED[sign].fullmatch(c) for c in found
+            looks_numeric(c.replace("−", "-"), sign) or _POINTED[sign].fullmatch(c) for c in figures
         )
         for sign in ".,"
     }
@@ -62,7 +62,7 @@ def decimal_sign(cells: Sequence[object], source: str) -> str:
         return "." if fits["."] else ","
     if not fits["."]:
         raise InputError(
-            f"{source}: numbers with a comma ({(commas or found)[0]}) and with a point ({(points or found)[0]}) are "
+            f"{source}: numbers with a comma ({(commas or figures)[0]}) and a point ({(points or figures)[0]}) are "
             "mixed. Export the table with one decimal sign."
         )
     if all(map(_GROUPED.fullmatch, commas + points)):
@@ -95,8 +95,8 @@ def _pointed(text: str, sign: str, unit: str) -> str:
     bare = _SPACES.sub("", text).replace("−", "-")
     if unit:
         bare = bare.removesuffix(unit).strip()
-    if not _PLAIN.fullmatch(bare) or (looks_numeric(bare) and sign == "."):
-        return bare if _PLAIN.fullmatch(bare) else text
+    if not _BARE_FIGURE.fullmatch(bare) or (looks_numeric(bare) and sign == "."):
+        return bare if _BARE_FIGURE.fullmatch(bare) else text
     if _POINTED[sign].fullmatch(bare) and not looks_numeric(bare, sign):
         bare = bare.replace("." if sign == "," else ",", "")
     return bare.replace(",", ".") if looks_numeric(bare, sign) else text

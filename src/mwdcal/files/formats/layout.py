@@ -108,13 +108,13 @@ def laid_out(
         InputError: no such sheet, row or columns, or no table.
         FitError: two tables that may both be meant, or a decimal sign that the numbers leave open.
     """
-    asked = [each for each in sheets if each.name == sheet] if sheet else list(sheets)
-    if not asked:
+    candidates = [each for each in sheets if each.name == sheet] if sheet else list(sheets)
+    if not candidates:
         names = ", ".join(shown(each.name) for each in sheets)
         raise InputError(f"{source}: there is no sheet {shown(sheet)}. The sheets are {names}.")
     tables = [
         layout
-        for each in asked
+        for each in candidates
         for layout in _tables(each, source, decimal)
         if header_line in (0, layout.form.header_line) and {*wanted} <= {*layout.names}
     ]

@@ -22,7 +22,7 @@ DELIMITERS = (";", "\t", ",", "|")
 _BLANKS = "blanks"
 _LOOKED_AT = 400
 """Lines by which the delimiter of a text is told."""
-_LARGEST_UNPACKED = 100_000_000
+_LARGEST_CONTENTS = 100_000_000
 _REPEATED = re.compile(rb'number-(?:rows|columns)-repeated="(\d+)"')
 _MOST_REPEATED = 1_100_000
 _MOST_CELLS = 3_000_000
@@ -132,7 +132,7 @@ def _check_ods(data: bytes, source: str) -> None:
     ):
         size = sum(entry.file_size for entry in archive.infolist())
         advice = "Save the sheet with the run alone."
-        at_most(size, _LARGEST_UNPACKED, source, "its contents", "bytes", advice)
+        at_most(size, _LARGEST_CONTENTS, source, "its contents", "bytes", advice)
         content = archive.read("content.xml")
     repeated = [int(each) for each in _REPEATED.findall(content)]
     if repeated and max(repeated) > _MOST_REPEATED:

@@ -240,8 +240,8 @@ def laid_out(
 
 def of_layout(where: layout.Layout, path: str | os.PathLike[str], kept: Collection[str]) -> Table:
     """The table of a layout in a file; the cells of the columns `kept` as they stand, of labels and serials."""
-    own = [(n, line) for n, line in enumerate(where.above, 1) if dialect.is_metadata(line)]
-    stated = meta.parse(own, Path(path).name)
+    lines = [(n, line) for n, line in enumerate(where.above, 1) if dialect.is_metadata(line)]
+    stated = meta.parse(lines, Path(path).name)
     return Table(
         layout.as_columns(where, kept),
         {**where.titles.metadata, **stated},

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from mwdcal.files.formats.columns import as_text
 
-_KEYS = {
+_TITLE_WORDS = {
     "serial": "serial sn s/n serialno serialnumber toolsn tools/n toolserial toolserialno toolserialnumber toolno "
     "toolid probesn probeno 仪器号 探管号 sondesn sensorsn seriennummer "
     "seriennr geratenummer geratenr sondennummer sondennr serienummer "
@@ -53,7 +53,7 @@ _DECLINATION = re.compile(
     r"(declination|deklination|misvisning|declinaci[oó]n|склонение|磁偏角)\W*([+-]?\d+[.,]?\d*)\s*(?:°|deg\w*)?\s*([EWO])?",
     re.IGNORECASE,
 )
-_LATIN = str.maketrans({"ø": "o", "Ø": "O", "ß": "ss", "º": "", "ª": "", "°": ""})
+_SPECIAL_LETTERS = str.maketrans({"ø": "o", "Ø": "O", "ß": "ss", "º": "", "ª": "", "°": ""})
 
 
 class Titles(NamedTuple):
@@ -137,7 +137,7 @@ def _pair(cell: str, right: Sequence[str]) -> tuple[str, str]:
 
 def _word(text: str) -> str:
     """Letters of a text in lower case without marks and blanks."""
-    plain = unicodedata.normalize("NFKD", text.translate(_LATIN).lower())
+    plain = unicodedata.normalize("NFKD", text.translate(_SPECIAL_LETTERS).lower())
     return re.sub(r"[^\w/№]|_", "", "".join(c for c in plain if not unicodedata.combining(c)))
 
 
@@ -168,4 +168,4 @@ def day_of_rows(name: str, cells: Sequence[str]) -> str:
     return days.pop() if len(days) == 1 else ""
 
 
-_MEANT = {_word(word): key for key, words in _KEYS.items() for word in words.split()}
+_MEANT = {_word(word): key for key, words in _TITLE_WORDS.items() for word in words.split()}
