@@ -22,6 +22,7 @@ from mwdcal.files.formats.figures import is_figure
 from mwdcal.files.formats.layout import Layout
 from mwdcal.files.formats.table import Table
 from mwdcal.files.formats.table import labels as labels_of
+from mwdcal.files.formats.text import is_preamble
 from mwdcal.files.metadata import toml
 from mwdcal.files.runs import check_run, renamed, to_readings
 from mwdcal.files.synonyms import ABOVE, BELOW
@@ -166,7 +167,7 @@ def _as_written(
     }
     table = tables.of_layout(where, path, labels)
     for form in [] if placed else [None, where.form]:
-        if form or _is_documented(path, where.form):
+        if form or _is_documented(path, where):
             with suppress(InputError):
                 plain = tables.read(path, export=form)
                 if _same(plain, table):
@@ -177,11 +178,17 @@ def _as_written(
     return table, form
 
 
-def _is_documented(path: str | os.PathLike[str], form: TableFormat) -> bool:
+def _is_documented(path: str | os.PathLike[str], where: Layout) -> bool:
     """Whether a table, but for the names of its columns, may be written as a run file is."""
+    form = where.form
     usual = {".csv": ",", ".tsv": "\t"}.get(Path(path).suffix.lower(), form.delimiter)
     below = form.first_line == form.header_line + 1
-    return below and form.delimiter == usual and form.decimal == "."
+    return (
+        below
+        and form.delimiter == usual
+        and form.decimal == "."
+        and all(map(is_preamble, where.above))
+    )
 
 
 def _same(one: Table, other: Table) -> bool:

@@ -164,8 +164,13 @@ def day_of(text: str, day_first: bool = False) -> str:
 
 def day_of_rows(name: str, cells: Sequence[str]) -> str:
     """The one day of all cells of a column of times; empty where it is none, or there are several days."""
-    days = {day_of(cell, not _ENGLISH_DATE.match(name)) for cell in cells if cell}
-    return days.pop() if len(days) == 1 else ""
+    day = ""
+    for cell in filter(None, cells):
+        each = day_of(cell, not _ENGLISH_DATE.match(name))
+        if not each or (day and each != day):
+            return ""
+        day = each
+    return day
 
 
 _MEANT = {_word(word): key for key, words in _TITLE_WORDS.items() for word in words.split()}
