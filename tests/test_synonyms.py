@@ -11,7 +11,16 @@ from cli_support import calibrated, mwdcal, numbers, read_csv, refused, servo_ru
 from mwdcal.errors import FitError, InputError
 from mwdcal.files import documents, synonyms
 from mwdcal.files.contract import COLUMNS
-from mwdcal.files.synonyms import CONVERSIONS, Resemblance, check_evidence, resembled, unused
+from mwdcal.files.synonyms import (
+    ABOVE,
+    ANTICLOCKWISE,
+    BELOW,
+    CONVERSIONS,
+    Resemblance,
+    check_evidence,
+    resembled,
+    unused,
+)
 from mwdcal.geometry.observables import RESULTS
 from mwdcal.identification.columns import proposed
 from simulation import Tool
@@ -78,6 +87,8 @@ def test_conversions_are_those_of_the_units():
     known = {
         "°F": (212.0, 100.0), "K": (373.15, 100.0), "rad": (np.pi, 180.0), "mg": (998.0, 0.998),
         "m/s²": (9.80665, 1.0), "µT": (48.0, 48_000.0), "mT": (0.048, 48_000.0), "gauss": (0.48, 48_000.0),
+        "mG": (480.0, 48_000.0), "gon": (100.0, 90.0), ABOVE: (-90.0, 0.0), BELOW: (90.0, 0.0),
+        ANTICLOCKWISE: (90.0, -90.0),
     }  # fmt: skip
     assert known.keys() == CONVERSIONS.keys()
     for unit, (given_as, wanted) in known.items():

@@ -115,8 +115,14 @@ def is_moved(path: str | os.PathLike[str], profile: Profile) -> bool:
     assert not isinstance(form, msgspec.UnsetType)
     with suppress(InputError, FitError):
         where = tables.laid_out(path, wanted=_channels_of(profile))
-        return where is not None and (where.form, where.sheet) != (form, "")
+        return where is not None and (where.number > 0 or not _same_place(where.form, form))
     return False
+
+
+def _same_place(one: TableFormat, other: TableFormat) -> bool:
+    """Whether two tables are written alike; the units below the names may be absent."""
+    written = ("encoding", "delimiter", "decimal", "header_line", "first_line")
+    return all(getattr(one, name) == getattr(other, name) for name in written)
 
 
 def _channels_of(profile: Profile) -> list[str]:

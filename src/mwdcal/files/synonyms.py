@@ -53,9 +53,9 @@ CONVERSIONS = {
     "gauss": "nT = gauss · 1e5",
     "mG": "nT = mG · 100",
     "gon": "° = gon · 0.9",
-    ABOVE: "inclination = 90° + elevation",
-    BELOW: "inclination = 90° - elevation",
-    ANTICLOCKWISE: "toolface = -angle",
+    ABOVE: f"° = {ABOVE} + 90",
+    BELOW: f"° = 90 - {BELOW}",
+    ANTICLOCKWISE: f"° = -{ANTICLOCKWISE}",
 }
 """How another unit is converted into that of the contract."""
 FACTORS = {
@@ -256,6 +256,8 @@ def resembled(name: str) -> Resemblance | None:
     >>> resembled("HX [steps]")
     Resemblance(column='mx', unit='steps')
     """
+    if name in _CHANNELS:
+        return None
     whole, bracketed = _resembled(name), _BRACKETED.fullmatch(name.strip())
     if whole or not bracketed or not (bare := _resembled(bracketed[1])):
         return whole
@@ -273,7 +275,7 @@ def _resembled(name: str) -> Resemblance | None:
     column = _column(whole, bare, set(words), unit)
     if column is None and _is_warmth(every, whole):
         column = "temperature_c"
-    if column is None:
+    if column is None or (unit == "counts" and column not in _CHANNELS):
         return None
     if not spread:
         implied = "°F" if "f" in (whole[-1:], bare[-1:]) and column == "temperature_c" else ""

@@ -51,7 +51,10 @@ _CCW = re.compile(
     re.IGNORECASE,
 )
 """Words of angles that count anticlockwise."""
-_SPOKEN = {"rad": r"radian|радиан|\brad\b", "gon": r"\bgon\b"}
+_SPOKEN = {
+    "rad": re.compile(r"radian|радиан|\brad\b", re.IGNORECASE),
+    "gon": re.compile(r"\bgon\b", re.IGNORECASE),
+}
 """Units of angles in a line above a table."""
 _SURROUNDINGS = re.compile(
     r"oven|chamber|ambient|(?<![a-z])(air|room|bath|lab)(?![a-z])|ofen|kammer|umgebung|raum|ovn|rom|horno|ambiente|"
@@ -247,7 +250,7 @@ def _spoken(meanings: Mapping[str, Resemblance], values: Values, above: Sequence
     A run needs rolls: toolfaces that are all below 6.3 are in radians.
     """
     text = " ".join(above)
-    stated = (unit for unit, words in _SPOKEN.items() if re.search(words, text, re.IGNORECASE))
+    stated = (unit for unit, words in _SPOKEN.items() if words.search(text))
     if unit := next(stated, ""):
         return unit
     rolls = [

@@ -57,12 +57,13 @@ Cells = Sequence[object]
 class Sheet(NamedTuple):
     """The rows of a sheet that are not blank, by number, each without blank cells at its end.
 
-    `form`: encoding and delimiter of a text.
+    `form`: encoding and delimiter of a text; `number` of the sheet in its file, from 0.
     """
 
     name: str
     rows: list[tuple[int, Cells]]
     form: TableFormat = TableFormat()
+    number: int = 0
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,8 @@ class Layout:
     """A table in a sheet: names and units of its columns, their cells, and what was not read.
 
     `form` says how the table is written, `cells` are text, numbers in it with a decimal point, and `texts` the same
-    as they stand there. `left_out` are lines below the names that are no readings, `above` the texts above them;
+    as they stand there; `fractions` are columns of a workbook with numbers that are not whole. `left_out` are lines
+    below the names that are no readings, `above` the texts above them;
     `titles` what the title block says of the tool and the day.
     """
 
@@ -81,6 +83,8 @@ class Layout:
     cells: list[list[str]]
     texts: list[list[str]]
     lines: list[int]
+    number: int = 0
+    fractions: tuple[str, ...] = ()
     above: tuple[str, ...] = ()
     titles: Titles = field(default_factory=lambda: Titles({}))
     left_out: tuple[tuple[int, str], ...] = ()
@@ -230,6 +234,10 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
             texts[names.index(n)] if n in names else c for n, c in zip(whole, joined, strict=True)
         ],
         lines=[line for line, _ in kept],
+        number=sheet.number,
+        fractions=tuple(
+            n for n, column in zip(names, columns, strict=True) if any(map(_is_fraction, column))
+        ),
         above=tuple(" ".join(map(as_text, row)).strip() for row in above),
         titles=_dated(titles(above), names, texts),
         left_out=tuple((line, _words(row)) for line, row in others if not _same(row, rows, head)),
@@ -270,6 +278,10 @@ def _dated(stated: Titles, names: Sequence[str], texts: Sequence[Sequence[str]])
     days = (day_of_rows(name, column) for name, column in zip(names, texts, strict=True))
     day = next(filter(None, days), "") if "date" not in stated.metadata else ""
     return Titles({**stated.metadata, "date": day}) if day else stated
+
+
+def _is_fraction(cell: object) -> bool:
+    return isinstance(cell, float) and not cell.is_integer()
 
 
 def _with_minutes(
@@ -400,5 +412,10 @@ def _is_mean(row: Cells, above: Sequence[Cells]) -> bool:
 
 def as_columns(layout: Layout, labels: Collection[str] = ()) -> dict[str, list[str]]:
     """The cells by the names of the columns; `labels` are columns whose cells are kept as they stand."""
+    for name in {*labels}.intersection(layout.fractions):
+        raise InputError(
+            f"the column {shown(name)}: a serial or label must be text; it has numbers, of which a workbook keeps no "
+            "last zero. Format the column as text, and type them as they stand on the tools."
+        )
     each = zip(layout.names, layout.cells, layout.texts, strict=True)
     return {name: texts if name in labels else cells for name, cells, texts in each}

@@ -6,12 +6,12 @@ import csv
 import io
 import re
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from mwdcal.errors import InputError
-from mwdcal.files.formats import dialect, figures, text, workbook
+from mwdcal.files.formats import dialect, figures, text
 from mwdcal.files.formats.columns import at_most, damaged_unless_read
 from mwdcal.files.formats.layout import Cells, Sheet
 from mwdcal.sensor.profile import TableFormat
@@ -36,11 +36,11 @@ def sheets_of(data: bytes, name: str) -> list[Sheet]:
     """
     suffix = Path(name).suffix.lower()
     if suffix == ".xlsx":
+        from mwdcal.files.formats import workbook
+
         names = workbook.sheet_names(data, name)
         return [
-            Sheet(
-                title, [(line, _plain(row)) for line, row in workbook.read_rows(data, name, place)]
-            )
+            Sheet(title, _rows(workbook.read_rows(data, name, place)), number=place)
             for place, title in enumerate(names)
         ]
     if suffix in OTHER_WORKBOOKS:
@@ -51,6 +51,10 @@ def sheets_of(data: bytes, name: str) -> list[Sheet]:
     mark, rows = _delimited(lines, name)
     form = TableFormat(encoding=encoding, delimiter=mark if mark in DELIMITERS else ",")  # type: ignore[arg-type]
     return [Sheet("", rows, form)]
+
+
+def _rows(rows: Iterable[tuple[int, Cells]]) -> list[tuple[int, Cells]]:
+    return [(line, _plain(row)) for line, row in rows]
 
 
 def _plain(row: Cells) -> list[object]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from mwdcal.errors import InputError, reason
 from mwdcal.files import metadata as meta
-from mwdcal.files.formats import atomic, dialect, layout, sheets, text
+from mwdcal.files.formats import atomic, dialect, layout, text
 from mwdcal.files.formats.columns import (
     LABELS,
     Column,
@@ -34,15 +34,14 @@ from mwdcal.sensor.profile import TableFormat
 _TABLES = {
     ".csv": "formats.text",
     ".tsv": "formats.text",
-    **dict.fromkeys((".txt", ".dat", ".lvm", ".asc", ".prn"), "formats.text"),
     ".parquet": "formats.parquet",
     ".xlsx": "formats.workbook",
 }
 _FORMATS = {**_TABLES, ".xml": "exchange.witsml", ".las": "exchange.las"}
-SUFFIXES = (".csv", ".tsv", ".txt", ".parquet", ".xlsx")
+SUFFIXES = tuple(_TABLES)
 """Of tables as documented; those of other programs are `EXCHANGED`."""
-LAID_OUT = (*(s for s in _TABLES if s != ".parquet"), *sheets.OTHER_WORKBOOKS)
-"""Suffixes of files in which a table is looked for."""
+LAID_OUT = (".csv", ".tsv", ".txt", ".dat", ".lvm", ".asc", ".prn", ".xlsx", ".xls", ".ods")
+"""Suffixes of files in which a table is looked for; those that are no tables as documented need a profile."""
 EXCHANGED = (".xml", ".las")
 """Suffixes of WITSML and LAS, whose columns are taken from the format's own names."""
 
@@ -225,6 +224,8 @@ def laid_out(
         InputError: the file cannot be read, or holds no such table.
         FitError: several tables that may be meant, or an open decimal sign.
     """
+    from mwdcal.files.formats import sheets
+
     file = Path(path)
     if file.suffix.lower() not in LAID_OUT:
         return None
@@ -266,17 +267,17 @@ def below_names(path: str | os.PathLike[str], form: TableFormat) -> list[tuple[i
 
 def _format(suffix: str) -> Any:
     """The module that reads and writes a format."""
-    if suffix in sheets.OTHER_WORKBOOKS:
-        raise InputError(
-            f"{suffix} files are read with a tool profile that mwdcal profile has made of one. Name it, or save the "
-            "sheet as .xlsx."
-        )
     return import_module(f"mwdcal.files.{_FORMATS[suffix]}")
 
 
 def _suffix(path: Path) -> str:
     suffix = path.suffix.lower()
-    if suffix not in _FORMATS and suffix not in sheets.OTHER_WORKBOOKS:
+    if suffix in LAID_OUT and suffix not in _FORMATS:
+        raise InputError(
+            f"'{path}': a {suffix} file is read by a tool profile that mwdcal profile has made of it. Name one by "
+            f"`tool`, or save the table as one of {', '.join(_TABLES)}."
+        )
+    if suffix not in _FORMATS:
         raise InputError(
             f"'{path}': the suffix must be one of {', '.join(_FORMATS)}; got "
             f"'{suffix or 'none'}'. Convert or rename the file."
@@ -288,7 +289,8 @@ def _content(path: Path) -> bytes:
     """The bytes of a regular file of a known suffix that is not too large."""
     try:
         check_file(path)
-        most = _LARGEST_FILES.get(_suffix(path), _LARGEST_TEXT)
+        suffix = path.suffix.lower()
+        most = _LARGEST_FILES.get(suffix if suffix in LAID_OUT else _suffix(path), _LARGEST_TEXT)
         advice = "Split it, or write long tables as Parquet."
         at_most(path.stat().st_size, most, f"'{path}'", "the file", "bytes", advice)
         return path.read_bytes()
