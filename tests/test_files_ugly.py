@@ -205,8 +205,9 @@ def test_a_folder_a_missing_file_and_unknown_suffixes(tmp_path):
     assert "no such file" in refusal(tmp_path / "missing.csv")
     assert "no such file" in refusal(tmp_path / "nul\0.csv")
     valid = "must be one of .csv, .tsv, .parquet, .xlsx"
-    for name in ("run.csv.gz", "run.xls", "run"):
+    for name in ("run.csv.gz", "run"):
         assert valid in refusal(put(tmp_path, ROW, name))
+    assert "mwdcal profile" in refusal(put(tmp_path, ROW, "run.xls"))
 
 
 @pytest.mark.skipif(os.name == "nt", reason="POSIX devices")

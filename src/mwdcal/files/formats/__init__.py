@@ -1,1 +1,1 @@
-"""Tables as CSV, TSV, Parquet and XLSX, and files that are written whole or not at all."""
+"""Tables as CSV, TSV, Parquet, XLSX and in any laboratory's `layout`; files that are written whole or not at all."""
