@@ -177,8 +177,8 @@ class Questions(list[str]):
         if len(texts) == 1:
             raise FitError(f"{source}: {texts[0]}")
         if texts:
-            listed = "\n".join(f"{n}. {text}" for n, text in enumerate(texts, 1))
-            raise FitError(f"{source}: {len(texts)} questions are open.\n{listed}")
+            listed = " ".join(f"({n}) {text}" for n, text in enumerate(texts, 1))
+            raise FitError(f"{source}: {len(texts)} questions are open. {listed}")
 
 
 def proposed(

@@ -53,7 +53,7 @@ class Proposal(NamedTuple):
     """A profile, how the axes of each triad in it were told, and the run that told.
 
     `unused` are columns of the table that are nothing of a run file, `by_value` columns of a run file whose
-    unit no name states; `metadata` what the table says of itself.
+    unit no name states; `metadata` what the table says of itself; `where` the table was, if it was looked for.
     """
 
     profile: Profile
@@ -63,6 +63,7 @@ class Proposal(NamedTuple):
     by_value: set[str]
     metadata: Mapping[str, object]
     run_sha256: str
+    where: Layout | None = None
 
 
 def propose(
@@ -88,7 +89,6 @@ def propose(
     table = replace(table, metadata={**table.metadata, **(stated or {})})
     names = where.names if where else [*table.columns]
     units = where.units if where else [""] * len(names)
-    above = where.above if where else ()
 
     problems: dict[str, str] = {}
 
@@ -102,18 +102,18 @@ def propose(
 
     north_stated = "azimuth_reference" in table.metadata
     columns, by_value = proposed(
-        names, units, values, table.source, above, north_stated, answers, problems
+        names,
+        units,
+        values,
+        table.source,
+        where.above if where else (),
+        north_stated,
+        answers,
+        problems,
     )
     profile = Profile(name=Path(path).stem, table=form or msgspec.UNSET, columns=columns)
     profile, readings, wirings = _wired(table, profile)
-    scales = {kind: _rounded(result.scale) for kind, result in wirings.items()}
-    if readings.relative:
-        scales["magnetometer"] = None
-    triads = {
-        kind: TriadProfile(axes=result.axes, scale=scales[kind])  # type: ignore[arg-type]
-        for kind, result in wirings.items()
-    }
-    name = str(readings.metadata.get("serial", Path(path).stem))
+    name, triads = str(readings.metadata.get("serial", Path(path).stem)), _triads(readings, wirings)
     profile = msgspec.structs.replace(profile, name=name, **triads)
     return Proposal(
         _without_the_usual(profile),
@@ -123,7 +123,19 @@ def propose(
         by_value,
         readings.metadata,
         readings.run_sha256,
+        where,
     )
+
+
+def _triads(readings: Readings, wirings: Mapping[str, Wiring]) -> dict[str, TriadProfile]:
+    """The triads of a profile: axes, and scales but for that of a magnetometer without a field strength."""
+    scales = {kind: _rounded(result.scale) for kind, result in wirings.items()}
+    if readings.relative:
+        scales["magnetometer"] = None
+    return {
+        kind: TriadProfile(axes=result.axes, scale=scales[kind])  # type: ignore[arg-type]
+        for kind, result in wirings.items()
+    }
 
 
 def _wired(table: Table, profile: Profile) -> tuple[Profile, Readings, dict[str, Wiring]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ from mwdcal.presentation.numbers import written
 from mwdcal.presentation.text import one_line, plural, table
 from mwdcal.sensor.profile import Profile, TableFormat, TriadProfile
 
+MOST_LEFT_OUT = 4
+"""Rows that the screen names."""
 SCALE_UNITS = {"accelerometer": "g", "magnetometer": "nT"}
 
 
@@ -62,7 +65,7 @@ def screen(proposal: Proposal, run: Path, output: Path | None) -> str:
     head = [run.name, profile.name, plural(proposal.stations, "station")]
     blocks = ["   ".join(map(one_line, [*head, *simulated(proposal.metadata)]))]
     if not isinstance(profile.table, msgspec.UnsetType):
-        blocks[0] += "\n" + _layout(profile.table, run.suffix.lower() == ".xlsx")
+        blocks[0] += "\n" + _layout(proposal, profile.table, run)
     if not isinstance(profile.columns, msgspec.UnsetType):
         guesses = dict.fromkeys(proposal.by_value, ", by its values")
         rows = [
@@ -95,12 +98,27 @@ def _scale(scale: float | None, unit: str) -> str:
     return f"{scale:g} raw units per {unit}" if scale else "left open: no field strength"
 
 
-def _layout(form: TableFormat, workbook: bool) -> str:
-    """How a table is written."""
-    if workbook:
-        return f"names in row {form.header_line}, readings from row {form.first_line}"
-    sign = "tab" if form.delimiter == "\t" else f"'{form.delimiter}'"
-    return (
-        f"{form.encoding}, delimiter {sign}, decimal sign '{form.decimal}', names in line "
-        f"{form.header_line}, readings from line {form.first_line}"
+def _layout(proposal: Proposal, form: TableFormat, run: Path) -> str:
+    """Where a table is and how it is written."""
+    where = proposal.where
+    written_so = where.form if where and form.find else form
+    workbook = run.suffix.lower() in (".xlsx", ".xls", ".ods")
+    word = "row" if workbook else "line"
+    place = (
+        f"names in {word} {written_so.header_line}, readings from {word} {written_so.first_line}"
     )
+    if form.find:
+        place += "; looked for by its names whenever it is read"
+    if where and where.left_out:
+        place += f"\nleft out: {_left_out(where.left_out, word)}"
+    if workbook:
+        return f"sheet '{one_line(where.sheet)}', {place}" if where else place
+    sign = "tab" if written_so.delimiter == "\t" else f"'{written_so.delimiter}'"
+    return f"{written_so.encoding}, delimiter {sign}, decimal sign '{written_so.decimal}', {place}"
+
+
+def _left_out(rows: Sequence[tuple[int, str]], word: str) -> str:
+    """The rows below the names that are no readings, the first few by what they say."""
+    named = [f"{word} {line} ({one_line(text)})" for line, text in rows[:MOST_LEFT_OUT]]
+    more = len(rows) - MOST_LEFT_OUT
+    return ", ".join(named) + (f" and {more} more" if more > 0 else "")
