@@ -41,7 +41,10 @@ _FAMILIES = {
 }
 """Columns of a triad, letters that its curves begin with (AX, GX), units that the header may state."""
 _UNITS_BY_ENDING = {"_m": "M", "_deg": "DEG", "_g": "G", "_nt": "NT", "_c": "DEGC", "_s": "S"}
-_NULLS = (-999.25, -9999.0, -999999.0, -987654321.0, -1.2345e300)
+_NULLS = (
+    *(-999.25, -9999.0, -999999.0, -987654321.0),
+    *(float(f"-1.{digits}e300") for digits in range(1001, 1100)),
+)
 """What may stand for a blank cell: the first one that is not a value."""
 _PARSED = "VWCP"
 """Sections of the header that lasio reads."""
