@@ -39,6 +39,7 @@ from mwdcal.files.faults import Cells, columns_of, faults, faults_beside_reading
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, Column, shown
 from mwdcal.files.formats.dialect import holds_numbers
+from mwdcal.files.formats.layout import Layout
 from mwdcal.files.formats.table import Table, labels
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import ColumnSource, Profile, TableFormat, TriadProfile
@@ -87,7 +88,11 @@ def read_export(
     if isinstance(form, msgspec.UnsetType):
         return tables.read(path, decimal=decimal, rows=rows)
     if form.find:
-        return _looked_for(path, profile)
+        decimal = "," if form.decimal == "," else ""
+        where = tables.laid_out(
+            path, sheet=form.sheet, wanted=_channels_of(profile), decimal=decimal
+        )
+        return _of_layout(where, path, profile) if where else tables.read(path)
     try:
         serial = _sources(profile).get("serial", ColumnSource(name="serial")).name
         table = tables.read(path, rows=rows, export=form, serial=serial)
@@ -101,22 +106,21 @@ def read_export(
         table = tables.read(path, decimal=decimal, rows=rows)
         if set(CHANNELS["accelerometer"]) <= {*table.columns}:
             return table
-    if is_moved(path, profile):
-        return _looked_for(path, profile)
+    if moved := _moved(path, form, profile):
+        return _of_layout(moved, path, profile)
     raise InputError(
         f"{problem} If the table is laid out otherwise than the tool profile says, correct [table] there, "
         "or propose a profile for it: mwdcal profile."
     )
 
 
-def is_moved(path: str | os.PathLike[str], profile: Profile) -> bool:
-    """Whether a file holds the table of a profile elsewhere than the profile says."""
-    form = profile.table
-    assert not isinstance(form, msgspec.UnsetType)
+def _moved(path: str | os.PathLike[str], form: TableFormat, profile: Profile) -> Layout | None:
+    """Where a file has the table of a profile, if elsewhere than the profile says."""
     with suppress(InputError, FitError):
         where = tables.laid_out(path, wanted=_channels_of(profile))
-        return where is not None and (where.number > 0 or not _same_place(where.form, form))
-    return False
+        if where and (where.number > 0 or not _same_place(where.form, form)):
+            return where
+    return None
 
 
 def _same_place(one: TableFormat, other: TableFormat) -> bool:
@@ -129,19 +133,12 @@ def _channels_of(profile: Profile) -> list[str]:
     return [each.name for column, each in _sources(profile).items() if column in RAW]
 
 
-def _looked_for(path: str | os.PathLike[str], profile: Profile) -> Table:
-    """The table in a file that has the channels of a profile, wherever it is.
+def _of_layout(where: Layout, path: str | os.PathLike[str], profile: Profile) -> Table:
+    """The table of a layout that has the channels of a profile.
 
     Raises:
-        InputError: there is none, or a column is in another unit than the profile says.
-        FitError: there are several.
+        InputError: a column is in another unit than the profile says.
     """
-    form = profile.table
-    assert not isinstance(form, msgspec.UnsetType)
-    decimal = "," if form.decimal == "," else ""
-    where = tables.laid_out(path, sheet=form.sheet, wanted=_channels_of(profile), decimal=decimal)
-    if where is None:
-        return tables.read(path)
     named = {each.name: column for column, each in _sources(profile).items()}
     for name, unit in zip(where.names, map(synonyms.unit_of, where.units), strict=True):
         stated = _sources(profile)[named[name]].unit if name in named else ""

@@ -84,10 +84,15 @@ def _without_end(line: str, delimiter: str, ends: int) -> str:
     return line
 
 
-def _cells(lines: Sequence[str], delimiter: str, source: str) -> Rows:
-    """The cells of each line."""
+def cells_of(
+    lines: Sequence[str], delimiter: str, source: str, *, skip_blanks: bool = False
+) -> Rows:
+    """The cells of each line; `skip_blanks` before a cell, which may be in quotes behind them."""
     try:
-        return [next(csv.reader([line], delimiter=delimiter), []) for line in lines]
+        return [
+            next(csv.reader([line], delimiter=delimiter, skipinitialspace=skip_blanks), [])
+            for line in lines
+        ]
     except csv.Error as error:
         raise InputError(
             f"{source}: the file is no table of text ({error}). Name the file with the readings."
@@ -111,10 +116,10 @@ def holds_numbers(row: Sequence[str]) -> bool:
 def above(data: bytes, form: TableFormat, source: str) -> Rows:
     """The lines above the column names."""
     lines = decoded(data, form.encoding, source).split("\n")
-    return _cells(lines[: form.header_line - 1], form.delimiter, source)
+    return cells_of(lines[: form.header_line - 1], form.delimiter, source)
 
 
 def below_names(data: bytes, form: TableFormat, source: str) -> Rows:
     """The names of the columns, and the lines between them and the first readings."""
     lines = decoded(data, form.encoding, source).split("\n")
-    return _cells(lines[form.header_line - 1 : form.first_line - 1], form.delimiter, source)
+    return cells_of(lines[form.header_line - 1 : form.first_line - 1], form.delimiter, source)

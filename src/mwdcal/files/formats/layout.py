@@ -19,7 +19,7 @@ import numpy as np
 from mwdcal.errors import FitError, InputError
 from mwdcal.files.formats import figures
 from mwdcal.files.formats.columns import as_text, looks_numeric, plain_names, shown
-from mwdcal.files.formats.titles import Titles, day_of_rows, titles
+from mwdcal.files.formats.titles import Titles, dated, titles
 from mwdcal.files.synonyms import unit_of
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import TableFormat
@@ -164,7 +164,7 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
     """The tables of a sheet, one below the other."""
     rows = sheet.rows
     heads = [k for k in range(len(rows)) if _is_head(rows, k)]
-    heads = [k for n, k in enumerate(heads) if n == 0 or not _repeats(rows, heads[0], k)]
+    heads = [k for n, k in enumerate(heads) if n == 0 or not _repeats(rows[k][1], rows, heads[0])]
     for head, end in pairwise([*heads, len(rows)]):
         if layout := _table(sheet, head, end, source, decimal):
             yield layout
@@ -176,9 +176,9 @@ def _is_head(rows: Sequence[tuple[int, Cells]], place: int) -> bool:
     return below and not _is_reading(rows[place][1]) and _texts(rows[place][1]) >= LEAST_COLUMNS
 
 
-def _repeats(rows: Sequence[tuple[int, Cells]], first: int, place: int) -> bool:
+def _repeats(row: Cells, rows: Sequence[tuple[int, Cells]], head: int) -> bool:
     """Whether a row repeats the names, or the units, above the first readings."""
-    return any(rows[k][1] == rows[place][1] for k in range(max(0, first - 2), first + 1))
+    return any(row == each for _, each in rows[max(0, head - 2) : head + 1])
 
 
 def _texts(row: Cells) -> int:
@@ -196,24 +196,17 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
     rows = sheet.rows
     names, units, top = _head(rows, head)
     readings = [place for place in range(head + 1, end) if _is_reading(rows[place][1])]
-    kept = _without_summary([rows[place] for place in readings], names)
+    kept = _without_summary([rows[place] for place in readings])
     lines = {line for line, _ in kept}
-    others = (rows[k] for k in range(head + 1, end) if rows[k][0] not in lines)
-    _check_cut(
-        kept, [row for k in range(head + 1, end) if (row := rows[k])[0] not in lines], source
-    )
-    width = max(len(names), *(len(row) for _, row in kept)) if kept else 0
-    if width < LEAST_COLUMNS:
+    others = [row for row in rows[head + 1 : end] if row[0] not in lines]
+    _check_cut(kept, others, source)
+    if not kept or max(len(names), *(len(row) for _, row in kept)) < LEAST_COLUMNS:
         return None
-    names, units = ([*each, *[""] * (width - len(each))] for each in (names, units))
-    columns = [[row[k] if k < len(row) else "" for _, row in kept] for k in range(width)]
-    used = [k for k in range(width) if names[k] or any(cell != "" for cell in columns[k])]
-    columns = [columns[k] for k in used]
-    names = [names[k] for k in used]
-    units = [units[k] for k in used]
+    names, units, columns = _used(kept, names, units)
     sign = decimal or figures.decimal_sign([c for column in columns for c in column], source)
     read = [figures.column(column, sign) for column in columns]
     above = [row for _, row in rows[:top]]
+    block = titles(above)
     texts = [[as_text(cell).strip() for cell in column] for column in columns]
     whole, joined = _with_minutes(names, [cells for cells, _ in read])
     stated = {
@@ -227,7 +220,7 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
             header_line=rows[head - any(units)][0],
             first_line=kept[0][0],
         ),
-        names=plain_names(list(whole)),
+        names=plain_names(whole),
         units=[stated.get(name, "") for name in whole],
         cells=joined,
         texts=[
@@ -239,9 +232,22 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
             n for n, column in zip(names, columns, strict=True) if any(map(_is_fraction, column))
         ),
         above=tuple(" ".join(map(as_text, row)).strip() for row in above),
-        titles=_dated(titles(above), names, texts),
-        left_out=tuple((line, _words(row)) for line, row in others if not _same(row, rows, head)),
+        titles=block._replace(metadata=dated(block.metadata, zip(names, texts, strict=True))),
+        left_out=tuple(
+            (line, _words(row)) for line, row in others if not _repeats(row, rows, head)
+        ),
     )
+
+
+def _used(
+    rows: Sequence[tuple[int, Cells]], names: Sequence[str], units: Sequence[str]
+) -> tuple[list[str], list[str], list[list[object]]]:
+    """Names, units and cells of the columns that have a name or a cell that is filled in."""
+    width = max(len(names), *(len(row) for _, row in rows))
+    names, units = ([*each, *[""] * (width - len(each))] for each in (names, units))
+    columns = [[row[k] if k < len(row) else "" for _, row in rows] for k in range(width)]
+    used = [k for k in range(width) if names[k] or any(cell != "" for cell in columns[k])]
+    return [names[k] for k in used], [units[k] for k in used], [columns[k] for k in used]
 
 
 def _check_cut(
@@ -273,13 +279,6 @@ def _form(cell: object) -> str:
     return re.sub(r"\d+([.,]\d+)?", "9", as_text(cell))
 
 
-def _dated(stated: Titles, names: Sequence[str], texts: Sequence[Sequence[str]]) -> Titles:
-    """What a title block says, with the day of a column of times where it names none."""
-    days = (day_of_rows(name, column) for name, column in zip(names, texts, strict=True))
-    day = next(filter(None, days), "") if "date" not in stated.metadata else ""
-    return Titles({**stated.metadata, "date": day}) if day else stated
-
-
 def _is_fraction(cell: object) -> bool:
     return isinstance(cell, float) and not cell.is_integer()
 
@@ -308,10 +307,6 @@ def _sum(degrees: str, minutes: str) -> str:
         return f"{degrees} {minutes}".strip()
     part = float(minutes) / 60
     return repr(float(degrees) + (-part if degrees.startswith("-") else part))
-
-
-def _same(row: Cells, rows: Sequence[tuple[int, Cells]], head: int) -> bool:
-    return any(row == rows[k][1] for k in range(max(0, head - 2), head + 1))
 
 
 def _words(row: Cells) -> str:
@@ -379,9 +374,7 @@ def _is_units(row: Cells) -> bool:
     return len(known) >= 2 and short and 2 * len(known) >= len([c for c in bare if c.strip("-–")])
 
 
-def _without_summary(
-    rows: Sequence[tuple[int, Cells]], names: Sequence[str]
-) -> list[tuple[int, Cells]]:
+def _without_summary(rows: Sequence[tuple[int, Cells]]) -> list[tuple[int, Cells]]:
     """Rows of readings without those of statistics: called so, or equal to the means of those above."""
     kept = [row for row in rows if not _is_summary(row[1])]
     numbered = sum(bool(row) and figures.is_figure(row[0]) for _, row in kept)

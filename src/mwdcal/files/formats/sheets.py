@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import re
 import zipfile
@@ -38,11 +37,8 @@ def sheets_of(data: bytes, name: str) -> list[Sheet]:
     if suffix == ".xlsx":
         from mwdcal.files.formats import workbook
 
-        names = workbook.sheet_names(data, name)
-        return [
-            Sheet(title, _rows(workbook.read_rows(data, name, place)), number=place)
-            for place, title in enumerate(names)
-        ]
+        pages = workbook.read_sheets(data, name)
+        return [Sheet(title, _rows(page), number=n) for n, (title, page) in enumerate(pages)]
     if suffix in OTHER_WORKBOOKS:
         return list(_by_calamine(data, name))
     text.refuse_foreign(data, name, allowed=text.UTF_16)
@@ -81,20 +77,8 @@ def _split(lines: Sequence[str], mark: str, source: str) -> list[list[str]]:
     if mark == _BLANKS:
         runs = r"\s{2,}|\t" if any(re.search(r"\S\s{2,}\S", line) for line in lines) else r"\s+"
         return [re.split(runs, line.strip()) if line.strip() else [] for line in lines]
-    try:
-        return [
-            [
-                cell.strip()
-                for cell in next(
-                    csv.reader([line.rstrip("\r")], delimiter=mark, skipinitialspace=True), []
-                )
-            ]
-            for line in lines
-        ]
-    except csv.Error as error:
-        raise InputError(
-            f"{source}: the file is no table of text ({error}). Name the file with the readings."
-        ) from None
+    rows = dialect.cells_of(lines, mark, source, skip_blanks=True)
+    return [[cell.strip() for cell in row] for row in rows]
 
 
 def _trimmed(row: Sequence[object]) -> list[object]:

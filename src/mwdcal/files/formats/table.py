@@ -8,7 +8,6 @@ import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
-from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,7 @@ from mwdcal.files.formats.columns import (
     looks_numeric,
 )
 from mwdcal.files.formats.columns import shown as shown
-from mwdcal.files.formats.titles import day_of_rows, titles
+from mwdcal.files.formats.titles import dated, titles
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import TableFormat
 
@@ -110,29 +109,20 @@ def parsed(
     suffix = _suffix(Path(name))
     form = _format(suffix)
     arguments: dict[str, Any] = {"most": rows} if suffix == ".parquet" else {}
-    stated = titles(_above(data, suffix, export, name)).metadata if export else {}
+    stated: Mapping[str, object] = {}
     if export and form is text:
+        stated = titles(dialect.above(data, export, name)).metadata
         data, arguments = dialect.plain(data, export, name), {"delimiter": export.delimiter}
     elif suffix == ".xlsx":
         arguments = {"form": export, "serial": serial}
     decimal = export.decimal if export else decimal
     parts: Parts = form.parse(data, name, **arguments)
     metadata = {**stated, **parts.metadata}
-    if export and "date" not in metadata:
-        texts = ((n, c) for n, c in parts.columns.items() if isinstance(c, list))
-        day = next(filter(None, (day_of_rows(name, cells) for name, cells in texts)), "")
-        metadata |= {"date": day} if day else {}
-    return Table(parts.columns, metadata, name, parts.lines, digest, decimal)
-
-
-def _above(data: bytes, suffix: str, export: TableFormat, name: str) -> Sequence[Sequence[object]]:
-    """The rows above the column names of an export."""
-    if suffix == ".xlsx":
-        rows = takewhile(
-            lambda row: row[0] < export.header_line, _format(suffix).read_rows(data, name)
+    if export:
+        metadata = dated(
+            metadata, ((n, c) for n, c in parts.columns.items() if isinstance(c, list))
         )
-        return [["" if cell is None else cell for cell in cells] for _, cells in rows]
-    return dialect.above(data, export, name) if _format(suffix) is text else []
+    return Table(parts.columns, metadata, name, parts.lines, digest, decimal)
 
 
 def check_decimal(decimal: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from typing import NamedTuple
 
@@ -162,7 +162,17 @@ def day_of(text: str, day_first: bool = False) -> str:
     return days.pop() if len(days) == 1 else ""
 
 
-def day_of_rows(name: str, cells: Sequence[str]) -> str:
+def dated(
+    metadata: Mapping[str, object], columns: Iterable[tuple[str, Sequence[str]]]
+) -> dict[str, object]:
+    """Metadata with the day of a column of times, where they have no date."""
+    if "date" in metadata:
+        return dict(metadata)
+    day = next(filter(None, (_day_of_cells(name, cells) for name, cells in columns)), "")
+    return {**metadata, "date": day} if day else dict(metadata)
+
+
+def _day_of_cells(name: str, cells: Sequence[str]) -> str:
     """The one day of all cells of a column of times; empty where it is none, or there are several days."""
     day = ""
     for cell in filter(None, cells):

@@ -8,6 +8,7 @@ import re
 import warnings
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from itertools import takewhile
 from typing import Any
 from xml.etree.ElementTree import iterparse
@@ -26,6 +27,7 @@ from mwdcal.files.formats.columns import (
     typed,
 )
 from mwdcal.files.formats.dialect import is_metadata
+from mwdcal.files.formats.titles import titles
 from mwdcal.sensor.profile import TableFormat
 
 # A file must not depend on the hour it was written: the first day a ZIP archive can hold.
@@ -48,12 +50,16 @@ def parse(
 
     `serial` is the name of the column of serials, which are read as the workbook shows them.
     """
-    rows = [row for row in read_rows(data, source) if form is None or _belongs(*row, form)]
+    every = list(read_rows(data, source))
+    rows = [row for row in every if form is None or _belongs(*row, form)]
     comments = list(takewhile(_is_comment, rows))
     table = rows[len(comments) :]
     width = len(table[0][1]) if table else 0
     padded = ((line, [*row, *[None] * (width - len(row))]) for line, row in table)
     metadata = meta.parse([(line, str(row[0]).strip()) for line, row in comments], source, "row")
+    if form:
+        above = [[as_text(cell) for cell in row] for line, row in every if line < form.header_line]
+        metadata = {**titles(above).metadata, **metadata}
     names, cells, lines = assemble(padded, source, "row")
     named = zip(names, zip(*cells, strict=True), strict=True)
     columns = {name: typed(name, column) for name, column in named}
@@ -166,35 +172,42 @@ def _check_formulas(archive: zipfile.ZipFile, sheet: str, source: str) -> None:
         )
 
 
-def read_rows(data: bytes, source: str, sheet: int = 0) -> Iterator[Row]:
-    """Row numbers and cells of a sheet, by default the first, without blank cells at the end and blank rows."""
+def read_rows(data: bytes, source: str) -> Iterator[Row]:
+    """Row numbers and cells of the first sheet, without blank cells at the end and blank rows."""
+    with _opened(data, source) as (archive, book):
+        yield from _rows(archive, book.worksheets[0], source)
+
+
+def read_sheets(data: bytes, source: str) -> Iterator[tuple[str, Iterator[Row]]]:
+    """The names of all sheets, and their rows as `read_rows` gives them: each to be read before the next."""
+    with _opened(data, source) as (archive, book):
+        for page in book.worksheets:
+            yield page.title, _rows(archive, page, source)
+
+
+@contextmanager
+def _opened(data: bytes, source: str) -> Iterator[tuple[zipfile.ZipFile, Any]]:
+    """The archive of a workbook that is small enough, and the workbook."""
     openpyxl = _module(source)
     advice = "Save it again as .xlsx, or as CSV UTF-8."
     with (
         damaged_unless_read(source, "an Excel workbook (.xlsx)", advice),
         warnings.catch_warnings(),
+        zipfile.ZipFile(io.BytesIO(data)) as archive,
     ):
         warnings.simplefilter("ignore")
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            workbook_limits.check(archive, source)
-            book = openpyxl.load_workbook(io.BytesIO(data), read_only=True, data_only=True)
-            page = book.worksheets[sheet]
-            _check_formulas(archive, page._worksheet_path, source)
-        page.reset_dimensions()
-        for line, row in enumerate(page.iter_rows(values_only=True), 1):
-            cells = _trimmed([_read(value) for value in row])
-            if cells:
-                yield line, cells
+        workbook_limits.check(archive, source)
+        yield archive, openpyxl.load_workbook(io.BytesIO(data), read_only=True, data_only=True)
 
 
-def sheet_names(data: bytes, source: str) -> list[str]:
-    """The names of the sheets of a workbook."""
-    advice = "Save it again as .xlsx, or as CSV UTF-8."
-    with damaged_unless_read(source, "an Excel workbook (.xlsx)", advice):
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            workbook_limits.check(archive, source)
-        book = _module(source).load_workbook(io.BytesIO(data), read_only=True)
-        return [page.title for page in book.worksheets]
+def _rows(archive: zipfile.ZipFile, page: Any, source: str) -> Iterator[Row]:
+    """Row numbers and cells of a sheet that are not blank."""
+    _check_formulas(archive, page._worksheet_path, source)
+    page.reset_dimensions()
+    for line, row in enumerate(page.iter_rows(values_only=True), 1):
+        cells = _trimmed([_read(value) for value in row])
+        if cells:
+            yield line, cells
 
 
 def _read(value: object) -> object:
