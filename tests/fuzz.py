@@ -524,7 +524,8 @@ def document_file(r: random.Random, sample: str, stem: Path) -> Path:
             node = node[key]
         old = node[last]
         if isinstance(old, int | float) and r.random() < 0.6:
-            node[last] = old * r.choice((-1, 0, 2, 1 + 1e-9, 1e6, 1e200))
+            near = max(min(old, 10**300), -(10**300))  # a longer integer is no float
+            node[last] = near * r.choice((-1, 0, 2, 1 + 1e-9, 1e6, 1e200))
         elif isinstance(node, dict) and r.random() < 0.3:
             del node[last]
         else:

@@ -58,6 +58,13 @@ def test_a_table_is_taken_as_it_comes(tmp_path, name):
     assert [*differences(taken(path), laboratory.truth)] == []
 
 
+def test_an_error_in_a_cell_of_any_workbook_names_its_row(tmp_path):
+    laboratory = next(each for each in LABORATORIES.values() if each.file.endswith(".ods"))
+    path = tmp_path / laboratory.file
+    path.write_bytes(laboratory.content)
+    assert ", row " in str(tables.cell_error(taken(path), "gx", 0, "no number"))
+
+
 @pytest.mark.parametrize("name", ASKED)
 def test_what_is_open_is_asked(tmp_path, name):
     path = tmp_path / LABORATORIES[name].file

@@ -184,6 +184,7 @@ INCONSISTENT = {
     "stations forgotten and none said": (forget_stations, "'stations' is 0"),
     "stations miscounted": (setting("stations", value=47), "'stations' is 47"),
     "gravity zero": (setting("earth", "gravity_g", value=0.0), "gravity_g"),
+    "radius of no sensor": (setting("accelerometer", "radius", value=1e-300), "cannot be inverted"),
     "axis mirrored": (mirrored_axis, "left-handed"),
     "axes exchanged": (exchanged_axes, "left-handed"),
 }
@@ -399,6 +400,10 @@ def test_gains_that_mirror_or_cannot_be_inverted_are_told_from_others():
     flat = np.diag([1.0, 1.0, 1e-5])
     stack = np.stack([np.eye(3), turned, -np.eye(3), flat, np.full((3, 3), np.nan)])[:, None]
     assert mirrored(stack)[:4].tolist() == [False, False, True, False]
+    assert mirrored(stack[:4] * 1e300).tolist() == [False, False, True, False]
+    assert not mirrored(stack[:4] * 0.0).any()
+    assert not invertible(stack[:2] * 1e31).any()
+    assert not invertible(stack[:2] * 1e-31).any()
     assert invertible(stack).tolist() == [True, True, True, False, False]
 
 

@@ -10,6 +10,7 @@ import msgspec
 from msgspec.structs import asdict
 
 from mwdcal.calibration.readings import TRIADS, simulated
+from mwdcal.files.formats.layout import WORKBOOKS
 from mwdcal.identification.proposal import Proposal, in_order
 from mwdcal.presentation.envelope import enveloped
 from mwdcal.presentation.numbers import written
@@ -102,7 +103,7 @@ def _layout(proposal: Proposal, form: TableFormat, run: Path) -> str:
     """Where a table is and how it is written."""
     where = proposal.where
     written_so = where.form if where and form.find else form
-    workbook = run.suffix.lower() in (".xlsx", ".xls", ".ods")
+    workbook = run.suffix.lower() in WORKBOOKS
     word = "row" if workbook else "line"
     place = (
         f"names in {word} {written_so.header_line}, readings from {word} {written_so.first_line}"

@@ -19,7 +19,7 @@ from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import Array, Bools, diagonal, outer
 
 LARGEST = 1e30
-"""Magnitude that no number of a calibration reaches."""
+"""Magnitude that no number of a calibration reaches, nor the inverse of a gain."""
 WORST = 1e4
 """Condition number that the gains of a real sensor never reach."""
 ASYMMETRY = 1e-6
@@ -198,12 +198,16 @@ def _semidefinite(correlation: Array) -> Bools:
 
 
 def invertible(slope: Array) -> Bools:
-    """Which gains (..., k, 3, 3) are finite and can be inverted at each of k places (...)."""
+    """Which gains (..., k, 3, 3) can be inverted at each of k places (...): finite, of a usual size, no axis lost."""
     finite = np.isfinite(slope)
-    condition = np.linalg.cond(np.where(finite, slope, 0.0))
+    largest = np.abs(np.where(finite, slope, 0.0)).max((-1, -2))
+    sized = (largest <= LARGEST) & (largest >= 1 / LARGEST)
+    condition = np.linalg.cond(np.where(finite & sized[..., None, None], slope, 0.0))
     return np.asarray(np.all(finite, (-1, -2, -3)) & np.all(condition <= WORST, -1))
 
 
 def mirrored(slope: Array) -> Bools:
     """Which gains (..., k, 3, 3) turn a right-handed triad into a left-handed one (...)."""
-    return np.asarray(np.any(np.linalg.det(np.nan_to_num(slope)) < 0, -1))
+    finite = np.nan_to_num(slope)
+    largest = np.abs(finite).max((-2, -1), keepdims=True)
+    return np.asarray(np.any(np.linalg.det(finite / np.where(largest > 0, largest, 1.0)) < 0, -1))

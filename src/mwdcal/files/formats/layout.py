@@ -24,6 +24,8 @@ from mwdcal.files.synonyms import unit_of
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import TableFormat
 
+WORKBOOKS = (".xlsx", ".xls", ".ods")
+"""Suffixes of files whose tables have rows, not lines."""
 LEAST_COLUMNS = 4
 """Columns that a table with three channels and a reference has at least."""
 _MOST_HEADER_ROWS = 3

@@ -12,11 +12,9 @@ from typing import Any
 from mwdcal.errors import InputError
 from mwdcal.files.formats import dialect, figures, text
 from mwdcal.files.formats.columns import at_most, damaged_unless_read
-from mwdcal.files.formats.layout import Cells, Sheet
+from mwdcal.files.formats.layout import WORKBOOKS, Cells, Sheet
 from mwdcal.sensor.profile import TableFormat
 
-OTHER_WORKBOOKS = (".ods", ".xls")
-"""Suffixes of workbooks that only a layout that is looked for can be read from."""
 DELIMITERS = (";", "\t", ",", "|")
 _BLANKS = "blanks"
 _LOOKED_AT = 400
@@ -39,7 +37,7 @@ def sheets_of(data: bytes, name: str) -> list[Sheet]:
 
         pages = workbook.read_sheets(data, name)
         return [Sheet(title, _rows(page), number=n) for n, (title, page) in enumerate(pages)]
-    if suffix in OTHER_WORKBOOKS:
+    if suffix in WORKBOOKS:
         return list(_by_calamine(data, name))
     text.refuse_foreign(data, name, allowed=text.UTF_16)
     encoding = dialect.encoding_of(data)

@@ -39,7 +39,7 @@ _TABLES = {
 _FORMATS = {**_TABLES, ".xml": "exchange.witsml", ".las": "exchange.las"}
 SUFFIXES = tuple(_TABLES)
 """Of tables as documented; those of other programs are `EXCHANGED`."""
-LAID_OUT = (".csv", ".tsv", ".txt", ".dat", ".lvm", ".asc", ".prn", ".xlsx", ".xls", ".ods")
+LAID_OUT = (".csv", ".tsv", ".txt", ".dat", ".lvm", ".asc", ".prn", *layout.WORKBOOKS)
 """Suffixes of files in which a table is looked for; those that are no tables as documented need a profile."""
 EXCHANGED = (".xml", ".las")
 """Suffixes of WITSML and LAS, whose columns are taken from the format's own names."""
@@ -195,7 +195,11 @@ def labels(table: Table, name: str) -> list[str]:
 
 def cell_error(table: Table, name: str, row: int, problem: str) -> InputError:
     """The error that names file, line and column before the problem."""
-    word = "row" if Path(table.source).suffix.lower() in ("", ".parquet", ".xlsx") else "line"
+    word = (
+        "row"
+        if Path(table.source).suffix.lower() in ("", ".parquet", *layout.WORKBOOKS)
+        else "line"
+    )
     number = table.lines[row] if row < len(table.lines) else row + 1
     return InputError(f"{table.source}, {word} {number}, column '{name}': {problem}")
 
