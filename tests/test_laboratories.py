@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 import mwdcal
+from cli_support import EXAMPLE
 from laboratories import laboratories, mutated
+from mwdcal.errors import InputError
 from mwdcal.files.formats import table as tables
 from mwdcal.files.runs import read_export, renamed
 
@@ -63,6 +65,12 @@ def test_an_error_in_a_cell_of_any_workbook_names_its_row(tmp_path):
     path = tmp_path / laboratory.file
     path.write_bytes(laboratory.content)
     assert ", row " in str(tables.cell_error(taken(path), "gx", 0, "no number"))
+
+
+@pytest.mark.parametrize("sign", [";", "point"])
+def test_a_decimal_sign_of_no_number_is_refused(sign):
+    with pytest.raises(InputError, match="must be '.' or ','"):
+        mwdcal.propose_profile(EXAMPLE / "run.csv", decimal=sign)
 
 
 @pytest.mark.parametrize("name", ASKED)

@@ -220,6 +220,8 @@ def laid_out(
     """
     from mwdcal.files.formats import sheets
 
+    if decimal:
+        check_decimal(decimal)
     file = Path(path)
     if file.suffix.lower() not in LAID_OUT:
         return None
