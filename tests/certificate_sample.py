@@ -10,13 +10,13 @@ from mwdcal.certificate.document import (
     LimitDecision,
     Method,
     Party,
-    Person,
     Quantity,
     ResultTable,
     Signature,
     SourceFile,
     TracedStandard,
 )
+from mwdcal.sensor.profile import Person
 
 GUARDED = "guarded acceptance: noise-free value + 2 × its 1σ must not exceed the limit"
 

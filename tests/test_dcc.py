@@ -30,7 +30,6 @@ from mwdcal.certificate.document import (
     LimitDecision,
     Method,
     Party,
-    Person,
     Quantity,
     ResultTable,
     Signature,
@@ -40,6 +39,7 @@ from mwdcal.certificate.document import (
 )
 from mwdcal.errors import InputError
 from mwdcal.files.exchange import xml
+from mwdcal.sensor.profile import Person
 
 UNITS = {
     "1": (r"\one", 1.0),

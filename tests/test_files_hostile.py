@@ -16,7 +16,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from cli_support import calibrated, mwdcal, servo_run
+from cli_support import calibrated, mwdcal, refused, servo_run
 from mwdcal.app import streaming
 from mwdcal.errors import InputError
 from mwdcal.files import metadata, profiles
@@ -190,6 +190,18 @@ def workbook(path, sheet=b"", part="xl/worksheets/sheet1.xml", head=b""):
         for name, content in parts.items():
             archive.writestr(name, content)
     return path
+
+
+def test_a_sheet_that_names_a_text_that_is_not_there_is_damaged(tmp_path):
+    row = (
+        b'<row r="1">'
+        + b"".join(b'<c r="%cl" t="s"><v>99</v></c>' % c for c in b"ABCD")
+        + b"</row>"
+    )
+    path = workbook(tmp_path / "run.xlsx", row.replace(b'l"', b'1"'))
+    for arguments in (("profile", path), ("calibrate", path)):
+        ran = mwdcal(*arguments, "-o", tmp_path / "out")
+        assert "expected an Excel workbook" in refused(ran, 2)
 
 
 FLOOD = b"".join(b' a%d=""' % i for i in range(200_000))

@@ -12,8 +12,8 @@ from msgspec.structs import replace as with_changes
 from scipy import stats
 
 import mwdcal
+from cli_support import EXAMPLE, process, refused, write_csv
 from cli_support import mwdcal as command
-from cli_support import process, refused, write_csv
 from mwdcal.calibration.options import Options
 from mwdcal.files.limits import load_limits
 from mwdcal.files.profiles import load_profile
@@ -329,3 +329,14 @@ def test_a_turn_on_is_no_error_of_the_calibration_and_is_one_of_the_roll_test():
     assert np.median(true) > np.degrees(
         0.02
     )  # two switchings on, of which 20 mg each turn gravity by 1.1°
+
+
+def test_a_field_in_volts_without_a_scale_states_no_uncertainty_lost_in_rounding(tmp_path):
+    """Warnings are errors here."""
+    tool = tmp_path / "tool.toml"
+    tool.write_text((EXAMPLE / "tool.toml").read_text().replace("scale = 5e-5", "# "))
+    ran = command(
+        "simulate", "--tool", tool, "-o", tmp_path / "tools.csv", "--repeat", 20, "--limits", "moradi",
+        "--workers", 1, "--model", "factors",
+    )  # fmt: skip
+    assert ran.code == 0, ran.err

@@ -362,6 +362,15 @@ def test_what_is_no_file_of_a_registry_is_named_and_stops_nothing(example, tmp_p
     assert "not added" in alone.err
 
 
+def test_a_laboratory_whose_people_have_no_name_is_not_added(tmp_path):
+    lab = tmp_path / "lab.toml"
+    lab.write_text(LAB.replace('name = "C. Moe"\n', ""))
+    registry(tmp_path / "r.sqlite", "init")
+    ran = mwdcal("registry", "--database", tmp_path / "r.sqlite", "add", lab)
+    assert ran.code == 2
+    assert "`name`" in ran.err
+
+
 def test_no_file_of_a_folder_is_left_out_but_those_that_systems_hide(example, tmp_path):
     folder = tmp_path / "mixed" / "_old"
     folder.mkdir(parents=True)

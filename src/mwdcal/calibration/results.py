@@ -304,7 +304,8 @@ def triad_results(
     params = result.state.params[:, where]
     to_file = np.broadcast_to(to_file, (len(params), *to_file.shape[-2:]))
     inner = to_file @ covariance[:, where, where]
-    sd = np.sqrt(np.einsum("bij,bij->bi", inner, to_file))
+    variance = np.einsum("bij,bij->bi", inner, to_file)
+    sd = np.sqrt(np.where(variance >= 0, variance, np.nan))  # below 0: lost in rounding
     values = np.einsum("bij,bj->bi", to_file, params)
     size = np.full(len(params), triad.model.size)
     rank = size.copy()

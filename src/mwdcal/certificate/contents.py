@@ -42,7 +42,6 @@ from mwdcal.certificate.document import (
     Item,
     Method,
     Party,
-    Person,
     SourceFile,
     TracedStandard,
 )
@@ -50,7 +49,7 @@ from mwdcal.certificate.laboratory import Laboratory, filled_pattern
 from mwdcal.certificate.tables import conditions, result_tables
 from mwdcal.errors import InputError
 from mwdcal.files.verifications import Verification
-from mwdcal.sensor.profile import MeasurementStandard
+from mwdcal.sensor.profile import MeasurementStandard, Person
 
 DOCUMENTATION = "mwdcal documentation, Methods"
 MOOSAVI = "S. M. Seyed Moosavi et al., Error Analysis in Accelerometers Calibration of MWD Instruments (2016)"

@@ -13,6 +13,7 @@ import msgspec
 from mwdcal.calibration.canonical import Signature
 from mwdcal.calibration.record import Finding
 from mwdcal.files.documents import laid_out
+from mwdcal.sensor.profile import Person
 
 CERTIFICATE_VERSION = 1
 """Version of the certificate's JSON: higher when a key goes, or changes its meaning."""
@@ -29,13 +30,6 @@ class Party(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     country: str = ""
     contact: str = ""
     accreditation: str = ""
-
-
-class Person(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Who measured, or who authorised the certificate."""
-
-    name: str
-    function: str = ""
 
 
 class Item(msgspec.Struct, frozen=True, kw_only=True):

@@ -10,10 +10,10 @@ from typing import Literal
 
 import msgspec
 
-from mwdcal.certificate.document import Party, Person
+from mwdcal.certificate.document import Party
 from mwdcal.errors import InputError
 from mwdcal.files.profiles import decoded_toml
-from mwdcal.sensor.profile import MeasurementStandard
+from mwdcal.sensor.profile import MeasurementStandard, Person
 
 NUMBER_FIELDS = ("serial", "date", "year", "digest")
 """What a pattern of certificate numbers may contain, in braces."""

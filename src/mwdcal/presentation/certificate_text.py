@@ -17,7 +17,6 @@ from mwdcal.certificate.document import (
     ConformityTest,
     LimitDecision,
     Party,
-    Person,
     Quantity,
     ResultTable,
     TracedStandard,
@@ -25,6 +24,7 @@ from mwdcal.certificate.document import (
 from mwdcal.presentation.certificate import EXACT_DIGITS, plain, probability, quantity_numbers
 from mwdcal.presentation.numbers import UNDETERMINED, capital, contribution, measured, unit
 from mwdcal.presentation.text import NOT_STATED, chance, harmless, plural
+from mwdcal.sensor.profile import Person
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

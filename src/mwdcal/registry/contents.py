@@ -20,7 +20,7 @@ from mwdcal.files.metadata import load_toml
 from mwdcal.files.profiles import decoded_profile
 from mwdcal.registry.store import Entry
 from mwdcal.registry.stored import LARGEST_OBJECT
-from mwdcal.sensor.profile import MeasurementStandard
+from mwdcal.sensor.profile import MeasurementStandard, Person
 
 TABLE_SUFFIXES = (*tables.SUFFIXES, *tables.EXCHANGED)
 """Suffixes of files with tables."""
@@ -138,11 +138,11 @@ def _of_toml(data: bytes, name: str) -> list[Entry]:
         raise InputError(f"{name}: {_NOT_KEPT}") from None
     try:
         kind = _toml_kind(fields, data, name)
-        people = [fields[key] for key in PEOPLE if key in fields]
+        people = [msgspec.convert(fields[key], Person) for key in PEOPLE if key in fields]
         standards = msgspec.convert(fields.get("standards", []), list[MeasurementStandard])
     except (msgspec.ValidationError, TypeError) as error:
         raise InputError(f"{name}: {error}. Correct the file.") from None
-    derived = [("person", {"function": "", **each}) for each in people]
+    derived = [("person", msgspec.to_builtins(each)) for each in people]
     derived += [("standard", msgspec.to_builtins(each)) for each in standards]
     return [
         Entry(kind, data, name),

@@ -164,6 +164,13 @@ class MeasurementStandard(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
     due: date | None = None
 
 
+class Person(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Who measured, or who authorised the certificate."""
+
+    name: str
+    function: str = ""
+
+
 class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A tool as its maker describes it: see `docs/files.md` for the TOML form.
 

@@ -27,10 +27,10 @@ from mwdcal.certificate.document import (
     ConformityTest,
     Item,
     Party,
-    Person,
     TracedStandard,
 )
 from mwdcal.errors import InputError
+from mwdcal.sensor.profile import Person
 
 UNKNOWN_COUNTRY = "ZZ"
 """A code that ISO 3166-1 leaves to its users, here for a country that is not stated."""

@@ -33,6 +33,8 @@ from mwdcal.sensor.profile import TableFormat
 # A file must not depend on the hour it was written: the first day a ZIP archive can hold.
 _EPOCH = datetime.datetime(1980, 1, 1)
 _TIMES = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ")
+_EXPECTED = "an Excel workbook (.xlsx)", "Save it again as .xlsx, or as CSV UTF-8."
+"""What a damaged file should have been, and what to do."""
 LONGEST_CELL = 32_767
 _MOST_DIGITS = 15
 _FORMULA = re.compile(rb"<(\w+:)?f[\s/>]")
@@ -189,9 +191,8 @@ def read_sheets(data: bytes, source: str) -> Iterator[tuple[str, Iterator[Row]]]
 def _opened(data: bytes, source: str) -> Iterator[tuple[zipfile.ZipFile, Any]]:
     """The archive of a workbook that is small enough, and the workbook."""
     openpyxl = _module(source)
-    advice = "Save it again as .xlsx, or as CSV UTF-8."
     with (
-        damaged_unless_read(source, "an Excel workbook (.xlsx)", advice),
+        damaged_unless_read(source, *_EXPECTED),
         warnings.catch_warnings(),
         zipfile.ZipFile(io.BytesIO(data)) as archive,
     ):
@@ -202,12 +203,13 @@ def _opened(data: bytes, source: str) -> Iterator[tuple[zipfile.ZipFile, Any]]:
 
 def _rows(archive: zipfile.ZipFile, page: Any, source: str) -> Iterator[Row]:
     """Row numbers and cells of a sheet that are not blank."""
-    _check_formulas(archive, page._worksheet_path, source)
-    page.reset_dimensions()
-    for line, row in enumerate(page.iter_rows(values_only=True), 1):
-        cells = _trimmed([_read(value) for value in row])
-        if cells:
-            yield line, cells
+    with damaged_unless_read(source, *_EXPECTED):
+        _check_formulas(archive, page._worksheet_path, source)
+        page.reset_dimensions()
+        for line, row in enumerate(page.iter_rows(values_only=True), 1):
+            cells = _trimmed([_read(value) for value in row])
+            if cells:
+                yield line, cells
 
 
 def _read(value: object) -> object:
