@@ -150,6 +150,33 @@ def test_sensor_block_turned_about_the_tool_axis(tmp_path, fitted):
     assert failed(rows) == {"error of toolface"}
 
 
+@pytest.mark.parametrize("bias_g", [0.0, 5e-3])
+def test_tables_to_a_verdict_in_one_command_are_the_two_commands(tmp_path, fitted, bias_g):
+    run = write_csv(tmp_path / "run.csv", fitted[1])
+    test = roll(tmp_path, ax=lambda r: r["ax"] + bias_g * SCALE[0])
+    alone, both = tmp_path / "alone.json", tmp_path / "both.json"
+    mwdcal("calibrate", run, "--tool", "servo", "-o", alone)
+    ran = mwdcal("calibrate", run, "--tool", "servo", "-o", both, "--rolltest", test, "--json",
+                 "--report", tmp_path / "page.html")  # fmt: skip
+    verdict = mwdcal("verify", both, test, "--json", "--report", tmp_path / "verified.html")
+    assert ran.code == verdict.code == int(bias_g > 0)
+    stated = ran.json["verification"]
+    assert stated == {name: verdict.json[name] for name in stated}
+    first, second = (json.loads(path.read_text()) for path in (alone, both))
+    assert {**first, "time": "", "sha256": ""} == {**second, "time": "", "sha256": ""}
+    assert (tmp_path / "page.html").read_bytes() == (tmp_path / "verified.html").read_bytes()
+    shown = mwdcal("calibrate", run, "--tool", "servo", "-o", both, "--rolltest", test)
+    assert ("FAIL" in shown.out) == ("next: mwdcal diagnose" in shown.out) == (bias_g > 0)
+    assert "PASS" in shown.out or bias_g
+
+
+def test_a_roll_test_of_the_fit_itself_leaves_no_file(tmp_path, fitted):
+    run = write_csv(tmp_path / "run.csv", fitted[1])
+    ran = mwdcal("calibrate", run, "-o", tmp_path / "c.json", "--rolltest", run)
+    assert "were in the fit" in refused(ran, 2)
+    assert not (tmp_path / "c.json").exists()
+
+
 def test_the_guarded_rule_takes_twice_the_uncertainty_off(tmp_path, fitted):
     """A value just under its limit passes the simple rule and fails the guarded one."""
     run = roll(tmp_path)

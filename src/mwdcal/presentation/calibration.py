@@ -31,7 +31,7 @@ from mwdcal.presentation.text import chance, number, one_line, quantity, table
 from mwdcal.presentation.typed import findings_as_typed
 
 if TYPE_CHECKING:
-    pass
+    from mwdcal.use.verification import Verdict
 
 MOST_RESHOOTS = 12
 """Most stations to re-shoot that messages name."""
@@ -82,6 +82,8 @@ class CalibrationSummary(msgspec.Struct, frozen=True, kw_only=True):
     nonlinearity: list[CurveScore]
     calibration: str
     report: str
+    verification: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
+    """What `verify` says of the roll test, without its head."""
 
 
 def _recorded(kind: type[msgspec.Struct], record: msgspec.Struct) -> dict[str, Any]:
@@ -91,9 +93,13 @@ def _recorded(kind: type[msgspec.Struct], record: msgspec.Struct) -> dict[str, A
 
 
 def summary(
-    calibration: Calibration, tried: list[CurveScore], output: Path | None, report: Path | None
+    calibration: Calibration,
+    tried: list[CurveScore],
+    output: Path | None,
+    report: Path | None,
+    verdict: Verdict | None = None,
 ) -> dict[str, Any]:
-    """The result for machines."""
+    """The result for machines, with the verdict of a roll test if there was one."""
     findings = findings_as_typed(calibration.findings)
     content = CalibrationSummary(
         **{**_recorded(CalibrationSummary, calibration), "findings": findings},
@@ -102,6 +108,7 @@ def summary(
         nonlinearity=tried,
         calibration=str(output or ""),
         report=str(report or ""),
+        verification=msgspec.to_builtins(verdict) if verdict else msgspec.UNSET,
     )
     return enveloped(
         "calibrate",
@@ -126,12 +133,16 @@ def body(calibration: Calibration, tried: list[CurveScore]) -> str:
 
 
 def screen(
-    calibration: Calibration, tried: list[CurveScore], output: Path, report: Path | None
+    calibration: Calibration,
+    tried: list[CurveScore],
+    output: Path,
+    report: Path | None,
+    judged: str = "",
 ) -> str:
-    """The result for people, with the files that were written, and what to do next."""
+    """The result for people, the files that were written, and what to do next or what `judged` says of it."""
     files = written(calibration=output, report=report)
-    after = f"{files}   next: mwdcal verify {one_line(output)} ROLLTEST.csv"
-    return f"{body(calibration, tried)}\n{after}"
+    after = f"\n\n{judged}" if judged else f"   next: mwdcal verify {one_line(output)} ROLLTEST.csv"
+    return f"{body(calibration, tried)}\n{files}{after}"
 
 
 def first_findings(calibration: Calibration) -> list[Finding]:

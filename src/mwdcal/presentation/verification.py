@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
 from msgspec import UNSET
 
@@ -45,6 +46,15 @@ def screen(
     header = ["", "raw", "noise-free", "1σ", FREEDOM, "limit", "", "where"]
     blocks = ["\n".join(map(one_line, lines)), table(rows, header, WIDE), *_sets(result)]
     return "\n\n".join(blocks)
+
+
+def next_step(result: Verdict, calibration: Path, run: Path) -> str:
+    """The command that says what a failed roll test looks like, as a line below it; nothing if no value failed."""
+    if not any(row.value is not None and not row.passed for row in result.rows):
+        return ""
+    return (
+        f"\n\nnext: mwdcal diagnose {one_line(calibration)} {one_line(run)}   (what it looks like)"
+    )
 
 
 def _sets(result: Verdict) -> list[str]:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
-from typing import Unpack
+from typing import TYPE_CHECKING, Unpack
 
 import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result, say
+
+if TYPE_CHECKING:
+    from mwdcal.calibration.readings import Readings
+    from mwdcal.calibration.record import Calibration
+    from mwdcal.use.verification import Verdict
 
 
 @options.command()
@@ -24,37 +30,67 @@ from mwdcal.app.messages import print_result, say
 @click.option(
     "--exclude", multiple=True, metavar="STATION", help="Leave a station out; may be repeated."
 )
+@click.option(
+    "--rolltest",
+    type=options.FILE,
+    metavar="TABLE",
+    help="Verify the result by this roll test at once.",
+)
+@options.LIMITS
 @options.report()
 @options.DECIMAL
 @options.JSON
 def command(
-    run: Path, output: Path, tool: str | None, exclude: tuple[str, ...],
+    run: Path, output: Path, tool: str | None, exclude: tuple[str, ...], rolltest: Path | None, limits: str,
     report: Path | None, decimal: str, as_json: bool, **typed: Unpack[options.Typed],
 ) -> None:  # fmt: skip
     """Fit the sensor model to a calibration RUN (CSV, TSV, Parquet, XLSX, WITSML or LAS).
 
     \b
-    Example: mwdcal calibrate run.csv --tool servo -o tool.json --report tool.html
-    Exit: 0 calibrated, 2 input cannot be read, 3 fit failed or refused.
+    Example: mwdcal calibrate run.csv --tool servo -o tool.json --rolltest roll.csv
+    Exit: 0 calibrated (and passed), 1 the roll test fails, 2 input cannot be read, 3 fit failed or refused.
     """
     from mwdcal.app.choices import load_run, options_of, prior_of
     from mwdcal.calibration.calibrate import chosen_fit, recorded
-    from mwdcal.files import documents
+    from mwdcal.files import documents, runs
     from mwdcal.files.formats import atomic
     from mwdcal.presentation import calibration as screen
 
-    options.check_outputs([output], [run, tool, typed["prior"]], page=report, calibration=True)
+    inputs = [run, tool, typed["prior"], rolltest, limits]
+    options.check_outputs([output], inputs, page=report, calibration=True)
     prior, digest = prior_of(typed["prior"])
     readings, profile = load_run(run, tool, decimal, prior)
+    turned = runs.read_run(rolltest, profile, decimal=decimal)[0] if rolltest else None
     choice, result = chosen_fit(readings, profile, options_of(typed, prior, exclude, digest), say)
     calibration = recorded(choice, result)
+    verdict, judged = _judged(calibration, turned, limits, (output, rolltest))
     rendered = ""
     if report:
         from mwdcal.presentation.calibration_page import render
 
-        rendered = render(calibration)
-    shown = (screen.summary if as_json else screen.screen)(
-        calibration, choice.curves, output, report
+        rendered = render(calibration, verdict, *([turned.metadata] if turned else []))
+    files = output, report
+    shown = (
+        screen.summary(calibration, choice.curves, *files, verdict)
+        if as_json
+        else screen.screen(calibration, choice.curves, *files, judged)
     )
     atomic.write_all([(output, documents.encode(calibration)), (report, rendered)])
-    print_result(shown, screen.first_findings(calibration))
+    print_result(shown, screen.first_findings(calibration) + (verdict.findings if verdict else []))
+    sys.exit(0 if verdict is None or verdict.passed else 1)
+
+
+def _judged(
+    calibration: Calibration,
+    rolltest: Readings | None,
+    limits: str,
+    files: tuple[Path, Path | None],
+) -> tuple[Verdict | None, str]:
+    """The verdict of a roll test, if there is one, and its screen; `files` of calibration and roll test."""
+    if rolltest is None or files[1] is None:
+        return None, ""
+    from mwdcal.library.tasks import verify
+    from mwdcal.presentation.verification import next_step, screen
+
+    verdict = verify(calibration, rolltest, Path(limits))
+    return verdict, screen(verdict, None) + next_step(verdict, files[0], files[1])

@@ -61,6 +61,9 @@ WHERE_OUTSIDE = preset(
     help="Results of rows more than 1 °C (without temperature terms: 5 °C) outside the calibrated "
     "temperatures: none; refuse the file; or extrapolated, and marked as such.",
 )
+LIMITS = preset(
+    "--limits", default="roll-test", metavar="NAME|FILE", help="Limits profile of the roll test."
+)
 DECIMAL = preset(
     "--decimal", default=".", metavar="SIGN", help="Decimal sign of numbers in text files."
 )

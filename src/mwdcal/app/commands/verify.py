@@ -14,7 +14,7 @@ from mwdcal.presentation.typed import findings_as_typed
 @options.command()
 @options.CALIBRATION
 @options.RUN
-@options.preset("--limits", default="roll-test", metavar="NAME|FILE", help="Limits profile.")
+@options.LIMITS
 @options.RESULT
 @options.report(help="Also write the report, with this verdict.")
 @options.DECIMAL
@@ -38,7 +38,7 @@ def command(
     from mwdcal.files.limits import load_limits
     from mwdcal.presentation.envelope import enveloped, with_signature
     from mwdcal.presentation.signature import load_calibration
-    from mwdcal.presentation.verification import screen
+    from mwdcal.presentation.verification import next_step, screen
     from mwdcal.use.verification import verify
 
     options.check_outputs([output], [calibration, run, limits, *key], page=report)
@@ -61,7 +61,6 @@ def command(
 
         rendered = render(fitted, result, *stated)
     atomic.write_all([(output, to_json(document) + "\n"), (report, rendered)])
-    print_result(
-        document if as_json else screen(result, loaded.signature, *stated), result.findings
-    )
+    shown = screen(result, loaded.signature, *stated) + next_step(result, calibration, run)
+    print_result(document if as_json else shown, result.findings)
     sys.exit(0 if result.passed else 1)
