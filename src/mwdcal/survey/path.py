@@ -155,12 +155,14 @@ class DirectionErrors:
         systematic: shifts (…, n, k, 2) upward and sideways, rad, by one standard deviation of each of k
             independent causes that last over the well.
         random: covariance (…, n, 2, 2) of the errors that are new at every station, rad².
+        course: the same of a turn of the whole course that ends at each station; None: exact.
     """
 
     inclination: Array
     azimuth: Array
     systematic: Array
     random: Array
+    course: Array | None = None
 
 
 class _Sums(NamedTuple):
@@ -262,12 +264,14 @@ def position_covariance(
     systematic: ArrayLike | None = None,
     random: ArrayLike | None = None,
     balanced: bool = False,
+    course: ArrayLike | None = None,
 ) -> Array:
     """Covariance (…, n, 3, 3) of the positions (north, east, down) of survey stations, m².
 
     `systematic` (…, n, k, 2 or 3): shifts upward, sideways and, where there is a third, in measured depth, by one
     standard deviation of each of k independent causes that last over the well. `random` (…, n, 2, 2 or 3, 3):
-    covariance of the same of the errors that are new at every station.
+    covariance of the same of the errors that are new at every station. `course` (…, n, 2, 2): of a turn, upward and
+    sideways, of the whole course that ends at a station.
     `balanced`: by the balanced tangential method, as the numbers of published error models are.
     The first station is where the path starts: its position is exact, its direction has the errors given for it.
     Units: m, radians. Singular: finite at vertical, with any number for the azimuth that the shifts refer to.
@@ -281,8 +285,9 @@ def position_covariance(
 
     def part(where: slice) -> tuple[Array, DirectionErrors]:
         stations = (..., where, slice(None), slice(None))
-        errors = DirectionErrors(inc[..., where], azi[..., where], lasting[stations], new[stations])
-        return md[..., where], errors
+        whole = None if course is None else np.asarray(course, float)[stations]
+        angles = inc[..., where], azi[..., where]
+        return md[..., where], DirectionErrors(*angles, lasting[stations], new[stations], whole)
 
     return np.concatenate(
         [covariance for _, covariance in _along(md.shape[-1], part, balanced=balanced)], -3
@@ -352,7 +357,8 @@ def _part_of_path(
 ) -> tuple[Array, Array, _Sums]:
     """Positions and covariance of stations the first of which has the sums `before`, and those of the last."""
     arc = arcs(md, hole_direction(errors.inclination, errors.azimuth), balanced)
-    upper, lower = _reach(arc, tilts(errors.inclination, errors.azimuth))
+    turns = tilts(errors.inclination, errors.azimuth)
+    upper, lower = _reach(arc, turns)
     shifts, random = errors.systematic, errors.random
     rows = slice(shifts.shape[-1])
     step = (
@@ -364,6 +370,9 @@ def _part_of_path(
     arrival = np.concatenate([before.arrival[..., None, :, :], lower[..., rows, :]], -3)
     through = arrival[..., :-1, :, :] + upper[..., rows, :]
     passed = through.mT @ random[..., :-1, :, :] @ through
+    if errors.course is not None:
+        turned = arc.length[..., None, None] * turns[..., 1:, :, :]
+        passed = passed + turned.mT @ errors.course[..., 1:, :, :] @ turned
     settled = _sums_from(before.settled, passed, -3)
     covariance = settled + arrival.mT @ random @ arrival + shift.mT @ shift
     last = _Sums(position[..., -1, :], *(each[..., -1, :, :] for each in (shift, settled, arrival)))
