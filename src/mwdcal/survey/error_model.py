@@ -73,7 +73,7 @@ class ErrorTerm(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def kind(self) -> str:
-        """Whether one error acts on all stations ("lasting"), each has its own ("random"), or each course ("course")."""
+        """One error for all stations ("lasting"), one for each ("random"), or one for each course ("course")."""
         if self.propagation_mode != "Random":
             return "lasting"
         return "course" if self.name.startswith(COURSE_TERMS) else "random"
