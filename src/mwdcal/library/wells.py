@@ -430,6 +430,7 @@ def survey(
     msa: bool = False,
     limits: FilePath | SurveyLimits = "owsg-mwd",
     sensor_drift: FilePath | None = None,
+    error_model: FilePath | ErrorModel = "owsg-mwd",
     switch: tuple[float, float] = (3.0, 5.0),
     tie_in: tuple[float, float, float] | None = None,
     outside: Literal["blank", "refuse", "extrapolate"] = "blank",
@@ -449,6 +450,8 @@ def survey(
         msa: take the interference of the drill string off the magnetometer, by multi-station analysis.
         limits: on |g|, |b| and dip: owsg-mwd, iscwsa-fixed, fixed, or a TOML file.
         sensor_drift: with `msa`, drift of the sensors since the calibration, 1σ: owsg (the default), none, or a file.
+        error_model: what the standard uncertainties hold besides calibration, noise and declination: owsg-mwd,
+            none, or a file in ISCWSA's JSON form.
         switch: inclinations, degrees, below which the toolface counts from magnetic north, and above which from the
             high side.
         tie_in: north, east and TVD of the first station, m.
@@ -473,8 +476,9 @@ def survey(
     loaded = load_calibration(_source(cal), [Path(key) for key in keys])
     table = _survey_table(readings, loaded.calibration, decimal)
     inputs = well_inputs(
-        loaded.calibration, table, _earth(reference), limits, msa, loaded.digest, loaded.findings
-    )
+        loaded.calibration, table, _earth(reference), limits, msa, loaded.digest, loaded.findings,
+        error_model,
+    )  # fmt: skip
     analysis = analysed(inputs, sensor_drift) if msa else None
     if analysis:
         analysis.check()

@@ -42,7 +42,7 @@ INPUTS = {
     "registry withdraw": (),
     "simulate": ("plan", "profile", "calibration", "effects", "rolltest", "limits"),
     "stations": ("log",),
-    "survey": ("calibration", "readings", "reference", "limits"),
+    "survey": ("calibration", "readings", "reference", "limits", "error_model"),
     "verify": ("calibration", "run", "limits"),
 }
 """The files behind the document of each command, whose digests are its keys `…_sha256`.

@@ -29,6 +29,7 @@ from mwdcal.survey.interference import (
 from mwdcal.survey.norths import North
 from mwdcal.survey.surveying import SurveyedWell, WellInputs
 from mwdcal.survey.well import Well
+from mwdcal.survey.well_errors import WellErrors
 
 MOST_CORRECTED = 30
 """Surveys of a table on interference_screen."""
@@ -137,7 +138,8 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
 
     `blind`: accepted ones whose azimuth interference could turn and still pass.
     `reference_sources`: where gravity, field, dip, declination and convergence come from, by name.
-    `error_terms` are in the standard uncertainties of surveys and path, `not_included` are not.
+    `error_terms` are in the standard uncertainties of surveys and path, `not_included` are not; `error_model` states
+    those that are not of the calibration, and the drift over `years_since_calibration` (null: not known, a year assumed).
     `msa` is the multi-station analysis, if one was asked for; `interference` and `separable` are of it.
     """
 
@@ -152,6 +154,8 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
     sd_declination_deg: float | None
     convergence_deg: float | None
     reference_sources: dict[str, str]
+    error_model: str
+    years_since_calibration: float | None
     error_terms: list[str]
     not_included: list[str]
     limits: str
@@ -177,6 +181,8 @@ def refusal(inputs: WellInputs, msa: MultiStationAnalysis) -> SurveySummary:
         blank=rows,
         north=north.name,
         **_stated(north, error_terms((), north.declination is not None)),
+        error_model=inputs.model.name if inputs.model else "none",
+        years_since_calibration=None,
         reference_sources=dict(inputs.surveys.sources),
         limits=inputs.limits.name,
         source=inputs.limits.source,
@@ -236,6 +242,8 @@ def summary(
         blank=int(well.blank.sum()),
         north=north.name,
         **_stated(north, well.terms),
+        error_model=well.errors.model.name if well.errors else "none",
+        years_since_calibration=well.errors.years if well.errors else None,
         reference_sources=dict(well.sources),
         limits=well.limits.name,
         source=well.limits.source,
@@ -308,6 +316,8 @@ def screen(
     if facts.end:
         lines.append(end_in_words(facts.end, facts.north))
     lines.append(well.terms.sentence)
+    if well.errors:
+        lines.append(model_in_words(well.errors))
     return "\n".join(
         [
             *map(one_line, lines),
@@ -315,6 +325,18 @@ def screen(
             survey_table(well),
             *([written(table=facts.output, page=facts.html)] if facts.output else []),
         ]
+    )
+
+
+def model_in_words(errors: WellErrors) -> str:
+    """The error model, and the time over which the sensors may have drifted."""
+    time = (
+        "an unknown time since the calibration, taken as a year"
+        if errors.years is None
+        else (f"{fixed(errors.years, 2)} years since the calibration")
+    )
+    return (
+        f"error model {errors.model.name} ({errors.model.source}); drift of the sensors over {time}"
     )
 
 

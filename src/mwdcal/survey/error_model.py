@@ -32,6 +32,8 @@ LEAST_INCLINATION = 1e-8
 
 They go with 1/sin(inclination) there; sideways, with sin(inclination), they have a limit.
 """
+USUAL_COURSE = 30.0
+"""Distance between surveys where no depths state it, m."""
 COURSE_TERMS = "XCL"
 """First letters of terms that shift a whole course, from one station to the next, and no survey."""
 LARGEST_MODEL = 1_000_000
@@ -117,14 +119,15 @@ class Hole:
     ) -> Hole:
         """A hole from its stations in their order; `azimuth` from the north of the path, `magnetic` from magnetic.
 
-        Before the first station the hole is as at it. Before any other its azimuth is that of the station itself where
-        the hole was vertical.
+        The course to the first station is as long as the second one, and straight. Before any other station the azimuth
+        is that of the station itself where the hole was vertical.
         """
         before = [
             np.concatenate([values[:1], values[:-1]]) for values in (md, inclination, azimuth)
         ]
         straight = np.abs(np.sin(before[1])) <= VERTICAL
         before[2] = np.where(straight, azimuth, before[2])
+        before[0][:1] -= md[1] - md[0] if len(md) > 1 else USUAL_COURSE
         values = (md, tvd, inclination, azimuth, magnetic, field, dip, gravity, *before)
         return Hole({n: np.asarray(v, float) for n, v in zip(OF_STATIONS, values, strict=True)})
 

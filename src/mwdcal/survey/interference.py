@@ -38,9 +38,13 @@ CORRECTED = "interference-corrected"
 DRIFTED = "sensor-drift-allowed"
 """The finding of one whose covariance allows for what the sensors have moved since the laboratory."""
 INTERFERENCE = "interference of the drill string"
+AXIAL, CROSS_AXIAL = f"axial {INTERFERENCE}", f"cross-axial {INTERFERENCE}"
+"""Interference of the drill string as error models part it: they state the first alone."""
 DRIFT = "drift of the sensors since the calibration"
 NEVER = ("sag", "misalignment in the hole", "measured depth")
 """Errors that no calibration and no survey of its own knows."""
+OF_MODELS = dict(zip(("SAG", "XYM", "D"), NEVER, strict=True))
+"""First letters of the terms of error models that state them."""
 
 
 @dataclass(frozen=True)
@@ -53,20 +57,30 @@ class ErrorTerms:
     @property
     def sentence(self) -> str:
         """Both, as they stand beside every 1σ."""
-        return f"1σ: {', '.join(self.included)}. Not in it: {', '.join(self.left_out)}."
+        lacking = f" Not in it: {', '.join(self.left_out)}." if self.left_out else ""
+        return f"1σ: {', '.join(self.included)}.{lacking}"
 
 
-def error_terms(findings: Iterable[Finding], declination: bool) -> ErrorTerms:
-    """Those of surveys by a calibration with these findings; `declination`: azimuths count from another north."""
-    there = {finding.id for finding in findings}
-    optional = [
-        ("declination", declination),
-        (INTERFERENCE, CORRECTED in there),
-        (DRIFT, DRIFTED in there),
-    ]
-    included = [name for name, known in optional if known]
-    left_out = [name for name, known in optional[1:] if not known]
-    return ErrorTerms(("calibration", "noise", *included), (*left_out, *NEVER))
+def error_terms(
+    findings: Iterable[Finding], declination: bool, modelled: Iterable[str] = ()
+) -> ErrorTerms:
+    """Those of surveys by a calibration with these findings; `declination`: azimuths count from another north.
+
+    `modelled`: what an error model adds: `AXIAL`, `DRIFT` and of `NEVER`.
+    """
+    there, model = {finding.id for finding in findings}, set(modelled)
+    parts = (
+        {AXIAL: True, CROSS_AXIAL: False} if AXIAL in model else {INTERFERENCE: CORRECTED in there}
+    )
+    optional = {
+        **parts,
+        DRIFT: DRIFTED in there or DRIFT in model,
+        **{name: name in model for name in NEVER},
+    }
+    included = [name for name, known in optional.items() if known]
+    north = ["declination"] if declination else []
+    left_out = [name for name, known in optional.items() if not known]
+    return ErrorTerms(("calibration", "noise", *north, *included), tuple(left_out))
 
 
 FEWEST_SURVEYS = 2

@@ -302,11 +302,13 @@ def calibrated_path(
     declination_sd: float = 0.0,
     start: ArrayLike = (0.0, 0.0, 0.0),
     declination_noise: float = 0.0,
+    more: Callable[[DirectionErrors, Readings, slice], DirectionErrors] | None = None,
 ) -> tuple[Array, Array]:
     """Positions (n, 3), north, east, true vertical depth, m, of readings in a well, and their covariance (n, 3, 3).
 
     As `well_path` and `position_covariance` of `direction_errors`, in memory that the causes of error do not enter.
-    A station without a direction leaves none of the following ones a position: leave it out.
+    A station without a direction leaves none of the following ones a position: leave it out. `more` adds errors to
+    those of the directions at some rows.
 
     Raises:
         InputError: the depths do not increase.
@@ -319,9 +321,8 @@ def calibrated_path(
 
     def part(where: slice) -> tuple[Array, DirectionErrors]:
         some = rows_of(readings, where)
-        return depth[where], direction_errors(
-            calibration, some, north, declination_sd, declination_noise
-        )
+        errors = direction_errors(calibration, some, north, declination_sd, declination_noise)
+        return depth[where], errors if more is None else more(errors, some, where)
 
     both = list(_along(len(depth), part, start))
     return np.concatenate([p for p, _ in both]), np.concatenate([c for _, c in both])

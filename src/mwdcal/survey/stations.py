@@ -1,8 +1,7 @@
 """Surveys: angles and strengths of calibrated readings in a well, each with its standard uncertainty.
 
-The uncertainty is that of the calibration and of the noise of one reading; of true and grid azimuths also
-that of the declination. Interference of the drill string and what has changed since the calibration are not
-part of it: `mwdcal.survey.acceptance` judges them.
+The uncertainty is that of the calibration and of the noise of one reading, with the variance that is `added`, such as
+that of an error model (`mwdcal.survey.well_errors`); of true and grid azimuths also that of the declination.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mwdcal.calibration.readings import Readings
-from mwdcal.calibration.record import Calibration
+from mwdcal.calibration.record import LARGEST_ANGLE_SD, Calibration
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, diagonal
@@ -21,6 +20,8 @@ from mwdcal.use.uncertainty import rows_of, without_value
 
 SURVEYED = ("inclination", "azimuth", "toolface", "north_toolface", "gravity", "field", "dip")
 """Observables of a survey, in the order of `Surveys.value`."""
+TURNS = np.array([OBSERVABLES[name].period > 0 for name in SURVEYED])
+"""Which of them are angles of a full turn."""
 STRENGTHS = slice(4, 7)
 """Where |g|, |b| and dip lie in it."""
 TOOLFACE_SWITCH = (np.radians(3.0), np.radians(5.0))
@@ -61,11 +62,12 @@ def surveyed(
     readings: Readings,
     switch: tuple[float, float] = TOOLFACE_SWITCH,
     advance: Callable[[int, int], None] = lambda done, total: None,
+    added: Callable[[Array, Array, slice], Array] | None = None,
 ) -> Surveys:
     """Surveys from readings, in the order in which they were taken.
 
     Shapes: `readings` of n stations without leading axes. Units: `switch` in radians. `advance` gets how many are
-    done, and of how many.
+    done, and of how many. `added` gives the variance (m, 7) that the vectors (m, 3) of some rows have besides.
     Singular: at vertical azimuth and toolface are NaN, the toolface from magnetic north is not.
 
     Raises:
@@ -89,6 +91,9 @@ def surveyed(
         lost = without_value(calibration, part, SURVEYED, value[rows], sd[rows])
         value[rows] = np.where(lost, np.nan, value[rows])
         sd[rows] = np.where(lost, np.nan, sd[rows])
+        if added is not None:
+            whole = np.sqrt(sd[rows] ** 2 + added(g, b, rows))
+            sd[rows] = np.where(TURNS & (whole > LARGEST_ANGLE_SD), np.nan, whole)
         strengths[rows] = covariance[:, STRENGTHS, STRENGTHS]
         done = rows.stop
         advance(done, readings.count)

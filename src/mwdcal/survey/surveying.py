@@ -23,6 +23,7 @@ from mwdcal.files.runs import renamed, to_readings
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import StandProfile
 from mwdcal.survey.acceptance import SurveyLimits, load_survey_limits
+from mwdcal.survey.error_model import BUILT_IN, ErrorModel, load_error_model
 from mwdcal.survey.interference import Interference, interference
 from mwdcal.survey.interference_estimate import Assumed, sensor_drift
 from mwdcal.survey.norths import SD_KEY, North, norths_of
@@ -39,6 +40,8 @@ from mwdcal.survey.references import (
 from mwdcal.survey.stations import RANDOM, TOOLFACE_SWITCH
 from mwdcal.survey.well import Well, well
 
+NO_MODEL = "none"
+"""The word for standard uncertainties of calibration, noise and declination alone."""
 MEASURED_DEPTH = "md_m"
 """The column of measured depths, m."""
 LARGEST_DEPTH = 20_000.0
@@ -206,6 +209,7 @@ def described(well: Well) -> Mapping[str, object]:
         "calibration_time": calibration.time,
         "survey_limits": well.limits.name,
         "north": north.name,
+        "error_model": "none" if well.errors is None else well.errors.model.name,
         "error_terms": list(well.terms.included),
         "not_included": list(well.terms.left_out),
     }
@@ -229,6 +233,7 @@ def described(well: Well) -> Mapping[str, object]:
 class WellInputs:
     """What the surveys of a well rest on.
 
+    `model`: the error model whose terms are in the standard uncertainties; None: none.
     `findings` are of the calibration's signature and of the reference; `digests` the SHA-256 of each input by name,
     empty for one that is in memory.
     """
@@ -239,6 +244,7 @@ class WellInputs:
     limits: SurveyLimits
     findings: list[Finding]
     digests: Mapping[str, str]
+    model: ErrorModel | None = None
 
     @property
     def stated(self) -> tuple[Mapping[str, object], Mapping[str, object]]:
@@ -273,10 +279,11 @@ def well_inputs(
     recognised: bool = False,
     digest: str = "",
     findings: Sequence[Finding] = (),
+    error_model: ErrorModel | str | os.PathLike[str] = BUILT_IN,
 ) -> WellInputs:
     """What surveys rest on: a table of readings, the calibration of their tool, reference and limits.
 
-    `reference` and `limits` are values, or files by path. Stations that multi-station analysis puts into the record
+    `reference`, `limits` and `error_model` are values, or files by path; `NO_MODEL` for none. Stations that multi-station analysis puts into the record
     have to be `recognised`. `digest` and `findings` are of the file of the calibration.
 
     Raises:
@@ -293,6 +300,8 @@ def well_inputs(
     read = survey_readings(table, calibration, place, recognised=recognised)
     digests = {"calibration": digest, "readings": table.digest}
     digests |= {"reference": place_digest} if read.uses_reference else {}
+    model = error_model_of(error_model)
+    digests |= {"error_model": model.digest} if model else {}
     return WellInputs(
         calibration,
         table,
@@ -300,7 +309,15 @@ def well_inputs(
         bounds,
         [*findings, *read.findings],
         {**digests, "limits": limits_digest},
+        model,
     )
+
+
+def error_model_of(model: ErrorModel | str | os.PathLike[str]) -> ErrorModel | None:
+    """An error model by itself, its name or its file; None for `NO_MODEL`."""
+    if isinstance(model, ErrorModel):
+        return model
+    return None if os.fspath(model) == NO_MODEL else load_error_model(model)
 
 
 def check_drift(drift: object, msa: bool) -> None:
@@ -331,8 +348,9 @@ def survey_well(
     surveys = inputs.surveys
     fitted = analysis.calibration if analysis else inputs.calibration
     result = well(
-        fitted, surveys.readings, inputs.limits, surveys.north, surveys.md, tie_in, switch, outside
-    )
+        fitted, surveys.readings, inputs.limits, surveys.north, surveys.md, tie_in, switch, outside,
+        model=inputs.model,
+    )  # fmt: skip
     findings = [*inputs.findings, *result.findings]
     return SurveyedWell(
         inputs, replace(result, findings=findings, sources=surveys.sources), analysis

@@ -21,10 +21,12 @@ from mwdcal.survey.acceptance import (
     blindness,
     judged,
 )
+from mwdcal.survey.error_model import ErrorModel
 from mwdcal.survey.interference import CORRECTED, DRIFTED, ErrorTerms, error_terms
 from mwdcal.survey.norths import North
 from mwdcal.survey.path import calibrated_path
 from mwdcal.survey.stations import TOOLFACE_SWITCH, Surveys, surveyed
+from mwdcal.survey.well_errors import WellErrors, hole_of, well_errors
 from mwdcal.use.correction import counted
 
 BLIND_FROM = 2.0
@@ -83,6 +85,7 @@ class Well:
 
     `vectors` (n, 3) each as corrected; `extrapolated` (n,): stations without a statement of accuracy, None where
     none may be. `position`: None without measured depths. `sources`: where references come from, by name.
+    `errors`: of the error model in the standard uncertainties; None: these hold calibration, noise and declination.
     """
 
     calibration: Calibration
@@ -97,6 +100,7 @@ class Well:
     extrapolated: Bools | None = None
     blindness: Blindness | None = None
     sources: Mapping[str, str] = field(default_factory=dict)
+    errors: WellErrors | None = None
 
     @cached_property
     def sd_azimuth(self) -> Array:
@@ -121,7 +125,8 @@ class Well:
     @property
     def terms(self) -> ErrorTerms:
         """What the standard uncertainties hold, and what they leave out."""
-        return error_terms(self.calibration.findings, self.north.declination is not None)
+        modelled = () if self.errors is None else self.errors.included
+        return error_terms(self.calibration.findings, self.north.declination is not None, modelled)
 
     @property
     def blank(self) -> Bools:
@@ -210,12 +215,13 @@ def well(
     switch: tuple[float, float] = TOOLFACE_SWITCH,
     outside: str = "blank",
     advance: Callable[[int, int], None] = lambda done, total: None,
+    model: ErrorModel | None = None,
 ) -> Well:
     """The surveys of a well from readings in their order, references with these; `md` (n,) measured depths, m.
 
     Units: `tie_in` north, east and TVD of the first station, m; `switch` as of `surveyed`. `outside` the calibrated
     temperatures as of `correction.correct`: blank results, refuse, or extrapolate without stated uncertainty.
-    `advance` as of `surveyed`.
+    `advance` as of `surveyed`. `model`: error model whose terms are in the standard uncertainties too.
 
     Raises:
         InputError: readings that do not belong to the calibration, or depths that do not increase.
@@ -223,18 +229,35 @@ def well(
     north = north or North()
     columns, _, findings = counted(calibration, readings, outside)
     beyond, blank = calibration.outside(readings), np.isnan(columns[RESULTS[0]])
-    surveys = _without(surveyed(calibration, readings, switch, advance), blank, beyond)
+    errors = (
+        None
+        if model is None or not calibration.has_field
+        else well_errors(model, calibration, readings)
+    )
+    added = None if errors is None else _added(errors, calibration, readings, md)
+    surveys = _without(surveyed(calibration, readings, switch, advance, added), blank, beyond)
     g, b = (np.stack([columns[name] for name in VECTORS[i : i + 3]], -1) for i in (0, 3))
     judgement, blind = _judged(calibration, readings, surveys, (g, b), limits)
     start = (0.0, 0.0, 0.0) if tie_in is None else tie_in
-    position = None if md is None else _positions(calibration, readings, md, north, blank, start)
+    position = None
+    if md is not None:
+        position = _positions(calibration, readings, md, north, blank, start, errors)
     if position is not None:
         position = position.without_accuracy(beyond)
     result = Well(
         calibration, readings, surveys, judgement, limits, north, (g, b), position, findings,
-        extrapolated=columns.get(EXTRAPOLATED), blindness=blind,
+        extrapolated=columns.get(EXTRAPOLATED), blindness=blind, errors=errors,
     )  # fmt: skip
     return replace(result, findings=findings + _findings(result, tie_in is None))
+
+
+def _added(
+    errors: WellErrors, calibration: Calibration, readings: Readings, md: Array | None
+) -> Callable[[Array, Array, slice], Array]:
+    """The variance that an error model adds to the observables of some surveys."""
+    whole = md is not None and not np.isnan(md).any()
+    hole = hole_of(calibration, readings, md if whole else None)
+    return lambda g, b, rows: errors.variances(g, b, hole.part(rows))
 
 
 def _without(surveys: Surveys, blank: Bools, beyond: Bools) -> Surveys:
@@ -280,7 +303,7 @@ def _to_judge(
 
 def _positions(
     calibration: Calibration, readings: Readings, md: Array, north: North, blank: Bools,
-    start: tuple[float, float, float],
+    start: tuple[float, float, float], errors: WellErrors | None,
 ) -> Position:  # fmt: skip
     """Positions of the stations with results."""
     whole = ~blank & ~np.isnan(md)
@@ -289,6 +312,11 @@ def _positions(
     place, covariance = np.full((len(md), 3), np.nan), np.full((len(md), 3, 3), np.nan)
     if whole.any():
         some = readings if whole.all() else readings.select(whole)
+        more = None
+        if errors is not None:
+            more = errors.adder(
+                calibration, hole_of(calibration, some, md[whole], north.offset, start)
+            )
         place[whole], covariance[whole] = calibrated_path(
             calibration,
             some,
@@ -297,6 +325,7 @@ def _positions(
             north.declination_sd,
             start,
             north.declination_noise,
+            more,
         )
     return Position(md, place, covariance)
 

@@ -45,6 +45,13 @@ if TYPE_CHECKING:
     "default), not at all (none), or as the [sensor] terms of a limits file.",
 )
 @options.preset(
+    "--error-model",
+    default="owsg-mwd",
+    metavar="NAME|FILE",
+    help="What every 1σ holds besides calibration, noise and declination: interference, sag, misalignment, depth and "
+    "drift since the calibration (owsg-mwd), nothing (none), or the terms of a file in ISCWSA's JSON form.",
+)
+@options.preset(
     "--limits",
     default="owsg-mwd",
     metavar="NAME|FILE",
@@ -69,7 +76,7 @@ if TYPE_CHECKING:
 @options.JSON
 def command(
     calibration: Path, readings: Path, output: Path, reference: Path | None, msa: bool,
-    msa_html: Path | None, sensor_drift: str | None, limits: str, switch: str, tie_in: str | None, outside: str,
+    msa_html: Path | None, sensor_drift: str | None, error_model: str, limits: str, switch: str, tie_in: str | None, outside: str,
     html: Path | None, decimal: str, key: tuple[Path, ...], as_json: bool,
 ) -> None:  # fmt: skip
     """Surveys of a well: READINGS in their order, corrected by the CALIBRATION of their tool.
@@ -91,13 +98,15 @@ def command(
     if msa_html and not msa:
         raise InputError("`msa_html` goes with `msa`. Leave it out, or add `msa`.")
     check_drift(sensor_drift, msa)
-    given = [calibration, readings, reference, limits, *key]
+    given = [calibration, readings, reference, limits, error_model, *key]
     options.check_outputs([output, msa_html], given, page=html)
     start, ends = _three("tie_in", tie_in), _switch(switch)
     loaded = load_calibration(calibration, key)
     fitted = loaded.calibration
     table = read_export(readings, fitted.profile, decimal=decimal, rows=MOST_ROWS)
-    inputs = well_inputs(fitted, table, reference, limits, msa, loaded.digest, loaded.findings)
+    inputs = well_inputs(
+        fitted, table, reference, limits, msa, loaded.digest, loaded.findings, error_model
+    )
     analysis = analysed(inputs, sensor_drift) if msa else None
     pages = _interference_page(inputs, analysis, msa_html)
     if analysis and not analysis.summary.separable:
