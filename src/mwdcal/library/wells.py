@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from mwdcal.presentation.conversion import Converted, Exported
     from mwdcal.presentation.survey import SurveySummary
     from mwdcal.survey.acceptance import SurveyLimits
+    from mwdcal.survey.error_model import ErrorModel
     from mwdcal.survey.interference import InterferenceSize, MultiStationAnalysis
     from mwdcal.survey.references import EarthReference, FilledRun
     from mwdcal.survey.surveying import SurveyedWell

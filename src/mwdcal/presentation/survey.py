@@ -139,7 +139,7 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
     `blind`: accepted ones whose azimuth interference could turn and still pass.
     `reference_sources`: where gravity, field, dip, declination and convergence come from, by name.
     `error_terms` are in the standard uncertainties of surveys and path, `not_included` are not; `error_model` states
-    those that are not of the calibration, and the drift over `years_since_calibration` (null: not known, a year assumed).
+    those that are not of the calibration. Drift counts over `years_since_calibration`; null: not known, taken as one.
     `msa` is the multi-station analysis, if one was asked for; `interference` and `separable` are of it.
     """
 

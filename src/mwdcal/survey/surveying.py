@@ -283,8 +283,9 @@ def well_inputs(
 ) -> WellInputs:
     """What surveys rest on: a table of readings, the calibration of their tool, reference and limits.
 
-    `reference`, `limits` and `error_model` are values, or files by path; `NO_MODEL` for none. Stations that multi-station analysis puts into the record
-    have to be `recognised`. `digest` and `findings` are of the file of the calibration.
+    `reference`, `limits` and `error_model` are values, or files by path; `NO_MODEL` for none. Stations that
+    multi-station analysis puts into the record have to be `recognised`. `digest` and `findings` are of the file of the
+    calibration.
 
     Raises:
         InputError: a file that cannot be read, readings that do not belong to the calibration.

@@ -76,8 +76,8 @@ if TYPE_CHECKING:
 @options.JSON
 def command(
     calibration: Path, readings: Path, output: Path, reference: Path | None, msa: bool,
-    msa_html: Path | None, sensor_drift: str | None, error_model: str, limits: str, switch: str, tie_in: str | None, outside: str,
-    html: Path | None, decimal: str, key: tuple[Path, ...], as_json: bool,
+    msa_html: Path | None, sensor_drift: str | None, error_model: str, limits: str, switch: str,
+    tie_in: str | None, outside: str, html: Path | None, decimal: str, key: tuple[Path, ...], as_json: bool,
 ) -> None:  # fmt: skip
     """Surveys of a well: READINGS in their order, corrected by the CALIBRATION of their tool.
 
