@@ -31,9 +31,11 @@ from mwdcal.survey.acceptance import (
     judged,
     load_survey_limits,
 )
+from mwdcal.survey.error_model import load_error_model
 from mwdcal.survey.path import well_path
 from mwdcal.survey.stations import STRENGTHS, SURVEYED, surveyed, switched
 from mwdcal.survey.surveying import survey_readings
+from mwdcal.survey.well_errors import well_errors
 
 EARTH = Earth()
 NOISE = (1e-4, 15.0)
@@ -259,6 +261,15 @@ def example(tmp_path_factory):
     return folder / "tool.json"
 
 
+BY_CALIBRATION = ("--error-model", "none")
+"""Standard uncertainties of calibration, noise and declination alone."""
+
+
+def floats(cells):
+    """Numbers of a column, NaN where it is blank."""
+    return np.array([float(cell) if cell else np.nan for cell in cells])
+
+
 def surveyed_file(example, folder, columns=None, *options, metadata=()):
     """The table that `survey` makes of the example's well, changed; and the document it prints."""
     source = EXAMPLE / "well.csv"
@@ -272,7 +283,7 @@ def surveyed_file(example, folder, columns=None, *options, metadata=()):
 
 
 def test_columns_of_a_well(example, tmp_path):
-    columns, document = surveyed_file(example, tmp_path)
+    columns, document = surveyed_file(example, tmp_path, None, *BY_CALIBRATION)
     given = read_csv(EXAMPLE / "well.csv")
     assert [*columns][: len(given)] == [*given]
     values = {k: np.array(v, float) for k, v in columns.items() if k.endswith(("_deg", "_m"))}
@@ -305,7 +316,9 @@ def test_reference_file_gives_norths_and_limits(example, tmp_path):
     assert made.code == 0, made
     place.write_text(made.out)
     blank = dict.fromkeys(("ref_gravity_g", "ref_field_nt", "ref_dip_deg"), [""] * 36)
-    columns, document = surveyed_file(example, tmp_path, blank, "--reference", place)
+    columns, document = surveyed_file(
+        example, tmp_path, blank, "--reference", place, *BY_CALIBRATION
+    )
     stated = made.json
     true, grid, magnetic = (
         np.array(columns[f"azimuth_{name}_deg"], float) for name in ("true", "grid", "magnetic")
@@ -332,7 +345,7 @@ def test_reference_file_gives_norths_and_limits(example, tmp_path):
 def test_a_declination_is_never_exact(example, tmp_path, stated, sd, finding):
     """Expected: OWSG set A Rev 5.1 at 48,000 nT and dip 63°, the example's field."""
     told = ("declination_deg = 2.4", *stated)
-    columns, document = surveyed_file(example, tmp_path, {}, metadata=told)
+    columns, document = surveyed_file(example, tmp_path, {}, *BY_CALIBRATION, metadata=told)
     horizontal = 48_000 * np.cos(np.radians(63))
     shared = np.hypot(sd[0], sd[1] / horizontal)
     declination = np.hypot(shared, np.hypot(0.10, 3000 / horizontal))
@@ -482,9 +495,9 @@ def test_an_uncertainty_of_declination_that_cannot_be_is_refused(example, tmp_pa
 def test_nothing_states_an_uncertainty_without_what_it_leaves_out(example, tmp_path):
     out, page = tmp_path / "out.csv", tmp_path / "s.html"
     source = EXAMPLE / "well.csv"
-    ran = cli("survey", example, source, "-o", out, "--html", page)
+    ran = cli("survey", example, source, "-o", out, "--html", page, *BY_CALIBRATION)
     left_out = ("interference of the drill string", "drift of the sensors", "sag", "measured depth")
-    document = cli("survey", example, source, "-o", out, "--json").json
+    document = cli("survey", example, source, "-o", out, "--json", *BY_CALIBRATION).json
     for told in (ran.out, page.read_text("utf-8"), out.read_text("utf-8")):
         assert all(name in " ".join(told.split()) for name in left_out)
     assert document["error_terms"] == ["calibration", "noise", "declination"]
@@ -660,6 +673,7 @@ def test_tie_in_moves_the_path(example, tmp_path):
         ({}, ("--switch", "6,5"), "--switch"),
         ({}, ("--tie-in", "1,2"), "--tie-in"),
         ({}, ("--limits", "nothing"), "nothing"),
+        ({}, ("--error-model", "nothing"), "Built in: owsg-mwd"),
         ({}, ("--outside", "hide"), "--outside"),
     ],
 )
@@ -685,7 +699,7 @@ def test_long_well_is_like_its_parts(example, tmp_path):
         parts, _ = surveyed_file(example, tmp_path)
     for name in whole:
         if name.endswith(("_deg", "_m", "_nt", "_g")):
-            one, other = (np.array(t[name], float) for t in (whole, parts))
+            one, other = (floats(t[name]) for t in (whole, parts))
             np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
 
@@ -732,8 +746,8 @@ def test_msa_takes_axial_interference_off(example, tmp_path):
     depth = np.array(columns["md_m"], float)
     true = 20 + 0.06 * np.maximum(depth - 600, 0)
     off = (np.array(columns["azimuth_magnetic_deg"], float) - true + 180) % 360 - 180
-    sd = np.array(columns["sd_azimuth_magnetic_deg"], float)
-    assert np.abs(off / sd).max() < 4
+    sd = floats(columns["sd_azimuth_magnetic_deg"])
+    assert np.nanmax(np.abs(off / sd)) < 4
     assert "SIMULATED" in (tmp_path / "m.html").read_text("utf-8")
 
 
@@ -741,7 +755,18 @@ def test_msa_takes_axial_interference_off(example, tmp_path):
 def test_results_say_whether_interference_was_taken_off(example, tmp_path):
     source, out, page = with_iron(tmp_path, 1500), tmp_path / "out.csv", tmp_path / "s.html"
     for options, corrected in (((), False), (("--msa",), True)):
-        ran = cli("survey", example, source, "-o", out, "--html", page, "--json", *options)
+        ran = cli(
+            "survey",
+            example,
+            source,
+            "-o",
+            out,
+            "--html",
+            page,
+            "--json",
+            *options,
+            *BY_CALIBRATION,
+        )
         ids = {finding["id"] for finding in ran.json["findings"]}
         shown = " ".join(page.read_text("utf-8").split())
         assert ("interference-corrected" in ids) is corrected
@@ -916,3 +941,42 @@ def test_tool_model_of_a_calibration(example, tmp_path):
         "course",
     )
     assert "--temperature" in refused(bad, 2)
+
+
+# ------------------------------------------------------------------ the error model
+
+
+def test_the_error_model_is_in_every_uncertainty_by_default(example, tmp_path):
+    """Expected: formulas of OWSG set A Rev 5.1 at the last station, with a year of drift of the sensors."""
+    columns, document = surveyed_file(example, tmp_path)
+    alone, _ = surveyed_file(example, tmp_path, None, *BY_CALIBRATION)
+    assert document["error_model"] == "owsg-mwd"
+    assert document["error_model_sha256"]
+    assert "axial interference of the drill string" in document["error_terms"]
+    assert document["not_included"] == ["cross-axial interference of the drill string"]
+    inclination, azimuth = (
+        np.radians(float(columns[f"{name}_deg"][-1]))
+        for name in ("inclination", "azimuth_magnetic")
+    )
+    sine, cosine, dip = np.sin(inclination), np.cos(inclination), np.radians(63)
+    hole = [0.2 * sine**0.25, 0.1 * sine, 0.3 * cosine]
+    scale = np.degrees(0.0005 * sine * cosine) * np.sqrt(2)
+    expected = [*hole, np.degrees(0.004 / 9.80665), scale, floats(alone["sd_inclination_deg"])[-1]]
+    stated = floats(columns["sd_inclination_deg"])[-1]
+    assert stated == pytest.approx(np.linalg.norm(expected), rel=0.01)
+    turn = np.degrees(220 * sine * np.sin(azimuth) / (48_000 * np.cos(dip)))
+    assert floats(columns["sd_azimuth_magnetic_deg"])[-1] > np.hypot(turn, 0.1)
+    for name in ("north", "east", "tvd"):
+        assert floats(columns[f"sd_{name}_m"])[-1] > floats(alone[f"sd_{name}_m"])[-1]
+
+
+@pytest.mark.parametrize(("years", "share"), [(0.25, 0.5), (1.0, 1.0), (4.0, 1.0)])
+def test_drift_grows_with_the_time_since_the_calibration(example, years, share):
+    model, calibration = load_error_model(), mwdcal.load(example)
+    dated = replace_struct(calibration, tool={**calibration.tool, "date": "2025-01-01"})
+    day = str(np.datetime64("2025-01-01") + round(years * 365.25))
+    readings = Readings(np.ones((1, 3)), np.ones((1, 3)), metadata={"date": day})
+    errors = well_errors(model, dated, readings)
+    assert errors.years == pytest.approx(years, abs=0.002)
+    assert errors.sensors.magnetometer_bias_nt == pytest.approx(70.0 * share, rel=0.005)
+    assert errors.sensors.axial_interference_nt == 220.0

@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Mapping
 
 import numpy as np
-from wells import NOISE, laboratory
 from world import Array, covered, percent, table, turned, vectors, write
 
 from mwdcal.calibration.readings import Readings
@@ -15,6 +14,7 @@ from mwdcal.survey.acceptance import load_survey_limits
 from mwdcal.survey.error_model import load_error_model
 from mwdcal.survey.norths import North
 from mwdcal.survey.well import Well, well
+from wells import NOISE, laboratory
 
 SEED = 29
 TOOLS, WELLS, SURVEYS, COURSE = 10, 1000, 60, 30.0
@@ -72,7 +72,9 @@ def drawn(
     """Readings of a well with their stated depths, and its true angles (from true north) and positions."""
     inclination, magnetic, field, dip = path
     sine, cosine = np.sin(np.radians(inclination)), np.abs(np.cos(np.radians(inclination)))
-    declination = DECLINATION + SD_DECLINATION * rng.normal() + NOISE_DECLINATION * rng.normal(size=SURVEYS)
+    declination = (
+        DECLINATION + SD_DECLINATION * rng.normal() + NOISE_DECLINATION * rng.normal(size=SURVEYS)
+    )
     azimuth = magnetic + declination
     md = 300.0 + COURSE * np.arange(SURVEYS)
     along = directions(inclination, azimuth)
@@ -85,8 +87,18 @@ def drawn(
     side = -second * sine + cosine * (fourth * north - third * east)
     leaning = along + np.radians(up)[:, None] * upward + np.radians(side)[:, None] * sideways
     leaning /= np.linalg.norm(leaning, axis=-1, keepdims=True)
-    seen = np.degrees(np.arccos(leaning[:, 2])), np.degrees(np.arctan2(leaning[:, 1], leaning[:, 0]))
-    g, b = vectors(seen[0], seen[1] - declination, rng.uniform(0, 360, SURVEYS), 1.0, np.full(SURVEYS, field), np.full(SURVEYS, dip))
+    seen = (
+        np.degrees(np.arccos(leaning[:, 2])),
+        np.degrees(np.arctan2(leaning[:, 1], leaning[:, 0])),
+    )
+    g, b = vectors(
+        seen[0],
+        seen[1] - declination,
+        rng.uniform(0, 360, SURVEYS),
+        1.0,
+        np.full(SURVEYS, field),
+        np.full(SURVEYS, dip),
+    )
     b = b + np.array([0.0, 0.0, axial])
     moved = [
         v * (1 + s * rng.normal(size=3)) + o * rng.normal(size=3)
@@ -98,24 +110,52 @@ def drawn(
     ]
     # the true hole: its depths, and what happens between stations
     tvd = places(md, along)[:, 2] + 300.0
-    depth = md - 0.35 * rng.normal(size=SURVEYS) - 0.00056 * md * rng.normal() - 2.5e-7 * md * tvd * rng.normal()
+    depth = (
+        md
+        - 0.35 * rng.normal(size=SURVEYS)
+        - 0.00056 * md * rng.normal()
+        - 2.5e-7 * md * tvd * rng.normal()
+    )
     place = places(depth, along) + (depth[0] - md[0]) * along[0]
     bend = np.abs(np.diff(np.radians(inclination)))
     swing = sine[1:] * np.abs(np.sin(np.diff(np.radians(azimuth))))
-    across = (np.maximum(x, TORTUOSITY * COURSE) * 0.167 * COURSE * rng.normal(size=SURVEYS - 1) for x in (bend, swing))
+    across = (
+        np.maximum(x, TORTUOSITY * COURSE) * 0.167 * COURSE * rng.normal(size=SURVEYS - 1)
+        for x in (bend, swing)
+    )
     wander = sum(x[:, None] * t[1:] for x, t in zip(across, (upward, sideways), strict=True))
     place[1:] -= np.cumsum(wander, 0)
-    sd = {n: np.full((SURVEYS, 3), s) for n, s in zip(("accelerometer", "magnetometer"), NOISE, strict=True)}
-    sd |= {"gravity": np.full(SURVEYS, 2e-5), "field": np.full(SURVEYS, 130.0), "dip": np.full(SURVEYS, np.radians(0.2))}
-    known = {"gravity": np.full(SURVEYS, 1.0), "field": np.full(SURVEYS, field), "dip": np.full(SURVEYS, np.radians(dip))}
-    return Readings(*raw, None, known, sd), md, {"inclination": inclination, "azimuth": azimuth}, place
+    sd = {
+        n: np.full((SURVEYS, 3), s)
+        for n, s in zip(("accelerometer", "magnetometer"), NOISE, strict=True)
+    }
+    sd |= {
+        "gravity": np.full(SURVEYS, 2e-5),
+        "field": np.full(SURVEYS, 130.0),
+        "dip": np.full(SURVEYS, np.radians(0.2)),
+    }
+    known = {
+        "gravity": np.full(SURVEYS, 1.0),
+        "field": np.full(SURVEYS, field),
+        "dip": np.full(SURVEYS, np.radians(dip)),
+    }
+    return (
+        Readings(*raw, None, known, sd),
+        md,
+        {"inclination": inclination, "azimuth": azimuth},
+        place,
+    )
 
 
 def surveyed(calibration: Calibration, readings: Readings, md: Array) -> Well:
     """The surveys that the product makes of a well."""
-    north = North(np.radians(DECLINATION), np.radians(SD_DECLINATION), None, np.radians(NOISE_DECLINATION))
+    north = North(
+        np.radians(DECLINATION), np.radians(SD_DECLINATION), None, np.radians(NOISE_DECLINATION)
+    )
     limits, _ = load_survey_limits()
-    return well(calibration, readings, limits, north, md, (0.0, 0.0, 300.0), model=load_error_model())
+    return well(
+        calibration, readings, limits, north, md, (0.0, 0.0, 300.0), model=load_error_model()
+    )
 
 
 def row(labs: list, path: tuple[Array, Array, float, float], times: float, rng) -> list[str]:  # type: ignore[no-untyped-def]
@@ -129,8 +169,13 @@ def row(labs: list, path: tuple[Array, Array, float, float], times: float, rng) 
         readings, md, truth, place = drawn(sensors, path, axial, rng)
         result = surveyed(calibration, readings, md)
         assert result.position is not None
-        for name, sd in (("inclination", result.surveys.of("inclination")[1]), ("azimuth", result.sd_azimuth)):
-            value = np.degrees(result.surveys.of(name)[0]) + (DECLINATION if name == "azimuth" else 0.0)
+        for name, sd in (
+            ("inclination", result.surveys.of("inclination")[1]),
+            ("azimuth", result.sd_azimuth),
+        ):
+            value = np.degrees(result.surveys.of(name)[0]) + (
+                DECLINATION if name == "azimuth" else 0.0
+            )
             errors[name].append(turned(value - truth[name]))
             stated[name].append(np.degrees(sd))
         position = result.position
@@ -153,7 +198,10 @@ def main() -> None:
     heads = ["well", "inclination within 95 %", "azimuth", "position in 95 % ellipsoid, middle", "at the end",
              "wells with an azimuth off by over 3σ", "of these with a finding"]  # fmt: skip
     parts = []
-    for title, times in (("Errors of the model's size", 1.0), ("Five times the model's interference along the tool", 5.0)):
+    for title, times in (
+        ("Errors of the model's size", 1.0),
+        ("Five times the model's interference along the tool", 5.0),
+    ):
         rows = [
             [name, *row(labs, path, times, np.random.default_rng([SEED, 100, index, int(times)]))]
             for index, (name, path) in enumerate(trajectories().items())
@@ -162,10 +210,10 @@ def main() -> None:
     write(
         "whole_wells",
         "Wells under the error model",
-        f"{WELLS} wells of {SURVEYS} surveys for each row, by {TOOLS} tools with their own calibrations. All errors are "
-        "drawn from OWSG set A Rev 5.1 (MWD) by a forward model of the script alone: drift of biases and scales of every "
-        "axis, interference along the tool, sag, misalignment, declination, depths and the course between stations. "
-        "The truth is where the hole lies. A finding is `rejected` or `blind-to-interference`.\n",
+        f"{WELLS} wells of {SURVEYS} surveys for each row, by {TOOLS} tools with their own calibrations. All errors "
+        "are drawn from OWSG set A Rev 5.1 (MWD) by a forward model of the script alone: drift of biases and scales of "
+        "every axis, interference along the tool, sag, misalignment, declination, depths and the course between "
+        "stations. The truth is where the hole lies. A finding is `rejected` or `blind-to-interference`.\n",
         *parts,
         facts={"Seed": SEED, "Wells in each row": WELLS},
     )

@@ -38,7 +38,7 @@ CORRECTED = "interference-corrected"
 DRIFTED = "sensor-drift-allowed"
 """The finding of one whose covariance allows for what the sensors have moved since the laboratory."""
 INTERFERENCE = "interference of the drill string"
-AXIAL, CROSS_AXIAL = f"axial {INTERFERENCE}", f"cross-axial {INTERFERENCE}"
+AXIAL_INTERFERENCE, CROSS_INTERFERENCE = f"axial {INTERFERENCE}", f"cross-axial {INTERFERENCE}"
 """Interference of the drill string as error models part it: they state the first alone."""
 DRIFT = "drift of the sensors since the calibration"
 NEVER = ("sag", "misalignment in the hole", "measured depth")
@@ -66,11 +66,13 @@ def error_terms(
 ) -> ErrorTerms:
     """Those of surveys by a calibration with these findings; `declination`: azimuths count from another north.
 
-    `modelled`: what an error model adds: `AXIAL`, `DRIFT` and of `NEVER`.
+    `modelled`: what an error model adds: `AXIAL_INTERFERENCE`, `DRIFT` and of `NEVER`.
     """
     there, model = {finding.id for finding in findings}, set(modelled)
     parts = (
-        {AXIAL: True, CROSS_AXIAL: False} if AXIAL in model else {INTERFERENCE: CORRECTED in there}
+        {AXIAL_INTERFERENCE: True, CROSS_INTERFERENCE: False}
+        if AXIAL_INTERFERENCE in model
+        else {INTERFERENCE: CORRECTED in there}
     )
     optional = {
         **parts,

@@ -22,7 +22,7 @@ from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array
 from mwdcal.survey.acceptance import SensorTerms
 from mwdcal.survey.error_model import USUAL_COURSE, ErrorModel, Hole
-from mwdcal.survey.interference import AXIAL, CORRECTED, DRIFT, DRIFTED, OF_MODELS
+from mwdcal.survey.interference import AXIAL_INTERFERENCE, CORRECTED, DRIFT, DRIFTED, OF_MODELS
 from mwdcal.survey.path import DirectionErrors, direction_gradient, well_path
 from mwdcal.survey.stations import SURVEYED, blocks
 from mwdcal.use.strengths import STANDARD_GRAVITY
@@ -30,7 +30,7 @@ from mwdcal.use.strengths import STANDARD_GRAVITY
 DRIFT_YEARS = 1.0
 """Time after which the sensors may have drifted by as much as the model's terms for sensors, years."""
 _SENSORS = ("AB", "AS", "MB", "MS")
-_DECLINATION = ("DEC", "DBH")
+_DECLINATION_TERMS = ("DEC", "DBH")
 _INTERFERENCE = "AMIL"
 DAYS_OF_YEAR = 365.25
 
@@ -82,7 +82,7 @@ class WellErrors:
     @property
     def included(self) -> list[str]:
         """What the standard uncertainties hold of it, by the names of `interference.error_terms`."""
-        names = [AXIAL] if self.sensors.axial_interference_nt else []
+        names = [AXIAL_INTERFERENCE] if self.sensors.axial_interference_nt else []
         names += [DRIFT] if self.sensors.magnetometer_bias_nt else []
         starts = [term.name for term in self.model.terms]
         return names + [
@@ -116,17 +116,15 @@ def _with_depth(shifts: Array) -> Array:
 def well_errors(model: ErrorModel, calibration: Calibration, readings: Readings) -> WellErrors:
     """What an error model adds to surveys by a calibration.
 
-    Interference is left out where multi-station analysis has taken it off, and drift where its covariance allows for
-    it already. A magnetometer calibrated to a field of 1 is scaled to the field of the references.
+    Where multi-station analysis has taken interference off, its covariance holds what is left of it, and the drift that
+    it was told to allow for: neither is added. A magnetometer calibrated to a field of 1 is scaled to the field of the
+    references.
     """
     sizes = {term.name: term.size for term in model.terms}
     done = {finding.id for finding in calibration.findings}
     years = _years(stated_day(calibration.tool), stated_day(readings.metadata))
-    share = (
-        0.0
-        if DRIFTED in done
-        else min(1.0, np.sqrt((DRIFT_YEARS if years is None else years) / DRIFT_YEARS))
-    )
+    elapsed = DRIFT_YEARS if years is None else years
+    share = 0.0 if {CORRECTED, DRIFTED} & done else min(1.0, np.sqrt(elapsed / DRIFT_YEARS))
     ab, scale_a, mb, scale_m = (share * _largest(sizes, start) for start in _SENSORS)
     axial = 0.0 if CORRECTED in done else sizes.get(_INTERFERENCE, 0.0)
     sensors = SensorTerms(
@@ -139,7 +137,9 @@ def well_errors(model: ErrorModel, calibration: Calibration, readings: Readings)
         sensors = msgspec.structs.replace(
             sensors, magnetometer_bias_nt=mb / known, axial_interference_nt=axial / known
         )
-    others = [name for name in sizes if name.startswith((*_SENSORS, *_DECLINATION, _INTERFERENCE))]
+    others = [
+        name for name in sizes if name.startswith((*_SENSORS, *_DECLINATION_TERMS, _INTERFERENCE))
+    ]
     return WellErrors(model.without(others), sensors, years)
 
 
