@@ -162,6 +162,21 @@ class DirectionErrors:
     systematic: Array
     random: Array
 
+    def stations(self, where: slice) -> DirectionErrors:
+        """Those of some stations."""
+        pairs = (..., where, slice(None), slice(None))
+        angles = self.inclination[..., where], self.azimuth[..., where]
+        return DirectionErrors(*angles, self.systematic[pairs], self.random[pairs])
+
+    def followed_by(self, others: DirectionErrors) -> DirectionErrors:
+        """Those of both, one after the other."""
+        return DirectionErrors(
+            np.concatenate([self.inclination, others.inclination], -1),
+            np.concatenate([self.azimuth, others.azimuth], -1),
+            np.concatenate([self.systematic, others.systematic], -3),
+            np.concatenate([self.random, others.random], -3),
+        )
+
 
 class _Sums(NamedTuple):
     """What has added up at the last station (…) of a part of a well.
@@ -174,6 +189,14 @@ class _Sums(NamedTuple):
     shift: Array
     settled: Array
     arrival: Array
+
+
+class PathEnd(NamedTuple):
+    """Where a path has come to: depth (…, 1) and errors of its last station, and what has added up there."""
+
+    md: Array
+    errors: DirectionErrors
+    sums: _Sums
 
 
 def tilts(inclination: ArrayLike, azimuth: ArrayLike) -> Array:
@@ -279,13 +302,13 @@ def position_covariance(
     lasting = np.zeros((*md.shape, 0, 2)) if systematic is None else np.asarray(systematic, float)
     new = np.zeros((*md.shape, 2, 2)) if random is None else np.asarray(random, float)
 
+    whole = DirectionErrors(inc, azi, lasting, new)
+
     def part(where: slice) -> tuple[Array, DirectionErrors]:
-        stations = (..., where, slice(None), slice(None))
-        errors = DirectionErrors(inc[..., where], azi[..., where], lasting[stations], new[stations])
-        return md[..., where], errors
+        return md[..., where], whole.stations(where)
 
     return np.concatenate(
-        [covariance for _, covariance in _along(md.shape[-1], part, balanced=balanced)], -3
+        [covariance for _, covariance, _ in _along(md.shape[-1], part, balanced=balanced)], -3
     )
 
 
@@ -306,38 +329,59 @@ def calibrated_path(
     Raises:
         InputError: the depths do not increase.
     """
+    norths = north, declination_sd, declination_noise
+    return continued_path(calibration, readings, md, norths, start)[:2]
+
+
+def continued_path(
+    calibration: Calibration,
+    readings: Readings,
+    md: ArrayLike,
+    norths: tuple[float, float, float],
+    before: ArrayLike | PathEnd = (0.0, 0.0, 0.0),
+) -> tuple[Array, Array, PathEnd]:
+    """The same of readings that follow others of their well, and where the path has come to.
+
+    `norths` as of `direction_errors`. `before`: the position of the first station, or where the path had come to: a
+    well in parts has the positions that it has as a whole.
+    """
     depth = np.asarray(md, float)
-    if not (np.diff(depth) > 0).all():
+    last = [before.md] if isinstance(before, PathEnd) else []
+    if not (np.diff(np.concatenate([*last, depth])) > 0).all():
         raise InputError(
             "`md` must increase from station to station. Sort the stations by measured depth."
         )
 
     def part(where: slice) -> tuple[Array, DirectionErrors]:
-        some = rows_of(readings, where)
-        return depth[where], direction_errors(
-            calibration, some, north, declination_sd, declination_noise
-        )
+        return depth[where], direction_errors(calibration, rows_of(readings, where), *norths)
 
-    both = list(_along(len(depth), part, start))
-    return np.concatenate([p for p, _ in both]), np.concatenate([c for _, c in both])
+    place, covariance = np.empty((len(depth), 3)), np.empty((len(depth), 3, 3))
+    done = 0
+    for places, covariances, before in _along(len(depth), part, before):  # noqa: B020, its end
+        rows = slice(done, done := done + len(places))
+        place[rows], covariance[rows] = places, covariances
+    return place, covariance, before
 
 
 def _along(
     count: int,
     part: Callable[[slice], tuple[Array, DirectionErrors]],
-    start: ArrayLike = (0.0, 0.0, 0.0),
+    before: ArrayLike | PathEnd = (0.0, 0.0, 0.0),
     balanced: bool = False,
-) -> Iterator[tuple[Array, Array]]:
-    """Positions (…, m, 3) and covariance (…, m, 3, 3) of all stations of a well, some at a time."""
-    sums = None
+) -> Iterator[tuple[Array, Array, PathEnd]]:
+    """Positions (…, m, 3) and covariance (…, m, 3, 3) of all stations, some at a time, and where each part ends."""
     for first in range(0, max(count, 1), STATIONS_AT_ONCE):
-        # each part begins with the last station of the one before
-        where = slice(max(first - 1, 0), first + STATIONS_AT_ONCE)
-        md, errors = part(where)
-        sums = sums or _no_sums(md, errors, start)
+        md, errors = part(slice(first, first + STATIONS_AT_ONCE))
+        new = slice(0, None)
+        if isinstance(before, PathEnd):  # each part begins with the last station of the one before
+            md = np.concatenate([before.md, md], -1)
+            errors, sums = before.errors.followed_by(errors), before.sums
+            new = slice(1, None)
+        else:
+            sums = _no_sums(md, errors, before)
         position, covariance, sums = _part_of_path(md, errors, sums, balanced)
-        skipped = first - where.start
-        yield position[..., skipped:, :], covariance[..., skipped:, :, :]
+        before = PathEnd(md[..., -1:], errors.stations(slice(-1, None)), sums)
+        yield position[..., new, :], covariance[..., new, :, :], before
 
 
 def _no_sums(md: Array, errors: DirectionErrors, start: ArrayLike) -> _Sums:
