@@ -15,6 +15,7 @@ from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files import carried, streams
 from mwdcal.files.contract import CHANNELS, check_columns
+from mwdcal.files.faults import wholly_blank
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import as_text
 from mwdcal.files.formats.table import EXCHANGED, Table
@@ -118,7 +119,7 @@ def apply_to_table(
     streaming.check_warmth(calibration, list(table.columns), source.source)
     whole = np.ones(source.count, bool)
     if missing == "blank":
-        whole = ~streaming.lacking(table, streaming.wholly_blank([table]))
+        whole = ~streaming.lacking(table, wholly_blank([table]))
     if not whole.any():
         raise streaming.nothing(source.source)
     kept = streaming.chosen(table, whole)

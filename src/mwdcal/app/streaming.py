@@ -29,11 +29,11 @@ from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files import carried, contract, runs, streams, synonyms
 from mwdcal.files.contract import CHANNELS, COLUMNS, RANGES, RAW, RAW_RANGE, TEMPERATURE
-from mwdcal.files.faults import columns_of
+from mwdcal.files.faults import OPTIONAL, blank_cell, columns_of, is_blank, wholly_blank
 from mwdcal.files.formats import atomic, parquet
 from mwdcal.files.formats.columns import check_names, no_stations
 from mwdcal.files.formats.sinks import ParquetSink, Sink, TextSink
-from mwdcal.files.formats.table import Table, cell_error
+from mwdcal.files.formats.table import Table
 from mwdcal.files.formats.table import numbers as as_numbers
 from mwdcal.files.streams import Part, StreamedTable
 from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, UNCERTAINTIES
@@ -57,11 +57,6 @@ SAMPLE = 1024
 """Rows of a part on which undetermined outputs are judged."""
 BLOCK = 1 << 14
 """Rows that plain NumPy takes at a time."""
-OPTIONAL = {
-    CHANNELS["magnetometer"]: "Fill it in, or remove the station.",
-    ("temperature_c",): "Fill it in, or leave the whole column blank.",
-}
-"""Columns that are blank on all rows or on none, and what to do where they are neither."""
 LONGEST_SERIAL = 60
 """Most characters of another tool's serial that a finding names."""
 _MOST = 10**15
@@ -119,7 +114,7 @@ def apply_to_file(
     worker = _Worker(calibration, source, first, outside, missing, source.rows >= least, names)
     done, tallies = 0, []
     with atomic.replacing(output) as stream, closing(worker.sink(stream, output)) as sink:
-        work = partial(_exactly_if_refused, source, partial(worker.corrected, sink))
+        work = partial(source.exactly_if_refused, partial(worker.corrected, sink))
         for rendered, size, tally in overlapped(chain([first], pieces), work):
             sink.write(rendered)
             tallies.append(tally)
@@ -194,30 +189,15 @@ def nothing(source: str) -> InputError:
     )
 
 
-def _exactly_if_refused(
-    source: StreamedTable, work: Callable[[Part], Result], piece: Any
-) -> Result:
-    """`work` of a piece; where something in it seems wrong, of its text looked at line by line."""
-    try:
-        return work(source.load(piece, False))
-    except InputError:
-        return work(source.load(piece, True))
-
-
 def _table(source: StreamedTable, piece: Any) -> Table:
-    return _exactly_if_refused(source, lambda part: part.table, piece)
+    return source.exactly_if_refused(lambda part: part.table, piece)
 
 
 def _total(tallies: Sequence[RowCounts], moved: Collection[str]) -> RowCounts:
-    counts = [(t.rows, t.beyond, t.lacking, t.valueless) for t in tallies]
-    rows, beyond, lacking, valueless = np.sum(counts, 0).tolist()
     serials = runs.serials({}, chain.from_iterable(tally.serials for tally in tallies))
-    lows, highs = zip(*(tally.warmth for tally in tallies), strict=True)
-    return RowCounts(
-        rows, beyond, tuple(name for name in JUDGED if name in moved), lacking, tuple(serials),
-        strengths.total(tally.strengths for tally in tallies), (min(lows), max(highs)), {}, valueless,
-        correction.total(tally.scatter for tally in tallies),
-    )  # fmt: skip
+    return correction.joined(tallies)._replace(
+        moved=tuple(name for name in JUDGED if name in moved), serials=tuple(serials)
+    )
 
 
 class _Worker:
@@ -354,8 +334,8 @@ class _Worker:
             if names not in self.absent:
                 if names[0] in table.columns:
                     channels[kind] = [_column(table, name) for name in names]
-            elif not all(_is_blank(table, name) for name in names):
-                raise _blank(self.source.load(self.first, True).table, names)
+            elif not all(is_blank(table, name) for name in names):
+                raise blank_cell(self.source.load(self.first, True).table, names)
         return channels
 
     def _compiled(self, channels: Channels, count: int) -> correction_numba.CorrectedRows:
@@ -415,8 +395,8 @@ class _Worker:
         runs.to_readings(table, self.calibration.profile)
         for names in OPTIONAL:
             present = names[0] in table.columns and names not in self.absent
-            if present and _is_blank(table, names[0]):
-                raise _blank(table, names)
+            if present and is_blank(table, names[0]):
+                raise blank_cell(table, names)
 
 
 def described(calibration: Calibration) -> dict[str, object]:
@@ -433,16 +413,6 @@ def described(calibration: Calibration) -> dict[str, object]:
 def stated(metadata: Mapping[str, object], remarks: Iterable[Finding]) -> list[str]:
     """The findings that a table's metadata state already, and others."""
     return [*carried.stated_findings(metadata), *(finding.text for finding in remarks)]
-
-
-def wholly_blank(tables: Iterable[Table]) -> tuple[tuple[str, ...], ...]:
-    """Groups of optional columns that are blank on every row of all tables; looks no further than needed."""
-    left = [*OPTIONAL]
-    for table in tables:
-        left = [g for g in left if g[0] in table.columns and all(_is_blank(table, n) for n in g)]
-        if not left:
-            break
-    return tuple(left)
 
 
 def lacking(table: Table, absent: Sequence[tuple[str, ...]]) -> Bools:
@@ -469,19 +439,7 @@ def spread(values: AnyArray, rows: Bools) -> AnyArray:
     return out
 
 
-def _blank(table: Table, names: tuple[str, ...]) -> InputError:
-    problem = f"must be filled in; got a blank cell. {OPTIONAL[names]}"
-    return runs.BlankReadingError(str(cell_error(table, names[0], 0, problem)))
-
-
 def _column(table: Table, name: str) -> Array:
     """The column as numbers; what they may be is checked with all the rest."""
     column = table.columns[name]
     return as_numbers(table, name) if isinstance(column, list) else column
-
-
-def _is_blank(table: Table, name: str) -> bool:
-    column = table.columns[name]
-    if isinstance(column, list):
-        return not any(cell.strip() for cell in column)
-    return bool(np.isnan(column).all())

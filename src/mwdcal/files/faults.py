@@ -24,6 +24,13 @@ Cells = Callable[[str], Array | None]
 """The numbers (R,) of a column by its name, NaN where blank; None where there is no such column."""
 
 
+OPTIONAL = {
+    CHANNELS["magnetometer"]: "Fill it in, or remove the station.",
+    ("temperature_c",): "Fill it in, or leave the whole column blank.",
+}
+"""Columns that are blank on all rows or on none, and what to do where they are neither."""
+
+
 class BlankReadingError(InputError):
     """A blank cell among readings or temperatures: `apply` may leave the results of its row blank."""
 
@@ -151,3 +158,27 @@ def _stacked(cells: Cells, names: tuple[str, ...], starts: Ints) -> Array:
     """The columns (k, R); those that are not there are blank."""
     columns = (cells(name) for name in names)
     return np.stack([np.full(starts[-1], np.nan) if c is None else c for c in columns])
+
+
+def wholly_blank(tables: Iterable[Table]) -> tuple[tuple[str, ...], ...]:
+    """Groups of optional columns that are blank on every row of all tables; looks no further than needed."""
+    left = [*OPTIONAL]
+    for table in tables:
+        left = [g for g in left if g[0] in table.columns and all(is_blank(table, n) for n in g)]
+        if not left:
+            break
+    return tuple(left)
+
+
+def blank_cell(table: Table, names: tuple[str, ...]) -> InputError:
+    """The refusal of a column that is blank on some rows and not on others."""
+    problem = f"must be filled in; got a blank cell. {OPTIONAL[names]}"
+    return BlankReadingError(str(cell_error(table, names[0], 0, problem)))
+
+
+def is_blank(table: Table, name: str) -> bool:
+    """Whether a column has no cell that is filled in."""
+    column = table.columns[name]
+    if isinstance(column, list):
+        return not any(cell.strip() for cell in column)
+    return bool(np.isnan(column).all())

@@ -28,7 +28,7 @@ from mwdcal.survey.interference import (
 )
 from mwdcal.survey.norths import North
 from mwdcal.survey.surveying import SurveyedWell, WellInputs
-from mwdcal.survey.well import Well
+from mwdcal.survey.well import LastStation, Well, WellCounts
 from mwdcal.survey.well_errors import WellErrors
 
 MOST_CORRECTED = 30
@@ -200,7 +200,7 @@ def result_summary(result: SurveyedWell, output: str = "", html: str = "") -> Su
     """The result for machines; `output` and `html` are the files that were written, if any."""
     msa = result.analysis.summary if result.analysis else None
     unused = unused_columns(result.inputs.surveys.readings.unused)
-    return summary(result.well, output, html, msa, unused)
+    return summary(result.well, result.counts, output, html, msa, unused)
 
 
 def document(inputs: WellInputs, facts: SurveySummary, signature: SignatureCheck) -> dict[str, Any]:
@@ -225,21 +225,21 @@ def all_findings(facts: SurveySummary) -> list[Finding]:
 
 def summary(
     well: Well,
+    counts: WellCounts,
     output: str,
     html: str,
     msa: MultiStationAnalysis | None = None,
     about_file: Sequence[Finding] = (),
 ) -> SurveySummary:
-    """The result for machines; findings `about_file` come after those about the well."""
-    judged, accepted = well.judgement.judged, well.judgement.accepted
+    """The result for machines, `counts` of all surveys; findings `about_file` come after those about the well."""
     north = well.north
     return SurveySummary(
-        rows=len(judged),
-        accepted=int(accepted.sum()),
-        rejected=int((judged & ~accepted).sum()),
-        not_judged=int((~judged).sum()),
-        blind=int(well.blind.sum()),
-        blank=int(well.blank.sum()),
+        rows=counts.rows,
+        accepted=counts.accepted,
+        rejected=counts.rejected,
+        not_judged=counts.rows - counts.judged,
+        blind=counts.blind,
+        blank=counts.blank,
         north=north.name,
         **_stated(north, well.terms),
         error_model=well.errors.model.name if well.errors else "none",
@@ -247,7 +247,7 @@ def summary(
         reference_sources=dict(well.sources),
         limits=well.limits.name,
         source=well.limits.source,
-        end=end_of_path(well),
+        end=end_of_path(counts.end) if counts.end else None,
         findings=[*well.findings, *about_file],
         output=output,
         html=html,
@@ -275,23 +275,21 @@ def _stated(north: North, terms: ErrorTerms) -> dict[str, Any]:
     }
 
 
-def end_of_path(well: Well) -> EndOfPath | None:
+def end_of_path(last: LastStation) -> EndOfPath:
     """The last station with a position."""
-    if well.position is None or np.isnan(well.position.place[:, 0]).all():
-        return None
-    last = int(np.flatnonzero(~np.isnan(well.position.place[:, 0]))[-1])
-    north, east, tvd = well.position.place[last].tolist()
-    sd_north, sd_east, sd_tvd = map(stated, well.position.sd[last].tolist())
+    north, east, tvd = last.place.tolist()
+    variances = np.maximum(np.diagonal(last.covariance), 0.0)
+    sd_north, sd_east, sd_tvd = map(stated, np.sqrt(variances).tolist())
     return EndOfPath(
-        station=well.readings.labels[last],
-        md_m=float(well.position.md[last]),
+        station=last.label,
+        md_m=last.md,
         north_m=north,
         east_m=east,
         tvd_m=tvd,
         sd_north_m=sd_north,
         sd_east_m=sd_east,
         sd_tvd_m=sd_tvd,
-        covariance_m2=[[*map(stated, row)] for row in well.position.covariance[last].tolist()],
+        covariance_m2=[[*map(stated, row)] for row in last.covariance.tolist()],
     )
 
 
@@ -322,7 +320,7 @@ def screen(
         [
             *map(one_line, lines),
             "",
-            survey_table(well),
+            survey_table(well, facts.rows),
             *([written(table=facts.output, page=facts.html)] if facts.output else []),
         ]
     )
@@ -370,10 +368,10 @@ def end_in_words(end: EndOfPath, north: str) -> str:
     return f"at {fixed(end.md_m, 2)} m MD, from {north} north: {', '.join(parts)}"
 
 
-def survey_table(well: Well, most: int = MOST_SURVEYS) -> str:
-    """The first surveys, each angle with its standard uncertainty."""
+def survey_table(well: Well, count: int, most: int = MOST_SURVEYS) -> str:
+    """The first of so many surveys, each angle with its standard uncertainty."""
     header, rows = survey_rows(well, most)
-    more = len(well.readings.labels) - len(rows)
+    more = count - len(rows)
     return table(rows, header) + (f"\n… and {more} more" if more > 0 else "")
 
 

@@ -242,7 +242,7 @@ MOST_ROWS_OF_PAGE = 2000
 
 def render(well: Well, findings: list[Finding], sha256: Mapping[str, str]) -> str:
     """The surveys as HTML; `sha256` of the files they come from, by what these are."""
-    facts = summary(well, "", "")
+    facts = summary(well, well.counts, "", "")
     stated = well.readings.metadata, well.calibration.tool
     header, rows = survey_rows(well, MOST_ROWS_OF_PAGE)
     located = has_path(well.position)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import msgspec
 import numpy as np
@@ -116,15 +117,19 @@ class AcceptanceTests:
             self.fixed, self.covariance[rows], self.largest[rows], self.missing[rows]
         )
 
+    @cached_property
+    def _weights(self) -> Array:
+        """Inverse (n, 3, 3) of the covariance of the departures that are judged, with ones for the others."""
+        blank = self.missing[:, :, None] | self.missing[:, None, :]
+        whole = np.where(blank, np.eye(len(STRENGTH_NAMES)), self.covariance)
+        sd, correlation = correlations(whole)
+        return np.asarray(np.linalg.inv(correlation) / (sd[:, :, None] * sd[:, None, :]))
+
     def accept(self, departures: Mapping[str, Array]) -> Bools:
         """Which of departures (n, k) of |g|, |b| and dip are accepted; none where nothing is judged.
 
         Those that are not named are zero.
         """
-        blank = self.missing[:, :, None] | self.missing[:, None, :]
-        whole = np.where(blank, np.eye(len(STRENGTH_NAMES)), self.covariance)
-        sd, correlation = correlations(whole)
-        weights = np.linalg.inv(correlation) / (sd[:, :, None] * sd[:, None, :])
         inside, square = (~self.missing).any(-1, keepdims=True), np.zeros(1)
         shifts: list[tuple[int, Array]] = []
         for name, departure in departures.items():
@@ -133,9 +138,9 @@ class AcceptanceTests:
             shift = np.where(missing, 0.0, departure) if missing.any() else departure
             if np.isfinite(most := self.fixed[place]):
                 inside = inside & (np.abs(shift) <= most)
-            square = square + weights[:, place, [place]] * shift**2
+            square = square + self._weights[:, place, [place]] * shift**2
             for other, before in shifts:
-                square = square + 2.0 * weights[:, place, [other]] * shift * before
+                square = square + 2.0 * self._weights[:, place, [other]] * shift * before
             shifts.append((place, shift))
         return np.asarray(inside & (square <= self.largest[:, None] ** 2))
 
@@ -162,12 +167,12 @@ class Judgement:
         """Stations (n,) of which anything is judged."""
         return np.asarray((~np.isnan(self.departure)).any(-1))
 
-    def findings(self) -> list[str]:
-        """What is wrong with each station; empty where nothing is."""
-        pairs = zip(self.judged.tolist(), self.accepted.tolist(), strict=True)
+    def findings(self, rows: slice = slice(None)) -> list[str]:
+        """What is wrong with each station of some rows; empty where nothing is."""
+        pairs = zip(self.judged[rows].tolist(), self.accepted[rows].tolist(), strict=True)
         return [
             "" if accepted else self._finding(i) if judged else "not judged: no reference"
-            for i, (judged, accepted) in enumerate(pairs)
+            for i, (judged, accepted) in enumerate(pairs, rows.start or 0)
         ]
 
     def _finding(self, i: int) -> str:

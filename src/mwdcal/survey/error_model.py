@@ -116,18 +116,20 @@ class Hole:
         field: ArrayLike,
         dip: ArrayLike,
         gravity: ArrayLike = STANDARD_GRAVITY,
+        last: tuple[float, float, float] | None = None,
     ) -> Hole:
         """A hole from its stations in their order; `azimuth` from the north of the path, `magnetic` from magnetic.
 
-        The course to the first station is as long as the second one, and straight. Before any other station the azimuth
-        is that of the station itself where the hole was vertical.
+        `last`: depth, inclination and azimuth of the station before; None: the course to the first station is straight
+        and as long as the next one. Where the hole was vertical the azimuth before is that of the station itself.
         """
-        before = [
-            np.concatenate([values[:1], values[:-1]]) for values in (md, inclination, azimuth)
-        ]
+        if last is None:
+            course = md[1] - md[0] if len(md) > 1 else USUAL_COURSE
+            last = (md[0] - course, inclination[0], azimuth[0])
+        each = zip(last, (md, inclination, azimuth), strict=True)
+        before = [np.concatenate([[first], values[:-1]]) for first, values in each]
         straight = np.abs(np.sin(before[1])) <= VERTICAL
         before[2] = np.where(straight, azimuth, before[2])
-        before[0][:1] -= md[1] - md[0] if len(md) > 1 else USUAL_COURSE
         values = (md, tvd, inclination, azimuth, magnetic, field, dip, gravity, *before)
         return Hole({n: np.asarray(v, float) for n, v in zip(OF_STATIONS, values, strict=True)})
 

@@ -164,6 +164,25 @@ class DirectionErrors:
     random: Array
     course: Array | None = None
 
+    def stations(self, where: slice) -> DirectionErrors:
+        """Those of some stations."""
+        pairs = (..., where, slice(None), slice(None))
+        angles = self.inclination[..., where], self.azimuth[..., where]
+        course = None if self.course is None else self.course[pairs]
+        return DirectionErrors(*angles, self.systematic[pairs], self.random[pairs], course)
+
+    def followed_by(self, others: DirectionErrors) -> DirectionErrors:
+        """Those of both, one after the other."""
+        return DirectionErrors(
+            np.concatenate([self.inclination, others.inclination], -1),
+            np.concatenate([self.azimuth, others.azimuth], -1),
+            np.concatenate([self.systematic, others.systematic], -3),
+            np.concatenate([self.random, others.random], -3),
+            None
+            if self.course is None or others.course is None
+            else np.concatenate([self.course, others.course], -3),
+        )
+
 
 class _Sums(NamedTuple):
     """What has added up at the last station (…) of a part of a well.
@@ -176,6 +195,14 @@ class _Sums(NamedTuple):
     shift: Array
     settled: Array
     arrival: Array
+
+
+class PathEnd(NamedTuple):
+    """Where a path has come to: depth (…, 1) and errors of its last station, and what has added up there."""
+
+    md: Array
+    errors: DirectionErrors
+    sums: _Sums
 
 
 def tilts(inclination: ArrayLike, azimuth: ArrayLike) -> Array:
@@ -274,14 +301,14 @@ def position_covariance(
     lasting = np.zeros((*md.shape, 0, 2)) if systematic is None else np.asarray(systematic, float)
     new = np.zeros((*md.shape, 2, 2)) if random is None else np.asarray(random, float)
 
+    turned = None if course is None else np.asarray(course, float)
+    whole = DirectionErrors(inc, azi, lasting, new, turned)
+
     def part(where: slice) -> tuple[Array, DirectionErrors]:
-        stations = (..., where, slice(None), slice(None))
-        whole = None if course is None else np.asarray(course, float)[stations]
-        angles = inc[..., where], azi[..., where]
-        return md[..., where], DirectionErrors(*angles, lasting[stations], new[stations], whole)
+        return md[..., where], whole.stations(where)
 
     return np.concatenate(
-        [covariance for _, covariance in _along(md.shape[-1], part, balanced=balanced)], -3
+        [covariance for _, covariance, _ in _along(md.shape[-1], part, balanced=balanced)], -3
     )
 
 
@@ -293,48 +320,71 @@ def calibrated_path(
     declination_sd: float = 0.0,
     start: ArrayLike = (0.0, 0.0, 0.0),
     declination_noise: float = 0.0,
-    more: Callable[[DirectionErrors, Readings, slice], DirectionErrors] | None = None,
 ) -> tuple[Array, Array]:
     """Positions (n, 3), north, east, true vertical depth, m, of readings in a well, and their covariance (n, 3, 3).
 
     As `well_path` and `position_covariance` of `direction_errors`, in memory that the causes of error do not enter.
-    A station without a direction leaves none of the following ones a position: leave it out. `more` adds errors to
-    those of the directions at some rows.
+    A station without a direction leaves none of the following ones a position: leave it out.
 
     Raises:
         InputError: the depths do not increase.
     """
+    norths = north, declination_sd, declination_noise
+    return continued_path(calibration, readings, md, norths, start)[:2]
+
+
+def continued_path(
+    calibration: Calibration,
+    readings: Readings,
+    md: ArrayLike,
+    norths: tuple[float, float, float],
+    before: ArrayLike | PathEnd = (0.0, 0.0, 0.0),
+    more: Callable[[DirectionErrors, Readings, slice], DirectionErrors] | None = None,
+) -> tuple[Array, Array, PathEnd]:
+    """The same of readings that follow others of their well, and where the path has come to.
+
+    `norths` as of `direction_errors`. `before`: the position of the first station, or where the path had come to: a
+    well in parts has the positions that it has as a whole. `more` adds errors to those of the directions at some rows.
+    """
     depth = np.asarray(md, float)
-    if not (np.diff(depth) > 0).all():
+    last = [before.md] if isinstance(before, PathEnd) else []
+    if not (np.diff(np.concatenate([*last, depth])) > 0).all():
         raise InputError(
             "`md` must increase from station to station. Sort the stations by measured depth."
         )
 
     def part(where: slice) -> tuple[Array, DirectionErrors]:
         some = rows_of(readings, where)
-        errors = direction_errors(calibration, some, north, declination_sd, declination_noise)
+        errors = direction_errors(calibration, some, *norths)
         return depth[where], errors if more is None else more(errors, some, where)
 
-    both = list(_along(len(depth), part, start))
-    return np.concatenate([p for p, _ in both]), np.concatenate([c for _, c in both])
+    place, covariance = np.empty((len(depth), 3)), np.empty((len(depth), 3, 3))
+    done = 0
+    for places, covariances, end in _along(len(depth), part, before):  # noqa: B007, where it ends
+        rows = slice(done, done := done + len(places))
+        place[rows], covariance[rows] = places, covariances
+    return place, covariance, end
 
 
 def _along(
     count: int,
     part: Callable[[slice], tuple[Array, DirectionErrors]],
-    start: ArrayLike = (0.0, 0.0, 0.0),
+    before: ArrayLike | PathEnd = (0.0, 0.0, 0.0),
     balanced: bool = False,
-) -> Iterator[tuple[Array, Array]]:
-    """Positions (…, m, 3) and covariance (…, m, 3, 3) of all stations of a well, some at a time."""
-    sums = None
+) -> Iterator[tuple[Array, Array, PathEnd]]:
+    """Positions (…, m, 3) and covariance (…, m, 3, 3) of all stations, some at a time, and where each part ends."""
     for first in range(0, max(count, 1), STATIONS_AT_ONCE):
-        # each part begins with the last station of the one before
-        where = slice(max(first - 1, 0), first + STATIONS_AT_ONCE)
-        md, errors = part(where)
-        sums = sums or _no_sums(md, errors, start)
+        md, errors = part(slice(first, first + STATIONS_AT_ONCE))
+        new = slice(0, None)
+        if isinstance(before, PathEnd):  # each part begins with the last station of the one before
+            md = np.concatenate([before.md, md], -1)
+            errors, sums = before.errors.followed_by(errors), before.sums
+            new = slice(1, None)
+        else:
+            sums = _no_sums(md, errors, before)
         position, covariance, sums = _part_of_path(md, errors, sums, balanced)
-        skipped = first - where.start
-        yield position[..., skipped:, :], covariance[..., skipped:, :, :]
+        before = PathEnd(md[..., -1:], errors.stations(slice(-1, None)), sums)
+        yield position[..., new, :], covariance[..., new, :, :], before
 
 
 def _no_sums(md: Array, errors: DirectionErrors, start: ArrayLike) -> _Sums:

@@ -38,12 +38,14 @@ class Surveys:
 
     NaN: not there, such as azimuth and toolface within the uncertainty of vertical, or without a stated one.
     `strengths` (n, 3, 3): covariance of |g|, |b| and dip. `magnetic` (n,): the toolface counts from magnetic north.
+    `ends_magnetic`: so it does behind the last station, until the inclination says otherwise.
     """
 
     value: Array
     sd: Array
     strengths: Array
     magnetic: Bools
+    ends_magnetic: bool
 
     def of(self, name: str) -> tuple[Array, Array]:
         """An observable (n,) and its standard uncertainty; `toolface` is the one that counts."""
@@ -63,8 +65,11 @@ def surveyed(
     switch: tuple[float, float] = TOOLFACE_SWITCH,
     advance: Callable[[int, int], None] = lambda done, total: None,
     added: Callable[[Array, Array, slice], Array] | None = None,
+    starts_magnetic: bool = False,
 ) -> Surveys:
     """Surveys from readings, in the order in which they were taken.
+
+    `starts_magnetic`: the toolface counted from magnetic north at the station before.
 
     Shapes: `readings` of n stations without leading axes. Units: `switch` in radians. `advance` gets how many are
     done, and of how many. `added` gives the variance (m, 7) that the vectors (m, 3) of some rows have besides.
@@ -98,8 +103,9 @@ def surveyed(
         done = rows.stop
         advance(done, readings.count)
     there = calibration.has_field and readings.magnetometer is not None
-    magnetic = switched(value[:, 0], low, high) & there
-    return Surveys(value, sd, strengths, magnetic)
+    magnetic = switched(value[:, 0], low, high, starts_magnetic)
+    ends = bool(magnetic[-1]) if magnetic.size else starts_magnetic
+    return Surveys(value, sd, strengths, magnetic & there, ends)
 
 
 def blocks(readings: Readings) -> Iterator[Readings]:
@@ -108,11 +114,11 @@ def blocks(readings: Readings) -> Iterator[Readings]:
         yield rows_of(readings, slice(start, start + STATIONS_AT_ONCE))
 
 
-def switched(inclination: Array, low: float, high: float) -> Bools:
+def switched(inclination: Array, low: float, high: float, before: bool = False) -> Bools:
     """Stations (n,) whose toolface is magnetic: from below `low` until above `high`, in their order.
 
-    A first station between the two is taken as gravity toolface.
+    A first station between the two is as the one `before`, by default gravity toolface.
     """
     decided = np.where(inclination < low, 1, np.where(inclination > high, 0, -1))
     last = np.maximum.accumulate(np.where(decided >= 0, np.arange(len(decided)), -1))
-    return np.asarray((last >= 0) & (decided[np.maximum(last, 0)] == 1))
+    return np.where(last >= 0, decided[np.maximum(last, 0)] == 1, before)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,7 +38,7 @@ from mwdcal.survey.references import (
     source_of,
 )
 from mwdcal.survey.stations import RANDOM, TOOLFACE_SWITCH
-from mwdcal.survey.well import Well, well
+from mwdcal.survey.well import Well, WellCounts, well
 
 NO_MODEL = "none"
 """The word for standard uncertainties of calibration, noise and declination alone."""
@@ -86,31 +86,58 @@ def survey_readings(
     Raises:
         InputError: a table that cannot be read, depths under another name or in another unit.
     """
+    readings, md = station_readings(table, calibration, recognised)
+    north = norths_of(table.metadata, table.source, lambda: [readings], calibration, reference)
+    claims = {
+        name: claim(table.source, readings, name)
+        for name in judged_constants(calibration, readings)
+    }
+    sources, findings = of_reference(claims, north, reference, table.source)
+    referenced = readings if reference is None else with_reference(readings, reference)
+    return SurveyReadings(referenced, md, north, sources, findings)
+
+
+def station_readings(
+    table: Table, calibration: Calibration, recognised: bool = True
+) -> tuple[Readings, Array | None]:
+    """The readings of a table of surveys, and its measured depths (n,) if it has them."""
     table = renamed(table, calibration.profile)
     check_columns(list(table.columns), table.source)
     if calibration.thermal:
         synonyms.check_evidence(list(table.columns), table.source, ("temperature_c",))
     in_a_well = replace_struct(calibration.profile, stand=StandProfile())
     readings, _ = to_readings(table, in_a_well, recognised)
-    north = norths_of(table, readings, calibration, reference)
-    names = (
-        CONSTANTS if calibration.has_field and readings.magnetometer is not None else CONSTANTS[:1]
-    )
+    return readings, depths(table)
+
+
+def judged_constants(calibration: Calibration, readings: Readings) -> tuple[str, ...]:
+    """Those of gravity, field and dip that surveys are judged by."""
+    whole = calibration.has_field and readings.magnetometer is not None
+    return CONSTANTS if whole else CONSTANTS[:1]
+
+
+def claim(source: str, readings: Readings, name: str) -> Claim:
+    """What a table claims of gravity, field or dip."""
+    factor = REFERENCES[name].factor
+    return Claim(source, _stated(readings, name) / factor, readings.uncertainty(name) / factor)
+
+
+def of_reference(
+    claims: Mapping[str, Claim], north: North, reference: EarthReference | None, source: str
+) -> tuple[dict[str, str], list[Finding]]:
+    """Where references come from, by name, and where the reference contradicts the claims of a table or is not used."""
     sources, findings = {}, []
-    for name in names:
+    for name, stated in claims.items():
         otherwise = NO_SOURCE if reference is None else FROM_REFERENCE
-        sources[name] = source_of(~np.isnan(_stated(readings, name)), otherwise)
+        sources[name] = source_of(~np.isnan(np.asarray(stated.values)), otherwise)
         if reference is not None:
-            findings += _contradictions(table.source, readings, reference, name)
-    if len(names) == len(CONSTANTS):
+            findings += _contradictions(stated, reference, name)
+    if len(claims) == len(CONSTANTS):
         sources |= north.sources
-    if reference is not None:
-        readings = _referenced(readings, reference)
-    result = SurveyReadings(readings, _depths(table), north, sources, findings)
-    if reference is not None and not result.uses_reference:
-        text = f"nothing of `reference` is used: {table.source} states all of it itself. Leave one of the two out."
+    if reference is not None and not any(FROM_REFERENCE in each for each in sources.values()):
+        text = f"nothing of `reference` is used: {source} states all of it itself. Leave one of the two out."
         findings.append(Finding(id="reference-unused", text=text))
-    return result
+    return sources, findings
 
 
 def _stated(readings: Readings, name: str) -> Array:
@@ -125,20 +152,14 @@ def _of_place(reference: EarthReference, name: str) -> tuple[float, float, float
     return value * factor, shared * factor, alone * factor
 
 
-def _contradictions(
-    source: str, readings: Readings, reference: EarthReference, name: str
-) -> list[Finding]:
-    """Where the table and the reference contradict each other."""
+def _contradictions(stated: Claim, reference: EarthReference, name: str) -> list[Finding]:
+    """Where a table and the reference contradict each other."""
     factor, (value, shared, alone) = REFERENCES[name].factor, _of_place(reference, name)
-    return contradictions(
-        name,
-        Claim(source, _stated(readings, name) / factor, readings.uncertainty(name) / factor),
-        Claim("the reference", [value / factor], np.hypot(shared, alone) / factor),
-        "Check unit, place and date.",
-    )
+    place = Claim("the reference", [value / factor], np.hypot(shared, alone) / factor)
+    return contradictions(name, stated, place, "Check unit, place and date.")
 
 
-def _referenced(readings: Readings, reference: EarthReference) -> Readings:
+def with_reference(readings: Readings, reference: EarthReference) -> Readings:
     """The readings with gravity, field and dip of the place where the table states none.
 
     Their uncertainty that all stations share stands under the name, and what is new at each under `RANDOM`.
@@ -154,7 +175,8 @@ def _referenced(readings: Readings, reference: EarthReference) -> Readings:
     return replace(readings, known=known, sd=sd)
 
 
-def _depths(table: Table) -> Array | None:
+def depths(table: Table) -> Array | None:
+    """Measured depths (n,), m, which increase; None where the table has none."""
     if MEASURED_DEPTH not in table.columns:
         for name in table.columns:
             if _DEPTH_NAMES.fullmatch(name.strip().lower()):
@@ -164,17 +186,24 @@ def _depths(table: Table) -> Array | None:
                 )
         return None
     column = table.columns[MEASURED_DEPTH]
-    depths = numbers(table, MEASURED_DEPTH) if isinstance(column, list) else column
-    wrong = np.flatnonzero((depths < 0) | (depths > LARGEST_DEPTH))
+    md = numbers(table, MEASURED_DEPTH) if isinstance(column, list) else column
+    wrong = np.flatnonzero((md < 0) | (md > LARGEST_DEPTH))
     if wrong.size:
-        problem = f"must be between 0 and {LARGEST_DEPTH:g} m; got {depths[wrong[0]]:g}."
+        problem = f"must be between 0 and {LARGEST_DEPTH:g} m; got {md[wrong[0]]:g}."
         raise cell_error(table, MEASURED_DEPTH, int(wrong[0]), problem)
-    there = np.flatnonzero(~np.isnan(depths))
-    back = there[1:][np.diff(depths[there]) <= 0]
+    there = np.flatnonzero(~np.isnan(md))
+    back = there[1:][np.diff(md[there]) <= 0]
     if back.size:
-        problem = f"must increase from station to station; got {depths[back[0]]:g}. Sort; leave repeated surveys out."
-        raise cell_error(table, MEASURED_DEPTH, int(back[0]), problem)
-    return depths if there.size else None
+        raise not_deeper(table, int(back[0]), md[back[0]])
+    return md if there.size else None
+
+
+def not_deeper(table: Table, row: int, depth: float) -> InputError:
+    """A measured depth that is not beyond that of the station before."""
+    problem = (
+        f"must increase from station to station; got {depth:g}. Sort; leave repeated surveys out."
+    )
+    return cell_error(table, MEASURED_DEPTH, row, problem)
 
 
 def surveyed_table(table: Table, well: Well) -> Table:
@@ -184,12 +213,7 @@ def surveyed_table(table: Table, well: Well) -> Table:
         InputError: a column has the name of a result already.
     """
     results = well.columns
-    taken = [name for name in results if name in table.columns]
-    if taken:
-        raise InputError(
-            f"{table.source}: the column '{taken[0]}' is there already, and would be lost under the result of that "
-            "name. Rename it."
-        )
+    check_free(table, results)
     texts: dict[str, str] = {}  # few words stand in many rows: each is in memory once
     columns = {
         name: values
@@ -199,6 +223,16 @@ def surveyed_table(table: Table, well: Well) -> Table:
     }
     metadata = {**table.metadata, **described(well)}
     return replace(table, columns={**table.columns, **columns}, metadata=metadata)
+
+
+def check_free(table: Table, results: Collection[str]) -> None:
+    """Refuse a table that has a column of the name of a result."""
+    taken = [name for name in results if name in table.columns]
+    if taken:
+        raise InputError(
+            f"{table.source}: the column '{taken[0]}' is there already, and would be lost under the result of that "
+            "name. Rename it."
+        )
 
 
 def described(well: Well) -> Mapping[str, object]:
@@ -259,10 +293,14 @@ class WellInputs:
 
 @dataclass(frozen=True)
 class SurveyedWell:
-    """The surveys of a well with what they rest on; `analysis` is None without multi-station analysis."""
+    """The surveys of a well with what they rest on; `analysis` is None without multi-station analysis.
+
+    Of a long table that was surveyed in parts `well` has the first stations only, and `counts` is of all.
+    """
 
     inputs: WellInputs
     well: Well
+    counts: WellCounts
     analysis: Interference | None = None
 
     @property
@@ -290,14 +328,8 @@ def well_inputs(
     Raises:
         InputError: a file that cannot be read, readings that do not belong to the calibration.
     """
-    bounds, limits_digest = (
-        (limits, "") if isinstance(limits, SurveyLimits) else load_survey_limits(limits)
-    )
-    place, place_digest = (
-        (reference, "")
-        if reference is None or isinstance(reference, EarthReference)
-        else load_reference(reference)
-    )
+    bounds, limits_digest = loaded_limits(limits)
+    place, place_digest = loaded_reference(reference)
     read = survey_readings(table, calibration, place, recognised=recognised)
     digests = {"calibration": digest, "readings": table.digest}
     digests |= {"reference": place_digest} if read.uses_reference else {}
@@ -319,6 +351,20 @@ def error_model_of(model: ErrorModel | str | os.PathLike[str]) -> ErrorModel | N
     if isinstance(model, ErrorModel):
         return model
     return None if os.fspath(model) == NO_MODEL else load_error_model(model)
+
+
+def loaded_limits(limits: SurveyLimits | str | os.PathLike[str]) -> tuple[SurveyLimits, str]:
+    """Limits, and the SHA-256 of their file, empty for those in memory."""
+    return (limits, "") if isinstance(limits, SurveyLimits) else load_survey_limits(limits)
+
+
+def loaded_reference(
+    reference: EarthReference | str | os.PathLike[str] | None,
+) -> tuple[EarthReference | None, str]:
+    """A reference, and the SHA-256 of its file, empty for one in memory."""
+    if reference is None or isinstance(reference, EarthReference):
+        return reference, ""
+    return load_reference(reference)
 
 
 def check_drift(drift: object, msa: bool) -> None:
@@ -353,6 +399,5 @@ def survey_well(
         model=inputs.model,
     )  # fmt: skip
     findings = [*inputs.findings, *result.findings]
-    return SurveyedWell(
-        inputs, replace(result, findings=findings, sources=surveys.sources), analysis
-    )
+    result = replace(result, findings=findings, sources=surveys.sources)
+    return SurveyedWell(inputs, result, result.counts, analysis)

@@ -9,21 +9,20 @@ own uncertainty (`mwdcal.survey.norths`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import date
 
-import msgspec
 import numpy as np
 
 from mwdcal.calibration.readings import Readings, stated_day
 from mwdcal.calibration.record import Calibration
 from mwdcal.geometry.observables import OBSERVABLES
-from mwdcal.geometry.vectors import Array
+from mwdcal.geometry.vectors import Array, ArrayLike
 from mwdcal.survey.acceptance import SensorTerms
 from mwdcal.survey.error_model import USUAL_COURSE, ErrorModel, Hole
 from mwdcal.survey.interference import AXIAL_INTERFERENCE, CORRECTED, DRIFT, DRIFTED, OF_MODELS
-from mwdcal.survey.path import DirectionErrors, direction_gradient, well_path
+from mwdcal.survey.path import DirectionErrors, PathEnd, direction_gradient, well_path
 from mwdcal.survey.stations import SURVEYED, blocks
 from mwdcal.use.strengths import STANDARD_GRAVITY
 
@@ -40,29 +39,36 @@ class WellErrors:
     """The errors that count for the surveys of a well.
 
     `model`: terms that act by their formulas. `sensors`: drift of biases and scales since the calibration and
-    interference along the tool, 1σ. `years` since the calibration; None: not known.
+    interference along the tool, 1σ. `years` since the calibration; None: not known. `relative`: the magnetometer is
+    calibrated to a field of 1, whose size the references tell.
     """
 
     model: ErrorModel
     sensors: SensorTerms
     years: float | None
+    relative: bool = False
 
-    def columns(self, g: Array, b: Array) -> Array:
-        """Errors (n, 13, 6) of both vectors by 1σ of each independent cause that lasts over a run."""
-        count, unit = len(g), np.eye(6)
-        both = np.concatenate([g, b], -1)
+    def columns(self, g: Array, b: Array, unit: ArrayLike = 1.0) -> Array:
+        """Errors (n, 13, 6) of both vectors by 1σ of each independent cause that lasts over a run.
+
+        `unit` of the field, nT: that of a magnetometer calibrated to a field of 1 is the field itself.
+        """
+        sensors, one = self.sensors, np.ones((len(g), 1))
         bias = np.repeat(
-            [
-                self.sensors.accelerometer_bias_ms2 / STANDARD_GRAVITY,
-                self.sensors.magnetometer_bias_nt,
-            ],
-            3,
+            [sensors.accelerometer_bias_ms2 / STANDARD_GRAVITY, sensors.magnetometer_bias_nt], 3
         )
-        scale = np.repeat([self.sensors.accelerometer_scale, self.sensors.magnetometer_scale], 3)
-        biases = np.broadcast_to(bias[:, None] * unit, (count, 6, 6))
-        scales = (scale * both)[..., None] * unit
-        axial = np.broadcast_to(self.sensors.axial_interference_nt * unit[5:], (count, 1, 6))
-        return np.concatenate([biases, scales, axial], -2)
+        scale = np.repeat([sensors.accelerometer_scale, sensors.magnetometer_scale], 3)
+        size = one / np.broadcast_to(unit, (len(g),))[:, None]
+        biases = bias * np.concatenate([one, one, one, size, size, size], -1)
+        each = np.concatenate(
+            [
+                biases[..., None] * np.eye(6),
+                (scale * np.concatenate([g, b], -1))[..., None] * np.eye(6),
+            ],
+            1,
+        )
+        axial = (sensors.axial_interference_nt * size)[..., None] * np.eye(6)[5:]
+        return np.asarray(np.nan_to_num(np.concatenate([each, axial], 1)))
 
     def variances(self, g: Array, b: Array, hole: Hole) -> Array:
         """Variance (n, 7) that all terms add to the observables of a survey, in the order of `SURVEYED`.
@@ -70,7 +76,7 @@ class WellErrors:
         Errors of the hole's direction against the tool, such as sag, leave the toolface as it is.
         """
         gradient = np.stack([OBSERVABLES[name].gradient(g, b) for name in SURVEYED], -2)
-        result = ((gradient @ self.columns(g, b).mT) ** 2).sum(-1)
+        result = ((gradient @ self.columns(g, b, self._unit(hole)).mT) ** 2).sum(-1)
         systematic, random, _ = self.model.errors(hole)
         upward, sideways = ((systematic[..., i] ** 2).sum(-1) + random[..., i, i] for i in range(2))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -89,7 +95,22 @@ class WellErrors:
             n for letters, n in OF_MODELS.items() if any(s.startswith(letters) for s in starts)
         ]
 
-    def adder(
+    def _unit(self, hole: Hole) -> ArrayLike:
+        return hole.quantities["bfield"] if self.relative else 1.0
+
+    def of_surveys(
+        self,
+        calibration: Calibration,
+        readings: Readings,
+        md: Array | None,
+        before: Sequence[float] | PathEnd,
+    ) -> Callable[[Array, Array, slice], Array]:
+        """The variance of observables at some rows, by both vectors; depths count where all are known."""
+        whole = md is not None and not np.isnan(md).any()
+        hole = hole_of(calibration, readings, md if whole else None, 0.0, before if whole else ())
+        return lambda g, b, rows: self.variances(g, b, hole.part(rows))
+
+    def of_path(
         self, calibration: Calibration, hole: Hole
     ) -> Callable[[DirectionErrors, Readings, slice], DirectionErrors]:
         """Adds the errors of the model to those of directions at some rows of a well."""
@@ -100,7 +121,7 @@ class WellErrors:
     def along(self, errors: DirectionErrors, g: Array, b: Array, hole: Hole) -> DirectionErrors:
         """Errors of direction and depth along a well: those given, and those of the model."""
         _, gradient = direction_gradient(g, b)
-        sensors = _with_depth(self.columns(g, b) @ gradient.mT)
+        sensors = _with_depth(self.columns(g, b, self._unit(hole)) @ gradient.mT)
         systematic, random, course = self.model.errors(hole)
         noise = np.zeros_like(random)
         noise[:, :2, :2] = errors.random
@@ -117,8 +138,7 @@ def well_errors(model: ErrorModel, calibration: Calibration, readings: Readings)
     """What an error model adds to surveys by a calibration.
 
     Where multi-station analysis has taken interference off, its covariance holds what is left of it, and the drift that
-    it was told to allow for: neither is added. A magnetometer calibrated to a field of 1 is scaled to the field of the
-    references.
+    it was told to allow for: neither is added.
     """
     sizes = {term.name: term.size for term in model.terms}
     done = {finding.id for finding in calibration.findings}
@@ -131,16 +151,10 @@ def well_errors(model: ErrorModel, calibration: Calibration, readings: Readings)
         accelerometer_bias_ms2=ab, accelerometer_scale=scale_a, magnetometer_bias_nt=mb,
         magnetometer_scale=scale_m, axial_interference_nt=axial,
     )  # fmt: skip
-    if calibration.relative:
-        field = readings.reference("field")
-        known = float(np.nanmean(field)) if np.isfinite(field).any() else np.inf
-        sensors = msgspec.structs.replace(
-            sensors, magnetometer_bias_nt=mb / known, axial_interference_nt=axial / known
-        )
     others = [
         name for name in sizes if name.startswith((*_SENSORS, *_DECLINATION_TERMS, _INTERFERENCE))
     ]
-    return WellErrors(model.without(others), sensors, years)
+    return WellErrors(model.without(others), sensors, years, calibration.relative)
 
 
 def _largest(sizes: dict[str, float], start: str) -> float:
@@ -159,20 +173,28 @@ def hole_of(
     readings: Readings,
     md: Array | None,
     north: float = 0.0,
-    start: Iterable[float] = (0.0, 0.0, 0.0),
+    before: Sequence[float] | PathEnd = (),
 ) -> Hole:
     """The hole as the readings see it; without depths one survey every 30 m.
 
+    `before`: where its path has come to, or the position of the first station.
     Singular: at vertical the azimuth is the magnetic toolface, as of `path.direction_gradient`.
     """
     parts = [_seen(calibration, part) for part in blocks(readings)]
     inclination, magnetic, field, dip = (np.concatenate(each) for each in zip(*parts, strict=True))
     depth = USUAL_COURSE * np.arange(1.0, len(inclination) + 1) if md is None else md
-    azimuth = magnetic + north
-    there = np.isfinite(depth) & np.isfinite(inclination) & np.isfinite(azimuth)
-    tvd = np.full(len(depth), np.nan)
-    tvd[there] = well_path(depth[there], inclination[there], azimuth[there], tuple(start))[:, 2]
-    return Hole.along(depth, tvd, inclination, azimuth, magnetic, field, dip)
+    angles = inclination, magnetic + north
+    last: tuple[float, float, float] | None = None
+    if isinstance(before, PathEnd):
+        end = before.md, before.errors.inclination, before.errors.azimuth
+        last = (end[0].item(), end[1].item(), end[2].item())
+        md, i, a = (np.concatenate(each) for each in zip(end, (depth, *angles), strict=True))
+        tvd = well_path(md, i, a, before.sums.position)[1:, 2]
+    else:
+        tvd = well_path(depth, *angles, before or (0.0, 0.0, 0.0))[:, 2]
+    if calibration.relative:
+        field = np.broadcast_to(readings.reference("field"), depth.shape)
+    return Hole.along(depth, tvd, *angles, magnetic, field, dip, last=last)
 
 
 def _seen(calibration: Calibration, readings: Readings) -> tuple[Array, Array, Array, Array]:

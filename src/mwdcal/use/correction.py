@@ -77,13 +77,8 @@ def scatters(
         names.remove("field")
     if count < FEWEST_ROWS:
         return {}
-    starts = np.unique(
-        np.linspace(0, max(count - WINDOW_ROWS, 0), min(-(-count // WINDOW_ROWS), WINDOWS)).astype(
-            int
-        )
-    )
     result: dict[str, Scatter] = {}
-    for start in starts.tolist():
+    for start in window_starts(count):
         rows = slice(start, start + WINDOW_ROWS)
         middle = rows_of(readings, slice(start, start + WINDOW_ROWS, 16))
         sd = standard_uncertainties(calibration, middle, names)
@@ -94,6 +89,13 @@ def scatters(
                 result.get(name, Scatter()), _window(name, values, sd[..., k] * unit)
             )
     return result
+
+
+def window_starts(count: int) -> list[int]:
+    """First rows of the windows of `WINDOW_ROWS` of so many rows, over all of which they spread."""
+    most = min(-(-count // WINDOW_ROWS), WINDOWS)
+    starts = np.linspace(0, max(count - WINDOW_ROWS, 0), most).astype(int)
+    return [int(start) for start in np.unique(starts)]
 
 
 def _window(name: str, values: Array, sd: Array) -> Scatter:
@@ -224,6 +226,20 @@ def counted(
 
     With `uncertainty` the columns of standard uncertainties too.
     """
+    columns, tally = tallied(calibration, readings, outside, lacking, uncertainty)
+    about = findings(calibration, readings, tally, outside)
+    strengths.check(calibration, tally.strengths, readings.name)
+    return columns, tally, about
+
+
+def tallied(
+    calibration: Calibration,
+    readings: Readings,
+    outside: str,
+    lacking: int = 0,
+    uncertainty: bool = False,
+) -> tuple[dict[str, AnyArray], RowCounts]:
+    """Output columns and counts of the rows, of which nothing is refused."""
     check_outside(outside)
     columns = compiled(calibration, readings) or reference(calibration, readings)
     beyond = calibration.outside(readings)
@@ -235,11 +251,23 @@ def counted(
         strengths.judged(calibration, columns, readings.known), warmth(readings.temperature),
         readings.metadata, valueless, scatters(calibration, readings, columns),
     )  # fmt: skip
-    about = findings(calibration, readings, tally, outside)
-    strengths.check(calibration, tally.strengths, readings.name)
     if outside == "extrapolate":
         columns[EXTRAPOLATED] = beyond
-    return columns, tally, about
+    return columns, tally
+
+
+def joined(tallies: Sequence[RowCounts]) -> RowCounts:
+    """The counts of the parts of a table together; serials and metadata are those of the first."""
+    counts = [(t.rows, t.beyond, t.lacking, t.valueless) for t in tallies]
+    rows, beyond, lacking, valueless = np.sum(counts, 0).tolist()
+    lows, highs = zip(*(tally.warmth for tally in tallies), strict=True)
+    moved = {name for tally in tallies for name in tally.moved}
+    return tallies[0]._replace(
+        rows=rows, beyond=beyond, moved=tuple(name for name in JUDGED if name in moved),
+        lacking=lacking, strengths=strengths.total(tally.strengths for tally in tallies),
+        warmth=(min(lows), max(highs)), valueless=valueless,
+        scatter=total(tally.scatter for tally in tallies),
+    )  # fmt: skip
 
 
 def warmth(temperature: Array | None) -> tuple[float, float]:

@@ -93,6 +93,7 @@ def command(
     from mwdcal.files.formats import table as tables
     from mwdcal.files.runs import MOST_ROWS, read_export
     from mwdcal.presentation.signature import load_calibration
+    from mwdcal.survey import long_table
     from mwdcal.survey.surveying import analysed, check_drift, survey_well, well_inputs
 
     if msa_html and not msa:
@@ -103,6 +104,13 @@ def command(
     start, ends = _three("tie_in", tie_in), _switch(switch)
     loaded = load_calibration(calibration, key)
     fitted = loaded.calibration
+    if not (msa or html) and long_table.in_parts(readings, output, fitted.profile):
+        result = long_table.survey_file(
+            fitted, readings, output, reference, limits, start, ends, outside, decimal,
+            loaded.digest, loaded.findings, error_model,
+        )  # fmt: skip
+        _print(result, loaded.signature, (str(output), ""), as_json)
+        return
     table = read_export(readings, fitted.profile, decimal=decimal, rows=MOST_ROWS)
     inputs = well_inputs(
         fitted, table, reference, limits, msa, loaded.digest, loaded.findings, error_model
