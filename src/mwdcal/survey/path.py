@@ -355,12 +355,13 @@ def continued_path(
     def part(where: slice) -> tuple[Array, DirectionErrors]:
         return depth[where], direction_errors(calibration, rows_of(readings, where), *norths)
 
-    place, covariance = np.empty((len(depth), 3)), np.empty((len(depth), 3, 3))
-    done = 0
-    for places, covariances, before in _along(len(depth), part, before):  # noqa: B020, its end
-        rows = slice(done, done := done + len(places))
-        place[rows], covariance[rows] = places, covariances
-    return place, covariance, before
+    place, covariance, end = [], [], None
+    for each in _along(len(depth), part, before):
+        place.append(each[0])
+        covariance.append(each[1])
+        end = each[2]
+    assert end is not None
+    return np.concatenate(place), np.concatenate(covariance), end
 
 
 def _along(
