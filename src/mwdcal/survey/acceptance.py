@@ -13,7 +13,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import msgspec
 import numpy as np
@@ -299,7 +299,7 @@ CROSS_AXIAL = np.arange(50.0, 301.0, 50.0)
 """Sizes across it: to twice what multi-station analysis assumes."""
 AROUND_TOOL = np.radians(np.arange(0.0, 360.0, 30.0))
 """Directions across it, rad."""
-SURVEYS_AT_ONCE = 1 << 8
+SURVEYS_AT_ONCE = 1 << 9
 """Surveys for which all sizes are tried at once, so that they stay in fast memory."""
 WHERE = ("along the tool", "across it")
 
@@ -316,22 +316,58 @@ class Blindness:
 
     def words(self, places: Ints, least: Array) -> list[str]:
         """What would pass at some surveys (m,) and turn their azimuth by at least so much (m,), rad."""
-        parts: list[list[str]] = [[] for _ in places]
-        for k, (where, last) in enumerate(zip(WHERE, (AXIAL[-1], CROSS_AXIAL[-1]), strict=True)):
-            names = {
-                size: f"{size:.0f} nT{' or more' if size >= last else ''} {where} by "
-                for size in np.unique(self.size[places, k]).tolist()
-            }
-            turns = np.degrees(self.turn[places, k]).tolist()
-            enough = (self.turn[places, k] >= least).tolist()
-            for each, size, turn, is_enough in zip(
-                parts, self.size[places, k].tolist(), turns, enough, strict=True
-            ):
-                if is_enough:
-                    each.append(f"{names[size]}{turn:.2g}°")
-        return [
-            f"interference would pass and turn the azimuth: {', '.join(each)}" for each in parts
+        texts = [
+            self._words_of(places, k, where, last, least)
+            for k, (where, last) in enumerate(zip(WHERE, (AXIAL[-1], CROSS_AXIAL[-1]), strict=True))
         ]
+        return [
+            f"interference would pass and turn the azimuth: {', '.join(filter(None, each))}"
+            for each in zip(*texts, strict=True)
+        ]
+
+    def _words_of(self, places: Ints, k: int, where: str, last: float, least: Array) -> list[str]:
+        """The same along the tool or across it; empty where less turns the azimuth."""
+        sizes, of_size = np.unique(self.size[places, k], return_inverse=True)
+        names = [
+            f"{size:.0f} nT{' or more' if size >= last else ''} {where} by "
+            for size in sizes.tolist()
+        ]
+        turn = self.turn[places, k]
+        angles, of_angle = np.unique(two_digits(np.degrees(turn)), return_inverse=True)
+        both, of_both = np.unique(of_size * len(angles) + of_angle, return_inverse=True)
+        texts = [
+            f"{names[pair // len(angles)]}{angles[pair % len(angles)]:.2g}°"
+            for pair in both.tolist()
+        ]
+        texts.append("")
+        return [texts[i] for i in np.where(turn >= least, of_both, len(both)).tolist()]
+
+
+def two_digits(values: Array) -> Array:
+    """Positive numbers (n,) with two digits, each as `.2g` rounds it.
+
+    Reference: between two neighbours of two digits `.2g` itself says to which the number halfway belongs.
+    """
+    low, high = _TWO_DIGITS[0], _TWO_DIGITS[-1]
+    inside = (values >= low) & (values <= high)
+    rounded = _TWO_DIGITS[np.searchsorted(_HALFWAY, values, "right").clip(0, len(_TWO_DIGITS) - 1)]
+    for place in np.flatnonzero(~inside).tolist():
+        rounded[place] = float(f"{values[place]:.2g}")
+    return np.asarray(rounded)
+
+
+_TWO_DIGITS = np.array([float(f"{d}e{e}") for e in range(-5, 3) for d in range(10, 100)])
+_HALFWAY = np.array(
+    [
+        half if f"{half:.2g}" == f"{above:.2g}" else np.nextafter(half, np.inf)
+        for half, above in (
+            (float(f"{d}.5e{e}"), float(f"{d + 1}e{e}"))
+            for e in range(-5, 3)
+            for d in range(10, 100)
+        )
+    ]
+)[:-1]
+"""The least numbers that `.2g` rounds to each but the first of `_TWO_DIGITS`."""
 
 
 def blindness(tests: AcceptanceTests, vectors: tuple[Array, Array]) -> Blindness:
@@ -351,6 +387,7 @@ def _blocks(count: int) -> Iterator[slice]:
         yield slice(start, start + SURVEYS_AT_ONCE)
 
 
+@cache
 def _candidates() -> tuple[Array, Array]:
     """Fields (k, 3) along the tool and across it, nT."""
     along = np.zeros((2 * len(AXIAL), 3))

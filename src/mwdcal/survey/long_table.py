@@ -238,7 +238,10 @@ class _LongTable:
                 is_blank(table, name) for name in names
             ):
                 raise blank_cell(self.opening if names in self.absent else table, names)
-        readings, md = station_readings(table, self.settings.calibration, recognised=False)
+        unlabelled = {name: table.columns[name] for name in table.columns if name != "station"}
+        readings, md = station_readings(
+            replace(table, columns=unlabelled), self.settings.calibration, recognised=False
+        )
         if md is not None:
             there = np.flatnonzero(~np.isnan(md))
             if md[there[0]] <= seen.depth:
@@ -268,7 +271,7 @@ class _LongTable:
             md = np.full(readings.count, np.nan)
         well, tally = part_of_well(
             calibration, readings, settings.limits, self.north, md, seen.before, settings.switch,
-            settings.outside, model=settings.model,
+            settings.outside, model=settings.model, whole=False,
         )  # fmt: skip
         seen.before = well.after
         seen.tallies.append(tally)

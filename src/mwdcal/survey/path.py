@@ -358,12 +358,13 @@ def continued_path(
         errors = direction_errors(calibration, some, *norths)
         return depth[where], errors if more is None else more(errors, some, where)
 
-    place, covariance = np.empty((len(depth), 3)), np.empty((len(depth), 3, 3))
-    done = 0
-    for places, covariances, end in _along(len(depth), part, before):  # noqa: B007, where it ends
-        rows = slice(done, done := done + len(places))
-        place[rows], covariance[rows] = places, covariances
-    return place, covariance, end
+    place, covariance, end = [], [], None
+    for each in _along(len(depth), part, before):
+        place.append(each[0])
+        covariance.append(each[1])
+        end = each[2]
+    assert end is not None
+    return np.concatenate(place), np.concatenate(covariance), end
 
 
 def _along(

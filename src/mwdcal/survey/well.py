@@ -321,7 +321,8 @@ class Well:
         if self.position is None or not path.any():
             return None
         row, at = int(np.flatnonzero(path)[-1]), self.position
-        return LastStation(labels[row], float(at.md[row]), at.place[row], at.covariance[row])
+        place, covariance = at.place[row].copy(), at.covariance[row].copy()  # of one station alone
+        return LastStation(labels[row], float(at.md[row]), place, covariance)
 
 
 def well(
@@ -373,9 +374,13 @@ def part_of_well(
     outside: str = "blank",
     advance: Callable[[int, int], None] = lambda done, total: None,
     model: ErrorModel | None = None,
+    whole: bool = True,
 ) -> tuple[Well, RowCounts]:
-    """The same of stations that follow others, without findings; and what the findings say of the corrected rows."""
-    columns, tally = tallied(calibration, readings, outside)
+    """The same of stations that follow others, without findings; and what the findings say of the corrected rows.
+
+    `whole`: the stations are all of the table.
+    """
+    columns, tally = tallied(calibration, readings, outside, whole=whole)
     beyond, blank = calibration.outside(readings), np.isnan(columns[RESULTS[0]])
     errors = None
     if model is not None and calibration.has_field:

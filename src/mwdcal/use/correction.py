@@ -238,8 +238,9 @@ def tallied(
     outside: str,
     lacking: int = 0,
     uncertainty: bool = False,
+    whole: bool = True,
 ) -> tuple[dict[str, AnyArray], RowCounts]:
-    """Output columns and counts of the rows, of which nothing is refused."""
+    """Output columns and counts of the rows, of which nothing is refused; their scatter only of a `whole` table."""
     check_outside(outside)
     columns = compiled(calibration, readings) or reference(calibration, readings)
     beyond = calibration.outside(readings)
@@ -249,7 +250,7 @@ def tallied(
     tally = RowCounts(
         readings.count + lacking, int(beyond.sum()), undetermined(calibration, readings), lacking, (),
         strengths.judged(calibration, columns, readings.known), warmth(readings.temperature),
-        readings.metadata, valueless, scatters(calibration, readings, columns),
+        readings.metadata, valueless, scatters(calibration, readings, columns) if whole else {},
     )  # fmt: skip
     if outside == "extrapolate":
         columns[EXTRAPOLATED] = beyond
