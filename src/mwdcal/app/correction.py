@@ -15,7 +15,7 @@ from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files import carried, streams
 from mwdcal.files.contract import CHANNELS, check_columns
-from mwdcal.files.faults import wholly_blank
+from mwdcal.files.faults import chosen, nothing, spread, wholly_blank, without_reading
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import as_text
 from mwdcal.files.formats.table import EXCHANGED, Table
@@ -119,16 +119,16 @@ def apply_to_table(
     streaming.check_warmth(calibration, list(table.columns), source.source)
     whole = np.ones(source.count, bool)
     if missing == "blank":
-        whole = ~streaming.lacking(table, wholly_blank([table]))
+        whole = ~without_reading(table, wholly_blank([table]))
     if not whole.any():
-        raise streaming.nothing(source.source)
-    kept = streaming.chosen(table, whole)
+        raise nothing(source.source)
+    kept = chosen(table, whole)
     readings, _ = to_readings(kept, calibration.profile)
     results, tally, findings = counted(
         calibration, readings, outside, source.count - kept.count, uncertainty
     )
     streaming.check_free(source.columns, list(results), source.source)
-    columns = {name: streaming.spread(values, whole) for name, values in results.items()}
+    columns = {name: spread(values, whole) for name, values in results.items()}
     metadata = {**source.metadata, **streaming.described(calibration)}
     if remarks := streaming.stated(metadata, findings):
         metadata["findings"] = remarks

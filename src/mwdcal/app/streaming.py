@@ -28,8 +28,18 @@ from mwdcal.calibration.readings import TRIADS, Readings, is_simulated
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files import carried, contract, runs, streams, synonyms
-from mwdcal.files.contract import CHANNELS, COLUMNS, RANGES, RAW, RAW_RANGE, TEMPERATURE
-from mwdcal.files.faults import OPTIONAL, blank_cell, columns_of, is_blank, wholly_blank
+from mwdcal.files.contract import CHANNELS, COLUMNS, RANGES, RAW_RANGE, TEMPERATURE
+from mwdcal.files.faults import (
+    OPTIONAL,
+    blank_cell,
+    chosen,
+    columns_of,
+    is_blank,
+    nothing,
+    spread,
+    wholly_blank,
+    without_reading,
+)
 from mwdcal.files.formats import atomic, parquet
 from mwdcal.files.formats.columns import check_names, no_stations
 from mwdcal.files.formats.sinks import ParquetSink, Sink, TextSink
@@ -37,7 +47,7 @@ from mwdcal.files.formats.table import Table
 from mwdcal.files.formats.table import numbers as as_numbers
 from mwdcal.files.streams import Part, StreamedTable
 from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, UNCERTAINTIES
-from mwdcal.geometry.vectors import AnyArray, Array, Bools
+from mwdcal.geometry.vectors import Array, Bools
 from mwdcal.use import correction, correction_numba, strengths
 from mwdcal.use.correction import JUDGED, RowCounts
 from mwdcal.use.uncertainty import with_uncertainty
@@ -181,14 +191,6 @@ def check_free(names: Iterable[str], results: Sequence[str], source: str) -> Non
         )
 
 
-def nothing(source: str) -> InputError:
-    """A table of which no row can be corrected."""
-    return InputError(
-        f"{source}: every row lacks a reading, so that there is nothing to correct. Check the "
-        "columns of the raw channels and temperature_c."
-    )
-
-
 def _table(source: StreamedTable, piece: Any) -> Table:
     return source.exactly_if_refused(lambda part: part.table, piece)
 
@@ -271,7 +273,7 @@ class _Worker:
         channels, corrected = self._compute(table)
         whole: Bools | None = None
         if corrected.unsound and self.missing == "blank":
-            whole = ~lacking(table, self.absent)
+            whole = ~without_reading(table, self.absent)
             table = chosen(table, whole)
             channels, corrected = self._compute(table)
         if corrected.unsound:
@@ -413,30 +415,6 @@ def described(calibration: Calibration) -> dict[str, object]:
 def stated(metadata: Mapping[str, object], remarks: Iterable[Finding]) -> list[str]:
     """The findings that a table's metadata state already, and others."""
     return [*carried.stated_findings(metadata), *(finding.text for finding in remarks)]
-
-
-def lacking(table: Table, absent: Sequence[tuple[str, ...]]) -> Bools:
-    """Rows (n,) with a blank reading or temperature; columns `absent` on all rows do not count."""
-    without = [name for group in absent for name in group]
-    names = [n for n in (*RAW, "temperature_c") if n in table.columns and n not in without]
-    return np.asarray(np.isnan([_column(table, name) for name in names]).any(axis=0))
-
-
-def chosen(table: Table, rows: Bools) -> Table:
-    """Some rows of a table, with their places."""
-    picked = np.flatnonzero(rows).tolist()
-    columns = {
-        name: [column[i] for i in picked] if isinstance(column, list) else column[rows]
-        for name, column in table.columns.items()
-    }
-    return replace(table, columns=columns, lines=[table.lines[i] for i in picked])
-
-
-def spread(values: AnyArray, rows: Bools) -> AnyArray:
-    """Values of the chosen rows, at their places among all; others are NaN, or False."""
-    out = np.full(rows.shape, False if values.dtype == bool else np.nan, values.dtype)
-    out[rows] = values
-    return out
 
 
 def _column(table: Table, name: str) -> Array:

@@ -7,7 +7,8 @@ are is judged tool by tool.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
@@ -15,9 +16,9 @@ import numpy as np
 
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.errors import InputError
-from mwdcal.files.contract import CHANNELS, RANGES, REFERENCES
+from mwdcal.files.contract import CHANNELS, RANGES, RAW, REFERENCES
 from mwdcal.files.formats.table import Table, cell_error, numbers, shown
-from mwdcal.geometry.vectors import Array, Bools, Ints
+from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints
 from mwdcal.sensor.profile import Profile
 
 Cells = Callable[[str], Array | None]
@@ -182,3 +183,42 @@ def is_blank(table: Table, name: str) -> bool:
     if isinstance(column, list):
         return not any(cell.strip() for cell in column)
     return bool(np.isnan(column).all())
+
+
+def without_reading(table: Table, absent: Sequence[tuple[str, ...]]) -> Bools:
+    """Rows (n,) with a blank reading or temperature; columns `absent` on all rows do not count."""
+    without = [name for group in absent for name in group]
+    names = [n for n in (*RAW, "temperature_c") if n in table.columns and n not in without]
+    return np.asarray(np.isnan([_cells(table, name) for name in names]).any(axis=0))
+
+
+def chosen(table: Table, rows: Bools) -> Table:
+    """Some rows of a table, with their places."""
+    picked = np.flatnonzero(rows).tolist()
+    columns = {
+        name: [column[i] for i in picked] if isinstance(column, list) else column[rows]
+        for name, column in table.columns.items()
+    }
+    return replace(table, columns=columns, lines=[table.lines[i] for i in picked])
+
+
+def spread(values: AnyArray, rows: Bools) -> AnyArray:
+    """Values of the chosen rows, at their places among all; others are NaN, False or blank."""
+    blank = {"b": False, "U": "", "O": ""}.get(values.dtype.kind, np.nan)
+    out = np.full(rows.shape, blank, values.dtype)
+    out[rows] = values
+    return out
+
+
+def _cells(table: Table, name: str) -> Array:
+    """The column as numbers; what they may be is checked with all the rest."""
+    column = table.columns[name]
+    return numbers(table, name) if isinstance(column, list) else column
+
+
+def nothing(source: str) -> InputError:
+    """A table of which no row can be corrected."""
+    return InputError(
+        f"{source}: every row lacks a reading, so that there is nothing to correct. Check the "
+        "columns of the raw channels and temperature_c."
+    )

@@ -435,6 +435,7 @@ def survey(
     switch: tuple[float, float] = (3.0, 5.0),
     tie_in: tuple[float, float, float] | None = None,
     outside: Literal["blank", "refuse", "extrapolate"] = "blank",
+    missing: Literal["refuse", "blank"] = "refuse",
     decimal: str = ".",
     keys: Iterable[FilePath] = (),
 ) -> WellSurvey:
@@ -457,6 +458,7 @@ def survey(
             high side.
         tie_in: north, east and TVD of the first station, m.
         outside: what becomes of readings outside the calibrated temperatures.
+        missing: rows without a reading, such as a tie-in station: refuse the table, or leave their results blank.
         decimal: decimal sign of a text file.
         keys: files of public keys to trust, by which the signature of the calibration is checked.
 
@@ -478,7 +480,7 @@ def survey(
     table = _survey_table(readings, loaded.calibration, decimal)
     inputs = well_inputs(
         loaded.calibration, table, _earth(reference), limits, msa, loaded.digest, loaded.findings,
-        error_model,
+        error_model, missing,
     )  # fmt: skip
     analysis = analysed(inputs, sensor_drift) if msa else None
     if analysis:

@@ -244,7 +244,7 @@ class _LongTable:
         )
         if md is not None:
             there = np.flatnonzero(~np.isnan(md))
-            if md[there[0]] <= seen.depth:
+            if md[there[0]] < seen.depth:
                 raise not_deeper(table, int(there[0]), md[there[0]])
         seen.serials.update(dict.fromkeys(labels(table, "serial")))
         given = labels(table, "station") or [""] * table.count

@@ -18,9 +18,10 @@ from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files import synonyms
 from mwdcal.files.contract import REFERENCES, check_columns
+from mwdcal.files.faults import chosen, nothing, spread, wholly_blank, without_reading
 from mwdcal.files.formats.table import Table, cell_error, numbers
 from mwdcal.files.runs import renamed, to_readings
-from mwdcal.geometry.vectors import Array
+from mwdcal.geometry.vectors import Array, Bools
 from mwdcal.sensor.profile import StandProfile
 from mwdcal.survey.acceptance import SurveyLimits, load_survey_limits
 from mwdcal.survey.error_model import BUILT_IN, ErrorModel, load_error_model
@@ -192,7 +193,7 @@ def depths(table: Table) -> Array | None:
         problem = f"must be between 0 and {LARGEST_DEPTH:g} m; got {md[wrong[0]]:g}."
         raise cell_error(table, MEASURED_DEPTH, int(wrong[0]), problem)
     there = np.flatnonzero(~np.isnan(md))
-    back = there[1:][np.diff(md[there]) <= 0]
+    back = there[1:][np.diff(md[there]) < 0]
     if back.size:
         raise not_deeper(table, int(back[0]), md[back[0]])
     return md if there.size else None
@@ -200,19 +201,19 @@ def depths(table: Table) -> Array | None:
 
 def not_deeper(table: Table, row: int, depth: float) -> InputError:
     """A measured depth that is not beyond that of the station before."""
-    problem = (
-        f"must increase from station to station; got {depth:g}. Sort; leave repeated surveys out."
-    )
+    problem = f"must not decrease from station to station; got {depth:g}. Sort the stations by measured depth."
     return cell_error(table, MEASURED_DEPTH, row, problem)
 
 
-def surveyed_table(table: Table, well: Well) -> Table:
-    """The table with the results beside its columns.
+def surveyed_table(table: Table, well: Well, rows: Bools | None = None) -> Table:
+    """The table with the results beside its columns; `rows` (n,) are those of the well, by default all.
 
     Raises:
         InputError: a column has the name of a result already.
     """
     results = well.columns
+    if rows is not None:
+        results = {name: spread(values, rows) for name, values in results.items()}
     check_free(table, results)
     texts: dict[str, str] = {}  # few words stand in many rows: each is in memory once
     columns = {
@@ -267,7 +268,8 @@ def described(well: Well) -> Mapping[str, object]:
 class WellInputs:
     """What the surveys of a well rest on.
 
-    `model`: the error model whose terms are in the standard uncertainties; None: none.
+    `model`: the error model whose terms are in the standard uncertainties; None: none. `rows` (n,) of the table that
+    have readings; None: all.
     `findings` are of the calibration's signature and of the reference; `digests` the SHA-256 of each input by name,
     empty for one that is in memory.
     """
@@ -279,6 +281,7 @@ class WellInputs:
     findings: list[Finding]
     digests: Mapping[str, str]
     model: ErrorModel | None = None
+    rows: Bools | None = None
 
     @property
     def stated(self) -> tuple[Mapping[str, object], Mapping[str, object]]:
@@ -306,7 +309,7 @@ class SurveyedWell:
     @property
     def table(self) -> Table:
         """The table of the readings with the results beside its columns."""
-        return surveyed_table(self.inputs.table, self.well)
+        return surveyed_table(self.inputs.table, self.well, self.inputs.rows)
 
 
 def well_inputs(
@@ -318,6 +321,7 @@ def well_inputs(
     digest: str = "",
     findings: Sequence[Finding] = (),
     error_model: ErrorModel | str | os.PathLike[str] = BUILT_IN,
+    missing: str = "refuse",
 ) -> WellInputs:
     """What surveys rest on: a table of readings, the calibration of their tool, reference and limits.
 
@@ -330,7 +334,16 @@ def well_inputs(
     """
     bounds, limits_digest = loaded_limits(limits)
     place, place_digest = loaded_reference(reference)
-    read = survey_readings(table, calibration, place, recognised=recognised)
+    rows = _with_readings(table, calibration) if missing == "blank" else np.ones(table.count, bool)
+    read = survey_readings(chosen(table, rows), calibration, place, recognised=recognised)
+    if not rows.all():
+        numbered = np.flatnonzero(rows) + 1
+        names = tuple(
+            label or str(i) for label, i in zip(read.readings.station, numbered, strict=True)
+        )
+        text = f"{np.sum(~rows)} of {rows.size} rows lack a reading: their results are blank."
+        about = [Finding(id="missing-reading", text=text), *read.findings]
+        read = replace(read, readings=replace(read.readings, station=names), findings=about)
     digests = {"calibration": digest, "readings": table.digest}
     digests |= {"reference": place_digest} if read.uses_reference else {}
     model = error_model_of(error_model)
@@ -343,7 +356,17 @@ def well_inputs(
         [*findings, *read.findings],
         {**digests, "limits": limits_digest},
         model,
+        None if rows.all() else rows,
     )
+
+
+def _with_readings(table: Table, calibration: Calibration) -> Bools:
+    """Rows (n,) that lack no reading."""
+    own = renamed(table, calibration.profile)
+    rows = ~without_reading(own, wholly_blank([own]))
+    if not rows.any():
+        raise nothing(table.source)
+    return rows
 
 
 def error_model_of(model: ErrorModel | str | os.PathLike[str]) -> ErrorModel | None:

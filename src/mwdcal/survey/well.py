@@ -53,7 +53,8 @@ WELL_FINDINGS = {
     "position.",
     "path-from-later": "the well path starts at station {start}: those before it have no result or no measured depth. "
     "`tie_in` gives the position of station {start}.",
-    "left-out": "left out of the well path, without a result or a measured depth: {count} of {rows} stations.",
+    "left-out": "left out of the well path, without a result, without a measured depth, or at the depth of the "
+    "station before: {count} of {rows} stations.",
     "no-path": "no well path: no station has both a measured depth and a direction with azimuth.",
 }
 """What the findings about a well say, in their order."""
@@ -465,7 +466,7 @@ def _positions(
     before: tuple[float, float, float] | PathEnd, errors: WellErrors | None,
 ) -> tuple[Position, tuple[float, float, float] | PathEnd]:  # fmt: skip
     """Positions of the stations with results, and where the path has come to."""
-    whole = ~blank & ~np.isnan(md)
+    whole = _on_path(md, blank, before)
     if not calibration.has_field or readings.magnetometer is None or not whole.any():
         whole = np.zeros(len(md), bool)
     place, covariance = np.full((len(md), 3), np.nan), np.full((len(md), 3, 3), np.nan)
@@ -479,6 +480,16 @@ def _positions(
             calibration, some, at, norths, before, more
         )
     return Position(md, place, covariance), before
+
+
+def _on_path(md: Array, blank: Bools, before: tuple[float, float, float] | PathEnd) -> Bools:
+    """Stations (n,) that the path goes through: of several at one depth the first that has a result."""
+    whole = ~blank & ~np.isnan(md)
+    depths = md[whole]
+    reached = before.md.item() if isinstance(before, PathEnd) else -np.inf
+    deeper = np.diff(np.concatenate([[reached], depths])) > 0
+    whole[whole] = deeper
+    return whole
 
 
 def _findings(result: Well, counts: WellCounts, from_first: bool) -> list[Finding]:

@@ -17,12 +17,7 @@ from mwdcal.presentation.text import one_line
 @options.argument("readings")
 @options.output(metavar="OUT", help="Table to write; format by suffix.")
 @options.WHERE_OUTSIDE
-@options.preset(
-    "--missing",
-    type=click.Choice(["refuse", "blank"]),
-    default="refuse",
-    help="Rows with a blank reading or temperature: refuse the file, or leave their results blank.",
-)
+@options.MISSING
 @click.option(
     "--uncertainty/--no-uncertainty",
     default=True,

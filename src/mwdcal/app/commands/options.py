@@ -54,6 +54,12 @@ preset = partial(click.option, show_default=True)
 CALIBRATION = argument("calibration")
 RUN = argument("run")
 LOG = argument("log")
+MISSING = preset(
+    "--missing",
+    type=click.Choice(["refuse", "blank"]),
+    default="refuse",
+    help="Rows with a blank reading or temperature: refuse the file, or leave their results blank.",
+)
 WHERE_OUTSIDE = preset(
     "--outside",
     default="blank",

@@ -68,6 +68,7 @@ if TYPE_CHECKING:
     "--tie-in", metavar="N,E,TVD", help="Position of the first station, m. Default: 0,0,0."
 )
 @options.WHERE_OUTSIDE
+@options.MISSING
 @click.option(
     "--html", type=options.FILE, metavar="S.html", help="Also write a page with the pictures."
 )
@@ -77,7 +78,8 @@ if TYPE_CHECKING:
 def command(
     calibration: Path, readings: Path, output: Path, reference: Path | None, msa: bool,
     msa_html: Path | None, sensor_drift: str | None, error_model: str, limits: str, switch: str,
-    tie_in: str | None, outside: str, html: Path | None, decimal: str, key: tuple[Path, ...], as_json: bool,
+    tie_in: str | None, outside: str, missing: str, html: Path | None, decimal: str, key: tuple[Path, ...],
+    as_json: bool,
 ) -> None:  # fmt: skip
     """Surveys of a well: READINGS in their order, corrected by the CALIBRATION of their tool.
 
@@ -104,7 +106,9 @@ def command(
     start, ends = _three("tie_in", tie_in), _switch(switch)
     loaded = load_calibration(calibration, key)
     fitted = loaded.calibration
-    if not (msa or html) and long_table.in_parts(readings, output, fitted.profile):
+    if not (msa or html or missing == "blank") and long_table.in_parts(
+        readings, output, fitted.profile
+    ):
         result = long_table.survey_file(
             fitted, readings, output, reference, limits, start, ends, outside, decimal,
             loaded.digest, loaded.findings, error_model,
@@ -113,7 +117,7 @@ def command(
         return
     table = read_export(readings, fitted.profile, decimal=decimal, rows=MOST_ROWS)
     inputs = well_inputs(
-        fitted, table, reference, limits, msa, loaded.digest, loaded.findings, error_model
+        fitted, table, reference, limits, msa, loaded.digest, loaded.findings, error_model, missing
     )
     analysis = analysed(inputs, sensor_drift) if msa else None
     pages = _interference_page(inputs, analysis, msa_html)
