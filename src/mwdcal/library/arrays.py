@@ -10,6 +10,7 @@ import numpy as np
 
 from mwdcal.calibration.readings import TRIADS, Readings, fingerprints, group_numbers
 from mwdcal.errors import InputError
+from mwdcal.estimation.evidence import WALKS
 from mwdcal.files import metadata as meta
 from mwdcal.files.contract import RAW_SPREAD, REFERENCES, TEMPERATURE, Range
 from mwdcal.geometry.vectors import Array, ArrayLike, Bools, wrap
@@ -229,6 +230,7 @@ def _uncertainties(sd: Mapping[str, ArrayLike], shape: tuple[int, ...]) -> dict[
     limits = {name: RAW_SPREAD._replace(positive=True) for name in TRIADS}
     limits |= {name: reference.uncertainty for name, reference in REFERENCES.items()}
     limits |= dict.fromkeys(COMMON, Range(0.0, 180.0, "°"))
+    limits |= dict.fromkeys(WALKS, RAW_SPREAD)
     uncertainties = {}
     for name, key in _by_name(sd, limits).items():
         label, advice = f"sd {key}", "State one standard uncertainty."
