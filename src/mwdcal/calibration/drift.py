@@ -9,6 +9,11 @@ import msgspec
 SHOWN_DRIFT = 3.0
 """A drift is a finding if it is so many times its standard uncertainty; smaller ones are in the uncertainty too."""
 
+SEEN = 5e-5
+"""Smallest effect of a drift on an angle that is named, degrees…"""
+SEEN_SHARE = 0.05
+"""…and as a share of its effect on the angle that it moves most."""
+
 STEADINESS = {
     "accelerometer-drift": "steady accelerometer offsets",
     "magnetometer-drift": "steady magnetometer offsets",
@@ -82,18 +87,22 @@ def declared_drift(drifts: Sequence[Drift]) -> str:
     return f"{words}: {', '.join(sizes)}" if sizes else ""
 
 
-def blindness(unseen: Sequence[UnseenDrift] | msgspec.UnsetType) -> list[str]:
-    """A sentence on each drift that no residual would show: what a small one would do.
+def blindness(unseen: Sequence[UnseenDrift] | msgspec.UnsetType) -> str:
+    """A sentence on what small drifts would do that no residual would show; blank if there are none.
 
     >>> blindness([UnseenDrift(name="field", change=10.0, unit="nT", inclination_deg=0.0, azimuth_deg=0.0213)])
-    ['field: an unseen drift of 10 nT would add 0.0213° to azimuth (1σ), and no uncertainty here includes it']
+    'an unseen drift from the first station to the last, 1σ, would add: 10 nT of the field 0.0213° to azimuth'
     """
-    sentences = []
-    for each in [] if isinstance(unseen, msgspec.UnsetType) else unseen:
-        added = [(n, getattr(each, f"{n}_deg")) for n in ("inclination", "toolface", "azimuth")]
-        words = ", ".join(f"{size:.4f}° to {name}" for name, size in added if size)
-        what = f"an unseen drift of {each.change:g} {each.unit}"
-        if words:
-            rest = "(1σ), and no uncertainty here includes it"
-            sentences.append(f"{each.name}: {what} would add {words} {rest}")
-    return sentences
+    each = [] if isinstance(unseen, msgspec.UnsetType) else map(_added, unseen)
+    words = "an unseen drift from the first station to the last, 1σ, would add"
+    added = "; ".join(filter(None, each))
+    return f"{words}: {added}" if added else ""
+
+
+def _added(unseen: UnseenDrift) -> str:
+    """What one drift would add, to the angles that it moves."""
+    angles = ("inclination", "toolface", "azimuth")
+    sizes = {name: getattr(unseen, f"{name}_deg") or 0.0 for name in angles}
+    least = max(SEEN, SEEN_SHARE * max(sizes.values()))
+    words = ", ".join(f"{size:.4f}° to {name}" for name, size in sizes.items() if size >= least)
+    return f"{unseen.change:g} {unseen.unit} of the {unseen.name} {words}" if words else ""

@@ -184,8 +184,7 @@ def remarks(calibration: Calibration) -> list[str]:
 
 def drift_remarks(calibration: Calibration) -> list[str]:
     """Drifts within the run: what one that is not seen would do, and those that are declared."""
-    declared = declared_drift(calibration.drift)
-    return [*blindness(calibration.unseen), *([declared] if declared else [])]
+    return [*filter(None, (blindness(calibration.unseen), declared_drift(calibration.drift)))]
 
 
 def heading(calibration: Calibration) -> str:
