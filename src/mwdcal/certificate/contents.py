@@ -420,7 +420,7 @@ def _out_of_date(standard: TracedStandard, calibrated: str) -> Iterator[Finding]
 def _exact(calibration: Calibration) -> Iterator[Finding]:
     names, steady = exact_and_steady(assumed_exact(calibration))
     if steady:
-        text = ". ".join(filter(None, (steady, blindness(calibration.unseen))))
+        text = "; ".join(filter(None, (steady, blindness(calibration.unseen))))
         yield Finding(id="assumed-steady", text=f"{text}.")
     if names:
         text = (
