@@ -9,9 +9,9 @@ import msgspec
 SHOWN_DRIFT = 3.0
 """A drift is a finding if it is so many times its standard uncertainty; smaller ones are in the uncertainty too."""
 
-SEEN = 5e-5
+LEAST_ADDED = 5e-5
 """Smallest effect of a drift on an angle that is named, degrees…"""
-SEEN_SHARE = 0.05
+ADDED_SHARE = 0.05
 """…and as a share of its effect on the angle that it moves most."""
 
 STEADINESS = {
@@ -103,6 +103,6 @@ def _added(unseen: UnseenDrift) -> str:
     """What one drift would add, to the angles that it moves."""
     angles = ("inclination", "toolface", "azimuth")
     sizes = {name: getattr(unseen, f"{name}_deg") or 0.0 for name in angles}
-    least = max(SEEN, SEEN_SHARE * max(sizes.values()))
+    least = max(LEAST_ADDED, ADDED_SHARE * max(sizes.values()))
     words = ", ".join(f"{size:.4f}° to {name}" for name, size in sizes.items() if size >= least)
     return f"{unseen.change:g} {unseen.unit} of the {unseen.name} {words}" if words else ""

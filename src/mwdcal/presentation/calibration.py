@@ -81,7 +81,7 @@ class CalibrationSummary(msgspec.Struct, frozen=True, kw_only=True):
     accuracy_1sigma_deg: dict[str, float | None]
     budget: list[BudgetRow]
     assumed_exact: list[str]
-    unseen: list[UnseenDrift] | msgspec.UnsetType
+    unseen: list[UnseenDrift] | msgspec.UnsetType = msgspec.UNSET
     constants: list[Constant]
     drift: list[Drift]
     stand: StandErrors
