@@ -212,9 +212,7 @@ def wandering(
     return result
 
 
-def drifted(
-    rng: np.random.Generator, session: Readings, name: str, lead: tuple[int, ...]
-) -> Array:
+def drifted(rng: np.random.Generator, session: Readings, name: str, lead: tuple[int, ...]) -> Array:
     """A declared drift (..., n, 3) since the first station: a trend and a walk of half its variance each."""
     size, steps = float(session.uncertainty(name).max(initial=0.0)), session.count - 1
     if not (size and steps):
@@ -222,7 +220,7 @@ def drifted(
     slopes = rng.normal(size=(*lead, 1, 3)) / steps
     walk = np.cumsum(slopes + rng.normal(size=(*lead, steps, 3)) / np.sqrt(steps), -2)
     start = np.zeros((*lead, 1, 3))
-    return size * np.sqrt(0.5) * np.concatenate([start, walk], -2)
+    return np.asarray(size * np.sqrt(0.5) * np.concatenate([start, walk], -2))
 
 
 def response(level: Array, minutes: Array, time_constant: float, start: float) -> Array:
