@@ -187,3 +187,16 @@ def _shown(document: str) -> str:
     unicode = codecs.lookup(sys.stdout.encoding or "utf-8").name == "utf-8"
     others = UNSAFE_BUT_LINES if unicode else re.compile(r"[^\x00-\x7e]")
     return others.sub(lambda character: json.dumps(character[0])[1:-1], document)
+
+
+@contextlib.contextmanager
+def offering_blank() -> Iterator[None]:
+    """Name the option that leaves the results of a row without readings blank, where one is refused."""
+    from mwdcal.files.faults import BlankReadingError
+
+    try:
+        yield
+    except BlankReadingError as error:
+        raise InputError(
+            f"{error} Or leave the results of such rows blank: --missing blank."
+        ) from None

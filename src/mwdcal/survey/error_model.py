@@ -125,9 +125,10 @@ class Hole:
         """
         if last is None:
             course = md[1] - md[0] if len(md) > 1 else USUAL_COURSE
-            last = (md[0] - course, inclination[0], azimuth[0])
+            last = (md[0] - (course or USUAL_COURSE), inclination[0], azimuth[0])
         each = zip(last, (md, inclination, azimuth), strict=True)
         before = [np.concatenate([[first], values[:-1]]) for first, values in each]
+        before[0] = _depth_before(md, before[0])
         straight = np.abs(np.sin(before[1])) <= VERTICAL
         before[2] = np.where(straight, azimuth, before[2])
         values = (md, tvd, inclination, azimuth, magnetic, field, dip, gravity, *before)
@@ -193,6 +194,13 @@ class ErrorModel:
         random, course = (_stacked(self.shifts(hole, kind), hole) for kind in ("random", "course"))
         course = course[..., :2]
         return systematic, random.mT @ random, course.mT @ course
+
+
+def _depth_before(md: Array, before: Array) -> Array:
+    """Depths (n,) of the last station above each: those `before` it, or before the first of several at one depth."""
+    first = np.maximum.accumulate(np.where(before < md, np.arange(len(md)), 0))
+    above = before[first]
+    return np.where(above < md, above, md - USUAL_COURSE)
 
 
 def _stacked(shifts: Mapping[str, Array], hole: Hole) -> Array:

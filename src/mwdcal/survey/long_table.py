@@ -33,6 +33,7 @@ from mwdcal.sensor.profile import Profile
 from mwdcal.survey.acceptance import SurveyLimits
 from mwdcal.survey.error_model import BUILT_IN, ErrorModel
 from mwdcal.survey.norths import norths_of
+from mwdcal.survey.path import TieIn
 from mwdcal.survey.references import Claim, EarthReference
 from mwdcal.survey.surveying import (
     MEASURED_DEPTH,
@@ -92,7 +93,7 @@ class _Settings(NamedTuple):
     calibration: Calibration
     limits: SurveyLimits
     reference: EarthReference | None
-    tie_in: tuple[float, float, float] | None
+    tie_in: tuple[float, float, float] | TieIn | None
     switch: tuple[float, float]
     outside: str
     model: ErrorModel | None = None
@@ -127,7 +128,7 @@ def survey_file(
     output: Path,
     reference: Path | None,
     limits: str,
-    tie_in: tuple[float, float, float] | None,
+    tie_in: tuple[float, float, float] | TieIn | None,
     switch: tuple[float, float],
     outside: str,
     decimal: str,

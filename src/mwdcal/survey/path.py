@@ -197,6 +197,32 @@ class _Sums(NamedTuple):
     arrival: Array
 
 
+class TieIn(NamedTuple):
+    """Where a path is tied in, taken as exact.
+
+    Units: measured depth m, inclination and azimuth (from the north of the path) rad, place (3,) m.
+    """
+
+    md: float
+    inclination: float
+    azimuth: float
+    place: Array
+
+    def before(self, errors: DirectionErrors) -> PathEnd:
+        """The end of a path that leads there, for stations with such `errors` to follow."""
+
+        def none(like: Array) -> Array:
+            return np.zeros((1, *like.shape[-2:]))
+
+        course = None if errors.course is None else none(errors.course)
+        exact = DirectionErrors(
+            np.array([self.inclination]), np.array([self.azimuth]),
+            none(errors.systematic), none(errors.random), course,
+        )  # fmt: skip
+        md = np.array([self.md])
+        return PathEnd(md, exact, _no_sums(md, exact, self.place))
+
+
 class PathEnd(NamedTuple):
     """Where a path has come to: depth (…, 1) and errors of its last station, and what has added up there."""
 
@@ -338,16 +364,17 @@ def continued_path(
     readings: Readings,
     md: ArrayLike,
     norths: tuple[float, float, float],
-    before: ArrayLike | PathEnd = (0.0, 0.0, 0.0),
+    before: ArrayLike | TieIn | PathEnd = (0.0, 0.0, 0.0),
     more: Callable[[DirectionErrors, Readings, slice], DirectionErrors] | None = None,
 ) -> tuple[Array, Array, PathEnd]:
     """The same of readings that follow others of their well, and where the path has come to.
 
-    `norths` as of `direction_errors`. `before`: the position of the first station, or where the path had come to: a
-    well in parts has the positions that it has as a whole. `more` adds errors to those of the directions at some rows.
+    `norths` as of `direction_errors`. `before`: the position of the first station, where the path is tied in, or where
+    it had come to: a well in parts has the positions that it has as a whole. `more` adds errors to those of the
+    directions at some rows.
     """
     depth = np.asarray(md, float)
-    last = [before.md] if isinstance(before, PathEnd) else []
+    last = [np.atleast_1d(before.md)] if isinstance(before, TieIn | PathEnd) else []
     if not (np.diff(np.concatenate([*last, depth])) > 0).all():
         raise InputError(
             "`md` must increase from station to station. Sort the stations by measured depth."
@@ -370,13 +397,15 @@ def continued_path(
 def _along(
     count: int,
     part: Callable[[slice], tuple[Array, DirectionErrors]],
-    before: ArrayLike | PathEnd = (0.0, 0.0, 0.0),
+    before: ArrayLike | TieIn | PathEnd = (0.0, 0.0, 0.0),
     balanced: bool = False,
 ) -> Iterator[tuple[Array, Array, PathEnd]]:
     """Positions (…, m, 3) and covariance (…, m, 3, 3) of all stations, some at a time, and where each part ends."""
     for first in range(0, max(count, 1), STATIONS_AT_ONCE):
         md, errors = part(slice(first, first + STATIONS_AT_ONCE))
         new = slice(0, None)
+        if isinstance(before, TieIn):
+            before = before.before(errors)
         if isinstance(before, PathEnd):  # each part begins with the last station of the one before
             md = np.concatenate([before.md, md], -1)
             errors, sums = before.errors.followed_by(errors), before.sums

@@ -28,6 +28,7 @@ from mwdcal.survey.error_model import BUILT_IN, ErrorModel, load_error_model
 from mwdcal.survey.interference import Interference, interference
 from mwdcal.survey.interference_estimate import Assumed, sensor_drift
 from mwdcal.survey.norths import SD_KEY, North, norths_of
+from mwdcal.survey.path import TieIn
 from mwdcal.survey.references import (
     FROM_REFERENCE,
     MEASURABLE,
@@ -390,6 +391,28 @@ def loaded_reference(
     return load_reference(reference)
 
 
+def start_of(numbers: Sequence[float]) -> tuple[float, float, float] | TieIn:
+    """Where a path starts: north, east and TVD of the first station, m, or behind depth, m, and two angles, degrees.
+
+    Raises:
+        InputError: neither three nor six numbers, or an inclination or depth that no hole has.
+    """
+    if len(numbers) == 3:
+        return (float(numbers[0]), float(numbers[1]), float(numbers[2]))
+    if len(numbers) != 6:
+        raise InputError(
+            "`tie_in` must be north, east and TVD, or measured depth, inclination, azimuth, north, east and TVD; got "
+            f"{len(numbers)} numbers."
+        )
+    md, inclination, azimuth, *place = map(float, numbers)
+    if not (0 <= md <= LARGEST_DEPTH and 0 <= inclination <= 180):
+        raise InputError(
+            f"`tie_in` must have a depth of 0 to {LARGEST_DEPTH:g} m and an inclination of 0 to 180°; got {md:g} and "
+            f"{inclination:g}."
+        )
+    return TieIn(md, float(np.radians(inclination)), float(np.radians(azimuth)), np.array(place))
+
+
 def check_drift(drift: object, msa: bool) -> None:
     """Refuse a drift of the sensors without the multi-station analysis that allows for it."""
     if drift and not msa:
@@ -410,7 +433,7 @@ def survey_well(
     inputs: WellInputs,
     analysis: Interference | None = None,
     *,
-    tie_in: tuple[float, float, float] | None = None,
+    tie_in: tuple[float, float, float] | TieIn | None = None,
     switch: tuple[float, float] = TOOLFACE_SWITCH,
     outside: str = "blank",
 ) -> SurveyedWell:

@@ -26,7 +26,7 @@ from mwdcal.survey.acceptance import (
 from mwdcal.survey.error_model import ErrorModel
 from mwdcal.survey.interference import CORRECTED, DRIFTED, ErrorTerms, error_terms
 from mwdcal.survey.norths import North
-from mwdcal.survey.path import PathEnd, continued_path
+from mwdcal.survey.path import PathEnd, TieIn, continued_path
 from mwdcal.survey.stations import TOOLFACE_SWITCH, Surveys, surveyed
 from mwdcal.survey.well_errors import WellErrors, hole_of, well_errors
 from mwdcal.use.correction import RowCounts, tallied
@@ -35,6 +35,8 @@ from mwdcal.use.strengths import check as check_strengths
 
 BLIND_FROM = 2.0
 """Stated standard uncertainties of azimuth by which interference that would pass turns it where acceptance is blind."""
+Start = tuple[float, float, float] | TieIn | PathEnd
+"""Where a path starts: position of the first station, a tie-in, or the end of the part before."""
 AXES_OF_EARTH = ("north", "east", "tvd")
 WELL_FINDINGS = {
     "rejected": "{rejected} of {judged} surveys lie outside the limits '{limits}' (first: station {first}: {why}).",
@@ -92,7 +94,7 @@ class Before:
     """
 
     magnetic: bool = False
-    path: tuple[float, float, float] | PathEnd = (0.0, 0.0, 0.0)
+    path: Start = (0.0, 0.0, 0.0)
     inaccurate: bool = False
 
 
@@ -332,7 +334,7 @@ def well(
     limits: SurveyLimits,
     north: North | None = None,
     md: Array | None = None,
-    tie_in: tuple[float, float, float] | None = None,
+    tie_in: tuple[float, float, float] | TieIn | None = None,
     switch: tuple[float, float] = TOOLFACE_SWITCH,
     outside: str = "blank",
     advance: Callable[[int, int], None] = lambda done, total: None,
@@ -340,9 +342,10 @@ def well(
 ) -> Well:
     """The surveys of a well from readings in their order, references with these; `md` (n,) measured depths, m.
 
-    Units: `tie_in` north, east and TVD of the first station, m; `switch` as of `surveyed`. `outside` the calibrated
-    temperatures as of `correction.correct`: blank results, refuse, or extrapolate without stated uncertainty.
-    `advance` as of `surveyed`. `model`: error model whose terms are in the standard uncertainties too.
+    Units: `tie_in` north, east and TVD of the first station, m, or where the path is tied in; `switch` as of
+    `surveyed`. `outside` the calibrated temperatures as of `correction.correct`: blank results, refuse, or extrapolate
+    without stated uncertainty. `advance` as of `surveyed`. `model`: error model whose terms are in the standard
+    uncertainties too.
 
     Raises:
         InputError: readings that do not belong to the calibration, or depths that do not increase.
@@ -463,8 +466,8 @@ def _to_judge(
 
 def _positions(
     calibration: Calibration, readings: Readings, md: Array, north: North, blank: Bools,
-    before: tuple[float, float, float] | PathEnd, errors: WellErrors | None,
-) -> tuple[Position, tuple[float, float, float] | PathEnd]:  # fmt: skip
+    before: Start, errors: WellErrors | None,
+) -> tuple[Position, Start]:  # fmt: skip
     """Positions of the stations with results, and where the path has come to."""
     whole = _on_path(md, blank, before)
     if not calibration.has_field or readings.magnetometer is None or not whole.any():
@@ -482,11 +485,11 @@ def _positions(
     return Position(md, place, covariance), before
 
 
-def _on_path(md: Array, blank: Bools, before: tuple[float, float, float] | PathEnd) -> Bools:
+def _on_path(md: Array, blank: Bools, before: Start) -> Bools:
     """Stations (n,) that the path goes through: of several at one depth the first that has a result."""
     whole = ~blank & ~np.isnan(md)
     depths = md[whole]
-    reached = before.md.item() if isinstance(before, PathEnd) else -np.inf
+    reached = np.max(before.md) if isinstance(before, TieIn | PathEnd) else -np.inf
     deeper = np.diff(np.concatenate([[reached], depths])) > 0
     whole[whole] = deeper
     return whole

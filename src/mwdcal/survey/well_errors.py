@@ -22,7 +22,7 @@ from mwdcal.geometry.vectors import Array, ArrayLike
 from mwdcal.survey.acceptance import SensorTerms
 from mwdcal.survey.error_model import USUAL_COURSE, ErrorModel, Hole
 from mwdcal.survey.interference import AXIAL_INTERFERENCE, CORRECTED, DRIFT, DRIFTED, OF_MODELS
-from mwdcal.survey.path import DirectionErrors, PathEnd, direction_gradient, well_path
+from mwdcal.survey.path import DirectionErrors, PathEnd, TieIn, direction_gradient, well_path
 from mwdcal.survey.stations import SURVEYED, blocks
 from mwdcal.use.strengths import STANDARD_GRAVITY
 
@@ -103,7 +103,7 @@ class WellErrors:
         calibration: Calibration,
         readings: Readings,
         md: Array | None,
-        before: Sequence[float] | PathEnd,
+        before: Sequence[float] | TieIn | PathEnd,
     ) -> Callable[[Array, Array, slice], Array]:
         """The variance of observables at some rows, by both vectors; depths count where all are known."""
         whole = md is not None and not np.isnan(md).any()
@@ -173,7 +173,7 @@ def hole_of(
     readings: Readings,
     md: Array | None,
     north: float = 0.0,
-    before: Sequence[float] | PathEnd = (),
+    before: Sequence[float] | TieIn | PathEnd = (),
 ) -> Hole:
     """The hole as the readings see it; without depths one survey every 30 m.
 
@@ -187,9 +187,12 @@ def hole_of(
     last: tuple[float, float, float] | None = None
     if isinstance(before, PathEnd):
         end = before.md, before.errors.inclination, before.errors.azimuth
-        last = (end[0].item(), end[1].item(), end[2].item())
-        md, i, a = (np.concatenate(each) for each in zip(end, (depth, *angles), strict=True))
-        tvd = well_path(md, i, a, before.sums.position)[1:, 2]
+        before = TieIn(end[0].item(), end[1].item(), end[2].item(), before.sums.position)
+    if isinstance(before, TieIn):
+        last = before[:3]
+        stations = zip(last, (depth, *angles), strict=True)
+        md, i, a = (np.concatenate([[first], values]) for first, values in stations)
+        tvd = well_path(md, i, a, before.place)[1:, 2]
     else:
         tvd = well_path(depth, *angles, before or (0.0, 0.0, 0.0))[:, 2]
     if calibration.relative:

@@ -7,8 +7,7 @@ from pathlib import Path
 import click
 
 from mwdcal.app.commands import options
-from mwdcal.app.messages import print_result
-from mwdcal.errors import InputError
+from mwdcal.app.messages import offering_blank, print_result
 from mwdcal.presentation.text import one_line
 
 
@@ -42,21 +41,16 @@ def command(
     from mwdcal.app.correction import Applied, apply_to_any
     from mwdcal.app.progress import bar
     from mwdcal.calibration.readings import simulated
-    from mwdcal.files.runs import BlankReadingError
     from mwdcal.presentation.envelope import enveloped, with_signature
     from mwdcal.presentation.signature import in_short, load_calibration
 
     options.check_outputs([output], [calibration, readings, *key])
     loaded = load_calibration(calibration, key)
     fitted = loaded.calibration
-    try:
-        with bar("correcting") as advance:
-            tally, findings, readings_digest = apply_to_any(
-                fitted, readings, output, outside, missing, decimal, uncertainty, advance
-            )
-    except BlankReadingError as error:
-        advice = "Or leave the results of such rows blank: --missing blank."
-        raise InputError(f"{error} {advice}") from None
+    with offering_blank(), bar("correcting") as advance:
+        tally, findings, readings_digest = apply_to_any(
+            fitted, readings, output, outside, missing, decimal, uncertainty, advance
+        )
     findings = loaded.findings + findings
     blank = tally.blank(outside)
     document = enveloped(

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING
 import click
 
 from mwdcal.app.commands import options
-from mwdcal.app.messages import print_result
+from mwdcal.app.messages import offering_blank, print_result
 from mwdcal.errors import InputError
 from mwdcal.presentation.typed import findings_as_typed
 
 if TYPE_CHECKING:
     from mwdcal.calibration.canonical import SignatureCheck
     from mwdcal.survey.interference import Interference
+    from mwdcal.survey.path import TieIn
     from mwdcal.survey.surveying import SurveyedWell, WellInputs
 
 
@@ -65,7 +66,10 @@ if TYPE_CHECKING:
     "side; between them as at the station before.",
 )
 @click.option(
-    "--tie-in", metavar="N,E,TVD", help="Position of the first station, m. Default: 0,0,0."
+    "--tie-in",
+    metavar="MD,INC,AZI,N,E,TVD",
+    help="Where the path is tied in, taken as exact: m and degrees, azimuth from the north of the path. Or N,E,TVD of "
+    "the first station. Default: 0,0,0.",
 )
 @options.WHERE_OUTSIDE
 @options.MISSING
@@ -103,7 +107,7 @@ def command(
     check_drift(sensor_drift, msa)
     given = [calibration, readings, reference, limits, error_model, *key]
     options.check_outputs([output, msa_html], given, page=html)
-    start, ends = _three("tie_in", tie_in), _switch(switch)
+    start, ends = _tie_in(tie_in), _switch(switch)
     loaded = load_calibration(calibration, key)
     fitted = loaded.calibration
     if not (msa or html or missing == "blank") and long_table.in_parts(
@@ -116,9 +120,18 @@ def command(
         _print(result, loaded.signature, (str(output), ""), as_json)
         return
     table = read_export(readings, fitted.profile, decimal=decimal, rows=MOST_ROWS)
-    inputs = well_inputs(
-        fitted, table, reference, limits, msa, loaded.digest, loaded.findings, error_model, missing
-    )
+    with offering_blank():
+        inputs = well_inputs(
+            fitted,
+            table,
+            reference,
+            limits,
+            msa,
+            loaded.digest,
+            loaded.findings,
+            error_model,
+            missing,
+        )
     analysis = analysed(inputs, sensor_drift) if msa else None
     pages = _interference_page(inputs, analysis, msa_html)
     if analysis and not analysis.summary.separable:
@@ -185,11 +198,13 @@ def _numbers(name: str, text: str, count: int) -> list[float]:
     return values
 
 
-def _three(name: str, text: str | None) -> tuple[float, float, float] | None:
+def _tie_in(text: str | None) -> tuple[float, float, float] | TieIn | None:
+    """Where the path starts, by three numbers or six."""
+    from mwdcal.survey.surveying import start_of
+
     if text is None:
         return None
-    first, second, third = _numbers(name, text, 3)
-    return first, second, third
+    return start_of(_numbers("tie_in", text, 6 if text.count(",") > 2 else 3))
 
 
 def _switch(text: str) -> tuple[float, float]:
