@@ -4,7 +4,7 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: papers measured verification scatter coverage drift diagnosis mutations help demo size test test-quick test-studies test-oldest \
-	test-versions fuzz kills registry-stress check bench bench-guard docs clean
+	test-versions fuzz kills registry-stress check check-lint check-types check-code check-docs bench bench-guard docs clean
 
 PYTHON ?= python3
 PYTHONS ?= python3.12 python3.13
@@ -97,15 +97,24 @@ registry-stress: $(INSTALLED) ## write to registries by 50 processes, end some a
 	@$(CLOCK); $(ONE_THREAD) PYTHONPATH=tests $(BIN)/python tests/registry_stress.py \
 		--writers 50 --seconds 60 --kills $(or $(COUNT),100)
 
-check: $(INSTALLED) ## lint, format, types, architecture, doctests, docs
-	@$(CLOCK); \
-	echo "ruff check"; $(BIN)/ruff check .; \
-	echo "ruff format"; $(BIN)/ruff format --check .; \
-	echo "mypy"; $(BIN)/mypy; \
-	echo "architecture"; $(BIN)/python -m pytest -q tests/test_architecture.py; \
-	echo "doctests"; $(ONE_THREAD) $(BIN)/python -m pytest -q --doctest-modules src \
-		--doctest-glob='*.md' docs; \
-	echo "docs"; $(SPHINX) -b html docs build/docs; $(SPHINX) -b man docs build/man; \
+check: $(INSTALLED) ## lint, format, types, architecture, doctests, docs; two at a time
+	@$(CLOCK); $(MAKE) --no-print-directory --keep-going -j2 $(WHOLE) check-types check-docs check-lint check-code
+
+# The parts of `make check` print what they find together, where make can do that.
+WHOLE := $(if $(filter output-sync,$(.FEATURES)),--output-sync=target)
+
+check-lint: $(INSTALLED)
+	@$(CLOCK); $(BIN)/ruff check .; $(BIN)/ruff format --check .
+
+check-types: $(INSTALLED)
+	@$(CLOCK); $(BIN)/mypy
+
+check-code: $(INSTALLED)
+	@$(CLOCK); $(BIN)/python -m pytest -q tests/test_architecture.py; \
+	$(ONE_THREAD) $(BIN)/python -m pytest -q --doctest-modules src --doctest-glob='*.md' docs
+
+check-docs: $(INSTALLED)
+	@$(CLOCK); $(SPHINX) -b html docs build/docs; $(SPHINX) -b man docs build/man; \
 	cmp build/man/mwdcal.1 docs/mwdcal.1 || { echo "docs/mwdcal.1, the manual page, is old: make docs"; exit 1; }
 
 bench: $(MEASURED) ## time mwdcal against SciPy and other packages, write docs/benchmarks.md (QUICK=1: two minutes)
