@@ -249,7 +249,8 @@ def test_a_bound_counts_kept_stations():
 
 
 @pytest.mark.parametrize(
-    ("seed", "stations"), [(0, 5), *(pytest.param(k, 7, marks=pytest.mark.study) for k in (0, 1, 2))]
+    ("seed", "stations"),
+    [(0, 5), *(pytest.param(k, 7, marks=pytest.mark.study) for k in (0, 1, 2))],
 )
 def test_rounding_does_not_choose_between_equal_stations(seed, stations):
     """Other unknowns, turned, round every number otherwise: so do other numbers of threads.

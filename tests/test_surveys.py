@@ -69,7 +69,7 @@ def readings(tool, inclination, azimuth, toolface, rng=None, shift=0.0):
     return Readings(raw["accelerometer"], raw["magnetometer"], warmth, known)
 
 
-@pytest.mark.parametrize("tools", [40, pytest.param(200, marks=pytest.mark.study)])
+@pytest.mark.parametrize("tools", [80, pytest.param(200, marks=pytest.mark.study)])
 def test_uncertainty_covers_the_errors_of_surveys(tools):
     """Errors of calibrations, 12 surveys each, in units of the stated covariance: chi-square, χ²/k = 1."""
     total, count = 0.0, 0
