@@ -46,8 +46,8 @@ TRIES = 4
 """…in each of so many tries."""
 SECONDS = 2.0
 """Processor time of a try, about."""
-ROUNDS = (2, 25)
-"""Fewest and most turns of a try."""
+MORE = (1, 25)
+"""Fewest and most turns of a try after its first."""
 DEEPEST = 15_000.0
 """Measured depth of the longest well, m."""
 TOOLS, SAMPLE = 300, 10
@@ -86,13 +86,14 @@ def ratio(guarded: Guarded) -> float:
 
     Both rise if a path is slower. A disturbance that lasts raises the least times, a short one the median.
     """
-    spent = processor_seconds(guarded.ours) + processor_seconds(guarded.theirs)  # also warms up
-    turns = [
-        (processor_seconds(guarded.ours), processor_seconds(guarded.theirs))
-        for _ in range(int(np.clip(SECONDS / spent, *ROUNDS)))
-    ]
+    turns = [_turn(guarded)]  # also warms up
+    turns += [_turn(guarded) for _ in range(int(np.clip(SECONDS / sum(turns[0]), *MORE)))]
     ours, theirs = zip(*turns, strict=True)
     return min(min(ours) / min(theirs), median(mine / other for mine, other in turns))
+
+
+def _turn(guarded: Guarded) -> tuple[float, float]:
+    return processor_seconds(guarded.ours), processor_seconds(guarded.theirs)
 
 
 def judged(guarded: Guarded, stored: float, tries: int) -> float:

@@ -55,7 +55,7 @@ def test_a_path_without_a_stored_ratio_is_measured_once(guard, path):
     calls = []
     found = path(lambda k: calls.append(k) or 9.0, lambda k: 0.1)
     assert guard.judged(found, np.inf, guard.TRIES) == 90.0
-    assert len(calls) == 1 + guard.ROUNDS[0]
+    assert len(calls) == 1 + guard.MORE[0]
 
 
 def test_a_command_that_fails_stops_the_guard(guard):
