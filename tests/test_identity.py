@@ -62,7 +62,7 @@ def done(*arguments):
 
 
 @pytest.mark.slow
-@settings(max_examples=5, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=2, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(serial=SERIALS, day=DATES)
 @example("12.10", "2024-03-01")
 @example("1e5", "2024-03-01")

@@ -71,13 +71,14 @@ def readings(tool, inclination, azimuth, toolface, rng=None, shift=0.0):
     return Readings(raw["accelerometer"], raw["magnetometer"], warmth, known)
 
 
-def test_uncertainty_covers_the_errors_of_surveys():
-    """Errors over 80 calibrations, 12 surveys each, in units of the stated covariance: chi-square, χ²/k = 1."""
+@pytest.mark.parametrize("tools", [80, pytest.param(200, marks=pytest.mark.study)])
+def test_uncertainty_covers_the_errors_of_surveys(tools):
+    """Errors of calibrations, 12 surveys each, in units of the stated covariance: chi-square, χ²/k = 1."""
     total, count = 0.0, 0
     names = ["inclination", "azimuth", "north_toolface", "gravity", "field", "dip"]
     places = [SURVEYED.index(name) for name in names]
     inc, azi, roll = np.radians([[4.0, 30, 88, 120], [20, 140, 260, 330], [10, 100, 200, 300]])
-    for seed in range(80):
+    for seed in range(tools):
         tool, calibration = laboratory(seed)
         surveys = surveyed(calibration, readings(tool, inc, azi, roll, np.random.default_rng(seed)))
         vectors = reference_vectors(inc, azi, roll, EARTH.gravity, EARTH.field, EARTH.dip)
@@ -87,8 +88,8 @@ def test_uncertainty_covers_the_errors_of_surveys():
         sd = surveys.sd[:, places]
         total += float(np.sum((error / sd) ** 2))
         count += error.size
-    # errors of one calibration are alike: the sum scatters by no more than that of 80 × 6 independent ones
-    assert total / count == pytest.approx(1.0, abs=4 * np.sqrt(2 / 480))
+    # errors of one calibration are alike: the sum scatters by no more than that of 6 independent ones of each
+    assert total / count == pytest.approx(1.0, abs=4 * np.sqrt(2 / (6 * tools)))
 
 
 def test_azimuth_does_not_depend_on_the_toolface():

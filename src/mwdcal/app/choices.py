@@ -11,8 +11,8 @@ from mwdcal.calibration.prior import DATASHEET, profile_for
 from mwdcal.calibration.readings import HIGHEST, Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.files import profiles, runs
+from mwdcal.presentation.calibration_source import calibration_of
 from mwdcal.presentation.typed import Typed, names
-from mwdcal.registry.calibration_source import calibration_of
 from mwdcal.sensor.profile import Profile
 
 Prior: TypeAlias = Calibration | Literal["datasheet"] | None
