@@ -276,9 +276,9 @@ def _closed(problem: Problem, finite: Bools) -> tuple[Fit, Bools]:
     state, analysis, good = closed_form.solution(problem, at)
     good = good & analysis.determined.keep.all(-1)
     if good.any() and not _all_declared(problem):
-        problem = _rescaled(problem, np.sqrt(analysis.variance_factor))
-        state, analysis, settled = closed_form.solution(problem, at)
-        good &= settled
+        quieter = _rescaled(problem, np.sqrt(analysis.variance_factor))
+        analysis = closed_form.rescaled(problem, quieter, analysis)
+        problem = quieter
     sound = finite & np.isfinite(state.params).all(-1)
     status = np.where(sound, int(Status.OK), int(Status.NOT_FINITE))
     trust = np.ones(problem.evidence.include.shape)

@@ -17,7 +17,7 @@ import numpy as np
 
 from mwdcal.calibration import results
 from mwdcal.calibration.automatic.auto import known_before
-from mwdcal.calibration.automatic.drift import by_drift
+from mwdcal.calibration.automatic.drift import with_drifts
 from mwdcal.calibration.automatic.nonlinearity import offered
 from mwdcal.calibration.diagnosis.findings import finding_flags
 from mwdcal.calibration.diagnosis.flags import Alone, FittedRuns, Flag
@@ -194,9 +194,9 @@ class _Batch:
             if chosen.order != options.order:
                 self._screen(some, chosen)
             for part, final in with_curves(readings, sound(some), chosen, self.profile, fail):
-                for few, result in in_chunks(readings, part, partial(fit, options=final), fail):
-                    for places, drifted in by_drift(result, final):
-                        self._note(few[places], final, drifted)
+                fits = in_chunks(readings, part, partial(fit, options=final), fail)
+                for few, result in with_drifts(fits, final):
+                    self._note(few, final, result)
 
     def _screen(self, tools: Ints, options: Options) -> None:
         """Refuse those of some tools that no fit could mend."""

@@ -6,7 +6,7 @@ does, walks of the field and of both triads' offsets are fitted with it, of size
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -18,9 +18,9 @@ from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.residuals import tail
 from mwdcal.estimation import drift
-from mwdcal.estimation.batch import put, take
+from mwdcal.estimation.batch import join, kind_of, put, take
 from mwdcal.estimation.minimisers import closed_form
-from mwdcal.estimation.minimisers.common_columns import are_common, perfect
+from mwdcal.estimation.minimisers.common_columns import Design, are_common, perfect
 from mwdcal.estimation.problem import Prior
 from mwdcal.estimation.solvers import Status
 from mwdcal.geometry.vectors import Array, Bools, Ints
@@ -39,6 +39,8 @@ DISPUTED_CHANCE = 0.01
 """The same chance where the run departs from its prior: a drift there would take up what is a conflict."""
 EVERY_PARAMETER = 12
 """Parameters of a triad that are all fitted."""
+TOGETHER = 320
+"""Most fits whose drifts are fitted together: few enough for the cache."""
 REDUNDANCY = 36.0
 """Fewest degrees of freedom of a triad that can tell a drift from noise."""
 
@@ -65,7 +67,7 @@ def _scores(result: Fit) -> drift.WalkScores:
     problem, analysis = result.problem, result.analysis
     if not (closed_form.applies(problem) and are_common(problem)):
         return drift.walk_scores(problem, result.state, analysis)
-    one, state = perfect(problem, result.state)
+    one, state = perfect(Design.of(problem, result.state))
     nominal = replace(take(analysis, np.arange(1)), residual=analysis.residual)
     return drift.walk_scores(one, state, nominal)
 
@@ -121,11 +123,29 @@ def fit_run(readings: Readings, options: Options) -> Fit:
 
 def by_drift(result: Fit, options: Options) -> Iterator[tuple[Ints, Fit]]:
     """Members without drift, as they are, and those with a drift of some triads, which is fitted."""
-    drifted = drifting(result, options)
-    for triads in np.unique(drifted, axis=0):
-        places = np.flatnonzero((drifted == triads).all(-1))
-        part = result if len(places) == len(drifted) else take(result, places)
-        yield places, with_drift(part, options, triads) if triads.any() else part
+    return with_drifts([(np.arange(len(result.status)), result)], options)
+
+
+def with_drifts(
+    fits: Iterable[tuple[Ints, Fit]], options: Options
+) -> Iterator[tuple[Ints, Fit]]:
+    """Tools and their fits: those without drift as they come, then those with a drift of the same triads together."""
+    waiting: dict[Hashable, list[tuple[Ints, Fit]]] = {}
+    for tools, result in fits:
+        drifted = drifting(result, options)
+        for triads in np.unique(drifted, axis=0):
+            places = np.flatnonzero((drifted == triads).all(-1))
+            part = result if len(places) == len(drifted) else take(result, places)
+            if triads.any():
+                kind = tuple(triads.tolist()), kind_of(part)
+                waiting.setdefault(kind, []).append((tools[places], part))
+            else:
+                yield tools[places], part
+    for (triads, _), parts in waiting.items():
+        tools, whole = (join(each) for each in zip(*parts, strict=True))
+        for first in range(0, len(tools), TOGETHER):
+            some = slice(first, first + TOGETHER)
+            yield tools[some], with_drift(take(whole, some), options, np.array(triads))
 
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
