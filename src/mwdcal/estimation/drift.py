@@ -123,6 +123,16 @@ class WalkScores:
         information = self.information[some]
         return WalkScores(self.score[:, index], information, lambda: self.alone()[some], places)
 
+    @property
+    def apart(self) -> bool:
+        """Whether there are walks of both triads, and readings of one say nothing of the walks of the other."""
+        triads = acting(self.places)
+        first, second = (
+            [c for n, t in triads.items() if t == triad for c in self.places[n].tolist()]
+            for triad in (0, 1)
+        )
+        return bool(first and second) and not self.information[:, first][..., second].any()
+
     def shown(self, name: str) -> Array:
         """Share (B,) of the information about a trend that residuals keep, of the axis along which it is least.
 
@@ -247,7 +257,15 @@ def walk_variances(
     Definition: for the coefficients u of a walk, V their covariance given the readings: θ = Σu² / Σ(1 - V/θ);
     of the noise, misfit less what the walks explain over its degrees of freedom (Henderson).
     """
-    parts, of_walk = scores.components(), acting(scores.places)
+    of_walk = acting(scores.places)
+    if scores.apart:
+        each = [scores.of([n for n, t in of_walk.items() if t == triad]) for triad in (0, 1)]
+        (first, quiet), (second, left) = (
+            walk_variances(part, variance, freedom, declared) for part in each
+        )
+        left[:, 0] = quiet[:, 0]
+        return np.concatenate([first, second], -1), left
+    parts = scores.components()
     triad = np.array([of_walk[name] for name, _ in parts])
     owner = np.zeros(scores.score.shape[-1], int)
     for number, columns in enumerate(parts.values()):
