@@ -15,7 +15,7 @@ from mwdcal.calibration.prior import prior_of
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.estimation.batch import put, take
 from mwdcal.estimation.evidence import ANGLES, Evidence
-from mwdcal.estimation.minimisers import closed_form, closed_form_drift
+from mwdcal.estimation.minimisers import closed_form, closed_form_drift, uncertain_stand
 from mwdcal.estimation.problem import Problem, State, Triad
 from mwdcal.estimation.resetting import set_apart, with_share
 from mwdcal.estimation.robust import LOSSES, consistency, inflation, weight, weighted
@@ -168,7 +168,7 @@ def fit(readings: Readings, options: Options | None = None, include: Array | Non
     evidence = _evidence(readings, include, options)
     lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
     problem, finite = _problem(readings, evidence, lead, options)
-    closed, good = _closed(problem, finite) if _comes_apart(problem, options) else (None, finite)
+    closed, good = _special(problem, options, finite)
     if closed is None or not good.any():
         return _general(problem, options, finite)
     if good.all():
@@ -264,10 +264,27 @@ def _finished(stage: _Stage, options: Options, finite: Bools, iterations: Ints) 
     return Fit(trusted, state, status, iterations, _noise(problem), trust, analysis)
 
 
-def _comes_apart(problem: Problem, options: Options) -> bool:
-    """Whether the fit has a closed form: not where references are not exact, for example."""
-    general = options.robust or options.separate_solver or problem.evidence.scatter
-    return not general and closed_form.applies(problem)
+def _special(problem: Problem, options: Options, finite: Bools) -> tuple[Fit | None, Bools]:
+    """The fit by a shorter way, if there is one, and for which members (B,) it holds."""
+    if options.robust or options.separate_solver or problem.evidence.scatter:
+        return None, finite
+    if closed_form.applies(problem):
+        return _closed(problem, finite)
+    if uncertain_stand.applies(problem):
+        return _on_stand(problem, finite)
+    return None, finite
+
+
+def _on_stand(problem: Problem, finite: Bools) -> tuple[Fit, Bools]:
+    """The fit on a stand of known angles, and for which members (B,) it holds: all directions are determined."""
+    found = uncertain_stand.solution(problem)
+    problem = _rescaled(problem, found.scale)
+    analysis = analyse(problem, found.state, found.determined)
+    good = found.good & finite & analysis.finite
+    problem.memo.clear()
+    status = np.where(good, int(Status.OK), int(Status.NOT_FINITE))
+    trust = np.ones(problem.evidence.include.shape)
+    return Fit(problem, found.state, status, found.steps, _noise(problem), trust, analysis), good
 
 
 def _closed(problem: Problem, finite: Bools) -> tuple[Fit, Bools]:

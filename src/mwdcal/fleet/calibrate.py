@@ -250,12 +250,11 @@ class _Batch:
     def _note_records(self, tools: Ints, fitted: FittedRuns) -> None:
         """What `mwdcal calibrate` writes for sound tools; of its time the day, so that another run gives the same."""
         for place in np.flatnonzero(~self.repeated[tools].any(-1)).tolist():
-            readings, profile = fitted.alone(place)
-            options = fitted.options
+            options, (readings, profile) = fitted.options, fitted.alone(place)
             with suppress(MwdcalError):  # of a tool that is sound by a hair in the batch alone
                 orders = tables_of(readings, self.asked, options)
                 choice = Choice(readings, profile, options, orders)
-                record = record_of(choice, fitted.alone_of(place))
+                record = record_of(choice, fitted.alone_as(place, (readings, profile)))
                 day = msgspec.structs.replace(record, time=record.time.partition("T")[0])
                 self.outcome.records[tools[place]] = msgspec.json.encode(day)
 

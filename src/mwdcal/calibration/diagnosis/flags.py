@@ -134,9 +134,9 @@ class FittedRuns:
         """The fit of one run, as a batch of one."""
         return self.result if self.count == 1 else take(self.result, np.array([place]))
 
-    def alone_of(self, place: int) -> FittedRuns:
-        """One of the runs, as a batch of one with the readings of that run."""
-        readings, profile = run = self.alone(place)
+    def alone_as(self, place: int, run: tuple[Readings, Profile]) -> FittedRuns:
+        """One of the runs, as a batch of one with the readings of that `run`."""
+        readings, profile = run
         one = FittedRuns(
             batch_of_one(readings), profile, self.options, self.member(place), lambda _: run
         )

@@ -192,14 +192,14 @@ def _affine_minimum(triad: Triad, target: Array, include: Array) -> AffineMinimu
         terms,
         forward,
         spread,
-        *_centred(triad, forward),
+        *centred_parts(triad, forward),
         left,
         include - share,
         fit.spanned,
     )
 
 
-def _centred(triad: Triad, forward: Array) -> tuple[Array, Array]:
+def centred_parts(triad: Triad, forward: Array) -> tuple[Array, Array]:
     """M (B, 3, 3) and T (B, 4, 4) of Φ in the model's own centred and scaled reading."""
     model = triad.model
     assert isinstance(model, Polynomial)
