@@ -277,14 +277,14 @@ def _special(problem: Problem, options: Options, finite: Bools) -> tuple[Fit | N
 
 def _on_stand(problem: Problem, finite: Bools) -> tuple[Fit, Bools]:
     """The fit on a stand of known angles, and for which members (B,) it holds: all directions are determined."""
-    found = uncertain_stand.solution(problem)
-    problem = _rescaled(problem, found.scale)
-    analysis = analyse(problem, found.state, found.determined)
-    good = found.good & finite & analysis.finite
+    there = uncertain_stand.solution(problem)
+    problem = _rescaled(problem, there.scale)
+    analysis = analyse(problem, there.state, there.determined)
+    good = there.good & finite & analysis.finite
     problem.memo.clear()
     status = np.where(good, int(Status.OK), int(Status.NOT_FINITE))
     trust = np.ones(problem.evidence.include.shape)
-    return Fit(problem, found.state, status, found.steps, _noise(problem), trust, analysis), good
+    return Fit(problem, there.state, status, there.steps, _noise(problem), trust, analysis), good
 
 
 def _closed(problem: Problem, finite: Bools) -> tuple[Fit, Bools]:

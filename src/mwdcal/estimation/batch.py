@@ -6,7 +6,7 @@ is common to all of them: names, orders, flags.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from functools import cache
 from typing import Any, TypeVar
@@ -44,7 +44,7 @@ def join(batches: Sequence[_T]) -> _T:
     return whole
 
 
-def kind_of(batch: Any) -> Hashable:
+def kind_of(batch: Any) -> Any:
     """What batches have in common that can be joined: all that is not an array, and the shapes of members."""
     if isinstance(batch, np.ndarray):
         return batch.shape[1:]

@@ -199,7 +199,7 @@ def _axes(problem: Problem, state: State, walks: Sequence[str]) -> Array:
 
 
 def _by_term(values: Array, terms: Array) -> Array:
-    """Sums (B, ..., k) over the stations of values (B, n, ..., a) by axis of drifts, times each of their terms (n, K)."""
+    """Sums (B, ..., k) over the stations of values (B, n, ..., a) by axis of drifts, times each term (n, K)."""
     flat = values.reshape(*values.shape[:2], -1)
     sums = (flat.mT @ terms).reshape(len(values), *values.shape[2:-1], -1, 3, terms.shape[-1])
     return np.asarray(sums.swapaxes(-1, -2).reshape(*sums.shape[:-3], -1))
@@ -282,12 +282,17 @@ def walk_variances(
     """
     of_walk = acting(scores.places)
     if scores.apart:
-        each = [scores.of([n for n, t in of_walk.items() if t == triad]) for triad in (0, 1)]
-        (first, quiet), (second, left) = (
-            walk_variances(part, variance, freedom, declared) for part in each
+        (lower, quiet), (upper, left) = (
+            walk_variances(
+                scores.of([n for n, t in of_walk.items() if t == triad]),
+                variance,
+                freedom,
+                declared,
+            )
+            for triad in (0, 1)
         )
         left[:, 0] = quiet[:, 0]
-        return np.concatenate([first, second], -1), left
+        return np.concatenate([lower, upper], -1), left
     parts = scores.components()
     triad = np.array([of_walk[name] for name, _ in parts])
     owner = np.zeros(scores.score.shape[-1], int)

@@ -161,7 +161,7 @@ def _without_copies(batch: _Batch, tools: Ints, repeated: Bools) -> Outcome:
         return readings.without_copies(repeated), profile
 
     readings = take(batch.readings, tools).without_copies(repeated)
-    outcome = calibrate_batch(readings, batch.asked, batch.profile, alone, batch.records)
+    outcome = calibrate_batch(readings, batch.given, batch.profile, alone, batch.records)
     outcome.copies[:] += np.count_nonzero(repeated)
     stations = np.flatnonzero(~repeated)
     for again in filter(None, outcome.lists["reshoot"]):
@@ -180,7 +180,7 @@ def _with_scales(profile: Profile) -> Profile:
 class _Batch:
     """Tools on their way: readings (B, n, ...), and the outcome that steps fill in for some of them.
 
-    `repeated` (B, n): the stations of sound fits that are copies of others. `asked` are the options as they came.
+    `repeated` (B, n): the stations of sound fits that are copies of others. `given` are the options as they came.
     """
 
     readings: Readings
@@ -188,7 +188,7 @@ class _Batch:
     alone: Alone
     outcome: Outcome
     repeated: Bools
-    asked: Options
+    given: Options
     records: bool
 
     def calibrate(self, options: Options) -> None:
@@ -252,7 +252,7 @@ class _Batch:
         for place in np.flatnonzero(~self.repeated[tools].any(-1)).tolist():
             options, (readings, profile) = fitted.options, fitted.alone(place)
             with suppress(MwdcalError):  # of a tool that is sound by a hair in the batch alone
-                orders = tables_of(readings, self.asked, options)
+                orders = tables_of(readings, self.given, options)
                 choice = Choice(readings, profile, options, orders)
                 record = record_of(choice, fitted.alone_as(place, (readings, profile)))
                 day = msgspec.structs.replace(record, time=record.time.partition("T")[0])

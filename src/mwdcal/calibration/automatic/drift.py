@@ -6,8 +6,9 @@ does, walks of the field and of both triads' offsets are fitted with it, of size
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from mwdcal.calibration.residuals import tail
 from mwdcal.estimation import drift
 from mwdcal.estimation.batch import join, kind_of, put, take
 from mwdcal.estimation.minimisers import closed_form
-from mwdcal.estimation.minimisers.common_columns import Design, are_common, perfect
+from mwdcal.estimation.minimisers.common_columns import Alike, are_common, perfect
 from mwdcal.estimation.problem import Prior
 from mwdcal.estimation.solvers import Status
 from mwdcal.geometry.vectors import Array, Bools, Ints
@@ -67,7 +68,7 @@ def _scores(result: Fit) -> drift.WalkScores:
     problem, analysis = result.problem, result.analysis
     if not (closed_form.applies(problem) and are_common(problem)):
         return drift.walk_scores(problem, result.state, analysis)
-    one, state = perfect(Design.of(problem, result.state))
+    one, state = perfect(Alike.of(problem, result.state))
     nominal = replace(take(analysis, np.arange(1)), residual=analysis.residual)
     return drift.walk_scores(one, state, nominal)
 
@@ -126,11 +127,9 @@ def by_drift(result: Fit, options: Options) -> Iterator[tuple[Ints, Fit]]:
     return with_drifts([(np.arange(len(result.status)), result)], options)
 
 
-def with_drifts(
-    fits: Iterable[tuple[Ints, Fit]], options: Options
-) -> Iterator[tuple[Ints, Fit]]:
+def with_drifts(fits: Iterable[tuple[Ints, Fit]], options: Options) -> Iterator[tuple[Ints, Fit]]:
     """Tools and their fits: those without drift as they come, then those with a drift of the same triads together."""
-    waiting: dict[Hashable, list[tuple[Ints, Fit]]] = {}
+    waiting: dict[tuple[Any, Any], list[tuple[Ints, Fit]]] = {}
     for tools, result in fits:
         drifted = drifting(result, options)
         for triads in np.unique(drifted, axis=0):

@@ -15,8 +15,8 @@ from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.results import variance_scales
 from mwdcal.estimation.minimisers import closed_form, closed_form_drift
 from mwdcal.estimation.minimisers.common_columns import (
+    Alike,
     CommonColumns,
-    Design,
     are_common,
     perfect,
     responses,
@@ -48,7 +48,7 @@ def may_show(result: Fit) -> Bools:
         common = closed_form.applies(problem) and are_common(problem)
     if not common:
         return every
-    design = Design.of(problem, result.state)
+    design = Alike.of(problem, result.state)
     if any(name.endswith(("-temperature", "-thermal-lag")) for name in _common(design)):
         return every
     scale = np.sqrt(np.maximum(variance_scales(result), 1e-12))
@@ -81,7 +81,7 @@ class _Drifts:
 
     @classmethod
     def of(
-        cls, problem: Problem, state: State, design: Design, residual: Array, response: list[Array]
+        cls, problem: Problem, state: State, design: Alike, residual: Array, response: list[Array]
     ) -> _Drifts:
         """Of a problem at its solution, with other whitened residuals (B, n, m) and responses."""
         columns, covariance, pull = {}, {}, {}
@@ -90,7 +90,10 @@ class _Drifts:
             precision = closed_form_drift.prior_precision(problem)
             for index, (places, each) in closed_form_drift.walk_columns(design).items():
                 known, value = precision[:, places], state.constants[:, places]
-                part, information = residual[..., 3 * index : 3 * index + 3], each.information(response[index])
+                part, information = (
+                    residual[..., 3 * index : 3 * index + 3],
+                    each.information(response[index]),
+                )
                 inner = inverse(information + known[..., None] * np.eye(len(places)))
                 force = each.score(response[index], part) + known * value
                 step = (inner @ force[..., None])[..., 0]
@@ -102,7 +105,10 @@ class _Drifts:
     def less(
         self, index: int, cross: Array, score: Array, information: Array
     ) -> tuple[Array, Array]:
-        """Score (B, k) and information (B, k, k) of effects on a triad less what drifts take, by their `cross` (B, k, q)."""
+        """Score (B, k) and information (B, k, k) of effects on a triad less what drifts take.
+
+        `cross` (B, k, q) is what they have in common.
+        """
         taken = cross @ self.covariance[index]
         return (
             score - (cross @ self.pull[index][..., None])[..., 0],
@@ -111,7 +117,7 @@ class _Drifts:
 
 
 @lru_cache(maxsize=8)
-def _common(design: Design) -> dict[str, dict[int, CommonColumns]]:
+def _common(design: Alike) -> dict[str, dict[int, CommonColumns]]:
     """What each effect does to the readings of the triads, by its name; nothing where it is each tool's own."""
     one, state = perfect(design)
     terms = [sensor_terms(one, state, index) for index in range(len(one.triads))]
@@ -128,7 +134,7 @@ def _common(design: Design) -> dict[str, dict[int, CommonColumns]]:
 
 
 @lru_cache(maxsize=8)
-def _across(design: Design) -> dict[str, dict[int, Array]]:
+def _across(design: Alike) -> dict[str, dict[int, Array]]:
     """What each effect has in common with the drifts that are in the fit of a design."""
     drifts = closed_form_drift.walk_columns(design) if design.problem.walks else {}
     return {
@@ -138,7 +144,7 @@ def _across(design: Design) -> dict[str, dict[int, Array]]:
 
 
 def _gains(
-    problem: Problem, design: Design, residual: Array, response: list[Array], drifts: _Drifts
+    problem: Problem, design: Alike, residual: Array, response: list[Array], drifts: _Drifts
 ) -> Iterator[tuple[Array, Ints]]:
     """By how much (B,) each family lowers the misfit, and its directions, from whitened residuals (B, n, m)."""
     parts = np.split(residual, residual.shape[-1] // 3, -1)
@@ -150,7 +156,7 @@ def _gains(
             terms = sensor_terms(*perfect(design), index)
             yield _gain_of_sides(terms, sides, parts[index], index, response[index], drifts)
         elif columns:
-            score, information, square = 0.0, 0.0, 0.0
+            score = information = square = np.zeros(())
             for index, each in columns.items():
                 reads = response[index]
                 both = each.score(reads, parts[index]), each.information(reads)

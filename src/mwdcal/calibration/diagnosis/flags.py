@@ -140,7 +140,8 @@ class FittedRuns:
         one = FittedRuns(
             batch_of_one(readings), profile, self.options, self.member(place), lambda _: run
         )
-        one._shown.update({0: shown for at, shown in self._shown.items() if at == place})
+        if place in self._shown:
+            one._shown[0] = self._shown[place]
         return one
 
     def shown(self, places: Ints) -> dict[int, Shown]:

@@ -13,8 +13,8 @@ import numpy as np
 
 from mwdcal.estimation.minimisers import closed_form
 from mwdcal.estimation.minimisers.common_columns import (
+    Alike,
     CommonColumns,
-    Design,
     are_common,
     perfect,
     responses,
@@ -41,7 +41,7 @@ def applies(problem: Problem) -> bool:
 
 
 @lru_cache(maxsize=16)
-def walk_columns(design: Design, alone: bool = False) -> WalkColumns:
+def walk_columns(design: Alike, alone: bool = False) -> WalkColumns:
     """What the terms of the drifts do to the readings of the triads; `alone`: with the sensors' parameters known."""
     perfect_problem, at = perfect(design)
     columns = perfect_problem.walk_columns(at)[0]
@@ -61,7 +61,7 @@ def scores(problem: Problem, state: State, residual: Array) -> Array:
         responses(problem, state),
         np.zeros((len(residual), len(problem.evidence.constants))),
     )
-    for index, (places, each) in walk_columns(Design.of(problem, state)).items():
+    for index, (places, each) in walk_columns(Alike.of(problem, state)).items():
         score[:, places] = each.score(reads[index], residual[..., 3 * index : 3 * index + 3])
     return score
 
@@ -70,7 +70,7 @@ def information(problem: Problem, state: State, alone: bool = False) -> Array:
     """Information (B, q, q) of the readings on the terms; `alone`: with the sensors' parameters known."""
     reads, count = responses(problem, state), len(problem.evidence.constants)
     whole = np.zeros((len(state.params), count, count))
-    for index, (places, each) in walk_columns(Design.of(problem, state), alone).items():
+    for index, (places, each) in walk_columns(Alike.of(problem, state), alone).items():
         whole[:, places[:, None], places] = each.information(reads[index])
     return whole
 
@@ -78,7 +78,7 @@ def information(problem: Problem, state: State, alone: bool = False) -> Array:
 def solution(problem: Problem, at: State) -> tuple[State, Analysis, Bools]:
     """State and analysis at the minimum for the attitudes of a state, and members (B,) that came there."""
     bare = replace(problem, evidence=replace(problem.evidence, constants=()))
-    columns, precision = walk_columns(Design.of(problem, at)), prior_precision(problem)
+    columns, precision = walk_columns(Alike.of(problem, at)), prior_precision(problem)
     value = np.zeros(precision.shape)
     steady, still = bare, replace(at, constants=value[:, :0])
     covariances: dict[int, Array] = {}

@@ -37,15 +37,15 @@ def are_common(problem: Problem) -> bool:
 
 
 @dataclass(frozen=True)
-class Design:
-    """The first member of a problem; equal to others of equal references and columns, whatever the readings."""
+class Alike:
+    """The first member of a problem; equal to others of equal references and constants, whatever the readings."""
 
     references: tuple[bytes | str, ...]
     problem: Problem = field(compare=False)
     state: State = field(compare=False)
 
     @classmethod
-    def of(cls, problem: Problem, state: State) -> Design:
+    def of(cls, problem: Problem, state: State) -> Alike:
         """Of the members of a problem that `are_common`."""
         evidence = problem.evidence
         masks = [constant.mask for constant in evidence.constants]
@@ -56,7 +56,7 @@ class Design:
 
 
 @lru_cache(maxsize=16)
-def perfect(design: Design) -> tuple[Problem, State]:
+def perfect(design: Alike) -> tuple[Problem, State]:
     """A design as sensors without error and with noise of one would read it."""
     problem, state = design.problem, design.state
     triads = [replace(triad, sd=np.ones_like(triad.sd)) for triad in problem.triads]

@@ -1,13 +1,13 @@
-"""Runs on a stand whose angles are known at every station, each with an error of its own: weights, noise and fit in turn.
+"""Runs on a stand whose angles are known at every station, each with an error: weights, noise and fit at once.
 
-A station says raw = S f(I + e) + o + noise, with errors e of its angles that a standard uncertainty bounds. Given e that
-is the closed form of exact references, and e is three unknowns of the station's own:
+A station says raw = S f(I + e) + o + noise, with errors e of its angles that a standard uncertainty bounds. Given e
+that is the closed form of exact references, and e is three unknowns of the station's own:
 
     W = 1 - P Pᵀ,     P = G L⁻ᵀ,  L Lᵀ = 1 + Gᵀ G,  G = S df/de σ_e / σ
 
-so that a step of the twelve elements of each Φ = [S o] takes a solution of 24 equations for a tool, and products of three
-columns for a station. It comes to the minimum that the general way comes to, and is tested against it. Arrays are
-(B, component, n), the stations last.
+so that a step of the twelve elements of each Φ = [S o] takes a solution of 24 equations for a tool, and products of
+three columns for a station. It comes to the minimum that the general way comes to, and is tested against it. Arrays
+are (B, component, n), the stations last.
 
 Reference: D. A. Harville, J. Am. Stat. Assoc. 72, 320 (1977), of the noise.
 """
@@ -28,19 +28,19 @@ from mwdcal.estimation.solvers import Determined
 from mwdcal.geometry.vectors import Array, Bools, Ints, inverse, quotient, solved
 from mwdcal.sensor.models import Polynomial
 
-MOST_ROUNDS = 12
+MOST_STAND_STEPS = 12
 """Most steps of a fit: a member that has not settled then goes the general way."""
-SETTLED_STEP = 1e-12
+LEAST_SQUARE = 1e-12
 """Square of the last step, in standard uncertainties."""
-SETTLED_NOISE = 1e-5
+LEAST_NOISE_CHANGE = 1e-5
 """Largest last change of the noise, as a share."""
-FASTEST = 3.0
+MOST_AT_ONCE = 3.0
 """Largest power of s that the noise takes at once."""
-LEAST_STEP = 1e-9
+LEAST_SECANT = 1e-9
 """Smaller changes of the noise tell nothing of its slope."""
-LEAST_SHARE = 1e-6
+LEAST_OF_SIGNAL = 1e-6
 """Noise below this share of the readings' size is left to the general way."""
-SIGNS = np.array([1.0, -1.0, -1.0])[:, None]
+ERROR_SIGNS = np.array([1.0, -1.0, -1.0])[:, None]
 """How inclination, azimuth and toolface follow the errors of a state."""
 
 
@@ -83,41 +83,35 @@ def solution(problem: Problem) -> Solution:
     estimated = np.array([not triad.declared for triad in problem.triads])
     stand = _Stand.of(problem)
     active, now = np.arange(len(good)), _Turn(stand, forward, errors, scale, 0 * scale, 0 * scale)
-    steps = np.full(len(good), MOST_ROUNDS)
-    for turn in range(1, MOST_ROUNDS + 1):
+    steps = np.full(len(good), MOST_STAND_STEPS)
+    for count in range(1, MOST_STAND_STEPS + 1):
         now, moving = now.next(estimated)
         forward[active], errors[active], scale[active] = now.forward, now.errors, now.scale
-        steps[active[~moving]] = turn
+        steps[active[~moving]] = count
         moving &= good[active]
         active = active[moving]
         if not active.size:
             break
-        now = now if moving.all() else take(now, moving)
+        now = now if moving.all() else take(now, np.flatnonzero(moving))
     good[active] = False
-    there = [
-        replace(each, forward=forward[:, t], **_parts(problem, t, forward[:, t]))
-        for t, each in enumerate(first)
-    ]
+    there: closed_form.Minima = []
+    for index, (each, triad) in enumerate(zip(first, problem.triads, strict=True)):
+        back, turn = closed_form.centred_parts(triad, forward[:, index])
+        there.append(replace(each, forward=forward[:, index], back=back, turn=turn))
     params = np.concatenate([each.params for each in there], -1)
     state = replace(at, params=params, errors=errors.mT)
     good &= np.isfinite(params).all(-1) & np.isfinite(scale).all(-1)
-    good &= np.all((scale * stand.noise_share > LEAST_SHARE) | ~estimated, -1)
+    good &= np.all((scale * stand.noise_share > LEAST_OF_SIGNAL) | ~estimated, -1)
     return Solution(state, scale, closed_form.determined(there), steps, good)
 
 
 def _first_noise(problem: Problem, minima: Sequence[AffineMinimum]) -> Array:
     """The noise at exact references over that of the problem (B, t); one where it is declared."""
     each = [
-        np.sqrt(np.sum(m.left**2, (1, 2)) / np.maximum(np.sum(m.open, (1, 2)), 1.0))
-        for m in minima
+        np.sqrt(np.sum(m.left**2, (1, 2)) / np.maximum(np.sum(m.open, (1, 2)), 1.0)) for m in minima
     ]
     declared = [triad.declared for triad in problem.triads]
     return np.where(declared, 1.0, np.stack(each, -1))
-
-
-def _parts(problem: Problem, index: int, forward: Array) -> dict[str, Array]:
-    back, turn = closed_form.centred_parts(problem.triads[index], forward)
-    return {"back": back, "turn": turn}
 
 
 @dataclass(frozen=True)
@@ -158,7 +152,7 @@ class _Stand:
 
     def vectors(self, errors: Array) -> tuple[Array, Array]:
         """f̃ (B, 2, 4, n) of both triads, and the change of f by one σ of each angle (B, 2, 3, 3, n)."""
-        angle = self.angles + SIGNS * errors
+        angle = self.angles + ERROR_SIGNS * errors
         (ci, ca, ct), (si, sa, st) = (np.moveaxis(of(angle), 1, 0) for of in (np.cos, np.sin))
         batch, stations = ci.shape
         f = np.ones((batch, 2, 4, stations))
@@ -176,7 +170,7 @@ class _Stand:
             )
             change[:, 1, axis, 1] = self.north * by_azimuth[axis]
         change[:, :, 0, 2], change[:, :, 1, 2] = f[:, :, 1], -f[:, :, 0]
-        change *= (SIGNS * self.angle_sd)[:, None, None]
+        change *= (ERROR_SIGNS * self.angle_sd)[:, None, None]
         return f, change
 
     def at(self, forward: Array, errors: Array, scale: Array) -> _Linear:
@@ -213,15 +207,15 @@ class _Turn:
         """A step of the fit, and of the noise where it is estimated (t,); and which members (B,) have not settled."""
         here = self.stand.at(self.forward, self.errors, self.scale)
         step, errors, length = here.step()
-        forward, moving = self.forward + step.reshape(self.forward.shape), length >= SETTLED_STEP
+        forward, moving = self.forward + step.reshape(self.forward.shape), length >= LEAST_SQUARE
         now = replace(self, forward=forward, errors=errors)
         if not estimated.any():
             return now, moving
         excess, power = here.excess(step, self.stand.include)
-        slope = quotient(self.excess - excess, self.change, np.abs(self.change) > LEAST_STEP)
-        slope = np.where(slope > 0, np.clip(slope, 1 / FASTEST, 2.0), 1 / power)
+        slope = quotient(self.excess - excess, self.change, np.abs(self.change) > LEAST_SECANT)
+        slope = np.where(slope > 0, np.clip(slope, 1 / MOST_AT_ONCE, 2.0), 1 / power)
         change = np.where(estimated, excess / slope, 0.0)
-        moving |= np.any(np.abs(change) >= SETTLED_NOISE, -1)
+        moving |= np.any(np.abs(change) >= LEAST_NOISE_CHANGE, -1)
         return replace(now, scale=self.scale * np.exp(change), excess=excess, change=change), moving
 
 
@@ -245,9 +239,7 @@ class _Linear:
             for j in range(k + 1):
                 known = np.sum(factor[:, k, :j] * factor[:, j, :j], 1)
                 product = np.sum(self.gain[:, :, k] * self.gain[:, :, j], 1) - known
-                factor[:, k, j] = (
-                    np.sqrt(1 + product) if j == k else product / factor[:, j, j]
-                )
+                factor[:, k, j] = np.sqrt(1 + product) if j == k else product / factor[:, j, j]
         return factor
 
     @cached_property
@@ -270,10 +262,10 @@ class _Linear:
         """XᵀWX (B, 24, 24)."""
         mixed = self.mixed.reshape(len(self.mixed), 24, -1)
         whole = -mixed @ mixed.mT
-        own = whole.reshape(-1, 6, 4, 6, 4)
+        by_row = whole.reshape(-1, 6, 4, 6, 4)
         square = self.rows @ self.rows.mT
         for row in range(6):
-            own[:, row, :, row] += square[:, row]
+            by_row[:, row, :, row] += square[:, row]
         return np.asarray(whole)
 
     def step(self) -> tuple[Array, Array, Array]:
@@ -306,10 +298,10 @@ class _Linear:
         left, covariance = self.after(step), inverse(self.information)
         along = np.sum(self.halves * left[:, :, None], 1)
         left = left - np.sum(self.halves * along[:, None], 2)
-        own = np.zeros((len(left), 6, 4, 6, left.shape[-1]))
+        weighed = np.zeros((len(left), 6, 4, 6, left.shape[-1]))
         for row in range(6):
-            own[:, row, :, row] = self.rows[:, row]
-        weighed = own.reshape(len(left), 24, 6, -1)
+            weighed[:, row, :, row] = self.rows[:, row]
+        weighed = weighed.reshape(len(left), 24, 6, -1)
         weighed -= np.einsum("bukn,bmkn->bumn", self.mixed, self.halves)
         each = []
         for index in (0, 1):
@@ -323,7 +315,7 @@ class _Linear:
             squares = whole - 2 * share + np.sum(overlap**2, (1, 2, 3))
             freedom = whole - share - taken
             factor = np.sum(left[:, axes] ** 2, (1, 2)) / np.where(freedom >= 1, freedom, np.nan)
-            power = np.clip((whole - share) / np.maximum(squares, 1e-9), 1.0, FASTEST)
+            power = np.clip((whole - share) / np.maximum(squares, 1e-9), 1.0, MOST_AT_ONCE)
             each.append((np.log(factor) / 2, power))
         excess, power = (np.stack(part, -1) for part in zip(*each, strict=True))
         return excess, power
