@@ -78,7 +78,7 @@ def chosen_fit(
     repeated = copies(result)[0]
     if not repeated.any():
         return choice, result
-    check(fit_refusals(_one_run(choice, result)))
+    check(fit_refusals(one_run(choice, result)))
     progress(f"{repeated.sum()} of {repeated.size} stations are copies of others: without them")
     left = np.array([label not in options.exclude for label in readings.labels])
     left[left] = repeated
@@ -90,15 +90,23 @@ def recorded(choice: Choice, result: Fit) -> Calibration:
 
     Raises `FitError` where the fit is not to be trusted.
     """
-    fitted = _one_run(choice, result)
+    fitted = one_run(choice, result)
     check(fit_refusals(fitted))
+    return record_of(choice, fitted)
+
+
+def record_of(choice: Choice, fitted: FittedRuns) -> Calibration:
+    """The record of a fit that nothing refuses, a batch of one.
+
+    Raises `FitError` where it would not be one.
+    """
     calibration = sealed(rounded(_record(choice, fitted)))
     if problem := inconsistency(calibration):
         raise FitError(f"the fit gives no usable calibration: {problem}. {UNSOUND_ADVICE}")
     return calibration
 
 
-def _one_run(choice: Choice, result: Fit) -> FittedRuns:
+def one_run(choice: Choice, result: Fit) -> FittedRuns:
     """The fit of a run as refusals and findings look at it: a batch of one."""
     readings, profile = choice.readings, choice.profile
     return FittedRuns(

@@ -16,7 +16,7 @@ from mwdcal.calibration.prior import prior_of
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.estimation.batch import put, take
 from mwdcal.estimation.evidence import ANGLES, Evidence
-from mwdcal.estimation.minimisers import closed_form, closed_form_drift
+from mwdcal.estimation.minimisers import closed_form, closed_form_drift, uncertain_stand
 from mwdcal.estimation.problem import Problem, State, Triad
 from mwdcal.estimation.resetting import set_apart, with_share
 from mwdcal.estimation.robust import LOSSES, consistency, inflation, weight, weighted
@@ -169,7 +169,7 @@ def fit(readings: Readings, options: Options | None = None, include: Array | Non
     evidence = _evidence(readings, include, options)
     lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
     problem, finite = _problem(readings, evidence, lead, options)
-    closed, good = _closed(problem, finite) if _comes_apart(problem, options) else (None, finite)
+    closed, good = _special(problem, options, finite)
     if closed is None or not good.any():
         return _general(problem, options, finite)
     if good.all():
@@ -265,15 +265,33 @@ def _finished(stage: _Stage, options: Options, finite: Bools, iterations: Ints) 
     return Fit(trusted, state, status, iterations, _noise(problem), trust, analysis)
 
 
-def _comes_apart(problem: Problem, options: Options) -> bool:
-    """Whether the fit has a closed form: not where references are not exact, for example."""
-    return not (options.robust or options.separate_solver) and _form(problem) is not None
-
-
 def _form(problem: Problem) -> ModuleType | None:
     """The closed form of a problem, without drift or with it, if there is one."""
     forms = () if problem.evidence.scatter else (closed_form, closed_form_drift)
     return next((form for form in forms if form.applies(problem)), None)
+
+
+def _special(problem: Problem, options: Options, finite: Bools) -> tuple[Fit | None, Bools]:
+    """The fit by a shorter way, if there is one, and for which members (B,) it holds."""
+    if options.robust or options.separate_solver:
+        return None, finite
+    if _form(problem) is not None:
+        return _closed(problem, finite)
+    if uncertain_stand.applies(problem):
+        return _on_stand(problem, finite)
+    return None, finite
+
+
+def _on_stand(problem: Problem, finite: Bools) -> tuple[Fit, Bools]:
+    """The fit on a stand of known angles, and for which members (B,) it holds: all directions are determined."""
+    there = uncertain_stand.solution(problem)
+    problem = _rescaled(problem, there.scale)
+    analysis = analyse(problem, there.state, there.determined)
+    good = there.good & finite & analysis.finite
+    problem.memo.clear()
+    status = np.where(good, int(Status.OK), int(Status.NOT_FINITE))
+    trust = np.ones(problem.evidence.include.shape)
+    return Fit(problem, there.state, status, there.steps, _noise(problem), trust, analysis), good
 
 
 def _closed(problem: Problem, finite: Bools) -> tuple[Fit, Bools]:
@@ -281,8 +299,12 @@ def _closed(problem: Problem, finite: Bools) -> tuple[Fit, Bools]:
     at, form = closed_form.start(problem), _form(problem) or closed_form
     state, analysis, good = form.solution(problem, at)
     good = good & analysis.determined.keep.all(-1)
+    if form is closed_form and good.any() and not _all_declared(problem):
+        quieter = _rescaled(problem, np.sqrt(analysis.variance_factor))
+        analysis = closed_form.rescaled(problem, quieter, analysis)
+        problem = quieter
     free, moving = np.array([not triad.declared for triad in problem.triads]), good[:, None]
-    for _ in range(NOISE_ROUNDS if problem.walks else 1):  # without drift the first is exact
+    for _ in range(NOISE_ROUNDS if problem.walks else 0):
         if not (moving & free).any():
             break
         scale = np.where(moving & free, np.sqrt(analysis.variance_factor), 1.0)

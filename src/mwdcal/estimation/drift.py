@@ -135,6 +135,16 @@ class WalkScores:
         information = self.information[some]
         return WalkScores(self.score[:, index], information, lambda: self.alone()[some], places)
 
+    @property
+    def apart(self) -> bool:
+        """Whether there are walks of both triads, and readings of one say nothing of the walks of the other."""
+        triads = acting(self.places)
+        first, second = (
+            [c for n, t in triads.items() if t == triad for c in self.places[n].tolist()]
+            for triad in (0, 1)
+        )
+        return bool(first and second) and not self.information[:, first][..., second].any()
+
     def shown(self, name: str) -> Array:
         """Share (B,) of the information about a trend that residuals keep, of the axis along which it is least.
 
@@ -173,15 +183,38 @@ def walk_scores(problem: Problem, state: State, analysis: Analysis) -> WalkScore
         return WalkScores(
             score, information() * scale, lambda: information(alone=True) * scale, each
         )
-    columns = walking.walk_columns(at)[..., old:] * sd[:, None, None]
-    linear = problem.linear(state)
+    linear, base = problem.linear(state), _axes(problem, state, [*each])
     whole = whole_covariance(linear, analysis.determined)
-    flat = columns.reshape(len(columns), -1, columns.shape[-1])
-    weighed = linear.weigh(columns).reshape(flat.shape)
-    crossed = linear.design.reshape(len(columns), -1, whole.shape[-1]).mT @ weighed
-    alone = flat.mT @ weighed
-    score = (flat.mT @ residual.reshape(len(residual), -1, 1))[..., 0]
+    terms = terms_of(base.shape[1])[0][:, 1:]
+    weighed, count = linear.weigh(base), len(base)
+    score = _by_term((base.mT @ residual[..., None])[..., 0], terms) * sd
+    crossed = _by_term(linear.design.mT @ weighed, terms) * sd[:, None]
+    pairs = (terms[:, :, None] * terms[:, None]).reshape(len(terms), -1)
+    alone = (base.mT @ weighed).reshape(count, len(terms), -1).mT @ pairs
+    alone = alone.reshape(count, *2 * (len(each), 3), *2 * terms.shape[1:])
+    alone = alone.transpose(0, 1, 5, 2, 3, 6, 4).reshape(scale.shape) * scale
     return WalkScores(score, alone - crossed.mT @ whole @ crossed, lambda: alone, each)
+
+
+def _axes(problem: Problem, state: State, walks: Sequence[str]) -> Array:
+    """Columns (B, n, m, a) of what a unit of each axis of some drifts does at every station."""
+    evidence = problem.evidence
+    zero, mask = np.zeros(len(evidence.include)), np.ones(evidence.include.shape)
+    axes = (
+        SharedConstant(axis, mask, zero, zero + 1, unknown=False)
+        for name in walks
+        for axis in WALKS[name]
+    )
+    lone = replace(problem, evidence=replace(evidence, constants=tuple(axes)))
+    lone.memo.update(problem.memo)
+    return lone.walk_columns(state)
+
+
+def _by_term(values: Array, terms: Array) -> Array:
+    """Sums (B, ..., k) over the stations of values (B, n, ..., a) by axis of drifts, times each term (n, K)."""
+    flat = values.reshape(*values.shape[:2], -1)
+    sums = (flat.mT @ terms).reshape(len(values), *values.shape[2:-1], -1, 3, terms.shape[-1])
+    return np.asarray(sums.swapaxes(-1, -2).reshape(*sums.shape[:-3], -1))
 
 
 def _walking(problem: Problem, state: State) -> tuple[Problem, State, Array, dict[str, Ints]]:
@@ -259,8 +292,18 @@ def walk_variances(
     Definition: for the coefficients u of a walk, V their covariance given the readings: θ = Σu² / Σ(1 - V/θ);
     of the noise, misfit less what the walks explain over its degrees of freedom (Henderson).
     """
-    parts, of_walk = scores.components(), acting(scores.places)
+    of_walk, parts = acting(scores.places), scores.components()
     triad = np.array([of_walk[name] for name, _ in parts])
+    if scores.apart:
+        (lower, quiet), (upper, left) = (
+            walk_variances(
+                scores.of([n for n, t in of_walk.items() if t == one]),
+                variance, freedom, declared, least[:, triad == one],
+            )
+            for one in (0, 1)
+        )  # fmt: skip
+        left[:, 0] = quiet[:, 0]
+        return np.concatenate([lower, upper], -1), left
     owner = np.zeros(scores.score.shape[-1], int)
     for number, columns in enumerate(parts.values()):
         owner[columns] = number

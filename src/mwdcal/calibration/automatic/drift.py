@@ -7,8 +7,9 @@ A declared drift is part of every fit, and no smaller than declared.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -20,9 +21,9 @@ from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.residuals import tail
 from mwdcal.estimation import drift
-from mwdcal.estimation.batch import put, take
+from mwdcal.estimation.batch import join, kind_of, put, take
 from mwdcal.estimation.minimisers import closed_form
-from mwdcal.estimation.minimisers.common_columns import are_common, perfect
+from mwdcal.estimation.minimisers.common_columns import Alike, are_common, perfect
 from mwdcal.estimation.problem import Prior
 from mwdcal.estimation.solvers import Status
 from mwdcal.geometry.vectors import Array, Bools, Ints
@@ -41,6 +42,8 @@ DISPUTED_CHANCE = 0.01
 """The same chance where the run departs from its prior: a drift there would take up what is a conflict."""
 EVERY_PARAMETER = 12
 """Parameters of a triad that are all fitted."""
+TOGETHER = 320
+"""Most fits whose drifts are fitted together: few enough for the cache."""
 REDUNDANCY = 36.0
 """Fewest degrees of freedom of a triad that can tell a drift from noise."""
 
@@ -67,7 +70,7 @@ def _scores(result: Fit) -> drift.WalkScores:
     problem, analysis = result.problem, result.analysis
     if not (closed_form.applies(problem) and are_common(problem)):
         return drift.walk_scores(problem, result.state, analysis)
-    one, state = perfect(problem, result.state)
+    one, state = perfect(Alike.of(problem, result.state))
     nominal = replace(take(analysis, np.arange(1)), residual=analysis.residual)
     return drift.walk_scores(one, state, nominal)
 
@@ -126,18 +129,34 @@ def fit_run(readings: Readings, options: Options) -> Fit:
 
 
 def by_drift(result: Fit, options: Options) -> Iterator[tuple[Ints, Fit]]:
-    """Members without drift, as they are, and those with a drift of some triads, which is fitted.
+    """Members without drift, as they are, and those with a drift of some triads, which is fitted."""
+    return with_drifts([(np.arange(len(result.status)), result)], options)
 
-    One that is declared is looked for in a fit without it, and stays as declared where none is seen.
+
+def with_drifts(fits: Iterable[tuple[Ints, Fit]], options: Options) -> Iterator[tuple[Ints, Fit]]:
+    """Tools and their fits: those without drift as they come, then those with a drift of the same triads together.
+
+    A drift that is declared is looked for in a fit without it, and stays as declared where none is seen.
     """
-    declared = bool(result.problem.walks) and not _apart(result, options)
-    steady = _without_drift(result, options) if declared else result
-    drifted = drifting(steady, options)
-    for triads in np.unique(drifted, axis=0):
-        places = np.flatnonzero((drifted == triads).all(-1))
-        part = steady if triads.any() else result
-        part = part if len(places) == len(drifted) else take(part, places)
-        yield places, with_drift(part, options, triads) if triads.any() else part
+    waiting: dict[tuple[Any, Any], list[tuple[Ints, Fit]]] = {}
+    for tools, result in fits:
+        declared = bool(result.problem.walks) and not _apart(result, options)
+        steady = _without_drift(result, options) if declared else result
+        drifted = drifting(steady, options)
+        for triads in np.unique(drifted, axis=0):
+            places = np.flatnonzero((drifted == triads).all(-1))
+            part = steady if triads.any() else result
+            part = part if len(places) == len(drifted) else take(part, places)
+            if triads.any():
+                kind = tuple(triads.tolist()), kind_of(part)
+                waiting.setdefault(kind, []).append((tools[places], part))
+            else:
+                yield tools[places], part
+    for (triads, _), parts in waiting.items():
+        tools, whole = (join(each) for each in zip(*parts, strict=True))
+        for first in range(0, len(tools), TOGETHER):
+            some = slice(first, first + TOGETHER)
+            yield tools[some], with_drift(take(whole, some), options, np.array(triads))
 
 
 def _without_drift(result: Fit, options: Options) -> Fit:

@@ -230,7 +230,8 @@ def stations_to_reshoot(result: Fit) -> Bools:
     again = np.zeros(result.analysis.residual.shape[:2], bool)
     some = np.flatnonzero(_suspects(result))
     if some.size:
-        again[some] = to_reshoot(chances(take(result, some)))
+        part = result if some.size == len(again) else take(result, some)
+        again[some] = to_reshoot(chances(part))
     return again
 
 
