@@ -206,8 +206,7 @@ def described(well: Well) -> Mapping[str, object]:
         "calibration_time": calibration.time,
         "survey_limits": well.limits.name,
         "north": north.name,
-        "error_terms": list(well.terms.included),
-        "not_included": list(well.terms.left_out),
+        **well.terms.stated,
     }
     for key, angle in (
         ("declination_deg", north.declination),

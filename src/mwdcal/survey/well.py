@@ -21,11 +21,11 @@ from mwdcal.survey.acceptance import (
     blindness,
     judged,
 )
-from mwdcal.survey.interference import CORRECTED, DRIFTED, ErrorTerms, error_terms
 from mwdcal.survey.norths import North
 from mwdcal.survey.path import calibrated_path
 from mwdcal.survey.stations import TOOLFACE_SWITCH, Surveys, surveyed
 from mwdcal.use.correction import counted
+from mwdcal.use.uncertainty import CORRECTED, DRIFTED, ErrorTerms, error_terms
 
 BLIND_FROM = 2.0
 """Stated standard uncertainties of azimuth by which interference that would pass turns it where acceptance is blind."""

@@ -2,17 +2,19 @@
 
 The uncertainty is that of the calibration and of the noise of one reading. Near vertical azimuth and toolface have
 no value, nor has azimuth where the field is vertical: a direction is then smaller than its own error.
+
+Beside every 1σ stands what it holds and what it leaves out: one sentence, one place.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mwdcal.calibration.readings import TRIADS, Readings
-from mwdcal.calibration.record import Calibration
+from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.geometry.observables import OBSERVABLES, OUTPUTS, UNCERTAINTIES
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, diagonal
 
@@ -29,6 +31,56 @@ LARGEST_DIRECTION_SD = 1 / 3
 Noise alone puts a vertical tool farther off in one reading of ninety."""
 DOUBTFUL = 4.0
 """Degrees from vertical within which a direction may have no value, for any calibration that is of use."""
+CORRECTED = "interference-corrected"
+"""The finding of a calibration from which multi-station analysis has taken interference."""
+DRIFTED = "sensor-drift-allowed"
+"""The finding of one whose covariance allows for what the sensors have moved since the laboratory."""
+INTERFERENCE = "interference of the drill string"
+DRIFT = "drift of the sensors since the calibration"
+NEVER = ("sag", "misalignment in the hole")
+"""Errors that no calibration and no survey of its own knows…"""
+DEPTH = "measured depth"
+"""…and one that only surveys with depths have."""
+
+
+@dataclass(frozen=True)
+class ErrorTerms:
+    """Sources of error in a standard uncertainty, and those that are not in it."""
+
+    included: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+    @property
+    def sentence(self) -> str:
+        """Both, as they stand beside every 1σ."""
+        return f"1σ: {', '.join(self.included)}. Not in it: {', '.join(self.left_out)}."
+
+    @property
+    def stated(self) -> dict[str, list[str]]:
+        """Both, as the metadata of a table and JSON state them."""
+        return {"error_terms": list(self.included), "not_included": list(self.left_out)}
+
+
+def error_terms(findings: Iterable[Finding], declination: bool, depth: bool = True) -> ErrorTerms:
+    """Those of readings by a calibration with these findings.
+
+    `declination`: azimuths count from another north. `depth`: the readings are surveys of a well.
+    """
+    there = {finding.id for finding in findings}
+    optional = [
+        ("declination", declination),
+        (INTERFERENCE, CORRECTED in there),
+        (DRIFT, DRIFTED in there),
+    ]
+    included = [name for name, known in optional if known]
+    left_out = [name for name, known in optional[1:] if not known]
+    lacking = (*left_out, *NEVER, *([DEPTH] if depth else []))
+    return ErrorTerms(("calibration", "noise", *included), lacking)
+
+
+def reading_terms(calibration: Calibration) -> ErrorTerms:
+    """Those of corrected readings: angles count from magnetic north, and there is no depth."""
+    return error_terms(calibration.findings, declination=False, depth=False)
 
 
 def standard_uncertainties(

@@ -50,6 +50,7 @@ def command(
     from mwdcal.files.runs import BlankReadingError
     from mwdcal.presentation.envelope import enveloped, with_signature
     from mwdcal.presentation.signature import in_short, load_calibration
+    from mwdcal.use.uncertainty import reading_terms
 
     options.check_outputs([output], [calibration, readings, *key])
     loaded = load_calibration(calibration, key)
@@ -63,10 +64,16 @@ def command(
         advice = "Or leave the results of such rows blank: --missing blank."
         raise InputError(f"{error} {advice}") from None
     findings = loaded.findings + findings
-    blank = tally.blank(outside)
+    blank, terms = tally.blank(outside), reading_terms(fitted)
     document = enveloped(
         "apply",
-        Applied(rows=tally.rows, blank=blank, output=str(output), findings=findings),
+        Applied(
+            rows=tally.rows,
+            blank=blank,
+            output=str(output),
+            findings=findings,
+            **(terms.stated if uncertainty else {}),
+        ),
         *(fitted.tool, tally.metadata),
         calibration=loaded.digest,
         readings=readings_digest,
@@ -75,4 +82,5 @@ def command(
     signed = one_line(in_short(loaded.signature))
     said = [corrected, f"wrote {one_line(output)}", signed, *simulated(fitted.tool)]
     document = with_signature(document, loaded.signature)
-    print_result(document if as_json else "   ".join(said), findings)
+    lines = ["   ".join(said), *([terms.sentence] if uncertainty else [])]
+    print_result(document if as_json else "\n".join(lines), findings)
