@@ -34,7 +34,7 @@ from mwdcal.use.roll_test import (
     roll_sets,
 )
 
-CONTRADICTED: dict[str, float] = {
+NO_ERROR_OF_A_TOOL: dict[str, float] = {
     **dict.fromkeys(("inclination", "azimuth", "toolface"), float(np.radians(5.0))),
     "gravity": 0.01,
     "field": 0.03,
@@ -209,7 +209,7 @@ class RollTest:
         named = self.readings.known.get(name)
         if named is None or self._lacks(name) or (name == "field" and self.calibration.relative):
             return 0.0
-        error, most = self._error(name), CONTRADICTED[name]
+        error, most = self._error(name), NO_ERROR_OF_A_TOOL[name]
         error = error[~np.isnan(error) & ~(self.near & (name in UNDEFINED_AT_VERTICAL))]
         if not error.size or bool(self.calibration.rests_on_free(name, self.readings).any()):
             return 0.0

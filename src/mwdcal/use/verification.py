@@ -18,7 +18,7 @@ from mwdcal.calibration.settings import ASSUMED, is_assumed
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array
-from mwdcal.use.departures import CONTRADICTED, LEVEL, Departures, RollTest, Statistic
+from mwdcal.use.departures import LEVEL, NO_ERROR_OF_A_TOOL, Departures, RollTest, Statistic
 from mwdcal.use.risk import COVERAGE, guard_factor, probability_within, risk_of_all
 from mwdcal.use.roll_test import DEPARTURE_CHANCE, HARMONICS, Largest, largest
 
@@ -373,7 +373,7 @@ def _contradicted(test: RollTest, limits: Limits) -> Iterator[Finding]:
     """References of the run far from what the tool reads, of quantities whose error is not judged."""
     judged = {name for name, _ in limits.error.items()}
     parts = []
-    for name in CONTRADICTED.keys() - judged:
+    for name in NO_ERROR_OF_A_TOOL.keys() - judged:
         if departure := test.contradicted(name):
             unit = OBSERVABLES[name].unit.replace("rad", "°")
             size = departure * _scale(unit)
