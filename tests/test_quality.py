@@ -496,6 +496,18 @@ def test_a_scatter_that_contradicts_one_setting_is_named_and_counted(record):
     assert single < both
 
 
+def test_the_raw_figure_stands_beside_each_value(record):
+    """Of each roll set: largest less smallest departure, or the largest; the row has the largest of all."""
+    result = verify(record, several(3, 1, 0.0, record), BOTH)
+    for row in result.rows:
+        departures = np.array([station.departures[row.name] for station in result.station_rows])
+        for each in row.sets:
+            part = departures[each.stations]
+            raw = np.ptp(part) if row.name.startswith("spread") else np.abs(part).max()
+            assert each.raw == pytest.approx(raw)
+        assert row.raw == max(each.raw for each in row.sets)
+
+
 @pytest.mark.parametrize(
     ("name", "factor", "shift", "shown"),
     [("dip", -1, 0, "dip by [+]130°"), ("field", 1e-3, 0, "field by [+]5e[+]04 nT"),

@@ -103,7 +103,8 @@ class JudgedSet(msgspec.Struct, frozen=True, kw_only=True):
     was judged: mean, cos t, cos 2t, sin t, sin 2t of toolface t, in the unit of the limit; None:
     the set was not rolled, or the figure judged is the raw one of each station. With one of `harmonics`, as
     of four toolfaces at right angles, the coefficients of 2t are zero. `passed`: by this set alone.
-    `degrees_of_freedom` of the uncertainty; None: unlimited, as the noise is declared.
+    `degrees_of_freedom` of the uncertainty; None: unlimited, as the noise is declared. `raw`: the largest figure
+    with the noise in it; None in documents of earlier versions.
     """
 
     label: str
@@ -114,6 +115,7 @@ class JudgedSet(msgspec.Struct, frozen=True, kw_only=True):
     passed: bool
     harmonics: int = len(HARMONICS)
     degrees_of_freedom: float | None = None
+    raw: float | None = None
 
 
 class VerifiedStation(msgspec.Struct, frozen=True, kw_only=True):
@@ -508,6 +510,7 @@ def _sets(outcome: Departures, factor: float, guarded: bool, limit: float) -> li
                 passed=not outcome.blocked and value + guard(guarded, freedom) * sd <= limit,
                 harmonics=len(HARMONICS) if curve is None else curve.harmonics,
                 degrees_of_freedom=freedom,
+                raw=max(each.raw for each in members) * factor,
             )
         )
     return sets
