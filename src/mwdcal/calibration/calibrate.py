@@ -18,7 +18,7 @@ from mwdcal.calibration.diagnosis.identity import dated, unidentified
 from mwdcal.calibration.diagnosis.refusals import UNSOUND_ADVICE, check, fit_refusals
 from mwdcal.calibration.diagnosis.repeats import copies
 from mwdcal.calibration.diagnosis.soundness import inconsistency
-from mwdcal.calibration.drift import Constant, Drift
+from mwdcal.calibration.drift import Constant, Drift, UnseenDrift
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import accuracy
@@ -146,6 +146,7 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
         settings=_practice(fitted),
         budget=_budget(fitted),
         assumed_exact=results.assumed_exact(result, readings.relative),
+        unseen=_unseen(fitted),
         errors=error_rows(fitted.residuals(0)),
         measures=measure_rows(fitted.residuals(0)),
         orders=list(choice.orders),
@@ -193,17 +194,22 @@ def _choices(options: Options) -> Choices:
 
 def _budget(fitted: FittedRuns) -> list[BudgetRow]:
     """What each source of error adds to the accuracy to expect."""
-    reference, prior = fitted.profile.reference_temperature_c, fitted.options.knowledge
-    tools = results.calibrated_tools(fitted.result, fitted.free, reference, prior)
     repeatability = [getattr(fitted.profile, name).repeatability for name in TRIADS]
     nominal = [getattr(fitted.profile, name).scale or 1.0 for name in TRIADS]
     shares = fitted.covariance.by_source(np.divide(repeatability, nominal).tolist())
+    return [BudgetRow(source=name, **sd) for name, sd in _accuracies(fitted, shares).items()]
+
+
+def _accuracies(fitted: FittedRuns, shares: dict[str, Array]) -> dict[str, dict[str, float | None]]:
+    """What each share (1, p, p) of the covariance adds to the accuracy to expect, degrees by angle."""
+    reference, prior = fitted.profile.reference_temperature_c, fitted.options.knowledge
+    tools = results.calibrated_tools(fitted.result, fitted.free, reference, prior)
     sd = accuracy(tools, np.stack([*shares.values()]))
     degrees = {f"{angle}_deg": np.degrees(values[:, 0]) for angle, values in sd.items()}
-    return [
-        BudgetRow(source=source, **{name: stated(sd[place]) for name, sd in degrees.items()})
+    return {
+        source: {name: stated(sd[place]) for name, sd in degrees.items()}
         for place, source in enumerate(shares)
-    ]
+    }
 
 
 def _constants(result: Fit) -> list[Constant]:
@@ -231,19 +237,39 @@ def _constants(result: Fit) -> list[Constant]:
 
 def _drifts(result: Fit, field_unit: str) -> list[Drift]:
     """How far field and offsets drifted within the run."""
-    units = [(1e3, "mg"), (1.0, field_unit), (1.0, field_unit)]
-    changes = results.drifts(result)
-    return [
-        Drift(
-            name=name.removesuffix("-drift"),
-            change=float(change[0]) * factor,
-            standard_uncertainty=float(sd[0]) * factor,
-            unit=unit,
+    declared, drifts = result.problem.evidence.drift, []
+    for name, (change, sd) in results.drifts(result).items():
+        factor, unit = _shown_drift(name, field_unit)
+        size = float(declared[name][0]) if name in declared else 0.0
+        drifts.append(
+            Drift(
+                name=name.removesuffix("-drift"),
+                change=float(change[0]) * factor,
+                standard_uncertainty=float(sd[0]) * factor,
+                unit=unit,
+                declared=size * factor if size else msgspec.UNSET,
+            )
         )
-        for (name, (change, sd)), (factor, unit) in zip(
-            changes.items(), [units[[*WALKS].index(n)] for n in changes], strict=True
-        )
-    ]
+    return drifts
+
+
+def _shown_drift(name: str, field_unit: str) -> tuple[float, str]:
+    """Factor and unit in which a drift is stated."""
+    return (1e3, "mg") if name == "accelerometer-drift" else (1.0, field_unit)
+
+
+def _unseen(fitted: FittedRuns) -> list[UnseenDrift] | msgspec.UnsetType:
+    """What drifts would do that no residual would show."""
+    readings = fitted.alone(0)[0]
+    field = 2e-4 if readings.relative else 10.0
+    sizes = dict(zip(WALKS, (1e-4, field, field), strict=True))
+    shares = {n: sizes[n] ** 2 * each for n, each in results.unseen_shares(fitted.result).items()}
+    unseen = []
+    for name, sd in (_accuracies(fitted, shares) if shares else {}).items():
+        factor, unit = _shown_drift(name, readings.field_unit)
+        word = name.removesuffix("-drift")
+        unseen.append(UnseenDrift(name=word, change=sizes[name] * factor, unit=unit, **sd))
+    return unseen or msgspec.UNSET
 
 
 def _triad(fitted: FittedRuns, index: int) -> TriadCalibration:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from types import ModuleType
 
 import numpy as np
 
@@ -233,8 +234,8 @@ def refitted(result: Fit, problem: Problem, state: State, scale: Array, options:
     """A fit of a problem that has more unknowns than that of `result`, the noise times `scale` (B, triads)."""
     problem = _rescaled(problem, scale)
     finite = result.status != int(Status.NOT_FINITE)
-    if closed_form_drift.applies(problem):
-        there, analysis, good = closed_form_drift.solution(problem, state)
+    if form := _form(problem):
+        there, analysis, good = form.solution(problem, state)
         if (good & analysis.determined.keep.all(-1)).all():
             once = result.iterations + 1
             trust, status = result.trust, np.where(finite, result.status, int(Status.NOT_FINITE))
@@ -266,19 +267,29 @@ def _finished(stage: _Stage, options: Options, finite: Bools, iterations: Ints) 
 
 def _comes_apart(problem: Problem, options: Options) -> bool:
     """Whether the fit has a closed form: not where references are not exact, for example."""
-    general = options.robust or options.separate_solver or problem.evidence.scatter
-    return not general and closed_form.applies(problem)
+    return not (options.robust or options.separate_solver) and _form(problem) is not None
+
+
+def _form(problem: Problem) -> ModuleType | None:
+    """The closed form of a problem, without drift or with it, if there is one."""
+    forms = () if problem.evidence.scatter else (closed_form, closed_form_drift)
+    return next((form for form in forms if form.applies(problem)), None)
 
 
 def _closed(problem: Problem, finite: Bools) -> tuple[Fit, Bools]:
     """The fit in closed form, and for which members (B,) it holds: all directions are determined."""
-    at = closed_form.start(problem)
-    state, analysis, good = closed_form.solution(problem, at)
+    at, form = closed_form.start(problem), _form(problem) or closed_form
+    state, analysis, good = form.solution(problem, at)
     good = good & analysis.determined.keep.all(-1)
-    if good.any() and not _all_declared(problem):
-        problem = _rescaled(problem, np.sqrt(analysis.variance_factor))
-        state, analysis, settled = closed_form.solution(problem, at)
+    free, moving = np.array([not triad.declared for triad in problem.triads]), good[:, None]
+    for _ in range(NOISE_ROUNDS if problem.walks else 1):  # without drift the first is exact
+        if not (moving & free).any():
+            break
+        scale = np.where(moving & free, np.sqrt(analysis.variance_factor), 1.0)
+        problem = _rescaled(problem, scale)
+        state, analysis, settled = form.solution(problem, at)
         good &= settled
+        moving = moving & np.any(np.abs(scale - 1) >= SETTLED, -1, keepdims=True)
     sound = finite & np.isfinite(state.params).all(-1)
     status = np.where(sound, int(Status.OK), int(Status.NOT_FINITE))
     trust = np.ones(problem.evidence.include.shape)

@@ -206,6 +206,13 @@ def unseen_drifts(result: Fit) -> list[str]:
     return [name for name in scores.places if scores.shown(name)[0] < drift.LEAST_TREND]
 
 
+def unseen_shares(result: Fit) -> dict[str, Array]:
+    """Covariance (B, p, p) that each of the `unseen_drifts` would add, per 1σ of 1 g or nT from end to end."""
+    problem, state, analysis = result.problem, result.state, result.analysis
+    effects = {n: drift.trend_effect(problem, state, analysis, n) for n in unseen_drifts(result)}
+    return {name: effect @ effect.mT for name, effect in effects.items()}
+
+
 def unconfirmed_dip(result: Fit) -> Array:
     """Dip (B,), radians, whose sign rests on the signs of the magnetometer in the profile alone, else NaN.
 

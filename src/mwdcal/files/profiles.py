@@ -58,7 +58,9 @@ _LIMITS: dict[type[msgspec.Struct], dict[str, tuple[float, float, str]]] = {
         "scale": (*_ALL, f'Put the sign into `axes`, for example "-x"; {_UNKNOWN}'),
         "noise": (*_ALL, f"1 sigma in raw units; {_UNKNOWN}"),
         "nonlinearity": (1e-9, 1.0, _SHARE),
-        "repeatability": (0.0, 1e15, f"1 sigma in raw units; {_UNKNOWN}"),
+        **dict.fromkeys(
+            ("repeatability", "drift"), (0.0, 1e15, f"1 sigma in raw units; {_UNKNOWN}")
+        ),
     },
     Datasheet: dict.fromkeys(
         Datasheet.__struct_fields__, (*_ALL, f"1 sigma, more than zero; {_UNKNOWN}")
@@ -66,7 +68,7 @@ _LIMITS: dict[type[msgspec.Struct], dict[str, tuple[float, float, str]]] = {
     StandProfile: {
         **{name: _ANGLE for name in StandProfile.__struct_fields__ if name.endswith("_deg")},
         "gravity_g": (0.0, 2.0, "1 sigma, in g."),
-        "field_nt": (0.0, 200_000.0, "1 sigma, in nT."),
+        **dict.fromkeys(("field_nt", "field_drift_nt"), (0.0, 200_000.0, "1 sigma, in nT.")),
     },
     TableFormat: dict.fromkeys(("header_line", "first_line"), (1, 1e6, "Lines count from 1.")),
 }

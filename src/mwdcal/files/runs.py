@@ -23,6 +23,7 @@ from mwdcal.calibration.readings import (
     serial_of,
 )
 from mwdcal.errors import FitError, InputError
+from mwdcal.estimation.evidence import WALKS
 from mwdcal.files import synonyms
 from mwdcal.files.contract import (
     CHANNELS,
@@ -342,6 +343,7 @@ def convert(
         if noise is not None:
             sd[kind] = noise
     common = {n: np.full(shape, np.radians(v)) for n, v in profile.stand.common().items()}
+    common |= _drifts(profile, scales, shape)
     readings = Readings(
         accelerometer=triads["accelerometer"],
         magnetometer=triads.get("magnetometer"),
@@ -351,6 +353,17 @@ def convert(
         settings=profile.stand.practice,
     )
     return readings, scales
+
+
+def _drifts(
+    profile: Profile, scales: Mapping[str, float | Array], shape: tuple[int, ...]
+) -> dict[str, Array]:
+    """Declared drifts (..., n) within a run, g and nT, by name of `WALKS`."""
+    sizes = [np.abs(getattr(profile, k).drift / np.asarray(s)) for k, s in scales.items()]
+    sizes = [np.reshape(size, (*np.shape(size)[:-2], 1)) for size in sizes]
+    field = [np.array(profile.stand.field_drift_nt)] if len(scales) > 1 else []
+    each = zip(WALKS, [*sizes, *field], strict=False)
+    return {name: np.broadcast_to(size, shape) for name, size in each if size.any()}
 
 
 def _given(cells: Cells, name: str) -> Array | None:

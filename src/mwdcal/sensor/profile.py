@@ -52,7 +52,8 @@ class TriadProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     `scale` is raw units per g (accelerometer) or per nT (magnetometer); None means
     unknown: it is then taken from the readings and cannot serve as a check.
     `noise` is the standard uncertainty of one station's raw reading (None: it is
-    estimated from the residuals); `repeatability` is added to it in quadrature.
+    estimated from the residuals); `repeatability` is added to it in quadrature. `drift` is how far an
+    axis's offset moves from the first station of a run to the last.
     `nonlinearity` is the linearity error of the datasheet as a share of the field (1 σ, for
     example 0.005): each axis then has its own quadratic and cubic term with that prior.
     `datasheet` are the maker's tolerances.
@@ -62,6 +63,7 @@ class TriadProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     scale: float | None = None
     noise: float | None = None
     repeatability: float = 0.0
+    drift: float = 0.0
     nonlinearity: float | None = None
     datasheet: Datasheet | None = None
 
@@ -81,6 +83,7 @@ class StandProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     added to either in quadrature. Toolface is set at every station. The others are errors
     that all stations have in common: zeros of the three scales, the lean of the stand's vertical,
     and the references for gravity, field and dip where the run does not state their uncertainty.
+    `field_drift_nt` is how far north, east and down of the field move from the first station to the last.
     `coil`: the field is made by a coil or simulated, and may be of any strength.
     `settings`: "per-direction" where the operator sets inclination and azimuth once and rolls the
     tool, "per-station" where the stand is set anew at every station.
@@ -98,6 +101,7 @@ class StandProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     tilt_deg: float = 0.0
     gravity_g: float = 0.0
     field_nt: float = 0.0
+    field_drift_nt: float = 0.0
     dip_deg: float = 0.0
     coil: bool = False
     settings: Literal["per-direction", "per-station"] | msgspec.UnsetType = msgspec.UNSET

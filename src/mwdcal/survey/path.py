@@ -30,7 +30,7 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import FREE_SHARE, Calibration
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import VERTICAL, is_vertical
-from mwdcal.geometry.vectors import Array, ArrayLike, eigen, outer, wrap
+from mwdcal.geometry.vectors import Array, ArrayLike, outer, square_root, wrap
 from mwdcal.survey.stations import STATIONS_AT_ONCE
 from mwdcal.use.uncertainty import rows_of
 
@@ -233,7 +233,7 @@ def direction_errors(
     azimuth, gradient = direction_gradient(g, b)
     change = gradient @ calibration.jacobian(readings)
     free = np.abs(change @ calibration.free_directions.transpose()) > FREE_SHARE
-    shifts = change @ _factor(calibration.parameter_covariance)
+    shifts = change @ square_root(calibration.parameter_covariance)
     shifts = np.where(np.any(free, (-1, -2), keepdims=True), np.nan, shifts.swapaxes(-1, -2))
     inclination = np.arctan2(np.hypot(g[..., 0], g[..., 1]), g[..., 2])
     turn = np.stack([np.zeros_like(inclination), np.sin(inclination)], -1)
@@ -244,15 +244,6 @@ def direction_errors(
         random=gradient @ calibration.noise_covariance(readings) @ gradient.mT
         + declination_noise**2 * outer(turn),
     )
-
-
-def _factor(covariance: Array) -> Array:
-    """A matrix (p, k) whose product with its transpose is a covariance (p, p): a column for each cause."""
-    scale = np.sqrt(np.diagonal(covariance))
-    whole = np.where(scale > 0, scale, 1.0)
-    values, vectors = eigen(covariance / whole[:, None] / whole)
-    kept = values > 0
-    return np.asarray(whole[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
 
 
 def position_covariance(

@@ -33,7 +33,7 @@ from mwdcal.calibration.record import Finding
 from mwdcal.calibration.residuals import REASONS, shown_in, tail
 from mwdcal.calibration.results import common_source, drift_shares, drifts, unconfirmed_dip
 from mwdcal.calibration.settings import DIRECTION
-from mwdcal.estimation.problem import Prior
+from mwdcal.estimation.problem import WALK_AXES, Prior
 from mwdcal.estimation.rank import free_directions
 from mwdcal.estimation.solvers import Determined
 from mwdcal.geometry.vectors import Bools
@@ -422,7 +422,8 @@ def _prior(fitted: FittedRuns) -> Iterator[Flag]:
     prior, constants = fitted.options.knowledge, fitted.result.problem.evidence.constants
     if prior is None:
         return
-    declared = {common_source(c.name) for c in constants if not c.unknown}
+    lasting = [c for c in constants if not (c.unknown or c.name in WALK_AXES)]
+    declared = {common_source(constant.name) for constant in lasting}
     both = ", ".join(name for name in prior.common if name in declared)
     every = np.ones(fitted.count, bool)
     yield _remark(
