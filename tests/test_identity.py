@@ -18,6 +18,7 @@ from cli_support import EXAMPLE
 from cli_support import mwdcal as command
 from mwdcal.calibration.diagnosis.identity import dated
 from mwdcal.calibration.readings import check_day, future_day, stated_day
+from mwdcal.errors import InputError
 from mwdcal.files import metadata
 from mwdcal.files.formats import table as tables
 
@@ -292,6 +293,35 @@ def test_serials_of_the_header_of_a_log_keep_their_spelling(tmp_path, serial):
     lines += [f"SERIAL. {serial} : serial", "~Curve", "DEPT.M :", "AX.G :", "~A", "1.0 0.5", ""]
     (tmp_path / "log.las").write_text("\n".join(lines))
     assert tables.read(tmp_path / "log.las").metadata["serial"] == serial
+
+
+@pytest.mark.parametrize("way", ["columns", "pandas", "pyarrow"])
+@pytest.mark.parametrize(
+    ("cells", "serial"), [([7.0, 7.0], "7"), ([7, 7], "7"), ([12.1, 12.1], None)]
+)
+def test_a_serial_that_lost_its_spelling_is_refused(way, cells, serial):
+    """12.10 and 12.1 are two tools; a table of numbers has one of them."""
+    columns = {n: np.ones(2) for n in ("ax", "ay", "az")} | {"serial": np.array(cells)}
+    if way == "pandas":
+        columns = pytest.importorskip("pandas").DataFrame(columns)
+    elif way == "pyarrow":
+        columns = pytest.importorskip("pyarrow").table(columns)
+    if serial:
+        assert mwdcal.read_run(columns).metadata["serial"] == serial
+    else:
+        with pytest.raises(InputError, match=r"'serial': must be text; got the number 12\.1"):
+            mwdcal.read_run(columns)
+
+
+@pytest.mark.parametrize(
+    ("name", "cells", "dtype", "expected"),
+    [("serial", ["1e5", None], "string", "1e5"), ("simulated", [True, None], "boolean", True)],
+)
+def test_a_missing_cell_of_pandas_is_blank(name, cells, dtype, expected):
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame({n: np.ones(2) for n in ("ax", "ay", "az")})
+    frame[name] = pandas.array(cells, dtype=dtype)
+    assert mwdcal.read_run(frame).metadata[name] == expected
 
 
 FRAMES = {"pandas": "DataFrame", "polars": "DataFrame"}

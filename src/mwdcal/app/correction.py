@@ -35,11 +35,17 @@ WHOLE = (".xlsx", *EXCHANGED)
 
 
 class Applied(msgspec.Struct, frozen=True, kw_only=True):
-    """What came of a table: its rows, those without results, and the table that was written."""
+    """What came of a table: its rows, those without results, and the table that was written.
+
+    `error_terms` are in the standard uncertainties of the table, `not_included` are not; both are empty where it
+    has none.
+    """
 
     rows: int
     blank: int
     output: str
+    error_terms: list[str] = []
+    not_included: list[str] = []
     findings: list[Finding]
 
 
@@ -129,7 +135,7 @@ def apply_to_table(
     )
     streaming.check_free(source.columns, list(results), source.source)
     columns = {name: spread(values, whole) for name, values in results.items()}
-    metadata = {**source.metadata, **streaming.described(calibration)}
+    metadata = {**source.metadata, **streaming.described(calibration, [*results])}
     if remarks := streaming.stated(metadata, findings):
         metadata["findings"] = remarks
     corrected = replace(source, columns={**source.columns, **columns}, metadata=metadata)

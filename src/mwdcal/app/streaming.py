@@ -50,7 +50,7 @@ from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, UNCERTAINTIES
 from mwdcal.geometry.vectors import Array, Bools
 from mwdcal.use import correction, correction_numba, strengths
 from mwdcal.use.correction import JUDGED, RowCounts
-from mwdcal.use.uncertainty import with_uncertainty
+from mwdcal.use.uncertainty import reading_terms, with_uncertainty
 
 TABLE_SIZES = {".csv": 1_000_000, ".tsv": 1_000_000, ".parquet": 8_000_000}
 """Bytes of a text table from which it is taken in parts, by what it becomes.
@@ -250,7 +250,7 @@ class _Worker:
     def sink(self, stream: IO[bytes], output: Path) -> Sink:
         """An empty table in the format of the output's name."""
         arrow, _ = parquet.modules(output.name)
-        metadata = {**self.source.metadata, **described(self.calibration)}
+        metadata = {**self.source.metadata, **described(self.calibration, self.names)}
         metadata.pop("findings", None)  # with those of the results, when these are known
         kinds = dict.fromkeys(self.names, arrow.float64()) | {EXTRAPOLATED: arrow.bool_()}
         results = arrow.schema([(name, kinds[name]) for name in self.names])
@@ -401,13 +401,15 @@ class _Worker:
                 raise blank_cell(table, names)
 
 
-def described(calibration: Calibration) -> dict[str, object]:
-    """What a corrected table says of the calibration it rests on."""
+def described(calibration: Calibration, names: Iterable[str]) -> dict[str, object]:
+    """What a corrected table with results of these names says of the calibration, and of their uncertainties."""
+    uncertain = not set(UNCERTAINTIES).isdisjoint(names)
     return {
         "calibration_run": calibration.run,
         "calibration_time": calibration.time,
         "azimuth_out": "magnetic",
         "field_unit": calibration.field_unit,
+        **(reading_terms(calibration).stated if uncertain else {}),
         **({"simulated": True} if is_simulated(calibration.tool) else {}),
     }
 

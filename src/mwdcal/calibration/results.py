@@ -431,6 +431,23 @@ def drifts(result: Fit) -> dict[str, tuple[Array, Array]]:
     return changes
 
 
+def drift_shares(result: Fit, values: Array) -> dict[str, Array]:
+    """Share (B,) of each drift within the run that goes with some values (B, n) of its stations.
+
+    Definition: r² of the drift, all axes together, with what of the values the terms of a drift can follow.
+    """
+    shares = {}
+    for name in drift.places(result.problem.evidence):
+        path, terms = drift.walk(result.problem, result.state, name)
+        basis = np.linalg.qr(terms - terms.mean(0))[0]
+        column = basis @ (basis.mT @ (values - values.mean(-1, keepdims=True))[..., None])
+        unit = column / np.maximum(np.linalg.norm(column, axis=-2, keepdims=True), 1e-300)
+        path = path - path.mean(-2, keepdims=True)
+        size = np.maximum(np.sum(path**2, (-2, -1)), 1e-300)
+        shares[name] = np.sum((unit.mT @ path) ** 2, (-2, -1)) / size
+    return shares
+
+
 def stand_errors(result: Fit) -> dict[str, Array]:
     """Estimated errors (B,) of the stand by field of `StandErrors`, degrees: those that are unknowns."""
     constants = result.problem.evidence.constants

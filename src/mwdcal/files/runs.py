@@ -229,6 +229,7 @@ def check_run(table: Table) -> None:
     names = list(table.columns)
     check_columns(names, table.source)
     synonyms.check_evidence(names, table.source)
+    _check_serials(table)
     tools = serials(table.metadata, labels(table, "serial"))
     if len(tools) > 1:
         raise InputError(
@@ -240,6 +241,16 @@ def check_run(table: Table) -> None:
             f"{table.source} is a continuous log ({table.count} rows): its rows are not stations. Find "
             f"the standstills first: mwdcal stations {table.source} -o run.csv. If each row is a "
             "station, remove time_s and sampling_hz."
+        )
+
+
+def _check_serials(table: Table) -> None:
+    """Refuse a column of serials that are numbers with decimals: 12.10 and 12.1 are two tools, and one number."""
+    column = table.columns.get("serial", [])
+    if not isinstance(column, list) and (broken := column[column % 1 > 0]).size:
+        raise InputError(
+            f"{table.source}, column 'serial': must be text; got the number {broken[0]:g}, whose spelling is lost. "
+            "Store serials as text, as in '12.10'."
         )
 
 

@@ -144,6 +144,7 @@ _WARMTH = {
         "thermistor",
         "thermocouple",
         "rtd",
+        "bht",
     ),
     *("ntc", "degc", "degf", "celsius", "fahrenheit"),
 }

@@ -19,17 +19,12 @@ from mwdcal.presentation.envelope import enveloped, with_signature
 from mwdcal.presentation.numbers import fixed, measured, number, signed, written
 from mwdcal.presentation.signature import in_short
 from mwdcal.presentation.text import chance, one_line, plural, table
-from mwdcal.survey.interference import (
-    ErrorTerms,
-    Interference,
-    InterferenceSize,
-    MultiStationAnalysis,
-    error_terms,
-)
+from mwdcal.survey.interference import Interference, InterferenceSize, MultiStationAnalysis
 from mwdcal.survey.norths import North
 from mwdcal.survey.surveying import SurveyedWell, WellInputs
 from mwdcal.survey.well import LastStation, Well, WellCounts
 from mwdcal.survey.well_errors import WellErrors
+from mwdcal.use.uncertainty import ErrorTerms, error_terms
 
 MOST_CORRECTED = 30
 """Surveys of a table on interference_screen."""
@@ -270,8 +265,7 @@ def _stated(north: North, terms: ErrorTerms) -> dict[str, Any]:
             key: None if angle is None else float(np.degrees(angle))
             for key, angle in angles.items()
         },
-        "error_terms": list(terms.included),
-        "not_included": list(terms.left_out),
+        **terms.stated,
     }
 
 

@@ -66,6 +66,7 @@ def _sets(result: Verdict) -> list[str]:
         for each in row.sets
         for cells in [
             [
+                quantity(each.raw, row.unit),
                 quantity(each.value, row.unit),
                 uncertainty(each.uncertainty, row.unit),
                 freedom(each),
@@ -73,7 +74,9 @@ def _sets(result: Verdict) -> list[str]:
         ]
     ]
     return (
-        [table(rows, ["each roll set by itself", "", "noise-free", "1σ", FREEDOM])] if rows else []
+        [table(rows, ["each roll set by itself", "", "raw", "noise-free", "1σ", FREEDOM])]
+        if rows
+        else []
     )
 
 

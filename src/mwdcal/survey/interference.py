@@ -1,11 +1,7 @@
-"""What a stated uncertainty of surveys holds, and what it leaves out: one sentence, one place.
-
-Multi-station analysis of surveys: interference, what it does to azimuth, and when it is refused.
-"""
+"""Multi-station analysis of surveys: interference, what it does to azimuth, and when it is refused."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import msgspec
@@ -32,58 +28,7 @@ from mwdcal.survey.interference_estimate import (
 )
 from mwdcal.survey.separability import missing
 from mwdcal.use.strengths import STANDARD_GRAVITY
-
-CORRECTED = "interference-corrected"
-"""The finding of a calibration from which multi-station analysis has taken interference."""
-DRIFTED = "sensor-drift-allowed"
-"""The finding of one whose covariance allows for what the sensors have moved since the laboratory."""
-INTERFERENCE = "interference of the drill string"
-AXIAL_INTERFERENCE, CROSS_INTERFERENCE = f"axial {INTERFERENCE}", f"cross-axial {INTERFERENCE}"
-"""Interference of the drill string as error models part it: they state the first alone."""
-DRIFT = "drift of the sensors since the calibration"
-NEVER = ("sag", "misalignment in the hole", "measured depth")
-"""Errors that no calibration and no survey of its own knows."""
-OF_MODELS = dict(zip(("SAG", "XYM", "D"), NEVER, strict=True))
-"""First letters of the terms of error models that state them."""
-
-
-@dataclass(frozen=True)
-class ErrorTerms:
-    """Sources of error in a standard uncertainty, and those that are not in it."""
-
-    included: tuple[str, ...]
-    left_out: tuple[str, ...]
-
-    @property
-    def sentence(self) -> str:
-        """Both, as they stand beside every 1σ."""
-        lacking = f" Not in it: {', '.join(self.left_out)}." if self.left_out else ""
-        return f"1σ: {', '.join(self.included)}.{lacking}"
-
-
-def error_terms(
-    findings: Iterable[Finding], declination: bool, modelled: Iterable[str] = ()
-) -> ErrorTerms:
-    """Those of surveys by a calibration with these findings; `declination`: azimuths count from another north.
-
-    `modelled`: what an error model adds: `AXIAL_INTERFERENCE`, `DRIFT` and of `NEVER`.
-    """
-    there, model = {finding.id for finding in findings}, set(modelled)
-    parts = (
-        {AXIAL_INTERFERENCE: True, CROSS_INTERFERENCE: False}
-        if AXIAL_INTERFERENCE in model
-        else {INTERFERENCE: CORRECTED in there}
-    )
-    optional = {
-        **parts,
-        DRIFT: DRIFTED in there or DRIFT in model,
-        **{name: name in model for name in NEVER},
-    }
-    included = [name for name, known in optional.items() if known]
-    north = ["declination"] if declination else []
-    left_out = [name for name, known in optional.items() if not known]
-    return ErrorTerms(("calibration", "noise", *north, *included), tuple(left_out))
-
+from mwdcal.use.uncertainty import CORRECTED, DRIFTED, ErrorTerms, error_terms
 
 FEWEST_SURVEYS = 2
 """Surveys below which nothing can be said of several stations."""

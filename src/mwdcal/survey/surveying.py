@@ -246,8 +246,7 @@ def described(well: Well) -> Mapping[str, object]:
         "survey_limits": well.limits.name,
         "north": north.name,
         "error_model": "none" if well.errors is None else well.errors.model.name,
-        "error_terms": list(well.terms.included),
-        "not_included": list(well.terms.left_out),
+        **well.terms.stated,
     }
     for key, angle in (
         ("declination_deg", north.declination),

@@ -24,7 +24,6 @@ from mwdcal.survey.acceptance import (
     judged,
 )
 from mwdcal.survey.error_model import ErrorModel
-from mwdcal.survey.interference import CORRECTED, DRIFTED, ErrorTerms, error_terms
 from mwdcal.survey.norths import North
 from mwdcal.survey.path import PathEnd, TieIn, continued_path
 from mwdcal.survey.stations import TOOLFACE_SWITCH, Surveys, surveyed
@@ -32,6 +31,7 @@ from mwdcal.survey.well_errors import WellErrors, hole_of, well_errors
 from mwdcal.use.correction import RowCounts, tallied
 from mwdcal.use.correction import findings as about_rows
 from mwdcal.use.strengths import check as check_strengths
+from mwdcal.use.uncertainty import CORRECTED, DRIFTED, ErrorTerms, error_terms
 
 BLIND_FROM = 2.0
 """Stated standard uncertainties of azimuth by which interference that would pass turns it where acceptance is blind."""
@@ -201,7 +201,9 @@ class Well:
     def terms(self) -> ErrorTerms:
         """What the standard uncertainties hold, and what they leave out."""
         modelled = () if self.errors is None else self.errors.included
-        return error_terms(self.calibration.findings, self.north.declination is not None, modelled)
+        return error_terms(
+            self.calibration.findings, self.north.declination is not None, modelled=modelled
+        )
 
     @property
     def blank(self) -> Bools:

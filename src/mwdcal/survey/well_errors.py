@@ -21,10 +21,10 @@ from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, ArrayLike
 from mwdcal.survey.acceptance import SensorTerms
 from mwdcal.survey.error_model import USUAL_COURSE, ErrorModel, Hole
-from mwdcal.survey.interference import AXIAL_INTERFERENCE, CORRECTED, DRIFT, DRIFTED, OF_MODELS
 from mwdcal.survey.path import DirectionErrors, PathEnd, TieIn, direction_gradient, well_path
 from mwdcal.survey.stations import SURVEYED, blocks
 from mwdcal.use.strengths import STANDARD_GRAVITY
+from mwdcal.use.uncertainty import AXIAL_INTERFERENCE, CORRECTED, DRIFT, DRIFTED, OF_MODELS
 
 DRIFT_YEARS = 1.0
 """Time after which the sensors may have drifted by as much as the model's terms for sensors, years."""

@@ -43,6 +43,7 @@ def command(
     from mwdcal.calibration.readings import simulated
     from mwdcal.presentation.envelope import enveloped, with_signature
     from mwdcal.presentation.signature import in_short, load_calibration
+    from mwdcal.use.uncertainty import reading_terms
 
     options.check_outputs([output], [calibration, readings, *key])
     loaded = load_calibration(calibration, key)
@@ -52,10 +53,16 @@ def command(
             fitted, readings, output, outside, missing, decimal, uncertainty, advance
         )
     findings = loaded.findings + findings
-    blank = tally.blank(outside)
+    blank, terms = tally.blank(outside), reading_terms(fitted)
     document = enveloped(
         "apply",
-        Applied(rows=tally.rows, blank=blank, output=str(output), findings=findings),
+        Applied(
+            rows=tally.rows,
+            blank=blank,
+            output=str(output),
+            findings=findings,
+            **(terms.stated if uncertainty else {}),
+        ),
         *(fitted.tool, tally.metadata),
         calibration=loaded.digest,
         readings=readings_digest,
@@ -64,4 +71,5 @@ def command(
     signed = one_line(in_short(loaded.signature))
     said = [corrected, f"wrote {one_line(output)}", signed, *simulated(fitted.tool)]
     document = with_signature(document, loaded.signature)
-    print_result(document if as_json else "   ".join(said), findings)
+    lines = ["   ".join(said), *([terms.sentence] if uncertainty else [])]
+    print_result(document if as_json else "\n".join(lines), findings)
