@@ -98,9 +98,10 @@ def longer(source: Path, target: Path, rows: int) -> Path:
     return target
 
 
-def without_noise(path: Path) -> Path:
-    """The profile of the example, that declares its stand and no noise: what a newcomer has."""
-    lines = (EXAMPLE / "tool.toml").read_text().splitlines()
+def without_noise(path: Path, stand: bool) -> Path:
+    """The profile of the example that declares no noise, and with its `stand` or as if that were exact."""
+    text = (EXAMPLE / "tool.toml").read_text()
+    lines = (text if stand else text.partition("[stand]")[0]).splitlines()
     path.write_text("\n".join(line for line in lines if not line.startswith("noise")) + "\n")
     return path
 
@@ -121,7 +122,10 @@ def paths(folder: Path) -> list[Guarded]:
     """All that is guarded, with its inputs written into a folder."""
     runs, tool = folder / "runs.parquet", folder / "tool.json"
     fleet.simulate(runs, TOOLS)
-    declared, undeclared = EXAMPLE / "tool.toml", without_noise(folder / "undeclared.toml")
+    declared = EXAMPLE / "tool.toml"
+    undeclared, exact = (
+        without_noise(folder / f"{n}.toml", n == "stand") for n in ("stand", "exact")
+    )
     calibrate = ("calibrate", EXAMPLE / "run.csv", "--tool", declared, "-o")
     command(*calibrate, tool)
     scipy = "SciPy, a loop over the tools", partial(fleet.scipy_seconds, SAMPLE)
@@ -147,7 +151,7 @@ def paths(folder: Path) -> list[Guarded]:
             "calibrate, 48 stations", *imports, partial(command, *calibrate, folder / "again.json")
         ),
         Guarded("calibrate, two roll groups", *scipy, partial(roll_groups, 10)),
-        fleets("noise undeclared", "servo"),
+        fleets("noise undeclared", exact),
         fleets("stand and noise declared", declared),
         fleets("stand declared, noise not", undeclared),
         long(("apply", tool, "surveys.csv", "-o", folder / "applied.csv"), "surveys.csv", 100_000),
