@@ -16,6 +16,7 @@ from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import BinaryIO, NamedTuple
+from weakref import finalize
 
 import numpy as np
 
@@ -207,7 +208,9 @@ class StoredColumns(Mapping[str, Column]):
 
     def __init__(self, others: Sequence[str], names: Sequence[str]) -> None:
         self._others = others
-        self._files = {name: TemporaryFile() for name in names}  # noqa: SIM115, closed with the columns
+        self._files = {name: TemporaryFile() for name in names}  # noqa: SIM115, closed by what follows
+        for file in self._files.values():
+            finalize(self, file.close)
 
     def add(self, values: Array, share: float) -> None:
         """Append values (rows, columns)."""
