@@ -16,6 +16,7 @@ from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import BinaryIO, NamedTuple
+from weakref import finalize
 
 import numpy as np
 
@@ -48,7 +49,7 @@ _ODD = ("nan", "inf", '"', "\r")
 """What plain numbers do not have, in lower case."""
 _CLOCK = re.compile(r"\d{4}-\d{1,2}-\d{1,2}|\d{1,2}:\d{2}|\d{1,2}[./]\d{1,2}[./]\d{4}")
 _BINARY = bytes([*range(0x09), *range(0x0E, 0x20)])
-_LONG = 100_000_000
+_LONG_LOG = 100_000_000
 """Bytes of text from which the columns of a log are not all in memory at once."""
 _EXAMPLE = "`columns` time_s,ax,ay,az"
 
@@ -165,7 +166,7 @@ def _read_text(stream: BinaryIO, names: list[str], decimal: str, source: str, sa
     wanted, lines = _wanted(layout), []
     others = [name for name in layout.names if name not in READ]
     filled: _Growing | StoredColumns = (
-        _Growing(others, wanted) if size < _LONG else StoredColumns(others, wanted)
+        _Growing(others, wanted) if size < _LONG_LOG else StoredColumns(others, wanted)
     )
     for piece in _pieces(stream, ahead, number, source):
         values, numbers, done = _piece(piece, done, layout)
@@ -207,7 +208,9 @@ class StoredColumns(Mapping[str, Column]):
 
     def __init__(self, others: Sequence[str], names: Sequence[str]) -> None:
         self._others = others
-        self._files = {name: TemporaryFile() for name in names}  # noqa: SIM115, closed with the columns
+        self._files = {name: TemporaryFile() for name in names}  # noqa: SIM115, closed by what follows
+        for file in self._files.values():
+            finalize(self, file.close)
 
     def add(self, values: Array, share: float) -> None:
         """Append values (rows, columns)."""

@@ -108,7 +108,7 @@ class _Stations(NamedTuple):
 
 
 @dataclass
-class _Seen:
+class _PartsSeen:
     """What was seen of the parts so far."""
 
     before: Before
@@ -222,7 +222,7 @@ class _LongTable:
 
     def columns(self) -> Iterator[dict[str, Column | Any]]:
         """The columns of each part, those of the input before the results."""
-        self.seen = _Seen(before=Before(path=self.settings.tie_in or (0.0, 0.0, 0.0)))
+        self.seen = _PartsSeen(before=Before(path=self.settings.tie_in or (0.0, 0.0, 0.0)))
         for piece in self.source.pieces():
             stations = self.source.exactly_if_refused(self._stations, piece)
             self.seen.rows.append(stations.readings.count if stations else 0)

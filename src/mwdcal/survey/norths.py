@@ -83,14 +83,8 @@ def norths_of(
         "declination_deg": reference.declination_deg, "convergence_deg": reference.convergence_deg
     }  # fmt: skip
     both = {key: value for key, value in {**of_place, **stated}.items() if value is not None}
-    sources = {
-        key.removesuffix("_deg"): FROM_TABLE
-        if key in stated
-        else FROM_REFERENCE
-        if key in both
-        else NO_SOURCE
-        for key in AZIMUTH_KEYS[1:]
-    }
+    known = {**dict.fromkeys(both, FROM_REFERENCE), **dict.fromkeys(stated, FROM_TABLE)}
+    sources = {key.removesuffix("_deg"): known.get(key, NO_SOURCE) for key in AZIMUTH_KEYS[1:]}
     given, findings = _stated_sd(metadata, source), []
     if given and "declination_deg" not in stated:
         text = f"{source}: {SD_KEY} is not used: no declination_deg is beside it. State both, or neither."
