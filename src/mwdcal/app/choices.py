@@ -11,6 +11,7 @@ from mwdcal.calibration.prior import DATASHEET, profile_for
 from mwdcal.calibration.readings import HIGHEST, Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.files import profiles, runs
+from mwdcal.files.settings import source_of_settings
 from mwdcal.presentation.typed import Typed, names
 from mwdcal.registry.calibration_source import calibration_of
 from mwdcal.sensor.profile import Profile
@@ -25,7 +26,7 @@ def load_run(
     """A run, with the digests of its files, and its tool profile."""
     profile, digest = profiles.load_profile(tool)
     readings, profile = runs.read_run(run, profile_for(prior, profile), decimal=decimal)
-    return replace(readings, profile_sha256=digest), profile
+    return replace(readings, profile_sha256=digest, settings_source=source_of_settings()), profile
 
 
 def options_of(

@@ -157,6 +157,7 @@ class Readings:
         table: all columns (n,) of the file or table that was read, as they stand there.
         profile: the tool profile by which raw channels became these readings, if there was one.
         run_sha256, profile_sha256: of the files that both come from.
+        settings_source: path and SHA-256 of the laboratory's settings that completed the profile.
     """
 
     accelerometer: Array
@@ -179,6 +180,7 @@ class Readings:
     profile: Profile | None = None
     run_sha256: str = ""
     profile_sha256: str = ""
+    settings_source: tuple[str, str] = ("", "")
 
     def __repr__(self) -> str:
         known = ", ".join(self.known) or "none"

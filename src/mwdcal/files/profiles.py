@@ -18,6 +18,7 @@ from mwdcal.errors import InputError, reason
 from mwdcal.files.contract import MAPPED, TEMPERATURE, units_of
 from mwdcal.files.formats.table import shown
 from mwdcal.files.metadata import LARGEST_TOML, load_toml
+from mwdcal.files.settings import completed
 from mwdcal.sensor.profile import (
     ColumnSource,
     Datasheet,
@@ -76,11 +77,12 @@ _LIMITS: dict[type[msgspec.Struct], dict[str, tuple[float, float, str]]] = {
 def load_profile(name_or_path: str | None = None) -> tuple[Profile, str]:
     """A tool profile and the SHA-256 of its bytes: built in by name, or a TOML file by path.
 
-    None is the built-in `generic`: channels along the tool axes, nothing else known.
+    None is the built-in `generic`: channels along the tool axes, nothing else known. In a command the laboratory's
+    settings complete it.
     """
     name = "generic" if name_or_path is None else name_or_path
     data, digest = read_toml(name, "profiles", "tool profile")
-    return decoded_profile(data, Path(name).name), digest
+    return completed(decoded_profile(data, Path(name).name)), digest
 
 
 def built_in(folder: str) -> list[str]:

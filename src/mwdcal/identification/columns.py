@@ -11,6 +11,7 @@ import numpy as np
 from mwdcal.errors import FitError, InputError
 from mwdcal.files.contract import CHANNELS, MAPPED, RAW, REFERENCES, forms, units_of
 from mwdcal.files.formats.columns import shown
+from mwdcal.files.settings import setting
 from mwdcal.files.synonyms import (
     ABOVE,
     ANTICLOCKWISE,
@@ -362,6 +363,8 @@ def _unit(column: str, name: str, stated: str, values: Array | None, source: str
         raise _open(name, column, allowed, source)
     both = {"°": _maybe_radians, "°C": _maybe_fahrenheit}.get(allowed[0])
     if both and known.size and both(known):
+        if allowed[0] == "°C" and (usual := setting("temperature_unit")):
+            return usual
         raise _open(name, column, allowed, source)
     return allowed[0]
 

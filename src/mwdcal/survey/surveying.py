@@ -20,6 +20,7 @@ from mwdcal.files import synonyms
 from mwdcal.files.contract import REFERENCES, check_columns
 from mwdcal.files.formats.table import Table, cell_error, numbers
 from mwdcal.files.runs import renamed, to_readings
+from mwdcal.files.settings import setting
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import StandProfile
 from mwdcal.survey.acceptance import SurveyLimits, load_survey_limits
@@ -46,6 +47,9 @@ LARGEST_DEPTH = 20_000.0
 _DEPTH_NAMES = re.compile(
     r"(md|dept|((measured|bit|survey|hole|along[ _-]?hole)[ _]?)?depth)[ _]*[\[(]?(m|ft|feet|met(re|er)s?)?[\])]?"
 )
+_DEPTH_UNIT = re.compile(r"(?<![a-z])(m|ft|feet|met(re|er)s?)[\])]?$")
+"""The unit at the end of such a name."""
+_METRES = {"m": 1.0, "ft": 0.3048}
 
 
 @dataclass(frozen=True)
@@ -152,26 +156,42 @@ def _referenced(readings: Readings, reference: EarthReference) -> Readings:
 
 
 def _depths(table: Table) -> Array | None:
-    if MEASURED_DEPTH not in table.columns:
-        for name in table.columns:
-            if _DEPTH_NAMES.fullmatch(name.strip().lower()):
-                raise InputError(
-                    f"{table.source}: column '{name}': measured depths must be in metres, in a column "
-                    f"'{MEASURED_DEPTH}'. Rename it, and convert feet (× 0.3048)."
-                )
+    name, factor = _depth_column(table)
+    if not name:
         return None
-    column = table.columns[MEASURED_DEPTH]
-    depths = numbers(table, MEASURED_DEPTH) if isinstance(column, list) else column
+    column = table.columns[name]
+    depths = factor * (numbers(table, name) if isinstance(column, list) else column)
     wrong = np.flatnonzero((depths < 0) | (depths > LARGEST_DEPTH))
     if wrong.size:
         problem = f"must be between 0 and {LARGEST_DEPTH:g} m; got {depths[wrong[0]]:g}."
-        raise cell_error(table, MEASURED_DEPTH, int(wrong[0]), problem)
+        raise cell_error(table, name, int(wrong[0]), problem)
     there = np.flatnonzero(~np.isnan(depths))
     back = there[1:][np.diff(depths[there]) <= 0]
     if back.size:
         problem = f"must increase from station to station; got {depths[back[0]]:g}. Sort; leave repeated surveys out."
-        raise cell_error(table, MEASURED_DEPTH, int(back[0]), problem)
+        raise cell_error(table, name, int(back[0]), problem)
     return depths if there.size else None
+
+
+def _depth_column(table: Table) -> tuple[str, float]:
+    """The column of measured depths, and metres per its unit; blank where there is none.
+
+    One that states no unit is in the laboratory's unit of length, where a command runs with its settings.
+    """
+    if MEASURED_DEPTH in table.columns:
+        return MEASURED_DEPTH, 1.0
+    for name in table.columns:
+        if _DEPTH_NAMES.fullmatch(name.strip().lower()):
+            stated = _DEPTH_UNIT.search(name.strip().lower())
+            unit = "" if stated else setting("length_unit")
+            if unit:
+                return name, _METRES[unit]
+            raise InputError(
+                f"{table.source}: column '{name}': measured depths must be in metres, in a column "
+                f"'{MEASURED_DEPTH}'. Rename it, and convert feet (× 0.3048); or state length_unit in mwdcal.toml, "
+                "which columns without a unit are in."
+            )
+    return "", 1.0
 
 
 def surveyed_table(table: Table, well: Well) -> Table:

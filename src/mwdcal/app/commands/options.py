@@ -11,6 +11,7 @@ from typing import Any
 from unicodedata import normalize
 
 import click
+from click.core import ParameterSource
 
 from mwdcal.app.messages import Command
 from mwdcal.errors import InputError
@@ -175,7 +176,8 @@ def database(**more: Any) -> Decorator:
 def _named_registry(context: click.Context, option: click.Parameter, typed: str | None) -> str:
     """The registry that a subcommand, its group or the environment names."""
     group = context.parent.params.get(option.name) if context.parent and option.name else None
-    named = typed or group
+    of_settings = context.get_parameter_source(option.name or "") is ParameterSource.DEFAULT_MAP
+    named = (group or typed) if of_settings else (typed or group)
     if not named and not context.resilient_parsing:
         raise InputError(f"--database must name the registry; got none. Or set ${REGISTRY}.")
     return named or ""

@@ -33,9 +33,11 @@ def command(
     from msgspec.structs import replace
 
     from mwdcal.calibration.diagnosis.findings import unused_columns
+    from mwdcal.calibration.diagnosis.identity import overdue
     from mwdcal.files import runs
     from mwdcal.files.formats import atomic
     from mwdcal.files.limits import load_limits
+    from mwdcal.files.settings import standards_of
     from mwdcal.presentation.envelope import enveloped, with_signature
     from mwdcal.presentation.signature import load_calibration
     from mwdcal.presentation.verification import next_step, screen
@@ -47,8 +49,9 @@ def command(
     readings, _ = runs.read_run(run, fitted.profile, decimal=decimal)
     bounds, limits_digest = load_limits(limits)
     result = verify(fitted, readings, bounds)
+    late = overdue(standards_of(fitted.profile), readings.metadata)
     findings = findings_as_typed(
-        loaded.findings + result.findings + unused_columns(readings.unused)
+        loaded.findings + result.findings + unused_columns(readings.unused) + late
     )
     result = replace(result, findings=findings)
     stated = fitted.tool, readings.metadata

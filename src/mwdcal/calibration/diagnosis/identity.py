@@ -3,9 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from datetime import UTC, datetime
 
-from mwdcal.calibration.readings import Readings, future_day, serial_of, unread_day
+from msgspec import UnsetType
+
+from mwdcal.calibration.readings import (
+    Readings,
+    future_day,
+    serial_of,
+    stated_day,
+    unread_day,
+)
 from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.sensor.profile import MeasurementStandard
 
 UNIDENTIFIED, FROM_THE_FUTURE, UNREAD_DAY = "no-serial", "future-date", "unreadable-date"
 """Findings on the identity of data: ids."""
@@ -33,6 +43,22 @@ def dated(metadata: Mapping[str, object], name: str) -> list[Finding]:
         return []
     text = f"{name} states the date {day}, which is still to come. Correct it, or the clock of this computer."
     return [Finding(id=FROM_THE_FUTURE, text=text)]
+
+
+def overdue(
+    standards: tuple[MeasurementStandard, ...] | UnsetType, metadata: Mapping[str, object]
+) -> list[Finding]:
+    """A finding for each standard whose calibration was due before the day of a run, else before today."""
+    day = stated_day(metadata) or datetime.now(UTC).date()
+    late = [s for s in standards if s.due and s.due < day] if isinstance(standards, tuple) else []
+    return [
+        Finding(
+            id="standard-overdue",
+            text=f"the calibration of the {s.quantity} standard {s.name} was due on {s.due}, before {day}. Have it "
+            "calibrated, or enter its new certificate.",
+        )
+        for s in late
+    ]
 
 
 def other_tool(calibration: Calibration, readings: Readings) -> tuple[str, str] | None:
