@@ -87,6 +87,14 @@ def read_export(
     form = profile.table
     if isinstance(form, msgspec.UnsetType):
         return tables.read(path, decimal=decimal, rows=rows)
+    table = _exported(path, form, profile, decimal, rows)
+    return replace(table, metadata={**form.north, **table.metadata})
+
+
+def _exported(
+    path: str | os.PathLike[str], form: TableFormat, profile: Profile, decimal: str, rows: int
+) -> Table:
+    """The table in a file that is written as a form says, or as documented."""
     if form.find:
         decimal = "," if form.decimal == "," else ""
         where = tables.laid_out(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from mwdcal.errors import FitError, InputError
+from mwdcal.errors import Answer, InputError, QuestionError
 from mwdcal.files.formats.columns import as_text, looks_numeric
 
 _SPACES = re.compile(r"(?<=\d)[ '’\u00a0\u202f\u2009](?=\d{3}(\D|$))")
@@ -67,8 +67,13 @@ def decimal_sign(cells: Sequence[object], source: str) -> str:
         )
     if all(map(_GROUPED.fullmatch, commas + points)):
         sign, marked = ("comma", commas) if commas else ("point", points)
-        raise FitError(
-            f"{source}: the {sign} in {marked[0]} may be a decimal sign or separate thousands. Say which by `decimal`."
+        written = "," if commas else "."
+        raise QuestionError(
+            f"{source}: the {sign} in {marked[0]} may be a decimal sign or separate thousands.",
+            [
+                Answer("a decimal sign", (("decimal", written),)),
+                Answer("it separates thousands", (("decimal", "." if commas else ","),)),
+            ],
         )
     return "," if commas else "."
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from mwdcal.errors import FitError, InputError
+from mwdcal.errors import Answer, InputError, QuestionError
 from mwdcal.files.formats import figures
 from mwdcal.files.formats.columns import as_text, looks_numeric, plain_names, shown
 from mwdcal.files.formats.titles import Titles, dated, titles
@@ -149,16 +149,22 @@ def _no_table(source: str, header_line: int, wanted: Collection[str]) -> InputEr
     )
 
 
-def _several(tables: Sequence[Layout], source: str, sheet: str) -> FitError:
+def _several(tables: Sequence[Layout], source: str, sheet: str) -> QuestionError:
     places = [
         f"{f'sheet {shown(t.sheet)}, ' if t.sheet else ''}row {t.form.header_line} ({len(t.lines)} rows)"
         for t in sorted(tables, key=lambda t: (t.sheet, t.form.header_line))
     ]
-    sheets = {t.sheet for t in tables}
-    option = "`sheet`" if len(sheets) == len(tables) and not sheet else "`header_row`"
-    return FitError(
-        f"{source} holds {len(tables)} tables with the same columns: {'; '.join(places)}. Say which one is meant by "
-        f"{option}."
+    by_sheet = len({t.sheet for t in tables}) == len(tables) and not sheet
+    answers = [
+        Answer(
+            f"{shown(t.sheet) if t.sheet else 'row'} {t.form.header_line}, {len(t.lines)} rows",
+            (("sheet", t.sheet) if by_sheet else ("header_row", str(t.form.header_line)),),
+        )
+        for t in tables
+    ]
+    return QuestionError(
+        f"{source} holds {len(tables)} tables with the same columns: {'; '.join(places)}. Which one is meant?",
+        answers,
     )
 
 
