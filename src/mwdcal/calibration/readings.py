@@ -39,6 +39,8 @@ LEAST_TEMPERATURE_SPAN = 10.0
 """A run that spans less has no temperature terms, °C. An order needs as much for each power."""
 HIGHEST = 3
 """The highest temperature order of a model."""
+IN_TABLE = "_in_table"
+"""End of the key of what a table states otherwise than the user says."""
 WORDS = ("serial", "tool", "operator", "lab", "date", "stand")
 """Metadata that are text, whatever they look like: a serial 12.10 is not 12.1."""
 _ISO_DAY = re.compile(r"(\d{4}-?\d\d-?\d\d)([T ].*)?", re.ASCII | re.DOTALL)

@@ -41,6 +41,7 @@ from mwdcal.files.formats.columns import LABELS, Column, shown
 from mwdcal.files.formats.dialect import holds_numbers
 from mwdcal.files.formats.layout import Layout
 from mwdcal.files.formats.table import Table, labels
+from mwdcal.files.statements import stated_table
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import ColumnSource, Profile, TableFormat, TriadProfile
 
@@ -54,11 +55,20 @@ _TURN = 360.0
 
 
 def read_run(
-    source: str | os.PathLike[str] | Table, profile: Profile, *, decimal: str = "."
+    source: str | os.PathLike[str] | Table,
+    profile: Profile,
+    *,
+    decimal: str = ".",
+    statements: Mapping[str, str] | None = None,
 ) -> tuple[Readings, Profile]:
-    """The readings of a run, a file or a table, and the profile with its nominal scales filled in."""
+    """The readings of a run, a file or a table, and the profile with its nominal scales filled in.
+
+    `statements`: serial, date and operator as the user says.
+    """
     if not isinstance(source, Table):
-        source = read_export(source, profile, decimal=decimal, rows=MOST_ROWS)
+        source = read_export(
+            source, profile, decimal=decimal, rows=MOST_ROWS, statements=statements
+        )
     table = renamed(source, profile)
     check_run(table)
     readings, profile = to_readings(table, profile)
@@ -77,18 +87,31 @@ def _other_numbers(table: Table) -> dict[str, Array]:
 
 
 def read_export(
-    path: str | os.PathLike[str], profile: Profile, *, decimal: str = ".", rows: int = 0
+    path: str | os.PathLike[str],
+    profile: Profile,
+    *,
+    decimal: str = ".",
+    rows: int = 0,
+    statements: Mapping[str, str] | None = None,
 ) -> Table:
     """The table in a file, written as the profile says or as documented, under its own names.
 
     `decimal` and `rows` as for `table.read`; a profile that says how tables are written says their
-    decimal sign as well.
+    decimal sign as well. `statements`: serial, date and operator as the user says.
     """
     form = profile.table
     if isinstance(form, msgspec.UnsetType):
-        return tables.read(path, decimal=decimal, rows=rows)
-    table = _exported(path, form, profile, decimal, rows)
-    return replace(table, metadata={**form.north, **table.metadata})
+        table = tables.read(path, decimal=decimal, rows=rows)
+    else:
+        table = _exported(path, form, profile, decimal, rows)
+        table = replace(table, metadata={**form.north, **table.metadata})
+    return stated_table(table, statements or {}, _serial_column(table, profile))
+
+
+def _serial_column(table: Table, profile: Profile) -> str:
+    """The column of serials in a table."""
+    name = _sources(profile).get("serial", ColumnSource(name="serial")).name
+    return name if name in table.columns else "serial"
 
 
 def _exported(

@@ -28,6 +28,7 @@ from mwdcal.presentation.text import one_line
     default=True,
     help="Columns with the standard uncertainty of each angle and strength. Without them long tables are faster.",
 )
+@options.of_run
 @options.DECIMAL
 @options.TRUSTED_KEYS
 @options.JSON
@@ -57,7 +58,15 @@ def command(
     try:
         with bar("correcting") as advance:
             tally, findings, readings_digest = apply_to_any(
-                fitted, readings, output, outside, missing, decimal, uncertainty, advance
+                fitted,
+                readings,
+                output,
+                outside,
+                missing,
+                decimal,
+                uncertainty,
+                advance,
+                options.statements(),
             )
     except BlankReadingError as error:
         advice = "Or leave the results of such rows blank: --missing blank."

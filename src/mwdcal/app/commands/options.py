@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterable
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -90,6 +91,43 @@ COLUMN_NAMES = click.option(
 RESULT = output(
     required=False, metavar="OUT.json", help="Also write the result as JSON, as --json prints it."
 )
+
+
+STATEMENTS = "mwdcal.statements"
+"""Where the context of a command has what the user says of a run."""
+
+
+def _note(context: click.Context, option: click.Parameter, typed: Any) -> None:
+    """Note what the user says of a run."""
+    if typed is not None:
+        said = typed.date().isoformat() if isinstance(typed, datetime) else str(typed).strip()
+        context.meta.setdefault(STATEMENTS, {})[str(option.name)] = said
+
+
+def of_run(function: Function) -> Function:
+    """The options with which a user says of a run what its table does not, or otherwise."""
+    noted = partial(click.option, callback=_note, expose_value=False)
+    for option in (
+        noted("--operator", metavar="NAME", help="Who measured; comes before the table's own."),
+        noted(
+            "--date",
+            type=click.DateTime(["%Y-%m-%d"]),
+            metavar="YYYY-MM-DD",
+            help="Day of the run; likewise.",
+        ),
+        noted(
+            "--serial",
+            metavar="S",
+            help="Serial of the tool; of several in the table, the one to take.",
+        ),
+    ):
+        function = option(function)
+    return function
+
+
+def statements() -> dict[str, str]:
+    """Serial, date and operator as the user says."""
+    return dict(click.get_current_context().meta.get(STATEMENTS, {}))
 
 
 def number(name: str, metavar: str, text: str, *variable: str) -> Decorator:

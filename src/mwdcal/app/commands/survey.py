@@ -64,6 +64,7 @@ if TYPE_CHECKING:
 @click.option(
     "--html", type=options.FILE, metavar="S.html", help="Also write a page with the pictures."
 )
+@options.of_run
 @options.DECIMAL
 @options.TRUSTED_KEYS
 @options.JSON
@@ -96,7 +97,8 @@ def command(
     start, ends = _three("tie_in", tie_in), _switch(switch)
     loaded = load_calibration(calibration, key)
     fitted = loaded.calibration
-    table = read_export(readings, fitted.profile, decimal=decimal, rows=MOST_ROWS)
+    said = options.statements()
+    table = read_export(readings, fitted.profile, decimal=decimal, rows=MOST_ROWS, statements=said)
     inputs = well_inputs(fitted, table, reference, limits, msa, loaded.digest, loaded.findings)
     analysis = analysed(inputs, sensor_drift) if msa else None
     pages = _interference_page(inputs, analysis, msa_html)

@@ -17,6 +17,7 @@ from mwdcal.presentation.typed import findings_as_typed
 @options.LIMITS
 @options.RESULT
 @options.report(help="Also write the report, with this verdict.")
+@options.of_run
 @options.DECIMAL
 @options.TRUSTED_KEYS
 @options.JSON
@@ -46,7 +47,9 @@ def command(
     options.check_outputs([output], [calibration, run, limits, *key], page=report)
     loaded = load_calibration(calibration, key)
     fitted = loaded.calibration
-    readings, _ = runs.read_run(run, fitted.profile, decimal=decimal)
+    readings, _ = runs.read_run(
+        run, fitted.profile, decimal=decimal, statements=options.statements()
+    )
     bounds, limits_digest = load_limits(limits)
     result = verify(fitted, readings, bounds)
     late = overdue(standards_of(fitted.profile), readings.metadata)

@@ -8,6 +8,8 @@ from datetime import UTC, datetime
 from msgspec import UnsetType
 
 from mwdcal.calibration.readings import (
+    IN_TABLE,
+    WORDS,
     Readings,
     future_day,
     serial_of,
@@ -35,14 +37,27 @@ def unidentified(serials: Mapping[str, str | None]) -> list[Finding]:
     return [Finding(id=UNIDENTIFIED, text=text)]
 
 
+def stated_otherwise(metadata: Mapping[str, object], name: str) -> list[Finding]:
+    """A finding on what a table states otherwise than the user says."""
+    return [
+        Finding(
+            id="stated-otherwise",
+            text=f"{name} states the {key} {other}; {metadata[key]}, as given, is used.",
+        )
+        for key in WORDS
+        if (other := metadata.get(f"{key}{IN_TABLE}"))
+    ]
+
+
 def dated(metadata: Mapping[str, object], name: str) -> list[Finding]:
-    """A finding if metadata state a day that cannot be read, or one that is still to come."""
+    """Findings on a day that cannot be read or is still to come, and on what the user says otherwise."""
+    others = stated_otherwise(metadata, name)
     if problem := unread_day(metadata, name):
-        return [Finding(id=UNREAD_DAY, text=problem)]
+        return [Finding(id=UNREAD_DAY, text=problem), *others]
     if (day := future_day(metadata)) is None:
-        return []
+        return others
     text = f"{name} states the date {day}, which is still to come. Correct it, or the clock of this computer."
-    return [Finding(id=FROM_THE_FUTURE, text=text)]
+    return [Finding(id=FROM_THE_FUTURE, text=text), *others]
 
 
 def overdue(
