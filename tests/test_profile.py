@@ -364,13 +364,17 @@ def attitudes(*turns):
     return turn[..., 0], turn[..., 2]
 
 
-def test_a_sign_that_the_dip_alone_would_tell_stays_open():
+def test_a_sign_is_told_by_the_dip_that_all_channels_share():
     north, down = attitudes(np.repeat([45.0, 90.0], 12), 30.0, np.tile(np.arange(0, 360, 30), 2))
     field = north * np.cos(np.radians(65)) + down * np.sin(np.radians(65))
     result = wiring(field * 3.0, north, down)
-    assert not is_clear(result)
-    assert sorted(result.alternatives) == [("+x", "+y", "+z"), ("+x", "+y", "-z")]
+    assert is_clear(result)
+    assert result.axes == ("+x", "+y", "+z")
+    reversed_z = wiring(field * [3.0, 3.0, -3.0], north, down)
+    assert reversed_z.axes == ("+x", "+y", "-z")
     assert is_clear(wiring(field * 3.0, field))
+    north, down = attitudes(np.full(12, 90.0), 30.0, np.arange(0, 360, 30))
+    assert not is_clear(wiring(north + 2 * down, north, down)), "z is the same at all stations"
 
 
 def test_few_stations_never_tell_wrong_axes():

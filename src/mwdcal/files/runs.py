@@ -173,7 +173,7 @@ def _of_layout(where: Layout, path: str | os.PathLike[str], profile: Profile) ->
     named = {each.name: column for column, each in _sources(profile).items()}
     for name, unit in zip(where.names, map(synonyms.unit_of, where.units), strict=True):
         stated = _sources(profile)[named[name]].unit if name in named else ""
-        if unit and stated and unit != stated and not stated.startswith(f"{unit} "):
+        if unit and stated and not _alike_units(unit, stated):
             raise InputError(
                 f"{Path(path).name}: {shown(name)} is in {unit}, by the tool profile in {stated}."
             )
@@ -193,11 +193,18 @@ def _check_below_names(path: str | os.PathLike[str], form: TableFormat, profile:
                 f"{where}: readings that by first_line = {form.first_line} of the tool profile would not be read."
             )
         for name, unit in zip(names, map(synonyms.unit_of, cells), strict=False):
-            if unit and unit != theirs.get(name.strip(), unit):
+            if unit and not _alike_units(unit, theirs.get(name.strip(), unit)):
                 raise InputError(
                     f"{where}: {shown(name.strip())} is in {unit}, by the tool profile in "
                     f"{theirs[name.strip()]}."
                 )
+
+
+def _alike_units(written: str, stated: str) -> bool:
+    """Whether a unit as it is written may be the one of a profile: G is also Gauss, and ° any sense of an angle."""
+    return (
+        written == stated or stated.startswith(f"{written} ") or (written, stated) == ("g", "gauss")
+    )
 
 
 def _sources(profile: Profile) -> dict[str, ColumnSource]:
@@ -241,7 +248,11 @@ def renamed(table: Table, profile: Profile) -> Table:
                 "the tool profile. Rename the former, or correct [columns] in the profile."
             )
     columns: dict[str, Column] = {}
+    form = profile.table
+    ignored = () if isinstance(form, msgspec.UnsetType) else form.ignore
     for name, cells in table.columns.items():
+        if name in ignored:
+            continue
         column = theirs.get(name, name)
         columns[column] = cells
         if name in theirs and column not in LABELS:
@@ -263,7 +274,7 @@ def check_run(table: Table) -> None:
     if len(tools) > 1:
         raise InputError(
             f"{table.source} has rows of more than one tool (serial {', '.join(tools)}). Take the "
-            "rows of one, or use mwdcal fleet."
+            "rows of one by `serial`, or use mwdcal fleet."
         )
     if table.count > ROWS_OF_LOG and ("time_s" in table.columns or "sampling_hz" in table.metadata):
         raise InputError(

@@ -11,6 +11,7 @@ from mwdcal.errors import Answer
 from mwdcal.files.contract import RAW, REFERENCES
 from mwdcal.files.synonyms import unit_of
 from mwdcal.geometry.vectors import Array
+from mwdcal.identification.words import spelled
 
 IN_BRACKETS = re.compile(r"[(\[]([^)\]]*)[)\]]\s*$")
 RANGES_BY_UNIT: dict[str, tuple[tuple[str, float, float], ...]] = {
@@ -26,6 +27,8 @@ _FEW = 4
 """Values of a column that a question shows."""
 _STEADY_DIP, _STEADY_FIELD = 3.0, 0.1
 """A dip varies by less at one place, degrees, and a field by a smaller share."""
+STEADY_NORM = 0.15
+"""By how much the norm of a triad varies at most, as a share of the range of its channels."""
 _LEAST_TURN = 20.0
 """By how much an angle of the stand varies at least, degrees."""
 _MOST_TRIPLES = 6
@@ -67,10 +70,13 @@ def channels_for(column: str, names: Sequence[str], values: Values) -> list[Answ
     return [Answer(with_values(n, values, n), (("column", f"{column}={n}"),)) for n in numbers]
 
 
-def triples_for(channels: Sequence[str], names: Sequence[str], values: Values) -> list[Answer]:
+def triples_for(
+    channels: Sequence[str], names: Sequence[str], values: Values, most: float = np.inf
+) -> list[Answer]:
     """Neighbouring columns that may be a triad, first those of which the norm varies least.
 
     A sound triad has the same norm at every attitude, but for its biases and scales, while each channel varies.
+    `most`: by how much it may vary, as a share of the channels' range.
     """
     numbers = {n: v for n in names if (v := values(n)) is not None and np.isfinite(v).all()}
     triples = []
@@ -85,7 +91,8 @@ def triples_for(channels: Sequence[str], names: Sequence[str], values: Values) -
             with_values(", ".join(three), values, *three),
             tuple(("column", f"{c}={n}") for c, n in zip(channels, three, strict=True)),
         )
-        for _, three in sorted(triples, key=lambda each: each[0])[:_MOST_TRIPLES]
+        for variation, three in sorted(triples, key=lambda each: each[0])[:_MOST_TRIPLES]
+        if variation <= most
     ]
 
 
@@ -109,8 +116,11 @@ def may_be(column: str, name: str, unit: str, values: Array | None) -> bool:
     known = values[np.isfinite(values)] if values is not None else np.empty(0)
     if known.size < LEAST_ROLLS:
         return False
-    bracketed = IN_BRACKETS.search(name)
-    stated = unit_of(unit) or unit_of(bracketed[1] if bracketed else name.split()[-1])
+    plain = spelled(name)
+    bracketed = IN_BRACKETS.search(plain)
+    stated = unit_of(spelled(unit)) or unit_of(
+        bracketed[1] if bracketed else plain.rpartition(" ")[2]
+    )
     foreign = bool(unit or bracketed) and not stated
     low, high = float(known.min()), float(known.max())
     if column == REFERENCES["dip"].column:
@@ -118,7 +128,7 @@ def may_be(column: str, name: str, unit: str, values: Array | None) -> bool:
         return stated == "°" and high - low < _STEADY_DIP and steep
     if column == REFERENCES["field"].column:
         ranges = {unit: (least, most) for unit, least, most in RANGES_BY_UNIT[column]}
-        least, most = ranges.get(stated, (np.inf, -np.inf))
+        least, most = ranges.get("nT" if not stated and not foreign else stated, (np.inf, -np.inf))
         return least <= low and high <= most and high - low < _STEADY_FIELD * high
     if foreign or stated not in ("", "°", "rad", "gon") or high - low < _LEAST_TURN:
         return False

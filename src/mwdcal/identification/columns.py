@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from mwdcal.errors import Answer, InputError, QuestionError, QuestionsError
 from mwdcal.files.contract import CHANNELS, MAPPED, RAW, REFERENCES, forms, units_of
-from mwdcal.files.formats.columns import shown
+from mwdcal.files.formats.columns import LABELS, shown
 from mwdcal.files.settings import setting
 from mwdcal.files.synonyms import (
     ABOVE,
@@ -27,6 +27,7 @@ from mwdcal.identification.answers import (
     IN_BRACKETS,
     LEAST_ROLLS,
     RANGES_BY_UNIT,
+    STEADY_NORM,
     Values,
     candidates_for,
     channels_for,
@@ -61,6 +62,10 @@ _GRID_NORTH = re.compile(r"grid|gitter|[qc]uadr[ií]cula|kartnord|сетк|坐�
 _OF_NORTH = re.compile(r"north|nord|norte|azi|azm|heading|азим|север|北|方位", re.IGNORECASE)
 """Words of the north that azimuths count from."""
 _NUMBERED = re.compile(r"(.*?[A-Za-z])[ _-]*([123])((?:\W.*|_[A-Za-z]+)?)")
+_TITLE = re.compile(
+    r"(acc|mag|accelerometers?|magnetometers?)?(?:s|ref|sensors?)? +", re.IGNORECASE
+)
+"""The title of a group of columns before the name of one."""
 _BARE_AZ = re.compile(r"az\W*(deg|°)?\W*", re.IGNORECASE)
 _BARE_AX = re.compile(r"a[xy]\b.*", re.IGNORECASE)
 _CCW = re.compile(
@@ -97,13 +102,25 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
         return turned and (
             turned._replace(unit=ANTICLOCKWISE) if turned.column == "ref_toolface_deg" else turned
         )
-    alike = resembled(plain)
+    alike = (
+        resembled(plain) or _without_title(plain) or resembled(f"{name} ({unit})" if unit else name)
+    )
     if _MEASURED.search(plain) and not (alike and alike.column == WARMTH):
         return None
     near = {form: column for column in MAPPED for form in forms(column)}
     spelt = next((near[form] for form in forms(plain) if form in near), None)
     stated = IN_BRACKETS.search(plain)
     return alike or (Resemblance(spelt, unit_of(stated[1]) if stated else "") if spelt else None)
+
+
+def _without_title(name: str) -> Resemblance | None:
+    """What a name resembles behind the title of its group, which says no other triad: Accelerometers Gx (V)."""
+    title = _TITLE.match(name)
+    alike = resembled(name[title.end() :]) if title else None
+    if not title or not alike:
+        return None
+    triad = begins_as(f"{title[1].rstrip('s')} x y") if title[1] else ""
+    return None if triad and alike.column[0] != triad[0] else alike
 
 
 def meanings_of(names: Sequence[str], units: Sequence[str]) -> dict[str, Resemblance]:
@@ -190,8 +207,10 @@ def proposed(
     north_is_stated: bool = False,
     answers: Mapping[str, str] | None = None,
     problems: Mapping[str, str] | None = None,
-) -> tuple[dict[str, ColumnSource], set[str]]:
+) -> tuple[dict[str, ColumnSource], set[str], dict[str, str]]:
     """The columns of a table by the name that they have in a run file, and those with a unit by their values.
+
+    And columns that are no evidence although they are called so, each with the reason.
 
     `above`: lines above the names. `north_is_stated`: the table's metadata say what azimuths count from. `answers`:
     columns of the table by the name of the run file, as the user says. `problems`: what is wrong with columns of
@@ -203,11 +222,13 @@ def proposed(
             values tell, azimuths from true or grid north, no accelerometer: all that is open.
     """
     meanings = meanings_of(names, units)
+    _tell_dip(meanings, values)
     said = answers or {}
+    ignored = _no_evidence(meanings, values, said)
     _answered(said, names, meanings, source)
     questions = Questions()
     spoken = _spoken(meanings, values, above)
-    chosen = _chosen(meanings, values, problems or {}, spoken, questions, source)
+    chosen = _chosen(meanings, values, problems or {}, spoken, ignored, questions, source)
     azimuth = chosen.get(REFERENCES["azimuth"].column)
     if azimuth and not north_is_stated:
         questions.ask(_check_north, azimuth.name, above, source)
@@ -218,12 +239,16 @@ def proposed(
     if not any("channels of the accelerometer" in each.text for each in questions):
         questions.ask(_check_triads, names, values, chosen, source)
     questions.ask(_check_units_of_triads, chosen, source)
+    if not {*RAW[3:]} & {*chosen, *said}:
+        questions.ask(_check_nameless, names, meanings, values, chosen, source)
     rest = {n: u for n, u in zip(names, units, strict=True) if n not in meanings}
     for column in lacking_references({*chosen, *said}):
         questions.ask(_check_lacking, column, rest, values, source)
     questions.raise_any(source)
     by_value = {c for c, each in chosen.items() if each.unit and not meanings[each.name].unit}
-    return _labels(names, chosen) | chosen, by_value
+    used = {each.name for each in chosen.values()}
+    ignored = {name: reason for name, reason in ignored.items() if name not in used}
+    return _labels(names, chosen) | chosen, by_value, ignored
 
 
 def _chosen(
@@ -231,6 +256,7 @@ def _chosen(
     values: Values,
     problems: Mapping[str, str],
     spoken: str,
+    ignored: Collection[str],
     questions: Questions,
     source: str,
 ) -> dict[str, ColumnSource]:
@@ -238,7 +264,8 @@ def _chosen(
     chosen: dict[str, ColumnSource] = {}
     for column in dict.fromkeys(m.column for m in meanings.values()):
         alike = [name for name, m in meanings.items() if m.column == column]
-        candidates = [n for n in alike if column == "serial" or values(n) is not None]
+        candidates = [n for n in alike if column in LABELS or values(n) is not None]
+        candidates = [n for n in candidates if n not in ignored]
         damaged = [problems[n] for n in alike if n in problems]
         if damaged and not _stated_among(candidates):
             questions += map(QuestionError, damaged)
@@ -248,6 +275,66 @@ def _chosen(
             unit = questions.ask(_unit, column, name, stated, values(name), source)
             chosen[column] = ColumnSource(name=name, unit=unit or "")
     return chosen
+
+
+def _no_evidence(
+    meanings: Mapping[str, Resemblance], values: Values, answers: Mapping[str, str]
+) -> dict[str, str]:
+    """Columns that are called as references and are none, each with the reason.
+
+    That is what the user says is none; totals computed from the channels; and rolls in whole degrees beside no other
+    angle of the stand, which are nominal.
+    """
+    ignored = {}
+    called = {m.column for m in meanings.values()}
+    lone = called.isdisjoint(REFERENCES[name].column for name in ("inclination", "azimuth"))
+    for name, m in meanings.items():
+        if answers.get(m.column) == "":
+            ignored[name] = "as you say"
+        elif m.column in answers:
+            continue
+        elif _is_total(m.column, name, meanings, values):
+            ignored[name] = "it is computed from the channels"
+        elif m.column == REFERENCES["toolface"].column and lone and _is_whole(values(name)):
+            ignored[name] = (
+                f"its rolls are nominal, in whole degrees without other angles of the stand; if they were set, say so "
+                f"by `column` {m.column}={name!r}"
+            )
+    return ignored
+
+
+def _is_whole(values: Array | None) -> bool:
+    return values is not None and bool(np.all(np.isnan(values) | (values == np.round(values))))
+
+
+def _tell_dip(meanings: dict[str, Resemblance], values: Values) -> None:
+    """Of several inclinations the one that hardly varies is the dip, where no column is called so."""
+    inclined = [n for n, m in meanings.items() if m.column == REFERENCES["inclination"].column]
+    if len(inclined) < 2 or any(m.column == REFERENCES["dip"].column for m in meanings.values()):
+        return
+    steady = [
+        n
+        for n in inclined
+        if may_be(REFERENCES["dip"].column, n, meanings[n].unit or "°", values(n))
+    ]
+    if len(steady) == 1 and not _CALLED_REFERENCE.search(spelled(steady[0])):
+        meanings[steady[0]] = Resemblance(REFERENCES["dip"].column, "°")
+
+
+def _is_total(column: str, name: str, meanings: Mapping[str, Resemblance], values: Values) -> bool:
+    """Whether a column of a strength is computed from the channels: in their raw unit, or equal to their norm."""
+    triad = {"ref_gravity_g": "accelerometer", "ref_field_nt": "magnetometer"}.get(column)
+    if triad is None:
+        return False
+    if meanings[name].unit in ("V", "mV", "counts", "raw"):
+        return True
+    channels = [n for n, m in meanings.items() if m.column in CHANNELS[triad]]
+    columns = [v for n in channels if (v := values(n)) is not None]
+    total = values(name)
+    if len(columns) != 3 or total is None:
+        return False
+    norm = np.linalg.norm(columns, axis=0)
+    return bool(np.ptp(norm) > 0 and np.abs(norm - total).max() < 0.02 * np.ptp(norm))
 
 
 def _check_lacking(column: str, others: Mapping[str, str], values: Values, source: str) -> None:
@@ -331,6 +418,26 @@ def _check_hidden(
         )
 
 
+def _check_nameless(
+    names: Sequence[str],
+    meanings: Mapping[str, Resemblance],
+    values: Values,
+    chosen: Mapping[str, ColumnSource],
+    source: str,
+) -> None:
+    """Ask whether three columns of a steady norm are magnetometers, in a table with references of a field."""
+    of_field = [REFERENCES[name].column for name in ("field", "dip", "azimuth")]
+    if not {*of_field} & {*chosen}:
+        return
+    unused = [n for n in names if n not in meanings]
+    if triples := triples_for(RAW[3:], unused, values, STEADY_NORM):
+        raise QuestionError(
+            f"{source}: no column is a magnetometer by its name, and the table states the field. Are these the "
+            "magnetometers?",
+            [*triples, none_of(*RAW[3:])],
+        )
+
+
 def _check_units_of_triads(chosen: Mapping[str, ColumnSource], source: str) -> None:
     """Refuse channels of a triad, or their standard uncertainties, of which two state different units."""
     for names in CHANNELS.values():
@@ -372,7 +479,8 @@ def _one(column: str, candidates: Sequence[str], values: Values, source: str) ->
     if column in candidates:
         return column
     if column == WARMTH:
-        candidates = [n for n in candidates if not _SURROUNDINGS.search(n)] or candidates
+        of_tool = [n for n in candidates if not _SURROUNDINGS.search(n)] or candidates
+        candidates = [n for n in of_tool if not _CALLED_REFERENCE.search(spelled(n))] or of_tool
     stated = [name for name in candidates if _CALLED_REFERENCE.search(spelled(name))]
     if len(candidates) == 1 or len(stated) == 1:
         return (stated or candidates)[0]

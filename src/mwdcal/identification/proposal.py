@@ -28,7 +28,8 @@ from mwdcal.files.formats.text import is_preamble
 from mwdcal.files.metadata import toml
 from mwdcal.files.profiles import CHOICE_OF_AXES
 from mwdcal.files.runs import check_run, renamed, to_readings
-from mwdcal.files.synonyms import ABOVE, BELOW
+from mwdcal.files.statements import stated_table
+from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
 from mwdcal.identification.columns import meanings_of, proposed
@@ -48,7 +49,7 @@ LAST_PLACES = (0.1, 0.01, 0.001)
 """Units in the last place of angles, degrees."""
 SAME_GRAVITY = 2e-4
 """A local gravity does not differ by more between stations, g; what tools measure does."""
-_OF_AZIMUTHS = ("azimuth_reference", "declination_deg", "convergence_deg")
+_SELDOM = ("ignore", "azimuth_reference", "declination_deg", "convergence_deg")
 MOST_NAMED = 6
 """Alternatives that a message names."""
 
@@ -66,7 +67,8 @@ class Proposal(NamedTuple):
 
     `unused` are columns of the table that are nothing of a run file, `by_value` columns of a run file whose
     unit no name states; `metadata` what the table says of itself; `where` the table was, if it was looked for;
-    `open_axes` the triads of which the run does not tell the axes.
+    `open_axes` the triads of which the run does not tell the axes, `ignored` columns that are called as references
+    and are none, each with the reason.
     """
 
     profile: Profile
@@ -78,6 +80,7 @@ class Proposal(NamedTuple):
     run_sha256: str
     where: Layout | None = None
     open_axes: Mapping[str, OpenAxes] = {}
+    ignored: Mapping[str, str] = {}
 
 
 def propose(
@@ -110,7 +113,7 @@ def propose(
 
     problems: dict[str, str] = {}
     above, stated_north = where.above if where else (), "azimuth_reference" in table.metadata
-    columns, by_value = proposed(
+    columns, by_value, ignored = proposed(
         names,
         units,
         partial(_numbers_of, table, problems),
@@ -120,6 +123,9 @@ def propose(
         answers,
         problems,
     )
+    if ignored:
+        form = msgspec.structs.replace(form or TableFormat(find=True), ignore=tuple(ignored))
+    table = _of_one_tool(table, columns, stated or {})
     profile = Profile(name=Path(path).stem, table=form or msgspec.UNSET, columns=columns)
     profile, readings, wirings, open_axes = _wired(table, profile)
     name, triads = str(readings.metadata.get("serial", Path(path).stem)), _triads(readings, wirings)
@@ -134,7 +140,24 @@ def propose(
         readings.run_sha256,
         where,
         open_axes,
+        ignored,
     )
+
+
+def _of_one_tool(
+    table: Table, columns: Mapping[str, ColumnSource], stated: Mapping[str, object]
+) -> Table:
+    """The rows of one tool, by the serial that the user says where there are several."""
+    column = columns["serial"].name if "serial" in columns else "serial"
+    tools = [*dict.fromkeys(filter(None, labels_of(table, column)))]
+    serial = str(stated.get("serial", ""))
+    if len(tools) > 1 and not serial:
+        raise QuestionError(
+            f"{table.source} has rows of {len(tools)} tools ({', '.join(map(shown, tools[:MOST_NAMED]))}). Which one "
+            "is meant?",
+            [Answer(tool, (("serial", tool),)) for tool in tools],
+        )
+    return stated_table(table, {"serial": serial} if len(tools) > 1 else {}, column)
 
 
 def _numbers_of(table: Table, problems: dict[str, str], name: str) -> Array | None:
@@ -172,6 +195,8 @@ def _wired(
     assert not isinstance(columns, msgspec.UnsetType)
     _check_gravity(readings, columns)
     wirings, open_axes = _wirings(run, readings, scaled)
+    if "magnetometer" in open_axes:
+        _check_sense(run, readings, scaled, columns)
     inclination = columns.get(REFERENCES["inclination"].column)
     elevated = bool(wirings and inclination and inclination.unit == ABOVE)
     if inclination and elevated and all(map(_is_left_handed, wirings.values())):
@@ -339,6 +364,34 @@ def _last_place(angles: Array) -> float:
     return 0.0 if place == LAST_PLACES[0] else float(np.radians(place))
 
 
+def _check_sense(
+    run: Table, readings: Readings, scaled: Profile, columns: Mapping[str, ColumnSource]
+) -> None:
+    """Ask whether the toolface counts anticlockwise, where both triads are told then and not otherwise."""
+    toolface = REFERENCES["toolface"].column
+    source = columns.get(toolface)
+    if not source or source.unit not in ("", "°") or "toolface" not in readings.known:
+        return
+    turned = replace(
+        readings, known={**readings.known, "toolface": -np.asarray(readings.known["toolface"])}
+    )
+    try:
+        wirings, open_axes = _wirings(run, turned, scaled)
+    except FitError:
+        return
+    if len(wirings) == len(TRIADS) and not open_axes:
+        raise QuestionError(
+            f"{run.source}: the readings fit only if {shown(source.name)} counts anticlockwise looking down the hole. "
+            "Does it?",
+            [
+                Answer(
+                    "yes, anticlockwise",
+                    (("column", f"{toolface}={source.name} ({ANTICLOCKWISE})"),),
+                )
+            ],
+        )
+
+
 def _lacking(kind: str, absent: list[str], stations: int) -> str:
     """Why a run does not tell the axes of a triad."""
     if absent:
@@ -414,7 +467,12 @@ def left_handed(proposal: Proposal) -> list[Finding]:
 
 def findings_on(proposal: Proposal) -> list[Finding]:
     """All that the reader of a proposal should know."""
-    return axes_open(proposal) + left_handed(proposal) + unused_columns(proposal.unused)
+    ignored = [
+        Finding(id="not-used", text=f"{shown(name)} is not used: {reason}.")
+        for name, reason in proposal.ignored.items()
+    ]
+    known = axes_open(proposal) + left_handed(proposal)
+    return known + ignored + unused_columns(proposal.unused)
 
 
 def as_toml(proposal: Proposal, source: str) -> str:
@@ -448,9 +506,7 @@ def as_toml(proposal: Proposal, source: str) -> str:
         else:
             fields = {key: fields[key] for key in fields if key not in ("find", "sheet")}
         fields = {
-            key: each
-            for key, each in fields.items()
-            if key not in _OF_AZIMUTHS or each != usual[key]
+            key: each for key, each in fields.items() if key not in _SELDOM or each != usual[key]
         }
         lines += [f"{key} = {toml(value)}" for key, value in fields.items()]
     if not isinstance(profile.columns, msgspec.UnsetType):
@@ -466,7 +522,7 @@ def as_toml(proposal: Proposal, source: str) -> str:
 
 def _open_section(kind: str, axes: OpenAxes, unit: str) -> list[str]:
     """The section of a triad whose axes are to be filled in."""
-    few = [f"#   axes = {toml(each)}" for each in axes.alternatives[:MOST_NAMED]]
+    few = [f"#   {toml(each)}" for each in axes.alternatives[:MOST_NAMED]]
     scale = (
         [f"scale = {axes.scale!r}   # raw units per {unit}, by the readings"] if axes.scale else []
     )
@@ -474,7 +530,7 @@ def _open_section(kind: str, axes: OpenAxes, unit: str) -> list[str]:
         "",
         f"[{kind}]",
         f"# Open: {axes.reason}. The tool axis that each channel measures, with its sign, such as:",
-        *(few or ['#   axes = ["+x", "+y", "+z"]']),
+        *(few or ['#   ["+x", "+y", "+z"]']),
         *(f"# {line}" for line in CHOICE_OF_AXES[kind]),
         "axes = []",
         *scale,

@@ -127,7 +127,7 @@ class TableFormat(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     `header_line` holds the column names, `first_line` the first readings; what stands above and
     between is not read. A workbook has only these two, which count its rows. Where `find` is set, the table is
     looked for by the names of its columns instead, on the sheet named, if any. `azimuth_reference` and its angles are
-    those of tables that do not state them.
+    those of tables that do not state them. `ignore` are columns that are no evidence whatever they are called.
     """
 
     encoding: Literal["utf-8", "utf-16", "cp1252", "cp1251", "gb18030"] = "utf-8"
@@ -140,6 +140,7 @@ class TableFormat(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     azimuth_reference: Literal["", "magnetic", "true", "grid"] = ""
     declination_deg: float | None = None
     convergence_deg: float | None = None
+    ignore: tuple[str, ...] = ()
 
     @property
     def north(self) -> dict[str, object]:
