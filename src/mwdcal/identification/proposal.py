@@ -21,7 +21,7 @@ from mwdcal.files.contract import CHANNELS, MAPPED, REFERENCES, units_of
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, shown
 from mwdcal.files.formats.figures import is_figure
-from mwdcal.files.formats.layout import Layout
+from mwdcal.files.formats.layout import WORKBOOKS, Layout
 from mwdcal.files.formats.table import Table
 from mwdcal.files.formats.table import labels as labels_of
 from mwdcal.files.formats.text import is_preamble
@@ -218,7 +218,8 @@ def _as_written(
 ) -> tuple[Table, TableFormat | None]:
     """The table of a file, and how a profile says it is written: not at all where it is written as documented.
 
-    Where neither that nor a fixed place gives the table of the layout, it is to be looked for whenever it is read.
+    Where neither that nor a fixed place gives the table of the layout, it is to be looked for whenever it is read, and
+    so is that of a workbook.
     """
     if where is None:
         return tables.read(path), None
@@ -226,7 +227,8 @@ def _as_written(
         name for name, m in meanings_of(where.names, where.units).items() if m.column in LABELS
     }
     table = tables.of_layout(where, path, labels)
-    for form in [] if placed else [None, where.form]:
+    workbook = Path(path).suffix.lower() in WORKBOOKS  # to read one twice takes seconds
+    for form in [] if placed else [None] if workbook else [None, where.form]:
         if form or _is_documented(path, where):
             with suppress(InputError):
                 plain = tables.read(path, export=form)
