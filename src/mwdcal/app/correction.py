@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -58,25 +58,27 @@ def apply_to_any(
     decimal: str,
     uncertainty: bool,
     advance: Callable[[int, int], None],
+    statements: Mapping[str, str],
 ) -> tuple[RowCounts, list[Finding], str]:
     """Correct a file into another: part by part, or whole where it is short text or a workbook.
 
     What was seen in the rows, what the reader should know, and the SHA-256 of the readings, empty
     where they were not read as a whole. `advance` gets how much of a long
     table is done, and the whole. An export as the calibration's profile describes it is taken whole, and
-    text that comes of it is written as it is. With `uncertainty` columns of standard uncertainties.
+    text that comes of it is written as it is. With `uncertainty` columns of standard uncertainties. `statements`:
+    serial, date and operator as the user says.
     """
     profile = calibration.profile
     exported = _is_exported(readings, profile, decimal)
     if streaming.in_parts(readings, output) and not exported:
         streamed = streaming.apply_to_file(
             calibration, readings, output, outside, advance,
-            missing=missing, decimal=decimal, uncertainty=uncertainty,
+            missing=missing, decimal=decimal, uncertainty=uncertainty, statements=statements,
         )  # fmt: skip
         return *streamed, ""
     if readings.suffix.lower() in TEXT and (exported or output.suffix.lower() in WHOLE):
         _check_size(readings)
-    source = read_export(readings, profile, decimal=decimal, rows=WHOLE_ROWS)
+    source = read_export(readings, profile, decimal=decimal, rows=WHOLE_ROWS, statements=statements)
     result, tally, findings = apply_to_table(calibration, source, outside, missing, uncertainty)
     if EXTRAPOLATED in result.columns and output.suffix.lower() != ".parquet":
         words = [as_text(bool(mark)) for mark in result.columns[EXTRAPOLATED]]

@@ -45,6 +45,7 @@ from mwdcal.files.formats.columns import check_names, no_stations
 from mwdcal.files.formats.sinks import ParquetSink, Sink, TextSink
 from mwdcal.files.formats.table import Table
 from mwdcal.files.formats.table import numbers as as_numbers
+from mwdcal.files.statements import with_statements
 from mwdcal.files.streams import Part, StreamedTable
 from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, UNCERTAINTIES
 from mwdcal.geometry.vectors import Array, Bools
@@ -107,6 +108,7 @@ def apply_to_file(
     missing: str = "refuse",
     decimal: str = ".",
     uncertainty: bool = True,
+    statements: Mapping[str, str] | None = None,
 ) -> tuple[RowCounts, list[Finding]]:
     """Correct a file into another; what was seen in the rows, and what the reader should know.
 
@@ -115,6 +117,7 @@ def apply_to_file(
     """
     correction.check_outside(outside)
     source = _source(readings, output, rows, decimal)
+    source.metadata.update(with_statements(source.metadata, statements or {}))
     names = correction.result_names(outside, uncertainty)
     _check_header(calibration, source, names)
     pieces = source.pieces()

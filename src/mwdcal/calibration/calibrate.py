@@ -14,7 +14,7 @@ from mwdcal.calibration.automatic.order_selection import Progress
 from mwdcal.calibration.canonical import rounded
 from mwdcal.calibration.diagnosis.findings import described, findings
 from mwdcal.calibration.diagnosis.flags import FittedRuns
-from mwdcal.calibration.diagnosis.identity import dated, unidentified
+from mwdcal.calibration.diagnosis.identity import dated, overdue, unidentified
 from mwdcal.calibration.diagnosis.refusals import UNSOUND_ADVICE, check, fit_refusals
 from mwdcal.calibration.diagnosis.repeats import copies
 from mwdcal.calibration.diagnosis.soundness import inconsistency
@@ -131,6 +131,8 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
         run=readings.source,
         run_sha256=readings.run_sha256,
         prior_sha256=options.prior_sha256 or msgspec.UNSET,
+        settings_file=readings.settings_source[0] or msgspec.UNSET,
+        settings_sha256=readings.settings_source[1] or msgspec.UNSET,
         software=SOFTWARE,
         method=options.method,
         options=_choices(options),
@@ -160,15 +162,17 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
         orders=list(choice.orders),
         station_rows=fitted.residuals(0).stations,
         inherited=list(prior.stations) if prior else [],
-        findings=[*findings(fitted), *_doubts(readings, prior)],
+        findings=[*findings(fitted), *_doubts(choice, prior)],
     )
 
 
-def _doubts(readings: Readings, prior: Knowledge | None) -> list[Finding]:
-    """Findings on the identity of a run and its prior, and on its day."""
+def _doubts(choice: Choice, prior: Knowledge | None) -> list[Finding]:
+    """Findings on the identity of a run and its prior, on its day, and on standards that were overdue then."""
+    readings = choice.readings
     alone = unidentified({readings.name: serial_of(readings.metadata)})
     doubts = [*prior.doubts] if prior and prior.doubts else alone
-    return doubts + dated(readings.metadata, readings.name)
+    late = overdue(choice.profile.standards, readings.metadata)
+    return doubts + dated(readings.metadata, readings.name) + late
 
 
 def _identity(readings: Readings, simulated: bool) -> dict[str, str]:

@@ -242,7 +242,8 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     `excluded` the labels of stations of the run that were left out of the fit, on request or as copies of others;
     `copies` the fingerprints of copies, absent if no station is a copy.
     `serial` is that of the tool, absent where the run states none; `simulated`: of the run or the prior;
-    `prior_sha256` of the file of the prior, absent where there was none.
+    `prior_sha256` of the file of the prior, absent where there was none. `settings_file`, `settings_sha256`: of the
+    laboratory's settings that completed profile or options, absent where there were none.
     `settings`: whether the errors of the stand's direction are "per-direction" or "per-station", or
     "assumed" to be per direction; absent where the stand's direction is exact, and in earlier versions.
     `gravity_stated`: whether the run states gravity at any station; absent in earlier versions.
@@ -260,6 +261,8 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     run: str
     run_sha256: str
     prior_sha256: str | msgspec.UnsetType = msgspec.UNSET
+    settings_file: str | msgspec.UnsetType = msgspec.UNSET
+    settings_sha256: str | msgspec.UnsetType = msgspec.UNSET
     software: str
     method: str
     options: Choices = Choices()

@@ -130,7 +130,8 @@ class TableFormat(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
     `header_line` holds the column names, `first_line` the first readings; what stands above and
     between is not read. A workbook has only these two, which count its rows. Where `find` is set, the table is
-    looked for by the names of its columns instead, on the sheet named, if any.
+    looked for by the names of its columns instead, on the sheet named, if any. `azimuth_reference` and its angles are
+    those of tables that do not state them. `ignore` are columns that are no evidence whatever they are called.
     """
 
     encoding: Literal["utf-8", "utf-16", "cp1252", "cp1251", "gb18030"] = "utf-8"
@@ -140,6 +141,16 @@ class TableFormat(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     first_line: int = 2
     find: bool = False
     sheet: str = ""
+    azimuth_reference: Literal["", "magnetic", "true", "grid"] = ""
+    declination_deg: float | None = None
+    convergence_deg: float | None = None
+    ignore: tuple[str, ...] = ()
+
+    @property
+    def north(self) -> dict[str, object]:
+        """What its azimuths count from, as metadata of a run state it; empty where it is not stated."""
+        keys = ("azimuth_reference", "declination_deg", "convergence_deg")
+        return {key: value for key in keys if (value := getattr(self, key)) not in ("", None)}
 
 
 class ColumnSource(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

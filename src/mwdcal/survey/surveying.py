@@ -21,6 +21,7 @@ from mwdcal.files.contract import REFERENCES, check_columns
 from mwdcal.files.faults import chosen, nothing, spread, wholly_blank, without_reading
 from mwdcal.files.formats.table import Table, cell_error, numbers
 from mwdcal.files.runs import renamed, to_readings
+from mwdcal.files.settings import setting
 from mwdcal.geometry.vectors import Array, Bools
 from mwdcal.sensor.profile import StandProfile
 from mwdcal.survey.acceptance import SurveyLimits, load_survey_limits
@@ -51,6 +52,9 @@ LARGEST_DEPTH = 20_000.0
 _DEPTH_NAMES = re.compile(
     r"(md|dept|((measured|bit|survey|hole|along[ _-]?hole)[ _]?)?depth)[ _]*[\[(]?(m|ft|feet|met(re|er)s?)?[\])]?"
 )
+_DEPTH_UNIT = re.compile(r"(?<![a-z])(m|ft|feet|met(re|er)s?)[\])]?$")
+"""The unit at the end of such a name."""
+_METRES = {"m": 1.0, "ft": 0.3048}
 
 
 @dataclass(frozen=True)
@@ -179,20 +183,15 @@ def with_reference(readings: Readings, reference: EarthReference) -> Readings:
 
 def depths(table: Table) -> Array | None:
     """Measured depths (n,), m, which increase; None where the table has none."""
-    if MEASURED_DEPTH not in table.columns:
-        for name in table.columns:
-            if _DEPTH_NAMES.fullmatch(name.strip().lower()):
-                raise InputError(
-                    f"{table.source}: column '{name}': measured depths must be in metres, in a column "
-                    f"'{MEASURED_DEPTH}'. Rename it, and convert feet (× 0.3048)."
-                )
+    name, factor = _depth_column(table)
+    if not name:
         return None
-    column = table.columns[MEASURED_DEPTH]
-    md = numbers(table, MEASURED_DEPTH) if isinstance(column, list) else column
+    column = table.columns[name]
+    md = factor * (numbers(table, name) if isinstance(column, list) else column)
     wrong = np.flatnonzero((md < 0) | (md > LARGEST_DEPTH))
     if wrong.size:
         problem = f"must be between 0 and {LARGEST_DEPTH:g} m; got {md[wrong[0]]:g}."
-        raise cell_error(table, MEASURED_DEPTH, int(wrong[0]), problem)
+        raise cell_error(table, name, int(wrong[0]), problem)
     there = np.flatnonzero(~np.isnan(md))
     back = there[1:][np.diff(md[there]) < 0]
     if back.size:
@@ -203,7 +202,28 @@ def depths(table: Table) -> Array | None:
 def not_deeper(table: Table, row: int, depth: float) -> InputError:
     """A measured depth that is not beyond that of the station before."""
     problem = f"must not decrease from station to station; got {depth:g}. Sort the stations by measured depth."
-    return cell_error(table, MEASURED_DEPTH, row, problem)
+    return cell_error(table, _depth_column(table)[0], row, problem)
+
+
+def _depth_column(table: Table) -> tuple[str, float]:
+    """The column of measured depths, and metres per its unit; blank where there is none.
+
+    One that states no unit is in the laboratory's unit of length, where a command runs with its settings.
+    """
+    if MEASURED_DEPTH in table.columns:
+        return MEASURED_DEPTH, 1.0
+    for name in table.columns:
+        if _DEPTH_NAMES.fullmatch(name.strip().lower()):
+            stated = _DEPTH_UNIT.search(name.strip().lower())
+            unit = "" if stated else setting("length_unit")
+            if unit:
+                return name, _METRES[unit]
+            raise InputError(
+                f"{table.source}: column '{name}': measured depths must be in metres, in a column "
+                f"'{MEASURED_DEPTH}'. Rename it, and convert feet (× 0.3048); or state length_unit in mwdcal.toml, "
+                "which columns without a unit are in."
+            )
+    return "", 1.0
 
 
 def surveyed_table(table: Table, well: Well, rows: Bools | None = None) -> Table:

@@ -22,6 +22,7 @@ from mwdcal.presentation.text import one_line
     default=True,
     help="Columns with the standard uncertainty of each angle and strength. Without them long tables are faster.",
 )
+@options.of_run
 @options.DECIMAL
 @options.TRUSTED_KEYS
 @options.JSON
@@ -50,8 +51,9 @@ def command(
     fitted = loaded.calibration
     with offering_blank(), bar("correcting") as advance:
         tally, findings, readings_digest = apply_to_any(
-            fitted, readings, output, outside, missing, decimal, uncertainty, advance
-        )
+            fitted, readings, output, outside, missing, decimal, uncertainty, advance,
+            options.statements(),
+        )  # fmt: skip
     findings = loaded.findings + findings
     blank, terms = tally.blank(outside), reading_terms(fitted)
     document = enveloped(

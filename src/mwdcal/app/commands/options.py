@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterable
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
 from unicodedata import normalize
 
 import click
+from click.core import ParameterSource
 
 from mwdcal.app.messages import Command
 from mwdcal.errors import InputError
@@ -97,6 +99,43 @@ RESULT = output(
 )
 
 
+STATEMENTS = "mwdcal.statements"
+"""Where the context of a command has what the user says of a run."""
+
+
+def _note(context: click.Context, option: click.Parameter, typed: Any) -> None:
+    """Note what the user says of a run."""
+    if typed is not None:
+        said = typed.date().isoformat() if isinstance(typed, datetime) else str(typed).strip()
+        context.meta.setdefault(STATEMENTS, {})[str(option.name)] = said
+
+
+def of_run(function: Function) -> Function:
+    """The options with which a user says of a run what its table does not, or otherwise."""
+    noted = partial(click.option, callback=_note, expose_value=False)
+    for option in (
+        noted("--operator", metavar="NAME", help="Who measured; comes before the table's own."),
+        noted(
+            "--date",
+            type=click.DateTime(["%Y-%m-%d"]),
+            metavar="YYYY-MM-DD",
+            help="Day of the run; likewise.",
+        ),
+        noted(
+            "--serial",
+            metavar="S",
+            help="Serial of the tool; of several in the table, the one to take.",
+        ),
+    ):
+        function = option(function)
+    return function
+
+
+def statements() -> dict[str, str]:
+    """Serial, date and operator as the user says."""
+    return dict(click.get_current_context().meta.get(STATEMENTS, {}))
+
+
 def number(name: str, metavar: str, text: str, *variable: str) -> Decorator:
     """An option with a number; `variable` where it is not named as the option."""
     return click.option(name, *variable, type=NUMBER, metavar=metavar, help=text)
@@ -181,7 +220,8 @@ def database(**more: Any) -> Decorator:
 def _named_registry(context: click.Context, option: click.Parameter, typed: str | None) -> str:
     """The registry that a subcommand, its group or the environment names."""
     group = context.parent.params.get(option.name) if context.parent and option.name else None
-    named = typed or group
+    of_settings = context.get_parameter_source(option.name or "") is ParameterSource.DEFAULT_MAP
+    named = (group or typed) if of_settings else (typed or group)
     if not named and not context.resilient_parsing:
         raise InputError(f"--database must name the registry; got none. Or set ${REGISTRY}.")
     return named or ""

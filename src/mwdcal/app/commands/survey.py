@@ -76,6 +76,7 @@ if TYPE_CHECKING:
 @click.option(
     "--html", type=options.FILE, metavar="S.html", help="Also write a page with the pictures."
 )
+@options.of_run
 @options.DECIMAL
 @options.TRUSTED_KEYS
 @options.JSON
@@ -110,28 +111,20 @@ def command(
     start, ends = _tie_in(tie_in), _switch(switch)
     loaded = load_calibration(calibration, key)
     fitted = loaded.calibration
-    if not (msa or html or missing == "blank") and long_table.in_parts(
-        readings, output, fitted.profile
-    ):
+    said = options.statements()
+    whole = msa or html or missing == "blank" or said
+    if not whole and long_table.in_parts(readings, output, fitted.profile):
         result = long_table.survey_file(
             fitted, readings, output, reference, limits, start, ends, outside, decimal,
             loaded.digest, loaded.findings, error_model,
         )  # fmt: skip
         _print(result, loaded.signature, (str(output), ""), as_json)
         return
-    table = read_export(readings, fitted.profile, decimal=decimal, rows=MOST_ROWS)
+    table = read_export(readings, fitted.profile, decimal=decimal, rows=MOST_ROWS, statements=said)
     with offering_blank():
         inputs = well_inputs(
-            fitted,
-            table,
-            reference,
-            limits,
-            msa,
-            loaded.digest,
-            loaded.findings,
-            error_model,
-            missing,
-        )
+            fitted, table, reference, limits, msa, loaded.digest, loaded.findings, error_model, missing,
+        )  # fmt: skip
     analysis = analysed(inputs, sensor_drift) if msa else None
     pages = _interference_page(inputs, analysis, msa_html)
     if analysis and not analysis.summary.separable:
