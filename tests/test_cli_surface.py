@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 
@@ -28,6 +29,8 @@ from mwdcal.app.cli import cli
 from mwdcal.app.commands import Group, options
 from mwdcal.errors import InputError
 from mwdcal.files import documents
+from mwdcal.library.drifts import limits_of
+from mwdcal.presentation.plan import wanted_accuracy
 from mwdcal.use.correction import OUTSIDE
 from schemas import of_calibration_files
 
@@ -555,9 +558,9 @@ def failing(sampling_hz, start, log):
 
 def test_a_wrong_value_of_any_length_stays_short():
     """What a message repeats of a value that nobody can have meant is cut."""
-    done = mwdcal("registry", "drift", "tools.sqlite", "--today", "x" * 5_000)
+    done = mwdcal("registry", "drift", "tools.sqlite", "--date", "x" * 5_000)
     assert done.code == 2
-    assert "--today" in done.err
+    assert "--date" in done.err
     assert "%Y-%m-%d" in done.err
     assert len(done.err) < 1_000
 
@@ -630,3 +633,38 @@ def test_completion_in_a_group_offers_its_commands_and_what_the_default_takes(ty
     *words, incomplete = typed.split(" ")
     items = ShellComplete(cli, {}, "mwdcal", "").get_completions(words, incomplete)
     assert {*offered} <= {item.value for item in items}
+
+
+OLD_NAMES = {
+    "plan": {"--html": "--report"},
+    "survey": {"--html": "--report"},
+    "registry": {"--database": "--registry"},
+    "registry list": {"--database": "--registry"},
+    "registry drift": {"--html": "--report", "--today": "--date", "--database": "--registry"},
+    "certificate sign": {"--key": "--private-key"},
+}
+"""Names of options before they were unified, by command."""
+
+
+@pytest.mark.parametrize("command", OLD_NAMES)
+def test_old_names_of_options_are_taken_and_hidden(command):
+    found = {**commands(), **cli.commands}[command]
+    shown = mwdcal(*command.split(), "--help").out
+    for old, new in OLD_NAMES[command].items():
+        context = click.Context(found)
+        parser = found.make_parser(context)
+        values = [parser.parse_args([name, "x.file"])[0] for name in (old, new)]
+        assert values[0] == values[1] != {}
+        assert new in shown
+        assert not re.search(rf"{old}\b", shown)
+        assert old not in [item.value for item in found.shell_complete(context, "--")]
+
+
+def test_a_hidden_page_of_the_analysis_stays_for_one_release():
+    option = next(o for o in commands()["survey"].params if o.name == "msa_html")
+    assert option.hidden
+
+
+def test_angles_of_limits_and_accuracies_have_their_unit_in_their_name():
+    for typed, read in ((wanted_accuracy, {"azimuth": 0.1}), (limits_of, {"azimuth": 0.1})):
+        assert typed(["azimuth_deg=0.1"]) == typed(["azimuth=0.1"]) == read

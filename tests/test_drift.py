@@ -699,7 +699,7 @@ def test_comparing_reports_its_progress(years, tmp_path):
         for number, calibration in enumerate(years[serial]):
             documents.write(tmp_path / "files" / f"{serial}-{number}.json", calibration)
     database = tmp_path / "tools.sqlite"
-    where = ("--database", database)
+    where = ("--registry", database)
     assert mwdcal("registry", "init", *where).code == 0
     assert mwdcal("registry", "add", tmp_path / "files", *where, "--workers", "1").code == 0
     for serial, total in ((None, 2), ("T-1", 1)):
@@ -720,7 +720,7 @@ def test_the_command_reads_a_registry(years, tmp_path):
     for serial, each in years.items():
         for number, calibration in enumerate(each):
             documents.write(tmp_path / "files" / f"{serial}-{number}.json", calibration)
-    where = ("--database", tmp_path / "tools.sqlite")
+    where = ("--registry", tmp_path / "tools.sqlite")
     assert mwdcal("registry", "init", *where).code == 0
     assert mwdcal("registry", "add", tmp_path / "files", *where, "--workers", "1").code == 0
     one = mwdcal("registry", "drift", "T-1", *where, "--json").json

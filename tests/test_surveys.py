@@ -427,7 +427,7 @@ def test_every_quantity_has_a_source_on_screen_page_table_and_in_json(example, t
     assert told["reference_sha256"]
     out, page = tmp_path / "again.csv", tmp_path / "s.html"
     screen = cli(
-        "survey", example, tmp_path / "in.csv", "--reference", file, "-o", out, "--html", page
+        "survey", example, tmp_path / "in.csv", "--reference", file, "-o", out, "--report", page
     ).out
     line = (
         "gravity, declination: table   field: table at 32 of 36 rows, else reference   "
@@ -482,7 +482,7 @@ def test_an_uncertainty_of_declination_that_cannot_be_is_refused(example, tmp_pa
 def test_nothing_states_an_uncertainty_without_what_it_leaves_out(example, tmp_path):
     out, page = tmp_path / "out.csv", tmp_path / "s.html"
     source = EXAMPLE / "well.csv"
-    ran = cli("survey", example, source, "-o", out, "--html", page)
+    ran = cli("survey", example, source, "-o", out, "--report", page)
     left_out = ("interference of the drill string", "drift of the sensors", "sag", "measured depth")
     document = cli("survey", example, source, "-o", out, "--json").json
     for told in (ran.out, page.read_text("utf-8"), out.read_text("utf-8")):
@@ -720,7 +720,7 @@ def test_msa_takes_axial_interference_off(example, tmp_path):
     assert plain["rejected"] > 20
     assert plain["interference"] is plain["separable"] is None
     ran = cli(
-        "survey", example, source, "-o", out, "--msa", "--json", "--msa-html", tmp_path / "m.html"
+        "survey", example, source, "-o", out, "--msa", "--json", "--report", tmp_path / "m.html"
     )
     assert ran.code == 0, ran
     size = ran.json["interference"]
@@ -741,14 +741,14 @@ def test_msa_takes_axial_interference_off(example, tmp_path):
 def test_results_say_whether_interference_was_taken_off(example, tmp_path):
     source, out, page = with_iron(tmp_path, 1500), tmp_path / "out.csv", tmp_path / "s.html"
     for options, corrected in (((), False), (("--msa",), True)):
-        ran = cli("survey", example, source, "-o", out, "--html", page, "--json", *options)
+        ran = cli("survey", example, source, "-o", out, "--report", page, "--json", *options)
         ids = {finding["id"] for finding in ran.json["findings"]}
         shown = " ".join(page.read_text("utf-8").split())
         assert ("interference-corrected" in ids) is corrected
         assert ("corrected for interference" in out.read_text("utf-8")) is corrected
         assert ("Not in it: interference of the drill string" in shown) is not corrected
         assert "judged by all three together" in shown
-    cli("survey", example, source, "-o", out, "--html", page, "--limits", "fixed")
+    cli("survey", example, source, "-o", out, "--report", page, "--limits", "fixed")
     assert "judged by all three together" not in " ".join(page.read_text("utf-8").split())
 
 
@@ -836,7 +836,7 @@ def test_what_is_accepted_is_what_the_tests_accept():
 def test_acceptance_that_is_blind_says_so_by_survey(example, tmp_path):
     source, out, page = (tmp_path / name for name in ("iron.csv", "out.csv", "s.html"))
     with_iron(tmp_path, 600, np.radians(90), np.radians(90))
-    ran = cli("survey", example, source, "-o", out, "--html", page)
+    ran = cli("survey", example, source, "-o", out, "--report", page)
     document = cli("survey", example, source, "-o", out, "--json").json
     columns = read_csv(out)
     assert document["accepted"] == document["blind"] == len(columns["accepted"]) == 30
@@ -880,17 +880,26 @@ def test_msa_near_horizontal_east_west_is_refused(example, tmp_path):
     assert cli("survey", example, north, "-o", out, "--msa", "--json").json["separable"] is True
 
 
-def test_page_of_the_analysis_goes_with_it(example, tmp_path):
-    ran = cli(
-        "survey",
-        example,
-        EXAMPLE / "well.csv",
-        "-o",
-        tmp_path / "o.csv",
-        "--msa-html",
-        tmp_path / "m.html",
+def test_the_page_shows_the_analysis_of_msa_alone(example, tmp_path):
+    line = ("survey", example, EXAMPLE / "well.csv", "-o", tmp_path / "o.csv")
+    page, alone = tmp_path / "s.html", tmp_path / "m.html"
+    assert cli(*line, "--report", page).code == 0
+    assert "Interference of the drill string" not in page.read_text("utf-8")
+    north = with_iron(tmp_path, 1500, np.radians(60), np.radians(10))
+    assert (
+        cli(
+            "survey", example, north, *line[3:], "--msa", "--report", page, "--msa-html", alone
+        ).code
+        == 0
     )
-    assert "--msa" in refused(ran, 2)
+    whole, part = (path.read_text("utf-8") for path in (page, alone))
+    assert whole.count("Interference of the drill string") == 1
+    ids = re.findall(r'<section id="([^"]+)"', whole)
+    assert len(ids) == len({*ids})
+    assert {f"analysis-{name}" for name in re.findall(r'<section id="([^"]+)"', part)[1:-1]} < {
+        *ids
+    }
+    assert "--msa" in refused(cli(*line, "--msa-html", alone), 2)
 
 
 # ------------------------------------------------------------------ sensor terms

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, TypeVar
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.comparison.compare import Comparison
+from mwdcal.errors import InputError
 from mwdcal.faults.diagnosis import Diagnosis
 from mwdcal.files import documents, runs
 from mwdcal.files.formats import atomic
@@ -33,11 +34,17 @@ class Inputs(NamedTuple):
 
     metadata: tuple[Mapping[str, object], ...] = ()
     digests: Mapping[str, str] = {}
+    calibration: Calibration | None = None
 
 
-def with_inputs(result: _Shown, *metadata: Mapping[str, object], **digests: str) -> _Shown:
-    """A result that knows what it was made of; equal to the one without."""
-    result.__dict__[_INPUTS] = Inputs(metadata, digests)
+def with_inputs(
+    result: _Shown,
+    *metadata: Mapping[str, object],
+    of: Calibration | None = None,
+    **digests: str,
+) -> _Shown:
+    """A result that knows its inputs, and the calibration that its page shows; equal to the one without."""
+    result.__dict__[_INPUTS] = Inputs(metadata, digests, of)
     return result
 
 
@@ -54,7 +61,7 @@ def _inputs(result: Any) -> Inputs:
 def _enveloped(command: str, result: Any, content: object) -> dict[str, Any]:
     from mwdcal.presentation.envelope import enveloped
 
-    metadata, digests = _inputs(result)
+    metadata, digests, _ = _inputs(result)
     return enveloped(command, content, *metadata, **digests)
 
 
@@ -86,6 +93,17 @@ def _verdict_document(verdict: Verdict) -> dict[str, Any]:
     return _enveloped("verify", verdict, verdict)
 
 
+def _verdict_page(verdict: Verdict) -> str:
+    from mwdcal.presentation.calibration_page import render
+
+    metadata, _, calibration = _inputs(verdict)
+    if calibration is None:
+        raise InputError(
+            "a verdict read from a file has no page. Verify again by mwdcal.verify(…)."
+        )
+    return render(calibration, verdict, *metadata)
+
+
 def _diagnosis_text(diagnosis: Diagnosis) -> str:
     from mwdcal.presentation.diagnosis import screen
 
@@ -94,6 +112,13 @@ def _diagnosis_text(diagnosis: Diagnosis) -> str:
 
 def _diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
     return _enveloped("diagnose", diagnosis, diagnosis)
+
+
+def _diagnosis_page(diagnosis: Diagnosis) -> str:
+    from mwdcal.presentation.diagnosis import render
+
+    metadata, digests, _ = _inputs(diagnosis)
+    return render(diagnosis, digests, *metadata)
 
 
 def _comparison_text(comparison: Comparison) -> str:
@@ -169,7 +194,7 @@ def _show(
     kind: type,
     text: Callable[[Any], str],
     document: Callable[[Any], dict[str, Any]],
-    page: Callable[[Any], str] | None,
+    page: Callable[[Any], str],
 ) -> None:
     """Put `summary`, `to_dict`, `report` and a short `repr` on a class."""
 
@@ -183,7 +208,6 @@ def _show(
 
     def report(self: object, path: str | os.PathLike[str]) -> None:
         """Write the page of the command: self-contained HTML."""
-        assert page
         atomic.write(os.fspath(path), page(self))
 
     def short(self: object) -> str:
@@ -192,8 +216,9 @@ def _show(
     def html(self: object) -> str:
         return f"<pre>{escape(text(self))}</pre>"
 
-    methods: dict[str, Callable[..., object]] = {"summary": summary, "to_dict": to_dict}
-    methods |= {"report": report} if page else {}
+    methods: dict[str, Callable[..., object]] = {
+        "summary": summary, "to_dict": to_dict, "report": report,
+    }  # fmt: skip
     methods |= {} if "_repr_html_" in vars(kind) else {"__repr__": short, "_repr_html_": html}
     for name, method in methods.items():
         setattr(kind, name, method)
@@ -202,8 +227,8 @@ def _show(
 Readings.columns = property(_columns)  # type: ignore[assignment]
 Readings.to_pandas = _to_pandas  # type: ignore[attr-defined]
 _show(Calibration, _calibration_text, _calibration_document, _calibration_page)
-_show(Verdict, _verdict_text, _verdict_document, None)
-_show(Diagnosis, _diagnosis_text, _diagnosis_document, None)
+_show(Verdict, _verdict_text, _verdict_document, _verdict_page)
+_show(Diagnosis, _diagnosis_text, _diagnosis_document, _diagnosis_page)
 _show(Comparison, _comparison_text, _comparison_document, _comparison_page)
 _show(Noise, _noise_text, _noise_document, _noise_page)
 _show(Stations, _stations_text, _stations_document, _stations_page)

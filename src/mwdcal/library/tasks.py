@@ -205,8 +205,7 @@ def compare(
     _check_readings(run)
     given = with_choices(options, choices)
     result = compare_methods(run, _profile(run, profile), given, progress=progress)
-    digests = {"run": run.run_sha256, "profile": run.profile_sha256}
-    return with_inputs(result, run.metadata, **digests)
+    return with_inputs(result, run.metadata, run=run.run_sha256, profile=run.profile_sha256)
 
 
 def verify(
@@ -227,7 +226,7 @@ def verify(
     verdict = msgspec.structs.replace(verdict, findings=findings)
     digests = {"calibration": digest_of(calibration), "limits": digest}
     stated = calibration.tool, rolltest.metadata
-    return with_inputs(verdict, *stated, run=rolltest.run_sha256, **digests)
+    return with_inputs(verdict, *stated, of=calibration, run=rolltest.run_sha256, **digests)
 
 
 def diagnose(calibration: Calibration, later: Readings) -> Diagnosis:
@@ -243,8 +242,8 @@ def diagnose(calibration: Calibration, later: Readings) -> Diagnosis:
     result = explain(calibration, later)
     findings = [*calibration.change_findings(), *result.findings, *unused_columns(later.unused)]
     result = msgspec.structs.replace(result, findings=findings)
-    digests = {"calibration": digest_of(calibration), "readings": later.run_sha256}
-    return with_inputs(result, calibration.tool, later.metadata, **digests)
+    stated, digest = (calibration.tool, later.metadata), digest_of(calibration)
+    return with_inputs(result, *stated, calibration=digest, readings=later.run_sha256)
 
 
 @dataclass(frozen=True)

@@ -218,7 +218,7 @@ class WellSurvey(Result):
         from mwdcal.presentation.survey_page import render
 
         well = self.surveyed.well
-        return render(well, well.findings, self.surveyed.inputs.named)
+        return render(well, well.findings, self.surveyed.inputs.named, self.surveyed.analysis)
 
     def msa_report(self, path: FilePath) -> None:
         """Write the page of the multi-station analysis.

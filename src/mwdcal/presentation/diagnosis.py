@@ -1,14 +1,16 @@
-"""A diagnosis on the screen: the verdict, what moved, how likely each fault is, what to do next."""
+"""A diagnosis on the screen and as a page: the verdict, what moved, how likely each fault is, what to do next."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
-from mwdcal.calibration.readings import simulated
+from mwdcal import __version__
+from mwdcal.calibration.readings import is_simulated, serial_of, simulated
 from mwdcal.faults.diagnosis import Diagnosis, Rival
 from mwdcal.faults.likelihood import FALSE_ALARMS
 from mwdcal.faults.physics import NONE, SURROUNDINGS
-from mwdcal.presentation.numbers import estimate, measured
+from mwdcal.presentation.numbers import capital, estimate, measured
+from mwdcal.presentation.page import banner, environment
 from mwdcal.presentation.text import chance, number, one_line, plural, table
 
 MEANINGS = {
@@ -37,6 +39,8 @@ NOT_YET = "do not judge the tool by these readings alone"
 """What to do where no single fault explains readings, of surveys, and where a sound tool is not excluded."""
 LEAST_LIKELIHOOD = 0.0005
 """Likelihoods below are shown as less than this."""
+MOVED_TITLES = ["moved", "channel", "by", "1σ", "unit"]
+"""Titles of the table of sizes of a fault."""
 
 
 def screen(result: Diagnosis, *metadata: Mapping[str, object]) -> str:
@@ -44,10 +48,34 @@ def screen(result: Diagnosis, *metadata: Mapping[str, object]) -> str:
     head = [verdict(result), result.run, plural(result.stations, "station"), *simulated(*metadata)]
     parts = ["   ".join(one_line(text) for text in head)]
     if result.parameters:
-        parts.append(_moved(result))
-    parts.append(_likelihoods(result))
+        parts.append(table(_moved(result), MOVED_TITLES))
+    parts.append(table(_likelihoods(result), ["", "likelihood"]))
     parts.append("\n".join(one_line(line) for line in _last(result)))
     return "\n\n".join(parts)
+
+
+def render(result: Diagnosis, sha256: Mapping[str, str], *metadata: Mapping[str, object]) -> str:
+    """The diagnosis as HTML; `sha256` of the calibration and the readings, `metadata` as of the screen."""
+    sound = result.fault == NONE
+    certain = sound and not any(finding.id == "unexplained" for finding in result.findings)
+    word, level = ("OK", "good") if certain else ("Attention", "attention" if sound else "bad")
+    return (
+        environment()
+        .get_template("diagnosis.html")
+        .render(
+            result=result,
+            serial=next(filter(None, map(serial_of, metadata)), None),
+            simulated=any(map(is_simulated, metadata)),
+            banner=banner(level, word, capital(verdict(result)), f"{capital(next_step(result))}."),
+            findings=result.findings,
+            moved=_moved(result),
+            moved_titles=MOVED_TITLES,
+            likelihoods=_likelihoods(result),
+            last=_last(result)[:-1],
+            sha256=sha256,
+            version=__version__,
+        )
+    )
 
 
 def verdict(result: Diagnosis) -> str:
@@ -88,20 +116,18 @@ def _size(size: float, uncertainty: float | None, unit: str | None) -> str:
     return estimate(size, uncertainty, unit or "")
 
 
-def _moved(result: Diagnosis) -> str:
-    """Table of all sizes of the fault."""
-    rows = [
+def _moved(result: Diagnosis) -> list[list[str]]:
+    """All sizes of the fault."""
+    return [
         [row.parameter, row.channel or "", *measured(row.size, row.uncertainty), row.unit]
         for row in result.parameters
     ]
-    return table(rows, ["moved", "channel", "by", "1σ", "unit"])
 
 
-def _likelihoods(result: Diagnosis) -> str:
-    """Table of all faults, the most likely first."""
+def _likelihoods(result: Diagnosis) -> list[list[str]]:
+    """All faults, the most likely first."""
     ordered = sorted(result.likelihoods.items(), key=lambda pair: -pair[1])
-    rows = [[f"{name}: {MEANINGS[name]}", _share(share)] for name, share in ordered]
-    return table(rows, ["", "likelihood"])
+    return [[f"{name}: {MEANINGS[name]}", _share(share)] for name, share in ordered]
 
 
 def _share(share: float) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,7 +19,6 @@ from mwdcal.presentation.survey import (
     direction_rows,
     misfit_in_words,
 )
-from mwdcal.presentation.survey_page import LARGEST_DRAWN_SD
 from mwdcal.presentation.text import plural
 from mwdcal.survey.interference import Interference, InterferenceStation, MultiStationAnalysis
 from mwdcal.use import plots
@@ -28,6 +27,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+LARGEST_DRAWN_SD = 2.0
+"""Standard uncertainty up to which an angle is drawn, degrees: near vertical that of azimuth grows without end."""
 MOST_CORRECTED_OF_PAGE = 2000
 """Surveys in the table of a page."""
 
@@ -35,7 +36,6 @@ MOST_CORRECTED_OF_PAGE = 2000
 def render(result: Interference, sha256: Mapping[str, str]) -> str:
     """The analysis as HTML; `sha256` of the files it comes from, by what these are."""
     summary, stated = result.summary, (result.readings.metadata, result.calibration.tool)
-    rows = corrected_rows(summary, MOST_CORRECTED_OF_PAGE)
     return (
         environment()
         .get_template("interference.html")
@@ -47,19 +47,29 @@ def render(result: Interference, sha256: Mapping[str, str]) -> str:
             simulated=any(map(is_simulated, stated)),
             banner=_banner(summary),
             findings=summary.findings,
-            directions=direction_rows(summary),
-            direction_titles=DIRECTION_TITLES,
-            misfit=misfit_in_words(summary),
             terms=result.terms.sentence,
-            strengths=draw_strengths(summary),
-            azimuths=draw_azimuths(summary),
-            titles=CORRECTED_TITLES,
-            rows=rows,
-            more=len(summary.station_rows) - len(rows),
+            analysis=sections(result),
             sha256=sha256,
             version=__version__,
         )
     )
+
+
+def sections(result: Interference) -> dict[str, Any]:
+    """The analysis as `interference_sections` of the templates show it."""
+    summary = result.summary
+    rows = corrected_rows(summary, MOST_CORRECTED_OF_PAGE)
+    return {
+        "summary": summary,
+        "directions": direction_rows(summary),
+        "direction_titles": DIRECTION_TITLES,
+        "misfit": misfit_in_words(summary),
+        "strengths": draw_strengths(summary),
+        "azimuths": draw_azimuths(summary),
+        "titles": CORRECTED_TITLES,
+        "rows": rows,
+        "more": len(summary.station_rows) - len(rows),
+    }
 
 
 def _banner(summary: MultiStationAnalysis) -> dict[str, str]:

@@ -91,30 +91,30 @@ class PlanDocument(PlanSummary, frozen=True, kw_only=True):
 
 
 def wanted_accuracy(words: Sequence[str]) -> dict[str, float]:
-    """Accuracies such as azimuth=0.1 as numbers, degrees, by angle."""
+    """Accuracies such as azimuth_deg=0.1 as numbers, degrees, by angle."""
     wanted = {}
     for word in words:
-        name, _, value = word.partition("=")
+        name, _, value = word.replace("_deg=", "=").partition("=")
         try:
             wanted[name] = float(value)
         except ValueError:
             wanted[name] = np.nan
         if not 0 < wanted[name] < 180:
-            raise InputError(f"`accuracy` must be such as azimuth=0.1, in degrees; got {word!r}.")
+            raise InputError(f"`accuracy` must be such as azimuth_deg=0.1; got {word!r}.")
     return wanted
 
 
 def reach(words: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """What a stand reaches, such as inclination=0:120, as the least and the largest setting by angle, degrees."""
+    """The reach of a stand, such as inclination_deg=0:120, as the least and the largest setting by angle, degrees."""
     ends = {}
     for word in words:
-        name, _, limits = word.partition("=")
+        name, _, limits = word.replace("_deg=", "=").partition("=")
         low, _, high = limits.partition(":")
         try:
             ends[name] = float(low), float(high)
         except ValueError:
             raise InputError(
-                f"`reach` must be such as inclination=0:120, in degrees; got {word!r}."
+                f"`reach` must be such as inclination_deg=0:120; got {word!r}."
             ) from None
     return ends
 

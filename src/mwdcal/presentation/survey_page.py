@@ -14,6 +14,7 @@ from mwdcal import __version__
 from mwdcal.calibration.readings import is_simulated, serial_of
 from mwdcal.calibration.record import Finding
 from mwdcal.geometry.vectors import Array, wrap
+from mwdcal.presentation.interference_page import LARGEST_DRAWN_SD, sections
 from mwdcal.presentation.page import banner, environment
 from mwdcal.presentation.survey import (
     SurveySummary,
@@ -25,6 +26,7 @@ from mwdcal.presentation.survey import (
 )
 from mwdcal.presentation.text import plural
 from mwdcal.survey.acceptance import SURVEY_UNITS
+from mwdcal.survey.interference import Interference
 from mwdcal.survey.well import Position, Well
 from mwdcal.use.plots import AFTER, BAND, BEFORE, MARKED, SERIES, new_figure, style
 
@@ -37,8 +39,6 @@ ELLIPSE_SDS = 2.0
 """Standard deviations of the ellipses of position."""
 ELLIPSE_SHARE = 0.08
 """Largest half axis of an ellipse as a share of the path."""
-LARGEST_DRAWN_SD = 2.0
-"""Standard uncertainty up to which an angle is drawn, degrees: near vertical that of azimuth grows without end."""
 MOST_ELLIPSES = 12
 """Ellipses of position on a map."""
 MOST_MARKS = 400
@@ -240,8 +240,13 @@ MOST_ROWS_OF_PAGE = 2000
 """Surveys in the table of a page."""
 
 
-def render(well: Well, findings: list[Finding], sha256: Mapping[str, str]) -> str:
-    """The surveys as HTML; `sha256` of the files they come from, by what these are."""
+def render(
+    well: Well,
+    findings: list[Finding],
+    sha256: Mapping[str, str],
+    analysis: Interference | None = None,
+) -> str:
+    """The surveys as HTML, with a multi-station analysis; `sha256` of the files they come from, by what these are."""
     facts = summary(well, "", "")
     stated = well.readings.metadata, well.calibration.tool
     header, rows = survey_rows(well, MOST_ROWS_OF_PAGE)
@@ -267,6 +272,7 @@ def render(well: Well, findings: list[Finding], sha256: Mapping[str, str]) -> st
             end=end_in_words(facts.end, facts.north) if facts.end else "",
             header=header,
             rows=rows,
+            analysis=sections(analysis) if analysis else None,
             more=facts.rows - len(rows),
             calibration=well.calibration.run_name,
             sha256=sha256,

@@ -42,7 +42,7 @@ def command() -> None:
 
     \b
     Examples: mwdcal certificate tool.json -o certificate.json
-              mwdcal certificate sign certificate.json --key laboratory.key
+              mwdcal certificate sign certificate.json --private-key laboratory.key
               mwdcal certificate verify certificate.json --key laboratory.key.pub
     """
 
@@ -134,8 +134,14 @@ def _folder(outputs: Sequence[Path]) -> Path:
 
 @options.command()
 @options.argument("document")
-@click.option(
-    "--key", type=options.FILE, required=True, metavar="K", help="Private key that signs."
+@options.renamed(
+    "--private-key",
+    "key",
+    old=("--key",),
+    type=options.FILE,
+    required=True,
+    metavar="K",
+    help="Private key that signs.",
 )
 @click.option(
     "-o",
@@ -156,7 +162,7 @@ def sign(document: Path, key: Path, output: Path | None, replace: bool, as_json:
     SHA-256 of its file.
 
     \b
-    Example: mwdcal certificate sign certificate.json --key laboratory.key
+    Example: mwdcal certificate sign certificate.json --private-key laboratory.key
     Exit: 0 signed, 2 input cannot be read or is signed already, 3 it was changed before.
     """
     from mwdcal.app.commands.certificate_keys import known

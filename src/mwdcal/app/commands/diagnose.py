@@ -15,11 +15,12 @@ from mwdcal.presentation.typed import findings_as_typed
 @options.CALIBRATION
 @options.argument("readings")
 @options.RESULT
+@options.report()
 @options.DECIMAL
 @options.JSON
 def command(
-    calibration: Path, readings: Path, output: Path | None, decimal: str, as_json: bool
-) -> None:
+    calibration: Path, readings: Path, output: Path | None, report: Path | None, decimal: str, as_json: bool
+) -> None:  # fmt: skip
     """Say which fault, if any, later READINGS of the tool of a CALIBRATION show.
 
     READINGS are a roll test or surveys, a run file with the references that are known, or none.
@@ -35,11 +36,11 @@ def command(
     from mwdcal.faults.physics import NONE
     from mwdcal.files import runs
     from mwdcal.files.formats import atomic
-    from mwdcal.presentation.diagnosis import screen
+    from mwdcal.presentation.diagnosis import render, screen
     from mwdcal.presentation.envelope import enveloped
     from mwdcal.registry.calibration_source import calibration_of
 
-    options.check_outputs([output], [calibration, readings])
+    options.check_outputs([output], [calibration, readings], page=report)
     fitted, digest = calibration_of(calibration)
     later, _ = runs.read_run(readings, fitted.profile, decimal=decimal)
     result = diagnose(fitted, later)
@@ -50,6 +51,7 @@ def command(
     stated = fitted.tool, later.metadata
     digests = {"calibration": digest, "readings": later.run_sha256}
     document = enveloped("diagnose", result, *stated, **digests)
-    atomic.write_all([(output, to_json(document) + "\n")])
+    page = render(result, digests, *stated) if report else ""
+    atomic.write_all([(output, to_json(document) + "\n"), (report, page)])
     print_result(document if as_json else screen(result, *stated), findings)
     sys.exit(0 if result.fault == NONE else 1)

@@ -35,6 +35,20 @@ class PointedNumber(click.types.FloatParamType):
         return super().convert(value, param, ctx)
 
 
+class Renamed(click.Option):
+    """An option that is still taken by its `old` names, which neither help nor completion shows."""
+
+    def __init__(self, *arguments: Any, old: tuple[str, ...], **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.old = old
+
+    def add_to_parser(self, parser: Any, ctx: click.Context) -> None:
+        """Let the parser take the old names too."""
+        names, self.opts = self.opts, [*self.opts, *self.old]
+        super().add_to_parser(parser, ctx)
+        self.opts = names
+
+
 NUMBER = PointedNumber()
 command = partial(click.command, cls=Command)
 argument = partial(click.argument, type=FILE)
@@ -42,9 +56,12 @@ output = partial(click.option, "-o", "--output", type=FILE, required=True)
 tool = partial(
     click.option, "--tool", metavar="NAME|FILE", help="Tool profile: a shipped name or a TOML file."
 )
+renamed = partial(click.option, cls=Renamed)
+"""An option with `old` names that stay for one release."""
 report = partial(
-    click.option,
+    renamed,
     "--report",
+    old=(),
     type=FILE,
     metavar="R.html",
     help="Also write a self-contained HTML report.",
@@ -62,8 +79,10 @@ WHERE_OUTSIDE = preset(
     "temperatures: none; refuse the file; or extrapolated, and marked as such.",
 )
 LIMITS = preset(
-    "--limits", default="roll-test", metavar="NAME|FILE", help="Limits profile of the roll test."
-)
+    "--limits", default="roll-test", metavar="NAME|FILE",
+    help="Limits of the roll test: roll-test, moosavi, moradi, or a TOML file with [error] and [spread]. Files of "
+    "survey --limits do not fit.",
+)  # fmt: skip
 DECIMAL = preset(
     "--decimal", default=".", metavar="SIGN", help="Decimal sign of numbers in text files."
 )
@@ -162,10 +181,12 @@ def fit_options(order: str, nonlinearity: str, prior: str, known: str) -> Decora
     return decorate
 
 
-def database(**more: Any) -> Decorator:
+def registry(**more: Any) -> Decorator:
     """The option that names a registry."""
-    return click.option(
-        "--database",
+    return renamed(
+        "--registry",
+        "database",
+        old=("--database",),
         metavar="URL|FILE",
         help=f"The registry: a file, or the URL of a PostgreSQL database. Default: ${REGISTRY}.",
         **more,
@@ -177,7 +198,7 @@ def _named_registry(context: click.Context, option: click.Parameter, typed: str 
     group = context.parent.params.get(option.name) if context.parent and option.name else None
     named = typed or group
     if not named and not context.resilient_parsing:
-        raise InputError(f"--database must name the registry; got none. Or set ${REGISTRY}.")
+        raise InputError(f"--registry must name the registry; got none. Or set ${REGISTRY}.")
     return named or ""
 
 
@@ -188,7 +209,7 @@ def _system_user() -> str:
     return system_user()
 
 
-DATABASE = database(callback=_named_registry)
+DATABASE = registry(callback=_named_registry)
 ACTOR = click.option(
     "--as", "actor", metavar="NAME", default=_system_user, show_default="the user of the system",
     help="Who acts, as the history states it.",

@@ -35,9 +35,7 @@ if TYPE_CHECKING:
     help="Multi-station analysis first: take the drill string's interference, as all surveys show it, off the "
     "magnetometer.",
 )
-@click.option(
-    "--msa-html", type=options.FILE, metavar="M.html", help="Also write a page of that analysis."
-)
+@click.option("--msa-html", type=options.FILE, hidden=True, help="Page of that analysis alone.")
 @click.option(
     "--sensor-drift",
     metavar="owsg|none|FILE",
@@ -48,7 +46,8 @@ if TYPE_CHECKING:
     "--limits",
     default="owsg-mwd",
     metavar="NAME|FILE",
-    help="Limits on |g|, |b| and dip: an error model (owsg-mwd), fixed ones (iscwsa-fixed, fixed), or a TOML file.",
+    help="Limits on |g|, |b| and dip: an error model (owsg-mwd), fixed ones (iscwsa-fixed, fixed), or a TOML file with "
+    "gravity_g, field_nt and dip_deg, or [sensor] and [reference]. Files of verify --limits do not fit.",
 )
 @options.preset(
     "--switch",
@@ -61,8 +60,9 @@ if TYPE_CHECKING:
     "--tie-in", metavar="N,E,TVD", help="Position of the first station, m. Default: 0,0,0."
 )
 @options.WHERE_OUTSIDE
-@click.option(
-    "--html", type=options.FILE, metavar="S.html", help="Also write a page with the pictures."
+@options.report(
+    old=("--html",),
+    help="Also write a page with the pictures; with --msa it shows the analysis too.",
 )
 @options.DECIMAL
 @options.TRUSTED_KEYS
@@ -70,7 +70,7 @@ if TYPE_CHECKING:
 def command(
     calibration: Path, readings: Path, output: Path, reference: Path | None, msa: bool,
     msa_html: Path | None, sensor_drift: str | None, limits: str, switch: str, tie_in: str | None, outside: str,
-    html: Path | None, decimal: str, key: tuple[Path, ...], as_json: bool,
+    report: Path | None, decimal: str, key: tuple[Path, ...], as_json: bool,
 ) -> None:  # fmt: skip
     """Surveys of a well: READINGS in their order, corrected by the CALIBRATION of their tool.
 
@@ -78,7 +78,7 @@ def command(
     whether each survey lies within the limits; with measured depths (md_m) north, east and TVD.
 
     \b
-    Example: mwdcal survey tool.json surveys.csv --reference here.json -o well.csv --html well.html
+    Example: mwdcal survey tool.json surveys.csv --reference here.json -o well.csv --report well.html
     Exit: 0 written, 2 input cannot be read, or does not belong to the calibration, 3 with --msa: the surveys do not
     separate interference from azimuth.
     """
@@ -92,7 +92,7 @@ def command(
         raise InputError("`msa_html` goes with `msa`. Leave it out, or add `msa`.")
     check_drift(sensor_drift, msa)
     given = [calibration, readings, reference, limits, *key]
-    options.check_outputs([output, msa_html], given, page=html)
+    options.check_outputs([output, msa_html], given, page=report)
     start, ends = _three("tie_in", tie_in), _switch(switch)
     loaded = load_calibration(calibration, key)
     fitted = loaded.calibration
@@ -101,16 +101,16 @@ def command(
     analysis = analysed(inputs, sensor_drift) if msa else None
     pages = _interference_page(inputs, analysis, msa_html)
     if analysis and not analysis.summary.separable:
-        atomic.write_all(pages)
+        atomic.write_all(pages + _interference_page(inputs, analysis, report))
         _refuse(inputs, analysis, loaded.signature, as_json)
     result = survey_well(inputs, analysis, tie_in=start, switch=ends, outside=outside)
-    if html:
+    if report:
         from mwdcal.presentation.survey_page import render
 
         findings = findings_as_typed(result.well.findings)
-        pages.append((html, render(result.well, findings, inputs.named)))
+        pages.append((report, render(result.well, findings, inputs.named, analysis)))
     atomic.write_all([(output, tables.streamed(output, result.table)), *pages])
-    _print(result, loaded.signature, (str(output), str(html or "")), as_json)
+    _print(result, loaded.signature, (str(output), str(report or "")), as_json)
 
 
 def _interference_page(
