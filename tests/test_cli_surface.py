@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import click
 import numpy as np
@@ -34,6 +35,7 @@ from mwdcal.presentation.plan import wanted_accuracy
 from mwdcal.use.correction import OUTSIDE
 from schemas import of_calibration_files
 
+PACKAGE = Path(documents.__file__).parents[1]
 COMMANDS = sorted({*commands(), *cli.commands})
 
 
@@ -668,3 +670,22 @@ def test_a_hidden_page_of_the_analysis_stays_for_one_release():
 def test_angles_of_limits_and_accuracies_have_their_unit_in_their_name():
     for typed, read in ((wanted_accuracy, {"azimuth": 0.1}), (limits_of, {"azimuth": 0.1})):
         assert typed(["azimuth_deg=0.1"]) == typed(["azimuth=0.1"]) == read
+
+
+@pytest.mark.parametrize(
+    ("line", "kind", "beside"),
+    [
+        ("calibrate run.csv --tool", "profiles", "generic"),
+        ("verify tool.json run.csv --limits", "limits", "roll-test"),
+        ("survey tool.json run.csv --limits", "survey_limits", "owsg-mwd"),
+        ("plan --plan", "plans", "moosavi-12"),
+        ("list", "", "methods"),
+    ],
+)
+def test_completion_offers_what_is_built_in(line, kind, beside):
+    first, *rest = line.split()
+    items = ShellComplete(cli, {}, "mwdcal", "_MWDCAL_COMPLETE").get_completions([first, *rest], "")
+    offered = {item.value for item in items if item.type == "plain"}
+    assert beside in offered
+    if kind:
+        assert {file.stem for file in (PACKAGE / kind).glob("*.toml")} == offered

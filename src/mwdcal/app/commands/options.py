@@ -11,6 +11,7 @@ from typing import Any
 from unicodedata import normalize
 
 import click
+from click.shell_completion import CompletionItem
 
 from mwdcal.app.messages import Command
 from mwdcal.errors import InputError
@@ -49,12 +50,30 @@ class Renamed(click.Option):
         self.opts = names
 
 
+def offers(folder: str) -> Callable[..., list[CompletionItem]]:
+    """The completion of an option: what a folder of the package has built in, and files."""
+
+    def complete(
+        context: click.Context, option: click.Parameter, typed: str
+    ) -> list[CompletionItem]:
+        from mwdcal.files.profiles import built_in
+
+        names = [name for name in built_in(folder) if name.startswith(typed)]
+        return [CompletionItem(typed, type="file"), *map(CompletionItem, names)]
+
+    return complete
+
+
 NUMBER = PointedNumber()
 command = partial(click.command, cls=Command)
 argument = partial(click.argument, type=FILE)
 output = partial(click.option, "-o", "--output", type=FILE, required=True)
 tool = partial(
-    click.option, "--tool", metavar="NAME|FILE", help="Tool profile: a shipped name or a TOML file."
+    click.option,
+    "--tool",
+    metavar="NAME|FILE",
+    shell_complete=offers("profiles"),
+    help="Tool profile: a name that mwdcal list profiles shows, or a TOML file.",
 )
 renamed = partial(click.option, cls=Renamed)
 """An option with `old` names that stay for one release."""
@@ -79,7 +98,7 @@ WHERE_OUTSIDE = preset(
     "temperatures: none; refuse the file; or extrapolated, and marked as such.",
 )
 LIMITS = preset(
-    "--limits", default="roll-test", metavar="NAME|FILE",
+    "--limits", default="roll-test", metavar="NAME|FILE", shell_complete=offers("limits"),
     help="Limits of the roll test: roll-test, moosavi, moradi, or a TOML file with [error] and [spread]. Files of "
     "survey --limits do not fit.",
 )  # fmt: skip

@@ -15,6 +15,7 @@ from mwdcal.app.messages import print_result
 @click.option(
     "--plan",
     "plans",
+    shell_complete=options.offers("plans"),
     multiple=True,
     metavar="NAME|FILE",
     help="A built-in plan, a TOML file of attitudes, or a run file; several are compared. "

@@ -27,6 +27,7 @@ ALWAYS = ("plan", "tool", "calibration", "order", "effects", "seed", "output", "
 @options.command()
 @options.preset(
     "--plan",
+    shell_complete=options.offers("plans"),
     metavar="NAME|FILE",
     default="twenty-four-state",
     help="A built-in plan, a TOML file of attitudes, or a run file.",
@@ -57,7 +58,13 @@ ALWAYS = ("plan", "tool", "calibration", "order", "effects", "seed", "output", "
 @options.preset(
     "--rolltest", metavar="NAME|FILE", default="roll-test", help="Plan of the roll test."
 )
-@options.preset("--limits", metavar="NAME|FILE", default="roll-test", help="Limits of the verdict.")
+@options.preset(
+    "--limits",
+    shell_complete=options.offers("limits"),
+    metavar="NAME|FILE",
+    default="roll-test",
+    help="Limits of the verdict.",
+)
 @click.option(
     "--workers", type=click.IntRange(1), metavar="N", help="Processes. Default: one per core."
 )

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 )
 @options.preset(
     "--limits",
+    shell_complete=options.offers("survey_limits"),
     default="owsg-mwd",
     metavar="NAME|FILE",
     help="Limits on |g|, |b| and dip: an error model (owsg-mwd), fixed ones (iscwsa-fixed, fixed), or a TOML file with "
