@@ -11,9 +11,8 @@ import pytest
 import mwdcal
 from cli_support import EXAMPLE, numbers, read_csv, refused
 from cli_support import mwdcal as command
-from mwdcal.calibration.options import Options
+from mwdcal.calibration.options import FitChoices, Options, SeedlessFitChoices
 from mwdcal.files.formats import table as tables
-from mwdcal.library.planning import FitChoices, SeedlessFitChoices
 from mwdcal.library.results import LONGEST_LINE
 from mwdcal.planning import procedure
 

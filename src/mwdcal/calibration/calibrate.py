@@ -28,8 +28,8 @@ from mwdcal.calibration.record import (
     SOFTWARE,
     BudgetRow,
     Calibration,
-    Choices,
     Finding,
+    FitSettings,
     StandErrors,
     TriadCalibration,
     Undetermined,
@@ -125,7 +125,7 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
         prior_sha256=options.prior_sha256 or msgspec.UNSET,
         software=SOFTWARE,
         method=options.method,
-        options=_choices(options),
+        options=_settings(options),
         seed=options.seed if options.method == "swarm" else None,
         time=datetime.now(UTC).isoformat(timespec="seconds"),
         field_unit=readings.field_unit,
@@ -179,16 +179,12 @@ def _practice(fitted: FittedRuns) -> str | msgspec.UnsetType:
     return PRACTICES[0] if evidence.set_together.any() else PRACTICES[1]
 
 
-def _choices(options: Options) -> Choices:
-    """What else was asked for."""
+def _settings(options: Options) -> FitSettings:
+    """The settings of the fit that a record states beyond method, model and order."""
+    settings = {name: getattr(options, name) for name in FitSettings.__struct_fields__}
     prior = options.knowledge
-    return Choices(
-        parameters=options.parameters,
-        ignore=list(options.ignore),
-        robust=options.robust,
-        paper_weights=options.paper_weights,
-        prior=prior.source if prior else None,
-    )
+    named = {"ignore": [*options.ignore], "prior": prior.source if prior else None}
+    return FitSettings(**settings | named)
 
 
 def _budget(fitted: FittedRuns) -> list[BudgetRow]:

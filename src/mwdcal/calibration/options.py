@@ -4,20 +4,61 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypedDict
 
+from mwdcal.calibration.fit_options import FIT_OPTIONS
 from mwdcal.calibration.prior import DATASHEET, Knowledge
 from mwdcal.calibration.readings import HIGHEST, TRIADS
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
 
-MODELS = ("polynomial", "factors")
+MODELS = FIT_OPTIONS["model"].words
 AUTO: Literal["auto"] = "auto"
 """What an option is whose value the software chooses (`mwdcal.calibration.automatic.auto`)."""
 USUAL = 0.005
 """Prior of own-axis terms, as a share of the field, where the profile declares none."""
 Orders = int | tuple[int, int]
 """Temperature order of both triads, or of accelerometer and magnetometer."""
+
+
+class CommonChoices(TypedDict, total=False):
+    """Attributes of `Options` that mean the same for one tool and for a fleet."""
+
+    method: str
+    model: str | None
+    order: Orders | Literal["auto"]
+    parameters: int
+    nonlinearity: Mapping[str, float] | tuple[str, ...] | Literal["auto"]
+    estimate: tuple[str, ...]
+    ignore: tuple[str, ...]
+    robust: str | None
+    paper_weights: bool
+
+
+class FleetChoices(CommonChoices, total=False):
+    """The options of the fit of a fleet, as keywords; its `order` is 0 by default, the same for both triads."""
+
+    prior: Literal["datasheet"] | None
+    seed: int
+
+
+class SeedlessFitChoices(CommonChoices, total=False):
+    """The attributes of `Options` but for the seed."""
+
+    scatter: bool
+    prior: Knowledge | Calibration | Literal["datasheet"] | None
+    prior_sha256: str
+    exclude: tuple[str, ...]
+
+
+class FitChoices(SeedlessFitChoices, total=False):
+    """The attributes of `Options`, as keywords of what fits."""
+
+    seed: int
+
+
+FLEET_NAMES = (*CommonChoices.__annotations__, "prior", "seed")
+"""The keywords of `FleetChoices`."""
 
 
 @dataclass(frozen=True)

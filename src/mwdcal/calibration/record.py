@@ -146,7 +146,7 @@ class Measures(msgspec.Struct, frozen=True, kw_only=True):
     rmse: float
 
 
-class Choices(msgspec.Struct, frozen=True, kw_only=True):
+class FitSettings(msgspec.Struct, frozen=True, kw_only=True):
     """How the fit was asked for, beyond method, model and order; see `mwdcal.calibration.options.Options`."""
 
     parameters: int = 12
@@ -261,7 +261,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     prior_sha256: str | msgspec.UnsetType = msgspec.UNSET
     software: str
     method: str
-    options: Choices = Choices()
+    options: FitSettings = FitSettings()
     seed: int | None = None
     time: str
     field_unit: str

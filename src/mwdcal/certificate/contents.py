@@ -24,6 +24,7 @@ from msgspec.structs import replace
 from mwdcal.calibration.canonical import canonical, rounded
 from mwdcal.calibration.diagnosis.identity import FROM_THE_FUTURE, UNIDENTIFIED, dated, unidentified
 from mwdcal.calibration.drift import exact_and_steady
+from mwdcal.calibration.fit_options import unusual
 from mwdcal.calibration.prediction import without_temperature
 from mwdcal.calibration.readings import CONSTANTS, check_day, is_simulated, serial_of, stated_day
 from mwdcal.calibration.record import SOFTWARE, Calibration, Finding, TriadCalibration
@@ -91,21 +92,11 @@ def _model(triad: TriadCalibration) -> str:
 
 def _deviations(calibration: Calibration) -> Iterator[str]:
     """What was done other than the usual procedure, a phrase each."""
-    options = calibration.options
     if without_temperature(calibration):
         yield f"{without_temperature(calibration)}: the results hold at the temperature of the calibration alone"
     if calibration.excluded:
         yield f"stations excluded from the fit: {', '.join(calibration.excluded)}"
-    if options.robust:
-        yield f"robust fit ({options.robust}): stations that do not agree have less weight"
-    if options.ignore:
-        yield f"references not used: {', '.join(options.ignore)}"
-    if options.parameters != 12:
-        yield f"{options.parameters} parameters of each triad, the others held at zero"
-    if options.paper_weights:
-        yield "unweighted sums, as the method's paper has them"
-    if options.prior:
-        yield f"prior knowledge of the parameters: {options.prior}"
+    yield from unusual(calibration.options, "deviation")
     if calibration.relative:
         yield "strength of the field unknown: the magnetometer is calibrated to a field of 1"
 

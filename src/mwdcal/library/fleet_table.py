@@ -19,6 +19,7 @@ from mwdcal import pool
 from mwdcal.calibration.automatic.nonlinearity import with_strengths
 from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.diagnosis.refusals import check_options, no_temperature
+from mwdcal.calibration.fit_options import FitArguments, stated_arguments
 from mwdcal.calibration.methods import check_stand_errors
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prior import DATASHEET, profile_for
@@ -38,9 +39,8 @@ from mwdcal.fleet.tables import (
     partitions,
 )
 from mwdcal.presentation.envelope import enveloped
-from mwdcal.presentation.fleet import FleetSummary, stated_options, summarise
+from mwdcal.presentation.fleet import FleetSummary, summarise
 from mwdcal.presentation.text import plural, slowly
-from mwdcal.presentation.typed import Typed
 from mwdcal.sensor.profile import Profile
 from mwdcal.use.correction_numba import cores
 
@@ -57,7 +57,7 @@ def calibrate_table(
     output: Path,
     tool: Profile | str | None,
     options: Options,
-    typed: Typed,
+    typed: FitArguments,
     workers: int | None,
     scheduler: str | None,
     records: bool | None,
@@ -146,17 +146,19 @@ def _finished(
     return done
 
 
-def _metadata(source: FleetTable, plan: Plan, typed: Typed, digest: str) -> dict[str, object]:
+def _metadata(
+    source: FleetTable, plan: Plan, typed: FitArguments, digest: str
+) -> dict[str, object]:
     """What the table of calibrations says of itself: the input's own, and how it was made."""
-    stated = {k: v for k, v in source.metadata.items() if k != SERIAL}
+    metadata = {k: v for k, v in source.metadata.items() if k != SERIAL}
     content = {
         "fleet": source.name,
-        "options": stated_options(typed),
+        "options": stated_arguments(typed),
         "profile": plan.profile.name,
         "reference_temperature_c": plan.profile.reference_temperature_c,
         "noise_estimated": list(plan.noise_estimated),
     }
-    return {**stated, **enveloped("fleet", content, stated, profile=digest)}
+    return {**metadata, **enveloped("fleet", content, metadata, profile=digest)}
 
 
 def prior_of_fleet(word: str | None) -> Literal["datasheet"] | None:

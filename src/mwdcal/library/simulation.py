@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, Unpack, overload
 
 import numpy as np
 
-from mwdcal.calibration.options import Options, Orders
+from mwdcal.calibration.options import Options, Orders, SeedlessFitChoices
 from mwdcal.calibration.readings import Readings, serial_of
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
@@ -23,7 +23,6 @@ from mwdcal.library.planning import (
     FilePath,
     PlanResult,
     PlanSource,
-    SeedlessFitChoices,
     ToolSource,
     check_whole,
     plan_table,

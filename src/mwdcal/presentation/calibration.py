@@ -10,14 +10,15 @@ import msgspec
 from mwdcal.calibration.automatic.nonlinearity import CurveScore
 from mwdcal.calibration.diagnosis.flags import listed
 from mwdcal.calibration.drift import Constant, Drift, exact_and_steady
+from mwdcal.calibration.fit_options import unusual
 from mwdcal.calibration.prediction import typical_accuracy, without_temperature
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import (
     BudgetRow,
     Calibration,
-    Choices,
     ErrorRow,
     Finding,
+    FitSettings,
     Measures,
     OrderScore,
     StandErrors,
@@ -66,7 +67,7 @@ class CalibrationSummary(msgspec.Struct, frozen=True, kw_only=True):
     excluded: list[str]
     temperature_c: tuple[float, float] | None
     method: str
-    options: Choices
+    options: FitSettings
     seed: int | None
     triads: dict[str, TriadSummary]
     errors: list[ErrorRow]
@@ -208,7 +209,7 @@ def known_inclinations(calibration: Calibration) -> list[float]:
 
 def how(calibration: Calibration) -> list[str]:
     """Method, model, and what was asked for beyond them."""
-    return [calibration.method, model(calibration), *choices(calibration.options)]
+    return [calibration.method, model(calibration), *unusual(calibration.options, "heading")]
 
 
 def model(calibration: Calibration) -> str:
@@ -217,17 +218,6 @@ def model(calibration: Calibration) -> str:
     if len(set(models.values())) == 1:
         return models["accelerometer"]
     return ", ".join(f"{name}: {model}" for name, model in models.items())
-
-
-def choices(options: Choices) -> list[str]:
-    """What was asked for beyond method, model and order."""
-    return [
-        *([f"{options.parameters} parameters"] if options.parameters != 12 else []),
-        *([f"without {' and '.join(options.ignore)}"] if options.ignore else []),
-        *([f"robust ({options.robust})"] if options.robust else []),
-        *(["the paper's weights"] if options.paper_weights else []),
-        *([f"prior {options.prior}"] if options.prior else []),
-    ]
 
 
 def errors(rows: list[ErrorRow]) -> str:

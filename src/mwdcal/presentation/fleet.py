@@ -12,18 +12,19 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from mwdcal.calibration import fit_options
+from mwdcal.calibration.fit_options import FIT_OPTIONS, FitArguments
 from mwdcal.calibration.readings import HIGHEST, TRIADS
-from mwdcal.calibration.record import Choices, Finding
+from mwdcal.calibration.record import Finding, FitSettings
 from mwdcal.files.formats import parquet
 from mwdcal.fleet.calibrate import OK, STAND_COLUMNS
 from mwdcal.fleet.sources import SERIAL
 from mwdcal.fleet.tables import one_chunk
 from mwdcal.geometry.vectors import Array
-from mwdcal.presentation.calibration import choices
 from mwdcal.presentation.envelope import enveloped
 from mwdcal.presentation.numbers import written
 from mwdcal.presentation.text import number, one_line, plural, table
-from mwdcal.presentation.typed import Typed, as_typed, names
+from mwdcal.presentation.typed import as_typed
 
 SERIALS_SHOWN = 5
 """Most serials that a line names."""
@@ -100,12 +101,12 @@ class FleetDocument(FleetCounts, frozen=True, kw_only=True):
     report: str
 
 
-def summarise(target: Path, typed: Typed, notes: list[str], **facts: Any) -> FleetSummary:
+def summarise(target: Path, typed: FitArguments, notes: list[str], **facts: Any) -> FleetSummary:
     """What the table of calibrations `target` says, read column by column, beside other `facts`."""
     _, pq = parquet.modules(target.name)
     whole = pq.ParquetFile(target)
     head = whole.read([SERIAL, "status", "message", "findings"])
-    columns, options = whole.schema_arrow.names, stated_options(typed)
+    columns, options = whole.schema_arrow.names, fit_options.stated_arguments(typed)
     shown = [n for n in columns if n.endswith(("_sd_deg", "_variance_factor")) or n in ERRORS]
     return FleetSummary(
         **facts,
@@ -132,33 +133,19 @@ def _wide(whole: Any) -> list[str]:
     return [f"{spans}, and --order 0 has no temperature terms."] if wide else []
 
 
-def stated_options(typed: Typed) -> dict[str, Any]:
-    """The options of a fleet, under the names that a calibration file and the command have."""
-    method, order = typed["method"], typed["order"]
-    return {
-        "method": method,
-        "seed": typed["seed"] if method == "swarm" else None,
-        "model": typed["model"],
-        "order": order if order == "auto" else int(order),
-        "nonlinearity": typed["nonlinearity"],
-        "estimate": list(names(typed["estimate"])),
-        "parameters": int(typed["parameters"] or 12),
-        "ignore": list(names(typed["ignore"])),
-        **{name: typed[name] for name in ("robust", "paper_weights", "prior")},
-    }
-
-
 def unusual(options: dict[str, Any]) -> list[str]:
-    """What was asked for beyond method and order, in words."""
-    also = msgspec.convert(options, Choices)
-    terms, stand = options["nonlinearity"], " and ".join(options["estimate"])
-    return [
-        *([f"model {options['model']}"] if options["model"] else []),
-        *([f"own-axis terms {terms}"] if terms != "none" else []),
-        *([f"stand: {stand}"] if stand else []),
-        *choices(also),
-        *([f"seed {options['seed']}"] if options["seed"] else []),
-    ]
+    """The options beyond method and order that are not the usual ones, in words."""
+    usual: dict[str, Any] = {"model": None, "nonlinearity": "none", "estimate": [], "seed": None}
+    before = {
+        name: FIT_OPTIONS[name].heading.format(
+            " and ".join(value) if isinstance(value, list) else value
+        )
+        for name, default in usual.items()
+        if (value := options[name]) != default and value != 0
+    }
+    seed = [before.pop("seed")] if "seed" in before else []
+    settings = msgspec.convert(options, FitSettings)
+    return [*before.values(), *fit_options.unusual(settings, "heading"), *seed]
 
 
 def numbers(whole: Any, name: str) -> Array:

@@ -40,8 +40,9 @@ def command(
     Example: mwdcal compare run.csv --tool servo --report methods.html
     Exit: 0 compared, 2 input cannot be read, 3 every method refused.
     """
-    from mwdcal.app.choices import load_run, order_of
+    from mwdcal.app.inputs import load_run
     from mwdcal.calibration.diagnosis.findings import unused_columns
+    from mwdcal.calibration.fit_options import order_of
     from mwdcal.calibration.options import Options
     from mwdcal.comparison.compare import able, compare
     from mwdcal.files.formats import atomic

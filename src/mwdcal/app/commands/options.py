@@ -14,8 +14,9 @@ import click
 from click.shell_completion import CompletionItem
 
 from mwdcal.app.messages import Command
+from mwdcal.calibration.fit_options import FIT_OPTIONS
+from mwdcal.calibration.fit_options import FitArguments as FitArguments
 from mwdcal.errors import InputError
-from mwdcal.presentation.typed import Typed as Typed
 
 Function = Callable[..., Any]
 Decorator = Callable[[Function], Function]
@@ -115,9 +116,6 @@ TRUSTED_KEYS = click.option(
     "variable MWDCAL_KEYS names.",
 )
 JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
-SEED = preset(
-    "--seed", type=click.IntRange(0), default=0, help="Seed of all that is drawn at random."
-)
 COLUMN_NAMES = click.option(
     "--columns", default="", metavar="NAMES",
     help="Columns of a text log without column names, such as time_s,ax,ay,az.",
@@ -135,66 +133,40 @@ def number(name: str, metavar: str, text: str, *variable: str) -> Decorator:
 
 
 SAMPLING_HZ = number("--sampling-hz", "HZ", "Rate of the log; wins over its column time_s.")
-_FIT = (
-    preset(
-        "--method", default="joint", metavar="METHOD",
-        help="joint: all evidence, weighted. least-squares: reference vectors only. swarm: the same "
-        "by particle swarm. newton: Newton-Raphson on |g| and inclination. toolface-inclination: the "
-        "accelerometer by angles alone. scalar: |g| and |b| alone.",
-    ),
-    SEED,
-    click.option(
-        "--paper-weights", is_flag=True,
-        help="Sum the squares as the method's paper does, unweighted, instead of by their uncertainty.",
-    ),
-    click.option(
-        "--robust", type=click.Choice(["huber", "student-t"]),
-        help="Bound what a bad station can do: huber keeps a little of its pull, student-t loses it.",
-    ),
-    click.option(
-        "--ignore", default="", metavar="NAMES",
-        help="What may not be used at any station: gravity, field, dip, or several with commas.",
-    ),
-    click.option(
-        "--estimate", default="", metavar="NAMES",
-        help="Errors of the stand to find as well: azimuth-zero, inclination-zero, tilt, or several with "
-        "commas.",
-    ),
-    click.option(
-        "--model", type=click.Choice(["polynomial", "factors"]),
-        help="Default: polynomial at order 0, factors above.",
-    ),
-    click.option(
-        "--parameters", type=click.Choice(["12", "9", "6"]),
-        help="Per triad at one temperature; default 12. 9: the sensor frame, without mounting rotation. "
-        "6: scale and bias alone.",
-    ),
-)  # fmt: skip
+
+
+def fit_option(
+    name: str, default: str | None = None, metavar: str | None = None, known: str = ""
+) -> Decorator:
+    """An option of the fit, as it is declared; its `default`, and words of what is `known`, vary by command."""
+    each = FIT_OPTIONS[name]
+    usual = each.default if default is None else default
+    kind = click.Choice(each.words) if each.words else None
+    return click.option(
+        f"--{name.replace('_', '-')}", is_flag=usual is False,
+        type=kind if each.least is None else click.IntRange(each.least),
+        default=usual, show_default=usual not in (None, "", False), metavar=metavar or each.metavar,
+        help=each.help.format(known),
+    )  # fmt: skip
+
+
+SEED = fit_option("seed")
 
 
 def fit_options(order: str, nonlinearity: str, prior: str, known: str) -> Decorator:
-    """The options that say how to fit, which the command gets as `Typed`.
+    """The options that say how to fit, which the command gets as `FitArguments`.
 
     With the defaults of two of them, and what a prior may be, as metavar and in words.
     """
-    declared = (
-        *_FIT,
-        click.option("--prior", metavar=prior, help=f"What is known beforehand: {known}."),
-        preset(
-            "--order", default=order, metavar="0…3|auto",
-            help="Order of temperature terms. auto: of each triad, the terms that noise does not explain.",
-        ),
-        preset(
-            "--nonlinearity", default=nonlinearity, metavar="auto|none|NAMES",
-            help="Own-axis quadratic and cubic terms. auto: of the triads whose profile declares "
-            "them, where the run speaks for them. NAMES: accelerometer, magnetometer, or both with "
-            "a comma.",
-        ),
-    )  # fmt: skip
+    more: dict[str, Any] = {
+        "order": (order,),
+        "nonlinearity": (nonlinearity,),
+        "prior": (None, prior, known),
+    }
 
     def decorate(function: Function) -> Function:
-        for option in reversed(declared):
-            function = option(function)
+        for name in reversed(FIT_OPTIONS):
+            function = fit_option(name, *more.get(name, ()))(function)
         return function
 
     return decorate

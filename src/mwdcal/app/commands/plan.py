@@ -77,7 +77,7 @@ from mwdcal.app.messages import print_result
 def command(
     plans: tuple[str, ...], stations: int | None, accuracy: tuple[str, ...], measured: Path | None,
     reach: tuple[str, ...], criterion: Literal["D", "A", "I"], speed: float, settle: float, soak: float,
-    tool: str | None, output: Path | None, report: Path | None, as_json: bool, **typed: Unpack[options.Typed],
+    tool: str | None, output: Path | None, report: Path | None, as_json: bool, **typed: Unpack[options.FitArguments],
 ) -> None:  # fmt: skip
     """What a calibration from planned stations will give: uncertainty, rank, accuracy, hours at the stand.
 
@@ -88,7 +88,8 @@ def command(
     Exit: 0 planned, 2 input cannot be read, 3 the stations cannot give a calibration.
     """
     from mwdcal.app import progress
-    from mwdcal.app.choices import options_of, prior_of
+    from mwdcal.app.inputs import prior_of
+    from mwdcal.calibration.fit_options import options_of
     from mwdcal.library import planning
     from mwdcal.presentation import plan as screen
 
