@@ -14,7 +14,7 @@ from mwdcal.calibration import fit_options
 from mwdcal.calibration.automatic.nonlinearity import choose_curves, compare_curves
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.estimate import fit
-from mwdcal.calibration.options import Options
+from mwdcal.calibration.options import Options, as_arguments, options_of
 from mwdcal.calibration.prediction import readings_at
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import FitSettings
@@ -297,14 +297,14 @@ def test_options_of_a_fleet_go_to_words_and_back():
     chosen = Options(
         order=0, nonlinearity=("magnetometer",), estimate=("tilt",), parameters=9, robust="huber"
     )
-    words = fit_options.as_arguments(chosen)
+    words = as_arguments(chosen)
     assert (words["nonlinearity"], words["estimate"], words["parameters"]) == (
         "magnetometer",
         "tilt",
         "9",
     )
-    assert fit_options.options_of(words) == chosen
-    assert fit_options.as_arguments(Options(nonlinearity={}))["nonlinearity"] == "none"
+    assert options_of(words) == chosen
+    assert as_arguments(Options(nonlinearity={}))["nonlinearity"] == "none"
 
 
 def test_settings_are_worded_for_screens_and_certificates():

@@ -6,10 +6,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, TypedDict, cast
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, TypedDict
 
 if TYPE_CHECKING:
-    from mwdcal.calibration.options import Options
     from mwdcal.calibration.record import Calibration, FitSettings
 
 Prior: TypeAlias = "Calibration | Literal['datasheet'] | None"
@@ -130,41 +129,6 @@ def order_of(word: str) -> int | Literal["auto"]:
     orders: dict[str, Any] = {str(order): order for order in range(HIGHEST + 1)}
     order: int | Literal["auto"] = orders.get(word, word)
     return order
-
-
-def options_of(
-    arguments: FitArguments,
-    prior: Prior = None,
-    exclude: tuple[str, ...] = (),
-    prior_sha256: str = "",
-) -> Options:
-    """The options of a command line, with the prior that its word names."""
-    from mwdcal.calibration.options import AUTO, Options
-
-    triads = arguments["nonlinearity"]
-    curved = {"none": (), AUTO: AUTO}.get(triads, names(triads) or (triads,))
-    read: dict[str, Any] = {
-        "order": order_of(arguments["order"]),
-        "parameters": int(arguments["parameters"] or 12),
-        "nonlinearity": curved,
-        "estimate": names(arguments["estimate"]),
-        "ignore": names(arguments["ignore"]),
-        "prior": prior,
-    }
-    return Options(**{**arguments, **read}, exclude=exclude, prior_sha256=prior_sha256)
-
-
-def as_arguments(options: Options) -> FitArguments:
-    """Options as the command line has them, in which a table of calibrations states them."""
-    from mwdcal.calibration.options import AUTO
-    from mwdcal.calibration.prior import DATASHEET
-
-    values: dict[str, Any] = {name: getattr(options, name) for name in FIT_OPTIONS}
-    curved, words = options.nonlinearity, {n: ",".join(values[n]) for n in ("estimate", "ignore")}
-    words["nonlinearity"] = curved if curved == AUTO else ",".join(sorted(curved)) or "none"
-    words |= {name: str(values[name]) for name in ("order", "parameters")}
-    prior = DATASHEET if options.prior else None
-    return cast("FitArguments", {**values, **words, "prior": prior})
 
 
 def stated_arguments(arguments: FitArguments) -> dict[str, Any]:

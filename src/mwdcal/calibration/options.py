@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, TypedDict
+from typing import Any, Literal, TypedDict, cast
 
-from mwdcal.calibration.fit_options import FIT_OPTIONS
+from mwdcal.calibration.fit_options import FIT_OPTIONS, FitArguments, Prior, names, order_of
 from mwdcal.calibration.prior import DATASHEET, Knowledge
 from mwdcal.calibration.readings import HIGHEST, TRIADS
 from mwdcal.calibration.record import Calibration
@@ -163,3 +163,33 @@ class Options:
     def kind(self, order: int) -> str:
         """The model of a triad: at order 0 both are the same, and the linear one is simpler."""
         return self.model or ("factors" if order else "polynomial")
+
+
+def options_of(
+    arguments: FitArguments,
+    prior: Prior = None,
+    exclude: tuple[str, ...] = (),
+    prior_sha256: str = "",
+) -> Options:
+    """The options of a command line, with the prior that its word names."""
+    triads = arguments["nonlinearity"]
+    curved = {"none": (), AUTO: AUTO}.get(triads, names(triads) or (triads,))
+    read: dict[str, Any] = {
+        "order": order_of(arguments["order"]),
+        "parameters": int(arguments["parameters"] or 12),
+        "nonlinearity": curved,
+        "estimate": names(arguments["estimate"]),
+        "ignore": names(arguments["ignore"]),
+        "prior": prior,
+    }
+    return Options(**{**arguments, **read}, exclude=exclude, prior_sha256=prior_sha256)
+
+
+def as_arguments(options: Options) -> FitArguments:
+    """Options as the command line has them, in which a table of calibrations states them."""
+    values: dict[str, Any] = {name: getattr(options, name) for name in FIT_OPTIONS}
+    curved, words = options.nonlinearity, {n: ",".join(values[n]) for n in ("estimate", "ignore")}
+    words["nonlinearity"] = curved if curved == AUTO else ",".join(sorted(curved)) or "none"
+    words |= {name: str(values[name]) for name in ("order", "parameters")}
+    prior = DATASHEET if options.prior else None
+    return cast("FitArguments", {**values, **words, "prior": prior})

@@ -318,6 +318,38 @@ class Readings:
         return replace(kept, known=known, copies=(*self.copies, *left))
 
 
+ReadingsLike = Readings | ArrayLike
+"""Readings, or an array of them."""
+
+
+def as_readings(source: ReadingsLike) -> Readings:
+    """Readings as they are, or those in the columns of an array (..., n, 3 or 6, and one more for the temperature).
+
+    Columns: accelerometer x, y, z; magnetometer x, y, z; temperature. Units: nominal g and nT along the tool axes, °C.
+
+    Raises:
+        InputError: an array of another shape, or of something else than numbers.
+    """
+    if isinstance(source, Readings):
+        return source
+    try:
+        array: Array = np.asarray(np.ma.filled(np.ma.array(source, dtype=float), np.nan))
+    except (TypeError, ValueError):
+        array = np.empty(0)
+    triads, more = divmod(array.shape[-1] if array.shape[1:] else 0, 3)
+    if triads not in (1, 2) or more > 1:
+        raise InputError(
+            "readings must be an array of the shape (n, 3), (n, 6) or (n, 7), with the columns ax, ay, az, mx, my, mz, "
+            f"temperature; got {type(source).__name__} of shape {array.shape}. Or make readings by "
+            "mwdcal.readings(…), or mwdcal.read_run(…) of a file."
+        )
+    return Readings(
+        accelerometer=array[..., :3],
+        magnetometer=array[..., 3:6] if triads == 2 else None,
+        temperature=array[..., -1] if more else None,
+    )
+
+
 def soaks(temperature: Array) -> Ints:
     """Number (..., n) of the soak that each station belongs to, coldest first.
 

@@ -16,8 +16,7 @@ from weakref import finalize
 import numpy as np
 from msgspec.structs import replace
 
-from mwdcal.calibration.fit_options import as_arguments
-from mwdcal.calibration.options import FLEET_NAMES, FleetChoices, Options
+from mwdcal.calibration.options import FLEET_NAMES, FleetChoices, Options, as_arguments
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import AnyArray

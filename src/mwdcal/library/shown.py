@@ -11,6 +11,7 @@ from hashlib import sha256
 from html import escape
 from typing import Any, NamedTuple, TypeVar
 
+from mwdcal.calibration.notebooks import html_table
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.comparison.compare import Comparison
@@ -224,6 +225,13 @@ def _show(
         setattr(kind, name, method)
 
 
+def _readings_html(readings: Readings) -> str:
+    """The readings at a glance."""
+    words = repr(readings).strip("<>").removeprefix("Readings: ")
+    return html_table("Readings", [(words,)])
+
+
+Readings._repr_html_ = _readings_html  # type: ignore[attr-defined]
 Readings.columns = property(_columns)  # type: ignore[assignment]
 Readings.to_pandas = _to_pandas  # type: ignore[attr-defined]
 _show(Calibration, _calibration_text, _calibration_document, _calibration_page)

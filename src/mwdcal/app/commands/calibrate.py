@@ -52,7 +52,7 @@ def command(
     """
     from mwdcal.app.inputs import load_run, prior_of
     from mwdcal.calibration.calibrate import chosen_fit, recorded
-    from mwdcal.calibration.fit_options import options_of
+    from mwdcal.calibration.options import options_of
     from mwdcal.files import documents, runs
     from mwdcal.files.formats import atomic
     from mwdcal.presentation import calibration as screen

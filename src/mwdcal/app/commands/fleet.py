@@ -63,7 +63,7 @@ def command(
     from mwdcal import pool
 
     with pool.preparing(1 if scheduler else workers):  # these imports, in the workers too
-        from mwdcal.calibration.fit_options import options_of
+        from mwdcal.calibration.options import options_of
         from mwdcal.files.formats import atomic, folders
         from mwdcal.fleet import calibration_files
         from mwdcal.library import fleet_table

@@ -89,7 +89,7 @@ def command(
     """
     from mwdcal.app import progress
     from mwdcal.app.inputs import prior_of
-    from mwdcal.calibration.fit_options import options_of
+    from mwdcal.calibration.options import options_of
     from mwdcal.library import planning
     from mwdcal.presentation import plan as screen
 

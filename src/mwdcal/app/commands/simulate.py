@@ -95,7 +95,7 @@ def command(
     )
     with pool.preparing(workers) if repeat else nullcontext():  # these imports, in the workers too
         from mwdcal.app.inputs import prior_of
-        from mwdcal.calibration.fit_options import options_of
+        from mwdcal.calibration.options import options_of
         from mwdcal.library import simulation
     chosen = options_of(typed, prior_of(typed["prior"])[0])
     result: simulation.RepeatedProcedure | simulation.SimulatedReadings
