@@ -18,7 +18,7 @@ SOURCE = ROOT / "src" / "mwdcal"
 
 # From the bottom up: a room imports from rooms below it. Rooms of one floor are strangers.
 FLOORS = (
-    ("errors",),
+    ("errors", "digests"),
     ("signals",),
     ("pool",),
     ("geometry",),

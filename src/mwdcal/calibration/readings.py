@@ -7,7 +7,6 @@ are °C. An unknown value is NaN, never zero.
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -18,6 +17,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import AnyArray, Array, ArrayLike, Bools, Ints
 from mwdcal.sensor.profile import Profile
@@ -121,7 +121,7 @@ def fingerprints(triads: Sequence[Array]) -> tuple[str, ...]:
     """
     rows = zip(*((triad + 0.0).tolist() for triad in triads), strict=True)
     texts = ([",".join(f"{value:.12g}" for value in reading) for reading in row] for row in rows)
-    hashes = ([hashlib.sha256(text.encode()).hexdigest() for text in row] for row in texts)
+    hashes = ([sha256_of(text.encode()) for text in row] for row in texts)
     return tuple("-".join(each[:DIGEST_LENGTH] for each in row) for row in hashes)
 
 

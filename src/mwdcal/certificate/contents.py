@@ -9,7 +9,6 @@ What the references of a calibration are traceable to, and whether that held on 
 
 from __future__ import annotations
 
-import hashlib
 import operator
 import re
 from calendar import monthrange
@@ -48,6 +47,7 @@ from mwdcal.certificate.document import (
 )
 from mwdcal.certificate.laboratory import Laboratory, filled_pattern
 from mwdcal.certificate.tables import conditions, result_tables
+from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError
 from mwdcal.files.verifications import Verification
 from mwdcal.sensor.profile import MeasurementStandard, Person
@@ -422,7 +422,7 @@ def _exact(calibration: Calibration) -> Iterator[Finding]:
 
 def _number(contents: Certificate, pattern: str) -> str:
     """The number of a certificate, from what it says."""
-    digest = hashlib.sha256(canonical(msgspec.to_builtins(contents))).hexdigest()
+    digest = sha256_of(canonical(msgspec.to_builtins(contents)))
     serial = re.sub(r"[^A-Za-z0-9._]+", "-", contents.item.serial).strip("-")[:40]
     return filled_pattern(
         pattern,

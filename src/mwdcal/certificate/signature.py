@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import base64
 import binascii
-import hashlib
 import json
 import math
 import re
@@ -22,6 +21,7 @@ from mwdcal.calibration.canonical import Signature, SignatureCheck, canonical, s
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.certificate.document import SourceFile
 from mwdcal.certificate.keys import PrivateKey, TrustedKey, available, moment, now
+from mwdcal.digests import sha256_of
 from mwdcal.errors import FitError, InputError
 from mwdcal.files import documents
 from mwdcal.files.formats.members import Member
@@ -328,7 +328,6 @@ def _sha256(path: Path) -> str | None:
     try:
         if not path.is_file():
             return None
-        with path.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
+        return sha256_of(path)
     except (OSError, ValueError):
         return None

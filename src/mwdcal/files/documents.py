@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import codecs
-import hashlib
 import json
 import os
 from collections import Counter
@@ -17,6 +16,7 @@ import msgspec
 from mwdcal.calibration.canonical import document_sha256, signed_form
 from mwdcal.calibration.diagnosis.soundness import check
 from mwdcal.calibration.record import SCHEMA_VERSION, Calibration, sealed
+from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import atomic, members
 from mwdcal.files.profiles import check_profile
@@ -96,7 +96,7 @@ def whole_file(path: Path) -> members.Member:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({reason(error)}). Check the path.") from None
-    return members.Member(data, path.name, hashlib.sha256(data).hexdigest())
+    return members.Member(data, path.name, sha256_of(data))
 
 
 def in_utf8(data: bytes) -> bytes:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import time
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -23,6 +22,7 @@ from mwdcal.calibration.fit_options import FitArguments, stated_arguments
 from mwdcal.calibration.methods import check_stand_errors
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prior import DATASHEET, profile_for
+from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError, reason
 from mwdcal.files import profiles, synonyms
 from mwdcal.files.formats import atomic, parquet
@@ -113,7 +113,7 @@ def _with_records(plan: Plan, profile_sha256: str, runs: Path) -> Plan:
     runs_sha256 = ""
     if runs.is_file():
         with runs.open("rb") as stream:
-            runs_sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
+            runs_sha256 = sha256_of(stream)
     return replace(plan, records=True, profile_sha256=profile_sha256, runs_sha256=runs_sha256)
 
 

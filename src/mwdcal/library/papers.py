@@ -7,12 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, date, datetime
 from functools import cached_property
-from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mwdcal.calibration.canonical import SignatureState
 from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError
 from mwdcal.files.formats.members import Member
 from mwdcal.library.registries import ToolRegistry, day_of
@@ -333,7 +333,7 @@ def sign(
         target = Path(output) if output is not None else _json_of(document)
         data = document.form("C.json")
         whole = data if isinstance(data, bytes) else data.encode()
-        file = Member(whole, target.name, sha256(whole).hexdigest())
+        file = Member(whole, target.name, sha256_of(whole))
         if target in document.saved and target.exists():
             file = documents.whole_file(target)
         folder = target.parent

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from hashlib import sha256
 from html import escape
 from typing import Any, NamedTuple, TypeVar
 
@@ -15,6 +14,7 @@ from mwdcal.calibration.notebooks import html_table
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.comparison.compare import Comparison
+from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError
 from mwdcal.faults.diagnosis import Diagnosis
 from mwdcal.files import documents, runs
@@ -51,7 +51,7 @@ def with_inputs(
 
 def digest_of(calibration: Calibration) -> str:
     """The SHA-256 of a calibration's file, as it is or would be written."""
-    return sha256(documents.encode(calibration)).hexdigest()
+    return sha256_of(documents.encode(calibration))
 
 
 def _inputs(result: Any) -> Inputs:

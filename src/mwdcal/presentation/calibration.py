@@ -27,8 +27,15 @@ from mwdcal.calibration.record import (
 from mwdcal.calibration.settings import ASSUMED, ASSUMED_PRACTICE
 from mwdcal.geometry.observables import TITLES
 from mwdcal.presentation.envelope import enveloped
-from mwdcal.presentation.numbers import degrees_of_freedom, estimate, uncertainty, written
-from mwdcal.presentation.text import chance, number, one_line, quantity, table
+from mwdcal.presentation.numbers import (
+    degrees_of_freedom,
+    estimate,
+    number,
+    quantity,
+    uncertainty,
+    written,
+)
+from mwdcal.presentation.text import chance, one_line, table
 from mwdcal.presentation.typed import findings_as_typed
 
 if TYPE_CHECKING:
@@ -224,7 +231,8 @@ def errors(rows: list[ErrorRow]) -> str:
     """Errors before and after, with what was to be expected."""
     cells = [
         [f"{TITLES.get(row.observable, row.observable)} error, rms"]
-        + [quantity(value, row.unit) for value in (row.before, row.after, row.expected)]
+        + [quantity(value, row.unit) for value in (row.before, row.after)]
+        + [quantity(row.expected, row.unit, 2)]
         for row in rows
     ]
     return table(cells, ["", "before", "after", "1σ expected"])

@@ -28,7 +28,7 @@ from mwdcal.presentation.numbers import HELD, capital, exponent, factor_places
 from mwdcal.presentation.page import banner, environment
 from mwdcal.presentation.text import plural, raised
 from mwdcal.presentation.typed import findings_as_typed
-from mwdcal.presentation.verification import BETWEEN_SETS, freedom
+from mwdcal.presentation.verification import BETWEEN_SETS, freedom, noise_free
 from mwdcal.use import plots
 from mwdcal.use.notation import Notation, convert
 from mwdcal.use.verification import SETTING_PRACTICES
@@ -54,7 +54,7 @@ def render(
     `metadata` are those of the roll test behind the verdict.
     """
     pages = environment()
-    pages.filters["freedom"] = freedom
+    pages.filters |= {"freedom": freedom, "noise_free": noise_free}
     template = pages.get_template("report.html")
     return template.render(
         cal=calibration,

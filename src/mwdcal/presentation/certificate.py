@@ -28,8 +28,8 @@ from mwdcal.presentation.numbers import (
     unit,
     written,
 )
+from mwdcal.presentation.numbers import quantity as in_unit
 from mwdcal.presentation.text import NOT_STATED, chance, one_line, table
-from mwdcal.presentation.text import quantity as in_unit
 from mwdcal.presentation.verification import VERDICT_RISK
 
 EXACT_DIGITS = 6

@@ -104,11 +104,11 @@ def errors(comparison: Comparison, kind: str, how: str = "") -> list[list[str]]:
     rows = []
     for name, unit in comparison.units.items():
         cells = [
-            number(getattr(row, kind)[name]) + CONVENTION_MARK * (name in row.resting)
+            number(getattr(row, kind)[name], 3) + CONVENTION_MARK * (name in row.resting)
             for row in able(comparison.rows)
         ]
         what = ", ".join(filter(None, (TITLES.get(name, name), how, unit)))
-        rows.append([what, number(comparison.before[name]), *cells])
+        rows.append([what, number(comparison.before[name], 3), *cells])
     return rows
 
 
@@ -118,7 +118,7 @@ def measures(comparison: Comparison) -> list[list[str]]:
     for before in comparison.measures_before:
         for what, when, key in STATISTICS:
             cells = [_measure(row, before.triad, when, key) for row in able(comparison.rows)]
-            first = number(getattr(before, key)) if when == "after" else ""
+            first = number(getattr(before, key), 3) if when == "after" else ""
             rows.append([f"{before.triad} |e|, {what}", first, *cells])
     return rows
 
@@ -127,7 +127,7 @@ def _measure(row: Row, triad: str, when: str, key: str) -> str:
     """One measure of the vector error of a triad by one method."""
     values = [getattr(m, key) for m in row.measures if (m.triad, m.when) == (triad, when)]
     rank, size = row.ranks[triad]
-    return number(values[0] if values else None) + CONVENTION_MARK * (rank < size)
+    return number(values[0] if values else None, 3) + CONVENTION_MARK * (rank < size)
 
 
 def effort(comparison: Comparison) -> list[list[str]]:

@@ -179,7 +179,7 @@ def terms_screen(converted: Converted, terms: list[SensorTerm], output: Path | N
     rows = [
         [
             term.name,
-            *(number(value) for value in (term.value, term.owsg)),
+            *(number(value, 3) for value in (term.value, term.owsg)),
             term.unit,
             UNDETERMINED if term.ratio is None else number(term.ratio, 2),
         ]

@@ -9,9 +9,9 @@ from mwdcal.calibration.readings import is_simulated, serial_of, simulated
 from mwdcal.faults.diagnosis import Diagnosis, Rival
 from mwdcal.faults.likelihood import FALSE_ALARMS
 from mwdcal.faults.physics import NONE, SURROUNDINGS
-from mwdcal.presentation.numbers import capital, estimate, measured
+from mwdcal.presentation.numbers import capital, estimate, measured, number
 from mwdcal.presentation.page import banner, environment
-from mwdcal.presentation.text import chance, number, one_line, plural, table
+from mwdcal.presentation.text import chance, one_line, plural, table
 
 MEANINGS = {
     NONE: "as calibrated",

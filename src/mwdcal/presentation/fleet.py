@@ -22,8 +22,8 @@ from mwdcal.fleet.sources import SERIAL
 from mwdcal.fleet.tables import one_chunk
 from mwdcal.geometry.vectors import Array
 from mwdcal.presentation.envelope import enveloped
-from mwdcal.presentation.numbers import written
-from mwdcal.presentation.text import number, one_line, plural, table
+from mwdcal.presentation.numbers import number, written
+from mwdcal.presentation.text import one_line, plural, table
 from mwdcal.presentation.typed import as_typed
 
 SERIALS_SHOWN = 5
@@ -241,7 +241,14 @@ def document(summary: FleetSummary, report: Path | None) -> dict[str, Any]:
 def text(summary: FleetSummary, report: Path | None) -> str:
     """The summary for people: about one screen."""
     rows = [[k.status, str(k.tools), "" if k.status == OK else _first(k)] for k in summary.statuses]
-    spread = [[_title(n), *map(number, values)] for n, values in summary.spread.items() if values]
+    spread = [
+        [
+            _title(name),
+            *(number(value, 2 if name.endswith("_sd_deg") else None) for value in values),
+        ]
+        for name, values in summary.spread.items()
+        if values
+    ]
     blocks = [_heading(summary), table(rows, ["status", "tools", "serials"])]
     if spread:
         blocks.append(table(spread, ["of sound tools", "1 %", "median", "99 %"]))

@@ -40,9 +40,8 @@ from mwdcal.presentation.fleet_figures import (
     nominal_unit,
     parameters_of,
 )
-from mwdcal.presentation.numbers import capital, number, unit
+from mwdcal.presentation.numbers import capital, number, uncertainty, unit
 from mwdcal.presentation.page import banner, environment
-from mwdcal.presentation.text import number as brief
 from mwdcal.presentation.text import plural
 
 if TYPE_CHECKING:
@@ -133,7 +132,7 @@ def render(calibrations: Path, summary: FleetSummary) -> str:
         banner=_banner(summary, fleet),
         options="; ".join(unusual(summary.options)) or "defaults",
         stand={name: summary.spread[name] for name in ERRORS if summary.spread.get(name)},
-        short=brief,
+        short=number,
         remark=remark,
         refused=[(k, REFUSED[k.status]) for k in summary.statuses if k.status != OK],
         is_doubt=is_doubt,
@@ -172,9 +171,9 @@ def _expected(row: AngleAccuracy) -> str:
     """The accuracy of an angle over the fleet in words."""
     if row.worst is None:
         return f"{row.angle} undetermined"
-    values = f"{number(row.median)}° median, {number(row.worst)}° worst"
+    values = f"{uncertainty(row.median)}° median, {uncertainty(row.worst)}° worst"
     free = f", undetermined in {plural(row.undetermined, 'tool')}" if row.undetermined else ""
-    return f"{row.angle} {values if row.tools > 1 else f'{number(row.median)}°'}{free}"
+    return f"{row.angle} {values if row.tools > 1 else f'{uncertainty(row.median)}°'}{free}"
 
 
 @dataclass(frozen=True)
@@ -283,7 +282,7 @@ class Fleet:
     def _shown(self, angle: str, tool: int) -> str:
         """The accuracy of one tool."""
         free = bool(self._free[angle][tool])
-        return "undetermined" if free else number(float(self._sd[angle][tool]))
+        return uncertainty(None if free else float(self._sd[angle][tool]))
 
     @property
     def titles(self) -> list[str]:

@@ -23,8 +23,16 @@ UNDETERMINED = "undetermined"
 """In place of an uncertainty that no reading determines."""
 
 
-def number(value: float | None, digits: int = 3) -> str:
-    """A number to some significant digits, without E notation; a dash where there is none."""
+def number(value: float | None, digits: int | None = None) -> str:
+    """A number to some significant digits, by default at most three, without E notation; a dash where there is none.
+
+    >>> [number(0.1), number(0.1, 3), number(12345.6), number(9.92e-5), number(None)]
+    ['0.1', '0.100', '12346', '9.92×10⁻⁵', '–']
+    """
+    if digits is None:
+        plain, times, raised_power = number(value, 3).partition("×")
+        stripped = plain.rstrip("0").rstrip(".") if "." in plain else plain
+        return stripped + times + raised_power
     if value is None or not np.isfinite(value):
         return "–"
     if value == 0:
@@ -41,6 +49,15 @@ def fixed(value: float | None, decimals: int) -> str:
     if value is None or not np.isfinite(value):
         return "–"
     return f"{round(value, decimals) + 0.0:.{max(decimals, 0)}f}".replace("-", "−")
+
+
+def quantity(value: float | None, symbol: str, digits: int | None = None) -> str:
+    """A number with its unit.
+
+    >>> [quantity(0.25, "°"), quantity(3, "nT"), quantity(0.03, "°", 2), quantity(None, "nT")]
+    ['0.25°', '3 nT', '0.030°', '–']
+    """
+    return number(value, digits) + (unit(symbol) if value is not None else "")
 
 
 def signed(value: float | None, decimals: int) -> str:

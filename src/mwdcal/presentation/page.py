@@ -19,6 +19,7 @@ from mwdcal.presentation.numbers import (
     fixed,
     measured,
     number,
+    quantity,
     root_sum_of_squares,
     signed,
     uncertainty,
@@ -147,7 +148,7 @@ def css(text: str) -> str:
 
 
 FILTERS = (
-    number, signed, fixed, measured, uncertainty, contribution, root_sum_of_squares, unit,
+    number, quantity, signed, fixed, measured, uncertainty, contribution, root_sum_of_squares, unit,
     raised, chance, plural, capital, css,
 )  # fmt: skip
 """What the templates call."""

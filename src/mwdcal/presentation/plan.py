@@ -18,9 +18,9 @@ from mwdcal.files.formats.table import Table
 from mwdcal.planning.expected import left_undetermined
 from mwdcal.planning.planned import WORKING_INCLINATIONS, Planned, station_names
 from mwdcal.presentation.envelope import enveloped
-from mwdcal.presentation.numbers import written
+from mwdcal.presentation.numbers import quantity, written
 from mwdcal.presentation.stations import MOST_LINES
-from mwdcal.presentation.text import one_line, quantity, table
+from mwdcal.presentation.text import one_line, table
 
 PLACE = "1σ, calibration alone, at 45° inclination"
 """What the accuracy of a plan is of."""

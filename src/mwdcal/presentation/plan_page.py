@@ -14,6 +14,7 @@ from mwdcal.geometry.vectors import Array, Ints, reference_vectors
 from mwdcal.planning.expected import left_undetermined, planned_earth
 from mwdcal.planning.planned import Planned
 from mwdcal.planning.plans import attitudes, soak_numbers
+from mwdcal.presentation.numbers import quantity
 from mwdcal.presentation.page import banner, environment
 from mwdcal.presentation.plan import (
     DETECTABLE_TITLES,
@@ -24,7 +25,7 @@ from mwdcal.presentation.plan import (
     facts,
     station_rows,
 )
-from mwdcal.presentation.text import plural, quantity
+from mwdcal.presentation.text import plural
 from mwdcal.use import plots
 
 if TYPE_CHECKING:

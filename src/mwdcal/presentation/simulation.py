@@ -13,8 +13,8 @@ from mwdcal.planning.procedure import PERCENTILES, Repetition, Share
 from mwdcal.planning.session import Session
 from mwdcal.planning.simulate import Effects
 from mwdcal.presentation.envelope import enveloped
-from mwdcal.presentation.numbers import fixed, number, written
-from mwdcal.presentation.text import one_line, plural, quantity, table
+from mwdcal.presentation.numbers import fixed, number, quantity, written
+from mwdcal.presentation.text import one_line, plural, table
 
 SIZES = {
     "inclination_zero_deg": ("inclination zero", "°"),

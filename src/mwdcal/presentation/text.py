@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import codecs
-import math
 import os
 import re
 import sys
@@ -118,18 +117,6 @@ def _twins(error: UnicodeError) -> tuple[str, int]:
 codecs.register_error(_HANDLER, _twins)
 
 
-def number(value: float | None) -> str:
-    """Three significant digits, or a dash."""
-    if value is None or math.isnan(value):
-        return "–"
-    return f"{value + 0.0:.3g}" if abs(value) < 100 else f"{value:.0f}"
-
-
-def quantity(value: float | None, unit: str) -> str:
-    """A value with its unit; no space before the degree sign."""
-    return number(value) if value is None else f"{number(value)}{'' if unit == '°' else ' '}{unit}"
-
-
 def plural(count: int, noun: str) -> str:
     """A count with its noun: 1 station, 2 stations."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
@@ -142,7 +129,7 @@ def chance(probability: float | None) -> str:
     ['0.41', '0.00012', '< 1e-9', '–']
     """
     if probability is None:
-        return number(probability)
+        return "–"
     return "< 1e-9" if probability < 1e-9 else f"{probability:.2g}"
 
 

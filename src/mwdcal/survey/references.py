@@ -14,7 +14,6 @@ References of a place in the columns of a run: blank cells are filled, given one
 
 from __future__ import annotations
 
-import hashlib
 import math
 import os
 from collections.abc import Mapping
@@ -28,6 +27,7 @@ import numpy as np
 
 from mwdcal.calibration.readings import EARTH_RANGES
 from mwdcal.calibration.record import DOCUMENT_VERSION, Finding
+from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError, reason
 from mwdcal.files.contract import (
     AZIMUTH_KEYS,
@@ -578,7 +578,7 @@ def load_reference(path: str | os.PathLike[str]) -> tuple[EarthReference, str]:
             f"{reference.gravity_ms2:g} and {reference.gravity_g:g}. Use the file as mwdcal wrote it."
         )
     check_ranges({key: value for key, value in numbers.items() if value is not None}, file.name)
-    return reference, hashlib.sha256(data).hexdigest()
+    return reference, sha256_of(data)
 
 
 FILLED = ("gravity", "field", "dip")
