@@ -228,6 +228,25 @@ def test_messages_of_the_library_name_arguments_not_options() -> None:
     none(typed, "write `order`, of which the command makes --order")
 
 
+ONCE = {
+    "9.80665": "geometry.units",
+    "0.3048": "geometry.units",
+    "1e-9, freedom": "",
+    ".hexdigest()": "digests",
+    'text == "undetermined"': "",
+}
+"""Pieces of code that only one module may have, or none."""
+
+
+@pytest.mark.parametrize("piece", ONCE)
+def test_a_rule_stands_in_one_place(piece: str) -> None:
+    """Text in quotes may name a figure; a fleet's `parts` and `sources` hash pieces of a table."""
+    quoted = re.compile(r'"""(?:.|\n)*?"""|"[^"\n]*"')
+    code = {n: quoted.sub("", PATHS[n].read_text("utf-8")) for n in PATHS if n != ONCE[piece]}
+    fleet = ("fleet.parts", "fleet.sources")
+    none({n: "again" for n, text in code.items() if piece in text and n not in fleet}, piece)
+
+
 def identifiers(tree: ast.Module) -> set[str]:
     """Names that a module gives to variables, arguments, attributes, functions and classes."""
     names = {n.id for n in ast.walk(tree) if isinstance(n, ast.Name)}

@@ -27,6 +27,7 @@ from mwdcal.estimation.uncertainty import (
     Analysis,
     analyse,
     determined_apart,
+    per_freedom,
     sandwich,
     scatter_ratios,
     settle_gauge,
@@ -323,7 +324,7 @@ def _bounded_factor(analysis: Analysis, trust: Array, loss: str, freedom: Array)
     """s² (B, t) of a fit with station weights `trust`, from the pulls w d that they bound."""
     squares = triad_sums(analysis.residual**2 * trust[..., None])
     share = np.array([consistency(loss, k) for k in freedom])[:, None]
-    return np.asarray(squares / np.where(analysis.freedom > 1e-9, analysis.freedom, np.nan) / share)
+    return np.asarray(per_freedom(squares, analysis.freedom) / share)
 
 
 @dataclass(frozen=True)

@@ -350,6 +350,12 @@ def as_readings(source: ReadingsLike) -> Readings:
     )
 
 
+def head(*metadata: Mapping[str, object]) -> dict[str, Any]:
+    """Serial and whether it is simulated, of what rests on inputs with these metadata."""
+    serial = next(filter(None, map(serial_of, metadata)), None)
+    return {"serial": serial, "simulated": any(map(is_simulated, metadata))}
+
+
 def soaks(temperature: Array) -> Ints:
     """Number (..., n) of the soak that each station belongs to, coldest first.
 

@@ -33,6 +33,8 @@ from mwdcal.geometry.vectors import (
 )
 from mwdcal.sensor.models import Model
 
+LEAST_FREEDOM = 1e-9
+"""Degrees of freedom that are more than what rounding leaves of none."""
 LEAST_SHARE = 0.05
 """A free direction with less than this share on a triad does not move the triad."""
 TESTED = 1e-3
@@ -262,7 +264,17 @@ def whole_covariance(linear: Linear, determined: Determined) -> Array:
 def variance_factors(residual: Array, spread: Array) -> tuple[Array, Array]:
     """s² and degrees of freedom (B, t) of each triad: restricted maximum likelihood."""
     freedom = triad_sums(diagonal(spread))
-    return triad_sums(residual**2) / np.where(freedom > 1e-9, freedom, np.nan), freedom
+    return per_freedom(triad_sums(residual**2), freedom), freedom
+
+
+def per_freedom(squares: Array, freedom: Array) -> Array:
+    """Sums of squares per degree of freedom; NaN where there is none, or only what rounding leaves of one."""
+    return np.asarray(squares / np.where(freedom > LEAST_FREEDOM, freedom, np.nan))
+
+
+def scaled_freedom(freedom: Array, squares: Array) -> Array:
+    """Effective degrees of freedom tr(S)² / tr(S²); none where tr(S²) is left by rounding alone."""
+    return np.asarray(freedom**2 / np.where(squares > LEAST_FREEDOM, squares, np.inf))
 
 
 def triad_sums(values: Array) -> Array:
@@ -298,7 +310,7 @@ def effective_freedom(problem: Problem, state: State, analysis: Analysis) -> Arr
         twice = np.einsum("bpq,bqp->b", gram, gram)
         each.append(np.sum(block**2, (1, 2, 3)) - 2 * mixed.sum(-1) + twice)
     squares = np.stack(each, -1)
-    return np.asarray(analysis.freedom**2 / np.where(squares > 1e-9, squares, np.inf))
+    return scaled_freedom(analysis.freedom, squares)
 
 
 def station_misfit(analysis: Analysis) -> tuple[Array, Array]:

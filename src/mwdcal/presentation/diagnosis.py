@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from mwdcal import __version__
-from mwdcal.calibration.readings import is_simulated, serial_of, simulated
+from mwdcal.calibration.readings import simulated
 from mwdcal.faults.diagnosis import Diagnosis, Rival
 from mwdcal.faults.likelihood import FALSE_ALARMS
 from mwdcal.faults.physics import NONE, SURROUNDINGS
 from mwdcal.presentation.numbers import capital, estimate, measured, number
-from mwdcal.presentation.page import banner, environment
+from mwdcal.presentation.page import banner, rendered
 from mwdcal.presentation.text import chance, one_line, plural, table
 
 MEANINGS = {
@@ -59,22 +58,17 @@ def render(result: Diagnosis, sha256: Mapping[str, str], *metadata: Mapping[str,
     sound = result.fault == NONE
     certain = sound and not any(finding.id == "unexplained" for finding in result.findings)
     word, level = ("OK", "good") if certain else ("Attention", "attention" if sound else "bad")
-    return (
-        environment()
-        .get_template("diagnosis.html")
-        .render(
-            result=result,
-            serial=next(filter(None, map(serial_of, metadata)), None),
-            simulated=any(map(is_simulated, metadata)),
-            banner=banner(level, word, capital(verdict(result)), f"{capital(next_step(result))}."),
-            findings=result.findings,
-            moved=_moved(result),
-            moved_titles=MOVED_TITLES,
-            likelihoods=_likelihoods(result),
-            last=_last(result)[:-1],
-            sha256=sha256,
-            version=__version__,
-        )
+    return rendered(
+        "diagnosis.html",
+        *metadata,
+        result=result,
+        banner=banner(level, word, capital(verdict(result)), f"{capital(next_step(result))}."),
+        findings=result.findings,
+        moved=_moved(result),
+        moved_titles=MOVED_TITLES,
+        likelihoods=_likelihoods(result),
+        last=_last(result)[:-1],
+        sha256=sha256,
     )
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 
 from mwdcal.calibration.canonical import Signature, SignatureCheck
-from mwdcal.calibration.readings import is_simulated, serial_of
+from mwdcal.calibration.readings import head
 from mwdcal.calibration.record import DOCUMENT_VERSION, SOFTWARE
 
 INPUTS = {
@@ -83,17 +83,16 @@ def enveloped(
     `metadata` are what the inputs say of themselves, `sha256` the digests by name; one that was not
     computed, or of a file that was not given, is None. Keys of the content stand before equal ones.
     """
-    head = Envelope(
+    envelope = Envelope(
         schema_version=DOCUMENT_VERSION,
         command=command,
         software=SOFTWARE,
-        serial=next(filter(None, map(serial_of, metadata)), None),
-        simulated=any(map(is_simulated, metadata)),
+        **head(*metadata),
     )
     digests = {f"{name}_sha256": sha256.pop(name, "") or None for name in INPUTS[command]}
     if sha256:
         raise ValueError(f"{command} has no input {', '.join(sha256)}")
-    return {**msgspec.to_builtins(head), **digests, **msgspec.to_builtins(content)}
+    return {**msgspec.to_builtins(envelope), **digests, **msgspec.to_builtins(content)}
 
 
 def with_signature(document: dict[str, Any], calibration: SignatureCheck) -> dict[str, Any]:

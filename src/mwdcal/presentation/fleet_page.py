@@ -41,7 +41,7 @@ from mwdcal.presentation.fleet_figures import (
     parameters_of,
 )
 from mwdcal.presentation.numbers import capital, number, uncertainty, unit
-from mwdcal.presentation.page import banner, environment
+from mwdcal.presentation.page import banner, rendered
 from mwdcal.presentation.text import plural
 
 if TYPE_CHECKING:
@@ -124,7 +124,8 @@ def render(calibrations: Path, summary: FleetSummary) -> str:
     fleet = Fleet(SoundTools(calibrations))
     tools = fleet.tools
     written = datetime.fromtimestamp(calibrations.stat().st_mtime, UTC)
-    return environment().get_template("fleet.html").render(
+    return rendered(
+        "fleet.html",
         result=summary,
         metadata=tools.metadata,
         simulated=is_simulated(tools.metadata),

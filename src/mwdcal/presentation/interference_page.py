@@ -7,11 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal import __version__
-from mwdcal.calibration.readings import is_simulated, serial_of
 from mwdcal.geometry.vectors import Array
 from mwdcal.presentation.numbers import estimate
-from mwdcal.presentation.page import banner, environment
+from mwdcal.presentation.page import banner, rendered
 from mwdcal.presentation.survey import (
     CORRECTED_TITLES,
     DIRECTION_TITLES,
@@ -36,22 +34,17 @@ MOST_CORRECTED_OF_PAGE = 2000
 def render(result: Interference, sha256: Mapping[str, str]) -> str:
     """The analysis as HTML; `sha256` of the files it comes from, by what these are."""
     summary, stated = result.summary, (result.readings.metadata, result.calibration.tool)
-    return (
-        environment()
-        .get_template("interference.html")
-        .render(
-            summary=summary,
-            readings=result.readings.source,
-            calibration=result.calibration.run_name,
-            serial=next(filter(None, map(serial_of, stated)), None),
-            simulated=any(map(is_simulated, stated)),
-            banner=_banner(summary),
-            findings=summary.findings,
-            terms=result.terms.sentence,
-            analysis=sections(result),
-            sha256=sha256,
-            version=__version__,
-        )
+    return rendered(
+        "interference.html",
+        *stated,
+        summary=summary,
+        readings=result.readings.source,
+        calibration=result.calibration.run_name,
+        banner=_banner(summary),
+        findings=summary.findings,
+        terms=result.terms.sentence,
+        analysis=sections(result),
+        sha256=sha256,
     )
 
 

@@ -8,12 +8,16 @@ from __future__ import annotations
 import io
 import re
 from base64 import b64encode
+from collections.abc import Mapping
 from hashlib import sha256
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from mwdcal import __version__
+from mwdcal.calibration.readings import head
 from mwdcal.errors import InputError
 from mwdcal.presentation.numbers import (
+    UNDETERMINED,
     capital,
     contribution,
     fixed,
@@ -133,8 +137,18 @@ def environment() -> Environment:
     environment.filters["svg"] = svg
     script = loader.get_source(environment, "page.js")[0]
     digest = b64encode(sha256(script.encode()).digest()).decode()
-    environment.globals |= {"script": Markup(script), "script_sha256": digest}
+    environment.globals |= {
+        "script": Markup(script),
+        "script_sha256": digest,
+        "UNDETERMINED": UNDETERMINED,
+    }
     return environment
+
+
+def rendered(template: str, *metadata: Mapping[str, object], **facts: Any) -> str:
+    """A page: a template with its facts, and what all pages state: serial, whether simulated, the version."""
+    whole = {**head(*metadata), "version": __version__, **facts}
+    return environment().get_template(template).render(**whole)
 
 
 def banner(level: str, word: str, headline: str, after: str) -> dict[str, str]:

@@ -9,12 +9,12 @@ from msgspec.structs import asdict
 
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import Finding
+from mwdcal.geometry.units import STANDARD_GRAVITY
 from mwdcal.presentation.envelope import enveloped
 from mwdcal.presentation.numbers import fixed, signed, written
 from mwdcal.presentation.text import one_line, table
 from mwdcal.presentation.typed import findings_as_typed
 from mwdcal.survey.references import MEASURABLE, EarthReference, FilledRun
-from mwdcal.use.strengths import STANDARD_GRAVITY
 
 DECIMALS = {"gravity": 6, "field": 1, "dip": 3, "declination": 3}
 """Digits behind the point of each value; uncertainties have as many."""

@@ -10,12 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal import __version__
-from mwdcal.calibration.readings import is_simulated, serial_of
 from mwdcal.calibration.record import Finding
 from mwdcal.geometry.vectors import Array, wrap
 from mwdcal.presentation.interference_page import LARGEST_DRAWN_SD, sections
-from mwdcal.presentation.page import banner, environment
+from mwdcal.presentation.page import banner, rendered
 from mwdcal.presentation.survey import (
     SurveySummary,
     declination_in_words,
@@ -251,33 +249,28 @@ def render(
     stated = well.readings.metadata, well.calibration.tool
     header, rows = survey_rows(well, MOST_ROWS_OF_PAGE)
     located = has_path(well.position)
-    return (
-        environment()
-        .get_template("survey.html")
-        .render(
-            facts=facts,
-            modelled=well.limits.probability is not None,
-            readings=well.readings.source,
-            serial=next(filter(None, map(serial_of, stated)), None),
-            simulated=any(map(is_simulated, stated)),
-            banner=_banner(facts),
-            findings=findings,
-            strengths=strengths(well) if facts.not_judged < facts.rows else None,
-            angles=angles(well),
-            path=path(well) if located else None,
-            enlarged=enlargement(well.position) if located and well.position else 1.0,
-            terms=well.terms.sentence,
-            declination=declination_in_words(facts),
-            sources=sources_in_words(facts).partition("   ")[2],
-            end=end_in_words(facts.end, facts.north) if facts.end else "",
-            header=header,
-            rows=rows,
-            analysis=sections(analysis) if analysis else None,
-            more=facts.rows - len(rows),
-            calibration=well.calibration.run_name,
-            sha256=sha256,
-            version=__version__,
-        )
+    return rendered(
+        "survey.html",
+        *stated,
+        facts=facts,
+        modelled=well.limits.probability is not None,
+        readings=well.readings.source,
+        banner=_banner(facts),
+        findings=findings,
+        strengths=strengths(well) if facts.not_judged < facts.rows else None,
+        angles=angles(well),
+        path=path(well) if located else None,
+        enlarged=enlargement(well.position) if located and well.position else 1.0,
+        terms=well.terms.sentence,
+        declination=declination_in_words(facts),
+        sources=sources_in_words(facts).partition("   ")[2],
+        end=end_in_words(facts.end, facts.north) if facts.end else "",
+        header=header,
+        rows=rows,
+        analysis=sections(analysis) if analysis else None,
+        more=facts.rows - len(rows),
+        calibration=well.calibration.run_name,
+        sha256=sha256,
     )
 
 

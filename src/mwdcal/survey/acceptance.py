@@ -21,9 +21,9 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.errors import InputError
 from mwdcal.files.profiles import decoded_toml
 from mwdcal.geometry.observables import OBSERVABLES, is_vertical
+from mwdcal.geometry.units import STANDARD_GRAVITY
 from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal
 from mwdcal.survey.stations import RANDOM, STRENGTHS, SURVEYED, Surveys
-from mwdcal.use.strengths import STANDARD_GRAVITY
 
 STRENGTH_NAMES = SURVEYED[STRENGTHS]
 LEAST_FREE = 1e-12

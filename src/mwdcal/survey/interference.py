@@ -19,6 +19,7 @@ from mwdcal.calibration.residuals import RESHOOT
 from mwdcal.errors import FitError
 from mwdcal.estimation.uncertainty import station_misfit
 from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.geometry.units import STANDARD_GRAVITY
 from mwdcal.geometry.vectors import Array, Bools, centred
 from mwdcal.survey.acceptance import SURVEY_UNITS, SensorTerms
 from mwdcal.survey.interference_estimate import (
@@ -31,7 +32,6 @@ from mwdcal.survey.interference_estimate import (
     varied,
 )
 from mwdcal.survey.separability import missing
-from mwdcal.use.strengths import STANDARD_GRAVITY
 
 CORRECTED = "interference-corrected"
 """The finding of a calibration from which multi-station analysis has taken interference."""

@@ -24,11 +24,11 @@ from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
 from mwdcal.estimation.uncertainty import TANGENT_STEP, analyse, tangent
 from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.geometry.units import STANDARD_GRAVITY
 from mwdcal.geometry.vectors import Array, Bools, diagonal
 from mwdcal.survey.acceptance import SensorTerms, load_survey_limits
 from mwdcal.survey.references import PLACE_SD
 from mwdcal.survey.stations import RANDOM
-from mwdcal.use.strengths import STANDARD_GRAVITY
 
 OFFSET_NAMES = ("cross-axial x", "cross-axial y", "axial")
 """Directions of interference, in the order of the tool axes x, y, z."""

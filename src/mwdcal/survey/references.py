@@ -40,10 +40,10 @@ from mwdcal.files.contract import (
 from mwdcal.files.formats.columns import Column, shown
 from mwdcal.files.formats.table import Table, numbers
 from mwdcal.files.runs import check_run
+from mwdcal.geometry.units import STANDARD_GRAVITY
 from mwdcal.geometry.vectors import Array, ArrayLike, Bools
 from mwdcal.survey import earth
 from mwdcal.survey.earth import LEAST_DISTORTION, Grid, grid_convergence
-from mwdcal.use.strengths import STANDARD_GRAVITY
 
 FARTHEST = 2.0
 """Combined standard uncertainties beyond which one value contradicts another."""
