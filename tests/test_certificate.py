@@ -19,7 +19,7 @@ from cli_support import EXAMPLE, servo_run, write_csv
 from mwdcal.calibration.record import Finding
 from mwdcal.certificate import contents, decisions
 from mwdcal.certificate.budget import budget
-from mwdcal.certificate.contents import Order, certificate
+from mwdcal.certificate.contents import CertificateRequest, certificate
 from mwdcal.certificate.document import Person
 from mwdcal.certificate.laboratory import (
     DecisionRule,
@@ -58,7 +58,9 @@ def thermal(tmp_path_factory):
 
 
 def order(**values):
-    return Order(**{"issued": datetime.now(UTC).date(), "calibration_sha256": "0" * 64, **values})
+    return CertificateRequest(
+        **{"issued": datetime.now(UTC).date(), "calibration_sha256": "0" * 64, **values}
+    )
 
 
 def issued(calibration, laboratory=None, **values):

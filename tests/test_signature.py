@@ -715,9 +715,9 @@ def test_a_signed_calibration_is_the_same_to_all_else(tmp_path, files, key, publ
     documents.write(tmp_path / "again.json", calibration)
     assert (tmp_path / "again.json").read_bytes() == path.read_bytes()
     assert state(tmp_path / "again.json", "--key", public) == (0, "intact")
-    from mwdcal.calibration.record import sealed
+    from mwdcal.calibration.record import with_checksum
 
-    assert sealed(calibration) == before
+    assert with_checksum(calibration) == before
     jsonschema = pytest.importorskip("jsonschema")
     record = json.loads(path.read_bytes())
     jsonschema.Draft202012Validator(documents.published_schema()).validate(record)

@@ -21,7 +21,7 @@ from mwdcal.files.formats.table import EXCHANGED, Table
 from mwdcal.files.runs import is_export, read_export, renamed, to_readings
 from mwdcal.geometry.observables import EXTRAPOLATED
 from mwdcal.sensor.profile import Profile
-from mwdcal.use.correction import RowCounts, counted
+from mwdcal.use.correction import RowCounts, correct_and_count
 
 LARGEST_TEXT = 8_000_000
 """Bytes of text that becomes a workbook, WITSML or LAS: memory is some fifty times as much."""
@@ -123,7 +123,7 @@ def apply_to_table(
         raise streaming.nothing(source.source)
     kept = streaming.chosen(table, whole)
     readings, _ = to_readings(kept, calibration.profile)
-    results, tally, findings = counted(
+    results, tally, findings = correct_and_count(
         calibration, readings, outside, source.count - kept.count, uncertainty
     )
     streaming.check_free(source.columns, list(results), source.source)

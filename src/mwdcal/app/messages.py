@@ -21,14 +21,14 @@ import click
 from mwdcal.errors import InputError, MwdcalError, reason
 from mwdcal.presentation.text import (
     UNSAFE_BUT_LINES,
-    fitting,
-    harmless,
+    escape_controls,
     laid_out,
     one_line,
     to_json,
+    transliterate,
     without_passwords,
 )
-from mwdcal.presentation.typed import as_typed
+from mwdcal.presentation.typed import with_option_names
 
 if TYPE_CHECKING:
     from mwdcal.calibration.record import Finding
@@ -74,7 +74,7 @@ class Command(click.Command):
         try:
             return super().invoke(context)
         except MwdcalError as error:
-            error.args = (as_typed(str(error)),)
+            error.args = (with_option_names(str(error)),)
             raise
 
 
@@ -108,7 +108,7 @@ class Screen:
 
     def write(self, text: str) -> int:
         """Write text; control characters in it are up to the writer."""
-        shown = fitting(text, self.encoding)
+        shown = transliterate(text, self.encoding)
         with self._given_up_when_it_fails():
             if shown:  # click tries with nothing, and takes no notice of a failure
                 self._stream.write(shown)
@@ -169,7 +169,7 @@ def _on_screen(text: str, stream: Any) -> str:
 
 def lines(findings: Iterable[Finding]) -> list[str]:
     """Findings, one line each."""
-    return [one_line(f"! {as_typed(finding.text)}") for finding in findings]
+    return [one_line(f"! {with_option_names(finding.text)}") for finding in findings]
 
 
 def print_result(result: Any, findings: Iterable[Finding] = ()) -> None:
@@ -177,7 +177,7 @@ def print_result(result: Any, findings: Iterable[Finding] = ()) -> None:
     if not isinstance(result, str):
         click.echo(_shown(to_json(result)))
     elif not quiet():
-        click.echo(_on_screen(harmless(result), sys.stdout))
+        click.echo(_on_screen(escape_controls(result), sys.stdout))
     for line in lines(findings):
         say(line)
 

@@ -22,7 +22,7 @@ from mwdcal.calibration.drift import Constant, Drift
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import accuracy
-from mwdcal.calibration.prior import Knowledge
+from mwdcal.calibration.prior import PriorInformation
 from mwdcal.calibration.readings import TRIADS, WORDS, Readings, is_simulated, serial_of
 from mwdcal.calibration.record import (
     SOFTWARE,
@@ -33,8 +33,8 @@ from mwdcal.calibration.record import (
     StandErrors,
     TriadCalibration,
     Undetermined,
-    sealed,
     stated,
+    with_checksum,
 )
 from mwdcal.calibration.residuals import error_rows, measure_rows
 from mwdcal.calibration.settings import ASSUMED_PRACTICE, DIRECTION, is_assumed
@@ -92,7 +92,7 @@ def recorded(choice: Choice, result: Fit) -> Calibration:
     """
     fitted = _one_run(choice, result)
     check(fit_refusals(fitted))
-    calibration = sealed(rounded(_record(choice, fitted)))
+    calibration = with_checksum(rounded(_record(choice, fitted)))
     if problem := inconsistency(calibration):
         raise FitError(f"the fit gives no usable calibration: {problem}. {UNSOUND_ADVICE}")
     return calibration
@@ -155,7 +155,7 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
     )
 
 
-def _doubts(readings: Readings, prior: Knowledge | None) -> list[Finding]:
+def _doubts(readings: Readings, prior: PriorInformation | None) -> list[Finding]:
     """Findings on the identity of a run and its prior, and on its day."""
     alone = unidentified({readings.name: serial_of(readings.metadata)})
     doubts = [*prior.doubts] if prior and prior.doubts else alone

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypedDict, cast
 
 from mwdcal.calibration.fit_options import FIT_OPTIONS, FitArguments, Prior, names, order_of
-from mwdcal.calibration.prior import DATASHEET, Knowledge
+from mwdcal.calibration.prior import DATASHEET, PriorInformation
 from mwdcal.calibration.readings import HIGHEST, TRIADS
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
@@ -46,7 +46,7 @@ class SeedlessFitChoices(CommonChoices, total=False):
     """The attributes of `Options` but for the seed."""
 
     scatter: bool
-    prior: Knowledge | Calibration | Literal["datasheet"] | None
+    prior: PriorInformation | Calibration | Literal["datasheet"] | None
     prior_sha256: str
     exclude: tuple[str, ...]
 
@@ -102,7 +102,7 @@ class Options:
     ignore: tuple[str, ...] = ()
     robust: str | None = None
     paper_weights: bool = False
-    prior: Knowledge | Calibration | Literal["datasheet"] | None = None
+    prior: PriorInformation | Calibration | Literal["datasheet"] | None = None
     prior_sha256: str = ""
     exclude: tuple[str, ...] = ()
     seed: int = 0
@@ -146,12 +146,12 @@ class Options:
         return {} if self.nonlinearity == AUTO else dict.fromkeys(self.nonlinearity, USUAL)
 
     @property
-    def knowledge(self) -> Knowledge | None:
+    def knowledge(self) -> PriorInformation | None:
         """What is known of the parameters beforehand.
 
         Raises `TypeError` for a prior that needs the readings to become knowledge of parameters.
         """
-        if self.prior is None or isinstance(self.prior, Knowledge):
+        if self.prior is None or isinstance(self.prior, PriorInformation):
             return self.prior
         raise TypeError("this prior needs the readings: use calibrate, not fit")
 

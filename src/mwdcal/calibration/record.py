@@ -623,7 +623,7 @@ def content_sha256(calibration: Calibration) -> str:
     return document_sha256(msgspec.to_builtins(calibration))
 
 
-def sealed(calibration: Calibration) -> Calibration:
+def with_checksum(calibration: Calibration) -> Calibration:
     """The record with the `sha256` of its contents, by which a later change shows; it is unsigned."""
     return msgspec.structs.replace(
         calibration, sha256=content_sha256(calibration), signature=msgspec.UNSET

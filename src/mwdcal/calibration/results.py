@@ -21,7 +21,7 @@ from mwdcal.calibration.automatic.courses import misfit_covariance
 from mwdcal.calibration.drift import STEADINESS
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.prediction import CalibratedTools
-from mwdcal.calibration.prior import Knowledge
+from mwdcal.calibration.prior import PriorInformation
 from mwdcal.calibration.record import FREE_SHARE, NOISE, ORDER, REPEATABILITY, SETTINGS
 from mwdcal.estimation import drift
 from mwdcal.estimation.batch import take
@@ -372,7 +372,7 @@ def triad_singular_values(result: Fit, index: int) -> Array:
     return np.asarray(values / values[:, :1])
 
 
-def temperature_range(result: Fit, prior: Knowledge | None) -> tuple[Array, Array]:
+def temperature_range(result: Fit, prior: PriorInformation | None) -> tuple[Array, Array]:
     """Coldest and hottest station (B,) each, °C; those behind the prior count too."""
     low, high = prior.temperature if prior and prior.temperature else (np.inf, -np.inf)
     temperature = result.problem.temperature
@@ -380,7 +380,7 @@ def temperature_range(result: Fit, prior: Knowledge | None) -> tuple[Array, Arra
 
 
 def calibrated_tools(
-    result: Fit, free: Sequence[list[Free]], reference: float, prior: Knowledge | None
+    result: Fit, free: Sequence[list[Free]], reference: float, prior: PriorInformation | None
 ) -> CalibratedTools:
     """The tools at the reference temperature, moved into their range where it lies outside."""
     problem, state = result.problem, result.state

@@ -122,7 +122,7 @@ STATEMENTS = (
 """Statements of every certificate."""
 
 
-class Order(msgspec.Struct, frozen=True, kw_only=True):
+class CertificateRequest(msgspec.Struct, frozen=True, kw_only=True):
     """What is particular to one certificate, beside its calibration and the laboratory.
 
     `customer`, `condition` and `received` stand before those of the laboratory file; `number` before its
@@ -145,7 +145,7 @@ class Order(msgspec.Struct, frozen=True, kw_only=True):
 
 @np.errstate(over="ignore", invalid="ignore")  # what is infinite is refused when it is hashed
 def certificate(
-    calibration: Calibration, order: Order, laboratory: Laboratory | None = None
+    calibration: Calibration, order: CertificateRequest, laboratory: Laboratory | None = None
 ) -> Certificate:
     """The certificate of a calibration, with every number at 12 significant digits.
 
@@ -197,7 +197,9 @@ def certificate(
     return replace(whole, number=number)
 
 
-def _parties(calibration: Calibration, order: Order, laboratory: Laboratory) -> dict[str, Any]:
+def _parties(
+    calibration: Calibration, order: CertificateRequest, laboratory: Laboratory
+) -> dict[str, Any]:
     """Laboratory, customer and people: as the laboratory states them, else as the run does."""
     return {
         "laboratory": laboratory.laboratory or _party(calibration.tool.get("lab", "")),
@@ -219,7 +221,7 @@ def _findings(contents: Certificate, calibration: Calibration) -> Iterator[Findi
         yield Finding(id="settings-assumed", text=ASSUMED)
 
 
-def _check_days(day: date, order: Order, laboratory: Laboratory) -> None:
+def _check_days(day: date, order: CertificateRequest, laboratory: Laboratory) -> None:
     """Refuse a certificate from before the calibration, and a tool that was received after it."""
     received = order.received or laboratory.item.received
     if order.issued < day:
@@ -255,7 +257,7 @@ def _check_number(number: str) -> None:
 
 def _tests(
     calibration: Calibration,
-    order: Order,
+    order: CertificateRequest,
     given: Mapping[When, Verification | None],
     laboratory: Laboratory,
 ) -> tuple[dict[str, ConformityTest], list[Finding]]:
@@ -271,7 +273,9 @@ def _tests(
     return tests, findings
 
 
-def _check_test(document: Verification, calibration: Calibration, order: Order) -> None:
+def _check_test(
+    document: Verification, calibration: Calibration, order: CertificateRequest
+) -> None:
     """Refuse a roll test of another tool, or with the wrong one of the two calibrations."""
     as_left = document is order.verification
     argument = _argument(document, order)
@@ -294,7 +298,9 @@ def _check_test(document: Verification, calibration: Calibration, order: Order) 
         )
 
 
-def _doubts(document: Verification, calibration: Calibration, order: Order) -> list[Finding]:
+def _doubts(
+    document: Verification, calibration: Calibration, order: CertificateRequest
+) -> list[Finding]:
     """What a roll test says of its identity, and whether it states that it is of the tool of the calibration."""
     said = [each for each in document.findings if each.id in (UNIDENTIFIED, FROM_THE_FUTURE)]
     serials = {
@@ -304,11 +310,11 @@ def _doubts(document: Verification, calibration: Calibration, order: Order) -> l
     return said or unidentified(serials)
 
 
-def _argument(document: Verification, order: Order) -> str:
+def _argument(document: Verification, order: CertificateRequest) -> str:
     return "`verification`" if document is order.verification else "`as_found`"
 
 
-def _check_issued(document: Verification, order: Order) -> None:
+def _check_issued(document: Verification, order: CertificateRequest) -> None:
     """Refuse a certificate from before a roll test that it shows."""
     stated, argument = {"date": document.date}, _argument(document, order)
     check_day(stated, argument)
@@ -319,7 +325,7 @@ def _check_issued(document: Verification, order: Order) -> None:
         )
 
 
-def _simulated(calibration: Calibration, order: Order) -> bool:
+def _simulated(calibration: Calibration, order: CertificateRequest) -> bool:
     documents = [each for each in (order.as_found, order.verification) if each]
     marked = calibration.simulated or is_simulated(calibration.tool)
     return marked or any(each.simulated for each in documents)
@@ -333,7 +339,7 @@ def _person(name: str) -> Person | None:
     return Person(name=name) if name.strip() else None
 
 
-def _item(calibration: Calibration, order: Order, laboratory: Laboratory) -> Item:
+def _item(calibration: Calibration, order: CertificateRequest, laboratory: Laboratory) -> Item:
     details = laboratory.item
     received = order.received or details.received
     return Item(

@@ -136,7 +136,7 @@ class Problem:
     prior: Prior
     memo: dict[str, Any] = field(init=False, repr=False, compare=False, default_factory=dict)
 
-    def of_other_noise(self, triads: tuple[Triad, ...], evidence: Evidence) -> Problem:
+    def with_noise(self, triads: tuple[Triad, ...], evidence: Evidence) -> Problem:
         """The same with other uncertainties alone: what does not depend on them is kept."""
         other = replace(self, triads=triads, evidence=evidence)
         other.memo.update({name: self.memo[name] for name in NOISELESS if name in self.memo})

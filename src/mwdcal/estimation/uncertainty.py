@@ -154,17 +154,17 @@ def determined_apart(problem: Problem, state: State, known: dict[int, Array]) ->
 
 
 def sandwich(
-    analysis: Analysis, problem: Problem, state: State, pulls: dict[int, Array]
+    analysis: Analysis, problem: Problem, state: State, influence: dict[int, Array]
 ) -> Analysis:
     """The analysis when triads minimise sums of their own: covariance, residuals' spread and s².
 
-    `pulls` (B, n, p_t, 3), by triad, is how an error of a station's whitened reading moves those.
+    `influence` (B, n, p_t, 3), by triad, is how an error of a station's whitened reading moves those.
     All other unknowns then follow as in the likelihood, those being held. Every error is counted
     with all that it does: of the readings, of the stand (in C = I + GGᵀ), of common references.
     """
     linear = problem.linear(state)
     design, u = linear.design, linear.prior.shape[-1]
-    moved, follow, back, fixed = _followed(problem, linear, pulls)
+    moved, follow, back, fixed = _followed(problem, linear, influence)
     noise = np.eye(design.shape[2]) + linear.private @ linear.private.mT
     covariance = np.einsum("bnim,bnmk,bnjk->bij", moved, noise, moved, optimize=True)
     independent = covariance
@@ -203,9 +203,9 @@ def sandwich(
 
 
 def _followed(
-    problem: Problem, linear: Linear, pulls: dict[int, Array]
+    problem: Problem, linear: Linear, influence: dict[int, Array]
 ) -> tuple[Array, Array, Array, Bools]:
-    """Influence (B, n, u, m) of errors on all unknowns when some triads have their own `pulls`.
+    """Influence (B, n, u, m) of errors on all unknowns when some triads have their own `influence`.
 
     Also how the gradient of the others follows those, the inverse of their information, and which
     unknowns (u,) are fixed by pulls.
@@ -213,7 +213,7 @@ def _followed(
     design, weighed, u = linear.design, linear.weighed[..., :-1], linear.prior.shape[-1]
     moved = np.zeros((*design.shape[:2], u, design.shape[2]))
     fixed = np.zeros(u, bool)
-    for index, pull in pulls.items():
+    for index, pull in influence.items():
         where = problem.slices()[index]
         moved[:, :, where, 3 * index : 3 * index + 3] = pull
         fixed[where] = True
@@ -508,7 +508,7 @@ def with_scatter(problem: Problem, state: State, ratios: dict[str, Array]) -> Pr
         if name in scatter:
             noise = np.sqrt(np.mean(triad.sd**2, (1, 2))) / size
             scatter[name] = np.minimum(scatter[name], np.maximum(noise, LEAST_SCATTER)[:, None])
-    return problem.of_other_noise(problem.triads, replace(problem.evidence, scatter=scatter))
+    return problem.with_noise(problem.triads, replace(problem.evidence, scatter=scatter))
 
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from mwdcal.calibration import results
-from mwdcal.calibration.automatic.auto import known_before
+from mwdcal.calibration.automatic.auto import with_prior
 from mwdcal.calibration.automatic.drift import by_drift
 from mwdcal.calibration.automatic.nonlinearity import offered
 from mwdcal.calibration.diagnosis.findings import finding_flags
@@ -139,7 +139,7 @@ def calibrate_batch(
     outcome = Outcome.blank(len(readings.accelerometer), names(options, profile))
     none = np.zeros(readings.accelerometer.shape[:-1], bool)
     batch = _Batch(readings, _with_scales(profile), alone, outcome, none)
-    batch.calibrate(known_before(options, readings, batch.profile))
+    batch.calibrate(with_prior(options, readings, batch.profile))
     repeated = np.flatnonzero(batch.repeated.any(-1))
     blank = [np.isnan(readings.reference(name)[repeated]) for name in readings.known]
     patterns = np.concatenate([batch.repeated[repeated], *blank], -1)

@@ -38,7 +38,7 @@ from mwdcal.fleet.tables import (
     in_several_folders,
     partitions,
 )
-from mwdcal.presentation.envelope import enveloped
+from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.fleet import FleetSummary, summarise
 from mwdcal.presentation.text import plural, slowly
 from mwdcal.sensor.profile import Profile
@@ -158,7 +158,7 @@ def _metadata(
         "reference_temperature_c": plan.profile.reference_temperature_c,
         "noise_estimated": list(plan.noise_estimated),
     }
-    return {**metadata, **enveloped("fleet", content, metadata, profile=digest)}
+    return {**metadata, **json_document("fleet", content, metadata, profile=digest)}
 
 
 def prior_of_fleet(word: str | None) -> Literal["datasheet"] | None:

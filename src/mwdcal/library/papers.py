@@ -21,7 +21,7 @@ from mwdcal.library.shown import digest_of
 from mwdcal.use.verification import Verdict
 
 if TYPE_CHECKING:
-    from mwdcal.certificate.contents import Order
+    from mwdcal.certificate.contents import CertificateRequest
     from mwdcal.certificate.document import Certificate, SourceFile
     from mwdcal.drift.document import ToolDrift
     from mwdcal.files.verifications import Verification
@@ -40,7 +40,7 @@ class Paper(Result):
 
     record: Certificate
     calibration: Calibration
-    order: Order
+    order: CertificateRequest
     drift: ToolDrift | None = None
     saved: list[Path] = field(default_factory=list)
 
@@ -160,7 +160,7 @@ def certificate(
         paper = mwdcal.certificate(cal, verification=test, laboratory="lab.toml")
         mwdcal.save(paper, "C.pdf")
     """
-    from mwdcal.certificate.contents import Order
+    from mwdcal.certificate.contents import CertificateRequest
     from mwdcal.certificate.contents import certificate as contents
     from mwdcal.certificate.laboratory import load_laboratory
 
@@ -174,7 +174,7 @@ def certificate(
         files.add("laboratory", Path(laboratory), laboratory_digest)
     issued = day_of(date, "date") or datetime.now(UTC).date()
     drift = _drift(registry, calibration, digest, issued) if registry is not None else None
-    order = Order(
+    order = CertificateRequest(
         issued=issued,
         number=number,
         customer=customer,

@@ -60,10 +60,10 @@ def _inputs(result: Any) -> Inputs:
 
 
 def _enveloped(command: str, result: Any, content: object) -> dict[str, Any]:
-    from mwdcal.presentation.envelope import enveloped
+    from mwdcal.presentation.envelope import json_document
 
     metadata, digests, _ = _inputs(result)
-    return enveloped(command, content, *metadata, **digests)
+    return json_document(command, content, *metadata, **digests)
 
 
 def _calibration_text(calibration: Calibration) -> str:

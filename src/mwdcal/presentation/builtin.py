@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from mwdcal.files.profiles import built_in
-from mwdcal.presentation.envelope import enveloped
+from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.text import one_line
 
 FOLDERS = {
@@ -72,7 +72,7 @@ def _what(folder: str, name: str) -> str:
 
 def document(kind: str, built: list[BuiltIn]) -> dict[str, Any]:
     """The list for machines."""
-    return enveloped("list", BuiltInSummary(kind=kind, entries=built))
+    return json_document("list", BuiltInSummary(kind=kind, entries=built))
 
 
 def screen(built: list[BuiltIn]) -> str:

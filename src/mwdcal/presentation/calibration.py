@@ -26,17 +26,17 @@ from mwdcal.calibration.record import (
 )
 from mwdcal.calibration.settings import ASSUMED, ASSUMED_PRACTICE
 from mwdcal.geometry.observables import TITLES
-from mwdcal.presentation.envelope import enveloped
+from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.numbers import (
     degrees_of_freedom,
     estimate,
+    files_written,
     number,
     quantity,
     uncertainty,
-    written,
 )
 from mwdcal.presentation.text import chance, one_line, table
-from mwdcal.presentation.typed import findings_as_typed
+from mwdcal.presentation.typed import findings_with_option_names
 
 if TYPE_CHECKING:
     from mwdcal.use.verification import Verdict
@@ -108,7 +108,7 @@ def summary(
     verdict: Verdict | None = None,
 ) -> dict[str, Any]:
     """The result for machines, with the verdict of a roll test if there was one."""
-    findings = findings_as_typed(calibration.findings)
+    findings = findings_with_option_names(calibration.findings)
     content = CalibrationSummary(
         **{**_recorded(CalibrationSummary, calibration), "findings": findings},
         triads={t.name: TriadSummary(**_recorded(TriadSummary, t)) for t in calibration.triads},
@@ -118,7 +118,7 @@ def summary(
         report=str(report or ""),
         verification=msgspec.to_builtins(verdict) if verdict else msgspec.UNSET,
     )
-    return enveloped(
+    return json_document(
         "calibrate",
         content,
         calibration.tool,
@@ -148,7 +148,7 @@ def screen(
     judged: str = "",
 ) -> str:
     """The result for people, the files that were written, and what to do next or what `judged` says of it."""
-    files = written(calibration=output, report=report)
+    files = files_written(calibration=output, report=report)
     after = f"\n\n{judged}" if judged else f"   next: mwdcal verify {one_line(output)} ROLLTEST.csv"
     return f"{body(calibration, tried)}\n{files}{after}"
 

@@ -27,7 +27,7 @@ from mwdcal.presentation.calibration import accuracy_in_words, how, known_inclin
 from mwdcal.presentation.numbers import HELD, capital, exponent, factor_places
 from mwdcal.presentation.page import banner, environment
 from mwdcal.presentation.text import plural, raised
-from mwdcal.presentation.typed import findings_as_typed
+from mwdcal.presentation.typed import findings_with_option_names
 from mwdcal.presentation.verification import BETWEEN_SETS, freedom, noise_free
 from mwdcal.use import plots
 from mwdcal.use.notation import Notation, convert
@@ -133,7 +133,7 @@ def _findings(calibration: Calibration, verdict: Verdict | None) -> list[Finding
     for extra in verdict.findings if verdict else ():
         if extra.id not in ids:
             findings.setdefault(extra.text, extra)
-    return sorted(findings_as_typed(findings.values()), key=lambda f: f.id != "reshoot")
+    return sorted(findings_with_option_names(findings.values()), key=lambda f: f.id != "reshoot")
 
 
 def _when(time: str) -> str:

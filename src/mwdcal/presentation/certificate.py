@@ -22,11 +22,11 @@ from mwdcal.presentation.numbers import (
     UNDETERMINED,
     contribution,
     exponent,
+    files_written,
     fixed,
     measured,
     number,
     unit,
-    written,
 )
 from mwdcal.presentation.numbers import quantity as in_unit
 from mwdcal.presentation.text import NOT_STATED, chance, one_line, table
@@ -101,7 +101,11 @@ def screen(certificate: Certificate, outputs: Sequence[Path]) -> str:
         *(_test(test) for test in tests),
         *([] if certificate.as_left else ["conformity was not tested"]),
         _budget(certificate.budget),
-        *([written(**{path.suffix[1:].upper(): path for path in outputs})] if outputs else []),
+        *(
+            [files_written(**{path.suffix[1:].upper(): path for path in outputs})]
+            if outputs
+            else []
+        ),
     ]
     return "\n\n".join(blocks)
 

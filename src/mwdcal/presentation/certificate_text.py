@@ -23,7 +23,7 @@ from mwdcal.certificate.document import (
 )
 from mwdcal.presentation.certificate import EXACT_DIGITS, plain, probability, quantity_numbers
 from mwdcal.presentation.numbers import UNDETERMINED, capital, contribution, measured, unit
-from mwdcal.presentation.text import NOT_STATED, chance, harmless, plural
+from mwdcal.presentation.text import NOT_STATED, chance, escape_controls, plural
 from mwdcal.sensor.profile import Person
 
 if TYPE_CHECKING:
@@ -197,7 +197,9 @@ def certificate_text(certificate: Certificate, pictures: Sequence[Picture] = ())
         sections=list(_sections(certificate, pictures)),
         end=f"End of certificate {certificate.number}",
     )
-    return msgspec.convert(mapped_texts(msgspec.to_builtins(text), harmless), CertificateText)
+    return msgspec.convert(
+        mapped_texts(msgspec.to_builtins(text), escape_controls), CertificateText
+    )
 
 
 def _percent(share: float) -> str:

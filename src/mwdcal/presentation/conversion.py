@@ -18,8 +18,8 @@ from mwdcal.files.formats import members
 from mwdcal.firmware.c_source import stated_errors
 from mwdcal.firmware.export import DEFAULT_BITS, FIXED_POINT, FirmwareSources, export
 from mwdcal.firmware.quantisation import SHARE_OF
-from mwdcal.presentation.envelope import enveloped
-from mwdcal.presentation.numbers import HELD, UNDETERMINED, number, written
+from mwdcal.presentation.envelope import json_document
+from mwdcal.presentation.numbers import HELD, UNDETERMINED, files_written, number
 from mwdcal.presentation.text import one_line, raised, table
 from mwdcal.registry.calibration_source import calibration_of
 from mwdcal.sensor.profile import Axis
@@ -187,7 +187,7 @@ def terms_screen(converted: Converted, terms: list[SensorTerm], output: Path | N
     ]
     heading = "\n".join(one_line("   ".join(line)) for line in _heading(converted))
     shown = table(rows, ["term", "1σ", "OWSG MWD", "unit", "ratio"])
-    files = [written(**{"tool model": output})] if output else []
+    files = [files_written(**{"tool model": output})] if output else []
     return "\n".join([heading, "", shown, *files])
 
 
@@ -254,7 +254,7 @@ def _identity(converted: Converted | Exported) -> dict[str, Any]:
 def _enveloped(converted: Converted | Exported, content: ConversionSummary) -> dict[str, Any]:
     calibration = converted.calibration
     digests = {"calibration": converted.sha256, "run": calibration.run_sha256}
-    return enveloped("convert", content, calibration.tool, **digests)
+    return json_document("convert", content, calibration.tool, **digests)
 
 
 def _triad(converted: Converted, name: str) -> ConvertedTriad:

@@ -75,7 +75,7 @@ class ExampleDocument(msgspec.Struct, frozen=True, kw_only=True):
     files: list[str]
 
 
-def enveloped(
+def json_document(
     command: str, content: object, *metadata: Mapping[str, object], **sha256: str
 ) -> dict[str, Any]:
     """The document of a command: its head, the SHA-256 of its input files, and the content.

@@ -21,10 +21,10 @@ from mwdcal.fleet.calibrate import OK, STAND_COLUMNS
 from mwdcal.fleet.sources import SERIAL
 from mwdcal.fleet.tables import one_chunk
 from mwdcal.geometry.vectors import Array
-from mwdcal.presentation.envelope import enveloped
-from mwdcal.presentation.numbers import number, written
+from mwdcal.presentation.envelope import json_document
+from mwdcal.presentation.numbers import files_written, number
 from mwdcal.presentation.text import one_line, plural, table
-from mwdcal.presentation.typed import as_typed
+from mwdcal.presentation.typed import with_option_names
 
 SERIALS_SHOWN = 5
 """Most serials that a line names."""
@@ -168,7 +168,9 @@ def _kinds(head: Any) -> list[StatusCount]:
     kinds = []
     for name, count in sorted(counts.items(), key=lambda kind: (kind[0] != OK, -kind[1])):
         tools = head.filter(compute.equal(status, name)).slice(0, SERIALS_SHOWN).to_pydict()
-        kinds.append(StatusCount(name, count, tools[SERIAL], as_typed(tools["message"][0])))
+        kinds.append(
+            StatusCount(name, count, tools[SERIAL], with_option_names(tools["message"][0]))
+        )
     return kinds
 
 
@@ -235,7 +237,7 @@ def document(summary: FleetSummary, report: Path | None) -> dict[str, Any]:
         report=str(report or ""),
     )
     stated = summary.metadata
-    return enveloped("fleet", content, stated, profile=stated["profile_sha256"])
+    return json_document("fleet", content, stated, profile=stated["profile_sha256"])
 
 
 def text(summary: FleetSummary, report: Path | None) -> str:
@@ -258,7 +260,7 @@ def text(summary: FleetSummary, report: Path | None) -> str:
     rate = f"{summary.seconds:.1f} s, {summary.tools / summary.seconds:.0f} tools/s"
     files = "in memory"
     if summary.output or report:
-        files = written(calibrations=summary.output, report=report)
+        files = files_written(calibrations=summary.output, report=report)
     return "\n".join(["\n\n".join(blocks), *_remarks(summary), "", f"{files}   {rate}"])
 
 

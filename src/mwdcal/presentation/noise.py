@@ -10,7 +10,7 @@ import numpy as np
 
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.logs.noise import ChannelNoise, Noise, Term
-from mwdcal.presentation.numbers import channels_of, written
+from mwdcal.presentation.numbers import channels_of, files_written
 from mwdcal.presentation.text import one_line, plural, table
 
 TERM_TITLES = {
@@ -52,7 +52,7 @@ def screen(noise: Noise, plot: Path | None, report: Path | None) -> str:
         profile_lines(noise),
     ]
     if plot or report:
-        blocks.append(written(picture=plot, report=report))
+        blocks.append(files_written(picture=plot, report=report))
     return "\n\n".join(blocks)
 
 

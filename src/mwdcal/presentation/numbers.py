@@ -161,7 +161,7 @@ def capital(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def written(**files: Path | str | None) -> str:
+def files_written(**files: Path | str | None) -> str:
     """The files that were written, each with what it is."""
     return one_line("wrote " + "   ".join(f"{p} ({what})" for what, p in files.items() if p))
 

@@ -29,7 +29,7 @@ from mwdcal.presentation.numbers import (
     uncertainty,
     unit,
 )
-from mwdcal.presentation.text import chance, harmless, plural, raised
+from mwdcal.presentation.text import chance, escape_controls, plural, raised
 from mwdcal.use.plots import POINT_NAMES, style
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def svg(figure: Figure, key: str) -> Markup:
     for line in figure.findobj(lambda artist: (artist.get_gid() or "").startswith(POINT_NAMES)):
         _, *names = str(line.get_label()).split("\n")
         text = _with_names(text, f'<g id="{key}-{line.get_gid()}">', names)
-    head, rest = harmless(text).split(">", 1)
+    head, rest = escape_controls(text).split(">", 1)
     text = re.sub(r' (width|height|version)="[^"]*"', "", head) + ">" + rest
     seen = f'<svg role="img" aria-label="{figure.get_label()}" tabindex="0"'
     return Markup(text.replace("<svg", seen, 1))
@@ -129,7 +129,7 @@ def environment() -> Environment:
         loader=loader,
         autoescape=True,
         undefined=StrictUndefined,
-        finalize=lambda shown: harmless(shown) if type(shown) is str else shown,
+        finalize=lambda shown: escape_controls(shown) if type(shown) is str else shown,
         trim_blocks=True,
         lstrip_blocks=True,
     )
@@ -158,7 +158,9 @@ def banner(level: str, word: str, headline: str, after: str) -> dict[str, str]:
 
 def css(text: str) -> str:
     """Text as the inside of a CSS string: nothing but letters and digits is left bare."""
-    return "".join(c if c.isascii() and c.isalnum() else f"\\{ord(c):x} " for c in harmless(text))
+    return "".join(
+        c if c.isascii() and c.isalnum() else f"\\{ord(c):x} " for c in escape_controls(text)
+    )
 
 
 FILTERS = (

@@ -17,8 +17,8 @@ from mwdcal.errors import InputError
 from mwdcal.files.formats.table import Table
 from mwdcal.planning.expected import left_undetermined
 from mwdcal.planning.planned import WORKING_INCLINATIONS, Planned, station_names
-from mwdcal.presentation.envelope import enveloped
-from mwdcal.presentation.numbers import quantity, written
+from mwdcal.presentation.envelope import json_document
+from mwdcal.presentation.numbers import files_written, quantity
 from mwdcal.presentation.stations import MOST_LINES
 from mwdcal.presentation.text import one_line, table
 
@@ -216,7 +216,7 @@ def document(
         output=str(output or ""),
         html=str(html or ""),
     )
-    return enveloped("plan", content, {"simulated": True}, **digests)
+    return json_document("plan", content, {"simulated": True}, **digests)
 
 
 def screen(
@@ -232,7 +232,7 @@ def screen(
     if len(plans) == 1:
         blocks += [accuracy(summaries[0]), detectable(summaries[0]), stations(plans[0])]
     if output or html:
-        blocks.append(written(**{"plan": output, "run sheet": html}))
+        blocks.append(files_written(**{"plan": output, "run sheet": html}))
     return "\n\n".join(blocks)
 
 

@@ -12,8 +12,8 @@ from msgspec.structs import asdict
 from mwdcal.calibration.readings import TRIADS, simulated
 from mwdcal.files.formats.layout import WORKBOOKS
 from mwdcal.identification.proposal import Proposal, in_order
-from mwdcal.presentation.envelope import enveloped
-from mwdcal.presentation.numbers import written
+from mwdcal.presentation.envelope import json_document
+from mwdcal.presentation.numbers import files_written
 from mwdcal.presentation.text import one_line, plural, table
 from mwdcal.sensor.profile import Profile, TableFormat, TriadProfile
 
@@ -49,7 +49,7 @@ def summary(proposal: Proposal, run: Path, output: Path | None) -> dict[str, Any
         unit_by_values=sorted(proposal.by_value),
         profile=str(output or ""),
     )
-    return enveloped("profile", content, proposal.metadata, run=proposal.run_sha256)
+    return json_document("profile", content, proposal.metadata, run=proposal.run_sha256)
 
 
 def _triad(proposal: Proposal, kind: str) -> ProposedTriad:
@@ -91,7 +91,7 @@ def screen(proposal: Proposal, run: Path, output: Path | None) -> str:
         command = (
             f"mwdcal calibrate {one_line(str(run))} --tool {one_line(str(output))} -o tool.json"
         )
-        blocks.append(f"{written(profile=output)}   next: {command}")
+        blocks.append(f"{files_written(profile=output)}   next: {command}")
     return "\n\n".join(blocks)
 
 

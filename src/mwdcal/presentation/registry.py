@@ -12,7 +12,7 @@ from mwdcal.calibration.diagnosis.identity import FROM_THE_FUTURE, UNIDENTIFIED
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.calibration.record import Finding
 from mwdcal.files.formats.columns import shown
-from mwdcal.presentation.envelope import enveloped
+from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.numbers import number
 from mwdcal.presentation.text import UNCUT, one_line, plural, table
 from mwdcal.registry.checking import Discrepancy
@@ -113,7 +113,7 @@ class RegistryChecked(msgspec.Struct, frozen=True, kw_only=True):
 
 def document(command: str, content: object, *metadata: Mapping[str, object]) -> dict[str, Any]:
     """A result for machines."""
-    return enveloped(command, content, *metadata)
+    return json_document(command, content, *metadata)
 
 
 def added(registry: Registry, adding: Adding) -> RegistryAdded:

@@ -30,8 +30,8 @@ from mwdcal.certificate.signature import check as check_signature
 from mwdcal.errors import InputError
 from mwdcal.files import documents
 from mwdcal.files.formats.members import Member
-from mwdcal.presentation.envelope import enveloped
-from mwdcal.presentation.numbers import written
+from mwdcal.presentation.envelope import json_document
+from mwdcal.presentation.numbers import files_written
 from mwdcal.presentation.text import one_line, table
 from mwdcal.registry.calibration_source import calibration_file
 
@@ -77,7 +77,7 @@ class KeysDocument(msgspec.Struct, frozen=True, kw_only=True):
     keys: list[TrustedKey]
 
 
-def in_short(check: SignatureCheck) -> str:
+def signature_status(check: SignatureCheck) -> str:
     """The state of a calibration's signature, as part of a line."""
     name = f"{check.key} ({check.owner})" if check.owner else check.key
     return one_line(IN_SHORT[check.state].format(key=name))
@@ -137,7 +137,7 @@ def for_machines(
     command: str, result: object, fields: Mapping[str, Any], digest: str
 ) -> dict[str, Any]:
     """The result, of a document with these fields, whose file had that SHA-256."""
-    return enveloped(f"certificate {command}", result, _stated(fields), document=digest)
+    return json_document(f"certificate {command}", result, _stated(fields), document=digest)
 
 
 def _stated(fields: Mapping[str, Any]) -> dict[str, Any]:
@@ -171,7 +171,7 @@ def keys(result: KeysDocument, **files: Path) -> str:
     """One row for each key, and the files that were written."""
     rows = [[key.key, key.owner, key.created[:10], _standing(key)] for key in result.keys]
     shown = table(rows, ["key", "owner", "created", ""])
-    return f"{shown}\n\n{written(**files)}" if files else shown
+    return f"{shown}\n\n{files_written(**files)}" if files else shown
 
 
 def _standing(key: TrustedKey) -> str:

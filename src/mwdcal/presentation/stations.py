@@ -12,7 +12,7 @@ from mwdcal.calibration.record import Finding
 from mwdcal.files.contract import RAW
 from mwdcal.logs.stations import Stations
 from mwdcal.presentation.noise import rounded
-from mwdcal.presentation.numbers import written
+from mwdcal.presentation.numbers import files_written
 from mwdcal.presentation.text import one_line, plural, table
 
 MOST_LINES = 40
@@ -80,14 +80,14 @@ def body(stations: Stations) -> str:
 
 def screen(stations: Stations, files: dict[str, str]) -> str:
     """What was found, the files that were written, and what to do next."""
-    outputs = written(run=files["output"], picture=files["plot"], report=files["report"])
+    outputs = files_written(run=files["output"], picture=files["plot"], report=files["report"])
     return f"{body(stations)}\n{outputs}   next: {one_line(next_command(files['output']))}"
 
 
 def shown_in(plot: Path | None, report: Path | None) -> str:
     """Where a log without a station is shown."""
     if plot or report:
-        return written(picture=plot, report=report)
+        return files_written(picture=plot, report=report)
     return "--report or --plot shows the log."
 
 

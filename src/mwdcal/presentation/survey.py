@@ -15,9 +15,9 @@ from mwdcal.calibration.canonical import SignatureCheck
 from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import Finding, stated
-from mwdcal.presentation.envelope import enveloped, with_signature
-from mwdcal.presentation.numbers import fixed, measured, number, signed, written
-from mwdcal.presentation.signature import in_short
+from mwdcal.presentation.envelope import json_document, with_signature
+from mwdcal.presentation.numbers import files_written, fixed, measured, number, signed
+from mwdcal.presentation.signature import signature_status
 from mwdcal.presentation.text import chance, one_line, plural, table
 from mwdcal.survey.interference import (
     ErrorTerms,
@@ -199,7 +199,7 @@ def result_summary(result: SurveyedWell, output: str = "", html: str = "") -> Su
 
 def document(inputs: WellInputs, facts: SurveySummary, signature: SignatureCheck) -> dict[str, Any]:
     """The document of a result or of a refusal, with what all inputs say of themselves."""
-    whole = enveloped("survey", facts, *inputs.stated, **inputs.digests)
+    whole = json_document("survey", facts, *inputs.stated, **inputs.digests)
     return with_signature(whole, signature)
 
 
@@ -297,7 +297,7 @@ def screen(
     if facts.blind:
         counts.append(f"{facts.blind} blind to interference")
     heading = [well.readings.source, plural(facts.rows, "survey"), *counts]
-    heading += [in_short(signature), *simulated(*metadata)]
+    heading += [signature_status(signature), *simulated(*metadata)]
     source = f" ({facts.source})" if facts.source else ""
     lines = [
         "   ".join(heading),
@@ -313,7 +313,7 @@ def screen(
             *map(one_line, lines),
             "",
             survey_table(well),
-            *([written(table=facts.output, page=facts.html)] if facts.output else []),
+            *([files_written(table=facts.output, page=facts.html)] if facts.output else []),
         ]
     )
 

@@ -64,7 +64,7 @@ def one_line(text: object) -> str:
     return _UNSAFE.sub(_escape, str(text))
 
 
-def harmless(text: str) -> str:
+def escape_controls(text: str) -> str:
     """As `one_line`, but line breaks stay."""
     return UNSAFE_BUT_LINES.sub(_escape, text)
 
@@ -93,7 +93,7 @@ def _escape(unsafe: re.Match[str]) -> str:
     return unsafe[0].encode("unicode_escape").decode("ascii")
 
 
-def fitting(text: str, encoding: str | None) -> str:
+def transliterate(text: str, encoding: str | None) -> str:
     r"""The text with plain twins of the characters that the encoding lacks.
 
     >>> fitting("1σ 0.1° 10⁻³ Ω", "ascii")
@@ -155,7 +155,7 @@ def laid_out(text: str, stream: Any) -> str:
         deeper = len(line) - len(line.lstrip(" ")) + 2
         return "# " if " # " in f" {line}" else " " * deeper
 
-    lines = fitting(text, stream.encoding).split("\n")
+    lines = transliterate(text, stream.encoding).split("\n")
     return "\n".join(fold(line, width, indent(line)) for line in lines)
 
 
@@ -194,15 +194,16 @@ def table(rows: list[list[str]], header: list[str], width: int = WIDEST, names: 
     rows: the first, or several. Elsewhere the table has at most a `width`.
     """
     cells = [
-        [fitting(one_line(cell), sys.stdout.encoding) for cell in row] for row in [header, *rows]
+        [transliterate(one_line(cell), sys.stdout.encoding) for cell in row]
+        for row in [header, *rows]
     ]
     whole, room = list(zip(*cells, strict=True)), columns(sys.stdout)
     if room is None:
-        return _drawn(whole, width)
-    return "\n\n".join(_drawn(some, UNCUT) for some in _abreast(whole, room, names))
+        return _render_table(whole, width)
+    return "\n\n".join(_render_table(some, UNCUT) for some in _split_columns(whole, room, names))
 
 
-def _abreast(whole: Sequence[Column], room: int, names: int) -> list[list[Column]]:
+def _split_columns(whole: Sequence[Column], room: int, names: int) -> list[list[Column]]:
     """The columns of a table in as many tables as they need, with the first ones in each."""
 
     def left(some: Sequence[Column]) -> int:
@@ -233,7 +234,7 @@ def _width(column: Iterable[str]) -> int:
     return max((cell_len(line) for cell in column for line in cell.split("\n")), default=0)
 
 
-def _drawn(whole: Sequence[Column], width: int) -> str:
+def _render_table(whole: Sequence[Column], width: int) -> str:
     """The columns of a table side by side; those with folded cells begin at the left."""
     room = _shared_out([_width(column) for column in whole], width - BETWEEN * (len(whole) - 1))
     tallest = max(title.count("\n") for title, *_ in whole)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from mwdcal.calibration.record import Finding
 
 
-def as_typed(text: str) -> str:
+def with_option_names(text: str) -> str:
     """A message of the library with the options of the command that runs instead of its arguments.
 
     The library names an argument in backticks, also in the files that it writes; the name stays as
@@ -27,6 +27,6 @@ def as_typed(text: str) -> str:
     return re.sub(r"`(\w+)`", lambda name: options.get(name[1], name[0]), text)
 
 
-def findings_as_typed(findings: Iterable[Finding]) -> list[Finding]:
+def findings_with_option_names(findings: Iterable[Finding]) -> list[Finding]:
     """The findings in the words of the command that runs."""
-    return [replace(finding, text=as_typed(finding.text)) for finding in findings]
+    return [replace(finding, text=with_option_names(finding.text)) for finding in findings]

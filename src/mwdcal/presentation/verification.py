@@ -10,7 +10,7 @@ from msgspec import UNSET
 from mwdcal.calibration.canonical import SignatureCheck
 from mwdcal.calibration.readings import simulated
 from mwdcal.presentation.numbers import measured, quantity, unit
-from mwdcal.presentation.signature import in_short
+from mwdcal.presentation.signature import signature_status
 from mwdcal.presentation.text import NOT_STATED, WIDE, chance, one_line, table
 from mwdcal.use.verification import SETTING_PRACTICES, JudgedSet, Verdict, VerdictRow
 
@@ -37,7 +37,7 @@ def screen(
         rows.append([row.name, raw, value, sd, freedom(row), limit, verdict, row.note])
     outcome = "PASS" if result.passed else "FAIL"
     first = [outcome, result.run, f"{result.stations} stations"]
-    first += [in_short(signature)] if signature else []
+    first += [signature_status(signature)] if signature else []
     first += simulated(*metadata)
     source = f" ({result.source})" if result.source else ""
     lines = ["   ".join(first), f"limits {result.limits}{source}", f"rule: {result.rule}"]

@@ -23,7 +23,7 @@ from mwdcal.registry.database.tools import TOOL_KINDS
 from mwdcal.registry.exports import read_manifest
 from mwdcal.registry.facts import content_address
 from mwdcal.registry.queries import records_page
-from mwdcal.registry.store import Draft, Entry, Registry, draft
+from mwdcal.registry.store import Draft, Entry, Registry, rows_to_insert
 
 FILES_AT_ONCE = 50
 """Files of a portion."""
@@ -131,7 +131,7 @@ def prepared(source: Source) -> Prepared:
     try:
         entries = _entries(source)
     except contents.UnlikeRunError as error:
-        result.doubtful = draft(error.entry)
+        result.doubtful = rows_to_insert(error.entry)
         result.problems.append(str(error))
         return result
     except MwdcalError as error:
@@ -139,7 +139,7 @@ def prepared(source: Source) -> Prepared:
         return result
     for entry in entries:
         try:
-            calibration, one = contents.checked(entry), draft(entry)
+            calibration, one = contents.checked(entry), rows_to_insert(entry)
             result.drafts.append(one)
             if calibration and not stated_day(calibration.tool):
                 result.undated.add(one["sha256"])

@@ -23,9 +23,9 @@ from mwdcal.files.profiles import decoded_toml
 from mwdcal.geometry.observables import OBSERVABLES, is_vertical
 from mwdcal.geometry.units import STANDARD_GRAVITY
 from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal
-from mwdcal.survey.stations import RANDOM, STRENGTHS, SURVEYED, Surveys
+from mwdcal.survey.stations import RANDOM, STRENGTHS, SURVEY_OBSERVABLES, Surveys
 
-STRENGTH_NAMES = SURVEYED[STRENGTHS]
+STRENGTH_NAMES = SURVEY_OBSERVABLES[STRENGTHS]
 LEAST_FREE = 1e-12
 """Share of a variance that is of its quantity alone, at least: the rounding of a correlation."""
 SURVEY_UNITS = {

@@ -14,7 +14,7 @@ import numpy as np
 from mwdcal.calibration import results
 from mwdcal.calibration.canonical import rounded
 from mwdcal.calibration.readings import Readings, is_simulated
-from mwdcal.calibration.record import Calibration, Finding, sealed, stated
+from mwdcal.calibration.record import Calibration, Finding, stated, with_checksum
 from mwdcal.calibration.residuals import RESHOOT
 from mwdcal.errors import FitError
 from mwdcal.estimation.uncertainty import station_misfit
@@ -267,7 +267,7 @@ def corrected_calibration(calibration: Calibration, whole: Estimate) -> Calibrat
         inherited=[*calibration.inherited, *whole.readings.digest],
         findings=[*calibration.findings, Finding(id=CORRECTED, text=text), *_drift(whole)],
     )
-    return sealed(rounded(record))
+    return with_checksum(rounded(record))
 
 
 def _drift(whole: Estimate) -> list[Finding]:

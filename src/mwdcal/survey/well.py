@@ -24,8 +24,8 @@ from mwdcal.survey.acceptance import (
 from mwdcal.survey.interference import CORRECTED, DRIFTED, ErrorTerms, error_terms
 from mwdcal.survey.norths import North
 from mwdcal.survey.path import calibrated_path
-from mwdcal.survey.stations import TOOLFACE_SWITCH, Surveys, surveyed
-from mwdcal.use.correction import counted
+from mwdcal.survey.stations import TOOLFACE_SWITCH, Surveys, survey_angles
+from mwdcal.use.correction import correct_and_count
 
 BLIND_FROM = 2.0
 """Stated standard uncertainties of azimuth by which interference that would pass turns it where acceptance is blind."""
@@ -221,9 +221,9 @@ def well(
         InputError: readings that do not belong to the calibration, or depths that do not increase.
     """
     north = north or North()
-    columns, _, findings = counted(calibration, readings, outside)
+    columns, _, findings = correct_and_count(calibration, readings, outside)
     beyond, blank = calibration.outside(readings), np.isnan(columns[RESULTS[0]])
-    surveys = _without(surveyed(calibration, readings, switch, advance), blank, beyond)
+    surveys = _without(survey_angles(calibration, readings, switch, advance), blank, beyond)
     g, b = (np.stack([columns[name] for name in VECTORS[i : i + 3]], -1) for i in (0, 3))
     judgement, blind = _judged(calibration, readings, surveys, (g, b), limits)
     start = (0.0, 0.0, 0.0) if tie_in is None else tie_in

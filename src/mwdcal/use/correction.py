@@ -209,11 +209,11 @@ def correct(
     `magnetic_toolface_deg` stands beside them. A strength of zero has no direction: NaN.
     Temperatures outside the calibrated range are blanked, refused or extrapolated as `outside` says.
     """
-    columns, _, about = counted(calibration, readings, outside, uncertainty=uncertainty)
+    columns, _, about = correct_and_count(calibration, readings, outside, uncertainty=uncertainty)
     return columns, about
 
 
-def counted(
+def correct_and_count(
     calibration: Calibration,
     readings: Readings,
     outside: str,

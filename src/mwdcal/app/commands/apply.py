@@ -48,8 +48,8 @@ def command(
     from mwdcal.app.progress import bar
     from mwdcal.calibration.readings import simulated
     from mwdcal.files.runs import BlankReadingError
-    from mwdcal.presentation.envelope import enveloped, with_signature
-    from mwdcal.presentation.signature import in_short, load_calibration
+    from mwdcal.presentation.envelope import json_document, with_signature
+    from mwdcal.presentation.signature import load_calibration, signature_status
 
     options.check_outputs([output], [calibration, readings, *key])
     loaded = load_calibration(calibration, key)
@@ -64,7 +64,7 @@ def command(
         raise InputError(f"{error} {advice}") from None
     findings = loaded.findings + findings
     blank = tally.blank(outside)
-    document = enveloped(
+    document = json_document(
         "apply",
         Applied(rows=tally.rows, blank=blank, output=str(output), findings=findings),
         *(fitted.tool, tally.metadata),
@@ -72,7 +72,7 @@ def command(
         readings=readings_digest,
     )
     corrected = f"{tally.rows} rows corrected" + (f", {blank} of them blank" if blank else "")
-    signed = one_line(in_short(loaded.signature))
+    signed = one_line(signature_status(loaded.signature))
     said = [corrected, f"wrote {one_line(output)}", signed, *simulated(fitted.tool)]
     document = with_signature(document, loaded.signature)
     print_result(document if as_json else "   ".join(said), findings)

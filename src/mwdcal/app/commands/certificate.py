@@ -19,7 +19,7 @@ import click
 from mwdcal.app.commands import Commands, Group, options
 from mwdcal.app.messages import print_result
 from mwdcal.errors import InputError
-from mwdcal.presentation.typed import findings_as_typed
+from mwdcal.presentation.typed import findings_with_option_names
 
 
 @click.group(
@@ -197,6 +197,6 @@ def verify(document: Path, files: tuple[Path, ...], key: tuple[Path, ...], as_js
             "`key` is missing, and the variable MWDCAL_KEYS is not set. Name a public key."
         )
     result = check_signature(document, key, files=files)
-    result.content = replace(result.content, findings=findings_as_typed(result.findings))
+    result.content = replace(result.content, findings=findings_with_option_names(result.findings))
     print_result(result.to_dict() if as_json else result.summary(), result.findings)
     sys.exit(0 if result.passed else 1)

@@ -11,7 +11,7 @@ import click
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result
 from mwdcal.errors import InputError
-from mwdcal.presentation.typed import findings_as_typed
+from mwdcal.presentation.typed import findings_with_option_names
 
 if TYPE_CHECKING:
     from mwdcal.calibration.canonical import SignatureCheck
@@ -108,7 +108,7 @@ def command(
     if report:
         from mwdcal.presentation.survey_page import render
 
-        findings = findings_as_typed(result.well.findings)
+        findings = findings_with_option_names(result.well.findings)
         pages.append((report, render(result.well, findings, inputs.named, analysis)))
     atomic.write_all([(output, tables.streamed(output, result.table)), *pages])
     _print(result, loaded.signature, (str(output), str(report or "")), as_json)
@@ -149,7 +149,7 @@ def _print(
         if as_json
         else screens.whole_screen(result, facts, signature)
     )
-    print_result(shown, findings_as_typed(screens.all_findings(facts)))
+    print_result(shown, findings_with_option_names(screens.all_findings(facts)))
 
 
 def _numbers(name: str, text: str, count: int) -> list[float]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result
 from mwdcal.presentation.text import to_json
-from mwdcal.presentation.typed import findings_as_typed
+from mwdcal.presentation.typed import findings_with_option_names
 
 
 @options.command()
@@ -36,7 +36,7 @@ def command(
     from mwdcal.files import runs
     from mwdcal.files.formats import atomic
     from mwdcal.files.limits import load_limits
-    from mwdcal.presentation.envelope import enveloped, with_signature
+    from mwdcal.presentation.envelope import json_document, with_signature
     from mwdcal.presentation.signature import load_calibration
     from mwdcal.presentation.verification import next_step, screen
     from mwdcal.use.verification import verify
@@ -47,13 +47,13 @@ def command(
     readings, _ = runs.read_run(run, fitted.profile, decimal=decimal)
     bounds, limits_digest = load_limits(limits)
     result = verify(fitted, readings, bounds)
-    findings = findings_as_typed(
+    findings = findings_with_option_names(
         loaded.findings + result.findings + unused_columns(readings.unused)
     )
     result = replace(result, findings=findings)
     stated = fitted.tool, readings.metadata
     digests = {"calibration": loaded.digest, "run": readings.run_sha256, "limits": limits_digest}
-    document = enveloped("verify", result, *stated, **digests)
+    document = json_document("verify", result, *stated, **digests)
     document = with_signature(document, loaded.signature)
     rendered = ""
     if report:

@@ -66,7 +66,7 @@ class Database:
     def reading(self) -> Iterator[sa.Connection]:
         """A transaction that sees one state of the database, whatever is written meanwhile."""
         options = {} if self.file else {"isolation_level": "REPEATABLE READ"}
-        with explained(self), self.engine.connect() as plain:
+        with as_input_error(self), self.engine.connect() as plain:
             connection = plain.execution_options(**options)
             try:
                 with connection.begin():
@@ -77,7 +77,7 @@ class Database:
     @contextlib.contextmanager
     def writing(self) -> Iterator[sa.Connection]:
         """A transaction of the only writer: on the disk when the block ends, or without effect."""
-        with explained(self), self.engine.connect() as plain:
+        with as_input_error(self), self.engine.connect() as plain:
             if self.file:
                 _set_journal(plain, self.shared)
             connection = plain.execution_options(mwdcal_writing=True)
@@ -244,17 +244,17 @@ def _begin(connection: sa.Connection) -> None:
 
 
 @contextlib.contextmanager
-def explained(database: Database) -> Iterator[None]:
+def as_input_error(database: Database) -> Iterator[None]:
     """Turn what the database refuses into one sentence without passwords."""
     try:
         yield
     except (UnicodeError, OverflowError):
         raise InputError(f"{database.name}: it is damaged. Restore it from a backup.") from None
     except (sa.exc.SQLAlchemyError, sqlite3.Error) as error:
-        raise InputError(f"{database.name}: {sentence(error, database)}") from None
+        raise InputError(f"{database.name}: {error_text(error, database)}") from None
 
 
-def sentence(error: Exception, database: Database) -> str:
+def error_text(error: Exception, database: Database) -> str:
     """What a database refused, without passwords, and what to do about it."""
     lines = str(getattr(error, "orig", None) or error).strip().splitlines()
     text = lines[0].strip() if lines else type(error).__name__
