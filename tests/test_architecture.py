@@ -149,6 +149,14 @@ def test_contributing_lists_the_rooms_with_their_purpose() -> None:
     assert [floor(room.replace("/", ".")) for room, _ in rows] == sorted(map(floor, ROOMS))
 
 
+def test_contributing_names_where_things_are_decided() -> None:
+    table = (ROOT / "CONTRIBUTING.md").read_text("utf-8").partition("## Where is it decided?")[2]
+    rows = re.findall(r"^\| [^|]+ \| `([a-z_.]+)` \| `?(\w*)`? *\|", table, re.M)
+    assert len(rows) >= 20
+    known = {module: {*constants(TREES[module]), *identifiers(TREES[module])} for module, _ in rows}
+    assert not [row for row in rows if row[1] and row[1] not in known[row[0]]]
+
+
 def test_no_import_cycle() -> None:
     try:
         TopologicalSorter(imports()).prepare()

@@ -34,7 +34,7 @@ WHOLE = (".xlsx", *EXCHANGED)
 
 
 class Applied(msgspec.Struct, frozen=True, kw_only=True):
-    """What came of a table: its rows, those without results, and the table that was written."""
+    """The result for a table: its rows, those without results, and the table that was written."""
 
     rows: int
     blank: int

@@ -1,4 +1,4 @@
-"""What commands say: results on stdout, messages and findings on stderr, errors in their words.
+"""The output of commands: results on stdout, messages and findings on stderr, errors in their words.
 
 Both streams take any text in any encoding; one that is closed, or that nobody reads, is not an error.
 """

@@ -260,7 +260,7 @@ class _Worker:
         return correction_numba.RowLimits(RAW_RANGE[:2], TEMPERATURE[:2], warmth, blank)
 
     def findings(self, tally: RowCounts, outside: str) -> list[Finding]:
-        """What the reader should know of rows with these counts."""
+        """The findings about rows with these counts."""
         metadata = runs.identified(self.source.metadata, tally.serials)
         heard = replace(self.said, metadata=metadata, source=self.source.name)
         return correction.findings(self.calibration, heard, tally, outside)
@@ -420,7 +420,7 @@ class _Worker:
 
 
 def described(calibration: Calibration) -> dict[str, object]:
-    """What a corrected table says of the calibration it rests on."""
+    """The statements of a corrected table about the calibration it rests on."""
     return {
         "calibration_run": calibration.run,
         "calibration_time": calibration.time,

@@ -163,7 +163,7 @@ def _doubts(readings: Readings, prior: PriorInformation | None) -> list[Finding]
 
 
 def _identity(readings: Readings, simulated: bool) -> dict[str, str]:
-    """What the run says of the tool, of whom and where it was measured; `simulated`: so is its prior."""
+    """The statements of the run about the tool, of whom and where it was measured; `simulated`: so is its prior."""
     tool = {k: str(v) for k, v in readings.metadata.items() if k in IDENTITY}
     return {**tool, "simulated": str(True)} if simulated else tool
 
@@ -188,7 +188,7 @@ def _settings(options: Options) -> FitSettings:
 
 
 def _budget(fitted: FittedRuns) -> list[BudgetRow]:
-    """What each source of error adds to the accuracy to expect."""
+    """The contribution of each source of error to the accuracy to expect."""
     reference, prior = fitted.profile.reference_temperature_c, fitted.options.knowledge
     tools = results.calibrated_tools(fitted.result, fitted.free, reference, prior)
     repeatability = [getattr(fitted.profile, name).repeatability for name in TRIADS]

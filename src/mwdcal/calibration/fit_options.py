@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from mwdcal.calibration.record import Calibration, FitSettings
 
 Prior: TypeAlias = "Calibration | Literal['datasheet'] | None"
-"""What is known before a fit: a calibration, the tolerances of the profile, or nothing."""
+"""The information before a fit: a calibration, the tolerances of the profile, or nothing."""
 
 
 class FitOption(NamedTuple):

@@ -105,7 +105,7 @@ EVIDENCE: dict[str, Callable[[Evidence], Evidence]] = {
     "toolface-inclination": angles_alone,
     "scalar": strengths_alone,
 }
-"""What each method uses of the evidence: "joint" all of it, weighted by its uncertainty."""
+"""The evidence that each method uses of the evidence: "joint" all of it, weighted by its uncertainty."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from mwdcal.errors import InputError
 
 MODELS = FIT_OPTIONS["model"].words
 AUTO: Literal["auto"] = "auto"
-"""What an option is whose value the software chooses (`mwdcal.calibration.automatic.auto`)."""
+"""The value of an option that the software chooses (`mwdcal.calibration.automatic.auto`)."""
 USUAL = 0.005
 """Prior of own-axis terms, as a share of the field, where the profile declares none."""
 Orders = int | tuple[int, int]
@@ -147,7 +147,7 @@ class Options:
 
     @property
     def knowledge(self) -> PriorInformation | None:
-        """What is known of the parameters beforehand.
+        """The prior information on the parameters.
 
         Raises `TypeError` for a prior that needs the readings to become knowledge of parameters.
         """

@@ -1,4 +1,4 @@
-"""What is known of a tool before the run: its datasheet, or a previous calibration.
+"""Information on a tool before the run: its datasheet, or a previous calibration.
 
 Knowledge is of the parameters as files name them, at a reference temperature; `prior_of` puts it
 into the parameters of a fit, where it is one more block of residuals.

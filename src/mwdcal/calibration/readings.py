@@ -187,7 +187,7 @@ class Readings:
 
     @property
     def name(self) -> str:
-        """What messages call the readings: the name of the file, if there is one."""
+        """The name of the readings in messages: the name of the file, if there is one."""
         return self.source or "the readings"
 
     @property

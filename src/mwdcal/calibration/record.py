@@ -78,7 +78,7 @@ class Undetermined(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class BudgetRow(msgspec.Struct, frozen=True, kw_only=True):
-    """What one source of error adds to the accuracy to expect, 1σ in degrees; None: undetermined."""
+    """The contribution of one source of error to the accuracy to expect, 1σ in degrees; None: undetermined."""
 
     source: str
     inclination_deg: float | None
@@ -402,7 +402,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def run_name(self) -> str:
-        """What messages call the run: its file, if it had one."""
+        """The name of the run in messages: its file, if it had one."""
         return self.run or "unnamed readings"
 
     @property

@@ -67,7 +67,7 @@ METHODS: dict[str, tuple[str, tuple[str, ...]]] = {
     "toolface-inclination": ("to toolface and inclination alone.", ()),
     "scalar": ("to the strengths of gravity and field alone.", ()),
 }
-"""What each method fits the parameters to, and where it is published."""
+"""The evidence that each method fits the parameters to, and where it is published."""
 
 
 def method(calibration: Calibration) -> Method:
@@ -91,7 +91,7 @@ def _model(triad: TriadCalibration) -> str:
 
 
 def _deviations(calibration: Calibration) -> Iterator[str]:
-    """What was done other than the usual procedure, a phrase each."""
+    """The departures from the usual procedure, a phrase each."""
     if without_temperature(calibration):
         yield f"{without_temperature(calibration)}: the results hold at the temperature of the calibration alone"
     if calibration.excluded:
@@ -109,7 +109,7 @@ LONGEST_NUMBER = 64
 """Characters of a certificate number."""
 NOT_TESTED = "Conformity was not tested: no roll test after the calibration was supplied."
 DATE_OF_FIT = (
-    "the run states no date: the day on which the calibration was computed stands for that of the "
+    "the run states no date: the day on which the calibration was computed is used as that of the "
     "measurements."
 )
 NO_AS_FOUND = "No roll test before the adjustment (as found) was supplied."
@@ -123,7 +123,7 @@ STATEMENTS = (
 
 
 class CertificateRequest(msgspec.Struct, frozen=True, kw_only=True):
-    """What is particular to one certificate, beside its calibration and the laboratory.
+    """The facts of one certificate, beside its calibration and the laboratory.
 
     `customer`, `condition` and `received` stand before those of the laboratory file; `number` before its
     pattern. `verification` (as left) and `as_found` are roll tests with this and with the previous calibration;
@@ -211,7 +211,7 @@ def _parties(
 
 
 def _findings(contents: Certificate, calibration: Calibration) -> Iterator[Finding]:
-    """What the reader should know of the certificate: changes, gaps, overdue standards, exact references."""
+    """The findings about the certificate: changes, gaps, overdue standards, exact references."""
     yield from calibration.change_findings()
     yield from _not_stated(contents, calibration)
     for standard in contents.traceability:
@@ -301,7 +301,7 @@ def _check_test(
 def _doubts(
     document: Verification, calibration: Calibration, order: CertificateRequest
 ) -> list[Finding]:
-    """What a roll test says of its identity, and whether it states that it is of the tool of the calibration."""
+    """The findings about the identity of a roll test, and whether it states that it is of the calibration's tool."""
     said = [each for each in document.findings if each.id in (UNIDENTIFIED, FROM_THE_FUTURE)]
     serials = {
         _argument(document, order): document.serial,
@@ -363,7 +363,7 @@ def _next_due(day: date, laboratory: Laboratory) -> str:
 
 
 def _statements(tests: dict[str, ConformityTest]) -> list[str]:
-    """What every certificate states, and what it must say of tests that it lacks or of their rule."""
+    """The statements of every certificate, and those it must make of tests that it lacks or of their rule."""
     rules = dict.fromkeys(test.rule_text for test in tests.values())
     return [
         *STATEMENTS,

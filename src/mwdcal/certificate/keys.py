@@ -32,7 +32,7 @@ _KEY_DIGITS = 16
 _MOST_BYTES = 1_000_000
 """Bytes of the largest file of keys."""
 _PREFIX = bytes.fromhex("302a300506032b6570032100")
-"""What stands before the 32 bytes of an Ed25519 key in its SubjectPublicKeyInfo (RFC 8410, section 4)."""
+"""The bytes before the 32 bytes of an Ed25519 key in its SubjectPublicKeyInfo (RFC 8410, section 4)."""
 _PEM = re.compile(rb"-----BEGIN ([A-Z0-9 ]+)-----\s(.*?)-----END \1-----", re.DOTALL)
 _PUBLIC_HEADS = {
     name: re.compile(rb"^%b: ([^\r\n]*)" % name.encode(), re.MULTILINE)

@@ -93,7 +93,7 @@ def load_laboratory(path: str | os.PathLike[str]) -> tuple[Laboratory, str]:
 
 
 def _problem(laboratory: Laboratory) -> str:
-    """What a laboratory cannot state; empty where all can be."""
+    """The statements that a laboratory cannot make; empty if it can make all."""
     named = {
         "laboratory.name": laboratory.laboratory,
         "customer.name": laboratory.customer,

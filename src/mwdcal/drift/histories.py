@@ -46,7 +46,7 @@ NOTES = {
     "drifts between them counts as a change",
     "order": "the {triad} has temperature terms of order {order}: compared to order {compared}",
 }
-"""What is said of a calibration that cannot be compared, or not in all of its parameters."""
+"""The statements about a calibration that cannot be compared, or not in all of its parameters."""
 
 
 SCALE_CHANGE = 0.1

@@ -1,4 +1,4 @@
-"""What `import mwdcal` offers: arrays converted and checked, and one function for each task."""
+"""The face of `import mwdcal`: arrays converted and checked, and one function for each task."""
 
 from mwdcal.calibration.options import Options as Options
 from mwdcal.calibration.readings import Readings as Readings

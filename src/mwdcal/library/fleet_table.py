@@ -149,7 +149,7 @@ def _finished(
 def _metadata(
     source: FleetTable, plan: Plan, typed: FitArguments, digest: str
 ) -> dict[str, object]:
-    """What the table of calibrations says of itself: the input's own, and how it was made."""
+    """The statements of the table of calibrations about itself: the input's own, and how it was made."""
     metadata = {k: v for k, v in source.metadata.items() if k != SERIAL}
     content = {
         "fleet": source.name,

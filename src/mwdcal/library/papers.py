@@ -56,7 +56,7 @@ class Paper(Result):
 
     @property
     def findings(self) -> Sequence[Finding]:
-        """What the reader should know: gaps, overdue standards, doubts of the calibration."""
+        """The findings: gaps, overdue standards, doubts of the calibration."""
         return self.record.findings
 
     @cached_property

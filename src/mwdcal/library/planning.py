@@ -69,7 +69,7 @@ class PlanResult(Result):
 
     @property
     def findings(self) -> list[Finding]:
-        """What the plans leave undetermined, and what else there is to say of them."""
+        """The directions that the plans leave undetermined, and other findings."""
         from mwdcal.presentation.plan import findings
 
         return findings(self.plans)

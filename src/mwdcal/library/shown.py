@@ -31,7 +31,7 @@ _INPUTS = "_inputs"
 
 
 class Inputs(NamedTuple):
-    """What a result was made of: what inputs say of themselves, and the SHA-256 of those that are files."""
+    """The inputs of a result: what inputs say of themselves, and the SHA-256 of those that are files."""
 
     metadata: tuple[Mapping[str, object], ...] = ()
     digests: Mapping[str, str] = {}
@@ -204,7 +204,7 @@ def _show(
         return text(self)
 
     def to_dict(self: object) -> dict[str, Any]:
-        """What the command prints as JSON, as a dictionary."""
+        """The command's JSON as a dictionary."""
         return document(self)
 
     def report(self: object, path: str | os.PathLike[str]) -> None:

@@ -293,7 +293,7 @@ def _truth(tool: int | tuple[ArrayLike, ArrayLike] | Truth) -> Truth:
 
 @dataclass(frozen=True)
 class _Scene:
-    """What is simulated: a plan, a profile, effects, the tool of a calibration; digests of their files."""
+    """The subject of a simulation: a plan, a profile, effects, the tool of a calibration; digests of their files."""
 
     plan: Table
     profile: Profile

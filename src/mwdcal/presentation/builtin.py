@@ -1,4 +1,4 @@
-"""What is built in, by the names that options take, for people and for machines."""
+"""All that is built in, by the names that options take, for people and for machines."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ METHODS_USED = {
     "toolface-inclination": "the angles of the accelerometer alone (Moosavi 2014)",
     "scalar": "strengths alone",
 }
-"""What each method of `calibrate` uses."""
+"""The evidence that each method of `calibrate` uses."""
 
 
 class BuiltIn(msgspec.Struct, frozen=True, kw_only=True):
@@ -42,7 +42,7 @@ class BuiltIn(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class BuiltInSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What `list` prints."""
+    """The output of `list`."""
 
     kind: str
     entries: list[BuiltIn]

@@ -50,7 +50,7 @@ ORDERS = "error: rms per axis, with the noise; inside: interpolation, at the end
 COMPARED = """
 by chance: probability that noise alone gives such a term; chosen: the lowest order above which \
 none is below 0.001"""
-"""What the table of orders means, and where orders were compared."""
+"""The meaning of the table of orders, and where orders were compared."""
 
 
 class TriadSummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -67,7 +67,7 @@ class TriadSummary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CalibrationSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What `calibrate` prints: fields of `Calibration`, accuracy, comparisons, and the files written."""
+    """The output of `calibrate`: fields of `Calibration`, accuracy, comparisons, and the files written."""
 
     run: str
     stations: int
@@ -170,7 +170,7 @@ def remarks(calibration: Calibration) -> list[str]:
     return [
         *residuals(calibration),
         f"accuracy to expect (1σ, calibration alone, typical): {'  '.join(accuracy)}",
-        *([f"taken as exact, and no residual tests it: {exact}{PROFILE}"] if exact else []),
+        *([f"Assumed exact; this run cannot check it: {exact}{PROFILE}"] if exact else []),
         *([steady] if steady else []),
         *([ASSUMED] if calibration.settings == ASSUMED_PRACTICE else []),
         *(
@@ -182,7 +182,7 @@ def remarks(calibration: Calibration) -> list[str]:
 
 
 def heading(calibration: Calibration) -> str:
-    """What was calibrated, from what, and how much of it is determined."""
+    """Tool, run, method and rank of a calibration."""
     serial = calibration.tool.get("serial", calibration.profile.name)
     inclinations = known_inclinations(calibration)
     parts = [calibration.run, serial, f"{calibration.stations} stations"]

@@ -104,7 +104,7 @@ def outcome(calibration: Calibration, verdict: Verdict | None) -> dict[str, str]
 
 
 def _fit_outcome(calibration: Calibration) -> tuple[str, str]:
-    """What the fit came to, in one line, and its level."""
+    """The outcome of the fit in one line, and its level."""
     ids = [finding.id for finding in calibration.findings]
     doubts = [i.removesuffix("-residuals") for i in ids if i.endswith("-residuals")]
     parts = [f"{name} residuals exceed the declared noise" for name in doubts]

@@ -168,7 +168,7 @@ def _source(line: BudgetLine, names: Sequence[str], combined: BudgetLine) -> lis
 
 
 def _share(line: BudgetLine, value: float | None, combined: float | None) -> str:
-    """What a source adds to the uncertainty of an angle."""
+    """The contribution of a source to the uncertainty of an angle."""
     if line.basis.startswith("assumed exact"):
         return ASSUMED_EXACT
     return contribution(value, combined) + "°" * (value is not None)

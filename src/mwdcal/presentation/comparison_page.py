@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 LOOKS = {method: look[:2] for method, look in zip(EVIDENCE, plots.SERIES, strict=True)}
 """Colour and marker of each method."""
 STATED = {"serial": "", "date": "measured "}
-"""What the heading takes from the metadata of the run, and what stands before it."""
+"""The metadata of the run in the heading, and the words before them."""
 ROW_HEIGHT = 0.6
 """Of an observable, inches: six markers below each other."""
 LAST_RATIO = 10.0
@@ -297,4 +297,4 @@ def draw_course(comparison: Comparison) -> Figure:
 
 TABLES = (refusals, errors, measures, effort, undetermined, marks, gauge, parameters_of)
 FIGURES = (draw_errors, draw_stations, draw_parameters, draw_course)
-"""What the template calls."""
+"""The functions that the templates call."""

@@ -71,7 +71,7 @@ class ConvertedTriad(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ConversionSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What `convert` prints and writes: whose calibration, then the values of each triad, or the sources.
+    """The output of `convert`: whose calibration, then the values of each triad, or the sources.
 
     `software` is that of the calibration; `converted_by` wrote this document.
     """
@@ -424,7 +424,7 @@ def export_screen(exported: Exported, folder: Path | None = None) -> str:
 
 
 def _error_title(name: str) -> str:
-    """What an error is of, and the share by which it is multiplied."""
+    """The subject of an error, and the share by which it is multiplied."""
     if name not in SHARE_OF:
         return name
     return f"{name.replace('_', ' ')} · {SHARE_OF[name]} across the axis"

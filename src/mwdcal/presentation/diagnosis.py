@@ -31,11 +31,11 @@ ADVICE = {
     "casing": "the calibration may be sound: check the references, and measure again away from casing and steel",
     "turn-on": "switch off and on and read again; calibrate again if the biases come back",
 }
-"""What to do about each."""
+"""The advice for each."""
 CHECK_FIRST = "check tool, units and references, then repeat the readings on a stand"
 IN_HOLE = "run mwdcal survey --msa on these surveys: it estimates a field fixed in the tool and corrects for it"
 NOT_YET = "do not judge the tool by these readings alone"
-"""What to do where no single fault explains readings, of surveys, and where a sound tool is not excluded."""
+"""The advice where no single fault explains readings, of surveys, and where a sound tool is not excluded."""
 LEAST_LIKELIHOOD = 0.0005
 """Likelihoods below are shown as less than this."""
 MOVED_TITLES = ["moved", "channel", "by", "1σ", "unit"]
@@ -131,10 +131,10 @@ def _share(share: float) -> str:
 
 
 def _last(result: Diagnosis) -> list[str]:
-    """What it rests on, what these readings leave open, and what to do."""
+    """The rule, the gaps of these readings, and the advice."""
     lines = [
-        f"rule: a fault is named where a sound tool gives as much evidence for one with a probability of at most "
-        f"{100 * FALSE_ALARMS:g} %; here {chance(result.probability)}"
+        f"rule: a healthy tool looks this bad with a probability of {chance(result.probability)}; a fault is reported "
+        f"at {100 * FALSE_ALARMS:g} % or less"
     ]
     if result.unseen:
         lines.append(f"not shown by these readings, at its usual size: {', '.join(result.unseen)}")
@@ -146,7 +146,7 @@ def _last(result: Diagnosis) -> list[str]:
 
 
 def next_step(result: Diagnosis) -> str:
-    """What to do: a tool is taken out of use only where readings exclude that it is sound."""
+    """The advice: a tool is taken out of use only where readings exclude that it is sound."""
     if any(finding.id == "unexplained" for finding in result.findings):
         return CHECK_FIRST
     steps = [IN_HOLE if result.fault == "magnetised" and result.surveys else ADVICE[result.fault]]

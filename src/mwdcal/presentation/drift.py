@@ -1,4 +1,4 @@
-"""What is printed of the drift of a tool and of a fleet."""
+"""The printed output of the drift of a tool and of a fleet."""
 
 from __future__ import annotations
 

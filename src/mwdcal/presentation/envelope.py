@@ -1,4 +1,4 @@
-"""What every document for machines says of itself: its form, who wrote it, and from which files."""
+"""The statements of every document for machines about itself: its form, who wrote it, and from which files."""
 
 from __future__ import annotations
 

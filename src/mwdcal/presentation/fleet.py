@@ -1,4 +1,4 @@
-"""What came of a fleet: counts, spreads and undetermined directions, for people and machines.
+"""The results of a fleet: counts, spreads and undetermined directions, for people and machines.
 
 The table of calibrations is read column by column, whatever its length.
 """
@@ -57,7 +57,7 @@ class FleetFinding(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FleetCounts(msgspec.Struct, frozen=True, kw_only=True):
-    """What came of a fleet. `spread` has the 1 %, 50 % and 99 % point of columns of sound tools.
+    """The results of a fleet. `spread` has the 1 %, 50 % and 99 % point of columns of sound tools.
 
     `orders` and `nonlinear`: tools by triad and chosen order, and by triad with own-axis terms.
     """
@@ -82,7 +82,7 @@ class FleetCounts(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FleetSummary(FleetCounts, frozen=True, kw_only=True):
-    """What screens and pages show: columns of all tools that are not used, and the table's metadata too."""
+    """The content of screens and pages: columns of all tools that are not used, and the table's metadata too."""
 
     unused: list[Finding]
     metadata: dict[str, Any]
@@ -94,7 +94,7 @@ class FleetSummary(FleetCounts, frozen=True, kw_only=True):
 
 
 class FleetDocument(FleetCounts, frozen=True, kw_only=True):
-    """What `fleet` prints: the fields of `FleetSummary`, the number of calibrated tools, and the page."""
+    """The output of `fleet`: the fields of `FleetSummary`, the number of calibrated tools, and the page."""
 
     tools_per_second: float
     calibrated: int
@@ -265,7 +265,7 @@ def text(summary: FleetSummary, report: Path | None) -> str:
 
 
 def _heading(summary: FleetSummary) -> str:
-    """What was calibrated, and how."""
+    """The subject and the method of the calibration."""
     counts = [plural(summary.tools, "tool"), plural(summary.stations, "station")]
     how = [f"method {summary.method}", f"order {summary.order}"]
     also = unusual(summary.options)

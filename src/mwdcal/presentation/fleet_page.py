@@ -201,7 +201,7 @@ class WorstTool:
 
 
 class Fleet:
-    """What the page says of the calibrated tools."""
+    """The statements of the page about the calibrated tools."""
 
     def __init__(self, tools: SoundTools) -> None:
         self.tools = tools
@@ -353,7 +353,7 @@ class _Reasons:
                 yield remark(finding)
 
     def _directions(self, lists: Mapping[str, Sequence[str]]) -> Iterator[str]:
-        """What nothing determines, and of which triads."""
+        """The directions that nothing determines, and their triads."""
         free = {triad: lists.get(f"{triad}_undetermined") or () for triad in TRIADS}
         groups: dict[str, list[str]] = {}
         for name in dict.fromkeys(name for names in free.values() for name in names):

@@ -31,7 +31,7 @@ UNSOUND_MARK = " (!)"
 
 
 class NoiseSummary(Noise, frozen=True, kw_only=True):
-    """What `noise` prints: the noise, and the files that were written."""
+    """The output of `noise`: the noise, and the files that were written."""
 
     plot: str
     report: str  # type: ignore[assignment,misc]  # a file here, a page of the noise there
@@ -57,7 +57,7 @@ def screen(noise: Noise, plot: Path | None, report: Path | None) -> str:
 
 
 def heading(noise: Noise) -> list[str]:
-    """What was looked at."""
+    """The data that were examined."""
     channels = list(noise.channels.values())
     rates = " and ".join(dict.fromkeys(f"{c.sampling_hz:.6g} Hz" for c in channels))
     return [

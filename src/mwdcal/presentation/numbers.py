@@ -94,7 +94,7 @@ def estimate(value: float, uncertainty: float | None, symbol: str = "") -> str:
 
 
 def contribution(value: float | None, combined: float | None) -> str:
-    """What one source adds to a combined uncertainty, to two digits; 0 below a thousandth of it.
+    """The contribution of one source to a combined uncertainty, to two digits; 0 below a thousandth of it.
 
     >>> [contribution(v, 0.013) for v in (0.00402, 1.4e-05, 1.2e-05, 3.5e-17, None)]
     ['0.0040', '0.000014', '0', '0', 'undetermined']

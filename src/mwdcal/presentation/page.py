@@ -167,4 +167,4 @@ FILTERS = (
     number, quantity, signed, fixed, measured, uncertainty, contribution, root_sum_of_squares, unit,
     raised, chance, plural, capital, css,
 )  # fmt: skip
-"""What the templates call."""
+"""The functions that the templates call."""

@@ -23,7 +23,7 @@ from mwdcal.presentation.stations import MOST_LINES
 from mwdcal.presentation.text import one_line, table
 
 PLACE = "1σ, calibration alone, at 45° inclination"
-"""What the accuracy of a plan is of."""
+"""The conditions of the accuracy of a plan."""
 STATION_TITLES = {
     "station": "station", "temperature_c": "T, °C", "ref_inclination_deg": "inclination, °",
     "ref_azimuth_deg": "azimuth, °", "ref_toolface_deg": "toolface, °",
@@ -32,7 +32,7 @@ STATION_TITLES = {
 
 
 class PlannedTriad(msgspec.Struct, frozen=True, kw_only=True):
-    """What a plan will give of a triad: uncertainties (1σ) by parameter of the calibration file."""
+    """The result of a plan for a triad: uncertainties (1σ) by parameter of the calibration file."""
 
     standard_uncertainties: dict[str, float | None]
     order: int
@@ -57,7 +57,7 @@ class DetectableError(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PlanSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What `plan` prints of one plan.
+    """The output of `plan` for one plan.
 
     `accuracy_deg` at 45° inclination, as `calibrate` states it; `accuracy_by_inclination_deg` by angle at
     `inclinations_deg`. `efficiency_bound`: at least this share of the best D-value per parameter. Without
@@ -83,7 +83,7 @@ class PlanSummary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PlanDocument(PlanSummary, frozen=True, kw_only=True):
-    """What `plan` prints: the first plan, the others that it was compared with, and the files written."""
+    """The output of `plan`: the first plan, the others that it was compared with, and the files written."""
 
     others: list[PlanSummary]
     output: str
@@ -120,7 +120,7 @@ def reach(words: Sequence[str]) -> dict[str, tuple[float, float]]:
 
 
 def facts(each: Planned) -> PlanSummary:
-    """What is said of a plan."""
+    """The statements about a plan."""
     return PlanSummary(**_fields(each))
 
 
@@ -237,7 +237,7 @@ def screen(
 
 
 def comparison_rows(facts: Sequence[PlanSummary]) -> list[list[str]]:
-    """What the plans give, a plan in each column."""
+    """The results of the plans, a plan in each column."""
     lines = [
         ["stations", *(str(each.stations) for each in facts)],
         ["at the stand", *(f"{each.session_hours:.1f} h" for each in facts)],
@@ -267,7 +267,7 @@ def accuracy(each: PlanSummary) -> str:
 
 
 DETECTABLE_TITLES = ["error of one station (80 % of runs)", "noticed from", "station named from"]
-"""What heads the table of errors that `calibrate` will report."""
+"""The titles of the table of errors that `calibrate` will report."""
 
 
 def detectable_rows(each: PlanSummary) -> list[list[str]]:

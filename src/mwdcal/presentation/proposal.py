@@ -30,7 +30,7 @@ class ProposedTriad(TriadProfile, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class ProposalSummary(Profile, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What `profile` prints: the profile, how sure its axes are, and its file."""
+    """The output of `profile`: the profile, how sure its axes are, and its file."""
 
     run: str
     stations: int

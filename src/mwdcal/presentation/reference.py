@@ -22,7 +22,7 @@ PLACE_UNITS = {"gravity": "g", "field": "nT", "dip": "°, down", "declination": 
 
 
 class ReferenceSummary(EarthReference, frozen=True, kw_only=True):
-    """What `reference` prints: the reference, and the cells that were filled in a run, by column."""
+    """The output of `reference`: the reference, and the cells that were filled in a run, by column."""
 
     filled: dict[str, int]
     output: str
@@ -83,7 +83,7 @@ def rows(reference: EarthReference) -> list[list[str]]:
 
 
 def notes(reference: EarthReference) -> list[str]:
-    """What turns azimuths, and where figures come from."""
+    """The causes that turn azimuths, and where figures come from."""
     sources = reference.sources
     lines = [f"true azimuth = magnetic azimuth {signed(reference.offset_deg('true'), 3)}°"]
     if reference.convergence_deg is not None:

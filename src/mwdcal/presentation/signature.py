@@ -46,7 +46,7 @@ IN_SHORT = {
 }
 """The states of a calibration's signature, as part of a line."""
 FILE_STATES = {"unchanged": "unchanged", "changed": "CHANGED", "missing": "not checked: not found"}
-"""What is said of the files of a certificate."""
+"""The statements about the files of a certificate."""
 
 
 class SignedDocument(msgspec.Struct, frozen=True, kw_only=True):
@@ -84,7 +84,7 @@ def signature_status(check: SignatureCheck) -> str:
 
 
 def signed_document(data: bytes, path: Path, folder: Path) -> tuple[SignedDocument, dict[str, Any]]:
-    """What was signed, and the fields of the document.
+    """The signed bytes, and the fields of the document.
 
     `folder`: where the files of a certificate are looked for, of which one may have changed.
     """
@@ -141,7 +141,7 @@ def for_machines(
 
 
 def _stated(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """What a document says of its tool, and whether it is simulated."""
+    """The statements of a document about its tool, and whether it is simulated."""
     return {name: fields[name] for name in ("serial", "simulated") if name in fields}
 
 

@@ -37,7 +37,7 @@ class TrueAttitude(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SimulationSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What `simulate` writes of the truth behind a run, and prints.
+    """The truth behind a run, as `simulate` writes and prints it.
 
     Parameters by triad in raw units, as `convert` prints them in this `notation`: factors (SF, B, m), or affine (M, b)
     for a calibration that is linear in its parameters above order 0. `stand`: errors common to the session, such

@@ -115,7 +115,7 @@ def interference_screen(result: Interference, *metadata: Mapping[str, object]) -
 MOST_SURVEYS = 30
 """Surveys of a table on screen."""
 OUTCOMES = {"true": "accepted", "false": "REJECTED", "": "not judged"}
-"""What the column `accepted` says, in words."""
+"""The column `accepted` in words."""
 
 
 class EndOfPath(msgspec.Struct, frozen=True, kw_only=True):
@@ -133,7 +133,7 @@ class EndOfPath(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What `survey` prints: stations counted by outcome, what they were judged by, where the path ends.
+    """The output of `survey`: stations counted by outcome, what they were judged by, where the path ends.
 
     `blind`: accepted ones whose azimuth interference could turn and still pass.
     `reference_sources`: where gravity, field, dip, declination and convergence come from, by name.
@@ -250,7 +250,7 @@ def summary(
 
 
 def _stated(north: North, terms: ErrorTerms) -> dict[str, Any]:
-    """What turns azimuths, degrees, and what their uncertainty holds."""
+    """The causes that turn azimuths, degrees, and what their uncertainty holds."""
     sd = None if north.declination is None else north.declination_sd
     angles = {
         "declination_deg": north.declination,

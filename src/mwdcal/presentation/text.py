@@ -39,7 +39,7 @@ TWINS = {chr(0xA0): " ", chr(0x2009): " ", chr(0x202F): " ", "‰": "per mille"}
         "₀ _0  ₁ _1  ₂ _2  ₃ _3  ₄ _4  ₅ _5  ₆ _6  ₇ _7  ₈ _8  ₉ _9  ᵢ _i  ⱼ _j  ᵏ ^k",
     )
 )
-"""What stands for a character where the encoding of the output lacks it; raised digits become ^2."""
+"""The replacement of a character where the encoding of the output lacks it; raised digits become ^2."""
 _BIDI = "\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069"
 _CONTROL = rf"\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff{_BIDI}"
 _UNSAFE = re.compile(f"[{_CONTROL}]")
@@ -134,7 +134,7 @@ def chance(probability: float | None) -> str:
 
 
 def columns(stream: Any) -> int | None:
-    """Columns to fill on the terminal that a stream is; None where it is none."""
+    """Terminal width, or None if the stream is not a terminal."""
     if not stream.isatty():
         return None
     stated = os.environ.get("COLUMNS", "")

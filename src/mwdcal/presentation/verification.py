@@ -59,7 +59,7 @@ def next_step(result: Verdict, calibration: Path, run: Path) -> str:
 
 
 def _sets(result: Verdict) -> list[str]:
-    """What each roll set shows of each limit, where there are several."""
+    """The result of each roll set for each limit, where there are several."""
     rows = [
         [row.name, one_line(each.label or BETWEEN_SETS), *map(str, cells)]
         for row in result.rows

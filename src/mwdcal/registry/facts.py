@@ -30,7 +30,7 @@ _METADATA_LINES = 200
 
 
 class Facts(msgspec.Struct, frozen=True, kw_only=True):
-    """What is indexed of a document; None where it does not say.
+    """The indexed facts of a document; None where it does not state them.
 
     `type`: of the tool, or the quantity of a standard. `label`: what people call it, such as a
     certificate's number. `time`: of the measurement, or of issue, ISO 8601 in UTC. `run`,

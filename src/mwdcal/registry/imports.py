@@ -52,7 +52,7 @@ class Source(NamedTuple):
 
 @dataclass
 class Prepared:
-    """What a source holds: drafts of records, or a `doubtful` one of a table that may be a run.
+    """The contents of a source: drafts of records, or a `doubtful` one of a table that may be a run.
 
     `problems` say what is wrong. SHA-256 of calibrations: `undated` of those that state no day of measurement,
     `changed` of those whose contents are not those that were written.
@@ -67,7 +67,7 @@ class Prepared:
 
 
 class FileResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What became of a file: how many records are new, known already, or refused; and why."""
+    """The outcome for a file: how many records are new, known already, or refused; and why."""
 
     file: str
     kind: str
@@ -78,7 +78,7 @@ class FileResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def sources(paths: Iterable[Path]) -> list[Source]:
-    """What there is to add at some paths: files, and all files of folders; row groups of fleets by themselves.
+    """The sources to add at some paths: files, and all files of folders; row groups of fleets by themselves.
 
     Raises:
         InputError: a path at which there is nothing, or an export with a damaged manifest.
@@ -121,12 +121,12 @@ def portions(whole: Sequence[Source]) -> list[Sequence[Source]]:
 
 
 def solve(portion: Sequence[Source]) -> bytes:
-    """What a portion holds, for another process: a list of `Prepared`."""
+    """The contents of a portion, for another process: a list of `Prepared`."""
     return pickle.dumps([prepared(source) for source in portion])
 
 
 def prepared(source: Source) -> Prepared:
-    """What a source holds; what is wrong with it is data."""
+    """The contents of a source; what is wrong with it is data."""
     result = Prepared(source)
     try:
         entries = _entries(source)
@@ -189,7 +189,7 @@ class Adding:
 
     @property
     def results(self) -> list[FileResult]:
-        """What became of each file."""
+        """The outcome for each file."""
         return [*self._files.values()]
 
     def take(self, each: Prepared) -> None:

@@ -1,4 +1,4 @@
-"""What people ask of a registry by a word: the tools, the past of one, a document by serial, hash or number."""
+"""Questions to a registry by a word: the tools, the past of one, a document by serial, hash or number."""
 
 from __future__ import annotations
 

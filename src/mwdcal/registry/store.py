@@ -28,7 +28,7 @@ from mwdcal.registry.stored import (
 )
 
 Draft = dict[str, Any]
-"""What is inserted of an entry: see `draft`."""
+"""The rows inserted for an entry: see `draft`."""
 
 
 class Entry(NamedTuple):
@@ -44,7 +44,7 @@ class Entry(NamedTuple):
 
 
 class Added(NamedTuple):
-    """What became of an entry: the record of it, and whether it is new."""
+    """The outcome for an entry: the record of it, and whether it is new."""
 
     number: int
     kind: str
@@ -62,7 +62,7 @@ class Registry:
 
     @property
     def name(self) -> str:
-        """What messages call it: its file, or its URL without password."""
+        """Its name in messages: its file, or its URL without password."""
         return self.database.name
 
     @contextlib.contextmanager

@@ -37,7 +37,7 @@ SURVEY_UNITS = {
 
 
 class SensorTerms(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What sensors may be off beside the calibration's own uncertainty, 1σ of each axis."""
+    """The errors of sensors beside the calibration's own uncertainty, 1σ of each axis."""
 
     accelerometer_bias_ms2: float = 0.0
     accelerometer_scale: float = 0.0
@@ -100,7 +100,7 @@ class SurveyLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 @dataclass(frozen=True)
 class AcceptanceTests:
-    """What surveys (n,) are judged by: fixed limits (3,), and a covariance (n, 3, 3) with the largest distance (n,).
+    """The limits of surveys (n,): fixed limits (3,), and a covariance (n, 3, 3) with the largest distance (n,).
 
     `missing` (n, 3): not judged.
     """
@@ -163,7 +163,7 @@ class Judgement:
         return np.asarray((~np.isnan(self.departure)).any(-1))
 
     def findings(self) -> list[str]:
-        """What is wrong with each station; empty where nothing is."""
+        """The fault of each station; empty if it has none."""
         pairs = zip(self.judged.tolist(), self.accepted.tolist(), strict=True)
         return [
             "" if accepted else self._finding(i) if judged else "not judged: no reference"

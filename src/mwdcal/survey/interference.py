@@ -142,7 +142,7 @@ class InterferenceStation(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MultiStationAnalysis(msgspec.Struct, frozen=True, kw_only=True):
-    """What the analysis of several surveys says, for machines.
+    """The analysis of several surveys, for machines.
 
     `separable`: the azimuth of every station is of use after the correction, `azimuth_sd_deg` (1σ, of what
     interference is left, at the worst station) being at most `largest_azimuth_sd_deg`. `missing` says which
@@ -479,7 +479,7 @@ def _doubtful(whole: Estimate, rows: list[InterferenceStation]) -> list[Finding]
 
 
 def _doubt(row: InterferenceStation) -> str:
-    """What is wrong with a survey, in a sentence."""
+    """The fault of a survey, in a sentence."""
     return (
         f"station {row.station} does not agree with the others ({row.deviation:.1f} standard deviations): |b| is "
         f"{row.field_after_nt - row.ref_field_nt:+.0f} nT and dip {row.dip_after_deg - row.ref_dip_deg:+.2f}° off the "

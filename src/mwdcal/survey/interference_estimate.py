@@ -95,7 +95,7 @@ class Assumed:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What each entry of `sd` is."""
+        """The quantity that each entry of `sd` belongs to."""
         return OFFSET_NAMES + tuple(f"scale {axis}" for axis in "xyz") * (self.scale > 0)
 
 

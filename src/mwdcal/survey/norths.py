@@ -60,14 +60,14 @@ class North:
 
     @property
     def offset(self) -> float:
-        """What is added to magnetic azimuths to count from that north."""
+        """The angle added to magnetic azimuths to count from that north."""
         return (self.declination or 0.0) - (self.convergence or 0.0)
 
 
 def norths_of(
     table: Table, readings: Readings, calibration: Calibration, reference: EarthReference | None
 ) -> North:
-    """What metadata and reference say of declination and convergence.
+    """The statements of metadata and reference about declination and convergence.
 
     A declination whose table states no uncertainty has that of the reference, else that of a global field model.
 

@@ -186,7 +186,7 @@ RANGES_OF_REFERENCE = {
 }
 """Accepted values."""
 _ARGUMENT_NAMES = {"latitude_deg": "latitude", "longitude_deg": "longitude"}
-"""What keys are called where they are given, if not by their own name."""
+"""Names of keys where they are given, if not by their own name."""
 _REMEDIES = {
     "latitude_deg": "North is positive.",
     "longitude_deg": "East is positive.",
@@ -263,7 +263,7 @@ class EarthReference(msgspec.Struct, frozen=True, kw_only=True):
         return declination_sd(self.field_nt * math.cos(math.radians(self.dip_deg)))
 
     def offset_deg(self, north: str) -> float:
-        """What is added to a magnetic azimuth to count it from a north, degrees."""
+        """The angle added to a magnetic azimuth to count it from a north, degrees."""
         stated = (north, self.declination_deg, self.convergence_deg)
         metadata = {k: v for k, v in zip(AZIMUTH_KEYS, stated, strict=True) if v is not None}
         return magnetic_offset(metadata, "reference")
@@ -475,7 +475,7 @@ def _findings(
     values: Mapping[str, float], altitude_m: float, measured: Mapping[str, float],
     uncertainties: Mapping[str, float], grid: Grid | None,
 ) -> list[Finding]:  # fmt: skip
-    """What the reader should know of a reference."""
+    """The findings about a reference."""
     findings = []
     for name in measured:
         if not uncertainties.get(name):

@@ -199,7 +199,7 @@ def surveyed_table(table: Table, well: Well) -> Table:
 
 
 def described(well: Well) -> Mapping[str, object]:
-    """What a table of surveys says of the calibration, north and limits it rests on."""
+    """The statements of a table of surveys about the calibration, north and limits it rests on."""
     calibration, north = well.calibration, well.north
     stated: dict[str, object] = {
         "calibration_run": calibration.run,
@@ -227,7 +227,7 @@ def described(well: Well) -> Mapping[str, object]:
 
 @dataclass(frozen=True)
 class WellInputs:
-    """What the surveys of a well rest on.
+    """The inputs of the surveys of a well.
 
     `findings` are of the calibration's signature and of the reference; `digests` the SHA-256 of each input by name,
     empty for one that is in memory.
@@ -242,7 +242,7 @@ class WellInputs:
 
     @property
     def stated(self) -> tuple[Mapping[str, object], Mapping[str, object]]:
-        """What calibration and readings say of themselves."""
+        """The statements of calibration and readings about themselves."""
         return self.calibration.tool, self.surveys.readings.metadata
 
     @property
@@ -274,7 +274,7 @@ def well_inputs(
     digest: str = "",
     findings: Sequence[Finding] = (),
 ) -> WellInputs:
-    """What surveys rest on: a table of readings, the calibration of their tool, reference and limits.
+    """The inputs of surveys: a table of readings, the calibration of their tool, reference and limits.
 
     `reference` and `limits` are values, or files by path. Stations that multi-station analysis puts into the record
     have to be `recognised`. `digest` and `findings` are of the file of the calibration.

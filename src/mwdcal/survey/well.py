@@ -50,7 +50,7 @@ WELL_FINDINGS = {
     "left-out": "left out of the well path, without a result or a measured depth: {count} of {rows} stations.",
     "no-path": "no well path: no station has both a measured depth and a direction with azimuth.",
 }
-"""What the findings about a well say, in their order."""
+"""The texts of the findings about a well, in their order."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class Well:
 
     @property
     def terms(self) -> ErrorTerms:
-        """What the standard uncertainties hold, and what they leave out."""
+        """The scope of the standard uncertainties: what they hold and leave out."""
         return error_terms(self.calibration.findings, self.north.declination is not None)
 
     @property
@@ -142,7 +142,7 @@ class Well:
 
     @cached_property
     def remarks(self) -> list[str]:
-        """What is wrong with each station."""
+        """The fault of each station."""
         remarks = zip(
             self.judgement.findings(), self.blank.tolist(), self.unstated.tolist(), strict=True
         )

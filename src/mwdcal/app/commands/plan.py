@@ -79,7 +79,7 @@ def command(
     reach: tuple[str, ...], criterion: Literal["D", "A", "I"], speed: float, settle: float, soak: float,
     tool: str | None, output: Path | None, report: Path | None, as_json: bool, **typed: Unpack[options.FitArguments],
 ) -> None:  # fmt: skip
-    """What a calibration from planned stations will give: uncertainty, rank, accuracy, hours at the stand.
+    """Predict a calibration from planned stations: uncertainty, rank, accuracy, hours at the stand.
 
     Nothing is measured: a nominal tool with the noise and the stand of the profile.
 

@@ -237,7 +237,7 @@ def _settings(fitted: FittedRuns) -> Iterator[Flag]:
 
 
 def _setting(fitted: FittedRuns, column: int, place: int) -> str:
-    """What is said of one setting's angle, a column of the settings' unknowns."""
+    """The statements about one setting's angle, a column of the settings' unknowns."""
     evidence, state = fitted.result.problem.evidence, fitted.result.state
     sd = evidence.set_together[place, :, column]
     second = column >= evidence.set_together.shape[-1] // 2

@@ -106,7 +106,7 @@ UNSOUND_ADVICE = (
     "Check 'noise' and 'repeatability' in the tool profile and the columns sd_: all are in the raw units of their "
     "channel; without them the noise is estimated."
 )
-"""What to do where a fit has no valid covariance."""
+"""The advice where a fit has no valid covariance."""
 OF_READINGS = {
     "few": "{source} has {count} stations; the model has {size} parameters per triad and needs {needed} or more. Add "
     "stations at other attitudes{remedy}.",
@@ -486,7 +486,7 @@ def _unexplained_errors(fitted: FittedRuns, sound: Bools) -> Flag:
 
 
 def _unsound(fitted: FittedRuns) -> Flag:
-    """Fits whose covariance is none, or whose gains are none that a sensor has."""
+    """Fits with an invalid covariance or implausible gains."""
     result, zero = fitted.result, fitted.profile.reference_temperature_c
     low, high = temperature_range(result, fitted.options.knowledge)
     with np.errstate(all="ignore"):  # of members that earlier refusals hold of

@@ -39,7 +39,7 @@ _WHAT_TO_DO = {
     "not a database": "Name a registry that mwdcal made.",
     "disk i/o error": "Check the disk; SQLite needs a local one, or use PostgreSQL.",
     "password": "Correct the user and the password in the URL.",
-    "permission denied": "Have the owner of the database give you the right.",
+    "permission denied": "Ask the database owner for access.",
     "does not exist": "Create it on the server, or correct the URL.",
     "resolve host": "Correct the name of the server in the URL.",
     **dict.fromkeys(
@@ -255,7 +255,7 @@ def as_input_error(database: Database) -> Iterator[None]:
 
 
 def error_text(error: Exception, database: Database) -> str:
-    """What a database refused, without passwords, and what to do about it."""
+    """The refusal of a database, without passwords, and what to do about it."""
     lines = str(getattr(error, "orig", None) or error).strip().splitlines()
     text = lines[0].strip() if lines else type(error).__name__
     password = database.engine.url.password
