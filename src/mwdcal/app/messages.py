@@ -101,7 +101,7 @@ class Screen:
         self._messages = messages
 
     def __getattr__(self, name: str) -> Any:
-        """What a terminal is asked for: its encoding, its descriptor; not its bytes."""
+        """The attributes that a terminal is asked for: its encoding, its descriptor; not its bytes."""
         if name not in ("closed", "encoding", "fileno", "isatty"):
             raise AttributeError(name)
         return getattr(self._stream, name)

@@ -1,4 +1,4 @@
-"""What a fit states of its tools, as arrays: a calibration file is one row of them, a fleet table all.
+"""The results of a fit for its tools, as arrays: a calibration file is one row of them, a fleet table all.
 
 Parameters, their uncertainties, constants of the run, errors of the stand; and the covariance, by
 source of error. What the readings' noise and angles that the stand sets at every station do is
@@ -38,7 +38,7 @@ SIGNS = (
     "signs of the magnetometer at a northern site",
     "signs of the magnetometer at a southern site",
 )
-"""What is assumed where only the profile says which hemisphere the dip is of: northern, southern."""
+"""The assumption where only the profile says which hemisphere the dip is of: northern, southern."""
 EVEN = 1e-6
 """Departure of a correlation matrix from symmetry that is left as it is."""
 
@@ -147,7 +147,7 @@ def constants_covariance(result: Fit) -> Array:
 
 
 def error_name(constant: str) -> str:
-    """What a common error is called: of a reference, of the stand, or a drift.
+    """The name of a common error: of a reference, of the stand, or a drift.
 
     >>> [error_name(name) for name in ("dip", "azimuth-zero", "stand-north")]
     ['dip reference error', 'azimuth zero of the stand', 'tilt of the stand about north']
@@ -164,7 +164,7 @@ def error_name(constant: str) -> str:
 
 
 def common_source(name: str) -> str:
-    """What a budget calls a source of error: a tilt is one source.
+    """The name of a source of error in a budget: a tilt is one source.
 
     >>> [common_source(name) for name in ("stand-north", "azimuth-zero", "gravity", "prior")]
     ['tilt of the stand', 'azimuth zero of the stand', 'gravity reference error', 'prior']

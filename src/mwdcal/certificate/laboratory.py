@@ -24,7 +24,7 @@ MOST_MONTHS = 1200
 
 
 class ItemDetails(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What is known of the tool beside its serial: maker, type, condition, day of receipt, other marks."""
+    """The facts about the tool beside its serial: maker, type, condition, day of receipt, other marks."""
 
     manufacturer: str = ""
     type: str = ""

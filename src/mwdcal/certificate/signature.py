@@ -146,7 +146,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def check(data: bytes, trusted: Mapping[str, TrustedKey]) -> SignatureCheck:
-    """What the signature of the document in a file says, by the keys that are trusted.
+    """The state of the signature of the document in a file, by the keys that are trusted.
 
     A file that can no longer be read as JSON, but names a signature, is altered.
     """

@@ -104,7 +104,7 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of all parameters beforehand: `precision` (B, p, p) about `expected` (B, p)."""
+    """Prior information on all parameters: `precision` (B, p, p) about `expected` (B, p)."""
 
     precision: Array
     expected: Array

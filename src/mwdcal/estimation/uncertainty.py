@@ -1,4 +1,4 @@
-"""What a fit is worth: covariance, rank, free directions by name, residuals per station.
+"""The quality of a fit: covariance, rank, free directions by name, residuals per station.
 
 Nothing is quoted for a direction that the evidence does not determine.
 

@@ -389,7 +389,7 @@ class SignatureVerdict(Result):
 
     @property
     def state(self) -> SignatureState:
-        """What the signature says, such as "intact", "altered", "unsigned", or "unknown": its key is not trusted."""
+        """The state of the signature, such as "intact", "altered", "unsigned", or "unknown": its key is not trusted."""
         state: SignatureState = self.content.check.state
         return state
 

@@ -91,7 +91,7 @@ class CalibrationSummary(msgspec.Struct, frozen=True, kw_only=True):
     calibration: str
     report: str
     verification: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
-    """What `verify` says of the roll test, without its head."""
+    """The document of `verify` on the roll test, without its head."""
 
 
 def _recorded(kind: type[msgspec.Struct], record: msgspec.Struct) -> dict[str, Any]:

@@ -127,7 +127,7 @@ def _fit_outcome(calibration: Calibration) -> tuple[str, str]:
 
 
 def _findings(calibration: Calibration, verdict: Verdict | None) -> list[Finding]:
-    """What to know and do, each thing once; stations to re-shoot first."""
+    """Findings and advice, each once; stations to re-shoot first."""
     findings = {f.text: f for f in calibration.findings}
     ids = {f.id for f in calibration.findings}
     for extra in verdict.findings if verdict else ():

@@ -357,7 +357,7 @@ def _decisions(tests: Sequence[ConformityTest]) -> TableBlock:
 
 
 def _key(decision: LimitDecision) -> tuple[str, str, str, float]:
-    """What is decided on: decisions of one key stand in one row."""
+    """The subjects of decisions: decisions of one key stand in one row."""
     quantity = decision.quantity
     return quantity.id, quantity.at, quantity.unit, decision.limit
 

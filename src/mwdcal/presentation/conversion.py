@@ -194,7 +194,7 @@ def terms_screen(converted: Converted, terms: list[SensorTerm], output: Path | N
 def temperature_findings(
     calibration: Calibration, notation: str, temperature: float | str | None
 ) -> list[Finding]:
-    """What to know where the values are asked for at a temperature without calibration.
+    """The finding where the values are asked for at a temperature without calibration.
 
     The reference temperature counts as asked for where the values depend on it.
     """

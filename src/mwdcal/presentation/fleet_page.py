@@ -102,11 +102,11 @@ REMARKED = {
     "distrusted": "the robust fit gives some stations little weight",
     "unused-columns": "some columns are not used",
 }
-"""What a finding says of tools, by its id or the end of it."""
+"""The statement of a finding about tools, by its id or the end of it."""
 
 
 def remark(finding: str) -> str:
-    """What a finding says of tools.
+    """The statement of a finding about tools.
 
     >>> remark("magnetometer-noise")
     'residuals of the magnetometer are far below the declared noise'
@@ -291,7 +291,7 @@ class Fleet:
         return [f"{angle} 1σ, °" for angle in self._sd]
 
     def of(self, tool: int) -> Iterator[str]:
-        """What is unusual in the accuracy and the parameters of one tool."""
+        """The unusual figures in the accuracy and the parameters of one tool."""
         free = [angle for angle in self._sd if self._free[angle][tool]]
         if free:
             yield f"{', '.join(free)} undetermined"
@@ -322,7 +322,7 @@ def _outlier(parameter: FleetParameter, tool: int, far: float) -> str:
 
 
 class _Reasons:
-    """What is the matter with some tools, from their findings and directions."""
+    """The faults of some tools, from their findings and directions."""
 
     def __init__(self, fleet: Fleet, some: Sequence[int]) -> None:
         tools, names = fleet.tools, ("findings", "reshoot", *(f"{t}_undetermined" for t in TRIADS))

@@ -109,7 +109,7 @@ def signed(result: SignedDocument, fields: Mapping[str, Any]) -> str:
 def checked_document(
     file: Member, path: Path, keys: Mapping[str, TrustedKey], named: Sequence[Path]
 ) -> tuple[CheckedDocument, dict[str, Any]]:
-    """What the signature in a file says, and the fields of the document.
+    """The state of the signature in a file, and the fields of the document.
 
     The files of a certificate are looked up only where it is intact: a stranger's may name any.
     """

@@ -27,7 +27,7 @@ SIZES = {
 
 
 class TrueAttitude(msgspec.Struct, frozen=True, kw_only=True):
-    """What is true of a station: angles that the stand has turned to, and the temperature of the sensors."""
+    """The truth of a station: angles that the stand has turned to, and the temperature of the sensors."""
 
     station: str
     inclination_deg: float

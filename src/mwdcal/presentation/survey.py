@@ -166,7 +166,7 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def refusal(inputs: WellInputs, msa: MultiStationAnalysis) -> SurveySummary:
-    """What a multi-station analysis says that cannot be used: none of the surveys is judged, nothing is written."""
+    """The refusal of a multi-station analysis: none of the surveys is judged, nothing is written."""
     rows, north = inputs.surveys.readings.count, inputs.surveys.north
     return SurveySummary(
         rows=rows,

@@ -1,4 +1,4 @@
-"""What a registry knows of a document, read from its bytes alone: one function for each kind."""
+"""The facts of a document, read from its bytes alone: one function for each kind."""
 
 from __future__ import annotations
 

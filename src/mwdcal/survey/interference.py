@@ -397,7 +397,7 @@ def deviations(whole: Estimate) -> tuple[Array, Bools]:
 def _findings(
     calibration: Calibration, readings: Readings, whole: Estimate, rows: list[InterferenceStation]
 ) -> list[Finding]:
-    """What a reader of one well's analysis should know."""
+    """The findings of one well's analysis."""
     size, sd, assumed = whole.size[0], whole.sd[0], whole.assumed
     texts = {}
     if not (np.abs(size) > LEAST_SEEN * sd).any():

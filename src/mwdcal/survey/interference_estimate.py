@@ -269,7 +269,7 @@ def _loosened(
 def _drifted(
     calibration: Calibration, known: PriorInformation, drift: SensorTerms
 ) -> PriorInformation:
-    """What is known of the tool once its biases and scales may have moved."""
+    """The remaining information on the tool once its biases and scales may have moved."""
     sizes = (
         (drift.accelerometer_bias_ms2 / STANDARD_GRAVITY, drift.accelerometer_scale),
         (drift.magnetometer_bias_nt, drift.magnetometer_scale),

@@ -1,4 +1,4 @@
-"""What the reader of a calibration should know, in plain words, each with its remedy."""
+"""The findings on a calibration in plain words, each with its remedy."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ REMARKS = {
     "{of[reason]} Re-shoot it, or `exclude` {of[station]}",
     "distrusted": "robust fit: low weight for station {stations}. Look at what they have in common.",
 }
-"""What a finding says, by its id or the end of it."""
+"""The statement of a finding, by its id or the end of it."""
 
 SCATTERED = {
     "gravity": "the strength of g by {:.2f} %",
@@ -133,7 +133,7 @@ SCATTERED = {
 
 
 def described(name: str) -> str:
-    """What a free direction means, and what would determine it."""
+    """The meaning of a free direction, and the measurement that would determine it."""
     steady, _, power = name.partition("-temperature-")
     course = f" (its variation with temperature, power {power})" if power else ""
     return FREE_DIRECTIONS.get(steady, steady) + course
@@ -285,7 +285,7 @@ def _drifts(fitted: FittedRuns) -> Iterator[Flag]:
 
 
 def _structure(fitted: FittedRuns) -> Iterator[Flag]:
-    """What the residuals look like, where they are more than noise."""
+    """The likely cause of residuals that are more than noise."""
     unit = shown_in("field", fitted.readings.relative)[1]
     looked_at = np.flatnonzero(suspected(fitted.result, fitted.chances))
     for place, shown in fitted.shown(looked_at).items():
@@ -303,7 +303,7 @@ def _looks(fitted: FittedRuns, name: str, unit: str, place: int) -> str:
 
 
 def _scatter(fitted: FittedRuns) -> Flag:
-    """What varies from station to station by more than the noise of the sensors."""
+    """The strengths that vary from station to station by more than the noise of the sensors."""
     scatter = fitted.result.problem.evidence.scatter
     sizes = {name: values.max(-1) for name, values in scatter.items()}
     large = np.max([np.zeros(fitted.count), *sizes.values()], 0) > SCATTER_SHARE

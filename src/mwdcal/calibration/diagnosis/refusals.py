@@ -77,7 +77,7 @@ TOOL_AXES = np.array([*"xyz"])
 Run = Callable[[int], Readings]
 """Readings of one member of a batch, without leading axis: their labels and source."""
 Words = dict[str, Any]
-"""What fills in the words of a flag, by name."""
+"""The values in the words of a flag, by name."""
 
 OF_OPTIONS = {
     "method": f"`method` must be one of {', '.join(EVIDENCE)}; got {{options.method!r}}.",
@@ -205,7 +205,7 @@ def check_options(options: Options) -> None:
 
 
 def minimiser(options: Options) -> str:
-    """What an own minimiser is called."""
+    """The name of a method that minimises by itself."""
     return "the paper's weights" if options.paper_weights else f"method {options.method}"
 
 

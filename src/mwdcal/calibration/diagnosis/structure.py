@@ -1,4 +1,4 @@
-"""What the misfit of a run looks like: zeros of the stand, drift, gradient, backlash, thermal lag.
+"""The likely causes of the misfit of a run: zeros of the stand, drift, gradient, backlash, thermal lag.
 
 Each effect is a family of columns that the residuals may have in common with it. A family is named
 where it takes away more of the misfit than noise of any direction would (F test), the best one
@@ -70,7 +70,7 @@ EFFECTS = {
     "the mounting",
     "thermal-lag": "thermal lag: readings follow the thermometer late. Wait longer after each change of temperature",
 }
-"""What the residuals look like, and what to do."""
+"""The likely cause of the residuals, and the remedy."""
 
 
 @dataclass(frozen=True)

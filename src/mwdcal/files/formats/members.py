@@ -91,7 +91,7 @@ def is_database(file: Path) -> bool:
 
 
 def name_of(path: str | os.PathLike[str]) -> str:
-    """What messages and documents call a calibration: its file, with the serial of a tool in it."""
+    """The name of a calibration in messages and documents: its file, with the serial of a tool in it."""
     file, serial = split(path)
     return file.name if serial is None else f"{file.name}{MARK}{serial}"
 

@@ -337,7 +337,7 @@ def _one_by_one(table: Table, name: str, cells: Sequence[str]) -> Array:
 
 
 def _advice(cell: str, decimal: str) -> str:
-    """What to do about a cell that is not a number."""
+    """The remedy for a cell that is not a number."""
     if decimal == "." and looks_numeric(cell, ","):
         return "Is the decimal comma intended? Use `decimal` ','."
     if decimal == "," and looks_numeric(cell, "."):
