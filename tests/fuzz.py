@@ -195,7 +195,7 @@ def samples(folder: Path) -> dict[str, list[Any]]:
 def registry_of(path: Path, *documents: Path) -> bytes:
     """The file of a registry that holds some documents."""
     for line in (("init",), ("add", *documents)):
-        ran = cli_support.mwdcal("registry", "--database", path, *line, "--as", "A. Borg")
+        ran = cli_support.mwdcal("registry", "--registry", path, *line, "--as", "A. Borg")
         assert ran.code == 0, ran
     return path.read_bytes()
 
@@ -527,7 +527,7 @@ def signed(folder: Path, calibration: str) -> dict[str, list[str]]:
     for typed in (
         ("key", "create", "-o", key, "--owner", "<b>L\u00e4b</b>"),
         ("key", "trust", listed, f"{key}.pub"),
-        ("sign", document, "--key", key),
+        ("sign", document, "--private-key", key),
     ):
         ran = cli_support.mwdcal("certificate", *typed)
         assert ran.code == 0, ran

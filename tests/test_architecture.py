@@ -18,7 +18,7 @@ SOURCE = ROOT / "src" / "mwdcal"
 
 # From the bottom up: a room imports from rooms below it. Rooms of one floor are strangers.
 FLOORS = (
-    ("errors",),
+    ("errors", "digests"),
     ("signals",),
     ("pool",),
     ("geometry",),
@@ -149,6 +149,14 @@ def test_contributing_lists_the_rooms_with_their_purpose() -> None:
     assert [floor(room.replace("/", ".")) for room, _ in rows] == sorted(map(floor, ROOMS))
 
 
+def test_contributing_names_where_things_are_decided() -> None:
+    table = (ROOT / "CONTRIBUTING.md").read_text("utf-8").partition("## Where is it decided?")[2]
+    rows = re.findall(r"^\| [^|]+ \| `([a-z_.]+)` \| `?(\w*)`? *\|", table, re.M)
+    assert len(rows) >= 20
+    known = {module: {*constants(TREES[module]), *identifiers(TREES[module])} for module, _ in rows}
+    assert not [row for row in rows if row[1] and row[1] not in known[row[0]]]
+
+
 def test_no_import_cycle() -> None:
     try:
         TopologicalSorter(imports()).prepare()
@@ -226,6 +234,25 @@ def test_messages_of_the_library_name_arguments_not_options() -> None:
     shown = ("presentation", "app", "__main__")
     typed = {n: options_in_words(TREES[n]) for n in PATHS if n.split(".")[0] not in shown}
     none(typed, "write `order`, of which the command makes --order")
+
+
+ONCE = {
+    "9.80665": "geometry.units",
+    "0.3048": "geometry.units",
+    "1e-9, freedom": "",
+    ".hexdigest()": "digests",
+    'text == "undetermined"': "",
+}
+"""Pieces of code that only one module may have, or none."""
+
+
+@pytest.mark.parametrize("piece", ONCE)
+def test_a_rule_stands_in_one_place(piece: str) -> None:
+    """Text in quotes may name a figure; a fleet's `parts` and `sources` hash pieces of a table."""
+    quoted = re.compile(r'"""(?:.|\n)*?"""|"[^"\n]*"')
+    code = {n: quoted.sub("", PATHS[n].read_text("utf-8")) for n in PATHS if n != ONCE[piece]}
+    fleet = ("fleet.parts", "fleet.sources")
+    none({n: "again" for n, text in code.items() if piece in text and n not in fleet}, piece)
 
 
 def identifiers(tree: ast.Module) -> set[str]:

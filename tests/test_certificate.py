@@ -19,7 +19,7 @@ from cli_support import EXAMPLE, servo_run, write_csv
 from mwdcal.calibration.record import Finding
 from mwdcal.certificate import contents, decisions
 from mwdcal.certificate.budget import budget
-from mwdcal.certificate.contents import Order, certificate
+from mwdcal.certificate.contents import CertificateRequest, certificate
 from mwdcal.certificate.document import Person
 from mwdcal.certificate.laboratory import (
     DecisionRule,
@@ -58,7 +58,9 @@ def thermal(tmp_path_factory):
 
 
 def order(**values):
-    return Order(**{"issued": datetime.now(UTC).date(), "calibration_sha256": "0" * 64, **values})
+    return CertificateRequest(
+        **{"issued": datetime.now(UTC).date(), "calibration_sha256": "0" * 64, **values}
+    )
 
 
 def issued(calibration, laboratory=None, **values):
@@ -610,7 +612,7 @@ def test_the_next_calibration_is_due_after_whole_months(servo, day, months, due)
 def test_without_a_date_of_the_run_the_day_of_the_fit_stands_and_is_said_to(servo):
     document = issued(servo, issued=date(2999, 1, 1))
     assert document.calibrated == servo.time[:10]
-    assert "stands for that of the measurements" in named(document.findings)["date-not-stated"]
+    assert "is used as that of the measurements" in named(document.findings)["date-not-stated"]
     assert "2999-01-01, which is still to come" in named(document.findings)["future-date"]
     with pytest.raises(
         mwdcal.InputError, match=f"must not be before .*{servo.time[:10]}; got 2000-01-01"

@@ -99,11 +99,14 @@ def test_a_killed_first_run_leaves_no_file_of_that_name(tmp_path):
 @pytest.mark.parametrize("when", ["fitting", "writing"])
 def test_ctrl_c_ends_with_130_and_one_line(tmp_path, when):
     target = tmp_path / "cal.json"
-    fitting = "import mwdcal.calibration.estimate as e, time\nreal = e.start\ndef slow(p):\n" + (
-        "    print('writing', flush=True)\n    for _ in range(2000):\n        time.sleep(0.01)\n"
-        "    return real(p)\ne.start = slow\n"
+    transliterate = (
+        "import mwdcal.calibration.estimate as e, time\nreal = e.start\ndef slow(p):\n"
+        + (
+            "    print('writing', flush=True)\n    for _ in range(2000):\n        time.sleep(0.01)\n"
+            "    return real(p)\ne.start = slow\n"
+        )
     )
-    child = started(("" if when == "writing" else fitting) + SLOW_WRITE, *CALIBRATE, target)
+    child = started(("" if when == "writing" else transliterate) + SLOW_WRITE, *CALIBRATE, target)
     assert child.stdout.readline() == "writing\n"
     child.send_signal(signal.SIGINT)
     _, err = child.communicate(timeout=30)

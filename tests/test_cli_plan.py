@@ -87,7 +87,7 @@ def test_plans_side_by_side():
 
 
 def test_the_fewest_stations_for_an_accuracy():
-    wanted = ("--accuracy", "azimuth=0.04", "--accuracy", "inclination=0.02")
+    wanted = ("--accuracy", "azimuth_deg=0.04", "--accuracy", "inclination_deg=0.02")
     document = mwdcal("plan", *wanted, "--tool", "servo", "--json").json
     reached = document["accuracy_by_inclination_deg"]
     assert max(reached["azimuth"]) <= 0.04
@@ -103,7 +103,7 @@ def test_the_fewest_stations_for_an_accuracy():
 def test_a_plan_shows_its_redundancy(tmp_path):
     """On the screen, in the document and on the sheet: 15 equations for 12 parameters are 3 degrees of freedom."""
     arguments = ("plan", "--stations", 5, "--tool", "servo")
-    shown = mwdcal(*arguments, "--html", tmp_path / "sheet.html")
+    shown = mwdcal(*arguments, "--report", tmp_path / "sheet.html")
     assert "degrees of freedom" in shown.out
     assert "calibrate cannot trace" in shown.err
     document = mwdcal(*arguments, "--json").json
@@ -117,7 +117,7 @@ def test_a_plan_shows_its_redundancy(tmp_path):
 
 def test_a_search_keeps_to_what_the_stand_reaches(tmp_path):
     sheet = tmp_path / "plan.csv"
-    reach = ("--reach", "inclination=0:90", "--reach", "azimuth=0:0")
+    reach = ("--reach", "inclination_deg=0:90", "--reach", "azimuth_deg=0:0")
     limited = mwdcal(
         "plan", "--stations", 12, *reach, "--tool", "servo", "-o", sheet, "--json"
     ).json
@@ -160,23 +160,27 @@ def test_the_next_stations_of_a_run_are_better_than_others(tmp_path):
         (("--plan", "million.toml"), 2, "this one has 1000000"),
         (("--plan", "million.toml", "--stations", 24), 2, "this one has 1000000"),
         (
-            ("--plan", "moosavi-12", "--reach", "inclination=0:100"),
+            ("--plan", "moosavi-12", "--reach", "inclination_deg=0:100"),
             2,
             "station 37, 38, 39, 40, 41 and 7 more lie",
         ),
-        (("--plan", "moosavi-12", "--reach", "azimuth=0:0"), 2, "the stand reaches azimuth 0:0°"),
-        (("--stations", 12, "--reach", "inclination=7:8"), 2, "no candidate is within"),
-        (("--stations", 200, "--reach", "azimuth=0:0"), 2, "the 84 candidates"),
-        (("--reach", "inclination=120"), 2, "such as inclination=0:120"),
+        (
+            ("--plan", "moosavi-12", "--reach", "azimuth_deg=0:0"),
+            2,
+            "the stand reaches azimuth 0:0°",
+        ),
+        (("--stations", 12, "--reach", "inclination_deg=7:8"), 2, "no candidate is within"),
+        (("--stations", 200, "--reach", "azimuth_deg=0:0"), 2, "the 84 candidates"),
+        (("--reach", "inclination_deg=120"), 2, "such as inclination_deg=0:120"),
         (("--reach", "roll=0:1"), 2, "--reach must be of inclination"),
         (("--measured", "accelerometer.csv"), 2, "no column mx"),
-        (("--accuracy", "inclination=1", "--method", "scalar"), 2, "undetermined"),
+        (("--accuracy", "inclination_deg=1", "--method", "scalar"), 2, "undetermined"),
         (("--stations", 505), 2, "between 1 and the 504 candidates"),
         (("--stations", 3), 3, "stations"),
         (("--stations", 12, "--plan", "six-state", "--plan", "moosavi-12"), 2, "Name it alone"),
-        (("--accuracy", "azimuth=0"), 2, "such as azimuth=0.1"),
+        (("--accuracy", "azimuth_deg=0"), 2, "such as azimuth_deg=0.1"),
         (("--accuracy", "roll=1"), 2, "inclination, toolface, azimuth"),
-        (("--accuracy", "azimuth=0.0001"), 2, "do not give the wanted accuracy"),
+        (("--accuracy", "azimuth_deg=0.0001"), 2, "do not give the wanted accuracy"),
         (("--speed", 0), 2, "--speed"),
         (("--measured", "nothing.csv"), 2, "nothing.csv"),
     ],
@@ -222,7 +226,7 @@ def test_a_plan_without_an_attitude_is_refused(tmp_path, name):
         if each != name
     }
     plan = write_csv(tmp_path / "p.csv", {"station": list(range(8)), **columns})
-    for options in ((), ("--html", tmp_path / "p.html"), ("--stations", 6)):
+    for options in ((), ("--report", tmp_path / "p.html"), ("--stations", 6)):
         ran = mwdcal("plan", "--plan", plan, "--tool", "servo", *options)
         assert f"station 1 has no ref_{name}_deg" in refused(ran, 2)
 

@@ -115,7 +115,7 @@ def uncoloured(printed):
 
 def words(printed):
     """Words in plain characters, without rules between them and without measured times."""
-    return re.sub("-{5,}", "", timeless(text.fitting(printed, "ascii"))).split()
+    return re.sub("-{5,}", "", timeless(text.transliterate(printed, "ascii"))).split()
 
 
 def untimed(document):
@@ -194,14 +194,14 @@ def test_json_says_the_same_in_every_encoding(files, monkeypatch, command):
 
 def test_plain_twins_of_what_an_encoding_lacks():
     assert (
-        text.fitting("1σ ± 0.1° – χ² 10⁻³ µT …", "ascii")
+        text.transliterate("1σ ± 0.1° – χ² 10⁻³ µT …", "ascii")
         == "1sigma +/- 0.1deg - chi^2 10^-3 uT ..."
     )
-    assert text.fitting("1σ ± 0.1° – χ² …", "cp1252") == "1sigma ± 0.1° – chi² …"
-    assert text.fitting("1σ ± 0.1° – χ² …", "cp850") == "1sigma ± 0.1° - chi² ..."
-    assert text.fitting("1σ ± 0.1° – χ² …", "utf-8") == "1σ ± 0.1° – χ² …"
+    assert text.transliterate("1σ ± 0.1° – χ² …", "cp1252") == "1sigma ± 0.1° – chi² …"
+    assert text.transliterate("1σ ± 0.1° – χ² …", "cp850") == "1sigma ± 0.1° - chi² ..."
+    assert text.transliterate("1σ ± 0.1° – χ² …", "utf-8") == "1σ ± 0.1° – χ² …"
     assert (
-        text.fitting("Größe 号", "ascii") == r"Gr\xf6\xdfe \u53f7"
+        text.transliterate("Größe 号", "ascii") == r"Gr\xf6\xdfe \u53f7"
     )  # other names stay other names
 
 
@@ -231,7 +231,7 @@ def test_every_character_that_the_package_prints_has_a_plain_twin():
     characters = printed_characters()
     assert {"°", "σ", "χ", "…"} <= characters
     controls = {c for c in characters if not c.isprintable() and c not in text.TWINS}
-    lacking = [c for c in characters - controls if text.fitting(c, "ascii").startswith("\\")]
+    lacking = [c for c in characters - controls if text.transliterate(c, "ascii").startswith("\\")]
     assert lacking == []
 
 

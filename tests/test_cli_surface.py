@@ -2,8 +2,10 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import click
 import numpy as np
@@ -28,9 +30,12 @@ from mwdcal.app.cli import cli
 from mwdcal.app.commands import Group, options
 from mwdcal.errors import InputError
 from mwdcal.files import documents
+from mwdcal.library.drifts import limits_of
+from mwdcal.presentation.plan import wanted_accuracy
 from mwdcal.use.correction import OUTSIDE
 from schemas import of_calibration_files
 
+PACKAGE = Path(documents.__file__).parents[1]
 COMMANDS = sorted({*commands(), *cli.commands})
 
 
@@ -555,9 +560,9 @@ def failing(sampling_hz, start, log):
 
 def test_a_wrong_value_of_any_length_stays_short():
     """What a message repeats of a value that nobody can have meant is cut."""
-    done = mwdcal("registry", "drift", "tools.sqlite", "--today", "x" * 5_000)
+    done = mwdcal("registry", "drift", "tools.sqlite", "--date", "x" * 5_000)
     assert done.code == 2
-    assert "--today" in done.err
+    assert "--date" in done.err
     assert "%Y-%m-%d" in done.err
     assert len(done.err) < 1_000
 
@@ -630,3 +635,57 @@ def test_completion_in_a_group_offers_its_commands_and_what_the_default_takes(ty
     *words, incomplete = typed.split(" ")
     items = ShellComplete(cli, {}, "mwdcal", "").get_completions(words, incomplete)
     assert {*offered} <= {item.value for item in items}
+
+
+OLD_NAMES = {
+    "plan": {"--html": "--report"},
+    "survey": {"--html": "--report"},
+    "registry": {"--database": "--registry"},
+    "registry list": {"--database": "--registry"},
+    "registry drift": {"--html": "--report", "--today": "--date", "--database": "--registry"},
+    "certificate sign": {"--key": "--private-key"},
+}
+"""Names of options before they were unified, by command."""
+
+
+@pytest.mark.parametrize("command", OLD_NAMES)
+def test_old_names_of_options_are_taken_and_hidden(command):
+    found = {**commands(), **cli.commands}[command]
+    shown = mwdcal(*command.split(), "--help").out
+    for old, new in OLD_NAMES[command].items():
+        context = click.Context(found)
+        parser = found.make_parser(context)
+        values = [parser.parse_args([name, "x.file"])[0] for name in (old, new)]
+        assert values[0] == values[1] != {}
+        assert new in shown
+        assert not re.search(rf"{old}\b", shown)
+        assert old not in [item.value for item in found.shell_complete(context, "--")]
+
+
+def test_a_hidden_page_of_the_analysis_stays_for_one_release():
+    option = next(o for o in commands()["survey"].params if o.name == "msa_html")
+    assert option.hidden
+
+
+def test_angles_of_limits_and_accuracies_have_their_unit_in_their_name():
+    for typed, read in ((wanted_accuracy, {"azimuth": 0.1}), (limits_of, {"azimuth": 0.1})):
+        assert typed(["azimuth_deg=0.1"]) == typed(["azimuth=0.1"]) == read
+
+
+@pytest.mark.parametrize(
+    ("line", "kind", "beside"),
+    [
+        ("calibrate run.csv --tool", "profiles", "generic"),
+        ("verify tool.json run.csv --limits", "limits", "roll-test"),
+        ("survey tool.json run.csv --limits", "survey_limits", "owsg-mwd"),
+        ("plan --plan", "plans", "moosavi-12"),
+        ("list", "", "methods"),
+    ],
+)
+def test_completion_offers_what_is_built_in(line, kind, beside):
+    first, *rest = line.split()
+    items = ShellComplete(cli, {}, "mwdcal", "_MWDCAL_COMPLETE").get_completions([first, *rest], "")
+    offered = {item.value for item in items if item.type == "plain"}
+    assert beside in offered
+    if kind:
+        assert {file.stem for file in (PACKAGE / kind).glob("*.toml")} == offered

@@ -25,7 +25,7 @@ from mwdcal.drift.walk import (
     GroupRates,
     History,
     Increments,
-    one_noise,
+    common_noise_scale,
     parameter_names,
     precision,
     quantiles,
@@ -361,15 +361,15 @@ def test_a_step_is_named_with_its_size(years):
 
 def test_noise_of_one_tool_is_pooled_unless_it_differs():
     freedom = np.full(4, 30.0)
-    ratio, degrees, together = one_noise(np.array([0.8, 1.0, 1.2, 1.0]), freedom)
+    ratio, degrees, together = common_noise_scale(np.array([0.8, 1.0, 1.2, 1.0]), freedom)
     np.testing.assert_allclose(ratio, 1.0 / np.array([0.8, 1.0, 1.2, 1.0]))
     assert together.all()
     assert np.all(degrees == 120)
-    ratio, degrees, together = one_noise(np.array([0.8, 1.0, 9.0, 1.0]), freedom)
+    ratio, degrees, together = common_noise_scale(np.array([0.8, 1.0, 9.0, 1.0]), freedom)
     assert not together.any()
     assert np.all(ratio == 1)
     assert np.all(degrees == 30)
-    ratio, degrees, together = one_noise(np.array([np.nan, 1.0]), freedom[:2])
+    ratio, degrees, together = common_noise_scale(np.array([np.nan, 1.0]), freedom[:2])
     assert not together.any()
     assert np.isinf(degrees[0])
 
@@ -699,7 +699,7 @@ def test_comparing_reports_its_progress(years, tmp_path):
         for number, calibration in enumerate(years[serial]):
             documents.write(tmp_path / "files" / f"{serial}-{number}.json", calibration)
     database = tmp_path / "tools.sqlite"
-    where = ("--database", database)
+    where = ("--registry", database)
     assert mwdcal("registry", "init", *where).code == 0
     assert mwdcal("registry", "add", tmp_path / "files", *where, "--workers", "1").code == 0
     for serial, total in ((None, 2), ("T-1", 1)):
@@ -720,7 +720,7 @@ def test_the_command_reads_a_registry(years, tmp_path):
     for serial, each in years.items():
         for number, calibration in enumerate(each):
             documents.write(tmp_path / "files" / f"{serial}-{number}.json", calibration)
-    where = ("--database", tmp_path / "tools.sqlite")
+    where = ("--registry", tmp_path / "tools.sqlite")
     assert mwdcal("registry", "init", *where).code == 0
     assert mwdcal("registry", "add", tmp_path / "files", *where, "--workers", "1").code == 0
     one = mwdcal("registry", "drift", "T-1", *where, "--json").json

@@ -67,6 +67,20 @@ def test_a_verdict_and_a_diagnosis_say_what_the_commands_print(calibrated):
 
 
 @pytest.mark.usefixtures("without_pictures")
+def test_pages_of_a_verdict_and_a_diagnosis_are_those_of_the_commands(calibrated, tmp_path):
+    _, path, _ = calibrated
+    made = mwdcal.load(path)
+    test = mwdcal.read_run(EXAMPLE / "rolltest.csv", made.profile)
+    ours, theirs = tmp_path / "ours.html", tmp_path / "theirs.html"
+    for result in (mwdcal.verify(made, test), mwdcal.diagnose(made, test)):
+        name = "verify" if hasattr(result, "passed") else "diagnose"
+        result.report(ours)
+        command(name, path, EXAMPLE / "rolltest.csv", "--report", theirs)
+        assert ours.read_text("utf-8") == theirs.read_text("utf-8")
+        assert "<h1>SIM-0001</h1>" in ours.read_text("utf-8")
+
+
+@pytest.mark.usefixtures("without_pictures")
 def test_a_comparison_and_logs_say_what_the_commands_print(tmp_path):
     run = mwdcal.read_run(EXAMPLE / "run.csv", PROFILE)
     found = mwdcal.compare(run)

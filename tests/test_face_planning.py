@@ -11,9 +11,8 @@ import pytest
 import mwdcal
 from cli_support import EXAMPLE, numbers, read_csv, refused
 from cli_support import mwdcal as command
-from mwdcal.calibration.options import Options
+from mwdcal.calibration.options import FitChoices, Options, SeedlessFitChoices
 from mwdcal.files.formats import table as tables
-from mwdcal.library.planning import FitChoices, SeedlessFitChoices
 from mwdcal.library.results import LONGEST_LINE
 from mwdcal.planning import procedure
 
@@ -26,8 +25,8 @@ PLANS = {
         {"plan": ["six-state", "twelve-state"]},
         ("--plan", "six-state", "--plan", "twelve-state"),
     ),
-    "best": (LARGE, ("--stations", 24, "--plan", "candidates", "--reach", "inclination=0:90", "--criterion", "D")),
-    "accurate": ({"accuracy_deg": {"azimuth": 0.1}}, ("--accuracy", "azimuth=0.1")),
+    "best": (LARGE, ("--stations", 24, "--plan", "candidates", "--reach", "inclination_deg=0:90", "--criterion", "D")),
+    "accurate": ({"accuracy_deg": {"azimuth": 0.1}}, ("--accuracy", "azimuth_deg=0.1")),
     "stand": (
         {"plan": "laboratory-thermal", "speed": 2.0, "settle": 60, "soak": 120.0, "order": 1},
         ("--plan", "laboratory-thermal", "--speed", 2, "--settle", 60, "--soak", 120, "--order", 1),
@@ -75,7 +74,7 @@ def test_a_plan_is_written_as_by_the_command(tmp_path):
     result = mwdcal.plan(mwdcal.load_profile("servo"), stations=24)
     result.save(ours / "plan.csv")
     result.report(ours / "sheet.html")
-    ran = command(*line, "-o", theirs / "plan.csv", "--html", theirs / "sheet.html")
+    ran = command(*line, "-o", theirs / "plan.csv", "--report", theirs / "sheet.html")
     for name in ("plan.csv", "sheet.html"):
         assert (ours / name).read_bytes() == (theirs / name).read_bytes()
     assert ran.out == result.summary().replace(str(ours), str(theirs)) + "\n"

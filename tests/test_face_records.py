@@ -77,12 +77,12 @@ def filled(work):
 def test_adding_says_what_the_command_says(here, tmp_path):
     ours, theirs = tmp_path / "ours.sqlite", tmp_path / "theirs.sqlite"
     files = ("old.json", "new.json", "run.csv")
-    command("registry", "init", "--database", theirs, "--as", "A. Borg")
+    command("registry", "init", "--registry", theirs, "--as", "A. Borg")
     with mwdcal.registry(ours, create=True, actor="A. Borg") as tools:
         for words in (["--json"], []):  # the second time everything is there already
             result = tools.add(*files)
             ran = command(
-                "registry", "add", *files, "--database", theirs, *words, "--as", "A. Borg"
+                "registry", "add", *files, "--registry", theirs, *words, "--as", "A. Borg"
             )
             if words:
                 agrees(result, ran, without=("registry", "head"))
@@ -109,7 +109,7 @@ def test_what_is_in_memory_is_added_as_save_writes_it(here, tmp_path):
 
 
 def test_questions_to_a_registry_have_the_answers_of_the_commands(here, filled, tmp_path):
-    where = ("--database", filled)
+    where = ("--registry", filled)
     with mwdcal.registry(filled) as tools:
         for words in ((), ("--json",)):
             for result, line in (
@@ -135,7 +135,7 @@ def test_questions_to_a_registry_have_the_answers_of_the_commands(here, filled, 
 
 
 def test_drift_is_that_of_the_command(here, filled, tmp_path):
-    where = ("--database", filled, "--today", "2027-01-01")
+    where = ("--registry", filled, "--date", "2027-01-01")
     limits = {"inclination_deg": 0.2}
     with mwdcal.registry(filled) as tools:
         one = tools.drift("SIM-0001", today="2027-01-01", limits=limits)
@@ -155,7 +155,7 @@ def test_the_page_of_a_drift_is_that_of_the_command(here, filled, tmp_path):
         tools.drift("SIM-0001", today="2027-01-01").report(tmp_path / "ours.html")
         with pytest.raises(InputError, match="no page"):
             tools.list().report(tmp_path / "no.html")
-    line = ("--today", "2027-01-01", "--html", tmp_path / "theirs.html", "--database", filled)
+    line = ("--date", "2027-01-01", "--report", tmp_path / "theirs.html", "--registry", filled)
     assert command("registry", "drift", "SIM-0001", *line).code == 0
     assert (tmp_path / "ours.html").read_bytes() == (tmp_path / "theirs.html").read_bytes()
 
@@ -336,7 +336,7 @@ def test_signing_a_file_says_what_the_command_says(here, key, tmp_path):
     for words in ((), ("--json",)):
         ours = mwdcal.sign("new.json", key, output=file)
         file.unlink()
-        line = ("certificate", "sign", "new.json", "--key", key, "-o", file)
+        line = ("certificate", "sign", "new.json", "--private-key", key, "-o", file)
         agrees(ours, command(*line, *words), without=("time",))
         if not words:
             file.unlink()

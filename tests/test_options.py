@@ -1,19 +1,23 @@
 """Choices of a fit: fewer parameters, the papers' own sums, own-axis terms by left-out stations."""
 
+import ast
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from cli_support import mwdcal
+from cli_support import commands, mwdcal
+from mwdcal.calibration import fit_options
 from mwdcal.calibration.automatic.nonlinearity import choose_curves, compare_curves
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.estimate import fit
-from mwdcal.calibration.options import Options
+from mwdcal.calibration.options import Options, as_arguments, options_of
 from mwdcal.calibration.prediction import readings_at
 from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.record import FitSettings
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import centred
@@ -259,3 +263,57 @@ def test_a_previous_calibration_is_taken_as_prior(tmp_path):
     assert "prior run.csv" in ran.out
     made = json.loads((tmp_path / "b.json").read_text("utf-8"))
     assert made["accelerometer"]["rank"] == 12
+
+
+# Declared once
+
+SOURCE = Path(fit_options.__file__).parents[1]
+
+
+def declares(path, name):
+    """Whether a module has a field or a string of a name."""
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        target = node.target if isinstance(node, ast.AnnAssign) else None
+        if getattr(target, "id", "") == name or getattr(node, "value", None) == name:
+            return True
+    return False
+
+
+@pytest.mark.parametrize("name", ["estimate", "robust", "paper_weights"])
+def test_an_option_of_the_fit_stands_in_four_files_at_most(name):
+    """`survey` has a robust fit of its own."""
+    modules = [path for path in SOURCE.rglob("*.py") if path.parent.name != "survey"]
+    places = [str(path.relative_to(SOURCE)) for path in modules if declares(path, name)]
+    assert len(places) <= 4, places
+
+
+def test_every_option_of_the_fit_is_one_of_options_and_of_the_command():
+    typed = {option.name for option in commands()["calibrate"].params}
+    assert {*fit_options.FIT_OPTIONS} == {*fit_options.FitArguments.__annotations__}
+    assert typed > {*fit_options.FIT_OPTIONS} < {field.name for field in fields(Options)}
+
+
+def test_options_of_a_fleet_go_to_words_and_back():
+    chosen = Options(
+        order=0, nonlinearity=("magnetometer",), estimate=("tilt",), parameters=9, robust="huber"
+    )
+    words = as_arguments(chosen)
+    assert (words["nonlinearity"], words["estimate"], words["parameters"]) == (
+        "magnetometer",
+        "tilt",
+        "9",
+    )
+    assert options_of(words) == chosen
+    assert as_arguments(Options(nonlinearity={}))["nonlinearity"] == "none"
+
+
+def test_settings_are_worded_for_screens_and_certificates():
+    settings = FitSettings(parameters=9, ignore=["field", "dip"], robust="huber")
+    assert [*fit_options.unusual(settings, "heading")] == [
+        "9 parameters",
+        "without field and dip",
+        "robust (huber)",
+    ]
+    words = "; ".join(fit_options.unusual(settings, "deviation"))
+    assert "references not used: field, dip" in words
+    assert not [*fit_options.unusual(FitSettings(), "heading")]

@@ -36,7 +36,15 @@ def commands(folder, output):
         "apply": ("apply", calibration, readings, "-o", output),
         "report": ("verify", calibration, readings, "--report", output),
         "convert": ("convert", calibration, "--notation", "forward", "-o", output),
-        "sign": ("certificate", "sign", calibration, "--key", folder / "lab.key", "-o", output),
+        "sign": (
+            "certificate",
+            "sign",
+            calibration,
+            "--private-key",
+            folder / "lab.key",
+            "-o",
+            output,
+        ),
         "calibrate": (
             "calibrate",
             EXAMPLE / "run.csv",
@@ -81,7 +89,7 @@ def test_what_a_certificate_beside_it_lists_stays(folder, tmp_path, command, nam
 def test_a_signed_certificate_replaces_nothing_that_it_lists_wherever_it_is(folder, name):
     document, key = folder / "issued" / "C.json", folder / "lab.key"
     before = (folder / name).read_bytes()
-    sign = ("certificate", "sign", document, "--key", key)
+    sign = ("certificate", "sign", document, "--private-key", key)
     said = refused(mwdcal(*sign, "-o", folder / name), 2)
     assert "it is a calibration" in said or "'C.json' lists it" in said
     assert (folder / name).read_bytes() == before

@@ -45,6 +45,8 @@ SAMPLES = {
     "calibrate-soaks": ("calibrate", "soaks.csv", *TOOL, "--order", "1", "-o", "new.json"),
     "verify": ("verify", "tool.json", EXAMPLE / "rolltest.csv"),
     "verify-failed": ("verify", "tool.json", EXAMPLE / "rolltest.csv", "--limits", "tight.toml"),
+    "diagnose": ("diagnose", "tool.json", EXAMPLE / "rolltest.csv"),
+    "diagnose-named": ("diagnose", "tool.json", "knocked.csv"),
     "compare": ("compare", EXAMPLE / "run.csv", *TOOL),
     "fleet": ("fleet", "fleet.parquet", *TOOL, "-o", "new.parquet", "--workers", "1"),
     "noise": ("noise", EXAMPLE / "static.csv", *TOOL),
@@ -56,8 +58,8 @@ SAMPLES = {
         *("certificate", "tool.json", "--laboratory", EXAMPLE / "laboratory.toml"),
         *("--verification", "left.json", "--as-found", "found.json"),
     ),
-    "registry-drift": ("registry", "drift", "SIM-0001", "--database", "tools.sqlite"),
-    "registry-drift-fleet": ("registry", "drift", "--database", "tools.sqlite"),
+    "registry-drift": ("registry", "drift", "SIM-0001", "--registry", "tools.sqlite"),
+    "registry-drift-fleet": ("registry", "drift", "--registry", "tools.sqlite"),
     "survey-rejected": ("survey", "tool.json", "iron.csv", "-o", "new.csv"),
 }
 """Commands that also write a page, by the name of the sample."""
@@ -66,7 +68,7 @@ SAMPLES = {
 def page_options(command):
     """Options of a command that name a page to write, the usual ones first."""
     options = [(option.opts[0], option.metavar or "") for option in command.params]
-    usual = [name for name, _ in options if name in ("--report", "--html")]
+    usual = [name for name, _ in options if name == "--report"]
     return usual or [name for name, metavar in options if ".html" in metavar]
 
 
@@ -120,9 +122,12 @@ def folder(tmp_path_factory):
         ran = mwdcal("verify", folder / f"{name}.json", EXAMPLE / "rolltest.csv", *limits, "--json")
         (folder / f"{when}.json").write_text(ran.out, "utf-8")
     fleet(folder / "fleet.parquet")
-    registry = ("registry", "--database", folder / "tools.sqlite")
+    registry = ("registry", "--registry", folder / "tools.sqlite")
     assert mwdcal(*registry, "init").code == 0
     assert mwdcal(*registry, "add", folder / "tool.json", folder / "before.json").code == 0
+    knocked = read_csv(EXAMPLE / "rolltest.csv")
+    knocked["ay"] = [f"{float(v) + 0.015:.6f}" for v in knocked["ay"]]
+    write_csv(folder / "knocked.csv", knocked, 'simulated = "yes"', 'serial = "SIM-0001"')
     iron = read_csv(EXAMPLE / "well.csv")
     iron["mz"] = [f"{float(v) + 0.06:.6f}" for v in iron["mz"]]
     write_csv(folder / "iron.csv", iron, 'simulated = "yes"')

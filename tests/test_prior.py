@@ -1,4 +1,4 @@
-"""Knowledge before the run: one more block of evidence, with its own finding where it is wrong."""
+"""PriorInformation before the run: one more block of evidence, with its own finding where it is wrong."""
 
 from dataclasses import replace
 

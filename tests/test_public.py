@@ -1,9 +1,11 @@
 """`import mwdcal`: the public names, conversion and refusal of arrays, and the ten lines of a first script."""
 
+import inspect
 import os
 import shutil
 import subprocess
 import sys
+import typing
 from dataclasses import replace
 from pathlib import Path
 
@@ -70,7 +72,7 @@ def test_drawing_and_its_library_wait_until_they_are_used():
 def test_every_public_name_is_there_and_has_a_docstring():
     from mwdcal import library
 
-    assert sorted(mwdcal.__all__) == sorted(library.__all__)
+    assert all(hasattr(library, name) for name in mwdcal.__all__)
     assert len(mwdcal.__all__) <= 32
     for name in mwdcal.__all__:
         assert getattr(mwdcal, name).__doc__, name
@@ -254,8 +256,8 @@ def test_refused_arrays(case, simulated):
 
 
 def test_calibrate_refuses_what_is_no_run(simulated):
-    with pytest.raises(mwdcal.InputError, match=r"got ndarray. Make them by mwdcal.readings"):
-        mwdcal.calibrate(simulated.accelerometer)
+    with pytest.raises(mwdcal.InputError, match=r"got object of shape \(0,\). Or make readings by"):
+        mwdcal.calibrate(object())
     many = mwdcal.readings(np.stack([simulated.accelerometer] * 2))
     with pytest.raises(mwdcal.InputError, match=r"one run, \(n, 3\); got \(2, 48, 3\)"):
         mwdcal.calibrate(many)
@@ -304,7 +306,8 @@ def test_refused_arguments(run, cal, simulated):
     for call, words in (
         (lambda: mwdcal.calibrate(run, mwdcal.Options()), "`profile` must be a tool profile"),
         (lambda: mwdcal.verify(cal, batch), "`rolltest` must have readings of one run"),
-        (lambda: mwdcal.apply(cal, a), "`survey` must be readings; got ndarray"),
+        (lambda: mwdcal.apply(cal, a[:, :2]), r"got ndarray of shape \(48, 2\)"),
+        (lambda: cal.fields([1.0, 0.0, 0.0]), r"got list of shape \(3,\)"),
         (lambda: cal.covariance((), run), "one observable or more"),
         (lambda: mwdcal.readings(a + 0j, m), "`accelerometer` must be numbers; got complex128"),
         (lambda: mwdcal.readings(a > 0, m), "must be numbers; got bool"),
@@ -606,3 +609,60 @@ def test_masked_cells_of_a_table_are_blank():
     (columns["ax"],) = hidden(columns["ax"], [4], 0.0)
     with pytest.raises(mwdcal.InputError, match="row 5, column 'ax'"):
         mwdcal.read_run(columns, EXAMPLE / "tool.toml")
+
+
+# Arrays of readings, and results in notebooks
+
+
+def test_arrays_are_accepted_where_readings_are(cal, rolltest):
+    a, m = columns(rolltest)
+    both, warm = np.hstack([a, m]), rolltest.temperature
+    whole = both if warm is None else np.hstack([both, warm[:, None]])
+    for ours, theirs in zip(cal.fields(whole), cal.fields(rolltest), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    np.testing.assert_array_equal(cal.fields(whole.tolist())[0], cal.fields(rolltest)[0])
+    plain = mwdcal.readings(a, m, temperature=warm)
+    np.testing.assert_array_equal(
+        cal.uncertainty("azimuth", whole), cal.uncertainty("azimuth", plain)
+    )
+    for name in ("jacobian", "noise_covariance", "outside", "unrecorded"):
+        np.testing.assert_array_equal(getattr(cal, name)(whole), getattr(cal, name)(plain))
+    assert mwdcal.apply(cal, whole).columns.keys() == mwdcal.apply(cal, plain).columns.keys()
+    assert mwdcal.diagnose(cal, whole).fault == mwdcal.diagnose(cal, plain).fault
+    hidden = np.ma.array(whole, mask=np.zeros(whole.shape, bool))
+    hidden[0, 0] = np.ma.masked
+    assert np.isnan(cal.fields(hidden)[0][0]).all()
+    with pytest.raises(mwdcal.InputError, match="must be finite; got nan at station 1"):
+        mwdcal.apply(cal, hidden)
+
+
+def test_a_file_and_columns_are_accepted_where_readings_are(tmp_path):
+    whole = mwdcal.read_run(EXAMPLE / "rolltest.csv", "servo")
+    cal = mwdcal.calibrate(EXAMPLE / "run.csv", EXAMPLE / "tool.toml")
+    by_file = mwdcal.apply(cal, EXAMPLE / "rolltest.csv")
+    table = {name: whole.columns[name] for name in ("ax", "ay", "az", "mx", "my", "mz")}
+    table["temperature_c"] = whole.columns["temperature_c"]
+    by_columns = mwdcal.apply(cal, table)
+    np.testing.assert_array_equal(by_file.inclination, by_columns.inclination)
+    assert mwdcal.verify(cal, EXAMPLE / "rolltest.csv").passed
+
+
+def test_results_show_themselves_in_notebooks(cal, rolltest):
+    corrected = mwdcal.apply(cal, rolltest)
+    shown = corrected._repr_html_()
+    assert f"{rolltest.count} rows corrected" in shown
+    assert "<td>inclination_deg</td>" in shown
+    assert len(repr(corrected)) < 300
+    assert len(corrected.to_dict()["columns"]["gx_g"]) == rolltest.count
+    for result in (cal, rolltest, mwdcal.verify(cal, rolltest), mwdcal.diagnose(cal, rolltest)):
+        assert result._repr_html_().startswith("<")
+
+
+@pytest.mark.parametrize("name", [name for name in mwdcal.__all__ if name.islower()])
+def test_keywords_are_typed(name):
+    """An editor completes them, and a type checker finds a misspelt one."""
+    function = getattr(mwdcal, name)
+    for way in typing.get_overloads(function) or [function]:
+        for argument in inspect.signature(way).parameters.values():
+            if argument.kind is inspect.Parameter.VAR_KEYWORD:
+                assert "Unpack" in str(argument.annotation)

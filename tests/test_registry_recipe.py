@@ -51,14 +51,14 @@ def test_the_recipe_leads_from_an_empty_folder_to_a_signed_certificate(tmp_path,
     )
     pages = pypdf.PdfReader(tmp_path / "laboratory" / "certificate.pdf").pages
     assert any("Biases from calibration to calibration" in page.extract_text() for page in pages)
-    ran = mwdcal("registry", "--database", "tools.sqlite", "history", "SIM-0001", "--json")
+    ran = mwdcal("registry", "--registry", "tools.sqlite", "history", "SIM-0001", "--json")
     kinds = [record["kind"] for record in ran.json["records"]]
     expected = {"calibration": 5, "run": 7, "verification": 3, "certificate": 1}
     assert {kind: kinds.count(kind) for kind in kinds} == expected
-    ran = mwdcal("registry", "--database", "tools.sqlite", "drift", "SIM-0001", "--json")
+    ran = mwdcal("registry", "--registry", "tools.sqlite", "drift", "SIM-0001", "--json")
     inclination = next(
         r for r in ran.json["tool"]["service"] if r["name"] == "spread of inclination"
     )
     assert (inclination["as_left_passed"], inclination["as_found_passed"]) == (True, False)
-    due = mwdcal("registry", "--database", "tools.sqlite", "list", "--due", "2027-06-01", "--json")
+    due = mwdcal("registry", "--registry", "tools.sqlite", "list", "--due", "2027-06-01", "--json")
     assert [tool["next_due"] for tool in due.json["tools"]] == [certificate["next_due"]]

@@ -29,9 +29,9 @@ from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import reference_vectors
 from mwdcal.planning import simulate
 from mwdcal.presentation import calibration as screen
-from mwdcal.presentation import calibration_page, conversion, text
+from mwdcal.presentation import calibration_page, conversion
 from mwdcal.presentation.calibration_page import render
-from mwdcal.presentation.numbers import fixed, measured, number, signed
+from mwdcal.presentation.numbers import fixed, measured, number, quantity, signed
 from mwdcal.presentation.page import css, svg
 from mwdcal.sensor.profile import Profile, TriadProfile
 from mwdcal.use import plots
@@ -328,7 +328,7 @@ def test_verdict_comes_first(whole, words):
     failed = words(whole, Outcome(False, [Row(), Row(passed=True, value=0.5, note="<b>")]))
     assert "Verification failed – 1 of 2 limits not met" in failed
     assert failed.index("Verification failed") < failed.index("Fit accepted")
-    assert "1.23°" in failed
+    assert "1.230° 0.040°" in failed  # two digits of the uncertainty
     assert "1.45°" in failed
     assert "0.040°</td><td>8</td>" in failed
     assert "Risk of a wrong verdict, all roll sets and limits together: 0.02." in failed
@@ -476,7 +476,7 @@ def test_held_parameters_are_said_to_be_held(words, parameters):
 
 
 def test_zero_has_no_sign():
-    assert text.number(-0.0) == "0"
+    assert number(-0.0) == quantity(-0.0, "") == "0"
 
 
 def test_summary_says_what_was_asked_for(tmp_path):
@@ -595,7 +595,7 @@ def test_values_are_rounded_to_their_uncertainty(value, uncertainty, text):
 
 def test_numbers():
     assert [number(v) for v in (0, 22.44, -0.0649, 1.5e-7, None, float("nan"), 12345)] == [
-        "0", "22.4", "−0.0649", "1.50×10⁻⁷", "–", "–", "12345",
+        "0", "22.4", "−0.0649", "1.5×10⁻⁷", "–", "–", "12345",
     ]  # fmt: skip
     assert [signed(v, 2) for v in (1, -1, -0.001, None)] == ["+1.00", "−1.00", "0.00", "–"]
     assert set(css("a<é\n}")) <= set("0123456789abcdef\\ ")

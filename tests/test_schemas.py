@@ -373,7 +373,7 @@ def test_sources_for_firmware(tmp_path, form):
     ],
 )
 def test_plans(tmp_path, options):
-    sheets = ("-o", tmp_path / "plan.csv", "--html", tmp_path / "plan.html")
+    sheets = ("-o", tmp_path / "plan.csv", "--report", tmp_path / "plan.html")
     document = shown("plan", *options, "--tool", EXAMPLE / "tool.toml", *sheets)
     assert (document["serial"], document["simulated"]) == (None, True)
     assert document["profile_sha256"] == sha256(EXAMPLE / "tool.toml")

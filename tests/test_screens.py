@@ -28,8 +28,8 @@ from mwdcal.presentation import text
 STORED = Path(__file__).parent / "screens"
 WIDTHS = (80, 120)
 PLACE = ("--latitude", "60", "--longitude", "3.5", "--altitude-m", "40", "--date", "2026-07-01")
-REGISTRY = ("--database", "tools.sqlite")
-NEW_REGISTRY = ("--database", "new.sqlite")
+REGISTRY = ("--registry", "tools.sqlite")
+NEW_REGISTRY = ("--registry", "new.sqlite")
 SCREENS = {
     "example": ("example", "new"),
     "calibrate": ("calibrate", "demo/run.csv", "--tool", "demo/tool.toml", "-o", "made.json"),
@@ -63,7 +63,7 @@ SCREENS = {
     "registry-list": ("registry", "list", *REGISTRY),
     "registry-list-due": ("registry", "list", "--due", "2030-01-01", *REGISTRY),
     "registry-history": ("registry", "history", "SIM-0001", *REGISTRY),
-    "registry-drift": ("registry", "drift", "SIM-0001", "--today", "2026-11-22", *REGISTRY),
+    "registry-drift": ("registry", "drift", "SIM-0001", "--date", "2026-11-22", *REGISTRY),
     "registry-get": ("registry", "get", "SIM-0001", "-o", "made.json", *REGISTRY),
     "registry-withdraw": ("registry", "withdraw", "2", "--reason", "wrong stand angles", *REGISTRY),
     "registry-export": ("registry", "export", "new", *REGISTRY),
@@ -78,7 +78,7 @@ SCREENS = {
                         "--workers", "1", "-o", "made.parquet"),
     "stations": ("stations", "demo/log.csv", "-o", "stations.csv"),
     "survey": ("survey", "tool.json", "demo/well.csv", "-o", "made.csv"),
-    "certificate-sign": ("certificate", "sign", "certificate.json", "--key", "lab.key", "-o", "made.json"),
+    "certificate-sign": ("certificate", "sign", "certificate.json", "--private-key", "lab.key", "-o", "made.json"),
     "certificate-verify": ("certificate", "verify", "signed.json", "--key", "lab.key.pub"),
     "certificate-altered": ("certificate", "verify", "altered.json", "--key", "lab.key.pub"),
     "key-list": ("certificate", "key", "list", "keys.json"),
@@ -178,7 +178,7 @@ def prepared(folder):
 def registry(folder):
     """A registry with a calibration, its run, roll test and verdict, a certificate and the laboratory."""
     pytest.importorskip("sqlalchemy")
-    whole = ("registry", "--database", folder / "unchanged.sqlite")
+    whole = ("registry", "--registry", folder / "unchanged.sqlite")
     assert mwdcal(*whole, "init", "--as", "A. Borg").code == 0
     certificate = [folder / each if "." in each else each for each in SCREENS["certificate"]]
     assert mwdcal(*certificate).code == 0
@@ -225,7 +225,7 @@ def signatures(folder):
         for name, target in (("certificate", "signed"), ("tool", "signed-tool")):
             typed = (
                 folder / f"{name}.json",
-                "--key",
+                "--private-key",
                 folder / "lab.key",
                 "-o",
                 folder / f"{target}.json",

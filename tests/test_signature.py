@@ -63,7 +63,7 @@ def no_passphrase():
 
 
 def signed(path, key, *options):
-    ran = mwdcal("certificate", "sign", path, "--key", key, *options)
+    ran = mwdcal("certificate", "sign", path, "--private-key", key, *options)
     assert ran.code == 0, ran
     return path
 
@@ -357,7 +357,9 @@ def test_a_private_key_is_its_owners_alone(tmp_path, key):
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     for mode in (0o640, 0o604, 0o660):
         path.chmod(mode)
-        message = refused(mwdcal("certificate", "sign", certificate(tmp_path), "--key", path), 2)
+        message = refused(
+            mwdcal("certificate", "sign", certificate(tmp_path), "--private-key", path), 2
+        )
         assert "chmod 600" in message
 
 
@@ -378,7 +380,7 @@ def test_a_passphrase(tmp_path, monkeypatch):
     assert b"ENCRYPTED" in path.read_bytes()
     signed(certificate(tmp_path), path)
     monkeypatch.setenv("MWDCAL_KEY_PASSPHRASE", "wrong")
-    other = ("certificate", "sign", certificate(tmp_path), "--key", path)
+    other = ("certificate", "sign", certificate(tmp_path), "--private-key", path)
     assert "passphrase is wrong" in refused(mwdcal(*other), 2)
     monkeypatch.delenv("MWDCAL_KEY_PASSPHRASE")
     monkeypatch.setattr(sys, "stdin", None)
@@ -428,13 +430,13 @@ def test_what_is_not_the_key_is_refused_in_a_sentence(tmp_path, key):
         path.write_bytes(content)
         path.chmod(0o600)
         if name != "private":
-            refused(mwdcal("certificate", "sign", document, "--replace", "--key", path), 2)
+            refused(mwdcal("certificate", "sign", document, "--replace", "--private-key", path), 2)
         if name not in ("public", "list"):
             message = refused(mwdcal("certificate", "verify", document, "--key", path), 2)
             assert ("private" in message) == (name in ("private", "openssh", "EC", "RSA")), name
             refused(mwdcal("certificate", "key", "trust", tmp_path / "k.json", path), 2)
     for place in (tmp_path, tmp_path / "missing", tmp_path / "missing.pub", "/dev/zero"):
-        refused(mwdcal("certificate", "sign", document, "--replace", "--key", place), 2)
+        refused(mwdcal("certificate", "sign", document, "--replace", "--private-key", place), 2)
         refused(mwdcal("certificate", "verify", document, "--key", place), 2)
     assert document.read_bytes() == data
     assert not (tmp_path / "k.json").exists()
@@ -459,7 +461,7 @@ def test_an_owner_controls_no_terminal(tmp_path, key):
 def test_signing_again_is_meant_or_refused(tmp_path, key, public):
     path = signed(certificate(tmp_path), key)
     data = path.read_bytes()
-    again = ("certificate", "sign", path, "--key", key)
+    again = ("certificate", "sign", path, "--private-key", key)
     assert "is signed already, by key" in refused(mwdcal(*again), 2)
     assert path.read_bytes() == data
     signed(path, key, "--replace")
@@ -475,7 +477,7 @@ def test_signing_into_another_file_leaves_the_first(tmp_path, key, public):
     assert path.read_bytes() == data
     assert state(output, "--key", public) == (0, "intact")
     for lost in (key, path):
-        refused(mwdcal("certificate", "sign", path, "--key", key, "-o", lost), 2)
+        refused(mwdcal("certificate", "sign", path, "--private-key", key, "-o", lost), 2)
 
 
 def test_a_calibration_that_was_changed_is_not_signed(tmp_path, files, key):
@@ -483,7 +485,7 @@ def test_a_calibration_that_was_changed_is_not_signed(tmp_path, files, key):
     fields["accelerometer"]["parameters"][9] += 1e-9
     path = tmp_path / "edited.json"
     path.write_text(json.dumps(fields))
-    assert "altered" in refused(mwdcal("certificate", "sign", path, "--key", key), 3)
+    assert "altered" in refused(mwdcal("certificate", "sign", path, "--private-key", key), 3)
 
 
 @pytest.mark.parametrize(
@@ -503,10 +505,10 @@ def test_a_calibration_that_was_changed_is_not_signed(tmp_path, files, key):
 def test_what_is_no_document_is_not_signed_or_verified(tmp_path, key, public, content):
     path = tmp_path / "other.json"
     path.write_text(content)
-    refused(mwdcal("certificate", "sign", path, "--key", key), 2)
+    refused(mwdcal("certificate", "sign", path, "--private-key", key), 2)
     refused(mwdcal("certificate", "verify", path, "--key", public), 2)
     for place in (tmp_path, tmp_path / "missing"):
-        refused(mwdcal("certificate", "sign", place, "--key", key), 2)
+        refused(mwdcal("certificate", "sign", place, "--private-key", key), 2)
         refused(mwdcal("certificate", "verify", place, "--key", public), 2)
 
 
@@ -713,9 +715,9 @@ def test_a_signed_calibration_is_the_same_to_all_else(tmp_path, files, key, publ
     documents.write(tmp_path / "again.json", calibration)
     assert (tmp_path / "again.json").read_bytes() == path.read_bytes()
     assert state(tmp_path / "again.json", "--key", public) == (0, "intact")
-    from mwdcal.calibration.record import sealed
+    from mwdcal.calibration.record import with_checksum
 
-    assert sealed(calibration) == before
+    assert with_checksum(calibration) == before
     jsonschema = pytest.importorskip("jsonschema")
     record = json.loads(path.read_bytes())
     jsonschema.Draft202012Validator(documents.published_schema()).validate(record)
@@ -729,7 +731,7 @@ def test_without_cryptography_it_says_what_to_install(tmp_path, files, key, publ
     ran = mwdcal("verify", path, files[1], "--key", public)
     assert "signature not checked" in ran.out
     assert 'pip install "mwdcal[certificate]"' in ran.err
-    message = refused(mwdcal("certificate", "sign", path, "--key", key), 2)
+    message = refused(mwdcal("certificate", "sign", path, "--private-key", key), 2)
     assert 'pip install "mwdcal[certificate]"' in message
     refused(mwdcal("certificate", "key", "create", "-o", tmp_path / "n.key"), 2)
     ran = mwdcal("certificate", "verify", path, "--key", public)
@@ -768,7 +770,7 @@ def test_what_cannot_be_listed_is_refused_before_anything_is_written(
     path = certificate(tmp_path, files=listed_files)
     data, out = path.read_bytes(), tmp_path / "signed.json"
     options = ("-o", out) if output else ()
-    refused(mwdcal("certificate", "sign", path, "--key", key, *options), 2)
+    refused(mwdcal("certificate", "sign", path, "--private-key", key, *options), 2)
     assert path.read_bytes() == data
     assert not out.exists()
 
@@ -777,7 +779,7 @@ def test_an_interrupted_or_refused_signature_leaves_the_file(tmp_path, key, monk
     path = certificate(tmp_path)
     data = path.read_bytes()
     path.chmod(0o444)
-    refused(mwdcal("certificate", "sign", path, "--key", key), 2)
+    refused(mwdcal("certificate", "sign", path, "--private-key", key), 2)
     assert path.read_bytes() == data
 
 
@@ -833,7 +835,7 @@ def test_a_calibration_that_is_signed_too_late_is_named(tmp_path, files, key):
     shutil.copy(files[0], calibration)
     assert mwdcal("certificate", calibration, "-o", path).code == 0
     signed(calibration, key)
-    ran = mwdcal("certificate", "sign", path, "--key", key)
+    ran = mwdcal("certificate", "sign", path, "--private-key", key)
     assert "! changed since the certificate was issued: tool.json." in ran.err
 
 

@@ -33,7 +33,7 @@ from mwdcal.survey.acceptance import (
 )
 from mwdcal.survey.error_model import load_error_model
 from mwdcal.survey.path import well_path
-from mwdcal.survey.stations import STRENGTHS, SURVEYED, surveyed, switched
+from mwdcal.survey.stations import STRENGTHS, SURVEY_OBSERVABLES, survey_angles, switched
 from mwdcal.survey.surveying import survey_readings
 from mwdcal.survey.well_errors import well_errors
 
@@ -76,11 +76,13 @@ def test_uncertainty_covers_the_errors_of_surveys(tools):
     """Errors of calibrations, 12 surveys each, in units of the stated covariance: chi-square, χ²/k = 1."""
     total, count = 0.0, 0
     names = ["inclination", "azimuth", "north_toolface", "gravity", "field", "dip"]
-    places = [SURVEYED.index(name) for name in names]
+    places = [SURVEY_OBSERVABLES.index(name) for name in names]
     inc, azi, roll = np.radians([[4.0, 30, 88, 120], [20, 140, 260, 330], [10, 100, 200, 300]])
     for seed in range(tools):
         tool, calibration = laboratory(seed)
-        surveys = surveyed(calibration, readings(tool, inc, azi, roll, np.random.default_rng(seed)))
+        surveys = survey_angles(
+            calibration, readings(tool, inc, azi, roll, np.random.default_rng(seed))
+        )
         vectors = reference_vectors(inc, azi, roll, EARTH.gravity, EARTH.field, EARTH.dip)
         true = np.stack([OBSERVABLES[name].value(*vectors) for name in names], -1)
         error = centred(surveys.value[:, places] - true)
@@ -104,7 +106,7 @@ def test_the_magnetic_toolface_takes_over_without_a_jump():
     """From 8° to vertical and back: azimuth + gravity toolface goes on as the toolface from north."""
     tool, calibration = laboratory()
     inc = np.radians(np.concatenate([np.arange(8.1, 0, -0.25), [0.0], np.arange(0.1, 8.2, 0.25)]))
-    surveys = surveyed(calibration, readings(tool, inc, np.radians(70), np.radians(40)))
+    surveys = survey_angles(calibration, readings(tool, inc, np.radians(70), np.radians(40)))
     toolface, sd = surveys.of("toolface")
     kind = surveys.magnetic
     down = slice(0, np.argmin(inc))
@@ -115,10 +117,10 @@ def test_the_magnetic_toolface_takes_over_without_a_jump():
     assert np.abs(centred(toolface - expected)).max() < 0.01
     switch = np.flatnonzero(np.diff(kind.astype(int)))
     azimuth = surveys.of("azimuth")[0]
-    gravity = surveys.value[:, SURVEYED.index("toolface")]
+    gravity = surveys.value[:, SURVEY_OBSERVABLES.index("toolface")]
     for i in switch:  # the same stations by either
         for k in (i, i + 1):
-            north = surveys.value[k, SURVEYED.index("north_toolface")]
+            north = surveys.value[k, SURVEY_OBSERVABLES.index("north_toolface")]
             assert abs(centred(azimuth[k] + gravity[k] - north)) < 1e-12
     assert np.isfinite(toolface).all()
     assert np.isfinite(sd).all()
@@ -134,7 +136,7 @@ def test_switch_keeps_its_state_between_its_ends():
 def test_bad_switch_is_refused():
     tool, calibration = laboratory()
     with pytest.raises(InputError, match="`switch` must be"):
-        surveyed(calibration, readings(tool, 1.0, 0.0, 0.0), (0.2, 0.1))
+        survey_angles(calibration, readings(tool, 1.0, 0.0, 0.0), (0.2, 0.1))
 
 
 def test_distance_of_the_published_case():
@@ -177,7 +179,7 @@ def test_error_model_accepts_at_its_probability():
         warmth,
         known,
     )
-    result = judged(surveyed(calibration, read), calibration.fields(read), read, limits)
+    result = judged(survey_angles(calibration, read), calibration.fields(read), read, limits)
     rejected = np.mean(~result.accepted)
     assert rejected == pytest.approx(0.0027, abs=4 * np.sqrt(0.0027 / count) + 0.0005)
     assert np.median(result.distance) == pytest.approx(np.sqrt(chi2.median(3)), rel=0.03)
@@ -187,7 +189,7 @@ def test_axial_interference_is_rejected_and_named():
     tool, calibration = laboratory()
     read = readings(tool, np.radians([10, 40]), np.radians([20, 300]), 1.0, shift=[0, 0, 1500.0])
     limits, _ = load_survey_limits()
-    result = judged(surveyed(calibration, read), calibration.fields(read), read, limits)
+    result = judged(survey_angles(calibration, read), calibration.fields(read), read, limits)
     assert not result.accepted.any()
     assert all("distance" in text and "field" in text for text in result.findings())
 
@@ -199,7 +201,7 @@ def test_fixed_limits_hold_one_by_one():
     known = {**read.known, "dip": read.known["dip"] + np.radians([0.0, 0.3, -0.1])}
     known["field"] = known["field"] + np.array([0.0, 0, 400])
     read = replace(read, known=known)
-    result = judged(surveyed(calibration, read), calibration.fields(read), read, limits)
+    result = judged(survey_angles(calibration, read), calibration.fields(read), read, limits)
     assert result.accepted.tolist() == [True, False, False]
     first, second, third = result.findings()
     assert first == ""
@@ -212,7 +214,7 @@ def test_nothing_is_accepted_without_a_reference():
     tool, calibration = laboratory()
     read = replace(readings(tool, 0.8, 0.5, 0.1), known={})
     result = judged(
-        surveyed(calibration, read), calibration.fields(read), read, load_survey_limits()[0]
+        survey_angles(calibration, read), calibration.fields(read), read, load_survey_limits()[0]
     )
     assert isinstance(result, Judgement)
     assert not result.accepted.any()
@@ -247,7 +249,7 @@ def test_a_distance_of_readings_of_any_uncertainty_is_a_number():
 
 
 def test_strengths_lie_where_they_are_said_to():
-    assert SURVEYED[STRENGTHS] == ("gravity", "field", "dip")
+    assert SURVEY_OBSERVABLES[STRENGTHS] == ("gravity", "field", "dip")
 
 
 # ------------------------------------------------------------------ the command
@@ -441,7 +443,7 @@ def test_every_quantity_has_a_source_on_screen_page_table_and_in_json(example, t
     assert told["reference_sha256"]
     out, page = tmp_path / "again.csv", tmp_path / "s.html"
     screen = cli(
-        "survey", example, tmp_path / "in.csv", "--reference", file, "-o", out, "--html", page
+        "survey", example, tmp_path / "in.csv", "--reference", file, "-o", out, "--report", page
     ).out
     line = (
         "gravity, declination: table   field: table at 32 of 36 rows, else reference   "
@@ -496,7 +498,7 @@ def test_an_uncertainty_of_declination_that_cannot_be_is_refused(example, tmp_pa
 def test_nothing_states_an_uncertainty_without_what_it_leaves_out(example, tmp_path):
     out, page = tmp_path / "out.csv", tmp_path / "s.html"
     source = EXAMPLE / "well.csv"
-    ran = cli("survey", example, source, "-o", out, "--html", page, *BY_CALIBRATION)
+    ran = cli("survey", example, source, "-o", out, "--report", page, *BY_CALIBRATION)
     left_out = ("interference of the drill string", "drift of the sensors", "sag", "measured depth")
     document = cli("survey", example, source, "-o", out, "--json", *BY_CALIBRATION).json
     for told in (ran.out, page.read_text("utf-8"), out.read_text("utf-8")):
@@ -735,7 +737,7 @@ def test_msa_takes_axial_interference_off(example, tmp_path):
     assert plain["rejected"] > 20
     assert plain["interference"] is plain["separable"] is None
     ran = cli(
-        "survey", example, source, "-o", out, "--msa", "--json", "--msa-html", tmp_path / "m.html"
+        "survey", example, source, "-o", out, "--msa", "--json", "--report", tmp_path / "m.html"
     )
     assert ran.code == 0, ran
     size = ran.json["interference"]
@@ -762,7 +764,7 @@ def test_results_say_whether_interference_was_taken_off(example, tmp_path):
             source,
             "-o",
             out,
-            "--html",
+            "--report",
             page,
             "--json",
             *options,
@@ -774,7 +776,7 @@ def test_results_say_whether_interference_was_taken_off(example, tmp_path):
         assert ("corrected for interference" in out.read_text("utf-8")) is corrected
         assert ("Not in it: interference of the drill string" in shown) is not corrected
         assert "judged by all three together" in shown
-    cli("survey", example, source, "-o", out, "--html", page, "--limits", "fixed")
+    cli("survey", example, source, "-o", out, "--report", page, "--limits", "fixed")
     assert "judged by all three together" not in " ".join(page.read_text("utf-8").split())
 
 
@@ -794,7 +796,9 @@ def test_interference_that_would_pass(inclination, azimuth, limits, along, acros
     inc, azi = np.radians([float(inclination)]), np.radians([float(azimuth)])
     b = reference_vectors(inc, azi, 0.0, 1.0, 48_000.0, np.radians(63))
     read = readings(tool, inc, azi, 0.0)
-    judgement = judged(surveyed(calibration, read), b, read, SurveyLimits(name="ours", **limits))
+    judgement = judged(
+        survey_angles(calibration, read), b, read, SurveyLimits(name="ours", **limits)
+    )
     blind = blindness(judgement.tests, b)
     for k, (size, turn) in enumerate((along, across)):
         assert blind.turn[0, k] == pytest.approx(turn, abs=1e-3)
@@ -813,7 +817,9 @@ def test_all_sizes_of_interference_are_tried(limits):
     known["dip"][5], known["field"][6], known["gravity"][7] = np.nan, np.nan, np.nan
     read = replace(read, known=known)
     g, b = vectors = calibration.fields(read)
-    tests = judged(surveyed(calibration, read), vectors, read, load_survey_limits(limits)[0]).tests
+    tests = judged(
+        survey_angles(calibration, read), vectors, read, load_survey_limits(limits)[0]
+    ).tests
     found = blindness(tests, vectors)
     along = [(0.0, 0.0, sign * size) for sign in (1, -1) for size in range(50, 3001, 50)]
     ways = [(np.cos(way), np.sin(way), 0.0) for way in np.radians(range(0, 360, 30))]
@@ -851,7 +857,7 @@ def test_what_is_accepted_is_what_the_tests_accept():
     read = readings(tool, *angles, rng, shift=rng.normal(size=(50, 3)) * 400)
     vectors = calibration.fields(read)
     for limits in (load_survey_limits()[0], SurveyLimits(name="ours", field_nt=200.0)):
-        judgement = judged(surveyed(calibration, read), vectors, read, limits)
+        judgement = judged(survey_angles(calibration, read), vectors, read, limits)
         departure = judgement.departure.transpose()[:, :, None]
         again = judgement.tests.accept(dict(zip(STRENGTH_NAMES, departure, strict=True)))[:, 0]
         assert 5 < judgement.accepted.sum() < 45
@@ -862,7 +868,7 @@ def test_what_is_accepted_is_what_the_tests_accept():
 def test_acceptance_that_is_blind_says_so_by_survey(example, tmp_path):
     source, out, page = (tmp_path / name for name in ("iron.csv", "out.csv", "s.html"))
     with_iron(tmp_path, 600, np.radians(90), np.radians(90))
-    ran = cli("survey", example, source, "-o", out, "--html", page)
+    ran = cli("survey", example, source, "-o", out, "--report", page)
     document = cli("survey", example, source, "-o", out, "--json").json
     columns = read_csv(out)
     assert document["accepted"] == document["blind"] == len(columns["accepted"]) == 30
@@ -906,17 +912,26 @@ def test_msa_near_horizontal_east_west_is_refused(example, tmp_path):
     assert cli("survey", example, north, "-o", out, "--msa", "--json").json["separable"] is True
 
 
-def test_page_of_the_analysis_goes_with_it(example, tmp_path):
-    ran = cli(
-        "survey",
-        example,
-        EXAMPLE / "well.csv",
-        "-o",
-        tmp_path / "o.csv",
-        "--msa-html",
-        tmp_path / "m.html",
+def test_the_page_shows_the_analysis_of_msa_alone(example, tmp_path):
+    line = ("survey", example, EXAMPLE / "well.csv", "-o", tmp_path / "o.csv")
+    page, alone = tmp_path / "s.html", tmp_path / "m.html"
+    assert cli(*line, "--report", page).code == 0
+    assert "Interference of the drill string" not in page.read_text("utf-8")
+    north = with_iron(tmp_path, 1500, np.radians(60), np.radians(10))
+    assert (
+        cli(
+            "survey", example, north, *line[3:], "--msa", "--report", page, "--msa-html", alone
+        ).code
+        == 0
     )
-    assert "--msa" in refused(ran, 2)
+    whole, part = (path.read_text("utf-8") for path in (page, alone))
+    assert whole.count("Interference of the drill string") == 1
+    ids = re.findall(r'<section id="([^"]+)"', whole)
+    assert len(ids) == len({*ids})
+    assert {f"analysis-{name}" for name in re.findall(r'<section id="([^"]+)"', part)[1:-1]} < {
+        *ids
+    }
+    assert "--msa" in refused(cli(*line, "--msa-html", alone), 2)
 
 
 # ------------------------------------------------------------------ sensor terms

@@ -138,7 +138,7 @@ def test_a_refused_correction_leaves_nothing(tmp_path, windows, monkeypatch):
 
 def test_documents_and_the_registry_are_written_and_leave_nothing(tmp_path, windows, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    registry = ("registry", "--database", "tools.sqlite")
+    registry = ("registry", "--registry", "tools.sqlite")
     verified = mwdcal_all(
         ("calibrate", EXAMPLE / "run.csv", "--tool", EXAMPLE / "tool.toml", "-o", "tool.json"),
         ("verify", "tool.json", EXAMPLE / "rolltest.csv", "--json"),
@@ -153,8 +153,8 @@ def test_documents_and_the_registry_are_written_and_leave_nothing(tmp_path, wind
         (*registry, "add", "tool.json", "v.json", "c.json"),
         (*registry, "backup", "backup.sqlite"),
         (*registry, "backup", "backup.sqlite"),
-        ("registry", "--database", "new.sqlite", "restore", "backup.sqlite"),
-        ("registry", "--database", "new.sqlite", "check"),
+        ("registry", "--registry", "new.sqlite", "restore", "backup.sqlite"),
+        ("registry", "--registry", "new.sqlite", "check"),
         (*registry, "export", "out"),
         (*registry, "get", "SIM-0001", "-o", "again.json"),
     )
@@ -327,7 +327,7 @@ def test_json_that_powershell_saved_is_read(tmp_path, monkeypatch, calibrated, e
     monkeypatch.undo()
     monkeypatch.chdir(tmp_path)
     Path("v.json").write_bytes(printed.decode("ascii").encode(encoding))
-    registry = ("registry", "--database", "tools.sqlite")
+    registry = ("registry", "--registry", "tools.sqlite")
     mwdcal_all(
         ("certificate", calibrated[0], "--verification", "v.json", "-o", "c.json"),
         ("certificate", "key", "create", "-o", "lab.key", "--owner", "Lab"),

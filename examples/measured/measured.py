@@ -20,9 +20,9 @@ import nulls
 import numpy as np
 
 from mwdcal import Calibration, Options, Profile, Readings
-from mwdcal.app.choices import options_of
 from mwdcal.app.commands import calibrate as command
 from mwdcal.app.commands.options import Typed
+from mwdcal.app.inputs import options_of
 from mwdcal.calibration.automatic.auto import Choice, choose
 from mwdcal.calibration.automatic.nonlinearity import ODDS, choices_of, declared, log_odds
 from mwdcal.calibration.calibrate import recorded

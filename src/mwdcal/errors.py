@@ -87,6 +87,6 @@ class QuestionsError(FitError):
 
 
 def reason(error: Exception) -> str:
-    """What the operating system says went wrong, without its error number and the path."""
+    """The error of the operating system, without its error number and the path."""
     text: str = getattr(error, "strerror", None) or str(error)
     return text.partition("[errno ")[2].partition("] ")[2] or text

@@ -15,7 +15,7 @@ from mwdcal.app import interruption
 from mwdcal.app.commands import Commands
 from mwdcal.app.messages import say, screens
 from mwdcal.errors import MwdcalError, reason
-from mwdcal.presentation.text import harmless, laid_out, without_passwords
+from mwdcal.presentation.text import escape_controls, laid_out, without_passwords
 
 INTERNAL = 70
 """Exit status of a defect of the program."""
@@ -89,7 +89,7 @@ def _status(arguments: list[str] | None) -> int:
             return cli.main(arguments, prog_name="mwdcal", standalone_mode=False) or 0
     except click.ClickException as error:
         error.show(usage := io.StringIO())
-        text = _LONG.sub(r"\1…", harmless(without_passwords(usage.getvalue())))
+        text = _LONG.sub(r"\1…", escape_controls(without_passwords(usage.getvalue())))
         click.echo(laid_out(text, sys.stderr), err=True, nl=False)
         return error.exit_code
     except (click.Abort, KeyboardInterrupt) as stop:

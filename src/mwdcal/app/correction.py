@@ -22,7 +22,7 @@ from mwdcal.files.formats.table import EXCHANGED, Table
 from mwdcal.files.runs import is_export, read_export, renamed, to_readings
 from mwdcal.geometry.observables import EXTRAPOLATED
 from mwdcal.sensor.profile import Profile
-from mwdcal.use.correction import RowCounts, counted
+from mwdcal.use.correction import RowCounts, correct_and_count
 
 LARGEST_TEXT = 8_000_000
 """Bytes of text that becomes a workbook, WITSML or LAS: memory is some fifty times as much."""
@@ -35,7 +35,7 @@ WHOLE = (".xlsx", *EXCHANGED)
 
 
 class Applied(msgspec.Struct, frozen=True, kw_only=True):
-    """What came of a table: its rows, those without results, and the table that was written.
+    """The result for a table: its rows, those without results, and the table that was written.
 
     `error_terms` are in the standard uncertainties of the table, `not_included` are not; both are empty where it
     has none.
@@ -132,7 +132,7 @@ def apply_to_table(
         raise nothing(source.source)
     kept = chosen(table, whole)
     readings, _ = to_readings(kept, calibration.profile)
-    results, tally, findings = counted(
+    results, tally, findings = correct_and_count(
         calibration, readings, outside, source.count - kept.count, uncertainty
     )
     streaming.check_free(source.columns, list(results), source.source)

@@ -88,7 +88,7 @@ def _cause(error: BaseException | None) -> Ended | None:
 
 
 def report(stop: BaseException) -> tuple[str, int]:
-    """What an interruption leaves, in words, and the exit status."""
+    """The words on what an interruption leaves, and the exit status."""
     left = getattr(stop, "__notes__", ["Files are as they were before."])
     number = stop.args[0] if isinstance(stop, Ended) else signal.SIGINT
     word = "interrupted" if number == signal.SIGINT else "terminated"

@@ -1,4 +1,4 @@
-"""What commands say: results on stdout, messages and findings on stderr, errors in their words.
+"""The output of commands: results on stdout, messages and findings on stderr, errors in their words.
 
 Both streams take any text in any encoding; one that is closed, or that nobody reads, is not an error.
 """
@@ -22,14 +22,14 @@ from mwdcal.app import laboratory
 from mwdcal.errors import InputError, MwdcalError, reason
 from mwdcal.presentation.text import (
     UNSAFE_BUT_LINES,
-    fitting,
-    harmless,
+    escape_controls,
     laid_out,
     one_line,
     to_json,
+    transliterate,
     without_passwords,
 )
-from mwdcal.presentation.typed import as_typed
+from mwdcal.presentation.typed import with_option_names
 
 if TYPE_CHECKING:
     from mwdcal.calibration.record import Finding
@@ -83,7 +83,7 @@ class Command(click.Command):
             with laboratory.using(used):
                 return super().invoke(context)
         except MwdcalError as error:
-            error.args = (as_typed(str(error)),)
+            error.args = (with_option_names(str(error)),)
             raise
         finally:
             if used and (line := laboratory.line_on(used)):
@@ -113,14 +113,14 @@ class Screen:
         self._messages = messages
 
     def __getattr__(self, name: str) -> Any:
-        """What a terminal is asked for: its encoding, its descriptor; not its bytes."""
+        """The attributes that a terminal is asked for: its encoding, its descriptor; not its bytes."""
         if name not in ("closed", "encoding", "fileno", "isatty"):
             raise AttributeError(name)
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
         """Write text; control characters in it are up to the writer."""
-        shown = fitting(text, self.encoding)
+        shown = transliterate(text, self.encoding)
         with self._given_up_when_it_fails():
             if shown:  # click tries with nothing, and takes no notice of a failure
                 self._stream.write(shown)
@@ -181,7 +181,7 @@ def _on_screen(text: str, stream: Any) -> str:
 
 def lines(findings: Iterable[Finding]) -> list[str]:
     """Findings, one line each."""
-    return [one_line(f"! {as_typed(finding.text)}") for finding in findings]
+    return [one_line(f"! {with_option_names(finding.text)}") for finding in findings]
 
 
 def print_result(result: Any, findings: Iterable[Finding] = ()) -> None:
@@ -189,7 +189,7 @@ def print_result(result: Any, findings: Iterable[Finding] = ()) -> None:
     if not isinstance(result, str):
         click.echo(_shown(to_json(result)))
     elif not quiet():
-        click.echo(_on_screen(harmless(result), sys.stdout))
+        click.echo(_on_screen(escape_controls(result), sys.stdout))
     for line in lines(findings):
         say(line)
 

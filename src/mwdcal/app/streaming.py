@@ -245,7 +245,7 @@ class _Worker:
         return correction_numba.RowLimits(RAW_RANGE[:2], TEMPERATURE[:2], warmth, blank)
 
     def findings(self, tally: RowCounts, outside: str) -> list[Finding]:
-        """What the reader should know of rows with these counts."""
+        """The findings about rows with these counts."""
         metadata = runs.identified(self.source.metadata, tally.serials)
         heard = replace(self.said, metadata=metadata, source=self.source.name)
         return correction.findings(self.calibration, heard, tally, outside)
@@ -405,7 +405,7 @@ class _Worker:
 
 
 def described(calibration: Calibration, names: Iterable[str]) -> dict[str, object]:
-    """What a corrected table with results of these names says of the calibration, and of their uncertainties."""
+    """The statements of a corrected table with results of these names about the calibration and their uncertainties."""
     uncertain = not set(UNCERTAINTIES).isdisjoint(names)
     return {
         "calibration_run": calibration.run,

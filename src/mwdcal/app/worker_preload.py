@@ -1,4 +1,4 @@
-"""What a worker process has loaded: imported once by a process that is then copied.
+"""The modules of a worker process: imported once by a process that is then copied.
 
 A small part brings in what is loaded at first use.
 """

@@ -22,19 +22,19 @@ from mwdcal.calibration.drift import Constant, Drift, UnseenDrift
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import accuracy
-from mwdcal.calibration.prior import Knowledge
+from mwdcal.calibration.prior import PriorInformation
 from mwdcal.calibration.readings import TRIADS, WORDS, Readings, is_simulated, serial_of
 from mwdcal.calibration.record import (
     SOFTWARE,
     BudgetRow,
     Calibration,
-    Choices,
     Finding,
+    FitSettings,
     StandErrors,
     TriadCalibration,
     Undetermined,
-    sealed,
     stated,
+    with_checksum,
 )
 from mwdcal.calibration.residuals import error_rows, measure_rows
 from mwdcal.calibration.settings import ASSUMED_PRACTICE, DIRECTION, is_assumed
@@ -100,7 +100,7 @@ def record_of(choice: Choice, fitted: FittedRuns) -> Calibration:
 
     Raises `FitError` where it would not be one.
     """
-    calibration = sealed(rounded(_record(choice, fitted)))
+    calibration = with_checksum(rounded(_record(choice, fitted)))
     if problem := inconsistency(calibration):
         raise FitError(f"the fit gives no usable calibration: {problem}. {UNSOUND_ADVICE}")
     return calibration
@@ -135,7 +135,7 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
         settings_sha256=readings.settings_source[1] or msgspec.UNSET,
         software=SOFTWARE,
         method=options.method,
-        options=_choices(options),
+        options=_settings(options),
         seed=options.seed if options.method == "swarm" else None,
         time=datetime.now(UTC).isoformat(timespec="seconds"),
         field_unit=readings.field_unit,
@@ -166,7 +166,7 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
     )
 
 
-def _doubts(choice: Choice, prior: Knowledge | None) -> list[Finding]:
+def _doubts(choice: Choice, prior: PriorInformation | None) -> list[Finding]:
     """Findings on the identity of a run and its prior, on its day, and on standards that were overdue then."""
     readings = choice.readings
     alone = unidentified({readings.name: serial_of(readings.metadata)})
@@ -176,7 +176,7 @@ def _doubts(choice: Choice, prior: Knowledge | None) -> list[Finding]:
 
 
 def _identity(readings: Readings, simulated: bool) -> dict[str, str]:
-    """What the run says of the tool, of whom and where it was measured; `simulated`: so is its prior."""
+    """The statements of the run about the tool, of whom and where it was measured; `simulated`: so is its prior."""
     tool = {k: str(v) for k, v in readings.metadata.items() if k in IDENTITY}
     return {**tool, "simulated": str(True)} if simulated else tool
 
@@ -192,20 +192,16 @@ def _practice(fitted: FittedRuns) -> str | msgspec.UnsetType:
     return PRACTICES[0] if evidence.set_together.any() else PRACTICES[1]
 
 
-def _choices(options: Options) -> Choices:
-    """What else was asked for."""
+def _settings(options: Options) -> FitSettings:
+    """The settings of the fit that a record states beyond method, model and order."""
+    settings = {name: getattr(options, name) for name in FitSettings.__struct_fields__}
     prior = options.knowledge
-    return Choices(
-        parameters=options.parameters,
-        ignore=list(options.ignore),
-        robust=options.robust,
-        paper_weights=options.paper_weights,
-        prior=prior.source if prior else None,
-    )
+    named = {"ignore": [*options.ignore], "prior": prior.source if prior else None}
+    return FitSettings(**settings | named)
 
 
 def _budget(fitted: FittedRuns) -> list[BudgetRow]:
-    """What each source of error adds to the accuracy to expect."""
+    """The contribution of each source of error to the accuracy to expect."""
     repeatability = [getattr(fitted.profile, name).repeatability for name in TRIADS]
     nominal = [getattr(fitted.profile, name).scale or 1.0 for name in TRIADS]
     shares = fitted.covariance.by_source(np.divide(repeatability, nominal).tolist())

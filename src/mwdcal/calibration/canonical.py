@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from typing import Any, Literal, TypeVar
 
 import msgspec
 
+from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError
 
 Record = TypeVar("Record", bound=msgspec.Struct)
@@ -75,7 +75,7 @@ def signed_form(fields: Mapping[str, Any]) -> bytes:
 def document_sha256(fields: Mapping[str, Any]) -> str:
     """The `content_sha256` of a calibration file, whose fields are these."""
     kept = {name: value for name, value in fields.items() if name not in UNHASHED}
-    return hashlib.sha256(canonical(kept)).hexdigest()
+    return sha256_of(canonical(kept))
 
 
 def rounded(record: Record) -> Record:

@@ -28,6 +28,7 @@ from mwdcal.estimation.uncertainty import (
     Analysis,
     analyse,
     determined_apart,
+    per_freedom,
     sandwich,
     scatter_ratios,
     settle_gauge,
@@ -221,7 +222,7 @@ def _general(problem: Problem, options: Options, finite: Bools) -> Fit:
     solved = solve(problem, start(problem), options)
     iterations, trust = solved.iterations, np.ones(problem.evidence.include.shape)
     determined = Determined.of(problem, solved.state)
-    stage = _Stage(problem, solved, trust, np.zeros_like(iterations), determined)
+    stage = _Iterate(problem, solved, trust, np.zeros_like(iterations), determined)
     if not _all_declared(problem):
         stage = _estimate_noise(stage, options)
     stage = _set_apart(stage, options)
@@ -242,11 +243,11 @@ def refitted(result: Fit, problem: Problem, state: State, scale: Array, options:
             return Fit(problem, there, status, once, _noise(problem), trust, analysis)
     solved = solve(problem, state, options)
     known = result.analysis.determined
-    stage = _Stage(problem, solved, result.trust, solved.iterations, known)
+    stage = _Iterate(problem, solved, result.trust, solved.iterations, known)
     return _finished(stage, options, finite, result.iterations + solved.iterations)
 
 
-def _finished(stage: _Stage, options: Options, finite: Bools, iterations: Ints) -> Fit:
+def _finished(stage: _Iterate, options: Options, finite: Bools, iterations: Ints) -> Fit:
     """The fit at the end of all turns: gauge settled, and analysed."""
     problem, solved, trust = stage.problem, stage.solved, stage.trust
     trusted, state = _trusting(problem, trust), solved.state
@@ -254,9 +255,9 @@ def _finished(stage: _Stage, options: Options, finite: Bools, iterations: Ints) 
     if len(state.params) and not determined.keep.all():
         state = settle_gauge(trusted, state, determined)
         determined = _determined(trusted, state, solved)
-    analysis, pulls = analyse(trusted, state, determined), solved.pulls(trusted, state)
-    if pulls:
-        analysis = sandwich(analysis, trusted, state, pulls)
+    analysis, influence = analyse(trusted, state, determined), solved.influence(trusted, state)
+    if influence:
+        analysis = sandwich(analysis, trusted, state, influence)
     if options.robust:
         analysis = _robustly(analysis, trusted, state, options.robust, trust)
     trusted.memo.clear()
@@ -341,7 +342,7 @@ def _robustly(
     """The analysis of a fit with station weights: they cost information of the data, none of the prior."""
     freedom = _tested(station_misfit(analysis)[1])
     louder = np.sqrt([inflation(loss, k) for k in freedom])[:, None]
-    wider = analyse(_louder(problem, louder), state, analysis.determined)
+    wider = analyse(_with_inflated_noise(problem, louder), state, analysis.determined)
     return replace(
         analysis,
         covariance=wider.covariance,
@@ -356,11 +357,11 @@ def _bounded_factor(analysis: Analysis, trust: Array, loss: str, freedom: Array)
     """s² (B, t) of a fit with station weights `trust`, from the pulls w d that they bound."""
     squares = triad_sums(analysis.residual**2 * trust[..., None])
     share = np.array([consistency(loss, k) for k in freedom])[:, None]
-    return np.asarray(squares / np.where(analysis.freedom > 1e-9, analysis.freedom, np.nan) / share)
+    return np.asarray(per_freedom(squares, analysis.freedom) / share)
 
 
 @dataclass(frozen=True)
-class _Stage:
+class _Iterate:
     """Where weighing and fitting in turn have come to: problem, solution, station weights (B, n).
 
     `steps` (B,) counts the steps of all fits so far; `determined` is known of a state nearby.
@@ -373,9 +374,9 @@ class _Stage:
     determined: Determined
 
 
-def _in_turn(
-    stage: _Stage, rounds: int, turn: Callable[[_Stage], tuple[_Stage, Bools]]
-) -> tuple[_Stage, Bools]:
+def _alternate(
+    stage: _Iterate, rounds: int, turn: Callable[[_Iterate], tuple[_Iterate, Bools]]
+) -> tuple[_Iterate, Bools]:
     """The stage after turns that also say who has settled, and who did: each member ends as if it were alone."""
     whole, active = stage, np.arange(len(stage.trust))
     ended = np.zeros(len(active), bool)
@@ -391,7 +392,7 @@ def _in_turn(
     return (stage if len(active) == len(ended) else put(whole, active, stage)), ended
 
 
-def _set_apart(stage: _Stage, options: Options) -> _Stage:
+def _set_apart(stage: _Iterate, options: Options) -> _Iterate:
     """The stage with stations of a setting set apart where residuals clearly show it, and noise anew."""
     evidence = stage.problem.evidence
     if options.separate_solver or not (evidence.assumed and evidence.set_together.any()):
@@ -402,12 +403,12 @@ def _set_apart(stage: _Stage, options: Options) -> _Stage:
         return stage
     part = take(stage, shown)
     evidence = replace(part.problem.evidence, apart=np.ones(len(shown)))
-    problem = part.problem.of_other_noise(part.problem.triads, evidence)
+    problem = part.problem.with_noise(part.problem.triads, evidence)
     part = replace(part, problem=problem, solved=solve(problem, part.solved.state, options))
     return put(stage, shown, _estimate_noise(part, options))
 
 
-def _estimate_noise(stage: _Stage, options: Options) -> _Stage:
+def _estimate_noise(stage: _Iterate, options: Options) -> _Iterate:
     """Variance per triad by restricted maximum likelihood, fit and estimate in turn.
 
     A triad without redundancy keeps its start: its residuals are rounding, and say nothing. Where every direction is
@@ -419,14 +420,16 @@ def _estimate_noise(stage: _Stage, options: Options) -> _Stage:
     clear = np.flatnonzero(stage.determined.clear)
     if clear.size and not options.separate_solver:
         turn = partial(_noise_turn, options=options, least=least, whole=False)
-        part, settled = _in_turn(take(stage, clear), rounds, turn)
+        part, settled = _alternate(take(stage, clear), rounds, turn)
         if settled.any():
             stage = put(stage, clear[settled], take(part, np.flatnonzero(settled)))
     turn = partial(_noise_turn, options=options, least=least, whole=True)
-    return _in_turn(stage, rounds, turn)[0]
+    return _alternate(stage, rounds, turn)[0]
 
 
-def _noise_turn(now: _Stage, options: Options, least: float, whole: bool) -> tuple[_Stage, Bools]:
+def _noise_turn(
+    now: _Iterate, options: Options, least: float, whole: bool
+) -> tuple[_Iterate, Bools]:
     """The noise as residuals have it, then a fit with it, or a step; and who has settled."""
     evidence, at = now.problem.evidence, now.solved.state
     free = [i for i, triad in enumerate(now.problem.triads) if not triad.declared]
@@ -474,11 +477,11 @@ def _steady(old: Problem, new: Problem) -> Bools:
     return np.asarray(np.all(each, 0))
 
 
-def _downweigh(stage: _Stage, options: Options) -> _Stage:
+def _downweigh(stage: _Iterate, options: Options) -> _Iterate:
     """Weigh the stations by their misfit and fit in turn."""
     loss, declared = options.robust or LOSSES[0], _all_declared(stage.problem)
 
-    def turn(now: _Stage) -> tuple[_Stage, Bools]:
+    def turn(now: _Iterate) -> tuple[_Iterate, Bools]:
         problem, solved = now.problem, now.solved
         weighed = _trusting(problem, now.trust)
         analysis = analyse(weighed, solved.state)
@@ -498,10 +501,10 @@ def _downweigh(stage: _Stage, options: Options) -> _Stage:
         solved = solve(_trusting(problem, trust), solved.state, options)
         steps = now.steps + solved.iterations
         settled = ~np.any(np.abs(trust / now.trust - 1) >= SETTLED, -1)
-        now = _Stage(problem, solved, trust, steps, now.determined)
+        now = _Iterate(problem, solved, trust, steps, now.determined)
         return now, settled | (steps > MOST_STEPS_IN_TURN)
 
-    return _in_turn(stage, ROBUST_ROUNDS, turn)[0]
+    return _alternate(stage, ROBUST_ROUNDS, turn)[0]
 
 
 def _typical(square: Array, freedom: Array) -> Array:
@@ -524,17 +527,17 @@ def _trusting(problem: Problem, trust: Array) -> Problem:
     """The problem with the covariance of each station, readings and angles, over its weight."""
     if (trust == 1).all():
         return problem
-    return _louder(problem, 1 / np.sqrt(trust))
+    return _with_inflated_noise(problem, 1 / np.sqrt(trust))
 
 
-def _louder(problem: Problem, factor: Array) -> Problem:
+def _with_inflated_noise(problem: Problem, factor: Array) -> Problem:
     """The problem with the readings and angles of each station noisier by a factor (B, n)."""
     triads = tuple(replace(t, sd=t.sd * factor[..., None]) for t in problem.triads)
     evidence = problem.evidence
     lone = {n: np.where(evidence.alone(n), factor, 1.0) for n in ANGLES}
     sd = {n: s * lone.get(n, 1.0) for n, s in evidence.sd.items()}
     scatter = {n: s * factor for n, s in evidence.scatter.items()}
-    return problem.of_other_noise(triads, replace(evidence, sd=sd, scatter=scatter))
+    return problem.with_noise(triads, replace(evidence, sd=sd, scatter=scatter))
 
 
 def _rescaled(problem: Problem, scale: Array) -> Problem:
@@ -544,4 +547,4 @@ def _rescaled(problem: Problem, scale: Array) -> Problem:
         t if t.declared else replace(t, sd=np.maximum(t.sd * factor, LEAST_NOISE * _size(t.raw)))
         for t, factor in zip(problem.triads, factors, strict=True)
     )
-    return problem.of_other_noise(triads, problem.evidence)
+    return problem.with_noise(triads, problem.evidence)

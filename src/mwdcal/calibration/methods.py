@@ -105,7 +105,7 @@ EVIDENCE: dict[str, Callable[[Evidence], Evidence]] = {
     "toolface-inclination": angles_alone,
     "scalar": strengths_alone,
 }
-"""What each method uses of the evidence: "joint" all of it, weighted by its uncertainty."""
+"""The evidence that each method uses of the evidence: "joint" all of it, weighted by its uncertainty."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class Solved:
     known: dict[int, Array] = field(default_factory=dict)
     unweighted: bool = False
 
-    def pulls(self, problem: Problem, state: State) -> dict[int, Array]:
+    def influence(self, problem: Problem, state: State) -> dict[int, Array]:
         """How an error of a station's whitened reading moves the triads that minimise `sums`.
 
         (B, n, p_t, 3) by triad; none where the likelihood is at its largest.
@@ -133,7 +133,7 @@ class Solved:
             return unweighted_pulls(problem, _alike(problem), state)
         triples = zip(problem.triads, problem.slices(), problem.targets(state), strict=False)
         return {
-            index: replace(self.sums[index], triad=triad).pulls(_alone(state, where), target)
+            index: replace(self.sums[index], triad=triad).influence(_alone(state, where), target)
             for index, (triad, where, target) in enumerate(triples)
             if index in self.sums
         }

@@ -4,20 +4,61 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, TypedDict, cast
 
-from mwdcal.calibration.prior import DATASHEET, Knowledge
+from mwdcal.calibration.fit_options import FIT_OPTIONS, FitArguments, Prior, names, order_of
+from mwdcal.calibration.prior import DATASHEET, PriorInformation
 from mwdcal.calibration.readings import HIGHEST, TRIADS
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
 
-MODELS = ("polynomial", "factors")
+MODELS = FIT_OPTIONS["model"].words
 AUTO: Literal["auto"] = "auto"
-"""What an option is whose value the software chooses (`mwdcal.calibration.automatic.auto`)."""
+"""The value of an option that the software chooses (`mwdcal.calibration.automatic.auto`)."""
 USUAL = 0.005
 """Prior of own-axis terms, as a share of the field, where the profile declares none."""
 Orders = int | tuple[int, int]
 """Temperature order of both triads, or of accelerometer and magnetometer."""
+
+
+class CommonChoices(TypedDict, total=False):
+    """Attributes of `Options` that mean the same for one tool and for a fleet."""
+
+    method: str
+    model: str | None
+    order: Orders | Literal["auto"]
+    parameters: int
+    nonlinearity: Mapping[str, float] | tuple[str, ...] | Literal["auto"]
+    estimate: tuple[str, ...]
+    ignore: tuple[str, ...]
+    robust: str | None
+    paper_weights: bool
+
+
+class FleetChoices(CommonChoices, total=False):
+    """The options of the fit of a fleet, as keywords; its `order` is 0 by default, the same for both triads."""
+
+    prior: Literal["datasheet"] | None
+    seed: int
+
+
+class SeedlessFitChoices(CommonChoices, total=False):
+    """The attributes of `Options` but for the seed."""
+
+    scatter: bool
+    prior: PriorInformation | Calibration | Literal["datasheet"] | None
+    prior_sha256: str
+    exclude: tuple[str, ...]
+
+
+class FitChoices(SeedlessFitChoices, total=False):
+    """The attributes of `Options`, as keywords of what fits."""
+
+    seed: int
+
+
+FLEET_NAMES = (*CommonChoices.__annotations__, "prior", "seed")
+"""The keywords of `FleetChoices`."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +102,7 @@ class Options:
     ignore: tuple[str, ...] = ()
     robust: str | None = None
     paper_weights: bool = False
-    prior: Knowledge | Calibration | Literal["datasheet"] | None = None
+    prior: PriorInformation | Calibration | Literal["datasheet"] | None = None
     prior_sha256: str = ""
     exclude: tuple[str, ...] = ()
     seed: int = 0
@@ -105,12 +146,12 @@ class Options:
         return {} if self.nonlinearity == AUTO else dict.fromkeys(self.nonlinearity, USUAL)
 
     @property
-    def knowledge(self) -> Knowledge | None:
-        """What is known of the parameters beforehand.
+    def knowledge(self) -> PriorInformation | None:
+        """The prior information on the parameters.
 
         Raises `TypeError` for a prior that needs the readings to become knowledge of parameters.
         """
-        if self.prior is None or isinstance(self.prior, Knowledge):
+        if self.prior is None or isinstance(self.prior, PriorInformation):
             return self.prior
         raise TypeError("this prior needs the readings: use calibrate, not fit")
 
@@ -122,3 +163,33 @@ class Options:
     def kind(self, order: int) -> str:
         """The model of a triad: at order 0 both are the same, and the linear one is simpler."""
         return self.model or ("factors" if order else "polynomial")
+
+
+def options_of(
+    arguments: FitArguments,
+    prior: Prior = None,
+    exclude: tuple[str, ...] = (),
+    prior_sha256: str = "",
+) -> Options:
+    """The options of a command line, with the prior that its word names."""
+    triads = arguments["nonlinearity"]
+    curved = {"none": (), AUTO: AUTO}.get(triads, names(triads) or (triads,))
+    read: dict[str, Any] = {
+        "order": order_of(arguments["order"]),
+        "parameters": int(arguments["parameters"] or 12),
+        "nonlinearity": curved,
+        "estimate": names(arguments["estimate"]),
+        "ignore": names(arguments["ignore"]),
+        "prior": prior,
+    }
+    return Options(**{**arguments, **read}, exclude=exclude, prior_sha256=prior_sha256)
+
+
+def as_arguments(options: Options) -> FitArguments:
+    """Options as the command line has them, in which a table of calibrations states them."""
+    values: dict[str, Any] = {name: getattr(options, name) for name in FIT_OPTIONS}
+    curved, words = options.nonlinearity, {n: ",".join(values[n]) for n in ("estimate", "ignore")}
+    words["nonlinearity"] = curved if curved == AUTO else ",".join(sorted(curved)) or "none"
+    words |= {name: str(values[name]) for name in ("order", "parameters")}
+    prior = DATASHEET if options.prior else None
+    return cast("FitArguments", {**values, **words, "prior": prior})

@@ -1,4 +1,4 @@
-"""What a calibration promises: readings at a wanted attitude, and 1σ over the attitude sphere.
+"""Forecasts of a calibration: readings at a wanted attitude, and 1σ over the attitude sphere.
 
 Everything here is of the calibration at the run's mean gravity, field and dip
 (`Calibration.earth`). Angles are radians, shapes broadcast; no drawing.

@@ -1,6 +1,6 @@
-"""What is known of a tool before the run: its datasheet, or a previous calibration.
+"""Information on a tool before the run: its datasheet, or a previous calibration.
 
-Knowledge is of the parameters as files name them, at a reference temperature; `prior_of` puts it
+PriorInformation is of the parameters as files name them, at a reference temperature; `prior_of` puts it
 into the parameters of a fit, where it is one more block of residuals.
 """
 
@@ -29,7 +29,7 @@ DRIFT_REACH = 50.0
 
 
 @dataclass(frozen=True)
-class Knowledge:
+class PriorInformation:
     """Expected values (k,) of named parameters and their precision (k, k).
 
     Names are "accelerometer scale-x" and so on, in nominal units and tool axes, of powers of
@@ -55,8 +55,8 @@ class Knowledge:
     doubts: tuple[Finding, ...] = ()
 
 
-def prior_of(knowledge: Knowledge | None, models: Sequence[Model], batch: int) -> Prior:
-    """Knowledge as precision and expectation (B, p) of a fit's parameters; none: all free.
+def prior_of(knowledge: PriorInformation | None, models: Sequence[Model], batch: int) -> Prior:
+    """PriorInformation as precision and expectation (B, p) of a fit's parameters; none: all free.
 
     Raises `FitError` where the knowledge is of another model.
     """
@@ -87,7 +87,7 @@ def prior_of(knowledge: Knowledge | None, models: Sequence[Model], batch: int) -
     return Prior(whole.mT @ known @ whole, np.asarray(centre))
 
 
-def from_datasheet(profile: Profile, relative: bool = False) -> Knowledge:
+def from_datasheet(profile: Profile, relative: bool = False) -> PriorInformation:
     """The datasheet's tolerances (1 σ) as knowledge of either model, at any order.
 
     `relative`: the field's strength is unknown, so that neither scale nor bias of the
@@ -100,7 +100,7 @@ def from_datasheet(profile: Profile, relative: bool = False) -> Knowledge:
         for name, value, sd in _tolerances(sheet) if sheet else []:
             if not np.isnan(sd) and (not unknown or name.startswith("misalignment")):
                 rows.append((f"{triad} {name}", value, sd))
-    return Knowledge(
+    return PriorInformation(
         "datasheet",
         profile.reference_temperature_c,
         tuple(name for name, _, _ in rows),
@@ -111,11 +111,11 @@ def from_datasheet(profile: Profile, relative: bool = False) -> Knowledge:
 
 
 def profile_for(
-    prior: Knowledge | Calibration | Literal["datasheet"] | None, profile: Profile
+    prior: PriorInformation | Calibration | Literal["datasheet"] | None, profile: Profile
 ) -> Profile:
     """The profile with what a prior needs of it: a previous calibration's scale where it has none.
 
-    Knowledge is of readings in nominal units; scales guessed from the run would give others.
+    PriorInformation is of readings in nominal units; scales guessed from the run would give others.
     Raises `InputError` where profile and prior do not belong together.
     """
     if prior == DATASHEET:
@@ -152,7 +152,7 @@ def _check_datasheet(profile: Profile) -> None:
         )
 
 
-def for_run(previous: Calibration, readings: Readings) -> Knowledge:
+def for_run(previous: Calibration, readings: Readings) -> PriorInformation:
     """A previous calibration as knowledge of the triads that a run has.
 
     A run without a magnetometer has no unit of the field that could differ.
@@ -185,7 +185,7 @@ def for_run(previous: Calibration, readings: Readings) -> Knowledge:
     )
 
 
-def from_calibration(previous: Calibration, relative: bool = False) -> Knowledge:
+def from_calibration(previous: Calibration, relative: bool = False) -> PriorInformation:
     """A previous calibration of the same tool, with its covariance and what it left undetermined.
 
     Raises `InputError` for one with own-axis terms (they are centred on their own run), or in
@@ -205,7 +205,7 @@ def from_calibration(previous: Calibration, relative: bool = False) -> Knowledge
     names = [f"{t.name} {name}" for t in previous.triads for name in t.parameter_names]
     covariance = previous.parameter_covariance
     moving = np.flatnonzero(np.diag(covariance) > 0)
-    return Knowledge(
+    return PriorInformation(
         previous.run,
         previous.reference_temperature,
         tuple(names[i] for i in moving),

@@ -7,7 +7,6 @@ are °C. An unknown value is NaN, never zero.
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -18,6 +17,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import AnyArray, Array, ArrayLike, Bools, Ints
 from mwdcal.sensor.profile import Profile
@@ -123,7 +123,7 @@ def fingerprints(triads: Sequence[Array]) -> tuple[str, ...]:
     """
     rows = zip(*((triad + 0.0).tolist() for triad in triads), strict=True)
     texts = ([",".join(f"{value:.12g}" for value in reading) for reading in row] for row in rows)
-    hashes = ([hashlib.sha256(text.encode()).hexdigest() for text in row] for row in texts)
+    hashes = ([sha256_of(text.encode()) for text in row] for row in texts)
     return tuple("-".join(each[:DIGEST_LENGTH] for each in row) for row in hashes)
 
 
@@ -191,7 +191,7 @@ class Readings:
 
     @property
     def name(self) -> str:
-        """What messages call the readings: the name of the file, if there is one."""
+        """The name of the readings in messages: the name of the file, if there is one."""
         return self.source or "the readings"
 
     @property
@@ -320,6 +320,44 @@ class Readings:
         names = [n if times[n] == 1 else f"{n} (row {i})" for i, n in numbered]
         left = compress(zip(names, self.digest or [""] * self.count, strict=True), repeated)
         return replace(kept, known=known, copies=(*self.copies, *left))
+
+
+ReadingsLike = Readings | ArrayLike
+"""Readings, or an array of them."""
+
+
+def as_readings(source: ReadingsLike) -> Readings:
+    """Readings as they are, or those in the columns of an array (..., n, 3 or 6, and one more for the temperature).
+
+    Columns: accelerometer x, y, z; magnetometer x, y, z; temperature. Units: nominal g and nT along the tool axes, °C.
+
+    Raises:
+        InputError: an array of another shape, or of something else than numbers.
+    """
+    if isinstance(source, Readings):
+        return source
+    try:
+        array: Array = np.asarray(np.ma.filled(np.ma.array(source, dtype=float), np.nan))
+    except (TypeError, ValueError):
+        array = np.empty(0)
+    triads, more = divmod(array.shape[-1] if array.shape[1:] else 0, 3)
+    if triads not in (1, 2) or more > 1:
+        raise InputError(
+            "readings must be an array of the shape (n, 3), (n, 6) or (n, 7), with the columns ax, ay, az, mx, my, mz, "
+            f"temperature; got {type(source).__name__} of shape {array.shape}. Or make readings by "
+            "mwdcal.readings(…), or mwdcal.read_run(…) of a file."
+        )
+    return Readings(
+        accelerometer=array[..., :3],
+        magnetometer=array[..., 3:6] if triads == 2 else None,
+        temperature=array[..., -1] if more else None,
+    )
+
+
+def head(*metadata: Mapping[str, object]) -> dict[str, Any]:
+    """Serial and whether it is simulated, of what rests on inputs with these metadata."""
+    serial = next(filter(None, map(serial_of, metadata)), None)
+    return {"serial": serial, "simulated": any(map(is_simulated, metadata))}
 
 
 def soaks(temperature: Array) -> Ints:

@@ -18,7 +18,15 @@ from mwdcal import __version__
 from mwdcal.calibration.canonical import Signature, document_sha256
 from mwdcal.calibration.drift import Constant, Drift, UnseenDrift
 from mwdcal.calibration.notebooks import html_table
-from mwdcal.calibration.readings import NANOTESLA, SOAK_GAP, Readings, simulated, stated_day
+from mwdcal.calibration.readings import (
+    NANOTESLA,
+    SOAK_GAP,
+    Readings,
+    ReadingsLike,
+    as_readings,
+    simulated,
+    stated_day,
+)
 from mwdcal.calibration.tilt import tilt_width
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
@@ -70,7 +78,7 @@ class Undetermined(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class BudgetRow(msgspec.Struct, frozen=True, kw_only=True):
-    """What one source of error adds to the accuracy to expect, 1σ in degrees; None: undetermined."""
+    """The contribution of one source of error to the accuracy to expect, 1σ in degrees; None: undetermined."""
 
     source: str
     inclination_deg: float | None
@@ -146,7 +154,7 @@ class Measures(msgspec.Struct, frozen=True, kw_only=True):
     rmse: float
 
 
-class Choices(msgspec.Struct, frozen=True, kw_only=True):
+class FitSettings(msgspec.Struct, frozen=True, kw_only=True):
     """How the fit was asked for, beyond method, model and order; see `mwdcal.calibration.options.Options`."""
 
     parameters: int = 12
@@ -265,7 +273,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     settings_sha256: str | msgspec.UnsetType = msgspec.UNSET
     software: str
     method: str
-    options: Choices = Choices()
+    options: FitSettings = FitSettings()
     seed: int | None = None
     time: str
     field_unit: str
@@ -399,7 +407,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def run_name(self) -> str:
-        """What messages call the run: its file, if it had one."""
+        """The name of the run in messages: its file, if it had one."""
         return self.run or "unnamed readings"
 
     @property
@@ -443,21 +451,26 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         ends = np.cumsum([0, *(len(triad.parameters) for triad in self.triads)]).tolist()
         return {t.name: slice(*pair) for t, pair in zip(self.triads, pairwise(ends), strict=True)}
 
-    def fields(self, readings: Readings) -> tuple[Array, Array]:
-        """Gravity (…, n, 3), g, and magnetic field (…, n, 3), nT: NaN without magnetometer."""
-        fields = [model.fields(*at) for _, model, at, _ in self._measured(readings)]
+    def fields(self, readings: ReadingsLike) -> tuple[Array, Array]:
+        """Gravity (…, n, 3), g, and magnetic field (…, n, 3), nT: NaN without magnetometer.
+
+        Here and below `readings` are `Readings`, or an array as `as_readings` takes it.
+        """
+        fields = [model.fields(*at) for _, model, at, _ in self._measured(as_readings(readings))]
         return fields[0], fields[1] if len(fields) > 1 else np.full_like(fields[0], np.nan)
 
-    def jacobian(self, readings: Readings) -> Array:
+    def jacobian(self, readings: ReadingsLike) -> Array:
         """Derivative (…, n, 6, p) of both vectors with respect to the parameters of all triads."""
+        readings = as_readings(readings)
         places = self.places()
         result = np.zeros((*readings.accelerometer.shape[:-1], 6, len(self.parameters)))
         for triad, model, at, vector in self._measured(readings):
             result[..., vector, places[triad.name]] = model.jacobian(*at)
         return result
 
-    def noise_covariance(self, readings: Readings) -> Array:
+    def noise_covariance(self, readings: ReadingsLike) -> Array:
         """Covariance (…, n, 6, 6) of both vectors from the noise of one reading."""
+        readings = as_readings(readings)
         result = np.zeros((*readings.accelerometer.shape[:-1], 6, 6))
         for triad, model, at, vector in self._measured(readings):
             slope = model.slope(*at)
@@ -465,18 +478,18 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
             result[..., vector, vector] = slope * sd[..., None, :] ** 2 @ slope.mT
         return result
 
-    def _gradients(self, names: Sequence[str], readings: Readings) -> Array:
+    def _gradients(self, names: Sequence[str], readings: ReadingsLike) -> Array:
         """Gradients (…, n, k, 6) of k observables with respect to both vectors."""
         fields = self.fields(readings)
         gradient = np.stack([OBSERVABLES[name].gradient(*fields) for name in names], -2)
         return np.where(np.isnan(gradient), 0.0, gradient) if not self.has_field else gradient
 
-    def sensitivity(self, name: str, readings: Readings) -> Array:
+    def sensitivity(self, name: str, readings: ReadingsLike) -> Array:
         """Gradient (…, n, p) of an observable with respect to the parameters."""
         gradient = self._gradients((name,), readings)
         return np.asarray((gradient @ self.jacobian(readings))[..., 0, :])
 
-    def uncertainty(self, name: str, readings: Readings, noise: bool = False) -> Array:
+    def uncertainty(self, name: str, readings: ReadingsLike, noise: bool = False) -> Array:
         """Standard uncertainty (…, n) of an observable: of the calibration, or of a reading too.
 
         Units: radians, g or nT. `noise` adds that of one reading.
@@ -488,7 +501,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         return np.sqrt(np.maximum(variance, 0.0))  # below zero by rounding alone
 
     def covariance(
-        self, names: str | Sequence[str], readings: Readings, noise: bool = False
+        self, names: str | Sequence[str], readings: ReadingsLike, noise: bool = False
     ) -> Array:
         """Covariance (…, n, k, k) of k observables at one reading, as `uncertainty` states each.
 
@@ -498,6 +511,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         Raises:
             InputError: an observable is unknown, or none is named.
         """
+        readings = as_readings(readings)
         names = (names,) if isinstance(names, str) else tuple(names)
         if not names:
             raise InputError("`names` must name one observable or more; got none.")
@@ -521,7 +535,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         return np.where(blank[..., :, None] | blank[..., None, :], np.nan, total)
 
     def expanded_uncertainty(
-        self, name: str, readings: Readings, probability: float = 0.95
+        self, name: str, readings: ReadingsLike, probability: float = 0.95
     ) -> Array:
         """Half width (…, n) of the interval that holds the calibration's error with a probability.
 
@@ -564,8 +578,9 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         spread = scaled**2 / fewest + variance.get(ORDER, 0.0) ** 2 / AXES_OF_A_TERM
         return min(sum(variance.values()) ** 2 / spread, fewest) if spread else fewest
 
-    def rests_on_free(self, name: str, readings: Readings) -> Bools:
+    def rests_on_free(self, name: str, readings: ReadingsLike) -> Bools:
         """Where (…, n) an observable moves with a direction that no evidence determines."""
+        readings = as_readings(readings)
         shape = readings.accelerometer.shape[:-1]
         if not self.free:
             return np.zeros(shape, bool)
@@ -589,11 +604,12 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         """
         return MARGIN if self.thermal else SOAK_GAP
 
-    def outside(self, readings: Readings, margin: float | None = None) -> Bools:
+    def outside(self, readings: ReadingsLike, margin: float | None = None) -> Bools:
         """Stations (…, n) outside the calibrated temperature range by more than a margin, °C.
 
         The margin is the calibration's own unless another is given.
         """
+        readings = as_readings(readings)
         shape = readings.accelerometer.shape[:-1]
         if self.temperature_c is None or readings.temperature is None:
             return np.zeros(shape, bool)
@@ -602,9 +618,9 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
             (readings.temperature < low - beyond) | (readings.temperature > high + beyond)
         )
 
-    def unrecorded(self, readings: Readings) -> bool:
+    def unrecorded(self, readings: ReadingsLike) -> bool:
         """Whether the readings have temperatures and the run of the calibration recorded none."""
-        return self.temperature_c is None and readings.temperature is not None
+        return self.temperature_c is None and as_readings(readings).temperature is not None
 
 
 def content_sha256(calibration: Calibration) -> str:
@@ -612,7 +628,7 @@ def content_sha256(calibration: Calibration) -> str:
     return document_sha256(msgspec.to_builtins(calibration))
 
 
-def sealed(calibration: Calibration) -> Calibration:
+def with_checksum(calibration: Calibration) -> Calibration:
     """The record with the `sha256` of its contents, by which a later change shows; it is unsigned."""
     return msgspec.structs.replace(
         calibration, sha256=content_sha256(calibration), signature=msgspec.UNSET

@@ -237,7 +237,10 @@ class Residuals:
         readings, after = self.readings, self.errors(self.after)
         warmth = readings.temperature
         chance = chances(self.fit)[0]
-        again, deviation = to_reshoot(chance), normal_quantile(np.maximum(chance, 1e-300))
+        again, deviation = (
+            stations_to_remeasure(chance),
+            normal_quantile(np.maximum(chance, 1e-300)),
+        )
         ratio = {
             name: np.abs(after[name]) / np.maximum(np.nan_to_num(sd, nan=np.inf), 1e-30)
             for name, sd in self.expected.items()
@@ -329,7 +332,7 @@ def _chances(fit: Fit) -> Array:
     return tail(square / np.where(declared, np.maximum(variance, 1.0), variance), freedom)
 
 
-def to_reshoot(chance: Array) -> Bools:
+def stations_to_remeasure(chance: Array) -> Bools:
     """Stations to take again, by the chances (..., n) of all."""
     return np.asarray(chance < RESHOOT / chance.shape[-1])
 

@@ -1,4 +1,4 @@
-"""What a fit states of its tools, as arrays: a calibration file is one row of them, a fleet table all.
+"""The results of a fit for its tools, as arrays: a calibration file is one row of them, a fleet table all.
 
 Parameters, their uncertainties, constants of the run, errors of the stand; and the covariance, by
 source of error. What the readings' noise and angles that the stand sets at every station do is
@@ -21,7 +21,7 @@ from mwdcal.calibration.automatic.courses import misfit_covariance
 from mwdcal.calibration.drift import STEADINESS
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.prediction import CalibratedTools
-from mwdcal.calibration.prior import Knowledge
+from mwdcal.calibration.prior import PriorInformation
 from mwdcal.calibration.record import FREE_SHARE, NOISE, ORDER, REPEATABILITY, SETTINGS
 from mwdcal.estimation import drift
 from mwdcal.estimation.batch import take
@@ -38,7 +38,7 @@ SIGNS = (
     "signs of the magnetometer at a northern site",
     "signs of the magnetometer at a southern site",
 )
-"""What is assumed where only the profile says which hemisphere the dip is of: northern, southern."""
+"""The assumption where only the profile says which hemisphere the dip is of: northern, southern."""
 EVEN = 1e-6
 """Departure of a correlation matrix from symmetry that is left as it is."""
 
@@ -147,7 +147,7 @@ def constants_covariance(result: Fit) -> Array:
 
 
 def error_name(constant: str) -> str:
-    """What a common error is called: of a reference, of the stand, or a drift.
+    """The name of a common error: of a reference, of the stand, or a drift.
 
     >>> [error_name(name) for name in ("dip", "azimuth-zero", "stand-north")]
     ['dip reference error', 'azimuth zero of the stand', 'tilt of the stand about north']
@@ -164,7 +164,7 @@ def error_name(constant: str) -> str:
 
 
 def common_source(name: str) -> str:
-    """What a budget calls a source of error: a tilt is one source.
+    """The name of a source of error in a budget: a tilt is one source.
 
     >>> [common_source(name) for name in ("stand-north", "azimuth-zero", "gravity", "prior")]
     ['tilt of the stand', 'azimuth zero of the stand', 'gravity reference error', 'prior']
@@ -379,7 +379,7 @@ def triad_singular_values(result: Fit, index: int) -> Array:
     return np.asarray(values / values[:, :1])
 
 
-def temperature_range(result: Fit, prior: Knowledge | None) -> tuple[Array, Array]:
+def temperature_range(result: Fit, prior: PriorInformation | None) -> tuple[Array, Array]:
     """Coldest and hottest station (B,) each, °C; those behind the prior count too."""
     low, high = prior.temperature if prior and prior.temperature else (np.inf, -np.inf)
     temperature = result.problem.temperature
@@ -387,7 +387,7 @@ def temperature_range(result: Fit, prior: Knowledge | None) -> tuple[Array, Arra
 
 
 def calibrated_tools(
-    result: Fit, free: Sequence[list[Free]], reference: float, prior: Knowledge | None
+    result: Fit, free: Sequence[list[Free]], reference: float, prior: PriorInformation | None
 ) -> CalibratedTools:
     """The tools at the reference temperature, moved into their range where it lies outside."""
     problem, state = result.problem, result.state

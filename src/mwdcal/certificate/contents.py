@@ -9,7 +9,6 @@ What the references of a calibration are traceable to, and whether that held on 
 
 from __future__ import annotations
 
-import hashlib
 import operator
 import re
 from calendar import monthrange
@@ -24,6 +23,7 @@ from msgspec.structs import replace
 from mwdcal.calibration.canonical import canonical, rounded
 from mwdcal.calibration.diagnosis.identity import FROM_THE_FUTURE, UNIDENTIFIED, dated, unidentified
 from mwdcal.calibration.drift import blindness, exact_and_steady
+from mwdcal.calibration.fit_options import unusual
 from mwdcal.calibration.prediction import without_temperature
 from mwdcal.calibration.readings import CONSTANTS, check_day, is_simulated, serial_of, stated_day
 from mwdcal.calibration.record import SOFTWARE, Calibration, Finding, TriadCalibration
@@ -47,6 +47,7 @@ from mwdcal.certificate.document import (
 )
 from mwdcal.certificate.laboratory import Laboratory, filled_pattern
 from mwdcal.certificate.tables import conditions, result_tables
+from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError
 from mwdcal.files.verifications import Verification
 from mwdcal.sensor.profile import MeasurementStandard, Person
@@ -66,7 +67,7 @@ METHODS: dict[str, tuple[str, tuple[str, ...]]] = {
     "toolface-inclination": ("to toolface and inclination alone.", ()),
     "scalar": ("to the strengths of gravity and field alone.", ()),
 }
-"""What each method fits the parameters to, and where it is published."""
+"""The evidence that each method fits the parameters to, and where it is published."""
 
 
 def method(calibration: Calibration) -> Method:
@@ -90,22 +91,12 @@ def _model(triad: TriadCalibration) -> str:
 
 
 def _deviations(calibration: Calibration) -> Iterator[str]:
-    """What was done other than the usual procedure, a phrase each."""
-    options = calibration.options
+    """The departures from the usual procedure, a phrase each."""
     if without_temperature(calibration):
         yield f"{without_temperature(calibration)}: the results hold at the temperature of the calibration alone"
     if calibration.excluded:
         yield f"stations excluded from the fit: {', '.join(calibration.excluded)}"
-    if options.robust:
-        yield f"robust fit ({options.robust}): stations that do not agree have less weight"
-    if options.ignore:
-        yield f"references not used: {', '.join(options.ignore)}"
-    if options.parameters != 12:
-        yield f"{options.parameters} parameters of each triad, the others held at zero"
-    if options.paper_weights:
-        yield "unweighted sums, as the method's paper has them"
-    if options.prior:
-        yield f"prior knowledge of the parameters: {options.prior}"
+    yield from unusual(calibration.options, "deviation")
     if calibration.relative:
         yield "strength of the field unknown: the magnetometer is calibrated to a field of 1"
 
@@ -118,7 +109,7 @@ LONGEST_NUMBER = 64
 """Characters of a certificate number."""
 NOT_TESTED = "Conformity was not tested: no roll test after the calibration was supplied."
 DATE_OF_FIT = (
-    "the run states no date: the day on which the calibration was computed stands for that of the "
+    "the run states no date: the day on which the calibration was computed is used as that of the "
     "measurements."
 )
 NO_AS_FOUND = "No roll test before the adjustment (as found) was supplied."
@@ -131,8 +122,8 @@ STATEMENTS = (
 """Statements of every certificate."""
 
 
-class Order(msgspec.Struct, frozen=True, kw_only=True):
-    """What is particular to one certificate, beside its calibration and the laboratory.
+class CertificateRequest(msgspec.Struct, frozen=True, kw_only=True):
+    """The facts of one certificate, beside its calibration and the laboratory.
 
     `customer`, `condition` and `received` stand before those of the laboratory file; `number` before its
     pattern. `verification` (as left) and `as_found` are roll tests with this and with the previous calibration;
@@ -154,7 +145,7 @@ class Order(msgspec.Struct, frozen=True, kw_only=True):
 
 @np.errstate(over="ignore", invalid="ignore")  # what is infinite is refused when it is hashed
 def certificate(
-    calibration: Calibration, order: Order, laboratory: Laboratory | None = None
+    calibration: Calibration, order: CertificateRequest, laboratory: Laboratory | None = None
 ) -> Certificate:
     """The certificate of a calibration, with every number at 12 significant digits.
 
@@ -206,7 +197,9 @@ def certificate(
     return replace(whole, number=number)
 
 
-def _parties(calibration: Calibration, order: Order, laboratory: Laboratory) -> dict[str, Any]:
+def _parties(
+    calibration: Calibration, order: CertificateRequest, laboratory: Laboratory
+) -> dict[str, Any]:
     """Laboratory, customer and people: as the laboratory states them, else as the run does."""
     return {
         "laboratory": laboratory.laboratory or _party(calibration.tool.get("lab", "")),
@@ -218,7 +211,7 @@ def _parties(calibration: Calibration, order: Order, laboratory: Laboratory) -> 
 
 
 def _findings(contents: Certificate, calibration: Calibration) -> Iterator[Finding]:
-    """What the reader should know of the certificate: changes, gaps, overdue standards, exact references."""
+    """The findings about the certificate: changes, gaps, overdue standards, exact references."""
     yield from calibration.change_findings()
     yield from _not_stated(contents, calibration)
     for standard in contents.traceability:
@@ -228,7 +221,7 @@ def _findings(contents: Certificate, calibration: Calibration) -> Iterator[Findi
         yield Finding(id="settings-assumed", text=ASSUMED)
 
 
-def _check_days(day: date, order: Order, laboratory: Laboratory) -> None:
+def _check_days(day: date, order: CertificateRequest, laboratory: Laboratory) -> None:
     """Refuse a certificate from before the calibration, and a tool that was received after it."""
     received = order.received or laboratory.item.received
     if order.issued < day:
@@ -264,7 +257,7 @@ def _check_number(number: str) -> None:
 
 def _tests(
     calibration: Calibration,
-    order: Order,
+    order: CertificateRequest,
     given: Mapping[When, Verification | None],
     laboratory: Laboratory,
 ) -> tuple[dict[str, ConformityTest], list[Finding]]:
@@ -280,7 +273,9 @@ def _tests(
     return tests, findings
 
 
-def _check_test(document: Verification, calibration: Calibration, order: Order) -> None:
+def _check_test(
+    document: Verification, calibration: Calibration, order: CertificateRequest
+) -> None:
     """Refuse a roll test of another tool, or with the wrong one of the two calibrations."""
     as_left = document is order.verification
     argument = _argument(document, order)
@@ -303,8 +298,10 @@ def _check_test(document: Verification, calibration: Calibration, order: Order) 
         )
 
 
-def _doubts(document: Verification, calibration: Calibration, order: Order) -> list[Finding]:
-    """What a roll test says of its identity, and whether it states that it is of the tool of the calibration."""
+def _doubts(
+    document: Verification, calibration: Calibration, order: CertificateRequest
+) -> list[Finding]:
+    """The findings about the identity of a roll test, and whether it states that it is of the calibration's tool."""
     said = [each for each in document.findings if each.id in (UNIDENTIFIED, FROM_THE_FUTURE)]
     serials = {
         _argument(document, order): document.serial,
@@ -313,11 +310,11 @@ def _doubts(document: Verification, calibration: Calibration, order: Order) -> l
     return said or unidentified(serials)
 
 
-def _argument(document: Verification, order: Order) -> str:
+def _argument(document: Verification, order: CertificateRequest) -> str:
     return "`verification`" if document is order.verification else "`as_found`"
 
 
-def _check_issued(document: Verification, order: Order) -> None:
+def _check_issued(document: Verification, order: CertificateRequest) -> None:
     """Refuse a certificate from before a roll test that it shows."""
     stated, argument = {"date": document.date}, _argument(document, order)
     check_day(stated, argument)
@@ -328,7 +325,7 @@ def _check_issued(document: Verification, order: Order) -> None:
         )
 
 
-def _simulated(calibration: Calibration, order: Order) -> bool:
+def _simulated(calibration: Calibration, order: CertificateRequest) -> bool:
     documents = [each for each in (order.as_found, order.verification) if each]
     marked = calibration.simulated or is_simulated(calibration.tool)
     return marked or any(each.simulated for each in documents)
@@ -342,7 +339,7 @@ def _person(name: str) -> Person | None:
     return Person(name=name) if name.strip() else None
 
 
-def _item(calibration: Calibration, order: Order, laboratory: Laboratory) -> Item:
+def _item(calibration: Calibration, order: CertificateRequest, laboratory: Laboratory) -> Item:
     details = laboratory.item
     received = order.received or details.received
     return Item(
@@ -366,7 +363,7 @@ def _next_due(day: date, laboratory: Laboratory) -> str:
 
 
 def _statements(tests: dict[str, ConformityTest]) -> list[str]:
-    """What every certificate states, and what it must say of tests that it lacks or of their rule."""
+    """The statements of every certificate, and those it must make of tests that it lacks or of their rule."""
     rules = dict.fromkeys(test.rule_text for test in tests.values())
     return [
         *STATEMENTS,
@@ -432,7 +429,7 @@ def _exact(calibration: Calibration) -> Iterator[Finding]:
 
 def _number(contents: Certificate, pattern: str) -> str:
     """The number of a certificate, from what it says."""
-    digest = hashlib.sha256(canonical(msgspec.to_builtins(contents))).hexdigest()
+    digest = sha256_of(canonical(msgspec.to_builtins(contents)))
     serial = re.sub(r"[^A-Za-z0-9._]+", "-", contents.item.serial).strip("-")[:40]
     return filled_pattern(
         pattern,

@@ -71,7 +71,7 @@ class ResultTable(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class BudgetLine(msgspec.Struct, frozen=True, kw_only=True):
-    """What one source adds to the standard uncertainty of each angle, in degrees; None: undetermined.
+    """The contribution of one source to the standard uncertainty of each angle, in degrees; None: undetermined.
 
     `kind`: "A" by statistics of the readings, "B" otherwise (JCGM 100, 4.2 and 4.3).
     """

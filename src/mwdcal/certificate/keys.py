@@ -10,7 +10,6 @@ from __future__ import annotations
 import base64
 import binascii
 import contextlib
-import hashlib
 import os
 import re
 from collections.abc import Callable, Iterable
@@ -22,6 +21,7 @@ from typing import Any, Literal, NamedTuple
 import msgspec
 from msgspec.structs import replace
 
+from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import atomic
 
@@ -32,7 +32,7 @@ _KEY_DIGITS = 16
 _MOST_BYTES = 1_000_000
 """Bytes of the largest file of keys."""
 _PREFIX = bytes.fromhex("302a300506032b6570032100")
-"""What stands before the 32 bytes of an Ed25519 key in its SubjectPublicKeyInfo (RFC 8410, section 4)."""
+"""The bytes before the 32 bytes of an Ed25519 key in its SubjectPublicKeyInfo (RFC 8410, section 4)."""
 _PEM = re.compile(rb"-----BEGIN ([A-Z0-9 ]+)-----\s(.*?)-----END \1-----", re.DOTALL)
 _PUBLIC_HEADS = {
     name: re.compile(rb"^%b: ([^\r\n]*)" % name.encode(), re.MULTILINE)
@@ -104,7 +104,7 @@ def now() -> str:
 
 def public_key(raw: bytes, owner: str = "", created: str = "") -> TrustedKey:
     """The key of 32 bytes."""
-    identity = hashlib.sha256(raw).hexdigest()[:_KEY_DIGITS]
+    identity = sha256_of(raw)[:_KEY_DIGITS]
     public = base64.b64encode(raw).decode()
     return TrustedKey(key=identity, public=public, owner=owner, created=created)
 

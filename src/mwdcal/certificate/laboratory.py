@@ -24,7 +24,7 @@ MOST_MONTHS = 1200
 
 
 class ItemDetails(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What is known of the tool beside its serial: maker, type, condition, day of receipt, other marks."""
+    """The facts about the tool beside its serial: maker, type, condition, day of receipt, other marks."""
 
     manufacturer: str = ""
     type: str = ""
@@ -93,7 +93,7 @@ def load_laboratory(path: str | os.PathLike[str]) -> tuple[Laboratory, str]:
 
 
 def _problem(laboratory: Laboratory) -> str:
-    """What a laboratory cannot state; empty where all can be."""
+    """The statements that a laboratory cannot make; empty if it can make all."""
     named = {
         "laboratory.name": laboratory.laboratory,
         "customer.name": laboratory.customer,

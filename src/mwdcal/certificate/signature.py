@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import base64
 import binascii
-import hashlib
 import json
 import math
 import re
@@ -22,6 +21,7 @@ from mwdcal.calibration.canonical import Signature, SignatureCheck, canonical, s
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.certificate.document import SourceFile
 from mwdcal.certificate.keys import PrivateKey, TrustedKey, available, moment, now
+from mwdcal.digests import sha256_of
 from mwdcal.errors import FitError, InputError
 from mwdcal.files import documents
 from mwdcal.files.formats.members import Member
@@ -52,7 +52,7 @@ STATES = {
     "unchecked": "the {document} is signed by {key}, and not checked: cryptography is not installed. Install "
     'mwdcal[certificate]: pip install "mwdcal[certificate]"',
 }
-"""What is said of each state."""
+"""The statements about each state."""
 CLOCKS_APART = timedelta(minutes=5)
 """By how much clocks of two computers may differ."""
 FLEET_TABLE = re.compile(r"(?i)(\.parquet)#.*")
@@ -66,7 +66,7 @@ DOCUMENT_NAMES = {
     "verify": "verification",
     "certificate": "certificate",
 }
-"""What documents are called, by the commands that made them."""
+"""Names of documents, by the commands that made them."""
 
 
 # ------------------------------------------------------------------------------ signing
@@ -97,7 +97,7 @@ def signed(file: Member, key: PrivateKey, replacing: bool = False) -> bytes:
 
 
 def message(fields: Mapping[str, Any], signature: Signature) -> bytes:
-    """What is signed: the canonical JSON of a document with its signature, but for the `value` of that."""
+    """The signed bytes: the canonical JSON of a document with its signature, but for the `value` of that."""
     stated = msgspec.to_builtins(signature)
     return canonical({**fields, SIGNATURE_KEY: {k: v for k, v in stated.items() if k != "value"}})
 
@@ -146,7 +146,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def check(data: bytes, trusted: Mapping[str, TrustedKey]) -> SignatureCheck:
-    """What the signature of the document in a file says, by the keys that are trusted.
+    """The state of the signature of the document in a file, by the keys that are trusted.
 
     A file that can no longer be read as JSON, but names a signature, is altered.
     """
@@ -194,7 +194,7 @@ def _has_the_form(data: bytes, fields: Mapping[str, Any], signature: Signature) 
 
 
 def _standing(key: TrustedKey, signature: Signature) -> str:
-    """What an intact signature is worth: a revoked key has none, a retired one signed before."""
+    """The value of an intact signature: a revoked key has none, a retired one signed before."""
     if key.revoked:
         return "revoked"
     if not key.retired:
@@ -231,7 +231,7 @@ def _said(
 
 
 def _clock(key: TrustedKey | None, signature: Signature | None) -> str:
-    """What is odd about the date of an intact signature, which is a claim of the signer; empty if nothing is."""
+    """The oddity of the date of an intact signature, which is a claim of the signer; empty if it has none."""
     if key is None or signature is None:
         return ""
     try:
@@ -295,7 +295,7 @@ def _base(name: str) -> str:
 
 
 def _checked(file: SourceFile, given: Sequence[Path], folder: Path) -> CheckedFile:
-    """A file that is listed, looked up: all that are `given` must be it; a folder in its place is none."""
+    """Compare a listed file with those `given`; a folder in its place does not count."""
     names = dict.fromkeys((file.name, _table(file.name)))
     beside = [p for name in names for p in (*_stated_places(name, folder), folder / _base(name))]
     places = given or [place for place in beside if _exists(place)][:1]
@@ -328,7 +328,6 @@ def _sha256(path: Path) -> str | None:
     try:
         if not path.is_file():
             return None
-        with path.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
+        return sha256_of(path)
     except (OSError, ValueError):
         return None

@@ -384,7 +384,7 @@ def _calibrated(readings: Readings, profile: Profile, options: Options) -> _Cali
 
 
 def _row(calibrated: _Calibrated, judge: _Judge, gauge: Gauge, progress: Progress) -> Row:
-    """What a method reached, in the fit and left out."""
+    """The errors of a method, in the fit and left out."""
     record, readings, method = calibrated.record, judge.readings, calibrated.options.method
     progress(f"{method}: {judge.parts} fits without a part of the stations each")
     left_out = judge.left_out(calibrated.options)

@@ -58,7 +58,7 @@ class Step:
 
 @dataclass(frozen=True)
 class ChangeTest:
-    """The outcome of the test of one tool: `probability` of as much under no change.
+    """The outcome of the test of one tool: `probability` that an unchanged tool shows this much.
 
     `scores` (n - 1, p) of a step of each parameter between calibrations, NaN where they do not tell;
     `largest_score` of those of steady parameters, and the `critical_score` that it may have; `misfit` (χ²)

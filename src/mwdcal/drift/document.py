@@ -1,4 +1,4 @@
-"""What is said of the drift of a tool and of a fleet: pure data, as pages, screens and JSON have it."""
+"""The statements about the drift of a tool and of a fleet: pure data, as pages, screens and JSON have it."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class ParameterStep(msgspec.Struct, frozen=True, kw_only=True):
 class Transition(msgspec.Struct, frozen=True, kw_only=True):
     """Two successive calibrations compared: misfit (χ²) of one set of parameters to both.
 
-    `probability` of as much under no change; it is drawn, and 0.0005 (1 of 2,000) means 0.0005 or less.
+    `probability` that an unchanged tool shows this much; it is drawn, and 0.0005 (1 of 2,000) means 0.0005 or less.
     """
 
     start: str
@@ -66,7 +66,7 @@ class Transition(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ChangeVerdict(msgspec.Struct, frozen=True, kw_only=True):
-    """Whether a tool changed: `probability` of as much under no change, over all parameters and transitions.
+    """Whether a tool changed: `probability` that an unchanged one shows this much, over all parameters and transitions.
 
     `largest_score` of all steps of one parameter, and the `critical_score` that raises an alarm; `misfit` (χ²)
     of one set of parameters to all calibrations. Probabilities are drawn: 0.0001 (1 of 10,000) means 0.0001 or less.

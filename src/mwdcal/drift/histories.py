@@ -16,8 +16,8 @@ from mwdcal.drift.walk import (
     ANY_TEMPERATURE,
     FIELD_DIRECTIONS,
     History,
+    common_noise_scale,
     factored,
-    one_noise,
     parameter_names,
     precision,
     years,
@@ -46,7 +46,7 @@ NOTES = {
     "drifts between them counts as a change",
     "order": "the {triad} has temperature terms of order {order}: compared to order {compared}",
 }
-"""What is said of a calibration that cannot be compared, or not in all of its parameters."""
+"""The statements about a calibration that cannot be compared, or not in all of its parameters."""
 
 
 SCALE_CHANGE = 0.1
@@ -217,7 +217,9 @@ class _Form:
             square = np.array([np.nan if factor is None else factor for factor in factors])
             freedom = np.array([t.degrees_of_freedom if t else 0.0 for t in triads])
             declared = np.array([t is not None and t.noise_source == DECLARED for t in triads])
-            ratio, degrees, together = one_noise(np.where(declared, square, np.nan), freedom)
+            ratio, degrees, together = common_noise_scale(
+                np.where(declared, square, np.nan), freedom
+            )
             single = np.where(np.isnan(square) | (freedom < 1), np.inf, freedom)
             parts = ratio, np.where(declared, degrees, single), together
             first, second, third = (np.repeat(part[:, None], 12 + 6 * order, -1) for part in parts)

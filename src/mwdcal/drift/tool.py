@@ -341,7 +341,7 @@ def _said(name: str, **values: object) -> Finding:
 
 
 def _findings(drift: ToolDrift, limits: Mapping[str, float], today: date | None) -> list[Finding]:
-    """What the reader should know."""
+    """The findings."""
     findings = []
 
     def say(name: str, **values: object) -> None:

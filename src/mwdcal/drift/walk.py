@@ -178,7 +178,7 @@ def precision(covariance: Array, free: Array) -> Array:
     return result
 
 
-def one_noise(factors: Array, freedom: Array) -> tuple[Array, Array, Bools]:
+def common_noise_scale(factors: Array, freedom: Array) -> tuple[Array, Array, Bools]:
     """What variances (…, n) of one triad are multiplied by if the noise of the tool is one, and their freedom.
 
     And which of them (…, n) then are of that one estimate.

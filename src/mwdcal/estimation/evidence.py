@@ -1,4 +1,4 @@
-"""What is known of the stations of a run: references with their uncertainty, and errors in common."""
+"""The evidence on the stations of a run: references with their uncertainty, and errors in common."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class SharedConstant:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What is known of the stations: arrays (B, n), radians, g, nT; NaN where unknown.
+    """The evidence on the stations: arrays (B, n), radians, g, nT; NaN where unknown.
 
     `sd` of the angles are independent per station, but for inclination and azimuth of stations of one
     `setting` of the stand (-1: of their own): these have one error in common, and errors of their own by

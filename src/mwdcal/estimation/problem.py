@@ -104,7 +104,7 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of all parameters beforehand: `precision` (B, p, p) about `expected` (B, p)."""
+    """Prior information on all parameters: `precision` (B, p, p) about `expected` (B, p)."""
 
     precision: Array
     expected: Array
@@ -136,7 +136,7 @@ class Problem:
     prior: Prior
     memo: dict[str, Any] = field(init=False, repr=False, compare=False, default_factory=dict)
 
-    def of_other_noise(self, triads: tuple[Triad, ...], evidence: Evidence) -> Problem:
+    def with_noise(self, triads: tuple[Triad, ...], evidence: Evidence) -> Problem:
         """The same with other uncertainties alone: what does not depend on them is kept."""
         other = replace(self, triads=triads, evidence=evidence)
         other.memo.update({name: self.memo[name] for name in NOISELESS if name in self.memo})

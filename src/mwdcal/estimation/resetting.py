@@ -43,4 +43,4 @@ def with_share(problem: Problem, state: State, analysis: Analysis) -> Problem:
     ratio = np.clip(np.nan_to_num(ratio, nan=1.0), 1 / LARGEST_CHANGE, LARGEST_CHANGE)
     share = problem.evidence.apart * np.sqrt(ratio)
     share = np.where(share < LEAST_APART, 0.0, np.minimum(share, 1.0))
-    return problem.of_other_noise(problem.triads, replace(problem.evidence, apart=share))
+    return problem.with_noise(problem.triads, replace(problem.evidence, apart=share))

@@ -1,4 +1,4 @@
-"""What a fit is worth: covariance, rank, free directions by name, residuals per station.
+"""The quality of a fit: covariance, rank, free directions by name, residuals per station.
 
 Nothing is quoted for a direction that the evidence does not determine.
 
@@ -33,6 +33,8 @@ from mwdcal.geometry.vectors import (
 )
 from mwdcal.sensor.models import Model
 
+LEAST_FREEDOM = 1e-9
+"""Degrees of freedom that are more than what rounding leaves of none."""
 LEAST_SHARE = 0.05
 """A free direction with less than this share on a triad does not move the triad."""
 TESTED = 1e-3
@@ -152,17 +154,17 @@ def determined_apart(problem: Problem, state: State, known: dict[int, Array]) ->
 
 
 def sandwich(
-    analysis: Analysis, problem: Problem, state: State, pulls: dict[int, Array]
+    analysis: Analysis, problem: Problem, state: State, influence: dict[int, Array]
 ) -> Analysis:
     """The analysis when triads minimise sums of their own: covariance, residuals' spread and s².
 
-    `pulls` (B, n, p_t, 3), by triad, is how an error of a station's whitened reading moves those.
+    `influence` (B, n, p_t, 3), by triad, is how an error of a station's whitened reading moves those.
     All other unknowns then follow as in the likelihood, those being held. Every error is counted
     with all that it does: of the readings, of the stand (in C = I + GGᵀ), of common references.
     """
     linear = problem.linear(state)
     design, u = linear.design, linear.prior.shape[-1]
-    moved, follow, back, fixed = _followed(problem, linear, pulls)
+    moved, follow, back, fixed = _followed(problem, linear, influence)
     noise = np.eye(design.shape[2]) + linear.private @ linear.private.mT
     covariance = np.einsum("bnim,bnmk,bnjk->bij", moved, noise, moved, optimize=True)
     independent = covariance
@@ -201,9 +203,9 @@ def sandwich(
 
 
 def _followed(
-    problem: Problem, linear: Linear, pulls: dict[int, Array]
+    problem: Problem, linear: Linear, influence: dict[int, Array]
 ) -> tuple[Array, Array, Array, Bools]:
-    """Influence (B, n, u, m) of errors on all unknowns when some triads have their own `pulls`.
+    """Influence (B, n, u, m) of errors on all unknowns when some triads have their own `influence`.
 
     Also how the gradient of the others follows those, the inverse of their information, and which
     unknowns (u,) are fixed by pulls.
@@ -211,7 +213,7 @@ def _followed(
     design, weighed, u = linear.design, linear.weighed[..., :-1], linear.prior.shape[-1]
     moved = np.zeros((*design.shape[:2], u, design.shape[2]))
     fixed = np.zeros(u, bool)
-    for index, pull in pulls.items():
+    for index, pull in influence.items():
         where = problem.slices()[index]
         moved[:, :, where, 3 * index : 3 * index + 3] = pull
         fixed[where] = True
@@ -262,7 +264,17 @@ def whole_covariance(linear: Linear, determined: Determined) -> Array:
 def variance_factors(residual: Array, spread: Array) -> tuple[Array, Array]:
     """s² and degrees of freedom (B, t) of each triad: restricted maximum likelihood."""
     freedom = triad_sums(diagonal(spread))
-    return triad_sums(residual**2) / np.where(freedom > 1e-9, freedom, np.nan), freedom
+    return per_freedom(triad_sums(residual**2), freedom), freedom
+
+
+def per_freedom(squares: Array, freedom: Array) -> Array:
+    """Sums of squares per degree of freedom; NaN where there is none, or only what rounding leaves of one."""
+    return np.asarray(squares / np.where(freedom > LEAST_FREEDOM, freedom, np.nan))
+
+
+def scaled_freedom(freedom: Array, squares: Array) -> Array:
+    """Effective degrees of freedom tr(S)² / tr(S²); none where tr(S²) is left by rounding alone."""
+    return np.asarray(freedom**2 / np.where(squares > LEAST_FREEDOM, squares, np.inf))
 
 
 def triad_sums(values: Array) -> Array:
@@ -298,7 +310,7 @@ def effective_freedom(problem: Problem, state: State, analysis: Analysis) -> Arr
         twice = np.einsum("bpq,bqp->b", gram, gram)
         each.append(np.sum(block**2, (1, 2, 3)) - 2 * mixed.sum(-1) + twice)
     squares = np.stack(each, -1)
-    return np.asarray(analysis.freedom**2 / np.where(squares > 1e-9, squares, np.inf))
+    return scaled_freedom(analysis.freedom, squares)
 
 
 def station_misfit(analysis: Analysis) -> tuple[Array, Array]:
@@ -506,7 +518,7 @@ def with_scatter(problem: Problem, state: State, ratios: dict[str, Array]) -> Pr
         if name in scatter:
             noise = np.sqrt(np.mean(triad.sd**2, (1, 2))) / size
             scatter[name] = np.minimum(scatter[name], np.maximum(noise, LEAST_SCATTER)[:, None])
-    return problem.of_other_noise(problem.triads, replace(problem.evidence, scatter=scatter))
+    return problem.with_noise(problem.triads, replace(problem.evidence, scatter=scatter))
 
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")

@@ -179,7 +179,7 @@ class Further(NamedTuple):
     without: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        """What to measure, in words."""
+        """The further measurement in words."""
         inclination, azimuth = np.degrees(self.inclination), np.degrees(self.azimuth) % 360
         return (
             f"four stations {self.text}, at {inclination:.0f}° inclination, {azimuth:.0f}° azimuth and toolfaces of "
@@ -381,7 +381,7 @@ class Moved(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Rival(msgspec.Struct, frozen=True, kw_only=True):
-    """What else explains the readings, as a `Diagnosis` has it: the cause, where, and its largest size."""
+    """Another explanation of the readings, as a `Diagnosis` has it: the cause, where, and its largest size."""
 
     fault: str
     channel: str | None

@@ -415,7 +415,7 @@ DISTINCT = float(np.log(1 / LIKELY))
 
 @dataclass(frozen=True)
 class FaultEvidence:
-    """What readings of one tool say of all faults; `forms` are the ways in which faults show.
+    """The evidence of readings of one tool for all faults; `forms` are the ways in which faults show.
 
     `none` explains the readings without a fault, `best` by each form that is not far behind and by the first of
     each kind, those at `likely`, as a batch; `dead` are dead channels. `by_form` (F,) is the log evidence of each

@@ -1,4 +1,4 @@
-"""What the reader of a table should know of the columns that were only copied into it."""
+"""The findings about the columns that were only copied into it."""
 
 from __future__ import annotations
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import codecs
-import hashlib
 import json
 import os
 from collections import Counter
@@ -16,7 +15,8 @@ import msgspec
 
 from mwdcal.calibration.canonical import document_sha256, signed_form
 from mwdcal.calibration.diagnosis.soundness import check
-from mwdcal.calibration.record import SCHEMA_VERSION, Calibration, sealed
+from mwdcal.calibration.record import SCHEMA_VERSION, Calibration, with_checksum
+from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import atomic, members
 from mwdcal.files.profiles import check_profile
@@ -96,7 +96,7 @@ def whole_file(path: Path) -> members.Member:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({reason(error)}). Check the path.") from None
-    return members.Member(data, path.name, hashlib.sha256(data).hexdigest())
+    return members.Member(data, path.name, sha256_of(data))
 
 
 def in_utf8(data: bytes) -> bytes:
@@ -120,7 +120,7 @@ def _decoded(data: bytes, name: str) -> Calibration:
     check_json(data, name, _AS_WRITTEN)
     calibration = msgspec.json.decode(data, type=Calibration)
     other_fields = calibration.changed and calibration.sha256 == document_sha256(json.loads(data))
-    return sealed(calibration) if other_fields else calibration  # those of another version
+    return with_checksum(calibration) if other_fields else calibration  # those of another version
 
 
 def check_json(data: bytes, name: str, advice: str) -> None:

@@ -97,7 +97,7 @@ def refuse(table: Table, rules: Iterable[Fault]) -> None:
 
 
 def _content(table: Table, name: str, row: int) -> str:
-    """What stands in a cell, for messages."""
+    """The content of a cell, for messages."""
     if name not in table.columns:
         return "no such column"
     value = float(numbers(table, name)[row])

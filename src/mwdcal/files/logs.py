@@ -7,7 +7,6 @@ the one that is wrong.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,6 +19,7 @@ from weakref import finalize
 
 import numpy as np
 
+from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError, reason
 from mwdcal.files import metadata as meta
 from mwdcal.files.contract import COLUMNS, RANGES, RAW, check_columns, check_near_misses
@@ -130,7 +130,7 @@ def _text(file: Path, names: list[str], decimal: str, say: Say) -> Table:
         with file.open("rb") as stream:
             table = _read_text(stream, names, decimal, file.name, say)
             stream.seek(0)
-            return replace(table, digest=hashlib.file_digest(stream, "sha256").hexdigest())
+            return replace(table, digest=sha256_of(stream))
     except (OSError, ValueError) as error:
         raise InputError(
             f"cannot read '{file}': {reason(error)}. Check the name and the file."

@@ -22,7 +22,7 @@ class _Listed(msgspec.Struct):
 
 
 class _Document(msgspec.Struct):
-    """What a JSON document says of itself: the command that wrote it, and the files that it lists."""
+    """The statements of a JSON document about itself: the command that wrote it, and the files that it lists."""
 
     command: str = ""
     files: list[_Listed] = []

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 import difflib
-import hashlib
 import re
 from collections.abc import Mapping
 from importlib import resources
@@ -14,6 +13,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from mwdcal.calibration.readings import TRIADS
+from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError, reason
 from mwdcal.files.contract import MAPPED, TEMPERATURE, units_of
 from mwdcal.files.formats.table import shown
@@ -126,7 +126,7 @@ def read_toml(name: str, folder: str, kind: str) -> tuple[bytes, str]:
             with path.open("rb") as stream:
                 data = stream.read(LARGEST_TOML + 1)
             if len(data) <= LARGEST_TOML:
-                return data.removeprefix(b"\xef\xbb\xbf"), hashlib.sha256(data).hexdigest()
+                return data.removeprefix(b"\xef\xbb\xbf"), sha256_of(data)
         exists = path.exists()
     except (OSError, ValueError) as error:
         raise InputError(

@@ -17,6 +17,7 @@ from typing import NamedTuple
 from mwdcal.errors import InputError
 from mwdcal.files.formats.columns import shown
 from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, UNCERTAINTIES
+from mwdcal.geometry.units import STANDARD_GRAVITY
 
 _SPELLINGS = {
     "°": "deg degree degrees grad",
@@ -63,7 +64,7 @@ FACTORS = {
     "K": (1.0, -273.15),
     "rad": (180 / math.pi, 0.0),
     "mg": (1e-3, 0.0),
-    "m/s²": (1 / 9.80665, 0.0),
+    "m/s²": (1 / STANDARD_GRAVITY, 0.0),
     "µT": (1e3, 0.0),
     "mT": (1e6, 0.0),
     "gauss": (1e5, 0.0),

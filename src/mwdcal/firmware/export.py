@@ -135,7 +135,7 @@ def _common(
     errors: Mapping[str, float],
     kind: str,
 ) -> dict[str, object]:
-    """What both headers say."""
+    """The common words of both headers."""
     return {
         "about": comment(c_source.head(calibration, sha256, work, errors)),
         "serial": literal(calibration.tool.get("serial", "")),

@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 
 from mwdcal.calibration import results
-from mwdcal.calibration.automatic.auto import Choice, known_before, tables_of
+from mwdcal.calibration.automatic.auto import Choice, tables_of, with_prior
 from mwdcal.calibration.automatic.drift import with_drifts
 from mwdcal.calibration.automatic.nonlinearity import offered
 from mwdcal.calibration.calibrate import record_of
@@ -143,7 +143,7 @@ def calibrate_batch(
     outcome = Outcome.blank(len(readings.accelerometer), names(options, profile))
     none = np.zeros(readings.accelerometer.shape[:-1], bool)
     batch = _Batch(readings, _with_scales(profile), alone, outcome, none, options, records)
-    batch.calibrate(known_before(options, readings, batch.profile))
+    batch.calibrate(with_prior(options, readings, batch.profile))
     repeated = np.flatnonzero(batch.repeated.any(-1))
     blank = [np.isnan(readings.reference(name)[repeated]) for name in readings.known]
     patterns = np.concatenate([batch.repeated[repeated], *blank], -1)

@@ -1,6 +1,6 @@
 """What a fleet keeps beside its output until it is done, and how that is told from what others put there.
 
-A part is sealed: its mark, length and checksum stand before its content. Rows that were dealt into
+A part is with_checksum: its mark, length and checksum stand before its content. Rows that were dealt into
 files of whole tools have a manifest beside them. What is damaged is not used, and made again.
 """
 
@@ -28,10 +28,10 @@ _PART = re.compile(r"[0-9a-f]{32}\.arrow")
 _DEALT = re.compile(r"sorted-[0-9a-f]{16}(\.tmp)?")
 _DEALT_FILE = re.compile(r"\d{4}\.parquet|manifest\.json")
 _BEGINNINGS = {".arrow": (SEAL, b"\xff\xff\xff\xff"), ".parquet": (b"PAR1",), ".json": (b"",)}
-"""How our files begin, by their suffix; parts of mwdcal before they were sealed as Arrow's streams do."""
+"""How our files begin, by their suffix; parts of mwdcal before they were with_checksum as Arrow's streams do."""
 
 
-def sealed(content: bytes, name: str) -> bytes:
+def with_checksum(content: bytes, name: str) -> bytes:
     """A part with its seal, which also holds its name."""
     return _head(content, name) + content
 
@@ -43,7 +43,7 @@ def _head(content: bytes | memoryview, name: str) -> bytes:
 
 
 def unsealed(data: bytes, name: str) -> memoryview | None:
-    """The content of a sealed part; None where it is damaged."""
+    """The content of a with_checksum part; None where it is damaged."""
     content = memoryview(data)[HEAD:]
     return content if data[:HEAD] == _head(content, name) else None
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import time
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -19,9 +18,11 @@ from mwdcal import pool
 from mwdcal.calibration.automatic.nonlinearity import with_strengths
 from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.diagnosis.refusals import check_options, no_temperature
+from mwdcal.calibration.fit_options import FitArguments, stated_arguments
 from mwdcal.calibration.methods import check_stand_errors
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prior import DATASHEET, profile_for
+from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError, reason
 from mwdcal.files import profiles, synonyms
 from mwdcal.files.formats import atomic, parquet
@@ -37,10 +38,9 @@ from mwdcal.fleet.tables import (
     in_several_folders,
     partitions,
 )
-from mwdcal.presentation.envelope import enveloped
-from mwdcal.presentation.fleet import FleetSummary, stated_options, summarise
+from mwdcal.presentation.envelope import json_document
+from mwdcal.presentation.fleet import FleetSummary, summarise
 from mwdcal.presentation.text import plural, slowly
-from mwdcal.presentation.typed import Typed
 from mwdcal.sensor.profile import Profile
 from mwdcal.use.correction_numba import cores
 
@@ -57,7 +57,7 @@ def calibrate_table(
     output: Path,
     tool: Profile | str | None,
     options: Options,
-    typed: Typed,
+    typed: FitArguments,
     workers: int | None,
     scheduler: str | None,
     records: bool | None,
@@ -113,7 +113,7 @@ def _with_records(plan: Plan, profile_sha256: str, runs: Path) -> Plan:
     runs_sha256 = ""
     if runs.is_file():
         with runs.open("rb") as stream:
-            runs_sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
+            runs_sha256 = sha256_of(stream)
     return replace(plan, records=True, profile_sha256=profile_sha256, runs_sha256=runs_sha256)
 
 
@@ -146,17 +146,19 @@ def _finished(
     return done
 
 
-def _metadata(source: FleetTable, plan: Plan, typed: Typed, digest: str) -> dict[str, object]:
-    """What the table of calibrations says of itself: the input's own, and how it was made."""
-    stated = {k: v for k, v in source.metadata.items() if k != SERIAL}
+def _metadata(
+    source: FleetTable, plan: Plan, typed: FitArguments, digest: str
+) -> dict[str, object]:
+    """The statements of the table of calibrations about itself: the input's own, and how it was made."""
+    metadata = {k: v for k, v in source.metadata.items() if k != SERIAL}
     content = {
         "fleet": source.name,
-        "options": stated_options(typed),
+        "options": stated_arguments(typed),
         "profile": plan.profile.name,
         "reference_temperature_c": plan.profile.reference_temperature_c,
         "noise_estimated": list(plan.noise_estimated),
     }
-    return {**stated, **enveloped("fleet", content, stated, profile=digest)}
+    return {**metadata, **json_document("fleet", content, metadata, profile=digest)}
 
 
 def prior_of_fleet(word: str | None) -> Literal["datasheet"] | None:
@@ -208,7 +210,7 @@ def _computed(
     try:
         for count, (index, content) in enumerate(results, 1):
             check_unchanged(tasks[index].pieces)
-            atomic.write(paths[index], kept.sealed(content, paths[index].name), durable=False)
+            atomic.write(paths[index], kept.with_checksum(content, paths[index].name), durable=False)
             disk.submit(kept.to_disk, paths[index])
             tools += tasks[index].tools
             rate = tools / (time.perf_counter() - begun)

@@ -7,12 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, date, datetime
 from functools import cached_property
-from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mwdcal.calibration.canonical import SignatureState
 from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError
 from mwdcal.files.formats.members import Member
 from mwdcal.files.settings import source_of_settings
@@ -22,7 +22,7 @@ from mwdcal.library.shown import digest_of
 from mwdcal.use.verification import Verdict
 
 if TYPE_CHECKING:
-    from mwdcal.certificate.contents import Order
+    from mwdcal.certificate.contents import CertificateRequest
     from mwdcal.certificate.document import Certificate, SourceFile
     from mwdcal.drift.document import ToolDrift
     from mwdcal.files.verifications import Verification
@@ -41,7 +41,7 @@ class Paper(Result):
 
     record: Certificate
     calibration: Calibration
-    order: Order
+    order: CertificateRequest
     drift: ToolDrift | None = None
     saved: list[Path] = field(default_factory=list)
 
@@ -57,7 +57,7 @@ class Paper(Result):
 
     @property
     def findings(self) -> Sequence[Finding]:
-        """What the reader should know: gaps, overdue standards, doubts of the calibration."""
+        """The findings: gaps, overdue standards, doubts of the calibration."""
         return self.record.findings
 
     @cached_property
@@ -161,7 +161,7 @@ def certificate(
         paper = mwdcal.certificate(cal, verification=test, laboratory="lab.toml")
         mwdcal.save(paper, "C.pdf")
     """
-    from mwdcal.certificate.contents import Order
+    from mwdcal.certificate.contents import CertificateRequest
     from mwdcal.certificate.contents import certificate as contents
     from mwdcal.certificate.laboratory import load_laboratory
 
@@ -178,7 +178,7 @@ def certificate(
         files.add("settings", Path(settings), settings_sha256)
     issued = day_of(date, "date") or datetime.now(UTC).date()
     drift = _drift(registry, calibration, digest, issued) if registry is not None else None
-    order = Order(
+    order = CertificateRequest(
         issued=issued,
         number=number,
         customer=customer,
@@ -337,7 +337,7 @@ def sign(
         target = Path(output) if output is not None else _json_of(document)
         data = document.form("C.json")
         whole = data if isinstance(data, bytes) else data.encode()
-        file = Member(whole, target.name, sha256(whole).hexdigest())
+        file = Member(whole, target.name, sha256_of(whole))
         if target in document.saved and target.exists():
             file = documents.whole_file(target)
         folder = target.parent
@@ -393,7 +393,7 @@ class SignatureVerdict(Result):
 
     @property
     def state(self) -> SignatureState:
-        """What the signature says, such as "intact", "altered", "unsigned", or "unknown": its key is not trusted."""
+        """The state of the signature, such as "intact", "altered", "unsigned", or "unknown": its key is not trusted."""
         state: SignatureState = self.content.check.state
         return state
 

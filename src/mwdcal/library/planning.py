@@ -6,12 +6,11 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack, cast
+from typing import TYPE_CHECKING, Any, Literal, Unpack, cast
 
 import numpy as np
 
-from mwdcal.calibration.options import Options, Orders
-from mwdcal.calibration.prior import Knowledge
+from mwdcal.calibration.options import FitChoices, Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import FitError, InputError
@@ -29,30 +28,6 @@ if TYPE_CHECKING:
 FilePath = str | os.PathLike[str]
 ToolSource = FilePath | Profile
 """A tool profile: built in by name, a TOML file by path, or the profile itself."""
-
-
-class SeedlessFitChoices(TypedDict, total=False):
-    """The attributes of `Options` but for the seed."""
-
-    method: str
-    model: str | None
-    order: Orders | Literal["auto"]
-    parameters: int
-    nonlinearity: Mapping[str, float] | tuple[str, ...] | Literal["auto"]
-    scatter: bool
-    estimate: tuple[str, ...]
-    ignore: tuple[str, ...]
-    robust: str | None
-    paper_weights: bool
-    prior: Knowledge | Calibration | Literal["datasheet"] | None
-    prior_sha256: str
-    exclude: tuple[str, ...]
-
-
-class FitChoices(SeedlessFitChoices, total=False):
-    """The attributes of `Options`, as keywords of what fits."""
-
-    seed: int
 
 
 def silent(done: int, total: int) -> None:
@@ -94,7 +69,7 @@ class PlanResult(Result):
 
     @property
     def findings(self) -> list[Finding]:
-        """What the plans leave undetermined, and what else there is to say of them."""
+        """The directions that the plans leave undetermined, and other findings."""
         from mwdcal.presentation.plan import findings
 
         return findings(self.plans)

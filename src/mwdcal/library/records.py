@@ -10,15 +10,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 from weakref import finalize
 
 import numpy as np
 from msgspec.structs import replace
 
-from mwdcal.calibration.options import Options
-from mwdcal.calibration.prior import DATASHEET
-from mwdcal.calibration.readings import TRIADS
+from mwdcal.calibration.options import FLEET_NAMES, FleetChoices, Options, as_arguments
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import AnyArray
@@ -32,23 +30,6 @@ from mwdcal.sensor.profile import Profile
 
 if TYPE_CHECKING:
     from mwdcal.presentation.fleet import FleetSummary
-    from mwdcal.presentation.typed import Typed
-
-
-class FleetChoices(TypedDict, total=False):
-    """The options of the fit of a fleet, by the attributes of `Options`; its `order` is 0 by default."""
-
-    method: str
-    model: str | None
-    order: int | Literal["auto"]
-    parameters: int
-    nonlinearity: Mapping[str, float] | tuple[str, ...] | Literal["auto"]
-    estimate: tuple[str, ...]
-    ignore: tuple[str, ...]
-    robust: str | None
-    paper_weights: bool
-    prior: Literal["datasheet"] | None
-    seed: int
 
 
 @dataclass(repr=False)
@@ -214,7 +195,15 @@ def fleet(
         records = True if records is None else records
     try:
         content = calibrate_table(
-            Path(runs), path, tool, options, _typed(options), workers, scheduler, records, progress
+            Path(runs),
+            path,
+            tool,
+            options,
+            as_arguments(options),
+            workers,
+            scheduler,
+            records,
+            progress,
         )
     except BaseException:
         if output is None:
@@ -239,11 +228,10 @@ def _check_lost(output: Path, runs: Path) -> None:
 def _options(choices: FleetChoices) -> Options:
     """Options of a fleet by name; its order is 0 unless it is chosen, without own-axis terms."""
     for name in choices:
-        if name not in FleetChoices.__annotations__:
-            names = ", ".join(FleetChoices.__annotations__)
+        if name not in FLEET_NAMES:
+            names = ", ".join(FLEET_NAMES)
             raise InputError(
-                f"unknown option '{name}'; expected one of {names}."
-                f"{nearest(name, FleetChoices.__annotations__)}"
+                f"unknown option '{name}'; expected one of {names}.{nearest(name, FLEET_NAMES)}"
             )
     if not isinstance(choices.get("order", 0), int | str):
         raise InputError(
@@ -251,22 +239,3 @@ def _options(choices: FleetChoices) -> Options:
         )
     given: dict[str, Any] = {"order": 0, "nonlinearity": (), **choices}
     return Options(**given)
-
-
-def _typed(options: Options) -> Typed:
-    """Options in the words of the command line, as the table of calibrations states them."""
-    curved = options.nonlinearity
-    terms = curved if isinstance(curved, str) else ",".join(n for n in TRIADS if n in curved)
-    return {
-        "method": options.method,
-        "model": options.model,
-        "order": str(options.order),
-        "parameters": str(options.parameters),
-        "nonlinearity": terms or "none",
-        "estimate": ",".join(options.estimate),
-        "ignore": ",".join(options.ignore),
-        "robust": options.robust,
-        "paper_weights": options.paper_weights,
-        "prior": DATASHEET if options.prior else None,
-        "seed": options.seed,
-    }

@@ -88,7 +88,7 @@ def _is_new(database: FilePath) -> bool:
 
 @dataclass(repr=False)
 class RegistryAnswer(Result):
-    """What a registry answers: `content` has all values of the JSON; its fields are attributes too."""
+    """The answer of a registry: `content` has all values of the JSON; its fields are attributes too."""
 
     content: Any
     text: str
@@ -102,7 +102,7 @@ class RegistryAnswer(Result):
 
     @property
     def findings(self) -> Sequence[Finding]:
-        """What the reader should know, each with an `id` and a `text`."""
+        """The findings, each with an `id` and a `text`."""
         return self.remarks
 
     def _text(self) -> str:

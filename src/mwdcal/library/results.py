@@ -1,4 +1,4 @@
-"""What every task of `import mwdcal` gives: values by name, and the words, document and page of the command."""
+"""The results of the tasks of `import mwdcal`: values by name, and the words, document and page of the command."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Result:
 
     @property
     def findings(self) -> Sequence[Finding]:
-        """What the reader should know, each with an `id` and a `text`."""
+        """The findings, each with an `id` and a `text`."""
         return []
 
     @property
@@ -49,7 +49,7 @@ class Result:
         return self._text()
 
     def to_dict(self) -> dict[str, Any]:
-        """What the command prints as JSON, as a dictionary."""
+        """The command's JSON as a dictionary."""
         return self._document()
 
     def report(self, path: str | os.PathLike[str]) -> None:

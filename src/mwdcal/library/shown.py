@@ -8,13 +8,15 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from hashlib import sha256
 from html import escape
 from typing import Any, NamedTuple, TypeVar
 
+from mwdcal.calibration.notebooks import html_table
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.comparison.compare import Comparison
+from mwdcal.digests import sha256_of
+from mwdcal.errors import InputError
 from mwdcal.faults.diagnosis import Diagnosis
 from mwdcal.files import documents, runs
 from mwdcal.files.formats import atomic
@@ -31,21 +33,27 @@ _INPUTS = "_inputs"
 
 
 class Inputs(NamedTuple):
-    """What a result was made of: what inputs say of themselves, and the SHA-256 of those that are files."""
+    """The inputs of a result: what inputs say of themselves, and the SHA-256 of those that are files."""
 
     metadata: tuple[Mapping[str, object], ...] = ()
     digests: Mapping[str, str] = {}
+    calibration: Calibration | None = None
 
 
-def with_inputs(result: _Shown, *metadata: Mapping[str, object], **digests: str) -> _Shown:
-    """A result that knows what it was made of; equal to the one without."""
-    result.__dict__[_INPUTS] = Inputs(metadata, digests)
+def with_inputs(
+    result: _Shown,
+    *metadata: Mapping[str, object],
+    of: Calibration | None = None,
+    **digests: str,
+) -> _Shown:
+    """A result that knows its inputs, and the calibration that its page shows; equal to the one without."""
+    result.__dict__[_INPUTS] = Inputs(metadata, digests, of)
     return result
 
 
 def digest_of(calibration: Calibration) -> str:
     """The SHA-256 of a calibration's file, as it is or would be written."""
-    return sha256(documents.encode(calibration)).hexdigest()
+    return sha256_of(documents.encode(calibration))
 
 
 def _inputs(result: Any) -> Inputs:
@@ -54,10 +62,10 @@ def _inputs(result: Any) -> Inputs:
 
 
 def _enveloped(command: str, result: Any, content: object) -> dict[str, Any]:
-    from mwdcal.presentation.envelope import enveloped
+    from mwdcal.presentation.envelope import json_document
 
-    metadata, digests = _inputs(result)
-    return enveloped(command, content, *metadata, **digests)
+    metadata, digests, _ = _inputs(result)
+    return json_document(command, content, *metadata, **digests)
 
 
 def _calibration_text(calibration: Calibration) -> str:
@@ -88,6 +96,17 @@ def _verdict_document(verdict: Verdict) -> dict[str, Any]:
     return _enveloped("verify", verdict, verdict)
 
 
+def _verdict_page(verdict: Verdict) -> str:
+    from mwdcal.presentation.calibration_page import render
+
+    metadata, _, calibration = _inputs(verdict)
+    if calibration is None:
+        raise InputError(
+            "a verdict read from a file has no page. Verify again by mwdcal.verify(…)."
+        )
+    return render(calibration, verdict, *metadata)
+
+
 def _diagnosis_text(diagnosis: Diagnosis) -> str:
     from mwdcal.presentation.diagnosis import screen
 
@@ -96,6 +115,13 @@ def _diagnosis_text(diagnosis: Diagnosis) -> str:
 
 def _diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
     return _enveloped("diagnose", diagnosis, diagnosis)
+
+
+def _diagnosis_page(diagnosis: Diagnosis) -> str:
+    from mwdcal.presentation.diagnosis import render
+
+    metadata, digests, _ = _inputs(diagnosis)
+    return render(diagnosis, digests, *metadata)
 
 
 def _comparison_text(comparison: Comparison) -> str:
@@ -188,7 +214,7 @@ def _show(
     kind: type,
     text: Callable[[Any], str],
     document: Callable[[Any], dict[str, Any]],
-    page: Callable[[Any], str] | None,
+    page: Callable[[Any], str],
 ) -> None:
     """Put `summary`, `to_dict`, `report` and a short `repr` on a class."""
 
@@ -197,12 +223,11 @@ def _show(
         return text(self)
 
     def to_dict(self: object) -> dict[str, Any]:
-        """What the command prints as JSON, as a dictionary."""
+        """The command's JSON as a dictionary."""
         return document(self)
 
     def report(self: object, path: str | os.PathLike[str]) -> None:
         """Write the page of the command: self-contained HTML."""
-        assert page
         atomic.write(os.fspath(path), page(self))
 
     def short(self: object) -> str:
@@ -211,18 +236,26 @@ def _show(
     def html(self: object) -> str:
         return f"<pre>{escape(text(self))}</pre>"
 
-    methods: dict[str, Callable[..., object]] = {"summary": summary, "to_dict": to_dict}
-    methods |= {"report": report} if page else {}
+    methods: dict[str, Callable[..., object]] = {
+        "summary": summary, "to_dict": to_dict, "report": report,
+    }  # fmt: skip
     methods |= {} if "_repr_html_" in vars(kind) else {"__repr__": short, "_repr_html_": html}
     for name, method in methods.items():
         setattr(kind, name, method)
 
 
+def _readings_html(readings: Readings) -> str:
+    """The readings at a glance."""
+    words = repr(readings).strip("<>").removeprefix("Readings: ")
+    return html_table("Readings", [(words,)])
+
+
+Readings._repr_html_ = _readings_html  # type: ignore[attr-defined]
 Readings.columns = property(_columns)  # type: ignore[assignment]
 Readings.to_pandas = _to_pandas  # type: ignore[attr-defined]
 _show(Calibration, _calibration_text, _calibration_document, _calibration_page)
-_show(Verdict, _verdict_text, _verdict_document, None)
-_show(Diagnosis, _diagnosis_text, _diagnosis_document, None)
+_show(Verdict, _verdict_text, _verdict_document, _verdict_page)
+_show(Diagnosis, _diagnosis_text, _diagnosis_document, _diagnosis_page)
 _show(Comparison, _comparison_text, _comparison_document, _comparison_page)
 _show(Noise, _noise_text, _noise_document, _noise_page)
 _show(Stations, _stations_text, _stations_document, _stations_page)

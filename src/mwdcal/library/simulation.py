@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, Unpack, overload
 
 import numpy as np
 
-from mwdcal.calibration.options import Options, Orders
+from mwdcal.calibration.options import Options, Orders, SeedlessFitChoices
 from mwdcal.calibration.readings import Readings, serial_of
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
@@ -23,7 +23,6 @@ from mwdcal.library.planning import (
     FilePath,
     PlanResult,
     PlanSource,
-    SeedlessFitChoices,
     ToolSource,
     check_whole,
     plan_table,
@@ -294,7 +293,7 @@ def _truth(tool: int | tuple[ArrayLike, ArrayLike] | Truth) -> Truth:
 
 @dataclass(frozen=True)
 class _Scene:
-    """What is simulated: a plan, a profile, effects, the tool of a calibration; digests of their files."""
+    """The subject of a simulation: a plan, a profile, effects, the tool of a calibration; digests of their files."""
 
     plan: Table
     profile: Profile

@@ -6,15 +6,16 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import Any, Literal, Protocol, cast, runtime_checkable
+from typing import Any, Literal, Protocol, Unpack, cast, runtime_checkable
 
 import msgspec
 import numpy as np
 
 from mwdcal.calibration.calibrate import calibrate as fit_and_judge
 from mwdcal.calibration.diagnosis.findings import unused_columns
-from mwdcal.calibration.options import Options
-from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.notebooks import html_table
+from mwdcal.calibration.options import FitChoices, Options
+from mwdcal.calibration.readings import Readings, ReadingsLike, as_readings
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.comparison.compare import Comparison
 from mwdcal.comparison.compare import compare as compare_methods
@@ -28,8 +29,8 @@ from mwdcal.files.formats.columns import LABELS, Column, as_text
 from mwdcal.files.formats.table import Table
 from mwdcal.files.limits import load_limits
 from mwdcal.geometry.vectors import AnyArray, Array
-from mwdcal.library.arrays import nearest, without_mask
-from mwdcal.library.results import arrays_of
+from mwdcal.library.arrays import nearest, readings, without_mask
+from mwdcal.library.results import arrays_of, brief, frame
 from mwdcal.library.shown import digest_of, with_inputs
 from mwdcal.logs.noise import Noise, find_noise
 from mwdcal.logs.stations import Stations, find_stations
@@ -44,6 +45,8 @@ CORRECTED_ANGLES = ("inclination", "azimuth", "toolface", "dip", "magnetic_toolf
 Path = str | os.PathLike[str]
 Tabular = Path | Table | Mapping[str, Any]
 """A file, a table, or columns by name: a dictionary of arrays, a pandas or a polars table."""
+RunSource = ReadingsLike | Tabular
+"""The readings of a run: `Readings`, an array of them, a file, or columns by name."""
 
 
 def load_profile(name: Path = "generic") -> Profile:
@@ -131,12 +134,15 @@ def _column(name: str, values: Any) -> Column:
 
 
 def calibrate(
-    run: Readings,
+    run: RunSource,
     profile: Path | Profile | None = None,
     options: Options | None = None,
-    **choices: Any,
+    **choices: Unpack[FitChoices],
 ) -> Calibration:
     """Fit the sensor model to a run, and state what the calibration is worth.
+
+    `run` is what `read_run` or `readings` has given, or what they take: a file, columns by name, or an array (n, 3),
+    (n, 6) or (n, 7) of accelerometer, magnetometer and temperature, as in all that follows.
 
     `profile` is by default the one that the run was read with, else a nominal one: channels along
     the tool axes in g and nT. `choices` are attributes of `Options` by name, such as
@@ -146,7 +152,7 @@ def calibrate(
         FitError: the run cannot give a calibration to be trusted; the message says what to add.
         InputError: an option is unknown.
     """
-    _check_readings(run)
+    run = readings_of(run, "run", profile or NOMINAL)
     whole = run if profile is None else replace(run, profile_sha256="")
     return fit_and_judge(whole, _profile(run, profile), with_choices(options, choices))
 
@@ -189,6 +195,21 @@ def _check_readings(readings: object, name: str = "run", single: bool = True) ->
         )
 
 
+def readings_of(
+    source: RunSource, name: str, profile: Path | Profile, single: bool = True
+) -> Readings:
+    """The readings of a run: as they are, of an array as `as_readings` takes it, or by `read_run` of a table."""
+    if isinstance(source, Readings):
+        pass
+    elif isinstance(source, str | os.PathLike | Table | Mapping) or hasattr(source, "columns"):
+        source = read_run(cast(Tabular, source), profile)
+    else:
+        array = as_readings(source)
+        source = readings(array.accelerometer, array.magnetometer, temperature=array.temperature)
+    _check_readings(source, name, single)
+    return source
+
+
 def with_choices(options: Options | None, choices: Mapping[str, Any]) -> Options | None:
     """Options with choices by name; None where nothing was chosen."""
     names = [field.name for field in fields(Options)]
@@ -201,27 +222,26 @@ def with_choices(options: Options | None, choices: Mapping[str, Any]) -> Options
 
 
 def compare(
-    run: Readings,
+    run: RunSource,
     profile: Path | Profile | None = None,
     options: Options | None = None,
     *,
     progress: Callable[[str], None] = lambda text: None,
-    **choices: Any,
+    **choices: Unpack[FitChoices],
 ) -> Comparison:
     """Calibrate a run by every method, and judge each by stations left out of its fit.
 
     `options` and `choices` as of `calibrate`, the same for all methods; their method does not
     count. `progress` is called with a sentence at each step.
     """
-    _check_readings(run)
+    run = readings_of(run, "run", profile or NOMINAL)
     given = with_choices(options, choices)
     result = compare_methods(run, _profile(run, profile), given, progress=progress)
-    digests = {"run": run.run_sha256, "profile": run.profile_sha256}
-    return with_inputs(result, run.metadata, **digests)
+    return with_inputs(result, run.metadata, run=run.run_sha256, profile=run.profile_sha256)
 
 
 def verify(
-    calibration: Calibration, rolltest: Readings, limits: Path | Limits = "roll-test"
+    calibration: Calibration, rolltest: RunSource, limits: Path | Limits = "roll-test"
 ) -> Verdict:
     """Judge a calibration by readings that its fit has not seen: `.passed`, and `.rows` with each figure.
 
@@ -231,17 +251,17 @@ def verify(
         InputError: stations of the fit, temperatures outside the calibrated range, or readings to
             which no limit applies.
     """
-    _check_readings(rolltest, "rolltest")
+    rolltest = readings_of(rolltest, "rolltest", calibration.profile)
     bounds, digest = (limits, "") if isinstance(limits, Limits) else load_limits(limits)
     verdict = judge(calibration, rolltest, bounds)
     findings = [*verdict.findings, *unused_columns(rolltest.unused)]
     verdict = msgspec.structs.replace(verdict, findings=findings)
     digests = {"calibration": digest_of(calibration), "limits": digest}
     stated = calibration.tool, rolltest.metadata
-    return with_inputs(verdict, *stated, run=rolltest.run_sha256, **digests)
+    return with_inputs(verdict, *stated, of=calibration, run=rolltest.run_sha256, **digests)
 
 
-def diagnose(calibration: Calibration, later: Readings) -> Diagnosis:
+def diagnose(calibration: Calibration, later: RunSource) -> Diagnosis:
     """Say which fault explains later readings of a calibrated tool best: `.fault` is "none" where none is needed.
 
     Definition: faults are compared by the density of the readings, all that is uncertain being integrated out;
@@ -250,12 +270,12 @@ def diagnose(calibration: Calibration, later: Readings) -> Diagnosis:
     Raises:
         InputError: readings of another tool or of the fit itself, or none that can be used.
     """
-    _check_readings(later, "later")
+    later = readings_of(later, "later", calibration.profile)
     result = explain(calibration, later)
     findings = [*calibration.change_findings(), *result.findings, *unused_columns(later.unused)]
     result = msgspec.structs.replace(result, findings=findings)
-    digests = {"calibration": digest_of(calibration), "readings": later.run_sha256}
-    return with_inputs(result, calibration.tool, later.metadata, **digests)
+    stated, digest = (calibration.tool, later.metadata), digest_of(calibration)
+    return with_inputs(result, *stated, calibration=digest, readings=later.run_sha256)
 
 
 @dataclass(frozen=True)
@@ -276,10 +296,41 @@ class Corrected:
     columns: dict[str, AnyArray]
     findings: list[Finding]
 
+    def __repr__(self) -> str:
+        return brief(self, self.summary)
+
+    def _repr_html_(self) -> str:
+        ranges = ((name, *_range(values)) for name, values in self.columns.items())
+        return html_table(self.summary(), [("", "least", "largest"), *ranges])
+
+    def summary(self) -> str:
+        """How many rows have results."""
+        blank = int(np.isnan(self.gravity).any(-1).sum())
+        rows = f"{self.gravity[..., 0].size} rows corrected"
+        return f"{rows}, {blank} of them blank" if blank else rows
+
+    def to_dict(self) -> dict[str, Any]:
+        """The columns as lists, None where there is no result, and the findings."""
+        lists = {
+            name: [None if value != value else value for value in values.tolist()]
+            for name, values in self.columns.items()
+        }
+        return {"columns": lists, "findings": msgspec.to_builtins(self.findings)}
+
+    def to_pandas(self) -> Any:
+        """The columns as a table of pandas, which must be installed."""
+        return frame(self.columns)
+
+
+def _range(values: AnyArray) -> tuple[str, str]:
+    """The least and the largest of some numbers as text; blank where there is none."""
+    known = values[~np.isnan(values)] if values.dtype.kind == "f" else values[:0]
+    return (f"{known.min():.6g}", f"{known.max():.6g}") if known.size else ("", "")
+
 
 def apply(
     calibration: Calibration,
-    survey: Readings,
+    survey: RunSource,
     outside: Literal["blank", "refuse", "extrapolate"] = "blank",
 ) -> Corrected:
     """Correct readings: vectors and angles.
@@ -290,7 +341,7 @@ def apply(
     Raises:
         InputError: readings that do not belong to the calibration.
     """
-    _check_readings(survey, "survey", single=False)
+    survey = readings_of(survey, "survey", calibration.profile, single=False)
     columns, findings = correct(calibration, survey, outside)
     return Corrected(
         gravity=np.stack([columns[f"g{axis}_g"] for axis in "xyz"], -1),
@@ -350,24 +401,51 @@ def load(path: Path) -> Calibration:
     return documents.read(path)
 
 
-def stations(log: Tabular, **options: Any) -> Stations:
+def stations(
+    log: Tabular,
+    *,
+    sampling_hz: float | None = None,
+    min_seconds: float | None = None,
+    trim_seconds: float | None = None,
+    threshold: float | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> Stations:
     """The standstills of a continuous log, each as a station: `.table` is a run for `read_run`.
 
-    `log` is a file, or columns by the names of log files: `time_s`, `ax`, …, `temperature_c`. `options`
-    are those of `mwdcal.logs.stations.find_stations`.
+    `log` is a file, or columns by the names of log files: `time_s`, `ax`, …, `temperature_c`. `sampling_hz` is the
+    rate of a log without a column `time_s`; a station has at least `min_seconds` after `trim_seconds` are cut off each
+    end; `threshold` is the movement that still counts as rest, in noise floors, found from the log where None. `say`
+    is called with a sentence at each step.
     """
     table = _log(log)
-    return with_inputs(find_stations(table, **options), table.metadata, log=table.digest)
+    search = {"min_seconds": min_seconds, "trim_seconds": trim_seconds, "threshold": threshold}
+    result = find_stations(table, sampling_hz=sampling_hz, say=say, **search)
+    return with_inputs(result, table.metadata, log=table.digest)
 
 
-def noise(log: Tabular, **options: Any) -> Noise:
+def noise(
+    log: Tabular,
+    *,
+    profile: Path | Profile | None = None,
+    sampling_hz: float | None = None,
+    between: tuple[float, float] = (-np.inf, np.inf),
+    station_seconds: float | None = None,
+    kind: Literal["overlapping", "modified"] = "overlapping",
+    say: Callable[[str], None] = lambda text: None,
+) -> Noise:
     """The noise of each raw channel of a log of a tool at rest, by Allan deviation.
 
-    `log` is a file, or columns by the names of log files. `options` are those of
-    `mwdcal.logs.noise.find_noise`.
+    `log` is a file, or columns by the names of log files; `profile` has the scales, with which figures come in g and
+    nT too. Only the seconds `between` two times are used; a station takes `station_seconds`, by default 30, or a tenth
+    of a shorter log. `kind` of the deviation: overlapping or modified. `say` is called with a sentence at each step.
     """
     table = _log(log)
-    return with_inputs(find_noise(table, **options), table.metadata, log=table.digest)
+    tool = load_profile(profile) if isinstance(profile, str | os.PathLike) else profile
+    result = find_noise(
+        table, profile=tool, sampling_hz=sampling_hz, between=between,
+        station_seconds=station_seconds, kind=kind, say=say,
+    )  # fmt: skip
+    return with_inputs(result, table.metadata, log=table.digest)
 
 
 def _log(source: Tabular) -> Table:

@@ -68,7 +68,7 @@ class PlaceReference(Result):
 
     @property
     def findings(self) -> list[Finding]:
-        """What the reader should know of the reference."""
+        """The findings about the reference."""
         return self.earth.findings
 
     def _text(self) -> str:
@@ -118,7 +118,7 @@ class FilledReferences(Result):
 
     @property
     def findings(self) -> list[Finding]:
-        """What the reader should know of the reference and of the run."""
+        """The findings about the reference and of the run."""
         return [*self.earth.findings, *self.run.findings]
 
     @property
@@ -168,7 +168,7 @@ class WellSurvey(Result):
 
     @property
     def findings(self) -> list[Finding]:
-        """What the reader should know: of the multi-station analysis, then of the surveys."""
+        """The findings: of the multi-station analysis, then of the surveys."""
         from mwdcal.presentation.survey import all_findings
 
         return all_findings(self._facts)
@@ -219,7 +219,7 @@ class WellSurvey(Result):
         from mwdcal.presentation.survey_page import render
 
         well = self.surveyed.well
-        return render(well, well.findings, self.surveyed.inputs.named)
+        return render(well, well.findings, self.surveyed.inputs.named, self.surveyed.analysis)
 
     def msa_report(self, path: FilePath) -> None:
         """Write the page of the multi-station analysis.
@@ -249,7 +249,7 @@ class Conversion(Result):
 
     @property
     def findings(self) -> list[Finding]:
-        """What the reader should know, such as a temperature outside the calibrated range."""
+        """The findings, such as a temperature outside the calibrated range."""
         return self.converted.findings
 
     @property
@@ -301,7 +301,7 @@ class FirmwareExport(Result):
 
     @property
     def findings(self) -> list[Finding]:
-        """What the reader should know of the calibration."""
+        """The findings about the calibration."""
         return self.exported.findings
 
     @property
@@ -340,7 +340,7 @@ class ToolModelExport(Result):
 
     @property
     def findings(self) -> list[Finding]:
-        """What the reader should know, such as a temperature outside the calibrated range."""
+        """The findings, such as a temperature outside the calibrated range."""
         return self.converted.findings
 
     def _text(self) -> str:
@@ -377,7 +377,7 @@ def reference(
 ) -> PlaceReference:
     """Gravity, magnetic field and the norths of a place and date, each with its standard uncertainty.
 
-    Definition: normal gravity of WGS84; main field by WMM2025 or IGRF-14. A measured value stands before the model.
+    Definition: normal gravity of WGS84; main field by WMM2025 or IGRF-14. A measured value overrides the model.
     Units: degrees, metres above the ellipsoid, g of 9.80665 m/s², nT; north, east and down are positive.
 
     Args:

@@ -1,4 +1,4 @@
-"""What a plan will give: the calibration of a nominal tool that reads without noise."""
+"""The result of a plan: the calibration of a nominal tool that reads without noise."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def _check_scale(profile: Profile, kind: str) -> None:
 
 
 def nominal_run(plan: Table, profile: Profile) -> tuple[Readings, Profile]:
-    """What a nominal tool reads at the stations of a plan, with the noise and the stand of a profile.
+    """The readings of a nominal tool at the stations of a plan, with the noise and the stand of a profile.
 
     Where the plan does not state gravity, field or dip they are those of `Earth`. A profile that says nothing of a
     magnetometer is of a tool without one.

@@ -255,7 +255,7 @@ def judged(
     stand: Stand = USUAL_STAND,
     candidates: Table | None = None,
 ) -> Planned:
-    """What a plan will give; its efficiency is among its own stations and the `candidates` at its temperatures.
+    """The result of a plan; its efficiency is among its own stations and the `candidates` at its temperatures.
 
     Raises:
         InputError: the plan does not state an attitude, or one that the stand cannot reach, or the profile not

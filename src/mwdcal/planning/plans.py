@@ -64,7 +64,7 @@ class PlannedStations(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
 
 
 class PlanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What is to be measured, in order: all stations at each temperature, °C.
+    """The stations of a plan, in order: all stations at each temperature, °C.
 
     `gravity_g`, `field_nt` and `dip_deg` are of the place, where the plan depends on them.
     """

@@ -81,7 +81,7 @@ class Judged:
 
 @dataclass(frozen=True)
 class Procedure:
-    """What is repeated: both sessions, how to fit, the limits of the roll test, and the seed.
+    """The subject of a repetition: both sessions, how to fit, the limits of the roll test, and the seed.
 
     `calibration` is that of a nominal tool that reads without noise, `options` say `auto` nowhere; `tool` is the
     one that is measured again and again, else each is drawn, of an `order`.
@@ -460,7 +460,7 @@ class LimitRow(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Repetition(msgspec.Struct, frozen=True, kw_only=True):
-    """What many repetitions show; shares are of all tools.
+    """The results of many repetitions; shares are of all tools.
 
     A tool is `good` where every true figure, of noise-free readings over the whole turn, is within its limit.
     `wrong_pass`, the consumer's risk: passed and not good; `wrong_fail`, the producer's risk: good and not passed.

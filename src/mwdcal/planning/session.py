@@ -98,7 +98,7 @@ def simulated_run(
 def session_facts(
     session: Session, result: Simulation, common: Mapping[str, Array]
 ) -> dict[str, object]:
-    """What is true of the session of one tool, with units, by field of the truth file."""
+    """The truth of the session of one tool, with units, by field of the truth file."""
     exact = {f"{name}_deg": np.degrees(value) for name, value in result.angles.items()}
     exact["temperature_c"] = result.temperature
     rows = zip(*(values.tolist() for values in exact.values()), strict=True)

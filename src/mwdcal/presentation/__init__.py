@@ -1,1 +1,1 @@
-"""What is shown of results, by capability: its screen and JSON, and beside it its page, which needs no network."""
+"""Screens, JSON and pages of results, by capability; pages need no network."""

@@ -1,4 +1,4 @@
-"""What is built in, by the names that options take, for people and for machines."""
+"""All that is built in, by the names that options take, for people and for machines."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from mwdcal.files.profiles import built_in
-from mwdcal.presentation.envelope import enveloped
+from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.text import one_line
 
 FOLDERS = {
@@ -30,7 +30,7 @@ METHODS_USED = {
     "toolface-inclination": "the angles of the accelerometer alone (Moosavi 2014)",
     "scalar": "strengths alone",
 }
-"""What each method of `calibrate` uses."""
+"""The evidence that each method of `calibrate` uses."""
 
 
 class BuiltIn(msgspec.Struct, frozen=True, kw_only=True):
@@ -42,7 +42,7 @@ class BuiltIn(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class BuiltInSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What `list` prints."""
+    """The output of `list`."""
 
     kind: str
     entries: list[BuiltIn]
@@ -72,7 +72,7 @@ def _what(folder: str, name: str) -> str:
 
 def document(kind: str, built: list[BuiltIn]) -> dict[str, Any]:
     """The list for machines."""
-    return enveloped("list", BuiltInSummary(kind=kind, entries=built))
+    return json_document("list", BuiltInSummary(kind=kind, entries=built))
 
 
 def screen(built: list[BuiltIn]) -> str:

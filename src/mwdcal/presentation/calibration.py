@@ -17,14 +17,15 @@ from mwdcal.calibration.drift import (
     declared_drift,
     exact_and_steady,
 )
+from mwdcal.calibration.fit_options import unusual
 from mwdcal.calibration.prediction import typical_accuracy, without_temperature
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import (
     BudgetRow,
     Calibration,
-    Choices,
     ErrorRow,
     Finding,
+    FitSettings,
     Measures,
     OrderScore,
     StandErrors,
@@ -32,10 +33,17 @@ from mwdcal.calibration.record import (
 )
 from mwdcal.calibration.settings import ASSUMED, ASSUMED_PRACTICE
 from mwdcal.geometry.observables import TITLES
-from mwdcal.presentation.envelope import enveloped
-from mwdcal.presentation.numbers import degrees_of_freedom, estimate, uncertainty, written
-from mwdcal.presentation.text import chance, number, one_line, quantity, table
-from mwdcal.presentation.typed import findings_as_typed
+from mwdcal.presentation.envelope import json_document
+from mwdcal.presentation.numbers import (
+    degrees_of_freedom,
+    estimate,
+    files_written,
+    number,
+    quantity,
+    uncertainty,
+)
+from mwdcal.presentation.text import chance, one_line, table
+from mwdcal.presentation.typed import findings_with_option_names
 
 if TYPE_CHECKING:
     from mwdcal.use.verification import Verdict
@@ -49,7 +57,7 @@ ORDERS = "error: rms per axis, with the noise; inside: interpolation, at the end
 COMPARED = """
 by chance: probability that noise alone gives such a term; chosen: the lowest order above which \
 none is below 0.001"""
-"""What the table of orders means, and where orders were compared."""
+"""The meaning of the table of orders, and where orders were compared."""
 
 
 class TriadSummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -66,14 +74,14 @@ class TriadSummary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CalibrationSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What `calibrate` prints: fields of `Calibration`, accuracy, comparisons, and the files written."""
+    """The output of `calibrate`: fields of `Calibration`, accuracy, comparisons, and the files written."""
 
     run: str
     stations: int
     excluded: list[str]
     temperature_c: tuple[float, float] | None
     method: str
-    options: Choices
+    options: FitSettings
     seed: int | None
     triads: dict[str, TriadSummary]
     errors: list[ErrorRow]
@@ -91,7 +99,7 @@ class CalibrationSummary(msgspec.Struct, frozen=True, kw_only=True):
     calibration: str
     report: str
     verification: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
-    """What `verify` says of the roll test, without its head."""
+    """The document of `verify` on the roll test, without its head."""
 
 
 def _recorded(kind: type[msgspec.Struct], record: msgspec.Struct) -> dict[str, Any]:
@@ -108,7 +116,7 @@ def summary(
     verdict: Verdict | None = None,
 ) -> dict[str, Any]:
     """The result for machines, with the verdict of a roll test if there was one."""
-    findings = findings_as_typed(calibration.findings)
+    findings = findings_with_option_names(calibration.findings)
     content = CalibrationSummary(
         **{**_recorded(CalibrationSummary, calibration), "findings": findings},
         triads={t.name: TriadSummary(**_recorded(TriadSummary, t)) for t in calibration.triads},
@@ -118,7 +126,7 @@ def summary(
         report=str(report or ""),
         verification=msgspec.to_builtins(verdict) if verdict else msgspec.UNSET,
     )
-    return enveloped(
+    return json_document(
         "calibrate",
         content,
         calibration.tool,
@@ -148,7 +156,7 @@ def screen(
     judged: str = "",
 ) -> str:
     """The result for people, the files that were written, and what to do next or what `judged` says of it."""
-    files = written(calibration=output, report=report)
+    files = files_written(calibration=output, report=report)
     after = f"\n\n{judged}" if judged else f"   next: mwdcal verify {one_line(output)} ROLLTEST.csv"
     return f"{body(calibration, tried)}\n{files}{after}"
 
@@ -170,7 +178,7 @@ def remarks(calibration: Calibration) -> list[str]:
     return [
         *residuals(calibration),
         f"accuracy to expect (1σ, calibration alone, typical): {'  '.join(accuracy)}",
-        *([f"taken as exact, and no residual tests it: {exact}{PROFILE}"] if exact else []),
+        *([f"Assumed exact; this run cannot check it: {exact}{PROFILE}"] if exact else []),
         *([steady] if steady else []),
         *drift_remarks(calibration),
         *([ASSUMED] if calibration.settings == ASSUMED_PRACTICE else []),
@@ -188,7 +196,7 @@ def drift_remarks(calibration: Calibration) -> list[str]:
 
 
 def heading(calibration: Calibration) -> str:
-    """What was calibrated, from what, and how much of it is determined."""
+    """Tool, run, method and rank of a calibration."""
     serial = calibration.tool.get("serial", calibration.profile.name)
     inclinations = known_inclinations(calibration)
     parts = [calibration.run, serial, f"{calibration.stations} stations"]
@@ -222,7 +230,7 @@ def known_inclinations(calibration: Calibration) -> list[float]:
 
 def how(calibration: Calibration) -> list[str]:
     """Method, model, and what was asked for beyond them."""
-    return [calibration.method, model(calibration), *choices(calibration.options)]
+    return [calibration.method, model(calibration), *unusual(calibration.options, "heading")]
 
 
 def model(calibration: Calibration) -> str:
@@ -233,22 +241,12 @@ def model(calibration: Calibration) -> str:
     return ", ".join(f"{name}: {model}" for name, model in models.items())
 
 
-def choices(options: Choices) -> list[str]:
-    """What was asked for beyond method, model and order."""
-    return [
-        *([f"{options.parameters} parameters"] if options.parameters != 12 else []),
-        *([f"without {' and '.join(options.ignore)}"] if options.ignore else []),
-        *([f"robust ({options.robust})"] if options.robust else []),
-        *(["the paper's weights"] if options.paper_weights else []),
-        *([f"prior {options.prior}"] if options.prior else []),
-    ]
-
-
 def errors(rows: list[ErrorRow]) -> str:
     """Errors before and after, with what was to be expected."""
     cells = [
         [f"{TITLES.get(row.observable, row.observable)} error, rms"]
-        + [quantity(value, row.unit) for value in (row.before, row.after, row.expected)]
+        + [quantity(value, row.unit) for value in (row.before, row.after)]
+        + [quantity(row.expected, row.unit, 2)]
         for row in rows
     ]
     return table(cells, ["", "before", "after", "1σ expected"])

@@ -32,8 +32,8 @@ from mwdcal.presentation.calibration import (
 from mwdcal.presentation.numbers import HELD, capital, exponent, factor_places
 from mwdcal.presentation.page import banner, environment
 from mwdcal.presentation.text import plural, raised
-from mwdcal.presentation.typed import findings_as_typed
-from mwdcal.presentation.verification import BETWEEN_SETS, freedom
+from mwdcal.presentation.typed import findings_with_option_names
+from mwdcal.presentation.verification import BETWEEN_SETS, freedom, noise_free
 from mwdcal.use import plots
 from mwdcal.use.notation import Notation, convert
 from mwdcal.use.verification import SETTING_PRACTICES
@@ -59,7 +59,7 @@ def render(
     `metadata` are those of the roll test behind the verdict.
     """
     pages = environment()
-    pages.filters["freedom"] = freedom
+    pages.filters |= {"freedom": freedom, "noise_free": noise_free}
     template = pages.get_template("report.html")
     return template.render(
         cal=calibration,
@@ -110,7 +110,7 @@ def outcome(calibration: Calibration, verdict: Verdict | None) -> dict[str, str]
 
 
 def _fit_outcome(calibration: Calibration) -> tuple[str, str]:
-    """What the fit came to, in one line, and its level."""
+    """The outcome of the fit in one line, and its level."""
     ids = [finding.id for finding in calibration.findings]
     doubts = [i.removesuffix("-residuals") for i in ids if i.endswith("-residuals")]
     parts = [f"{name} residuals exceed the declared noise" for name in doubts]
@@ -133,13 +133,13 @@ def _fit_outcome(calibration: Calibration) -> tuple[str, str]:
 
 
 def _findings(calibration: Calibration, verdict: Verdict | None) -> list[Finding]:
-    """What to know and do, each thing once; stations to re-shoot first."""
+    """Findings and advice, each once; stations to re-shoot first."""
     findings = {f.text: f for f in calibration.findings}
     ids = {f.id for f in calibration.findings}
     for extra in verdict.findings if verdict else ():
         if extra.id not in ids:
             findings.setdefault(extra.text, extra)
-    return sorted(findings_as_typed(findings.values()), key=lambda f: f.id != "reshoot")
+    return sorted(findings_with_option_names(findings.values()), key=lambda f: f.id != "reshoot")
 
 
 def _when(time: str) -> str:

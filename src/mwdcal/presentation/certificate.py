@@ -22,14 +22,14 @@ from mwdcal.presentation.numbers import (
     UNDETERMINED,
     contribution,
     exponent,
+    files_written,
     fixed,
     measured,
     number,
     unit,
-    written,
 )
+from mwdcal.presentation.numbers import quantity as in_unit
 from mwdcal.presentation.text import NOT_STATED, chance, one_line, table
-from mwdcal.presentation.text import quantity as in_unit
 from mwdcal.presentation.verification import VERDICT_RISK
 
 EXACT_DIGITS = 6
@@ -101,7 +101,11 @@ def screen(certificate: Certificate, outputs: Sequence[Path]) -> str:
         *(_test(test) for test in tests),
         *([] if certificate.as_left else ["conformity was not tested"]),
         _budget(certificate.budget),
-        *([written(**{path.suffix[1:].upper(): path for path in outputs})] if outputs else []),
+        *(
+            [files_written(**{path.suffix[1:].upper(): path for path in outputs})]
+            if outputs
+            else []
+        ),
     ]
     return "\n\n".join(blocks)
 
@@ -169,7 +173,7 @@ def _source(line: BudgetLine, names: Sequence[str], combined: BudgetLine) -> lis
 
 
 def _share(line: BudgetLine, value: float | None, combined: float | None) -> str:
-    """What a source adds to the uncertainty of an angle."""
+    """The contribution of a source to the uncertainty of an angle."""
     if line.basis.startswith("assumed exact"):
         return ASSUMED_EXACT
     return contribution(value, combined) + "°" * (value is not None)

@@ -37,7 +37,7 @@ def certificate_pictures(
     as_found: Verdict | None = None,
     drift: ToolDrift | None = None,
 ) -> list[Picture]:
-    """What the results look like: errors before and after, residuals, 1σ, roll tests, earlier calibrations."""
+    """Pictures of the results: errors before and after, residuals, 1σ, roll tests, earlier calibrations."""
     tests = _roll_tests(as_found, as_left)
     return [*_fit(calibration), *_accuracy(calibration), *tests, *_past(drift)]
 

@@ -1,4 +1,4 @@
-"""What a certificate says to people, as text in blocks: page and PDF lay out the same words and numbers."""
+"""A certificate for people, as text in blocks: page and PDF lay out the same words and numbers."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from mwdcal.certificate.document import (
 )
 from mwdcal.presentation.certificate import EXACT_DIGITS, plain, probability, quantity_numbers
 from mwdcal.presentation.numbers import UNDETERMINED, capital, contribution, measured, unit
-from mwdcal.presentation.text import NOT_STATED, chance, harmless, plural
+from mwdcal.presentation.text import NOT_STATED, chance, escape_controls, plural
 from mwdcal.sensor.profile import Person
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Mark: TypeAlias = Literal["", "good", "bad", "free", "key", "code"]
-"""What stands out: passed, failed or overdue, undetermined or not stated, a total, a digest."""
+"""The cells that stand out: passed, failed or overdue, undetermined or not stated, a total, a digest."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Picture:
 
     @property
     def alt(self) -> str:
-        """What the figure shows, for readers who do not see it."""
+        """A description of the figure for readers who do not see it."""
         return str(self.figure.get_label()) or self.title
 
 
@@ -197,7 +197,9 @@ def certificate_text(certificate: Certificate, pictures: Sequence[Picture] = ())
         sections=list(_sections(certificate, pictures)),
         end=f"End of certificate {certificate.number}",
     )
-    return msgspec.convert(mapped_texts(msgspec.to_builtins(text), harmless), CertificateText)
+    return msgspec.convert(
+        mapped_texts(msgspec.to_builtins(text), escape_controls), CertificateText
+    )
 
 
 def _percent(share: float) -> str:
@@ -308,7 +310,7 @@ def _outcome(test: ConformityTest) -> TestOutcome:
 
 
 def _test_facts(tests: Sequence[ConformityTest]) -> TableBlock:
-    """What each roll test is of, a test in each column."""
+    """The subject of each roll test, a test in each column."""
     digest = "Calibration applied, SHA-256"
     facts: dict[str, Callable[[ConformityTest], str]] = {
         "Date": lambda test: test.date,
@@ -355,7 +357,7 @@ def _decisions(tests: Sequence[ConformityTest]) -> TableBlock:
 
 
 def _key(decision: LimitDecision) -> tuple[str, str, str, float]:
-    """What is decided on: decisions of one key stand in one row."""
+    """The subjects of decisions: decisions of one key stand in one row."""
     quantity = decision.quantity
     return quantity.id, quantity.at, quantity.unit, decision.limit
 
@@ -388,7 +390,7 @@ def _decision(decision: LimitDecision | None, guarded: bool) -> list[Cell]:
 
 
 def _decision_notes(tests: Sequence[ConformityTest]) -> list[str]:
-    """What the table of decisions means, and the remarks on single decisions."""
+    """The meaning of the table of decisions, and the remarks on single decisions."""
     each = [(test.when, decision) for test in tests for decision in test.decisions]
     factors = {test.when: _coverages([d.quantity for d in test.decisions]) for test in tests}
     apart = len(set(factors.values())) > 1

@@ -73,7 +73,7 @@ def _joined(value: str, sd: str) -> str:
 
 
 def heading(comparison: Comparison) -> list[str]:
-    """What was compared, and how."""
+    """The subject and the method of the comparison."""
     orders = " and ".join(str(order) for order in dict.fromkeys(comparison.orders))
     whole = comparison.parts == comparison.stations
     parts = [
@@ -104,11 +104,11 @@ def errors(comparison: Comparison, kind: str, how: str = "") -> list[list[str]]:
     rows = []
     for name, unit in comparison.units.items():
         cells = [
-            number(getattr(row, kind)[name]) + CONVENTION_MARK * (name in row.resting)
+            number(getattr(row, kind)[name], 3) + CONVENTION_MARK * (name in row.resting)
             for row in able(comparison.rows)
         ]
         what = ", ".join(filter(None, (TITLES.get(name, name), how, unit)))
-        rows.append([what, number(comparison.before[name]), *cells])
+        rows.append([what, number(comparison.before[name], 3), *cells])
     return rows
 
 
@@ -118,7 +118,7 @@ def measures(comparison: Comparison) -> list[list[str]]:
     for before in comparison.measures_before:
         for what, when, key in STATISTICS:
             cells = [_measure(row, before.triad, when, key) for row in able(comparison.rows)]
-            first = number(getattr(before, key)) if when == "after" else ""
+            first = number(getattr(before, key), 3) if when == "after" else ""
             rows.append([f"{before.triad} |e|, {what}", first, *cells])
     return rows
 
@@ -127,7 +127,7 @@ def _measure(row: Row, triad: str, when: str, key: str) -> str:
     """One measure of the vector error of a triad by one method."""
     values = [getattr(m, key) for m in row.measures if (m.triad, m.when) == (triad, when)]
     rank, size = row.ranks[triad]
-    return number(values[0] if values else None) + CONVENTION_MARK * (rank < size)
+    return number(values[0] if values else None, 3) + CONVENTION_MARK * (rank < size)
 
 
 def effort(comparison: Comparison) -> list[list[str]]:
@@ -147,14 +147,14 @@ def effort(comparison: Comparison) -> list[list[str]]:
 
 
 def notes(comparison: Comparison) -> list[str]:
-    """What each method leaves free, and what the tables mean."""
+    """The parameters that each method leaves free, and what the tables mean."""
     measure = "|e|: length of the vector error, as a share of the reference vector (Moradi)"
     stated = [measure] if comparison.measures_before and able(comparison.rows) else []
     return [*undetermined(comparison), *stated, *marks(comparison)]
 
 
 def undetermined(comparison: Comparison) -> list[str]:
-    """What each method leaves free."""
+    """The parameters that each method leaves free."""
     return [
         f"{row.method} leaves undetermined: {', '.join(row.undetermined)}"
         for row in able(comparison.rows)
@@ -163,7 +163,7 @@ def undetermined(comparison: Comparison) -> list[str]:
 
 
 def marks(comparison: Comparison) -> list[str]:
-    """What marks in the tables mean, where there are any."""
+    """The meaning of marks in the tables, if there are any."""
     if not able(comparison.rows):
         return []
     if any(CONVENTION_MARK in cell for row in figures(comparison) for cell in row):
@@ -266,7 +266,7 @@ class ComparedMethod(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ComparisonSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What `compare` prints: the fields of `Comparison`, unused columns, and the page."""
+    """The output of `compare`: the fields of `Comparison`, unused columns, and the page."""
 
     run: str
     stations: int

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal import __version__
 from mwdcal.calibration.methods import EVIDENCE
 from mwdcal.comparison.compare import Comparison, Row, able
 from mwdcal.geometry.observables import TITLES
@@ -29,7 +28,7 @@ from mwdcal.presentation.comparison import (
 )
 from mwdcal.presentation.numbers import capital, number
 from mwdcal.presentation.numbers import unit as spaced
-from mwdcal.presentation.page import banner, environment
+from mwdcal.presentation.page import banner, rendered
 from mwdcal.presentation.text import superscript
 from mwdcal.use import plots
 
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
 LOOKS = {method: look[:2] for method, look in zip(EVIDENCE, plots.SERIES, strict=True)}
 """Colour and marker of each method."""
 STATED = {"serial": "", "date": "measured "}
-"""What the heading takes from the metadata of the run, and what stands before it."""
+"""The metadata of the run in the heading, and the words before them."""
 ROW_HEIGHT = 0.6
 """Of an observable, inches: six markers below each other."""
 LAST_RATIO = 10.0
@@ -67,9 +66,9 @@ def render(
 
     `metadata` are those of the run; `time` is when the methods were compared.
     """
-    template = environment().get_template("comparison.html")
-    return template.render(
-        {function.__name__: function for function in TABLES + FIGURES},
+    return rendered(
+        "comparison.html",
+        **{function.__name__: function for function in TABLES + FIGURES},
         result=comparison,
         simulated=comparison.simulated,
         banner=_banner(comparison),
@@ -81,7 +80,6 @@ def render(
         run_sha256=run_sha256,
         profile_sha256=profile_sha256,
         time=time,
-        version=__version__,
     )
 
 
@@ -299,4 +297,4 @@ def draw_course(comparison: Comparison) -> Figure:
 
 TABLES = (refusals, errors, measures, effort, undetermined, marks, gauge, parameters_of)
 FIGURES = (draw_errors, draw_stations, draw_parameters, draw_course)
-"""What the template calls."""
+"""The functions that the templates call."""

@@ -19,8 +19,8 @@ from mwdcal.firmware.c_source import stated_errors
 from mwdcal.firmware.export import DEFAULT_BITS, FIXED_POINT, FirmwareSources, export
 from mwdcal.firmware.quantisation import SHARE_OF
 from mwdcal.presentation.calibration_source import calibration_of
-from mwdcal.presentation.envelope import enveloped
-from mwdcal.presentation.numbers import HELD, UNDETERMINED, number, written
+from mwdcal.presentation.envelope import json_document
+from mwdcal.presentation.numbers import HELD, UNDETERMINED, files_written, number
 from mwdcal.presentation.text import one_line, raised, table
 from mwdcal.sensor.profile import Axis
 from mwdcal.survey.tool_model import SensorTerm, sensor_terms, tool_model_text
@@ -71,7 +71,7 @@ class ConvertedTriad(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ConversionSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What `convert` prints and writes: whose calibration, then the values of each triad, or the sources.
+    """The output of `convert`: whose calibration, then the values of each triad, or the sources.
 
     `software` is that of the calibration; `converted_by` wrote this document.
     """
@@ -179,7 +179,7 @@ def terms_screen(converted: Converted, terms: list[SensorTerm], output: Path | N
     rows = [
         [
             term.name,
-            *(number(value) for value in (term.value, term.owsg)),
+            *(number(value, 3) for value in (term.value, term.owsg)),
             term.unit,
             UNDETERMINED if term.ratio is None else number(term.ratio, 2),
         ]
@@ -187,14 +187,14 @@ def terms_screen(converted: Converted, terms: list[SensorTerm], output: Path | N
     ]
     heading = "\n".join(one_line("   ".join(line)) for line in _heading(converted))
     shown = table(rows, ["term", "1σ", "OWSG MWD", "unit", "ratio"])
-    files = [written(**{"tool model": output})] if output else []
+    files = [files_written(**{"tool model": output})] if output else []
     return "\n".join([heading, "", shown, *files])
 
 
 def temperature_findings(
     calibration: Calibration, notation: str, temperature: float | str | None
 ) -> list[Finding]:
-    """What to know where the values are asked for at a temperature without calibration.
+    """The finding where the values are asked for at a temperature without calibration.
 
     The reference temperature counts as asked for where the values depend on it.
     """
@@ -254,7 +254,7 @@ def _identity(converted: Converted | Exported) -> dict[str, Any]:
 def _enveloped(converted: Converted | Exported, content: ConversionSummary) -> dict[str, Any]:
     calibration = converted.calibration
     digests = {"calibration": converted.sha256, "run": calibration.run_sha256}
-    return enveloped("convert", content, calibration.tool, **digests)
+    return json_document("convert", content, calibration.tool, **digests)
 
 
 def _triad(converted: Converted, name: str) -> ConvertedTriad:
@@ -424,7 +424,7 @@ def export_screen(exported: Exported, folder: Path | None = None) -> str:
 
 
 def _error_title(name: str) -> str:
-    """What an error is of, and the share by which it is multiplied."""
+    """The subject of an error, and the share by which it is multiplied."""
     if name not in SHARE_OF:
         return name
     return f"{name.replace('_', ' ')} · {SHARE_OF[name]} across the axis"

@@ -1,4 +1,4 @@
-"""A diagnosis on the screen: the verdict, what moved, how likely each fault is, what to do next."""
+"""A diagnosis on the screen and as a page: the verdict, what moved, how likely each fault is, what to do next."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from mwdcal.calibration.readings import simulated
 from mwdcal.faults.diagnosis import Diagnosis, Rival
 from mwdcal.faults.likelihood import FALSE_ALARMS
 from mwdcal.faults.physics import NONE, SURROUNDINGS
-from mwdcal.presentation.numbers import estimate, measured
-from mwdcal.presentation.text import chance, number, one_line, plural, table
+from mwdcal.presentation.numbers import capital, estimate, measured, number
+from mwdcal.presentation.page import banner, rendered
+from mwdcal.presentation.text import chance, one_line, plural, table
 
 MEANINGS = {
     NONE: "as calibrated",
@@ -30,13 +31,15 @@ ADVICE = {
     "casing": "the calibration may be sound: check the references, and measure again away from casing and steel",
     "turn-on": "switch off and on and read again; calibrate again if the biases come back",
 }
-"""What to do about each."""
+"""The advice for each."""
 CHECK_FIRST = "check tool, units and references, then repeat the readings on a stand"
 IN_HOLE = "run mwdcal survey --msa on these surveys: it estimates a field fixed in the tool and corrects for it"
 NOT_YET = "do not judge the tool by these readings alone"
-"""What to do where no single fault explains readings, of surveys, and where a sound tool is not excluded."""
+"""The advice where no single fault explains readings, of surveys, and where a sound tool is not excluded."""
 LEAST_LIKELIHOOD = 0.0005
 """Likelihoods below are shown as less than this."""
+MOVED_TITLES = ["moved", "channel", "by", "1σ", "unit"]
+"""Titles of the table of sizes of a fault."""
 
 
 def screen(result: Diagnosis, *metadata: Mapping[str, object]) -> str:
@@ -44,10 +47,29 @@ def screen(result: Diagnosis, *metadata: Mapping[str, object]) -> str:
     head = [verdict(result), result.run, plural(result.stations, "station"), *simulated(*metadata)]
     parts = ["   ".join(one_line(text) for text in head)]
     if result.parameters:
-        parts.append(_moved(result))
-    parts.append(_likelihoods(result))
+        parts.append(table(_moved(result), MOVED_TITLES))
+    parts.append(table(_likelihoods(result), ["", "likelihood"]))
     parts.append("\n".join(one_line(line) for line in _last(result)))
     return "\n\n".join(parts)
+
+
+def render(result: Diagnosis, sha256: Mapping[str, str], *metadata: Mapping[str, object]) -> str:
+    """The diagnosis as HTML; `sha256` of the calibration and the readings, `metadata` as of the screen."""
+    sound = result.fault == NONE
+    certain = sound and not any(finding.id == "unexplained" for finding in result.findings)
+    word, level = ("OK", "good") if certain else ("Attention", "attention" if sound else "bad")
+    return rendered(
+        "diagnosis.html",
+        *metadata,
+        result=result,
+        banner=banner(level, word, capital(verdict(result)), f"{capital(next_step(result))}."),
+        findings=result.findings,
+        moved=_moved(result),
+        moved_titles=MOVED_TITLES,
+        likelihoods=_likelihoods(result),
+        last=_last(result)[:-1],
+        sha256=sha256,
+    )
 
 
 def verdict(result: Diagnosis) -> str:
@@ -88,20 +110,18 @@ def _size(size: float, uncertainty: float | None, unit: str | None) -> str:
     return estimate(size, uncertainty, unit or "")
 
 
-def _moved(result: Diagnosis) -> str:
-    """Table of all sizes of the fault."""
-    rows = [
+def _moved(result: Diagnosis) -> list[list[str]]:
+    """All sizes of the fault."""
+    return [
         [row.parameter, row.channel or "", *measured(row.size, row.uncertainty), row.unit]
         for row in result.parameters
     ]
-    return table(rows, ["moved", "channel", "by", "1σ", "unit"])
 
 
-def _likelihoods(result: Diagnosis) -> str:
-    """Table of all faults, the most likely first."""
+def _likelihoods(result: Diagnosis) -> list[list[str]]:
+    """All faults, the most likely first."""
     ordered = sorted(result.likelihoods.items(), key=lambda pair: -pair[1])
-    rows = [[f"{name}: {MEANINGS[name]}", _share(share)] for name, share in ordered]
-    return table(rows, ["", "likelihood"])
+    return [[f"{name}: {MEANINGS[name]}", _share(share)] for name, share in ordered]
 
 
 def _share(share: float) -> str:
@@ -111,10 +131,10 @@ def _share(share: float) -> str:
 
 
 def _last(result: Diagnosis) -> list[str]:
-    """What it rests on, what these readings leave open, and what to do."""
+    """The rule, the gaps of these readings, and the advice."""
     lines = [
-        f"rule: a fault is named where a sound tool gives as much evidence for one with a probability of at most "
-        f"{100 * FALSE_ALARMS:g} %; here {chance(result.probability)}"
+        f"rule: a healthy tool looks this bad with a probability of {chance(result.probability)}; a fault is reported "
+        f"at {100 * FALSE_ALARMS:g} % or less"
     ]
     if result.unseen:
         lines.append(f"not shown by these readings, at its usual size: {', '.join(result.unseen)}")
@@ -126,7 +146,7 @@ def _last(result: Diagnosis) -> list[str]:
 
 
 def next_step(result: Diagnosis) -> str:
-    """What to do: a tool is taken out of use only where readings exclude that it is sound."""
+    """The advice: a tool is taken out of use only where readings exclude that it is sound."""
     if any(finding.id == "unexplained" for finding in result.findings):
         return CHECK_FIRST
     steps = [IN_HOLE if result.fault == "magnetised" and result.surveys else ADVICE[result.fault]]

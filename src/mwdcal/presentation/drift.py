@@ -1,4 +1,4 @@
-"""What is printed of the drift of a tool and of a fleet."""
+"""The printed output of the drift of a tool and of a fleet."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from mwdcal.calibration.readings import SIMULATED
 from mwdcal.drift.change import LEAST_PAIR_PROBABILITY, LEAST_PROBABILITY
 from mwdcal.drift.document import DueDate, FleetDrift, FleetTool, ServiceRow, ToolDrift, WalkRate
 from mwdcal.drift.forecast import RISK
-from mwdcal.presentation.envelope import enveloped
-from mwdcal.presentation.numbers import measured, number, unit, written
+from mwdcal.presentation.envelope import json_document
+from mwdcal.presentation.numbers import files_written, measured, number, unit
 from mwdcal.presentation.text import chance, one_line, plural, table
 
 DUE_RULE = (
@@ -152,14 +152,14 @@ def document(result: RegistryDrift) -> dict[str, Any]:
     """The drift for machines."""
     marked = [each.simulated for each in (result.tool, result.fleet) if each]
     stated = {"serial": result.tool.serial if result.tool else "", "simulated": any(marked)}
-    return enveloped("registry drift", result, stated)
+    return json_document("registry drift", result, stated)
 
 
 def text(result: RegistryDrift, page: Path | None) -> str:
     """The drift for people."""
     shown = tool_screen(result.tool) if result.tool else ""
     shown = fleet_screen(result.fleet) if result.fleet else shown
-    return "\n\n".join(filter(None, [shown, written(page=page) if page else ""]))
+    return "\n\n".join(filter(None, [shown, files_written(page=page) if page else ""]))
 
 
 def simulated(drift: ToolDrift | FleetDrift) -> list[str]:

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mwdcal import __version__
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.drift.document import AccuracyForecast, DueDate, FleetDrift, ParameterCourse, ToolDrift
 from mwdcal.drift.forecast import COVERAGE_FACTOR, LONGEST_INTERVAL, RISK
@@ -27,7 +26,7 @@ from mwdcal.presentation.drift import (
     step_rows,
 )
 from mwdcal.presentation.numbers import capital, number
-from mwdcal.presentation.page import banner, environment
+from mwdcal.presentation.page import banner, rendered
 from mwdcal.presentation.text import plural
 from mwdcal.use import plots
 
@@ -213,7 +212,8 @@ def render_tool(drift: ToolDrift) -> str:
     """The page of one tool."""
     triads = triads_of(drift)
     several = sum(each.used for each in drift.calibrations) > 1
-    return environment().get_template("drift.html").render(
+    return rendered(
+        "drift.html",
         drift=drift,
         simulated=drift.simulated,
         banner=_tool_banner(drift),
@@ -231,7 +231,6 @@ def render_tool(drift: ToolDrift) -> str:
         longest=LONGEST_INTERVAL,
         factor=COVERAGE_FACTOR,
         risk=RISK,
-        version=__version__,
     )  # fmt: skip
 
 
@@ -273,14 +272,14 @@ def _parameter_row(course: ParameterCourse) -> list[str]:
 
 def render_fleet(fleet: FleetDrift) -> str:
     """The page of many tools."""
-    return environment().get_template("drift_fleet.html").render(
+    return rendered(
+        "drift_fleet.html",
         fleet=fleet,
         drawn_chance=drawn_chance,
         simulated=fleet.simulated,
         banner=_fleet_banner(fleet),
         scores=draw_scores(fleet) if fleet.tested else None,
         rates={name: rate_rows(rates) for name, rates in fleet.rates.items()},
-        version=__version__,
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""What every document for machines says of itself: its form, who wrote it, and from which files."""
+"""The statements of every document for machines about itself: its form, who wrote it, and from which files."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 
 from mwdcal.calibration.canonical import Signature, SignatureCheck
-from mwdcal.calibration.readings import is_simulated, serial_of
+from mwdcal.calibration.readings import head
 from mwdcal.calibration.record import DOCUMENT_VERSION, SOFTWARE
 from mwdcal.files.settings import LaboratorySettings, source_of_settings
 
@@ -87,7 +87,7 @@ class WrittenSettings(msgspec.Struct, frozen=True, kw_only=True):
     settings: LaboratorySettings
 
 
-def enveloped(
+def json_document(
     command: str, content: object, *metadata: Mapping[str, object], **sha256: str
 ) -> dict[str, Any]:
     """The document of a command: its head, the SHA-256 of its input files, and the content.
@@ -96,19 +96,18 @@ def enveloped(
     computed, or of a file that was not given, is None. Keys of the content stand before equal ones.
     """
     settings, settings_sha256 = source_of_settings()
-    head = Envelope(
+    envelope = Envelope(
         schema_version=DOCUMENT_VERSION,
         command=command,
         software=SOFTWARE,
-        serial=next(filter(None, map(serial_of, metadata)), None),
-        simulated=any(map(is_simulated, metadata)),
+        **head(*metadata),
         settings_file=settings or msgspec.UNSET,
         settings_sha256=settings_sha256 or msgspec.UNSET,
     )
     digests = {f"{name}_sha256": sha256.pop(name, "") or None for name in INPUTS[command]}
     if sha256:
         raise ValueError(f"{command} has no input {', '.join(sha256)}")
-    return {**msgspec.to_builtins(head), **digests, **msgspec.to_builtins(content)}
+    return {**msgspec.to_builtins(envelope), **digests, **msgspec.to_builtins(content)}
 
 
 def with_signature(document: dict[str, Any], calibration: SignatureCheck) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What came of a fleet: counts, spreads and undetermined directions, for people and machines.
+"""The results of a fleet: counts, spreads and undetermined directions, for people and machines.
 
 The table of calibrations is read column by column, whatever its length.
 """
@@ -12,18 +12,19 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from mwdcal.calibration import fit_options
+from mwdcal.calibration.fit_options import FIT_OPTIONS, FitArguments
 from mwdcal.calibration.readings import HIGHEST, TRIADS
-from mwdcal.calibration.record import Choices, Finding
+from mwdcal.calibration.record import Finding, FitSettings
 from mwdcal.files.formats import parquet
 from mwdcal.fleet.calibrate import OK, STAND_COLUMNS
 from mwdcal.fleet.sources import SERIAL
 from mwdcal.fleet.tables import one_chunk
 from mwdcal.geometry.vectors import Array
-from mwdcal.presentation.calibration import choices
-from mwdcal.presentation.envelope import enveloped
-from mwdcal.presentation.numbers import written
-from mwdcal.presentation.text import number, one_line, plural, table
-from mwdcal.presentation.typed import Typed, as_typed, names
+from mwdcal.presentation.envelope import json_document
+from mwdcal.presentation.numbers import files_written, number
+from mwdcal.presentation.text import one_line, plural, table
+from mwdcal.presentation.typed import with_option_names
 
 SERIALS_SHOWN = 5
 """Most serials that a line names."""
@@ -56,7 +57,7 @@ class FleetFinding(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FleetCounts(msgspec.Struct, frozen=True, kw_only=True):
-    """What came of a fleet. `spread` has the 1 %, 50 % and 99 % point of columns of sound tools.
+    """The results of a fleet. `spread` has the 1 %, 50 % and 99 % point of columns of sound tools.
 
     `orders` and `nonlinear`: tools by triad and chosen order, and by triad with own-axis terms.
     """
@@ -81,7 +82,7 @@ class FleetCounts(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FleetSummary(FleetCounts, frozen=True, kw_only=True):
-    """What screens and pages show: columns of all tools that are not used, and the table's metadata too."""
+    """The content of screens and pages: columns of all tools that are not used, and the table's metadata too."""
 
     unused: list[Finding]
     metadata: dict[str, Any]
@@ -93,19 +94,19 @@ class FleetSummary(FleetCounts, frozen=True, kw_only=True):
 
 
 class FleetDocument(FleetCounts, frozen=True, kw_only=True):
-    """What `fleet` prints: the fields of `FleetSummary`, the number of calibrated tools, and the page."""
+    """The output of `fleet`: the fields of `FleetSummary`, the number of calibrated tools, and the page."""
 
     tools_per_second: float
     calibrated: int
     report: str
 
 
-def summarise(target: Path, typed: Typed, notes: list[str], **facts: Any) -> FleetSummary:
+def summarise(target: Path, typed: FitArguments, notes: list[str], **facts: Any) -> FleetSummary:
     """What the table of calibrations `target` says, read column by column, beside other `facts`."""
     _, pq = parquet.modules(target.name)
     whole = pq.ParquetFile(target)
     head = whole.read([SERIAL, "status", "message", "findings"])
-    columns, options = whole.schema_arrow.names, stated_options(typed)
+    columns, options = whole.schema_arrow.names, fit_options.stated_arguments(typed)
     shown = [n for n in columns if n.endswith(("_sd_deg", "_variance_factor")) or n in ERRORS]
     return FleetSummary(
         **facts,
@@ -132,33 +133,19 @@ def _wide(whole: Any) -> list[str]:
     return [f"{spans}, and --order 0 has no temperature terms."] if wide else []
 
 
-def stated_options(typed: Typed) -> dict[str, Any]:
-    """The options of a fleet, under the names that a calibration file and the command have."""
-    method, order = typed["method"], typed["order"]
-    return {
-        "method": method,
-        "seed": typed["seed"] if method == "swarm" else None,
-        "model": typed["model"],
-        "order": order if order == "auto" else int(order),
-        "nonlinearity": typed["nonlinearity"],
-        "estimate": list(names(typed["estimate"])),
-        "parameters": int(typed["parameters"] or 12),
-        "ignore": list(names(typed["ignore"])),
-        **{name: typed[name] for name in ("robust", "paper_weights", "prior")},
-    }
-
-
 def unusual(options: dict[str, Any]) -> list[str]:
-    """What was asked for beyond method and order, in words."""
-    also = msgspec.convert(options, Choices)
-    terms, stand = options["nonlinearity"], " and ".join(options["estimate"])
-    return [
-        *([f"model {options['model']}"] if options["model"] else []),
-        *([f"own-axis terms {terms}"] if terms != "none" else []),
-        *([f"stand: {stand}"] if stand else []),
-        *choices(also),
-        *([f"seed {options['seed']}"] if options["seed"] else []),
-    ]
+    """The options beyond method and order that are not the usual ones, in words."""
+    usual: dict[str, Any] = {"model": None, "nonlinearity": "none", "estimate": [], "seed": None}
+    before = {
+        name: FIT_OPTIONS[name].heading.format(
+            " and ".join(value) if isinstance(value, list) else value
+        )
+        for name, default in usual.items()
+        if (value := options[name]) != default and value != 0
+    }
+    seed = [before.pop("seed")] if "seed" in before else []
+    settings = msgspec.convert(options, FitSettings)
+    return [*before.values(), *fit_options.unusual(settings, "heading"), *seed]
 
 
 def numbers(whole: Any, name: str) -> Array:
@@ -181,7 +168,9 @@ def _kinds(head: Any) -> list[StatusCount]:
     kinds = []
     for name, count in sorted(counts.items(), key=lambda kind: (kind[0] != OK, -kind[1])):
         tools = head.filter(compute.equal(status, name)).slice(0, SERIALS_SHOWN).to_pydict()
-        kinds.append(StatusCount(name, count, tools[SERIAL], as_typed(tools["message"][0])))
+        kinds.append(
+            StatusCount(name, count, tools[SERIAL], with_option_names(tools["message"][0]))
+        )
     return kinds
 
 
@@ -248,13 +237,20 @@ def document(summary: FleetSummary, report: Path | None) -> dict[str, Any]:
         report=str(report or ""),
     )
     stated = summary.metadata
-    return enveloped("fleet", content, stated, profile=stated["profile_sha256"])
+    return json_document("fleet", content, stated, profile=stated["profile_sha256"])
 
 
 def text(summary: FleetSummary, report: Path | None) -> str:
     """The summary for people: about one screen."""
     rows = [[k.status, str(k.tools), "" if k.status == OK else _first(k)] for k in summary.statuses]
-    spread = [[_title(n), *map(number, values)] for n, values in summary.spread.items() if values]
+    spread = [
+        [
+            _title(name),
+            *(number(value, 2 if name.endswith("_sd_deg") else None) for value in values),
+        ]
+        for name, values in summary.spread.items()
+        if values
+    ]
     blocks = [_heading(summary), table(rows, ["status", "tools", "serials"])]
     if spread:
         blocks.append(table(spread, ["of sound tools", "1 %", "median", "99 %"]))
@@ -264,12 +260,12 @@ def text(summary: FleetSummary, report: Path | None) -> str:
     rate = f"{summary.seconds:.1f} s, {summary.tools / summary.seconds:.0f} tools/s"
     files = "in memory"
     if summary.output or report:
-        files = written(calibrations=summary.output, report=report)
+        files = files_written(calibrations=summary.output, report=report)
     return "\n".join(["\n\n".join(blocks), *_remarks(summary), "", f"{files}   {rate}"])
 
 
 def _heading(summary: FleetSummary) -> str:
-    """What was calibrated, and how."""
+    """The subject and the method of the calibration."""
     counts = [plural(summary.tools, "tool"), plural(summary.stations, "station")]
     how = [f"method {summary.method}", f"order {summary.order}"]
     also = unusual(summary.options)

@@ -54,7 +54,7 @@ class FleetParameter:
 
     @property
     def sensors(self) -> str:
-        """What may be compared."""
+        """The quantities that may be compared."""
         return f"{self.triad}, {self.kind}" if self.kind else self.triad
 
     @property

@@ -40,9 +40,8 @@ from mwdcal.presentation.fleet_figures import (
     nominal_unit,
     parameters_of,
 )
-from mwdcal.presentation.numbers import capital, number, unit
-from mwdcal.presentation.page import banner, environment
-from mwdcal.presentation.text import number as brief
+from mwdcal.presentation.numbers import capital, number, uncertainty, unit
+from mwdcal.presentation.page import banner, rendered
 from mwdcal.presentation.text import plural
 
 if TYPE_CHECKING:
@@ -103,11 +102,11 @@ REMARKED = {
     "distrusted": "the robust fit gives some stations little weight",
     "unused-columns": "some columns are not used",
 }
-"""What a finding says of tools, by its id or the end of it."""
+"""The statement of a finding about tools, by its id or the end of it."""
 
 
 def remark(finding: str) -> str:
-    """What a finding says of tools.
+    """The statement of a finding about tools.
 
     >>> remark("magnetometer-noise")
     'residuals of the magnetometer are far below the declared noise'
@@ -125,7 +124,8 @@ def render(calibrations: Path, summary: FleetSummary) -> str:
     fleet = Fleet(SoundTools(calibrations))
     tools = fleet.tools
     written = datetime.fromtimestamp(calibrations.stat().st_mtime, UTC)
-    return environment().get_template("fleet.html").render(
+    return rendered(
+        "fleet.html",
         result=summary,
         metadata=tools.metadata,
         simulated=is_simulated(tools.metadata),
@@ -133,7 +133,7 @@ def render(calibrations: Path, summary: FleetSummary) -> str:
         banner=_banner(summary, fleet),
         options="; ".join(unusual(summary.options)) or "defaults",
         stand={name: summary.spread[name] for name in ERRORS if summary.spread.get(name)},
-        short=brief,
+        short=number,
         remark=remark,
         refused=[(k, REFUSED[k.status]) for k in summary.statuses if k.status != OK],
         is_doubt=is_doubt,
@@ -172,9 +172,9 @@ def _expected(row: AngleAccuracy) -> str:
     """The accuracy of an angle over the fleet in words."""
     if row.worst is None:
         return f"{row.angle} undetermined"
-    values = f"{number(row.median)}° median, {number(row.worst)}° worst"
+    values = f"{uncertainty(row.median)}° median, {uncertainty(row.worst)}° worst"
     free = f", undetermined in {plural(row.undetermined, 'tool')}" if row.undetermined else ""
-    return f"{row.angle} {values if row.tools > 1 else f'{number(row.median)}°'}{free}"
+    return f"{row.angle} {values if row.tools > 1 else f'{uncertainty(row.median)}°'}{free}"
 
 
 @dataclass(frozen=True)
@@ -201,7 +201,7 @@ class WorstTool:
 
 
 class Fleet:
-    """What the page says of the calibrated tools."""
+    """The statements of the page about the calibrated tools."""
 
     def __init__(self, tools: SoundTools) -> None:
         self.tools = tools
@@ -283,7 +283,7 @@ class Fleet:
     def _shown(self, angle: str, tool: int) -> str:
         """The accuracy of one tool."""
         free = bool(self._free[angle][tool])
-        return "undetermined" if free else number(float(self._sd[angle][tool]))
+        return uncertainty(None if free else float(self._sd[angle][tool]))
 
     @property
     def titles(self) -> list[str]:
@@ -291,7 +291,7 @@ class Fleet:
         return [f"{angle} 1σ, °" for angle in self._sd]
 
     def of(self, tool: int) -> Iterator[str]:
-        """What is unusual in the accuracy and the parameters of one tool."""
+        """The unusual figures in the accuracy and the parameters of one tool."""
         free = [angle for angle in self._sd if self._free[angle][tool]]
         if free:
             yield f"{', '.join(free)} undetermined"
@@ -322,7 +322,7 @@ def _outlier(parameter: FleetParameter, tool: int, far: float) -> str:
 
 
 class _Reasons:
-    """What is the matter with some tools, from their findings and directions."""
+    """The faults of some tools, from their findings and directions."""
 
     def __init__(self, fleet: Fleet, some: Sequence[int]) -> None:
         tools, names = fleet.tools, ("findings", "reshoot", *(f"{t}_undetermined" for t in TRIADS))
@@ -353,7 +353,7 @@ class _Reasons:
                 yield remark(finding)
 
     def _directions(self, lists: Mapping[str, Sequence[str]]) -> Iterator[str]:
-        """What nothing determines, and of which triads."""
+        """The directions that nothing determines, and their triads."""
         free = {triad: lists.get(f"{triad}_undetermined") or () for triad in TRIADS}
         groups: dict[str, list[str]] = {}
         for name in dict.fromkeys(name for names in free.values() for name in names):

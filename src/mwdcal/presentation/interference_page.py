@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal import __version__
-from mwdcal.calibration.readings import is_simulated, serial_of
 from mwdcal.geometry.vectors import Array
 from mwdcal.presentation.numbers import estimate
-from mwdcal.presentation.page import banner, environment
+from mwdcal.presentation.page import banner, rendered
 from mwdcal.presentation.survey import (
     CORRECTED_TITLES,
     DIRECTION_TITLES,
@@ -19,7 +17,6 @@ from mwdcal.presentation.survey import (
     direction_rows,
     misfit_in_words,
 )
-from mwdcal.presentation.survey_page import LARGEST_DRAWN_SD
 from mwdcal.presentation.text import plural
 from mwdcal.survey.interference import Interference, InterferenceStation, MultiStationAnalysis
 from mwdcal.use import plots
@@ -28,6 +25,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+LARGEST_DRAWN_SD = 2.0
+"""Standard uncertainty up to which an angle is drawn, degrees: near vertical that of azimuth grows without end."""
 MOST_CORRECTED_OF_PAGE = 2000
 """Surveys in the table of a page."""
 
@@ -35,31 +34,35 @@ MOST_CORRECTED_OF_PAGE = 2000
 def render(result: Interference, sha256: Mapping[str, str]) -> str:
     """The analysis as HTML; `sha256` of the files it comes from, by what these are."""
     summary, stated = result.summary, (result.readings.metadata, result.calibration.tool)
-    rows = corrected_rows(summary, MOST_CORRECTED_OF_PAGE)
-    return (
-        environment()
-        .get_template("interference.html")
-        .render(
-            summary=summary,
-            readings=result.readings.source,
-            calibration=result.calibration.run_name,
-            serial=next(filter(None, map(serial_of, stated)), None),
-            simulated=any(map(is_simulated, stated)),
-            banner=_banner(summary),
-            findings=summary.findings,
-            directions=direction_rows(summary),
-            direction_titles=DIRECTION_TITLES,
-            misfit=misfit_in_words(summary),
-            terms=result.terms.sentence,
-            strengths=draw_strengths(summary),
-            azimuths=draw_azimuths(summary),
-            titles=CORRECTED_TITLES,
-            rows=rows,
-            more=len(summary.station_rows) - len(rows),
-            sha256=sha256,
-            version=__version__,
-        )
+    return rendered(
+        "interference.html",
+        *stated,
+        summary=summary,
+        readings=result.readings.source,
+        calibration=result.calibration.run_name,
+        banner=_banner(summary),
+        findings=summary.findings,
+        terms=result.terms.sentence,
+        analysis=sections(result),
+        sha256=sha256,
     )
+
+
+def sections(result: Interference) -> dict[str, Any]:
+    """The analysis as `interference_sections` of the templates show it."""
+    summary = result.summary
+    rows = corrected_rows(summary, MOST_CORRECTED_OF_PAGE)
+    return {
+        "summary": summary,
+        "directions": direction_rows(summary),
+        "direction_titles": DIRECTION_TITLES,
+        "misfit": misfit_in_words(summary),
+        "strengths": draw_strengths(summary),
+        "azimuths": draw_azimuths(summary),
+        "titles": CORRECTED_TITLES,
+        "rows": rows,
+        "more": len(summary.station_rows) - len(rows),
+    }
 
 
 def _banner(summary: MultiStationAnalysis) -> dict[str, str]:

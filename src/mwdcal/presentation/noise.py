@@ -10,7 +10,7 @@ import numpy as np
 
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.logs.noise import ChannelNoise, Noise, Term
-from mwdcal.presentation.numbers import channels_of, written
+from mwdcal.presentation.numbers import channels_of, files_written
 from mwdcal.presentation.text import one_line, plural, table
 
 TERM_TITLES = {
@@ -31,7 +31,7 @@ UNSOUND_MARK = " (!)"
 
 
 class NoiseSummary(Noise, frozen=True, kw_only=True):
-    """What `noise` prints: the noise, and the files that were written."""
+    """The output of `noise`: the noise, and the files that were written."""
 
     plot: str
     report: str  # type: ignore[assignment,misc]  # a file here, a page of the noise there
@@ -52,12 +52,12 @@ def screen(noise: Noise, plot: Path | None, report: Path | None) -> str:
         profile_lines(noise),
     ]
     if plot or report:
-        blocks.append(written(picture=plot, report=report))
+        blocks.append(files_written(picture=plot, report=report))
     return "\n\n".join(blocks)
 
 
 def heading(noise: Noise) -> list[str]:
-    """What was looked at."""
+    """The data that were examined."""
     channels = list(noise.channels.values())
     rates = " and ".join(dict.fromkeys(f"{c.sampling_hz:.6g} Hz" for c in channels))
     return [

@@ -6,14 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal import __version__
 from mwdcal.calibration.diagnosis.findings import UNUSED
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.logs.noise import ChannelNoise, Noise
 from mwdcal.logs.regular import NOT_AT_REST
 from mwdcal.presentation.noise import heading, marked, profile_lines, rounded, scaled, tables
 from mwdcal.presentation.numbers import channels_of, number
-from mwdcal.presentation.page import banner, environment
+from mwdcal.presentation.page import banner, rendered
 from mwdcal.presentation.text import plural
 from mwdcal.use import plots
 
@@ -27,8 +26,8 @@ AXIS_MARKERS = {"x": "o", "y": "s", "z": "^"}
 
 def render(noise: Noise, log_sha256: str = "", profile: str = "", profile_sha256: str = "") -> str:
     """The report as HTML, with the name of its tool profile and the SHA-256 of its sources."""
-    template = environment().get_template("noise.html")
-    return template.render(
+    return rendered(
+        "noise.html",
         result=noise,
         simulated=noise.simulated,
         banner=_banner(noise),
@@ -41,7 +40,6 @@ def render(noise: Noise, log_sha256: str = "", profile: str = "", profile_sha256
         log_sha256=log_sha256,
         profile=profile,
         profile_sha256=profile_sha256,
-        version=__version__,
     )
 
 

@@ -23,8 +23,16 @@ UNDETERMINED = "undetermined"
 """In place of an uncertainty that no reading determines."""
 
 
-def number(value: float | None, digits: int = 3) -> str:
-    """A number to some significant digits, without E notation; a dash where there is none."""
+def number(value: float | None, digits: int | None = None) -> str:
+    """A number to some significant digits, by default at most three, without E notation; a dash where there is none.
+
+    >>> [number(0.1), number(0.1, 3), number(12345.6), number(9.92e-5), number(None)]
+    ['0.1', '0.100', '12346', '9.92×10⁻⁵', '–']
+    """
+    if digits is None:
+        plain, times, raised_power = number(value, 3).partition("×")
+        stripped = plain.rstrip("0").rstrip(".") if "." in plain else plain
+        return stripped + times + raised_power
     if value is None or not np.isfinite(value):
         return "–"
     if value == 0:
@@ -41,6 +49,15 @@ def fixed(value: float | None, decimals: int) -> str:
     if value is None or not np.isfinite(value):
         return "–"
     return f"{round(value, decimals) + 0.0:.{max(decimals, 0)}f}".replace("-", "−")
+
+
+def quantity(value: float | None, symbol: str, digits: int | None = None) -> str:
+    """A number with its unit.
+
+    >>> [quantity(0.25, "°"), quantity(3, "nT"), quantity(0.03, "°", 2), quantity(None, "nT")]
+    ['0.25°', '3 nT', '0.030°', '–']
+    """
+    return number(value, digits) + (unit(symbol) if value is not None else "")
 
 
 def signed(value: float | None, decimals: int) -> str:
@@ -77,7 +94,7 @@ def estimate(value: float, uncertainty: float | None, symbol: str = "") -> str:
 
 
 def contribution(value: float | None, combined: float | None) -> str:
-    """What one source adds to a combined uncertainty, to two digits; 0 below a thousandth of it.
+    """The contribution of one source to a combined uncertainty, to two digits; 0 below a thousandth of it.
 
     >>> [contribution(v, 0.013) for v in (0.00402, 1.4e-05, 1.2e-05, 3.5e-17, None)]
     ['0.0040', '0.000014', '0', '0', 'undetermined']
@@ -144,7 +161,7 @@ def capital(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def written(**files: Path | str | None) -> str:
+def files_written(**files: Path | str | None) -> str:
     """The files that were written, each with what it is."""
     return one_line("wrote " + "   ".join(f"{p} ({what})" for what, p in files.items() if p))
 

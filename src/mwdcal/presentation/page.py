@@ -8,23 +8,28 @@ from __future__ import annotations
 import io
 import re
 from base64 import b64encode
+from collections.abc import Mapping
 from hashlib import sha256
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from mwdcal import __version__
+from mwdcal.calibration.readings import head
 from mwdcal.errors import InputError
 from mwdcal.presentation.numbers import (
+    UNDETERMINED,
     capital,
     contribution,
     fixed,
     measured,
     number,
+    quantity,
     root_sum_of_squares,
     signed,
     uncertainty,
     unit,
 )
-from mwdcal.presentation.text import chance, harmless, plural, raised
+from mwdcal.presentation.text import chance, escape_controls, plural, raised
 from mwdcal.use.plots import POINT_NAMES, style
 
 if TYPE_CHECKING:
@@ -76,7 +81,7 @@ def svg(figure: Figure, key: str) -> Markup:
     for line in figure.findobj(lambda artist: (artist.get_gid() or "").startswith(POINT_NAMES)):
         _, *names = str(line.get_label()).split("\n")
         text = _with_names(text, f'<g id="{key}-{line.get_gid()}">', names)
-    head, rest = harmless(text).split(">", 1)
+    head, rest = escape_controls(text).split(">", 1)
     text = re.sub(r' (width|height|version)="[^"]*"', "", head) + ">" + rest
     seen = f'<svg role="img" aria-label="{figure.get_label()}" tabindex="0"'
     return Markup(text.replace("<svg", seen, 1))
@@ -124,7 +129,7 @@ def environment() -> Environment:
         loader=loader,
         autoescape=True,
         undefined=StrictUndefined,
-        finalize=lambda shown: harmless(shown) if type(shown) is str else shown,
+        finalize=lambda shown: escape_controls(shown) if type(shown) is str else shown,
         trim_blocks=True,
         lstrip_blocks=True,
     )
@@ -132,8 +137,18 @@ def environment() -> Environment:
     environment.filters["svg"] = svg
     script = loader.get_source(environment, "page.js")[0]
     digest = b64encode(sha256(script.encode()).digest()).decode()
-    environment.globals |= {"script": Markup(script), "script_sha256": digest}
+    environment.globals |= {
+        "script": Markup(script),
+        "script_sha256": digest,
+        "UNDETERMINED": UNDETERMINED,
+    }
     return environment
+
+
+def rendered(template: str, *metadata: Mapping[str, object], **facts: Any) -> str:
+    """A page: a template with its facts, and what all pages state: serial, whether simulated, the version."""
+    whole = {**head(*metadata), "version": __version__, **facts}
+    return environment().get_template(template).render(**whole)
 
 
 def banner(level: str, word: str, headline: str, after: str) -> dict[str, str]:
@@ -143,11 +158,13 @@ def banner(level: str, word: str, headline: str, after: str) -> dict[str, str]:
 
 def css(text: str) -> str:
     """Text as the inside of a CSS string: nothing but letters and digits is left bare."""
-    return "".join(c if c.isascii() and c.isalnum() else f"\\{ord(c):x} " for c in harmless(text))
+    return "".join(
+        c if c.isascii() and c.isalnum() else f"\\{ord(c):x} " for c in escape_controls(text)
+    )
 
 
 FILTERS = (
-    number, signed, fixed, measured, uncertainty, contribution, root_sum_of_squares, unit,
+    number, quantity, signed, fixed, measured, uncertainty, contribution, root_sum_of_squares, unit,
     raised, chance, plural, capital, css,
 )  # fmt: skip
-"""What the templates call."""
+"""The functions that the templates call."""

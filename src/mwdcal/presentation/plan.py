@@ -17,13 +17,13 @@ from mwdcal.errors import InputError
 from mwdcal.files.formats.table import Table
 from mwdcal.planning.expected import left_undetermined
 from mwdcal.planning.planned import WORKING_INCLINATIONS, Planned, station_names
-from mwdcal.presentation.envelope import enveloped
-from mwdcal.presentation.numbers import written
+from mwdcal.presentation.envelope import json_document
+from mwdcal.presentation.numbers import files_written, quantity
 from mwdcal.presentation.stations import MOST_LINES
-from mwdcal.presentation.text import one_line, quantity, table
+from mwdcal.presentation.text import one_line, table
 
 PLACE = "1σ, calibration alone, at 45° inclination"
-"""What the accuracy of a plan is of."""
+"""The conditions of the accuracy of a plan."""
 STATION_TITLES = {
     "station": "station", "temperature_c": "T, °C", "ref_inclination_deg": "inclination, °",
     "ref_azimuth_deg": "azimuth, °", "ref_toolface_deg": "toolface, °",
@@ -32,7 +32,7 @@ STATION_TITLES = {
 
 
 class PlannedTriad(msgspec.Struct, frozen=True, kw_only=True):
-    """What a plan will give of a triad: uncertainties (1σ) by parameter of the calibration file."""
+    """The result of a plan for a triad: uncertainties (1σ) by parameter of the calibration file."""
 
     standard_uncertainties: dict[str, float | None]
     order: int
@@ -57,7 +57,7 @@ class DetectableError(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PlanSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What `plan` prints of one plan.
+    """The output of `plan` for one plan.
 
     `accuracy_deg` at 45° inclination, as `calibrate` states it; `accuracy_by_inclination_deg` by angle at
     `inclinations_deg`. `efficiency_bound`: at least this share of the best D-value per parameter. Without
@@ -83,7 +83,7 @@ class PlanSummary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PlanDocument(PlanSummary, frozen=True, kw_only=True):
-    """What `plan` prints: the first plan, the others that it was compared with, and the files written."""
+    """The output of `plan`: the first plan, the others that it was compared with, and the files written."""
 
     others: list[PlanSummary]
     output: str
@@ -91,36 +91,36 @@ class PlanDocument(PlanSummary, frozen=True, kw_only=True):
 
 
 def wanted_accuracy(words: Sequence[str]) -> dict[str, float]:
-    """Accuracies such as azimuth=0.1 as numbers, degrees, by angle."""
+    """Accuracies such as azimuth_deg=0.1 as numbers, degrees, by angle."""
     wanted = {}
     for word in words:
-        name, _, value = word.partition("=")
+        name, _, value = word.replace("_deg=", "=").partition("=")
         try:
             wanted[name] = float(value)
         except ValueError:
             wanted[name] = np.nan
         if not 0 < wanted[name] < 180:
-            raise InputError(f"`accuracy` must be such as azimuth=0.1, in degrees; got {word!r}.")
+            raise InputError(f"`accuracy` must be such as azimuth_deg=0.1; got {word!r}.")
     return wanted
 
 
 def reach(words: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """What a stand reaches, such as inclination=0:120, as the least and the largest setting by angle, degrees."""
+    """The reach of a stand, such as inclination_deg=0:120, as the least and the largest setting by angle, degrees."""
     ends = {}
     for word in words:
-        name, _, limits = word.partition("=")
+        name, _, limits = word.replace("_deg=", "=").partition("=")
         low, _, high = limits.partition(":")
         try:
             ends[name] = float(low), float(high)
         except ValueError:
             raise InputError(
-                f"`reach` must be such as inclination=0:120, in degrees; got {word!r}."
+                f"`reach` must be such as inclination_deg=0:120; got {word!r}."
             ) from None
     return ends
 
 
 def facts(each: Planned) -> PlanSummary:
-    """What is said of a plan."""
+    """The statements about a plan."""
     return PlanSummary(**_fields(each))
 
 
@@ -216,7 +216,7 @@ def document(
         output=str(output or ""),
         html=str(html or ""),
     )
-    return enveloped("plan", content, {"simulated": True}, **digests)
+    return json_document("plan", content, {"simulated": True}, **digests)
 
 
 def screen(
@@ -232,12 +232,12 @@ def screen(
     if len(plans) == 1:
         blocks += [accuracy(summaries[0]), detectable(summaries[0]), stations(plans[0])]
     if output or html:
-        blocks.append(written(**{"plan": output, "run sheet": html}))
+        blocks.append(files_written(**{"plan": output, "run sheet": html}))
     return "\n\n".join(blocks)
 
 
 def comparison_rows(facts: Sequence[PlanSummary]) -> list[list[str]]:
-    """What the plans give, a plan in each column."""
+    """The results of the plans, a plan in each column."""
     lines = [
         ["stations", *(str(each.stations) for each in facts)],
         ["at the stand", *(f"{each.session_hours:.1f} h" for each in facts)],
@@ -267,7 +267,7 @@ def accuracy(each: PlanSummary) -> str:
 
 
 DETECTABLE_TITLES = ["error of one station (80 % of runs)", "noticed from", "station named from"]
-"""What heads the table of errors that `calibrate` will report."""
+"""The titles of the table of errors that `calibrate` will report."""
 
 
 def detectable_rows(each: PlanSummary) -> list[list[str]]:

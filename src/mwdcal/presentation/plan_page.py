@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mwdcal import __version__
 from mwdcal.calibration.prediction import accuracy_at
 from mwdcal.files.contract import REFERENCES
 from mwdcal.geometry.vectors import Array, Ints, reference_vectors
 from mwdcal.planning.expected import left_undetermined, planned_earth
 from mwdcal.planning.planned import Planned
 from mwdcal.planning.plans import attitudes, soak_numbers
-from mwdcal.presentation.page import banner, environment
+from mwdcal.presentation.numbers import quantity
+from mwdcal.presentation.page import banner, rendered
 from mwdcal.presentation.plan import (
     DETECTABLE_TITLES,
     PLACE,
@@ -24,7 +24,7 @@ from mwdcal.presentation.plan import (
     facts,
     station_rows,
 )
-from mwdcal.presentation.text import plural, quantity
+from mwdcal.presentation.text import plural
 from mwdcal.use import plots
 
 if TYPE_CHECKING:
@@ -39,8 +39,8 @@ def render(plans: Sequence[Planned]) -> str:
     """The sheet of the first plan, and the others beside it, as HTML."""
     first, summaries = plans[0], [facts(each) for each in plans]
     soaks = soak_numbers(first.plan)
-    template = environment().get_template("plan.html")
-    return template.render(
+    return rendered(
+        "plan.html",
         plan=first.plan.source,
         profile=first.calibration.profile.name,
         summary=summaries[0],
@@ -57,7 +57,6 @@ def render(plans: Sequence[Planned]) -> str:
         detectable_titles=DETECTABLE_TITLES,
         coverage=draw_coverage(plans),
         curves=draw_accuracy(plans),
-        version=__version__,
     )
 
 

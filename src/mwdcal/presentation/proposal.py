@@ -13,10 +13,10 @@ from mwdcal.calibration.readings import TRIADS, simulated
 from mwdcal.calibration.record import Finding
 from mwdcal.files.formats.layout import WORKBOOKS
 from mwdcal.identification.proposal import Proposal, findings_on, in_order
-from mwdcal.presentation.envelope import enveloped
-from mwdcal.presentation.numbers import written
+from mwdcal.presentation.envelope import json_document
+from mwdcal.presentation.numbers import files_written
 from mwdcal.presentation.text import one_line, plural, table
-from mwdcal.presentation.typed import findings_as_typed
+from mwdcal.presentation.typed import findings_with_option_names
 from mwdcal.sensor.profile import Axis, Profile, TableFormat, TriadProfile
 
 MOST_LEFT_OUT = 4
@@ -36,7 +36,7 @@ class ProposedTriad(TriadProfile, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class ProposalSummary(Profile, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What `profile` prints: the profile, how sure its axes are, and its file."""
+    """The output of `profile`: the profile, how sure its axes are, and its file."""
 
     run: str
     stations: int
@@ -54,10 +54,10 @@ def summary(proposal: Proposal, run: Path, output: Path | None) -> dict[str, Any
         run=run.name,
         stations=proposal.stations,
         unit_by_values=sorted(proposal.by_value),
-        findings=findings_as_typed(findings_on(proposal)),
+        findings=findings_with_option_names(findings_on(proposal)),
         profile=str(output or ""),
     )
-    return enveloped("profile", content, proposal.metadata, run=proposal.run_sha256)
+    return json_document("profile", content, proposal.metadata, run=proposal.run_sha256)
 
 
 def _triad(proposal: Proposal, kind: str) -> ProposedTriad:
@@ -107,7 +107,7 @@ def screen(proposal: Proposal, run: Path, output: Path | None) -> str:
         )
         if proposal.open_axes:
             command = f"fill in the axes in {one_line(str(output))}, then {command}"
-        blocks.append(f"{written(profile=output)}   next: {command}")
+        blocks.append(f"{files_written(profile=output)}   next: {command}")
     return "\n\n".join(blocks)
 
 

@@ -9,12 +9,12 @@ from msgspec.structs import asdict
 
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import Finding
-from mwdcal.presentation.envelope import enveloped
-from mwdcal.presentation.numbers import fixed, signed, written
+from mwdcal.geometry.units import STANDARD_GRAVITY
+from mwdcal.presentation.envelope import json_document
+from mwdcal.presentation.numbers import files_written, fixed, signed
 from mwdcal.presentation.text import one_line, table
-from mwdcal.presentation.typed import findings_as_typed
+from mwdcal.presentation.typed import findings_with_option_names
 from mwdcal.survey.references import MEASURABLE, EarthReference, FilledRun
-from mwdcal.use.strengths import STANDARD_GRAVITY
 
 DECIMALS = {"gravity": 6, "field": 1, "dip": 3, "declination": 3}
 """Digits behind the point of each value; uncertainties have as many."""
@@ -22,7 +22,7 @@ PLACE_UNITS = {"gravity": "g", "field": "nT", "dip": "°, down", "declination": 
 
 
 class ReferenceSummary(EarthReference, frozen=True, kw_only=True):
-    """What `reference` prints: the reference, and the cells that were filled in a run, by column."""
+    """The output of `reference`: the reference, and the cells that were filled in a run, by column."""
 
     filled: dict[str, int]
     output: str
@@ -30,7 +30,7 @@ class ReferenceSummary(EarthReference, frozen=True, kw_only=True):
 
 def findings(reference: EarthReference, run: FilledRun | None) -> list[Finding]:
     """Findings of the reference and of the run that was filled."""
-    return findings_as_typed([*reference.findings, *(run.findings if run else [])])
+    return findings_with_option_names([*reference.findings, *(run.findings if run else [])])
 
 
 def document(
@@ -43,7 +43,7 @@ def document(
         output=str(output or ""),
     )
     metadata = [run.table.metadata] if run else []
-    return enveloped("reference", content, *metadata, run=run.table.digest if run else "")
+    return json_document("reference", content, *metadata, run=run.table.digest if run else "")
 
 
 def screen(reference: EarthReference, run: FilledRun | None, output: Path | None) -> str:
@@ -56,7 +56,7 @@ def screen(reference: EarthReference, run: FilledRun | None, output: Path | None
     if run:
         blocks.append(one_line("filled " + "   ".join(f"{c}: {n}" for c, n in run.cells.items())))
     if output:
-        blocks.append(written(run=output) if run else written(reference=output))
+        blocks.append(files_written(run=output) if run else files_written(reference=output))
     return "\n\n".join(blocks)
 
 
@@ -83,7 +83,7 @@ def rows(reference: EarthReference) -> list[list[str]]:
 
 
 def notes(reference: EarthReference) -> list[str]:
-    """What turns azimuths, and where figures come from."""
+    """The causes that turn azimuths, and where figures come from."""
     sources = reference.sources
     lines = [f"true azimuth = magnetic azimuth {signed(reference.offset_deg('true'), 3)}°"]
     if reference.convergence_deg is not None:

@@ -1,4 +1,4 @@
-"""What is printed of a registry, for people and for machines."""
+"""The printed output of a registry, for people and for machines."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mwdcal.calibration.diagnosis.identity import FROM_THE_FUTURE, UNIDENTIFIED
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.calibration.record import Finding
 from mwdcal.files.formats.columns import shown
-from mwdcal.presentation.envelope import enveloped
+from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.numbers import number
 from mwdcal.presentation.text import UNCUT, one_line, plural, table
 from mwdcal.registry.checking import Discrepancy
@@ -21,7 +21,7 @@ from mwdcal.registry.lookup import ListedRecord, ListedTool, Listing, alike
 from mwdcal.registry.store import Registry
 
 KEYS = ("number", "kind", "sha256", "name")
-"""What names a record in a document."""
+"""The key that names a record in a document."""
 ACCURACIES = ("inclination", "toolface", "azimuth")
 MOST_REFUSED = 20
 """Most findings of a kind."""
@@ -44,7 +44,7 @@ class RegistryUpgraded(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RegistryAdded(msgspec.Struct, frozen=True, kw_only=True):
-    """What was added: new records by kind, how many were known or refused, each file; the newest event."""
+    """The additions: new records by kind, how many were known or refused, each file; the newest event."""
 
     registry: str
     new: dict[str, int]
@@ -113,11 +113,11 @@ class RegistryChecked(msgspec.Struct, frozen=True, kw_only=True):
 
 def document(command: str, content: object, *metadata: Mapping[str, object]) -> dict[str, Any]:
     """A result for machines."""
-    return enveloped(command, content, *metadata)
+    return json_document(command, content, *metadata)
 
 
 def added(registry: Registry, adding: Adding) -> RegistryAdded:
-    """What became of all files."""
+    """The outcome for all files."""
     results = adding.results
     findings = [*_refusals(results), *_doubts(registry, adding)]
     events, head = registry.head()
@@ -162,7 +162,7 @@ def _refusal(group: Sequence[FileResult]) -> str:
 
 
 def _doubts(registry: Registry, adding: Adding) -> list[Finding]:
-    """What was added, and may not be as it was meant."""
+    """Additions that may not be as they were meant."""
     findings = []
     if adding.unidentified:
         text = (
@@ -249,7 +249,7 @@ def copied_text(result: RegistryCopied) -> str:
 
 
 def problems_of(result: RegistryChecked) -> list[Finding]:
-    """What a check found, as findings."""
+    """The discrepancies of a check, as findings."""
     return [Finding(id=each.id, text=f"{each.text}.") for each in result.discrepancies]
 
 

@@ -31,8 +31,8 @@ from mwdcal.errors import InputError
 from mwdcal.files import documents
 from mwdcal.files.formats.members import Member
 from mwdcal.presentation.calibration_source import calibration_file
-from mwdcal.presentation.envelope import enveloped
-from mwdcal.presentation.numbers import written
+from mwdcal.presentation.envelope import json_document
+from mwdcal.presentation.numbers import files_written
 from mwdcal.presentation.text import one_line, table
 
 IN_SHORT = {
@@ -46,7 +46,7 @@ IN_SHORT = {
 }
 """The states of a calibration's signature, as part of a line."""
 FILE_STATES = {"unchanged": "unchanged", "changed": "CHANGED", "missing": "not checked: not found"}
-"""What is said of the files of a certificate."""
+"""The statements about the files of a certificate."""
 
 
 class SignedDocument(msgspec.Struct, frozen=True, kw_only=True):
@@ -77,14 +77,14 @@ class KeysDocument(msgspec.Struct, frozen=True, kw_only=True):
     keys: list[TrustedKey]
 
 
-def in_short(check: SignatureCheck) -> str:
+def signature_status(check: SignatureCheck) -> str:
     """The state of a calibration's signature, as part of a line."""
     name = f"{check.key} ({check.owner})" if check.owner else check.key
     return one_line(IN_SHORT[check.state].format(key=name))
 
 
 def signed_document(data: bytes, path: Path, folder: Path) -> tuple[SignedDocument, dict[str, Any]]:
-    """What was signed, and the fields of the document.
+    """The signed bytes, and the fields of the document.
 
     `folder`: where the files of a certificate are looked for, of which one may have changed.
     """
@@ -109,7 +109,7 @@ def signed(result: SignedDocument, fields: Mapping[str, Any]) -> str:
 def checked_document(
     file: Member, path: Path, keys: Mapping[str, TrustedKey], named: Sequence[Path]
 ) -> tuple[CheckedDocument, dict[str, Any]]:
-    """What the signature in a file says, and the fields of the document.
+    """The state of the signature in a file, and the fields of the document.
 
     The files of a certificate are looked up only where it is intact: a stranger's may name any.
     """
@@ -137,11 +137,11 @@ def for_machines(
     command: str, result: object, fields: Mapping[str, Any], digest: str
 ) -> dict[str, Any]:
     """The result, of a document with these fields, whose file had that SHA-256."""
-    return enveloped(f"certificate {command}", result, _stated(fields), document=digest)
+    return json_document(f"certificate {command}", result, _stated(fields), document=digest)
 
 
 def _stated(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """What a document says of its tool, and whether it is simulated."""
+    """The statements of a document about its tool, and whether it is simulated."""
     return {name: fields[name] for name in ("serial", "simulated") if name in fields}
 
 
@@ -171,7 +171,7 @@ def keys(result: KeysDocument, **files: Path) -> str:
     """One row for each key, and the files that were written."""
     rows = [[key.key, key.owner, key.created[:10], _standing(key)] for key in result.keys]
     shown = table(rows, ["key", "owner", "created", ""])
-    return f"{shown}\n\n{written(**files)}" if files else shown
+    return f"{shown}\n\n{files_written(**files)}" if files else shown
 
 
 def _standing(key: TrustedKey) -> str:

@@ -12,9 +12,9 @@ from mwdcal.calibration.readings import SIMULATED
 from mwdcal.planning.procedure import PERCENTILES, Repetition, Share
 from mwdcal.planning.session import Session
 from mwdcal.planning.simulate import Effects
-from mwdcal.presentation.envelope import enveloped
-from mwdcal.presentation.numbers import fixed, number, written
-from mwdcal.presentation.text import one_line, plural, quantity, table
+from mwdcal.presentation.envelope import json_document
+from mwdcal.presentation.numbers import files_written, fixed, number, quantity
+from mwdcal.presentation.text import one_line, plural, table
 
 SIZES = {
     "inclination_zero_deg": ("inclination zero", "°"),
@@ -27,7 +27,7 @@ SIZES = {
 
 
 class TrueAttitude(msgspec.Struct, frozen=True, kw_only=True):
-    """What is true of a station: angles that the stand has turned to, and the temperature of the sensors."""
+    """The truth of a station: angles that the stand has turned to, and the temperature of the sensors."""
 
     station: str
     inclination_deg: float
@@ -37,7 +37,7 @@ class TrueAttitude(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SimulationSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What `simulate` writes of the truth behind a run, and prints.
+    """The truth behind a run, as `simulate` writes and prints it.
 
     Parameters by triad in raw units, as `convert` prints them in this `notation`: factors (SF, B, m), or affine (M, b)
     for a calibration that is linear in its parameters above order 0. `stand`: errors common to the session, such
@@ -78,7 +78,7 @@ def document(
     fields = {"plan": session.plan.source, "tool": session.profile.name, "effects": session.effects}
     content = msgspec.convert(msgspec.to_builtins({**fields, **facts, **named}), SimulationSummary)
     labels = {"simulated": True, "serial": serial}
-    return enveloped("simulate", content, labels, **digests)
+    return json_document("simulate", content, labels, **digests)
 
 
 def screen(document: Mapping[str, Any]) -> str:
@@ -100,7 +100,7 @@ def screen(document: Mapping[str, Any]) -> str:
     blocks = [one_line("   ".join(head)), errors]
     if document["output"]:
         follow = f"next: mwdcal calibrate {document['output']} --tool TOOL.toml -o CAL.json"
-        files = written(run=document["output"], truth=document["truth"])
+        files = files_written(run=document["output"], truth=document["truth"])
         blocks.append(f"{files}   {one_line(follow)}")
     return "\n\n".join(blocks)
 
@@ -122,7 +122,7 @@ def repeated(document: Mapping[str, Any]) -> str:
         ["of all tools", "tools", "share", "95 % interval"],
     )
     named = {"tools": document["output"], "picture": document["plot"]}
-    files = [written(**named)] * any(named.values())
+    files = [files_written(**named)] * any(named.values())
     refused = [f"refused: {', '.join(f'{k} {v}' for k, v in result.refused.items())}"] * bool(
         result.refused
     )

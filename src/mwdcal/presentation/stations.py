@@ -12,7 +12,7 @@ from mwdcal.calibration.record import Finding
 from mwdcal.files.contract import RAW
 from mwdcal.logs.stations import Stations
 from mwdcal.presentation.noise import rounded
-from mwdcal.presentation.numbers import written
+from mwdcal.presentation.numbers import files_written
 from mwdcal.presentation.text import one_line, plural, table
 
 MOST_LINES = 40
@@ -20,7 +20,7 @@ MOST_LINES = 40
 
 
 class StationsSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What `stations` prints: an entry for each station, what was left, and the files written."""
+    """The output of `stations`: an entry for each station, what was left, and the files written."""
 
     log: str
     rows: int
@@ -73,26 +73,26 @@ def _seconds(stations: Stations) -> float:
 
 
 def body(stations: Stations) -> str:
-    """What was found, for people."""
+    """The result, for people."""
     lines = [one_line("   ".join(heading(stations))), "   ".join(search(stations)), ""]
     return "\n".join([*lines, _stations_table(stations)])
 
 
 def screen(stations: Stations, files: dict[str, str]) -> str:
-    """What was found, the files that were written, and what to do next."""
-    outputs = written(run=files["output"], picture=files["plot"], report=files["report"])
+    """The result, the files that were written, and what to do next."""
+    outputs = files_written(run=files["output"], picture=files["plot"], report=files["report"])
     return f"{body(stations)}\n{outputs}   next: {one_line(next_command(files['output']))}"
 
 
 def shown_in(plot: Path | None, report: Path | None) -> str:
     """Where a log without a station is shown."""
     if plot or report:
-        return written(picture=plot, report=report)
+        return files_written(picture=plot, report=report)
     return "--report or --plot shows the log."
 
 
 def next_command(output: str) -> str:
-    """What to do with the run."""
+    """The advice for the run."""
     return f"mwdcal calibrate {output} -o CAL.json"
 
 

@@ -6,15 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal import __version__
 from mwdcal.calibration.diagnosis.findings import UNUSED
-from mwdcal.calibration.readings import is_simulated, serial_of
+from mwdcal.calibration.readings import serial_of
 from mwdcal.files.contract import RAW
 from mwdcal.geometry.vectors import Array
 from mwdcal.logs.station_means import ALL_STILL
 from mwdcal.logs.stations import Stations
 from mwdcal.presentation.numbers import capital, channels_of, fixed, measured
-from mwdcal.presentation.page import banner, environment
+from mwdcal.presentation.page import banner, rendered
 from mwdcal.presentation.stations import extent, left, next_command, search, share
 from mwdcal.presentation.text import plural
 from mwdcal.use import plots
@@ -50,26 +49,21 @@ def render(stations: Stations, log_sha256: str, output: str = "", why: str = "")
     A log without a station has none, but the reason `why`.
     """
     metadata = stations.table.metadata
-    return (
-        environment()
-        .get_template("standstills.html")
-        .render(
-            result=stations,
-            log=stations.table.source,
-            heading=_heading(stations),
-            serial=serial_of(metadata),
-            simulated=is_simulated(metadata),
-            banner=_banner(stations, output, why),
-            findings=stations.findings,
-            figure=figure(stations),
-            **_table(stations),
-            left=left(stations),
-            reasons=LEFT_OUT,
-            search=search(stations),
-            log_sha256=log_sha256,
-            output=output,
-            version=__version__,
-        )
+    return rendered(
+        "standstills.html",
+        metadata,
+        result=stations,
+        log=stations.table.source,
+        heading=_heading(stations),
+        banner=_banner(stations, output, why),
+        findings=stations.findings,
+        figure=figure(stations),
+        **_table(stations),
+        left=left(stations),
+        reasons=LEFT_OUT,
+        search=search(stations),
+        log_sha256=log_sha256,
+        output=output,
     )
 
 

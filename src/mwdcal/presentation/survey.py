@@ -15,9 +15,9 @@ from mwdcal.calibration.canonical import SignatureCheck
 from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import Finding, stated
-from mwdcal.presentation.envelope import enveloped, with_signature
-from mwdcal.presentation.numbers import fixed, measured, number, signed, written
-from mwdcal.presentation.signature import in_short
+from mwdcal.presentation.envelope import json_document, with_signature
+from mwdcal.presentation.numbers import files_written, fixed, measured, number, signed
+from mwdcal.presentation.signature import signature_status
 from mwdcal.presentation.text import chance, one_line, plural, table
 from mwdcal.survey.interference import Interference, InterferenceSize, MultiStationAnalysis
 from mwdcal.survey.norths import North
@@ -111,7 +111,7 @@ def interference_screen(result: Interference, *metadata: Mapping[str, object]) -
 MOST_SURVEYS = 30
 """Surveys of a table on screen."""
 OUTCOMES = {"true": "accepted", "false": "REJECTED", "": "not judged"}
-"""What the column `accepted` says, in words."""
+"""The column `accepted` in words."""
 
 
 class EndOfPath(msgspec.Struct, frozen=True, kw_only=True):
@@ -129,7 +129,7 @@ class EndOfPath(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What `survey` prints: stations counted by outcome, what they were judged by, where the path ends.
+    """The output of `survey`: stations counted by outcome, what they were judged by, where the path ends.
 
     `blind`: accepted ones whose azimuth interference could turn and still pass.
     `reference_sources`: where gravity, field, dip, declination and convergence come from, by name.
@@ -165,7 +165,7 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def refusal(inputs: WellInputs, msa: MultiStationAnalysis) -> SurveySummary:
-    """What a multi-station analysis says that cannot be used: none of the surveys is judged, nothing is written."""
+    """The refusal of a multi-station analysis: none of the surveys is judged, nothing is written."""
     rows, north = inputs.surveys.readings.count, inputs.surveys.north
     return SurveySummary(
         rows=rows,
@@ -200,7 +200,7 @@ def result_summary(result: SurveyedWell, output: str = "", html: str = "") -> Su
 
 def document(inputs: WellInputs, facts: SurveySummary, signature: SignatureCheck) -> dict[str, Any]:
     """The document of a result or of a refusal, with what all inputs say of themselves."""
-    whole = enveloped("survey", facts, *inputs.stated, **inputs.digests)
+    whole = json_document("survey", facts, *inputs.stated, **inputs.digests)
     return with_signature(whole, signature)
 
 
@@ -253,7 +253,7 @@ def summary(
 
 
 def _stated(north: North, terms: ErrorTerms) -> dict[str, Any]:
-    """What turns azimuths, degrees, and what their uncertainty holds."""
+    """The causes that turn azimuths, degrees, and what their uncertainty holds."""
     sd = None if north.declination is None else north.declination_sd
     angles = {
         "declination_deg": north.declination,
@@ -297,7 +297,7 @@ def screen(
     if facts.blind:
         counts.append(f"{facts.blind} blind to interference")
     heading = [well.readings.source, plural(facts.rows, "survey"), *counts]
-    heading += [in_short(signature), *simulated(*metadata)]
+    heading += [signature_status(signature), *simulated(*metadata)]
     source = f" ({facts.source})" if facts.source else ""
     lines = [
         "   ".join(heading),
@@ -315,7 +315,7 @@ def screen(
             *map(one_line, lines),
             "",
             survey_table(well, facts.rows),
-            *([written(table=facts.output, page=facts.html)] if facts.output else []),
+            *([files_written(table=facts.output, page=facts.html)] if facts.output else []),
         ]
     )
 

@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal import __version__
-from mwdcal.calibration.readings import is_simulated, serial_of
 from mwdcal.calibration.record import Finding
 from mwdcal.geometry.vectors import Array, wrap
-from mwdcal.presentation.page import banner, environment
+from mwdcal.presentation.interference_page import LARGEST_DRAWN_SD, sections
+from mwdcal.presentation.page import banner, rendered
 from mwdcal.presentation.survey import (
     SurveySummary,
     declination_in_words,
@@ -25,6 +24,7 @@ from mwdcal.presentation.survey import (
 )
 from mwdcal.presentation.text import plural
 from mwdcal.survey.acceptance import SURVEY_UNITS
+from mwdcal.survey.interference import Interference
 from mwdcal.survey.well import Position, Well
 from mwdcal.use.plots import AFTER, BAND, BEFORE, MARKED, SERIES, new_figure, style
 
@@ -37,8 +37,6 @@ ELLIPSE_SDS = 2.0
 """Standard deviations of the ellipses of position."""
 ELLIPSE_SHARE = 0.08
 """Largest half axis of an ellipse as a share of the path."""
-LARGEST_DRAWN_SD = 2.0
-"""Standard uncertainty up to which an angle is drawn, degrees: near vertical that of azimuth grows without end."""
 MOST_ELLIPSES = 12
 """Ellipses of position on a map."""
 MOST_MARKS = 400
@@ -240,38 +238,39 @@ MOST_ROWS_OF_PAGE = 2000
 """Surveys in the table of a page."""
 
 
-def render(well: Well, findings: list[Finding], sha256: Mapping[str, str]) -> str:
-    """The surveys as HTML; `sha256` of the files they come from, by what these are."""
+def render(
+    well: Well,
+    findings: list[Finding],
+    sha256: Mapping[str, str],
+    analysis: Interference | None = None,
+) -> str:
+    """The surveys as HTML, with a multi-station analysis; `sha256` of the files they come from, by what these are."""
     facts = summary(well, well.counts, "", "")
     stated = well.readings.metadata, well.calibration.tool
     header, rows = survey_rows(well, MOST_ROWS_OF_PAGE)
     located = has_path(well.position)
-    return (
-        environment()
-        .get_template("survey.html")
-        .render(
-            facts=facts,
-            modelled=well.limits.probability is not None,
-            readings=well.readings.source,
-            serial=next(filter(None, map(serial_of, stated)), None),
-            simulated=any(map(is_simulated, stated)),
-            banner=_banner(facts),
-            findings=findings,
-            strengths=strengths(well) if facts.not_judged < facts.rows else None,
-            angles=angles(well),
-            path=path(well) if located else None,
-            enlarged=enlargement(well.position) if located and well.position else 1.0,
-            terms=well.terms.sentence,
-            declination=declination_in_words(facts),
-            sources=sources_in_words(facts).partition("   ")[2],
-            end=end_in_words(facts.end, facts.north) if facts.end else "",
-            header=header,
-            rows=rows,
-            more=facts.rows - len(rows),
-            calibration=well.calibration.run_name,
-            sha256=sha256,
-            version=__version__,
-        )
+    return rendered(
+        "survey.html",
+        *stated,
+        facts=facts,
+        modelled=well.limits.probability is not None,
+        readings=well.readings.source,
+        banner=_banner(facts),
+        findings=findings,
+        strengths=strengths(well) if facts.not_judged < facts.rows else None,
+        angles=angles(well),
+        path=path(well) if located else None,
+        enlarged=enlargement(well.position) if located and well.position else 1.0,
+        terms=well.terms.sentence,
+        declination=declination_in_words(facts),
+        sources=sources_in_words(facts).partition("   ")[2],
+        end=end_in_words(facts.end, facts.north) if facts.end else "",
+        header=header,
+        rows=rows,
+        analysis=sections(analysis) if analysis else None,
+        more=facts.rows - len(rows),
+        calibration=well.calibration.run_name,
+        sha256=sha256,
     )
 
 

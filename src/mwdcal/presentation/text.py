@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import codecs
-import math
 import os
 import re
 import sys
@@ -40,7 +39,7 @@ TWINS = {chr(0xA0): " ", chr(0x2009): " ", chr(0x202F): " ", "‰": "per mille"}
         "₀ _0  ₁ _1  ₂ _2  ₃ _3  ₄ _4  ₅ _5  ₆ _6  ₇ _7  ₈ _8  ₉ _9  ᵢ _i  ⱼ _j  ᵏ ^k",
     )
 )
-"""What stands for a character where the encoding of the output lacks it; raised digits become ^2."""
+"""The replacement of a character where the encoding of the output lacks it; raised digits become ^2."""
 _BIDI = "\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069"
 _CONTROL = rf"\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff{_BIDI}"
 _UNSAFE = re.compile(f"[{_CONTROL}]")
@@ -65,7 +64,7 @@ def one_line(text: object) -> str:
     return _UNSAFE.sub(_escape, str(text))
 
 
-def harmless(text: str) -> str:
+def escape_controls(text: str) -> str:
     """As `one_line`, but line breaks stay."""
     return UNSAFE_BUT_LINES.sub(_escape, text)
 
@@ -94,7 +93,7 @@ def _escape(unsafe: re.Match[str]) -> str:
     return unsafe[0].encode("unicode_escape").decode("ascii")
 
 
-def fitting(text: str, encoding: str | None) -> str:
+def transliterate(text: str, encoding: str | None) -> str:
     r"""The text with plain twins of the characters that the encoding lacks.
 
     >>> fitting("1σ 0.1° 10⁻³ Ω", "ascii")
@@ -118,18 +117,6 @@ def _twins(error: UnicodeError) -> tuple[str, int]:
 codecs.register_error(_HANDLER, _twins)
 
 
-def number(value: float | None) -> str:
-    """Three significant digits, or a dash."""
-    if value is None or math.isnan(value):
-        return "–"
-    return f"{value + 0.0:.3g}" if abs(value) < 100 else f"{value:.0f}"
-
-
-def quantity(value: float | None, unit: str) -> str:
-    """A value with its unit; no space before the degree sign."""
-    return number(value) if value is None else f"{number(value)}{'' if unit == '°' else ' '}{unit}"
-
-
 def plural(count: int, noun: str) -> str:
     """A count with its noun: 1 station, 2 stations."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
@@ -142,12 +129,12 @@ def chance(probability: float | None) -> str:
     ['0.41', '0.00012', '< 1e-9', '–']
     """
     if probability is None:
-        return number(probability)
+        return "–"
     return "< 1e-9" if probability < 1e-9 else f"{probability:.2g}"
 
 
 def columns(stream: Any) -> int | None:
-    """Columns to fill on the terminal that a stream is; None where it is none."""
+    """Terminal width, or None if the stream is not a terminal."""
     if not stream.isatty():
         return None
     stated = os.environ.get("COLUMNS", "")
@@ -168,7 +155,7 @@ def laid_out(text: str, stream: Any) -> str:
         deeper = len(line) - len(line.lstrip(" ")) + 2
         return "# " if " # " in f" {line}" else " " * deeper
 
-    lines = fitting(text, stream.encoding).split("\n")
+    lines = transliterate(text, stream.encoding).split("\n")
     return "\n".join(fold(line, width, indent(line)) for line in lines)
 
 
@@ -207,15 +194,16 @@ def table(rows: list[list[str]], header: list[str], width: int = WIDEST, names: 
     rows: the first, or several. Elsewhere the table has at most a `width`.
     """
     cells = [
-        [fitting(one_line(cell), sys.stdout.encoding) for cell in row] for row in [header, *rows]
+        [transliterate(one_line(cell), sys.stdout.encoding) for cell in row]
+        for row in [header, *rows]
     ]
     whole, room = list(zip(*cells, strict=True)), columns(sys.stdout)
     if room is None:
-        return _drawn(whole, width)
-    return "\n\n".join(_drawn(some, UNCUT) for some in _abreast(whole, room, names))
+        return _render_table(whole, width)
+    return "\n\n".join(_render_table(some, UNCUT) for some in _split_columns(whole, room, names))
 
 
-def _abreast(whole: Sequence[Column], room: int, names: int) -> list[list[Column]]:
+def _split_columns(whole: Sequence[Column], room: int, names: int) -> list[list[Column]]:
     """The columns of a table in as many tables as they need, with the first ones in each."""
 
     def left(some: Sequence[Column]) -> int:
@@ -246,7 +234,7 @@ def _width(column: Iterable[str]) -> int:
     return max((cell_len(line) for cell in column for line in cell.split("\n")), default=0)
 
 
-def _drawn(whole: Sequence[Column], width: int) -> str:
+def _render_table(whole: Sequence[Column], width: int) -> str:
     """The columns of a table side by side; those with folded cells begin at the left."""
     room = _shared_out([_width(column) for column in whole], width - BETWEEN * (len(whole) - 1))
     tallest = max(title.count("\n") for title, *_ in whole)

@@ -9,8 +9,9 @@ from msgspec import UNSET
 
 from mwdcal.calibration.canonical import SignatureCheck
 from mwdcal.calibration.readings import simulated
-from mwdcal.presentation.signature import in_short
-from mwdcal.presentation.text import NOT_STATED, WIDE, chance, one_line, quantity, table
+from mwdcal.presentation.numbers import measured, quantity, unit
+from mwdcal.presentation.signature import signature_status
+from mwdcal.presentation.text import NOT_STATED, WIDE, chance, one_line, table
 from mwdcal.use.verification import SETTING_PRACTICES, JudgedSet, Verdict, VerdictRow
 
 FREEDOM = "DoF"
@@ -30,13 +31,13 @@ def screen(
     """
     rows = []
     for row in result.rows:
-        sd = uncertainty(row.uncertainty, row.unit)
-        raw, value, limit = (quantity(v, row.unit) for v in (row.raw, row.value, row.limit))
+        (value, sd), limit = noise_free(row, row.unit), quantity(row.limit, row.unit)
+        raw = quantity(row.raw, row.unit)
         verdict = "pass" if row.passed else "FAIL"
         rows.append([row.name, raw, value, sd, freedom(row), limit, verdict, row.note])
     outcome = "PASS" if result.passed else "FAIL"
     first = [outcome, result.run, f"{result.stations} stations"]
-    first += [in_short(signature)] if signature else []
+    first += [signature_status(signature)] if signature else []
     first += simulated(*metadata)
     source = f" ({result.source})" if result.source else ""
     lines = ["   ".join(first), f"limits {result.limits}{source}", f"rule: {result.rule}"]
@@ -58,20 +59,13 @@ def next_step(result: Verdict, calibration: Path, run: Path) -> str:
 
 
 def _sets(result: Verdict) -> list[str]:
-    """What each roll set shows of each limit, where there are several."""
+    """The result of each roll set for each limit, where there are several."""
     rows = [
         [row.name, one_line(each.label or BETWEEN_SETS), *map(str, cells)]
         for row in result.rows
         if len(row.sets) > 1 and row.uncertainty is not None
         for each in row.sets
-        for cells in [
-            [
-                quantity(each.raw, row.unit),
-                quantity(each.value, row.unit),
-                uncertainty(each.uncertainty, row.unit),
-                freedom(each),
-            ]
-        ]
+        for cells in [[quantity(each.raw, row.unit), *noise_free(each, row.unit), freedom(each)]]
     ]
     return (
         [table(rows, ["each roll set by itself", "", "raw", "noise-free", "1σ", FREEDOM])]
@@ -80,9 +74,12 @@ def _sets(result: Verdict) -> list[str]:
     )
 
 
-def uncertainty(value: float | None, unit: str) -> str:
-    """A standard uncertainty, or that it is not stated."""
-    return NOT_STATED if value is None else quantity(value, unit)
+def noise_free(judged: VerdictRow | JudgedSet, symbol: str) -> tuple[str, str]:
+    """Value and 1σ of a limit or roll set, both to two digits of the latter; or that it is not stated."""
+    if judged.uncertainty is None or judged.value is None:
+        return quantity(judged.value, symbol), NOT_STATED
+    value, sd = measured(judged.value, judged.uncertainty)
+    return value + unit(symbol), sd + unit(symbol)
 
 
 def freedom(judged: VerdictRow | JudgedSet) -> str:

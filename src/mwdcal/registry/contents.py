@@ -1,4 +1,4 @@
-"""What a file is to a registry: the records that are made of it, by its content."""
+"""A file as a registry sees it: the records that are made of it, by its content."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ class ExportedFile(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Manifest(msgspec.Struct, frozen=True, kw_only=True):
-    """What an export holds: `events` of the history, the newest with the hash `head`, and all files."""
+    """The contents of an export: `events` of the history, the newest with the hash `head`, and all files."""
 
     schema_version: int = EXPORT_VERSION
     command: str = "registry export"

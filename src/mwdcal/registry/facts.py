@@ -1,9 +1,8 @@
-"""What a registry knows of a document, read from its bytes alone: one function for each kind."""
+"""The facts of a document, read from its bytes alone: one function for each kind."""
 
 from __future__ import annotations
 
 import base64
-import hashlib
 import json
 import math
 import re
@@ -14,6 +13,7 @@ from typing import Any
 import msgspec
 
 from mwdcal.calibration.readings import is_simulated, stated_day
+from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError
 from mwdcal.files import metadata
 
@@ -30,7 +30,7 @@ _METADATA_LINES = 200
 
 
 class Facts(msgspec.Struct, frozen=True, kw_only=True):
-    """What is indexed of a document; None where it does not say.
+    """The indexed facts of a document; None where it does not state them.
 
     `type`: of the tool, or the quantity of a standard. `label`: what people call it, such as a
     certificate's number. `time`: of the measurement, or of issue, ISO 8601 in UTC. `run`,
@@ -236,7 +236,7 @@ def _public_key(data: bytes, name: str) -> Facts:
         raise ValueError("no public key in PEM form")
     raw = base64.b64decode(b"".join(block[1].split()), validate=True)[-_RAW_KEY:]
     stated = owner[1].decode("utf-8", "replace").strip() if owner else ""
-    return Facts(label=_text(stated), type=hashlib.sha256(raw).hexdigest()[:16])
+    return Facts(label=_text(stated), type=sha256_of(raw)[:16])
 
 
 RECORD_KINDS: dict[str, Callable[[bytes, str], Facts]] = {
@@ -257,4 +257,4 @@ RECORD_KINDS: dict[str, Callable[[bytes, str], Facts]] = {
 
 def content_address(data: bytes) -> str:
     """The SHA-256 by which an object is addressed."""
-    return hashlib.sha256(data).hexdigest()
+    return sha256_of(data)

@@ -23,7 +23,7 @@ from mwdcal.registry.database.tools import TOOL_KINDS
 from mwdcal.registry.exports import read_manifest
 from mwdcal.registry.facts import content_address
 from mwdcal.registry.queries import records_page
-from mwdcal.registry.store import Draft, Entry, Registry, draft
+from mwdcal.registry.store import Draft, Entry, Registry, rows_to_insert
 
 FILES_AT_ONCE = 50
 """Files of a portion."""
@@ -52,7 +52,7 @@ class Source(NamedTuple):
 
 @dataclass
 class Prepared:
-    """What a source holds: drafts of records, or a `doubtful` one of a table that may be a run.
+    """The contents of a source: drafts of records, or a `doubtful` one of a table that may be a run.
 
     `problems` say what is wrong. SHA-256 of calibrations: `undated` of those that state no day of measurement,
     `changed` of those whose contents are not those that were written.
@@ -67,7 +67,7 @@ class Prepared:
 
 
 class FileResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What became of a file: how many records are new, known already, or refused; and why."""
+    """The outcome for a file: how many records are new, known already, or refused; and why."""
 
     file: str
     kind: str
@@ -78,7 +78,7 @@ class FileResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def sources(paths: Iterable[Path]) -> list[Source]:
-    """What there is to add at some paths: files, and all files of folders; row groups of fleets by themselves.
+    """The sources to add at some paths: files, and all files of folders; row groups of fleets by themselves.
 
     Raises:
         InputError: a path at which there is nothing, or an export with a damaged manifest.
@@ -121,17 +121,17 @@ def portions(whole: Sequence[Source]) -> list[Sequence[Source]]:
 
 
 def solve(portion: Sequence[Source]) -> bytes:
-    """What a portion holds, for another process: a list of `Prepared`."""
+    """The contents of a portion, for another process: a list of `Prepared`."""
     return pickle.dumps([prepared(source) for source in portion])
 
 
 def prepared(source: Source) -> Prepared:
-    """What a source holds; what is wrong with it is data."""
+    """The contents of a source; what is wrong with it is data."""
     result = Prepared(source)
     try:
         entries = _entries(source)
     except contents.UnlikeRunError as error:
-        result.doubtful = draft(error.entry)
+        result.doubtful = rows_to_insert(error.entry)
         result.problems.append(str(error))
         return result
     except MwdcalError as error:
@@ -139,7 +139,7 @@ def prepared(source: Source) -> Prepared:
         return result
     for entry in entries:
         try:
-            calibration, one = contents.checked(entry), draft(entry)
+            calibration, one = contents.checked(entry), rows_to_insert(entry)
             result.drafts.append(one)
             if calibration and not stated_day(calibration.tool):
                 result.undated.add(one["sha256"])
@@ -189,7 +189,7 @@ class Adding:
 
     @property
     def results(self) -> list[FileResult]:
-        """What became of each file."""
+        """The outcome for each file."""
         return [*self._files.values()]
 
     def take(self, each: Prepared) -> None:

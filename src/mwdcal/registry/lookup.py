@@ -1,4 +1,4 @@
-"""What people ask of a registry by a word: the tools, the past of one, a document by serial, hash or number."""
+"""Questions to a registry by a word: the tools, the past of one, a document by serial, hash or number."""
 
 from __future__ import annotations
 
@@ -223,7 +223,7 @@ def alike(registry: Registry, serials: Collection[str]) -> list[list[str]]:
 
 
 def _spelling(serial: str) -> str:
-    """What is common to the ways in which people write a serial."""
+    """The common part of the ways in which people write a serial."""
     if serial.isascii():
         return "".join(serial.casefold().split())
     characters = normalize("NFKC", serial).casefold()

@@ -1,4 +1,4 @@
-"""What lists and pages ask of a registry. Rows are mappings with the columns of `database.models`."""
+"""Queries of lists and pages to a registry. Rows are mappings with the columns of `database.models`."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ from mwdcal.registry.stored import (
 )
 
 Draft = dict[str, Any]
-"""What is inserted of an entry: see `draft`."""
+"""The rows inserted for an entry: see `draft`."""
 
 
 class Entry(NamedTuple):
@@ -44,7 +44,7 @@ class Entry(NamedTuple):
 
 
 class Added(NamedTuple):
-    """What became of an entry: the record of it, and whether it is new."""
+    """The outcome for an entry: the record of it, and whether it is new."""
 
     number: int
     kind: str
@@ -62,7 +62,7 @@ class Registry:
 
     @property
     def name(self) -> str:
-        """What messages call it: its file, or its URL without password."""
+        """Its name in messages: its file, or its URL without password."""
         return self.database.name
 
     @contextlib.contextmanager
@@ -92,7 +92,7 @@ class Registry:
             InputError: a file is not of its kind, its serial is another than the entry's, or the
                 database refuses.
         """
-        return self.insert([draft(entry) for entry in entries], actor, when)
+        return self.insert([rows_to_insert(entry) for entry in entries], actor, when)
 
     def insert(
         self,
@@ -175,7 +175,7 @@ def person(actor: str) -> str:
     return name
 
 
-def draft(entry: Entry) -> Draft:
+def rows_to_insert(entry: Entry) -> Draft:
     """The rows of an entry, without their number: columns of a record, and `object`."""
     if len(entry.data) > LARGEST_OBJECT:
         raise InputError(
@@ -203,19 +203,21 @@ def draft(entry: Entry) -> Draft:
 
 def _insert(connection: sa.Connection, drafts: Sequence[Draft], who: str, time: str) -> list[Added]:
     """Insert what is new, with its events; what became of each."""
-    known = _known(connection, [draft["sha256"] for draft in drafts])
+    known = _known(connection, [rows_to_insert["sha256"] for rows_to_insert in drafts])
     stored = {sha256 for sha256, _ in known}
     number, previous = chain.head(connection)
     rows, packed, events, result = [], [], [], []
-    for draft in drafts:
-        row = {name: value for name, value in draft.items() if name != "object"}
+    for rows_to_insert in drafts:
+        row = {name: value for name, value in rows_to_insert.items() if name != "object"}
         key = (row["sha256"], row["kind"])
         new = key not in known
         if new:
             number += 1
             known[key] = (number, row["serial"])
             row["number"] = number
-            object_row = None if row["sha256"] in stored else {"number": number, **draft["object"]}
+            object_row = (
+                None if row["sha256"] in stored else {"number": number, **rows_to_insert["object"]}
+            )
             if object_row:
                 packed.append(object_row)
                 stored.add(row["sha256"])

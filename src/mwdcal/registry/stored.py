@@ -31,7 +31,7 @@ Row = Mapping[str, Any]
 
 
 class AlteredError(FitError):
-    """What is stored in a registry is not what was added to it: `what` is wrong."""
+    """A registry no longer holds what was added to it: `what` is wrong."""
 
     def __init__(self, what: str) -> None:
         super().__init__(

@@ -164,7 +164,7 @@ class ColumnSource(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 class MeasurementStandard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the references of a calibration are traceable to: a stand, a magnetometer, a gravity survey.
+    """The standards to which the references of a calibration are traceable: a stand, a magnetometer, a gravity survey.
 
     `certificate` is the number of its own calibration certificate, of `issued`, by `issuer`; `due` the
     day from which it no longer holds.
@@ -232,7 +232,7 @@ Scale ± 5 %, bias ± 10 mg, axis alignment ± 2 mrad, scale drift ± 180 ppm/°
 The magnetometer: scale ± 2 %, hard iron ± 1 % of 50 µT, alignment ± 4 mrad.
 """
 AGEING = ("turn_on", "bias_walk", "scale_walk")
-"""What a tool changes by between calibrations."""
+"""The changes of a tool between calibrations."""
 USUAL_AGEING = {
     "accelerometer": Datasheet(turn_on=4e-4, bias_walk=4e-4, scale_walk=5e-4),
     "magnetometer": Datasheet(turn_on=70.0, bias_walk=70.0, scale_walk=1.6e-3),

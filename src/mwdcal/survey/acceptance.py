@@ -22,11 +22,11 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.errors import InputError
 from mwdcal.files.profiles import decoded_toml
 from mwdcal.geometry.observables import OBSERVABLES, is_vertical
+from mwdcal.geometry.units import STANDARD_GRAVITY
 from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal
-from mwdcal.survey.stations import RANDOM, STRENGTHS, SURVEYED, Surveys
-from mwdcal.use.strengths import STANDARD_GRAVITY
+from mwdcal.survey.stations import RANDOM, STRENGTHS, SURVEY_OBSERVABLES, Surveys
 
-STRENGTH_NAMES = SURVEYED[STRENGTHS]
+STRENGTH_NAMES = SURVEY_OBSERVABLES[STRENGTHS]
 LEAST_FREE = 1e-12
 """Share of a variance that is of its quantity alone, at least: the rounding of a correlation."""
 SURVEY_UNITS = {
@@ -38,7 +38,7 @@ SURVEY_UNITS = {
 
 
 class SensorTerms(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What sensors may be off beside the calibration's own uncertainty, 1σ of each axis."""
+    """The errors of sensors beside the calibration's own uncertainty, 1σ of each axis."""
 
     accelerometer_bias_ms2: float = 0.0
     accelerometer_scale: float = 0.0
@@ -101,7 +101,7 @@ class SurveyLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 @dataclass(frozen=True)
 class AcceptanceTests:
-    """What surveys (n,) are judged by: fixed limits (3,), and a covariance (n, 3, 3) with the largest distance (n,).
+    """The limits of surveys (n,): fixed limits (3,), and a covariance (n, 3, 3) with the largest distance (n,).
 
     `missing` (n, 3): not judged.
     """

@@ -7,7 +7,6 @@ Grid north of a map projection: its convergence at a place, from points that PRO
 
 from __future__ import annotations
 
-import hashlib
 import re
 from calendar import isleap
 from collections.abc import Sequence
@@ -22,6 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import Array, ArrayLike
 
@@ -208,7 +208,7 @@ def _coefficients(library: str, file: str) -> tuple[str, str]:
             f"{library} {version(library)} has no file {file}. Install another version: "
             'pip install -U "mwdcal[survey]"'
         ) from None
-    return data.decode("utf-8"), hashlib.sha256(data).hexdigest()
+    return data.decode("utf-8"), sha256_of(data)
 
 
 def _named(model: str, file: str, library: str) -> str:

@@ -21,9 +21,9 @@ import numpy as np
 
 from mwdcal.errors import InputError, reason
 from mwdcal.geometry.observables import VERTICAL
+from mwdcal.geometry.units import STANDARD_GRAVITY
 from mwdcal.geometry.vectors import Array, ArrayLike
 from mwdcal.survey.formulas import Formula, parsed
-from mwdcal.use.strengths import STANDARD_GRAVITY
 
 BUILT_IN = "owsg-mwd"
 """The error model that counts by default."""

@@ -10,11 +10,12 @@ import numpy as np
 from mwdcal.calibration import results
 from mwdcal.calibration.canonical import rounded
 from mwdcal.calibration.readings import Readings, is_simulated
-from mwdcal.calibration.record import Calibration, Finding, sealed, stated
+from mwdcal.calibration.record import Calibration, Finding, stated, with_checksum
 from mwdcal.calibration.residuals import RESHOOT
 from mwdcal.errors import FitError
 from mwdcal.estimation.uncertainty import station_misfit
 from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.geometry.units import STANDARD_GRAVITY
 from mwdcal.geometry.vectors import Array, Bools, centred
 from mwdcal.survey.acceptance import SURVEY_UNITS, SensorTerms
 from mwdcal.survey.interference_estimate import (
@@ -27,7 +28,6 @@ from mwdcal.survey.interference_estimate import (
     varied,
 )
 from mwdcal.survey.separability import missing
-from mwdcal.use.strengths import STANDARD_GRAVITY
 from mwdcal.use.uncertainty import CORRECTED, DRIFTED, ErrorTerms, error_terms
 
 FEWEST_SURVEYS = 2
@@ -103,7 +103,7 @@ class InterferenceStation(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MultiStationAnalysis(msgspec.Struct, frozen=True, kw_only=True):
-    """What the analysis of several surveys says, for machines.
+    """The analysis of several surveys, for machines.
 
     `separable`: the azimuth of every station is of use after the correction, `azimuth_sd_deg` (1σ, of what
     interference is left, at the worst station) being at most `largest_azimuth_sd_deg`. `missing` says which
@@ -228,7 +228,7 @@ def corrected_calibration(calibration: Calibration, whole: Estimate) -> Calibrat
         inherited=[*calibration.inherited, *whole.readings.digest],
         findings=[*calibration.findings, Finding(id=CORRECTED, text=text), *_drift(whole)],
     )
-    return sealed(rounded(record))
+    return with_checksum(rounded(record))
 
 
 def _drift(whole: Estimate) -> list[Finding]:
@@ -358,7 +358,7 @@ def deviations(whole: Estimate) -> tuple[Array, Bools]:
 def _findings(
     calibration: Calibration, readings: Readings, whole: Estimate, rows: list[InterferenceStation]
 ) -> list[Finding]:
-    """What a reader of one well's analysis should know."""
+    """The findings of one well's analysis."""
     size, sd, assumed = whole.size[0], whole.sd[0], whole.assumed
     texts = {}
     if not (np.abs(size) > LEAST_SEEN * sd).any():
@@ -440,7 +440,7 @@ def _doubtful(whole: Estimate, rows: list[InterferenceStation]) -> list[Finding]
 
 
 def _doubt(row: InterferenceStation) -> str:
-    """What is wrong with a survey, in a sentence."""
+    """The fault of a survey, in a sentence."""
     return (
         f"station {row.station} does not agree with the others ({row.deviation:.1f} standard deviations): |b| is "
         f"{row.field_after_nt - row.ref_field_nt:+.0f} nT and dip {row.dip_after_deg - row.ref_dip_deg:+.2f}° off the "

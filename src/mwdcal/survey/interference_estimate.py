@@ -18,17 +18,17 @@ from mwdcal.calibration.automatic.courses import OFFSETS
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import UNKNOWN_GRAVITY, unknown_gravity
-from mwdcal.calibration.prior import Knowledge, for_run
+from mwdcal.calibration.prior import PriorInformation, for_run
 from mwdcal.calibration.readings import CONSTANTS, Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
 from mwdcal.estimation.uncertainty import TANGENT_STEP, analyse, tangent
 from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.geometry.units import STANDARD_GRAVITY
 from mwdcal.geometry.vectors import Array, Bools, diagonal
 from mwdcal.survey.acceptance import SensorTerms, load_survey_limits
 from mwdcal.survey.references import PLACE_SD
 from mwdcal.survey.stations import RANDOM
-from mwdcal.use.strengths import STANDARD_GRAVITY
 
 OFFSET_NAMES = ("cross-axial x", "cross-axial y", "axial")
 """Directions of interference, in the order of the tool axes x, y, z."""
@@ -95,7 +95,7 @@ class Assumed:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What each entry of `sd` is."""
+        """The quantity that each entry of `sd` belongs to."""
         return OFFSET_NAMES + tuple(f"scale {axis}" for axis in "xyz") * (self.scale > 0)
 
 
@@ -121,8 +121,8 @@ class Estimate:
     cautious_spread: Array
     azimuth_sd: Array
     open_azimuth: Bools
-    bound: Knowledge
-    released: Knowledge
+    bound: PriorInformation
+    released: PriorInformation
 
     @property
     def sd(self) -> Array:
@@ -253,8 +253,10 @@ def _options(calibration: Calibration, assumed: Assumed) -> Options:
     )
 
 
-def _loosened(known: Knowledge, directions: Array, sd: Array) -> tuple[Knowledge, Array, Array]:
-    """Knowledge (k,) that also varies along directions (k, d) by `sd` (d,), and what it says of their sizes.
+def _loosened(
+    known: PriorInformation, directions: Array, sd: Array
+) -> tuple[PriorInformation, Array, Array]:
+    """PriorInformation (k,) that also varies along directions (k, d) by `sd` (d,), and what it says of their sizes.
 
     Their gain (d, k), by which a departure of the parameters is theirs, and their covariance (d, d) beside it.
     """
@@ -264,8 +266,10 @@ def _loosened(known: Knowledge, directions: Array, sd: Array) -> tuple[Knowledge
     return replace(known, precision=precision), -left @ weighed.T, np.asarray(left)
 
 
-def _drifted(calibration: Calibration, known: Knowledge, drift: SensorTerms) -> Knowledge:
-    """What is known of the tool once its biases and scales may have moved."""
+def _drifted(
+    calibration: Calibration, known: PriorInformation, drift: SensorTerms
+) -> PriorInformation:
+    """The remaining information on the tool once its biases and scales may have moved."""
     sizes = (
         (drift.accelerometer_bias_ms2 / STANDARD_GRAVITY, drift.accelerometer_scale),
         (drift.magnetometer_bias_nt, drift.magnetometer_scale),
@@ -276,7 +280,7 @@ def _drifted(calibration: Calibration, known: Knowledge, drift: SensorTerms) -> 
     return _loosened(known, moves, sd[sd > 0])[0]
 
 
-def _unit_changes(calibration: Calibration, known: Knowledge, place: int) -> Array:
+def _unit_changes(calibration: Calibration, known: PriorInformation, place: int) -> Array:
     """Changes (k, 6) of the known parameters that add one unit to each axis of a triad, and one to each scale."""
     triad = calibration.triads[place]
     model, params = triad.functions(calibration.reference_temperature), np.array(triad.parameters)

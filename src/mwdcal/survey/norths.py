@@ -60,7 +60,7 @@ class North:
 
     @property
     def offset(self) -> float:
-        """What is added to magnetic azimuths to count from that north."""
+        """The angle added to magnetic azimuths to count from that north."""
         return (self.declination or 0.0) - (self.convergence or 0.0)
 
 
@@ -71,7 +71,7 @@ def norths_of(
     calibration: Calibration,
     reference: EarthReference | None,
 ) -> North:
-    """What metadata of a table and reference say of declination and convergence; `readings` of the table in parts.
+    """The statements of a table and a reference about declination and convergence; `readings` of the table in parts.
 
     A declination whose table states no uncertainty has that of the reference, else that of a global field model.
 

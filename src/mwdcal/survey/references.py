@@ -14,7 +14,6 @@ References of a place in the columns of a run: blank cells are filled, given one
 
 from __future__ import annotations
 
-import hashlib
 import math
 import os
 from collections.abc import Mapping
@@ -28,6 +27,7 @@ import numpy as np
 
 from mwdcal.calibration.readings import EARTH_RANGES
 from mwdcal.calibration.record import DOCUMENT_VERSION, Finding
+from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError, reason
 from mwdcal.files.contract import (
     AZIMUTH_KEYS,
@@ -40,10 +40,10 @@ from mwdcal.files.contract import (
 from mwdcal.files.formats.columns import Column, shown
 from mwdcal.files.formats.table import Table, numbers
 from mwdcal.files.runs import check_run
+from mwdcal.geometry.units import STANDARD_GRAVITY
 from mwdcal.geometry.vectors import Array, ArrayLike, Bools
 from mwdcal.survey import earth
 from mwdcal.survey.earth import LEAST_DISTORTION, Grid, grid_convergence
-from mwdcal.use.strengths import STANDARD_GRAVITY
 
 FARTHEST = 2.0
 """Combined standard uncertainties beyond which one value contradicts another."""
@@ -186,7 +186,7 @@ RANGES_OF_REFERENCE = {
 }
 """Accepted values."""
 _ARGUMENT_NAMES = {"latitude_deg": "latitude", "longitude_deg": "longitude"}
-"""What keys are called where they are given, if not by their own name."""
+"""Names of keys where they are given, if not by their own name."""
 _REMEDIES = {
     "latitude_deg": "North is positive.",
     "longitude_deg": "East is positive.",
@@ -263,7 +263,7 @@ class EarthReference(msgspec.Struct, frozen=True, kw_only=True):
         return declination_sd(self.field_nt * math.cos(math.radians(self.dip_deg)))
 
     def offset_deg(self, north: str) -> float:
-        """What is added to a magnetic azimuth to count it from a north, degrees."""
+        """The angle added to a magnetic azimuth to count it from a north, degrees."""
         stated = (north, self.declination_deg, self.convergence_deg)
         metadata = {k: v for k, v in zip(AZIMUTH_KEYS, stated, strict=True) if v is not None}
         return magnetic_offset(metadata, "reference")
@@ -475,7 +475,7 @@ def _findings(
     values: Mapping[str, float], altitude_m: float, measured: Mapping[str, float],
     uncertainties: Mapping[str, float], grid: Grid | None,
 ) -> list[Finding]:  # fmt: skip
-    """What the reader should know of a reference."""
+    """The findings about a reference."""
     findings = []
     for name in measured:
         if not uncertainties.get(name):
@@ -578,7 +578,7 @@ def load_reference(path: str | os.PathLike[str]) -> tuple[EarthReference, str]:
             f"{reference.gravity_ms2:g} and {reference.gravity_g:g}. Use the file as mwdcal wrote it."
         )
     check_ranges({key: value for key, value in numbers.items() if value is not None}, file.name)
-    return reference, hashlib.sha256(data).hexdigest()
+    return reference, sha256_of(data)
 
 
 FILLED = ("gravity", "field", "dip")

@@ -23,7 +23,7 @@ AROUND = np.radians(np.arange(0.0, 360.0, 15.0))
 
 
 def missing(whole: Estimate, corrected: Calibration, calibration: Calibration) -> str:
-    """What one more survey must be for what is lacking, in sentences; empty where nothing is."""
+    """The further survey that would help, in sentences; empty if none is needed."""
     parts = []
     if not whole.separable[0]:
         parts.append(_attitude(whole, corrected, calibration))

@@ -18,9 +18,17 @@ from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, diagonal
 from mwdcal.use.uncertainty import rows_of, without_value
 
-SURVEYED = ("inclination", "azimuth", "toolface", "north_toolface", "gravity", "field", "dip")
+SURVEY_OBSERVABLES = (
+    "inclination",
+    "azimuth",
+    "toolface",
+    "north_toolface",
+    "gravity",
+    "field",
+    "dip",
+)
 """Observables of a survey, in the order of `Surveys.value`."""
-TURNS = np.array([OBSERVABLES[name].period > 0 for name in SURVEYED])
+TURNS = np.array([OBSERVABLES[name].period > 0 for name in SURVEY_OBSERVABLES])
 """Which of them are angles of a full turn."""
 STRENGTHS = slice(4, 7)
 """Where |g|, |b| and dip lie in it."""
@@ -34,7 +42,7 @@ STATIONS_AT_ONCE = 1 << 12
 
 @dataclass(frozen=True)
 class Surveys:
-    """Observables (n, 7) in the order of `SURVEYED`, radians, g, nT, and their standard uncertainties (n, 7).
+    """Observables (n, 7) in the order of `SURVEY_OBSERVABLES`, radians, g, nT, and their standard uncertainties (n, 7).
 
     NaN: not there, such as azimuth and toolface within the uncertainty of vertical, or without a stated one.
     `strengths` (n, 3, 3): covariance of |g|, |b| and dip. `magnetic` (n,): the toolface counts from magnetic north.
@@ -49,7 +57,7 @@ class Surveys:
 
     def of(self, name: str) -> tuple[Array, Array]:
         """An observable (n,) and its standard uncertainty; `toolface` is the one that counts."""
-        place, north = SURVEYED.index(name), SURVEYED.index("north_toolface")
+        place, north = SURVEY_OBSERVABLES.index(name), SURVEY_OBSERVABLES.index("north_toolface")
         value, sd = self.value[:, place], self.sd[:, place]
         if name != "toolface":
             return value, sd
@@ -59,7 +67,7 @@ class Surveys:
         )
 
 
-def surveyed(
+def survey_angles(
     calibration: Calibration,
     readings: Readings,
     switch: tuple[float, float] = TOOLFACE_SWITCH,
@@ -85,15 +93,15 @@ def surveyed(
             f"`switch` must be two inclinations between 0 and 90°, the lower one first; got {np.degrees(low):g}° and "
             f"{np.degrees(high):g}°."
         )
-    value = np.empty((readings.count, len(SURVEYED)))
+    value = np.empty((readings.count, len(SURVEY_OBSERVABLES)))
     sd, strengths, done = np.empty_like(value), np.empty((readings.count, 3, 3)), 0
     for part in blocks(readings):
         rows = slice(done, done + part.count)
         g, b = calibration.fields(part)
-        value[rows] = np.stack([OBSERVABLES[name].value(g, b) for name in SURVEYED], -1)
-        covariance = calibration.covariance(SURVEYED, part, noise=True)
+        value[rows] = np.stack([OBSERVABLES[name].value(g, b) for name in SURVEY_OBSERVABLES], -1)
+        covariance = calibration.covariance(SURVEY_OBSERVABLES, part, noise=True)
         sd[rows] = np.sqrt(np.maximum(diagonal(covariance), 0.0))
-        lost = without_value(calibration, part, SURVEYED, value[rows], sd[rows])
+        lost = without_value(calibration, part, SURVEY_OBSERVABLES, value[rows], sd[rows])
         value[rows] = np.where(lost, np.nan, value[rows])
         sd[rows] = np.where(lost, np.nan, sd[rows])
         if added is not None:

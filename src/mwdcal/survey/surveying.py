@@ -258,7 +258,7 @@ def check_free(table: Table, results: Collection[str]) -> None:
 
 
 def described(well: Well) -> Mapping[str, object]:
-    """What a table of surveys says of the calibration, north and limits it rests on."""
+    """The statements of a table of surveys about the calibration, north and limits it rests on."""
     calibration, north = well.calibration, well.north
     stated: dict[str, object] = {
         "calibration_run": calibration.run,
@@ -286,7 +286,7 @@ def described(well: Well) -> Mapping[str, object]:
 
 @dataclass(frozen=True)
 class WellInputs:
-    """What the surveys of a well rest on.
+    """The inputs of the surveys of a well.
 
     `model`: the error model whose terms are in the standard uncertainties; None: none. `rows` (n,) of the table that
     have readings; None: all.
@@ -305,7 +305,7 @@ class WellInputs:
 
     @property
     def stated(self) -> tuple[Mapping[str, object], Mapping[str, object]]:
-        """What calibration and readings say of themselves."""
+        """The statements of calibration and readings about themselves."""
         return self.calibration.tool, self.surveys.readings.metadata
 
     @property
@@ -343,7 +343,7 @@ def well_inputs(
     error_model: ErrorModel | str | os.PathLike[str] = BUILT_IN,
     missing: str = "refuse",
 ) -> WellInputs:
-    """What surveys rest on: a table of readings, the calibration of their tool, reference and limits.
+    """The inputs of surveys: a table of readings, the calibration of their tool, reference and limits.
 
     `reference`, `limits` and `error_model` are values, or files by path; `NO_MODEL` for none. Stations that
     multi-station analysis puts into the record have to be `recognised`. `digest` and `findings` are of the file of the

@@ -19,10 +19,10 @@ from mwdcal.calibration.prediction import CORNERS, CalibratedTools
 from mwdcal.calibration.record import FREE_SHARE, SOFTWARE, Calibration, stated
 from mwdcal.errors import FitError
 from mwdcal.files.formats import atomic
+from mwdcal.geometry.units import STANDARD_GRAVITY
 from mwdcal.geometry.vectors import Array, ArrayLike, reference_vectors
 from mwdcal.survey.acceptance import SensorTerms, load_survey_limits
 from mwdcal.survey.path import direction_gradient
-from mwdcal.use.strengths import STANDARD_GRAVITY
 
 
 class TermKind(NamedTuple):

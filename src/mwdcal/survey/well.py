@@ -26,7 +26,7 @@ from mwdcal.survey.acceptance import (
 from mwdcal.survey.error_model import ErrorModel
 from mwdcal.survey.norths import North
 from mwdcal.survey.path import PathEnd, TieIn, continued_path
-from mwdcal.survey.stations import TOOLFACE_SWITCH, Surveys, surveyed
+from mwdcal.survey.stations import TOOLFACE_SWITCH, Surveys, survey_angles
 from mwdcal.survey.well_errors import WellErrors, hole_of, well_errors
 from mwdcal.use.correction import RowCounts, tallied
 from mwdcal.use.correction import findings as about_rows
@@ -59,7 +59,7 @@ WELL_FINDINGS = {
     "station before: {count} of {rows} stations.",
     "no-path": "no well path: no station has both a measured depth and a direction with azimuth.",
 }
-"""What the findings about a well say, in their order."""
+"""The texts of the findings about a well, in their order."""
 
 
 @dataclass(frozen=True)
@@ -392,7 +392,7 @@ def part_of_well(
     if model is not None and calibration.has_field:
         errors = well_errors(model, calibration, readings)
     added = None if errors is None else errors.of_surveys(calibration, readings, md, before.path)
-    angles = surveyed(calibration, readings, switch, advance, added, before.magnetic)
+    angles = survey_angles(calibration, readings, switch, advance, added, before.magnetic)
     surveys = _without(angles, blank, beyond)
     g, b = (np.stack([columns[name] for name in VECTORS[i : i + 3]], -1) for i in (0, 3))
     judgement, blind = _judged(calibration, readings, surveys, (g, b), limits)

@@ -18,12 +18,12 @@ import numpy as np
 from mwdcal.calibration.readings import Readings, stated_day
 from mwdcal.calibration.record import Calibration
 from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.geometry.units import STANDARD_GRAVITY
 from mwdcal.geometry.vectors import Array, ArrayLike
 from mwdcal.survey.acceptance import SensorTerms
 from mwdcal.survey.error_model import USUAL_COURSE, ErrorModel, Hole
 from mwdcal.survey.path import DirectionErrors, PathEnd, TieIn, direction_gradient, well_path
-from mwdcal.survey.stations import SURVEYED, blocks
-from mwdcal.use.strengths import STANDARD_GRAVITY
+from mwdcal.survey.stations import SURVEY_OBSERVABLES, blocks
 from mwdcal.use.uncertainty import AXIAL_INTERFERENCE, CORRECTED, DRIFT, DRIFTED, OF_MODELS
 
 DRIFT_YEARS = 1.0
@@ -71,18 +71,18 @@ class WellErrors:
         return np.asarray(np.nan_to_num(np.concatenate([each, axial], 1)))
 
     def variances(self, g: Array, b: Array, hole: Hole) -> Array:
-        """Variance (n, 7) that all terms add to the observables of a survey, in the order of `SURVEYED`.
+        """Variance (n, 7) that all terms add to the observables of a survey, in the order of `SURVEY_OBSERVABLES`.
 
         Errors of the hole's direction against the tool, such as sag, leave the toolface as it is.
         """
-        gradient = np.stack([OBSERVABLES[name].gradient(g, b) for name in SURVEYED], -2)
+        gradient = np.stack([OBSERVABLES[name].gradient(g, b) for name in SURVEY_OBSERVABLES], -2)
         result = ((gradient @ self.columns(g, b, self._unit(hole)).mT) ** 2).sum(-1)
         systematic, random, _ = self.model.errors(hole)
         upward, sideways = ((systematic[..., i] ** 2).sum(-1) + random[..., i, i] for i in range(2))
         with np.errstate(divide="ignore", invalid="ignore"):
             azimuth = sideways / np.sin(hole.inclination) ** 2
-        result[:, SURVEYED.index("inclination")] += upward
-        result[:, SURVEYED.index("azimuth")] += azimuth
+        result[:, SURVEY_OBSERVABLES.index("inclination")] += upward
+        result[:, SURVEY_OBSERVABLES.index("azimuth")] += azimuth
         return np.asarray(result)
 
     @property

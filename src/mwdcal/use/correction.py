@@ -155,7 +155,7 @@ def _joined(one: Scatter, other: Scatter) -> Scatter:
 
 
 def unsteady(scatter: Mapping[str, Scatter]) -> str:
-    """What scatters in most of the windows, and how far; empty where nothing does."""
+    """The quantities that scatter in most of the windows, and how far; empty if there are none."""
     words = []
     for name, each in scatter.items():
         if 2 * each.scattered > each.windows:
@@ -206,12 +206,12 @@ ROW_FINDINGS = {
     "not nT.",
     "undetermined": "{moved} rest on what the calibration leaves undetermined ({free}): no uncertainty can be stated.",
 }
-"""What the findings about corrected rows say, in their order."""
+"""The texts of the findings about corrected rows, in their order."""
 RESULTS_BEYOND = (
     "blank",
     f"extrapolated, with no statement of accuracy, and marked in the column '{EXTRAPOLATED}'",
 )
-"""What becomes of results outside the calibrated temperatures."""
+"""The treatment of results outside the calibrated temperatures."""
 COMPILED_ROWS = 300_000
 """Number of rows from which the compiled loops repay their loading."""
 
@@ -253,11 +253,11 @@ def correct(
     `magnetic_toolface_deg` stands beside them. A strength of zero has no direction: NaN.
     Temperatures outside the calibrated range are blanked, refused or extrapolated as `outside` says.
     """
-    columns, _, about = counted(calibration, readings, outside, uncertainty=uncertainty)
+    columns, _, about = correct_and_count(calibration, readings, outside, uncertainty=uncertainty)
     return columns, about
 
 
-def counted(
+def correct_and_count(
     calibration: Calibration,
     readings: Readings,
     outside: str,

@@ -9,7 +9,6 @@ digits wherever it stands. Importing this module needs Numba.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import os
 import sys
@@ -21,6 +20,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numba import njit
 
+from mwdcal.digests import sha256_of
 from mwdcal.geometry.observables import VERTICAL
 from mwdcal.geometry.vectors import AnyArray, Array
 
@@ -272,4 +272,4 @@ def _checksums() -> Path:
 def _kept() -> dict[str, str]:
     """SHA-256 of the files that Numba keeps for this module and this Python."""
     files = _folder().glob(f"correction_kernels.*.{_VERSION}.*nb[ic]")
-    return {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(files)}
+    return {p.name: sha256_of(p) for p in sorted(files)}

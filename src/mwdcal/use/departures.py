@@ -192,7 +192,7 @@ class RollTest:
         return self.readings.common_uncertainty(name, self.value("inclination"))
 
     def _lacks(self, name: str) -> str:
-        """What is missing to have an observable at all; empty where nothing is."""
+        """The inputs that an observable lacks; empty if it lacks none."""
         if name not in ("azimuth", "field", "dip"):
             return ""
         if not self.calibration.has_field:

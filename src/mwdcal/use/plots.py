@@ -50,7 +50,7 @@ SERIES: tuple[tuple[str, str, Any], ...] = (
 POINT_NAMES = "points"
 """Start of the gid of a line whose label names its points, below a first `_`, one on each line."""
 ACCURACY_OF = {"of the calibration alone": False, "of one reading: calibration and noise": True}
-"""What an accuracy is of, and whether the noise of one reading is in it."""
+"""The subject of an accuracy, and whether the noise of one reading is in it."""
 TEMPERATURES = 41
 """Points of a curve over temperature."""
 WIDTH = 7.1
@@ -234,7 +234,7 @@ def _undetermined(axes: Axes, names: Sequence[str]) -> None:
 
 
 def _accuracy_axes(figure: Figure, panels: Sequence[Axes]) -> Figure:
-    """What both panels share: plain numbers, and one legend of all curves."""
+    """The parts that both panels share: plain numbers, and one legend of all curves."""
     low, high = panels[0].get_ylim()
     plain_numbers(panels[0].yaxis, *((1.0, 2.0, 5.0) if high / low < 300 else (1.0,)))
     panels[0].set_ylabel("1σ, °")

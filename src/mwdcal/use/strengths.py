@@ -18,6 +18,7 @@ from mwdcal.calibration.readings import EARTH_RANGES, TRIADS
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES, OUTPUTS
+from mwdcal.geometry.units import STANDARD_GRAVITY
 from mwdcal.geometry.vectors import AnyArray, Array
 
 OFF_REFERENCE = 0.05
@@ -27,8 +28,6 @@ MOST_OFF = 0.5
 ALIKE = {"gravity": 1.5, "field": 6.0}
 """Greatest over least strength up to which one unit may explain all rows."""
 JUDGED_STRENGTHS = ("gravity", "field")
-STANDARD_GRAVITY = 9.80665
-"""1 g, m/s²."""
 STRENGTH_UNITS: dict[str, dict[str, float]] = {
     "gravity": {"g": 1.0, "m/s²": STANDARD_GRAVITY, "mg": 1000.0},
     "field": {"nT": 1.0, "µT": 1e-3, "mT": 1e-6, "gauss": 1e-5, "mG": 1e-2},

@@ -97,7 +97,7 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class JudgedSet(msgspec.Struct, frozen=True, kw_only=True):
-    """What one roll set shows of one limit, or, without a `label`, the stations outside of roll sets.
+    """The result of one roll set for one limit, or, without a `label`, the stations outside of roll sets.
 
     `stations` are their places in `Verdict.station_rows`, from 0. `coefficients` of the curve that
     was judged: mean, cos t, cos 2t, sin t, sin 2t of toolface t, in the unit of the limit; None:
@@ -228,7 +228,7 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True, dict=True):
 
 
 RULES = {
-    "simple": "simple acceptance: a noise-free value passes up to its limit; its 1σ is stated beside it",
+    "simple": "simple acceptance: pass if the noise-free value is within the limit; 1σ is shown for information",
     "guarded": "guarded acceptance: noise-free value + 2 × its 1σ must not exceed the limit",
 }
 """Decision rules in words. Of a 1σ with few degrees of freedom Student's factor takes the place of 2."""
@@ -477,7 +477,7 @@ def stated_freedom(freedom: float) -> float | None:
 
 
 def _choice(outcome: Departures, taken: float, unit: str) -> str:
-    """What was taken off the largest of several figures."""
+    """The amount taken off the largest of several figures."""
     count, single = len(outcome.statistics), any(not each.label for each in outcome.statistics)
     if count == 1:
         return ""

@@ -42,8 +42,8 @@ def command(
     from mwdcal.app.correction import Applied, apply_to_any
     from mwdcal.app.progress import bar
     from mwdcal.calibration.readings import simulated
-    from mwdcal.presentation.envelope import enveloped, with_signature
-    from mwdcal.presentation.signature import in_short, load_calibration
+    from mwdcal.presentation.envelope import json_document, with_signature
+    from mwdcal.presentation.signature import load_calibration, signature_status
     from mwdcal.use.uncertainty import reading_terms
 
     options.check_outputs([output], [calibration, readings, *key])
@@ -56,7 +56,7 @@ def command(
         )  # fmt: skip
     findings = loaded.findings + findings
     blank, terms = tally.blank(outside), reading_terms(fitted)
-    document = enveloped(
+    document = json_document(
         "apply",
         Applied(
             rows=tally.rows,
@@ -70,7 +70,7 @@ def command(
         readings=readings_digest,
     )
     corrected = f"{tally.rows} rows corrected" + (f", {blank} of them blank" if blank else "")
-    signed = one_line(in_short(loaded.signature))
+    signed = one_line(signature_status(loaded.signature))
     said = [corrected, f"wrote {one_line(output)}", signed, *simulated(fitted.tool)]
     document = with_signature(document, loaded.signature)
     lines = ["   ".join(said), *([terms.sentence] if uncertainty else [])]

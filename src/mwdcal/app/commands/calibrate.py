@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 @options.JSON
 def command(
     run: Path, output: Path, tool: str | None, exclude: tuple[str, ...], rolltest: Path | None, limits: str,
-    registry: str | None, report: Path | None, decimal: str, as_json: bool, **typed: Unpack[options.Typed],
+    registry: str | None, report: Path | None, decimal: str, as_json: bool, **typed: Unpack[options.FitArguments],
 ) -> None:  # fmt: skip
     """Fit the sensor model to a calibration RUN (CSV, TSV, Parquet, XLSX, WITSML or LAS).
 
@@ -56,8 +56,9 @@ def command(
     Example: mwdcal calibrate run.csv --tool servo -o tool.json --rolltest roll.csv
     Exit: 0 calibrated (and passed), 1 the roll test fails, 2 input cannot be read, 3 fit failed or refused.
     """
-    from mwdcal.app.choices import load_runs, options_of, prior_of
+    from mwdcal.app.inputs import load_runs, prior_of
     from mwdcal.calibration.calibrate import chosen_fit, recorded
+    from mwdcal.calibration.options import options_of
     from mwdcal.files import documents
     from mwdcal.files.formats import atomic
     from mwdcal.presentation import calibration as screen

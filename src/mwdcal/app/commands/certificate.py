@@ -19,7 +19,7 @@ import click
 from mwdcal.app.commands import Commands, Group, options
 from mwdcal.app.messages import print_result
 from mwdcal.errors import InputError
-from mwdcal.presentation.typed import findings_as_typed
+from mwdcal.presentation.typed import findings_with_option_names
 
 
 @click.group(
@@ -42,7 +42,7 @@ def command() -> None:
 
     \b
     Examples: mwdcal certificate tool.json -o certificate.json
-              mwdcal certificate sign certificate.json --key laboratory.key
+              mwdcal certificate sign certificate.json --private-key laboratory.key
               mwdcal certificate verify certificate.json --key laboratory.key.pub
     """
 
@@ -134,8 +134,14 @@ def _folder(outputs: Sequence[Path]) -> Path:
 
 @options.command()
 @options.argument("document")
-@click.option(
-    "--key", type=options.FILE, required=True, metavar="K", help="Private key that signs."
+@options.renamed(
+    "--private-key",
+    "key",
+    old=("--key",),
+    type=options.FILE,
+    required=True,
+    metavar="K",
+    help="Private key that signs.",
 )
 @click.option(
     "-o",
@@ -156,7 +162,7 @@ def sign(document: Path, key: Path, output: Path | None, replace: bool, as_json:
     SHA-256 of its file.
 
     \b
-    Example: mwdcal certificate sign certificate.json --key laboratory.key
+    Example: mwdcal certificate sign certificate.json --private-key laboratory.key
     Exit: 0 signed, 2 input cannot be read or is signed already, 3 it was changed before.
     """
     from mwdcal.app.commands.certificate_keys import known
@@ -191,6 +197,6 @@ def verify(document: Path, files: tuple[Path, ...], key: tuple[Path, ...], as_js
             "`key` is missing, and the variable MWDCAL_KEYS is not set. Name a public key."
         )
     result = check_signature(document, key, files=files)
-    result.content = replace(result.content, findings=findings_as_typed(result.findings))
+    result.content = replace(result.content, findings=findings_with_option_names(result.findings))
     print_result(result.to_dict() if as_json else result.summary(), result.findings)
     sys.exit(0 if result.passed else 1)

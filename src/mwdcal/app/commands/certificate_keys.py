@@ -61,10 +61,10 @@ def subcommand(function: Callable[..., Any]) -> Any:
 def _print(name: str, file: Path, keys: list[TrustedKey], as_json: bool, **written: Path) -> None:
     """The keys in a file, and what was written."""
     from mwdcal.presentation import signature as screens
-    from mwdcal.presentation.envelope import enveloped
+    from mwdcal.presentation.envelope import json_document
 
     result = screens.KeysDocument(file=str(file), keys=keys)
-    shown = enveloped(f"certificate key {name}", result)
+    shown = json_document(f"certificate key {name}", result)
     print_result(shown if as_json else screens.keys(result, **written))
 
 

@@ -13,7 +13,7 @@ from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result, say
 from mwdcal.errors import FitError
 from mwdcal.presentation.text import one_line
-from mwdcal.presentation.typed import as_typed
+from mwdcal.presentation.typed import with_option_names
 
 
 @options.command()
@@ -40,19 +40,20 @@ def command(
     Example: mwdcal compare run.csv --tool servo --report methods.html
     Exit: 0 compared, 2 input cannot be read, 3 every method refused.
     """
-    from mwdcal.app.choices import load_run, order_of
+    from mwdcal.app.inputs import load_run
     from mwdcal.calibration.diagnosis.findings import unused_columns
+    from mwdcal.calibration.fit_options import order_of
     from mwdcal.calibration.options import Options
     from mwdcal.comparison.compare import able, compare
     from mwdcal.files.formats import atomic
     from mwdcal.presentation import comparison as screen
-    from mwdcal.presentation.envelope import enveloped
+    from mwdcal.presentation.envelope import json_document
 
     options.check_outputs([], [run, tool], page=report)
     readings, profile = load_run(run, tool, decimal)
     unused = unused_columns(readings.unused)
     result = compare(readings, profile, Options(order=order_of(order), seed=seed), progress=say)
-    rows = tuple(replace(row, refused=as_typed(row.refused)) for row in result.rows)
+    rows = tuple(replace(row, refused=with_option_names(row.refused)) for row in result.rows)
     result = replace(result, rows=rows)
     if report:
         from mwdcal.presentation.comparison_page import render
@@ -63,7 +64,7 @@ def command(
     if as_json:
         digests = {"run": readings.run_sha256, "profile": readings.profile_sha256}
         content = screen.document(result, unused, report)
-        print_result(enveloped("compare", content, readings.metadata, **digests), unused)
+        print_result(json_document("compare", content, readings.metadata, **digests), unused)
     else:
         written = f"\nwrote {one_line(report)} (report)" if report else ""
         print_result(screen.text(result, parameters) + written, unused)

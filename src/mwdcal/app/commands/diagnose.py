@@ -8,18 +8,19 @@ from pathlib import Path
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result
 from mwdcal.presentation.text import to_json
-from mwdcal.presentation.typed import findings_as_typed
+from mwdcal.presentation.typed import findings_with_option_names
 
 
 @options.command()
 @options.CALIBRATION
 @options.argument("readings")
 @options.RESULT
+@options.report()
 @options.DECIMAL
 @options.JSON
 def command(
-    calibration: Path, readings: Path, output: Path | None, decimal: str, as_json: bool
-) -> None:
+    calibration: Path, readings: Path, output: Path | None, report: Path | None, decimal: str, as_json: bool
+) -> None:  # fmt: skip
     """Say which fault, if any, later READINGS of the tool of a CALIBRATION show.
 
     READINGS are a roll test or surveys, a run file with the references that are known, or none.
@@ -36,20 +37,21 @@ def command(
     from mwdcal.files import runs
     from mwdcal.files.formats import atomic
     from mwdcal.presentation.calibration_source import calibration_of
-    from mwdcal.presentation.diagnosis import screen
-    from mwdcal.presentation.envelope import enveloped
+    from mwdcal.presentation.diagnosis import render, screen
+    from mwdcal.presentation.envelope import json_document
 
-    options.check_outputs([output], [calibration, readings])
+    options.check_outputs([output], [calibration, readings], page=report)
     fitted, digest = calibration_of(calibration)
     later, _ = runs.read_run(readings, fitted.profile, decimal=decimal)
     result = diagnose(fitted, later)
-    findings = findings_as_typed(
+    findings = findings_with_option_names(
         [*fitted.change_findings(), *result.findings, *unused_columns(later.unused)]
     )
     result = replace(result, findings=findings)
     stated = fitted.tool, later.metadata
     digests = {"calibration": digest, "readings": later.run_sha256}
-    document = enveloped("diagnose", result, *stated, **digests)
-    atomic.write_all([(output, to_json(document) + "\n")])
+    document = json_document("diagnose", result, *stated, **digests)
+    page = render(result, digests, *stated) if report else ""
+    atomic.write_all([(output, to_json(document) + "\n"), (report, page)])
     print_result(document if as_json else screen(result, *stated), findings)
     sys.exit(0 if result.fault == NONE else 1)

@@ -42,7 +42,7 @@ def command(folder: Path, as_json: bool) -> None:
     """
     from mwdcal.calibration.readings import SIMULATED
     from mwdcal.files.formats import atomic
-    from mwdcal.presentation.envelope import ExampleDocument, enveloped
+    from mwdcal.presentation.envelope import ExampleDocument, json_document
     from mwdcal.presentation.text import one_line, table
 
     if folder.exists() and not folder.is_dir():
@@ -60,7 +60,7 @@ def command(folder: Path, as_json: bool) -> None:
     screen = f"{table(rows, [f'wrote, all {SIMULATED}', ''])}\n\n"
     screen += f"next: mwdcal calibrate {run} --tool {tool} -o tool.json"
     written = ExampleDocument(folder=str(folder), files=[str(file) for file in files])
-    document = enveloped("example", written, {"simulated": True})
+    document = json_document("example", written, {"simulated": True})
     print_result(document if as_json else screen)
 
 

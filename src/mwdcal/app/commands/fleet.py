@@ -46,7 +46,7 @@ from mwdcal.errors import FitError, InputError
 def command(
     runs: Path, output: Path, tool: str | None, workers: int | None,
     scheduler: str | None, records: bool | None, calibrations: Path | None, report: Path | None,
-    as_json: bool, **typed: Unpack[options.Typed],
+    as_json: bool, **typed: Unpack[options.FitArguments],
 ) -> None:  # fmt: skip
     """Calibrate many tools: RUNS is a folder of run files, or a table with a column `serial`.
 
@@ -63,7 +63,7 @@ def command(
     from mwdcal import pool
 
     with pool.preparing(1 if scheduler else workers):  # these imports, in the workers too
-        from mwdcal.app.choices import options_of
+        from mwdcal.calibration.options import options_of
         from mwdcal.files.formats import atomic, folders
         from mwdcal.fleet import calibration_files
         from mwdcal.library import fleet_table

@@ -144,7 +144,7 @@ def command(
     from mwdcal.app import laboratory, questions
     from mwdcal.files.formats import atomic
     from mwdcal.files.settings import settings_toml
-    from mwdcal.presentation.envelope import WrittenSettings, enveloped
+    from mwdcal.presentation.envelope import WrittenSettings, json_document
     from mwdcal.presentation.text import one_line
 
     path = folder / laboratory.SETTINGS_FILE
@@ -165,7 +165,7 @@ def command(
     atomic.write(path, settings_toml(settings))
     written = WrittenSettings(file=str(path), settings=settings)
     shown = f"wrote {one_line(path)} (settings)   edit it, or answer again: mwdcal init --replace"
-    print_result(enveloped("init", written) if as_json else shown)
+    print_result(json_document("init", written) if as_json else shown)
 
 
 def _check(question: SettingsQuestion, folder: Path, text: str) -> None:

@@ -8,7 +8,7 @@ import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result, say
-from mwdcal.presentation.typed import findings_as_typed
+from mwdcal.presentation.typed import findings_with_option_names
 
 
 @options.command()
@@ -49,7 +49,7 @@ def command(
     from mwdcal.logs.allan import Kind
     from mwdcal.logs.noise import check, find_noise
     from mwdcal.presentation import noise as screen
-    from mwdcal.presentation.envelope import enveloped
+    from mwdcal.presentation.envelope import json_document
     from mwdcal.presentation.noise_page import figure, render
     from mwdcal.presentation.page import picture
 
@@ -62,12 +62,12 @@ def command(
     kind: Kind = "modified" if modified else "overlapping"
     noise = find_noise(readings, profile=profile, between=between, kind=kind, say=slowly, **times)
     unused = unused_columns(synonyms.unused(list(readings.columns), COLUMNS))
-    noise = replace(noise, findings=findings_as_typed([*noise.findings, *unused]))
+    noise = replace(noise, findings=findings_with_option_names([*noise.findings, *unused]))
     drawn = picture(figure(noise), plot.suffix) if plot else b""
     sources = readings.digest, profile.name if profile else "", digest
     rendered = render(noise, *sources) if report else ""
     digests = {"log": readings.digest, "profile": digest}
-    document = enveloped(
+    document = json_document(
         "noise", screen.document(noise, plot, report), readings.metadata, **digests
     )
     atomic.write_all([(plot, drawn), (report, rendered)])

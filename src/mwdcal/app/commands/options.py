@@ -13,10 +13,12 @@ from unicodedata import normalize
 
 import click
 from click.core import ParameterSource
+from click.shell_completion import CompletionItem
 
 from mwdcal.app.messages import Command
+from mwdcal.calibration.fit_options import FIT_OPTIONS
+from mwdcal.calibration.fit_options import FitArguments as FitArguments
 from mwdcal.errors import InputError
-from mwdcal.presentation.typed import Typed as Typed
 
 Function = Callable[..., Any]
 Decorator = Callable[[Function], Function]
@@ -37,16 +39,51 @@ class PointedNumber(click.types.FloatParamType):
         return super().convert(value, param, ctx)
 
 
+class Renamed(click.Option):
+    """An option that is still taken by its `old` names, which neither help nor completion shows."""
+
+    def __init__(self, *arguments: Any, old: tuple[str, ...], **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.old = old
+
+    def add_to_parser(self, parser: Any, ctx: click.Context) -> None:
+        """Let the parser take the old names too."""
+        names, self.opts = self.opts, [*self.opts, *self.old]
+        super().add_to_parser(parser, ctx)
+        self.opts = names
+
+
+def offers(folder: str) -> Callable[..., list[CompletionItem]]:
+    """The completion of an option: what a folder of the package has built in, and files."""
+
+    def complete(
+        context: click.Context, option: click.Parameter, typed: str
+    ) -> list[CompletionItem]:
+        from mwdcal.files.profiles import built_in
+
+        names = [name for name in built_in(folder) if name.startswith(typed)]
+        return [CompletionItem(typed, type="file"), *map(CompletionItem, names)]
+
+    return complete
+
+
 NUMBER = PointedNumber()
 command = partial(click.command, cls=Command)
 argument = partial(click.argument, type=FILE)
 output = partial(click.option, "-o", "--output", type=FILE, required=True)
 tool = partial(
-    click.option, "--tool", metavar="NAME|FILE", help="Tool profile: a shipped name or a TOML file."
-)
-report = partial(
     click.option,
+    "--tool",
+    metavar="NAME|FILE",
+    shell_complete=offers("profiles"),
+    help="Tool profile: a name that mwdcal list profiles shows, or a TOML file.",
+)
+renamed = partial(click.option, cls=Renamed)
+"""An option with `old` names that stay for one release."""
+report = partial(
+    renamed,
     "--report",
+    old=(),
     type=FILE,
     metavar="R.html",
     help="Also write a self-contained HTML report.",
@@ -70,8 +107,10 @@ WHERE_OUTSIDE = preset(
     "temperatures: none; refuse the file; or extrapolated, and marked as such.",
 )
 LIMITS = preset(
-    "--limits", default="roll-test", metavar="NAME|FILE", help="Limits profile of the roll test."
-)
+    "--limits", default="roll-test", metavar="NAME|FILE", shell_complete=offers("limits"),
+    help="Limits of the roll test: roll-test, moosavi, moradi, or a TOML file with [error] and [spread]. Files of "
+    "survey --limits do not fit.",
+)  # fmt: skip
 DECIMAL = preset(
     "--decimal", default=".", metavar="SIGN", help="Decimal sign of numbers in text files."
 )
@@ -85,9 +124,6 @@ TRUSTED_KEYS = click.option(
     "variable MWDCAL_KEYS names.",
 )
 JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
-SEED = preset(
-    "--seed", type=click.IntRange(0), default=0, help="Seed of all that is drawn at random."
-)
 COLUMN_NAMES = click.option(
     "--columns", default="", metavar="NAMES",
     help="Columns of a text log without column names, such as time_s,ax,ay,az.",
@@ -142,75 +178,51 @@ def number(name: str, metavar: str, text: str, *variable: str) -> Decorator:
 
 
 SAMPLING_HZ = number("--sampling-hz", "HZ", "Rate of the log; wins over its column time_s.")
-_FIT = (
-    preset(
-        "--method", default="joint", metavar="METHOD",
-        help="joint: all evidence, weighted. least-squares: reference vectors only. swarm: the same "
-        "by particle swarm. newton: Newton-Raphson on |g| and inclination. toolface-inclination: the "
-        "accelerometer by angles alone. scalar: |g| and |b| alone.",
-    ),
-    SEED,
-    click.option(
-        "--paper-weights", is_flag=True,
-        help="Sum the squares as the method's paper does, unweighted, instead of by their uncertainty.",
-    ),
-    click.option(
-        "--robust", type=click.Choice(["huber", "student-t"]),
-        help="Bound what a bad station can do: huber keeps a little of its pull, student-t loses it.",
-    ),
-    click.option(
-        "--ignore", default="", metavar="NAMES",
-        help="What may not be used at any station: gravity, field, dip, or several with commas.",
-    ),
-    click.option(
-        "--estimate", default="", metavar="NAMES",
-        help="Errors of the stand to find as well: azimuth-zero, inclination-zero, tilt, or several with "
-        "commas.",
-    ),
-    click.option(
-        "--model", type=click.Choice(["polynomial", "factors"]),
-        help="Default: polynomial at order 0, factors above.",
-    ),
-    click.option(
-        "--parameters", type=click.Choice(["12", "9", "6"]),
-        help="Per triad at one temperature; default 12. 9: the sensor frame, without mounting rotation. "
-        "6: scale and bias alone.",
-    ),
-)  # fmt: skip
+
+
+def fit_option(
+    name: str, default: str | None = None, metavar: str | None = None, known: str = ""
+) -> Decorator:
+    """An option of the fit, as it is declared; its `default`, and words of what is `known`, vary by command."""
+    each = FIT_OPTIONS[name]
+    usual = each.default if default is None else default
+    kind = click.Choice(each.words) if each.words else None
+    return click.option(
+        f"--{name.replace('_', '-')}", is_flag=usual is False,
+        type=kind if each.least is None else click.IntRange(each.least),
+        default=usual, show_default=usual not in (None, "", False), metavar=metavar or each.metavar,
+        help=each.help.format(known),
+    )  # fmt: skip
+
+
+SEED = fit_option("seed")
 
 
 def fit_options(order: str, nonlinearity: str, prior: str, known: str) -> Decorator:
-    """The options that say how to fit, which the command gets as `Typed`.
+    """The options that say how to fit, which the command gets as `FitArguments`.
 
     With the defaults of two of them, and what a prior may be, as metavar and in words.
     """
-    declared = (
-        *_FIT,
-        click.option("--prior", metavar=prior, help=f"What is known beforehand: {known}."),
-        preset(
-            "--order", default=order, metavar="0…3|auto",
-            help="Order of temperature terms. auto: of each triad, the terms that noise does not explain.",
-        ),
-        preset(
-            "--nonlinearity", default=nonlinearity, metavar="auto|none|NAMES",
-            help="Own-axis quadratic and cubic terms. auto: of the triads whose profile declares "
-            "them, where the run speaks for them. NAMES: accelerometer, magnetometer, or both with "
-            "a comma.",
-        ),
-    )  # fmt: skip
+    more: dict[str, Any] = {
+        "order": (order,),
+        "nonlinearity": (nonlinearity,),
+        "prior": (None, prior, known),
+    }
 
     def decorate(function: Function) -> Function:
-        for option in reversed(declared):
-            function = option(function)
+        for name in reversed(FIT_OPTIONS):
+            function = fit_option(name, *more.get(name, ()))(function)
         return function
 
     return decorate
 
 
-def database(**more: Any) -> Decorator:
+def registry(**more: Any) -> Decorator:
     """The option that names a registry."""
-    return click.option(
-        "--database",
+    return renamed(
+        "--registry",
+        "database",
+        old=("--database",),
         metavar="URL|FILE",
         help=f"The registry: a file, or the URL of a PostgreSQL database. Default: ${REGISTRY}.",
         **more,
@@ -223,7 +235,7 @@ def _named_registry(context: click.Context, option: click.Parameter, typed: str 
     of_settings = context.get_parameter_source(option.name or "") is ParameterSource.DEFAULT_MAP
     named = (group or typed) if of_settings else (typed or group)
     if not named and not context.resilient_parsing:
-        raise InputError(f"--database must name the registry; got none. Or set ${REGISTRY}.")
+        raise InputError(f"--registry must name the registry; got none. Or set ${REGISTRY}.")
     return named or ""
 
 
@@ -234,7 +246,7 @@ def _system_user() -> str:
     return system_user()
 
 
-DATABASE = database(callback=_named_registry)
+DATABASE = registry(callback=_named_registry)
 ACTOR = click.option(
     "--as", "actor", metavar="NAME", default=_system_user, show_default="the user of the system",
     help="Who acts, as the history states it.",

@@ -15,6 +15,7 @@ from mwdcal.app.messages import print_result
 @click.option(
     "--plan",
     "plans",
+    shell_complete=options.offers("plans"),
     multiple=True,
     metavar="NAME|FILE",
     help="A built-in plan, a TOML file of attitudes, or a run file; several are compared. "
@@ -28,9 +29,10 @@ from mwdcal.app.messages import print_result
 )
 @click.option(
     "--accuracy",
-    metavar="ANGLE=DEG",
+    metavar="ANGLE_deg=VALUE",
     multiple=True,
-    help="The fewest stations that give an accuracy (1σ), such as azimuth=0.1, and enough redundancy; may be repeated.",
+    help="The fewest stations that give an accuracy (1σ), such as azimuth_deg=0.1, and enough "
+    "redundancy; may be repeated.",
 )
 @click.option(
     "--measured",
@@ -40,9 +42,9 @@ from mwdcal.app.messages import print_result
 )
 @click.option(
     "--reach",
-    metavar="ANGLE=LOW:HIGH",
+    metavar="ANGLE_deg=LOW:HIGH",
     multiple=True,
-    help="What the stand reaches, such as inclination=0:120 or azimuth=0:0, degrees; may be repeated. Default: "
+    help="What the stand reaches, such as inclination_deg=0:120 or azimuth_deg=0:0; may be repeated. Default: "
     "every attitude.",
 )
 @options.preset(
@@ -68,32 +70,30 @@ from mwdcal.app.messages import print_result
     metavar="PLAN.csv",
     help="Also write the plan: a run file with blank readings.",
 )
-@click.option(
-    "--html",
-    type=options.FILE,
-    metavar="PLAN.html",
-    help="Also write a run sheet to print and tick off.",
+@options.report(
+    old=("--html",), metavar="PLAN.html", help="Also write a run sheet to print and tick off."
 )
 @options.JSON
 def command(
     plans: tuple[str, ...], stations: int | None, accuracy: tuple[str, ...], measured: Path | None,
     reach: tuple[str, ...], criterion: Literal["D", "A", "I"], speed: float, settle: float, soak: float,
-    tool: str | None, output: Path | None, html: Path | None, as_json: bool, **typed: Unpack[options.Typed],
+    tool: str | None, output: Path | None, report: Path | None, as_json: bool, **typed: Unpack[options.FitArguments],
 ) -> None:  # fmt: skip
-    """What a calibration from planned stations will give: uncertainty, rank, accuracy, hours at the stand.
+    """Predict a calibration from planned stations: uncertainty, rank, accuracy, hours at the stand.
 
     Nothing is measured: a nominal tool with the noise and the stand of the profile.
 
     \b
-    Example: mwdcal plan --stations 24 --tool servo -o plan.csv --html sheet.html
+    Example: mwdcal plan --stations 24 --tool servo -o plan.csv --report sheet.html
     Exit: 0 planned, 2 input cannot be read, 3 the stations cannot give a calibration.
     """
     from mwdcal.app import progress
-    from mwdcal.app.choices import options_of, prior_of
+    from mwdcal.app.inputs import prior_of
+    from mwdcal.calibration.options import options_of
     from mwdcal.library import planning
     from mwdcal.presentation import plan as screen
 
-    options.check_outputs([output], [tool, measured, *plans], page=html)
+    options.check_outputs([output], [tool, measured, *plans], page=report)
     with progress.bar("planning") as show:
         result = planning.plan(
             tool or "generic", plan=plans, stations=stations, measured=measured,
@@ -103,6 +103,6 @@ def command(
         )  # fmt: skip
     if output:
         result.save(output)
-    if html:
-        result.report(html)
+    if report:
+        result.report(report)
     print_result(result.to_dict() if as_json else result.summary(), result.findings)

@@ -27,9 +27,7 @@ def measured(function: options.Function) -> options.Function:
         option = key.replace("_", "-")
         sd = "Its standard uncertainty (1σ)."
         function = options.number(f"--sd-{option}", metavar, sd)(function)
-        function = options.number(f"--{option}", metavar, f"{text}: stands before the model.")(
-            function
-        )
+        function = options.number(f"--{option}", metavar, f"{text}; overrides the model.")(function)
     return function
 
 
@@ -95,7 +93,7 @@ def command(
     """Gravity, magnetic field, dip, declination and convergence at a place and date, without a network.
 
     Normal gravity of WGS84; main field by WMM2025 or IGRF-14, which know neither the rocks nor the steel around:
-    a value measured at the place stands before the model. Each value has its standard uncertainty. Survey takes
+    a value measured at the place overrides the model. Each value has its standard uncertainty. Survey takes
     the file with --reference.
 
     \b

@@ -40,7 +40,7 @@ SUBCOMMANDS = {
 
 
 @click.group(cls=Group, commands=Commands(SUBCOMMANDS))
-@options.database(envvar=options.REGISTRY)
+@options.registry(envvar=options.REGISTRY)
 def command(database: str | None) -> None:
     """Keep every tool's past in a database: runs, calibrations, verifications, certificates, standards, people.
 
@@ -48,9 +48,9 @@ def command(database: str | None) -> None:
     is an event of a history with who and when, chained by hashes.
 
     \b
-    Example: mwdcal registry --database tools.sqlite init
-             mwdcal registry --database tools.sqlite add calibrations runs tool.toml
-             mwdcal registry --database tools.sqlite list
+    Example: mwdcal registry --registry tools.sqlite init
+             mwdcal registry --registry tools.sqlite add calibrations runs tool.toml
+             mwdcal registry --registry tools.sqlite list
     """
 
 
@@ -62,7 +62,7 @@ def init(database: str, actor: str, as_json: bool) -> None:
     """Create an empty registry, in a new file or an empty PostgreSQL database.
 
     \b
-    Example: mwdcal registry init --database tools.sqlite
+    Example: mwdcal registry init --registry tools.sqlite
     Exit: 0 created, 2 it exists already, or cannot be written.
     """
     from mwdcal.presentation import registry as screen
@@ -87,7 +87,7 @@ def upgrade(database: str, actor: str, target: str | None, as_json: bool) -> Non
     All in one transaction. Back it up before.
 
     \b
-    Example: mwdcal registry upgrade --database tools.sqlite
+    Example: mwdcal registry upgrade --registry tools.sqlite
     Exit: 0 as it should be, 2 it cannot be opened, or a newer program made it.
     """
     from mwdcal.presentation import registry as screen
@@ -117,7 +117,7 @@ def check(database: str, head: str | None, as_json: bool) -> None:
     the newest events are missing together with all that they brought.
 
     \b
-    Example: mwdcal registry check --database tools.sqlite
+    Example: mwdcal registry check --registry tools.sqlite
     Exit: 0 sound, 1 altered, 2 it cannot be opened.
     """
     from mwdcal.app.progress import bar
@@ -145,7 +145,7 @@ def export(folder: Path, database: str, as_json: bool) -> None:
     and restore keep the history.
 
     \b
-    Example: mwdcal registry export tools --database tools.sqlite
+    Example: mwdcal registry export tools --registry tools.sqlite
     Exit: 0 written, 2 the folder is not empty, or cannot be written, 3 a document was altered.
     """
     from mwdcal.app.progress import bar
@@ -176,7 +176,7 @@ def backup(output: Path, database: str, as_json: bool) -> None:
     Note the hash that it prints: `check --head` later tells whether all is still there.
 
     \b
-    Example: mwdcal registry backup tools-backup.sqlite --database tools.sqlite
+    Example: mwdcal registry backup tools-backup.sqlite --registry tools.sqlite
     Exit: 0 written, 2 the registry cannot be opened, or the file cannot be written, 3 the registry was altered.
     """
     from mwdcal.presentation import registry as screen
@@ -199,7 +199,7 @@ def restore(source: Path, database: str, actor: str, as_json: bool) -> None:
     """Fill a new registry, a file or an empty PostgreSQL database, from the backup in a FILE.
 
     \b
-    Example: mwdcal registry restore tools-backup.sqlite --database restored.sqlite
+    Example: mwdcal registry restore tools-backup.sqlite --registry restored.sqlite
     Exit: 0 restored, 2 the registry is not empty or cannot be written, 3 the backup was altered.
     """
     from mwdcal.presentation import registry as screen
@@ -234,7 +234,7 @@ def add(
     cannot be added does not stop the others.
 
     \b
-    Example: mwdcal registry add runs tool.toml cals.parquet --as "A. Borg" --database tools.sqlite
+    Example: mwdcal registry add runs tool.toml cals.parquet --as "A. Borg" --registry tools.sqlite
     Exit: 0 added, or there already; 2 a file is missing, or not one could be added.
     """
     from mwdcal import pool
@@ -276,7 +276,7 @@ def withdraw(record: str, reason: str, database: str, actor: str, as_json: bool)
     """Withdraw a RECORD, by its number or SHA-256: it stays in the history, and no longer counts.
 
     \b
-    Example: mwdcal registry withdraw 1207 --reason "wrong stand angles" --database tools.sqlite
+    Example: mwdcal registry withdraw 1207 --reason "wrong stand angles" --registry tools.sqlite
     Exit: 0 withdrawn, 2 there is no such record, or it is withdrawn already.
     """
     from mwdcal.presentation import registry as screen
@@ -310,7 +310,7 @@ FIRST = options.preset("--offset", type=click.IntRange(0), default=0, help="Rows
 @click.option(
     "--due",
     type=click.DateTime(["%Y-%m-%d"]),
-    metavar="DATE",
+    metavar="YYYY-MM-DD",
     help="Only tools and measurement standards whose calibration is due before this day.",
 )
 @ROWS
@@ -323,9 +323,9 @@ def listing(
     """List the tools of a registry: last calibration, accuracy to expect, next due, last verdict.
 
     \b
-    Example: mwdcal registry list --database tools.sqlite
-    Example: mwdcal registry list --due 2027-01-01 --database tools.sqlite
-    Example: mwdcal registry list --kind certificate --database tools.sqlite
+    Example: mwdcal registry list --registry tools.sqlite
+    Example: mwdcal registry list --due 2027-01-01 --registry tools.sqlite
+    Example: mwdcal registry list --kind certificate --registry tools.sqlite
     Exit: 0 listed, 2 the registry cannot be opened.
     """
     from mwdcal.presentation import registry as screen
@@ -348,7 +348,7 @@ def history(serial: str, database: str, limit: int, offset: int, as_json: bool) 
     """Show the past of the tool SERIAL: all its records, who added them and when.
 
     \b
-    Example: mwdcal registry history SIM-0001 --database tools.sqlite
+    Example: mwdcal registry history SIM-0001 --registry tools.sqlite
     Exit: 0 shown, 2 there is no such tool, or the registry cannot be opened.
     """
     from mwdcal.presentation import registry as screen
@@ -372,7 +372,7 @@ def get(record: str, database: str, output: Path, as_json: bool) -> None:
     The first eight digits of a SHA-256 will do where no other begins with them.
 
     \b
-    Example: mwdcal registry get SIM-0001 -o tool.json --database tools.sqlite
+    Example: mwdcal registry get SIM-0001 -o tool.json --registry tools.sqlite
     Exit: 0 written, 2 no such record, or the file cannot be written, 3 the record was altered.
     """
     from mwdcal.files.formats import atomic
@@ -407,17 +407,19 @@ def get(record: str, database: str, output: Path, as_json: bool) -> None:
     show_default=True,
     help="Share of unchanged tools that are called changed.",
 )
-@click.option(
-    "--today",
+@options.renamed(
+    "--date",
+    "today",
+    old=("--today",),
     type=click.DateTime(["%Y-%m-%d"]),
-    metavar="DATE",
+    metavar="YYYY-MM-DD",
     help="Day by which tools are overdue. Default: today.",
 )
-@click.option("--html", type=options.FILE, metavar="D.html", help="Also write a page.")
+@options.report(old=("--html",))
 @options.JSON
 def drift(
     serial: str | None, database: str, limits: tuple[str, ...], level: float,
-    today: datetime | None, html: Path | None, as_json: bool,
+    today: datetime | None, report: Path | None, as_json: bool,
 ) -> None:  # fmt: skip
     """Compare the calibrations of the tool SERIAL, or of every tool: did it change, and when is it due?
 
@@ -425,8 +427,8 @@ def drift(
     date follows from the random walk of the parameters, learnt from the tool and others of its type.
 
     \b
-    Example: mwdcal registry drift SIM-0001 --html drift.html --database tools.sqlite
-    Example: mwdcal registry drift --limit inclination_deg=0.1 --html fleet.html --database tools.sqlite
+    Example: mwdcal registry drift SIM-0001 --report drift.html --registry tools.sqlite
+    Example: mwdcal registry drift --limit inclination_deg=0.1 --report fleet.html --registry tools.sqlite
     Exit: 0 compared, 2 there is no such tool, or the registry cannot be opened, 3 a document was altered.
     """
     from mwdcal.app.progress import bar
@@ -436,12 +438,12 @@ def drift(
     from mwdcal.presentation import drift_page as pages
     from mwdcal.registry.store import open_registry
 
-    options.check_outputs([], [database], page=html)
+    options.check_outputs([], [database], page=report)
     day = (today or datetime.now(UTC)).date()
     allowed = drifts.limits_of(limits)
     with open_registry(database) as registry, bar("comparing") as advance:
         result = drifts.of_registry(registry, serial, allowed, level, day, advance)
-    if html:
-        atomic.write(html, pages.render(result.tool, result.fleet))
-    shown = screen.document(result) if as_json else screen.text(result, html)
+    if report:
+        atomic.write(report, pages.render(result.tool, result.fleet))
+    shown = screen.document(result) if as_json else screen.text(result, report)
     print_result(shown, result.tool.findings if result.tool else [])

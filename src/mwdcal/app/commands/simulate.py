@@ -27,6 +27,7 @@ ALWAYS = ("plan", "tool", "calibration", "order", "effects", "seed", "output", "
 @options.command()
 @options.preset(
     "--plan",
+    shell_complete=options.offers("plans"),
     metavar="NAME|FILE",
     default="twenty-four-state",
     help="A built-in plan, a TOML file of attitudes, or a run file.",
@@ -57,7 +58,13 @@ ALWAYS = ("plan", "tool", "calibration", "order", "effects", "seed", "output", "
 @options.preset(
     "--rolltest", metavar="NAME|FILE", default="roll-test", help="Plan of the roll test."
 )
-@options.preset("--limits", metavar="NAME|FILE", default="roll-test", help="Limits of the verdict.")
+@options.preset(
+    "--limits",
+    shell_complete=options.offers("limits"),
+    metavar="NAME|FILE",
+    default="roll-test",
+    help="Limits of the verdict.",
+)
 @click.option(
     "--workers", type=click.IntRange(1), metavar="N", help="Processes. Default: one per core."
 )
@@ -67,7 +74,7 @@ ALWAYS = ("plan", "tool", "calibration", "order", "effects", "seed", "output", "
 def command(
     plan: str, tool: str | None, calibration: Path | None, effects: str | None, output: Path,
     truth: Path | None, repeat: int | None, rolltest: str, limits: str, workers: int | None,
-    plot: Path | None, as_json: bool, **typed: Unpack[options.Typed],
+    plot: Path | None, as_json: bool, **typed: Unpack[options.FitArguments],
 ) -> None:  # fmt: skip
     """Simulate a run: a tool, a plan, a stand with its errors, noise. The same seed, the same run.
 
@@ -88,7 +95,8 @@ def command(
         [output, truth], [plan, tool, calibration, effects, rolltest, limits], plot
     )
     with pool.preparing(workers) if repeat else nullcontext():  # these imports, in the workers too
-        from mwdcal.app.choices import options_of, prior_of
+        from mwdcal.app.inputs import prior_of
+        from mwdcal.calibration.options import options_of
         from mwdcal.library import simulation
     chosen = options_of(typed, prior_of(typed["prior"])[0])
     result: simulation.RepeatedProcedure | simulation.SimulatedReadings

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import lines, print_result, say
-from mwdcal.presentation.typed import as_typed, findings_as_typed
+from mwdcal.presentation.typed import findings_with_option_names, with_option_names
 
 
 @options.command()
@@ -46,7 +46,7 @@ def command(
     from mwdcal.files.formats import atomic, table
     from mwdcal.logs.stations import StandstillError, find_stations
     from mwdcal.presentation import stations as screen
-    from mwdcal.presentation.envelope import enveloped
+    from mwdcal.presentation.envelope import json_document
     from mwdcal.presentation.page import picture
     from mwdcal.presentation.stations_page import figure, render
 
@@ -58,8 +58,8 @@ def command(
         stations = find_stations(readings, say=slowly, **search)
     except StandstillError as error:  # the picture helps most then
         refusal, stations = error, error.analysis
-    stations = replace(stations, findings=findings_as_typed(stations.findings))
-    why = as_typed(str(refusal or ""))
+    stations = replace(stations, findings=findings_with_option_names(stations.findings))
+    why = with_option_names(str(refusal or ""))
     drawn = picture(figure(stations), plot.suffix) if plot else b""
     rendered = render(stations, readings.digest, str(output), why) if report else ""
     if not refusal:
@@ -71,5 +71,5 @@ def command(
         raise refusal
     files = {"output": str(output), "plot": str(plot or ""), "report": str(report or "")}
     content = screen.summary(stations, files)
-    document = enveloped("stations", content, readings.metadata, log=readings.digest)
+    document = json_document("stations", content, readings.metadata, log=readings.digest)
     print_result(document if as_json else screen.screen(stations, files), stations.findings)

@@ -11,7 +11,7 @@ import click
 from mwdcal.app.commands import options
 from mwdcal.app.messages import offering_blank, print_result
 from mwdcal.errors import InputError
-from mwdcal.presentation.typed import findings_as_typed
+from mwdcal.presentation.typed import findings_with_option_names
 
 if TYPE_CHECKING:
     from mwdcal.calibration.canonical import SignatureCheck
@@ -36,9 +36,7 @@ if TYPE_CHECKING:
     help="Multi-station analysis first: take the drill string's interference, as all surveys show it, off the "
     "magnetometer.",
 )
-@click.option(
-    "--msa-html", type=options.FILE, metavar="M.html", help="Also write a page of that analysis."
-)
+@click.option("--msa-html", type=options.FILE, hidden=True, help="Page of that analysis alone.")
 @click.option(
     "--sensor-drift",
     metavar="owsg|none|FILE",
@@ -54,9 +52,11 @@ if TYPE_CHECKING:
 )
 @options.preset(
     "--limits",
+    shell_complete=options.offers("survey_limits"),
     default="owsg-mwd",
     metavar="NAME|FILE",
-    help="Limits on |g|, |b| and dip: an error model (owsg-mwd), fixed ones (iscwsa-fixed, fixed), or a TOML file.",
+    help="Limits on |g|, |b| and dip: an error model (owsg-mwd), fixed ones (iscwsa-fixed, fixed), or a TOML file with "
+    "gravity_g, field_nt and dip_deg, or [sensor] and [reference]. Files of verify --limits do not fit.",
 )
 @options.preset(
     "--switch",
@@ -73,8 +73,9 @@ if TYPE_CHECKING:
 )
 @options.WHERE_OUTSIDE
 @options.MISSING
-@click.option(
-    "--html", type=options.FILE, metavar="S.html", help="Also write a page with the pictures."
+@options.report(
+    old=("--html",),
+    help="Also write a page with the pictures; with --msa it shows the analysis too.",
 )
 @options.of_run
 @options.DECIMAL
@@ -83,7 +84,7 @@ if TYPE_CHECKING:
 def command(
     calibration: Path, readings: Path, output: Path, reference: Path | None, msa: bool,
     msa_html: Path | None, sensor_drift: str | None, error_model: str, limits: str, switch: str,
-    tie_in: str | None, outside: str, missing: str, html: Path | None, decimal: str, key: tuple[Path, ...],
+    tie_in: str | None, outside: str, missing: str, report: Path | None, decimal: str, key: tuple[Path, ...],
     as_json: bool,
 ) -> None:  # fmt: skip
     """Surveys of a well: READINGS in their order, corrected by the CALIBRATION of their tool.
@@ -92,7 +93,7 @@ def command(
     whether each survey lies within the limits; with measured depths (md_m) north, east and TVD.
 
     \b
-    Example: mwdcal survey tool.json surveys.csv --reference here.json -o well.csv --html well.html
+    Example: mwdcal survey tool.json surveys.csv --reference here.json -o well.csv --report well.html
     Exit: 0 written, 2 input cannot be read, or does not belong to the calibration, 3 with --msa: the surveys do not
     separate interference from azimuth.
     """
@@ -107,12 +108,12 @@ def command(
         raise InputError("`msa_html` goes with `msa`. Leave it out, or add `msa`.")
     check_drift(sensor_drift, msa)
     given = [calibration, readings, reference, limits, error_model, *key]
-    options.check_outputs([output, msa_html], given, page=html)
+    options.check_outputs([output, msa_html], given, page=report)
     start, ends = _tie_in(tie_in), _switch(switch)
     loaded = load_calibration(calibration, key)
     fitted = loaded.calibration
     said = options.statements()
-    whole = msa or html or missing == "blank" or said
+    whole = msa or report or missing == "blank" or said
     if not whole and long_table.in_parts(readings, output, fitted.profile):
         result = long_table.survey_file(
             fitted, readings, output, reference, limits, start, ends, outside, decimal,
@@ -128,16 +129,16 @@ def command(
     analysis = analysed(inputs, sensor_drift) if msa else None
     pages = _interference_page(inputs, analysis, msa_html)
     if analysis and not analysis.summary.separable:
-        atomic.write_all(pages)
+        atomic.write_all(pages + _interference_page(inputs, analysis, report))
         _refuse(inputs, analysis, loaded.signature, as_json)
     result = survey_well(inputs, analysis, tie_in=start, switch=ends, outside=outside)
-    if html:
+    if report:
         from mwdcal.presentation.survey_page import render
 
-        findings = findings_as_typed(result.well.findings)
-        pages.append((html, render(result.well, findings, inputs.named)))
+        findings = findings_with_option_names(result.well.findings)
+        pages.append((report, render(result.well, findings, inputs.named, analysis)))
     atomic.write_all([(output, tables.streamed(output, result.table)), *pages])
-    _print(result, loaded.signature, (str(output), str(html or "")), as_json)
+    _print(result, loaded.signature, (str(output), str(report or "")), as_json)
 
 
 def _interference_page(
@@ -175,7 +176,7 @@ def _print(
         if as_json
         else screens.whole_screen(result, facts, signature)
     )
-    print_result(shown, findings_as_typed(screens.all_findings(facts)))
+    print_result(shown, findings_with_option_names(screens.all_findings(facts)))
 
 
 def _numbers(name: str, text: str, count: int) -> list[float]:

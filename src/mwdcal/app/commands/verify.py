@@ -8,7 +8,7 @@ from pathlib import Path
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result
 from mwdcal.presentation.text import to_json
-from mwdcal.presentation.typed import findings_as_typed
+from mwdcal.presentation.typed import findings_with_option_names
 
 
 @options.command()
@@ -39,7 +39,7 @@ def command(
     from mwdcal.files.formats import atomic
     from mwdcal.files.limits import load_limits
     from mwdcal.files.settings import standards_of
-    from mwdcal.presentation.envelope import enveloped, with_signature
+    from mwdcal.presentation.envelope import json_document, with_signature
     from mwdcal.presentation.signature import load_calibration
     from mwdcal.presentation.verification import next_step, screen
     from mwdcal.use.verification import verify
@@ -53,13 +53,13 @@ def command(
     bounds, limits_digest = load_limits(limits)
     result = verify(fitted, readings, bounds)
     late = overdue(standards_of(fitted.profile), readings.metadata)
-    findings = findings_as_typed(
+    findings = findings_with_option_names(
         loaded.findings + result.findings + unused_columns(readings.unused) + late
     )
     result = replace(result, findings=findings)
     stated = fitted.tool, readings.metadata
     digests = {"calibration": loaded.digest, "run": readings.run_sha256, "limits": limits_digest}
-    document = enveloped("verify", result, *stated, **digests)
+    document = json_document("verify", result, *stated, **digests)
     document = with_signature(document, loaded.signature)
     rendered = ""
     if report:

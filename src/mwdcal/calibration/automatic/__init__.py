@@ -1,1 +1,1 @@
-"""What the software chooses where an option says `auto`: order, nonlinearity."""
+"""The choices of the software where an option says `auto`: order, nonlinearity."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mwdcal.calibration.prior import Knowledge
+from mwdcal.calibration.prior import PriorInformation
 from mwdcal.calibration.readings import TRIADS, Readings, stated_day
 from mwdcal.calibration.record import Calibration
 from mwdcal.geometry.vectors import Array
@@ -41,8 +41,8 @@ class Ageing:
 
 
 def aged(
-    known: Knowledge, previous: Calibration, readings: Readings, profile: Profile
-) -> Knowledge:
+    known: PriorInformation, previous: Calibration, readings: Readings, profile: Profile
+) -> PriorInformation:
     """A previous calibration as knowledge of a later run, with what the tool may have changed meanwhile."""
     years, when = _elapsed(previous, readings)
     each = {triad: Ageing.of(profile, triad, years) for triad in TRIADS}

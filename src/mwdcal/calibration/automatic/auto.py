@@ -72,7 +72,7 @@ def resolved(
     options: Options, readings: Readings, profile: Profile, progress: Progress
 ) -> tuple[Options, list[OrderScore], list[CurveScore]]:
     """The options without `auto`, and the tables of what was chosen among."""
-    options = known_before(options, readings, profile)
+    options = with_prior(options, readings, profile)
     check_readings(readings, options)
     orders: list[OrderScore] = []
     if options.order == AUTO:
@@ -83,7 +83,7 @@ def resolved(
     return options, orders, curves
 
 
-def known_before(options: Options, readings: Readings, profile: Profile) -> Options:
+def with_prior(options: Options, readings: Readings, profile: Profile) -> Options:
     """The options with what is known of one or many tools beforehand, as their prior.
 
     A previous calibration brings its model and order along; own-axis terms asked for by name get

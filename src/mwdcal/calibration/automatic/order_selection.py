@@ -116,7 +116,7 @@ def _too_weak(result: Fit) -> Bools:
 
 
 def order_errors(readings: Readings, options: Options, progress: Progress) -> list[OrderScore]:
-    """What an order that was given is worth at temperatures left out, one row per triad.
+    """The errors of a given order at temperatures left out, one row per triad.
 
     None where there are too few soaks to leave one out.
     """

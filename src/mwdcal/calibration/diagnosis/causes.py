@@ -1,4 +1,4 @@
-"""What may have caused a refusal: a station, wrong axes, a column that is not used, the span of temperatures."""
+"""The possible causes of a refusal: a station, wrong axes, a column that is not used, the span of temperatures."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def _column(fitted: FittedRuns, place: int) -> str:
 
 
 REFUSAL_ENDINGS = {"culprit": _culprit, "axes": _axes, "column": _column}
-"""What the words of a refusal may end with, for one run."""
+"""The possible ends of a refusal, for one run."""
 
 
 def spanned(fitted: FittedRuns, index: int) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 An error δ of a station moves the residuals of all stations by δ times the response to it. The tests of
 `calibrate` then follow noncentral χ² distributions, and δ is found at which they exceed their limits
 in `POWER` of all runs. Two tests are looked at: that of the single station, which names it
-(`residuals.to_reshoot`), and that of all residuals of a triad. The error also widens the residuals of
+(`residuals.stations_to_remeasure`), and that of all residuals of a triad. The error also widens the residuals of
 the others, by which the first is judged: a run of few stations may name none, however large δ is.
 
 Reference: W. Baarda, A testing procedure for use in geodetic networks, Netherlands Geodetic

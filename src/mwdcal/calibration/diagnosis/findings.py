@@ -1,4 +1,4 @@
-"""What the reader of a calibration should know, in plain words, each with its remedy."""
+"""The findings on a calibration in plain words, each with its remedy."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ REMARKS = {
     "{of[reason]} Re-shoot it, or `exclude` {of[station]}",
     "distrusted": "robust fit: low weight for station {stations}. Look at what they have in common.",
 }
-"""What a finding says, by its id or the end of it."""
+"""The statement of a finding, by its id or the end of it."""
 
 SCATTERED = {
     "gravity": "the strength of g by {:.2f} %",
@@ -138,7 +138,7 @@ SCATTERED = {
 
 
 def described(name: str) -> str:
-    """What a free direction means, and what would determine it."""
+    """The meaning of a free direction, and the measurement that would determine it."""
     steady, _, power = name.partition("-temperature-")
     course = f" (its variation with temperature, power {power})" if power else ""
     return FREE_DIRECTIONS.get(steady, steady) + course
@@ -243,7 +243,7 @@ def _settings(fitted: FittedRuns) -> Iterator[Flag]:
 
 
 def _setting(fitted: FittedRuns, column: int, place: int) -> str:
-    """What is said of one setting's angle, a column of the settings' unknowns."""
+    """The statements about one setting's angle, a column of the settings' unknowns."""
     evidence, state = fitted.result.problem.evidence, fitted.result.state
     sd = evidence.set_together[place, :, column]
     second = column >= evidence.set_together.shape[-1] // 2
@@ -311,7 +311,7 @@ def _followed(fitted: FittedRuns) -> Iterator[Flag]:
 
 
 def _structure(fitted: FittedRuns) -> Iterator[Flag]:
-    """What the residuals look like, where they are more than noise."""
+    """The likely cause of residuals that are more than noise."""
     unit = shown_in("field", fitted.readings.relative)[1]
     looked_at = np.flatnonzero(suspected(fitted.result, fitted.chances))
     for place, shown in fitted.shown(looked_at).items():
@@ -329,7 +329,7 @@ def _looks(fitted: FittedRuns, name: str, unit: str, place: int) -> str:
 
 
 def _scatter(fitted: FittedRuns) -> Flag:
-    """What varies from station to station by more than the noise of the sensors."""
+    """The strengths that vary from station to station by more than the noise of the sensors."""
     scatter = fitted.result.problem.evidence.scatter
     sizes = {name: values.max(-1) for name, values in scatter.items()}
     large = np.max([np.zeros(fitted.count), *sizes.values()], 0) > SCATTER_SHARE

@@ -45,13 +45,13 @@ class Flag:
     station: int | None = None
 
     def sentence(self, place: int) -> str:
-        """What the flag says of one member."""
+        """The sentence of the flag for one member."""
         return self.words.format_map(_Values(self.values, place))
 
 
 @dataclass(frozen=True)
 class _Values:
-    """What fills in the words of a flag for the member at `place`."""
+    """The values in the words of a flag for the member at `place`."""
 
     values: Mapping[str, Any]
     place: int

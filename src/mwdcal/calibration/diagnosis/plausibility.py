@@ -10,7 +10,14 @@ import numpy as np
 from mwdcal.calibration.diagnosis.soundness import invertible, mirrored
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import EARTH_RANGES, Readings
-from mwdcal.calibration.residuals import RESHOOT, Residuals, chances, chi_chance, tail, to_reshoot
+from mwdcal.calibration.residuals import (
+    RESHOOT,
+    Residuals,
+    chances,
+    chi_chance,
+    stations_to_remeasure,
+    tail,
+)
 from mwdcal.calibration.results import variance_scales
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.evidence import STAND_ERRORS, UNKNOWN
@@ -226,12 +233,12 @@ def departures(result: Fit) -> tuple[Array, Ints]:
 
 
 def stations_to_reshoot(result: Fit) -> Bools:
-    """Stations (B, n) to take again: `to_reshoot`, evaluated only where a bound allows it to be true."""
+    """Stations (B, n) to take again: `stations_to_remeasure`, evaluated only where a bound allows it to be true."""
     again = np.zeros(result.analysis.residual.shape[:2], bool)
     some = np.flatnonzero(_suspects(result))
     if some.size:
         part = result if some.size == len(again) else take(result, some)
-        again[some] = to_reshoot(chances(part))
+        again[some] = stations_to_remeasure(chances(part))
     return again
 
 

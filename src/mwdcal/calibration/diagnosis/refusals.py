@@ -78,7 +78,7 @@ TOOL_AXES = np.array([*"xyz"])
 Run = Callable[[int], Readings]
 """Readings of one member of a batch, without leading axis: their labels and source."""
 Words = dict[str, Any]
-"""What fills in the words of a flag, by name."""
+"""The values in the words of a flag, by name."""
 
 OF_OPTIONS = {
     "method": f"`method` must be one of {', '.join(EVIDENCE)}; got {{options.method!r}}.",
@@ -107,7 +107,7 @@ UNSOUND_ADVICE = (
     "Check 'noise' and 'repeatability' in the tool profile and the columns sd_: all are in the raw units of their "
     "channel; without them the noise is estimated."
 )
-"""What to do where a fit has no valid covariance."""
+"""The advice where a fit has no valid covariance."""
 OF_READINGS = {
     "few": "{source} has {count} stations; the model has {size} parameters per triad and needs {needed} or more. Add "
     "stations at other attitudes{remedy}.",
@@ -209,7 +209,7 @@ def check_options(options: Options) -> None:
 
 
 def minimiser(options: Options) -> str:
-    """What an own minimiser is called."""
+    """The name of a method that minimises by itself."""
     return "the paper's weights" if options.paper_weights else f"method {options.method}"
 
 
@@ -497,7 +497,7 @@ def _unexplained_errors(fitted: FittedRuns, sound: Bools) -> Flag:
 
 
 def _unsound(fitted: FittedRuns) -> Flag:
-    """Fits whose covariance is none, or whose gains are none that a sensor has."""
+    """Fits with an invalid covariance or implausible gains."""
     result, zero = fitted.result, fitted.profile.reference_temperature_c
     low, high = temperature_range(result, fitted.options.knowledge)
     with np.errstate(all="ignore"):  # of members that earlier refusals hold of

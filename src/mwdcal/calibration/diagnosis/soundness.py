@@ -41,7 +41,7 @@ def check(calibration: Calibration, name: str, advice: str) -> None:
 
 
 def inconsistency(calibration: Calibration) -> str:
-    """What is impossible in a calibration, or does not fit together; empty where all is well."""
+    """The contradictions in a calibration; empty if there are none."""
     rules = (_parts, _numbers, _surroundings, _ranks, _covariance, _gains)
     return next((problem for rule in rules for problem in rule(calibration)), "")
 

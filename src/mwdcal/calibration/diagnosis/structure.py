@@ -1,4 +1,4 @@
-"""What the misfit of a run looks like: zeros of the stand, drift, gradient, backlash, thermal lag.
+"""The likely causes of the misfit of a run: zeros of the stand, drift, gradient, backlash, thermal lag.
 
 Each effect is a family of columns that the residuals may have in common with it. A family is named
 where it takes away more of the misfit than noise of any direction would (F test), the best one
@@ -20,7 +20,7 @@ from mwdcal.calibration.diagnosis.families import COURSE_SUFFIX, families, produ
 from mwdcal.calibration.diagnosis.first_look import EFFECT_CHANCE, LEFT_BY_FIT, may_show
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import TRIADS
-from mwdcal.calibration.residuals import chances, to_reshoot
+from mwdcal.calibration.residuals import chances, stations_to_remeasure
 from mwdcal.calibration.results import variance_scales
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.problem import Problem, State
@@ -70,7 +70,7 @@ EFFECTS = {
     "the mounting",
     "thermal-lag": "thermal lag: readings follow the thermometer late. Wait longer after each change of temperature",
 }
-"""What the residuals look like, and what to do."""
+"""The likely cause of the residuals, and the remedy."""
 
 
 @dataclass(frozen=True)
@@ -229,7 +229,7 @@ def _testable(problem: Problem, state: State, others: Mapping[str, Array]) -> di
 
 def _without_bad_stations(result: Fit) -> Fit:
     """The fits less their stations to take again, if they are few: one bad station looks like anything."""
-    bad = to_reshoot(chances(result))
+    bad = stations_to_remeasure(chances(result))
     bad &= bad.mean(-1, keepdims=True) <= BAD_SHARE
     evidence = result.problem.evidence
     fewer = replace(evidence, include=evidence.include * ~bad)

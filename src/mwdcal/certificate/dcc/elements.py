@@ -17,7 +17,7 @@ from xml.etree import ElementTree as ET
 
 from mwdcal.certificate.document import Quantity
 from mwdcal.files.exchange.xml import lines, one_line
-from mwdcal.use.strengths import STANDARD_GRAVITY
+from mwdcal.geometry.units import STANDARD_GRAVITY
 
 LANGUAGE = "en"
 UNSTATED = "not stated"

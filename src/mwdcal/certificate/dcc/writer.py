@@ -211,7 +211,7 @@ def _quantity(quantity: Quantity, *metadata: Child, basic: str = _MEASURED_VALUE
 
 
 def _undetermined(quantity: Quantity) -> ET.Element:
-    """What stands in place of the number of a quantity that is undetermined."""
+    """The text in place of the number of a quantity that is undetermined."""
     name = title(quantity.name or quantity.id)
     text = content(f"{NO_VALUE} {quantity.at}")
     return typed("text", f"undetermined-{quantity.id}", name, text)
@@ -275,7 +275,7 @@ def _budget(budget: Budget) -> ET.Element:
 
 
 def _sd(line: BudgetLine, angle: str) -> float | None:
-    """What a line of the budget adds to an angle, degrees."""
+    """The contribution of a line of the budget to an angle, degrees."""
     value: float | None = getattr(line, f"{angle}_deg")
     return value
 

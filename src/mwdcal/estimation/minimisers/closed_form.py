@@ -19,7 +19,7 @@ import numpy as np
 from mwdcal.estimation.minimisers import closed_form_factors
 from mwdcal.estimation.problem import GEOMETRIC_NOISE, Problem, State, Triad
 from mwdcal.estimation.solvers import RANK_TOLERANCE, Determined, regress
-from mwdcal.estimation.uncertainty import Analysis
+from mwdcal.estimation.uncertainty import Analysis, per_freedom
 from mwdcal.geometry.vectors import (
     Array,
     Bools,
@@ -159,7 +159,7 @@ def solution(problem: Problem, at: State) -> tuple[State, Analysis, Bools]:
         np.stack([np.sum(getattr(h, n) ** k, (1, 2)) for h in triads], -1)
         for n, k in (("left", 2), ("open", 1))
     )
-    factor = squares / np.where(freedom > 1e-9, freedom, np.nan)
+    factor = per_freedom(squares, freedom)
     none = np.zeros((len(include), p, 0))
     known = determined(triads)
     nothing = none[:, :0], none, none

@@ -21,7 +21,7 @@ from mwdcal.estimation.minimisers.common_columns import (
     sensor_terms,
 )
 from mwdcal.estimation.problem import WALK_AXES, Problem, State
-from mwdcal.estimation.uncertainty import Analysis, variance_factors
+from mwdcal.estimation.uncertainty import Analysis, scaled_freedom, variance_factors
 from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, inverse
 from mwdcal.sensor.models import affine_parts
 
@@ -119,7 +119,7 @@ def effective_freedom(problem: Problem, analysis: Analysis) -> Array:
         known = -precision[:, places, None] * analysis.constants[:, places[:, None], places]
         np.einsum("bii->bi", known)[...] += 1
         square[:, index] += np.sum(known * known.mT, (-1, -2)) - diagonal(known).sum(-1)
-    return np.asarray(analysis.freedom**2 / np.where(square > 1e-9, square, np.inf))
+    return scaled_freedom(analysis.freedom, square)
 
 
 def prior_precision(problem: Problem) -> Array:

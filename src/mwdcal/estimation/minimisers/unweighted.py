@@ -82,7 +82,7 @@ class Sums:
         """Information (B, p, p) of the observables, in relative units and radians."""
         return self.linear(state, geometry=True).normal.information
 
-    def pulls(self, state: State, target: Array) -> Array:
+    def influence(self, state: State, target: Array) -> Array:
         """Change (B, n, p, 3) of the minimum by an error of each station's whitened reading.
 
         On the determined subspace. The observables' gradients are taken at `target` (B, n, 3), the

@@ -31,9 +31,10 @@ from mwdcal.files.formats.columns import (
     shown,
 )
 from mwdcal.files.synonyms import FACTORS, unit_of
+from mwdcal.geometry.units import FOOT
 
 _DEPTHS = ("DEPT", "DEPTH", "MD")
-_DEPTH_FACTORS = {"M": 1.0, "METER": 1.0, "METRE": 1.0, "FT": 0.3048, "F": 0.3048, "FEET": 0.3048}
+_DEPTH_FACTORS = {"M": 1.0, "METER": 1.0, "METRE": 1.0, "FT": FOOT, "F": FOOT, "FEET": FOOT}
 _TEMPERATURES = ("TEMP", "TEMPERATURE", "TEMPERATURE_C")
 _FAMILIES = {
     "accelerometer": (("ax", "ay", "az"), ("A", "G"), ("g", "mg", "m/s²")),

@@ -7,6 +7,7 @@ from typing import NamedTuple
 from mwdcal.errors import InputError
 from mwdcal.files.formats.columns import looks_numeric, shown
 from mwdcal.files.synonyms import FACTORS
+from mwdcal.geometry.units import FOOT
 
 
 class Leaf(NamedTuple):
@@ -54,11 +55,11 @@ OF_STATION = (
 
 _PER_MS2 = FACTORS["m/s²"][0]
 _UOMS = {
-    "m": {"m": 1.0, "cm": 0.01, "mm": 1e-3, "km": 1e3, "ft": 0.3048, "ftUS": 1200 / 3937},
+    "m": {"m": 1.0, "cm": 0.01, "mm": 1e-3, "km": 1e3, "ft": FOOT, "ftUS": 1200 / 3937},
     "dega": {"dega": 1.0, "rad": FACTORS["rad"][0], "gon": 0.9, "mina": 1 / 60, "seca": 1 / 3600},
     "gn": {
         **{"gn": 1.0, "mgn": FACTORS["mg"][0], "m/s2": _PER_MS2, "cm/s2": 0.01 * _PER_MS2},
-        **{"Gal": 0.01 * _PER_MS2, "mGal": 1e-5 * _PER_MS2, "ft/s2": 0.3048 * _PER_MS2},
+        **{"Gal": 0.01 * _PER_MS2, "mGal": 1e-5 * _PER_MS2, "ft/s2": FOOT * _PER_MS2},
     },
     "nT": {
         **{"nT": 1.0, "uT": FACTORS["µT"][0], "mT": FACTORS["mT"][0], "T": 1e9},

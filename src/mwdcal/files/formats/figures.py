@@ -9,7 +9,7 @@ from mwdcal.errors import Answer, InputError, QuestionError
 from mwdcal.files.formats.columns import as_text, looks_numeric
 
 _SPACES = re.compile(r"(?<=\d)[ '’\u00a0\u202f\u2009](?=\d{3}(\D|$))")
-"""What separates thousands and is never a decimal sign."""
+"""A separator of thousands and is never a decimal sign."""
 _WRITTEN = r"[+\-−]?(?:\d+(?:[.,]\d+)*[.,]?|[.,]\d+)(?:[eE][+\-−]?\d+)?"
 _FIGURE = re.compile(rf"({_WRITTEN})\s*([°º%]?\s?[A-Za-zµμ²/°º]{{0,6}})")
 _BARE_FIGURE = re.compile(_WRITTEN)

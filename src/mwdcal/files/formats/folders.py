@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,6 +9,7 @@ from pathlib import Path
 from unicodedata import normalize
 from urllib.parse import quote
 
+from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import atomic
 
@@ -65,7 +65,7 @@ def _escaped(text: str) -> str:
 
 def mark_of(serial: str) -> str:
     """What tells a serial from those that share its name; no name has this sign otherwise."""
-    return f"~{hashlib.sha256(serial.encode()).hexdigest()[:8]}"
+    return f"~{sha256_of(serial.encode())[:8]}"
 
 
 def check_new(folder: Path) -> None:

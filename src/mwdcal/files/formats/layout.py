@@ -40,7 +40,7 @@ _SUMMARY = re.compile(
     r"平均(值)?|标准差|最大值?|最小值?|合计|spread|σ|µ)\W*",
     re.IGNORECASE,
 )
-"""What a row of statistics is called in its first cell."""
+"""The name of a row of statistics, in its first cell."""
 _OF_LOGGERS = re.compile(
     r"(avg|smp|min|max|std|tot|float|double|int\d*|real|string|-+|=+)", re.IGNORECASE
 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 from collections.abc import Iterable, Iterator
@@ -10,6 +9,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import parquet
 from mwdcal.files.formats.atomic import SQLITE
@@ -91,7 +91,7 @@ def is_database(file: Path) -> bool:
 
 
 def name_of(path: str | os.PathLike[str]) -> str:
-    """What messages and documents call a calibration: its file, with the serial of a tool in it."""
+    """The name of a calibration in messages and documents: its file, with the serial of a tool in it."""
     file, serial = split(path)
     return file.name if serial is None else f"{file.name}{MARK}{serial}"
 
@@ -105,7 +105,7 @@ def read(path: str | os.PathLike[str]) -> Member:
     file, serial = split(path)
     try:
         with file.open("rb") as stream:
-            digest = hashlib.file_digest(stream, "sha256").hexdigest()
+            digest = sha256_of(stream)
     except OSError as error:
         raise InputError(f"{file}: cannot be read ({reason(error)}). Check the path.") from None
     table, schema = parquet.opened(file, file.name)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -13,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError, reason
 from mwdcal.files import metadata as meta
 from mwdcal.files.formats import atomic, dialect, layout, text
@@ -105,7 +105,7 @@ def parsed(
     serial: str = "serial",
 ) -> Table:
     """The table in the bytes of a file of that name: see `read`."""
-    digest = hashlib.sha256(data).hexdigest()
+    digest = sha256_of(data)
     suffix = _suffix(Path(name))
     form = _format(suffix)
     arguments: dict[str, Any] = {"most": rows} if suffix == ".parquet" else {}
@@ -244,7 +244,7 @@ def of_layout(where: layout.Layout, path: str | os.PathLike[str], kept: Collecti
         {**where.titles.metadata, **stated},
         Path(path).name,
         where.lines,
-        hashlib.sha256(_content(Path(path))).hexdigest(),
+        sha256_of(_content(Path(path))),
     )
 
 
@@ -337,7 +337,7 @@ def _one_by_one(table: Table, name: str, cells: Sequence[str]) -> Array:
 
 
 def _advice(cell: str, decimal: str) -> str:
-    """What to do about a cell that is not a number."""
+    """The remedy for a cell that is not a number."""
     if decimal == "." and looks_numeric(cell, ","):
         return "Is the decimal comma intended? Use `decimal` ','."
     if decimal == "," and looks_numeric(cell, "."):

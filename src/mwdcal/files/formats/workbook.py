@@ -34,7 +34,7 @@ from mwdcal.sensor.profile import TableFormat
 _EPOCH = datetime.datetime(1980, 1, 1)
 _TIMES = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ")
 _EXPECTED = "an Excel workbook (.xlsx)", "Save it again as .xlsx, or as CSV UTF-8."
-"""What a damaged file should have been, and what to do."""
+"""The expected form of a damaged file, and the remedy."""
 LONGEST_CELL = 32_767
 _MOST_DIGITS = 15
 _FORMULA = re.compile(rb"<(\w+:)?f[\s/>]")

@@ -7,7 +7,6 @@ the event itself without `hash`.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from mwdcal.calibration.canonical import canonical
+from mwdcal.digests import sha256_of
 from mwdcal.registry.database.models import history
 
 GENESIS = "0" * 64
@@ -28,7 +28,7 @@ def digest(fields: Mapping[str, Any]) -> str:
         TypeError, ValueError: a value is not text or a finite number, as only in a damaged database.
     """
     kept = {name: value for name, value in fields.items() if value is not None}
-    return hashlib.sha256(canonical(kept)).hexdigest()
+    return sha256_of(canonical(kept))
 
 
 def event_hash(event: Mapping[str, Any]) -> str:

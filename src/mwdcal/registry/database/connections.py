@@ -39,7 +39,7 @@ _WHAT_TO_DO = {
     "not a database": "Name a registry that mwdcal made.",
     "disk i/o error": "Check the disk; SQLite needs a local one, or use PostgreSQL.",
     "password": "Correct the user and the password in the URL.",
-    "permission denied": "Have the owner of the database give you the right.",
+    "permission denied": "Ask the database owner for access.",
     "does not exist": "Create it on the server, or correct the URL.",
     "resolve host": "Correct the name of the server in the URL.",
     **dict.fromkeys(
@@ -66,7 +66,7 @@ class Database:
     def reading(self) -> Iterator[sa.Connection]:
         """A transaction that sees one state of the database, whatever is written meanwhile."""
         options = {} if self.file else {"isolation_level": "REPEATABLE READ"}
-        with explained(self), self.engine.connect() as plain:
+        with as_input_error(self), self.engine.connect() as plain:
             connection = plain.execution_options(**options)
             try:
                 with connection.begin():
@@ -77,7 +77,7 @@ class Database:
     @contextlib.contextmanager
     def writing(self) -> Iterator[sa.Connection]:
         """A transaction of the only writer: on the disk when the block ends, or without effect."""
-        with explained(self), self.engine.connect() as plain:
+        with as_input_error(self), self.engine.connect() as plain:
             if self.file:
                 _set_journal(plain, self.shared)
             connection = plain.execution_options(mwdcal_writing=True)
@@ -244,18 +244,18 @@ def _begin(connection: sa.Connection) -> None:
 
 
 @contextlib.contextmanager
-def explained(database: Database) -> Iterator[None]:
+def as_input_error(database: Database) -> Iterator[None]:
     """Turn what the database refuses into one sentence without passwords."""
     try:
         yield
     except (UnicodeError, OverflowError):
         raise InputError(f"{database.name}: it is damaged. Restore it from a backup.") from None
     except (sa.exc.SQLAlchemyError, sqlite3.Error) as error:
-        raise InputError(f"{database.name}: {sentence(error, database)}") from None
+        raise InputError(f"{database.name}: {error_text(error, database)}") from None
 
 
-def sentence(error: Exception, database: Database) -> str:
-    """What a database refused, without passwords, and what to do about it."""
+def error_text(error: Exception, database: Database) -> str:
+    """The refusal of a database, without passwords, and what to do about it."""
     lines = str(getattr(error, "orig", None) or error).strip().splitlines()
     text = lines[0].strip() if lines else type(error).__name__
     password = database.engine.url.password

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 REFUSAL = "a registry only grows: nothing in it is changed or removed"
-"""What the database answers to an UPDATE or DELETE of a guarded table."""
+"""The answer of the database to an UPDATE or DELETE of a guarded table."""
 FUNCTION = "mwdcal_refuse"
 """The PostgreSQL function that the triggers call."""
 FUNCTION_BODY = f"BEGIN RAISE EXCEPTION '{REFUSAL}'; END"

@@ -94,7 +94,7 @@ def change(database: Database, target: str, actor: str) -> tuple[str, str]:
 
 
 def differences(connection: sa.Connection) -> list[str]:
-    """What is wrong with the tables, indexes and triggers of a database, one sentence each."""
+    """The faults of the tables, indexes and triggers of a database, one sentence each."""
     if connection.dialect.name == "sqlite":
         wrong = [
             row for row in connection.scalars(sa.text("PRAGMA integrity_check")) if row != "ok"

@@ -1,25 +1,19 @@
-"""From the words of the command line to a run, its tool profile, and the options of a calibration."""
+"""Inputs that a command line names: a run with its tool profile, and what is known before the fit."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, cast
 
-from mwdcal.calibration.options import AUTO, Options
+from mwdcal.calibration.fit_options import Prior
 from mwdcal.calibration.prior import DATASHEET, profile_for
-from mwdcal.calibration.readings import HIGHEST, Readings
-from mwdcal.calibration.record import Calibration
+from mwdcal.calibration.readings import Readings
 from mwdcal.files import profiles, runs
 from mwdcal.files.parting import parted
 from mwdcal.files.settings import source_of_settings
 from mwdcal.presentation.calibration_source import calibration_of
-from mwdcal.presentation.typed import Typed, names
 from mwdcal.sensor.profile import Profile
-
-Prior: TypeAlias = Calibration | Literal["datasheet"] | None
-"""What is known before a fit: a calibration, the tolerances of the profile, or nothing."""
 
 
 def load_run(
@@ -69,23 +63,6 @@ def load_runs(
     return readings, runs.read_run(second, profile)[0], profile
 
 
-def options_of(
-    typed: Typed, prior: Prior = None, exclude: tuple[str, ...] = (), prior_sha256: str = ""
-) -> Options:
-    """The options as typed, with the prior that `prior_of` has read."""
-    triads = typed["nonlinearity"]
-    curved = {"none": (), AUTO: AUTO}.get(triads, names(triads) or (triads,))
-    read: dict[str, Any] = {
-        "order": order_of(typed["order"]),
-        "parameters": int(typed["parameters"] or 12),
-        "nonlinearity": curved,
-        "estimate": names(typed["estimate"]),
-        "ignore": names(typed["ignore"]),
-        "prior": prior,
-    }
-    return Options(**{**typed, **read}, exclude=exclude, prior_sha256=prior_sha256)
-
-
 def prior_of(word: str | None) -> tuple[Prior, str]:
     """The prior that a word names, and the SHA-256 of its file.
 
@@ -94,9 +71,3 @@ def prior_of(word: str | None) -> tuple[Prior, str]:
     if not word:
         return None, ""
     return (DATASHEET, "") if word == DATASHEET else calibration_of(Path(word))
-
-
-def order_of(word: str) -> int | Literal["auto"]:
-    """An order as a number; what is none is left for `Options` to refuse."""
-    orders = {str(order): order for order in range(HIGHEST + 1)}
-    return orders.get(word, cast('Literal["auto"]', word))
