@@ -210,7 +210,11 @@ def test_json_of_calibrate_holds_the_numbers_of_the_text(tmp_path):
         return digits + ("" if unit == "°" else " ") + unit
 
     for row in told["errors"]:
-        cells = [shown(row[k], row["unit"]) for k in ("before", "after", "expected")]
+        cells = [shown(row[k], row["unit"]) for k in ("before", "after")]
+        places = max(1 - int(f"{row['expected']:.1e}".partition("e")[2]), 0)  # two digits
+        cells.append(
+            f"{row['expected']:.{places}f}{'' if row['unit'] == '°' else ' '}{row['unit']}"
+        )
         assert (
             f"{names.get(row['observable'], row['observable'])} error, rms {' '.join(cells)}"
             in lines

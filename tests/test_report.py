@@ -328,7 +328,8 @@ def test_verdict_comes_first(whole, words):
     failed = words(whole, Outcome(False, [Row(), Row(passed=True, value=0.5, note="<b>")]))
     assert "Verification failed – 1 of 2 limits not met" in failed
     assert failed.index("Verification failed") < failed.index("Fit accepted")
-    assert "1.230° 0.040°" in failed  # two digits of the uncertainty
+    assert "1.230°" in failed  # two digits of the uncertainty…
+    assert "0.040°" in failed  # …and that
     assert "1.45°" in failed
     assert "0.040°</td><td>8</td>" in failed
     assert "Risk of a wrong verdict, all roll sets and limits together: 0.02." in failed

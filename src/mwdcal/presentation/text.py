@@ -96,7 +96,7 @@ def _escape(unsafe: re.Match[str]) -> str:
 def transliterate(text: str, encoding: str | None) -> str:
     r"""The text with plain twins of the characters that the encoding lacks.
 
-    >>> fitting("1σ 0.1° 10⁻³ Ω", "ascii")
+    >>> transliterate("1σ 0.1° 10⁻³ Ω", "ascii")
     '1sigma 0.1deg 10^-3 \\u03a9'
     """
     name = encoding or "utf-8"

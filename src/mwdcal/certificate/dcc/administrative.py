@@ -184,7 +184,7 @@ def _persons(certificate: Certificate) -> Iterator[ET.Element]:
 
 
 def _statements(certificate: Certificate) -> Iterator[ET.Element]:
-    """The statements on the whole calibration: simulation, traceability, conformity, the words of the certificate."""
+    """The statements on the whole calibration: simulation, traceability, conformity, the certificate's own words."""
     if certificate.simulated:
         yield typed(
             "statement", "simulated", words("declaration", f"{SIMULATED}: no tool was measured.")
