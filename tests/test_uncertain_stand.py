@@ -97,15 +97,18 @@ def test_too_weak_attitudes_go_the_general_way(general):
     np.testing.assert_array_equal(ours.state.params, theirs.state.params)
 
 
-def test_misfit_counts_what_is_tested_alone():
+@pytest.mark.parametrize("least", [(0.1 * TESTED, 0.0), (-0.5, -0.1)])
+def test_misfit_counts_what_is_tested_alone(least):
     analysis = fit(on_stand(8, 2), OPTIONS).analysis
     spread = analysis.spread.copy()
     values, vectors = np.linalg.eigh(spread[0, 5])
-    values[:2] = 0.1 * TESTED, 0.0
+    values[:2] = least
     spread[0, 5] = vectors * values @ vectors.T
     analysis = replace(analysis, spread=spread)
     square, freedom = station_misfit(analysis)
-    back = np.linalg.pinv(spread, rcond=1e-3, hermitian=True)
+    every, axes = np.linalg.eigh(spread)
+    every = np.where(every > TESTED, every, np.inf)
+    back = axes / every[..., None, :] @ np.swapaxes(axes, -1, -2)
     left = np.einsum("bnij,bnj->bni", back, analysis.residual)
     np.testing.assert_allclose(left_out_residual(analysis), left, atol=1e-8)
     np.testing.assert_allclose(square, np.sum(left * analysis.residual, -1), rtol=1e-8)

@@ -336,7 +336,11 @@ def _tested_inverse(spread: Array) -> tuple[Array, Array]:
     back = inverse(spread)
     freedom = np.full(spread.shape[:-2], float(spread.shape[-1]))
     with np.errstate(invalid="ignore", over="ignore"):
-        some = ~(np.sum(back**2, (-1, -2)) < TESTED**-2)  # else every eigenvalue is above it
+        some = ~(np.sum(back**2, (-1, -2)) < TESTED**-2)  # else no eigenvalue is nearer to zero
+    try:
+        np.linalg.cholesky(spread[~some])
+    except np.linalg.LinAlgError:  # a robust fit may leave a variance below zero
+        some[...] = True
     if some.any():
         values, vectors = eigen(spread[some])
         tested = values > TESTED
