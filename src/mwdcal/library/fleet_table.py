@@ -210,7 +210,9 @@ def _computed(
     try:
         for count, (index, content) in enumerate(results, 1):
             check_unchanged(tasks[index].pieces)
-            atomic.write(paths[index], kept.with_checksum(content, paths[index].name), durable=False)
+            atomic.write(
+                paths[index], kept.with_checksum(content, paths[index].name), durable=False
+            )
             disk.submit(kept.to_disk, paths[index])
             tools += tasks[index].tools
             rate = tools / (time.perf_counter() - begun)

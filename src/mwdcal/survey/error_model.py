@@ -8,7 +8,6 @@ Reference: SPE 67616; ISCWSA MWD error model, revision 5; OWSG set A, Rev 5.1.
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from typing import Literal
 import msgspec
 import numpy as np
 
+from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError, reason
 from mwdcal.geometry.observables import VERTICAL
 from mwdcal.geometry.units import STANDARD_GRAVITY
@@ -241,7 +241,7 @@ def load_error_model(name_or_path: str | os.PathLike[str] = BUILT_IN) -> ErrorMo
     head = model.metadata
     return ErrorModel(
         head.short_name, head.source, tuple(model.terms), parameters, formulas,
-        hashlib.sha256(data).hexdigest(),
+        sha256_of(data),
     )  # fmt: skip
 
 

@@ -10,7 +10,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial, reduce
-from hashlib import file_digest
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -19,6 +18,7 @@ import numpy as np
 
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.digests import sha256_of
 from mwdcal.files import streams, synonyms
 from mwdcal.files.contract import COLUMNS, check_columns
 from mwdcal.files.faults import OPTIONAL, blank_cell, is_blank, wholly_blank
@@ -148,8 +148,7 @@ def survey_file(
     model = error_model_of(error_model)
     settings = _Settings(calibration, bounds, place, tie_in, switch, outside, model)
     long = _LongTable(settings, readings, output, decimal)
-    with readings.open("rb") as source:
-        digests = {"calibration": digest, "readings": file_digest(source, "sha256").hexdigest()}
+    digests = {"calibration": digest, "readings": sha256_of(readings)}
     with atomic.replacing(output) as stream, closing(long.sink(stream)) as sink:
         for columns in long.columns():
             sink.write(columns)

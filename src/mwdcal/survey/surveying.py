@@ -22,6 +22,7 @@ from mwdcal.files.faults import chosen, nothing, spread, wholly_blank, without_r
 from mwdcal.files.formats.table import Table, cell_error, numbers
 from mwdcal.files.runs import renamed, to_readings
 from mwdcal.files.settings import setting
+from mwdcal.geometry.units import FOOT
 from mwdcal.geometry.vectors import Array, Bools
 from mwdcal.sensor.profile import StandProfile
 from mwdcal.survey.acceptance import SurveyLimits, load_survey_limits
@@ -54,7 +55,7 @@ _DEPTH_NAMES = re.compile(
 )
 _DEPTH_UNIT = re.compile(r"(?<![a-z])(m|ft|feet|met(re|er)s?)[\])]?$")
 """The unit at the end of such a name."""
-_METRES = {"m": 1.0, "ft": 0.3048}
+_METRES = {"m": 1.0, "ft": FOOT}
 
 
 @dataclass(frozen=True)
@@ -220,7 +221,7 @@ def _depth_column(table: Table) -> tuple[str, float]:
                 return name, _METRES[unit]
             raise InputError(
                 f"{table.source}: column '{name}': measured depths must be in metres, in a column "
-                f"'{MEASURED_DEPTH}'. Rename it, and convert feet (× 0.3048); or state length_unit in mwdcal.toml, "
+                f"'{MEASURED_DEPTH}'. Rename it, and convert feet; or state length_unit in mwdcal.toml, "
                 "which columns without a unit are in."
             )
     return "", 1.0
@@ -382,8 +383,8 @@ def well_inputs(
 
 def _with_readings(table: Table, calibration: Calibration) -> Bools:
     """Rows (n,) that lack no reading."""
-    own = renamed(table, calibration.profile)
-    rows = ~without_reading(own, wholly_blank([own]))
+    known = renamed(table, calibration.profile)
+    rows = ~without_reading(known, wholly_blank([known]))
     if not rows.any():
         raise nothing(table.source)
     return rows
