@@ -377,6 +377,46 @@ def test_a_sign_is_told_by_the_dip_that_all_channels_share():
     assert not is_clear(wiring(north + 2 * down, north, down)), "z is the same at all stations"
 
 
+WORDS_OF_THE_FIELD = {
+    "Accelerometers Gx (V)": "ax", "Magnetometers Hy (nT)": "my", "Accéléromètre Z (g)": "az", "Z (mg)": "az",
+    "X (nT)": "mx", "Mag. X (G)": "mx", "Température (°С)": "temperature_c", "Face outil (°)": "ref_toolface_deg",
+    "Mergulho (°)": "ref_dip_deg", "Feltinklinasjon (grader)": "ref_dip_deg", "地磁倾角(°)": "ref_dip_deg",
+    "Угол установки, °": "ref_toolface_deg", "CAMPO_TOTAL_mGauss": "ref_field_nt", "Az (gon)": "ref_azimuth_deg",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WORDS_OF_THE_FIELD)
+def test_words_of_the_field(name):
+    assert meaning(name).column == WORDS_OF_THE_FIELD[name]
+
+
+def test_a_total_that_is_computed_from_the_channels_is_no_reference(tmp_path):
+    run = servo_run()
+    total = np.linalg.norm([run[name] for name in ("ax", "ay", "az")], axis=0)
+    columns = {**renamed(run, ax="Ax (V)", ay="Ay (V)", az="Az (V)"), "Gtot (V)": total}
+    del columns["ref_gravity_g"]
+    path, tool = write_csv(tmp_path / "run.csv", columns), tmp_path / "tool.toml"
+    ran = mwdcal("profile", path, "-o", tool)
+    assert "'Gtot (V)' is not used: it is computed from the channels." in ran.err
+    assert mwdcal("calibrate", path, "--tool", tool, "-o", tmp_path / "cal.json").code == 0
+
+
+def test_a_toolface_that_counts_anticlockwise_is_asked_about(tmp_path):
+    run = servo_run(inclinations=(20, 60, 100))
+    path = write_csv(
+        tmp_path / "run.csv", {**run, "ref_toolface_deg": (360.0 - run["ref_toolface_deg"]) % 360}
+    )
+    tool, toolface = tmp_path / "tool.toml", "ref_toolface_deg"
+    message = refused(mwdcal("profile", path, "-o", tool), 3)
+    assert "'ref_toolface_deg' counts anticlockwise looking down the hole. Does it?" in message
+    ran = mwdcal(
+        "profile", path, "-o", tool, "--column", f"{toolface}={toolface} (° anticlockwise)"
+    )
+    assert ran.code == 0, ran
+    turned = np.degrees(read_run(path, tool).reference("toolface")) - run[toolface]
+    np.testing.assert_allclose((turned + 180) % 360 - 180, 0.0, atol=1e-9)
+
+
 def test_few_stations_never_tell_wrong_axes():
     rng = np.random.default_rng(5)
     told = 0

@@ -22,7 +22,7 @@ from mwdcal.registry.store import Entry
 from mwdcal.registry.stored import LARGEST_OBJECT
 from mwdcal.sensor.profile import MeasurementStandard, Person
 
-TABLE_SUFFIXES = (*tables.SUFFIXES, *tables.EXCHANGED, *tables.LAID_OUT)
+TABLE_SUFFIXES = (*tables.SUFFIXES, *tables.EXCHANGED)
 """Suffixes of files with tables."""
 COMMANDS_KEPT = {"calibrate": "calibration", "verify": "verification", "certificate": "certificate"}
 """Kinds of documents by the command that writes them."""
@@ -84,7 +84,14 @@ def of_bytes(data: bytes, name: str) -> list[Entry]:
         return [Entry(_json_kind(text, name), data, name)]
     if Path(name).suffix.lower() in TABLE_SUFFIXES:
         return [_run(data, name)]
-    return _of_toml(data, name)
+    try:
+        return _of_toml(data, name)
+    except InputError as error:
+        if (
+            Path(name).suffix.lower() in tables.LAID_OUT
+        ):  # of a laboratory, if a calibration was made of it
+            raise UnlikeRunError(str(error), Entry("run", data, name)) from None
+        raise
 
 
 def checked(entry: Entry) -> Calibration | None:

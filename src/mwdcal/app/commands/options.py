@@ -135,7 +135,7 @@ RESULT = output(
 )
 
 
-RUN_STATEMENTS = "mwdcal.statements"
+SAID_OF_RUN = "mwdcal.statements"
 """Where the context of a command has what the user says of a run."""
 
 
@@ -143,7 +143,7 @@ def _note(context: click.Context, option: click.Parameter, typed: Any) -> None:
     """Note what the user says of a run."""
     if typed is not None:
         said = typed.date().isoformat() if isinstance(typed, datetime) else str(typed).strip()
-        context.meta.setdefault(RUN_STATEMENTS, {})[str(option.name)] = said
+        context.meta.setdefault(SAID_OF_RUN, {})[str(option.name)] = said
 
 
 def of_run(function: Function) -> Function:
@@ -169,7 +169,7 @@ def of_run(function: Function) -> Function:
 
 def statements() -> dict[str, str]:
     """Serial, date and operator as the user says."""
-    return dict(click.get_current_context().meta.get(RUN_STATEMENTS, {}))
+    return dict(click.get_current_context().meta.get(SAID_OF_RUN, {}))
 
 
 def number(name: str, metavar: str, text: str, *variable: str) -> Decorator:

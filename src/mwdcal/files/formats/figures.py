@@ -9,7 +9,7 @@ from mwdcal.errors import Answer, InputError, QuestionError
 from mwdcal.files.formats.columns import as_text, looks_numeric
 
 _SPACES = re.compile(r"(?<=\d)[ '’\u00a0\u202f\u2009](?=\d{3}(\D|$))")
-"""A separator of thousands and is never a decimal sign."""
+"""What separates thousands and is never a decimal sign."""
 _WRITTEN = r"[+\-−]?(?:\d+(?:[.,]\d+)*[.,]?|[.,]\d+)(?:[eE][+\-−]?\d+)?"
 _FIGURE = re.compile(rf"({_WRITTEN})\s*([°º%]?\s?[A-Za-zµμ²/°º]{{0,6}})")
 _BARE_FIGURE = re.compile(_WRITTEN)
@@ -19,7 +19,7 @@ _DEGREES = re.compile(
 """Degrees, minutes and seconds."""
 _BEARING = re.compile(r"([NS])\s*(\d+(?:[.,]\d+)?)\s*°?\s*([EWO])", re.IGNORECASE)
 """A bearing by quadrants, such as N45E."""
-_DAY_CELL = re.compile(r"\s*\d{1,2}\.\d{1,2}\.(\d{4}|\d{2})([ T].*)?")
+_POINTED_DAY = re.compile(r"\s*\d{1,2}\.\d{1,2}\.(\d{4}|\d{2})([ T].*)?")
 """A day as in Germany or Russia, which is no number."""
 _GROUPED = re.compile(r"[+\-−]?[1-9]\d{0,2}([.,]\d{3})+")
 _POINTED = {
@@ -37,7 +37,7 @@ def is_figure(cell: object) -> bool:
     """
     if not isinstance(cell, str):
         return isinstance(cell, int | float) and not isinstance(cell, bool)
-    if _DAY_CELL.fullmatch(cell):
+    if _POINTED_DAY.fullmatch(cell):
         return False
     text = _SPACES.sub("", cell)
     return any(form.fullmatch(text) for form in (_FIGURE, _DEGREES, _BEARING))
