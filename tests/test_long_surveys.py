@@ -175,7 +175,7 @@ def test_parquet_in_parts_has_the_same_values(tool, tmp_path, in_parts, suffix):
 @pytest.mark.parametrize(
     ("column", "row", "cell", "message"),
     [
-        ("md_m", 600, "100.0", "line 602, column 'md_m': must increase from station to station; got 100."),
+        ("md_m", 600, "100.0", "line 602, column 'md_m': must not decrease from station to station; got 100."),
         ("md_m", 600, "x", "line 602, column 'md_m': expected a number; got 'x'."),
         ("ax", 500, "", "line 502, column 'ax': must be filled in; got a blank cell."),
         ("ref_dip_deg", 650, "nan", "line 652, column 'ref_dip_deg': expected a number; got 'nan'."),

@@ -1061,3 +1061,20 @@ def test_a_tie_in_has_three_numbers_or_six(example, tmp_path):
         "survey", example, EXAMPLE / "well.csv", "-o", tmp_path / "o.csv", "--tie-in", "1,2,3,4"
     )
     assert "--tie-in must be 6 numbers" in refused(ran, 2)
+
+
+def test_dogleg_severity_and_vertical_section(example, tmp_path):
+    """Expected: cos β = cos ΔI - sin I₁ sin I₂ (1 - cos ΔA), and north cos A + east sin A."""
+    columns, _ = surveyed_file(example, tmp_path, None, *BY_CALIBRATION, "--section-azimuth", "40")
+    names = ("md_m", "inclination_deg", "azimuth_true_deg")
+    md, inclination, azimuth = (floats(columns[name]) for name in names)
+    i, a = np.radians(inclination), np.radians(azimuth)
+    turned = np.sin(i[1:]) * np.sin(i[:-1]) * (1 - np.cos(np.diff(a)))
+    dogleg = np.degrees(np.arccos(np.clip(np.cos(np.diff(i)) - turned, -1, 1))) / np.diff(md) * 30
+    assert columns["dogleg_severity_deg_per_30m"][0] == ""
+    ours = floats(columns["dogleg_severity_deg_per_30m"])[1:]
+    np.testing.assert_allclose(ours, dogleg, rtol=1e-5, atol=1e-6)
+    section = np.radians(40)
+    north, east = (floats(columns[f"{name}_m"]) for name in ("north", "east"))
+    expected = north * np.cos(section) + east * np.sin(section)
+    np.testing.assert_allclose(floats(columns["vertical_section_m"]), expected, atol=1e-9)

@@ -434,6 +434,7 @@ def survey(
     error_model: FilePath | ErrorModel = "owsg-mwd",
     switch: tuple[float, float] = (3.0, 5.0),
     tie_in: Sequence[float] | None = None,
+    section_azimuth: float = 0.0,
     outside: Literal["blank", "refuse", "extrapolate"] = "blank",
     missing: Literal["refuse", "blank"] = "refuse",
     decimal: str = ".",
@@ -458,6 +459,7 @@ def survey(
             high side.
         tie_in: north, east and TVD of the first station, m; or measured depth, inclination, azimuth (degrees, from the
             north of the path), north, east and TVD of the point where the path is tied in.
+        section_azimuth: of the vertical section, degrees from the north of the path.
         outside: what becomes of readings outside the calibrated temperatures.
         missing: rows without a reading, such as a tie-in station: refuse the table, or leave their results blank.
         decimal: decimal sign of a text file.
@@ -481,7 +483,7 @@ def survey(
     table = _survey_table(readings, loaded.calibration, decimal)
     inputs = well_inputs(
         loaded.calibration, table, _earth(reference), limits, msa, loaded.digest, loaded.findings,
-        error_model, missing,
+        error_model, missing, _number("section_azimuth", section_azimuth),
     )  # fmt: skip
     analysis = analysed(inputs, sensor_drift) if msa else None
     if analysis:

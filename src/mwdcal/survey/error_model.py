@@ -24,6 +24,7 @@ from mwdcal.geometry.observables import VERTICAL
 from mwdcal.geometry.units import STANDARD_GRAVITY
 from mwdcal.geometry.vectors import Array, ArrayLike
 from mwdcal.survey.formulas import Formula, parsed
+from mwdcal.survey.path import arcs, hole_direction
 
 BUILT_IN = "owsg-mwd"
 """The error model that counts by default."""
@@ -120,17 +121,16 @@ class Hole:
     ) -> Hole:
         """A hole from its stations in their order; `azimuth` from the north of the path, `magnetic` from magnetic.
 
-        `last`: depth, inclination and azimuth of the station before; None: the course to the first station is straight
-        and as long as the next one. Where the hole was vertical the azimuth before is that of the station itself.
+        `last`: depth, inclination and azimuth of the station before; None: a straight course of 30 m leads to the
+        first, as to a station without depth. Where the hole was vertical the azimuth before is that of the station.
         """
-        if last is None:
-            course = md[1] - md[0] if len(md) > 1 else USUAL_COURSE
-            last = (md[0] - (course or USUAL_COURSE), inclination[0], azimuth[0])
+        last = (np.nan, inclination[0], azimuth[0]) if last is None else last
         each = zip(last, (md, inclination, azimuth), strict=True)
         before = [np.concatenate([[first], values[:-1]]) for first, values in each]
-        before[0] = _depth_before(md, before[0])
         straight = np.abs(np.sin(before[1])) <= VERTICAL
         before[2] = np.where(straight, azimuth, before[2])
+        md = np.where(np.isfinite(md), md, 0.0)
+        before[0] = _depth_before(md, before[0])
         values = (md, tvd, inclination, azimuth, magnetic, field, dip, gravity, *before)
         return Hole({n: np.asarray(v, float) for n, v in zip(OF_STATIONS, values, strict=True)})
 
@@ -152,6 +152,16 @@ class Hole:
     def azimuth(self) -> Array:
         """Azimuth (n,) from the north of the path, rad."""
         return self.quantities["azt"]
+
+    @property
+    def dogleg(self) -> Array:
+        """Angle (n,) between the directions at a station and the one before, over the course between, rad/m."""
+        ends = (
+            hole_direction(self.inclination, self.azimuth),
+            hole_direction(self.quantities["incprev"], self.quantities["azprev"]),
+        )
+        course = arcs(np.stack([self.quantities["mdprev"], self.md], -1), np.stack(ends, -2))
+        return np.asarray(course.dogleg[..., 0] / course.length[..., 0])
 
 
 @dataclass(frozen=True)
@@ -197,9 +207,10 @@ class ErrorModel:
 
 
 def _depth_before(md: Array, before: Array) -> Array:
-    """Depths (n,) of the last station above each: those `before` it, or before the first of several at one depth."""
-    first = np.maximum.accumulate(np.where(before < md, np.arange(len(md)), 0))
-    above = before[first]
+    """Depths (n,) of the last station above each, by those `before` it, NaN where these have none."""
+    places = np.arange(len(md))
+    known = before[np.maximum.accumulate(np.where(np.isfinite(before), places, 0))]
+    above = known[np.maximum.accumulate(np.where(known < md, places, 0))]
     return np.where(above < md, above, md - USUAL_COURSE)
 
 

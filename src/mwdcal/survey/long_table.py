@@ -52,6 +52,7 @@ from mwdcal.survey.surveying import (
     of_reference,
     station_readings,
     with_reference,
+    with_section,
 )
 from mwdcal.survey.well import Before, Well, WellCounts, part_of_well, with_findings
 from mwdcal.use.correction import (
@@ -135,6 +136,7 @@ def survey_file(
     digest: str,
     findings: Iterable[Finding],
     error_model: str = BUILT_IN,
+    section_azimuth: float = 0.0,
 ) -> SurveyedWell:
     """Survey a long table into another, as `mwdcal.survey.surveying` does with a table in memory.
 
@@ -148,6 +150,7 @@ def survey_file(
     model = error_model_of(error_model)
     settings = _Settings(calibration, bounds, place, tie_in, switch, outside, model)
     long = _LongTable(settings, readings, output, decimal)
+    long.north = with_section(long.north, section_azimuth)
     digests = {"calibration": digest, "readings": sha256_of(readings)}
     with atomic.replacing(output) as stream, closing(long.sink(stream)) as sink:
         for columns in long.columns():
@@ -325,13 +328,16 @@ class _LongTable:
         ends = np.cumsum(self.seen.rows)
         starts = window_starts(int(ends[-1]))
         wanted = np.concatenate([np.arange(start, start + WINDOW_ROWS) for start in starts])
-        parts = []
+        parts, places = [], []
         for piece, count, end in zip(self.source.pieces(), self.seen.rows, ends, strict=True):
-            rows = wanted[(wanted >= end - count) & (wanted < end)] - (end - count)
+            rows = wanted[(wanted >= end - count) & (wanted < end)]
             if rows.size:
-                parts.append(rows_of(self._readings(piece), rows))
-        calibration, outside = self.settings.calibration, self.settings.outside
-        return dict(tallied(calibration, _one_after_another(parts), outside)[1].scatter)
+                parts.append(rows_of(self._readings(piece), rows - (end - count)))
+                places.append(rows)
+        order = np.empty(len(wanted), int)  # windows overlap, and parts end within them
+        order[np.argsort(wanted, kind="stable")] = np.argsort(np.concatenate(places), kind="stable")
+        readings = rows_of(_one_after_another(parts), order)
+        return dict(tallied(self.settings.calibration, readings, self.settings.outside)[1].scatter)
 
 
 def _one_after_another(parts: list[Readings]) -> Readings:

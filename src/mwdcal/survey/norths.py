@@ -36,7 +36,7 @@ class North:
 
     None: not known. `declination_sd`: standard uncertainty that the stations share, `declination_noise` that of
     what changes from one to the next. `findings`: where they are assumed, or sources disagree. `sources`: where each
-    comes from, by name.
+    comes from, by name. `section`: azimuth of the vertical section, from the north of the path.
     """
 
     declination: float | None = None
@@ -45,6 +45,7 @@ class North:
     declination_noise: float = 0.0
     findings: tuple[Finding, ...] = ()
     sources: Mapping[str, str] = field(default_factory=dict)
+    section: float = 0.0
 
     @property
     def name(self) -> str:

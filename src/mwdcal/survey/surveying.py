@@ -343,12 +343,13 @@ def well_inputs(
     findings: Sequence[Finding] = (),
     error_model: ErrorModel | str | os.PathLike[str] = BUILT_IN,
     missing: str = "refuse",
+    section_azimuth: float = 0.0,
 ) -> WellInputs:
     """The inputs of surveys: a table of readings, the calibration of their tool, reference and limits.
 
     `reference`, `limits` and `error_model` are values, or files by path; `NO_MODEL` for none. Stations that
     multi-station analysis puts into the record have to be `recognised`. `digest` and `findings` are of the file of the
-    calibration.
+    calibration. `section_azimuth` of the vertical section, degrees from the north of the path.
 
     Raises:
         InputError: a file that cannot be read, readings that do not belong to the calibration.
@@ -369,6 +370,7 @@ def well_inputs(
     digests |= {"reference": place_digest} if read.uses_reference else {}
     model = error_model_of(error_model)
     digests |= {"error_model": model.digest} if model else {}
+    read = replace(read, north=with_section(read.north, section_azimuth))
     return WellInputs(
         calibration,
         table,
@@ -388,6 +390,17 @@ def _with_readings(table: Table, calibration: Calibration) -> Bools:
     if not rows.any():
         raise nothing(table.source)
     return rows
+
+
+def with_section(north: North, azimuth: float) -> North:
+    """A north with the azimuth, degrees, of the vertical section.
+
+    Raises:
+        InputError: no azimuth.
+    """
+    if not -360 <= azimuth <= 360:
+        raise InputError(f"`section_azimuth` must be an azimuth in degrees; got {azimuth:g}.")
+    return replace(north, section=float(np.radians(azimuth)))
 
 
 def error_model_of(model: ErrorModel | str | os.PathLike[str]) -> ErrorModel | None:

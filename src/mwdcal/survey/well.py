@@ -64,11 +64,15 @@ WELL_FINDINGS = {
 
 @dataclass(frozen=True)
 class Position:
-    """Where stations lie: `place` (n, 3) north, east, TVD, m, and `covariance` (n, 3, 3); NaN: not on the path."""
+    """Where stations lie: `place` (n, 3) north, east, TVD, m, and `covariance` (n, 3, 3); NaN: not on the path.
+
+    `dogleg` (n,): angle between the directions here and at the station before over the course between, rad/m.
+    """
 
     md: Array
     place: Array
     covariance: Array
+    dogleg: Array
 
     @property
     def on_path(self) -> Bools:
@@ -279,6 +283,9 @@ class Well:
                     f"{name}_m": self.position.place[:, k],
                     f"sd_{name}_m": self.position.sd[:, k],
                 }
+            columns["dogleg_severity_deg_per_30m"] = np.degrees(self.position.dogleg * 30.0)
+            section = np.array([np.cos(self.north.section), np.sin(self.north.section)])
+            columns["vertical_section_m"] = self.position.place[:, :2] @ section
         return columns
 
     @cached_property
@@ -391,7 +398,13 @@ def part_of_well(
     errors = None
     if model is not None and calibration.has_field:
         errors = well_errors(model, calibration, readings)
-    added = None if errors is None else errors.of_surveys(calibration, readings, md, before.path)
+    added = (
+        None
+        if errors is None
+        else errors.of_surveys(
+            calibration, readings, None if md is None else np.where(blank, np.nan, md), before.path
+        )
+    )
     angles = survey_angles(calibration, readings, switch, advance, added, before.magnetic)
     surveys = _without(angles, blank, beyond)
     g, b = (np.stack([columns[name] for name in VECTORS[i : i + 3]], -1) for i in (0, 3))
@@ -475,16 +488,19 @@ def _positions(
     if not calibration.has_field or readings.magnetometer is None or not whole.any():
         whole = np.zeros(len(md), bool)
     place, covariance = np.full((len(md), 3), np.nan), np.full((len(md), 3, 3), np.nan)
+    dogleg = np.full(len(md), np.nan)
     if whole.any():
         some = readings if whole.all() else readings.select(whole)
         norths, at = (north.offset, north.declination_sd, north.declination_noise), md[whole]
-        more = None
-        if errors is not None:
-            more = errors.of_path(calibration, hole_of(calibration, some, at, north.offset, before))
+        hole = hole_of(calibration, some, at, north.offset, before)
+        more = None if errors is None else errors.of_path(calibration, hole)
+        dogleg[whole] = hole.dogleg
+        if not isinstance(before, TieIn | PathEnd):  # no course leads to the first station
+            dogleg[np.argmax(whole)] = np.nan
         place[whole], covariance[whole], before = continued_path(
             calibration, some, at, norths, before, more
         )
-    return Position(md, place, covariance), before
+    return Position(md, place, covariance, dogleg), before
 
 
 def _on_path(md: Array, blank: Bools, before: Start) -> Bools:

@@ -21,7 +21,7 @@ from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.units import STANDARD_GRAVITY
 from mwdcal.geometry.vectors import Array, ArrayLike
 from mwdcal.survey.acceptance import SensorTerms
-from mwdcal.survey.error_model import USUAL_COURSE, ErrorModel, Hole
+from mwdcal.survey.error_model import ErrorModel, Hole
 from mwdcal.survey.path import DirectionErrors, PathEnd, TieIn, direction_gradient, well_path
 from mwdcal.survey.stations import SURVEY_OBSERVABLES, blocks
 from mwdcal.use.uncertainty import AXIAL_INTERFERENCE, CORRECTED, DRIFT, DRIFTED, OF_MODELS
@@ -105,9 +105,9 @@ class WellErrors:
         md: Array | None,
         before: Sequence[float] | TieIn | PathEnd,
     ) -> Callable[[Array, Array, slice], Array]:
-        """The variance of observables at some rows, by both vectors; depths count where all are known."""
-        whole = md is not None and not np.isnan(md).any()
-        hole = hole_of(calibration, readings, md if whole else None, 0.0, before if whole else ())
+        """The variance of observables at some rows, by both vectors."""
+        depth = np.full(readings.count, np.nan) if md is None else md
+        hole = hole_of(calibration, readings, depth, 0.0, before)
         return lambda g, b, rows: self.variances(g, b, hole.part(rows))
 
     def of_path(
@@ -171,18 +171,17 @@ def _years(calibrated: date | None, surveyed: date | None) -> float | None:
 def hole_of(
     calibration: Calibration,
     readings: Readings,
-    md: Array | None,
+    md: Array,
     north: float = 0.0,
     before: Sequence[float] | TieIn | PathEnd = (),
 ) -> Hole:
-    """The hole as the readings see it; without depths one survey every 30 m.
+    """The hole as the readings see it; TVD where all depths are known.
 
     `before`: where its path has come to, or the position of the first station.
     Singular: at vertical the azimuth is the magnetic toolface, as of `path.direction_gradient`.
     """
     parts = [_seen(calibration, part) for part in blocks(readings)]
     inclination, magnetic, field, dip = (np.concatenate(each) for each in zip(*parts, strict=True))
-    depth = USUAL_COURSE * np.arange(1.0, len(inclination) + 1) if md is None else md
     angles = inclination, magnetic + north
     last: tuple[float, float, float] | None = None
     if isinstance(before, PathEnd):
@@ -190,14 +189,15 @@ def hole_of(
         before = TieIn(end[0].item(), end[1].item(), end[2].item(), before.sums.position)
     if isinstance(before, TieIn):
         last = before[:3]
-        stations = zip(last, (depth, *angles), strict=True)
-        md, i, a = (np.concatenate([[first], values]) for first, values in stations)
-        tvd = well_path(md, i, a, before.place)[1:, 2]
-    else:
-        tvd = well_path(depth, *angles, before or (0.0, 0.0, 0.0))[:, 2]
+    tvd = np.zeros(len(md))
+    if np.isfinite(md).all():
+        start = before.place if isinstance(before, TieIn) else before or (0.0, 0.0, 0.0)
+        stations = zip(last or (), (md, *angles), strict=False)
+        whole = [np.concatenate([[first], values]) for first, values in stations] or [md, *angles]
+        tvd = well_path(whole[0], whole[1], whole[2], start)[-len(md) :, 2]
     if calibration.relative:
-        field = np.broadcast_to(readings.reference("field"), depth.shape)
-    return Hole.along(depth, tvd, *angles, magnetic, field, dip, last=last)
+        field = np.broadcast_to(readings.reference("field"), md.shape)
+    return Hole.along(md, tvd, *angles, magnetic, field, dip, last=last)
 
 
 def _seen(calibration: Calibration, readings: Readings) -> tuple[Array, Array, Array, Array]:

@@ -71,6 +71,14 @@ if TYPE_CHECKING:
     help="Where the path is tied in, taken as exact: m and degrees, azimuth from the north of the path. Or N,E,TVD of "
     "the first station. Default: 0,0,0.",
 )
+@click.option(
+    "--section-azimuth",
+    type=float,
+    default=0.0,
+    show_default=True,
+    metavar="DEG",
+    help="Azimuth of the vertical section, from the north of the path.",
+)
 @options.WHERE_OUTSIDE
 @options.MISSING
 @options.report(
@@ -84,7 +92,8 @@ if TYPE_CHECKING:
 def command(
     calibration: Path, readings: Path, output: Path, reference: Path | None, msa: bool,
     msa_html: Path | None, sensor_drift: str | None, error_model: str, limits: str, switch: str,
-    tie_in: str | None, outside: str, missing: str, report: Path | None, decimal: str, key: tuple[Path, ...],
+    tie_in: str | None, section_azimuth: float, outside: str, missing: str, report: Path | None, decimal: str,
+    key: tuple[Path, ...],
     as_json: bool,
 ) -> None:  # fmt: skip
     """Surveys of a well: READINGS in their order, corrected by the CALIBRATION of their tool.
@@ -117,7 +126,7 @@ def command(
     if not whole and long_table.in_parts(readings, output, fitted.profile):
         result = long_table.survey_file(
             fitted, readings, output, reference, limits, start, ends, outside, decimal,
-            loaded.digest, loaded.findings, error_model,
+            loaded.digest, loaded.findings, error_model, section_azimuth,
         )  # fmt: skip
         _print(result, loaded.signature, (str(output), ""), as_json)
         return
@@ -125,6 +134,7 @@ def command(
     with offering_blank():
         inputs = well_inputs(
             fitted, table, reference, limits, msa, loaded.digest, loaded.findings, error_model, missing,
+            section_azimuth,
         )  # fmt: skip
     analysis = analysed(inputs, sensor_drift) if msa else None
     pages = _interference_page(inputs, analysis, msa_html)
