@@ -38,7 +38,7 @@ def parted(table: Table) -> tuple[Table, Table]:
         which = (
             f"{' and '.join(map(shown, marks))} mark different rows"
             if marks
-            else "no column marks it"
+            else "no column marks it: its stations were in the fit"
         )
         raise InputError(
             f"{table.source} holds both run and roll test, and {which}. Mark the roll test in one column, such as "
