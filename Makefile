@@ -4,13 +4,15 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: papers measured verification scatter coverage drift diagnosis mutations help demo size test test-quick test-studies test-oldest \
-	test-versions fuzz kills registry-stress check bench bench-guard docs clean
+	test-versions fuzz kills registry-stress check check-lint check-types check-code check-docs bench bench-guard docs clean
 
 PYTHON ?= python3
 PYTHONS ?= python3.12 python3.13
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+FOR_DEMO := $(VENV)/.demo
+comma := ,
 BENCH := build/bench-venv/bin
 MEASURED := build/bench-venv/.installed
 
@@ -44,12 +46,13 @@ help: ## list the targets
 size: ## print code lines and modules by room
 	@$(PYTHON) tests/size.py
 
-demo: $(INSTALLED) ## calibrate the example tool, verify it, write its report
+demo: $(FOR_DEMO) ## calibrate the example tool, verify it, write its report (under a minute)
 	@$(CLOCK); mkdir -p build/demo; \
-	$(BIN)/mwdcal calibrate examples/servo/run.csv --tool examples/servo/tool.toml \
+	run() { echo; echo "$$ mwdcal $$*"; $(BIN)/mwdcal "$$@"; }; \
+	run calibrate examples/servo/run.csv --tool examples/servo/tool.toml \
 		-o build/demo/tool.json --report build/demo/tool.html; \
-	$(BIN)/mwdcal verify build/demo/tool.json examples/servo/rolltest.csv; \
-	echo "report: build/demo/tool.html"
+	run verify build/demo/tool.json examples/servo/rolltest.csv; \
+	echo; echo "report: build/demo/tool.html"
 
 test: $(INSTALLED) ## run the tests on all cores
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python -m pytest -q -rs --durations=25 --durations-min=5 \
@@ -94,15 +97,24 @@ registry-stress: $(INSTALLED) ## write to registries by 50 processes, end some a
 	@$(CLOCK); $(ONE_THREAD) PYTHONPATH=tests $(BIN)/python tests/registry_stress.py \
 		--writers 50 --seconds 60 --kills $(or $(COUNT),100)
 
-check: $(INSTALLED) ## lint, format, types, architecture, doctests, docs
-	@$(CLOCK); \
-	echo "ruff check"; $(BIN)/ruff check .; \
-	echo "ruff format"; $(BIN)/ruff format --check .; \
-	echo "mypy"; $(BIN)/mypy; \
-	echo "architecture"; $(BIN)/python -m pytest -q tests/test_architecture.py; \
-	echo "doctests"; $(ONE_THREAD) $(BIN)/python -m pytest -q --doctest-modules src \
-		--doctest-glob='*.md' docs; \
-	echo "docs"; $(SPHINX) -b html docs build/docs; $(SPHINX) -b man docs build/man; \
+check: $(INSTALLED) ## lint, format, types, architecture, doctests, docs; two at a time
+	@$(CLOCK); $(MAKE) --no-print-directory --keep-going -j2 $(WHOLE) check-types check-docs check-lint check-code
+
+# The parts of `make check` print what they find together, where make can do that.
+WHOLE := $(if $(filter output-sync,$(.FEATURES)),--output-sync=target)
+
+check-lint: $(INSTALLED)
+	@$(CLOCK); $(BIN)/ruff check .; $(BIN)/ruff format --check .
+
+check-types: $(INSTALLED)
+	@$(CLOCK); $(BIN)/mypy
+
+check-code: $(INSTALLED)
+	@$(CLOCK); $(BIN)/python -m pytest -q tests/test_architecture.py; \
+	$(ONE_THREAD) $(BIN)/python -m pytest -q --doctest-modules src --doctest-glob='*.md' docs
+
+check-docs: $(INSTALLED)
+	@$(CLOCK); $(SPHINX) -b html docs build/docs; $(SPHINX) -b man docs build/man; \
 	cmp build/man/mwdcal.1 docs/mwdcal.1 || { echo "docs/mwdcal.1, the manual page, is old: make docs"; exit 1; }
 
 bench: $(MEASURED) ## time mwdcal against SciPy and other packages, write docs/benchmarks.md (QUICK=1: two minutes)
@@ -143,21 +155,25 @@ clean: ## remove everything that can be made again
 	@$(CLOCK); rm -rf build dist $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis; \
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-$(INSTALLED): pyproject.toml constraints.txt
-	@start=$$(date +%s); \
+# An environment in $(1) with the package and $(2); stops where Python is missing or too old.
+define INSTALL_INTO
+start=$$(date +%s); \
 	command -v $(PYTHON) >/dev/null 2>&1 || { \
 		echo "mwdcal needs Python 3.11 or newer; '$(PYTHON)' was not found. Name one: make PYTHON=/path/to/python3" >&2; exit 1; }; \
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 		found=$$($(PYTHON) -c 'import sys; print(sys.version.split()[0])'); \
 		echo "mwdcal needs Python 3.11 or newer; '$(PYTHON)' is $$found. Name another: make PYTHON=/path/to/python3" >&2; exit 1; }; \
-	set -e; echo "installing into $(VENV)"; \
-	$(PYTHON) -m venv $(VENV); \
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[all,dev]'; \
+	set -e; echo "installing $(3) into $(1)"; \
+	$(PYTHON) -m venv $(1); \
+	$(1)/bin/python $(INSTALL) -c constraints.txt $(2); \
 	touch $@; echo "installed: $$(($$(date +%s) - start)) s"
+endef
+
+$(FOR_DEMO): pyproject.toml constraints.txt
+	@$(call INSTALL_INTO,$(VENV),-e '.[report]',mwdcal and what draws its pages)
+
+$(INSTALLED): pyproject.toml constraints.txt
+	@$(call INSTALL_INTO,$(VENV),-e '.[all$(comma)dev]',mwdcal and what its developers need (minutes)); touch $(FOR_DEMO)
 
 $(MEASURED): pyproject.toml constraints.txt benchmarks/requirements.txt
-	@start=$$(date +%s); set -e; echo "installing the alternatives into build/bench-venv"; \
-	$(PYTHON) -m venv build/bench-venv; \
-	$(BENCH)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt \
-		-e '.[all]' -r benchmarks/requirements.txt; \
-	touch $@; echo "installed: $$(($$(date +%s) - start)) s"
+	@$(call INSTALL_INTO,build/bench-venv,-e '.[all]' -r benchmarks/requirements.txt,mwdcal and the alternatives)

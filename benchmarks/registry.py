@@ -24,7 +24,7 @@ from measuring import seconds
 
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.record import Calibration, sealed
+from mwdcal.calibration.record import Calibration, with_checksum
 from mwdcal.files.formats.members import RECORD
 from mwdcal.files.profiles import load_profile
 from mwdcal.planning.plans import load_plan
@@ -75,7 +75,7 @@ def renamed(record: Calibration, serial: str, year: int) -> str:
     about = {"serial": serial, "date": f"{year}-03-01", "simulated": "True"}
     time = f"{year}-03-01"
     changed = msgspec.structs.replace(record, tool=about, serial=serial, time=time)
-    return msgspec.json.encode(sealed(changed)).decode()
+    return msgspec.json.encode(with_checksum(changed)).decode()
 
 
 def imported(registry: Registry, paths: list[Path], workers: int) -> None:

@@ -39,6 +39,7 @@ import pyarrow.parquet as pq
 import cli_support
 import mwdcal
 from cli_support import EXAMPLE, cell, servo_run, write_csv
+from laboratories import laboratories, mutated
 from mwdcal.files.formats import table
 from test_fleet import roll_run
 
@@ -88,6 +89,11 @@ SURVEY_LIMITS = (
 )
 PLAN = 'name = "lab"\ntemperature_c = [25, 60]\n[[stations]]\ninclination_deg = [5, 60, 120]\ntoolface_deg = [0, 90]\n'
 EFFECTS = "[accelerometer]\nturn_on = 2e-4\n[stand]\ntilt_deg = 0.1\n[earth]\nvariation_nt = 20.0\n"
+SETTINGS = (
+    'limits = "moradi"\ndecision = "guarded"\nlength_unit = "ft"\ntemperature_unit = "°C"\n[stand]\nazimuth_deg = 0.1\n'
+    'settings = "per-station"\n[[standards]]\nquantity = "stand"\nname = "table"\ndue = 2026-01-31\n',
+    'tool = "servo"\nkeys = ["lab.key.pub"]\nregistry = "out-tools.sqlite"\n[stand]\ninclination_deg = 0.02\n',
+)
 CALIBRATIONS = (
     ("servo.csv",),
     ("servo.csv", "--parameters", "9"),
@@ -192,6 +198,21 @@ def registry_of(path: Path, *documents: Path) -> bytes:
         ran = cli_support.mwdcal("registry", "--registry", path, *line, "--as", "A. Borg")
         assert ran.code == 0, ran
     return path.read_bytes()
+
+
+LABORATORIES = laboratories()
+
+
+def laboratory_table(r: random.Random, stem: Path) -> tuple[Path, bool]:
+    """A laboratory's own table, often changed, in a file; whether it has a magnetometer."""
+    whole = r.choice(LABORATORIES)
+    changed = (
+        mutated(whole, np.random.default_rng(r.randrange(2**32))) if r.random() < 0.7 else None
+    )
+    each = changed or whole
+    path = stem.with_suffix(Path(each.file).suffix)
+    path.write_bytes(each.content)
+    return path, "mx" in each.truth
 
 
 # ------------------------------------------------------------------------------------- damage
@@ -732,7 +753,7 @@ NETWORK = ("scheduler",)
 COMMANDS = cli_support.commands()
 WITH_FILES = [n for n, c in COMMANDS.items() if any(p.name in SAMPLES for p in c.params)]
 """Commands that read a file."""
-RARE = {"compare": 0.05, "noise": 0.15}
+RARE = {"compare": 0.05, "noise": 0.15, "profile": 4.0}
 """How often a command that takes long is run, against the others."""
 
 
@@ -812,6 +833,10 @@ def value(r: random.Random, p: click.Parameter, sound: dict[str, list[Any]], fol
     """A value of an argument or option."""
     name = str(p.name)
     metavar = str(getattr(p, "metavar", "") or "")
+    if name == "folder" and metavar == "[DIR]":
+        path = folder / "out-folder"
+        path.mkdir(exist_ok=True)
+        return str(path)
     if name in OUTPUTS:
         suffixes = re.findall(r"\.\w+", metavar) or sorted({*TABLE_SUFFIXES})
         path = folder / f"out-{name}{r.choice(suffixes)}"
@@ -973,13 +998,56 @@ def promises(
     return broken
 
 
-def case(seed: int, sound: dict[str, list[Any]], folder: Path) -> tuple[str, int, list[str]]:
+def laboratory_case(r: random.Random, folder: Path) -> tuple[list[str], bool]:
+    """The command line that proposes a profile for a laboratory's table; whether it has a magnetometer."""
+    path, magnetic = laboratory_table(r, folder / "in-run")
+    damaged(r, path)
+    line = ["profile", str(path), "-o", str(folder / "out-output.toml")]
+    answers = (
+        "--decimal",
+        ",",
+        "--serial",
+        "T-1",
+        "--north",
+        "true",
+        "--header-row",
+        "2",
+        "--column",
+        "ref_dip_deg=",
+    )
+    for place in range(0, len(answers), 2):
+        line += answers[place : place + 2] if r.random() < 0.1 else ()
+    return line, magnetic
+
+
+def calibrated_by(line: list[str], magnetic: bool, folder: Path) -> list[str]:
+    """What is broken by a calibration of a laboratory's table by the profile proposed for it."""
+    before, output = contents(folder), folder / "out-cal.json"
+    following = ["calibrate", line[1], "--tool", line[3], "-o", str(output)]
+    ran = cli_support.mwdcal(*following)
+    broken = promises(following, ran, folder, before)
+    if ran.code == 0 and magnetic and mwdcal.load(output).magnetometer is None:
+        broken.append("the magnetometer was lost")
+    return broken
+
+
+def case(
+    seed: int, sound: dict[str, list[Any]], folder: Path, only: str = ""
+) -> tuple[str, int, list[str]]:
     """Run a case: its command, exit code, and the promises it breaks."""
     r = random.Random(seed)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     (name,) = r.choices(WITH_FILES, [RARE.get(n, 1.0) for n in WITH_FILES])
-    line = command(r, name, sound, folder)
+    name = only or name
+    from_laboratory = name == "profile" and r.random() < 0.8
+    magnetic = False
+    if from_laboratory:
+        line, magnetic = laboratory_case(r, folder)
+    else:
+        line = command(r, name, sound, folder)
+    if r.random() < 0.1:
+        damaged(r, toml_file(r, r.choice(SETTINGS), folder / "mwdcal"))
     (folder / "command").write_text(json.dumps(line))
     before = contents(folder)
     forget_peak()
@@ -990,7 +1058,9 @@ def case(seed: int, sound: dict[str, list[Any]], folder: Path) -> tuple[str, int
             ran = cli_support.mwdcal(*line)
             code = ran.code
             broken = promises(line, ran, folder, before)
-            if code == 0 and not broken and r.random() < 0.03:
+            if from_laboratory and code == 0 and not broken:
+                broken = calibrated_by(line, magnetic, folder)
+            elif code == 0 and not broken and r.random() < 0.03:
                 broken = repeated(line, folder)
         except Hang:
             broken = ["interrupted as too slow"]
@@ -1031,7 +1101,7 @@ def repeated(line: list[str], folder: Path) -> list[str]:
 # ------------------------------------------------------------------------------------- running
 
 
-def work(seeds: range, until: float, keep: bool) -> tuple[Counter[str], list[str]]:
+def work(seeds: range, until: float, keep: bool, only: str = "") -> tuple[Counter[str], list[str]]:
     """Run cases until a time: how they ended, and what was found."""
     counts: Counter[str] = Counter()
     findings = []
@@ -1040,7 +1110,7 @@ def work(seeds: range, until: float, keep: bool) -> tuple[Counter[str], list[str
         for seed in seeds:
             if time.time() > until:
                 break
-            name, code, broken = case(seed, sound, Path(place) / "case")
+            name, code, broken = case(seed, sound, Path(place) / "case", only)
             counts[f"{name} {code}"] += 1
             if broken:
                 findings.append(f"seed {seed} {name}: " + "; ".join(broken))
@@ -1058,10 +1128,14 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=10.0, help="stop after so long")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--keep", action="store_true", help="keep the files of sound cases as well")
+    parser.add_argument("--only", default="", help="one command, such as profile")
     given = parser.parse_args()
     first, last = map(int, given.seeds.split(":"))
     until = time.time() + 60 * given.minutes
-    shares = [(range(first + k, last, given.jobs), until, given.keep) for k in range(given.jobs)]
+    shares = [
+        (range(first + k, last, given.jobs), until, given.keep, given.only)
+        for k in range(given.jobs)
+    ]
     if given.jobs == 1:
         results = [work(*shares[0])]
     else:

@@ -31,7 +31,7 @@ from mwdcal.presentation import (
     stations,
     survey,
 )
-from mwdcal.presentation.envelope import INPUTS, Envelope, ExampleDocument
+from mwdcal.presentation.envelope import INPUTS, Envelope, ExampleDocument, WrittenSettings
 from mwdcal.registry.lookup import Listing
 from mwdcal.use.verification import Verdict
 
@@ -49,6 +49,7 @@ CONTENTS: dict[str, type] = {
     "convert": conversion.ConversionSummary,
     "diagnose": Diagnosis,
     "example": ExampleDocument,
+    "init": WrittenSettings,
     "list": builtin.BuiltInSummary,
     "fleet": fleet.FleetDocument,
     "noise": noise.NoiseSummary,

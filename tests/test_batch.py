@@ -13,7 +13,7 @@ from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.errors import FitError, InputError
-from mwdcal.estimation.batch import batch_of_one, put, take
+from mwdcal.estimation.batch import batch_of_one, join, kind_of, put, take
 from mwdcal.sensor.profile import Profile, TriadProfile
 from simulation import Tool, plan
 
@@ -61,6 +61,17 @@ def test_members_taken_out_are_indexed_and_put_back_make_the_batch_again(data):
         assert ours.dtype == first.dtype
     unchanged = zip(arrays(other), arrays(tree(count, offset=100.0)), strict=True)
     assert all((a == b).all() for a, b in unchanged)
+
+
+def test_parts_of_a_batch_join_if_they_are_of_a_kind():
+    batch = {"a": np.arange(6.0).reshape(3, 2), "b": (np.arange(3), "name")}
+    parts = [take(batch, np.array([0])), take(batch, np.array([1, 2]))]
+    assert kind_of(parts[0]) == kind_of(parts[1])
+    whole = join(parts)
+    np.testing.assert_array_equal(whole["a"], batch["a"])
+    np.testing.assert_array_equal(whole["b"][0], batch["b"][0])
+    assert kind_of({**batch, "b": (np.arange(3), "other")}) != kind_of(batch)
+    assert kind_of({**batch, "a": np.zeros((3, 3))}) != kind_of(batch)
 
 
 def test_a_batch_of_one_has_its_member_first():

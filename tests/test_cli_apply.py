@@ -104,6 +104,23 @@ def test_the_order_of_the_columns_is_that_of_the_contract(tmp_path, calibration)
     assert list(read_csv(path)) == [*surveys(), *ADDED]
 
 
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_a_standard_uncertainty_stands_beside_what_it_leaves_out(tmp_path, calibration, suffix):
+    """On screen, in JSON and in the table; without `sd_` columns there is nothing to say it of."""
+    source = write_csv(tmp_path / "in.csv", surveys())
+    left_out = ("interference of the drill string", "drift of the sensors", "sag", "misalignment")
+    out = tmp_path / f"out{suffix}"
+    ran = mwdcal("apply", calibration, source, "-o", out)
+    document = json.loads(mwdcal("apply", calibration, source, "-o", out, "--json").out)
+    table = out.read_bytes().decode("utf-8", "replace")
+    for told in (ran.out, " ".join(document["not_included"]), table):
+        assert all(name in " ".join(told.split()) for name in left_out)
+    assert document["error_terms"] == ["calibration", "noise"]
+    plain = mwdcal("apply", calibration, source, "-o", out, "--no-uncertainty")
+    assert "1σ" not in plain.out
+    assert b"not_included" not in out.read_bytes()
+
+
 def test_input_columns_of_a_text_table_keep_every_character(tmp_path, calibration):
     run = {k: list(v) for k, v in surveys().items()}
     run["ax"] = [f"{v:+.14e}" for v in run["ax"]]

@@ -326,6 +326,7 @@ def active(tmp_path_factory):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("without_layout")
 def test_no_command_shows_control_characters_or_takes_markup(active, monkeypatch):
     monkeypatch.chdir(active)
     commands = [

@@ -150,6 +150,7 @@ def test_sensor_block_turned_about_the_tool_axis(tmp_path, fitted):
     assert failed(rows) == {"error of toolface"}
 
 
+@pytest.mark.usefixtures("without_pictures")
 @pytest.mark.parametrize("bias_g", [0.0, 5e-3])
 def test_tables_to_a_verdict_in_one_command_are_the_two_commands(tmp_path, fitted, bias_g):
     run = write_csv(tmp_path / "run.csv", fitted[1])

@@ -351,6 +351,7 @@ class Page(HTMLParser):
             assert self.open.pop() == tag
 
 
+@pytest.mark.usefixtures("without_layout")
 def test_the_page_is_whole_and_needs_nothing_else(whole):
     page = render(whole, "<tool>", "ab" * 32)
     parsed = Page()

@@ -355,6 +355,18 @@ def test_a_column_that_explains_the_residuals_is_named_and_others_are_not(seed):
         calibrate(quiet, Profile(name="x"))
 
 
+@pytest.mark.parametrize("levels", [(25, 80, 140), (140, 110, 80, 50, 25)])
+def test_a_column_that_a_drift_within_the_run_goes_with_is_named(levels):
+    """Soaks in turn, their temperature under no telling name, noise not declared: the fit takes it for a drift."""
+    angles = [np.tile(a, len(levels)) for a in plan(toolfaces=6)]
+    warmth = np.repeat(np.array(levels, float), 24)
+    one = single(read(tools(1, 4, order=1), angles, warmth, 4, declared=False))
+    others = {"X17": warmth, "battery": np.random.default_rng(1).uniform(size=one.count)}
+    found = calibrate(replace(one, temperature=None, others=others), Profile(name="x")).findings
+    assert "accelerometer-drift" in {f.id for f in found}
+    assert ["'X17'" in f.text for f in found if f.id == "column-explains"] == [True]
+
+
 @pytest.mark.parametrize("seed", [1, 2, 3, 4])
 def test_no_column_explains_the_residuals_of_a_tool_at_one_temperature(seed):
     warm = unrecorded(seed)

@@ -74,3 +74,48 @@ def test_every_line_of_the_first_pages_runs(tmp_path, monkeypatch, page):
         assert ran.code == 0, (line, ran)
         if dollar and output.strip():
             assert [*map(str.rstrip, ran.out.splitlines())] == output.rstrip().split("\n"), line
+
+
+BASE = """
+import sys
+from mwdcal.app.cli import main
+
+sys.modules |= dict.fromkeys(sys.argv[1].split(","))
+for line in sys.stdin.read().splitlines():
+    try:
+        main(line.split())
+    except SystemExit as stop:
+        assert not stop.code, line
+"""
+"""Runs command lines where some modules are not installed."""
+
+
+def test_without_extras_all_commands_on_text_tables_run(tmp_path):
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    extras = [each for some in project["optional-dependencies"].values() for each in some]
+    names = {re.split(r"[\[>=]", each)[0] for each in extras} - {"mwdcal"}
+    absent = ",".join(sorted(name.replace("-", "_") for name in names))
+    lines = (
+        "example demo",
+        "calibrate demo/run.csv --tool demo/tool.toml -o tool.json",
+        "verify tool.json demo/rolltest.csv",
+        "profile demo/export.csv -o export.toml",
+        "stations demo/log.csv -o stations.csv",
+        "noise demo/static.csv",
+        "plan --plan six-state --tool demo/tool.toml -o plan.csv",
+        "apply tool.json demo/surveys.csv -o corrected.csv",
+        "survey tool.json demo/well.csv -o well.csv",
+        "diagnose tool.json demo/rolltest.csv",
+        "convert tool.json --notation forward",
+        "certificate tool.json --laboratory demo/laboratory.toml",
+    )
+    command = [sys.executable, "-c", BASE, absent]
+    environment = {**os.environ, "PYTHONUTF8": "1"}
+    options = {"cwd": tmp_path, "env": environment, "capture_output": True, "text": True}
+    done = subprocess.run(command, input="\n".join(lines), check=False, **options)
+    assert done.returncode == 0, done.stderr[-2000:]
+    done = subprocess.run(
+        command, input="registry --database tools.sqlite init", check=False, **options
+    )
+    assert 'pip install "mwdcal[registry]"' in done.stderr
+    assert done.returncode

@@ -259,6 +259,7 @@ def test_a_certificate_of_results_in_memory_has_the_values_of_files(here):
     assert ours == theirs
 
 
+@pytest.mark.usefixtures("without_layout")
 @pytest.mark.parametrize("suffix", ["html", "pdf"])
 def test_pages_and_pdf_are_those_of_the_command(here, tmp_path, suffix):
     pytest.importorskip("matplotlib")

@@ -91,6 +91,9 @@ REFUSALS = {
     "scale of truth": (A + "scale = true", "must be a number; got true or false"),
     "zero noise": (A + "noise = 0.0", "key 'accelerometer.noise': must be between"),
     "negative repeatability": (A + "repeatability = -1e-9", "accelerometer.repeatability"),
+    "negative drift": (A + "drift = -1e-9", "accelerometer.drift"),
+    "no drift": (A + "drift = nan", "key 'accelerometer.drift': must be between 0"),
+    "no field drift": ('name = "a"\n[stand]\nfield_drift_nt = nan', "'stand.field_drift_nt'"),
     "huge nonlinearity": (A + "nonlinearity = 5", "accelerometer.nonlinearity"),
     "negative stand": ('name = "a"\n[stand]\ntoolface_deg = -1', "'stand.toolface_deg'"),
     "practice of the stand": (

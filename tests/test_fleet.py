@@ -219,6 +219,23 @@ def test_a_profile_without_scale_or_noise_is_filled_in_per_tool(tmp_path):
         check_same(rows[serial], alone(columns, "x", tool="generic"), 1e-6)
 
 
+@pytest.mark.parametrize(
+    "stand", ["", "azimuth_deg = 0.05"], ids=["closed form", "uncertain stand"]
+)
+def test_a_declared_drift_is_that_of_each_tool_alone(tmp_path, stand):
+    """No noise is declared: each tool's is told apart from the drift in as many rounds as alone. 0.6 mV is 0.2 mg."""
+    profile = tmp_path / "tool.toml"
+    triads = "[accelerometer]\nscale = 3.0\ndrift = 6e-4\n[magnetometer]\nscale = 5e-5\n"
+    profile.write_text(f'name = "t"\n{triads}[stand]\nfield_drift_nt = 40\n{stand}')
+    runs = {f"T{seed}": short_run(seed) for seed in range(3)}
+    rows = calibrated(write_fleet(tmp_path / "runs.parquet", runs), tool=str(profile))
+    for serial, columns in runs.items():
+        made = alone(columns, "x", tool=str(profile))
+        declared = {each.name: each.declared for each in made.drift}
+        assert declared == pytest.approx({"field": 40.0, "accelerometer": 0.2})
+        check_same(rows[serial], made)
+
+
 def test_factors_and_true_azimuths(tmp_path):
     metadata = {"azimuth_reference": "true", "declination_deg": 7.5}
     runs = {f"T{seed}": short_run(seed) for seed in range(3)}

@@ -47,6 +47,7 @@ def units(page):
     return {row[1]: row[-1] for row in cells}
 
 
+@pytest.mark.usefixtures("without_layout")
 @pytest.mark.parametrize(
     ("tool", "model", "expected"),
     [

@@ -18,6 +18,7 @@ from cli_support import EXAMPLE
 from cli_support import mwdcal as command
 from mwdcal.calibration.diagnosis.identity import dated
 from mwdcal.calibration.readings import check_day, future_day, stated_day
+from mwdcal.errors import InputError
 from mwdcal.files import metadata
 from mwdcal.files.formats import table as tables
 
@@ -62,7 +63,7 @@ def done(*arguments):
 
 
 @pytest.mark.slow
-@settings(max_examples=5, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=2, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(serial=SERIALS, day=DATES)
 @example("12.10", "2024-03-01")
 @example("1e5", "2024-03-01")
@@ -98,7 +99,7 @@ def through(folder, serial, day):
         day[:10],
     )
     assert done("convert", made, "--notation", "forward", "--json").json["serial"] == serial
-    place = ("--database", folder / "r.sqlite")
+    place = ("--registry", folder / "r.sqlite")
     done("registry", *place, "init")
     done("registry", *place, "add", run, made, folder / "v.json", folder / "C.json")
     (tool,) = done("registry", *place, "list", "--json").json["tools"]
@@ -234,7 +235,7 @@ def test_a_day_that_is_to_come_is_said_wherever_readings_are_used(run, test_run)
 def test_a_registry_says_which_records_are_of_no_tool_or_of_a_day_to_come(tmp_path, run):
     for name, stated in {"none": {"serial": None}, "late": {"date": "2999-01-01"}}.items():
         mwdcal.save(mwdcal.calibrate(of(run, **stated)), tmp_path / f"{name}.json")
-    place = ("--database", tmp_path / "r.sqlite")
+    place = ("--registry", tmp_path / "r.sqlite")
     done("registry", *place, "init")
     ran = done("registry", *place, "add", tmp_path / "none.json", tmp_path / "late.json", "--json")
     said = {each["id"]: each["text"] for each in ran.json["findings"]}
@@ -292,6 +293,35 @@ def test_serials_of_the_header_of_a_log_keep_their_spelling(tmp_path, serial):
     lines += [f"SERIAL. {serial} : serial", "~Curve", "DEPT.M :", "AX.G :", "~A", "1.0 0.5", ""]
     (tmp_path / "log.las").write_text("\n".join(lines))
     assert tables.read(tmp_path / "log.las").metadata["serial"] == serial
+
+
+@pytest.mark.parametrize("way", ["columns", "pandas", "pyarrow"])
+@pytest.mark.parametrize(
+    ("cells", "serial"), [([7.0, 7.0], "7"), ([7, 7], "7"), ([12.1, 12.1], None)]
+)
+def test_a_serial_that_lost_its_spelling_is_refused(way, cells, serial):
+    """12.10 and 12.1 are two tools; a table of numbers has one of them."""
+    columns = {n: np.ones(2) for n in ("ax", "ay", "az")} | {"serial": np.array(cells)}
+    if way == "pandas":
+        columns = pytest.importorskip("pandas").DataFrame(columns)
+    elif way == "pyarrow":
+        columns = pytest.importorskip("pyarrow").table(columns)
+    if serial:
+        assert mwdcal.read_run(columns).metadata["serial"] == serial
+    else:
+        with pytest.raises(InputError, match=r"'serial': must be text; got the number 12\.1"):
+            mwdcal.read_run(columns)
+
+
+@pytest.mark.parametrize(
+    ("name", "cells", "dtype", "expected"),
+    [("serial", ["1e5", None], "string", "1e5"), ("simulated", [True, None], "boolean", True)],
+)
+def test_a_missing_cell_of_pandas_is_blank(name, cells, dtype, expected):
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame({n: np.ones(2) for n in ("ax", "ay", "az")})
+    frame[name] = pandas.array(cells, dtype=dtype)
+    assert mwdcal.read_run(frame).metadata[name] == expected
 
 
 FRAMES = {"pandas": "DataFrame", "polars": "DataFrame"}

@@ -514,6 +514,7 @@ def test_screen_says_what_the_analysis_says() -> None:
     assert "is missing: one at inclination" in interference_screen(refused)
 
 
+@pytest.mark.usefixtures("without_layout")
 def test_page_shows_before_and_after_and_is_the_same_twice() -> None:
     hostile = replace(well(), source="<script>x</script>\x1b[2J.csv")
     result = interference(laboratory(), hostile, depth=np.linspace(800, 2540, 30))

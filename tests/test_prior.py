@@ -79,7 +79,8 @@ def test_two_runs_in_turn_are_as_good_as_both_together(unknown):
         assert (np.abs(values[0] - values[1]) < 0.02 * sd).all(), name
 
 
-def test_intervals_cover_with_tools_drawn_from_their_datasheet():
+@pytest.mark.parametrize("tools", [60, pytest.param(240, marks=pytest.mark.study)])
+def test_intervals_cover_with_tools_drawn_from_their_datasheet(tools):
     """Six stations, no redundancy to speak of without it, on a new tool each time."""
     covered, widths = [], []
     sheet = {"noise": 1e-4}, {"noise": 15.0}
@@ -88,7 +89,7 @@ def test_intervals_cover_with_tools_drawn_from_their_datasheet():
         accelerometer=msgspec.structs.replace(SHEET.accelerometer, **sheet[0]),
         magnetometer=msgspec.structs.replace(SHEET.magnetometer, **sheet[1]),
     )
-    for seed in range(120):
+    for seed in range(tools):
         rng = np.random.default_rng(seed)
         turn = np.tan(np.radians(0.1))
         gain = (np.eye(3) - turn * rng.normal(size=(2, 3, 3)) * (1 - np.eye(3))) / (
@@ -131,8 +132,9 @@ def test_a_tool_that_has_changed_is_told():
     assert [f for f in changed.findings if f.id == "prior-conflict"]
 
 
-def test_no_false_alarm_of_a_changed_tool():
-    previous = [calibrate(make(seed), PROFILE) for seed in range(40)]
+@pytest.mark.parametrize("tools", [15, pytest.param(60, marks=pytest.mark.study)])
+def test_no_false_alarm_of_a_changed_tool(tools):
+    previous = [calibrate(make(seed), PROFILE) for seed in range(tools)]
     alarms = [
         any(f.id == "prior-conflict" for f in calibrate(
             make(1000 + seed), PROFILE, Options(prior=from_calibration(record))).findings)

@@ -1,18 +1,22 @@
 """`mwdcal profile`: exports as people have them, calibrated without an option typed by hand."""
 
 import itertools
+import os
 
 import numpy as np
 import pytest
 
 import exports
 from cli_support import mwdcal, numbers, read_csv, refused, servo_run, write_csv
+from mwdcal import propose_profile, read_run
 from mwdcal.calibration.readings import TRIADS
+from mwdcal.errors import FitError
 from mwdcal.files.profiles import load_profile
 from mwdcal.geometry.observables import RESULTS
 from mwdcal.geometry.vectors import tool_from_earth
 from mwdcal.identification.columns import meaning
 from mwdcal.identification.wiring import is_clear, wiring
+from terminal import at_terminal
 
 DIALECTS = list(exports.DIALECTS)
 
@@ -111,7 +115,6 @@ def thousands(run):
 
 
 OPEN = {
-    "one inclination": (servo_run(inclinations=(90,)), "axes of the accelerometer open"),
     "two azimuths": (
         {**renamed(servo_run(), ref_azimuth_deg="Azi stand", ), "Ref Azi": servo_run()["ref_azimuth_deg"]},
         "'Azi stand' and 'Ref Azi' may each be 'ref_azimuth_deg'",
@@ -119,7 +122,7 @@ OPEN = {
     "true north": (renamed(servo_run(), ref_azimuth_deg="Azimuth true"), "counts from true or grid north"),
     "no unit of temperature": (
         renamed(changed(temperature_c=np.full(48, 77.0)), temperature_c="Temp"),
-        "neither its name nor its values say whether it is in °C or °F or K",
+        "neither its name nor its values (77, 77, 77, 77) say whether it is in °C or °F or K",
     ),
     "gal or milli-g": (
         renamed(changed(ref_gravity_g=np.full(48, 981.2)), ref_gravity_g="Gtotal"), "in g or mg or m/s²",
@@ -144,14 +147,80 @@ OPEN = {
         renamed(changed(ref_field_nt=np.full(48, 5.0)), ref_field_nt="Btotal"),
         "in nT or µT or mT or gauss",
     ),
-    "no toolface": (changed(ref_toolface_deg=None), "(no toolface)"),
-    "nameless channels": (renamed(servo_run(), ax="Ch1", ay="Ch2", az="Ch3"), "no column says by its name"),
+    "nameless channels": (
+        renamed(servo_run(), ax="Ch1", ay="Ch2", az="Ch3"),
+        "could not tell which columns are the accelerometers (ax, ay, az)",
+    ),
     "two magnetometers": (changed(mz=None), "only mx, my"),
     "no relation": (
         changed(**{k: np.random.default_rng(1).normal(size=48) for k in exports.RAW}),
         "no axes of the accelerometer explain",
     ),
 }  # fmt: skip
+
+
+ROLLS = {
+    "one inclination": (servo_run(inclinations=(90,)), "the stations do not tell the axes apart", 1),
+    "no toolface": (changed(ref_toolface_deg=None), "there is no column of the stand's toolface", 2),
+    "rolls alone": (
+        changed(ref_inclination_deg=None, ref_azimuth_deg=None, ref_dip_deg=None),
+        "there is no column of the stand's inclination",
+        2,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", ROLLS)
+def test_axes_that_a_table_does_not_tell_are_left_open(tmp_path, case):
+    """The profile is written; calibrate names the lines to fill in; filled in, it is a profile as any other."""
+    columns, reason, count = ROLLS[case]
+    run, tool = write_csv(tmp_path / "run.csv", columns), tmp_path / "tool.toml"
+    ran = mwdcal("profile", run, "-o", tool, "--json")
+    assert ran.code == 0, ran
+    findings = [each for each in ran.json["findings"] if each["id"] == "axes-open"]
+    assert len(findings) == count
+    assert reason in findings[0]["text"]
+    assert ran.json["accelerometer"]["axes"] == []
+    text = tool.read_text("utf-8")
+    lines = [n for n, line in enumerate(text.splitlines(), 1) if line == "axes = []"]
+    assert len(lines) == count
+    message = refused(mwdcal("calibrate", run, "--tool", tool, "-o", tmp_path / "cal.json"), 2)
+    assert f"line{'s' if count > 1 else ''} {' and '.join(map(str, lines))}: the axes of" in message
+    assert ("dip north and south" in message) == (count == 2)
+    tool.write_text(text.replace("axes = []", 'axes = ["+x", "+y", "+z"]'), "utf-8")
+    profile = load_profile(str(tool))[0]
+    assert profile.accelerometer.scale == pytest.approx(3.0, rel=0.1)
+    with pytest.raises(FitError, match="axes are open"):
+        propose_profile(run).profile  # noqa: B018
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a pseudo-terminal")
+def test_what_is_open_is_asked_on_a_terminal_and_the_answers_are_in_the_profile(tmp_path):
+    """By two columns that may be the azimuth, a temperature without a unit, and true north with its declination."""
+    run = renamed(servo_run(), ref_azimuth_deg="Azi true", temperature_c="Temp")
+    run |= {"Azimuth": run["Azi true"] + 40.0, "Temp": np.full(48, 77.0)}
+    path, tool = write_csv(tmp_path / "run.csv", run), tmp_path / "tool.toml"
+    refused(mwdcal("profile", path, "-o", tool), 3)
+    typed = ["9", "2", "1", "", "2.5"]
+    code, screen = at_terminal(["profile", str(path), "-o", str(tool)], typed)
+    assert code == 0, screen
+    assert "Type a number from 1 to 3" in screen
+    first = ", ".join(f"{value:.6g}" for value in run["Azi true"][:4])
+    assert f"Azi true: {first}" in " ".join(screen.split())
+    profile = load_profile(str(tool))[0]
+    assert profile.columns["ref_azimuth_deg"].name == "Azi true"
+    assert profile.columns["temperature_c"].unit == "°F"
+    assert profile.table.north == {"azimuth_reference": "true", "declination_deg": 2.5}
+    options = ("--column", "ref_azimuth_deg=Azi true", "--column", "temperature_c=Temp (°F)")
+    by_options = (*options, "--north", "true", "--declination-deg", "2.5")
+    ran = mwdcal("profile", path, "-o", tmp_path / "same.toml", *by_options)
+    assert ran.code == 0, ran
+    assert (tmp_path / "same.toml").read_bytes() == tool.read_bytes()
+    ran = mwdcal("calibrate", path, "--tool", tool, "-o", tmp_path / "cal.json")
+    assert ran.code == 0, ran
+    magnetic = read_run(path, tool).reference("azimuth")
+    turned = np.degrees(magnetic) - (run["Azi true"] - 2.5)
+    np.testing.assert_allclose((turned + 180) % 360 - 180, 0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("case", OPEN)
@@ -295,13 +364,17 @@ def attitudes(*turns):
     return turn[..., 0], turn[..., 2]
 
 
-def test_a_sign_that_the_dip_alone_would_tell_stays_open():
+def test_a_sign_is_told_by_the_dip_that_all_channels_share():
     north, down = attitudes(np.repeat([45.0, 90.0], 12), 30.0, np.tile(np.arange(0, 360, 30), 2))
     field = north * np.cos(np.radians(65)) + down * np.sin(np.radians(65))
     result = wiring(field * 3.0, north, down)
-    assert not is_clear(result)
-    assert sorted(result.alternatives) == [("+x", "+y", "+z"), ("+x", "+y", "-z")]
+    assert is_clear(result)
+    assert result.axes == ("+x", "+y", "+z")
+    reversed_z = wiring(field * [3.0, 3.0, -3.0], north, down)
+    assert reversed_z.axes == ("+x", "+y", "-z")
     assert is_clear(wiring(field * 3.0, field))
+    north, down = attitudes(np.full(12, 90.0), 30.0, np.arange(0, 360, 30))
+    assert not is_clear(wiring(north + 2 * down, north, down)), "z is the same at all stations"
 
 
 def test_few_stations_never_tell_wrong_axes():
@@ -439,8 +512,10 @@ def test_a_simulated_run_is_said_to_be_one(tmp_path):
 def test_columns_that_are_not_understood_are_named(tmp_path):
     run = write_csv(tmp_path / "run.csv", renamed(servo_run(), ref_azimuth_deg="Lage 2"))
     message = refused(mwdcal("profile", run, "-o", tmp_path / "tool.toml"), 3)
-    assert "(no azimuth)" in message
-    assert "Columns not understood: 'Lage 2'." in message
+    assert "no column is 'ref_azimuth_deg' by its name. Is it one of these?" in message
+    assert "--column 'ref_azimuth_deg=Lage 2' or --column ref_azimuth_deg=." in message
+    answer = ("--column", "ref_azimuth_deg=Lage 2")
+    assert mwdcal("profile", run, "-o", tmp_path / "tool.toml", *answer).code == 0
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """Verification rows: what is judged, how sure, and what is left out."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -492,6 +494,46 @@ def test_a_scatter_that_contradicts_one_setting_is_named_and_counted(record):
     assert "settings-doubted" not in ids(apart)
     single, both = (rows_of(each)["error of inclination"].uncertainty for each in (apart, result))
     assert single < both
+
+
+def test_the_raw_figure_stands_beside_each_value(record):
+    """Of each roll set: largest less smallest departure, or the largest; the row has the largest of all."""
+    result = verify(record, several(3, 1, 0.0, record), BOTH)
+    for row in result.rows:
+        departures = np.array([station.departures[row.name] for station in result.station_rows])
+        for each in row.sets:
+            part = departures[each.stations]
+            raw = np.ptp(part) if row.name.startswith("spread") else np.abs(part).max()
+            assert each.raw == pytest.approx(raw)
+        assert row.raw == max(each.raw for each in row.sets)
+
+
+@pytest.mark.parametrize(
+    ("name", "factor", "shift", "shown"),
+    [("dip", -1, 0, "dip by [+]130°"), ("field", 1e-3, 0, "field by [+]5e[+]04 nT"),
+     ("toolface", 1, 30 * DEG, "toolface by -30°"), ("gravity", 0.98, 0, "gravity by [+]0.02 g")],
+)  # fmt: skip
+def test_references_that_no_limit_judges_and_the_readings_contradict_are_named(
+    record, name, factor, shift, shown
+):
+    """Of a sound tool at dip 65° in 50,000 nT, whose inclination and azimuth are right."""
+    face = plan((45,))[2]
+    known = {"dip": np.full(12, 65 * DEG), "field": np.full(12, 5e4), "gravity": np.ones(12)}
+    right = roll(45, **known, toolface=face)
+    assert "contradicted" not in ids(verify(record, right, BOTH))
+    wrong = msgspec_replace(right, known={**right.known, name: right.known[name] * factor + shift})
+    result = verify(record, wrong, BOTH)
+    assert result.passed
+    [text] = [f.text for f in result.findings if f.id == "contradicted"]
+    assert re.search(shown, text)
+    errors = {
+        "dip": "dip_deg",
+        "field": "field_nt",
+        "toolface": "toolface_deg",
+        "gravity": "gravity_g",
+    }
+    judged = Limits(name="all", error=Bounds(**{errors[name]: 1.0}))
+    assert "contradicted" not in ids(verify(record, wrong, judged))
 
 
 def several(count, seed, size, record, toolfaces=12, sd=NOISE):

@@ -26,6 +26,7 @@ def recipe():
     return [line for block in blocks for line in block.splitlines()]
 
 
+@pytest.mark.usefixtures("without_layout")
 def test_the_recipe_leads_from_an_empty_folder_to_a_signed_certificate(tmp_path, monkeypatch):
     first, second, *lines = recipe()
     assert first == "python examples/registry/laboratory.py laboratory --tools 200"

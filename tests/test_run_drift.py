@@ -12,9 +12,15 @@ from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.results import StatedCovariance, drifts
+from mwdcal.certificate.budget import budget
+from mwdcal.errors import FitError
 from mwdcal.estimation.drift import terms_of, walk_scores
+from mwdcal.files.formats.table import Table
 from mwdcal.geometry.vectors import earth_field, earth_gravity, tool_from_earth
-from mwdcal.sensor.profile import Profile
+from mwdcal.planning.expected import expected
+from mwdcal.planning.simulate import drifted
+from mwdcal.presentation.calibration import remarks
+from mwdcal.sensor.profile import Profile, StandProfile, TriadProfile
 
 COUNT = 48
 
@@ -178,3 +184,170 @@ def test_what_held_parameters_leave_is_no_drift():
     [(_, result)] = by_drift(fit(bent, options), options)
     assert not result.problem.walks
     assert chances(result)[0][0, 0] < 1e-6
+
+
+# Declared drifts
+
+
+def with_sd(readings, **sizes):
+    """The readings with declared drifts, g or nT."""
+    sd = {f"{name}-drift": np.full(COUNT, size) for name, size in sizes.items()}
+    return replace(readings, sd={**readings.sd, **sd})
+
+
+def one_run(readings, place=0):
+    """One of several runs by itself."""
+    return Readings(readings.accelerometer[place], readings.magnetometer[place],
+                    known=readings.known, sd=readings.sd)  # fmt: skip
+
+
+def sizes_of(result, name):
+    """1σ of the change from the first station to the last that a fit allows for on an axis before the readings."""
+    drift = [c for c in result.problem.evidence.constants if c.name == name]
+    change = np.array([c.mask[0, -1] - c.mask[0, 0] for c in drift])
+    return float(np.linalg.norm(change * [c.sd[0] for c in drift]))
+
+
+@pytest.mark.parametrize("straight", [False, True], ids=["walk", "straight"])
+def test_intervals_include_a_declared_drift_that_no_residual_shows(straight):
+    """0.2 mg in runs of one direction after the other: undeclared, the gains' intervals cover less."""
+    readings = runs(11, 60, offset=2e-4, straight=straight)
+    declared, _ = covered(with_sd(readings, accelerometer=2e-4))
+    assert declared.mean() > 0.94
+    if straight:
+        assert covered(readings)[0].mean() < 0.9
+
+
+def test_a_declared_drift_is_the_change_from_the_first_station_to_the_last():
+    """Half of the variance is a walk, of which cosines hold most; nothing drifts here, and nothing shrinks."""
+    options = Options(order=0)
+    [(_, result)] = by_drift(fit(with_sd(runs(2, 1), accelerometer=3e-4), options), options)
+    assert sizes_of(result, "accelerometer-drift-x") == pytest.approx(3e-4, rel=0.06)
+
+
+def test_the_larger_of_a_declared_and_a_seen_drift_counts():
+    """There and back, 0.6 mg: declared as 0.01 mg it is as large, and no surer, as if nothing had been declared."""
+    readings = runs(3, 1, noise=(2e-5, 15.0))
+    places = np.r_[0:COUNT:2, COUNT - 1 : 0 : -2]
+    slope = 6e-4 * np.linspace(-0.5, 0.5, COUNT)[:, None] * np.array([0.0, 1.0, 0.0])
+    known = {name: value[places] for name, value in readings.known.items()}
+    raw = readings.accelerometer[0, places] + slope, readings.magnetometer[0, places]
+    bare = Readings(*raw, known=known, sd={})
+    profile, options = Profile(name="x"), Options(order=0)
+    each = [calibrate(r, profile, options) for r in (bare, with_sd(bare, accelerometer=1e-5))]
+    seen, declared = (next(d for d in c.drift if d.name == "accelerometer") for c in each)
+    assert declared.declared == pytest.approx(0.01)
+    assert declared.change == pytest.approx(seen.change, rel=1e-3)
+    assert 1 < declared.standard_uncertainty / seen.standard_uncertainty < 1.1
+
+
+def test_the_closed_form_of_a_declared_drift_is_the_general_fit():
+    """A member that leaves a station out takes the batch to the general minimiser."""
+    sd = {"accelerometer": np.array(1e-4), "magnetometer": np.array(15.0)}
+    readings = replace(with_sd(runs(2, 2), accelerometer=2e-4, field=40.0))
+    readings = replace(readings, sd={**readings.sd, **sd})
+    include = np.ones((2, COUNT))
+    include[1, 5] = 0
+    closed, general = (fit(readings, Options(order=0), use) for use in (include[0], include))
+    for name in ("params", "constants"):
+        a, b = (getattr(each.state, name)[0] for each in (closed, general))
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-6 * np.abs(b).max())
+    a, b = (np.diag(each.analysis.covariance[0]) for each in (closed, general))
+    np.testing.assert_allclose(a, b, rtol=1e-6)
+    assert closed.analysis.freedom[0] == pytest.approx(general.analysis.freedom[0], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"robust": "huber"}, {"parameters": 6}, {"method": "newton"}, {"method": "least-squares"},
+     {"method": "toolface-inclination", "paper_weights": True}],
+    ids=str,
+)  # fmt: skip
+def test_every_fit_includes_a_declared_drift(changes):
+    """As independent errors: where the drift is much larger than the noise, σ is in proportion to it."""
+    profile, options = Profile(name="x"), Options(order=0, **changes)
+    readings = one_run(runs(2, 1))
+    if "paper_weights" in changes:
+        with pytest.raises(FitError, match="accelerometer-drift"):
+            calibrate(with_sd(readings, accelerometer=2e-3), profile, options)
+        return
+    each = [calibrate(with_sd(readings, accelerometer=u), profile, options) for u in (2e-3, 4e-3)]
+    small, large = (next(r for r in c.budget if "accelerometer" in r.source) for c in each)
+    assert small.inclination_deg > 0.02
+    assert large.inclination_deg == pytest.approx(2 * small.inclination_deg, rel=0.1)
+
+
+def test_a_field_drift_needs_a_field_in_nanotesla():
+    readings = one_run(with_sd(runs(2, 1), field=40.0))
+    known = {name: value for name, value in readings.known.items() if name != "field"}
+    with pytest.raises(FitError, match="Give ref_field_nt"):
+        calibrate(replace(readings, known=known), Profile(name="x"), Options(order=0))
+
+
+def test_what_is_declared_is_not_taken_as_steady():
+    readings = one_run(with_sd(runs(2, 1), accelerometer=2e-4))
+    record = calibrate(readings, Profile(name="x"), Options(order=0))
+    assert "steady accelerometer offsets" not in record.assumed_exact
+    assert "accelerometer" not in {each.name for each in record.unseen}
+    assert any(
+        "declared drift" in line and "accelerometer 0.2 mg" in line for line in remarks(record)
+    )
+    [line] = [x for x in budget(record).lines if x.source.startswith("drift of the accelerometer")]
+    assert "0.2 mg" in line.basis
+
+
+def errors_at_45(gain, offset):
+    """Root mean squares of inclination and toolface errors, degrees, of a nominal accelerometer so corrected."""
+    azimuth_free = np.radians(np.arange(0.0, 360.0, 5.0))
+    down = np.sqrt(0.5) * np.column_stack(
+        [-np.cos(azimuth_free), np.sin(azimuth_free), 0 * azimuth_free + 1]
+    )
+    change = down @ (gain - np.eye(3)).T + offset
+    across = np.column_stack(
+        [-np.cos(azimuth_free), np.sin(azimuth_free), -1 + 0 * azimuth_free]
+    ) / np.sqrt(2)
+    around = np.column_stack([np.sin(azimuth_free), np.cos(azimuth_free), 0 * azimuth_free])
+    inclination = np.sum(change * across, 1)
+    toolface = np.sum(change * around, 1) / np.sqrt(0.5)
+    return np.degrees([np.sqrt(np.mean(inclination**2)), np.sqrt(np.mean(toolface**2))])
+
+
+def test_what_an_unseen_drift_would_do_is_what_it_does():
+    """Second formula: 0.1 mg put on one axis after the other of noise-free readings, and regression.
+
+    The tool is used as it was at the first station or at the last: half the squares of both.
+    """
+    readings = one_run(runs(2, 1))
+    record = calibrate(readings, Profile(name="x"), Options(order=0))
+    [unseen] = [each for each in record.unseen if each.name == "accelerometer"]
+    assert (unseen.change, unseen.unit) == (pytest.approx(0.1), "mg")
+    known = readings.known
+    g = tool_from_earth(*(known[n] for n in ("inclination", "azimuth", "toolface")))[..., 2]
+    place, squares = np.linspace(0, 1, COUNT), np.zeros(2)
+    for start in (0.0, 1.0):
+        for axis in np.eye(3):
+            raw = g + 1e-4 * (place - start)[:, None] * axis
+            fitted = np.linalg.lstsq(np.column_stack([g, np.ones(COUNT)]), raw, rcond=None)[0].T
+            gain = np.linalg.inv(fitted[:, :3])
+            squares += errors_at_45(gain, -gain @ fitted[:, 3]) ** 2 / 2
+    stated = unseen.inclination_deg, unseen.toolface_deg
+    assert stated == pytest.approx(np.sqrt(squares), rel=0.03)
+
+
+def test_a_plan_includes_a_declared_drift_and_a_simulation_draws_it():
+    inc, azi = np.repeat([[5, 45, 90, 135], [0, 90, 180, 270]], 12, axis=1)
+    face = np.tile(np.arange(12) * 30.0, 4)
+    names = (f"ref_{name}_deg" for name in ("inclination", "azimuth", "toolface"))
+    plan = Table(
+        dict(zip(names, (inc * 1.0, azi * 1.0, face), strict=True)), {}, "plan", range(1, 49)
+    )
+    sensors = {"accelerometer": TriadProfile(scale=1.0, noise=1e-4, drift=2e-4),
+               "magnetometer": TriadProfile(scale=1.0, noise=15.0)}  # fmt: skip
+    profile = Profile(name="x", stand=StandProfile(field_drift_nt=40.0), **sensors)
+    sources = {row.source: row for row in expected(plan, profile).budget}
+    assert sources["drift of the accelerometer during the run"].inclination_deg > 0.002
+    assert sources["drift of the field during the run"].azimuth_deg > 0.005
+    session = with_sd(one_run(runs(2, 1)), accelerometer=2e-4)
+    moved = drifted(np.random.default_rng(1), session, "accelerometer-drift", (4000,))
+    assert np.all(moved[:, 0] == 0)
+    assert moved[:, -1].std() == pytest.approx(2e-4, rel=0.03)

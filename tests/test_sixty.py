@@ -66,7 +66,7 @@ def predicted(tools, limit):
 
     def observed(factors):
         fields = factor_fields(factors, WARM, raw)
-        return np.concatenate([complex_value(name, fields) for name in NAMES], 1)
+        return np.concatenate([complex_value(name, fields) for name in NAMES], -1)
 
     rows = complex_steps(observed, tools)
     return rows @ limit @ np.swapaxes(rows, -1, -2)

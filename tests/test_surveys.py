@@ -31,9 +31,11 @@ from mwdcal.survey.acceptance import (
     judged,
     load_survey_limits,
 )
+from mwdcal.survey.error_model import load_error_model
 from mwdcal.survey.path import well_path
 from mwdcal.survey.stations import STRENGTHS, SURVEY_OBSERVABLES, survey_angles, switched
 from mwdcal.survey.surveying import survey_readings
+from mwdcal.survey.well_errors import well_errors
 
 EARTH = Earth()
 NOISE = (1e-4, 15.0)
@@ -69,13 +71,14 @@ def readings(tool, inclination, azimuth, toolface, rng=None, shift=0.0):
     return Readings(raw["accelerometer"], raw["magnetometer"], warmth, known)
 
 
-def test_uncertainty_covers_the_errors_of_surveys():
-    """Errors over 80 calibrations, 12 surveys each, in units of the stated covariance: chi-square, χ²/k = 1."""
+@pytest.mark.parametrize("tools", [80, pytest.param(200, marks=pytest.mark.study)])
+def test_uncertainty_covers_the_errors_of_surveys(tools):
+    """Errors of calibrations, 12 surveys each, in units of the stated covariance: chi-square, χ²/k = 1."""
     total, count = 0.0, 0
     names = ["inclination", "azimuth", "north_toolface", "gravity", "field", "dip"]
     places = [SURVEY_OBSERVABLES.index(name) for name in names]
     inc, azi, roll = np.radians([[4.0, 30, 88, 120], [20, 140, 260, 330], [10, 100, 200, 300]])
-    for seed in range(80):
+    for seed in range(tools):
         tool, calibration = laboratory(seed)
         surveys = survey_angles(
             calibration, readings(tool, inc, azi, roll, np.random.default_rng(seed))
@@ -87,8 +90,8 @@ def test_uncertainty_covers_the_errors_of_surveys():
         sd = surveys.sd[:, places]
         total += float(np.sum((error / sd) ** 2))
         count += error.size
-    # errors of one calibration are alike: the sum scatters by no more than that of 80 × 6 independent ones
-    assert total / count == pytest.approx(1.0, abs=4 * np.sqrt(2 / 480))
+    # errors of one calibration are alike: the sum scatters by no more than that of 6 independent ones of each
+    assert total / count == pytest.approx(1.0, abs=4 * np.sqrt(2 / (6 * tools)))
 
 
 def test_azimuth_does_not_depend_on_the_toolface():
@@ -261,6 +264,15 @@ def example(tmp_path_factory):
     return folder / "tool.json"
 
 
+BY_CALIBRATION = ("--error-model", "none")
+"""Standard uncertainties of calibration, noise and declination alone."""
+
+
+def floats(cells):
+    """Numbers of a column, NaN where it is blank."""
+    return np.array([float(cell) if cell else np.nan for cell in cells])
+
+
 def surveyed_file(example, folder, columns=None, *options, metadata=()):
     """The table that `survey` makes of the example's well, changed; and the document it prints."""
     source = EXAMPLE / "well.csv"
@@ -274,7 +286,7 @@ def surveyed_file(example, folder, columns=None, *options, metadata=()):
 
 
 def test_columns_of_a_well(example, tmp_path):
-    columns, document = surveyed_file(example, tmp_path)
+    columns, document = surveyed_file(example, tmp_path, None, *BY_CALIBRATION)
     given = read_csv(EXAMPLE / "well.csv")
     assert [*columns][: len(given)] == [*given]
     values = {k: np.array(v, float) for k, v in columns.items() if k.endswith(("_deg", "_m"))}
@@ -307,7 +319,9 @@ def test_reference_file_gives_norths_and_limits(example, tmp_path):
     assert made.code == 0, made
     place.write_text(made.out)
     blank = dict.fromkeys(("ref_gravity_g", "ref_field_nt", "ref_dip_deg"), [""] * 36)
-    columns, document = surveyed_file(example, tmp_path, blank, "--reference", place)
+    columns, document = surveyed_file(
+        example, tmp_path, blank, "--reference", place, *BY_CALIBRATION
+    )
     stated = made.json
     true, grid, magnetic = (
         np.array(columns[f"azimuth_{name}_deg"], float) for name in ("true", "grid", "magnetic")
@@ -334,7 +348,7 @@ def test_reference_file_gives_norths_and_limits(example, tmp_path):
 def test_a_declination_is_never_exact(example, tmp_path, stated, sd, finding):
     """Expected: OWSG set A Rev 5.1 at 48,000 nT and dip 63°, the example's field."""
     told = ("declination_deg = 2.4", *stated)
-    columns, document = surveyed_file(example, tmp_path, {}, metadata=told)
+    columns, document = surveyed_file(example, tmp_path, {}, *BY_CALIBRATION, metadata=told)
     horizontal = 48_000 * np.cos(np.radians(63))
     shared = np.hypot(sd[0], sd[1] / horizontal)
     declination = np.hypot(shared, np.hypot(0.10, 3000 / horizontal))
@@ -484,9 +498,9 @@ def test_an_uncertainty_of_declination_that_cannot_be_is_refused(example, tmp_pa
 def test_nothing_states_an_uncertainty_without_what_it_leaves_out(example, tmp_path):
     out, page = tmp_path / "out.csv", tmp_path / "s.html"
     source = EXAMPLE / "well.csv"
-    ran = cli("survey", example, source, "-o", out, "--report", page)
+    ran = cli("survey", example, source, "-o", out, "--report", page, *BY_CALIBRATION)
     left_out = ("interference of the drill string", "drift of the sensors", "sag", "measured depth")
-    document = cli("survey", example, source, "-o", out, "--json").json
+    document = cli("survey", example, source, "-o", out, "--json", *BY_CALIBRATION).json
     for told in (ran.out, page.read_text("utf-8"), out.read_text("utf-8")):
         assert all(name in " ".join(told.split()) for name in left_out)
     assert document["error_terms"] == ["calibration", "noise", "declination"]
@@ -642,16 +656,16 @@ def test_tie_in_moves_the_path(example, tmp_path):
 @pytest.mark.parametrize(
     ("columns", "options", "message"),
     [
-        ({"md_m": [str(1000 - i) for i in range(36)]}, (), "must increase"),
+        ({"md_m": [str(1000 - i) for i in range(36)]}, (), "must not decrease"),
         (
-            {"md_m": ["7", "8", "8", *map(str, range(9, 42))]},
+            {"md_m": ["7", "8", "7.9", *map(str, range(9, 42))]},
             (),
-            "line 5, column 'md_m': must increase",
+            "line 5, column 'md_m': must not decrease",
         ),
         (
             {"md_m": ["7", "", "6", *map(str, range(9, 42))]},
             (),
-            "line 5, column 'md_m': must increase",
+            "line 5, column 'md_m': must not decrease",
         ),
         ({"DEPT": ["1"] * 36}, (), "measured depths must be in metres"),
         ({"Hole Depth (ft)": ["1"] * 36}, (), "measured depths must be in metres"),
@@ -662,6 +676,7 @@ def test_tie_in_moves_the_path(example, tmp_path):
         ({}, ("--switch", "6,5"), "--switch"),
         ({}, ("--tie-in", "1,2"), "--tie-in"),
         ({}, ("--limits", "nothing"), "nothing"),
+        ({}, ("--error-model", "nothing"), "Built in: owsg-mwd"),
         ({}, ("--outside", "hide"), "--outside"),
     ],
 )
@@ -687,7 +702,7 @@ def test_long_well_is_like_its_parts(example, tmp_path):
         parts, _ = surveyed_file(example, tmp_path)
     for name in whole:
         if name.endswith(("_deg", "_m", "_nt", "_g")):
-            one, other = (np.array(t[name], float) for t in (whole, parts))
+            one, other = (floats(t[name]) for t in (whole, parts))
             np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
 
@@ -734,8 +749,8 @@ def test_msa_takes_axial_interference_off(example, tmp_path):
     depth = np.array(columns["md_m"], float)
     true = 20 + 0.06 * np.maximum(depth - 600, 0)
     off = (np.array(columns["azimuth_magnetic_deg"], float) - true + 180) % 360 - 180
-    sd = np.array(columns["sd_azimuth_magnetic_deg"], float)
-    assert np.abs(off / sd).max() < 4
+    sd = floats(columns["sd_azimuth_magnetic_deg"])
+    assert np.nanmax(np.abs(off / sd)) < 4
     assert "SIMULATED" in (tmp_path / "m.html").read_text("utf-8")
 
 
@@ -743,7 +758,18 @@ def test_msa_takes_axial_interference_off(example, tmp_path):
 def test_results_say_whether_interference_was_taken_off(example, tmp_path):
     source, out, page = with_iron(tmp_path, 1500), tmp_path / "out.csv", tmp_path / "s.html"
     for options, corrected in (((), False), (("--msa",), True)):
-        ran = cli("survey", example, source, "-o", out, "--report", page, "--json", *options)
+        ran = cli(
+            "survey",
+            example,
+            source,
+            "-o",
+            out,
+            "--report",
+            page,
+            "--json",
+            *options,
+            *BY_CALIBRATION,
+        )
         ids = {finding["id"] for finding in ran.json["findings"]}
         shown = " ".join(page.read_text("utf-8").split())
         assert ("interference-corrected" in ids) is corrected
@@ -931,3 +957,107 @@ def test_tool_model_of_a_calibration(example, tmp_path):
         "course",
     )
     assert "--temperature" in refused(bad, 2)
+
+
+# ------------------------------------------------------------------ the error model
+
+
+def test_the_error_model_is_in_every_uncertainty_by_default(example, tmp_path):
+    """Expected: formulas of OWSG set A Rev 5.1 at the last station, with a year of drift of the sensors."""
+    columns, document = surveyed_file(example, tmp_path)
+    alone, _ = surveyed_file(example, tmp_path, None, *BY_CALIBRATION)
+    assert document["error_model"] == "owsg-mwd"
+    assert document["error_model_sha256"]
+    assert "axial interference of the drill string" in document["error_terms"]
+    assert document["not_included"] == ["cross-axial interference of the drill string"]
+    inclination, azimuth = (
+        np.radians(float(columns[f"{name}_deg"][-1]))
+        for name in ("inclination", "azimuth_magnetic")
+    )
+    sine, cosine, dip = np.sin(inclination), np.cos(inclination), np.radians(63)
+    hole = [0.2 * sine**0.25, 0.1 * sine, 0.3 * cosine]
+    scale = np.degrees(0.0005 * sine * cosine) * np.sqrt(2)
+    expected = [*hole, np.degrees(0.004 / 9.80665), scale, floats(alone["sd_inclination_deg"])[-1]]
+    stated = floats(columns["sd_inclination_deg"])[-1]
+    assert stated == pytest.approx(np.linalg.norm(expected), rel=0.01)
+    turn = np.degrees(220 * sine * np.sin(azimuth) / (48_000 * np.cos(dip)))
+    assert floats(columns["sd_azimuth_magnetic_deg"])[-1] > np.hypot(turn, 0.1)
+    for name in ("north", "east", "tvd"):
+        assert floats(columns[f"sd_{name}_m"])[-1] > floats(alone[f"sd_{name}_m"])[-1]
+
+
+@pytest.mark.parametrize(("years", "share"), [(0.25, 0.5), (1.0, 1.0), (4.0, 1.0)])
+def test_drift_grows_with_the_time_since_the_calibration(example, years, share):
+    model, calibration = load_error_model(), mwdcal.load(example)
+    dated = replace_struct(calibration, tool={**calibration.tool, "date": "2025-01-01"})
+    day = str(np.datetime64("2025-01-01") + round(years * 365.25))
+    readings = Readings(np.ones((1, 3)), np.ones((1, 3)), metadata={"date": day})
+    errors = well_errors(model, dated, readings)
+    assert errors.years == pytest.approx(years, abs=0.002)
+    assert errors.sensors.magnetometer_bias_nt == pytest.approx(70.0 * share, rel=0.005)
+    assert errors.sensors.axial_interference_nt == 220.0
+
+
+# ------------------------------------------------------------------ a well as it is drilled
+
+
+def test_stations_at_one_depth_are_all_judged_and_one_is_on_the_path(example, tmp_path):
+    given = read_csv(EXAMPLE / "well.csv")
+    twice = {name: [cell for cell in cells for _ in range(2)] for name, cells in given.items()}
+    twice["station"] = [str(i) for i in range(72)]
+    source = write_csv(tmp_path / "in.csv", twice, "simulated = true")
+    ran = cli("survey", example, source, "-o", tmp_path / "twice.csv", "--json")
+    assert ran.code == 0, ran
+    columns, once = read_csv(tmp_path / "twice.csv"), surveyed_file(example, tmp_path, {})[0]
+    assert set(columns["accepted"]) == {"true"}
+    assert columns["tvd_m"][1::2] == [""] * 36
+    assert floats(columns["tvd_m"][::2]) == pytest.approx(floats(once["tvd_m"]), abs=1e-9)
+    assert "left-out" in {finding["id"] for finding in ran.json["findings"]}
+
+
+def test_rows_without_readings_keep_their_place(example, tmp_path):
+    given = read_csv(EXAMPLE / "well.csv")
+    blank = {name: [*given[name]] for name in ("ax", "ay", "az", "mx", "my", "mz")}
+    for cells in blank.values():
+        cells[0] = cells[7] = ""
+    source = write_csv(tmp_path / "in.csv", {**given, **blank}, "simulated = true")
+    out = tmp_path / "out.csv"
+    assert "--missing blank" in refused(cli("survey", example, source, "-o", out), 2)
+    ran = cli("survey", example, source, "-o", out, "--missing", "blank", "--json")
+    assert ran.code == 0, ran
+    columns, whole = read_csv(out), surveyed_file(example, tmp_path, {})[0]
+    assert columns["md_m"] == given["md_m"]
+    for name in ("inclination_deg", "accepted", "finding", "north_m"):
+        assert columns[name][0] == columns[name][7] == ""
+    assert columns["inclination_deg"][8] == whole["inclination_deg"][8]
+    assert "missing-reading" in {finding["id"] for finding in ran.json["findings"]}
+
+
+def test_a_path_that_is_tied_in_begins_at_the_tie_in(example, tmp_path):
+    """Expected: the path from the first station, moved by the arc that leads there from the tie-in."""
+    at = ("-100", "0.3", "350", "7", "-4", "-98")
+    options = (*BY_CALIBRATION, "--tie-in")
+    ran = cli(
+        "survey", example, EXAMPLE / "well.csv", "-o", tmp_path / "o.csv", *options, ",".join(at)
+    )
+    assert "--tie-in must have a depth" in refused(ran, 2)
+    moved = {"md_m": [str(float(cell) + 200) for cell in read_csv(EXAMPLE / "well.csv")["md_m"]]}
+    tied, _ = surveyed_file(example, tmp_path, moved, *options, "100,0.3,350,7,-4,98")
+    first, _ = surveyed_file(example, tmp_path, moved, *BY_CALIBRATION)
+    azimuth = "azimuth_magnetic_deg"
+    ends = [
+        np.radians([0.3, float(first["inclination_deg"][0])]),
+        np.radians([350.0, float(first[azimuth][0])]),
+    ]
+    arc = well_path([100.0, 200.0], *ends, start=(7.0, -4.0, 98.0))[1]
+    for k, name in enumerate(("north_m", "east_m", "tvd_m")):
+        assert floats(tied[name]) == pytest.approx(floats(first[name]) + arc[k], abs=1e-9)
+    # the direction at the tie-in is exact, that of the first station is not
+    assert 0 < float(tied["sd_north_m"][0]) < float(tied["sd_north_m"][1])
+
+
+def test_a_tie_in_has_three_numbers_or_six(example, tmp_path):
+    ran = cli(
+        "survey", example, EXAMPLE / "well.csv", "-o", tmp_path / "o.csv", "--tie-in", "1,2,3,4"
+    )
+    assert "--tie-in must be 6 numbers" in refused(ran, 2)

@@ -38,7 +38,7 @@ ALIKE = {
     "ref_field_nt": "Btotal, BTotal, field_nt, B_total, ref_b, ref_field, total_field, Bt, Htotal, Field (µT), "
     "Btotal (nT), mag field, Total Magnetic Field [nT], Field [gauss]",
     "temperature_c": "temp, temperature, Temp, temp_f, temp_c, tempC, TempF, T_C, DegC, tool_temp, Temp 1, "
-    "board_temperature, T_sens, Oven temp, Chamber T, Temp 2, tmp, TBoard, ambient_temp, MWD Temp, Kanal 3 [°C], "
+    "board_temperature, BHT, T_sens, Oven temp, Chamber T, Temp 2, tmp, TBoard, ambient_temp, MWD Temp, Kanal 3 [°C], "
     "PT100 (degC), Ofentemperatur, boardtemp, temp max, Temp (°F), T (°C), "
     "Temperature (K), Tool Temp [degC], Temp ℉, TEMP ºC",
     "sd_ref_inclination_deg": "sd_inc, inclination_sd_deg, sigma Inc",

@@ -122,6 +122,28 @@ def test_swapped_axes_are_named(cal, count, order):
     assert "dip" in text
 
 
+@pytest.mark.parametrize("count", [2, 3])
+def test_swapped_axes_of_two_or_three_rows_are_named(cal, count):
+    right = shot(*(each[:count] for each in attitudes(6)))
+    wrong = replace(right, magnetometer=right.magnetometer[:, [1, 0, 2]])
+    assert not {"unsteady", "odd-rows"} & {f.id for f in correction.correct(cal, right)[1]}
+    assert "unsteady" in [f.id for f in correction.correct(cal, wrong)[1]]
+
+
+@pytest.mark.parametrize("count", [6, 40, 3000])
+@pytest.mark.parametrize("row", [0, 2, -1])
+def test_a_single_row_of_the_wrong_sign_is_named(cal, count, row):
+    """One cell of the magnetometer; the dip there is that of the mirrored vector."""
+    right = shot(*attitudes(count))
+    assert "odd-rows" not in [f.id for f in correction.correct(cal, right)[1]]
+    field = right.magnetometer.copy()
+    field[row, np.argmax(np.abs(field[row]))] *= -1
+    columns, findings = correction.correct(cal, replace(right, magnetometer=field))
+    [text] = [f.text for f in findings if f.id == "odd-rows"]
+    assert "dip at 1 of " in text
+    assert f"as far as {columns['dip_deg'][row]:.1f}°" in text
+
+
 @pytest.mark.parametrize("axis", range(3))
 def test_an_axis_of_the_wrong_sign_is_named(cal, axis):
     sign = np.where(np.arange(3) == axis, -1.0, 1.0)

@@ -12,6 +12,7 @@ from mwdcal.geometry.vectors import (
     rotation,
     skew,
     solved,
+    square_root,
     tool_from_earth,
     wrap,
 )
@@ -123,3 +124,18 @@ def test_a_matrix_without_inverse_is_nan_and_spoils_no_other():
     for found in (inverse(stack) @ right, solved(stack, right)):
         np.testing.assert_allclose(found[0, :, 0], [0.4, 0.2], rtol=1e-15)
         assert np.isnan(found[1:]).any((1, 2)).all()
+
+
+def test_the_root_of_a_covariance_keeps_small_quantities_beside_large_ones():
+    """Standard deviations over sixteen decades: g per °C beside nT, or informations about them."""
+    rng = np.random.default_rng(5)
+    mixed, sd = rng.normal(size=(12, 12)), 10.0 ** np.linspace(-8, 8, 12)
+    covariance = mixed @ mixed.T * sd[:, None] * sd
+    root = square_root(covariance)
+    np.testing.assert_allclose((root @ root.T) / sd / sd[:, None], mixed @ mixed.T, atol=1e-12)
+
+
+def test_the_root_of_a_covariance_has_no_column_for_what_does_not_vary():
+    root = square_root(np.diag([4.0, 0.0, 9.0]))
+    assert root.shape == (3, 2)
+    np.testing.assert_allclose(root @ root.T, np.diag([4.0, 0.0, 9.0]), atol=1e-14)

@@ -22,7 +22,16 @@ INTERNAL = 70
 COMPLETION = "_MWDCAL_COMPLETE"
 """Variable with which a shell asks for completions, which are bytes."""
 SECTIONS = {
-    "Calibrate": ("profile", "stations", "noise", "calibrate", "verify", "compare", "fleet"),
+    "Calibrate": (
+        "init",
+        "profile",
+        "stations",
+        "noise",
+        "calibrate",
+        "verify",
+        "compare",
+        "fleet",
+    ),
     "Use": ("apply", "convert", "diagnose"),
     "Plan": ("plan", "simulate", "list", "example"),
     "Well": ("reference", "survey"),

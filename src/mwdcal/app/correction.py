@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files import carried, streams
 from mwdcal.files.contract import CHANNELS, check_columns
+from mwdcal.files.faults import chosen, nothing, spread, wholly_blank, without_reading
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import as_text
 from mwdcal.files.formats.table import EXCHANGED, Table
@@ -34,11 +35,17 @@ WHOLE = (".xlsx", *EXCHANGED)
 
 
 class Applied(msgspec.Struct, frozen=True, kw_only=True):
-    """The result for a table: its rows, those without results, and the table that was written."""
+    """The result for a table: its rows, those without results, and the table that was written.
+
+    `error_terms` are in the standard uncertainties of the table, `not_included` are not; both are empty where it
+    has none.
+    """
 
     rows: int
     blank: int
     output: str
+    error_terms: list[str] = []
+    not_included: list[str] = []
     findings: list[Finding]
 
 
@@ -51,25 +58,27 @@ def apply_to_any(
     decimal: str,
     uncertainty: bool,
     advance: Callable[[int, int], None],
+    statements: Mapping[str, str],
 ) -> tuple[RowCounts, list[Finding], str]:
     """Correct a file into another: part by part, or whole where it is short text or a workbook.
 
     What was seen in the rows, what the reader should know, and the SHA-256 of the readings, empty
     where they were not read as a whole. `advance` gets how much of a long
     table is done, and the whole. An export as the calibration's profile describes it is taken whole, and
-    text that comes of it is written as it is. With `uncertainty` columns of standard uncertainties.
+    text that comes of it is written as it is. With `uncertainty` columns of standard uncertainties. `statements`:
+    serial, date and operator as the user says.
     """
     profile = calibration.profile
     exported = _is_exported(readings, profile, decimal)
     if streaming.in_parts(readings, output) and not exported:
         streamed = streaming.apply_to_file(
             calibration, readings, output, outside, advance,
-            missing=missing, decimal=decimal, uncertainty=uncertainty,
+            missing=missing, decimal=decimal, uncertainty=uncertainty, statements=statements,
         )  # fmt: skip
         return *streamed, ""
     if readings.suffix.lower() in TEXT and (exported or output.suffix.lower() in WHOLE):
         _check_size(readings)
-    source = read_export(readings, profile, decimal=decimal, rows=WHOLE_ROWS)
+    source = read_export(readings, profile, decimal=decimal, rows=WHOLE_ROWS, statements=statements)
     result, tally, findings = apply_to_table(calibration, source, outside, missing, uncertainty)
     if EXTRAPOLATED in result.columns and output.suffix.lower() != ".parquet":
         words = [as_text(bool(mark)) for mark in result.columns[EXTRAPOLATED]]
@@ -118,17 +127,17 @@ def apply_to_table(
     streaming.check_warmth(calibration, list(table.columns), source.source)
     whole = np.ones(source.count, bool)
     if missing == "blank":
-        whole = ~streaming.lacking(table, streaming.wholly_blank([table]))
+        whole = ~without_reading(table, wholly_blank([table]))
     if not whole.any():
-        raise streaming.nothing(source.source)
-    kept = streaming.chosen(table, whole)
+        raise nothing(source.source)
+    kept = chosen(table, whole)
     readings, _ = to_readings(kept, calibration.profile)
     results, tally, findings = correct_and_count(
         calibration, readings, outside, source.count - kept.count, uncertainty
     )
     streaming.check_free(source.columns, list(results), source.source)
-    columns = {name: streaming.spread(values, whole) for name, values in results.items()}
-    metadata = {**source.metadata, **streaming.described(calibration)}
+    columns = {name: spread(values, whole) for name, values in results.items()}
+    metadata = {**source.metadata, **streaming.described(calibration, [*results])}
     if remarks := streaming.stated(metadata, findings):
         metadata["findings"] = remarks
     corrected = replace(source, columns={**source.columns, **columns}, metadata=metadata)

@@ -18,6 +18,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 import click
 
+from mwdcal.app import laboratory
 from mwdcal.errors import InputError, MwdcalError, reason
 from mwdcal.presentation.text import (
     UNSAFE_BUT_LINES,
@@ -38,6 +39,8 @@ LONGEST_MESSAGE = 2000
 """Characters of a message that are shown: what a file is named or says may be of any length."""
 ONLY_ERRORS = "mwdcal.quiet"
 """Where the context of a command says that it prints only errors, and JSON."""
+LABORATORY = "mwdcal.settings"
+"""Where the context of a command has the laboratory's settings."""
 COLOURS = {"!": "yellow", "PASS": "green", "pass": "green", "FAIL": "red"}
 """Colours of marks and verdicts on a terminal, where the words alone say the same."""
 READER_HAS_LEFT = {errno.EPIPE, errno.EINVAL} if sys.platform == "win32" else {errno.EPIPE}
@@ -63,6 +66,8 @@ class Command(click.Command):
         for word in args:
             if word != word.encode("utf-8", "ignore").decode():
                 raise InputError(f"'{word}': a name must be valid UTF-8. Rename the file.")
+        if used := laboratory.settings_of(self, context, args):
+            context.meta[LABORATORY] = used
         return super().parse_args(context, args)
 
     def get_help(self, context: click.Context) -> str:
@@ -70,12 +75,19 @@ class Command(click.Command):
         return laid_out(super().get_help(context), sys.stdout)
 
     def invoke(self, context: click.Context) -> Any:
-        """Run the command."""
+        """Run the command with the laboratory's settings, and say what it used of them."""
+        used = context.meta.get(LABORATORY)
+        if used:
+            laboratory.note_options(context, used)
         try:
-            return super().invoke(context)
+            with laboratory.using(used):
+                return super().invoke(context)
         except MwdcalError as error:
             error.args = (with_option_names(str(error)),)
             raise
+        finally:
+            if used and (line := laboratory.line_on(used)):
+                say(line)
 
 
 def _be_quiet(context: click.Context, option: click.Parameter, typed: bool) -> None:
@@ -187,3 +199,16 @@ def _shown(document: str) -> str:
     unicode = codecs.lookup(sys.stdout.encoding or "utf-8").name == "utf-8"
     others = UNSAFE_BUT_LINES if unicode else re.compile(r"[^\x00-\x7e]")
     return others.sub(lambda character: json.dumps(character[0])[1:-1], document)
+
+
+@contextlib.contextmanager
+def offering_blank() -> Iterator[None]:
+    """Name the option that leaves the results of a row without readings blank, where one is refused."""
+    from mwdcal.files.faults import BlankReadingError
+
+    try:
+        yield
+    except BlankReadingError as error:
+        raise InputError(
+            f"{error} Or leave the results of such rows blank: --missing blank."
+        ) from None

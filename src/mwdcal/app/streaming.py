@@ -28,19 +28,30 @@ from mwdcal.calibration.readings import TRIADS, Readings, is_simulated
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files import carried, contract, runs, streams, synonyms
-from mwdcal.files.contract import CHANNELS, COLUMNS, RANGES, RAW, RAW_RANGE, TEMPERATURE
-from mwdcal.files.faults import columns_of
+from mwdcal.files.contract import CHANNELS, COLUMNS, RANGES, RAW_RANGE, TEMPERATURE
+from mwdcal.files.faults import (
+    OPTIONAL,
+    blank_cell,
+    chosen,
+    columns_of,
+    is_blank,
+    nothing,
+    spread,
+    wholly_blank,
+    without_reading,
+)
 from mwdcal.files.formats import atomic, parquet
 from mwdcal.files.formats.columns import check_names, no_stations
 from mwdcal.files.formats.sinks import ParquetSink, Sink, TextSink
-from mwdcal.files.formats.table import Table, cell_error
+from mwdcal.files.formats.table import Table
 from mwdcal.files.formats.table import numbers as as_numbers
+from mwdcal.files.statements import with_statements
 from mwdcal.files.streams import Part, StreamedTable
 from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, UNCERTAINTIES
-from mwdcal.geometry.vectors import AnyArray, Array, Bools
+from mwdcal.geometry.vectors import Array, Bools
 from mwdcal.use import correction, correction_numba, strengths
 from mwdcal.use.correction import JUDGED, RowCounts
-from mwdcal.use.uncertainty import with_uncertainty
+from mwdcal.use.uncertainty import reading_terms, with_uncertainty
 
 TABLE_SIZES = {".csv": 1_000_000, ".tsv": 1_000_000, ".parquet": 8_000_000}
 """Bytes of a text table from which it is taken in parts, by what it becomes.
@@ -57,11 +68,6 @@ SAMPLE = 1024
 """Rows of a part on which undetermined outputs are judged."""
 BLOCK = 1 << 14
 """Rows that plain NumPy takes at a time."""
-OPTIONAL = {
-    CHANNELS["magnetometer"]: "Fill it in, or remove the station.",
-    ("temperature_c",): "Fill it in, or leave the whole column blank.",
-}
-"""Columns that are blank on all rows or on none, and what to do where they are neither."""
 LONGEST_SERIAL = 60
 """Most characters of another tool's serial that a finding names."""
 _MOST = 10**15
@@ -102,6 +108,7 @@ def apply_to_file(
     missing: str = "refuse",
     decimal: str = ".",
     uncertainty: bool = True,
+    statements: Mapping[str, str] | None = None,
 ) -> tuple[RowCounts, list[Finding]]:
     """Correct a file into another; what was seen in the rows, and what the reader should know.
 
@@ -110,6 +117,7 @@ def apply_to_file(
     """
     correction.check_outside(outside)
     source = _source(readings, output, rows, decimal)
+    source.metadata.update(with_statements(source.metadata, statements or {}))
     names = correction.result_names(outside, uncertainty)
     _check_header(calibration, source, names)
     pieces = source.pieces()
@@ -119,7 +127,7 @@ def apply_to_file(
     worker = _Worker(calibration, source, first, outside, missing, source.rows >= least, names)
     done, tallies = 0, []
     with atomic.replacing(output) as stream, closing(worker.sink(stream, output)) as sink:
-        work = partial(_exactly_if_refused, source, partial(worker.corrected, sink))
+        work = partial(source.exactly_if_refused, partial(worker.corrected, sink))
         for rendered, size, tally in overlapped(chain([first], pieces), work):
             sink.write(rendered)
             tallies.append(tally)
@@ -186,38 +194,15 @@ def check_free(names: Iterable[str], results: Sequence[str], source: str) -> Non
         )
 
 
-def nothing(source: str) -> InputError:
-    """A table of which no row can be corrected."""
-    return InputError(
-        f"{source}: every row lacks a reading, so that there is nothing to correct. Check the "
-        "columns of the raw channels and temperature_c."
-    )
-
-
-def _exactly_if_refused(
-    source: StreamedTable, work: Callable[[Part], Result], piece: Any
-) -> Result:
-    """`work` of a piece; where something in it seems wrong, of its text looked at line by line."""
-    try:
-        return work(source.load(piece, False))
-    except InputError:
-        return work(source.load(piece, True))
-
-
 def _table(source: StreamedTable, piece: Any) -> Table:
-    return _exactly_if_refused(source, lambda part: part.table, piece)
+    return source.exactly_if_refused(lambda part: part.table, piece)
 
 
 def _total(tallies: Sequence[RowCounts], moved: Collection[str]) -> RowCounts:
-    counts = [(t.rows, t.beyond, t.lacking, t.valueless) for t in tallies]
-    rows, beyond, lacking, valueless = np.sum(counts, 0).tolist()
     serials = runs.serials({}, chain.from_iterable(tally.serials for tally in tallies))
-    lows, highs = zip(*(tally.warmth for tally in tallies), strict=True)
-    return RowCounts(
-        rows, beyond, tuple(name for name in JUDGED if name in moved), lacking, tuple(serials),
-        strengths.total(tally.strengths for tally in tallies), (min(lows), max(highs)), {}, valueless,
-        correction.total(tally.scatter for tally in tallies),
-    )  # fmt: skip
+    return correction.joined(tallies)._replace(
+        moved=tuple(name for name in JUDGED if name in moved), serials=tuple(serials)
+    )
 
 
 class _Worker:
@@ -268,7 +253,7 @@ class _Worker:
     def sink(self, stream: IO[bytes], output: Path) -> Sink:
         """An empty table in the format of the output's name."""
         arrow, _ = parquet.modules(output.name)
-        metadata = {**self.source.metadata, **described(self.calibration)}
+        metadata = {**self.source.metadata, **described(self.calibration, self.names)}
         metadata.pop("findings", None)  # with those of the results, when these are known
         kinds = dict.fromkeys(self.names, arrow.float64()) | {EXTRAPOLATED: arrow.bool_()}
         results = arrow.schema([(name, kinds[name]) for name in self.names])
@@ -291,7 +276,7 @@ class _Worker:
         channels, corrected = self._compute(table)
         whole: Bools | None = None
         if corrected.unsound and self.missing == "blank":
-            whole = ~lacking(table, self.absent)
+            whole = ~without_reading(table, self.absent)
             table = chosen(table, whole)
             channels, corrected = self._compute(table)
         if corrected.unsound:
@@ -354,8 +339,8 @@ class _Worker:
             if names not in self.absent:
                 if names[0] in table.columns:
                     channels[kind] = [_column(table, name) for name in names]
-            elif not all(_is_blank(table, name) for name in names):
-                raise _blank(self.source.load(self.first, True).table, names)
+            elif not all(is_blank(table, name) for name in names):
+                raise blank_cell(self.source.load(self.first, True).table, names)
         return channels
 
     def _compiled(self, channels: Channels, count: int) -> correction_numba.CorrectedRows:
@@ -415,17 +400,19 @@ class _Worker:
         runs.to_readings(table, self.calibration.profile)
         for names in OPTIONAL:
             present = names[0] in table.columns and names not in self.absent
-            if present and _is_blank(table, names[0]):
-                raise _blank(table, names)
+            if present and is_blank(table, names[0]):
+                raise blank_cell(table, names)
 
 
-def described(calibration: Calibration) -> dict[str, object]:
-    """The statements of a corrected table about the calibration it rests on."""
+def described(calibration: Calibration, names: Iterable[str]) -> dict[str, object]:
+    """What a corrected table with results of these names says of the calibration, and of their uncertainties."""
+    uncertain = not set(UNCERTAINTIES).isdisjoint(names)
     return {
         "calibration_run": calibration.run,
         "calibration_time": calibration.time,
         "azimuth_out": "magnetic",
         "field_unit": calibration.field_unit,
+        **(reading_terms(calibration).stated if uncertain else {}),
         **({"simulated": True} if is_simulated(calibration.tool) else {}),
     }
 
@@ -435,53 +422,7 @@ def stated(metadata: Mapping[str, object], remarks: Iterable[Finding]) -> list[s
     return [*carried.stated_findings(metadata), *(finding.text for finding in remarks)]
 
 
-def wholly_blank(tables: Iterable[Table]) -> tuple[tuple[str, ...], ...]:
-    """Groups of optional columns that are blank on every row of all tables; looks no further than needed."""
-    left = [*OPTIONAL]
-    for table in tables:
-        left = [g for g in left if g[0] in table.columns and all(_is_blank(table, n) for n in g)]
-        if not left:
-            break
-    return tuple(left)
-
-
-def lacking(table: Table, absent: Sequence[tuple[str, ...]]) -> Bools:
-    """Rows (n,) with a blank reading or temperature; columns `absent` on all rows do not count."""
-    without = [name for group in absent for name in group]
-    names = [n for n in (*RAW, "temperature_c") if n in table.columns and n not in without]
-    return np.asarray(np.isnan([_column(table, name) for name in names]).any(axis=0))
-
-
-def chosen(table: Table, rows: Bools) -> Table:
-    """Some rows of a table, with their places."""
-    picked = np.flatnonzero(rows).tolist()
-    columns = {
-        name: [column[i] for i in picked] if isinstance(column, list) else column[rows]
-        for name, column in table.columns.items()
-    }
-    return replace(table, columns=columns, lines=[table.lines[i] for i in picked])
-
-
-def spread(values: AnyArray, rows: Bools) -> AnyArray:
-    """Values of the chosen rows, at their places among all; others are NaN, or False."""
-    out = np.full(rows.shape, False if values.dtype == bool else np.nan, values.dtype)
-    out[rows] = values
-    return out
-
-
-def _blank(table: Table, names: tuple[str, ...]) -> InputError:
-    problem = f"must be filled in; got a blank cell. {OPTIONAL[names]}"
-    return runs.BlankReadingError(str(cell_error(table, names[0], 0, problem)))
-
-
 def _column(table: Table, name: str) -> Array:
     """The column as numbers; what they may be is checked with all the rest."""
     column = table.columns[name]
     return as_numbers(table, name) if isinstance(column, list) else column
-
-
-def _is_blank(table: Table, name: str) -> bool:
-    column = table.columns[name]
-    if isinstance(column, list):
-        return not any(cell.strip() for cell in column)
-    return bool(np.isnan(column).all())

@@ -14,11 +14,11 @@ from mwdcal.calibration.automatic.order_selection import Progress
 from mwdcal.calibration.canonical import rounded
 from mwdcal.calibration.diagnosis.findings import described, findings
 from mwdcal.calibration.diagnosis.flags import FittedRuns
-from mwdcal.calibration.diagnosis.identity import dated, unidentified
+from mwdcal.calibration.diagnosis.identity import dated, overdue, unidentified
 from mwdcal.calibration.diagnosis.refusals import UNSOUND_ADVICE, check, fit_refusals
 from mwdcal.calibration.diagnosis.repeats import copies
 from mwdcal.calibration.diagnosis.soundness import inconsistency
-from mwdcal.calibration.drift import Constant, Drift
+from mwdcal.calibration.drift import Constant, Drift, UnseenDrift
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import accuracy
@@ -78,7 +78,7 @@ def chosen_fit(
     repeated = copies(result)[0]
     if not repeated.any():
         return choice, result
-    check(fit_refusals(_one_run(choice, result)))
+    check(fit_refusals(one_run(choice, result)))
     progress(f"{repeated.sum()} of {repeated.size} stations are copies of others: without them")
     left = np.array([label not in options.exclude for label in readings.labels])
     left[left] = repeated
@@ -90,15 +90,23 @@ def recorded(choice: Choice, result: Fit) -> Calibration:
 
     Raises `FitError` where the fit is not to be trusted.
     """
-    fitted = _one_run(choice, result)
+    fitted = one_run(choice, result)
     check(fit_refusals(fitted))
+    return record_of(choice, fitted)
+
+
+def record_of(choice: Choice, fitted: FittedRuns) -> Calibration:
+    """The record of a fit that nothing refuses, a batch of one.
+
+    Raises `FitError` where it would not be one.
+    """
     calibration = with_checksum(rounded(_record(choice, fitted)))
     if problem := inconsistency(calibration):
         raise FitError(f"the fit gives no usable calibration: {problem}. {UNSOUND_ADVICE}")
     return calibration
 
 
-def _one_run(choice: Choice, result: Fit) -> FittedRuns:
+def one_run(choice: Choice, result: Fit) -> FittedRuns:
     """The fit of a run as refusals and findings look at it: a batch of one."""
     readings, profile = choice.readings, choice.profile
     return FittedRuns(
@@ -123,6 +131,8 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
         run=readings.source,
         run_sha256=readings.run_sha256,
         prior_sha256=options.prior_sha256 or msgspec.UNSET,
+        settings_file=readings.settings_source[0] or msgspec.UNSET,
+        settings_sha256=readings.settings_source[1] or msgspec.UNSET,
         software=SOFTWARE,
         method=options.method,
         options=_settings(options),
@@ -146,20 +156,23 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
         settings=_practice(fitted),
         budget=_budget(fitted),
         assumed_exact=results.assumed_exact(result, readings.relative),
+        unseen=_unseen(fitted),
         errors=error_rows(fitted.residuals(0)),
         measures=measure_rows(fitted.residuals(0)),
         orders=list(choice.orders),
         station_rows=fitted.residuals(0).stations,
         inherited=list(prior.stations) if prior else [],
-        findings=[*findings(fitted), *_doubts(readings, prior)],
+        findings=[*findings(fitted), *_doubts(choice, prior)],
     )
 
 
-def _doubts(readings: Readings, prior: PriorInformation | None) -> list[Finding]:
-    """Findings on the identity of a run and its prior, and on its day."""
+def _doubts(choice: Choice, prior: PriorInformation | None) -> list[Finding]:
+    """Findings on the identity of a run and its prior, on its day, and on standards that were overdue then."""
+    readings = choice.readings
     alone = unidentified({readings.name: serial_of(readings.metadata)})
     doubts = [*prior.doubts] if prior and prior.doubts else alone
-    return doubts + dated(readings.metadata, readings.name)
+    late = overdue(choice.profile.standards, readings.metadata)
+    return doubts + dated(readings.metadata, readings.name) + late
 
 
 def _identity(readings: Readings, simulated: bool) -> dict[str, str]:
@@ -189,17 +202,22 @@ def _settings(options: Options) -> FitSettings:
 
 def _budget(fitted: FittedRuns) -> list[BudgetRow]:
     """The contribution of each source of error to the accuracy to expect."""
-    reference, prior = fitted.profile.reference_temperature_c, fitted.options.knowledge
-    tools = results.calibrated_tools(fitted.result, fitted.free, reference, prior)
     repeatability = [getattr(fitted.profile, name).repeatability for name in TRIADS]
     nominal = [getattr(fitted.profile, name).scale or 1.0 for name in TRIADS]
     shares = fitted.covariance.by_source(np.divide(repeatability, nominal).tolist())
+    return [BudgetRow(source=name, **sd) for name, sd in _accuracies(fitted, shares).items()]
+
+
+def _accuracies(fitted: FittedRuns, shares: dict[str, Array]) -> dict[str, dict[str, float | None]]:
+    """What each share (1, p, p) of the covariance adds to the accuracy to expect, degrees by angle."""
+    reference, prior = fitted.profile.reference_temperature_c, fitted.options.knowledge
+    tools = results.calibrated_tools(fitted.result, fitted.free, reference, prior)
     sd = accuracy(tools, np.stack([*shares.values()]))
     degrees = {f"{angle}_deg": np.degrees(values[:, 0]) for angle, values in sd.items()}
-    return [
-        BudgetRow(source=source, **{name: stated(sd[place]) for name, sd in degrees.items()})
+    return {
+        source: {name: stated(sd[place]) for name, sd in degrees.items()}
         for place, source in enumerate(shares)
-    ]
+    }
 
 
 def _constants(result: Fit) -> list[Constant]:
@@ -227,19 +245,39 @@ def _constants(result: Fit) -> list[Constant]:
 
 def _drifts(result: Fit, field_unit: str) -> list[Drift]:
     """How far field and offsets drifted within the run."""
-    units = [(1e3, "mg"), (1.0, field_unit), (1.0, field_unit)]
-    changes = results.drifts(result)
-    return [
-        Drift(
-            name=name.removesuffix("-drift"),
-            change=float(change[0]) * factor,
-            standard_uncertainty=float(sd[0]) * factor,
-            unit=unit,
+    declared, drifts = result.problem.evidence.drift, []
+    for name, (change, sd) in results.drifts(result).items():
+        factor, unit = _shown_drift(name, field_unit)
+        size = float(declared[name][0]) if name in declared else 0.0
+        drifts.append(
+            Drift(
+                name=name.removesuffix("-drift"),
+                change=float(change[0]) * factor,
+                standard_uncertainty=float(sd[0]) * factor,
+                unit=unit,
+                declared=size * factor if size else msgspec.UNSET,
+            )
         )
-        for (name, (change, sd)), (factor, unit) in zip(
-            changes.items(), [units[[*WALKS].index(n)] for n in changes], strict=True
-        )
-    ]
+    return drifts
+
+
+def _shown_drift(name: str, field_unit: str) -> tuple[float, str]:
+    """Factor and unit in which a drift is stated."""
+    return (1e3, "mg") if name == "accelerometer-drift" else (1.0, field_unit)
+
+
+def _unseen(fitted: FittedRuns) -> list[UnseenDrift] | msgspec.UnsetType:
+    """What drifts would do that no residual would show."""
+    readings = fitted.alone(0)[0]
+    field = 2e-4 if readings.relative else 10.0
+    sizes = dict(zip(WALKS, (1e-4, field, field), strict=True))
+    shares = {n: sizes[n] ** 2 * each for n, each in results.unseen_shares(fitted.result).items()}
+    unseen = []
+    for name, sd in (_accuracies(fitted, shares) if shares else {}).items():
+        factor, unit = _shown_drift(name, readings.field_unit)
+        word = name.removesuffix("-drift")
+        unseen.append(UnseenDrift(name=word, change=sizes[name] * factor, unit=unit, **sd))
+    return unseen or msgspec.UNSET
 
 
 def _triad(fitted: FittedRuns, index: int) -> TriadCalibration:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from types import ModuleType
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from mwdcal.calibration.prior import prior_of
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.estimation.batch import put, take
 from mwdcal.estimation.evidence import ANGLES, Evidence
-from mwdcal.estimation.minimisers import closed_form, closed_form_drift
+from mwdcal.estimation.minimisers import closed_form, closed_form_drift, uncertain_stand
 from mwdcal.estimation.problem import Problem, State, Triad
 from mwdcal.estimation.resetting import set_apart, with_share
 from mwdcal.estimation.robust import LOSSES, consistency, inflation, weight, weighted
@@ -169,9 +170,7 @@ def fit(readings: Readings, options: Options | None = None, include: Array | Non
     evidence = _evidence(readings, include, options)
     lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
     problem, finite = _problem(readings, evidence, lead, options)
-    closed, good = (
-        _closed(problem, finite) if _has_closed_form(problem, options) else (None, finite)
-    )
+    closed, good = _special(problem, options, finite)
     if closed is None or not good.any():
         return _general(problem, options, finite)
     if good.all():
@@ -236,8 +235,8 @@ def refitted(result: Fit, problem: Problem, state: State, scale: Array, options:
     """A fit of a problem that has more unknowns than that of `result`, the noise times `scale` (B, triads)."""
     problem = _rescaled(problem, scale)
     finite = result.status != int(Status.NOT_FINITE)
-    if closed_form_drift.applies(problem):
-        there, analysis, good = closed_form_drift.solution(problem, state)
+    if form := _form(problem):
+        there, analysis, good = form.solution(problem, state)
         if (good & analysis.determined.keep.all(-1)).all():
             once = result.iterations + 1
             trust, status = result.trust, np.where(finite, result.status, int(Status.NOT_FINITE))
@@ -267,21 +266,53 @@ def _finished(stage: _Iterate, options: Options, finite: Bools, iterations: Ints
     return Fit(trusted, state, status, iterations, _noise(problem), trust, analysis)
 
 
-def _has_closed_form(problem: Problem, options: Options) -> bool:
-    """Whether the fit has a closed form: not where references are not exact, for example."""
-    general = options.robust or options.separate_solver or problem.evidence.scatter
-    return not general and closed_form.applies(problem)
+def _form(problem: Problem) -> ModuleType | None:
+    """The closed form of a problem, without drift or with it, if there is one."""
+    forms = () if problem.evidence.scatter else (closed_form, closed_form_drift)
+    return next((form for form in forms if form.applies(problem)), None)
+
+
+def _special(problem: Problem, options: Options, finite: Bools) -> tuple[Fit | None, Bools]:
+    """The fit by a shorter way, if there is one, and for which members (B,) it holds."""
+    if options.robust or options.separate_solver:
+        return None, finite
+    if _form(problem) is not None:
+        return _closed(problem, finite)
+    if uncertain_stand.applies(problem):
+        return _on_stand(problem, finite)
+    return None, finite
+
+
+def _on_stand(problem: Problem, finite: Bools) -> tuple[Fit, Bools]:
+    """The fit on a stand of known angles, and for which members (B,) it holds: all directions are determined."""
+    there = uncertain_stand.solution(problem)
+    problem = _rescaled(problem, there.scale)
+    analysis = analyse(problem, there.state, there.determined)
+    good = there.good & finite & analysis.finite
+    problem.memo.clear()
+    status = np.where(good, int(Status.OK), int(Status.NOT_FINITE))
+    trust = np.ones(problem.evidence.include.shape)
+    return Fit(problem, there.state, status, there.steps, _noise(problem), trust, analysis), good
 
 
 def _closed(problem: Problem, finite: Bools) -> tuple[Fit, Bools]:
     """The fit in closed form, and for which members (B,) it holds: all directions are determined."""
-    at = closed_form.start(problem)
-    state, analysis, good = closed_form.solution(problem, at)
+    at, form = closed_form.start(problem), _form(problem) or closed_form
+    state, analysis, good = form.solution(problem, at)
     good = good & analysis.determined.keep.all(-1)
-    if good.any() and not _all_declared(problem):
-        problem = _rescaled(problem, np.sqrt(analysis.variance_factor))
-        state, analysis, settled = closed_form.solution(problem, at)
+    if form is closed_form and good.any() and not _all_declared(problem):
+        quieter = _rescaled(problem, np.sqrt(analysis.variance_factor))
+        analysis = closed_form.rescaled(problem, quieter, analysis)
+        problem = quieter
+    free, moving = np.array([not triad.declared for triad in problem.triads]), good[:, None]
+    for _ in range(NOISE_ROUNDS if problem.walks else 0):
+        if not (moving & free).any():
+            break
+        scale = np.where(moving & free, np.sqrt(analysis.variance_factor), 1.0)
+        problem = _rescaled(problem, scale)
+        state, analysis, settled = form.solution(problem, at)
         good &= settled
+        moving = moving & np.any(np.abs(scale - 1) >= SETTLED, -1, keepdims=True)
     sound = finite & np.isfinite(state.params).all(-1)
     status = np.where(sound, int(Status.OK), int(Status.NOT_FINITE))
     trust = np.ones(problem.evidence.include.shape)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
 from mwdcal.calibration.readings import CONSTANTS, Readings
 from mwdcal.calibration.settings import DIRECTION, numbered
-from mwdcal.estimation.evidence import ANGLES, UNKNOWN, Evidence, SharedConstant
+from mwdcal.estimation.drift import walk_constants
+from mwdcal.estimation.evidence import ANGLES, UNKNOWN, WALKS, Evidence, SharedConstant
 from mwdcal.geometry.vectors import AnyArray, Array, Ints
 from mwdcal.sensor.profile import COMMON
 
@@ -37,7 +39,8 @@ def evidence_of(readings: Readings, include: Array) -> Evidence:
         sd |= {name: np.zeros(group.shape) for name in ("field", "dip")}
     alone = np.full(group.shape, -1)
     apart, stand = np.zeros(len(group)), _stand(readings, lead)
-    bare = Evidence(known, sd, group, alone, apart, included, (), stand=stand)
+    drift = _declared(readings, [*WALKS][: 2 * len(readings.triads) - 1], lead)
+    bare = Evidence(known, sd, group, alone, apart, included, (), stand=stand, drift=drift)
     known, sd = _share_known(bare)
     setting = _settings(readings, group, known, sd)
     settings, assumed = int(setting.max(initial=-1)) + 1, not readings.settings
@@ -66,12 +69,16 @@ def _stand(readings: Readings, lead: tuple[int, ...]) -> dict[str, Array]:
     A tilt of known size leans to any azimuth: each of its two turns has half the variance.
     """
     turn_sd: dict[str, Array] = {}
-    for name in COMMON:
-        if name in readings.sd:
-            turns = STAND_TURNS.get(name, (name,))
-            sd = flat(readings.uncertainty(name), lead).max(-1) / math.sqrt(len(turns))
-            turn_sd |= dict.fromkeys(turns, sd)
+    for name, size in _declared(readings, COMMON, lead).items():
+        turns = STAND_TURNS.get(name, (name,))
+        turn_sd |= dict.fromkeys(turns, size / math.sqrt(len(turns)))
     return turn_sd
+
+
+def _declared(readings: Readings, names: Iterable[str], lead: tuple[int, ...]) -> dict[str, Array]:
+    """Declared standard uncertainties (B,) of errors that all stations share."""
+    given = [name for name in names if name in readings.sd]
+    return {name: flat(readings.uncertainty(name), lead).max(-1) for name in given}
 
 
 def acts_on(evidence: Evidence, name: str) -> Array:
@@ -132,7 +139,14 @@ def constants(evidence: Evidence) -> tuple[SharedConstant, ...]:
         shared += _common_error(name, known.astype(float), sd)
     for name, sd in evidence.stand.items():
         shared += _common_error(name, acts_on(evidence, name), sd)
-    return tuple(shared)
+    return (*shared, *walk_constants(declared_sizes(evidence), evidence.include.shape[-1]))
+
+
+def declared_sizes(evidence: Evidence) -> dict[str, Array]:
+    """Trend and walk (B, 2) of each declared drift: nobody knows which it is, so each has half of the variance."""
+    parts = np.full(2, math.sqrt(0.5))
+    sizes = {name: np.maximum(size, 1e-12) for name, size in evidence.drift.items() if size.any()}
+    return {name: size[:, None] * parts for name, size in sizes.items()}
 
 
 def _common_error(name: str, mask: Array, sd: Array) -> list[SharedConstant]:

@@ -39,6 +39,8 @@ LEAST_TEMPERATURE_SPAN = 10.0
 """A run that spans less has no temperature terms, °C. An order needs as much for each power."""
 HIGHEST = 3
 """The highest temperature order of a model."""
+IN_TABLE = "_in_table"
+"""End of the key of what a table states otherwise than the user says."""
 WORDS = ("serial", "tool", "operator", "lab", "date", "stand")
 """Metadata that are text, whatever they look like: a serial 12.10 is not 12.1."""
 _ISO_DAY = re.compile(r"(\d{4}-?\d\d-?\d\d)([T ].*)?", re.ASCII | re.DOTALL)
@@ -157,6 +159,7 @@ class Readings:
         table: all columns (n,) of the file or table that was read, as they stand there.
         profile: the tool profile by which raw channels became these readings, if there was one.
         run_sha256, profile_sha256: of the files that both come from.
+        settings_source: path and SHA-256 of the laboratory's settings that completed the profile.
     """
 
     accelerometer: Array
@@ -179,6 +182,7 @@ class Readings:
     profile: Profile | None = None
     run_sha256: str = ""
     profile_sha256: str = ""
+    settings_source: tuple[str, str] = ("", "")
 
     def __repr__(self) -> str:
         known = ", ".join(self.known) or "none"

@@ -16,7 +16,7 @@ import numpy as np
 
 from mwdcal import __version__
 from mwdcal.calibration.canonical import Signature, document_sha256
-from mwdcal.calibration.drift import Constant, Drift
+from mwdcal.calibration.drift import Constant, Drift, UnseenDrift
 from mwdcal.calibration.notebooks import html_table
 from mwdcal.calibration.readings import (
     NANOTESLA,
@@ -244,12 +244,14 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     `covariance` is of the parameters of all triads in order, scaled by s² where that is
     estimated; `free` are directions (rows) of parameter space that no evidence determines.
     `budget` says what each source of error adds to the accuracy to expect; `assumed_exact` names
-    what is assumed exact and no residual can test: references, signs, steadiness during the run.
+    what is assumed exact and no residual can test: references, signs, steadiness during the run. `unseen` says what
+    a drift would do there; absent in earlier versions.
     `inherited` are the fingerprints of the stations behind the prior, if there was one;
     `excluded` the labels of stations of the run that were left out of the fit, on request or as copies of others;
     `copies` the fingerprints of copies, absent if no station is a copy.
     `serial` is that of the tool, absent where the run states none; `simulated`: of the run or the prior;
-    `prior_sha256` of the file of the prior, absent where there was none.
+    `prior_sha256` of the file of the prior, absent where there was none. `settings_file`, `settings_sha256`: of the
+    laboratory's settings that completed profile or options, absent where there were none.
     `settings`: whether the errors of the stand's direction are "per-direction" or "per-station", or
     "assumed" to be per direction; absent where the stand's direction is exact, and in earlier versions.
     `gravity_stated`: whether the run states gravity at any station; absent in earlier versions.
@@ -267,6 +269,8 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     run: str
     run_sha256: str
     prior_sha256: str | msgspec.UnsetType = msgspec.UNSET
+    settings_file: str | msgspec.UnsetType = msgspec.UNSET
+    settings_sha256: str | msgspec.UnsetType = msgspec.UNSET
     software: str
     method: str
     options: FitSettings = FitSettings()
@@ -290,6 +294,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     settings: str | msgspec.UnsetType = msgspec.UNSET
     budget: list[BudgetRow] = []
     assumed_exact: list[str] = []
+    unseen: list[UnseenDrift] | msgspec.UnsetType = msgspec.UNSET
     errors: list[ErrorRow]
     measures: list[Measures]
     orders: list[OrderScore] = []

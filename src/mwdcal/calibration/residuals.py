@@ -321,6 +321,10 @@ def _judged(fit: Fit) -> Analysis:
 
 def chances(fit: Fit) -> Array:
     """How likely a misfit as large as each station's (B, n) is, if only noise is in it."""
+    return fit.problem.once("chances", fit.state, lambda _: _chances(fit))
+
+
+def _chances(fit: Fit) -> Array:
     square, freedom = station_misfit(_judged(fit))
     others = np.maximum(freedom.sum(-1, keepdims=True) - freedom, 1)
     variance = np.maximum((square.sum(-1, keepdims=True) - square) / others, 1e-30)

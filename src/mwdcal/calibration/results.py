@@ -206,6 +206,13 @@ def unseen_drifts(result: Fit) -> list[str]:
     return [name for name in scores.places if scores.shown(name)[0] < drift.LEAST_TREND]
 
 
+def unseen_shares(result: Fit) -> dict[str, Array]:
+    """Covariance (B, p, p) that each of the `unseen_drifts` would add, per 1σ of 1 g or nT from end to end."""
+    problem, state, analysis = result.problem, result.state, result.analysis
+    effects = {n: drift.trend_effect(problem, state, analysis, n) for n in unseen_drifts(result)}
+    return {name: effect @ effect.mT for name, effect in effects.items()}
+
+
 def unconfirmed_dip(result: Fit) -> Array:
     """Dip (B,), radians, whose sign rests on the signs of the magnetometer in the profile alone, else NaN.
 
@@ -422,6 +429,23 @@ def drifts(result: Fit) -> dict[str, tuple[Array, Array]]:
         spread = drift.walk_covariance(result.problem, result.analysis, name)
         changes[name] = change, np.sqrt(np.einsum("bi,bij,bj->b", pull, spread, pull))
     return changes
+
+
+def drift_shares(result: Fit, values: Array) -> dict[str, Array]:
+    """Share (B,) of each drift within the run that goes with some values (B, n) of its stations.
+
+    Definition: r² of the drift, all axes together, with what of the values the terms of a drift can follow.
+    """
+    shares = {}
+    for name in drift.places(result.problem.evidence):
+        path, terms = drift.walk(result.problem, result.state, name)
+        basis = np.linalg.qr(terms - terms.mean(0))[0]
+        column = basis @ (basis.mT @ (values - values.mean(-1, keepdims=True))[..., None])
+        unit = column / np.maximum(np.linalg.norm(column, axis=-2, keepdims=True), 1e-300)
+        path = path - path.mean(-2, keepdims=True)
+        size = np.maximum(np.sum(path**2, (-2, -1)), 1e-300)
+        shares[name] = np.sum((unit.mT @ path) ** 2, (-2, -1)) / size
+    return shares
 
 
 def stand_errors(result: Fit) -> dict[str, Array]:

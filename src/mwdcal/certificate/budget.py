@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from mwdcal.calibration.drift import declared_drift
 from mwdcal.calibration.prediction import (
     TYPICAL,
     accuracy_at,
@@ -29,7 +30,7 @@ from mwdcal.calibration.record import (
     TriadCalibration,
     stated,
 )
-from mwdcal.calibration.results import PRIOR
+from mwdcal.calibration.results import PRIOR, error_name
 from mwdcal.certificate.decisions import PROBABILITY, When, student_factor
 from mwdcal.certificate.document import Budget, BudgetLine, Quantity, ResultTable
 from mwdcal.files.verifications import Verification
@@ -249,6 +250,9 @@ def _basis(calibration: Calibration, source: str) -> str:
         return "scatter of the soaks about the temperature terms"
     if source == PRIOR:
         return f"prior: {calibration.options.prior or 'declared'}"
+    for drift in calibration.drift:
+        if source == error_name(f"{drift.name}-drift-x"):
+            return declared_drift([drift]) or "sized by the order of the residuals"
     return "declared; common to all stations"
 
 

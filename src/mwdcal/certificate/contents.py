@@ -22,7 +22,7 @@ from msgspec.structs import replace
 
 from mwdcal.calibration.canonical import canonical, rounded
 from mwdcal.calibration.diagnosis.identity import FROM_THE_FUTURE, UNIDENTIFIED, dated, unidentified
-from mwdcal.calibration.drift import exact_and_steady
+from mwdcal.calibration.drift import blindness, exact_and_steady
 from mwdcal.calibration.fit_options import unusual
 from mwdcal.calibration.prediction import without_temperature
 from mwdcal.calibration.readings import CONSTANTS, check_day, is_simulated, serial_of, stated_day
@@ -417,7 +417,8 @@ def _out_of_date(standard: TracedStandard, calibrated: str) -> Iterator[Finding]
 def _exact(calibration: Calibration) -> Iterator[Finding]:
     names, steady = exact_and_steady(assumed_exact(calibration))
     if steady:
-        yield Finding(id="assumed-steady", text=f"{steady}.")
+        text = "; ".join(filter(None, (steady, blindness(calibration.unseen))))
+        yield Finding(id="assumed-steady", text=f"{text}.")
     if names:
         text = (
             f"assumed exact in the budget: {', '.join(names)}. State their uncertainty in [stand] of the tool "

@@ -105,6 +105,7 @@ class Rule:
             risk=None if within is None else (1 - within if passed else within),
             note=row.note,
             degrees_of_freedom=row.freedom,
+            raw=row.raw,
         )
 
 

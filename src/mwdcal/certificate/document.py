@@ -116,7 +116,8 @@ class LimitDecision(msgspec.Struct, frozen=True, kw_only=True):
     `acceptance_limit`: what the value must not exceed, the limit less the guard band.
     `probability_within`: that the true value is within the limit, given value and uncertainty; None where
     the uncertainty is not stated. `risk`: of the wrong decision that was taken, from it.
-    `degrees_of_freedom` of the uncertainty; None: unlimited, or not stated.
+    `degrees_of_freedom` of the uncertainty; None: unlimited, or not stated. `raw`: the value with the noise in it;
+    None: not stated, as in documents of earlier versions.
     """
 
     quantity: Quantity
@@ -127,6 +128,7 @@ class LimitDecision(msgspec.Struct, frozen=True, kw_only=True):
     risk: float | None
     note: str = ""
     degrees_of_freedom: float | None = None
+    raw: float | None = None
 
 
 class ConformityTest(msgspec.Struct, frozen=True, kw_only=True):

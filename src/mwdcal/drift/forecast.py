@@ -24,7 +24,7 @@ from mwdcal.calibration.record import FREE_SHARE, Calibration
 from mwdcal.drift.document import ServiceRow
 from mwdcal.drift.histories import ToolHistory
 from mwdcal.drift.walk import DAYS_PER_YEAR, FACTOR_NAMES, VISIT, WALK_GROUPS, group_places
-from mwdcal.geometry.vectors import AnyArray, Array
+from mwdcal.geometry.vectors import AnyArray, Array, square_root
 from mwdcal.sensor.models import Basis, Factors
 from mwdcal.use.verification import Verdict, VerdictRow
 
@@ -150,12 +150,11 @@ class Paths:
         rates: Mapping[tuple[str, str], Array], rng: np.random.Generator,
     ) -> Paths:  # fmt: skip
         """By the covariance (p, p) of a calibration, and drawn rates (n,) of groups of parameters at `places`."""
-        values, vectors = np.linalg.eigh(covariance)
-        root = vectors * np.sqrt(np.maximum(values, 0.0))
-        size = len(next(iter(rates.values()))), len(covariance)
-        walk = rng.standard_normal(size, np.float32)
+        draws, root = len(next(iter(rates.values()))), square_root(covariance)
+        walk = rng.standard_normal((draws, len(covariance)), np.float32)
         for group, drawn in rates.items():
             walk[:, places[group]] *= np.sqrt(drawn, dtype=np.float32)[:, None]
+        size = draws, root.shape[1]
         return cls(rng.standard_normal(size, np.float32) @ root.mT.astype(np.float32), walk)
 
 

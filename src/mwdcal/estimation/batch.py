@@ -6,7 +6,7 @@ is common to all of them: names, orders, flags.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from functools import cache
 from typing import Any, TypeVar
@@ -34,6 +34,26 @@ def put(batch: _T, index: Ints, members: _T) -> _T:
 
     changed: _T = mapped(placed, batch, members)
     return changed
+
+
+def join(batches: Sequence[_T]) -> _T:
+    """The members of batches of one kind as one batch."""
+    if len(batches) == 1:
+        return batches[0]
+    whole: _T = mapped(lambda *arrays: np.concatenate(arrays), *batches)
+    return whole
+
+
+def kind_of(batch: Any) -> Any:
+    """What batches have in common that can be joined: all that is not an array, and the shapes of members."""
+    if isinstance(batch, np.ndarray):
+        return batch.shape[1:]
+    if isinstance(batch, Mapping):
+        return tuple((key, kind_of(value)) for key, value in batch.items())
+    if isinstance(batch, tuple):
+        return tuple(kind_of(part) for part in batch)
+    names = _names(batch.__class__)
+    return tuple(kind_of(getattr(batch, name)) for name in names) if names else batch
 
 
 def batch_of_one(member: _T) -> _T:

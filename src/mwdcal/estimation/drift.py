@@ -12,7 +12,7 @@ Reference: K. Karhunen, Ann. Acad. Sci. Fenn. A 37 (1947); R. B. Schall, Biometr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -63,24 +63,36 @@ def acting(walks: Iterable[str]) -> dict[str, int]:
     return {name: min([*WALKS].index(name), 1) for name in walks}
 
 
-def with_walks(problem: Problem, state: State, sizes: dict[str, Array]) -> tuple[Problem, State]:
-    """The problem with drifts as constants of the run, and the state for it.
+def walk_constants(sizes: Mapping[str, Array], count: int) -> tuple[SharedConstant, ...]:
+    """Drifts over `count` stations as constants of the run.
 
     `sizes` (B, 2) of each: r of its trend and s of its walk, g or nT.
     """
-    evidence, count = problem.evidence, problem.evidence.include.shape[-1]
     values, variance = terms_of(count)
-    batch = len(evidence.include)
-    zero, new = np.zeros(batch), list(evidence.constants)
-    for name, size in sizes.items():
-        spread = np.sqrt(size**2 @ variance)
-        for axis in WALKS[name]:
-            for value, sd in zip(values.mT, spread.mT, strict=True):
-                mask = np.broadcast_to(value, (batch, count))
-                new.append(SharedConstant(axis, mask, zero, sd, unknown=False))
-    more = np.zeros((batch, len(new) - len(evidence.constants)))
-    walking = replace(problem, evidence=replace(evidence, constants=tuple(new)))
+    return tuple(
+        SharedConstant(axis, np.broadcast_to(value, (len(sd), count)), 0 * sd, sd, unknown=False)
+        for name, size in sizes.items()
+        for axis in WALKS[name]
+        for value, sd in zip(values.mT, np.sqrt(size**2 @ variance).mT, strict=True)
+    )
+
+
+def with_walks(problem: Problem, state: State, sizes: dict[str, Array]) -> tuple[Problem, State]:
+    """The problem with drifts as further constants of the run, and the state for it."""
+    evidence = problem.evidence
+    new = walk_constants(sizes, evidence.include.shape[-1])
+    more = np.zeros((len(evidence.include), len(new)))
+    walking = replace(problem, evidence=replace(evidence, constants=(*evidence.constants, *new)))
     return walking, replace(state, constants=np.concatenate([state.constants, more], -1))
+
+
+def without_walks(problem: Problem, state: State) -> tuple[Problem, State]:
+    """The problem as if the run were steady, and the state for it."""
+    evidence, walks = problem.evidence, problem.walks
+    left = tuple(c for index, c in enumerate(evidence.constants) if index not in walks)
+    constants = np.delete(state.constants, walks, -1)
+    steady = replace(problem, evidence=replace(evidence, constants=left))
+    return steady, replace(state, constants=constants)
 
 
 def places(evidence: Evidence) -> dict[str, Ints]:
@@ -123,6 +135,16 @@ class WalkScores:
         information = self.information[some]
         return WalkScores(self.score[:, index], information, lambda: self.alone()[some], places)
 
+    @property
+    def apart(self) -> bool:
+        """Whether there are walks of both triads, and readings of one say nothing of the walks of the other."""
+        triads = acting(self.places)
+        first, second = (
+            [c for n, t in triads.items() if t == triad for c in self.places[n].tolist()]
+            for triad in (0, 1)
+        )
+        return bool(first and second) and not self.information[:, first][..., second].any()
+
     def shown(self, name: str) -> Array:
         """Share (B,) of the information about a trend that residuals keep, of the axis along which it is least.
 
@@ -161,15 +183,38 @@ def walk_scores(problem: Problem, state: State, analysis: Analysis) -> WalkScore
         return WalkScores(
             score, information() * scale, lambda: information(alone=True) * scale, each
         )
-    columns = walking.walk_columns(at)[..., old:] * sd[:, None, None]
-    linear = problem.linear(state)
+    linear, base = problem.linear(state), _axes(problem, state, [*each])
     whole = whole_covariance(linear, analysis.determined)
-    flat = columns.reshape(len(columns), -1, columns.shape[-1])
-    weighed = linear.weigh(columns).reshape(flat.shape)
-    crossed = linear.design.reshape(len(columns), -1, whole.shape[-1]).mT @ weighed
-    alone = flat.mT @ weighed
-    score = (flat.mT @ residual.reshape(len(residual), -1, 1))[..., 0]
+    terms = terms_of(base.shape[1])[0][:, 1:]
+    weighed, count = linear.weigh(base), len(base)
+    score = _by_term((base.mT @ residual[..., None])[..., 0], terms) * sd
+    crossed = _by_term(linear.design.mT @ weighed, terms) * sd[:, None]
+    pairs = (terms[:, :, None] * terms[:, None]).reshape(len(terms), -1)
+    alone = (base.mT @ weighed).reshape(count, len(terms), -1).mT @ pairs
+    alone = alone.reshape(count, *2 * (len(each), 3), *2 * terms.shape[1:])
+    alone = alone.transpose(0, 1, 5, 2, 3, 6, 4).reshape(scale.shape) * scale
     return WalkScores(score, alone - crossed.mT @ whole @ crossed, lambda: alone, each)
+
+
+def _axes(problem: Problem, state: State, walks: Sequence[str]) -> Array:
+    """Columns (B, n, m, a) of what a unit of each axis of some drifts does at every station."""
+    evidence = problem.evidence
+    zero, mask = np.zeros(len(evidence.include)), np.ones(evidence.include.shape)
+    axes = (
+        SharedConstant(axis, mask, zero, zero + 1, unknown=False)
+        for name in walks
+        for axis in WALKS[name]
+    )
+    lone = replace(problem, evidence=replace(evidence, constants=tuple(axes)))
+    lone.memo.update(problem.memo)
+    return lone.walk_columns(state)
+
+
+def _by_term(values: Array, terms: Array) -> Array:
+    """Sums (B, ..., k) over the stations of values (B, n, ..., a) by axis of drifts, times each term (n, K)."""
+    flat = values.reshape(*values.shape[:2], -1)
+    sums = (flat.mT @ terms).reshape(len(values), *values.shape[2:-1], -1, 3, terms.shape[-1])
+    return np.asarray(sums.swapaxes(-1, -2).reshape(*sums.shape[:-3], -1))
 
 
 def _walking(problem: Problem, state: State) -> tuple[Problem, State, Array, dict[str, Ints]]:
@@ -238,17 +283,27 @@ class _Ridge:
 
 
 def walk_variances(
-    scores: WalkScores, variance: Array, freedom: Array, declared: Bools
+    scores: WalkScores, variance: Array, freedom: Array, declared: Bools, least: Array
 ) -> tuple[Array, Array]:
     """Variances (B, c) of the components of the drifts in units of the noise, and of the noise (B, t): REML.
 
     `variance` (B, t) is s² of the fit without walks, of so many degrees of `freedom`; that of the noise
-    stays 1 where it is `declared`.
+    stays 1 where it is `declared`. None of a drift is below its `least` (B, c).
     Definition: for the coefficients u of a walk, V their covariance given the readings: θ = Σu² / Σ(1 - V/θ);
     of the noise, misfit less what the walks explain over its degrees of freedom (Henderson).
     """
-    parts, of_walk = scores.components(), acting(scores.places)
+    of_walk, parts = acting(scores.places), scores.components()
     triad = np.array([of_walk[name] for name, _ in parts])
+    if scores.apart:
+        (lower, quiet), (upper, left) = (
+            walk_variances(
+                scores.of([n for n, t in of_walk.items() if t == one]),
+                variance, freedom, declared, least[:, triad == one],
+            )
+            for one in (0, 1)
+        )  # fmt: skip
+        left[:, 0] = quiet[:, 0]
+        return np.concatenate([lower, upper], -1), left
     owner = np.zeros(scores.score.shape[-1], int)
     for number, columns in enumerate(parts.values()):
         owner[columns] = number
@@ -257,16 +312,17 @@ def walk_variances(
     left = np.where(declared, 1.0, variance)
     first = [scores.square(columns) for columns in parts.values()]
     theta = np.stack([np.maximum(q - m, 0.1 * m) / s for q, m, s in first], -1)
-    ridge = _Ridge.of(scores, max(parts.values(), key=len))
+    ridge, floor = _Ridge.of(scores, max(parts.values(), key=len)), np.maximum(least, LEAST_WALK**2)
     for _ in range(VARIANCE_ROUNDS):
         ratio = (left[:, triad] / theta)[:, owner]
         value, known = ridge.at(ratio)
         used = (1 - known * ratio) @ of
-        theta = np.maximum(value**2 @ of / np.maximum(used, 1e-9), LEAST_WALK**2)
+        theta = np.maximum(value**2 @ of / np.maximum(used, 1e-9), floor)
         explained = (value * ridge.score) @ of
         by_triad = np.stack([explained[:, triad == t].sum(-1) for t in range(misfit.shape[-1])], -1)
         left = np.where(declared, 1.0, np.maximum((misfit - by_triad) / freedom, 1e-3 * variance))
-    return theta * np.where([part == 0 for _, part in parts], 1.0, _widened(used)), left
+    wider = theta * np.where([part == 0 for _, part in parts], 1.0, _widened(used))
+    return np.where(theta > least, wider, theta), left
 
 
 def _widened(freedom: Array) -> Array:
@@ -274,6 +330,19 @@ def _widened(freedom: Array) -> Array:
     from scipy.special import stdtrit
 
     return np.asarray((stdtrit(np.maximum(freedom, FEWEST_USED), 0.975) / 1.959964) ** 2)
+
+
+def trend_effect(problem: Problem, state: State, analysis: Analysis, name: str) -> Array:
+    """What a trend of r = 1, g or nT, that is not in the fit does to the parameters (B, p, k): 1σ of each term."""
+    batch, old = len(state.params), len(problem.evidence.constants)
+    walking, at = with_walks(problem, state, {name: np.tile([1.0, 0.0], (batch, 1))})
+    sd = np.stack([constant.sd for constant in walking.evidence.constants[old:]], -1)
+    linear = problem.linear(state)
+    columns = linear.weigh(walking.walk_columns(at)[..., old:] * sd[:, None, None])
+    crossed = linear.design.reshape(batch, -1, linear.prior.shape[-1]).mT @ columns.reshape(
+        batch, -1, sd.shape[-1]
+    )
+    return np.asarray(-whole_covariance(linear, analysis.determined)[:, : linear.size] @ crossed)
 
 
 def walk(problem: Problem, state: State, name: str) -> tuple[Array, Array]:

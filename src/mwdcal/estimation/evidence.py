@@ -62,7 +62,8 @@ class Evidence:
     each station then has its own. `stand` (B,) are the standard uncertainties of errors that all
     stations have in common, by name of `STAND_ERRORS`. `scatter` (B, n) is how far what should be
     constant departs from station to station, 1σ: "gravity" and "field" as a share, "dip" and the
-    common "direction" of a group in radians.
+    common "direction" of a group in radians. `drift` (B,) are declared drifts by name of `WALKS`, 1σ of the change
+    from the first station to the last.
     """
 
     known: dict[str, Array]
@@ -77,6 +78,7 @@ class Evidence:
     absent: tuple[str, ...] = ()
     stand: Mapping[str, Array] = field(default_factory=dict)
     scatter: dict[str, Array] = field(default_factory=dict)
+    drift: Mapping[str, Array] = field(default_factory=dict)
 
     def is_known(self, name: str) -> Bools:
         """Where a reference value is given (B, n)."""

@@ -318,10 +318,9 @@ def station_misfit(analysis: Analysis) -> tuple[Array, Array]:
 
     Directions of a station's readings that nothing tests (share below `TESTED`) do not count.
     """
-    values, vectors = eigen(analysis.spread)
-    tested = values > TESTED
-    along = np.einsum("bnij,bni->bnj", vectors, analysis.residual) ** 2
-    return quotient(along, values, tested).sum(-1), np.sum(tested, -1).astype(float)
+    back, freedom = _tested_inverse(analysis.spread)
+    residual = analysis.residual
+    return np.sum(residual * (back @ residual[..., None])[..., 0], -1), freedom
 
 
 def left_out_residual(analysis: Analysis) -> Array:
@@ -329,10 +328,21 @@ def left_out_residual(analysis: Analysis) -> Array:
 
     Exact for a linear problem. Directions of a station's readings that nothing else tests have none.
     """
-    values, vectors = eigen(analysis.spread)
-    along = np.einsum("bnij,bni->bnj", vectors, analysis.residual)
-    along = quotient(along, values, values > TESTED)
-    return np.asarray(np.einsum("bnij,bnj->bni", vectors, along))
+    return np.asarray((_tested_inverse(analysis.spread)[0] @ analysis.residual[..., None])[..., 0])
+
+
+def _tested_inverse(spread: Array) -> tuple[Array, Array]:
+    """Inverse (B, n, m, m) along the directions that are tested, and their number (B, n)."""
+    back = inverse(spread)
+    freedom = np.full(spread.shape[:-2], float(spread.shape[-1]))
+    with np.errstate(invalid="ignore", over="ignore"):
+        some = ~(np.sum(back**2, (-1, -2)) < TESTED**-2)  # else every eigenvalue is above it
+    if some.any():
+        values, vectors = eigen(spread[some])
+        tested = values > TESTED
+        along = vectors * quotient(np.ones_like(values), values, tested)[:, None]
+        back[some], freedom[some] = along @ vectors.mT, np.count_nonzero(tested, -1)
+    return back, freedom
 
 
 def without_station(problem: Problem, state: State, analysis: Analysis) -> Array:

@@ -24,7 +24,7 @@ from mwdcal.estimation.problem import Prior, Problem, State, Triad
 from mwdcal.estimation.solvers import Linear
 from mwdcal.estimation.start import oriented
 from mwdcal.faults.physics import DEAD, FAULTS, NONE, SIZE, FaultForm, columns
-from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, inverse, outer
+from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, inverse, outer, square_root
 
 FREE_SIZE = 0.3
 """Standard uncertainty of a direction that the calibration has left free: it turns or stretches by as much."""
@@ -94,11 +94,7 @@ class Suspect:
 
 def _root(calibration: Calibration) -> Array:
     """Root (p, k) of the covariance of all parameters, free directions of `FREE_SIZE` in it."""
-    covariance = calibration.parameter_covariance
-    scale = np.sqrt(np.diag(covariance))
-    scale = np.where(scale > 0, scale, 1.0)
-    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    known = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    known = square_root(calibration.parameter_covariance)
     return np.concatenate([known, FREE_SIZE * calibration.free_directions.transpose()], -1)
 
 
@@ -519,9 +515,8 @@ class FaultEvidence:
         """
         observed = log_mean(_linear(self.forms, self.information, self.none.gradient[0]))
         rng = np.random.default_rng(0)
-        values, vectors = np.linalg.eigh(self.information)
-        root = vectors * np.sqrt(np.maximum(values, 0.0))
-        sound = rng.normal(size=(draws, SIZE)) @ root.transpose()
+        root = square_root(self.information)
+        sound = rng.normal(size=(draws, root.shape[1])) @ root.transpose()
         if np.isfinite(freedom):
             sound *= np.sqrt(freedom / rng.chisquare(freedom, draws))[:, None]
         beyond = log_mean(_linear(self.forms, self.information, sound)) >= observed

@@ -7,7 +7,8 @@ are is judged tool by tool.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
@@ -15,13 +16,20 @@ import numpy as np
 
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.errors import InputError
-from mwdcal.files.contract import CHANNELS, RANGES, REFERENCES
+from mwdcal.files.contract import CHANNELS, RANGES, RAW, REFERENCES
 from mwdcal.files.formats.table import Table, cell_error, numbers, shown
-from mwdcal.geometry.vectors import Array, Bools, Ints
+from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints
 from mwdcal.sensor.profile import Profile
 
 Cells = Callable[[str], Array | None]
 """The numbers (R,) of a column by its name, NaN where blank; None where there is no such column."""
+
+
+OPTIONAL = {
+    CHANNELS["magnetometer"]: "Fill it in, or remove the station.",
+    ("temperature_c",): "Fill it in, or leave the whole column blank.",
+}
+"""Columns that are blank on all rows or on none, and what to do where they are neither."""
 
 
 class BlankReadingError(InputError):
@@ -151,3 +159,66 @@ def _stacked(cells: Cells, names: tuple[str, ...], starts: Ints) -> Array:
     """The columns (k, R); those that are not there are blank."""
     columns = (cells(name) for name in names)
     return np.stack([np.full(starts[-1], np.nan) if c is None else c for c in columns])
+
+
+def wholly_blank(tables: Iterable[Table]) -> tuple[tuple[str, ...], ...]:
+    """Groups of optional columns that are blank on every row of all tables; looks no further than needed."""
+    left = [*OPTIONAL]
+    for table in tables:
+        left = [g for g in left if g[0] in table.columns and all(is_blank(table, n) for n in g)]
+        if not left:
+            break
+    return tuple(left)
+
+
+def blank_cell(table: Table, names: tuple[str, ...]) -> InputError:
+    """The refusal of a column that is blank on some rows and not on others."""
+    problem = f"must be filled in; got a blank cell. {OPTIONAL[names]}"
+    return BlankReadingError(str(cell_error(table, names[0], 0, problem)))
+
+
+def is_blank(table: Table, name: str) -> bool:
+    """Whether a column has no cell that is filled in."""
+    column = table.columns[name]
+    if isinstance(column, list):
+        return not any(cell.strip() for cell in column)
+    return bool(np.isnan(column).all())
+
+
+def without_reading(table: Table, absent: Sequence[tuple[str, ...]]) -> Bools:
+    """Rows (n,) with a blank reading or temperature; columns `absent` on all rows do not count."""
+    without = [name for group in absent for name in group]
+    names = [n for n in (*RAW, "temperature_c") if n in table.columns and n not in without]
+    return np.asarray(np.isnan([_cells(table, name) for name in names]).any(axis=0))
+
+
+def chosen(table: Table, rows: Bools) -> Table:
+    """Some rows of a table, with their places."""
+    picked = np.flatnonzero(rows).tolist()
+    columns = {
+        name: [column[i] for i in picked] if isinstance(column, list) else column[rows]
+        for name, column in table.columns.items()
+    }
+    return replace(table, columns=columns, lines=[table.lines[i] for i in picked])
+
+
+def spread(values: AnyArray, rows: Bools) -> AnyArray:
+    """Values of the chosen rows, at their places among all; others are NaN, False or blank."""
+    blank = {"b": False, "U": "", "O": ""}.get(values.dtype.kind, np.nan)
+    out = np.full(rows.shape, blank, values.dtype)
+    out[rows] = values
+    return out
+
+
+def _cells(table: Table, name: str) -> Array:
+    """The column as numbers; what they may be is checked with all the rest."""
+    column = table.columns[name]
+    return numbers(table, name) if isinstance(column, list) else column
+
+
+def nothing(source: str) -> InputError:
+    """A table of which no row can be corrected."""
+    return InputError(
+        f"{source}: every row lacks a reading, so that there is nothing to correct. Check the "
+        "columns of the raw channels and temperature_c."
+    )

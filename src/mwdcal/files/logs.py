@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import BinaryIO, NamedTuple
+from weakref import finalize
 
 import numpy as np
 
@@ -43,9 +45,12 @@ READ = (TIME, *RANGES)
 _PIECE = 16_000_000
 _LONGEST_ROW = 1_000_000
 _TYPED = (".parquet", ".xlsx", *tables.EXCHANGED)
-_ODD = re.compile(r"nan|inf|[\"\r]", re.IGNORECASE)
+_ODD = ("nan", "inf", '"', "\r")
+"""What plain numbers do not have, in lower case."""
 _CLOCK = re.compile(r"\d{4}-\d{1,2}-\d{1,2}|\d{1,2}:\d{2}|\d{1,2}[./]\d{1,2}[./]\d{4}")
-_BINARY = re.compile(rb"[\x00-\x08\x0e-\x1f]")
+_BINARY = bytes([*range(0x09), *range(0x0E, 0x20)])
+_LONG_LOG = 100_000_000
+"""Bytes of text from which the columns of a log are not all in memory at once."""
 _EXAMPLE = "`columns` time_s,ax,ay,az"
 
 
@@ -94,11 +99,12 @@ def check(table: Table) -> Table:
 
 def _accepted(table: Table) -> Table:
     """The log with numbers in every column that means something; refused if no channel reads them."""
-    numbers = {name: _numbers(table, name) for name in table.columns if name in READ}
-    numeric = replace(table, columns={**table.columns, **numbers})
-    cells = columns_of(numeric)
-    refuse(numeric, chain.from_iterable(range_faults(cells, name) for name in RAW))
-    return numeric
+    if not isinstance(table.columns, StoredColumns):
+        numbers = {name: _numbers(table, name) for name in table.columns if name in READ}
+        table = replace(table, columns={**table.columns, **numbers})
+    for name in RAW:
+        refuse(table, range_faults(columns_of(table), name))
+    return table
 
 
 def _typed(file: Path, names: Sequence[str], decimal: str) -> Table:
@@ -158,25 +164,27 @@ def _read_text(stream: BinaryIO, names: list[str], decimal: str, source: str, sa
     size = os.fstat(stream.fileno()).st_size
     ahead, done = (first + "\n", number - 1) if names else ("", number)
     wanted, lines = _wanted(layout), []
-    numbers_read = _Growing(len(wanted))
+    others = [name for name in layout.names if name not in READ]
+    filled: _Growing | StoredColumns = (
+        _Growing(others, wanted) if size < _LONG_LOG else StoredColumns(others, wanted)
+    )
     for piece in _pieces(stream, ahead, number, source):
         values, numbers, done = _piece(piece, done, layout)
         share = stream.tell() / size
-        numbers_read.add(values, share)
+        filled.add(values, share)
         lines.append(numbers)
         say(f"reading {source}: {100 * share:.0f} %")
     if not sum(map(len, lines)):
         raise _empty(source)
-    columns: dict[str, Column] = {name: [] for name in layout.names if name not in READ}
-    columns |= zip(wanted, numbers_read.whole(), strict=True)
-    return Table(columns, metadata, source, _joined(lines), decimal=decimal)
+    return Table(filled.whole(), metadata, source, _joined(lines), decimal=decimal)
 
 
 class _Growing:
     """Columns that are filled piece by piece: a long log is in memory once, not as pieces and as a whole."""
 
-    def __init__(self, count: int) -> None:
-        self.columns = [np.empty(0) for _ in range(count)]
+    def __init__(self, others: Sequence[str], names: Sequence[str]) -> None:
+        self.others, self.names = others, names
+        self.columns = [np.empty(0) for _ in names]
         self.rows = 0
 
     def add(self, values: Array, share: float) -> None:
@@ -188,9 +196,45 @@ class _Growing:
                 column[:start], self.columns[i] = self.columns[i][:start], column
             column[start : self.rows] = values[:, i]
 
-    def whole(self) -> list[Array]:
+    def whole(self) -> Mapping[str, Column]:
         """The columns, as long as what was added; the room that is left over was never touched."""
-        return [column[: self.rows] for column in self.columns]
+        columns: dict[str, Column] = {name: [] for name in self.others}
+        filled = (column[: self.rows] for column in self.columns)
+        return columns | dict(zip(self.names, filled, strict=True))
+
+
+class StoredColumns(Mapping[str, Column]):
+    """Columns of a long log, each in a file without a name, from which it is read when it is asked for."""
+
+    def __init__(self, others: Sequence[str], names: Sequence[str]) -> None:
+        self._others = others
+        self._files = {name: TemporaryFile() for name in names}  # noqa: SIM115, closed by what follows
+        for file in self._files.values():
+            finalize(self, file.close)
+
+    def add(self, values: Array, share: float) -> None:
+        """Append values (rows, columns)."""
+        for file, column in zip(self._files.values(), values.transpose(), strict=True):
+            file.write(np.ascontiguousarray(column, float).data)
+
+    def whole(self) -> Mapping[str, Column]:
+        """The columns."""
+        for file in self._files.values():
+            file.flush()
+        return self
+
+    def __getitem__(self, name: str) -> Column:
+        if name in self._others:
+            return []
+        file = self._files[name]
+        file.seek(0)
+        return np.fromfile(file)
+
+    def __iter__(self) -> Iterator[str]:
+        return chain(self._others, self._files)
+
+    def __len__(self) -> int:
+        return len(self._others) + len(self._files)
 
 
 def _top(stream: BinaryIO, source: str) -> tuple[list[tuple[int, str]], str, int]:
@@ -214,11 +258,10 @@ def _top(stream: BinaryIO, source: str) -> tuple[list[tuple[int, str]], str, int
 
 def _decoded(data: bytes, number: int, source: str) -> str:
     """Text of a piece whose first line has this number."""
-    strange = _BINARY.search(data)
     try:
-        if strange is None:
+        if len(data.translate(None, _BINARY)) == len(data):
             return data.decode("utf-8")
-        bad = strange.start()
+        bad = next(place for place, byte in enumerate(data) if byte in _BINARY)
     except UnicodeDecodeError as error:
         bad = error.start
     line = number + data.count(b"\n", 0, bad)
@@ -294,7 +337,8 @@ def _plain(text: str, count: int, layout: _Layout) -> Array | None:
     """The values of a piece of plain numbers and blanks, None where it is anything else."""
     mark, names = layout.delimiter, layout.names
     wanted = [names.index(name) for name in _wanted(layout)]
-    if _ODD.search(text) or (layout.decimal == "," and "." in text):
+    lowered = text.lower()
+    if any(odd in lowered for odd in _ODD) or (layout.decimal == "," and "." in text):
         return None
     if mark is not None:
         if text.count(mark) != (len(names) - 1) * count:

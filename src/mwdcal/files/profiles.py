@@ -18,6 +18,7 @@ from mwdcal.errors import InputError, reason
 from mwdcal.files.contract import MAPPED, TEMPERATURE, units_of
 from mwdcal.files.formats.table import shown
 from mwdcal.files.metadata import LARGEST_TOML, load_toml
+from mwdcal.files.settings import completed
 from mwdcal.sensor.profile import (
     ColumnSource,
     Datasheet,
@@ -48,6 +49,7 @@ _WORDS = {
     "datetime": "a date with time",
     "time": "a time of day",
 }
+_OPEN_AXES = re.compile(r"\s*axes\s*=\s*\[\s*\]")
 _ALL = (1e-15, 1e15)
 _UNKNOWN = "leave it out where it is unknown."
 _SHARE = "1 sigma as a share of the field, such as 0.005; leave it out for a linear axis."
@@ -58,7 +60,9 @@ _LIMITS: dict[type[msgspec.Struct], dict[str, tuple[float, float, str]]] = {
         "scale": (*_ALL, f'Put the sign into `axes`, for example "-x"; {_UNKNOWN}'),
         "noise": (*_ALL, f"1 sigma in raw units; {_UNKNOWN}"),
         "nonlinearity": (1e-9, 1.0, _SHARE),
-        "repeatability": (0.0, 1e15, f"1 sigma in raw units; {_UNKNOWN}"),
+        **dict.fromkeys(
+            ("repeatability", "drift"), (0.0, 1e15, f"1 sigma in raw units; {_UNKNOWN}")
+        ),
     },
     Datasheet: dict.fromkeys(
         Datasheet.__struct_fields__, (*_ALL, f"1 sigma, more than zero; {_UNKNOWN}")
@@ -66,21 +70,35 @@ _LIMITS: dict[type[msgspec.Struct], dict[str, tuple[float, float, str]]] = {
     StandProfile: {
         **{name: _ANGLE for name in StandProfile.__struct_fields__ if name.endswith("_deg")},
         "gravity_g": (0.0, 2.0, "1 sigma, in g."),
-        "field_nt": (0.0, 200_000.0, "1 sigma, in nT."),
+        **dict.fromkeys(("field_nt", "field_drift_nt"), (0.0, 200_000.0, "1 sigma, in nT.")),
     },
     TableFormat: dict.fromkeys(("header_line", "first_line"), (1, 1e6, "Lines count from 1.")),
 }
 """Least and greatest value of each number, and what to do about another one."""
 
 
+CHOICE_OF_AXES = {
+    "accelerometer": (
+        "Gravity counts downwards: a channel that reads positive when its axis points up has a minus.",
+        "Reversing z turns inclination upside down; exchanging x and y, or reversing one, turns toolface.",
+    ),
+    "magnetometer": (
+        "The field counts along itself: in the north it dips down (dip north), in the south up (dip south).",
+        "Reversing all three axes exchanges dip north and south, and turns azimuth by 180 degrees.",
+    ),
+}
+"""The meaning of the axes of a triad: what is changed by choosing others."""
+
+
 def load_profile(name_or_path: str | None = None) -> tuple[Profile, str]:
     """A tool profile and the SHA-256 of its bytes: built in by name, or a TOML file by path.
 
-    None is the built-in `generic`: channels along the tool axes, nothing else known.
+    None is the built-in `generic`: channels along the tool axes, nothing else known. In a command the laboratory's
+    settings complete it.
     """
     name = "generic" if name_or_path is None else name_or_path
     data, digest = read_toml(name, "profiles", "tool profile")
-    return decoded_profile(data, Path(name).name), digest
+    return completed(decoded_profile(data, Path(name).name)), digest
 
 
 def built_in(folder: str) -> list[str]:
@@ -160,6 +178,7 @@ def _decoded(data: bytes, struct: type[_Decoded]) -> _Decoded:
 def decoded_profile(data: bytes, source: str) -> Profile:
     """The checked profile in the bytes of a TOML file, without a byte order mark."""
     try:
+        _check_axes_stated(data.decode(), source)
         profile = _decoded(data, Profile)
     except msgspec.ValidationError as error:
         raise _invalid(str(error), source) from None
@@ -176,6 +195,27 @@ def decoded_profile(data: bytes, source: str) -> Profile:
         ) from None
     check_profile(profile, source)
     return profile
+
+
+def _check_axes_stated(text: str, source: str) -> None:
+    """Refuse a proposed profile whose axes are still to be filled in."""
+    sections = load_toml(text)
+    lacking = [kind for kind in TRIADS if _axes_of(sections.get(kind)) == []]
+    if not lacking:
+        return
+    lines = [n for n, line in enumerate(text.splitlines(), 1) if _OPEN_AXES.match(line)]
+    where = (
+        f", line{'s' if len(lines) > 1 else ''} {' and '.join(map(str, lines))}" if lines else ""
+    )
+    changes = " ".join(line for kind in lacking for line in CHOICE_OF_AXES[kind])
+    raise InputError(
+        f"{source}{where}: the axes of {' and '.join(lacking)} are open. Fill in axes = "
+        f'["+x", "+y", "+z"] or another order and signs: the tool axis that each channel measures. {changes}'
+    )
+
+
+def _axes_of(section: object) -> object:
+    return section.get("axes") if isinstance(section, dict) else None
 
 
 def toml_problem(error: Exception) -> str:

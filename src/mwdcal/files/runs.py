@@ -23,6 +23,7 @@ from mwdcal.calibration.readings import (
     serial_of,
 )
 from mwdcal.errors import FitError, InputError
+from mwdcal.estimation.evidence import WALKS
 from mwdcal.files import synonyms
 from mwdcal.files.contract import (
     CHANNELS,
@@ -41,6 +42,7 @@ from mwdcal.files.formats.columns import LABELS, Column, shown
 from mwdcal.files.formats.dialect import holds_numbers
 from mwdcal.files.formats.layout import Layout
 from mwdcal.files.formats.table import Table, labels
+from mwdcal.files.statements import stated_table
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import ColumnSource, Profile, TableFormat, TriadProfile
 
@@ -54,11 +56,20 @@ _TURN = 360.0
 
 
 def read_run(
-    source: str | os.PathLike[str] | Table, profile: Profile, *, decimal: str = "."
+    source: str | os.PathLike[str] | Table,
+    profile: Profile,
+    *,
+    decimal: str = ".",
+    statements: Mapping[str, str] | None = None,
 ) -> tuple[Readings, Profile]:
-    """The readings of a run, a file or a table, and the profile with its nominal scales filled in."""
+    """The readings of a run, a file or a table, and the profile with its nominal scales filled in.
+
+    `statements`: serial, date and operator as the user says.
+    """
     if not isinstance(source, Table):
-        source = read_export(source, profile, decimal=decimal, rows=MOST_ROWS)
+        source = read_export(
+            source, profile, decimal=decimal, rows=MOST_ROWS, statements=statements
+        )
     table = renamed(source, profile)
     check_run(table)
     readings, profile = to_readings(table, profile)
@@ -77,16 +88,37 @@ def _other_numbers(table: Table) -> dict[str, Array]:
 
 
 def read_export(
-    path: str | os.PathLike[str], profile: Profile, *, decimal: str = ".", rows: int = 0
+    path: str | os.PathLike[str],
+    profile: Profile,
+    *,
+    decimal: str = ".",
+    rows: int = 0,
+    statements: Mapping[str, str] | None = None,
 ) -> Table:
     """The table in a file, written as the profile says or as documented, under its own names.
 
     `decimal` and `rows` as for `table.read`; a profile that says how tables are written says their
-    decimal sign as well.
+    decimal sign as well. `statements`: serial, date and operator as the user says.
     """
     form = profile.table
     if isinstance(form, msgspec.UnsetType):
-        return tables.read(path, decimal=decimal, rows=rows)
+        table = tables.read(path, decimal=decimal, rows=rows)
+    else:
+        table = _exported(path, form, profile, decimal, rows)
+        table = replace(table, metadata={**form.north, **table.metadata})
+    return stated_table(table, statements or {}, _serial_column(table, profile))
+
+
+def _serial_column(table: Table, profile: Profile) -> str:
+    """The column of serials in a table."""
+    name = _sources(profile).get("serial", ColumnSource(name="serial")).name
+    return name if name in table.columns else "serial"
+
+
+def _exported(
+    path: str | os.PathLike[str], form: TableFormat, profile: Profile, decimal: str, rows: int
+) -> Table:
+    """The table in a file that is written as a form says, or as documented."""
     if form.find:
         decimal = "," if form.decimal == "," else ""
         where = tables.laid_out(
@@ -142,7 +174,7 @@ def _of_layout(where: Layout, path: str | os.PathLike[str], profile: Profile) ->
     named = {each.name: column for column, each in _sources(profile).items()}
     for name, unit in zip(where.names, map(synonyms.unit_of, where.units), strict=True):
         stated = _sources(profile)[named[name]].unit if name in named else ""
-        if unit and stated and unit != stated and not stated.startswith(f"{unit} "):
+        if unit and stated and not _alike_units(unit, stated):
             raise InputError(
                 f"{Path(path).name}: {shown(name)} is in {unit}, by the tool profile in {stated}."
             )
@@ -162,11 +194,18 @@ def _check_below_names(path: str | os.PathLike[str], form: TableFormat, profile:
                 f"{where}: readings that by first_line = {form.first_line} of the tool profile would not be read."
             )
         for name, unit in zip(names, map(synonyms.unit_of, cells), strict=False):
-            if unit and unit != theirs.get(name.strip(), unit):
+            if unit and not _alike_units(unit, theirs.get(name.strip(), unit)):
                 raise InputError(
                     f"{where}: {shown(name.strip())} is in {unit}, by the tool profile in "
                     f"{theirs[name.strip()]}."
                 )
+
+
+def _alike_units(written: str, stated: str) -> bool:
+    """Whether a unit as it is written may be the one of a profile: G is also Gauss, and ° any sense of an angle."""
+    return (
+        written == stated or stated.startswith(f"{written} ") or (written, stated) == ("g", "gauss")
+    )
 
 
 def _sources(profile: Profile) -> dict[str, ColumnSource]:
@@ -210,7 +249,11 @@ def renamed(table: Table, profile: Profile) -> Table:
                 "the tool profile. Rename the former, or correct [columns] in the profile."
             )
     columns: dict[str, Column] = {}
+    form = profile.table
+    ignored = () if isinstance(form, msgspec.UnsetType) else form.ignore
     for name, cells in table.columns.items():
+        if name in ignored:
+            continue
         column = theirs.get(name, name)
         columns[column] = cells
         if name in theirs and column not in LABELS:
@@ -228,17 +271,28 @@ def check_run(table: Table) -> None:
     names = list(table.columns)
     check_columns(names, table.source)
     synonyms.check_evidence(names, table.source)
+    _check_serials(table)
     tools = serials(table.metadata, labels(table, "serial"))
     if len(tools) > 1:
         raise InputError(
             f"{table.source} has rows of more than one tool (serial {', '.join(tools)}). Take the "
-            "rows of one, or use mwdcal fleet."
+            "rows of one by `serial`, or use mwdcal fleet."
         )
     if table.count > ROWS_OF_LOG and ("time_s" in table.columns or "sampling_hz" in table.metadata):
         raise InputError(
             f"{table.source} is a continuous log ({table.count} rows): its rows are not stations. Find "
             f"the standstills first: mwdcal stations {table.source} -o run.csv. If each row is a "
             "station, remove time_s and sampling_hz."
+        )
+
+
+def _check_serials(table: Table) -> None:
+    """Refuse a column of serials that are numbers with decimals: 12.10 and 12.1 are two tools, and one number."""
+    column = table.columns.get("serial", [])
+    if not isinstance(column, list) and (broken := column[column % 1 > 0]).size:
+        raise InputError(
+            f"{table.source}, column 'serial': must be text; got the number {broken[0]:g}, whose spelling is lost. "
+            "Store serials as text, as in '12.10'."
         )
 
 
@@ -331,6 +385,7 @@ def convert(
         if noise is not None:
             sd[kind] = noise
     common = {n: np.full(shape, np.radians(v)) for n, v in profile.stand.common().items()}
+    common |= _drifts(profile, scales, shape)
     readings = Readings(
         accelerometer=triads["accelerometer"],
         magnetometer=triads.get("magnetometer"),
@@ -340,6 +395,17 @@ def convert(
         settings=profile.stand.practice,
     )
     return readings, scales
+
+
+def _drifts(
+    profile: Profile, scales: Mapping[str, float | Array], shape: tuple[int, ...]
+) -> dict[str, Array]:
+    """Declared drifts (..., n) within a run, g and nT, by name of `WALKS`."""
+    sizes = [np.abs(getattr(profile, k).drift / np.asarray(s)) for k, s in scales.items()]
+    sizes = [np.reshape(size, (*np.shape(size)[:-2], 1)) for size in sizes]
+    field = [np.array(profile.stand.field_drift_nt)] if len(scales) > 1 else []
+    each = zip(WALKS, [*sizes, *field], strict=False)
+    return {name: np.broadcast_to(size, shape) for name, size in each if size.any()}
 
 
 def _given(cells: Cells, name: str) -> Array | None:

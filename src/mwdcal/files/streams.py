@@ -9,22 +9,23 @@ spelling or anything that is refused: one place decides what is accepted, and wo
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from mwdcal.errors import InputError
 from mwdcal.files.contract import RANGES, RAW
 from mwdcal.files.formats import parquet, text
-from mwdcal.files.formats.columns import Column
+from mwdcal.files.formats.columns import LABELS, Column
 from mwdcal.files.formats.table import Table, check_decimal, numbers, pointed
 from mwdcal.geometry.observables import RESULTS, UNCERTAINTIES
-from mwdcal.geometry.vectors import Ints
+from mwdcal.geometry.vectors import Array, Ints
 
+Result = TypeVar("Result")
 PART_ROWS = 1 << 16
 """Most rows of a part of a Parquet table."""
 PART = 16 << 20
@@ -66,12 +67,22 @@ class StreamedTable:
     pieces: Callable[[], Iterator[Any]]
     load: Callable[[Any, bool], Part]
 
+    def exactly_if_refused(self, work: Callable[[Part], Result], piece: Any) -> Result:
+        """`work` of a piece; where something in it seems wrong, of its text looked at line by line."""
+        try:
+            return work(self.load(piece, False))
+        except InputError:
+            return work(self.load(piece, True))
 
-def open_parquet(path: Path, rows: int = 0, decimal: str = ".") -> StreamedTable:
+
+def open_parquet(
+    path: Path, rows: int = 0, decimal: str = ".", also: Sequence[str] = ()
+) -> StreamedTable:
     """A Parquet file in parts of `rows` rows; by default as many as memory bears.
 
-    What is carried has the type it has in the file, whatever it is; `decimal` is the sign in
-    columns of text that are read as numbers.
+    The table of a part has the columns of numbers of the contract, and those named `also`. What is carried
+    has the type it has in the file, whatever it is; `decimal` is the sign in columns of text that are read as
+    numbers.
     """
     check_decimal(decimal)
     arrow, _ = parquet.modules(path.name)
@@ -97,7 +108,7 @@ def open_parquet(path: Path, rows: int = 0, decimal: str = ".") -> StreamedTable
                 arrow.Table.from_batches([batch]), stored, path.name, arrow, 2 * PART
             )
             carried = carried.select(names)
-            wanted = [name for name in names if name in RANGES]
+            wanted = [name for name in names if name in RANGES or name in also]
             columns = {n: parquet.as_column(n, carried.column(n), arrow) for n in wanted}
         lines = range(first, first + len(batch))
         table = Table(columns, metadata, path.name, lines, decimal=decimal)
@@ -107,11 +118,13 @@ def open_parquet(path: Path, rows: int = 0, decimal: str = ".") -> StreamedTable
     return StreamedTable(path.name, names, metadata, schema, count, count, pieces, load)
 
 
-def open_text(path: Path, typed: bool = False, decimal: str = ".") -> StreamedTable:
+def open_text(
+    path: Path, typed: bool = False, decimal: str = ".", also: Sequence[str] = ()
+) -> StreamedTable:
     """A text table in pieces; `typed`: the contract's columns of numbers are carried as numbers.
 
-    Where `decimal` is the comma every line goes through the exact parser, and numbers are carried
-    with the point.
+    The table of a part has the columns of numbers of the contract, and those named `also`. Where `decimal` is
+    the comma every line goes through the exact parser, and numbers are carried with the point.
     """
     check_decimal(decimal)
     arrow, _ = parquet.modules(path.name)
@@ -125,6 +138,7 @@ def open_text(path: Path, typed: bool = False, decimal: str = ".") -> StreamedTa
     body = start.split(b"\n", top.lines)[-1].rstrip(b"\n")
     numeric = [name for name in top.names if typed and name in RANGES]
     types = {n: arrow.float64() if n in numeric else arrow.string() for n in top.names}
+    wanted = [name for name in top.names if name in RANGES or name in also]
 
     def pieces() -> Iterator[Any]:
         yield body, top.lines, len(first)
@@ -138,7 +152,7 @@ def open_text(path: Path, typed: bool = False, decimal: str = ".") -> StreamedTa
 
     def load(piece: Any, exact: bool) -> Part:
         data, above, size = piece
-        both = None if exact or decimal != "." else _plain(data, top, arrow)
+        both = None if exact or decimal != "." else _plain(data, top, wanted, arrow)
         if both is None:
             parts = text.rows(data, top, above, path.name)
             table = Table(parts.columns, {}, path.name, parts.lines, decimal=decimal)
@@ -146,7 +160,7 @@ def open_text(path: Path, typed: bool = False, decimal: str = ".") -> StreamedTa
         carried, table = both
         if typed:
             carried = _typed(carried, table, numeric, arrow)
-        columns = {n: c for n, c in table.columns.items() if n in RANGES}
+        columns = {n: table.columns[n] for n in wanted}
         stated = replace(table, columns=columns, metadata=top.metadata, source=path.name)
         return Part(carried, stated, size)
 
@@ -177,7 +191,9 @@ def _newlines(data: bytes) -> bytes:
     return data if data.endswith(b"\n") else data + b"\n"
 
 
-def _plain(data: bytes, top: text.Head, arrow: Any) -> tuple[Any, Table] | None:
+def _plain(
+    data: bytes, top: text.Head, wanted: Sequence[str], arrow: Any
+) -> tuple[Any, Table] | None:
     """Strings and table of a piece, unusual lines by the exact parser; None where it takes all."""
     from pyarrow import csv
 
@@ -198,7 +214,7 @@ def _plain(data: bytes, top: text.Head, arrow: Any) -> tuple[Any, Table] | None:
             if len(both) != len(order):  # lines that are blank are no rows
                 return None
             carried = both.take(order)
-        columns = {n: _numbers(n, carried.column(n), arrow) for n in top.names if n in RANGES}
+        columns = {n: _numbers(n, carried.column(n), arrow) for n in wanted}
     except (arrow.ArrowInvalid, arrow.ArrowKeyError):
         return None
     return carried, Table(columns, {}, "", range(carried.num_rows))
@@ -223,11 +239,12 @@ def _sorted(data: bytes, delimiter: bytes) -> tuple[bytes, bytes, Ints | None]:
 
 
 def _numbers(name: str, cells: Any, arrow: Any) -> Column:
-    """Readings as numbers, other columns as text, which may have blank cells."""
+    """Readings as numbers; so other columns, which may have blank cells, or as text where a cell is no number."""
     import pyarrow.compute as compute
 
     if name not in (*RAW, "temperature_c"):
-        return [str(cell) for cell in cells.to_pylist()]
+        numbers = None if name in (*LABELS, "simulated") else _or_blank(cells, arrow)
+        return cells.to_pylist() if numbers is None else numbers
     if cells[0].as_py() == "" and cells.unique().to_pylist() == [""]:
         blank = np.full(len(cells), np.nan)
         blank.flags.writeable = False  # as the others are: compiled loops take columns of one type
@@ -237,6 +254,18 @@ def _numbers(name: str, cells: Any, arrow: Any) -> Column:
     except arrow.ArrowInvalid:  # blanks around a number
         values = compute.utf8_trim_whitespace(cells).cast(arrow.float64())
     return np.asarray(values.to_numpy(), float)
+
+
+def _or_blank(cells: Any, arrow: Any) -> Array | None:
+    """The cells as finite numbers, blank ones as NaN; None where a cell is anything else."""
+    import pyarrow.compute as compute
+
+    try:
+        filled = compute.if_else(compute.equal(cells, ""), None, cells).cast(arrow.float64())
+    except arrow.ArrowInvalid:
+        return None
+    values = np.asarray(filled.to_numpy(), float)
+    return values if np.isfinite(values).sum() + filled.null_count == len(values) else None
 
 
 def _typed(carried: Any, table: Table, numeric: list[str], arrow: Any) -> Any:

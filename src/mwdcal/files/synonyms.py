@@ -77,6 +77,7 @@ FACTORS = {
 """The same in numbers: factor, and what is added to the product."""
 _WARM = ("°C", "°F", "K")
 _MAGNETIC_UNITS = ("nT", "µT", "mT", "gauss", "mG")
+_GRAVITY_UNITS = ("g", "mg", "m/s²")
 WARMTH = "temperature_c"
 _STATED = {"ref", "reference", "local"}
 """Words of columns that are known, not measured."""
@@ -114,9 +115,11 @@ _BYWORDS = _STATED | {
     ),
 }
 """Words that do not change what a column resembles."""
+_CALLED_G = ("ref_field_nt", "mx", "my", "mz")
+"""Columns beside whose names G is Gauss, no unit of gravity."""
 _SPREADS = {"sd", "sigma", "std", "stdev", "unc", "uncertainty"}
-_ACCELEROMETERS = "acc accel acceleration accelerometer g a gravity grav"
-_MAGNETOMETERS = "mag magnetometer b h flux fluxgate m magfield magneticfield magn fg"
+_ACCELEROMETERS = "acc accel acceleration accelerometer accelerometers g a gravity grav"
+_MAGNETOMETERS = "mag magnetometer magnetometers b h flux fluxgate m magfield magneticfield magn fg"
 _INSTEAD = {
     "ref_inclination_deg": "inc incl incli inclin inclination",
     "ref_azimuth_deg": "azi azm azim azimut azimuth hdg heading bearing",
@@ -145,6 +148,7 @@ _WARMTH = {
         "thermistor",
         "thermocouple",
         "rtd",
+        "bht",
     ),
     *("ntc", "degc", "degf", "celsius", "fahrenheit"),
 }
@@ -278,6 +282,8 @@ def _resembled(name: str) -> Resemblance | None:
         column = "temperature_c"
     if column is None or (unit == "counts" and column not in _CHANNELS):
         return None
+    if column in _CALLED_G and unit == "g" and name.rstrip(" )]").endswith("G"):
+        unit = "gauss"
     if not spread:
         implied = "°F" if "f" in (whole[-1:], bare[-1:]) and column == "temperature_c" else ""
         return Resemblance(column, unit or implied)
@@ -291,14 +297,18 @@ def _column(whole: str, bare: str, words: set[str], unit: str) -> str | None:
     stated = bool(words & _STATED)
     magnetic = stated or unit in _MAGNETIC_UNITS or words & {"mag", "magnetic"}
     rules = {
-        "ref_field_nt": (bare == "field" and magnetic) or (bare in ("b", "h") and stated),
-        "ref_azimuth_deg": bare == "az" and (stated or unit in ("°", "rad")),
+        "ref_field_nt": (bare == "field" and magnetic)
+        or (bare in ("b", "h") and stated)
+        or (bare == "t" and unit in _MAGNETIC_UNITS),
+        "ref_azimuth_deg": bare == "az" and (stated or unit in ("°", "rad", "gon")),
         "temperature_c": bare in ("t", "deg", "") and unit in _WARM,
         "ref_gravity_g": bare == "g" and stated,
     }
     short = (s.removeprefix("ref").removesuffix("deg") for s in (whole, bare))
     if bare in ("tx", "ty", "tz") and unit in _MAGNETIC_UNITS:
         return f"m{bare[1]}"
+    if whole in ("x", "y", "z") and unit in (*_MAGNETIC_UNITS, *_GRAVITY_UNITS):
+        return f"{'m' if unit in _MAGNETIC_UNITS else 'a'}{whole}"
     known = [_SYNONYMS[stem] for stem in (whole, bare, *short) if stem in _SYNONYMS]
     return next(iter([column for column, fits in rules.items() if fits] + known), None)
 
@@ -322,7 +332,14 @@ def _words(name: str) -> list[str]:
     """The words of a name in lower case, its units spelled without signs."""
     text = unicodedata.normalize("NFKC", name.replace("º", "°"))
     text = re.sub(r"m\s*/\s*s\s*(\^\s*)?2|ms-2", " mss ", text)
-    for sign, word in (("°", " deg "), ("μ", "u"), ("µ", "u")):
+    for sign, word in (
+        ("°", " deg "),
+        ("μ", "u"),
+        ("µ", "u"),
+        ("мкТл", " ut "),
+        ("нТл", " nt "),
+        ("мВ", " mv "),
+    ):
         text = text.replace(sign, word)
     for cased, word in _CASED.items():
         text = re.sub(rf"(?<![A-Za-z]){cased}(?![A-Za-z])", word, text)

@@ -9,6 +9,7 @@ columns, not objects: `names` says which.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
@@ -16,9 +17,10 @@ import msgspec
 import numpy as np
 
 from mwdcal.calibration import results
-from mwdcal.calibration.automatic.auto import with_prior
-from mwdcal.calibration.automatic.drift import by_drift
+from mwdcal.calibration.automatic.auto import Choice, tables_of, with_prior
+from mwdcal.calibration.automatic.drift import with_drifts
 from mwdcal.calibration.automatic.nonlinearity import offered
+from mwdcal.calibration.calibrate import record_of
 from mwdcal.calibration.diagnosis.findings import finding_flags
 from mwdcal.calibration.diagnosis.flags import Alone, FittedRuns, Flag
 from mwdcal.calibration.diagnosis.refusals import BAD_INPUT, fit_refusals, reading_refusals
@@ -57,8 +59,8 @@ LISTS = ("findings", "reshoot", *(f"{triad}_undetermined" for triad in TRIADS))
 class Outcome:
     """What became of B tools: a status and a message each, and columns (B,) of results.
 
-    Where a tool has no result, there are NaN among `numbers`, and None among `lists` and units. `copies` (B,)
-    counts the stations that were left out as copies of others.
+    Where a tool has no result, there are NaN among `numbers`, and None among `lists`, `records` and units. `copies`
+    (B,) counts the stations that were left out as copies of others.
     """
 
     status: AnyArray
@@ -67,6 +69,7 @@ class Outcome:
     numbers: dict[str, Array]
     lists: dict[str, AnyArray]
     copies: Ints
+    records: AnyArray
 
     @classmethod
     def blank(cls, count: int, numbers: Iterable[str]) -> Outcome:
@@ -78,6 +81,7 @@ class Outcome:
             numbers={name: np.full(count, np.nan) for name in numbers},
             lists={name: np.full(count, None, object) for name in LISTS},
             copies=np.zeros(count, int),
+            records=np.full(count, None, object),
         )
 
     def sound(self, tools: Ints) -> Ints:
@@ -129,27 +133,27 @@ def names(options: Options, profile: Profile, triads: Sequence[str] = TRIADS) ->
 
 
 def calibrate_batch(
-    readings: Readings, options: Options, profile: Profile, alone: Alone
+    readings: Readings, options: Options, profile: Profile, alone: Alone, records: bool = False
 ) -> Outcome:
     """Calibrate tools of the same shape: readings (B, n, ...), at the profile's temperature.
 
     `alone` gives one tool's own readings where a check needs words for it. Stations to take again
-    are counted from 0.
+    are counted from 0. `records`: also what `mwdcal calibrate` writes for each sound tool.
     """
     outcome = Outcome.blank(len(readings.accelerometer), names(options, profile))
     none = np.zeros(readings.accelerometer.shape[:-1], bool)
-    batch = _Batch(readings, _with_scales(profile), alone, outcome, none)
+    batch = _Batch(readings, _with_scales(profile), alone, outcome, none, options, records)
     batch.calibrate(with_prior(options, readings, batch.profile))
     repeated = np.flatnonzero(batch.repeated.any(-1))
     blank = [np.isnan(readings.reference(name)[repeated]) for name in readings.known]
     patterns = np.concatenate([batch.repeated[repeated], *blank], -1)
     for pattern, tools in alike(repeated, patterns):
-        again = _without_copies(batch, tools, pattern[: readings.count], options)
+        again = _without_copies(batch, tools, pattern[: readings.count])
         outcome = put(outcome, tools, again)
     return outcome
 
 
-def _without_copies(batch: _Batch, tools: Ints, repeated: Bools, options: Options) -> Outcome:
+def _without_copies(batch: _Batch, tools: Ints, repeated: Bools) -> Outcome:
     """Some tools of a batch as if the stations where `repeated` (n,) is true were not in their runs."""
 
     def alone(place: int) -> tuple[Readings, Profile]:
@@ -157,7 +161,7 @@ def _without_copies(batch: _Batch, tools: Ints, repeated: Bools, options: Option
         return readings.without_copies(repeated), profile
 
     readings = take(batch.readings, tools).without_copies(repeated)
-    outcome = calibrate_batch(readings, options, batch.profile, alone)
+    outcome = calibrate_batch(readings, batch.given, batch.profile, alone, batch.records)
     outcome.copies[:] += np.count_nonzero(repeated)
     stations = np.flatnonzero(~repeated)
     for again in filter(None, outcome.lists["reshoot"]):
@@ -176,7 +180,7 @@ def _with_scales(profile: Profile) -> Profile:
 class _Batch:
     """Tools on their way: readings (B, n, ...), and the outcome that steps fill in for some of them.
 
-    `repeated` (B, n): the stations of sound fits that are copies of others.
+    `repeated` (B, n): the stations of sound fits that are copies of others. `given` are the options as they came.
     """
 
     readings: Readings
@@ -184,6 +188,8 @@ class _Batch:
     alone: Alone
     outcome: Outcome
     repeated: Bools
+    given: Options
+    records: bool
 
     def calibrate(self, options: Options) -> None:
         """Choose what the options leave to the data, fit, and note what came of it."""
@@ -194,9 +200,9 @@ class _Batch:
             if chosen.order != options.order:
                 self._screen(some, chosen)
             for part, final in with_curves(readings, sound(some), chosen, self.profile, fail):
-                for few, result in in_chunks(readings, part, partial(fit, options=final), fail):
-                    for places, drifted in by_drift(result, final):
-                        self._note(few[places], final, drifted)
+                fits = in_chunks(readings, part, partial(fit, options=final), fail)
+                for few, result in with_drifts(fits, final):
+                    self._note(few, final, result)
 
     def _screen(self, tools: Ints, options: Options) -> None:
         """Refuse those of some tools that no fit could mend."""
@@ -236,8 +242,21 @@ class _Batch:
         self._note_findings(tools[good], fitted)
         if readings.magnetometer is not None:
             self.outcome.unit[tools[good]] = readings.field_unit
+        if self.records:
+            self._note_records(tools[good], fitted)
         for name, values in _columns(fitted, self.profile.reference_temperature_c).items():
             self.outcome.numbers[name][tools[good]] = values
+
+    def _note_records(self, tools: Ints, fitted: FittedRuns) -> None:
+        """What `mwdcal calibrate` writes for sound tools; of its time the day, so that another run gives the same."""
+        for place in np.flatnonzero(~self.repeated[tools].any(-1)).tolist():
+            options, (readings, profile) = fitted.options, fitted.alone(place)
+            with suppress(MwdcalError):  # of a tool that is sound by a hair in the batch alone
+                orders = tables_of(readings, self.given, options)
+                choice = Choice(readings, profile, options, orders)
+                record = record_of(choice, fitted.alone_as(place, (readings, profile)))
+                day = msgspec.structs.replace(record, time=record.time.partition("T")[0])
+                self.outcome.records[tools[place]] = msgspec.json.encode(day)
 
     def _note_findings(self, tools: Ints, fitted: FittedRuns) -> None:
         """The findings of sound tools; what is undetermined, by triad."""

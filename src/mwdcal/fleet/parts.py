@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,11 +11,11 @@ import msgspec
 import numpy as np
 
 from mwdcal import __version__
-from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.diagnosis.flags import Alone
 from mwdcal.calibration.diagnosis.refusals import BAD_INPUT
 from mwdcal.calibration.options import AUTO, Options
-from mwdcal.calibration.readings import HIGHEST, TRIADS
-from mwdcal.errors import InputError, MwdcalError
+from mwdcal.calibration.readings import HIGHEST, TRIADS, Readings
+from mwdcal.errors import InputError
 from mwdcal.estimation.batch import put
 from mwdcal.files.contract import AZIMUTH_KEYS, CHANNELS
 from mwdcal.files.formats import parquet
@@ -25,7 +24,7 @@ from mwdcal.fleet.calibrate import LISTS, OK, Outcome, calibrate_batch, names
 from mwdcal.fleet.runs import Rows, batches, refused_tools
 from mwdcal.fleet.sources import SERIAL, FleetTable
 from mwdcal.fleet.tables import Partition, read
-from mwdcal.geometry.vectors import Array
+from mwdcal.geometry.vectors import Array, Ints
 from mwdcal.sensor.profile import Profile
 
 WHOLE_NUMBERS = ("rank", "size", "order")
@@ -113,12 +112,25 @@ def _result(rows: Rows, plan: Plan) -> Any:
     for tool, text in refused_tools(rows).items():
         whole.status[tool], whole.message[tool] = BAD_INPUT, text
     for tools, readings in batches(rows, np.flatnonzero(whole.status == OK)):
-        outcome = calibrate_batch(readings, plan.options, plan.profile, rows.members(tools))
+        outcome = calibrate_batch(
+            readings, plan.options, plan.profile, _alone(rows, tools, plan), plan.records
+        )
         whole = put(whole, tools, outcome)
     again = whole.lists["reshoot"]
     for tool in np.flatnonzero(whole.status == OK).tolist():
         again[tool] = [rows.label(tool, station) for station in again[tool]]
     return _table(rows, plan, whole)
+
+
+def _alone(rows: Rows, tools: Ints, plan: Plan) -> Alone:
+    """One of some tools as a single run, which states the profile that the fleet has."""
+    members = rows.members(tools)
+
+    def alone(place: int) -> tuple[Readings, Profile]:
+        readings, profile = members(place)
+        return replace(readings, profile_sha256=plan.profile_sha256), profile
+
+    return alone
 
 
 def _table(rows: Rows, plan: Plan, whole: Outcome) -> Any:
@@ -148,25 +160,9 @@ def _table(rows: Rows, plan: Plan, whole: Outcome) -> Any:
             "method": arrow.repeat(plan.options.method, len(rows.counts)),
             "model": arrow.array(kinds[np.nan_to_num(order + 1).astype(int)], text),
             "order": _numbers("order", order),
-            **({RECORD: arrow.array(_records(rows, plan, whole), text)} if plan.records else {}),
+            **({RECORD: arrow.array(whole.records, text)} if plan.records else {}),
         }
     )
-
-
-def _records(rows: Rows, plan: Plan, whole: Outcome) -> list[bytes | None]:
-    """What `mwdcal calibrate` writes for each sound tool, None for others; of its time the day.
-
-    So another run on the same day gives the same bytes.
-    """
-    records: list[bytes | None] = [None] * len(rows.counts)
-    for tool in np.flatnonzero(whole.status == OK).tolist():
-        readings, profile = rows.alone(tool)
-        readings = replace(readings, profile_sha256=plan.profile_sha256)
-        with suppress(MwdcalError):  # of a tool that is sound by a hair in the batch alone
-            calibration = calibrate(readings, profile, plan.options)
-            day = calibration.time.partition("T")[0]
-            records[tool] = msgspec.json.encode(msgspec.structs.replace(calibration, time=day))
-    return records
 
 
 def _numbers(name: str, values: Array) -> Any:

@@ -154,6 +154,18 @@ def eigen(matrix: Array) -> tuple[Array, Array]:
     return np.asarray(values), np.asarray(vectors)
 
 
+def square_root(covariance: Array) -> Array:
+    """A matrix (p, k) whose product with its transpose is a covariance (p, p) of quantities in any units.
+
+    Each is scaled to a variance of 1 first: the rounding of the largest would otherwise drown the smallest.
+    """
+    scale = np.sqrt(np.diagonal(covariance))
+    scale = np.where(scale > 0, scale, 1.0)
+    values, vectors = eigen(covariance / scale / scale[:, None])
+    kept = values > 0
+    return np.asarray(scale[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
+
+
 def eigenvalues(matrix: Array) -> Array:
     """Eigenvalues (..., k) alone, smallest first: half the work."""
     return np.asarray(np.linalg.eigvalsh(finite(matrix)))

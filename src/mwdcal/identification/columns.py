@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from mwdcal.errors import FitError, InputError
+from mwdcal.errors import Answer, InputError, QuestionError, QuestionsError
 from mwdcal.files.contract import CHANNELS, MAPPED, RAW, REFERENCES, forms, units_of
-from mwdcal.files.formats.columns import shown
+from mwdcal.files.formats.columns import LABELS, shown
+from mwdcal.files.settings import setting
 from mwdcal.files.synonyms import (
     ABOVE,
     ANTICLOCKWISE,
@@ -22,6 +23,22 @@ from mwdcal.files.synonyms import (
     unit_of,
 )
 from mwdcal.geometry.vectors import Array
+from mwdcal.identification.answers import (
+    IN_BRACKETS,
+    LEAST_ROLLS,
+    RANGES_BY_UNIT,
+    STEADY_NORM,
+    Values,
+    candidates_for,
+    channels_for,
+    first_values,
+    in_units,
+    lacking_references,
+    may_be,
+    none_of,
+    triples_for,
+    with_values,
+)
 from mwdcal.identification.words import spelled
 from mwdcal.sensor.profile import ColumnSource
 
@@ -41,9 +58,14 @@ _OTHER_NORTH = re.compile(
     r"true|grid|geogra|wahr|gitter|rechtweisend|[qc]uadr[ií]cula|verdadero|verdadeiro|istinn|kartnord|истин|сетк|географ|真|坐标北|网格",
     re.IGNORECASE,
 )
+_GRID_NORTH = re.compile(r"grid|gitter|[qc]uadr[ií]cula|kartnord|сетк|坐标北|网格", re.IGNORECASE)
 _OF_NORTH = re.compile(r"north|nord|norte|azi|azm|heading|азим|север|北|方位", re.IGNORECASE)
 """Words of the north that azimuths count from."""
 _NUMBERED = re.compile(r"(.*?[A-Za-z])[ _-]*([123])((?:\W.*|_[A-Za-z]+)?)")
+_TITLE = re.compile(
+    r"(acc|mag|accelerometers?|magnetometers?)?(?:s|ref|sensors?)? +", re.IGNORECASE
+)
+"""The title of a group of columns before the name of one."""
 _BARE_AZ = re.compile(r"az\W*(deg|°)?\W*", re.IGNORECASE)
 _BARE_AX = re.compile(r"a[xy]\b.*", re.IGNORECASE)
 _CCW = re.compile(
@@ -62,23 +84,10 @@ _SURROUNDINGS = re.compile(
     re.IGNORECASE,
 )
 """What has a temperature of its own that is not the tool's."""
-_IN_BRACKETS = re.compile(r"[(\[]([^)\]]*)[)\]]\s*$")
-_BY_VALUE: dict[str, tuple[tuple[str, float, float], ...]] = {
-    "ref_gravity_g": (("g", 0.9, 1.1), ("m/s²", 9.0, 10.5), ("mg", 990.0, 1010.0)),
-    "ref_field_nt": (
-        ("nT", 15_000.0, 80_000.0), ("µT", 15.0, 80.0), ("gauss", 0.15, 0.8), ("mT", 0.015, 0.08),
-    ),
-}  # fmt: skip
-"""Units of quantities of which the Earth has but one range of values; 980 may be milli-g or gal."""
-LEAST_ROLLS = 5
-"""Toolfaces from which on their unit is told by their range."""
 COOLEST_FAHRENHEIT = 45.0
 """Numbers below it are degrees Celsius: no tool is calibrated below 7 °C alone."""
 HOTTEST_CELSIUS = 200.0
 """Numbers above it may be degrees Fahrenheit: hardly a tool works above 200 °C."""
-
-Values = Callable[[str], Array | None]
-"""The numbers of a column by its name; None where it holds no numbers."""
 
 
 def meaning(name: str, unit: str = "") -> Resemblance | None:
@@ -93,13 +102,25 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
         return turned and (
             turned._replace(unit=ANTICLOCKWISE) if turned.column == "ref_toolface_deg" else turned
         )
-    alike = resembled(plain)
+    alike = (
+        resembled(plain) or _without_title(plain) or resembled(f"{name} ({unit})" if unit else name)
+    )
     if _MEASURED.search(plain) and not (alike and alike.column == WARMTH):
         return None
     near = {form: column for column in MAPPED for form in forms(column)}
     spelt = next((near[form] for form in forms(plain) if form in near), None)
-    stated = _IN_BRACKETS.search(plain)
+    stated = IN_BRACKETS.search(plain)
     return alike or (Resemblance(spelt, unit_of(stated[1]) if stated else "") if spelt else None)
+
+
+def _without_title(name: str) -> Resemblance | None:
+    """What a name resembles behind the title of its group, which says no other triad: Accelerometers Gx (V)."""
+    title = _TITLE.match(name)
+    alike = resembled(name[title.end() :]) if title else None
+    if not title or not alike:
+        return None
+    triad = begins_as(f"{title[1].rstrip('s')} x y") if title[1] else ""
+    return None if triad and alike.column[0] != triad[0] else alike
 
 
 def meanings_of(names: Sequence[str], units: Sequence[str]) -> dict[str, Resemblance]:
@@ -146,7 +167,7 @@ def _answered(
                 f"`column` {shown(ours)}: expected one of {', '.join(MAPPED[:14])} and their sd_…."
             )
         name, unit = theirs, ""
-        match = _IN_BRACKETS.search(theirs)
+        match = IN_BRACKETS.search(theirs)
         if theirs not in names and match:
             name, unit = theirs[: match.start()].strip(), match[1].strip()
         if name and name not in names:
@@ -160,25 +181,21 @@ def _answered(
             meanings[name] = Resemblance(ours, unit_of(unit) or unit or stated)
 
 
-class Questions(list[str]):
-    """What names and readings leave open, each with the option that answers it."""
+class Questions(list[QuestionError]):
+    """What names and readings leave open, each with what answers it."""
 
     def ask(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """What a function returns; None where it has a question."""
         try:
             return function(*arguments)
-        except FitError as question:
-            self.append(str(question))
+        except QuestionError as question:
+            self.append(question)
             return None
 
     def raise_any(self, source: str) -> None:
         """Raise all questions together."""
-        texts = [each.removeprefix(f"{source}: ") for each in dict.fromkeys(self)]
-        if len(texts) == 1:
-            raise FitError(f"{source}: {texts[0]}")
-        if texts:
-            listed = " ".join(f"({n}) {text}" for n, text in enumerate(texts, 1))
-            raise FitError(f"{source}: {len(texts)} questions are open. {listed}")
+        if self:
+            raise QuestionsError(source, [*{str(each): each for each in self}.values()])
 
 
 def proposed(
@@ -190,8 +207,10 @@ def proposed(
     north_is_stated: bool = False,
     answers: Mapping[str, str] | None = None,
     problems: Mapping[str, str] | None = None,
-) -> tuple[dict[str, ColumnSource], set[str]]:
+) -> tuple[dict[str, ColumnSource], set[str], dict[str, str]]:
     """The columns of a table by the name that they have in a run file, and those with a unit by their values.
+
+    And columns that are no evidence although they are called so, each with the reason.
 
     `above`: lines above the names. `north_is_stated`: the table's metadata say what azimuths count from. `answers`:
     columns of the table by the name of the run file, as the user says. `problems`: what is wrong with columns of
@@ -203,40 +222,133 @@ def proposed(
             values tell, azimuths from true or grid north, no accelerometer: all that is open.
     """
     meanings = meanings_of(names, units)
-    _answered(answers or {}, names, meanings, source)
-    spoken = _spoken(meanings, values, above)
+    _tell_dip(meanings, values)
+    said = answers or {}
+    ignored = _no_evidence(meanings, values, said)
+    _answered(said, names, meanings, source)
     questions = Questions()
-    chosen: dict[str, ColumnSource] = {}
-    for column in dict.fromkeys(m.column for m in meanings.values()):
-        candidates = [name for name, m in meanings.items() if m.column == column]
-        numbers = [n for n in candidates if column == "serial" or values(n) is not None]
-        damaged = [problems[n] for n in candidates if problems and n in problems]
-        if damaged and not _stated_among(numbers):
-            questions += damaged
-        candidates = numbers
-        name = questions.ask(_one, column, candidates, source) if candidates else None
-        if name:
-            unit = questions.ask(
-                _unit,
-                column,
-                name,
-                meanings[name].unit or _angles(column, spoken),
-                values(name),
-                source,
-            )
-            chosen[column] = ColumnSource(name=name, unit=unit or "")
+    spoken = _spoken(meanings, values, above)
+    chosen = _chosen(meanings, values, problems or {}, spoken, ignored, questions, source)
     azimuth = chosen.get(REFERENCES["azimuth"].column)
     if azimuth and not north_is_stated:
         questions.ask(_check_north, azimuth.name, above, source)
     for triad, channels in CHANNELS.items():
-        if not {*channels} & {*chosen}:
+        if not {*channels} & {*chosen, *said}:
             others = [n for n in names if n not in meanings]
-            questions.ask(_check_hidden, triad, channels, others, source)
-    questions.ask(_check_triads, names, chosen, source)
+            questions.ask(_check_hidden, triad, channels, others, values, source)
+    if not any("channels of the accelerometer" in each.text for each in questions):
+        questions.ask(_check_triads, names, values, chosen, source)
     questions.ask(_check_units_of_triads, chosen, source)
+    if not {*RAW[3:]} & {*chosen, *said}:
+        questions.ask(_check_nameless, names, meanings, values, chosen, source)
+    rest = {n: u for n, u in zip(names, units, strict=True) if n not in meanings}
+    for column in lacking_references({*chosen, *said}):
+        questions.ask(_check_lacking, column, rest, values, source)
     questions.raise_any(source)
     by_value = {c for c, each in chosen.items() if each.unit and not meanings[each.name].unit}
-    return _labels(names, chosen) | chosen, by_value
+    used = {each.name for each in chosen.values()}
+    ignored = {name: reason for name, reason in ignored.items() if name not in used}
+    return _labels(names, chosen) | chosen, by_value, ignored
+
+
+def _chosen(
+    meanings: Mapping[str, Resemblance],
+    values: Values,
+    problems: Mapping[str, str],
+    spoken: str,
+    ignored: Collection[str],
+    questions: Questions,
+    source: str,
+) -> dict[str, ColumnSource]:
+    """The columns of a run file that the names of a table are, each with its unit; questions where they may be two."""
+    chosen: dict[str, ColumnSource] = {}
+    for column in dict.fromkeys(m.column for m in meanings.values()):
+        alike = [name for name, m in meanings.items() if m.column == column]
+        candidates = [n for n in alike if column in LABELS or values(n) is not None]
+        candidates = [n for n in candidates if n not in ignored]
+        damaged = [problems[n] for n in alike if n in problems]
+        if damaged and not _stated_among(candidates):
+            questions += map(QuestionError, damaged)
+        name = questions.ask(_one, column, candidates, values, source) if candidates else None
+        if name:
+            stated = meanings[name].unit or _angles(column, spoken)
+            unit = questions.ask(_unit, column, name, stated, values(name), source)
+            chosen[column] = ColumnSource(name=name, unit=unit or "")
+    return chosen
+
+
+def _no_evidence(
+    meanings: Mapping[str, Resemblance], values: Values, answers: Mapping[str, str]
+) -> dict[str, str]:
+    """Columns that are called as references and are none, each with the reason.
+
+    That is what the user says is none; totals computed from the channels; and rolls in whole degrees beside no other
+    angle of the stand, which are nominal.
+    """
+    ignored = {}
+    called = {m.column for m in meanings.values()}
+    lone = called.isdisjoint(REFERENCES[name].column for name in ("inclination", "azimuth"))
+    for name, m in meanings.items():
+        if answers.get(m.column) == "":
+            ignored[name] = "as you say"
+        elif m.column in answers:
+            continue
+        elif _is_total(m.column, name, meanings, values):
+            ignored[name] = "it is computed from the channels"
+        elif m.column == REFERENCES["toolface"].column and lone and _is_whole(values(name)):
+            ignored[name] = (
+                f"its rolls are nominal, in whole degrees without other angles of the stand; if they were set, say so "
+                f"by `column` {m.column}={name!r}"
+            )
+    return ignored
+
+
+def _is_whole(values: Array | None) -> bool:
+    return values is not None and bool(np.all(np.isnan(values) | (values == np.round(values))))
+
+
+def _tell_dip(meanings: dict[str, Resemblance], values: Values) -> None:
+    """Of several inclinations the one that hardly varies is the dip, where no column is called so."""
+    inclined = [n for n, m in meanings.items() if m.column == REFERENCES["inclination"].column]
+    if len(inclined) < 2 or any(m.column == REFERENCES["dip"].column for m in meanings.values()):
+        return
+    steady = [
+        n
+        for n in inclined
+        if may_be(REFERENCES["dip"].column, n, meanings[n].unit or "°", values(n))
+    ]
+    if len(steady) == 1 and not _CALLED_REFERENCE.search(spelled(steady[0])):
+        meanings[steady[0]] = Resemblance(REFERENCES["dip"].column, "°")
+
+
+def _is_total(column: str, name: str, meanings: Mapping[str, Resemblance], values: Values) -> bool:
+    """Whether a column of a strength is computed from the channels: in their raw unit, or equal to their norm."""
+    triad = {"ref_gravity_g": "accelerometer", "ref_field_nt": "magnetometer"}.get(column)
+    if triad is None:
+        return False
+    if meanings[name].unit in ("V", "mV", "counts", "raw"):
+        return True
+    channels = [n for n, m in meanings.items() if m.column in CHANNELS[triad]]
+    columns = [v for n in channels if (v := values(n)) is not None]
+    total = values(name)
+    if len(columns) != 3 or total is None:
+        return False
+    norm = np.linalg.norm(columns, axis=0)
+    return bool(np.ptp(norm) > 0 and np.abs(norm - total).max() < 0.02 * np.ptp(norm))
+
+
+def _check_lacking(column: str, others: Mapping[str, str], values: Values, source: str) -> None:
+    """Ask whether columns that are not understood, with their units, are a reference that is absent."""
+    fits = [
+        n
+        for n, unit in others.items()
+        if not _MEASURED.search(spelled(n)) and may_be(column, n, unit, values(n))
+    ]
+    if fits:
+        raise QuestionError(
+            f"{source}: no column is '{column}' by its name. Is it one of these?",
+            candidates_for(column, fits, values),
+        )
 
 
 def _stated_among(names: Sequence[str]) -> bool:
@@ -266,31 +378,63 @@ def _angles(column: str, unit: str) -> str:
     return unit if stand else ""
 
 
-def _check_triads(names: Sequence[str], chosen: Mapping[str, ColumnSource], source: str) -> None:
+def _check_triads(
+    names: Sequence[str], values: Values, chosen: Mapping[str, ColumnSource], source: str
+) -> None:
     """Refuse a table without accelerometers, or with a part of the magnetometers."""
     absent = [name for name in RAW[:3] if name not in chosen]
+    others = [n for n in names if n not in {each.name for each in chosen.values()}]
     if absent:
-        answer = " ".join(f"{name}=NAME" for name in absent)
-        raise FitError(
-            f"{source}: no column says by its name that it is {', '.join(absent)}; the names are "
-            f"{', '.join(map(shown, names[:20]))}. Name the accelerometers such as Gx, Gy, Gz or ax, ay, az, or say "
-            f"which they are by `column` {answer}."
+        raise QuestionError(
+            f"{source}: could not tell which columns are the accelerometers ({', '.join(absent)}); the names are "
+            f"{', '.join(map(shown, names[:20]))}.",
+            triples_for(RAW[:3], others, values)
+            if len(absent) == 3
+            else channels_for(absent[0], others, values),
         )
-    if 0 < sum(name in chosen for name in RAW[3:]) < 3:
-        raise FitError(
+    lacking = [name for name in RAW[3:] if name not in chosen]
+    if 0 < len(lacking) < 3:
+        raise QuestionError(
             f"{source}: of the magnetometers only {', '.join(n for n in RAW[3:] if n in chosen)} can be told by "
-            "name. Name all three such as Bx, By, Bz or mx, my, mz, or say which they are by `column`."
+            "name.",
+            channels_for(lacking[0], others, values),
         )
 
 
-def _check_hidden(triad: str, channels: Sequence[str], others: Sequence[str], source: str) -> None:
+def _check_hidden(
+    triad: str, channels: Sequence[str], others: Sequence[str], values: Values, source: str
+) -> None:
     """Refuse a table without a triad of which columns that are not understood begin as its channels do."""
-    hidden = [name for name in others if begins_as(name) in channels]
+    hidden = {channel: n for n in others if (channel := begins_as(n)) in channels}
     if hidden:
-        raise FitError(
-            f"{source}: {', '.join(map(shown, hidden[:6]))} begin as channels of the {triad} do, and end in what is "
-            "no known unit. If they are the channels, put the unit in brackets, as in 'Bx (counts)'; if they are "
-            "something else, give them names that say so."
+        whole = tuple(
+            ("column", f"{channel}={hidden.get(channel, 'NAME')}") for channel in channels
+        )
+        taken = Answer(with_values(", ".join(hidden.values()), values, *hidden.values()), whole)
+        raise QuestionError(
+            f"{source}: {', '.join(map(shown, [*hidden.values()][:6]))} begin as channels of the {triad} do, and end "
+            "in what is no known unit. Are they the channels?",
+            [*([taken] if len(hidden) == len(channels) else []), none_of(*channels)],
+        )
+
+
+def _check_nameless(
+    names: Sequence[str],
+    meanings: Mapping[str, Resemblance],
+    values: Values,
+    chosen: Mapping[str, ColumnSource],
+    source: str,
+) -> None:
+    """Ask whether three columns of a steady norm are magnetometers, in a table with references of a field."""
+    of_field = [REFERENCES[name].column for name in ("field", "dip", "azimuth")]
+    if not {*of_field} & {*chosen}:
+        return
+    unused = [n for n in names if n not in meanings]
+    if triples := triples_for(RAW[3:], unused, values, STEADY_NORM):
+        raise QuestionError(
+            f"{source}: no column is a magnetometer by its name, and the table states the field. Are these the "
+            "magnetometers?",
+            [*triples, none_of(*RAW[3:])],
         )
 
 
@@ -301,7 +445,7 @@ def _check_units_of_triads(chosen: Mapping[str, ColumnSource], source: str) -> N
         stated = [chosen[c] for c in columns if c in chosen and chosen[c].unit]
         other = next((each for each in stated if each.unit != stated[0].unit), None)
         if other:
-            raise FitError(
+            raise QuestionError(
                 f"{source}: {shown(stated[0].name)} is in {stated[0].unit}, {shown(other.name)} in {other.unit}. "
                 "Give the channels of a triad in one unit: their scale is one."
             )
@@ -315,30 +459,38 @@ def _check_north(name: str, above: Sequence[str], source: str) -> None:
     if not line and not _OTHER_NORTH.search(f"{name} {spelled(name)}"):
         return
     said = f"by the line {shown(line)}" if line else "by its name"
-    raise FitError(
-        f"{source}: {shown(name)} counts from true or grid north {said}. Put the lines "
-        '# azimuth_reference = "true" and # declination_deg = … above the table (east is positive), or '
-        '# azimuth_reference = "magnetic" where it is magnetic.'
+    grid = bool(_GRID_NORTH.search(f"{line or name} {spelled(name)}"))
+    norths = [
+        Answer("true north", (("north", "true"),), ("declination_deg",)),
+        Answer("grid north", (("north", "grid"),), ("declination_deg", "convergence_deg")),
+    ]
+    raise QuestionError(
+        f"{source}: {shown(name)} counts from true or grid north {said}, and the readings from magnetic north. "
+        "Which is it, and what is the declination, degrees east?",
+        [
+            *(norths[::-1] if grid else norths),
+            Answer("magnetic north after all", (("north", "magnetic"),)),
+        ],
     )
 
 
-def _one(column: str, candidates: Sequence[str], source: str) -> str:
+def _one(column: str, candidates: Sequence[str], values: Values, source: str) -> str:
     """The only candidate for a column: of its very name, or the only one that is called a reference."""
     if column in candidates:
         return column
     if column == WARMTH:
-        candidates = [n for n in candidates if not _SURROUNDINGS.search(n)] or candidates
-    if column == WARMTH and len(candidates) > 1:
-        raise FitError(
-            f"{source}: {' and '.join(map(shown, candidates))} may each be the temperature of the tool. Rename the "
-            f"one nearest to the sensors to '{column}', or say which by `column` {column}=NAME."
-        )
+        of_tool = [n for n in candidates if not _SURROUNDINGS.search(n)] or candidates
+        candidates = [n for n in of_tool if not _CALLED_REFERENCE.search(spelled(n))] or of_tool
     stated = [name for name in candidates if _CALLED_REFERENCE.search(spelled(name))]
     if len(candidates) == 1 or len(stated) == 1:
         return (stated or candidates)[0]
-    raise FitError(
-        f"{source}: {' and '.join(map(shown, candidates))} may each be '{column}'. Call the one that the stand "
-        f"shows a reference, such as 'Ref {candidates[0]}', or say which by `column` {column}=NAME."
+    of = "the temperature of the tool" if column == WARMTH else f"'{column}'"
+    advice = (
+        "Which is nearest to the sensors?" if column == WARMTH else "Which one does the stand show?"
+    )
+    raise QuestionError(
+        f"{source}: {' and '.join(map(shown, candidates))} may each be {of}. {advice}",
+        candidates_for(column, candidates, values),
     )
 
 
@@ -350,19 +502,22 @@ def _unit(column: str, name: str, stated: str, values: Array | None, source: str
     if stated:
         if stated in allowed:
             return stated
-        raise FitError(
+        raise QuestionError(
             f"{source}: {shown(name)} is '{column}' by its name, and in {stated}, which is not one of "
-            f"{', '.join(allowed)}. Correct its name or its unit."
+            f"{', '.join(allowed)}.",
+            [*in_units(name, column, allowed), none_of(column)],
         )
     known = values[np.isfinite(values)]
-    if column in _BY_VALUE and known.size:
-        for unit, low, high in _BY_VALUE[column]:
+    if column in RANGES_BY_UNIT and known.size:
+        for unit, low, high in RANGES_BY_UNIT[column]:
             if low <= known.min() and known.max() <= high:
                 return unit
-        raise _open(name, column, allowed, source)
+        raise _open(name, column, allowed, known, source)
     both = {"°": _maybe_radians, "°C": _maybe_fahrenheit}.get(allowed[0])
     if both and known.size and both(known):
-        raise _open(name, column, allowed, source)
+        if allowed[0] == "°C" and (usual := setting("temperature_unit")):
+            return usual
+        raise _open(name, column, allowed, known, source)
     return allowed[0]
 
 
@@ -374,11 +529,13 @@ def _maybe_fahrenheit(temperatures: Array) -> bool:
     return bool(temperatures.min() >= COOLEST_FAHRENHEIT or temperatures.max() > HOTTEST_CELSIUS)
 
 
-def _open(name: str, column: str, allowed: Sequence[str], source: str) -> FitError:
-    return FitError(
-        f"{source}: {shown(name)} is '{column}', and neither its name nor its values say whether it is in "
-        f"{' or '.join(allowed)}. Write the unit behind the name, such as '{name} ({allowed[0]})', or say it "
-        f"by `column` {column}='{name} ({allowed[0]})'."
+def _open(
+    name: str, column: str, allowed: Sequence[str], known: Array, source: str
+) -> QuestionError:
+    return QuestionError(
+        f"{source}: {shown(name)} is '{column}', and neither its name nor its values ({first_values(known)}) say "
+        f"whether it is in {' or '.join(allowed)}.",
+        in_units(name, column, allowed),
     )
 
 

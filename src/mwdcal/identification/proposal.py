@@ -3,29 +3,33 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
+from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import Finding
-from mwdcal.errors import FitError, InputError
+from mwdcal.errors import Answer, FitError, InputError, QuestionError
 from mwdcal.files.contract import CHANNELS, MAPPED, REFERENCES, units_of
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, shown
 from mwdcal.files.formats.figures import is_figure
-from mwdcal.files.formats.layout import Layout
+from mwdcal.files.formats.layout import WORKBOOKS, Layout
 from mwdcal.files.formats.table import Table
 from mwdcal.files.formats.table import labels as labels_of
 from mwdcal.files.formats.text import is_preamble
 from mwdcal.files.metadata import toml
+from mwdcal.files.profiles import CHOICE_OF_AXES
 from mwdcal.files.runs import check_run, renamed, to_readings
-from mwdcal.files.synonyms import ABOVE, BELOW
+from mwdcal.files.statements import stated_table
+from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
 from mwdcal.identification.columns import meanings_of, proposed
@@ -45,15 +49,26 @@ LAST_PLACES = (0.1, 0.01, 0.001)
 """Units in the last place of angles, degrees."""
 SAME_GRAVITY = 2e-4
 """A local gravity does not differ by more between stations, g; what tools measure does."""
+_SELDOM = ("ignore", "azimuth_reference", "declination_deg", "convergence_deg")
 MOST_NAMED = 6
 """Alternatives that a message names."""
+
+
+class OpenAxes(NamedTuple):
+    """Why the axes of a triad are open, those that fit about as well, and its nominal scale."""
+
+    reason: str
+    alternatives: Sequence[tuple[str, ...]]
+    scale: float | None
 
 
 class Proposal(NamedTuple):
     """A profile, how the axes of each triad in it were told, and the run that told.
 
     `unused` are columns of the table that are nothing of a run file, `by_value` columns of a run file whose
-    unit no name states; `metadata` what the table says of itself; `where` the table was, if it was looked for.
+    unit no name states; `metadata` what the table says of itself; `where` the table was, if it was looked for;
+    `open_axes` the triads of which the run does not tell the axes, `ignored` columns that are called as references
+    and are none, each with the reason.
     """
 
     profile: Profile
@@ -64,6 +79,8 @@ class Proposal(NamedTuple):
     metadata: Mapping[str, object]
     run_sha256: str
     where: Layout | None = None
+    open_axes: Mapping[str, OpenAxes] = {}
+    ignored: Mapping[str, str] = {}
 
 
 def propose(
@@ -74,45 +91,43 @@ def propose(
     decimal: str = "",
     answers: Mapping[str, str] | None = None,
     stated: Mapping[str, object] | None = None,
+    north: Mapping[str, object] | None = None,
 ) -> Proposal:
     """The profile with which a table of stations at known attitudes is a calibration run.
 
     `sheet`, `header_row` and `decimal` say where the table is and how its numbers are written, `answers` which
-    column holds what, `stated` what the table does not say of the tool, as metadata.
+    column holds what, `stated` what the table does not say of the tool, as metadata, `north` what its azimuths count
+    from, as metadata too.
 
     Raises:
         InputError: the file cannot be read, or is no table of stations.
-        FitError: columns, units or axes that names and readings leave open.
+        FitError: columns and units that names and readings leave open, or readings that no axes explain.
     """
     where = tables.laid_out(path, sheet=sheet, header_row=header_row, decimal=decimal)
     table, form = _as_written(path, where, bool(sheet or header_row or decimal))
-    table = replace(table, metadata={**table.metadata, **(stated or {})})
+    table = replace(table, metadata={**table.metadata, **(stated or {}), **(north or {})})
+    if north:
+        form = msgspec.structs.replace(form or TableFormat(find=True), **north)
     names = where.names if where else [*table.columns]
     units = where.units if where else [""] * len(names)
 
     problems: dict[str, str] = {}
-
-    def values(name: str) -> Array | None:
-        try:
-            return tables.numbers(table, name)
-        except InputError as error:
-            if 2 * sum(map(is_figure, labels_of(table, name))) > table.count:
-                problems[name] = str(error)
-            return None
-
-    north_stated = "azimuth_reference" in table.metadata
-    columns, by_value = proposed(
+    above, stated_north = where.above if where else (), "azimuth_reference" in table.metadata
+    columns, by_value, ignored = proposed(
         names,
         units,
-        values,
+        partial(_numbers_of, table, problems),
         table.source,
-        where.above if where else (),
-        north_stated,
+        above,
+        stated_north,
         answers,
         problems,
     )
+    if ignored:
+        form = msgspec.structs.replace(form or TableFormat(find=True), ignore=tuple(ignored))
+    table = _of_one_tool(table, columns, stated or {})
     profile = Profile(name=Path(path).stem, table=form or msgspec.UNSET, columns=columns)
-    profile, readings, wirings = _wired(table, profile)
+    profile, readings, wirings, open_axes = _wired(table, profile)
     name, triads = str(readings.metadata.get("serial", Path(path).stem)), _triads(readings, wirings)
     profile = msgspec.structs.replace(profile, name=name, **triads)
     return Proposal(
@@ -124,7 +139,35 @@ def propose(
         readings.metadata,
         readings.run_sha256,
         where,
+        open_axes,
+        ignored,
     )
+
+
+def _of_one_tool(
+    table: Table, columns: Mapping[str, ColumnSource], stated: Mapping[str, object]
+) -> Table:
+    """The rows of one tool, by the serial that the user says where there are several."""
+    column = columns["serial"].name if "serial" in columns else "serial"
+    tools = [*dict.fromkeys(filter(None, labels_of(table, column)))]
+    serial = str(stated.get("serial", ""))
+    if len(tools) > 1 and not serial:
+        raise QuestionError(
+            f"{table.source} has rows of {len(tools)} tools ({', '.join(map(shown, tools[:MOST_NAMED]))}). Which one "
+            "is meant?",
+            [Answer(tool, (("serial", tool),)) for tool in tools],
+        )
+    return stated_table(table, {"serial": serial} if len(tools) > 1 else {}, column)
+
+
+def _numbers_of(table: Table, problems: dict[str, str], name: str) -> Array | None:
+    """The numbers of a column; None where it has none, with the problem where most of its cells are numbers."""
+    try:
+        return tables.numbers(table, name)
+    except InputError as error:
+        if 2 * sum(map(is_figure, labels_of(table, name))) > table.count:
+            problems[name] = str(error)
+        return None
 
 
 def _triads(readings: Readings, wirings: Mapping[str, Wiring]) -> dict[str, TriadProfile]:
@@ -138,26 +181,31 @@ def _triads(readings: Readings, wirings: Mapping[str, Wiring]) -> dict[str, Tria
     }
 
 
-def _wired(table: Table, profile: Profile) -> tuple[Profile, Readings, dict[str, Wiring]]:
-    """The readings of a table by a profile, and the axes of its triads.
+def _wired(
+    table: Table, profile: Profile
+) -> tuple[Profile, Readings, dict[str, Wiring], dict[str, OpenAxes]]:
+    """The readings of a table by a profile, the axes of its triads, and the triads whose axes are open.
 
     An elevation may count upwards or downwards: the sense is the one by which the channels are a right-handed set.
     """
     run = renamed(table, profile)
     check_run(run)
-    readings, _ = to_readings(run, profile)
+    readings, scaled = to_readings(run, profile)
     columns = profile.columns
     assert not isinstance(columns, msgspec.UnsetType)
     _check_gravity(readings, columns)
-    wirings = _wirings(run, readings)
+    wirings, open_axes = _wirings(run, readings, scaled)
+    if "magnetometer" in open_axes:
+        _check_sense(run, readings, scaled, columns)
     inclination = columns.get(REFERENCES["inclination"].column)
-    if inclination and inclination.unit == ABOVE and all(map(_is_left_handed, wirings.values())):
+    elevated = bool(wirings and inclination and inclination.unit == ABOVE)
+    if inclination and elevated and all(map(_is_left_handed, wirings.values())):
         below = {
             **columns,
             REFERENCES["inclination"].column: ColumnSource(name=inclination.name, unit=BELOW),
         }
         return _wired(table, msgspec.structs.replace(profile, columns=below))
-    return profile, readings, wirings
+    return profile, readings, wirings, open_axes
 
 
 def _is_left_handed(result: Wiring) -> bool:
@@ -170,7 +218,8 @@ def _as_written(
 ) -> tuple[Table, TableFormat | None]:
     """The table of a file, and how a profile says it is written: not at all where it is written as documented.
 
-    Where neither that nor a fixed place gives the table of the layout, it is to be looked for whenever it is read.
+    Where neither that nor a fixed place gives the table of the layout, it is to be looked for whenever it is read, and
+    so is that of a workbook.
     """
     if where is None:
         return tables.read(path), None
@@ -178,7 +227,8 @@ def _as_written(
         name for name, m in meanings_of(where.names, where.units).items() if m.column in LABELS
     }
     table = tables.of_layout(where, path, labels)
-    for form in [] if placed else [None, where.form]:
+    workbook = Path(path).suffix.lower() in WORKBOOKS  # to read one twice takes seconds
+    for form in [] if placed else [None] if workbook else [None, where.form]:
         if form or _is_documented(path, where):
             with suppress(InputError):
                 plain = tables.read(path, export=form)
@@ -236,24 +286,42 @@ def _without_the_usual(profile: Profile) -> Profile:
     return msgspec.structs.replace(profile, columns=msgspec.UNSET) if is_run_file else profile
 
 
-def _wirings(run: Table, readings: Readings) -> dict[str, Wiring]:
-    """The axes of the triads that the run has."""
+def _wirings(
+    run: Table, readings: Readings, scaled: Profile
+) -> tuple[dict[str, Wiring], dict[str, OpenAxes]]:
+    """The axes of the triads that the run has, and why those of others are open; `scaled` has their scales."""
     known = {name: readings.reference(name) for name in NEEDED["magnetometer"]}
-    results = {}
+    if readings.count < LEAST_STATIONS or not np.ptp(readings.accelerometer, axis=0).all():
+        raise FitError(
+            f"{run.source}: a profile is proposed for at least {LEAST_STATIONS} stations whose readings vary; got "
+            f"{readings.count}. Measure more stations."
+        )
+    results: dict[str, Wiring] = {}
+    open_axes: dict[str, OpenAxes] = {}
     for kind in TRIADS:
         if getattr(readings, kind) is None:
             continue
+        scale = (
+            _rounded(getattr(scaled, kind).scale)
+            if kind != "magnetometer" or not readings.relative
+            else None
+        )
         absent = [name for name in NEEDED[kind] if np.isnan(known[name]).all()]
         whole = np.all([~np.isnan(known[name]) for name in NEEDED[kind]], 0)
         if absent or whole.sum() < LEAST_STATIONS:
-            raise _unknown(kind, absent, int(whole.sum()), readings)
+            open_axes[kind] = OpenAxes(_lacking(kind, absent, int(whole.sum())), (), scale)
+            continue
         raw = np.stack([tables.numbers(run, name) for name in CHANNELS[kind]], -1)[whole]
         result = wiring(raw, *_parts(kind, readings, whole))
-        if not is_clear(result):
-            raise FitError(f"{run.source}: {_choice(kind, result)}")
-        results[kind] = result
-        _check_independent(readings, results)
-    return results
+        if is_clear(result):
+            results[kind] = result
+            _check_independent(readings, results)
+        elif len(result.alternatives) == 1 or result.unexplained > UNRELATED:
+            raise FitError(f"{run.source}: {_unexplained(kind, result)}")
+        else:
+            reason = "the stations do not tell the axes apart"
+            open_axes[kind] = OpenAxes(reason, result.alternatives, scale)
+    return results, open_axes
 
 
 def _check_gravity(readings: Readings, columns: Mapping[str, ColumnSource]) -> None:
@@ -262,14 +330,17 @@ def _check_gravity(readings: Readings, columns: Mapping[str, ColumnSource]) -> N
     if np.ptp(gravity) <= SAME_GRAVITY:
         return
     name, apart = columns[REFERENCES["gravity"].column].name, 1000 * np.ptp(gravity)
-    raise FitError(
+    raise QuestionError(
         f"{readings.source}: {shown(name)} differs between stations by {apart:.2g} mg, as no local gravity does: "
-        "the tool has measured it. Remove the column, or put the gravity of the place into it."
+        "the tool has measured it, and it is no reference.",
+        [Answer("leave it out", (("column", "ref_gravity_g="),))],
     )
 
 
 def _check_independent(readings: Readings, results: dict[str, Wiring]) -> None:
     """Refuse inclinations that were computed from the readings: they are no reference."""
+    if "accelerometer" not in results:
+        return
     result = results["accelerometer"]
     permutation = TriadProfile(axes=result.axes).permutation  # type: ignore[arg-type]
     vectors = readings.accelerometer @ permutation.transpose()
@@ -295,16 +366,40 @@ def _last_place(angles: Array) -> float:
     return 0.0 if place == LAST_PLACES[0] else float(np.radians(place))
 
 
-def _unknown(kind: str, absent: list[str], stations: int, readings: Readings) -> FitError:
-    """The refusal of a run without the references that tell the axes of a triad."""
-    lacking = f" (no {absent[0]})" if absent else ""
-    others = f" Columns not understood: {', '.join(readings.unused)}." if readings.unused else ""
-    return FitError(
-        f"{readings.source}: the axes of the {kind} are told by readings at known "
-        f"{', '.join(NEEDED[kind])}: at least {LEAST_STATIONS} stations, got {stations}{lacking}. Add these "
-        'columns, or write a profile with axes such as ["+x", "+y", "+z"] (all 48 orders and signs are open).'
-        f"{others}"
+def _check_sense(
+    run: Table, readings: Readings, scaled: Profile, columns: Mapping[str, ColumnSource]
+) -> None:
+    """Ask whether the toolface counts anticlockwise, where both triads are told then and not otherwise."""
+    toolface = REFERENCES["toolface"].column
+    source = columns.get(toolface)
+    if not source or source.unit not in ("", "°") or "toolface" not in readings.known:
+        return
+    turned = replace(
+        readings, known={**readings.known, "toolface": -np.asarray(readings.known["toolface"])}
     )
+    try:
+        wirings, open_axes = _wirings(run, turned, scaled)
+    except FitError:
+        return
+    if len(wirings) == len(TRIADS) and not open_axes:
+        raise QuestionError(
+            f"{run.source}: the readings fit only if {shown(source.name)} counts anticlockwise looking down the hole. "
+            "Does it?",
+            [
+                Answer(
+                    "yes, anticlockwise",
+                    (("column", f"{toolface}={source.name} ({ANTICLOCKWISE})"),),
+                )
+            ],
+        )
+
+
+def _lacking(kind: str, absent: list[str], stations: int) -> str:
+    """Why a run does not tell the axes of a triad."""
+    if absent:
+        return f"there is no column of the stand's {' and '.join(absent)}"
+    needed = f"{LEAST_STATIONS} stations with known {', '.join(NEEDED[kind])} are needed"
+    return f"{needed}, and there are {stations}"
 
 
 def _parts(kind: str, readings: Readings, whole: Bools) -> list[Array]:
@@ -324,27 +419,44 @@ def _parts(kind: str, readings: Readings, whole: Bools) -> list[Array]:
     return [strength * (north * np.cos(dip)[:, None] + down * np.sin(dip)[:, None])]
 
 
-def _choice(kind: str, result: Wiring) -> str:
-    """The sentence on axes that the readings leave open."""
-    if len(result.alternatives) == 1 or result.unexplained > UNRELATED:
-        return (
-            f"no axes of the {kind} explain its readings: the best, {toml(result.axes)}, leave "
-            f"{result.unexplained:.0%} of their variation. Check the reference angles, their units, and whether "
-            "the columns are the raw channels."
-        )
-    named = " or ".join(toml(axes) for axes in result.alternatives[:MOST_NAMED])
-    more = len(result.alternatives) - MOST_NAMED
+def _unexplained(kind: str, result: Wiring) -> str:
+    """The sentence on readings that no axes explain."""
     return (
-        f"the readings leave the axes of the {kind} open: {named}{f' or {more} others' if more > 0 else ''}. "
-        "Add stations at other inclinations and toolfaces, or write the axes into a profile."
+        f"no axes of the {kind} explain its readings: the best, {toml(result.axes)}, leave "
+        f"{result.unexplained:.0%} of their variation. Check the reference angles, their units, and whether "
+        "the columns are the raw channels."
     )
 
 
+def axes_open(proposal: Proposal) -> list[Finding]:
+    """A finding on each triad of which the table does not tell the axes."""
+    return [
+        Finding(
+            id="axes-open",
+            text=f"{kind}: the axes are open, as {each.reason}. Fill in the line `axes` of [{kind}] in the profile"
+            f"{_alternatives(each)}.",
+        )
+        for kind, each in proposal.open_axes.items()
+    ]
+
+
+def _alternatives(axes: OpenAxes) -> str:
+    """Axes that fit about as well, in words; empty where all are open."""
+    if not axes.alternatives:
+        return ""
+    named = " or ".join(toml(each) for each in axes.alternatives[:MOST_NAMED])
+    more = len(axes.alternatives) - MOST_NAMED
+    return f": {named}{f' or {more} others' if more > 0 else ''}"
+
+
 def left_handed(proposal: Proposal) -> list[Finding]:
-    """A finding on triads whose channels x, y, z are a left-handed set by the axes proposed."""
+    """A finding on triads whose channels x, y, z are a left-handed set by the axes proposed.
+
+    Not on an accelerometer alone beside a right-handed magnetometer: it reads positive upwards, as many do.
+    """
     triads = [kind for kind, result in proposal.wirings.items() if _is_left_handed(result)]
-    if not triads:
-        return []
+    if not triads or (triads != [*proposal.wirings] and triads == ["accelerometer"]):
+        return []  # of the other polarity: a reversed angle would turn the magnetometer as well
     return [
         Finding(
             id="left-handed",
@@ -353,6 +465,16 @@ def left_handed(proposal: Proposal) -> list[Finding]:
             "from below.",
         )
     ]
+
+
+def findings_on(proposal: Proposal) -> list[Finding]:
+    """All that the reader of a proposal should know."""
+    ignored = [
+        Finding(id="not-used", text=f"{shown(name)} is not used: {reason}.")
+        for name, reason in proposal.ignored.items()
+    ]
+    known = axes_open(proposal) + left_handed(proposal)
+    return known + ignored + unused_columns(proposal.unused)
 
 
 def as_toml(proposal: Proposal, source: str) -> str:
@@ -373,6 +495,8 @@ def as_toml(proposal: Proposal, source: str) -> str:
             ]
             if scale := getattr(profile, kind).scale:
                 lines.append(f"scale = {scale!r}   # raw units per {unit}")
+        elif kind in proposal.open_axes:
+            lines += _open_section(kind, proposal.open_axes[kind], unit)
     if not isinstance(profile.table, msgspec.UnsetType):
         lines += ["", "[table]"]
         fields = msgspec.structs.asdict(profile.table)
@@ -383,6 +507,9 @@ def as_toml(proposal: Proposal, source: str) -> str:
             fields = {key: fields[key] for key in ("header_line", "first_line")}
         else:
             fields = {key: fields[key] for key in fields if key not in ("find", "sheet")}
+        fields = {
+            key: each for key, each in fields.items() if key not in _SELDOM or each != usual[key]
+        }
         lines += [f"{key} = {toml(value)}" for key, value in fields.items()]
     if not isinstance(profile.columns, msgspec.UnsetType):
         lines += [
@@ -393,6 +520,23 @@ def as_toml(proposal: Proposal, source: str) -> str:
             guess = "   # unit by its values" if column in proposal.by_value else ""
             lines.append(f"{column} = {toml(_stated(each))}{guess}")
     return "\n".join(lines) + "\n"
+
+
+def _open_section(kind: str, axes: OpenAxes, unit: str) -> list[str]:
+    """The section of a triad whose axes are to be filled in."""
+    few = [f"#   {toml(each)}" for each in axes.alternatives[:MOST_NAMED]]
+    scale = (
+        [f"scale = {axes.scale!r}   # raw units per {unit}, by the readings"] if axes.scale else []
+    )
+    return [
+        "",
+        f"[{kind}]",
+        f"# Open: {axes.reason}. The tool axis that each channel measures, with its sign, such as:",
+        *(few or ['#   ["+x", "+y", "+z"]']),
+        *(f"# {line}" for line in CHOICE_OF_AXES[kind]),
+        "axes = []",
+        *scale,
+    ]
 
 
 def in_order(columns: dict[str, ColumnSource]) -> list[tuple[str, ColumnSource]]:

@@ -7,6 +7,7 @@ per cent of the channels' variation, any other most of it, unless the attitudes 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import permutations, product
 from typing import NamedTuple
 
@@ -64,12 +65,27 @@ def wiring(raw: Array, *parts: Array) -> Wiring:
         for order in permutations(range(3))
         for signs in product((0, 1), repeat=3)
     )
+    if len(parts) == 2 and sum(each[0] < ranked[0][0] + ALTERNATIVE for each in ranked) > 1:
+        ranked = sorted((_joint(moved, parts, *each[1:]), *each[1:]) for each in ranked)
     best, order, signs = ranked[0]
     near = [each for each in ranked if each[0] < best + ALTERNATIVE]
     scale = float(np.median(sizes[range(3), order]))
     return Wiring(
         _named(order, signs), scale, best, ranked[1][0], [_named(*each[1:]) for each in near]
     )
+
+
+def _joint(
+    moved: Array, parts: Sequence[Array], order: tuple[int, ...], signs: tuple[int, ...]
+) -> float:
+    """The share of all channels' variation that is left with one scale and one share of both components for all.
+
+    Of an unknown dip the components come in the same shares on every axis; the first counts along itself.
+    """
+    axes, senses = list(order), 1.0 - 2.0 * np.array(signs)
+    columns = np.stack([((part - part.mean(0))[:, axes] * senses).ravel() for part in parts], -1)
+    slope, share = _line(columns, moved.reshape(-1, 1))
+    return float(share[0]) if slope[0, 0] > 0 else 1.0
 
 
 def _line(columns: Array, moved: Array) -> tuple[Array, Array]:

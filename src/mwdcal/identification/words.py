@@ -10,9 +10,12 @@ _LATIN = str.maketrans({"ø": "o", "Ø": "O", "æ": "ae", "ß": "ss", "ł": "l"}
 _ELEVATION = r"\b(elev(ation)?|elevacion|inc\w* (from|to|above|over) (the )?horiz\w*|pitch)\b"
 """Names of angles that count from the horizontal."""
 TRANSLATIONS = (
+    (r"(roll|rulle|dreh)[ _-]?(sett?|gruppe|satz)|\bsett\b|serie de giro|серия|组号", "group "),
     (r"\|\s*b\s*\|", "Btotal"),
     (r"\|\s*g\s*\|", "Gtotal"),
     (r"pruf(?=stand)|mess(?=stand)", ""),
+    (r"(?<=[°º] )[СсC]\b|(?<=[°º])[СсC]\b", "C"),
+    (r"\bm(illi)?gauss\b", "mG"),
     (r"grav(?=axial|tran)", "acc "),
     (r"axial", "Z "),
     (r"tran(s|sverse|sversal)?[ _]*1", "X "),
@@ -22,39 +25,46 @@ TRANSLATIONS = (
         "elevation ",
     ),
     (
-        r"магнитн\w* наклонен\w*|наклонение|磁倾角|inclina\w* magn\w*|magn\w* inklin\w*|echado|buzamiento",
+        r"(угол )?(магнитн\w* )?наклонени[ея]|(地磁|磁)倾角?|incl\w*\.? magn\w*\.?|"
+        r"(magn\w*|felt|feld|field) ?[-_ ]?inkl\w*|mergulho( magn\w*)?|echado|buzamiento|(field|magnetic) inclination",
         "dip ",
     ),
     (
         r"neigung|inklination|inclinaison|inclinaca?o|inclinacion|zenith( angle)?|drift angle|deviation angle|"
-        r"inklinasjon|helning|зенит\w*( угол)?|наклон(?!ен)|井斜角?",
+        r"inklinasjon|helning|зенит\w*( угол)?|наклон(?!ен)|井斜角?|倾角",
         "inclination ",
     ),
-    (r"азимут|asimut|azimute?(?!h)|acimut|方位角?|rumbo", "azimuth "),
+    (r"азимут|asimut|azimute?(?!h)|acimut|方位角?|rumbo|richtung(?!swinkel)|peilung", "azimuth "),
     (
-        r"rollwinkel|roll angle|werkzeugwinkel|verdrehung|verdrehwinkel|drehwinkel|rotasjon|rulle?vinkel|"
-        r"verktoy(flate|vinkel)\w*|face d[ae] ferramenta|визир\w*( угол)?|"
-        r"angulo de giro|giro|rotacion|(угол установки )?отклонител\w*|визирн\w* угол|поворот|工具面角?|"
+        r"rollwinkel|roll angle|werkzeug(winkel|lage|flache)|verdrehung|verdrehwinkel|drehwinkel|rotasjon|rulle?vinkel|"
+        r"verktoy(flate|vinkel)\w*|(face|angulo) d[ae] ferramenta|(face|angle)( d[e'])? ?(l'?)?outil|"
+        r"ghsf?\b|угол установки( отклонител\w*)?|визир\w*( угол)?|"
+        r"angulo de giro|giro|rotacion|отклонител\w*|визирн\w* угол|поворот|工具面角?|"
         r"cara de (la )?herramienta|gravity tool ?face|h\.?s\.?[ _-]*tool ?face|tool[ _-]*face",
         "toolface ",
     ),
     (
         r"beschleunigung\w*|beschl\b\.?|akselerasjon|akselerometer|akselero|aceleracion|acelerometro|acel\b|"
-        r"aceleracao|ускорен\w*|акселерометр\w*|акс\b|\baks\b|加速度计?|加计|加表",
+        r"aceleracao|accelerometre|acceleration|\bac\.|ускорен\w*|акселерометр\w*|акс\b|\baks\b|加速度计?|加计|加表",
         "acc ",
     ),
     (
-        r"magnetfeld(?=[ _]*[xyz])|magnetfelt(?=[ _]*[xyz])|magnetometro|magnetometer|магнитометр\w*|магн\b|"
-        r"феррозонд\w*|磁力计|磁通门|磁强计|campo magnetico(?=[ _]*[xyz])|campo mag(?=[ _]*[xyz])|"
-        r"flux[ _-]*gate|磁场(?=[ (（_]*[xyz])",
+        r"magnetometre|magn\b\.?(?=[ _]*[xyz]\b)|magnetfeld(?=[ _]*[xyz])|magnetfelt(?=[ _]*[xyz])|"
+        r"magnetometro|magnetometers?|магнитометр\w*|магн\b|феррозонд\w*|磁力计|磁通门|磁强计|"
+        r"campo magnetico(?=[ _]*[xyz])|campo mag(?=[ _]*[xyz])|"
+        r"flux[ _-]*gates?|磁场(?=[ (（_]*[xyz])",
         "mag ",
     ),
     (
-        r"feldstarke|gesamtfeld|totalfeld|totalfelt|champ total|campo total|intensidad total|полн\w* поле|"
+        r"feldstarke|gesamtfeld|totalfeld|totalfelt|champ( magn\w*)?( total)?|campo (total|local|magn\w*)|"
+        r"intensidad total|полн\w* (магн\w* )?(поле|вектор\w*)|"
         r"модуль (магн\w*|поля)|总磁场(强度)?|磁场强度|总场|totalintensitat",
         "total field ",
     ),
-    (r"schwere|gravitation|tyngde\w*|gravedad|gravidade|сила тяжести|重力(加速度)?", "gravity "),
+    (
+        r"schwere|gravitation|pesanteur|tyngde\w*|gravedad|gravidade|сила тяжести|重力(加速度)?",
+        "gravity ",
+    ),
     (r"нтл", "nT"),
     (r"мктл", "uT"),
     (r"(?<![a-zа-я])(градус\w*|град|grados|graus|grader|grad)(?![a-zа-я])|度(?=[)）]?$)", "deg"),
@@ -65,7 +75,7 @@ TRANSLATIONS = (
         r"sollwert|soll|referenz|referanse|referencia|stand|эталон\w*|стенд|задан\w*|标准|参考|转台",
         "ref ",
     ),
-    (r"seriennummer|seriennr|serienummer|заводской номер|序列号|numero de serie", "serial "),
+    (r"seriennummer|seriennr|serienummer|заводской номер|序列号|num\w*\.? de serie", "serial "),
     (r"gerat|sonde", "tool "),
     (r"(de|da) [qc]uadr[ií]cula( utm)?|gitter|kartesisch", "grid "),
     (r"achse|aksen?|eje|ось|轴", ""),
@@ -80,9 +90,10 @@ def spelled(name: str) -> str:
     >>> spelled("Neigung Soll (°)"), spelled("gravTran1Raw")
     ('inclination ref (°)', 'acc X Raw')
     """
-    text = name.translate(_LATIN).replace("°", "\0").replace("²", "\1")
+    text = name.translate(_LATIN).replace("º", "°").replace("°", "\0").replace("²", "\1")
     text = unicodedata.normalize("NFKD", text)
-    text = "".join(c for c in text if not unicodedata.combining(c))
+    text = "".join(c for c in text if not unicodedata.combining(c)).replace("_", " ")
+    text = text.replace("\0", "°").replace("\1", "²")
     for pattern, word in TRANSLATIONS:
         text = re.sub(pattern, word, text, flags=re.IGNORECASE)
-    return text.replace("\0", "°").replace("\1", "²").strip()
+    return text.strip()

@@ -10,6 +10,7 @@ import numpy as np
 
 from mwdcal.calibration.readings import TRIADS, Readings, fingerprints, group_numbers
 from mwdcal.errors import InputError
+from mwdcal.estimation.evidence import WALKS
 from mwdcal.files import metadata as meta
 from mwdcal.files.contract import RAW_SPREAD, REFERENCES, TEMPERATURE, Range
 from mwdcal.geometry.vectors import Array, ArrayLike, Bools, wrap
@@ -65,6 +66,8 @@ def readings(
         sd: standard uncertainties by name, in the same units: of `accelerometer` and `magnetometer`
             (scalar, (3,) per axis or (n, 3)), of references, and of errors that all stations share:
             `azimuth_zero`, `toolface_zero`, `inclination_zero` and `tilt`. Names may end in `_deg`.
+            `accelerometer_drift`, `magnetometer_drift` and `field_drift`: of the change from the first station
+            to the last, of an axis.
             The noise of a triad that is not named is estimated from the residuals.
         group: numbers or names; stations of one group share a direction of the tool axis. Blank, None,
             NaN or negative: no group.
@@ -229,6 +232,7 @@ def _uncertainties(sd: Mapping[str, ArrayLike], shape: tuple[int, ...]) -> dict[
     limits = {name: RAW_SPREAD._replace(positive=True) for name in TRIADS}
     limits |= {name: reference.uncertainty for name, reference in REFERENCES.items()}
     limits |= dict.fromkeys(COMMON, Range(0.0, 180.0, "°"))
+    limits |= dict.fromkeys(WALKS, RAW_SPREAD)
     uncertainties = {}
     for name, key in _by_name(sd, limits).items():
         label, advice = f"sd {key}", "State one standard uncertainty."

@@ -15,6 +15,7 @@ from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError
 from mwdcal.files.formats.members import Member
+from mwdcal.files.settings import source_of_settings
 from mwdcal.library.registries import ToolRegistry, day_of
 from mwdcal.library.results import Result
 from mwdcal.library.shown import digest_of
@@ -172,6 +173,9 @@ def certificate(
     if laboratory is not None:
         stated, laboratory_digest = load_laboratory(Path(laboratory))
         files.add("laboratory", Path(laboratory), laboratory_digest)
+    settings, settings_sha256 = source_of_settings()
+    if settings:
+        files.add("settings", Path(settings), settings_sha256)
     issued = day_of(date, "date") or datetime.now(UTC).date()
     drift = _drift(registry, calibration, digest, issued) if registry is not None else None
     order = CertificateRequest(

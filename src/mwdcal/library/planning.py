@@ -13,7 +13,7 @@ import numpy as np
 from mwdcal.calibration.options import FitChoices, Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration, Finding
-from mwdcal.errors import InputError
+from mwdcal.errors import FitError, InputError
 from mwdcal.files import profiles, runs
 from mwdcal.files.formats.table import Table
 from mwdcal.geometry.vectors import AnyArray
@@ -273,16 +273,23 @@ class ProposedProfile(Result):
 
     @property
     def profile(self) -> Profile:
-        """The profile with which the table is a calibration run."""
+        """The profile with which the table is a calibration run.
+
+        Raises:
+            FitError: the table does not tell the axes of a triad: they are to be filled in.
+        """
+        from mwdcal.identification.proposal import axes_open
+
+        if open_ones := axes_open(self.proposal):
+            raise FitError(f"{self.path.name}: {' '.join(each.text for each in open_ones)}")
         return self.proposal.profile
 
     @property
     def findings(self) -> list[Finding]:
-        """Triads that are a left-handed set by the axes proposed, and columns that are not used."""
-        from mwdcal.calibration.diagnosis.findings import unused_columns
-        from mwdcal.identification.proposal import left_handed
+        """Triads whose axes are open, or a left-handed set by those proposed, and columns that are not used."""
+        from mwdcal.identification.proposal import findings_on
 
-        return left_handed(self.proposal) + unused_columns(self.proposal.unused)
+        return findings_on(self.proposal)
 
     def to_toml(self) -> str:
         """The text of the profile, with how its entries were recognised."""
@@ -321,6 +328,9 @@ def propose_profile(
     serial: str = "",
     date: str = "",
     column: Mapping[str, str] | None = None,
+    north: str = "",
+    declination_deg: float | None = None,
+    convergence_deg: float | None = None,
 ) -> ProposedProfile:
     """Propose a tool profile for a table as a laboratory keeps it: text or workbook, of any layout.
 
@@ -331,7 +341,11 @@ def propose_profile(
     `sheet`, `header_row` (of the column names) and `decimal` ("." or ",") say what is open about the table, `column`
     which column holds what, by the name of the run file: {"ref_azimuth_deg": "Azi 2"}, with the unit in brackets
     behind the name where the table does not state it; a blank name for a column that is none. `serial` and `date`
-    of the run where the table states none.
+    of the run where the table states none. `north` ("magnetic", "true" or "grid") is what its azimuths count from,
+    with the declination and the convergence (degrees east) that turn them magnetic.
+
+    Where the table does not tell the axes of a triad, as one of rolls alone, a finding `axes-open` says so, and the
+    profile that is saved has lines to fill in.
 
     Raises:
         InputError: the file cannot be read, or is not a table of stations.
@@ -346,6 +360,11 @@ def propose_profile(
     from mwdcal.identification.proposal import propose
 
     stated = {"serial": serial, "date": date}
+    norths = {
+        "azimuth_reference": north,
+        "declination_deg": declination_deg,
+        "convergence_deg": convergence_deg,
+    }
     proposal = propose(
         table_path,
         sheet=sheet,
@@ -353,5 +372,6 @@ def propose_profile(
         decimal=decimal,
         answers=column,
         stated={key: value for key, value in stated.items() if value},
+        north={key: value for key, value in norths.items() if value not in ("", None)},
     )
     return ProposedProfile(proposal, Path(table_path))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from html import escape
 from typing import Any, NamedTuple, TypeVar
 
@@ -23,6 +24,7 @@ from mwdcal.geometry.vectors import AnyArray
 from mwdcal.library.results import arrays_of, brief, frame
 from mwdcal.logs.noise import Noise
 from mwdcal.logs.stations import Stations
+from mwdcal.presentation.text import to_json
 from mwdcal.sensor.profile import NOMINAL
 from mwdcal.use.verification import Verdict
 
@@ -189,6 +191,23 @@ def _columns(readings: Readings) -> Mapping[str, AnyArray]:
 def _to_pandas(readings: Readings) -> Any:
     """The columns as a table of pandas, with the metadata in `attrs`."""
     return frame(readings.columns, readings.metadata)
+
+
+@dataclass(frozen=True)
+class VerdictFile:
+    """A verdict as the file that `verify` writes of it."""
+
+    verdict: Verdict
+
+    @property
+    def serial(self) -> str | None:
+        """The serial of the tool."""
+        serial: str | None = _verdict_document(self.verdict)["serial"]
+        return serial
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the document."""
+        atomic.write(path, to_json(_verdict_document(self.verdict)) + "\n")
 
 
 def _show(

@@ -310,7 +310,7 @@ class _Scene:
         """All that is named, read."""
         from mwdcal.planning.session import calibrated_tool
         from mwdcal.planning.simulate import Effects, load_effects
-        from mwdcal.registry.calibration_source import calibration_of
+        from mwdcal.presentation.calibration_source import calibration_of
 
         check_whole("seed", seed, 0)
         table = plan_table(plan)

@@ -96,7 +96,9 @@ def table_of(source: Tabular, name: str, read: Callable[[Path], Table]) -> Table
         return source
     if isinstance(source, str | os.PathLike):
         return read(source)
-    names = getattr(source, "columns", source)
+    names = getattr(
+        source, "column_names", getattr(source, "columns", source)
+    )  # of pyarrow, of pandas
     columns = {str(key): _column(str(key), source[key]) for key in names}
     count = max(map(len, columns.values()), default=0)
     for key, column in columns.items():
@@ -109,16 +111,25 @@ def table_of(source: Tabular, name: str, read: Callable[[Path], Table]) -> Table
     return Table(columns, metadata, name, range(1, count + 1))
 
 
+def _is_missing(cell: Any) -> bool:
+    """Whether a cell holds nothing: None, NaN, or the NA of pandas, which is neither equal to itself nor not."""
+    try:
+        return cell is None or bool(cell != cell)
+    except TypeError:
+        return True
+
+
 def _column(name: str, values: Any) -> Column:
-    """Numbers, or the text of a column of labels; other text stays text."""
+    """Numbers, or the text of a column of labels; other text stays text, and a serial that is a number a number."""
     array = np.ma.array(values)
     if array.ndim != 1 or (array.dtype.kind in "bcmM" and name != "simulated"):
         raise InputError(
             f"column '{name}' must be numbers or text, one for each row; got {array.dtype} of shape "
             f"{array.shape}."
         )
-    if name in LABELS or array.dtype.kind in "OUS":
-        return ["" if cell is None or cell != cell else as_text(cell) for cell in array.tolist()]
+    decimals = array.dtype.kind == "f" and name == "serial"
+    if (name in LABELS and not decimals) or array.dtype.kind in "OUS":
+        return ["" if _is_missing(cell) else as_text(cell) for cell in array.tolist()]
     return without_mask(array.astype(float))
 
 

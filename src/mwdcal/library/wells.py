@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from mwdcal.presentation.conversion import Converted, Exported
     from mwdcal.presentation.survey import SurveySummary
     from mwdcal.survey.acceptance import SurveyLimits
+    from mwdcal.survey.error_model import ErrorModel
     from mwdcal.survey.interference import InterferenceSize, MultiStationAnalysis
     from mwdcal.survey.references import EarthReference, FilledRun
     from mwdcal.survey.surveying import SurveyedWell
@@ -430,9 +431,11 @@ def survey(
     msa: bool = False,
     limits: FilePath | SurveyLimits = "owsg-mwd",
     sensor_drift: FilePath | None = None,
+    error_model: FilePath | ErrorModel = "owsg-mwd",
     switch: tuple[float, float] = (3.0, 5.0),
-    tie_in: tuple[float, float, float] | None = None,
+    tie_in: Sequence[float] | None = None,
     outside: Literal["blank", "refuse", "extrapolate"] = "blank",
+    missing: Literal["refuse", "blank"] = "refuse",
     decimal: str = ".",
     keys: Iterable[FilePath] = (),
 ) -> WellSurvey:
@@ -449,10 +452,14 @@ def survey(
         msa: take the interference of the drill string off the magnetometer, by multi-station analysis.
         limits: on |g|, |b| and dip: owsg-mwd, iscwsa-fixed, fixed, or a TOML file.
         sensor_drift: with `msa`, drift of the sensors since the calibration, 1σ: owsg (the default), none, or a file.
+        error_model: what the standard uncertainties hold besides calibration, noise and declination: owsg-mwd,
+            none, or a file in ISCWSA's JSON form.
         switch: inclinations, degrees, below which the toolface counts from magnetic north, and above which from the
             high side.
-        tie_in: north, east and TVD of the first station, m.
+        tie_in: north, east and TVD of the first station, m; or measured depth, inclination, azimuth (degrees, from the
+            north of the path), north, east and TVD of the point where the path is tied in.
         outside: what becomes of readings outside the calibrated temperatures.
+        missing: rows without a reading, such as a tie-in station: refuse the table, or leave their results blank.
         decimal: decimal sign of a text file.
         keys: files of public keys to trust, by which the signature of the calibration is checked.
 
@@ -465,16 +472,17 @@ def survey(
         `well.columns["azimuth_true_deg"]` and `well.interference.axial_nt`.
     """
     from mwdcal.presentation.signature import load_calibration
-    from mwdcal.survey.surveying import analysed, check_drift, survey_well, well_inputs
+    from mwdcal.survey.surveying import analysed, check_drift, start_of, survey_well, well_inputs
 
     check_drift(sensor_drift, msa)
     ends: Any = tuple(np.radians(_finite("switch", switch, 2)).tolist())
-    start: Any = None if tie_in is None else tuple(_finite("tie_in", tie_in, 3))
+    start = None if tie_in is None else start_of(_finite("tie_in", tie_in, len(tie_in)))
     loaded = load_calibration(_source(cal), [Path(key) for key in keys])
     table = _survey_table(readings, loaded.calibration, decimal)
     inputs = well_inputs(
-        loaded.calibration, table, _earth(reference), limits, msa, loaded.digest, loaded.findings
-    )
+        loaded.calibration, table, _earth(reference), limits, msa, loaded.digest, loaded.findings,
+        error_model, missing,
+    )  # fmt: skip
     analysis = analysed(inputs, sensor_drift) if msa else None
     if analysis:
         analysis.check()

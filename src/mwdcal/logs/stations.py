@@ -6,7 +6,7 @@ slower still: it never decides what stands still. See `standstill` for the metho
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -18,7 +18,7 @@ from mwdcal.errors import InputError
 from mwdcal.files.contract import CHANNELS, RAW, TEMPERATURE, Range
 from mwdcal.files.formats.columns import Column
 from mwdcal.files.formats.table import Table, numbers
-from mwdcal.files.logs import READ, TIME, Say, silent
+from mwdcal.files.logs import READ, TIME, Say, StoredColumns, silent
 from mwdcal.files.synonyms import unused
 from mwdcal.geometry.vectors import Array, Ints
 from mwdcal.logs import standstill
@@ -195,12 +195,12 @@ def _none(stations: Stations) -> str:
 
 def _traces(log: Table, time: Array, findings: list[Finding]) -> Traces:
     """The raw channels that have samples."""
-    traces = {name: _trace(log, time, name) for name in RAW if name in log.columns}
+    traces = _traces_of(log, time, [name for name in RAW if name in log.columns])
     magnetometer = [name for name in CHANNELS["magnetometer"] if name in traces]
     if magnetometer and not any(len(traces[name][0]) for name in magnetometer):
         text = "mx, my and mz are blank from end to end: the stations have no magnetometer."
         findings.append(Finding(id="no-magnetometer", text=text))
-        traces = {name: traces[name] for name in CHANNELS["accelerometer"]}
+        traces = _traces_of(log, time, CHANNELS["accelerometer"])
     for name, (_, value) in traces.items():
         if not len(value):
             raise InputError(
@@ -211,6 +211,30 @@ def _traces(log: Table, time: Array, findings: list[Finding]) -> Traces:
             text = f"{name} reads {value[0] + 0.0:g} from end to end: a dead channel?"
             findings.append(Finding(id="dead-channel", text=text))
     return traces
+
+
+class _StoredTraces(Mapping[str, Trace]):
+    """Channels of a log whose columns are not in memory: each is read when it is asked for."""
+
+    def __init__(self, log: Table, time: Array, names: Sequence[str]) -> None:
+        self._log, self._time, self._names = log, time, names
+
+    def __getitem__(self, name: str) -> Trace:
+        if name not in self._names:
+            raise KeyError(name)
+        return _trace(self._log, self._time, name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+
+def _traces_of(log: Table, time: Array, names: Sequence[str]) -> Traces:
+    """Channels of a log; in memory if its columns are."""
+    traces = _StoredTraces(log, time, names)
+    return traces if isinstance(log.columns, StoredColumns) else dict(traces)
 
 
 def _trace(log: Table, time: Array, name: str) -> Trace:

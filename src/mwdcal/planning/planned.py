@@ -24,6 +24,7 @@ from mwdcal.calibration.diagnosis.plausibility import freedom_of
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import TWELFTHS, accuracy_at, angles, readings_at
+from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.evidence import ANGLES
@@ -78,7 +79,7 @@ class Stand:
             least, most = (0, 180) if name == ANGLES[0] else (-360, 360)
             if name not in ANGLES or not (least <= low <= high <= most and high - low <= 360):
                 raise InputError(
-                    f"`reach` must be of {', '.join(ANGLES)}, such as inclination=0:120, from the least setting to "
+                    f"`reach` must be of {', '.join(ANGLES)}, such as inclination_deg=0:120, from the least setting to "
                     f"the largest; got {name}={low:g}:{high:g}."
                 )
 
@@ -524,8 +525,13 @@ def station_names(plan: Table) -> list[str]:
 
 
 def _set_anew(profile: Profile) -> Profile:
-    """The profile with a stand that is set anew at every station: only an order says which ones share a setting."""
-    return with_fields(profile, stand=with_fields(profile.stand, settings="per-station"))
+    """The profile as it is for stations without an order: a stand that is set anew at each, and no drift.
+
+    Only an order says which ones share a setting, and what a drift does.
+    """
+    steady = {name: with_fields(getattr(profile, name), drift=0.0) for name in TRIADS}
+    stand = with_fields(profile.stand, settings="per-station", field_drift_nt=0.0)
+    return with_fields(profile, stand=stand, **steady)
 
 
 def _check_reached(plan: Table, stand: Stand) -> None:

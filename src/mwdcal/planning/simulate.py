@@ -212,6 +212,17 @@ def wandering(
     return result
 
 
+def drifted(rng: np.random.Generator, session: Readings, name: str, lead: tuple[int, ...]) -> Array:
+    """A declared drift (..., n, 3) since the first station: a trend and a walk of half its variance each."""
+    size, steps = float(session.uncertainty(name).max(initial=0.0)), session.count - 1
+    if not (size and steps):
+        return np.zeros((session.count, 3))
+    slopes = rng.normal(size=(*lead, 1, 3)) / steps
+    walk = np.cumsum(slopes + rng.normal(size=(*lead, steps, 3)) / np.sqrt(steps), -2)
+    start = np.zeros((*lead, 1, 3))
+    return np.asarray(size * np.sqrt(0.5) * np.concatenate([start, walk], -2))
+
+
 def response(level: Array, minutes: Array, time_constant: float, start: float) -> Array:
     """How something follows levels (n,) that change when the one before was last read, minutes (n,).
 
@@ -487,7 +498,7 @@ def simulated(
     readings, turn_on = {}, {}
     for name, exact in _read(truth, vectors, warmth, damage).items():
         sensor = getattr(effects, name)
-        whole = exact
+        whole = exact + drifted(rng, session, f"{name}-drift", lead)
         if sensor.turn_on:
             turn_on[name] = sensor.turn_on * rng.normal(size=(*lead, 3))
             whole = whole + turn_on[name][..., None, :]
@@ -536,6 +547,7 @@ def _vectors(
         )
         attitude = attitude @ rotation(turn)[..., None, :, :]
     earth = [earth_gravity(gravity), earth_field(field, dip)]
+    earth[1] = earth[1] + drifted(rng, session, "field-drift", attitude.shape[:-3])
     if effects.earth.variation_nt:
         size = effects.earth.variation_nt, effects.earth.variation_minutes
         earth[1] = earth[1] + wandering(rng, attitude.shape[:-1], minutes, *size)

@@ -9,7 +9,14 @@ import msgspec
 
 from mwdcal.calibration.automatic.nonlinearity import CurveScore
 from mwdcal.calibration.diagnosis.flags import listed
-from mwdcal.calibration.drift import Constant, Drift, exact_and_steady
+from mwdcal.calibration.drift import (
+    Constant,
+    Drift,
+    UnseenDrift,
+    blindness,
+    declared_drift,
+    exact_and_steady,
+)
 from mwdcal.calibration.fit_options import unusual
 from mwdcal.calibration.prediction import typical_accuracy, without_temperature
 from mwdcal.calibration.readings import simulated
@@ -82,6 +89,7 @@ class CalibrationSummary(msgspec.Struct, frozen=True, kw_only=True):
     accuracy_1sigma_deg: dict[str, float | None]
     budget: list[BudgetRow]
     assumed_exact: list[str]
+    unseen: list[UnseenDrift] | msgspec.UnsetType = msgspec.UNSET
     constants: list[Constant]
     drift: list[Drift]
     stand: StandErrors
@@ -172,6 +180,7 @@ def remarks(calibration: Calibration) -> list[str]:
         f"accuracy to expect (1σ, calibration alone, typical): {'  '.join(accuracy)}",
         *([f"Assumed exact; this run cannot check it: {exact}{PROFILE}"] if exact else []),
         *([steady] if steady else []),
+        *drift_remarks(calibration),
         *([ASSUMED] if calibration.settings == ASSUMED_PRACTICE else []),
         *(
             f"estimated constant of the run: {c.name} {estimate(c.value, c.standard_uncertainty, c.unit)}"
@@ -179,6 +188,11 @@ def remarks(calibration: Calibration) -> list[str]:
         ),
         *stand(calibration),
     ]
+
+
+def drift_remarks(calibration: Calibration) -> list[str]:
+    """Drifts within the run: what one that is not seen would do, and those that are declared."""
+    return [*filter(None, (blindness(calibration.unseen), declared_drift(calibration.drift)))]
 
 
 def heading(calibration: Calibration) -> str:

@@ -23,7 +23,12 @@ from mwdcal.calibration.record import MAGNETIC, Calibration, Finding, TriadCalib
 from mwdcal.errors import InputError
 from mwdcal.estimation.solvers import RANK_TOLERANCE
 from mwdcal.geometry.observables import TITLES
-from mwdcal.presentation.calibration import accuracy_in_words, how, known_inclinations
+from mwdcal.presentation.calibration import (
+    accuracy_in_words,
+    drift_remarks,
+    how,
+    known_inclinations,
+)
 from mwdcal.presentation.numbers import HELD, capital, exponent, factor_places
 from mwdcal.presentation.page import banner, environment
 from mwdcal.presentation.text import plural, raised
@@ -74,6 +79,7 @@ def render(
         accuracy=_accuracy(calibration),
         soaked=_soaked(calibration),
         kinds=_kinds(verdict),
+        drifts=list(map(capital, drift_remarks(calibration))),
         settings=SETTING_PRACTICES,
         outside=BETWEEN_SETS,
         titles=TITLES,

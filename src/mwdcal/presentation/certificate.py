@@ -132,7 +132,7 @@ def _test(test: ConformityTest) -> str:
         *([test.settings] if test.settings else []),
         *([f"{VERDICT_RISK}: {chance(test.risk)}"] if test.risk is not None else []),
     ]
-    header = ["", "value", "U", "limit", "accepted up to", "", "P within", "risk"]
+    header = ["", "raw", "value", "U", "limit", "accepted up to", "", "P within", "risk"]
     rows = [_decision(decision) for decision in test.decisions]
     return "\n".join(map(one_line, lines)) + "\n\n" + table(rows, header)
 
@@ -142,9 +142,14 @@ def _decision(decision: LimitDecision) -> list[str]:
     value, _, expanded = quantity_numbers(quantity)
     limits = (decision.limit, decision.acceptance_limit)
     shown = [in_unit(limit, quantity.unit) for limit in limits]
+    raw = (
+        NOT_STATED
+        if decision.raw is None
+        else measured(decision.raw, quantity.expanded_uncertainty)[0] + unit(quantity.unit)
+    )
     verdict = "pass" if decision.passed else "FAIL"
     chances = [chance(p) for p in (decision.probability_within, decision.risk)]
-    return [quantity.name, value, expanded, *shown, verdict, *chances]
+    return [quantity.name, raw, value, expanded, *shown, verdict, *chances]
 
 
 def _budget(budget: Budget) -> str:

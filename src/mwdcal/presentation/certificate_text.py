@@ -341,7 +341,7 @@ def _decisions(tests: Sequence[ConformityTest]) -> TableBlock:
     keys = {_key(each): each for each in chain(*(test.decisions for test in tests))}
     guarded = any(each.acceptance_limit not in (None, each.limit) for each in keys.values())
     columns = [Column("limit on"), Column("limit", number=True)]
-    titles = ["value ± U", *["acceptance limit"][:guarded], "decision", "P within; risk"]
+    titles = ["value ± U; raw", *["acceptance limit"][:guarded], "decision", "P within; risk"]
     columns += [Column(title, True, title is titles[0]) for _ in tests for title in titles]
     groups = [("", 2), *((test.when, len(titles)) for test in tests)]
     by_test = [{_key(each): each for each in test.decisions} for test in tests]
@@ -374,13 +374,15 @@ def _decision(decision: LimitDecision | None, guarded: bool) -> list[Cell]:
     ]
     shown = [f"± {expanded}"] if decision.quantity.expanded_uncertainty is not None else []
     symbol, most = unit(decision.quantity.unit), decision.acceptance_limit
+    raw = measured(decision.raw or 0.0, decision.quantity.expanded_uncertainty)[0] + symbol
+    noisy = [] if decision.raw is None else [f"raw {raw}"]
     accepted = (
         NOT_STATED
         if most is None
         else measured(most, decision.quantity.expanded_uncertainty)[0] + symbol
     )
     return [
-        Cell([value, *(shown or [f"U {NOT_STATED}"])]),
+        Cell([value, *(shown or [f"U {NOT_STATED}"]), *noisy]),
         *([_cell(accepted)] if guarded else []),
         Cell(["PASS" if decision.passed else "FAIL"], "good" if decision.passed else "bad"),
         Cell(odds if within is not None or risk is not None else [NOT_STATED]),

@@ -18,10 +18,10 @@ from mwdcal.files.formats import members
 from mwdcal.firmware.c_source import stated_errors
 from mwdcal.firmware.export import DEFAULT_BITS, FIXED_POINT, FirmwareSources, export
 from mwdcal.firmware.quantisation import SHARE_OF
+from mwdcal.presentation.calibration_source import calibration_of
 from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.numbers import HELD, UNDETERMINED, files_written, number
 from mwdcal.presentation.text import one_line, raised, table
-from mwdcal.registry.calibration_source import calibration_of
 from mwdcal.sensor.profile import Axis
 from mwdcal.survey.tool_model import SensorTerm, sensor_terms, tool_model_text
 from mwdcal.use.notation import COURSE, Notation, convert, powers

@@ -10,6 +10,7 @@ import msgspec
 from mwdcal.calibration.canonical import Signature, SignatureCheck
 from mwdcal.calibration.readings import head
 from mwdcal.calibration.record import DOCUMENT_VERSION, SOFTWARE
+from mwdcal.files.settings import LaboratorySettings, source_of_settings
 
 INPUTS = {
     "apply": ("calibration", "readings"),
@@ -23,6 +24,7 @@ INPUTS = {
     "diagnose": ("calibration", "readings"),
     "example": (),
     "fleet": ("runs", "profile"),
+    "init": (),
     "list": (),
     "noise": ("log", "profile"),
     "plan": ("profile", "measured"),
@@ -42,7 +44,7 @@ INPUTS = {
     "registry withdraw": (),
     "simulate": ("plan", "profile", "calibration", "effects", "rolltest", "limits"),
     "stations": ("log",),
-    "survey": ("calibration", "readings", "reference", "limits"),
+    "survey": ("calibration", "readings", "reference", "limits", "error_model"),
     "verify": ("calibration", "run", "limits"),
 }
 """The files behind the document of each command, whose digests are its keys `…_sha256`.
@@ -56,7 +58,8 @@ class Envelope(msgspec.Struct, frozen=True, kw_only=True):
 
     `software` is name and version; `serial` that of the tool, None where no input states one;
     `simulated`: some input says that it is. `calibration_signature`: of the calibration that was used;
-    `signature`: of this document, once it is signed.
+    `signature`: of this document, once it is signed. `settings_file` and `settings_sha256`: of the laboratory's
+    settings, where the command has used any.
     """
 
     schema_version: int
@@ -66,6 +69,8 @@ class Envelope(msgspec.Struct, frozen=True, kw_only=True):
     simulated: bool
     calibration_signature: SignatureCheck | msgspec.UnsetType = msgspec.UNSET
     signature: Signature | msgspec.UnsetType = msgspec.UNSET
+    settings_file: str | msgspec.UnsetType = msgspec.UNSET
+    settings_sha256: str | msgspec.UnsetType = msgspec.UNSET
 
 
 class ExampleDocument(msgspec.Struct, frozen=True, kw_only=True):
@@ -73,6 +78,13 @@ class ExampleDocument(msgspec.Struct, frozen=True, kw_only=True):
 
     folder: str
     files: list[str]
+
+
+class WrittenSettings(msgspec.Struct, frozen=True, kw_only=True):
+    """The settings that `init` has written, and their file."""
+
+    file: str
+    settings: LaboratorySettings
 
 
 def json_document(
@@ -83,11 +95,14 @@ def json_document(
     `metadata` are what the inputs say of themselves, `sha256` the digests by name; one that was not
     computed, or of a file that was not given, is None. Keys of the content stand before equal ones.
     """
+    settings, settings_sha256 = source_of_settings()
     envelope = Envelope(
         schema_version=DOCUMENT_VERSION,
         command=command,
         software=SOFTWARE,
         **head(*metadata),
+        settings_file=settings or msgspec.UNSET,
+        settings_sha256=settings_sha256 or msgspec.UNSET,
     )
     digests = {f"{name}_sha256": sha256.pop(name, "") or None for name in INPUTS[command]}
     if sha256:

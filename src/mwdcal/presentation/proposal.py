@@ -10,12 +10,14 @@ import msgspec
 from msgspec.structs import asdict
 
 from mwdcal.calibration.readings import TRIADS, simulated
+from mwdcal.calibration.record import Finding
 from mwdcal.files.formats.layout import WORKBOOKS
-from mwdcal.identification.proposal import Proposal, in_order
+from mwdcal.identification.proposal import Proposal, findings_on, in_order
 from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.numbers import files_written
 from mwdcal.presentation.text import one_line, plural, table
-from mwdcal.sensor.profile import Profile, TableFormat, TriadProfile
+from mwdcal.presentation.typed import findings_with_option_names
+from mwdcal.sensor.profile import Axis, Profile, TableFormat, TriadProfile
 
 MOST_LEFT_OUT = 4
 """Rows that the screen names."""
@@ -23,8 +25,12 @@ SCALE_UNITS = {"accelerometer": "g", "magnetometer": "nT"}
 
 
 class ProposedTriad(TriadProfile, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A triad of the profile, and what its axes leave of the readings' variation, where there are any."""
+    """A triad of the profile, and what its axes leave of the readings' variation, where there are any.
 
+    `axes` are empty where the table does not tell them.
+    """
+
+    axes: list[Axis]  # type: ignore[assignment]
     unexplained: float | None = None
     next_best: float | None = None
 
@@ -37,6 +43,7 @@ class ProposalSummary(Profile, frozen=True, forbid_unknown_fields=True, kw_only=
     accelerometer: ProposedTriad
     magnetometer: ProposedTriad
     unit_by_values: list[str]
+    findings: list[Finding]
     profile: str
 
 
@@ -47,6 +54,7 @@ def summary(proposal: Proposal, run: Path, output: Path | None) -> dict[str, Any
         run=run.name,
         stations=proposal.stations,
         unit_by_values=sorted(proposal.by_value),
+        findings=findings_with_option_names(findings_on(proposal)),
         profile=str(output or ""),
     )
     return json_document("profile", content, proposal.metadata, run=proposal.run_sha256)
@@ -55,9 +63,11 @@ def summary(proposal: Proposal, run: Path, output: Path | None) -> dict[str, Any
 def _triad(proposal: Proposal, kind: str) -> ProposedTriad:
     """A triad as the profile has it, and how sure its axes are."""
     triad, result = asdict(getattr(proposal.profile, kind)), proposal.wirings.get(kind)
+    axes = [] if kind in proposal.open_axes else [*triad.pop("axes")]
+    each = {**triad, "axes": axes}
     if result is None:
-        return ProposedTriad(**triad)
-    return ProposedTriad(**triad, unexplained=result.unexplained, next_best=result.next_best)
+        return ProposedTriad(**each)
+    return ProposedTriad(**each, unexplained=result.unexplained, next_best=result.next_best)
 
 
 def screen(proposal: Proposal, run: Path, output: Path | None) -> str:
@@ -84,6 +94,10 @@ def screen(proposal: Proposal, run: Path, output: Path | None) -> str:
         ]
         for kind, result in proposal.wirings.items()
     ]
+    rows += [
+        [kind, "open: fill in", _scale(each.scale, SCALE_UNITS[kind]), "–", "–"]
+        for kind, each in proposal.open_axes.items()
+    ]
     blocks.append(
         table(rows, ["triad", "axes", "nominal scale", "unexplained", "by the next best"])
     )
@@ -91,6 +105,8 @@ def screen(proposal: Proposal, run: Path, output: Path | None) -> str:
         command = (
             f"mwdcal calibrate {one_line(str(run))} --tool {one_line(str(output))} -o tool.json"
         )
+        if proposal.open_axes:
+            command = f"fill in the axes in {one_line(str(output))}, then {command}"
         blocks.append(f"{files_written(profile=output)}   next: {command}")
     return "\n\n".join(blocks)
 

@@ -30,10 +30,10 @@ from mwdcal.certificate.signature import check as check_signature
 from mwdcal.errors import InputError
 from mwdcal.files import documents
 from mwdcal.files.formats.members import Member
+from mwdcal.presentation.calibration_source import calibration_file
 from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.numbers import files_written
 from mwdcal.presentation.text import one_line, table
-from mwdcal.registry.calibration_source import calibration_file
 
 IN_SHORT = {
     "unsigned": "unsigned calibration",

@@ -19,16 +19,12 @@ from mwdcal.presentation.envelope import json_document, with_signature
 from mwdcal.presentation.numbers import files_written, fixed, measured, number, signed
 from mwdcal.presentation.signature import signature_status
 from mwdcal.presentation.text import chance, one_line, plural, table
-from mwdcal.survey.interference import (
-    ErrorTerms,
-    Interference,
-    InterferenceSize,
-    MultiStationAnalysis,
-    error_terms,
-)
+from mwdcal.survey.interference import Interference, InterferenceSize, MultiStationAnalysis
 from mwdcal.survey.norths import North
 from mwdcal.survey.surveying import SurveyedWell, WellInputs
-from mwdcal.survey.well import Well
+from mwdcal.survey.well import LastStation, Well, WellCounts
+from mwdcal.survey.well_errors import WellErrors
+from mwdcal.use.uncertainty import ErrorTerms, error_terms
 
 MOST_CORRECTED = 30
 """Surveys of a table on interference_screen."""
@@ -137,7 +133,8 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
 
     `blind`: accepted ones whose azimuth interference could turn and still pass.
     `reference_sources`: where gravity, field, dip, declination and convergence come from, by name.
-    `error_terms` are in the standard uncertainties of surveys and path, `not_included` are not.
+    `error_terms` are in the standard uncertainties of surveys and path, `not_included` are not; `error_model` states
+    those that are not of the calibration. Drift counts over `years_since_calibration`; null: not known, taken as one.
     `msa` is the multi-station analysis, if one was asked for; `interference` and `separable` are of it.
     """
 
@@ -152,6 +149,8 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
     sd_declination_deg: float | None
     convergence_deg: float | None
     reference_sources: dict[str, str]
+    error_model: str
+    years_since_calibration: float | None
     error_terms: list[str]
     not_included: list[str]
     limits: str
@@ -177,6 +176,8 @@ def refusal(inputs: WellInputs, msa: MultiStationAnalysis) -> SurveySummary:
         blank=rows,
         north=north.name,
         **_stated(north, error_terms((), north.declination is not None)),
+        error_model=inputs.model.name if inputs.model else "none",
+        years_since_calibration=None,
         reference_sources=dict(inputs.surveys.sources),
         limits=inputs.limits.name,
         source=inputs.limits.source,
@@ -194,7 +195,7 @@ def result_summary(result: SurveyedWell, output: str = "", html: str = "") -> Su
     """The result for machines; `output` and `html` are the files that were written, if any."""
     msa = result.analysis.summary if result.analysis else None
     unused = unused_columns(result.inputs.surveys.readings.unused)
-    return summary(result.well, output, html, msa, unused)
+    return summary(result.well, result.counts, output, html, msa, unused)
 
 
 def document(inputs: WellInputs, facts: SurveySummary, signature: SignatureCheck) -> dict[str, Any]:
@@ -219,27 +220,29 @@ def all_findings(facts: SurveySummary) -> list[Finding]:
 
 def summary(
     well: Well,
+    counts: WellCounts,
     output: str,
     html: str,
     msa: MultiStationAnalysis | None = None,
     about_file: Sequence[Finding] = (),
 ) -> SurveySummary:
-    """The result for machines; findings `about_file` come after those about the well."""
-    judged, accepted = well.judgement.judged, well.judgement.accepted
+    """The result for machines, `counts` of all surveys; findings `about_file` come after those about the well."""
     north = well.north
     return SurveySummary(
-        rows=len(judged),
-        accepted=int(accepted.sum()),
-        rejected=int((judged & ~accepted).sum()),
-        not_judged=int((~judged).sum()),
-        blind=int(well.blind.sum()),
-        blank=int(well.blank.sum()),
+        rows=counts.rows,
+        accepted=counts.accepted,
+        rejected=counts.rejected,
+        not_judged=counts.rows - counts.judged,
+        blind=counts.blind,
+        blank=counts.blank,
         north=north.name,
         **_stated(north, well.terms),
+        error_model=well.errors.model.name if well.errors else "none",
+        years_since_calibration=well.errors.years if well.errors else None,
         reference_sources=dict(well.sources),
         limits=well.limits.name,
         source=well.limits.source,
-        end=end_of_path(well),
+        end=end_of_path(counts.end) if counts.end else None,
         findings=[*well.findings, *about_file],
         output=output,
         html=html,
@@ -262,28 +265,25 @@ def _stated(north: North, terms: ErrorTerms) -> dict[str, Any]:
             key: None if angle is None else float(np.degrees(angle))
             for key, angle in angles.items()
         },
-        "error_terms": list(terms.included),
-        "not_included": list(terms.left_out),
+        **terms.stated,
     }
 
 
-def end_of_path(well: Well) -> EndOfPath | None:
+def end_of_path(last: LastStation) -> EndOfPath:
     """The last station with a position."""
-    if well.position is None or np.isnan(well.position.place[:, 0]).all():
-        return None
-    last = int(np.flatnonzero(~np.isnan(well.position.place[:, 0]))[-1])
-    north, east, tvd = well.position.place[last].tolist()
-    sd_north, sd_east, sd_tvd = map(stated, well.position.sd[last].tolist())
+    north, east, tvd = last.place.tolist()
+    variances = np.maximum(np.diagonal(last.covariance), 0.0)
+    sd_north, sd_east, sd_tvd = map(stated, np.sqrt(variances).tolist())
     return EndOfPath(
-        station=well.readings.labels[last],
-        md_m=float(well.position.md[last]),
+        station=last.label,
+        md_m=last.md,
         north_m=north,
         east_m=east,
         tvd_m=tvd,
         sd_north_m=sd_north,
         sd_east_m=sd_east,
         sd_tvd_m=sd_tvd,
-        covariance_m2=[[*map(stated, row)] for row in well.position.covariance[last].tolist()],
+        covariance_m2=[[*map(stated, row)] for row in last.covariance.tolist()],
     )
 
 
@@ -308,13 +308,27 @@ def screen(
     if facts.end:
         lines.append(end_in_words(facts.end, facts.north))
     lines.append(well.terms.sentence)
+    if well.errors:
+        lines.append(model_in_words(well.errors))
     return "\n".join(
         [
             *map(one_line, lines),
             "",
-            survey_table(well),
+            survey_table(well, facts.rows),
             *([files_written(table=facts.output, page=facts.html)] if facts.output else []),
         ]
+    )
+
+
+def model_in_words(errors: WellErrors) -> str:
+    """The error model, and the time over which the sensors may have drifted."""
+    time = (
+        "an unknown time since the calibration, taken as a year"
+        if errors.years is None
+        else (f"{fixed(errors.years, 2)} years since the calibration")
+    )
+    return (
+        f"error model {errors.model.name} ({errors.model.source}); drift of the sensors over {time}"
     )
 
 
@@ -348,10 +362,10 @@ def end_in_words(end: EndOfPath, north: str) -> str:
     return f"at {fixed(end.md_m, 2)} m MD, from {north} north: {', '.join(parts)}"
 
 
-def survey_table(well: Well, most: int = MOST_SURVEYS) -> str:
-    """The first surveys, each angle with its standard uncertainty."""
+def survey_table(well: Well, count: int, most: int = MOST_SURVEYS) -> str:
+    """The first of so many surveys, each angle with its standard uncertainty."""
     header, rows = survey_rows(well, most)
-    more = len(well.readings.labels) - len(rows)
+    more = count - len(rows)
     return table(rows, header) + (f"\n… and {more} more" if more > 0 else "")
 
 

@@ -245,7 +245,7 @@ def render(
     analysis: Interference | None = None,
 ) -> str:
     """The surveys as HTML, with a multi-station analysis; `sha256` of the files they come from, by what these are."""
-    facts = summary(well, "", "")
+    facts = summary(well, well.counts, "", "")
     stated = well.readings.metadata, well.calibration.tool
     header, rows = survey_rows(well, MOST_ROWS_OF_PAGE)
     located = has_path(well.position)

@@ -65,10 +65,12 @@ def _sets(result: Verdict) -> list[str]:
         for row in result.rows
         if len(row.sets) > 1 and row.uncertainty is not None
         for each in row.sets
-        for cells in [[*noise_free(each, row.unit), freedom(each)]]
+        for cells in [[quantity(each.raw, row.unit), *noise_free(each, row.unit), freedom(each)]]
     ]
     return (
-        [table(rows, ["each roll set by itself", "", "noise-free", "1σ", FREEDOM])] if rows else []
+        [table(rows, ["each roll set by itself", "", "raw", "noise-free", "1σ", FREEDOM])]
+        if rows
+        else []
     )
 
 

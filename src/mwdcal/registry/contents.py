@@ -22,7 +22,7 @@ from mwdcal.registry.store import Entry
 from mwdcal.registry.stored import LARGEST_OBJECT
 from mwdcal.sensor.profile import MeasurementStandard, Person
 
-TABLE_SUFFIXES = (*tables.SUFFIXES, *tables.EXCHANGED)
+TABLE_SUFFIXES = (*tables.SUFFIXES, *tables.EXCHANGED, *tables.LAID_OUT)
 """Suffixes of files with tables."""
 COMMANDS_KEPT = {"calibrate": "calibration", "verify": "verification", "certificate": "certificate"}
 """Kinds of documents by the command that writes them."""

@@ -52,7 +52,8 @@ class TriadProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     `scale` is raw units per g (accelerometer) or per nT (magnetometer); None means
     unknown: it is then taken from the readings and cannot serve as a check.
     `noise` is the standard uncertainty of one station's raw reading (None: it is
-    estimated from the residuals); `repeatability` is added to it in quadrature.
+    estimated from the residuals); `repeatability` is added to it in quadrature. `drift` is how far an
+    axis's offset moves from the first station of a run to the last.
     `nonlinearity` is the linearity error of the datasheet as a share of the field (1 σ, for
     example 0.005): each axis then has its own quadratic and cubic term with that prior.
     `datasheet` are the maker's tolerances.
@@ -62,6 +63,7 @@ class TriadProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     scale: float | None = None
     noise: float | None = None
     repeatability: float = 0.0
+    drift: float = 0.0
     nonlinearity: float | None = None
     datasheet: Datasheet | None = None
 
@@ -81,6 +83,7 @@ class StandProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     added to either in quadrature. Toolface is set at every station. The others are errors
     that all stations have in common: zeros of the three scales, the lean of the stand's vertical,
     and the references for gravity, field and dip where the run does not state their uncertainty.
+    `field_drift_nt` is how far north, east and down of the field move from the first station to the last.
     `coil`: the field is made by a coil or simulated, and may be of any strength.
     `settings`: "per-direction" where the operator sets inclination and azimuth once and rolls the
     tool, "per-station" where the stand is set anew at every station.
@@ -98,6 +101,7 @@ class StandProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     tilt_deg: float = 0.0
     gravity_g: float = 0.0
     field_nt: float = 0.0
+    field_drift_nt: float = 0.0
     dip_deg: float = 0.0
     coil: bool = False
     settings: Literal["per-direction", "per-station"] | msgspec.UnsetType = msgspec.UNSET
@@ -126,7 +130,8 @@ class TableFormat(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
     `header_line` holds the column names, `first_line` the first readings; what stands above and
     between is not read. A workbook has only these two, which count its rows. Where `find` is set, the table is
-    looked for by the names of its columns instead, on the sheet named, if any.
+    looked for by the names of its columns instead, on the sheet named, if any. `azimuth_reference` and its angles are
+    those of tables that do not state them. `ignore` are columns that are no evidence whatever they are called.
     """
 
     encoding: Literal["utf-8", "utf-16", "cp1252", "cp1251", "gb18030"] = "utf-8"
@@ -136,6 +141,16 @@ class TableFormat(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     first_line: int = 2
     find: bool = False
     sheet: str = ""
+    azimuth_reference: Literal["", "magnetic", "true", "grid"] = ""
+    declination_deg: float | None = None
+    convergence_deg: float | None = None
+    ignore: tuple[str, ...] = ()
+
+    @property
+    def north(self) -> dict[str, object]:
+        """What its azimuths count from, as metadata of a run state it; empty where it is not stated."""
+        keys = ("azimuth_reference", "declination_deg", "convergence_deg")
+        return {key: value for key in keys if (value := getattr(self, key)) not in ("", None)}
 
 
 class ColumnSource(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

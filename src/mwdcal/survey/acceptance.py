@@ -13,6 +13,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache, cached_property
 
 import msgspec
 import numpy as np
@@ -116,15 +117,19 @@ class AcceptanceTests:
             self.fixed, self.covariance[rows], self.largest[rows], self.missing[rows]
         )
 
+    @cached_property
+    def _weights(self) -> Array:
+        """Inverse (n, 3, 3) of the covariance of the departures that are judged, with ones for the others."""
+        blank = self.missing[:, :, None] | self.missing[:, None, :]
+        whole = np.where(blank, np.eye(len(STRENGTH_NAMES)), self.covariance)
+        sd, correlation = correlations(whole)
+        return np.asarray(np.linalg.inv(correlation) / (sd[:, :, None] * sd[:, None, :]))
+
     def accept(self, departures: Mapping[str, Array]) -> Bools:
         """Which of departures (n, k) of |g|, |b| and dip are accepted; none where nothing is judged.
 
         Those that are not named are zero.
         """
-        blank = self.missing[:, :, None] | self.missing[:, None, :]
-        whole = np.where(blank, np.eye(len(STRENGTH_NAMES)), self.covariance)
-        sd, correlation = correlations(whole)
-        weights = np.linalg.inv(correlation) / (sd[:, :, None] * sd[:, None, :])
         inside, square = (~self.missing).any(-1, keepdims=True), np.zeros(1)
         shifts: list[tuple[int, Array]] = []
         for name, departure in departures.items():
@@ -133,9 +138,9 @@ class AcceptanceTests:
             shift = np.where(missing, 0.0, departure) if missing.any() else departure
             if np.isfinite(most := self.fixed[place]):
                 inside = inside & (np.abs(shift) <= most)
-            square = square + weights[:, place, [place]] * shift**2
+            square = square + self._weights[:, place, [place]] * shift**2
             for other, before in shifts:
-                square = square + 2.0 * weights[:, place, [other]] * shift * before
+                square = square + 2.0 * self._weights[:, place, [other]] * shift * before
             shifts.append((place, shift))
         return np.asarray(inside & (square <= self.largest[:, None] ** 2))
 
@@ -162,12 +167,12 @@ class Judgement:
         """Stations (n,) of which anything is judged."""
         return np.asarray((~np.isnan(self.departure)).any(-1))
 
-    def findings(self) -> list[str]:
-        """The fault of each station; empty if it has none."""
-        pairs = zip(self.judged.tolist(), self.accepted.tolist(), strict=True)
+    def findings(self, rows: slice = slice(None)) -> list[str]:
+        """What is wrong with each station of some rows; empty where nothing is."""
+        pairs = zip(self.judged[rows].tolist(), self.accepted[rows].tolist(), strict=True)
         return [
             "" if accepted else self._finding(i) if judged else "not judged: no reference"
-            for i, (judged, accepted) in enumerate(pairs)
+            for i, (judged, accepted) in enumerate(pairs, rows.start or 0)
         ]
 
     def _finding(self, i: int) -> str:
@@ -294,7 +299,7 @@ CROSS_AXIAL = np.arange(50.0, 301.0, 50.0)
 """Sizes across it: to twice what multi-station analysis assumes."""
 AROUND_TOOL = np.radians(np.arange(0.0, 360.0, 30.0))
 """Directions across it, rad."""
-SURVEYS_AT_ONCE = 1 << 8
+SURVEYS_AT_ONCE = 1 << 9
 """Surveys for which all sizes are tried at once, so that they stay in fast memory."""
 WHERE = ("along the tool", "across it")
 
@@ -311,22 +316,58 @@ class Blindness:
 
     def words(self, places: Ints, least: Array) -> list[str]:
         """What would pass at some surveys (m,) and turn their azimuth by at least so much (m,), rad."""
-        parts: list[list[str]] = [[] for _ in places]
-        for k, (where, last) in enumerate(zip(WHERE, (AXIAL[-1], CROSS_AXIAL[-1]), strict=True)):
-            names = {
-                size: f"{size:.0f} nT{' or more' if size >= last else ''} {where} by "
-                for size in np.unique(self.size[places, k]).tolist()
-            }
-            turns = np.degrees(self.turn[places, k]).tolist()
-            enough = (self.turn[places, k] >= least).tolist()
-            for each, size, turn, is_enough in zip(
-                parts, self.size[places, k].tolist(), turns, enough, strict=True
-            ):
-                if is_enough:
-                    each.append(f"{names[size]}{turn:.2g}°")
-        return [
-            f"interference would pass and turn the azimuth: {', '.join(each)}" for each in parts
+        texts = [
+            self._words_of(places, k, where, last, least)
+            for k, (where, last) in enumerate(zip(WHERE, (AXIAL[-1], CROSS_AXIAL[-1]), strict=True))
         ]
+        return [
+            f"interference would pass and turn the azimuth: {', '.join(filter(None, each))}"
+            for each in zip(*texts, strict=True)
+        ]
+
+    def _words_of(self, places: Ints, k: int, where: str, last: float, least: Array) -> list[str]:
+        """The same along the tool or across it; empty where less turns the azimuth."""
+        sizes, of_size = np.unique(self.size[places, k], return_inverse=True)
+        names = [
+            f"{size:.0f} nT{' or more' if size >= last else ''} {where} by "
+            for size in sizes.tolist()
+        ]
+        turn = self.turn[places, k]
+        angles, of_angle = np.unique(two_digits(np.degrees(turn)), return_inverse=True)
+        both, of_both = np.unique(of_size * len(angles) + of_angle, return_inverse=True)
+        texts = [
+            f"{names[pair // len(angles)]}{angles[pair % len(angles)]:.2g}°"
+            for pair in both.tolist()
+        ]
+        texts.append("")
+        return [texts[i] for i in np.where(turn >= least, of_both, len(both)).tolist()]
+
+
+def two_digits(values: Array) -> Array:
+    """Positive numbers (n,) with two digits, each as `.2g` rounds it.
+
+    Reference: between two neighbours of two digits `.2g` itself says to which the number halfway belongs.
+    """
+    low, high = _TWO_DIGITS[0], _TWO_DIGITS[-1]
+    inside = (values >= low) & (values <= high)
+    rounded = _TWO_DIGITS[np.searchsorted(_HALFWAY, values, "right").clip(0, len(_TWO_DIGITS) - 1)]
+    for place in np.flatnonzero(~inside).tolist():
+        rounded[place] = float(f"{values[place]:.2g}")
+    return np.asarray(rounded)
+
+
+_TWO_DIGITS = np.array([float(f"{d}e{e}") for e in range(-5, 3) for d in range(10, 100)])
+_HALFWAY = np.array(
+    [
+        half if f"{half:.2g}" == f"{above:.2g}" else np.nextafter(half, np.inf)
+        for half, above in (
+            (float(f"{d}.5e{e}"), float(f"{d + 1}e{e}"))
+            for e in range(-5, 3)
+            for d in range(10, 100)
+        )
+    ]
+)[:-1]
+"""The least numbers that `.2g` rounds to each but the first of `_TWO_DIGITS`."""
 
 
 def blindness(tests: AcceptanceTests, vectors: tuple[Array, Array]) -> Blindness:
@@ -346,6 +387,7 @@ def _blocks(count: int) -> Iterator[slice]:
         yield slice(start, start + SURVEYS_AT_ONCE)
 
 
+@cache
 def _candidates() -> tuple[Array, Array]:
     """Fields (k, 3) along the tool and across it, nT."""
     along = np.zeros((2 * len(AXIAL), 3))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from math import hypot, radians
 
@@ -13,7 +13,7 @@ from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files.contract import AZIMUTH_KEYS, REFERENCES, check_near_misses, stated_norths
 from mwdcal.files.formats.columns import shown
-from mwdcal.files.formats.table import Table
+from mwdcal.geometry.vectors import Array
 from mwdcal.survey.references import (
     FROM_MODEL,
     FROM_REFERENCE,
@@ -65,31 +65,29 @@ class North:
 
 
 def norths_of(
-    table: Table, readings: Readings, calibration: Calibration, reference: EarthReference | None
+    metadata: Mapping[str, object],
+    source: str,
+    readings: Callable[[], Iterable[Readings]],
+    calibration: Calibration,
+    reference: EarthReference | None,
 ) -> North:
-    """The statements of metadata and reference about declination and convergence.
+    """What metadata of a table and reference say of declination and convergence; `readings` of the table in parts.
 
     A declination whose table states no uncertainty has that of the reference, else that of a global field model.
 
     Raises:
         InputError: an uncertainty that cannot be.
     """
-    stated = stated_norths(table.metadata, table.source)
+    stated = stated_norths(metadata, source)
     of_place = {} if reference is None else {
         "declination_deg": reference.declination_deg, "convergence_deg": reference.convergence_deg
     }  # fmt: skip
     both = {key: value for key, value in {**of_place, **stated}.items() if value is not None}
-    sources = {
-        key.removesuffix("_deg"): FROM_TABLE
-        if key in stated
-        else FROM_REFERENCE
-        if key in both
-        else NO_SOURCE
-        for key in AZIMUTH_KEYS[1:]
-    }
-    given, findings = _stated_sd(table), []
+    known = {**dict.fromkeys(both, FROM_REFERENCE), **dict.fromkeys(stated, FROM_TABLE)}
+    sources = {key.removesuffix("_deg"): known.get(key, NO_SOURCE) for key in AZIMUTH_KEYS[1:]}
+    given, findings = _stated_sd(metadata, source), []
     if given and "declination_deg" not in stated:
-        text = f"{table.source}: {SD_KEY} is not used: no declination_deg is beside it. State both, or neither."
+        text = f"{source}: {SD_KEY} is not used: no declination_deg is beside it. State both, or neither."
         findings.append(Finding(id="declination-uncertainty-unused", text=text))
         given = 0.0
     if "declination_deg" not in both:
@@ -103,14 +101,14 @@ def norths_of(
         FROM_TABLE if given else FROM_MODEL if reference is None else FROM_REFERENCE
     )
     if "declination_deg" in stated and not given:
-        source = "the reference" if reference else "a global field model"
+        model = "the reference" if reference else "a global field model"
         text = (
-            f"{table.source} states a declination without uncertainty: {shared:.2f}° (1σ) of {source} is taken. State "
+            f"{source} states a declination without uncertainty: {shared:.2f}° (1σ) of {model} is taken. State "
             f"{SD_KEY}."
         )
         findings.append(Finding(id="declination-uncertainty-assumed", text=text))
     if reference is not None:
-        findings += north_contradictions(table.source, stated, given, reference)
+        findings += north_contradictions(source, stated, given, reference)
     return North(
         _radians(both["declination_deg"]),
         radians(given or shared),
@@ -125,25 +123,37 @@ def _radians(angle: float | None) -> float | None:
     return None if angle is None else radians(angle)
 
 
-def _horizontal(readings: Readings, calibration: Calibration) -> float:
+def _horizontal(parts: Callable[[], Iterable[Readings]], calibration: Calibration) -> float:
     """The horizontal field by the references of the readings, else by the readings themselves, nT."""
-    known = readings.reference("field") * np.cos(readings.reference("dip"))
-    if np.isnan(known).all() and calibration.has_field and readings.magnetometer is not None:
-        g, b = calibration.fields(readings)
-        known = np.linalg.norm(np.cross(g, b), axis=-1) / np.linalg.norm(g, axis=-1)
-        known = np.full(1, np.nan) if calibration.relative else known
+    known = np.concatenate([_referenced_field(readings) for readings in parts()])
+    if np.isnan(known).all():
+        known = np.concatenate([_measured_field(readings, calibration) for readings in parts()])
     return USUAL_HORIZONTAL if np.isnan(known).all() else float(np.nanmedian(known))
 
 
-def _stated_sd(table: Table) -> float:
-    """1σ of the declination that the table states, degrees; 0 where it states none."""
-    check_near_misses(list(table.metadata), (SD_KEY,), f"{table.source}: metadata")
-    value = table.metadata.get(SD_KEY, 0.0)
+def _referenced_field(readings: Readings) -> Array:
+    """Horizontal fields (n,) by references."""
+    field = readings.reference("field") * np.cos(readings.reference("dip"))
+    return np.broadcast_to(field, readings.count)
+
+
+def _measured_field(readings: Readings, calibration: Calibration) -> Array:
+    """Horizontal fields (n,) as measured; NaN where no nT were."""
+    if not calibration.has_field or calibration.relative or readings.magnetometer is None:
+        return np.full(readings.count, np.nan)
+    g, b = calibration.fields(readings)
+    return np.asarray(np.linalg.norm(np.cross(g, b), axis=-1) / np.linalg.norm(g, axis=-1))
+
+
+def _stated_sd(metadata: Mapping[str, object], source: str) -> float:
+    """1σ of the declination that a table states, degrees; 0 where it states none."""
+    check_near_misses(list(metadata), (SD_KEY,), f"{source}: metadata")
+    value = metadata.get(SD_KEY, 0.0)
     number = float(value) if isinstance(value, int | float) else float("nan")
     limits = REFERENCES["dip"].uncertainty
     if isinstance(value, bool) or not limits.low <= number <= limits.high:
         raise InputError(
-            f"{table.source}, metadata '{SD_KEY}': must be {limits}; got {shown(value)}. State the standard "
+            f"{source}, metadata '{SD_KEY}': must be {limits}; got {shown(value)}. State the standard "
             "uncertainty (1σ) of the declination."
         )
     return number

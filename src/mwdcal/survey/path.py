@@ -30,7 +30,7 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import FREE_SHARE, Calibration
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import VERTICAL, is_vertical
-from mwdcal.geometry.vectors import Array, ArrayLike, eigen, outer, wrap
+from mwdcal.geometry.vectors import Array, ArrayLike, outer, square_root, wrap
 from mwdcal.survey.stations import STATIONS_AT_ONCE
 from mwdcal.use.uncertainty import rows_of
 
@@ -155,12 +155,33 @@ class DirectionErrors:
         systematic: shifts (…, n, k, 2) upward and sideways, rad, by one standard deviation of each of k
             independent causes that last over the well.
         random: covariance (…, n, 2, 2) of the errors that are new at every station, rad².
+        course: the same of a turn of the whole course that ends at each station; None: exact.
     """
 
     inclination: Array
     azimuth: Array
     systematic: Array
     random: Array
+    course: Array | None = None
+
+    def stations(self, where: slice) -> DirectionErrors:
+        """Those of some stations."""
+        pairs = (..., where, slice(None), slice(None))
+        angles = self.inclination[..., where], self.azimuth[..., where]
+        course = None if self.course is None else self.course[pairs]
+        return DirectionErrors(*angles, self.systematic[pairs], self.random[pairs], course)
+
+    def followed_by(self, others: DirectionErrors) -> DirectionErrors:
+        """Those of both, one after the other."""
+        return DirectionErrors(
+            np.concatenate([self.inclination, others.inclination], -1),
+            np.concatenate([self.azimuth, others.azimuth], -1),
+            np.concatenate([self.systematic, others.systematic], -3),
+            np.concatenate([self.random, others.random], -3),
+            None
+            if self.course is None or others.course is None
+            else np.concatenate([self.course, others.course], -3),
+        )
 
 
 class _Sums(NamedTuple):
@@ -174,6 +195,40 @@ class _Sums(NamedTuple):
     shift: Array
     settled: Array
     arrival: Array
+
+
+class TieIn(NamedTuple):
+    """Where a path is tied in, taken as exact.
+
+    Units: measured depth m, inclination and azimuth (from the north of the path) rad, place (3,) m.
+    """
+
+    md: float
+    inclination: float
+    azimuth: float
+    place: Array
+
+    def before(self, errors: DirectionErrors) -> PathEnd:
+        """The end of a path that leads there, for stations with such `errors` to follow."""
+
+        def none(like: Array) -> Array:
+            return np.zeros((1, *like.shape[-2:]))
+
+        course = None if errors.course is None else none(errors.course)
+        exact = DirectionErrors(
+            np.array([self.inclination]), np.array([self.azimuth]),
+            none(errors.systematic), none(errors.random), course,
+        )  # fmt: skip
+        md = np.array([self.md])
+        return PathEnd(md, exact, _no_sums(md, exact, self.place))
+
+
+class PathEnd(NamedTuple):
+    """Where a path has come to: depth (…, 1) and errors of its last station, and what has added up there."""
+
+    md: Array
+    errors: DirectionErrors
+    sums: _Sums
 
 
 def tilts(inclination: ArrayLike, azimuth: ArrayLike) -> Array:
@@ -233,7 +288,7 @@ def direction_errors(
     azimuth, gradient = direction_gradient(g, b)
     change = gradient @ calibration.jacobian(readings)
     free = np.abs(change @ calibration.free_directions.transpose()) > FREE_SHARE
-    shifts = change @ _factor(calibration.parameter_covariance)
+    shifts = change @ square_root(calibration.parameter_covariance)
     shifts = np.where(np.any(free, (-1, -2), keepdims=True), np.nan, shifts.swapaxes(-1, -2))
     inclination = np.arctan2(np.hypot(g[..., 0], g[..., 1]), g[..., 2])
     turn = np.stack([np.zeros_like(inclination), np.sin(inclination)], -1)
@@ -246,15 +301,6 @@ def direction_errors(
     )
 
 
-def _factor(covariance: Array) -> Array:
-    """A matrix (p, k) whose product with its transpose is a covariance (p, p): a column for each cause."""
-    scale = np.sqrt(np.diagonal(covariance))
-    whole = np.where(scale > 0, scale, 1.0)
-    values, vectors = eigen(covariance / whole[:, None] / whole)
-    kept = values > 0
-    return np.asarray(whole[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
-
-
 def position_covariance(
     md: ArrayLike,
     inclination: ArrayLike,
@@ -262,12 +308,14 @@ def position_covariance(
     systematic: ArrayLike | None = None,
     random: ArrayLike | None = None,
     balanced: bool = False,
+    course: ArrayLike | None = None,
 ) -> Array:
     """Covariance (…, n, 3, 3) of the positions (north, east, down) of survey stations, m².
 
     `systematic` (…, n, k, 2 or 3): shifts upward, sideways and, where there is a third, in measured depth, by one
     standard deviation of each of k independent causes that last over the well. `random` (…, n, 2, 2 or 3, 3):
-    covariance of the same of the errors that are new at every station.
+    covariance of the same of the errors that are new at every station. `course` (…, n, 2, 2): of a turn, upward and
+    sideways, of the whole course that ends at a station.
     `balanced`: by the balanced tangential method, as the numbers of published error models are.
     The first station is where the path starts: its position is exact, its direction has the errors given for it.
     Units: m, radians. Singular: finite at vertical, with any number for the azimuth that the shifts refer to.
@@ -279,13 +327,14 @@ def position_covariance(
     lasting = np.zeros((*md.shape, 0, 2)) if systematic is None else np.asarray(systematic, float)
     new = np.zeros((*md.shape, 2, 2)) if random is None else np.asarray(random, float)
 
+    turned = None if course is None else np.asarray(course, float)
+    whole = DirectionErrors(inc, azi, lasting, new, turned)
+
     def part(where: slice) -> tuple[Array, DirectionErrors]:
-        stations = (..., where, slice(None), slice(None))
-        errors = DirectionErrors(inc[..., where], azi[..., where], lasting[stations], new[stations])
-        return md[..., where], errors
+        return md[..., where], whole.stations(where)
 
     return np.concatenate(
-        [covariance for _, covariance in _along(md.shape[-1], part, balanced=balanced)], -3
+        [covariance for _, covariance, _ in _along(md.shape[-1], part, balanced=balanced)], -3
     )
 
 
@@ -306,38 +355,66 @@ def calibrated_path(
     Raises:
         InputError: the depths do not increase.
     """
+    norths = north, declination_sd, declination_noise
+    return continued_path(calibration, readings, md, norths, start)[:2]
+
+
+def continued_path(
+    calibration: Calibration,
+    readings: Readings,
+    md: ArrayLike,
+    norths: tuple[float, float, float],
+    before: ArrayLike | TieIn | PathEnd = (0.0, 0.0, 0.0),
+    more: Callable[[DirectionErrors, Readings, slice], DirectionErrors] | None = None,
+) -> tuple[Array, Array, PathEnd]:
+    """The same of readings that follow others of their well, and where the path has come to.
+
+    `norths` as of `direction_errors`. `before`: the position of the first station, where the path is tied in, or where
+    it had come to: a well in parts has the positions that it has as a whole. `more` adds errors to those of the
+    directions at some rows.
+    """
     depth = np.asarray(md, float)
-    if not (np.diff(depth) > 0).all():
+    last = [np.atleast_1d(before.md)] if isinstance(before, TieIn | PathEnd) else []
+    if not (np.diff(np.concatenate([*last, depth])) > 0).all():
         raise InputError(
             "`md` must increase from station to station. Sort the stations by measured depth."
         )
 
     def part(where: slice) -> tuple[Array, DirectionErrors]:
         some = rows_of(readings, where)
-        return depth[where], direction_errors(
-            calibration, some, north, declination_sd, declination_noise
-        )
+        errors = direction_errors(calibration, some, *norths)
+        return depth[where], errors if more is None else more(errors, some, where)
 
-    both = list(_along(len(depth), part, start))
-    return np.concatenate([p for p, _ in both]), np.concatenate([c for _, c in both])
+    place, covariance, end = [], [], None
+    for each in _along(len(depth), part, before):
+        place.append(each[0])
+        covariance.append(each[1])
+        end = each[2]
+    assert end is not None
+    return np.concatenate(place), np.concatenate(covariance), end
 
 
 def _along(
     count: int,
     part: Callable[[slice], tuple[Array, DirectionErrors]],
-    start: ArrayLike = (0.0, 0.0, 0.0),
+    before: ArrayLike | TieIn | PathEnd = (0.0, 0.0, 0.0),
     balanced: bool = False,
-) -> Iterator[tuple[Array, Array]]:
-    """Positions (…, m, 3) and covariance (…, m, 3, 3) of all stations of a well, some at a time."""
-    sums = None
+) -> Iterator[tuple[Array, Array, PathEnd]]:
+    """Positions (…, m, 3) and covariance (…, m, 3, 3) of all stations, some at a time, and where each part ends."""
     for first in range(0, max(count, 1), STATIONS_AT_ONCE):
-        # each part begins with the last station of the one before
-        where = slice(max(first - 1, 0), first + STATIONS_AT_ONCE)
-        md, errors = part(where)
-        sums = sums or _no_sums(md, errors, start)
+        md, errors = part(slice(first, first + STATIONS_AT_ONCE))
+        new = slice(0, None)
+        if isinstance(before, TieIn):
+            before = before.before(errors)
+        if isinstance(before, PathEnd):  # each part begins with the last station of the one before
+            md = np.concatenate([before.md, md], -1)
+            errors, sums = before.errors.followed_by(errors), before.sums
+            new = slice(1, None)
+        else:
+            sums = _no_sums(md, errors, before)
         position, covariance, sums = _part_of_path(md, errors, sums, balanced)
-        skipped = first - where.start
-        yield position[..., skipped:, :], covariance[..., skipped:, :, :]
+        before = PathEnd(md[..., -1:], errors.stations(slice(-1, None)), sums)
+        yield position[..., new, :], covariance[..., new, :, :], before
 
 
 def _no_sums(md: Array, errors: DirectionErrors, start: ArrayLike) -> _Sums:
@@ -352,7 +429,8 @@ def _part_of_path(
 ) -> tuple[Array, Array, _Sums]:
     """Positions and covariance of stations the first of which has the sums `before`, and those of the last."""
     arc = arcs(md, hole_direction(errors.inclination, errors.azimuth), balanced)
-    upper, lower = _reach(arc, tilts(errors.inclination, errors.azimuth))
+    turns = tilts(errors.inclination, errors.azimuth)
+    upper, lower = _reach(arc, turns)
     shifts, random = errors.systematic, errors.random
     rows = slice(shifts.shape[-1])
     step = (
@@ -364,6 +442,9 @@ def _part_of_path(
     arrival = np.concatenate([before.arrival[..., None, :, :], lower[..., rows, :]], -3)
     through = arrival[..., :-1, :, :] + upper[..., rows, :]
     passed = through.mT @ random[..., :-1, :, :] @ through
+    if errors.course is not None:
+        turned = arc.length[..., None, None] * turns[..., 1:, :, :]
+        passed = passed + turned.mT @ errors.course[..., 1:, :, :] @ turned
     settled = _sums_from(before.settled, passed, -3)
     covariance = settled + arrival.mT @ random @ arrival + shift.mT @ shift
     last = _Sums(position[..., -1, :], *(each[..., -1, :, :] for each in (shift, settled, arrival)))

@@ -1,8 +1,7 @@
 """Surveys: angles and strengths of calibrated readings in a well, each with its standard uncertainty.
 
-The uncertainty is that of the calibration and of the noise of one reading; of true and grid azimuths also
-that of the declination. Interference of the drill string and what has changed since the calibration are not
-part of it: `mwdcal.survey.acceptance` judges them.
+The uncertainty is that of the calibration and of the noise of one reading, with the variance that is `added`, such as
+that of an error model (`mwdcal.survey.well_errors`); of true and grid azimuths also that of the declination.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mwdcal.calibration.readings import Readings
-from mwdcal.calibration.record import Calibration
+from mwdcal.calibration.record import LARGEST_ANGLE_SD, Calibration
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, diagonal
@@ -29,6 +28,8 @@ SURVEY_OBSERVABLES = (
     "dip",
 )
 """Observables of a survey, in the order of `Surveys.value`."""
+TURNS = np.array([OBSERVABLES[name].period > 0 for name in SURVEY_OBSERVABLES])
+"""Which of them are angles of a full turn."""
 STRENGTHS = slice(4, 7)
 """Where |g|, |b| and dip lie in it."""
 TOOLFACE_SWITCH = (np.radians(3.0), np.radians(5.0))
@@ -45,12 +46,14 @@ class Surveys:
 
     NaN: not there, such as azimuth and toolface within the uncertainty of vertical, or without a stated one.
     `strengths` (n, 3, 3): covariance of |g|, |b| and dip. `magnetic` (n,): the toolface counts from magnetic north.
+    `ends_magnetic`: so it does behind the last station, until the inclination says otherwise.
     """
 
     value: Array
     sd: Array
     strengths: Array
     magnetic: Bools
+    ends_magnetic: bool
 
     def of(self, name: str) -> tuple[Array, Array]:
         """An observable (n,) and its standard uncertainty; `toolface` is the one that counts."""
@@ -69,11 +72,15 @@ def survey_angles(
     readings: Readings,
     switch: tuple[float, float] = TOOLFACE_SWITCH,
     advance: Callable[[int, int], None] = lambda done, total: None,
+    added: Callable[[Array, Array, slice], Array] | None = None,
+    starts_magnetic: bool = False,
 ) -> Surveys:
     """Surveys from readings, in the order in which they were taken.
 
+    `starts_magnetic`: the toolface counted from magnetic north at the station before.
+
     Shapes: `readings` of n stations without leading axes. Units: `switch` in radians. `advance` gets how many are
-    done, and of how many.
+    done, and of how many. `added` gives the variance (m, 7) that the vectors (m, 3) of some rows have besides.
     Singular: at vertical azimuth and toolface are NaN, the toolface from magnetic north is not.
 
     Raises:
@@ -97,12 +104,16 @@ def survey_angles(
         lost = without_value(calibration, part, SURVEY_OBSERVABLES, value[rows], sd[rows])
         value[rows] = np.where(lost, np.nan, value[rows])
         sd[rows] = np.where(lost, np.nan, sd[rows])
+        if added is not None:
+            whole = np.sqrt(sd[rows] ** 2 + added(g, b, rows))
+            sd[rows] = np.where(TURNS & (whole > LARGEST_ANGLE_SD), np.nan, whole)
         strengths[rows] = covariance[:, STRENGTHS, STRENGTHS]
         done = rows.stop
         advance(done, readings.count)
     there = calibration.has_field and readings.magnetometer is not None
-    magnetic = switched(value[:, 0], low, high) & there
-    return Surveys(value, sd, strengths, magnetic)
+    magnetic = switched(value[:, 0], low, high, starts_magnetic)
+    ends = bool(magnetic[-1]) if magnetic.size else starts_magnetic
+    return Surveys(value, sd, strengths, magnetic & there, ends)
 
 
 def blocks(readings: Readings) -> Iterator[Readings]:
@@ -111,11 +122,11 @@ def blocks(readings: Readings) -> Iterator[Readings]:
         yield rows_of(readings, slice(start, start + STATIONS_AT_ONCE))
 
 
-def switched(inclination: Array, low: float, high: float) -> Bools:
+def switched(inclination: Array, low: float, high: float, before: bool = False) -> Bools:
     """Stations (n,) whose toolface is magnetic: from below `low` until above `high`, in their order.
 
-    A first station between the two is taken as gravity toolface.
+    A first station between the two is as the one `before`, by default gravity toolface.
     """
     decided = np.where(inclination < low, 1, np.where(inclination > high, 0, -1))
     last = np.maximum.accumulate(np.where(decided >= 0, np.arange(len(decided)), -1))
-    return np.asarray((last >= 0) & (decided[np.maximum(last, 0)] == 1))
+    return np.where(last >= 0, decided[np.maximum(last, 0)] == 1, before)

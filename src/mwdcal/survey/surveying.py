@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,14 +18,19 @@ from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files import synonyms
 from mwdcal.files.contract import REFERENCES, check_columns
+from mwdcal.files.faults import chosen, nothing, spread, wholly_blank, without_reading
 from mwdcal.files.formats.table import Table, cell_error, numbers
 from mwdcal.files.runs import renamed, to_readings
-from mwdcal.geometry.vectors import Array
+from mwdcal.files.settings import setting
+from mwdcal.geometry.units import FOOT
+from mwdcal.geometry.vectors import Array, Bools
 from mwdcal.sensor.profile import StandProfile
 from mwdcal.survey.acceptance import SurveyLimits, load_survey_limits
+from mwdcal.survey.error_model import BUILT_IN, ErrorModel, load_error_model
 from mwdcal.survey.interference import Interference, interference
 from mwdcal.survey.interference_estimate import Assumed, sensor_drift
 from mwdcal.survey.norths import SD_KEY, North, norths_of
+from mwdcal.survey.path import TieIn
 from mwdcal.survey.references import (
     FROM_REFERENCE,
     MEASURABLE,
@@ -37,8 +42,10 @@ from mwdcal.survey.references import (
     source_of,
 )
 from mwdcal.survey.stations import RANDOM, TOOLFACE_SWITCH
-from mwdcal.survey.well import Well, well
+from mwdcal.survey.well import Well, WellCounts, well
 
+NO_MODEL = "none"
+"""The word for standard uncertainties of calibration, noise and declination alone."""
 MEASURED_DEPTH = "md_m"
 """The column of measured depths, m."""
 LARGEST_DEPTH = 20_000.0
@@ -46,6 +53,9 @@ LARGEST_DEPTH = 20_000.0
 _DEPTH_NAMES = re.compile(
     r"(md|dept|((measured|bit|survey|hole|along[ _-]?hole)[ _]?)?depth)[ _]*[\[(]?(m|ft|feet|met(re|er)s?)?[\])]?"
 )
+_DEPTH_UNIT = re.compile(r"(?<![a-z])(m|ft|feet|met(re|er)s?)[\])]?$")
+"""The unit at the end of such a name."""
+_METRES = {"m": 1.0, "ft": FOOT}
 
 
 @dataclass(frozen=True)
@@ -83,31 +93,58 @@ def survey_readings(
     Raises:
         InputError: a table that cannot be read, depths under another name or in another unit.
     """
+    readings, md = station_readings(table, calibration, recognised)
+    north = norths_of(table.metadata, table.source, lambda: [readings], calibration, reference)
+    claims = {
+        name: claim(table.source, readings, name)
+        for name in judged_constants(calibration, readings)
+    }
+    sources, findings = of_reference(claims, north, reference, table.source)
+    referenced = readings if reference is None else with_reference(readings, reference)
+    return SurveyReadings(referenced, md, north, sources, findings)
+
+
+def station_readings(
+    table: Table, calibration: Calibration, recognised: bool = True
+) -> tuple[Readings, Array | None]:
+    """The readings of a table of surveys, and its measured depths (n,) if it has them."""
     table = renamed(table, calibration.profile)
     check_columns(list(table.columns), table.source)
     if calibration.thermal:
         synonyms.check_evidence(list(table.columns), table.source, ("temperature_c",))
     in_a_well = replace_struct(calibration.profile, stand=StandProfile())
     readings, _ = to_readings(table, in_a_well, recognised)
-    north = norths_of(table, readings, calibration, reference)
-    names = (
-        CONSTANTS if calibration.has_field and readings.magnetometer is not None else CONSTANTS[:1]
-    )
+    return readings, depths(table)
+
+
+def judged_constants(calibration: Calibration, readings: Readings) -> tuple[str, ...]:
+    """Those of gravity, field and dip that surveys are judged by."""
+    whole = calibration.has_field and readings.magnetometer is not None
+    return CONSTANTS if whole else CONSTANTS[:1]
+
+
+def claim(source: str, readings: Readings, name: str) -> Claim:
+    """What a table claims of gravity, field or dip."""
+    factor = REFERENCES[name].factor
+    return Claim(source, _stated(readings, name) / factor, readings.uncertainty(name) / factor)
+
+
+def of_reference(
+    claims: Mapping[str, Claim], north: North, reference: EarthReference | None, source: str
+) -> tuple[dict[str, str], list[Finding]]:
+    """Where references come from, by name, and where the reference contradicts the claims of a table or is not used."""
     sources, findings = {}, []
-    for name in names:
+    for name, stated in claims.items():
         otherwise = NO_SOURCE if reference is None else FROM_REFERENCE
-        sources[name] = source_of(~np.isnan(_stated(readings, name)), otherwise)
+        sources[name] = source_of(~np.isnan(np.asarray(stated.values)), otherwise)
         if reference is not None:
-            findings += _contradictions(table.source, readings, reference, name)
-    if len(names) == len(CONSTANTS):
+            findings += _contradictions(stated, reference, name)
+    if len(claims) == len(CONSTANTS):
         sources |= north.sources
-    if reference is not None:
-        readings = _referenced(readings, reference)
-    result = SurveyReadings(readings, _depths(table), north, sources, findings)
-    if reference is not None and not result.uses_reference:
-        text = f"nothing of `reference` is used: {table.source} states all of it itself. Leave one of the two out."
+    if reference is not None and not any(FROM_REFERENCE in each for each in sources.values()):
+        text = f"nothing of `reference` is used: {source} states all of it itself. Leave one of the two out."
         findings.append(Finding(id="reference-unused", text=text))
-    return result
+    return sources, findings
 
 
 def _stated(readings: Readings, name: str) -> Array:
@@ -122,20 +159,14 @@ def _of_place(reference: EarthReference, name: str) -> tuple[float, float, float
     return value * factor, shared * factor, alone * factor
 
 
-def _contradictions(
-    source: str, readings: Readings, reference: EarthReference, name: str
-) -> list[Finding]:
-    """Where the table and the reference contradict each other."""
+def _contradictions(stated: Claim, reference: EarthReference, name: str) -> list[Finding]:
+    """Where a table and the reference contradict each other."""
     factor, (value, shared, alone) = REFERENCES[name].factor, _of_place(reference, name)
-    return contradictions(
-        name,
-        Claim(source, _stated(readings, name) / factor, readings.uncertainty(name) / factor),
-        Claim("the reference", [value / factor], np.hypot(shared, alone) / factor),
-        "Check unit, place and date.",
-    )
+    place = Claim("the reference", [value / factor], np.hypot(shared, alone) / factor)
+    return contradictions(name, stated, place, "Check unit, place and date.")
 
 
-def _referenced(readings: Readings, reference: EarthReference) -> Readings:
+def with_reference(readings: Readings, reference: EarthReference) -> Readings:
     """The readings with gravity, field and dip of the place where the table states none.
 
     Their uncertainty that all stations share stands under the name, and what is new at each under `RANDOM`.
@@ -151,42 +182,61 @@ def _referenced(readings: Readings, reference: EarthReference) -> Readings:
     return replace(readings, known=known, sd=sd)
 
 
-def _depths(table: Table) -> Array | None:
-    if MEASURED_DEPTH not in table.columns:
-        for name in table.columns:
-            if _DEPTH_NAMES.fullmatch(name.strip().lower()):
-                raise InputError(
-                    f"{table.source}: column '{name}': measured depths must be in metres, in a column "
-                    f"'{MEASURED_DEPTH}'. Rename it, and convert feet (× 0.3048)."
-                )
+def depths(table: Table) -> Array | None:
+    """Measured depths (n,), m, which increase; None where the table has none."""
+    name, factor = _depth_column(table)
+    if not name:
         return None
-    column = table.columns[MEASURED_DEPTH]
-    depths = numbers(table, MEASURED_DEPTH) if isinstance(column, list) else column
-    wrong = np.flatnonzero((depths < 0) | (depths > LARGEST_DEPTH))
+    column = table.columns[name]
+    md = factor * (numbers(table, name) if isinstance(column, list) else column)
+    wrong = np.flatnonzero((md < 0) | (md > LARGEST_DEPTH))
     if wrong.size:
-        problem = f"must be between 0 and {LARGEST_DEPTH:g} m; got {depths[wrong[0]]:g}."
-        raise cell_error(table, MEASURED_DEPTH, int(wrong[0]), problem)
-    there = np.flatnonzero(~np.isnan(depths))
-    back = there[1:][np.diff(depths[there]) <= 0]
+        problem = f"must be between 0 and {LARGEST_DEPTH:g} m; got {md[wrong[0]]:g}."
+        raise cell_error(table, name, int(wrong[0]), problem)
+    there = np.flatnonzero(~np.isnan(md))
+    back = there[1:][np.diff(md[there]) < 0]
     if back.size:
-        problem = f"must increase from station to station; got {depths[back[0]]:g}. Sort; leave repeated surveys out."
-        raise cell_error(table, MEASURED_DEPTH, int(back[0]), problem)
-    return depths if there.size else None
+        raise not_deeper(table, int(back[0]), md[back[0]])
+    return md if there.size else None
 
 
-def surveyed_table(table: Table, well: Well) -> Table:
-    """The table with the results beside its columns.
+def not_deeper(table: Table, row: int, depth: float) -> InputError:
+    """A measured depth that is not beyond that of the station before."""
+    problem = f"must not decrease from station to station; got {depth:g}. Sort the stations by measured depth."
+    return cell_error(table, _depth_column(table)[0], row, problem)
+
+
+def _depth_column(table: Table) -> tuple[str, float]:
+    """The column of measured depths, and metres per its unit; blank where there is none.
+
+    One that states no unit is in the laboratory's unit of length, where a command runs with its settings.
+    """
+    if MEASURED_DEPTH in table.columns:
+        return MEASURED_DEPTH, 1.0
+    for name in table.columns:
+        if _DEPTH_NAMES.fullmatch(name.strip().lower()):
+            stated = _DEPTH_UNIT.search(name.strip().lower())
+            unit = "" if stated else setting("length_unit")
+            if unit:
+                return name, _METRES[unit]
+            raise InputError(
+                f"{table.source}: column '{name}': measured depths must be in metres, in a column "
+                f"'{MEASURED_DEPTH}'. Rename it, and convert feet (× 0.3048); or state length_unit in mwdcal.toml, "
+                "which columns without a unit are in."
+            )
+    return "", 1.0
+
+
+def surveyed_table(table: Table, well: Well, rows: Bools | None = None) -> Table:
+    """The table with the results beside its columns; `rows` (n,) are those of the well, by default all.
 
     Raises:
         InputError: a column has the name of a result already.
     """
     results = well.columns
-    taken = [name for name in results if name in table.columns]
-    if taken:
-        raise InputError(
-            f"{table.source}: the column '{taken[0]}' is there already, and would be lost under the result of that "
-            "name. Rename it."
-        )
+    if rows is not None:
+        results = {name: spread(values, rows) for name, values in results.items()}
+    check_free(table, results)
     texts: dict[str, str] = {}  # few words stand in many rows: each is in memory once
     columns = {
         name: values
@@ -198,6 +248,16 @@ def surveyed_table(table: Table, well: Well) -> Table:
     return replace(table, columns={**table.columns, **columns}, metadata=metadata)
 
 
+def check_free(table: Table, results: Collection[str]) -> None:
+    """Refuse a table that has a column of the name of a result."""
+    taken = [name for name in results if name in table.columns]
+    if taken:
+        raise InputError(
+            f"{table.source}: the column '{taken[0]}' is there already, and would be lost under the result of that "
+            "name. Rename it."
+        )
+
+
 def described(well: Well) -> Mapping[str, object]:
     """The statements of a table of surveys about the calibration, north and limits it rests on."""
     calibration, north = well.calibration, well.north
@@ -206,8 +266,8 @@ def described(well: Well) -> Mapping[str, object]:
         "calibration_time": calibration.time,
         "survey_limits": well.limits.name,
         "north": north.name,
-        "error_terms": list(well.terms.included),
-        "not_included": list(well.terms.left_out),
+        "error_model": "none" if well.errors is None else well.errors.model.name,
+        **well.terms.stated,
     }
     for key, angle in (
         ("declination_deg", north.declination),
@@ -229,6 +289,8 @@ def described(well: Well) -> Mapping[str, object]:
 class WellInputs:
     """The inputs of the surveys of a well.
 
+    `model`: the error model whose terms are in the standard uncertainties; None: none. `rows` (n,) of the table that
+    have readings; None: all.
     `findings` are of the calibration's signature and of the reference; `digests` the SHA-256 of each input by name,
     empty for one that is in memory.
     """
@@ -239,6 +301,8 @@ class WellInputs:
     limits: SurveyLimits
     findings: list[Finding]
     digests: Mapping[str, str]
+    model: ErrorModel | None = None
+    rows: Bools | None = None
 
     @property
     def stated(self) -> tuple[Mapping[str, object], Mapping[str, object]]:
@@ -253,16 +317,20 @@ class WellInputs:
 
 @dataclass(frozen=True)
 class SurveyedWell:
-    """The surveys of a well with what they rest on; `analysis` is None without multi-station analysis."""
+    """The surveys of a well with what they rest on; `analysis` is None without multi-station analysis.
+
+    Of a long table that was surveyed in parts `well` has the first stations only, and `counts` is of all.
+    """
 
     inputs: WellInputs
     well: Well
+    counts: WellCounts
     analysis: Interference | None = None
 
     @property
     def table(self) -> Table:
         """The table of the readings with the results beside its columns."""
-        return surveyed_table(self.inputs.table, self.well)
+        return surveyed_table(self.inputs.table, self.well, self.inputs.rows)
 
 
 def well_inputs(
@@ -273,26 +341,34 @@ def well_inputs(
     recognised: bool = False,
     digest: str = "",
     findings: Sequence[Finding] = (),
+    error_model: ErrorModel | str | os.PathLike[str] = BUILT_IN,
+    missing: str = "refuse",
 ) -> WellInputs:
     """The inputs of surveys: a table of readings, the calibration of their tool, reference and limits.
 
-    `reference` and `limits` are values, or files by path. Stations that multi-station analysis puts into the record
-    have to be `recognised`. `digest` and `findings` are of the file of the calibration.
+    `reference`, `limits` and `error_model` are values, or files by path; `NO_MODEL` for none. Stations that
+    multi-station analysis puts into the record have to be `recognised`. `digest` and `findings` are of the file of the
+    calibration.
 
     Raises:
         InputError: a file that cannot be read, readings that do not belong to the calibration.
     """
-    bounds, limits_digest = (
-        (limits, "") if isinstance(limits, SurveyLimits) else load_survey_limits(limits)
-    )
-    place, place_digest = (
-        (reference, "")
-        if reference is None or isinstance(reference, EarthReference)
-        else load_reference(reference)
-    )
-    read = survey_readings(table, calibration, place, recognised=recognised)
+    bounds, limits_digest = loaded_limits(limits)
+    place, place_digest = loaded_reference(reference)
+    rows = _with_readings(table, calibration) if missing == "blank" else np.ones(table.count, bool)
+    read = survey_readings(chosen(table, rows), calibration, place, recognised=recognised)
+    if not rows.all():
+        numbered = np.flatnonzero(rows) + 1
+        names = tuple(
+            label or str(i) for label, i in zip(read.readings.station, numbered, strict=True)
+        )
+        text = f"{np.sum(~rows)} of {rows.size} rows lack a reading: their results are blank."
+        about = [Finding(id="missing-reading", text=text), *read.findings]
+        read = replace(read, readings=replace(read.readings, station=names), findings=about)
     digests = {"calibration": digest, "readings": table.digest}
     digests |= {"reference": place_digest} if read.uses_reference else {}
+    model = error_model_of(error_model)
+    digests |= {"error_model": model.digest} if model else {}
     return WellInputs(
         calibration,
         table,
@@ -300,7 +376,61 @@ def well_inputs(
         bounds,
         [*findings, *read.findings],
         {**digests, "limits": limits_digest},
+        model,
+        None if rows.all() else rows,
     )
+
+
+def _with_readings(table: Table, calibration: Calibration) -> Bools:
+    """Rows (n,) that lack no reading."""
+    renamed_table = renamed(table, calibration.profile)
+    rows = ~without_reading(renamed_table, wholly_blank([renamed_table]))
+    if not rows.any():
+        raise nothing(table.source)
+    return rows
+
+
+def error_model_of(model: ErrorModel | str | os.PathLike[str]) -> ErrorModel | None:
+    """An error model by itself, its name or its file; None for `NO_MODEL`."""
+    if isinstance(model, ErrorModel):
+        return model
+    return None if os.fspath(model) == NO_MODEL else load_error_model(model)
+
+
+def loaded_limits(limits: SurveyLimits | str | os.PathLike[str]) -> tuple[SurveyLimits, str]:
+    """Limits, and the SHA-256 of their file, empty for those in memory."""
+    return (limits, "") if isinstance(limits, SurveyLimits) else load_survey_limits(limits)
+
+
+def loaded_reference(
+    reference: EarthReference | str | os.PathLike[str] | None,
+) -> tuple[EarthReference | None, str]:
+    """A reference, and the SHA-256 of its file, empty for one in memory."""
+    if reference is None or isinstance(reference, EarthReference):
+        return reference, ""
+    return load_reference(reference)
+
+
+def start_of(numbers: Sequence[float]) -> tuple[float, float, float] | TieIn:
+    """Where a path starts: north, east and TVD of the first station, m, or behind depth, m, and two angles, degrees.
+
+    Raises:
+        InputError: neither three nor six numbers, or an inclination or depth that no hole has.
+    """
+    if len(numbers) == 3:
+        return (float(numbers[0]), float(numbers[1]), float(numbers[2]))
+    if len(numbers) != 6:
+        raise InputError(
+            "`tie_in` must be north, east and TVD, or measured depth, inclination, azimuth, north, east and TVD; got "
+            f"{len(numbers)} numbers."
+        )
+    md, inclination, azimuth, *place = map(float, numbers)
+    if not (0 <= md <= LARGEST_DEPTH and 0 <= inclination <= 180):
+        raise InputError(
+            f"`tie_in` must have a depth of 0 to {LARGEST_DEPTH:g} m and an inclination of 0 to 180°; got {md:g} and "
+            f"{inclination:g}."
+        )
+    return TieIn(md, float(np.radians(inclination)), float(np.radians(azimuth)), np.array(place))
 
 
 def check_drift(drift: object, msa: bool) -> None:
@@ -323,7 +453,7 @@ def survey_well(
     inputs: WellInputs,
     analysis: Interference | None = None,
     *,
-    tie_in: tuple[float, float, float] | None = None,
+    tie_in: tuple[float, float, float] | TieIn | None = None,
     switch: tuple[float, float] = TOOLFACE_SWITCH,
     outside: str = "blank",
 ) -> SurveyedWell:
@@ -331,9 +461,9 @@ def survey_well(
     surveys = inputs.surveys
     fitted = analysis.calibration if analysis else inputs.calibration
     result = well(
-        fitted, surveys.readings, inputs.limits, surveys.north, surveys.md, tie_in, switch, outside
-    )
+        fitted, surveys.readings, inputs.limits, surveys.north, surveys.md, tie_in, switch, outside,
+        model=inputs.model,
+    )  # fmt: skip
     findings = [*inputs.findings, *result.findings]
-    return SurveyedWell(
-        inputs, replace(result, findings=findings, sources=surveys.sources), analysis
-    )
+    result = replace(result, findings=findings, sources=surveys.sources)
+    return SurveyedWell(inputs, result, result.counts, analysis)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from operator import or_
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,14 +23,20 @@ from mwdcal.survey.acceptance import (
     blindness,
     judged,
 )
-from mwdcal.survey.interference import CORRECTED, DRIFTED, ErrorTerms, error_terms
+from mwdcal.survey.error_model import ErrorModel
 from mwdcal.survey.norths import North
-from mwdcal.survey.path import calibrated_path
+from mwdcal.survey.path import PathEnd, TieIn, continued_path
 from mwdcal.survey.stations import TOOLFACE_SWITCH, Surveys, survey_angles
-from mwdcal.use.correction import correct_and_count
+from mwdcal.survey.well_errors import WellErrors, hole_of, well_errors
+from mwdcal.use.correction import RowCounts, tallied
+from mwdcal.use.correction import findings as about_rows
+from mwdcal.use.strengths import check as check_strengths
+from mwdcal.use.uncertainty import CORRECTED, DRIFTED, ErrorTerms, error_terms
 
 BLIND_FROM = 2.0
 """Stated standard uncertainties of azimuth by which interference that would pass turns it where acceptance is blind."""
+Start = tuple[float, float, float] | TieIn | PathEnd
+"""Where a path starts: position of the first station, a tie-in, or the end of the part before."""
 AXES_OF_EARTH = ("north", "east", "tvd")
 WELL_FINDINGS = {
     "rejected": "{rejected} of {judged} surveys lie outside the limits '{limits}' (first: station {first}: {why}).",
@@ -47,7 +55,8 @@ WELL_FINDINGS = {
     "position.",
     "path-from-later": "the well path starts at station {start}: those before it have no result or no measured depth. "
     "`tie_in` gives the position of station {start}.",
-    "left-out": "left out of the well path, without a result or a measured depth: {count} of {rows} stations.",
+    "left-out": "left out of the well path, without a result, without a measured depth, or at the depth of the "
+    "station before: {count} of {rows} stations.",
     "no-path": "no well path: no station has both a measured depth and a direction with azimuth.",
 }
 """The texts of the findings about a well, in their order."""
@@ -66,9 +75,8 @@ class Position:
         """Stations (n,) with a position."""
         return ~np.isnan(self.place[:, 0])
 
-    def without_accuracy(self, beyond: Bools) -> Position:
-        """The same, with no covariance from the first station on the path on that is `beyond` (n,)."""
-        lost = np.logical_or.accumulate(beyond & self.on_path)
+    def without_accuracy(self, lost: Bools) -> Position:
+        """The same, with no covariance at stations where it is `lost` (n,)."""
         return replace(self, covariance=np.where(lost[:, None, None], np.nan, self.covariance))
 
     @property
@@ -78,11 +86,80 @@ class Position:
 
 
 @dataclass(frozen=True)
+class Before:
+    """What stations leave to those that follow them.
+
+    `magnetic`: the toolface counts from magnetic north. `path`: where the path has come to, at first where it starts.
+    `inaccurate`: no accuracy is stated of positions any more.
+    """
+
+    magnetic: bool = False
+    path: Start = (0.0, 0.0, 0.0)
+    inaccurate: bool = False
+
+
+class LastStation(NamedTuple):
+    """The last station with a position: its place (3,), m, with covariance (3, 3)."""
+
+    label: str
+    md: float
+    place: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class WellCounts:
+    """Stations of a well, counted by what its findings and its summary say of them.
+
+    `unjudged` have a result and no reference; `partly` lack a reference of those that `lacking` (3,) names. `first`:
+    label of the first rejected station, and why; `blindest`: how far interference turns its azimuth, its label, and
+    the interference in words; `start`: row, label and depth of the first station on the path. `weighed`: |g| is judged
+    somewhere; `located`: there are measured depths.
+    """
+
+    rows: int
+    judged: int
+    accepted: int
+    rejected: int
+    blind: int
+    blank: int
+    unjudged: int
+    partly: int
+    on_path: int
+    rejected_on_path: int
+    lacking: tuple[bool, ...]
+    weighed: bool
+    located: bool
+    first: tuple[str, str] | None
+    blindest: tuple[float, str, str] | None
+    start: tuple[int, str, float] | None
+    end: LastStation | None
+
+    def followed_by(self, other: WellCounts) -> WellCounts:
+        """Those of a well of which these are the first part, and the others the next."""
+        start = other.start and (other.start[0] + self.rows, *other.start[1:])
+        most = [each for each in (self.blindest, other.blindest) if each]
+        sums = {
+            f.name: getattr(self, f.name) + getattr(other, f.name)
+            for f in fields(self)
+            if f.type == "int"
+        }
+        return replace(
+            self, **sums, lacking=tuple(map(or_, self.lacking, other.lacking)),
+            weighed=self.weighed or other.weighed, located=self.located or other.located,
+            first=self.first or other.first, start=self.start or start, end=other.end or self.end,
+            blindest=max(most, key=lambda each: each[0], default=None),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
 class Well:
     """Surveys of a well in the order of their table.
 
     `vectors` (n, 3) each as corrected; `extrapolated` (n,): stations without a statement of accuracy, None where
-    none may be. `position`: None without measured depths. `sources`: where references come from, by name.
+    none may be. `position`: None without measured depths. `sources`: where references come from, by name. `after`:
+    what these stations leave to others that follow.
+    `errors`: of the error model in the standard uncertainties; None: these hold calibration, noise and declination.
     """
 
     calibration: Calibration
@@ -97,6 +174,8 @@ class Well:
     extrapolated: Bools | None = None
     blindness: Blindness | None = None
     sources: Mapping[str, str] = field(default_factory=dict)
+    after: Before = Before()
+    errors: WellErrors | None = None
 
     @cached_property
     def sd_azimuth(self) -> Array:
@@ -121,7 +200,10 @@ class Well:
     @property
     def terms(self) -> ErrorTerms:
         """The scope of the standard uncertainties: what they hold and leave out."""
-        return error_terms(self.calibration.findings, self.north.declination is not None)
+        modelled = () if self.errors is None else self.errors.included
+        return error_terms(
+            self.calibration.findings, self.north.declination is not None, modelled=modelled
+        )
 
     @property
     def blank(self) -> Bools:
@@ -140,18 +222,18 @@ class Well:
         lacking = np.isnan(self.judgement.departure) & stated
         return np.asarray(lacking & np.array([True, not self.calibration.relative, True]))
 
-    @cached_property
-    def remarks(self) -> list[str]:
-        """The fault of each station."""
+    def remarks(self, rows: slice = slice(None)) -> list[str]:
+        """What is wrong with each station of some rows."""
         remarks = zip(
-            self.judgement.findings(), self.blank.tolist(), self.unstated.tolist(), strict=True
-        )
+            self.judgement.findings(rows), self.blank[rows].tolist(), self.unstated[rows].tolist(),
+            strict=True,
+        )  # fmt: skip
         remarked = [
             "no result" if blank else "not judged: no statement of accuracy" if unstated else remark
             for remark, blank, unstated in remarks
         ]
-        places = np.flatnonzero(self.blind)
-        for place, words in zip(places.tolist(), self.what_passes(places), strict=True):
+        places, start = np.flatnonzero(self.blind[rows]), rows.start or 0
+        for place, words in zip(places.tolist(), self.what_passes(places + start), strict=True):
             remarked[place] = f"blind: {words}"
         return remarked
 
@@ -188,7 +270,7 @@ class Well:
         columns["accepted"] = np.where(
             self.judgement.judged, np.where(self.judgement.accepted, "true", "false"), ""
         )
-        columns["finding"] = np.array(self.remarks, dtype=object)
+        columns["finding"] = np.array(self.remarks(), dtype=object)
         if self.extrapolated is not None:
             columns[EXTRAPOLATED] = np.where(self.extrapolated, "true", "false")
         if self.position is not None:
@@ -199,6 +281,54 @@ class Well:
                 }
         return columns
 
+    @cached_property
+    def counts(self) -> WellCounts:
+        """The stations, counted by what findings and summary say of them."""
+        judged, accepted, labels = (
+            self.judgement.judged,
+            self.judgement.accepted,
+            self.readings.labels,
+        )
+        rejected, partly = judged & ~accepted, judged & self.lacking.any(-1)
+        unjudged = ~judged & ~self.blank & ~self.unstated
+        path = np.zeros(len(judged), bool) if self.position is None else self.position.on_path
+        masks = {
+            "judged": judged, "accepted": accepted, "rejected": rejected, "blind": self.blind, "blank": self.blank,
+            "unjudged": unjudged, "partly": partly, "on_path": path, "rejected_on_path": rejected & path,
+        }  # fmt: skip
+        numbers: dict[str, Any] = {n: int(np.count_nonzero(mask)) for n, mask in masks.items()}
+        first, lacking = int(np.argmax(rejected)), np.asarray(self.lacking[partly].any(0))
+        why = self.remarks(slice(first, first + 1))[0] if rejected.any() else ""
+        return WellCounts(
+            rows=len(judged), **numbers, lacking=tuple(lacking.tolist()),
+            weighed=not np.isnan(self.judgement.departure[:, 0]).all(),
+            located=self.position is not None, first=(labels[first], why) if rejected.any() else None,
+            blindest=self._blindest(labels), start=self._start(labels, path), end=self._end(labels, path),
+        )  # fmt: skip
+
+    def _blindest(self, labels: Sequence[str]) -> tuple[float, str, str] | None:
+        """The accepted survey whose azimuth interference turns most, and what does."""
+        if self.blindness is None or not self.blind.any():
+            return None
+        turn = np.where(self.blind, self.blindness.turn.max(-1), -1.0)
+        place = int(np.argmax(turn))
+        return float(turn[place]), labels[place], self.what_passes(np.array([place]))[0]
+
+    def _start(self, labels: Sequence[str], path: Bools) -> tuple[int, str, float] | None:
+        """The first station on the path."""
+        if self.position is None or not path.any():
+            return None
+        row = int(np.argmax(path))
+        return row, labels[row], float(self.position.md[row])
+
+    def _end(self, labels: Sequence[str], path: Bools) -> LastStation | None:
+        """The last station on the path."""
+        if self.position is None or not path.any():
+            return None
+        row, at = int(np.flatnonzero(path)[-1]), self.position
+        place, covariance = at.place[row].copy(), at.covariance[row].copy()  # of one station alone
+        return LastStation(labels[row], float(at.md[row]), place, covariance)
+
 
 def well(
     calibration: Calibration,
@@ -206,35 +336,92 @@ def well(
     limits: SurveyLimits,
     north: North | None = None,
     md: Array | None = None,
-    tie_in: tuple[float, float, float] | None = None,
+    tie_in: tuple[float, float, float] | TieIn | None = None,
     switch: tuple[float, float] = TOOLFACE_SWITCH,
     outside: str = "blank",
     advance: Callable[[int, int], None] = lambda done, total: None,
+    model: ErrorModel | None = None,
 ) -> Well:
     """The surveys of a well from readings in their order, references with these; `md` (n,) measured depths, m.
 
-    Units: `tie_in` north, east and TVD of the first station, m; `switch` as of `surveyed`. `outside` the calibrated
-    temperatures as of `correction.correct`: blank results, refuse, or extrapolate without stated uncertainty.
-    `advance` as of `surveyed`.
+    Units: `tie_in` north, east and TVD of the first station, m, or where the path is tied in; `switch` as of
+    `surveyed`. `outside` the calibrated temperatures as of `correction.correct`: blank results, refuse, or extrapolate
+    without stated uncertainty. `advance` as of `surveyed`. `model`: error model whose terms are in the standard
+    uncertainties too.
 
     Raises:
         InputError: readings that do not belong to the calibration, or depths that do not increase.
     """
+    start = (0.0, 0.0, 0.0) if tie_in is None else tie_in
     north = north or North()
-    columns, _, findings = correct_and_count(calibration, readings, outside)
+    result, tally = part_of_well(
+        calibration,
+        readings,
+        limits,
+        north,
+        md,
+        Before(path=start),
+        switch,
+        outside,
+        advance,
+        model,
+    )
+    return with_findings(result, tally, result.counts, outside, tie_in is None)
+
+
+def part_of_well(
+    calibration: Calibration,
+    readings: Readings,
+    limits: SurveyLimits,
+    north: North,
+    md: Array | None,
+    before: Before,
+    switch: tuple[float, float] = TOOLFACE_SWITCH,
+    outside: str = "blank",
+    advance: Callable[[int, int], None] = lambda done, total: None,
+    model: ErrorModel | None = None,
+    whole: bool = True,
+) -> tuple[Well, RowCounts]:
+    """The same of stations that follow others, without findings; and what the findings say of the corrected rows.
+
+    `whole`: the stations are all of the table.
+    """
+    columns, tally = tallied(calibration, readings, outside, whole=whole)
     beyond, blank = calibration.outside(readings), np.isnan(columns[RESULTS[0]])
-    surveys = _without(survey_angles(calibration, readings, switch, advance), blank, beyond)
+    errors = None
+    if model is not None and calibration.has_field:
+        errors = well_errors(model, calibration, readings)
+    added = None if errors is None else errors.of_surveys(calibration, readings, md, before.path)
+    angles = survey_angles(calibration, readings, switch, advance, added, before.magnetic)
+    surveys = _without(angles, blank, beyond)
     g, b = (np.stack([columns[name] for name in VECTORS[i : i + 3]], -1) for i in (0, 3))
     judgement, blind = _judged(calibration, readings, surveys, (g, b), limits)
-    start = (0.0, 0.0, 0.0) if tie_in is None else tie_in
-    position = None if md is None else _positions(calibration, readings, md, north, blank, start)
-    if position is not None:
-        position = position.without_accuracy(beyond)
+    after = replace(before, magnetic=angles.ends_magnetic)
+    position = None
+    if md is not None:
+        position, end = _positions(calibration, readings, md, north, blank, before.path, errors)
+        lost = np.logical_or.accumulate(beyond & position.on_path) | before.inaccurate
+        position = position.without_accuracy(lost)
+        after = replace(after, path=end, inaccurate=bool(lost[-1]))
     result = Well(
-        calibration, readings, surveys, judgement, limits, north, (g, b), position, findings,
-        extrapolated=columns.get(EXTRAPOLATED), blindness=blind,
+        calibration, readings, surveys, judgement, limits, north, (g, b), position, [],
+        extrapolated=columns.get(EXTRAPOLATED), blindness=blind, after=after, errors=errors,
     )  # fmt: skip
-    return replace(result, findings=findings + _findings(result, tie_in is None))
+    return result, tally
+
+
+def with_findings(
+    result: Well, tally: RowCounts, counts: WellCounts, outside: str, from_first: bool
+) -> Well:
+    """The well with its findings, about all stations that the counts are of.
+
+    Raises:
+        InputError: most readings have a strength that no place has, or lie `outside` where that is refused.
+    """
+    calibration, readings = result.calibration, result.readings
+    findings = about_rows(calibration, readings, tally, outside)
+    check_strengths(calibration, tally.strengths, readings.name)
+    return replace(result, findings=findings + _findings(result, counts, from_first))
 
 
 def _without(surveys: Surveys, blank: Bools, beyond: Bools) -> Surveys:
@@ -244,6 +431,7 @@ def _without(surveys: Surveys, blank: Bools, beyond: Bools) -> Surveys:
         np.where((blank | beyond)[:, None], np.nan, surveys.sd),
         np.where((blank | beyond)[:, None, None], np.nan, surveys.strengths),
         surveys.magnetic & ~blank,
+        surveys.ends_magnetic,
     )
 
 
@@ -280,60 +468,60 @@ def _to_judge(
 
 def _positions(
     calibration: Calibration, readings: Readings, md: Array, north: North, blank: Bools,
-    start: tuple[float, float, float],
-) -> Position:  # fmt: skip
-    """Positions of the stations with results."""
-    whole = ~blank & ~np.isnan(md)
+    before: Start, errors: WellErrors | None,
+) -> tuple[Position, Start]:  # fmt: skip
+    """Positions of the stations with results, and where the path has come to."""
+    whole = _on_path(md, blank, before)
     if not calibration.has_field or readings.magnetometer is None or not whole.any():
         whole = np.zeros(len(md), bool)
     place, covariance = np.full((len(md), 3), np.nan), np.full((len(md), 3, 3), np.nan)
     if whole.any():
         some = readings if whole.all() else readings.select(whole)
-        place[whole], covariance[whole] = calibrated_path(
-            calibration,
-            some,
-            md[whole],
-            north.offset,
-            north.declination_sd,
-            start,
-            north.declination_noise,
+        norths, at = (north.offset, north.declination_sd, north.declination_noise), md[whole]
+        more = None
+        if errors is not None:
+            more = errors.of_path(calibration, hole_of(calibration, some, at, north.offset, before))
+        place[whole], covariance[whole], before = continued_path(
+            calibration, some, at, norths, before, more
         )
-    return Position(md, place, covariance)
+    return Position(md, place, covariance), before
 
 
-def _findings(result: Well, from_first: bool) -> list[Finding]:
+def _on_path(md: Array, blank: Bools, before: Start) -> Bools:
+    """Stations (n,) that the path goes through: of several at one depth the first that has a result."""
+    whole = ~blank & ~np.isnan(md)
+    depths = md[whole]
+    reached = np.max(before.md) if isinstance(before, TieIn | PathEnd) else -np.inf
+    deeper = np.diff(np.concatenate([[reached], depths])) > 0
+    whole[whole] = deeper
+    return whole
+
+
+def _findings(result: Well, counts: WellCounts, from_first: bool) -> list[Finding]:
     """Findings about a well."""
-    judgement, position = result.judgement, result.position
-    rejected = judgement.judged & ~judgement.accepted
-    unjudged = ~judgement.judged & ~result.blank & ~result.unstated
-    partly = judgement.judged & result.lacking.any(-1)
-    on_path = np.zeros(len(rejected), bool) if position is None else position.on_path
-    there, start = bool(on_path.any()), int(np.argmax(on_path))
+    start, label, depth = counts.start or (0, "", 0.0)
+    first, why = counts.first or ("", "")
+    _, blindest, worst = counts.blindest or (0.0, "", "")
+    there = counts.on_path > 0
     applies = {
-        "rejected": rejected.any(),
-        "blind-to-interference": result.blind.any(),
-        "rejected-on-path": (rejected & on_path).any(),
-        "not-judged": unjudged.any(),
-        "partly-judged": partly.any(),
-        "laboratory-gravity": unknown_gravity(result.calibration)
-        and not np.isnan(judgement.departure[:, 0]).all(),
+        "rejected": counts.rejected,
+        "blind-to-interference": counts.blind,
+        "rejected-on-path": counts.rejected_on_path,
+        "not-judged": counts.unjudged,
+        "partly-judged": counts.partly,
+        "laboratory-gravity": unknown_gravity(result.calibration) and counts.weighed,
         "magnetic-north": result.north.declination is None and result.calibration.has_field,
-        "path-from-first": there and from_first and position is not None and position.md[start] > 0,
+        "path-from-first": there and from_first and depth > 0,
         "path-from-later": start > 0,
-        "left-out": there and not on_path.all(),
-        "no-path": position is not None and not there,
+        "left-out": there and counts.on_path < counts.rows,
+        "no-path": counts.located and not there,
     }
-    turn = 0.0 if result.blindness is None else result.blindness.turn.max(-1)
-    blindest = int(np.argmax(np.where(result.blind, turn, -1.0)))
-    first, labels = int(np.argmax(rejected)), result.readings.labels
-    absent = np.asarray(result.lacking[partly].any(0)).tolist()
     words = {
-        "rejected": int(rejected.sum()), "judged": int(judgement.judged.sum()), "limits": result.limits.name,
-        "rows": len(rejected), "first": labels[first], "why": result.remarks[first], "start": labels[start],
-        "names": " and ".join(n for n, lacks in zip(STRENGTH_NAMES, absent, strict=True) if lacks),
-        "blind": int(result.blind.sum()), "accepted": int(judgement.accepted.sum()), "blindest": labels[blindest],
-        "worst": result.what_passes(np.array([blindest]))[0] if result.blind.any() else "",
-        "partly": int(partly.sum()), "unjudged": int(unjudged.sum()), "count": int((~on_path).sum()),
+        "rejected": counts.rejected, "judged": counts.judged, "limits": result.limits.name, "rows": counts.rows,
+        "first": first, "why": why, "start": label, "blind": counts.blind, "accepted": counts.accepted,
+        "names": " and ".join(n for n, lacks in zip(STRENGTH_NAMES, counts.lacking, strict=True) if lacks),
+        "blindest": blindest, "worst": worst, "partly": counts.partly, "unjudged": counts.unjudged,
+        "count": counts.rows - counts.on_path,
     }  # fmt: skip
     return [*result.corrected, *result.north.findings] + [
         Finding(id=name, text=text.format(**words))

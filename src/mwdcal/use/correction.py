@@ -46,14 +46,19 @@ WINDOW_ROWS = 512
 """Neighbouring rows that are looked at together."""
 WINDOWS = 4
 """Most windows of a part of a table."""
-FEWEST_ROWS = 4
+FEWEST_ROWS = 2
 """Fewest rows that are judged."""
+ROWS_PER_LAG = 4
+"""Rows of a window for each row of the longest lag."""
+ABOUT = 5
+"""Rows, with its own, to whose median a row is compared."""
 
 
 class Scatter(NamedTuple):
     """Windows of rows of a table that were looked at, those in which a value scatters, and its extremes in these.
 
-    `allowed`: the median 1σ of one row.
+    `allowed`: the median 1σ of one row. `odd` of the `rows` of windows that do not scatter depart from the rows
+    about them; `farthest`: by how much at most, and the value there.
     """
 
     windows: int = 0
@@ -61,6 +66,9 @@ class Scatter(NamedTuple):
     low: float = np.inf
     high: float = -np.inf
     allowed: float = 0.0
+    rows: int = 0
+    odd: int = 0
+    farthest: tuple[float, float] = (0.0, np.nan)
 
 
 def scatters(
@@ -77,13 +85,8 @@ def scatters(
         names.remove("field")
     if count < FEWEST_ROWS:
         return {}
-    starts = np.unique(
-        np.linspace(0, max(count - WINDOW_ROWS, 0), min(-(-count // WINDOW_ROWS), WINDOWS)).astype(
-            int
-        )
-    )
     result: dict[str, Scatter] = {}
-    for start in starts.tolist():
+    for start in window_starts(count):
         rows = slice(start, start + WINDOW_ROWS)
         middle = rows_of(readings, slice(start, start + WINDOW_ROWS, 16))
         sd = standard_uncertainties(calibration, middle, names)
@@ -96,6 +99,13 @@ def scatters(
     return result
 
 
+def window_starts(count: int) -> list[int]:
+    """First rows of the windows of `WINDOW_ROWS` of so many rows, over all of which they spread."""
+    most = min(-(-count // WINDOW_ROWS), WINDOWS)
+    starts = np.linspace(0, max(count - WINDOW_ROWS, 0), most).astype(int)
+    return [int(start) for start in np.unique(starts)]
+
+
 def _window(name: str, values: Array, sd: Array) -> Scatter:
     """Whether values (…, n) of neighbouring rows scatter."""
     known = values[np.isfinite(values)]
@@ -104,11 +114,28 @@ def _window(name: str, values: Array, sd: Array) -> Scatter:
         return Scatter()
     allowed = float(np.median(sd))
     usual = STEADY_CHANGES[name] * (float(np.median(known)) if name == "field" else 1.0)
-    lags = [lag for lag in LAGS if lag <= len(known) // FEWEST_ROWS]
+    lags = [lag for lag in LAGS if lag <= max(len(known) // ROWS_PER_LAG, 1)]
     change = max(float(np.median(np.abs(known[lag:] - known[:-lag]))) for lag in lags)
-    if change <= max(usual, DEVIATIONS * allowed):
-        return Scatter(windows=1)
-    return Scatter(1, 1, float(known.min()), float(known.max()), allowed)
+    most = max(usual, DEVIATIONS * allowed)
+    if change > most:
+        return Scatter(1, 1, float(known.min()), float(known.max()), allowed)
+    departure = np.abs(known - _about(known))
+    worst = int(np.argmax(departure))
+    odd = int(np.count_nonzero(departure > most))
+    farthest = float(departure[worst]), float(known[worst])
+    return Scatter(windows=1, allowed=allowed, rows=len(known), odd=odd, farthest=farthest)
+
+
+def _about(values: Array) -> Array:
+    """The median (n,) of the rows about each of some rows, its own among them.
+
+    >>> _about(np.array([1.0, 1, 9, 1, 2, 2, 2])).tolist()
+    [1.0, 1.0, 1.0, 2.0, 2.0, 2.0, 2.0]
+    """
+    width = min(ABOUT, len(values))
+    medians = np.median(np.lib.stride_tricks.sliding_window_view(values, width), -1)
+    first = np.clip(np.arange(len(values)) - width // 2, 0, len(values) - width)
+    return np.asarray(medians[first])
 
 
 def total(parts: Iterable[Mapping[str, Scatter]]) -> dict[str, Scatter]:
@@ -122,7 +149,8 @@ def total(parts: Iterable[Mapping[str, Scatter]]) -> dict[str, Scatter]:
 def _joined(one: Scatter, other: Scatter) -> Scatter:
     return Scatter(
         one.windows + other.windows, one.scattered + other.scattered, min(one.low, other.low),
-        max(one.high, other.high), max(one.allowed, other.allowed),
+        max(one.high, other.high), max(one.allowed, other.allowed), one.rows + other.rows,
+        one.odd + other.odd, max(one.farthest, other.farthest),
     )  # fmt: skip
 
 
@@ -131,13 +159,27 @@ def unsteady(scatter: Mapping[str, Scatter]) -> str:
     words = []
     for name, each in scatter.items():
         if 2 * each.scattered > each.windows:
-            digits = {"gravity": 3, "field": 0, "dip": 1}[name]
+            digits, unit = SHOWN_STRENGTHS[name]
             extent = f"{each.low:.{digits}f}…{each.high:.{digits}f}"
-            unit = {"gravity": " g", "field": " nT", "dip": "°"}[name]
             words.append(f"{name} {extent}{unit} (1σ of a row: {each.allowed:.2g}{unit})")
     return ", ".join(words)
 
 
+def odd_rows(scatter: Mapping[str, Scatter]) -> str:
+    """What is odd at single rows, and how far; empty where nothing is, or where all rows scatter."""
+    words = []
+    for name, each in scatter.items():
+        if each.odd and 2 * each.scattered <= each.windows:
+            digits, unit = SHOWN_STRENGTHS[name]
+            (departure, value), rows = each.farthest, f"{each.odd} of {each.rows} rows"
+            words.append(
+                f"{name} at {rows} (as far as {value:.{digits}f}{unit}, {departure:.{digits}f}{unit} off)"
+            )
+    return ", ".join(words)
+
+
+SHOWN_STRENGTHS = {"gravity": (3, " g"), "field": (0, " nT"), "dip": (1, "°")}
+"""Decimals and unit of each value that may scatter."""
 OUTSIDE = ("blank", "refuse", "extrapolate")
 JUDGED = ("gravity", "inclination", "toolface", "azimuth", "field", "dip", "magnetic_toolface")
 """Observables that a calibration may leave undetermined."""
@@ -156,6 +198,8 @@ ROW_FINDINGS = {
     "implausible-field": "{off[field]}: iron or a current was near, or a reading is in another unit.",
     "unsteady": "from row to row {unsteady} change more than any place does: are two axes swapped, or a sign wrong? A "
     "tool that moves, iron nearby, and rows from several places look the same.",
+    "odd-rows": "unlike the rows about them: {odd}. Is a sign or a digit of a reading wrong there? A tool that moved, "
+    "iron nearby, and a row from another place look the same.",
     "without-value": "azimuth or a toolface is blank in {tally.valueless} of {tally.rows} rows: within the uncertainty "
     "the tool is vertical there, or the field is, and the angle would have a 1σ of more than {largest:.0f}°.",
     "field-relative": "the magnetometer is calibrated to field = 1: bx_nt, by_nt, bz_nt and field_nt are relative, "
@@ -224,6 +268,21 @@ def correct_and_count(
 
     With `uncertainty` the columns of standard uncertainties too.
     """
+    columns, tally = tallied(calibration, readings, outside, lacking, uncertainty)
+    about = findings(calibration, readings, tally, outside)
+    strengths.check(calibration, tally.strengths, readings.name)
+    return columns, tally, about
+
+
+def tallied(
+    calibration: Calibration,
+    readings: Readings,
+    outside: str,
+    lacking: int = 0,
+    uncertainty: bool = False,
+    whole: bool = True,
+) -> tuple[dict[str, AnyArray], RowCounts]:
+    """Output columns and counts of the rows, of which nothing is refused; their scatter only of a `whole` table."""
     check_outside(outside)
     columns = compiled(calibration, readings) or reference(calibration, readings)
     beyond = calibration.outside(readings)
@@ -233,13 +292,25 @@ def correct_and_count(
     tally = RowCounts(
         readings.count + lacking, int(beyond.sum()), undetermined(calibration, readings), lacking, (),
         strengths.judged(calibration, columns, readings.known), warmth(readings.temperature),
-        readings.metadata, valueless, scatters(calibration, readings, columns),
+        readings.metadata, valueless, scatters(calibration, readings, columns) if whole else {},
     )  # fmt: skip
-    about = findings(calibration, readings, tally, outside)
-    strengths.check(calibration, tally.strengths, readings.name)
     if outside == "extrapolate":
         columns[EXTRAPOLATED] = beyond
-    return columns, tally, about
+    return columns, tally
+
+
+def joined(tallies: Sequence[RowCounts]) -> RowCounts:
+    """The counts of the parts of a table together; serials and metadata are those of the first."""
+    counts = [(t.rows, t.beyond, t.lacking, t.valueless) for t in tallies]
+    rows, beyond, lacking, valueless = np.sum(counts, 0).tolist()
+    lows, highs = zip(*(tally.warmth for tally in tallies), strict=True)
+    moved = {name for tally in tallies for name in tally.moved}
+    return tallies[0]._replace(
+        rows=rows, beyond=beyond, moved=tuple(name for name in JUDGED if name in moved),
+        lacking=lacking, strengths=strengths.total(tally.strengths for tally in tallies),
+        warmth=(min(lows), max(highs)), valueless=valueless,
+        scatter=total(tally.scatter for tally in tallies),
+    )  # fmt: skip
 
 
 def warmth(temperature: Array | None) -> tuple[float, float]:
@@ -331,6 +402,7 @@ def findings(
         "implausible-gravity": "gravity" in off,
         "implausible-field": "field" in off,
         "unsteady": changing,
+        "odd-rows": odd_rows(tally.scatter),
         "without-value": tally.valueless,
         "field-relative": calibration.relative,
         "undetermined": tally.moved,
@@ -342,6 +414,7 @@ def findings(
         "results": RESULTS_BEYOND[outside == "extrapolate"],
         "readings_at": unknown if calibration.unrecorded(readings) else "",
         "unsteady": changing,
+        "odd": odd_rows(tally.scatter),
         "largest": np.degrees(LARGEST_DIRECTION_SD),
         "moved": ", ".join(tally.moved),
         "free": ", ".join(dict.fromkeys(u.id for u in calibration.undetermined())),

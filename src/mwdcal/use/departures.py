@@ -34,6 +34,13 @@ from mwdcal.use.roll_test import (
     roll_sets,
 )
 
+NO_ERROR_OF_A_TOOL: dict[str, float] = {
+    **dict.fromkeys(("inclination", "azimuth", "toolface"), float(np.radians(5.0))),
+    "gravity": 0.01,
+    "field": 0.03,
+    "dip": float(np.radians(2.0)),
+}
+"""Departures from a reference of the run that are no error of a tool: radians, g, a share of the field."""
 UNDEFINED_AT_VERTICAL = ("azimuth", "toolface")
 """Angles that do not exist at vertical."""
 LEVEL = ("inclination", "gravity")
@@ -196,6 +203,19 @@ class RollTest:
         """Departure (n,) from the reference that the run itself gives; NaN where it gives none."""
         known = self.readings.known.get(name, np.nan)
         return OBSERVABLES[name].difference(self.value(name), known)
+
+    def contradicted(self, name: str) -> float:
+        """Median departure from the run's own reference, where it is more than a sound tool shows; else zero."""
+        named = self.readings.known.get(name)
+        if named is None or self._lacks(name) or (name == "field" and self.calibration.relative):
+            return 0.0
+        error, most = self._error(name), NO_ERROR_OF_A_TOOL[name]
+        error = error[~np.isnan(error) & ~(self.near & (name in UNDEFINED_AT_VERTICAL))]
+        if not error.size or bool(self.calibration.rests_on_free(name, self.readings).any()):
+            return 0.0
+        most *= float(np.nanmedian(named)) if name == "field" else 1.0
+        size = float(np.median(np.abs(error)))
+        return float(np.copysign(size, np.median(error))) if size > most else 0.0
 
     def loose(self, index: Ints) -> str:
         """Why stations do not determine a curve of one harmonic or two; empty where they do."""

@@ -2,17 +2,19 @@
 
 The uncertainty is that of the calibration and of the noise of one reading. Near vertical azimuth and toolface have
 no value, nor has azimuth where the field is vertical: a direction is then smaller than its own error.
+
+Beside every 1σ stands what it holds and what it leaves out: one sentence, one place.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mwdcal.calibration.readings import TRIADS, Readings
-from mwdcal.calibration.record import Calibration
+from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.geometry.observables import OBSERVABLES, OUTPUTS, UNCERTAINTIES
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, diagonal
 
@@ -29,6 +31,71 @@ LARGEST_DIRECTION_SD = 1 / 3
 Noise alone puts a vertical tool farther off in one reading of ninety."""
 DOUBTFUL = 4.0
 """Degrees from vertical within which a direction may have no value, for any calibration that is of use."""
+CORRECTED = "interference-corrected"
+"""The finding of a calibration from which multi-station analysis has taken interference."""
+DRIFTED = "sensor-drift-allowed"
+"""The finding of one whose covariance allows for what the sensors have moved since the laboratory."""
+INTERFERENCE = "interference of the drill string"
+AXIAL_INTERFERENCE, CROSS_INTERFERENCE = f"axial {INTERFERENCE}", f"cross-axial {INTERFERENCE}"
+"""Interference of the drill string as error models part it: they state the first alone."""
+DRIFT = "drift of the sensors since the calibration"
+NEVER = ("sag", "misalignment in the hole")
+"""Errors that no calibration and no survey of its own knows…"""
+DEPTH = "measured depth"
+"""…and one that only surveys with depths have."""
+OF_MODELS = dict(zip(("SAG", "XYM", "D"), (*NEVER, DEPTH), strict=True))
+"""First letters of the terms of error models that state them."""
+
+
+@dataclass(frozen=True)
+class ErrorTerms:
+    """Sources of error in a standard uncertainty, and those that are not in it."""
+
+    included: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+    @property
+    def sentence(self) -> str:
+        """Both, as they stand beside every 1σ."""
+        lacking = f" Not in it: {', '.join(self.left_out)}." if self.left_out else ""
+        return f"1σ: {', '.join(self.included)}.{lacking}"
+
+    @property
+    def stated(self) -> dict[str, list[str]]:
+        """Both, as the metadata of a table and JSON state them."""
+        return {"error_terms": list(self.included), "not_included": list(self.left_out)}
+
+
+def error_terms(
+    findings: Iterable[Finding],
+    declination: bool,
+    depth: bool = True,
+    modelled: Iterable[str] = (),
+) -> ErrorTerms:
+    """Those of readings by a calibration with these findings.
+
+    `declination`: azimuths count from another north. `depth`: the readings are surveys of a well. `modelled`: what an
+    error model adds: `AXIAL_INTERFERENCE`, `DRIFT`, `DEPTH` and of `NEVER`.
+    """
+    there, model = {finding.id for finding in findings}, set(modelled)
+    parts = {INTERFERENCE: CORRECTED in there}
+    if AXIAL_INTERFERENCE in model:
+        parts = {AXIAL_INTERFERENCE: True, CROSS_INTERFERENCE: False}
+    others = [*NEVER, *([DEPTH] if depth else [])]
+    optional = {
+        **parts,
+        DRIFT: DRIFTED in there or DRIFT in model,
+        **{name: name in model for name in others},
+    }
+    included = [name for name, known in optional.items() if known]
+    north = ["declination"] if declination else []
+    left_out = [name for name, known in optional.items() if not known]
+    return ErrorTerms(("calibration", "noise", *north, *included), tuple(left_out))
+
+
+def reading_terms(calibration: Calibration) -> ErrorTerms:
+    """Those of corrected readings: angles count from magnetic north, and there is no depth."""
+    return error_terms(calibration.findings, declination=False, depth=False)
 
 
 def standard_uncertainties(

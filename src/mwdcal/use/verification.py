@@ -18,7 +18,7 @@ from mwdcal.calibration.settings import ASSUMED, is_assumed
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array
-from mwdcal.use.departures import LEVEL, Departures, RollTest, Statistic
+from mwdcal.use.departures import LEVEL, NO_ERROR_OF_A_TOOL, Departures, RollTest, Statistic
 from mwdcal.use.risk import COVERAGE, guard_factor, probability_within, risk_of_all
 from mwdcal.use.roll_test import DEPARTURE_CHANCE, HARMONICS, Largest, largest
 
@@ -48,12 +48,15 @@ VERDICT_FINDINGS = {
     "outside-temperature": "{where} lie outside the calibrated range {calibrated} °C. The calibration has no "
     "temperature terms: drift over the difference counts as its error.",
     "not-judged": "not judged: {limits}.",
+    "contradicted": "the readings contradict references of the run that no limit judges: {what}. Check their unit, "
+    "sign and place; or signs or axes of a sensor are exchanged. The verdict says nothing about it.",
     "no-roll-set": "no roll set: spreads were not judged.",
     "harmonic-unseen": "{title}: the toolfaces hardly show the second harmonic of a turn, a difference of scales or a "
     "misalignment of x and y (four at right angles fit a mean and the first harmonic alone). The value may be "
     "too small by it: add toolfaces between them.",
     "little-scatter": "{title}: the readings scatter less about the curves than the stated noise explains (chance "
-    "below {chance:g}). It is overstated, or readings are repeated. The 1σ rests on the stated noise.",
+    "below {chance:g}). It is overstated, readings are repeated, or stations apart in the table share one setting of "
+    "the stand (then give them one group: it is counted once). The 1σ rests on the stated noise.",
     "settings-doubted": "{title}: the readings scatter about the curves as if the stand was set at every station. Its "
     "error is counted both ways. State [stand] settings in the profile.",
     "weak-test": "{row.name}: its 1σ of {row.uncertainty:.2g} {row.unit} is more than half of the limit: this "
@@ -100,7 +103,8 @@ class JudgedSet(msgspec.Struct, frozen=True, kw_only=True):
     was judged: mean, cos t, cos 2t, sin t, sin 2t of toolface t, in the unit of the limit; None:
     the set was not rolled, or the figure judged is the raw one of each station. With one of `harmonics`, as
     of four toolfaces at right angles, the coefficients of 2t are zero. `passed`: by this set alone.
-    `degrees_of_freedom` of the uncertainty; None: unlimited, as the noise is declared.
+    `degrees_of_freedom` of the uncertainty; None: unlimited, as the noise is declared. `raw`: the largest figure
+    with the noise in it; None in documents of earlier versions.
     """
 
     label: str
@@ -111,6 +115,7 @@ class JudgedSet(msgspec.Struct, frozen=True, kw_only=True):
     passed: bool
     harmonics: int = len(HARMONICS)
     degrees_of_freedom: float | None = None
+    raw: float | None = None
 
 
 class VerifiedStation(msgspec.Struct, frozen=True, kw_only=True):
@@ -262,6 +267,7 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
         rows=rows,
         findings=[
             *_findings(test, skipped),
+            *_contradicted(test, limits),
             *_remarks(judged),
             *chain(*(j.findings for j in judged)),
         ],
@@ -363,6 +369,19 @@ def _findings(test: RollTest, skipped: Sequence[str]) -> Iterator[Finding]:
         yield _finding("no-roll-set")
     if calibration.temperature_c is None:
         yield _finding("no-temperature", tested=f", {tested} °C" if tested else "")
+
+
+def _contradicted(test: RollTest, limits: Limits) -> Iterator[Finding]:
+    """References of the run far from what the tool reads, of quantities whose error is not judged."""
+    judged = {name for name, _ in limits.error.items()}
+    parts = []
+    for name in NO_ERROR_OF_A_TOOL.keys() - judged:
+        if departure := test.contradicted(name):
+            unit = OBSERVABLES[name].unit.replace("rad", "°")
+            size = departure * _scale(unit)
+            parts.append(f"{name} by {size:+.3g}{'' if unit == '°' else ' '}{unit}")
+    if parts:
+        yield _finding("contradicted", what=", ".join(sorted(parts)))
 
 
 def _finding(name: str, **values: object) -> Finding:
@@ -491,6 +510,7 @@ def _sets(outcome: Departures, factor: float, guarded: bool, limit: float) -> li
                 passed=not outcome.blocked and value + guard(guarded, freedom) * sd <= limit,
                 harmonics=len(HARMONICS) if curve is None else curve.harmonics,
                 degrees_of_freedom=freedom,
+                raw=max(each.raw for each in members) * factor,
             )
         )
     return sets

@@ -7,8 +7,7 @@ from pathlib import Path
 import click
 
 from mwdcal.app.commands import options
-from mwdcal.app.messages import print_result
-from mwdcal.errors import InputError
+from mwdcal.app.messages import offering_blank, print_result
 from mwdcal.presentation.text import one_line
 
 
@@ -17,17 +16,13 @@ from mwdcal.presentation.text import one_line
 @options.argument("readings")
 @options.output(metavar="OUT", help="Table to write; format by suffix.")
 @options.WHERE_OUTSIDE
-@options.preset(
-    "--missing",
-    type=click.Choice(["refuse", "blank"]),
-    default="refuse",
-    help="Rows with a blank reading or temperature: refuse the file, or leave their results blank.",
-)
+@options.MISSING
 @click.option(
     "--uncertainty/--no-uncertainty",
     default=True,
     help="Columns with the standard uncertainty of each angle and strength. Without them long tables are faster.",
 )
+@options.of_run
 @options.DECIMAL
 @options.TRUSTED_KEYS
 @options.JSON
@@ -47,26 +42,29 @@ def command(
     from mwdcal.app.correction import Applied, apply_to_any
     from mwdcal.app.progress import bar
     from mwdcal.calibration.readings import simulated
-    from mwdcal.files.runs import BlankReadingError
     from mwdcal.presentation.envelope import json_document, with_signature
     from mwdcal.presentation.signature import load_calibration, signature_status
+    from mwdcal.use.uncertainty import reading_terms
 
     options.check_outputs([output], [calibration, readings, *key])
     loaded = load_calibration(calibration, key)
     fitted = loaded.calibration
-    try:
-        with bar("correcting") as advance:
-            tally, findings, readings_digest = apply_to_any(
-                fitted, readings, output, outside, missing, decimal, uncertainty, advance
-            )
-    except BlankReadingError as error:
-        advice = "Or leave the results of such rows blank: --missing blank."
-        raise InputError(f"{error} {advice}") from None
+    with offering_blank(), bar("correcting") as advance:
+        tally, findings, readings_digest = apply_to_any(
+            fitted, readings, output, outside, missing, decimal, uncertainty, advance,
+            options.statements(),
+        )  # fmt: skip
     findings = loaded.findings + findings
-    blank = tally.blank(outside)
+    blank, terms = tally.blank(outside), reading_terms(fitted)
     document = json_document(
         "apply",
-        Applied(rows=tally.rows, blank=blank, output=str(output), findings=findings),
+        Applied(
+            rows=tally.rows,
+            blank=blank,
+            output=str(output),
+            findings=findings,
+            **(terms.stated if uncertainty else {}),
+        ),
         *(fitted.tool, tally.metadata),
         calibration=loaded.digest,
         readings=readings_digest,
@@ -75,4 +73,5 @@ def command(
     signed = one_line(signature_status(loaded.signature))
     said = [corrected, f"wrote {one_line(output)}", signed, *simulated(fitted.tool)]
     document = with_signature(document, loaded.signature)
-    print_result(document if as_json else "   ".join(said), findings)
+    lines = ["   ".join(said), *([terms.sentence] if uncertainty else [])]
+    print_result(document if as_json else "\n".join(lines), findings)

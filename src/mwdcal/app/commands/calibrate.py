@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Unpack
 import click
 
 from mwdcal.app.commands import options
-from mwdcal.app.messages import print_result, say
+from mwdcal.app.messages import lines, print_result, say
 
 if TYPE_CHECKING:
     from mwdcal.calibration.readings import Readings
@@ -34,15 +34,21 @@ if TYPE_CHECKING:
     "--rolltest",
     type=options.FILE,
     metavar="TABLE",
-    help="Verify the result by this roll test at once.",
+    help="Verify the result by this roll test at once; the RUN itself where a column marks the roll test.",
 )
 @options.LIMITS
+@click.option(
+    "--registry",
+    metavar="URL|FILE",
+    help="Enter calibration, run, tool profile and verdict in this registry.",
+)
 @options.report()
+@options.of_run
 @options.DECIMAL
 @options.JSON
 def command(
     run: Path, output: Path, tool: str | None, exclude: tuple[str, ...], rolltest: Path | None, limits: str,
-    report: Path | None, decimal: str, as_json: bool, **typed: Unpack[options.FitArguments],
+    registry: str | None, report: Path | None, decimal: str, as_json: bool, **typed: Unpack[options.FitArguments],
 ) -> None:  # fmt: skip
     """Fit the sensor model to a calibration RUN (CSV, TSV, Parquet, XLSX, WITSML or LAS).
 
@@ -50,18 +56,18 @@ def command(
     Example: mwdcal calibrate run.csv --tool servo -o tool.json --rolltest roll.csv
     Exit: 0 calibrated (and passed), 1 the roll test fails, 2 input cannot be read, 3 fit failed or refused.
     """
-    from mwdcal.app.inputs import load_run, prior_of
+    from mwdcal.app.inputs import load_runs, prior_of
     from mwdcal.calibration.calibrate import chosen_fit, recorded
     from mwdcal.calibration.options import options_of
-    from mwdcal.files import documents, runs
+    from mwdcal.files import documents
     from mwdcal.files.formats import atomic
     from mwdcal.presentation import calibration as screen
 
-    inputs = [run, tool, typed["prior"], rolltest, limits]
+    inputs = [run, tool, typed["prior"], rolltest, limits, registry]
     options.check_outputs([output], inputs, page=report, calibration=True)
+    _enter(registry)
     prior, digest = prior_of(typed["prior"])
-    readings, profile = load_run(run, tool, decimal, prior)
-    turned = runs.read_run(rolltest, profile, decimal=decimal)[0] if rolltest else None
+    readings, turned, profile = load_runs(run, rolltest, tool, decimal, prior, options.statements())
     choice, result = chosen_fit(readings, profile, options_of(typed, prior, exclude, digest), say)
     calibration = recorded(choice, result)
     verdict, judged = _judged(calibration, turned, limits, (output, rolltest))
@@ -77,6 +83,7 @@ def command(
         else screen.screen(calibration, choice.curves, *files, judged)
     )
     atomic.write_all([(output, documents.encode(calibration)), (report, rendered)])
+    _enter(registry, output, run, tool, rolltest, verdict)
     print_result(shown, screen.first_findings(calibration) + (verdict.findings if verdict else []))
     sys.exit(0 if verdict is None or verdict.passed else 1)
 
@@ -95,3 +102,22 @@ def _judged(
 
     verdict = verify(calibration, rolltest, Path(limits))
     return verdict, screen(verdict, None) + next_step(verdict, files[0], files[1])
+
+
+def _enter(registry: str | None, *items: Path | str | Verdict | None) -> None:
+    """Enter the files of a calibration in a registry, if one is named; without any see that it can be opened."""
+    if not registry:
+        return
+    from mwdcal.library.registries import registry as open_tools
+    from mwdcal.library.shown import VerdictFile
+
+    files = dict.fromkeys(each for each in items if isinstance(each, Path))
+    profiles = [Path(each) for each in items if isinstance(each, str) and Path(each).is_file()]
+    verdicts = [
+        VerdictFile(each) for each in items if each is not None and not isinstance(each, str | Path)
+    ]
+    with open_tools(registry) as tools:
+        if items:
+            answer = tools.add(*profiles, *verdicts, *files)
+            for line in (answer.summary().strip().splitlines()[0], *lines(answer.findings)):
+                say(line)

@@ -36,9 +36,9 @@ def command(
     from mwdcal.faults.physics import NONE
     from mwdcal.files import runs
     from mwdcal.files.formats import atomic
+    from mwdcal.presentation.calibration_source import calibration_of
     from mwdcal.presentation.diagnosis import render, screen
     from mwdcal.presentation.envelope import json_document
-    from mwdcal.registry.calibration_source import calibration_of
 
     options.check_outputs([output], [calibration, readings], page=report)
     fitted, digest = calibration_of(calibration)

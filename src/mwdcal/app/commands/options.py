@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterable
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
 from unicodedata import normalize
 
 import click
+from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
 from mwdcal.app.messages import Command
@@ -91,6 +93,12 @@ preset = partial(click.option, show_default=True)
 CALIBRATION = argument("calibration")
 RUN = argument("run")
 LOG = argument("log")
+MISSING = preset(
+    "--missing",
+    type=click.Choice(["refuse", "blank"]),
+    default="refuse",
+    help="Rows with a blank reading or temperature: refuse the file, or leave their results blank.",
+)
 WHERE_OUTSIDE = preset(
     "--outside",
     default="blank",
@@ -125,6 +133,43 @@ COLUMN_NAMES = click.option(
 RESULT = output(
     required=False, metavar="OUT.json", help="Also write the result as JSON, as --json prints it."
 )
+
+
+RUN_STATEMENTS = "mwdcal.statements"
+"""Where the context of a command has what the user says of a run."""
+
+
+def _note(context: click.Context, option: click.Parameter, typed: Any) -> None:
+    """Note what the user says of a run."""
+    if typed is not None:
+        said = typed.date().isoformat() if isinstance(typed, datetime) else str(typed).strip()
+        context.meta.setdefault(RUN_STATEMENTS, {})[str(option.name)] = said
+
+
+def of_run(function: Function) -> Function:
+    """The options with which a user says of a run what its table does not, or otherwise."""
+    noted = partial(click.option, callback=_note, expose_value=False)
+    for option in (
+        noted("--operator", metavar="NAME", help="Who measured; comes before the table's own."),
+        noted(
+            "--date",
+            type=click.DateTime(["%Y-%m-%d"]),
+            metavar="YYYY-MM-DD",
+            help="Day of the run; likewise.",
+        ),
+        noted(
+            "--serial",
+            metavar="S",
+            help="Serial of the tool; of several in the table, the one to take.",
+        ),
+    ):
+        function = option(function)
+    return function
+
+
+def statements() -> dict[str, str]:
+    """Serial, date and operator as the user says."""
+    return dict(click.get_current_context().meta.get(RUN_STATEMENTS, {}))
 
 
 def number(name: str, metavar: str, text: str, *variable: str) -> Decorator:
@@ -187,7 +232,8 @@ def registry(**more: Any) -> Decorator:
 def _named_registry(context: click.Context, option: click.Parameter, typed: str | None) -> str:
     """The registry that a subcommand, its group or the environment names."""
     group = context.parent.params.get(option.name) if context.parent and option.name else None
-    named = typed or group
+    of_settings = context.get_parameter_source(option.name or "") is ParameterSource.DEFAULT_MAP
+    named = (group or typed) if of_settings else (typed or group)
     if not named and not context.resilient_parsing:
         raise InputError(f"--registry must name the registry; got none. Or set ${REGISTRY}.")
     return named or ""

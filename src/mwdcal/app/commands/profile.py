@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result
-from mwdcal.errors import InputError
+from mwdcal.errors import InputError, QuestionError, QuestionsError
+
+if TYPE_CHECKING:
+    from mwdcal.library.planning import ProposedProfile
+
+MOST_ROUNDS = 20
+"""Rounds of questions: each answer may open another."""
 
 
 @options.command()
@@ -25,52 +32,88 @@ from mwdcal.errors import InputError
     "--column",
     multiple=True,
     metavar="OURS=THEIRS",
-    help="What a column is: ref_azimuth_deg='Azi 2', ref_field_nt='F [µT]'. Repeatable.",
+    help="What a column is: ref_azimuth_deg='Azi 2', ref_field_nt='F [µT]'; blank: none is. Repeatable.",
 )
+@click.option(
+    "--north",
+    type=click.Choice(["magnetic", "true", "grid"]),
+    help="What the azimuths of the stand count from, where the table does not state it.",
+)
+@options.number(
+    "--declination-deg", "DEG", "Declination of azimuths from true or grid north, east."
+)
+@options.number("--convergence-deg", "DEG", "Convergence of azimuths from grid north, east.")
 @click.option("--replace", is_flag=True, help="Replace a profile that exists.")
 @options.JSON
 def command(
-    run: Path,
-    output: Path,
-    sheet: str,
-    header_row: int | None,
-    decimal: str,
-    serial: str,
-    date: str,
-    column: tuple[str, ...],
-    replace: bool,
-    as_json: bool,
-) -> None:
+    run: Path, output: Path, column: tuple[str, ...], replace: bool, as_json: bool, **given: Any
+) -> None:  # fmt: skip
     """Propose a tool profile for a RUN as a logger or spreadsheet program has written it.
 
     Takes .csv .tsv .txt .dat .lvm .xlsx .xls .ods. Finds sheet, names and units of the columns, the last row of
     readings, decimal sign and encoding, the meaning of each column, and, from readings at known attitudes, the axes
     and nominal scales of both triads. calibrate, verify, compare and apply then take such tables with
-    --tool TOOL.toml as they are, also where the table has moved. What is open is asked, all at once.
+    --tool TOOL.toml as they are, also where the table has moved. What is open is asked: on a terminal one question
+    after the other, elsewhere all at once, each with the option that answers it.
 
     \b
     Example: mwdcal profile export.xlsx -o tool.toml --column temperature_c="Oven temp"
     Exit: 0 written, 2 input cannot be read, 3 questions are open (nothing is written).
     """
-    from mwdcal.library import planning
-
     options.check_outputs([output], [run])
-    answers = dict(_answer(each) for each in column)
-    result = planning.propose_profile(
-        run,
-        sheet=sheet,
-        header_row=header_row or 0,
-        decimal=decimal,
-        serial=serial,
-        date=date,
-        column=answers,
-    )
+    stated = {name: value for name, value in given.items() if value is not None}
+    result = _proposed(run, stated, dict(map(_answer, column)), replace or not output.exists())
     if not replace and output.exists() and output.read_bytes() != result.to_toml().encode():
         raise InputError(
             f"'{output}' exists, and may have been completed by hand. Name another file, or add --replace."
         )
     result.save(output)
     print_result(result.to_dict() if as_json else result.summary(), result.findings)
+
+
+def _proposed(
+    run: Path, stated: dict[str, Any], answers: dict[str, str], may_ask: bool
+) -> ProposedProfile:
+    """The proposal, after questions on a terminal where it may ask."""
+    from mwdcal.app import questions
+    from mwdcal.library import planning
+
+    for _ in range(MOST_ROUNDS):
+        try:
+            return planning.propose_profile(run, column=answers, **stated)
+        except (QuestionError, QuestionsError) as error:
+            every = error.questions if isinstance(error, QuestionsError) else (error,)
+            open_ones = [each for each in every if each.answers]
+            if not open_ones or not may_ask or not questions.on_terminal():
+                raise
+            for each in open_ones:
+                _take(each, stated, answers)
+    raise InputError(f"{run.name}: the answers open ever more questions. Answer them by options.")
+
+
+def _take(question: QuestionError, stated: dict[str, Any], answers: dict[str, str]) -> None:
+    """Ask a question, and note its answer with those given before."""
+    from mwdcal.app import questions
+
+    place = questions.choose(question.text, [answer.name for answer in question.answers])
+    chosen = question.answers[place]
+    for argument, value in chosen.arguments:
+        if argument == "column":
+            answers.update([_answer(value)])
+        else:
+            stated[argument] = int(value) if argument == "header_row" else value
+    for name in chosen.numbers:
+        stated[name] = float(questions.ask([f"{name} (degrees, east is positive)"], "0", _number))
+
+
+def _number(text: str) -> None:
+    """Refuse what is no angle."""
+    try:
+        if abs(float(text)) <= 180:
+            return
+    except ValueError:
+        pass
+    raise InputError(f"Type a number of degrees between -180 and 180; got {text!r}.")
 
 
 def _answer(text: str) -> tuple[str, str]:

@@ -89,7 +89,8 @@ def command(
     """
     from mwdcal import pool
 
-    _check(repeat, truth, calibration, tool)
+    _check(repeat, truth, calibration)
+    tool = None if calibration else tool
     options.check_outputs(
         [output, truth], [plan, tool, calibration, effects, rolltest, limits], plot
     )
@@ -118,9 +119,7 @@ def command(
     print_result(result.to_dict() if as_json else result.summary())
 
 
-def _check(
-    repeat: int | None, truth: Path | None, calibration: Path | None, tool: str | None
-) -> None:
+def _check(repeat: int | None, truth: Path | None, calibration: Path | None) -> None:
     """Refuse options that do not go together."""
     context = click.get_current_context()
     typed = [
@@ -132,7 +131,7 @@ def _check(
         raise InputError(
             "`truth`: with `repeat` the table holds what is true of each tool. Leave it out."
         )
-    if calibration and (tool or "order" in typed):
+    if calibration and {"tool", "order"} & {*typed}:
         raise InputError(
             "`calibration` brings its own profile and order. Leave out `tool` and `order`."
         )

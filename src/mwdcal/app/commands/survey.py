@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING
 import click
 
 from mwdcal.app.commands import options
-from mwdcal.app.messages import print_result
+from mwdcal.app.messages import offering_blank, print_result
 from mwdcal.errors import InputError
 from mwdcal.presentation.typed import findings_with_option_names
 
 if TYPE_CHECKING:
     from mwdcal.calibration.canonical import SignatureCheck
     from mwdcal.survey.interference import Interference
+    from mwdcal.survey.path import TieIn
     from mwdcal.survey.surveying import SurveyedWell, WellInputs
 
 
@@ -43,6 +44,13 @@ if TYPE_CHECKING:
     "default), not at all (none), or as the [sensor] terms of a limits file.",
 )
 @options.preset(
+    "--error-model",
+    default="owsg-mwd",
+    metavar="NAME|FILE",
+    help="What every 1σ holds besides calibration, noise and declination: interference, sag, misalignment, depth and "
+    "drift since the calibration (owsg-mwd), nothing (none), or the terms of a file in ISCWSA's JSON form.",
+)
+@options.preset(
     "--limits",
     shell_complete=options.offers("survey_limits"),
     default="owsg-mwd",
@@ -58,20 +66,26 @@ if TYPE_CHECKING:
     "side; between them as at the station before.",
 )
 @click.option(
-    "--tie-in", metavar="N,E,TVD", help="Position of the first station, m. Default: 0,0,0."
+    "--tie-in",
+    metavar="MD,INC,AZI,N,E,TVD",
+    help="Where the path is tied in, taken as exact: m and degrees, azimuth from the north of the path. Or N,E,TVD of "
+    "the first station. Default: 0,0,0.",
 )
 @options.WHERE_OUTSIDE
+@options.MISSING
 @options.report(
     old=("--html",),
     help="Also write a page with the pictures; with --msa it shows the analysis too.",
 )
+@options.of_run
 @options.DECIMAL
 @options.TRUSTED_KEYS
 @options.JSON
 def command(
     calibration: Path, readings: Path, output: Path, reference: Path | None, msa: bool,
-    msa_html: Path | None, sensor_drift: str | None, limits: str, switch: str, tie_in: str | None, outside: str,
-    report: Path | None, decimal: str, key: tuple[Path, ...], as_json: bool,
+    msa_html: Path | None, sensor_drift: str | None, error_model: str, limits: str, switch: str,
+    tie_in: str | None, outside: str, missing: str, report: Path | None, decimal: str, key: tuple[Path, ...],
+    as_json: bool,
 ) -> None:  # fmt: skip
     """Surveys of a well: READINGS in their order, corrected by the CALIBRATION of their tool.
 
@@ -87,18 +101,31 @@ def command(
     from mwdcal.files.formats import table as tables
     from mwdcal.files.runs import MOST_ROWS, read_export
     from mwdcal.presentation.signature import load_calibration
+    from mwdcal.survey import long_table
     from mwdcal.survey.surveying import analysed, check_drift, survey_well, well_inputs
 
     if msa_html and not msa:
         raise InputError("`msa_html` goes with `msa`. Leave it out, or add `msa`.")
     check_drift(sensor_drift, msa)
-    given = [calibration, readings, reference, limits, *key]
+    given = [calibration, readings, reference, limits, error_model, *key]
     options.check_outputs([output, msa_html], given, page=report)
-    start, ends = _three("tie_in", tie_in), _switch(switch)
+    start, ends = _tie_in(tie_in), _switch(switch)
     loaded = load_calibration(calibration, key)
     fitted = loaded.calibration
-    table = read_export(readings, fitted.profile, decimal=decimal, rows=MOST_ROWS)
-    inputs = well_inputs(fitted, table, reference, limits, msa, loaded.digest, loaded.findings)
+    said = options.statements()
+    whole = msa or report or missing == "blank" or said
+    if not whole and long_table.in_parts(readings, output, fitted.profile):
+        result = long_table.survey_file(
+            fitted, readings, output, reference, limits, start, ends, outside, decimal,
+            loaded.digest, loaded.findings, error_model,
+        )  # fmt: skip
+        _print(result, loaded.signature, (str(output), ""), as_json)
+        return
+    table = read_export(readings, fitted.profile, decimal=decimal, rows=MOST_ROWS, statements=said)
+    with offering_blank():
+        inputs = well_inputs(
+            fitted, table, reference, limits, msa, loaded.digest, loaded.findings, error_model, missing,
+        )  # fmt: skip
     analysis = analysed(inputs, sensor_drift) if msa else None
     pages = _interference_page(inputs, analysis, msa_html)
     if analysis and not analysis.summary.separable:
@@ -165,11 +192,13 @@ def _numbers(name: str, text: str, count: int) -> list[float]:
     return values
 
 
-def _three(name: str, text: str | None) -> tuple[float, float, float] | None:
+def _tie_in(text: str | None) -> tuple[float, float, float] | TieIn | None:
+    """Where the path starts, by three numbers or six."""
+    from mwdcal.survey.surveying import start_of
+
     if text is None:
         return None
-    first, second, third = _numbers(name, text, 3)
-    return first, second, third
+    return start_of(_numbers("tie_in", text, 6 if text.count(",") > 2 else 3))
 
 
 def _switch(text: str) -> tuple[float, float]:

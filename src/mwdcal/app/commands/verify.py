@@ -17,6 +17,7 @@ from mwdcal.presentation.typed import findings_with_option_names
 @options.LIMITS
 @options.RESULT
 @options.report(help="Also write the report, with this verdict.")
+@options.of_run
 @options.DECIMAL
 @options.TRUSTED_KEYS
 @options.JSON
@@ -33,9 +34,11 @@ def command(
     from msgspec.structs import replace
 
     from mwdcal.calibration.diagnosis.findings import unused_columns
+    from mwdcal.calibration.diagnosis.identity import overdue
     from mwdcal.files import runs
     from mwdcal.files.formats import atomic
     from mwdcal.files.limits import load_limits
+    from mwdcal.files.settings import standards_of
     from mwdcal.presentation.envelope import json_document, with_signature
     from mwdcal.presentation.signature import load_calibration
     from mwdcal.presentation.verification import next_step, screen
@@ -44,11 +47,14 @@ def command(
     options.check_outputs([output], [calibration, run, limits, *key], page=report)
     loaded = load_calibration(calibration, key)
     fitted = loaded.calibration
-    readings, _ = runs.read_run(run, fitted.profile, decimal=decimal)
+    readings, _ = runs.read_run(
+        run, fitted.profile, decimal=decimal, statements=options.statements()
+    )
     bounds, limits_digest = load_limits(limits)
     result = verify(fitted, readings, bounds)
+    late = overdue(standards_of(fitted.profile), readings.metadata)
     findings = findings_with_option_names(
-        loaded.findings + result.findings + unused_columns(readings.unused)
+        loaded.findings + result.findings + unused_columns(readings.unused) + late
     )
     result = replace(result, findings=findings)
     stated = fitted.tool, readings.metadata

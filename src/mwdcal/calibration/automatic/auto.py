@@ -56,6 +56,18 @@ def choose(readings: Readings, profile: Profile, options: Options, progress: Pro
     return Choice(readings, profile, options, orders, curves, excluded)
 
 
+def tables_of(readings: Readings, given: Options, chosen: Options) -> list[OrderScore]:
+    """The table of orders of one run, for which others have chosen the options."""
+    orders: list[OrderScore] = []
+    if given.order == AUTO:
+        orders = choose_order(readings, replace(chosen, order=AUTO, nonlinearity={}), _silent)[1]
+    return orders or order_errors(readings, chosen, _silent)
+
+
+def _silent(text: str) -> None:
+    """Nobody waits for a word on the way."""
+
+
 def resolved(
     options: Options, readings: Readings, profile: Profile, progress: Progress
 ) -> tuple[Options, list[OrderScore], list[CurveScore]]:

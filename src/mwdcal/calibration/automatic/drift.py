@@ -1,26 +1,29 @@
 """Slow drift within a run: seen in the residuals of a fit, and then part of its model.
 
-A run is fitted without drift first. Where its residuals follow the order of the stations more than noise
+A run is looked at without drift first. Where its residuals follow the order of the stations more than noise
 does, walks of the field and of both triads' offsets are fitted with it, of sizes that the run itself tells.
+A declared drift is part of every fit, and no smaller than declared.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from mwdcal.calibration.automatic.courses import f_test, terms_beyond
 from mwdcal.calibration.diagnosis.plausibility import departures
 from mwdcal.calibration.estimate import Fit, fit, refitted
+from mwdcal.calibration.evidence import declared_sizes
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.residuals import tail
 from mwdcal.estimation import drift
-from mwdcal.estimation.batch import put, take
+from mwdcal.estimation.batch import join, kind_of, put, take
 from mwdcal.estimation.minimisers import closed_form
-from mwdcal.estimation.minimisers.common_columns import are_common, perfect
+from mwdcal.estimation.minimisers.common_columns import Alike, are_common, perfect
 from mwdcal.estimation.problem import Prior
 from mwdcal.estimation.solvers import Status
 from mwdcal.geometry.vectors import Array, Bools, Ints
@@ -39,6 +42,8 @@ DISPUTED_CHANCE = 0.01
 """The same chance where the run departs from its prior: a drift there would take up what is a conflict."""
 EVERY_PARAMETER = 12
 """Parameters of a triad that are all fitted."""
+TOGETHER = 320
+"""Most fits whose drifts are fitted together: few enough for the cache."""
 REDUNDANCY = 36.0
 """Fewest degrees of freedom of a triad that can tell a drift from noise."""
 
@@ -65,7 +70,7 @@ def _scores(result: Fit) -> drift.WalkScores:
     problem, analysis = result.problem, result.analysis
     if not (closed_form.applies(problem) and are_common(problem)):
         return drift.walk_scores(problem, result.state, analysis)
-    one, state = perfect(problem, result.state)
+    one, state = perfect(Alike.of(problem, result.state))
     nominal = replace(take(analysis, np.arange(1)), residual=analysis.residual)
     return drift.walk_scores(one, state, nominal)
 
@@ -75,10 +80,8 @@ def drifting(result: Fit, options: Options) -> Bools:
 
     None where parameters are held: what these would take up follows the attitudes, and so the order of stations.
     """
-    apart = options.robust or options.separate_solver or result.analysis.influence is not None
-    apart = apart or options.parameters < EVERY_PARAMETER
     drifted = np.zeros(result.analysis.freedom.shape, bool)
-    if apart:
+    if _apart(result, options):
         return drifted
     sound = (result.status == int(Status.OK)) & result.analysis.finite
     sound &= result.analysis.freedom.min(-1) >= REDUNDANCY
@@ -92,6 +95,12 @@ def drifting(result: Fit, options: Options) -> Bools:
     limit = np.where(disputed[:, None], DISPUTED_CHANCE, limit)
     drifted[sound] = chance < limit
     return drifted
+
+
+def _apart(result: Fit, options: Options) -> bool:
+    """Whether the residuals of a fit follow from more than the readings, so that no drift is looked for."""
+    apart = options.robust or options.separate_solver or result.analysis.influence is not None
+    return bool(apart) or options.parameters < EVERY_PARAMETER
 
 
 def _undisputed(result: Fit, options: Options) -> tuple[Fit, Bools]:
@@ -121,11 +130,39 @@ def fit_run(readings: Readings, options: Options) -> Fit:
 
 def by_drift(result: Fit, options: Options) -> Iterator[tuple[Ints, Fit]]:
     """Members without drift, as they are, and those with a drift of some triads, which is fitted."""
-    drifted = drifting(result, options)
-    for triads in np.unique(drifted, axis=0):
-        places = np.flatnonzero((drifted == triads).all(-1))
-        part = result if len(places) == len(drifted) else take(result, places)
-        yield places, with_drift(part, options, triads) if triads.any() else part
+    return with_drifts([(np.arange(len(result.status)), result)], options)
+
+
+def with_drifts(fits: Iterable[tuple[Ints, Fit]], options: Options) -> Iterator[tuple[Ints, Fit]]:
+    """Tools and their fits: those without drift as they come, then those with a drift of the same triads together.
+
+    A drift that is declared is looked for in a fit without it, and stays as declared where none is seen.
+    """
+    waiting: dict[tuple[Any, Any], list[tuple[Ints, Fit]]] = {}
+    for tools, result in fits:
+        declared = bool(result.problem.walks) and not _apart(result, options)
+        steady = _without_drift(result, options) if declared else result
+        drifted = drifting(steady, options)
+        for triads in np.unique(drifted, axis=0):
+            places = np.flatnonzero((drifted == triads).all(-1))
+            part = steady if triads.any() else result
+            part = part if len(places) == len(drifted) else take(part, places)
+            if triads.any():
+                kind = tuple(triads.tolist()), kind_of(part)
+                waiting.setdefault(kind, []).append((tools[places], part))
+            else:
+                yield tools[places], part
+    for (triads, _), parts in waiting.items():
+        tools, whole = (join(each) for each in zip(*parts, strict=True))
+        for first in range(0, len(tools), TOGETHER):
+            some = slice(first, first + TOGETHER)
+            yield tools[some], with_drift(take(whole, some), options, np.array(triads))
+
+
+def _without_drift(result: Fit, options: Options) -> Fit:
+    """The fit as if the run were steady."""
+    problem, state = drift.without_walks(result.problem, result.state)
+    return refitted(result, problem, state, np.ones(result.analysis.freedom.shape), options)
 
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
@@ -134,9 +171,14 @@ def with_drift(result: Fit, options: Options, triads: Bools) -> Fit:
     problem, (alone, _) = result.problem, _undisputed(result, options)
     declared, analysis = np.isnan(result.noise), alone.analysis
     scores = drift.walk_scores(alone.problem, alone.state, analysis)
-    scores = scores.of([n for n, t in drift.acting(scores.places).items() if triads[t]])
-    theta, left = drift.walk_variances(scores, analysis.variance_factor, analysis.freedom, declared)
-    noise = drift.noise(problem)
+    known, noise = declared_sizes(problem.evidence), drift.noise(problem)
+    acting = drift.acting(scores.places).items()
+    scores = scores.of([name for name, triad in acting if triads[triad] or name in known])
+    parts = [(known.get(n, np.zeros((1, 2)))[:, i], noise[n]) for n, i in scores.components()]
+    least = np.stack([(size / one) ** 2 for size, one in parts], -1)
+    theta, left = drift.walk_variances(
+        scores, analysis.variance_factor, analysis.freedom, declared, least
+    )
     sizes = {name: np.zeros((len(theta), 2)) for name in scores.places}
     for (name, part), variance in zip(scores.components(), theta.T, strict=True):
         sizes[name][:, part] = np.sqrt(variance) * noise[name]

@@ -31,9 +31,9 @@ from mwdcal.calibration.drift import SHOWN_DRIFT
 from mwdcal.calibration.readings import EARTH_RANGES, HIGHEST, TRIADS
 from mwdcal.calibration.record import Finding
 from mwdcal.calibration.residuals import REASONS, shown_in, tail
-from mwdcal.calibration.results import common_source, drifts, unconfirmed_dip
+from mwdcal.calibration.results import common_source, drift_shares, drifts, unconfirmed_dip
 from mwdcal.calibration.settings import DIRECTION
-from mwdcal.estimation.problem import Prior
+from mwdcal.estimation.problem import WALK_AXES, Prior
 from mwdcal.estimation.rank import free_directions
 from mwdcal.estimation.solvers import Determined
 from mwdcal.geometry.vectors import Bools
@@ -51,6 +51,8 @@ SCATTER_SHARE = 3e-4
 """A scatter from station to station beyond this share, or radians, is a finding."""
 LARGEST_DEVIATION = 37.0
 """Larger deviations have no figure: a normal variable's chance is then below 1e-300."""
+FOLLOWED = 0.9
+"""Share of a drift within the run that goes with a column, from which the column is named."""
 UNUSED = "unused-columns"
 COLUMNS_NAMED = 20
 """Most columns that the finding names."""
@@ -84,6 +86,9 @@ REMARKS = {
     "drift": "Readings follow the order of the stations as if the offsets of the {triad} drifted by "
     "{change:.2g} {unit} (1σ {sd:.1g} {unit}) during the run. The fit allows for this drift, and the uncertainty "
     "includes it. Let the tool warm up, and change inclination and azimuth in another order than from end to end.",
+    "column-explains": "The drift within the run goes with the column {column!r}, which is not used. If it is the "
+    "temperature of the tool, name it 'temperature_c' (°C), or under [columns] of the tool profile; else find out what "
+    "it stands for.",
     "no-redundancy": "{triads}: no redundancy, so nothing in this run checks the fit. Add stations.",
     "few-degrees-of-freedom": "the {few}: another run like this one may state {share:.0f} % more or less (1σ), and an "
     "error of a single station is hard to see. Add stations.",
@@ -165,6 +170,7 @@ def finding_flags(fitted: FittedRuns) -> Iterator[Flag]:
     yield from _settings(fitted)
     yield _hemisphere(fitted)
     yield from _drifts(fitted)
+    yield from _followed(fitted)
     yield from _structure(fitted)
     yield _scatter(fitted)
     yield _repeated(fitted)
@@ -284,6 +290,26 @@ def _drifts(fitted: FittedRuns) -> Iterator[Flag]:
         yield Flag(name, change > SHOWN_DRIFT * sd, words, values)
 
 
+def _followed(fitted: FittedRuns) -> Iterator[Flag]:
+    """Columns that the run does not use, and that its drift goes with: a temperature under another name.
+
+    Not those that explain the residuals, which `_structure` names.
+    """
+    sizes = drifts(fitted.result)
+    shown = fitted.shown(np.flatnonzero(suspected(fitted.result, fitted.chances))) if sizes else {}
+    for column, values in fitted.readings.others.items():
+        counter = np.all(np.diff(values) == 1, -1)
+        follows = {
+            name: (share > FOLLOWED) & ~counter & (sizes[name][0] > SHOWN_DRIFT * sizes[name][1])
+            for name, share in drift_shares(fitted.result, values).items()
+        }
+        members = np.any([np.zeros(fitted.count, bool), *follows.values()], 0)
+        known = COLUMN + column
+        named = [place for place, each in shown.items() if known in each and is_shown(each, known)]
+        members[named] = False
+        yield _remark("column-explains", members, column=column)
+
+
 def _structure(fitted: FittedRuns) -> Iterator[Flag]:
     """The likely cause of residuals that are more than noise."""
     unit = shown_in("field", fitted.readings.relative)[1]
@@ -396,7 +422,8 @@ def _prior(fitted: FittedRuns) -> Iterator[Flag]:
     prior, constants = fitted.options.knowledge, fitted.result.problem.evidence.constants
     if prior is None:
         return
-    declared = {common_source(c.name) for c in constants if not c.unknown}
+    lasting = [c for c in constants if not (c.unknown or c.name in WALK_AXES)]
+    declared = {common_source(constant.name) for constant in lasting}
     both = ", ".join(name for name in prior.common if name in declared)
     every = np.ones(fitted.count, bool)
     yield _remark(

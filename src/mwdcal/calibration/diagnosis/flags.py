@@ -20,7 +20,7 @@ from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.residuals import Residuals
 from mwdcal.calibration.results import StatedCovariance
-from mwdcal.estimation.batch import take
+from mwdcal.estimation.batch import batch_of_one, take
 from mwdcal.estimation.rank import Free, free_directions
 from mwdcal.geometry.vectors import Array, Bools, Ints
 from mwdcal.sensor.profile import Profile
@@ -133,6 +133,16 @@ class FittedRuns:
     def member(self, place: int) -> Fit:
         """The fit of one run, as a batch of one."""
         return self.result if self.count == 1 else take(self.result, np.array([place]))
+
+    def alone_as(self, place: int, run: tuple[Readings, Profile]) -> FittedRuns:
+        """One of the runs, as a batch of one with the readings of that `run`."""
+        readings, profile = run
+        one = FittedRuns(
+            batch_of_one(readings), profile, self.options, self.member(place), lambda _: run
+        )
+        if place in self._shown:
+            one._shown[0] = self._shown[place]
+        return one
 
     def shown(self, places: Ints) -> dict[int, Shown]:
         """Effects that the residuals of some runs show; many runs at once take less time than one by one."""

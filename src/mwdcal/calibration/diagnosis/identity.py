@@ -3,9 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from datetime import UTC, datetime
 
-from mwdcal.calibration.readings import Readings, future_day, serial_of, unread_day
+from msgspec import UnsetType
+
+from mwdcal.calibration.readings import (
+    IN_TABLE,
+    WORDS,
+    Readings,
+    future_day,
+    serial_of,
+    stated_day,
+    unread_day,
+)
 from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.sensor.profile import MeasurementStandard
 
 UNIDENTIFIED, FROM_THE_FUTURE, UNREAD_DAY = "no-serial", "future-date", "unreadable-date"
 """Findings on the identity of data: ids."""
@@ -25,14 +37,43 @@ def unidentified(serials: Mapping[str, str | None]) -> list[Finding]:
     return [Finding(id=UNIDENTIFIED, text=text)]
 
 
+def stated_otherwise(metadata: Mapping[str, object], name: str) -> list[Finding]:
+    """A finding on what a table states otherwise than the user says."""
+    return [
+        Finding(
+            id="stated-otherwise",
+            text=f"{name} states the {key} {other}; {metadata[key]}, as given, is used.",
+        )
+        for key in WORDS
+        if (other := metadata.get(f"{key}{IN_TABLE}"))
+    ]
+
+
 def dated(metadata: Mapping[str, object], name: str) -> list[Finding]:
-    """A finding if metadata state a day that cannot be read, or one that is still to come."""
+    """Findings on a day that cannot be read or is still to come, and on what the user says otherwise."""
+    others = stated_otherwise(metadata, name)
     if problem := unread_day(metadata, name):
-        return [Finding(id=UNREAD_DAY, text=problem)]
+        return [Finding(id=UNREAD_DAY, text=problem), *others]
     if (day := future_day(metadata)) is None:
-        return []
+        return others
     text = f"{name} states the date {day}, which is still to come. Correct it, or the clock of this computer."
-    return [Finding(id=FROM_THE_FUTURE, text=text)]
+    return [Finding(id=FROM_THE_FUTURE, text=text), *others]
+
+
+def overdue(
+    standards: tuple[MeasurementStandard, ...] | UnsetType, metadata: Mapping[str, object]
+) -> list[Finding]:
+    """A finding for each standard whose calibration was due before the day of a run, else before today."""
+    day = stated_day(metadata) or datetime.now(UTC).date()
+    late = [s for s in standards if s.due and s.due < day] if isinstance(standards, tuple) else []
+    return [
+        Finding(
+            id="standard-overdue",
+            text=f"the calibration of the {s.quantity} standard {s.name} was due on {s.due}, before {day}. Have it "
+            "calibrated, or enter its new certificate.",
+        )
+        for s in late
+    ]
 
 
 def other_tool(calibration: Calibration, readings: Readings) -> tuple[str, str] | None:

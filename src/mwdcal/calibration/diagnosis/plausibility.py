@@ -237,7 +237,8 @@ def stations_to_reshoot(result: Fit) -> Bools:
     again = np.zeros(result.analysis.residual.shape[:2], bool)
     some = np.flatnonzero(_suspects(result))
     if some.size:
-        again[some] = stations_to_remeasure(chances(take(result, some)))
+        part = result if some.size == len(again) else take(result, some)
+        again[some] = stations_to_remeasure(chances(part))
     return again
 
 

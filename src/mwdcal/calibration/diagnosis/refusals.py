@@ -41,6 +41,7 @@ from mwdcal.calibration.residuals import shown_in
 from mwdcal.calibration.results import temperature_range
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.batch import batch_of_one
+from mwdcal.estimation.evidence import WALKS
 from mwdcal.estimation.robust import LOSSES
 from mwdcal.estimation.solvers import Status
 from mwdcal.geometry.vectors import Array, Bools
@@ -110,8 +111,11 @@ UNSOUND_ADVICE = (
 OF_READINGS = {
     "few": "{source} has {count} stations; the model has {size} parameters per triad and needs {needed} or more. Add "
     "stations at other attitudes{remedy}.",
-    "common": "{takes} the stand as exact, and [stand] of the tool profile declares {declared}: no uncertainty would "
-    "include it. Use `method` least-squares or joint without `paper_weights`, or take it out of the profile.",
+    "common": "{takes} the stand as exact and the run as steady, and the tool profile declares {declared}: no "
+    "uncertainty would include it. Use `method` least-squares or joint without `paper_weights`, or take it out of "
+    "the profile.",
+    "relative": "`field_drift_nt` of [stand] in the tool profile is in nT, and the run does not state the strength of "
+    "the field. Give ref_field_nt, or take it out of the profile.",
     "dead": "{source}: the {triad} channel on tool axis {axis} does not move: the same value at all {count} stations. "
     "A dead sensor, a wrong column, or all stations in one attitude; check the wiring and the columns.",
     "little": "{source}: the {triad} channel on tool axis {axis} moves by {moved:.3g} {unit} over the run, too little "
@@ -227,6 +231,7 @@ def reading_refusals(readings: Readings, options: Options, run: Run) -> Iterator
     words = {"source": source, "count": readings.count}
     yield _few_stations(readings, options, words)
     yield _common_errors(readings, options)
+    yield _field_in_nanotesla(readings)
     for triad in readings.triads:
         yield from _channels(readings, triad, options.knowledge is not None, words)
         if triad in readings.sd:
@@ -255,12 +260,18 @@ def _few_stations(readings: Readings, options: Options, words: Words) -> Flag:
 
 def _common_errors(readings: Readings, options: Options) -> Flag:
     """Declared errors that all stations share where the method cannot have them as unknowns."""
-    declared = [name for name in COMMON if name in readings.sd]
+    declared = [name for name in (*COMMON, *WALKS) if name in readings.sd]
     exact = options.method == "swarm" or options.paper_weights
     takes = f"{minimiser(options)} take{'' if options.paper_weights else 's'}"
     values = {"takes": takes, "declared": ", ".join(declared)}
     held = _all(readings, bool(declared) and exact)
     return Flag("common-errors", held, OF_READINGS["common"], values)
+
+
+def _field_in_nanotesla(readings: Readings) -> Flag:
+    """A declared drift of a field whose strength is not known."""
+    lost = readings.relative and bool(readings.uncertainty("field-drift").any())
+    return Flag("common-errors", _all(readings, lost), OF_READINGS["relative"], {})
 
 
 def _channels(readings: Readings, triad: str, prior: bool, words: Words) -> Iterator[Flag]:

@@ -97,7 +97,8 @@ def _impossible(value: Any, path: str = "") -> Iterator[tuple[str, float]]:
             yield path, value
     elif isinstance(value, dict):
         for key, item in value.items():
-            yield from _impossible(item, f"{path}.{key}" if path else str(key))
+            if not (isinstance(item, float) and abs(item) <= LARGEST):
+                yield from _impossible(item, f"{path}.{key}" if path else str(key))
     elif isinstance(value, list | tuple):
         for index, item in enumerate(value):
             if not (isinstance(item, float) and abs(item) <= LARGEST):

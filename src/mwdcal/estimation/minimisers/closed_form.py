@@ -167,6 +167,19 @@ def solution(problem: Problem, at: State) -> tuple[State, Analysis, Bools]:
     return state, analysis, np.all([triad.settled for triad in triads], axis=0)
 
 
+def rescaled(problem: Problem, quieter: Problem, analysis: Analysis) -> Analysis:
+    """The analysis of a problem of which the noise of a triad alone is another: its minimum stays."""
+    pairs = zip(problem.triads, quieter.triads, strict=True)
+    ratio = np.stack([(new.sd / old.sd)[:, 0, 0] for old, new in pairs], -1)
+    of_params = np.repeat(ratio, [t.model.size for t in problem.triads], -1)
+    return replace(
+        analysis,
+        covariance=analysis.covariance * outer(of_params),
+        variance_factor=analysis.variance_factor / ratio**2,
+        residual=analysis.residual / np.repeat(ratio, 3, -1)[:, None],
+    )
+
+
 def _affine_minimum(triad: Triad, target: Array, include: Array) -> AffineMinimum:
     weight = include / triad.sd**2
     alike = bool((weight == weight[..., :1]).all())
@@ -179,14 +192,14 @@ def _affine_minimum(triad: Triad, target: Array, include: Array) -> AffineMinimu
         terms,
         forward,
         spread,
-        *_centred(triad, forward),
+        *centred_parts(triad, forward),
         left,
         include - share,
         fit.spanned,
     )
 
 
-def _centred(triad: Triad, forward: Array) -> tuple[Array, Array]:
+def centred_parts(triad: Triad, forward: Array) -> tuple[Array, Array]:
     """M (B, 3, 3) and T (B, 4, 4) of Φ in the model's own centred and scaled reading."""
     model = triad.model
     assert isinstance(model, Polynomial)

@@ -7,11 +7,13 @@ changes by the noise times the drift, so that each round comes some thousand tim
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
 from mwdcal.estimation.minimisers import closed_form
 from mwdcal.estimation.minimisers.common_columns import (
+    Alike,
     CommonColumns,
     are_common,
     perfect,
@@ -38,11 +40,12 @@ def applies(problem: Problem) -> bool:
     return walks and are_common(problem)
 
 
-def walk_columns(problem: Problem, state: State, alone: bool = False) -> WalkColumns:
+@lru_cache(maxsize=16)
+def walk_columns(design: Alike, alone: bool = False) -> WalkColumns:
     """What the terms of the drifts do to the readings of the triads; `alone`: with the sensors' parameters known."""
-    perfect_problem, at = perfect(problem, state)
+    perfect_problem, at = perfect(design)
     columns = perfect_problem.walk_columns(at)[0]
-    walk = np.array([WALK_AXES[c.name][0] for c in problem.evidence.constants])
+    walk = np.array([WALK_AXES[c.name][0] for c in perfect_problem.evidence.constants])
     each = {}
     for index in np.unique(np.minimum(walk, 1)).tolist():
         terms = sensor_terms(perfect_problem, at, index)[:, : 0 if alone else None]
@@ -58,7 +61,7 @@ def scores(problem: Problem, state: State, residual: Array) -> Array:
         responses(problem, state),
         np.zeros((len(residual), len(problem.evidence.constants))),
     )
-    for index, (places, each) in walk_columns(problem, state).items():
+    for index, (places, each) in walk_columns(Alike.of(problem, state)).items():
         score[:, places] = each.score(reads[index], residual[..., 3 * index : 3 * index + 3])
     return score
 
@@ -67,7 +70,7 @@ def information(problem: Problem, state: State, alone: bool = False) -> Array:
     """Information (B, q, q) of the readings on the terms; `alone`: with the sensors' parameters known."""
     reads, count = responses(problem, state), len(problem.evidence.constants)
     whole = np.zeros((len(state.params), count, count))
-    for index, (places, each) in walk_columns(problem, state, alone).items():
+    for index, (places, each) in walk_columns(Alike.of(problem, state), alone).items():
         whole[:, places[:, None], places] = each.information(reads[index])
     return whole
 
@@ -75,7 +78,7 @@ def information(problem: Problem, state: State, alone: bool = False) -> Array:
 def solution(problem: Problem, at: State) -> tuple[State, Analysis, Bools]:
     """State and analysis at the minimum for the attitudes of a state, and members (B,) that came there."""
     bare = replace(problem, evidence=replace(problem.evidence, constants=()))
-    columns, precision = walk_columns(problem, at), _precision(problem)
+    columns, precision = walk_columns(Alike.of(problem, at)), prior_precision(problem)
     value = np.zeros(precision.shape)
     steady, still = bare, replace(at, constants=value[:, :0])
     covariances: dict[int, Array] = {}
@@ -109,7 +112,7 @@ def effective_freedom(problem: Problem, analysis: Analysis) -> Array:
     With V the covariance of the terms of the drifts and Λ their precision before, 1 - ΛV is what the readings say of
     them: tr(S²) is less than tr(S) by the trace of that, and more by the trace of its square.
     """
-    precision, square = _precision(problem), analysis.freedom.copy()
+    precision, square = prior_precision(problem), analysis.freedom.copy()
     owner = np.array([min(WALK_AXES[c.name][0], 1) for c in problem.evidence.constants])
     for index in np.unique(owner).tolist():
         places = np.flatnonzero(owner == index)
@@ -119,7 +122,7 @@ def effective_freedom(problem: Problem, analysis: Analysis) -> Array:
     return scaled_freedom(analysis.freedom, square)
 
 
-def _precision(problem: Problem) -> Array:
+def prior_precision(problem: Problem) -> Array:
     """Precision (B, q) of the constants before the run."""
     return np.stack([constant.sd for constant in problem.evidence.constants], -1) ** -2.0
 

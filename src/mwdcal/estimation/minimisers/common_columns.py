@@ -8,7 +8,8 @@ are linear in SᵀS, S and 1: they are formed once.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -35,9 +36,29 @@ def are_common(problem: Problem) -> bool:
     return all(np.array_equal(a, np.broadcast_to(a[:1], a.shape), equal_nan=True) for a in arrays)
 
 
-def perfect(problem: Problem, state: State) -> tuple[Problem, State]:
-    """The first member as sensors without error and with noise of one would read it."""
-    problem, state = take((problem, state), np.arange(1))
+@dataclass(frozen=True)
+class Alike:
+    """The first member of a problem; equal to others of equal references and constants, whatever the readings."""
+
+    references: tuple[bytes | str, ...]
+    problem: Problem = field(compare=False)
+    state: State = field(compare=False)
+
+    @classmethod
+    def of(cls, problem: Problem, state: State) -> Alike:
+        """Of the members of a problem that `are_common`."""
+        evidence = problem.evidence
+        masks = [constant.mask for constant in evidence.constants]
+        arrays = [*evidence.known.values(), evidence.include, problem.temperature, *masks]
+        names = [str(len(problem.triads)), *(constant.name for constant in evidence.constants)]
+        each = [array[0].tobytes() for array in (*arrays, state.attitude)]
+        return cls((*names, *each), *take((problem, state), np.arange(1)))
+
+
+@lru_cache(maxsize=16)
+def perfect(design: Alike) -> tuple[Problem, State]:
+    """A design as sensors without error and with noise of one would read it."""
+    problem, state = design.problem, design.state
     triads = [replace(triad, sd=np.ones_like(triad.sd)) for triad in problem.triads]
     params = [triad.model.start(np.eye(3)[None], np.zeros((1, 3))) for triad in triads]
     state = replace(state, params=np.concatenate(params, -1))
@@ -67,13 +88,15 @@ class CommonColumns:
 
     `whole` and `left` (n, 6, k), in the frame of the field and then in that of the readings: what an effect does, and
     what the sensors' parameters do not take up. `taken` (4, 6, k) is what they take up, by element of f̃.
-    `products` (k k, 16): sums over the stations, by element of SᵀS, S and 1.
+    By element of SᵀS, S and 1, sums over the stations: `products` (16, k k) of what is left, and `lengths` (16, k),
+    squares of the whole.
     """
 
     whole: Array
     left: Array
     taken: Array
     products: Array
+    lengths: Array
 
     @classmethod
     def of(cls, terms: Array, columns: Array, of_reading: Bools) -> CommonColumns:
@@ -86,26 +109,26 @@ class CommonColumns:
         taken = basis.transpose() @ whole.reshape(len(whole), -1)
         left = whole - (basis @ taken).reshape(whole.shape)
         taken = np.linalg.solve(triangle, taken).reshape(-1, *whole.shape[1:])
-        flat = np.moveaxis(left, 1, 0)
-        return cls(whole, left, taken, _by_response(np.moveaxis(flat, 2, 1)[:, None] @ flat))
+        lengths = _by_response(np.einsum("nik,njk->ijk", whole, whole))
+        return cls(whole, left, taken, _products(left, left), lengths)
 
     def information(self, response: Array) -> Array:
         """Information (B, k, k) on the effects, the sensors' parameters being unknown; of `responses` (B, 3, 6)."""
         count = self.whole.shape[-1]
-        whole = self.products @ _squares_of(response)[..., None]
-        return np.asarray(whole.reshape(-1, count, count))
+        return np.asarray((squares_of(response) @ self.products).reshape(-1, count, count))
+
+    def across(self, other: CommonColumns) -> Array:
+        """Sums (16, k q) as `products`, of our columns and of others."""
+        return _products(self.left, other.left)
 
     def squares(self, response: Array) -> Array:
         """Squares (B, k) of the lengths of the columns in whitened readings."""
-        each = np.einsum("nik,njk->ijk", self.whole, self.whole)
-        return np.asarray(
-            (_by_response(each[..., None]) @ _squares_of(response)[..., None])[..., 0]
-        )
+        return np.asarray(squares_of(response) @ self.lengths)
 
     def score(self, response: Array, residual: Array) -> Array:
         """Scores (B, k) of the effects in whitened residuals (B, n, 3) of a fit without them."""
-        flat = (residual @ response).reshape(len(residual), 1, -1)
-        return np.asarray((flat @ self.left.reshape(-1, self.left.shape[-1]))[:, 0])
+        flat = (residual @ response).reshape(len(residual), -1)
+        return np.asarray(flat @ self.left.reshape(-1, self.left.shape[-1]))
 
     def seen(self, response: Array) -> Array:
         """What effects do to whitened residuals (B, n, 3, k)."""
@@ -117,18 +140,24 @@ class CommonColumns:
         return np.asarray(both @ response.mT)
 
 
+def _products(first: Array, second: Array) -> Array:
+    """Sums (16, k q) over the stations of products of columns (n, 6, k) and (n, 6, q)."""
+    flat = np.moveaxis(first, 0, 2)[:, None] @ np.moveaxis(second, 1, 0)
+    return _by_response(flat)
+
+
 def _by_response(sums: Array) -> Array:
-    """Sums (6, 6, ...) over the stations of products of elements, flat, by the 16 `_squares_of` a response."""
+    """Sums (6, 6, ...) over the stations of products of elements, flat, by the 16 `squares_of` a response."""
     field = sums[FIRST_AXES, SECOND_AXES] + sums[SECOND_AXES, FIRST_AXES]
     field[FIRST_AXES == SECOND_AXES] /= 2
     across = sums[3:, :3] + np.swapaxes(sums[:3, 3:], 0, 1)
     reading = sums[3, 3] + sums[4, 4] + sums[5, 5]
     count = reading.size
     parts = [part.reshape(-1, count) for part in (field, across, reading)]
-    return np.concatenate(parts).transpose().copy()
+    return np.concatenate(parts)
 
 
-def _squares_of(response: Array) -> Array:
+def squares_of(response: Array) -> Array:
     """Elements (B, 16) of SᵀS, S and 1, over σ², of responses (B, 3, 6)."""
     gain, one = response[..., :3], response[:, :1, 3]
     square = (gain.mT @ gain)[:, FIRST_AXES, SECOND_AXES]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from mwdcal.errors import FitError, InputError
+from mwdcal.errors import Answer, InputError, QuestionError
 from mwdcal.files.formats.columns import as_text, looks_numeric
 
 _SPACES = re.compile(r"(?<=\d)[ '’\u00a0\u202f\u2009](?=\d{3}(\D|$))")
@@ -19,6 +19,8 @@ _DEGREES = re.compile(
 """Degrees, minutes and seconds."""
 _BEARING = re.compile(r"([NS])\s*(\d+(?:[.,]\d+)?)\s*°?\s*([EWO])", re.IGNORECASE)
 """A bearing by quadrants, such as N45E."""
+_DAY = re.compile(r"\s*\d{1,2}\.\d{1,2}\.(\d{4}|\d{2})([ T].*)?")
+"""A day as in Germany or Russia, which is no number."""
 _GROUPED = re.compile(r"[+\-−]?[1-9]\d{0,2}([.,]\d{3})+")
 _POINTED = {
     ".": re.compile(r"[+\-−]?[1-9]\d{0,2}(,\d{3})+(\.\d*)?"),
@@ -35,6 +37,8 @@ def is_figure(cell: object) -> bool:
     """
     if not isinstance(cell, str):
         return isinstance(cell, int | float) and not isinstance(cell, bool)
+    if _DAY.fullmatch(cell):
+        return False
     text = _SPACES.sub("", cell)
     return any(form.fullmatch(text) for form in (_FIGURE, _DEGREES, _BEARING))
 
@@ -67,8 +71,13 @@ def decimal_sign(cells: Sequence[object], source: str) -> str:
         )
     if all(map(_GROUPED.fullmatch, commas + points)):
         sign, marked = ("comma", commas) if commas else ("point", points)
-        raise FitError(
-            f"{source}: the {sign} in {marked[0]} may be a decimal sign or separate thousands. Say which by `decimal`."
+        written = "," if commas else "."
+        raise QuestionError(
+            f"{source}: the {sign} in {marked[0]} may be a decimal sign or separate thousands.",
+            [
+                Answer("a decimal sign", (("decimal", written),)),
+                Answer("it separates thousands", (("decimal", "." if commas else ","),)),
+            ],
         )
     return "," if commas else "."
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from mwdcal.errors import FitError, InputError
+from mwdcal.errors import Answer, InputError, QuestionError
 from mwdcal.files.formats import figures
 from mwdcal.files.formats.columns import as_text, looks_numeric, plain_names, shown
 from mwdcal.files.formats.titles import Titles, dated, titles
@@ -31,6 +31,8 @@ LEAST_COLUMNS = 4
 _MOST_HEADER_ROWS = 3
 _BESIDES = 8
 """Rows of readings from which another table in the file is one to be asked about."""
+_SHARED = 0.6
+"""Share of columns that two tables have in common if each may be meant."""
 _SUMMARY = re.compile(
     r"\W*(mean|average|avg|median|std\w*|st\.?\s?dev\w*|standard deviation|rms|min(imum)?|max(imum)?|sum|total|range|"
     r"span|mittel(wert)?|durchschnitt|stabw\w*|standardabw\w*\.?|summe|snitt|gjennomsnitt|standardavvik|media|"
@@ -43,7 +45,7 @@ _OF_LOGGERS = re.compile(
     r"(avg|smp|min|max|std|tot|float|double|int\d*|real|string|-+|=+)", re.IGNORECASE
 )
 """What loggers write below names and units: how a value was sampled, of what type it is, rules."""
-_UNIT_BEHIND = re.compile(r"(.*?)\s*([(\[][^)\]]*[)\]])")
+_UNIT_BEHIND = re.compile(r"(.*?)\s*([(\[][^)\]]*[)\]]|,\s*[^\s,]{1,5})")
 _AXIS = re.compile(r"\W*([xyz123])\W*([(\[].*)?", re.IGNORECASE)
 """A name that is an axis alone, and says nothing without the title above it."""
 _DEGREES_OF = re.compile(
@@ -134,8 +136,9 @@ def laid_out(
 
 
 def _alike(one: Layout, other: Layout) -> bool:
-    """Whether two tables have the same columns, in whatever case."""
-    return {n.casefold() for n in one.names} == {n.casefold() for n in other.names}
+    """Whether two tables share most of their columns, in whatever spelling."""
+    ours, theirs = ({*_spelling(each.names)} for each in (one, other))
+    return len(ours & theirs) >= _SHARED * max(len(ours), len(theirs))
 
 
 def _no_table(source: str, header_line: int, wanted: Collection[str]) -> InputError:
@@ -149,16 +152,22 @@ def _no_table(source: str, header_line: int, wanted: Collection[str]) -> InputEr
     )
 
 
-def _several(tables: Sequence[Layout], source: str, sheet: str) -> FitError:
+def _several(tables: Sequence[Layout], source: str, sheet: str) -> QuestionError:
     places = [
         f"{f'sheet {shown(t.sheet)}, ' if t.sheet else ''}row {t.form.header_line} ({len(t.lines)} rows)"
         for t in sorted(tables, key=lambda t: (t.sheet, t.form.header_line))
     ]
-    sheets = {t.sheet for t in tables}
-    option = "`sheet`" if len(sheets) == len(tables) and not sheet else "`header_row`"
-    return FitError(
-        f"{source} holds {len(tables)} tables with the same columns: {'; '.join(places)}. Say which one is meant by "
-        f"{option}."
+    by_sheet = len({t.sheet for t in tables}) == len(tables) and not sheet
+    answers = [
+        Answer(
+            f"{shown(t.sheet) if t.sheet else 'row'} {t.form.header_line}, {len(t.lines)} rows",
+            (("sheet", t.sheet) if by_sheet else ("header_row", str(t.form.header_line)),),
+        )
+        for t in tables
+    ]
+    return QuestionError(
+        f"{source} holds {len(tables)} tables of like columns: {'; '.join(places)}. Which one is meant?",
+        answers,
     )
 
 
@@ -166,7 +175,7 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
     """The tables of a sheet, one below the other."""
     rows = sheet.rows
     heads = [k for k in range(len(rows)) if _is_head(rows, k)]
-    heads = [k for n, k in enumerate(heads) if n == 0 or not _repeats(rows[k][1], rows, heads[0])]
+    heads = [k for n, k in enumerate(heads) if n == 0 or _begins_anew(rows, heads[:n], k)]
     for head, end in pairwise([*heads, len(rows)]):
         if layout := _table(sheet, head, end, source, decimal):
             yield layout
@@ -178,9 +187,27 @@ def _is_head(rows: Sequence[tuple[int, Cells]], place: int) -> bool:
     return below and not _is_reading(rows[place][1]) and _texts(rows[place][1]) >= LEAST_COLUMNS
 
 
+def _begins_anew(rows: Sequence[tuple[int, Cells]], heads: Sequence[int], place: int) -> bool:
+    """Whether a head is that of another table: of other names, or below the serial of another tool."""
+    if not _repeats(rows[place][1], rows, heads[0]):
+        return True
+    ours = titles([row for _, row in rows[: heads[0]]]).metadata.get("serial")
+    above = [row for _, row in rows[heads[-1] : place] if not _is_reading(row)]
+    theirs = titles(above).metadata.get("serial")
+    return theirs is not None and theirs != ours
+
+
 def _repeats(row: Cells, rows: Sequence[tuple[int, Cells]], head: int) -> bool:
-    """Whether a row repeats the names, or the units, above the first readings."""
-    return any(row == each for _, each in rows[max(0, head - 2) : head + 1])
+    """Whether a row repeats the names, or the units, above the first readings, in whatever spelling."""
+    return any(_spelling(row) == _spelling(each) for _, each in rows[max(0, head - 2) : head + 1])
+
+
+def _spelling(row: Cells) -> list[str]:
+    """The letters and digits of cells, in lower case."""
+    cells = [re.sub(r"[\W_]+", "", as_text(cell).casefold()) for cell in row]
+    while cells and not cells[-1]:
+        cells.pop()
+    return cells
 
 
 def _texts(row: Cells) -> int:
@@ -329,7 +356,7 @@ def _head(rows: Sequence[tuple[int, Cells]], place: int) -> tuple[list[str], lis
         top
         and place - top < _MOST_HEADER_ROWS - 1
         and rows[top - 1][0] == rows[top][0] - 1
-        and _need_titles(names)
+        and (_need_titles(names) or _stands_over_units(rows[top - 1][1], names))
         and _is_title(rows[top - 1][1])
     ):
         top -= 1
@@ -343,6 +370,18 @@ def _need_titles(names: Sequence[str]) -> bool:
     return (
         any(_AXIS.fullmatch(name) for name in names) or max(Counter(bare).values(), default=0) > 1
     )
+
+
+def _is_unit(name: str) -> bool:
+    """Whether a name is a unit and nothing else."""
+    text = name.strip(" []()")
+    return bool(unit_of(text)) and not re.search(r"[\s,]", text)
+
+
+def _stands_over_units(row: Cells, names: Sequence[str]) -> bool:
+    """Whether a row has a text over each name that is nothing but a unit, of which there are some."""
+    bare = [k for k, name in enumerate(names) if _is_unit(name)]
+    return bool(bare) and all(k < len(row) and isinstance(row[k], str) and row[k] for k in bare)
 
 
 def _is_title(row: Cells) -> bool:
@@ -362,7 +401,9 @@ def _joined(row: Cells, names: Sequence[str]) -> list[str]:
 
 
 def _with_title(title: str, name: str) -> str:
-    """A name behind its title; a unit in brackets behind the title comes last."""
+    """A name behind its title; a unit behind the title comes last, and so does a name that is a unit."""
+    if _is_unit(name):
+        return f"{title} ({name.strip(' []()')})"
     match = _UNIT_BEHIND.fullmatch(title) if "(" not in name and "[" not in name else None
     return " ".join([match[1], name, match[2]]).strip() if match else f"{title} {name}".strip()
 

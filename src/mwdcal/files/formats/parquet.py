@@ -164,7 +164,7 @@ def _size_of(cells: Any) -> int:
 def render(columns: Mapping[str, Column], metadata: Mapping[str, object], source: str) -> bytes:
     """The bytes that `parse` turns back into the same columns and metadata."""
     arrow, parquet = modules(source)
-    arrays = {name: _array(column, arrow) for name, column in columns.items()}
+    arrays = {name: array_of(column, arrow) for name, column in columns.items()}
     described = {KEY: msgspec.json.encode(metadata, enc_hook=str)}
     table = arrow.table(arrays).replace_schema_metadata(described)
     stream = arrow.BufferOutputStream()
@@ -247,7 +247,8 @@ def _in_microseconds(cells: Any, arrow: Any) -> Any:
     return cells.cast(arrow.duration("us") if arrow.types.is_duration(kind) else arrow.time64("us"))
 
 
-def _array(column: Column, arrow: Any) -> Any:
+def array_of(column: Column, arrow: Any) -> Any:
+    """A column as an Arrow array; what is blank is null."""
     if isinstance(column, list):
         return arrow.array([cell or None for cell in column], arrow.string())
     kind = None if column.dtype == bool else arrow.float64()

@@ -8,6 +8,9 @@ from __future__ import annotations
 import base64
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
+from pathlib import Path
+from shutil import copyfileobj
+from tempfile import TemporaryFile
 from typing import IO, Any
 
 import msgspec
@@ -15,6 +18,7 @@ import numpy as np
 
 from mwdcal.files import metadata as meta
 from mwdcal.files.formats import parquet, text
+from mwdcal.files.formats.columns import Column
 from mwdcal.geometry.vectors import AnyArray, Bools
 
 _ARROW_SCHEMA = b"ARROW:schema"
@@ -55,9 +59,10 @@ class ParquetSink:
         """Append a row group."""
         self._writer.write_table(rendered)
 
-    def finish(self, findings: Sequence[str]) -> None:
-        """Write the findings and the end of the file."""
-        if findings:  # also in Arrow's copy of the schema, whose metadata readers take
+    def finish(self, findings: Sequence[str], metadata: Mapping[str, object] | None = None) -> None:
+        """Write the findings, `metadata` that were not known before, and the end of the file."""
+        self._metadata = dict(metadata or self._metadata)
+        if findings or metadata:  # also in Arrow's copy of the schema, whose metadata readers take
             described = {parquet.KEY: self._described(findings)}
             stored = base64.b64encode(self._schema.with_metadata(described).serialize())
             self._writer.add_key_value_metadata({**described, _ARROW_SCHEMA: stored})
@@ -199,6 +204,41 @@ class TextSink:
             values = cells.cast(self._arrow.float64(), safe=False)
             return compute.if_else(compute.is_nan(values), None, values)
         return self._arrow.array(parquet.texts(cells, self._arrow), self._arrow.string())
+
+
+class SpooledSink:
+    """A text table whose head is known at the end: until then its rows are in a file without a name, beside it."""
+
+    def __init__(self, stream: IO[bytes], delimiter: str) -> None:
+        self._arrow, _ = parquet.modules(stream.name)
+        self._stream, self._delimiter = stream, delimiter
+        self._rows = TemporaryFile(dir=Path(stream.name).parent)  # noqa: SIM115, closed by `close`
+        self._names: list[str] = []
+
+    def write(self, columns: Mapping[str, Column | Any]) -> None:
+        """Append rows of columns as in memory, or as Arrow has texts; each cell as `formats.text` spells it."""
+        self._names = [*columns]
+        cells = [self._spelt(name, column) for name, column in columns.items()]
+        lines = text.joined(cells, self._delimiter, self._arrow)
+        self._rows.write(lines)
+
+    def _spelt(self, name: str, column: Column | Any) -> Any:
+        if isinstance(column, np.ndarray):
+            return text.spelt(column, self._arrow)
+        if isinstance(column, list):
+            column = self._arrow.array(text.one_line(name, column), self._arrow.string())
+        return text.quoted(column, self._delimiter)
+
+    def finish(self, metadata: Mapping[str, object]) -> None:
+        """Write the head, and the rows behind it."""
+        head = "".join(f"{line}\n" for line in meta.render(metadata))
+        self._stream.write((head + text.header(self._names, self._delimiter)).encode())
+        self._rows.seek(0)
+        copyfileobj(self._rows, self._stream, 1 << 20)
+
+    def close(self) -> None:
+        """Remove the rows that waited."""
+        self._rows.close()
 
 
 Sink = ParquetSink | TextSink

@@ -7,7 +7,7 @@ import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain, takewhile
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,9 +23,13 @@ from mwdcal.files.formats.columns import (
     of_texts,
     plain_names,
 )
+from mwdcal.geometry.vectors import Array
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """What a cell begins with that spreadsheet programs run as a formula, unless it is a number."""
+_BREAKS = "\n\r\0"
+_SMALLEST_ALIKE, _LARGEST_ALIKE = 1e-4, 1e10
+"""Between these Arrow spells numbers that are not whole as `repr` does."""
 _LONGEST_LINE = 100_000
 _ROWS_AT_ONCE = 1 << 12
 _MAX_LINES = 1_000_000
@@ -141,13 +145,62 @@ def _cells(name: str, column: Column, decimal: str) -> list[str]:
             "" if value != value else repr(value) for value in np.asarray(column, float).tolist()
         ]
         return plain if decimal == "." else [cell.replace(".", decimal) for cell in plain]
-    for cell in column:
-        if any(mark in cell for mark in "\n\r\0"):
-            raise InputError(
-                f"column '{name}': cells of a text file must be one line; got {cell!r}. "
-                "Remove the line break, or write Parquet."
-            )
-    return column
+    return one_line(name, column)
+
+
+def one_line(name: str, cells: list[str]) -> list[str]:
+    """The cells; refuses a line break in one, which text tables do not have."""
+    joined_cells = "".join(cells)
+    if any(mark in joined_cells for mark in _BREAKS):
+        cell = next(cell for cell in cells if any(mark in cell for mark in _BREAKS))
+        raise InputError(
+            f"column '{name}': cells of a text file must be one line; got {cell!r}. "
+            "Remove the line break, or write Parquet."
+        )
+    return cells
+
+
+def spelt(values: Array, arrow: Any) -> Any:
+    """Numbers (n,) as Arrow's texts, spelled as `repr` does; NaN is blank."""
+    import pyarrow.compute as compute
+
+    values = np.asarray(values, float)
+    words = arrow.array(values).cast(arrow.string())
+    size = np.abs(values)
+    with np.errstate(
+        invalid="ignore"
+    ):  # Arrow spells whole, small and large numbers in another way
+        odd = ~((size >= _SMALLEST_ALIKE) & (size < _LARGEST_ALIKE) & (values != np.trunc(values)))
+    if odd.any():
+        others = ["" if value != value else repr(value) for value in values[odd].tolist()]
+        words = compute.replace_with_mask(words, odd, arrow.array(others, arrow.string()))
+    return words
+
+
+def quoted(cells: Any, delimiter: str) -> Any:
+    """Arrow's texts, blank where null, in quotes where a text table needs them."""
+    import pyarrow.compute as compute
+
+    cells = compute.fill_null(cells, "")
+    odd = compute.match_substring_regex(cells, f'["\r\n{delimiter}]')
+    if not compute.any(odd).as_py():
+        return cells
+    doubled = compute.replace_substring(cells, '"', '""')
+    return compute.if_else(odd, compute.binary_join_element_wise('"', doubled, '"', ""), cells)
+
+
+def joined(columns: Sequence[Any], delimiter: str, arrow: Any) -> memoryview:
+    """The lines of rows of which Arrow has the cells, each with its end."""
+    import pyarrow.compute as compute
+
+    cells = [c.combine_chunks() if hasattr(c, "combine_chunks") else c for c in columns]
+    ended = compute.binary_join_element_wise(cells[-1], "\n", "")
+    rows = compute.binary_join_element_wise(*cells[:-1], ended, delimiter)
+    if isinstance(rows, arrow.ChunkedArray):
+        rows = rows.combine_chunks()
+    _, offsets, data = rows.buffers()
+    ends = np.frombuffer(offsets, np.int32)[[rows.offset, rows.offset + len(rows)]]
+    return memoryview(data)[ends[0] : ends[1]]
 
 
 def lines(data: bytes, source: str, above: int = 0) -> list[str]:

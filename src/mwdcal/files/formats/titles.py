@@ -13,9 +13,9 @@ from mwdcal.files.formats.columns import as_text
 _TITLE_WORDS = {
     "serial": "serial sn s/n serialno serialnumber toolsn tools/n toolserial toolserialno toolserialnumber toolno "
     "toolid probesn probeno 仪器号 探管号 sondesn sensorsn seriennummer "
-    "seriennr geratenummer geratenr sondennummer sondennr serienummer "
+    "serie nserie seriennr geratenummer geratenr sondennummer sondennr serienummer "
     "serienr verktoynr instrumentnr numerodeserie nodeserie nserie numeroserie nsserie numserie ndeserie "
-    "заводскойномер серийныйномер зав№ серийный№ прибор№ 序列号 编号 仪器编号 出厂编号",
+    "заводской№ заводскойномер серийныйномер зав№ серийный№ прибор№ 序列号 编号 仪器编号 出厂编号",
     "date": "date testdate caldate calibrationdate measured datum prufdatum messdatum dato kalibreringsdato fecha "
     "data дата датакалибровки 日期 校准日期 测试日期",
     "operator": "operator technician measuredby testedby by bediener prufer operateur operador tecnico operatoer "
@@ -37,7 +37,7 @@ _PARTS = re.compile(r"\s+/\s+|,\s+|;\s*|\s{3,}")
 """The separator of facts in one cell."""
 _TOOL = re.compile(
     r"#?\s*(?:(?:tool|probe|sensor|sonde|instrument|herramienta|ferramenta|verktøy|gerät|прибор|зонд|датчик|инклинометр|仪器|探管)\s*"
-    r"(?P<mark>s/?n|serial( no)?|no\b|nr\b|зав\.?\s*№|№|#|号|编号)?|(?P<sn>sn|s/n|serial no))\s*[.:：|=]*\s*",
+    r"(?P<mark>s/?n|serial( no)?|n[°º]|no\b|nr\b|зав\.?\s*№|№|#|号|编号)?|(?P<sn>sn|s/n|serial no))\s*[.:：|=]*\s*",
     re.IGNORECASE,
 )
 _SERIAL = re.compile(r"(?=\S*\d)[^\W_][\w./-]*")
@@ -132,7 +132,9 @@ def _pair(cell: str, right: Sequence[str]) -> tuple[str, str]:
     key = _MEANT.get(_word(head.lstrip("#")), "")
     if not key:
         return "", ""
-    return key, "".join(tail).strip(' "') or next((each for each in right[:3] if each), "")
+    return key, "".join(tail).strip(' "') or next(
+        (each.lstrip(":= ") for each in right[:3] if each), ""
+    )
 
 
 def _word(text: str) -> str:

@@ -1,0 +1,60 @@
+"""A table that holds a calibration run and its roll test, told apart by a column that marks the roll test."""
+
+from __future__ import annotations
+
+import re
+
+from mwdcal.errors import InputError
+from mwdcal.files.contract import COLUMNS
+from mwdcal.files.formats.columns import shown
+from mwdcal.files.formats.table import Table, labels
+from mwdcal.files.statements import rows_of
+
+_ROLL_TEST = re.compile(
+    r"\W*(roll([\s_-]*(test|over|check|set))|rt|verif(y|ication|iziert)?|verifikation|check|validation|control|kontrolle|"
+    r"(roll)?pruefung|(roll)?prüfung|rulletest|kontroll|prueba( de giro)?|verificaci[oó]n|verifica[cç][aã]o|проверка|"
+    r"поверка|контроль|验证|检验)[\s_-]*(run|shot|station|row|test|\d*)\W*",
+    re.IGNORECASE,
+)
+"""What a laboratory calls the roll test, in a cell or as the name of a column."""
+_YES = re.compile(r"(x|yes|y|ja|si|sí|sim|да|是|true|1|1\.0|✓|✔|√)", re.IGNORECASE)
+_NO = re.compile(r"(|no|n|nei|nein|não|нет|否|false|0|0\.0|-|–)", re.IGNORECASE)
+
+
+def parted(table: Table) -> tuple[Table, Table]:
+    """The rows of the calibration run and those of the roll test.
+
+    A column marks the roll test by its name, with yes at its rows, or by its cells, as 'cal' and 'roll test'.
+
+    Raises:
+        InputError: no column marks it, or several do and differ.
+    """
+    marks = {
+        name: rows
+        for name in table.columns
+        if name not in COLUMNS and (rows := _marked_rows(table, name))
+    }
+    if len({tuple(rows) for rows in marks.values()}) != 1:
+        which = (
+            f"{' and '.join(map(shown, marks))} mark different rows"
+            if marks
+            else "no column marks it"
+        )
+        raise InputError(
+            f"{table.source} holds both run and roll test, and {which}. Mark the roll test in one column, such as "
+            "'Roll test' with yes at its rows, or name another table by `rolltest`."
+        )
+    rows = next(iter(marks.values()))
+    others = [row for row in range(table.count) if row not in {*rows}]
+    return rows_of(table, others), rows_of(table, rows)
+
+
+def _marked_rows(table: Table, name: str) -> list[int]:
+    """The rows that a column marks as roll test; none where it marks nothing or all of them."""
+    cells = labels(table, name)
+    called = _ROLL_TEST.fullmatch(name.strip())
+    if called and all(_YES.fullmatch(cell) or _NO.fullmatch(cell) for cell in cells):
+        rows = [row for row, cell in enumerate(cells) if _YES.fullmatch(cell)]
+    else:
+        rows = [row for row, cell in enumerate(cells) if cell and _ROLL_TEST.fullmatch(cell)]
+    return rows if len(rows) < len(cells) else []

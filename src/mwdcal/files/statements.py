@@ -1,0 +1,54 @@
+"""What a user says of a run beside its table: serial, day, operator."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from mwdcal.calibration.readings import IN_TABLE
+from mwdcal.errors import InputError
+from mwdcal.files.formats.columns import shown
+from mwdcal.files.formats.table import Table, labels
+
+
+def with_statements(
+    metadata: Mapping[str, object], statements: Mapping[str, str]
+) -> dict[str, object]:
+    """Metadata with what the user says, which comes first; what they stated otherwise stays beside it."""
+    others = {
+        f"{key}{IN_TABLE}": str(metadata[key])
+        for key, value in statements.items()
+        if metadata.get(key) not in (None, "", value)
+    }
+    return {**metadata, **statements, **others}
+
+
+def stated_table(table: Table, statements: Mapping[str, str], column: str = "serial") -> Table:
+    """A table with what the user says of it; of several tools in it, the rows of the one that is named.
+
+    `column`: that of the serials.
+
+    Raises:
+        InputError: the table has serials, and none of them is the one named.
+    """
+    cells, serial = labels(table, column), statements.get("serial")
+    if serial and any(cells):
+        rows = [row for row, cell in enumerate(cells) if cell == serial]
+        if not rows:
+            known = ", ".join(map(shown, [*dict.fromkeys(filter(None, cells))][:8]))
+            raise InputError(
+                f"{table.source}: no row is of the serial {shown(serial)}; the column {shown(column)} has {known}. "
+                "Name one of these by `serial`."
+            )
+        table = rows_of(table, rows)
+    return replace(table, metadata=with_statements(table.metadata, statements))
+
+
+def rows_of(table: Table, rows: list[int]) -> Table:
+    """Some rows of a table."""
+    columns = {
+        name: [cells[row] for row in rows] if isinstance(cells, list) else cells[rows]
+        for name, cells in table.columns.items()
+    }
+    lines = [table.lines[row] for row in rows] if len(table.lines) else table.lines
+    return replace(table, columns=columns, lines=lines)

@@ -1,0 +1,137 @@
+"""Answers to what a table leaves open: columns, units and triads that may be meant, what is believed first."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection, Sequence
+
+import numpy as np
+
+from mwdcal.errors import Answer
+from mwdcal.files.contract import RAW, REFERENCES
+from mwdcal.files.synonyms import unit_of
+from mwdcal.geometry.vectors import Array
+from mwdcal.identification.words import spelled
+
+IN_BRACKETS = re.compile(r"[(\[]([^)\]]*)[)\]]\s*$")
+RANGES_BY_UNIT: dict[str, tuple[tuple[str, float, float], ...]] = {
+    "ref_gravity_g": (("g", 0.9, 1.1), ("m/s²", 9.0, 10.5), ("mg", 990.0, 1010.0)),
+    "ref_field_nt": (
+        ("nT", 15_000.0, 80_000.0), ("µT", 15.0, 80.0), ("gauss", 0.15, 0.8), ("mT", 0.015, 0.08),
+    ),
+}  # fmt: skip
+"""Units of quantities of which the Earth has but one range of values; 980 may be milli-g or gal."""
+LEAST_ROLLS = 5
+"""Toolfaces from which on their unit is told by their range."""
+_FEW = 4
+"""Values of a column that a question shows."""
+_STEADY_DIP, _STEADY_FIELD = 3.0, 0.1
+"""A dip varies by less at one place, degrees, and a field by a smaller share."""
+STEADY_NORM = 0.15
+"""By how much the norm of a triad varies at most, as a share of the range of its channels."""
+_LEAST_TURN = 20.0
+"""By how much an angle of the stand varies at least, degrees."""
+_MOST_TRIPLES = 6
+"""Neighbouring columns that a question offers as a triad."""
+
+Values = Callable[[str], Array | None]
+"""The numbers of a column by its name; None where it holds no numbers."""
+
+
+def none_of(*columns: str) -> Answer:
+    """The answer that no column of a table holds these."""
+    return Answer("none of them", tuple(("column", f"{column}=") for column in columns))
+
+
+def with_values(words: str, values: Values, *names: str) -> str:
+    """An answer with a few values of each of its columns."""
+    few = []
+    for name in names:
+        cells = values(name)
+        known = cells[np.isfinite(cells)] if cells is not None else np.empty(0)
+        few.append(first_values(known) or "no numbers")
+    return f"{words}:  {'  |  '.join(few)}"
+
+
+def first_values(values: Array) -> str:
+    """The first few of some values."""
+    return ", ".join(f"{value:.6g}" for value in values[:_FEW].tolist())
+
+
+def candidates_for(column: str, names: Sequence[str], values: Values) -> list[Answer]:
+    """Each of the names as the answer to which one a column is, and that none is."""
+    each = [Answer(with_values(n, values, n), (("column", f"{column}={n}"),)) for n in names]
+    return [*each, none_of(column)]
+
+
+def channels_for(column: str, names: Sequence[str], values: Values) -> list[Answer]:
+    """Columns of numbers that may be a channel."""
+    numbers = [n for n in names if values(n) is not None]
+    return [Answer(with_values(n, values, n), (("column", f"{column}={n}"),)) for n in numbers]
+
+
+def triples_for(
+    channels: Sequence[str], names: Sequence[str], values: Values, most: float = np.inf
+) -> list[Answer]:
+    """Neighbouring columns that may be a triad, first those of which the norm varies least.
+
+    A sound triad has the same norm at every attitude, but for its biases and scales, while each channel varies.
+    `most`: by how much it may vary, as a share of the channels' range.
+    """
+    numbers = {n: v for n in names if (v := values(n)) is not None and np.isfinite(v).all()}
+    triples = []
+    for place in range(len(numbers) - 2):
+        three = [*numbers][place : place + 3]
+        columns = np.stack([numbers[n] for n in three], -1)
+        norm, spread = np.linalg.norm(columns, axis=-1), np.ptp(columns, axis=0)
+        if spread.min() > 0:
+            triples.append((float(np.std(norm) / spread.max()), three))
+    return [
+        Answer(
+            with_values(", ".join(three), values, *three),
+            tuple(("column", f"{c}={n}") for c, n in zip(channels, three, strict=True)),
+        )
+        for variation, three in sorted(triples, key=lambda each: each[0])[:_MOST_TRIPLES]
+        if variation <= most
+    ]
+
+
+def in_units(name: str, column: str, allowed: Sequence[str]) -> list[Answer]:
+    """Each of the units as the answer to the one that a column is in."""
+    return [Answer(unit, (("column", f"{column}={name} ({unit})"),)) for unit in allowed]
+
+
+def lacking_references(present: Collection[str]) -> list[str]:
+    """References of a run that a table should have, and has none of, beside its channels."""
+    magnetic = () if {*present}.isdisjoint(RAW[3:]) else ("azimuth", "field", "dip")
+    names = (REFERENCES[name].column for name in ("inclination", "toolface", *magnetic))
+    return [column for column in names if column not in present]
+
+
+def may_be(column: str, name: str, unit: str, values: Array | None) -> bool:
+    """Whether a column whose name says nothing may be a reference by its unit and its values.
+
+    An angle of the stand varies; dip and field hardly do, and state their unit.
+    """
+    known = values[np.isfinite(values)] if values is not None else np.empty(0)
+    if known.size < LEAST_ROLLS:
+        return False
+    plain = spelled(name)
+    bracketed = IN_BRACKETS.search(plain)
+    stated = unit_of(spelled(unit)) or unit_of(
+        bracketed[1] if bracketed else plain.rpartition(" ")[2]
+    )
+    foreign = bool(unit or bracketed) and not stated
+    low, high = float(known.min()), float(known.max())
+    if column == REFERENCES["dip"].column:
+        steep = min(abs(low), abs(high)) > 5 and max(abs(low), abs(high)) < 90
+        return stated == "°" and high - low < _STEADY_DIP and steep
+    if column == REFERENCES["field"].column:
+        ranges = {unit: (least, most) for unit, least, most in RANGES_BY_UNIT[column]}
+        least, most = ranges.get("nT" if not stated and not foreign else stated, (np.inf, -np.inf))
+        return least <= low and high <= most and high - low < _STEADY_FIELD * high
+    if foreign or stated not in ("", "°", "rad", "gon") or high - low < _LEAST_TURN:
+        return False
+    numbered = bool(np.allclose(np.diff(known), np.diff(known)[0]))
+    inside = 0 <= low <= high <= 180 if "inclination" in column else -360 <= low <= high <= 360
+    return inside and not numbered

@@ -1,0 +1,65 @@
+"""The guard of speed: what it calls lost, and that a disturbance is not."""
+
+from importlib import import_module
+
+import numpy as np
+import pytest
+
+from cli_support import ROOT
+
+pytest.importorskip("pyarrow")
+
+
+@pytest.fixture
+def guard(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    return import_module("guard")
+
+
+@pytest.fixture
+def path(guard, monkeypatch):
+    """A path whose calls, and those of its reference, take the seconds that two functions give of their number."""
+
+    def timed(ours, theirs):
+        counts = {"ours": 0, "theirs": 0}
+
+        def seconds(call):
+            name = call()
+            counts[name] += 1
+            return (ours if name == "ours" else theirs)(counts[name])
+
+        monkeypatch.setattr(guard, "processor_seconds", seconds)
+        return guard.Guarded("p", "r", lambda: "theirs", lambda: "ours")
+
+    return timed
+
+
+def judged(guard, found):
+    return guard.judged(found, 2.0, guard.TRIES)
+
+
+def test_a_path_that_takes_twice_as_long_has_lost_in_every_try(guard, path):
+    assert judged(guard, path(lambda k: 0.4, lambda k: 0.1)) == 4.0 > guard.LOST * 2.0
+
+
+@pytest.mark.parametrize("slow", [lambda k: k % 3 == 0, lambda k: k < 30, lambda k: k > 1])
+def test_a_disturbance_of_either_or_both_is_no_loss(guard, path, slow):
+    """Of every third call; of both for a long time and then not; of both for ever."""
+    found = path(lambda k: 0.2 * (1 + slow(k)), lambda k: 0.1 * (1 + slow(k)))
+    assert judged(guard, found) == pytest.approx(2.0, rel=0.01)
+    alone = path(lambda k: 0.2 * (1 + (k % 3 == 0)), lambda k: 0.1)
+    assert judged(guard, alone) == pytest.approx(2.0, rel=0.01)
+
+
+def test_a_path_without_a_stored_ratio_is_measured_once(guard, path):
+    calls = []
+    found = path(lambda k: calls.append(k) or 9.0, lambda k: 0.1)
+    assert guard.judged(found, np.inf, guard.TRIES) == 90.0
+    assert len(calls) == 1 + guard.MORE[0]
+
+
+def test_a_command_that_fails_stops_the_guard(guard):
+    with pytest.raises(SystemExit, match="ended with 2"):
+        guard.command("apply", "no.json", "no.csv")
+    with pytest.raises(SystemExit, match="python -c"):
+        guard.python("-c", "raise SystemExit(3)")
