@@ -150,7 +150,7 @@ def test_surveys_are_those_of_the_command(folder, here, tmp_path, msa):
     mc.save(here, tmp_path / "here.json")
     out, page = tmp_path / "out.csv", tmp_path / "out.html"
     options = ("--reference", tmp_path / "here.json", *(["--msa"] if msa else []), "-o", out)
-    typed = ran("survey", folder / "tool.json", WELL, *options, "--html", page)
+    typed = ran("survey", folder / "tool.json", WELL, *options, "--report", page)
     table, drawn = out.read_bytes(), page.read_text("utf-8")
     well = mc.survey(folder / "tool.json", WELL, reference=tmp_path / "here.json", msa=msa)
     forms_are_short(well)

@@ -99,7 +99,7 @@ def through(folder, serial, day):
         day[:10],
     )
     assert done("convert", made, "--notation", "forward", "--json").json["serial"] == serial
-    place = ("--database", folder / "r.sqlite")
+    place = ("--registry", folder / "r.sqlite")
     done("registry", *place, "init")
     done("registry", *place, "add", run, made, folder / "v.json", folder / "C.json")
     (tool,) = done("registry", *place, "list", "--json").json["tools"]
@@ -235,7 +235,7 @@ def test_a_day_that_is_to_come_is_said_wherever_readings_are_used(run, test_run)
 def test_a_registry_says_which_records_are_of_no_tool_or_of_a_day_to_come(tmp_path, run):
     for name, stated in {"none": {"serial": None}, "late": {"date": "2999-01-01"}}.items():
         mwdcal.save(mwdcal.calibrate(of(run, **stated)), tmp_path / f"{name}.json")
-    place = ("--database", tmp_path / "r.sqlite")
+    place = ("--registry", tmp_path / "r.sqlite")
     done("registry", *place, "init")
     ran = done("registry", *place, "add", tmp_path / "none.json", tmp_path / "late.json", "--json")
     said = {each["id"]: each["text"] for each in ran.json["findings"]}

@@ -53,7 +53,7 @@ def commands(folder, output):
             "-o",
             output,
         ),
-        "backup": ("registry", "--database", folder / "no.sqlite", "backup", output),
+        "backup": ("registry", "--registry", folder / "no.sqlite", "backup", output),
     }
 
 

@@ -73,14 +73,14 @@ def example(tmp_path_factory):
 def filled(example):
     """A registry of them, in a file."""
     path = example.parent / "tools.sqlite"
-    run("registry", "--database", path, "init", "--as", "A. Borg")
-    run("registry", "--database", path, "add", example, "--as", "A. Borg", "--workers", 1)
+    run("registry", "--registry", path, "init", "--as", "A. Borg")
+    run("registry", "--registry", path, "add", example, "--as", "A. Borg", "--workers", 1)
     return path
 
 
 def registry(path, *arguments, code=0):
     """The document of a subcommand, valid by its published schema."""
-    ran = run("registry", "--database", path, *arguments, "--json", code=code)
+    ran = run("registry", "--registry", path, *arguments, "--json", code=code)
     return checked(f"registry {arguments[0]}", ran.json)
 
 
@@ -188,7 +188,7 @@ def test_a_tool_that_is_not_there_is_named_with_those_that_are(filled, serial, w
 def test_the_registry_behind_a_tool_is_an_input_which_no_output_replaces(filled, example):
     ran = mwdcal("apply", f"{filled}#SIM-0001", example / "rolltest-2023.csv", "-o", filled)
     assert "would be lost" in refused(ran, 2)
-    assert "would be lost" in refused(mwdcal("registry", "--database", filled, "backup", filled), 2)
+    assert "would be lost" in refused(mwdcal("registry", "--registry", filled, "backup", filled), 2)
 
 
 def test_an_export_makes_the_same_registry(filled, example, tmp_path):
@@ -239,7 +239,7 @@ def test_a_withdrawn_calibration_counts_no_longer_also_in_an_export(filled, exam
         assert [r["sha256"] for r in past if r["reason"]] == [digest]
     assert registry(copy, "list", "--search", "SIM-0001")["tools"][0]["calibrated"] == "2022-03-01"
     assert registry(work, "check")["sound"]
-    again = mwdcal("registry", "--database", work, "withdraw", digest, "--reason", "x")
+    again = mwdcal("registry", "--registry", work, "withdraw", digest, "--reason", "x")
     assert "withdrawn already" in refused(again, 2)
 
 
@@ -258,7 +258,7 @@ def test_an_interrupted_import_leaves_no_withdrawn_calibration_that_counts(
 
     with monkeypatch.context() as patch:  # stopped as soon as the first transaction is on the disk
         patch.setattr(Adding, "_note", stopped)
-        mwdcal("registry", "--database", copy, "add", tmp_path / "out", "--workers", 1)
+        mwdcal("registry", "--registry", copy, "add", tmp_path / "out", "--workers", 1)
     registry(copy, "add", tmp_path / "out")
     past = registry(copy, "history", "SIM-0001")["records"]
     assert [r["sha256"] for r in past if r["reason"]] == [digest]
@@ -316,7 +316,7 @@ def test_a_calibration_that_was_changed_is_added_and_said_to_be(example, tmp_pat
 
 
 def test_a_page_behind_the_last_one_is_empty(filled):
-    shown = run("registry", "--database", filled, "list", "--offset", 99).out
+    shown = run("registry", "--registry", filled, "list", "--offset", 99).out
     assert shown == "3 tools\n"
 
 
@@ -325,7 +325,7 @@ def test_nothing_replaces_a_registry_but_a_backup_another(filled, tmp_path):
     registry(other, "init")
     before = other.read_bytes()
     for words in (["backup", other], ["get", "SIM-0001", "-o", other]):
-        ran = mwdcal("registry", "--database", filled, *words)
+        ran = mwdcal("registry", "--registry", filled, *words)
         assert "it is a registry, which would be lost" in refused(ran, 2)
     assert other.read_bytes() == before
     for _ in range(2):
@@ -357,7 +357,7 @@ def test_what_is_no_file_of_a_registry_is_named_and_stops_nothing(example, tmp_p
         "table.csv": "columns of a run are missing (ax, ay, az)", "edited.json": "edited.json",
     }.items():  # fmt: skip
         assert word in words[name], name
-    alone = mwdcal("registry", "--database", path, "add", mixed / "notes.txt")
+    alone = mwdcal("registry", "--registry", path, "add", mixed / "notes.txt")
     assert alone.code == 2
     assert "not added" in alone.err
 
@@ -366,7 +366,7 @@ def test_a_laboratory_whose_people_have_no_name_is_not_added(tmp_path):
     lab = tmp_path / "lab.toml"
     lab.write_text(LAB.replace('name = "C. Moe"\n', ""))
     registry(tmp_path / "r.sqlite", "init")
-    ran = mwdcal("registry", "--database", tmp_path / "r.sqlite", "add", lab)
+    ran = mwdcal("registry", "--registry", tmp_path / "r.sqlite", "add", lab)
     assert ran.code == 2
     assert "`name`" in ran.err
 
@@ -391,7 +391,7 @@ def test_a_table_of_other_columns_is_a_run_if_a_calibration_was_made_of_it(examp
     registry(path, "init")
     assert (
         "Add it together with a calibration"
-        in run("registry", "--database", path, "add", exported, code=2).err
+        in run("registry", "--registry", path, "add", exported, code=2).err
     )
     result = registry(path, "add", exported, tmp_path / "cal.json", tmp_path / "tool.toml")
     assert result["new"] == {"calibration": 1, "profile": 1, "run": 1}
@@ -418,16 +418,16 @@ def test_a_backup_is_a_registry_and_restores_one(filled, tmp_path):
 
 
 def test_the_registry_is_named_by_option_group_or_environment(filled, tmp_path, monkeypatch):
-    lists = [run("registry", "--database", filled, "list").out]
-    lists.append(run("registry", "list", "--database", filled).out)
+    lists = [run("registry", "--registry", filled, "list").out]
+    lists.append(run("registry", "list", "--registry", filled).out)
     other = tmp_path / "other.sqlite"
-    run("registry", "init", "--database", other)
+    run("registry", "init", "--registry", other)
     monkeypatch.setenv("MWDCAL_REGISTRY", str(other))
-    lists.append(run("registry", "--database", filled, "list").out)
+    lists.append(run("registry", "--registry", filled, "list").out)
     assert len(set(lists)) == 1
     assert run("registry", "list").out != lists[0]
     monkeypatch.delenv("MWDCAL_REGISTRY")
-    assert "--database must name the registry" in refused(mwdcal("registry", "list"), 2)
+    assert "--registry must name the registry" in refused(mwdcal("registry", "list"), 2)
 
 
 def test_the_commands_work_on_postgresql_and_tell_no_password(
@@ -446,7 +446,7 @@ def test_the_commands_work_on_postgresql_and_tell_no_password(
     backup = registry(url, "backup", tmp_path / "b.sqlite")
     assert registry(tmp_path / "b.sqlite", "check", "--head", backup["head"])["sound"]
     secret = url.replace("://postgres", "://user:s3cret", 1)
-    ran = mwdcal("registry", "--database", secret, "list")
+    ran = mwdcal("registry", "--registry", secret, "list")
     assert ran.code == 2
     assert "s3cret" not in ran.out + ran.err + str(added)
 
@@ -462,7 +462,7 @@ def test_an_altered_registry_is_found_and_a_text_of_others_stays_a_text(filled, 
             "UPDATE records SET name = ? WHERE kind = 'profile'", ("\x1b[2J<b>x</b>",)
         )
     connection.close()
-    ran = mwdcal("registry", "--database", work, "check")
+    ran = mwdcal("registry", "--registry", work, "check")
     assert ran.code == 1
     assert ran.out.startswith("FAIL")
-    assert "\x1b" not in mwdcal("registry", "--database", work, "list", "--kind", "profile").out
+    assert "\x1b" not in mwdcal("registry", "--registry", work, "list", "--kind", "profile").out

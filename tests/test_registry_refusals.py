@@ -271,10 +271,10 @@ def test_no_command_prints_the_password_of_a_mistyped_url(url, tmp_path, monkeyp
     readings.write_text("ax,ay,az,mx,my,mz\n0,0,1,0,0,1\n")
     monkeypatch.chdir(tmp_path)
     for words in (
-        ("registry", "--database", url, "list"),
+        ("registry", "--registry", url, "list"),
         ("registry", url, "list"),
-        ("registry", "--database", "r.sqlite", "restore", url),
-        ("registry", "--database", "r.sqlite", "add", url),
+        ("registry", "--registry", "r.sqlite", "restore", url),
+        ("registry", "--registry", "r.sqlite", "add", url),
         ("apply", f"{url}#S", readings, "-o", "o.csv"),
         ("verify", f"{url}#S", readings),
         ("calibrate", url, "--tool", "servo", "-o", "o.json"),

@@ -66,7 +66,7 @@ def test_a_rotten_registry_never_replaces_a_good_backup(database, tmp_path):
         if night == 10:
             rot(database)
             good = file.read_bytes()
-        ran = mwdcal("registry", "--database", database, "backup", file, "--json")
+        ran = mwdcal("registry", "--registry", database, "backup", file, "--json")
         if night < 10:
             heads.append(ran.json["head"])
             continue

@@ -153,7 +153,7 @@ def test_one_command_to_the_entry_in_a_registry(tmp_path, by):
     option = ("--registry", database) if by == "option" else ()
     assert "no such file" in refused(mwdcal(*line, *option), 2)
     assert not (tmp_path / "tool.json").exists()
-    assert mwdcal("registry", "--database", database, "init").code == 0
+    assert mwdcal("registry", "--registry", database, "init").code == 0
     ran = mwdcal(*line, *option)
     assert ran.code == 0, ran
     with library.registry(database) as tools:

@@ -79,7 +79,7 @@ class Stand:
             least, most = (0, 180) if name == ANGLES[0] else (-360, 360)
             if name not in ANGLES or not (least <= low <= high <= most and high - low <= 360):
                 raise InputError(
-                    f"`reach` must be of {', '.join(ANGLES)}, such as inclination=0:120, from the least setting to "
+                    f"`reach` must be of {', '.join(ANGLES)}, such as inclination_deg=0:120, from the least setting to "
                     f"the largest; got {name}={low:g}:{high:g}."
                 )
 

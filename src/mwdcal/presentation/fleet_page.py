@@ -40,7 +40,7 @@ from mwdcal.presentation.fleet_figures import (
     nominal_unit,
     parameters_of,
 )
-from mwdcal.presentation.numbers import capital, number, uncertainty, unit
+from mwdcal.presentation.numbers import UNDETERMINED, capital, number, uncertainty, unit
 from mwdcal.presentation.page import banner, rendered
 from mwdcal.presentation.text import plural
 
@@ -83,6 +83,7 @@ REMARKED = {
     "settings-apart": "stations of one direction scatter as if the stand had been set anew at each",
     "field-drift": "the field drifted during the run: fit and uncertainty include it",
     "drift": "offsets of the {triad} drifted during the run: fit and uncertainty include it",
+    "column-explains": "the drift goes with a column that is not used",
     "no-redundancy": "nothing in the run checks the fit",
     "few-degrees-of-freedom": "the residuals are too few to know the uncertainties better than to a quarter",
     "hemisphere": "the dip is negative: a southern site, or a magnetometer with reversed signs",
@@ -283,7 +284,7 @@ class Fleet:
     def _shown(self, angle: str, tool: int) -> str:
         """The accuracy of one tool."""
         free = bool(self._free[angle][tool])
-        return uncertainty(None if free else float(self._sd[angle][tool]))
+        return UNDETERMINED if free else number(float(self._sd[angle][tool]), 2)
 
     @property
     def titles(self) -> list[str]:

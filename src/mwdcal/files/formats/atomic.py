@@ -32,7 +32,7 @@ SQLITE = b"SQLite format 3\0"
 _WRITTEN_AHEAD = 18, 2
 """Where such a file says so, and how, if it is shared: a registry in use, and no backup of one."""
 _PATTERN = ".mwdcal-*.tmp"
-_DAY = 86_400.0
+_DAY_SECONDS = 86_400.0
 """Seconds after which a file of another machine counts as left behind: its locks may not reach here."""
 _RENAME_SECONDS = 5.0
 """Seconds after which a file that is not open counts as left behind on Windows: its writer may yet rename it."""
@@ -279,7 +279,7 @@ def _remove_if_left(path: Path) -> None:
     near = path.name.startswith(f".mwdcal-{_machine()}-")
     with path.open("rb+") as stream:
         fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if near or age > _DAY:
+        if near or age > _DAY_SECONDS:
             path.unlink()
 
 
