@@ -25,8 +25,8 @@ from mwdcal.drift.change import CHANGE_LEVEL, Contrasts, change_test
 from mwdcal.drift.walk import (
     FIELD_DIRECTIONS,
     History,
-    factored,
     common_noise_scale,
+    factored,
     parameter_names,
     precision,
 )
