@@ -234,6 +234,7 @@ def test_json_of_apply_holds_the_numbers_of_the_text(tmp_path, files):
     said, told = mwdcal(*arguments), mwdcal(*arguments, "--json").json
     assert said.out == (
         f"{told['rows']} rows corrected   wrote {told['output']}   unsigned calibration\n"
+        f"1σ: {', '.join(told['error_terms'])}. Not in it: {', '.join(told['not_included'])}.\n"
     )
     assert said.err == "".join(f"! {f['text']}\n" for f in told["findings"])
 

@@ -250,7 +250,10 @@ def test_options_of_surveys_are_those_of_the_command(folder, tmp_path):
     [
         ({"reference": {}}, "`reference` must be that of a place, or its file; got dict"),
         ({"switch": 4}, "`switch` must be 2 finite numbers; got 4"),
-        ({"tie_in": (1, 2)}, "`tie_in` must be 3 finite numbers"),
+        ({"tie_in": (1, 2)}, "north, east and TVD; got 2 numbers"),
+        ({"tie_in": (1, 2, float("nan"))}, "`tie_in` must be 3 finite numbers"),
+        ({"tie_in": (100, 200, 0, 1, 2, 3)}, "an inclination of 0 to 180°; got 100 and 200"),
+        ({"section_azimuth": 400}, "`section_azimuth` must be an azimuth"),
         ({"outside": "drop"}, "`outside` must be one of blank, refuse, extrapolate; got 'drop'"),
         ({"limits": "strict"}, "strict"),
         ({"sensor_drift": "owsg"}, "`sensor_drift` goes with `msa`"),
