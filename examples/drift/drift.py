@@ -92,7 +92,9 @@ def histories(setting: Setting, part: int, tools: int = AT_ONCE) -> Iterator[His
     names = parameter_names(dict.fromkeys(TRIADS, 0))
     for each in zip(*(zip(*row, strict=True) for row in rows), strict=True):
         values, covariance, factors, degrees = (np.stack(c) for c in zip(*each, strict=True))
-        ratio, freedom, one = (p.mT.repeat(12, -1) for p in common_noise_scale(factors.mT, degrees.mT))
+        ratio, freedom, one = (
+            p.mT.repeat(12, -1) for p in common_noise_scale(factors.mT, degrees.mT)
+        )
         covariance = covariance * outer(np.sqrt(ratio))
         known = np.stack([precision(matrix, np.zeros((0, 24))) for matrix in covariance])
         yield History(names, values, covariance, known, freedom, one, times)

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 from mwdcal.errors import InputError
 from mwdcal.files.formats.columns import shown
+from mwdcal.files.formats.titles import UNITS_BY_SIGN
 from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, UNCERTAINTIES
 from mwdcal.geometry.units import STANDARD_GRAVITY
 
@@ -332,15 +333,8 @@ def _words(name: str) -> list[str]:
     """The words of a name in lower case, its units spelled without signs."""
     text = unicodedata.normalize("NFKC", name.replace("º", "°"))
     text = re.sub(r"m\s*/\s*s\s*(\^\s*)?2|ms-2", " mss ", text)
-    for sign, word in (
-        ("°", " deg "),
-        ("μ", "u"),
-        ("µ", "u"),
-        ("мкТл", " ut "),
-        ("нТл", " nt "),
-        ("мВ", " mv "),
-    ):
-        text = text.replace(sign, word)
+    for sign, word in UNITS_BY_SIGN.items():
+        text = text.replace(sign, word if len(word) == 1 else f" {word} ")
     for cased, word in _CASED.items():
         text = re.sub(rf"(?<![A-Za-z]){cased}(?![A-Za-z])", word, text)
     return [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", text)]

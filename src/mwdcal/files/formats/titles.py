@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 from mwdcal.files.formats.columns import as_text
 
+UNITS_BY_SIGN = {"°": "deg", "μ": "u", "µ": "u", "мкТл": "ut", "нТл": "nt", "мВ": "mv"}
+"""Spellings of units in letters, by their signs and by other alphabets."""
 _TITLE_WORDS = {
     "serial": "serial sn s/n serialno serialnumber toolsn tools/n toolserial toolserialno toolserialnumber toolno "
     "toolid probesn probeno 仪器号 探管号 sondesn sensorsn seriennummer "
