@@ -72,6 +72,7 @@ SCREENS = {
     "registry-backup": ("registry", "backup", "made.sqlite", *REGISTRY),
     "registry-restore": ("registry", "restore", "unchanged.sqlite", *NEW_REGISTRY),
     "registry-upgrade": ("registry", "upgrade", *REGISTRY),
+    "init": ("init", "laboratory", "--defaults"),
     "list": ("list", "limits"),
     "simulate": ("simulate", "--plan", "six-state", "--effects", "stand.toml", "-o", "made.csv"),
     "simulate-repeat": ("simulate", "--plan", "six-state", "--repeat", "20", "--limits", "tight.toml",
@@ -195,6 +196,8 @@ def registry(folder):
 def undone(folder):
     """Take back what a command has left: its output, a new folder or registry, and what the registry was given."""
     shutil.rmtree(folder / "new", ignore_errors=True)
+    (folder / "laboratory").mkdir(exist_ok=True)
+    (folder / "laboratory" / "mwdcal.toml").unlink(missing_ok=True)
     for left in (*folder.glob("new.sqlite*"), *folder.glob("made.*")):
         left.unlink()
     with suppress(FileNotFoundError):
