@@ -162,7 +162,7 @@ def test_parts_without_a_checksum_are_not_used(tmp_path, small_parts):
 
 def test_the_seal_of_a_part_is_its_length_and_checksum():
     content = bytes(range(256)) * 9
-    whole = kept.sealed(content, "a")
+    whole = kept.with_checksum(content, "a")
     assert bytes(kept.unsealed(whole, "a")) == content
     assert kept.unsealed(whole, "b") is None
     rng = random.Random(3)
