@@ -58,6 +58,7 @@ SAMPLES = {
     "runs": "fleet",
     "tool": "profile",
     "limits": "limits",
+    "error_model": "model",
     "sensor_drift": "limits",
     "prior": "calibration",
     "effects": "effects",
@@ -86,6 +87,28 @@ OUTPUTS = ("output", "report", "plot", "folder", "calibrations", "truth", "html"
 LIMITS = 'name = "lab"\n[spread]\ninclination_deg = 0.2\nazimuth_deg = 1.5\n'
 SURVEY_LIMITS = (
     'name = "lab"\nprobability = 0.9973\nfield_nt = 900.0\n[sensor]\nmagnetometer_bias_nt = 70.0\n'
+)
+ERROR_MODEL = json.dumps(
+    {
+        "metadata": {"short_name": "lab"},
+        "parameters": {"XCLTortuosity": 0.0006},
+        "terms": [
+            {
+                "name": "AMIL",
+                "value": 220.0,
+                "units": "nT",
+                "propagation_mode": "Systematic",
+                "azimuth_formula": "Sin(Inc) * Sin(AzM) / (BField * Cos(Dip))",
+            },
+            {
+                "name": "XYM3E",
+                "value": 0.3,
+                "units": "deg",
+                "propagation_mode": "Random",
+                "inclination_formula": "Abs(Cos(Inc)) * Max(1, Sqr(10 / (MD - MDPrev)))",
+            },
+        ],
+    }
 )
 PLAN = 'name = "lab"\ntemperature_c = [25, 60]\n[[stations]]\ninclination_deg = [5, 60, 120]\ntoolface_deg = [0, 90]\n'
 EFFECTS = "[accelerometer]\nturn_on = 2e-4\n[stand]\ntilt_deg = 0.1\n[earth]\nvariation_nt = 20.0\n"
@@ -183,6 +206,7 @@ def samples(folder: Path) -> dict[str, list[Any]]:
         "profile": [(EXAMPLE / "tool.toml").read_text("utf-8")],
         "limits": [LIMITS, SURVEY_LIMITS],
         "reference": [place.out],
+        "model": [ERROR_MODEL],
         **signed(folder, calibrations[0]),
         "effects": [EFFECTS],
         "verification": tests,
@@ -703,6 +727,7 @@ WORDS = {
     "decimal": (".", ".", ".", ",", ";"),
     "columns": ("time_s,ax,ay,az,mx,my,mz", "ax,ay,az", "ax,ax,ax", ","),
     "limits": ("moosavi", "moradi", "x"),
+    "error_model": ("owsg-mwd", "none", "x"),
     "tool": (*("servo",) * 12, "generic", "sap6", "x"),
     "prior": ("datasheet",),
     "plan": ("six-state", "moosavi-12", "roll-test", "x"),

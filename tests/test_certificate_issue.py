@@ -102,7 +102,7 @@ def test_without_a_test_it_says_that_conformity_was_not_tested(here):
 def test_numbers_on_the_screen_have_two_digits_of_their_uncertainty(here):
     lines = mwdcal("certificate", "new.json", "--verification", "left.json", *DATES).out.splitlines()  # fmt: skip
     (line,) = (line for line in lines if line.startswith("spread of inclination"))
-    assert line.split()[3:6] == ["0.021°", "0.025°", "0.1°"]
+    assert line.split()[4:7] == ["0.021°", "0.025°", "0.1°"]
     (line,) = (line for line in lines if line.startswith("expanded uncertainty"))
     assert line.split()[2:] == ["0.0046°", "0.0091°", "0.030°"]
 

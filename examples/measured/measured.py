@@ -21,14 +21,13 @@ import numpy as np
 
 from mwdcal import Calibration, Options, Profile, Readings
 from mwdcal.app.commands import calibrate as command
-from mwdcal.app.commands.options import Typed
-from mwdcal.app.inputs import options_of
 from mwdcal.calibration.automatic.auto import Choice, choose
 from mwdcal.calibration.automatic.nonlinearity import ODDS, choices_of, declared, log_odds
 from mwdcal.calibration.calibrate import recorded
 from mwdcal.calibration.estimate import Fit, fit
+from mwdcal.calibration.fit_options import FitArguments
 from mwdcal.calibration.methods import EVIDENCE
-from mwdcal.calibration.options import USUAL
+from mwdcal.calibration.options import USUAL, options_of
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.errors import MwdcalError
 from mwdcal.estimation.rank import free_directions
@@ -105,10 +104,10 @@ def ways(curved: str) -> list[str]:
     return joint + others
 
 
-def typed(words: str) -> Typed:
+def typed(words: str) -> FitArguments:
     """The options that the command line makes of these words."""
     context = command.command.make_context("calibrate", ["-", "-o", "-", *words.split()])
-    return Typed(**{name: context.params[name] for name in Typed.__annotations__})
+    return FitArguments(**{name: context.params[name] for name in FitArguments.__annotations__})
 
 
 @cache
