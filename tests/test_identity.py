@@ -295,6 +295,33 @@ def test_serials_of_the_header_of_a_log_keep_their_spelling(tmp_path, serial):
     assert tables.read(tmp_path / "log.las").metadata["serial"] == serial
 
 
+@pytest.mark.parametrize(
+    ("cells", "serial"), [([7.0] * 48, "7"), ([12.1] * 48, None), (["12.10"] * 48, "12.10")]
+)
+def test_serials_of_a_parquet_file_that_are_numbers_with_decimals_are_refused(
+    tmp_path, cells, serial
+):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    table = tables.read(EXAMPLE / "run.csv")
+    numbers = {name: tables.numbers(table, name) for name in table.columns if name != "station"}
+    arrow = pytest.importorskip("pyarrow").table({**numbers, "serial": cells})
+    parquet.write_table(arrow, tmp_path / "run.parquet")
+    ran = command(
+        "calibrate",
+        tmp_path / "run.parquet",
+        "--tool",
+        EXAMPLE / "tool.toml",
+        "-o",
+        tmp_path / "c.json",
+        "--json",
+    )
+    if serial is None:
+        assert ran.code == 2
+        assert "whose spelling is lost" in ran.err
+    else:
+        assert ran.json["serial"] == serial
+
+
 @pytest.mark.parametrize("way", ["columns", "pandas", "pyarrow"])
 @pytest.mark.parametrize(
     ("cells", "serial"), [([7.0, 7.0], "7"), ([7, 7], "7"), ([12.1, 12.1], None)]

@@ -271,7 +271,6 @@ def check_run(table: Table) -> None:
     names = list(table.columns)
     check_columns(names, table.source)
     synonyms.check_evidence(names, table.source)
-    _check_serials(table)
     tools = serials(table.metadata, labels(table, "serial"))
     if len(tools) > 1:
         raise InputError(
@@ -324,6 +323,7 @@ def to_readings(
     Azimuths are taken as magnetic unless the metadata `azimuth_reference` says otherwise,
     also where the metadata state a declination. Fingerprints of the stations only where they are to be `recognised`.
     """
+    _check_serials(table)
     check_columns(list(table.columns), table.source)
     cells = columns_of(table)
     refuse(table, faults(cells, np.array([0, table.count]), profile))

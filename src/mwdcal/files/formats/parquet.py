@@ -197,13 +197,16 @@ def is_index(name: str) -> bool:
 
 
 def as_column(name: str, cells: Any, arrow: Any) -> Column:
-    """A column as floats (blank: NaN) where it is numeric, else as text; so long whole numbers."""
+    """A column as floats (blank: NaN) where it is numeric, else as text; so labels and long whole numbers.
+
+    Serials that are numbers with decimals stay numbers: their spelling is lost.
+    """
     if arrow.types.is_dictionary(cells.type):
         cells = cells.cast(cells.type.value_type)
     types, kind = arrow.types, cells.type
     numeric = types.is_floating(kind) or types.is_decimal(kind)
     whole = types.is_integer(kind) and not _is_code(cells)
-    if name in LABELS or not (numeric or whole):
+    if (name in LABELS and not (name == "serial" and numeric)) or not (numeric or whole):
         return texts(cells, arrow)
     return np.array(cells.cast(arrow.float64(), safe=False).to_numpy(), float)
 
