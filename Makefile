@@ -121,8 +121,9 @@ bench: $(MEASURED) ## time mwdcal against SciPy and other packages, write docs/b
 	@$(CLOCK); $(ONE_THREAD) PYTHONPATH=tests $(BENCH)/python benchmarks/bench.py \
 		$(if $(QUICK),--quick --output build/benchmarks)
 
-bench-guard: $(INSTALLED) ## compare the speed of what users wait for with a reference and the last release (KEEP=1: store it)
-	@$(CLOCK); $(ONE_THREAD) PYTHONPATH=benchmarks $(BIN)/python benchmarks/guard.py $(if $(KEEP),--keep)
+bench-guard: $(INSTALLED) ## compare the speed of what users wait for with a reference and the last release (KEEP=1: store it; MOST=2: on another machine)
+	@$(CLOCK); $(ONE_THREAD) PYTHONPATH=benchmarks $(BIN)/python benchmarks/guard.py $(if $(KEEP),--keep) \
+		$(if $(MOST),--most $(MOST))
 
 measured: $(INSTALLED) ## calibrate the measured sets (MWDCAL_DATA) and rewrite docs/measured.md
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python examples/measured/measured.py

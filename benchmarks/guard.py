@@ -41,7 +41,7 @@ from mwdcal.app import cli
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "servo"
 STORED = Path(__file__).with_name("guard.json")
 LOST = 4 / 3
-"""A path has lost if its ratio is this many times the stored one…"""
+"""A path has lost if its ratio is more than this many times the stored one…"""
 TRIES = 4
 """…in each of so many tries."""
 SECONDS = 2.0
@@ -96,11 +96,11 @@ def _turn(guarded: Guarded) -> tuple[float, float]:
     return processor_seconds(guarded.ours), processor_seconds(guarded.theirs)
 
 
-def judged(guarded: Guarded, stored: float, tries: int) -> float:
-    """The ratio; measured again while it looks lost."""
+def judged(guarded: Guarded, most: float, tries: int) -> float:
+    """The ratio; measured again while it is above the most that counts as kept."""
     found = ratio(guarded)
     for _ in range(tries - 1):
-        if found <= LOST * stored:
+        if found <= most:
             break
         found = min(found, ratio(guarded))
     return float(f"{found:.3g}")
@@ -273,6 +273,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("word", nargs="?", default="", help="only paths with this word")
     parser.add_argument("--keep", action="store_true", help="store the ratios that are measured")
+    parser.add_argument(
+        "--most", type=float, default=LOST, help="largest share of a stored ratio (default: a third more)"
+    )
     asked = parser.parse_args()
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else every process compiles everything anew
     stored: dict[str, float] = json.loads(STORED.read_text()) if STORED.exists() else {}
@@ -285,16 +288,16 @@ def main() -> None:
             if asked.word not in guarded.name:
                 continue
             before = stored.get(guarded.name)
-            found = judged(guarded, before or np.inf, 1 if asked.keep else TRIES)
+            found = judged(guarded, asked.most * (before or np.inf), 1 if asked.keep else TRIES)
             measured[guarded.name] = found
-            verdict = "new" if before is None else "LOST" if found > LOST * before else "ok"
+            verdict = "new" if before is None else "LOST" if found > asked.most * before else "ok"
             lost += [guarded.name] if verdict == "LOST" else []
             was = f"stored {before or 0:7.3g}  {verdict}"
             print(f"{guarded.name:32} {found:7.3g} x {guarded.beside:28} {was}", flush=True)
     if asked.keep:
         STORED.write_text(json.dumps({**stored, **measured}, indent=1) + "\n")
     elif lost:
-        sys.exit(f"more than a third slower than stored in {STORED.name}: {', '.join(lost)}")
+        sys.exit(f"over {asked.most:.2f} times the ratio stored in {STORED.name}: {', '.join(lost)}")
 
 
 if __name__ == "__main__":
