@@ -274,7 +274,10 @@ def main() -> None:
     parser.add_argument("word", nargs="?", default="", help="only paths with this word")
     parser.add_argument("--keep", action="store_true", help="store the ratios that are measured")
     parser.add_argument(
-        "--most", type=float, default=LOST, help="largest share of a stored ratio (default: a third more)"
+        "--most",
+        type=float,
+        default=LOST,
+        help="largest share of a stored ratio (default: a third more)",
     )
     asked = parser.parse_args()
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else every process compiles everything anew
@@ -297,7 +300,9 @@ def main() -> None:
     if asked.keep:
         STORED.write_text(json.dumps({**stored, **measured}, indent=1) + "\n")
     elif lost:
-        sys.exit(f"over {asked.most:.2f} times the ratio stored in {STORED.name}: {', '.join(lost)}")
+        sys.exit(
+            f"over {asked.most:.2f} times the ratio stored in {STORED.name}: {', '.join(lost)}"
+        )
 
 
 if __name__ == "__main__":

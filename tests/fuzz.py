@@ -1046,7 +1046,7 @@ def laboratory_case(r: random.Random, folder: Path) -> tuple[list[str], bool]:
 
 
 def calibrated_by(line: list[str], magnetic: bool, folder: Path) -> list[str]:
-    """What is broken by a calibration of a laboratory's table by the profile proposed for it."""
+    """Promises broken by a calibration of a laboratory's table by the profile proposed for it."""
     before, output = contents(folder), folder / "out-cal.json"
     following = ["calibrate", line[1], "--tool", line[3], "-o", str(output)]
     ran = cli_support.mwdcal(*following)

@@ -1,4 +1,4 @@
-"""What a user says of a run beside its table, and one table for run and roll test, into a registry."""
+"""Statements of a user about a run, and one table for run and roll test, into a registry."""
 
 import json
 

@@ -209,7 +209,7 @@ def _budget(fitted: FittedRuns) -> list[BudgetRow]:
 
 
 def _accuracies(fitted: FittedRuns, shares: dict[str, Array]) -> dict[str, dict[str, float | None]]:
-    """What each share (1, p, p) of the covariance adds to the accuracy to expect, degrees by angle."""
+    """The contribution of each share (1, p, p) of the covariance to the accuracy to expect, degrees by angle."""
     reference, prior = fitted.profile.reference_temperature_c, fitted.options.knowledge
     tools = results.calibrated_tools(fitted.result, fitted.free, reference, prior)
     sd = accuracy(tools, np.stack([*shares.values()]))
@@ -267,7 +267,7 @@ def _shown_drift(name: str, field_unit: str) -> tuple[float, str]:
 
 
 def _unseen(fitted: FittedRuns) -> list[UnseenDrift] | msgspec.UnsetType:
-    """What drifts would do that no residual would show."""
+    """The effect of drifts that no residual would show."""
     readings = fitted.alone(0)[0]
     field = 2e-4 if readings.relative else 10.0
     sizes = dict(zip(WALKS, (1e-4, field, field), strict=True))

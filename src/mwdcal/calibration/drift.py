@@ -100,7 +100,7 @@ def blindness(unseen: Sequence[UnseenDrift] | msgspec.UnsetType) -> str:
 
 
 def _added(unseen: UnseenDrift) -> str:
-    """What one drift would add, to the angles that it moves."""
+    """The contribution of one drift to the angles that it moves."""
     angles = ("inclination", "toolface", "azimuth")
     sizes = {name: getattr(unseen, f"{name}_deg") or 0.0 for name in angles}
     least = max(LEAST_ADDED, ADDED_SHARE * max(sizes.values()))

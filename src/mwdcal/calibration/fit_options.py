@@ -142,7 +142,7 @@ def stated_arguments(arguments: FitArguments) -> dict[str, Any]:
 
 
 def unusual(settings: FitSettings, wording: Literal["heading", "deviation"]) -> Iterator[str]:
-    """What a record states beyond method, model and order, in the words of a screen or of a certificate."""
+    """Settings of a record beyond method, model and order, in the words of a screen or of a certificate."""
     usual, between = type(settings)(), {"heading": " and ", "deviation": ", "}[wording]
     for name in settings.__struct_fields__:
         value = getattr(settings, name)

@@ -333,7 +333,7 @@ def _widened(freedom: Array) -> Array:
 
 
 def trend_effect(problem: Problem, state: State, analysis: Analysis, name: str) -> Array:
-    """What a trend of r = 1, g or nT, that is not in the fit does to the parameters (B, p, k): 1σ of each term."""
+    """The effect on the parameters (B, p, k) of a trend of r = 1, g or nT, that is not in the fit: 1σ of each term."""
     batch, old = len(state.params), len(problem.evidence.constants)
     walking, at = with_walks(problem, state, {name: np.tile([1.0, 0.0], (batch, 1))})
     sd = np.stack([constant.sd for constant in walking.evidence.constants[old:]], -1)

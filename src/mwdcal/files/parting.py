@@ -16,7 +16,7 @@ _ROLL_TEST = re.compile(
     r"поверка|контроль|验证|检验)[\s_-]*(run|shot|station|row|test|\d*)\W*",
     re.IGNORECASE,
 )
-"""What a laboratory calls the roll test, in a cell or as the name of a column."""
+"""Names of the roll test, in a cell or as the name of a column."""
 _YES = re.compile(r"(x|yes|y|ja|si|sí|sim|да|是|true|1|1\.0|✓|✔|√)", re.IGNORECASE)
 _NO = re.compile(r"(|no|n|nei|nein|não|нет|否|false|0|0\.0|-|–)", re.IGNORECASE)
 

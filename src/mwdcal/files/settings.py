@@ -1,4 +1,4 @@
-"""What a laboratory states once for all its commands, in `mwdcal.toml`, and what of it the running command has used."""
+"""Settings of a laboratory for all its commands, in `mwdcal.toml`, and those that the running command has used."""
 
 from __future__ import annotations
 

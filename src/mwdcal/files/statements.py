@@ -1,4 +1,4 @@
-"""What a user says of a run beside its table: serial, day, operator."""
+"""Statements of a user about a run beside its table: serial, day, operator."""
 
 from __future__ import annotations
 

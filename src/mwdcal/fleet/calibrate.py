@@ -248,7 +248,7 @@ class _Batch:
             self.outcome.numbers[name][tools[good]] = values
 
     def _note_records(self, tools: Ints, fitted: FittedRuns) -> None:
-        """What `mwdcal calibrate` writes for sound tools; of its time the day, so that another run gives the same."""
+        """Records of sound tools, as `mwdcal calibrate` writes them; of the time the day alone, so that runs repeat."""
         for place in np.flatnonzero(~self.repeated[tools].any(-1)).tolist():
             options, (readings, profile) = fitted.options, fitted.alone(place)
             with suppress(MwdcalError):  # of a tool that is sound by a hair in the batch alone

@@ -182,7 +182,7 @@ def _answered(
 
 
 class Questions(list[QuestionError]):
-    """What names and readings leave open, each with what answers it."""
+    """Open questions about names and readings, each with the option that answers it."""
 
     def ask(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """What a function returns; None where it has a question."""

@@ -168,7 +168,7 @@ class Judgement:
         return np.asarray((~np.isnan(self.departure)).any(-1))
 
     def findings(self, rows: slice = slice(None)) -> list[str]:
-        """What is wrong with each station of some rows; empty where nothing is."""
+        """The fault of each station of some rows; empty if it has none."""
         pairs = zip(self.judged[rows].tolist(), self.accepted[rows].tolist(), strict=True)
         return [
             "" if accepted else self._finding(i) if judged else "not judged: no reference"

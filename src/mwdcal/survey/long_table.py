@@ -110,7 +110,7 @@ class _Stations(NamedTuple):
 
 @dataclass
 class _PartsSeen:
-    """What was seen of the parts so far."""
+    """State after the parts so far."""
 
     before: Before
     first: Well | None = None
@@ -365,7 +365,7 @@ def _short(values: ArrayLike) -> Array:
 
 
 def _joined_claims(parts: list[Claim]) -> Claim:
-    """What the parts of a table claim, together."""
+    """The claims of all parts of a table together."""
     values, sd = (np.concatenate([np.asarray(p[i]) for p in parts]) for i in (1, 2))
     return Claim(parts[0].source, values, sd)
 

@@ -124,7 +124,7 @@ def judged_constants(calibration: Calibration, readings: Readings) -> tuple[str,
 
 
 def claim(source: str, readings: Readings, name: str) -> Claim:
-    """What a table claims of gravity, field or dip."""
+    """The claim of a table about gravity, field or dip."""
     factor = REFERENCES[name].factor
     return Claim(source, _stated(readings, name) / factor, readings.uncertainty(name) / factor)
 

@@ -91,7 +91,7 @@ class Position:
 
 @dataclass(frozen=True)
 class Before:
-    """What stations leave to those that follow them.
+    """State that stations pass on to those that follow them.
 
     `magnetic`: the toolface counts from magnetic north. `path`: where the path has come to, at first where it starts.
     `inaccurate`: no accuracy is stated of positions any more.
@@ -227,7 +227,7 @@ class Well:
         return np.asarray(lacking & np.array([True, not self.calibration.relative, True]))
 
     def remarks(self, rows: slice = slice(None)) -> list[str]:
-        """What is wrong with each station of some rows."""
+        """The fault of each station of some rows."""
         remarks = zip(
             self.judgement.findings(rows), self.blank[rows].tolist(), self.unstated[rows].tolist(),
             strict=True,

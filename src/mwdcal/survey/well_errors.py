@@ -87,7 +87,7 @@ class WellErrors:
 
     @property
     def included(self) -> list[str]:
-        """What the standard uncertainties hold of it, by the names of `interference.error_terms`."""
+        """Parts of it that are in the standard uncertainties, by the names of `use.uncertainty.error_terms`."""
         names = [AXIAL_INTERFERENCE] if self.sensors.axial_interference_nt else []
         names += [DRIFT] if self.sensors.magnetometer_bias_nt else []
         starts = [term.name for term in self.model.terms]
@@ -135,7 +135,7 @@ def _with_depth(shifts: Array) -> Array:
 
 
 def well_errors(model: ErrorModel, calibration: Calibration, readings: Readings) -> WellErrors:
-    """What an error model adds to surveys by a calibration.
+    """The errors that an error model adds to surveys by a calibration.
 
     Where multi-station analysis has taken interference off, its covariance holds what is left of it, and the drift that
     it was told to allow for: neither is added.

@@ -166,7 +166,7 @@ def unsteady(scatter: Mapping[str, Scatter]) -> str:
 
 
 def odd_rows(scatter: Mapping[str, Scatter]) -> str:
-    """What is odd at single rows, and how far; empty where nothing is, or where all rows scatter."""
+    """Quantities that are odd at single rows, and how far; empty if none is, or if all rows scatter."""
     words = []
     for name, each in scatter.items():
         if each.odd and 2 * each.scattered <= each.windows:

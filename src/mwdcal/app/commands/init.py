@@ -18,7 +18,7 @@ STAND_UNCERTAINTIES = tuple(
     for kind in ("", "repeatability_")
     for angle in ("inclination", "azimuth", "toolface")
 )
-"""What `--stand` takes."""
+"""Values of `--stand`."""
 
 
 class SettingsQuestion(NamedTuple):

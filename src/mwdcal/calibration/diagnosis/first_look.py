@@ -118,7 +118,7 @@ class _Drifts:
 
 @lru_cache(maxsize=8)
 def _common(design: Alike) -> dict[str, dict[int, CommonColumns]]:
-    """What each effect does to the readings of the triads, by its name; nothing where it is each tool's own."""
+    """The change of the readings of the triads by each effect, by name; nothing if it differs from tool to tool."""
     one, state = perfect(design)
     terms = [sensor_terms(one, state, index) for index in range(len(one.triads))]
     columns: dict[str, dict[int, CommonColumns]] = {}
@@ -135,7 +135,7 @@ def _common(design: Alike) -> dict[str, dict[int, CommonColumns]]:
 
 @lru_cache(maxsize=8)
 def _across(design: Alike) -> dict[str, dict[int, Array]]:
-    """What each effect has in common with the drifts that are in the fit of a design."""
+    """The part of each effect that the drifts in the fit of a design can explain."""
     drifts = closed_form_drift.walk_columns(design) if design.problem.walks else {}
     return {
         name: {i: c.across(drifts[i][1]) for i, c in columns.items() if i in drifts}

@@ -279,7 +279,7 @@ class _Linear:
         return step[..., 0], self.angle_sd * self._back(along), np.sum(step * pull, (1, 2))
 
     def after(self, step: Array) -> Array:
-        """What a step (B, 24) leaves of the readings (B, 6, n)."""
+        """Readings (B, 6, n) less those explained by a step (B, 24)."""
         return np.asarray(self.left - (step.reshape(-1, 6, 1, 4) @ self.rows)[:, :, 0])
 
     def _back(self, along: Array) -> Array:
