@@ -243,6 +243,7 @@ ALIKE = {
     "a field more": lambda d: d.replace(b'"number"', b'"a": 1,\n  "number"'),
     "another time": lambda d: d.replace(b'"time": "2', b'"time": "3'),
     "another algorithm": lambda d: d.replace(b"Ed25519", b"Ed448"),
+    "a signature beyond ASCII": lambda d: d.replace(b'"value": "', '"value": "ü'.encode()),
     "a field in the signature": lambda d: d.replace(b'"algorithm"', b'"a": 1,\n    "algorithm"'),
     "NaN": lambda d: d.replace(b" 0.1\n", b" NaN\n"),
     "too large a number": lambda d: d.replace(b" 0.1\n", b" 1e999\n"),

@@ -283,7 +283,7 @@ def _size(whole: Estimate) -> InterferenceSize:
         axial_nt=axial,
         sd_axial_nt=sd_axial,
         cross_axial_nt=across,
-        sd_cross_axial_nt=float(np.sqrt(along @ spread[:2, :2] @ along)),
+        sd_cross_axial_nt=float(np.sqrt(max(along @ spread[:2, :2] @ along, 0.0))),
         cross_axial_x_nt=x,
         sd_cross_axial_x_nt=sd_x,
         cross_axial_y_nt=y,

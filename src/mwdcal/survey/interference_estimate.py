@@ -128,7 +128,7 @@ class Estimate:
     def sd(self) -> Array:
         """1σ (B, d) of each direction: where interference is not separable, the cautious one."""
         spread = np.where(self.separable[:, None, None], self.spread, self.cautious_spread)
-        return np.asarray(np.sqrt(diagonal(spread)))
+        return np.asarray(np.sqrt(np.maximum(diagonal(spread), 0.0)))
 
     @property
     def determined(self) -> Array:
@@ -303,7 +303,9 @@ def _azimuth_sd(result: Fit, covariance: Array) -> Array:
     by_params = triad.model.jacobian(state.params[:, where], triad.raw, problem.temperature)
     moved = np.einsum("bni,bnip->bnp", gradient, by_params)
     return np.asarray(
-        np.sqrt(np.einsum("bnp,bpq,bnq->bn", moved, covariance[:, where, where], moved))
+        np.sqrt(
+            np.maximum(np.einsum("bnp,bpq,bnq->bn", moved, covariance[:, where, where], moved), 0.0)
+        )
     )
 
 
