@@ -1,4 +1,4 @@
-"""SHA-256, by which files and documents are told apart."""
+"""SHA-256 of files and documents."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ def join(batches: Sequence[_T]) -> _T:
 
 
 def kind_of(batch: Any) -> Any:
-    """What batches have in common that can be joined: all that is not an array, and the shapes of members."""
+    """The common part of batches to be joined: all that is not an array, and the shapes of members."""
     if isinstance(batch, np.ndarray):
         return batch.shape[1:]
     if isinstance(batch, Mapping):

@@ -46,7 +46,7 @@ _PIECE = 16_000_000
 _LONGEST_ROW = 1_000_000
 _TYPED = (".parquet", ".xlsx", *tables.EXCHANGED)
 _ODD = ("nan", "inf", '"', "\r")
-"""What plain numbers do not have, in lower case."""
+"""Letters and signs that no plain number has, in lower case."""
 _CLOCK = re.compile(r"\d{4}-\d{1,2}-\d{1,2}|\d{1,2}:\d{2}|\d{1,2}[./]\d{1,2}[./]\d{4}")
 _BINARY = bytes([*range(0x09), *range(0x0E, 0x20)])
 _LONG_LOG = 100_000_000

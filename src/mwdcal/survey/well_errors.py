@@ -15,6 +15,7 @@ from datetime import date
 
 import numpy as np
 
+from mwdcal.calibration.automatic.ageing import JULIAN_YEAR
 from mwdcal.calibration.readings import Readings, stated_day
 from mwdcal.calibration.record import Calibration
 from mwdcal.geometry.observables import OBSERVABLES
@@ -31,7 +32,6 @@ DRIFT_YEARS = 1.0
 _SENSORS = ("AB", "AS", "MB", "MS")
 _DECLINATION_TERMS = ("DEC", "DBH")
 _INTERFERENCE = "AMIL"
-DAYS_OF_YEAR = 365.25
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ def _years(calibrated: date | None, surveyed: date | None) -> float | None:
     """Time from one day to a later one; None where one is not stated, or the survey is the earlier one."""
     if calibrated is None or surveyed is None or surveyed < calibrated:
         return None
-    return (surveyed - calibrated).days / DAYS_OF_YEAR
+    return (surveyed - calibrated).days / JULIAN_YEAR
 
 
 def hole_of(

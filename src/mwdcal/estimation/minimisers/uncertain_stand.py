@@ -116,7 +116,7 @@ def _first_noise(problem: Problem, minima: Sequence[AffineMinimum]) -> Array:
 
 @dataclass(frozen=True)
 class _Stand:
-    """What stays as it is: angles and their σ (B, 3, n), strengths (B, n), readings and their noise (B, 6, n)."""
+    """Constants of the iteration: angles and σ (B, 3, n), strengths (B, n), readings and noise (B, 6, n)."""
 
     angles: Array
     angle_sd: Array
