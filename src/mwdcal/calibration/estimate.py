@@ -27,6 +27,7 @@ from mwdcal.estimation.uncertainty import (
     LEAST_SCATTER,
     Analysis,
     analyse,
+    completed,
     determined_apart,
     per_freedom,
     sandwich,
@@ -176,7 +177,11 @@ def fit(readings: Readings, options: Options | None = None, include: Array | Non
     if good.all():
         return closed
     rest = np.flatnonzero(~good)
-    return put(closed, rest, _general(take(problem, rest), options, finite[rest]))
+    other = _general(take(problem, rest), options, finite[rest])
+    if closed.analysis.squares is not None:
+        analysis = completed(other.problem, other.state, other.analysis)
+        other = replace(other, analysis=analysis)
+    return put(closed, rest, other)
 
 
 def scatters(readings: Readings, options: Options) -> bool:
@@ -287,9 +292,8 @@ def _on_stand(problem: Problem, finite: Bools) -> tuple[Fit, Bools]:
     """The fit on a stand of known angles, and for which members (B,) it holds: all directions are determined."""
     there = uncertain_stand.solution(problem)
     problem = _rescaled(problem, there.scale)
-    analysis = analyse(problem, there.state, there.determined)
+    analysis = uncertain_stand.analysed(problem, there.state, there.determined)
     good = there.good & finite & analysis.finite
-    problem.memo.clear()
     status = np.where(good, int(Status.OK), int(Status.NOT_FINITE))
     trust = np.ones(problem.evidence.include.shape)
     return Fit(problem, there.state, status, there.steps, _noise(problem), trust, analysis), good

@@ -27,8 +27,12 @@ from mwdcal.estimation import drift
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.problem import WALK_AXES
 from mwdcal.estimation.rank import Free
-from mwdcal.estimation.solvers import Linear
-from mwdcal.estimation.uncertainty import marginal_rank
+from mwdcal.estimation.uncertainty import (
+    marginal_rank,
+    moved_by_readings,
+    of_stand,
+    sum_of_squares,
+)
 from mwdcal.geometry.vectors import Array, Bools, diagonal, outer
 from mwdcal.sensor.models import Whole
 
@@ -238,16 +242,8 @@ def _scaled(result: Fit, covariance: Array) -> Array:
 
 
 def _of_lone_settings(result: Fit) -> Array:
-    """Covariance (B, p, p) from errors of angles that the stand sets at every station, before scaling.
-
-    A station's reading has the covariance C = I + GGᵀ in units of its noise, the columns of G being
-    what its unknowns do; those of known angles are meant here.
-    """
-    problem = result.problem
-    if not any(problem.evidence.sd[n].any() for n in ("inclination", "azimuth", "toolface")):
-        return np.zeros_like(result.analysis.covariance)
-    linear = problem.linear(result.state)
-    return _sum_of_squares(_moved(result, linear) @ linear.private)
+    """Covariance (B, p, p) from errors of angles that the stand sets at every station, before scaling."""
+    return of_stand(result.problem, result.state, result.analysis)
 
 
 def _of_repeatability(result: Fit, repeatability: Sequence[float]) -> Array:
@@ -262,23 +258,8 @@ def _of_repeatability(result: Fit, repeatability: Sequence[float]) -> Array:
         known[:, None, None] * sd / triad.sd
         for known, sd, triad in zip(declared.mT, repeatability, result.problem.triads, strict=False)
     ]
-    moved = _moved(result, result.problem.linear(result.state))
-    return _sum_of_squares(moved * np.concatenate(shares, -1)[:, :, None])
-
-
-def _moved(result: Fit, linear: Linear) -> Array:
-    """How an error of a station's whitened reading moves the parameters (B, n, p, m)."""
-    analysis, p = result.analysis, linear.size
-    if analysis.influence is not None:
-        return np.asarray(analysis.influence[:, :, :p])
-    rows, information = linear.weighed[..., :-1].mT, linear.normal.information
-    cross = np.linalg.solve(information[:, p:, p:], information[:, p:, :p])
-    return analysis.covariance[:, None] @ (rows[:, :, :p] - cross.mT[:, None] @ rows[:, :, p:])
-
-
-def _sum_of_squares(effect: Array) -> Array:
-    """Covariance (B, p, p) of what independent errors of unit size do (B, n, p, a)."""
-    return np.asarray(np.einsum("bnia,bnja->bij", effect, effect, optimize=True))
+    moved = moved_by_readings(result.problem.linear(result.state), result.analysis)
+    return sum_of_squares(moved * np.concatenate(shares, -1)[:, :, None])
 
 
 @dataclass(frozen=True)

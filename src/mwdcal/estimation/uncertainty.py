@@ -75,6 +75,8 @@ class Analysis:
     `of_settings` (B, p, s) what one of each setting of the stand does.
     `influence` (B, n, u, m) is how an error of a station's whitened reading moves X's unknowns,
     where that is not as the likelihood has it.
+    Where it is known already: `squares` (B, t), the tr(S²) of `effective_freedom`, and `of_stand` (B, p, p), what the
+    angles that each station has for itself add to the covariance.
     """
 
     covariance: Array
@@ -87,6 +89,8 @@ class Analysis:
     effects: Array
     of_settings: Array
     influence: Array | None = None
+    squares: Array | None = None
+    of_stand: Array | None = None
 
     @property
     def finite(self) -> Bools:
@@ -114,12 +118,12 @@ def analyse(problem: Problem, state: State, determined: Determined | None = None
         residual,
         spread,
         whole[:, p : p + q, p : p + q],
-        _effects(problem, whole[:, :p, p : p + q]),
+        effects_of(problem, whole[:, :p, p : p + q]),
         whole[:, :p, settings:],
     )
 
 
-def _effects(problem: Problem, cross: Array) -> Array:
+def effects_of(problem: Problem, cross: Array) -> Array:
     """Effects (B, p, q) from the covariance (B, p, q) of parameters and constants."""
     constants = problem.evidence.constants
     each = [
@@ -297,6 +301,13 @@ def effective_freedom(problem: Problem, state: State, analysis: Analysis) -> Arr
     and s² scatters less than its `freedom` says. Reference: F. E. Satterthwaite, Biometrics
     Bulletin 2, 110 (1946).
     """
+    return scaled_freedom(analysis.freedom, _squares(problem, state, analysis))
+
+
+def _squares(problem: Problem, state: State, analysis: Analysis) -> Array:
+    """tr(S²) (B, t) of `effective_freedom`."""
+    if analysis.squares is not None:
+        return analysis.squares
     linear = problem.linear(state)
     whole = whole_covariance(linear, analysis.determined)
     weighed, count = linear.weighed[..., :-1], linear.residual.shape[-1]
@@ -309,8 +320,45 @@ def effective_freedom(problem: Problem, state: State, analysis: Analysis) -> Arr
         gram = np.einsum("bnip,bniq->bpq", rows, rows, optimize=True) @ whole
         twice = np.einsum("bpq,bqp->b", gram, gram)
         each.append(np.sum(block**2, (1, 2, 3)) - 2 * mixed.sum(-1) + twice)
-    squares = np.stack(each, -1)
-    return scaled_freedom(analysis.freedom, squares)
+    return np.stack(each, -1)
+
+
+def of_stand(problem: Problem, state: State, analysis: Analysis) -> Array:
+    """Covariance (B, p, p) from errors of angles that the stand sets at every station, before scaling.
+
+    A station's reading has the covariance C = I + GGᵀ in units of its noise, the columns of G being
+    what its unknowns do; those of known angles are meant here.
+    """
+    if analysis.of_stand is not None:
+        return analysis.of_stand
+    if not any(problem.evidence.sd[n].any() for n in ("inclination", "azimuth", "toolface")):
+        return np.zeros_like(analysis.covariance)
+    linear = problem.linear(state)
+    return sum_of_squares(moved_by_readings(linear, analysis) @ linear.private)
+
+
+def moved_by_readings(linear: Linear, analysis: Analysis) -> Array:
+    """How an error of a station's whitened reading moves the parameters (B, n, p, m)."""
+    p = linear.size
+    if analysis.influence is not None:
+        return np.asarray(analysis.influence[:, :, :p])
+    rows, information = linear.weighed[..., :-1].mT, linear.normal.information
+    cross = np.linalg.solve(information[:, p:, p:], information[:, p:, :p])
+    return analysis.covariance[:, None] @ (rows[:, :, :p] - cross.mT[:, None] @ rows[:, :, p:])
+
+
+def sum_of_squares(effect: Array) -> Array:
+    """Covariance (B, p, p) of what independent errors of unit size do (B, n, p, a)."""
+    return np.asarray(np.einsum("bnia,bnja->bij", effect, effect, optimize=True))
+
+
+def completed(problem: Problem, state: State, analysis: Analysis) -> Analysis:
+    """The analysis with all that can be known of it."""
+    return replace(
+        analysis,
+        squares=_squares(problem, state, analysis),
+        of_stand=of_stand(problem, state, analysis),
+    )
 
 
 def station_misfit(analysis: Analysis) -> tuple[Array, Array]:
