@@ -178,10 +178,7 @@ def fit(readings: Readings, options: Options | None = None, include: Array | Non
         return closed
     rest = np.flatnonzero(~good)
     other = _general(take(problem, rest), options, finite[rest])
-    if closed.analysis.squares is not None:
-        analysis = completed(other.problem, other.state, other.analysis)
-        other = replace(other, analysis=analysis)
-    return put(closed, rest, other)
+    return put(closed, rest, other if closed.analysis.squares is None else _completed(other))
 
 
 def scatters(readings: Readings, options: Options) -> bool:
@@ -240,16 +237,42 @@ def refitted(result: Fit, problem: Problem, state: State, scale: Array, options:
     """A fit of a problem that has more unknowns than that of `result`, the noise times `scale` (B, triads)."""
     problem = _rescaled(problem, scale)
     finite = result.status != int(Status.NOT_FINITE)
+    if result.analysis.squares is not None and uncertain_stand.applies(problem):
+        return _refined(result, problem, state, options)
     if form := _form(problem):
         there, analysis, good = form.solution(problem, state)
         if (good & analysis.determined.keep.all(-1)).all():
             once = result.iterations + 1
             trust, status = result.trust, np.where(finite, result.status, int(Status.NOT_FINITE))
             return Fit(problem, there, status, once, _noise(problem), trust, analysis)
+    return _refitted_anyhow(result, problem, state, options)
+
+
+def _refitted_anyhow(result: Fit, problem: Problem, state: State, options: Options) -> Fit:
+    """The same by the method's minimiser."""
+    finite = result.status != int(Status.NOT_FINITE)
     solved = solve(problem, state, options)
     known = result.analysis.determined
     stage = _Iterate(problem, solved, result.trust, solved.iterations, known)
     return _finished(stage, options, finite, result.iterations + solved.iterations)
+
+
+def _refined(result: Fit, problem: Problem, state: State, options: Options) -> Fit:
+    """The same on a stand of known angles; by the method's minimiser where not all directions are determined."""
+    there = uncertain_stand.refined(problem, state)
+    analysis = uncertain_stand.analysed(problem, there.state, there.determined)
+    good = there.good & analysis.finite & (result.status != int(Status.NOT_FINITE))
+    status, steps = np.where(good, int(Status.OK), int(Status.NOT_FINITE)), result.iterations + there.steps
+    whole = Fit(problem, there.state, status, steps, _noise(problem), result.trust, analysis)
+    if good.all():
+        return whole
+    rest = np.flatnonzero(~good)
+    return put(whole, rest, _completed(_refitted_anyhow(*take((result, problem, state), rest), options)))
+
+
+def _completed(result: Fit) -> Fit:
+    """The fit with all of its analysis."""
+    return replace(result, analysis=completed(result.problem, result.state, result.analysis))
 
 
 def _finished(stage: _Iterate, options: Options, finite: Bools, iterations: Ints) -> Fit:

@@ -19,7 +19,7 @@ from functools import partial
 import numpy as np
 
 from mwdcal.estimation.evidence import WALKS, Evidence, SharedConstant
-from mwdcal.estimation.minimisers import closed_form_drift
+from mwdcal.estimation.minimisers import closed_form_drift, uncertain_stand
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import Analysis, whole_covariance
 from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, eigen, finite, inverse, outer
@@ -56,6 +56,12 @@ def terms_of(count: int) -> tuple[Array, Array]:
 def families(problem: Problem) -> list[str]:
     """The walks that a run may show: of the offsets of each triad, and of the field."""
     return [*WALKS][: 1 if len(problem.triads) == 1 else len(WALKS)]
+
+
+def looked_for(problem: Problem) -> list[str]:
+    """Those of them that are not in the fit of a problem."""
+    present = places(problem.evidence)
+    return [name for name in families(problem) if name not in present]
 
 
 def acting(walks: Iterable[str]) -> dict[str, int]:
@@ -170,12 +176,14 @@ class WalkScores:
         )
 
 
-def walk_scores(problem: Problem, state: State, analysis: Analysis) -> WalkScores:
-    """Scores of the walks of a run that has none in its fit: what the fit's unknowns cannot take up.
+def walk_scores(
+    problem: Problem, state: State, analysis: Analysis, walks: Sequence[str] = ()
+) -> WalkScores:
+    """Scores of the walks, or of some, of a run that has none in its fit: what the fit's unknowns cannot take up.
 
     The problem may be of one member for the residuals (B, n, m) of many.
     """
-    walking, at, sd, each = _walking(problem, state)
+    walking, at, sd, each = _walking(problem, state, walks or looked_for(problem))
     old, residual, scale = len(problem.evidence.constants), analysis.residual, outer(sd)
     if not old and closed_form_drift.applies(walking):
         score = closed_form_drift.scores(walking, at, residual) * sd
@@ -183,6 +191,9 @@ def walk_scores(problem: Problem, state: State, analysis: Analysis) -> WalkScore
         return WalkScores(
             score, information() * scale, lambda: information(alone=True) * scale, each
         )
+    if not old and analysis.squares is not None and uncertain_stand.applies(walking):
+        score, whole, alone = uncertain_stand.walk_scores(problem, state, walking, at)
+        return WalkScores(score * sd, whole * scale, lambda: alone * scale, each)
     linear, base = problem.linear(state), _axes(problem, state, [*each])
     whole = whole_covariance(linear, analysis.determined)
     terms = terms_of(base.shape[1])[0][:, 1:]
@@ -217,17 +228,15 @@ def _by_term(values: Array, terms: Array) -> Array:
     return np.asarray(sums.swapaxes(-1, -2).reshape(*sums.shape[:-3], -1))
 
 
-def _walking(problem: Problem, state: State) -> tuple[Problem, State, Array, dict[str, Ints]]:
+def _walking(
+    problem: Problem, state: State, walks: Sequence[str]
+) -> tuple[Problem, State, Array, dict[str, Ints]]:
     """The problem with drifts that are not in its fit, r = s = 1 noise of a reading, and without their means.
 
     And the state for it, the standard deviations (B, k) of their terms, and the places of those of each drift.
     """
-    present, old = places(problem.evidence), problem.evidence.constants
-    sizes = {
-        name: np.stack([size, size], -1)
-        for name, size in noise(problem).items()
-        if name in families(problem) and name not in present
-    }
+    old = problem.evidence.constants
+    sizes = {n: np.stack([size, size], -1) for n, size in noise(problem).items() if n in walks}
     walking, at = with_walks(problem, state, sizes)
     kept: list[SharedConstant] = []
     columns = {}

@@ -53,9 +53,10 @@ def chances(result: Fit) -> tuple[Array, Bools]:
 
     The least of those of the walks that act on a triad, times their number; and whether a trend would not show (B, t).
     """
-    scores, analysis = _scores(result), result.analysis
+    analysis = result.analysis
     least, hidden = np.ones(analysis.freedom.shape), np.zeros(analysis.freedom.shape, bool)
-    for name, triad in drift.acting(scores.places).items():
+    for name, triad in drift.acting(drift.looked_for(result.problem)).items():
+        scores = _scores(result, name)
         scatter, rest = (x[:, triad] for x in (analysis.variance_factor, analysis.freedom))
         total, mean, square = scores.square(scores.places[name])
         ratio = np.where(square > 0, mean / np.where(square > 0, square, 1.0), 0.0)
@@ -66,13 +67,13 @@ def chances(result: Fit) -> tuple[Array, Bools]:
     return least, hidden
 
 
-def _scores(result: Fit) -> drift.WalkScores:
+def _scores(result: Fit, walk: str) -> drift.WalkScores:
     problem, analysis = result.problem, result.analysis
     if not (closed_form.applies(problem) and are_common(problem)):
-        return drift.walk_scores(problem, result.state, analysis)
+        return drift.walk_scores(problem, result.state, analysis, [walk])
     one, state = perfect(Alike.of(problem, result.state))
     nominal = replace(take(analysis, np.arange(1)), residual=analysis.residual)
-    return drift.walk_scores(one, state, nominal)
+    return drift.walk_scores(one, state, nominal, [walk])
 
 
 def drifting(result: Fit, options: Options) -> Bools:
@@ -170,10 +171,10 @@ def with_drift(result: Fit, options: Options, triads: Bools) -> Fit:
     """A fit with walks of estimated size that act on some triads (t,), from one without."""
     problem, (alone, _) = result.problem, _undisputed(result, options)
     declared, analysis = np.isnan(result.noise), alone.analysis
-    scores = drift.walk_scores(alone.problem, alone.state, analysis)
     known, noise = declared_sizes(problem.evidence), drift.noise(problem)
-    acting = drift.acting(scores.places).items()
-    scores = scores.of([name for name, triad in acting if triads[triad] or name in known])
+    acting = drift.acting(drift.looked_for(alone.problem)).items()
+    walks = [name for name, triad in acting if triads[triad] or name in known]
+    scores = drift.walk_scores(alone.problem, alone.state, analysis, walks)
     parts = [(known.get(n, np.zeros((1, 2)))[:, i], noise[n]) for n, i in scores.components()]
     least = np.stack([(size / one) ** 2 for size, one in parts], -1)
     theta, left = drift.walk_variances(

@@ -66,6 +66,11 @@ class StandColumns:
         first, second = (by_tool(f[:, None] * self.courses[:, None]) for f in self.terms)
         return first, second
 
+    @cached_property
+    def _courses(self) -> Array:
+        """Products (K K, n) of the courses."""
+        return (self.courses[:, None] * self.courses).reshape(-1, self.courses.shape[-1])
+
     def gram(self, inner: Array) -> Array:
         """Sums XᵀMX (B, u, u) for the symmetric M (6, 6, B, n) of each station."""
         count = self.weight.shape[1]
@@ -82,9 +87,7 @@ class StandColumns:
         if not self.axes.size:
             return of_params
         across = self.crossed(inner)
-        moved = np.einsum("ij...,ja...->ia...", inner, self.axes)
-        own = self.own(np.einsum("ia...,ib...->ab...", self.axes, moved))
-        return np.block([[of_params, across], [across.mT, own]])
+        return np.block([[of_params, across], [across.mT, self.of_axes(inner)]])
 
     def crossed(self, inner: Array) -> Array:
         """Sums (B, 24, q) of XᵀMD over the stations, D being the columns of the drifts alone."""
@@ -96,11 +99,12 @@ class StandColumns:
             across.append(each.reshape(count, 3, axes, 4, terms).swapaxes(2, 3))
         return np.stack(across, 1).reshape(count, OF_PARAMETERS, axes * terms)
 
-    def own(self, inner: Array) -> Array:
-        """Sums (B, q, q) over the stations of products (a, a, B, n) of axes of drifts, by their terms."""
+    def of_axes(self, inner: Array) -> Array:
+        """Sums DᵀMD (B, q, q) over the stations."""
         axes, terms = self.of_drifts
-        pairs = (self.courses[:, None] * self.courses).reshape(-1, self.courses.shape[-1])
-        each = (by_tool(inner) @ pairs.transpose()).reshape(-1, axes, axes, terms, terms)
+        moved = np.einsum("ij...,ja...->ia...", inner, self.axes)
+        products = by_tool(np.einsum("ia...,ib...->ab...", self.axes, moved))
+        each = (products @ self._courses.transpose()).reshape(-1, axes, axes, terms, terms)
         return each.swapaxes(2, 3).reshape(-1, axes * terms, axes * terms)
 
     def pull(self, values: Array) -> Array:
@@ -147,8 +151,7 @@ class StandColumns:
             spread[rows] += mixed
             spread[:, rows] += mixed.swapaxes(0, 1)
         own = covariance[:, OF_PARAMETERS:, OF_PARAMETERS:].reshape(-1, axes, terms, axes, terms)
-        pairs = (self.courses[:, None] * self.courses).reshape(-1, self.courses.shape[-1])
         flat = own.swapaxes(2, 3).reshape(len(own), axes**2, -1)
-        inner = by_component(flat @ pairs, axes, axes)
+        inner = by_component(flat @ self._courses, axes, axes)
         moved = np.einsum("ab...,jb...->aj...", inner, self.axes)
         spread += np.einsum("ia...,aj...->ij...", self.axes, moved)

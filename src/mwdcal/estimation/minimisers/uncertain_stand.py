@@ -103,6 +103,32 @@ def solution(problem: Problem) -> Solution:
     return Solution(state, there.scale, determined, steps, good)
 
 
+def refined(problem: Problem, state: State) -> Solution:
+    """The fits from a state nearby, the noise being what the problem has."""
+    at = closed_form.start(problem)
+    first = [m for m in closed_form.minima(problem, at) if isinstance(m, AffineMinimum)]
+    one, zero = np.ones((len(state.params), 2)), np.zeros((len(state.params), 2))
+    start = _Turn(
+        Stand.of(problem), _forward(problem, state), state.errors.mT, state.constants, one, zero, zero
+    )
+    sound = np.isfinite(state.params).all(-1)
+    there, steps, good = _settled(start, np.zeros(2, bool), sound)
+    there_state, determined = _ended(problem, there, first, at)
+    good &= determined.clear & np.isfinite(there_state.params).all(-1)
+    return Solution(there_state, one, determined, steps, good)
+
+
+def walk_scores(problem: Problem, state: State, walking: Problem, at: State) -> tuple[Array, Array, Array]:
+    """Scores (B, q) of terms of drifts at the fits of a problem without them, their covariance, and what that is alone.
+
+    `walking` has them besides, at the state `at`. `alone` (B, q, q) is the covariance with all else known.
+    """
+    here, there = linear(problem, state), linear(walking, at)
+    score = -there.columns.pull(here.weighed(here.left))[:, OF_PARAMETERS:]
+    alone, crossed = there.columns.of_axes(here.weight), there.columns.crossed(here.weight)
+    return score, alone - crossed.mT @ (here.covariance @ crossed), alone
+
+
 def linear(problem: Problem, state: State) -> StandLinear:
     """The problem linearised at a state; the last answer is kept."""
     return problem.once("on stand", state, lambda _: _linear(problem, state))
