@@ -191,8 +191,9 @@ def walk_scores(
         return WalkScores(
             score, information() * scale, lambda: information(alone=True) * scale, each
         )
-    if not old and analysis.squares is not None and uncertain_stand.applies(walking):
-        score, whole, alone = uncertain_stand.walk_scores(problem, state, walking, at)
+    if not old and analysis.squares is not None and uncertain_stand.applies(problem):
+        numbers, courses = [[*WALKS].index(name) for name in each], terms_of(residual.shape[1])[0].mT[1:]
+        score, whole, alone = uncertain_stand.walk_scores(problem, state, numbers, courses)
         return WalkScores(score * sd, whole * scale, lambda: alone * scale, each)
     linear, base = problem.linear(state), _axes(problem, state, [*each])
     whole = whole_covariance(linear, analysis.determined)

@@ -118,15 +118,26 @@ def refined(problem: Problem, state: State) -> Solution:
     return Solution(there_state, one, determined, steps, good)
 
 
-def walk_scores(problem: Problem, state: State, walking: Problem, at: State) -> tuple[Array, Array, Array]:
-    """Scores (B, q) of terms of drifts at the fits of a problem without them, their covariance, and what that is alone.
+def walk_scores(
+    problem: Problem, state: State, walks: Sequence[int], courses: Array
+) -> tuple[Array, Array, Array]:
+    """Scores (B, q) of walks by their numbers at fits without them, their covariance, and what that is alone.
 
-    `walking` has them besides, at the state `at`. `alone` (B, q, q) is the covariance with all else known.
+    They are of unit terms of some `courses` (K, n), the axes of a term together. `alone` (B, q, q) is the covariance
+    with all else known.
     """
-    here, there = linear(problem, state), linear(walking, at)
-    score = -there.columns.pull(here.weighed(here.left))[:, OF_PARAMETERS:]
-    alone, crossed = there.columns.of_axes(here.weight), there.columns.crossed(here.weight)
-    return score, alone - crossed.mT @ (here.covariance @ crossed), alone
+    here, count = linear(problem, state), 3 * len(walks) * len(courses)
+    every = np.broadcast_to(courses, (len(state.params), *courses.shape))
+    none = np.zeros((len(every), count))
+    stand = replace(Stand.of(problem), walks=tuple(walks), courses=every)
+    one = np.ones((len(every), len(problem.triads)))
+    columns = stand.at(_forward(problem, state), state.errors.mT, none, one).columns
+    score = -columns.pull(here.weighed(here.left))[:, OF_PARAMETERS:]
+    alone, crossed = columns.of_axes(here.weight), columns.crossed(here.weight)
+    left = alone - crossed.mT @ (here.covariance @ crossed)
+    places = np.arange(count).reshape(len(walks), 3, -1).swapaxes(1, 2).ravel()
+    pairs = np.ix_(np.arange(len(every)), places, places)
+    return score[:, places], left[pairs], alone[pairs]
 
 
 def linear(problem: Problem, state: State) -> StandLinear:
