@@ -192,9 +192,7 @@ def walk_scores(
             score, information() * scale, lambda: information(alone=True) * scale, each
         )
     if not old and analysis.squares is not None and uncertain_stand.applies(problem):
-        numbers, courses = [[*WALKS].index(name) for name in each], terms_of(residual.shape[1])[0].mT[1:]
-        score, whole, alone = uncertain_stand.walk_scores(problem, state, numbers, courses)
-        return WalkScores(score * sd, whole * scale, lambda: alone * scale, each)
+        return _on_stand(problem, state, each, sd)
     linear, base = problem.linear(state), _axes(problem, state, [*each])
     whole = whole_covariance(linear, analysis.determined)
     terms = terms_of(base.shape[1])[0][:, 1:]
@@ -206,6 +204,19 @@ def walk_scores(
     alone = alone.reshape(count, *2 * (len(each), 3), *2 * terms.shape[1:])
     alone = alone.transpose(0, 1, 5, 2, 3, 6, 4).reshape(scale.shape) * scale
     return WalkScores(score, alone - crossed.mT @ whole @ crossed, lambda: alone, each)
+
+
+def _on_stand(problem: Problem, state: State, places: dict[str, Ints], sd: Array) -> WalkScores:
+    """The same on a stand of known angles, where the terms of an axis are together."""
+    courses = terms_of(problem.evidence.include.shape[-1])[0].mT[1:]
+    walks = uncertain_stand.stand_walks(problem, state, courses)
+    score, left, alone = walks.among([[*WALKS].index(name) for name in places])
+    by_axis = {name: c.reshape(3, -1).mT.ravel() for name, c in places.items()}
+    sizes = np.empty(sd.shape)
+    for name, c in places.items():
+        sizes[:, by_axis[name]] = sd[:, c]
+    scale = outer(sizes)
+    return WalkScores(score * sizes, left * scale, lambda: alone * scale, by_axis)
 
 
 def _axes(problem: Problem, state: State, walks: Sequence[str]) -> Array:

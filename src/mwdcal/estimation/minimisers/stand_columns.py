@@ -9,6 +9,7 @@ Arrays are (component, B, n) where not said otherwise: each step goes over all t
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,6 +19,8 @@ from mwdcal.geometry.vectors import Array
 
 TRIAD_ROWS = (slice(0, 3), slice(3, 6))
 """Rows of a station's six readings that are each triad's."""
+FIELD_WALK = 2
+"""Number of the walk of the field; the others are of the offsets of a triad."""
 OF_PARAMETERS = 24
 """Number of the elements of Φ of both triads."""
 
@@ -70,6 +73,20 @@ class StandColumns:
     def _courses(self) -> Array:
         """Products (K K, n) of the courses."""
         return (self.courses[:, None] * self.courses).reshape(-1, self.courses.shape[-1])
+
+    def axes_of(self, walks: Iterable[int], forward: Array, attitude: Array) -> Array:
+        """What a unit of each axis of some walks, by their numbers, adds to the whitened readings (6, a, B, n).
+
+        At Φ (B, 2, 3, 4) and attitudes (3, 3, B, n).
+        """
+        numbers = [*walks]
+        axes = np.zeros((6, 3 * len(numbers), *self.weight.shape[1:]))
+        for place, walk in enumerate(numbers):
+            rows, unit = TRIAD_ROWS[min(walk, 1)], np.eye(3)[..., None, None]
+            if walk == FIELD_WALK:
+                unit = np.einsum("bij,jabn->iabn", forward[:, 1, :, :3], attitude)
+            axes[rows, 3 * place : 3 * place + 3] = unit * self.weight[rows, None]
+        return axes
 
     def gram(self, inner: Array) -> Array:
         """Sums XᵀMX (B, u, u) for the symmetric M (6, 6, B, n) of each station."""

@@ -5,7 +5,7 @@ Arrays are (component, B, n), those that a stand and a state are made of (B, com
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -23,8 +23,6 @@ MOST_AT_ONCE = 3.0
 """Largest power of s that the noise takes at once."""
 ERROR_SIGNS = np.array([1.0, -1.0, -1.0])[:, None]
 """How inclination, azimuth and toolface follow the errors of a state."""
-FIELD_WALK = 2
-"""Number of the walk of the field; the others are of the offsets of a triad."""
 
 
 @dataclass(frozen=True)
@@ -104,15 +102,9 @@ class Stand:
         f, change, attitude = self.vectors(errors)
         noise = self.sd * np.repeat(scale, 3, -1)[..., None]
         weight = by_component(self.include[:, None] / noise, 6)
-        axes = np.zeros((6, 3 * len(self.walks), *weight.shape[1:]))
-        for place, walk in enumerate(self.walks):
-            rows, columns = TRIAD_ROWS[min(walk, 1)], slice(3 * place, 3 * place + 3)
-            unit = np.eye(3)[..., None, None]
-            if walk == FIELD_WALK:
-                unit = np.einsum("bij,jabn->iabn", forward[:, 1, :, :3], attitude)
-            axes[rows, columns] = unit * weight[rows, None]
-        courses = self.courses[0] if self.walks else self.courses[:1].reshape(0, weight.shape[-1])
-        columns = StandColumns(f, weight, axes, courses)
+        courses = self.courses[0] if self.walks else np.zeros((0, weight.shape[-1]))
+        columns = StandColumns(f, weight, np.zeros((6, 0, *weight.shape[1:])), courses)
+        columns = replace(columns, axes=columns.axes_of(self.walks, forward, attitude))
         held = np.where(self.angle_sd > 0, errors / np.where(self.angle_sd > 0, self.angle_sd, 1.0), 0.0)
         gain = [
             np.einsum("bij,jabn->iabn", forward[:, t, :, :3], change[t]) * weight[rows, None]
@@ -122,7 +114,7 @@ class Stand:
         unknowns = np.concatenate([forward.reshape(len(forward), -1), value], -1)
         left = by_component(self.raw, 6) * weight - columns.change(unknowns)
         left += np.einsum("ik...,k...->i...", gain, by_component(held, 3))
-        return StandLinear(columns, left, gain, self.angle_sd, self.precision, value)
+        return StandLinear(columns, left, gain, attitude, self.angle_sd, self.precision, value)
 
 
 @dataclass(frozen=True)
@@ -130,12 +122,13 @@ class StandLinear:
     """Runs at a state: whitened readings `left` (6, B, n) without the errors of angles, and what unknowns do to them.
 
     `columns` are those of Φ and of the terms of drifts, of which `value` (B, q) are there, known to a `precision` before;
-    `gain` (6, 3, B, n) is what one σ of each angle does.
+    `gain` (6, 3, B, n) is what one σ of each angle does, and `attitude` (3, 3, B, n) where the angles are.
     """
 
     columns: StandColumns
     left: Array
     gain: Array
+    attitude: Array
     angle_sd: Array
     precision: Array
     value: Array

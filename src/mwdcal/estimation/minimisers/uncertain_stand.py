@@ -22,8 +22,9 @@ import numpy as np
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.minimisers import closed_form
 from mwdcal.estimation.minimisers.closed_form import AffineMinimum
-from mwdcal.estimation.minimisers.stand_columns import OF_PARAMETERS, TRIAD_ROWS
+from mwdcal.estimation.minimisers.stand_columns import OF_PARAMETERS, TRIAD_ROWS, StandColumns
 from mwdcal.estimation.minimisers.stand_linear import MOST_AT_ONCE, Stand, StandLinear
+from mwdcal.estimation.evidence import WALKS
 from mwdcal.estimation.problem import WALK_AXES, Problem, State
 from mwdcal.estimation.solvers import Determined
 from mwdcal.estimation.uncertainty import Analysis, effects_of, variance_factors
@@ -118,26 +119,42 @@ def refined(problem: Problem, state: State) -> Solution:
     return Solution(there_state, one, determined, steps, good)
 
 
-def walk_scores(
-    problem: Problem, state: State, walks: Sequence[int], courses: Array
-) -> tuple[Array, Array, Array]:
-    """Scores (B, q) of walks by their numbers at fits without them, their covariance, and what that is alone.
+@dataclass(frozen=True)
+class StandWalks:
+    """What the fits of runs without drift leave of all walks, of unit terms: those of a walk axis by axis.
 
-    They are of unit terms of some `courses` (K, n), the axes of a term together. `alone` (B, q, q) is the covariance
-    with all else known.
+    `score` (B, q) of the terms, XᵀWD (B, 24, q) with the parameters, `crossed`, and what these take up, `taken`.
     """
-    here, count = linear(problem, state), 3 * len(walks) * len(courses)
-    every = np.broadcast_to(courses, (len(state.params), *courses.shape))
-    none = np.zeros((len(every), count))
-    stand = replace(Stand.of(problem), walks=tuple(walks), courses=every)
-    one = np.ones((len(every), len(problem.triads)))
-    columns = stand.at(_forward(problem, state), state.errors.mT, none, one).columns
-    score = -columns.pull(here.weighed(here.left))[:, OF_PARAMETERS:]
-    alone, crossed = columns.of_axes(here.weight), columns.crossed(here.weight)
-    left = alone - crossed.mT @ (here.covariance @ crossed)
-    places = np.arange(count).reshape(len(walks), 3, -1).swapaxes(1, 2).ravel()
-    pairs = np.ix_(np.arange(len(every)), places, places)
-    return score[:, places], left[pairs], alone[pairs]
+
+    weight: Array
+    columns: StandColumns
+    score: Array
+    crossed: Array
+    taken: Array
+
+    @classmethod
+    def of(cls, problem: Problem, state: State, courses: Array) -> StandWalks:
+        """At the fits of a problem, for some `courses` (K, n)."""
+        here = linear(problem, state)
+        axes = here.columns.axes_of(range(len(WALKS)), _forward(problem, state), here.attitude)
+        columns = replace(here.columns, axes=axes, courses=courses)
+        score = -columns.pull(here.weighed(here.left))[:, OF_PARAMETERS:]
+        crossed = columns.crossed(here.weight)
+        return cls(here.weight, columns, score, crossed, here.covariance @ crossed)
+
+    def among(self, walks: Sequence[int]) -> tuple[Array, Array, Array]:
+        """Scores (B, q) of some walks by their numbers, their covariance, and what that is with all else known."""
+        axes = np.array([3 * walk + axis for walk in walks for axis in range(3)])
+        terms = len(self.columns.courses)
+        places = (axes[:, None] * terms + np.arange(terms)).ravel()
+        alone = replace(self.columns, axes=self.columns.axes[:, axes]).of_axes(self.weight)
+        left = alone - self.crossed[:, :, places].mT @ self.taken[:, :, places]
+        return self.score[:, places], left, alone
+
+
+def stand_walks(problem: Problem, state: State, courses: Array) -> StandWalks:
+    """What fits leave of all walks; the last answer is kept."""
+    return problem.once("stand walks", state, lambda _: StandWalks.of(problem, state, courses))
 
 
 def linear(problem: Problem, state: State) -> StandLinear:
