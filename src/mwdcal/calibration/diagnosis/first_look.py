@@ -49,7 +49,7 @@ def may_show(result: Fit) -> Bools:
     if not common:
         return every
     design = Alike.of(problem, result.state)
-    if any(name.endswith(("-temperature", "-thermal-lag")) for name in _common(design)):
+    if any(name.endswith(("-temperature", "-thermal-lag")) for name in common_effects(design)):
         return every
     scale = np.sqrt(np.maximum(variance_scales(result), 1e-12))
     residual = result.analysis.residual / np.repeat(scale, 3, -1)[:, None]
@@ -117,7 +117,7 @@ class _Drifts:
 
 
 @lru_cache(maxsize=8)
-def _common(design: Alike) -> dict[str, dict[int, CommonColumns]]:
+def common_effects(design: Alike) -> dict[str, dict[int, CommonColumns]]:
     """The change of the readings of the triads by each effect, by name; nothing if it differs from tool to tool."""
     one, state = perfect(design)
     terms = [sensor_terms(one, state, index) for index in range(len(one.triads))]
@@ -139,7 +139,7 @@ def _across(design: Alike) -> dict[str, dict[int, Array]]:
     drifts = closed_form_drift.walk_columns(design) if design.problem.walks else {}
     return {
         name: {i: c.across(drifts[i][1]) for i, c in columns.items() if i in drifts}
-        for name, columns in _common(design).items()
+        for name, columns in common_effects(design).items()
     }
 
 
@@ -148,7 +148,7 @@ def _gains(
 ) -> Iterator[tuple[Array, Ints]]:
     """By how much (B,) each family lowers the misfit, and its directions, from whitened residuals (B, n, m)."""
     parts = np.split(residual, residual.shape[-1] // 3, -1)
-    for name, columns in _common(design).items():
+    for name, columns in common_effects(design).items():
         triad, _, kind = name.partition("-")
         if kind == "hysteresis":
             index = TRIADS.index(triad)
@@ -166,10 +166,10 @@ def _gains(
                     both = drifts.less(index, cross, *both)
                 score, information = score + both[0], information + both[1]
                 square = square + each.squares(reads)
-            yield _gain(score, information, square)
+            yield gain_of(score, information, square)
 
 
-def _gain(score: Array, information: Array, square: Array) -> tuple[Array, Ints]:
+def gain_of(score: Array, information: Array, square: Array) -> tuple[Array, Ints]:
     """By how much (B,) columns of so large a `square` (B, k) lower the misfit, and their directions."""
     length = np.sqrt(np.where(square > 0, square, 1.0))
     value, vector = eigen(information / outer(length))
@@ -190,7 +190,7 @@ def _gain_of_sides(
         seen = drifts.columns[index].left
         cross = (sides.mT @ seen.reshape(len(seen), -1)).reshape(len(sides), 3, 6, -1)
         cross = np.sum(response[..., None] * cross, 2)
-        return _gain(*drifts.less(index, cross, score, left[..., None] * np.eye(3)), whole)
+        return gain_of(*drifts.less(index, cross, score, left[..., None] * np.eye(3)), whole)
     kept = left > LEFT_BY_FIT * whole
     return quotient(score**2, left, kept).sum(-1), np.count_nonzero(kept, -1)
 

@@ -18,11 +18,13 @@ import numpy as np
 from mwdcal.calibration.automatic.courses import f_test, steady_columns
 from mwdcal.calibration.diagnosis.families import COURSE_SUFFIX, families, products
 from mwdcal.calibration.diagnosis.first_look import EFFECT_CHANCE, LEFT_BY_FIT, may_show
+from mwdcal.calibration.diagnosis.stand_look import on_stand_may_show
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.residuals import chances, stations_to_remeasure
 from mwdcal.calibration.results import variance_scales
 from mwdcal.estimation.batch import take
+from mwdcal.estimation.minimisers import uncertain_stand
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import whole_covariance
 from mwdcal.geometry.vectors import Array, Bools, Ints, eigen, outer, quotient
@@ -144,7 +146,9 @@ def shown_effects(result: Fit, others: Mapping[str, Array]) -> list[Shown]:
         return [{} for _ in result.status]
     include = result.problem.evidence.include
     every: list[Shown] = [{} for _ in result.status]
-    looked_at, result = may_show(result) | bool(others), _without_bad_stations(result)
+    stand = result.analysis.squares is not None and uncertain_stand.applies(result.problem)
+    looked_at = (on_stand_may_show(result) if stand else may_show(result)) | bool(others)
+    result = _without_bad_stations(result)
     looked_at |= (result.problem.evidence.include != include).any(-1)
     places = np.flatnonzero(looked_at)
     for first in range(0, len(places), AT_ONCE):

@@ -25,9 +25,12 @@ FIRST_AXES, SECOND_AXES = np.triu_indices(3)
 
 def are_common(problem: Problem) -> bool:
     """Whether all references are exact, and members differ in their readings and the level of their noise alone."""
+    return closed_form.but_for_constants(problem) and are_alike(problem)
+
+
+def are_alike(problem: Problem) -> bool:
+    """Whether members differ in their readings and the level of their noise alone."""
     evidence = problem.evidence
-    if not closed_form.but_for_constants(problem):
-        return False
     if not all(isinstance(triad.model, Polynomial) for triad in problem.triads):
         return False
     if any(np.ptp(triad.sd, axis=(1, 2)).any() for triad in problem.triads):

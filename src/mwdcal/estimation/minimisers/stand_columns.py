@@ -116,6 +116,20 @@ class StandColumns:
             across.append(each.reshape(count, 3, axes, 4, terms).swapaxes(2, 3))
         return np.stack(across, 1).reshape(count, OF_PARAMETERS, axes * terms)
 
+    def with_others(self, weighed: Array) -> Array:
+        """Sums (B, u, k) of Xᵀ times other columns (6, k, B, n), weighed, over the stations."""
+        count, others = self.weight.shape[1], weighed.shape[1]
+        heavy = weighed * self.weight[:, None]
+        each = [
+            (by_tool(heavy[rows]) @ by_tool(f).mT).reshape(count, 3, others, 4).swapaxes(2, 3)
+            for rows, f in zip(TRIAD_ROWS, self.terms, strict=True)
+        ]
+        if self.axes.size:
+            moved = np.einsum("ia...,ik...->ak...", self.axes, weighed)
+            terms = by_tool(moved) @ self.courses.transpose()
+            each.append(terms.reshape(count, len(self.axes[0]), others, -1).swapaxes(2, 3))
+        return np.concatenate([part.reshape(count, -1, others) for part in each], 1)
+
     def of_axes(self, inner: Array) -> Array:
         """Sums DᵀMD (B, q, q) over the stations."""
         axes, terms = self.of_drifts
