@@ -16,10 +16,11 @@ from mwdcal.calibration.diagnosis.first_look import common_effects, gain_of, lea
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.results import variance_scales
+from mwdcal.estimation.evidence import ANGLES
 from mwdcal.estimation.minimisers import uncertain_stand
 from mwdcal.estimation.minimisers.common_columns import Alike, are_alike, responses
 from mwdcal.estimation.minimisers.stand_columns import TRIAD_ROWS
-from mwdcal.estimation.problem import Problem
+from mwdcal.estimation.problem import Problem, State
 from mwdcal.geometry.vectors import Array, Bools
 
 STAND_MARGIN = 0.75
@@ -35,7 +36,7 @@ def on_stand_may_show(result: Fit) -> Bools:
     problem, every = result.problem, np.ones(len(result.status), bool)
     if not are_alike(problem):
         return every
-    design = Alike.of(problem, replace(result.state, errors=0 * result.state.errors))
+    design = _exact(problem, result.state)
     common = common_effects(design)
     if any(name.endswith(("-temperature", "-thermal-lag")) for name in common):
         return every
@@ -60,6 +61,14 @@ def on_stand_may_show(result: Fit) -> Bools:
                 least = least_gain(count, left) * STAND_MARGIN
                 shown |= (directions == count) & (rest == left) & (gain > least * misfit)
     return np.asarray(shown)
+
+
+def _exact(problem: Problem, state: State) -> Alike:
+    """The design of a problem as if its stand did not err."""
+    evidence = problem.evidence
+    sd = {n: 0 * sd if n in ANGLES else sd for n, sd in evidence.sd.items()}
+    exact = replace(problem, evidence=replace(evidence, sd=sd))
+    return Alike.of(exact, replace(state, errors=0 * state.errors))
 
 
 def _columns(problem: Problem, result: Fit, design: Alike) -> Iterator[Array]:

@@ -157,9 +157,9 @@ class StandColumns:
         return change
 
     def spread(self, covariance: Array) -> Array:
-        """Covariance (6, 6, B, n) of what unknowns of a covariance (B, u, u) do to each station."""
+        """Covariance (6, 6, B, n) of what Φ of a covariance (B, 24, 24) does to each station."""
         count, spread = len(covariance), np.empty((6, *self.weight.shape))
-        of_params = covariance[:, :OF_PARAMETERS, :OF_PARAMETERS].reshape(count, 2, 3, 4, 2, 3, 4)
+        of_params = covariance.reshape(count, 2, 3, 4, 2, 3, 4)
         for (one, other), pair in self._pairs.items():
             rows, columns = TRIAD_ROWS[one], TRIAD_ROWS[other]
             flat = of_params[:, one, :, :, other].transpose(0, 1, 3, 2, 4).reshape(count, 9, 16)
@@ -167,22 +167,16 @@ class StandColumns:
             each = each * self.weight[rows, None] * self.weight[columns]
             spread[rows, columns] = each
             spread[columns, rows] = each.swapaxes(0, 1)
-        if self.axes.size:
-            self._spread_by_drifts(spread, covariance)
         return spread
 
-    def _spread_by_drifts(self, spread: Array, covariance: Array) -> None:
-        """Add what the drifts do, and do together with the parameters."""
-        axes, terms = self.of_drifts
-        across = covariance[:, :OF_PARAMETERS, OF_PARAMETERS:].reshape(-1, 2, 3, 4, axes, terms)
-        for index, (rows, along) in enumerate(zip(TRIAD_ROWS, self._along, strict=True)):
-            flat = across[:, index].swapaxes(2, 3).reshape(len(covariance), 3 * axes, -1)
-            each = by_component(flat @ along, 3, axes) * self.weight[rows, None]
-            mixed = np.einsum("ia...,ja...->ij...", each, self.axes)
-            spread[rows] += mixed
-            spread[:, rows] += mixed.swapaxes(0, 1)
-        own = covariance[:, OF_PARAMETERS:, OF_PARAMETERS:].reshape(-1, axes, terms, axes, terms)
-        flat = own.swapaxes(2, 3).reshape(len(own), axes**2, -1)
-        inner = by_component(flat @ self._courses, axes, axes)
-        moved = np.einsum("ab...,jb...->aj...", inner, self.axes)
-        spread += np.einsum("ia...,aj...->ij...", self.axes, moved)
+    def less(self, taken: Array) -> Array:
+        """Columns (B, n, 6, q) of the drifts less what Φ takes of each, (B, 24, q)."""
+        count, axes = len(taken), np.moveaxis(self.axes, (0, 1), (2, 3))
+        whole = axes[..., None] * self.courses.transpose()[:, None, None]
+        whole = whole.reshape(*whole.shape[:3], -1)
+        each = taken.reshape(count, 2, 3, 4, -1).swapaxes(2, 3)
+        for index, (rows, f) in enumerate(zip(TRIAD_ROWS, self.terms, strict=True)):
+            part = by_tool(f).mT @ each[:, index].reshape(count, 4, -1)
+            part = part.reshape(count, -1, 3, taken.shape[-1])
+            whole[:, :, rows] -= part * by_tool(self.weight[rows]).mT[..., None]
+        return whole

@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from mwdcal.estimation.minimisers.stand_columns import (
+    OF_PARAMETERS,
     TRIAD_ROWS,
     StandColumns,
     by_component,
@@ -178,25 +179,70 @@ class StandLinear:
         return first, second
 
     @cached_property
+    def parts(self) -> tuple[Array, Array, Array]:
+        """Covariance (B, 24, 24) of Φ if there were no drifts, what Φ takes of their terms (B, 24, q), and theirs (B, q, q).
+
+        A drift's mean is an offset: of the sums of both together only rounding would be left.
+        """
+        p, information = OF_PARAMETERS, self.of_data
+        alone = inverse(information[:, :p, :p])
+        if not self.precision.size:
+            return alone, information[:, :p, p:], information[:, p:, p:]
+        taken = alone @ information[:, :p, p:]
+        rest = information[:, p:, p:] - information[:, p:, :p] @ taken
+        np.einsum("bii->bi", rest)[...] += self.precision
+        return alone, taken, inverse(rest)
+
+    @cached_property
     def covariance(self) -> Array:
         """Covariance (B, u, u) of Φ and the terms of drifts."""
-        information = self.of_data.copy()
-        among = information[:, -self.precision.shape[-1] :] if self.precision.size else information[:, :0]
-        place = np.arange(among.shape[1])
-        among[:, place, place - len(place)] += self.precision
-        return inverse(information)
+        alone, taken, inner = self.parts
+        if not self.precision.size:
+            return alone
+        across = -taken @ inner
+        return np.block([[alone - across @ taken.mT, across], [across.mT, inner]])
 
     @cached_property
     def spread(self) -> Array:
         """W - WX V XᵀW (6, 6, B, n), the covariance of the weighed residuals of each station."""
-        taken = np.einsum("ij...,jk...->ik...", self.weight, self.columns.spread(self.covariance))
-        return self.weight - np.einsum("ij...,jk...->ik...", taken, self.weight)
+        alone, taken, inner = self.parts
+        both = self.columns.spread(alone)
+        if self.precision.size:
+            left = self.columns.less(taken)
+            both += by_component((left @ inner[:, None] @ left.mT).reshape(*left.shape[:2], 36).mT, 6, 6)
+        moved = np.einsum("ij...,jk...->ik...", self.weight, both)
+        return self.weight - np.einsum("ij...,jk...->ik...", moved, self.weight)
+
+    @cached_property
+    def apart(self) -> tuple[Array, ...]:
+        """XᵀWX, then both of `squared`, where the columns of drifts are less what Φ takes of them."""
+        each, p = (self.of_data, *self.squared), OF_PARAMETERS
+        if not self.precision.size:
+            return each
+        taken, changed = self.parts[1], []
+        for whole in each:
+            across = whole[:, :p, p:] - whole[:, :p, :p] @ taken
+            own = whole[:, p:, p:] - taken.mT @ whole[:, :p, p:] - across.mT @ taken
+            changed.append(np.block([[whole[:, :p, :p], across], [across.mT, own]]))
+        return tuple(changed)
+
+    @cached_property
+    def of_angles(self) -> Array:
+        """Covariance (B, 24, 24) of Φ from the errors of angles alone."""
+        alone, taken, inner = self.parts
+        data, *squared = self.apart
+        reach = np.concatenate([alone, -taken @ inner], -1) if self.precision.size else alone
+        return reach @ (data - sum(squared)) @ reach.mT
 
     @cached_property
     def shared_squares(self) -> Array:
         """tr((XᵀW E W X V)²) (B, t)."""
-        each = [squared @ self.covariance for squared in self.squared]
-        return np.stack([np.sum(part * part.mT, (1, 2)) for part in each], -1)
+        alone, _, inner = self.parts
+        each, p = [], OF_PARAMETERS
+        for squared in self.apart[1:]:
+            part = np.concatenate([squared[..., :p] @ alone, squared[..., p:] @ inner], -1)
+            each.append(np.sum(part * part.mT, (1, 2)))
+        return np.stack(each, -1)
 
     def weighed(self, values: Array) -> Array:
         """W times values (6, B, n)."""

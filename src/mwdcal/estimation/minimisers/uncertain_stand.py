@@ -197,7 +197,7 @@ def analysed(problem: Problem, state: State, determined: Determined) -> Analysis
     moved = moved_params(problem, _forward(problem, state))
     whole = at.covariance.copy()
     whole[:, :p] = moved @ whole[:, :p]
-    of_data = whole[:, :p] @ (at.of_data - sum(at.squared)) @ whole[:, :p].mT
+    of_angles = moved @ at.of_angles @ moved.mT
     whole[:, :, :p] = whole[:, :, :p] @ moved.mT
     spread = at.spread * include
     squares = [
@@ -210,7 +210,7 @@ def analysed(problem: Problem, state: State, determined: Determined) -> Analysis
     cross, nothing = whole[:, :p, p:], np.zeros((len(whole), p, 0))
     return Analysis(
         whole[:, :p, :p], determined, factor, freedom, residual, spread,
-        whole[:, p:, p:], effects_of(problem, cross), nothing, squares=squares, of_stand=of_data,
+        whole[:, p:, p:], effects_of(problem, cross), nothing, squares=squares, of_stand=of_angles,
     )  # fmt: skip
 
 
