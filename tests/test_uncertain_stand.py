@@ -82,10 +82,12 @@ def test_a_tool_does_not_depend_on_its_fleet():
 def test_angles_err_as_the_problem_has_it():
     problem = fit(on_stand(6, 2), OPTIONS).problem
     errors = np.random.default_rng(0).normal(size=(2, 48, 3)) * 0.01
-    vectors = stand_linear.Stand.of(problem).vectors(errors.mT)[0]
+    vectors = stand_linear.StandRuns.of(problem).vectors(errors.mT)[0]
     state = replace(closed_form.start(problem), errors=errors)
     for index, target in enumerate(problem.targets(state)):
-        np.testing.assert_allclose(np.moveaxis(vectors[index, :3], 0, -1), target, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(
+            np.moveaxis(vectors[index, :3], 0, -1), target, rtol=0, atol=1e-9
+        )
 
 
 def test_too_weak_attitudes_go_the_general_way(general):

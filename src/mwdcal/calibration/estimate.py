@@ -262,17 +262,25 @@ def _refined(result: Fit, problem: Problem, state: State, options: Options) -> F
     there = uncertain_stand.refined(problem, state)
     analysis = uncertain_stand.analysed(problem, there.state, there.determined)
     good = there.good & analysis.finite & (result.status != int(Status.NOT_FINITE))
-    status, steps = np.where(good, int(Status.OK), int(Status.NOT_FINITE)), result.iterations + there.steps
+    status, steps = (
+        np.where(good, int(Status.OK), int(Status.NOT_FINITE)),
+        result.iterations + there.steps,
+    )
     whole = Fit(problem, there.state, status, steps, _noise(problem), result.trust, analysis)
     if good.all():
         return whole
     rest = np.flatnonzero(~good)
-    return put(whole, rest, _completed(_refitted_anyhow(*take((result, problem, state), rest), options)))
+    return put(
+        whole, rest, _completed(_refitted_anyhow(*take((result, problem, state), rest), options))
+    )
 
 
 def _completed(result: Fit) -> Fit:
-    """The fit with all of its analysis."""
-    return replace(result, analysis=completed(result.problem, result.state, result.analysis))
+    """The fit of a stand of known angles with all of its analysis."""
+    problem, state, known = result.problem, result.state, result.analysis.determined
+    if known.keep.all():
+        return replace(result, analysis=uncertain_stand.analysed(problem, state, known))
+    return replace(result, analysis=completed(problem, state, result.analysis))
 
 
 def _finished(stage: _Iterate, options: Options, finite: Bools, iterations: Ints) -> Fit:

@@ -32,7 +32,10 @@ LARGEST_RESCALING = 0.1
 
 
 def on_stand_may_show(result: Fit) -> Bools:
-    """Fits (B,) on an uncertain stand that may show an effect; all where columns are not common, or temperature varies."""
+    """Fits (B,) on an uncertain stand that may show an effect.
+
+    All of them where the columns of effects are not common to tools, or depend on temperature.
+    """
     problem, every = result.problem, np.ones(len(result.status), bool)
     if not are_alike(problem):
         return every

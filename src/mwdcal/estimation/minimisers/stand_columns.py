@@ -40,8 +40,8 @@ def by_component(values: Array, *shape: int) -> Array:
 class StandColumns:
     """Columns of the elements of Φ of both triads, then of the terms of drifts, axis by axis.
 
-    `terms` (2, 4, B, n) are f̃ of each triad, `weight` (6, B, n) is one over the noise of a reading. `axes` (6, a, B, n) are
-    what a unit of each axis of the drifts adds to the whitened readings, `courses` (K, n) their terms.
+    `terms` (2, 4, B, n) are f̃ of each triad, `weight` (6, B, n) is one over the noise of a reading. `axes` (6, a, B, n)
+    are what a unit of each axis of the drifts adds to the whitened readings, `courses` (K, n) their terms.
     """
 
     terms: Array
@@ -141,9 +141,14 @@ class StandColumns:
     def pull(self, values: Array) -> Array:
         """Sums (B, u) of Xᵀ times values (6, B, n) over the stations."""
         heavy = values * self.weight
-        each = [by_tool(heavy[rows]) @ by_tool(f).mT for rows, f in zip(TRIAD_ROWS, self.terms, strict=True)]
+        each = [
+            by_tool(heavy[rows]) @ by_tool(f).mT
+            for rows, f in zip(TRIAD_ROWS, self.terms, strict=True)
+        ]
         if self.axes.size:
-            each.append(by_tool(np.einsum("ia...,i...->a...", self.axes, values)) @ self.courses.transpose())
+            each.append(
+                by_tool(np.einsum("ia...,i...->a...", self.axes, values)) @ self.courses.transpose()
+            )
         return np.concatenate([part.reshape(len(part), -1) for part in each], -1)
 
     def change(self, step: Array) -> Array:
@@ -153,7 +158,9 @@ class StandColumns:
         change = np.concatenate(each) * self.weight
         if self.axes.size:
             of_drifts = step[:, OF_PARAMETERS:].reshape(-1, *self.of_drifts) @ self.courses
-            change += np.einsum("ia...,a...->i...", self.axes, by_component(of_drifts, len(self.axes[0])))
+            change += np.einsum(
+                "ia...,a...->i...", self.axes, by_component(of_drifts, len(self.axes[0]))
+            )
         return change
 
     def spread(self, covariance: Array) -> Array:

@@ -18,7 +18,7 @@ from mwdcal.estimation.minimisers.stand_columns import (
     by_tool,
 )
 from mwdcal.estimation.problem import WALK_AXES, Problem
-from mwdcal.geometry.vectors import Array, inverse
+from mwdcal.geometry.vectors import Array, inverse, quotient
 
 MOST_AT_ONCE = 3.0
 """Largest power of s that the noise takes at once."""
@@ -27,7 +27,7 @@ ERROR_SIGNS = np.array([1.0, -1.0, -1.0])[:, None]
 
 
 @dataclass(frozen=True)
-class Stand:
+class StandRuns:
     """Constants of the iteration: angles and σ (B, 3, n), strengths (B, n), readings and noise (B, 6, n).
 
     `courses` (B, K, n) are the terms of each axis of the drifts, of precision (B, q); `walks` their numbers.
@@ -46,7 +46,7 @@ class Stand:
     walks: tuple[int, ...]
 
     @classmethod
-    def of(cls, problem: Problem) -> Stand:
+    def of(cls, problem: Problem) -> StandRuns:
         """Of a problem."""
         evidence = problem.evidence
         known = evidence.known
@@ -79,7 +79,7 @@ class Stand:
         return np.asarray(sd / np.where(size > 0, size, 1.0))
 
     def vectors(self, errors: Array) -> tuple[Array, Array, Array]:
-        """f̃ (2, 4, B, n) of both triads, the change of f by one σ of each angle (2, 3, 3, B, n), and attitudes (3, 3, B, n)."""
+        """f̃ (2, 4, B, n), the change of f by one σ of each angle (2, 3, 3, B, n), and attitudes (3, 3, B, n)."""
         angle = np.ascontiguousarray(np.moveaxis(self.angles + ERROR_SIGNS * errors, 1, 0))
         (ci, ca, ct), (si, sa, st) = np.cos(angle), np.sin(angle)
         sd = np.ascontiguousarray(np.moveaxis(ERROR_SIGNS * self.angle_sd, 1, 0))
@@ -106,12 +106,12 @@ class Stand:
         courses = self.courses[0] if self.walks else np.zeros((0, weight.shape[-1]))
         columns = StandColumns(f, weight, np.zeros((6, 0, *weight.shape[1:])), courses)
         columns = replace(columns, axes=columns.axes_of(self.walks, forward, attitude))
-        held = np.where(self.angle_sd > 0, errors / np.where(self.angle_sd > 0, self.angle_sd, 1.0), 0.0)
-        gain = [
+        held = quotient(errors, self.angle_sd, self.angle_sd > 0)
+        each = [
             np.einsum("bij,jabn->iabn", forward[:, t, :, :3], change[t]) * weight[rows, None]
             for t, rows in enumerate(TRIAD_ROWS)
         ]
-        gain = np.concatenate(gain)
+        gain = np.concatenate(each)
         unknowns = np.concatenate([forward.reshape(len(forward), -1), value], -1)
         left = by_component(self.raw, 6) * weight - columns.change(unknowns)
         left += np.einsum("ik...,k...->i...", gain, by_component(held, 3))
@@ -122,7 +122,7 @@ class Stand:
 class StandLinear:
     """Runs at a state: whitened readings `left` (6, B, n) without the errors of angles, and what unknowns do to them.
 
-    `columns` are those of Φ and of the terms of drifts, of which `value` (B, q) are there, known to a `precision` before;
+    `columns` are those of Φ and of the terms of drifts, which are at a `value` (B, q), known to a `precision` before;
     `gain` (6, 3, B, n) is what one σ of each angle does, and `attitude` (3, 3, B, n) where the angles are.
     """
 
@@ -162,7 +162,7 @@ class StandLinear:
         weight = -np.einsum("ik...,jk...->ij...", self.halves, self.halves)
         for row in range(6):
             weight[row, row] += 1
-        return weight
+        return np.asarray(weight)
 
     @cached_property
     def of_data(self) -> Array:
@@ -173,14 +173,16 @@ class StandLinear:
     def squared(self) -> tuple[Array, Array]:
         """XᵀW E W X (B, u, u), E being one for the readings of a triad and zero for those of the other."""
         first, second = (
-            self.columns.gram(np.einsum("ik...,kj...->ij...", self.weight[:, rows], self.weight[rows]))
+            self.columns.gram(
+                np.einsum("ik...,kj...->ij...", self.weight[:, rows], self.weight[rows])
+            )
             for rows in TRIAD_ROWS
         )
         return first, second
 
     @cached_property
     def parts(self) -> tuple[Array, Array, Array]:
-        """Covariance (B, 24, 24) of Φ if there were no drifts, what Φ takes of their terms (B, 24, q), and theirs (B, q, q).
+        """Covariance (B, 24, 24) of Φ without drifts, what Φ takes of their terms (B, 24, q), and theirs (B, q, q).
 
         A drift's mean is an offset: of the sums of both together only rounding would be left.
         """
@@ -209,9 +211,11 @@ class StandLinear:
         both = self.columns.spread(alone)
         if self.precision.size:
             left = self.columns.less(taken)
-            both += by_component((left @ inner[:, None] @ left.mT).reshape(*left.shape[:2], 36).mT, 6, 6)
+            both += by_component(
+                (left @ inner[:, None] @ left.mT).reshape(*left.shape[:2], 36).mT, 6, 6
+            )
         moved = np.einsum("ij...,jk...->ik...", self.weight, both)
-        return self.weight - np.einsum("ij...,jk...->ik...", moved, self.weight)
+        return np.asarray(self.weight - np.einsum("ij...,jk...->ik...", moved, self.weight))
 
     @cached_property
     def apart(self) -> tuple[Array, ...]:
@@ -222,8 +226,8 @@ class StandLinear:
         taken, changed = self.parts[1], []
         for whole in each:
             across = whole[:, :p, p:] - whole[:, :p, :p] @ taken
-            own = whole[:, p:, p:] - taken.mT @ whole[:, :p, p:] - across.mT @ taken
-            changed.append(np.block([[whole[:, :p, :p], across], [across.mT, own]]))
+            among = whole[:, p:, p:] - taken.mT @ whole[:, :p, p:] - across.mT @ taken
+            changed.append(np.block([[whole[:, :p, :p], across], [across.mT, among]]))
         return tuple(changed)
 
     @cached_property
@@ -279,10 +283,10 @@ class StandLinear:
         """
         left, each, whole = self.weighed(self.after(step)), [], 3 * include.sum(-1)
         for rows, squared in zip(TRIAD_ROWS, self.squared, strict=True):
-            own = self.weight[rows, rows]
-            share = whole - np.einsum("iibn,bn->b", own, include)
+            block = self.weight[rows, rows]
+            share = whole - np.einsum("iibn,bn->b", block, include)
             taken = np.sum(self.covariance * squared, (1, 2))
-            squares = np.einsum("ijbn,ijbn,bn->b", own, own, include)
+            squares = np.einsum("ijbn,ijbn,bn->b", block, block, include)
             freedom = whole - share - taken
             misfit = np.einsum("ibn,ibn->b", left[rows], left[rows])
             factor = misfit / np.where(freedom >= 1, freedom, np.nan)

@@ -20,19 +20,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mwdcal.estimation.batch import take
+from mwdcal.estimation.evidence import WALKS
 from mwdcal.estimation.minimisers import closed_form
 from mwdcal.estimation.minimisers.closed_form import AffineMinimum
 from mwdcal.estimation.minimisers.stand_columns import OF_PARAMETERS, TRIAD_ROWS, StandColumns
-from mwdcal.estimation.minimisers.stand_linear import MOST_AT_ONCE, Stand, StandLinear
-from mwdcal.estimation.evidence import WALKS
+from mwdcal.estimation.minimisers.stand_linear import MOST_AT_ONCE, StandRuns, StandLinear
 from mwdcal.estimation.problem import WALK_AXES, Problem, State
 from mwdcal.estimation.solvers import Determined
 from mwdcal.estimation.uncertainty import Analysis, effects_of, variance_factors
 from mwdcal.geometry.vectors import Array, Bools, Ints, inverse, quotient
 from mwdcal.sensor.models import Polynomial, affine_parts
 
-MOST_STAND_STEPS = 16
+MOST_STAND_STEPS = 12
 """Most steps of a fit: a member that has not settled then goes the general way."""
+STEPS_ALIKE = 4
+"""First steps that are taken by one covariance; those of members that have not settled have their own."""
 LEAST_SQUARE = 1e-12
 """Square of the last step, in standard uncertainties."""
 LEAST_NOISE_CHANGE = 1e-5
@@ -60,16 +62,17 @@ def applies(problem: Problem) -> bool:
 
 def _are_drifts(problem: Problem) -> bool:
     """Whether all constants are terms of drifts, those of each axis the same, at all tools."""
-    names, first = [c.name for c in problem.evidence.constants], 0
-    if not names:
-        return True
-    terms = names.count(names[0])
-    regular = [name for name in dict.fromkeys(names) for _ in range(terms)]
-    masks = [constant.mask for constant in problem.evidence.constants]
+    constants = problem.evidence.constants
+    names = [constant.name for constant in constants]
+    terms = names.count(names[0]) if names else 1
+    masks = [constants[place % terms].mask[:1] for place in range(len(names))]
     return (
         all(name in WALK_AXES for name in names)
-        and names == regular
-        and all(np.array_equal(m, np.broadcast_to(masks[i % terms][:1], m.shape)) for i, m in enumerate(masks, first))
+        and names == [name for name in dict.fromkeys(names) for _ in range(terms)]
+        and all(
+            np.array_equal(constant.mask, np.broadcast_to(mask, constant.mask.shape))
+            for constant, mask in zip(constants, masks, strict=True)
+        )
     )
 
 
@@ -95,7 +98,7 @@ def solution(problem: Problem) -> Solution:
     good = closed_form.determined(minima).clear & np.all([each.settled for each in first], 0)
     forward = np.stack([each.forward for each in first], 1)
     estimated = np.array([not triad.declared for triad in problem.triads])
-    stand, scale = Stand.of(problem), _first_noise(problem, first)
+    stand, scale = StandRuns.of(problem), _first_noise(problem, first)
     start = _Turn(stand, forward, at.errors.mT, at.constants, scale, 0 * scale, 0 * scale)
     there, steps, settled = _settled(start, estimated, good)
     state, determined = _ended(problem, there, first, at)
@@ -108,15 +111,14 @@ def refined(problem: Problem, state: State) -> Solution:
     """The fits from a state nearby, the noise being what the problem has."""
     at = closed_form.start(problem)
     first = [m for m in closed_form.minima(problem, at) if isinstance(m, AffineMinimum)]
-    one, zero = np.ones((len(state.params), 2)), np.zeros((len(state.params), 2))
-    start = _Turn(
-        Stand.of(problem), _forward(problem, state), state.errors.mT, state.constants, one, zero, zero
-    )
-    sound = np.isfinite(state.params).all(-1)
+    stand, forward = StandRuns.of(problem), _forward(problem, state)
+    one, zero = np.ones((len(forward), 2)), np.zeros((len(forward), 2))
+    start = _Turn(stand, forward, state.errors.mT, state.constants, one, zero, zero)
+    sound = np.asarray(np.isfinite(state.params).all(-1))
     there, steps, good = _settled(start, np.zeros(2, bool), sound)
-    there_state, determined = _ended(problem, there, first, at)
-    good &= determined.clear & np.isfinite(there_state.params).all(-1)
-    return Solution(there_state, one, determined, steps, good)
+    state, determined = _ended(problem, there, first, at)
+    good &= determined.clear & np.isfinite(state.params).all(-1)
+    return Solution(state, one, determined, steps, good)
 
 
 @dataclass(frozen=True)
@@ -165,7 +167,7 @@ def linear(problem: Problem, state: State) -> StandLinear:
 def _linear(problem: Problem, state: State) -> StandLinear:
     scale = np.ones((len(state.params), len(problem.triads)))
     forward = _forward(problem, state)
-    return Stand.of(problem).at(forward, state.errors.mT, state.constants, scale)
+    return StandRuns.of(problem).at(forward, state.errors.mT, state.constants, scale)
 
 
 def _forward(problem: Problem, state: State) -> Array:
@@ -192,35 +194,40 @@ def moved_params(problem: Problem, forward: Array) -> Array:
 
 def analysed(problem: Problem, state: State, determined: Determined) -> Analysis:
     """The analysis of fits with all directions determined, as `analyse` has it, with what the stand does."""
-    at = linear(problem, state)
-    include, p = problem.evidence.include, OF_PARAMETERS
+    at, include, p = linear(problem, state), problem.evidence.include, OF_PARAMETERS
     moved = moved_params(problem, _forward(problem, state))
     whole = at.covariance.copy()
     whole[:, :p] = moved @ whole[:, :p]
-    of_angles = moved @ at.of_angles @ moved.mT
     whole[:, :, :p] = whole[:, :, :p] @ moved.mT
-    spread = at.spread * include
-    squares = [
-        np.einsum("ijbn,ijbn->b", own[rows, rows], 2 * spread[rows, rows] - own[rows, rows] * include)
-        for own, rows in zip((at.weight,) * 2, TRIAD_ROWS, strict=True)
-    ]
-    squares = np.stack(squares, -1) + at.shared_squares
-    residual, spread = (np.ascontiguousarray(np.moveaxis(x, (-2, -1), (0, 1))) for x in (at.weighed(at.left), spread))
-    factor, freedom = variance_factors(residual, spread)
-    cross, nothing = whole[:, :p, p:], np.zeros((len(whole), p, 0))
+    spread, residual = at.spread * include, at.weighed(at.left)
+    pairs = [(at.weight[rows, rows], spread[rows, rows]) for rows in TRIAD_ROWS]
+    lone = [np.einsum("ijbn,ijbn->b", w, 2 * left - w * include) for w, left in pairs]
+    spread, residual = (
+        np.ascontiguousarray(np.moveaxis(each, (-2, -1), (0, 1))) for each in (spread, residual)
+    )
     return Analysis(
-        whole[:, :p, :p], determined, factor, freedom, residual, spread,
-        whole[:, p:, p:], effects_of(problem, cross), nothing, squares=squares, of_stand=of_angles,
-    )  # fmt: skip
+        whole[:, :p, :p],
+        determined,
+        *variance_factors(residual, spread),
+        residual,
+        spread,
+        whole[:, p:, p:],
+        effects_of(problem, whole[:, :p, p:]),
+        np.zeros((len(whole), p, 0)),
+        squares=np.stack(lone, -1) + at.shared_squares,
+        of_stand=moved @ at.of_angles @ moved.mT,
+    )
 
 
 def _settled(start: _Turn, estimated: Bools, sound: Bools) -> tuple[_Turn, Ints, Bools]:
     """Where fits end, after how many steps (B,), and which of the `sound` ones have settled (B,)."""
-    forward, errors, value, scale = (getattr(start, n).copy() for n in ("forward", "errors", "value", "scale"))
+    forward, errors, value, scale = (
+        getattr(start, n).copy() for n in ("forward", "errors", "value", "scale")
+    )
     active, now = np.arange(len(sound)), start
     steps, good = np.full(len(sound), MOST_STAND_STEPS), sound.copy()
     for count in range(1, MOST_STAND_STEPS + 1):
-        now, moving = now.next(estimated)
+        now, moving = now.next(estimated, anew=count > STEPS_ALIKE)
         forward[active], errors[active], scale[active] = now.forward, now.errors, now.scale
         value[active] = now.value
         steps[active[~moving]] = count
@@ -257,13 +264,13 @@ def _first_noise(problem: Problem, minima: Sequence[AffineMinimum]) -> Array:
 
 @dataclass(frozen=True)
 class _Turn:
-    """Where fits have come to: Φ (B, 2, 3, 4), errors (B, 3, n), terms of drifts (B, q), noise over the problem's (B, t).
+    """Where fits have come to: Φ (B, 2, 3, 4), errors (B, 3, n), drifts (B, q), the noise over the problem's (B, t).
 
-    `covariance` (B, u, u) is that of the unknowns, of which steps are taken. `excess` (B, t) is the logarithm of s as it
-    was, `change` that of the noise since: their secant says the next one.
+    `covariance` (B, u, u) is that of the unknowns, by which steps are taken. `excess` (B, t) is the logarithm of s as
+    it was, `change` that of the noise since: their secant says the next one.
     """
 
-    stand: Stand
+    stand: StandRuns
     forward: Array
     errors: Array
     value: Array
@@ -272,14 +279,15 @@ class _Turn:
     change: Array
     covariance: Array | None = None
 
-    def next(self, estimated: Bools) -> tuple[_Turn, Bools]:
+    def next(self, estimated: Bools, anew: bool) -> tuple[_Turn, Bools]:
         """A step of the fit, and of the noise where it is estimated (t,); and which members (B,) have not settled.
 
-        While the noise stays, so does the covariance: it says how far to go, and not where to end.
+        While the noise stays, so does the covariance unless it is asked for `anew`: it says how far to go, not where to
+        end.
         """
         here = self.stand.at(self.forward, self.errors, self.value, self.scale)
         covariance = self.covariance
-        if covariance is None or estimated.any():
+        if covariance is None or anew or estimated.any():
             covariance = here.covariance
         step, errors, length = here.step(covariance)
         moved = step[:, :OF_PARAMETERS].reshape(self.forward.shape)
