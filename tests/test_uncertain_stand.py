@@ -5,10 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mwdcal.calibration.estimate import fit
+from mwdcal.calibration.automatic.drift import with_drift
+from mwdcal.calibration.diagnosis import structure
+from mwdcal.calibration.estimate import fit, refitted
 from mwdcal.calibration.options import Options
+from mwdcal.estimation import drift, uncertainty
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.minimisers import closed_form, stand_linear, uncertain_stand
+from mwdcal.estimation.solvers import stepped
 from mwdcal.estimation.uncertainty import TESTED, left_out_residual, station_misfit
 from test_common_columns import imperfect
 from test_run_drift import runs
@@ -88,6 +92,91 @@ def test_angles_err_as_the_problem_has_it():
         np.testing.assert_allclose(
             np.moveaxis(vectors[index, :3], 0, -1), target, rtol=0, atol=1e-9
         )
+
+
+DRIFTING = [[], [True, False], [False, True], [True, True]]
+
+
+def drifting(seed, triads, **changes):
+    """Fits of tools, with a drift of some triads."""
+    result = fit(on_stand(seed, 5, **changes), OPTIONS)
+    return with_drift(result, OPTIONS, np.array(triads)) if triads else result
+
+
+@pytest.mark.parametrize("triads", DRIFTING, ids=str)
+def test_no_step_of_the_general_way_leads_further(triads):
+    ours = drifting(9, triads, size=2.0)
+    problem, state = ours.problem, ours.state
+    assert uncertain_stand.applies(problem)
+    moved = stepped(problem, state, ours.analysis.determined)
+    sd = np.sqrt(np.einsum("bii->bi", ours.analysis.covariance))
+    np.testing.assert_allclose((moved.params - state.params) / sd, 0, atol=1e-6)
+    np.testing.assert_allclose(moved.errors, state.errors, atol=1e-9)
+    if triads:
+        size = np.stack([constant.sd for constant in problem.evidence.constants], -1)
+        np.testing.assert_allclose((moved.constants - state.constants) / size, 0, atol=1e-6)
+
+
+@pytest.mark.parametrize("triads", DRIFTING, ids=str)
+def test_its_analysis_is_the_general_one(triads):
+    ours = drifting(9, triads)
+    problem, state, mine = ours.problem, ours.state, ours.analysis
+    other = uncertainty.analyse(problem, state, mine.determined)
+    other = uncertainty.completed(problem, state, other)
+    for name in vars(other):
+        if name not in ("determined", "influence"):
+            a, b = getattr(mine, name), getattr(other, name)
+            size = np.abs(b).max(initial=0.0)
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-9 * size, err_msg=name)
+
+
+def test_scores_of_drifts_are_the_general_ones():
+    result = fit(on_stand(10, 4), OPTIONS)
+    given = result.problem, result.state
+    mine = drift.walk_scores(*given, result.analysis)
+    other = drift.walk_scores(*given, replace(result.analysis, squares=None))
+    for name, places in mine.places.items():
+        some = np.ix_(np.arange(4), places, places)
+        theirs = other.of([name])
+        size = np.abs(theirs.information).max()
+        np.testing.assert_allclose(mine.score[:, places], theirs.score, atol=1e-9 * np.sqrt(size))
+        np.testing.assert_allclose(mine.information[some], theirs.information, atol=1e-9 * size)
+        np.testing.assert_allclose(mine.alone()[some], theirs.alone(), rtol=1e-9, atol=1e-9 * size)
+        np.testing.assert_allclose(mine.shown(name), other.shown(name), rtol=1e-7)
+
+
+def test_what_a_huge_drift_leaves_is_not_lost_in_rounding():
+    """A drift of 100 000 times the noise: by orthogonal columns, of which the drift's precision is a row each."""
+    result = fit(on_stand(11, 2), OPTIONS)
+    size = np.full((2, 2), 10.0)
+    walking = drift.with_walks(result.problem, result.state, {"accelerometer-drift": size})
+    ours = refitted(result, *walking, np.ones((2, 2)), OPTIONS)
+    linear = ours.problem.linear(ours.state)
+    root = np.linalg.cholesky(linear.weight).mT
+    columns = (root @ linear.design).reshape(2, -1, linear.prior.shape[-1])
+    prior = np.sqrt(np.einsum("bii->bi", linear.prior))[..., None] * np.eye(linear.prior.shape[-1])
+    whole = np.concatenate([columns, prior], 1)
+    basis = np.linalg.qr(whole / np.linalg.norm(whole, axis=1, keepdims=True))[0]
+    basis = basis[:, : columns.shape[1]].reshape(2, 48, 6, -1)
+    expected = root.mT @ (np.eye(6) - basis @ basis.mT) @ root
+    np.testing.assert_allclose(ours.analysis.spread, expected, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("declared", [True, False])
+def test_the_first_look_leaves_out_no_effect(declared, monkeypatch):
+    """Hysteresis from none to what is plain, at the same references: tools of chances about the limit."""
+    known = replace(imperfect(runs(12, 48)), settings="per-station")
+    moved = np.sign(np.diff(known.magnetometer, axis=1, prepend=known.magnetometer[:, :1]))
+    raw = known.magnetometer + np.linspace(0.0, 30.0, 48)[:, None, None] * moved
+    angles = {name: np.radians(sd) for name, sd in STAND.items()}
+    readings = replace(known, magnetometer=raw, sd=angles | (NOISE if declared else {}))
+    result = fit(readings, OPTIONS)
+    ours, looked_at = structure.shown_effects(result, {}), structure.on_stand_may_show(result)
+    monkeypatch.setattr(structure, "on_stand_may_show", lambda result: np.ones(48, bool))
+    theirs = structure.shown_effects(result, {})
+    assert [[*each] for each in ours] == [[*each] for each in theirs]
+    assert any(theirs)
+    assert not looked_at.all()
 
 
 def test_too_weak_attitudes_go_the_general_way(general):

@@ -24,7 +24,7 @@ from mwdcal.estimation.evidence import WALKS
 from mwdcal.estimation.minimisers import closed_form
 from mwdcal.estimation.minimisers.closed_form import AffineMinimum
 from mwdcal.estimation.minimisers.stand_columns import OF_PARAMETERS, TRIAD_ROWS, StandColumns
-from mwdcal.estimation.minimisers.stand_linear import MOST_AT_ONCE, StandRuns, StandLinear
+from mwdcal.estimation.minimisers.stand_linear import MOST_AT_ONCE, StandLinear, StandRuns
 from mwdcal.estimation.problem import WALK_AXES, Problem, State
 from mwdcal.estimation.solvers import Determined
 from mwdcal.estimation.uncertainty import Analysis, effects_of, variance_factors
