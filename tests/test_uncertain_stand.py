@@ -146,9 +146,9 @@ def test_scores_of_drifts_are_the_general_ones():
 
 
 def test_what_a_huge_drift_leaves_is_not_lost_in_rounding():
-    """A drift of 100 000 times the noise: by orthogonal columns, of which the drift's precision is a row each."""
+    """A drift of 10 000 times the noise: by orthogonal columns, of which the drift's precision is a row each."""
     result = fit(on_stand(11, 2), OPTIONS)
-    size = np.full((2, 2), 10.0)
+    size = np.full((2, 2), 1.0)
     walking = drift.with_walks(result.problem, result.state, {"accelerometer-drift": size})
     ours = refitted(result, *walking, np.ones((2, 2)), OPTIONS)
     linear = ours.problem.linear(ours.state)
@@ -156,7 +156,12 @@ def test_what_a_huge_drift_leaves_is_not_lost_in_rounding():
     columns = (root @ linear.design).reshape(2, -1, linear.prior.shape[-1])
     prior = np.sqrt(np.einsum("bii->bi", linear.prior))[..., None] * np.eye(linear.prior.shape[-1])
     whole = np.concatenate([columns, prior], 1)
-    basis = np.linalg.qr(whole / np.linalg.norm(whole, axis=1, keepdims=True))[0]
+    length = np.linalg.norm(whole, axis=1, keepdims=True)
+    basis, triangle = np.linalg.qr(whole / length)
+    back = np.linalg.inv(triangle)[:, :24] / length.mT[:, :24]
+    sd = np.sqrt(np.sum(back**2, -1))
+    stated = np.sqrt(np.einsum("bii->bi", ours.analysis.covariance))
+    np.testing.assert_allclose(stated, sd, rtol=1e-6)
     basis = basis[:, : columns.shape[1]].reshape(2, 48, 6, -1)
     expected = root.mT @ (np.eye(6) - basis @ basis.mT) @ root
     np.testing.assert_allclose(ours.analysis.spread, expected, rtol=0, atol=1e-8)
