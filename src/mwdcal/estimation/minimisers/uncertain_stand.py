@@ -35,7 +35,7 @@ MOST_STAND_STEPS = 12
 """Most steps of a fit: a member that has not settled then goes the general way."""
 STEPS_ALIKE = 4
 """First steps that are taken by one covariance; those of members that have not settled have their own."""
-LEAST_SQUARE = 1e-12
+LEAST_SQUARE = 1e-10
 """Square of the last step, in standard uncertainties."""
 LEAST_NOISE_CHANGE = 1e-5
 """Largest last change of the noise, as a share."""
