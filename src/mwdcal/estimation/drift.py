@@ -170,19 +170,17 @@ class WalkScores:
         )
 
 
-def walk_scores(problem: Problem, state: State, analysis: Analysis) -> WalkScores:
+def walk_scores(
+    problem: Problem, state: State, analysis: Analysis, walks: Sequence[str] | None = None
+) -> WalkScores:
     """Scores of the walks of a run that has none in its fit: what the fit's unknowns cannot take up.
 
-    The problem may be of one member for the residuals (B, n, m) of many.
+    `walks`: some of them; all if None.
     """
-    walking, at, sd, each = _walking(problem, state)
+    walking, at, sd, each = _walking(problem, state, families(problem) if walks is None else walks)
     old, residual, scale = len(problem.evidence.constants), analysis.residual, outer(sd)
     if not old and closed_form_drift.applies(walking):
-        score = closed_form_drift.scores(walking, at, residual) * sd
-        information = partial(closed_form_drift.information, walking, at)
-        return WalkScores(
-            score, information() * scale, lambda: information(alone=True) * scale, each
-        )
+        return _common_scores(walking, at, sd, each, residual)
     linear, base = problem.linear(state), _axes(problem, state, [*each])
     whole = whole_covariance(linear, analysis.determined)
     terms = terms_of(base.shape[1])[0][:, 1:]
@@ -194,6 +192,22 @@ def walk_scores(problem: Problem, state: State, analysis: Analysis) -> WalkScore
     alone = alone.reshape(count, *2 * (len(each), 3), *2 * terms.shape[1:])
     alone = alone.transpose(0, 1, 5, 2, 3, 6, 4).reshape(scale.shape) * scale
     return WalkScores(score, alone - crossed.mT @ whole @ crossed, lambda: alone, each)
+
+
+def common_scores(problem: Problem, state: State, residual: Array) -> WalkScores:
+    """The scores of all walks of runs at the same exact references, of residuals (B, n, m).
+
+    The problem may be of one member for the residuals of many.
+    """
+    return _common_scores(*_walking(problem, state, families(problem)), residual)
+
+
+def _common_scores(
+    walking: Problem, at: State, sd: Array, places: dict[str, Ints], residual: Array
+) -> WalkScores:
+    score, scale = closed_form_drift.scores(walking, at, residual) * sd, outer(sd)
+    information = partial(closed_form_drift.information, walking, at)
+    return WalkScores(score, information() * scale, lambda: information(alone=True) * scale, places)
 
 
 def _axes(problem: Problem, state: State, walks: Sequence[str]) -> Array:
@@ -217,8 +231,10 @@ def _by_term(values: Array, terms: Array) -> Array:
     return np.asarray(sums.swapaxes(-1, -2).reshape(*sums.shape[:-3], -1))
 
 
-def _walking(problem: Problem, state: State) -> tuple[Problem, State, Array, dict[str, Ints]]:
-    """The problem with drifts that are not in its fit, r = s = 1 noise of a reading, and without their means.
+def _walking(
+    problem: Problem, state: State, walks: Sequence[str]
+) -> tuple[Problem, State, Array, dict[str, Ints]]:
+    """The problem with those of some drifts that are not in its fit, r = s = 1 noise of a reading, and without their means.
 
     And the state for it, the standard deviations (B, k) of their terms, and the places of those of each drift.
     """
@@ -226,7 +242,7 @@ def _walking(problem: Problem, state: State) -> tuple[Problem, State, Array, dic
     sizes = {
         name: np.stack([size, size], -1)
         for name, size in noise(problem).items()
-        if name in families(problem) and name not in present
+        if name in walks and name not in present
     }
     walking, at = with_walks(problem, state, sizes)
     kept: list[SharedConstant] = []

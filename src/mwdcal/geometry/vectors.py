@@ -132,6 +132,28 @@ def inverse(matrix: Array) -> Array:
     return _each(np.linalg.inv, matrix)
 
 
+@np.errstate(invalid="ignore", divide="ignore", over="ignore")
+def inverse_of_three(matrix: Array) -> Array:
+    """Inverse of symmetric matrices (..., 3, 3) by cofactors; not finite where one is singular.
+
+    A tenth of the time of `inverse`, and less exact where a matrix is almost singular.
+    """
+    (a, b, c), (_, d, e), (_, _, f) = np.moveaxis(matrix, (-2, -1), (0, 1))
+    xx, xy, xz = d * f - e * e, c * e - b * f, b * e - c * d
+    yz = b * c - a * e
+    rows = (xx, xy, xz, xy, a * f - c * c, yz, xz, yz, a * d - b * b)
+    back = np.stack(rows, -1) / (a * xx + b * xy + c * xz)[..., None]
+    return np.asarray(back.reshape(matrix.shape))
+
+
+def are_positive(matrix: Array) -> Bools:
+    """Which symmetric matrices (..., 3, 3) have positive eigenvalues alone: their minors are positive."""
+    (a, b, c), (_, d, e), (_, _, f) = np.moveaxis(matrix, (-2, -1), (0, 1))
+    minor = a * d - b * b
+    whole = minor * f - a * e * e - d * c * c + 2 * b * c * e
+    return np.asarray((a > 0) & (minor > 0) & (whole > 0))
+
+
 def solved(matrix: Array, right: Array) -> Array:
     """Solutions (..., k, m) of matrix x = right; NaN for a singular matrix, never an exception."""
     return _each(np.linalg.solve, matrix, right)

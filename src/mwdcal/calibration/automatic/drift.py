@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -53,7 +54,8 @@ def chances(result: Fit) -> tuple[Array, Bools]:
 
     The least of those of the walks that act on a triad, times their number; and whether a trend would not show (B, t).
     """
-    scores, analysis = _scores(result), result.analysis
+    scores, trends = _scores(result)
+    analysis = result.analysis
     least, hidden = np.ones(analysis.freedom.shape), np.zeros(analysis.freedom.shape, bool)
     for name, triad in drift.acting(scores.places).items():
         scatter, rest = (x[:, triad] for x in (analysis.variance_factor, analysis.freedom))
@@ -62,17 +64,29 @@ def chances(result: Fit) -> tuple[Array, Bools]:
         one = f_test(total * ratio, mean * ratio, np.nan_to_num(scatter), rest)
         one = np.nan_to_num(one, nan=1.0) * (1 + (triad > 0))
         least[:, triad] = np.minimum(least[:, triad], one)
-        hidden[:, triad] |= scores.shown(name) < drift.LEAST_TREND
+        hidden[:, triad] |= trends[name] < drift.LEAST_TREND
     return least, hidden
 
 
-def _scores(result: Fit) -> drift.WalkScores:
+def _scores(result: Fit) -> tuple[drift.WalkScores, dict[str, Array]]:
+    """Scores of all walks, and how much of the trend of each is `shown`."""
     problem, analysis = result.problem, result.analysis
     if not (closed_form.applies(problem) and are_common(problem)):
-        return drift.walk_scores(problem, result.state, analysis)
-    one, state = perfect(Alike.of(problem, result.state))
-    nominal = replace(take(analysis, np.arange(1)), residual=analysis.residual)
-    return drift.walk_scores(one, state, nominal)
+        scores = drift.walk_scores(problem, result.state, analysis)
+        return scores, {name: scores.shown(name) for name in scores.places}
+    residual = analysis.residual
+    units, trends = _of_units(Alike.of(problem, result.state), residual.shape[-1])
+    return replace(units, score=residual.reshape(len(residual), -1) @ units.score), trends
+
+
+@lru_cache(maxsize=16)
+def _of_units(design: Alike, axes: int) -> tuple[drift.WalkScores, dict[str, Array]]:
+    """The scores of perfect sensors whose residuals are one on one axis of one station."""
+    problem, state = perfect(design)
+    stations = problem.temperature.shape[1]
+    residual = np.eye(stations * axes).reshape(-1, stations, axes)
+    scores = drift.common_scores(problem, state, residual)
+    return scores, {name: scores.shown(name) for name in scores.places}
 
 
 def drifting(result: Fit, options: Options) -> Bools:
@@ -170,10 +184,10 @@ def with_drift(result: Fit, options: Options, triads: Bools) -> Fit:
     """A fit with walks of estimated size that act on some triads (t,), from one without."""
     problem, (alone, _) = result.problem, _undisputed(result, options)
     declared, analysis = np.isnan(result.noise), alone.analysis
-    scores = drift.walk_scores(alone.problem, alone.state, analysis)
     known, noise = declared_sizes(problem.evidence), drift.noise(problem)
-    acting = drift.acting(scores.places).items()
-    scores = scores.of([name for name, triad in acting if triads[triad] or name in known])
+    acting = drift.acting(drift.families(problem)).items()
+    walks = [name for name, triad in acting if triads[triad] or name in known]
+    scores = drift.walk_scores(alone.problem, alone.state, analysis, walks)
     parts = [(known.get(n, np.zeros((1, 2)))[:, i], noise[n]) for n, i in scores.components()]
     least = np.stack([(size / one) ** 2 for size, one in parts], -1)
     theta, left = drift.walk_variances(
