@@ -418,13 +418,14 @@ def drifts(result: Fit) -> dict[str, tuple[Array, Array]]:
     changes = {}
     for name in drift.places(result.problem.evidence):
         path, terms = drift.walk(result.problem, result.state, name)
-        apart = path[:, :, None] - path[:, None]
-        distance = np.linalg.norm(apart, axis=-1)
-        far = distance.reshape(len(path), -1).argmax(-1)
-        first, second = np.unravel_index(far, distance.shape[1:])
+        size = np.sum(path**2, -1)
+        square = size[:, :, None] + size[:, None] - 2 * (path @ path.mT)
+        far = square.reshape(len(path), -1).argmax(-1)
+        first, second = np.unravel_index(far, square.shape[1:])
         every = np.arange(len(path))
-        change = distance[every, first, second]
-        along = apart[every, first, second] / np.maximum(change, 1e-300)[:, None]
+        apart = path[every, first] - path[every, second]
+        change = np.linalg.norm(apart, axis=-1)
+        along = apart / np.maximum(change, 1e-300)[:, None]
         pull = outer(along, terms[first] - terms[second]).reshape(len(path), -1)
         spread = drift.walk_covariance(result.problem, result.analysis, name)
         changes[name] = change, np.sqrt(np.einsum("bi,bij,bj->b", pull, spread, pull))

@@ -23,7 +23,7 @@ def take(batch: _T, index: Ints | slice) -> _T:
     """The members at `index`, as a batch of their own."""
 
     def taken(array: AnyArray) -> AnyArray:
-        if isinstance(index, slice) or 0 not in array.strides:
+        if not isinstance(index, np.ndarray) or 0 not in array.strides:
             return array[index]
         if is_once(array) and len(index) <= len(array):
             return array[: len(index)]

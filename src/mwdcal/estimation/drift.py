@@ -22,7 +22,7 @@ from mwdcal.estimation.evidence import WALKS, Evidence, SharedConstant
 from mwdcal.estimation.minimisers import closed_form_drift
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import Analysis, whole_covariance
-from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, eigen, finite, inverse, outer
+from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, eigen, finite, inverse, inverse_of_positive, outer
 
 MOST_TERMS = 8
 """Cosines of a walk: they hold 93 % of its variance; the rest looks like noise."""
@@ -287,8 +287,9 @@ class _Ridge:
         variance, value = np.empty(self.score.shape), np.empty(self.score.shape)
         lone = 1 / (self.values + ratio[:, self.some])
         scaled = self.cross * lone[:, None]
-        extra = ratio[:, self.others, None] * np.eye(len(self.others))
-        whole = inverse(self.rest + extra - scaled @ self.cross.mT)
+        rest = self.rest - scaled @ self.cross.mT
+        np.einsum("bii->bi", rest)[...] += ratio[:, self.others]
+        whole = inverse_of_positive(rest)
         pull = self.score[:, self.others, None] - scaled @ self.score[:, self.some, None]
         shared = whole @ pull
         value[:, self.others] = shared[..., 0]

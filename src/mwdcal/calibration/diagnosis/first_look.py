@@ -26,7 +26,7 @@ from mwdcal.estimation.minimisers.common_columns import (
     squares_of,
 )
 from mwdcal.estimation.problem import Problem, State
-from mwdcal.geometry.vectors import Array, Bools, Ints, eigen, inverse, outer, quotient
+from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, eigen, inverse_of_positive, outer, quotient
 
 EFFECT_CHANCE = 1e-4
 """Chance of so much common structure in noise, below which an effect is named."""
@@ -98,12 +98,13 @@ class _Drifts:
                     residual[..., 3 * index : 3 * index + 3],
                     each.information(response[index]),
                 )
-                inner = inverse(information + known[..., None] * np.eye(len(places)))
+                np.einsum("bii->bi", information)[...] += known
+                inner = inverse_of_positive(information)
                 force = each.score(response[index], part) + known * value
                 step = (inner @ force[..., None])[..., 0]
                 columns[index], covariance[index], pull[index] = each, inner, step
                 misfit += np.sum(known * value**2 - force * step, -1)
-                freedom += np.sum(inner * information, (-1, -2))
+                freedom += len(places) - np.sum(known * diagonal(inner), -1)
         return cls(columns, covariance, pull, misfit, freedom)
 
     def less(

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mwdcal.estimation.batch import for_all, is_once, repeated
+from mwdcal.estimation.batch import for_all, is_once
 from mwdcal.estimation.minimisers import closed_form_factors
 from mwdcal.estimation.problem import GEOMETRIC_NOISE, Problem, State, Triad
 from mwdcal.estimation.solvers import RANK_TOLERANCE, Determined, regress
@@ -208,38 +208,38 @@ def _diagonal_matrices(*parts: Array) -> Array:
 
 
 def _affine_minimum(triad: Triad, target: Array, include: Array) -> AffineMinimum:
-    level = noise_level(triad)
-    if level is not None and is_once(target, include):
-        return _common_minimum(triad, target, include, level)
+    """The minimum of one triad; at vectors that are held once, two products of all readings."""
+    level, shape = noise_level(triad), triad.raw.shape
+    if level is None:
+        return _uneven_minimum(triad, target, include)
+    some = slice(1 if is_once(target, include) else None)
+    fit = regress(triad.raw[some], target[some], include[some])
+    terms, cofactor = fit.terms, fit.cofactor[:, 0]
+    pull = (terms @ cofactor).mT * include[some].mT
+    forward = (pull @ triad.raw).mT
+    free = include[some] - np.sum(pull.mT * terms, -1, keepdims=True)
+    return AffineMinimum(
+        include,
+        np.broadcast_to(terms, (*shape[:2], 4)),
+        forward,
+        np.broadcast_to((cofactor * level**2)[:, None], (len(level), 3, 4, 4)),
+        *centred_parts(triad, forward),
+        (triad.raw - terms @ forward.mT) * (include / level),
+        np.broadcast_to(free, shape),
+        np.broadcast_to(fit.spanned, shape[:1]),
+    )
+
+
+def _uneven_minimum(triad: Triad, target: Array, include: Array) -> AffineMinimum:
+    """The same where the noise differs from reading to reading."""
     weight = include / triad.sd**2
-    fit = regress(triad.raw, target, weight if level is None else weight[..., :1])
+    fit = regress(triad.raw, target, weight)
     terms, forward, spread = fit.terms, fit.forward.mT, fit.cofactor
     left = (triad.raw - terms @ forward.mT) * np.sqrt(weight)
     share = np.einsum("banj,bnj->bna", terms[:, None] @ spread, terms) * weight
     parts = centred_parts(triad, forward)
     free = include - share
     return AffineMinimum(include, terms, forward, spread, *parts, left, free, fit.spanned)
-
-
-def _common_minimum(triad: Triad, target: Array, include: Array, level: Array) -> AffineMinimum:
-    """The minimum at vectors that are held once, all readings having one noise (B, 1, 1): two products."""
-    count, one = len(triad.raw), regress(triad.raw[:1], target[:1], include[:1])
-    terms, cofactor = one.terms[0], one.cofactor[0, 0]
-    pull = (terms @ cofactor).transpose() * include[0, :, 0]
-    forward = pull @ triad.raw
-    left = (triad.raw - terms @ forward) * (include / level)
-    free = include[:1] - np.sum(pull.transpose() * terms, -1, keepdims=True)
-    spread = np.broadcast_to((cofactor * level**2)[:, None], (count, 3, 4, 4))
-    return AffineMinimum(
-        include,
-        repeated(one.terms, count),
-        forward.mT,
-        spread,
-        *centred_parts(triad, forward.mT),
-        left,
-        repeated(np.broadcast_to(free, (1, *left.shape[1:])), count),
-        repeated(one.spanned, count),
-    )
 
 
 def noise_level(triad: Triad) -> Array | None:
