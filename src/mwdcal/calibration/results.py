@@ -25,6 +25,7 @@ from mwdcal.calibration.prior import PriorInformation
 from mwdcal.calibration.record import FREE_SHARE, NOISE, ORDER, REPEATABILITY, SETTINGS
 from mwdcal.estimation import drift
 from mwdcal.estimation.batch import take
+from mwdcal.estimation.evidence import STAND_ERRORS
 from mwdcal.estimation.problem import WALK_AXES
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.solvers import Linear
@@ -428,7 +429,7 @@ def drifts(result: Fit) -> dict[str, tuple[Array, Array]]:
         along = apart / np.maximum(change, 1e-300)[:, None]
         pull = outer(along, terms[first] - terms[second]).reshape(len(path), -1)
         spread = drift.walk_covariance(result.problem, result.analysis, name)
-        changes[name] = change, np.sqrt(np.einsum("bi,bij,bj->b", pull, spread, pull))
+        changes[name] = change, np.sqrt(np.sum((spread @ pull[..., None])[..., 0] * pull, -1))
     return changes
 
 
@@ -452,7 +453,9 @@ def drift_shares(result: Fit, values: Array) -> dict[str, Array]:
 def stand_errors(result: Fit) -> dict[str, Array]:
     """Estimated errors (B,) of the stand by field of `StandErrors`, degrees: those that are unknowns."""
     constants = result.problem.evidence.constants
-    names = [c.name if c.unknown else "" for c in constants]
+    names = [c.name if c.unknown and c.name in STAND_ERRORS else "" for c in constants]
+    if not any(names):
+        return {}
     value, covariance = np.degrees(result.state.constants), constants_covariance(result)
     covariance = np.degrees(np.degrees(covariance))
     errors = {}
