@@ -25,8 +25,9 @@ def take(batch: _T, index: Ints | slice) -> _T:
     def taken(array: AnyArray) -> AnyArray:
         if not isinstance(index, np.ndarray) or 0 not in array.strides:
             return array[index]
-        if is_once(array) and len(index) <= len(array):
-            return array[: len(index)]
+        if is_once(array):
+            count = len(index)
+            return array[:count] if count <= len(array) else repeated(array, count)
         return np.broadcast_to(_compact(array)[index], (len(index), *array.shape[1:]))
 
     members: _T = mapped(taken, batch)
@@ -39,7 +40,9 @@ def held_once(batch: _T) -> _T:
     def held(array: AnyArray) -> AnyArray:
         if is_once(array):
             return array
-        equal = len(array) and _same(array[-1], array[0]) and _same(array, repeated(array, len(array)))
+        equal = (
+            len(array) and _same(array[-1], array[0]) and _same(array, repeated(array, len(array)))
+        )
         return repeated(array, len(array)) if equal else array
 
     same: _T = mapped(held, batch)

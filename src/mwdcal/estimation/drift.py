@@ -22,7 +22,17 @@ from mwdcal.estimation.evidence import WALKS, Evidence, SharedConstant
 from mwdcal.estimation.minimisers import closed_form_drift
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import Analysis, whole_covariance
-from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, eigen, finite, inverse, inverse_of_positive, outer
+from mwdcal.geometry.vectors import (
+    Array,
+    Bools,
+    Ints,
+    diagonal,
+    eigen,
+    finite,
+    inverse,
+    inverse_of_positive,
+    outer,
+)
 
 MOST_TERMS = 8
 """Cosines of a walk: they hold 93 % of its variance; the rest looks like noise."""
@@ -234,9 +244,10 @@ def _by_term(values: Array, terms: Array) -> Array:
 def _walking(
     problem: Problem, state: State, walks: Sequence[str]
 ) -> tuple[Problem, State, Array, dict[str, Ints]]:
-    """The problem with those of some drifts that are not in its fit, r = s = 1 noise of a reading, and without their means.
+    """The problem with those of some drifts that are not in its fit, r = s = 1 noise of a reading.
 
-    And the state for it, the standard deviations (B, k) of their terms, and the places of those of each drift.
+    They are without their means. And the state for it, the standard deviations (B, k) of their terms, and the places
+    of those of each drift.
     """
     present, old = places(problem.evidence), problem.evidence.constants
     sizes = {

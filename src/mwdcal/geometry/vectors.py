@@ -135,7 +135,7 @@ def inverse(matrix: Array) -> Array:
 
 
 def inverse_of_positive(matrix: Array) -> Array:
-    """Inverse of symmetric positive matrices (..., k, k), by halves: two thirds of the time of `inverse` from k = 20 on."""
+    """Inverse of symmetric positive matrices (..., k, k), by halves: two thirds of the time from 20 rows on."""
     half = matrix.shape[-1] // 2
     if half < LEAST_HALF:
         return inverse(matrix)

@@ -26,7 +26,16 @@ from mwdcal.estimation.minimisers.common_columns import (
     squares_of,
 )
 from mwdcal.estimation.problem import Problem, State
-from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, eigen, inverse_of_positive, outer, quotient
+from mwdcal.geometry.vectors import (
+    Array,
+    Bools,
+    Ints,
+    diagonal,
+    eigen,
+    inverse_of_positive,
+    outer,
+    quotient,
+)
 
 EFFECT_CHANCE = 1e-4
 """Chance of so much common structure in noise, below which an effect is named."""
@@ -94,10 +103,8 @@ class _Drifts:
             precision = closed_form_drift.prior_precision(problem)
             for index, (places, each) in closed_form_drift.walk_columns(design).items():
                 known, value = precision[:, places], state.constants[:, places]
-                part, information = (
-                    residual[..., 3 * index : 3 * index + 3],
-                    each.information(response[index]),
-                )
+                part = residual[..., 3 * index : 3 * index + 3]
+                information = each.information(response[index])
                 np.einsum("bii->bi", information)[...] += known
                 inner = inverse_of_positive(information)
                 force = each.score(response[index], part) + known * value
@@ -138,7 +145,9 @@ class _Families:
     sides: list[str]
 
     @classmethod
-    def of(cls, columns: dict[str, dict[int, CommonColumns]], triads: int, stations: int) -> _Families:
+    def of(
+        cls, columns: dict[str, dict[int, CommonColumns]], triads: int, stations: int
+    ) -> _Families:
         """Of the effects of each family on each triad."""
         common = {name: each for name, each in columns.items() if each}
         counts = [next(iter(each.values())).whole.shape[-1] for each in common.values()]
@@ -160,14 +169,14 @@ class _Families:
         self, residual: Array, response: list[Array]
     ) -> tuple[list[Array], list[Array], Array]:
         """By triad: scores (B, k) and products (B, p) of all families; and the squares (B, k) of whole columns."""
-        scores, information, square = [], [], 0.0
+        scores, information, square = [], [], np.zeros(())
         for index, reads in enumerate(response):
             pull = residual[..., 3 * index : 3 * index + 3] @ reads
             scores.append(pull.reshape(len(pull), -1) @ self.left[index].reshape(pull[0].size, -1))
             squared = squares_of(reads)
             information.append(squared @ self.products[index])
             square = square + squared @ self.squares[index]
-        return scores, information, np.asarray(square)
+        return scores, information, square
 
 
 @lru_cache(maxsize=8)

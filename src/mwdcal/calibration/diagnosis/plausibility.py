@@ -164,11 +164,11 @@ def straying(result: Fit) -> Bools:
     analysis = result.analysis
     variance = diagonal(analysis.spread)
     stray = analysis.residual**2 > STRAY_DEVIATIONS**2 * np.maximum(variance, 1e-30)
-    members = stray.any((-1, -2))
+    members = np.asarray(stray.any((-1, -2)))
     places = np.flatnonzero(members)
     if places.size:
         members[places] = ~_explained(take(result, places))
-    return np.asarray(members)
+    return members
 
 
 def _explained(result: Fit) -> Bools:
@@ -187,7 +187,7 @@ def _run_variance(result: Fit) -> Array:
     """The s² (B,) of all readings of a run together, or one if that is less."""
     factor, freedom = result.analysis.variance_factor, np.maximum(result.analysis.freedom, 0)
     squares = np.sum(np.nan_to_num(factor) * freedom, -1)
-    return np.maximum(squares / np.maximum(result.analysis.freedom.sum(-1), 1.0), 1.0)
+    return np.asarray(np.maximum(squares / np.maximum(result.analysis.freedom.sum(-1), 1.0), 1.0))
 
 
 def freedom_of(result: Fit) -> Array:

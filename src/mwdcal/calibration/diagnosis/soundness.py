@@ -191,7 +191,9 @@ def is_covariance(covariance: Array) -> Bools:
 def _semidefinite(correlation: Array) -> Bools:
     """Which symmetric matrices (..., p, p) have no negative eigenvalue beyond rounding."""
     half = correlation.shape[-1] // 2
-    if half and not correlation[..., :half, half:].any():  # of two triads that have no error in common
+    if (
+        half and not correlation[..., :half, half:].any()
+    ):  # of two triads that have no error in common
         first, second = correlation[..., :half, :half], correlation[..., half:, half:]
         return _semidefinite(first) & _semidefinite(second)
     lifted = correlation + ASYMMETRY * np.eye(correlation.shape[-1])
