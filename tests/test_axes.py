@@ -9,7 +9,7 @@ import pytest
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.diagnosis.axes import explaining, named
 from mwdcal.calibration.diagnosis.flags import FittedRuns
-from mwdcal.calibration.diagnosis.plausibility import excessive_errors
+from mwdcal.calibration.diagnosis.plausibility import excessive_errors, straying
 from mwdcal.calibration.diagnosis.refusals import fit_refusals
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
@@ -159,3 +159,25 @@ def test_errors_that_the_misfit_does_not_explain():
     assert expected < 0.1 * DEG
     sound = one(miswired(1, ("dip",), wrong=[np.eye(3)]), 0)
     assert excessive_errors(sound, fit(sound)) == {}
+
+
+@pytest.mark.parametrize("declared", [True, False], ids=["declared", "estimated"])
+def test_runs_whose_errors_are_not_looked_at_have_none_that_the_misfit_does_not_explain(declared):
+    """Angles misread by all sizes: at one station, at a third of them, at all."""
+    sound = one(miswired(1, ("dip",), wrong=[np.eye(3)]), 0)
+    sound = sound if declared else replace(sound, sd={})
+    rng, passed, looked = np.random.default_rng(3), 0, 0
+    for size in np.radians(np.geomspace(0.05, 30, 12)):
+        for share in (1 / sound.count, 0.3, 1.0):
+            for name in ("inclination", "azimuth", "toolface"):
+                off = size * (rng.permutation(sound.count) < share * sound.count)
+                known = {**sound.known, name: sound.known[name] + off}
+                run = replace(sound, known=known)
+                result = fit(run)
+                if straying(result)[0]:
+                    looked += 1
+                else:
+                    passed += 1
+                    assert excessive_errors(run, result) == {}
+    assert passed > 20
+    assert looked > 5

@@ -13,7 +13,16 @@ from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.errors import FitError, InputError
-from mwdcal.estimation.batch import batch_of_one, join, kind_of, put, take
+from mwdcal.estimation.batch import (
+    batch_of_one,
+    for_all,
+    held_once,
+    is_once,
+    join,
+    kind_of,
+    put,
+    take,
+)
 from mwdcal.sensor.profile import Profile, TriadProfile
 from simulation import Tool, plan
 
@@ -78,6 +87,41 @@ def test_a_batch_of_one_has_its_member_first():
     one = Leaf(np.arange(6.0).reshape(2, 3))
     assert batch_of_one(one).rows.shape == (1, 2, 3)
     assert (take(batch_of_one(one), 0).rows == one.rows).all()
+
+
+def test_what_members_have_in_common_is_held_once_and_stays_so():
+    common, own = np.tile([1.0, np.nan, 3.0], (4, 1)), np.arange(12.0).reshape(4, 3)
+    level = np.broadcast_to(np.arange(4.0)[:, None], (4, 3))
+    whole = held_once({"common": common, "own": own, "level": level})
+    some = take(whole, np.array([2, 0, 2, 1, 1]))
+    parts = join([take(whole, np.array([0, 1])), take(whole, np.array([2, 3]))])
+    for each, index in ((whole, range(4)), (some, [2, 0, 2, 1, 1]), (parts, range(4))):
+        assert is_once(each["common"])
+        assert not is_once(each["own"], each["common"])
+        assert not each["level"].strides[1]
+        for name, values in (("common", common), ("own", own), ("level", level)):
+            np.testing.assert_array_equal(each[name], values[list(index)])
+    assert is_once(put(whole, np.array([1]), take(whole, np.array([3])))["common"])
+    other = put(whole, np.array([1]), {**take(whole, np.array([3])), "common": np.zeros((1, 3))})
+    np.testing.assert_array_equal(other["common"][:3], [[1, np.nan, 3], [0, 0, 0], [1, np.nan, 3]])
+
+
+def test_parts_that_hold_different_values_once_do_not_join_as_one():
+    parts = [held_once({"a": np.full((2, 3), value)}) for value in (1.0, 2.0)]
+    np.testing.assert_array_equal(join(parts)["a"][:, 0], [1, 1, 2, 2])
+
+
+def test_work_on_what_is_held_once_is_done_once():
+    seen = []
+
+    def doubled(*arrays):
+        seen.append(len(arrays[0]))
+        return 2 * arrays[0]
+
+    once, own = np.broadcast_to(np.arange(3.0), (5, 3)), np.ones((5, 3))
+    np.testing.assert_array_equal(for_all(doubled, once), 2 * once)
+    np.testing.assert_array_equal(for_all(doubled, once, own), 2 * once)
+    assert seen == [1, 5]
 
 
 NOMINAL = TriadProfile(scale=1.0)

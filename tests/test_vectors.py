@@ -5,8 +5,11 @@ import pytest
 
 from mwdcal.geometry import observables as ob
 from mwdcal.geometry.vectors import (
+    are_positive,
     centred,
     inverse,
+    inverse_of_positive,
+    inverse_of_three,
     nearest_rotation,
     reference_vectors,
     rotation,
@@ -139,3 +142,28 @@ def test_the_root_of_a_covariance_has_no_column_for_what_does_not_vary():
     root = square_root(np.diag([4.0, 0.0, 9.0]))
     assert root.shape == (3, 2)
     np.testing.assert_allclose(root @ root.T, np.diag([4.0, 0.0, 9.0]), atol=1e-14)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("size", [3, 9, 10, 30, 57])
+def test_inverses_of_symmetric_matrices_give_one(shape, size):
+    rows = np.random.default_rng(size).standard_normal((*shape, size, 2 * size))
+    matrix = rows @ rows.mT
+    ways = [inverse_of_positive] + [inverse_of_three] * (size == 3)
+    for way in ways:
+        back = way(matrix)
+        np.testing.assert_allclose(
+            back @ matrix, np.broadcast_to(np.eye(size), matrix.shape), atol=1e-10
+        )
+        np.testing.assert_allclose(back, back.mT, atol=1e-12 * np.abs(back).max())
+
+
+def test_positive_matrices_are_those_without_a_negative_eigenvalue():
+    rng = np.random.default_rng(2)
+    turns = rotation(rng.standard_normal((200, 3)))
+    values = rng.uniform(-0.3, 1, (200, 3))
+    positive = are_positive((turns * values[:, None]) @ turns.mT)
+    assert 20 < positive.sum() < 180
+    np.testing.assert_array_equal(positive, (values > 0).all(-1))
+    assert not are_positive(np.full((3, 3), np.nan))
+    assert not np.isfinite(inverse_of_three(np.ones((3, 3)))).any()

@@ -14,7 +14,7 @@ from mwdcal.calibration.methods import EVIDENCE, Solved, solve, with_stand_error
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prior import prior_of
 from mwdcal.calibration.readings import TRIADS, Readings
-from mwdcal.estimation.batch import put, take
+from mwdcal.estimation.batch import held_once, put, take
 from mwdcal.estimation.evidence import ANGLES, Evidence
 from mwdcal.estimation.minimisers import closed_form, closed_form_drift, uncertain_stand
 from mwdcal.estimation.problem import Problem, State, Triad
@@ -121,6 +121,7 @@ def _problem(
     """
     cold = np.zeros(readings.count)
     temperature = flat(cold if readings.temperature is None else readings.temperature, lead)
+    temperature = held_once(temperature)
     curved = options.curved
     names = readings.triads
     raws = [flat(getattr(readings, name), lead, 3) for name in names]
@@ -130,7 +131,8 @@ def _problem(
         kind, sound = options.kind(order), raw if finite.all() else _sound(raw, finite)
         whole = model_of(kind, order, sound, temperature, evidence.include, name in curved)
         declared = name in readings.sd
-        sd = flat(readings.sd[name], lead, 3) if declared else 1e-3 * _size(raw) + 0 * raw
+        sd = readings.sd[name] if declared else 1e-3 * _size(raw)
+        sd = flat(sd, lead, 3) if declared else np.broadcast_to(sd, raw.shape)
         triads.append(Triad(restricted(whole, options.parameters), sound, sd, declared))
     prior = prior_of(options.knowledge, [t.model for t in triads], len(evidence.include))
     problem = Problem(tuple(triads), temperature, evidence, prior)
@@ -168,7 +170,7 @@ def fit(readings: Readings, options: Options | None = None, include: Array | Non
     """
     options = options or Options()
     include = np.ones(readings.count) if include is None else np.asarray(include, float)
-    evidence = _evidence(readings, include, options)
+    evidence = held_once(_evidence(readings, include, options))
     lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
     problem, finite = _problem(readings, evidence, lead, options)
     closed, good = _special(problem, options, finite)
@@ -579,7 +581,15 @@ def _rescaled(problem: Problem, scale: Array) -> Problem:
     """The problem with the noise of triads that declare none times `scale` (B, triads)."""
     factors = np.moveaxis(np.where(np.isfinite(scale), scale, 1.0), -1, 0)[..., None, None]
     triads = tuple(
-        t if t.declared else replace(t, sd=np.maximum(t.sd * factor, LEAST_NOISE * _size(t.raw)))
+        t if t.declared else replace(t, sd=_noise_times(t, factor))
         for t, factor in zip(problem.triads, factors, strict=True)
     )
     return problem.with_noise(triads, problem.evidence)
+
+
+def _noise_times(triad: Triad, factor: Array) -> Array:
+    """The noise of a triad times a factor (B, 1, 1), held once for all readings where it is alike."""
+    level = closed_form.noise_level(triad)
+    least = LEAST_NOISE * _size(triad.raw)
+    sd = np.maximum((triad.sd if level is None else level) * factor, least)
+    return np.broadcast_to(sd, triad.sd.shape)

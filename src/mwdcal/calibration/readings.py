@@ -386,6 +386,8 @@ def soaks(temperature: Array) -> Ints:
 def usable_soaks(temperature: Array) -> Ints:
     """Number (..., n) of each station's soak: all 0 where temperatures span less than `LEAST_TEMPERATURE_SPAN`."""
     wide = np.ptp(temperature, axis=-1, keepdims=True) >= LEAST_TEMPERATURE_SPAN
+    if not wide.any():
+        return np.zeros(temperature.shape, int)
     return np.where(wide, soaks(temperature), 0)
 
 

@@ -25,6 +25,7 @@ from mwdcal.calibration.prior import PriorInformation
 from mwdcal.calibration.record import FREE_SHARE, NOISE, ORDER, REPEATABILITY, SETTINGS
 from mwdcal.estimation import drift
 from mwdcal.estimation.batch import take
+from mwdcal.estimation.evidence import STAND_ERRORS
 from mwdcal.estimation.problem import WALK_AXES
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.uncertainty import (
@@ -399,16 +400,17 @@ def drifts(result: Fit) -> dict[str, tuple[Array, Array]]:
     changes = {}
     for name in drift.places(result.problem.evidence):
         path, terms = drift.walk(result.problem, result.state, name)
-        apart = path[:, :, None] - path[:, None]
-        distance = np.linalg.norm(apart, axis=-1)
-        far = distance.reshape(len(path), -1).argmax(-1)
-        first, second = np.unravel_index(far, distance.shape[1:])
+        size = np.sum(path**2, -1)
+        square = size[:, :, None] + size[:, None] - 2 * (path @ path.mT)
+        far = square.reshape(len(path), -1).argmax(-1)
+        first, second = np.unravel_index(far, square.shape[1:])
         every = np.arange(len(path))
-        change = distance[every, first, second]
-        along = apart[every, first, second] / np.maximum(change, 1e-300)[:, None]
+        apart = path[every, first] - path[every, second]
+        change = np.linalg.norm(apart, axis=-1)
+        along = apart / np.maximum(change, 1e-300)[:, None]
         pull = outer(along, terms[first] - terms[second]).reshape(len(path), -1)
         spread = drift.walk_covariance(result.problem, result.analysis, name)
-        changes[name] = change, np.sqrt(np.einsum("bi,bij,bj->b", pull, spread, pull))
+        changes[name] = change, np.sqrt(np.sum((spread @ pull[..., None])[..., 0] * pull, -1))
     return changes
 
 
@@ -432,7 +434,9 @@ def drift_shares(result: Fit, values: Array) -> dict[str, Array]:
 def stand_errors(result: Fit) -> dict[str, Array]:
     """Estimated errors (B,) of the stand by field of `StandErrors`, degrees: those that are unknowns."""
     constants = result.problem.evidence.constants
-    names = [c.name if c.unknown else "" for c in constants]
+    names = [c.name if c.unknown and c.name in STAND_ERRORS else "" for c in constants]
+    if not any(names):
+        return {}
     value, covariance = np.degrees(result.state.constants), constants_covariance(result)
     covariance = np.degrees(np.degrees(covariance))
     errors = {}

@@ -22,7 +22,17 @@ from mwdcal.estimation.evidence import WALKS, Evidence, SharedConstant
 from mwdcal.estimation.minimisers import closed_form_drift, uncertain_stand
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import Analysis, whole_covariance
-from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, eigen, finite, inverse, outer
+from mwdcal.geometry.vectors import (
+    Array,
+    Bools,
+    Ints,
+    diagonal,
+    eigen,
+    finite,
+    inverse,
+    inverse_of_positive,
+    outer,
+)
 
 MOST_TERMS = 8
 """Cosines of a walk: they hold 93 % of its variance; the rest looks like noise."""
@@ -56,12 +66,6 @@ def terms_of(count: int) -> tuple[Array, Array]:
 def families(problem: Problem) -> list[str]:
     """The walks that a run may show: of the offsets of each triad, and of the field."""
     return [*WALKS][: 1 if len(problem.triads) == 1 else len(WALKS)]
-
-
-def looked_for(problem: Problem) -> list[str]:
-    """Those of them that are not in the fit of a problem."""
-    present = places(problem.evidence)
-    return [name for name in families(problem) if name not in present]
 
 
 def acting(walks: Iterable[str]) -> dict[str, int]:
@@ -177,20 +181,16 @@ class WalkScores:
 
 
 def walk_scores(
-    problem: Problem, state: State, analysis: Analysis, walks: Sequence[str] = ()
+    problem: Problem, state: State, analysis: Analysis, walks: Sequence[str] | None = None
 ) -> WalkScores:
-    """Scores of the walks, or of some, of a run that has none in its fit: what the fit's unknowns cannot take up.
+    """Scores of the walks of a run that has none in its fit: what the fit's unknowns cannot take up.
 
-    The problem may be of one member for the residuals (B, n, m) of many.
+    `walks`: some of them; all if None.
     """
-    walking, at, sd, each = _walking(problem, state, walks or looked_for(problem))
+    walking, at, sd, each = _walking(problem, state, families(problem) if walks is None else walks)
     old, residual, scale = len(problem.evidence.constants), analysis.residual, outer(sd)
     if not old and closed_form_drift.applies(walking):
-        score = closed_form_drift.scores(walking, at, residual) * sd
-        information = partial(closed_form_drift.information, walking, at)
-        return WalkScores(
-            score, information() * scale, lambda: information(alone=True) * scale, each
-        )
+        return _common_scores(walking, at, sd, each, residual)
     if not old and analysis.squares is not None and uncertain_stand.applies(problem):
         return _on_stand(problem, state, each, sd)
     linear, base = problem.linear(state), _axes(problem, state, [*each])
@@ -219,6 +219,22 @@ def _on_stand(problem: Problem, state: State, places: dict[str, Ints], sd: Array
     return WalkScores(score * sizes, left * scale, lambda: alone * scale, by_axis)
 
 
+def common_scores(problem: Problem, state: State, residual: Array) -> WalkScores:
+    """The scores of all walks of runs at the same exact references, of residuals (B, n, m).
+
+    The problem may be of one member for the residuals of many.
+    """
+    return _common_scores(*_walking(problem, state, families(problem)), residual)
+
+
+def _common_scores(
+    walking: Problem, at: State, sd: Array, places: dict[str, Ints], residual: Array
+) -> WalkScores:
+    score, scale = closed_form_drift.scores(walking, at, residual) * sd, outer(sd)
+    information = partial(closed_form_drift.information, walking, at)
+    return WalkScores(score, information() * scale, lambda: information(alone=True) * scale, places)
+
+
 def _axes(problem: Problem, state: State, walks: Sequence[str]) -> Array:
     """Columns (B, n, m, a) of what a unit of each axis of some drifts does at every station."""
     evidence = problem.evidence
@@ -243,12 +259,17 @@ def _by_term(values: Array, terms: Array) -> Array:
 def _walking(
     problem: Problem, state: State, walks: Sequence[str]
 ) -> tuple[Problem, State, Array, dict[str, Ints]]:
-    """The problem with drifts that are not in its fit, r = s = 1 noise of a reading, and without their means.
+    """The problem with those of some drifts that are not in its fit, r = s = 1 noise of a reading.
 
-    And the state for it, the standard deviations (B, k) of their terms, and the places of those of each drift.
+    They are without their means. And the state for it, the standard deviations (B, k) of their terms, and the places
+    of those of each drift.
     """
-    old = problem.evidence.constants
-    sizes = {n: np.stack([size, size], -1) for n, size in noise(problem).items() if n in walks}
+    present, old = places(problem.evidence), problem.evidence.constants
+    sizes = {
+        name: np.stack([size, size], -1)
+        for name, size in noise(problem).items()
+        if name in walks and name not in present
+    }
     walking, at = with_walks(problem, state, sizes)
     kept: list[SharedConstant] = []
     columns = {}
@@ -292,8 +313,9 @@ class _Ridge:
         variance, value = np.empty(self.score.shape), np.empty(self.score.shape)
         lone = 1 / (self.values + ratio[:, self.some])
         scaled = self.cross * lone[:, None]
-        extra = ratio[:, self.others, None] * np.eye(len(self.others))
-        whole = inverse(self.rest + extra - scaled @ self.cross.mT)
+        rest = self.rest - scaled @ self.cross.mT
+        np.einsum("bii->bi", rest)[...] += ratio[:, self.others]
+        whole = inverse_of_positive(rest)
         pull = self.score[:, self.others, None] - scaled @ self.score[:, self.some, None]
         shared = whole @ pull
         value[:, self.others] = shared[..., 0]

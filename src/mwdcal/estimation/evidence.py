@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from mwdcal.estimation.batch import for_all
 from mwdcal.geometry.vectors import Array, Bools, Ints
 
 ANGLES = ("inclination", "azimuth", "toolface")
@@ -82,12 +83,12 @@ class Evidence:
 
     def is_known(self, name: str) -> Bools:
         """Where a reference value is given (B, n)."""
-        return ~np.isnan(self.known[name])
+        return for_all(lambda values: ~np.isnan(values), self.known[name])
 
     @cached_property
     def known_or_zero(self) -> dict[str, Array]:
         """The reference values, zero where unknown."""
-        return {name: np.nan_to_num(values) for name, values in self.known.items()}
+        return {name: for_all(np.nan_to_num, values) for name, values in self.known.items()}
 
     @cached_property
     def members(self) -> Array:

@@ -25,6 +25,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from mwdcal.estimation.batch import for_all
 from mwdcal.estimation.evidence import EARTH, STAND, STAND_ERRORS, UNKNOWN, WALKS, Evidence
 from mwdcal.estimation.solvers import Linear
 from mwdcal.geometry.vectors import (
@@ -151,7 +152,7 @@ class Problem:
             attitude,
             np.stack(constants, -1) if constants else np.zeros((shape[0], 0)),
             np.zeros((*shape, len(evidence.absent))),
-            np.zeros((*shape, 3)),
+            np.broadcast_to(0.0, (*shape, 3)),
             np.zeros((shape[0], evidence.set_together.shape[-1])),
         )
 
@@ -184,8 +185,8 @@ class Problem:
 
     @staticmethod
     def _seen(attitude: Array, gravity: Array, field: Array, dip: Array) -> list[Array]:
-        earth = earth_gravity(gravity), earth_field(field, dip)
-        return [np.einsum("bnij,bnj->bni", attitude, vector) for vector in earth]
+        earth = for_all(earth_gravity, gravity), for_all(earth_field, field, dip)
+        return [for_all(_turned, attitude, vector) for vector in earth]
 
     def attitude(self, state: State) -> Array:
         """Attitudes (B, n, 3, 3) with the errors of known angles in."""
@@ -551,3 +552,8 @@ class Problem:
             return np.asarray(natural)
         whole = rotation(UNKNOWN * private) @ attitude
         return np.where(free[..., None, None], whole, natural)
+
+
+def _turned(attitude: Array, vector: Array) -> Array:
+    """Vectors (B, n, 3) of the earth as tools of an attitude (B, n, 3, 3) see them."""
+    return np.asarray(np.einsum("bnij,bnj->bni", attitude, vector))

@@ -16,16 +16,19 @@ from itertools import chain
 
 import numpy as np
 
+from mwdcal.estimation.batch import is_once, repeated
 from mwdcal.estimation.problem import GEOMETRIC_NOISE, Problem, State
 from mwdcal.estimation.solvers import RANK_TOLERANCE, Determined, Linear
 from mwdcal.geometry.vectors import (
     Array,
     Bools,
     Ints,
+    are_positive,
     diagonal,
     eigen,
     finite,
     inverse,
+    inverse_of_three,
     nearest_rotation,
     outer,
     quotient,
@@ -367,8 +370,7 @@ def station_misfit(analysis: Analysis) -> tuple[Array, Array]:
     Directions of a station's readings that nothing tests (share below `TESTED`) do not count.
     """
     back, freedom = _tested_inverse(analysis.spread)
-    residual = analysis.residual
-    return np.sum(residual * (back @ residual[..., None])[..., 0], -1), freedom
+    return np.sum(analysis.residual * _along(back, analysis.residual), -1), freedom
 
 
 def left_out_residual(analysis: Analysis) -> Array:
@@ -376,18 +378,39 @@ def left_out_residual(analysis: Analysis) -> Array:
 
     Exact for a linear problem. Directions of a station's readings that nothing else tests have none.
     """
-    return np.asarray((_tested_inverse(analysis.spread)[0] @ analysis.residual[..., None])[..., 0])
+    return _along(_tested_inverse(analysis.spread)[0], analysis.residual)
+
+
+def _along(back: Array, residual: Array) -> Array:
+    """Products (B, n, m) of matrices (B, n, m, m) with residuals; station by station where the first are held once."""
+    if is_once(back):
+        return np.asarray((np.moveaxis(residual, 1, 0) @ back[0].mT).swapaxes(0, 1))
+    return np.asarray((back @ residual[..., None])[..., 0])
 
 
 def _tested_inverse(spread: Array) -> tuple[Array, Array]:
     """Inverse (B, n, m, m) along the directions that are tested, and their number (B, n)."""
-    back = inverse(spread)
+    if is_once(spread):
+        back, freedom = _inverse_of_tested(spread[:1])
+        return repeated(back, len(spread)), repeated(freedom, len(spread))
+    if spread.shape[-1] == 6 and not spread[..., :3, 3:].any():  # no error moves both triads
+        each = [_inverse_of_tested(spread[..., k : k + 3, k : k + 3]) for k in (0, 3)]
+        back = np.zeros(spread.shape)
+        back[..., :3, :3], back[..., 3:, 3:] = each[0][0], each[1][0]
+        return back, each[0][1] + each[1][1]
+    return _inverse_of_tested(spread)
+
+
+def _inverse_of_tested(spread: Array) -> tuple[Array, Array]:
+    """The same, whatever the members and the triads have in common."""
+    three = spread.shape[-1] == 3
+    back = inverse_of_three(spread) if three else inverse(spread)
     freedom = np.full(spread.shape[:-2], float(spread.shape[-1]))
     with np.errstate(invalid="ignore", over="ignore"):
         some = ~(np.sum(back**2, (-1, -2)) < TESTED**-2)  # else no eigenvalue is nearer to zero
-    try:
-        np.linalg.cholesky(spread[~some])
-    except np.linalg.LinAlgError:  # a robust fit may leave a variance below zero
+    if three:
+        some |= ~are_positive(spread)
+    elif not _all_positive(spread[~some]):
         some[...] = True
     if some.any():
         values, vectors = eigen(spread[some])
@@ -395,6 +418,15 @@ def _tested_inverse(spread: Array) -> tuple[Array, Array]:
         along = vectors * quotient(np.ones_like(values), values, tested)[:, None]
         back[some], freedom[some] = along @ vectors.mT, np.count_nonzero(tested, -1)
     return back, freedom
+
+
+def _all_positive(spread: Array) -> bool:
+    """Whether no matrix has a negative eigenvalue: a robust fit may leave a variance below zero."""
+    try:
+        np.linalg.cholesky(spread)
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 def without_station(problem: Problem, state: State, analysis: Analysis) -> Array:

@@ -24,7 +24,9 @@ from mwdcal.geometry.vectors import AnyArray, Bools, Ints
 from mwdcal.sensor.profile import Profile
 
 TOOLS_PER_FIT = 320
-"""Tools fitted in one call: few enough for the cache, many enough for NumPy."""
+"""Tools fitted in one call: few enough for the cache, many enough for NumPy…"""
+AT_EXACT_REFERENCES = 640
+"""…and where all references are exact: a tool then takes a fifth of the memory."""
 _T = TypeVar("_T")
 Fail = Callable[[Ints, Exception], None]
 """What becomes of tools that an exception stops."""
@@ -72,6 +74,12 @@ def with_curves(
     trials = in_chunks(readings, tools, shown, fail)
     for chosen, some in _by_choice(trials):
         yield some, replace(options, nonlinearity=dict(compress(terms.items(), chosen)))
+
+
+def tools_per_fit(readings: Readings) -> int:
+    """How many tools of a batch are fitted in one call."""
+    exact = not any(readings.uncertainty(name).any() for name in readings.known)
+    return AT_EXACT_REFERENCES if exact else TOOLS_PER_FIT
 
 
 def alike(tools: Ints, keys: AnyArray) -> list[tuple[AnyArray, Ints]]:

@@ -17,6 +17,7 @@ import numpy as np
 from mwdcal.calibration.diagnosis.flags import Alone
 from mwdcal.calibration.readings import Readings, group_numbers
 from mwdcal.errors import InputError, MwdcalError
+from mwdcal.estimation.batch import held_once
 from mwdcal.files.contract import COLUMNS, RANGES
 from mwdcal.files.faults import faults
 from mwdcal.files.formats import parquet
@@ -229,4 +230,5 @@ def _readings(rows: Rows, tools: Ints) -> Readings:
 
     readings, _ = convert(cells, where.shape, rows.profile, rows.offsets[0][tools][:, None])
     group = rows.groups[where]
-    return replace(readings, group=group if (group >= 0).any() else None, source=rows.source)
+    readings = replace(readings, group=group if (group >= 0).any() else None, source=rows.source)
+    return held_once(readings)

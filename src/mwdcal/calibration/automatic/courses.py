@@ -83,6 +83,8 @@ def f_test(square: Array, freedom: Array, scatter: Array, rest: Array) -> Array:
     Against a `scatter` that `rest` degrees of freedom tell of. NaN where there is nothing to test.
     """
     tested = (freedom > 0) & (rest >= 1)
+    if not tested.any():
+        return np.full(np.broadcast_shapes(tested.shape, square.shape, scatter.shape), np.nan)
     ratio = square / np.where(tested, freedom * scatter, 1.0)
     ratio, freedom = np.where(tested, ratio, 0.0), np.where(tested, freedom, 1.0)
     return np.where(tested, fisher_tail(freedom, np.maximum(rest, 1.0), ratio), np.nan)

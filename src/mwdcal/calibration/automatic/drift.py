@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -53,27 +54,39 @@ def chances(result: Fit) -> tuple[Array, Bools]:
 
     The least of those of the walks that act on a triad, times their number; and whether a trend would not show (B, t).
     """
+    scores, trends = _scores(result)
     analysis = result.analysis
     least, hidden = np.ones(analysis.freedom.shape), np.zeros(analysis.freedom.shape, bool)
-    for name, triad in drift.acting(drift.looked_for(result.problem)).items():
-        scores = _scores(result, name)
+    for name, triad in drift.acting(scores.places).items():
         scatter, rest = (x[:, triad] for x in (analysis.variance_factor, analysis.freedom))
         total, mean, square = scores.square(scores.places[name])
         ratio = np.where(square > 0, mean / np.where(square > 0, square, 1.0), 0.0)
         one = f_test(total * ratio, mean * ratio, np.nan_to_num(scatter), rest)
         one = np.nan_to_num(one, nan=1.0) * (1 + (triad > 0))
         least[:, triad] = np.minimum(least[:, triad], one)
-        hidden[:, triad] |= scores.shown(name) < drift.LEAST_TREND
+        hidden[:, triad] |= trends[name] < drift.LEAST_TREND
     return least, hidden
 
 
-def _scores(result: Fit, walk: str) -> drift.WalkScores:
+def _scores(result: Fit) -> tuple[drift.WalkScores, dict[str, Array]]:
+    """Scores of all walks, and how much of the trend of each is `shown`."""
     problem, analysis = result.problem, result.analysis
     if not (closed_form.applies(problem) and are_common(problem)):
-        return drift.walk_scores(problem, result.state, analysis, [walk])
-    one, state = perfect(Alike.of(problem, result.state))
-    nominal = replace(take(analysis, np.arange(1)), residual=analysis.residual)
-    return drift.walk_scores(one, state, nominal, [walk])
+        scores = drift.walk_scores(problem, result.state, analysis)
+        return scores, {name: scores.shown(name) for name in scores.places}
+    residual = analysis.residual
+    units, trends = _of_units(Alike.of(problem, result.state), residual.shape[-1])
+    return replace(units, score=residual.reshape(len(residual), -1) @ units.score), trends
+
+
+@lru_cache(maxsize=16)
+def _of_units(design: Alike, axes: int) -> tuple[drift.WalkScores, dict[str, Array]]:
+    """The scores of perfect sensors whose residuals are one on one axis of one station."""
+    problem, state = perfect(design)
+    stations = problem.temperature.shape[1]
+    residual = np.eye(stations * axes).reshape(-1, stations, axes)
+    scores = drift.common_scores(problem, state, residual)
+    return scores, {name: scores.shown(name) for name in scores.places}
 
 
 def drifting(result: Fit, options: Options) -> Bools:
@@ -172,7 +185,7 @@ def with_drift(result: Fit, options: Options, triads: Bools) -> Fit:
     problem, (alone, _) = result.problem, _undisputed(result, options)
     declared, analysis = np.isnan(result.noise), alone.analysis
     known, noise = declared_sizes(problem.evidence), drift.noise(problem)
-    acting = drift.acting(drift.looked_for(alone.problem)).items()
+    acting = drift.acting(drift.families(problem)).items()
     walks = [name for name, triad in acting if triads[triad] or name in known]
     scores = drift.walk_scores(alone.problem, alone.state, analysis, walks)
     parts = [(known.get(n, np.zeros((1, 2)))[:, i], noise[n]) for n, i in scores.components()]

@@ -295,6 +295,8 @@ def _followed(fitted: FittedRuns) -> Iterator[Flag]:
 
     Not those that explain the residuals, which `_structure` names.
     """
+    if not fitted.readings.others:
+        return
     sizes = drifts(fitted.result)
     shown = fitted.shown(np.flatnonzero(suspected(fitted.result, fitted.chances))) if sizes else {}
     for column, values in fitted.readings.others.items():

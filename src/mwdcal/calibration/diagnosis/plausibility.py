@@ -144,9 +144,7 @@ def excessive_errors(readings: Readings, result: Fit) -> dict[str, tuple[float, 
     that is above one: so are the uncertainties that a calibration states. In a robust fit stations
     count with the pull that they have. A drift within the run that is part of the fit is no error here.
     """
-    analysis = result.analysis
-    squares = np.nan_to_num(analysis.variance_factor[0]) * np.maximum(analysis.freedom[0], 0)
-    misfit = np.sqrt(max(squares.sum() / max(analysis.freedom[0].sum(), 1.0), 1.0))
+    misfit = float(np.sqrt(_run_variance(result)[0]))
     residuals, weight = Residuals(readings, result), result.trust[0]
     excessive = {}
     for name, after in residuals.errors(residuals.undrifted).items():
@@ -166,7 +164,30 @@ def straying(result: Fit) -> Bools:
     analysis = result.analysis
     variance = diagonal(analysis.spread)
     stray = analysis.residual**2 > STRAY_DEVIATIONS**2 * np.maximum(variance, 1e-30)
-    return np.asarray(stray.any((-1, -2)))
+    members = np.asarray(stray.any((-1, -2)))
+    places = np.flatnonzero(members)
+    if places.size:
+        members[places] = ~_explained(take(result, places))
+    return members
+
+
+def _explained(result: Fit) -> Bools:
+    """Members (B,) that cannot have `excessive_errors`: no station's misfit d² is that large.
+
+    By Schwarz's inequality the square of any error of a station is at most d² times its expectation. Half of the
+    limit is left for errors that are not linear in the readings.
+    """
+    square, tested = station_misfit(result.analysis)
+    whole = (tested == result.analysis.residual.shape[-1]).all(-1) & ~robust(result)
+    least = EXCESS_RATIO**2 / 2 * _run_variance(result)
+    return np.asarray(whole & (square.max(-1) <= least) & (result.analysis.influence is None))
+
+
+def _run_variance(result: Fit) -> Array:
+    """The s² (B,) of all readings of a run together, or one if that is less."""
+    factor, freedom = result.analysis.variance_factor, np.maximum(result.analysis.freedom, 0)
+    squares = np.sum(np.nan_to_num(factor) * freedom, -1)
+    return np.asarray(np.maximum(squares / np.maximum(result.analysis.freedom.sum(-1), 1.0), 1.0))
 
 
 def freedom_of(result: Fit) -> Array:

@@ -16,7 +16,7 @@ import numpy as np
 from mwdcal.calibration.readings import HIGHEST, TRIADS
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
-from mwdcal.geometry.vectors import Array, Bools, diagonal, outer
+from mwdcal.geometry.vectors import Array, Bools, diagonal, inverse, outer
 
 LARGEST = 1e30
 """Magnitude that no number of a calibration reaches, nor the inverse of a gain."""
@@ -190,6 +190,12 @@ def is_covariance(covariance: Array) -> Bools:
 
 def _semidefinite(correlation: Array) -> Bools:
     """Which symmetric matrices (..., p, p) have no negative eigenvalue beyond rounding."""
+    half = correlation.shape[-1] // 2
+    if (
+        half and not correlation[..., :half, half:].any()
+    ):  # of two triads that have no error in common
+        first, second = correlation[..., :half, :half], correlation[..., half:, half:]
+        return _semidefinite(first) & _semidefinite(second)
     lifted = correlation + ASYMMETRY * np.eye(correlation.shape[-1])
     try:
         np.linalg.cholesky(lifted)
@@ -203,8 +209,12 @@ def invertible(slope: Array) -> Bools:
     finite = np.isfinite(slope)
     largest = np.abs(np.where(finite, slope, 0.0)).max((-1, -2))
     sized = (largest <= LARGEST) & (largest >= 1 / LARGEST)
-    condition = np.linalg.cond(np.where(finite & sized[..., None, None], slope, 0.0))
-    return np.asarray(np.all(finite, (-1, -2, -3)) & np.all(condition <= WORST, -1))
+    usable = np.where(finite & sized[..., None, None], slope, 0.0)
+    bound = np.linalg.norm(usable, axis=(-2, -1)) * np.linalg.norm(inverse(usable), axis=(-2, -1))
+    fine = bound <= WORST  # no condition number is larger
+    if not fine.all():
+        fine[~fine] = np.linalg.cond(usable[~fine]) <= WORST
+    return np.asarray(np.all(finite, (-1, -2, -3)) & np.all(fine, -1))
 
 
 def mirrored(slope: Array) -> Bools:

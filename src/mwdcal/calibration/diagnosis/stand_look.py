@@ -40,7 +40,7 @@ def on_stand_may_show(result: Fit) -> Bools:
     if not are_alike(problem):
         return every
     design = _exact(problem, result.state)
-    common = common_effects(design)
+    common = common_effects(design).columns
     if any(name.endswith(("-temperature", "-thermal-lag")) for name in common):
         return every
     at, errors = uncertain_stand.linear(problem, result.state), result.state.errors
@@ -77,7 +77,7 @@ def _exact(problem: Problem, state: State) -> Alike:
 def _columns(problem: Problem, result: Fit, design: Alike) -> Iterator[Array]:
     """Columns (6, k, B, n) of every effect in whitened readings."""
     response, include = responses(problem, result.state), problem.evidence.include
-    for name, columns in common_effects(design).items():
+    for name, columns in common_effects(design).columns.items():
         triad, _, kind = name.partition("-")
         if kind == "hysteresis":
             index = TRIADS.index(triad)

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mwdcal.estimation.batch import for_all, is_once
 from mwdcal.estimation.minimisers import closed_form_factors
 from mwdcal.estimation.problem import GEOMETRIC_NOISE, Problem, State, Triad
 from mwdcal.estimation.solvers import RANK_TOLERANCE, Determined, regress
@@ -87,9 +88,11 @@ class AffineMinimum:
     @property
     def covariance(self) -> Array:
         """Covariance (B, 12, 12) of the parameters."""
-        inner = self.turn.mT[:, None] @ self.spread @ self.turn[:, None]
-        both = self.back[:, :, None] * self.back[:, None]
-        whole = both.reshape(-1, 9, 3) @ inner.reshape(-1, 3, 16)
+        spread, both = self.spread, self.back[:, :, None] * self.back[:, None]
+        if not spread.strides[1]:  # alike for all axes
+            spread, both = spread[:, :1], both.sum(-1, keepdims=True)
+        inner = self.turn.mT[:, None] @ spread @ self.turn[:, None]
+        whole = both.reshape(len(both), 9, -1) @ inner.reshape(len(both), -1, 16)
         whole = np.swapaxes(whole.reshape(-1, 3, 3, 4, 4), 2, 3).reshape(-1, 12, 12)
         return np.asarray(whole[:, PLACES[:, None], PLACES])
 
@@ -100,15 +103,32 @@ class AffineMinimum:
         Normalised, the information is a Kronecker product.
         """
         gain, batch = self.forward[..., :3], len(self.forward)
-        read = self.terms[..., :3] @ gain.mT
-        size = np.sqrt(np.einsum("bni,bni->bn", read, read))[..., None]
-        rows = self.terms * (self.include / (GEOMETRIC_NOISE * size))
+        square = gain.mT @ gain
+        pairs = for_all(_pairs, self.terms)
+        strength = _over_stations(square.reshape(batch, 9), pairs[..., _OF_VECTOR].mT)
+        weight = self.include[..., 0] / (GEOMETRIC_NOISE**2 * strength)
         undo = inverse(self.turn)
-        parts = [gain.mT @ gain, undo @ rows.mT @ rows @ undo.mT]
+        parts = [square, undo @ _over_stations(weight, pairs).reshape(batch, 4, 4) @ undo.mT]
         sizes = [np.sqrt(diagonal(part)) for part in parts]
         pair = [eigenvalues(m / outer(s)) for m, s in zip(parts, sizes, strict=True)]
         squares, norms = (np.einsum("bi,bj->bij", *p).reshape(batch, 12) for p in (pair, sizes))
         return np.sqrt(np.clip(squares, 0, None)), norms[:, PLACES]
+
+
+_OF_VECTOR = np.array([0, 1, 2, 4, 5, 6, 8, 9, 10])
+"""Products of the elements of the vector, without the one, among the `_pairs` of f̃."""
+
+
+def _pairs(terms: Array) -> Array:
+    """Products (B, n, 16) of the elements of f̃ with each other."""
+    return outer(terms).reshape(*terms.shape[:2], 16)
+
+
+def _over_stations(values: Array, columns: Array) -> Array:
+    """Sums (B, k) of values (B, n) times columns (B, n, k): one product where these are held once."""
+    if is_once(columns):
+        return np.asarray(values @ columns[0])
+    return np.asarray((values[:, None] @ columns)[:, 0])
 
 
 Minima = list[AffineMinimum | closed_form_factors.FactorsMinimum]
@@ -131,8 +151,10 @@ def minima(problem: Problem, at: State) -> Minima:
 def start(problem: Problem) -> State:
     """The known attitudes, with parameters of zero."""
     known, shape = problem.evidence.known, problem.temperature.shape
-    azimuth = known["azimuth"] if len(problem.triads) > 1 else np.zeros_like(known["azimuth"])
-    attitude = tool_from_earth(known["inclination"], azimuth, known["toolface"])
+    azimuth = known["azimuth"]
+    if len(problem.triads) == 1:
+        azimuth = for_all(np.zeros_like, azimuth)
+    attitude = for_all(tool_from_earth, known["inclination"], azimuth, known["toolface"])
     params = np.zeros((shape[0], problem.slices()[-1].stop))
     return problem.start(params, attitude)
 
@@ -152,13 +174,10 @@ def solution(problem: Problem, at: State) -> tuple[State, Analysis, Bools]:
     covariance = np.zeros((len(include), p, p))
     for triad, where in zip(triads, problem.slices(), strict=True):
         covariance[:, where, where] = triad.covariance
-    left, free = (np.concatenate([getattr(h, n) for h in triads], -1) for n in ("left", "open"))
-    spread = np.zeros((*free.shape, free.shape[-1]))
-    np.einsum("...ii->...i", spread)[...] = free
-    squares, freedom = (
-        np.stack([np.sum(getattr(h, n) ** k, (1, 2)) for h in triads], -1)
-        for n, k in (("left", 2), ("open", 1))
-    )
+    left = np.concatenate([h.left for h in triads], -1)
+    spread = for_all(_diagonal_matrices, *(h.open for h in triads))
+    squares = np.stack([np.sum(h.left**2, (1, 2)) for h in triads], -1)
+    freedom = np.stack([for_all(lambda x: np.sum(x, (1, 2)), h.open) for h in triads], -1)
     factor = per_freedom(squares, freedom)
     none = np.zeros((len(include), p, 0))
     known = determined(triads)
@@ -180,23 +199,55 @@ def rescaled(problem: Problem, quieter: Problem, analysis: Analysis) -> Analysis
     )
 
 
+def _diagonal_matrices(*parts: Array) -> Array:
+    """Matrices (B, n, m, m) of which the parts (B, n, 3) are the diagonal."""
+    free = np.concatenate(parts, -1)
+    spread = np.zeros((*free.shape, free.shape[-1]))
+    np.einsum("...ii->...i", spread)[...] = free
+    return spread
+
+
 def _affine_minimum(triad: Triad, target: Array, include: Array) -> AffineMinimum:
+    """The minimum of one triad; at vectors that are held once, two products of all readings."""
+    level, shape = noise_level(triad), triad.raw.shape
+    if level is None:
+        return _uneven_minimum(triad, target, include)
+    some = slice(1 if is_once(target, include) else None)
+    fit = regress(triad.raw[some], target[some], include[some])
+    terms, cofactor = fit.terms, fit.cofactor[:, 0]
+    pull = (terms @ cofactor).mT * include[some].mT
+    forward = (pull @ triad.raw).mT
+    free = include[some] - np.sum(pull.mT * terms, -1, keepdims=True)
+    return AffineMinimum(
+        include,
+        np.broadcast_to(terms, (*shape[:2], 4)),
+        forward,
+        np.broadcast_to((cofactor * level**2)[:, None], (len(level), 3, 4, 4)),
+        *centred_parts(triad, forward),
+        (triad.raw - terms @ forward.mT) * (include / level),
+        np.broadcast_to(free, shape),
+        np.broadcast_to(fit.spanned, shape[:1]),
+    )
+
+
+def _uneven_minimum(triad: Triad, target: Array, include: Array) -> AffineMinimum:
+    """The same where the noise differs from reading to reading."""
     weight = include / triad.sd**2
-    alike = bool((weight == weight[..., :1]).all())
-    fit = regress(triad.raw, target, weight[..., :1] if alike else weight)
+    fit = regress(triad.raw, target, weight)
     terms, forward, spread = fit.terms, fit.forward.mT, fit.cofactor
     left = (triad.raw - terms @ forward.mT) * np.sqrt(weight)
     share = np.einsum("banj,bnj->bna", terms[:, None] @ spread, terms) * weight
-    return AffineMinimum(
-        include,
-        terms,
-        forward,
-        spread,
-        *centred_parts(triad, forward),
-        left,
-        include - share,
-        fit.spanned,
-    )
+    parts = centred_parts(triad, forward)
+    free = include - share
+    return AffineMinimum(include, terms, forward, spread, *parts, left, free, fit.spanned)
+
+
+def noise_level(triad: Triad) -> Array | None:
+    """The noise (B, 1, 1) of all readings of a triad; None where they differ in it."""
+    level = triad.sd[:, :1, :1]
+    if any(triad.sd.strides[1:]) and (triad.sd != level).any():
+        return None
+    return level
 
 
 def centred_parts(triad: Triad, forward: Array) -> tuple[Array, Array]:

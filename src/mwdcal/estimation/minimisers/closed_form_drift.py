@@ -22,7 +22,7 @@ from mwdcal.estimation.minimisers.common_columns import (
 )
 from mwdcal.estimation.problem import WALK_AXES, Problem, State
 from mwdcal.estimation.uncertainty import Analysis, scaled_freedom, variance_factors
-from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, inverse
+from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, inverse_of_positive
 from mwdcal.sensor.models import affine_parts
 
 DRIFT_ROUNDS = 12
@@ -133,7 +133,7 @@ def _covariances(columns: WalkColumns, precision: Array, reads: list[Array]) -> 
     for index, (places, each) in columns.items():
         information = each.information(reads[index])
         np.einsum("bii->bi", information)[...] += precision[:, places]
-        covariance[index] = inverse(information)
+        covariance[index] = inverse_of_positive(information)
     return covariance
 
 

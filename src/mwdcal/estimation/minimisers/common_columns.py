@@ -13,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from mwdcal.estimation.batch import take
+from mwdcal.estimation.batch import held_once, is_once, take
 from mwdcal.estimation.minimisers import closed_form
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.geometry.vectors import Array, Bools, inverse
@@ -33,10 +33,10 @@ def are_alike(problem: Problem) -> bool:
     evidence = problem.evidence
     if not all(isinstance(triad.model, Polynomial) for triad in problem.triads):
         return False
-    if any(np.ptp(triad.sd, axis=(1, 2)).any() for triad in problem.triads):
+    if any(closed_form.noise_level(triad) is None for triad in problem.triads):
         return False
     arrays = [*evidence.known.values(), evidence.include, problem.temperature]
-    return all(np.array_equal(a, np.broadcast_to(a[:1], a.shape), equal_nan=True) for a in arrays)
+    return is_once(*held_once(tuple(arrays)))
 
 
 @dataclass(frozen=True)
@@ -113,16 +113,12 @@ class CommonColumns:
         left = whole - (basis @ taken).reshape(whole.shape)
         taken = np.linalg.solve(triangle, taken).reshape(-1, *whole.shape[1:])
         lengths = _by_response(np.einsum("nik,njk->ijk", whole, whole))
-        return cls(whole, left, taken, _products(left, left), lengths)
+        return cls(whole, left, taken, products_of(left, left), lengths)
 
     def information(self, response: Array) -> Array:
         """Information (B, k, k) on the effects, the sensors' parameters being unknown; of `responses` (B, 3, 6)."""
         count = self.whole.shape[-1]
         return np.asarray((squares_of(response) @ self.products).reshape(-1, count, count))
-
-    def across(self, other: CommonColumns) -> Array:
-        """Sums (16, k q) as `products`, of our columns and of others."""
-        return _products(self.left, other.left)
 
     def squares(self, response: Array) -> Array:
         """Squares (B, k) of the lengths of the columns in whitened readings."""
@@ -130,6 +126,10 @@ class CommonColumns:
 
     def score(self, response: Array, residual: Array) -> Array:
         """Scores (B, k) of the effects in whitened residuals (B, n, 3) of a fit without them."""
+        if len(response) == 1:  # of one response for all residuals
+            columns = self.seen(response)[0]
+            flat = residual.reshape(len(residual), -1)
+            return np.asarray(flat @ columns.reshape(-1, columns.shape[-1]))
         flat = (residual @ response).reshape(len(residual), -1)
         return np.asarray(flat @ self.left.reshape(-1, self.left.shape[-1]))
 
@@ -143,7 +143,7 @@ class CommonColumns:
         return np.asarray(both @ response.mT)
 
 
-def _products(first: Array, second: Array) -> Array:
+def products_of(first: Array, second: Array) -> Array:
     """Sums (16, k q) over the stations of products of columns (n, 6, k) and (n, 6, q)."""
     flat = np.moveaxis(first, 0, 2)[:, None] @ np.moveaxis(second, 1, 0)
     return _by_response(flat)
