@@ -135,6 +135,17 @@ class Evidence:
         return self._turn_sd(lone)
 
     @cached_property
+    def held_sd(self) -> Array:
+        """The same (B, n, 3) of angles that have a reference, zero of the others."""
+        return np.where(self.referenced, self.turn_sd, 0.0)
+
+    @cached_property
+    def about_tool(self) -> bool:
+        """Whether stations turn about axes of the tool alone: all three of a free one, else the tool's own."""
+        across = (self.turn_sd[..., :2] > 0).any(-1) & ~self.free
+        return not (across.any() or self.set_together.any())
+
+    @cached_property
     def exact_turn_sd(self) -> Array:
         """The same where every reference is exact."""
         return self._turn_sd(dict.fromkeys(ANGLES, np.zeros(())))

@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import Any, TypeVar
 
 import numpy as np
@@ -53,7 +53,7 @@ WALK_AXES = {
     for axis, name in enumerate(names)
 }
 """Number of the walk and of its axis by the name of a constant."""
-NOISELESS = ("state", "attitude", "predictions", "linear True")
+NOISELESS = ("state", "attitude", "group axes", "predictions", "linear True")
 """What a problem's memo has that no noise enters."""
 
 
@@ -91,7 +91,7 @@ class Prediction:
 
     `misfit` (B, n, 3) raw; `by_params` (B, n, 3, p); `by_turn` (B, n, 3, 3) for a turn of the
     station; `by_earth` (B, n, 3, 3) for its gravity, field and dip; `by_vector` (B, n, 3, 3) for
-    the field's north, east and down; `strength` (B, n) of the field in raw units.
+    the field's north, east and down; `vector` (B, n, 3) is the field in raw units.
     """
 
     misfit: Array
@@ -99,7 +99,12 @@ class Prediction:
     by_turn: Array
     by_earth: Array
     by_vector: Array
-    strength: Array
+    vector: Array
+
+    @property
+    def strength(self) -> Array:
+        """Size (B, n) of the field in raw units."""
+        return np.asarray(np.linalg.norm(self.vector, axis=-1))
 
 
 @dataclass(frozen=True)
@@ -157,8 +162,8 @@ class Problem:
 
     def slices(self) -> list[slice]:
         """Where each triad's parameters lie."""
-        ends = np.cumsum([0] + [t.model.size for t in self.triads])
-        return [slice(int(a), int(b)) for a, b in pairwise(ends)]
+        ends = accumulate((t.model.size for t in self.triads), initial=0)
+        return [slice(*each) for each in pairwise(ends)]
 
     def fields(self, state: State) -> tuple[Array, Array]:
         """Corrected vectors (B, n, 3) of both triads, left-out stations too; NaN for a missing one."""
@@ -231,19 +236,11 @@ class Problem:
 
     def _predictions(self, state: State) -> list[Prediction]:
         gravity, field, dip = (self.constant(state, c) for c in EARTH)
-        attitude = self.attitude(state)
-        one, zero = np.ones_like(gravity), np.zeros((*gravity.shape, 3))
-        changes = (
-            [earth_gravity(one), zero, zero],
-            [zero, earth_field(one, dip), earth_field(field, dip + np.pi / 2)],
-        )
-        result = []
+        attitude, result = self.attitude(state), []
+        targets = self._seen(attitude, gravity, field, dip)
+        changes = self._earth_changes(field, dip)
         for triad, where, target, change in zip(
-            self.triads,
-            self.slices(),
-            self._seen(attitude, gravity, field, dip),
-            changes,
-            strict=False,
+            self.triads, self.slices(), targets, changes, strict=False
         ):
             params = state.params[:, where]
             fields = triad.model.fields(params, triad.raw, self.temperature)
@@ -257,12 +254,22 @@ class Problem:
                     misfit,
                     back @ by_params,
                     back @ skew(target),
-                    by_vector @ np.stack(change, -1),
+                    by_vector @ change,
                     by_vector,
-                    np.linalg.norm(np.einsum("bnij,bnj->bni", back, target), axis=-1),
+                    np.einsum("bnij,bnj->bni", back, target),
                 )
             )
         return result
+
+    @staticmethod
+    def _earth_changes(field: Array, dip: Array) -> Array:
+        """Changes (2, B, n, 3, 3) of both earth vectors, columns of each, by gravity, field and dip."""
+        changes = np.zeros((2, *field.shape, 3, 3))
+        north, down = np.cos(dip), np.sin(dip)
+        changes[0, ..., 2, 0] = 1.0
+        changes[1, ..., 0, 1], changes[1, ..., 2, 1] = north, down
+        changes[1, ..., 0, 2], changes[1, ..., 2, 2] = -field * down, field * north
+        return changes
 
     def linear(self, state: State, geometry: bool = False) -> Linear:
         """Linearise at a state; `geometry` takes references as exact and noise as uniform.
@@ -275,19 +282,19 @@ class Problem:
         if geometry and (state.errors.any() or state.settings.any()):
             state = replace(state, errors=0 * state.errors, settings=0 * state.settings)
         residual, blocks, turns, by_earth = self._whitened(state, geometry)
-        angles = turns @ self._angle_axes(state)
-        residual = residual - np.einsum("bnmi,bni->bnm", angles, state.errors)
+        angles = turns if self.evidence.about_tool else turns @ self._angle_axes(state)
+        if state.errors.any():
+            residual = residual - np.einsum("bnmi,bni->bnm", angles, state.errors)
         constants = self._constant_columns(state, by_earth, turns, geometry)
         if not geometry and self.walks:
             drifted = constants[..., self.walks] @ state.constants[:, None, self.walks, None]
             residual = residual + drifted[..., 0]
         settings = self._setting_columns(angles, geometry)
         shared = np.concatenate([constants, *self._group_turns(state, turns), settings], -1)
-        departures = by_earth[..., [EARTH.index(name) for name in self.evidence.absent]]
-        private = [
-            self._private_turns(angles, turns, geometry),
-            departures * self._absent_scales(state)[..., None, :],
-        ]
+        private = [self._private_turns(angles, turns, geometry)]
+        if self.evidence.absent:
+            departures = by_earth[..., [EARTH.index(name) for name in self.evidence.absent]]
+            private.append(departures * self._absent_scales(state)[..., None, :])
         if self.evidence.scatter and not geometry:
             columns, scatter = self.scatter_columns(state), self.evidence.scatter
             private += [c * scatter[name][..., None, None] for name, c in columns.items()]
@@ -300,7 +307,9 @@ class Problem:
         """Errors of known angles in units of their σ, among `count` private unknowns, and which are none."""
         held = np.zeros((*state.errors.shape[:2], count))
         loose = np.ones(held.shape, bool)
-        sd = np.where(self.evidence.referenced, self.evidence.turn_sd, 0.0)
+        sd = self.evidence.held_sd
+        if not sd.any():
+            return held, loose
         held[..., :3] = quotient(state.errors, sd, sd > 0)
         loose[..., :3] = sd == 0
         return held, loose
@@ -444,6 +453,8 @@ class Problem:
         """
         sd = self.evidence.exact_turn_sd if geometry else self.evidence.turn_sd
         natural, free = angles * sd[..., None, :], self.evidence.free
+        if self.evidence.about_tool:
+            return natural
         return np.where(free[..., None, None], UNKNOWN * turns, natural) if free.any() else natural
 
     def _setting_columns(self, angles: Array, geometry: bool) -> Array:
@@ -473,6 +484,11 @@ class Problem:
 
     def _group_axes(self, state: State) -> dict[str, Array]:
         """Earth axes (B, k, 3) of each group's shared turns: inclining, and across or about down."""
+        if self.memo.get("state") is not state:
+            return self._find_group_axes(state)
+        return self.once("group axes", state, self._find_group_axes)
+
+    def _find_group_axes(self, state: State) -> dict[str, Array]:
         members = self.evidence.members
         tied = self.evidence.is_known("toolface") | self.evidence.is_known("azimuth")
         axis = self._mean_of(members, state.attitude[..., 2, :])
@@ -509,7 +525,8 @@ class Problem:
         first = step.shape[-1] - state.settings.shape[-1]
         private = linear.private_step(step)
         attitude = self._turn_stand(state, step[:, p : p + q])
-        attitude = self._turn_groups(replace(state, attitude=attitude), step[:, p + q : first])
+        base = state if attitude is state.attitude else replace(state, attitude=attitude)
+        attitude = self._turn_groups(base, step[:, p + q : first])
         attitude = self._turn_stations(state, attitude, private[..., :3])
         absent = private[..., 3 : 3 + state.departures.shape[-1]]
         departures = state.departures + absent * self._absent_scales(state)
@@ -542,6 +559,8 @@ class Problem:
         sd = self.evidence.exact_turn_sd
         if not sd.any():
             return attitude
+        if self.evidence.about_tool:
+            return np.asarray(rotation(sd * private) @ attitude)
         bare = replace(state, errors=0 * state.errors, settings=0 * state.settings)
         free, turn = self.evidence.free, (sd * private)[..., None, :] * self._angle_axes(bare)
         about_down = np.zeros(turn.shape[:-1])

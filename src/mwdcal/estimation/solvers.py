@@ -296,36 +296,47 @@ class Linearisable(Protocol):
 class _Descent:
     """Damped steps of one batch until every member has stopped.
 
-    All are of the members still `active`; `linear` is taken at `state`.
+    All are of the members still `active`; `linear` is taken at `state`, or None where nobody has asked for it yet.
     """
 
     problem: Linearisable
     state: Any
-    linear: Linear
+    linear: Linear | None
     determined: Determined
     damping: Array
     active: Ints
 
     def step(self) -> tuple[Bools, Bools]:
         """One iteration: which active members are at a minimum, and which are not finite."""
-        problem, linear = self.problem, self.linear
+        problem, linear = self.problem, self.here()
         normal = linear.normal
         finite = np.isfinite(normal.cost) & np.isfinite(normal.information).all((-1, -2))
         if not finite.all():
             return np.zeros_like(finite), ~finite
         step = _step(normal, self.determined, self.damping)
         trial = problem.move(self.state, linear, step)
+        small = _small(linear, step, self.state.params)
+        if small.all():  # taken whatever it does to the cost
+            self.state, self.linear, self.damping = trial, None, self._calmer()
+            return small, ~finite
         after = problem.linear(trial)
         # the gradient holds the weights fixed, and so must the cost that judges the step
         before = normal.cost if linear.loose.all() else linear.cost(linear)
         cost = linear.cost(after)
-        small = _small(linear, step, self.state.params)
         with np.errstate(invalid="ignore"):
             better = (cost <= before * (1 + 1e-9) + 1e-9) | small
         self._accept(trial, after, better)
-        calmer = np.where(self.damping < 1e-6, 0.0, self.damping / 10)
-        self.damping = np.where(better, calmer, np.maximum(10 * self.damping, 1e-3))
+        self.damping = np.where(better, self._calmer(), np.maximum(10 * self.damping, 1e-3))
         return small & better, ~finite
+
+    def here(self) -> Linear:
+        """The problem linearised at the state."""
+        self.linear = self.linear or self.problem.linear(self.state)
+        return self.linear
+
+    def _calmer(self) -> Array:
+        """Damping after a step that is taken."""
+        return np.where(self.damping < 1e-6, 0.0, self.damping / 10)
 
     def arrived(self) -> Bools:
         """Which active members no full step would move by more than a `NEGLIGIBLE` share of σ.
@@ -333,7 +344,7 @@ class _Descent:
         Rounding of the cost can refuse such steps for ever, and flat directions make them shrink
         slowly: both are at their minimum for all purposes.
         """
-        normal = self.linear.normal
+        normal = self.here().normal
         step = _step(normal, self.determined)
         return self.settled(np.asarray(_length(normal, step) < NEGLIGIBLE**2))
 

@@ -34,6 +34,8 @@ ELLIPSOID_SPAN = 2e-3
 """Columns of the ellipsoid with a singular value below this share of the largest are noise."""
 LEAST_SPAN = 1e-3
 """Least share of the field along an axis with which least squares gives a start."""
+FEWEST_KNOWN = 4
+"""Fewest stations of known direction with which it does."""
 
 
 def start(problem: Problem) -> State:
@@ -62,10 +64,11 @@ def _triad_start(problem: Problem, state: State, index: int) -> Array:
     radius = np.sqrt(np.sum(x * x * include[..., None], (-2, -1)) / np.sum(include, -1))
     radius = np.where(radius > 0, radius, 1.0)
     x = x / radius[:, None, None]
-    matrix, offset = _ellipsoid(x, strength, include)
-    linear, linear_offset, usable = _linear(problem, state, index, x)
-    matrix = np.where(usable[:, None, None], linear, matrix)
-    offset = np.where(usable[:, None], linear_offset, offset)
+    matrix, offset, usable = _linear(problem, state, index, x)
+    if not usable.all():
+        root, centred = _ellipsoid(x, strength, include)
+        matrix = np.where(usable[:, None, None], matrix, root)
+        offset = np.where(usable[:, None], offset, centred)
     matrix = matrix / radius[:, None, None]
     return triad.model.start(matrix, offset - np.einsum("bij,bj->bi", matrix, centre))
 
@@ -86,11 +89,11 @@ def _ellipsoid(x: Array, strength: Array, include: Array) -> tuple[Array, Array]
     values, vectors = eigen(quadric)
     sound = values[:, 0] > 1e-3 * values[:, 2]
     values = np.where(sound[:, None], values, 1.0)
-    half = np.einsum("bij,bj,bkj->bik", vectors, values, vectors)
-    centre = -solved(half, solution[:, 6:, None])[..., 0]
+    along = vectors.mT @ solution[:, 6:, None] / values[..., None]
+    centre = -(vectors @ along)[..., 0]
     centre = np.where(sound[:, None], centre, (x.max(-2) + x.min(-2)) / 2)
-    root = np.einsum("bij,bj,bkj->bik", vectors, np.sqrt(values), vectors)
-    mapped = np.linalg.norm(np.einsum("bij,bnj->bni", root, x - centre[:, None, :]), axis=-1)
+    root = (vectors * np.sqrt(values)[:, None]) @ vectors.mT
+    mapped = np.linalg.norm((x - centre[:, None, :]) @ root, axis=-1)
     scale = np.sum(strength * include, -1) / np.maximum(np.sum(mapped * include, -1), 1e-30)
     matrix = root * scale[:, None, None]
     return matrix, -np.einsum("bij,bj->bi", matrix, centre)
@@ -114,11 +117,14 @@ def _linear(problem: Problem, state: State, index: int, x: Array) -> tuple[Array
     known = [evidence.is_known(name) for name in ANGLES]
     whole = known[0] & known[2] & (known[1] | (index == 0))
     weight = evidence.include * whole
+    if (np.count_nonzero(weight, axis=-1) < FEWEST_KNOWN).all():
+        count = len(x)
+        return np.zeros((count, 3, 3)), np.zeros((count, 3)), np.zeros(count, bool)
     attitude = tool_from_earth(*(np.nan_to_num(evidence.known[name]) for name in ANGLES))
     terms = np.concatenate([x, np.ones_like(x[..., :1])], -1)
     gram = np.einsum("bn,bni,bnj->bij", weight, terms, terms)
     values = eigenvalues(gram)
-    usable = (values[:, 0] > LEAST_SPAN**2 * values[:, -1]) & (weight.sum(-1) >= 4)
+    usable = (values[:, 0] > LEAST_SPAN**2 * values[:, -1]) & (weight.sum(-1) >= FEWEST_KNOWN)
     gram = np.where(usable[:, None, None], gram, np.eye(4))
 
     if index == 0:
@@ -187,9 +193,12 @@ def _best_turn(fields: Sequence[Array], targets: Sequence[Array]) -> Array:
 def _share(problem: Problem, angles: dict[str, Array]) -> dict[str, Array]:
     """Stations of a group whose direction is unknown start from their mean direction."""
     evidence = problem.evidence
-    inc, azi = angles["inclination"], angles["azimuth"]
-    axis = tool_from_earth(inc, azi, np.zeros_like(inc))[..., 2, :]
     members = evidence.members
+    if not members.size:
+        return angles
+    inc, azi = angles["inclination"], angles["azimuth"]
+    across = np.sin(inc)
+    axis = np.stack([across * np.cos(azi), across * np.sin(azi), np.cos(inc)], -1)
     mean = members @ (members.mT @ axis)
     means = {
         "inclination": np.arctan2(np.hypot(mean[..., 0], mean[..., 1]), mean[..., 2]),
@@ -210,6 +219,8 @@ def _by_toolface(
     """
     evidence = problem.evidence
     faced = evidence.is_known("toolface") & (evidence.include > 0)
+    if not faced.any():
+        return angles
     lone = faced & (evidence.group < 0)
 
     def mean(name: str, inclination: Array, field: Array) -> tuple[Array, Bools]:

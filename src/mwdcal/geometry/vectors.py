@@ -22,6 +22,8 @@ Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
 ArrayLike = npt.ArrayLike
 AnyArray = npt.NDArray[Any]
+_CROSS = np.cross(np.eye(3)[:, None], np.eye(3)).mT.reshape(3, 9)
+"""The matrices of the cross product with each axis, row by row."""
 
 
 def wrap(angle: ArrayLike, period: float = 2 * np.pi) -> Array:
@@ -83,11 +85,7 @@ def reference_vectors(
 
 def skew(vector: Array) -> Array:
     """The matrix (..., 3, 3) of the cross product: skew(a) @ b = a × b."""
-    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
-    matrix = np.zeros((*vector.shape, 3))
-    matrix[..., 0, 1], matrix[..., 0, 2], matrix[..., 1, 2] = -z, y, -x
-    matrix[..., 1, 0], matrix[..., 2, 0], matrix[..., 2, 1] = z, -y, x
-    return matrix
+    return np.asarray((vector @ _CROSS).reshape(*vector.shape, 3))
 
 
 def rotation(turn: Array) -> Array:

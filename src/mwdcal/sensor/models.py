@@ -192,8 +192,9 @@ class Polynomial:
         matrix, offset = affine_parts(self._blocks(params))
         offset = np.einsum("...ij,...kj->...ki", turn, offset)
         blocks = affine_terms(turn[..., None, :, :] @ matrix, offset)
-        flat = blocks.reshape(*params.shape[:-1], self.affine)
-        return np.concatenate([flat, params[..., self.affine :]], -1)
+        flat = blocks.reshape(*blocks.shape[:-2], self.affine)
+        rest = np.broadcast_to(params[..., self.affine :], (*flat.shape[:-1], 6 * self.curved))
+        return np.concatenate([flat, rest], -1)
 
     def with_course(self, direction: Array, power: int) -> Array:
         """A change (..., p) of the steady parameters, moved to a power of temperature."""
