@@ -105,6 +105,19 @@ class Evidence:
         return {name: self.members * groups[:, None, :] for name, groups in unknown.items()}
 
     @cached_property
+    def shared_turns(self) -> Array:
+        """The same (B, n, 2 k) of the inclination, then the azimuth."""
+        return np.concatenate([self.shared[name] for name in ANGLES[:2]], -1)
+
+    @cached_property
+    def upright(self) -> tuple[Array, Bools, Bools]:
+        """Members (B, n, k) whose toolface or azimuth is known, which groups (B, k) have one, and which a known angle."""
+        tied = self.members * (self.is_known("toolface") | self.is_known("azimuth"))[..., None]
+        inclined = self.members * self.is_known("inclination")[..., None]
+        across = tied.any(-2)
+        return tied, across, across | inclined.any(-2)
+
+    @cached_property
     def set_together(self) -> Array:
         """σ (B, n, 2 k) of inclination, then azimuth, that stations have from each of k settings."""
         numbers = np.arange(self.settings)

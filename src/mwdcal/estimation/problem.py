@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import accumulate, pairwise
 from typing import Any, TypeVar
 
@@ -30,8 +30,6 @@ from mwdcal.estimation.solvers import Linear
 from mwdcal.geometry.vectors import (
     Array,
     Bools,
-    earth_field,
-    earth_gravity,
     eigen,
     inverse,
     outer,
@@ -39,7 +37,7 @@ from mwdcal.geometry.vectors import (
     rotation,
     skew,
 )
-from mwdcal.sensor.models import Model
+from mwdcal.sensor.models import Model, stacked
 
 _Result = TypeVar("_Result")
 
@@ -183,14 +181,16 @@ class Problem:
             value = value + state.departures[..., self.evidence.absent.index(name)]
         return np.asarray(value)
 
-    def targets(self, state: State) -> list[Array]:
-        """Vectors (B, n, 3) that perfect triads would read: gravity, then the field."""
+    def targets(self, state: State) -> Array:
+        """Vectors (2, B, n, 3) that perfect triads would read: gravity, then the field."""
         return self._seen(self.attitude(state), *(self.constant(state, c) for c in EARTH))
 
     @staticmethod
-    def _seen(attitude: Array, gravity: Array, field: Array, dip: Array) -> list[Array]:
-        earth = earth_gravity(gravity), earth_field(field, dip)
-        return [np.einsum("bnij,bnj->bni", attitude, vector) for vector in earth]
+    def _seen(attitude: Array, gravity: Array, field: Array, dip: Array) -> Array:
+        earth = np.zeros((2, *gravity.shape, 3, 1))
+        earth[0, ..., 2, 0] = gravity
+        earth[1, ..., 0, 0], earth[1, ..., 2, 0] = field * np.cos(dip), field * np.sin(dip)
+        return np.asarray((attitude @ earth)[..., 0])
 
     def attitude(self, state: State) -> Array:
         """Attitudes (B, n, 3, 3) with the errors of known angles in."""
@@ -236,30 +236,38 @@ class Problem:
 
     def _predictions(self, state: State) -> list[Prediction]:
         gravity, field, dip = (self.constant(state, c) for c in EARTH)
-        attitude, result = self.attitude(state), []
+        attitude = self.attitude(state)
         targets = self._seen(attitude, gravity, field, dip)
         changes = self._earth_changes(field, dip)
-        for triad, where, target, change in zip(
-            self.triads, self.slices(), targets, changes, strict=False
-        ):
-            params = state.params[:, where]
-            fields = triad.model.fields(params, triad.raw, self.temperature)
-            some = slice(None if triad.model.varies else 1)
-            back = inverse(triad.model.slope(params, triad.raw[:, some], self.temperature[:, some]))
-            misfit = np.einsum("bnij,bnj->bni", back, fields - target)
-            by_vector = -back @ attitude
-            by_params = triad.model.jacobian(params, triad.raw - misfit, self.temperature)
-            result.append(
-                Prediction(
-                    misfit,
-                    back @ by_params,
-                    back @ skew(target),
-                    by_vector @ change,
-                    by_vector,
-                    np.einsum("bnij,bnj->bni", back, target),
-                )
-            )
-        return result
+        if self.alike:
+            params = state.params.reshape(len(attitude), 2, -1).swapaxes(0, 1)
+            both = self._predicted(self.alike, params, attitude, targets, changes)
+            return [Prediction(*parts) for parts in zip(*vars(both).values(), strict=True)]
+        parameters = [state.params[:, where] for where in self.slices()]
+        each = zip(self.triads, parameters, targets, changes, strict=False)
+        return [self._predicted(t, params, attitude, *rest) for t, params, *rest in each]
+
+    def _predicted(
+        self, triad: Triad, params: Array, attitude: Array, target: Array, change: Array
+    ) -> Prediction:
+        model, raw, temperature = triad.model, triad.raw, self.temperature
+        some = slice(None if model.varies else 1)
+        back = inverse(model.slope(params, raw[..., some, :], temperature[:, some]))
+        departure = model.fields(params, raw, temperature) - target
+        misfit, vector = ((back @ v[..., None])[..., 0] for v in (departure, target))
+        by_vector = -back @ attitude
+        by_params = back @ model.jacobian(params, raw - misfit, temperature)
+        by_turn = back @ skew(target)
+        return Prediction(misfit, by_params, by_turn, by_vector @ change, by_vector, vector)
+
+    @cached_property
+    def alike(self) -> Triad | None:
+        """Both triads as one with a leading axis, if their models are of one kind: half as many calls."""
+        first, last = self.triads[0], self.triads[-1]
+        model = stacked([triad.model for triad in self.triads])
+        if first is last or model is None:
+            return None
+        return Triad(model, np.stack([first.raw, last.raw]), np.stack([first.sd, last.sd]))
 
     @staticmethod
     def _earth_changes(field: Array, dip: Array) -> Array:
@@ -424,20 +432,33 @@ class Problem:
         p, constants = state.params.shape[-1], self.evidence.constants
         pull = np.zeros((len(state.params), p + shared))
         pull[:, :p] = state.params - self.prior.expected
-        diagonal = np.full(pull.shape, UNKNOWN**-2)
         for index, constant in enumerate(constants):
-            diagonal[:, p + index] = constant.sd**-2
             if not constant.unknown:
                 pull[:, p + index] = state.constants[:, index] - constant.value
-        settings = slice(pull.shape[-1] - state.settings.shape[-1], None)
-        pull[:, settings], diagonal[:, settings] = state.settings, 1.0
-        precision = diagonal[..., None] * np.eye(diagonal.shape[-1])
-        known = self.prior.precision
-        if geometry and known.any():
-            norms = [np.sqrt(np.sum(block**2, (1, 2))) for block in blocks]
-            known = self.prior.informed(np.concatenate(norms, -1))
-        precision[:, :p, :p] = known
+        pull[:, pull.shape[-1] - state.settings.shape[-1] :] = state.settings
+        if not (geometry and self.prior.precision.any()):
+            return self.precision, pull
+        norms = [np.sqrt(np.sum(block**2, (1, 2))) for block in blocks]
+        precision = self.precision.copy()
+        precision[:, :p, :p] = self.prior.informed(np.concatenate(norms, -1))
         return precision, pull
+
+    @cached_property
+    def precision(self) -> Array:
+        """Precision (B, u, u) of the parameters and the shared unknowns, by all that is known beforehand."""
+        constants, p = self.evidence.constants, self.prior.expected.shape[-1]
+        groups, settings = (
+            getattr(self.evidence, n).shape[-1] for n in ("shared_turns", "set_together")
+        )
+        diagonal = np.full(
+            (len(self.temperature), p + len(constants) + groups + settings), UNKNOWN**-2
+        )
+        for index, constant in enumerate(constants):
+            diagonal[:, p + index] = constant.sd**-2
+        diagonal[:, diagonal.shape[-1] - settings :] = 1.0
+        precision = diagonal[..., None] * np.eye(diagonal.shape[-1])
+        precision[:, :p, :p] = self.prior.precision
+        return precision
 
     def _angle_axes(self, state: State) -> Array:
         """Axes (B, n, 3, 3), as columns in the tool, about which inclination, azimuth and toolface turn it."""
@@ -482,42 +503,47 @@ class Problem:
         turned = np.einsum("bnij,bni->bnj", state.attitude, fixed)
         return np.where(by_toolface[..., None], turned, across)
 
-    def _group_axes(self, state: State) -> dict[str, Array]:
-        """Earth axes (B, k, 3) of each group's shared turns: inclining, and across or about down."""
+    def _group_axes(self, state: State) -> Array:
+        """Earth axes (B, 2, k, 3) of each group's shared turns: inclining, and across or about down."""
         if self.memo.get("state") is not state:
             return self._find_group_axes(state)
         return self.once("group axes", state, self._find_group_axes)
 
-    def _find_group_axes(self, state: State) -> dict[str, Array]:
-        members = self.evidence.members
-        tied = self.evidence.is_known("toolface") | self.evidence.is_known("azimuth")
-        axis = self._mean_of(members, state.attitude[..., 2, :])
+    def _find_group_axes(self, state: State) -> Array:
+        axis = self._mean_of(self.evidence.members, state.attitude[..., 2, :])
+        tied, across, upright = self.evidence.upright
         azimuth = np.arctan2(axis[..., 1], axis[..., 0])
-        first = np.stack([np.sin(azimuth), -np.cos(azimuth), np.zeros_like(azimuth)], -1)
-        upright = np.einsum("bnk,bn->bk", members, tied) > 0
-        if upright.any():
-            along = self._mean_of(members * tied[..., None], self._across(state))
+        axes = np.zeros((len(axis), 2, *axis.shape[1:]))
+        axes[:, 0, :, 0], axes[:, 0, :, 1] = np.sin(azimuth), -np.cos(azimuth)
+        if across.any():
+            along = self._mean_of(tied, self._across(state))
             size = np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-300)
-            first = np.where(upright[..., None], along / size, first)
-        upright |= np.einsum("bnk,bn->bk", members, self.evidence.is_known("inclination")) > 0
-        second = np.where(upright[..., None], np.array([0.0, 0.0, 1.0]), np.cross(axis, first))
-        return {"inclination": first, "azimuth": second}
+            axes[:, 0] = np.where(across[..., None], along / size, axes[:, 0])
+        second = (skew(axis) @ axes[:, 0, :, :, None])[..., 0]
+        axes[:, 1] = np.where(upright[..., None], np.array([0.0, 0.0, 1.0]), second)
+        return axes
 
     @staticmethod
     def _mean_of(members: Array, vectors: Array) -> Array:
         """Mean (B, k, 3) of vectors (B, n, 3) over the members (B, n, k) of each group."""
         count = np.maximum(members.sum(-2), 1.0)
-        return np.asarray(np.einsum("bnk,bni->bki", members, vectors) / count[..., None])
+        return np.asarray(members.mT @ vectors / count[..., None])
 
     def _group_turns(self, state: State, turns: Array) -> list[Array]:
         """Columns (B, n, m, k) of both shared turns of each group."""
-        if not self.evidence.members.shape[-1]:
+        if not self.evidence.members.size:
             return []
-        columns, base = [], (self._rolled(state), self.attitude(state))
-        for attitude, (name, axis) in zip(base, self._group_axes(state).items(), strict=True):
-            tool = np.einsum("bnij,bkj->bnik", attitude, axis)
-            columns.append(turns @ tool * self.evidence.shared[name][..., None, :])
-        return columns
+        axes, base = self._group_axes(state), (self._rolled(state), self.attitude(state))
+        each = zip(
+            base, np.moveaxis(axes, 1, 0), np.split(self.evidence.shared_turns, 2, -1), strict=True
+        )
+        if base[0] is base[1]:
+            flat = axes.reshape(len(axes), -1, 3)
+            each = [(base[0], flat, self.evidence.shared_turns)]
+        return [
+            (turns @ attitude @ axis[:, None].mT) * shared[..., None, :]
+            for attitude, axis, shared in each
+        ]
 
     def move(self, state: State, linear: Linear, step: Array) -> State:
         """The state after a step; unknown private angles and the errors of known ones follow."""
@@ -548,11 +574,12 @@ class Problem:
         attitude = state.attitude
         if not turns.size:
             return attitude
-        axes, parts = self._group_axes(state).items(), np.split(turns, 2, -1)
-        for (name, axis), turn in zip(axes, parts, strict=True):
-            vector = np.einsum("bnk,bk,bki->bni", self.evidence.shared[name], turn, axis)
-            attitude = attitude @ rotation(vector)
-        return attitude
+        evidence, axes = self.evidence, self._group_axes(state)
+        sizes = turns * evidence.shared_turns.any(-2)
+        first, second = np.moveaxis(rotation(sizes.reshape(*axes.shape[:-1], 1) * axes), 1, 0)
+        whole = (first @ second - np.eye(3)).reshape(*first.shape[:-2], 9)
+        turned = (evidence.members @ whole).reshape(attitude.shape)
+        return np.asarray(attitude + attitude @ turned)
 
     def _turn_stations(self, state: State, attitude: Array, private: Array) -> Array:
         """Attitudes with unknown angles turned by private unknowns (B, n, 3) in units of their σ."""

@@ -28,6 +28,10 @@ RANK_TOLERANCE = 2e-2
 NEGLIGIBLE = 1e-2
 """A member that is still on its way when iterations end has settled if a full step is a smaller
 share of the standard uncertainty than this."""
+SHORT = 1e-3
+"""Standard uncertainties: a full step shorter than this is taken whatever it does to the cost, and is the last…"""
+NOTHING = 1e-8
+"""…if the next, shorter by the same factor, would be shorter than this."""
 CLEAR_MARGIN = 5.0
 """A direction is clearly determined with a singular value so many times `RANK_TOLERANCE`."""
 SPANNED = 1e-6
@@ -296,7 +300,8 @@ class Linearisable(Protocol):
 class _Descent:
     """Damped steps of one batch until every member has stopped.
 
-    All are of the members still `active`; `linear` is taken at `state`, or None where nobody has asked for it yet.
+    All are of the members still `active`; `linear` is taken at `state`, or None where nobody has asked for it yet;
+    `length` is that of the last full step in standard uncertainties, else infinite.
     """
 
     problem: Linearisable
@@ -305,6 +310,7 @@ class _Descent:
     determined: Determined
     damping: Array
     active: Ints
+    length: Array
 
     def step(self) -> tuple[Bools, Bools]:
         """One iteration: which active members are at a minimum, and which are not finite."""
@@ -315,7 +321,9 @@ class _Descent:
             return np.zeros_like(finite), ~finite
         step = _step(normal, self.determined, self.damping)
         trial = problem.move(self.state, linear, step)
-        small = _small(linear, step, self.state.params)
+        length = np.sqrt(_length(normal, step))
+        small = _small(linear, step, self.state.params, length) | self._last(length)
+        self.length = np.where(self.damping > 0, np.inf, length)
         if small.all():  # taken whatever it does to the cost
             self.state, self.linear, self.damping = trial, None, self._calmer()
             return small, ~finite
@@ -333,6 +341,12 @@ class _Descent:
         """The problem linearised at the state."""
         self.linear = self.linear or self.problem.linear(self.state)
         return self.linear
+
+    def _last(self, length: Array) -> Bools:
+        """Which full steps are so much shorter than those before that the next would be nothing."""
+        return np.asarray(
+            (self.damping == 0) & (length < SHORT) & (length**2 < NOTHING * self.length)
+        )
 
     def _calmer(self) -> Array:
         """Damping after a step that is taken."""
@@ -387,14 +401,13 @@ def _length(normal: Normal, step: Array) -> Array:
     return np.asarray(np.einsum("...i,...ij,...j->...", step, normal.information, step))
 
 
-def _small(linear: Linear, step: Array, params: Array) -> Bools:
-    """Below a millionth of the standard uncertainty, or rounding of each triad's largest parameter."""
+def _small(linear: Linear, step: Array, params: Array, length: Array) -> Bools:
+    """Of a `length` (B,) below a millionth of the standard uncertainty, or rounding of each triad's largest parameter."""
     size, moved = (
         np.stack([np.abs(x[:, columns]).max(-1) for _, _, columns in linear.placed()])
         for x in (params, step)
     )
-    near = _length(linear.normal, step) < 1e-12
-    return np.asarray(near | np.all(moved <= 1e-12 * size, 0))
+    return np.asarray((length < 1e-6) | np.all(moved <= 1e-12 * size, 0))
 
 
 def stepped(problem: Linearisable, state: Any, determined: Determined) -> Any:
@@ -409,7 +422,8 @@ def gauss_newton(problem: Linearisable, state: Any, limit: int = 60) -> tuple[An
     status = np.full(count, int(Status.NOT_CONVERGED))
     iterations = np.zeros(count, int)
     determined, linear = Determined.of(problem, state), problem.linear(state)
-    descent = _Descent(problem, state, linear, determined, np.zeros(count), np.arange(count))
+    undamped, far = np.zeros(count), np.full(count, np.inf)
+    descent = _Descent(problem, state, linear, determined, undamped, np.arange(count), far)
     for _ in range(limit):
         if not descent.active.size:
             break

@@ -56,7 +56,7 @@ LEAST_SCATTER = 1e-5
 """Scatter below which there is none."""
 LARGEST_CHANGE = 20.0
 """A variance changes by this factor at most in one round."""
-AT_REST = 1e-12
+AT_REST = 1e-11
 """Stations and groups are at their best where no step turns them further, rad, or moves them by more σ."""
 PIN = 0.05
 """Parameters are known to this share of the field when runs are compared by their probability."""
