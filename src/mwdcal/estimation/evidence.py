@@ -111,11 +111,11 @@ class Evidence:
 
     @cached_property
     def upright(self) -> tuple[Array, Bools, Bools]:
-        """Members (B, n, k) whose toolface or azimuth is known, which groups (B, k) have one, and which a known angle."""
+        """Members (B, n, k) of known toolface or azimuth, which groups (B, k) have one, and which any known angle."""
         tied = self.members * (self.is_known("toolface") | self.is_known("azimuth"))[..., None]
         inclined = self.members * self.is_known("inclination")[..., None]
-        across = tied.any(-2)
-        return tied, across, across | inclined.any(-2)
+        across, leant = (np.any(members > 0, -2) for members in (tied, inclined))
+        return tied, across, np.asarray(across | leant)
 
     @cached_property
     def set_together(self) -> Array:

@@ -533,17 +533,14 @@ class Problem:
         """Columns (B, n, m, k) of both shared turns of each group."""
         if not self.evidence.members.size:
             return []
-        axes, base = self._group_axes(state), (self._rolled(state), self.attitude(state))
-        each = zip(
-            base, np.moveaxis(axes, 1, 0), np.split(self.evidence.shared_turns, 2, -1), strict=True
-        )
-        if base[0] is base[1]:
-            flat = axes.reshape(len(axes), -1, 3)
-            each = [(base[0], flat, self.evidence.shared_turns)]
-        return [
-            (turns @ attitude @ axis[:, None].mT) * shared[..., None, :]
-            for attitude, axis, shared in each
-        ]
+        axes, shared = self._group_axes(state), self.evidence.shared_turns
+        rolled, attitude = self._rolled(state), self.attitude(state)
+        if rolled is attitude:
+            parts = [(attitude, axes.reshape(len(axes), -1, 3), shared)]
+        else:
+            first, second = np.split(shared, 2, -1)
+            parts = [(rolled, axes[:, 0], first), (attitude, axes[:, 1], second)]
+        return [(turns @ base @ axis[:, None].mT) * who[..., None, :] for base, axis, who in parts]
 
     def move(self, state: State, linear: Linear, step: Array) -> State:
         """The state after a step; unknown private angles and the errors of known ones follow."""

@@ -28,9 +28,9 @@ RANK_TOLERANCE = 2e-2
 NEGLIGIBLE = 1e-2
 """A member that is still on its way when iterations end has settled if a full step is a smaller
 share of the standard uncertainty than this."""
-SHORT = 1e-3
+LAST_STEP = 1e-3
 """Standard uncertainties: a full step shorter than this is taken whatever it does to the cost, and is the last…"""
-NOTHING = 1e-8
+NEXT_STEP = 1e-8
 """…if the next, shorter by the same factor, would be shorter than this."""
 CLEAR_MARGIN = 5.0
 """A direction is clearly determined with a singular value so many times `RANK_TOLERANCE`."""
@@ -345,7 +345,7 @@ class _Descent:
     def _last(self, length: Array) -> Bools:
         """Which full steps are so much shorter than those before that the next would be nothing."""
         return np.asarray(
-            (self.damping == 0) & (length < SHORT) & (length**2 < NOTHING * self.length)
+            (self.damping == 0) & (length < LAST_STEP) & (length**2 < NEXT_STEP * self.length)
         )
 
     def _calmer(self) -> Array:
@@ -402,7 +402,7 @@ def _length(normal: Normal, step: Array) -> Array:
 
 
 def _small(linear: Linear, step: Array, params: Array, length: Array) -> Bools:
-    """Of a `length` (B,) below a millionth of the standard uncertainty, or rounding of each triad's largest parameter."""
+    """Of a `length` (B,) below a millionth, or within rounding of each triad's largest parameter."""
     size, moved = (
         np.stack([np.abs(x[:, columns]).max(-1) for _, _, columns in linear.placed()])
         for x in (params, step)

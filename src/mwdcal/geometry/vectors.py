@@ -22,7 +22,7 @@ Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
 ArrayLike = npt.ArrayLike
 AnyArray = npt.NDArray[Any]
-_CROSS = np.cross(np.eye(3)[:, None], np.eye(3)).mT.reshape(3, 9)
+_CROSS_PRODUCTS = np.cross(np.eye(3)[:, None], np.eye(3)).mT.reshape(3, 9)
 """The matrices of the cross product with each axis, row by row."""
 
 
@@ -85,7 +85,7 @@ def reference_vectors(
 
 def skew(vector: Array) -> Array:
     """The matrix (..., 3, 3) of the cross product: skew(a) @ b = a × b."""
-    return np.asarray((vector @ _CROSS).reshape(*vector.shape, 3))
+    return np.asarray((vector @ _CROSS_PRODUCTS).reshape(*vector.shape, 3))
 
 
 def rotation(turn: Array) -> Array:
