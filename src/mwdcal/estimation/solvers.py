@@ -28,7 +28,7 @@ RANK_TOLERANCE = 2e-2
 NEGLIGIBLE = 1e-2
 """A member that is still on its way when iterations end has settled if a full step is a smaller
 share of the standard uncertainty than this."""
-LAST_STEP = 1e-3
+SHORT_STEP = 1e-3
 """Standard uncertainties: a full step shorter than this is taken whatever it does to the cost, and is the last…"""
 NEXT_STEP = 1e-8
 """…if the next, shorter by the same factor, would be shorter than this."""
@@ -345,7 +345,7 @@ class _Descent:
     def _last(self, length: Array) -> Bools:
         """Which full steps are so much shorter than those before that the next would be nothing."""
         return np.asarray(
-            (self.damping == 0) & (length < LAST_STEP) & (length**2 < NEXT_STEP * self.length)
+            (self.damping == 0) & (length < SHORT_STEP) & (length**2 < NEXT_STEP * self.length)
         )
 
     def _calmer(self) -> Array:

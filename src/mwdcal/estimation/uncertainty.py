@@ -446,10 +446,12 @@ def readjusted(problem: Problem, state: State) -> State:
         step = np.zeros((len(state.params), linear.design.shape[-1]))
         groups = inverse(normal.information[:, fixed:, fixed:])
         step[:, fixed:] = -(groups @ normal.gradient[:, fixed:, None])[..., 0]
-        moved = np.abs(step).max(initial=0.0), np.abs(linear.private_step(step) * linear.loose)
-        if max(moved[0], moved[1].max(initial=0.0)) < AT_REST:
+        turned, private = np.abs(step).max(initial=0.0), linear.private_step(step)
+        if max(turned, np.abs(private - linear.held).max(initial=0.0)) < AT_REST:
             break
         state = problem.move(state, linear, step)
+        if max(turned, np.abs(private * linear.loose).max(initial=0.0)) < AT_REST:
+            break
     return state
 
 
