@@ -99,3 +99,24 @@ def test_the_names_of_paths_begin_with_those_of_their_kind(guard):
     words = [name for names in guard.KINDS for name in names.split()]
     stored = guard.json.loads(guard.STORED.read_text())
     assert all(any(name.startswith(word) for word in words) for name in stored)
+
+
+def test_a_figure_reaches_what_it_is_at_least_or_aimed_at(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    wait = import_module("waits").Wait
+    small = [wait("w", found, 5.0, 3.0, "ms").verdict for found in (2.0, 4.0, 6.0)]
+    large = [wait("w", found, 50, 100, "x", more=True).verdict for found in (101, 60, 40)]
+    assert small == large == ["aim", "at least", "**short of it**"]
+
+
+def test_rows_in_which_another_is_faster_say_why(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    bench = import_module("bench")
+    rows = [bench.Row(f"{name}; other", 2.0, 1.0, 0.5) for name in ("24 shots by strength", "odd")]
+    rows.append(bench.Row("fast; other", 1.0, 2.0, 2.0))
+    first, second = bench.slower({"peers": bench.Group(rows)})
+    assert "24 shots" in first
+    assert bench.CLOSED in first
+    assert second.endswith("**no reason known**.")
+    table = bench.group_table(rows)
+    assert [("slower" in line) for line in table.splitlines()[2:]] == [True, True, False]
