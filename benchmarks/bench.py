@@ -75,7 +75,7 @@ CLOSED = "a closed form of a few small solutions; ours weighs each reading, and 
 SLOWER = {
     "24 shots": f"{CLOSED}; it iterates to the minimum",
     "six positions": CLOSED,
-    "12 factors; SciPy, analytic Jacobian": "SciPy gets the Jacobian by hand, and finds no covariance, rank or leverage",
+    "12 factors; SciPy, analytic Jacobian": "SciPy gets the Jacobian by hand, and finds no covariance or rank",
     "position covariance, 14 sensor terms": "NumPy written for this one job: never vertical, no random errors",
     "vectors alone, against a copy": "a copy moves the same bytes and computes nothing",
     "mwdcal calibrate": "the import alone computes, reads and writes nothing",
