@@ -9,7 +9,7 @@ from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.estimation.rank import free_directions
-from mwdcal.estimation.solvers import stepped
+from mwdcal.estimation.solvers import gauss_newton, stepped
 from mwdcal.estimation.uncertainty import marginal_rank, readjusted
 from mwdcal.geometry.vectors import rotation
 from mwdcal.sensor.models import stacked
@@ -326,6 +326,19 @@ def test_a_fit_ends_where_further_steps_move_nothing(known, others):
     sd = np.sqrt(np.diagonal(result.analysis.covariance, axis1=1, axis2=2))
     assert (result.status == 0).all()
     assert np.abs((state.params - result.state.params) / sd).max() < 1e-6
+
+
+@pytest.mark.parametrize("away", [1e-1, 1e-4])
+def test_a_fit_that_starts_near_its_end_goes_all_the_way(away):
+    """No first step, however short, foretells the next."""
+    result = fit(readings(Tool.random(3), plan((0.5, 45, 90, 135)), ("inclination", "field")))
+    sd = np.sqrt(np.diagonal(result.analysis.covariance, axis1=1, axis2=2))
+    start = replace(result.state, params=result.state.params + away * sd)
+    state, status, iterations = gauss_newton(result.problem, start)
+    before, after = (result.problem.linear(at).normal.cost for at in (result.state, state))
+    assert status == 0
+    assert iterations >= 2
+    assert after - before < 1e-10 * away**2
 
 
 @pytest.mark.parametrize("options", [Options(), Options(nonlinearity={"magnetometer": 0.005})])

@@ -301,7 +301,7 @@ class _Descent:
     """Damped steps of one batch until every member has stopped.
 
     All are of the members still `active`; `linear` is taken at `state`, or None where nobody has asked for it yet;
-    `length` is that of the last full step in standard uncertainties, else infinite.
+    `length` is that of the last full step in standard uncertainties, zero before there is one.
     """
 
     problem: Linearisable
@@ -323,7 +323,7 @@ class _Descent:
         trial = problem.move(self.state, linear, step)
         length = np.sqrt(_length(normal, step))
         small = _small(linear, step, self.state.params, length) | self._last(length)
-        self.length = np.where(self.damping > 0, np.inf, length)
+        self.length = np.where(self.damping > 0, 0.0, length)
         if small.all():  # taken whatever it does to the cost
             self.state, self.linear, self.damping = trial, None, self._calmer()
             return small, ~finite
@@ -422,8 +422,8 @@ def gauss_newton(problem: Linearisable, state: Any, limit: int = 60) -> tuple[An
     status = np.full(count, int(Status.NOT_CONVERGED))
     iterations = np.zeros(count, int)
     determined, linear = Determined.of(problem, state), problem.linear(state)
-    undamped, far = np.zeros(count), np.full(count, np.inf)
-    descent = _Descent(problem, state, linear, determined, undamped, np.arange(count), far)
+    zero = np.zeros(count)
+    descent = _Descent(problem, state, linear, determined, zero, np.arange(count), zero)
     for _ in range(limit):
         if not descent.active.size:
             break
