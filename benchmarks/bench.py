@@ -127,7 +127,24 @@ def waits(quick: bool) -> Group:
     return Group(text=import_module("waits").report(0.01 if quick else 1.0))
 
 
-OWN = {"fleet": fleet, "apply": apply, "registry": registry, "waits": waits}
+def procedures(quick: bool) -> Group:
+    """Simulated calibrations."""
+    return Group(import_module("procedures").rows(*((500, 20) if quick else (10_000, 100))))
+
+
+def surveys(quick: bool) -> Group:
+    """Positions with their covariance."""
+    return Group(import_module("surveys").rows(*((10**5, 2_000) if quick else (10**6, 10_000))))
+
+
+OWN = {
+    "fleet": fleet,
+    "apply": apply,
+    "procedures": procedures,
+    "surveys": surveys,
+    "registry": registry,
+    "waits": waits,
+}
 
 
 def measured(name: str, quick: bool) -> Group:
