@@ -8,6 +8,9 @@ third longer than it did, in every one of some tries, has lost its speed unnotic
     python benchmarks/guard.py            # compare; exit status 1 and the names of the paths that lost
     python benchmarks/guard.py --keep     # measure anew and store the ratios
     python benchmarks/guard.py fleet      # only paths with this word in their name
+    python benchmarks/guard.py --stored before.json --keep    # the same with another file of ratios
+
+With PYTHONPATH it takes the sources of another commit (docs/benchmarks.md shows one that it fails on).
 """
 
 from __future__ import annotations
@@ -268,6 +271,38 @@ def long(folder: Path) -> Iterator[Guarded]:
         yield Guarded(f"{name}, {rows} rows", *reading, ours)
 
 
+def small(folder: Path) -> Iterator[Guarded]:
+    """The example's other files as they come, with default options: the first minute of a newcomer."""
+    tool = folder / "first.json"
+    command("calibrate", EXAMPLE / "run.csv", "--tool", EXAMPLE / "tool.toml", "-o", tool)
+    loop = "SciPy, one tool", partial(fleet.scipy_seconds, 1)
+    for name, *words in (
+        ("verify", tool, EXAMPLE / "rolltest.csv"),
+        ("profile", EXAMPLE / "export.csv", "-o", folder / "export.toml"),
+        ("survey", tool, EXAMPLE / "well.csv", "-o", folder / "first.csv"),
+        ("apply", tool, EXAMPLE / "surveys.csv", "-o", folder / "corrected.csv"),
+    ):
+        yield Guarded(f"{name}, the example", *loop, partial(command, name, *words))
+
+
+KINDS = {
+    "calibrate": singles,
+    "fleet": fleets,
+    "registry": registries,
+    "apply survey noise stations": long,
+    "verify profile survey apply": small,
+}
+"""Kinds of paths, by how the names of the paths begin."""
+
+
+def asked_paths(word: str, folder: Path) -> Iterator[Guarded]:
+    """The paths with a word in their name; a kind without any is not even prepared where the word begins with one's."""
+    begins = [name for names in KINDS for name in names.split() if word.startswith(name)]
+    for names, kind in KINDS.items():
+        if not begins or set(begins) & set(names.split()):
+            yield from (each for each in kind(folder) if word in each.name)
+
+
 def main() -> None:
     """Measure, and compare with what is stored or store it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -279,17 +314,13 @@ def main() -> None:
         default=LOST,
         help="largest share of a stored ratio (default: a third more)",
     )
+    parser.add_argument("--stored", type=Path, default=STORED, help="file of the ratios")
     asked = parser.parse_args()
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else every process compiles everything anew
-    stored: dict[str, float] = json.loads(STORED.read_text()) if STORED.exists() else {}
+    stored: dict[str, float] = json.loads(asked.stored.read_text()) if asked.stored.exists() else {}
     measured, lost = {}, []
     with TemporaryDirectory() as place:
-        folder = Path(place)
-        for guarded in (
-            each for kind in (singles, fleets, registries, long) for each in kind(folder)
-        ):
-            if asked.word not in guarded.name:
-                continue
+        for guarded in asked_paths(asked.word, Path(place)):
             before = stored.get(guarded.name)
             found = judged(guarded, asked.most * (before or np.inf), 1 if asked.keep else TRIES)
             measured[guarded.name] = found
@@ -298,10 +329,10 @@ def main() -> None:
             was = f"stored {before or 0:7.3g}  {verdict}"
             print(f"{guarded.name:32} {found:7.3g} x {guarded.beside:28} {was}", flush=True)
     if asked.keep:
-        STORED.write_text(json.dumps({**stored, **measured}, indent=1) + "\n")
+        asked.stored.write_text(json.dumps({**stored, **measured}, indent=1) + "\n")
     elif lost:
         sys.exit(
-            f"over {asked.most:.2f} times the ratio stored in {STORED.name}: {', '.join(lost)}"
+            f"over {asked.most:.2f} times the ratio stored in {asked.stored.name}: {', '.join(lost)}"
         )
 
 

@@ -9,8 +9,10 @@ from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.estimation.rank import free_directions
-from mwdcal.estimation.uncertainty import marginal_rank
+from mwdcal.estimation.solvers import gauss_newton, stepped
+from mwdcal.estimation.uncertainty import marginal_rank, readjusted
 from mwdcal.geometry.vectors import rotation
+from mwdcal.sensor.models import stacked
 from simulation import DEG, Tool, plan
 
 NOISE = {"accelerometer": np.array(1e-4), "magnetometer": np.array(15.0)}
@@ -304,3 +306,70 @@ def test_a_group_with_few_filled_cells_is_as_uncertain_as_they_are():
     z = (params[:, 6:8] - row) / np.sqrt(np.diagonal(spread, axis1=1, axis2=2))[:, 6:8]
     assert 0.8 < np.sqrt(np.mean(z**2)) < 1.2
     assert finished.size == 12
+
+
+WAYS = [(known, {}) for known, _, _ in RANKS] + [
+    (("field",), {"group": np.repeat(np.arange(4), 12)}),
+    (("field",), {"sd": {}}),
+]
+
+
+@pytest.mark.parametrize(("known", "others"), WAYS)
+def test_a_fit_ends_where_further_steps_move_nothing(known, others):
+    """A fit foretells that its next step would be nothing: here three more are taken."""
+    inc, azi, face = plan((0.5, 45, 90, 135))
+    azi = np.repeat(azi[::12], 12) if "group" in others else azi
+    result = fit(readings(Tool.random(3), (inc, azi, face), known, **others))
+    state, determined = result.state, result.analysis.determined
+    for _ in range(3):
+        state = stepped(result.problem, state, determined)
+    sd = np.sqrt(np.diagonal(result.analysis.covariance, axis1=1, axis2=2))
+    assert (result.status == 0).all()
+    assert np.abs((state.params - result.state.params) / sd).max() < 1e-6
+
+
+@pytest.mark.parametrize("away", [1e-1, 1e-4])
+def test_a_fit_that_starts_near_its_end_goes_all_the_way(away):
+    """No first step, however short, foretells the next."""
+    result = fit(readings(Tool.random(3), plan((0.5, 45, 90, 135)), ("inclination", "field")))
+    sd = np.sqrt(np.diagonal(result.analysis.covariance, axis1=1, axis2=2))
+    start = replace(result.state, params=result.state.params + away * sd)
+    state, status, iterations = gauss_newton(result.problem, start)
+    before, after = (result.problem.linear(at).normal.cost for at in (result.state, state))
+    assert status == 0
+    assert iterations >= 2
+    assert after - before < 1e-10 * away**2
+
+
+@pytest.mark.parametrize("options", [Options(), Options(nonlinearity={"magnetometer": 0.005})])
+def test_both_triads_in_one_call_are_those_one_by_one(options):
+    result = fit(readings(Tool.random(4), plan(), ("field", "inclination"), count=2), options)
+    problem, apart = result.problem, replace(result.problem)
+    assert (problem.alike is None) == bool(options.nonlinearity != "auto")
+    vars(apart)["alike"] = None
+    for one, other in zip(
+        problem.predictions(result.state), apart.predictions(result.state), strict=True
+    ):
+        for name, values in vars(one).items():
+            np.testing.assert_allclose(values, vars(other)[name], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "options", [Options(model="factors"), Options(order=(0, 1)), Options(parameters=9)]
+)
+def test_models_of_two_kinds_are_not_stacked(options):
+    run = replace(readings(Tool.random(4), plan(), EVERYTHING), temperature=20 + np.arange(48.0))
+    assert stacked([triad.model for triad in fit(run, options).problem.triads]) is None
+
+
+def test_stations_are_readjusted_only_where_that_moves_them():
+    """At the minimum nothing moves; errors of known angles come back, to second order, where a state has none."""
+    free = fit(readings(Tool.random(5), plan(), ("field",)))
+    assert readjusted(free.problem, free.state) is free.state
+    sd = {**NOISE, "inclination": np.full(48, 1e-3), "azimuth": np.full(48, 1e-3)}
+    known = fit(readings(Tool.random(5), plan(), EVERYTHING, sd=sd))
+    blank = replace(known.state, errors=np.zeros_like(known.state.errors))
+    errors = readjusted(known.problem, blank).errors
+    size = np.abs(known.state.errors).max()
+    assert size > 1e-4
+    np.testing.assert_allclose(errors, known.state.errors, atol=4 * size**2)

@@ -63,3 +63,60 @@ def test_a_command_that_fails_stops_the_guard(guard):
         guard.command("apply", "no.json", "no.csv")
     with pytest.raises(SystemExit, match="python -c"):
         guard.python("-c", "raise SystemExit(3)")
+
+
+def test_kinds_of_paths_are_prepared_only_where_the_word_begins_with_one_of_theirs(
+    guard, monkeypatch
+):
+    prepared = []
+
+    def kind(*names):
+        def paths(_):
+            prepared.extend(names)
+            yield from (guard.Guarded(name, "r", None, None) for name in names)
+
+        return paths
+
+    kinds = {
+        "fleet": kind("fleet, small", "fleet, large"),
+        "apply noise": kind("apply, 9", "noise, 9"),
+    }
+    monkeypatch.setattr(guard, "KINDS", kinds)
+
+    def named(word):
+        prepared.clear()
+        return [each.name for each in guard.asked_paths(word, None)]
+
+    assert named("fleet, large") == ["fleet, large"]
+    assert prepared == ["fleet, small", "fleet, large"]
+    assert named("large") == ["fleet, large"]
+    assert named("9") == ["apply, 9", "noise, 9"]
+    assert named("") == prepared == ["fleet, small", "fleet, large", "apply, 9", "noise, 9"]
+
+
+def test_the_names_of_paths_begin_with_those_of_their_kind(guard):
+    """Without preparing any: names stand in the code of a kind."""
+    words = [name for names in guard.KINDS for name in names.split()]
+    stored = guard.json.loads(guard.STORED.read_text())
+    assert all(any(name.startswith(word) for word in words) for name in stored)
+
+
+def test_a_figure_reaches_what_it_is_at_least_or_aimed_at(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    wait = import_module("waits").Wait
+    small = [wait("w", found, 5.0, 3.0, "ms").verdict for found in (2.0, 4.0, 6.0)]
+    large = [wait("w", found, 50, 100, "x", more=True).verdict for found in (101, 60, 40)]
+    assert small == large == ["aim", "at least", "**short of it**"]
+
+
+def test_rows_in_which_another_is_faster_say_why(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    bench = import_module("bench")
+    rows = [bench.Row(f"{name}; other", 2.0, 1.0, 0.5) for name in ("24 shots by strength", "odd")]
+    rows.append(bench.Row("fast; other", 1.0, 2.0, 2.0))
+    first, second = bench.slower({"peers": bench.Group(rows)})
+    assert "24 shots" in first
+    assert bench.CLOSED in first
+    assert second.endswith("**no reason known**.")
+    table = bench.group_table(rows)
+    assert [("slower" in line) for line in table.splitlines()[2:]] == [True, True, False]

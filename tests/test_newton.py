@@ -202,8 +202,8 @@ def test_thirty_factors_in_under_ten_iterations_over_temperature(warm):
 
 def free_changes(found):
     """Whether a turn about an axis, or the scale, of twelve factors is free, by name."""
-    moved = {name: tangent(TWELVE, found.params, each) for name, each in CHANGES.items()}
-    return {n: free_share(found.determined, each) > COUPLED for n, each in moved.items()}
+    moved = np.stack([tangent(TWELVE, found.params, each) for each in CHANGES.values()], 1)
+    return dict(zip(CHANGES, (free_share(found.determined, moved) > COUPLED).mT, strict=True))
 
 
 def test_eleven_of_twelve_are_determined_and_the_free_one_has_a_name(cold):

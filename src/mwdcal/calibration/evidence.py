@@ -21,7 +21,9 @@ STAND_TURNS = {"tilt": ("stand-north", "stand-east")}
 
 def flat(value: AnyArray, lead: tuple[int, ...], *tail: int) -> AnyArray:
     """A value with one batch axis: (B, n, *tail)."""
-    whole = np.broadcast_to(value, (*lead, *tail))
+    shape = (*lead, *tail)
+    value = np.asarray(value)
+    whole = value if value.shape == shape else np.broadcast_to(value, shape)
     return whole.reshape(math.prod(lead[:-1]), lead[-1], *tail)
 
 
@@ -109,6 +111,8 @@ def _share_known(evidence: Evidence) -> tuple[dict[str, Array], dict[str, Array]
         return known, spread
     for name in ("inclination", "azimuth"):
         given = evidence.is_known(name)
+        if given.all() or not given.any():
+            continue
         filled = evidence.members * given[..., None]
         count, total = filled.sum(-2), evidence.members.sum(-2)
         turn = np.einsum("bnk,bn->bk", filled, np.exp(1j * np.nan_to_num(known[name])))

@@ -131,6 +131,8 @@ class Solved:
         """
         if self.unweighted:
             return unweighted_pulls(problem, _alike(problem), state)
+        if not self.sums:
+            return {}
         triples = zip(problem.triads, problem.slices(), problem.targets(state), strict=False)
         return {
             index: replace(self.sums[index], triad=triad).influence(_alone(state, where), target)

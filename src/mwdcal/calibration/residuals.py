@@ -239,7 +239,7 @@ class Residuals:
         chance = chances(self.fit)[0]
         again, deviation = (
             stations_to_remeasure(chance),
-            normal_quantile(np.maximum(chance, 1e-300)),
+            normal_quantile(np.clip(chance, 1e-300, 1.0)),
         )
         ratio = {
             name: np.abs(after[name]) / np.maximum(np.nan_to_num(sd, nan=np.inf), 1e-30)

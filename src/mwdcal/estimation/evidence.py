@@ -106,6 +106,19 @@ class Evidence:
         return {name: self.members * groups[:, None, :] for name, groups in unknown.items()}
 
     @cached_property
+    def shared_turns(self) -> Array:
+        """The same (B, n, 2 k) of the inclination, then the azimuth."""
+        return np.concatenate([self.shared[name] for name in ANGLES[:2]], -1)
+
+    @cached_property
+    def upright(self) -> tuple[Array, Bools, Bools]:
+        """Members (B, n, k) of known toolface or azimuth, which groups (B, k) have one, and which any known angle."""
+        tied = self.members * (self.is_known("toolface") | self.is_known("azimuth"))[..., None]
+        inclined = self.members * self.is_known("inclination")[..., None]
+        across, leant = (np.any(members > 0, -2) for members in (tied, inclined))
+        return tied, across, np.asarray(across | leant)
+
+    @cached_property
     def set_together(self) -> Array:
         """σ (B, n, 2 k) of inclination, then azimuth, that stations have from each of k settings."""
         numbers = np.arange(self.settings)
@@ -134,6 +147,17 @@ class Evidence:
         share = self.apart[:, None]
         lone = {n: self.sd[n] * np.where(self.alone(n), 1.0, share) for n in ANGLES}
         return self._turn_sd(lone)
+
+    @cached_property
+    def held_sd(self) -> Array:
+        """The same (B, n, 3) of angles that have a reference, zero of the others."""
+        return np.where(self.referenced, self.turn_sd, 0.0)
+
+    @cached_property
+    def about_tool(self) -> bool:
+        """Whether stations turn about axes of the tool alone: all three of a free one, else the tool's own."""
+        across = (self.turn_sd[..., :2] > 0).any(-1) & ~self.free
+        return not (across.any() or self.set_together.any())
 
     @cached_property
     def exact_turn_sd(self) -> Array:

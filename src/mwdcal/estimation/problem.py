@@ -19,20 +19,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
-from itertools import pairwise
+from functools import cached_property, partial
+from itertools import accumulate, pairwise
 from typing import Any, TypeVar
 
 import numpy as np
 
-from mwdcal.estimation.batch import for_all
+from mwdcal.estimation.batch import for_all, is_once
 from mwdcal.estimation.evidence import EARTH, STAND, STAND_ERRORS, UNKNOWN, WALKS, Evidence
 from mwdcal.estimation.solvers import Linear
 from mwdcal.geometry.vectors import (
     Array,
     Bools,
-    earth_field,
-    earth_gravity,
     eigen,
     inverse,
     outer,
@@ -40,7 +38,7 @@ from mwdcal.geometry.vectors import (
     rotation,
     skew,
 )
-from mwdcal.sensor.models import Model
+from mwdcal.sensor.models import Model, stacked
 
 _Result = TypeVar("_Result")
 
@@ -54,7 +52,7 @@ WALK_AXES = {
     for axis, name in enumerate(names)
 }
 """Number of the walk and of its axis by the name of a constant."""
-NOISELESS = ("state", "attitude", "predictions", "linear True")
+NOISELESS = ("state", "attitude", "group axes", "predictions", "linear True")
 """What a problem's memo has that no noise enters."""
 
 
@@ -92,7 +90,7 @@ class Prediction:
 
     `misfit` (B, n, 3) raw; `by_params` (B, n, 3, p); `by_turn` (B, n, 3, 3) for a turn of the
     station; `by_earth` (B, n, 3, 3) for its gravity, field and dip; `by_vector` (B, n, 3, 3) for
-    the field's north, east and down; `strength` (B, n) of the field in raw units.
+    the field's north, east and down; `vector` (B, n, 3) is the field in raw units.
     """
 
     misfit: Array
@@ -100,7 +98,12 @@ class Prediction:
     by_turn: Array
     by_earth: Array
     by_vector: Array
-    strength: Array
+    vector: Array
+
+    @property
+    def strength(self) -> Array:
+        """Size (B, n) of the field in raw units."""
+        return np.asarray(np.linalg.norm(self.vector, axis=-1))
 
 
 @dataclass(frozen=True)
@@ -158,8 +161,8 @@ class Problem:
 
     def slices(self) -> list[slice]:
         """Where each triad's parameters lie."""
-        ends = np.cumsum([0] + [t.model.size for t in self.triads])
-        return [slice(int(a), int(b)) for a, b in pairwise(ends)]
+        ends = accumulate((t.model.size for t in self.triads), initial=0)
+        return [slice(*each) for each in pairwise(ends)]
 
     def fields(self, state: State) -> tuple[Array, Array]:
         """Corrected vectors (B, n, 3) of both triads, left-out stations too; NaN for a missing one."""
@@ -180,13 +183,16 @@ class Problem:
         return np.asarray(value)
 
     def targets(self, state: State) -> list[Array]:
-        """Vectors (B, n, 3) that perfect triads would read: gravity, then the field."""
+        """Vectors (2, B, n, 3) that perfect triads would read: gravity, then the field."""
         return self._seen(self.attitude(state), *(self.constant(state, c) for c in EARTH))
 
     @staticmethod
     def _seen(attitude: Array, gravity: Array, field: Array, dip: Array) -> list[Array]:
-        earth = for_all(earth_gravity, gravity), for_all(earth_field, field, dip)
-        return [for_all(_turned, attitude, vector) for vector in earth]
+        down = for_all(earth_gravity, gravity)
+        north = for_all(earth_field, field, dip)
+        if is_once(attitude, down) or is_once(attitude, north):
+            return [for_all(_turned, attitude, vector) for vector in (down, north)]
+        return [*(attitude @ np.stack([down, north])[..., None])[..., 0]]
 
     def attitude(self, state: State) -> Array:
         """Attitudes (B, n, 3, 3) with the errors of known angles in."""
@@ -233,37 +239,47 @@ class Problem:
     def _predictions(self, state: State) -> list[Prediction]:
         gravity, field, dip = (self.constant(state, c) for c in EARTH)
         attitude = self.attitude(state)
-        one, zero = np.ones_like(gravity), np.zeros((*gravity.shape, 3))
-        changes = (
-            [earth_gravity(one), zero, zero],
-            [zero, earth_field(one, dip), earth_field(field, dip + np.pi / 2)],
-        )
-        result = []
-        for triad, where, target, change in zip(
-            self.triads,
-            self.slices(),
-            self._seen(attitude, gravity, field, dip),
-            changes,
-            strict=False,
-        ):
-            params = state.params[:, where]
-            fields = triad.model.fields(params, triad.raw, self.temperature)
-            some = slice(None if triad.model.varies else 1)
-            back = inverse(triad.model.slope(params, triad.raw[:, some], self.temperature[:, some]))
-            misfit = np.einsum("bnij,bnj->bni", back, fields - target)
-            by_vector = -back @ attitude
-            by_params = triad.model.jacobian(params, triad.raw - misfit, self.temperature)
-            result.append(
-                Prediction(
-                    misfit,
-                    back @ by_params,
-                    back @ skew(target),
-                    by_vector @ np.stack(change, -1),
-                    by_vector,
-                    np.linalg.norm(np.einsum("bnij,bnj->bni", back, target), axis=-1),
-                )
-            )
-        return result
+        targets = self._seen(attitude, gravity, field, dip)
+        changes = self._earth_changes(field, dip)
+        if self.alike:
+            params = state.params.reshape(len(attitude), 2, -1).swapaxes(0, 1)
+            both = self._predicted(self.alike, params, attitude, targets, changes)
+            return [Prediction(*parts) for parts in zip(*vars(both).values(), strict=True)]
+        parameters = [state.params[:, where] for where in self.slices()]
+        each = zip(self.triads, parameters, targets, changes, strict=False)
+        return [self._predicted(t, params, attitude, *rest) for t, params, *rest in each]
+
+    def _predicted(
+        self, triad: Triad, params: Array, attitude: Array, target: Array, change: Array
+    ) -> Prediction:
+        model, raw, temperature = triad.model, triad.raw, self.temperature
+        some = slice(None if model.varies else 1)
+        back = inverse(model.slope(params, raw[..., some, :], temperature[:, some]))
+        departure = model.fields(params, raw, temperature) - target
+        misfit, vector = ((back @ v[..., None])[..., 0] for v in (departure, target))
+        by_vector = -back @ attitude
+        by_params = back @ model.jacobian(params, raw - misfit, temperature)
+        by_turn = back @ skew(target)
+        return Prediction(misfit, by_params, by_turn, by_vector @ change, by_vector, vector)
+
+    @cached_property
+    def alike(self) -> Triad | None:
+        """Both triads as one with a leading axis, if their models are of one kind: half as many calls."""
+        first, last = self.triads[0], self.triads[-1]
+        model = stacked([triad.model for triad in self.triads])
+        if first is last or model is None:
+            return None
+        return Triad(model, np.stack([first.raw, last.raw]), np.stack([first.sd, last.sd]))
+
+    @staticmethod
+    def _earth_changes(field: Array, dip: Array) -> Array:
+        """Changes (2, B, n, 3, 3) of both earth vectors, columns of each, by gravity, field and dip."""
+        changes = np.zeros((2, *field.shape, 3, 3))
+        north, down = np.cos(dip), np.sin(dip)
+        changes[0, ..., 2, 0] = 1.0
+        changes[1, ..., 0, 1], changes[1, ..., 2, 1] = north, down
+        changes[1, ..., 0, 2], changes[1, ..., 2, 2] = -field * down, field * north
+        return changes
 
     def linear(self, state: State, geometry: bool = False) -> Linear:
         """Linearise at a state; `geometry` takes references as exact and noise as uniform.
@@ -276,19 +292,19 @@ class Problem:
         if geometry and (state.errors.any() or state.settings.any()):
             state = replace(state, errors=0 * state.errors, settings=0 * state.settings)
         residual, blocks, turns, by_earth = self._whitened(state, geometry)
-        angles = turns @ self._angle_axes(state)
-        residual = residual - np.einsum("bnmi,bni->bnm", angles, state.errors)
+        angles = turns if self.evidence.about_tool else turns @ self._angle_axes(state)
+        if state.errors.any():
+            residual = residual - np.einsum("bnmi,bni->bnm", angles, state.errors)
         constants = self._constant_columns(state, by_earth, turns, geometry)
         if not geometry and self.walks:
             drifted = constants[..., self.walks] @ state.constants[:, None, self.walks, None]
             residual = residual + drifted[..., 0]
         settings = self._setting_columns(angles, geometry)
         shared = np.concatenate([constants, *self._group_turns(state, turns), settings], -1)
-        departures = by_earth[..., [EARTH.index(name) for name in self.evidence.absent]]
-        private = [
-            self._private_turns(angles, turns, geometry),
-            departures * self._absent_scales(state)[..., None, :],
-        ]
+        private = [self._private_turns(angles, turns, geometry)]
+        if self.evidence.absent:
+            departures = by_earth[..., [EARTH.index(name) for name in self.evidence.absent]]
+            private.append(departures * self._absent_scales(state)[..., None, :])
         if self.evidence.scatter and not geometry:
             columns, scatter = self.scatter_columns(state), self.evidence.scatter
             private += [c * scatter[name][..., None, None] for name, c in columns.items()]
@@ -301,7 +317,9 @@ class Problem:
         """Errors of known angles in units of their σ, among `count` private unknowns, and which are none."""
         held = np.zeros((*state.errors.shape[:2], count))
         loose = np.ones(held.shape, bool)
-        sd = np.where(self.evidence.referenced, self.evidence.turn_sd, 0.0)
+        sd = self.evidence.held_sd
+        if not sd.any():
+            return held, loose
         held[..., :3] = quotient(state.errors, sd, sd > 0)
         loose[..., :3] = sd == 0
         return held, loose
@@ -416,20 +434,33 @@ class Problem:
         p, constants = state.params.shape[-1], self.evidence.constants
         pull = np.zeros((len(state.params), p + shared))
         pull[:, :p] = state.params - self.prior.expected
-        diagonal = np.full(pull.shape, UNKNOWN**-2)
         for index, constant in enumerate(constants):
-            diagonal[:, p + index] = constant.sd**-2
             if not constant.unknown:
                 pull[:, p + index] = state.constants[:, index] - constant.value
-        settings = slice(pull.shape[-1] - state.settings.shape[-1], None)
-        pull[:, settings], diagonal[:, settings] = state.settings, 1.0
-        precision = diagonal[..., None] * np.eye(diagonal.shape[-1])
-        known = self.prior.precision
-        if geometry and known.any():
-            norms = [np.sqrt(np.sum(block**2, (1, 2))) for block in blocks]
-            known = self.prior.informed(np.concatenate(norms, -1))
-        precision[:, :p, :p] = known
+        pull[:, pull.shape[-1] - state.settings.shape[-1] :] = state.settings
+        if not (geometry and self.prior.precision.any()):
+            return self.precision, pull
+        norms = [np.sqrt(np.sum(block**2, (1, 2))) for block in blocks]
+        precision = self.precision.copy()
+        precision[:, :p, :p] = self.prior.informed(np.concatenate(norms, -1))
         return precision, pull
+
+    @cached_property
+    def precision(self) -> Array:
+        """Precision (B, u, u) of the parameters and the shared unknowns, by all that is known beforehand."""
+        constants, p = self.evidence.constants, self.prior.expected.shape[-1]
+        groups, settings = (
+            getattr(self.evidence, n).shape[-1] for n in ("shared_turns", "set_together")
+        )
+        diagonal = np.full(
+            (len(self.temperature), p + len(constants) + groups + settings), UNKNOWN**-2
+        )
+        for index, constant in enumerate(constants):
+            diagonal[:, p + index] = constant.sd**-2
+        diagonal[:, diagonal.shape[-1] - settings :] = 1.0
+        precision = diagonal[..., None] * np.eye(diagonal.shape[-1])
+        precision[:, :p, :p] = self.prior.precision
+        return precision
 
     def _angle_axes(self, state: State) -> Array:
         """Axes (B, n, 3, 3), as columns in the tool, about which inclination, azimuth and toolface turn it."""
@@ -445,6 +476,8 @@ class Problem:
         """
         sd = self.evidence.exact_turn_sd if geometry else self.evidence.turn_sd
         natural, free = angles * sd[..., None, :], self.evidence.free
+        if self.evidence.about_tool:
+            return natural
         return np.where(free[..., None, None], UNKNOWN * turns, natural) if free.any() else natural
 
     def _setting_columns(self, angles: Array, geometry: bool) -> Array:
@@ -472,37 +505,44 @@ class Problem:
         turned = np.einsum("bnij,bni->bnj", state.attitude, fixed)
         return np.where(by_toolface[..., None], turned, across)
 
-    def _group_axes(self, state: State) -> dict[str, Array]:
-        """Earth axes (B, k, 3) of each group's shared turns: inclining, and across or about down."""
-        members = self.evidence.members
-        tied = self.evidence.is_known("toolface") | self.evidence.is_known("azimuth")
-        axis = self._mean_of(members, state.attitude[..., 2, :])
+    def _group_axes(self, state: State) -> Array:
+        """Earth axes (B, 2, k, 3) of each group's shared turns: inclining, and across or about down."""
+        if self.memo.get("state") is not state:
+            return self._find_group_axes(state)
+        return self.once("group axes", state, self._find_group_axes)
+
+    def _find_group_axes(self, state: State) -> Array:
+        axis = self._mean_of(self.evidence.members, state.attitude[..., 2, :])
+        tied, across, upright = self.evidence.upright
         azimuth = np.arctan2(axis[..., 1], axis[..., 0])
-        first = np.stack([np.sin(azimuth), -np.cos(azimuth), np.zeros_like(azimuth)], -1)
-        upright = np.einsum("bnk,bn->bk", members, tied) > 0
-        if upright.any():
-            along = self._mean_of(members * tied[..., None], self._across(state))
+        axes = np.zeros((len(axis), 2, *axis.shape[1:]))
+        axes[:, 0, :, 0], axes[:, 0, :, 1] = np.sin(azimuth), -np.cos(azimuth)
+        if across.any():
+            along = self._mean_of(tied, self._across(state))
             size = np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-300)
-            first = np.where(upright[..., None], along / size, first)
-        upright |= np.einsum("bnk,bn->bk", members, self.evidence.is_known("inclination")) > 0
-        second = np.where(upright[..., None], np.array([0.0, 0.0, 1.0]), np.cross(axis, first))
-        return {"inclination": first, "azimuth": second}
+            axes[:, 0] = np.where(across[..., None], along / size, axes[:, 0])
+        second = (skew(axis) @ axes[:, 0, :, :, None])[..., 0]
+        axes[:, 1] = np.where(upright[..., None], np.array([0.0, 0.0, 1.0]), second)
+        return axes
 
     @staticmethod
     def _mean_of(members: Array, vectors: Array) -> Array:
         """Mean (B, k, 3) of vectors (B, n, 3) over the members (B, n, k) of each group."""
         count = np.maximum(members.sum(-2), 1.0)
-        return np.asarray(np.einsum("bnk,bni->bki", members, vectors) / count[..., None])
+        return np.asarray(members.mT @ vectors / count[..., None])
 
     def _group_turns(self, state: State, turns: Array) -> list[Array]:
         """Columns (B, n, m, k) of both shared turns of each group."""
-        if not self.evidence.members.shape[-1]:
+        if not self.evidence.members.size:
             return []
-        columns, base = [], (self._rolled(state), self.attitude(state))
-        for attitude, (name, axis) in zip(base, self._group_axes(state).items(), strict=True):
-            tool = np.einsum("bnij,bkj->bnik", attitude, axis)
-            columns.append(turns @ tool * self.evidence.shared[name][..., None, :])
-        return columns
+        axes, shared = self._group_axes(state), self.evidence.shared_turns
+        rolled, attitude = self._rolled(state), self.attitude(state)
+        if rolled is attitude:
+            parts = [(attitude, axes.reshape(len(axes), -1, 3), shared)]
+        else:
+            first, second = np.split(shared, 2, -1)
+            parts = [(rolled, axes[:, 0], first), (attitude, axes[:, 1], second)]
+        return [(turns @ base @ axis[:, None].mT) * who[..., None, :] for base, axis, who in parts]
 
     def move(self, state: State, linear: Linear, step: Array) -> State:
         """The state after a step; unknown private angles and the errors of known ones follow."""
@@ -510,7 +550,8 @@ class Problem:
         first = step.shape[-1] - state.settings.shape[-1]
         private = linear.private_step(step)
         attitude = self._turn_stand(state, step[:, p : p + q])
-        attitude = self._turn_groups(replace(state, attitude=attitude), step[:, p + q : first])
+        base = state if attitude is state.attitude else replace(state, attitude=attitude)
+        attitude = self._turn_groups(base, step[:, p + q : first])
         attitude = self._turn_stations(state, attitude, private[..., :3])
         absent = private[..., 3 : 3 + state.departures.shape[-1]]
         departures = state.departures + absent * self._absent_scales(state)
@@ -532,17 +573,20 @@ class Problem:
         attitude = state.attitude
         if not turns.size:
             return attitude
-        axes, parts = self._group_axes(state).items(), np.split(turns, 2, -1)
-        for (name, axis), turn in zip(axes, parts, strict=True):
-            vector = np.einsum("bnk,bk,bki->bni", self.evidence.shared[name], turn, axis)
-            attitude = attitude @ rotation(vector)
-        return attitude
+        evidence, axes = self.evidence, self._group_axes(state)
+        sizes = turns * evidence.shared_turns.any(-2)
+        first, second = np.moveaxis(rotation(sizes.reshape(*axes.shape[:-1], 1) * axes), 1, 0)
+        whole = (first @ second - np.eye(3)).reshape(*first.shape[:-2], 9)
+        turned = (evidence.members @ whole).reshape(attitude.shape)
+        return np.asarray(attitude + attitude @ turned)
 
     def _turn_stations(self, state: State, attitude: Array, private: Array) -> Array:
         """Attitudes with unknown angles turned by private unknowns (B, n, 3) in units of their σ."""
         sd = self.evidence.exact_turn_sd
         if not sd.any():
             return attitude
+        if self.evidence.about_tool:
+            return np.asarray(rotation(sd * private) @ attitude)
         bare = replace(state, errors=0 * state.errors, settings=0 * state.settings)
         free, turn = self.evidence.free, (sd * private)[..., None, :] * self._angle_axes(bare)
         about_down = np.zeros(turn.shape[:-1])
@@ -556,4 +600,4 @@ class Problem:
 
 def _turned(attitude: Array, vector: Array) -> Array:
     """Vectors (B, n, 3) of the earth as tools of an attitude (B, n, 3, 3) see them."""
-    return np.asarray(np.einsum("bnij,bnj->bni", attitude, vector))
+    return np.asarray((attitude @ vector[..., None])[..., 0])

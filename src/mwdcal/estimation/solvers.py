@@ -28,6 +28,10 @@ RANK_TOLERANCE = 2e-2
 NEGLIGIBLE = 1e-2
 """A member that is still on its way when iterations end has settled if a full step is a smaller
 share of the standard uncertainty than this."""
+SHORT_STEP = 1e-3
+"""Standard uncertainties: a full step shorter than this is taken whatever it does to the cost, and is the last…"""
+NEXT_STEP = 1e-8
+"""…if the next, shorter by the same factor, would be shorter than this."""
 CLEAR_MARGIN = 5.0
 """A direction is clearly determined with a singular value so many times `RANK_TOLERANCE`."""
 SPANNED = 1e-6
@@ -296,36 +300,57 @@ class Linearisable(Protocol):
 class _Descent:
     """Damped steps of one batch until every member has stopped.
 
-    All are of the members still `active`; `linear` is taken at `state`.
+    All are of the members still `active`; `linear` is taken at `state`, or None where nobody has asked for it yet;
+    `length` is that of the last full step in standard uncertainties, zero before there is one.
     """
 
     problem: Linearisable
     state: Any
-    linear: Linear
+    linear: Linear | None
     determined: Determined
     damping: Array
     active: Ints
+    length: Array
 
     def step(self) -> tuple[Bools, Bools]:
         """One iteration: which active members are at a minimum, and which are not finite."""
-        problem, linear = self.problem, self.linear
+        problem, linear = self.problem, self.here()
         normal = linear.normal
         finite = np.isfinite(normal.cost) & np.isfinite(normal.information).all((-1, -2))
         if not finite.all():
             return np.zeros_like(finite), ~finite
         step = _step(normal, self.determined, self.damping)
         trial = problem.move(self.state, linear, step)
+        length = np.sqrt(_length(normal, step))
+        small = _small(linear, step, self.state.params, length) | self._last(length)
+        self.length = np.where(self.damping > 0, 0.0, length)
+        if small.all():  # taken whatever it does to the cost
+            self.state, self.linear, self.damping = trial, None, self._calmer()
+            return small, ~finite
         after = problem.linear(trial)
         # the gradient holds the weights fixed, and so must the cost that judges the step
         before = normal.cost if linear.loose.all() else linear.cost(linear)
         cost = linear.cost(after)
-        small = _small(linear, step, self.state.params)
         with np.errstate(invalid="ignore"):
             better = (cost <= before * (1 + 1e-9) + 1e-9) | small
         self._accept(trial, after, better)
-        calmer = np.where(self.damping < 1e-6, 0.0, self.damping / 10)
-        self.damping = np.where(better, calmer, np.maximum(10 * self.damping, 1e-3))
+        self.damping = np.where(better, self._calmer(), np.maximum(10 * self.damping, 1e-3))
         return small & better, ~finite
+
+    def here(self) -> Linear:
+        """The problem linearised at the state."""
+        self.linear = self.linear or self.problem.linear(self.state)
+        return self.linear
+
+    def _last(self, length: Array) -> Bools:
+        """Which full steps are so much shorter than those before that the next would be nothing."""
+        return np.asarray(
+            (self.damping == 0) & (length < SHORT_STEP) & (length**2 < NEXT_STEP * self.length)
+        )
+
+    def _calmer(self) -> Array:
+        """Damping after a step that is taken."""
+        return np.where(self.damping < 1e-6, 0.0, self.damping / 10)
 
     def arrived(self) -> Bools:
         """Which active members no full step would move by more than a `NEGLIGIBLE` share of σ.
@@ -333,7 +358,7 @@ class _Descent:
         Rounding of the cost can refuse such steps for ever, and flat directions make them shrink
         slowly: both are at their minimum for all purposes.
         """
-        normal = self.linear.normal
+        normal = self.here().normal
         step = _step(normal, self.determined)
         return self.settled(np.asarray(_length(normal, step) < NEGLIGIBLE**2))
 
@@ -376,14 +401,13 @@ def _length(normal: Normal, step: Array) -> Array:
     return np.asarray(np.einsum("...i,...ij,...j->...", step, normal.information, step))
 
 
-def _small(linear: Linear, step: Array, params: Array) -> Bools:
-    """Below a millionth of the standard uncertainty, or rounding of each triad's largest parameter."""
+def _small(linear: Linear, step: Array, params: Array, length: Array) -> Bools:
+    """Of a `length` (B,) below a millionth, or within rounding of each triad's largest parameter."""
     size, moved = (
         np.stack([np.abs(x[:, columns]).max(-1) for _, _, columns in linear.placed()])
         for x in (params, step)
     )
-    near = _length(linear.normal, step) < 1e-12
-    return np.asarray(near | np.all(moved <= 1e-12 * size, 0))
+    return np.asarray((length < 1e-6) | np.all(moved <= 1e-12 * size, 0))
 
 
 def stepped(problem: Linearisable, state: Any, determined: Determined) -> Any:
@@ -398,7 +422,8 @@ def gauss_newton(problem: Linearisable, state: Any, limit: int = 60) -> tuple[An
     status = np.full(count, int(Status.NOT_CONVERGED))
     iterations = np.zeros(count, int)
     determined, linear = Determined.of(problem, state), problem.linear(state)
-    descent = _Descent(problem, state, linear, determined, np.zeros(count), np.arange(count))
+    zero = np.zeros(count)
+    descent = _Descent(problem, state, linear, determined, zero, np.arange(count), zero)
     for _ in range(limit):
         if not descent.active.size:
             break

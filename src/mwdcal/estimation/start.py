@@ -6,12 +6,12 @@ nominal values but for the orientation of the axes, and where all else fails.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from mwdcal.estimation.evidence import ANGLES
+from mwdcal.estimation.evidence import ANGLES, EARTH
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.solvers import regress
 from mwdcal.geometry import observables
@@ -34,6 +34,12 @@ ELLIPSOID_SPAN = 2e-3
 """Columns of the ellipsoid with a singular value below this share of the largest are noise."""
 LEAST_SPAN = 1e-3
 """Least share of the field along an axis with which least squares gives a start."""
+SQUARES = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2]), np.array([1, 2, 2, 1, 2, 1.0])
+"""Axes of the products in a quadric, and how often each counts."""
+SPHERE = np.array([1, 0, 0, 1, 0, 1, 0, 0, 0.0])
+"""Coefficients of a sphere about zero in the terms of the ellipsoid."""
+FEWEST_KNOWN = 4
+"""Fewest stations of known direction with which it does."""
 
 
 def start(problem: Problem) -> State:
@@ -46,39 +52,45 @@ def start(problem: Problem) -> State:
     level = np.broadcast_to(np.eye(3), (*shape, 3, 3))
     empty = problem.start(np.zeros((shape[0], 0)), level)
     params = []
-    for index, where in enumerate(problem.slices()):
+    for where, free in zip(problem.slices(), _triad_starts(problem, empty), strict=True):
         known = diagonal(problem.prior.precision[:, where, where]) > 0
-        free = _triad_start(problem, empty, index)
         whole = known.all(-1, keepdims=True)
         params.append(np.where(whole, problem.prior.expected[:, where], free))
     return oriented(problem, replace(empty, params=np.concatenate(params, -1)))
 
 
-def _triad_start(problem: Problem, state: State, index: int) -> Array:
-    triad, include = problem.triads[index], problem.evidence.include
-    strength = problem.constant(state, ("gravity", "field")[index])
-    centre = np.sum(triad.raw * include[..., None], -2) / np.sum(include, -1)[..., None]
-    x = triad.raw - centre[:, None, :]
-    radius = np.sqrt(np.sum(x * x * include[..., None], (-2, -1)) / np.sum(include, -1))
+def _triad_starts(problem: Problem, state: State) -> list[Array]:
+    """Parameters (B, p) of each triad."""
+    triads, include = problem.triads, problem.evidence.include
+    raw, count = np.stack([triad.raw for triad in triads]), np.sum(include, -1)
+    centre = np.sum(raw * include[..., None], -2) / count[..., None]
+    x = raw - centre[..., None, :]
+    radius = np.sqrt(np.sum(x * x * include[..., None], (-2, -1)) / count)
     radius = np.where(radius > 0, radius, 1.0)
-    x = x / radius[:, None, None]
-    matrix, offset = _ellipsoid(x, strength, include)
-    linear, linear_offset, usable = _linear(problem, state, index, x)
-    matrix = np.where(usable[:, None, None], linear, matrix)
-    offset = np.where(usable[:, None], linear_offset, offset)
-    matrix = matrix / radius[:, None, None]
-    return triad.model.start(matrix, offset - np.einsum("bij,bj->bi", matrix, centre))
+    x = x / radius[..., None, None]
+    each = [_linear(problem, state, index, part) for index, part in enumerate(x)]
+    matrix, offset, usable = (np.stack(parts) for parts in zip(*each, strict=True))
+    if not usable.all():
+        strength = [problem.constant(state, name) for name in EARTH[: len(triads)]]
+        flat = (-1, *x.shape[2:])
+        every = np.broadcast_to(include, raw.shape[:-1]).reshape(flat[:2])
+        root, centred = _ellipsoid(x.reshape(flat), np.concatenate(strength), every)
+        matrix = np.where(usable[..., None, None], matrix, root.reshape(matrix.shape))
+        offset = np.where(usable[..., None], offset, centred.reshape(offset.shape))
+    matrix = matrix / radius[..., None, None]
+    offset = offset - (matrix @ centre[..., None])[..., 0]
+    return [t.model.start(*pair) for t, *pair in zip(triads, matrix, offset, strict=True)]
 
 
 def _ellipsoid(x: Array, strength: Array, include: Array) -> tuple[Array, Array]:
     """Symmetric matrix and offset that put centred readings on a sphere of the given strength."""
-    i, j = np.triu_indices(3)
-    features = np.concatenate([x[..., i] * x[..., j] * np.where(i == j, 1.0, 2.0), 2 * x], -1)
+    i, j, times = SQUARES
+    features = np.concatenate([x[..., i] * x[..., j] * times, 2 * x], -1)
     weighed = features * include[..., None]
     gram = weighed.mT @ features
     size = np.sum(x * x * include[..., None], (-2, -1)) / np.sum(include, -1)
-    sphere = np.concatenate([np.eye(3)[i, j], np.zeros(3)]) / np.maximum(size, 1e-300)[:, None]
-    left = np.sum(weighed, -2) - np.einsum("bij,bj->bi", gram, sphere)
+    sphere = SPHERE / np.maximum(size, 1e-300)[:, None]
+    left = np.sum(weighed, -2) - (gram @ sphere[..., None])[..., 0]
     solution = sphere + _where_determined(gram, left)
     quadric = np.zeros((len(x), 3, 3))
     quadric[:, i, j] = solution[:, :6]
@@ -86,14 +98,14 @@ def _ellipsoid(x: Array, strength: Array, include: Array) -> tuple[Array, Array]
     values, vectors = eigen(quadric)
     sound = values[:, 0] > 1e-3 * values[:, 2]
     values = np.where(sound[:, None], values, 1.0)
-    half = np.einsum("bij,bj,bkj->bik", vectors, values, vectors)
-    centre = -solved(half, solution[:, 6:, None])[..., 0]
+    along = vectors.mT @ solution[:, 6:, None] / values[..., None]
+    centre = -(vectors @ along)[..., 0]
     centre = np.where(sound[:, None], centre, (x.max(-2) + x.min(-2)) / 2)
-    root = np.einsum("bij,bj,bkj->bik", vectors, np.sqrt(values), vectors)
-    mapped = np.linalg.norm(np.einsum("bij,bnj->bni", root, x - centre[:, None, :]), axis=-1)
+    root = (vectors * np.sqrt(values)[:, None]) @ vectors.mT
+    mapped = np.linalg.norm((x - centre[:, None, :]) @ root, axis=-1)
     scale = np.sum(strength * include, -1) / np.maximum(np.sum(mapped * include, -1), 1e-30)
     matrix = root * scale[:, None, None]
-    return matrix, -np.einsum("bij,bj->bi", matrix, centre)
+    return matrix, -(matrix @ centre[..., None])[..., 0]
 
 
 def _where_determined(gram: Array, right: Array) -> Array:
@@ -104,8 +116,8 @@ def _where_determined(gram: Array, right: Array) -> Array:
     """
     values, vectors = eigen(gram)
     kept = values > ELLIPSOID_SPAN**2 * values[:, -1:]
-    along = np.einsum("bij,bi->bj", vectors, right)
-    return np.asarray(np.einsum("bij,bj->bi", vectors, quotient(along, values, kept)))
+    along = (vectors.mT @ right[..., None])[..., 0]
+    return np.asarray((vectors @ quotient(along, values, kept)[..., None])[..., 0])
 
 
 def _linear(problem: Problem, state: State, index: int, x: Array) -> tuple[Array, Array, Bools]:
@@ -114,11 +126,14 @@ def _linear(problem: Problem, state: State, index: int, x: Array) -> tuple[Array
     known = [evidence.is_known(name) for name in ANGLES]
     whole = known[0] & known[2] & (known[1] | (index == 0))
     weight = evidence.include * whole
+    if (np.count_nonzero(weight, axis=-1) < FEWEST_KNOWN).all():
+        count = len(x)
+        return np.zeros((count, 3, 3)), np.zeros((count, 3)), np.zeros(count, bool)
     attitude = tool_from_earth(*(np.nan_to_num(evidence.known[name]) for name in ANGLES))
     terms = np.concatenate([x, np.ones_like(x[..., :1])], -1)
     gram = np.einsum("bn,bni,bnj->bij", weight, terms, terms)
     values = eigenvalues(gram)
-    usable = (values[:, 0] > LEAST_SPAN**2 * values[:, -1]) & (weight.sum(-1) >= 4)
+    usable = (values[:, 0] > LEAST_SPAN**2 * values[:, -1]) & (weight.sum(-1) >= FEWEST_KNOWN)
     gram = np.where(usable[:, None, None], gram, np.eye(4))
 
     if index == 0:
@@ -173,7 +188,7 @@ def oriented(problem: Problem, state: State) -> State:
     return replace(state, attitude=rotation(turn[..., None] * np.array([0.0, 0.0, 1.0])) @ attitude)
 
 
-def _best_turn(fields: Sequence[Array], targets: Sequence[Array]) -> Array:
+def _best_turn(fields: Sequence[Array], targets: Iterable[Array]) -> Array:
     """Angle (B, n) about the tool axis that brings targets closest to fields, in closed form."""
     sine, cosine = np.zeros(fields[0].shape[:-1]), np.zeros(fields[0].shape[:-1])
     for field, target in zip(fields, targets, strict=False):
@@ -187,9 +202,12 @@ def _best_turn(fields: Sequence[Array], targets: Sequence[Array]) -> Array:
 def _share(problem: Problem, angles: dict[str, Array]) -> dict[str, Array]:
     """Stations of a group whose direction is unknown start from their mean direction."""
     evidence = problem.evidence
-    inc, azi = angles["inclination"], angles["azimuth"]
-    axis = tool_from_earth(inc, azi, np.zeros_like(inc))[..., 2, :]
     members = evidence.members
+    if not members.size:
+        return angles
+    inc, azi = angles["inclination"], angles["azimuth"]
+    across = np.sin(inc)
+    axis = np.stack([across * np.cos(azi), across * np.sin(azi), np.cos(inc)], -1)
     mean = members @ (members.mT @ axis)
     means = {
         "inclination": np.arctan2(np.hypot(mean[..., 0], mean[..., 1]), mean[..., 2]),
@@ -210,6 +228,8 @@ def _by_toolface(
     """
     evidence = problem.evidence
     faced = evidence.is_known("toolface") & (evidence.include > 0)
+    if not faced.any():
+        return angles
     lone = faced & (evidence.group < 0)
 
     def mean(name: str, inclination: Array, field: Array) -> tuple[Array, Bools]:

@@ -59,7 +59,7 @@ LEAST_SCATTER = 1e-5
 """Scatter below which there is none."""
 LARGEST_CHANGE = 20.0
 """A variance changes by this factor at most in one round."""
-AT_REST = 1e-12
+AT_REST = 1e-11
 """Stations and groups are at their best where no step turns them further, rad, or moves them by more σ."""
 PIN = 0.05
 """Parameters are known to this share of the field when runs are compared by their probability."""
@@ -458,12 +458,17 @@ def candidates(problem: Problem, state: State, triads: list[int]) -> dict[str, A
     directions = {name: np.zeros_like(state.params) for name in names}
     for triad in triads:
         where, model = problem.slices()[triad], problem.triads[triad].model
-        for name, change in CHANGES.items():
-            steady = tangent(model, state.params[:, where], change)
-            directions[name][:, where] = steady
+        steady = changed(model, state.params[:, where])
+        for name, direction in zip(CHANGES, np.moveaxis(steady, 1, 0), strict=True):
+            directions[name][:, where] = direction
             for power, course in enumerate(courses[name], 1):
-                directions[course][:, where] = model.with_course(steady, power)
+                directions[course][:, where] = model.with_course(direction, power)
     return directions
+
+
+def changed(model: Model, params: Array) -> Array:
+    """Changes (B, 4, p) of the parameters (B, p) by those of all fields in `CHANGES`."""
+    return tangent(model, params[:, None], np.stack([*CHANGES.values()]))
 
 
 def tangent(model: Model, params: Array, change: Array) -> Array:
@@ -471,12 +476,11 @@ def tangent(model: Model, params: Array, change: Array) -> Array:
     return np.asarray((model.transformed(params, change) - params) / TANGENT_STEP)
 
 
-def free_share(determined: Determined, direction: Array) -> Array:
-    """Share (B,), 0…1, of a direction of parameter space that lies in the free subspace."""
-    scaled = direction * determined.norms
-    inside = np.einsum("bpk,bp->bk", determined.null(), scaled)
-    total = np.sum(scaled**2, -1)
-    return quotient(np.sum(inside**2, -1), total, total > 0)
+def free_share(determined: Determined, directions: Array) -> Array:
+    """Shares (B, c), 0…1, of directions (B, c, p) of parameter space that lie in the free subspace."""
+    scaled = directions * determined.norms[:, None]
+    inside, total = np.sum((scaled @ determined.null()) ** 2, -1), np.sum(scaled**2, -1)
+    return quotient(inside, total, total > 0)
 
 
 def marginal_rank(determined: Determined, where: slice) -> Ints:
@@ -492,14 +496,23 @@ def settle_gauge(problem: Problem, state: State, determined: Determined) -> Stat
     is the nominal one.
     """
     every = list(range(len(problem.triads)))
-    for triads in [every] + [[t] for t in every if len(every) > 1]:
-        named = candidates(problem, state, triads)
-        free = np.stack([free_share(determined, named[n]) > COUPLED for n in ROTATIONS], -1)
-        turn = _polar_turn(problem, state, triads[0], free)
-        state = _turn(problem, state, triads, turn)
+    each = np.zeros((len(state.params), len(every), len(CHANGES), state.params.shape[-1]))
+    for triad, where in enumerate(problem.slices()):
+        each[:, triad, :, where] = changed(problem.triads[triad].model, state.params[:, where])
+    sets, moved = [[triad] for triad in every], each
+    if len(every) > 1:
+        sets, moved = [every, *sets], np.concatenate([each.sum(1, keepdims=True), each], 1)
+    share = free_share(determined, moved.reshape(len(each), -1, each.shape[-1]))
+    free = share.reshape(moved.shape[:-1]) > COUPLED
+    for index, triads in enumerate(sets):
+        turned = free[:, index, : len(ROTATIONS)]
+        if turned.any():
+            turn = _polar_turn(problem, state, triads[0], turned)
+            state = _turn(problem, state, triads, turn)
+    scaled = free[:, -len(every) :, -1]
     for triad in every:
-        share = free_share(determined, candidates(problem, state, [triad])["scale"])
-        state = _rescale(problem, state, triad, share > COUPLED)
+        if scaled[:, triad].any():
+            state = _rescale(problem, state, triad, scaled[:, triad])
     return readjusted(problem, state)
 
 
@@ -513,9 +526,11 @@ def readjusted(problem: Problem, state: State) -> State:
         step = np.zeros((len(state.params), linear.design.shape[-1]))
         groups = inverse(normal.information[:, fixed:, fixed:])
         step[:, fixed:] = -(groups @ normal.gradient[:, fixed:, None])[..., 0]
+        turned, private = np.abs(step).max(initial=0.0), linear.private_step(step)
+        if max(turned, np.abs(private - linear.held).max(initial=0.0)) < AT_REST:
+            break
         state = problem.move(state, linear, step)
-        moved = np.abs(step).max(initial=0.0), np.abs(linear.private_step(step) * linear.loose)
-        if max(moved[0], moved[1].max(initial=0.0)) < AT_REST:
+        if max(turned, np.abs(private * linear.loose).max(initial=0.0)) < AT_REST:
             break
     return state
 

@@ -24,6 +24,8 @@ ArrayLike = npt.ArrayLike
 AnyArray = npt.NDArray[Any]
 LEAST_HALF = 5
 """A matrix is inverted by halves where these have so many rows."""
+_CROSS_PRODUCTS = np.cross(np.eye(3)[:, None], np.eye(3)).mT.reshape(3, 9)
+"""The matrices of the cross product with each axis, row by row."""
 
 
 def wrap(angle: ArrayLike, period: float = 2 * np.pi) -> Array:
@@ -85,11 +87,7 @@ def reference_vectors(
 
 def skew(vector: Array) -> Array:
     """The matrix (..., 3, 3) of the cross product: skew(a) @ b = a × b."""
-    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
-    matrix = np.zeros((*vector.shape, 3))
-    matrix[..., 0, 1], matrix[..., 0, 2], matrix[..., 1, 2] = -z, y, -x
-    matrix[..., 1, 0], matrix[..., 2, 0], matrix[..., 2, 1] = z, -y, x
-    return matrix
+    return np.asarray((vector @ _CROSS_PRODUCTS).reshape(*vector.shape, 3))
 
 
 def rotation(turn: Array) -> Array:

@@ -16,7 +16,8 @@ The order of the parameters is defined by `affine_parts` and `factor_parts`, and
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -192,8 +193,9 @@ class Polynomial:
         matrix, offset = affine_parts(self._blocks(params))
         offset = np.einsum("...ij,...kj->...ki", turn, offset)
         blocks = affine_terms(turn[..., None, :, :] @ matrix, offset)
-        flat = blocks.reshape(*params.shape[:-1], self.affine)
-        return np.concatenate([flat, params[..., self.affine :]], -1)
+        flat = blocks.reshape(*blocks.shape[:-2], self.affine)
+        rest = np.broadcast_to(params[..., self.affine :], (*flat.shape[:-1], 6 * self.curved))
+        return np.concatenate([flat, rest], -1)
 
     def with_course(self, direction: Array, power: int) -> Array:
         """A change (..., p) of the steady parameters, moved to a power of temperature."""
@@ -434,6 +436,16 @@ def restricted(model: Whole, parameters: int) -> Model:
 
 
 Model = Whole | Restricted
+
+
+def stacked(models: Sequence[Model]) -> Polynomial | None:
+    """Polynomials that differ in their centres and scales alone, as one with a leading axis; else None."""
+    first = models[0]
+    whole = [m for m in models if isinstance(m, Polynomial) and isinstance(first, Polynomial)]
+    if len(whole) < len(models) or len({(m.basis, m.curved) for m in whole}) > 1:
+        return None
+    centre, scale = np.stack([m.centre for m in whole]), np.stack([m.scale for m in whole])
+    return replace(whole[0], centre=centre, scale=scale)
 
 
 def _with_power(name: str, power: int) -> str:

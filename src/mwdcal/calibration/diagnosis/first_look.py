@@ -62,7 +62,9 @@ def may_show(result: Fit) -> Bools:
     if not common:
         return every
     design = Alike.of(problem, result.state)
-    if any(name.endswith(("-temperature", "-thermal-lag")) for name in common_effects(design).columns):
+    if any(
+        name.endswith(("-temperature", "-thermal-lag")) for name in common_effects(design).columns
+    ):
         return every
     scale = np.sqrt(np.maximum(variance_scales(result), 1e-12))
     residual = result.analysis.residual / np.repeat(scale, 3, -1)[:, None]
