@@ -16,7 +16,7 @@ from mwdcal.calibration import results
 from mwdcal.calibration.automatic.auto import Choice, choose
 from mwdcal.calibration.automatic.drift import fit_run
 from mwdcal.calibration.automatic.order_selection import Progress
-from mwdcal.calibration.canonical import rounded
+from mwdcal.calibration.canonical import figures, rounded
 from mwdcal.calibration.diagnosis.findings import described, finding_flags, findings
 from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag
 from mwdcal.calibration.diagnosis.identity import dated, overdue, unidentified
@@ -129,13 +129,13 @@ class Records:
 
         Raises `FitError` where it would not be one.
         """
-        calibration = with_checksum(rounded(self._whole(place, choice)))
+        calibration = with_checksum(self._whole(place, choice))
         if problem := inconsistency(calibration):
             raise FitError(f"the fit gives no usable calibration: {problem}. {UNSOUND_ADVICE}")
         return calibration
 
     def _whole(self, place: int, choice: Choice) -> Calibration:
-        """The calibration file of one fit, in full digits."""
+        """The calibration file of one fit."""
         readings, options, result = choice.readings, choice.options, self.fitted.result
         prior = options.knowledge
         tool = _identity(readings, prior is not None and prior.simulated)
@@ -143,7 +143,7 @@ class Records:
             tool=tool,
             serial=serial_of(tool) or msgspec.UNSET,
             simulated=is_simulated(tool),
-            profile=choice.profile,
+            profile=rounded(choice.profile),
             profile_sha256=readings.profile_sha256,
             run=readings.source,
             run_sha256=readings.run_sha256,
@@ -159,10 +159,10 @@ class Records:
             stations=readings.count,
             excluded=[*choice.excluded, *(label for label, _ in readings.copies)],
             copies=[digest for _, digest in readings.copies] or msgspec.UNSET,
-            singular_values=result.analysis.determined.values[place].tolist(),
+            singular_values=figures(result.analysis.determined.values[place]),
             gravity_stated=readings.states("gravity"),
             settings=self._practice(place, readings),
-            orders=list(choice.orders),
+            orders=[*map(rounded, choice.orders)],
             station_rows=self.fitted.stations(place),
             inherited=list(prior.stations) if prior else [],
             findings=[*self._findings(place, choice), *_doubts(choice, prior)],
@@ -180,9 +180,9 @@ class Records:
         return {
             "temperature_c": [None] * count
             if fitted.readings.temperature is None
-            else [*zip(*(end.tolist() for end in ends), strict=True)],
+            else [*zip(*(figures(end) for end in ends), strict=True)],
             **dict(zip(TRIADS, triads, strict=False)),
-            "covariance_rows": fitted.covariance.in_file(reference).tolist(),
+            "covariance_rows": figures(fitted.covariance.in_file(reference)),
             "free": _free(fitted),
             "constants": _constants(result),
             "drift": _drifts(result, fitted.readings.field_unit),
@@ -244,7 +244,7 @@ def _settings(options: Options) -> FitSettings:
 
 def _by_run(values: dict[str, Array], count: int) -> list[dict[str, float]]:
     """The values (B,) of each of `count` runs by name."""
-    rows = zip(*(each.tolist() for each in values.values()), strict=True)
+    rows = zip(*map(figures, values.values()), strict=True)
     return [dict(zip(values, row, strict=True)) for row in rows] if values else [{}] * count
 
 
@@ -254,7 +254,7 @@ def _free(fitted: FittedRuns) -> list[list[list[float]]]:
         return [[] for _ in fitted.free]
     maps = results.to_file(fitted.result, fitted.profile.reference_temperature_c)
     return [
-        [(each @ entry.direction).tolist() for entry in free]
+        [figures(each @ entry.direction) for entry in free]
         for each, free in zip(maps, fitted.free, strict=True)
     ]
 
@@ -294,7 +294,7 @@ def _accuracies(
     tools = results.calibrated_tools(fitted.result, fitted.free, reference, prior)
     sd = accuracy(tools, np.stack([*shares.values()]))
     names = [f"{angle}_deg" for angle in sd]
-    degrees = np.degrees(np.stack([*sd.values()], -1)).tolist()
+    degrees = figures(np.degrees(np.stack([*sd.values()], -1)))
     return {
         source: [dict(zip(names, map(stated, row), strict=True)) for row in each]
         for source, each in zip(shares, degrees, strict=True)
@@ -315,8 +315,8 @@ def _constants(result: Fit) -> list[list[Constant]]:
         unit = {"gravity": "g", "field": "nT"}.get(constant.name, "°")
         factor = float(np.degrees(1)) if unit == "°" else 1.0
         name = constant.name if constant.unknown else results.error_name(constant.name)
-        figures = (values * factor).tolist(), (uncertainties * factor).tolist()
-        for each, value, own in zip(constants, *figures, strict=True):
+        numbers = figures(values * factor), figures(uncertainties * factor)
+        for each, value, own in zip(constants, *numbers, strict=True):
             each.append(Constant(name=name, value=value, standard_uncertainty=own, unit=unit))
     return constants
 
@@ -328,8 +328,8 @@ def _drifts(result: Fit, field_unit: str) -> list[list[Drift]]:
     for name, (change, sd) in results.drifts(result).items():
         factor, unit = _shown_drift(name, field_unit)
         size = declared.get(name, np.zeros(len(change)))
-        figures = ((each * factor).tolist() for each in (change, sd, size))
-        for each, moved, own, stated_size in zip(drifts, *figures, strict=True):
+        numbers = (figures(each * factor) for each in (change, sd, size))
+        for each, moved, own, stated_size in zip(drifts, *numbers, strict=True):
             each.append(
                 Drift(
                     name=name.removesuffix("-drift"),
@@ -356,7 +356,7 @@ def _unseen(fitted: FittedRuns) -> list[list[UnseenDrift] | msgspec.UnsetType]:
     unseen: list[list[UnseenDrift]] = [[] for _ in range(fitted.count)]
     for name, sd in (_accuracies(fitted, shares) if shares else {}).items():
         factor, unit = _shown_drift(name, fitted.readings.field_unit)
-        word, size = name.removesuffix("-drift"), sizes[name] * factor
+        word, size = name.removesuffix("-drift"), figures(np.array(sizes[name] * factor))
         for place in np.flatnonzero(members[name]).tolist():
             unseen[place].append(UnseenDrift(name=word, change=size, unit=unit, **sd[place]))
     return [each or msgspec.UNSET for each in unseen]
@@ -374,14 +374,17 @@ def _triads(fitted: FittedRuns, index: int) -> list[TriadCalibration]:
     model = triad.model
     powers = model if isinstance(model, Polynomial) else Polynomial(model.basis)
     field_unit = "1 (field = 1)" if fitted.readings.relative else "nT"
-    singular = results.triad_singular_values(fitted.result, index).tolist()
+    singular = figures(results.triad_singular_values(fitted.result, index))
     centre, scale = (
-        np.broadcast_to(each, (count, 1, 3))[:, 0].tolist()
+        figures(np.broadcast_to(each, (count, 1, 3))[:, 0])
         for each in (powers.centre, powers.scale)
     )
-    facts = (triad.parameters, triad.sd, triad.rank, triad.size, triad.noise, triad.declared)
-    checks = (triad.variance_factor, triad.degrees_of_freedom, fitted.chances[:, index])
-    rows = zip(*(each.tolist() for each in (*facts, *checks)), strict=True)
+    numbers = (
+        *(triad.parameters, triad.sd, triad.noise, triad.variance_factor),
+        *(triad.degrees_of_freedom, fitted.chances[:, index]),
+    )
+    counts = (triad.rank.tolist(), triad.size.tolist(), triad.declared.tolist())
+    rows = zip(*map(figures, numbers), *counts, strict=True)
     return [
         TriadCalibration(
             name=name,
@@ -409,6 +412,6 @@ def _triads(fitted: FittedRuns, index: int) -> list[TriadCalibration]:
             misfit_probability=stated(chance),
         )
         for place, (
-            parameters, sd, rank, size, noise, declared, factor, freedom, chance
+            parameters, sd, noise, factor, freedom, chance, rank, size, declared
         ) in enumerate(rows)
     ]  # fmt: skip

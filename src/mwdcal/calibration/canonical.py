@@ -90,7 +90,7 @@ def rounded(record: Record) -> Record:
     More digits would differ from machine to machine with the threads of its linear algebra.
     """
     fields = msgspec.to_builtins(record)
-    return msgspec.convert(_with(iter(_in_digits(numbers(fields)).tolist()), fields), type(record))
+    return msgspec.convert(_with(iter(figures(numbers(fields))), fields), type(record))
 
 
 def numbers(document: Any) -> Array:
@@ -122,8 +122,8 @@ def _with(new: Iterator[float], value: Any) -> Any:
 
 
 @np.errstate(all="ignore")
-def _in_digits(values: Array) -> Array:
-    """Numbers at so many significant digits as a file has, each the double nearest to its decimal.
+def figures(values: Array) -> Any:
+    """Numbers (...) at so many significant digits as a file has, each the double nearest to its decimal, as lists.
 
     A whole number of that many digits over a power of ten, both exact doubles, is that nearest double. What is too
     small or too large for this, or so near to halfway that the product may have crossed it, is spelled.
@@ -136,7 +136,7 @@ def _in_digits(values: Array) -> Array:
     whole = np.rint(scaled)
     known &= (whole >= POWERS[DIGITS - 1]) & (whole < POWERS[DIGITS])
     known &= np.abs(np.abs(scaled - whole) - 0.5) > HALFWAY
-    rounded = np.copysign(np.where(power >= 0, whole / scale, whole * scale), values)
+    rounded = np.array(np.copysign(np.where(power >= 0, whole / scale, whole * scale), values))
     spelled = [float(f"{value:.{DIGITS - 1}e}") for value in values[~known].tolist()]
     rounded[~known] = spelled
-    return rounded
+    return rounded.tolist()

@@ -9,6 +9,7 @@ from math import erfc, gamma
 
 import numpy as np
 
+from mwdcal.calibration.canonical import figures
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import ErrorRow, Measures, StationRow, stated
@@ -107,12 +108,12 @@ def vector_measures(triad: str, when: str, actual: Array, target: Array) -> list
     for rows, kept in _filled(error):
         if kept.shape[-1] < 2:
             continue
-        figures = kept.mean(-1), kept.std(-1, ddof=1), np.mean(kept**2, -1)
-        for row, (mean, std, mse) in zip(
-            rows.tolist(), np.stack(figures, -1).tolist(), strict=True
-        ):
-            one = Measures(triad=triad, when=when, mean=mean, std=std, mse=mse, rmse=mse**0.5)
-            each[row].append(one)
+        square = np.mean(kept**2, -1)
+        sizes = kept.mean(-1), kept.std(-1, ddof=1), square, square**0.5
+        names = ("mean", "std", "mse", "rmse")
+        for row, values in zip(rows.tolist(), figures(np.stack(sizes, -1)), strict=True):
+            one = dict(zip(names, values, strict=True))
+            each[row].append(Measures(triad=triad, when=when, **one))
     return each
 
 
@@ -290,17 +291,17 @@ class Residuals:
 
     def stations(self, place: int, run: Readings) -> list[StationRow]:
         """Errors of every station of one `run`, with the ones to take again."""
-        again, deviation = (each[place].tolist() for each in self._chances)
+        again, deviation = (each[place] for each in self._chances)
         names = [*self.judged]
         rows = zip(
             run.labels,
             run.digest or [""] * run.count,
-            [None] * run.count if run.temperature is None else run.temperature.tolist(),
-            self._angles[place].tolist(),
+            [None] * run.count if run.temperature is None else figures(run.temperature),
+            figures(self._angles[place]),
             *(_named(names, each[place]) for each in self._shown),
-            self.fit.trust[place].tolist(),
-            deviation,
-            again,
+            figures(self.fit.trust[place]),
+            figures(deviation),
+            again.tolist(),
             strict=True,
         )
         return [
@@ -335,7 +336,7 @@ class Residuals:
 
 def _named(names: list[str], errors: Array) -> list[dict[str, float]]:
     """Errors (n, k) by name, station by station, those that are not NaN."""
-    rows = errors.tolist()
+    rows = figures(errors)
     if not np.isnan(errors).any():
         return [dict(zip(names, row, strict=True)) for row in rows]
     return [{n: e for n, e in zip(names, row, strict=True) if e == e} for row in rows]
@@ -347,9 +348,11 @@ def error_rows(residuals: Residuals) -> list[list[ErrorRow]]:
     kinds = residuals.errors_before, residuals.errors_after, residuals.expected
     for name, judged in residuals.judged.items():
         factor, unit = shown_in(name, residuals.readings.relative)
-        figures = [(rms(np.where(judged, each[name], np.nan)) * factor).tolist() for each in kinds]
+        sizes = (rms(np.where(judged, each[name], np.nan)) * factor for each in kinds)
         counts = np.count_nonzero(judged, -1).tolist()
-        for row, count, before, after, expected in zip(rows, counts, *figures, strict=True):
+        for row, count, before, after, expected in zip(
+            rows, counts, *map(figures, sizes), strict=True
+        ):
             if count:
                 row.append(
                     ErrorRow(
