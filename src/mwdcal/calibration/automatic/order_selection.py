@@ -120,6 +120,8 @@ def order_errors(readings: Readings, options: Options, progress: Progress) -> li
 
     None where there are too few soaks to leave one out.
     """
+    if usable_soaks(_temperature(readings)).max() + 1 < _needed(options.orders):
+        return []
     batch = batch_of_one(readings)
     if _judged_soaks(batch, options)[0] < _needed(options.orders):
         return []
