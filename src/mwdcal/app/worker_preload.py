@@ -14,7 +14,7 @@ from mwdcal.app.cli import without_pandas
 from mwdcal.calibration.options import Options
 from mwdcal.files.contract import CHANNELS, REFERENCES
 from mwdcal.files.formats import parquet
-from mwdcal.fleet.parts import Plan, packed, solved
+from mwdcal.fleet.parts import Plan, calibrations, packed
 from mwdcal.fleet.sources import SERIAL
 from mwdcal.geometry.vectors import reference_vectors
 from mwdcal.sensor.profile import Profile, StandProfile, TriadProfile
@@ -38,7 +38,7 @@ def warm() -> None:
             stand = StandProfile(inclination_deg=sd, azimuth_deg=sd, toolface_deg=sd)
             profile = Profile(name="", accelerometer=triad, magnetometer=triad, stand=stand)
             plan = Plan("", {}, tuple(columns), profile, Options(nonlinearity={}))
-            packed(solved(plan, loaded))
+            packed(calibrations(plan, loaded))
 
 
 without_pandas()

@@ -242,8 +242,8 @@ def _settings(options: Options) -> FitSettings:
     return FitSettings(**settings | named)
 
 
-def _by_run(values: dict[str, Array], count: int) -> list[dict[str, float]]:
-    """The values (B,) of each of `count` runs by name."""
+def _by_run(values: dict[str, Array], count: int) -> list[dict[str, Any]]:
+    """The values (B, ...) of each of `count` runs by name."""
     rows = zip(*map(figures, values.values()), strict=True)
     return [dict(zip(values, row, strict=True)) for row in rows] if values else [{}] * count
 
@@ -316,8 +316,10 @@ def _constants(result: Fit) -> list[list[Constant]]:
         factor = float(np.degrees(1)) if unit == "°" else 1.0
         name = constant.name if constant.unknown else results.error_name(constant.name)
         numbers = figures(values * factor), figures(uncertainties * factor)
-        for each, value, own in zip(constants, *numbers, strict=True):
-            each.append(Constant(name=name, value=value, standard_uncertainty=own, unit=unit))
+        for each, value, uncertainty in zip(constants, *numbers, strict=True):
+            each.append(
+                Constant(name=name, value=value, standard_uncertainty=uncertainty, unit=unit)
+            )
     return constants
 
 
@@ -329,12 +331,12 @@ def _drifts(result: Fit, field_unit: str) -> list[list[Drift]]:
         factor, unit = _shown_drift(name, field_unit)
         size = declared.get(name, np.zeros(len(change)))
         numbers = (figures(each * factor) for each in (change, sd, size))
-        for each, moved, own, stated_size in zip(drifts, *numbers, strict=True):
+        for each, moved, uncertainty, stated_size in zip(drifts, *numbers, strict=True):
             each.append(
                 Drift(
                     name=name.removesuffix("-drift"),
                     change=moved,
-                    standard_uncertainty=own,
+                    standard_uncertainty=uncertainty,
                     unit=unit,
                     declared=stated_size or msgspec.UNSET,
                 )
@@ -365,26 +367,31 @@ def _unseen(fitted: FittedRuns) -> list[list[UnseenDrift] | msgspec.UnsetType]:
 def _triads(fitted: FittedRuns, index: int) -> list[TriadCalibration]:
     """The record of one triad of each run."""
     name, reference = TRIADS[index], fitted.profile.reference_temperature_c
+    # in the order in memory that a run alone has: sums then end in the same digit
+    result = replace(fitted.result, state=mapped(np.ascontiguousarray, fitted.result.state))
     covariance, count = fitted.covariance.total, fitted.count
-    state = mapped(
-        np.ascontiguousarray, fitted.result.state
-    )  # summed as of a run alone, to the last digit
-    result = replace(fitted.result, state=state)
     triad = results.triad_results(result, index, covariance, fitted.free, reference)
     model = triad.model
     powers = model if isinstance(model, Polynomial) else Polynomial(model.basis)
+    centre, scale = (np.broadcast_to(x, (count, 1, 3))[:, 0] for x in (powers.centre, powers.scale))
+    numbers = {
+        "centre": centre,
+        "radius": scale[:, 0],
+        "parameters": triad.parameters,
+        "singular_values": results.triad_singular_values(fitted.result, index),
+        "noise": triad.noise,
+        "degrees_of_freedom": triad.degrees_of_freedom,
+    }
+    some = {
+        "variance_factor": triad.variance_factor,
+        "misfit_probability": fitted.chances[:, index],
+    }
     field_unit = "1 (field = 1)" if fitted.readings.relative else "nT"
-    singular = figures(results.triad_singular_values(fitted.result, index))
-    centre, scale = (
-        figures(np.broadcast_to(each, (count, 1, 3))[:, 0])
-        for each in (powers.centre, powers.scale)
+    counts = (each.tolist() for each in (triad.rank, triad.size, triad.declared))
+    rows = zip(
+        *(_by_run(numbers, count), _by_run(some, count), figures(triad.sd), fitted.free, *counts),
+        strict=True,
     )
-    numbers = (
-        *(triad.parameters, triad.sd, triad.noise, triad.variance_factor),
-        *(triad.degrees_of_freedom, fitted.chances[:, index]),
-    )
-    counts = (triad.rank.tolist(), triad.size.tolist(), triad.declared.tolist())
-    rows = zip(*map(figures, numbers), *counts, strict=True)
     return [
         TriadCalibration(
             name=name,
@@ -392,26 +399,19 @@ def _triads(fitted: FittedRuns, index: int) -> list[TriadCalibration]:
             model=model.kind,
             order=model.basis.order,
             curved=model.curved,
-            centre=centre[place],
-            radius=scale[place][0],
             parameter_names=list(model.names),
-            parameters=parameters,
-            standard_uncertainties=[stated(each) for each in sd],
+            standard_uncertainties=[*map(stated, sd)],
             rank=rank,
             size=size,
-            singular_values=singular[place],
             undetermined=[
-                Undetermined(id=free.id, text=f"{name}: {described(free.id)}")
-                for free in fitted.free[place]
-                if index in free.triads
+                Undetermined(id=each.id, text=f"{name}: {described(each.id)}")
+                for each in free
+                if index in each.triads
             ],
-            noise=noise,
             noise_source="declared" if declared else "estimated from the residuals",
-            variance_factor=stated(factor),
-            degrees_of_freedom=freedom,
-            misfit_probability=stated(chance),
+            variance_factor=stated(doubtful["variance_factor"]),
+            misfit_probability=stated(doubtful["misfit_probability"]),
+            **known,
         )
-        for place, (
-            parameters, sd, noise, factor, freedom, chance, rank, size, declared
-        ) in enumerate(rows)
-    ]  # fmt: skip
+        for known, doubtful, sd, free, rank, size, declared in rows
+    ]

@@ -95,17 +95,17 @@ def rounded(record: Record) -> Record:
 
 def numbers(document: Any) -> Array:
     """All numbers with a fraction in a document, in their order."""
-    found: list[float] = []
-    _collect(document, found)
-    return np.array(found)
+    values: list[float] = []
+    _collect(document, values)
+    return np.array(values)
 
 
-def _collect(value: Any, found: list[float]) -> None:
+def _collect(value: Any, values: list[float]) -> None:
     for item in value.values() if isinstance(value, dict) else value:
         if isinstance(item, float):
-            found.append(item)
+            values.append(item)
         elif isinstance(item, dict | list | tuple):
-            _collect(item, found)
+            _collect(item, values)
 
 
 def _with(new: Iterator[float], value: Any) -> Any:

@@ -267,9 +267,9 @@ class _Batch:
                 ids[place][flag.id] = None
                 if flag.station is not None:
                     stations[place].append(flag.station)
-        for tool, found, again, free in zip(tools, ids, stations, fitted.free, strict=True):
+        for tool, kinds, again, free in zip(tools, ids, stations, fitted.free, strict=True):
             undetermined = {entry.id for entry in free}
-            lists["findings"][tool] = [name for name in found if name not in undetermined]
+            lists["findings"][tool] = [name for name in kinds if name not in undetermined]
             lists["reshoot"][tool] = again
             for index, triad in enumerate(TRIADS):
                 free_here = [entry.id for entry in free if index in entry.triads]

@@ -96,12 +96,12 @@ def load(plan: Plan, task: Task) -> tuple[Task, bytes]:
 def solve(plan: Plan, loaded: tuple[Task, bytes]) -> None:
     """Calibrate the tools of loaded rows, and keep their table, one row per tool, where the task says."""
     task, rows = loaded
-    table = solved(plan, rows)
+    table = calibrations(plan, rows)
     check_unchanged(task.partition.pieces)
     kept.write_part(task.path, packed(table))
 
 
-def solved(plan: Plan, loaded: bytes) -> Any:
+def calibrations(plan: Plan, loaded: bytes) -> Any:
     """The Arrow table of the tools of loaded rows."""
     if plan.version != __version__:
         raise InputError(

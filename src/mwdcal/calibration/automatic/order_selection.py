@@ -108,6 +108,8 @@ def _tested(
     powers = np.arange(1, HIGHEST + 1)
     for order in range(int(limit.max()) + 1):
         some = np.flatnonzero((orders < 0).any(-1))
+        if not some.size:
+            break
         if bare is not None:
             known = _without_doubt(
                 take(bare, some), replace(options, order=order), limit[some], orders[some]
