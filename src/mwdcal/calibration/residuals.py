@@ -27,6 +27,8 @@ LEAST_ACROSS = 1e-9
 """An attitude is exactly vertical below this sine of its inclination."""
 PROBES = 200
 """Stations at which the influence of each is looked at: no more, however long the run."""
+CHANGES = 2_000_000
+"""Changes of an observable, at one station by another, that are worked out at once: 16 MB."""
 REASONS = {
     "gravity": "moved before it settled?",
     "inclination": "stand inclination misread?",
@@ -256,14 +258,17 @@ class Residuals:
             t.model.jacobian(params[:, where], t.raw[:, some], problem.temperature[:, some])
             for t, where in zip(problem.triads, problem.slices(), strict=True)
         ]
+        size = max(1, CHANGES // (some.size * self.readings.count))
         for name in self.judged:
             gradient = np.nan_to_num(OBSERVABLES[name].gradient(*self.after)[:, some])
             triples = zip(np.split(gradient, [3], axis=-1), rows, self._moves, strict=False)
-            changes = [
-                np.einsum("bni,bnip->bnp", part, row) @ moved.mT for part, row, moved in triples
-            ]
-            change = np.sum(changes, 0) * self.weights[name][:, some, None]
-            influence[name] = np.abs(change).max(1)
+            pairs = [(np.einsum("bni,bnip->bnp", part, row), moved) for part, row, moved in triples]
+            weights, parts = self.weights[name][:, some, None], []
+            for first in range(0, len(params), size):
+                runs = slice(first, first + size)
+                change = np.sum([row[runs] @ moved[runs].mT for row, moved in pairs], 0)
+                parts.append(np.abs(change * weights[runs]).max(1))
+            influence[name] = np.concatenate(parts)
         return influence
 
     @cached_property
