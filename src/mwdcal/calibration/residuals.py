@@ -27,7 +27,7 @@ LEAST_ACROSS = 1e-9
 """An attitude is exactly vertical below this sine of its inclination."""
 PROBES = 200
 """Stations at which the influence of each is looked at: no more, however long the run."""
-CHANGES = 2_000_000
+CHANGES_AT_ONCE = 2_000_000
 """Changes of an observable, at one station by another, that are worked out at once: 16 MB."""
 REASONS = {
     "gravity": "moved before it settled?",
@@ -258,7 +258,7 @@ class Residuals:
             t.model.jacobian(params[:, where], t.raw[:, some], problem.temperature[:, some])
             for t, where in zip(problem.triads, problem.slices(), strict=True)
         ]
-        size = max(1, CHANGES // (some.size * self.readings.count))
+        size = max(1, CHANGES_AT_ONCE // (some.size * self.readings.count))
         for name in self.judged:
             gradient = np.nan_to_num(OBSERVABLES[name].gradient(*self.after)[:, some])
             triples = zip(np.split(gradient, [3], axis=-1), rows, self._moves, strict=False)
