@@ -31,6 +31,8 @@ from mwdcal.estimation.solvers import Linear
 from mwdcal.geometry.vectors import (
     Array,
     Bools,
+    earth_field,
+    earth_gravity,
     eigen,
     inverse,
     outer,
@@ -243,7 +245,7 @@ class Problem:
         changes = self._earth_changes(field, dip)
         if self.alike:
             params = state.params.reshape(len(attitude), 2, -1).swapaxes(0, 1)
-            both = self._predicted(self.alike, params, attitude, targets, changes)
+            both = self._predicted(self.alike, params, attitude, np.stack(targets), changes)
             return [Prediction(*parts) for parts in zip(*vars(both).values(), strict=True)]
         parameters = [state.params[:, where] for where in self.slices()]
         each = zip(self.triads, parameters, targets, changes, strict=False)

@@ -19,7 +19,7 @@ from mwdcal.calibration.residuals import (
     tail,
 )
 from mwdcal.calibration.results import variance_scales
-from mwdcal.estimation.batch import take
+from mwdcal.estimation.batch import batch_of_one, take
 from mwdcal.estimation.evidence import STAND_ERRORS, UNKNOWN
 from mwdcal.estimation.minimisers import closed_form, closed_form_drift
 from mwdcal.estimation.rank import Free
@@ -145,10 +145,10 @@ def excessive_errors(readings: Readings, result: Fit) -> dict[str, tuple[float, 
     count with the pull that they have. A drift within the run that is part of the fit is no error here.
     """
     misfit = float(np.sqrt(_run_variance(result)[0]))
-    residuals, weight = Residuals(readings, result), result.trust[0]
+    residuals, weight = Residuals(batch_of_one(readings), result), result.trust[0]
     excessive = {}
-    for name, after in residuals.errors(residuals.undrifted).items():
-        expected = residuals.expected[name]
+    for name, [after] in residuals.errors(residuals.undrifted).items():
+        [expected] = residuals.expected[name]
         known = ~np.isnan(after + expected) & (weight > 0)
         if not known.any():
             continue
