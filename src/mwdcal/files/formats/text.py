@@ -182,11 +182,21 @@ def quoted(cells: Any, delimiter: str) -> Any:
     import pyarrow.compute as compute
 
     cells = compute.fill_null(cells, "")
-    odd = compute.match_substring_regex(cells, f'["\r\n{delimiter}]')
-    if not compute.any(odd).as_py():
+    if not _holds(cells, ('"', "\r", "\n", delimiter)):
         return cells
+    odd = compute.match_substring_regex(cells, f'["\r\n{delimiter}]')
     doubled = compute.replace_substring(cells, '"', '""')
     return compute.if_else(odd, compute.binary_join_element_wise('"', doubled, '"', ""), cells)
+
+
+def _holds(cells: Any, marks: Sequence[str]) -> bool:
+    """Whether a mark is in the memory of Arrow's texts, which may hold more than these: a look at all bytes at once."""
+    for chunk in getattr(cells, "chunks", [cells]):
+        data = chunk.buffers()[-1]
+        whole = b"" if data is None else data.to_pybytes()
+        if any(mark.encode() in whole for mark in marks):
+            return True
+    return False
 
 
 def joined(columns: Sequence[Any], delimiter: str, arrow: Any) -> memoryview:
