@@ -116,9 +116,8 @@ class AcceptanceTests:
     def part(self, rows: slice | Ints) -> AcceptanceTests:
         """Those of some surveys."""
         return AcceptanceTests(
-            self.fixed, *(
-                each[rows] for each in (self.covariance, self.largest, self.missing, self.weights)
-            )
+            self.fixed,
+            *(each[rows] for each in (self.covariance, self.largest, self.missing, self.weights)),
         )
 
     def largest_field(self) -> Array:
@@ -126,7 +125,9 @@ class AcceptanceTests:
         field, dip = (STRENGTH_NAMES.index(name) for name in ("field", "dip"))
         weights = self.weights
         shared = weights[:, field, dip] ** 2 / weights[:, dip, dip]
-        most = np.minimum(self.largest / np.sqrt(weights[:, field, field] - shared), self.fixed[field])
+        most = np.minimum(
+            self.largest / np.sqrt(weights[:, field, field] - shared), self.fixed[field]
+        )
         return np.where(self.missing[:, field], np.nan, most)
 
     def accept(self, departures: Mapping[str, Array]) -> Bools:
@@ -465,7 +466,9 @@ class _Tried(NamedTuple):
         ways = np.concatenate([self.b[:, 2:], -self.b[:, 2:]], -1)
         above, below = (2 * self.strength * sign * most + most**2 for sign in (1, -1))
         back = np.sqrt(np.maximum(ways**2 + below, 0.0))
-        gap = (ways < 0) & (ways**2 + below > 0) & (most < self.strength) & (back - ways > AXIAL[-1])
+        gap = (
+            (ways < 0) & (ways**2 + below > 0) & (most < self.strength) & (back - ways > AXIAL[-1])
+        )
         reach = np.where(gap, -ways - back, np.sqrt(ways**2 + above) - ways)
         return np.asarray(np.fmin(reach.max(-1), AXIAL[-1]))
 
@@ -499,7 +502,7 @@ def _most_along(tried: _Tried) -> tuple[Array, Array]:
         fields, some = _along_tool(last), tried.part(rows)
         passing = some.passing(fields).reshape(len(rows), 2, -1)
         largest = passing.shape[-1] - 1 - np.argmax(passing[..., ::-1], -1)
-        turns = some.turns(fields, largest + [0, passing.shape[-1]])
+        turns = some.turns(fields, np.add(largest, [0, passing.shape[-1]]))
         turns = np.where(passing.any(-1) & (turns > 0), turns, 0.0)
         turn[rows], way = turns.max(-1), turns.argmax(-1)
         sizes = AXIAL[np.take_along_axis(largest, way[:, None], -1)[:, 0]]

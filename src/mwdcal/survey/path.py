@@ -288,7 +288,9 @@ def direction_errors(
     azimuth, gradient = direction_gradient(g, b)
     change = gradient @ calibration.jacobian(readings)
     free = np.abs(change @ calibration.free_directions.transpose()) > FREE_SHARE
-    shifts = change @ square_root(calibration.parameter_covariance)
+    flat = change.reshape(-1, change.shape[-1])  # one product is faster than one for each reading
+    shifts = flat @ square_root(calibration.parameter_covariance)
+    shifts = shifts.reshape(*change.shape[:-1], shifts.shape[-1])
     shifts = np.where(np.any(free, (-1, -2), keepdims=True), np.nan, shifts.swapaxes(-1, -2))
     inclination = np.arctan2(np.hypot(g[..., 0], g[..., 1]), g[..., 2])
     turn = np.stack([np.zeros_like(inclination), np.sin(inclination)], -1)

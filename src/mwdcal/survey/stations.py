@@ -80,7 +80,8 @@ def survey_angles(
     `starts_magnetic`: the toolface counted from magnetic north at the station before.
 
     Shapes: `readings` of n stations without leading axes. Units: `switch` in radians. `advance` gets how many are
-    done, and of how many. `added` gives the variance (m, 7) that some rows have besides, by gradients and both vectors (m, 3).
+    done, and of how many. `added` gives the variance (m, 7) that some rows have besides, by their gradients
+    (m, 7, 6) and both vectors (m, 3).
     Singular: at vertical azimuth and toolface are NaN, the toolface from magnetic north is not.
 
     Raises:

@@ -185,7 +185,9 @@ class SeenHole(NamedTuple):
         for some in blocks(readings):
             g, b = calibration.fields(some)
             azimuth, _ = direction_gradient(g, b)
-            parts.append((value["inclination"](g, b), azimuth, value["field"](g, b), value["dip"](g, b)))
+            parts.append(
+                (value["inclination"](g, b), azimuth, value["field"](g, b), value["dip"](g, b))
+            )
         return cls(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
     def part(self, rows: Bools) -> SeenHole:
@@ -223,5 +225,3 @@ def hole_of(
     if calibration.relative:
         field = np.broadcast_to(readings.reference("field"), md.shape)
     return Hole.along(md, tvd, *angles, magnetic, field, dip, last=last)
-
-
