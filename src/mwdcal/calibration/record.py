@@ -472,9 +472,11 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         """Covariance (…, n, 6, 6) of both vectors from the noise of one reading."""
         readings = as_readings(readings)
         result = np.zeros((*readings.accelerometer.shape[:-1], 6, 6))
-        for triad, model, at, vector in self._measured(readings):
-            slope = model.slope(*at)
-            sd = np.broadcast_to(readings.sd.get(triad.name, np.array(triad.noise)), at[1].shape)
+        for triad, model, (parameters, raw, temperature), vector in self._measured(readings):
+            sd = readings.sd.get(triad.name, np.array(triad.noise))
+            if not model.varies and np.ndim(sd) < raw.ndim:  # one for all readings
+                raw, temperature = raw[..., :1, :], temperature[..., :1]
+            slope, sd = model.slope(parameters, raw, temperature), np.broadcast_to(sd, raw.shape)
             result[..., vector, vector] = slope * sd[..., None, :] ** 2 @ slope.mT
         return result
 

@@ -29,7 +29,7 @@ FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """What a cell begins with that spreadsheet programs run as a formula, unless it is a number."""
 _BREAKS = "\n\r\0"
 _SMALLEST_ALIKE, _LARGEST_ALIKE = 1e-4, 1e10
-"""Between these Arrow spells numbers that are not whole as `repr` does."""
+"""Between these Arrow spells numbers as `repr` does, whole ones without their ".0"."""
 _LONGEST_LINE = 100_000
 _ROWS_AT_ONCE = 1 << 12
 _MAX_LINES = 1_000_000
@@ -167,10 +167,12 @@ def spelt(values: Array, arrow: Any) -> Any:
     values = np.asarray(values, float)
     words = arrow.array(values).cast(arrow.string())
     size = np.abs(values)
-    with np.errstate(
-        invalid="ignore"
-    ):  # Arrow spells whole, small and large numbers in another way
-        odd = ~((size >= _SMALLEST_ALIKE) & (size < _LARGEST_ALIKE) & (values != np.trunc(values)))
+    with np.errstate(invalid="ignore"):
+        whole = (size < _LARGEST_ALIKE) & (values == np.trunc(values))
+        odd = ~(whole | ((size >= _SMALLEST_ALIKE) & (size < _LARGEST_ALIKE)))
+    if whole.any():
+        pointed = compute.binary_join_element_wise(words, ".0", "")
+        words = pointed if whole.all() else compute.if_else(whole, pointed, words)
     if odd.any():
         others = ["" if value != value else repr(value) for value in values[odd].tolist()]
         words = compute.replace_with_mask(words, odd, arrow.array(others, arrow.string()))
