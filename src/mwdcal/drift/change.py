@@ -207,14 +207,25 @@ def stretches(history: History, draws: int) -> AnyArray:
 
     Calibrations of a triad whose noise was estimated together (`pooled`) have one factor.
     """
-    freedom = history.freedom
+    freedom, pooled = history.freedom, history.pooled
+    shape = freedom.shape
+    return _stretches(history.names, shape, freedom.tobytes(), pooled.tobytes(), draws)
+
+
+@lru_cache(maxsize=8)
+def _stretches(
+    names: tuple[str, ...], shape: tuple[int, ...], freedoms: bytes, pooling: bytes, draws: int
+) -> AnyArray:
+    """The same of all tools with such estimates."""
+    freedom = np.frombuffer(freedoms).reshape(shape)
+    pooled = np.frombuffer(pooling, bool).reshape(shape)
     result = np.ones((draws, *freedom.shape), np.float32)
     rng = np.random.default_rng([SEED_OF_DRAWS, *freedom.shape])
     for triad in TRIADS:
-        columns = [place for place, name in enumerate(history.names) if name.startswith(triad)]
+        columns = [place for place, name in enumerate(names) if name.startswith(triad)]
         if not columns:
             continue
-        degrees, together = freedom[:, columns[0]], history.pooled[:, columns[0]]
+        degrees, together = freedom[:, columns[0]], pooled[:, columns[0]]
         groups = [np.flatnonzero(together), *np.flatnonzero(~together)[:, None]]
         for rows in (each for each in groups if each.size and np.isfinite(degrees[each[0]])):
             grown = np.sqrt(degrees[rows[0]] / rng.chisquare(degrees[rows[0]], draws))
