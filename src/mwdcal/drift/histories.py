@@ -278,7 +278,7 @@ class _Form:
                     alike.setdefault((ratio, (*form, *at)), []).append(each)
             for (ratio, _), some in alike.items():
                 many = self._factors(some, name, ratio)
-                found |= {id(c): both for c, *both in zip(some, *many, strict=True)}
+                found |= {id(c): (v, j) for c, v, j in zip(some, *many, strict=True)}
         return result
 
     def _unit_ratio(self, calibration: Calibration, triad: TriadCalibration) -> float:

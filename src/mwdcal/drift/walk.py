@@ -22,7 +22,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from mwdcal.calibration.readings import TRIADS
-from mwdcal.geometry.vectors import Array, ArrayLike, Bools, Ints, diagonal, outer
+from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, outer
 from mwdcal.sensor.models import OFF_COLUMNS, OFF_DIAGONAL, OFF_ROWS, Model
 
 WALK_KINDS = ("scale", "bias", "misalignment")
@@ -365,7 +365,7 @@ class GroupRates:
         return np.asarray(np.exp(logs - logsumexp(logs)))
 
 
-def quantiles(rates: Array, probability: Array, shares: ArrayLike) -> Array:
+def quantiles(rates: Array, probability: Array, shares: Sequence[float] | Array) -> Array:
     """Rates below which lie the given shares of a distribution (r,) over rates (r,), between them interpolated."""
     inner = np.cumsum(probability) - probability / 2
     return np.asarray(np.exp(np.interp(shares, inner, np.log(rates))))

@@ -225,7 +225,7 @@ def usual_difference(phase: Array, m: int, above: float) -> float:
     count, below = phase.shape[-1] - 2 * m, 0
     for start in range(0, count, BLOCK_SAMPLES):
         part = _differences(phase, m, slice(start, min(start + BLOCK_SAMPLES, count)))
-        below += np.count_nonzero(np.abs(part) <= above * m)
+        below += int(np.count_nonzero(np.abs(part) <= above * m))
     if below < count // 2:
         return np.inf
     size = np.abs(_differences(phase, m))

@@ -116,9 +116,8 @@ class AcceptanceTests:
     def part(self, rows: slice | Ints) -> AcceptanceTests:
         """Those of some surveys."""
         return AcceptanceTests(
-            self.fixed,
-            *(each[rows] for each in (self.covariance, self.largest, self.missing, self.weights)),
-        )
+            self.fixed, self.covariance[rows], self.largest[rows], self.missing[rows], self.weights[rows]
+        )  # fmt: skip
 
     def largest_field(self) -> Array:
         """Largest departure (n,) of |b| that is accepted with some departure of dip, |g| being right; NaN: any."""
