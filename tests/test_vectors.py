@@ -6,7 +6,9 @@ import pytest
 from mwdcal.geometry import observables as ob
 from mwdcal.geometry.vectors import (
     centred,
+    dot,
     inverse,
+    length,
     nearest_rotation,
     reference_vectors,
     rotation,
@@ -139,3 +141,11 @@ def test_the_root_of_a_covariance_has_no_column_for_what_does_not_vary():
     root = square_root(np.diag([4.0, 0.0, 9.0]))
     assert root.shape == (3, 2)
     np.testing.assert_allclose(root @ root.T, np.diag([4.0, 0.0, 9.0]), atol=1e-14)
+
+
+@pytest.mark.parametrize("shape", [(3,), (0, 3), (7, 3), (4, 5, 3)])
+def test_lengths_and_products_have_the_digits_of_numpy(shape):
+    rng = np.random.default_rng(6)
+    first, second = rng.normal(size=(2, *shape)) * 10.0 ** rng.integers(-9, 9, (2, *shape))
+    np.testing.assert_array_equal(length(first), np.linalg.norm(first, axis=-1))
+    np.testing.assert_array_equal(dot(first, second), np.sum(first * second, -1))
