@@ -268,7 +268,7 @@ class _Form:
     def _of_all(self) -> dict[str, dict[int, tuple[Array, Array]]]:
         """The same of all calibrations as their fields are, those of one model together."""
         result: dict[str, dict[int, tuple[Array, Array]]] = {name: {} for name in self.orders}
-        for name, found in result.items():
+        for name, factors in result.items():
             alike: dict[tuple[float, object], list[Calibration]] = {}
             for each in self.compared:
                 if (triad := getattr(each, name)) is not None:
@@ -278,7 +278,7 @@ class _Form:
                     alike.setdefault((ratio, (*form, *at)), []).append(each)
             for (ratio, _), some in alike.items():
                 many = self._factors(some, name, ratio)
-                found |= {id(c): (v, j) for c, v, j in zip(some, *many, strict=True)}
+                factors |= {id(c): (v, j) for c, v, j in zip(some, *many, strict=True)}
         return result
 
     def _unit_ratio(self, calibration: Calibration, triad: TriadCalibration) -> float:

@@ -48,7 +48,7 @@ _TYPED = (".parquet", ".xlsx", *tables.EXCHANGED)
 _ODD = ("nan", "inf", '"', "\r")
 """Letters and signs that no plain number has, in lower case."""
 _CLOCK = re.compile(r"\d{4}-\d{1,2}-\d{1,2}|\d{1,2}:\d{2}|\d{1,2}[./]\d{1,2}[./]\d{4}")
-_PLAIN = b"0123456789+-.eE \r\n"
+_OF_NUMBERS = b"0123456789+-.eE \r\n"
 """All that plain numbers are spelled with, and lines end with."""
 _BINARY = bytes([*range(0x09), *range(0x0E, 0x20)])
 _LONG_LOG = 100_000_000
@@ -324,7 +324,7 @@ def _by_arrow(data: bytes, done: int, layout: _Layout) -> tuple[Array, Sequence[
     """As `_piece` of plain numbers, by Arrow; None where a piece is anything else, or there is no Arrow."""
     if layout.delimiter is None or layout.decimal != ".":
         return None
-    if data.translate(None, _PLAIN + layout.delimiter.encode()):
+    if data.translate(None, _OF_NUMBERS + layout.delimiter.encode()):
         return None
     try:
         import pyarrow as arrow

@@ -211,13 +211,13 @@ def rounding(values: Array, averaging: Sequence[int], phase: Array | None = None
 
 def largest_difference(phase: Array, m: int) -> tuple[float, int]:
     """Largest difference of averages over m samples that follow each other, by its size, and its place."""
-    count, found = phase.shape[-1] - 2 * m, (-1.0, 0)
+    count, largest = phase.shape[-1] - 2 * m, (-1.0, 0)
     for start in range(0, count, BLOCK_SAMPLES):
         size = np.abs(_differences(phase, m, slice(start, min(start + BLOCK_SAMPLES, count))))
         place = int(np.argmax(size))
-        if size[place] > found[0]:
-            found = float(size[place]), start + place
-    return found[0] / m, found[1]
+        if size[place] > largest[0]:
+            largest = float(size[place]), start + place
+    return largest[0] / m, largest[1]
 
 
 def usual_difference(phase: Array, m: int, above: float) -> float:
