@@ -13,7 +13,7 @@ from mwdcal.files import logs
 @pytest.mark.parametrize(
     "command",
     [
-        ("noise", EXAMPLE / "static.csv", "--json"),
+        ("noise", EXAMPLE / "static.csv", "--json", "--quiet"),
         ("stations", EXAMPLE / "log.csv", "-o", "{out}", "--json"),
     ],
 )
