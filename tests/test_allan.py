@@ -919,3 +919,19 @@ def test_measured_first_minute_of_a_hand_held_sensor():
     for channel in found.channels.values():
         assert channel.sampling_hz == pytest.approx(100, rel=0.001)
         assert channel.terms["white"].value == pytest.approx(0.36, rel=0.1)
+
+
+@pytest.mark.parametrize("m", [1, 7, 3000])
+def test_differences_of_averages_in_blocks_are_those_of_averages(m):
+    values = np.random.default_rng(2).normal(5.0, 1.0, 30_001)
+    values[20_000] += 100.0
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    averages = (sums[m:] - sums[:-m]) / m
+    size = np.abs(averages[m:] - averages[:-m])
+    phase = allan.phase_of(values)
+    largest, place = allan.largest_difference(phase, m)
+    assert largest == pytest.approx(size.max(), rel=1e-9)
+    assert size[place] == pytest.approx(size.max(), rel=1e-9)
+    median = float(np.median(size))
+    assert allan.usual_difference(phase, m, 1.01 * median) == pytest.approx(median, rel=1e-9)
+    assert allan.usual_difference(phase, m, 0.99 * median) == np.inf

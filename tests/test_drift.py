@@ -711,7 +711,7 @@ def test_comparing_reports_its_progress(years, tmp_path):
         assert heard == [(done, total) for done in range(total)]
 
 
-def test_the_command_reads_a_registry(years, tmp_path):
+def test_the_command_reads_a_registry(years, tmp_path, monkeypatch):
     pytest.importorskip("sqlalchemy")
     from cli_support import mwdcal
     from mwdcal.files import documents
@@ -729,5 +729,8 @@ def test_the_command_reads_a_registry(years, tmp_path):
     assert one["fleet"] is None
     every = mwdcal("registry", "drift", *where, "--limit", "inclination_deg=0.02", "--json").json
     assert (every["fleet"]["tools"], every["limits_deg"]) == (3, {"inclination": 0.02})
+    monkeypatch.setattr("mwdcal.library.drifts.TOOLS_READ", 1)
+    one_by_one = mwdcal("registry", "drift", *where, "--limit", "inclination_deg=0.02", "--json")
+    assert one_by_one.json == every
     for wrong in (("T-0",), ("--limit", "dip_deg=1"), ("--limit", "inclination_deg=-1")):
         assert mwdcal("registry", "drift", *wrong, *where).code == 2

@@ -13,7 +13,7 @@ from mwdcal.files import logs
 @pytest.mark.parametrize(
     "command",
     [
-        ("noise", EXAMPLE / "static.csv", "--json"),
+        ("noise", EXAMPLE / "static.csv", "--json", "--quiet"),
         ("stations", EXAMPLE / "log.csv", "-o", "{out}", "--json"),
     ],
 )
@@ -53,3 +53,44 @@ def test_odd_cells_are_seen(tmp_path, cell):
         return
     with pytest.raises(logs.InputError, match="line 201"):
         logs.read(path)
+
+
+ROWS = {
+    "blanks": "0,1,,\n0.1,,2.5,\n0.2,,,3\n",
+    "spellings": "0,1e-3,-.5,5.\n0.1,+1,2E2,1e-320\n0.2,123456789.123456789,0.1,-0\n",
+    "line-ends": "0,1,2,3\r\n0.1,4,5,6\r\n",
+    "no-end": "0,1,2,3\n0.1,4,5,6",
+    "blank-lines": "0,1,2,3\n0.1,4,5,6\n\n\n",
+    "blanks-around": "0, 1,2 ,3\n0.1,4,5, 6\n",
+    "too-few": "0,1,2,3\n0.1,4,5\n",
+    "too-many": "0,1,2,3\n0.1,4,5,6,7\n",
+    "too-large": "0,1,2,3\n0.1,4,5,1e999\n",
+    "two-numbers": "0,1,2,3\n0.1,4,5,6 7\n",
+    "letters": "0,1,2,3\n0.1,4,5,6e\n",
+    "line-of-blanks": "0,1,2,3\n   \n0.1,4,5,6\n",
+    "returns": "0,1,2,3\r0.1,4,5,6\r",
+}
+
+
+@pytest.mark.parametrize("rows", ROWS.values(), ids=ROWS)
+@pytest.mark.parametrize("piece", [8, logs._PIECE])
+def test_a_long_log_is_read_like_a_short_one(tmp_path, monkeypatch, rows, piece):
+    path = tmp_path / "log.csv"
+    path.write_bytes(b"time_s,ax,ay,az\n" + rows.encode())
+    monkeypatch.setattr(logs, "_PIECE", piece)
+    found = []
+    for least in (logs._LONG_LOG, 1):
+        monkeypatch.setattr(logs, "_LONG_LOG", least)
+        try:
+            table = logs.read(path)
+            columns = {n: np.asarray(column).tobytes() for n, column in table.columns.items()}
+            found.append((columns, list(table.lines)))
+        except logs.InputError as error:
+            found.append(str(error))
+    assert found[0] == found[1]
+
+
+def test_plain_pieces_of_a_long_log_are_read_by_arrow(tmp_path, monkeypatch):
+    monkeypatch.setattr(logs, "_LONG_LOG", 1)
+    monkeypatch.setattr(logs, "_piece", None)  # the reader of short logs is not called
+    assert len(logs.read(EXAMPLE / "static.csv").columns["ax"]) > 1000

@@ -19,6 +19,7 @@ from mwdcal.files.documents import read
 from mwdcal.files.formats import text
 from mwdcal.survey import acceptance, long_table
 from mwdcal.survey.path import calibrated_path, continued_path
+from mwdcal.survey.references import declination_sd
 
 ROWS = 700
 
@@ -201,6 +202,35 @@ def test_numbers_are_spelt_as_by_repr():
     values = np.concatenate([drawn, rng.integers(-(10**6), 10**6, 1000) / 1.0, ends])
     expected = ["" if value != value else repr(value) for value in values.tolist()]
     assert text.spelt(values, pa).to_pylist() == expected
+    assert text.spelt(np.full(2, -48000.0), pa).to_pylist() == ["-48000.0"] * 2
+
+
+def test_the_first_fault_is_named_though_references_are_read_first(tool, tmp_path, in_parts):
+    columns = well(tool)
+    columns["ax"][5], columns["ref_field_nt"][600] = "x", "-1"
+    source, out = written(tmp_path / "well.csv", columns), tmp_path / "out.csv"
+    in_parts()
+    assert "line 7, column 'ax'" in refused(cli("survey", tool, source, "-o", out), 2)
+    columns["ax"][5] = columns["ax"][6]
+    written(source, columns)
+    assert "line 602, column 'ref_field_nt'" in refused(cli("survey", tool, source, "-o", out), 2)
+
+
+def test_the_horizontal_field_of_a_long_table_is_the_median_of_its_references(
+    tool, tmp_path, in_parts
+):
+    """By which a declination without a stated uncertainty is uncertain."""
+    columns = well(tool)
+    fields = 47_000.0 + 2_000.0 * np.linspace(0.0, 1.0, ROWS) ** 2
+    columns["ref_field_nt"] = [repr(field) for field in fields.tolist()]
+    source, out = tmp_path / "well.csv", tmp_path / "out.csv"
+    written(source, columns, ["declination_deg = 2.4"])
+    in_parts()
+    assert cli("survey", tool, source, "-o", out).code == 0
+    (line,) = (line for line in out.read_text().splitlines() if "sd_declination_deg =" in line)
+    level = np.median(fields) * np.cos(np.radians(63.0))
+    shared, _ = declination_sd(level)
+    assert float(line.partition("=")[2]) == pytest.approx(shared, rel=1e-12)
 
 
 @pytest.mark.parametrize("delimiter", [",", "\t"])

@@ -166,6 +166,30 @@ def test_igrf_is_that_of_ppigrf():
         assert components(field) == pytest.approx(theirs, abs=tolerance), year
 
 
+def test_the_field_is_that_of_a_library_everywhere_and_at_the_poles():
+    """The library evaluates the same coefficients by recurrences of its own."""
+    pygeomag = pytest.importorskip("pygeomag")
+    rng, theirs = np.random.default_rng(15), pygeomag.GeoMag(coefficients_file="wmm/WMM_2025.COF")
+    places = rng.uniform((-90, -180, -9000, 2025), (90, 360, 20_000, 2030), (60, 4))
+    places[:4, 0] = 90.0, -90.0, 0.0, 90.0
+    ours = earth.main_fields(earth.field_model("wmm2025", 2025.0), *places.transpose())
+    for found, (latitude, longitude, altitude, year) in zip(ours, places, strict=True):
+        seen = theirs.calculate(latitude, longitude, altitude / 1000, year)
+        assert found == pytest.approx((seen.x, seen.y, seen.z), abs=1e-4)
+
+
+def test_fields_of_many_places_and_dates_are_those_of_each():
+    model, spots = (
+        earth.field_model("igrf14", 2025.0),
+        [(60.0, 3.5, 0.0, 2025.5), (-90.0, 9.0, 1e4, 2029.0)],
+    )
+    together = earth.main_fields(model, *np.transpose(spots))
+    assert together.shape == (2, 3)
+    for found, spot in zip(together, spots, strict=True):
+        alone = earth.main_field(model, *spot)
+        assert components(alone) == pytest.approx(found, abs=1e-6)
+
+
 def test_both_models_agree_within_what_their_makers_state():
     day, spots = 2026.5, [(60.0, 3.5), (-33.0, 151.0), (29.4, -98.5), (25.0, 51.0), (0.0, 120.0)]
     for latitude, longitude in spots:

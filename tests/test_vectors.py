@@ -7,9 +7,11 @@ from mwdcal.geometry import observables as ob
 from mwdcal.geometry.vectors import (
     are_positive,
     centred,
+    dot,
     inverse,
     inverse_of_positive,
     inverse_of_three,
+    length,
     nearest_rotation,
     reference_vectors,
     rotation,
@@ -167,3 +169,11 @@ def test_positive_matrices_are_those_without_a_negative_eigenvalue():
     np.testing.assert_array_equal(positive, (values > 0).all(-1))
     assert not are_positive(np.full((3, 3), np.nan))
     assert not np.isfinite(inverse_of_three(np.ones((3, 3)))).any()
+
+
+@pytest.mark.parametrize("shape", [(3,), (0, 3), (7, 3), (4, 5, 3)])
+def test_lengths_and_products_have_the_digits_of_numpy(shape):
+    rng = np.random.default_rng(6)
+    first, second = rng.normal(size=(2, *shape)) * 10.0 ** rng.integers(-9, 9, (2, *shape))
+    np.testing.assert_array_equal(length(first), np.linalg.norm(first, axis=-1))
+    np.testing.assert_array_equal(dot(first, second), np.sum(first * second, -1))

@@ -472,13 +472,15 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         """Covariance (…, n, 6, 6) of both vectors from the noise of one reading."""
         readings = as_readings(readings)
         result = np.zeros((*readings.accelerometer.shape[:-1], 6, 6))
-        for triad, model, at, vector in self._measured(readings):
-            slope = model.slope(*at)
-            sd = np.broadcast_to(readings.sd.get(triad.name, np.array(triad.noise)), at[1].shape)
+        for triad, model, (parameters, raw, temperature), vector in self._measured(readings):
+            sd = readings.sd.get(triad.name, np.array(triad.noise))
+            if not model.varies and np.ndim(sd) < raw.ndim:  # one for all readings
+                raw, temperature = raw[..., :1, :], temperature[..., :1]
+            slope, sd = model.slope(parameters, raw, temperature), np.broadcast_to(sd, raw.shape)
             result[..., vector, vector] = slope * sd[..., None, :] ** 2 @ slope.mT
         return result
 
-    def _gradients(self, names: Sequence[str], readings: ReadingsLike) -> Array:
+    def gradients(self, names: Sequence[str], readings: ReadingsLike) -> Array:
         """Gradients (…, n, k, 6) of k observables with respect to both vectors."""
         fields = self.fields(readings)
         gradient = np.stack([OBSERVABLES[name].gradient(*fields) for name in names], -2)
@@ -486,7 +488,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
 
     def sensitivity(self, name: str, readings: ReadingsLike) -> Array:
         """Gradient (…, n, p) of an observable with respect to the parameters."""
-        gradient = self._gradients((name,), readings)
+        gradient = self.gradients((name,), readings)
         return np.asarray((gradient @ self.jacobian(readings))[..., 0, :])
 
     def uncertainty(self, name: str, readings: ReadingsLike, noise: bool = False) -> Array:
@@ -501,10 +503,15 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         return np.sqrt(np.maximum(variance, 0.0))  # below zero by rounding alone
 
     def covariance(
-        self, names: str | Sequence[str], readings: ReadingsLike, noise: bool = False
+        self,
+        names: str | Sequence[str],
+        readings: ReadingsLike,
+        noise: bool = False,
+        gradients: Array | None = None,
     ) -> Array:
         """Covariance (…, n, k, k) of k observables at one reading, as `uncertainty` states each.
 
+        `gradients` of the observables, where they are known already.
         Units: products of radians, g and nT. Singular: NaN in the rows and columns of an observable
         without a stated uncertainty.
 
@@ -521,9 +528,10 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
                     f"`names` must be observables ({', '.join(OBSERVABLES)}); got {name!r}. "
                     "Correct the name."
                 )
-        rows = self._gradients(names, readings)
+        rows = self.gradients(names, readings) if gradients is None else gradients
         moved = self.jacobian(readings)
-        vectors = moved @ self.parameter_covariance @ moved.mT
+        flat = moved.reshape(-1, moved.shape[-1])  # one product is faster than one for each reading
+        vectors = (flat @ self.parameter_covariance).reshape(moved.shape) @ moved.mT
         if noise:
             vectors = vectors + self.noise_covariance(readings)
         total = rows @ vectors @ rows.mT

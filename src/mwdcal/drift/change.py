@@ -142,7 +142,9 @@ class Contrasts:
 
     def sums(self, pull: Array) -> Array:
         """What speaks for a change (…, n - 1, p) at each transition, of covariance `information`."""
-        later = np.cumsum(pull[..., ::-1, :], -2)[..., ::-1, :]
+        later = pull.copy()
+        for k in range(pull.shape[-2] - 1, 0, -1):  # a running sum, whose terms lie side by side
+            later[..., k - 1, :] += later[..., k, :]
         rest = later[..., 1:, :]
         mean = (later[..., 0, :] @ self._mean.astype(pull.dtype))[..., None, :]
         after = self.after.astype(pull.dtype)
@@ -155,7 +157,9 @@ class Contrasts:
 
     def misfit(self, departures: Array, pull: Array) -> Array:
         """Misfit (…,) of one set of parameters to all calibrations."""
-        total = pull.sum(-2)
+        total = pull[..., 0, :]
+        for k in range(1, pull.shape[-2]):
+            total = total + pull[..., k, :]
         whole = np.einsum("...ki,...ki->...", departures, pull)
         return np.asarray(whole - (total * (total @ self._mean.astype(pull.dtype))).sum(-1))
 
@@ -207,14 +211,14 @@ def stretches(history: History, draws: int) -> AnyArray:
 
     Calibrations of a triad whose noise was estimated together (`pooled`) have one factor.
     """
-    freedom = history.freedom
+    freedom, pooled = history.freedom, history.pooled
     result = np.ones((draws, *freedom.shape), np.float32)
     rng = np.random.default_rng([SEED_OF_DRAWS, *freedom.shape])
     for triad in TRIADS:
         columns = [place for place, name in enumerate(history.names) if name.startswith(triad)]
         if not columns:
             continue
-        degrees, together = freedom[:, columns[0]], history.pooled[:, columns[0]]
+        degrees, together = freedom[:, columns[0]], pooled[:, columns[0]]
         groups = [np.flatnonzero(together), *np.flatnonzero(~together)[:, None]]
         for rows in (each for each in groups if each.size and np.isfinite(degrees[each[0]])):
             grown = np.sqrt(degrees[rows[0]] / rng.chisquare(degrees[rows[0]], draws))
@@ -243,7 +247,7 @@ def _test(history: History, level: float, draws: int) -> ChangeTest:
     pull, null_pull = contrasts.pull(departures), contrasts.pull(null)
     scores = np.where(contrasts.known, contrasts.scores(pull), np.nan)
     largest = float(np.nanmax(np.abs(scores[:, steady]), initial=0.0))
-    most = np.abs(contrasts.scores(null_pull)[..., steady]).max((-1, -2), initial=0.0)
+    most = np.abs(contrasts.scores(null_pull)[..., steady]).reshape(draws, -1).max(-1, initial=0.0)
     misfit, misfits = float(contrasts.misfit(departures, pull)), contrasts.misfit(null, null_pull)
     (by_step, each_step), (by_misfit, each_misfit) = _ranks(most, largest), _ranks(misfits, misfit)
     evidence = np.minimum(each_step / STEP_SHARE, each_misfit / (1 - STEP_SHARE))

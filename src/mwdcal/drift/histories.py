@@ -19,7 +19,7 @@ from mwdcal.drift.walk import (
     common_noise_scale,
     factored,
     parameter_names,
-    precision,
+    precisions,
     years,
 )
 from mwdcal.geometry.vectors import Array, Bools, outer
@@ -123,7 +123,7 @@ def tool_history(calibrations: Sequence[Calibration]) -> ToolHistory:
         np.concatenate(part, -1) for part in zip(*form.noise(), strict=True)
     )
     like = np.stack(covariance) * outer(np.sqrt(ratio))
-    known = np.stack([precision(*each) for each in zip(like, free, strict=True)])
+    known = precisions(like, free)
     history = History(names, np.stack(values), like, known, freedom, together, years(kept), prior)
     units = tuple(map(form.unit, names))
     tool = tuple(ordered), tuple(days), tuple(used), tuple(map(tuple, notes))
@@ -259,7 +259,27 @@ class _Form:
 
     def _triad(self, calibration: Calibration, triad: TriadCalibration) -> tuple[Array, Array]:
         """Factors (k,) of a triad and their derivatives (k, p) by its parameters in the file."""
-        return self._factors(calibration, triad, self._unit_ratio(calibration, triad))
+        values, jacobian = self._of_all[triad.name][id(calibration)]
+        strength = self._strength(calibration, triad.name)
+        powers = strength ** _powers_of_strength(len(values))
+        return values * powers, jacobian * powers[:, None]
+
+    @cached_property
+    def _of_all(self) -> dict[str, dict[int, tuple[Array, Array]]]:
+        """The same of all calibrations as their fields are, those of one model together."""
+        result: dict[str, dict[int, tuple[Array, Array]]] = {name: {} for name in self.orders}
+        for name, factors in result.items():
+            alike: dict[tuple[float, object], list[Calibration]] = {}
+            for each in self.compared:
+                if (triad := getattr(each, name)) is not None:
+                    ratio = self._unit_ratio(each, triad)
+                    form = triad.model, triad.order, triad.curved, str(triad.centre), triad.radius
+                    at = each.reference_temperature, _axes(each, name).tobytes()
+                    alike.setdefault((ratio, (*form, *at)), []).append(each)
+            for (ratio, _), some in alike.items():
+                many = self._factors(some, name, ratio)
+                factors |= {id(c): (v, j) for c, v, j in zip(some, *many, strict=True)}
+        return result
 
     def _unit_ratio(self, calibration: Calibration, triad: TriadCalibration) -> float:
         """By what the unit of a triad's readings is another than the latest's: 1, or the ratio of nominal scales.
@@ -272,26 +292,28 @@ class _Form:
         if abs(np.log(ratio)) <= np.log1p(SCALE_CHANGE):
             return 1.0
         scale, latest = (
-            np.abs(self._factors(c, getattr(c, triad.name), 1.0)[0][:3]).mean()
+            np.abs(
+                self._strength(c, triad.name) ** -1.0
+                * self._factors([c], triad.name, 1.0)[0][0, :3]
+            ).mean()
             for c in (calibration, last)
         )
         return ratio if abs(np.log(scale / ratio / latest)) < abs(np.log(scale / latest)) else 1.0
 
     def _factors(
-        self, calibration: Calibration, triad: TriadCalibration, unit_ratio: float
+        self, alike: Sequence[Calibration], name: str, unit_ratio: float
     ) -> tuple[Array, Array]:
-        """The same where the readings are in a unit of which the latest's is `unit_ratio`."""
-        x = self._points[triad.name]
-        axes = unit_ratio * (
-            _axes(calibration, triad.name)
-            @ np.linalg.inv(_axes(self._last(triad.name), triad.name))
-        )
-        model = triad.functions(calibration.reference_temperature)
-        raw, order = x @ axes.transpose(), self.orders[triad.name]
-        result = factored(model, np.array(triad.parameters), raw, self.span, order, x)
-        strength = self._strength(calibration, triad.name)
-        powers = _powers_of_strength(len(result.values))
-        return result.values * strength**powers, result.jacobian * (strength**powers)[:, None]
+        """Factors (c, k) of a triad of calibrations with one model, and their derivatives (c, k, p).
+
+        Their readings are in a unit of which the latest's is `unit_ratio`.
+        """
+        x, first = self._points[name], alike[0]
+        axes = unit_ratio * (_axes(first, name) @ np.linalg.inv(_axes(self._last(name), name)))
+        model = getattr(first, name).functions(first.reference_temperature)
+        raw, order = x @ axes.transpose(), self.orders[name]
+        parameters = np.array([getattr(each, name).parameters for each in alike])
+        result = factored(model, parameters, raw, self.span, order, x)
+        return result.values, result.jacobian
 
     def _last(self, triad: str) -> Calibration:
         """The latest calibration of a triad: one in nT before one to field = 1."""

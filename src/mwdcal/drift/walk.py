@@ -22,7 +22,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from mwdcal.calibration.readings import TRIADS
-from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal
+from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, outer
 from mwdcal.sensor.models import OFF_COLUMNS, OFF_DIAGONAL, OFF_ROWS, Model
 
 WALK_KINDS = ("scale", "bias", "misalignment")
@@ -176,6 +176,16 @@ def precision(covariance: Array, free: Array) -> Array:
     known = across @ np.linalg.pinv(inner, DEPENDENT, hermitian=True) @ across.transpose()
     result[np.ix_(moving, moving)] = known / np.outer(sd, sd)
     return result
+
+
+def precisions(covariance: Array, free: Sequence[Array]) -> Array:
+    """The same of several calibrations (n, p, p), together where all parameters of all move freely."""
+    variance = diagonal(covariance)
+    if not (variance > HELD_SD**2).all() or any(rows.size for rows in free):
+        return np.stack([precision(*each) for each in zip(covariance, free, strict=True)])
+    scale = outer(np.sqrt(variance))
+    known = np.linalg.pinv(covariance / scale, DEPENDENT, hermitian=True)
+    return np.asarray(known / scale)
 
 
 def common_noise_scale(factors: Array, freedom: Array) -> tuple[Array, Array, Bools]:
@@ -355,7 +365,7 @@ class GroupRates:
         return np.asarray(np.exp(logs - logsumexp(logs)))
 
 
-def quantiles(rates: Array, probability: Array, shares: Sequence[float]) -> Array:
+def quantiles(rates: Array, probability: Array, shares: Sequence[float] | Array) -> Array:
     """Rates below which lie the given shares of a distribution (r,) over rates (r,), between them interpolated."""
     inner = np.cumsum(probability) - probability / 2
     return np.asarray(np.exp(np.interp(shares, inner, np.log(rates))))
@@ -363,4 +373,4 @@ def quantiles(rates: Array, probability: Array, shares: Sequence[float]) -> Arra
 
 def draws(rates: Array, probability: Array, count: int, rng: np.random.Generator) -> Array:
     """Rates (count,) drawn from a distribution over rates."""
-    return quantiles(rates, probability, rng.uniform(size=count).tolist())
+    return quantiles(rates, probability, rng.uniform(size=count))

@@ -48,6 +48,8 @@ _TYPED = (".parquet", ".xlsx", *tables.EXCHANGED)
 _ODD = ("nan", "inf", '"', "\r")
 """Letters and signs that no plain number has, in lower case."""
 _CLOCK = re.compile(r"\d{4}-\d{1,2}-\d{1,2}|\d{1,2}:\d{2}|\d{1,2}[./]\d{1,2}[./]\d{4}")
+_OF_NUMBERS = b"0123456789+-.eE \r\n"
+"""All that plain numbers are spelled with, and lines end with."""
 _BINARY = bytes([*range(0x09), *range(0x0E, 0x20)])
 _LONG_LOG = 100_000_000
 """Bytes of text from which the columns of a log are not all in memory at once."""
@@ -162,14 +164,18 @@ def _read_text(stream: BinaryIO, names: list[str], decimal: str, source: str, sa
     metadata = meta.parse(comments, source)
     layout = _layout(first, number, names, decimal, source)
     size = os.fstat(stream.fileno()).st_size
-    ahead, done = (first + "\n", number - 1) if names else ("", number)
+    ahead, done = ((first + "\n").encode(), number - 1) if names else (b"", number)
     wanted, lines = _wanted(layout), []
     others = [name for name in layout.names if name not in READ]
     filled: _Growing | StoredColumns = (
         _Growing(others, wanted) if size < _LONG_LOG else StoredColumns(others, wanted)
     )
-    for piece in _pieces(stream, ahead, number, source):
-        values, numbers, done = _piece(piece, done, layout)
+    for piece in _pieces(stream, ahead):
+        taken = _by_arrow(piece, done, layout) if size >= _LONG_LOG else None
+        if taken is None:
+            text = _decoded(piece, done + 1, source).replace("\r\n", "\n")
+            taken = _piece(text, done, layout)
+        values, numbers, done = taken
         share = stream.tell() / size
         filled.add(values, share)
         lines.append(numbers)
@@ -305,15 +311,45 @@ def _wanted(layout: _Layout) -> list[str]:
     return [name for name in layout.names if name in READ]
 
 
-def _pieces(stream: BinaryIO, ahead: str, done: int, source: str) -> Iterator[str]:
-    """The rest of the file in whole lines, `ahead` before it; `done` lines were read already."""
+def _pieces(stream: BinaryIO, ahead: bytes) -> Iterator[bytes]:
+    """The rest of the file in whole lines, `ahead` before it."""
     while data := stream.read(_PIECE) + stream.readline():
-        text = _decoded(data, done + 1, source)
-        done += text.count("\n")
-        yield ahead + text.replace("\r\n", "\n")
-        ahead = ""
+        yield ahead + data
+        ahead = b""
     if ahead:
         yield ahead
+
+
+def _by_arrow(data: bytes, done: int, layout: _Layout) -> tuple[Array, Sequence[int], int] | None:
+    """As `_piece` of plain numbers, by Arrow; None where a piece is anything else, or there is no Arrow."""
+    if layout.delimiter is None or layout.decimal != ".":
+        return None
+    if data.translate(None, _OF_NUMBERS + layout.delimiter.encode()):
+        return None
+    try:
+        import pyarrow as arrow
+        from pyarrow import csv
+    except ImportError:
+        return None
+    wanted, count = _wanted(layout), data.count(b"\n") + (not data.endswith(b"\n"))
+    try:
+        cells = csv.read_csv(
+            arrow.BufferReader(data),
+            csv.ReadOptions(
+                column_names=layout.names, use_threads=False, block_size=len(data) + 1
+            ),
+            csv.ParseOptions(delimiter=layout.delimiter, quote_char=False),
+            csv.ConvertOptions(
+                column_types=dict.fromkeys(wanted, arrow.float64()), include_columns=wanted,
+                null_values=[""],
+            ),
+        )  # fmt: skip
+    except arrow.ArrowInvalid:
+        return None
+    values = np.stack([np.asarray(column.to_numpy(), float) for column in cells.columns])
+    if len(cells) != count or np.isinf(values).any():
+        return None
+    return values.transpose(), range(done + 1, done + count + 1), done + count
 
 
 def _piece(text: str, done: int, layout: _Layout) -> tuple[Array, Sequence[int], int]:

@@ -334,7 +334,7 @@ def to_readings(
     readings = replace(
         readings,
         group=group_numbers(labels(table, "group")),
-        station=_stations(table),
+        station=numbered_labels(labels(table, "station"), table.count),
         digest=fingerprints([channels for channels in raw if channels is not None])
         if recognised
         else (),
@@ -539,10 +539,15 @@ def _quantity(name: str) -> str:
     return REFERENCES[name].column.removeprefix("ref_")
 
 
-def _stations(table: Table) -> tuple[str, ...]:
-    """Labels of the stations; a blank one is the number of its row."""
-    given = labels(table, "station") or [""] * table.count
-    return tuple(label or str(i) for i, label in enumerate(given, 1))
+def numbered_labels(given: Sequence[str], count: int, first: int = 1) -> tuple[str, ...]:
+    """Labels of `count` stations, as given or numbered; a blank one is the number of its row, counted from `first`."""
+    if not given:
+        return tuple(map(str, range(first, first + count)))
+    return (
+        tuple(given)
+        if all(given)
+        else tuple(label or str(i) for i, label in enumerate(given, first))
+    )
 
 
 def _raw_columns(readings: Readings, profile: Profile, kind: str) -> dict[str, Column]:

@@ -9,7 +9,7 @@ spelling or anything that is refused: one place decides what is accepted, and wo
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -76,26 +76,31 @@ class StreamedTable:
 
 
 def open_parquet(
-    path: Path, rows: int = 0, decimal: str = ".", also: Sequence[str] = ()
+    path: Path,
+    rows: int = 0,
+    decimal: str = ".",
+    also: Sequence[str] = (),
+    only: Collection[str] = (),
 ) -> StreamedTable:
     """A Parquet file in parts of `rows` rows; by default as many as memory bears.
 
     The table of a part has the columns of numbers of the contract, and those named `also`. What is carried
     has the type it has in the file, whatever it is; `decimal` is the sign in columns of text that are read as
-    numbers.
+    numbers. `only`: those columns alone.
     """
     check_decimal(decimal)
     arrow, _ = parquet.modules(path.name)
     file, stored = parquet.opened(path, path.name, buffer_size=1 << 20, pre_buffer=False)
     count = file.metadata.num_rows
     names = [name for name in stored.names if not parquet.is_index(name)]
+    names = [name for name in names if name in only] if only else names
     metadata = parquet.metadata_of(file.metadata.metadata, path.name)
     width = max(8 * len(names), parquet.row_size(file.metadata)) + 8 * len(RESULTS + UNCERTAINTIES)
     step = max(1, min(rows or PART_ROWS, PART // width))
 
     def pieces() -> Iterator[Any]:
         first = 1
-        batches = file.iter_batches(step, use_threads=True)
+        batches = file.iter_batches(step, columns=names if only else None, use_threads=True)
         with parquet.reading(path.name):
             for batch in batches:
                 yield first, batch
@@ -119,12 +124,17 @@ def open_parquet(
 
 
 def open_text(
-    path: Path, typed: bool = False, decimal: str = ".", also: Sequence[str] = ()
+    path: Path,
+    typed: bool = False,
+    decimal: str = ".",
+    also: Sequence[str] = (),
+    only: Collection[str] = (),
 ) -> StreamedTable:
     """A text table in pieces; `typed`: the contract's columns of numbers are carried as numbers.
 
     The table of a part has the columns of numbers of the contract, and those named `also`. Where `decimal` is
-    the comma every line goes through the exact parser, and numbers are carried with the point.
+    the comma every line goes through the exact parser, and numbers are carried with the point. `only`: the table of a
+    part has those columns alone.
     """
     check_decimal(decimal)
     arrow, _ = parquet.modules(path.name)
@@ -139,6 +149,7 @@ def open_text(
     numeric = [name for name in top.names if typed and name in RANGES]
     types = {n: arrow.float64() if n in numeric else arrow.string() for n in top.names}
     wanted = [name for name in top.names if name in RANGES or name in also]
+    wanted = [name for name in wanted if name in only] if only else wanted
 
     def pieces() -> Iterator[Any]:
         yield body, top.lines, len(first)
@@ -152,7 +163,7 @@ def open_text(
 
     def load(piece: Any, exact: bool) -> Part:
         data, above, size = piece
-        both = None if exact or decimal != "." else _plain(data, top, wanted, arrow)
+        both = None if exact or decimal != "." else _plain(data, top, wanted, arrow, bool(only))
         if both is None:
             parts = text.rows(data, top, above, path.name)
             table = Table(parts.columns, {}, path.name, parts.lines, decimal=decimal)
@@ -192,9 +203,12 @@ def _newlines(data: bytes) -> bytes:
 
 
 def _plain(
-    data: bytes, top: text.Head, wanted: Sequence[str], arrow: Any
+    data: bytes, top: text.Head, wanted: Sequence[str], arrow: Any, alone: bool = False
 ) -> tuple[Any, Table] | None:
-    """Strings and table of a piece, unusual lines by the exact parser; None where it takes all."""
+    """Strings and table of a piece, unusual lines by the exact parser; None where it takes all.
+
+    `alone`: strings of the wanted columns alone.
+    """
     from pyarrow import csv
 
     plain, odd, order = _sorted(data, top.delimiter.encode())
@@ -206,10 +220,14 @@ def _plain(
             arrow.BufferReader(plain),
             csv.ReadOptions(column_names=top.names, use_threads=False, block_size=len(plain) + 1),
             csv.ParseOptions(delimiter=top.delimiter, quote_char=False),
-            csv.ConvertOptions(column_types=strings, strings_can_be_null=False),
+            csv.ConvertOptions(
+                column_types=strings,
+                strings_can_be_null=False,
+                include_columns=wanted if alone else None,
+            ),
         )
         if order is not None:
-            few = _strings(text.rows(odd, top, 1, "").columns, arrow)
+            few = _strings(text.rows(odd, top, 1, "").columns, arrow).select(carried.column_names)
             both = arrow.concat_tables([carried, few]).combine_chunks()
             if len(both) != len(order):  # lines that are blank are no rows
                 return None

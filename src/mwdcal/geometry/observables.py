@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mwdcal.geometry.vectors import Array, ArrayLike, Bools, centred, wrap
+from mwdcal.geometry.vectors import Array, ArrayLike, Bools, centred, dot, length, wrap
 
 TITLES = {
     "gravity": "|g|",
@@ -45,7 +45,7 @@ VERTICAL = 1e-12
 
 def is_vertical(g: Array) -> Bools:
     """Where the attitude is exactly vertical (..., ) as booleans."""
-    return np.asarray(np.hypot(g[..., 0], g[..., 1]) <= VERTICAL * np.linalg.norm(g, axis=-1))
+    return np.asarray(np.hypot(g[..., 0], g[..., 1]) <= VERTICAL * length(g))
 
 
 def inclination(g: Array, b: Array) -> Array:
@@ -86,7 +86,7 @@ def north_toolface(g: Array, b: Array) -> Array:
 
 
 def _azimuth_parts(g: Array, b: Array) -> tuple[Array, Array]:
-    strength = np.linalg.norm(g, axis=-1)
+    strength = length(g)
     east = (g[..., 0] * b[..., 1] - g[..., 1] * b[..., 0]) * strength
     along = g[..., 0] * b[..., 0] + g[..., 1] * b[..., 1]
     return east, b[..., 2] * (g[..., 0] ** 2 + g[..., 1] ** 2) - g[..., 2] * along
@@ -99,18 +99,18 @@ def azimuth(g: Array, b: Array) -> Array:
 
 def dip(g: Array, b: Array) -> Array:
     """Angle of the field below the horizontal, -π/2…π/2 (through atan2: exact at the poles)."""
-    down = np.sum(g * b, -1)
-    return np.asarray(np.arctan2(down, np.linalg.norm(np.cross(g, b), axis=-1)))
+    down = dot(g, b)
+    return np.asarray(np.arctan2(down, length(np.cross(g, b))))
 
 
 def gravity(g: Array, b: Array) -> Array:
     """Strength of gravity."""
-    return np.asarray(np.linalg.norm(g, axis=-1))
+    return np.asarray(length(g))
 
 
 def field(g: Array, b: Array) -> Array:
     """Strength of the magnetic field."""
-    return np.asarray(np.linalg.norm(b, axis=-1))
+    return np.asarray(length(b))
 
 
 def _six(first: Array, second: Array) -> Array:
@@ -118,7 +118,7 @@ def _six(first: Array, second: Array) -> Array:
 
 
 def _unit(vector: Array) -> Array:
-    return np.asarray(vector / np.linalg.norm(vector, axis=-1, keepdims=True))
+    return np.asarray(vector / length(vector)[..., None])
 
 
 def _inclination_gradient(g: Array, b: Array) -> Array:
@@ -127,7 +127,7 @@ def _inclination_gradient(g: Array, b: Array) -> Array:
     x = np.where(vertical, 0.0, g[..., 0] / safe)
     y = np.where(vertical, -1.0, g[..., 1] / safe)
     down = g[..., 2]
-    rows = np.stack([down * x, down * y, -across], -1) / np.sum(g * g, -1)[..., None]
+    rows = np.stack([down * x, down * y, -across], -1) / dot(g, g)[..., None]
     return _six(rows, np.zeros_like(b))
 
 
@@ -144,7 +144,7 @@ def _turning(vector: Array, exists: Bools | bool = True) -> Array:
 
 def _azimuth_gradient(g: Array, b: Array) -> Array:
     east, north = _azimuth_parts(g, b)
-    strength = np.linalg.norm(g, axis=-1)
+    strength = length(g)
     (gx, gy, gz), (bx, by, bz) = np.moveaxis(g, -1, 0), np.moveaxis(b, -1, 0)
     zero, scaled = np.zeros_like(east), east / strength**2
     east_g = [strength * by + scaled * gx, -strength * bx + scaled * gy, scaled * gz]
@@ -162,18 +162,18 @@ def _north_toolface_gradient(g: Array, b: Array) -> Array:
     down, lean, turned, share = _north_parts(g, b)
     across = _turning(turned)
     axis = np.array([0.0, 0.0, 1.0])
-    part = (np.sum(across * down, -1) / lean)[..., None]
+    part = (dot(across, down) / lean)[..., None]
     of_down = -share[..., None] * (across - part * axis) - part * b
-    of_down = of_down - np.sum(of_down * down, -1, keepdims=True) * down
-    return _six(of_down / np.linalg.norm(g, axis=-1, keepdims=True), across - part * (down + axis))
+    of_down = of_down - dot(of_down, down)[..., None] * down
+    return _six(of_down / length(g)[..., None], across - part * (down + axis))
 
 
 def _dip_gradient(g: Array, b: Array) -> Array:
-    strength = np.linalg.norm(g, axis=-1, keepdims=True)
-    total = np.linalg.norm(b, axis=-1, keepdims=True)
+    strength = length(g)[..., None]
+    total = length(b)[..., None]
     down, north = g / strength, b / total
-    sine = np.sum(down * north, -1, keepdims=True)
-    cosine = np.linalg.norm(np.cross(down, north), axis=-1, keepdims=True)
+    sine = dot(down, north)[..., None]
+    cosine = length(np.cross(down, north))[..., None]
     return _six(
         (north - sine * down) / (strength * cosine), (down - sine * north) / (total * cosine)
     )

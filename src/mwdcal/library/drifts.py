@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import date
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -23,15 +23,17 @@ from mwdcal.files.limits import load_limits
 from mwdcal.presentation.drift import RegistryDrift
 from mwdcal.registry import queries
 from mwdcal.registry.store import Registry
-from mwdcal.registry.stored import AlteredError
 from mwdcal.use.verification import Bounds, Verdict
 
+_Document = tuple[queries.Row, bytes]
 Advance = Callable[[int, int], None]
 """Hears how many tools are done, and of how many."""
 PEERS_READ = 200
 """Most other tools of its type that a single tool is compared with."""
 PAGE = 500
 """Rows of a registry that are read at once."""
+TOOLS_READ = 50
+"""Tools whose calibrations are read at once, and are in memory together."""
 
 
 def limits_of(typed: Iterable[str]) -> dict[str, float]:
@@ -74,16 +76,15 @@ def of_registry(
     whole = partial(RegistryDrift, registry=registry.name, limits_deg=limits)
     if serial is not None:
         return whole(tool=_of_tool(registry, serial, limits, level, today, advance))
-    tools, refused, rows = [], {}, list(_tools(registry))
-    for done, row in enumerate(rows):
-        advance(done, len(rows))
+    tools, refused = [], {}
+    serials = [row["serial"] for row in _tools(registry)]
+    for done, past in enumerate(_pasts(registry, serials)):
+        advance(done, len(serials))
         try:
-            if tool := _measured(registry, row["serial"], level):
+            if tool := past.measured(level):
                 tools.append(tool)
-        except AlteredError:
-            raise
         except MwdcalError as error:
-            refused[row["serial"]] = str(error)
+            refused[past.serial] = str(error)
     if not tools:
         raise InputError(
             f"{registry.name}: there is no calibration to compare. Add some: mwdcal registry add."
@@ -102,14 +103,15 @@ def drift_of(
     serial = calibration.tool.get("serial")
     if serial is None:
         return None
-    calibrations, digests = _calibrations(registry, serial)
+    past = _past(registry, serial)
+    calibrations, digests = past.calibrations()
     known = [c for c in calibrations if c.sha256 != calibration.sha256]
     day = calibration.day
     earlier = [c for c in known if c.day <= day]
     if not earlier:
         return None
     digests |= {str(calibration.sha256): sha256}
-    tool = measured(serial, [*earlier, calibration], [*_tests(registry, serial)], digests=digests)
+    tool = measured(serial, [*earlier, calibration], past.tests(), digests=digests)
     rates = TypeRates.of([tool, *_peers(registry, serial, tool.drift.type)])
     return predicted(tool, rates, default_limits(load_limits()[0].error), today)
 
@@ -117,7 +119,7 @@ def drift_of(
 def _of_tool(
     registry: Registry, serial: str, limits: dict[str, float], level: float, today: date, advance: Advance,
 ) -> ToolDrift:  # fmt: skip
-    tool = _measured(registry, serial, level)
+    tool = _past(registry, serial).measured(level)
     if tool is None:
         raise InputError(
             f"{registry.name} has no calibration of a tool {shown(serial)}. mwdcal registry list shows its tools."
@@ -130,18 +132,16 @@ def _peers(
     registry: Registry, serial: str, kind: str, advance: Advance = lambda done, total: None
 ) -> Iterator[MeasuredTool]:
     """Other tools of a type, at most `PEERS_READ`, spread evenly; those that cannot be read are left out."""
-    rows = [row for row in _tools(registry, type=kind) if row["serial"] != serial]
-    some = rows[:: -(-len(rows) // PEERS_READ) or 1]
-    for done, row in enumerate(some):
+    serials = [row["serial"] for row in _tools(registry, type=kind) if row["serial"] != serial]
+    some = serials[:: -(-len(serials) // PEERS_READ) or 1]
+    for done, past in enumerate(_pasts(registry, some)):
         advance(done, len(some))
         try:
-            calibrations, _ = _calibrations(registry, row["serial"])
-        except AlteredError:
-            raise
+            calibrations, _ = past.calibrations()
         except MwdcalError:
             continue
         if len(calibrations) > 1:
-            yield measured(row["serial"], calibrations, tested=False)
+            yield measured(past.serial, calibrations, tested=False)
 
 
 def _tools(registry: Registry, **where: object) -> Iterator[queries.Row]:
@@ -149,37 +149,66 @@ def _tools(registry: Registry, **where: object) -> Iterator[queries.Row]:
     return _rows(partial(queries.tools_page, registry, where=where))
 
 
-def _measured(registry: Registry, serial: str, level: float) -> MeasuredTool | None:
-    """A tool by its calibrations and roll tests; None where it has no calibration."""
-    calibrations, digests = _calibrations(registry, serial)
-    if not calibrations:
-        return None
-    tests = list(_tests(registry, serial))
-    return measured(serial, calibrations, tests, level, digests)
+class _Past(NamedTuple):
+    """The documents of a tool in a registry: rows with bytes of calibrations and of roll tests, and rows of runs."""
+
+    serial: str
+    files: list[_Document]
+    verdicts: list[_Document]
+    runs: list[queries.Row]
+
+    def measured(self, level: float) -> MeasuredTool | None:
+        """The tool by its calibrations and roll tests; None where it has no calibration."""
+        calibrations, digests = self.calibrations()
+        if not calibrations:
+            return None
+        return measured(self.serial, calibrations, self.tests(), level, digests)
+
+    def calibrations(self) -> tuple[list[Calibration], dict[str, str]]:
+        """The calibrations of the tool, and the SHA-256 of each file by that of its content."""
+        read, digests = [], {}
+        for row, data in self.files:
+            calibration = documents.proved(Member(data, row["name"], row["sha256"]))
+            read.append(calibration)
+            digests[str(calibration.sha256)] = row["sha256"]
+        return read, digests
+
+    def tests(self) -> list[ServiceTest]:
+        """The roll tests of the tool, each on the day of its run or, unknown, when it was added."""
+        days, result = {row["sha256"]: row["time"] for row in self.runs}, []
+        for row, data in self.verdicts:
+            day = row["time"] or days.get(row["run"]) or row["added"]
+            document = msgspec.json.decode(documents.in_utf8(data), type=dict[str, Any])
+            verdict = msgspec.convert(document, Verdict)
+            named = row["calibration"] or ""
+            result.append(ServiceTest(date.fromisoformat(day[:10]), named, verdict))
+        return result
 
 
-def _calibrations(registry: Registry, serial: str) -> tuple[list[Calibration], dict[str, str]]:
-    """The calibrations of a tool, and the SHA-256 of each file by that of its content."""
-    read, digests = [], {}
-    for row, data in queries.calibrations(registry, serial):
-        calibration = documents.proved(Member(data, row["name"], row["sha256"]))
-        read.append(calibration)
-        digests[str(calibration.sha256)] = row["sha256"]
-    return read, digests
+def _past(registry: Registry, serial: str) -> _Past:
+    """The documents of one tool."""
+    return next(_pasts(registry, [serial]))
 
 
-def _tests(registry: Registry, serial: str) -> Iterator[ServiceTest]:
-    """The roll tests of a tool that were not withdrawn, each on the day of its run or, unknown, when it was added."""
-    where: dict[str, object] = {"serial": serial}
-    rows = list(_records(registry, "verification", where))
-    runs = _records(registry, "run", where) if rows else ()
-    days = {row["sha256"]: row["time"] for row in runs}
-    for row in rows:
-        day = row["time"] or days.get(row["run"]) or row["added"]
-        _, data = queries.document(registry, row["number"])
-        document = msgspec.json.decode(documents.in_utf8(data), type=dict[str, Any])
-        verdict = msgspec.convert(document, Verdict)
-        yield ServiceTest(date.fromisoformat(day[:10]), row["calibration"] or "", verdict)
+def _pasts(registry: Registry, serials: Sequence[str]) -> Iterator[_Past]:
+    """The documents of tools that were not withdrawn, those of some tools read at once.
+
+    Raises:
+        AlteredError: one of them is not what was added.
+    """
+    for first in range(0, len(serials), TOOLS_READ):
+        some = [*serials[first : first + TOOLS_READ]]
+        pasts = {serial: _Past(serial, [], [], []) for serial in some}
+        for row, data in queries.calibrations(registry, *some):
+            pasts[row["serial"]].files.append((row, data))
+        where: dict[str, object] = {"serial": some}
+        verdicts = list(_records(registry, "verification", where))
+        for row in verdicts:
+            _, data = queries.document(registry, row["number"])
+            pasts[row["serial"]].verdicts.append((row, data))
+        for row in _records(registry, "run", where) if verdicts else ():
+            pasts[row["serial"]].runs.append(row)
+        yield from pasts.values()
 
 
 def _records(registry: Registry, kind: str, where: dict[str, object]) -> Iterator[queries.Row]:

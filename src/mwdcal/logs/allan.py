@@ -69,7 +69,7 @@ REACH = 8
 """Lag in averaging factors beyond which covariances of second differences are left out."""
 APART = 128
 """Ratio of averaging factors above which only quantisation and random walk correlate variances."""
-BLOCK_SAMPLES = 1 << 14
+BLOCK_SAMPLES = 1 << 13
 """Samples that are taken at once, so that they stay in fast memory."""
 LONG_RECORD = 64
 """Averages in a record above which their centring no longer counts in covariances."""
@@ -126,17 +126,23 @@ def variance(
 
 
 def variances(
-    values: Array, averaging: Sequence[int], kind: Kind = "overlapping"
+    values: Array,
+    averaging: Sequence[int],
+    kind: Kind = "overlapping",
+    phase: Array | None = None,
 ) -> tuple[Array, Array]:
-    """Allan variances (..., m), plain and centred: both of `variance` in one pass."""
-    phase = _phase(values)
+    """Allan variances (..., m), plain and centred: both of `variance` in one pass.
+
+    Here and below `phase` is the `phase_of` the values, where it is known already.
+    """
+    phase = phase_of(values) if phase is None else phase
     pairs = [_variances(phase, int(m), kind) for m in averaging]
     whole = np.array(pairs).reshape(-1, 2, *phase.shape[:-1])
     plain, centred = np.moveaxis(whole, (0, 1), (-1, 0))
     return plain, centred
 
 
-def _phase(values: Array) -> Array:
+def phase_of(values: Array) -> Array:
     """Sums (..., n + 1) of the readings less their mean, which second differences do not see.
 
     Without the mean, sums stay small: rounding is that of the noise, not that of the offset.
@@ -183,7 +189,7 @@ def _moments_of(step: Callable[[slice], Array], count: int) -> tuple[Array, Arra
         part = step(slice(start, min(start + BLOCK_SAMPLES, count)))
         size = part.shape[-1]
         middle = part.mean(-1)
-        part = part - middle[..., None]
+        part -= middle[..., None]
         apart = middle - mean
         mean = mean + apart * (size / (start + size))
         square = (
@@ -194,25 +200,46 @@ def _moments_of(step: Callable[[slice], Array], count: int) -> tuple[Array, Arra
     return mean, square / count
 
 
-def rounding(values: Array, averaging: Sequence[int]) -> Array:
+def rounding(values: Array, averaging: Sequence[int], phase: Array | None = None) -> Array:
     """Allan deviation (..., m) that the rounding of numbers alone can make of a record (..., n)."""
+    phase = phase_of(values) if phase is None else phase
     sums, largest = (
-        np.maximum(v.max(-1, keepdims=True), -v.min(-1, keepdims=True))
-        for v in (_phase(values), values)
+        np.maximum(v.max(-1, keepdims=True), -v.min(-1, keepdims=True)) for v in (phase, values)
     )
     return np.asarray(np.finfo(float).eps * (sums / np.asarray(averaging, float) + largest))
 
 
-def differences(values: Array, m: int) -> Array:
-    """Differences (..., n - 2m + 1) of averages over m samples that follow each other."""
-    return _differences(_phase(values), m) / m
+def largest_difference(phase: Array, m: int) -> tuple[float, int]:
+    """Largest difference of averages over m samples that follow each other, by its size, and its place."""
+    count, largest = phase.shape[-1] - 2 * m, (-1.0, 0)
+    for start in range(0, count, BLOCK_SAMPLES):
+        size = np.abs(_differences(phase, m, slice(start, min(start + BLOCK_SAMPLES, count))))
+        place = int(np.argmax(size))
+        if size[place] > largest[0]:
+            largest = float(size[place]), start + place
+    return largest[0] / m, largest[1]
+
+
+def usual_difference(phase: Array, m: int, above: float) -> float:
+    """Median size of these differences; infinite where it is more than `above`, as half of them are."""
+    count, below = phase.shape[-1] - 2 * m, 0
+    for start in range(0, count, BLOCK_SAMPLES):
+        part = _differences(phase, m, slice(start, min(start + BLOCK_SAMPLES, count)))
+        below += int(np.count_nonzero(np.abs(part) <= above * m))
+    if below < count // 2:
+        return np.inf
+    size = np.abs(_differences(phase, m))
+    return float(np.median(size, overwrite_input=True)) / m
 
 
 def _differences(phase: Array, m: int, rows: slice = slice(None)) -> Array:
     """Second differences (..., n - 2m) over m samples, or some of them."""
     ends = (phase[..., 2 * m :], phase[..., m:-m], phase[..., : -2 * m])
     last, middle, first = (end[..., rows] for end in ends)
-    return np.asarray(last - 2 * middle + first)
+    result = 2 * middle
+    np.subtract(last, result, out=result)
+    result += first
+    return np.asarray(result)
 
 
 def drift(values: Array) -> Array:
@@ -477,10 +504,15 @@ def fit(variance: Array, slope: Array, moments: Moments) -> NoiseTerms:
 
 
 def single(
-    values: Array, length: float, moments: Moments, terms: NoiseTerms
+    values: Array,
+    length: float,
+    moments: Moments,
+    terms: NoiseTerms,
+    seen: Array | None = None,
 ) -> tuple[Array, Array, Bools]:
     """Deviation (B,) of one mean over `length` samples of records (B, n), drift included.
 
+    `seen`: Allan deviation (B,) of the records at `length`, where it is known already.
     With its degrees of freedom (B,), and whether (B,) it was measured: the Allan deviation at
     `length`, where the terms do not describe the record or are known by far less.
     """
@@ -496,7 +528,8 @@ def single(
     measurable = measurable @ [np.interp(np.log(whole), places, one) for one in np.eye(len(places))]
     described = (terms.chance >= CONTRADICTED) & (length >= moments.averaging[terms.start])
     measured = ~described | (measurable > BETTER * known)
-    size = np.where(measured, deviation(values, [whole])[:, 0], np.sqrt(variance))
+    seen = deviation(values, [whole])[:, 0] if seen is None else seen
+    size = np.where(measured, seen, np.sqrt(variance))
     return size, np.where(measured, measurable, known), measured
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import msgspec
 import numpy as np
@@ -44,6 +44,8 @@ SOUND = 10
 """Stations that a log holds where their duration is chosen for it."""
 EVENT = 8.0
 """Size of a difference, in robust standard deviations, that no noise reaches."""
+ROBUST = 1.4826
+"""Standard deviation of normal noise over its median size."""
 STEP_ROUNDING = 1e-6
 """Rounding error of a ratio of whole numbers of steps of the converter."""
 EVENT_PARTS = 256
@@ -178,12 +180,12 @@ def find_noise(
         say(f"Allan variances of {name}, {rows.stop - rows.start} samples")
         try:
             value, hertz = regular.samples(log, name, rows, rate, findings)
-            variances = _variances(name, value, hertz * station)
+            record = _record(name, value, hertz * station)
         except regular.UnusableChannelError as error:
             findings.append(Finding(id="channel-left-out", text=f"{error} It was left out."))
             continue
         cells[name] = regular.cells_of(value, hertz)
-        channel = _channel(name, value, hertz, station, kind, variances, remarks)
+        channel = _channel(name, record, hertz, station, kind, remarks)
         channels[name] = channel if profile is None else _physical(name, channel, profile)
     if not channels:
         reasons = " ".join(finding.text for finding in findings)
@@ -238,26 +240,38 @@ def _station_seconds(given: float | None, seconds: float, rate: float, source: s
     return given
 
 
-def _variances(name: str, value: Array, length: float) -> tuple[Array, Array]:
-    """Plain and centred Allan variances (m,) of a channel at all octaves; refused without noise there or in `length`.
+class _Record(NamedTuple):
+    """A channel: samples (n,) and their `phase`, Allan variances (m,), plain and centred, at all octaves.
+
+    `station`: Allan variance at the length of a station.
+    """
+
+    value: Array
+    phase: Array
+    plain: Array
+    centred: Array
+    station: float
+
+
+def _record(name: str, value: Array, length: float) -> _Record:
+    """A channel with its Allan variances; refused without noise at an octave or in `length`.
 
     Errors: `regular.UnusableChannelError`.
     """
-    factors = [*allan.octaves(len(value)), max(round(length), 1)]
-    plain, centred = allan.variances(value, factors)
-    regular.check_noise(name, value, factors, centred)
-    return plain[:-1], centred[:-1]
+    factors, phase = [*allan.octaves(len(value)), max(round(length), 1)], allan.phase_of(value)
+    plain, centred = allan.variances(value, factors, phase=phase)
+    regular.check_noise(name, value, factors, centred, phase)
+    return _Record(value, phase, plain[:-1], centred[:-1], float(plain[-1]))
 
 
 def _channel(
-    name: str, value: Array, rate: float, station: float, kind: Kind, variances: tuple[Array, Array],
-    findings: list[Finding],
-) -> ChannelNoise:  # fmt: skip
-    """The noise of one channel with these `_variances`; samples are counted inside, seconds outside."""
-    plain, centred = variances
+    name: str, record: _Record, rate: float, station: float, kind: Kind, findings: list[Finding]
+) -> ChannelNoise:
+    """The noise of one channel; samples are counted inside, seconds outside."""
+    value, phase, plain, centred, _ = record
     moments, requested = _moments(len(value), "overlapping"), _moments(len(value), kind)
     if kind != "overlapping":
-        plain = allan.variance(value, allan.octaves(len(value)), kind)
+        plain, _ = allan.variances(value, allan.octaves(len(value)), kind, phase)
     slope = np.asarray(allan.drift(value))
     terms = allan.fit(centred[None], slope[None], moments)
     freedom = allan.freedom(requested, terms.bounded, terms.steady, terms.covariance)[0]
@@ -267,7 +281,7 @@ def _channel(
     fitted = np.sqrt(fitted[0] + (terms.steady * moments.averaging) ** 2 / 2)
     named = _terms(terms, rate)
     white = named["white"].value
-    remarks = _findings(name, value, rate, station, moments, terms)
+    remarks = _findings(name, record, rate, station, moments, terms)
     findings += remarks
     return ChannelNoise(
         samples=len(value),
@@ -284,7 +298,7 @@ def _channel(
         fit_from_s=float(moments.averaging[terms.start[0]] / rate),
         chance=float(terms.chance[0]),
         doubts=[finding.id for finding in remarks if finding.id in DOUBTS],
-        station=_station(value, station * rate, moments, terms),
+        station=_station(record, station * rate, moments, terms),
     )
 
 
@@ -329,24 +343,26 @@ def _drift(terms: NoiseTerms, rate: float) -> Term:
     )
 
 
-def _station(value: Array, length: float, moments: Moments, terms: NoiseTerms) -> StationNoise:
+def _station(record: _Record, length: float, moments: Moments, terms: NoiseTerms) -> StationNoise:
     """The noise of a mean over `length` samples, or of one."""
-    noise, freedom, measured = allan.single(value[None], length, moments, terms)
+    seen = np.sqrt([record.station])
+    noise, freedom, measured = allan.single(record.value[None], length, moments, terms, seen)
     lower, upper = (float(limit[0]) for limit in allan.band(noise, freedom))
     source = "measured" if measured[0] else "terms"
     return StationNoise(noise=float(noise[0]), lower=lower, upper=upper, source=source)
 
 
 def _findings(
-    name: str, value: Array, rate: float, station: float, moments: Moments, terms: NoiseTerms
+    name: str, record: _Record, rate: float, station: float, moments: Moments, terms: NoiseTerms
 ) -> list[Finding]:
     """What the reader should know about a channel."""
+    value = record.value
     apart = np.diff(np.sort(value))
     step = float(np.min(apart, where=apart > 0, initial=np.inf))
     del apart
     sample = float(np.std(np.diff(value)) / np.sqrt(2))
     coarse = sample < COARSE * step
-    texts = {"event": _event(name, value, rate, COARSE * step, coarse)}
+    texts = {"event": _event(name, record.phase, rate, COARSE * step, coarse)}
     if coarse:
         texts["coarse"] = (
             f"{name} is read in steps of {step:.3g}, above its noise of {sample:.2g}: the figures "
@@ -370,19 +386,17 @@ def _findings(
     return [Finding(id=key, text=text) for key, text in texts.items() if text]
 
 
-def _event(name: str, value: Array, rate: float, least: float, coarse: bool) -> str:
+def _event(name: str, phase: Array, rate: float, least: float, coarse: bool) -> str:
     """The finding, if any, on a difference between averages too large for noise: a spike, or a move.
 
     `least` is the noise that the steps of the converter can hide: in single samples, and if they
     are `coarse` in averages.
     """
-    for m in sorted({1, max(len(value) // EVENT_PARTS, 1)}):
-        size = allan.differences(value, m)
-        np.abs(size, out=size)
-        worst = int(np.argmax(size))
-        largest = float(size[worst])
-        median = float(np.median(size, overwrite_input=True))
-        usual = max(1.4826 * median, least if coarse or m == 1 else 0.0)
+    for m in sorted({1, max((len(phase) - 1) // EVENT_PARTS, 1)}):
+        largest, worst = allan.largest_difference(phase, m)
+        quiet = largest / EVENT / ROBUST  # a median beyond it makes no event of the largest
+        median = allan.usual_difference(phase, m, quiet)
+        usual = max(ROBUST * median, least if coarse or m == 1 else 0.0)
         if usual > 0 and largest / usual > EVENT + STEP_ROUNDING:
             return (
                 f"{name} changes by {largest:.3g} about {(worst + m) / rate:.4g} s after the start, "

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from numbers import Real
 from typing import TypeGuard
 
@@ -22,7 +23,7 @@ from mwdcal.files.formats.table import Table, cell_error, numbers
 from mwdcal.files.logs import TIME
 from mwdcal.geometry.vectors import Array
 from mwdcal.logs import allan, standstill
-from mwdcal.logs.standstill import Cells
+from mwdcal.logs.standstill import CellGrid, Cells
 from mwdcal.logs.station_means import count
 
 ANY = Range(-np.inf, np.inf, "s")
@@ -247,10 +248,12 @@ def _check_changes(name: str, value: Array) -> None:
         raise UnusableChannelError(reads)
 
 
-def check_noise(name: str, value: Array, factors: Sequence[int], centred: Array) -> None:
+def check_noise(
+    name: str, value: Array, factors: Sequence[int], centred: Array, phase: Array
+) -> None:
     """Refuse samples (n,) without noise in means over some of the factors (m,), by their `centred` variances (m,)."""
-    size = np.sqrt(centred)
-    for i in np.flatnonzero(size <= np.maximum(allan.rounding(value, factors), SMALLEST_NOISE))[:1]:
+    least = np.maximum(allan.rounding(value, factors, phase), SMALLEST_NOISE)
+    for i in np.flatnonzero(np.sqrt(centred) <= least)[:1]:
         raise UnusableChannelError(
             f"{name} has no noise above the rounding of numbers in averages over "
             f"{count(factors[i], 'sample')}: a ramp, a pattern, or simulated without noise?"
@@ -271,7 +274,13 @@ CAUSES = {"accelerometer": "the tool moves", "magnetometer": "the tool or iron n
 
 def cells_of(value: Array, rate: float) -> Cells:
     """A channel (n,) of `rate` samples a second, in cells."""
-    return standstill.cells_of(np.arange(len(value)) / rate, value, SLOW_CELL)
+    return standstill.filled(_grid(len(value), rate), value)
+
+
+@lru_cache(maxsize=2)
+def _grid(samples: int, rate: float) -> CellGrid:
+    """The cells of so many samples: channels of one length and rate have the same."""
+    return standstill.cell_grid(np.arange(samples) / rate, SLOW_CELL)
 
 
 def movement(channels: Mapping[str, Cells]) -> list[Finding]:

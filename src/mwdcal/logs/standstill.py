@@ -126,32 +126,60 @@ class Standstills(NamedTuple):
         return self.start[self.taken], self.end[self.taken]
 
 
+class CellGrid(NamedTuple):
+    """The cells of a channel by its clock alone: start, end and gaps (m,), and the usual step between samples, s.
+
+    `stretches` at one rate: first sample, number of cells, and samples of each.
+    """
+
+    start: Array
+    end: Array
+    torn: Bools
+    step: float
+    stretches: list[tuple[int, int, int]]
+
+
 def cells_of(time: Array, value: Array, length: float) -> Cells:
     """A channel in cells of about `length` seconds, but of no fewer than `FEWEST` samples.
 
     Shapes: `time` (n,) ascending, `value` (n,) without blanks. Where the rate changes, so does the
     number of samples of a cell; what is left there belongs in time to the cell before.
     """
-    step = time_step(time)
+    return filled(cell_grid(time, length), value)
+
+
+def filled(grid: CellGrid, value: Array) -> Cells:
+    """The channel (n,) in the cells of its clock."""
     steps = np.abs(np.diff(value))
-    rough = float(np.median(steps)) / 0.6745 / np.sqrt(2) if steps.size else 0.0
+    rough = float(np.median(steps, overwrite_input=True)) / 0.6745 / np.sqrt(2) if steps.size else 0
+    level = [
+        np.median(value[first : first + count * size].reshape(count, size), axis=-1)
+        for first, count, size in grid.stretches
+    ]
+    whole = np.concatenate(level).astype(float)
+    return Cells(grid.start, grid.end, whole, grid.torn, grid.step, float(rough), resolution(value))
+
+
+def cell_grid(time: Array, length: float) -> CellGrid:
+    """The cells of samples at these times (n,)."""
     bounds = [*_rate_changes(time), len(time)]
-    parts = [_even(time[a:b], value[a:b], length) for a, b in pairwise(bounds)]
-    start, end, level, torn = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return Cells(start, end, level, torn, step, rough, resolution(value))
+    parts = [_even(time[a:b], length) for a, b in pairwise(bounds)]
+    start, end, torn = (np.concatenate([part[k] for part in parts]) for k in range(3))
+    shapes = [(int(a), *part[3]) for a, part in zip(bounds, parts, strict=False)]
+    return CellGrid(start, end, torn, time_step(time), shapes)
 
 
-def _even(time: Array, value: Array, length: float) -> tuple[Array, Array, Array, Bools]:
-    """Start, end, median and gaps of cells of samples at one rate."""
+def _even(time: Array, length: float) -> tuple[Array, Array, Bools, tuple[int, int]]:
+    """Start, end and gaps of cells of samples at one rate, their number, and samples of each."""
     step = time_step(time)
     size = max(FEWEST, round(length / step)) if step > 0 else FEWEST
     count = len(time) // size
-    clock, whole = (x[: count * size].reshape(count, size) for x in (time, value))
+    clock = time[: count * size].reshape(count, size)
     end = clock[:, -1] + step
     torn = np.any(np.diff(clock) > (size + 0.5) * step, axis=-1)
     if count and time[-1] - clock[-1, -1] < size * step:
         end[-1] = time[-1] + step
-    return clock[:, 0], end, np.asarray(np.median(whole, axis=-1), float), torn
+    return clock[:, 0].copy(), end, torn, (count, size)
 
 
 def _rate_changes(time: Array) -> Ints:

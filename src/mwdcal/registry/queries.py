@@ -131,10 +131,14 @@ def records_page(
     offset: int = 0,
     limit: int = 50,
 ) -> Page:
-    """Records of a kind whose columns equal `where`, in order of the time they state; columns as of `past`."""
+    """Records of a kind whose columns equal `where`, in order of the time they state; columns as of `past`.
+
+    A list in `where` holds the values that a column may have.
+    """
     query = sa.select(records.c.number).where(records.c.kind == kind)
     for name, value in (where or {}).items():
-        query = query.where(records.c[name] == value)
+        column = records.c[name]
+        query = query.where(column.in_(value) if isinstance(value, list) else column == value)
     keys = [records.c.time, records.c.number]
     order = [key.desc() if newest_first else key for key in keys]
     return _records_page(registry, query, order, offset, limit)
@@ -168,22 +172,22 @@ def document(registry: Registry, number: int) -> tuple[Row, bytes]:
     raise InputError(f"{registry.name}: there is no record {number}. Check the number.")
 
 
-def calibrations(registry: Registry, serial: str) -> Iterator[tuple[Row, bytes]]:
-    """The calibrations of a tool that were not withdrawn, oldest first, each with its file's bytes.
+def calibrations(registry: Registry, *serials: str) -> Iterator[tuple[Row, bytes]]:
+    """The calibrations of some tools that were not withdrawn, oldest first, each with its file's bytes.
 
     Raises:
         AlteredError: one of them is not what was added.
     """
-    query = _calibrations_of(serial).where(withdrawals.c.number.is_(None))
+    query = _calibrations_of(*serials).where(withdrawals.c.number.is_(None))
     return ((stored.record, stored.data) for stored in registry.documents(query))
 
 
-def _calibrations_of(serial: str) -> sa.Select[Any]:
-    """All calibrations of a tool, oldest first."""
+def _calibrations_of(*serials: str) -> sa.Select[Any]:
+    """All calibrations of some tools, oldest first."""
     return (
         with_objects()
         .outerjoin(withdrawals, withdrawals.c.record == records.c.number)
-        .where(records.c.serial == serial, records.c.kind == "calibration")
+        .where(records.c.serial.in_(serials), records.c.kind == "calibration")
         .order_by(records.c.time, records.c.number)
     )
 

@@ -13,7 +13,8 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -23,7 +24,7 @@ from mwdcal.errors import InputError
 from mwdcal.files.profiles import decoded_toml
 from mwdcal.geometry.observables import OBSERVABLES, is_vertical
 from mwdcal.geometry.units import STANDARD_GRAVITY
-from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal
+from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, dot, length
 from mwdcal.survey.stations import RANDOM, STRENGTHS, SURVEY_OBSERVABLES, Surveys
 
 STRENGTH_NAMES = SURVEY_OBSERVABLES[STRENGTHS]
@@ -103,27 +104,30 @@ class SurveyLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 class AcceptanceTests:
     """The limits of surveys (n,): fixed limits (3,), and a covariance (n, 3, 3) with the largest distance (n,).
 
-    `missing` (n, 3): not judged.
+    `missing` (n, 3): not judged. `weights` (n, 3, 3): inverse of the covariance of what is judged, ones for the rest.
     """
 
     fixed: Array
     covariance: Array
     largest: Array
     missing: Bools
+    weights: Array
 
-    def part(self, rows: slice) -> AcceptanceTests:
+    def part(self, rows: slice | Ints) -> AcceptanceTests:
         """Those of some surveys."""
         return AcceptanceTests(
-            self.fixed, self.covariance[rows], self.largest[rows], self.missing[rows]
-        )
+            self.fixed, self.covariance[rows], self.largest[rows], self.missing[rows], self.weights[rows]
+        )  # fmt: skip
 
-    @cached_property
-    def _weights(self) -> Array:
-        """Inverse (n, 3, 3) of the covariance of the departures that are judged, with ones for the others."""
-        blank = self.missing[:, :, None] | self.missing[:, None, :]
-        whole = np.where(blank, np.eye(len(STRENGTH_NAMES)), self.covariance)
-        sd, correlation = correlations(whole)
-        return np.asarray(np.linalg.inv(correlation) / (sd[:, :, None] * sd[:, None, :]))
+    def largest_field(self) -> Array:
+        """Largest departure (n,) of |b| that is accepted with some departure of dip, |g| being right; NaN: any."""
+        field, dip = (STRENGTH_NAMES.index(name) for name in ("field", "dip"))
+        weights = self.weights
+        shared = weights[:, field, dip] ** 2 / weights[:, dip, dip]
+        most = np.minimum(
+            self.largest / np.sqrt(weights[:, field, field] - shared), self.fixed[field]
+        )
+        return np.where(self.missing[:, field], np.nan, most)
 
     def accept(self, departures: Mapping[str, Array]) -> Bools:
         """Which of departures (n, k) of |g|, |b| and dip are accepted; none where nothing is judged.
@@ -138,9 +142,9 @@ class AcceptanceTests:
             shift = np.where(missing, 0.0, departure) if missing.any() else departure
             if np.isfinite(most := self.fixed[place]):
                 inside = inside & (np.abs(shift) <= most)
-            square = square + self._weights[:, place, [place]] * shift**2
+            square = square + self.weights[:, place, [place]] * shift**2
             for other, before in shifts:
-                square = square + 2.0 * self._weights[:, place, [other]] * shift * before
+                square = square + 2.0 * self.weights[:, place, [other]] * shift * before
             shifts.append((place, shift))
         return np.asarray(inside & (square <= self.largest[:, None] ** 2))
 
@@ -247,7 +251,8 @@ def judged(
         bound = np.where(np.isfinite(fixed), fixed, alone)
     over = np.abs(departure) > fixed
     accepted = ~missing.all(-1) & ~over.any(-1) & (together <= largest)
-    tests = AcceptanceTests(fixed, covariance, largest, missing)
+    weights = _weights(covariance, missing)
+    tests = AcceptanceTests(fixed, covariance, largest, missing, weights)
     return Judgement(departure, bound, together, largest, np.asarray(accepted), tests)
 
 
@@ -260,6 +265,14 @@ def distance(departure: Array, covariance: Array) -> Array:
     scaled = np.where(missing, 0.0, departure) / sd
     solved = np.linalg.solve(correlation, scaled[..., None])[..., 0]
     return np.asarray(np.sqrt(np.maximum(np.sum(scaled * solved, -1), 0.0)))
+
+
+def _weights(covariance: Array, missing: Bools) -> Array:
+    """Inverse (n, 3, 3) of the covariance of the departures that are judged, with ones for the others."""
+    blank = missing[:, :, None] | missing[:, None, :]
+    whole = np.where(blank, np.eye(len(STRENGTH_NAMES)), covariance)
+    sd, correlation = correlations(whole)
+    return np.asarray(np.linalg.inv(correlation) / (sd[:, :, None] * sd[:, None, :]))
 
 
 def correlations(covariance: Array) -> tuple[Array, Array]:
@@ -299,8 +312,12 @@ CROSS_AXIAL = np.arange(50.0, 301.0, 50.0)
 """Sizes across it: to twice what multi-station analysis assumes."""
 AROUND_TOOL = np.radians(np.arange(0.0, 360.0, 30.0))
 """Directions across it, rad."""
-SURVEYS_AT_ONCE = 1 << 9
-"""Surveys for which all sizes are tried at once, so that they stay in fast memory."""
+SURVEYS_AT_ONCE = 1 << 10
+"""Surveys for which sizes are tried at once, so that they stay in fast memory."""
+LADDER = (200.0, 400.0, 600.0, 800.0, 1200.0, 1800.0, AXIAL[-1])
+"""Sizes along the tool up to which those surveys are tried together that let no larger one pass."""
+LOOSER = 1 + 1e-6
+"""Share by which the largest departure of |b| is taken larger, so that rounding leaves out no size that passes."""
 WHERE = ("along the tool", "across it")
 
 
@@ -388,33 +405,122 @@ def _blocks(count: int) -> Iterator[slice]:
 
 
 @cache
-def _candidates() -> tuple[Array, Array]:
-    """Fields (k, 3) along the tool and across it, nT."""
-    along = np.zeros((2 * len(AXIAL), 3))
-    along[:, 2] = np.concatenate([AXIAL, -AXIAL])
-    around = np.stack([np.cos(AROUND_TOOL), np.sin(AROUND_TOOL), 0 * AROUND_TOOL], -1)
-    return along, (CROSS_AXIAL[:, None, None] * around).reshape(-1, 3)
+def _along_tool(last: float) -> Array:
+    """Fields (k, 3) along the tool up to a size, nT, one way and the other."""
+    sizes = AXIAL[last >= AXIAL]
+    fields = np.zeros((2 * len(sizes), 3))
+    fields[:, 2] = np.concatenate([sizes, -sizes])
+    return fields
+
+
+@cache
+def _across_tool(size: float) -> Array:
+    """Fields (k, 3) of a size across the tool, nT."""
+    return size * np.stack([np.cos(AROUND_TOOL), np.sin(AROUND_TOOL), 0 * AROUND_TOOL], -1)
+
+
+class _Tried(NamedTuple):
+    """Surveys (m,) at which interference is tried.
+
+    Gravity's direction and the field; the horizontal field turned by 90° to the right, NaN at vertical, and its square;
+    |b|, its vertical part, and dip.
+    """
+
+    tests: AcceptanceTests
+    down: Array
+    b: Array
+    side: Array
+    across: Array
+    strength: Array
+    below: Array
+    dip: Array
+
+    def part(self, rows: Ints) -> _Tried:
+        """Some of them."""
+        return _Tried(self.tests.part(rows), *(each[rows] for each in self[1:]))
+
+    def passing(self, fields: Array) -> Bools:
+        """Which interference (k, 3) would pass at each survey (m, k)."""
+        along, fall = self.b @ fields.mT, self.down @ fields.mT
+        total = np.sqrt(self.strength**2 + 2 * along + np.linalg.norm(fields, axis=-1) ** 2)
+        dip = np.arcsin(np.clip((self.below + fall) / total, -1.0, 1.0))
+        return self.tests.accept({"field": total - self.strength, "dip": dip - self.dip})
+
+    def turns(self, fields: Array, of: Ints | None = None) -> Array:
+        """Turns (m, k) of the azimuth by interference (k, 3), rad; or those (m, j) `of` some at each survey.
+
+        Interference f makes the horizontal field h to h + f - (f·d) d, d down: the azimuth turns by the angle between.
+        """
+        along, fall, turn = (vector @ fields.mT for vector in (self.b, self.down, self.side))
+        if of is not None:
+            along, fall, turn = (np.take_along_axis(each, of, -1) for each in (along, fall, turn))
+        return np.abs(np.arctan2(turn, self.across + along - self.below * fall))
+
+    def reach(self) -> Array:
+        """Size (m,) of interference along the tool above which none passes, nT, by |b| alone.
+
+        |b| rises along one way, and falls along the other until the field lies across the tool.
+        """
+        most = LOOSER * np.fmin(self.tests.largest_field(), AXIAL[-1])[:, None]
+        ways = np.concatenate([self.b[:, 2:], -self.b[:, 2:]], -1)
+        above, below = (2 * self.strength * sign * most + most**2 for sign in (1, -1))
+        back = np.sqrt(np.maximum(ways**2 + below, 0.0))
+        gap = (
+            (ways < 0) & (ways**2 + below > 0) & (most < self.strength) & (back - ways > AXIAL[-1])
+        )
+        reach = np.where(gap, -ways - back, np.sqrt(ways**2 + above) - ways)
+        return np.asarray(np.fmin(reach.max(-1), AXIAL[-1]))
 
 
 def _of(tests: AcceptanceTests, g: Array, b: Array) -> tuple[Array, Array]:
-    """Sizes and turns (m, 2) of some surveys.
+    """Sizes and turns (m, 2) of some surveys."""
+    down = g / length(g)[:, None]
+    normal = np.cross(down, b)
+    side = np.where(is_vertical(g)[:, None], np.nan, normal)
+    strength, across = length(b)[:, None], dot(side, side)[:, None]
+    below = dot(down, b)[:, None]
+    dip = np.arctan2(below, length(normal)[:, None])
+    tried = _Tried(tests, down, b, side, across, strength, below, dip)
+    pairs = zip(_most_along(tried), _most_across(tried), strict=True)
+    size, turn = (np.stack(pair, -1) for pair in pairs)
+    return size, turn
 
-    Interference f makes the horizontal field h to h + f - (f·d) d, d down: the azimuth turns by the angle between them.
+
+def _most_along(tried: _Tried) -> tuple[Array, Array]:
+    """Size and turn (m,) of what turns the azimuth most along the tool: either way the largest that passes.
+
+    Sizes that |b| refuses are not tried.
     """
-    down = g / np.linalg.norm(g, axis=-1, keepdims=True)
-    side = np.where(is_vertical(g)[:, None], np.nan, np.cross(down, b))
-    strength, across = np.linalg.norm(b, axis=-1, keepdims=True), np.sum(side**2, -1, keepdims=True)
-    below = np.sum(down * b, -1, keepdims=True)
-    before = np.arctan2(below, np.linalg.norm(np.cross(down, b), axis=-1, keepdims=True))
-    sizes, turns = [], []
-    for fields in _candidates():
-        size, along, fall = np.linalg.norm(fields, axis=-1), b @ fields.mT, down @ fields.mT
-        total = np.sqrt(strength**2 + 2 * along + size**2)
-        dip = np.arcsin(np.clip((below + fall) / total, -1.0, 1.0))
-        passing = tests.accept({"field": total - strength, "dip": dip - before})
-        turn = np.abs(np.arctan2(side @ fields.mT, across + along - below * fall))
-        turn = np.where(passing & (turn > 0), turn, 0.0)
-        best = np.argmax(turn, -1)[:, None]
-        turns.append(np.take_along_axis(turn, best, -1)[:, 0])
-        sizes.append(size[best[:, 0]])
-    return np.stack(sizes, -1), np.stack(turns, -1)
+    reach = tried.reach()
+    size, turn = np.full(reach.shape, AXIAL[0]), np.zeros(reach.shape)
+    steps = np.searchsorted(LADDER, reach)
+    for step, last in enumerate(LADDER):
+        rows = np.flatnonzero(steps == step)
+        if not rows.size:
+            continue
+        fields, some = _along_tool(last), tried.part(rows)
+        passing = some.passing(fields).reshape(len(rows), 2, -1)
+        largest = passing.shape[-1] - 1 - np.argmax(passing[..., ::-1], -1)
+        turns = some.turns(fields, np.add(largest, [0, passing.shape[-1]]))
+        turns = np.where(passing.any(-1) & (turns > 0), turns, 0.0)
+        turn[rows], way = turns.max(-1), turns.argmax(-1)
+        sizes = AXIAL[np.take_along_axis(largest, way[:, None], -1)[:, 0]]
+        size[rows] = np.where(turn[rows] > 0, sizes, AXIAL[0])
+    return size, turn
+
+
+def _most_across(tried: _Tried) -> tuple[Array, Array]:
+    """The same across the tool: the largest size first, as a smaller one turns the azimuth less in every direction."""
+    rows = np.arange(len(tried.b))
+    size, turn = np.full(rows.shape, CROSS_AXIAL[0]), np.zeros(rows.shape)
+    for each in CROSS_AXIAL[::-1].tolist():
+        fields = _across_tool(each)
+        turns = tried.turns(fields)
+        most = np.where(tried.passing(fields) & (turns > 0), turns, 0.0).max(-1)
+        better = most > turn[rows]
+        size[rows[better]], turn[rows[better]] = each, most[better]
+        left = ~(turn[rows] >= turns.max(-1))
+        if not left.any():
+            break
+        rows, tried = rows[left], tried.part(np.flatnonzero(left))
+    return size, turn

@@ -7,9 +7,10 @@ Grid north of a map projection: its convergence at a place, from points that PRO
 
 from __future__ import annotations
 
+import math
 import re
 from calendar import isleap
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from datetime import date
 from functools import cache
@@ -39,8 +40,8 @@ EPOCH_YEARS = 5.0
 """Years between the epochs of a model, over which its coefficients change evenly."""
 _WMM_FILE = "wmm/WMM_2025.COF"
 _IGRF_FILE = "IGRF14.shc"
-_HIGHEST_DEGREE = 133
-"""Of pygeomag's high resolution. IGRF needs 13, one more than its usual one."""
+_MODEL_RADIUS = 6_371_200.0
+"""Radius of the sphere that coefficients refer to, m."""
 
 
 class MainField(NamedTuple):
@@ -54,15 +55,18 @@ class MainField(NamedTuple):
 class FieldModel(NamedTuple):
     """Coefficients of the main field from an epoch on.
 
-    `coefficients` names their file and its version; `evaluate` takes latitude and longitude in degrees,
-    kilometres above the ellipsoid, and the decimal year.
+    `coefficients` names their file and its version. `cosines` and `sines` (N + 1, N + 1) by degree and order, nT, at
+    the epoch, and what they change by in a year.
     """
 
     epoch: float
     valid_to: float
     coefficients: str
     sha256: str
-    evaluate: Any
+    cosines: Array
+    sines: Array
+    cosine_rates: Array
+    sine_rates: Array
 
 
 def normal_gravity(latitude_deg: ArrayLike, altitude_m: ArrayLike) -> Array:
@@ -120,8 +124,78 @@ def main_field(
     model: FieldModel, latitude_deg: float, longitude_deg: float, altitude_m: float, year: float
 ) -> MainField:
     """The main field that a model gives at a place, metres above the ellipsoid, and decimal year."""
-    result = model.evaluate(latitude_deg, longitude_deg, altitude_m / 1000.0, year)
-    return MainField(float(result.f), float(result.i), float(result.d))
+    north, east, down = main_fields(model, latitude_deg, longitude_deg, altitude_m, year).tolist()
+    level = math.hypot(north, east)
+    dip, declination = math.atan2(down, level), math.atan2(east, north)
+    return MainField(math.hypot(level, down), math.degrees(dip), math.degrees(declination))
+
+
+def main_fields(
+    model: FieldModel,
+    latitude_deg: ArrayLike,
+    longitude_deg: ArrayLike,
+    altitude_m: ArrayLike,
+    year: ArrayLike,
+) -> Array:
+    """Main fields (…, 3) at places and decimal years: north, east and down of the ellipsoid, nT.
+
+    Definition: spherical harmonics with the functions of Legendre as Schmidt scales them, by their recurrences in the
+    degree; those of order 1 and more over the sine of the distance from the pole, so that the east stays finite there.
+    Units: geodetic latitude and longitude in degrees, metres above the ellipsoid.
+    Reference: Langel, in Jacobs (ed.), Geomagnetism, vol. 1 (1987), chapter 4.
+    """
+    lat, lon, h, time = np.broadcast_arrays(latitude_deg, longitude_deg, altitude_m, year)
+    lat, lon, minor = np.radians(lat), np.radians(lon), (1 - FLATTENING) ** 2
+    vertical = SEMI_MAJOR_AXIS / np.sqrt(np.cos(lat) ** 2 + minor * np.sin(lat) ** 2)
+    across, axial = (vertical + h) * np.cos(lat), (minor * vertical + h) * np.sin(lat)
+    radius = np.hypot(across, axial)
+    sine, cosine = (np.abs(across) / radius)[..., None], (axial / radius)[..., None]
+    order = np.arange(len(model.cosines))
+    waves = np.cos(lon[..., None] * order), np.sin(lon[..., None] * order)
+    years = time[..., None, None] - model.epoch
+    g, h_ = model.cosines + years * model.cosine_rates, model.sines + years * model.sine_rates
+    inward, south, east = (np.zeros(lat.shape) for _ in range(3))
+    share = (_MODEL_RADIUS / radius)[..., None]
+    for n, (value, over, slope) in enumerate(_legendre(len(order) - 1, sine, cosine), 1):
+        size = share ** (n + 2)
+        along = size * (g[..., n, :] * waves[0] + h_[..., n, :] * waves[1])
+        turned = size * (g[..., n, :] * waves[1] - h_[..., n, :] * waves[0])
+        inward -= (n + 1) * (along * value).sum(-1)
+        south -= (along * slope).sum(-1)
+        east += (turned * order * over).sum(-1)
+    tilt_sine = cosine[..., 0] * np.cos(lat) - sine[..., 0] * np.sin(lat)
+    tilt_cosine = sine[..., 0] * np.cos(lat) + cosine[..., 0] * np.sin(lat)
+    north = -south * tilt_cosine - inward * tilt_sine
+    return np.stack([north, east, inward * tilt_cosine - south * tilt_sine], -1)
+
+
+def _legendre(last: int, sine: Array, cosine: Array) -> Iterator[tuple[Array, Array, Array]]:
+    """Functions of degree 1 to `last` by order (…, last + 1), the same over the sine, and their derivatives.
+
+    Of the sine and cosine (…, 1) of the distance from the pole. Over the sine those of order 0, which would not be
+    finite, are zero.
+    """
+    order = np.arange(last + 1)
+    value, over, slope = (np.zeros((*sine.shape[:-1], last + 1)) for _ in range(3))
+    value[..., 0] = 1.0
+    before = value * 0.0, over, slope
+    for n in range(1, last + 1):
+        lower = order < n
+        root = np.sqrt(np.where(lower, n**2 - order**2, 1.0))
+        first = np.where(lower, (2 * n - 1) / root, 0.0)
+        second = np.where(lower, np.sqrt(np.maximum((n - 1.0) ** 2 - order**2, 0.0)) / root, 0.0)
+        scale = np.sqrt((2 * n - 1) / (2 * n)) if n > 1 else 1.0
+        diagonal = value[..., n - 1 : n], over[..., n - 1 : n], slope[..., n - 1 : n]
+        after = (
+            first * cosine * value - second * before[0],
+            first * cosine * over - second * before[1],
+            first * (cosine * slope - sine * value) - second * before[2],
+        )
+        after[0][..., n : n + 1] = scale * sine * diagonal[0]
+        after[1][..., n : n + 1] = scale * diagonal[0]
+        after[2][..., n : n + 1] = scale * (sine * diagonal[2] + cosine * diagonal[0])
+        before, (value, over, slope) = (value, over, slope), after
+        yield after
 
 
 def field_model(name: str, year: float) -> FieldModel:
@@ -150,42 +224,43 @@ def _epoch(year: float) -> float:
 
 @cache
 def _wmm() -> FieldModel:
-    """WMM2025 of pygeomag."""
-    library = optional_library("pygeomag", "The World Magnetic Model")
-    model = library.GeoMag(coefficients_file=_WMM_FILE)
-    _, sha256 = _coefficients("pygeomag", _WMM_FILE)
+    """WMM2025 of pygeomag, which is not imported."""
+    text, sha256 = _coefficients("pygeomag", _WMM_FILE, "The World Magnetic Model")
+    (_, name, released), *rows = [line.split() for line in text.splitlines()]
+    whole = [row for row in rows if len(row) == 6]  # not those of nines at the end
     first, last = FIELD_MODELS["wmm2025"]
-    release = f", released {model.release_date}"
-    return FieldModel(
-        first, last, _named(model.model, _WMM_FILE, "pygeomag") + release, sha256, model.calculate
-    )
+    named = f"{_named(name, _WMM_FILE, 'pygeomag')}, released {released}"
+    columns = (_square([(int(n), int(m), float(row[k])) for n, m, *row in whole]) for k in range(4))
+    return FieldModel(first, last, named, sha256, *columns)
 
 
 @cache
 def _igrf(epoch: float) -> FieldModel:
     """IGRF-14 from an epoch to the next: coefficients of ppigrf, which is not imported (it needs pandas)."""
-    library = optional_library("pygeomag", "The geomagnetic reference field")
-    text, sha256 = _coefficients("ppigrf", _IGRF_FILE)
+    text, sha256 = _coefficients("ppigrf", _IGRF_FILE, "The geomagnetic reference field")
     header, *rows = [line.split() for line in text.splitlines() if line and line[0] != "#"][1:]
     now = [float(year) for year in header].index(epoch)
-    # By degree and order, negative for sines: at this epoch and the next.
-    values = {(int(n), int(m)): (float(row[now]), float(row[now + 1])) for n, m, *row in rows}
-    none = (0.0, 0.0)
-    data = [
-        (n, m, *_with_rates(values.get((n, m), none), values.get((n, -m), none) if m else none))
-        for n in range(1, _HIGHEST_DEGREE + 1)
-        for m in range(n + 1)
+    each = [(int(n), int(m), float(row[now]), float(row[now + 1])) for n, m, *row in rows]
+    cosines, sines = (
+        [row for row in each if (row[1] < 0) == negative] for negative in (False, True)
+    )
+    parts = [
+        _square([(n, abs(m), value) for n, m, value, _ in part]) for part in (cosines, sines)
+    ] + [
+        _square([(n, abs(m), (later - value) / EPOCH_YEARS) for n, m, value, later in part])
+        for part in (cosines, sines)
     ]
-    model = library.GeoMag(coefficients_data=((epoch, "IGRF-14", ""), data), high_resolution=True)
     last = FIELD_MODELS["igrf14"][1]
-    named = _named("IGRF-14", _IGRF_FILE, "ppigrf")
-    return FieldModel(epoch, last, named, sha256, model.calculate)
+    return FieldModel(epoch, last, _named("IGRF-14", _IGRF_FILE, "ppigrf"), sha256, *parts)
 
 
-def _with_rates(cosine: Sequence[float], sine: Sequence[float]) -> tuple[float, ...]:
-    """Both coefficients at an epoch, and their changes in a year, from those at two epochs."""
-    rates = ((pair[1] - pair[0]) / EPOCH_YEARS for pair in (cosine, sine))
-    return cosine[0], sine[0], *rates
+def _square(entries: Sequence[tuple[int, int, float]]) -> Array:
+    """Coefficients by degree and order, as a matrix."""
+    size = max(n for n, _, _ in entries) + 1
+    matrix = np.zeros((size, size))
+    for n, m, value in entries:
+        matrix[n, m] = value
+    return matrix
 
 
 def optional_library(name: str, what: str) -> Any:
@@ -196,11 +271,11 @@ def optional_library(name: str, what: str) -> Any:
         raise _missing(name, what) from None
 
 
-def _coefficients(library: str, file: str) -> tuple[str, str]:
+def _coefficients(library: str, file: str, what: str) -> tuple[str, str]:
     """The text of a file of coefficients in a library that need not be imported, and its SHA-256."""
     spec = find_spec(library)
     if spec is None or spec.origin is None:
-        raise _missing(library, "The geomagnetic reference field")
+        raise _missing(library, what)
     try:
         data = (Path(spec.origin).parent / file).read_bytes()
     except OSError:

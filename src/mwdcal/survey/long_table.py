@@ -6,7 +6,7 @@ the first part is named.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial, reduce
@@ -15,24 +15,26 @@ from typing import IO, Any, NamedTuple
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace as replace_struct
 
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.digests import sha256_of
+from mwdcal.errors import InputError
 from mwdcal.files import streams, synonyms
-from mwdcal.files.contract import COLUMNS, check_columns
+from mwdcal.files.contract import COLUMNS, REFERENCES, check_columns
 from mwdcal.files.faults import OPTIONAL, blank_cell, is_blank, wholly_blank
 from mwdcal.files.formats import atomic, parquet
 from mwdcal.files.formats.columns import LABELS, Column, check_names, no_stations
 from mwdcal.files.formats.sinks import ParquetSink, SpooledSink
 from mwdcal.files.formats.table import Table, labels
-from mwdcal.files.runs import identified
+from mwdcal.files.runs import check_references, identified, numbered_labels
 from mwdcal.files.streams import Part, StreamedTable
 from mwdcal.geometry.vectors import Array, ArrayLike
-from mwdcal.sensor.profile import Profile
+from mwdcal.sensor.profile import Profile, StandProfile
 from mwdcal.survey.acceptance import SurveyLimits
 from mwdcal.survey.error_model import BUILT_IN, ErrorModel
-from mwdcal.survey.norths import norths_of
+from mwdcal.survey.norths import horizontal_field, norths_of
 from mwdcal.survey.path import TieIn
 from mwdcal.survey.references import Claim, EarthReference
 from mwdcal.survey.surveying import (
@@ -174,11 +176,8 @@ class _LongTable:
     def __init__(self, settings: _Settings, readings: Path, output: Path, decimal: str) -> None:
         self.settings, self.path = settings, readings
         self.delimiter = _DELIMITERS.get(output.suffix.lower(), "")
-        if readings.suffix.lower() == ".parquet":
-            rows = _TEXT_ROWS if self.delimiter else 0
-            self.source = streams.open_parquet(readings, rows, decimal, _ALSO)
-        else:
-            self.source = streams.open_text(readings, decimal=decimal, also=_ALSO)
+        self.decimal = decimal
+        self.source = self._opened()
         self.head = self._head(self.source)
         first = next((table for table in self._tables() if table.count), None)
         if first is None:
@@ -190,8 +189,36 @@ class _LongTable:
         )
         self.north = norths_of(
             self.source.metadata, self.source.name, self._all_readings, settings.calibration,
-            settings.reference,
+            settings.reference, self._horizontal_fields,
         )  # fmt: skip
+
+    def _opened(self, only: Collection[str] = ()) -> StreamedTable:
+        """The table in parts, or some of its columns."""
+        if self.path.suffix.lower() == ".parquet":
+            rows = _TEXT_ROWS if self.delimiter else 0
+            return streams.open_parquet(self.path, rows, self.decimal, _ALSO, only)
+        return streams.open_text(self.path, decimal=self.decimal, also=_ALSO, only=only)
+
+    def _horizontal_fields(self) -> list[Array]:
+        """Horizontal fields by references, nT; all columns are read where one is refused, for the first fault."""
+        only = {REFERENCES[name].column for name in ("field", "dip")}.intersection(
+            self.source.names
+        )
+        if not only:
+            return [np.full(1, np.nan)]
+        source, profile = self._opened(only), self.settings.calibration.profile
+        read = partial(
+            check_references, profile=replace_struct(profile, stand=StandProfile()), kinds=[]
+        )
+        try:
+            return [
+                source.exactly_if_refused(
+                    lambda part: horizontal_field(read(part.table), part.table.count), piece
+                )
+                for piece in source.pieces()
+            ]
+        except InputError:
+            return [horizontal_field(each.known, each.count) for each in self._all_readings()]
 
     def _head(self, source: StreamedTable) -> Table:
         """The table without rows; refuses names of columns that surveys cannot have."""
@@ -250,9 +277,8 @@ class _LongTable:
             if md[there[0]] < seen.depth:
                 raise not_deeper(table, int(there[0]), md[there[0]])
         seen.serials.update(dict.fromkeys(labels(table, "serial")))
-        given = labels(table, "station") or [""] * table.count
-        numbered = enumerate(given, sum(seen.rows) + 1)
-        readings = replace(readings, station=tuple(label or str(i) for i, label in numbered))
+        station = numbered_labels(labels(table, "station"), table.count, sum(seen.rows) + 1)
+        readings = replace(readings, station=station)
         return _Stations(readings, md, self._carried(part))
 
     def _carried(self, part: Part) -> dict[str, Column | Any]:

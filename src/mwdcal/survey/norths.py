@@ -71,9 +71,11 @@ def norths_of(
     readings: Callable[[], Iterable[Readings]],
     calibration: Calibration,
     reference: EarthReference | None,
+    horizontal: Callable[[], Iterable[Array]] | None = None,
 ) -> North:
     """The statements of a table and a reference about declination and convergence; `readings` of the table in parts.
 
+    `horizontal`: horizontal fields by its references, where these can be read by themselves.
     A declination whose table states no uncertainty has that of the reference, else that of a global field model.
 
     Raises:
@@ -95,7 +97,7 @@ def norths_of(
         convergence = _radians(both.get("convergence_deg"))
         return North(convergence=convergence, findings=tuple(findings), sources=sources)
     if given or reference is None:
-        shared, alone = declination_sd(_horizontal(readings, calibration))
+        shared, alone = declination_sd(_horizontal(readings, calibration, horizontal))
     else:
         shared, alone = reference.declination_spread_deg
     sources["sd_declination"] = (
@@ -124,18 +126,25 @@ def _radians(angle: float | None) -> float | None:
     return None if angle is None else radians(angle)
 
 
-def _horizontal(parts: Callable[[], Iterable[Readings]], calibration: Calibration) -> float:
+def _horizontal(
+    parts: Callable[[], Iterable[Readings]],
+    calibration: Calibration,
+    by_references: Callable[[], Iterable[Array]] | None,
+) -> float:
     """The horizontal field by the references of the readings, else by the readings themselves, nT."""
-    known = np.concatenate([_referenced_field(readings) for readings in parts()])
+    if by_references is None:
+        known = np.concatenate([horizontal_field(each.known, each.count) for each in parts()])
+    else:
+        known = np.concatenate([*by_references()])
     if np.isnan(known).all():
         known = np.concatenate([_measured_field(readings, calibration) for readings in parts()])
     return USUAL_HORIZONTAL if np.isnan(known).all() else float(np.nanmedian(known))
 
 
-def _referenced_field(readings: Readings) -> Array:
-    """Horizontal fields (n,) by references."""
-    field = readings.reference("field") * np.cos(readings.reference("dip"))
-    return np.broadcast_to(field, readings.count)
+def horizontal_field(known: Mapping[str, Array], count: int) -> Array:
+    """Horizontal fields (n,) by references, nT; NaN where one lacks."""
+    field, dip = (np.broadcast_to(known.get(name, np.nan), count) for name in ("field", "dip"))
+    return np.asarray(field * np.cos(dip))
 
 
 def _measured_field(readings: Readings, calibration: Calibration) -> Array:

@@ -30,7 +30,7 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import FREE_SHARE, Calibration
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import VERTICAL, is_vertical
-from mwdcal.geometry.vectors import Array, ArrayLike, outer, square_root, wrap
+from mwdcal.geometry.vectors import Array, ArrayLike, dot, length, outer, square_root, wrap
 from mwdcal.survey.stations import STATIONS_AT_ONCE
 from mwdcal.use.uncertainty import rows_of
 
@@ -69,8 +69,8 @@ class Arcs:
 
     def _half(self) -> tuple[Array, Array]:
         """Sine and cosine of half the dogleg."""
-        sine = np.linalg.norm(self.lower - self.upper, axis=-1) / 2
-        return sine, np.linalg.norm(self.lower + self.upper, axis=-1) / 2
+        sine = length(self.lower - self.upper) / 2
+        return sine, length(self.lower + self.upper) / 2
 
     def _share(self) -> Array:
         """The share s = tan(β/2) / β of the sum of both directions."""
@@ -251,21 +251,21 @@ def direction_gradient(g: Array, b: Array) -> tuple[Array, Array]:
     Units: rad per unit of g and of b. Singular: finite at vertical, where h is taken as at toolface zero and the
     azimuth is the magnetic toolface; NaN where g and b are parallel.
     """
-    strength, vertical = np.linalg.norm(g, axis=-1, keepdims=True), is_vertical(g)[..., None]
+    strength, vertical = length(g)[..., None], is_vertical(g)[..., None]
     d = g / strength
     normal = np.cross(d, b)
-    horizontal = np.linalg.norm(normal, axis=-1, keepdims=True)
+    horizontal = length(normal)[..., None]
     e = normal / np.where(horizontal > 0, horizontal, np.nan)
     cosine = d[..., 2:]
     sine = np.where(vertical, 0.0, np.hypot(d[..., :1], d[..., 1:2]))
     heading = np.where(vertical, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]) - cosine * d)
-    h = heading / np.linalg.norm(heading, axis=-1, keepdims=True)
-    along = np.sum(d * b, -1, keepdims=True) / horizontal
+    h = heading / length(heading)[..., None]
+    along = dot(d, b)[..., None] / horizontal
     sideways = (along * sine * e - cosine * np.cross(d, h)) / strength
     rows = [np.concatenate([-h / strength, np.zeros_like(b)], -1)]
     rows.append(np.concatenate([sideways, -sine * e / horizontal], -1))
     north = np.cross(e, d)
-    azimuth = np.arctan2(np.sum(h * e, -1), np.sum(h * north, -1))
+    azimuth = np.arctan2(dot(h, e), dot(h, north))
     return wrap(azimuth), np.stack(rows, -2)
 
 
@@ -288,7 +288,9 @@ def direction_errors(
     azimuth, gradient = direction_gradient(g, b)
     change = gradient @ calibration.jacobian(readings)
     free = np.abs(change @ calibration.free_directions.transpose()) > FREE_SHARE
-    shifts = change @ square_root(calibration.parameter_covariance)
+    flat = change.reshape(-1, change.shape[-1])  # one product is faster than one for each reading
+    shifts = flat @ square_root(calibration.parameter_covariance)
+    shifts = shifts.reshape(*change.shape[:-1], shifts.shape[-1])
     shifts = np.where(np.any(free, (-1, -2), keepdims=True), np.nan, shifts.swapaxes(-1, -2))
     inclination = np.arctan2(np.hypot(g[..., 0], g[..., 1]), g[..., 2])
     turn = np.stack([np.zeros_like(inclination), np.sin(inclination)], -1)

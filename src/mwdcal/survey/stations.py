@@ -72,7 +72,7 @@ def survey_angles(
     readings: Readings,
     switch: tuple[float, float] = TOOLFACE_SWITCH,
     advance: Callable[[int, int], None] = lambda done, total: None,
-    added: Callable[[Array, Array, slice], Array] | None = None,
+    added: Callable[[Array, Array, Array, slice], Array] | None = None,
     starts_magnetic: bool = False,
 ) -> Surveys:
     """Surveys from readings, in the order in which they were taken.
@@ -80,7 +80,8 @@ def survey_angles(
     `starts_magnetic`: the toolface counted from magnetic north at the station before.
 
     Shapes: `readings` of n stations without leading axes. Units: `switch` in radians. `advance` gets how many are
-    done, and of how many. `added` gives the variance (m, 7) that the vectors (m, 3) of some rows have besides.
+    done, and of how many. `added` gives the variance (m, 7) that some rows have besides, by their gradients
+    (m, 7, 6) and both vectors (m, 3).
     Singular: at vertical azimuth and toolface are NaN, the toolface from magnetic north is not.
 
     Raises:
@@ -99,13 +100,14 @@ def survey_angles(
         rows = slice(done, done + part.count)
         g, b = calibration.fields(part)
         value[rows] = np.stack([OBSERVABLES[name].value(g, b) for name in SURVEY_OBSERVABLES], -1)
-        covariance = calibration.covariance(SURVEY_OBSERVABLES, part, noise=True)
+        slopes = calibration.gradients(SURVEY_OBSERVABLES, part)
+        covariance = calibration.covariance(SURVEY_OBSERVABLES, part, True, slopes)
         sd[rows] = np.sqrt(np.maximum(diagonal(covariance), 0.0))
         lost = without_value(calibration, part, SURVEY_OBSERVABLES, value[rows], sd[rows])
         value[rows] = np.where(lost, np.nan, value[rows])
         sd[rows] = np.where(lost, np.nan, sd[rows])
         if added is not None:
-            whole = np.sqrt(sd[rows] ** 2 + added(g, b, rows))
+            whole = np.sqrt(sd[rows] ** 2 + added(slopes, g, b, rows))
             sd[rows] = np.where(TURNS & (whole > LARGEST_ANGLE_SD), np.nan, whole)
         strengths[rows] = covariance[:, STRENGTHS, STRENGTHS]
         done = rows.stop

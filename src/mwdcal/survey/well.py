@@ -27,7 +27,7 @@ from mwdcal.survey.error_model import ErrorModel
 from mwdcal.survey.norths import North
 from mwdcal.survey.path import PathEnd, TieIn, continued_path
 from mwdcal.survey.stations import TOOLFACE_SWITCH, Surveys, survey_angles
-from mwdcal.survey.well_errors import WellErrors, hole_of, well_errors
+from mwdcal.survey.well_errors import SeenHole, WellErrors, hole_of, well_errors
 from mwdcal.use.correction import RowCounts, tallied
 from mwdcal.use.correction import findings as about_rows
 from mwdcal.use.strengths import check as check_strengths
@@ -395,16 +395,12 @@ def part_of_well(
     """
     columns, tally = tallied(calibration, readings, outside, whole=whole)
     beyond, blank = calibration.outside(readings), np.isnan(columns[RESULTS[0]])
-    errors = None
+    errors, added = None, None
+    seen = SeenHole.at(calibration, readings)
     if model is not None and calibration.has_field:
         errors = well_errors(model, calibration, readings)
-    added = (
-        None
-        if errors is None
-        else errors.of_surveys(
-            calibration, readings, None if md is None else np.where(blank, np.nan, md), before.path
-        )
-    )
+        depth = None if md is None else np.where(blank, np.nan, md)
+        added = errors.of_surveys(calibration, readings, depth, before.path, seen)
     angles = survey_angles(calibration, readings, switch, advance, added, before.magnetic)
     surveys = _without(angles, blank, beyond)
     g, b = (np.stack([columns[name] for name in VECTORS[i : i + 3]], -1) for i in (0, 3))
@@ -412,7 +408,9 @@ def part_of_well(
     after = replace(before, magnetic=angles.ends_magnetic)
     position = None
     if md is not None:
-        position, end = _positions(calibration, readings, md, north, blank, before.path, errors)
+        position, end = _positions(
+            calibration, readings, seen, md, north, blank, before.path, errors
+        )
         lost = np.logical_or.accumulate(beyond & position.on_path) | before.inaccurate
         position = position.without_accuracy(lost)
         after = replace(after, path=end, inaccurate=bool(lost[-1]))
@@ -480,7 +478,7 @@ def _to_judge(
 
 
 def _positions(
-    calibration: Calibration, readings: Readings, md: Array, north: North, blank: Bools,
+    calibration: Calibration, readings: Readings, seen: SeenHole, md: Array, north: North, blank: Bools,
     before: Start, errors: WellErrors | None,
 ) -> tuple[Position, Start]:  # fmt: skip
     """Positions of the stations with results, and where the path has come to."""
@@ -492,7 +490,7 @@ def _positions(
     if whole.any():
         some = readings if whole.all() else readings.select(whole)
         norths, at = (north.offset, north.declination_sd, north.declination_noise), md[whole]
-        hole = hole_of(calibration, some, at, north.offset, before)
+        hole = hole_of(calibration, some, seen.part(whole), at, north.offset, before)
         more = None if errors is None else errors.of_path(calibration, hole)
         dogleg[whole] = hole.dogleg
         if not isinstance(before, TieIn | PathEnd):  # no course leads to the first station

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import date
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from mwdcal.calibration.readings import Readings, stated_day
 from mwdcal.calibration.record import Calibration
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.units import STANDARD_GRAVITY
-from mwdcal.geometry.vectors import Array, ArrayLike
+from mwdcal.geometry.vectors import Array, ArrayLike, Bools
 from mwdcal.survey.acceptance import SensorTerms
 from mwdcal.survey.error_model import ErrorModel, Hole
 from mwdcal.survey.path import DirectionErrors, PathEnd, TieIn, direction_gradient, well_path
@@ -70,12 +71,12 @@ class WellErrors:
         axial = (sensors.axial_interference_nt * size)[..., None] * np.eye(6)[5:]
         return np.asarray(np.nan_to_num(np.concatenate([each, axial], 1)))
 
-    def variances(self, g: Array, b: Array, hole: Hole) -> Array:
+    def variances(self, gradient: Array, g: Array, b: Array, hole: Hole) -> Array:
         """Variance (n, 7) that all terms add to the observables of a survey, in the order of `SURVEY_OBSERVABLES`.
 
+        `gradient` (n, 7, 6) of these by both vectors.
         Errors of the hole's direction against the tool, such as sag, leave the toolface as it is.
         """
-        gradient = np.stack([OBSERVABLES[name].gradient(g, b) for name in SURVEY_OBSERVABLES], -2)
         result = ((gradient @ self.columns(g, b, self._unit(hole)).mT) ** 2).sum(-1)
         systematic, random, _ = self.model.errors(hole)
         upward, sideways = ((systematic[..., i] ** 2).sum(-1) + random[..., i, i] for i in range(2))
@@ -104,11 +105,12 @@ class WellErrors:
         readings: Readings,
         md: Array | None,
         before: Sequence[float] | TieIn | PathEnd,
-    ) -> Callable[[Array, Array, slice], Array]:
-        """The variance of observables at some rows, by both vectors."""
+        seen: SeenHole,
+    ) -> Callable[[Array, Array, Array, slice], Array]:
+        """The variance of observables at some rows, by their gradients and both vectors."""
         depth = np.full(readings.count, np.nan) if md is None else md
-        hole = hole_of(calibration, readings, depth, 0.0, before)
-        return lambda g, b, rows: self.variances(g, b, hole.part(rows))
+        hole = hole_of(calibration, readings, seen, depth, 0.0, before)
+        return lambda gradient, g, b, rows: self.variances(gradient, g, b, hole.part(rows))
 
     def of_path(
         self, calibration: Calibration, hole: Hole
@@ -168,9 +170,35 @@ def _years(calibrated: date | None, surveyed: date | None) -> float | None:
     return (surveyed - calibrated).days / JULIAN_YEAR
 
 
+class SeenHole(NamedTuple):
+    """Inclination, azimuth from magnetic north, field and dip (n,) at readings."""
+
+    inclination: Array
+    magnetic: Array
+    field: Array
+    dip: Array
+
+    @classmethod
+    def at(cls, calibration: Calibration, readings: Readings) -> SeenHole:
+        """Those that a calibrated tool sees."""
+        value, parts = {name: OBSERVABLES[name].value for name in OBSERVABLES}, []
+        for some in blocks(readings):
+            g, b = calibration.fields(some)
+            azimuth, _ = direction_gradient(g, b)
+            parts.append(
+                (value["inclination"](g, b), azimuth, value["field"](g, b), value["dip"](g, b))
+            )
+        return cls(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+
+    def part(self, rows: Bools) -> SeenHole:
+        """Those of some readings."""
+        return SeenHole(*(each[rows] for each in self))
+
+
 def hole_of(
     calibration: Calibration,
     readings: Readings,
+    seen: SeenHole,
     md: Array,
     north: float = 0.0,
     before: Sequence[float] | TieIn | PathEnd = (),
@@ -180,8 +208,7 @@ def hole_of(
     `before`: where its path has come to, or the position of the first station.
     Singular: at vertical the azimuth is the magnetic toolface, as of `path.direction_gradient`.
     """
-    parts = [_seen(calibration, part) for part in blocks(readings)]
-    inclination, magnetic, field, dip = (np.concatenate(each) for each in zip(*parts, strict=True))
+    inclination, magnetic, field, dip = seen
     angles = inclination, magnetic + north
     last: tuple[float, float, float] | None = None
     if isinstance(before, PathEnd):
@@ -198,13 +225,3 @@ def hole_of(
     if calibration.relative:
         field = np.broadcast_to(readings.reference("field"), md.shape)
     return Hole.along(md, tvd, *angles, magnetic, field, dip, last=last)
-
-
-def _seen(calibration: Calibration, readings: Readings) -> tuple[Array, Array, Array, Array]:
-    """Inclination, azimuth from magnetic north, field and dip (n,) at readings."""
-    g, b = calibration.fields(readings)
-    azimuth, _ = direction_gradient(g, b)
-    return (
-        OBSERVABLES["inclination"].value(g, b), azimuth,
-        OBSERVABLES["field"].value(g, b), OBSERVABLES["dip"].value(g, b),
-    )  # fmt: skip

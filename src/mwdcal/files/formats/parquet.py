@@ -221,6 +221,8 @@ def _is_code(cells: Any) -> bool:
 
 def texts(cells: Any, arrow: Any) -> list[str]:
     """Cells of any type as text tables have them."""
+    if arrow.types.is_string(cells.type) or arrow.types.is_large_string(cells.type):
+        return list(cells.fill_null("").to_pylist())
     try:
         values = _in_microseconds(cells, arrow).to_pylist()
     except (ValueError, OverflowError, KeyError):  # nanoseconds, years or time zones Python lacks

@@ -29,7 +29,7 @@ FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """What a cell begins with that spreadsheet programs run as a formula, unless it is a number."""
 _BREAKS = "\n\r\0"
 _SMALLEST_ALIKE, _LARGEST_ALIKE = 1e-4, 1e10
-"""Between these Arrow spells numbers that are not whole as `repr` does."""
+"""Between these Arrow spells numbers as `repr` does, whole ones without their ".0"."""
 _LONGEST_LINE = 100_000
 _ROWS_AT_ONCE = 1 << 12
 _MAX_LINES = 1_000_000
@@ -167,10 +167,12 @@ def spelt(values: Array, arrow: Any) -> Any:
     values = np.asarray(values, float)
     words = arrow.array(values).cast(arrow.string())
     size = np.abs(values)
-    with np.errstate(
-        invalid="ignore"
-    ):  # Arrow spells whole, small and large numbers in another way
-        odd = ~((size >= _SMALLEST_ALIKE) & (size < _LARGEST_ALIKE) & (values != np.trunc(values)))
+    with np.errstate(invalid="ignore"):
+        whole = (size < _LARGEST_ALIKE) & (values == np.trunc(values))
+        odd = ~(whole | ((size >= _SMALLEST_ALIKE) & (size < _LARGEST_ALIKE)))
+    if whole.any():
+        pointed = compute.binary_join_element_wise(words, ".0", "")
+        words = pointed if whole.all() else compute.if_else(whole, pointed, words)
     if odd.any():
         others = ["" if value != value else repr(value) for value in values[odd].tolist()]
         words = compute.replace_with_mask(words, odd, arrow.array(others, arrow.string()))
@@ -182,11 +184,21 @@ def quoted(cells: Any, delimiter: str) -> Any:
     import pyarrow.compute as compute
 
     cells = compute.fill_null(cells, "")
-    odd = compute.match_substring_regex(cells, f'["\r\n{delimiter}]')
-    if not compute.any(odd).as_py():
+    if not _holds(cells, ('"', "\r", "\n", delimiter)):
         return cells
+    odd = compute.match_substring_regex(cells, f'["\r\n{delimiter}]')
     doubled = compute.replace_substring(cells, '"', '""')
     return compute.if_else(odd, compute.binary_join_element_wise('"', doubled, '"', ""), cells)
+
+
+def _holds(cells: Any, marks: Sequence[str]) -> bool:
+    """Whether a mark is in the memory of Arrow's texts, which may hold more than these: a look at all bytes at once."""
+    for chunk in getattr(cells, "chunks", [cells]):
+        data = chunk.buffers()[-1]
+        whole = b"" if data is None else data.to_pybytes()
+        if any(mark.encode() in whole for mark in marks):
+            return True
+    return False
 
 
 def joined(columns: Sequence[Any], delimiter: str, arrow: Any) -> memoryview:
