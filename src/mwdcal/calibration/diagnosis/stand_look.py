@@ -12,7 +12,12 @@ from dataclasses import replace
 import numpy as np
 
 from mwdcal.calibration.diagnosis.families import moves, side
-from mwdcal.calibration.diagnosis.first_look import common_effects, gain_of, least_gain
+from mwdcal.calibration.diagnosis.first_look import (
+    HYSTERESIS,
+    common_effects,
+    gain_of,
+    least_gain,
+)
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.results import variance_scales
@@ -77,21 +82,20 @@ def _exact(problem: Problem, state: State) -> Alike:
 def _columns(problem: Problem, result: Fit, design: Alike) -> Iterator[Array]:
     """Columns (6, k, B, n) of every effect in whitened readings."""
     response, include = responses(problem, result.state), problem.evidence.include
-    for name, columns in common_effects(design).columns.items():
-        triad, _, kind = name.partition("-")
-        if kind == "hysteresis":
-            index = TRIADS.index(triad)
-            one = problem.triads[index]
-            sides = side(moves(one.raw)) * include[..., None] / one.sd
-            every = np.zeros((6, 3, *include.shape))
-            for axis in range(3):
-                every[3 * index + axis, axis] = sides[..., axis]
-            yield every
-        elif columns:
-            count = next(iter(columns.values())).whole.shape[-1]
-            every = np.zeros((6, count, *include.shape))
-            for index, each in columns.items():
-                flat = each.whole.transpose(1, 2, 0).reshape(6, -1)
-                both = (response[index] @ flat).reshape(len(include), 3, count, -1)
-                every[TRIAD_ROWS[index]] = np.moveaxis(both, 0, 2)
-            yield every
+    effects = common_effects(design)
+    for columns in effects.columns.values():
+        count = next(iter(columns.values())).whole.shape[-1]
+        every = np.zeros((6, count, *include.shape))
+        for index, each in columns.items():
+            flat = each.whole.transpose(1, 2, 0).reshape(6, -1)
+            both = (response[index] @ flat).reshape(len(include), 3, count, -1)
+            every[TRIAD_ROWS[index]] = np.moveaxis(both, 0, 2)
+        yield every
+    for name in effects.sides:
+        index = TRIADS.index(name.removesuffix(HYSTERESIS))
+        one = problem.triads[index]
+        sides = side(moves(one.raw)) * include[..., None] / one.sd
+        every = np.zeros((6, 3, *include.shape))
+        for axis in range(3):
+            every[3 * index + axis, axis] = sides[..., axis]
+        yield every
