@@ -201,6 +201,17 @@ class WellSurvey(Result):
         """Measured depth, and north, east and TVD (n, 3) with covariance, m; None without measured depths."""
         return self.surveyed.well.position
 
+    @cached_property
+    def contributions(self) -> Mapping[str, AnyArray] | None:
+        """The causes of every 1σ: a row for each station and cause; None beyond 2000 surveys, and without azimuths."""
+        from mwdcal.presentation.contributions import contribution_columns
+
+        parts = self.surveyed.contributions
+        if parts is None:
+            return None
+        columns = contribution_columns(parts).items()
+        return {k: np.array(v, object) if isinstance(v, list) else v for k, v in columns}
+
     def to_pandas(self) -> Any:
         """The columns as a table of pandas, with what the command's table states of itself in `attrs`."""
         return frame(self.columns, self._whole_table.metadata)
@@ -218,8 +229,7 @@ class WellSurvey(Result):
     def _page(self) -> str:
         from mwdcal.presentation.survey_page import render
 
-        well = self.surveyed.well
-        return render(well, well.findings, self.surveyed.inputs.named, self.surveyed.analysis)
+        return render(self.surveyed, self.surveyed.well.findings)
 
     def msa_report(self, path: FilePath) -> None:
         """Write the page of the multi-station analysis.

@@ -6,15 +6,22 @@ The surveys of a well, on the screen and for machines.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from mwdcal.calibration.canonical import SignatureCheck
 from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import Finding, stated
+from mwdcal.presentation.contributions import (
+    ContributionSummary,
+    contribution_screen,
+    contribution_summary,
+)
 from mwdcal.presentation.envelope import json_document, with_signature
 from mwdcal.presentation.numbers import files_written, fixed, measured, number, signed
 from mwdcal.presentation.signature import signature_status
@@ -136,6 +143,7 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
     `error_terms` are in the standard uncertainties of surveys and path, `not_included` are not; `error_model` states
     those that are not of the calibration. Drift counts over `years_since_calibration`; null: not known, taken as one.
     `msa` is the multi-station analysis, if one was asked for; `interference` and `separable` are of it.
+    `contributions`: what makes the uncertainty of each survey; null beyond 2000 surveys.
     """
 
     rows: int
@@ -162,6 +170,7 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
     interference: InterferenceSize | None = None
     separable: bool | None = None
     msa: MultiStationAnalysis | None = None
+    contributions: ContributionSummary | None = None
 
 
 def refusal(inputs: WellInputs, msa: MultiStationAnalysis) -> SurveySummary:
@@ -195,7 +204,9 @@ def result_summary(result: SurveyedWell, output: str = "", html: str = "") -> Su
     """The result for machines; `output` and `html` are the files that were written, if any."""
     msa = result.analysis.summary if result.analysis else None
     unused = unused_columns(result.inputs.surveys.readings.unused)
-    return summary(result.well, result.counts, output, html, msa, unused)
+    facts = summary(result.well, result.counts, output, html, msa, unused)
+    budget = result.contributions and contribution_summary(result.contributions)
+    return replace(facts, contributions=budget)
 
 
 def document(inputs: WellInputs, facts: SurveySummary, signature: SignatureCheck) -> dict[str, Any]:
@@ -204,13 +215,24 @@ def document(inputs: WellInputs, facts: SurveySummary, signature: SignatureCheck
     return with_signature(whole, signature)
 
 
-def whole_screen(result: SurveyedWell, facts: SurveySummary, signature: SignatureCheck) -> str:
-    """The result for people, behind the multi-station analysis if there is one."""
+def whole_screen(
+    result: SurveyedWell,
+    facts: SurveySummary,
+    signature: SignatureCheck,
+    station: str | None = None,
+    **files: Path | None,
+) -> str:
+    """The result for people, behind the multi-station analysis if there is one.
+
+    `station`: label of the one whose contributions are shown, by default the last. `files`: others that were written.
+    """
     stated = result.inputs.stated
-    shown = screen(result.well, facts, signature, *stated)
-    return (
-        f"{interference_screen(result.analysis, *stated)}\n\n{shown}" if result.analysis else shown
-    )
+    parts = [interference_screen(result.analysis, *stated)] if result.analysis else []
+    parts.append(screen(result.well, facts, signature, *stated))
+    if result.contributions:
+        parts.append(contribution_screen(result.contributions, station))
+    written = files_written(table=facts.output, page=facts.html, **files) if facts.output else ""
+    return "\n\n".join(parts) + (f"\n{written}" if written else "")
 
 
 def all_findings(facts: SurveySummary) -> list[Finding]:
@@ -315,7 +337,6 @@ def screen(
             *map(one_line, lines),
             "",
             survey_table(well, facts.rows),
-            *([files_written(table=facts.output, page=facts.html)] if facts.output else []),
         ]
     )
 

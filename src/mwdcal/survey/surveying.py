@@ -9,6 +9,7 @@ import os
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from msgspec.structs import replace as replace_struct
@@ -26,6 +27,7 @@ from mwdcal.geometry.units import FOOT
 from mwdcal.geometry.vectors import Array, Bools
 from mwdcal.sensor.profile import StandProfile
 from mwdcal.survey.acceptance import SurveyLimits, load_survey_limits
+from mwdcal.survey.contributions import Contributions, contributions
 from mwdcal.survey.error_model import BUILT_IN, ErrorModel, load_error_model
 from mwdcal.survey.interference import Interference, interference
 from mwdcal.survey.interference_estimate import Assumed, sensor_drift
@@ -48,6 +50,8 @@ NO_MODEL = "none"
 """The word for standard uncertainties of calibration, noise and declination alone."""
 MEASURED_DEPTH = "md_m"
 """The column of measured depths, m."""
+MOST_CONTRIBUTED = 2000
+"""Surveys of a table whose contributions are computed."""
 LARGEST_DEPTH = 20_000.0
 """No hole is longer, m."""
 _DEPTH_NAMES = re.compile(
@@ -326,6 +330,13 @@ class SurveyedWell:
     well: Well
     counts: WellCounts
     analysis: Interference | None = None
+
+    @cached_property
+    def contributions(self) -> Contributions | None:
+        """What makes the uncertainty of each survey; None for long tables, and where azimuths are not measured."""
+        if self.counts.rows > MOST_CONTRIBUTED or self.counts.rows != self.well.readings.count:
+            return None
+        return contributions(self.well)
 
     @property
     def table(self) -> Table:

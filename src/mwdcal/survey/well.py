@@ -180,6 +180,7 @@ class Well:
     sources: Mapping[str, str] = field(default_factory=dict)
     after: Before = Before()
     errors: WellErrors | None = None
+    started: Start = (0.0, 0.0, 0.0)
 
     @cached_property
     def sd_azimuth(self) -> Array:
@@ -419,6 +420,7 @@ def part_of_well(
     result = Well(
         calibration, readings, surveys, judgement, limits, north, (g, b), position, [],
         extrapolated=columns.get(EXTRAPOLATED), blindness=blind, after=after, errors=errors,
+        started=before.path,
     )  # fmt: skip
     return result, tally
 

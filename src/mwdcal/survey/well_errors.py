@@ -76,7 +76,7 @@ class WellErrors:
         Errors of the hole's direction against the tool, such as sag, leave the toolface as it is.
         """
         gradient = np.stack([OBSERVABLES[name].gradient(g, b) for name in SURVEY_OBSERVABLES], -2)
-        result = ((gradient @ self.columns(g, b, self._unit(hole)).mT) ** 2).sum(-1)
+        result = ((gradient @ self.columns(g, b, self.unit(hole)).mT) ** 2).sum(-1)
         systematic, random, _ = self.model.errors(hole)
         upward, sideways = ((systematic[..., i] ** 2).sum(-1) + random[..., i, i] for i in range(2))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -95,7 +95,8 @@ class WellErrors:
             n for letters, n in OF_MODELS.items() if any(s.startswith(letters) for s in starts)
         ]
 
-    def _unit(self, hole: Hole) -> ArrayLike:
+    def unit(self, hole: Hole) -> ArrayLike:
+        """The unit of the field, nT, that `columns` take."""
         return hole.quantities["bfield"] if self.relative else 1.0
 
     def of_surveys(
@@ -121,15 +122,15 @@ class WellErrors:
     def along(self, errors: DirectionErrors, g: Array, b: Array, hole: Hole) -> DirectionErrors:
         """Errors of direction and depth along a well: those given, and those of the model."""
         _, gradient = direction_gradient(g, b)
-        sensors = _with_depth(self.columns(g, b, self._unit(hole)) @ gradient.mT)
+        sensors = with_depth(self.columns(g, b, self.unit(hole)) @ gradient.mT)
         systematic, random, course = self.model.errors(hole)
         noise = np.zeros_like(random)
         noise[:, :2, :2] = errors.random
-        lasting = np.concatenate([_with_depth(errors.systematic), sensors, systematic], -2)
+        lasting = np.concatenate([with_depth(errors.systematic), sensors, systematic], -2)
         return DirectionErrors(errors.inclination, errors.azimuth, lasting, noise + random, course)
 
 
-def _with_depth(shifts: Array) -> Array:
+def with_depth(shifts: Array) -> Array:
     """Shifts (n, k, 3) of direction alone (n, k, 2), which leave depths as they are."""
     return np.concatenate([shifts, np.zeros((*shifts.shape[:-1], 1))], -1)
 

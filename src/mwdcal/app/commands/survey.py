@@ -79,6 +79,18 @@ if TYPE_CHECKING:
     metavar="DEG",
     help="Azimuth of the vertical section, from the north of the path.",
 )
+@click.option(
+    "--station",
+    metavar="LABEL",
+    help="Station whose contributions to the uncertainty are on the screen. Default: the last on the path.",
+)
+@click.option(
+    "--contributions",
+    type=options.FILE,
+    metavar="FILE",
+    help="Also write a table of the contributions: what each cause of error makes of every 1σ, a row for each "
+    "station and cause.",
+)
 @options.WHERE_OUTSIDE
 @options.MISSING
 @options.report(
@@ -92,9 +104,9 @@ if TYPE_CHECKING:
 def command(
     calibration: Path, readings: Path, output: Path, reference: Path | None, msa: bool,
     msa_html: Path | None, sensor_drift: str | None, error_model: str, limits: str, switch: str,
-    tie_in: str | None, section_azimuth: float, outside: str, missing: str, report: Path | None, decimal: str,
-    key: tuple[Path, ...],
-    as_json: bool,
+    tie_in: str | None, section_azimuth: float, station: str | None,
+    contributions: Path | None, outside: str, missing: str, report: Path | None, decimal: str,
+    key: tuple[Path, ...], as_json: bool,
 ) -> None:  # fmt: skip
     """Surveys of a well: READINGS in their order, corrected by the CALIBRATION of their tool.
 
@@ -117,12 +129,12 @@ def command(
         raise InputError("`msa_html` goes with `msa`. Leave it out, or add `msa`.")
     check_drift(sensor_drift, msa)
     given = [calibration, readings, reference, limits, error_model, *key]
-    options.check_outputs([output, msa_html], given, page=report)
+    options.check_outputs([output, msa_html, contributions], given, page=report)
     start, ends = _tie_in(tie_in), _switch(switch)
     loaded = load_calibration(calibration, key)
     fitted = loaded.calibration
     said = options.statements()
-    whole = msa or report or missing == "blank" or said
+    whole = msa or report or missing == "blank" or said or contributions or station
     if not whole and long_table.in_parts(readings, output, fitted.profile):
         result = long_table.survey_file(
             fitted, readings, output, reference, limits, start, ends, outside, decimal,
@@ -142,13 +154,40 @@ def command(
         atomic.write_all(pages + _interference_page(inputs, analysis, report))
         _refuse(inputs, analysis, loaded.signature, as_json)
     result = survey_well(inputs, analysis, tie_in=start, switch=ends, outside=outside)
+    pages += _pages(result, report, contributions, station)
+    atomic.write_all([(output, tables.streamed(output, result.table)), *pages])
+    _print(
+        result, loaded.signature, (str(output), str(report or "")), as_json, station, contributions
+    )
+
+
+def _pages(
+    result: SurveyedWell, report: Path | None, table: Path | None, station: str | None
+) -> list[tuple[Path, bytes | str]]:
+    """The page, and the table of contributions, where they were asked for.
+
+    Raises:
+        InputError: contributions were asked for, and there are none.
+    """
+    from mwdcal.files.formats import table as tables
+    from mwdcal.presentation.contributions import contribution_table, station_row
+
+    pages: list[tuple[Path, bytes | str]] = []
     if report:
         from mwdcal.presentation.survey_page import render
 
-        findings = findings_with_option_names(result.well.findings)
-        pages.append((report, render(result.well, findings, inputs.named, analysis)))
-    atomic.write_all([(output, tables.streamed(output, result.table)), *pages])
-    _print(result, loaded.signature, (str(output), str(report or "")), as_json)
+        pages.append((report, render(result, findings_with_option_names(result.well.findings))))
+    if table is None and station is None:
+        return pages
+    if result.contributions is None:
+        raise InputError(
+            "`contributions` and `station` are for tables of at most 2000 surveys with magnetic readings. Leave them "
+            "out, or survey a part of the table."
+        )
+    station_row(result.contributions, station)
+    if table:
+        pages.append((table, tables.rendered(table, contribution_table(result))))
+    return pages
 
 
 def _interference_page(
@@ -175,7 +214,12 @@ def _refuse(
 
 
 def _print(
-    result: SurveyedWell, signature: SignatureCheck, files: tuple[str, str], as_json: bool
+    result: SurveyedWell,
+    signature: SignatureCheck,
+    files: tuple[str, str],
+    as_json: bool,
+    station: str | None = None,
+    contributions: Path | None = None,
 ) -> None:
     """Print the result, with the files that were written."""
     from mwdcal.presentation import survey as screens
@@ -184,7 +228,7 @@ def _print(
     shown: object = (
         screens.document(result.inputs, facts, signature)
         if as_json
-        else screens.whole_screen(result, facts, signature)
+        else screens.whole_screen(result, facts, signature, station, contributions=contributions)
     )
     print_result(shown, findings_with_option_names(screens.all_findings(facts)))
 
