@@ -17,7 +17,7 @@ from mwdcal.calibration.prediction import readings_at
 from mwdcal.files import streams
 from mwdcal.files.documents import read
 from mwdcal.files.formats import text
-from mwdcal.survey import acceptance, long_table
+from mwdcal.survey import acceptance, long_table, surveying
 from mwdcal.survey.path import calibrated_path, continued_path
 
 ROWS = 700
