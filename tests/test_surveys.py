@@ -1078,3 +1078,64 @@ def test_dogleg_severity_and_vertical_section(example, tmp_path):
     north, east = (floats(columns[f"{name}_m"]) for name in ("north", "east"))
     expected = north * np.cos(section) + east * np.sin(section)
     np.testing.assert_allclose(floats(columns["vertical_section_m"]), expected, atol=1e-9)
+
+
+# ------------------------------------------------------------------ feet
+
+
+@pytest.mark.parametrize(("unit", "metres"), [("ft", 0.3048), ("usft", 1200 / 3937)])
+def test_feet_are_metres_in_another_unit(example, tmp_path, unit, metres):
+    """Depths that state feet, or none: every length is that of the same well in metres, divided by the foot."""
+    given = read_csv(EXAMPLE / "well.csv")
+    deep = [repr(float(cell) / metres) for cell in given.pop("md_m")]
+    whole, document = surveyed_file(example, tmp_path, {})
+    path = tmp_path / "contributions.csv"
+    for name in (f"md_{unit}", "MD", f"MD ({unit})"):
+        source = write_csv(tmp_path / "feet.csv", {**given, name: deep}, "simulated = true")
+        out = tmp_path / "feet_out.csv"
+        typed = ("survey", example, source, "-o", out, "--length-unit", unit)
+        ran = cli(*typed, "--contributions", path, "--json")
+        assert ran.code == 0, ran
+        columns = read_csv(out)
+        assert not [column for column in columns if column.endswith("_m")]
+        for column in ("north", "sd_east", "tvd", "vertical_section"):
+            expected = floats(whole[f"{column}_m"]) / metres
+            np.testing.assert_allclose(
+                floats(columns[f"{column}_{unit}"]), expected, rtol=1e-9, atol=1e-9
+            )
+        severity = floats(columns[f"dogleg_severity_deg_per_100{unit}"])[1:]
+        metric = floats(whole["dogleg_severity_deg_per_30m"])[1:]
+        np.testing.assert_allclose(severity, metric / 30 * 100 * metres, rtol=1e-9, atol=1e-9)
+        assert ran.json["length_unit"] == unit
+        assert ran.json["end"]["tvd_m"] == pytest.approx(document["end"]["tvd_m"], rel=1e-12)
+        last = read_csv(path)
+        assert float(last[f"md_{unit}"][-1]) == pytest.approx(1050 / metres, rel=1e-12)
+        assert f"at {1050 / metres:.2f} {unit} MD" in cli(*typed).out
+
+
+def test_feet_of_a_tie_in_of_a_table_in_metres_and_of_the_settings(example, tmp_path, monkeypatch):
+    moved = {"md_m": [str(float(cell) + 200) for cell in read_csv(EXAMPLE / "well.csv")["md_m"]]}
+    metric, _ = surveyed_file(example, tmp_path, moved, "--tie-in", "30.48,1,20,0,3.048,30.48")
+    feet = ("--tie-in", "100,1,20,0,10,100", "--length-unit", "ft")
+    tied, _ = surveyed_file(example, tmp_path, moved, *feet)
+    np.testing.assert_allclose(
+        floats(tied["east_ft"]), floats(metric["east_m"]) / 0.3048, rtol=1e-9
+    )
+    (tmp_path / "mwdcal.toml").write_text('length_unit = "usft"\n')
+    monkeypatch.chdir(tmp_path)
+    stated, _ = surveyed_file(example, tmp_path, moved)
+    assert "tvd_usft" in stated
+    chosen, _ = surveyed_file(example, tmp_path, moved, "--length-unit", "m")
+    assert "tvd_m" in chosen
+
+
+def test_a_trajectory_in_feet_says_so(example, tmp_path):
+    given = read_csv(EXAMPLE / "well.csv")
+    feet = {"md_ft": [repr(float(cell) / 0.3048) for cell in given.pop("md_m")], **given}
+    source = write_csv(tmp_path / "feet.csv", feet, "simulated = true")
+    out = tmp_path / "well.xml"
+    ran = cli("survey", example, source, "-o", out, "--length-unit", "ft")
+    assert ran.code == 0, ran
+    text = out.read_text("utf-8")
+    assert text.count('<md uom="ft">') == text.count('<tvd uom="ft">') == 36
+    assert 'uom="m"' not in text

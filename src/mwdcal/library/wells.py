@@ -209,7 +209,7 @@ class WellSurvey(Result):
         parts = self.surveyed.contributions
         if parts is None:
             return None
-        columns = contribution_columns(parts).items()
+        columns = contribution_columns(parts, self.surveyed.well.length_unit).items()
         return {k: np.array(v, object) if isinstance(v, list) else v for k, v in columns}
 
     def to_pandas(self) -> Any:
@@ -445,6 +445,7 @@ def survey(
     switch: tuple[float, float] = (3.0, 5.0),
     tie_in: Sequence[float] | None = None,
     section_azimuth: float = 0.0,
+    length_unit: Literal["", "m", "ft", "usft"] = "",
     outside: Literal["blank", "refuse", "extrapolate"] = "blank",
     missing: Literal["refuse", "blank"] = "refuse",
     decimal: str = ".",
@@ -453,7 +454,7 @@ def survey(
     """The surveys of a well: readings in their order, corrected by the calibration of their tool.
 
     Definition: inclination, azimuth, toolface, |g|, |b| and dip with standard uncertainties; whether each survey lies
-    within the limits; with measured depths (`md_m`) north, east and TVD by minimum curvature.
+    within the limits; with measured depths (`md_m`, `md_ft`, `md_usft`) north, east and TVD by minimum curvature.
     Singular: at vertical azimuth and gravity toolface are NaN.
 
     Args:
@@ -467,9 +468,11 @@ def survey(
             none, or a file in ISCWSA's JSON form.
         switch: inclinations, degrees, below which the toolface counts from magnetic north, and above which from the
             high side.
-        tie_in: north, east and TVD of the first station, m; or measured depth, inclination, azimuth (degrees, from the
-            north of the path), north, east and TVD of the point where the path is tied in.
+        tie_in: north, east and TVD of the first station, in `length_unit`; or measured depth, inclination, azimuth
+            (degrees, from the north of the path), north, east and TVD of the point where the path is tied in.
         section_azimuth: of the vertical section, degrees from the north of the path.
+        length_unit: of the results and of `tie_in`, and of depths whose column states none: m (the default), ft, or
+            usft (1200/3937 m).
         outside: what becomes of readings outside the calibrated temperatures.
         missing: rows without a reading, such as a tie-in station: refuse the table, or leave their results blank.
         decimal: decimal sign of a text file.
@@ -488,12 +491,16 @@ def survey(
 
     check_drift(sensor_drift, msa)
     ends: Any = tuple(np.radians(_finite("switch", switch, 2)).tolist())
-    start = None if tie_in is None else start_of(_finite("tie_in", tie_in, len(tie_in)))
+    start = (
+        None
+        if tie_in is None
+        else start_of(_finite("tie_in", tie_in, len(tie_in)), length_unit or "m")
+    )
     loaded = load_calibration(_source(cal), [Path(key) for key in keys])
     table = _survey_table(readings, loaded.calibration, decimal)
     inputs = well_inputs(
         loaded.calibration, table, _earth(reference), limits, msa, loaded.digest, loaded.findings,
-        error_model, missing, _number("section_azimuth", section_azimuth),
+        error_model, missing, _number("section_azimuth", section_azimuth), length_unit,
     )  # fmt: skip
     analysis = analysed(inputs, sensor_drift) if msa else None
     if analysis:

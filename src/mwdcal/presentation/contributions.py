@@ -10,6 +10,7 @@ import numpy as np
 from mwdcal.errors import InputError
 from mwdcal.files.formats.columns import Column
 from mwdcal.files.formats.table import Table
+from mwdcal.geometry.units import LENGTH_UNITS
 from mwdcal.geometry.vectors import Array
 from mwdcal.presentation.numbers import fixed, number
 from mwdcal.presentation.text import table
@@ -21,15 +22,15 @@ SHARE_TITLES = ["of the variance, %", "propagation", "inc", "azi", "north", "eas
 _STATED_DIGITS = 6
 
 
-def _key(quantity: str) -> str:
-    return f"{quantity}_deg" if quantity in CONTRIBUTED[:2] else f"{quantity}_m"
+def _sd_columns(unit: str = "m") -> list[str]:
+    """Columns of 1σ by a cause, in the order of `CONTRIBUTED`."""
+    return [f"sd_{n}_deg" if n in CONTRIBUTED[:2] else f"sd_{n}_{unit}" for n in CONTRIBUTED]
 
 
-SD_COLUMNS = [f"sd_{_key(name)}" for name in CONTRIBUTED]
-"""Columns of 1σ by a cause, in the order of `CONTRIBUTED`, in the units of files."""
-_PER_RADIAN_OR_METRE = np.where(
-    [name in CONTRIBUTED[:2] for name in CONTRIBUTED], np.degrees(1.0), 1.0
-)
+def _factors(unit: str = "m") -> Array:
+    """Units of files per radian and metre, in the order of `CONTRIBUTED`."""
+    turns = [name in CONTRIBUTED[:2] for name in CONTRIBUTED]
+    return np.where(turns, np.degrees(1.0), 1 / LENGTH_UNITS[unit])
 
 
 class CauseOfError(msgspec.Struct, frozen=True, kw_only=True):
@@ -73,7 +74,7 @@ def contribution_summary(result: Contributions) -> ContributionSummary:
 
 
 def _cause(name: str, propagation: str, sd: Array) -> CauseOfError:
-    columns = zip(SD_COLUMNS, (sd * _PER_RADIAN_OR_METRE).T, strict=True)
+    columns = zip(_sd_columns(), (sd * _factors()).T, strict=True)
     return CauseOfError(cause=name, propagation=propagation, **{k: _stated(v) for k, v in columns})
 
 
@@ -84,22 +85,23 @@ def _stated(values: Array) -> list[float | None]:
 def contribution_table(surveyed: SurveyedWell) -> Table:
     """A table of the contributions, with what the table of the surveys states of itself."""
     assert surveyed.contributions is not None
-    return Table(contribution_columns(surveyed.contributions), described(surveyed.well))
+    unit = surveyed.well.length_unit
+    return Table(contribution_columns(surveyed.contributions, unit), described(surveyed.well))
 
 
-def contribution_columns(result: Contributions) -> Mapping[str, Column]:
-    """A row for each station and cause, with 1σ and share in the variance."""
+def contribution_columns(result: Contributions, unit: str = "m") -> Mapping[str, Column]:
+    """A row for each station and cause, with 1σ and share in the variance; lengths in a unit."""
     count, stations = len(result.causes), len(result.station)
     columns: dict[str, Column] = {
         "station": [label for label in result.station for _ in range(count)],
-        "md_m": np.repeat(result.md, count),
+        f"md_{unit}": np.repeat(result.md / LENGTH_UNITS[unit], count),
         "cause": [cause.name for cause in result.causes] * stations,
         "propagation": [cause.propagation for cause in result.causes] * stations,
     }
     sd, share = (
         np.swapaxes(each, 0, 1).reshape(-1, len(CONTRIBUTED)) for each in (result.sd, result.share)
     )
-    columns |= dict(zip(SD_COLUMNS, (sd * _PER_RADIAN_OR_METRE).T, strict=True))
+    columns |= dict(zip(_sd_columns(unit), (sd * _factors(unit)).T, strict=True))
     return columns | {f"share_{name}": share[:, k] for k, name in enumerate(CONTRIBUTED)}
 
 
@@ -122,7 +124,7 @@ def station_row(result: Contributions, label: str | None) -> int:
     return rows[0]
 
 
-def share_rows(result: Contributions, row: int) -> list[list[str]]:
+def share_rows(result: Contributions, row: int, unit: str = "m") -> list[list[str]]:
     """Shares of each cause at a station, per cent, the largest in position or azimuth first; 1σ of all last."""
     share, shown = result.share[:, row], len(SHARE_TITLES) - 2
     order = np.argsort(-np.nan_to_num(share[:, :shown]).max(-1), kind="stable")
@@ -130,16 +132,16 @@ def share_rows(result: Contributions, row: int) -> list[list[str]]:
         [*result.causes[k], *(fixed(100 * part, 1) for part in share[k, :shown].tolist())]
         for k in order.tolist()
     ]
-    total = (result.total[row] * _PER_RADIAN_OR_METRE)[:shown].tolist()
-    units = ["°", "°", " m", " m", " m"]
+    total = (result.total[row] * _factors(unit))[:shown].tolist()
+    units = ["°", "°", *[f" {unit}"] * 3]
     sd = [number(v, 2) + (u if np.isfinite(v) else "") for v, u in zip(total, units, strict=True)]
     return [*rows, ["1σ of all", "", *sd]]
 
 
-def contribution_screen(result: Contributions, label: str | None = None) -> str:
+def contribution_screen(result: Contributions, label: str | None = None, unit: str = "m") -> str:
     """The causes of the uncertainty at one station for people."""
     row = station_row(result, label)
-    md = result.md[row]
-    where = f" at {fixed(md, 2)} m MD" if np.isfinite(md) else ""
+    md = result.md[row] / LENGTH_UNITS[unit]
+    where = f" at {fixed(md, 2)} {unit} MD" if np.isfinite(md) else ""
     heading = f"contributions to the uncertainty of station {result.station[row]}{where}"
-    return f"{heading}\n\n{table(share_rows(result, row), SHARE_TITLES)}"
+    return f"{heading}\n\n{table(share_rows(result, row, unit), SHARE_TITLES)}"

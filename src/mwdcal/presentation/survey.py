@@ -17,6 +17,7 @@ from mwdcal.calibration.canonical import SignatureCheck
 from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import Finding, stated
+from mwdcal.geometry.units import LENGTH_UNITS
 from mwdcal.presentation.contributions import (
     ContributionSummary,
     contribution_screen,
@@ -143,6 +144,7 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
     `error_terms` are in the standard uncertainties of surveys and path, `not_included` are not; `error_model` states
     those that are not of the calibration. Drift counts over `years_since_calibration`; null: not known, taken as one.
     `msa` is the multi-station analysis, if one was asked for; `interference` and `separable` are of it.
+    Lengths are in metres; `length_unit` is that of table, screen and page.
     `contributions`: what makes the uncertainty of each survey; null beyond 2000 surveys.
     """
 
@@ -167,6 +169,7 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
     findings: list[Finding]
     output: str
     html: str
+    length_unit: str = "m"
     interference: InterferenceSize | None = None
     separable: bool | None = None
     msa: MultiStationAnalysis | None = None
@@ -230,7 +233,8 @@ def whole_screen(
     parts = [interference_screen(result.analysis, *stated)] if result.analysis else []
     parts.append(screen(result.well, facts, signature, *stated))
     if result.contributions:
-        parts.append(contribution_screen(result.contributions, station))
+        unit = result.well.length_unit
+        parts.append(contribution_screen(result.contributions, station, unit))
     written = files_written(table=facts.output, page=facts.html, **files) if facts.output else ""
     return "\n\n".join(parts) + (f"\n{written}" if written else "")
 
@@ -268,6 +272,7 @@ def summary(
         findings=[*well.findings, *about_file],
         output=output,
         html=html,
+        length_unit=well.length_unit,
         interference=msa.interference if msa else None,
         separable=msa.separable if msa else None,
         msa=msa,
@@ -328,7 +333,7 @@ def screen(
     if facts.reference_sources:
         lines.append(sources_in_words(facts))
     if facts.end:
-        lines.append(end_in_words(facts.end, facts.north))
+        lines.append(end_in_words(facts.end, facts.north, facts.length_unit))
     lines.append(well.terms.sentence)
     if well.errors:
         lines.append(model_in_words(well.errors))
@@ -370,17 +375,18 @@ def sources_in_words(facts: SurveySummary) -> str:
     return "   ".join(["references", *parts])
 
 
-def end_in_words(end: EndOfPath, north: str) -> str:
-    """Where the path ends, with standard uncertainties."""
+def end_in_words(end: EndOfPath, north: str, unit: str = "m") -> str:
+    """Where the path ends, with standard uncertainties, in a unit of length."""
+    metres = LENGTH_UNITS[unit]
     parts = [
-        f"{title} {fixed(value, 2)} m (1σ {'not stated' if sd is None else fixed(sd, 2)})"
+        f"{title} {fixed(value / metres, 2)} {unit} (1σ {'not stated' if sd is None else fixed(sd / metres, 2)})"
         for title, value, sd in (
             ("north", end.north_m, end.sd_north_m),
             ("east", end.east_m, end.sd_east_m),
             ("TVD", end.tvd_m, end.sd_tvd_m),
         )
     ]
-    return f"at {fixed(end.md_m, 2)} m MD, from {north} north: {', '.join(parts)}"
+    return f"at {fixed(end.md_m / metres, 2)} {unit} MD, from {north} north: {', '.join(parts)}"
 
 
 def survey_table(well: Well, count: int, most: int = MOST_SURVEYS) -> str:
@@ -400,12 +406,13 @@ def survey_rows(well: Well, most: int) -> tuple[list[str], list[list[str]]]:
         "gravity_g": "|g| g", "field_nt": "|b| (relative)" if relative else "|b| nT", "dip_deg": "dip °",
     }  # fmt: skip
     digits = {"gravity_g": 5, "field_nt": 5 if relative else 0, "dip_deg": 2}
-    header = ["station", *(["md m"] if well.position else [])]
+    header = ["station", *([f"md {well.length_unit}"] if well.position else [])]
     for name, title in shown.items():
         header += [title, "1σ"] if name in angles else [title]
     modelled, rows = well.limits.probability is not None, []
+    metres = LENGTH_UNITS[well.length_unit]
     for i, label in enumerate(well.readings.labels[:most]):
-        row = [label, *([fixed(well.position.md[i], 2)] if well.position else [])]
+        row = [label, *([fixed(well.position.md[i] / metres, 2)] if well.position else [])]
         for name in shown:
             row.append(fixed(columns[name][i], digits.get(name, 2)))
             if name in angles:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mwdcal.calibration.record import Finding
+from mwdcal.geometry.units import LENGTH_UNITS
 from mwdcal.geometry.vectors import Array, Bools, wrap
 from mwdcal.presentation.contributions import SHARE_TITLES, share_rows, station_row
 from mwdcal.presentation.interference_page import LARGEST_DRAWN_SD, sections
@@ -55,7 +56,8 @@ def along(well: Well) -> tuple[Array, str]:
     """Where stations (n,) lie along a depth axis, and its title: measured depth, else their number."""
     if well.position is None:
         return np.arange(1.0, len(well.judgement.accepted) + 1), "station"
-    return well.position.md, "measured depth, m"
+    unit = well.length_unit
+    return well.position.md / LENGTH_UNITS[unit], f"measured depth, {unit}"
 
 
 @style()
@@ -259,15 +261,18 @@ def path(well: Well) -> Figure:
     assert position is not None
     there = ~np.isnan(position.place[:, 0])
     figure, panels = new_figure("Well path on the map and in vertical section", 3.9, 1, 2)
-    place, covariance = position.place[there], position.covariance[there]
+    unit, metres = well.length_unit, LENGTH_UNITS[well.length_unit]
+    place, covariance = position.place[there] / metres, position.covariance[there] / metres**2
     towards, enlarged = _section(place), enlargement(position)
     plan = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
     section = np.array([[np.cos(towards), np.sin(towards), 0.0], [0.0, 0.0, 1.0]])
     for axes, view in zip(panels[0], (plan, section), strict=True):
         _shade(axes, place @ view.T, well.blind[there])
         _view(axes, place, covariance, view, enlarged)
-    panels[0, 0].set(xlabel="east, m", ylabel=f"north ({well.north.name}), m")
-    panels[0, 1].set(xlabel=f"along {np.degrees(wrap(towards)):.0f}°, m", ylabel="TVD, m")
+    panels[0, 0].set(xlabel=f"east, {unit}", ylabel=f"north ({well.north.name}), {unit}")
+    panels[0, 1].set(
+        xlabel=f"along {np.degrees(wrap(towards)):.0f}°, {unit}", ylabel=f"TVD, {unit}"
+    )
     panels[0, 1].invert_yaxis()
     panels[0, 0].set_title("map")
     panels[0, 1].set_title("vertical section")
@@ -353,14 +358,14 @@ def render(surveyed: SurveyedWell, findings: list[Finding]) -> str:
         angles=angles(well),
         path=path(well) if located else None,
         contributions=shares(well, budget) if budget else None,
-        causes=share_rows(budget, station_row(budget, None)) if budget else [],
+        causes=share_rows(budget, station_row(budget, None), well.length_unit) if budget else [],
         cause_titles=SHARE_TITLES,
         last=budget.station[station_row(budget, None)] if budget else "",
         enlarged=enlargement(well.position) if located and well.position else 1.0,
         terms=well.terms.sentence,
         declination=declination_in_words(facts),
         sources=sources_in_words(facts).partition("   ")[2],
-        end=end_in_words(facts.end, facts.north) if facts.end else "",
+        end=end_in_words(facts.end, facts.north, facts.length_unit) if facts.end else "",
         header=header,
         rows=rows,
         analysis=sections(analysis) if analysis else None,

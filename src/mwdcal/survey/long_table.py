@@ -36,16 +36,18 @@ from mwdcal.survey.norths import norths_of
 from mwdcal.survey.path import TieIn
 from mwdcal.survey.references import Claim, EarthReference
 from mwdcal.survey.surveying import (
-    MEASURED_DEPTH,
+    MEASURED_DEPTHS,
     SurveyedWell,
     SurveyReadings,
     WellInputs,
     check_free,
     claim,
+    depth_column,
     depths,
     described,
     error_model_of,
     judged_constants,
+    length_unit_of,
     loaded_limits,
     loaded_reference,
     not_deeper,
@@ -71,7 +73,7 @@ LONG_ROWS = 1 << 16
 """Rows of a Parquet table beyond which it is."""
 _TEXT_ROWS = 1 << 14
 """Rows of a part of a Parquet table that becomes text."""
-_ALSO = (MEASURED_DEPTH, *LABELS, "simulated")
+_ALSO = (*MEASURED_DEPTHS, *LABELS, "simulated")
 _DELIMITERS = {".csv": ",", ".tsv": "\t"}
 
 
@@ -98,6 +100,8 @@ class _Settings(NamedTuple):
     switch: tuple[float, float]
     outside: str
     model: ErrorModel | None = None
+    unit: str = ""
+    shown_unit: str = "m"
 
 
 class _Stations(NamedTuple):
@@ -137,6 +141,7 @@ def survey_file(
     findings: Iterable[Finding],
     error_model: str = BUILT_IN,
     section_azimuth: float = 0.0,
+    length_unit: str = "",
 ) -> SurveyedWell:
     """Survey a long table into another, as `mwdcal.survey.surveying` does with a table in memory.
 
@@ -148,7 +153,9 @@ def survey_file(
     bounds, limits_digest = loaded_limits(limits)
     place, place_digest = loaded_reference(reference)
     model = error_model_of(error_model)
-    settings = _Settings(calibration, bounds, place, tie_in, switch, outside, model)
+    settings = _Settings(
+        calibration, bounds, place, tie_in, switch, outside, model, *length_unit_of(length_unit)
+    )
     long = _LongTable(settings, readings, output, decimal)
     long.north = with_section(long.north, section_azimuth)
     digests = {"calibration": digest, "readings": sha256_of(readings)}
@@ -185,8 +192,9 @@ class _LongTable:
             raise no_stations(self.source.name)
         self.opening = first
         self.absent = wholly_blank([first])
-        self.located = MEASURED_DEPTH in self.source.names and any(
-            not is_blank(table, MEASURED_DEPTH) for table in self._tables()
+        depth, _ = depth_column(self.head, settings.unit)
+        self.located = depth in MEASURED_DEPTHS and any(
+            not is_blank(table, depth) for table in self._tables()
         )
         self.north = norths_of(
             self.source.metadata, self.source.name, self._all_readings, settings.calibration,
@@ -200,7 +208,7 @@ class _LongTable:
         check_columns(source.names, source.name)
         if self.settings.calibration.thermal:
             synonyms.check_evidence(source.names, source.name, ("temperature_c",))
-        depths(head)
+        depths(head, self.settings.unit)
         return head
 
     def _table(self, piece: Any) -> Table:
@@ -211,7 +219,10 @@ class _LongTable:
 
     def _readings(self, piece: Any) -> Readings:
         """The readings of a piece."""
-        read = partial(station_readings, calibration=self.settings.calibration, recognised=False)
+        read = partial(
+            station_readings, calibration=self.settings.calibration, recognised=False,
+            length_unit=self.settings.unit,
+        )  # fmt: skip
         return self.source.exactly_if_refused(lambda part: read(part.table)[0], piece)
 
     def _all_readings(self) -> Iterator[Readings]:
@@ -243,12 +254,12 @@ class _LongTable:
                 raise blank_cell(self.opening if names in self.absent else table, names)
         unlabelled = {name: table.columns[name] for name in table.columns if name != "station"}
         readings, md = station_readings(
-            replace(table, columns=unlabelled), self.settings.calibration, recognised=False
+            replace(table, columns=unlabelled), self.settings.calibration, False, self.settings.unit
         )
         if md is not None:
             there = np.flatnonzero(~np.isnan(md))
             if md[there[0]] < seen.depth:
-                raise not_deeper(table, int(there[0]), md[there[0]])
+                raise not_deeper(table, int(there[0]), md[there[0]], self.settings.unit)
         seen.serials.update(dict.fromkeys(labels(table, "serial")))
         given = labels(table, "station") or [""] * table.count
         numbered = enumerate(given, sum(seen.rows) + 1)
@@ -276,6 +287,7 @@ class _LongTable:
             calibration, readings, settings.limits, self.north, md, seen.before, settings.switch,
             settings.outside, model=settings.model, whole=False,
         )  # fmt: skip
+        well = replace(well, length_unit=settings.shown_unit)
         seen.before = well.after
         seen.tallies.append(tally)
         seen.counts.append(well.counts)
@@ -314,7 +326,7 @@ class _LongTable:
             digests.pop("reference", None)
         inputs = WellInputs(
             settings.calibration, self.head, surveys, settings.limits, [*findings, *about], digests,
-            settings.model,
+            settings.model, length_unit=settings.shown_unit,
         )  # fmt: skip
         counts = reduce(WellCounts.followed_by, seen.counts)
         tally = joined(seen.tallies)._replace(scatter=self._scatter(), metadata=readings.metadata)

@@ -23,7 +23,7 @@ from mwdcal.files.faults import chosen, nothing, spread, wholly_blank, without_r
 from mwdcal.files.formats.table import Table, cell_error, numbers
 from mwdcal.files.runs import renamed, to_readings
 from mwdcal.files.settings import setting
-from mwdcal.geometry.units import FOOT
+from mwdcal.geometry.units import LENGTH_UNITS
 from mwdcal.geometry.vectors import Array, Bools
 from mwdcal.sensor.profile import StandProfile
 from mwdcal.survey.acceptance import SurveyLimits, load_survey_limits
@@ -48,18 +48,17 @@ from mwdcal.survey.well import Well, WellCounts, well
 
 NO_MODEL = "none"
 """The word for standard uncertainties of calibration, noise and declination alone."""
-MEASURED_DEPTH = "md_m"
-"""The column of measured depths, m."""
+MEASURED_DEPTHS = {f"md_{unit}": unit for unit in LENGTH_UNITS}
+"""The columns of measured depths, with their unit."""
 MOST_CONTRIBUTED = 2000
 """Surveys of a table whose contributions are computed."""
 LARGEST_DEPTH = 20_000.0
 """No hole is longer, m."""
 _DEPTH_NAMES = re.compile(
-    r"(md|dept|((measured|bit|survey|hole|along[ _-]?hole)[ _]?)?depth)[ _]*[\[(]?(m|ft|feet|met(re|er)s?)?[\])]?"
+    r"(md|dept|((measured|bit|survey|hole|along[ _-]?hole)[ _]?)?depth)[ _]*[\[(]?(m|(us)?ft|feet|met(re|er)s?)?[\])]?"
 )
-_DEPTH_UNIT = re.compile(r"(?<![a-z])(m|ft|feet|met(re|er)s?)[\])]?$")
+_DEPTH_UNIT = re.compile(r"(?<![a-z])(m|(us)?ft|feet|met(re|er)s?)[\])]?$")
 """The unit at the end of such a name."""
-_METRES = {"m": 1.0, "ft": FOOT}
 
 
 @dataclass(frozen=True)
@@ -87,6 +86,7 @@ def survey_readings(
     calibration: Calibration,
     reference: EarthReference | None = None,
     recognised: bool = True,
+    length_unit: str = "",
 ) -> SurveyReadings:
     """The readings of a table of surveys, and the references they are judged and turned by.
 
@@ -97,7 +97,7 @@ def survey_readings(
     Raises:
         InputError: a table that cannot be read, depths under another name or in another unit.
     """
-    readings, md = station_readings(table, calibration, recognised)
+    readings, md = station_readings(table, calibration, recognised, length_unit)
     north = norths_of(table.metadata, table.source, lambda: [readings], calibration, reference)
     claims = {
         name: claim(table.source, readings, name)
@@ -109,7 +109,7 @@ def survey_readings(
 
 
 def station_readings(
-    table: Table, calibration: Calibration, recognised: bool = True
+    table: Table, calibration: Calibration, recognised: bool = True, length_unit: str = ""
 ) -> tuple[Readings, Array | None]:
     """The readings of a table of surveys, and its measured depths (n,) if it has them."""
     table = renamed(table, calibration.profile)
@@ -118,7 +118,7 @@ def station_readings(
         synonyms.check_evidence(list(table.columns), table.source, ("temperature_c",))
     in_a_well = replace_struct(calibration.profile, stand=StandProfile())
     readings, _ = to_readings(table, in_a_well, recognised)
-    return readings, depths(table)
+    return readings, depths(table, length_unit)
 
 
 def judged_constants(calibration: Calibration, readings: Readings) -> tuple[str, ...]:
@@ -186,9 +186,12 @@ def with_reference(readings: Readings, reference: EarthReference) -> Readings:
     return replace(readings, known=known, sd=sd)
 
 
-def depths(table: Table) -> Array | None:
-    """Measured depths (n,), m, which increase; None where the table has none."""
-    name, factor = _depth_column(table)
+def depths(table: Table, length_unit: str = "") -> Array | None:
+    """Measured depths (n,), m, which increase; None where the table has none.
+
+    `length_unit` is that of a column without one; blank: such a column is refused.
+    """
+    name, factor = depth_column(table, length_unit)
     if not name:
         return None
     column = table.columns[name]
@@ -200,35 +203,57 @@ def depths(table: Table) -> Array | None:
     there = np.flatnonzero(~np.isnan(md))
     back = there[1:][np.diff(md[there]) < 0]
     if back.size:
-        raise not_deeper(table, int(back[0]), md[back[0]])
+        raise not_deeper(table, int(back[0]), md[back[0]], length_unit)
     return md if there.size else None
 
 
-def not_deeper(table: Table, row: int, depth: float) -> InputError:
-    """A measured depth that is not beyond that of the station before."""
-    problem = f"must not decrease from station to station; got {depth:g}. Sort the stations by measured depth."
-    return cell_error(table, _depth_column(table)[0], row, problem)
+def not_deeper(table: Table, row: int, depth: float, length_unit: str = "") -> InputError:
+    """A measured depth, m, that is not beyond that of the station before."""
+    name, factor = depth_column(table, length_unit)
+    problem = f"must not decrease from station to station; got {depth / factor:g}. Sort the stations by measured depth."
+    return cell_error(table, name, row, problem)
 
 
-def _depth_column(table: Table) -> tuple[str, float]:
+def depth_column(table: Table, length_unit: str = "") -> tuple[str, float]:
     """The column of measured depths, and metres per its unit; blank where there is none.
 
-    One that states no unit is in the laboratory's unit of length, where a command runs with its settings.
+    Raises:
+        InputError: the column has another name, and no unit of length was chosen.
     """
-    if MEASURED_DEPTH in table.columns:
-        return MEASURED_DEPTH, 1.0
+    for name, unit in MEASURED_DEPTHS.items():
+        if name in table.columns:
+            return name, LENGTH_UNITS[unit]
     for name in table.columns:
         if _DEPTH_NAMES.fullmatch(name.strip().lower()):
+            if not length_unit:
+                raise InputError(
+                    f"{table.source}: column '{name}': measured depths must be in metres, in a column 'md_m'; in feet "
+                    "in 'md_ft', in US survey feet in 'md_usft'. Rename it, or give `length_unit`."
+                )
             stated = _DEPTH_UNIT.search(name.strip().lower())
-            unit = "" if stated else setting("length_unit")
-            if unit:
-                return name, _METRES[unit]
-            raise InputError(
-                f"{table.source}: column '{name}': measured depths must be in metres, in a column "
-                f"'{MEASURED_DEPTH}'. Rename it, and convert feet; or state length_unit in mwdcal.toml, "
-                "which columns without a unit are in."
-            )
+            return name, LENGTH_UNITS[_unit_of(stated[1] if stated else "", length_unit)]
     return "", 1.0
+
+
+def _unit_of(stated: str, chosen: str) -> str:
+    """The unit of depths whose title states one, or none; feet without more words are those that were chosen."""
+    if stated.startswith("m"):
+        return "m"
+    if stated in LENGTH_UNITS and (stated, chosen) != ("ft", "usft"):
+        return stated
+    return "ft" if stated and chosen == "m" else chosen
+
+
+def length_unit_of(given: str) -> tuple[str, str]:
+    """The unit of lengths without one, blank where none was chosen, and that of results.
+
+    Raises:
+        InputError: no unit of length.
+    """
+    chosen = given or setting("length_unit")
+    if chosen and chosen not in LENGTH_UNITS:
+        raise InputError(f"`length_unit` must be one of {', '.join(LENGTH_UNITS)}; got {chosen!r}.")
+    return chosen, chosen or "m"
 
 
 def surveyed_table(table: Table, well: Well, rows: Bools | None = None) -> Table:
@@ -271,6 +296,7 @@ def described(well: Well) -> Mapping[str, object]:
         "survey_limits": well.limits.name,
         "north": north.name,
         "error_model": "none" if well.errors is None else well.errors.model.name,
+        **({} if well.length_unit == "m" else {"length_unit": well.length_unit}),
         **well.terms.stated,
     }
     for key, angle in (
@@ -293,8 +319,8 @@ def described(well: Well) -> Mapping[str, object]:
 class WellInputs:
     """The inputs of the surveys of a well.
 
-    `model`: the error model whose terms are in the standard uncertainties; None: none. `rows` (n,) of the table that
-    have readings; None: all.
+    `length_unit` is that of results. `model`: the error model whose terms are in the standard uncertainties; None:
+    none. `rows` (n,) of the table that have readings; None: all.
     `findings` are of the calibration's signature and of the reference; `digests` the SHA-256 of each input by name,
     empty for one that is in memory.
     """
@@ -307,6 +333,7 @@ class WellInputs:
     digests: Mapping[str, str]
     model: ErrorModel | None = None
     rows: Bools | None = None
+    length_unit: str = "m"
 
     @property
     def stated(self) -> tuple[Mapping[str, object], Mapping[str, object]]:
@@ -355,12 +382,14 @@ def well_inputs(
     error_model: ErrorModel | str | os.PathLike[str] = BUILT_IN,
     missing: str = "refuse",
     section_azimuth: float = 0.0,
+    length_unit: str = "",
 ) -> WellInputs:
     """The inputs of surveys: a table of readings, the calibration of their tool, reference and limits.
 
     `reference`, `limits` and `error_model` are values, or files by path; `NO_MODEL` for none. Stations that
     multi-station analysis puts into the record have to be `recognised`. `digest` and `findings` are of the file of the
-    calibration. `section_azimuth` of the vertical section, degrees from the north of the path.
+    calibration. `length_unit` (m, ft, usft) is that of results, and of depths that state none. `section_azimuth` of the
+    vertical section, degrees from the north of the path.
 
     Raises:
         InputError: a file that cannot be read, readings that do not belong to the calibration.
@@ -368,7 +397,8 @@ def well_inputs(
     bounds, limits_digest = loaded_limits(limits)
     place, place_digest = loaded_reference(reference)
     rows = _with_readings(table, calibration) if missing == "blank" else np.ones(table.count, bool)
-    read = survey_readings(chosen(table, rows), calibration, place, recognised=recognised)
+    unit, shown_unit = length_unit_of(length_unit)
+    read = survey_readings(chosen(table, rows), calibration, place, recognised, unit)
     if not rows.all():
         numbered = np.flatnonzero(rows) + 1
         names = tuple(
@@ -391,6 +421,7 @@ def well_inputs(
         {**digests, "limits": limits_digest},
         model,
         None if rows.all() else rows,
+        shown_unit,
     )
 
 
@@ -435,26 +466,31 @@ def loaded_reference(
     return load_reference(reference)
 
 
-def start_of(numbers: Sequence[float]) -> tuple[float, float, float] | TieIn:
-    """Where a path starts: north, east and TVD of the first station, m, or behind depth, m, and two angles, degrees.
+def start_of(numbers: Sequence[float], unit: str = "m") -> tuple[float, float, float] | TieIn:
+    """Where a path starts: north, east and TVD of the first station, or behind measured depth and two angles, degrees.
+
+    Lengths are in a `unit` of length.
 
     Raises:
         InputError: neither three nor six numbers, or an inclination or depth that no hole has.
     """
-    if len(numbers) == 3:
-        return (float(numbers[0]), float(numbers[1]), float(numbers[2]))
-    if len(numbers) != 6:
+    if len(numbers) not in (3, 6):
         raise InputError(
             "`tie_in` must be north, east and TVD, or measured depth, inclination, azimuth, north, east and TVD; got "
             f"{len(numbers)} numbers."
         )
-    md, inclination, azimuth, *place = map(float, numbers)
-    if not (0 <= md <= LARGEST_DEPTH and 0 <= inclination <= 180):
+    metres = LENGTH_UNITS[unit]
+    north, east, tvd = (metres * float(number) for number in numbers[-3:])
+    if len(numbers) == 3:
+        return north, east, tvd
+    md, inclination, azimuth = map(float, numbers[:3])
+    if not (0 <= md * metres <= LARGEST_DEPTH and 0 <= inclination <= 180):
         raise InputError(
-            f"`tie_in` must have a depth of 0 to {LARGEST_DEPTH:g} m and an inclination of 0 to 180°; got {md:g} and "
-            f"{inclination:g}."
+            f"`tie_in` must have a depth of 0 to {LARGEST_DEPTH / metres:g} {unit} and an inclination of 0 to 180°; "
+            f"got {md:g} and {inclination:g}."
         )
-    return TieIn(md, float(np.radians(inclination)), float(np.radians(azimuth)), np.array(place))
+    place = np.array([north, east, tvd])
+    return TieIn(md * metres, float(np.radians(inclination)), float(np.radians(azimuth)), place)
 
 
 def check_drift(drift: object, msa: bool) -> None:
@@ -489,5 +525,7 @@ def survey_well(
         model=inputs.model,
     )  # fmt: skip
     findings = [*inputs.findings, *result.findings]
-    result = replace(result, findings=findings, sources=surveys.sources)
+    result = replace(
+        result, findings=findings, sources=surveys.sources, length_unit=inputs.length_unit
+    )
     return SurveyedWell(inputs, result, result.counts, analysis)

@@ -14,6 +14,7 @@ from mwdcal.calibration.prediction import UNKNOWN_GRAVITY, unknown_gravity
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, VECTORS
+from mwdcal.geometry.units import LENGTH_UNITS, USUAL_COURSES
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints, diagonal, wrap
 from mwdcal.survey.acceptance import (
     STRENGTH_NAMES,
@@ -163,6 +164,7 @@ class Well:
     `vectors` (n, 3) each as corrected; `extrapolated` (n,): stations without a statement of accuracy, None where
     none may be. `position`: None without measured depths. `sources`: where references come from, by name. `after`:
     what these stations leave to others that follow.
+    `started`: where their path starts. `length_unit`: of the columns.
     `errors`: of the error model in the standard uncertainties; None: these hold calibration, noise and declination.
     """
 
@@ -181,6 +183,7 @@ class Well:
     after: Before = Before()
     errors: WellErrors | None = None
     started: Start = (0.0, 0.0, 0.0)
+    length_unit: str = "m"
 
     @cached_property
     def sd_azimuth(self) -> Array:
@@ -279,14 +282,21 @@ class Well:
         if self.extrapolated is not None:
             columns[EXTRAPOLATED] = np.where(self.extrapolated, "true", "false")
         if self.position is not None:
-            for k, name in enumerate(AXES_OF_EARTH):
-                columns |= {
-                    f"{name}_m": self.position.place[:, k],
-                    f"sd_{name}_m": self.position.sd[:, k],
-                }
-            columns["dogleg_severity_deg_per_30m"] = np.degrees(self.position.dogleg * 30.0)
-            section = np.array([np.cos(self.north.section), np.sin(self.north.section)])
-            columns["vertical_section_m"] = self.position.place[:, :2] @ section
+            columns |= self._located(self.position)
+        return columns
+
+    def _located(self, position: Position) -> dict[str, AnyArray]:
+        """The columns of positions, in the unit of length."""
+        columns: dict[str, AnyArray] = {}
+        unit = self.length_unit
+        metres, course = LENGTH_UNITS[unit], USUAL_COURSES[unit]
+        place, sd = position.place / metres, position.sd / metres
+        for k, name in enumerate(AXES_OF_EARTH):
+            columns |= {f"{name}_{unit}": place[:, k], f"sd_{name}_{unit}": sd[:, k]}
+        severity = np.degrees(position.dogleg * course * metres)
+        columns[f"dogleg_severity_deg_per_{course:g}{unit}"] = severity
+        section = np.array([np.cos(self.north.section), np.sin(self.north.section)])
+        columns[f"vertical_section_{unit}"] = place[:, :2] @ section
         return columns
 
     @cached_property

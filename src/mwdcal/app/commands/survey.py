@@ -72,6 +72,12 @@ if TYPE_CHECKING:
     "the first station. Default: 0,0,0.",
 )
 @click.option(
+    "--length-unit",
+    type=click.Choice(["m", "ft", "usft"]),
+    help="Unit of length of the results and of --tie-in, and of depths whose column states none: metres, feet, or US "
+    "survey feet (1200/3937 m). Default: length_unit of mwdcal.toml, else m.",
+)
+@click.option(
     "--section-azimuth",
     type=float,
     default=0.0,
@@ -104,14 +110,14 @@ if TYPE_CHECKING:
 def command(
     calibration: Path, readings: Path, output: Path, reference: Path | None, msa: bool,
     msa_html: Path | None, sensor_drift: str | None, error_model: str, limits: str, switch: str,
-    tie_in: str | None, section_azimuth: float, station: str | None,
+    tie_in: str | None, length_unit: str | None, section_azimuth: float, station: str | None,
     contributions: Path | None, outside: str, missing: str, report: Path | None, decimal: str,
     key: tuple[Path, ...], as_json: bool,
 ) -> None:  # fmt: skip
     """Surveys of a well: READINGS in their order, corrected by the CALIBRATION of their tool.
 
     Adds inclination, azimuth, toolface, |g|, |b| and dip with standard uncertainties to the columns of READINGS, and
-    whether each survey lies within the limits; with measured depths (md_m) north, east and TVD.
+    whether each survey lies within the limits; with measured depths (md_m, md_ft or md_usft) north, east and TVD.
 
     \b
     Example: mwdcal survey tool.json surveys.csv --reference here.json -o well.csv --report well.html
@@ -130,7 +136,8 @@ def command(
     check_drift(sensor_drift, msa)
     given = [calibration, readings, reference, limits, error_model, *key]
     options.check_outputs([output, msa_html, contributions], given, page=report)
-    start, ends = _tie_in(tie_in), _switch(switch)
+    unit = length_unit or ""
+    start, ends = _tie_in(tie_in, unit), _switch(switch)
     loaded = load_calibration(calibration, key)
     fitted = loaded.calibration
     said = options.statements()
@@ -138,7 +145,7 @@ def command(
     if not whole and long_table.in_parts(readings, output, fitted.profile):
         result = long_table.survey_file(
             fitted, readings, output, reference, limits, start, ends, outside, decimal,
-            loaded.digest, loaded.findings, error_model, section_azimuth,
+            loaded.digest, loaded.findings, error_model, section_azimuth, unit,
         )  # fmt: skip
         _print(result, loaded.signature, (str(output), ""), as_json)
         return
@@ -146,7 +153,7 @@ def command(
     with offering_blank():
         inputs = well_inputs(
             fitted, table, reference, limits, msa, loaded.digest, loaded.findings, error_model, missing,
-            section_azimuth,
+            section_azimuth, unit,
         )  # fmt: skip
     analysis = analysed(inputs, sensor_drift) if msa else None
     pages = _interference_page(inputs, analysis, msa_html)
@@ -246,13 +253,14 @@ def _numbers(name: str, text: str, count: int) -> list[float]:
     return values
 
 
-def _tie_in(text: str | None) -> tuple[float, float, float] | TieIn | None:
+def _tie_in(text: str | None, unit: str) -> tuple[float, float, float] | TieIn | None:
     """Where the path starts, by three numbers or six."""
-    from mwdcal.survey.surveying import start_of
+    from mwdcal.survey.surveying import length_unit_of, start_of
 
     if text is None:
         return None
-    return start_of(_numbers("tie_in", text, 6 if text.count(",") > 2 else 3))
+    numbers = _numbers("tie_in", text, 6 if text.count(",") > 2 else 3)
+    return start_of(numbers, length_unit_of(unit)[1])
 
 
 def _switch(text: str) -> tuple[float, float]:

@@ -67,6 +67,8 @@ _UOMS = {
     },
 }
 """Units of measure of each quantity, in the one that we use."""
+UOM_OF_LENGTH = {"m": "m", "ft": "ft", "usft": "ftUS"}
+"""Units of measure by the units of lengths."""
 UOM_OF_UNIT = {
     **{"g": "gn", "mg": "mgn", "m/s²": "m/s2"},
     **{"nT": "nT", "µT": "uT", "mT": "mT", "gauss": "gauss"},
