@@ -119,6 +119,11 @@ def unmagnetic(columns, rng):
         columns[name] = [""] * ROWS
 
 
+def norths(columns, rng):
+    columns["ref_declination_deg"] = [repr(value) for value in np.linspace(1, 3, ROWS).tolist()]
+    columns["sd_random_ref_declination_deg"] = ["0.2"] * ROWS
+
+
 CASES = {
     "gaps": (gaps, ["declination_deg = 2.5"], ("--json",)),
     "reference": (gaps, ["declination_deg = 2.5"], ("--reference",)),
@@ -127,6 +132,7 @@ CASES = {
     "bare": (bare, ["declination_deg = 2.5"], ()),
     "swapped": (swapped, [], ()),
     "unmagnetic": (unmagnetic, [], ()),
+    "norths": (norths, [], ()),
 }  # fmt: skip
 
 

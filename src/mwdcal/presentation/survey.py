@@ -29,7 +29,7 @@ from mwdcal.presentation.signature import signature_status
 from mwdcal.presentation.text import chance, one_line, plural, table
 from mwdcal.survey.interference import Interference, InterferenceSize, MultiStationAnalysis
 from mwdcal.survey.norths import North
-from mwdcal.survey.surveying import SurveyedWell, WellInputs
+from mwdcal.survey.surveying import BY_ROW, SurveyedWell, WellInputs
 from mwdcal.survey.well import LastStation, Well, WellCounts
 from mwdcal.survey.well_errors import WellErrors
 from mwdcal.use.uncertainty import ErrorTerms, error_terms
@@ -140,6 +140,7 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
     """The output of `survey`: stations counted by outcome, what they were judged by, where the path ends.
 
     `blind`: accepted ones whose azimuth interference could turn and still pass.
+    The declination is the mean where it varies by row.
     `reference_sources`: where gravity, field, dip, declination and convergence come from, by name.
     `error_terms` are in the standard uncertainties of surveys and path, `not_included` are not; `error_model` states
     those that are not of the calibration. Drift counts over `years_since_calibration`; null: not known, taken as one.
@@ -206,7 +207,8 @@ def refusal(inputs: WellInputs, msa: MultiStationAnalysis) -> SurveySummary:
 def result_summary(result: SurveyedWell, output: str = "", html: str = "") -> SurveySummary:
     """The result for machines; `output` and `html` are the files that were written, if any."""
     msa = result.analysis.summary if result.analysis else None
-    unused = unused_columns(result.inputs.surveys.readings.unused)
+    others = result.inputs.surveys.readings.unused
+    unused = unused_columns(tuple(t for t in others if not any(name in t for name in BY_ROW)))
     facts = summary(result.well, result.counts, output, html, msa, unused)
     budget = result.contributions and contribution_summary(result.contributions)
     return replace(facts, contributions=budget)
@@ -281,6 +283,7 @@ def summary(
 
 def _stated(north: North, terms: ErrorTerms) -> dict[str, Any]:
     """The causes that turn azimuths, degrees, and what their uncertainty holds."""
+    north = north.typical
     sd = None if north.declination is None else north.declination_sd
     angles = {
         "declination_deg": north.declination,

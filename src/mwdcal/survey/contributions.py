@@ -123,12 +123,12 @@ def contributions(well: Well) -> Contributions | None:
     if well.position is not None:
         depth, path = np.where(well.blank, np.nan, well.position.md), well.position.on_path
     hole = hole_of(calibration, readings, depth, north.offset, well.started)
-    causes = _causes(well, readings, hole)
+    causes = _causes(well, readings, hole, np.ones(count, bool))
     positions = np.full((len(causes), count, 3, 3), np.nan)
     if path.any():
         some = readings if path.all() else readings.select(path)
-        below = hole_of(calibration, some, depth[path], north.offset, well.started)
-        along = causes if path.all() else _causes(well, some, below)
+        below = hole_of(calibration, some, depth[path], north.of_path(count)[0][path], well.started)
+        along = causes if path.all() else _causes(well, some, below, path)
         positions[:, path] = [along[cause].positions(below, well.started) for cause in causes]
     frame = _frame(hole)
     spread = np.einsum("nij,cnjk,nik->cni", frame, positions, frame)
@@ -156,21 +156,22 @@ def _frame(hole: Hole) -> Array:
     return np.concatenate([earth, np.stack([along, sideways, upward], 1)], 1)
 
 
-def _causes(well: Well, readings: Readings, hole: Hole) -> dict[Cause, _Errors]:
-    """Errors of direction and depth by cause; all together are those of the path of the well."""
-    calibration, north, count = well.calibration, well.north, readings.count
+def _causes(well: Well, readings: Readings, hole: Hole, rows: Bools) -> dict[Cause, _Errors]:
+    """Errors of direction and depth by cause at some rows; all together are those of the path of the well."""
+    calibration, count = well.calibration, readings.count
+    _, shared, alone = (value[rows][:, None, None] for value in well.north.of_path(len(rows)))
     whole = direction_errors(calibration, readings, declination_sd=1.0)
     lasting, noise = with_depth(whole.systematic), np.zeros((count, 3, 3))
     noise[:, :2, :2] = whole.random
     turn = lasting[:, -1:]  # by 1 rad of north
-    daily = turn.mT @ turn * north.declination_noise**2
+    daily = turn.mT @ turn * alone**2
     corrected = any(finding.id == CORRECTED for finding in calibration.findings)
     result = {
         Cause(CORRECTION if corrected else "calibration", SYSTEMATIC): _Errors.of(
             count, lasting[:, :-1]
         ),
         Cause("noise", RANDOM_ERRORS): _Errors.of(count, random=noise),
-        Cause("declination", OF_WELL): _Errors.of(count, turn * north.declination_sd),
+        Cause("declination", OF_WELL): _Errors.of(count, turn * shared),
         Cause("declination", RANDOM_ERRORS): _Errors.of(count, random=daily),
     }
     if well.errors is not None:

@@ -32,14 +32,16 @@ from mwdcal.geometry.vectors import Array, ArrayLike
 from mwdcal.sensor.profile import Profile
 from mwdcal.survey.acceptance import SurveyLimits
 from mwdcal.survey.error_model import BUILT_IN, ErrorModel
-from mwdcal.survey.norths import norths_of
+from mwdcal.survey.norths import DECLINATIONS, norths_of
 from mwdcal.survey.path import TieIn
 from mwdcal.survey.references import Claim, EarthReference
 from mwdcal.survey.surveying import (
+    BY_ROW,
     MEASURED_DEPTHS,
     SurveyedWell,
     SurveyReadings,
     WellInputs,
+    by_row,
     check_free,
     claim,
     depth_column,
@@ -53,6 +55,7 @@ from mwdcal.survey.surveying import (
     not_deeper,
     of_reference,
     station_readings,
+    typical_north,
     with_reference,
     with_section,
 )
@@ -73,7 +76,7 @@ LONG_ROWS = 1 << 16
 """Rows of a Parquet table beyond which it is."""
 _TEXT_ROWS = 1 << 14
 """Rows of a part of a Parquet table that becomes text."""
-_ALSO = (*MEASURED_DEPTHS, *LABELS, "simulated")
+_ALSO = (*MEASURED_DEPTHS, *BY_ROW, *LABELS, "simulated")
 _DELIMITERS = {".csv": ",", ".tsv": "\t"}
 
 
@@ -109,6 +112,7 @@ class _Stations(NamedTuple):
 
     readings: Readings
     md: Array | None
+    north: dict[str, Array]
     carried: dict[str, Column | Any]
 
 
@@ -196,10 +200,17 @@ class _LongTable:
         self.located = depth in MEASURED_DEPTHS and any(
             not is_blank(table, depth) for table in self._tables()
         )
+        metadata = {**self.source.metadata, **typical_north(self._by_row())}
         self.north = norths_of(
-            self.source.metadata, self.source.name, self._all_readings, settings.calibration,
-            settings.reference,
-        )  # fmt: skip
+            metadata, self.source.name, self._all_readings, settings.calibration, settings.reference
+        )
+
+    def _by_row(self) -> dict[str, Array]:
+        """The columns of a declination that varies by row, of the whole table."""
+        if DECLINATIONS[0] not in self.source.names:
+            return {}
+        parts = [by_row(table) for table in self._tables()]
+        return {n: np.concatenate([each[n] for each in parts]) for n in parts[0]}
 
     def _head(self, source: StreamedTable) -> Table:
         """The table without rows; refuses names of columns that surveys cannot have."""
@@ -264,7 +275,7 @@ class _LongTable:
         given = labels(table, "station") or [""] * table.count
         numbered = enumerate(given, sum(seen.rows) + 1)
         readings = replace(readings, station=tuple(label or str(i) for i, label in numbered))
-        return _Stations(readings, md, self._carried(part))
+        return _Stations(readings, md, by_row(table), self._carried(part))
 
     def _carried(self, part: Part) -> dict[str, Column | Any]:
         """The columns of the input as they are written: text as it is, numbers of typed formats as such."""
@@ -281,10 +292,11 @@ class _LongTable:
         self._note(readings, md)
         if settings.reference:
             readings = with_reference(readings, settings.reference)
+        north = self.north.by_row(stations.north)
         if md is None and self.located:
             md = np.full(readings.count, np.nan)
         well, tally = part_of_well(
-            calibration, readings, settings.limits, self.north, md, seen.before, settings.switch,
+            calibration, readings, settings.limits, north, md, seen.before, settings.switch,
             settings.outside, model=settings.model, whole=False,
         )  # fmt: skip
         well = replace(well, length_unit=settings.shown_unit)

@@ -272,16 +272,17 @@ def direction_gradient(g: Array, b: Array) -> tuple[Array, Array]:
 def direction_errors(
     calibration: Calibration,
     readings: Readings,
-    north: float = 0.0,
-    declination_sd: float = 0.0,
-    declination_noise: float = 0.0,
+    north: float | Array = 0.0,
+    declination_sd: float | Array = 0.0,
+    declination_noise: float | Array = 0.0,
 ) -> DirectionErrors:
     """The direction of the hole at readings (…, n), with its errors from the calibration and from noise.
 
     Errors of the calibration last over the well, with the uncertainty of north as one cause more; noise is new at every
     station.
     Units: radians. `north`: declination, for azimuths from true north, less convergence, for those from
-    grid north; `declination_sd`: its standard uncertainty, and `declination_noise` what is new at every station.
+    grid north; `declination_sd`: its standard uncertainty, and `declination_noise` what is new at every station; each
+    one value, or one for each station (n,).
     Singular: finite at vertical. NaN where the direction rests on what no evidence determines, and without a field.
     """
     g, b = calibration.fields(readings)
@@ -295,9 +296,11 @@ def direction_errors(
     return DirectionErrors(
         inclination=inclination,
         azimuth=wrap(azimuth + north),
-        systematic=np.concatenate([shifts, turn[..., None, :] * declination_sd], -2),
+        systematic=np.concatenate(
+            [shifts, turn[..., None, :] * np.asarray(declination_sd)[..., None, None]], -2
+        ),
         random=gradient @ calibration.noise_covariance(readings) @ gradient.mT
-        + declination_noise**2 * outer(turn),
+        + np.asarray(declination_noise)[..., None, None] ** 2 * outer(turn),
     )
 
 
@@ -363,7 +366,7 @@ def continued_path(
     calibration: Calibration,
     readings: Readings,
     md: ArrayLike,
-    norths: tuple[float, float, float],
+    norths: tuple[ArrayLike, ArrayLike, ArrayLike],
     before: ArrayLike | TieIn | PathEnd = (0.0, 0.0, 0.0),
     more: Callable[[DirectionErrors, Readings, slice], DirectionErrors] | None = None,
 ) -> tuple[Array, Array, PathEnd]:
@@ -380,9 +383,11 @@ def continued_path(
             "`md` must increase from station to station. Sort the stations by measured depth."
         )
 
+    each_north = [np.broadcast_to(np.asarray(value, float), depth.shape) for value in norths]
+
     def part(where: slice) -> tuple[Array, DirectionErrors]:
         some = rows_of(readings, where)
-        errors = direction_errors(calibration, some, *norths)
+        errors = direction_errors(calibration, some, *(value[where] for value in each_north))
         return depth[where], errors if more is None else more(errors, some, where)
 
     place, covariance, end = [], [], None

@@ -18,7 +18,13 @@ from mwdcal.calibration.readings import CONSTANTS, Readings, is_simulated
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files import synonyms
-from mwdcal.files.contract import REFERENCES, check_columns
+from mwdcal.files.contract import (
+    REFERENCES,
+    ROTATION,
+    check_columns,
+    check_near_misses,
+    stated_norths,
+)
 from mwdcal.files.faults import chosen, nothing, spread, wholly_blank, without_reading
 from mwdcal.files.formats.table import Table, cell_error, numbers
 from mwdcal.files.runs import renamed, to_readings
@@ -31,7 +37,7 @@ from mwdcal.survey.contributions import Contributions, contributions
 from mwdcal.survey.error_model import BUILT_IN, ErrorModel, load_error_model
 from mwdcal.survey.interference import Interference, interference
 from mwdcal.survey.interference_estimate import Assumed, sensor_drift
-from mwdcal.survey.norths import SD_KEY, North, norths_of
+from mwdcal.survey.norths import DECLINATIONS, SD_KEY, North, norths_of
 from mwdcal.survey.path import TieIn
 from mwdcal.survey.references import (
     FROM_REFERENCE,
@@ -50,6 +56,14 @@ NO_MODEL = "none"
 """The word for standard uncertainties of calibration, noise and declination alone."""
 MEASURED_DEPTHS = {f"md_{unit}": unit for unit in LENGTH_UNITS}
 """The columns of measured depths, with their unit."""
+RANDOM_COLUMNS = {f"sd_random_{REFERENCES[name].column}": RANDOM + name for name in CONSTANTS}
+"""Columns of what gravity, field and dip are uncertain by anew at every row, by their names in `Readings.sd`."""
+BY_ROW = {
+    DECLINATIONS[0]: ROTATION,
+    **dict.fromkeys(DECLINATIONS[1:], REFERENCES["dip"].uncertainty),
+    **{f"sd_random_{REFERENCES[name].column}": REFERENCES[name].uncertainty for name in CONSTANTS},
+}
+"""Columns of references that surveys alone have, with the values they take."""
 MOST_CONTRIBUTED = 2000
 """Surveys of a table whose contributions are computed."""
 LARGEST_DEPTH = 20_000.0
@@ -98,7 +112,10 @@ def survey_readings(
         InputError: a table that cannot be read, depths under another name or in another unit.
     """
     readings, md = station_readings(table, calibration, recognised, length_unit)
-    north = norths_of(table.metadata, table.source, lambda: [readings], calibration, reference)
+    rows = by_row(renamed(table, calibration.profile))
+    stated = {**table.metadata, **typical_north(rows)}
+    north = norths_of(stated, table.source, lambda: [readings], calibration, reference)
+    north = north.by_row(rows)
     claims = {
         name: claim(table.source, readings, name)
         for name in judged_constants(calibration, readings)
@@ -118,7 +135,51 @@ def station_readings(
         synonyms.check_evidence(list(table.columns), table.source, ("temperature_c",))
     in_a_well = replace_struct(calibration.profile, stand=StandProfile())
     readings, _ = to_readings(table, in_a_well, recognised)
+    columns = by_row(table).items()
+    alone = {RANDOM_COLUMNS[name]: values for name, values in columns if name in RANDOM_COLUMNS}
+    if alone:
+        factors = {RANDOM + name: REFERENCES[name].factor for name in CONSTANTS}
+        alone = {name: np.nan_to_num(values) * factors[name] for name, values in alone.items()}
+        readings = replace(readings, sd={**readings.sd, **alone})
     return readings, depths(table, length_unit)
+
+
+def by_row(table: Table) -> dict[str, Array]:
+    """Columns (n,) of references that a survey alone has, in the units of files: declination, and 1σ new at each row.
+
+    Raises:
+        InputError: a cell that cannot be, or a declination that is blank where nothing else states one.
+    """
+    check_near_misses([*table.columns], [*BY_ROW], f"{table.source}: column")
+    result = {}
+    for name, limits in BY_ROW.items():
+        if name not in table.columns:
+            continue
+        cells = table.columns[name]
+        values = numbers(table, name) if isinstance(cells, list) else np.asarray(cells, float)
+        wrong = np.flatnonzero(limits.outside(values))
+        if wrong.size:
+            problem = f"must be {limits}; got {values[wrong[0]]:g}."
+            raise cell_error(table, name, int(wrong[0]), problem)
+        result[name] = values
+    declination = result.get(DECLINATIONS[0])
+    if declination is None:
+        return result
+    otherwise = stated_norths(table.metadata, table.source).get("declination_deg", np.nan)
+    declination = np.where(np.isnan(declination), otherwise, declination)
+    result[DECLINATIONS[0]] = declination
+    blank = np.flatnonzero(np.isnan(declination))
+    if 0 < blank.size < declination.size:
+        problem = "is blank, and no declination_deg in the metadata stands for it. Fill the cell, or state one."
+        raise cell_error(table, DECLINATIONS[0], int(blank[0]), problem)
+    return result if not blank.size else {k: v for k, v in result.items() if k != DECLINATIONS[0]}
+
+
+def typical_north(rows: Mapping[str, Array]) -> dict[str, float]:
+    """The declination of a table that varies by row, and its 1σ, as metadata state one for all: their means."""
+    keys = zip(("declination_deg", SD_KEY), DECLINATIONS[:2], strict=True)
+    known = {key: rows[name] for key, name in keys if name in rows and DECLINATIONS[0] in rows}
+    return {k: float(np.nanmean(v)) for k, v in known.items() if not np.isnan(v).all()}
 
 
 def judged_constants(calibration: Calibration, readings: Readings) -> tuple[str, ...]:
@@ -182,7 +243,7 @@ def with_reference(readings: Readings, reference: EarthReference) -> Readings:
         blank = np.isnan(stated)
         known[name] = np.where(blank, value, stated)
         sd[name] = np.where(blank, shared, readings.uncertainty(name))
-        sd[RANDOM + name] = np.where(blank, alone, 0.0)
+        sd[RANDOM + name] = np.where(blank, alone, readings.uncertainty(RANDOM + name))
     return replace(readings, known=known, sd=sd)
 
 
@@ -289,7 +350,7 @@ def check_free(table: Table, results: Collection[str]) -> None:
 
 def described(well: Well) -> Mapping[str, object]:
     """The statements of a table of surveys about the calibration, north and limits it rests on."""
-    calibration, north = well.calibration, well.north
+    calibration, north = well.calibration, well.north.typical
     stated: dict[str, object] = {
         "calibration_run": calibration.run,
         "calibration_time": calibration.time,

@@ -254,7 +254,7 @@ class Well:
     @cached_property
     def columns(self) -> dict[str, AnyArray]:
         """Results by column, in the units of files; only azimuths whose north is known."""
-        norths = {"magnetic": 0.0}
+        norths: dict[str, float | Array] = {"magnetic": 0.0}
         if self.north.declination is not None:
             norths["true"] = self.north.declination
             if self.north.convergence is not None:
@@ -503,8 +503,9 @@ def _positions(
     dogleg = np.full(len(md), np.nan)
     if whole.any():
         some = readings if whole.all() else readings.select(whole)
-        norths, at = (north.offset, north.declination_sd, north.declination_noise), md[whole]
-        hole = hole_of(calibration, some, at, north.offset, before)
+        offset, shared, alone = (value[whole] for value in north.of_path(len(md)))
+        norths, at = (offset, shared, alone), md[whole]
+        hole = hole_of(calibration, some, at, offset, before)
         more = None if errors is None else errors.of_path(calibration, hole)
         dogleg[whole] = hole.dogleg
         if not isinstance(before, TieIn | PathEnd):  # no course leads to the first station

@@ -173,7 +173,7 @@ def hole_of(
     calibration: Calibration,
     readings: Readings,
     md: Array,
-    north: float = 0.0,
+    north: float | Array = 0.0,
     before: Sequence[float] | TieIn | PathEnd = (),
 ) -> Hole:
     """The hole as the readings see it; TVD where all depths are known.
