@@ -442,6 +442,7 @@ def survey(
     limits: FilePath | SurveyLimits = "owsg-mwd",
     sensor_drift: FilePath | None = None,
     error_model: FilePath | ErrorModel = "owsg-mwd",
+    runs: Sequence[tuple[Calibration | FilePath, Tabular | Readings]] = (),
     switch: tuple[float, float] = (3.0, 5.0),
     tie_in: Sequence[float] | None = None,
     section_azimuth: float = 0.0,
@@ -466,6 +467,8 @@ def survey(
         sensor_drift: with `msa`, drift of the sensors since the calibration, 1σ: owsg (the default), none, or a file.
         error_model: what the standard uncertainties hold besides calibration, noise and declination: owsg-mwd,
             none, or a file in ISCWSA's JSON form.
+        runs: the runs of the same well that follow, each a calibration and readings: their path goes on where the run
+            before ended.
         switch: inclinations, degrees, below which the toolface counts from magnetic north, and above which from the
             high side.
         tie_in: north, east and TVD of the first station, in `length_unit`; or measured depth, inclination, azimuth
@@ -487,7 +490,8 @@ def survey(
         `well.columns["azimuth_true_deg"]` and `well.interference.axial_nt`.
     """
     from mwdcal.presentation.signature import load_calibration
-    from mwdcal.survey.surveying import analysed, check_drift, start_of, survey_well, well_inputs
+    from mwdcal.survey.runs import survey_runs
+    from mwdcal.survey.surveying import analysed, check_drift, start_of, well_inputs
 
     check_drift(sensor_drift, msa)
     ends: Any = tuple(np.radians(_finite("switch", switch, 2)).tolist())
@@ -496,17 +500,24 @@ def survey(
         if tie_in is None
         else start_of(_finite("tie_in", tie_in, len(tie_in)), length_unit or "m")
     )
-    loaded = load_calibration(_source(cal), [Path(key) for key in keys])
-    table = _survey_table(readings, loaded.calibration, decimal)
-    inputs = well_inputs(
-        loaded.calibration, table, _earth(reference), limits, msa, loaded.digest, loaded.findings,
-        error_model, missing, _number("section_azimuth", section_azimuth), length_unit,
-    )  # fmt: skip
-    analysis = analysed(inputs, sensor_drift) if msa else None
-    if analysis:
-        analysis.check()
-    result = survey_well(inputs, analysis, tie_in=start, switch=ends, outside=outside)
-    return WellSurvey(result, loaded.signature)
+    loaded = [
+        load_calibration(_source(tool), [Path(key) for key in keys])
+        for tool in (cal, *(tool for tool, _ in runs))
+    ]
+    inputs = [
+        well_inputs(
+            tool.calibration, _survey_table(table, tool.calibration, decimal), _earth(reference), limits, msa,
+            tool.digest, tool.findings, error_model, missing, _number("section_azimuth", section_azimuth),
+            length_unit,
+        )
+        for tool, table in zip(loaded, (readings, *(table for _, table in runs)), strict=True)
+    ]  # fmt: skip
+    analyses = [analysed(each, sensor_drift) if msa else None for each in inputs]
+    for analysis in analyses:
+        if analysis:
+            analysis.check()
+    result = survey_runs(inputs, analyses, tie_in=start, switch=ends, outside=outside)
+    return WellSurvey(result, loaded[0].signature)
 
 
 def convert(

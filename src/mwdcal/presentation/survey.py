@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from mwdcal.calibration.canonical import SignatureCheck
 from mwdcal.calibration.diagnosis.findings import unused_columns
-from mwdcal.calibration.readings import simulated
+from mwdcal.calibration.readings import serial_of, simulated
 from mwdcal.calibration.record import Finding, stated
 from mwdcal.geometry.units import LENGTH_UNITS
 from mwdcal.presentation.contributions import (
@@ -136,6 +136,24 @@ class EndOfPath(msgspec.Struct, frozen=True, kw_only=True):
     covariance_m2: list[list[float | None]]
 
 
+class RunOfWell(msgspec.Struct, frozen=True, kw_only=True):
+    """One of several runs of a well: its tool, its surveys, and where it ends."""
+
+    run: int
+    serial: str
+    readings: str
+    readings_sha256: str
+    calibration_run: str
+    calibration_time: str
+    calibration_sha256: str
+    years_since_calibration: float | None
+    rows: int
+    accepted: int
+    rejected: int
+    end: EndOfPath | None
+    msa: MultiStationAnalysis | None
+
+
 class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
     """The output of `survey`: stations counted by outcome, what they were judged by, where the path ends.
 
@@ -146,6 +164,7 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
     those that are not of the calibration. Drift counts over `years_since_calibration`; null: not known, taken as one.
     `msa` is the multi-station analysis, if one was asked for; `interference` and `separable` are of it.
     Lengths are in metres; `length_unit` is that of table, screen and page.
+    `runs` of a well in several; its stations are then named run:station.
     `contributions`: what makes the uncertainty of each survey; null beyond 2000 surveys.
     """
 
@@ -175,6 +194,7 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
     separable: bool | None = None
     msa: MultiStationAnalysis | None = None
     contributions: ContributionSummary | None = None
+    runs: list[RunOfWell] = []
 
 
 def refusal(inputs: WellInputs, msa: MultiStationAnalysis) -> SurveySummary:
@@ -211,7 +231,41 @@ def result_summary(result: SurveyedWell, output: str = "", html: str = "") -> Su
     unused = unused_columns(tuple(t for t in others if not any(name in t for name in BY_ROW)))
     facts = summary(result.well, result.counts, output, html, msa, unused)
     budget = result.contributions and contribution_summary(result.contributions)
-    return replace(facts, contributions=budget)
+    runs = [_run_of_well(i, run) for i, run in enumerate(result.runs, 1)]
+    return replace(facts, contributions=budget, runs=runs)
+
+
+def _run_of_well(place: int, run: SurveyedWell) -> RunOfWell:
+    well, counts = run.well, run.counts
+    return RunOfWell(
+        run=place, serial=serial_of(well.calibration.tool) or "", readings=well.readings.source,
+        readings_sha256=run.inputs.digests["readings"], calibration_run=well.calibration.run,
+        calibration_time=well.calibration.time, calibration_sha256=run.inputs.digests["calibration"],
+        years_since_calibration=well.errors.years if well.errors else None,
+        rows=counts.rows, accepted=counts.accepted, rejected=counts.rejected,
+        end=end_of_path(counts.end) if counts.end else None,
+        msa=run.analysis.summary if run.analysis else None,
+    )  # fmt: skip
+
+
+def runs_in_words(facts: SurveySummary) -> list[str]:
+    """A line for each of several runs: its tool and surveys, and where it ends."""
+    metres = LENGTH_UNITS[facts.length_unit]
+    lines = []
+    for run in facts.runs:
+        years = run.years_since_calibration
+        time = (
+            "time since the calibration unknown"
+            if years is None
+            else f"{fixed(years, 2)} years since the calibration"
+        )
+        end = f", to {fixed(run.end.md_m / metres, 2)} {facts.length_unit} MD" if run.end else ""
+        counts = f"{run.accepted} of {plural(run.rows, 'survey')} accepted"
+        tool = f"tool {run.serial}, " if run.serial else ""
+        lines.append(
+            f"run {run.run}   {run.readings}   {tool}calibration {run.calibration_run}, {time}   {counts}{end}"
+        )
+    return lines
 
 
 def document(inputs: WellInputs, facts: SurveySummary, signature: SignatureCheck) -> dict[str, Any]:
@@ -232,7 +286,8 @@ def whole_screen(
     `station`: label of the one whose contributions are shown, by default the last. `files`: others that were written.
     """
     stated = result.inputs.stated
-    parts = [interference_screen(result.analysis, *stated)] if result.analysis else []
+    analyses = [run.analysis for run in result.runs] or [result.analysis]
+    parts = [interference_screen(each, *stated) for each in analyses if each]
     parts.append(screen(result.well, facts, signature, *stated))
     if result.contributions:
         unit = result.well.length_unit
@@ -243,7 +298,8 @@ def whole_screen(
 
 def all_findings(facts: SurveySummary) -> list[Finding]:
     """The findings of the multi-station analysis, then those about the surveys."""
-    return [*(facts.msa.findings if facts.msa else []), *facts.findings]
+    analyses = [facts.msa, *(run.msa for run in facts.runs)]
+    return [*(f for each in analyses if each for f in each.findings), *facts.findings]
 
 
 def summary(
@@ -333,13 +389,14 @@ def screen(
         "   ".join(heading),
         f"azimuths from {facts.north} north{declination_in_words(facts)}   limits {facts.limits}{source}",
     ]
+    lines += runs_in_words(facts)
     if facts.reference_sources:
         lines.append(sources_in_words(facts))
     if facts.end:
         lines.append(end_in_words(facts.end, facts.north, facts.length_unit))
     lines.append(well.terms.sentence)
     if well.errors:
-        lines.append(model_in_words(well.errors))
+        lines.append(model_in_words(well.errors, bool(facts.runs)))
     return "\n".join(
         [
             *map(one_line, lines),
@@ -349,8 +406,10 @@ def screen(
     )
 
 
-def model_in_words(errors: WellErrors) -> str:
-    """The error model, and the time over which the sensors may have drifted."""
+def model_in_words(errors: WellErrors, runs: bool = False) -> str:
+    """The error model, and the time over which the sensors may have drifted; that of several runs stands with these."""
+    if runs:
+        return f"error model {errors.model.name} ({errors.model.source})"
     time = (
         "an unknown time since the calibration, taken as a year"
         if errors.years is None

@@ -19,8 +19,9 @@ from mwdcal.presentation.survey import (
     SurveySummary,
     declination_in_words,
     end_in_words,
+    result_summary,
+    runs_in_words,
     sources_in_words,
-    summary,
     survey_rows,
 )
 from mwdcal.presentation.text import plural
@@ -342,7 +343,12 @@ MOST_ROWS_OF_PAGE = 2000
 def render(surveyed: SurveyedWell, findings: list[Finding]) -> str:
     """The surveys as HTML, with the multi-station analysis if there is one."""
     well, analysis, budget = surveyed.well, surveyed.analysis, surveyed.contributions
-    facts = summary(well, well.counts, "", "")
+    facts = result_summary(surveyed)
+    digests = dict(surveyed.inputs.named)
+    for i, run in enumerate(surveyed.runs[1:], 2):
+        digests |= {
+            f"{name} {i}": run.inputs.named.get(name, "") for name in digests if " " not in name
+        }
     stated = well.readings.metadata, well.calibration.tool
     header, rows = survey_rows(well, MOST_ROWS_OF_PAGE)
     located = has_path(well.position)
@@ -371,7 +377,8 @@ def render(surveyed: SurveyedWell, findings: list[Finding]) -> str:
         analysis=sections(analysis) if analysis else None,
         more=facts.rows - len(rows),
         calibration=well.calibration.run_name,
-        sha256=surveyed.inputs.named,
+        sha256={name: digest for name, digest in digests.items() if digest},
+        runs=runs_in_words(facts),
     )
 
 

@@ -7,6 +7,7 @@ propagates: *random* errors are new at every station, *systematic* ones last ove
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -14,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.record import Calibration
 from mwdcal.geometry.vectors import Array, Bools
 from mwdcal.survey.error_model import Hole
 from mwdcal.survey.path import (
@@ -25,7 +27,7 @@ from mwdcal.survey.path import (
     tilts,
 )
 from mwdcal.survey.well import Start, Well
-from mwdcal.survey.well_errors import WellErrors, hole_of, with_depth
+from mwdcal.survey.well_errors import SENSOR_CAUSES, WellErrors, hole_of, with_depth
 from mwdcal.use.uncertainty import AXIAL_INTERFERENCE, CORRECTED, DRIFT, OF_MODELS
 
 CORRECTION = "calibration and multi-station analysis"
@@ -98,50 +100,131 @@ class _Errors(NamedTuple):
         each = np.diagonal(self.random, axis1=-2, axis2=-1)
         return np.asarray((self.lasting**2).sum(-2) + each)[:, :2]
 
-    def positions(self, hole: Hole, start: Start) -> Array:
-        """Covariance (n, 3, 3) of the positions of a hole from where it starts; a tie-in is exact."""
-        path, first = [hole.md, hole.inclination, hole.azimuth], isinstance(start, TieIn)
+    def positions(self, runs: Sequence[_Run], start: Start) -> Array:
+        """Covariance (n, 3, 3) of the positions of runs from where the first one starts; a tie-in is exact."""
+        holes = [run.below for run in runs if run.path.any()]
+        md, inclination, azimuth = (
+            np.concatenate([getattr(hole, name) for hole in holes])
+            for name in ("md", "inclination", "azimuth")
+        )
         lasting, random, course = self
+        first = isinstance(start, TieIn)
         if isinstance(start, TieIn):
-            path = [np.concatenate([[a], b]) for a, b in zip(start[:3], path, strict=True)]
+            path = zip(start[:3], (md, inclination, azimuth), strict=True)
+            md, inclination, azimuth = (np.concatenate([[a], b]) for a, b in path)
             lasting, random, course = (
                 np.concatenate([np.zeros((1, *each.shape[1:])), each]) for each in self
             )
-        md, inclination, azimuth = path
         covariance = position_covariance(md, inclination, azimuth, lasting, random, course=course)
         return covariance[1:] if first else covariance
 
 
-def contributions(well: Well) -> Contributions | None:
-    """The contributions at all stations of a well; None where azimuths are not measured."""
-    calibration, readings, north = well.calibration, well.readings, well.north
-    if not calibration.has_field or readings.magnetometer is None:
+class _Run(NamedTuple):
+    """A run: its hole and causes at all stations, and at those of the path (n,)."""
+
+    well: Well
+    hole: Hole
+    causes: dict[Cause, _Errors]
+    path: Bools
+    below: Hole
+    along: dict[Cause, _Errors]
+
+
+def contributions(wells: Sequence[Well]) -> Contributions | None:
+    """The contributions at all stations of a well, in one or several runs; None where azimuths are not measured."""
+    if any(not w.calibration.has_field or w.readings.magnetometer is None for w in wells):
         return None
-    count = readings.count
-    depth = np.full(count, np.nan)
-    path: Bools = np.zeros(count, bool)
-    if well.position is not None:
-        depth, path = np.where(well.blank, np.nan, well.position.md), well.position.on_path
-    hole = hole_of(calibration, readings, depth, north.offset, well.started)
-    causes = _causes(well, readings, hole, np.ones(count, bool))
-    positions = np.full((len(causes), count, 3, 3), np.nan)
+    runs = [_run(well) for well in wells]
+    causes = tuple(dict.fromkeys(cause for run in runs for cause in run.causes))
+    path = np.concatenate([run.path for run in runs])
+    positions = np.full((len(causes), len(path), 3, 3), np.nan)
     if path.any():
-        some = readings if path.all() else readings.select(path)
-        below = hole_of(calibration, some, depth[path], north.of_path(count)[0][path], well.started)
-        along = causes if path.all() else _causes(well, some, below, path)
-        positions[:, path] = [along[cause].positions(below, well.started) for cause in causes]
-    frame = _frame(hole)
+        along = [_joined_errors(runs, cause) for cause in causes]
+        positions[:, path] = [errors.positions(runs, wells[0].started) for errors in along]
+    frame = np.concatenate([_frame(run.hole) for run in runs])
     spread = np.einsum("nij,cnjk,nik->cni", frame, positions, frame)
-    if well.position is not None:
-        lost = np.asarray(np.isnan(well.position.covariance).any((-1, -2)))
-        spread = np.where(lost[:, None], np.nan, spread)
-    angles = _angles(well, np.stack([errors.angles for errors in causes.values()]))
-    labels = tuple(readings.labels)
-    return Contributions(labels, depth, (*causes,), np.concatenate([angles, spread], -1))
+    lost = np.concatenate([_lost(well) for well in wells])
+    spread = np.where(lost[:, None], np.nan, spread)
+    angles = np.concatenate([_angles(run, causes) for run in runs], 1)
+    labels = [[*well.readings.labels] for well in wells]
+    if len(wells) > 1:
+        labels = [[f"{i}:{name}" for name in each] for i, each in enumerate(labels, 1)]
+    depth = np.concatenate([_depth(well) for well in wells])
+    variance = np.concatenate([angles, spread], -1)
+    return Contributions(tuple(name for each in labels for name in each), depth, causes, variance)
 
 
-def _angles(well: Well, turns: Array) -> Array:
-    """Variances (c, n, 2) of inclination and azimuth by those upward and sideways, where these are stated."""
+def _run(well: Well) -> _Run:
+    """A run of a well."""
+    readings, north, count = well.readings, well.north, well.readings.count
+    path = np.zeros(count, bool) if well.position is None else well.position.on_path
+    depth, offset = np.where(well.blank, np.nan, _depth(well)), north.of_path(count)[0]
+    hole = hole_of(well.calibration, readings, depth, offset, well.started)
+    causes = _causes(well, readings, hole, np.ones(count, bool))
+    if path.all() or not path.any():
+        return _Run(well, hole, causes, path, hole, causes if path.any() else {})
+    some = readings.select(path)
+    below = hole_of(well.calibration, some, depth[path], offset[path], well.started)
+    return _Run(well, hole, causes, path, below, _causes(well, some, below, path))
+
+
+def _depth(well: Well) -> Array:
+    return np.full(well.readings.count, np.nan) if well.position is None else well.position.md
+
+
+def _lost(well: Well) -> Bools:
+    """Stations (n,) without a statement of the accuracy of their position."""
+    if well.position is None:
+        return np.ones(well.readings.count, bool)
+    return np.asarray(np.isnan(well.position.covariance).any((-1, -2)))
+
+
+def _joined_errors(runs: Sequence[_Run], cause: Cause) -> _Errors:
+    """The errors of one cause along all runs: its lasting ones are the same in all, or each run has its own."""
+    counts = [int(run.path.sum()) for run in runs]
+    parts = [run.along.get(cause, _Errors.of(n)) for run, n in zip(runs, counts, strict=True)]
+    if cause.propagation not in (RANDOM_ERRORS, SYSTEMATIC):
+        owners = [0] * len(runs)
+    elif cause.name == "calibration":
+        calibrations = [run.well.calibration for run in runs]
+        owners = [
+            next(i for i, other in enumerate(calibrations) if _same(other, calibration))
+            for calibration in calibrations
+        ]
+    else:
+        owners = [*range(len(runs))]
+    widths = {
+        owner: max(p.lasting.shape[1] for p, o in zip(parts, owners, strict=True) if o == owner)
+        for owner in owners
+    }
+    blocks = [
+        np.concatenate(
+            [
+                part.lasting if o == owner else np.zeros((n, width, 3))
+                for o, width in widths.items()
+            ],
+            1,
+        )
+        if part.lasting.shape[1]
+        else np.zeros((n, sum(widths.values()), 3))
+        for part, owner, n in zip(parts, owners, counts, strict=True)
+    ]
+    return _Errors(
+        np.concatenate(blocks), *(np.concatenate([part[k] for part in parts]) for k in (1, 2))
+    )
+
+
+def _same(one: Calibration, other: Calibration) -> bool:
+    """Whether two calibrations are the same: their errors are then the same too."""
+    return np.array_equal(one.parameters, other.parameters) and np.array_equal(
+        one.parameter_covariance, other.parameter_covariance
+    )
+
+
+def _angles(run: _Run, causes: Sequence[Cause]) -> Array:
+    """Variances (c, n, 2) of inclination and azimuth by causes, where 1σ of these is stated."""
+    well, none = run.well, _Errors.of(run.well.readings.count)
+    turns = np.stack([run.causes.get(cause, none).angles for cause in causes])
     stated = np.stack([np.isfinite(well.surveys.of(name)[1]) for name in CONTRIBUTED[:2]], -1)
     sine = np.sin(well.surveys.of("inclination")[0])
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -185,8 +268,8 @@ def _modelled(errors: WellErrors, fields: tuple[Array, Array], hole: Hole) -> di
     sensors = with_depth(errors.columns(*fields, errors.unit(hole)) @ gradient.mT)
     count, modes = len(hole.md), {t.name: t.propagation_mode.lower() for t in errors.model.terms}
     result = {
-        Cause(AXIAL_INTERFERENCE, SYSTEMATIC): _Errors.of(count, sensors[:, 12:]),
-        Cause(DRIFT, SYSTEMATIC): _Errors.of(count, sensors[:, :12]),
+        Cause(AXIAL_INTERFERENCE, SYSTEMATIC): _Errors.of(count, sensors[:, SENSOR_CAUSES - 1 :]),
+        Cause(DRIFT, SYSTEMATIC): _Errors.of(count, sensors[:, : SENSOR_CAUSES - 1]),
     }
     groups: dict[Cause, list[Array]] = {}
     for kind in ("lasting", "random", "course"):

@@ -21,7 +21,7 @@ lasting cause makes along the well are added before they are squared; those of i
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -229,6 +229,50 @@ class PathEnd(NamedTuple):
     md: Array
     errors: DirectionErrors
     sums: _Sums
+
+    def widened(self, causes: int) -> PathEnd:
+        """The same with room for more lasting causes, which so far have done nothing."""
+        errors, sums = self.errors, self.sums
+        return PathEnd(
+            self.md, replace(errors, systematic=_widened(errors.systematic, causes)),
+            sums._replace(shift=_widened(sums.shift, causes)),
+        )  # fmt: skip
+
+
+def _widened(shifts: Array, causes: int) -> Array:
+    """Shifts (…, k, m) with zeros up to so many causes."""
+    lacking = np.zeros((*shifts.shape[:-2], causes - shifts.shape[-2], shifts.shape[-1]))
+    return np.concatenate([shifts, lacking], -2)
+
+
+@dataclass(frozen=True)
+class CauseOrder:
+    """The order of lasting causes along several runs: those before a run, then those that it adds.
+
+    `names` of all, empty for those of one run alone; `places` in them of the causes of the run.
+    """
+
+    names: tuple[str, ...]
+    places: tuple[int, ...]
+
+    @staticmethod
+    def of(before: tuple[str, ...], causes: tuple[str, ...]) -> CauseOrder:
+        """For a run with some `causes`, after runs with those `before`."""
+        names, places = [*before], []
+        for name in causes:
+            if name and name in before:
+                places.append(before.index(name))
+            else:
+                places.append(len(names))
+                names.append(name)
+        return CauseOrder((*names,), (*places,))
+
+    def placed(self, errors: DirectionErrors) -> DirectionErrors:
+        """The errors of the run with its causes at their places, and zeros for all others."""
+        shifts = errors.systematic
+        systematic = np.zeros((*shifts.shape[:-2], len(self.names), shifts.shape[-1]))
+        systematic[..., list(self.places), :] = shifts
+        return replace(errors, systematic=systematic)
 
 
 def tilts(inclination: ArrayLike, azimuth: ArrayLike) -> Array:

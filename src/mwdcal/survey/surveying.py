@@ -50,7 +50,7 @@ from mwdcal.survey.references import (
     source_of,
 )
 from mwdcal.survey.stations import RANDOM, TOOLFACE_SWITCH
-from mwdcal.survey.well import Well, WellCounts, well
+from mwdcal.survey.well import Before, Well, WellCounts, well
 
 NO_MODEL = "none"
 """The word for standard uncertainties of calibration, noise and declination alone."""
@@ -411,20 +411,22 @@ class WellInputs:
 class SurveyedWell:
     """The surveys of a well with what they rest on; `analysis` is None without multi-station analysis.
 
-    Of a long table that was surveyed in parts `well` has the first stations only, and `counts` is of all.
+    Of a long table that was surveyed in parts `well` has the first stations only, and `counts` is of all. `runs` are
+    those of a well in several, whose surveys `well` has together.
     """
 
     inputs: WellInputs
     well: Well
     counts: WellCounts
     analysis: Interference | None = None
+    runs: tuple[SurveyedWell, ...] = ()
 
     @cached_property
     def contributions(self) -> Contributions | None:
         """What makes the uncertainty of each survey; None for long tables, and where azimuths are not measured."""
         if self.counts.rows > MOST_CONTRIBUTED or self.counts.rows != self.well.readings.count:
             return None
-        return contributions(self.well)
+        return contributions([run.well for run in self.runs] or [self.well])
 
     @property
     def table(self) -> Table:
@@ -577,13 +579,14 @@ def survey_well(
     tie_in: tuple[float, float, float] | TieIn | None = None,
     switch: tuple[float, float] = TOOLFACE_SWITCH,
     outside: str = "blank",
+    follows: Before | None = None,
 ) -> SurveyedWell:
     """The surveys of a well, corrected for interference where there is an `analysis`; else as of `well`."""
     surveys = inputs.surveys
     fitted = analysis.calibration if analysis else inputs.calibration
     result = well(
         fitted, surveys.readings, inputs.limits, surveys.north, surveys.md, tie_in, switch, outside,
-        model=inputs.model,
+        model=inputs.model, follows=follows,
     )  # fmt: skip
     findings = [*inputs.findings, *result.findings]
     result = replace(

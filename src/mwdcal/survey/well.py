@@ -26,9 +26,9 @@ from mwdcal.survey.acceptance import (
 )
 from mwdcal.survey.error_model import ErrorModel
 from mwdcal.survey.norths import North
-from mwdcal.survey.path import PathEnd, TieIn, continued_path
+from mwdcal.survey.path import CauseOrder, DirectionErrors, PathEnd, TieIn, continued_path
 from mwdcal.survey.stations import TOOLFACE_SWITCH, Surveys, survey_angles
-from mwdcal.survey.well_errors import WellErrors, hole_of, well_errors
+from mwdcal.survey.well_errors import WellErrors, cause_names, hole_of, well_errors
 from mwdcal.use.correction import RowCounts, tallied
 from mwdcal.use.correction import findings as about_rows
 from mwdcal.use.strengths import check as check_strengths
@@ -38,6 +38,8 @@ BLIND_FROM = 2.0
 """Stated standard uncertainties of azimuth by which interference that would pass turns it where acceptance is blind."""
 Start = tuple[float, float, float] | TieIn | PathEnd
 """Where a path starts: position of the first station, a tie-in, or the end of the part before."""
+AddsErrors = Callable[[DirectionErrors, Readings, slice], DirectionErrors]
+"""Adds errors to those of directions at some rows."""
 AXES_OF_EARTH = ("north", "east", "tvd")
 WELL_FINDINGS = {
     "rejected": "{rejected} of {judged} surveys lie outside the limits '{limits}' (first: station {first}: {why}).",
@@ -95,12 +97,19 @@ class Before:
     """State that stations pass on to those that follow them.
 
     `magnetic`: the toolface counts from magnetic north. `path`: where the path has come to, at first where it starts.
-    `inaccurate`: no accuracy is stated of positions any more.
+    `inaccurate`: no accuracy is stated of positions any more. `causes`: names of the lasting causes along the path of
+    the runs before, empty in the first one; `ran`: the same with this run.
     """
 
     magnetic: bool = False
     path: Start = (0.0, 0.0, 0.0)
     inaccurate: bool = False
+    causes: tuple[str, ...] = ()
+    ran: tuple[str, ...] = ()
+
+    def next_run(self) -> Before:
+        """The same for the first station of the next run, whose tool starts anew."""
+        return replace(self, magnetic=False, causes=self.ran)
 
 
 class LastStation(NamedTuple):
@@ -359,13 +368,14 @@ def well(
     outside: str = "blank",
     advance: Callable[[int, int], None] = lambda done, total: None,
     model: ErrorModel | None = None,
+    follows: Before | None = None,
 ) -> Well:
     """The surveys of a well from readings in their order, references with these; `md` (n,) measured depths, m.
 
     Units: `tie_in` north, east and TVD of the first station, m, or where the path is tied in; `switch` as of
     `surveyed`. `outside` the calibrated temperatures as of `correction.correct`: blank results, refuse, or extrapolate
     without stated uncertainty. `advance` as of `surveyed`. `model`: error model whose terms are in the standard
-    uncertainties too.
+    uncertainties too. `follows`: what the run before leaves, instead of `tie_in`.
 
     Raises:
         InputError: readings that do not belong to the calibration, or depths that do not increase.
@@ -378,13 +388,13 @@ def well(
         limits,
         north,
         md,
-        Before(path=start),
+        follows or Before(path=start),
         switch,
         outside,
         advance,
         model,
     )
-    return with_findings(result, tally, result.counts, outside, tie_in is None)
+    return with_findings(result, tally, result.counts, outside, tie_in is None and follows is None)
 
 
 def part_of_well(
@@ -423,10 +433,14 @@ def part_of_well(
     after = replace(before, magnetic=angles.ends_magnetic)
     position = None
     if md is not None:
-        position, end = _positions(calibration, readings, md, north, blank, before.path, errors)
+        order = CauseOrder.of(before.causes, cause_names(calibration, errors))
+        position, end = _positions(
+            calibration, readings, md, north, blank, before.path, errors,
+            order if before.causes else None,
+        )  # fmt: skip
         lost = np.logical_or.accumulate(beyond & position.on_path) | before.inaccurate
         position = position.without_accuracy(lost)
-        after = replace(after, path=end, inaccurate=bool(lost[-1]))
+        after = replace(after, path=end, inaccurate=bool(lost[-1]), ran=order.names)
     result = Well(
         calibration, readings, surveys, judgement, limits, north, (g, b), position, [],
         extrapolated=columns.get(EXTRAPOLATED), blindness=blind, after=after, errors=errors,
@@ -493,7 +507,7 @@ def _to_judge(
 
 def _positions(
     calibration: Calibration, readings: Readings, md: Array, north: North, blank: Bools,
-    before: Start, errors: WellErrors | None,
+    before: Start, errors: WellErrors | None, order: CauseOrder | None = None,
 ) -> tuple[Position, Start]:  # fmt: skip
     """Positions of the stations with results, and where the path has come to."""
     whole = _on_path(md, blank, before)
@@ -507,6 +521,8 @@ def _positions(
         norths, at = (offset, shared, alone), md[whole]
         hole = hole_of(calibration, some, at, offset, before)
         more = None if errors is None else errors.of_path(calibration, hole)
+        if order is not None and isinstance(before, PathEnd):
+            before, more = before.widened(len(order.names)), _in_order(order, more)
         dogleg[whole] = hole.dogleg
         if not isinstance(before, TieIn | PathEnd):  # no course leads to the first station
             dogleg[np.argmax(whole)] = np.nan
@@ -516,13 +532,21 @@ def _positions(
     return Position(md, place, covariance, dogleg), before
 
 
+def _in_order(order: CauseOrder, more: AddsErrors | None) -> AddsErrors:
+    """Adds errors, if there are more, and puts all lasting ones where those of the runs before have their places."""
+
+    def added(errors: DirectionErrors, readings: Readings, rows: slice) -> DirectionErrors:
+        return order.placed(errors if more is None else more(errors, readings, rows))
+
+    return added
+
+
 def _on_path(md: Array, blank: Bools, before: Start) -> Bools:
     """Stations (n,) that the path goes through: of several at one depth the first that has a result."""
     whole = ~blank & ~np.isnan(md)
     depths = md[whole]
     reached = np.max(before.md) if isinstance(before, TieIn | PathEnd) else -np.inf
-    deeper = np.diff(np.concatenate([[reached], depths])) > 0
-    whole[whole] = deeper
+    whole[whole] = depths > np.maximum.accumulate(np.concatenate([[reached], depths]))[:-1]
     return whole
 
 

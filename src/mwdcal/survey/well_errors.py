@@ -18,6 +18,7 @@ import numpy as np
 from mwdcal.calibration.automatic.ageing import JULIAN_YEAR
 from mwdcal.calibration.readings import Readings, stated_day
 from mwdcal.calibration.record import Calibration
+from mwdcal.digests import sha256_of
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.units import STANDARD_GRAVITY
 from mwdcal.geometry.vectors import Array, ArrayLike
@@ -29,6 +30,8 @@ from mwdcal.use.uncertainty import AXIAL_INTERFERENCE, CORRECTED, DRIFT, DRIFTED
 
 DRIFT_YEARS = 1.0
 """Time after which the sensors may have drifted by as much as the model's terms for sensors, years."""
+SENSOR_CAUSES = 13
+"""Independent errors of the sensors: bias and scale of every axis, and interference along the tool."""
 _SENSORS = ("AB", "AS", "MB", "MS")
 _DECLINATION_TERMS = ("DEC", "DBH")
 _INTERFERENCE = "AMIL"
@@ -128,6 +131,24 @@ class WellErrors:
         noise[:, :2, :2] = errors.random
         lasting = np.concatenate([with_depth(errors.systematic), sensors, systematic], -2)
         return DirectionErrors(errors.inclination, errors.azimuth, lasting, noise + random, course)
+
+
+def cause_names(calibration: Calibration, errors: WellErrors | None) -> tuple[str, ...]:
+    """Names of the causes that last, in the order of `DirectionErrors.systematic`; those of one run alone have none.
+
+    Causes of one name are the same in all runs of a well: the calibration, if it is the same one, the declination, and
+    terms of the model that last over the well or all wells.
+    """
+    digest = sha256_of(
+        calibration.parameters.tobytes() + calibration.parameter_covariance.tobytes()
+    )
+    names = [f"calibration {digest} {i}" for i in range(len(calibration.parameter_covariance))]
+    names.append("declination")
+    if errors is None:
+        return (*names,)
+    terms = [term for term in errors.model.terms if term.kind == "lasting"]
+    ours = [t.name if t.propagation_mode in ("Well", "Global") else "" for t in terms]
+    return (*names, *[""] * SENSOR_CAUSES, *ours)
 
 
 def with_depth(shifts: Array) -> Array:

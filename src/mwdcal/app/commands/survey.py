@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import radians
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -15,6 +16,7 @@ from mwdcal.presentation.typed import findings_with_option_names
 
 if TYPE_CHECKING:
     from mwdcal.calibration.canonical import SignatureCheck
+    from mwdcal.presentation.signature import LoadedCalibration
     from mwdcal.survey.interference import Interference
     from mwdcal.survey.path import TieIn
     from mwdcal.survey.surveying import SurveyedWell, WellInputs
@@ -49,6 +51,15 @@ if TYPE_CHECKING:
     metavar="NAME|FILE",
     help="What every 1σ holds besides calibration, noise and declination: interference, sag, misalignment, depth and "
     "drift since the calibration (owsg-mwd), nothing (none), or the terms of a file in ISCWSA's JSON form.",
+)
+@click.option(
+    "--run",
+    nargs=2,
+    type=str,
+    multiple=True,
+    metavar="CALIBRATION READINGS",
+    help="The next run of the same well, with the calibration of its tool; its path goes on where the run before "
+    "ended. May be repeated.",
 )
 @options.preset(
     "--limits",
@@ -110,8 +121,9 @@ if TYPE_CHECKING:
 def command(
     calibration: Path, readings: Path, output: Path, reference: Path | None, msa: bool,
     msa_html: Path | None, sensor_drift: str | None, error_model: str, limits: str, switch: str,
-    tie_in: str | None, length_unit: str | None, section_azimuth: float, station: str | None,
-    contributions: Path | None, outside: str, missing: str, report: Path | None, decimal: str,
+    run: tuple[tuple[str, str], ...], tie_in: str | None, length_unit: str | None,
+    section_azimuth: float, station: str | None, contributions: Path | None, outside: str,
+    missing: str, report: Path | None, decimal: str,
     key: tuple[Path, ...], as_json: bool,
 ) -> None:  # fmt: skip
     """Surveys of a well: READINGS in their order, corrected by the CALIBRATION of their tool.
@@ -126,46 +138,62 @@ def command(
     """
     from mwdcal.files.formats import atomic
     from mwdcal.files.formats import table as tables
-    from mwdcal.files.runs import MOST_ROWS, read_export
     from mwdcal.presentation.signature import load_calibration
     from mwdcal.survey import long_table
-    from mwdcal.survey.surveying import analysed, check_drift, survey_well, well_inputs
+    from mwdcal.survey.runs import survey_runs
+    from mwdcal.survey.surveying import analysed, check_drift
 
-    if msa_html and not msa:
-        raise InputError("`msa_html` goes with `msa`. Leave it out, or add `msa`.")
+    if msa_html and (not msa or run):
+        raise InputError("`msa_html` goes with `msa` of one run. Leave it out, or add `msa`.")
     check_drift(sensor_drift, msa)
-    given = [calibration, readings, reference, limits, error_model, *key]
+    pairs = [(calibration, readings), *((Path(tool), Path(table)) for tool, table in run)]
+    given = [*(file for pair in pairs for file in pair), reference, limits, error_model, *key]
     options.check_outputs([output, msa_html, contributions], given, page=report)
     unit = length_unit or ""
     start, ends = _tie_in(tie_in, unit), _switch(switch)
-    loaded = load_calibration(calibration, key)
-    fitted = loaded.calibration
+    loaded = [load_calibration(tool, key) for tool, _ in pairs]
     said = options.statements()
-    whole = msa or report or missing == "blank" or said or contributions or station
-    if not whole and long_table.in_parts(readings, output, fitted.profile):
+    whole = msa or report or missing == "blank" or said or contributions or station or run
+    if not whole and long_table.in_parts(readings, output, loaded[0].calibration.profile):
         result = long_table.survey_file(
-            fitted, readings, output, reference, limits, start, ends, outside, decimal,
-            loaded.digest, loaded.findings, error_model, section_azimuth, unit,
+            loaded[0].calibration, readings, output, reference, limits, start, ends, outside, decimal,
+            loaded[0].digest, loaded[0].findings, error_model, section_azimuth, unit,
         )  # fmt: skip
-        _print(result, loaded.signature, (str(output), ""), as_json)
+        _print(result, loaded[0].signature, (str(output), ""), as_json)
         return
-    table = read_export(readings, fitted.profile, decimal=decimal, rows=MOST_ROWS, statements=said)
-    with offering_blank():
-        inputs = well_inputs(
-            fitted, table, reference, limits, msa, loaded.digest, loaded.findings, error_model, missing,
-            section_azimuth, unit,
-        )  # fmt: skip
-    analysis = analysed(inputs, sensor_drift) if msa else None
-    pages = _interference_page(inputs, analysis, msa_html)
-    if analysis and not analysis.summary.separable:
-        atomic.write_all(pages + _interference_page(inputs, analysis, report))
-        _refuse(inputs, analysis, loaded.signature, as_json)
-    result = survey_well(inputs, analysis, tie_in=start, switch=ends, outside=outside)
+    how = (reference, limits, msa, error_model, missing, section_azimuth, unit)
+    inputs = [
+        _inputs(tool, table, decimal, {} if i else said, how)
+        for i, (tool, (_, table)) in enumerate(zip(loaded, pairs, strict=True))
+    ]
+    analyses = [analysed(each, sensor_drift) if msa else None for each in inputs]
+    pages = _interference_page(inputs[0], analyses[0], msa_html)
+    for each, analysis, tool in zip(inputs, analyses, loaded, strict=True):
+        if analysis and not analysis.summary.separable:
+            atomic.write_all(pages + _interference_page(each, analysis, report))
+            _refuse(each, analysis, tool.signature, as_json)
+    result = survey_runs(inputs, analyses, tie_in=start, switch=ends, outside=outside)
     pages += _pages(result, report, contributions, station)
     atomic.write_all([(output, tables.streamed(output, result.table)), *pages])
-    _print(
-        result, loaded.signature, (str(output), str(report or "")), as_json, station, contributions
-    )
+    files = str(output), str(report or "")
+    _print(result, loaded[0].signature, files, as_json, station, contributions)
+
+
+def _inputs(
+    tool: LoadedCalibration, readings: Path, decimal: str, said: Mapping[str, str], how: Any
+) -> WellInputs:
+    """The inputs of a run: its calibration and its table."""
+    from mwdcal.files.runs import MOST_ROWS, read_export
+    from mwdcal.survey.surveying import well_inputs
+
+    reference, limits, msa, error_model, missing, section_azimuth, unit = how
+    profile = tool.calibration.profile
+    table = read_export(readings, profile, decimal=decimal, rows=MOST_ROWS, statements=said)
+    with offering_blank():
+        return well_inputs(
+            tool.calibration, table, reference, limits, msa, tool.digest, tool.findings, error_model,
+            missing, section_azimuth, unit,
+        )  # fmt: skip
 
 
 def _pages(
