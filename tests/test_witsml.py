@@ -367,6 +367,7 @@ def test_elements_are_in_the_order_of_the_schema_with_their_units(tmp_path):
             "magDipAngleReference",
             "rawData",
             "valid",
+            "matrixCov",
             "extensionNameValue",
         ),
     ]

@@ -244,8 +244,13 @@ class WellSurvey(Result):
         atomic.write(path, render(self.surveyed.analysis, self.surveyed.inputs.named))
 
     def save(self, path: FilePath) -> None:
-        """Write the table of the command: the readings with the results beside them; the suffix is the format."""
-        tables.write(path, self._whole_table)
+        """Write the table of the command: the readings with the results beside them; the suffix is the format.
+
+        WITSML has the covariance of the positions too.
+        """
+        with_covariance = Path(path).suffix.lower() == ".xml"
+        whole = self.surveyed.table_with(True) if with_covariance else self._whole_table
+        tables.write(path, whole)
 
 
 @dataclass(frozen=True, repr=False, eq=False)

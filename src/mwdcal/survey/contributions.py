@@ -47,6 +47,10 @@ class Cause(NamedTuple):
     propagation: str
 
 
+TIE_IN = Cause("tie-in", OF_WELL)
+"""The position where the path is tied in."""
+
+
 @dataclass(frozen=True)
 class Contributions:
     """Variances (c, n, 8) of `CONTRIBUTED` by c causes at stations, rad² and m²; NaN: none stated, or off the path."""
@@ -138,9 +142,13 @@ def contributions(wells: Sequence[Well]) -> Contributions | None:
     causes = tuple(dict.fromkeys(cause for run in runs for cause in run.causes))
     path = np.concatenate([run.path for run in runs])
     positions = np.full((len(causes), len(path), 3, 3), np.nan)
+    start = wells[0].started
     if path.any():
         along = [_joined_errors(runs, cause) for cause in causes]
-        positions[:, path] = [errors.positions(runs, wells[0].started) for errors in along]
+        positions[:, path] = [errors.positions(runs, start) for errors in along]
+    if isinstance(start, TieIn) and start.covariance is not None and start.covariance.any():
+        fixed = np.where(path[:, None, None], start.covariance, np.nan)
+        positions, causes = np.concatenate([positions, fixed[None]]), (*causes, TIE_IN)
     frame = np.concatenate([_frame(run.hole) for run in runs])
     spread = np.einsum("nij,cnjk,nik->cni", frame, positions, frame)
     lost = np.concatenate([_lost(well) for well in wells])

@@ -198,15 +198,17 @@ class _Sums(NamedTuple):
 
 
 class TieIn(NamedTuple):
-    """Where a path is tied in, taken as exact.
+    """Where a path is tied in: its direction is taken as exact, and its place as well where it has no covariance.
 
-    Units: measured depth m, inclination and azimuth (from the north of the path) rad, place (3,) m.
+    Units: measured depth m, inclination and azimuth (from the north of the path) rad, place (3,) m, covariance (3, 3)
+    of the place, m², which is independent of all errors below it.
     """
 
     md: float
     inclination: float
     azimuth: float
     place: Array
+    covariance: Array | None = None
 
     def before(self, errors: DirectionErrors) -> PathEnd:
         """The end of a path that leads there, for stations with such `errors` to follow."""
@@ -220,7 +222,10 @@ class TieIn(NamedTuple):
             none(errors.systematic), none(errors.random), course,
         )  # fmt: skip
         md = np.array([self.md])
-        return PathEnd(md, exact, _no_sums(md, exact, self.place))
+        sums = _no_sums(md, exact, self.place)
+        if self.covariance is not None:
+            sums = sums._replace(settled=self.covariance)
+        return PathEnd(md, exact, sums)
 
 
 class PathEnd(NamedTuple):

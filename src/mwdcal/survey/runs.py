@@ -62,7 +62,12 @@ def survey_runs(
         for finding in run.well.findings
     ]
     together = replace(together, findings=findings)
-    first = replace(runs[0].inputs, table=_joined_table(runs), rows=_joined_rows(runs))
+    first = replace(
+        runs[0].inputs,
+        table=_joined_table(runs),
+        rows=_joined_rows(runs),
+        tie_ins=_joined_tie_ins(runs),
+    )
     return SurveyedWell(first, together, together.counts, None, tuple(runs))
 
 
@@ -94,7 +99,10 @@ def _joined_well(wells: Sequence[Well]) -> Well:
     position = None
     if first.position is not None:
         position = Position(
-            *(np.concatenate([getattr(well.position, n) for well in wells]) for n in _POSITION)
+            *(
+                np.concatenate([getattr(well.position, n) for well in wells])
+                for n in _POSITION_PARTS
+            )
         )
     readings = replace(
         first.readings,
@@ -120,7 +128,7 @@ def _stack(parts: Sequence[Array]) -> Array:
     return np.concatenate(parts)
 
 
-_POSITION = ("md", "place", "covariance", "dogleg")
+_POSITION_PARTS = ("md", "place", "covariance", "dogleg")
 
 
 def _joined(kind: type, parts: Sequence[Any], **others: object) -> Any:
@@ -155,6 +163,16 @@ def _joined_rows(runs: Sequence[SurveyedWell]) -> Bools | None:
     ]
     together = np.concatenate(rows)
     return None if together.all() else together
+
+
+def _joined_tie_ins(runs: Sequence[SurveyedWell]) -> dict[int, TieIn]:
+    """The tie-in stations of all runs by the row of the joined table."""
+    starts = np.cumsum([0, *(run.inputs.table.count for run in runs)]).tolist()
+    return {
+        start + row: tie_in
+        for start, run in zip(starts, runs, strict=False)
+        for row, tie_in in run.inputs.tie_ins.items()
+    }
 
 
 def _joined_table(runs: Sequence[SurveyedWell]) -> Table:

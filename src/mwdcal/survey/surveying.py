@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -30,7 +30,7 @@ from mwdcal.files.formats.table import Table, cell_error, numbers
 from mwdcal.files.runs import renamed, to_readings
 from mwdcal.files.settings import setting
 from mwdcal.geometry.units import LENGTH_UNITS
-from mwdcal.geometry.vectors import Array, Bools
+from mwdcal.geometry.vectors import AnyArray, Array, Bools
 from mwdcal.sensor.profile import StandProfile
 from mwdcal.survey.acceptance import SurveyLimits, load_survey_limits
 from mwdcal.survey.contributions import Contributions, contributions
@@ -38,7 +38,7 @@ from mwdcal.survey.error_model import BUILT_IN, ErrorModel, load_error_model
 from mwdcal.survey.interference import Interference, interference
 from mwdcal.survey.interference_estimate import Assumed, sensor_drift
 from mwdcal.survey.norths import DECLINATIONS, SD_KEY, North, norths_of
-from mwdcal.survey.path import TieIn
+from mwdcal.survey.path import PathEnd, TieIn
 from mwdcal.survey.references import (
     FROM_REFERENCE,
     MEASURABLE,
@@ -50,7 +50,8 @@ from mwdcal.survey.references import (
     source_of,
 )
 from mwdcal.survey.stations import RANDOM, TOOLFACE_SWITCH
-from mwdcal.survey.well import Before, Well, WellCounts, well
+from mwdcal.survey.trajectory import TrajectoryFacts, has_stations, north_of_tie_in, trajectory
+from mwdcal.survey.well import AXES_OF_EARTH, Before, Well, WellCounts, well
 
 NO_MODEL = "none"
 """The word for standard uncertainties of calibration, noise and declination alone."""
@@ -317,15 +318,29 @@ def length_unit_of(given: str) -> tuple[str, str]:
     return chosen, chosen or "m"
 
 
-def surveyed_table(table: Table, well: Well, rows: Bools | None = None) -> Table:
+def surveyed_table(
+    table: Table,
+    well: Well,
+    rows: Bools | None = None,
+    covariance: bool = False,
+    tie_ins: Mapping[int, TieIn] | None = None,
+) -> Table:
     """The table with the results beside its columns; `rows` (n,) are those of the well, by default all.
+
+    With the `covariance` of the positions if asked for. `tie_ins` have what they state at their rows.
 
     Raises:
         InputError: a column has the name of a result already.
     """
     results = well.columns
+    if covariance and well.position is not None:
+        results = results | covariance_columns(well.position.covariance, well.length_unit)
     if rows is not None:
         results = {name: spread(values, rows) for name, values in results.items()}
+        for row, start in (tie_ins or {}).items():
+            for name, value in _of_tie_in(start, well).items():
+                if name in results:
+                    results[name][row] = value
     check_free(table, results)
     texts: dict[str, str] = {}  # few words stand in many rows: each is in memory once
     columns = {
@@ -336,6 +351,35 @@ def surveyed_table(table: Table, well: Well, rows: Bools | None = None) -> Table
     }
     metadata = {**table.metadata, **described(well)}
     return replace(table, columns={**table.columns, **columns}, metadata=metadata)
+
+
+def covariance_columns(covariance: Array, unit: str) -> dict[str, AnyArray]:
+    """The six elements (n,) of covariances (n, 3, 3) of positions: north, east and vertical, in a unit of length."""
+    axes, metres = "nev", LENGTH_UNITS[unit]
+    return {
+        f"covariance_{axes[i]}{axes[j]}_{unit}2": covariance[:, i, j] / metres**2
+        for i in range(3)
+        for j in range(i, 3)
+    }
+
+
+def _of_tie_in(start: TieIn, well: Well) -> dict[str, float]:
+    """Columns of results at a tie-in station, in the units of files."""
+    unit, metres = well.length_unit, LENGTH_UNITS[well.length_unit]
+    covariance = np.zeros((3, 3)) if start.covariance is None else start.covariance
+    place = start.place / metres
+    sd = np.sqrt(np.maximum(np.diagonal(covariance), 0.0)) / metres
+    values = {
+        "inclination_deg": float(np.degrees(start.inclination)),
+        f"azimuth_{well.north.name}_deg": float(np.degrees(start.azimuth)),
+        f"vertical_section_{unit}": float(
+            place[0] * np.cos(well.north.section) + place[1] * np.sin(well.north.section)
+        ),
+    }
+    for k, name in enumerate(AXES_OF_EARTH):
+        values |= {f"{name}_{unit}": float(place[k]), f"sd_{name}_{unit}": float(sd[k])}
+    whole = covariance_columns(covariance[None], unit)
+    return values | {name: float(value[0]) for name, value in whole.items()}
 
 
 def check_free(table: Table, results: Collection[str]) -> None:
@@ -382,8 +426,9 @@ class WellInputs:
 
     `length_unit` is that of results. `model`: the error model whose terms are in the standard uncertainties; None:
     none. `rows` (n,) of the table that have readings; None: all.
-    `findings` are of the calibration's signature and of the reference; `digests` the SHA-256 of each input by name,
-    empty for one that is in memory.
+    `tie_ins` by the row of the table that states them. `unused` (n,): surveys that are rejected or superseded by their
+    status. `findings` are of the calibration's signature and of the reference; `digests` the SHA-256 of each input by
+    name, empty for one that is in memory.
     """
 
     calibration: Calibration
@@ -395,6 +440,8 @@ class WellInputs:
     model: ErrorModel | None = None
     rows: Bools | None = None
     length_unit: str = "m"
+    tie_ins: Mapping[int, TieIn] = field(default_factory=dict)
+    unused: Bools | None = None
 
     @property
     def stated(self) -> tuple[Mapping[str, object], Mapping[str, object]]:
@@ -431,7 +478,13 @@ class SurveyedWell:
     @property
     def table(self) -> Table:
         """The table of the readings with the results beside its columns."""
-        return surveyed_table(self.inputs.table, self.well, self.inputs.rows)
+        return self.table_with()
+
+    def table_with(self, covariance: bool = False) -> Table:
+        """The same, with the covariance of the positions too; a tie-in station has what it states."""
+        return surveyed_table(
+            self.inputs.table, self.well, self.inputs.rows, covariance, self.inputs.tie_ins
+        )
 
 
 def well_inputs(
@@ -459,25 +512,23 @@ def well_inputs(
     """
     bounds, limits_digest = loaded_limits(limits)
     place, place_digest = loaded_reference(reference)
-    rows = _with_readings(table, calibration) if missing == "blank" else np.ones(table.count, bool)
     unit, shown_unit = length_unit_of(length_unit)
-    read = survey_readings(chosen(table, rows), calibration, place, recognised, unit)
-    if not rows.all():
-        numbered = np.flatnonzero(rows) + 1
-        names = tuple(
-            label or str(i) for label, i in zip(read.readings.station, numbered, strict=True)
-        )
-        text = f"{np.sum(~rows)} of {rows.size} rows lack a reading: their results are blank."
-        about = [Finding(id="missing-reading", text=text), *read.findings]
-        read = replace(read, readings=replace(read.readings, station=names), findings=about)
+    said, rows = _said_of(table, calibration, missing == "blank", unit)
+    read = survey_readings(chosen(said.table, rows), calibration, place, recognised, unit)
+    unused = said.unused[rows]
+    if unused.any() and read.md is not None:
+        read = replace(read, md=np.where(unused, np.nan, read.md))
+    read = replace(read, findings=[*said.findings, *read.findings])
+    read = _with_blank_rows(read, rows)
     digests = {"calibration": digest, "readings": table.digest}
     digests |= {"reference": place_digest} if read.uses_reference else {}
     model = error_model_of(error_model)
     digests |= {"error_model": model.digest} if model else {}
     read = replace(read, north=with_section(read.north, section_azimuth))
+    _check_north(said, read.north)
     return WellInputs(
         calibration,
-        table,
+        said.table,
         read,
         bounds,
         [*findings, *read.findings],
@@ -485,16 +536,51 @@ def well_inputs(
         model,
         None if rows.all() else rows,
         shown_unit,
+        {said.tie_row: said.tie_in} if said.tie_in and said.tie_row is not None else {},
+        unused if unused.any() else None,
     )
 
 
-def _with_readings(table: Table, calibration: Calibration) -> Bools:
-    """Rows (n,) that lack no reading."""
+def _with_blank_rows(read: SurveyReadings, rows: Bools) -> SurveyReadings:
+    """Surveys of some `rows` of a table, named by these where they have no label."""
+    if rows.all():
+        return read
+    numbered = np.flatnonzero(rows) + 1
+    names = tuple(label or str(i) for label, i in zip(read.readings.station, numbered, strict=True))
+    text = f"{np.sum(~rows)} of {rows.size} rows lack a reading: their results are blank."
+    about = [Finding(id="missing-reading", text=text), *read.findings]
+    return replace(read, readings=replace(read.readings, station=names), findings=about)
+
+
+def _check_north(said: TrajectoryFacts, north: North) -> None:
+    """Refuse a tie-in station whose azimuth counts from another north than the path."""
+    counted = north_of_tie_in(said.table)
+    if said.tie_in and counted not in ("", north.name):
+        raise InputError(
+            f"{said.table.source}: the tie-in station counts its azimuth from {counted} north, and the path goes from "
+            f"{north.name} north. State declination_deg and convergence_deg, give `reference`, or give `tie_in`."
+        )
+
+
+def _said_of(
+    table: Table, calibration: Calibration, blank: bool, unit: str
+) -> tuple[TrajectoryFacts, Bools]:
+    """The statements of a table about its norths, tie-in and statuses, and its rows (n,) that are surveys.
+
+    Rows without readings are none where they may be `blank`, nor is a tie-in station.
+    """
+    none = np.zeros(table.count, bool)
+    if not (blank or has_stations(table)):
+        return trajectory(table, None, none), ~none
     known = renamed(table, calibration.profile)
-    rows = ~without_reading(known, wholly_blank([known]))
+    without = without_reading(known, wholly_blank([known]))
+    said = trajectory(table, depths(known, unit), without)
+    rows = ~without if blank else ~none
+    if said.tie_row is not None:
+        rows[said.tie_row] = False
     if not rows.any():
         raise nothing(table.source)
-    return rows
+    return said, rows
 
 
 def with_section(north: North, azimuth: float) -> North:
@@ -569,7 +655,30 @@ def analysed(inputs: WellInputs, drift: str | os.PathLike[str] | None = None) ->
     """
     assumed = Assumed(drift=sensor_drift(drift or "owsg"))
     surveys = inputs.surveys
-    return interference(inputs.calibration, surveys.readings, assumed, surveys.md)
+    readings, md = surveys.readings, surveys.md
+    if inputs.unused is not None:
+        readings = readings.select(~inputs.unused)
+        md = None if md is None else md[~inputs.unused]
+    return interference(inputs.calibration, readings, assumed, md)
+
+
+LARGEST_GAP = 0.1
+"""Distance, m, by which the tie-in station of a run may differ from the end of the run before."""
+
+
+def tie_in_differs(stated: TieIn, end: object) -> list[Finding]:
+    """The finding that the tie-in station of a run is not where the run before ended."""
+    if not isinstance(end, PathEnd):
+        return []
+    off = float(np.linalg.norm(stated.place - end.sums.position))
+    deeper = stated.md - float(end.md[-1])
+    if off <= LARGEST_GAP and abs(deeper) <= LARGEST_GAP:
+        return []
+    text = (
+        f"the tie-in station lies {off:.2f} m from the end of the run before, {deeper:+.2f} m along the hole: the path "
+        "goes on from that end."
+    )
+    return [Finding(id="tie-in-differs", text=text)]
 
 
 def survey_well(
@@ -583,12 +692,15 @@ def survey_well(
 ) -> SurveyedWell:
     """The surveys of a well, corrected for interference where there is an `analysis`; else as of `well`."""
     surveys = inputs.surveys
+    stated = next(iter(inputs.tie_ins.values()), None)
+    about = [] if follows is None or stated is None else tie_in_differs(stated, follows.path)
+    tie_in = stated if tie_in is None and follows is None else tie_in
     fitted = analysis.calibration if analysis else inputs.calibration
     result = well(
         fitted, surveys.readings, inputs.limits, surveys.north, surveys.md, tie_in, switch, outside,
         model=inputs.model, follows=follows,
     )  # fmt: skip
-    findings = [*inputs.findings, *result.findings]
+    findings = [*inputs.findings, *about, *result.findings]
     result = replace(
         result, findings=findings, sources=surveys.sources, length_unit=inputs.length_unit
     )

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from mwdcal.survey.path import TieIn
     from mwdcal.survey.surveying import SurveyedWell, WellInputs
 
+Outputs = list[tuple[Path, Any]]
+"""Files to write, with their content."""
+
 
 @options.command()
 @options.CALIBRATION
@@ -108,6 +111,11 @@ if TYPE_CHECKING:
     help="Also write a table of the contributions: what each cause of error makes of every 1σ, a row for each "
     "station and cause.",
 )
+@click.option(
+    "--covariance",
+    is_flag=True,
+    help="Add the covariance of the position to the table: covariance_nn_m2 and so on; WITSML always has it.",
+)
 @options.WHERE_OUTSIDE
 @options.MISSING
 @options.report(
@@ -122,8 +130,8 @@ def command(
     calibration: Path, readings: Path, output: Path, reference: Path | None, msa: bool,
     msa_html: Path | None, sensor_drift: str | None, error_model: str, limits: str, switch: str,
     run: tuple[tuple[str, str], ...], tie_in: str | None, length_unit: str | None,
-    section_azimuth: float, station: str | None, contributions: Path | None, outside: str,
-    missing: str, report: Path | None, decimal: str,
+    section_azimuth: float, station: str | None, contributions: Path | None, covariance: bool,
+    outside: str, missing: str, report: Path | None, decimal: str,
     key: tuple[Path, ...], as_json: bool,
 ) -> None:  # fmt: skip
     """Surveys of a well: READINGS in their order, corrected by the CALIBRATION of their tool.
@@ -137,7 +145,6 @@ def command(
     separate interference from azimuth.
     """
     from mwdcal.files.formats import atomic
-    from mwdcal.files.formats import table as tables
     from mwdcal.presentation.signature import load_calibration
     from mwdcal.survey import long_table
     from mwdcal.survey.runs import survey_runs
@@ -153,7 +160,9 @@ def command(
     start, ends = _tie_in(tie_in, unit), _switch(switch)
     loaded = [load_calibration(tool, key) for tool, _ in pairs]
     said = options.statements()
-    whole = msa or report or missing == "blank" or said or contributions or station or run
+    whole = (
+        msa or report or missing == "blank" or said or contributions or station or run or covariance
+    )
     if not whole and long_table.in_parts(readings, output, loaded[0].calibration.profile):
         result = long_table.survey_file(
             loaded[0].calibration, readings, output, reference, limits, start, ends, outside, decimal,
@@ -174,7 +183,7 @@ def command(
             _refuse(each, analysis, tool.signature, as_json)
     result = survey_runs(inputs, analyses, tie_in=start, switch=ends, outside=outside)
     pages += _pages(result, report, contributions, station)
-    atomic.write_all([(output, tables.streamed(output, result.table)), *pages])
+    atomic.write_all([_table(result, output, covariance), *pages])
     files = str(output), str(report or "")
     _print(result, loaded[0].signature, files, as_json, station, contributions)
 
@@ -196,9 +205,17 @@ def _inputs(
         )  # fmt: skip
 
 
+def _table(result: SurveyedWell, output: Path, covariance: bool) -> tuple[Path, Any]:
+    """The table of the surveys; WITSML has the covariance of the positions in any case."""
+    from mwdcal.files.formats import table as tables
+
+    table = result.table_with(covariance or output.suffix.lower() == ".xml")
+    return output, tables.streamed(output, table)
+
+
 def _pages(
     result: SurveyedWell, report: Path | None, table: Path | None, station: str | None
-) -> list[tuple[Path, bytes | str]]:
+) -> Outputs:
     """The page, and the table of contributions, where they were asked for.
 
     Raises:
@@ -207,7 +224,7 @@ def _pages(
     from mwdcal.files.formats import table as tables
     from mwdcal.presentation.contributions import contribution_table, station_row
 
-    pages: list[tuple[Path, bytes | str]] = []
+    pages: Outputs = []
     if report:
         from mwdcal.presentation.survey_page import render
 
@@ -227,7 +244,7 @@ def _pages(
 
 def _interference_page(
     inputs: WellInputs, analysis: Interference | None, page: Path | None
-) -> list[tuple[Path, bytes | str]]:
+) -> Outputs:
     """The page of a multi-station analysis, where one was asked for."""
     if not analysis or not page:
         return []

@@ -39,8 +39,19 @@ _LENGTHS = {
     "vertical_section": "vertSect",
 }
 """Beginnings of columns of lengths that are elements of a station."""
+_AXES = {"n": "N", "e": "E", "v": "Vert"}
+_STATUSES = {"definitive": "position", "rejected": "rejected", "superseded": "open"}
+"""Words of the column `status`, and of the element; a column keeps the word itself, in an extension."""
 _OURS = {
     **{f"{n}_{u}": (e, UOM_OF_LENGTH[u]) for n, e in _LENGTHS.items() for u in UOM_OF_LENGTH},
+    **{
+        f"covariance_{a}{b}_{u}2": (
+            f"matrixCov/variance{_AXES[a]}{_AXES[b]}",
+            f"{UOM_OF_LENGTH[u]}2",
+        )
+        for a, b in ("nn", "ne", "nv", "ee", "ev", "vv")
+        for u in ("m", "ft")
+    },
     "inclination_deg": ("incl", "dega"),
     "magnetic_toolface_deg": ("mtf", "dega"),
     "toolface_deg": ("gtf", "dega"),
@@ -332,6 +343,9 @@ def _station(
     yield f"<trajectoryStation uid={_quoted(uid)}>"
     typed = any(place.path == _TYPE for place in places.values())
     elements = {} if typed else {_TYPE: _NO_TYPE}
+    status = _STATUSES.get(cells.get("status", "").strip().lower())
+    if status:
+        elements["statusTrajStation"] = (status, "")
     elements |= {
         place.of(cells.get(_KIND, "")): (cells[name], place.uom)
         for name, place in places.items()
