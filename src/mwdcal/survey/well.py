@@ -34,8 +34,11 @@ from mwdcal.use.correction import findings as about_rows
 from mwdcal.use.strengths import check as check_strengths
 from mwdcal.use.uncertainty import CORRECTED, DRIFTED, ErrorTerms, error_terms
 
-BLIND_FROM = 2.0
-"""Stated standard uncertainties of azimuth by which interference that would pass turns it where acceptance is blind."""
+BLIND_FROM = 1.5
+"""Stated standard uncertainties of azimuth by which interference that would pass turns it where acceptance is blind.
+
+Other errors add to the turn: from here on one azimuth in fifteen is off by more than three, of those that pass.
+"""
 Start = tuple[float, float, float] | TieIn | PathEnd
 """Where a path starts: position of the first station, a tie-in, or the end of the part before."""
 AddsErrors = Callable[[DirectionErrors, Readings, slice], DirectionErrors]
