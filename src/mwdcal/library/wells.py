@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from mwdcal.survey.error_model import ErrorModel
     from mwdcal.survey.interference import InterferenceSize, MultiStationAnalysis
     from mwdcal.survey.references import EarthReference, FilledRun
-    from mwdcal.survey.surveying import SurveyedWell
+    from mwdcal.survey.surveying import SurveyedWell, WellInputs
     from mwdcal.survey.tool_model import SensorTerm
     from mwdcal.survey.well import Position
 
@@ -448,6 +448,7 @@ def survey(
     sensor_drift: FilePath | None = None,
     error_model: FilePath | ErrorModel = "owsg-mwd",
     runs: Sequence[tuple[Calibration | FilePath, Tabular | Readings]] = (),
+    registry: FilePath | None = None,
     switch: tuple[float, float] = (3.0, 5.0),
     tie_in: Sequence[float] | None = None,
     section_azimuth: float = 0.0,
@@ -474,6 +475,8 @@ def survey(
             none, or a file in ISCWSA's JSON form.
         runs: the runs of the same well that follow, each a calibration and readings: their path goes on where the run
             before ended.
+        registry: URL or file of a registry; the random walk of the tool that its calibrations show is the drift
+            since the calibration, instead of that of the error model.
         switch: inclinations, degrees, below which the toolface counts from magnetic north, and above which from the
             high side.
         tie_in: north, east and TVD of the first station, in `length_unit`; or measured depth, inclination, azimuth
@@ -517,6 +520,7 @@ def survey(
         )
         for tool, table in zip(loaded, (readings, *(table for _, table in runs)), strict=True)
     ]  # fmt: skip
+    inputs = [_with_walk(each, registry) for each in inputs]
     analyses = [analysed(each, sensor_drift) if msa else None for each in inputs]
     for analysis in analyses:
         if analysis:
@@ -597,6 +601,15 @@ def export(
     form = "c" if form is None else form
     _check_word("form", form, FORMS_OF_FIRMWARE)
     return FirmwareExport(conversion.exported(_source(cal), FORMS_OF_FIRMWARE[form], word_bits))
+
+
+def _with_walk(inputs: WellInputs, registry: FilePath | None) -> WellInputs:
+    """The inputs with the random walk of their tool, where a registry is named."""
+    if registry is None:
+        return inputs
+    from mwdcal.library.drifts import with_walk
+
+    return with_walk(inputs, os.fspath(registry))
 
 
 def _source(cal: object) -> Calibration | FilePath:

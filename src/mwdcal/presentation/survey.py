@@ -162,6 +162,7 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
     `reference_sources`: where gravity, field, dip, declination and convergence come from, by name.
     `error_terms` are in the standard uncertainties of surveys and path, `not_included` are not; `error_model` states
     those that are not of the calibration. Drift counts over `years_since_calibration`; null: not known, taken as one.
+    `random_walk`: the drift is that of the tool by a registry, not the model's.
     `msa` is the multi-station analysis, if one was asked for; `interference` and `separable` are of it.
     Lengths are in metres; `length_unit` is that of table, screen and page.
     `runs` of a well in several; its stations are then named run:station.
@@ -181,6 +182,7 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
     reference_sources: dict[str, str]
     error_model: str
     years_since_calibration: float | None
+    random_walk: bool
     error_terms: list[str]
     not_included: list[str]
     limits: str
@@ -211,6 +213,7 @@ def refusal(inputs: WellInputs, msa: MultiStationAnalysis) -> SurveySummary:
         **_stated(north, error_terms((), north.declination is not None)),
         error_model=inputs.model.name if inputs.model else "none",
         years_since_calibration=None,
+        random_walk=False,
         reference_sources=dict(inputs.surveys.sources),
         limits=inputs.limits.name,
         source=inputs.limits.source,
@@ -323,6 +326,7 @@ def summary(
         **_stated(north, well.terms),
         error_model=well.errors.model.name if well.errors else "none",
         years_since_calibration=well.errors.years if well.errors else None,
+        random_walk=well.errors is not None and well.errors.by_walk,
         reference_sources=dict(well.sources),
         limits=well.limits.name,
         source=well.limits.source,
@@ -409,15 +413,19 @@ def screen(
 def model_in_words(errors: WellErrors, runs: bool = False) -> str:
     """The error model, and the time over which the sensors may have drifted; that of several runs stands with these."""
     if runs:
-        return f"error model {errors.model.name} ({errors.model.source})"
+        walk = "; drift by the random walk of each tool" if errors.by_walk else ""
+        return f"error model {errors.model.name} ({errors.model.source}){walk}"
     time = (
         "an unknown time since the calibration, taken as a year"
         if errors.years is None
         else (f"{fixed(errors.years, 2)} years since the calibration")
     )
-    return (
-        f"error model {errors.model.name} ({errors.model.source}); drift of the sensors over {time}"
+    drift = (
+        "drift of the sensors by the random walk of this tool"
+        if errors.by_walk
+        else "drift of the sensors"
     )
+    return f"error model {errors.model.name} ({errors.model.source}); {drift} over {time}"
 
 
 def declination_in_words(facts: SurveySummary) -> str:

@@ -32,7 +32,7 @@ from mwdcal.files.settings import setting
 from mwdcal.geometry.units import LENGTH_UNITS
 from mwdcal.geometry.vectors import AnyArray, Array, Bools
 from mwdcal.sensor.profile import StandProfile
-from mwdcal.survey.acceptance import SurveyLimits, load_survey_limits
+from mwdcal.survey.acceptance import SensorTerms, SurveyLimits, load_survey_limits
 from mwdcal.survey.contributions import Contributions, contributions
 from mwdcal.survey.error_model import BUILT_IN, ErrorModel, load_error_model
 from mwdcal.survey.interference import Interference, interference
@@ -427,8 +427,8 @@ class WellInputs:
     `length_unit` is that of results. `model`: the error model whose terms are in the standard uncertainties; None:
     none. `rows` (n,) of the table that have readings; None: all.
     `tie_ins` by the row of the table that states them. `unused` (n,): surveys that are rejected or superseded by their
-    status. `findings` are of the calibration's signature and of the reference; `digests` the SHA-256 of each input by
-    name, empty for one that is in memory.
+    status. `walk`: random walk of the sensors in a year, 1σ, as of `well_errors`. `findings` are of the calibration's
+    signature and of the reference; `digests` the SHA-256 of each input by name, empty for one that is in memory.
     """
 
     calibration: Calibration
@@ -442,6 +442,7 @@ class WellInputs:
     length_unit: str = "m"
     tie_ins: Mapping[int, TieIn] = field(default_factory=dict)
     unused: Bools | None = None
+    walk: SensorTerms | None = None
 
     @property
     def stated(self) -> tuple[Mapping[str, object], Mapping[str, object]]:
@@ -698,7 +699,7 @@ def survey_well(
     fitted = analysis.calibration if analysis else inputs.calibration
     result = well(
         fitted, surveys.readings, inputs.limits, surveys.north, surveys.md, tie_in, switch, outside,
-        model=inputs.model, follows=follows,
+        model=inputs.model, follows=follows, walk=inputs.walk,
     )  # fmt: skip
     findings = [*inputs.findings, *about, *result.findings]
     result = replace(

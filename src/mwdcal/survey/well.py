@@ -20,6 +20,7 @@ from mwdcal.survey.acceptance import (
     STRENGTH_NAMES,
     Blindness,
     Judgement,
+    SensorTerms,
     SurveyLimits,
     blindness,
     judged,
@@ -372,13 +373,14 @@ def well(
     advance: Callable[[int, int], None] = lambda done, total: None,
     model: ErrorModel | None = None,
     follows: Before | None = None,
+    walk: SensorTerms | None = None,
 ) -> Well:
     """The surveys of a well from readings in their order, references with these; `md` (n,) measured depths, m.
 
     Units: `tie_in` north, east and TVD of the first station, m, or where the path is tied in; `switch` as of
     `surveyed`. `outside` the calibrated temperatures as of `correction.correct`: blank results, refuse, or extrapolate
     without stated uncertainty. `advance` as of `surveyed`. `model`: error model whose terms are in the standard
-    uncertainties too. `follows`: what the run before leaves, instead of `tie_in`.
+    uncertainties too. `follows`: what the run before leaves, instead of `tie_in`. `walk` as of `well_errors`.
 
     Raises:
         InputError: readings that do not belong to the calibration, or depths that do not increase.
@@ -396,6 +398,7 @@ def well(
         outside,
         advance,
         model,
+        walk=walk,
     )
     return with_findings(result, tally, result.counts, outside, tie_in is None and follows is None)
 
@@ -412,6 +415,7 @@ def part_of_well(
     advance: Callable[[int, int], None] = lambda done, total: None,
     model: ErrorModel | None = None,
     whole: bool = True,
+    walk: SensorTerms | None = None,
 ) -> tuple[Well, RowCounts]:
     """The same of stations that follow others, without findings; and what the findings say of the corrected rows.
 
@@ -421,7 +425,7 @@ def part_of_well(
     beyond, blank = calibration.outside(readings), np.isnan(columns[RESULTS[0]])
     errors = None
     if model is not None and calibration.has_field:
-        errors = well_errors(model, calibration, readings)
+        errors = well_errors(model, calibration, readings, walk)
     added = (
         None
         if errors is None

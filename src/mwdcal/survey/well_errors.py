@@ -33,6 +33,9 @@ DRIFT_YEARS = 1.0
 SENSOR_CAUSES = 13
 """Independent errors of the sensors: bias and scale of every axis, and interference along the tool."""
 _SENSORS = ("AB", "AS", "MB", "MS")
+_WALKS = (
+    "accelerometer_bias_ms2", "accelerometer_scale", "magnetometer_bias_nt", "magnetometer_scale",
+)  # fmt: skip
 _DECLINATION_TERMS = ("DEC", "DBH")
 _INTERFERENCE = "AMIL"
 
@@ -43,13 +46,14 @@ class WellErrors:
 
     `model`: terms that act by their formulas. `sensors`: drift of biases and scales since the calibration and
     interference along the tool, 1σ. `years` since the calibration; None: not known. `relative`: the magnetometer is
-    calibrated to a field of 1, whose size the references tell.
+    calibrated to a field of 1, whose size the references tell. `by_walk`: the drift is the random walk of this tool.
     """
 
     model: ErrorModel
     sensors: SensorTerms
     years: float | None
     relative: bool = False
+    by_walk: bool = False
 
     def columns(self, g: Array, b: Array, unit: ArrayLike = 1.0) -> Array:
         """Errors (n, 13, 6) of both vectors by 1σ of each independent cause that lasts over a run.
@@ -156,9 +160,12 @@ def with_depth(shifts: Array) -> Array:
     return np.concatenate([shifts, np.zeros((*shifts.shape[:-1], 1))], -1)
 
 
-def well_errors(model: ErrorModel, calibration: Calibration, readings: Readings) -> WellErrors:
+def well_errors(
+    model: ErrorModel, calibration: Calibration, readings: Readings, walk: SensorTerms | None = None
+) -> WellErrors:
     """The errors that an error model adds to surveys by a calibration.
 
+    `walk`: 1σ of what the sensors of this tool move by in a year, as a random walk; by default the model's terms.
     Where multi-station analysis has taken interference off, its covariance holds what is left of it, and the drift that
     it was told to allow for: neither is added.
     """
@@ -166,8 +173,11 @@ def well_errors(model: ErrorModel, calibration: Calibration, readings: Readings)
     done = {finding.id for finding in calibration.findings}
     years = _years(stated_day(calibration.tool), stated_day(readings.metadata))
     elapsed = DRIFT_YEARS if years is None else years
-    share = 0.0 if {CORRECTED, DRIFTED} & done else min(1.0, np.sqrt(elapsed / DRIFT_YEARS))
-    ab, scale_a, mb, scale_m = (share * _largest(sizes, start) for start in _SENSORS)
+    share, terms = min(1.0, np.sqrt(elapsed / DRIFT_YEARS)), [_largest(sizes, s) for s in _SENSORS]
+    if walk is not None:
+        share, terms = float(np.sqrt(elapsed)), [getattr(walk, name) for name in _WALKS]
+    share = 0.0 if {CORRECTED, DRIFTED} & done else share
+    ab, scale_a, mb, scale_m = (share * term for term in terms)
     axial = 0.0 if CORRECTED in done else sizes.get(_INTERFERENCE, 0.0)
     sensors = SensorTerms(
         accelerometer_bias_ms2=ab, accelerometer_scale=scale_a, magnetometer_bias_nt=mb,
@@ -176,7 +186,7 @@ def well_errors(model: ErrorModel, calibration: Calibration, readings: Readings)
     others = [
         name for name in sizes if name.startswith((*_SENSORS, *_DECLINATION_TERMS, _INTERFERENCE))
     ]
-    return WellErrors(model.without(others), sensors, years, calibration.relative)
+    return WellErrors(model.without(others), sensors, years, calibration.relative, walk is not None)
 
 
 def _largest(sizes: dict[str, float], start: str) -> float:

@@ -64,6 +64,12 @@ Outputs = list[tuple[Path, Any]]
     help="The next run of the same well, with the calibration of its tool; its path goes on where the run before "
     "ended. May be repeated.",
 )
+@click.option(
+    "--registry",
+    metavar="URL|FILE",
+    help="Registry with earlier calibrations of the tool: the random walk that they show is the drift since the "
+    "calibration, instead of that of the error model.",
+)
 @options.preset(
     "--limits",
     shell_complete=options.offers("survey_limits"),
@@ -128,8 +134,8 @@ Outputs = list[tuple[Path, Any]]
 @options.JSON
 def command(
     calibration: Path, readings: Path, output: Path, reference: Path | None, msa: bool,
-    msa_html: Path | None, sensor_drift: str | None, error_model: str, limits: str, switch: str,
-    run: tuple[tuple[str, str], ...], tie_in: str | None, length_unit: str | None,
+    msa_html: Path | None, sensor_drift: str | None, error_model: str, registry: str | None, limits: str,
+    switch: str, run: tuple[tuple[str, str], ...], tie_in: str | None, length_unit: str | None,
     section_azimuth: float, station: str | None, contributions: Path | None, covariance: bool,
     outside: str, missing: str, report: Path | None, decimal: str,
     key: tuple[Path, ...], as_json: bool,
@@ -160,9 +166,8 @@ def command(
     start, ends = _tie_in(tie_in, unit), _switch(switch)
     loaded = [load_calibration(tool, key) for tool, _ in pairs]
     said = options.statements()
-    whole = (
-        msa or report or missing == "blank" or said or contributions or station or run or covariance
-    )
+    blank = missing == "blank"
+    whole = any((msa, report, blank, said, contributions, station, run, covariance, registry))
     if not whole and long_table.in_parts(readings, output, loaded[0].calibration.profile):
         result = long_table.survey_file(
             loaded[0].calibration, readings, output, reference, limits, start, ends, outside, decimal,
@@ -170,7 +175,7 @@ def command(
         )  # fmt: skip
         _print(result, loaded[0].signature, (str(output), ""), as_json)
         return
-    how = (reference, limits, msa, error_model, missing, section_azimuth, unit)
+    how = (reference, limits, msa, error_model, missing, section_azimuth, unit, registry)
     inputs = [
         _inputs(tool, table, decimal, {} if i else said, how)
         for i, (tool, (_, table)) in enumerate(zip(loaded, pairs, strict=True))
@@ -195,14 +200,19 @@ def _inputs(
     from mwdcal.files.runs import MOST_ROWS, read_export
     from mwdcal.survey.surveying import well_inputs
 
-    reference, limits, msa, error_model, missing, section_azimuth, unit = how
+    reference, limits, msa, error_model, missing, section_azimuth, unit, registry = how
     profile = tool.calibration.profile
     table = read_export(readings, profile, decimal=decimal, rows=MOST_ROWS, statements=said)
     with offering_blank():
-        return well_inputs(
+        inputs = well_inputs(
             tool.calibration, table, reference, limits, msa, tool.digest, tool.findings, error_model,
             missing, section_azimuth, unit,
         )  # fmt: skip
+    if not registry:
+        return inputs
+    from mwdcal.library.drifts import with_walk
+
+    return with_walk(inputs, registry)
 
 
 def _table(result: SurveyedWell, output: Path, covariance: bool) -> tuple[Path, Any]:
