@@ -734,3 +734,41 @@ def test_the_command_reads_a_registry(years, tmp_path, monkeypatch):
     assert one_by_one.json == every
     for wrong in (("T-0",), ("--limit", "dip_deg=1"), ("--limit", "inclination_deg=-1")):
         assert mwdcal("registry", "drift", *wrong, *where).code == 2
+
+
+def test_surveys_drift_by_the_random_walk_of_their_tool(years, tmp_path):
+    """Expected: what a parameter moves by in a year, as `registry drift` prints it, times the root of the years."""
+    pytest.importorskip("sqlalchemy")
+    import mwdcal as mc
+    from cli_support import mwdcal
+    from mwdcal.files import documents
+
+    (tmp_path / "files").mkdir()
+    for number, calibration in enumerate(years["T-1"]):
+        documents.write(tmp_path / "files" / f"{number}.json", calibration)
+    where = ("--registry", tmp_path / "tools.sqlite")
+    assert mwdcal("registry", "init", *where).code == 0
+    assert mwdcal("registry", "add", tmp_path / "files", *where, "--workers", "1").code == 0
+    rows = mwdcal("registry", "drift", "T-1", *where, "--json").json["tool"]["rates"]
+    rates = {(row["triad"], row["kind"]): row["per_root_year"] for row in rows}
+    latest = years["T-1"][-1]
+    day = date.fromisoformat(str(latest.tool["date"]))
+    later = date.fromordinal(day.toordinal() + round(4 * 365.25))
+    stations = Bench("twelve-state", 9).readings(later.isoformat())
+    well = mc.survey(latest, stations, registry=where[1])
+    errors = well.surveyed.well.errors
+    assert errors.by_walk
+    assert well.to_dict()["random_walk"] is True
+    assert errors.years == pytest.approx(4.0, abs=0.003)
+    moved = rates["magnetometer", "bias"] * 2.0
+    assert errors.sensors.magnetometer_bias_nt == pytest.approx(moved, rel=1e-3)
+    turned = np.radians(rates["accelerometer", "misalignment"])
+    scale = np.sqrt(rates["accelerometer", "scale"] ** 2 + 2 * turned**2) * 2.0
+    assert errors.sensors.accelerometer_scale == pytest.approx(scale, rel=1e-3)
+    assert "random walk of this tool" in well.summary()
+    plain = mc.survey(latest, stations)
+    assert not plain.surveyed.well.errors.by_walk
+    assert plain.surveyed.well.errors.sensors.magnetometer_bias_nt == pytest.approx(70.0)
+    other = with_changes(latest, tool={**latest.tool, "serial": ""})
+    with pytest.raises(InputError, match="no serial"):
+        mc.survey(other, replace(stations, metadata={"date": later.isoformat()}), registry=where[1])

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+import published_wells
 from mwdcal.errors import InputError
 from mwdcal.survey.error_model import Hole, load_error_model
 from mwdcal.survey.formulas import parsed
@@ -62,6 +63,23 @@ def test_every_term_of_the_published_well_and_the_total():
             np.testing.assert_allclose(covariance[row][0], expected, rtol=0, atol=3e-6 * size)
         total = sum(covariance[row][0] for covariance in ours.values())
         np.testing.assert_allclose(total, published[depth, "TOTAL"], rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("well", [2, 3])
+def test_every_term_of_the_published_wells_2_and_3_to_the_printed_digits(well):
+    """A hole that turns through all azimuths, in feet, and one that drops to vertical and rises beyond horizontal."""
+    md, inclination, azimuth = published_wells.stations(well)
+    field, dip, declination = published_wells.EARTH[well]
+    tvd = well_path(md, inclination, azimuth)[:, 2]
+    magnetic = azimuth - np.radians(declination)
+    hole = Hole.along(md, tvd, inclination, azimuth, magnetic, field, np.radians(dip))
+    ours = {name: covariance[-1] for name, covariance in covariances(hole)}
+    expected = published_wells.published(well)
+    assert set(ours) == set(expected) - {"TOTAL"}
+    for name, covariance in ours.items():
+        np.testing.assert_allclose(covariance, expected[name], rtol=0, atol=5.1e-5, err_msg=name)
+    total = sum(ours.values())
+    np.testing.assert_allclose(total, expected["TOTAL"], rtol=0, atol=5.1e-5)
 
 
 def test_a_term_that_is_larger_has_errors_as_much_larger():

@@ -185,7 +185,7 @@ def test_units_that_nothing_else_tells(laboratory, tmp_path):
     for name in ("feet", "metres"):
         ran = mwdcal("survey", job / "cal.json", job / f"{name}.csv", "-o", job / f"{name}_out.csv")
         assert ran.code == 0, ran
-    one, other = (read_csv(job / f"{name}_out.csv")["tvd_m"] for name in ("feet", "metres"))
+    one, other = (read_csv(job / f"{name}_out.csv")["tvd_ft"] for name in ("feet", "metres"))
     np.testing.assert_allclose([float(x) for x in one], [float(x) for x in other], atol=1e-6)
 
 

@@ -17,7 +17,7 @@ from mwdcal.calibration.prediction import readings_at
 from mwdcal.files import streams
 from mwdcal.files.documents import read
 from mwdcal.files.formats import text
-from mwdcal.survey import acceptance, long_table
+from mwdcal.survey import acceptance, long_table, surveying
 from mwdcal.survey.path import calibrated_path, continued_path
 from mwdcal.survey.references import declination_sd
 
@@ -30,6 +30,12 @@ def tool(tmp_path_factory):
     fit = ("calibrate", EXAMPLE / "run.csv", "--tool", EXAMPLE / "tool.toml")
     assert cli(*fit, "-o", folder / "tool.json").code == 0
     return folder / "tool.json"
+
+
+@pytest.fixture(autouse=True)
+def _without_contributions(monkeypatch):
+    """Long tables have none: these short ones stand for them."""
+    monkeypatch.setattr(surveying, "MOST_CONTRIBUTED", 0)
 
 
 @pytest.fixture
@@ -114,6 +120,11 @@ def unmagnetic(columns, rng):
         columns[name] = [""] * ROWS
 
 
+def norths(columns, rng):
+    columns["ref_declination_deg"] = [repr(value) for value in np.linspace(1, 3, ROWS).tolist()]
+    columns["sd_random_ref_declination_deg"] = ["0.2"] * ROWS
+
+
 CASES = {
     "gaps": (gaps, ["declination_deg = 2.5"], ("--json",)),
     "reference": (gaps, ["declination_deg = 2.5"], ("--reference",)),
@@ -122,6 +133,7 @@ CASES = {
     "bare": (bare, ["declination_deg = 2.5"], ()),
     "swapped": (swapped, [], ()),
     "unmagnetic": (unmagnetic, [], ()),
+    "norths": (norths, [], ()),
 }  # fmt: skip
 
 

@@ -1078,3 +1078,136 @@ def test_dogleg_severity_and_vertical_section(example, tmp_path):
     north, east = (floats(columns[f"{name}_m"]) for name in ("north", "east"))
     expected = north * np.cos(section) + east * np.sin(section)
     np.testing.assert_allclose(floats(columns["vertical_section_m"]), expected, atol=1e-9)
+
+
+# ------------------------------------------------------------------ feet
+
+
+@pytest.mark.parametrize(("unit", "metres"), [("ft", 0.3048), ("usft", 1200 / 3937)])
+def test_feet_are_metres_in_another_unit(example, tmp_path, unit, metres):
+    """Depths that state feet, or none: every length is that of the same well in metres, divided by the foot."""
+    given = read_csv(EXAMPLE / "well.csv")
+    deep = [repr(float(cell) / metres) for cell in given.pop("md_m")]
+    whole, document = surveyed_file(example, tmp_path, {})
+    path = tmp_path / "contributions.csv"
+    for name in (f"md_{unit}", "MD", f"MD ({unit})"):
+        source = write_csv(tmp_path / "feet.csv", {**given, name: deep}, "simulated = true")
+        out = tmp_path / "feet_out.csv"
+        typed = ("survey", example, source, "-o", out, "--length-unit", unit)
+        ran = cli(*typed, "--contributions", path, "--json")
+        assert ran.code == 0, ran
+        columns = read_csv(out)
+        assert not [column for column in columns if column.endswith("_m")]
+        for column in ("north", "sd_east", "tvd", "vertical_section"):
+            expected = floats(whole[f"{column}_m"]) / metres
+            np.testing.assert_allclose(
+                floats(columns[f"{column}_{unit}"]), expected, rtol=1e-9, atol=1e-9
+            )
+        severity = floats(columns[f"dogleg_severity_deg_per_100{unit}"])[1:]
+        metric = floats(whole["dogleg_severity_deg_per_30m"])[1:]
+        np.testing.assert_allclose(severity, metric / 30 * 100 * metres, rtol=1e-9, atol=1e-9)
+        assert ran.json["length_unit"] == unit
+        assert ran.json["end"]["tvd_m"] == pytest.approx(document["end"]["tvd_m"], rel=1e-12)
+        last = read_csv(path)
+        assert float(last[f"md_{unit}"][-1]) == pytest.approx(1050 / metres, rel=1e-12)
+        assert f"at {1050 / metres:.2f} {unit} MD" in cli(*typed).out
+
+
+def test_feet_of_a_tie_in_of_a_table_in_metres_and_of_the_settings(example, tmp_path, monkeypatch):
+    moved = {"md_m": [str(float(cell) + 200) for cell in read_csv(EXAMPLE / "well.csv")["md_m"]]}
+    metric, _ = surveyed_file(example, tmp_path, moved, "--tie-in", "30.48,1,20,0,3.048,30.48")
+    feet = ("--tie-in", "100,1,20,0,10,100", "--length-unit", "ft")
+    tied, _ = surveyed_file(example, tmp_path, moved, *feet)
+    np.testing.assert_allclose(
+        floats(tied["east_ft"]), floats(metric["east_m"]) / 0.3048, rtol=1e-9
+    )
+    (tmp_path / "mwdcal.toml").write_text('length_unit = "usft"\n')
+    monkeypatch.chdir(tmp_path)
+    stated, _ = surveyed_file(example, tmp_path, moved)
+    assert "tvd_usft" in stated
+    chosen, _ = surveyed_file(example, tmp_path, moved, "--length-unit", "m")
+    assert "tvd_m" in chosen
+
+
+def test_a_trajectory_in_feet_says_so(example, tmp_path):
+    given = read_csv(EXAMPLE / "well.csv")
+    feet = {"md_ft": [repr(float(cell) / 0.3048) for cell in given.pop("md_m")], **given}
+    source = write_csv(tmp_path / "feet.csv", feet, "simulated = true")
+    out = tmp_path / "well.xml"
+    ran = cli("survey", example, source, "-o", out, "--length-unit", "ft")
+    assert ran.code == 0, ran
+    text = out.read_text("utf-8")
+    assert text.count('<md uom="ft">') == text.count('<tvd uom="ft">') == 36
+    assert 'uom="m"' not in text
+
+
+# ------------------------------------------------------------------ references by station
+
+
+def test_a_declination_by_row_turns_each_row_by_its_own(example, tmp_path):
+    """Expected: true = magnetic + declination at every row; 1σ that rows share and 1σ of each, added as squares."""
+    declination, shared, alone = (
+        np.linspace(1.0, 4.0, 36),
+        np.linspace(0.1, 0.3, 36),
+        np.full(36, 0.2),
+    )
+    rows = {
+        "ref_declination_deg": [repr(value) for value in declination.tolist()],
+        "sd_ref_declination_deg": [repr(value) for value in shared.tolist()],
+        "sd_random_ref_declination_deg": [repr(value) for value in alone.tolist()],
+    }
+    columns, document = surveyed_file(example, tmp_path, rows, *BY_CALIBRATION)
+    magnetic, true = (floats(columns[f"azimuth_{name}_deg"]) for name in ("magnetic", "true"))
+    np.testing.assert_allclose((true - magnetic) % 360, declination, atol=1e-9)
+    without, _ = surveyed_file(example, tmp_path, {}, *BY_CALIBRATION)
+    known = ~np.isnan(floats(without["sd_azimuth_magnetic_deg"]))
+    sd = np.sqrt(floats(without["sd_azimuth_magnetic_deg"]) ** 2 + shared**2 + alone**2)
+    np.testing.assert_allclose(floats(columns["sd_azimuth_true_deg"])[known], sd[known], rtol=1e-9)
+    assert document["declination_deg"] == pytest.approx(2.5)
+    assert document["reference_sources"]["declination"] == "table"
+    assert not {"unused-columns", "column-unused"} & {each["id"] for each in document["findings"]}
+    angles = (np.radians(floats(columns[f"{n}_deg"])) for n in ("inclination", "azimuth_true"))
+    path = well_path(floats(columns["md_m"]), *angles)
+    np.testing.assert_allclose(floats(columns["east_m"]), path[:, 1], atol=1e-6)
+    # the end turns by the shift that all rows share, weighted by courses; that of each row adds up as squares
+    sine = np.sin(np.radians(floats(columns["inclination_deg"])))
+    course = 30.0 * np.where(np.isin(np.arange(36), (0, 35)), 0.5, 1.0) * sine
+    heading = np.radians(floats(columns["azimuth_true_deg"]))
+    shift = np.radians(np.stack([shared, alone])) * course
+    north = np.hypot((shift[0] * np.sin(heading)).sum(), np.linalg.norm(shift[1] * np.sin(heading)))
+    stated = floats(columns["sd_north_m"])[-1]
+    alone_north, _ = surveyed_file(
+        example, tmp_path, rows | {k: ["0"] * 36 for k in [*rows][1:]}, *BY_CALIBRATION
+    )
+    rest = floats(alone_north["sd_north_m"])[-1]
+    assert np.sqrt(stated**2 - rest**2) == pytest.approx(north, rel=0.01)
+
+
+def test_a_declination_by_row_is_whole_or_has_one_that_stands_for_it(example, tmp_path):
+    cells = ["2.4"] * 35 + [""]
+    given = {**read_csv(EXAMPLE / "well.csv"), "ref_declination_deg": cells}
+    source = write_csv(tmp_path / "in.csv", given, "simulated = true")
+    ran = cli("survey", example, source, "-o", tmp_path / "out.csv")
+    assert "'ref_declination_deg': is blank" in refused(ran, 2)
+    columns, _ = surveyed_file(
+        example, tmp_path, {"ref_declination_deg": cells}, metadata=["declination_deg = 9"]
+    )
+    turned = floats(columns["azimuth_true_deg"]) - floats(columns["azimuth_magnetic_deg"])
+    np.testing.assert_allclose(turned[[0, -1]] % 360, [2.4, 9.0], atol=1e-9)
+    wrong = {"ref_declination_deg": ["200"] * 36}
+    source = write_csv(tmp_path / "in.csv", {**given, **wrong}, "simulated = true")
+    assert "between -180 and 180" in refused(
+        cli("survey", example, source, "-o", tmp_path / "out.csv"), 2
+    )
+
+
+def test_random_uncertainty_of_a_reference_widens_the_limits_of_its_row(example, tmp_path):
+    """Expected: a field 500 nT off passes where its reference is uncertain by 1000 nT, and nowhere else."""
+    off = ["48600"] * 36
+    sd = ["1000"] * 18 + ["10"] * 18
+    columns, _ = surveyed_file(
+        example, tmp_path, {"ref_field_nt": off, "sd_ref_field_nt": ["10"] * 36, "sd_random_ref_field_nt": sd},
+        "--limits", "owsg-mwd",
+    )  # fmt: skip
+    assert set(columns["accepted"][:18]) == {"true"}
+    assert "false" in columns["accepted"][18:]

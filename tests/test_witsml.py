@@ -340,7 +340,8 @@ def test_what_is_written_is_read(tmp_path, table):
 
 def test_elements_are_in_the_order_of_the_schema_with_their_units(tmp_path):
     count = 2
-    names = [*witsml._OURS, "azimuth_deg", "ax", "ay", "az", "mx", "my", "mz", "station", "gx_g"]
+    metric = [name for name in witsml._OURS if not name.endswith(("ft", "ft2"))]
+    names = [*metric, "azimuth_deg", "ax", "ay", "az", "mx", "my", "mz", "station", "gx_g"]
     columns = {name: np.arange(count) + 0.5 for name in names} | {"station": ["a", "b"]}
     units = {"accelerometer_unit": "m/s²", "magnetometer_unit": "µT"}
     root = ElementTree.fromstring(rendered("t.xml", Table(columns, units)))
@@ -348,13 +349,25 @@ def test_elements_are_in_the_order_of_the_schema_with_their_units(tmp_path):
     assert first.get("uid") == "a"
     tags = [element.tag.removeprefix(SERIES) for element in first]
     assert tags == [
-        *("typeTrajStation", "md", "tvd", "incl", "azi", "mtf", "gtf", "dispNs", "dispEw"),
+        *(
+            "typeTrajStation",
+            "md",
+            "tvd",
+            "incl",
+            "azi",
+            "mtf",
+            "gtf",
+            "dispNs",
+            "dispEw",
+            "vertSect",
+        ),
         *("gravTotalUncert", "dipAngleUncert", "magTotalUncert", "gravTotalFieldReference"),
         *(
             "magTotalFieldReference",
             "magDipAngleReference",
             "rawData",
             "valid",
+            "matrixCov",
             "extensionNameValue",
         ),
     ]

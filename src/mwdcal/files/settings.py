@@ -30,7 +30,7 @@ class LaboratorySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     registry: str = ""
     keys: tuple[str, ...] = ()
     laboratory: str = ""
-    length_unit: Literal["", "m", "ft"] = ""
+    length_unit: Literal["", "m", "ft", "usft"] = ""
     temperature_unit: Literal["", "°C", "°F", "K"] = ""
     stand: StandProfile = StandProfile()
     standards: tuple[MeasurementStandard, ...] = ()

@@ -228,7 +228,18 @@ NOTICED = {
     "temperature_c": "°C",
 }
 """Columns that must not be overlooked, with their units."""
-OURS = ("time_s", "start_s", "end_s", "samples", "drifting", "serial", "simulated", "md_m")
+OURS = (
+    "time_s",
+    "start_s",
+    "end_s",
+    "samples",
+    "drifting",
+    "serial",
+    "simulated",
+    "md_m",
+    "md_ft",
+    "md_usft",
+)
 """Columns beyond the contract that mwdcal itself reads or writes in run files."""
 _COPIED = ("drift_", "witsml ")
 """What columns begin with that mwdcal writes of a log, and that a WITSML file has beyond a run's."""

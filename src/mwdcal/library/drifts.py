@@ -3,26 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from datetime import date
+from dataclasses import replace
+from datetime import UTC, date, datetime
 from functools import partial
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
 
 from mwdcal.calibration.prediction import STATED_ANGLES
-from mwdcal.calibration.record import Calibration
+from mwdcal.calibration.readings import TRIADS, serial_of
+from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.drift.change import CHANGE_LEVEL
 from mwdcal.drift.document import ToolDrift
 from mwdcal.drift.fleet import fleet_drift
 from mwdcal.drift.forecast import ServiceTest
 from mwdcal.drift.tool import MeasuredTool, TypeRates, measured, predicted
+from mwdcal.drift.walk import WALK_GROUPS
 from mwdcal.errors import InputError, MwdcalError
 from mwdcal.files import documents
 from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.members import Member
 from mwdcal.files.limits import load_limits
+from mwdcal.geometry.units import STANDARD_GRAVITY
 from mwdcal.presentation.drift import RegistryDrift
 from mwdcal.registry import queries
-from mwdcal.registry.store import Registry
+from mwdcal.registry.store import Registry, open_registry
+from mwdcal.survey.acceptance import SensorTerms
+from mwdcal.survey.surveying import WellInputs
 from mwdcal.use.verification import Bounds, Verdict
 
 _Document = tuple[queries.Row, bytes]
@@ -91,6 +99,40 @@ def of_registry(
         )
     fleet, _ = fleet_drift(tools, limits, today, refused, level)
     return whole(fleet=fleet)
+
+
+def with_walk(inputs: WellInputs, database: str) -> WellInputs:
+    """The inputs of surveys with the random walk of their tool, as the calibrations in a registry show it.
+
+    What a parameter moves by in a year is the median of its rate. Misalignments act as scales of the other axes.
+
+    Raises:
+        InputError: the calibration has no serial, or the registry no calibration of its tool.
+    """
+    serial = serial_of(inputs.calibration.tool)
+    if not serial:
+        raise InputError("the calibration has no serial: `registry` cannot find its tool.")
+    with open_registry(database) as registry:
+        tool = of_registry(registry, serial, {}, CHANGE_LEVEL, datetime.now(UTC).date()).tool
+    rates = {} if tool is None else {(r.triad, r.kind): r.per_root_year for r in tool.rates}
+    if not set(WALK_GROUPS) <= set(rates) or inputs.calibration.relative:
+        text = (
+            f"the registry shows no random walk of tool {serial} in g and nT, as of several calibrations: the drift is "
+            "that of the error model."
+        )
+        return replace(inputs, findings=[*inputs.findings, Finding(id="no-random-walk", text=text)])
+    scale = {
+        triad: float(
+            np.hypot(rates[triad, "scale"], np.sqrt(2) * np.radians(rates[triad, "misalignment"]))
+        )
+        for triad in TRIADS
+    }
+    walk = SensorTerms(
+        accelerometer_bias_ms2=rates["accelerometer", "bias"] * STANDARD_GRAVITY,
+        accelerometer_scale=scale["accelerometer"],
+        magnetometer_bias_nt=rates["magnetometer", "bias"], magnetometer_scale=scale["magnetometer"],
+    )  # fmt: skip
+    return replace(inputs, walk=walk)
 
 
 def drift_of(

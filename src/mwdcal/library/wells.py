@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from mwdcal.survey.error_model import ErrorModel
     from mwdcal.survey.interference import InterferenceSize, MultiStationAnalysis
     from mwdcal.survey.references import EarthReference, FilledRun
-    from mwdcal.survey.surveying import SurveyedWell
+    from mwdcal.survey.surveying import SurveyedWell, WellInputs
     from mwdcal.survey.tool_model import SensorTerm
     from mwdcal.survey.well import Position
 
@@ -201,6 +201,17 @@ class WellSurvey(Result):
         """Measured depth, and north, east and TVD (n, 3) with covariance, m; None without measured depths."""
         return self.surveyed.well.position
 
+    @cached_property
+    def contributions(self) -> Mapping[str, AnyArray] | None:
+        """The causes of every 1σ: a row for each station and cause; None beyond 2000 surveys, and without azimuths."""
+        from mwdcal.presentation.contributions import contribution_columns
+
+        parts = self.surveyed.contributions
+        if parts is None:
+            return None
+        columns = contribution_columns(parts, self.surveyed.well.length_unit).items()
+        return {k: np.array(v, object) if isinstance(v, list) else v for k, v in columns}
+
     def to_pandas(self) -> Any:
         """The columns as a table of pandas, with what the command's table states of itself in `attrs`."""
         return frame(self.columns, self._whole_table.metadata)
@@ -218,8 +229,7 @@ class WellSurvey(Result):
     def _page(self) -> str:
         from mwdcal.presentation.survey_page import render
 
-        well = self.surveyed.well
-        return render(well, well.findings, self.surveyed.inputs.named, self.surveyed.analysis)
+        return render(self.surveyed, self.surveyed.well.findings)
 
     def msa_report(self, path: FilePath) -> None:
         """Write the page of the multi-station analysis.
@@ -234,8 +244,13 @@ class WellSurvey(Result):
         atomic.write(path, render(self.surveyed.analysis, self.surveyed.inputs.named))
 
     def save(self, path: FilePath) -> None:
-        """Write the table of the command: the readings with the results beside them; the suffix is the format."""
-        tables.write(path, self._whole_table)
+        """Write the table of the command: the readings with the results beside them; the suffix is the format.
+
+        WITSML has the covariance of the positions too.
+        """
+        with_covariance = Path(path).suffix.lower() == ".xml"
+        whole = self.surveyed.table_with(True) if with_covariance else self._whole_table
+        tables.write(path, whole)
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -432,9 +447,12 @@ def survey(
     limits: FilePath | SurveyLimits = "owsg-mwd",
     sensor_drift: FilePath | None = None,
     error_model: FilePath | ErrorModel = "owsg-mwd",
+    runs: Sequence[tuple[Calibration | FilePath, Tabular | Readings]] = (),
+    registry: FilePath | None = None,
     switch: tuple[float, float] = (3.0, 5.0),
     tie_in: Sequence[float] | None = None,
     section_azimuth: float = 0.0,
+    length_unit: Literal["", "m", "ft", "usft"] = "",
     outside: Literal["blank", "refuse", "extrapolate"] = "blank",
     missing: Literal["refuse", "blank"] = "refuse",
     decimal: str = ".",
@@ -443,7 +461,7 @@ def survey(
     """The surveys of a well: readings in their order, corrected by the calibration of their tool.
 
     Definition: inclination, azimuth, toolface, |g|, |b| and dip with standard uncertainties; whether each survey lies
-    within the limits; with measured depths (`md_m`) north, east and TVD by minimum curvature.
+    within the limits; with measured depths (`md_m`, `md_ft`, `md_usft`) north, east and TVD by minimum curvature.
     Singular: at vertical azimuth and gravity toolface are NaN.
 
     Args:
@@ -455,11 +473,17 @@ def survey(
         sensor_drift: with `msa`, drift of the sensors since the calibration, 1σ: owsg (the default), none, or a file.
         error_model: what the standard uncertainties hold besides calibration, noise and declination: owsg-mwd,
             none, or a file in ISCWSA's JSON form.
+        runs: the runs of the same well that follow, each a calibration and readings: their path goes on where the run
+            before ended.
+        registry: URL or file of a registry; the random walk of the tool that its calibrations show is the drift
+            since the calibration, instead of that of the error model.
         switch: inclinations, degrees, below which the toolface counts from magnetic north, and above which from the
             high side.
-        tie_in: north, east and TVD of the first station, m; or measured depth, inclination, azimuth (degrees, from the
-            north of the path), north, east and TVD of the point where the path is tied in.
+        tie_in: north, east and TVD of the first station, in `length_unit`; or measured depth, inclination, azimuth
+            (degrees, from the north of the path), north, east and TVD of the point where the path is tied in.
         section_azimuth: of the vertical section, degrees from the north of the path.
+        length_unit: of the results and of `tie_in`, and of depths whose column states none: m (the default), ft, or
+            usft (1200/3937 m).
         outside: what becomes of readings outside the calibrated temperatures.
         missing: rows without a reading, such as a tie-in station: refuse the table, or leave their results blank.
         decimal: decimal sign of a text file.
@@ -474,22 +498,35 @@ def survey(
         `well.columns["azimuth_true_deg"]` and `well.interference.axial_nt`.
     """
     from mwdcal.presentation.signature import load_calibration
-    from mwdcal.survey.surveying import analysed, check_drift, start_of, survey_well, well_inputs
+    from mwdcal.survey.runs import survey_runs
+    from mwdcal.survey.surveying import analysed, check_drift, start_of, well_inputs
 
     check_drift(sensor_drift, msa)
     ends: Any = tuple(np.radians(_finite("switch", switch, 2)).tolist())
-    start = None if tie_in is None else start_of(_finite("tie_in", tie_in, len(tie_in)))
-    loaded = load_calibration(_source(cal), [Path(key) for key in keys])
-    table = _survey_table(readings, loaded.calibration, decimal)
-    inputs = well_inputs(
-        loaded.calibration, table, _earth(reference), limits, msa, loaded.digest, loaded.findings,
-        error_model, missing, _number("section_azimuth", section_azimuth),
-    )  # fmt: skip
-    analysis = analysed(inputs, sensor_drift) if msa else None
-    if analysis:
-        analysis.check()
-    result = survey_well(inputs, analysis, tie_in=start, switch=ends, outside=outside)
-    return WellSurvey(result, loaded.signature)
+    start = (
+        None
+        if tie_in is None
+        else start_of(_finite("tie_in", tie_in, len(tie_in)), length_unit or "m")
+    )
+    loaded = [
+        load_calibration(_source(tool), [Path(key) for key in keys])
+        for tool in (cal, *(tool for tool, _ in runs))
+    ]
+    inputs = [
+        well_inputs(
+            tool.calibration, _survey_table(table, tool.calibration, decimal), _earth(reference), limits, msa,
+            tool.digest, tool.findings, error_model, missing, _number("section_azimuth", section_azimuth),
+            length_unit,
+        )
+        for tool, table in zip(loaded, (readings, *(table for _, table in runs)), strict=True)
+    ]  # fmt: skip
+    inputs = [_with_walk(each, registry) for each in inputs]
+    analyses = [analysed(each, sensor_drift) if msa else None for each in inputs]
+    for analysis in analyses:
+        if analysis:
+            analysis.check()
+    result = survey_runs(inputs, analyses, tie_in=start, switch=ends, outside=outside)
+    return WellSurvey(result, loaded[0].signature)
 
 
 def convert(
@@ -564,6 +601,15 @@ def export(
     form = "c" if form is None else form
     _check_word("form", form, FORMS_OF_FIRMWARE)
     return FirmwareExport(conversion.exported(_source(cal), FORMS_OF_FIRMWARE[form], word_bits))
+
+
+def _with_walk(inputs: WellInputs, registry: FilePath | None) -> WellInputs:
+    """The inputs with the random walk of their tool, where a registry is named."""
+    if registry is None:
+        return inputs
+    from mwdcal.library.drifts import with_walk
+
+    return with_walk(inputs, os.fspath(registry))
 
 
 def _source(cal: object) -> Calibration | FilePath:

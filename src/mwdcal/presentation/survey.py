@@ -6,22 +6,30 @@ The surveys of a well, on the screen and for machines.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from mwdcal.calibration.canonical import SignatureCheck
 from mwdcal.calibration.diagnosis.findings import unused_columns
-from mwdcal.calibration.readings import simulated
+from mwdcal.calibration.readings import serial_of, simulated
 from mwdcal.calibration.record import Finding, stated
+from mwdcal.geometry.units import LENGTH_UNITS
+from mwdcal.presentation.contributions import (
+    ContributionSummary,
+    contribution_screen,
+    contribution_summary,
+)
 from mwdcal.presentation.envelope import json_document, with_signature
 from mwdcal.presentation.numbers import files_written, fixed, measured, number, signed
 from mwdcal.presentation.signature import signature_status
 from mwdcal.presentation.text import chance, one_line, plural, table
 from mwdcal.survey.interference import Interference, InterferenceSize, MultiStationAnalysis
 from mwdcal.survey.norths import North
-from mwdcal.survey.surveying import SurveyedWell, WellInputs
+from mwdcal.survey.surveying import BY_ROW, SurveyedWell, WellInputs
 from mwdcal.survey.well import LastStation, Well, WellCounts
 from mwdcal.survey.well_errors import WellErrors
 from mwdcal.use.uncertainty import ErrorTerms, error_terms
@@ -128,14 +136,37 @@ class EndOfPath(msgspec.Struct, frozen=True, kw_only=True):
     covariance_m2: list[list[float | None]]
 
 
+class RunOfWell(msgspec.Struct, frozen=True, kw_only=True):
+    """One of several runs of a well: its tool, its surveys, and where it ends."""
+
+    run: int
+    serial: str
+    readings: str
+    readings_sha256: str
+    calibration_run: str
+    calibration_time: str
+    calibration_sha256: str
+    years_since_calibration: float | None
+    rows: int
+    accepted: int
+    rejected: int
+    end: EndOfPath | None
+    msa: MultiStationAnalysis | None
+
+
 class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
     """The output of `survey`: stations counted by outcome, what they were judged by, where the path ends.
 
     `blind`: accepted ones whose azimuth interference could turn and still pass.
+    The declination is the mean where it varies by row.
     `reference_sources`: where gravity, field, dip, declination and convergence come from, by name.
     `error_terms` are in the standard uncertainties of surveys and path, `not_included` are not; `error_model` states
     those that are not of the calibration. Drift counts over `years_since_calibration`; null: not known, taken as one.
+    `random_walk`: the drift is that of the tool by a registry, not the model's.
     `msa` is the multi-station analysis, if one was asked for; `interference` and `separable` are of it.
+    Lengths are in metres; `length_unit` is that of table, screen and page.
+    `runs` of a well in several; its stations are then named run:station.
+    `contributions`: what makes the uncertainty of each survey; null beyond 2000 surveys.
     """
 
     rows: int
@@ -151,6 +182,7 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
     reference_sources: dict[str, str]
     error_model: str
     years_since_calibration: float | None
+    random_walk: bool
     error_terms: list[str]
     not_included: list[str]
     limits: str
@@ -159,9 +191,12 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
     findings: list[Finding]
     output: str
     html: str
+    length_unit: str = "m"
     interference: InterferenceSize | None = None
     separable: bool | None = None
     msa: MultiStationAnalysis | None = None
+    contributions: ContributionSummary | None = None
+    runs: list[RunOfWell] = []
 
 
 def refusal(inputs: WellInputs, msa: MultiStationAnalysis) -> SurveySummary:
@@ -178,6 +213,7 @@ def refusal(inputs: WellInputs, msa: MultiStationAnalysis) -> SurveySummary:
         **_stated(north, error_terms((), north.declination is not None)),
         error_model=inputs.model.name if inputs.model else "none",
         years_since_calibration=None,
+        random_walk=False,
         reference_sources=dict(inputs.surveys.sources),
         limits=inputs.limits.name,
         source=inputs.limits.source,
@@ -194,8 +230,45 @@ def refusal(inputs: WellInputs, msa: MultiStationAnalysis) -> SurveySummary:
 def result_summary(result: SurveyedWell, output: str = "", html: str = "") -> SurveySummary:
     """The result for machines; `output` and `html` are the files that were written, if any."""
     msa = result.analysis.summary if result.analysis else None
-    unused = unused_columns(result.inputs.surveys.readings.unused)
-    return summary(result.well, result.counts, output, html, msa, unused)
+    others = result.inputs.surveys.readings.unused
+    unused = unused_columns(tuple(t for t in others if not any(name in t for name in BY_ROW)))
+    facts = summary(result.well, result.counts, output, html, msa, unused)
+    budget = result.contributions and contribution_summary(result.contributions)
+    runs = [_run_of_well(i, run) for i, run in enumerate(result.runs, 1)]
+    return replace(facts, contributions=budget, runs=runs)
+
+
+def _run_of_well(place: int, run: SurveyedWell) -> RunOfWell:
+    well, counts = run.well, run.counts
+    return RunOfWell(
+        run=place, serial=serial_of(well.calibration.tool) or "", readings=well.readings.source,
+        readings_sha256=run.inputs.digests["readings"], calibration_run=well.calibration.run,
+        calibration_time=well.calibration.time, calibration_sha256=run.inputs.digests["calibration"],
+        years_since_calibration=well.errors.years if well.errors else None,
+        rows=counts.rows, accepted=counts.accepted, rejected=counts.rejected,
+        end=end_of_path(counts.end) if counts.end else None,
+        msa=run.analysis.summary if run.analysis else None,
+    )  # fmt: skip
+
+
+def runs_in_words(facts: SurveySummary) -> list[str]:
+    """A line for each of several runs: its tool and surveys, and where it ends."""
+    metres = LENGTH_UNITS[facts.length_unit]
+    lines = []
+    for run in facts.runs:
+        years = run.years_since_calibration
+        time = (
+            "time since the calibration unknown"
+            if years is None
+            else f"{fixed(years, 2)} years since the calibration"
+        )
+        end = f", to {fixed(run.end.md_m / metres, 2)} {facts.length_unit} MD" if run.end else ""
+        counts = f"{run.accepted} of {plural(run.rows, 'survey')} accepted"
+        tool = f"tool {run.serial}, " if run.serial else ""
+        lines.append(
+            f"run {run.run}   {run.readings}   {tool}calibration {run.calibration_run}, {time}   {counts}{end}"
+        )
+    return lines
 
 
 def document(inputs: WellInputs, facts: SurveySummary, signature: SignatureCheck) -> dict[str, Any]:
@@ -204,18 +277,32 @@ def document(inputs: WellInputs, facts: SurveySummary, signature: SignatureCheck
     return with_signature(whole, signature)
 
 
-def whole_screen(result: SurveyedWell, facts: SurveySummary, signature: SignatureCheck) -> str:
-    """The result for people, behind the multi-station analysis if there is one."""
+def whole_screen(
+    result: SurveyedWell,
+    facts: SurveySummary,
+    signature: SignatureCheck,
+    station: str | None = None,
+    **files: Path | None,
+) -> str:
+    """The result for people, behind the multi-station analysis if there is one.
+
+    `station`: label of the one whose contributions are shown, by default the last. `files`: others that were written.
+    """
     stated = result.inputs.stated
-    shown = screen(result.well, facts, signature, *stated)
-    return (
-        f"{interference_screen(result.analysis, *stated)}\n\n{shown}" if result.analysis else shown
-    )
+    analyses = [run.analysis for run in result.runs] or [result.analysis]
+    parts = [interference_screen(each, *stated) for each in analyses if each]
+    parts.append(screen(result.well, facts, signature, *stated))
+    if result.contributions:
+        unit = result.well.length_unit
+        parts.append(contribution_screen(result.contributions, station, unit))
+    written = files_written(table=facts.output, page=facts.html, **files) if facts.output else ""
+    return "\n\n".join(parts) + (f"\n{written}" if written else "")
 
 
 def all_findings(facts: SurveySummary) -> list[Finding]:
     """The findings of the multi-station analysis, then those about the surveys."""
-    return [*(facts.msa.findings if facts.msa else []), *facts.findings]
+    analyses = [facts.msa, *(run.msa for run in facts.runs)]
+    return [*(f for each in analyses if each for f in each.findings), *facts.findings]
 
 
 def summary(
@@ -239,6 +326,7 @@ def summary(
         **_stated(north, well.terms),
         error_model=well.errors.model.name if well.errors else "none",
         years_since_calibration=well.errors.years if well.errors else None,
+        random_walk=well.errors is not None and well.errors.by_walk,
         reference_sources=dict(well.sources),
         limits=well.limits.name,
         source=well.limits.source,
@@ -246,6 +334,7 @@ def summary(
         findings=[*well.findings, *about_file],
         output=output,
         html=html,
+        length_unit=well.length_unit,
         interference=msa.interference if msa else None,
         separable=msa.separable if msa else None,
         msa=msa,
@@ -254,6 +343,7 @@ def summary(
 
 def _stated(north: North, terms: ErrorTerms) -> dict[str, Any]:
     """The causes that turn azimuths, degrees, and what their uncertainty holds."""
+    north = north.typical
     sd = None if north.declination is None else north.declination_sd
     angles = {
         "declination_deg": north.declination,
@@ -303,33 +393,39 @@ def screen(
         "   ".join(heading),
         f"azimuths from {facts.north} north{declination_in_words(facts)}   limits {facts.limits}{source}",
     ]
+    lines += runs_in_words(facts)
     if facts.reference_sources:
         lines.append(sources_in_words(facts))
     if facts.end:
-        lines.append(end_in_words(facts.end, facts.north))
+        lines.append(end_in_words(facts.end, facts.north, facts.length_unit))
     lines.append(well.terms.sentence)
     if well.errors:
-        lines.append(model_in_words(well.errors))
+        lines.append(model_in_words(well.errors, bool(facts.runs)))
     return "\n".join(
         [
             *map(one_line, lines),
             "",
             survey_table(well, facts.rows),
-            *([files_written(table=facts.output, page=facts.html)] if facts.output else []),
         ]
     )
 
 
-def model_in_words(errors: WellErrors) -> str:
-    """The error model, and the time over which the sensors may have drifted."""
+def model_in_words(errors: WellErrors, runs: bool = False) -> str:
+    """The error model, and the time over which the sensors may have drifted; that of several runs stands with these."""
+    if runs:
+        walk = "; drift by the random walk of each tool" if errors.by_walk else ""
+        return f"error model {errors.model.name} ({errors.model.source}){walk}"
     time = (
         "an unknown time since the calibration, taken as a year"
         if errors.years is None
         else (f"{fixed(errors.years, 2)} years since the calibration")
     )
-    return (
-        f"error model {errors.model.name} ({errors.model.source}); drift of the sensors over {time}"
+    drift = (
+        "drift of the sensors by the random walk of this tool"
+        if errors.by_walk
+        else "drift of the sensors"
     )
+    return f"error model {errors.model.name} ({errors.model.source}); {drift} over {time}"
 
 
 def declination_in_words(facts: SurveySummary) -> str:
@@ -349,17 +445,18 @@ def sources_in_words(facts: SurveySummary) -> str:
     return "   ".join(["references", *parts])
 
 
-def end_in_words(end: EndOfPath, north: str) -> str:
-    """Where the path ends, with standard uncertainties."""
+def end_in_words(end: EndOfPath, north: str, unit: str = "m") -> str:
+    """Where the path ends, with standard uncertainties, in a unit of length."""
+    metres = LENGTH_UNITS[unit]
     parts = [
-        f"{title} {fixed(value, 2)} m (1σ {'not stated' if sd is None else fixed(sd, 2)})"
+        f"{title} {fixed(value / metres, 2)} {unit} (1σ {'not stated' if sd is None else fixed(sd / metres, 2)})"
         for title, value, sd in (
             ("north", end.north_m, end.sd_north_m),
             ("east", end.east_m, end.sd_east_m),
             ("TVD", end.tvd_m, end.sd_tvd_m),
         )
     ]
-    return f"at {fixed(end.md_m, 2)} m MD, from {north} north: {', '.join(parts)}"
+    return f"at {fixed(end.md_m / metres, 2)} {unit} MD, from {north} north: {', '.join(parts)}"
 
 
 def survey_table(well: Well, count: int, most: int = MOST_SURVEYS) -> str:
@@ -379,12 +476,13 @@ def survey_rows(well: Well, most: int) -> tuple[list[str], list[list[str]]]:
         "gravity_g": "|g| g", "field_nt": "|b| (relative)" if relative else "|b| nT", "dip_deg": "dip °",
     }  # fmt: skip
     digits = {"gravity_g": 5, "field_nt": 5 if relative else 0, "dip_deg": 2}
-    header = ["station", *(["md m"] if well.position else [])]
+    header = ["station", *([f"md {well.length_unit}"] if well.position else [])]
     for name, title in shown.items():
         header += [title, "1σ"] if name in angles else [title]
     modelled, rows = well.limits.probability is not None, []
+    metres = LENGTH_UNITS[well.length_unit]
     for i, label in enumerate(well.readings.labels[:most]):
-        row = [label, *([fixed(well.position.md[i], 2)] if well.position else [])]
+        row = [label, *([fixed(well.position.md[i] / metres, 2)] if well.position else [])]
         for name in shown:
             row.append(fixed(columns[name][i], digits.get(name, 2)))
             if name in angles:

@@ -5,26 +5,29 @@ The page of the surveys of a well.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mwdcal.calibration.record import Finding
-from mwdcal.geometry.vectors import Array, wrap
+from mwdcal.geometry.units import LENGTH_UNITS
+from mwdcal.geometry.vectors import Array, Bools, wrap
+from mwdcal.presentation.contributions import SHARE_TITLES, share_rows, station_row
 from mwdcal.presentation.interference_page import LARGEST_DRAWN_SD, sections
 from mwdcal.presentation.page import banner, rendered
 from mwdcal.presentation.survey import (
     SurveySummary,
     declination_in_words,
     end_in_words,
+    result_summary,
+    runs_in_words,
     sources_in_words,
-    summary,
     survey_rows,
 )
 from mwdcal.presentation.text import plural
 from mwdcal.survey.acceptance import SURVEY_UNITS
-from mwdcal.survey.interference import Interference
+from mwdcal.survey.contributions import Contributions
+from mwdcal.survey.surveying import SurveyedWell
 from mwdcal.survey.well import Position, Well
 from mwdcal.use.plots import AFTER, BAND, BEFORE, MARKED, SERIES, new_figure, style
 
@@ -37,6 +40,8 @@ ELLIPSE_SDS = 2.0
 """Standard deviations of the ellipses of position."""
 ELLIPSE_SHARE = 0.08
 """Largest half axis of an ellipse as a share of the path."""
+BLIND_SHADE = "#f0b429"
+"""Shade of stretches where acceptance is blind to interference."""
 MOST_ELLIPSES = 12
 """Ellipses of position on a map."""
 MOST_MARKS = 400
@@ -52,7 +57,8 @@ def along(well: Well) -> tuple[Array, str]:
     """Where stations (n,) lie along a depth axis, and its title: measured depth, else their number."""
     if well.position is None:
         return np.arange(1.0, len(well.judgement.accepted) + 1), "station"
-    return well.position.md, "measured depth, m"
+    unit = well.length_unit
+    return well.position.md / LENGTH_UNITS[unit], f"measured depth, {unit}"
 
 
 @style()
@@ -77,6 +83,59 @@ def strengths(well: Well) -> Figure:
     if handles:
         figure.legend(handles.values(), handles, loc="outside upper left", ncols=3)
     return figure
+
+
+SHARE_COLOURS = (
+    "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#7c3aed", "#d55e00", "#56b4e9", "#b8a200", "#4b5563", "#a3c1ad",
+)  # fmt: skip
+"""Colours of causes; neighbours differ in lightness, and lines part them."""
+SHOWN_SHARES = {"inclination": 0, "azimuth": 1, "lateral": 6, "highside": 7}
+"""Quantities whose shares are drawn, and their places in `CONTRIBUTED`."""
+
+
+@style()
+def shares(well: Well, budget: Contributions) -> Figure:
+    """The share of each cause in the variance over depth: of the angles, and of the position across the hole."""
+    depth, title = along(well)
+    names = [*dict.fromkeys(cause.name for cause in budget.causes)]
+    located = has_path(well.position)
+    shown = {n: k for n, k in SHOWN_SHARES.items() if located or k < 2}
+    figure, panels = new_figure(
+        "Share of each cause in the variance of angles and position, over depth",
+        4.6,
+        1,
+        len(shown),
+        sharey=True,
+    )
+    for axes, (name, k) in zip(panels[0], shown.items(), strict=True):
+        _share_track(axes, depth, [_share_of(budget, cause, k) for cause in names])
+        axes.set_xlabel(f"{name}, % of variance")
+    panels[0, 0].set_ylabel(title)
+    _downwards(panels[0, 0], depth)
+    figure.legend(
+        *(panels[0, 0].get_legend_handles_labels()[0], names), loc="outside upper left", ncols=2
+    )
+    return figure
+
+
+def _share_of(budget: Contributions, name: str, k: int) -> Array:
+    """The share (n,) of all causes of a name, per cent."""
+    rows = [i for i, cause in enumerate(budget.causes) if cause.name == name]
+    return np.asarray(100 * budget.share[rows, :, k].sum(0))
+
+
+def _share_track(axes: Axes, depth: Array, parts: list[Array]) -> None:
+    """Shares side by side, over depth."""
+    there = ~np.isnan(parts[0]) & ~np.isnan(depth)
+    edge = np.zeros(int(there.sum()))
+    for i, part in enumerate(parts):
+        upper = edge + part[there]
+        colour = SHARE_COLOURS[i % len(SHARE_COLOURS)]
+        axes.fill_betweenx(
+            depth[there], edge, upper, color=colour, lw=0.4, ec="white", label=str(i)
+        )
+        edge = upper
+    axes.set_xlim(0, 100)
 
 
 def _track(axes: Axes, well: Well, depth: Array, k: int, factor: float) -> None:
@@ -133,6 +192,8 @@ def angles(well: Well) -> Figure:
     )
     for axes, (value, sd, name) in zip(panels[0, :2], tracks, strict=True):
         _angle_track(axes, depth, value, sd)
+        for top, bottom in stretches(depth, well.blind):
+            axes.axhspan(top, bottom, color=BLIND_SHADE, alpha=0.35, lw=0)
         axes.set_xlabel(name)
     panels[0, 0].set_ylabel(title)
     panels[0, 1].set_yticklabels([])
@@ -140,6 +201,22 @@ def angles(well: Well) -> Figure:
     panels[0, 2].remove()
     _dial(figure.add_subplot(where, projection="polar"), well, depth, toolface[0])
     return figure
+
+
+def stretches(depth: Array, chosen: Bools) -> list[tuple[float, float]]:
+    """From where to where neighbouring stations are all chosen, half a course farther at both ends."""
+    known = np.flatnonzero(~np.isnan(depth))
+    at, some = depth[known], chosen[known]
+    middle = (at[1:] + at[:-1]) / 2
+    edges = np.concatenate([at[:1], middle, at[-1:]])
+    change = np.diff(np.concatenate([[False], some, [False]]).astype(int))
+    return [
+        *zip(
+            edges[np.flatnonzero(change > 0)].tolist(),
+            edges[np.flatnonzero(change < 0)].tolist(),
+            strict=True,
+        )
+    ]
 
 
 def _angle_track(axes: Axes, depth: Array, value: Array, sd: Array) -> None:
@@ -177,25 +254,44 @@ def _dial(axes: Any, well: Well, depth: Array, toolface: Array) -> None:
 
 @style()
 def path(well: Well) -> Figure:
-    """The hole on the map, and in the vertical section towards its end, with ellipses of position."""
+    """The hole on the map, and in the vertical section towards its end, with ellipses of position.
+
+    Ellipses are drawn as large as they are, filled, and enlarged. Where acceptance is blind the hole is shaded.
+    """
     position = well.position
     assert position is not None
     there = ~np.isnan(position.place[:, 0])
     figure, panels = new_figure("Well path on the map and in vertical section", 3.9, 1, 2)
-    place, covariance = position.place[there], position.covariance[there]
+    unit, metres = well.length_unit, LENGTH_UNITS[well.length_unit]
+    place, covariance = position.place[there] / metres, position.covariance[there] / metres**2
     towards, enlarged = _section(place), enlargement(position)
     plan = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
     section = np.array([[np.cos(towards), np.sin(towards), 0.0], [0.0, 0.0, 1.0]])
     for axes, view in zip(panels[0], (plan, section), strict=True):
+        _shade(axes, place @ view.T, well.blind[there])
         _view(axes, place, covariance, view, enlarged)
-    panels[0, 0].set(xlabel="east, m", ylabel=f"north ({well.north.name}), m")
-    panels[0, 1].set(xlabel=f"along {np.degrees(wrap(towards)):.0f}°, m", ylabel="TVD, m")
+    panels[0, 0].set(xlabel=f"east, {unit}", ylabel=f"north ({well.north.name}), {unit}")
+    panels[0, 1].set(
+        xlabel=f"along {np.degrees(wrap(towards)):.0f}°, {unit}", ylabel=f"TVD, {unit}"
+    )
     panels[0, 1].invert_yaxis()
     panels[0, 0].set_title("map")
     panels[0, 1].set_title("vertical section")
     for axes in panels[0]:
         axes.set_aspect("equal", adjustable="datalim")
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper left", ncols=4)
     return figure
+
+
+def _shade(axes: Axes, points: Array, blind: Bools) -> None:
+    """Shade the stretches of a hole whose stations are `blind` (n,)."""
+    if blind.any():
+        line = np.where(blind[:, None], points, np.nan)
+        axes.plot(
+            *line.T, color=BLIND_SHADE, lw=9, marker="o", ms=9, mec="none", alpha=0.5, label="blind", zorder=1,
+            solid_capstyle="round",
+        )  # fmt: skip
 
 
 def _section(place: Array) -> float:
@@ -207,15 +303,21 @@ def _section(place: Array) -> float:
 def _view(axes: Axes, place: Array, covariance: Array, view: Array, enlarged: float) -> None:
     """Positions (n, 3) in a plane, `view` (2, 3), with some ellipses, `enlarged` times."""
     points = place @ view.T
-    axes.plot(*points.T, color=AFTER, marker="." if len(points) <= MOST_MARKS else "", lw=1.0)
+    marker = "." if len(points) <= MOST_MARKS else ""
+    axes.plot(*points.T, color=AFTER, marker=marker, lw=1.0, label="hole")
     chosen = np.unique(np.linspace(0, len(points) - 1, MOST_ELLIPSES).round().astype(int))
     circle = np.stack([np.cos(ELLIPSE_POINTS), np.sin(ELLIPSE_POINTS)])
+    labels = ["2σ as large as it is", f"2σ, {enlarged:g} times as large"]
     for i in chosen:
         spread = view @ covariance[i] @ view.T
         if np.isfinite(spread).all():
             values, vectors = np.linalg.eigh(spread)
-            ring = enlarged * ELLIPSE_SDS * (vectors * np.sqrt(np.maximum(values, 0.0))) @ circle
-            axes.plot(*(points[i][:, None] + ring), color=MARKED, lw=0.7)
+            ring = ELLIPSE_SDS * (vectors * np.sqrt(np.maximum(values, 0.0))) @ circle
+            axes.fill(*(points[i][:, None] + ring), color=MARKED, lw=0.7, label=labels[0])
+            if enlarged > 1:
+                larger = points[i][:, None] + enlarged * ring
+                axes.plot(*larger, color=MARKED, lw=0.7, ls=(0, (4, 2)), label=labels[1])
+            labels = ["_", "_"]
 
 
 def enlargement(position: Position) -> float:
@@ -238,14 +340,15 @@ MOST_ROWS_OF_PAGE = 2000
 """Surveys in the table of a page."""
 
 
-def render(
-    well: Well,
-    findings: list[Finding],
-    sha256: Mapping[str, str],
-    analysis: Interference | None = None,
-) -> str:
-    """The surveys as HTML, with a multi-station analysis; `sha256` of the files they come from, by what these are."""
-    facts = summary(well, well.counts, "", "")
+def render(surveyed: SurveyedWell, findings: list[Finding]) -> str:
+    """The surveys as HTML, with the multi-station analysis if there is one."""
+    well, analysis, budget = surveyed.well, surveyed.analysis, surveyed.contributions
+    facts = result_summary(surveyed)
+    digests = dict(surveyed.inputs.named)
+    for i, run in enumerate(surveyed.runs[1:], 2):
+        digests |= {
+            f"{name} {i}": run.inputs.named.get(name, "") for name in digests if " " not in name
+        }
     stated = well.readings.metadata, well.calibration.tool
     header, rows = survey_rows(well, MOST_ROWS_OF_PAGE)
     located = has_path(well.position)
@@ -260,17 +363,22 @@ def render(
         strengths=strengths(well) if facts.not_judged < facts.rows else None,
         angles=angles(well),
         path=path(well) if located else None,
+        contributions=shares(well, budget) if budget else None,
+        causes=share_rows(budget, station_row(budget, None), well.length_unit) if budget else [],
+        cause_titles=SHARE_TITLES,
+        last=budget.station[station_row(budget, None)] if budget else "",
         enlarged=enlargement(well.position) if located and well.position else 1.0,
         terms=well.terms.sentence,
         declination=declination_in_words(facts),
         sources=sources_in_words(facts).partition("   ")[2],
-        end=end_in_words(facts.end, facts.north) if facts.end else "",
+        end=end_in_words(facts.end, facts.north, facts.length_unit) if facts.end else "",
         header=header,
         rows=rows,
         analysis=sections(analysis) if analysis else None,
         more=facts.rows - len(rows),
         calibration=well.calibration.run_name,
-        sha256=sha256,
+        sha256={name: digest for name, digest in digests.items() if digest},
+        runs=runs_in_words(facts),
     )
 
 

@@ -34,25 +34,30 @@ from mwdcal.geometry.vectors import Array, ArrayLike
 from mwdcal.sensor.profile import Profile, StandProfile
 from mwdcal.survey.acceptance import SurveyLimits
 from mwdcal.survey.error_model import BUILT_IN, ErrorModel
-from mwdcal.survey.norths import horizontal_field, norths_of
+from mwdcal.survey.norths import DECLINATIONS, horizontal_field, norths_of
 from mwdcal.survey.path import TieIn
 from mwdcal.survey.references import Claim, EarthReference
 from mwdcal.survey.surveying import (
-    MEASURED_DEPTH,
+    BY_ROW,
+    MEASURED_DEPTHS,
     SurveyedWell,
     SurveyReadings,
     WellInputs,
+    by_row,
     check_free,
     claim,
+    depth_column,
     depths,
     described,
     error_model_of,
     judged_constants,
+    length_unit_of,
     loaded_limits,
     loaded_reference,
     not_deeper,
     of_reference,
     station_readings,
+    typical_north,
     with_reference,
     with_section,
 )
@@ -73,7 +78,7 @@ LONG_ROWS = 1 << 16
 """Rows of a Parquet table beyond which it is."""
 _TEXT_ROWS = 1 << 14
 """Rows of a part of a Parquet table that becomes text."""
-_ALSO = (MEASURED_DEPTH, *LABELS, "simulated")
+_ALSO = (*MEASURED_DEPTHS, *BY_ROW, *LABELS, "simulated")
 _DELIMITERS = {".csv": ",", ".tsv": "\t"}
 
 
@@ -100,6 +105,8 @@ class _Settings(NamedTuple):
     switch: tuple[float, float]
     outside: str
     model: ErrorModel | None = None
+    unit: str = ""
+    shown_unit: str = "m"
 
 
 class _Stations(NamedTuple):
@@ -107,6 +114,7 @@ class _Stations(NamedTuple):
 
     readings: Readings
     md: Array | None
+    north: dict[str, Array]
     carried: dict[str, Column | Any]
 
 
@@ -139,6 +147,7 @@ def survey_file(
     findings: Iterable[Finding],
     error_model: str = BUILT_IN,
     section_azimuth: float = 0.0,
+    length_unit: str = "",
 ) -> SurveyedWell:
     """Survey a long table into another, as `mwdcal.survey.surveying` does with a table in memory.
 
@@ -150,7 +159,9 @@ def survey_file(
     bounds, limits_digest = loaded_limits(limits)
     place, place_digest = loaded_reference(reference)
     model = error_model_of(error_model)
-    settings = _Settings(calibration, bounds, place, tie_in, switch, outside, model)
+    settings = _Settings(
+        calibration, bounds, place, tie_in, switch, outside, model, *length_unit_of(length_unit)
+    )
     long = _LongTable(settings, readings, output, decimal)
     long.north = with_section(long.north, section_azimuth)
     digests = {"calibration": digest, "readings": sha256_of(readings)}
@@ -184,13 +195,22 @@ class _LongTable:
             raise no_stations(self.source.name)
         self.opening = first
         self.absent = wholly_blank([first])
-        self.located = MEASURED_DEPTH in self.source.names and any(
-            not is_blank(table, MEASURED_DEPTH) for table in self._tables()
+        depth, _ = depth_column(self.head, settings.unit)
+        self.located = depth in MEASURED_DEPTHS and any(
+            not is_blank(table, depth) for table in self._tables()
         )
+        metadata = {**self.source.metadata, **typical_north(self._by_row())}
         self.north = norths_of(
-            self.source.metadata, self.source.name, self._all_readings, settings.calibration,
-            settings.reference, self._horizontal_fields,
+            metadata, self.source.name, self._all_readings, settings.calibration, settings.reference,
+            self._horizontal_fields,
         )  # fmt: skip
+
+    def _by_row(self) -> dict[str, Array]:
+        """The columns of a declination that varies by row, of the whole table."""
+        if DECLINATIONS[0] not in self.source.names:
+            return {}
+        parts = [by_row(table) for table in self._tables()]
+        return {n: np.concatenate([each[n] for each in parts]) for n in parts[0]}
 
     def _opened(self, only: Collection[str] = ()) -> StreamedTable:
         """The table in parts, or some of its columns."""
@@ -227,7 +247,7 @@ class _LongTable:
         check_columns(source.names, source.name)
         if self.settings.calibration.thermal:
             synonyms.check_evidence(source.names, source.name, ("temperature_c",))
-        depths(head)
+        depths(head, self.settings.unit)
         return head
 
     def _table(self, piece: Any) -> Table:
@@ -238,7 +258,10 @@ class _LongTable:
 
     def _readings(self, piece: Any) -> Readings:
         """The readings of a piece."""
-        read = partial(station_readings, calibration=self.settings.calibration, recognised=False)
+        read = partial(
+            station_readings, calibration=self.settings.calibration, recognised=False,
+            length_unit=self.settings.unit,
+        )  # fmt: skip
         return self.source.exactly_if_refused(lambda part: read(part.table)[0], piece)
 
     def _all_readings(self) -> Iterator[Readings]:
@@ -270,16 +293,16 @@ class _LongTable:
                 raise blank_cell(self.opening if names in self.absent else table, names)
         unlabelled = {name: table.columns[name] for name in table.columns if name != "station"}
         readings, md = station_readings(
-            replace(table, columns=unlabelled), self.settings.calibration, recognised=False
+            replace(table, columns=unlabelled), self.settings.calibration, False, self.settings.unit
         )
         if md is not None:
             there = np.flatnonzero(~np.isnan(md))
             if md[there[0]] < seen.depth:
-                raise not_deeper(table, int(there[0]), md[there[0]])
+                raise not_deeper(table, int(there[0]), md[there[0]], self.settings.unit)
         seen.serials.update(dict.fromkeys(labels(table, "serial")))
         station = numbered_labels(labels(table, "station"), table.count, sum(seen.rows) + 1)
         readings = replace(readings, station=station)
-        return _Stations(readings, md, self._carried(part))
+        return _Stations(readings, md, by_row(table), self._carried(part))
 
     def _carried(self, part: Part) -> dict[str, Column | Any]:
         """The columns of the input as they are written: text as it is, numbers of typed formats as such."""
@@ -296,12 +319,14 @@ class _LongTable:
         self._note(readings, md)
         if settings.reference:
             readings = with_reference(readings, settings.reference)
+        north = self.north.by_row(stations.north)
         if md is None and self.located:
             md = np.full(readings.count, np.nan)
         well, tally = part_of_well(
-            calibration, readings, settings.limits, self.north, md, seen.before, settings.switch,
+            calibration, readings, settings.limits, north, md, seen.before, settings.switch,
             settings.outside, model=settings.model, whole=False,
         )  # fmt: skip
+        well = replace(well, length_unit=settings.shown_unit)
         seen.before = well.after
         seen.tallies.append(tally)
         seen.counts.append(well.counts)
@@ -340,7 +365,7 @@ class _LongTable:
             digests.pop("reference", None)
         inputs = WellInputs(
             settings.calibration, self.head, surveys, settings.limits, [*findings, *about], digests,
-            settings.model,
+            settings.model, length_unit=settings.shown_unit,
         )  # fmt: skip
         counts = reduce(WellCounts.followed_by, seen.counts)
         tally = joined(seen.tallies)._replace(scatter=self._scatter(), metadata=readings.metadata)

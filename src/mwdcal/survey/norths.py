@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
-from math import hypot, radians
+from dataclasses import dataclass, field, replace
+from math import radians
 
 import numpy as np
 
@@ -26,6 +26,8 @@ from mwdcal.survey.references import (
 
 SD_KEY = "sd_declination_deg"
 """Metadata key of a table: standard uncertainty (1σ) of its declination, degrees."""
+DECLINATIONS = tuple(f"{start}ref_declination_deg" for start in ("", "sd_", "sd_random_"))
+"""Columns of a declination that varies by row: its value, 1σ that rows share, and 1σ that is new at each."""
 USUAL_HORIZONTAL = 20_000.0
 """Horizontal field where neither a reference nor a reading states one, nT."""
 
@@ -35,17 +37,19 @@ class North:
     """The norths that azimuths may count from, radians: true = magnetic + declination, grid = true - convergence.
 
     None: not known. `declination_sd`: standard uncertainty that the stations share, `declination_noise` that of
-    what changes from one to the next. `findings`: where they are assumed, or sources disagree. `sources`: where each
-    comes from, by name. `section`: azimuth of the vertical section, from the north of the path.
+    what changes from one to the next; each one value, or one for each station (n,), of which `base` has the means.
+    `findings`: where they are assumed, or sources disagree. `sources`: where each comes from, by name. `section`:
+    azimuth of the vertical section, from the north of the path.
     """
 
-    declination: float | None = None
-    declination_sd: float = 0.0
+    declination: float | Array | None = None
+    declination_sd: float | Array = 0.0
     convergence: float | None = None
-    declination_noise: float = 0.0
+    declination_noise: float | Array = 0.0
     findings: tuple[Finding, ...] = ()
     sources: Mapping[str, str] = field(default_factory=dict)
     section: float = 0.0
+    base: North | None = None
 
     @property
     def name(self) -> str:
@@ -55,14 +59,39 @@ class North:
         return "true" if self.convergence is None else "grid"
 
     @property
-    def declination_uncertainty(self) -> float:
+    def declination_uncertainty(self) -> Array:
         """Standard uncertainty of the declination at one station."""
-        return hypot(self.declination_sd, self.declination_noise)
+        return np.asarray(np.hypot(self.declination_sd, self.declination_noise))
 
     @property
-    def offset(self) -> float:
+    def offset(self) -> Array:
         """The angle added to magnetic azimuths to count from that north."""
-        return (self.declination or 0.0) - (self.convergence or 0.0)
+        turned = 0.0 if self.declination is None else self.declination
+        return np.asarray(turned, float) - (self.convergence or 0.0)
+
+    def of_path(self, count: int) -> tuple[Array, Array, Array]:
+        """That angle (n,), its 1σ that all stations share, and what is new at each."""
+        parts = self.offset, self.declination_sd, self.declination_noise
+        offset, shared, alone = (np.broadcast_to(np.asarray(part, float), count) for part in parts)
+        return offset, shared, alone
+
+    @property
+    def typical(self) -> North:
+        """With one value for all stations."""
+        return self if self.base is None else replace(self.base, section=self.section)
+
+    def by_row(self, columns: Mapping[str, Array]) -> North:
+        """The same with the columns (n,) of `DECLINATIONS` that a table has, degrees; blank cells keep what it has."""
+        parts = self.declination, self.declination_sd, self.declination_noise
+        new = [
+            value if name not in columns else _where_blank(np.radians(columns[name]), value)
+            for name, value in zip(DECLINATIONS, parts, strict=True)
+        ]
+        declination, shared, alone = new
+        return replace(
+            self, declination=declination, declination_sd=0.0 if shared is None else shared,
+            declination_noise=0.0 if alone is None else alone, base=self,
+        )  # fmt: skip
 
 
 def norths_of(
@@ -120,6 +149,11 @@ def norths_of(
         tuple(findings),
         sources,
     )
+
+
+def _where_blank(values: Array, otherwise: float | Array | None) -> Array:
+    """Values (n,), and another one where they are blank."""
+    return np.where(np.isnan(values), np.nan if otherwise is None else otherwise, values)
 
 
 def _radians(angle: float | None) -> float | None:

@@ -21,7 +21,7 @@ lasting cause makes along the well are added before they are squared; those of i
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -198,15 +198,17 @@ class _Sums(NamedTuple):
 
 
 class TieIn(NamedTuple):
-    """Where a path is tied in, taken as exact.
+    """Where a path is tied in: its direction is taken as exact, and its place as well where it has no covariance.
 
-    Units: measured depth m, inclination and azimuth (from the north of the path) rad, place (3,) m.
+    Units: measured depth m, inclination and azimuth (from the north of the path) rad, place (3,) m, covariance (3, 3)
+    of the place, m², which is independent of all errors below it.
     """
 
     md: float
     inclination: float
     azimuth: float
     place: Array
+    covariance: Array | None = None
 
     def before(self, errors: DirectionErrors) -> PathEnd:
         """The end of a path that leads there, for stations with such `errors` to follow."""
@@ -220,7 +222,10 @@ class TieIn(NamedTuple):
             none(errors.systematic), none(errors.random), course,
         )  # fmt: skip
         md = np.array([self.md])
-        return PathEnd(md, exact, _no_sums(md, exact, self.place))
+        sums = _no_sums(md, exact, self.place)
+        if self.covariance is not None:
+            sums = sums._replace(settled=self.covariance)
+        return PathEnd(md, exact, sums)
 
 
 class PathEnd(NamedTuple):
@@ -229,6 +234,50 @@ class PathEnd(NamedTuple):
     md: Array
     errors: DirectionErrors
     sums: _Sums
+
+    def widened(self, causes: int) -> PathEnd:
+        """The same with room for more lasting causes, which so far have done nothing."""
+        errors, sums = self.errors, self.sums
+        return PathEnd(
+            self.md, replace(errors, systematic=_widened(errors.systematic, causes)),
+            sums._replace(shift=_widened(sums.shift, causes)),
+        )  # fmt: skip
+
+
+def _widened(shifts: Array, causes: int) -> Array:
+    """Shifts (…, k, m) with zeros up to so many causes."""
+    lacking = np.zeros((*shifts.shape[:-2], causes - shifts.shape[-2], shifts.shape[-1]))
+    return np.concatenate([shifts, lacking], -2)
+
+
+@dataclass(frozen=True)
+class CauseOrder:
+    """The order of lasting causes along several runs: those before a run, then those that it adds.
+
+    `names` of all, empty for those of one run alone; `places` in them of the causes of the run.
+    """
+
+    names: tuple[str, ...]
+    places: tuple[int, ...]
+
+    @staticmethod
+    def of(before: tuple[str, ...], causes: tuple[str, ...]) -> CauseOrder:
+        """For a run with some `causes`, after runs with those `before`."""
+        names, places = [*before], []
+        for name in causes:
+            if name and name in before:
+                places.append(before.index(name))
+            else:
+                places.append(len(names))
+                names.append(name)
+        return CauseOrder((*names,), (*places,))
+
+    def placed(self, errors: DirectionErrors) -> DirectionErrors:
+        """The errors of the run with its causes at their places, and zeros for all others."""
+        shifts = errors.systematic
+        systematic = np.zeros((*shifts.shape[:-2], len(self.names), shifts.shape[-1]))
+        systematic[..., list(self.places), :] = shifts
+        return replace(errors, systematic=systematic)
 
 
 def tilts(inclination: ArrayLike, azimuth: ArrayLike) -> Array:
@@ -272,16 +321,17 @@ def direction_gradient(g: Array, b: Array) -> tuple[Array, Array]:
 def direction_errors(
     calibration: Calibration,
     readings: Readings,
-    north: float = 0.0,
-    declination_sd: float = 0.0,
-    declination_noise: float = 0.0,
+    north: float | Array = 0.0,
+    declination_sd: float | Array = 0.0,
+    declination_noise: float | Array = 0.0,
 ) -> DirectionErrors:
     """The direction of the hole at readings (…, n), with its errors from the calibration and from noise.
 
     Errors of the calibration last over the well, with the uncertainty of north as one cause more; noise is new at every
     station.
     Units: radians. `north`: declination, for azimuths from true north, less convergence, for those from
-    grid north; `declination_sd`: its standard uncertainty, and `declination_noise` what is new at every station.
+    grid north; `declination_sd`: its standard uncertainty, and `declination_noise` what is new at every station; each
+    one value, or one for each station (n,).
     Singular: finite at vertical. NaN where the direction rests on what no evidence determines, and without a field.
     """
     g, b = calibration.fields(readings)
@@ -297,9 +347,11 @@ def direction_errors(
     return DirectionErrors(
         inclination=inclination,
         azimuth=wrap(azimuth + north),
-        systematic=np.concatenate([shifts, turn[..., None, :] * declination_sd], -2),
+        systematic=np.concatenate(
+            [shifts, turn[..., None, :] * np.asarray(declination_sd)[..., None, None]], -2
+        ),
         random=gradient @ calibration.noise_covariance(readings) @ gradient.mT
-        + declination_noise**2 * outer(turn),
+        + np.asarray(declination_noise)[..., None, None] ** 2 * outer(turn),
     )
 
 
@@ -365,7 +417,7 @@ def continued_path(
     calibration: Calibration,
     readings: Readings,
     md: ArrayLike,
-    norths: tuple[float, float, float],
+    norths: tuple[ArrayLike, ArrayLike, ArrayLike],
     before: ArrayLike | TieIn | PathEnd = (0.0, 0.0, 0.0),
     more: Callable[[DirectionErrors, Readings, slice], DirectionErrors] | None = None,
 ) -> tuple[Array, Array, PathEnd]:
@@ -382,9 +434,11 @@ def continued_path(
             "`md` must increase from station to station. Sort the stations by measured depth."
         )
 
+    each_north = [np.broadcast_to(np.asarray(value, float), depth.shape) for value in norths]
+
     def part(where: slice) -> tuple[Array, DirectionErrors]:
         some = rows_of(readings, where)
-        errors = direction_errors(calibration, some, *norths)
+        errors = direction_errors(calibration, some, *(value[where] for value in each_north))
         return depth[where], errors if more is None else more(errors, some, where)
 
     place, covariance, end = [], [], None

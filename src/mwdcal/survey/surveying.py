@@ -8,7 +8,8 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from msgspec.structs import replace as replace_struct
@@ -17,20 +18,27 @@ from mwdcal.calibration.readings import CONSTANTS, Readings, is_simulated
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files import synonyms
-from mwdcal.files.contract import REFERENCES, check_columns
+from mwdcal.files.contract import (
+    REFERENCES,
+    ROTATION,
+    check_columns,
+    check_near_misses,
+    stated_norths,
+)
 from mwdcal.files.faults import chosen, nothing, spread, wholly_blank, without_reading
 from mwdcal.files.formats.table import Table, cell_error, numbers
 from mwdcal.files.runs import renamed, to_readings
 from mwdcal.files.settings import setting
-from mwdcal.geometry.units import FOOT
-from mwdcal.geometry.vectors import Array, Bools
+from mwdcal.geometry.units import LENGTH_UNITS
+from mwdcal.geometry.vectors import AnyArray, Array, Bools
 from mwdcal.sensor.profile import StandProfile
-from mwdcal.survey.acceptance import SurveyLimits, load_survey_limits
+from mwdcal.survey.acceptance import SensorTerms, SurveyLimits, load_survey_limits
+from mwdcal.survey.contributions import Contributions, contributions
 from mwdcal.survey.error_model import BUILT_IN, ErrorModel, load_error_model
 from mwdcal.survey.interference import Interference, interference
 from mwdcal.survey.interference_estimate import Assumed, sensor_drift
-from mwdcal.survey.norths import SD_KEY, North, norths_of
-from mwdcal.survey.path import TieIn
+from mwdcal.survey.norths import DECLINATIONS, SD_KEY, North, norths_of
+from mwdcal.survey.path import PathEnd, TieIn
 from mwdcal.survey.references import (
     FROM_REFERENCE,
     MEASURABLE,
@@ -42,20 +50,30 @@ from mwdcal.survey.references import (
     source_of,
 )
 from mwdcal.survey.stations import RANDOM, TOOLFACE_SWITCH
-from mwdcal.survey.well import Well, WellCounts, well
+from mwdcal.survey.trajectory import TrajectoryFacts, has_stations, north_of_tie_in, trajectory
+from mwdcal.survey.well import AXES_OF_EARTH, Before, Well, WellCounts, well
 
 NO_MODEL = "none"
 """The word for standard uncertainties of calibration, noise and declination alone."""
-MEASURED_DEPTH = "md_m"
-"""The column of measured depths, m."""
+MEASURED_DEPTHS = {f"md_{unit}": unit for unit in LENGTH_UNITS}
+"""The columns of measured depths, with their unit."""
+RANDOM_COLUMNS = {f"sd_random_{REFERENCES[name].column}": RANDOM + name for name in CONSTANTS}
+"""Columns of what gravity, field and dip are uncertain by anew at every row, by their names in `Readings.sd`."""
+BY_ROW = {
+    DECLINATIONS[0]: ROTATION,
+    **dict.fromkeys(DECLINATIONS[1:], REFERENCES["dip"].uncertainty),
+    **{f"sd_random_{REFERENCES[name].column}": REFERENCES[name].uncertainty for name in CONSTANTS},
+}
+"""Columns of references that surveys alone have, with the values they take."""
+MOST_CONTRIBUTED = 2000
+"""Surveys of a table whose contributions are computed."""
 LARGEST_DEPTH = 20_000.0
 """No hole is longer, m."""
 _DEPTH_NAMES = re.compile(
-    r"(md|dept|((measured|bit|survey|hole|along[ _-]?hole)[ _]?)?depth)[ _]*[\[(]?(m|ft|feet|met(re|er)s?)?[\])]?"
+    r"(md|dept|((measured|bit|survey|hole|along[ _-]?hole)[ _]?)?depth)[ _]*[\[(]?(m|(us)?ft|feet|met(re|er)s?)?[\])]?"
 )
-_DEPTH_UNIT = re.compile(r"(?<![a-z])(m|ft|feet|met(re|er)s?)[\])]?$")
+_DEPTH_UNIT = re.compile(r"(?<![a-z])(m|(us)?ft|feet|met(re|er)s?)[\])]?$")
 """The unit at the end of such a name."""
-_METRES = {"m": 1.0, "ft": FOOT}
 
 
 @dataclass(frozen=True)
@@ -83,6 +101,7 @@ def survey_readings(
     calibration: Calibration,
     reference: EarthReference | None = None,
     recognised: bool = True,
+    length_unit: str = "",
 ) -> SurveyReadings:
     """The readings of a table of surveys, and the references they are judged and turned by.
 
@@ -93,8 +112,11 @@ def survey_readings(
     Raises:
         InputError: a table that cannot be read, depths under another name or in another unit.
     """
-    readings, md = station_readings(table, calibration, recognised)
-    north = norths_of(table.metadata, table.source, lambda: [readings], calibration, reference)
+    readings, md = station_readings(table, calibration, recognised, length_unit)
+    rows = by_row(renamed(table, calibration.profile))
+    stated = {**table.metadata, **typical_north(rows)}
+    north = norths_of(stated, table.source, lambda: [readings], calibration, reference)
+    north = north.by_row(rows)
     claims = {
         name: claim(table.source, readings, name)
         for name in judged_constants(calibration, readings)
@@ -105,7 +127,7 @@ def survey_readings(
 
 
 def station_readings(
-    table: Table, calibration: Calibration, recognised: bool = True
+    table: Table, calibration: Calibration, recognised: bool = True, length_unit: str = ""
 ) -> tuple[Readings, Array | None]:
     """The readings of a table of surveys, and its measured depths (n,) if it has them."""
     table = renamed(table, calibration.profile)
@@ -114,7 +136,51 @@ def station_readings(
         synonyms.check_evidence(list(table.columns), table.source, ("temperature_c",))
     in_a_well = replace_struct(calibration.profile, stand=StandProfile())
     readings, _ = to_readings(table, in_a_well, recognised)
-    return readings, depths(table)
+    columns = by_row(table).items()
+    alone = {RANDOM_COLUMNS[name]: values for name, values in columns if name in RANDOM_COLUMNS}
+    if alone:
+        factors = {RANDOM + name: REFERENCES[name].factor for name in CONSTANTS}
+        alone = {name: np.nan_to_num(values) * factors[name] for name, values in alone.items()}
+        readings = replace(readings, sd={**readings.sd, **alone})
+    return readings, depths(table, length_unit)
+
+
+def by_row(table: Table) -> dict[str, Array]:
+    """Columns (n,) of references that a survey alone has, in the units of files: declination, and 1σ new at each row.
+
+    Raises:
+        InputError: a cell that cannot be, or a declination that is blank where nothing else states one.
+    """
+    check_near_misses([*table.columns], [*BY_ROW], f"{table.source}: column")
+    result = {}
+    for name, limits in BY_ROW.items():
+        if name not in table.columns:
+            continue
+        cells = table.columns[name]
+        values = numbers(table, name) if isinstance(cells, list) else np.asarray(cells, float)
+        wrong = np.flatnonzero(limits.outside(values))
+        if wrong.size:
+            problem = f"must be {limits}; got {values[wrong[0]]:g}."
+            raise cell_error(table, name, int(wrong[0]), problem)
+        result[name] = values
+    declination = result.get(DECLINATIONS[0])
+    if declination is None:
+        return result
+    otherwise = stated_norths(table.metadata, table.source).get("declination_deg", np.nan)
+    declination = np.where(np.isnan(declination), otherwise, declination)
+    result[DECLINATIONS[0]] = declination
+    blank = np.flatnonzero(np.isnan(declination))
+    if 0 < blank.size < declination.size:
+        problem = "is blank, and no declination_deg in the metadata stands for it. Fill the cell, or state one."
+        raise cell_error(table, DECLINATIONS[0], int(blank[0]), problem)
+    return result if not blank.size else {k: v for k, v in result.items() if k != DECLINATIONS[0]}
+
+
+def typical_north(rows: Mapping[str, Array]) -> dict[str, float]:
+    """The declination of a table that varies by row, and its 1σ, as metadata state one for all: their means."""
+    keys = zip(("declination_deg", SD_KEY), DECLINATIONS[:2], strict=True)
+    known = {key: rows[name] for key, name in keys if name in rows and DECLINATIONS[0] in rows}
+    return {k: float(np.nanmean(v)) for k, v in known.items() if not np.isnan(v).all()}
 
 
 def judged_constants(calibration: Calibration, readings: Readings) -> tuple[str, ...]:
@@ -178,13 +244,16 @@ def with_reference(readings: Readings, reference: EarthReference) -> Readings:
         blank = np.isnan(stated)
         known[name] = np.where(blank, value, stated)
         sd[name] = np.where(blank, shared, readings.uncertainty(name))
-        sd[RANDOM + name] = np.where(blank, alone, 0.0)
+        sd[RANDOM + name] = np.where(blank, alone, readings.uncertainty(RANDOM + name))
     return replace(readings, known=known, sd=sd)
 
 
-def depths(table: Table) -> Array | None:
-    """Measured depths (n,), m, which increase; None where the table has none."""
-    name, factor = _depth_column(table)
+def depths(table: Table, length_unit: str = "") -> Array | None:
+    """Measured depths (n,), m, which increase; None where the table has none.
+
+    `length_unit` is that of a column without one; blank: such a column is refused.
+    """
+    name, factor = depth_column(table, length_unit)
     if not name:
         return None
     column = table.columns[name]
@@ -196,46 +265,82 @@ def depths(table: Table) -> Array | None:
     there = np.flatnonzero(~np.isnan(md))
     back = there[1:][np.diff(md[there]) < 0]
     if back.size:
-        raise not_deeper(table, int(back[0]), md[back[0]])
+        raise not_deeper(table, int(back[0]), md[back[0]], length_unit)
     return md if there.size else None
 
 
-def not_deeper(table: Table, row: int, depth: float) -> InputError:
-    """A measured depth that is not beyond that of the station before."""
-    problem = f"must not decrease from station to station; got {depth:g}. Sort the stations by measured depth."
-    return cell_error(table, _depth_column(table)[0], row, problem)
+def not_deeper(table: Table, row: int, depth: float, length_unit: str = "") -> InputError:
+    """A measured depth, m, that is not beyond that of the station before."""
+    name, factor = depth_column(table, length_unit)
+    problem = f"must not decrease from station to station; got {depth / factor:g}. Sort the stations by measured depth."
+    return cell_error(table, name, row, problem)
 
 
-def _depth_column(table: Table) -> tuple[str, float]:
+def depth_column(table: Table, length_unit: str = "") -> tuple[str, float]:
     """The column of measured depths, and metres per its unit; blank where there is none.
 
-    One that states no unit is in the laboratory's unit of length, where a command runs with its settings.
+    Raises:
+        InputError: the column has another name, and no unit of length was chosen.
     """
-    if MEASURED_DEPTH in table.columns:
-        return MEASURED_DEPTH, 1.0
+    for name, unit in MEASURED_DEPTHS.items():
+        if name in table.columns:
+            return name, LENGTH_UNITS[unit]
     for name in table.columns:
         if _DEPTH_NAMES.fullmatch(name.strip().lower()):
+            if not length_unit:
+                raise InputError(
+                    f"{table.source}: column '{name}': measured depths must be in metres, in a column 'md_m'; in feet "
+                    "in 'md_ft', in US survey feet in 'md_usft'. Rename it, or give `length_unit`."
+                )
             stated = _DEPTH_UNIT.search(name.strip().lower())
-            unit = "" if stated else setting("length_unit")
-            if unit:
-                return name, _METRES[unit]
-            raise InputError(
-                f"{table.source}: column '{name}': measured depths must be in metres, in a column "
-                f"'{MEASURED_DEPTH}'. Rename it, and convert feet; or state length_unit in mwdcal.toml, "
-                "which columns without a unit are in."
-            )
+            return name, LENGTH_UNITS[_unit_of(stated[1] if stated else "", length_unit)]
     return "", 1.0
 
 
-def surveyed_table(table: Table, well: Well, rows: Bools | None = None) -> Table:
+def _unit_of(stated: str, chosen: str) -> str:
+    """The unit of depths whose title states one, or none; feet without more words are those that were chosen."""
+    if stated.startswith("m"):
+        return "m"
+    if stated in LENGTH_UNITS and (stated, chosen) != ("ft", "usft"):
+        return stated
+    return "ft" if stated and chosen == "m" else chosen
+
+
+def length_unit_of(given: str) -> tuple[str, str]:
+    """The unit of lengths without one, blank where none was chosen, and that of results.
+
+    Raises:
+        InputError: no unit of length.
+    """
+    chosen = given or setting("length_unit")
+    if chosen and chosen not in LENGTH_UNITS:
+        raise InputError(f"`length_unit` must be one of {', '.join(LENGTH_UNITS)}; got {chosen!r}.")
+    return chosen, chosen or "m"
+
+
+def surveyed_table(
+    table: Table,
+    well: Well,
+    rows: Bools | None = None,
+    covariance: bool = False,
+    tie_ins: Mapping[int, TieIn] | None = None,
+) -> Table:
     """The table with the results beside its columns; `rows` (n,) are those of the well, by default all.
+
+    With the `covariance` of the positions if asked for. `tie_ins` have what they state at their rows.
 
     Raises:
         InputError: a column has the name of a result already.
     """
     results = well.columns
+    if covariance and well.position is not None:
+        results = results | covariance_columns(well.position.covariance, well.length_unit)
     if rows is not None:
         results = {name: spread(values, rows) for name, values in results.items()}
+        for row, start in (tie_ins or {}).items():
+            for name, value in _of_tie_in(start, well).items():
+                if name in results:
+                    results[name][row] = value
     check_free(table, results)
     texts: dict[str, str] = {}  # few words stand in many rows: each is in memory once
     columns = {
@@ -246,6 +351,35 @@ def surveyed_table(table: Table, well: Well, rows: Bools | None = None) -> Table
     }
     metadata = {**table.metadata, **described(well)}
     return replace(table, columns={**table.columns, **columns}, metadata=metadata)
+
+
+def covariance_columns(covariance: Array, unit: str) -> dict[str, AnyArray]:
+    """The six elements (n,) of covariances (n, 3, 3) of positions: north, east and vertical, in a unit of length."""
+    axes, metres = "nev", LENGTH_UNITS[unit]
+    return {
+        f"covariance_{axes[i]}{axes[j]}_{unit}2": covariance[:, i, j] / metres**2
+        for i in range(3)
+        for j in range(i, 3)
+    }
+
+
+def _of_tie_in(start: TieIn, well: Well) -> dict[str, float]:
+    """Columns of results at a tie-in station, in the units of files."""
+    unit, metres = well.length_unit, LENGTH_UNITS[well.length_unit]
+    covariance = np.zeros((3, 3)) if start.covariance is None else start.covariance
+    place = start.place / metres
+    sd = np.sqrt(np.maximum(np.diagonal(covariance), 0.0)) / metres
+    values = {
+        "inclination_deg": float(np.degrees(start.inclination)),
+        f"azimuth_{well.north.name}_deg": float(np.degrees(start.azimuth)),
+        f"vertical_section_{unit}": float(
+            place[0] * np.cos(well.north.section) + place[1] * np.sin(well.north.section)
+        ),
+    }
+    for k, name in enumerate(AXES_OF_EARTH):
+        values |= {f"{name}_{unit}": float(place[k]), f"sd_{name}_{unit}": float(sd[k])}
+    whole = covariance_columns(covariance[None], unit)
+    return values | {name: float(value[0]) for name, value in whole.items()}
 
 
 def check_free(table: Table, results: Collection[str]) -> None:
@@ -260,13 +394,14 @@ def check_free(table: Table, results: Collection[str]) -> None:
 
 def described(well: Well) -> Mapping[str, object]:
     """The statements of a table of surveys about the calibration, north and limits it rests on."""
-    calibration, north = well.calibration, well.north
+    calibration, north = well.calibration, well.north.typical
     stated: dict[str, object] = {
         "calibration_run": calibration.run,
         "calibration_time": calibration.time,
         "survey_limits": well.limits.name,
         "north": north.name,
         "error_model": "none" if well.errors is None else well.errors.model.name,
+        **({} if well.length_unit == "m" else {"length_unit": well.length_unit}),
         **well.terms.stated,
     }
     for key, angle in (
@@ -289,10 +424,11 @@ def described(well: Well) -> Mapping[str, object]:
 class WellInputs:
     """The inputs of the surveys of a well.
 
-    `model`: the error model whose terms are in the standard uncertainties; None: none. `rows` (n,) of the table that
-    have readings; None: all.
-    `findings` are of the calibration's signature and of the reference; `digests` the SHA-256 of each input by name,
-    empty for one that is in memory.
+    `length_unit` is that of results. `model`: the error model whose terms are in the standard uncertainties; None:
+    none. `rows` (n,) of the table that have readings; None: all.
+    `tie_ins` by the row of the table that states them. `unused` (n,): surveys that are rejected or superseded by their
+    status. `walk`: random walk of the sensors in a year, 1σ, as of `well_errors`. `findings` are of the calibration's
+    signature and of the reference; `digests` the SHA-256 of each input by name, empty for one that is in memory.
     """
 
     calibration: Calibration
@@ -303,6 +439,10 @@ class WellInputs:
     digests: Mapping[str, str]
     model: ErrorModel | None = None
     rows: Bools | None = None
+    length_unit: str = "m"
+    tie_ins: Mapping[int, TieIn] = field(default_factory=dict)
+    unused: Bools | None = None
+    walk: SensorTerms | None = None
 
     @property
     def stated(self) -> tuple[Mapping[str, object], Mapping[str, object]]:
@@ -319,18 +459,33 @@ class WellInputs:
 class SurveyedWell:
     """The surveys of a well with what they rest on; `analysis` is None without multi-station analysis.
 
-    Of a long table that was surveyed in parts `well` has the first stations only, and `counts` is of all.
+    Of a long table that was surveyed in parts `well` has the first stations only, and `counts` is of all. `runs` are
+    those of a well in several, whose surveys `well` has together.
     """
 
     inputs: WellInputs
     well: Well
     counts: WellCounts
     analysis: Interference | None = None
+    runs: tuple[SurveyedWell, ...] = ()
+
+    @cached_property
+    def contributions(self) -> Contributions | None:
+        """What makes the uncertainty of each survey; None for long tables, and where azimuths are not measured."""
+        if self.counts.rows > MOST_CONTRIBUTED or self.counts.rows != self.well.readings.count:
+            return None
+        return contributions([run.well for run in self.runs] or [self.well])
 
     @property
     def table(self) -> Table:
         """The table of the readings with the results beside its columns."""
-        return surveyed_table(self.inputs.table, self.well, self.inputs.rows)
+        return self.table_with()
+
+    def table_with(self, covariance: bool = False) -> Table:
+        """The same, with the covariance of the positions too; a tie-in station has what it states."""
+        return surveyed_table(
+            self.inputs.table, self.well, self.inputs.rows, covariance, self.inputs.tie_ins
+        )
 
 
 def well_inputs(
@@ -344,52 +499,89 @@ def well_inputs(
     error_model: ErrorModel | str | os.PathLike[str] = BUILT_IN,
     missing: str = "refuse",
     section_azimuth: float = 0.0,
+    length_unit: str = "",
 ) -> WellInputs:
     """The inputs of surveys: a table of readings, the calibration of their tool, reference and limits.
 
     `reference`, `limits` and `error_model` are values, or files by path; `NO_MODEL` for none. Stations that
     multi-station analysis puts into the record have to be `recognised`. `digest` and `findings` are of the file of the
-    calibration. `section_azimuth` of the vertical section, degrees from the north of the path.
+    calibration. `length_unit` (m, ft, usft) is that of results, and of depths that state none. `section_azimuth` of the
+    vertical section, degrees from the north of the path.
 
     Raises:
         InputError: a file that cannot be read, readings that do not belong to the calibration.
     """
     bounds, limits_digest = loaded_limits(limits)
     place, place_digest = loaded_reference(reference)
-    rows = _with_readings(table, calibration) if missing == "blank" else np.ones(table.count, bool)
-    read = survey_readings(chosen(table, rows), calibration, place, recognised=recognised)
-    if not rows.all():
-        numbered = np.flatnonzero(rows) + 1
-        names = tuple(
-            label or str(i) for label, i in zip(read.readings.station, numbered, strict=True)
-        )
-        text = f"{np.sum(~rows)} of {rows.size} rows lack a reading: their results are blank."
-        about = [Finding(id="missing-reading", text=text), *read.findings]
-        read = replace(read, readings=replace(read.readings, station=names), findings=about)
+    unit, shown_unit = length_unit_of(length_unit)
+    said, rows = _said_of(table, calibration, missing == "blank", unit)
+    read = survey_readings(chosen(said.table, rows), calibration, place, recognised, unit)
+    unused = said.unused[rows]
+    if unused.any() and read.md is not None:
+        read = replace(read, md=np.where(unused, np.nan, read.md))
+    read = replace(read, findings=[*said.findings, *read.findings])
+    read = _with_blank_rows(read, rows)
     digests = {"calibration": digest, "readings": table.digest}
     digests |= {"reference": place_digest} if read.uses_reference else {}
     model = error_model_of(error_model)
     digests |= {"error_model": model.digest} if model else {}
     read = replace(read, north=with_section(read.north, section_azimuth))
+    _check_north(said, read.north)
     return WellInputs(
         calibration,
-        table,
+        said.table,
         read,
         bounds,
         [*findings, *read.findings],
         {**digests, "limits": limits_digest},
         model,
         None if rows.all() else rows,
+        shown_unit,
+        {said.tie_row: said.tie_in} if said.tie_in and said.tie_row is not None else {},
+        unused if unused.any() else None,
     )
 
 
-def _with_readings(table: Table, calibration: Calibration) -> Bools:
-    """Rows (n,) that lack no reading."""
+def _with_blank_rows(read: SurveyReadings, rows: Bools) -> SurveyReadings:
+    """Surveys of some `rows` of a table, named by these where they have no label."""
+    if rows.all():
+        return read
+    numbered = np.flatnonzero(rows) + 1
+    names = tuple(label or str(i) for label, i in zip(read.readings.station, numbered, strict=True))
+    text = f"{np.sum(~rows)} of {rows.size} rows lack a reading: their results are blank."
+    about = [Finding(id="missing-reading", text=text), *read.findings]
+    return replace(read, readings=replace(read.readings, station=names), findings=about)
+
+
+def _check_north(said: TrajectoryFacts, north: North) -> None:
+    """Refuse a tie-in station whose azimuth counts from another north than the path."""
+    counted = north_of_tie_in(said.table)
+    if said.tie_in and counted not in ("", north.name):
+        raise InputError(
+            f"{said.table.source}: the tie-in station counts its azimuth from {counted} north, and the path goes from "
+            f"{north.name} north. State declination_deg and convergence_deg, give `reference`, or give `tie_in`."
+        )
+
+
+def _said_of(
+    table: Table, calibration: Calibration, blank: bool, unit: str
+) -> tuple[TrajectoryFacts, Bools]:
+    """The statements of a table about its norths, tie-in and statuses, and its rows (n,) that are surveys.
+
+    Rows without readings are none where they may be `blank`, nor is a tie-in station.
+    """
+    none = np.zeros(table.count, bool)
+    if not (blank or has_stations(table)):
+        return trajectory(table, None, none), ~none
     known = renamed(table, calibration.profile)
-    rows = ~without_reading(known, wholly_blank([known]))
+    without = without_reading(known, wholly_blank([known]))
+    said = trajectory(table, depths(known, unit), without)
+    rows = ~without if blank else ~none
+    if said.tie_row is not None:
+        rows[said.tie_row] = False
     if not rows.any():
         raise nothing(table.source)
-    return rows
+    return said, rows
 
 
 def with_section(north: North, azimuth: float) -> North:
@@ -424,26 +616,31 @@ def loaded_reference(
     return load_reference(reference)
 
 
-def start_of(numbers: Sequence[float]) -> tuple[float, float, float] | TieIn:
-    """Where a path starts: north, east and TVD of the first station, m, or behind depth, m, and two angles, degrees.
+def start_of(numbers: Sequence[float], unit: str = "m") -> tuple[float, float, float] | TieIn:
+    """Where a path starts: north, east and TVD of the first station, or behind measured depth and two angles, degrees.
+
+    Lengths are in a `unit` of length.
 
     Raises:
         InputError: neither three nor six numbers, or an inclination or depth that no hole has.
     """
-    if len(numbers) == 3:
-        return (float(numbers[0]), float(numbers[1]), float(numbers[2]))
-    if len(numbers) != 6:
+    if len(numbers) not in (3, 6):
         raise InputError(
             "`tie_in` must be north, east and TVD, or measured depth, inclination, azimuth, north, east and TVD; got "
             f"{len(numbers)} numbers."
         )
-    md, inclination, azimuth, *place = map(float, numbers)
-    if not (0 <= md <= LARGEST_DEPTH and 0 <= inclination <= 180):
+    metres = LENGTH_UNITS[unit]
+    north, east, tvd = (metres * float(number) for number in numbers[-3:])
+    if len(numbers) == 3:
+        return north, east, tvd
+    md, inclination, azimuth = map(float, numbers[:3])
+    if not (0 <= md * metres <= LARGEST_DEPTH and 0 <= inclination <= 180):
         raise InputError(
-            f"`tie_in` must have a depth of 0 to {LARGEST_DEPTH:g} m and an inclination of 0 to 180°; got {md:g} and "
-            f"{inclination:g}."
+            f"`tie_in` must have a depth of 0 to {LARGEST_DEPTH / metres:g} {unit} and an inclination of 0 to 180°; "
+            f"got {md:g} and {inclination:g}."
         )
-    return TieIn(md, float(np.radians(inclination)), float(np.radians(azimuth)), np.array(place))
+    place = np.array([north, east, tvd])
+    return TieIn(md * metres, float(np.radians(inclination)), float(np.radians(azimuth)), place)
 
 
 def check_drift(drift: object, msa: bool) -> None:
@@ -459,7 +656,30 @@ def analysed(inputs: WellInputs, drift: str | os.PathLike[str] | None = None) ->
     """
     assumed = Assumed(drift=sensor_drift(drift or "owsg"))
     surveys = inputs.surveys
-    return interference(inputs.calibration, surveys.readings, assumed, surveys.md)
+    readings, md = surveys.readings, surveys.md
+    if inputs.unused is not None:
+        readings = readings.select(~inputs.unused)
+        md = None if md is None else md[~inputs.unused]
+    return interference(inputs.calibration, readings, assumed, md)
+
+
+LARGEST_GAP = 0.1
+"""Distance, m, by which the tie-in station of a run may differ from the end of the run before."""
+
+
+def tie_in_differs(stated: TieIn, end: object) -> list[Finding]:
+    """The finding that the tie-in station of a run is not where the run before ended."""
+    if not isinstance(end, PathEnd):
+        return []
+    off = float(np.linalg.norm(stated.place - end.sums.position))
+    deeper = stated.md - float(end.md[-1])
+    if off <= LARGEST_GAP and abs(deeper) <= LARGEST_GAP:
+        return []
+    text = (
+        f"the tie-in station lies {off:.2f} m from the end of the run before, {deeper:+.2f} m along the hole: the path "
+        "goes on from that end."
+    )
+    return [Finding(id="tie-in-differs", text=text)]
 
 
 def survey_well(
@@ -469,14 +689,20 @@ def survey_well(
     tie_in: tuple[float, float, float] | TieIn | None = None,
     switch: tuple[float, float] = TOOLFACE_SWITCH,
     outside: str = "blank",
+    follows: Before | None = None,
 ) -> SurveyedWell:
     """The surveys of a well, corrected for interference where there is an `analysis`; else as of `well`."""
     surveys = inputs.surveys
+    stated = next(iter(inputs.tie_ins.values()), None)
+    about = [] if follows is None or stated is None else tie_in_differs(stated, follows.path)
+    tie_in = stated if tie_in is None and follows is None else tie_in
     fitted = analysis.calibration if analysis else inputs.calibration
     result = well(
         fitted, surveys.readings, inputs.limits, surveys.north, surveys.md, tie_in, switch, outside,
-        model=inputs.model,
+        model=inputs.model, follows=follows, walk=inputs.walk,
     )  # fmt: skip
-    findings = [*inputs.findings, *result.findings]
-    result = replace(result, findings=findings, sources=surveys.sources)
+    findings = [*inputs.findings, *about, *result.findings]
+    result = replace(
+        result, findings=findings, sources=surveys.sources, length_unit=inputs.length_unit
+    )
     return SurveyedWell(inputs, result, result.counts, analysis)

@@ -14,29 +14,36 @@ from mwdcal.calibration.prediction import UNKNOWN_GRAVITY, unknown_gravity
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, VECTORS
+from mwdcal.geometry.units import LENGTH_UNITS, USUAL_COURSES
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints, diagonal, wrap
 from mwdcal.survey.acceptance import (
     STRENGTH_NAMES,
     Blindness,
     Judgement,
+    SensorTerms,
     SurveyLimits,
     blindness,
     judged,
 )
 from mwdcal.survey.error_model import ErrorModel
 from mwdcal.survey.norths import North
-from mwdcal.survey.path import PathEnd, TieIn, continued_path
+from mwdcal.survey.path import CauseOrder, DirectionErrors, PathEnd, TieIn, continued_path
 from mwdcal.survey.stations import TOOLFACE_SWITCH, Surveys, survey_angles
-from mwdcal.survey.well_errors import SeenHole, WellErrors, hole_of, well_errors
+from mwdcal.survey.well_errors import SeenHole, WellErrors, cause_names, hole_of, well_errors
 from mwdcal.use.correction import RowCounts, tallied
 from mwdcal.use.correction import findings as about_rows
 from mwdcal.use.strengths import check as check_strengths
 from mwdcal.use.uncertainty import CORRECTED, DRIFTED, ErrorTerms, error_terms
 
-BLIND_FROM = 2.0
-"""Stated standard uncertainties of azimuth by which interference that would pass turns it where acceptance is blind."""
+BLIND_FROM = 1.5
+"""Stated standard uncertainties of azimuth by which interference that would pass turns it where acceptance is blind.
+
+Other errors add to the turn: from here on one azimuth in fifteen is off by more than three, of those that pass.
+"""
 Start = tuple[float, float, float] | TieIn | PathEnd
 """Where a path starts: position of the first station, a tie-in, or the end of the part before."""
+AddsErrors = Callable[[DirectionErrors, Readings, slice], DirectionErrors]
+"""Adds errors to those of directions at some rows."""
 AXES_OF_EARTH = ("north", "east", "tvd")
 WELL_FINDINGS = {
     "rejected": "{rejected} of {judged} surveys lie outside the limits '{limits}' (first: station {first}: {why}).",
@@ -94,12 +101,19 @@ class Before:
     """State that stations pass on to those that follow them.
 
     `magnetic`: the toolface counts from magnetic north. `path`: where the path has come to, at first where it starts.
-    `inaccurate`: no accuracy is stated of positions any more.
+    `inaccurate`: no accuracy is stated of positions any more. `causes`: names of the lasting causes along the path of
+    the runs before, empty in the first one; `ran`: the same with this run.
     """
 
     magnetic: bool = False
     path: Start = (0.0, 0.0, 0.0)
     inaccurate: bool = False
+    causes: tuple[str, ...] = ()
+    ran: tuple[str, ...] = ()
+
+    def next_run(self) -> Before:
+        """The same for the first station of the next run, whose tool starts anew."""
+        return replace(self, magnetic=False, causes=self.ran)
 
 
 class LastStation(NamedTuple):
@@ -163,6 +177,7 @@ class Well:
     `vectors` (n, 3) each as corrected; `extrapolated` (n,): stations without a statement of accuracy, None where
     none may be. `position`: None without measured depths. `sources`: where references come from, by name. `after`:
     what these stations leave to others that follow.
+    `started`: where their path starts. `length_unit`: of the columns.
     `errors`: of the error model in the standard uncertainties; None: these hold calibration, noise and declination.
     """
 
@@ -180,6 +195,8 @@ class Well:
     sources: Mapping[str, str] = field(default_factory=dict)
     after: Before = Before()
     errors: WellErrors | None = None
+    started: Start = (0.0, 0.0, 0.0)
+    length_unit: str = "m"
 
     @cached_property
     def sd_azimuth(self) -> Array:
@@ -250,7 +267,7 @@ class Well:
     @cached_property
     def columns(self) -> dict[str, AnyArray]:
         """Results by column, in the units of files; only azimuths whose north is known."""
-        norths = {"magnetic": 0.0}
+        norths: dict[str, float | Array] = {"magnetic": 0.0}
         if self.north.declination is not None:
             norths["true"] = self.north.declination
             if self.north.convergence is not None:
@@ -278,14 +295,21 @@ class Well:
         if self.extrapolated is not None:
             columns[EXTRAPOLATED] = np.where(self.extrapolated, "true", "false")
         if self.position is not None:
-            for k, name in enumerate(AXES_OF_EARTH):
-                columns |= {
-                    f"{name}_m": self.position.place[:, k],
-                    f"sd_{name}_m": self.position.sd[:, k],
-                }
-            columns["dogleg_severity_deg_per_30m"] = np.degrees(self.position.dogleg * 30.0)
-            section = np.array([np.cos(self.north.section), np.sin(self.north.section)])
-            columns["vertical_section_m"] = self.position.place[:, :2] @ section
+            columns |= self._located(self.position)
+        return columns
+
+    def _located(self, position: Position) -> dict[str, AnyArray]:
+        """The columns of positions, in the unit of length."""
+        columns: dict[str, AnyArray] = {}
+        unit = self.length_unit
+        metres, course = LENGTH_UNITS[unit], USUAL_COURSES[unit]
+        place, sd = position.place / metres, position.sd / metres
+        for k, name in enumerate(AXES_OF_EARTH):
+            columns |= {f"{name}_{unit}": place[:, k], f"sd_{name}_{unit}": sd[:, k]}
+        severity = np.degrees(position.dogleg * course * metres)
+        columns[f"dogleg_severity_deg_per_{course:g}{unit}"] = severity
+        section = np.array([np.cos(self.north.section), np.sin(self.north.section)])
+        columns[f"vertical_section_{unit}"] = place[:, :2] @ section
         return columns
 
     @cached_property
@@ -348,13 +372,15 @@ def well(
     outside: str = "blank",
     advance: Callable[[int, int], None] = lambda done, total: None,
     model: ErrorModel | None = None,
+    follows: Before | None = None,
+    walk: SensorTerms | None = None,
 ) -> Well:
     """The surveys of a well from readings in their order, references with these; `md` (n,) measured depths, m.
 
     Units: `tie_in` north, east and TVD of the first station, m, or where the path is tied in; `switch` as of
     `surveyed`. `outside` the calibrated temperatures as of `correction.correct`: blank results, refuse, or extrapolate
     without stated uncertainty. `advance` as of `surveyed`. `model`: error model whose terms are in the standard
-    uncertainties too.
+    uncertainties too. `follows`: what the run before leaves, instead of `tie_in`. `walk` as of `well_errors`.
 
     Raises:
         InputError: readings that do not belong to the calibration, or depths that do not increase.
@@ -367,13 +393,14 @@ def well(
         limits,
         north,
         md,
-        Before(path=start),
+        follows or Before(path=start),
         switch,
         outside,
         advance,
         model,
+        walk=walk,
     )
-    return with_findings(result, tally, result.counts, outside, tie_in is None)
+    return with_findings(result, tally, result.counts, outside, tie_in is None and follows is None)
 
 
 def part_of_well(
@@ -388,6 +415,7 @@ def part_of_well(
     advance: Callable[[int, int], None] = lambda done, total: None,
     model: ErrorModel | None = None,
     whole: bool = True,
+    walk: SensorTerms | None = None,
 ) -> tuple[Well, RowCounts]:
     """The same of stations that follow others, without findings; and what the findings say of the corrected rows.
 
@@ -398,7 +426,7 @@ def part_of_well(
     errors, added = None, None
     seen = SeenHole.at(calibration, readings)
     if model is not None and calibration.has_field:
-        errors = well_errors(model, calibration, readings)
+        errors = well_errors(model, calibration, readings, walk)
         depth = None if md is None else np.where(blank, np.nan, md)
         added = errors.of_surveys(calibration, readings, depth, before.path, seen)
     angles = survey_angles(calibration, readings, switch, advance, added, before.magnetic)
@@ -408,15 +436,18 @@ def part_of_well(
     after = replace(before, magnetic=angles.ends_magnetic)
     position = None
     if md is not None:
+        order = CauseOrder.of(before.causes, cause_names(calibration, errors))
         position, end = _positions(
-            calibration, readings, seen, md, north, blank, before.path, errors
-        )
+            calibration, readings, seen, md, north, blank, before.path, errors,
+            order if before.causes else None,
+        )  # fmt: skip
         lost = np.logical_or.accumulate(beyond & position.on_path) | before.inaccurate
         position = position.without_accuracy(lost)
-        after = replace(after, path=end, inaccurate=bool(lost[-1]))
+        after = replace(after, path=end, inaccurate=bool(lost[-1]), ran=order.names)
     result = Well(
         calibration, readings, surveys, judgement, limits, north, (g, b), position, [],
         extrapolated=columns.get(EXTRAPOLATED), blindness=blind, after=after, errors=errors,
+        started=before.path,
     )  # fmt: skip
     return result, tally
 
@@ -479,7 +510,7 @@ def _to_judge(
 
 def _positions(
     calibration: Calibration, readings: Readings, seen: SeenHole, md: Array, north: North, blank: Bools,
-    before: Start, errors: WellErrors | None,
+    before: Start, errors: WellErrors | None, order: CauseOrder | None = None,
 ) -> tuple[Position, Start]:  # fmt: skip
     """Positions of the stations with results, and where the path has come to."""
     whole = _on_path(md, blank, before)
@@ -489,9 +520,12 @@ def _positions(
     dogleg = np.full(len(md), np.nan)
     if whole.any():
         some = readings if whole.all() else readings.select(whole)
-        norths, at = (north.offset, north.declination_sd, north.declination_noise), md[whole]
-        hole = hole_of(calibration, some, seen.part(whole), at, north.offset, before)
+        offset, shared, alone = (value[whole] for value in north.of_path(len(md)))
+        norths, at = (offset, shared, alone), md[whole]
+        hole = hole_of(calibration, some, seen.part(whole), at, offset, before)
         more = None if errors is None else errors.of_path(calibration, hole)
+        if order is not None and isinstance(before, PathEnd):
+            before, more = before.widened(len(order.names)), _in_order(order, more)
         dogleg[whole] = hole.dogleg
         if not isinstance(before, TieIn | PathEnd):  # no course leads to the first station
             dogleg[np.argmax(whole)] = np.nan
@@ -501,13 +535,21 @@ def _positions(
     return Position(md, place, covariance, dogleg), before
 
 
+def _in_order(order: CauseOrder, more: AddsErrors | None) -> AddsErrors:
+    """Adds errors, if there are more, and puts all lasting ones where those of the runs before have their places."""
+
+    def added(errors: DirectionErrors, readings: Readings, rows: slice) -> DirectionErrors:
+        return order.placed(errors if more is None else more(errors, readings, rows))
+
+    return added
+
+
 def _on_path(md: Array, blank: Bools, before: Start) -> Bools:
     """Stations (n,) that the path goes through: of several at one depth the first that has a result."""
     whole = ~blank & ~np.isnan(md)
     depths = md[whole]
     reached = np.max(before.md) if isinstance(before, TieIn | PathEnd) else -np.inf
-    deeper = np.diff(np.concatenate([[reached], depths])) > 0
-    whole[whole] = deeper
+    whole[whole] = depths > np.maximum.accumulate(np.concatenate([[reached], depths]))[:-1]
     return whole
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from mwdcal.calibration.automatic.ageing import JULIAN_YEAR
 from mwdcal.calibration.readings import Readings, stated_day
 from mwdcal.calibration.record import Calibration
+from mwdcal.digests import sha256_of
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.units import STANDARD_GRAVITY
 from mwdcal.geometry.vectors import Array, ArrayLike, Bools
@@ -30,7 +31,12 @@ from mwdcal.use.uncertainty import AXIAL_INTERFERENCE, CORRECTED, DRIFT, DRIFTED
 
 DRIFT_YEARS = 1.0
 """Time after which the sensors may have drifted by as much as the model's terms for sensors, years."""
+SENSOR_CAUSES = 13
+"""Independent errors of the sensors: bias and scale of every axis, and interference along the tool."""
 _SENSORS = ("AB", "AS", "MB", "MS")
+_WALKS = (
+    "accelerometer_bias_ms2", "accelerometer_scale", "magnetometer_bias_nt", "magnetometer_scale",
+)  # fmt: skip
 _DECLINATION_TERMS = ("DEC", "DBH")
 _INTERFERENCE = "AMIL"
 
@@ -41,13 +47,14 @@ class WellErrors:
 
     `model`: terms that act by their formulas. `sensors`: drift of biases and scales since the calibration and
     interference along the tool, 1σ. `years` since the calibration; None: not known. `relative`: the magnetometer is
-    calibrated to a field of 1, whose size the references tell.
+    calibrated to a field of 1, whose size the references tell. `by_walk`: the drift is the random walk of this tool.
     """
 
     model: ErrorModel
     sensors: SensorTerms
     years: float | None
     relative: bool = False
+    by_walk: bool = False
 
     def columns(self, g: Array, b: Array, unit: ArrayLike = 1.0) -> Array:
         """Errors (n, 13, 6) of both vectors by 1σ of each independent cause that lasts over a run.
@@ -77,7 +84,7 @@ class WellErrors:
         `gradient` (n, 7, 6) of these by both vectors.
         Errors of the hole's direction against the tool, such as sag, leave the toolface as it is.
         """
-        result = ((gradient @ self.columns(g, b, self._unit(hole)).mT) ** 2).sum(-1)
+        result = ((gradient @ self.columns(g, b, self.unit(hole)).mT) ** 2).sum(-1)
         systematic, random, _ = self.model.errors(hole)
         upward, sideways = ((systematic[..., i] ** 2).sum(-1) + random[..., i, i] for i in range(2))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -96,7 +103,8 @@ class WellErrors:
             n for letters, n in OF_MODELS.items() if any(s.startswith(letters) for s in starts)
         ]
 
-    def _unit(self, hole: Hole) -> ArrayLike:
+    def unit(self, hole: Hole) -> ArrayLike:
+        """The unit of the field, nT, that `columns` take."""
         return hole.quantities["bfield"] if self.relative else 1.0
 
     def of_surveys(
@@ -123,22 +131,43 @@ class WellErrors:
     def along(self, errors: DirectionErrors, g: Array, b: Array, hole: Hole) -> DirectionErrors:
         """Errors of direction and depth along a well: those given, and those of the model."""
         _, gradient = direction_gradient(g, b)
-        sensors = _with_depth(self.columns(g, b, self._unit(hole)) @ gradient.mT)
+        sensors = with_depth(self.columns(g, b, self.unit(hole)) @ gradient.mT)
         systematic, random, course = self.model.errors(hole)
         noise = np.zeros_like(random)
         noise[:, :2, :2] = errors.random
-        lasting = np.concatenate([_with_depth(errors.systematic), sensors, systematic], -2)
+        lasting = np.concatenate([with_depth(errors.systematic), sensors, systematic], -2)
         return DirectionErrors(errors.inclination, errors.azimuth, lasting, noise + random, course)
 
 
-def _with_depth(shifts: Array) -> Array:
+def cause_names(calibration: Calibration, errors: WellErrors | None) -> tuple[str, ...]:
+    """Names of the causes that last, in the order of `DirectionErrors.systematic`; those of one run alone have none.
+
+    Causes of one name are the same in all runs of a well: the calibration, if it is the same one, the declination, and
+    terms of the model that last over the well or all wells.
+    """
+    digest = sha256_of(
+        calibration.parameters.tobytes() + calibration.parameter_covariance.tobytes()
+    )
+    names = [f"calibration {digest} {i}" for i in range(len(calibration.parameter_covariance))]
+    names.append("declination")
+    if errors is None:
+        return (*names,)
+    terms = [term for term in errors.model.terms if term.kind == "lasting"]
+    ours = [t.name if t.propagation_mode in ("Well", "Global") else "" for t in terms]
+    return (*names, *[""] * SENSOR_CAUSES, *ours)
+
+
+def with_depth(shifts: Array) -> Array:
     """Shifts (n, k, 3) of direction alone (n, k, 2), which leave depths as they are."""
     return np.concatenate([shifts, np.zeros((*shifts.shape[:-1], 1))], -1)
 
 
-def well_errors(model: ErrorModel, calibration: Calibration, readings: Readings) -> WellErrors:
+def well_errors(
+    model: ErrorModel, calibration: Calibration, readings: Readings, walk: SensorTerms | None = None
+) -> WellErrors:
     """The errors that an error model adds to surveys by a calibration.
 
+    `walk`: 1σ of what the sensors of this tool move by in a year, as a random walk; by default the model's terms.
     Where multi-station analysis has taken interference off, its covariance holds what is left of it, and the drift that
     it was told to allow for: neither is added.
     """
@@ -146,8 +175,11 @@ def well_errors(model: ErrorModel, calibration: Calibration, readings: Readings)
     done = {finding.id for finding in calibration.findings}
     years = _years(stated_day(calibration.tool), stated_day(readings.metadata))
     elapsed = DRIFT_YEARS if years is None else years
-    share = 0.0 if {CORRECTED, DRIFTED} & done else min(1.0, np.sqrt(elapsed / DRIFT_YEARS))
-    ab, scale_a, mb, scale_m = (share * _largest(sizes, start) for start in _SENSORS)
+    share, terms = min(1.0, np.sqrt(elapsed / DRIFT_YEARS)), [_largest(sizes, s) for s in _SENSORS]
+    if walk is not None:
+        share, terms = float(np.sqrt(elapsed)), [getattr(walk, name) for name in _WALKS]
+    share = 0.0 if {CORRECTED, DRIFTED} & done else share
+    ab, scale_a, mb, scale_m = (share * term for term in terms)
     axial = 0.0 if CORRECTED in done else sizes.get(_INTERFERENCE, 0.0)
     sensors = SensorTerms(
         accelerometer_bias_ms2=ab, accelerometer_scale=scale_a, magnetometer_bias_nt=mb,
@@ -156,7 +188,7 @@ def well_errors(model: ErrorModel, calibration: Calibration, readings: Readings)
     others = [
         name for name in sizes if name.startswith((*_SENSORS, *_DECLINATION_TERMS, _INTERFERENCE))
     ]
-    return WellErrors(model.without(others), sensors, years, calibration.relative)
+    return WellErrors(model.without(others), sensors, years, calibration.relative, walk is not None)
 
 
 def _largest(sizes: dict[str, float], start: str) -> float:
@@ -200,7 +232,7 @@ def hole_of(
     readings: Readings,
     seen: SeenHole,
     md: Array,
-    north: float = 0.0,
+    north: float | Array = 0.0,
     before: Sequence[float] | TieIn | PathEnd = (),
 ) -> Hole:
     """The hole as the readings see it; TVD where all depths are known.

@@ -91,9 +91,9 @@ QUESTIONS = (
     ),
     SettingsQuestion(
         "--length-unit",
-        "Unit of depths that state none, m or ft?",
+        "Unit of length, m, ft or usft (US survey feet)?",
         "m",
-        "How survey reads a column MD.",
+        "How survey reads a column MD, and what it writes.",
     ),
     SettingsQuestion(
         "--temperature-unit",
@@ -107,7 +107,7 @@ QUESTIONS = (
 ALLOWED = {
     "settings": ("per-direction", "per-station"),
     "decision": ("simple", "guarded"),
-    "length_unit": ("m", "ft"),
+    "length_unit": ("m", "ft", "usft"),
     "temperature_unit": ("°C", "°F", "K"),
 }
 """Answers by the name of their option, where only some are possible."""

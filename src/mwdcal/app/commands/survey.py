@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import radians
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -15,9 +16,13 @@ from mwdcal.presentation.typed import findings_with_option_names
 
 if TYPE_CHECKING:
     from mwdcal.calibration.canonical import SignatureCheck
+    from mwdcal.presentation.signature import LoadedCalibration
     from mwdcal.survey.interference import Interference
     from mwdcal.survey.path import TieIn
     from mwdcal.survey.surveying import SurveyedWell, WellInputs
+
+Outputs = list[tuple[Path, Any]]
+"""Files to write, with their content."""
 
 
 @options.command()
@@ -50,6 +55,21 @@ if TYPE_CHECKING:
     help="What every 1σ holds besides calibration, noise and declination: interference, sag, misalignment, depth and "
     "drift since the calibration (owsg-mwd), nothing (none), or the terms of a file in ISCWSA's JSON form.",
 )
+@click.option(
+    "--run",
+    nargs=2,
+    type=str,
+    multiple=True,
+    metavar="CALIBRATION READINGS",
+    help="The next run of the same well, with the calibration of its tool; its path goes on where the run before "
+    "ended. May be repeated.",
+)
+@click.option(
+    "--registry",
+    metavar="URL|FILE",
+    help="Registry with earlier calibrations of the tool: the random walk that they show is the drift since the "
+    "calibration, instead of that of the error model.",
+)
 @options.preset(
     "--limits",
     shell_complete=options.offers("survey_limits"),
@@ -72,12 +92,35 @@ if TYPE_CHECKING:
     "the first station. Default: 0,0,0.",
 )
 @click.option(
+    "--length-unit",
+    type=click.Choice(["m", "ft", "usft"]),
+    help="Unit of length of the results and of --tie-in, and of depths whose column states none: metres, feet, or US "
+    "survey feet (1200/3937 m). Default: length_unit of mwdcal.toml, else m.",
+)
+@click.option(
     "--section-azimuth",
     type=float,
     default=0.0,
     show_default=True,
     metavar="DEG",
     help="Azimuth of the vertical section, from the north of the path.",
+)
+@click.option(
+    "--station",
+    metavar="LABEL",
+    help="Station whose contributions to the uncertainty are on the screen. Default: the last on the path.",
+)
+@click.option(
+    "--contributions",
+    type=options.FILE,
+    metavar="FILE",
+    help="Also write a table of the contributions: what each cause of error makes of every 1σ, a row for each "
+    "station and cause.",
+)
+@click.option(
+    "--covariance",
+    is_flag=True,
+    help="Add the covariance of the position to the table: covariance_nn_m2 and so on; WITSML always has it.",
 )
 @options.WHERE_OUTSIDE
 @options.MISSING
@@ -91,15 +134,16 @@ if TYPE_CHECKING:
 @options.JSON
 def command(
     calibration: Path, readings: Path, output: Path, reference: Path | None, msa: bool,
-    msa_html: Path | None, sensor_drift: str | None, error_model: str, limits: str, switch: str,
-    tie_in: str | None, section_azimuth: float, outside: str, missing: str, report: Path | None, decimal: str,
-    key: tuple[Path, ...],
-    as_json: bool,
+    msa_html: Path | None, sensor_drift: str | None, error_model: str, registry: str | None, limits: str,
+    switch: str, run: tuple[tuple[str, str], ...], tie_in: str | None, length_unit: str | None,
+    section_azimuth: float, station: str | None, contributions: Path | None, covariance: bool,
+    outside: str, missing: str, report: Path | None, decimal: str,
+    key: tuple[Path, ...], as_json: bool,
 ) -> None:  # fmt: skip
     """Surveys of a well: READINGS in their order, corrected by the CALIBRATION of their tool.
 
     Adds inclination, azimuth, toolface, |g|, |b| and dip with standard uncertainties to the columns of READINGS, and
-    whether each survey lies within the limits; with measured depths (md_m) north, east and TVD.
+    whether each survey lies within the limits; with measured depths (md_m, md_ft or md_usft) north, east and TVD.
 
     \b
     Example: mwdcal survey tool.json surveys.csv --reference here.json -o well.csv --report well.html
@@ -107,53 +151,110 @@ def command(
     separate interference from azimuth.
     """
     from mwdcal.files.formats import atomic
-    from mwdcal.files.formats import table as tables
-    from mwdcal.files.runs import MOST_ROWS, read_export
     from mwdcal.presentation.signature import load_calibration
     from mwdcal.survey import long_table
-    from mwdcal.survey.surveying import analysed, check_drift, survey_well, well_inputs
+    from mwdcal.survey.runs import survey_runs
+    from mwdcal.survey.surveying import analysed, check_drift
 
-    if msa_html and not msa:
-        raise InputError("`msa_html` goes with `msa`. Leave it out, or add `msa`.")
+    if msa_html and (not msa or run):
+        raise InputError("`msa_html` goes with `msa` of one run. Leave it out, or add `msa`.")
     check_drift(sensor_drift, msa)
-    given = [calibration, readings, reference, limits, error_model, *key]
-    options.check_outputs([output, msa_html], given, page=report)
-    start, ends = _tie_in(tie_in), _switch(switch)
-    loaded = load_calibration(calibration, key)
-    fitted = loaded.calibration
+    pairs = [(calibration, readings), *((Path(tool), Path(table)) for tool, table in run)]
+    given = [*(file for pair in pairs for file in pair), reference, limits, error_model, *key]
+    options.check_outputs([output, msa_html, contributions], given, page=report)
+    unit = length_unit or ""
+    start, ends = _tie_in(tie_in, unit), _switch(switch)
+    loaded = [load_calibration(tool, key) for tool, _ in pairs]
     said = options.statements()
-    whole = msa or report or missing == "blank" or said
-    if not whole and long_table.in_parts(readings, output, fitted.profile):
+    blank = missing == "blank"
+    whole = any((msa, report, blank, said, contributions, station, run, covariance, registry))
+    if not whole and long_table.in_parts(readings, output, loaded[0].calibration.profile):
         result = long_table.survey_file(
-            fitted, readings, output, reference, limits, start, ends, outside, decimal,
-            loaded.digest, loaded.findings, error_model, section_azimuth,
+            loaded[0].calibration, readings, output, reference, limits, start, ends, outside, decimal,
+            loaded[0].digest, loaded[0].findings, error_model, section_azimuth, unit,
         )  # fmt: skip
-        _print(result, loaded.signature, (str(output), ""), as_json)
+        _print(result, loaded[0].signature, (str(output), ""), as_json)
         return
-    table = read_export(readings, fitted.profile, decimal=decimal, rows=MOST_ROWS, statements=said)
+    how = (reference, limits, msa, error_model, missing, section_azimuth, unit, registry)
+    inputs = [
+        _inputs(tool, table, decimal, {} if i else said, how)
+        for i, (tool, (_, table)) in enumerate(zip(loaded, pairs, strict=True))
+    ]
+    analyses = [analysed(each, sensor_drift) if msa else None for each in inputs]
+    pages = _interference_page(inputs[0], analyses[0], msa_html)
+    for each, analysis, tool in zip(inputs, analyses, loaded, strict=True):
+        if analysis and not analysis.summary.separable:
+            atomic.write_all(pages + _interference_page(each, analysis, report))
+            _refuse(each, analysis, tool.signature, as_json)
+    result = survey_runs(inputs, analyses, tie_in=start, switch=ends, outside=outside)
+    pages += _pages(result, report, contributions, station)
+    atomic.write_all([_table(result, output, covariance), *pages])
+    files = str(output), str(report or "")
+    _print(result, loaded[0].signature, files, as_json, station, contributions)
+
+
+def _inputs(
+    tool: LoadedCalibration, readings: Path, decimal: str, said: Mapping[str, str], how: Any
+) -> WellInputs:
+    """The inputs of a run: its calibration and its table."""
+    from mwdcal.files.runs import MOST_ROWS, read_export
+    from mwdcal.survey.surveying import well_inputs
+
+    reference, limits, msa, error_model, missing, section_azimuth, unit, registry = how
+    profile = tool.calibration.profile
+    table = read_export(readings, profile, decimal=decimal, rows=MOST_ROWS, statements=said)
     with offering_blank():
         inputs = well_inputs(
-            fitted, table, reference, limits, msa, loaded.digest, loaded.findings, error_model, missing,
-            section_azimuth,
+            tool.calibration, table, reference, limits, msa, tool.digest, tool.findings, error_model,
+            missing, section_azimuth, unit,
         )  # fmt: skip
-    analysis = analysed(inputs, sensor_drift) if msa else None
-    pages = _interference_page(inputs, analysis, msa_html)
-    if analysis and not analysis.summary.separable:
-        atomic.write_all(pages + _interference_page(inputs, analysis, report))
-        _refuse(inputs, analysis, loaded.signature, as_json)
-    result = survey_well(inputs, analysis, tie_in=start, switch=ends, outside=outside)
+    if not registry:
+        return inputs
+    from mwdcal.library.drifts import with_walk
+
+    return with_walk(inputs, registry)
+
+
+def _table(result: SurveyedWell, output: Path, covariance: bool) -> tuple[Path, Any]:
+    """The table of the surveys; WITSML has the covariance of the positions in any case."""
+    from mwdcal.files.formats import table as tables
+
+    table = result.table_with(covariance or output.suffix.lower() == ".xml")
+    return output, tables.streamed(output, table)
+
+
+def _pages(
+    result: SurveyedWell, report: Path | None, table: Path | None, station: str | None
+) -> Outputs:
+    """The page, and the table of contributions, where they were asked for.
+
+    Raises:
+        InputError: contributions were asked for, and there are none.
+    """
+    from mwdcal.files.formats import table as tables
+    from mwdcal.presentation.contributions import contribution_table, station_row
+
+    pages: Outputs = []
     if report:
         from mwdcal.presentation.survey_page import render
 
-        findings = findings_with_option_names(result.well.findings)
-        pages.append((report, render(result.well, findings, inputs.named, analysis)))
-    atomic.write_all([(output, tables.streamed(output, result.table)), *pages])
-    _print(result, loaded.signature, (str(output), str(report or "")), as_json)
+        pages.append((report, render(result, findings_with_option_names(result.well.findings))))
+    if table is None and station is None:
+        return pages
+    if result.contributions is None:
+        raise InputError(
+            "`contributions` and `station` are for tables of at most 2000 surveys with magnetic readings. Leave them "
+            "out, or survey a part of the table."
+        )
+    station_row(result.contributions, station)
+    if table:
+        pages.append((table, tables.rendered(table, contribution_table(result))))
+    return pages
 
 
 def _interference_page(
     inputs: WellInputs, analysis: Interference | None, page: Path | None
-) -> list[tuple[Path, bytes | str]]:
+) -> Outputs:
     """The page of a multi-station analysis, where one was asked for."""
     if not analysis or not page:
         return []
@@ -175,7 +276,12 @@ def _refuse(
 
 
 def _print(
-    result: SurveyedWell, signature: SignatureCheck, files: tuple[str, str], as_json: bool
+    result: SurveyedWell,
+    signature: SignatureCheck,
+    files: tuple[str, str],
+    as_json: bool,
+    station: str | None = None,
+    contributions: Path | None = None,
 ) -> None:
     """Print the result, with the files that were written."""
     from mwdcal.presentation import survey as screens
@@ -184,7 +290,7 @@ def _print(
     shown: object = (
         screens.document(result.inputs, facts, signature)
         if as_json
-        else screens.whole_screen(result, facts, signature)
+        else screens.whole_screen(result, facts, signature, station, contributions=contributions)
     )
     print_result(shown, findings_with_option_names(screens.all_findings(facts)))
 
@@ -202,13 +308,14 @@ def _numbers(name: str, text: str, count: int) -> list[float]:
     return values
 
 
-def _tie_in(text: str | None) -> tuple[float, float, float] | TieIn | None:
+def _tie_in(text: str | None, unit: str) -> tuple[float, float, float] | TieIn | None:
     """Where the path starts, by three numbers or six."""
-    from mwdcal.survey.surveying import start_of
+    from mwdcal.survey.surveying import length_unit_of, start_of
 
     if text is None:
         return None
-    return start_of(_numbers("tie_in", text, 6 if text.count(",") > 2 else 3))
+    numbers = _numbers("tie_in", text, 6 if text.count(",") > 2 else 3)
+    return start_of(numbers, length_unit_of(unit)[1])
 
 
 def _switch(text: str) -> tuple[float, float]:

@@ -24,20 +24,37 @@ from mwdcal.files.exchange.witsml_schema import (
     NAMESPACE,
     OF_STATION,
     OF_TRAJECTORY,
+    UOM_OF_LENGTH,
     UOM_OF_UNIT,
     Leaf,
     converted,
 )
 from mwdcal.files.formats.columns import MAX_COLUMNS, Column, Parts, at_most, no_stations, number
 
+_LENGTHS = {
+    "md": "md",
+    "tvd": "tvd",
+    "north": "dispNs",
+    "east": "dispEw",
+    "vertical_section": "vertSect",
+}
+"""Beginnings of columns of lengths that are elements of a station."""
+_AXES = {"n": "N", "e": "E", "v": "Vert"}
+_STATUSES = {"definitive": "position", "rejected": "rejected", "superseded": "open"}
+"""Words of the column `status`, and of the element; a column keeps the word itself, in an extension."""
 _OURS = {
-    "md_m": ("md", "m"),
-    "tvd_m": ("tvd", "m"),
+    **{f"{n}_{u}": (e, UOM_OF_LENGTH[u]) for n, e in _LENGTHS.items() for u in UOM_OF_LENGTH},
+    **{
+        f"covariance_{a}{b}_{u}2": (
+            f"matrixCov/variance{_AXES[a]}{_AXES[b]}",
+            f"{UOM_OF_LENGTH[u]}2",
+        )
+        for a, b in ("nn", "ne", "nv", "ee", "ev", "vv")
+        for u in ("m", "ft")
+    },
     "inclination_deg": ("incl", "dega"),
     "magnetic_toolface_deg": ("mtf", "dega"),
     "toolface_deg": ("gtf", "dega"),
-    "north_m": ("dispNs", "m"),
-    "east_m": ("dispEw", "m"),
     "sd_gravity_g": ("gravTotalUncert", "gn"),
     "sd_dip_deg": ("dipAngleUncert", "dega"),
     "sd_field_nt": ("magTotalUncert", "nT"),
@@ -198,10 +215,12 @@ def _described(
 def _places(names: Sequence[str], metadata: Mapping[str, object]) -> dict[str, _Place]:
     """The elements that columns are written to; a column without one is an extension."""
     magnetic = metadata.get("field_unit", "nT") == "nT"
+    first = {_OURS[name][0]: name for name in reversed(names) if name in _OURS}
     places = {
         name: _Place(*_OURS[name])
         for name in names
-        if name in _OURS and (magnetic or _OURS[name][1] != "nT" or name.startswith("ref_"))
+        if name in first.values()
+        and (magnetic or _OURS[name][1] != "nT" or name.startswith("ref_"))
     }
     if _KIND in names and "toolface_deg" in places:
         places["toolface_deg"] = _Place(*_OURS["toolface_deg"], _OURS["magnetic_toolface_deg"][0])
@@ -264,7 +283,9 @@ def render(columns: Mapping[str, Column], metadata: Mapping[str, object], source
 
 def _check_writable(columns: Mapping[str, Column], source: str) -> None:
     """Refuse a table without depths, and text and numbers that XML cannot hold."""
-    depths = columns.get("md_m")
+    depths = next(
+        (columns[n] for n, (path, _) in _OURS.items() if path == "md" and n in columns), None
+    )
     if depths is None or isinstance(depths, list) or np.isnan(depths).any():
         raise InputError(
             f"{source}: every station of a WITSML trajectory must have a measured depth in the column 'md_m'. "
@@ -322,6 +343,9 @@ def _station(
     yield f"<trajectoryStation uid={_quoted(uid)}>"
     typed = any(place.path == _TYPE for place in places.values())
     elements = {} if typed else {_TYPE: _NO_TYPE}
+    status = _STATUSES.get(cells.get("status", "").strip().lower())
+    if status:
+        elements["statusTrajStation"] = (status, "")
     elements |= {
         place.of(cells.get(_KIND, "")): (cells[name], place.uom)
         for name, place in places.items()

@@ -56,6 +56,7 @@ OF_STATION = (
 _PER_MS2 = FACTORS["m/s²"][0]
 _UOMS = {
     "m": {"m": 1.0, "cm": 0.01, "mm": 1e-3, "km": 1e3, "ft": FOOT, "ftUS": 1200 / 3937},
+    "m2": {"m2": 1.0, "cm2": 1e-4, "ft2": FOOT**2, "ftUS2": (1200 / 3937) ** 2},
     "dega": {"dega": 1.0, "rad": FACTORS["rad"][0], "gon": 0.9, "mina": 1 / 60, "seca": 1 / 3600},
     "gn": {
         **{"gn": 1.0, "mgn": FACTORS["mg"][0], "m/s2": _PER_MS2, "cm/s2": 0.01 * _PER_MS2},
@@ -67,6 +68,8 @@ _UOMS = {
     },
 }
 """Units of measure of each quantity, in the one that we use."""
+UOM_OF_LENGTH = {"m": "m", "ft": "ft", "usft": "ftUS"}
+"""Units of measure by the units of lengths."""
 UOM_OF_UNIT = {
     **{"g": "gn", "mg": "mgn", "m/s²": "m/s2"},
     **{"nT": "nT", "µT": "uT", "mT": "mT", "gauss": "gauss"},
