@@ -76,7 +76,8 @@ def test_causes_in_a_straight_hole_are_their_formulas_times_its_length(tool, tmp
     upward = np.radians(0.2) * sine**0.25
     assert sag["sd_inclination_deg"] == pytest.approx(upward)
     assert sag["sd_highside_m"] == pytest.approx(length * upward)
-    assert sag["sd_lateral_m"] == pytest.approx(0.0, abs=1e-9)
+    rounding = np.sqrt(np.finfo(float).eps)  # the root of a variance that is rounded
+    assert sag["sd_lateral_m"] <= rounding * sag["sd_highside_m"]
     axial = at_end(well, "axial interference of the drill string", "systematic")
     turn = 220 * sine * np.sin(azimuth) / across
     assert axial["sd_azimuth_deg"] == pytest.approx(turn, rel=2e-3)  # field and dip as measured
