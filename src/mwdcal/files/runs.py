@@ -36,7 +36,14 @@ from mwdcal.files.contract import (
     units_of,
 )
 from mwdcal.files.faults import BlankReadingError as BlankReadingError
-from mwdcal.files.faults import Cells, columns_of, faults, faults_beside_readings, refuse
+from mwdcal.files.faults import (
+    Cells,
+    columns_of,
+    faults,
+    faults_beside_readings,
+    is_blank,
+    refuse,
+)
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, Column, shown
 from mwdcal.files.formats.dialect import holds_numbers
@@ -52,6 +59,8 @@ MOST_ROWS = 1_000_000
 """Rows that a run may have at most, as many as a text table."""
 MOST_OTHERS = 20
 """Unused columns of numbers that are kept to see whether they explain the residuals."""
+STATED_REFERENCES = ("gravity", "field", "dip")
+"""References that may be the same at all stations, and be stated once."""
 _TURN = 360.0
 
 
@@ -234,7 +243,7 @@ def renamed(table: Table, profile: Profile) -> Table:
         InputError: a channel of the profile that the table has not, or a name that is taken.
     """
     if not is_export(table.columns, profile):
-        return table
+        return _with_stated_references(table)
     sources = _sources(profile)
     theirs = {s.name: column for column, s in sources.items() if s.name in table.columns}
     for column, source in sources.items():
@@ -263,6 +272,23 @@ def renamed(table: Table, profile: Profile) -> Table:
             factor, offset = synonyms.FACTORS.get(unit, (1.0, 0.0))
             values = tables.numbers(table, name)
             columns[column] = values * factor + offset if (factor, offset) != (1.0, 0.0) else values
+    places = {theirs.get(name, name): place for name, place in table.places.items()}
+    return _with_stated_references(replace(table, columns=columns, places=places))
+
+
+def _with_stated_references(table: Table) -> Table:
+    """The table with the references that its metadata state for all stations, where it has no column of them."""
+    columns = dict(table.columns)
+    for column in (REFERENCES[name].column for name in STATED_REFERENCES):
+        value = table.metadata.get(column)
+        if value is None or (column in columns and not is_blank(table, column)):
+            continue
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise InputError(
+                f"{table.source}, metadata '{column}': must be a number; got {shown(str(value))}. Write it with a "
+                "decimal point and without quotes."
+            )
+        columns[column] = np.full(table.count, float(value))
     return replace(table, columns=columns)
 
 

@@ -13,6 +13,8 @@ from mwdcal.files.synonyms import unit_of
 from mwdcal.geometry.vectors import Array
 from mwdcal.identification.words import spelled
 
+BOTH_UNITS = " and "
+"""What stands between two units of one column, of which one is wrong."""
 IN_BRACKETS = re.compile(r"[(\[]([^)\]]*)[)\]]\s*$")
 RANGES_BY_UNIT: dict[str, tuple[tuple[str, float, float], ...]] = {
     "ref_gravity_g": (("g", 0.9, 1.1), ("m/s²", 9.0, 10.5), ("mg", 990.0, 1010.0)),

@@ -24,6 +24,7 @@ from mwdcal.files.synonyms import (
 )
 from mwdcal.geometry.vectors import Array
 from mwdcal.identification.answers import (
+    BOTH_UNITS,
     IN_BRACKETS,
     LEAST_ROLLS,
     RANGES_BY_UNIT,
@@ -61,6 +62,8 @@ _OTHER_NORTH = re.compile(
 _GRID_NORTH = re.compile(r"grid|gitter|[qc]uadr[ií]cula|kartnord|сетк|坐标北|网格", re.IGNORECASE)
 _OF_NORTH = re.compile(r"north|nord|norte|azi|azm|heading|азим|север|北|方位", re.IGNORECASE)
 """Words of the north that azimuths count from."""
+_TWICE = re.compile(r" \(\d+\)$")
+"""The end of a name that stands in a table more than once."""
 _NUMBERED = re.compile(r"(.*?[A-Za-z])[ _-]*([123])((?:\W.*|_[A-Za-z]+)?)")
 _TITLE = re.compile(
     r"(acc|mag|accelerometers?|magnetometers?)?(?:s|ref|sensors?)? +", re.IGNORECASE
@@ -94,6 +97,9 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     """What a column holds by its name, and its unit, stated beside the name or in it."""
     if name in MAPPED:
         return Resemblance(name, unit_of(unit) or "".join(units_of(name)[:1]))
+    if both := _two_units(name, unit):
+        once = meaning(name)
+        return once and once._replace(unit=both if units_of(once.column) else unit)
     plain = spelled(f"{name} ({unit})" if unit else name)
     if "elevation" in plain:
         return Resemblance("ref_inclination_deg", BELOW if "below" in plain else ABOVE)
@@ -113,6 +119,14 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     return alike or (Resemblance(spelt, unit_of(stated[1]) if stated else "") if spelt else None)
 
 
+def _two_units(name: str, unit: str) -> str:
+    """The units by a name, by the row below it and by its cells in words, if two of them differ; else empty."""
+    bracketed = IN_BRACKETS.search(spelled(name))
+    by_name = unit_of(bracketed[1]) if bracketed else ""
+    every = dict.fromkeys(filter(None, [by_name, *map(unit_of, spelled(unit).split(BOTH_UNITS))]))
+    return BOTH_UNITS.join(every) if len(every) > 1 and {*every} != {"g", "gauss"} else ""
+
+
 def _without_title(name: str) -> Resemblance | None:
     """What a name resembles behind the title of its group, which says no other triad: Accelerometers Gx (V)."""
     title = _TITLE.match(name)
@@ -130,10 +144,12 @@ def meanings_of(names: Sequence[str], units: Sequence[str]) -> dict[str, Resembl
     there is a Neigung.
     """
     numbered = _numbered(names)
+    bare = {name: _TWICE.sub("", name) for name in names}
+    once = {
+        name: numbered.get(name, base if base in names else name) for name, base in bare.items()
+    }
     results = {
-        name: m
-        for name, unit in zip(names, units, strict=True)
-        if (m := meaning(numbered.get(name, name), unit))
+        name: m for name, unit in zip(names, units, strict=True) if (m := meaning(once[name], unit))
     }
     lone = [n for n, m in results.items() if m.column == "az" and _BARE_AZ.fullmatch(n)]
     if lone and not any(_BARE_AX.fullmatch(n) for n in names):
@@ -192,6 +208,11 @@ class Questions(list[QuestionError]):
             self.append(question)
             return None
 
+    def believed(self) -> set[str]:
+        """The columns of a table that the first answers to open questions take."""
+        first = [each.answers[0].arguments for each in self if each.answers]
+        return {value.partition("=")[2] for arguments in first for _, value in arguments}
+
     def raise_any(self, source: str) -> None:
         """Raise all questions together."""
         if self:
@@ -204,7 +225,7 @@ def proposed(
     values: Values,
     source: str,
     above: Sequence[str] = (),
-    north_is_stated: bool = False,
+    stated: Mapping[str, object] | None = None,
     answers: Mapping[str, str] | None = None,
     problems: Mapping[str, str] | None = None,
 ) -> tuple[dict[str, ColumnSource], set[str], dict[str, str]]:
@@ -212,9 +233,9 @@ def proposed(
 
     And columns that are no evidence although they are called so, each with the reason.
 
-    `above`: lines above the names. `north_is_stated`: the table's metadata say what azimuths count from. `answers`:
-    columns of the table by the name of the run file, as the user says. `problems`: what is wrong with columns of
-    which `values` gave none although most of their cells are numbers.
+    `above`: lines above the names. `stated`: what the table says of itself, as metadata. `answers`: columns of the
+    table by the name of the run file, as the user says. `problems`: what is wrong with columns of which `values` gave
+    none although most of their cells are numbers.
 
     Raises:
         InputError: an answer that names no column.
@@ -223,14 +244,14 @@ def proposed(
     """
     meanings = meanings_of(names, units)
     _tell_dip(meanings, values)
-    said = answers or {}
+    said, known = answers or {}, stated or {}
     ignored = _no_evidence(meanings, values, said)
     _answered(said, names, meanings, source)
     questions = Questions()
     spoken = _spoken(meanings, values, above)
-    chosen = _chosen(meanings, values, problems or {}, spoken, ignored, questions, source)
+    chosen = _chosen(meanings, values, problems or {}, spoken, ignored, said, questions, source)
     azimuth = chosen.get(REFERENCES["azimuth"].column)
-    if azimuth and not north_is_stated:
+    if azimuth and "azimuth_reference" not in known and not north_of(azimuth.name, above, known):
         questions.ask(_check_north, azimuth.name, above, source)
     for triad, channels in CHANNELS.items():
         if not {*channels} & {*chosen, *said}:
@@ -240,9 +261,11 @@ def proposed(
         questions.ask(_check_triads, names, values, chosen, source)
     questions.ask(_check_units_of_triads, chosen, source)
     if not {*RAW[3:]} & {*chosen, *said}:
-        questions.ask(_check_nameless, names, meanings, values, chosen, source)
+        believed = questions.believed()
+        others = [n for n in names if n not in meanings and n not in believed]
+        questions.ask(_check_nameless, others, values, {*chosen, *known}, source)
     rest = {n: u for n, u in zip(names, units, strict=True) if n not in meanings}
-    for column in lacking_references({*chosen, *said}):
+    for column in lacking_references({*chosen, *said, *known}):
         questions.ask(_check_lacking, column, rest, values, source)
     questions.raise_any(source)
     by_value = {c for c, each in chosen.items() if each.unit and not meanings[each.name].unit}
@@ -257,6 +280,7 @@ def _chosen(
     problems: Mapping[str, str],
     spoken: str,
     ignored: Collection[str],
+    said: Collection[str],
     questions: Questions,
     source: str,
 ) -> dict[str, ColumnSource]:
@@ -272,7 +296,10 @@ def _chosen(
         name = questions.ask(_one, column, candidates, values, source) if candidates else None
         if name:
             stated = meanings[name].unit or _angles(column, spoken)
-            unit = questions.ask(_unit, column, name, stated, values(name), source)
+            cells = values(name)
+            unit = questions.ask(_unit, column, name, stated, cells, source)
+            if unit and stated and column not in said:
+                questions.ask(_check_range, column, name, unit, cells, source)
             chosen[column] = ColumnSource(name=name, unit=unit or "")
     return chosen
 
@@ -419,17 +446,12 @@ def _check_hidden(
 
 
 def _check_nameless(
-    names: Sequence[str],
-    meanings: Mapping[str, Resemblance],
-    values: Values,
-    chosen: Mapping[str, ColumnSource],
-    source: str,
+    unused: Sequence[str], values: Values, known: Collection[str], source: str
 ) -> None:
-    """Ask whether three columns of a steady norm are magnetometers, in a table with references of a field."""
+    """Ask whether three unused columns of a steady norm are magnetometers, in a table with references of a field."""
     of_field = [REFERENCES[name].column for name in ("field", "dip", "azimuth")]
-    if not {*of_field} & {*chosen}:
+    if not {*of_field} & {*known}:
         return
-    unused = [n for n in names if n not in meanings]
     if triples := triples_for(RAW[3:], unused, values, STEADY_NORM):
         raise QuestionError(
             f"{source}: no column is a magnetometer by its name, and the table states the field. Are these the "
@@ -474,6 +496,17 @@ def _check_north(name: str, above: Sequence[str], source: str) -> None:
     )
 
 
+def north_of(name: str, above: Sequence[str], stated: Mapping[str, object]) -> str:
+    """The north that azimuths count from where their name or a line says it, and all that it takes is stated."""
+    line = next((a for a in above if _OTHER_NORTH.search(a) and _OF_NORTH.search(a)), "")
+    text = f"{line} {name} {spelled(name)}"
+    if not _OTHER_NORTH.search(text):
+        return ""
+    north = "grid" if _GRID_NORTH.search(text) else "true"
+    needed = ("declination_deg",) if north == "true" else ("declination_deg", "convergence_deg")
+    return north if {*needed} <= {*stated} else ""
+
+
 def _one(column: str, candidates: Sequence[str], values: Values, source: str) -> str:
     """The only candidate for a column: of its very name, or the only one that is called a reference."""
     if column in candidates:
@@ -502,6 +535,12 @@ def _unit(column: str, name: str, stated: str, values: Array | None, source: str
     if stated:
         if stated in allowed:
             return stated
+        if BOTH_UNITS in stated:
+            raise QuestionError(
+                f"{source}: {shown(name)} is in {stated}: its name, the row below it and its cells say different "
+                "units. Which one holds?",
+                in_units(name, column, [u for u in allowed if u in stated.split(BOTH_UNITS)]),
+            )
         raise QuestionError(
             f"{source}: {shown(name)} is '{column}' by its name, and in {stated}, which is not one of "
             f"{', '.join(allowed)}.",
@@ -519,6 +558,24 @@ def _unit(column: str, name: str, stated: str, values: Array | None, source: str
             return usual
         raise _open(name, column, allowed, known, source)
     return allowed[0]
+
+
+def _check_range(column: str, name: str, unit: str, values: Array | None, source: str) -> None:
+    """Ask about values that cannot be in the unit stated, and can be in another."""
+    known = values[np.isfinite(values)] if values is not None else np.empty(0)
+    if not known.size:
+        return
+    ranges = {u: (low, high) for u, low, high in RANGES_BY_UNIT.get(column, ())}
+    fits = [u for u, (low, high) in ranges.items() if low <= known.min() and known.max() <= high]
+    turns = column in (REFERENCES["azimuth"].column, REFERENCES["toolface"].column)
+    if unit == "°" and turns and known.size > LEAST_ROLLS and _maybe_radians(known):
+        fits = ["rad"] if np.ptp(known) > 3 else []
+    if fits and unit not in fits:
+        raise QuestionError(
+            f"{source}: {shown(name)} is in {unit}, and its values ({first_values(known)}) are those of "
+            f"{' or '.join(fits)}. Which unit holds?",
+            in_units(name, column, [*fits, unit]),
+        )
 
 
 def _maybe_radians(angles: Array) -> bool:

@@ -27,12 +27,12 @@ from mwdcal.files.formats.table import labels as labels_of
 from mwdcal.files.formats.text import is_preamble
 from mwdcal.files.metadata import toml
 from mwdcal.files.profiles import CHOICE_OF_AXES
-from mwdcal.files.runs import check_run, renamed, to_readings
+from mwdcal.files.runs import STATED_REFERENCES, check_run, renamed, to_readings
 from mwdcal.files.statements import stated_table
 from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
-from mwdcal.identification.columns import meanings_of, proposed
+from mwdcal.identification.columns import meanings_of, north_of, proposed
 from mwdcal.identification.wiring import LEAST_STATIONS, Wiring, is_clear, wiring
 from mwdcal.sensor.profile import ColumnSource, Profile, TableFormat, TriadProfile
 
@@ -112,17 +112,18 @@ def propose(
     units = where.units if where else [""] * len(names)
 
     problems: dict[str, str] = {}
-    above, stated_north = where.above if where else (), "azimuth_reference" in table.metadata
+    above = where.above if where else ()
     columns, by_value, ignored = proposed(
         names,
         units,
         partial(_numbers_of, table, problems),
         table.source,
         above,
-        stated_north,
+        table.metadata,
         answers,
         problems,
     )
+    table, form = _with_north(table, form, columns, above)
     if ignored:
         form = msgspec.structs.replace(form or TableFormat(find=True), ignore=tuple(ignored))
     table = _of_one_tool(table, columns, stated or {})
@@ -142,6 +143,24 @@ def propose(
         open_axes,
         ignored,
     )
+
+
+def _with_north(
+    table: Table,
+    form: TableFormat | None,
+    columns: Mapping[str, ColumnSource],
+    above: Sequence[str],
+) -> tuple[Table, TableFormat | None]:
+    """The table and its form with the north of its azimuths, where names and a declination above it tell it."""
+    azimuth = columns.get(REFERENCES["azimuth"].column)
+    if azimuth is None or "azimuth_reference" in table.metadata:
+        return table, form
+    north = north_of(azimuth.name, above, table.metadata)
+    if not north:
+        return table, form
+    metadata = {**table.metadata, "azimuth_reference": north}
+    form = msgspec.structs.replace(form or TableFormat(find=True), azimuth_reference=north)
+    return replace(table, metadata=metadata), form
 
 
 def _of_one_tool(
@@ -537,6 +556,17 @@ def _open_section(kind: str, axes: OpenAxes, unit: str) -> list[str]:
         "axes = []",
         *scale,
     ]
+
+
+def stated_references(proposal: Proposal) -> dict[str, float]:
+    """The references that the table states once for all stations, in units of a run file."""
+    columns = proposal.profile.columns
+    named = {} if isinstance(columns, msgspec.UnsetType) else columns
+    return {
+        column: float(str(proposal.metadata[column]))
+        for column in (REFERENCES[name].column for name in STATED_REFERENCES)
+        if column in proposal.metadata and column not in named
+    }
 
 
 def in_order(columns: dict[str, ColumnSource]) -> list[tuple[str, ColumnSource]]:

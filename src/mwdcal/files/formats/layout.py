@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import NamedTuple
@@ -18,7 +18,14 @@ import numpy as np
 
 from mwdcal.errors import Answer, InputError, QuestionError
 from mwdcal.files.formats import figures
-from mwdcal.files.formats.columns import as_text, looks_numeric, plain_names, shown
+from mwdcal.files.formats.columns import (
+    as_text,
+    letters_of,
+    looks_numeric,
+    plain_names,
+    shown,
+)
+from mwdcal.files.formats.title_references import stated_above
 from mwdcal.files.formats.titles import Titles, dated, titles
 from mwdcal.files.synonyms import unit_of
 from mwdcal.geometry.vectors import Array
@@ -61,13 +68,14 @@ Cells = Sequence[object]
 class Sheet(NamedTuple):
     """The rows of a sheet that are not blank, by number, each without blank cells at its end.
 
-    `form`: encoding and delimiter of a text; `number` of the sheet in its file, from 0.
+    `form`: encoding and delimiter of a text; `number` of the sheet in its file, and `first_column` of its rows, from 0.
     """
 
     name: str
     rows: list[tuple[int, Cells]]
     form: TableFormat = TableFormat()
     number: int = 0
+    first_column: int = 0
 
 
 @dataclass(frozen=True)
@@ -77,7 +85,8 @@ class Layout:
     `form` says how the table is written, `cells` are text, numbers in it with a decimal point, and `texts` the same
     as they stand there; `fractions` are columns of a workbook with numbers that are not whole. `left_out` are lines
     below the names that are no readings, `above` the texts above them;
-    `titles` what the title block says of the tool and the day.
+    `titles` what the title block says of the tool, the day and the place; `places` letters of the columns in a
+    workbook.
     """
 
     sheet: str
@@ -92,6 +101,7 @@ class Layout:
     above: tuple[str, ...] = ()
     titles: Titles = field(default_factory=lambda: Titles({}))
     left_out: tuple[tuple[int, str], ...] = ()
+    places: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def size(self) -> int:
@@ -231,15 +241,16 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
     _check_cut(kept, others, source)
     if not kept or max(len(names), *(len(row) for _, row in kept)) < LEAST_COLUMNS:
         return None
-    names, units, columns = _used(kept, names, units)
+    names, units, columns, letters = _used(kept, names, units, sheet.first_column)
     sign = decimal or figures.decimal_sign([c for column in columns for c in column], source)
     read = [figures.column(column, sign) for column in columns]
     above = [row for _, row in rows[:top]]
-    block = titles(above)
+    block = stated_above(above)
     texts = [[as_text(cell).strip() for cell in column] for column in columns]
     whole, joined = _with_minutes(names, [cells for cells, _ in read])
     stated = {
-        name: unit or by_cells for name, unit, (_, by_cells) in zip(names, units, read, strict=True)
+        name: " and ".join(dict.fromkeys(filter(None, [unit, by_cells])))
+        for name, unit, (_, by_cells) in zip(names, units, read, strict=True)
     }
     return Layout(
         sheet=sheet.name,
@@ -249,7 +260,7 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
             header_line=rows[head - any(units)][0],
             first_line=kept[0][0],
         ),
-        names=plain_names(whole),
+        names=whole,
         units=[stated.get(name, "") for name in whole],
         cells=joined,
         texts=[
@@ -265,18 +276,24 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
         left_out=tuple(
             (line, _words(row)) for line, row in others if not _repeats(row, rows, head)
         ),
+        places=dict(zip(names, letters, strict=True)) if sheet.name else {},
     )
 
 
 def _used(
-    rows: Sequence[tuple[int, Cells]], names: Sequence[str], units: Sequence[str]
-) -> tuple[list[str], list[str], list[list[object]]]:
-    """Names, units and cells of the columns that have a name or a cell that is filled in."""
+    rows: Sequence[tuple[int, Cells]], names: Sequence[str], units: Sequence[str], first: int
+) -> tuple[list[str], list[str], list[list[object]], list[str]]:
+    """Names, units, cells and letters of the columns that have a name or a cell that is filled in."""
     width = max(len(names), *(len(row) for _, row in rows))
     names, units = ([*each, *[""] * (width - len(each))] for each in (names, units))
     columns = [[row[k] if k < len(row) else "" for _, row in rows] for k in range(width)]
     used = [k for k in range(width) if names[k] or any(cell != "" for cell in columns[k])]
-    return [names[k] for k in used], [units[k] for k in used], [columns[k] for k in used]
+    return (
+        plain_names([names[k] for k in used]),
+        [units[k] for k in used],
+        [columns[k] for k in used],
+        [letters_of(first + k) for k in used],
+    )
 
 
 def _check_cut(

@@ -106,7 +106,9 @@ def _by_calamine(data: bytes, source: str) -> Iterator[Sheet]:
             first = page.start[0] if page.start else 0
             rows = enumerate(page.to_python(skip_empty_area=True), first + 1)
             yield Sheet(
-                name, [(line, cells) for line, row in rows if (cells := _trimmed(_plain(row)))]
+                name,
+                [(line, cells) for line, row in rows if (cells := _trimmed(_plain(row)))],
+                first_column=page.start[1] if page.start else 0,
             )
 
 

@@ -27,7 +27,7 @@ from mwdcal.files.formats.columns import (
     typed,
 )
 from mwdcal.files.formats.dialect import is_metadata
-from mwdcal.files.formats.titles import titles
+from mwdcal.files.formats.title_references import stated_above
 from mwdcal.sensor.profile import TableFormat
 
 # A file must not depend on the hour it was written: the first day a ZIP archive can hold.
@@ -61,7 +61,7 @@ def parse(
     metadata = meta.parse([(line, str(row[0]).strip()) for line, row in comments], source, "row")
     if form:
         above = [[as_text(cell) for cell in row] for line, row in every if line < form.header_line]
-        metadata = {**titles(above).metadata, **metadata}
+        metadata = {**stated_above(above).metadata, **metadata}
     names, cells, lines = assemble(padded, source, "row")
     named = zip(names, zip(*cells, strict=True), strict=True)
     columns = {name: typed(name, column) for name, column in named}
