@@ -100,7 +100,7 @@ MAPPED = (*COLUMNS, "serial")
 """Columns that a table may have under another name."""
 _UNITS_BY_END = {
     "deg": ("°", "rad", "gon"),
-    "g": ("g", "mg", "m/s²"),
+    "g": ("g", "mg", "m/s²", "gal", "mGal"),
     "nt": ("nT", "µT", "mT", "gauss", "mG"),
     "c": ("°C", "°F", "K"),
 }

@@ -301,7 +301,8 @@ def check_profile(profile: Profile, source: str) -> None:
         raise InputError(f"{source}, key 'name': must not be blank; got ''. Name the tool.")
     _check_section(profile, source)
     form = profile.table
-    if not isinstance(form, msgspec.UnsetType) and form.first_line <= form.header_line:
+    stated = not isinstance(form, msgspec.UnsetType) and not form.find
+    if stated and form.first_line <= form.header_line:
         raise InputError(
             f"{source}, key 'table.first_line': must be below the names in line {form.header_line}; got "
             f"{form.first_line}. Correct it."

@@ -22,7 +22,7 @@ from mwdcal.calibration.readings import (
     is_simulated,
     serial_of,
 )
-from mwdcal.errors import FitError, InputError
+from mwdcal.errors import FitError, InputError, QuestionError
 from mwdcal.estimation.evidence import WALKS
 from mwdcal.files import synonyms
 from mwdcal.files.contract import (
@@ -49,6 +49,7 @@ from mwdcal.files.formats.columns import LABELS, Column, shown
 from mwdcal.files.formats.dialect import holds_numbers
 from mwdcal.files.formats.layout import Layout
 from mwdcal.files.formats.table import Table, labels
+from mwdcal.files.marks import UNMARKED, without_rejected
 from mwdcal.files.statements import stated_table
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import ColumnSource, Profile, TableFormat, TriadProfile
@@ -79,7 +80,7 @@ def read_run(
         source = read_export(
             source, profile, decimal=decimal, rows=MOST_ROWS, statements=statements
         )
-    table = renamed(source, profile)
+    table = run_table(source, profile)
     check_run(table)
     readings, profile = to_readings(table, profile)
     return replace(readings, others=_other_numbers(table)), profile
@@ -130,9 +131,7 @@ def _exported(
     """The table in a file that is written as a form says, or as documented."""
     if form.find:
         decimal = "," if form.decimal == "," else ""
-        where = tables.laid_out(
-            path, sheet=form.sheet, wanted=_channels_of(profile), decimal=decimal
-        )
+        where = _laid_out(path, form, _channels_of(profile), decimal)
         return _of_layout(where, path, profile) if where else tables.read(path)
     try:
         serial = _sources(profile).get("serial", ColumnSource(name="serial")).name
@@ -152,6 +151,20 @@ def _exported(
     raise InputError(
         f"{problem} If the table is laid out otherwise than the tool profile says, correct [table] there, "
         "or propose a profile for it: mwdcal profile."
+    )
+
+
+def _laid_out(
+    path: str | os.PathLike[str], form: TableFormat, wanted: Sequence[str], decimal: str
+) -> Layout | None:
+    """Where a file has the table of a profile: of several, the one in the row that the profile states."""
+    try:
+        return tables.laid_out(path, sheet=form.sheet, wanted=wanted, decimal=decimal)
+    except QuestionError:
+        if form.header_line == 1:
+            raise
+    return tables.laid_out(
+        path, sheet=form.sheet, header_row=form.header_line, wanted=wanted, decimal=decimal
     )
 
 
@@ -234,6 +247,14 @@ def _not_as_stated(table: Table, profile: Profile) -> InputError:
         f"{table.source}: none of the columns {', '.join(map(shown, stated))} that [columns] of the tool "
         f"profile names; found {', '.join(shown(name) for name in [*table.columns][:12])}."
     )
+
+
+def run_table(table: Table, profile: Profile) -> Table:
+    """The rows of a run that its laboratory has not rejected, under the names and in the units of the run file."""
+    exported = is_export(table.columns, profile)
+    named = {each.name: column for column, each in _sources(profile).items()} if exported else {}
+    used = [n for n in table.columns if named.get(n, n) in UNMARKED]
+    return renamed(without_rejected(table, profile.table, used), profile)
 
 
 def renamed(table: Table, profile: Profile) -> Table:
@@ -366,6 +387,7 @@ def to_readings(
         source=table.source,
         run_sha256=table.digest,
         unused=synonyms.unused(list(table.columns), COLUMNS),
+        remarks=table.remarks,
     )
     triads = {
         kind: msgspec.structs.replace(getattr(profile, kind), scale=float(np.squeeze(scale)))

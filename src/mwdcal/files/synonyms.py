@@ -27,8 +27,10 @@ _SPELLINGS = {
     "°F": "f fahrenheit",
     "K": "k kelvin",
     "g": "g",
-    "mg": "millig",
+    "mg": "millig mg",
     "m/s²": "mss",
+    "gal": "gal gals",
+    "mGal": "mgal",
     "nT": "nt gamma",
     "µT": "ut",
     "mT": "millit",
@@ -50,6 +52,8 @@ CONVERSIONS = {
     "rad": "° = rad · 180/π",
     "mg": "g = mg / 1000",
     "m/s²": "g = m/s² / 9.80665",
+    "gal": "g = gal / 980.665",
+    "mGal": "g = mGal / 980665",
     "µT": "nT = µT · 1000",
     "mT": "nT = mT · 1e6",
     "gauss": "nT = gauss · 1e5",
@@ -66,6 +70,8 @@ FACTORS = {
     "rad": (180 / math.pi, 0.0),
     "mg": (1e-3, 0.0),
     "m/s²": (1 / STANDARD_GRAVITY, 0.0),
+    "gal": (1e-2 / STANDARD_GRAVITY, 0.0),
+    "mGal": (1e-5 / STANDARD_GRAVITY, 0.0),
     "µT": (1e3, 0.0),
     "mT": (1e6, 0.0),
     "gauss": (1e5, 0.0),
@@ -78,9 +84,9 @@ FACTORS = {
 """The same in numbers: factor, and what is added to the product."""
 _WARM = ("°C", "°F", "K")
 _MAGNETIC_UNITS = ("nT", "µT", "mT", "gauss", "mG")
-_GRAVITY_UNITS = ("g", "mg", "m/s²")
+_GRAVITY_UNITS = ("g", "mg", "m/s²", "gal", "mGal")
 WARMTH = "temperature_c"
-_STATED = {"ref", "reference", "local"}
+_STATED = {"ref", "reference", "local", "model", "igrf", "bggm", "wmm"}
 """Words of columns that are known, not measured."""
 _BYWORDS = _STATED | {
     *("true", "grid", "mag", "magnetic", "stand", "nominal", "target", "given", "set", "angle"),
@@ -243,6 +249,7 @@ _CASED = {
     "uT": " ut ",
     "mT": " millit ",
     "mG": " milligauss ",
+    "mGal": " mgal ",
     "mg": " millig ",
 }
 
@@ -285,6 +292,8 @@ def _resembled(name: str) -> Resemblance | None:
         return None
     if column in _CALLED_G and unit == "g" and name.rstrip(" )]").endswith("G"):
         unit = "gauss"
+    if column in _CALLED_G and unit == "mg":
+        unit = "mG"
     if not spread:
         implied = "°F" if "f" in (whole[-1:], bare[-1:]) and column == "temperature_c" else ""
         return Resemblance(column, unit or implied)

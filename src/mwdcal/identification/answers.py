@@ -17,7 +17,9 @@ BOTH_UNITS = " and "
 """What stands between two units of one column, of which one is wrong."""
 IN_BRACKETS = re.compile(r"[(\[]([^)\]]*)[)\]]\s*$")
 RANGES_BY_UNIT: dict[str, tuple[tuple[str, float, float], ...]] = {
-    "ref_gravity_g": (("g", 0.9, 1.1), ("m/s²", 9.0, 10.5), ("mg", 990.0, 1010.0)),
+    "ref_gravity_g": (
+        ("g", 0.9, 1.1), ("m/s²", 9.0, 10.5), ("mg", 990.0, 1010.0), ("mGal", 970_000.0, 990_000.0),
+    ),
     "ref_field_nt": (
         ("nT", 15_000.0, 80_000.0), ("µT", 15.0, 80.0), ("gauss", 0.15, 0.8), ("mT", 0.015, 0.08),
     ),

@@ -71,6 +71,12 @@ _TITLE = re.compile(
 """The title of a group of columns before the name of one."""
 _BARE_AZ = re.compile(r"az\W*(deg|°)?\W*", re.IGNORECASE)
 _BARE_AX = re.compile(r"a[xy]\b.*", re.IGNORECASE)
+_OF_LOGGER = re.compile(
+    r"\s*(?:channel|chan|ch|input|ai|kanal|eingang|canal|voie|канал|通道)\W*\d*\s*[(\[:]\s*([^()\[\]]+?)\s*[)\]]?\s*",
+    re.IGNORECASE,
+)
+"""A channel of a logger, with what it is in brackets or behind a colon."""
+_BARE_T = re.compile(r"t\W*(°|deg)?\W*", re.IGNORECASE)
 _CCW = re.compile(
     r"\(?(counter|anti)[ -]?clockwise\)?|\bccw\b|gegen (den )?uhrzeiger\w*|против час\w*",
     re.IGNORECASE,
@@ -100,6 +106,8 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     if both := _two_units(name, unit):
         once = meaning(name)
         return once and once._replace(unit=both if units_of(once.column) else unit)
+    logged = _OF_LOGGER.fullmatch(name)
+    name = logged[1] if logged else name
     plain = spelled(f"{name} ({unit})" if unit else name)
     if "elevation" in plain:
         return Resemblance("ref_inclination_deg", BELOW if "below" in plain else ABOVE)
@@ -151,14 +159,28 @@ def meanings_of(names: Sequence[str], units: Sequence[str]) -> dict[str, Resembl
     results = {
         name: m for name, unit in zip(names, units, strict=True) if (m := meaning(once[name], unit))
     }
-    lone = [n for n, m in results.items() if m.column == "az" and _BARE_AZ.fullmatch(n)]
-    if lone and not any(_BARE_AX.fullmatch(n) for n in names):
+    every = [n for n, m in results.items() if m.column == "az"]
+    lone = [n for n in every if _BARE_AZ.fullmatch(n)]
+    triad = [n for n in every if n not in lone[:1]] or any(_BARE_AX.fullmatch(n) for n in names)
+    if lone and (not triad or (len(every) == 2 and _follows(names, every, lone[0], results))):
         results[lone[0]] = Resemblance("ref_azimuth_deg", "°")
     inclined = [n for n, m in results.items() if m.column == "ref_inclination_deg"]
     dips = [n for n in inclined if re.search("inklination", n, re.IGNORECASE)]
     if len(dips) == 1 and any(re.search("neigung", n, re.IGNORECASE) for n in inclined):
         results[dips[0]] = results[dips[0]]._replace(column="ref_dip_deg")
     return results
+
+
+def _follows(
+    names: Sequence[str], every: Sequence[str], lone: str, meanings: Mapping[str, Resemblance]
+) -> bool:
+    """Whether of two columns that may be az the other one stands behind ax and ay, and the `lone` one does not."""
+    behind = {
+        name: [meanings[n].column for n in names[max(k - 2, 0) : k] if n in meanings]
+        == ["ax", "ay"]
+        for k, name in enumerate(names)
+    }
+    return not behind[lone] and all(behind[name] for name in every if name != lone)
 
 
 def _numbered(names: Sequence[str]) -> dict[str, str]:
@@ -227,7 +249,8 @@ def proposed(
     above: Sequence[str] = (),
     stated: Mapping[str, object] | None = None,
     answers: Mapping[str, str] | None = None,
-    problems: Mapping[str, str] | None = None,
+    problems: Mapping[str, QuestionError] | None = None,
+    besides: Sequence[QuestionError] = (),
 ) -> tuple[dict[str, ColumnSource], set[str], dict[str, str]]:
     """The columns of a table by the name that they have in a run file, and those with a unit by their values.
 
@@ -235,7 +258,7 @@ def proposed(
 
     `above`: lines above the names. `stated`: what the table says of itself, as metadata. `answers`: columns of the
     table by the name of the run file, as the user says. `problems`: what is wrong with columns of which `values` gave
-    none although most of their cells are numbers.
+    none although most of their cells are numbers. `besides`: questions that are open as well.
 
     Raises:
         InputError: an answer that names no column.
@@ -244,10 +267,12 @@ def proposed(
     """
     meanings = meanings_of(names, units)
     _tell_dip(meanings, values)
+    _tell_temperature(meanings, names, units, values)
     said, known = answers or {}, stated or {}
+    _tell_numbers(meanings, values, said)
     ignored = _no_evidence(meanings, values, said)
     _answered(said, names, meanings, source)
-    questions = Questions()
+    questions = Questions(besides)
     spoken = _spoken(meanings, values, above)
     chosen = _chosen(meanings, values, problems or {}, spoken, ignored, said, questions, source)
     azimuth = chosen.get(REFERENCES["azimuth"].column)
@@ -277,7 +302,7 @@ def proposed(
 def _chosen(
     meanings: Mapping[str, Resemblance],
     values: Values,
-    problems: Mapping[str, str],
+    problems: Mapping[str, QuestionError],
     spoken: str,
     ignored: Collection[str],
     said: Collection[str],
@@ -292,7 +317,7 @@ def _chosen(
         candidates = [n for n in candidates if n not in ignored]
         damaged = [problems[n] for n in alike if n in problems]
         if damaged and not _stated_among(candidates):
-            questions += map(QuestionError, damaged)
+            questions += damaged
         name = questions.ask(_one, column, candidates, values, source) if candidates else None
         if name:
             stated = meanings[name].unit or _angles(column, spoken)
@@ -346,6 +371,39 @@ def _tell_dip(meanings: dict[str, Resemblance], values: Values) -> None:
     ]
     if len(steady) == 1 and not _CALLED_REFERENCE.search(spelled(steady[0])):
         meanings[steady[0]] = Resemblance(REFERENCES["dip"].column, "°")
+
+
+def _tell_numbers(
+    meanings: dict[str, Resemblance], values: Values, answers: Collection[str]
+) -> None:
+    """A column of serials that number the rows is one of stations: S/N 1, 2, 3."""
+    for name, m in meanings.items():
+        cells = values(name) if m.column == "serial" and "serial" not in answers else None
+        if cells is not None and cells.size > LEAST_ROLLS and _is_steps(cells):
+            meanings[name] = Resemblance("station")
+
+
+def _tell_temperature(
+    meanings: dict[str, Resemblance], names: Sequence[str], units: Sequence[str], values: Values
+) -> None:
+    """A column T is the temperature by its values, where no other is called so."""
+    if any(m.column == WARMTH for m in meanings.values()):
+        return
+    lone = [
+        n
+        for n, unit in zip(names, units, strict=True)
+        if n not in meanings and _BARE_T.fullmatch(f"{n} {unit}".strip())
+    ]
+    cells = values(lone[0]) if len(lone) == 1 else None
+    known = cells[np.isfinite(cells)] if cells is not None else np.empty(0)
+    if known.size and np.all(np.abs(known - 70) <= 130) and not _is_steps(known):
+        meanings[lone[0]] = Resemblance(WARMTH)
+
+
+def _is_steps(values: Array) -> bool:
+    """Whether values go on in equal steps, as times and numbers do."""
+    steps = np.diff(values)
+    return steps.size > 1 and bool(steps[0]) and bool(np.allclose(steps, steps[0]))
 
 
 def _is_total(column: str, name: str, meanings: Mapping[str, Resemblance], values: Values) -> bool:

@@ -33,7 +33,7 @@ def command(
     """
     from msgspec.structs import replace
 
-    from mwdcal.calibration.diagnosis.findings import unused_columns
+    from mwdcal.calibration.diagnosis.findings import of_table
     from mwdcal.calibration.diagnosis.identity import overdue
     from mwdcal.files import runs
     from mwdcal.files.formats import atomic
@@ -54,7 +54,7 @@ def command(
     result = verify(fitted, readings, bounds)
     late = overdue(standards_of(fitted.profile), readings.metadata)
     findings = findings_with_option_names(
-        loaded.findings + result.findings + unused_columns(readings.unused) + late
+        loaded.findings + result.findings + of_table(readings) + late
     )
     result = replace(result, findings=findings)
     stated = fitted.tool, readings.metadata

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -61,6 +61,15 @@ _DEGREES_OF = re.compile(
 )
 """The name of a column of degrees, or of minutes."""
 _BRACKETS = re.compile(r"[(\[][^)\]]*[)\]]")
+
+ADJUSTED = re.compile(
+    r"as[- ]?left|(before|after|pre|post)[- ]?(adjust|calib)\w*|(vor|nach) (der )?(justier|abgleich|kalibrier)\w*|"
+    r"(f(ø|o)r|etter|efter) (juster|kalibrer)\w*|(antes|despu[eé]s|depois) (del?a?|do|da) (ajust|calibr)\w*|"
+    r"(avant|apr[eè]s) (ajust|r[eé]glage|[eé]talonn)\w*|(до|после) (регулир|настрой|юстир|калибр)\w*|"
+    r"(校准|调整|调校)(前|后)|(調整|校正)(前|後)",
+    re.IGNORECASE,
+)
+"""Words of a run before or after an adjustment of the tool: two of them are two runs."""
 
 Cells = Sequence[object]
 
@@ -130,19 +139,34 @@ def laid_out(
     if not candidates:
         names = ", ".join(shown(each.name) for each in sheets)
         raise InputError(f"{source}: there is no sheet {shown(sheet)}. The sheets are {names}.")
-    tables = [
-        layout
-        for each in candidates
-        for layout in _tables(each, source, decimal)
-        if header_line in (0, layout.form.header_line) and {*wanted} <= {*layout.names}
-    ]
+    tables, covers = [], []
+    for each in sheets:
+        layouts = list(_tables(each, source, decimal)) if each in candidates else []
+        covers += [] if layouts or any(_is_reading(row) for _, row in each.rows) else [each]
+        tables += [
+            layout
+            for layout in layouts
+            if header_line in (0, layout.form.header_line) and {*wanted} <= {*layout.names}
+        ]
     if not tables:
         raise _no_table(source, header_line, wanted)
     best = max(tables, key=lambda layout: layout.size)
     alike = [t for t in tables if t is not best and _alike(t, best) and len(t.lines) >= _BESIDES]
     if alike and not header_line:
         raise _several([best, *alike], source, sheet)
-    return best
+    return _with_covers(best, covers)
+
+
+def _with_covers(layout: Layout, covers: Sequence[Sheet]) -> Layout:
+    """A table with what sheets without readings say, where its own title block does not."""
+    blocks = [stated_above([row for _, row in sheet.rows]) for sheet in covers]
+    stated = {key: value for block in blocks[::-1] for key, value in block.metadata.items()}
+    own = layout.titles
+    day = own.unclear_day or next((b.unclear_day for b in blocks if b.unclear_day), "")
+    metadata = {**stated, **own.metadata}
+    return replace(
+        layout, titles=Titles(metadata, "" if "date" in metadata else day) if blocks else own
+    )
 
 
 def _alike(one: Layout, other: Layout) -> bool:
@@ -183,12 +207,18 @@ def _several(tables: Sequence[Layout], source: str, sheet: str) -> QuestionError
 
 def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
     """The tables of a sheet, one below the other."""
-    rows = sheet.rows
+    rows = [row for row in sheet.rows if not _is_ruler(row[1])]
+    sheet = sheet._replace(rows=rows)
     heads = [k for k in range(len(rows)) if _is_head(rows, k)]
     heads = [k for n, k in enumerate(heads) if n == 0 or _begins_anew(rows, heads[:n], k)]
     for head, end in pairwise([*heads, len(rows)]):
         if layout := _table(sheet, head, end, source, decimal):
             yield layout
+
+
+def _is_ruler(row: Cells) -> bool:
+    """Whether a row is a line of dashes or the like."""
+    return all(isinstance(cell, str) and re.fullmatch(r"[-=_*+|\s]*", cell) for cell in row)
 
 
 def _is_head(rows: Sequence[tuple[int, Cells]], place: int) -> bool:
@@ -200,6 +230,11 @@ def _is_head(rows: Sequence[tuple[int, Cells]], place: int) -> bool:
 def _begins_anew(rows: Sequence[tuple[int, Cells]], heads: Sequence[int], place: int) -> bool:
     """Whether a head is that of another table: of other names, or below the serial of another tool."""
     if not _repeats(rows[place][1], rows, heads[0]):
+        return True
+    between = [
+        " ".join(map(as_text, row)) for _, row in rows[heads[-1] : place] if not _is_reading(row)
+    ]
+    if any(map(ADJUSTED.search, between)):
         return True
     ours = titles([row for _, row in rows[: heads[0]]]).metadata.get("serial")
     above = [row for _, row in rows[heads[-1] : place] if not _is_reading(row)]
@@ -249,7 +284,7 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
     texts = [[as_text(cell).strip() for cell in column] for column in columns]
     whole, joined = _with_minutes(names, [cells for cells, _ in read])
     stated = {
-        name: " and ".join(dict.fromkeys(filter(None, [unit, by_cells])))
+        name: _both(unit, by_cells)
         for name, unit, (_, by_cells) in zip(names, units, read, strict=True)
     }
     return Layout(
@@ -278,6 +313,13 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
         ),
         places=dict(zip(names, letters, strict=True)) if sheet.name else {},
     )
+
+
+def _both(unit: str, by_cells: str) -> str:
+    """The unit by the row of units, or by the cells; both where they differ."""
+    if unit_of(unit) and unit_of(by_cells) and unit_of(unit) != unit_of(by_cells):
+        return f"{unit} and {by_cells}"
+    return unit or by_cells
 
 
 def _used(
@@ -410,9 +452,13 @@ def _joined(row: Cells, names: Sequence[str]) -> list[str]:
     """Names with the title above each: that of the column, or of the nearest column to the left that has one."""
     above = [" ".join(as_text(cell).split()) for cell in row]
     above += [""] * (len(names) - len(above))
-    title, joined = "", []
+    title, of_axes, joined = "", False, []
     for upper, name in zip(above, [*names, *[""] * len(above)], strict=False):
-        title = upper or (title if name else "")
+        is_axis = bool(_AXIS.fullmatch(name))
+        if upper:
+            title, of_axes = upper, is_axis
+        elif not name or (of_axes and not is_axis):
+            title = ""
         joined.append(_with_title(title, name) if title != name else name)
     return joined[: max(len(names), len(above))]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 import zipfile
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -65,9 +66,11 @@ def _delimited(lines: Sequence[str], source: str) -> tuple[str, list[tuple[int, 
 
 
 def _numbers(rows: Sequence[Sequence[str]]) -> int:
-    """Numbers in the rows that have at least four."""
-    counts = (sum(map(figures.is_figure, row)) for row in rows)
-    return sum(count for count in counts if count >= 4)
+    """Numbers in the rows that have at least four, and as many cells as most of these have."""
+    counts = [(len(row), count) for row in rows if (count := sum(map(figures.is_figure, row))) >= 4]
+    widths = Counter(width for width, _ in counts)
+    usual = max(widths, key=lambda width: widths[width], default=0)
+    return sum(count for width, count in counts if width == usual)
 
 
 def _split(lines: Sequence[str], mark: str, source: str) -> list[list[str]]:

@@ -64,6 +64,7 @@ class Table:
         decimal: the decimal sign of numbers in text cells.
         places: letters of the columns in a workbook, by name, for messages.
         sheet: name of its sheet there.
+        remarks: sentences on rows that were left out, for findings.
     """
 
     columns: Mapping[str, Column]
@@ -74,6 +75,7 @@ class Table:
     decimal: str = "."
     places: Mapping[str, str] = field(default_factory=dict)
     sheet: str = ""
+    remarks: tuple[str, ...] = ()
 
     @property
     def count(self) -> int:
@@ -203,15 +205,20 @@ def labels(table: Table, name: str) -> list[str]:
 
 def cell_error(table: Table, name: str, row: int, problem: str) -> InputError:
     """The error that names file, line and column before the problem."""
-    word = (
-        "row"
-        if Path(table.source).suffix.lower() in ("", ".parquet", *layout.WORKBOOKS)
-        else "line"
-    )
     number = table.lines[row] if row < len(table.lines) else row + 1
     sheet = f", sheet {shown(table.sheet)}" if table.sheet else ""
-    place = f"cell {table.places[name]}{number}" if name in table.places else f"{word} {number}"
+    place = (
+        f"cell {table.places[name]}{number}"
+        if name in table.places
+        else f"{row_word(table)} {number}"
+    )
     return InputError(f"{table.source}{sheet}, {place}, column '{name}': {problem}")
+
+
+def row_word(table: Table) -> str:
+    """The word for a row of a table in its file: texts have lines."""
+    suffix = Path(table.source).suffix.lower()
+    return "row" if suffix in ("", ".parquet", *layout.WORKBOOKS) else "line"
 
 
 def laid_out(

@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from mwdcal.files.formats.columns import as_text, looks_numeric
 from mwdcal.files.formats.titles import Titles, titles
 from mwdcal.files.synonyms import FACTORS, unit_of
-
-_GAL = 1.0 / 980.665
-"""A gal, in g."""
 
 
 class _Quantity(NamedTuple):
@@ -33,19 +30,25 @@ class _Quantity(NamedTuple):
 _OF_PLACES = (
     _Quantity(
         "ref_field_nt",
-        r"(total|mag\w*|local|earth'?s?) field|field( strength| intensity| total)?|totalfeld|gesamtfeld|feldstarke|"
-        r"totalintensitat|erdmagnetfeld|magnetfeld|flussdichte|totalfelt\w*|feltstyrke|magnetfelt|"
-        r"campo (magn\w+|total|local)( (total|local|magn\w+))?|intensidade?( total)?|champ( magn\w*)?( total| local)?|"
-        r"(магн\w* )?поле|модуль( магн\w*)?( поля)?|индукци\w+|напряженност\w+( поля)?|"
-        r"(地)?磁场(总)?(强度)?|总场(强度)?|总磁场(强度)?|b[ -]?tot(al)?|\|b\||tmf|tmi",
-        "bfht",
+        r"(total|mag\w*|local|earth'?s?) field|field( strength| intensity| total)?|[bfht] ?total|[bfht]tot|[bfht]ref|bt|totalfeld|"
+        r"erdfeld|"
+        r"gesamtfeld|feldstarke|"
+        r"felt|totalintensitat|erdmagnetfeld|magnetfeld|flussdichte|totalfelt\w*|feltstyrke|magnetfelt|"
+        r"campo( (magn\w+|totale?|local))*|totaalveld|pole calkow\w*|(teljes )?terero|toplam alan|medan total|全磁力|"
+        r"magnetfalt|"
+        r"intensidade?( total)?|champ( magn\w*)?( total| local)?|"
+        r"(магн\w* )?поле|полн\w* (вектор|поле)|модуль( магн\w*)?( поля)?|индукци\w+|напряженност\w+( поля)?|"
+        r"(地)?磁场(总)?(强度)?|总场(强度)?|总磁场(强度)?|\|b\||tmf|tmi",
+        "bfhtт",
         ("nT", "µT", "mT", "gauss", "mG"),
         15_000.0,
         80_000.0,
     ),
     _Quantity(
         "ref_dip_deg",
-        r"(mag\w*|local|field) (dip|inclination)( angle)?|dip( angle)?|(feld|feld-|magn\w* ?)?inklination|"
+        r"(mag\w*|local|field) (dip|inclination)( angle)?|dip( angle)?|dipref|manyetik egim|magn\w* inklinacio|伏角|"
+        r"inklinacja( pola)?|inclinazione magn\w*|magn\w* inclinatie|"
+        r"(feld|feld-|magn\w* ?)?inklination|"
         r"(felt|magn\w* ?)?inklinasjon|mergulho( magn\w*)?|inclinaca?o (magn\w*|do campo)|"
         r"inclinacion (magn\w*|del campo)|echado|buzamiento|inclinaison( magn\w*| du champ)?|"
         r"(магн\w* )?наклонени[ея]|(地)?磁倾角",
@@ -56,19 +59,21 @@ _OF_PLACES = (
     ),
     _Quantity(
         "ref_gravity_g",
-        r"(local )?gravity( field| acceleration)?|(local|site) g|g[ -]?(local|lokal|ref|tot(al)?)|\|g\||"
+        r"(local )?gravity( field| acceleration)?|g ?total|gtot|gref|gt|zwaartekracht|yercekimi|nehezsegi gyorsulas|"
+        r"gravita|gravitasi|tyngdkraft|重力(加速度)?|ускорение силы тяжести|"
+        r"(local|site) g|g[ -]?(local|lokal|ref|tot(al)?)|\|g\||"
         r"(lokale )?(schwere(beschleunigung)?|fallbeschleunigung|erdbeschleunigung|ortsschwere)|"
         r"tyngde(akselerasjon|kraft)?\w*|(aceleracion de la )?gravedad|(aceleraca?o da )?gravidade|pesanteur|"
         r"ускорение свободного падения|сил\w тяжести|(当地)?重力(加速度)?",
         "g",
-        ("g", "mg", "m/s²", "gal", "mgal"),
+        ("g", "mg", "m/s²", "gal", "mGal"),
         0.97,
         1.03,
     ),
 )
 _WRITTEN_UNIT = (
-    r"n\s?t\b|[uµμ]\s?t\b|m\s?t\b|milli ?gauss|m\s?g(al|auss)?\b|gauss|gal\b|нтл|мктл|мтл|м/с²?|м/с2|"
-    r"m\s?/\s?s\s?(?:²|\^?2)?|g\b|г\b|°|deg\w*|grad\w*|rad\b|град\w*|度"
+    r"n\s?t\b|[uµμ]\s?t\b|m\s?t\b|milli ?gauss|m\s?g(al|auss)?\b|gauss|gal\b|нтл|мктл|мтл|мгал|м/с²?|м/с2|"
+    r"m\s?/\s?s\s?(?:²|\^?2)?|g\b|г\b|°|deg\w*|grad\w*|rad\b|град\w*|fok|derece|stopni|度"
 )
 _WRITTEN_NUMBER = (
     r"[+\-−]?\d{1,3}(?:[ '’.,\u00a0\u202f]\d{3})+(?:[.,]\d+)?(?!\d)|[+\-−]?\d+(?:[.,]\d+)?"
@@ -82,6 +87,10 @@ _UNSURE = re.compile(
 )
 """Words by which a value is no reference."""
 _BETWEEN = r"(?P<between>[^\d+\-−;]{0,30}?)"
+_REFERRING = re.compile(
+    r"(?<![^\W\d_])(ref|reference|local|lokal|value|wert|t|f|i|g|т)(?![^\W\d_])"
+)
+"""Words and letters behind the word of a quantity that say nothing more."""
 _STATEMENTS = {
     q: re.compile(
         rf"(?<![^\W\d_])(?:(?P<word>{q.words})|(?P<letter>[{q.letters}]))(?![^\W\d_]){_BETWEEN}"
@@ -92,7 +101,8 @@ _STATEMENTS = {
 }
 _SPELT = {
     "нтл": "nT", "мктл": "µT", "мтл": "mT", "м/с": "m/s²", "м/с²": "m/s²", "м/с2": "m/s²", "m/s": "m/s²", "г": "g",
-    "град": "°", "度": "°", "gal": "gal", "mgal": "mgal", "mg": "mg", "mgauss": "mG", "milligauss": "mG",
+    "град": "°", "度": "°", "fok": "°", "derece": "°", "stopni": "°", "gal": "gal",
+    "mgal": "mGal", "мгал": "mGal", "mg": "mg", "mgauss": "mG", "milligauss": "mG",
 }  # fmt: skip
 """Units in small letters, where `unit_of` does not know them or goes by capitals."""
 
@@ -103,11 +113,11 @@ def stated_above(rows: Sequence[Sequence[object]]) -> Titles:
     return block._replace(metadata={**references_in(rows), **block.metadata})
 
 
-def references_in(rows: Sequence[Sequence[object]]) -> dict[str, float]:
+def references_in(rows: Iterable[Sequence[object]]) -> dict[str, float]:
     """The references that rows above a table state, by column of a run file, in its unit; none that is stated twice.
 
-    >>> references_in([["Local field:", "48 912 nT", "Dip", "66,2°"], ["g (m/s²)", 9.8123]])
-    {'ref_field_nt': 48912.0, 'ref_dip_deg': 66.2, 'ref_gravity_g': 1.000576343603575}
+    >>> references_in([["Local field:", "48 912 nT", "Dip", "66,2°"], ["g (m/s²)", 9.80665]])
+    {'ref_field_nt': 48912.0, 'ref_dip_deg': 66.2, 'ref_gravity_g': 1.0}
     >>> references_in([["local field 46.8 uT nominal"], ["field uncertainty 50 nT"]])
     {}
     """
@@ -137,13 +147,16 @@ def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
         r"\W*(nomin|номин|标称|nenn)", behind
     ):
         return
-    inner = re.search(rf"[(\[,]\s*({_WRITTEN_UNIT})\s*[)\]]?", between)
-    stated = _unit(inner[1] if inner else match["unit"] or "")
-    if stated == "g" and "gauss" in quantity.units:
-        stated = "gauss"
-    bare = between.replace(inner[0], "") if inner else between
+    inner = re.search(rf"(?<![^\W\d_])({_WRITTEN_UNIT})(?![^\W\d_])", between)
+    stated = _unit(
+        match["unit"] or (inner[1] if inner else "") or ("°" if match["minutes"] else "")
+    )
+    if "gauss" in quantity.units:
+        stated = {"g": "gauss", "mg": "mG"}.get(stated, stated)
+    bare = _REFERRING.sub("", between.replace(inner[0], "") if inner else between)
     direct = not re.search(r"[^\W_]", bare)
-    if (match["letter"] and not (direct and stated)) or not (direct or stated):
+    sure = stated or ("=" in bare and "." in match["number"].replace(",", "."))
+    if (match["letter"] and not (direct and sure)) or not (direct or stated):
         return
     if stated and stated not in quantity.units:
         return
@@ -177,7 +190,5 @@ def _numbers(text: str, minutes: str | None) -> Iterator[float]:
 
 def _converted(number: float, unit: str) -> float:
     """A number in the unit of the run file."""
-    if unit in ("gal", "mgal"):
-        return number * _GAL * (1e-3 if unit == "mgal" else 1.0)
     factor, _ = FACTORS.get(unit, (1.0, 0.0))
     return number * factor
