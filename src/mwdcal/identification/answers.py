@@ -10,7 +10,7 @@ import numpy as np
 from mwdcal.errors import Answer
 from mwdcal.files.contract import RAW, REFERENCES
 from mwdcal.files.synonyms import unit_of
-from mwdcal.geometry.vectors import Array
+from mwdcal.geometry.vectors import Array, Bools
 from mwdcal.identification.words import spelled
 
 BOTH_UNITS = " and "
@@ -27,6 +27,7 @@ RANGES_BY_UNIT: dict[str, tuple[tuple[str, float, float], ...]] = {
 """Units of quantities of which the Earth has but one range of values; 980 may be milli-g or gal."""
 LEAST_ROLLS = 5
 """Toolfaces from which on their unit is told by their range."""
+_FILLER = re.compile(r"-?9{3,}(\.9+|\.25)?")
 _FEW = 4
 """Values of a column that a question shows."""
 _STEADY_DIP, _STEADY_FIELD = 3.0, 0.1
@@ -55,6 +56,15 @@ def with_values(words: str, values: Values, *names: str) -> str:
         known = cells[np.isfinite(cells)] if cells is not None else np.empty(0)
         few.append(first_values(known) or "no numbers")
     return f"{words}:  {'  |  '.join(few)}"
+
+
+def is_filler(values: Array) -> Bools:
+    """Which values (n,) are numbers that programs write where there is none: 9999.99, -999.25.
+
+    >>> is_filler(np.array([9999.99, -999.25, 99.0, 1000.0])).tolist()
+    [True, True, False, False]
+    """
+    return np.asarray([_FILLER.fullmatch(f"{value:.12g}") is not None for value in values], bool)
 
 
 def first_values(values: Array) -> str:
@@ -87,9 +97,9 @@ def triples_for(
     for place in range(len(numbers) - 2):
         three = [*numbers][place : place + 3]
         columns = np.stack([numbers[n] for n in three], -1)
-        norm, spread = np.linalg.norm(columns, axis=-1), np.ptp(columns, axis=0)
+        spread = np.ptp(columns, axis=0)
         if spread.min() > 0:
-            triples.append((float(np.std(norm) / spread.max()), three))
+            triples.append((_variation(columns) / float(spread.max()), three))
     return [
         Answer(
             with_values(", ".join(three), values, *three),
@@ -98,6 +108,15 @@ def triples_for(
         for variation, three in sorted(triples, key=lambda each: each[0])[:_MOST_TRIPLES]
         if variation <= most
     ]
+
+
+def _variation(columns: Array) -> float:
+    """The standard deviation of the distance (n,) of vectors (n, 3) from the centre of the sphere nearest to them."""
+    centred = columns - columns.mean(0)
+    design = np.column_stack([2 * centred, np.ones(len(centred))])
+    squares = np.sum(centred**2, -1)
+    middle, *_ = np.linalg.lstsq(design, squares, rcond=1e-9)
+    return float(np.std(np.linalg.norm(centred - middle[:3], axis=-1)))
 
 
 def in_units(name: str, column: str, allowed: Sequence[str]) -> list[Answer]:

@@ -33,6 +33,7 @@ from mwdcal.identification.answers import (
     candidates_for,
     channels_for,
     first_values,
+    is_filler,
     in_units,
     lacking_references,
     may_be,
@@ -396,6 +397,7 @@ def _tell_temperature(
     ]
     cells = values(lone[0]) if len(lone) == 1 else None
     known = cells[np.isfinite(cells)] if cells is not None else np.empty(0)
+    known = known[~is_filler(known)]
     if known.size and np.all(np.abs(known - 70) <= 130) and not _is_steps(known):
         meanings[lone[0]] = Resemblance(WARMTH)
 
@@ -610,6 +612,8 @@ def _unit(column: str, name: str, stated: str, values: Array | None, source: str
             if low <= known.min() and known.max() <= high:
                 return unit
         raise _open(name, column, allowed, known, source)
+    if allowed[0] == "°" and 360 < np.abs(known).max(initial=0) <= 400:
+        raise _open(name, column, ("gon", "°"), known, source)
     both = {"°": _maybe_radians, "°C": _maybe_fahrenheit}.get(allowed[0])
     if both and known.size and both(known):
         if allowed[0] == "°C" and (usual := setting("temperature_unit")):
@@ -628,6 +632,8 @@ def _check_range(column: str, name: str, unit: str, values: Array | None, source
     turns = column in (REFERENCES["azimuth"].column, REFERENCES["toolface"].column)
     if unit == "°" and turns and known.size > LEAST_ROLLS and _maybe_radians(known):
         fits = ["rad"] if np.ptp(known) > 3 else []
+    if unit == "°C" and known.min() > HOTTEST_CELSIUS:
+        fits = ["K"]
     if fits and unit not in fits:
         raise QuestionError(
             f"{source}: {shown(name)} is in {unit}, and its values ({first_values(known)}) are those of "

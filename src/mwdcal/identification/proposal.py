@@ -34,7 +34,12 @@ from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW, WARMTH
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
 from mwdcal.identification.columns import meanings_of, north_of, proposed
-from mwdcal.identification.rows import check_columns_of_rows, question_on_cells, question_on_mark
+from mwdcal.identification.rows import (
+    check_cells,
+    check_columns_of_rows,
+    question_on_cells,
+    question_on_mark,
+)
 from mwdcal.identification.wiring import LEAST_STATIONS, Wiring, is_clear, wiring
 from mwdcal.sensor.profile import ColumnSource, Profile, TableFormat, TriadProfile
 
@@ -138,7 +143,7 @@ def propose(
         problems,
         open_rows,
     )
-    _check_blank(table, columns)
+    check_cells(table, columns)
     table, form = _with_north(table, form, columns, above)
     if ignored:
         form = msgspec.structs.replace(form or TableFormat(find=True), ignore=tuple(ignored))
@@ -207,19 +212,6 @@ def _without_rejected(
         question_on_mark(table, name, cell, rows) for (name, cell), rows in marks.doubtful.items()
     ]
     return without_rejected(table, form or msgspec.UNSET, used), questions
-
-
-def _check_blank(table: Table, columns: Mapping[str, ColumnSource]) -> None:
-    """Ask whether rows without a reading are left out, where other rows have it."""
-    questions = []
-    for column in (*RAW, WARMTH):
-        name = columns[column].name if column in columns else ""
-        values = tables.numbers(table, name) if name else np.empty(0)
-        if np.isnan(values).any() and not np.isnan(values).all():
-            row = int(np.argmax(np.isnan(values)))
-            questions.append(question_on_cells(table, name, row, [""]))
-    if questions:
-        raise QuestionsError(table.source, questions)
 
 
 def _numbers_of(table: Table, problems: dict[str, QuestionError], name: str) -> Array | None:

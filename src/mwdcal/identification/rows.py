@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
-from mwdcal.errors import Answer, InputError, QuestionError
+import numpy as np
+
+from mwdcal.errors import Answer, InputError, QuestionError, QuestionsError
+from mwdcal.files.contract import CHANNELS, RANGES, RAW, units_of
 from mwdcal.files.formats.columns import shown
-from mwdcal.files.formats.table import Table, cell_error
+from mwdcal.files.formats.table import Table, cell_error, labels, numbers
 from mwdcal.files.marks import place
+from mwdcal.files.synonyms import FACTORS, WARMTH
+from mwdcal.geometry.vectors import Array, Bools
+from mwdcal.identification.answers import is_filler
+from mwdcal.identification.wiring import LEAST_STATIONS
+from mwdcal.sensor.profile import ColumnSource
 
+FAR_OUT = 4.0
+"""By how much a single reading lies farther out than all others that was mistyped."""
+_FEW_ROWS, _FEW_SHARE = 2, 0.15
+"""Rows at most that are asked about, and their share."""
 _FEW_WORDS = 2
 """Words of a mark at most; more are a remark, which may speak of another row."""
 
@@ -29,11 +41,53 @@ def question_on_mark(table: Table, name: str, cell: str, rows: Sequence[int]) ->
 
 def question_on_cells(table: Table, name: str, row: int, cells: Sequence[str]) -> QuestionError:
     """Ask whether the rows with some cells that are no numbers are left out; `row` is the first of them."""
-    problem = f"expected a number; got {shown(cells[0]) if cells[0] else 'a blank cell'}. Is its row to be left out?"
+    got = shown(cells[0]) if cells[0] else "a blank cell"
+    problem = f"expected a reading; got {got}. Is its row to be left out?"
     return QuestionError(
         str(cell_error(table, name, row, problem)),
         [Answer("leave such rows out", tuple(("leave_out", f"{name}={cell}") for cell in cells))],
     )
+
+
+def check_cells(table: Table, columns: Mapping[str, ColumnSource]) -> None:
+    """Ask whether rows are left out that have no reading, a number that stands for none, or one that cannot be.
+
+    Cells of which there are many are of another unit or column: they are refused when they are read.
+    """
+    raw = {
+        column: numbers(table, source.name)
+        for column, source in columns.items()
+        if column in RANGES
+    }
+    questions = []
+    for column, values in raw.items():
+        factor, offset = (
+            FACTORS.get(columns[column].unit, (1.0, 0.0)) if units_of(column) else (1.0, 0.0)
+        )
+        wrong = is_filler(values) | RANGES[column].outside(values * factor + offset)
+        if column in (*RAW, WARMTH) and not np.isnan(values).all():
+            wrong |= np.isnan(values)
+        if column in RAW:
+            wrong |= _far_out(raw, column)
+        if 0 < wrong.sum() <= max(_FEW_ROWS, _FEW_SHARE * wrong.size):
+            rows = np.flatnonzero(wrong).tolist()
+            cells = labels(table, columns[column].name)
+            each = [*dict.fromkeys(cells[row] for row in rows)]
+            questions.append(question_on_cells(table, columns[column].name, rows[0], each))
+    if questions:
+        raise QuestionsError(table.source, questions)
+
+
+def _far_out(values: Mapping[str, Array], column: str) -> Bools:
+    """Whether a row (n,) is the one of a triad that lies far outside all others, by this channel."""
+    triad = next(names for names in CHANNELS.values() if column in names)
+    if values[column].size < LEAST_STATIONS or not all(name in values for name in triad):
+        return np.zeros(values[column].size, bool)
+    off = np.abs(np.stack([values[name] for name in triad], -1))
+    off = np.nan_to_num(np.abs(off - np.nanmedian(off, 0)))
+    *_, second, largest = np.sort(off.max(-1))
+    far = off.max(-1) > FAR_OUT * second
+    return np.asarray(far & (largest > 0) & (off[:, triad.index(column)] == off.max(-1)))
 
 
 def check_columns_of_rows(table: Table, names: Collection[str]) -> None:

@@ -69,7 +69,7 @@ TRANSLATIONS = (
         r"magnetometre|magn\b\.?(?=[ _]*[xyz]\b)|magnetfeld(?=[ _]*[xyz])|magnetfelt(?=[ _]*[xyz])|"
         r"magnetometro|magnetometers?|магнитометр\w*|магн\b|феррозонд\w*|磁力计|磁通门|磁强计|"
         r"campo magnetico(?=[ _]*[xyz])|campo mag(?=[ _]*[xyz])|"
-        r"flux[ _-]*gates?|磁场(?=[ (（_]*[xyz])",
+        r"\bmtm\b|磁(?=[ _]*[xyz])|flux[ _-]*gates?|磁场(?=[ (（_]*[xyz])",
         "mag ",
     ),
     (

@@ -482,17 +482,28 @@ def _is_units(row: Cells) -> bool:
 
 def _without_summary(rows: Sequence[tuple[int, Cells]]) -> list[tuple[int, Cells]]:
     """Rows of readings without those of statistics: called so, or equal to the means of those above."""
-    kept = [row for row in rows if not _is_summary(row[1])]
+    widths = Counter(sum(cell != "" for cell in row) for _, row in rows)
+    usual = max(widths, key=lambda width: widths[width], default=0)
+    kept = [row for row in rows if not _is_summary(row[1], usual)]
     numbered = sum(bool(row) and figures.is_figure(row[0]) for _, row in kept)
     if numbered >= 0.8 * len(kept):  # rows are numbered: one with a word instead is none of them
-        kept = [(n, row) for n, row in kept if row[0] == "" or figures.is_figure(row[0])]
+        kept = [(n, row) for n, row in kept if _is_blank(row[0]) or figures.is_figure(row[0])]
     while len(kept) > LEAST_COLUMNS and _is_mean(kept[-1][1], [row for _, row in kept[:-1]]):
         kept.pop()
     return kept
 
 
-def _is_summary(row: Cells) -> bool:
-    texts = [cell for cell in row[:3] if isinstance(cell, str) and not figures.is_figure(cell)]
+def _is_blank(cell: object) -> bool:
+    """Whether a cell is blank or says that there is no value: ---, n/a."""
+    return isinstance(cell, str) and bool(
+        re.fullmatch(r"(n/?a|nan|null|none|[\W_]*)", cell, re.IGNORECASE)
+    )
+
+
+def _is_summary(row: Cells, width: int) -> bool:
+    """Whether a row is one of statistics: its name is in front, or anywhere in a row that others outnumber by a cell."""
+    looked_at = row if sum(cell != "" for cell in row) < width else row[:3]
+    texts = [cell for cell in looked_at if isinstance(cell, str) and not figures.is_figure(cell)]
     return any(_SUMMARY.fullmatch(text) for text in texts if text)
 
 

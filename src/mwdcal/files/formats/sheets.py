@@ -17,7 +17,7 @@ from mwdcal.files.formats.layout import WORKBOOKS, Cells, Sheet
 from mwdcal.sensor.profile import TableFormat
 
 DELIMITERS = (";", "\t", ",", "|")
-_BLANKS = "blanks"
+_BLANKS, _RUNS = "blanks", "runs of blanks"
 _LOOKED_AT = 400
 """Lines by which the delimiter of a text is told."""
 _LARGEST_CONTENTS = 100_000_000
@@ -60,7 +60,9 @@ def _plain(row: Cells) -> list[object]:
 def _delimited(lines: Sequence[str], source: str) -> tuple[str, list[tuple[int, Cells]]]:
     """The delimiter of a text by which most numbers show, and its rows by it."""
     looked_at = lines[:_LOOKED_AT]
-    best = max((*DELIMITERS, _BLANKS), key=lambda mark: _numbers(_split(looked_at, mark, source)))
+    best = max(
+        (*DELIMITERS, _RUNS, _BLANKS), key=lambda mark: _numbers(_split(looked_at, mark, source))
+    )
     rows = enumerate(_split(lines, best, source), 1)
     return best, [(line, _trimmed(row)) for line, row in rows if any(row)]
 
@@ -75,9 +77,9 @@ def _numbers(rows: Sequence[Sequence[str]]) -> int:
 
 def _split(lines: Sequence[str], mark: str, source: str) -> list[list[str]]:
     """The cells of each line, without blanks around."""
-    if mark == _BLANKS:
-        runs = r"\s{2,}|\t" if any(re.search(r"\S\s{2,}\S", line) for line in lines) else r"\s+"
-        return [re.split(runs, line.strip()) if line.strip() else [] for line in lines]
+    if mark in (_BLANKS, _RUNS):  # a unit in brackets belongs to the name before it
+        apart = r"\s{2,}|\t" if mark == _RUNS else r"\s+(?![\[(])"
+        return [re.split(apart, line.strip()) if line.strip() else [] for line in lines]
     rows = dialect.cells_of(lines, mark, source, skip_blanks=True)
     return [[cell.strip() for cell in row] for row in rows]
 

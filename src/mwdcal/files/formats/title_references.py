@@ -30,7 +30,8 @@ class _Quantity(NamedTuple):
 _OF_PLACES = (
     _Quantity(
         "ref_field_nt",
-        r"(total|mag\w*|local|earth'?s?) field|field( strength| intensity| total)?|[bfht] ?total|[bfht]tot|[bfht]ref|bt|totalfeld|"
+        r"(total|mag\w*|local|earth'?s?) field|field( strength| intensity| total)?|[bfht] ?total|[bfht](tot|ref)|bt|"
+        r"totalfeld|"
         r"erdfeld|"
         r"gesamtfeld|feldstarke|"
         r"felt|totalintensitat|erdmagnetfeld|magnetfeld|flussdichte|totalfelt\w*|feltstyrke|magnetfelt|"
