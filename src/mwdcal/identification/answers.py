@@ -28,6 +28,8 @@ RANGES_BY_UNIT: dict[str, tuple[tuple[str, float, float], ...]] = {
 LEAST_ROLLS = 5
 """Toolfaces from which on their unit is told by their range."""
 _FILLER = re.compile(r"-?9{3,}(\.9+|\.25)?")
+_REGULAR = 0.8
+"""Share of equal steps of numbered rows."""
 _FEW = 4
 """Values of a column that a question shows."""
 _STEADY_DIP, _STEADY_FIELD = 3.0, 0.1
@@ -65,6 +67,17 @@ def is_filler(values: Array) -> Bools:
     [True, True, False, False]
     """
     return np.asarray([_FILLER.fullmatch(f"{value:.12g}") is not None for value in values], bool)
+
+
+def is_numbering(values: Array) -> bool:
+    """Whether numbers go on in equal steps but for a few, as those of rows and times do.
+
+    >>> is_numbering(np.array([1.0, 2, 3, 3, 4, 5, 6])), is_numbering(np.array([0.0, 90, 180, 270, 0, 90]))
+    (True, False)
+    """
+    steps = np.diff(values)
+    usual = float(np.median(steps)) if steps.size else 0.0
+    return usual != 0.0 and float(np.isclose(steps, usual).mean()) > _REGULAR
 
 
 def first_values(values: Array) -> str:
@@ -155,6 +168,5 @@ def may_be(column: str, name: str, unit: str, values: Array | None) -> bool:
         return least <= low and high <= most and high - low < _STEADY_FIELD * high
     if foreign or stated not in ("", "°", "rad", "gon") or high - low < _LEAST_TURN:
         return False
-    numbered = bool(np.allclose(np.diff(known), np.diff(known)[0]))
     inside = 0 <= low <= high <= 180 if "inclination" in column else -360 <= low <= high <= 360
-    return inside and not numbered
+    return inside and not is_numbering(known)

@@ -33,8 +33,9 @@ from mwdcal.identification.answers import (
     candidates_for,
     channels_for,
     first_values,
-    is_filler,
     in_units,
+    is_filler,
+    is_numbering,
     lacking_references,
     may_be,
     none_of,
@@ -73,7 +74,8 @@ _TITLE = re.compile(
 _BARE_AZ = re.compile(r"az\W*(deg|°)?\W*", re.IGNORECASE)
 _BARE_AX = re.compile(r"a[xy]\b.*", re.IGNORECASE)
 _OF_LOGGER = re.compile(
-    r"\s*(?:channel|chan|ch|input|ai|kanal|eingang|canal|voie|канал|通道)\W*\d*\s*[(\[:]\s*([^()\[\]]+?)\s*[)\]]?\s*",
+    r"\s*(?:channel|chan|ch|input|ai|kanal|eingang|canal|voie|канал|通道)\W*\d*\s*[(\[:]\s*"
+    r"([^()\[\]]+?)\s*[)\]]?(\s*[(\[].*)?",
     re.IGNORECASE,
 )
 """A channel of a logger, with what it is in brackets or behind a colon."""
@@ -108,7 +110,7 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
         once = meaning(name)
         return once and once._replace(unit=both if units_of(once.column) else unit)
     logged = _OF_LOGGER.fullmatch(name)
-    name = logged[1] if logged else name
+    name = f"{logged[1]}{logged[2] or ''}" if logged else name
     plain = spelled(f"{name} ({unit})" if unit else name)
     if "elevation" in plain:
         return Resemblance("ref_inclination_deg", BELOW if "below" in plain else ABOVE)
@@ -274,8 +276,9 @@ def proposed(
     ignored = _no_evidence(meanings, values, said)
     _answered(said, names, meanings, source)
     questions = Questions(besides)
+    damaged = {} if problems is None else problems  # filled while values are read
     spoken = _spoken(meanings, values, above)
-    chosen = _chosen(meanings, values, problems or {}, spoken, ignored, said, questions, source)
+    chosen = _chosen(meanings, values, damaged, spoken, ignored, said, questions, source)
     azimuth = chosen.get(REFERENCES["azimuth"].column)
     if azimuth and "azimuth_reference" not in known and not north_of(azimuth.name, above, known):
         questions.ask(_check_north, azimuth.name, above, source)
@@ -283,7 +286,8 @@ def proposed(
         if not {*channels} & {*chosen, *said}:
             others = [n for n in names if n not in meanings]
             questions.ask(_check_hidden, triad, channels, others, values, source)
-    if not any("channels of the accelerometer" in each.text for each in questions):
+    hidden = any("channels of the accelerometer" in each.text for each in questions)
+    if not hidden and not any(n in damaged for n, m in meanings.items() if m.column in RAW):
         questions.ask(_check_triads, names, values, chosen, source)
     questions.ask(_check_units_of_triads, chosen, source)
     if not {*RAW[3:]} & {*chosen, *said}:
@@ -380,7 +384,7 @@ def _tell_numbers(
     """A column of serials that number the rows is one of stations: S/N 1, 2, 3."""
     for name, m in meanings.items():
         cells = values(name) if m.column == "serial" and "serial" not in answers else None
-        if cells is not None and cells.size > LEAST_ROLLS and _is_steps(cells):
+        if cells is not None and cells.size > LEAST_ROLLS and is_numbering(cells):
             meanings[name] = Resemblance("station")
 
 
@@ -398,14 +402,8 @@ def _tell_temperature(
     cells = values(lone[0]) if len(lone) == 1 else None
     known = cells[np.isfinite(cells)] if cells is not None else np.empty(0)
     known = known[~is_filler(known)]
-    if known.size and np.all(np.abs(known - 70) <= 130) and not _is_steps(known):
+    if known.size and np.all(np.abs(known - 70) <= 130) and not is_numbering(known):
         meanings[lone[0]] = Resemblance(WARMTH)
-
-
-def _is_steps(values: Array) -> bool:
-    """Whether values go on in equal steps, as times and numbers do."""
-    steps = np.diff(values)
-    return steps.size > 1 and bool(steps[0]) and bool(np.allclose(steps, steps[0]))
 
 
 def _is_total(column: str, name: str, meanings: Mapping[str, Resemblance], values: Values) -> bool:
@@ -606,7 +604,12 @@ def _unit(column: str, name: str, stated: str, values: Array | None, source: str
             f"{', '.join(allowed)}.",
             [*in_units(name, column, allowed), none_of(column)],
         )
-    known = values[np.isfinite(values)]
+    return _unit_by_values(column, name, values[np.isfinite(values)], source)
+
+
+def _unit_by_values(column: str, name: str, known: Array, source: str) -> str:
+    """The only unit that values of a column can be in."""
+    allowed = units_of(column)
     if column in RANGES_BY_UNIT and known.size:
         for unit, low, high in RANGES_BY_UNIT[column]:
             if low <= known.min() and known.max() <= high:

@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -16,8 +16,8 @@ import numpy as np
 from mwdcal.calibration.diagnosis.findings import MARKED_ROWS, unused_columns
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import Finding
-from mwdcal.errors import Answer, FitError, InputError, QuestionError, QuestionsError
-from mwdcal.files.contract import CHANNELS, MAPPED, RAW, REFERENCES, units_of
+from mwdcal.errors import Answer, FitError, InputError, QuestionError
+from mwdcal.files.contract import CHANNELS, MAPPED, REFERENCES, units_of
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, looks_numeric, shown
 from mwdcal.files.formats.figures import is_figure
@@ -30,7 +30,7 @@ from mwdcal.files.metadata import toml
 from mwdcal.files.profiles import CHOICE_OF_AXES
 from mwdcal.files.runs import STATED_REFERENCES, check_run, renamed, to_readings
 from mwdcal.files.statements import stated_table
-from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW, WARMTH
+from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
 from mwdcal.identification.columns import meanings_of, north_of, proposed
@@ -116,55 +116,37 @@ def propose(
     """
     where = tables.laid_out(path, sheet=sheet, header_row=header_row, decimal=decimal)
     table, form = _as_written(path, where, bool(sheet or header_row or decimal))
-    if form and header_row:
-        form = msgspec.structs.replace(form, header_line=header_row)
     table = replace(table, metadata={**table.metadata, **(stated or {}), **(north or {})})
-    if north:
-        form = msgspec.structs.replace(form or TableFormat(find=True), **north)
-    if leave_out or keep:
-        check_columns_of_rows(table, {**(leave_out or {}), **(keep or {})})
-        form = msgspec.structs.replace(
-            form or TableFormat(find=True), leave_out=leave_out or {}, keep=keep or {}
-        )
+    check_columns_of_rows(table, {**(leave_out or {}), **(keep or {})})
+    place = {"header_line": header_row} if header_row else {}
+    said = {**place, **(north or {}), "leave_out": leave_out or {}, "keep": keep or {}}
+    form = _with(form, {key: value for key, value in said.items() if value not in ({}, None)})
     names = where.names if where else [*table.columns]
     units = where.units if where else [""] * len(names)
-
     table, open_rows = _without_rejected(table, form, names, units)
     problems: dict[str, QuestionError] = {}
     above = where.above if where else ()
+    values = partial(_numbers_of, table, problems)
     columns, by_value, ignored = proposed(
-        names,
-        units,
-        partial(_numbers_of, table, problems),
-        table.source,
-        above,
-        table.metadata,
-        answers,
-        problems,
-        open_rows,
+        names, units, values, table.source, above, table.metadata, answers, problems, open_rows
     )
     check_cells(table, columns)
     table, form = _with_north(table, form, columns, above)
-    if ignored:
-        form = msgspec.structs.replace(form or TableFormat(find=True), ignore=tuple(ignored))
+    form = _with(form, {"ignore": tuple(ignored)} if ignored else {})
     table = _of_one_tool(table, columns, stated or {})
     profile = Profile(name=Path(path).stem, table=form or msgspec.UNSET, columns=columns)
     profile, readings, wirings, open_axes = _wired_by_elevation(table, profile)
     name, triads = str(readings.metadata.get("serial", Path(path).stem)), _triads(readings, wirings)
     profile = msgspec.structs.replace(profile, name=name, **triads)
     return Proposal(
-        _without_the_usual(profile),
-        wirings,
-        readings.count,
-        readings.unused,
-        readings.remarks,
-        by_value,
-        readings.metadata,
-        readings.run_sha256,
-        where,
-        open_axes,
-        ignored,
-    )
+        _without_the_usual(profile), wirings, readings.count, readings.unused, readings.remarks, by_value,
+        readings.metadata, readings.run_sha256, where, open_axes, ignored,
+    )  # fmt: skip
+
+
+def _with(form: TableFormat | None, fields: Mapping[str, Any]) -> TableFormat | None:
+    """How tables are written, with more of it; without it as documented."""
+    return msgspec.structs.replace(form or TableFormat(find=True), **fields) if fields else form
 
 
 def _with_north(
@@ -181,8 +163,7 @@ def _with_north(
     if not north:
         return table, form
     metadata = {**table.metadata, "azimuth_reference": north}
-    form = msgspec.structs.replace(form or TableFormat(find=True), azimuth_reference=north)
-    return replace(table, metadata=metadata), form
+    return replace(table, metadata=metadata), _with(form, {"azimuth_reference": north})
 
 
 def _of_one_tool(

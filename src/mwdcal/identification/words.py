@@ -38,7 +38,8 @@ TRANSLATIONS = (
     (
         r"kipp(achse|winkel)|schwenkachse|\btilt\b|inclinazione|inclinatie|helling|haeldning|hældning|lutning|"
         r"(kat )?odchylenia|(kat )?nachylenia|ferdeseg|dolesszog|egim|kemiringan|傾斜角?|зен\w*\.?( угол\w*)?|"
-        r"neigung|inklination|inclinaison|inclinaca?o|inclinacion|zenith( angle)?|drift angle|deviation angle|"
+        r"neigung(swinkel)?|desviacion|sapma( acisi)?|inklination|inclinaison|inclinaca?o|"
+        r"inclinacion|zenith( angle)?|drift angle|deviation angle|"
         r"inklinasjon|helning|зенит\w*( угол)?|наклон(?!ен)|井斜角?|倾角",
         "inclination ",
     ),
@@ -58,7 +59,8 @@ TRANSLATIONS = (
         "toolface ",
     ),
     (
-        r"przysp(ieszenie)?\b\.?|gyorsulas|ivme\w*|versnelling|accelerazione|accelerometro|percepatan|加速度|γ|"
+        r"przysp(ieszenie)?\b\.?|gyorsulas(mero)?|ivme\w*|versn(elling)?\b\.?|accelerazione|"
+        r"accelerometro|percepatan|加速度|γ|"
         r"beschleunigung\w*|beschl\b\.?|akselerasjon|akselerometer|akselero|aceleracion|acelerometro|acel\b|"
         r"aceleracao|accelerometre|acceleration|\bac\.|ускорен\w*|акселерометр\w*|акс\b|\baks\b|加速度计?|加计|加表",
         "acc ",
@@ -67,13 +69,14 @@ TRANSLATIONS = (
         r"pole magn\w*\.?(?=[ _]*[xyz])|magneses(?=[ _]*[xyz])|manyetik(?=[ _]*[xyz])|magneetveld(?=[ _]*[xyz])|"
         r"medan(?=[ _]*[xyz])|磁気(?=[ _]*[xyz])|magnetfalt(?=[ _]*[xyz])|campo(?=[ _]*[xyz]\b)|"
         r"magnetometre|magn\b\.?(?=[ _]*[xyz]\b)|magnetfeld(?=[ _]*[xyz])|magnetfelt(?=[ _]*[xyz])|"
-        r"magnetometro|magnetometers?|магнитометр\w*|магн\b|феррозонд\w*|磁力计|磁通门|磁强计|"
-        r"campo magnetico(?=[ _]*[xyz])|campo mag(?=[ _]*[xyz])|"
+        r"magnetometro|magnetometr(?=[ _]*[xyz])|magnetometers?|магнитометр\w*|магн\b|феррозонд\w*|磁力计|"
+        r"磁通门|磁强计|campo magnetico(?=[ _]*[xyz])|campo mag(?=[ _]*[xyz])|"
         r"\bmtm\b|磁(?=[ _]*[xyz])|flux[ _-]*gates?|磁场(?=[ (（_]*[xyz])",
         "mag ",
     ),
     (
-        r"pole calkow\w*|calkowite pole|(teljes )?terero|toplam alan|totaalveld|campo totale|medan total|全磁力|"
+        r"natezenie pola|pole calkow\w*|calkowite pole|(teljes )?terero|toplam alan|totaalveld|"
+        r"campo totale|medan total|全磁力|"
         r"feldstarke|gesamtfeld|totalfeld|totalfelt|champ( magn\w*)?( total)?|campo (total|local|magn\w*)|"
         r"intensidad total|полн\w* (магн\w* )?(поле|вектор\w*)|"
         r"модуль (магн\w*|поля)|总磁场(强度)?|磁场强度|总场|totalintensitat",
@@ -86,14 +89,18 @@ TRANSLATIONS = (
     ),
     (r"нтл", "nT"),
     (r"мктл", "uT"),
+    (r"мгс(?![а-я])", "mG"),
+    (r"(?<![а-я])гс(?![а-я])", "gauss"),
     (
-        r"(?<![a-zа-я])(градус\w*|град|grados|graus|graden|gradi|grader|grad|derajat|derece|stopni?e?|fok)(?![a-zа-я])|(?<!温)度(?=[)）]?$)",
+        r"(?<![a-zа-я])(градус\w*|град|grados|graus|graden|gradi|grader|grad|derajat|derece|"
+        r"stopni?e?|fok)(?![a-zа-я])|(?<!温)度(?=[)）]?$)",
         "deg",
     ),
     (r"код\w* ацп|ацп|отсч\w*|码值", "adc"),
     (r"мв(?![а-я])", "mV"),
     (
-        r"temp-ra|темп-ра|sicaklik|homerseklet|temperatuur|suhu|pt100(0)?\b|temperatura|temperature?n?|температура|темп\b\.?|温度",
+        r"temp-ra|темп-ра|sicaklik|homerseklet|temperatuur|suhu|pt100(0)?\b|temperatura|"
+        r"temperature?n?|температура|темп\b\.?|温度",
         "temperature ",
     ),
     (

@@ -161,11 +161,11 @@ def _with_covers(layout: Layout, covers: Sequence[Sheet]) -> Layout:
     """A table with what sheets without readings say, where its own title block does not."""
     blocks = [stated_above([row for _, row in sheet.rows]) for sheet in covers]
     stated = {key: value for block in blocks[::-1] for key, value in block.metadata.items()}
-    own = layout.titles
-    day = own.unclear_day or next((b.unclear_day for b in blocks if b.unclear_day), "")
-    metadata = {**stated, **own.metadata}
+    block = layout.titles
+    day = block.unclear_day or next((b.unclear_day for b in blocks if b.unclear_day), "")
+    metadata = {**stated, **block.metadata}
     return replace(
-        layout, titles=Titles(metadata, "" if "date" in metadata else day) if blocks else own
+        layout, titles=Titles(metadata, "" if "date" in metadata else day) if blocks else block
     )
 
 
@@ -501,7 +501,7 @@ def _is_blank(cell: object) -> bool:
 
 
 def _is_summary(row: Cells, width: int) -> bool:
-    """Whether a row is one of statistics: its name is in front, or anywhere in a row that others outnumber by a cell."""
+    """Whether a row is one of statistics: its name is in front, or anywhere in a row of fewer cells than most."""
     looked_at = row if sum(cell != "" for cell in row) < width else row[:3]
     texts = [cell for cell in looked_at if isinstance(cell, str) and not figures.is_figure(cell)]
     return any(_SUMMARY.fullmatch(text) for text in texts if text)

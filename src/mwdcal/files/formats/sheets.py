@@ -60,9 +60,11 @@ def _plain(row: Cells) -> list[object]:
 def _delimited(lines: Sequence[str], source: str) -> tuple[str, list[tuple[int, Cells]]]:
     """The delimiter of a text by which most numbers show, and its rows by it."""
     looked_at = lines[:_LOOKED_AT]
-    best = max(
-        (*DELIMITERS, _RUNS, _BLANKS), key=lambda mark: _numbers(_split(looked_at, mark, source))
-    )
+    marks = (*DELIMITERS, _RUNS, _BLANKS)
+    counts = {mark: _numbers(_split(looked_at, mark, source)) for mark in marks}
+    best = max(DELIMITERS, key=lambda mark: counts[mark])
+    if 2 * counts[best] < max(counts.values()):  # blanks may stand within cells
+        best = max(marks, key=lambda mark: counts[mark])
     rows = enumerate(_split(lines, best, source), 1)
     return best, [(line, _trimmed(row)) for line, row in rows if any(row)]
 
@@ -78,7 +80,7 @@ def _numbers(rows: Sequence[Sequence[str]]) -> int:
 def _split(lines: Sequence[str], mark: str, source: str) -> list[list[str]]:
     """The cells of each line, without blanks around."""
     if mark in (_BLANKS, _RUNS):  # a unit in brackets belongs to the name before it
-        apart = r"\s{2,}|\t" if mark == _RUNS else r"\s+(?![\[(])"
+        apart = r"\s{2,}|\t" if mark == _RUNS else r"\s+(?![\[(])(?![^\[(]*[\])])"
         return [re.split(apart, line.strip()) if line.strip() else [] for line in lines]
     rows = dialect.cells_of(lines, mark, source, skip_blanks=True)
     return [[cell.strip() for cell in row] for row in rows]
