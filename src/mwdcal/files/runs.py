@@ -198,7 +198,8 @@ def _of_layout(where: Layout, path: str | os.PathLike[str], profile: Profile) ->
         stated = _sources(profile)[named[name]].unit if name in named else ""
         if unit and stated and not _alike_units(unit, stated):
             raise InputError(
-                f"{Path(path).name}: {shown(name)} is in {unit}, by the tool profile in {stated}."
+                f"{Path(path).name}: {shown(name)} is in {unit}, by the tool profile in {stated}. Correct "
+                "[columns] there, or propose a profile for this table: mwdcal profile."
             )
     return tables.of_layout(where, path, [n for n, column in named.items() if column in LABELS])
 
@@ -263,6 +264,9 @@ def renamed(table: Table, profile: Profile) -> Table:
     Raises:
         InputError: a channel of the profile that the table has not, or a name that is taken.
     """
+    form = profile.table
+    ignored = () if isinstance(form, msgspec.UnsetType) else form.ignore
+    table = replace(table, columns={n: c for n, c in table.columns.items() if n not in ignored})
     if not is_export(table.columns, profile):
         return _with_stated_references(table)
     sources = _sources(profile)
@@ -271,19 +275,15 @@ def renamed(table: Table, profile: Profile) -> Table:
         if column in RAW and source.name not in table.columns:
             raise InputError(
                 f"{table.source}: the column {shown(source.name)}, which is '{column}' by the tool profile, "
-                "is missing. Correct [columns] in the profile, or the table."
+                "is missing. Correct [columns] in the profile."
             )
         if column in table.columns and source.name != column:
             raise InputError(
                 f"{table.source}: '{column}' is a column of the table, and {shown(source.name)} is '{column}' by "
-                "the tool profile. Rename the former, or correct [columns] in the profile."
+                "the tool profile. Correct [columns] in the profile, or name the former under ignore in [table] there."
             )
     columns: dict[str, Column] = {}
-    form = profile.table
-    ignored = () if isinstance(form, msgspec.UnsetType) else form.ignore
     for name, cells in table.columns.items():
-        if name in ignored:
-            continue
         column = theirs.get(name, name)
         columns[column] = cells
         if name in theirs and column not in LABELS:

@@ -349,6 +349,11 @@ def _words(name: str) -> list[str]:
     return [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", text)]
 
 
+def synonyms_of(column: str) -> list[str]:
+    """Words of three letters or more that a column is called by."""
+    return [word for word in _INSTEAD.get(column, "").split() if len(word) > 2]
+
+
 def begins_as(name: str) -> str:
     """The raw channel that a name begins as, before words that are no unit; empty if it begins as none.
 
@@ -420,7 +425,8 @@ def check_evidence(
         how += ", or name it under [columns] of the tool profile"
     raise InputError(
         f"{source}: the column {shown(name)} resembles '{resemblance.column}', which is absent, and would not "
-        f"be used.{which} {how}; if it is something else, give it a name that says so, or remove it.{likewise}"
+        f"be used.{which} {how}; if it is something else, name it under ignore in [table] of the tool profile, "
+        f"or give it a name that says so.{likewise}"
     )
 
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Sequence
+from functools import cache
 
 import numpy as np
 
 from mwdcal.errors import Answer
 from mwdcal.files.contract import RAW, REFERENCES
-from mwdcal.files.synonyms import unit_of
+from mwdcal.files.synonyms import synonyms_of, unit_of
 from mwdcal.geometry.vectors import Array, Bools
-from mwdcal.identification.words import spelled
+from mwdcal.identification.words import spelled, translated
 
 BOTH_UNITS = " and "
 """What stands between two units of one column, of which one is wrong."""
@@ -142,6 +143,35 @@ def lacking_references(present: Collection[str]) -> list[str]:
     magnetic = () if {*present}.isdisjoint(RAW[3:]) else ("azimuth", "field", "dip")
     names = (REFERENCES[name].column for name in ("inclination", "toolface", *magnetic))
     return [column for column in names if column not in present]
+
+
+def is_near(column: str, name: str) -> bool:
+    """Whether a word of a name is one of a column's but for a letter, or two that are exchanged.
+
+    >>> [is_near("ref_dip_deg", n) for n in ("Dpi (°)", "Inklinatoin des Feldes", "Pos")]
+    [True, True, False]
+    """
+    words = re.findall(r"[^\W\d_]{3,}", spelled(IN_BRACKETS.sub("", name)).lower())
+    return any(_is_mistyped(word, each) for word in words for each in _words_of(column))
+
+
+@cache
+def _words_of(column: str) -> frozenset[str]:
+    """Words of three letters or more that say of a column that it is one of a run file's."""
+    return frozenset(synonyms_of(column)) | translated(column)
+
+
+def _is_mistyped(word: str, meant: str) -> bool:
+    """Whether a word is another one with one letter too many, too few or wrong, or two exchanged."""
+    if word == meant or abs(len(word) - len(meant)) > 1:
+        return False
+    first = next(
+        (k for k, (a, b) in enumerate(zip(word, meant, strict=False)) if a != b),
+        min(len(word), len(meant)),
+    )
+    one, two = word[first:], meant[first:]
+    exchanged = one[1::-1] + one[2:] == two and len(one) > 1
+    return exchanged or one[1:] == two or one == two[1:] or (len(word) > 3 and one[1:] == two[1:])
 
 
 def may_be(column: str, name: str, unit: str, values: Array | None) -> bool:

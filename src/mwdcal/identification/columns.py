@@ -35,6 +35,7 @@ from mwdcal.identification.answers import (
     first_values,
     in_units,
     is_filler,
+    is_near,
     is_numbering,
     lacking_references,
     may_be,
@@ -67,6 +68,8 @@ _OF_NORTH = re.compile(r"north|nord|norte|azi|azm|heading|азим|север|�
 _TWICE = re.compile(r" \(\d+\)$")
 """The end of a name that stands in a table more than once."""
 _NUMBERED = re.compile(r"(.*?[A-Za-z])[ _-]*([123])((?:\W.*|_[A-Za-z]+)?)")
+BY_NAME_ALONE = (WARMTH, REFERENCES["gravity"].column)
+"""Columns that a run may lack, and that values alone do not tell."""
 _TITLE = re.compile(
     r"(acc|mag|accelerometers?|magnetometers?)?(?:s|ref|sensors?)? +", re.IGNORECASE
 )
@@ -295,7 +298,8 @@ def proposed(
         others = [n for n in names if n not in meanings and n not in believed]
         questions.ask(_check_nameless, others, values, {*chosen, *known}, source)
     rest = {n: u for n, u in zip(names, units, strict=True) if n not in meanings}
-    for column in lacking_references({*chosen, *said, *known}):
+    lacking = [*lacking_references({*chosen, *said, *known}), *BY_NAME_ALONE]
+    for column in (each for each in lacking if each not in {*chosen, *said, *known}):
         questions.ask(_check_lacking, column, rest, values, source)
     questions.raise_any(source)
     by_value = {c for c, each in chosen.items() if each.unit and not meanings[each.name].unit}
@@ -423,11 +427,14 @@ def _is_total(column: str, name: str, meanings: Mapping[str, Resemblance], value
 
 
 def _check_lacking(column: str, others: Mapping[str, str], values: Values, source: str) -> None:
-    """Ask whether columns that are not understood, with their units, are a reference that is absent."""
-    fits = [
+    """Ask whether columns that are not understood are one that is absent, by a mistyped name or by unit and values."""
+    numbers = {n: values(n) for n in others if not _MEASURED.search(spelled(n))}
+    near = [n for n, cells in numbers.items() if cells is not None and is_near(column, n)]
+    by_values = column not in BY_NAME_ALONE
+    fits = near + [
         n
-        for n, unit in others.items()
-        if not _MEASURED.search(spelled(n)) and may_be(column, n, unit, values(n))
+        for n, cells in numbers.items()
+        if by_values and n not in near and may_be(column, n, others[n], cells)
     ]
     if fits:
         raise QuestionError(
@@ -522,12 +529,17 @@ def _check_units_of_triads(chosen: Mapping[str, ColumnSource], source: str) -> N
     """Refuse channels of a triad, or their standard uncertainties, of which two state different units."""
     for names in CHANNELS.values():
         columns = [*names, *(f"sd_{name}" for name in names)]
-        stated = [chosen[c] for c in columns if c in chosen and chosen[c].unit]
-        other = next((each for each in stated if each.unit != stated[0].unit), None)
-        if other:
+        stated = {c: chosen[c] for c in columns if c in chosen and chosen[c].unit}
+        units = [*dict.fromkeys(each.unit for each in stated.values())]
+        if len(units) > 1:
+            first, other = (next(e for e in stated.values() if e.unit == u) for u in units[:2])
             raise QuestionError(
-                f"{source}: {shown(stated[0].name)} is in {stated[0].unit}, {shown(other.name)} in {other.unit}. "
-                "Give the channels of a triad in one unit: their scale is one."
+                f"{source}: {shown(first.name)} is in {first.unit}, {shown(other.name)} in {other.unit}. The channels "
+                "of a triad have one scale. Which unit are all of them in?",
+                [
+                    Answer(u, tuple(("column", f"{c}={e.name} ({u})") for c, e in stated.items()))
+                    for u in units
+                ],
             )
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 import unicodedata
 
+from mwdcal.files.synonyms import resembled
+
 _LATIN = str.maketrans({"ø": "o", "Ø": "O", "æ": "ae", "ß": "ss", "ł": "l", "ı": "i", "İ": "i"})
 """Letters that do not come apart into a plain letter and a mark."""
 _ELEVATION = r"\b(elev(ation)?|elevacion|inc\w* (from|to|above|over) (the )?horiz\w*|pitch)\b"
@@ -134,3 +136,15 @@ def spelled(name: str) -> str:
     for pattern, word in TRANSLATIONS:
         text = re.sub(pattern, word, text, flags=re.IGNORECASE)
     return text.strip()
+
+
+def translated(column: str) -> frozenset[str]:
+    """Words of other languages for what a column of a run file holds."""
+    patterns = (
+        pattern
+        for pattern, word in TRANSLATIONS
+        if (m := resembled(word.strip())) and m.column == column
+    )
+    return frozenset(
+        word for pattern in patterns for word in re.findall(r"(?<!\\)[^\W\d_]{5,}", pattern)
+    )

@@ -96,7 +96,7 @@ def check_names(names: Sequence[str], where: str) -> None:
     for name in (name for i, name in enumerate(names) if name in names[:i]):
         raise InputError(
             f"{where}: column names must be unique; got {shown(name)} more than once. "
-            "Rename or remove one of the columns."
+            "Rename one of the columns, or propose a tool profile for the table as it is: mwdcal profile."
         )
 
 

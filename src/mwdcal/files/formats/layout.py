@@ -358,7 +358,7 @@ def _check_cut(
         line, row = cut[0]
         raise InputError(
             f"{source}, row {line}: '{_words(row)}' begins as a station and ends before the numbers of the other "
-            "rows. Was the file cut? Complete the row, or remove it."
+            "rows. Was the file cut? Export the whole of it."
         )
 
 
@@ -525,7 +525,7 @@ def as_columns(layout: Layout, labels: Collection[str] = ()) -> dict[str, list[s
     for name in {*labels}.intersection(layout.fractions):
         raise InputError(
             f"the column {shown(name)}: a serial or label must be text; it has numbers, of which a workbook keeps no "
-            "last zero. Format the column as text, and type them as they stand on the tools."
+            "last zero. Say that it is none by `column` serial= or station=, and state the serial by `serial`."
         )
     each = zip(layout.names, layout.cells, layout.texts, strict=True)
     return {name: texts if name in labels else cells for name, cells, texts in each}

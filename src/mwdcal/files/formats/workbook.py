@@ -169,8 +169,8 @@ def _check_formulas(archive: zipfile.ZipFile, sheet: str, source: str) -> None:
     if without:
         more = f" and {len(without) - _NAMED} more" if len(without) > _NAMED else ""
         raise InputError(
-            f"{source}: formulas without a value, in the cells {', '.join(without[:_NAMED])}{more}. Open the workbook "
-            "in a spreadsheet program, let it calculate, and save it; or write numbers in place of the formulas."
+            f"{source}: formulas without a value, in the cells {', '.join(without[:_NAMED])}{more}. Name a copy "
+            "that a spreadsheet program has saved: it calculates them."
         )
 
 
