@@ -37,7 +37,9 @@ _REJECTED = re.compile(rf"\W*({_OF_REFUSAL})\W*|\W*({_OF_REFUSAL})\s*[-–—:;,
 """A cell that rejects its row, whatever reason follows."""
 _MAY_REJECT = re.compile(
     rf"(?<![^\W\d_])({_OF_REFUSAL}|fail(ed)?|outlier|suspect|questionable|doubtful|ausreißer|ausreisser|fehler|avvik|"
-    r"nicht bestanden|falha|fallo|выброс|сбой)(?![^\W\d_])|不合格|异常|可疑"
+    r"moved|bumped|disturbed|slipped|knocked|bewegt|verrutscht|gestossen|flyttet|movi(o|do)|mexeu|bouge|сдвин\w*|"
+    r"толкн\w*|"
+    r"nicht bestanden|falha|fallo|выброс|сбой)(?![^\W\d_])|不合格|异常|可疑|移动|碰到"
 )
 """A cell that may reject its row, or speak of another one."""
 _ACCEPTED = re.compile(

@@ -87,6 +87,8 @@ _UNSURE = re.compile(
     re.IGNORECASE,
 )
 """Words by which a value is no reference."""
+_BEFORE = 8
+"""Characters before a quantity in which a word may stand by which its value is no reference."""
 _BETWEEN = r"(?P<between>[^\d+\-−;]{0,30}?)"
 _REFERRING = re.compile(
     r"(?<![^\W\d_])(ref|reference|local|lokal|value|wert|t|f|i|g|т)(?![^\W\d_])"
@@ -127,6 +129,8 @@ def references_in(rows: Iterable[Sequence[object]]) -> dict[str, float]:
         text = _plain(" ".join(filter(None, (as_text(cell).strip() for cell in row))))
         for quantity, pattern in _STATEMENTS.items():
             for match in pattern.finditer(text):
+                if _UNSURE.search(text[max(match.start() - _BEFORE, 0) : match.start()]):
+                    continue
                 values.setdefault(quantity.column, {}).update(
                     dict.fromkeys(_values(quantity, match))
                 )
