@@ -83,8 +83,10 @@ def _far_out(values: Mapping[str, Array], column: str) -> Bools:
     triad = next(names for names in CHANNELS.values() if column in names)
     if values[column].size < LEAST_STATIONS or not all(name in values for name in triad):
         return np.zeros(values[column].size, bool)
-    off = np.abs(np.stack([values[name] for name in triad], -1))
-    off = np.nan_to_num(np.abs(off - np.nanmedian(off, 0)))
+    channels = np.stack([values[name] for name in triad], -1)
+    if np.isnan(channels).all(0).any():
+        return np.zeros(len(channels), bool)
+    off = np.nan_to_num(np.abs(channels - np.nanmedian(channels, 0)))
     *_, second, largest = np.sort(off.max(-1))
     far = off.max(-1) > FAR_OUT * second
     return np.asarray(far & (largest > 0) & (off[:, triad.index(column)] == off.max(-1)))
