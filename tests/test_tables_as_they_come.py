@@ -261,6 +261,14 @@ def test_a_rejected_row_can_be_kept(tmp_path):
     assert 'keep = {Status = ["REJECT"]}' in (tmp_path / "tool.toml").read_text()
 
 
+def test_a_row_that_repeats_another_in_every_cell_counts_once(tmp_path):
+    columns = {n: np.append(v, v[10]) for n, v in table().items()}
+    ran, one = calibrated(tmp_path, written(tmp_path / "a.csv", columns))
+    _, two = calibrated(tmp_path, written(tmp_path / "b.csv", table()))
+    assert one["magnetometer"]["parameters"] == two["magnetometer"]["parameters"]
+    assert "left out: line 50 (every cell as in line 12)" in ran.err
+
+
 def test_apply_keeps_every_row(tmp_path):
     calibrated(tmp_path, written(tmp_path / "a.csv", table()))
     path = written(tmp_path / "b.csv", table(**marked("Status", {7: "REJECT"}, "OK")))

@@ -16,7 +16,7 @@ import msgspec
 
 from mwdcal.calibration.diagnosis.flags import listed
 from mwdcal.errors import Answer, InputError, QuestionError
-from mwdcal.files.formats.columns import looks_numeric, shown
+from mwdcal.files.formats.columns import Column, looks_numeric, shown
 from mwdcal.files.formats.layout import ADJUSTED
 from mwdcal.files.formats.table import Table, labels, row_word
 from mwdcal.files.parting import marked_rows
@@ -61,6 +61,9 @@ _AFFIRMED = {"y", "yes", "true", "1", "x", "ja", "j", "si", "s", "sim", "oui", "
 _DENIED = {"n", "no", "false", "0", "nein", "nei", "nao", "non", "нет", "н", "否"}
 MARKS_NAMED = 8
 """Rows that a sentence names."""
+_OF_NUMBERS = frozenset("0123456789+-−eE.,:;/ ")
+_MOST_STATIONS = 2000
+"""Stations of a run beyond which no copies are looked for."""
 _MOST_VALUES = 5
 """Values of a column of a status at most; one of more tells something else."""
 
@@ -83,6 +86,7 @@ def marks_in(table: Table, form: TableFormat, used: Collection[str]) -> Marks:
     for name in table.columns:
         chosen, kept = ({*map(_plain, each.get(name, ()))} for each in (form.leave_out, form.keep))
         judged = name not in used and name not in form.ignore and not name.startswith("witsml ")
+        judged = judged and (_holds_words(table.columns[name]) or _names_judgements(_plain(name)))
         judged = judged and not marked_rows(table, name)
         cells = labels(table, name) if chosen or kept or judged else []
         spelt = {cell: _plain(cell) for cell in {*cells}}
@@ -122,6 +126,32 @@ def _verdicts(name: str, cells: Sequence[str]) -> dict[str, bool]:
     return verdicts
 
 
+def _holds_words(column: Column) -> bool:
+    """Whether a column has a cell with more than the signs of numbers."""
+    return isinstance(column, list) and not set("".join(column)) <= _OF_NUMBERS
+
+
+def _names_judgements(name: str) -> bool:
+    return any(each.fullmatch(name) for each in (_OF_ACCEPTANCE, _OF_REJECTION, _OF_STATUS))
+
+
+def _copies(table: Table) -> dict[int, str]:
+    """Rows that repeat another one in every cell, its label too, and where that one stands.
+
+    Some column must tell all other rows apart; without one, rows alike may be measurements of their own.
+    """
+    if table.count > _MOST_STATIONS:
+        return {}
+    columns = [labels(table, name) for name in table.columns]
+    first: dict[tuple[str, ...], int] = {}
+    copies = {}
+    for row, cells in enumerate(zip(*columns, strict=True)):
+        if first.setdefault(cells, row) != row:
+            copies[row] = f"every cell as in {place(table, first[cells])}"
+    different = table.count - len(copies)
+    return copies if any(len({*cells}) == different for cells in columns) else {}
+
+
 def _plain(text: str) -> str:
     """Small letters without marks, and blanks around."""
     plain = unicodedata.normalize("NFKD", text.replace("ø", "o").replace("й", "\0").casefold())
@@ -140,8 +170,10 @@ def without_rejected(
     form = TableFormat() if isinstance(form, msgspec.UnsetType) else form
     _check_one_run(table, form)
     marks = marks_in(table, form, used)
-    if not marks.left_out and not marks.doubtful:
+    copies = _copies(table)
+    if not marks.left_out and not marks.doubtful and not copies:
         return table
+    marks = marks._replace(left_out={**copies, **marks.left_out})
     rows = [row for row in range(table.count) if row not in marks.left_out]
     if not rows:
         raise InputError(
@@ -175,7 +207,7 @@ def _remarks(table: Table, marks: Marks) -> Iterator[str]:
     """A sentence on the rows that are left out, and one on those that may have to be."""
     if marks.left_out:
         each = [f"{place(table, row)} ({said})" for row, said in sorted(marks.left_out.items())]
-        yield f"rows that are marked as rejected are left out: {listed(each, MARKS_NAMED)}."
+        yield f"rows that are rejected, or copies of others, are left out: {listed(each, MARKS_NAMED)}."
     doubtful = {
         row: f"{shown(name)}: {cell}"
         for (name, cell), rows in marks.doubtful.items()
