@@ -493,3 +493,17 @@ def test_a_failed_roll_test_leads_on(tmp_path):
     )
     assert both.code == 1
     assert both.json["verification"]["findings"][-1]["id"] == "next-step"
+
+
+def test_a_fleet_leaves_rejected_rows_out_too_and_says_so(tmp_path):
+    """A folder of two runs: the one with the rejected row has as many stations less."""
+    folder = tmp_path / "runs"
+    folder.mkdir()
+    run = servo_run()
+    write_csv(folder / "A1.csv", {**run, **marked("Status", {7: "REJECT"}, "OK")})
+    write_csv(folder / "A2.csv", run)
+    ran = mwdcal("fleet", folder, "-o", tmp_path / "cals.parquet", "--tool", "servo", "--json")
+    assert ran.code == 0, ran
+    assert ran.json["stations"] == 95
+    assert "A1.csv: rows that are rejected" in ran.err
+    assert "line 8 ('Status': REJECT)" in ran.err
