@@ -479,7 +479,7 @@ def test_a_failed_roll_test_leads_on(tmp_path):
     assert f"next: mwdcal diagnose {cal} {roll}" in ran.out
     machine = mwdcal("verify", cal, roll, "--json").json["findings"][-1]
     assert machine["id"] == "next-step"
-    assert f"mwdcal diagnose {cal} {roll}" in machine["text"]
+    assert "mwdcal diagnose cal.json roll.csv" in machine["text"]
     both = mwdcal(
         "calibrate",
         tmp_path / "a.csv",

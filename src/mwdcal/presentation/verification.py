@@ -60,8 +60,8 @@ def next_step(result: Verdict, calibration: Path, run: Path) -> str:
 
 
 def with_next_step(result: Verdict, calibration: Path, run: Path) -> Verdict:
-    """The verdict with a finding `next-step` where a value failed, for machines."""
-    again, command = _after_failure(result, calibration, run)
+    """The verdict with a finding `next-step` where a value failed, for machines: files by name, wherever they lie."""
+    again, command = _after_failure(result, Path(calibration.name), Path(run.name))
     if not again:
         return result
     text = f"Measure again: {again}. What the failure looks like says: {command}"
