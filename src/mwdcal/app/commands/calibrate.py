@@ -107,12 +107,16 @@ def _judged(
 def _for_machines(
     verdict: Verdict | None, calibration: Path, rolltest: Path | None
 ) -> Verdict | None:
-    """A verdict with what to do after a failure."""
+    """A verdict in the words of the command, with what to do after a failure."""
     if verdict is None or rolltest is None:
         return verdict
+    from msgspec.structs import replace
+
+    from mwdcal.presentation.typed import findings_with_option_names
     from mwdcal.presentation.verification import with_next_step
 
-    return with_next_step(verdict, calibration, rolltest)
+    said = replace(verdict, findings=findings_with_option_names(verdict.findings))
+    return with_next_step(said, calibration, rolltest)
 
 
 def _enter(registry: str | None, *items: Path | str | Verdict | None) -> None:
