@@ -1039,6 +1039,10 @@ def laboratory_case(r: random.Random, folder: Path) -> tuple[list[str], bool]:
         "2",
         "--column",
         "ref_dip_deg=",
+        "--leave-out",
+        "Comment=bad",
+        "--keep",
+        "Remarks=see logbook",
     )
     for place in range(0, len(answers), 2):
         line += answers[place : place + 2] if r.random() < 0.1 else ()

@@ -266,8 +266,8 @@ def test_a_foreign_file_under_a_typed_suffix(tmp_path, suffix):
 def test_rows_are_named_in_typed_files(tmp_path, suffix):
     path = tmp_path / f"run{suffix}"
     write(path, Table({"ax": ["1", "oops"], "ay": ["1", "2"], "az": ["1", "2"]}))
-    row = 2 if suffix == ".parquet" else 3
-    assert f"run{suffix}, row {row}, column 'ax': expected a number; got 'oops'" in refusal(path)
+    place = "row 2" if suffix == ".parquet" else "cell A3"
+    assert f"run{suffix}, {place}, column 'ax': expected a number; got 'oops'" in refusal(path)
 
 
 def test_parquet_with_odd_contents(tmp_path):

@@ -348,6 +348,8 @@ def test_commands_take_a_tool_as_they_take_its_file(fleet, tmp_path, serial):
     assert [ran.code for ran in verdicts] in ([0, 0], [1, 1])
     first, second = (ran.json for ran in verdicts)
     assert first["calibration_sha256"] == digest
+    for each in (first, second):  # after a FAIL the command names the calibration
+        each["findings"] = [f for f in each["findings"] if f["id"] != "next-step"]
     assert first | which == second | which
 
 

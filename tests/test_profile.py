@@ -321,11 +321,25 @@ def test_other_units_below_the_names_are_refused(with_units, tmp_path, unit):
     )
 
 
-def test_mixed_decimal_signs_are_refused(tmp_path):
+def test_a_cell_of_another_decimal_sign_is_named_and_its_row_left_out(tmp_path):
     path = write_csv(tmp_path / "run.csv", servo_run(), delimiter=";")
     path.write_text(path.read_text().replace("\n1;25.0;", "\n1;25,5;"))
+    message = refused(mwdcal("profile", path, "-o", tmp_path / "tool.toml"), 3)
+    assert "line 2" in message
+    option = ["--leave-out", "temperature_c=25,5"]
+    assert " ".join(option).replace("temp", "'temp") + "'" in message
+    ran = mwdcal("profile", path, "-o", tmp_path / "tool.toml", *option)
+    assert ran.code == 0
+    assert "line 2 ('temperature_c': 25,5)" in ran.err
+
+
+def test_as_many_commas_as_points_are_refused(tmp_path):
+    path = write_csv(tmp_path / "run.csv", servo_run(), delimiter=";")
+    lines = path.read_text().split("\n")
+    half = len(lines) // 2
+    path.write_text("\n".join([line.replace(".", ",") for line in lines[:half]] + lines[half:]))
     message = refused(mwdcal("profile", path, "-o", tmp_path / "tool.toml"), 2)
-    assert "25,5" in message
+    assert "are mixed. Say which one is the decimal sign by --decimal" in message
 
 
 # ------------------------------------------------------------------------------------ axes

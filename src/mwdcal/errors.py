@@ -75,7 +75,7 @@ class QuestionsError(FitError):
     """All questions that are open together."""
 
     def __init__(self, source: str, questions: Sequence[QuestionError]) -> None:
-        texts = [str(each).removeprefix(f"{source}: ") for each in questions]
+        texts = [re.sub(rf"^{re.escape(source)}[:,] ", "", str(each)) for each in questions]
         listed = " ".join(f"({n}) {text}" for n, text in enumerate(texts, 1))
         one = len(texts) == 1
         super().__init__(

@@ -154,6 +154,7 @@ class Readings:
         metadata: serial, date, operator, …, as the file states them.
         source: name of the file.
         unused: columns of the file that are not used, each with what it resembles.
+        remarks: sentences on rows of the file that are left out.
         others: the numbers (..., n) in those of them that have one at every station, by name.
         table: all columns (n,) of the file or table that was read, as they stand there.
         profile: the tool profile by which raw channels became these readings, if there was one.
@@ -174,6 +175,7 @@ class Readings:
     metadata: Mapping[str, object] = field(default_factory=dict)
     source: str = ""
     unused: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
     others: Mapping[str, Array] = field(default_factory=dict)
     table: Mapping[str, AnyArray] = field(default_factory=dict)
     columns: ClassVar[Mapping[str, AnyArray]]

@@ -100,7 +100,7 @@ MAPPED = (*COLUMNS, "serial")
 """Columns that a table may have under another name."""
 _UNITS_BY_END = {
     "deg": ("°", "rad", "gon"),
-    "g": ("g", "mg", "m/s²"),
+    "g": ("g", "mg", "m/s²", "gal", "mGal"),
     "nt": ("nT", "µT", "mT", "gauss", "mG"),
     "c": ("°C", "°F", "K"),
 }
@@ -156,7 +156,8 @@ def check_near_misses(names: Collection[str], contract: Sequence[str], what: str
             how = CONVERSIONS.get(alike.unit if alike else "", "and convert its unit")
             raise InputError(
                 f"{what} {shown(name)} must be spelled exactly as documented. Did you mean "
-                f"'{meant}'? Rename it ({how}), or choose a different name."
+                f"'{meant}'? Rename it ({how}), choose a different name, or propose a tool profile for the table as "
+                "it is: mwdcal profile."
             )
 
 
@@ -178,7 +179,8 @@ def _missing(missing: Sequence[str], names: Sequence[str], source: str) -> Input
     present = ", ".join(shown(name) for name in names[:20]) + (" …" if names[20:] else "")
     return InputError(
         f"{source}: the columns ax, ay, az must be present; {_listed(missing)} missing; "
-        f"found {present}.{meant} Rename the columns, or check the delimiter of the file."
+        f"found {present}.{meant} Rename the columns, propose a tool profile for the table "
+        "as it is (mwdcal profile), or check the delimiter of the file."
     )
 
 
@@ -206,7 +208,7 @@ def magnetic_offset(metadata: Mapping[str, object], source: str) -> float:
         if key not in stated:
             raise InputError(
                 f"{source}: {kind} azimuths need the metadata '{key}'; got none. Add a line "
-                f"`# {key} = …`, or give magnetic azimuths."
+                f"`# {key} = …`, state {key} in [table] of the tool profile, or give magnetic azimuths."
             )
     return sum((sign * stated[key] for key, sign in _NORTHS[kind].items()), 0.0)
 

@@ -25,9 +25,11 @@ Cells = Callable[[str], Array | None]
 """The numbers (R,) of a column by its name, NaN where blank; None where there is no such column."""
 
 
+LEAVE_OUT = "leave such rows out by leave_out in [table] of the tool profile"
+"""The remedy for rows without a reading in a table that stays as it is."""
 OPTIONAL = {
-    CHANNELS["magnetometer"]: "Fill it in, or remove the station.",
-    ("temperature_c",): "Fill it in, or leave the whole column blank.",
+    CHANNELS["magnetometer"]: f"Fill it in, or {LEAVE_OUT}.",
+    ("temperature_c",): f"Fill it in, {LEAVE_OUT}, or leave the whole column blank.",
 }
 """Columns that are blank on all rows or on none, and what to do where they are neither."""
 
@@ -55,8 +57,8 @@ def faults(cells: Cells, starts: Ints, profile: Profile) -> Iterator[Fault]:
 
     A column is not read before its turn.
     """
-    readings = [(names, "Fill it in, or remove the station.") for names in CHANNELS.values()]
-    warmth = (("temperature_c",), "Fill it in, or leave the whole column blank.")
+    readings = [(names, f"Fill it in, or {LEAVE_OUT}.") for names in CHANNELS.values()]
+    warmth = (("temperature_c",), f"Fill it in, {LEAVE_OUT}, or leave the whole column blank.")
     for names, advice in (*readings, warmth):
         for name in names:
             yield from range_faults(cells, name)

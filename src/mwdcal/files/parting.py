@@ -32,7 +32,7 @@ def parted(table: Table) -> tuple[Table, Table]:
     marks = {
         name: rows
         for name in table.columns
-        if name not in COLUMNS and (rows := _marked_rows(table, name))
+        if name not in COLUMNS and (rows := marked_rows(table, name))
     }
     if len({tuple(rows) for rows in marks.values()}) != 1:
         which = (
@@ -49,7 +49,7 @@ def parted(table: Table) -> tuple[Table, Table]:
     return rows_of(table, others), rows_of(table, rows)
 
 
-def _marked_rows(table: Table, name: str) -> list[int]:
+def marked_rows(table: Table, name: str) -> list[int]:
     """The rows that a column marks as roll test; none where it marks nothing or all of them."""
     cells = labels(table, name)
     called = _ROLL_TEST.fullmatch(name.strip())

@@ -300,14 +300,16 @@ def check_profile(profile: Profile, source: str) -> None:
     if not profile.name.strip():
         raise InputError(f"{source}, key 'name': must not be blank; got ''. Name the tool.")
     _check_section(profile, source)
+    if not isinstance(profile.columns, msgspec.UnsetType):
+        _check_columns(profile.columns, source)
     form = profile.table
-    if not isinstance(form, msgspec.UnsetType) and form.first_line <= form.header_line:
+    if isinstance(form, msgspec.UnsetType) or form.find:
+        return
+    if form.first_line <= form.header_line:
         raise InputError(
             f"{source}, key 'table.first_line': must be below the names in line {form.header_line}; got "
             f"{form.first_line}. Correct it."
         )
-    if not isinstance(profile.columns, msgspec.UnsetType):
-        _check_columns(profile.columns, source)
 
 
 def _check_section(section: msgspec.Struct, source: str, prefix: str = "") -> None:

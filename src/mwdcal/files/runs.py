@@ -22,7 +22,7 @@ from mwdcal.calibration.readings import (
     is_simulated,
     serial_of,
 )
-from mwdcal.errors import FitError, InputError
+from mwdcal.errors import FitError, InputError, QuestionError
 from mwdcal.estimation.evidence import WALKS
 from mwdcal.files import synonyms
 from mwdcal.files.contract import (
@@ -36,12 +36,20 @@ from mwdcal.files.contract import (
     units_of,
 )
 from mwdcal.files.faults import BlankReadingError as BlankReadingError
-from mwdcal.files.faults import Cells, columns_of, faults, faults_beside_readings, refuse
+from mwdcal.files.faults import (
+    Cells,
+    columns_of,
+    faults,
+    faults_beside_readings,
+    is_blank,
+    refuse,
+)
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, Column, shown
 from mwdcal.files.formats.dialect import holds_numbers
 from mwdcal.files.formats.layout import Layout
 from mwdcal.files.formats.table import Table, labels
+from mwdcal.files.marks import UNMARKED, without_rejected
 from mwdcal.files.statements import stated_table
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import ColumnSource, Profile, TableFormat, TriadProfile
@@ -52,6 +60,8 @@ MOST_ROWS = 1_000_000
 """Rows that a run may have at most, as many as a text table."""
 MOST_OTHERS = 20
 """Unused columns of numbers that are kept to see whether they explain the residuals."""
+STATED_REFERENCES = ("gravity", "field", "dip")
+"""References that may be the same at all stations, and be stated once."""
 _TURN = 360.0
 
 
@@ -70,7 +80,7 @@ def read_run(
         source = read_export(
             source, profile, decimal=decimal, rows=MOST_ROWS, statements=statements
         )
-    table = renamed(source, profile)
+    table = run_table(source, profile)
     check_run(table)
     readings, profile = to_readings(table, profile)
     return replace(readings, others=_other_numbers(table)), profile
@@ -121,9 +131,7 @@ def _exported(
     """The table in a file that is written as a form says, or as documented."""
     if form.find:
         decimal = "," if form.decimal == "," else ""
-        where = tables.laid_out(
-            path, sheet=form.sheet, wanted=_channels_of(profile), decimal=decimal
-        )
+        where = _laid_out(path, form, _channels_of(profile), decimal)
         return _of_layout(where, path, profile) if where else tables.read(path)
     try:
         serial = _sources(profile).get("serial", ColumnSource(name="serial")).name
@@ -143,6 +151,20 @@ def _exported(
     raise InputError(
         f"{problem} If the table is laid out otherwise than the tool profile says, correct [table] there, "
         "or propose a profile for it: mwdcal profile."
+    )
+
+
+def _laid_out(
+    path: str | os.PathLike[str], form: TableFormat, wanted: Sequence[str], decimal: str
+) -> Layout | None:
+    """Where a file has the table of a profile: of several, the one in the row that the profile states."""
+    try:
+        return tables.laid_out(path, sheet=form.sheet, wanted=wanted, decimal=decimal)
+    except QuestionError:
+        if form.header_line == 1:
+            raise
+    return tables.laid_out(
+        path, sheet=form.sheet, header_row=form.header_line, wanted=wanted, decimal=decimal
     )
 
 
@@ -176,7 +198,8 @@ def _of_layout(where: Layout, path: str | os.PathLike[str], profile: Profile) ->
         stated = _sources(profile)[named[name]].unit if name in named else ""
         if unit and stated and not _alike_units(unit, stated):
             raise InputError(
-                f"{Path(path).name}: {shown(name)} is in {unit}, by the tool profile in {stated}."
+                f"{Path(path).name}: {shown(name)} is in {unit}, by the tool profile in {stated}. Correct "
+                "[columns] there, or propose a profile for this table: mwdcal profile."
             )
     return tables.of_layout(where, path, [n for n, column in named.items() if column in LABELS])
 
@@ -227,33 +250,40 @@ def _not_as_stated(table: Table, profile: Profile) -> InputError:
     )
 
 
+def run_table(table: Table, profile: Profile) -> Table:
+    """The rows of a run that its laboratory has not rejected, under the names and in the units of the run file."""
+    exported = is_export(table.columns, profile)
+    named = {each.name: column for column, each in _sources(profile).items()} if exported else {}
+    used = [n for n in table.columns if named.get(n, n) in UNMARKED]
+    return renamed(without_rejected(table, profile.table, used), profile)
+
+
 def renamed(table: Table, profile: Profile) -> Table:
     """An export under the names and in the units of the run file; a run file as it is.
 
     Raises:
         InputError: a channel of the profile that the table has not, or a name that is taken.
     """
+    form = profile.table
+    ignored = () if isinstance(form, msgspec.UnsetType) else form.ignore
+    table = replace(table, columns={n: c for n, c in table.columns.items() if n not in ignored})
     if not is_export(table.columns, profile):
-        return table
+        return _with_stated_references(table)
     sources = _sources(profile)
     theirs = {s.name: column for column, s in sources.items() if s.name in table.columns}
     for column, source in sources.items():
         if column in RAW and source.name not in table.columns:
             raise InputError(
                 f"{table.source}: the column {shown(source.name)}, which is '{column}' by the tool profile, "
-                "is missing. Correct [columns] in the profile, or the table."
+                "is missing. Correct [columns] in the profile."
             )
         if column in table.columns and source.name != column:
             raise InputError(
                 f"{table.source}: '{column}' is a column of the table, and {shown(source.name)} is '{column}' by "
-                "the tool profile. Rename the former, or correct [columns] in the profile."
+                "the tool profile. Correct [columns] in the profile, or name the former under ignore in [table] there."
             )
     columns: dict[str, Column] = {}
-    form = profile.table
-    ignored = () if isinstance(form, msgspec.UnsetType) else form.ignore
     for name, cells in table.columns.items():
-        if name in ignored:
-            continue
         column = theirs.get(name, name)
         columns[column] = cells
         if name in theirs and column not in LABELS:
@@ -263,6 +293,23 @@ def renamed(table: Table, profile: Profile) -> Table:
             factor, offset = synonyms.FACTORS.get(unit, (1.0, 0.0))
             values = tables.numbers(table, name)
             columns[column] = values * factor + offset if (factor, offset) != (1.0, 0.0) else values
+    places = {theirs.get(name, name): place for name, place in table.places.items()}
+    return _with_stated_references(replace(table, columns=columns, places=places))
+
+
+def _with_stated_references(table: Table) -> Table:
+    """The table with the references that its metadata state for all stations, where it has no column of them."""
+    columns = dict(table.columns)
+    for column in (REFERENCES[name].column for name in STATED_REFERENCES):
+        value = table.metadata.get(column)
+        if value is None or (column in columns and not is_blank(table, column)):
+            continue
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise InputError(
+                f"{table.source}, metadata '{column}': must be a number; got {shown(str(value))}. Write it with a "
+                "decimal point and without quotes."
+            )
+        columns[column] = np.full(table.count, float(value))
     return replace(table, columns=columns)
 
 
@@ -342,6 +389,7 @@ def to_readings(
         source=table.source,
         run_sha256=table.digest,
         unused=synonyms.unused(list(table.columns), COLUMNS),
+        remarks=table.remarks,
     )
     triads = {
         kind: msgspec.structs.replace(getattr(profile, kind), scale=float(np.squeeze(scale)))

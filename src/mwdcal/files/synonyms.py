@@ -27,8 +27,10 @@ _SPELLINGS = {
     "°F": "f fahrenheit",
     "K": "k kelvin",
     "g": "g",
-    "mg": "millig",
+    "mg": "millig mg",
     "m/s²": "mss",
+    "gal": "gal gals",
+    "mGal": "mgal",
     "nT": "nt gamma",
     "µT": "ut",
     "mT": "millit",
@@ -50,6 +52,8 @@ CONVERSIONS = {
     "rad": "° = rad · 180/π",
     "mg": "g = mg / 1000",
     "m/s²": "g = m/s² / 9.80665",
+    "gal": "g = gal / 980.665",
+    "mGal": "g = mGal / 980665",
     "µT": "nT = µT · 1000",
     "mT": "nT = mT · 1e6",
     "gauss": "nT = gauss · 1e5",
@@ -66,6 +70,8 @@ FACTORS = {
     "rad": (180 / math.pi, 0.0),
     "mg": (1e-3, 0.0),
     "m/s²": (1 / STANDARD_GRAVITY, 0.0),
+    "gal": (1e-2 / STANDARD_GRAVITY, 0.0),
+    "mGal": (1e-5 / STANDARD_GRAVITY, 0.0),
     "µT": (1e3, 0.0),
     "mT": (1e6, 0.0),
     "gauss": (1e5, 0.0),
@@ -78,9 +84,9 @@ FACTORS = {
 """The same in numbers: factor, and what is added to the product."""
 _WARM = ("°C", "°F", "K")
 _MAGNETIC_UNITS = ("nT", "µT", "mT", "gauss", "mG")
-_GRAVITY_UNITS = ("g", "mg", "m/s²")
+_GRAVITY_UNITS = ("g", "mg", "m/s²", "gal", "mGal")
 WARMTH = "temperature_c"
-_STATED = {"ref", "reference", "local"}
+_STATED = {"ref", "reference", "local", "model", "igrf", "bggm", "wmm"}
 """Words of columns that are known, not measured."""
 _BYWORDS = _STATED | {
     *("true", "grid", "mag", "magnetic", "stand", "nominal", "target", "given", "set", "angle"),
@@ -254,6 +260,7 @@ _CASED = {
     "uT": " ut ",
     "mT": " millit ",
     "mG": " milligauss ",
+    "mGal": " mgal ",
     "mg": " millig ",
 }
 
@@ -296,6 +303,8 @@ def _resembled(name: str) -> Resemblance | None:
         return None
     if column in _CALLED_G and unit == "g" and name.rstrip(" )]").endswith("G"):
         unit = "gauss"
+    if column in _CALLED_G and unit == "mg":
+        unit = "mG"
     if not spread:
         implied = "°F" if "f" in (whole[-1:], bare[-1:]) and column == "temperature_c" else ""
         return Resemblance(column, unit or implied)
@@ -349,6 +358,11 @@ def _words(name: str) -> list[str]:
     for cased, word in _CASED.items():
         text = re.sub(rf"(?<![A-Za-z]){cased}(?![A-Za-z])", word, text)
     return [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", text)]
+
+
+def synonyms_of(column: str) -> list[str]:
+    """Words of three letters or more that a column is called by."""
+    return [word for word in _INSTEAD.get(column, "").split() if len(word) > 2]
 
 
 def begins_as(name: str) -> str:
@@ -422,7 +436,8 @@ def check_evidence(
         how += ", or name it under [columns] of the tool profile"
     raise InputError(
         f"{source}: the column {shown(name)} resembles '{resemblance.column}', which is absent, and would not "
-        f"be used.{which} {how}; if it is something else, give it a name that says so, or remove it.{likewise}"
+        f"be used.{which} {how}; if it is something else, name it under ignore in [table] of the tool profile, "
+        f"or give it a name that says so.{likewise}"
     )
 
 

@@ -28,8 +28,8 @@ FAULT = "#fault"
 
 
 def read(path: Path, profile: Profile) -> Table:
-    """The table of a run file under the names of the run file's columns."""
-    return runs.renamed(runs.read_export(path, profile, rows=runs.MOST_ROWS), profile)
+    """The rows of a run file that its laboratory has not rejected, under the names of the run file's columns."""
+    return runs.run_table(runs.read_export(path, profile, rows=runs.MOST_ROWS), profile)
 
 
 def serials(table: Table, otherwise: str) -> list[str]:

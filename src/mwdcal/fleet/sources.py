@@ -17,7 +17,7 @@ from urllib.parse import unquote
 import msgspec
 
 from mwdcal.calibration.readings import is_simulated
-from mwdcal.errors import InputError
+from mwdcal.errors import InputError, MwdcalError, QuestionError
 from mwdcal.files import contract, synonyms
 from mwdcal.files.contract import REFERENCES, magnetic_offset
 from mwdcal.files.formats import parquet
@@ -100,13 +100,14 @@ class FleetTable:
 
 @dataclass(frozen=True)
 class _File:
-    """What one file says: `text` of its serials, `offset` of its azimuths."""
+    """What one file says: `text` of its serials, `offset` of its azimuths, `remarks` on rows that are left out."""
 
     pieces: list[Piece]
     columns: tuple[str, ...]
     metadata: dict[str, object]
     text: bool
     offset: float
+    remarks: tuple[str, ...] = ()
 
 
 def open_source(
@@ -127,7 +128,8 @@ def open_source(
         _check_columns(files[0].columns, path.name)
     elif not path.is_dir() and (fault := dict(files[0].pieces[0].keys).get(FAULT)):
         raise InputError(str(fault))
-    source = _joined(path.name, files, _left_alone(others) if mixed else [])
+    notes = [*(_left_alone(others) if mixed else []), *(r for each in files for r in each.remarks)]
+    source = _joined(path.name, files, notes)
     if source.rows == 0:
         raise InputError(f"{path.name}: the table has no rows. Add one row per station.")
     largest = max(piece.rows for piece in source.pieces)
@@ -231,7 +233,7 @@ def _look_at_runs(file: Path, root: Path, profile: Profile) -> _File:
         run_files.run_of(table, stated[0])
         north = AZIMUTH in table.columns
         offset = magnetic_offset(table.metadata, table.source) if north else 0.0
-    except InputError as error:
+    except (InputError, QuestionError) as error:
         return _refused(file, str(serial), error)
     keys: Keys = ((RUN_FILE, str(file.resolve())),)
     if len(stated) == 1:
@@ -239,10 +241,11 @@ def _look_at_runs(file: Path, root: Path, profile: Profile) -> _File:
     known = msgspec.json.encode(profile).decode()
     piece = Piece(str(file.resolve()), stamp, 0, table.count, keys, profile=known)
     columns = tuple(dict.fromkeys((*table.columns, *dict(keys))))
-    return _File([piece], columns, dict(table.metadata), True, offset)
+    remarks = tuple(f"{file.name}: {remark}" for remark in table.remarks)
+    return _File([piece], columns, dict(table.metadata), True, offset, remarks)
 
 
-def _refused(file: Path, serial: str, error: InputError) -> _File:
+def _refused(file: Path, serial: str, error: MwdcalError) -> _File:
     """A file that cannot be read as a tool with one row."""
     path = str(file.resolve())
     keys: Keys = ((RUN_FILE, path), (SERIAL, serial), (FAULT, str(error)))

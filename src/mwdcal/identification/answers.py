@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Sequence
+from functools import cache
 
 import numpy as np
 
 from mwdcal.errors import Answer
 from mwdcal.files.contract import RAW, REFERENCES
-from mwdcal.files.synonyms import unit_of
-from mwdcal.geometry.vectors import Array
-from mwdcal.identification.words import spelled
+from mwdcal.files.synonyms import synonyms_of, unit_of
+from mwdcal.geometry.vectors import Array, Bools
+from mwdcal.identification.words import spelled, translated
 
+BOTH_UNITS = " and "
+"""What stands between two units of one column, of which one is wrong."""
 IN_BRACKETS = re.compile(r"[(\[]([^)\]]*)[)\]]\s*$")
 RANGES_BY_UNIT: dict[str, tuple[tuple[str, float, float], ...]] = {
-    "ref_gravity_g": (("g", 0.9, 1.1), ("m/s²", 9.0, 10.5), ("mg", 990.0, 1010.0)),
+    "ref_gravity_g": (
+        ("g", 0.9, 1.1), ("m/s²", 9.0, 10.5), ("mg", 990.0, 1010.0), ("mGal", 970_000.0, 990_000.0),
+    ),
     "ref_field_nt": (
         ("nT", 15_000.0, 80_000.0), ("µT", 15.0, 80.0), ("gauss", 0.15, 0.8), ("mT", 0.015, 0.08),
     ),
@@ -23,6 +28,9 @@ RANGES_BY_UNIT: dict[str, tuple[tuple[str, float, float], ...]] = {
 """Units of quantities of which the Earth has but one range of values; 980 may be milli-g or gal."""
 LEAST_ROLLS = 5
 """Toolfaces from which on their unit is told by their range."""
+_FILLER = re.compile(r"-?9{3,}(\.9+|\.25)?")
+_REGULAR = 0.8
+"""Share of equal steps of numbered rows."""
 _FEW = 4
 """Values of a column that a question shows."""
 _STEADY_DIP, _STEADY_FIELD = 3.0, 0.1
@@ -51,6 +59,26 @@ def with_values(words: str, values: Values, *names: str) -> str:
         known = cells[np.isfinite(cells)] if cells is not None else np.empty(0)
         few.append(first_values(known) or "no numbers")
     return f"{words}:  {'  |  '.join(few)}"
+
+
+def is_filler(values: Array) -> Bools:
+    """Which values (n,) are numbers that programs write where there is none: 9999.99, -999.25.
+
+    >>> is_filler(np.array([9999.99, -999.25, 99.0, 1000.0])).tolist()
+    [True, True, False, False]
+    """
+    return np.asarray([_FILLER.fullmatch(f"{value:.12g}") is not None for value in values], bool)
+
+
+def is_numbering(values: Array) -> bool:
+    """Whether numbers go on in equal steps but for a few, as those of rows and times do.
+
+    >>> is_numbering(np.array([1.0, 2, 3, 3, 4, 5, 6])), is_numbering(np.array([0.0, 90, 180, 270, 0, 90]))
+    (True, False)
+    """
+    steps = np.diff(values)
+    usual = float(np.median(steps)) if steps.size else 0.0
+    return usual != 0.0 and float(np.isclose(steps, usual).mean()) > _REGULAR
 
 
 def first_values(values: Array) -> str:
@@ -83,9 +111,9 @@ def triples_for(
     for place in range(len(numbers) - 2):
         three = [*numbers][place : place + 3]
         columns = np.stack([numbers[n] for n in three], -1)
-        norm, spread = np.linalg.norm(columns, axis=-1), np.ptp(columns, axis=0)
+        spread = np.ptp(columns, axis=0)
         if spread.min() > 0:
-            triples.append((float(np.std(norm) / spread.max()), three))
+            triples.append((_variation(columns) / float(spread.max()), three))
     return [
         Answer(
             with_values(", ".join(three), values, *three),
@@ -94,6 +122,15 @@ def triples_for(
         for variation, three in sorted(triples, key=lambda each: each[0])[:_MOST_TRIPLES]
         if variation <= most
     ]
+
+
+def _variation(columns: Array) -> float:
+    """The standard deviation of the distance (n,) of vectors (n, 3) from the centre of the sphere nearest to them."""
+    centred = columns - columns.mean(0)
+    design = np.column_stack([2 * centred, np.ones(len(centred))])
+    squares = np.sum(centred**2, -1)
+    middle, *_ = np.linalg.lstsq(design, squares, rcond=1e-9)
+    return float(np.std(np.linalg.norm(centred - middle[:3], axis=-1)))
 
 
 def in_units(name: str, column: str, allowed: Sequence[str]) -> list[Answer]:
@@ -106,6 +143,35 @@ def lacking_references(present: Collection[str]) -> list[str]:
     magnetic = () if {*present}.isdisjoint(RAW[3:]) else ("azimuth", "field", "dip")
     names = (REFERENCES[name].column for name in ("inclination", "toolface", *magnetic))
     return [column for column in names if column not in present]
+
+
+def is_near(column: str, name: str) -> bool:
+    """Whether a word of a name is one of a column's but for a letter, or two that are exchanged.
+
+    >>> [is_near("ref_dip_deg", n) for n in ("Dpi (°)", "Inklinatoin des Feldes", "Pos")]
+    [True, True, False]
+    """
+    words = re.findall(r"[^\W\d_]{3,}", spelled(IN_BRACKETS.sub("", name)).lower())
+    return any(_is_mistyped(word, each) for word in words for each in _words_of(column))
+
+
+@cache
+def _words_of(column: str) -> frozenset[str]:
+    """Words of three letters or more that say of a column that it is one of a run file's."""
+    return frozenset(synonyms_of(column)) | translated(column)
+
+
+def _is_mistyped(word: str, meant: str) -> bool:
+    """Whether a word is another one with one letter too many, too few or wrong, or two exchanged."""
+    if word == meant or abs(len(word) - len(meant)) > 1:
+        return False
+    first = next(
+        (k for k, (a, b) in enumerate(zip(word, meant, strict=False)) if a != b),
+        min(len(word), len(meant)),
+    )
+    one, two = word[first:], meant[first:]
+    exchanged = one[1::-1] + one[2:] == two and len(one) > 1
+    return exchanged or one[1:] == two or one == two[1:] or (len(word) > 3 and one[1:] == two[1:])
 
 
 def may_be(column: str, name: str, unit: str, values: Array | None) -> bool:
@@ -132,6 +198,5 @@ def may_be(column: str, name: str, unit: str, values: Array | None) -> bool:
         return least <= low and high <= most and high - low < _STEADY_FIELD * high
     if foreign or stated not in ("", "°", "rad", "gon") or high - low < _LEAST_TURN:
         return False
-    numbered = bool(np.allclose(np.diff(known), np.diff(known)[0]))
     inside = 0 <= low <= high <= 180 if "inclination" in column else -360 <= low <= high <= 360
-    return inside and not numbered
+    return inside and not is_numbering(known)

@@ -24,6 +24,7 @@ from mwdcal.files.synonyms import (
 )
 from mwdcal.geometry.vectors import Array
 from mwdcal.identification.answers import (
+    BOTH_UNITS,
     IN_BRACKETS,
     LEAST_ROLLS,
     RANGES_BY_UNIT,
@@ -33,6 +34,9 @@ from mwdcal.identification.answers import (
     channels_for,
     first_values,
     in_units,
+    is_filler,
+    is_near,
+    is_numbering,
     lacking_references,
     may_be,
     none_of,
@@ -61,13 +65,24 @@ _OTHER_NORTH = re.compile(
 _GRID_NORTH = re.compile(r"grid|gitter|[qc]uadr[ií]cula|kartnord|сетк|坐标北|网格", re.IGNORECASE)
 _OF_NORTH = re.compile(r"north|nord|norte|azi|azm|heading|азим|север|北|方位", re.IGNORECASE)
 """Words of the north that azimuths count from."""
+_TWICE = re.compile(r" \(\d+\)$")
+"""The end of a name that stands in a table more than once."""
 _NUMBERED = re.compile(r"(.*?[A-Za-z])[ _-]*([123])((?:\W.*|_[A-Za-z]+)?)")
+BY_NAME_ALONE = (WARMTH, REFERENCES["gravity"].column)
+"""Columns that a run may lack, and that values alone do not tell."""
 _TITLE = re.compile(
     r"(acc|mag|accelerometers?|magnetometers?)?(?:s|ref|sensors?)? +", re.IGNORECASE
 )
 """The title of a group of columns before the name of one."""
 _BARE_AZ = re.compile(r"az\W*(deg|°)?\W*", re.IGNORECASE)
 _BARE_AX = re.compile(r"a[xy]\b.*", re.IGNORECASE)
+_OF_LOGGER = re.compile(
+    r"\s*(?:channel|chan|ch|input|ai|kanal|eingang|canal|voie|канал|通道)\W*\d*\s*[(\[:]\s*"
+    r"([^()\[\]]+?)\s*[)\]]?(\s*[(\[].*)?",
+    re.IGNORECASE,
+)
+"""A channel of a logger, with what it is in brackets or behind a colon."""
+_BARE_T = re.compile(r"t\W*(°|deg)?\W*", re.IGNORECASE)
 _CCW = re.compile(
     r"\(?(counter|anti)[ -]?clockwise\)?|\bccw\b|gegen (den )?uhrzeiger\w*|против час\w*",
     re.IGNORECASE,
@@ -94,6 +109,11 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     """What a column holds by its name, and its unit, stated beside the name or in it."""
     if name in MAPPED:
         return Resemblance(name, unit_of(unit) or "".join(units_of(name)[:1]))
+    if both := _two_units(name, unit):
+        once = meaning(name)
+        return once and once._replace(unit=both if units_of(once.column) else unit)
+    logged = _OF_LOGGER.fullmatch(name)
+    name = f"{logged[1]}{logged[2] or ''}" if logged else name
     plain = spelled(f"{name} ({unit})" if unit else name)
     if "elevation" in plain:
         return Resemblance("ref_inclination_deg", BELOW if "below" in plain else ABOVE)
@@ -113,6 +133,14 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     return alike or (Resemblance(spelt, unit_of(stated[1]) if stated else "") if spelt else None)
 
 
+def _two_units(name: str, unit: str) -> str:
+    """The units by a name, by the row below it and by its cells in words, if two of them differ; else empty."""
+    bracketed = IN_BRACKETS.search(spelled(name))
+    by_name = unit_of(bracketed[1]) if bracketed else ""
+    every = dict.fromkeys(filter(None, [by_name, *map(unit_of, spelled(unit).split(BOTH_UNITS))]))
+    return BOTH_UNITS.join(every) if len(every) > 1 and {*every} != {"g", "gauss"} else ""
+
+
 def _without_title(name: str) -> Resemblance | None:
     """What a name resembles behind the title of its group, which says no other triad: Accelerometers Gx (V)."""
     title = _TITLE.match(name)
@@ -130,19 +158,35 @@ def meanings_of(names: Sequence[str], units: Sequence[str]) -> dict[str, Resembl
     there is a Neigung.
     """
     numbered = _numbered(names)
-    results = {
-        name: m
-        for name, unit in zip(names, units, strict=True)
-        if (m := meaning(numbered.get(name, name), unit))
+    bare = {name: _TWICE.sub("", name) for name in names}
+    once = {
+        name: numbered.get(name, base if base in names else name) for name, base in bare.items()
     }
-    lone = [n for n, m in results.items() if m.column == "az" and _BARE_AZ.fullmatch(n)]
-    if lone and not any(_BARE_AX.fullmatch(n) for n in names):
+    results = {
+        name: m for name, unit in zip(names, units, strict=True) if (m := meaning(once[name], unit))
+    }
+    every = [n for n, m in results.items() if m.column == "az"]
+    lone = [n for n in every if _BARE_AZ.fullmatch(n)]
+    triad = [n for n in every if n not in lone[:1]] or any(_BARE_AX.fullmatch(n) for n in names)
+    if lone and (not triad or (len(every) == 2 and _follows(names, every, lone[0], results))):
         results[lone[0]] = Resemblance("ref_azimuth_deg", "°")
     inclined = [n for n, m in results.items() if m.column == "ref_inclination_deg"]
     dips = [n for n in inclined if re.search("inklination", n, re.IGNORECASE)]
     if len(dips) == 1 and any(re.search("neigung", n, re.IGNORECASE) for n in inclined):
         results[dips[0]] = results[dips[0]]._replace(column="ref_dip_deg")
     return results
+
+
+def _follows(
+    names: Sequence[str], every: Sequence[str], lone: str, meanings: Mapping[str, Resemblance]
+) -> bool:
+    """Whether of two columns that may be az the other one stands behind ax and ay, and the `lone` one does not."""
+    behind = {
+        name: [meanings[n].column for n in names[max(k - 2, 0) : k] if n in meanings]
+        == ["ax", "ay"]
+        for k, name in enumerate(names)
+    }
+    return not behind[lone] and all(behind[name] for name in every if name != lone)
 
 
 def _numbered(names: Sequence[str]) -> dict[str, str]:
@@ -192,6 +236,11 @@ class Questions(list[QuestionError]):
             self.append(question)
             return None
 
+    def believed(self) -> set[str]:
+        """The columns of a table that the first answers to open questions take."""
+        first = [each.answers[0].arguments for each in self if each.answers]
+        return {value.partition("=")[2] for arguments in first for _, value in arguments}
+
     def raise_any(self, source: str) -> None:
         """Raise all questions together."""
         if self:
@@ -204,17 +253,18 @@ def proposed(
     values: Values,
     source: str,
     above: Sequence[str] = (),
-    north_is_stated: bool = False,
+    stated: Mapping[str, object] | None = None,
     answers: Mapping[str, str] | None = None,
-    problems: Mapping[str, str] | None = None,
+    problems: Mapping[str, QuestionError] | None = None,
+    besides: Sequence[QuestionError] = (),
 ) -> tuple[dict[str, ColumnSource], set[str], dict[str, str]]:
     """The columns of a table by the name that they have in a run file, and those with a unit by their values.
 
     And columns that are no evidence although they are called so, each with the reason.
 
-    `above`: lines above the names. `north_is_stated`: the table's metadata say what azimuths count from. `answers`:
-    columns of the table by the name of the run file, as the user says. `problems`: what is wrong with columns of
-    which `values` gave none although most of their cells are numbers.
+    `above`: lines above the names. `stated`: what the table says of itself, as metadata. `answers`: columns of the
+    table by the name of the run file, as the user says. `problems`: what is wrong with columns of which `values` gave
+    none although most of their cells are numbers. `besides`: questions that are open as well.
 
     Raises:
         InputError: an answer that names no column.
@@ -223,26 +273,33 @@ def proposed(
     """
     meanings = meanings_of(names, units)
     _tell_dip(meanings, values)
-    said = answers or {}
+    _tell_temperature(meanings, names, units, values)
+    said, known = answers or {}, stated or {}
+    _tell_numbers(meanings, values, said)
     ignored = _no_evidence(meanings, values, said)
     _answered(said, names, meanings, source)
-    questions = Questions()
+    questions = Questions(besides)
+    damaged = {} if problems is None else problems  # filled while values are read
     spoken = _spoken(meanings, values, above)
-    chosen = _chosen(meanings, values, problems or {}, spoken, ignored, questions, source)
+    chosen = _chosen(meanings, values, damaged, spoken, ignored, said, questions, source)
     azimuth = chosen.get(REFERENCES["azimuth"].column)
-    if azimuth and not north_is_stated:
+    if azimuth and "azimuth_reference" not in known and not north_of(azimuth.name, above, known):
         questions.ask(_check_north, azimuth.name, above, source)
     for triad, channels in CHANNELS.items():
         if not {*channels} & {*chosen, *said}:
             others = [n for n in names if n not in meanings]
             questions.ask(_check_hidden, triad, channels, others, values, source)
-    if not any("channels of the accelerometer" in each.text for each in questions):
+    hidden = any("channels of the accelerometer" in each.text for each in questions)
+    if not hidden and not any(n in damaged for n, m in meanings.items() if m.column in RAW):
         questions.ask(_check_triads, names, values, chosen, source)
     questions.ask(_check_units_of_triads, chosen, source)
     if not {*RAW[3:]} & {*chosen, *said}:
-        questions.ask(_check_nameless, names, meanings, values, chosen, source)
+        believed = questions.believed()
+        others = [n for n in names if n not in meanings and n not in believed]
+        questions.ask(_check_nameless, others, values, {*chosen, *known}, source)
     rest = {n: u for n, u in zip(names, units, strict=True) if n not in meanings}
-    for column in lacking_references({*chosen, *said}):
+    lacking = [*lacking_references({*chosen, *said, *known}), *BY_NAME_ALONE]
+    for column in (each for each in lacking if each not in {*chosen, *said, *known}):
         questions.ask(_check_lacking, column, rest, values, source)
     questions.raise_any(source)
     by_value = {c for c, each in chosen.items() if each.unit and not meanings[each.name].unit}
@@ -254,9 +311,10 @@ def proposed(
 def _chosen(
     meanings: Mapping[str, Resemblance],
     values: Values,
-    problems: Mapping[str, str],
+    problems: Mapping[str, QuestionError],
     spoken: str,
     ignored: Collection[str],
+    said: Collection[str],
     questions: Questions,
     source: str,
 ) -> dict[str, ColumnSource]:
@@ -268,11 +326,14 @@ def _chosen(
         candidates = [n for n in candidates if n not in ignored]
         damaged = [problems[n] for n in alike if n in problems]
         if damaged and not _stated_among(candidates):
-            questions += map(QuestionError, damaged)
+            questions += damaged
         name = questions.ask(_one, column, candidates, values, source) if candidates else None
         if name:
             stated = meanings[name].unit or _angles(column, spoken)
-            unit = questions.ask(_unit, column, name, stated, values(name), source)
+            cells = values(name)
+            unit = questions.ask(_unit, column, name, stated, cells, source)
+            if unit and stated and column not in said:
+                questions.ask(_check_range, column, name, unit, cells, source)
             chosen[column] = ColumnSource(name=name, unit=unit or "")
     return chosen
 
@@ -321,6 +382,34 @@ def _tell_dip(meanings: dict[str, Resemblance], values: Values) -> None:
         meanings[steady[0]] = Resemblance(REFERENCES["dip"].column, "°")
 
 
+def _tell_numbers(
+    meanings: dict[str, Resemblance], values: Values, answers: Collection[str]
+) -> None:
+    """A column of serials that number the rows is one of stations: S/N 1, 2, 3."""
+    for name, m in meanings.items():
+        cells = values(name) if m.column == "serial" and "serial" not in answers else None
+        if cells is not None and cells.size > LEAST_ROLLS and is_numbering(cells):
+            meanings[name] = Resemblance("station")
+
+
+def _tell_temperature(
+    meanings: dict[str, Resemblance], names: Sequence[str], units: Sequence[str], values: Values
+) -> None:
+    """A column T is the temperature by its values, where no other is called so."""
+    if any(m.column == WARMTH for m in meanings.values()):
+        return
+    lone = [
+        n
+        for n, unit in zip(names, units, strict=True)
+        if n not in meanings and _BARE_T.fullmatch(f"{n} {unit}".strip())
+    ]
+    cells = values(lone[0]) if len(lone) == 1 else None
+    known = cells[np.isfinite(cells)] if cells is not None else np.empty(0)
+    known = known[~is_filler(known)]
+    if known.size and np.all(np.abs(known - 70) <= 130) and not is_numbering(known):
+        meanings[lone[0]] = Resemblance(WARMTH)
+
+
 def _is_total(column: str, name: str, meanings: Mapping[str, Resemblance], values: Values) -> bool:
     """Whether a column of a strength is computed from the channels: in their raw unit, or equal to their norm."""
     triad = {"ref_gravity_g": "accelerometer", "ref_field_nt": "magnetometer"}.get(column)
@@ -338,11 +427,14 @@ def _is_total(column: str, name: str, meanings: Mapping[str, Resemblance], value
 
 
 def _check_lacking(column: str, others: Mapping[str, str], values: Values, source: str) -> None:
-    """Ask whether columns that are not understood, with their units, are a reference that is absent."""
-    fits = [
+    """Ask whether columns that are not understood are one that is absent, by a mistyped name or by unit and values."""
+    numbers = {n: values(n) for n in others if not _MEASURED.search(spelled(n))}
+    near = [n for n, cells in numbers.items() if cells is not None and is_near(column, n)]
+    by_values = column not in BY_NAME_ALONE
+    fits = near + [
         n
-        for n, unit in others.items()
-        if not _MEASURED.search(spelled(n)) and may_be(column, n, unit, values(n))
+        for n, cells in numbers.items()
+        if by_values and n not in near and may_be(column, n, others[n], cells)
     ]
     if fits:
         raise QuestionError(
@@ -419,17 +511,12 @@ def _check_hidden(
 
 
 def _check_nameless(
-    names: Sequence[str],
-    meanings: Mapping[str, Resemblance],
-    values: Values,
-    chosen: Mapping[str, ColumnSource],
-    source: str,
+    unused: Sequence[str], values: Values, known: Collection[str], source: str
 ) -> None:
-    """Ask whether three columns of a steady norm are magnetometers, in a table with references of a field."""
+    """Ask whether three unused columns of a steady norm are magnetometers, in a table with references of a field."""
     of_field = [REFERENCES[name].column for name in ("field", "dip", "azimuth")]
-    if not {*of_field} & {*chosen}:
+    if not {*of_field} & {*known}:
         return
-    unused = [n for n in names if n not in meanings]
     if triples := triples_for(RAW[3:], unused, values, STEADY_NORM):
         raise QuestionError(
             f"{source}: no column is a magnetometer by its name, and the table states the field. Are these the "
@@ -442,12 +529,17 @@ def _check_units_of_triads(chosen: Mapping[str, ColumnSource], source: str) -> N
     """Refuse channels of a triad, or their standard uncertainties, of which two state different units."""
     for names in CHANNELS.values():
         columns = [*names, *(f"sd_{name}" for name in names)]
-        stated = [chosen[c] for c in columns if c in chosen and chosen[c].unit]
-        other = next((each for each in stated if each.unit != stated[0].unit), None)
-        if other:
+        stated = {c: chosen[c] for c in columns if c in chosen and chosen[c].unit}
+        units = [*dict.fromkeys(each.unit for each in stated.values())]
+        if len(units) > 1:
+            first, other = (next(e for e in stated.values() if e.unit == u) for u in units[:2])
             raise QuestionError(
-                f"{source}: {shown(stated[0].name)} is in {stated[0].unit}, {shown(other.name)} in {other.unit}. "
-                "Give the channels of a triad in one unit: their scale is one."
+                f"{source}: {shown(first.name)} is in {first.unit}, {shown(other.name)} in {other.unit}. The channels "
+                "of a triad have one scale. Which unit are all of them in?",
+                [
+                    Answer(u, tuple(("column", f"{c}={e.name} ({u})") for c, e in stated.items()))
+                    for u in units
+                ],
             )
 
 
@@ -472,6 +564,17 @@ def _check_north(name: str, above: Sequence[str], source: str) -> None:
             Answer("magnetic north after all", (("north", "magnetic"),)),
         ],
     )
+
+
+def north_of(name: str, above: Sequence[str], stated: Mapping[str, object]) -> str:
+    """The north that azimuths count from where their name or a line says it, and all that it takes is stated."""
+    line = next((a for a in above if _OTHER_NORTH.search(a) and _OF_NORTH.search(a)), "")
+    text = f"{line} {name} {spelled(name)}"
+    if not _OTHER_NORTH.search(text):
+        return ""
+    north = "grid" if _GRID_NORTH.search(text) else "true"
+    needed = ("declination_deg",) if north == "true" else ("declination_deg", "convergence_deg")
+    return north if {*needed} <= {*stated} else ""
 
 
 def _one(column: str, candidates: Sequence[str], values: Values, source: str) -> str:
@@ -502,23 +605,56 @@ def _unit(column: str, name: str, stated: str, values: Array | None, source: str
     if stated:
         if stated in allowed:
             return stated
+        if BOTH_UNITS in stated:
+            raise QuestionError(
+                f"{source}: {shown(name)} is in {stated}: its name, the row below it and its cells say different "
+                "units. Which one holds?",
+                in_units(name, column, [u for u in allowed if u in stated.split(BOTH_UNITS)]),
+            )
         raise QuestionError(
             f"{source}: {shown(name)} is '{column}' by its name, and in {stated}, which is not one of "
             f"{', '.join(allowed)}.",
             [*in_units(name, column, allowed), none_of(column)],
         )
-    known = values[np.isfinite(values)]
+    return _unit_by_values(column, name, values[np.isfinite(values)], source)
+
+
+def _unit_by_values(column: str, name: str, known: Array, source: str) -> str:
+    """The only unit that values of a column can be in."""
+    allowed = units_of(column)
     if column in RANGES_BY_UNIT and known.size:
         for unit, low, high in RANGES_BY_UNIT[column]:
             if low <= known.min() and known.max() <= high:
                 return unit
         raise _open(name, column, allowed, known, source)
+    if allowed[0] == "°" and 360 < np.abs(known).max(initial=0) <= 400:
+        raise _open(name, column, ("gon", "°"), known, source)
     both = {"°": _maybe_radians, "°C": _maybe_fahrenheit}.get(allowed[0])
     if both and known.size and both(known):
         if allowed[0] == "°C" and (usual := setting("temperature_unit")):
             return usual
         raise _open(name, column, allowed, known, source)
     return allowed[0]
+
+
+def _check_range(column: str, name: str, unit: str, values: Array | None, source: str) -> None:
+    """Ask about values that cannot be in the unit stated, and can be in another."""
+    known = values[np.isfinite(values)] if values is not None else np.empty(0)
+    if not known.size:
+        return
+    ranges = {u: (low, high) for u, low, high in RANGES_BY_UNIT.get(column, ())}
+    fits = [u for u, (low, high) in ranges.items() if low <= known.min() and known.max() <= high]
+    turns = column in (REFERENCES["azimuth"].column, REFERENCES["toolface"].column)
+    if unit == "°" and turns and known.size > LEAST_ROLLS and _maybe_radians(known):
+        fits = ["rad"] if np.ptp(known) > 3 else []
+    if unit == "°C" and known.min() > HOTTEST_CELSIUS:
+        fits = ["K"]
+    if fits and unit not in fits:
+        raise QuestionError(
+            f"{source}: {shown(name)} is in {unit}, and its values ({first_values(known)}) are those of "
+            f"{' or '.join(fits)}. Which unit holds?",
+            in_units(name, column, [*fits, unit]),
+        )
 
 
 def _maybe_radians(angles: Array) -> bool:

@@ -8,31 +8,38 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 
-from mwdcal.calibration.diagnosis.findings import unused_columns
+from mwdcal.calibration.diagnosis.findings import MARKED_ROWS, unused_columns
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import Finding
 from mwdcal.errors import Answer, FitError, InputError, QuestionError
 from mwdcal.files.contract import CHANNELS, MAPPED, REFERENCES, units_of
 from mwdcal.files.formats import table as tables
-from mwdcal.files.formats.columns import LABELS, shown
+from mwdcal.files.formats.columns import LABELS, looks_numeric, shown
 from mwdcal.files.formats.figures import is_figure
 from mwdcal.files.formats.layout import WORKBOOKS, Layout
 from mwdcal.files.formats.table import Table
 from mwdcal.files.formats.table import labels as labels_of
 from mwdcal.files.formats.text import is_preamble
+from mwdcal.files.marks import UNMARKED, marks_in, without_rejected
 from mwdcal.files.metadata import toml
 from mwdcal.files.profiles import CHOICE_OF_AXES
-from mwdcal.files.runs import check_run, renamed, to_readings
+from mwdcal.files.runs import STATED_REFERENCES, check_run, renamed, to_readings
 from mwdcal.files.statements import stated_table
 from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
-from mwdcal.identification.columns import meanings_of, proposed
+from mwdcal.identification.columns import meanings_of, north_of, proposed
+from mwdcal.identification.rows import (
+    check_cells,
+    check_columns_of_rows,
+    question_on_cells,
+    question_on_mark,
+)
 from mwdcal.identification.wiring import LEAST_STATIONS, Wiring, is_clear, wiring
 from mwdcal.sensor.profile import ColumnSource, Profile, TableFormat, TriadProfile
 
@@ -49,7 +56,7 @@ LAST_PLACES = (0.1, 0.01, 0.001)
 """Units in the last place of angles, degrees."""
 SAME_GRAVITY = 2e-4
 """A local gravity does not differ by more between stations, g; what tools measure does."""
-_SELDOM = ("ignore", "azimuth_reference", "declination_deg", "convergence_deg")
+_SELDOM = ("ignore", "azimuth_reference", "declination_deg", "convergence_deg", "leave_out", "keep")
 MOST_NAMED = 6
 """Alternatives that a message names."""
 
@@ -65,7 +72,8 @@ class OpenAxes(NamedTuple):
 class Proposal(NamedTuple):
     """A profile, how the axes of each triad in it were told, and the run that told.
 
-    `unused` are columns of the table that are nothing of a run file, `by_value` columns of a run file whose
+    `unused` are columns of the table that are nothing of a run file, `remarks` sentences on rows that are left out,
+    `by_value` columns of a run file whose
     unit no name states; `metadata` what the table says of itself; `where` the table was, if it was looked for;
     `open_axes` the triads of which the run does not tell the axes, `ignored` columns that are called as references
     and are none, each with the reason.
@@ -75,6 +83,7 @@ class Proposal(NamedTuple):
     wirings: dict[str, Wiring]
     stations: int
     unused: tuple[str, ...]
+    remarks: tuple[str, ...]
     by_value: set[str]
     metadata: Mapping[str, object]
     run_sha256: str
@@ -92,12 +101,14 @@ def propose(
     answers: Mapping[str, str] | None = None,
     stated: Mapping[str, object] | None = None,
     north: Mapping[str, object] | None = None,
+    leave_out: Mapping[str, Sequence[str]] | None = None,
+    keep: Mapping[str, Sequence[str]] | None = None,
 ) -> Proposal:
     """The profile with which a table of stations at known attitudes is a calibration run.
 
     `sheet`, `header_row` and `decimal` say where the table is and how its numbers are written, `answers` which
     column holds what, `stated` what the table does not say of the tool, as metadata, `north` what its azimuths count
-    from, as metadata too.
+    from, as metadata too; `leave_out` and `keep` which rows are rejected by the texts of a column, and which are not.
 
     Raises:
         InputError: the file cannot be read, or is no table of stations.
@@ -106,42 +117,53 @@ def propose(
     where = tables.laid_out(path, sheet=sheet, header_row=header_row, decimal=decimal)
     table, form = _as_written(path, where, bool(sheet or header_row or decimal))
     table = replace(table, metadata={**table.metadata, **(stated or {}), **(north or {})})
-    if north:
-        form = msgspec.structs.replace(form or TableFormat(find=True), **north)
+    check_columns_of_rows(table, {**(leave_out or {}), **(keep or {})})
+    place = {"header_line": header_row} if header_row else {}
+    said = {**place, **(north or {}), "leave_out": leave_out or {}, "keep": keep or {}}
+    form = _with(form, {key: value for key, value in said.items() if value not in ({}, None)})
     names = where.names if where else [*table.columns]
     units = where.units if where else [""] * len(names)
-
-    problems: dict[str, str] = {}
-    above, stated_north = where.above if where else (), "azimuth_reference" in table.metadata
+    table, open_rows = _without_rejected(table, form, names, units)
+    problems: dict[str, QuestionError] = {}
+    above = where.above if where else ()
+    values = partial(_numbers_of, table, problems)
     columns, by_value, ignored = proposed(
-        names,
-        units,
-        partial(_numbers_of, table, problems),
-        table.source,
-        above,
-        stated_north,
-        answers,
-        problems,
+        names, units, values, table.source, above, table.metadata, answers, problems, open_rows
     )
-    if ignored:
-        form = msgspec.structs.replace(form or TableFormat(find=True), ignore=tuple(ignored))
+    check_cells(table, columns)
+    table, form = _with_north(table, form, columns, above)
+    form = _with(form, {"ignore": tuple(ignored)} if ignored else {})
     table = _of_one_tool(table, columns, stated or {})
     profile = Profile(name=Path(path).stem, table=form or msgspec.UNSET, columns=columns)
-    profile, readings, wirings, open_axes = _wired(table, profile)
+    profile, readings, wirings, open_axes = _wired_by_elevation(table, profile)
     name, triads = str(readings.metadata.get("serial", Path(path).stem)), _triads(readings, wirings)
     profile = msgspec.structs.replace(profile, name=name, **triads)
     return Proposal(
-        _without_the_usual(profile),
-        wirings,
-        readings.count,
-        readings.unused,
-        by_value,
-        readings.metadata,
-        readings.run_sha256,
-        where,
-        open_axes,
-        ignored,
-    )
+        _without_the_usual(profile), wirings, readings.count, readings.unused, readings.remarks, by_value,
+        readings.metadata, readings.run_sha256, where, open_axes, ignored,
+    )  # fmt: skip
+
+
+def _with(form: TableFormat | None, fields: Mapping[str, Any]) -> TableFormat | None:
+    """How tables are written, with more of it; without it as documented."""
+    return msgspec.structs.replace(form or TableFormat(find=True), **fields) if fields else form
+
+
+def _with_north(
+    table: Table,
+    form: TableFormat | None,
+    columns: Mapping[str, ColumnSource],
+    above: Sequence[str],
+) -> tuple[Table, TableFormat | None]:
+    """The table and its form with the north of its azimuths, where names and a declination above it tell it."""
+    azimuth = columns.get(REFERENCES["azimuth"].column)
+    if azimuth is None or "azimuth_reference" in table.metadata:
+        return table, form
+    north = north_of(azimuth.name, above, table.metadata)
+    if not north:
+        return table, form
+    metadata = {**table.metadata, "azimuth_reference": north}
+    return replace(table, metadata=metadata), _with(form, {"azimuth_reference": north})
 
 
 def _of_one_tool(
@@ -160,13 +182,30 @@ def _of_one_tool(
     return stated_table(table, {"serial": serial} if len(tools) > 1 else {}, column)
 
 
-def _numbers_of(table: Table, problems: dict[str, str], name: str) -> Array | None:
+def _without_rejected(
+    table: Table, form: TableFormat | None, names: Sequence[str], units: Sequence[str]
+) -> tuple[Table, list[QuestionError]]:
+    """The rows of a table that are not marked as rejected, and a question on each mark that is not plain."""
+    meanings = meanings_of(names, units)
+    used = [n for n, m in meanings.items() if m.column in UNMARKED]
+    marks = marks_in(table, form or TableFormat(), used)
+    questions = [
+        question_on_mark(table, name, cell, rows) for (name, cell), rows in marks.doubtful.items()
+    ]
+    return without_rejected(table, form or msgspec.UNSET, used), questions
+
+
+def _numbers_of(table: Table, problems: dict[str, QuestionError], name: str) -> Array | None:
     """The numbers of a column; None where it has none, with the problem where most of its cells are numbers."""
     try:
         return tables.numbers(table, name)
-    except InputError as error:
-        if 2 * sum(map(is_figure, labels_of(table, name))) > table.count:
-            problems[name] = str(error)
+    except InputError:
+        cells = labels_of(table, name)
+        wrong = [
+            cell for cell in dict.fromkeys(cells) if cell and not looks_numeric(cell, table.decimal)
+        ]
+        if wrong and 2 * sum(map(is_figure, cells)) > table.count:
+            problems[name] = question_on_cells(table, name, cells.index(wrong[0]), wrong)
         return None
 
 
@@ -206,6 +245,24 @@ def _wired(
         }
         return _wired(table, msgspec.structs.replace(profile, columns=below))
     return profile, readings, wirings, open_axes
+
+
+def _wired_by_elevation(
+    table: Table, profile: Profile
+) -> tuple[Profile, Readings, dict[str, Wiring], dict[str, OpenAxes]]:
+    """The same, with an elevation that counts downwards where the readings fit no other."""
+    columns, name = profile.columns, REFERENCES["inclination"].column
+    assert not isinstance(columns, msgspec.UnsetType)
+    elevated = name in columns and columns[name].unit == ABOVE
+    try:
+        result = _wired(table, profile)
+        if not elevated or not result[3]:
+            return result
+    except FitError:
+        if not elevated:
+            raise
+    below = {**columns, name: ColumnSource(name=columns[name].name, unit=BELOW)}
+    return _wired(table, msgspec.structs.replace(profile, columns=below))
 
 
 def _is_left_handed(result: Wiring) -> bool:
@@ -473,7 +530,8 @@ def findings_on(proposal: Proposal) -> list[Finding]:
         Finding(id="not-used", text=f"{shown(name)} is not used: {reason}.")
         for name, reason in proposal.ignored.items()
     ]
-    known = axes_open(proposal) + left_handed(proposal)
+    marked = [Finding(id=MARKED_ROWS, text=text) for text in proposal.remarks]
+    known = axes_open(proposal) + left_handed(proposal) + marked
     return known + ignored + unused_columns(proposal.unused)
 
 
@@ -537,6 +595,17 @@ def _open_section(kind: str, axes: OpenAxes, unit: str) -> list[str]:
         "axes = []",
         *scale,
     ]
+
+
+def stated_references(proposal: Proposal) -> dict[str, float]:
+    """The references that the table states once for all stations, in units of a run file."""
+    columns = proposal.profile.columns
+    named = {} if isinstance(columns, msgspec.UnsetType) else columns
+    return {
+        column: float(str(proposal.metadata[column]))
+        for column in (REFERENCES[name].column for name in STATED_REFERENCES)
+        if column in proposal.metadata and column not in named
+    }
 
 
 def in_order(columns: dict[str, ColumnSource]) -> list[tuple[str, ColumnSource]]:

@@ -5,12 +5,17 @@ from __future__ import annotations
 import re
 import unicodedata
 
-_LATIN = str.maketrans({"ø": "o", "Ø": "O", "æ": "ae", "ß": "ss", "ł": "l"})
+from mwdcal.files.synonyms import resembled
+
+_LATIN = str.maketrans({"ø": "o", "Ø": "O", "æ": "ae", "ß": "ss", "ł": "l", "ı": "i", "İ": "i"})
 """Letters that do not come apart into a plain letter and a mark."""
 _ELEVATION = r"\b(elev(ation)?|elevacion|inc\w* (from|to|above|over) (the )?horiz\w*|pitch)\b"
 """Names of angles that count from the horizontal."""
 TRANSLATIONS = (
     (r"(roll|rulle|dreh)[ _-]?(sett?|gruppe|satz)|\bsett\b|serie de giro|серия|组号", "group "),
+    (r"\bdeg(rees|\.)? ?(m|mag)\b", "deg"),
+    (r"\bdeg(rees|\.)? ?(t|true)\b", "true deg"),
+    (r"\bdeg(rees|\.)? ?(g|grid)\b", "grid deg"),
     (r"\|\s*b\s*\|", "Btotal"),
     (r"\|\s*g\s*\|", "Gtotal"),
     (r"pruf(?=stand)|mess(?=stand)", ""),
@@ -21,21 +26,33 @@ TRANSLATIONS = (
     (r"tran(s|sverse|sversal)?[ _]*1", "X "),
     (r"tran(s|sverse|sversal)?[ _]*2", "Y "),
     (
-        r"hoehenwinkel|hohenwinkel|elevasjon|neigung.*horizontal\w*|угол места|仰角|" + _ELEVATION,
+        r"hoehenwinkel|hohenwinkel|elevasjon|stupning|neigung.*horizontal\w*|угол места|仰角|"
+        + _ELEVATION,
         "elevation ",
     ),
     (
+        r"manyetik egim|inklinacja( pola| magn\w*)?|magn\w* inklinacio|inclinazione magn\w*|magn\w* inclinatie|"
+        r"magn\w* (inklination|lutning)|inklinasi( magnet\w*)?|伏角|"
         r"(угол )?(магнитн\w* )?наклонени[ея]|(地磁|磁)倾角?|incl\w*\.? magn\w*\.?|"
         r"(magn\w*|felt|feld|field) ?[-_ ]?inkl\w*|mergulho( magn\w*)?|echado|buzamiento|(field|magnetic) inclination",
         "dip ",
     ),
     (
-        r"neigung|inklination|inclinaison|inclinaca?o|inclinacion|zenith( angle)?|drift angle|deviation angle|"
+        r"kipp(achse|winkel)|schwenkachse|\btilt\b|inclinazione|inclinatie|helling|haeldning|hældning|lutning|"
+        r"(kat )?odchylenia|(kat )?nachylenia|ferdeseg|dolesszog|egim|kemiringan|傾斜角?|зен\w*\.?( угол\w*)?|"
+        r"neigung(swinkel)?|desviacion|sapma( acisi)?|inklination|inclinaison|inclinaca?o|"
+        r"inclinacion|zenith( angle)?|drift angle|deviation angle|"
         r"inklinasjon|helning|зенит\w*( угол)?|наклон(?!ен)|井斜角?|倾角",
         "inclination ",
     ),
-    (r"азимут|asimut|azimute?(?!h)|acimut|方位角?|rumbo|richtung(?!swinkel)|peilung", "azimuth "),
     (
+        r"drehtisch|turn ?table|rotary table|baring|azymut|yonelim|азимут|asimut|azimute?(?!h)|acimut|方位角?|rumbo|"
+        r"richtung(?!swinkel)|peilung",
+        "azimuth ",
+    ),
+    (
+        r"rollachse|roll axis|\brulle?\b|rullning|rotasi|(kat )?ustawienia narzedzia|takim yuzu|szerszamallas|"
+        r"gereedschapsvlak|v(ae|æ)rkt(o|ø)jsflade|faccia utensile|ツールフェース|回転角|угол поворота|"
         r"rollwinkel|roll angle|werkzeug(winkel|lage|flache)|verdrehung|verdrehwinkel|drehwinkel|rotasjon|rulle?vinkel|"
         r"verktoy(flate|vinkel)\w*|(face|angulo) d[ae] ferramenta|(face|angle)( d[e'])? ?(l'?)?outil|"
         r"ghsf?\b|угол установки( отклонител\w*)?|визир\w*( угол)?|"
@@ -44,42 +61,64 @@ TRANSLATIONS = (
         "toolface ",
     ),
     (
+        r"przysp(ieszenie)?\b\.?|gyorsulas(mero)?|ivme\w*|versn(elling)?\b\.?|accelerazione|"
+        r"accelerometro|percepatan|加速度|γ|"
         r"beschleunigung\w*|beschl\b\.?|akselerasjon|akselerometer|akselero|aceleracion|acelerometro|acel\b|"
         r"aceleracao|accelerometre|acceleration|\bac\.|ускорен\w*|акселерометр\w*|акс\b|\baks\b|加速度计?|加计|加表",
         "acc ",
     ),
     (
+        r"pole magn\w*\.?(?=[ _]*[xyz])|magneses(?=[ _]*[xyz])|manyetik(?=[ _]*[xyz])|magneetveld(?=[ _]*[xyz])|"
+        r"medan(?=[ _]*[xyz])|磁気(?=[ _]*[xyz])|magnetfalt(?=[ _]*[xyz])|campo(?=[ _]*[xyz]\b)|"
         r"magnetometre|magn\b\.?(?=[ _]*[xyz]\b)|magnetfeld(?=[ _]*[xyz])|magnetfelt(?=[ _]*[xyz])|"
-        r"magnetometro|magnetometers?|магнитометр\w*|магн\b|феррозонд\w*|磁力计|磁通门|磁强计|"
-        r"campo magnetico(?=[ _]*[xyz])|campo mag(?=[ _]*[xyz])|"
-        r"flux[ _-]*gates?|磁场(?=[ (（_]*[xyz])",
+        r"magnetometro|magnetometr(?=[ _]*[xyz])|magnetometers?|магнитометр\w*|магн\b|феррозонд\w*|磁力计|"
+        r"磁通门|磁强计|campo magnetico(?=[ _]*[xyz])|campo mag(?=[ _]*[xyz])|"
+        r"\bmtm\b|磁(?=[ _]*[xyz])|flux[ _-]*gates?|磁场(?=[ (（_]*[xyz])",
         "mag ",
     ),
     (
+        r"natezenie pola|pole calkow\w*|calkowite pole|(teljes )?terero|toplam alan|totaalveld|"
+        r"campo totale|medan total|全磁力|"
         r"feldstarke|gesamtfeld|totalfeld|totalfelt|champ( magn\w*)?( total)?|campo (total|local|magn\w*)|"
         r"intensidad total|полн\w* (магн\w* )?(поле|вектор\w*)|"
         r"модуль (магн\w*|поля)|总磁场(强度)?|磁场强度|总场|totalintensitat",
         "total field ",
     ),
     (
+        r"zwaartekracht|yercekimi|nehezsegi gyorsulas|gravita\b|gravitasi\b|tyngdkraft|"
         r"schwere|gravitation|pesanteur|tyngde\w*|gravedad|gravidade|сила тяжести|重力(加速度)?",
         "gravity ",
     ),
     (r"нтл", "nT"),
     (r"мктл", "uT"),
-    (r"(?<![a-zа-я])(градус\w*|град|grados|graus|grader|grad)(?![a-zа-я])|度(?=[)）]?$)", "deg"),
+    (r"мгс(?![а-я])", "mG"),
+    (r"(?<![а-я])гс(?![а-я])", "gauss"),
+    (
+        r"(?<![a-zа-я])(градус\w*|град|grados|graus|graden|gradi|grader|grad|derajat|derece|"
+        r"stopni?e?|fok)(?![a-zа-я])|(?<!温)度(?=[)）]?$)",
+        "deg",
+    ),
     (r"код\w* ацп|ацп|отсч\w*|码值", "adc"),
     (r"мв(?![а-я])", "mV"),
-    (r"temperatura|temperature?n?|температура|темп\b\.?|温度", "temperature "),
     (
-        r"sollwert|soll|referenz|referanse|referencia|stand|эталон\w*|стенд|задан\w*|标准|参考|转台",
+        r"temp-ra|темп-ра|sicaklik|homerseklet|temperatuur|suhu|pt100(0)?\b|temperatura|"
+        r"temperature?n?|температура|темп\b\.?|温度",
+        "temperature ",
+    ),
+    (
+        r"sollwerte?|sollwinkel|soll|\brig\b|referenz|referanse|referencia|stand|эталон\w*|стенд|задан\w*|标准|参考|转台",
         "ref ",
     ),
     (r"seriennummer|seriennr|serienummer|заводской номер|序列号|num\w*\.? de serie", "serial "),
     (r"gerat|sonde", "tool "),
     (r"(de|da) [qc]uadr[ií]cula( utm)?|gitter|kartesisch", "grid "),
     (r"achse|aksen?|eje|ось|轴", ""),
-    (r"magn\b\.?|magnetisch", "magnetic"),
+    (
+        r"magnetisch\w*|magnetic[oa]s?|magnetique|magnetiska?|magnetycz\w*|manyetik|magneses|магнитн\w*|magnet\b|"
+        r"magn\b\.?",
+        "magnetic",
+    ),
+    (r"\((alta|high ?side|lado alto|hochseite|oben)\)", ""),
 )
 """Words of other languages and of WITSML, and the word of the field for each."""
 
@@ -97,3 +136,15 @@ def spelled(name: str) -> str:
     for pattern, word in TRANSLATIONS:
         text = re.sub(pattern, word, text, flags=re.IGNORECASE)
     return text.strip()
+
+
+def translated(column: str) -> frozenset[str]:
+    """Words of other languages for what a column of a run file holds."""
+    patterns = (
+        pattern
+        for pattern, word in TRANSLATIONS
+        if (m := resembled(word.strip())) and m.column == column
+    )
+    return frozenset(
+        word for pattern in patterns for word in re.findall(r"(?<!\\)[^\W\d_]{5,}", pattern)
+    )

@@ -331,6 +331,8 @@ def propose_profile(
     north: str = "",
     declination_deg: float | None = None,
     convergence_deg: float | None = None,
+    leave_out: Mapping[str, Sequence[str]] | None = None,
+    keep: Mapping[str, Sequence[str]] | None = None,
 ) -> ProposedProfile:
     """Propose a tool profile for a table as a laboratory keeps it: text or workbook, of any layout.
 
@@ -342,7 +344,8 @@ def propose_profile(
     which column holds what, by the name of the run file: {"ref_azimuth_deg": "Azi 2"}, with the unit in brackets
     behind the name where the table does not state it; a blank name for a column that is none. `serial` and `date`
     of the run where the table states none. `north` ("magnetic", "true" or "grid") is what its azimuths count from,
-    with the declination and the convergence (degrees east) that turn them magnetic.
+    with the declination and the convergence (degrees east) that turn them magnetic. `leave_out` says by the texts of a
+    column which rows are rejected, {"QC": ["X"]}, and `keep` which are not.
 
     Where the table does not tell the axes of a triad, as one of rolls alone, a finding `axes-open` says so, and the
     profile that is saved has lines to fill in.
@@ -373,5 +376,7 @@ def propose_profile(
         answers=column,
         stated={key: value for key, value in stated.items() if value},
         north={key: value for key, value in norths.items() if value not in ("", None)},
+        leave_out=leave_out,
+        keep=keep,
     )
     return ProposedProfile(proposal, Path(table_path))

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from mwdcal.calibration.calibrate import calibrate as fit_and_judge
-from mwdcal.calibration.diagnosis.findings import unused_columns
+from mwdcal.calibration.diagnosis.findings import of_table
 from mwdcal.calibration.notebooks import html_table
 from mwdcal.calibration.options import FitChoices, Options
 from mwdcal.calibration.readings import Readings, ReadingsLike, as_readings
@@ -254,7 +254,7 @@ def verify(
     rolltest = readings_of(rolltest, "rolltest", calibration.profile)
     bounds, digest = (limits, "") if isinstance(limits, Limits) else load_limits(limits)
     verdict = judge(calibration, rolltest, bounds)
-    findings = [*verdict.findings, *unused_columns(rolltest.unused)]
+    findings = [*verdict.findings, *of_table(rolltest)]
     verdict = msgspec.structs.replace(verdict, findings=findings)
     digests = {"calibration": digest_of(calibration), "limits": digest}
     stated = calibration.tool, rolltest.metadata
@@ -272,7 +272,7 @@ def diagnose(calibration: Calibration, later: RunSource) -> Diagnosis:
     """
     later = readings_of(later, "later", calibration.profile)
     result = explain(calibration, later)
-    findings = [*calibration.change_findings(), *result.findings, *unused_columns(later.unused)]
+    findings = [*calibration.change_findings(), *result.findings, *of_table(later)]
     result = msgspec.structs.replace(result, findings=findings)
     stated, digest = (calibration.tool, later.metadata), digest_of(calibration)
     return with_inputs(result, *stated, calibration=digest, readings=later.run_sha256)

@@ -11,8 +11,9 @@ from msgspec.structs import asdict
 
 from mwdcal.calibration.readings import TRIADS, simulated
 from mwdcal.calibration.record import Finding
+from mwdcal.files.contract import RANGES
 from mwdcal.files.formats.layout import WORKBOOKS
-from mwdcal.identification.proposal import Proposal, findings_on, in_order
+from mwdcal.identification.proposal import Proposal, findings_on, in_order, stated_references
 from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.numbers import files_written
 from mwdcal.presentation.text import one_line, plural, table
@@ -82,6 +83,10 @@ def screen(proposal: Proposal, run: Path, output: Path | None) -> str:
         rows = [
             [c, each.name, (each.unit or "–") + guesses.get(c, "")]
             for c, each in in_order(profile.columns)
+        ]
+        rows += [
+            [column, "above the names", f"{value:.8g} {RANGES[column].unit}"]
+            for column, value in stated_references(proposal).items()
         ]
         blocks.append(table(rows, ["column of a run file", "column here", "unit here"]))
     rows = [

@@ -6,9 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from msgspec import UNSET
+from msgspec.structs import replace
 
 from mwdcal.calibration.canonical import SignatureCheck
 from mwdcal.calibration.readings import simulated
+from mwdcal.calibration.record import Finding
 from mwdcal.presentation.numbers import measured, quantity, unit
 from mwdcal.presentation.signature import signature_status
 from mwdcal.presentation.text import NOT_STATED, WIDE, chance, one_line, table
@@ -50,12 +52,27 @@ def screen(
 
 
 def next_step(result: Verdict, calibration: Path, run: Path) -> str:
-    """The command that says what a failed roll test looks like, as a line below it; nothing if no value failed."""
-    if not any(row.value is not None and not row.passed for row in result.rows):
+    """Lines below a failed roll test: what to measure again, and the command that says what it looks like."""
+    again, command = _after_failure(result, calibration, run)
+    if not again:
         return ""
-    return (
-        f"\n\nnext: mwdcal diagnose {one_line(calibration)} {one_line(run)}   (what it looks like)"
-    )
+    return f"\n\nmeasure again: {again}\nnext: {command}   (what it looks like)"
+
+
+def with_next_step(result: Verdict, calibration: Path, run: Path) -> Verdict:
+    """The verdict with a finding `next-step` where a value failed, for machines: files by name, wherever they lie."""
+    again, command = _after_failure(result, Path(calibration.name), Path(run.name))
+    if not again:
+        return result
+    text = f"Measure again: {again}. What the failure looks like says: {command}"
+    return replace(result, findings=[*result.findings, Finding(id="next-step", text=text)])
+
+
+def _after_failure(result: Verdict, calibration: Path, run: Path) -> tuple[str, str]:
+    """Where values failed, each place once, and the command that says what it looks like; empty if none failed."""
+    failed = [row for row in result.rows if row.value is not None and not row.passed]
+    places = dict.fromkeys(row.note.partition(";")[0] for row in failed)
+    return "; ".join(places), f"mwdcal diagnose {one_line(calibration)} {one_line(run)}"
 
 
 def _sets(result: Verdict) -> list[str]:

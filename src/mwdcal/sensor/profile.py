@@ -132,9 +132,12 @@ class TableFormat(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     between is not read. A workbook has only these two, which count its rows. Where `find` is set, the table is
     looked for by the names of its columns instead, on the sheet named, if any. `azimuth_reference` and its angles are
     those of tables that do not state them. `ignore` are columns that are no evidence whatever they are called.
+    `leave_out` and `keep` say by the texts of a column which rows of a run are rejected, and which are not.
     """
 
-    encoding: Literal["utf-8", "utf-16", "cp1252", "cp1251", "gb18030"] = "utf-8"
+    encoding: Literal[
+        "utf-8", "utf-16", "cp1252", "cp1251", "gb18030", "cp932", "cp1250", "cp1254"
+    ] = "utf-8"
     delimiter: Literal[",", ";", "\t", "|"] = ","
     decimal: Literal[".", ","] = "."
     header_line: int = 1
@@ -145,6 +148,8 @@ class TableFormat(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     declination_deg: float | None = None
     convergence_deg: float | None = None
     ignore: tuple[str, ...] = ()
+    leave_out: dict[str, tuple[str, ...]] = {}
+    keep: dict[str, tuple[str, ...]] = {}
 
     @property
     def north(self) -> dict[str, object]:

@@ -78,7 +78,7 @@ def command(
         rendered = render(calibration, verdict, *([turned.metadata] if turned else []))
     files = output, report
     shown = (
-        screen.summary(calibration, choice.curves, *files, verdict)
+        screen.summary(calibration, choice.curves, *files, _for_machines(verdict, output, rolltest))
         if as_json
         else screen.screen(calibration, choice.curves, *files, judged)
     )
@@ -102,6 +102,21 @@ def _judged(
 
     verdict = verify(calibration, rolltest, Path(limits))
     return verdict, screen(verdict, None) + next_step(verdict, files[0], files[1])
+
+
+def _for_machines(
+    verdict: Verdict | None, calibration: Path, rolltest: Path | None
+) -> Verdict | None:
+    """A verdict in the words of the command, with what to do after a failure."""
+    if verdict is None or rolltest is None:
+        return verdict
+    from msgspec.structs import replace
+
+    from mwdcal.presentation.typed import findings_with_option_names
+    from mwdcal.presentation.verification import with_next_step
+
+    said = replace(verdict, findings=findings_with_option_names(verdict.findings))
+    return with_next_step(said, calibration, rolltest)
 
 
 def _enter(registry: str | None, *items: Path | str | Verdict | None) -> None:

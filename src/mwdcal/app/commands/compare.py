@@ -41,7 +41,7 @@ def command(
     Exit: 0 compared, 2 input cannot be read, 3 every method refused.
     """
     from mwdcal.app.inputs import load_run
-    from mwdcal.calibration.diagnosis.findings import unused_columns
+    from mwdcal.calibration.diagnosis.findings import of_table
     from mwdcal.calibration.fit_options import order_of
     from mwdcal.calibration.options import Options
     from mwdcal.comparison.compare import able, compare
@@ -51,7 +51,7 @@ def command(
 
     options.check_outputs([], [run, tool], page=report)
     readings, profile = load_run(run, tool, decimal)
-    unused = unused_columns(readings.unused)
+    unused = of_table(readings)
     result = compare(readings, profile, Options(order=order_of(order), seed=seed), progress=say)
     rows = tuple(replace(row, refused=with_option_names(row.refused)) for row in result.rows)
     result = replace(result, rows=rows)

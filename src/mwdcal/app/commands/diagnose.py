@@ -31,7 +31,7 @@ def command(
     """
     from msgspec.structs import replace
 
-    from mwdcal.calibration.diagnosis.findings import unused_columns
+    from mwdcal.calibration.diagnosis.findings import of_table
     from mwdcal.faults.diagnosis import diagnose
     from mwdcal.faults.physics import NONE
     from mwdcal.files import runs
@@ -45,7 +45,7 @@ def command(
     later, _ = runs.read_run(readings, fitted.profile, decimal=decimal)
     result = diagnose(fitted, later)
     findings = findings_with_option_names(
-        [*fitted.change_findings(), *result.findings, *unused_columns(later.unused)]
+        [*fitted.change_findings(), *result.findings, *of_table(later)]
     )
     result = replace(result, findings=findings)
     stated = fitted.tool, later.metadata

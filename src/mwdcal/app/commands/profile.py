@@ -14,6 +14,12 @@ from mwdcal.errors import InputError, QuestionError, QuestionsError
 if TYPE_CHECKING:
     from mwdcal.library.planning import ProposedProfile
 
+BY_COLUMN = {
+    "column": "OURS=THEIRS, such as ref_azimuth_deg='Azi 2'",
+    "leave_out": "COLUMN=TEXT, such as 'QC=rejected'",
+    "keep": "COLUMN=TEXT, such as 'QC=second try'",
+}
+"""Options that say something of a column, and what is expected."""
 MOST_ROUNDS = 20
 """Rounds of questions: each answer may open another."""
 
@@ -35,6 +41,15 @@ MOST_ROUNDS = 20
     help="What a column is: ref_azimuth_deg='Azi 2', ref_field_nt='F [µT]'; blank: none is. Repeatable.",
 )
 @click.option(
+    "--leave-out",
+    multiple=True,
+    metavar="COLUMN=TEXT",
+    help="Rows with this text are rejected: QC=X; blank: rows without a reading there. Repeatable.",
+)
+@click.option(
+    "--keep", multiple=True, metavar="COLUMN=TEXT", help="Rows with this text count. Repeatable."
+)
+@click.option(
     "--north",
     type=click.Choice(["magnetic", "true", "grid"]),
     help="What the azimuths of the stand count from, where the table does not state it.",
@@ -46,7 +61,8 @@ MOST_ROUNDS = 20
 @click.option("--replace", is_flag=True, help="Replace a profile that exists.")
 @options.JSON
 def command(
-    run: Path, output: Path, column: tuple[str, ...], replace: bool, as_json: bool, **given: Any
+    run: Path, output: Path, column: tuple[str, ...], leave_out: tuple[str, ...], keep: tuple[str, ...],
+    replace: bool, as_json: bool, **given: Any
 ) -> None:  # fmt: skip
     """Propose a tool profile for a RUN as a logger or spreadsheet program has written it.
 
@@ -62,7 +78,11 @@ def command(
     """
     options.check_outputs([output], [run])
     stated = {name: value for name, value in given.items() if value is not None}
-    result = _proposed(run, stated, dict(map(_answer, column)), replace or not output.exists())
+    answers = Answers(stated)
+    for name, texts in (("column", column), ("leave_out", leave_out), ("keep", keep)):
+        for text in texts:
+            answers.take(name, text)
+    result = _proposed(run, answers, replace or not output.exists())
     if not replace and output.exists() and output.read_bytes() != result.to_toml().encode():
         raise InputError(
             f"'{output}' exists, and may have been completed by hand. Name another file, or add --replace."
@@ -71,39 +91,47 @@ def command(
     print_result(result.to_dict() if as_json else result.summary(), result.findings)
 
 
-def _proposed(
-    run: Path, stated: dict[str, Any], answers: dict[str, str], may_ask: bool
-) -> ProposedProfile:
+class Answers(dict[str, Any]):
+    """What the user has said, as arguments of `propose_profile`."""
+
+    def take(self, argument: str, value: str) -> None:
+        """Note the value of an argument; of one with columns beside those noted before."""
+        if argument not in BY_COLUMN:
+            self[argument] = int(value) if argument == "header_row" else value
+            return
+        name, text = _pair(argument, value)
+        known = self.setdefault(argument, {})
+        known[name] = text if argument == "column" else [*known.get(name, ()), text]
+
+
+def _proposed(run: Path, answers: Answers, may_ask: bool) -> ProposedProfile:
     """The proposal, after questions on a terminal where it may ask."""
     from mwdcal.app import questions
     from mwdcal.library import planning
 
     for _ in range(MOST_ROUNDS):
         try:
-            return planning.propose_profile(run, column=answers, **stated)
+            return planning.propose_profile(run, **answers)
         except (QuestionError, QuestionsError) as error:
             every = error.questions if isinstance(error, QuestionsError) else (error,)
             open_ones = [each for each in every if each.answers]
             if not open_ones or not may_ask or not questions.on_terminal():
                 raise
             for each in open_ones:
-                _take(each, stated, answers)
+                _ask(each, answers)
     raise InputError(f"{run.name}: the answers open ever more questions. Answer them by options.")
 
 
-def _take(question: QuestionError, stated: dict[str, Any], answers: dict[str, str]) -> None:
+def _ask(question: QuestionError, answers: Answers) -> None:
     """Ask a question, and note its answer with those given before."""
     from mwdcal.app import questions
 
     place = questions.choose(question.text, [answer.name for answer in question.answers])
     chosen = question.answers[place]
     for argument, value in chosen.arguments:
-        if argument == "column":
-            answers.update([_answer(value)])
-        else:
-            stated[argument] = int(value) if argument == "header_row" else value
+        answers.take(argument, value)
     for name in chosen.numbers:
-        stated[name] = float(questions.ask([f"{name} (degrees, east is positive)"], "0", _number))
+        answers[name] = float(questions.ask([f"{name} (degrees, east is positive)"], "0", _number))
 
 
 def _number(text: str) -> None:
@@ -116,11 +144,11 @@ def _number(text: str) -> None:
     raise InputError(f"Type a number of degrees between -180 and 180; got {text!r}.")
 
 
-def _answer(text: str) -> tuple[str, str]:
-    """The name in a run file and the column of the table, as typed."""
-    ours, sign, theirs = text.partition("=")
-    if not sign:
-        raise InputError(
-            f"--column {text!r}: expected OURS=THEIRS, such as ref_azimuth_deg='Azi 2'."
-        )
-    return ours.strip(), theirs.strip()
+def _pair(argument: str, text: str) -> tuple[str, str]:
+    """What an option says of a column: the name before the first sign, of rows before the last one."""
+    if "=" not in text:
+        option = f"--{argument.replace('_', '-')}"
+        expected = BY_COLUMN[argument]
+        raise InputError(f"{option} {text!r}: expected {expected}.")
+    name, _, said = text.partition("=") if argument == "column" else text.rpartition("=")
+    return name.strip(), said.strip()

@@ -33,7 +33,7 @@ def command(
     """
     from msgspec.structs import replace
 
-    from mwdcal.calibration.diagnosis.findings import unused_columns
+    from mwdcal.calibration.diagnosis.findings import of_table
     from mwdcal.calibration.diagnosis.identity import overdue
     from mwdcal.files import runs
     from mwdcal.files.formats import atomic
@@ -41,7 +41,7 @@ def command(
     from mwdcal.files.settings import standards_of
     from mwdcal.presentation.envelope import json_document, with_signature
     from mwdcal.presentation.signature import load_calibration
-    from mwdcal.presentation.verification import next_step, screen
+    from mwdcal.presentation.verification import next_step, screen, with_next_step
     from mwdcal.use.verification import verify
 
     options.check_outputs([output], [calibration, run, limits, *key], page=report)
@@ -54,12 +54,13 @@ def command(
     result = verify(fitted, readings, bounds)
     late = overdue(standards_of(fitted.profile), readings.metadata)
     findings = findings_with_option_names(
-        loaded.findings + result.findings + unused_columns(readings.unused) + late
+        loaded.findings + result.findings + of_table(readings) + late
     )
     result = replace(result, findings=findings)
     stated = fitted.tool, readings.metadata
     digests = {"calibration": loaded.digest, "run": readings.run_sha256, "limits": limits_digest}
-    document = json_document("verify", result, *stated, **digests)
+    content = with_next_step(result, calibration, run)
+    document = json_document("verify", content, *stated, **digests)
     document = with_signature(document, loaded.signature)
     rendered = ""
     if report:

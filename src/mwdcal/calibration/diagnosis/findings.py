@@ -28,7 +28,7 @@ from mwdcal.calibration.diagnosis.plausibility import (
 from mwdcal.calibration.diagnosis.structure import COLUMN, is_shown, suspected
 from mwdcal.calibration.diagnosis.structure import described as seen_as
 from mwdcal.calibration.drift import SHOWN_DRIFT
-from mwdcal.calibration.readings import EARTH_RANGES, HIGHEST, TRIADS
+from mwdcal.calibration.readings import EARTH_RANGES, HIGHEST, TRIADS, Readings
 from mwdcal.calibration.record import Finding
 from mwdcal.calibration.residuals import REASONS, shown_in, tail
 from mwdcal.calibration.results import common_source, drift_shares, drifts, unconfirmed_dip
@@ -53,7 +53,7 @@ LARGEST_DEVIATION = 37.0
 """Larger deviations have no figure: a normal variable's chance is then below 1e-300."""
 FOLLOWED = 0.9
 """Share of a drift within the run that goes with a column, from which the column is named."""
-UNUSED = "unused-columns"
+UNUSED, MARKED_ROWS = "unused-columns", "marked-rows"
 COLUMNS_NAMED = 20
 """Most columns that the finding names."""
 STATIONS_NAMED = 8
@@ -151,6 +151,12 @@ def unused_columns(columns: Sequence[str]) -> list[Finding]:
     return [Finding(id=UNUSED, text=f"columns not used: {listed(columns, COLUMNS_NAMED)}.")]
 
 
+def of_table(readings: Readings) -> list[Finding]:
+    """Rows of the table that its laboratory has marked, and columns that are not used."""
+    marked = [Finding(id=MARKED_ROWS, text=text) for text in readings.remarks]
+    return [*marked, *unused_columns(readings.unused)]
+
+
 def findings(flags: Iterable[Flag], place: int, labels: Sequence[str]) -> list[Finding]:
     """The findings of one run, in order of weight, of the `flags` of its batch; `labels` of its stations."""
     return [
@@ -183,8 +189,8 @@ def finding_flags(fitted: FittedRuns) -> Iterator[Flag]:
     yield from _undetermined(fitted)
     yield from _prior(fitted)
     yield from _model(fitted)
-    for unused in unused_columns(fitted.readings.unused):
-        yield _common(fitted, unused.id, unused.text, range(fitted.count))
+    for each in of_table(fitted.readings):
+        yield _common(fitted, each.id, each.text, range(fitted.count))
     yield from _reshoot(fitted)
     yield _distrusted(fitted)
 

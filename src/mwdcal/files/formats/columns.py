@@ -96,7 +96,7 @@ def check_names(names: Sequence[str], where: str) -> None:
     for name in (name for i, name in enumerate(names) if name in names[:i]):
         raise InputError(
             f"{where}: column names must be unique; got {shown(name)} more than once. "
-            "Rename or remove one of the columns."
+            "Rename one of the columns, or propose a tool profile for the table as it is: mwdcal profile."
         )
 
 
@@ -106,17 +106,27 @@ def plain_names(names: Sequence[str]) -> list[str]:
     One line without control characters and blanks around, no '#' before the first, none blank, no
     two alike.
 
-    >>> plain_names(["#ax", "Temp\\n(C)", " ", "note", "note "])
-    ['ax', 'Temp (C)', 'column 3', 'note', 'note (2)']
+    >>> plain_names(["#ax", "Temp\\n(C)", " ", "note", "note ", "note"])
+    ['ax', 'Temp (C)', 'column 3', 'note', 'note (2)', 'note (3)']
     """
     plain = [_CONTROLS.sub(" ", name).strip() for name in names]
     plain[:1] = [name.lstrip("# ") for name in plain[:1]]
     taken = {name for name, wanted in zip(names, plain, strict=True) if name == wanted}
     for place, (name, wanted) in enumerate(zip(names, plain, strict=True)):
-        if name != wanted:
+        if name != wanted or name in names[:place]:
             plain[place] = _free(wanted or f"column {place + 1}", taken)
             taken.add(plain[place])
     return plain
+
+
+def letters_of(place: int) -> str:
+    """The letters of a column of a workbook by its place from 0.
+
+    >>> [letters_of(place) for place in (0, 25, 26, 701, 702)]
+    ['A', 'Z', 'AA', 'ZZ', 'AAA']
+    """
+    before, letter = divmod(place, 26)
+    return (letters_of(before - 1) if before else "") + chr(ord("A") + letter)
 
 
 def _free(name: str, taken: set[str]) -> str:

@@ -20,6 +20,16 @@ _FOREIGN_WORDS = {
         "азимут|зенит|темп|прибор|дата|угол|ускор|магн|поле|точк|номер|град|станц", re.IGNORECASE
     ),
     "gb18030": re.compile("角|温度|磁|加速度|日期|序|编号|工具|方位|井斜|重力|标定|仪器"),
+    "cp932": re.compile("角|温度|磁|加速度|日付|番号|センサ|ツール|方位|傾斜|重力|校正|機器|測定"),
+    "cp1250": re.compile(
+        "kąt|narzędz|świadec|całkow|przyśp|ciąż|położ|ferdeség|térerő|nehézségi|hőmérs|jegyző|gyorsulás|mágnes|"
+        "szerszám|úhel|sklon|zrychlen|teplot|měř|číslo|înclin|unghi|câmp|ubrzan|kut|mjer|naklon",
+        re.IGNORECASE,
+    ),
+    "cp1254": re.compile(
+        "eğim|sıra|sıcaklık|takım|açıklama|ivme|yüzü|yönelim|ölçüm|kalibrasyon|yerçekimi",
+        re.IGNORECASE,
+    ),
 }
 """Encodings without a mark, and words of the field that show them: single bytes may be ° or ü of another."""
 
@@ -47,11 +57,20 @@ def encoding_of(data: bytes) -> str:
     try:
         data.decode("utf-8")
     except UnicodeDecodeError:
-        named = (
-            e for e, words in _FOREIGN_WORDS.items() if words.search(data.decode(e, "replace"))
-        )
-        return next(named, "cp1252")
+        counts = {e: _words_in(data, e, words) for e, words in _FOREIGN_WORDS.items()}
+        best = max(counts, key=lambda e: counts[e])
+        return best if counts[best] else "cp1252"
     return "utf-8"
+
+
+def _words_in(data: bytes, encoding: str, words: re.Pattern[str]) -> int:
+    """The different words of the field that some bytes hold in an encoding, of which some are no ASCII."""
+    try:
+        text = data.decode(encoding)
+    except UnicodeDecodeError:
+        return 0
+    every = {word.lower() for word in words.findall(text)}
+    return len(every) if any(not word.isascii() for word in every) else 0
 
 
 def plain(data: bytes, form: TableFormat, source: str) -> bytes:

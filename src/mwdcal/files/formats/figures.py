@@ -22,6 +22,8 @@ _BEARING = re.compile(r"([NS])\s*(\d+(?:[.,]\d+)?)\s*°?\s*([EWO])", re.IGNORECA
 _POINTED_DAY = re.compile(r"\s*\d{1,2}\.\d{1,2}\.(\d{4}|\d{2})([ T].*)?")
 """A day as in Germany or Russia, which is no number."""
 _GROUPED = re.compile(r"[+\-−]?[1-9]\d{0,2}([.,]\d{3})+")
+_USUAL = 0.9
+"""Share of numbers of one decimal sign from which on the others are mistyped."""
 _POINTED = {
     ".": re.compile(r"[+\-−]?[1-9]\d{0,2}(,\d{3})+(\.\d*)?"),
     ",": re.compile(r"[+\-−]?[1-9]\d{0,2}(\.\d{3})+(,\d*)?"),
@@ -65,9 +67,12 @@ def decimal_sign(cells: Sequence[object], source: str) -> str:
     if fits["."] != fits[","]:
         return "." if fits["."] else ","
     if not fits["."]:
+        usual = max(fits, key=lambda sign: _of_sign(figures, sign))
+        if _of_sign(figures, usual) >= _USUAL * len(commas + points):
+            return usual
         raise InputError(
             f"{source}: numbers with a comma ({(commas or figures)[0]}) and a point ({(points or figures)[0]}) are "
-            "mixed. Export the table with one decimal sign."
+            "mixed. Say which one is the decimal sign by `decimal`."
         )
     if all(map(_GROUPED.fullmatch, commas + points)):
         sign, marked = ("comma", commas) if commas else ("point", points)
@@ -80,6 +85,12 @@ def decimal_sign(cells: Sequence[object], source: str) -> str:
             ],
         )
     return "," if commas else "."
+
+
+def _of_sign(cells: Sequence[str], sign: str) -> int:
+    """How many of some numbers with a comma or a point have that decimal sign."""
+    marked = [cell.replace("−", "-") for cell in cells if "," in cell or "." in cell]
+    return sum(looks_numeric(c, sign) or bool(_POINTED[sign].fullmatch(c)) for c in marked)
 
 
 def column(cells: Sequence[object], sign: str) -> tuple[list[str], str]:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -18,7 +18,14 @@ import numpy as np
 
 from mwdcal.errors import Answer, InputError, QuestionError
 from mwdcal.files.formats import figures
-from mwdcal.files.formats.columns import as_text, looks_numeric, plain_names, shown
+from mwdcal.files.formats.columns import (
+    as_text,
+    letters_of,
+    looks_numeric,
+    plain_names,
+    shown,
+)
+from mwdcal.files.formats.title_references import stated_above
 from mwdcal.files.formats.titles import Titles, dated, titles
 from mwdcal.files.synonyms import unit_of
 from mwdcal.geometry.vectors import Array
@@ -55,19 +62,29 @@ _DEGREES_OF = re.compile(
 """The name of a column of degrees, or of minutes."""
 _BRACKETS = re.compile(r"[(\[][^)\]]*[)\]]")
 
+ADJUSTED = re.compile(
+    r"as[- ]?left|(before|after|pre|post)[- ]?(adjust|calib)\w*|(vor|nach) (der )?(justier|abgleich|kalibrier)\w*|"
+    r"(f(ø|o)r|etter|efter) (juster|kalibrer)\w*|(antes|despu[eé]s|depois) (del?a?|do|da) (ajust|calibr)\w*|"
+    r"(avant|apr[eè]s) (ajust|r[eé]glage|[eé]talonn)\w*|(до|после) (регулир|настрой|юстир|калибр)\w*|"
+    r"(校准|调整|调校)(前|后)|(調整|校正)(前|後)",
+    re.IGNORECASE,
+)
+"""Words of a run before or after an adjustment of the tool: two of them are two runs."""
+
 Cells = Sequence[object]
 
 
 class Sheet(NamedTuple):
     """The rows of a sheet that are not blank, by number, each without blank cells at its end.
 
-    `form`: encoding and delimiter of a text; `number` of the sheet in its file, from 0.
+    `form`: encoding and delimiter of a text; `number` of the sheet in its file, and `first_column` of its rows, from 0.
     """
 
     name: str
     rows: list[tuple[int, Cells]]
     form: TableFormat = TableFormat()
     number: int = 0
+    first_column: int = 0
 
 
 @dataclass(frozen=True)
@@ -77,7 +94,8 @@ class Layout:
     `form` says how the table is written, `cells` are text, numbers in it with a decimal point, and `texts` the same
     as they stand there; `fractions` are columns of a workbook with numbers that are not whole. `left_out` are lines
     below the names that are no readings, `above` the texts above them;
-    `titles` what the title block says of the tool and the day.
+    `titles` what the title block says of the tool, the day and the place; `places` letters of the columns in a
+    workbook.
     """
 
     sheet: str
@@ -92,6 +110,7 @@ class Layout:
     above: tuple[str, ...] = ()
     titles: Titles = field(default_factory=lambda: Titles({}))
     left_out: tuple[tuple[int, str], ...] = ()
+    places: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def size(self) -> int:
@@ -120,19 +139,34 @@ def laid_out(
     if not candidates:
         names = ", ".join(shown(each.name) for each in sheets)
         raise InputError(f"{source}: there is no sheet {shown(sheet)}. The sheets are {names}.")
-    tables = [
-        layout
-        for each in candidates
-        for layout in _tables(each, source, decimal)
-        if header_line in (0, layout.form.header_line) and {*wanted} <= {*layout.names}
-    ]
+    tables, covers = [], []
+    for each in sheets:
+        layouts = list(_tables(each, source, decimal)) if each in candidates else []
+        covers += [] if layouts or any(_is_reading(row) for _, row in each.rows) else [each]
+        tables += [
+            layout
+            for layout in layouts
+            if header_line in (0, layout.form.header_line) and {*wanted} <= {*layout.names}
+        ]
     if not tables:
         raise _no_table(source, header_line, wanted)
     best = max(tables, key=lambda layout: layout.size)
     alike = [t for t in tables if t is not best and _alike(t, best) and len(t.lines) >= _BESIDES]
     if alike and not header_line:
         raise _several([best, *alike], source, sheet)
-    return best
+    return _with_covers(best, covers)
+
+
+def _with_covers(layout: Layout, covers: Sequence[Sheet]) -> Layout:
+    """A table with what sheets without readings say, where its own title block does not."""
+    blocks = [stated_above([row for _, row in sheet.rows]) for sheet in covers]
+    stated = {key: value for block in blocks[::-1] for key, value in block.metadata.items()}
+    block = layout.titles
+    day = block.unclear_day or next((b.unclear_day for b in blocks if b.unclear_day), "")
+    metadata = {**stated, **block.metadata}
+    return replace(
+        layout, titles=Titles(metadata, "" if "date" in metadata else day) if blocks else block
+    )
 
 
 def _alike(one: Layout, other: Layout) -> bool:
@@ -173,12 +207,18 @@ def _several(tables: Sequence[Layout], source: str, sheet: str) -> QuestionError
 
 def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
     """The tables of a sheet, one below the other."""
-    rows = sheet.rows
+    rows = [row for row in sheet.rows if not _is_ruler(row[1])]
+    sheet = sheet._replace(rows=rows)
     heads = [k for k in range(len(rows)) if _is_head(rows, k)]
     heads = [k for n, k in enumerate(heads) if n == 0 or _begins_anew(rows, heads[:n], k)]
     for head, end in pairwise([*heads, len(rows)]):
         if layout := _table(sheet, head, end, source, decimal):
             yield layout
+
+
+def _is_ruler(row: Cells) -> bool:
+    """Whether a row is a line of dashes or the like."""
+    return all(isinstance(cell, str) and re.fullmatch(r"[-=_*+|\s]*", cell) for cell in row)
 
 
 def _is_head(rows: Sequence[tuple[int, Cells]], place: int) -> bool:
@@ -190,6 +230,11 @@ def _is_head(rows: Sequence[tuple[int, Cells]], place: int) -> bool:
 def _begins_anew(rows: Sequence[tuple[int, Cells]], heads: Sequence[int], place: int) -> bool:
     """Whether a head is that of another table: of other names, or below the serial of another tool."""
     if not _repeats(rows[place][1], rows, heads[0]):
+        return True
+    between = [
+        " ".join(map(as_text, row)) for _, row in rows[heads[-1] : place] if not _is_reading(row)
+    ]
+    if any(map(ADJUSTED.search, between)):
         return True
     ours = titles([row for _, row in rows[: heads[0]]]).metadata.get("serial")
     above = [row for _, row in rows[heads[-1] : place] if not _is_reading(row)]
@@ -231,15 +276,16 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
     _check_cut(kept, others, source)
     if not kept or max(len(names), *(len(row) for _, row in kept)) < LEAST_COLUMNS:
         return None
-    names, units, columns = _used(kept, names, units)
+    names, units, columns, letters = _used(kept, names, units, sheet.first_column)
     sign = decimal or figures.decimal_sign([c for column in columns for c in column], source)
     read = [figures.column(column, sign) for column in columns]
     above = [row for _, row in rows[:top]]
-    block = titles(above)
+    block = stated_above(above)
     texts = [[as_text(cell).strip() for cell in column] for column in columns]
     whole, joined = _with_minutes(names, [cells for cells, _ in read])
     stated = {
-        name: unit or by_cells for name, unit, (_, by_cells) in zip(names, units, read, strict=True)
+        name: _both(unit, by_cells)
+        for name, unit, (_, by_cells) in zip(names, units, read, strict=True)
     }
     return Layout(
         sheet=sheet.name,
@@ -249,7 +295,7 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
             header_line=rows[head - any(units)][0],
             first_line=kept[0][0],
         ),
-        names=plain_names(whole),
+        names=whole,
         units=[stated.get(name, "") for name in whole],
         cells=joined,
         texts=[
@@ -265,18 +311,31 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
         left_out=tuple(
             (line, _words(row)) for line, row in others if not _repeats(row, rows, head)
         ),
+        places=dict(zip(names, letters, strict=True)) if sheet.name else {},
     )
 
 
+def _both(unit: str, by_cells: str) -> str:
+    """The unit by the row of units, or by the cells; both where they differ."""
+    if unit_of(unit) and unit_of(by_cells) and unit_of(unit) != unit_of(by_cells):
+        return f"{unit} and {by_cells}"
+    return unit or by_cells
+
+
 def _used(
-    rows: Sequence[tuple[int, Cells]], names: Sequence[str], units: Sequence[str]
-) -> tuple[list[str], list[str], list[list[object]]]:
-    """Names, units and cells of the columns that have a name or a cell that is filled in."""
+    rows: Sequence[tuple[int, Cells]], names: Sequence[str], units: Sequence[str], first: int
+) -> tuple[list[str], list[str], list[list[object]], list[str]]:
+    """Names, units, cells and letters of the columns that have a name or a cell that is filled in."""
     width = max(len(names), *(len(row) for _, row in rows))
     names, units = ([*each, *[""] * (width - len(each))] for each in (names, units))
     columns = [[row[k] if k < len(row) else "" for _, row in rows] for k in range(width)]
     used = [k for k in range(width) if names[k] or any(cell != "" for cell in columns[k])]
-    return [names[k] for k in used], [units[k] for k in used], [columns[k] for k in used]
+    return (
+        plain_names([names[k] for k in used]),
+        [units[k] for k in used],
+        [columns[k] for k in used],
+        [letters_of(first + k) for k in used],
+    )
 
 
 def _check_cut(
@@ -299,7 +358,7 @@ def _check_cut(
         line, row = cut[0]
         raise InputError(
             f"{source}, row {line}: '{_words(row)}' begins as a station and ends before the numbers of the other "
-            "rows. Was the file cut? Complete the row, or remove it."
+            "rows. Was the file cut? Export the whole of it."
         )
 
 
@@ -393,9 +452,13 @@ def _joined(row: Cells, names: Sequence[str]) -> list[str]:
     """Names with the title above each: that of the column, or of the nearest column to the left that has one."""
     above = [" ".join(as_text(cell).split()) for cell in row]
     above += [""] * (len(names) - len(above))
-    title, joined = "", []
+    title, of_axes, joined = "", False, []
     for upper, name in zip(above, [*names, *[""] * len(above)], strict=False):
-        title = upper or (title if name else "")
+        is_axis = bool(_AXIS.fullmatch(name))
+        if upper:
+            title, of_axes = upper, is_axis
+        elif not name or (of_axes and not is_axis):
+            title = ""
         joined.append(_with_title(title, name) if title != name else name)
     return joined[: max(len(names), len(above))]
 
@@ -419,17 +482,28 @@ def _is_units(row: Cells) -> bool:
 
 def _without_summary(rows: Sequence[tuple[int, Cells]]) -> list[tuple[int, Cells]]:
     """Rows of readings without those of statistics: called so, or equal to the means of those above."""
-    kept = [row for row in rows if not _is_summary(row[1])]
+    widths = Counter(sum(cell != "" for cell in row) for _, row in rows)
+    usual = max(widths, key=lambda width: widths[width], default=0)
+    kept = [row for row in rows if not _is_summary(row[1], usual)]
     numbered = sum(bool(row) and figures.is_figure(row[0]) for _, row in kept)
     if numbered >= 0.8 * len(kept):  # rows are numbered: one with a word instead is none of them
-        kept = [(n, row) for n, row in kept if row[0] == "" or figures.is_figure(row[0])]
+        kept = [(n, row) for n, row in kept if _is_blank(row[0]) or figures.is_figure(row[0])]
     while len(kept) > LEAST_COLUMNS and _is_mean(kept[-1][1], [row for _, row in kept[:-1]]):
         kept.pop()
     return kept
 
 
-def _is_summary(row: Cells) -> bool:
-    texts = [cell for cell in row[:3] if isinstance(cell, str) and not figures.is_figure(cell)]
+def _is_blank(cell: object) -> bool:
+    """Whether a cell is blank or says that there is no value: ---, n/a."""
+    return isinstance(cell, str) and bool(
+        re.fullmatch(r"(n/?a|nan|null|none|[\W_]*)", cell, re.IGNORECASE)
+    )
+
+
+def _is_summary(row: Cells, width: int) -> bool:
+    """Whether a row is one of statistics: its name is in front, or anywhere in a row of fewer cells than most."""
+    looked_at = row if sum(cell != "" for cell in row) < width else row[:3]
+    texts = [cell for cell in looked_at if isinstance(cell, str) and not figures.is_figure(cell)]
     return any(_SUMMARY.fullmatch(text) for text in texts if text)
 
 
@@ -451,7 +525,7 @@ def as_columns(layout: Layout, labels: Collection[str] = ()) -> dict[str, list[s
     for name in {*labels}.intersection(layout.fractions):
         raise InputError(
             f"the column {shown(name)}: a serial or label must be text; it has numbers, of which a workbook keeps no "
-            "last zero. Format the column as text, and type them as they stand on the tools."
+            "last zero. Say that it is none by `column` serial= or station=, and state the serial by `serial`."
         )
     each = zip(layout.names, layout.cells, layout.texts, strict=True)
     return {name: texts if name in labels else cells for name, cells, texts in each}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 import zipfile
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from mwdcal.files.formats.layout import WORKBOOKS, Cells, Sheet
 from mwdcal.sensor.profile import TableFormat
 
 DELIMITERS = (";", "\t", ",", "|")
-_BLANKS = "blanks"
+_BLANKS, _RUNS = "blanks", "runs of blanks"
 _LOOKED_AT = 400
 """Lines by which the delimiter of a text is told."""
 _LARGEST_CONTENTS = 100_000_000
@@ -59,22 +60,28 @@ def _plain(row: Cells) -> list[object]:
 def _delimited(lines: Sequence[str], source: str) -> tuple[str, list[tuple[int, Cells]]]:
     """The delimiter of a text by which most numbers show, and its rows by it."""
     looked_at = lines[:_LOOKED_AT]
-    best = max((*DELIMITERS, _BLANKS), key=lambda mark: _numbers(_split(looked_at, mark, source)))
+    marks = (*DELIMITERS, _RUNS, _BLANKS)
+    counts = {mark: _numbers(_split(looked_at, mark, source)) for mark in marks}
+    best = max(DELIMITERS, key=lambda mark: counts[mark])
+    if 2 * counts[best] < max(counts.values()):  # blanks may stand within cells
+        best = max(marks, key=lambda mark: counts[mark])
     rows = enumerate(_split(lines, best, source), 1)
     return best, [(line, _trimmed(row)) for line, row in rows if any(row)]
 
 
 def _numbers(rows: Sequence[Sequence[str]]) -> int:
-    """Numbers in the rows that have at least four."""
-    counts = (sum(map(figures.is_figure, row)) for row in rows)
-    return sum(count for count in counts if count >= 4)
+    """Numbers in the rows that have at least four, and as many cells as most of these have."""
+    counts = [(len(row), count) for row in rows if (count := sum(map(figures.is_figure, row))) >= 4]
+    widths = Counter(width for width, _ in counts)
+    usual = max(widths, key=lambda width: widths[width], default=0)
+    return sum(count for width, count in counts if width == usual)
 
 
 def _split(lines: Sequence[str], mark: str, source: str) -> list[list[str]]:
     """The cells of each line, without blanks around."""
-    if mark == _BLANKS:
-        runs = r"\s{2,}|\t" if any(re.search(r"\S\s{2,}\S", line) for line in lines) else r"\s+"
-        return [re.split(runs, line.strip()) if line.strip() else [] for line in lines]
+    if mark in (_BLANKS, _RUNS):  # a unit in brackets belongs to the name before it
+        apart = r"\s{2,}|\t" if mark == _RUNS else r"\s+(?![\[(])(?![^\[(]*[\])])"
+        return [re.split(apart, line.strip()) if line.strip() else [] for line in lines]
     rows = dialect.cells_of(lines, mark, source, skip_blanks=True)
     return [[cell.strip() for cell in row] for row in rows]
 
@@ -106,7 +113,9 @@ def _by_calamine(data: bytes, source: str) -> Iterator[Sheet]:
             first = page.start[0] if page.start else 0
             rows = enumerate(page.to_python(skip_empty_area=True), first + 1)
             yield Sheet(
-                name, [(line, cells) for line, row in rows if (cells := _trimmed(_plain(row)))]
+                name,
+                [(line, cells) for line, row in rows if (cells := _trimmed(_plain(row)))],
+                first_column=page.start[1] if page.start else 0,
             )
 
 

@@ -23,10 +23,12 @@ from mwdcal.files.formats.columns import (
     as_text,
     at_most,
     check_names,
+    letters_of,
     looks_numeric,
 )
 from mwdcal.files.formats.columns import shown as shown
-from mwdcal.files.formats.titles import dated, titles
+from mwdcal.files.formats.title_references import stated_above
+from mwdcal.files.formats.titles import dated
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import TableFormat
 
@@ -60,6 +62,9 @@ class Table:
         lines: line (text) or row (other formats) of each station, for messages.
         digest: SHA-256 of the file's bytes, hexadecimal.
         decimal: the decimal sign of numbers in text cells.
+        places: letters of the columns in a workbook, by name, for messages.
+        sheet: name of its sheet there.
+        remarks: sentences on rows that were left out, for findings.
     """
 
     columns: Mapping[str, Column]
@@ -68,6 +73,9 @@ class Table:
     lines: Sequence[int] = ()
     digest: str = ""
     decimal: str = "."
+    places: Mapping[str, str] = field(default_factory=dict)
+    sheet: str = ""
+    remarks: tuple[str, ...] = ()
 
     @property
     def count(self) -> int:
@@ -111,7 +119,7 @@ def parsed(
     arguments: dict[str, Any] = {"most": rows} if suffix == ".parquet" else {}
     stated: Mapping[str, object] = {}
     if export and form is text:
-        stated = titles(dialect.above(data, export, name)).metadata
+        stated = stated_above(dialect.above(data, export, name)).metadata
         data, arguments = dialect.plain(data, export, name), {"delimiter": export.delimiter}
     elif suffix == ".xlsx":
         arguments = {"form": export, "serial": serial}
@@ -122,7 +130,9 @@ def parsed(
         metadata = dated(
             metadata, ((n, c) for n, c in parts.columns.items() if isinstance(c, list))
         )
-    return Table(parts.columns, metadata, name, parts.lines, digest, decimal)
+    letters = map(letters_of, range(len(parts.columns))) if suffix == ".xlsx" else ()
+    places = dict(zip(parts.columns, letters, strict=False))
+    return Table(parts.columns, metadata, name, parts.lines, digest, decimal, places)
 
 
 def check_decimal(decimal: str) -> None:
@@ -195,13 +205,20 @@ def labels(table: Table, name: str) -> list[str]:
 
 def cell_error(table: Table, name: str, row: int, problem: str) -> InputError:
     """The error that names file, line and column before the problem."""
-    word = (
-        "row"
-        if Path(table.source).suffix.lower() in ("", ".parquet", *layout.WORKBOOKS)
-        else "line"
-    )
     number = table.lines[row] if row < len(table.lines) else row + 1
-    return InputError(f"{table.source}, {word} {number}, column '{name}': {problem}")
+    sheet = f", sheet {shown(table.sheet)}" if table.sheet else ""
+    place = (
+        f"cell {table.places[name]}{number}"
+        if name in table.places
+        else f"{row_word(table)} {number}"
+    )
+    return InputError(f"{table.source}{sheet}, {place}, column '{name}': {problem}")
+
+
+def row_word(table: Table) -> str:
+    """The word for a row of a table in its file: texts have lines."""
+    suffix = Path(table.source).suffix.lower()
+    return "row" if suffix in ("", ".parquet", *layout.WORKBOOKS) else "line"
 
 
 def laid_out(
@@ -245,6 +262,8 @@ def of_layout(where: layout.Layout, path: str | os.PathLike[str], kept: Collecti
         Path(path).name,
         where.lines,
         sha256_of(_content(Path(path))),
+        places=where.places,
+        sheet=where.sheet,
     )
 
 

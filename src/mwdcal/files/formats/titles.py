@@ -10,7 +10,15 @@ from typing import NamedTuple
 
 from mwdcal.files.formats.columns import as_text
 
-UNITS_BY_SIGN = {"°": "deg", "μ": "u", "µ": "u", "мкТл": "ut", "нТл": "nt", "мВ": "mv"}
+UNITS_BY_SIGN = {
+    "°": "deg",
+    "μ": "u",
+    "µ": "u",
+    "мкТл": "ut",
+    "нТл": "nt",
+    "мВ": "mv",
+    "мГал": "mgal",
+}
 """Spellings of units in letters, by their signs and by other alphabets."""
 _TITLE_WORDS = {
     "serial": "serial sn s/n serialno serialnumber toolsn tools/n toolserial toolserialno toolserialnumber toolno "
@@ -52,7 +60,13 @@ _TRUE_NORTH = re.compile(
     r"true\s+north|geographic north|nord géographique|rechtweisend", re.IGNORECASE
 )
 _DECLINATION = re.compile(
-    r"(declination|deklination|misvisning|declinaci[oó]n|склонение|磁偏角)\W*([+-]?\d+[.,]?\d*)\s*(?:°|deg\w*)?\s*([EWO])?",
+    r"(declination|deklination|misvisning|declinaci[oó]n|склонение|磁偏角)[^\w+−-]*([+−-]?\d+[.,]?\d*)"
+    r"\s*(?:°|deg\w*)?\s*\(?([EWO](?!\s*[+(])|west|зап|vest|oest)?",
+    re.IGNORECASE,
+)
+_CONVERGENCE = re.compile(
+    r"(convergence|konvergenz|meridiankonvergens|convergencia|сближение меридианов|收敛角)[^\w+−-]*([+−-]?\d+[.,]?\d*)"
+    r"\s*(?:°|deg\w*)?\s*\(?([EWO](?!\s*[+(])|west|зап|vest|oest)?",
     re.IGNORECASE,
 )
 _SPECIAL_LETTERS = str.maketrans({"ø": "o", "Ø": "O", "ß": "ss", "º": "", "ª": "", "°": ""})
@@ -78,12 +92,15 @@ def titles(rows: Sequence[Sequence[object]]) -> Titles:
     """
     metadata: dict[str, object] = {}
     unclear, days, tools = "", dict[str, None](), dict[str, None]()
-    declination, true = None, False
+    declination = convergence = None
+    true = False
     for row in rows:
         whole = [as_text(cell).strip() for cell in row]
         cells = [part.strip() for cell in whole for part in _PARTS.split(cell)]
-        declination = _declination(" ".join(whole)) if declination is None else declination
-        true = true or bool(_TRUE_NORTH.search(" ".join(whole)))
+        text = " ".join(whole)
+        declination = _rotation(_DECLINATION, text) if declination is None else declination
+        convergence = _rotation(_CONVERGENCE, text) if convergence is None else convergence
+        true = true or bool(_TRUE_NORTH.search(text))
         for place, cell in enumerate(cells):
             key, value = _pair(cell, cells[place + 1 :])
             days |= dict.fromkeys(filter(None, [day_of(cell)]))
@@ -103,16 +120,18 @@ def titles(rows: Sequence[Sequence[object]]) -> Titles:
         metadata |= {"declination_deg": declination} | (
             {"azimuth_reference": "true"} if true else {}
         )
+    if convergence is not None:
+        metadata["convergence_deg"] = convergence
     return Titles(metadata, "" if "date" in metadata else unclear)
 
 
-def _declination(text: str) -> float | None:
-    """The declination that a line states with its sense or sign, degrees east."""
-    match = _DECLINATION.search(text)
+def _rotation(statement: re.Pattern[str], text: str) -> float | None:
+    """The declination or convergence that a line states with its sense or sign, degrees east."""
+    match = statement.search(text)
     if not match:
         return None
-    west = match[3].upper() in ("W", "O") if match[3] else False
-    value = float(match[2].replace(",", "."))
+    west = bool(match[3]) and match[3].upper()[0] in "WOЗV"
+    value = float(match[2].replace(",", ".").replace("−", "-"))
     return -abs(value) if west else value
 
 

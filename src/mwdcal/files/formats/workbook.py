@@ -27,7 +27,7 @@ from mwdcal.files.formats.columns import (
     typed,
 )
 from mwdcal.files.formats.dialect import is_metadata
-from mwdcal.files.formats.titles import titles
+from mwdcal.files.formats.title_references import stated_above
 from mwdcal.sensor.profile import TableFormat
 
 # A file must not depend on the hour it was written: the first day a ZIP archive can hold.
@@ -61,7 +61,7 @@ def parse(
     metadata = meta.parse([(line, str(row[0]).strip()) for line, row in comments], source, "row")
     if form:
         above = [[as_text(cell) for cell in row] for line, row in every if line < form.header_line]
-        metadata = {**titles(above).metadata, **metadata}
+        metadata = {**stated_above(above).metadata, **metadata}
     names, cells, lines = assemble(padded, source, "row")
     named = zip(names, zip(*cells, strict=True), strict=True)
     columns = {name: typed(name, column) for name, column in named}
@@ -169,8 +169,8 @@ def _check_formulas(archive: zipfile.ZipFile, sheet: str, source: str) -> None:
     if without:
         more = f" and {len(without) - _NAMED} more" if len(without) > _NAMED else ""
         raise InputError(
-            f"{source}: formulas without a value, in the cells {', '.join(without[:_NAMED])}{more}. Open the workbook "
-            "in a spreadsheet program, let it calculate, and save it; or write numbers in place of the formulas."
+            f"{source}: formulas without a value, in the cells {', '.join(without[:_NAMED])}{more}. Name a copy "
+            "that a spreadsheet program has saved: it calculates them."
         )
 
 

@@ -1,0 +1,199 @@
+"""References that the title block of a table states for all its stations: field strength, dip and gravity.
+
+A value counts where its word stands before it, its unit is known or its value allows one unit alone, and it is one that
+the Earth has. A nominal or approximate value, a range and an uncertainty are no reference.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+from mwdcal.files.formats.columns import as_text, looks_numeric
+from mwdcal.files.formats.titles import Titles, titles
+from mwdcal.files.synonyms import FACTORS, unit_of
+
+
+class _Quantity(NamedTuple):
+    """Words of a quantity, letters for it, its units with the first as in the run file, and the Earth's values."""
+
+    column: str
+    words: str
+    letters: str
+    units: tuple[str, ...]
+    low: float
+    high: float
+
+
+_OF_PLACES = (
+    _Quantity(
+        "ref_field_nt",
+        r"(total|mag\w*|local|earth'?s?) field|field( strength| intensity| total)?|[bfht] ?total|[bfht](tot|ref)|bt|"
+        r"totalfeld|"
+        r"erdfeld|"
+        r"gesamtfeld|feldstarke|"
+        r"felt|totalintensitat|erdmagnetfeld|magnetfeld|flussdichte|totalfelt\w*|feltstyrke|magnetfelt|"
+        r"campo( (magn\w+|totale?|local))*|totaalveld|pole calkow\w*|(teljes )?terero|toplam alan|medan total|全磁力|"
+        r"magnetfalt|"
+        r"intensidade?( total)?|champ( magn\w*)?( total| local)?|"
+        r"(магн\w* )?поле|полн\w* (вектор|поле)|модуль( магн\w*)?( поля)?|индукци\w+|напряженност\w+( поля)?|"
+        r"(地)?磁场(总)?(强度)?|总场(强度)?|总磁场(强度)?|\|b\||tmf|tmi",
+        "bfhtт",
+        ("nT", "µT", "mT", "gauss", "mG"),
+        15_000.0,
+        80_000.0,
+    ),
+    _Quantity(
+        "ref_dip_deg",
+        r"(mag\w*|local|field) (dip|inclination)( angle)?|dip( angle)?|dipref|manyetik egim|magn\w* inklinacio|伏角|"
+        r"inklinacja( pola)?|inclinazione magn\w*|magn\w* inclinatie|"
+        r"(feld|feld-|magn\w* ?)?inklination|"
+        r"(felt|magn\w* ?)?inklinasjon|mergulho( magn\w*)?|inclinaca?o (magn\w*|do campo)|"
+        r"inclinacion (magn\w*|del campo)|echado|buzamiento|inclinaison( magn\w*| du champ)?|"
+        r"(магн\w* )?наклонени[ея]|(地)?磁倾角",
+        "i",
+        ("°", "rad"),
+        -90.0,
+        90.0,
+    ),
+    _Quantity(
+        "ref_gravity_g",
+        r"(local )?gravity( field| acceleration)?|g ?total|gtot|gref|gt|zwaartekracht|yercekimi|nehezsegi gyorsulas|"
+        r"gravita|gravitasi|tyngdkraft|重力(加速度)?|ускорение силы тяжести|"
+        r"(local|site) g|g[ -]?(local|lokal|ref|tot(al)?)|\|g\||"
+        r"(lokale )?(schwere(beschleunigung)?|fallbeschleunigung|erdbeschleunigung|ortsschwere)|"
+        r"tyngde(akselerasjon|kraft)?\w*|(aceleracion de la )?gravedad|(aceleraca?o da )?gravidade|pesanteur|"
+        r"ускорение свободного падения|сил\w тяжести|(当地)?重力(加速度)?",
+        "g",
+        ("g", "mg", "m/s²", "gal", "mGal"),
+        0.97,
+        1.03,
+    ),
+)
+_WRITTEN_UNIT = (
+    r"n\s?t\b|[uµμ]\s?t\b|m\s?t\b|milli ?gauss|m\s?g(al|auss)?\b|gauss|gal\b|нтл|мктл|мтл|мгал|м/с²?|м/с2|"
+    r"m\s?/\s?s\s?(?:²|\^?2)?|g\b|г\b|°|deg\w*|grad\w*|rad\b|град\w*|fok|derece|stopni|度"
+)
+_WRITTEN_NUMBER = (
+    r"[+\-−]?\d{1,3}(?:[ '’.,\u00a0\u202f]\d{3})+(?:[.,]\d+)?(?!\d)|[+\-−]?\d+(?:[.,]\d+)?"
+)
+_MINUTES = r"(?:\s*°\s*(?P<minutes>\d+(?:[.,]\d+)?)\s*['′’])?"
+_UNSURE = re.compile(
+    r"nomin|approx|about|circa|\bca\b|\bcca\b|≈|~|\bnenn|ungefahr|omtrent|aprox|environ|пример|около|номин|约|标称|"
+    r"uncert|\bunc\b|unsicher|usikker|incert|погреш|不确定|toler|limit|grenz|range|bereich|диапазон|范围|量程|"
+    r"\bmin\b|\bmax\b|\bstd|\bsd\b|sigma|σ|±|spec|resol|offset|drift|gradient|noise|toolface|survey|tool face",
+    re.IGNORECASE,
+)
+"""Words by which a value is no reference."""
+_BEFORE = 8
+"""Characters before a quantity in which a word may stand by which its value is no reference."""
+_BETWEEN = r"(?P<between>[^\d+\-−;]{0,30}?)"
+_REFERRING = re.compile(
+    r"(?<![^\W\d_])(ref|reference|local|lokal|value|wert|t|f|i|g|т)(?![^\W\d_])"
+)
+"""Words and letters behind the word of a quantity that say nothing more."""
+_STATEMENTS = {
+    q: re.compile(
+        rf"(?<![^\W\d_])(?:(?P<word>{q.words})|(?P<letter>[{q.letters}]))(?![^\W\d_]){_BETWEEN}"
+        rf"(?P<number>{_WRITTEN_NUMBER}){_MINUTES}\s*(?P<unit>{_WRITTEN_UNIT})?(?P<behind>[^\d;]{{0,12}})",
+        re.IGNORECASE,
+    )
+    for q in _OF_PLACES
+}
+_SPELT = {
+    "нтл": "nT", "мктл": "µT", "мтл": "mT", "м/с": "m/s²", "м/с²": "m/s²", "м/с2": "m/s²", "m/s": "m/s²", "г": "g",
+    "град": "°", "度": "°", "fok": "°", "derece": "°", "stopni": "°", "gal": "gal",
+    "mgal": "mGal", "мгал": "mGal", "mg": "mg", "mgauss": "mG", "milligauss": "mG",
+}  # fmt: skip
+"""Units in small letters, where `unit_of` does not know them or goes by capitals."""
+
+
+def stated_above(rows: Sequence[Sequence[object]]) -> Titles:
+    """What rows above a table say of the tool, the day and the place, as metadata."""
+    block = titles(rows)
+    return block._replace(metadata={**references_in(rows), **block.metadata})
+
+
+def references_in(rows: Iterable[Sequence[object]]) -> dict[str, float]:
+    """The references that rows above a table state, by column of a run file, in its unit; none that is stated twice.
+
+    >>> references_in([["Local field:", "48 912 nT", "Dip", "66,2°"], ["g (m/s²)", 9.80665]])
+    {'ref_field_nt': 48912.0, 'ref_dip_deg': 66.2, 'ref_gravity_g': 1.0}
+    >>> references_in([["local field 46.8 uT nominal"], ["field uncertainty 50 nT"]])
+    {}
+    """
+    values: dict[str, dict[float, None]] = {}
+    for row in rows:
+        text = _plain(" ".join(filter(None, (as_text(cell).strip() for cell in row))))
+        for quantity, pattern in _STATEMENTS.items():
+            for match in pattern.finditer(text):
+                if _UNSURE.search(text[max(match.start() - _BEFORE, 0) : match.start()]):
+                    continue
+                values.setdefault(quantity.column, {}).update(
+                    dict.fromkeys(_values(quantity, match))
+                )
+    return {column: next(iter(each)) for column, each in values.items() if len(each) == 1}
+
+
+def _plain(text: str) -> str:
+    """Small letters without marks; the signs of units stay."""
+    kept = text.replace("°", "\0").replace("º", "\0").replace("²", "\1").replace("й", "\2")
+    plain = unicodedata.normalize("NFKD", kept.lower().translate({ord("ø"): "o", ord("ß"): "ss"}))
+    bare = "".join(c for c in plain if not unicodedata.combining(c))
+    return bare.replace("\0", "°").replace("\1", "²").replace("\2", "й")
+
+
+def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
+    """The value that a text states, in the unit of the run file, if it is one."""
+    between, behind = match["between"], match["behind"]
+    if _UNSURE.search(f"{match['word'] or ''} {between}") or re.match(
+        r"\W*(nomin|номин|标称|nenn)", behind
+    ):
+        return
+    inner = re.search(rf"(?<![^\W\d_])({_WRITTEN_UNIT})(?![^\W\d_])", between)
+    stated = _unit(
+        match["unit"] or (inner[1] if inner else "") or ("°" if match["minutes"] else "")
+    )
+    if "gauss" in quantity.units:
+        stated = {"g": "gauss", "mg": "mG"}.get(stated, stated)
+    bare = _REFERRING.sub("", between.replace(inner[0], "") if inner else between)
+    direct = not re.search(r"[^\W_]", bare)
+    sure = stated or ("=" in bare and "." in match["number"].replace(",", "."))
+    if (match["letter"] and not (direct and sure)) or not (direct or stated):
+        return
+    if stated and stated not in quantity.units:
+        return
+    numbers = [*_numbers(match["number"], match["minutes"])]
+    units = (stated,) if stated else quantity.units
+    values = {_converted(number, unit) for number in numbers for unit in units}
+    inside = [v for v in values if quantity.low <= v <= quantity.high and v]
+    if len(inside) == 1:
+        yield inside[0]
+
+
+def _unit(text: str) -> str:
+    """The unit that a text in small letters is; empty where it is none."""
+    bare = text.replace(" ", "").replace("^", "")
+    if bare in _SPELT:
+        return _SPELT[bare]
+    cased = {"nt": "nT", "ut": "µT", "µt": "µT", "μt": "µT", "mt": "mT"}
+    return cased.get(bare) or unit_of("m/s2" if bare.startswith("m/s") else bare)
+
+
+def _numbers(text: str, minutes: str | None) -> Iterator[float]:
+    """The numbers that digits may be: a point or a comma may be the decimal sign, or separate thousands."""
+    plain = re.sub(r"[ '’\u00a0\u202f](?=\d{3})", "", text.replace("−", "-"))
+    part = float(minutes.replace(",", ".")) / 60 if minutes else 0.0
+    for sign, other in (".,", ",."):
+        bare = plain.replace(other, "") if re.search(rf"\{other}\d{{3}}(?!\d)", plain) else plain
+        if looks_numeric(bare, sign):
+            number = float(bare.replace(sign, "."))
+            yield number - part if plain.startswith("-") else number + part
+
+
+def _converted(number: float, unit: str) -> float:
+    """A number in the unit of the run file."""
+    factor, _ = FACTORS.get(unit, (1.0, 0.0))
+    return number * factor

@@ -1,0 +1,228 @@
+"""Rows of a run that its laboratory has marked as rejected, in a column of remarks or of a status.
+
+A mark that is plain leaves its row out of the run, and is named. What may be one is asked about when a profile is
+proposed, and named where the row is used. `leave_out` and `keep` of a tool profile decide.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import msgspec
+
+from mwdcal.calibration.diagnosis.flags import listed
+from mwdcal.errors import Answer, InputError, QuestionError
+from mwdcal.files.formats.columns import Column, looks_numeric, shown
+from mwdcal.files.formats.layout import ADJUSTED
+from mwdcal.files.formats.table import Table, labels, row_word
+from mwdcal.files.parting import marked_rows
+from mwdcal.files.statements import rows_of
+from mwdcal.files.synonyms import OURS
+from mwdcal.sensor.profile import TableFormat
+
+_OF_REFUSAL = (
+    r"reject(ed)?|bad|invalid|void|voided|discard(ed)?|unusable|omit(ted)?|excluded?|scrap(ped)?|do not use|dnu|"
+    r"n\.? ?ok|nok|not ok|no good|n\.o\.k\.?|verworfen|ungultig|schlecht|fehlmessung|unbrauchbar|gestrichen|"
+    r"nicht (ok|verwenden|verwertbar)|n\.? ?i\.? ?o\.?|forkastet|ugyldig|darlig|underkjent|strøket|stroket|feilmaling|"
+    r"ikke (ok|bruk|brukes)|rechazad[oa]|invalid[oa]|descartad[oa]|anulad[oa]|no (ok|usar|valid[oa])|mal[oa]?|"
+    r"rejeitad[oa]|ruim|nao (ok|usar)|rejete?e?|mauvaise?|annulee?|ecarte|non ok|брак|забракован[оа]?|отбракован[оа]?|"
+    r"плохо|плохая|не ?год(ен|на|но)|недейств\w*|исключ\w*|не использовать|отклонен[оа]?|не ок|"
+    r"作废|剔除|无效|废弃|舍弃|弃用|不可用|坏点?"
+)
+_REJECTED = re.compile(rf"\W*({_OF_REFUSAL})\W*|\W*({_OF_REFUSAL})\s*[-–—:;,.(/!].*", re.DOTALL)
+"""A cell that rejects its row, whatever reason follows."""
+_MAY_REJECT = re.compile(
+    rf"(?<![^\W\d_])({_OF_REFUSAL}|fail(ed)?|outlier|suspect|questionable|doubtful|ausreißer|ausreisser|fehler|avvik|"
+    r"moved|bumped|disturbed|slipped|knocked|bewegt|verrutscht|gestossen|flyttet|movi(o|do)|mexeu|bouge|сдвин\w*|"
+    r"толкн\w*|"
+    r"nicht bestanden|falha|fallo|выброс|сбой)(?![^\W\d_])|不合格|异常|可疑|移动|碰到"
+)
+"""A cell that may reject its row, or speak of another one."""
+_ACCEPTED = re.compile(
+    r"ok(ay)?|good|valid|accept(ed)?|pass(ed)?|use(d)?|i\.? ?o\.?|gut|gultig|bestanden|godkjent|gyldig|bra|bien|bueno|"
+    r"buena|aceptad[oa]|valid[oa]|bom|boa|aceit[oa]|bon(ne)?|годен|годна|хорошо|норма|да|ок|合格|正常|有效|良好?"
+)
+_OF_ACCEPTANCE = re.compile(
+    r"(is )?(ok|valid|use|used|accept|accepted|good|gultig|gyldig|valid[oa]|годен|有效|io)\W*"
+)
+_OF_REJECTION = re.compile(
+    r"(is )?(reject|rejected|bad|exclude|excluded|invalid|verworfen|forkastet|брак|剔除)\W*"
+)
+_OF_STATUS = re.compile(
+    r"(status|state|flag|flags|quality|qual|qc|qa|check|result|bewertung|qualitat|kvalitet|estado|calidad|qualidade|"
+    r"statut|etat|статус|качество|оценка|状态|质量|判定|结果)\W*(flag|code)?\W*"
+)
+"""Names of columns whose values judge rows, one by one."""
+_AFFIRMED = {"y", "yes", "true", "1", "x", "ja", "j", "si", "s", "sim", "oui", "o", "да", "д", "是"}
+_DENIED = {"n", "no", "false", "0", "nein", "nei", "nao", "non", "нет", "н", "否"}
+MARKS_NAMED = 8
+"""Rows that a sentence names."""
+_OF_NUMBERS = frozenset("0123456789+-−eE.,:;/ ")
+_MOST_STATIONS = 2000
+"""Stations of a run beyond which no copies are looked for."""
+_MOST_VALUES = 5
+"""Values of a column of a status at most; one of more tells something else."""
+
+
+UNMARKED = ("group", "serial", *OURS)
+"""Columns of a run file that mark no row."""
+
+
+class Marks(NamedTuple):
+    """Rows that are left out, by number, with what says so; and cells that may reject their rows, which are used."""
+
+    left_out: dict[int, str]
+    doubtful: dict[tuple[str, str], list[int]]
+
+
+def marks_in(table: Table, form: TableFormat, used: Collection[str]) -> Marks:
+    """The marks in the columns of a table that are not `used`, and what the form says of any column."""
+    left_out: dict[int, str] = {}
+    doubtful: dict[tuple[str, str], list[int]] = {}
+    for name in table.columns:
+        chosen, kept = ({*map(_plain, each.get(name, ()))} for each in (form.leave_out, form.keep))
+        judged = name not in used and name not in form.ignore and not name.startswith("witsml ")
+        judged = judged and (_holds_words(table.columns[name]) or _names_judgements(_plain(name)))
+        judged = judged and not marked_rows(table, name)
+        cells = labels(table, name) if chosen or kept or judged else []
+        spelt = {cell: _plain(cell) for cell in {*cells}}
+        plain = [spelt[cell] for cell in cells]
+        verdicts = _verdicts(_plain(name), plain) if judged else {}
+        for row, cell in enumerate(plain):
+            verdict = True if cell in chosen else None if cell in kept else verdicts.get(cell)
+            if verdict:
+                left_out.setdefault(row, f"{shown(name)}: {cells[row] or 'blank'}")
+            elif verdict is not None:
+                doubtful.setdefault((name, cells[row]), []).append(row)
+    return Marks(left_out, doubtful)
+
+
+def _verdicts(name: str, cells: Sequence[str]) -> dict[str, bool]:
+    """The cells of a column that reject their rows (true), or may do so (false)."""
+    different = {*cells}
+    filled = different - {""}
+    if len(filled) > _MOST_VALUES:
+        filled = {c for c in filled if not looks_numeric(c)}
+    if filled and all(map(ADJUSTED.search, filled)):
+        return {}
+    judges = len(different) > 1 and len(filled) <= _MOST_VALUES
+    if judges and _OF_ACCEPTANCE.fullmatch(name) and filled <= _AFFIRMED | _DENIED:
+        return dict.fromkeys(filled & _DENIED, True)
+    if judges and _OF_REJECTION.fullmatch(name) and filled <= _AFFIRMED | _DENIED:
+        return dict.fromkeys(filled & _AFFIRMED, True)
+    verdicts = {c: True for c in filled if _REJECTED.fullmatch(c)}
+    verdicts |= {c: False for c in filled if c not in verdicts and _MAY_REJECT.search(c)}
+    accepted = {c for c in filled if _ACCEPTED.fullmatch(c)}
+    if 2 * sum(map(accepted.__contains__, cells)) < len(cells):
+        accepted = set()
+    named = _OF_STATUS.fullmatch(name) or _OF_ACCEPTANCE.fullmatch(name)
+    if judges and (accepted or named):
+        usual = accepted or {max(sorted(different), key=cells.count)}
+        verdicts |= dict.fromkeys(filled - usual - {*verdicts}, False)
+    return verdicts
+
+
+def _holds_words(column: Column) -> bool:
+    """Whether a column has a cell with more than the signs of numbers."""
+    return isinstance(column, list) and not set("".join(column)) <= _OF_NUMBERS
+
+
+def _names_judgements(name: str) -> bool:
+    return any(each.fullmatch(name) for each in (_OF_ACCEPTANCE, _OF_REJECTION, _OF_STATUS))
+
+
+def _copies(table: Table) -> dict[int, str]:
+    """Rows that repeat another one in every cell, its label too, and where that one stands.
+
+    Some column must tell all other rows apart; without one, rows alike may be measurements of their own.
+    """
+    if table.count > _MOST_STATIONS:
+        return {}
+    columns = [labels(table, name) for name in table.columns]
+    first: dict[tuple[str, ...], int] = {}
+    copies = {}
+    for row, cells in enumerate(zip(*columns, strict=True)):
+        if first.setdefault(cells, row) != row:
+            copies[row] = f"every cell as in {place(table, first[cells])}"
+    different = table.count - len(copies)
+    return copies if any(len({*cells}) == different for cells in columns) else {}
+
+
+def _plain(text: str) -> str:
+    """Small letters without marks, and blanks around."""
+    plain = unicodedata.normalize("NFKD", text.replace("ø", "o").replace("й", "\0").casefold())
+    bare = "".join(c for c in plain if not unicodedata.combining(c)).replace("\0", "й")
+    return " ".join(bare.split())
+
+
+def without_rejected(
+    table: Table, form: TableFormat | msgspec.UnsetType, used: Collection[str]
+) -> Table:
+    """The table without the rows that its laboratory rejected; `remarks` of it name these, and those that are doubtful.
+
+    Raises:
+        InputError: no row is left.
+    """
+    form = TableFormat() if isinstance(form, msgspec.UnsetType) else form
+    _check_one_run(table, form)
+    marks = marks_in(table, form, used)
+    copies = _copies(table)
+    if not marks.left_out and not marks.doubtful and not copies:
+        return table
+    marks = marks._replace(left_out={**copies, **marks.left_out})
+    rows = [row for row in range(table.count) if row not in marks.left_out]
+    if not rows:
+        raise InputError(
+            f"{table.source}: every row is marked as rejected ({next(iter(marks.left_out.values()))}). If they count, "
+            "say so by keep = {NAME = [TEXT]} in [table] of the tool profile."
+        )
+    return replace(rows_of(table, rows), remarks=(*table.remarks, *_remarks(table, marks)))
+
+
+def _check_one_run(table: Table, form: TableFormat) -> None:
+    """Ask which run is meant where a column says that rows are from before and after an adjustment."""
+    for name, column in table.columns.items():
+        texts = (
+            [*dict.fromkeys(filter(None, labels(table, name)))] if isinstance(column, list) else []
+        )
+        if not texts or not all(map(ADJUSTED.search, texts[: _MOST_VALUES + 1])):
+            continue
+        left = [text for text in texts if text not in form.leave_out.get(name, ())]
+        if len(left) > 1 and not {*left} <= {*form.keep.get(name, ())}:
+            pairs = [
+                tuple(("leave_out", f"{name}={t}") for t in left if t != text) for text in left
+            ]
+            raise QuestionError(
+                f"{table.source} holds {len(left)} runs, of which {shown(name)} says {', '.join(map(shown, left))}. "
+                "Which one is meant? The rows of the others are left out by leave_out in [table] of the tool profile.",
+                [Answer(text, arguments) for text, arguments in zip(left, pairs, strict=True)],
+            )
+
+
+def _remarks(table: Table, marks: Marks) -> Iterator[str]:
+    """A sentence on the rows that are left out, and one on those that may have to be."""
+    if marks.left_out:
+        each = [f"{place(table, row)} ({said})" for row, said in sorted(marks.left_out.items())]
+        yield f"rows that are rejected, or copies of others, are left out: {listed(each, MARKS_NAMED)}."
+    doubtful = {
+        row: f"{shown(name)}: {cell}"
+        for (name, cell), rows in marks.doubtful.items()
+        for row in rows
+        if row not in marks.left_out
+    }
+    if doubtful:
+        each = [f"{place(table, row)} ({said})" for row, said in sorted(doubtful.items())]
+        yield (
+            f"rows that may be marked as rejected are used: {listed(each, MARKS_NAMED)}. To leave them out, or to "
+            "keep them without this line, use leave_out or keep in [table] of the tool profile."
+        )
+
+
+def place(table: Table, row: int) -> str:
+    """The line of a row in its file."""
+    number = table.lines[row] if row < len(table.lines) else row + 1
+    return f"{row_word(table)} {number}"

@@ -1,0 +1,509 @@
+"""What a laboratory's table says beside its readings: references, marks, adjustments, mistyped cells and names."""
+
+import csv
+import json
+import re
+
+import numpy as np
+import openpyxl
+import pytest
+
+import mwdcal as library
+from cli_support import channels, mwdcal, refused, servo_run, stations, write_csv
+from mwdcal.files.formats.title_references import references_in
+from mwdcal.files.formats.titles import titles
+from simulation import Tool, plan
+
+NAMES = {
+    "station": "Pos", "temperature_c": "Temp (C)", "ax": "Gx (V)", "ay": "Gy (V)", "az": "Gz (V)",
+    "mx": "Hx (V)", "my": "Hy (V)", "mz": "Hz (V)", "ref_inclination_deg": "Inc (deg)",
+    "ref_azimuth_deg": "Azi (deg)", "ref_toolface_deg": "TF (deg)", "ref_gravity_g": "Local G (g)",
+    "ref_field_nt": "Btotal (nT)", "ref_dip_deg": "Dip (deg)",
+}  # fmt: skip
+
+
+def table(**others):
+    """The columns of a sound run as a laboratory calls them; None takes one away, more come behind."""
+    run = {NAMES[name]: values for name, values in servo_run().items()}
+    run |= {NAMES.get(name, name): values for name, values in others.items()}
+    return {name: values for name, values in run.items() if values is not None}
+
+
+def written(path, columns, *above, encoding="utf-8", delimiter=","):
+    """A text table with lines above its names."""
+    write_csv(path, columns, delimiter=delimiter)
+    path.write_text("\n".join([*above, path.read_text("utf-8")]), encoding)
+    return path
+
+
+def read(path, **answers):
+    """The run that the proposed profile makes of a table."""
+    return library.read_run(path, library.propose_profile(path, **answers).profile)
+
+
+def calibrated(folder, path, *options):
+    """What `calibrate` says and stores of a table, by the profile proposed for it."""
+    tool, cal = folder / "tool.toml", folder / "cal.json"
+    ran = mwdcal("profile", path, "-o", tool, "--replace", *options)
+    assert ran.code == 0, ran
+    ran = mwdcal("calibrate", path, "--tool", tool, "-o", cal)
+    assert ran.code == 0, ran
+    return ran, json.loads(cal.read_text())
+
+
+# ------------------------------------------------------------------------------ title blocks
+
+PLACE = {"ref_field_nt": 48_912.0, "ref_dip_deg": 66.25, "ref_gravity_g": 9.8123 / 9.80665}
+TITLES = {
+    "English": [["Local field: 48912 nT", "Dip 66.25 deg", "g = 9.8123 m/s2"]],
+    "cells": [["Total field", 48.912, "µT"], ["Dip", "66°15'"], ["Gravity", 981.23, "gal"]],
+    "German": [["Erdfeld 48,912 µT; Inklination 66,25°; Fallbeschleunigung 9,8123 m/s²"]],
+    "Norwegian": [
+        ["Totalfelt:", "48 912", "nT"],
+        ["Feltinklinasjon", "66,25 °"],
+        ["Tyngde 9,8123 m/s²"],
+    ],
+    "Spanish": [
+        ["Campo total (nT): 48.912"],
+        ["Inclinación magnética 66,25°"],
+        ["Gravedad local", 9.8123, "m/s2"],
+    ],
+    "Portuguese": [
+        ["Intensidade total 489,12 mG", "Mergulho magnético 66,25 °", "Gravidade 981230 mGal"]
+    ],
+    "French": [
+        ["Champ total F", "0.48912 gauss"],
+        ["Inclinaison magnétique I", 66.25, "°"],
+        ["g", "9,8123 m/s²"],
+    ],
+    "Russian": [["Т = 48,912 мкТл, наклонение 66,25°, g = 9,8123 м/с²"]],
+    "Chinese": [["总磁场强度", 48912, "nT", "磁倾角", "66.25°", "重力加速度", 9.8123, "m/s²"]],
+}
+NO_REFERENCES = (
+    [["local field 48.9 uT nominal"], ["field uncertainty 50 nT"], ["Dip tolerance 0.3 deg"]],
+    [["Fluxgate: 2.5 V at 50 000 nT"], ["Field range ±70 µT"], ["Magnetic field tool, model 45"]],
+    [
+        ["Operator: G. Field", 12],
+        ["Tool", "F 45-12"],
+        ["Gravity toolface 90 deg"],
+        ["Max. field 48912 nT"],
+    ],
+)
+
+
+@pytest.mark.parametrize("language", TITLES)
+def test_a_title_block_states_the_references_of_the_run(language):
+    assert references_in(TITLES[language]) == pytest.approx(PLACE, rel=1e-12)
+
+
+@pytest.mark.parametrize("rows", NO_REFERENCES)
+def test_what_is_nominal_a_range_or_a_name_is_no_reference(rows):
+    assert references_in(rows) == {}
+
+
+def test_two_values_of_one_reference_are_none():
+    assert references_in([["Field 48912 nT"], ["Field 49001 nT"]]) == {}
+
+
+def test_a_calibration_by_references_above_the_names_is_that_by_columns(tmp_path):
+    """The same values in columns of the table: the same parameters."""
+    run = servo_run()
+    place = {name: float(run[name][0]) for name in PLACE}
+    field, dip, gravity = place.values()
+    above = [f"Local field;{field!r} nT", f"Dip;{dip!r} deg", f"Local gravity;{gravity!r} g"]
+    titled = written(tmp_path / "a.csv", table(**dict.fromkeys(PLACE)), *above, delimiter=";")
+    whole = written(tmp_path / "b.csv", table(), delimiter=";")
+    ran = mwdcal("profile", titled, "-o", tmp_path / "shown.toml")
+    assert re.search(rf"ref_field_nt +above the names +{field:.8g} nT", ran.out)
+    (_, one), (_, two) = (calibrated(tmp_path, path) for path in (titled, whole))
+    for kind in ("accelerometer", "magnetometer"):
+        np.testing.assert_allclose(
+            one[kind]["parameters"], two[kind]["parameters"], rtol=1e-11, atol=0
+        )
+
+
+def test_a_column_counts_before_the_title(tmp_path):
+    path = written(tmp_path / "a.csv", table(), "Local field,12345 nT,Local field,51000 nT")
+    assert read(path).reference("field") == pytest.approx(servo_run()["ref_field_nt"])
+
+
+def test_a_cover_sheet_states_serial_and_references(tmp_path):
+    columns = table(**dict.fromkeys(PLACE))
+    book = openpyxl.Workbook()
+    for row in (["Tool S/N", "DM-17"], ["Total field", 50_000, "nT"], ["Dip", 65, "deg"]):
+        book.active.append(row)
+    sheet = book.create_sheet("Data")
+    for row in ([*columns], *zip(*columns.values(), strict=True)):
+        sheet.append([v.item() if hasattr(v, "item") else v for v in row])
+    book.save(tmp_path / "run.xlsx")
+    run = read(tmp_path / "run.xlsx")
+    assert run.metadata["serial"] == "DM-17"
+    assert run.reference("field") == pytest.approx(np.full(run.count, 50_000.0))
+    assert np.degrees(run.reference("dip")) == pytest.approx(np.full(run.count, 65.0))
+
+
+DECLINATIONS = (
+    (["Declination: -1.62 deg"], -1.62),
+    (["Declination", -1.62, "deg (E +)"], -1.62),
+    (["Declination 3.4 W"], -3.4),
+    (["Deklination 3,4° W"], -3.4),
+    (["Магнитное склонение: +13,30° (восточное)"], 13.3),
+)
+
+
+@pytest.mark.parametrize(("row", "east"), DECLINATIONS)
+def test_a_declination_keeps_its_sign(row, east):
+    assert titles([row]).metadata["declination_deg"] == pytest.approx(east)
+
+
+def test_grid_azimuths_are_turned_by_the_title(tmp_path):
+    """grid = magnetic + declination - convergence."""
+    run = servo_run()
+    grid = (run["ref_azimuth_deg"] - 1.62 - 0.38) % 360
+    columns = {("Azi grid (deg)" if n == "Azi (deg)" else n): v for n, v in table().items()}
+    columns["Azi grid (deg)"] = grid
+    path = written(
+        tmp_path / "a.csv",
+        columns,
+        "Declination,-1.62 deg (E +)",
+        "Grid convergence,0.38 deg (E +)",
+    )
+    difference = np.degrees(read(path).reference("azimuth")) - run["ref_azimuth_deg"]
+    assert np.abs((difference + 180) % 360 - 180).max() < 1e-9
+
+
+# --------------------------------------------------------------------------------- marked rows
+
+
+def marked(name, cells, usual=""):
+    """A column with texts at some stations, by number from 1."""
+    return {name: [cells.get(k + 1, usual) for k in range(48)]}
+
+
+REJECTED = {
+    "Status": {7: "REJECT", 20: "reject"},
+    "Merknad": {7: "FORKASTET - truck utenfor", 20: "ikke OK"},
+    "Bewertung": {7: "n.i.O.", 20: "nicht OK"},
+    "Observaciones": {7: "rechazada", 20: "anulado, mal contacto"},
+    "Obs.": {7: "rejeitado", 20: "descartada"},
+    "Примечание": {7: "брак", 20: "не годен"},
+    "备注": {7: "作废", 20: "剔除"},
+    "Reject": {7: "x", 20: "x"},
+}
+
+
+@pytest.mark.parametrize("name", REJECTED)
+def test_a_rejected_row_is_left_out_and_named(tmp_path, name):
+    """The calibration is that of the table without the rows."""
+    usual = "OK" if name in ("Status", "Bewertung") else ""
+    path = written(tmp_path / "a.csv", table(**marked(name, REJECTED[name], usual)))
+    keep = [k for k in range(48) if k + 1 not in REJECTED[name]]
+    less = {n: [v[k] for k in keep] for n, v in table().items()}
+    other = write_csv(tmp_path / "b.csv", less)
+    (ran, one), (_, two) = (calibrated(tmp_path, each) for each in (path, other))
+    assert one["accelerometer"]["parameters"] == two["accelerometer"]["parameters"]
+    assert "left out: line 8 (" in ran.err
+    assert "line 21 (" in ran.err
+    assert "marked-rows" in [each["id"] for each in one["findings"]]
+
+
+def roll_test(seed=5):
+    """Twelve stations of the same tool at an inclination of its own."""
+    inc, azi, face = plan((40,), 12)
+    tool = Tool.random(1, noise=(1e-4, 15.0))
+    g, b = (v[0] for v in tool.readings(np.random.default_rng(seed), 1, inc, azi, face))
+    earth = (tool.gravity, tool.field, np.degrees(tool.dip))
+    warmth = np.full(len(inc), 25.0)
+    return {**stations(inc, azi, face, earth=earth, temperature_c=warmth), **channels(g, b)}
+
+
+def test_a_verification_leaves_rejected_rows_out_too(tmp_path):
+    calibrated(tmp_path, written(tmp_path / "a.csv", table()))
+    rows = roll_test()
+    rows["ax"][6] += 0.5
+    columns = {NAMES[n]: v for n, v in rows.items()}
+    columns["Status"] = ["REJECT" if k == 6 else "OK" for k in range(12)]
+    ran = mwdcal("verify", tmp_path / "cal.json", written(tmp_path / "roll.csv", columns))
+    assert ran.code == 0
+    assert "11 stations" in ran.out
+    assert "line 8 ('Status': REJECT)" in ran.err
+
+
+@pytest.mark.parametrize(
+    ("name", "cells", "usual", "text"),
+    [
+        ("Status", {7: "N"}, "OK", "N"), ("Flag", {7: "1"}, "0", "1"),
+        ("Remarks", {7: "repeat of rejected 6"}, "", "repeat of rejected 6"),
+        ("Obs", {7: "se movió un poco"}, "", "se movió un poco"), ("Result", {7: "FAIL"}, "PASS", "FAIL"),
+    ],
+)  # fmt: skip
+def test_a_doubtful_mark_is_asked_about(tmp_path, name, cells, usual, text):
+    path = written(tmp_path / "a.csv", table(**marked(name, cells, usual)))
+    message = refused(mwdcal("profile", path, "-o", tmp_path / "tool.toml"), 3)
+    assert f"line 8: '{name}' says '{text}'" in message
+    assert "--leave-out" in message
+    assert "--keep" in message
+    assert read(path, keep={name: [text]}).count == 48
+    assert read(path, leave_out={name: [text]}).count == 47
+
+
+@pytest.mark.parametrize(
+    "text", ["stand levelled again", "ny måling av 21", "checked", "see logbook"]
+)
+def test_other_remarks_mark_nothing(tmp_path, text):
+    assert read(written(tmp_path / "a.csv", table(**marked("Remarks", {7: text})))).count == 48
+
+
+def test_a_rejected_row_can_be_kept(tmp_path):
+    path = written(tmp_path / "a.csv", table(**marked("Status", {7: "REJECT"}, "OK")))
+    ran, _ = calibrated(tmp_path, path, "--keep", "Status=REJECT")
+    assert "48 stations" in ran.out
+    assert 'keep = {Status = ["REJECT"]}' in (tmp_path / "tool.toml").read_text()
+
+
+def test_a_row_that_repeats_another_in_every_cell_counts_once(tmp_path):
+    columns = {n: np.append(v, v[10]) for n, v in table().items()}
+    ran, one = calibrated(tmp_path, written(tmp_path / "a.csv", columns))
+    _, two = calibrated(tmp_path, written(tmp_path / "b.csv", table()))
+    assert one["magnetometer"]["parameters"] == two["magnetometer"]["parameters"]
+    assert "left out: line 50 (every cell as in line 12)" in ran.err
+
+
+def test_apply_keeps_every_row(tmp_path):
+    calibrated(tmp_path, written(tmp_path / "a.csv", table()))
+    path = written(tmp_path / "b.csv", table(**marked("Status", {7: "REJECT"}, "OK")))
+    assert mwdcal("apply", tmp_path / "cal.json", path, "-o", tmp_path / "out.csv").code == 0
+    lines = (tmp_path / "out.csv").read_text("utf-8-sig").splitlines()
+    assert sum(not line.startswith("#") for line in lines) == 49
+
+
+@pytest.mark.parametrize(
+    "words", [("as found", "as left"), ("校准前", "校准后"), ("før justering", "etter justering")]
+)
+def test_runs_before_and_after_an_adjustment_are_two(tmp_path, words):
+    if words[0] == "as found":
+        words = ("before adjustment", "after adjustment")
+    columns = {n: np.concatenate([v, v]) for n, v in table().items()}
+    columns["State"] = [words[0]] * 48 + [words[1]] * 48
+    path = written(tmp_path / "a.csv", columns)
+    message = refused(mwdcal("profile", path, "-o", tmp_path / "tool.toml"), 3)
+    assert "holds 2 runs, of which 'State' says" in message
+    assert read(path, leave_out={"State": [words[0]]}).count == 48
+
+
+def test_a_second_table_below_is_taken_by_its_row_in_every_command(tmp_path):
+    lines = write_csv(tmp_path / "a.csv", table()).read_text().splitlines()
+    path = tmp_path / "b.csv"
+    path.write_text("\n".join(["BEFORE ADJUSTMENT", *lines, "", "AFTER ADJUSTMENT", *lines]))
+    assert "2 tables of like columns" in refused(
+        mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3
+    )
+    ran, _ = calibrated(tmp_path, path, "--header-row", "53")
+    assert "48 stations" in ran.out
+
+
+# ------------------------------------------------------------------------- names, units, cells
+
+
+def test_names_that_stand_twice_are_told_apart(tmp_path):
+    names = ["Pos", "T", "X", "Y", "Z", "X", "Y", "Z", "Inc", "Azi", "TF"]
+    run = servo_run()
+    columns = [
+        run[n] for n in ("station", "temperature_c", "ax", "ay", "az", "mx", "my", "mz", *ANGLES)
+    ]
+    path = tmp_path / "a.csv"
+    with path.open("w", newline="") as stream:
+        csv.writer(stream).writerows([names, *zip(*columns, strict=True)])
+    message = refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
+    assert "--column ax=X --column ay=Y --column az=Z" in message
+    assert "--column 'mx=X (2)' --column 'my=Y (2)' --column 'mz=Z (2)'" in message
+    answers = dict(zip(channels_of(run), ["X", "Y", "Z", "X (2)", "Y (2)", "Z (2)"], strict=True))
+    result = read(path, column=answers)
+    assert result.magnetometer is not None
+    assert result.temperature == pytest.approx(run["temperature_c"])
+
+
+ANGLES = ("ref_inclination_deg", "ref_azimuth_deg", "ref_toolface_deg")
+
+
+def channels_of(run):
+    return [name for name in ("ax", "ay", "az", "mx", "my", "mz") if name in run]
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("Dpi", "ref_dip_deg"), ("Inklinatoin", "ref_dip_deg"), ("Btotall", "ref_field_nt"),
+        ("Totalfedl", "ref_field_nt"), ("Azmi", "ref_azimuth_deg"), ("Tmep", "temperature_c"),
+        ("Garvity", "ref_gravity_g"),
+    ],
+)  # fmt: skip
+def test_a_mistyped_name_is_asked_about(tmp_path, name, meant):
+    columns = {(name if n == NAMES[meant] else n): v for n, v in table().items()}
+    path = written(tmp_path / "a.csv", columns)
+    message = refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
+    assert f"no column is '{meant}' by its name" in message
+    assert f"--column {meant}={name}" in message
+
+
+@pytest.mark.parametrize("name", ["Shift", "Stand no", "Trip", "Setup", "Tip", "Depth"])
+def test_other_names_are_none_of_them(tmp_path, name):
+    path = written(
+        tmp_path / "a.csv", table(**{"ref_dip_deg": None, name: np.tile([1.0, 2.0], 24)})
+    )
+    unused = [f.text for f in library.propose_profile(path).findings if f.id == "unused-columns"]
+    if name != "Tip":
+        assert unused == [f"columns not used: '{name}'."]
+
+
+def test_units_that_contradict_each_other_are_both_named(tmp_path):
+    columns = {("Btotal (µT)" if n == "Btotal (nT)" else n): v for n, v in table().items()}
+    units = {"Btotal (µT)": "nT", "Gx (V)": "V", "Gy (V)": "V", "Gz (V)": "V"}
+    names, *rows = write_csv(tmp_path / "a.csv", columns).read_text().splitlines()
+    path = tmp_path / "b.csv"
+    path.write_text("\n".join([names, ",".join(units.get(n, "") for n in columns), *rows]))
+    message = refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
+    assert "'Btotal (µT)' is in µT and nT" in message
+    run = read(path, column={"ref_field_nt": "Btotal (µT) (nT)"})
+    assert run.reference("field") == pytest.approx(servo_run()["ref_field_nt"])
+
+
+@pytest.mark.parametrize(
+    ("column", "factor", "stated", "fits"),
+    [
+        ("ref_field_nt", 1e-3, "nT", "µT"),
+        ("ref_gravity_g", 9.80665, "g", "m/s²"),
+        ("ref_toolface_deg", np.pi / 180, "°", "rad"),
+    ],
+)
+def test_values_that_contradict_their_unit_are_asked_about(tmp_path, column, factor, stated, fits):
+    path = written(tmp_path / "a.csv", table(**{column: servo_run()[column] * factor}))
+    message = refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
+    assert f"is in {stated}, and its values" in message
+    assert f"are those of {fits}" in message
+
+
+@pytest.mark.parametrize("text", ["#N/A", "74..95", "9999.99", "-999.25", ""])
+@pytest.mark.parametrize("column", ["ref_azimuth_deg", "ay"])
+def test_a_cell_without_a_reading_is_named_with_the_option_that_leaves_its_row_out(
+    tmp_path, column, text
+):
+    if column == "ref_azimuth_deg" and not text:
+        return  # an unknown reference
+    cells = [repr(float(v)) for v in servo_run()[column]]
+    path = written(tmp_path / "a.csv", table(**{column: [*cells[:9], text, *cells[10:]]}))
+    message = refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
+    assert f"line 11, column '{NAMES[column]}'" in message
+    assert f"'{NAMES[column]}={text}'" in message
+    assert read(path, leave_out={NAMES[column]: [text]}).count == 47
+
+
+def test_a_lost_decimal_point_is_asked_about(tmp_path):
+    cells = [f"{v:.5f}" for v in servo_run()["az"]]
+    wrong = cells[9].replace(".", "")
+    path = written(tmp_path / "a.csv", table(az=[*cells[:9], wrong, *cells[10:]]))
+    assert f"got '{wrong}'" in refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
+
+
+def test_a_wrong_cell_of_a_workbook_is_named_as_the_program_names_it(tmp_path):
+    columns = table()
+    book = openpyxl.Workbook()
+    book.active.title = "Roll test"
+    for row in (["Title"], [], [*columns], *zip(*columns.values(), strict=True)):
+        book.active.append([v.item() if hasattr(v, "item") else v for v in row])
+    place = f"{openpyxl.utils.get_column_letter([*columns].index('Gy (V)') + 1)}9"
+    book.active[place] = "see note"
+    book.save(tmp_path / "run.xlsx")
+    message = refused(mwdcal("profile", tmp_path / "run.xlsx", "-o", tmp_path / "t.toml"), 3)
+    assert f"sheet 'Roll test', cell {place}, column 'Gy (V)'" in message
+
+
+def test_magnetometers_of_unknown_names_with_an_offset_are_asked_about(tmp_path):
+    """The norm of channels that read 2.5 V at no field is not steady; their distance from the middle is."""
+    run = servo_run()
+    others = {f"CH{k} (V)": run[n] + 2.5 for k, n in enumerate(("mx", "my", "mz"), 5)}
+    path = written(tmp_path / "a.csv", table(mx=None, my=None, mz=None, **others))
+    message = refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
+    assert "--column 'mx=CH5 (V)' --column 'my=CH6 (V)' --column 'mz=CH7 (V)'" in message
+
+
+WORDS = {
+    "cp1250": [
+        "Kąt odchylenia [°]",
+        "Azymut [°]",
+        "Kąt ustawienia narzędzia [°]",
+        "Przysp. {} [V]",
+        "Pole magn. {} [V]",
+    ],
+    "cp1254": ["Eğim (°)", "Azimut (°)", "Takım yüzü (°)", "İvme {} (V)", "Manyetik {} (V)"],
+    "cp932": ["傾斜角[deg]", "方位角[deg]", "ツールフェース[deg]", "加速度{}[V]", "磁気{}[V]"],
+}
+
+
+@pytest.mark.parametrize("encoding", WORDS)
+def test_encodings_without_a_mark_are_told_by_words_of_the_field(tmp_path, encoding):
+    run, words = servo_run(), WORDS[encoding]
+    columns = dict(zip(words[:3], (run[n] for n in ANGLES), strict=True))
+    for name, triad in zip(words[3:], ("a", "m"), strict=True):
+        columns |= {name.format(axis.upper()): run[f"{triad}{axis}"] for axis in "xyz"}
+    path = written(tmp_path / "a.csv", columns, encoding=encoding)
+    result = read(path)
+    assert np.degrees(result.reference("inclination")) == pytest.approx(run["ref_inclination_deg"])
+    assert result.magnetometer is not None
+
+
+def test_az_is_the_azimuth_where_another_column_is_the_channel(tmp_path):
+    names = {"ref_azimuth_deg": "AZ", "ax": "AX", "ay": "AY", "az": "AZ_"}
+    columns = {names.get(n, NAMES[n]): v for n, v in servo_run().items()}
+    run = read(written(tmp_path / "a.csv", columns))
+    assert np.degrees(run.reference("azimuth")) == pytest.approx(servo_run()["ref_azimuth_deg"])
+
+
+def test_rows_numbered_under_s_n_are_stations(tmp_path):
+    columns = {("S/N" if n == "Pos" else n): v for n, v in table().items()}
+    assert read(written(tmp_path / "a.csv", columns)).count == 48
+
+
+# ------------------------------------------------------------------------------- after a FAIL
+
+
+def test_a_failed_roll_test_leads_on(tmp_path):
+    calibrated(tmp_path, written(tmp_path / "a.csv", table()))
+    rows = roll_test()
+    rows["ax"] = rows["ax"] + 0.06
+    roll = written(tmp_path / "roll.csv", {NAMES[n]: v for n, v in rows.items()})
+    cal = tmp_path / "cal.json"
+    ran = mwdcal("verify", cal, roll)
+    assert ran.code == 1
+    assert re.search(r"^measure again: station \d+; station \d+$", ran.out, re.MULTILINE)
+    assert f"next: mwdcal diagnose {cal} {roll}" in ran.out
+    machine = mwdcal("verify", cal, roll, "--json").json["findings"][-1]
+    assert machine["id"] == "next-step"
+    assert "mwdcal diagnose cal.json roll.csv" in machine["text"]
+    both = mwdcal(
+        "calibrate",
+        tmp_path / "a.csv",
+        "--tool",
+        tmp_path / "tool.toml",
+        "-o",
+        cal,
+        "--rolltest",
+        roll,
+        "--json",
+    )
+    assert both.code == 1
+    assert both.json["verification"]["findings"][-1]["id"] == "next-step"
+
+
+def test_a_fleet_leaves_rejected_rows_out_too_and_says_so(tmp_path):
+    """A folder of two runs: the one with the rejected row has as many stations less."""
+    folder = tmp_path / "runs"
+    folder.mkdir()
+    run = servo_run()
+    write_csv(folder / "A1.csv", {**run, **marked("Status", {7: "REJECT"}, "OK")})
+    write_csv(folder / "A2.csv", run)
+    ran = mwdcal("fleet", folder, "-o", tmp_path / "cals.parquet", "--tool", "servo", "--json")
+    assert ran.code == 0, ran
+    assert ran.json["stations"] == 95
+    assert "A1.csv: rows that are rejected" in ran.err
+    assert "line 8 ('Status': REJECT)" in ran.err
