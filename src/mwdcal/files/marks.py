@@ -61,7 +61,7 @@ _AFFIRMED = {"y", "yes", "true", "1", "x", "ja", "j", "si", "s", "sim", "oui", "
 _DENIED = {"n", "no", "false", "0", "nein", "nei", "nao", "non", "нет", "н", "否"}
 MARKS_NAMED = 8
 """Rows that a sentence names."""
-_OF_NUMBERS = frozenset("0123456789+-−eE.,:;/ ")
+_MARK_NUMBERS = frozenset("0123456789+-−eE.,:;/ ")
 _MOST_STATIONS = 2000
 """Stations of a run beyond which no copies are looked for."""
 _MOST_VALUES = 5
@@ -128,7 +128,7 @@ def _verdicts(name: str, cells: Sequence[str]) -> dict[str, bool]:
 
 def _holds_words(column: Column) -> bool:
     """Whether a column has a cell with more than the signs of numbers."""
-    return isinstance(column, list) and not set("".join(column)) <= _OF_NUMBERS
+    return isinstance(column, list) and not set("".join(column)) <= _MARK_NUMBERS
 
 
 def _names_judgements(name: str) -> bool:
