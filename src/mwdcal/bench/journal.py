@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 from collections.abc import Iterator
@@ -15,14 +16,14 @@ from mwdcal.errors import InputError
 from mwdcal.files.formats import atomic
 
 Event = dict[str, Any]
-NAME = "session.jsonl"
+JOURNAL_NAME = "session.jsonl"
 
 
 class Journal:
     """Events of a session; those that a former server wrote first."""
 
     def __init__(self, folder: Path) -> None:
-        self.path = folder / NAME
+        self.path = folder / JOURNAL_NAME
         self.events: list[Event] = [*self._past()]
         self._stream = self.path.open("ab")
 
@@ -42,8 +43,8 @@ class Journal:
                     raise TypeError
             except (ValueError, TypeError, KeyError):
                 raise InputError(
-                    f"{self.path}, line {number}: is no event of a session. Take the line from a copy, or name another "
-                    "folder with --session."
+                    f"{self.path}, line {number}: is not an event of a session. Take the line from a copy, or name "
+                    "another folder."
                 ) from None
             yield event
 
@@ -69,10 +70,8 @@ class Journal:
     def _take_back(self, size: int) -> None:
         """Cut a line that was written in part."""
         path = os.fspath(self.path)
-        try:
+        with contextlib.suppress(OSError):
             self._stream.close()
-        except OSError:
-            pass
         os.truncate(path, size)
         self._stream = self.path.open("ab")
 

@@ -1,7 +1,7 @@
 """The bench as a web server on this machine: one session, several browsers that watch it.
 
-Who has the token in the address may decide; nothing is changed by a GET, by another site's form, or under another host's name.
-No request leaves the machine.
+Who has the token in the address may decide. A GET changes nothing, nor does another site's form, or a request under
+another host's name. No request leaves the machine.
 """
 
 from __future__ import annotations
@@ -9,10 +9,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import re
 import secrets
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Collection, Mapping, Sequence
 from importlib.resources import files
-from math import isfinite
+from ipaddress import ip_address
 from threading import Event, Thread
 from urllib.parse import parse_qs, urlsplit
 
@@ -33,16 +34,15 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from mwdcal.bench import pages
-from mwdcal.bench.session import Session
-from mwdcal.bench.sources import Source
-from mwdcal.bench.stream import TEMPERATURE, Stream
+from mwdcal.bench.session import BenchSession
+from mwdcal.bench.sources import LineSource
+from mwdcal.bench.stream import LARGEST_VALUE, TEMPERATURE_COLUMN
 from mwdcal.errors import InputError, MwdcalError
 from mwdcal.files.contract import RAW
 
-COOKIE = "mwdcal_bench"
 TICK = 0.1
 """Seconds between live figures."""
-LARGEST = 64_000
+LARGEST_FORM = 64_000
 """Bytes of a form that are read."""
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
@@ -56,61 +56,104 @@ HEADERS = {
     "Content-Security-Policy": POLICY, "X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store", "Cross-Origin-Opener-Policy": "same-origin",
 }  # fmt: skip
-READING = ("GET", "HEAD")
+UNCHANGING = ("GET", "HEAD")
 """Methods that change nothing."""
 STATIC = {"bench.js": "text/javascript", "bench.css": "text/css"}
 
 
 class Bench:
-    """A session, its source, and the server's doors."""
+    """A session, its source, and the server's doors. `hosts` are the names, with port, under which it answers.
+
+    `any_address`: it answers under any address of the machine, too, which no other site can have.
+    """
 
     def __init__(
-        self, session: Session, source: Source, hosts: tuple[str, ...], token: str | None = None
-    ) -> None:
-        self.session, self.source, self.hosts = session, source, hosts
+        self, session: BenchSession, source: LineSource, hosts: Collection[str], token: str | None = None,
+        any_address: bool = False,
+    ) -> None:  # fmt: skip
+        self.session, self.source, self.hosts, self.any_address = (
+            session,
+            source,
+            hosts,
+            any_address,
+        )
         self.token = token or secrets.token_urlsafe(24)
+        self.cookie = f"mwdcal_bench_{next(iter(hosts)).rpartition(':')[2]}"
         self.stop = Event()
         self.reader = Thread(target=self._read, name="bench source", daemon=True)
         self._fragment: tuple[int, str] = (-1, "")
-        self.doors: dict[str, Callable[[Mapping[str, str]], None]] = {
+        self._forms: dict[str, Callable[[Mapping[str, str]], None]] = {
             "start": self._start,
-            "resume": lambda form: session.resume(),
-            "accept": lambda form: session.accept(),
-            "again": lambda form: session.measure_again(),
-            "undo": lambda form: session.undo(),
-            "skip": lambda form: session.skip(),
-            "pause": lambda form: session.switch("paused", True),
-            "go_on": lambda form: session.switch("paused", False),
+            "accept": lambda form: session.accept(_whole(form.get("position", ""))),
+            "again": lambda form: session.measure_again(_whole(form.get("position", ""))),
             "auto": lambda form: session.switch("auto", "on" in form),
-            "calibrate": lambda form: session.calibrate(),
-            "rolltest": lambda form: session.start_rolltest(),
             "certificate": lambda form: session.certify(form.get("number", "").strip()[:100]),
             "typed": self._typed,
+            "temperature": self._temperature,
         }
+        self._buttons: dict[str, Callable[[], None]] = {
+            "resume": session.resume,
+            "undo": session.undo,
+            "skip": session.skip,
+            "pause": lambda: session.switch("paused", True),
+            "go_on": lambda: session.switch("paused", False),
+            "calibrate": session.calibrate,
+            "rolltest": session.start_rolltest,
+            "reopen": session.reopen,
+            "repeat": session.repeat_rolltest,
+            "enter": session.enter,
+        }
+
+    def decide(self, name: str, form: Mapping[str, str]) -> bool:
+        """Do what a form or a button asks for; whether there is one of this name."""
+        if name in self._forms:
+            self._forms[name](form)
+        elif name in self._buttons:
+            self._buttons[name]()
+        return name in self._forms or name in self._buttons
 
     # ------------------------------------------------------------------ the source
 
     def _read(self) -> None:
-        for time, line in self.source.lines(self.stop):
-            self.session.line(time, line)
+        while not self.stop.is_set():
+            try:
+                for time, line in self.source.lines(self.stop):
+                    self.session.line(time, line)
+            except Exception as error:  # the session must go on
+                self.session.say(
+                    f"the source has failed ({type(error).__name__}: {error}). Trying again."
+                )
+            self.stop.wait(1.0)
 
     def _start(self, form: Mapping[str, str]) -> None:
-        earth = {name: _number(form.get(name, ""), name) for name in pages.EARTH}
-        self.session.start(form.get("serial", "")[:100], form.get("operator", "")[:100], **earth)
+        earth = {
+            name: _number(form.get(name, ""), pages.texts()[name])
+            for name in pages.STAND_REFERENCES
+        }
+        serial, operator, plan = (
+            form.get(name, "")[:100] for name in ("serial", "operator", "plan")
+        )
+        self.session.start(serial, operator, plan, earth)
 
     def _typed(self, form: Mapping[str, str]) -> None:
-        """A reading by hand is a station."""
-        stream = Stream(self.session.stream.form)
-        line = form.get("reading", "").replace(",", " ").replace(";", " ").replace("\t", " ")
-        values = _numbers(line)
-        names = stream.channels or {6: RAW, 7: (*RAW, TEMPERATURE), 3: RAW[:3]}.get(len(values), ())
-        if len(names) != len(values) or not values:
-            raise InputError(
-                f"a reading is {len(names) or 6} numbers, {' '.join(names or RAW)}; got {len(values)}. Type it again."
-            )
-        self.session.accept(dict(zip(names, values, strict=True)))
+        """Readings by hand are stations, one a line."""
+        lines = [line for line in form.get("reading", "").splitlines() if line.strip()]
+        rows = [typed_reading(line, self.session.stream.channels) for line in lines]
+        if not rows:
+            raise InputError("there is no reading. Type one, or paste one a line.")
+        self.session.accept_typed(rows, _whole(form.get("position", "")))
+
+    def _temperature(self, form: Mapping[str, str]) -> None:
+        value = _number(form.get("temperature", ""), pages.texts()["temperature"])
+        if value is None:
+            raise InputError("the temperature is missing. Type it in °C.")
+        self.session.state_temperature(value)
 
     # ------------------------------------------------------------------ requests
+
+    def answers_to(self, host: str) -> bool:
+        """Whether a host with port is the bench's. Another site can give its name our address, no more."""
+        return host in self.hosts or (self.any_address and _is_address(host))
 
     def fragment(self) -> str:
         """The changing part of the page, made once for all browsers."""
@@ -123,7 +166,7 @@ class Bench:
         """The page."""
         if "token" in request.query_params:
             answer: Response = RedirectResponse("/", 303)
-            answer.set_cookie(COOKIE, self.token, httponly=True, samesite="strict")
+            answer.set_cookie(self.cookie, self.token, httponly=True, samesite="strict")
             return answer
         return HTMLResponse(await run_in_threadpool(pages.page, self.session, self.token))
 
@@ -146,12 +189,10 @@ class Bench:
 
     async def act(self, request: Request) -> Response:
         """A decision."""
-        door = self.doors.get(request.path_params["name"])
-        if door is None:
-            return PlainTextResponse("there is nothing of this name", 404)
-        form = request.state.form
+        name, form = request.path_params["name"], request.state.form
         try:
-            await run_in_threadpool(door, form)
+            if not await run_in_threadpool(self.decide, name, form):
+                return PlainTextResponse("there is nothing of this name", 404)
         except MwdcalError as error:
             return PlainTextResponse(str(error), 409)
         if "text/html" in request.headers.get("accept", ""):
@@ -168,7 +209,7 @@ class Bench:
             if self.session.version != seen:
                 seen = self.session.version
                 yield _event("page", await run_in_threadpool(self.fragment))
-            now = pages.live(self.session, self.source.note, self.source.drops)
+            now = pages.live(self.session, self.source)
             if (text := json.dumps(now)) != last:
                 last = text
                 yield f"event: live\ndata: {text}\n\n"
@@ -218,23 +259,23 @@ class _Guard:
 
         request = Request(scope, receive)
         door = self._refusal(request) or (
-            await self._form(request) if request.method not in READING else None
+            await self._form(request) if request.method not in UNCHANGING else None
         )
         await (door or self.app)(scope, receive, with_headers)
 
     def _refusal(self, request: Request) -> Response | None:
         """Why a request is not from the bench's page, if it is not."""
-        if request.headers.get("host", "") not in self.bench.hosts:
+        if not self.bench.answers_to(request.headers.get("host", "")):
             return PlainTextResponse("this address is not the bench's", 421)
-        known = request.query_params.get("token") or request.cookies.get(COOKIE) or ""
+        known = request.query_params.get("token") or request.cookies.get(self.bench.cookie) or ""
         if not self._is_token(known):
             return PlainTextResponse(
                 "Open the address that mwdcal bench has printed: it has the token.", 403
             )
-        if request.method in READING:
+        if request.method in UNCHANGING:
             return None
         origin, site = request.headers.get("origin"), request.headers.get("sec-fetch-site", "")
-        foreign = origin is not None and _netloc(origin) not in self.bench.hosts
+        foreign = origin is not None and not self.bench.answers_to(_netloc(origin))
         if foreign or site in ("cross-site", "same-site"):
             return PlainTextResponse("this form is not the bench's", 403)
         return None
@@ -244,7 +285,7 @@ class _Guard:
         data = bytearray()
         async for chunk in request.stream():
             data += chunk
-            if len(data) > LARGEST:
+            if len(data) > LARGEST_FORM:
                 return PlainTextResponse("this form is too long", 413)
         try:
             form = parse_qs(data.decode(), keep_blank_values=True, max_num_fields=50)
@@ -271,29 +312,56 @@ def _event(name: str, content: str) -> str:
     return f"event: {name}\ndata: {json.dumps(content)}\n\n"
 
 
-def _numbers(line: str) -> list[float]:
-    """The numbers of a typed line."""
+def _is_address(host: str) -> bool:
+    """Whether a host with port is an address rather than a name."""
     try:
-        values = [float(word) for word in line.split()]
-        if not all(map(isfinite, values)):
-            raise ValueError("infinite")
-        return values
-    except ValueError as error:
+        ip_address(host.rpartition(":")[0].strip("[]"))
+        return True
+    except ValueError:
+        return False
+
+
+def typed_reading(line: str, channels: Sequence[str]) -> dict[str, float]:
+    """A reading by channel; numbers stand apart by blanks, tabs, semicolons or commas, or have a decimal comma.
+
+    Raises:
+        InputError: a word is not a number, or the numbers are not those of the channels.
+    """
+    between = (
+        r"[\s;]+" if "," in line and "." not in line and re.search(r"\d,\d", line) else r"[\s;,]+"
+    )
+    words = [word.replace(",", ".") for word in re.split(between, line.strip())]
+    if between != r"[\s;,]+" and len(words) < 3:  # 1,2,3: whole numbers
+        words = line.replace(",", " ").split()
+    values = [_number(word, "reading") for word in words if word]
+    if len(values) in (len(channels), len(channels) - 1) and channels:
+        names: Sequence[str] = channels
+    else:
+        names = {3: RAW[:3], 6: RAW, 7: (*RAW, TEMPERATURE_COLUMN)}.get(len(values), ())
+    if not names:
         raise InputError(
-            f"the reading has a word that is no number ({error}). Type it again."
-        ) from None
+            f"a reading is {' '.join(RAW)} and, if known, the temperature; got {len(values)} numbers. Type it again."
+        )
+    return {name: v for name, v in zip(names, values, strict=False) if v is not None}
 
 
 def _number(text: str, name: str) -> float | None:
-    """A number of the form; None where it is blank."""
+    """A number of the form; None if it is blank."""
     if not text.strip():
         return None
     try:
         value = float(text)
-        if isfinite(value):
+        if abs(value) < LARGEST_VALUE:
             return value
-        raise ValueError
     except ValueError:
-        raise InputError(
-            f"{pages.texts()[name]}: '{text[:40]}' is no number. Correct it."
-        ) from None
+        pass
+    raise InputError(f"{name}: '{text[:40]}' is not a number that can be. Correct it.")
+
+
+def _whole(text: str) -> int | None:
+    """A position of the form, from 0; None if it is blank."""
+    if not text:
+        return None
+    if re.fullmatch("[0-9]{1,6}", text):
+        return int(text)
+    raise InputError(f"position: '{text[:40]}' is not a whole number. Open the page again.")

@@ -1,8 +1,8 @@
 """Whether the tool stands still, said while it is read.
 
-The stream is cut into cells of half a second. A cell is still where no channel scatters more than three times its noise, or
-lies farther from the first cell of the standstill than noise allows. So many still cells in a row are a station, whose reading
-is their mean.
+The stream is cut into cells of half a second. A cell is still if no channel scatters more than three times its noise,
+nor lies farther from the first cell of the standstill than noise allows. So many still cells in a row are a station,
+whose reading is their mean. While a channel creeps, the oldest cells are dropped, until the others creep no more.
 """
 
 from __future__ import annotations
@@ -10,27 +10,30 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from math import inf, sqrt
+from math import hypot, inf, sqrt
 
-CELL = 0.5
+CELL_SECONDS = 0.5
 """Length of a cell, seconds."""
-FEWEST = 3
+FEWEST_IN_CELL = 3
 """Samples of a cell at least."""
-SCATTER = 3.0
+CELL_SCATTER = 3.0
 """Times its noise that a channel may scatter within a cell."""
-APART = 5.0
+CELLS_APART = 5.0
 """Standard deviations that the means of two cells of a standstill may lie apart."""
-GAP = 3.0
+CREEP_SIGMA = 4.0
+"""Standard deviations of a trend over the standstill beyond which a channel creeps."""
+SILENCE = 3.0
 """Seconds without a sample that end a standstill."""
 QUIETEST = 40
 """Cells of which the quietest tell the noise of a channel."""
 
 
 @dataclass
-class Cell:
+class HalfSecond:
     """Sums over the samples of half a second."""
 
     start: float
+    first: tuple[float, ...]
     count: int = 0
     end: float = 0.0
     sums: list[float] = field(default_factory=list)
@@ -39,7 +42,6 @@ class Cell:
     def add(self, time: float, values: Sequence[float]) -> None:
         """One sample more."""
         if not self.count:
-            self.first = tuple(values)
             self.sums, self.squares = [0.0] * len(values), [0.0] * len(values)
         self.count, self.end = self.count + 1, time
         for place, (value, origin) in enumerate(zip(values, self.first, strict=True)):
@@ -50,9 +52,7 @@ class Cell:
     @property
     def means(self) -> list[float]:
         """The mean of each channel."""
-        return [
-            origin + total / self.count for origin, total in zip(self.first, self.sums, strict=True)
-        ]
+        return [a + total / self.count for a, total in zip(self.first, self.sums, strict=True)]
 
     @property
     def scatter(self) -> list[float]:
@@ -78,92 +78,139 @@ class Standstill:
 class Settling:
     """The state of the tool: "moving", "settling" or "settled".
 
-    `sensors` channels decide, those that follow, such as a temperature, do not. `window` is how long the tool
-    has to stand, in seconds; `least` (k,) the smallest noise of each sensor that is believed: its resolution.
+    The first `sensors` channels decide, those that follow, such as a temperature, do not. `window` is how long the tool
+    has to stand, in seconds; `least` (k,) the smallest noise of each sensor that is believed. `moves` counts how often
+    a standstill has ended.
     """
 
     def __init__(self, sensors: int, window: float = 5.0, least: Sequence[float] = ()) -> None:
         self.sensors, self.window = sensors, window
-        self.least = list(least) or [0.0] * sensors
-        self.cell: Cell | None = None
-        self.still: list[Cell] = []
+        self.least = [*least] or [0.0] * sensors
+        self.step = [inf] * sensors
+        self.still: list[HalfSecond] = []
         self.recent: deque[list[float]] = deque(maxlen=QUIETEST)
         self.noise = [inf] * sensors
         self.time = -inf
+        self.moves = 0
+        self._cell: HalfSecond | None = None
+        self._before: Sequence[float] = ()
+        self._settled = False
 
     def take(self, time: float, values: Sequence[float]) -> None:
-        """One sample of all channels at a time in seconds, which does not go back."""
-        if time < self.time or time - self.time > GAP:
-            self.cell, self.still = None, []
+        """One sample of all channels at a time in seconds; a gap, or a clock set back, ends a standstill."""
+        if time < self.time or time - self.time > SILENCE:
+            self._cell = None
+            self._end()
         self.time = time
-        if self.cell is not None and time - self.cell.start >= CELL and self.cell.count >= FEWEST:
-            self._close(self.cell)
-            self.cell = None
-        if self.cell is None:
-            self.cell = Cell(time)
-        self.cell.add(time, values)
+        cell = self._cell
+        if cell is not None and time - cell.start >= CELL_SECONDS and cell.count >= FEWEST_IN_CELL:
+            self._judge(cell)
+            cell = None
+        self._learn_steps(values)
+        if cell is None:
+            cell = self._cell = HalfSecond(time, tuple(values))
+        cell.add(time, values)
 
-    def _close(self, cell: Cell) -> None:
-        """Judge a whole cell."""
+    def _learn_steps(self, values: Sequence[float]) -> None:
+        """The smallest step of each sensor: that of its converter, if it is coarse."""
+        for place, (a, b) in enumerate(zip(values[: self.sensors], self._before, strict=False)):
+            if 0 < abs(a - b) < self.step[place]:
+                self.step[place] = abs(a - b)
+        self._before = values
+
+    def _end(self) -> None:
+        """The standstill is over."""
+        self.moves += bool(self.still)
+        self.still, self._settled = [], False
+
+    def _judge(self, cell: HalfSecond) -> None:
+        """Take a whole cell into the standstill, or end it."""
         scatter = cell.scatter[: self.sensors]
         self.recent.append(scatter)
-        ranked = (sorted(each) for each in zip(*self.recent, strict=True))
         quarter = (len(self.recent) - 1) // 4
-        self.noise = [
-            max(each[quarter], least) for each, least in zip(ranked, self.least, strict=True)
-        ]
-        quiet = all(s <= SCATTER * n for s, n in zip(scatter, self.noise, strict=True))
-        if not quiet:
-            self.still = []
-        elif self.still and not (
-            self._alike(cell, self.still[0]) and self._alike(cell, self.still[-1])
-        ):
-            self.still = [cell]
-        else:
-            self.still.append(cell)
-        longest = int(4 * self.window / CELL)
-        del self.still[:-longest]
-
-    def _alike(self, one: Cell, other: Cell) -> bool:
-        spread = sqrt(1 / one.count + 1 / other.count)
-        return all(
-            abs(a - b) <= APART * n * spread
-            for a, b, n in zip(one.means, other.means, self.noise, strict=False)
+        ranked = (sorted(each) for each in zip(*self.recent, strict=True))
+        # a value between two steps of a converter scatters by half a step
+        coarse = (
+            max(a, step / 2) if step < inf else a
+            for a, step in zip(self.least, self.step, strict=True)
         )
+        self.noise = [max(each[quarter], least) for each, least in zip(ranked, coarse, strict=True)]
+        quiet = all(s <= CELL_SCATTER * n for s, n in zip(scatter, self.noise, strict=True))
+        ends = (self.still[0], self.still[-1]) if self.still else ()
+        if not quiet or not all(self._alike(cell, other) for other in ends):
+            self._end()
+        if quiet:
+            self.still.append(cell)
+            del self.still[: -int(4 * self.window / CELL_SECONDS)]
+        self._settled = False
+        while self.still and self._stood >= self.window:
+            if not self._creeps():
+                self._settled = True
+                break
+            del self.still[0]
+
+    def _alike(self, one: HalfSecond, other: HalfSecond) -> bool:
+        spread = sqrt(1 / one.count + 1 / other.count)
+        pairs = zip(one.means, other.means, self.noise, strict=False)
+        return all(abs(a - b) <= CELLS_APART * n * spread for a, b, n in pairs)
+
+    def _creeps(self) -> bool:
+        """Whether the means of the cells of a sensor have a trend that its noise does not explain."""
+        count = sum(cell.count for cell in self.still) / len(self.still)
+        columns = [*zip(*(cell.means for cell in self.still), strict=True)][: self.sensors]
+        return any(
+            _trend(column, noise / sqrt(count)) > CREEP_SIGMA
+            for column, noise in zip(columns, self.noise, strict=True)
+        )
+
+    @property
+    def _stood(self) -> float:
+        return self.still[-1].end - self.still[0].start if self.still else 0.0
 
     @property
     def seconds_left(self) -> float:
         """How long the tool still has to stand; the whole window while it moves."""
-        stood = self.still[-1].end - self.still[0].start if self.still else 0.0
-        return max(self.window - stood, 0.0)
+        return max(self.window - self._stood, 0.0)
 
     @property
     def state(self) -> str:
-        """ "moving", "settling" or "settled"."""
+        """The state in a word."""
         if not self.still:
             return "moving"
-        return "settling" if self.seconds_left > 0 else "settled"
-
-    @property
-    def began(self) -> float:
-        """When the present standstill began, seconds; infinite while the tool moves."""
-        return self.still[0].start if self.still else inf
+        return "settled" if self._settled else "settling"
 
     def station(self) -> Standstill:
         """The mean over the standstill; only while settled."""
         cells = self.still
         samples = sum(cell.count for cell in cells)
-        each = list(zip(*(cell.means for cell in cells), strict=True))
+        each = [*zip(*(cell.means for cell in cells), strict=True)]
         weights = [cell.count / samples for cell in cells]
         means = tuple(sum(m * w for m, w in zip(row, weights, strict=True)) for row in each)
-        sd = tuple(_sd_of_mean(row, weights, mean) for row, mean in zip(each, means, strict=True))
-        floor = [n / sqrt(samples) for n in self.noise]
-        sd = tuple(max(pair) for pair in zip(sd, floor, strict=False)) + sd[len(floor) :]
-        return Standstill(means, sd, samples, cells[0].start, cells[-1].end)
+        sd = [_sd_of_mean(row, weights, mean) for row, mean in zip(each, means, strict=True)]
+        scatter = [*zip(*(cell.scatter for cell in cells), strict=True)]
+        for place in range(self.sensors):
+            sample = max(sqrt(sum(s * s for s in scatter[place]) / len(cells)), self.least[place])
+            sd[place] = max(sd[place], sample / sqrt(samples))
+            if sample < (step := self.step[place]) / 2 < inf:  # its error does not average out
+                sd[place] = hypot(sd[place], step / sqrt(12))
+        return Standstill(means, tuple(sd), samples, cells[0].start, cells[-1].end)
+
+
+def _trend(means: Sequence[float], sd: float) -> float:
+    """Slope of a straight line through means over its standard deviation, by their scatter if that exceeds `sd`."""
+    many = len(means)
+    if many < FEWEST_IN_CELL:
+        return 0.0
+    middle, mean = (many - 1) / 2, sum(means) / many
+    square = many * (many * many - 1) / 12
+    slope = sum((i - middle) * (m - mean) for i, m in enumerate(means)) / square
+    left = sum((m - mean - slope * (i - middle)) ** 2 for i, m in enumerate(means)) / (many - 2)
+    spread = max(sd, sqrt(left))
+    return abs(slope) * sqrt(square) / spread if spread else 0.0
 
 
 def _sd_of_mean(cells: Sequence[float], weights: Sequence[float], mean: float) -> float:
-    """Standard uncertainty of a mean of cells, by their scatter: it holds noise that wanders from cell to cell, too."""
+    """Standard uncertainty of a mean of cells by their scatter, which holds noise that wanders from cell to cell."""
     many = len(cells)
     if many < 2:
         return 0.0

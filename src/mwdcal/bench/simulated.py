@@ -13,31 +13,33 @@ from mwdcal.geometry.vectors import Array
 from mwdcal.planning.simulate import StationPlan, Truth, drawn, reading
 from mwdcal.sensor.profile import Profile
 
-RATE = 10.0
+SAMPLE_HZ = 10.0
 """Samples a second."""
-BLOCK = 5
+SAMPLES_AT_ONCE = 5
 """Samples that are made at once."""
-TURN = 6.0
+TURN_SECONDS = 6.0
 """Seconds of a move of the stand."""
-KNOCK_DEG = 1.5
-"""How far the tool stands off where it was knocked."""
-TEMPERATURE = 25.0
+KNOCKED_DEG = 1.5
+"""How far a knocked tool stands off."""
+ROOM_C = 25.0
+"""Temperature of the simulated tool, °C."""
 Attitude = tuple[float, float, float]
 """Inclination, azimuth and toolface, degrees."""
 
 
 class DemoStand:
-    """The source of `--source demo`. `order` says where the tool is to be now, and the number of the attempt.
+    """The source of simulated readings: a tool, and a stand that goes where `order` says.
 
-    `knocked` are attempts, counted from 0, at which the tool does not quite stand where the stand says.
+    `order` gives an attitude and the number of the attempt. `knocked` are attempts, counted from 0, at which somebody
+    knocks the tool off the angles that the stand shows.
     """
 
     def __init__(
-        self, profile: Profile, order: Callable[[], tuple[Attitude | None, int]],
-        speed: float = 1.0, seed: int = 1, knocked: Sequence[int] = (7, 15),
-    ) -> None:  # fmt: skip
+        self, profile: Profile, speed: float = 1.0, seed: int = 1, knocked: Sequence[int] = (7, 15)
+    ) -> None:
         self.note, self.drops = "", 0
-        self.profile, self.order, self.speed, self.knocked = profile, order, speed, {*knocked}
+        self.order: Callable[[], tuple[Attitude | None, int]] = lambda: (None, -1)
+        self.profile, self.speed, self.knocked = profile, speed, {*knocked}
         self.rng = np.random.default_rng(seed)
         self.tool: Truth = drawn(self.rng, profile, 0)
         self.here = np.array([10.0, 20.0, 30.0])
@@ -62,20 +64,20 @@ class DemoStand:
         while not stop.is_set():
             wanted = self.order()
             if wanted[0] is not None and wanted != goal:
-                goal, start, left = wanted, self.here, TURN
+                goal, start, left = wanted, self.here, TURN_SECONDS
                 end = self._setting(wanted[0], wanted[1])
-            clock = (done + np.arange(BLOCK)) / RATE
-            remaining = np.maximum(left - np.arange(1, BLOCK + 1) / RATE, 0.0)
-            share = 0.5 + 0.5 * np.cos(np.pi * remaining / TURN)
+            clock = (done + np.arange(SAMPLES_AT_ONCE)) / SAMPLE_HZ
+            remaining = np.maximum(left - np.arange(1, SAMPLES_AT_ONCE + 1) / SAMPLE_HZ, 0.0)
+            share = 0.5 + 0.5 * np.cos(np.pi * remaining / TURN_SECONDS)
             attitude = start + share[:, None] * (end - start)
             left, self.here = float(remaining[-1]), attitude[-1]
             for seconds, row in zip(clock, self._read(attitude), strict=True):
                 yield (
                     float(seconds),
-                    ",".join([f"{seconds:.1f}", *(f"{v:.7g}" for v in row), f"{TEMPERATURE}"]),
+                    ",".join([f"{seconds:.1f}", *(f"{v:.7g}" for v in row), f"{ROOM_C}"]),
                 )
-            done += BLOCK
-            ahead = done / RATE / self.speed - (time.monotonic() - began)
+            done += SAMPLES_AT_ONCE
+            ahead = done / SAMPLE_HZ / self.speed - (time.monotonic() - began)
             if ahead > 0.002:
                 stop.wait(ahead)
 
@@ -85,13 +87,13 @@ class DemoStand:
         sd = np.array([stand.inclination_deg, stand.azimuth_deg, stand.toolface_deg])
         off = sd * self.rng.normal(size=3)
         if attempt in self.knocked:
-            off = off + KNOCK_DEG
+            off = off + KNOCKED_DEG
         return np.asarray(attitude) + off
 
     def _read(self, attitude_deg: Array) -> Array:
         """Raw channels (n, k) with noise at attitudes (n, 3)."""
-        angles = np.radians(attitude_deg).T
-        plan = StationPlan(*angles, np.full(len(attitude_deg), TEMPERATURE))
+        inclination, azimuth, toolface = np.radians(attitude_deg).T
+        plan = StationPlan(inclination, azimuth, toolface, np.full(len(attitude_deg), ROOM_C))
         columns = []
         for vectors, name in zip(
             reading(self.tool, plan), ("accelerometer", "magnetometer"), strict=False

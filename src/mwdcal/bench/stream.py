@@ -1,120 +1,121 @@
-"""Lines of a stream, and the channels that they hold: as the tool profile's `[stream]` says, or learned from the first lines."""
+"""The lines of a stream and their channels: as `[stream]` of the tool profile says, or learned from the first lines."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import isfinite
 
-from mwdcal.errors import InputError
 from mwdcal.files.contract import RAW
 from mwdcal.files.synonyms import FACTORS
 from mwdcal.sensor.profile import StreamForm
 
-TEMPERATURE, TIME, LABEL = "temperature_c", "time_s", "skip"
-LONGEST = 4000
+TEMPERATURE_COLUMN, TIME_COLUMN = "temperature_c", "time_s"
+LINE_CHARACTERS = 4000
 """Characters of a line that are read; a longer line is garbage."""
+LARGEST_VALUE = 1e12
+"""No reading is larger, nor a time."""
 LEARNED = 5
 """Lines of numbers that agree, from which their number of columns is learned."""
-ORDERS = {
-    6: RAW,
-    7: (*RAW, TEMPERATURE),
-    8: (TIME, *RAW, TEMPERATURE),
+COLUMNS_BY_NUMBER = {
     3: RAW[:3],
-    4: (*RAW[:3], TEMPERATURE),
+    4: (*RAW[:3], TEMPERATURE_COLUMN),
+    6: RAW,
+    7: (*RAW, TEMPERATURE_COLUMN),
+    8: (TIME_COLUMN, *RAW, TEMPERATURE_COLUMN),
 }
 """Columns of a line of so many numbers, where nothing says what they are."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """The channels of one line, raw, in the order of `Stream.channels`; its own time in seconds, if it has one."""
+    """The channels of one line, raw, in the order of `Stream.channels`; its time in seconds, if it has one."""
 
     values: tuple[float, ...]
     time: float | None = None
 
 
 class Stream:
-    """Reads lines; counts those that it cannot read."""
+    """Reads lines; counts those that it can read, and those that it cannot."""
 
     def __init__(self, form: StreamForm | None = None) -> None:
         self.form = form
-        self.garbage = 0
+        self.good = self.garbage = 0
         self._seen: list[int] = []
-        self._pattern = None if form is None or not form.pattern else re.compile(form.pattern)
-        if self.form is not None and not self.form.columns and self._pattern is None:
-            raise InputError(
-                '[stream] of the tool profile names no columns. Add columns = ["ax", …], or pattern.'
-            )
+        self._pattern = re.compile(form.pattern) if form and form.pattern else None
+        self.channels = self._channels()
 
-    @property
-    def channels(self) -> tuple[str, ...]:
+    def _channels(self) -> tuple[str, ...]:
         """Raw channels and temperature of a sample, in their order; empty until they are known."""
-        if self.form is None:
-            return ()
-        names = self.form.columns or tuple((self._pattern or re.compile("")).groupindex)
-        return tuple(name for name in (*RAW, TEMPERATURE) if name in names)
+        names = self.form.columns if self.form else ()
+        names = names or (tuple(self._pattern.groupindex) if self._pattern else ())
+        return tuple(name for name in (*RAW, TEMPERATURE_COLUMN) if name in names)
 
     def take(self, line: str) -> Sample | None:
-        """The sample of a line; None where it holds none, which is counted unless it is blank."""
+        """The sample of a line, or None; a line that is neither blank nor a header then counts as garbage."""
         if not line.strip():
             return None
         try:
-            return self._read(line) if len(line) <= LONGEST else self._garbage()
+            if len(line) > LINE_CHARACTERS:
+                raise ValueError("too long")
+            sample = self._learn(line) if self.form is None else self._read(line, self.form)
         except (ValueError, OverflowError):
-            return self._garbage()
+            if not _header(_parts(line, _separator(line))):
+                self.garbage += 1
+            return None
+        self.good += sample is not None
+        return sample
 
-    def _garbage(self) -> None:
-        self.garbage += 1
-
-    def _read(self, line: str) -> Sample | None:
-        if self.form is None:
-            return self._learn(line)
+    def _read(self, line: str, form: StreamForm) -> Sample:
         if self._pattern is not None:
-            found = self._pattern.search(line)
-            cells: Mapping[str, str] = found.groupdict() if found else {}
+            match = self._pattern.search(line)
+            cells: Mapping[str, str | None] = match.groupdict() if match else {}
         else:
-            parts = line.split(self.form.separator or None)
-            if len(parts) != len(self.form.columns):
-                return self._garbage()
-            cells = dict(zip(self.form.columns, parts, strict=True))
-        values = tuple(self._number(cells, name) for name in self.channels)
-        time = self._number(cells, TIME) if TIME in cells else None
-        if not all(map(isfinite, values)) or (time is not None and not isfinite(time)):
-            return self._garbage()
-        return Sample(values, time)
-
-    def _number(self, cells: Mapping[str, str], name: str) -> float:
-        unit = self.form.units.get(name, "") if self.form else ""
-        factor, offset = FACTORS.get(unit, (1.0, 0.0))
-        return float(cells[name]) * factor + offset
+            cells = dict(zip(form.columns, _parts(line, form.separator), strict=True))
+        values = tuple(_number(cells, name, form) for name in self.channels)
+        return Sample(values, _number(cells, TIME_COLUMN, form) if TIME_COLUMN in cells else None)
 
     def _learn(self, line: str) -> Sample | None:
         """Take note of a line before the form is known: a line of names, or the number of its columns."""
-        separator = next((sign for sign in (";", "\t", ",") if sign in line), "")
-        parts = [part.strip() for part in line.split(separator or None)]
-        if named := _named(parts):
-            self.form = StreamForm(columns=named, separator=separator)
-            return None
-        for part in parts:
-            float(part)
-        self._seen = [*self._seen[-LEARNED + 1 :], len(parts)]
-        if len(self._seen) == LEARNED and len({*self._seen}) == 1:
-            if len(parts) not in ORDERS:
-                return self._garbage()
-            self.form = StreamForm(columns=ORDERS[len(parts)], separator=separator)
-            return self._read(line)
+        separator = _separator(line)
+        parts = _parts(line, separator)
+        columns = _header(parts)
+        if not columns:
+            for part in parts:
+                float(part)
+            self._seen = [*self._seen[-LEARNED + 1 :], len(parts)]
+            if len(self._seen) < LEARNED or len({*self._seen}) > 1:
+                return None
+            if len(parts) not in COLUMNS_BY_NUMBER:
+                raise ValueError("columns of a number that means nothing")
+            columns = COLUMNS_BY_NUMBER[len(parts)]
+        self.form = StreamForm(columns=columns, separator=separator)
+        self.channels = self._channels()
         return None
 
 
-def _named(parts: Sequence[str]) -> tuple[str, ...]:
-    """Columns of a line of names; empty where it is no such line."""
-    lower = [part.strip().strip('"').lower() for part in parts]
-    known = [name for name in lower if name in (*RAW, TEMPERATURE, TIME)]
-    if not {"ax", "ay", "az"} <= {*known}:
+def _separator(line: str) -> str:
+    """The sign between the columns of a line; empty for white space."""
+    return next((sign for sign in (";", "\t", ",") if sign in line), "")
+
+
+def _parts(line: str, separator: str) -> list[str]:
+    return [part.strip() for part in line.split(separator or None)]
+
+
+def _header(parts: Sequence[str]) -> tuple[str, ...]:
+    """Columns of a line of names; empty if it is no such line."""
+    names = [part.strip('"').lower() for part in parts]
+    if not {*RAW[:3]} <= {*names}:
         return ()
-    return tuple(
-        name if name in (*RAW, TEMPERATURE, TIME) else f"{LABEL}_{i}"
-        for i, name in enumerate(lower)
-    )
+    known = (*RAW, TEMPERATURE_COLUMN, TIME_COLUMN)
+    return tuple(name if name in known else f"skip_{i}" for i, name in enumerate(names))
+
+
+def _number(cells: Mapping[str, str | None], name: str, form: StreamForm) -> float:
+    """A cell as a number; a value without size, or beyond all reason, is a ValueError."""
+    factor, offset = FACTORS.get(form.units.get(name, ""), (1.0, 0.0))
+    value = float(cells.get(name) or "") * factor + offset
+    if abs(value) < LARGEST_VALUE:
+        return value
+    raise ValueError("no reading is so large")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 from datetime import datetime
 from pathlib import Path
 
@@ -10,8 +9,6 @@ import click
 
 from mwdcal.app.commands import options
 from mwdcal.errors import InputError
-
-LOCAL = "127.0.0.1"
 
 
 @options.command()
@@ -22,24 +19,24 @@ LOCAL = "127.0.0.1"
 )
 @click.option(
     "--plan",
-    default="twenty-four-state",
-    show_default=True,
     metavar="NAME|FILE",
     shell_complete=options.offers("plans"),
-    help="A built-in plan, a TOML file of attitudes, or a run file.",
+    help="A built-in plan, a TOML file of attitudes, a run file, or best-N, the best N stations for the tool.  "
+    "[default: twenty-four-state]",
 )
-@options.tool(default="servo", show_default=True)
+@options.tool(help="Tool profile: a built-in name or a TOML file.  [default: servo]")
 @click.option(
     "--source",
     metavar="SPEC",
     help="Where readings come from: serial:/dev/ttyUSB0@115200, tcp:HOST:PORT, tail:FILE, manual, or demo. "
-    "[default: manual]",
+    " [default: manual]",
 )
 @click.option(
     "--session",
     type=options.FILE,
     metavar="DIR",
-    help="Folder of the session; one that was begun before goes on. [default: a new one by date and time]",
+    help="Folder of the session; one that was begun before goes on, with its options.  [default: a new one by date "
+    "and time]",
 )
 @options.renamed(
     "--registry",
@@ -55,9 +52,9 @@ LOCAL = "127.0.0.1"
 )
 @click.option(
     "--host",
-    default=LOCAL,
+    default="127.0.0.1",
     show_default=True,
-    help="Address to listen at: that of the laboratory's network for a tablet at the stand.",
+    help="Address to listen at; 0.0.0.0 for a tablet at the stand, in the laboratory's network.",
 )
 @click.option(
     "--port",
@@ -67,24 +64,21 @@ LOCAL = "127.0.0.1"
     help="Port to listen at.",
 )
 @click.option("--no-browser", is_flag=True, help="Do not open the browser.")
-@options.preset(
+@click.option(
     "--speed",
     type=click.FloatRange(0.1, 1000),
-    default=1.0,
     metavar="X",
-    help="How many times as fast the simulated stand goes.",
+    help="How many times as fast as real time the simulated stand goes.  [default: 1]",
 )
-@options.preset(
+@click.option(
     "--settle",
     type=click.FloatRange(0.5, 600),
-    default=5.0,
     metavar="S",
-    help="How long the tool has to stand still for a station.",
+    help="How long, in seconds, the tool has to stand still for a station.  [default: 5]",
 )
 def command(
-    demo: bool, plan: str, tool: str, source: str | None, session: Path | None, registry: str | None, laboratory: Path | None,
-    host: str, port: int, no_browser: bool, speed: float, settle: float,
-) -> None:  # fmt: skip
+    demo: bool, session: Path | None, host: str, port: int, no_browser: bool, **chosen: object
+) -> None:
     """Calibrate a tool live: the page says where to turn it, takes the stations, and ends with the certificate.
 
     The first line printed is the address of the page, with its token. Nothing leaves this machine. The folder of the
@@ -95,50 +89,25 @@ def command(
     Example: mwdcal bench --tool tool.toml --plan moosavi-12 --source serial:/dev/ttyUSB0@115200 --session S-117
     Exit: 0 ended, 2 input cannot be read.
     """
-    from mwdcal.bench.serving import opened, serve
+    from mwdcal.bench import serving
     from mwdcal.files.formats import atomic
 
-    spec = source or ("demo" if demo else "manual")
+    serving.require()
+    given = {name: value for name, value in chosen.items() if value is not None}
+    given |= {"laboratory": str(given["laboratory"])} if "laboratory" in given else {}
+    given |= {"source": "demo"} if demo else {}
     folder = session or Path(datetime.now().strftime("bench-%Y-%m-%d-%H%M%S"))
     with atomic.folder(folder), atomic.holding(folder / ".bench.lock") as ours:
         if not ours:
             raise InputError(
                 f"another bench has the session '{folder}' open. Close it, or name another folder with --session."
             )
-        listening = _listening(host, port)
-        bench = opened(
-            folder,
-            plan,
-            tool,
-            spec,
-            registry,
-            laboratory,
-            speed,
-            settle,
-            host,
-            listening.getsockname()[1],
-        )
-        click.echo(f"http://{_shown(host)}:{listening.getsockname()[1]}/?token={bench.token}")
+        opened = serving.listening(host, port)
+        port = opened.getsockname()[1]
+        bench = serving.bench_of(folder, given, host, port)
+        url = serving.address(host, port, bench.token)
+        click.echo(url)
         click.echo(
             f"session {folder}   Ctrl-C ends; mwdcal bench --session {folder} goes on", err=True
         )
-        serve(bench, listening, browser=not no_browser)
-
-
-def _shown(host: str) -> str:
-    """A host as addresses write it."""
-    return f"[{host}]" if ":" in host else host
-
-
-def _listening(host: str, port: int) -> socket.socket:
-    """A socket that listens."""
-    try:
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        listening = socket.socket(family, socket.SOCK_STREAM)
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listening.bind((host, port))
-        return listening
-    except OSError as error:
-        raise InputError(
-            f"cannot listen at {host}:{port}: {error.strerror}. Choose another --host or --port."
-        ) from error
+        serving.serve(bench, opened, "" if no_browser else url)

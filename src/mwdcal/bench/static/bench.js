@@ -1,25 +1,45 @@
-// Live figures and fragments come by server-sent events; decisions go as forms.
+// Live figures and the page come by server-sent events; decisions go as forms.
 "use strict";
 const main = document.getElementById("main");
 const message = document.getElementById("message");
 const events = new EventSource("/events");
+const shown = new Map();
+let live = {};
 
+// Only parts that differ are replaced: what has the focus, or is read aloud, stays.
 events.addEventListener("page", (event) => {
+  const fresh = document.createElement("template");
+  fresh.innerHTML = JSON.parse(event.data);
+  for (const part of fresh.content.querySelectorAll("[data-part]")) {
+    const name = part.dataset.part;
+    const old = main.querySelector(`[data-part="${name}"]`);
+    if (shown.get(name) !== part.innerHTML) {
+      shown.set(name, part.innerHTML);
+      replace(old, part.innerHTML);
+    }
+    old.className = part.className;
+    old.hidden = part.hidden;
+  }
+  refresh();
+});
+
+function replace(old, html) {
   const active = document.activeElement;
-  const id = active && main.contains(active) ? active.id : "";
+  const inside = active && old.contains(active);
+  const id = inside ? active.id : "";
   const typed = new Map();
-  for (const field of main.querySelectorAll("input[type=text], textarea")) typed.set(field.id, field.value);
-  main.innerHTML = JSON.parse(event.data);
+  for (const field of old.querySelectorAll("input[type=text], textarea, select")) typed.set(field.id, field.value);
+  old.innerHTML = html;
   for (const [name, value] of typed) {
     const field = document.getElementById(name);
     if (field && value) field.value = value;
   }
-  const again = id && document.getElementById(id);
-  if (again) again.focus({ preventScroll: true });
-});
+  if (!inside) return;
+  const again = document.getElementById(id) || document.getElementById("order");
+  again.focus({ preventScroll: true });
+}
 
-events.addEventListener("live", (event) => {
-  const live = JSON.parse(event.data);
+function refresh() {
   for (const place of document.querySelectorAll("[data-live]")) {
     const text = live[place.dataset.live];
     if (text !== undefined && place.textContent !== text) place.textContent = text;
@@ -28,7 +48,12 @@ events.addEventListener("live", (event) => {
     const angle = live["turn_" + needle.dataset.turn];
     if (angle !== undefined) needle.setAttribute("transform", `rotate(${angle})`);
   }
-  document.body.dataset.state = live.state;
+  document.body.dataset.state = live.state || "";
+}
+
+events.addEventListener("live", (event) => {
+  live = JSON.parse(event.data);
+  refresh();
 });
 
 events.onerror = () => { message.textContent = message.dataset.lost; };
@@ -36,8 +61,13 @@ events.onopen = () => { if (message.textContent === message.dataset.lost) messag
 
 async function send(form, submitter) {
   const body = new URLSearchParams(new FormData(form, submitter));
-  const answer = await fetch(form.action, { method: "POST", body, headers: { Accept: "text/plain" } });
-  message.textContent = answer.ok ? "" : await answer.text();
+  try {
+    const answer = await fetch(form.action, { method: "POST", body, headers: { Accept: "text/plain" } });
+    message.textContent = answer.ok ? "" : await answer.text();
+    if (answer.ok) for (const field of form.querySelectorAll("textarea")) field.value = "";
+  } catch {
+    message.textContent = message.dataset.lost;
+  }
 }
 
 document.addEventListener("submit", (event) => {
@@ -50,10 +80,15 @@ document.addEventListener("change", (event) => {
 });
 
 document.addEventListener("keydown", (event) => {
-  if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input, textarea, button, a, summary")) {
-    if (!(event.key === " " && event.target.matches("button[data-key]"))) return;
+  if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
+  if (event.target.matches("textarea") && event.key === "Enter" && !event.shiftKey) {
+    event.preventDefault();
+    event.target.form.requestSubmit();
+    return;
   }
-  const button = main.querySelector(`button[data-key="${CSS.escape(event.key.toLowerCase())}"]:not(:disabled)`);
+  if (event.target.matches("input, textarea, select, a, summary")) return;
+  if (event.target.matches("button") && [" ", "Enter"].includes(event.key)) return;
+  const button = main.querySelector(`button[data-key="${CSS.escape(event.key.toLowerCase())}"]`);
   if (!button) return;
   event.preventDefault();
   button.click();
