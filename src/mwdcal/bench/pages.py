@@ -200,7 +200,8 @@ def _results(session: BenchSession) -> dict[str, Any]:
     def degrees(value: float | None) -> str:
         return f"{number(value, 2)}°" if value else "–"
 
-    errors = fit.calibration.errors if fit.calibration and session.calibrated else []
+    shown = session.calibrated or session.order is None
+    errors = fit.calibration.errors if fit.calibration and shown else []
     verdict = session.verdict.rows if session.verdict else []
     return {
         "fit_note": "" if fit.calibration else reason,

@@ -42,7 +42,7 @@ def attitude(angles_deg: tuple[float, float, float], label: str) -> Markup:
     """The tool as it should lie, on the axes north, east and down."""
     inclination, azimuth, toolface = np.radians(angles_deg)
     earth_axes = np.asarray(tool_from_earth(inclination, azimuth, toolface))
-    high, _, along = (_projected(axis) for axis in earth_axes)
+    _, high, along = (_projected(axis) for axis in earth_axes)
     (x, y), (u, v) = 85 * along, 26 * high
     axes = "".join(
         f'<line class="axis" x2="{a:.1f}" y2="{b:.1f}"/><text x="{1.13 * a:.1f}" y="{1.13 * b + 4:.1f}">{name}</text>'
@@ -75,27 +75,23 @@ def sphere(part: Positions, order: int | None, bad: Sequence[int], label: str) -
     across, up = x, z * np.cos(VIEW) + y * np.sin(VIEW)
     front = y * np.cos(VIEW) - z * np.sin(VIEW) <= 0
     done = part.done
-    marks = []
-    for i in range(part.count):
-        u, v = 100 * float(across[i]), -100 * float(up[i])
+    marks = {"left": "", "done": "", "bad": "", "next": ""}
+    for i, (u, v) in enumerate(zip(100 * across, -100 * up, strict=True)):
         side = "" if front[i] else " behind"
+        kind = "done" if i in done else "left"
+        marks[kind] += f'<circle class="{kind}mark{side}" cx="{u:.1f}" cy="{v:.1f}" r="4"/>'
         if i in bad:
-            shape = (
-                f'<path class="badmark{side}" d="M{u - 5:.1f},{v - 5:.1f} l10,10 m0,-10 l-10,10"/>'
+            marks["bad"] += (
+                f'<path class="badmark" d="M{u - 8:.1f},{v - 8:.1f} l16,16 m0,-16 l-16,16"/>'
             )
-        elif i in done:
-            shape = f'<circle class="done{side}" cx="{u:.1f}" cy="{v:.1f}" r="4"/>'
-        else:
-            shape = f'<circle class="leftmark{side}" cx="{u:.1f}" cy="{v:.1f}" r="4"/>'
-        marks.append(shape)
         if i == order:
-            marks.append(
-                f'<rect class="nextmark" x="{u - 8:.1f}" y="{v - 8:.1f}" width="16" height="16"/>'
+            marks["next"] = (
+                f'<rect class="nextmark" x="{u - 9:.1f}" y="{v - 9:.1f}" width="18" height="18"/>'
             )
     ring = f'<ellipse class="axis" rx="100" ry="{100 * np.sin(VIEW):.1f}"/>'
     return Markup(
         f'<svg viewBox="-110 -110 220 220" width="260" role="img" aria-label="{label}">'
-        f'<circle class="axis" r="100"/>{ring}{"".join(marks)}</svg>'
+        f'<circle class="axis" r="100"/>{ring}{"".join(marks.values())}</svg>'
     )
 
 

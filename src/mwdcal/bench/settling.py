@@ -20,12 +20,16 @@ CELL_SCATTER = 3.0
 """Times its noise that a channel may scatter within a cell."""
 CELLS_APART = 5.0
 """Standard deviations that the means of two cells of a standstill may lie apart."""
-CREEP_SIGMA = 4.0
+CREEP_SIGMA = 3.0
 """Standard deviations of a trend over the standstill beyond which a channel creeps."""
+DOUBTFUL_SIGMA = 2.0
+"""Beyond these the change over the standstill counts as an uncertainty of the mean."""
 SILENCE = 3.0
 """Seconds without a sample that end a standstill."""
-QUIETEST = 40
-"""Cells of which the quietest tell the noise of a channel."""
+LATEST = 40
+"""Cells of which the quieter ones, their first quartile, tell the noise of a channel."""
+QUARTILE = 0.6745
+"""Of the normal distribution; so the first quartile of a scatter of χ² follows (Wilson and Hilferty)."""
 
 
 @dataclass
@@ -88,7 +92,7 @@ class Settling:
         self.least = [*least] or [0.0] * sensors
         self.step = [inf] * sensors
         self.still: list[HalfSecond] = []
-        self.recent: deque[list[float]] = deque(maxlen=QUIETEST)
+        self.recent: deque[list[float]] = deque(maxlen=LATEST)
         self.noise = [inf] * sensors
         self.time = -inf
         self.moves = 0
@@ -127,14 +131,15 @@ class Settling:
         """Take a whole cell into the standstill, or end it."""
         scatter = cell.scatter[: self.sensors]
         self.recent.append(scatter)
-        quarter = (len(self.recent) - 1) // 4
-        ranked = (sorted(each) for each in zip(*self.recent, strict=True))
-        # a value between two steps of a converter scatters by half a step
-        coarse = (
-            max(a, step / 2) if step < inf else a
-            for a, step in zip(self.least, self.step, strict=True)
-        )
-        self.noise = [max(each[quarter], least) for each, least in zip(ranked, coarse, strict=True)]
+        quartiles = (sorted(each)[len(each) // 4] for each in zip(*self.recent, strict=True))
+        freedom = cell.count - 1
+        usual = (1 - 2 / (9 * freedom) - QUARTILE * sqrt(2 / (9 * freedom))) ** 1.5
+        self.noise = [
+            max(
+                each / usual, least, step / 2 if step < inf else 0.0
+            )  # half a step: a value between two
+            for each, least, step in zip(quartiles, self.least, self.step, strict=True)
+        ]
         quiet = all(s <= CELL_SCATTER * n for s, n in zip(scatter, self.noise, strict=True))
         ends = (self.still[0], self.still[-1]) if self.still else ()
         if not quiet or not all(self._alike(cell, other) for other in ends):
@@ -155,13 +160,23 @@ class Settling:
         return all(abs(a - b) <= CELLS_APART * n * spread for a, b, n in pairs)
 
     def _creeps(self) -> bool:
-        """Whether the means of the cells of a sensor have a trend that its noise does not explain."""
+        """Whether a sensor has a trend that its scatter does not explain."""
+        return any(sigmas > CREEP_SIGMA for _, sigmas in self._trends())
+
+    def _trends(self) -> list[tuple[float, float]]:
+        """The change of each sensor over the standstill, and the same in standard deviations."""
         count = sum(cell.count for cell in self.still) / len(self.still)
-        columns = [*zip(*(cell.means for cell in self.still), strict=True)][: self.sensors]
-        return any(
-            _trend(column, noise / sqrt(count)) > CREEP_SIGMA
-            for column, noise in zip(columns, self.noise, strict=True)
-        )
+        columns = [*zip(*(cell.means for cell in self.still), strict=True)]
+        return [
+            _trend(columns[place], scatter / sqrt(count))
+            for place, scatter in enumerate(self._scatter())
+        ]
+
+    def _scatter(self) -> list[float]:
+        """The standard deviation of a sample of each sensor within the cells of the standstill."""
+        each = [*zip(*(cell.scatter for cell in self.still), strict=True)][: self.sensors]
+        pooled = (sqrt(sum(s * s for s in cells) / len(cells)) for cells in each)
+        return [max(pair) for pair in zip(pooled, self.least, strict=True)]
 
     @property
     def _stood(self) -> float:
@@ -187,32 +202,38 @@ class Settling:
         weights = [cell.count / samples for cell in cells]
         means = tuple(sum(m * w for m, w in zip(row, weights, strict=True)) for row in each)
         sd = [_sd_of_mean(row, weights, mean) for row, mean in zip(each, means, strict=True)]
-        scatter = [*zip(*(cell.scatter for cell in cells), strict=True)]
-        for place in range(self.sensors):
-            sample = max(sqrt(sum(s * s for s in scatter[place]) / len(cells)), self.least[place])
+        pairs = zip(self._scatter(), self._trends(), strict=True)
+        for place, (sample, (change, sigmas)) in enumerate(pairs):
             sd[place] = max(sd[place], sample / sqrt(samples))
+            if sigmas > DOUBTFUL_SIGMA:
+                sd[place] = hypot(sd[place], change)
             if sample < (step := self.step[place]) / 2 < inf:  # its error does not average out
                 sd[place] = hypot(sd[place], step / sqrt(12))
         return Standstill(means, tuple(sd), samples, cells[0].start, cells[-1].end)
 
 
-def _trend(means: Sequence[float], sd: float) -> float:
-    """Slope of a straight line through means over its standard deviation, by their scatter if that exceeds `sd`."""
+def _trend(means: Sequence[float], sd: float) -> tuple[float, float]:
+    """The change along a straight line through means, and the same over its standard deviation.
+
+    That follows from the scatter of the means about the line, or from their `sd` if that is larger.
+    """
     many = len(means)
     if many < FEWEST_IN_CELL:
-        return 0.0
+        return 0.0, 0.0
     middle, mean = (many - 1) / 2, sum(means) / many
     square = many * (many * many - 1) / 12
     slope = sum((i - middle) * (m - mean) for i, m in enumerate(means)) / square
     left = sum((m - mean - slope * (i - middle)) ** 2 for i, m in enumerate(means)) / (many - 2)
     spread = max(sd, sqrt(left))
-    return abs(slope) * sqrt(square) / spread if spread else 0.0
+    return abs(slope) * (many - 1), abs(slope) * sqrt(square) / spread if spread else 0.0
 
 
 def _sd_of_mean(cells: Sequence[float], weights: Sequence[float], mean: float) -> float:
     """Standard uncertainty of a mean of cells by their scatter, which holds noise that wanders from cell to cell."""
-    many = len(cells)
-    if many < 2:
-        return 0.0
-    square = sum(w * (cell - mean) ** 2 for cell, w in zip(cells, weights, strict=True))
-    return sqrt(square / (many - 1))
+    largest = 0.0
+    for size in (1, 2):  # means of two cells follow noise that wanders more slowly
+        batches = [slice(i, i + size) for i in range(0, len(cells) - size + 1, size)]
+        if len(batches) > 1:
+            square = sum(sum(weights[b]) * (sum(cells[b]) / size - mean) ** 2 for b in batches)
+            largest = max(largest, square / (len(batches) - 1))
+    return sqrt(largest)

@@ -52,7 +52,7 @@ class Warmth:
         if before is None or now is None or not 0 < now / before < 1 or self.is_steady:
             return None
         minutes = (self.course[-1][0] - self.course[0][0]) / 60 / 2
-        return minutes * log(abs(now) / STEADY_RATE) / log(before / now)
+        return minutes * log(abs(now) / STEADY_RATE) / log(before / now) - minutes / 2
 
 
 def _rate(course: list[tuple[float, float]]) -> float | None:
