@@ -2,8 +2,8 @@
 
     python tests/bench_kills.py --count 200 --seed 1
 
-The stand is a server behind TCP in this process, which goes where the page says. What the page has shown as accepted must be
-in the journal after the kill, and each position once in run.csv.
+The stand is a server behind TCP in this process, which goes where the page says. What the page has shown as accepted
+must be in the journal after the kill, and each position once in run.csv.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import socket
 import subprocess
@@ -34,7 +35,7 @@ class Stand:
         inc, azi, face = (np.array([value * DEG]) for value in attitude)
         g, b = (v[0, 0] for v in self.tool.readings(self.rng, 1, inc, azi, face))
         raw = [*(g * SCALE[0]), *(b * SCALE[1]), self.time, self.temperature]
-        values = dict(zip(HEADER.split(",")[1:7] + ["time_s", "temperature_c"], raw, strict=True))
+        values = dict(zip((*HEADER.split(",")[1:7], "time_s", "temperature_c"), raw, strict=True))
         self.time = round(self.time + 1 / RATE, 6)
         return ",".join(f"{values[name]:.8g}" for name in self.names)
 
@@ -91,10 +92,8 @@ class StandServer:
 
     def drop(self):
         if self.connection is not None:
-            try:
+            with contextlib.suppress(OSError):
                 self.connection.shutdown(socket.SHUT_RDWR)
-            except OSError:
-                pass
             self.connection.close()
 
     def close(self):

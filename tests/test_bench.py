@@ -141,7 +141,6 @@ def test_roll_test_certificate_and_registry(finished, tmp_path):
     assert {row.name: row.value for row in session.verdict.rows} == pytest.approx(rows)
     session.certify("C-1")
     session.wait_for_fits()
-    session.wait_for_fits()
     assert json.loads((session.folder / "certificate.json").read_text())["number"] == "C-1"
     listed = mwdcal("registry", "list", "--registry", session.registry, "--json").json
     assert [tool["serial"] for tool in listed["tools"]] == ["T-1"]
@@ -403,9 +402,9 @@ def test_a_tool_that_turns_or_creeps_is_never_settled():
 
 
 def test_a_creeping_stand_is_waited_for():
-    """A displacement of 20, in units of the noise, that dies away with τ = 8 s: the mean is taken when about 2.4 is left.
+    """A displacement of 20 times the noise dies away with τ = 8 s: the mean is taken when about 2.4 is left.
 
-    A trend of three standard deviations over 50 samples is 3·√(12/50) = 1.5; the mean of the window is 1.6 times that off.
+    A trend of three standard deviations over 50 samples is 3·√(12/50) = 1.5; the mean is 1.6 times that off.
     """
     time, left = np.arange(1500) / 10, []
     away = np.where(

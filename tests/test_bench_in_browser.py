@@ -66,7 +66,10 @@ class Operator:
         )
 
     def heading(self, name):
-        self.page.get_by_role("heading", name=re.compile(name)).wait_for(timeout=LONGEST)
+        try:
+            self.page.get_by_role("heading", name=re.compile(name)).wait_for(timeout=LONGEST)
+        except playwright.TimeoutError:
+            raise AssertionError(self.page.inner_text("body")) from None
 
     def look(self):
         """What axe-core calls serious, or worse, and what does not fit in, at each width and scheme."""
@@ -75,11 +78,12 @@ class Operator:
             self.page.set_viewport_size({"width": width, "height": 900})
             self.page.emulate_media(color_scheme=scheme)
             self.page.evaluate(AXE)
-            for rule in self.page.evaluate(RUN_AXE)["violations"]:
-                if rule["impact"] in ("serious", "critical"):
-                    faults.append(
-                        f"{width} {scheme} {rule['id']}: {rule['nodes'][0]['html'][:200]}"
-                    )
+            found = self.page.evaluate(RUN_AXE)["violations"]
+            faults += [
+                f"{width} {scheme} {rule['id']}: {rule['nodes'][0]['html'][:200]}"
+                for rule in found
+                if rule["impact"] in ("serious", "critical")
+            ]
             if self.page.evaluate("document.documentElement.scrollWidth > innerWidth"):
                 faults.append(f"{width} {scheme}: wider than the screen")
         self.page.set_viewport_size({"width": 1280, "height": 900})
@@ -200,8 +204,9 @@ def test_two_browsers_and_a_restart(tmp_path, browser):
 
 
 def test_readings_by_hand(tmp_path, browser):
-    """Rows pasted from the vendor's program; the page shows a station at once, and each new fit within a second."""
-    bench = BenchProcess("--source", "manual", "--tool", EXAMPLE / "tool.toml", "--plan", "moosavi-12", folder=tmp_path / "S")  # fmt: skip
+    """Rows pasted from the vendor's program; the page shows a station at once."""
+    given = ("--source", "manual", "--tool", EXAMPLE / "tool.toml", "--plan", "moosavi-12")
+    bench = BenchProcess(*given, folder=tmp_path / "S")
     operator, stand = Operator(browser, bench.url), Stand()
     page = operator.page
     page.get_by_label("Serial of the tool").fill("T-1")

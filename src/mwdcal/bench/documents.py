@@ -58,18 +58,17 @@ def saved_fit(folder: Path, stations: int) -> RunFit:
 
 
 def save_calibration(calibration: Calibration, folder: Path) -> dict[str, str]:
-    """Write the calibration and its page; files by what they are."""
+    """Write the calibration; its file by what it is."""
     mwdcal.save(calibration, folder / "tool.json")
-    return {"calibration": "tool.json", **_page(calibration, folder / "report.html", "report")}
+    return {"calibration": "tool.json"}
 
 
 def verify(calibration: Calibration, folder: Path) -> tuple[Verdict, dict[str, str]]:
-    """The verdict on the roll test, and its files by what they are."""
+    """The verdict on the roll test, and its file by what it is."""
     limits = setting("limits") or "roll-test"
     verdict = mwdcal.verify(calibration, folder / "rolltest.csv", limits)
     mwdcal.save(verdict, folder / "verification.json")
-    page = _page(verdict, folder / "rolltest.html", "verification_report")
-    return verdict, {"verification": "verification.json", **page}
+    return verdict, {"verification": "verification.json"}
 
 
 def certify(
@@ -105,10 +104,10 @@ def tools_in(registry: str | None) -> Sequence[Any]:
         return sorted(tools.list().rows, key=lambda tool: tool.next_due or "9")
 
 
-def _page(result: Any, path: Path, name: str) -> dict[str, str]:
-    """The page of a result, where what draws it is installed."""
+def draw(result: Any, folder: Path, name: str) -> dict[str, str]:
+    """Write the page of a result, "report" or "rolltest", where what draws it is installed; its file by what it is."""
     try:
-        result.report(path)
+        result.report(folder / f"{name}.html")
     except InputError:
         return {}
-    return {name: path.name}
+    return {f"{name}_html": f"{name}.html"}

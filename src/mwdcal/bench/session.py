@@ -429,8 +429,9 @@ class BenchSession:
                 self.message, self.version = message, self.version + 1
 
     def wait_for_fits(self) -> None:
-        """Wait until all that was requested is done."""
-        self._pool.submit(lambda: None).result()
+        """Wait until all that was requested is done, and what that has requested."""
+        for _ in range(3):
+            self._pool.submit(lambda: None).result()
 
     def _fit_run(self) -> None:
         count = len(self.parts[RUN_PART].done)
@@ -462,6 +463,14 @@ class BenchSession:
             if not self.calibrated:
                 self._record("papers", files=files)
                 self._record("calibrated")
+        self._submit(partial(self._draw, fit.calibration, "report"))
+
+    def _draw(self, result: object, name: str) -> None:
+        """Write the page of a result, which takes longer than the result."""
+        files = documents.draw(result, self.folder, name)
+        with self.lock:
+            if not files.items() <= self.papers.items():
+                self._record("papers", files=files)
 
     def start_rolltest(self) -> None:
         """Go on to the roll test. One measured before the run was changed is judged at once."""
@@ -486,6 +495,7 @@ class BenchSession:
             self.verdict = verdict
             if not files.items() <= self.papers.items():
                 self._record("papers", files=files)
+        self._submit(partial(self._draw, verdict, "rolltest"))
 
     def certify(self, number: str = "") -> None:
         """Issue the certificate, and enter all in the registry, where one is named."""
