@@ -13,6 +13,8 @@ from mwdcal.errors import InputError, MwdcalError
 from mwdcal.files.settings import setting
 
 if TYPE_CHECKING:
+    from threading import RLock
+
     from mwdcal.calibration.record import Calibration
     from mwdcal.use.verification import Verdict
 
@@ -40,12 +42,17 @@ class RunFit:
         return {f.station: f.text for f in findings if f.id == REMEASURE and f.station}
 
 
-def fit(folder: Path, stations: int) -> RunFit:
-    """The calibration of the run in a folder, as `mwdcal calibrate` makes it of run.csv and tool.toml."""
+def fit(folder: Path, stations: int, lock: RLock) -> RunFit:
+    """The calibration of the run in a folder, as `mwdcal calibrate` makes it of run.csv and tool.toml.
+
+    Nobody who holds the `lock` writes these files while they are read.
+    """
     if stations < FEWEST_STATIONS:
         return RunFit(stations)
     try:
-        calibration = mwdcal.calibrate(mwdcal.read_run(folder / "run.csv", folder / "tool.toml"))
+        with lock:
+            readings = mwdcal.read_run(folder / "run.csv", folder / "tool.toml")
+        calibration = mwdcal.calibrate(readings)
     except MwdcalError as error:
         return RunFit(stations, reason=str(error))
     return RunFit(stations, calibration, accuracy_deg=typical_accuracy(calibration))

@@ -158,7 +158,9 @@ def _order_text(session: BenchSession) -> str:
     if session.calibrated and not session.testing:
         return t["next_rolltest"]
     if (order := session.order) is None:
-        return t["measure_bad"] if session.bad else t["all_measured"]
+        return t[
+            "fitting" if session.is_fitting else "measure_bad" if session.bad else "all_measured"
+        ]
     part = session.part
     angles = zip(ORDERED_ANGLES, part.attitude(order), strict=True)
     turn = t["roll" if session.testing else "turn"].format(

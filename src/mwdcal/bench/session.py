@@ -74,7 +74,7 @@ class BenchSession:
         self.papers: dict[str, str] = {}
         self.course: list[tuple[int, dict[str, float | None]]] = []
         self._used: tuple[int, int] = (-1, -1)
-        self._requested = 0
+        self._requested = self._fitted = 0
         self._unwritten = False
         self._pool, self._context = ThreadPoolExecutor(1), contextvars.copy_context()
         self.journal = Journal(folder)
@@ -402,7 +402,15 @@ class BenchSession:
     def _if_latest(self, number: int, task: Callable[[], None]) -> None:
         """Leave a fit out if a later one is requested already."""
         if number == self._requested:
-            task()
+            try:
+                task()
+            finally:
+                self._fitted = number
+
+    @property
+    def is_fitting(self) -> bool:
+        """Whether a fit is still to come that knows the latest station."""
+        return self._fitted != self._requested
 
     def _submit(self, task: Callable[[], None]) -> None:
         self._pool.submit(self._context.copy().run, self._guarded, task)
@@ -435,7 +443,7 @@ class BenchSession:
 
     def _fit_run(self) -> None:
         count = len(self.parts[RUN_PART].done)
-        fit = documents.fit(self.folder, count)
+        fit = documents.fit(self.folder, count, self.lock)
         with self.lock:
             self.fit = fit
             if fit.calibration is not None:
@@ -454,7 +462,7 @@ class BenchSession:
             self._submit(self._calibrate)
 
     def _calibrate(self) -> None:
-        fit = documents.fit(self.folder, len(self.parts[RUN_PART].done))
+        fit = documents.fit(self.folder, len(self.parts[RUN_PART].done), self.lock)
         if fit.calibration is None:
             raise InputError(fit.reason)
         files = documents.save_calibration(fit.calibration, self.folder)
