@@ -52,6 +52,8 @@ DEEPEST = 15_000.0
 """Measured depth of the longest well, m."""
 TOOLS, SAMPLE = 1000, 10
 """Tools of the fleets, and of the loop of SciPy that they are compared with."""
+WARM = 4
+"""Tools of the fleet whose temperature orders are chosen."""
 IMPORTS = "import numpy, scipy.special"
 
 Call = Callable[[], object]
@@ -172,6 +174,15 @@ def without_noise(path: Path, stand: bool) -> Path:
     return path
 
 
+def warm(folder: Path) -> Path:
+    """Runs of some tools at several temperatures, whose sixty factors vary with them."""
+    folder.mkdir()
+    for seed in range(WARM):
+        words = ("--plan", "moosavi-12", "--tool", "servo", "--seed", seed)
+        command("simulate", *words, "-o", folder / f"{seed}.csv")
+    return folder
+
+
 def roll_groups() -> mwdcal.Readings:
     """Readings of 24 shots, two roll groups of eight among them."""
     run = mwdcal.simulate((20, 70, 110), 8, seed=1)
@@ -222,6 +233,7 @@ def fleets(folder: Path) -> Iterator[Guarded]:
         ("stand declared, noise not", runs, undeclared, "--no-records"),
         ("a text table", text, "servo", "--no-records"),
         ("with records", few, "servo"),
+        ("orders auto", warm(folder / "warm"), declared, "--no-records", "--order", "auto"),
     ):
         words = ("fleet", table, "--tool", profile, "--workers", "1", *options)
         target = folder / f"{len([*folder.iterdir()])}.parquet"

@@ -46,7 +46,7 @@ from mwdcal import pool  # noqa: E402
 from mwdcal.files.formats import atomic  # noqa: E402
 from mwdcal.fleet import sources  # noqa: E402
 from mwdcal.fleet import tables as fleet_tables  # noqa: E402
-from mwdcal.fleet.parts import Plan, load, solve  # noqa: E402
+from mwdcal.fleet.parts import Plan, Task, calibrations, load  # noqa: E402
 
 ANGLES = ("inclination", "azimuth", "toolface")
 
@@ -786,7 +786,7 @@ def test_other_options_or_input_are_other_parts(fleet):
     keys.append(plan.key(replace(part, pieces=(piece,))))
     assert len(set(keys)) == len(keys)
     with pytest.raises(InputError, match="same version"):
-        solve(replace(plan, version="0"), load(plan, part))
+        calibrations(replace(plan, version="0"), load(plan, Task(part, fleet[0]))[1])
 
 
 def _die_once(mark, task):

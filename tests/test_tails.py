@@ -79,6 +79,12 @@ def test_the_tail_has_limits_and_shapes():
     assert found[:, 2] == pytest.approx(0.0, abs=1e-280)
 
 
+def test_a_row_of_quantiles_does_not_depend_on_the_others():
+    chances = 10.0 ** np.random.default_rng(3).uniform(-290, 0, (40, 7))
+    alone = [normal_quantile(row).tolist() for row in chances]
+    assert normal_quantile(chances).tolist() == alone
+
+
 @given(st.floats(1e-300, 1.0))
 def test_the_quantile_is_that_of_scipy(chance):
     found = float(normal_quantile(np.array(chance)))

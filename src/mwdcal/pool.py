@@ -3,7 +3,7 @@
 Both run the same two steps, `load` and `solve`, and hand results over as they come. Processes
 get what was loaded here, where a row group is decoded once; workers of a cluster load for
 themselves. A result only counts when it has arrived, so a worker that dies costs what it had
-in hand, which is done again by others.
+in hand, which is done again by others. Where results are large, `solve` writes them to a file and returns none.
 """
 
 from __future__ import annotations
@@ -63,9 +63,9 @@ class Steps:
     """What is done to a task: `solve(load(task))`; both can be sent to another process."""
 
     load: Callable[[Any], Any]
-    solve: Callable[[Any], bytes]
+    solve: Callable[[Any], Any]
 
-    def __call__(self, task: Any) -> bytes:
+    def __call__(self, task: Any) -> Any:
         """Both steps at one place."""
         return self.solve(self.load(task))
 
@@ -91,7 +91,7 @@ def preparing(workers: int | None) -> Iterator[None]:
 
 def results(
     steps: Steps, tasks: Sequence[Any], workers: int, scheduler: str | None
-) -> Iterator[tuple[int, bytes]]:
+) -> Iterator[tuple[int, Any]]:
     """Index and result of each task, in the order in which they are ready."""
     if scheduler:
         return _on_cluster(steps, tasks, scheduler)
@@ -139,7 +139,7 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _on_cores(steps: Steps, tasks: Sequence[Any], workers: int) -> Iterator[tuple[int, bytes]]:
+def _on_cores(steps: Steps, tasks: Sequence[Any], workers: int) -> Iterator[tuple[int, Any]]:
     """By a pool of processes; a new pool where a process died."""
     left = list(range(len(tasks)))
     for _ in range(ATTEMPTS):
@@ -163,14 +163,14 @@ def _on_cores(steps: Steps, tasks: Sequence[Any], workers: int) -> Iterator[tupl
 
 def _by_pool(
     steps: Steps, tasks: Sequence[Any], left: Sequence[int], workers: int
-) -> Iterator[tuple[int, bytes]]:
+) -> Iterator[tuple[int, Any]]:
     """Results of one pool; no more tasks are loaded than keep it busy."""
     waiting = iter(tuple(left))
     with (
         _settings_of_workers(),
         ProcessPoolExecutor(workers, _context(), _follow_the_command) as pool,
     ):
-        running: dict[Future[bytes], int] = {}
+        running: dict[Future[Any], int] = {}
         try:
             while True:
                 for index in waiting:
@@ -200,14 +200,14 @@ def _without_main() -> Iterator[None]:
         sys.modules["__main__"] = main
 
 
-def _ready(running: Iterable[Future[bytes]]) -> set[Future[bytes]]:
+def _ready(running: Iterable[Future[Any]]) -> set[Future[Any]]:
     """The futures that are done: one at least."""
     while not (done := wait(running, WAIT_SECONDS, FIRST_COMPLETED).done):
         pass
     return done
 
 
-def _on_cluster(steps: Steps, tasks: Sequence[Any], address: str) -> Iterator[tuple[int, bytes]]:
+def _on_cluster(steps: Steps, tasks: Sequence[Any], address: str) -> Iterator[tuple[int, Any]]:
     """By the workers of a Dask scheduler, which gives a dead worker's tasks to others."""
     try:
         distributed: Any = import_module("distributed")

@@ -14,7 +14,7 @@ from mwdcal.app.cli import without_pandas
 from mwdcal.calibration.options import Options
 from mwdcal.files.contract import CHANNELS, REFERENCES
 from mwdcal.files.formats import parquet
-from mwdcal.fleet.parts import Plan, packed, solve
+from mwdcal.fleet.parts import Plan, calibrations, packed
 from mwdcal.fleet.sources import SERIAL
 from mwdcal.geometry.vectors import reference_vectors
 from mwdcal.sensor.profile import Profile, StandProfile, TriadProfile
@@ -37,7 +37,8 @@ def warm() -> None:
         for sd in (0.0, 0.1):
             stand = StandProfile(inclination_deg=sd, azimuth_deg=sd, toolface_deg=sd)
             profile = Profile(name="", accelerometer=triad, magnetometer=triad, stand=stand)
-            solve(Plan("", {}, tuple(columns), profile, Options(nonlinearity={})), loaded)
+            plan = Plan("", {}, tuple(columns), profile, Options(nonlinearity={}))
+            packed(calibrations(plan, loaded))
 
 
 without_pandas()

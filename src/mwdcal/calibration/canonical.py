@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, Literal, TypeVar
 
 import msgspec
+import numpy as np
 
 from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError
+from mwdcal.geometry.vectors import Array
 
 Record = TypeVar("Record", bound=msgspec.Struct)
 DIGITS = 12
 """Significant digits of every number in a calibration file."""
+POWERS = np.array([10**power for power in range(23)], float)
+"""The powers of ten that are doubles."""
+HALFWAY = 1e-3
+"""What rounding may do to a whole number of that many digits, and more."""
 UNHASHED = ("time", "sha256", "signature")
 """Fields of a calibration that its `sha256` is not of."""
 
@@ -83,16 +89,54 @@ def rounded(record: Record) -> Record:
 
     More digits would differ from machine to machine with the threads of its linear algebra.
     """
-    return msgspec.convert(_rounded(msgspec.to_builtins(record)), type(record))
+    fields = msgspec.to_builtins(record)
+    return msgspec.convert(_with(iter(figures(numbers(fields))), fields), type(record))
 
 
-def _rounded(value: Any) -> Any:
-    """Numbers are rounded where they stand: a record has thousands, and a call for each would double the time."""
-    if isinstance(value, dict):
-        return dict(zip(value, _rounded([*value.values()]), strict=True))
-    if not isinstance(value, list | tuple):
-        return value
-    return [
-        float(f"{item:.{DIGITS - 1}e}") if isinstance(item, float) else _rounded(item)
-        for item in value
+def numbers(document: Any) -> Array:
+    """All numbers with a fraction in a document, in their order."""
+    values: list[float] = []
+    _collect(document, values)
+    return np.array(values)
+
+
+def _collect(value: Any, values: list[float]) -> None:
+    for item in value.values() if isinstance(value, dict) else value:
+        if isinstance(item, float):
+            values.append(item)
+        elif isinstance(item, dict | list | tuple):
+            _collect(item, values)
+
+
+def _with(new: Iterator[float], value: Any) -> Any:
+    """A document with other `numbers`."""
+    items = [
+        next(new)
+        if isinstance(item, float)
+        else _with(new, item)
+        if isinstance(item, dict | list | tuple)
+        else item
+        for item in (value.values() if isinstance(value, dict) else value)
     ]
+    return dict(zip(value, items, strict=True)) if isinstance(value, dict) else items
+
+
+@np.errstate(all="ignore")
+def figures(values: Array) -> Any:
+    """Numbers (...) at so many significant digits as a file has, each the double nearest to its decimal, as lists.
+
+    A whole number of that many digits over a power of ten, both exact doubles, is that nearest double. What is too
+    small or too large for this, or so near to halfway that the product may have crossed it, is spelled.
+    """
+    size = np.abs(values)
+    power = DIGITS - 1 - np.floor(np.log10(size))
+    known = np.abs(power) < len(POWERS)
+    scale = POWERS[np.where(known, np.abs(power), 0.0).astype(int)]
+    scaled = np.where(power >= 0, size * scale, size / scale)
+    whole = np.rint(scaled)
+    known &= (whole >= POWERS[DIGITS - 1]) & (whole < POWERS[DIGITS])
+    known &= np.abs(np.abs(scaled - whole) - 0.5) > HALFWAY
+    rounded = np.array(np.copysign(np.where(power >= 0, whole / scale, whole * scale), values))
+    spelled = [float(f"{value:.{DIGITS - 1}e}") for value in values[~known].tolist()]
+    rounded[~known] = spelled
+    return rounded.tolist()

@@ -121,10 +121,9 @@ def fingerprints(triads: Sequence[Array]) -> tuple[str, ...]:
     Accelerometer first, then after a dash the magnetometer: stations of a fit are recognised
     without their magnetometer too.
     """
-    rows = zip(*((triad + 0.0).tolist() for triad in triads), strict=True)
-    texts = ([",".join(f"{value:.12g}" for value in reading) for reading in row] for row in rows)
-    hashes = ([sha256_of(text.encode()) for text in row] for row in texts)
-    return tuple("-".join(each[:DIGEST_LENGTH] for each in row) for row in hashes)
+    texts = ([f"{x:.12g},{y:.12g},{z:.12g}" for x, y, z in (t + 0.0).tolist()] for t in triads)
+    hashes = ([sha256_of(text.encode())[:DIGEST_LENGTH] for text in each] for each in texts)
+    return tuple(map("-".join, zip(*hashes, strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -386,7 +385,7 @@ def soaks(temperature: Array) -> Ints:
 def usable_soaks(temperature: Array) -> Ints:
     """Number (..., n) of each station's soak: all 0 where temperatures span less than `LEAST_TEMPERATURE_SPAN`."""
     wide = np.ptp(temperature, axis=-1, keepdims=True) >= LEAST_TEMPERATURE_SPAN
-    return np.where(wide, soaks(temperature), 0)
+    return np.where(wide, soaks(temperature), 0) if wide.any() else np.zeros(temperature.shape, int)
 
 
 def highest_order(temperature: Array) -> Ints:

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import erfc, gamma
 
 import numpy as np
 
+from mwdcal.calibration.canonical import figures
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import ErrorRow, Measures, StationRow, stated
+from mwdcal.estimation.batch import take
 from mwdcal.estimation.evidence import ANGLES, STAND_ERRORS
 from mwdcal.estimation.tails import normal_quantile
 from mwdcal.estimation.uncertainty import Analysis, station_misfit, without_station
 from mwdcal.geometry.observables import OBSERVABLES
-from mwdcal.geometry.vectors import Array, Bools
+from mwdcal.geometry.vectors import Array, Bools, Ints
 
 SHOWN = ("gravity", "inclination", "toolface", "azimuth", "field", "dip")
 RESHOOT = 0.01
@@ -25,6 +27,8 @@ LEAST_ACROSS = 1e-9
 """An attitude is exactly vertical below this sine of its inclination."""
 PROBES = 200
 """Stations at which the influence of each is looked at: no more, however long the run."""
+CHANGES_AT_ONCE = 2_000_000
+"""Changes of an observable, at one station by another, that are worked out at once: 16 MB."""
 REASONS = {
     "gravity": "moved before it settled?",
     "inclination": "stand inclination misread?",
@@ -35,10 +39,25 @@ REASONS = {
 }
 
 
-def rms(values: Array) -> float:
-    """Root mean square of what is not NaN; NaN where nothing is left."""
-    values = values[~np.isnan(values)]
-    return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
+def rms(values: Array) -> Array:
+    """Root mean square (...) of what is not NaN of values (..., n); NaN where nothing is left."""
+    each = np.full(values.shape[:-1], np.nan)
+    for rows, kept in _filled(values):
+        if kept.shape[-1]:
+            each.flat[rows] = np.sqrt(np.mean(kept**2, -1))
+    return each
+
+
+def _filled(values: Array) -> Iterator[tuple[Ints, Array]]:
+    """What is not NaN of values (..., n), as rows (b, k) that are filled at the same places, and their numbers (b,)."""
+    rows = values.reshape(-1, values.shape[-1])
+    blank = np.isnan(rows)
+    patterns, number = blank[:1], np.zeros(len(rows), int)
+    if (blank != patterns).any():
+        patterns, number = np.unique(blank, axis=0, return_inverse=True)
+    for place, pattern in enumerate(patterns):
+        some = np.flatnonzero(number == place)
+        yield some, np.compress(~pattern, rows[some], -1)
 
 
 def shown_in(name: str, relative: bool = False) -> tuple[float, str]:
@@ -75,29 +94,36 @@ def departure(name: str, g: Array, b: Array, known: Mapping[str, Array]) -> Arra
 
 
 def nominal(readings: Readings) -> tuple[Array, Array]:
-    """Vectors (n, 3) that the tool reads uncalibrated; a field of unknown strength has a mean of one."""
+    """Vectors (..., n, 3) that the tool reads uncalibrated; a field of unknown strength has a mean of one."""
     raw = readings.magnetometer
     if raw is None:
         return readings.accelerometer, np.full_like(readings.accelerometer, np.nan)
-    scale = np.linalg.norm(raw, axis=-1).mean() if readings.relative else 1.0
-    return readings.accelerometer, raw / scale
+    if readings.relative:
+        raw = raw / np.linalg.norm(raw, axis=-1).mean(-1)[..., None, None]
+    return readings.accelerometer, raw
 
 
-def vector_measures(triad: str, when: str, actual: Array, target: Array) -> list[Measures]:
-    """Moradi's measures of the vector error (n, 3), as a share of the target; none of one station."""
+def vector_measures(triad: str, when: str, actual: Array, target: Array) -> list[list[Measures]]:
+    """Moradi's measures of the vector error (B, n, 3), as a share of the target; none of one station."""
     error = np.linalg.norm(actual - target, axis=-1) / np.linalg.norm(target, axis=-1)
-    error = error[~np.isnan(error)]
-    if len(error) < 2:
-        return []
-    mean, std, mse = float(error.mean()), float(error.std(ddof=1)), float(np.mean(error**2))
-    return [Measures(triad=triad, when=when, mean=mean, std=std, mse=mse, rmse=mse**0.5)]
+    each: list[list[Measures]] = [[] for _ in error]
+    for rows, kept in _filled(error):
+        if kept.shape[-1] < 2:
+            continue
+        square = np.mean(kept**2, -1)
+        sizes = kept.mean(-1), kept.std(-1, ddof=1), square, square**0.5
+        names = ("mean", "std", "mse", "rmse")
+        for row, values in zip(rows.tolist(), figures(np.stack(sizes, -1)), strict=True):
+            one = dict(zip(names, values, strict=True))
+            each[row].append(Measures(triad=triad, when=when, **one))
+    return each
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """The errors of one fitted run (B = 1), before and after, with what was to be expected.
+    """The errors of fitted runs, before and after, with what was to be expected.
 
-    Dictionaries have an entry for each observable, arrays in them are (n,), vectors (n, 3).
+    Dictionaries have an entry for each observable, arrays in them are (B, n), vectors (B, n, 3).
     """
 
     readings: Readings
@@ -106,8 +132,7 @@ class Residuals:
     @cached_property
     def after(self) -> tuple[Array, Array]:
         """Corrected vectors; the field is NaN without magnetometer."""
-        g, b = self.fit.problem.fields(self.fit.state)
-        return g[0], b[0]
+        return self.fit.problem.fields(self.fit.state)
 
     @cached_property
     def undrifted(self) -> tuple[Array, Array]:
@@ -115,19 +140,19 @@ class Residuals:
         problem, state = self.fit.problem, self.fit.state
         if not problem.walks:
             return self.after
-        drift = (problem.walk_columns(state) @ state.constants[:, None, :, None])[0, ..., 0]
+        drift = (problem.walk_columns(state) @ state.constants[:, None, :, None])[..., 0]
         steady = [*self.after]
         for index, (triad, where) in enumerate(zip(problem.triads, problem.slices(), strict=True)):
-            slope = triad.model.slope(state.params[:, where], triad.raw, problem.temperature)[0]
-            raw = drift[:, 3 * index : 3 * index + 3] * triad.sd[0]
-            steady[index] = steady[index] + np.einsum("nij,nj->ni", slope, raw)
+            slope = triad.model.slope(state.params[:, where], triad.raw, problem.temperature)
+            raw = drift[..., 3 * index : 3 * index + 3] * triad.sd
+            steady[index] = steady[index] + np.einsum("bnij,bnj->bni", slope, raw)
         return steady[0], steady[1]
 
     @cached_property
     def targets(self) -> tuple[Array, Array]:
         """Vectors that a perfect tool would read at the fitted attitudes."""
         g, b = self.fit.problem.targets(self.fit.state)
-        return g[0], b[0]
+        return g, b
 
     @cached_property
     def known(self) -> dict[str, Array]:
@@ -138,11 +163,11 @@ class Residuals:
         """
         problem, state = self.fit.problem, self.fit.state
         evidence = problem.evidence
-        known = {name: np.asarray(evidence.known[name][0]) for name in SHOWN}
+        known = {name: np.asarray(evidence.known[name]) for name in SHOWN}
         for name in {"gravity", "field", "dip"}.difference(evidence.absent):
-            known[name] = np.asarray(problem.constant(state, name)[0])
+            known[name] = problem.constant(state, name)
         if any(constant.name in STAND_ERRORS for constant in evidence.constants):
-            north, _, down = np.moveaxis(state.attitude[0], -1, 0)
+            north, _, down = np.moveaxis(state.attitude, -1, 0)
             for name in ANGLES:
                 fitted = OBSERVABLES[name].value(down, north)
                 known[name] = np.where(np.isnan(fitted + known[name]), known[name], fitted)
@@ -156,7 +181,7 @@ class Residuals:
 
     @cached_property
     def judged(self) -> dict[str, Bools]:
-        """Stations whose error is known, of observables for which there is such a station."""
+        """Stations whose error is known, of observables for which there is such a station in some run."""
         usable = SHOWN if len(self.fit.problem.triads) > 1 else SHOWN[:3]
         judged = {n: ~np.isnan(self.known[n]) & (self.weights[n] > 0) for n in usable}
         return {name: stations for name, stations in judged.items() if stations.any()}
@@ -164,6 +189,16 @@ class Residuals:
     def errors(self, fields: tuple[Array, Array]) -> dict[str, Array]:
         """The `departure` of both vectors from the references of the run."""
         return {name: departure(name, *fields, self.known) for name in self.judged}
+
+    @cached_property
+    def errors_after(self) -> dict[str, Array]:
+        """The `errors` that the fit leaves."""
+        return self.errors(self.after)
+
+    @cached_property
+    def errors_before(self) -> dict[str, Array]:
+        """The `errors` of the readings as they came."""
+        return self.errors(nominal(self.readings))
 
     @cached_property
     def expected(self) -> dict[str, Array]:
@@ -175,42 +210,44 @@ class Residuals:
         fit, problem, expected = self.fit, self.fit.problem, {}
         private = problem.linear(fit.state).private
         total = np.eye(private.shape[-2]) + private @ private.mT
-        # Covariance (n, m, m) of the whitened misfit, in units of the noise whatever the weights.
-        misfit = np.asarray(total @ _judged(fit).spread @ total)[0]
-        noise = [triad.sd[0] * np.sqrt(fit.trust[0])[:, None] for triad in problem.triads]
+        # Covariance (B, n, m, m) of the whitened misfit, in units of the noise whatever the weights.
+        misfit = total @ _judged(fit).spread @ total
+        noise = [triad.sd * np.sqrt(fit.trust)[..., None] for triad in problem.triads]
         slopes = [
-            triad.model.slope(fit.state.params[:, where], triad.raw, problem.temperature)[0]
+            triad.model.slope(fit.state.params[:, where], triad.raw, problem.temperature)
             for triad, where in zip(problem.triads, problem.slices(), strict=True)
         ]
         for name in self.judged:
             parts = np.split(OBSERVABLES[name].gradient(*self.targets), [3], axis=-1)
             rows = [
-                np.einsum("ni,nij->nj", part, slope) * sd
+                np.einsum("bni,bnij->bnj", part, slope) * sd
                 for part, slope, sd in zip(parts, slopes, noise, strict=False)
             ]
-            row = np.nan_to_num(np.concatenate(rows, -1) * self.weights[name][:, None])
-            variance = np.einsum("ni,nij,nj->n", row, misfit, row)
+            row = np.nan_to_num(np.concatenate(rows, -1) * self.weights[name][..., None])
+            variance = np.einsum("bni,bnij,bnj->bn", row, misfit, row)
             unused = name in problem.evidence.absent
             expected[name] = np.where(unused, np.nan, np.sqrt(np.maximum(variance, 0)))
         return expected
 
     @cached_property
     def _moves(self) -> list[Array]:
-        """Change (n, p) of each triad's parameters when a station is left out."""
+        """Change (B, n, p) of each triad's parameters when a station is left out."""
         fit = self.fit
-        moved = without_station(fit.problem, fit.state, fit.analysis)[0]
-        return [moved[:, where] for where in fit.problem.slices()]
+        moved = without_station(fit.problem, fit.state, fit.analysis)
+        return [moved[..., where] for where in fit.problem.slices()]
 
     @cached_property
     def left_out(self) -> tuple[Array, Array]:
         """Corrected vectors of each station, by the fit without it."""
         problem, state = self.fit.problem, self.fit.state
-        fields = []
+        shape, fields = problem.temperature.shape, []
+        each, warmth = np.repeat(np.arange(shape[0]), shape[1]), problem.temperature.reshape(-1, 1)
         for triad, where, moved in zip(problem.triads, problem.slices(), self._moves, strict=True):
-            params = state.params[:, where] + moved
-            raw, temperature = triad.raw[0][:, None], problem.temperature[0][:, None]
-            fields.append(triad.model.fields(params, raw, temperature)[:, 0])
-        return fields[0], fields[1] if len(fields) > 1 else np.full_like(fields[0], np.nan)
+            params = (state.params[:, None, where] + moved).reshape(each.size, -1)
+            model = take(triad.model, each)
+            fields.append(model.fields(params, triad.raw.reshape(-1, 1, 3), warmth))
+        g, *others = (field.reshape(*shape, 3) for field in fields)
+        return g, others[0] if others else np.full_like(g, np.nan)
 
     @cached_property
     def influence(self) -> dict[str, Array]:
@@ -218,87 +255,135 @@ class Residuals:
         some = np.unique(np.linspace(0, self.readings.count - 1, PROBES).astype(int))
         problem, params, influence = self.fit.problem, self.fit.state.params, {}
         rows = [
-            t.model.jacobian(params[:, where], t.raw[:, some], problem.temperature[:, some])[0]
+            t.model.jacobian(params[:, where], t.raw[:, some], problem.temperature[:, some])
             for t, where in zip(problem.triads, problem.slices(), strict=True)
         ]
+        size = max(1, CHANGES_AT_ONCE // (some.size * self.readings.count))
         for name in self.judged:
-            gradient = np.nan_to_num(OBSERVABLES[name].gradient(*self.after)[some])
+            gradient = np.nan_to_num(OBSERVABLES[name].gradient(*self.after)[:, some])
             triples = zip(np.split(gradient, [3], axis=-1), rows, self._moves, strict=False)
-            changes = [
-                np.einsum("ni,nip->np", part, row) @ m.transpose() for part, row, m in triples
-            ]
-            change = np.sum(changes, 0) * self.weights[name][some][:, None]
-            influence[name] = np.abs(change).max(0)
+            pairs = [(np.einsum("bni,bnip->bnp", part, row), moved) for part, row, moved in triples]
+            weights, parts = self.weights[name][:, some, None], []
+            for first in range(0, len(params), size):
+                runs = slice(first, first + size)
+                change = np.sum([row[runs] @ moved[runs].mT for row, moved in pairs], 0)
+                parts.append(np.abs(change * weights[runs]).max(1))
+            influence[name] = np.concatenate(parts)
         return influence
 
     @cached_property
-    def stations(self) -> list[StationRow]:
-        """Errors of every station, with the ones to take again."""
-        readings, after = self.readings, self.errors(self.after)
-        warmth = readings.temperature
-        chance = chances(self.fit)[0]
-        again, deviation = (
-            stations_to_remeasure(chance),
-            normal_quantile(np.maximum(chance, 1e-300)),
+    def _chances(self) -> tuple[Bools, Array]:
+        """Stations to take again, and the deviation of each."""
+        chance = chances(self.fit)
+        return stations_to_remeasure(chance), normal_quantile(np.maximum(chance, 1e-300))
+
+    @cached_property
+    def _angles(self) -> Array:
+        """Corrected `ANGLES` (B, n, 3), degrees."""
+        return np.degrees([OBSERVABLES[name].value(*self.after) for name in ANGLES]).transpose(
+            1, 2, 0
         )
-        ratio = {
-            name: np.abs(after[name]) / np.maximum(np.nan_to_num(sd, nan=np.inf), 1e-30)
-            for name, sd in self.expected.items()
-        }
-        shown = after, self.errors(nominal(readings)), self.errors(self.left_out), self.influence
-        factors = {name: shown_in(name, readings.relative)[0] for name in after}
-        angles = {n: np.degrees(OBSERVABLES[n].value(*self.after)) for n in ANGLES}
-        rows = []
-        for i in range(readings.count):
-            errors, before, left_out, influence = (_scaled(each, factors, i) for each in shown)
-            worst = max(errors, key=lambda name: ratio[name][i], default=None) if again[i] else None
-            rows.append(
-                StationRow(
-                    station=readings.labels[i],
-                    digest=readings.digest[i] if readings.digest else "",
-                    temperature_c=None if warmth is None else float(warmth[i]),
-                    **{f"{name}_deg": stated(angle[i]) for name, angle in angles.items()},
-                    errors=errors,
-                    errors_before=before,
-                    errors_left_out=left_out,
-                    influence=influence,
-                    weight=float(self.fit.trust[0, i]),
-                    deviation=float(deviation[i]),
-                    reshoot=bool(again[i]),
-                    worst=worst,
-                )
+
+    @cached_property
+    def _shown(self) -> list[Array]:
+        """Errors after, before and left out, and influence, each (B, n, k), in the units they are shown in."""
+        kinds = self.errors_after, self.errors_before, self.errors(self.left_out), self.influence
+        factors = [shown_in(name, self.readings.relative)[0] for name in self.judged]
+        missing = np.stack([~each.any(-1, keepdims=True) for each in self.judged.values()], -1)
+        return [
+            np.where(missing, np.nan, np.stack([*each.values()], -1) * factors) for each in kinds
+        ]
+
+    def stations(self, place: int, run: Readings) -> list[StationRow]:
+        """Errors of every station of one `run`, with the ones to take again."""
+        again, deviation = (each[place] for each in self._chances)
+        names = [*self.judged]
+        rows = zip(
+            run.labels,
+            run.digest or [""] * run.count,
+            [None] * run.count if run.temperature is None else figures(run.temperature),
+            figures(self._angles[place]),
+            *(_named(names, each[place]) for each in self._shown),
+            figures(self.fit.trust[place]),
+            figures(deviation),
+            again.tolist(),
+            strict=True,
+        )
+        return [
+            StationRow(
+                station=label,
+                digest=digest,
+                temperature_c=warmth,
+                **{f"{name}_deg": stated(angle) for name, angle in zip(ANGLES, angles, strict=True)},
+                errors=errors,
+                errors_before=before,
+                errors_left_out=left_out,
+                influence=influence,
+                weight=weight,
+                deviation=far,
+                reshoot=bad,
+                worst=self._worst(place, number, errors) if bad else None,
             )
-        return rows
+            for number, (
+                label, digest, warmth, angles, errors, before, left_out, influence, weight, far, bad
+            ) in enumerate(rows)
+        ]  # fmt: skip
+
+    def _worst(self, place: int, station: int, errors: Mapping[str, float]) -> str | None:
+        """The observable whose error is largest for what was to be expected."""
+
+        def ratio(name: str) -> float:
+            expected = np.nan_to_num(self.expected[name][place, station], nan=np.inf)
+            return float(abs(self.errors_after[name][place, station]) / max(expected, 1e-30))
+
+        return max(errors, key=ratio, default=None)
 
 
-def error_rows(residuals: Residuals) -> list[ErrorRow]:
-    """Root mean square errors before and after, and what was to be expected after."""
-    rows, after = [], residuals.errors(residuals.after)
-    before = residuals.errors(nominal(residuals.readings))
+def _named(names: list[str], errors: Array) -> list[dict[str, float]]:
+    """Errors (n, k) by name, station by station, those that are not NaN."""
+    rows = figures(errors)
+    if not np.isnan(errors).any():
+        return [dict(zip(names, row, strict=True)) for row in rows]
+    return [{n: e for n, e in zip(names, row, strict=True) if e == e} for row in rows]
+
+
+def error_rows(residuals: Residuals) -> list[list[ErrorRow]]:
+    """Root mean square errors of each run before and after, and what was to be expected after."""
+    rows: list[list[ErrorRow]] = [[] for _ in residuals.fit.status]
+    kinds = residuals.errors_before, residuals.errors_after, residuals.expected
     for name, judged in residuals.judged.items():
         factor, unit = shown_in(name, residuals.readings.relative)
-        rows.append(
-            ErrorRow(
-                observable=name,
-                unit=unit,
-                stations=int(judged.sum()),
-                before=rms(before[name][judged]) * factor,
-                after=rms(after[name][judged]) * factor,
-                expected=stated(rms(residuals.expected[name][judged]) * factor),
-            )
-        )
+        sizes = (rms(np.where(judged, each[name], np.nan)) * factor for each in kinds)
+        counts = np.count_nonzero(judged, -1).tolist()
+        for row, count, before, after, expected in zip(
+            rows, counts, *map(figures, sizes), strict=True
+        ):
+            if count:
+                row.append(
+                    ErrorRow(
+                        observable=name,
+                        unit=unit,
+                        stations=count,
+                        before=before,
+                        after=after,
+                        expected=stated(expected),
+                    )
+                )
     return rows
 
 
-def measure_rows(residuals: Residuals) -> list[Measures]:
-    """Moradi's measures of the vector error, where reference vectors are whole."""
-    rows = []
+def measure_rows(residuals: Residuals) -> list[list[Measures]]:
+    """Moradi's measures of the vector error of each run, where reference vectors are whole."""
+    rows: list[list[Measures]] = [[] for _ in residuals.fit.status]
     for index, name in enumerate(TRIADS[: len(residuals.fit.problem.triads)]):
         needed = ("inclination", "toolface", "azimuth")[: 2 + index]
         whole = np.all([~np.isnan(residuals.known[n]) for n in needed], axis=0)
-        target = np.where(whole[:, None], residuals.targets[index], np.nan)
+        target = np.where(whole[..., None], residuals.targets[index], np.nan)
         for when, fields in (("before", nominal(residuals.readings)), ("after", residuals.after)):
-            rows += vector_measures(name, when, fields[index], target)
+            for row, more in zip(
+                rows, vector_measures(name, when, fields[index], target), strict=True
+            ):
+                row += more
     return rows
 
 
@@ -369,9 +454,3 @@ def chi_chance(square: Array, freedom: Array, small: bool = False) -> Array:
     spread = 2 / (9 * np.maximum(freedom, 1e-9))
     normal = (np.cbrt(square / np.maximum(freedom, 1e-9)) - 1 + spread) / np.sqrt(2 * spread)
     return np.asarray(0.5 * np.vectorize(erfc, otypes=[float])(-normal if small else normal))
-
-
-def _scaled(errors: dict[str, Array], factors: dict[str, float], index: int) -> dict[str, float]:
-    """Errors of one station that are not NaN, in the units they are shown in."""
-    pairs = {n: float(e[index] * factors[n]) for n, e in errors.items()}
-    return {n: v for n, v in pairs.items() if not np.isnan(v)}

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import compress
 
 import numpy as np
 
@@ -108,11 +109,11 @@ class StatedCovariance:
         uneven = np.any(np.abs(whole - whole.mT) > EVEN * outer(sd), (-1, -2))
         return np.asarray(np.where(uneven[:, None, None], (whole + whole.mT) / 2, whole))
 
-    def by_source(self, repeatability: Sequence[float] = ()) -> dict[str, Array]:
+    def by_source(self, repeatability: Array | None = None) -> dict[str, Array]:
         """Covariance (B, p, p) by source; all together they are `total`.
 
-        A common error comes under its `common_source`. `repeatability` of each triad, in its field, is the part
-        of the declared noise that comes under this name.
+        A common error comes under its `common_source`. `repeatability` (B, t) of each triad, in its field, is
+        the part of the declared noise that comes under this name.
         """
         result, (independent, _, prior, order) = self.result, self._parts
         lone = self._lone_settings
@@ -174,8 +175,8 @@ def common_source(name: str) -> str:
     return "tilt of the stand" if name.startswith("stand-") else error_name(name)
 
 
-def assumed_exact(result: Fit, relative: bool) -> list[str]:
-    """References and conditions assumed exact whose error moves no residual, and enters the calibration in full.
+def assumed_exact(result: Fit, relative: bool) -> list[list[str]]:
+    """References and conditions that each run assumes exact whose error moves no residual, but the calibration.
 
     A toolface zero turns both triads, and a strength scales one, as sensors of other mounting or
     scale would have it. The field = 1 of a `relative` magnetometer is no reference. The signs of the magnetometer
@@ -186,30 +187,37 @@ def assumed_exact(result: Fit, relative: bool) -> list[str]:
     declared = {c.name.removesuffix("-zero") for c in evidence.constants} | set(evidence.absent)
     if relative:
         declared.add("field")
-    exact = [
-        name
+    holds = {
+        "toolface zero of the stand" if name == "toolface" else f"{name} reference": (
+            evidence.is_known(name).any(-1)
+        )
         for name in quantities[: 1 + len(result.problem.triads)]
-        if evidence.is_known(name).any() and name not in declared
-    ]
-    names = ["toolface zero of the stand" if n == "toolface" else f"{n} reference" for n in exact]
-    dip = float(unconfirmed_dip(result)[0])
-    signs = [] if np.isnan(dip) else [SIGNS[dip < 0]]
-    return [*names, *signs, *(STEADINESS[name] for name in unseen_drifts(result))]
+        if name not in declared
+    }
+    dip = unconfirmed_dip(result)
+    holds |= {SIGNS[0]: dip >= 0, SIGNS[1]: dip < 0}
+    holds |= {STEADINESS[name]: members for name, members in unseen_drifts(result).items()}
+    return [[*compress(holds, each)] for each in np.stack([*holds.values()], -1).tolist()]
 
 
-def unseen_drifts(result: Fit) -> list[str]:
-    """Drifts that are not in the fit and whose trend residuals would not show, of a batch of one."""
+def unseen_drifts(result: Fit) -> dict[str, Bools]:
+    """Members (B,) whose residuals would not show the trend of a drift that is not in the fit, by its name."""
+    return result.problem.once("unseen drifts", result.state, lambda _: _unseen_drifts(result))
+
+
+def _unseen_drifts(result: Fit) -> dict[str, Bools]:
     present = drift.places(result.problem.evidence)
     if result.analysis.influence is not None or {*drift.families(result.problem)} <= {*present}:
-        return []
+        return {}
     scores = drift.walk_scores(result.problem, result.state, result.analysis)
-    return [name for name in scores.places if scores.shown(name)[0] < drift.LEAST_TREND]
+    return {name: scores.shown(name) < drift.LEAST_TREND for name in scores.places}
 
 
 def unseen_shares(result: Fit) -> dict[str, Array]:
-    """Covariance (B, p, p) that each of the `unseen_drifts` would add, per 1σ of 1 g or nT from end to end."""
+    """Covariance (B, p, p) that each drift which a run would not show adds, per 1σ of 1 g or nT from end to end."""
     problem, state, analysis = result.problem, result.state, result.analysis
-    effects = {n: drift.trend_effect(problem, state, analysis, n) for n in unseen_drifts(result)}
+    unseen = [name for name, members in unseen_drifts(result).items() if members.any()]
+    effects = {name: drift.trend_effect(problem, state, analysis, name) for name in unseen}
     return {name: effect @ effect.mT for name, effect in effects.items()}
 
 
@@ -250,17 +258,19 @@ def _of_lone_settings(result: Fit) -> Array:
     return _sum_of_squares(_moved(result, linear) @ linear.private)
 
 
-def _of_repeatability(result: Fit, repeatability: Sequence[float]) -> Array:
+def _of_repeatability(result: Fit, repeatability: Array | None) -> Array:
     """Covariance (B, p, p) from the repeatability of each triad's readings, before scaling.
 
     It is a part of the noise that is declared; where the noise is estimated it is in the estimate.
     """
     declared = np.isnan(result.noise)
-    if not (declared.any() and any(repeatability)):
+    if repeatability is None or not (declared.any() and repeatability.any()):
         return np.zeros_like(result.analysis.covariance)
     shares = [
-        known[:, None, None] * sd / triad.sd
-        for known, sd, triad in zip(declared.mT, repeatability, result.problem.triads, strict=False)
+        (known * sd)[:, None, None] / triad.sd
+        for known, sd, triad in zip(
+            declared.mT, repeatability.mT, result.problem.triads, strict=False
+        )
     ]
     moved = _moved(result, result.problem.linear(result.state))
     return _sum_of_squares(moved * np.concatenate(shares, -1)[:, :, None])

@@ -14,6 +14,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Any, ClassVar
 
 import msgspec
@@ -487,7 +488,7 @@ class _Judge:
 
     def summary(self, g: Array, b: Array) -> dict[str, float]:
         """Root mean square errors by observable, and the scatter within groups, in shown units."""
-        result = {name: rms(error) for name, error in self.errors(g, b).items()}
+        result = {name: float(rms(error)) for name, error in self.errors(g, b).items()}
         if self.grouped:
             scatter = group_scatter(directions(g, b), self.readings.groups)
             result[SCATTER] = float(np.degrees(scatter))
@@ -502,7 +503,8 @@ class _Judge:
         blind = {**known, "azimuth": np.zeros(self.readings.count)}
         ideal = reference_vectors(**blind)[0], reference_vectors(**known)[1]
         each = zip(TRIADS, fields, ideal, strict=True)
-        return tuple(row for triad in each for row in vector_measures(triad[0], when, *triad[1:]))
+        measures = [vector_measures(name, when, f[None], i[None])[0] for name, f, i in each]
+        return tuple(chain.from_iterable(measures))
 
 
 def score(row: Row, best: Mapping[str, float]) -> float:

@@ -82,17 +82,19 @@ def _stirling(z: Array) -> Array:
 def normal_quantile(chance: Array) -> Array:
     """Standard deviations z that a normal value exceeds, on either side, with a chance above 0.
 
-    By Newton's method for the logarithm of the chance, which is concave: it comes from above.
+    By Newton's method for the logarithm of the chance, which is concave: it comes from above. Each row of chances
+    (..., n) goes on until all of it has come.
 
     >>> normal_quantile(np.array([1.0, 0.05, 0.0027])).round(4)
     array([0.  , 1.96, 3.  ])
     """
     chance = np.asarray(chance, float)
-    z = np.sqrt(2 * np.log(1 / chance))
+    z, moving = np.sqrt(2 * np.log(1 / chance)), np.ones(chance.shape, bool)
     for _ in range(MOST_FRACTIONS):
         tail = np.vectorize(erfc, otypes=[float])(z / np.sqrt(2))
         step = np.log(tail / chance) * tail / (np.sqrt(2 / np.pi) * np.exp(-(z**2) / 2))
-        z = z + step
-        if (np.abs(step) <= LAST_DIGIT * np.maximum(z, 1)).all():
+        z = z + np.where(moving, step, 0.0)
+        moving = moving & np.any(np.abs(step) > LAST_DIGIT * np.maximum(z, 1), -1, keepdims=True)
+        if not moving.any():
             break
     return np.asarray(np.maximum(z, 0))

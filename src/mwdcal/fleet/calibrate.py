@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 
 import msgspec
 import numpy as np
@@ -20,7 +20,7 @@ from mwdcal.calibration import results
 from mwdcal.calibration.automatic.auto import Choice, tables_of, with_prior
 from mwdcal.calibration.automatic.drift import with_drifts
 from mwdcal.calibration.automatic.nonlinearity import offered
-from mwdcal.calibration.calibrate import record_of
+from mwdcal.calibration.calibrate import Records
 from mwdcal.calibration.diagnosis.findings import finding_flags
 from mwdcal.calibration.diagnosis.flags import Alone, FittedRuns, Flag
 from mwdcal.calibration.diagnosis.refusals import BAD_INPUT, fit_refusals, reading_refusals
@@ -229,9 +229,8 @@ class _Batch:
     def _note(self, tools: Ints, options: Options, result: Fit) -> None:
         """Check a fit of some tools, and note results and findings of the sound ones."""
         readings = take(self.readings, tools)
-        fitted = FittedRuns(
-            readings, self.profile, options, result, lambda place: self.alone(int(tools[place]))
-        )
+        alone = cache(lambda place: self.alone(int(tools[place])))
+        fitted = FittedRuns(readings, self.profile, options, result, alone)
         self._refuse(tools, fit_refusals(fitted))
         good = np.flatnonzero(self.outcome.status[tools] == OK)
         if not good.size:
@@ -239,38 +238,38 @@ class _Batch:
         if good.size < len(tools):
             fitted = fitted.take(good)
         self.repeated[tools[good]] = copies(fitted.result)
-        self._note_findings(tools[good], fitted)
+        flags = [*finding_flags(fitted)]
+        self._note_findings(tools[good], fitted, flags)
         if readings.magnetometer is not None:
             self.outcome.unit[tools[good]] = readings.field_unit
         if self.records:
-            self._note_records(tools[good], fitted)
+            self._note_records(tools[good], Records(fitted, flags))
         for name, values in _columns(fitted, self.profile.reference_temperature_c).items():
             self.outcome.numbers[name][tools[good]] = values
 
-    def _note_records(self, tools: Ints, fitted: FittedRuns) -> None:
+    def _note_records(self, tools: Ints, records: Records) -> None:
         """Records of sound tools, as `mwdcal calibrate` writes them; of the time the day alone, so that runs repeat."""
         for place in np.flatnonzero(~self.repeated[tools].any(-1)).tolist():
-            options, (readings, profile) = fitted.options, fitted.alone(place)
             with suppress(MwdcalError):  # of a tool that is sound by a hair in the batch alone
+                options, (readings, profile) = records.fitted.options, records.fitted.alone(place)
                 orders = tables_of(readings, self.given, options)
-                choice = Choice(readings, profile, options, orders)
-                record = record_of(choice, fitted.alone_as(place, (readings, profile)))
+                record = records.of(place, Choice(readings, profile, options, orders))
                 day = msgspec.structs.replace(record, time=record.time.partition("T")[0])
                 self.outcome.records[tools[place]] = msgspec.json.encode(day)
 
-    def _note_findings(self, tools: Ints, fitted: FittedRuns) -> None:
+    def _note_findings(self, tools: Ints, fitted: FittedRuns, flags: Sequence[Flag]) -> None:
         """The findings of sound tools; what is undetermined, by triad."""
         lists = self.outcome.lists
         ids: list[dict[str, None]] = [{} for _ in tools]
         stations: list[list[int]] = [[] for _ in tools]
-        for flag in finding_flags(fitted):
+        for flag in flags:
             for place in np.flatnonzero(flag.members).tolist():
                 ids[place][flag.id] = None
                 if flag.station is not None:
                     stations[place].append(flag.station)
-        for tool, flags, again, free in zip(tools, ids, stations, fitted.free, strict=True):
+        for tool, kinds, again, free in zip(tools, ids, stations, fitted.free, strict=True):
             undetermined = {entry.id for entry in free}
-            lists["findings"][tool] = [name for name in flags if name not in undetermined]
+            lists["findings"][tool] = [name for name in kinds if name not in undetermined]
             lists["reshoot"][tool] = again
             for index, triad in enumerate(TRIADS):
                 free_here = [entry.id for entry in free if index in entry.triads]

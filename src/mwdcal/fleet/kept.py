@@ -18,6 +18,7 @@ from zlib import crc32
 import msgspec
 
 from mwdcal.errors import InputError
+from mwdcal.files.formats import atomic
 
 SEAL = b"mwdcal fleet part "
 HEAD = 64
@@ -40,6 +41,16 @@ def _head(content: bytes | memoryview, name: str) -> bytes:
     """The seal of a part."""
     check = crc32(content, crc32(name.encode()))
     return (SEAL + b"%016x %08x" % (len(content), check)).ljust(HEAD - 1) + b"\n"
+
+
+def write_part(path: Path, content: bytes) -> None:
+    """Keep a finished part: whole, or not at all; a loss of power may damage it until it is `to_disk`."""
+    if not path.parent.is_dir():
+        raise InputError(
+            f"'{path.parent}': no such folder on this machine. Workers on other machines must see the table, "
+            "and the folder of the output, under the same paths."
+        )
+    atomic.write(path, with_checksum(content, path.name), durable=False)
 
 
 def unsealed(data: bytes, name: str) -> memoryview | None:

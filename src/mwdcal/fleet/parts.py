@@ -1,10 +1,14 @@
-"""One partition of a fleet: the same two steps for every worker, on this machine or another."""
+"""One partition of a fleet: the same two steps for every worker, on this machine or another.
+
+A worker writes its own part: nothing of it passes through the command, which reads it when it puts the table together.
+"""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -20,9 +24,10 @@ from mwdcal.estimation.batch import put
 from mwdcal.files.contract import AZIMUTH_KEYS, CHANNELS
 from mwdcal.files.formats import parquet
 from mwdcal.files.formats.members import RECORD
+from mwdcal.fleet import kept
 from mwdcal.fleet.calibrate import LISTS, OK, Outcome, calibrate_batch, names
 from mwdcal.fleet.runs import Rows, batches, refused_tools
-from mwdcal.fleet.sources import SERIAL, FleetTable
+from mwdcal.fleet.sources import SERIAL, FleetTable, check_unchanged
 from mwdcal.fleet.tables import Partition, read
 from mwdcal.geometry.vectors import Array, Ints
 from mwdcal.sensor.profile import Profile
@@ -75,13 +80,29 @@ class Plan:
         return hashlib.sha256(msgspec.json.encode([self, partition])).hexdigest()[:32]
 
 
-def load(plan: Plan, partition: Partition) -> bytes:
-    """The rows of a partition, in Arrow's stream format."""
-    return packed(read(partition, plan.columns))
+@dataclass(frozen=True)
+class Task:
+    """A partition, and the file that keeps what becomes of it, where every worker sees it."""
+
+    partition: Partition
+    path: Path
 
 
-def solve(plan: Plan, loaded: bytes) -> bytes:
-    """Calibrate the tools of loaded rows: a table in Arrow's stream format, one row per tool."""
+def load(plan: Plan, task: Task) -> tuple[Task, bytes]:
+    """The task with its rows, in Arrow's stream format."""
+    return task, packed(read(task.partition, plan.columns))
+
+
+def solve(plan: Plan, loaded: tuple[Task, bytes]) -> None:
+    """Calibrate the tools of loaded rows, and keep their table, one row per tool, where the task says."""
+    task, rows = loaded
+    table = calibrations(plan, rows)
+    check_unchanged(task.partition.pieces)
+    kept.write_part(task.path, packed(table))
+
+
+def calibrations(plan: Plan, loaded: bytes) -> Any:
+    """The Arrow table of the tools of loaded rows."""
     if plan.version != __version__:
         raise InputError(
             f"the worker runs mwdcal {__version__}, the command {plan.version}. Install the "
@@ -90,7 +111,7 @@ def solve(plan: Plan, loaded: bytes) -> bytes:
     arrow, _ = parquet.modules(plan.source)
     table = arrow.ipc.open_stream(loaded).read_all()
     rows = Rows(table, plan.source, plan.metadata, plan.profile, plan.runs_sha256)
-    return packed(_result(rows, plan))
+    return _result(rows, plan)
 
 
 def packed(table: Any) -> bytes:

@@ -94,8 +94,8 @@ class Rows:
         numbers = group_numbers([str(name).strip() for name in names], self.starts.tolist())
         return none if numbers is None else numbers
 
-    def alone(self, tool: int) -> tuple[Readings, Profile]:
-        """One tool's readings as a single run has them; raises what a single run would."""
+    def alone(self, tool: int, proved: bool = False) -> tuple[Readings, Profile]:
+        """One tool's readings as a single run has them; raises what a single run would, if it is not `proved`."""
         arrow, _ = parquet.modules(self.source)
         part = self.table.slice(self.starts[tool], self.counts[tool])
         serial = part.column(SERIAL)[0].as_py()
@@ -108,7 +108,7 @@ class Rows:
         source = f"serial {serial} of {place}"
         metadata = {**self.metadata, SERIAL: str(serial), **self._north(tool, source)}
         table = Table(columns, metadata, source, lines, self.digest)
-        return to_readings(table, self.profile)
+        return to_readings(table, self.profile, proved=proved)
 
     def _run(self, tool: int, serial: str) -> Table | None:
         """The run of a tool that comes from a run file; refuses one of several, or that cannot be read."""
@@ -156,8 +156,8 @@ class Rows:
         return self.any(self.table.column(FAULT).is_valid().to_numpy())
 
     def members(self, tools: Ints) -> Alone:
-        """The same for some tools, by place among these."""
-        return lambda place: self.alone(int(tools[place]))
+        """The same for some tools that none of `refused_tools` is among, by place among these."""
+        return lambda place: self.alone(int(tools[place]), proved=True)
 
     def label(self, tool: int, station: int) -> str:
         """A station's label, as a single run has it."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -28,10 +28,9 @@ from mwdcal.files import profiles, synonyms
 from mwdcal.files.formats import atomic, parquet
 from mwdcal.files.formats.members import RECORD
 from mwdcal.fleet import kept
-from mwdcal.fleet.parts import Plan, load, solve
+from mwdcal.fleet.parts import Plan, Task, load, solve
 from mwdcal.fleet.sources import SERIAL, FleetTable, check_unchanged, open_source
 from mwdcal.fleet.tables import (
-    Partition,
     Tools,
     close_rows,
     find_tools,
@@ -87,10 +86,8 @@ def calibrate_table(
         whole = partitions(source, tools, folder, say)
         parts = {folder / f"{plan.key(part)}.arrow": part for part in whole}
         done = _finished(parts, tools, source, say)
-        missing = {path: part for path, part in parts.items() if path not in done}
-        computing = _computed(
-            pool.results(steps, list(missing.values()), workers or cores(), scheduler), missing, say
-        )
+        tasks = [Task(part, path) for path, part in parts.items() if path not in done]
+        computing = _computed(pool.results(steps, tasks, workers or cores(), scheduler), tasks, say)
         with contextlib.closing(computing) as computed:
             tables = _in_order(parts, done, computed)
             _merge(tables, target, _metadata(source, plan, typed, digest), source)
@@ -195,31 +192,28 @@ def _check_target(target: Path, runs: Path) -> None:
 
 
 def _computed(
-    results: Iterator[tuple[int, bytes]],
-    missing: Mapping[Path, Partition],
-    say: Callable[[str], None],
+    results: Iterator[tuple[int, None]], tasks: Sequence[Task], say: Callable[[str], None]
 ) -> Generator[Path, None, None]:
-    """The parts that are missing, one by one as they are computed; each is kept when it is whole."""
-    if not missing:
+    """The parts that are missing, one by one as workers have written them."""
+    if not tasks:
         return
     begun, tools, say_slowly = time.perf_counter(), 0, slowly(say, EVERY)
-    paths, tasks = list(missing), list(missing.values())
     for name in NEEDED_AT_THE_END:  # while the workers start: later it would be waited for
         import_module(name)
     disk = ThreadPoolExecutor(1)  # the next part is computed while one goes to the disk
     try:
-        for count, (index, content) in enumerate(results, 1):
-            check_unchanged(tasks[index].pieces)
-            atomic.write(
-                paths[index], kept.with_checksum(content, paths[index].name), durable=False
-            )
-            disk.submit(kept.to_disk, paths[index])
-            tools += tasks[index].tools
+        for count, (index, _) in enumerate(results, 1):
+            task = tasks[index]
+            check_unchanged(task.partition.pieces)
+            disk.submit(kept.to_disk, task.path)
+            tools += task.partition.tools
             rate = tools / (time.perf_counter() - begun)
-            say_slowly(f"part {count} of {len(missing)}   {rate:.0f} tools/s")
-            yield paths[index]
+            say_slowly(f"part {count} of {len(tasks)}   {rate:.0f} tools/s")
+            yield task.path
     except InputError:
-        check_unchanged(piece for task in tasks for piece in task.pieces)  # then that is the reason
+        check_unchanged(
+            piece for task in tasks for piece in task.partition.pieces
+        )  # if that is why
         raise
     finally:
         disk.shutdown(cancel_futures=True)

@@ -423,7 +423,7 @@ def _recommended(
         stations = {name: channels[name].station.noise for name in names if name in channels}
         if not stations or kind in withheld:
             continue
-        profile[kind] = rms(np.array([*stations.values()]))
+        profile[kind] = float(rms(np.array([*stations.values()])))
         noisy, quiet = (pick(stations, key=stations.__getitem__) for pick in (max, min))
         if stations[noisy] > UNEVEN * stations[quiet]:
             text = (

@@ -19,8 +19,10 @@ from mwdcal.calibration.readings import HIGHEST, TRIADS, Readings, highest_order
 from mwdcal.calibration.record import OrderScore, stated
 from mwdcal.calibration.residuals import shown_in
 from mwdcal.estimation.batch import batch_of_one, mapped, take
+from mwdcal.estimation.evidence import ANGLES
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.rank import free_directions
+from mwdcal.estimation.solvers import Status
 from mwdcal.estimation.uncertainty import TESTED, marginal_rank, readjusted
 from mwdcal.geometry.vectors import Array, Bools, Ints
 
@@ -28,6 +30,8 @@ Progress = Callable[[str], None]
 """What gets a line for each trial."""
 FEWEST_SOAKS = 3
 """Fewest soaks among which one can be left out."""
+UNDOUBTED = 1e-12
+"""A term is there without doubt if noise alone gives one as large with a probability below this."""
 LOWEST_RANK = 8
 """A triad of 12 parameters whose three rotations and scale are free has this rank."""
 
@@ -62,8 +66,18 @@ def choose_orders(readings: Readings, options: Options) -> Ints:
     orders = np.zeros((len(levels), 2), int)
     for count in np.unique(levels[levels > 1]):
         alike = np.flatnonzero(levels == count)
-        orders[alike] = _tested(take(readings, alike), options)[0][:, [0, -1]]
+        some = take(readings, alike)
+        orders[alike] = _tested(some, options, _bare_stand(some, options))[0][:, [0, -1]]
     return orders
+
+
+def _bare_stand(readings: Readings, options: Options) -> Readings | None:
+    """The readings as if the stand were exact, where factors over temperature then come in closed form."""
+    whole = all(not np.isnan(readings.reference(name)).any() for name in ANGLES)
+    if options.method != "joint" or options.robust or options.model == "polynomial" or not whole:
+        return None
+    noise = {name: sd for name, sd in readings.sd.items() if name in TRIADS}
+    return replace(readings, sd=noise) if len(noise) < len(readings.sd) else None
 
 
 def _judged_soaks(readings: Readings, options: Options) -> Ints:
@@ -79,29 +93,61 @@ def _judged_soaks(readings: Readings, options: Options) -> Ints:
     return np.asarray(levels)
 
 
-def _tested(readings: Readings, options: Options) -> tuple[Ints, Array]:
+def _tested(
+    readings: Readings, options: Options, bare: Readings | None = None
+) -> tuple[Ints, Array]:
     """The lowest orders (B, t) that leave no term which is there, and the chance (B, t, k) of each term.
 
     The chance is that of the term in a fit of the order below, or of the order chosen. An order that the
-    stations do not determine is not taken.
+    stations do not determine is not taken. Where `bare` readings of an exact stand leave no doubt, no fit is
+    made, and no chance stated.
     """
     limit = _highest(readings, options)
     orders = np.full((len(limit), len(readings.triads)), -1)
     chance = np.full((*orders.shape, HIGHEST), np.nan)
     powers = np.arange(1, HIGHEST + 1)
     for order in range(int(limit.max()) + 1):
-        result = fit(readings, replace(options, order=order))
-        limit = np.where(_too_weak(result) & (order > 0), np.minimum(limit, order - 1), limit)
-        orders = np.where((orders < 0) & (limit < order)[:, None], order - 1, orders)
-        terms = terms_beyond(result)
-        within = (powers <= limit[:, None]) & (powers > order)
-        open_ = (orders < 0)[..., None] & within[:, None]
-        chance = np.where(open_, terms.chance[..., :HIGHEST], chance)
-        wanted = np.any(terms.present[..., :HIGHEST] & within[:, None], -1)
-        orders = np.where((orders < 0) & ~(wanted & (order < limit)[:, None]), order, orders)
-        if (orders >= 0).all():
+        some = np.flatnonzero((orders < 0).any(-1))
+        if not some.size:
             break
+        if bare is not None:
+            known = _without_doubt(
+                take(bare, some), replace(options, order=order), limit[some], orders[some]
+            )
+            last = known & (limit[some] == order)
+            orders[some[last]] = np.where(orders[some[last]] < 0, order, orders[some[last]])
+            some = some[~known]
+        if not some.size:
+            continue
+        result = fit(take(readings, some), replace(options, order=order))
+        weak = _too_weak(result) & (order > 0)
+        limit[some[weak]] = np.minimum(limit[some[weak]], order - 1)
+        most, chosen = limit[some], orders[some]
+        chosen = np.where((chosen < 0) & (most < order)[:, None], order - 1, chosen)
+        terms = terms_beyond(result)
+        within = (powers <= most[:, None]) & (powers > order)
+        open_ = (chosen < 0)[..., None] & within[:, None]
+        chance[some] = np.where(open_, terms.chance[..., :HIGHEST], chance[some])
+        wanted = np.any(terms.present[..., :HIGHEST] & within[:, None], -1)
+        closed = (chosen < 0) & ~(wanted & (order < most)[:, None])
+        orders[some] = np.where(closed, order, chosen)
     return orders, chance
+
+
+def _without_doubt(bare: Readings, options: Options, limit: Ints, orders: Ints) -> Bools:
+    """Members (B,) of which an exact stand already says all that a fit of an order would.
+
+    Every direction is clearly determined, and each triad whose order is open is at its `limit` (B,), or has a term
+    within it that errors of the stand, in the residuals here, cannot feign.
+    """
+    result, order = fit(bare, options), max(options.orders)
+    clear = result.analysis.determined.clear & (result.status == int(Status.OK))
+    powers = np.arange(1, HIGHEST + 1)
+    within = (powers <= limit[:, None]) & (powers > order)
+    chances = np.where(within[:, None], terms_beyond(result).chance[..., :HIGHEST], np.nan)
+    there = np.any(np.nan_to_num(chances, nan=1.0) < UNDOUBTED, -1)
+    done = (orders >= 0) | there | (limit == order)[:, None]
+    return np.asarray(clear & done.all(-1))
 
 
 def _too_weak(result: Fit) -> Bools:
@@ -120,6 +166,8 @@ def order_errors(readings: Readings, options: Options, progress: Progress) -> li
 
     None where there are too few soaks to leave one out.
     """
+    if usable_soaks(_temperature(readings)).max() + 1 < _needed(options.orders):
+        return []
     batch = batch_of_one(readings)
     if _judged_soaks(batch, options)[0] < _needed(options.orders):
         return []

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -36,7 +36,7 @@ from mwdcal.calibration.settings import DIRECTION
 from mwdcal.estimation.problem import WALK_AXES, Prior
 from mwdcal.estimation.rank import free_directions
 from mwdcal.estimation.solvers import Determined
-from mwdcal.geometry.vectors import Bools
+from mwdcal.geometry.vectors import Array, Bools
 
 MISFIT_CHANCE = 1e-3
 """Chance of so large or so small residuals, or of so large a departure of what is declared, below which it is
@@ -151,13 +151,16 @@ def unused_columns(columns: Sequence[str]) -> list[Finding]:
     return [Finding(id=UNUSED, text=f"columns not used: {listed(columns, COLUMNS_NAMED)}.")]
 
 
-def findings(fitted: FittedRuns) -> list[Finding]:
-    """All findings of a single run, a batch of one, in order of weight."""
-    labels: dict[int | None, str] = dict(enumerate(fitted.alone(0)[0].labels))
+def findings(flags: Iterable[Flag], place: int, labels: Sequence[str]) -> list[Finding]:
+    """The findings of one run, in order of weight, of the `flags` of its batch; `labels` of its stations."""
     return [
-        Finding(id=flag.id, text=flag.sentence(0), station=labels.get(flag.station))
-        for flag in finding_flags(fitted)
-        if flag.members[0]
+        Finding(
+            id=flag.id,
+            text=flag.sentence(place),
+            station=None if flag.station is None else labels[flag.station],
+        )
+        for flag in flags
+        if flag.members[place]
     ]
 
 
@@ -359,18 +362,21 @@ def _repeated(fitted: FittedRuns) -> Flag:
 def _beyond_order(fitted: FittedRuns) -> Iterator[Flag]:
     """A variation with temperature that the order of a triad does not follow."""
     present = terms_beyond(fitted.result).present
+    size = cache(lambda: misfit_size(fitted.result))
     for index, triad in enumerate(TRIADS[: present.shape[1]]):
         members = np.any(present[:, index], -1)
-        words = {"triad": triad, "of": partial(_course, fitted, index, present[:, index])}
+        words = {"triad": triad, "of": partial(_course, fitted, index, present[:, index], size)}
         yield Flag(f"{triad}-temperature-misfit", members, REMARKS["temperature-misfit"], words)
 
 
-def _course(fitted: FittedRuns, index: int, present: Bools, place: int) -> dict[str, Any]:
-    """What is left out of a triad's course of temperature, of powers `present` (B, k)."""
+def _course(
+    fitted: FittedRuns, index: int, present: Bools, size: Callable[[], Array], place: int
+) -> dict[str, Any]:
+    """What is left out of a triad's course of temperature, of powers `present` (B, k) and a `size` (B, t)."""
     problem, state = fitted.result.problem, fitted.result.state
     order, observable = problem.triads[index].model.basis.order, ("gravity", "field")[index]
     scale, unit = shown_in(observable, fitted.readings.relative)
-    share = float(misfit_size(fitted.result)[place, index])
+    share = float(size()[place, index])
     strength = float(np.mean(problem.constant(state, observable)[place]))
     powers = np.flatnonzero(present[place]) + 1
     cause = "readings differ from one temperature to the next as no course of order 3 does"
@@ -385,8 +391,8 @@ def _course(fitted: FittedRuns, index: int, present: Bools, place: int) -> dict[
             remedy = "Use another `method`: swarm has no temperature terms"
         elif aligned(fitted.result)[place, index]:
             remedy = "Repeat the same attitudes at other temperatures"
-    size = {"rms": share * strength * scale, "unit": unit, "angle": np.degrees(share)}
-    return {"cause": cause, "remedy": remedy, **size}
+    figures = {"rms": share * strength * scale, "unit": unit, "angle": np.degrees(share)}
+    return {"cause": cause, "remedy": remedy, **figures}
 
 
 def _untested(fitted: FittedRuns) -> Flag:
@@ -410,11 +416,12 @@ def _aligned(fitted: FittedRuns) -> Flag:
 
 def _undetermined(fitted: FittedRuns) -> Iterator[Flag]:
     """Directions that nothing determines."""
-    kinds = [[(entry.id, entry.triads) for entry in free] for free in fitted.free]
-    for name, triads in dict.fromkeys(kind for each in kinds for kind in each):
-        places = [place for place, each in enumerate(kinds) if (name, triads) in each]
-        text = f"{' and '.join(TRIADS[triad] for triad in triads)}: {described(name)}."
-        yield _common(fitted, name, text, places)
+    kinds = [tuple((entry.id, entry.triads) for entry in free) for free in fitted.free]
+    for kind in dict.fromkeys(kinds):
+        places = [place for place, each in enumerate(kinds) if each == kind]
+        for name, triads in dict.fromkeys(kind):
+            text = f"{' and '.join(TRIADS[triad] for triad in triads)}: {described(name)}."
+            yield _common(fitted, name, text, places)
 
 
 def _prior(fitted: FittedRuns) -> Iterator[Flag]:
@@ -476,7 +483,7 @@ def _reshoot(fitted: FittedRuns) -> Iterator[Flag]:
 
 def _misfit(fitted: FittedRuns, station: int, place: int) -> dict[str, Any]:
     """The misfit of a station, where it is worst, and why that may be."""
-    row = fitted.residuals(place).stations[station]
+    row = fitted.stations(place)[station]
     worst = row.worst or "gravity"
     measurable = row.deviation < LARGEST_DEVIATION
     return {

@@ -18,6 +18,7 @@ from mwdcal.calibration.diagnosis.structure import Effect, Shown, effects, shown
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.record import StationRow
 from mwdcal.calibration.residuals import Residuals
 from mwdcal.calibration.results import StatedCovariance
 from mwdcal.estimation.batch import batch_of_one, take
@@ -87,7 +88,7 @@ class FittedRuns:
     options: Options
     result: Fit
     alone: Alone
-    _residuals: dict[int, Residuals] = field(init=False, repr=False, default_factory=dict)
+    _stations: dict[int, list[StationRow]] = field(init=False, repr=False, default_factory=dict)
     _shown: dict[int, Shown] = field(init=False, repr=False, default_factory=dict)
 
     @cached_property
@@ -159,8 +160,13 @@ class FittedRuns:
         shown = self.shown(np.array([place]))[place]
         return effects(self.member(place), others, shown)
 
-    def residuals(self, place: int) -> Residuals:
-        """The errors of one run."""
-        if place not in self._residuals:
-            self._residuals[place] = Residuals(self.alone(place)[0], self.member(place))
-        return self._residuals[place]
+    @cached_property
+    def residuals(self) -> Residuals:
+        """The errors of the runs."""
+        return Residuals(self.readings, self.result)
+
+    def stations(self, place: int) -> list[StationRow]:
+        """The errors of every station of one run."""
+        if place not in self._stations:
+            self._stations[place] = self.residuals.stations(place, self.alone(place)[0])
+        return self._stations[place]

@@ -19,7 +19,7 @@ from mwdcal.calibration.residuals import (
     tail,
 )
 from mwdcal.calibration.results import variance_scales
-from mwdcal.estimation.batch import take
+from mwdcal.estimation.batch import batch_of_one, take
 from mwdcal.estimation.evidence import STAND_ERRORS, UNKNOWN
 from mwdcal.estimation.minimisers import closed_form, closed_form_drift
 from mwdcal.estimation.rank import Free
@@ -147,10 +147,10 @@ def excessive_errors(readings: Readings, result: Fit) -> dict[str, tuple[float, 
     analysis = result.analysis
     squares = np.nan_to_num(analysis.variance_factor[0]) * np.maximum(analysis.freedom[0], 0)
     misfit = np.sqrt(max(squares.sum() / max(analysis.freedom[0].sum(), 1.0), 1.0))
-    residuals, weight = Residuals(readings, result), result.trust[0]
+    residuals, weight = Residuals(batch_of_one(readings), result), result.trust[0]
     excessive = {}
-    for name, after in residuals.errors(residuals.undrifted).items():
-        expected = residuals.expected[name]
+    for name, [after] in residuals.errors(residuals.undrifted).items():
+        [expected] = residuals.expected[name]
         known = ~np.isnan(after + expected) & (weight > 0)
         if not known.any():
             continue

@@ -13,6 +13,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from mwdcal.calibration.canonical import numbers
 from mwdcal.calibration.readings import HIGHEST, TRIADS
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
@@ -71,8 +72,10 @@ def _parts(calibration: Calibration) -> Iterator[str]:
 
 def _numbers(calibration: Calibration) -> Iterator[str]:
     """Numbers that are not finite, too large, or negative where none can be."""
-    for path, value in _impossible(msgspec.to_builtins(calibration)):
-        yield f"'{path}' must be a finite number below {LARGEST:g}; got {value:g}"
+    fields = msgspec.to_builtins(calibration)
+    if not (np.abs(numbers(fields)) <= LARGEST).all():
+        for path, value in _impossible(fields):
+            yield f"'{path}' must be a finite number below {LARGEST:g}; got {value:g}"
     for triad in calibration.triads:
         positive = {
             "noise": triad.noise,
@@ -97,12 +100,10 @@ def _impossible(value: Any, path: str = "") -> Iterator[tuple[str, float]]:
             yield path, value
     elif isinstance(value, dict):
         for key, item in value.items():
-            if not (isinstance(item, float) and abs(item) <= LARGEST):
-                yield from _impossible(item, f"{path}.{key}" if path else str(key))
+            yield from _impossible(item, f"{path}.{key}" if path else str(key))
     elif isinstance(value, list | tuple):
         for index, item in enumerate(value):
-            if not (isinstance(item, float) and abs(item) <= LARGEST):
-                yield from _impossible(item, f"{path}[{index}]")
+            yield from _impossible(item, f"{path}[{index}]")
 
 
 def _surroundings(calibration: Calibration) -> Iterator[str]:
