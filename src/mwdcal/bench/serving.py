@@ -132,6 +132,7 @@ def listening(host: str, port: int) -> socket.socket:
         opened = socket.socket(family, socket.SOCK_STREAM)
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         opened.bind((host, port))
+        opened.listen(128)  # a browser that is faster than the server waits
         return opened
     except OSError as error:
         raise InputError(
