@@ -75,7 +75,8 @@ class StandServer:
         self.listener = socket.create_server(("127.0.0.1", 0))
         self.port = self.listener.getsockname()[1]
         self.connection, self.stopped = None, False
-        threading.Thread(target=self._serve, daemon=True).start()
+        self.thread = threading.Thread(target=self._serve, daemon=True)
+        self.thread.start()
 
     def _serve(self):
         while not self.stopped:
@@ -88,7 +89,8 @@ class StandServer:
                     self.connection.sendall(("\n".join(lines) + "\n").encode())
                     time.sleep(len(lines) / RATE / self.speed)
             except OSError:
-                continue
+                if self.connection is not None:
+                    self.connection.close()
 
     def drop(self):
         if self.connection is not None:
@@ -99,7 +101,10 @@ class StandServer:
     def close(self):
         self.stopped = True
         self.drop()
+        with contextlib.suppress(OSError):
+            self.listener.shutdown(socket.SHUT_RDWR)  # wakes up who waits
         self.listener.close()
+        self.thread.join(5)
 
 
 class BenchProcess:
