@@ -4,7 +4,7 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: papers measured verification scatter coverage drift diagnosis mutations help demo size test test-quick test-studies test-oldest \
-	test-versions fuzz kills registry-stress check check-lint check-types check-code check-docs bench bench-guard docs clean
+	test-versions fuzz kills bench-kills registry-stress check check-lint check-types check-code check-docs bench bench-guard docs clean
 
 PYTHON ?= python3
 PYTHONS ?= python3.12 python3.13
@@ -92,6 +92,9 @@ mutations: $(INSTALLED) ## change one operator or constant in so many (EVERY=40)
 
 kills: $(INSTALLED) ## end commands at random moments (COUNT=1000) and check what they leave
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python tests/kills.py --count $(or $(COUNT),1000) --seed $(or $(SEED),1)
+
+bench-kills: $(INSTALLED) ## end server, source and browser of a bench at random moments (COUNT=200) and check what is left
+	@$(CLOCK); $(ONE_THREAD) $(BIN)/python tests/bench_kills.py --count $(or $(COUNT),200) --seed $(or $(SEED),1)
 
 registry-stress: $(INSTALLED) ## write to registries by 50 processes, end some at random, and check what is left (two minutes)
 	@$(CLOCK); $(ONE_THREAD) PYTHONPATH=tests $(BIN)/python tests/registry_stress.py \

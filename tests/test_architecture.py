@@ -35,6 +35,7 @@ FLOORS = (
     ("presentation",),
     ("library",),
     ("",),  # the package itself: its public names
+    ("bench",),
     ("app",),
     ("__main__",),
 )

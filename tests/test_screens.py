@@ -89,6 +89,7 @@ SCREENS = {
 }  # fmt: skip
 """Commands and what they run on."""
 WITHOUT_A_SCREEN = {
+    "bench",  # serves until it is stopped
     "completion",
     *(f"certificate key {name}" for name in ("create", "trust", "revoke")),
 }

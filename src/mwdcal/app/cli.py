@@ -23,6 +23,7 @@ COMPLETION = "_MWDCAL_COMPLETE"
 """Variable with which a shell asks for completions, which are bytes."""
 SECTIONS = {
     "Calibrate": (
+        "bench",
         "init",
         "profile",
         "stations",

@@ -15,7 +15,7 @@ import msgspec
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError, reason
-from mwdcal.files.contract import MAPPED, TEMPERATURE, units_of
+from mwdcal.files.contract import CHANNELS, MAPPED, TEMPERATURE, units_of
 from mwdcal.files.formats.table import shown
 from mwdcal.files.metadata import LARGEST_TOML, load_toml
 from mwdcal.files.settings import completed
@@ -24,6 +24,7 @@ from mwdcal.sensor.profile import (
     Datasheet,
     Profile,
     StandProfile,
+    StreamForm,
     TableFormat,
     TriadProfile,
 )
@@ -55,6 +56,7 @@ _UNKNOWN = "leave it out where it is unknown."
 _SHARE = "1 sigma as a share of the field, such as 0.005; leave it out for a linear axis."
 _ANGLE = (0.0, 180.0, "1 sigma, in degrees.")
 _LIMITS: dict[type[msgspec.Struct], dict[str, tuple[float, float, str]]] = {
+    StreamForm: {},
     Profile: {"reference_temperature_c": (TEMPERATURE.low, TEMPERATURE.high, "In °C.")},
     TriadProfile: {
         "scale": (*_ALL, f'Put the sign into `axes`, for example "-x"; {_UNKNOWN}'),
@@ -302,6 +304,8 @@ def check_profile(profile: Profile, source: str) -> None:
     _check_section(profile, source)
     if not isinstance(profile.columns, msgspec.UnsetType):
         _check_columns(profile.columns, source)
+    if not isinstance(profile.stream, msgspec.UnsetType):
+        _check_stream(profile.stream, source)
     form = profile.table
     if isinstance(form, msgspec.UnsetType) or form.find:
         return
@@ -309,6 +313,21 @@ def check_profile(profile: Profile, source: str) -> None:
         raise InputError(
             f"{source}, key 'table.first_line': must be below the names in line {form.header_line}; got "
             f"{form.first_line}. Correct it."
+        )
+
+
+def _check_stream(form: StreamForm, source: str) -> None:
+    """Refuse a stream whose lines name no accelerometer, or a pattern that is none."""
+    try:
+        names = {*form.columns, *re.compile(form.pattern).groupindex}
+    except re.error as error:
+        raise InputError(
+            f"{source}, key 'stream.pattern': is no regular expression ({error}). Correct it."
+        ) from None
+    missing = {*CHANNELS["accelerometer"]} - names
+    if missing or (form.columns and form.pattern):
+        raise InputError(
+            f"{source}, section 'stream': must name ax, ay and az, in `columns` or as groups of `pattern`. Correct it."
         )
 
 

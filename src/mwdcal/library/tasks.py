@@ -361,13 +361,13 @@ class Savable(Protocol):
 
 
 def save(
-    result: Calibration | Readings | Savable,
+    result: Calibration | Readings | Verdict | Savable,
     path: Path,
     profile: Path | Profile | None = None,
     *,
     decimals: int | None = None,
 ) -> None:
-    """Write a calibration file (JSON), or the readings of a run as `read_run` reads them.
+    """Write a calibration file or a verdict (JSON), or the readings of a run as `read_run` reads them.
 
     A run is a CSV, TSV, Parquet or XLSX file, by the suffix. Its channels are raw: in the axes and
     units of the `profile`, by default the one that the run was read with, else g and nT along the
@@ -380,6 +380,11 @@ def save(
         return
     if isinstance(result, Calibration):
         documents.write(path, result)
+        return
+    if isinstance(result, Verdict):
+        from mwdcal.library.shown import VerdictFile
+
+        VerdictFile(result).save(path)
         return
     _check_readings(result, "result")
     table = runs.from_readings(result, _profile(result, profile))

@@ -168,6 +168,20 @@ class ColumnSource(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     unit: str = ""
 
 
+class StreamForm(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How a line of the tool's live stream is read, by `mwdcal bench`.
+
+    `columns` are `ax` … `mz`, `temperature_c` and `time_s` in their order, any other name is not read; `separator` is
+    blank for white space. Instead of both a regular expression `pattern` with groups of these names. `units` of the
+    temperature, such as "°F"; channels are raw.
+    """
+
+    columns: tuple[str, ...] = ()
+    separator: str = ","
+    pattern: str = ""
+    units: dict[str, str] = {}
+
+
 class MeasurementStandard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The standards to which the references of a calibration are traceable: a stand, a magnetometer, a gravity survey.
 
@@ -207,6 +221,7 @@ class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     standards: tuple[MeasurementStandard, ...] | msgspec.UnsetType = msgspec.UNSET
     table: TableFormat | msgspec.UnsetType = msgspec.UNSET
     columns: dict[str, ColumnSource] | msgspec.UnsetType = msgspec.UNSET
+    stream: StreamForm | msgspec.UnsetType = msgspec.UNSET
 
     @property
     def has_magnetometer(self) -> bool:

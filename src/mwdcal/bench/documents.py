@@ -1,0 +1,120 @@
+"""The documents of a session's folder: what the commands make of the same files, byte for byte but for the time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import mwdcal
+from mwdcal.calibration.prediction import typical_accuracy
+from mwdcal.errors import InputError, MwdcalError
+from mwdcal.files.settings import setting
+
+if TYPE_CHECKING:
+    from threading import RLock
+
+    from mwdcal.calibration.record import Calibration
+    from mwdcal.use.verification import Verdict
+
+FEWEST_STATIONS = 8
+"""Stations before which no fit is tried."""
+REMEASURE = "reshoot"
+"""The finding that names a station to measure again."""
+ENTERED = ("tool.json", "verification.json", "certificate.json")
+"""What is entered in the registry."""
+
+
+@dataclass(frozen=True)
+class RunFit:
+    """What the stations so far tell: a calibration, or the reason why there is none yet."""
+
+    stations: int
+    calibration: Calibration | None = None
+    reason: str = ""
+    accuracy_deg: dict[str, float | None] = field(default_factory=dict)
+
+    @property
+    def bad(self) -> dict[str, str]:
+        """The problem of each station to measure again, by label."""
+        findings = self.calibration.findings if self.calibration else []
+        return {f.station: f.text for f in findings if f.id == REMEASURE and f.station}
+
+
+def fit(folder: Path, stations: int, lock: RLock) -> RunFit:
+    """The calibration of the run in a folder, as `mwdcal calibrate` makes it of run.csv and tool.toml.
+
+    Nobody who holds the `lock` writes these files while they are read.
+    """
+    if stations < FEWEST_STATIONS:
+        return RunFit(stations)
+    try:
+        with lock:
+            readings = mwdcal.read_run(folder / "run.csv", folder / "tool.toml")
+        calibration = mwdcal.calibrate(readings)
+    except MwdcalError as error:
+        return RunFit(stations, reason=str(error))
+    return RunFit(stations, calibration, accuracy_deg=typical_accuracy(calibration))
+
+
+def saved_fit(folder: Path, stations: int) -> RunFit:
+    """The calibration that was saved."""
+    calibration = mwdcal.load(folder / "tool.json")
+    return RunFit(stations, calibration, accuracy_deg=typical_accuracy(calibration))
+
+
+def save_calibration(calibration: Calibration, folder: Path) -> dict[str, str]:
+    """Write the calibration; its file by what it is."""
+    mwdcal.save(calibration, folder / "tool.json")
+    return {"calibration": "tool.json"}
+
+
+def verify(calibration: Calibration, folder: Path) -> tuple[Verdict, dict[str, str]]:
+    """The verdict on the roll test, and its file by what it is."""
+    limits = setting("limits") or "roll-test"
+    verdict = mwdcal.verify(calibration, folder / "rolltest.csv", limits)
+    mwdcal.save(verdict, folder / "verification.json")
+    return verdict, {"verification": "verification.json"}
+
+
+def certify(
+    folder: Path, number: str, laboratory: Path | None, say: Callable[[str], None]
+) -> dict[str, str]:
+    """Issue the certificate in all forms that can be made here; files by what they are."""
+    chosen: dict[str, Any] = {"number": number} if number else {}
+    chosen |= {"laboratory": laboratory} if laboratory else {}
+    verification = folder / "verification.json"
+    paper = mwdcal.certificate(folder / "tool.json", verification=verification, **chosen)
+    mwdcal.save(paper, folder / "certificate.json")
+    files = {"certificate": "certificate.json"}
+    for kind in ("html", "pdf"):
+        try:
+            mwdcal.save(paper, folder / f"certificate.{kind}")
+            files[f"certificate_{kind}"] = f"certificate.{kind}"
+        except InputError as error:
+            say(str(error))
+    return files
+
+
+def enter(folder: Path, registry: str) -> str:
+    """Enter the documents in the registry; what was entered, in words."""
+    with mwdcal.registry(registry, create=True) as tools:
+        return tools.add(*(folder / name for name in ENTERED)).summary().splitlines()[0]
+
+
+def tools_in(registry: str | None) -> Sequence[Any]:
+    """The tools of a registry, those that are due first; none where there is no registry yet."""
+    if registry is None or ("://" not in registry and not Path(registry).exists()):
+        return ()
+    with mwdcal.registry(registry) as tools:
+        return sorted(tools.list().rows, key=lambda tool: tool.next_due or "9")
+
+
+def draw(result: Any, folder: Path, name: str) -> dict[str, str]:
+    """Write the page of a result, "report" or "rolltest", where what draws it is installed; its file by what it is."""
+    try:
+        result.report(folder / f"{name}.html")
+    except InputError:
+        return {}
+    return {f"{name}_html": f"{name}.html"}

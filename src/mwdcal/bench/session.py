@@ -1,0 +1,549 @@
+"""A calibration session: the order of the day, and what each accepted station tells.
+
+The events of the journal make the state: it is the same after a restart as before. All files of the folder are those
+that the commands make and take.
+"""
+
+from __future__ import annotations
+
+import contextvars
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from datetime import datetime
+from functools import partial
+from pathlib import Path
+from threading import RLock
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mwdcal.bench import documents
+from mwdcal.bench.attitude import is_near, live_values
+from mwdcal.bench.journal import Event, Journal
+from mwdcal.bench.positions import PLAN_COLUMNS, Positions, SessionPlan, TakenStation
+from mwdcal.bench.settling import Settling, Standstill
+from mwdcal.bench.stream import TEMPERATURE_COLUMN, Stream
+from mwdcal.bench.warmth import Warmth
+from mwdcal.errors import InputError, MwdcalError
+from mwdcal.files.contract import CHANNELS
+from mwdcal.files.formats import table as tables
+from mwdcal.sensor.profile import StreamForm
+
+if TYPE_CHECKING:
+    from mwdcal.sensor.profile import Profile
+    from mwdcal.use.verification import Verdict
+
+RUN_PART, ROLLTEST_PART = "run", "rolltest"
+NOISE_SHARE = 2e-5
+"""Noise of a sample, as a share of the strength of gravity or field, below which none is believed."""
+WARM_C = 3.0
+"""The tool's temperature is farther from that of the order: the oven is not there."""
+
+
+class BenchSession:
+    """One tool at one stand. Its methods may be called from several threads.
+
+    `plans` makes the plan of a name; `options` is what the bench was opened with, for the journal; `tools` are
+    those of the registry.
+    """
+
+    def __init__(
+        self, folder: Path, profile: Profile, plan: SessionPlan, rolltest: SessionPlan, *,
+        plans: Callable[[str], SessionPlan] | None = None, window: float = 5.0, registry: str | None = None,
+        laboratory: Path | None = None, earth: Mapping[str, float] | None = None,
+        options: Mapping[str, Any] | None = None, tools: Sequence[Any] = (),
+    ) -> None:  # fmt: skip
+        self.folder, self.profile, self.plan, self.plans = folder, profile, plan, plans
+        self.registry, self.laboratory, self.options = registry, laboratory, dict(options or {})
+        self.source = str(self.options.get("source", "manual"))
+        self.tools, self.earth, self.lock = tools, dict(earth or {}), RLock()
+        self.parts = {
+            RUN_PART: Positions(RUN_PART, plan.columns),
+            ROLLTEST_PART: Positions(ROLLTEST_PART, rolltest.columns),
+        }
+        self.stream = Stream(profile.stream if isinstance(profile.stream, StreamForm) else None)
+        self.window, self.warmth = window, Warmth()
+        self.settling: Settling | None = None
+        self.sample: tuple[float, ...] = ()
+        self.facts: dict[str, Any] = {}
+        self.auto = self.paused = self.calibrated = self.testing = False
+        self.typed_temperature: float | None = None
+        self.attempts, self.version, self.message = 0, 0, ""
+        self.fit = documents.RunFit(0)
+        self.verdict: Verdict | None = None
+        self.papers: dict[str, str] = {}
+        self.course: list[tuple[int, dict[str, float | None]]] = []
+        self._used: tuple[int, int] = (-1, -1)
+        self._requested = self._fitted = 0
+        self._unwritten = False
+        self._pool, self._context = ThreadPoolExecutor(1), contextvars.copy_context()
+        self.journal = Journal(folder)
+        for event in self.journal.events:
+            self._apply(event)
+        self.waiting = True
+        if self.facts:
+            self._write_tables()
+            self._refit()
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the readings are simulated."""
+        return self.source == "demo"
+
+    # ------------------------------------------------------------------ what has happened
+
+    def _record(self, kind: str, **facts: Any) -> None:
+        """Write an event, then let it happen."""
+        event: Event = {"event": kind, "at": datetime.now().astimezone().isoformat(), **facts}
+        self.journal.add(event)
+        self._apply(event)
+        self.version += 1
+
+    def _apply(self, event: Event) -> None:
+        """Let an event happen, now or again after a restart."""
+        kind = event["event"]
+        part = self.parts[event.get("part", RUN_PART)]
+        if kind == "started":
+            plan = SessionPlan(**event["plan"])
+            self.plan, self.facts = plan, dict(event["facts"])
+            self.earth |= event["earth"]
+            self.parts[RUN_PART] = Positions(RUN_PART, plan.columns)
+        elif kind == "station":
+            part.accept(TakenStation(event["position"], event["row"]))
+            self.attempts += 1
+        elif kind == "undone":
+            part.undo()
+        elif kind == "again":
+            part.measure_again(event["positions"])
+        elif kind == "skipped":
+            part.skip(event["position"])
+        elif kind == "cleared":
+            part.clear()
+        else:
+            self._switch(kind, event)
+
+    def _switch(self, kind: str, event: Event) -> None:
+        """Let an event happen that is not of a station."""
+        if kind in ("auto", "paused"):
+            setattr(self, kind, bool(event["on"]))
+        elif kind in ("calibrated", "testing"):
+            setattr(self, kind, True)
+        elif kind == "reopened":
+            self.calibrated = self.testing = False
+            self.verdict, self.papers = None, {}
+        elif kind == "temperature":
+            self.typed_temperature = event["value"]
+        elif kind == "papers":
+            self.papers |= event["files"]
+
+    @property
+    def part(self) -> Positions:
+        """The part that is being measured."""
+        return self.parts[ROLLTEST_PART if self.testing else RUN_PART]
+
+    @property
+    def order(self) -> int | None:
+        """The position to go to; None while there is none."""
+        if not self.facts or (self.calibrated and not self.testing):
+            return None
+        return self.part.order
+
+    # ------------------------------------------------------------------ the stream
+
+    def line(self, time: float, line: str) -> None:
+        """Take a line of the stream; never raises for what it holds."""
+        with self.lock:
+            sample = self.stream.take(line)
+            if sample is None:
+                return
+            now = time if sample.time is None else sample.time
+            self.sample = sample.values
+            if self.settling is None:
+                self.settling = self._new_settling()
+                self.version += 1
+            self.settling.take(now, sample.values)
+            if TEMPERATURE_COLUMN in self.stream.channels:
+                self.warmth.take(now, self.raw[TEMPERATURE_COLUMN])
+            if self._ready_by_itself():
+                try:
+                    self.accept()
+                except MwdcalError as error:
+                    self.say(str(error))
+
+    @property
+    def raw(self) -> dict[str, float]:
+        """The latest sample by channel."""
+        return dict(zip(self.stream.channels, self.sample, strict=False))
+
+    def _new_settling(self) -> Settling:
+        """The judge of standstills, for the sensors in the stream."""
+        raw, least = self.raw, []
+        for names in CHANNELS.values():
+            strength = float(np.linalg.norm([raw[name] for name in names if name in raw]))
+            least += [NOISE_SHARE * strength for name in names if name in raw]
+        return Settling(len(least), self.window, least)
+
+    def _ready_by_itself(self) -> bool:
+        return (
+            self.auto and not self.paused and not self.waiting and self.order is not None
+            and self.settling is not None and self.settling.state == "settled"
+            and self.settling.moves != self._used[0] and not self.away
+        )  # fmt: skip
+
+    @property
+    def away(self) -> str:
+        """Why the tool is not where it was ordered: "not_there", "not_warm"; empty if it is."""
+        order = self.order
+        if order is None or not self.sample:
+            return ""
+        ordered, known = self.part.temperature(order), self.temperature
+        is_cold = None not in (ordered, known) and abs((known or 0) - (ordered or 0)) > WARM_C
+        if is_cold or (ordered is not None and not self.warmth.is_steady):
+            return "not_warm"
+        place = self.part.attitude(order), self.earth.get("dip_deg")
+        return "" if is_near(self.raw, self.profile, *place) else "not_there"
+
+    @property
+    def temperature(self) -> float | None:
+        """The tool's temperature, °C: that of the stream, else what was typed."""
+        return self.raw.get(TEMPERATURE_COLUMN, self.typed_temperature)
+
+    def live(self) -> dict[str, float]:
+        """Angles in degrees and strengths of the latest sample by the nominal scales."""
+        return live_values(self.raw, self.profile) if self.sample else {}
+
+    # ------------------------------------------------------------------ decisions
+
+    def start(
+        self,
+        serial: str,
+        operator: str = "",
+        plan: str = "",
+        earth: Mapping[str, float | None] | None = None,
+    ) -> None:
+        """Begin: the tool's serial, who measures, the plan, and gravity, field and dip where they are known."""
+        is_other = plan not in ("", self.plan.name) and self.plans is not None
+        chosen = self.plans(plan) if is_other and self.plans else self.plan
+        with self.lock:
+            if self.facts:
+                raise InputError("the session has begun already.")
+            if not (serial := serial.strip()):
+                raise InputError(
+                    "the serial of the tool is missing. Every document names the tool by it: type it."
+                )
+            facts = {"serial": serial, "date": datetime.now().date().isoformat()}
+            facts |= {"operator": operator.strip()} if operator.strip() else {}
+            facts |= {"plan": chosen.name} if chosen.name else {}
+            stated: dict[str, Any] = {**facts, "simulated": True} if self.simulated else {**facts}
+            self._record(
+                "started", facts=stated, earth={k: v for k, v in (earth or {}).items() if v is not None},
+                plan={"name": chosen.name, "columns": chosen.columns, "accuracy_deg": chosen.accuracy_deg},
+                options=self.options,
+            )  # fmt: skip
+            self.waiting = False
+
+    def resume(self) -> None:
+        """Go on after a restart."""
+        with self.lock:
+            if not self.facts:
+                raise InputError("the session has not begun. Press Start.")
+            self.waiting, self.version = False, self.version + 1
+
+    def accept(self, position: int | None = None) -> None:
+        """Take the standstill as the station that is asked for; `position`: the one that the page has shown."""
+        with self.lock:
+            order = self._expected(position)
+            settling, attitude = self.settling, self.part.attitude(order)
+            if settling is None or settling.state != "settled":
+                raise InputError("the tool does not stand still yet. Wait until it has settled.")
+            moves, place = self._used
+            if settling.moves == moves and self.part.attitude(place) != attitude:
+                raise InputError(
+                    f"the tool has not moved since station {place + 1}. Move it to the next position."
+                )
+            row = _measured(settling.station(), self.stream.channels)
+            self._take(order, row)
+            self._used = settling.moves, order
+
+    def accept_typed(
+        self, rows: Sequence[Mapping[str, float]], position: int | None = None
+    ) -> None:
+        """Take readings by hand as the stations that are asked for, one after the other."""
+        with self.lock:
+            self._expected(position)
+            if len(rows) > (many := len(self.part.open_positions)):
+                raise InputError(
+                    f"{len(rows)} readings, but only {many} positions are left. Paste fewer."
+                )
+            for row in rows:
+                self._take(self._expected(None), {"samples": 1.0, **row})
+
+    def _expected(self, position: int | None) -> int:
+        """The position that is asked for, which must be the one that the page has shown."""
+        if self.waiting:
+            raise InputError("the session waits. Press Start or Resume first.")
+        if (order := self.order) is None:
+            raise InputError("no station is asked for: all are measured. Press Re-measure for one.")
+        if position is not None and position != order:
+            raise InputError(
+                f"the page has shown station {position + 1}; station {order + 1} is next. Try again."
+            )
+        return order
+
+    def _take(self, order: int, measured: Mapping[str, Any]) -> None:
+        """Take a station; its row holds what the plan and the stand state, and what was measured."""
+        part = self.part
+        row = {"station": str(order + 1), **measured}
+        if TEMPERATURE_COLUMN not in row and self.typed_temperature is not None:
+            row[TEMPERATURE_COLUMN] = self.typed_temperature
+        row |= {name: part.columns[name][order] for name in PLAN_COLUMNS[:3]}
+        row |= {f"ref_{name}": value for name, value in self.earth.items()}
+        self._record("station", part=part.name, position=order, row=row)
+        self.message = ""
+        self._write_tables()
+        self._refit()
+
+    def undo(self) -> None:
+        """Take the last station back."""
+        with self.lock:
+            self._check_open()
+            if not self.part.taken:
+                raise InputError("there is no station to take back.")
+            self._record("undone", part=self.part.name)
+            self._used = (-1, -1)
+            self._write_tables()
+            self._refit()
+
+    def measure_again(self, position: int | None = None) -> None:
+        """Ask for stations again: the one named, else all bad ones, else the last."""
+        with self.lock:
+            self._check_open()
+            part, done = self.part, self.part.done
+            bad = [int(label) - 1 for label in self.bad]
+            wanted = [position] if position is not None else bad or [*done][-1:]
+            wanted = [each for each in wanted if each in done and each not in part.again]
+            if not wanted:
+                raise InputError(
+                    "there is no station to measure again, or it is asked for already."
+                )
+            self._record("again", part=part.name, positions=wanted)
+
+    def skip(self) -> None:
+        """Leave a position out."""
+        with self.lock:
+            self._record("skipped", part=self.part.name, position=self._expected(None))
+
+    def switch(self, name: str, on: bool) -> None:
+        """Turn "auto", accept when settled, or "paused" on or off."""
+        with self.lock:
+            self._record(name, on=on)
+
+    def state_temperature(self, value: float) -> None:
+        """State the tool's temperature, where the stream has none."""
+        with self.lock:
+            self._record("temperature", value=value)
+
+    def _check_open(self) -> None:
+        """Refuse to change what is done."""
+        if self.calibrated and not self.testing:
+            raise InputError("the run is calibrated. Press Back to the run to change its stations.")
+        if "certificate" in self.papers:
+            raise InputError("the certificate is issued: this session is over. Begin another one.")
+
+    def reopen(self) -> None:
+        """Go back to the run after its calibration. The roll test stays, and is judged by the next calibration."""
+        with self.lock:
+            if "certificate" in self.papers:
+                self._check_open()
+            self._record("reopened")
+            self._refit()
+
+    def repeat_rolltest(self) -> None:
+        """Measure the roll test again from its beginning."""
+        with self.lock:
+            self._check_open()
+            if not self.testing:
+                raise InputError("there is no roll test to measure again.")
+            self._record("cleared", part=ROLLTEST_PART)
+            self.papers.pop("verification", None)
+            self.verdict, self._used = None, (-1, -1)
+            self._write_tables()
+
+    # ------------------------------------------------------------------ results
+
+    @property
+    def bad(self) -> dict[str, str]:
+        """The problem of each station of the run that does not fit, by label, but for those asked for again."""
+        if self.testing:
+            return {}
+        again = self.parts[RUN_PART].again
+        return {label: text for label, text in self.fit.bad.items() if int(label) - 1 not in again}
+
+    def _write_tables(self) -> None:
+        """Write the run files from the events. The stations are in the journal already: a full disk loses none."""
+        try:
+            for part in self.parts.values():
+                path = self.folder / f"{part.name}.csv"
+                if part.taken:
+                    tables.write(path, part.table(self.facts))
+                else:
+                    path.unlink(missing_ok=True)
+            self._unwritten = False
+        except (MwdcalError, OSError) as error:
+            self._unwritten = True
+            self.say(f"{error} The station is safe in session.jsonl.")
+
+    def _refit(self) -> None:
+        """Fit what there is, beside the stream."""
+        self._requested += 1
+        task = self._judge if self.testing else self._fit_run
+        self._submit(partial(self._if_latest, self._requested, task))
+
+    def _if_latest(self, number: int, task: Callable[[], None]) -> None:
+        """Leave a fit out if a later one is requested already."""
+        if number == self._requested:
+            try:
+                task()
+            finally:
+                self._fitted = number
+
+    @property
+    def is_fitting(self) -> bool:
+        """Whether a fit is still to come that knows the latest station."""
+        return self._fitted != self._requested
+
+    def _submit(self, task: Callable[[], None]) -> None:
+        self._pool.submit(self._context.copy().run, self._guarded, task)
+
+    def _guarded(self, task: Callable[[], None]) -> None:
+        """Do a task; what goes wrong is shown, and the session goes on."""
+        try:
+            if self._unwritten:
+                self._write_tables()
+            task()
+        except MwdcalError as error:
+            self.say(str(error))
+        except Exception as error:  # the session must go on
+            self.say(
+                f"internal error ({type(error).__name__}: {error}). Nothing accepted is lost; please report it."
+            )
+        with self.lock:
+            self.version += 1
+
+    def say(self, message: str) -> None:
+        """Show a message on the page."""
+        with self.lock:
+            if message != self.message:
+                self.message, self.version = message, self.version + 1
+
+    def wait_for_fits(self) -> None:
+        """Wait until all that was requested is done, and what that has requested."""
+        for _ in range(3):
+            self._pool.submit(lambda: None).result()
+
+    def _fit_run(self) -> None:
+        count = len(self.parts[RUN_PART].done)
+        fit = documents.fit(self.folder, count, self.lock)
+        with self.lock:
+            self.fit = fit
+            if fit.calibration is not None:
+                self.course = [point for point in self.course if point[0] != count]
+                self.course.append((count, fit.accuracy_deg))
+
+    def calibrate(self) -> None:
+        """Write the calibration of the run and its report."""
+        with self.lock:
+            if (count := len(self.parts[RUN_PART].done)) < documents.FEWEST_STATIONS:
+                raise InputError(
+                    f"a calibration needs {documents.FEWEST_STATIONS} stations at least, got {count}. Measure more."
+                )
+            if self.calibrated:
+                raise InputError("the run is calibrated already.")
+            self._submit(self._calibrate)
+
+    def _calibrate(self) -> None:
+        fit = documents.fit(self.folder, len(self.parts[RUN_PART].done), self.lock)
+        if fit.calibration is None:
+            raise InputError(fit.reason)
+        files = documents.save_calibration(fit.calibration, self.folder)
+        with self.lock:
+            self.fit = fit
+            if not self.calibrated:
+                self._record("papers", files=files)
+                self._record("calibrated")
+        self._submit(partial(self._draw, fit.calibration, "report"))
+
+    def _draw(self, result: object, name: str) -> None:
+        """Write the page of a result, which takes longer than the result."""
+        files = documents.draw(result, self.folder, name)
+        with self.lock:
+            if not files.items() <= self.papers.items():
+                self._record("papers", files=files)
+
+    def start_rolltest(self) -> None:
+        """Go on to the roll test. One measured before the run was changed is judged at once."""
+        with self.lock:
+            if not self.calibrated:
+                raise InputError("the roll test needs the calibration. Press Calibrate first.")
+            if not self.testing:
+                self._record("testing")
+                self._refit()
+
+    def _judge(self) -> None:
+        """The verdict of the roll test, once all its stations are there."""
+        if self.fit.calibration is None:
+            self.fit = documents.saved_fit(self.folder, len(self.parts[RUN_PART].done))
+        part, calibration = self.parts[ROLLTEST_PART], self.fit.calibration
+        if calibration is None or part.order is not None or not part.taken:
+            with self.lock:
+                self.verdict = None
+            return
+        verdict, files = documents.verify(calibration, self.folder)
+        with self.lock:
+            self.verdict = verdict
+            if not files.items() <= self.papers.items():
+                self._record("papers", files=files)
+        self._submit(partial(self._draw, verdict, "rolltest"))
+
+    def certify(self, number: str = "") -> None:
+        """Issue the certificate, and enter all in the registry, where one is named."""
+        with self.lock:
+            if self.verdict is None:
+                raise InputError("the certificate needs the roll test. Measure it first.")
+            if "certificate" in self.papers:
+                raise InputError("the certificate is issued already.")
+            self._submit(partial(self._certify, number))
+
+    def _certify(self, number: str) -> None:
+        if "certificate" in self.papers:
+            return
+        files = documents.certify(self.folder, number, self.laboratory, self.say)
+        with self.lock:
+            self._record("papers", files=files)
+        self._enter()
+
+    def enter(self) -> None:
+        """Enter all in the registry, where that failed before."""
+        with self.lock:
+            if self.registry is None or "certificate" not in self.papers:
+                raise InputError("there is nothing to enter, or no registry is named.")
+            self._submit(self._enter)
+
+    def _enter(self) -> None:
+        if self.registry is not None:
+            text = documents.enter(self.folder, self.registry)
+            with self.lock:
+                self._record("papers", files={"registry": text})
+
+    def close(self) -> None:
+        """End: what is written stays."""
+        self._pool.shutdown(wait=True)
+        self.journal.close()
+
+
+def _measured(still: Standstill, channels: Sequence[str]) -> dict[str, Any]:
+    """Cells of the run file of a standstill."""
+    row: dict[str, Any] = dict(zip(channels, still.means, strict=True))
+    pairs = zip(channels, still.sd, strict=True)
+    row |= {f"sd_{name}": sd for name, sd in pairs if name != TEMPERATURE_COLUMN}
+    return row | {"samples": float(still.samples), "start_s": still.start, "end_s": still.end}

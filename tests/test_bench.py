@@ -1,0 +1,833 @@
+"""The session of the bench: stations from a stream, what survives, and what is refused. No browser."""
+
+import errno
+import json
+import os
+import re
+import threading
+import time
+from pathlib import Path
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+
+from bench_support import (
+    EARTH,
+    HEADER,
+    BenchProcess,
+    Stand,
+    StandServer,
+    lines_of,
+    measure,
+)
+from cli_support import EXAMPLE, RAW, mwdcal, process
+from mwdcal import load_profile
+from mwdcal.bench import serving
+from mwdcal.bench.journal import Journal
+from mwdcal.bench.session import BenchSession
+from mwdcal.bench.settling import Settling
+from mwdcal.bench.sources import GrowingFile, Lines, SerialPort, Socket, source_of
+from mwdcal.bench.stream import Stream
+from mwdcal.bench.warmth import Warmth
+from mwdcal.errors import InputError
+from mwdcal.sensor.profile import StreamForm
+from simulation import DEG
+
+TOOL = EXAMPLE / "tool.toml"
+PLAN = "twenty-four-state"
+
+
+def session_in(folder, plan=PLAN, start=True, **options):
+    """A session with a tool on the servo's scales; one that was begun there before goes on."""
+    folder.mkdir(exist_ok=True)
+    (folder / "tool.toml").write_bytes(TOOL.read_bytes())
+    profile = load_profile(folder / "tool.toml")
+    planned = serving.session_plan(profile, plan)
+    session = BenchSession(folder, profile, planned, serving._rolltest(), window=2.0, **options)
+    if start and not session.facts:
+        session.start("T-1", "A. Example", earth=EARTH)
+    elif start:
+        session.resume()
+    return session
+
+
+@pytest.fixture
+def session(tmp_path):
+    opened = session_in(tmp_path / "S")
+    yield opened
+    opened.close()
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A session up to the roll test, two stations of which were knocked and measured again, and its stand."""
+    folder, stand = tmp_path_factory.mktemp("bench") / "S", Stand()
+    session = session_in(folder)
+    session.line(0.0, HEADER)
+    named = []
+    while session.order is not None:
+        knocked = session.order in (7, 15) and session.order not in session.part.done
+        measure(session, stand, (1.5, 1.5, 1.5) if knocked else (0, 0, 0), seconds=3)
+    session.wait_for_fits()
+    named = [*session.bad]
+    session.measure_again()
+    while session.order is not None:
+        measure(session, stand, seconds=3)
+    session.calibrate()
+    session.wait_for_fits()
+    yield session, stand, named
+    session.close()
+
+
+def without_time(path):
+    content = json.loads(Path(path).read_text("utf-8"))
+    return {name: value for name, value in content.items() if name not in ("time", "sha256")}
+
+
+# ------------------------------------------------------------------ the whole
+
+
+def test_the_two_knocked_stations_are_named_and_no_other(finished):
+    session, _, named = finished
+    assert named == ["8", "16"]
+    assert session.calibrated
+    assert session.bad == {}
+
+
+def test_the_calibration_is_as_accurate_as_it_says(finished):
+    """Angles of noise-free readings at other attitudes, by formulas of their own, against the true ones."""
+    session, stand, _ = finished
+    inc, azi, face = (
+        np.array(a) * DEG
+        for a in ([45.0] * 6, [10, 70, 130, 190, 250, 310], [5, 65, 125, 185, 245, 305])
+    )
+    columns = np.concatenate(stand.tool.clean(inc, azi, face), -1)
+    g, b = session.fit.calibration.fields(columns)
+    east = np.cross(g, b)
+    north = np.cross(east, g) / np.linalg.norm(g, axis=-1, keepdims=True)
+    axis_north, axis_east = north[:, 2], east[:, 2]
+    got = {
+        "inclination": np.arctan2(np.hypot(g[:, 0], g[:, 1]), g[:, 2]) - inc,
+        "toolface": np.arctan2(-g[:, 0], -g[:, 1]) - face,
+        "azimuth": np.arctan2(axis_east, axis_north) - azi,
+    }
+    for name, error in got.items():
+        error = np.degrees((error + np.pi) % (2 * np.pi) - np.pi)
+        stated = session.fit.accuracy_deg[name]
+        assert np.abs(error).max() < 4 * stated, (name, error, stated)
+        assert stated < 0.05
+
+
+def test_the_calibration_is_that_of_the_command(finished, tmp_path):
+    session, *_ = finished
+    run, again = session.folder / "run.csv", tmp_path / "again.json"
+    ran = mwdcal("calibrate", run, "--tool", session.folder / "tool.toml", "-o", again)
+    assert ran.code == 0, ran
+    assert without_time(session.folder / "tool.json") == without_time(again)
+
+
+@pytest.mark.slow
+def test_roll_test_certificate_and_registry(finished, tmp_path):
+    session, stand, _ = finished
+    session.registry = str(tmp_path / "tools.sqlite")
+    session.start_rolltest()
+    while session.order is not None:
+        measure(session, stand, seconds=3)
+    session.wait_for_fits()
+    assert session.verdict.passed
+    ran = mwdcal("verify", session.folder / "tool.json", session.folder / "rolltest.csv", "--json")
+    rows = {row["name"]: row["value"] for row in ran.json["rows"]}
+    assert {row.name: row.value for row in session.verdict.rows} == pytest.approx(rows)
+    session.certify("C-1")
+    session.wait_for_fits()
+    assert json.loads((session.folder / "certificate.json").read_text())["number"] == "C-1"
+    listed = mwdcal("registry", "list", "--registry", session.registry, "--json").json
+    assert [tool["serial"] for tool in listed["tools"]] == ["T-1"]
+    with pytest.raises(InputError, match="certificate is issued"):
+        session.reopen()
+
+
+# ------------------------------------------------------------------ decisions
+
+
+def accept_some(session, stand, count):
+    for _ in range(count):
+        measure(session, stand, seconds=3)
+
+
+def test_a_session_goes_on_after_a_restart(session):
+    stand = Stand()
+    session.line(0.0, HEADER)
+    accept_some(session, stand, 3)
+    session.skip()
+    session.switch("auto", True)
+    rows = lines_of(session.folder / "run.csv")
+    session.close()
+    again = session_in(
+        session.folder, plan="moosavi-12", start=False
+    )  # the plan is that of the session
+    assert again.waiting
+    assert again.plan.name == PLAN
+    assert (again.order, again.auto, again.facts["serial"]) == (4, True, "T-1")
+    assert lines_of(again.folder / "run.csv") == rows
+    with pytest.raises(InputError, match="Resume"):
+        again.accept()
+    again.resume()
+    again.line(0.0, HEADER)
+    again.switch("auto", False)
+    measure(again, stand, seconds=3)
+    assert len(again.part.done) == 4
+    again.close()
+
+
+def test_a_last_line_that_was_cut_off_is_taken_away(session):
+    session.line(0.0, HEADER)
+    accept_some(session, Stand(), 2)
+    session.close()
+    path = session.folder / "session.jsonl"
+    whole = path.read_bytes()
+    for cut in (1, 20, len(whole.splitlines()[-1])):
+        path.write_bytes(whole[:-cut])
+        again = session_in(session.folder)
+        assert len(again.part.done) == 1
+        again.close()
+        assert path.read_bytes().endswith(b"}\n")
+    path.write_bytes(whole.replace(b'"event"', b'"evnt"', 1))
+    with pytest.raises(InputError, match="line 1"):
+        Journal(session.folder)
+
+
+def test_a_standstill_is_one_station(session):
+    """A pedal that bounces, a second browser, and an old page cannot take it twice."""
+    session.line(0.0, HEADER)
+    stand = Stand()
+    attitude = session.part.attitude(0)
+    for line in stand.lines(attitude):
+        session.line(0.0, line)
+    with pytest.raises(InputError, match="shown station 6"):
+        session.accept(5)
+    session.accept(0)
+    with pytest.raises(InputError, match="shown station 1"):
+        session.accept(0)
+    with pytest.raises(InputError, match="has not moved"):
+        session.accept(1)
+    assert [*session.part.done] == [0]
+
+
+def test_undo_gives_a_former_station_back(session):
+    session.line(0.0, HEADER)
+    stand = Stand()
+    accept_some(session, stand, 2)
+    before = session.part.done[1].row
+    session.measure_again()
+    assert session.order == 1
+    measure(session, stand, seconds=3)
+    assert session.part.done[1].row != before
+    session.undo()
+    assert session.part.done[1].row == before
+    assert session.order == 1  # it is still asked for
+    session.undo()
+    session.undo()
+    assert session.part.done == {}
+    assert not (session.folder / "run.csv").exists()
+    with pytest.raises(InputError, match="no station to take back"):
+        session.undo()
+
+
+@pytest.mark.slow
+def test_a_bad_station_that_is_found_late_is_measured_again(finished, tmp_path):
+    """Back to the run after calibration and roll test; the roll test is judged again without being measured again."""
+    done, stand, _ = finished
+    folder = tmp_path / "S"
+    folder.mkdir()
+    kept = [e for e in done.journal.events if e.get("files", {}).get("certificate") is None]
+    kept = [e for e in kept if "registry" not in e.get("files", {})]
+    (folder / "session.jsonl").write_text("".join(json.dumps(event) + "\n" for event in kept))
+    for name in ("tool.json", "verification.json"):
+        (folder / name).write_bytes((done.folder / name).read_bytes())
+    session = session_in(folder)
+    session.line(0.0, HEADER)
+    session.start_rolltest()
+    while session.order is not None:
+        measure(session, stand, seconds=3)
+    session.wait_for_fits()
+    assert session.verdict is not None
+    before = json.loads((folder / "tool.json").read_text())["run_sha256"]
+    session.reopen()
+    session.measure_again(3)
+    measure(session, stand, seconds=3)
+    session.calibrate()
+    session.wait_for_fits()
+    assert json.loads((folder / "tool.json").read_text())["run_sha256"] != before
+    session.start_rolltest()
+    session.wait_for_fits()
+    assert session.verdict is not None
+    session.repeat_rolltest()
+    assert session.verdict is None
+    assert session.order == 0
+    session.close()
+
+
+def test_nothing_is_accepted_on_a_full_disk(session, monkeypatch):
+    session.line(0.0, HEADER)
+    stand = Stand()
+    accept_some(session, stand, 1)
+    size = (session.folder / "session.jsonl").stat().st_size
+    for line in stand.lines(session.part.attitude(1)):
+        session.line(0.0, line)
+
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(InputError, match="No space left.*nothing was accepted"):
+            session.accept()
+    assert (session.folder / "session.jsonl").stat().st_size == size
+    assert [*session.part.done] == [0]
+    session.accept()
+    assert [*session.part.done] == [0, 1]
+    assert len(lines_of(session.folder / "session.jsonl")) == 3
+
+
+def test_a_station_in_the_journal_is_safe_where_the_run_file_cannot_be_written(
+    session, monkeypatch
+):
+    session.line(0.0, HEADER)
+    stand = Stand()
+    accept_some(session, stand, 1)
+    with monkeypatch.context() as patch:
+        refuse = InputError("cannot write 'run.csv': No space left on device. Make room.")
+        patch.setattr("mwdcal.bench.session.tables.write", lambda *_: (_ for _ in ()).throw(refuse))
+        measure(session, stand, seconds=3)
+        session.wait_for_fits()
+        assert "safe in session.jsonl" in session.message
+    accept_some(session, stand, 1)
+    rows = [line for line in lines_of(session.folder / "run.csv") if line[:1].isdigit()]
+    assert len(rows) == 3
+
+
+def test_stations_come_by_themselves(session):
+    session.line(0.0, HEADER)
+    session.switch("auto", True)
+    stand = Stand()
+    for line in stand.lines((90.0, 0.0, 0.0)):  # not the position that is asked for
+        session.line(0.0, line)
+    assert session.away == "not_there"
+    for _ in range(3):
+        for line in stand.lines(session.part.attitude(session.order)):
+            session.line(0.0, line)
+    assert [*session.part.done] == [0, 1, 2]
+    session.switch("paused", True)
+    for line in stand.lines(session.part.attitude(3)):
+        session.line(0.0, line)
+    assert len(session.part.done) == 3
+
+
+def test_a_clock_that_starts_again_stops_nothing(session):
+    session.line(0.0, HEADER)
+    session.switch("auto", True)
+    stand = Stand()
+    stand.time = 1e6
+    for _ in range(2):
+        for line in stand.lines(session.part.attitude(session.order)):
+            session.line(0.0, line)
+        stand.time = 0.0
+    assert len(session.part.done) == 2
+
+
+def test_an_oven_has_to_be_warm(tmp_path):
+    session = session_in(tmp_path / "S", plan="laboratory-thermal")
+    session.line(0.0, HEADER)
+    session.switch("auto", True)
+    warm = session.part.temperature(0)
+    stand = Stand(temperature=warm + 10)
+    for line in stand.lines(session.part.attitude(0)):
+        session.line(0.0, line)
+    assert session.away == "not_warm"
+    stand.temperature = warm
+    for line in stand.lines(session.part.attitude(0), seconds=60):
+        session.line(0.0, line)
+    assert len(session.part.done) == 1
+    assert session.part.is_new_soak(
+        next(i for i in range(48) if session.part.temperature(i) != warm)
+    )
+    session.close()
+
+
+def test_a_temperature_that_the_stream_has_not_is_typed(tmp_path):
+    session = session_in(tmp_path / "S")
+    names = ",".join(HEADER.split(",")[:-1])
+    stand = Stand(stream=names)
+    session.line(0.0, names)
+    session.state_temperature(31.5)
+    accept_some(session, stand, 1)
+    assert session.part.done[0].row["temperature_c"] == 31.5
+    session.close()
+
+
+def test_simulated_and_real_readings_do_not_mix(tmp_path):
+    bench = serving.bench_of(tmp_path, {"source": "demo"}, "127.0.0.1", 1)
+    bench.session.start("D", "", "", {})
+    bench.session.close()
+    with pytest.raises(InputError, match="do not mix"):
+        serving.bench_of(tmp_path, {"source": "manual"}, "127.0.0.1", 1)
+    again = serving.bench_of(tmp_path, {}, "127.0.0.1", 1)
+    assert again.session.source == "demo"
+    again.session.close()
+
+
+# ------------------------------------------------------------------ standing still
+
+
+def fed(values, rate=10.0, window=3.0, least=None):
+    """The states of a channel, one a sample, and the judge at the end."""
+    judge = Settling(1, window, [least or 0.0])
+    states = []
+    for i, value in enumerate(values):
+        judge.take(i / rate, (float(value),))
+        states.append(judge.state)
+    return states, judge
+
+
+def test_a_tool_that_turns_or_creeps_is_never_settled():
+    rng = np.random.default_rng(1)
+    time = np.arange(1200) / 10
+    noise = rng.normal(0, 1e-4, len(time))
+    for course in (0.02 * time, np.sin(time / 3), np.sin(time / 60)):
+        assert "settled" not in fed(course + noise)[0]
+    states, _ = fed(noise)
+    assert states[50:].count("settled") > 0.9 * len(states[50:])
+
+
+def test_a_creeping_stand_is_waited_for():
+    """A displacement of 20 times the noise dies away with τ = 8 s: the mean is taken when about 2.4 is left.
+
+    A trend of three standard deviations over 50 samples is 3·√(12/50) = 1.5; the mean is 1.6 times that off.
+    """
+    time, left = np.arange(1500) / 10, []
+    away = np.where(
+        time < 40, 0.0, np.where(time < 44, (time - 40) * 250, 1000 + 20 * np.exp((44 - time) / 8))
+    )
+    for seed in range(20):
+        noise = np.random.default_rng(seed).normal(0, 1.0, len(time))
+        judge = Settling(1, 5.0, [0.0])
+        for t, value in zip(time, away + noise, strict=True):
+            judge.take(t, (value,))
+            if t > 46 and judge.state == "settled":
+                break
+        assert judge.state == "settled"
+        left.append(judge.station().means[0] - 1000)
+    assert np.max(np.abs(left)) < 4
+    assert np.mean(np.abs(left)) < 3
+
+
+@pytest.mark.parametrize("kind", ["white", "correlated", "quantised", "fine"])
+def test_the_stated_uncertainty_of_a_mean_holds(kind):
+    """Means of standstills against the truth: their errors over the stated uncertainty are not above one, rms."""
+    errors = []
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        truth = rng.uniform(-1, 1)
+        move = np.linspace(truth - 2, truth, 50)  # on the way the steps of a converter show
+        noise = rng.normal(0, 1e-3, 1200)
+        course = np.concatenate([move, np.full(1150, truth)])
+        if kind == "correlated":  # a low pass of 0.3 s
+            for i in range(1, len(noise)):
+                noise[i] = 0.7 * noise[i - 1] + 0.714 * noise[i]
+        step = {"quantised": 5e-3, "fine": 1e-6}.get(kind)
+        values = course + noise
+        values = np.round(values / step) * step if step else values
+        judge = Settling(1, 5.0, [0.0])
+        for i, value in enumerate(values):
+            judge.take(i / 10, (float(value),))
+            if i > 100 and judge.state == "settled":
+                break
+        still = judge.station()
+        errors.append((still.means[0] - truth) / still.sd[0])
+    assert 0.3 < np.sqrt(np.mean(np.square(errors))) < (2.0 if kind == "correlated" else 1.25)
+
+
+def test_a_gap_ends_a_standstill():
+    judge = Settling(1, 2.0, [1e-4])
+    rng = np.random.default_rng(1)
+    for i in range(60):
+        judge.take(i / 10, (float(rng.normal(0, 1e-3)),))
+    assert judge.state == "settled"
+    judge.take(20.0, (0.0,))
+    assert judge.state == "moving"
+    assert judge.moves == 1
+
+
+def test_minutes_to_equilibrium():
+    """Exponential warming with τ = 5 min: the rate falls to 0.2 °C/min when the closed form says so."""
+    warmth, tau = Warmth(), 300.0
+    for second in range(900):
+        warmth.take(float(second), 100 - 80 * np.exp(-second / tau))
+    rate = 80 / tau * 60 * np.exp(-900 / tau)
+    assert warmth.rate == pytest.approx(rate, rel=0.15)
+    assert warmth.minutes_left == pytest.approx(tau / 60 * np.log(rate / 0.2), abs=1.5)
+    assert not warmth.is_steady
+
+
+# ------------------------------------------------------------------ lines
+
+
+def test_forms_of_lines():
+    stated = Stream(
+        StreamForm(
+            columns=("time_s", "ax", "x", "ay", "az", "temperature_c"),
+            separator=";",
+            units={"temperature_c": "°F"},
+        )
+    )
+    sample = stated.take("5; 1;9;2;3; 50")
+    assert sample.time == 5
+    assert sample.values == pytest.approx((1, 2, 3, 10))
+    pattern = Stream(StreamForm(pattern=r"A (?P<ax>\S+) (?P<ay>\S+) (?P<az>\S+)"))
+    assert pattern.take("> A 1 2 -3.5 *").values == (1, 2, -3.5)
+    assert pattern.take("> B") is None
+    header = Stream()
+    assert header.take("AX,AY,AZ,status") is None
+    assert header.take("1,2,3,4").values == (1, 2, 3)
+    assert header.take("AX,AY,AZ,status") is None  # once more after a reconnect
+    assert header.garbage == 0
+    learned = Stream()
+    taken = [learned.take("1 2 3 4 5 6 20") for _ in range(7)]
+    assert learned.channels == (*RAW, "temperature_c")
+    assert taken[-1].values == (1, 2, 3, 4, 5, 6, 20)
+
+
+GARBAGE = (
+    "",
+    " ",
+    "x",
+    "1,2",
+    "nan," * 7 + "nan",
+    "1e400," * 7 + "1",
+    "1,,3,4,5,6,7,8",
+    "\x00\ufffd",
+    "9" * 5000,
+    "-,-",
+    "1e300,1e300,1e300,1e300,1e300,1e300,1e300,1e300",
+)
+
+
+def fuzzed_lines(rng, count):
+    good = Stand().line((45.0, 10.0, 20.0))
+    for _ in range(count):
+        if rng.random() < 0.3:
+            yield str(rng.choice(GARBAGE))
+        else:
+            letters = list(good)
+            for _ in range(rng.integers(0, 6)):
+                letters[rng.integers(len(letters))] = chr(int(rng.integers(1, 0x250)))
+            yield "".join(letters)
+
+
+def test_no_line_breaks_a_session(session):
+    session.switch("auto", True)
+    for number, line in enumerate(
+        fuzzed_lines(np.random.default_rng(1), int(os.environ.get("FUZZED", "400")))
+    ):
+        session.line(number / 10, line)
+        if number % 50 == 0:
+            session.line(number / 10, HEADER)
+    assert "internal error" not in session.message
+    assert session.stream.garbage > 50
+    session.switch("auto", False)
+    measure(session, Stand(), seconds=4)
+
+
+def collected(source, count, seconds=20.0):
+    """So many lines of a source, with its stop event."""
+    stop, lines = threading.Event(), []
+    for _, line in source.lines(stop):
+        lines.append(line)
+        if len(lines) >= count:
+            stop.set()
+    return lines
+
+
+def test_lines_are_cut_at_any_end():
+    lines = Lines()
+    pieces = (b"a,1\r", b"\nb,2\nc", b",3\rd,4", b"\n")
+    assert [line for piece in pieces for line in lines.take(piece)] == ["a,1", "b,2", "c,3", "d,4"]
+    assert Lines(midway=True).take(b"9,9\n1,2\n") == ["1,2"]
+    endless = Lines()
+    for _ in range(100):
+        endless.take(b"x" * 1000)
+    assert len(endless.rest) < 5000
+
+
+def test_a_growing_file_may_be_cut_or_replaced(tmp_path):
+    path = tmp_path / "stream.csv"
+    path.write_text("1\n2\n")
+
+    def write():
+        time.sleep(0.3)
+        with path.open("a") as stream:
+            stream.write("3\n")
+        time.sleep(0.5)
+        other = tmp_path / "other.csv"
+        other.write_text("4\n5\n")
+        other.replace(path)
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    source = GrowingFile(path)
+    assert collected(source, 5) == ["1", "2", "3", "4", "5"]
+    assert source.drops == 1
+    writer.join()
+
+
+def test_a_tcp_connection_is_made_again():
+    server = StandServer(speed=20)
+    source = Socket("127.0.0.1", server.port)
+    threading.Timer(0.5, server.drop).start()
+    lines = collected(source, 400)
+    assert source.drops == 1
+    assert lines.count(HEADER) == 2
+    server.close()
+
+
+@pytest.mark.slow
+def test_a_serial_port_with_garbage_and_silence(session):
+    """One line in ten has a damaged byte, and the line is silent for three seconds (`DROPOUT` of them) twice."""
+    pytest.importorskip("serial", reason="pyserial is not installed")
+    pty = pytest.importorskip("pty", reason="no pseudo-terminals here")
+    master, slave = pty.openpty()
+    source = SerialPort(os.ttyname(slave), 115_200)
+    rng, stand, stop = np.random.default_rng(2), Stand(), threading.Event()
+    session.line(0.0, HEADER)
+    session.switch("auto", True)
+
+    def send(line):
+        data = bytearray(line.encode() + b"\r\n")
+        for place in range(len(data)):
+            if rng.random() < 0.01 / len(line) * 10:
+                data[place] = rng.integers(1, 255)
+        os.write(master, bytes(data))
+
+    def read():
+        for now, line in source.lines(stop):
+            session.line(now, line)
+
+    reader = threading.Thread(target=read, daemon=True)
+    reader.start()
+    time.sleep(0.3)
+    for number in range(4):
+        silence = float(os.environ.get("DROPOUT", "3")) + 0.5 if number in (1, 3) else 0
+        for index, line in enumerate(stand.lines(session.part.attitude(session.order), seconds=9)):
+            if silence and index == 40:
+                time.sleep(silence)
+                stand.time += silence
+            send(line)
+            time.sleep(0.002)
+        limit = time.monotonic() + 5
+        while len(session.part.done) <= number and time.monotonic() < limit:
+            send(stand.line(stand.here))
+            time.sleep(0.005)
+    stop.set()
+    assert [*session.part.done] == [0, 1, 2, 3]
+    assert session.stream.garbage > 0
+    reader.join(5)
+    os.close(slave)
+    os.close(master)
+
+
+def test_sources_are_named():
+    for text in ("serial:/dev/ttyUSB0@9600", "tcp:[::1]:5000", "tail:x.csv", "manual"):
+        assert source_of(text) is not None
+    for text in ("", "tcp:host", "tcp:host:99999", "tail:", "usb:1"):
+        with pytest.raises(InputError, match="Correct it"):
+            source_of(text)
+
+
+# ------------------------------------------------------------------ the server
+
+client_of = pytest.importorskip("starlette.testclient", reason="starlette is not installed")
+HOST = "127.0.0.1:8000"
+
+
+@pytest.fixture
+def bench(tmp_path):
+    opened = serving.bench_of(tmp_path, {"source": "manual", "tool": str(TOOL)}, "127.0.0.1", 8000)
+    yield opened
+    opened.stop.set()
+
+
+@pytest.fixture
+def client(bench):
+    with client_of.TestClient(bench.app(), base_url=f"http://{HOST}") as client:
+        client.get(f"/?token={bench.token}")
+        yield client
+
+
+def post(client, bench, name, headers=None, **form):
+    return client.post(f"/do/{name}", data={"token": bench.token, **form}, headers=headers or {})
+
+
+def test_who_has_no_token_is_refused(bench):
+    with client_of.TestClient(bench.app(), base_url=f"http://{HOST}") as client:
+        for path in (
+            "/",
+            "/events",
+            "/static/bench.js",
+            "/files/run.csv",
+            "/?token=x",
+            "/?token=é",
+        ):
+            assert client.get(path).status_code == 403, path
+        assert post(client, bench, "start", serial="T").status_code == 403
+        client.get(f"/?token={bench.token}")
+        assert client.get("/").status_code == 200
+        assert client.post("/do/start", data={"serial": "T"}).status_code == 403
+    assert bench.session.facts == {}
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [{"host": "evil.example:8000"}, {"host": "127.0.0.1:9"}, {"host": ""}, {"origin": "http://evil.example"},
+     {"origin": "null"}, {"origin": "http://["}, {"sec-fetch-site": "cross-site"}, {"sec-fetch-site": "same-site"}],
+)  # fmt: skip
+def test_other_sites_are_refused(client, bench, headers):
+    assert post(client, bench, "start", headers, serial="T").status_code in (403, 421)
+    assert bench.session.facts == {}
+
+
+def test_a_get_changes_nothing(client, bench):
+    for name in ("start", "undo", "calibrate"):
+        assert client.get(f"/do/{name}?token={bench.token}&serial=T").status_code == 405
+    assert bench.session.journal.events == []
+
+
+def test_everywhere_means_any_address_and_no_name():
+    from mwdcal.bench.server import Bench
+
+    bench = Bench(Mock(), Mock(), ["0.0.0.0:80"], any_address=True)
+    assert bench.answers_to("192.168.1.7:80")
+    assert bench.answers_to("[fe80::1]:80")
+    assert not bench.answers_to("evil.example:80")
+    assert serving.address("0.0.0.0", 80, "t").startswith("http://")
+    assert "0.0.0.0" not in serving.address("0.0.0.0", 80, "t")
+
+
+def test_headers_keep_the_page_to_itself(client, bench):
+    answer = client.get("/")
+    policy = answer.headers["content-security-policy"]
+    assert "default-src 'none'" in policy
+    assert "unsafe" not in policy
+    assert "http" not in re.sub(r"http://www.w3.org/\S+", "", answer.text)
+
+
+def test_a_run_by_hand(client, bench):
+    """Typed and pasted readings, one of them with decimal commas, to a calibration."""
+    assert post(
+        client, bench, "start", serial="T-1", **{k: str(v) for k, v in EARTH.items()}
+    ).is_success
+    stand, session = Stand(), bench.session
+
+    def reading():
+        position = session.part.open_positions[len(rows)]
+        return stand.line(session.part.attitude(position)).split(",")[1:]
+
+    rows: list[str] = []
+    rows.append(" ".join(reading()))
+    rows.append("\t".join(reading()).replace(".", ","))
+    rows.append("; ".join(reading()))
+    assert post(client, bench, "typed", reading="1 2 x 4 5 6").status_code == 409
+    assert post(client, bench, "typed", reading="1 2").status_code == 409
+    assert post(client, bench, "typed", reading="\n".join(rows) + "\n1 2").status_code == 409
+    assert session.part.done == {}
+    assert post(client, bench, "typed", reading="\n".join(rows), position="0").is_success
+    assert len(session.part.done) == 3
+    assert session.part.done[1].row["az"] == pytest.approx(
+        float(rows[1].split()[2].replace(",", "."))
+    )
+    rows = []
+    while len(rows) < 21:
+        rows.append(", ".join(reading()))
+    assert post(client, bench, "typed", reading="\n".join(rows)).is_success
+    session.wait_for_fits()
+    assert session.fit.calibration is not None
+    page = client.get("/").text
+    assert "All stations are measured" in page
+    assert post(client, bench, "calibrate").is_success
+    session.wait_for_fits()
+    assert "Calibrated: T-1" in client.get("/").text
+    assert client.get("/files/tool.json").status_code == 200
+    for name in ("session.jsonl", "tool.toml", "../tool.json", "%2e%2e%2fx"):
+        assert client.get(f"/files/{name}").status_code == 404
+
+
+def test_no_request_is_an_internal_error(client, bench):
+    rng = np.random.default_rng(int(os.environ.get("SEED", "5")))
+    names = [*bench._forms, *bench._buttons, "", "nothing", "..", "é"]
+    values = [
+        "",
+        "0",
+        "1e9",
+        "-1",
+        "nan",
+        "x" * 90_000,
+        "\x00",
+        "é",
+        "1 2 3 4 5 6",
+        "1,2\n3",
+        "99999999999999999999",
+    ]
+    fields = [
+        "serial",
+        "operator",
+        "plan",
+        "position",
+        "on",
+        "reading",
+        "number",
+        "temperature",
+        *EARTH,
+    ]
+    for _ in range(int(os.environ.get("FUZZED", "400"))):
+        chosen = rng.choice(fields, rng.integers(0, 5))
+        form = {str(name): str(rng.choice(values)) for name in chosen}
+        path = f"/{rng.choice(['do', 'files', 'static', 'x'])}/{rng.choice(names)}"
+        kind = rng.integers(0, 6)
+        if kind == 0:
+            short = {name: value[:200] for name, value in form.items()}
+            answer = client.get(path.replace("\x00", ""), params=short)
+        elif kind == 1:
+            answer = client.request(str(rng.choice(["PUT", "DELETE", "PATCH", "OPTIONS"])), path)
+        elif kind == 2:
+            answer = client.post(path, content=rng.bytes(int(rng.integers(0, 200))))
+        else:
+            answer = client.post(path, data={"token": bench.token, **form})
+        assert answer.status_code < 500, (path, form, answer.text)
+        assert "internal error" not in answer.text
+    bench.session.wait_for_fits()
+    assert "internal error" not in bench.session.message
+
+
+@pytest.mark.slow
+def test_two_benches_on_one_folder_are_refused(tmp_path):
+    first = BenchProcess("--source", "manual", folder=tmp_path / "S")
+    try:
+        second = process("bench", "--no-browser", "--session", tmp_path / "S", timeout=60)
+        assert second.returncode == 2
+        assert "another bench" in second.stderr
+    finally:
+        first.stop()
+
+
+@pytest.mark.slow
+def test_kills_lose_no_station(tmp_path):
+    """The small twin of `python tests/bench_kills.py --count 200`."""
+    import bench_kills
+
+    assert bench_kills.run(count=4, seed=1, folder=tmp_path) == []
+
+
+def test_help_tells_the_address_first():
+    assert "first line printed is the address" in mwdcal("bench", "--help").out
+    assert mwdcal("bench", "--source", "usb:1", "--session", "x/y").code == 2

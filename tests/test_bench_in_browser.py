@@ -1,0 +1,240 @@
+"""The bench as an operator has it: in Chromium, from Start to the certificate, by mouse and by keyboard.
+
+Skips where Chromium or what drives it (the extra `dev`) is missing.
+"""
+
+import json
+import re
+import shutil
+import time
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+from bench_support import EARTH, BenchProcess, Stand
+from cli_support import EXAMPLE, mwdcal
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+axe = pytest.importorskip("axe_playwright_python", reason="axe-core is not installed")
+pytest.importorskip("starlette", reason="starlette is not installed")
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed: the bench was not looked at"),
+]  # fmt: skip
+AXE = files(axe).joinpath("axe.min.js").read_text("utf-8")
+RUN_AXE = "axe.run(document, {resultTypes: ['violations'], selectors: false, elementRef: false})"
+VIEWS = [(1280, "light"), (800, "dark"), (1280, "dark"), (800, "light")]
+LONGEST = 60_000
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with playwright.sync_playwright() as driver:
+        chromium = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield chromium
+        chromium.close()
+
+
+class Operator:
+    """A page of the bench, and what the browser complained of."""
+
+    def __init__(self, browser, url):
+        # axe is injected into the page, which the page's own policy would not let in
+        self.context = browser.new_context(viewport={"width": 1280, "height": 900}, bypass_csp=True)
+        self.page, self.complaints, self.host = self.context.new_page(), [], url.split("/?")[0]
+        self.page.on("console", lambda message: self.complaints.append(message.text))
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("request", self._request)
+        self.page.goto(url)
+
+    def _request(self, request):
+        if not request.url.startswith((self.host, "data:")):
+            self.complaints.append(request.url)
+
+    def button(self, name):
+        return self.page.get_by_role("button", name=name, exact=True)
+
+    def status(self):
+        return self.page.get_by_role("status").inner_text()
+
+    def wait_for_status(self, pattern):
+        self.page.get_by_role("status").filter(has_text=re.compile(pattern)).wait_for(
+            timeout=LONGEST
+        )
+
+    def heading(self, name):
+        try:
+            self.page.get_by_role("heading", name=re.compile(name)).wait_for(timeout=LONGEST)
+        except playwright.TimeoutError:
+            raise AssertionError(self.page.inner_text("body")) from None
+
+    def look(self):
+        """What axe-core calls serious, or worse, and what does not fit in, at each width and scheme."""
+        faults = []
+        for width, scheme in VIEWS:
+            self.page.set_viewport_size({"width": width, "height": 900})
+            self.page.emulate_media(color_scheme=scheme)
+            self.page.evaluate(AXE)
+            found = self.page.evaluate(RUN_AXE)["violations"]
+            faults += [
+                f"{width} {scheme} {rule['id']}: {rule['nodes'][0]['html'][:200]}"
+                for rule in found
+                if rule["impact"] in ("serious", "critical")
+            ]
+            if self.page.evaluate("document.documentElement.scrollWidth > innerWidth"):
+                faults.append(f"{width} {scheme}: wider than the screen")
+        self.page.set_viewport_size({"width": 1280, "height": 900})
+        return faults
+
+
+@pytest.fixture
+def demo(tmp_path, browser):
+    folder = tmp_path / "S"
+    laboratory = (
+        "--laboratory",
+        EXAMPLE / "laboratory.toml",
+        "--registry",
+        tmp_path / "tools.sqlite",
+    )
+    bench = BenchProcess("--demo", "--speed", "100", *laboratory, folder=folder)
+    operator = Operator(browser, bench.url)
+    yield bench, operator, folder
+    operator.context.close()
+    bench.stop()
+
+
+def without_time(path):
+    content = json.loads(Path(path).read_text("utf-8"))
+    return {name: value for name, value in content.items() if name not in ("time", "sha256")}
+
+
+def test_the_whole_story(demo, tmp_path):
+    """24 stations, two of them disturbed; both named and measured again; roll test, certificate, registry."""
+    _, operator, folder = demo
+    page, faults = operator.page, operator.look()
+    operator.button("Start").click()
+    operator.wait_for_status("Station 1")
+    faults += operator.look()
+    page.get_by_label("Accept when settled").check()
+    operator.wait_for_status("All stations are measured")
+    page.get_by_text(re.compile("^Stations 8, 16 do not fit")).wait_for(timeout=LONGEST)
+    faults += operator.look()
+    operator.button("Re-measure").click()
+    operator.wait_for_status("Next: Calibrate")
+    operator.button("Calibrate").click()
+    operator.heading("^Calibrated: DEMO-1")
+    faults += operator.look()
+    operator.button("Start roll test").click()
+    operator.heading("^PASS")
+    operator.button("Issue certificate").click()
+    page.get_by_text("Registry:").wait_for(timeout=LONGEST)
+    faults += operator.look()
+    assert faults == []
+    assert operator.complaints == []
+    assert page.get_by_role("link", name=re.compile("certificate.pdf")).count() == 1
+    ran = mwdcal(
+        "calibrate", folder / "run.csv", "--tool", folder / "tool.toml", "-o", tmp_path / "t.json"
+    )
+    assert ran.code == 0, ran
+    assert without_time(folder / "tool.json") == without_time(tmp_path / "t.json")
+    listed = mwdcal("registry", "list", "--registry", tmp_path / "tools.sqlite", "--json").json
+    assert [tool["serial"] for tool in listed["tools"]] == ["DEMO-1"]
+
+
+def test_the_story_by_keyboard_alone(demo):
+    _, operator, _ = demo
+    page = operator.page
+    page.keyboard.press("Tab")  # into the page: the first field is the serial
+    for _ in range(20):
+        if page.evaluate("document.activeElement.id") == "b-start":
+            break
+        page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    operator.wait_for_status("Station 1")
+    for number in range(1, 25):
+        operator.wait_for_status(rf"^Station {number}\.")
+        page.locator("[data-live=state_text]").filter(has_text=re.compile("^settled$")).wait_for()
+        page.keyboard.press(" ")
+    operator.wait_for_status("All stations are measured")
+    page.get_by_text(re.compile("^Stations 8, 16 do not fit")).wait_for(timeout=LONGEST)
+    page.keyboard.press("r")
+    for number in (8, 16):
+        operator.wait_for_status(rf"^Station {number}\.")
+        page.locator("[data-live=state_text]").filter(has_text=re.compile("^settled$")).wait_for()
+        page.keyboard.press(" ")
+    operator.wait_for_status("Next: Calibrate")
+    page.keyboard.press("c")
+    operator.heading("^Calibrated")
+    page.keyboard.press("t")
+    for number in range(1, 13):
+        operator.wait_for_status(rf"Station {number}\.")
+        page.locator("[data-live=state_text]").filter(has_text=re.compile("^settled$")).wait_for()
+        page.keyboard.press(" ")
+    operator.heading("^PASS")
+    for _ in range(40):
+        if page.evaluate("document.activeElement.id") == "b-certificate":
+            break
+        page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    page.get_by_text("Registry:").wait_for(timeout=LONGEST)
+    assert operator.complaints == []
+
+
+def test_two_browsers_and_a_restart(tmp_path, browser):
+    """The office sees what the tablet accepts; after a kill the session goes on where it was."""
+    bench = BenchProcess("--demo", "--speed", "100", folder=tmp_path / "S")
+    tablet, office = Operator(browser, bench.url), Operator(browser, bench.url)
+    tablet.button("Start").click()
+    tablet.page.get_by_label("Accept when settled").check()
+    office.wait_for_status(r"^Station 1\d\.")
+    shown = int(re.search(r"Stations: (\d+)", office.page.inner_text("#main"))[1])
+    bench.kill()
+    tablet.page.get_by_text("The bench does not answer").wait_for(timeout=LONGEST)
+    again = BenchProcess("--speed", "100", folder=tmp_path / "S")
+    late = Operator(browser, again.url)
+    assert int(re.search(r"Stations: (\d+)", late.page.inner_text("#main"))[1]) >= shown
+    late.button("Resume").click()
+    late.wait_for_status("All stations are measured")
+    for each in (tablet, office, late):
+        each.context.close()
+    again.stop()
+
+
+def test_readings_by_hand(tmp_path, browser):
+    """Rows pasted from the vendor's program; the page shows a station at once."""
+    given = ("--source", "manual", "--tool", EXAMPLE / "tool.toml", "--plan", "moosavi-12")
+    bench = BenchProcess(*given, folder=tmp_path / "S")
+    operator, stand = Operator(browser, bench.url), Stand()
+    page = operator.page
+    page.get_by_label("Serial of the tool").fill("T-1")
+    for label, name in (
+        ("Field at", "field_nt"),
+        ("Dip at", "dip_deg"),
+        ("Gravity at", "gravity_g"),
+    ):
+        page.get_by_label(re.compile(label)).fill(str(EARTH[name]))
+    operator.button("Start").click()
+    operator.wait_for_status("Station 1")
+    plan = json.loads((tmp_path / "S/session.jsonl").read_text().splitlines()[0])["plan"]["columns"]
+    names = ("ref_inclination_deg", "ref_azimuth_deg", "ref_toolface_deg")
+    rows = [
+        stand.line([plan[name][i] or 0.0 for name in names]).split(",", 1)[1] for i in range(48)
+    ]
+    page.get_by_label(re.compile("^Reading")).fill("\n".join(rows[:46]))
+    operator.button("Take reading").click()
+    operator.wait_for_status("Station 47")
+    assert operator.look() == []
+    page.get_by_text("Accuracy so far").wait_for(timeout=LONGEST)
+    page.get_by_label(re.compile("^Reading")).fill(rows[46])
+    begun = time.monotonic()
+    page.keyboard.press("Enter")
+    operator.wait_for_status("Station 48")
+    assert time.monotonic() - begun < 1.0  # 0.3 s on a quiet machine
+    page.get_by_label(re.compile("^Reading")).fill(rows[47])
+    operator.button("Take reading").click()
+    operator.wait_for_status("Next: Calibrate")
+    operator.context.close()
+    bench.stop()
