@@ -433,7 +433,7 @@ def tail(square: Array, freedom: Array) -> Array:
     chance = np.ones(square.shape)
     for degrees in np.unique(freedom[freedom > 0]):
         some = freedom == degrees
-        half = np.minimum(square[some] / 2, 700)
+        half = np.clip(square[some] / 2, 0, 700)
         power = 0.5 if degrees % 2 else 1.0
         small = np.exp(-half)
         total = np.vectorize(erfc)(np.sqrt(half)) if degrees % 2 else small

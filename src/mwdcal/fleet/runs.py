@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from mwdcal.calibration.diagnosis.flags import Alone
-from mwdcal.calibration.readings import Readings, group_numbers
+from mwdcal.calibration.readings import TRIADS, Readings, group_numbers
 from mwdcal.errors import InputError, MwdcalError
 from mwdcal.estimation.batch import held_once
 from mwdcal.files.contract import COLUMNS, RANGES
@@ -220,7 +220,7 @@ def _kinds(rows: Rows) -> Ints:
 
 
 def _readings(rows: Rows, tools: Ints) -> Readings:
-    """Readings (B, n, ...) of tools of one kind."""
+    """Readings (B, n, ...) of tools of one kind; what they have in common is held once, but for what the tools read."""
     where = rows.starts[tools][:, None] + np.arange(rows.counts[tools[0]])
 
     @cache
@@ -231,4 +231,5 @@ def _readings(rows: Rows, tools: Ints) -> Readings:
     readings, _ = convert(cells, where.shape, rows.profile, rows.offsets[0][tools][:, None])
     group = rows.groups[where]
     readings = replace(readings, group=group if (group >= 0).any() else None, source=rows.source)
-    return held_once(readings)
+    read = {name: getattr(readings, name) for name in TRIADS}
+    return replace(held_once(readings), **read)

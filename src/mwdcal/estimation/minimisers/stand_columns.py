@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from math import prod
 
 import numpy as np
 
@@ -23,6 +24,12 @@ FIELD_WALK = 2
 """Number of the walk of the field; the others are of the offsets of a triad."""
 OF_PARAMETERS = 24
 """Number of the elements of Φ of both triads."""
+
+
+def summed(*factors: Array) -> Array:
+    """The product of arrays (..., B, n) summed for each tool (B,), in one order whatever the number of tools."""
+    each = np.sum(prod(factors), -1)
+    return np.asarray(sum(each.reshape(-1, each.shape[-1])))
 
 
 def by_tool(components: Array) -> Array:

@@ -16,6 +16,7 @@ from mwdcal.estimation.minimisers.stand_columns import (
     StandColumns,
     by_component,
     by_tool,
+    summed,
 )
 from mwdcal.estimation.problem import WALK_AXES, Problem
 from mwdcal.geometry.vectors import Array, inverse, quotient
@@ -284,11 +285,11 @@ class StandLinear:
         left, each, whole = self.weighed(self.after(step)), [], 3 * include.sum(-1)
         for rows, squared in zip(TRIAD_ROWS, self.squared, strict=True):
             block = self.weight[rows, rows]
-            share = whole - np.einsum("iibn,bn->b", block, include)
+            share = whole - summed(np.einsum("iibn->ibn", block), include)
             taken = np.sum(self.covariance * squared, (1, 2))
-            squares = np.einsum("ijbn,ijbn,bn->b", block, block, include)
+            squares = summed(block, block, include)
             freedom = whole - share - taken
-            misfit = np.einsum("ibn,ibn->b", left[rows], left[rows])
+            misfit = summed(left[rows], left[rows])
             factor = misfit / np.where(freedom >= 1, freedom, np.nan)
             power = np.clip((whole - share) / np.maximum(squares, 1e-9), 1.0, MOST_AT_ONCE)
             each.append((np.log(factor) / 2, power))

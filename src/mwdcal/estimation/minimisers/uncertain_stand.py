@@ -23,7 +23,12 @@ from mwdcal.estimation.batch import take
 from mwdcal.estimation.evidence import WALKS
 from mwdcal.estimation.minimisers import closed_form
 from mwdcal.estimation.minimisers.closed_form import AffineMinimum
-from mwdcal.estimation.minimisers.stand_columns import OF_PARAMETERS, TRIAD_ROWS, StandColumns
+from mwdcal.estimation.minimisers.stand_columns import (
+    OF_PARAMETERS,
+    TRIAD_ROWS,
+    StandColumns,
+    summed,
+)
 from mwdcal.estimation.minimisers.stand_linear import MOST_AT_ONCE, StandLinear, StandRuns
 from mwdcal.estimation.problem import WALK_AXES, Problem, State
 from mwdcal.estimation.solvers import Determined
@@ -201,7 +206,7 @@ def analysed(problem: Problem, state: State, determined: Determined) -> Analysis
     whole[:, :, :p] = whole[:, :, :p] @ moved.mT
     spread, residual = at.spread * include, at.weighed(at.left)
     pairs = [(at.weight[rows, rows], spread[rows, rows]) for rows in TRIAD_ROWS]
-    lone = [np.einsum("ijbn,ijbn->b", w, 2 * left - w * include) for w, left in pairs]
+    lone = [summed(w, 2 * left - w * include) for w, left in pairs]
     spread, residual = (
         np.ascontiguousarray(np.moveaxis(each, (-2, -1), (0, 1))) for each in (spread, residual)
     )
