@@ -82,7 +82,7 @@ SAMPLES = {
 """The kind of file that each argument or option takes, by its name."""
 DOCUMENTS = ("calibration", "verification", "signed")
 """Kinds of files that are JSON."""
-OUTPUTS = ("output", "report", "plot", "folder", "calibrations", "truth", "html", "msa_html")
+OUTPUTS = ("output", "report", "plot", "folder", "calibrations", "truth", "html", "msa_html", "contributions")
 """Arguments and options that name what to write."""
 LIMITS = 'name = "lab"\n[spread]\ninclination_deg = 0.2\nazimuth_deg = 1.5\n'
 SURVEY_LIMITS = (
@@ -775,7 +775,8 @@ OTHERWISE = 0.08
 REFUSED = {2, 3}
 NETWORK = ("scheduler",)
 """Options that are left out: what they name is not a file."""
-COMMANDS = cli_support.commands()
+COMMANDS = {name: c for name, c in cli_support.commands().items() if name != "bench"}
+"""All but the server, whose requests and lines `test_bench` makes up."""
 WITH_FILES = [n for n, c in COMMANDS.items() if any(p.name in SAMPLES for p in c.params)]
 """Commands that read a file."""
 RARE = {"compare": 0.05, "noise": 0.15, "profile": 4.0}

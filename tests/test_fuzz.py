@@ -6,7 +6,6 @@ import click
 import pytest
 
 import fuzz
-from cli_support import commands
 
 
 @pytest.mark.slow
@@ -17,9 +16,9 @@ def test_no_promise_is_broken(tmp_path, monkeypatch):
     assert not findings
 
 
-@pytest.mark.parametrize("name", sorted(commands()))
+@pytest.mark.parametrize("name", sorted(fuzz.COMMANDS))
 def test_the_fuzzer_has_files_for_every_argument(name):
     """Of this command: a new one says in `fuzz.SAMPLES` what its arguments take."""
-    for p in commands()[name].params:
+    for p in fuzz.COMMANDS[name].params:
         takes_file = isinstance(p.type, click.Path) or "FILE" in str(getattr(p, "metavar", ""))
         assert not takes_file or p.name in {*fuzz.SAMPLES, *fuzz.OUTPUTS}
