@@ -46,7 +46,7 @@ def with_cell(column, text):
 
 
 def test_the_run_that_the_ugly_ones_are_made_of_is_fine(tmp_path):
-    readings, _ = read_run(put(tmp_path, with_cell("ax", "0.1")), GENERIC)
+    readings, _ = read_run(put(tmp_path, with_cell("ax", "0.11")), GENERIC)
     assert readings.count == 2
 
 
