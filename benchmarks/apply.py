@@ -24,7 +24,7 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.files import documents, profiles
 from mwdcal.geometry.vectors import Array
-from mwdcal.planning.simulate import grid, run, servo
+from mwdcal.planning.plans import grid, run, servo
 from mwdcal.use import correction_numba
 from mwdcal.use.correction import compiled, numbers, reference
 

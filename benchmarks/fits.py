@@ -28,7 +28,7 @@ from scipy.optimize import OptimizeResult, least_squares
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import TRIADS, Readings
-from mwdcal.estimation.evidence import ANGLES
+from mwdcal.estimation.problem import ANGLES
 from mwdcal.sensor.models import OFF_DIAGONAL, Basis
 from simulation import (
     DEG,

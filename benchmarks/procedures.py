@@ -23,9 +23,8 @@ from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.files.profiles import load_profile
 from mwdcal.geometry.vectors import reference_vectors
-from mwdcal.planning.plans import load_plan
+from mwdcal.planning.plans import drawn, load_plan
 from mwdcal.planning.session import Session
-from mwdcal.planning.simulate import drawn
 from mwdcal.sensor.profile import StandProfile
 
 TOOLS, AT_ONCE, ALONE = 10_000, 500, 100

@@ -27,12 +27,10 @@ from mwdcal.calibration.options import Options
 from mwdcal.calibration.record import Calibration, with_checksum
 from mwdcal.files.formats.members import RECORD
 from mwdcal.files.profiles import load_profile
-from mwdcal.planning.plans import load_plan
+from mwdcal.planning.plans import drawn, load_plan
 from mwdcal.planning.session import Session
-from mwdcal.planning.simulate import drawn
-from mwdcal.registry import checking, imports, lookup, queries
-from mwdcal.registry.setup import create
-from mwdcal.registry.store import Registry, open_registry
+from mwdcal.registry import checking, imports, lookup
+from mwdcal.registry.store import Registry, create, open_registry
 
 CALIBRATIONS, YEARS, SAMPLE, GROUP = 100_000, 5, 40, 1000
 """Calibrations in all, those of each tool, tools that are fitted, and rows of a row group."""
@@ -93,22 +91,22 @@ def pages(registry: Registry, count: int) -> dict[str, Callable[[int], object]]:
         return f"B-{(7919 * k) % tools:06}"
 
     return {
-        "tools, first page": lambda k: queries.tools_page(registry),
-        "tools, last page": lambda k: queries.tools_page(registry, offset=tools - 50),
-        "tools by day of calibration": lambda k: queries.tools_page(
+        "tools, first page": lambda k: lookup.tools_page(registry),
+        "tools, last page": lambda k: lookup.tools_page(registry, offset=tools - 50),
+        "tools by day of calibration": lambda k: lookup.tools_page(
             registry, order="calibrated", descending=True
         ),
-        "tools with a text in serial or type": lambda k: queries.tools_page(
+        "tools with a text in serial or type": lambda k: lookup.tools_page(
             registry, search=serial(k)[3:]
         ),
-        "tools due": lambda k: queries.tools_page(registry, due_before="2030-01-01"),
-        "past of a tool": lambda k: queries.past(registry, serial(k)),
-        "latest calibration of a tool": lambda k: queries.latest_calibration(registry, serial(k)),
-        "all calibrations of a tool": lambda k: [*queries.calibrations(registry, serial(k))],
-        "calibrations, newest first": lambda k: queries.records_page(registry, "calibration"),
-        "history, newest events": lambda k: queries.events(registry),
+        "tools due": lambda k: lookup.tools_page(registry, due_before="2030-01-01"),
+        "past of a tool": lambda k: lookup.past(registry, serial(k)),
+        "latest calibration of a tool": lambda k: lookup.latest_calibration(registry, serial(k)),
+        "all calibrations of a tool": lambda k: [*lookup.calibrations(registry, serial(k))],
+        "calibrations, newest first": lambda k: lookup.records_page(registry, "calibration"),
+        "history, newest events": lambda k: lookup.events(registry),
         "what is due": lambda k: lookup.listed(registry, None, "", "2030-01-01", 0, 50),
-        "counts of everything": lambda k: queries.counts(registry),
+        "counts of everything": lambda k: lookup.counts(registry),
     }
 
 

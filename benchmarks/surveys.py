@@ -17,13 +17,12 @@ import numpy as np
 from measuring import Row, peak, seconds
 
 from mwdcal.calibration.calibrate import calibrate
-from mwdcal.calibration.prediction import readings_at
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration
+from mwdcal.calibration.results import readings_at
 from mwdcal.files.profiles import load_profile
-from mwdcal.planning.plans import load_plan
+from mwdcal.planning.plans import drawn, load_plan
 from mwdcal.planning.session import Session
-from mwdcal.planning.simulate import drawn
 from mwdcal.survey.path import calibrated_path, position_covariance
 from mwdcal.survey.tool_model import sensor_terms, term_shifts, tool_model
 

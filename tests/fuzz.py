@@ -82,7 +82,17 @@ SAMPLES = {
 """The kind of file that each argument or option takes, by its name."""
 DOCUMENTS = ("calibration", "verification", "signed")
 """Kinds of files that are JSON."""
-OUTPUTS = ("output", "report", "plot", "folder", "calibrations", "truth", "html", "msa_html", "contributions")
+OUTPUTS = (
+    "output",
+    "report",
+    "plot",
+    "folder",
+    "calibrations",
+    "truth",
+    "html",
+    "msa_html",
+    "contributions",
+)
 """Arguments and options that name what to write."""
 LIMITS = 'name = "lab"\n[spread]\ninclination_deg = 0.2\nazimuth_deg = 1.5\n'
 SURVEY_LIMITS = (

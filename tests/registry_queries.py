@@ -17,9 +17,8 @@ from pathlib import Path
 
 import sqlalchemy as sa
 
-from mwdcal.registry import checking, copies, lookup, queries
-from mwdcal.registry.setup import create
-from mwdcal.registry.store import Entry, Registry, open_registry
+from mwdcal.registry import checking, exports, lookup
+from mwdcal.registry.store import Entry, Registry, create, open_registry
 from registry_support import calibration, empty_database, postgresql_server
 
 PER_TOOL = 5
@@ -54,35 +53,35 @@ def files(count: int) -> Iterator[Entry]:
 
 def pages(registry: Registry, tools: int) -> dict[str, Callable[[], object]]:
     """The queries of every page, the dearest of each."""
-    serial = queries.tools_page(registry, offset=tools // 2, limit=1).rows[0]["serial"]
+    serial = lookup.tools_page(registry, offset=tools // 2, limit=1).rows[0]["serial"]
     return {
-        "tools, first page": lambda: queries.tools_page(registry),
-        "tools, last page": lambda: queries.tools_page(registry, offset=tools - 50),
-        "tools, search": lambda: queries.tools_page(registry, search="99"),
-        "tools, of a type": lambda: queries.tools_page(registry, where={"type": "type 3"}),
+        "tools, first page": lambda: lookup.tools_page(registry),
+        "tools, last page": lambda: lookup.tools_page(registry, offset=tools - 50),
+        "tools, search": lambda: lookup.tools_page(registry, search="99"),
+        "tools, of a type": lambda: lookup.tools_page(registry, where={"type": "type 3"}),
         **{
-            f"tools, by {name}": lambda name=name: queries.tools_page(
+            f"tools, by {name}": lambda name=name: lookup.tools_page(
                 registry, order=name, descending=True, offset=tools // 2
             )
-            for name in queries.TOOL_ORDERS
+            for name in lookup.TOOL_ORDERS
         },
-        "tools, overdue": lambda: queries.tools_page(
+        "tools, overdue": lambda: lookup.tools_page(
             registry, due_before="2026-06-30", order="next_due"
         ),
-        "past of a tool": lambda: queries.past(registry, serial),
-        "calibrations of a tool": lambda: list(queries.calibrations(registry, serial)),
-        "latest calibration": lambda: queries.latest_calibration(registry, serial),
-        "calibrations, newest": lambda: queries.records_page(registry, "calibration"),
-        "calibrations, half way": lambda: queries.records_page(
+        "past of a tool": lambda: lookup.past(registry, serial),
+        "calibrations of a tool": lambda: list(lookup.calibrations(registry, serial)),
+        "latest calibration": lambda: lookup.latest_calibration(registry, serial),
+        "calibrations, newest": lambda: lookup.records_page(registry, "calibration"),
+        "calibrations, half way": lambda: lookup.records_page(
             registry, "calibration", offset=tools * PER_TOOL // 2
         ),
-        "calibrations, oldest": lambda: queries.records_page(
+        "calibrations, oldest": lambda: lookup.records_page(
             registry, "calibration", newest_first=False
         ),
         "due": lambda: lookup.listed(registry, None, "", "2026-12-31", 0, 50),
-        "history": lambda: queries.events(registry),
-        "history, half way": lambda: queries.events(registry, offset=tools * PER_TOOL // 2),
-        "counts": lambda: queries.counts(registry),
+        "history": lambda: lookup.events(registry),
+        "history, half way": lambda: lookup.events(registry, offset=tools * PER_TOOL // 2),
+        "counts": lambda: lookup.counts(registry),
     }
 
 
@@ -117,7 +116,7 @@ def timed(database: Path | str, folder: Path, count: int, brief: bool) -> bool:
             if brief
             else (
                 ("check", lambda: checking.check(registry)),
-                ("backup", lambda: copies.backup(registry, folder / "backup.registry")),
+                ("backup", lambda: exports.backup(registry, folder / "backup.registry")),
             )
         ):
             begun = time.perf_counter()

@@ -25,10 +25,9 @@ from pathlib import Path
 import sqlalchemy as sa
 
 from mwdcal.errors import InputError
-from mwdcal.registry import checking, queries
+from mwdcal.registry import checking, lookup
 from mwdcal.registry.database.models import records
-from mwdcal.registry.setup import create
-from mwdcal.registry.store import Entry, open_registry
+from mwdcal.registry.store import Entry, create, open_registry
 from registry_support import calibration, empty_database, postgresql_server
 
 SERIALS = 40
@@ -150,7 +149,7 @@ def losses(database: str, calls: list[list[str]]) -> dict[str, object]:
         return {
             "lost": [sha for call in calls for sha in call if sha not in kept],
             "discrepancies": checking.check(registry),
-            "records": queries.counts(registry).get("calibration", 0),
+            "records": lookup.counts(registry).get("calibration", 0),
         }
 
 

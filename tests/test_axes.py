@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from mwdcal.calibration.calibrate import calibrate
-from mwdcal.calibration.diagnosis.axes import explaining, named
 from mwdcal.calibration.diagnosis.flags import FittedRuns
 from mwdcal.calibration.diagnosis.plausibility import excessive_errors, straying
-from mwdcal.calibration.diagnosis.refusals import fit_refusals
+from mwdcal.calibration.diagnosis.refusals import explaining, fit_refusals, named
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import TRIADS, Readings

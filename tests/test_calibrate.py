@@ -6,17 +6,17 @@ import pytest
 from scipy.special import stdtrit
 from scipy.stats import chi2
 
-from mwdcal.calibration.automatic.order_selection import choose_order
+from mwdcal.calibration.automatic.auto import choose_order
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.prediction import readings_at
 from mwdcal.calibration.readings import Readings, highest_order, soaks
 from mwdcal.calibration.record import Calibration
+from mwdcal.calibration.results import readings_at
 from mwdcal.errors import FitError, InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import reference_vectors
-from mwdcal.planning.simulate import grid, run, servo
+from mwdcal.planning.plans import grid, run, servo
 from mwdcal.sensor.profile import Profile, TriadProfile
 from simulation import Tool, plan
 

@@ -20,11 +20,11 @@ from mwdcal.calibration.record import Finding
 from mwdcal.certificate import contents, decisions
 from mwdcal.certificate.budget import budget
 from mwdcal.certificate.contents import CertificateRequest, certificate
-from mwdcal.certificate.document import Person
-from mwdcal.certificate.laboratory import (
+from mwdcal.certificate.document import (
     DecisionRule,
     Laboratory,
     LaboratoryCondition,
+    Person,
     Recalibration,
 )
 from mwdcal.files import verifications
@@ -94,7 +94,7 @@ def propagated(calibration, inclination, temperature):
     """1σ (3,) in degrees of the angles at an inclination, rms over azimuth and toolface: differences of the angles
     of corrected readings, for steps along the parameters, in the covariance of the file."""
     azimuth, toolface = (a.ravel() for a in np.meshgrid(SIXTH, SIXTH))
-    at = mwdcal.calibration.prediction.readings_at(
+    at = mwdcal.calibration.results.readings_at(
         calibration, inclination, azimuth, toolface, temperature
     )
     covariance = calibration.parameter_covariance
@@ -199,7 +199,7 @@ def test_the_line_of_repeatability_is_what_such_errors_do_to_the_angles():
     (row,) = (row for row in first.budget if row.source == "repeatability of the readings")
     grid = np.meshgrid([math.pi / 4], SIXTH, SIXTH)
     azimuth, toolface = (angle.ravel() for angle in grid[1:])
-    at = mwdcal.calibration.prediction.readings_at(first, math.pi / 4, azimuth, toolface)
+    at = mwdcal.calibration.results.readings_at(first, math.pi / 4, azimuth, toolface)
     here, rng, squares, count = angles_of(*first.fields(at)), np.random.default_rng(3), 0.0, 60
     for _ in range(count):
         error = rng.normal(0, repeated / triad.scale, run.accelerometer.shape)
@@ -496,7 +496,7 @@ def test_what_nobody_states_is_named(servo):
 
 
 def contents_of_example():
-    from mwdcal.certificate.laboratory import load_laboratory
+    from mwdcal.certificate.document import load_laboratory
 
     return load_laboratory(EXAMPLE / "laboratory.toml")
 
@@ -723,7 +723,7 @@ def test_a_number_that_no_page_can_bear_is_refused(servo, number):
 )
 def test_any_names_go_into_a_certificate_and_out_again(servo, serial, customer, marks):
     odd = replace(servo, tool={**servo.tool, "serial": serial})
-    from mwdcal.certificate.laboratory import ItemDetails
+    from mwdcal.certificate.document import ItemDetails
 
     laboratory = Laboratory(item=ItemDetails(identification=marks))
     try:

@@ -24,13 +24,14 @@ pypdf = pytest.importorskip("pypdf", reason="pypdf is not installed")
 typst = pytest.importorskip("typst", reason="typst is not installed")
 pytest.importorskip("matplotlib", reason="matplotlib is not installed")
 
-from mwdcal.presentation.certificate import probability, quantity_numbers  # noqa: E402
-from mwdcal.presentation.certificate_page import (  # noqa: E402
+from mwdcal.presentation.certificate import (  # noqa: E402
     certificate_pictures,
+    certificate_text,
+    probability,
+    quantity_numbers,
     render_page,
     render_pdf,
 )
-from mwdcal.presentation.certificate_text import certificate_text  # noqa: E402
 
 MM = 72 / 25.4
 HOSTILE = [

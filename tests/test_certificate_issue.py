@@ -11,8 +11,7 @@ import msgspec
 import pytest
 
 from cli_support import EXAMPLE, ROOT, mwdcal, refused
-from mwdcal.certificate.document import Certificate
-from mwdcal.certificate.laboratory import load_laboratory
+from mwdcal.certificate.document import Certificate, load_laboratory
 from mwdcal.errors import InputError
 from mwdcal.library.papers import Paper
 from test_schemas import checked

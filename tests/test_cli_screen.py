@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from cli_support import calibrated, mwdcal, refused, servo_run, write_csv
-from mwdcal.app import cli, progress
+from mwdcal.app import cli, messages
 from mwdcal.presentation import text
 
 SOURCE = Path(cli.__file__).parents[1]
@@ -129,8 +129,8 @@ def untimed(document):
 @pytest.fixture
 def no_progress(monkeypatch):
     """Nothing is said of how far a command is, however slow the machine."""
-    monkeypatch.setattr(progress, "PATIENCE", 600.0)
-    monkeypatch.setattr(progress.slowly, "__defaults__", (600.0,))
+    monkeypatch.setattr(messages, "PATIENCE", 600.0)
+    monkeypatch.setattr(messages.slowly, "__defaults__", (600.0,))
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -167,7 +167,7 @@ def test_a_terminal_sees_what_a_file_holds(files, monkeypatch, no_progress, argu
 def test_a_progress_bar_is_drawn_in_every_encoding(files, monkeypatch, encoding):
     monkeypatch.chdir(files)
     monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setattr(progress, "PATIENCE", 0.0)
+    monkeypatch.setattr(messages, "PATIENCE", 0.0)
     code, out, err = shown_on_a_terminal(encoding, "apply", *COMMANDS["apply"])
     assert code == 0
     assert "\x1b" in err

@@ -16,11 +16,11 @@ from cli_support import (
     stations,
     write_csv,
 )
-from mwdcal.planning import simulate
+from mwdcal.planning import plans
 
 SEED = 11
-PLAN = simulate.grid([5, 45, 90, 135], 12, [0, 90, 180, 270], [25.0])
-ROLL = simulate.grid([45], 12, [60], [25.0])
+PLAN = plans.grid([5, 45, 90, 135], 12, [0, 90, 180, 270], [25.0])
+ROLL = plans.grid([45], 12, [60], [25.0])
 DEG = np.pi / 180
 
 
@@ -33,8 +33,8 @@ def columns(readings, plan, truth):
 
 
 def simulated(plan, seed):
-    truth = simulate.servo(np.random.default_rng(SEED))
-    return columns(simulate.run(truth, plan, np.random.default_rng(seed)), plan, truth)
+    truth = plans.servo(np.random.default_rng(SEED))
+    return columns(plans.run(truth, plan, np.random.default_rng(seed)), plan, truth)
 
 
 @pytest.fixture(scope="module")
@@ -214,7 +214,7 @@ def test_a_knocked_tool_that_was_not_rolled_never_exits_with_0(
     tmp_path, fitted, toolfaces, references
 ):
     """Knocked by 8 mg and 600 nT along x: rolled it fails, at one toolface it looks good."""
-    still = simulate.StationPlan(
+    still = plans.StationPlan(
         *(np.full(len(toolfaces), v) for v in (45 * DEG, 60 * DEG, 0.0, 25.0))
     )
     run = simulated(dataclasses.replace(still, toolface=np.array(toolfaces) * DEG), 5)

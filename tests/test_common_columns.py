@@ -7,11 +7,11 @@ import pytest
 
 from mwdcal.calibration.automatic.drift import by_drift, with_drift
 from mwdcal.calibration.diagnosis import structure
-from mwdcal.calibration.diagnosis.first_look import may_show
 from mwdcal.calibration.diagnosis.plausibility import freedom_of
+from mwdcal.calibration.diagnosis.structure import may_show
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
-from mwdcal.estimation.minimisers import closed_form_drift, common_columns
+from mwdcal.estimation.minimisers import closed_form_drift
 from test_run_drift import runs
 
 OPTIONS = Options(order=0)
@@ -33,7 +33,7 @@ def apart(monkeypatch):
     """Lets every tool go the general way from now on."""
 
     def general():
-        for module in (common_columns, closed_form_drift):
+        for module in (closed_form_drift, closed_form_drift):
             monkeypatch.setattr(module, "are_common", lambda problem: False)
         monkeypatch.setattr(structure, "may_show", lambda result: np.ones(len(result.status), bool))
 

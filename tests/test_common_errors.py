@@ -13,10 +13,9 @@ from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.diagnosis.plausibility import misfit_chances
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.prediction import typical_accuracy
 from mwdcal.calibration.prior import from_calibration
 from mwdcal.calibration.readings import Readings
-from mwdcal.calibration.results import StatedCovariance, assumed_exact
+from mwdcal.calibration.results import StatedCovariance, assumed_exact, typical_accuracy
 from mwdcal.errors import FitError
 from mwdcal.estimation.batch import take
 from mwdcal.files import documents

@@ -19,12 +19,11 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.comparison import compare as module
 from mwdcal.comparison.compare import SCATTER, Gauge, compare, in_gauge
 from mwdcal.errors import InputError
-from mwdcal.estimation.rank import Free
-from mwdcal.estimation.uncertainty import unrotating
+from mwdcal.estimation.uncertainty import Free, unrotating
 from mwdcal.geometry.vectors import group_scatter
-from mwdcal.planning import simulate
+from mwdcal.planning import plans
 from mwdcal.presentation import comparison as command
-from mwdcal.presentation.comparison_page import render
+from mwdcal.presentation.comparison import render
 from mwdcal.sensor.profile import Profile, TriadProfile
 from simulation import Tool, attitude, plan
 from test_calibrate import NOISE, PROFILE, make
@@ -43,9 +42,9 @@ def whole():
 
 @cache
 def heated():
-    stations = simulate.grid([5.0, 45.0, 90.0, 135.0], 6, [0, 90, 200, 300], [25.0, 65.0, 105.0])
-    tool = simulate.servo(np.random.default_rng(5))
-    made = simulate.run(tool, stations, np.random.default_rng(6))
+    stations = plans.grid([5.0, 45.0, 90.0, 135.0], 6, [0, 90, 200, 300], [25.0, 65.0, 105.0])
+    tool = plans.servo(np.random.default_rng(5))
+    made = plans.run(tool, stations, np.random.default_rng(6))
     sd = {"accelerometer": np.array(1e-4), "magnetometer": np.array(15.0)}
     return compare(replace(made, source="hot.csv", sd=sd), PROFILE)
 
@@ -426,7 +425,7 @@ def separate(figure):
 
 @pytest.mark.parametrize("method", ["joint", "scalar"])
 def test_a_method_far_worse_flattens_no_other(whole, method):
-    figures = pytest.importorskip("mwdcal.presentation.comparison_page")
+    figures = pytest.importorskip("mwdcal.presentation.comparison")
     bad = worse(whole, method, 100)
     index = [row.method for row in whole.rows].index(method)
     others = [i for i in range(6) if i != index]
@@ -451,7 +450,7 @@ def test_a_method_far_worse_flattens_no_other(whole, method):
 
 @pytest.mark.parametrize("method", ["joint", "scalar"])
 def test_ratios_beyond_the_axis_have_their_value_at_its_edge(whole, method):
-    figures = pytest.importorskip("mwdcal.presentation.comparison_page")
+    figures = pytest.importorskip("mwdcal.presentation.comparison")
     bad = worse(whole, method, 100)
     figure = figures.draw_errors(bad)
     (axes,) = figure.axes
@@ -475,7 +474,7 @@ def test_ratios_beyond_the_axis_have_their_value_at_its_edge(whole, method):
 
 @pytest.mark.usefixtures("without_layout")
 def test_parameters_beyond_the_axis_have_an_arrow_and_the_largest_its_value(whole):
-    figures = pytest.importorskip("mwdcal.presentation.comparison_page")
+    figures = pytest.importorskip("mwdcal.presentation.comparison")
     rows = list(whole.rows)
     first, last = rows[0].parameters["accelerometer"], rows[-1].parameters["accelerometer"]
     values = {name: value.copy() for name, value in last.values.items()}
@@ -511,7 +510,7 @@ def test_a_relative_field_has_no_nanotesla_on_the_page():
 
 
 def test_long_runs_show_the_worst_of_each_part():
-    from mwdcal.presentation.comparison_page import MOST_STATIONS, _largest
+    from mwdcal.presentation.comparison import MOST_STATIONS, _largest
 
     values = np.sin(np.arange(1000) ** 2) * 1e-3
     values[737] = 9.0

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from mwdcal.calibration.automatic.auto import choose_order, choose_orders
 from mwdcal.calibration.automatic.courses import course_misfit, misfit_covariance, terms_beyond
-from mwdcal.calibration.automatic.order_selection import choose_order, choose_orders
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
@@ -18,7 +18,7 @@ from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.errors import FitError
 from mwdcal.estimation.batch import mapped, take
 from mwdcal.geometry.observables import OBSERVABLES
-from mwdcal.planning.simulate import servo
+from mwdcal.planning.plans import servo
 from mwdcal.sensor.profile import Profile
 from simulation import DEG, attitude, factor_readings, factors_within_limits, plan
 

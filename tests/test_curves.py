@@ -11,8 +11,8 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from cli_support import mwdcal
-from mwdcal.calibration.automatic import nonlinearity
-from mwdcal.calibration.automatic.nonlinearity import ODDS, choices_of, choose_curves
+from mwdcal.calibration.automatic import auto
+from mwdcal.calibration.automatic.auto import ODDS, choices_of, choose_curves
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
@@ -69,7 +69,7 @@ def test_stations_are_judged_as_by_fits_without_them(terms, stand):
     sd = noise | {name: np.full(36, each) for name, each in stand.items()}
     run = replace(run, sd=sd, settings="per-station")
     options = Options(nonlinearity=terms)
-    found = nonlinearity._left_out(batch_of_one(run), options)[0]
+    found = auto._left_out(batch_of_one(run), options)[0]
     for station in range(36):
         include = (np.arange(36) != station).astype(float)
         result = fit(run, options, include)

@@ -20,7 +20,7 @@ from cli_support import EXAMPLE, mwdcal
 from dcc_clients import NAMESPACES, with_schema
 from mwdcal.calibration.record import Finding
 from mwdcal.certificate.dcc import to_xml
-from mwdcal.certificate.dcc.elements import dsi_unit
+from mwdcal.certificate.dcc.administrative import dsi_unit
 from mwdcal.certificate.document import (
     Budget,
     BudgetLine,

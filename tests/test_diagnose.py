@@ -11,20 +11,31 @@ import mwdcal
 from cli_support import SERVO_NOISE, read_csv, refused, servo_run, write_csv
 from cli_support import mwdcal as command
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.prediction import raw_reading
-from mwdcal.faults import physics
+from mwdcal.calibration.results import raw_reading
+from mwdcal.faults import likelihood
 from mwdcal.faults.diagnosis import diagnose
-from mwdcal.faults.likelihood import FaultEvidence, Suspect, explained, padded, raw_of, repeated
-from mwdcal.faults.physics import DEPARTURES, FAULTS, NONE, SIZE, Damage
+from mwdcal.faults.likelihood import (
+    DEPARTURES,
+    FAULTS,
+    NONE,
+    SIZE,
+    Damage,
+    FaultEvidence,
+    Suspect,
+    explained,
+    padded,
+    raw_of,
+    repeated,
+)
 from mwdcal.geometry.vectors import reference_vectors, tool_from_earth
-from mwdcal.planning import simulate
-from mwdcal.planning.simulate import Effects, FaultEffect, load_effects
+from mwdcal.planning import plans
+from mwdcal.planning.plans import Effects, FaultEffect, load_effects
 from mwdcal.sensor.profile import Datasheet, Profile, TriadProfile
 from simulation import Tool
 
-PLAN = simulate.grid([5, 45, 90, 135], 6, [0, 90, 180, 270], [20.0, 90.0])
-ROLL = simulate.grid([5, 45, 90], 4, [0, 120, 240], [90.0])
-SOAKS = simulate.grid([5, 45, 90], 4, [0, 120, 240], [30.0, 90.0])
+PLAN = plans.grid([5, 45, 90, 135], 6, [0, 90, 180, 270], [20.0, 90.0])
+ROLL = plans.grid([5, 45, 90], 4, [0, 120, 240], [90.0])
+SOAKS = plans.grid([5, 45, 90], 4, [0, 120, 240], [30.0, 90.0])
 
 
 def noise(count):
@@ -44,8 +55,8 @@ def tool(number):
     """A tool and its calibration, of a run of its own with the noise declared."""
     rng = np.random.default_rng([77, number])
     tolerances = TriadProfile(datasheet=Datasheet())
-    truth = simulate.drawn(rng, Profile(name="servo", magnetometer=tolerances), order=1)
-    run = simulate.run(truth, PLAN, rng)
+    truth = plans.drawn(rng, Profile(name="servo", magnetometer=tolerances), order=1)
+    run = plans.run(truth, PLAN, rng)
     sd = {name: np.resize(value[0], (PLAN.count, 3)) for name, value in NOISE.items()}
     return mwdcal.calibrate(
         replace(run, sd=sd), options=Options(order=1, nonlinearity="none")
@@ -61,7 +72,7 @@ def later(number, seed=0, known=None, plan=ROLL, **fault):
     blank = np.zeros((plan.count, 3))
     session = mwdcal.Readings(blank, blank, plan.temperature, references, noise(plan.count))
     rng, effects = np.random.default_rng([78, number, seed]), Effects(fault=FaultEffect(**fault))
-    result = simulate.simulated(truth, session, rng, effects)
+    result = plans.simulated(truth, session, rng, effects)
     kept = references if known is None else {name: references[name] for name in known}
     return replace(result.readings, known=kept), result.damage
 
@@ -70,7 +81,7 @@ def test_every_kind_of_fault_has_the_size_of_its_own_forms():
     """Also those that are far behind the best one: a rival's size was that of another fault, or of none."""
     calibration, _ = tool(0)
     readings, _ = later(0, kind="magnetised", size=40.0)
-    forms = physics.hypotheses(physics.faults(calibration.profile))
+    forms = likelihood.hypotheses(likelihood.faults(calibration.profile))
     evidence = FaultEvidence.of(Suspect.of(calibration, readings), forms)
     for kind in {form.kind for form in forms}:
         form, sizes, _ = evidence.sizes(kind)
@@ -84,9 +95,9 @@ def test_every_kind_of_fault_has_the_size_of_its_own_forms():
 def read(departures, raw, vectors, attitude, temperature, gain=1.0):
     """Readings of a tool with departures, whose channels have gains (6,) in their fields and no cross terms."""
     damage = Damage(departures, np.zeros(6, bool), np.zeros(6))
-    field = physics.changed_field(damage, vectors[:, 3:], attitude)
+    field = likelihood.changed_field(damage, vectors[:, 3:], attitude)
     whole = np.concatenate([vectors[:, :3], field], -1)
-    return physics.changed_readings(
+    return likelihood.changed_readings(
         damage, raw + gain * (whole - vectors), whole, temperature, 30.0, gain
     )
 
@@ -99,7 +110,7 @@ def test_columns_are_derivatives_of_the_physics():
         np.broadcast_to(gain, raw.shape),
         np.broadcast_to(np.diag(gain[3:]), attitude.shape),
     )
-    columns = physics.columns(raw, vectors, attitude, warmth, gain, by_field)
+    columns = likelihood.columns(raw, vectors, attitude, warmth, gain, by_field)
     for place in range(SIZE):
         step = 1e-6 * np.eye(SIZE)[place]
         up, down = (read(s * step, raw, vectors, attitude, ROLL.temperature, gain) for s in (1, -1))
@@ -112,12 +123,14 @@ def test_what_turns_with_the_tool_and_what_stays_in_the_earth():
     departures = np.zeros(SIZE)
     departures[DEPARTURES["disturbance"]] = 300.0, -200.0, 100.0
     damage = Damage(departures, np.zeros(6, bool), np.zeros(6))
-    strength = np.linalg.norm(physics.changed_field(damage, field, attitude), axis=-1)
+    strength = np.linalg.norm(likelihood.changed_field(damage, field, attitude), axis=-1)
     level, down = 48_000 * np.cos(DIP) + 300, 48_000 * np.sin(DIP) + 100
     np.testing.assert_allclose(strength, np.sqrt(level**2 + 200**2 + down**2))
     departures[:] = 0.0
     departures[DEPARTURES["iron"]] = 10.0, 20.0, 200.0
-    changed = physics.changed_field(Damage(departures, *[np.zeros(6)] * 2), field, attitude) - field
+    changed = (
+        likelihood.changed_field(Damage(departures, *[np.zeros(6)] * 2), field, attitude) - field
+    )
     np.testing.assert_allclose(changed, np.tile([10.0, 20.0, 200.0], (ROLL.count, 1)), atol=1e-9)
 
 
@@ -127,14 +140,14 @@ def test_a_turned_axis_keeps_its_gain():
     departures[DEPARTURES["turn"]][:2] = 3.0, 4.0
     damage = Damage(departures, np.zeros(6, bool), np.zeros(6))
     vectors = np.eye(3, 6)
-    read = physics.changed_readings(damage, vectors, vectors, np.full(3, 30.0), 30.0)
+    read = likelihood.changed_readings(damage, vectors, vectors, np.full(3, 30.0), 30.0)
     np.testing.assert_allclose(read[:, 0], np.array([1.0, 3.0, 4.0]) / np.sqrt(26))
 
 
 def test_a_channel_dies_of_heat():
     damage = Damage(np.zeros(SIZE), np.arange(6) == 2, np.full(6, 0.3), above=80.0)
     raw = np.ones((2, 6))
-    read = physics.changed_readings(damage, raw, raw, np.array([79.0, 81.0]), 30.0)
+    read = likelihood.changed_readings(damage, raw, raw, np.array([79.0, 81.0]), 30.0)
     np.testing.assert_allclose(read, [[1] * 6, [1, 1, 0.3, 1, 1, 1]])
 
 
@@ -146,7 +159,7 @@ def test_the_evidence_is_that_of_a_normal_density():
     calibration, _ = tool(0)
     readings, _ = later(0, kind="turn-on", size=0.3)
     suspect = Suspect.of(calibration, readings)
-    forms = physics.faults(calibration.profile)
+    forms = likelihood.faults(calibration.profile)
     each = repeated(suspect, np.zeros(len(forms), int))
     none = explained(suspect, np.zeros((1, SIZE, 0)), suspect.start())
     best = explained(each, padded(forms), each.start())
@@ -180,7 +193,7 @@ def test_the_evidence_is_that_of_a_normal_density():
     ]
     gain = np.concatenate([1 / np.diagonal(s, axis1=-2, axis2=-1) for s in slopes], -1)
     warmth, whole = ROLL.temperature - 30, np.concatenate(vectors, -1)
-    seen = physics.columns(mean, whole, attitude, warmth, gain, np.linalg.inv(slopes[1]))
+    seen = likelihood.columns(mean, whole, attitude, warmth, gain, np.linalg.inv(slopes[1]))
     for form, evidence in zip(forms, best.evidence - none.evidence, strict=True):
         change = (seen @ form.mixing).reshape(-1, form.mixing.shape[1])
         expected = density(sound + change @ change.T) - density(sound)
@@ -307,7 +320,7 @@ def test_an_accelerometer_alone_and_no_temperature():
 
 def test_a_relative_field():
     _, truth = tool(5)
-    run = simulate.run(truth, PLAN, np.random.default_rng(1))
+    run = plans.run(truth, PLAN, np.random.default_rng(1))
     known = {name: value for name, value in run.known.items() if name != "field"}
     calibration = mwdcal.calibrate(
         replace(run, known=known), options=Options(order=1, nonlinearity="none")

@@ -11,20 +11,20 @@ from scipy.stats import binom, multivariate_normal, norm
 
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.prediction import typical_accuracy
 from mwdcal.calibration.readings import TRIADS, fingerprints
-from mwdcal.drift import change
-from mwdcal.drift.change import NULL_DRAWS, Contrasts, change_test
-from mwdcal.drift.fleet import fleet_drift
-from mwdcal.drift.forecast import RISK, Paths, ServiceTest, outlook
-from mwdcal.drift.histories import tool_history
-from mwdcal.drift.tool import TypeRates, measured, predicted
+from mwdcal.calibration.results import typical_accuracy
+from mwdcal.drift import walk
+from mwdcal.drift.histories import RISK, Paths, ServiceTest, outlook, tool_history
+from mwdcal.drift.tool import TypeRates, fleet_drift, measured, predicted
 from mwdcal.drift.walk import (
     FACTOR_NAMES,
+    NULL_DRAWS,
     WALK_GROUPS,
+    Contrasts,
     GroupRates,
     History,
     Increments,
+    change_test,
     common_noise_scale,
     parameter_names,
     precision,
@@ -34,9 +34,8 @@ from mwdcal.errors import InputError
 from mwdcal.files import documents
 from mwdcal.files.formats.members import Member
 from mwdcal.files.profiles import load_profile
-from mwdcal.planning.plans import load_plan
+from mwdcal.planning.plans import drawn, load_plan
 from mwdcal.planning.session import Session
-from mwdcal.planning.simulate import drawn
 from mwdcal.use.notation import convert
 from mwdcal.use.verification import Verdict, VerdictRow
 
@@ -297,7 +296,7 @@ def test_few_draws_call_the_same_tools_changed(monkeypatch, level):
         values[1:, BIAS] += size * np.sqrt(covariance[BIAS, BIAS])
         tools.append(history(values, covariance))
     few = [change_test(each, level) for each in tools]
-    monkeypatch.setattr(change, "FIRST_DRAWS", NULL_DRAWS)
+    monkeypatch.setattr(walk, "FIRST_DRAWS", NULL_DRAWS)
     every = [change_test(each, level) for each in tools]
     assert [each.changed for each in few] == [each.changed for each in every]
     assert {each.changed for each in few} == {True, False}
@@ -329,7 +328,7 @@ def test_power_against_a_step_is_that_of_its_score():
 
 
 def test_the_largest_of_independent_scores_has_its_known_distribution(monkeypatch):
-    monkeypatch.setattr(change, "FIRST_DRAWS", NULL_DRAWS)
+    monkeypatch.setattr(walk, "FIRST_DRAWS", NULL_DRAWS)
     test = change_test(history(np.zeros((2, SIZE)), np.eye(SIZE)))
     none = change_test(history(np.zeros((2, SIZE)), np.eye(SIZE)), 0.2)
     for each, level in ((test, 0.01), (none, 0.2)):
@@ -619,8 +618,13 @@ def test_a_run_without_gravity_is_no_change_of_the_tool(stated):
 @pytest.mark.usefixtures("without_layout")
 def test_pages_mark_simulated_data_and_escape_names(years):
     pytest.importorskip("matplotlib")
-    from mwdcal.presentation.drift import fleet_screen, tool_screen
-    from mwdcal.presentation.drift_page import drift_picture, render_fleet, render_tool
+    from mwdcal.presentation.drift import (
+        drift_picture,
+        fleet_screen,
+        render_fleet,
+        render_tool,
+        tool_screen,
+    )
 
     name = "<script>alert(1)</script>\x1b[2J"
     tools = [measured(name, years["T-1"]), measured("T-2", years["T-2"])]
@@ -675,8 +679,7 @@ def test_a_calibration_with_a_prior_says_so_and_teaches_no_rate():
 @pytest.mark.usefixtures("without_pictures")
 def test_the_least_probability_that_is_drawn_is_a_bound(years):
     pytest.importorskip("matplotlib")
-    from mwdcal.presentation.drift import fleet_screen, tool_screen
-    from mwdcal.presentation.drift_page import render_fleet, render_tool
+    from mwdcal.presentation.drift import fleet_screen, render_fleet, render_tool, tool_screen
 
     fleet, (drift, _) = fleet_drift(
         [measured("T-1", years["T-1"]), measured("T-2", years["T-2"])], LIMITS, TODAY

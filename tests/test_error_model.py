@@ -9,8 +9,7 @@ import pytest
 
 import published_wells
 from mwdcal.errors import InputError
-from mwdcal.survey.error_model import Hole, load_error_model
-from mwdcal.survey.formulas import parsed
+from mwdcal.survey.error_model import Hole, load_error_model, parsed
 from mwdcal.survey.path import position_covariance, well_path
 from test_tool_model import read_example, six
 from test_well_path import needs_published_wells

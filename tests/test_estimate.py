@@ -8,9 +8,8 @@ import pytest
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
-from mwdcal.estimation.rank import free_directions
 from mwdcal.estimation.solvers import gauss_newton, stepped
-from mwdcal.estimation.uncertainty import marginal_rank, readjusted
+from mwdcal.estimation.uncertainty import free_directions, marginal_rank, readjusted
 from mwdcal.geometry.vectors import rotation
 from mwdcal.sensor.models import stacked
 from simulation import DEG, Tool, plan

@@ -8,8 +8,8 @@ import pytest
 
 from cli_support import SCALE, channels, mwdcal, stations, write_csv
 from mwdcal.calibration.calibrate import calibrate
-from mwdcal.calibration.prediction import typical_accuracy
 from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.results import typical_accuracy
 from simulation import DEG, Tool, attitude, bound, complex_steps, plan
 from test_calibrate import NOISE, PROFILE, make
 from test_observables import complex_value

@@ -303,10 +303,10 @@ def test_a_certificate_refuses_with_a_remedy(here, tmp_path):
 @pytest.fixture(scope="module")
 def key(tmp_path_factory):
     pytest.importorskip("cryptography")
-    from mwdcal.certificate import keys
+    from mwdcal.certificate import signature
 
     path = tmp_path_factory.mktemp("keys") / "lab.key"
-    keys.create(path, "LAB", "")
+    signature.create(path, "LAB", "")
     return path
 
 
@@ -361,16 +361,16 @@ def test_signing_a_file_says_what_the_command_says(here, key, tmp_path):
 
 def test_an_encrypted_key_needs_its_passphrase(here, tmp_path, monkeypatch):
     pytest.importorskip("cryptography")
-    from mwdcal.certificate import keys
+    from mwdcal.certificate import signature
 
-    monkeypatch.delenv(keys.PASSPHRASE, raising=False)
-    keys.create(tmp_path / "lab.key", "LAB", "word")
+    monkeypatch.delenv(signature.PASSPHRASE, raising=False)
+    signature.create(tmp_path / "lab.key", "LAB", "word")
     with pytest.raises(
-        InputError, match=f"Give its `passphrase`, or set the variable {keys.PASSPHRASE}"
+        InputError, match=f"Give its `passphrase`, or set the variable {signature.PASSPHRASE}"
     ):
         mwdcal.sign("new.json", tmp_path / "lab.key", output=tmp_path / "a.json")
     mwdcal.sign("new.json", tmp_path / "lab.key", output=tmp_path / "a.json", passphrase="word")
-    monkeypatch.setenv(keys.PASSPHRASE, "word")
+    monkeypatch.setenv(signature.PASSPHRASE, "word")
     mwdcal.sign("new.json", tmp_path / "lab.key", output=tmp_path / "b.json")
     assert documents.read(tmp_path / "b.json").serial == "SIM-0001"
 

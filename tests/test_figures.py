@@ -11,27 +11,27 @@ import pytest
 
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.prediction import readings_at
+from mwdcal.calibration.results import readings_at
 from mwdcal.errors import InputError
-from mwdcal.planning import simulate
+from mwdcal.planning import plans
 from mwdcal.presentation.calibration_page import render
 from mwdcal.sensor.profile import Profile, TriadProfile
 from mwdcal.use.verification import Bounds, Limits, verify
 from simulation import DEG
 from test_report import SERVO, Page, calibrated, heated, run
 
-TOOL = simulate.servo(np.random.default_rng(5))
+TOOL = plans.servo(np.random.default_rng(5))
 LIMITS = Limits(
     name="all",
     spread=Bounds(inclination_deg=0.1, azimuth_deg=1.0, gravity_g=0.003, toolface_deg=0.1),
     error=Bounds(inclination_deg=0.25, azimuth_deg=2.0, toolface_deg=0.2, field_nt=300.0),
 )
-SETS = simulate.grid([10.0, 45.0, 70.0, 90.0, 120.0], 8, [60.0, 120.0, 200.0, 300.0, 20.0], [25.0])
-ONE = simulate.grid([45.0], 12, [60.0], [25.0])
+SETS = plans.grid([10.0, 45.0, 70.0, 90.0, 120.0], 8, [60.0, 120.0, 200.0, 300.0, 20.0], [25.0])
+ONE = plans.grid([45.0], 12, [60.0], [25.0])
 
 
 def readings(plan, seed, *, knock=0.0, drop=()):
-    clean = simulate.run(TOOL, plan, np.random.default_rng(seed))
+    clean = plans.run(TOOL, plan, np.random.default_rng(seed))
     known = {name: value for name, value in clean.known.items() if name not in drop}
     moved = clean.accelerometer + np.array([knock, 0.0, 0.0])
     return replace(clean, accelerometer=moved, known=known, source="roll.csv")
@@ -39,7 +39,7 @@ def readings(plan, seed, *, knock=0.0, drop=()):
 
 @cache
 def sound(*drop):
-    plan = simulate.grid([5.0, 45.0, 90.0, 135.0], 12, [0.0, 90.0, 180.0, 270.0], [25.0])
+    plan = plans.grid([5.0, 45.0, 90.0, 135.0], 12, [0.0, 90.0, 180.0, 270.0], [25.0])
     return calibrate(readings(plan, 1, drop=drop), SERVO)
 
 
@@ -196,8 +196,8 @@ def test_scale_and_bias_over_temperature(model):
 
 def test_channels_against_the_tool_axes_have_positive_scales():
     """A tool whose channels point the other way has the same scales, and biases of its own readings."""
-    soaked = simulate.run(
-        TOOL, simulate.grid([5.0, 45.0, 90.0, 135.0], 6, [0, 90, 200, 300], [25.0, 65.0]),
+    soaked = plans.run(
+        TOOL, plans.grid([5.0, 45.0, 90.0, 135.0], 6, [0, 90, 200, 300], [25.0, 65.0]),
         np.random.default_rng(6),
     )  # fmt: skip
     axes = Profile(
@@ -221,8 +221,8 @@ def test_channels_against_the_tool_axes_have_positive_scales():
 
 
 def test_relative_fields_are_per_mille():
-    soaked = simulate.run(
-        TOOL, simulate.grid([5.0, 45.0, 90.0, 135.0], 6, [0, 90, 200, 300], [25.0, 65.0]),
+    soaked = plans.run(
+        TOOL, plans.grid([5.0, 45.0, 90.0, 135.0], 6, [0, 90, 200, 300], [25.0, 65.0]),
         np.random.default_rng(6),
     )  # fmt: skip
     known = {k: v for k, v in soaked.known.items() if k != "field"}
@@ -370,7 +370,7 @@ def test_stations_are_listed_with_their_attitude():
 
 
 def test_stations_outside_of_roll_sets_are_drawn_without_a_curve():
-    plan = simulate.StationPlan(
+    plan = plans.StationPlan(
         np.radians(np.linspace(20, 160, 12)), np.radians(np.arange(12) * 77.0 % 360),
         np.radians(np.arange(12) * 30.0), np.full(12, 25.0),
     )  # fmt: skip
@@ -386,14 +386,14 @@ def test_stations_outside_of_roll_sets_are_drawn_without_a_curve():
 
 
 def test_more_roll_sets_than_looks_show_the_worst():
-    plan = simulate.grid([20.0, 40.0, 60.0, 80.0, 100.0, 120.0, 140.0], 8, [60.0], [25.0])
+    plan = plans.grid([20.0, 40.0, 60.0, 80.0, 100.0, 120.0, 140.0], 8, [60.0], [25.0])
     result = verify(sound(), readings(plan, 4, knock=0.004), LIMITS)
     assert len(result.rows[0].sets) == 7
     assert {"worst roll set", "other roll sets"} <= set(curves(result.plot.toolface().axes[0]))
 
 
 def test_vertical_stations_have_no_azimuth_to_draw():
-    plan = simulate.grid([0.0, 45.0], 12, [0.0, 60.0], [25.0])
+    plan = plans.grid([0.0, 45.0], 12, [0.0, 60.0], [25.0])
     result = verify(sound(), readings(plan, 5), LIMITS)
     names = {row.name: row for row in result.rows}
     (one,) = names["error of azimuth"].sets
@@ -426,7 +426,7 @@ def test_a_verdict_without_values_has_no_picture():
 
 
 def test_a_set_that_was_not_rolled_is_drawn_and_fails():
-    plan = simulate.StationPlan(*(np.concatenate([v, v])[:12] for v in (
+    plan = plans.StationPlan(*(np.concatenate([v, v])[:12] for v in (
         np.full(12, 45 * DEG), np.full(12, 60 * DEG), np.radians(np.arange(12) * 10.0), np.full(12, 25.0)
     )))  # fmt: skip
     result = verify(sound(), readings(plan, 6), LIMITS)

@@ -17,10 +17,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from cli_support import calibrated, mwdcal, refused, servo_run
-from mwdcal.app import streaming
+from mwdcal.app import correction
 from mwdcal.errors import InputError
 from mwdcal.files import metadata, profiles
-from mwdcal.files.formats import workbook_limits
+from mwdcal.files.formats import workbook as workbook_limits
 from mwdcal.files.formats.columns import plain_names
 from mwdcal.files.formats.table import Table, numbers, read, write
 from mwdcal.files.limits import load_limits
@@ -138,7 +138,7 @@ def test_text_cells_are_written_as_they_are_and_formulas_are_reported(
         tmp_path / "in.csv",
         Table({**{n: [str(v)] * count for n, v in READING.items()}, "note": NOTES, "-x": NOTES[:1] * count}),
     )  # fmt: skip
-    monkeypatch.setattr(streaming, "TABLE_SIZES", {".csv": 0} if parts else {})
+    monkeypatch.setattr(correction, "TABLE_SIZES", {".csv": 0} if parts else {})
     ran = applied(calibration, tmp_path, tmp_path / "in.csv", "out.csv", "--json")
     header, rows = others_read(tmp_path / "out.csv")
     assert [row[header.index("note")] for row in rows] == NOTES
@@ -423,7 +423,7 @@ def test_decimal_commas_part_by_part_are_those_of_a_short_table(calibration, tmp
     lines = ["station;ax;ay;az;note"] + [f"{i};0,1;0,3;2,9;{i},5" for i in range(50)]
     (tmp_path / "in.csv").write_text("\n".join(lines))
     for name, long in (("short.csv", {}), ("long.csv", {".csv": 0})):
-        monkeypatch.setattr(streaming, "TABLE_SIZES", long)
+        monkeypatch.setattr(correction, "TABLE_SIZES", long)
         applied(calibration, tmp_path, tmp_path / "in.csv", name, "--decimal", ",")
     short, long = (read(tmp_path / name).columns for name in ("short.csv", "long.csv"))
     assert short == long

@@ -13,8 +13,7 @@ from hypothesis.extra.numpy import arrays
 
 from mwdcal.calibration.readings import Readings
 from mwdcal.errors import InputError
-from mwdcal.files.contract import RAW
-from mwdcal.files.faults import faults
+from mwdcal.files.contract import RAW, faults
 from mwdcal.files.formats.table import SUFFIXES, Table, write
 from mwdcal.files.profiles import built_in, load_profile
 from mwdcal.files.runs import check_run, from_readings, read_run, to_readings

@@ -24,9 +24,8 @@ from cli_support import (
     write_csv,
 )
 from mwdcal import calibrate, load, read_run, save
-from mwdcal.calibration.canonical import rounded
 from mwdcal.calibration.readings import Readings
-from mwdcal.calibration.record import StationRow
+from mwdcal.calibration.record import StationRow, rounded
 from mwdcal.files import documents
 from simulation import Tool, attitude
 from test_notation import AXES, SCALES, TRIADS, made, signed

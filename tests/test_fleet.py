@@ -27,11 +27,11 @@ from cli_support import (
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.prediction import typical_accuracy
 from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.results import typical_accuracy
 from mwdcal.errors import InputError, MwdcalError
 from mwdcal.estimation.batch import take
-from mwdcal.estimation.rank import free_directions
+from mwdcal.estimation.uncertainty import free_directions
 from mwdcal.files.formats import table as tables
 from mwdcal.files.profiles import load_profile
 from mwdcal.files.runs import to_readings

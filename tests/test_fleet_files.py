@@ -9,7 +9,7 @@ import pytest
 
 import mwdcal as library
 from cli_support import EXAMPLE, mwdcal, read_csv, refused, servo_run, write_csv
-from mwdcal.files.formats.folders import file_name
+from mwdcal.files.formats.atomic import file_name
 from test_fleet import roll_run, short_run, write_fleet
 
 pa = pytest.importorskip("pyarrow")

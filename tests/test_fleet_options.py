@@ -11,8 +11,8 @@ import pytest
 from cli_support import mwdcal, refused, servo_run
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.prediction import typical_accuracy
 from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.results import typical_accuracy
 from mwdcal.estimation.batch import take
 from mwdcal.files import documents
 from mwdcal.fleet.calibrate import column
@@ -216,7 +216,7 @@ def test_the_order_of_a_method_without_any(tmp_path):
 
 
 def test_a_trial_that_stops_the_batch_does_not_stop_the_others(tmp_path, monkeypatch):
-    import mwdcal.calibration.automatic.order_selection as selection
+    import mwdcal.calibration.automatic.auto as selection
 
     def fragile(readings, *given):
         if readings.accelerometer[..., 0, 0].max() > 5:

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from cli_support import EXAMPLE, mwdcal, servo_run
 from mwdcal.calibration import calibrate
-from mwdcal.calibration.automatic import order_selection
-from mwdcal.calibration.automatic.order_selection import choose_orders
-from mwdcal.calibration.canonical import DIGITS, figures, rounded
+from mwdcal.calibration.automatic import auto
+from mwdcal.calibration.automatic.auto import choose_orders
 from mwdcal.calibration.options import Options
+from mwdcal.calibration.record import DIGITS, figures, rounded
 from mwdcal.calibration.residuals import rms
 from mwdcal.estimation.batch import batch_of_one, join
 from mwdcal.files.profiles import load_profile
@@ -115,17 +115,17 @@ def test_orders_without_a_fit_are_those_of_all_fits(tmp_path, monkeypatch):
         runs.append(replace(batch_of_one(readings), station=(), digest=(), metadata={}, source=""))
     runs = [replace(run, run_sha256="", others={}, table={}, profile=None) for run in runs]
     fits, options = [], Options(order="auto")
-    whole = order_selection.fit
+    whole = auto.fit
 
     def counted(readings, *arguments):
         stand = any(name not in readings.triads and sd.any() for name, sd in readings.sd.items())
         fits.append(len(readings.accelerometer) * stand)
         return whole(readings, *arguments)
 
-    monkeypatch.setattr(order_selection, "fit", counted)
+    monkeypatch.setattr(auto, "fit", counted)
     quick, few = choose_orders(join(runs), options), sum(fits)
     fits.clear()
-    monkeypatch.setattr(order_selection, "_bare_stand", lambda readings, options: None)
+    monkeypatch.setattr(auto, "_bare_stand", lambda readings, options: None)
     assert choose_orders(join(runs), options).tolist() == quick.tolist()
     assert len({*map(tuple, quick.tolist())}) > 3
     assert few < 0.7 * sum(fits)

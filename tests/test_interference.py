@@ -18,7 +18,7 @@ from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.batch import take
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import centred
-from mwdcal.planning.simulate import grid, run, servo
+from mwdcal.planning.plans import grid, run, servo
 from mwdcal.presentation.interference_page import render
 from mwdcal.presentation.survey import interference_screen
 from mwdcal.survey.acceptance import SensorTerms

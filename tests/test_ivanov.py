@@ -10,7 +10,7 @@ import pytest
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
-from mwdcal.estimation.rank import free_directions
+from mwdcal.estimation.uncertainty import free_directions
 from mwdcal.geometry.observables import OBSERVABLES
 from simulation import DEG, Tool, attitude, plan
 

@@ -10,7 +10,7 @@ import mwdcal
 from cli_support import EXAMPLE
 
 PACKAGE = Path(mwdcal.__file__).parent
-MODULES, FUNCTIONS, FOLDERS = 85, 820, 17
+MODULES, FUNCTIONS, FOLDERS = 68, 870, 17
 TRACED = """
 import sys
 from pathlib import Path

@@ -13,7 +13,7 @@ import pytest
 
 from cli_support import EXAMPLE, refused
 from cli_support import mwdcal as cli
-from mwdcal.calibration.prediction import readings_at
+from mwdcal.calibration.results import readings_at
 from mwdcal.files import streams
 from mwdcal.files.documents import read
 from mwdcal.files.formats import text

@@ -13,7 +13,7 @@ from mwdcal.estimation.minimisers.newton import newton, propagated
 from mwdcal.estimation.solvers import Status
 from mwdcal.estimation.uncertainty import CHANGES, COUPLED, free_share, tangent
 from mwdcal.geometry.vectors import rotation
-from mwdcal.planning.simulate import grid, reading, servo
+from mwdcal.planning.plans import grid, reading, servo
 from mwdcal.sensor.models import Basis, Factors, Polynomial
 
 LEADS = [(), (1,), (3, 2)]

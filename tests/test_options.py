@@ -11,13 +11,13 @@ from scipy.optimize import least_squares
 
 from cli_support import commands, mwdcal
 from mwdcal.calibration import fit_options
-from mwdcal.calibration.automatic.nonlinearity import choose_curves, compare_curves
+from mwdcal.calibration.automatic.auto import choose_curves, compare_curves
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options, as_arguments, options_of
-from mwdcal.calibration.prediction import readings_at
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import FitSettings
+from mwdcal.calibration.results import readings_at
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import centred

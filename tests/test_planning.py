@@ -16,7 +16,7 @@ from mwdcal.calibration import results
 from mwdcal.calibration.diagnosis.detection import detections
 from mwdcal.calibration.diagnosis.plausibility import misfit_chances, stations_to_reshoot
 from mwdcal.calibration.estimate import fit
-from mwdcal.calibration.prediction import accuracy_at, readings_at
+from mwdcal.calibration.results import accuracy_at, readings_at
 from mwdcal.errors import FitError, InputError
 from mwdcal.files.documents import read
 from mwdcal.files.profiles import built_in, load_profile

@@ -7,7 +7,7 @@ import pytest
 
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.prediction import accuracy_at, readings_at
+from mwdcal.calibration.results import accuracy_at, readings_at
 from test_calibrate import PROFILE, make
 
 CIRCLE = np.arange(12) * np.pi / 6

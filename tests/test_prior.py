@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cli_support import SERVO_NOISE, calibrated, mwdcal, servo_run, write_csv
-from mwdcal.calibration.automatic.ageing import aged
+from mwdcal.calibration.automatic.drift import aged
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options

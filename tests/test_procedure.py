@@ -18,9 +18,8 @@ from mwdcal.calibration.options import Options
 from mwdcal.files.limits import load_limits
 from mwdcal.files.profiles import load_profile
 from mwdcal.planning import procedure as procedures
-from mwdcal.planning.plans import load_plan
+from mwdcal.planning.plans import Effects, SensorEffects, StandEffects, drawn, load_plan
 from mwdcal.planning.procedure import Procedure, Share, summarised
-from mwdcal.planning.simulate import Effects, SensorEffects, StandEffects, drawn
 from mwdcal.sensor.profile import StandProfile
 from mwdcal.use.verification import Bounds, Limits
 

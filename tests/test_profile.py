@@ -15,7 +15,7 @@ from mwdcal.files.profiles import load_profile
 from mwdcal.geometry.observables import RESULTS
 from mwdcal.geometry.vectors import tool_from_earth
 from mwdcal.identification.columns import meaning
-from mwdcal.identification.wiring import is_clear, wiring
+from mwdcal.identification.proposal import is_clear, wiring
 from terminal import at_terminal
 
 DIALECTS = list(exports.DIALECTS)

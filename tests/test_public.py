@@ -347,7 +347,7 @@ def test_short_representations(cal, rolltest):
 
 
 def test_accuracy_of_the_representation_is_the_typical_one(cal):
-    from mwdcal.calibration.prediction import typical_accuracy
+    from mwdcal.calibration.results import typical_accuracy
 
     accuracy = cal.glance()["accuracy"]
     for name, value in typical_accuracy(cal).items():

@@ -12,12 +12,12 @@ import pytest
 
 from cli_support import EXAMPLE, mwdcal, read_csv, refused, write_csv
 from mwdcal.errors import InputError
-from mwdcal.survey import earth
-from mwdcal.survey.earth import grid_convergence
+from mwdcal.survey import references
 from mwdcal.survey.references import (
     MOMENT_SD,
     PLACE_SD,
     EarthReference,
+    grid_convergence,
     load_reference,
     reference_at,
 )
@@ -37,10 +37,10 @@ def data(name):
 
 
 def test_normal_gravity_is_the_published_one():
-    at_sea_level = earth.normal_gravity([0, 45, 60, 90], 0.0)
+    at_sea_level = references.normal_gravity([0, 45, 60, 90], 0.0)
     expected = [9.7803253359, 9.806197769, 9.819176953, 9.8321849379]  # NIMA TR8350.2
     assert at_sea_level == pytest.approx(expected, abs=1e-9)
-    above = earth.normal_gravity(45.0, [500.0, 2000.0])
+    above = references.normal_gravity(45.0, [500.0, 2000.0])
     assert above == pytest.approx([9.80465515, 9.80002947], abs=5e-9)
 
 
@@ -49,14 +49,14 @@ def test_normal_gravity_is_that_of_boule():
     latitude, height = np.linspace(-90, 90, 37)[:, None], np.array([0.0, 100.0, 2000.0, 8000.0])
     latitude, height = np.broadcast_arrays(latitude, height)
     theirs = boule.WGS84.normal_gravity((None, latitude, height), si_units=True)
-    assert earth.normal_gravity(latitude, height) == pytest.approx(theirs, abs=1e-9)
+    assert references.normal_gravity(latitude, height) == pytest.approx(theirs, abs=1e-9)
 
 
 def test_normal_gravity_on_the_ellipsoid_is_somiglianas_formula():
     latitude = np.linspace(-90, 90, 181)
     s = np.sin(np.radians(latitude)) ** 2
     somigliana = 9.7803253359 * (1 + 0.00193185265241 * s) / np.sqrt(1 - 0.00669437999014 * s)
-    assert earth.normal_gravity(latitude, 0.0) == pytest.approx(somigliana, abs=1e-9)
+    assert references.normal_gravity(latitude, 0.0) == pytest.approx(somigliana, abs=1e-9)
 
 
 def geopotential(radial, axial):
@@ -84,7 +84,7 @@ def test_normal_gravity_is_the_gradient_of_the_potential(altitude):
         )
         return (8 * near - far) / (12 * step)
 
-    gravity = earth.normal_gravity(np.degrees(latitude), altitude)
+    gravity = references.normal_gravity(np.degrees(latitude), altitude)
     assert gravity == pytest.approx(np.hypot(slope(step, 0.0), slope(0.0, step)), abs=1e-9)
 
 
@@ -97,12 +97,12 @@ def moradi(latitude, doubled):
 
 def test_moradis_equation_7_holds_with_the_sine_of_twice_the_latitude():
     latitude = np.linspace(0, 90, 91)
-    exact = earth.normal_gravity(latitude, 0.0)
+    exact = references.normal_gravity(latitude, 0.0)
     meant, printed = (moradi(latitude, doubled) - exact for doubled in (True, False))
     assert np.abs(meant).max() < 1e-5  # 0.0000057 of it by another digit in the constant
     assert printed[-1] == pytest.approx(meant[-1] - 5.67e-5, abs=1e-7)  # the pole
     assert printed[45] - meant[45] == pytest.approx(2.84e-5, rel=1e-2)
-    height = earth.normal_gravity(45.0, 1000.0) - earth.normal_gravity(45.0, 0.0)
+    height = references.normal_gravity(45.0, 1000.0) - references.normal_gravity(45.0, 0.0)
     assert height == pytest.approx(-3.086e-6 * 1000, rel=1e-3)
 
 
@@ -115,8 +115,8 @@ def test_wmm2025_gives_its_100_official_values():
     assert len(rows) == 100
     for year, altitude, latitude, longitude, *official in rows:
         north, east, down, strength = official[3:7]
-        model = earth.field_model("wmm2025", year)
-        field = earth.main_field(model, latitude, longitude, 1000 * altitude, year)
+        model = references.field_model("wmm2025", year)
+        field = references.main_field(model, latitude, longitude, 1000 * altitude, year)
         horizontal = np.hypot(north, east)
         assert field.field_nt == pytest.approx(strength, abs=1e-3)
         assert field.dip_deg == pytest.approx(np.degrees(np.arctan2(down, horizontal)), abs=1e-6)
@@ -135,15 +135,15 @@ def components(field):
 
 @published
 def test_igrf_gives_the_grid_of_noaa(monkeypatch):
-    monkeypatch.setattr(earth, "_IGRF_FILE", "IGRF13.shc")  # the generation of that grid
-    earth._igrf.cache_clear()
+    monkeypatch.setattr(references, "_IGRF_FILE", "IGRF13.shc")  # the generation of that grid
+    references._igrf.cache_clear()
     with data("noaa_igrf_2022-10-05_5km.csv").open() as stream:
         rows = [list(map(float, row.values())) for row in csv.DictReader(stream)]
     fields = []
     for year, latitude, longitude, h, *_ in rows[::15]:
-        model = earth.field_model("igrf14", year)
-        fields.append(components(earth.main_field(model, latitude, longitude, 1000 * h, year)))
-    earth._igrf.cache_clear()
+        model = references.field_model("igrf14", year)
+        fields.append(components(references.main_field(model, latitude, longitude, 1000 * h, year)))
+    references._igrf.cache_clear()
     off = np.array(fields) - np.array(rows)[::15, 4:]
     # ppigrf itself is off by as much; the date matters by 0.4 nT a day.
     assert np.abs(off).max() < 5.0
@@ -160,8 +160,8 @@ def test_igrf_is_that_of_ppigrf():
         latitude, longitude = rng.uniform(-88, 88), rng.uniform(-180, 360)
         altitude = rng.uniform(-8000, 9000)
         east, north, up = ppigrf.igrf(longitude, latitude, altitude / 1000, datetime(year, 1, 1))
-        model = earth.field_model("igrf14", float(year))
-        field = earth.main_field(model, latitude, longitude, altitude, float(year))
+        model = references.field_model("igrf14", float(year))
+        field = references.main_field(model, latitude, longitude, altitude, float(year))
         theirs = [float(np.squeeze(c)) for c in (north, east, -up)]
         assert components(field) == pytest.approx(theirs, abs=tolerance), year
 
@@ -172,7 +172,7 @@ def test_the_field_is_that_of_a_library_everywhere_and_at_the_poles():
     rng, theirs = np.random.default_rng(15), pygeomag.GeoMag(coefficients_file="wmm/WMM_2025.COF")
     places = rng.uniform((-90, -180, -9000, 2025), (90, 360, 20_000, 2030), (60, 4))
     places[:4, 0] = 90.0, -90.0, 0.0, 90.0
-    ours = earth.main_fields(earth.field_model("wmm2025", 2025.0), *places.transpose())
+    ours = references.main_fields(references.field_model("wmm2025", 2025.0), *places.transpose())
     for found, (latitude, longitude, altitude, year) in zip(ours, places, strict=True):
         seen = theirs.calculate(latitude, longitude, altitude / 1000, year)
         assert found == pytest.approx((seen.x, seen.y, seen.z), abs=1e-4)
@@ -180,13 +180,13 @@ def test_the_field_is_that_of_a_library_everywhere_and_at_the_poles():
 
 def test_fields_of_many_places_and_dates_are_those_of_each():
     model, spots = (
-        earth.field_model("igrf14", 2025.0),
+        references.field_model("igrf14", 2025.0),
         [(60.0, 3.5, 0.0, 2025.5), (-90.0, 9.0, 1e4, 2029.0)],
     )
-    together = earth.main_fields(model, *np.transpose(spots))
+    together = references.main_fields(model, *np.transpose(spots))
     assert together.shape == (2, 3)
     for found, spot in zip(together, spots, strict=True):
-        alone = earth.main_field(model, *spot)
+        alone = references.main_field(model, *spot)
         assert components(alone) == pytest.approx(found, abs=1e-6)
 
 
@@ -194,7 +194,7 @@ def test_both_models_agree_within_what_their_makers_state():
     day, spots = 2026.5, [(60.0, 3.5), (-33.0, 151.0), (29.4, -98.5), (25.0, 51.0), (0.0, 120.0)]
     for latitude, longitude in spots:
         wmm, igrf = (
-            earth.main_field(earth.field_model(name, day), latitude, longitude, 0.0, day)
+            references.main_field(references.field_model(name, day), latitude, longitude, 0.0, day)
             for name in ("wmm2025", "igrf14")
         )
         assert abs(wmm.field_nt - igrf.field_nt) < 20
@@ -205,7 +205,7 @@ def test_both_models_agree_within_what_their_makers_state():
 def test_the_epoch_of_igrf_is_the_last_one_before_the_date():
     epochs = {1900.0: 1900.0, 1904.9: 1900.0, 2022.7: 2020.0, 2025.0: 2025.0, 2030.0: 2025.0}
     for year, epoch in epochs.items():
-        model = earth.field_model("igrf14", year)
+        model = references.field_model("igrf14", year)
         assert (model.epoch, model.valid_to) == (epoch, 2030.0)
         assert "IGRF14.shc of ppigrf" in model.coefficients
         assert len(model.sha256) == 64
@@ -416,7 +416,7 @@ def test_the_north_of_a_run_that_contradicts_the_place_is_named(tmp_path):
     ("name", "options"), [("pygeomag", ()), ("pyproj", ("--crs", "EPSG:23031"))]
 )
 def test_a_missing_library_says_what_to_install(monkeypatch, name, options):
-    earth._wmm.cache_clear()
+    references._wmm.cache_clear()
     monkeypatch.setitem(sys.modules, name, None)
     message = refused(mwdcal("reference", *TYPED, *options), 2)
     assert f"needs {name}" in message

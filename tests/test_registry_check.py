@@ -15,8 +15,7 @@ import sqlalchemy as sa
 
 from mwdcal.errors import InputError
 from mwdcal.registry import checking, stored
-from mwdcal.registry.setup import create
-from mwdcal.registry.store import Entry, open_registry
+from mwdcal.registry.store import Entry, create, open_registry
 from registry_support import calibration, drop_database, empty_database
 
 TABLES = ("objects", "records", "withdrawals", "history", "tools", "alembic_version")

@@ -9,12 +9,11 @@ from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 
 from mwdcal.errors import InputError
-from mwdcal.registry import checking, queries
+from mwdcal.registry import checking, lookup
 from mwdcal.registry.database import migrating, models
 from mwdcal.registry.database.connections import connect
 from mwdcal.registry.database.schema import SCHEMA_VERSION_OF_REGISTRY
-from mwdcal.registry.setup import move_to, upgrade
-from mwdcal.registry.store import open_registry
+from mwdcal.registry.store import move_to, open_registry, upgrade
 from registry_support import registry_database
 
 database = pytest.fixture(params=["sqlite", "postgresql"])(registry_database)
@@ -38,7 +37,7 @@ def filled_at(database, revision):
         for table, row in frozen_rows():
             connection.execute(sa.insert(models.metadata.tables[table]), row)
         if revision >= "0002":
-            from mwdcal.registry.database.tools import refresh_all
+            from mwdcal.registry.database.schema import refresh_all
 
             refresh_all(connection)
     place.engine.dispose()
@@ -73,7 +72,7 @@ def test_a_registry_of_each_version_goes_up_and_down_with_its_content(database, 
     upgrade(database, "Ada")
     with open_registry(database) as registry:
         assert checking.check(registry) == []
-        assert [row["serial"] for row in queries.tools_page(registry).rows] == ["A-0", "A-1", "A-2"]
+        assert [row["serial"] for row in lookup.tools_page(registry).rows] == ["A-0", "A-1", "A-2"]
     assert content(database)[0] == rows
     move_to(database, revision, "Ada")
     changed = revision != SCHEMA_VERSION_OF_REGISTRY

@@ -9,10 +9,9 @@ import pytest
 import sqlalchemy as sa
 
 from mwdcal.errors import MwdcalError
-from mwdcal.registry import exports, lookup, queries, stored
+from mwdcal.registry import exports, lookup, stored
 from mwdcal.registry.database import models
-from mwdcal.registry.setup import create
-from mwdcal.registry.store import Entry, open_registry
+from mwdcal.registry.store import Entry, create, open_registry
 from registry_support import calibration, drop_database, empty_database
 from test_registry_check import PostgresqlTables, sound, without_triggers
 
@@ -25,10 +24,10 @@ def answers(database, folder):
     questions = {
         "serial": lambda registry: lookup.document(registry, "A-1"),
         "latest": lambda registry: lookup.latest_file(registry, "A-1").record,
-        "drift": lambda registry: [*queries.calibrations(registry, "A-1")],
+        "drift": lambda registry: [*lookup.calibrations(registry, "A-1")],
         "export": lambda registry: exported(registry, folder),
         **{
-            f"record {n}": lambda registry, n=n: queries.document(registry, n)
+            f"record {n}": lambda registry, n=n: lookup.numbered(registry, n)
             for n in (2, 7, 10, 13, 14)
         },
     }
@@ -202,7 +201,7 @@ def test_tools_are_found_in_any_case_and_form_of_their_letters(request, tmp_path
         registry.add([Entry("calibration", calibration(s), "a.json") for s in SPELLINGS], "Ada")
         for serial, words in SPELLINGS.items():
             for word in words:
-                found = [row["serial"] for row in queries.tools_page(registry, word).rows]
+                found = [row["serial"] for row in lookup.tools_page(registry, word).rows]
                 assert found == [serial], word
-        assert queries.tools_page(registry, "servo").total == len(SPELLINGS)  # by type
-        assert queries.tools_page(registry, ".*").total == 0
+        assert lookup.tools_page(registry, "servo").total == len(SPELLINGS)  # by type
+        assert lookup.tools_page(registry, ".*").total == 0

@@ -14,10 +14,9 @@ import sqlalchemy as sa
 from cli_support import mwdcal
 from mwdcal.errors import InputError
 from mwdcal.files import documents
-from mwdcal.registry import checking, copies, lookup, queries
-from mwdcal.registry.database import connections, places
-from mwdcal.registry.setup import create, upgrade
-from mwdcal.registry.store import Entry, open_registry
+from mwdcal.registry import checking, exports, lookup
+from mwdcal.registry.database import connections
+from mwdcal.registry.store import Entry, create, open_registry, upgrade
 from registry_support import calibration
 
 ENTRY = Entry("calibration", calibration("A-1"), "a.json")
@@ -94,7 +93,7 @@ def test_a_registry_is_not_created_twice(registry_file):
     with refused("is not empty"):
         create(registry_file, "Ada")
     with refused("is not empty"):
-        copies.restore(registry_file, registry_file, "Ada")
+        exports.restore(registry_file, registry_file, "Ada")
     assert registry_file.read_bytes() == before
 
 
@@ -167,7 +166,7 @@ def test_a_registry_that_may_not_be_written_is_read(file, folder, in_use):
             path.chmod(file)
             place.chmod(folder)
             with another_user(), open_registry(path) as registry:
-                assert queries.tools_page(registry).total == 1
+                assert lookup.tools_page(registry).total == 1
                 assert checking.check(registry) == []
                 assert lookup.document(registry, "A-1")[1] == ENTRY.data
     finally:
@@ -196,11 +195,11 @@ def test_network_drives(registry_file, monkeypatch, tmp_path):
     mounts = tmp_path / "mounts"
     folder = str(tmp_path).replace(" ", "\\040")
     mounts.write_text(f"disk / ext4 rw 0 0\nnas:/tools {folder} nfs4 rw 0 0\n")
-    monkeypatch.setattr(places, "_MOUNTS", mounts)
+    monkeypatch.setattr(connections, "_MOUNTS", mounts)
     for call in (opened, lambda p: create(p, "Ada")):
         with refused("network drive", "PostgreSQL"):
             call(registry_file)
-    monkeypatch.setattr(places, "_MOUNTS", tmp_path / "none")  # not Linux
+    monkeypatch.setattr(connections, "_MOUNTS", tmp_path / "none")  # not Linux
     opened(registry_file)
 
 
@@ -210,7 +209,7 @@ def test_network_drives(registry_file, monkeypatch, tmp_path):
 )
 def test_the_file_system_of_a_place(place, kind):
     mounts = "d / ext4 rw 0 0\n//nas/x /mnt/my\\040nas cifs rw 0 0\nd /srv nfs rw 0 0\nd /srv xfs rw 0 0\n"
-    assert places.file_system(Path(place), mounts) == kind
+    assert connections.file_system(Path(place), mounts) == kind
 
 
 def test_paths_of_windows_are_no_urls():

@@ -7,10 +7,9 @@ import pytest
 import sqlalchemy as sa
 
 from cli_support import mwdcal
-from mwdcal.registry import checking, copies, queries
+from mwdcal.registry import checking, exports, lookup
 from mwdcal.registry.database.models import objects
-from mwdcal.registry.setup import create
-from mwdcal.registry.store import Entry, open_registry
+from mwdcal.registry.store import Entry, create, open_registry
 from registry_support import calibration, registry_database
 from test_registry_check import PostgresqlTables, without_triggers
 
@@ -24,7 +23,7 @@ def test_what_is_added_comes_back_once(database):
         first, again = registry.add([entry], "Ada"), registry.add([entry], "Ben")
         assert [(a.new, a.number) for a in (*first, *again)] == [(True, 2), (False, 2)]
         assert registry.content(first[0].sha256) == entry.data
-        assert queries.tools_page(registry).rows[0]["inclination_deg"] == 0.03
+        assert lookup.tools_page(registry).rows[0]["inclination_deg"] == 0.03
         assert checking.check(registry) == []
 
 
@@ -34,12 +33,12 @@ def test_a_backup_is_the_registry(database, tmp_path):
         registry.add(
             [Entry("calibration", calibration(f"A-{i}"), "a.json") for i in range(5)], "Ada"
         )
-        head = copies.backup(registry, tmp_path / "backup.registry")
+        head = exports.backup(registry, tmp_path / "backup.registry")
         assert head == registry.head()[1]
-    copies.restore(tmp_path / "backup.registry", tmp_path / "new.registry", "Ada")
+    exports.restore(tmp_path / "backup.registry", tmp_path / "new.registry", "Ada")
     with open_registry(tmp_path / "new.registry") as registry:
         assert checking.check(registry, head=head) == []
-        assert queries.counts(registry)["calibration"] == 5
+        assert lookup.counts(registry)["calibration"] == 5
 
 
 def rot(database):
@@ -74,7 +73,7 @@ def test_a_rotten_registry_never_replaces_a_good_backup(database, tmp_path):
         assert "was altered or is damaged (the calibration" in ran.err
         assert "was not written" in ran.err
         assert file.read_bytes() == good
-    copies.restore(file, tmp_path / "new.registry", "Ada")
+    exports.restore(file, tmp_path / "new.registry", "Ada")
     with open_registry(tmp_path / "new.registry") as registry:
         assert checking.check(registry, head=heads[-1]) == []
-        assert queries.counts(registry)["calibration"] == 9
+        assert lookup.counts(registry)["calibration"] == 9

@@ -12,10 +12,9 @@ import pytest
 import sqlalchemy as sa
 
 from mwdcal.errors import FitError, InputError
-from mwdcal.registry import checking, copies, queries
+from mwdcal.registry import checking, exports, lookup
 from mwdcal.registry.database import models
-from mwdcal.registry.setup import create
-from mwdcal.registry.store import Entry, open_registry
+from mwdcal.registry.store import Entry, create, open_registry
 from registry_stress import acknowledged_in, losses, stressed, write_on, writers_context
 from registry_support import calibration, empty_database, registry_database
 
@@ -50,7 +49,7 @@ def test_a_backup_among_writers_holds_what_was_acknowledged_before(database, tmp
             before = [sha for call in acknowledged_in(tmp_path, {}) for sha in call]
             path = tmp_path / f"{number}.backup"
             with open_registry(database) as registry:
-                head = copies.backup(registry, path)
+                head = exports.backup(registry, path)
                 assert checking.check(registry, head) == []  # while it goes on
             with open_registry(path) as kept:
                 assert checking.check(kept, head) == []
@@ -72,14 +71,14 @@ def test_a_backup_restored_into_either_database_is_the_same(database, to, tmp_pa
             [Entry("calibration", calibration(f"A-{i}"), "a.json") for i in range(9)], "Ada"
         )
         registry.withdraw(added[3].number, "wrong tool", "Ben")
-        head = copies.backup(registry, tmp_path / "tools.backup")
+        head = exports.backup(registry, tmp_path / "tools.backup")
         rows = everything(registry)
     url = to == "postgresql"
     target = empty_database(request.getfixturevalue("postgresql")) if url else tmp_path / "new"
-    assert copies.restore(tmp_path / "tools.backup", target, "Eve") == head
+    assert exports.restore(tmp_path / "tools.backup", target, "Eve") == head
     with open_registry(target) as registry:
         assert checking.check(registry, head) == []
-        newest = queries.events(registry, limit=1).rows[0]
+        newest = lookup.events(registry, limit=1).rows[0]
         assert (newest["action"], newest["subject"], newest["actor"]) == ("restore", head, "Eve")
         again = everything(registry)
         again["history"].pop()
@@ -101,13 +100,13 @@ def test_an_altered_backup_is_not_restored(tmp_path):
     create(tmp_path / "tools.registry", "Ada")
     with open_registry(tmp_path / "tools.registry") as registry:
         registry.add([Entry("calibration", calibration("A-1"), "a.json")], "Ada")
-        copies.backup(registry, tmp_path / "tools.backup")
+        exports.backup(registry, tmp_path / "tools.backup")
     with closing(sqlite3.connect(tmp_path / "tools.backup")) as connection:
         connection.execute("DROP TRIGGER records_no_update")
         connection.execute("UPDATE records SET inclination_deg = 0.01")
         connection.commit()
     with pytest.raises(FitError, match="was altered or is damaged"):
-        copies.restore(tmp_path / "tools.backup", tmp_path / "new.registry", "Ada")
+        exports.restore(tmp_path / "tools.backup", tmp_path / "new.registry", "Ada")
     assert not (tmp_path / "new.registry").exists()
 
 
@@ -115,18 +114,18 @@ def test_a_backup_that_cannot_be_written_leaves_nothing(tmp_path):
     create(tmp_path / "tools.registry", "Ada")
     with open_registry(tmp_path / "tools.registry") as registry:
         with pytest.raises(InputError, match="does not exist"):
-            copies.backup(registry, tmp_path / "no" / "tools.backup")
+            exports.backup(registry, tmp_path / "no" / "tools.backup")
         with pytest.raises(InputError, match="registry itself"):
-            copies.backup(registry, tmp_path / "tools.registry")
-        copies.backup(registry, tmp_path / "tools.backup")
-        copies.backup(registry, tmp_path / "tools.backup")  # replaces the older
+            exports.backup(registry, tmp_path / "tools.registry")
+        exports.backup(registry, tmp_path / "tools.backup")
+        exports.backup(registry, tmp_path / "tools.backup")  # replaces the older
     assert sorted(p.name for p in tmp_path.iterdir()) == ["tools.backup", "tools.registry"]
 
 
 CREATION = """
 import sys
 from mwdcal.registry.database import connections, migrating
-from mwdcal.registry.setup import create
+from mwdcal.registry.store import create
 import os, signal
 
 def kill(*arguments):

@@ -18,16 +18,11 @@ from markupsafe import Markup
 
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.prediction import (
-    accuracy_at,
-    accuracy_curves,
-    readings_at,
-    typical_accuracy,
-)
 from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.results import accuracy_at, accuracy_curves, readings_at, typical_accuracy
 from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import reference_vectors
-from mwdcal.planning import simulate
+from mwdcal.planning import plans
 from mwdcal.presentation import calibration as screen
 from mwdcal.presentation import calibration_page, conversion
 from mwdcal.presentation.calibration_page import render
@@ -79,10 +74,8 @@ def calibrated(drop=(), magnetometer=True, moved=True, profile=SERVO, **metadata
 
 @cache
 def soaked(unknown=()):
-    stations = simulate.grid([5.0, 45.0, 90.0, 135.0], 6, [0, 90, 200, 300], [25.0, 65.0, 105.0])
-    made = simulate.run(
-        simulate.servo(np.random.default_rng(5)), stations, np.random.default_rng(6)
-    )
+    stations = plans.grid([5.0, 45.0, 90.0, 135.0], 6, [0, 90, 200, 300], [25.0, 65.0, 105.0])
+    made = plans.run(plans.servo(np.random.default_rng(5)), stations, np.random.default_rng(6))
     known = {k: v for k, v in made.known.items() if k not in unknown}
     return replace(made, source="hot.csv", known=known)
 

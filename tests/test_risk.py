@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mwdcal.use.risk import guard_factor, probability_within, risk_of_all
+from mwdcal.use.verification import guard_factor, probability_within, risk_of_all
 
 
 @pytest.mark.parametrize(

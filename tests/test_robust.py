@@ -11,7 +11,7 @@ from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.residuals import Residuals
 from mwdcal.errors import FitError, InputError
-from mwdcal.estimation.robust import consistency, inflation, weight
+from mwdcal.estimation.solvers import consistency, inflation, weight
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.sensor.profile import Profile
 from simulation import DEG, Tool, bound, plan

@@ -18,7 +18,7 @@ from mwdcal.estimation.drift import terms_of, walk_scores
 from mwdcal.files.formats.table import Table
 from mwdcal.geometry.vectors import earth_field, earth_gravity, tool_from_earth
 from mwdcal.planning.expected import expected
-from mwdcal.planning.simulate import drifted
+from mwdcal.planning.plans import drifted
 from mwdcal.presentation.calibration import remarks
 from mwdcal.sensor.profile import Profile, StandProfile, TriadProfile
 

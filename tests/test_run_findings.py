@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mwdcal.calibration.calibrate import calibrate
-from mwdcal.calibration.diagnosis.repeats import resolution
+from mwdcal.calibration.diagnosis.findings import resolution
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings, fingerprints
 from mwdcal.errors import FitError

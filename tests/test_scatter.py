@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mwdcal.calibration.automatic.nonlinearity import scattered
+from mwdcal.calibration.automatic.auto import scattered
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings

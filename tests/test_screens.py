@@ -21,8 +21,8 @@ import numpy as np
 import pytest
 
 from cli_support import called, commands, mwdcal, read_csv, servo_run, write_csv
-from mwdcal.app import cli, progress
-from mwdcal.certificate import keys, signature
+from mwdcal.app import cli, messages
+from mwdcal.certificate import signature
 from mwdcal.presentation import text
 
 STORED = Path(__file__).parent / "screens"
@@ -250,9 +250,9 @@ def write_key(path, owner):
     private = curve.from_private_bytes(bytes(32))
     with (
         patch.object(curve, "generate", lambda: private),
-        patch.object(keys, "now", lambda: "2026-01-01T00:00:00+00:00"),
+        patch.object(signature, "now", lambda: "2026-01-01T00:00:00+00:00"),
     ):
-        keys.create(path, owner, "")
+        signature.create(path, owner, "")
 
 
 def dated(demo, folder):
@@ -284,8 +284,8 @@ def files(tmp_path_factory):
 @pytest.fixture
 def work(files, computed_once, tmp_path, monkeypatch):
     """A copy of the files to run in; nothing is said of how far a command is."""
-    monkeypatch.setattr(progress.slowly, "__defaults__", (600.0,))
-    monkeypatch.setattr(progress, "PATIENCE", 600.0)
+    monkeypatch.setattr(messages.slowly, "__defaults__", (600.0,))
+    monkeypatch.setattr(messages, "PATIENCE", 600.0)
     monkeypatch.chdir(shutil.copytree(files, tmp_path / "work"))
 
 
@@ -465,8 +465,8 @@ def test_a_quiet_completion_prints_nothing():
 
 
 if __name__ == "__main__":
-    progress.PATIENCE = 600.0
-    progress.slowly.__defaults__ = (600.0,)
+    messages.PATIENCE = 600.0
+    messages.slowly.__defaults__ = (600.0,)
     with tempfile.TemporaryDirectory() as place:
         prepared(Path(place))
         os.chdir(place)

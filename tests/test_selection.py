@@ -8,12 +8,12 @@ import pytest
 
 from cli_support import mwdcal, servo_run, write_csv
 from mwdcal.calibration.automatic import drift
-from mwdcal.calibration.automatic.order_selection import choose_order, order_errors
+from mwdcal.calibration.automatic.auto import choose_order, order_errors
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.record import Calibration, OrderScore
 from mwdcal.geometry.vectors import reference_vectors
-from mwdcal.planning.simulate import StationPlan, grid, run, servo
+from mwdcal.planning.plans import StationPlan, grid, run, servo
 from mwdcal.sensor.profile import Profile
 
 PROFILE = Profile(name="test tool")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mwdcal.calibration.settings import is_assumed, settings_of
+from mwdcal.calibration.options import is_assumed, settings_of
 from mwdcal.errors import InputError
 from mwdcal.library.arrays import readings
 

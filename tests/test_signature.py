@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 
 from cli_support import EXAMPLE, ROOT, calibrated, mwdcal, process, refused, servo_run, write_csv
-from mwdcal.certificate import keys, signature
-from mwdcal.certificate import keys as key_files
+from mwdcal.certificate import signature
+from mwdcal.certificate import signature as key_files
 from mwdcal.errors import InputError
 from mwdcal.files import documents
 from mwdcal.files.formats.members import Member
@@ -192,7 +192,7 @@ def test_a_changed_byte_is_detected_in_1000_of_1000(tmp_path, files, key, docume
     else:
         path = certificate(tmp_path)
     data = signed(path, key).read_bytes()
-    trusted = keys.trusted([key.with_name("lab.key.pub")])
+    trusted = signature.trusted([key.with_name("lab.key.pub")])
     assert signature.check(data, trusted).state == "intact"
     trials = list(changed_bytes(data, random.Random(8032), 1100))[:1000]
     states = [signature.check(other, trusted).state for other in trials]
@@ -204,7 +204,7 @@ def test_a_changed_byte_is_detected_in_1000_of_1000(tmp_path, files, key, docume
 def test_every_character_of_the_signature_counts(tmp_path, key, public):
     """Base64 has several spellings of the same bytes; only one is accepted."""
     data = signed(certificate(tmp_path), key).read_bytes()
-    trusted = keys.trusted([public])
+    trusted = signature.trusted([public])
     value = json.loads(data)["signature"]["value"]
     for at, character in enumerate(value):
         for other in "ABQgw019+/=":
@@ -329,7 +329,7 @@ def test_rotation_and_revocation(tmp_path, key, public):
     for place, retired in enumerate(("2001-01-02T00:00:00+12:00", "2001-01-01T13:00:00+00:00")):
         other = written.replace('"retired": ""', f'"retired": "{retired}"')
         (tmp_path / f"{place}.json").write_text(other)
-    both = keys.trusted([tmp_path / "1.json", tmp_path / "0.json"])
+    both = signature.trusted([tmp_path / "1.json", tmp_path / "0.json"])
     assert (
         both[digits].retired == "2001-01-02T00:00:00+12:00"
     )  # the earlier: 12:00 UTC of the first

@@ -17,9 +17,7 @@ from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.files.profiles import built_in, load_profile
-from mwdcal.planning.plans import load_plan
-from mwdcal.planning.session import Session, tool_facts
-from mwdcal.planning.simulate import (
+from mwdcal.planning.plans import (
     EarthEffects,
     Effects,
     SensorEffects,
@@ -27,8 +25,10 @@ from mwdcal.planning.simulate import (
     TemperatureEffects,
     drawn,
     load_effects,
+    load_plan,
     simulated,
 )
+from mwdcal.planning.session import Session, tool_facts
 from mwdcal.sensor.models import factor_parts
 from mwdcal.sensor.profile import StandProfile
 from simulation import DEG, attitude

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import mwdcal
 from cli_support import EXAMPLE, calibrated, refused, servo_run, write_csv
 from cli_support import mwdcal as command
-from mwdcal.calibration.diagnosis.soundness import invertible, is_covariance, mirrored
+from mwdcal.calibration.diagnosis.plausibility import invertible, is_covariance, mirrored
 from mwdcal.calibration.record import LARGEST_ANGLE_SD
 from mwdcal.errors import InputError
 from simulation import DEG

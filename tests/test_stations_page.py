@@ -16,7 +16,7 @@ from test_stations import ACC, tumble
 pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")
 
-from mwdcal.presentation.stations_page import figure
+from mwdcal.presentation.stations import figure
 
 VOID = ("meta", "br", "use", "path")
 

@@ -24,7 +24,7 @@ from cli_support import (
     servo_run,
     write_csv,
 )
-from mwdcal.app import progress, streaming
+from mwdcal.app import correction, messages
 from mwdcal.app.correction import apply_to_table
 from mwdcal.errors import InputError
 from mwdcal.files import documents, streams
@@ -57,7 +57,7 @@ def cold(tmp_path_factory):
 @pytest.fixture
 def small_pieces(monkeypatch):
     """Every text table is long, and read in pieces of a few lines."""
-    monkeypatch.setattr(streaming, "TABLE_SIZES", dict.fromkeys(streaming.TABLE_SIZES, 0))
+    monkeypatch.setattr(correction, "TABLE_SIZES", dict.fromkeys(correction.TABLE_SIZES, 0))
     monkeypatch.setattr(streams, "PIECE", 3000)
 
 
@@ -115,7 +115,7 @@ def test_parts_of_any_size_give_the_whole(tmp_path, warm, least, group):
     wanted, findings = whole(made, source)
     out = tmp_path / "out.parquet"
     seen = []
-    told = streaming.apply_to_file(
+    told = correction.apply_to_file(
         made, source, out, "blank", lambda *done: seen.append(done), rows=321, least=least
     )
     assert (told[0].rows, told[1]) == (5000, findings)
@@ -135,11 +135,11 @@ def test_rows_outside_the_temperatures(tmp_path, warm, outside, least):
         with pytest.raises(InputError) as wanted:
             whole(warm[1], source, outside)
         with pytest.raises(InputError) as found:
-            streaming.apply_to_file(*arguments, rows=300, least=least)
+            correction.apply_to_file(*arguments, rows=300, least=least)
         assert str(found.value) == str(wanted.value)
         assert [f.name for f in tmp_path.iterdir()] == ["log.parquet"]
     else:
-        streaming.apply_to_file(*arguments, rows=300, least=least)
+        correction.apply_to_file(*arguments, rows=300, least=least)
         assert_same(out, whole(warm[1], source, outside)[0])
 
 
@@ -165,7 +165,7 @@ def test_columns_of_every_type_are_carried_through(tmp_path, cold):
     source = write_parquet(tmp_path / "log.parquet", columns, row_group_size=100)
     for least in PARTS.values():
         out = tmp_path / "out.parquet"
-        streaming.apply_to_file(cold[1], source, out, "blank", rows=64, least=least)
+        correction.apply_to_file(cold[1], source, out, "blank", rows=64, least=least)
         before, after = parquet.read_table(source), parquet.read_table(out)
         assert after.schema.names == [*columns, *CORRECTED]
         for name in columns:
@@ -175,7 +175,7 @@ def test_columns_of_every_type_are_carried_through(tmp_path, cold):
         for name in CORRECTED:
             np.testing.assert_allclose(after[name].to_numpy(), wanted.columns[name], atol=1e-6)
     text = tmp_path / "out.csv"
-    streaming.apply_to_file(cold[1], source, text, "blank", rows=64)
+    correction.apply_to_file(cold[1], source, text, "blank", rows=64)
     table.write(tmp_path / "whole.csv", wanted)
     ours, theirs = (read_csv(p) for p in (text, tmp_path / "whole.csv"))
     for name in ("label", "place", "when", "good", "none"):
@@ -285,8 +285,8 @@ def test_rows_that_lack_a_reading(tmp_path, warm, small_pieces, holes, outside, 
     )
     out, options = tmp_path / f"out{suffix}", {"rows": 200, "least": PARTS[least]}
     with pytest.raises(InputError, match="blank"):
-        streaming.apply_to_file(warm[1], source, out, outside, **options)
-    told = streaming.apply_to_file(warm[1], source, out, outside, missing="blank", **options)
+        correction.apply_to_file(warm[1], source, out, outside, **options)
+    told = correction.apply_to_file(warm[1], source, out, outside, missing="blank", **options)
     wanted, findings = whole(warm[1], source, outside, "blank")
     assert (told[0].rows, told[1]) == (1200, findings)
     assert_same(out, wanted)
@@ -336,7 +336,7 @@ def test_what_is_wrong_is_not_missing(tmp_path, warm, small_pieces, suffix):
     write = write_parquet if suffix == ".parquet" else write_csv
     source, out = write(tmp_path / f"log{suffix}", columns), tmp_path / "out.parquet"
     with pytest.raises(InputError) as found:
-        streaming.apply_to_file(warm[1], source, out, "blank", rows=500, missing="blank")
+        correction.apply_to_file(warm[1], source, out, "blank", rows=500, missing="blank")
     with pytest.raises(InputError) as wanted:
         whole(warm[1], source, "blank", "blank")
     assert str(found.value) == str(wanted.value)
@@ -385,7 +385,7 @@ def test_marks_are_truth_values_where_the_format_has_them(tmp_path, warm, suffix
 
 def test_the_index_of_pandas_is_left_out(tmp_path, cold):
     source = write_parquet(tmp_path / "l.parquet", {**log(50), "__index_level_0__": np.arange(50)})
-    streaming.apply_to_file(cold[1], source, tmp_path / "out.parquet", "blank")
+    correction.apply_to_file(cold[1], source, tmp_path / "out.parquet", "blank")
     assert "__index_level_0__" not in parquet.read_schema(tmp_path / "out.parquet").names
 
 
@@ -413,7 +413,7 @@ def test_one_wrong_cell_far_down_is_named_and_nothing_is_left(tmp_path, warm, wr
     out = tmp_path / "out.parquet"
     out.write_bytes(b"old")
     with pytest.raises(InputError) as found:
-        streaming.apply_to_file(warm[1], source, out, "blank", least=least)
+        correction.apply_to_file(warm[1], source, out, "blank", least=least)
     assert str(found.value) == str(wanted.value)
     assert f"row 70001, column '{wrong[0]}'" in str(found.value)
     assert out.read_bytes() == b"old"
@@ -431,14 +431,14 @@ def test_columns_that_are_blank_for_a_while(tmp_path, cold, names, how):
     out = tmp_path / "out.parquet"
     for least in PARTS.values():
         if how == "all":
-            told = streaming.apply_to_file(cold[1], source, out, "blank", rows=500, least=least)
+            told = correction.apply_to_file(cold[1], source, out, "blank", rows=500, least=least)
             assert told[1] == whole(cold[1], source)[1]
             assert_same(out, whole(cold[1], source)[0])
         else:
             with pytest.raises(InputError) as wanted:
                 whole(cold[1], source)
             with pytest.raises(InputError) as found:
-                streaming.apply_to_file(cold[1], source, out, "blank", rows=500, least=least)
+                correction.apply_to_file(cold[1], source, out, "blank", rows=500, least=least)
             assert str(found.value) == str(wanted.value)
 
 
@@ -451,7 +451,7 @@ def test_references_are_checked_too(tmp_path, cold, column, value):
     with pytest.raises(InputError) as wanted:
         whole(cold[1], source)
     with pytest.raises(InputError) as found:
-        streaming.apply_to_file(cold[1], source, tmp_path / "o.parquet", "blank", rows=500)
+        correction.apply_to_file(cold[1], source, tmp_path / "o.parquet", "blank", rows=500)
     assert str(found.value) == str(wanted.value)
 
 
@@ -501,7 +501,7 @@ def test_interrupted_it_leaves_the_old_file(tmp_path, warm, monkeypatch, small_p
     def interrupt(*given):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(streaming.ParquetSink, when, interrupt)
+    monkeypatch.setattr(correction.ParquetSink, when, interrupt)
     assert mwdcal("apply", warm[0], source, "-o", out).code == 130
     assert out.read_bytes() == b"old"
     assert {f.name for f in tmp_path.iterdir()} == {"log.parquet", "out.parquet"}
@@ -513,7 +513,7 @@ def caught_writing(folder, calibration):
     In many short sleeps: a signal that comes just before one does not wake from it.
     """
     slow = (
-        f"import sys, time, {streaming.__name__} as streaming\nfrom mwdcal.app.cli import main\n"
+        f"import sys, time, {correction.__name__} as streaming\nfrom mwdcal.app.cli import main\n"
         "def write(*given):\n    print('writing', flush=True)\n"
         "    for _ in range(2000):\n        time.sleep(0.01)\n"
         "streaming.ParquetSink.write = write\nmain(sys.argv[1:])\n"
@@ -587,7 +587,7 @@ def text(folder, change=lambda s: s, count=120):
 def test_text_in_pieces_gives_the_whole(tmp_path, warm, small_pieces, change, suffix, least):
     source, out = text(tmp_path, change), tmp_path / f"out{suffix}"
     wanted, findings = whole(warm[1], source)
-    told = streaming.apply_to_file(warm[1], source, out, "blank", least=least)
+    told = correction.apply_to_file(warm[1], source, out, "blank", least=least)
     assert (told[0].rows, told[1]) == (120, findings)
     table.write(tmp_path / f"whole{suffix}", wanted)
     found = table.read(out)
@@ -631,7 +631,7 @@ def test_text_that_is_refused_is_refused_alike(tmp_path, warm, small_pieces, cha
     outcomes = []
     for run in (
         lambda: whole(warm[1], source),
-        lambda: streaming.apply_to_file(warm[1], source, tmp_path / "o.csv", "blank", least=least),
+        lambda: correction.apply_to_file(warm[1], source, tmp_path / "o.csv", "blank", least=least),
     ):
         try:
             run()
@@ -696,16 +696,16 @@ def test_a_corrected_table_has_one_line_of_findings(tmp_path, warm, small_pieces
 def test_parquet_and_long_text_are_taken_in_parts_where_the_formats_allow_it(tmp_path, monkeypatch):
     short = write_csv(tmp_path / "a.csv", log(50))
     packed = write_parquet(tmp_path / "a.parquet", log(1))
-    assert not streaming.in_parts(short, tmp_path / "o.csv")
-    assert streaming.in_parts(packed, tmp_path / "o.csv")
-    monkeypatch.setattr(streaming, "TABLE_SIZES", dict.fromkeys(streaming.TABLE_SIZES, 100))
+    assert not correction.in_parts(short, tmp_path / "o.csv")
+    assert correction.in_parts(packed, tmp_path / "o.csv")
+    monkeypatch.setattr(correction, "TABLE_SIZES", dict.fromkeys(correction.TABLE_SIZES, 100))
     for source in (short, packed):
-        assert streaming.in_parts(source, tmp_path / "o.csv")
-        assert not streaming.in_parts(source, tmp_path / "o.xlsx")
-    assert not streaming.in_parts(tmp_path / "none.parquet", tmp_path / "o.csv")
-    assert not streaming.in_parts(tmp_path, tmp_path / "o.csv")
+        assert correction.in_parts(source, tmp_path / "o.csv")
+        assert not correction.in_parts(source, tmp_path / "o.xlsx")
+    assert not correction.in_parts(tmp_path / "none.parquet", tmp_path / "o.csv")
+    assert not correction.in_parts(tmp_path, tmp_path / "o.csv")
     monkeypatch.setattr(streams, "find_spec", lambda name: None)  # without PyArrow
-    assert not streaming.in_parts(short, tmp_path / "o.csv")
+    assert not correction.in_parts(short, tmp_path / "o.csv")
 
 
 def test_work_overlaps_keeps_its_order_and_stops_at_an_error():
@@ -725,10 +725,10 @@ def test_work_overlaps_keeps_its_order_and_stops_at_an_error():
 
     found = []
     with pytest.raises(InputError, match="thirty"):
-        found.extend(streaming.overlapped(items(), work))
+        found.extend(correction.overlapped(items(), work))
     assert found == [] or found == [i * i for i in range(30)]
     assert max(taken) < 45
-    stopped = streaming.overlapped(items(), work)
+    stopped = correction.overlapped(items(), work)
     assert [next(stopped), next(stopped)] == [0, 1]
     stopped.close()
 
@@ -744,10 +744,10 @@ class Terminal(io.StringIO):
 def test_progress_is_shown_on_a_terminal_and_only_to_the_patient(
     monkeypatch, stream, patience, seen
 ):
-    monkeypatch.setattr(progress, "PATIENCE", patience)
+    monkeypatch.setattr(messages, "PATIENCE", patience)
     monkeypatch.setattr(sys, "stderr", shown := stream())
     limit, before = time.monotonic() + 20, {*threading.enumerate()}
-    with progress.bar("correcting") as advance:  # nothing is told, as while a workbook is written
+    with messages.bar("correcting") as advance:  # nothing is told, as while a workbook is written
         while seen and "correcting" not in shown.getvalue() and time.monotonic() < limit:
             time.sleep(0.01)
         advance(2, 4)
@@ -757,10 +757,10 @@ def test_progress_is_shown_on_a_terminal_and_only_to_the_patient(
 
 
 def test_progress_begins_with_what_was_told_before_it_was_seen(monkeypatch):
-    monkeypatch.setattr(progress, "PATIENCE", 0.1)
+    monkeypatch.setattr(messages, "PATIENCE", 0.1)
     monkeypatch.setattr(sys, "stderr", shown := Terminal())
     limit = time.monotonic() + 20
-    with progress.bar("correcting") as advance:
+    with messages.bar("correcting") as advance:
         advance(2, 4)
         while "50%" not in shown.getvalue() and time.monotonic() < limit:
             time.sleep(0.01)
@@ -851,7 +851,7 @@ def test_only_unusual_lines_go_through_the_exact_parser(tmp_path, warm, small_pi
 
     source = text(tmp_path, change)
     wanted, findings = whole(warm[1], source)
-    tally, said = streaming.apply_to_file(warm[1], source, tmp_path / "o.csv", "blank")
+    tally, said = correction.apply_to_file(warm[1], source, tmp_path / "o.csv", "blank")
     assert (tally.rows, said) == (120, findings)
     assert exact["rows"] == 2
     assert_same(tmp_path / "o.csv", wanted)
@@ -863,14 +863,14 @@ def test_a_row_is_spelled_alike_whatever_stands_beside_it(tmp_path, cold):
     for word in ("plain", "a, b"):
         columns = {"note": ["", word, ""], "tiny": [5e-5, -3e-7, 2e20], **log(3, low=10, high=40)}
         source = write_parquet(tmp_path / "log.parquet", columns)
-        streaming.apply_to_file(cold[1], source, tmp_path / "out.csv", "extrapolate")
+        correction.apply_to_file(cold[1], source, tmp_path / "out.csv", "extrapolate")
         found.append((tmp_path / "out.csv").read_text("utf-8").replace('"a, b"', "plain"))
     assert found[0] == found[1]
 
 
 def test_findings_are_in_the_schema_that_readers_take(tmp_path, warm):
     source = write_parquet(tmp_path / "log.parquet", log())
-    _, findings = streaming.apply_to_file(warm[1], source, tmp_path / "out.parquet", "blank")
+    _, findings = correction.apply_to_file(warm[1], source, tmp_path / "out.parquet", "blank")
     read = parquet.read_table(tmp_path / "out.parquet").schema.metadata[b"mwdcal"]
     assert json.loads(read)["findings"] == [finding.text for finding in findings]
     assert findings
@@ -904,7 +904,7 @@ def test_rows_of_another_tool_are_told(tmp_path, monkeypatch, cells, told, suffi
     command = ("calibrate", run, "--tool", "servo", "-o", tmp_path / "cal.json", "--order", 0)
     assert mwdcal(*command).code == 0
     if length == "long":
-        monkeypatch.setattr(streaming, "TABLE_SIZES", dict.fromkeys(streaming.TABLE_SIZES, 0))
+        monkeypatch.setattr(correction, "TABLE_SIZES", dict.fromkeys(correction.TABLE_SIZES, 0))
         monkeypatch.setattr(streams, "PIECE", 3000)
     columns = {"serial": [cells[i * len(cells) // 120] for i in range(120)]}
     columns |= log(120, low=24, high=26)
@@ -923,7 +923,7 @@ def test_rows_of_another_tool_are_told(tmp_path, monkeypatch, cells, told, suffi
 @pytest.mark.parametrize("suffix", [".csv", ".long.csv", ".parquet"])
 def test_a_blank_reading_is_refused_with_the_way_out(tmp_path, warm, monkeypatch, name, suffix):
     if "long" in suffix:
-        monkeypatch.setattr(streaming, "TABLE_SIZES", dict.fromkeys(streaming.TABLE_SIZES, 0))
+        monkeypatch.setattr(correction, "TABLE_SIZES", dict.fromkeys(correction.TABLE_SIZES, 0))
     columns = log(100, low=10, high=40)
     columns[name] = columns[name].copy()
     columns[name][50] = np.nan
@@ -943,7 +943,7 @@ def test_a_blank_reading_is_refused_with_the_way_out(tmp_path, warm, monkeypatch
 @pytest.mark.parametrize("outside", ["blank", "extrapolate"])
 def test_rows_without_results_are_counted(tmp_path, warm, monkeypatch, suffix, outside):
     if "long" in suffix:
-        monkeypatch.setattr(streaming, "TABLE_SIZES", dict.fromkeys(streaming.TABLE_SIZES, 0))
+        monkeypatch.setattr(correction, "TABLE_SIZES", dict.fromkeys(correction.TABLE_SIZES, 0))
     columns, _ = gappy(400, {"ax": range(5), "mz": range(3, 9)})
     path = tmp_path / f"log{suffix}"
     if suffix == ".parquet":

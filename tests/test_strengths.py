@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from cli_support import calibrated, channels, mwdcal, read_csv, refused, servo_run, write_csv
-from mwdcal.app import streaming
-from mwdcal.app.streaming import apply_to_file
+from mwdcal.app import correction
+from mwdcal.app.correction import apply_to_file
 from mwdcal.errors import InputError
 from mwdcal.files import documents
 from mwdcal.use import strengths
@@ -27,7 +27,7 @@ def calibration(tmp_path_factory):
 def way(request, monkeypatch):
     """Suffix of the table; text in parts where the way says so."""
     if request.param == "in parts, text":
-        monkeypatch.setitem(streaming.TABLE_SIZES, ".csv", 1)
+        monkeypatch.setitem(correction.TABLE_SIZES, ".csv", 1)
     return WAYS[request.param]
 
 

@@ -21,7 +21,7 @@ from mwdcal.errors import InputError
 from mwdcal.files.formats import table as tables
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import centred, reference_vectors
-from mwdcal.planning.simulate import Earth, Truth, grid, run, servo
+from mwdcal.planning.plans import Earth, Truth, grid, run, servo
 from mwdcal.survey.acceptance import (
     STRENGTH_NAMES,
     Judgement,
@@ -35,7 +35,7 @@ from mwdcal.survey.error_model import load_error_model
 from mwdcal.survey.path import well_path
 from mwdcal.survey.stations import STRENGTHS, SURVEY_OBSERVABLES, survey_angles, switched
 from mwdcal.survey.surveying import survey_readings
-from mwdcal.survey.well_errors import well_errors
+from mwdcal.survey.well import well_errors
 
 EARTH = Earth()
 NOISE = (1e-4, 15.0)

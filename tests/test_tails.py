@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import fdtrc, ndtri
 
-from mwdcal.estimation.tails import fisher_tail, normal_quantile
+from mwdcal.estimation.uncertainty import fisher_tail, normal_quantile
 
 FREEDOM = st.floats(1, 1e4)
 BERNOULLI = [(1, 6), (-1, 30), (1, 42), (-1, 30), (5, 66), (-691, 2730), (7, 6), (-3617, 510)]

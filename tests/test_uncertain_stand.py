@@ -11,7 +11,7 @@ from mwdcal.calibration.estimate import fit, refitted
 from mwdcal.calibration.options import Options
 from mwdcal.estimation import drift, uncertainty
 from mwdcal.estimation.batch import take
-from mwdcal.estimation.minimisers import closed_form, stand_linear, uncertain_stand
+from mwdcal.estimation.minimisers import closed_form, uncertain_stand
 from mwdcal.estimation.solvers import stepped
 from mwdcal.estimation.uncertainty import TESTED, left_out_residual, station_misfit
 from test_common_columns import imperfect
@@ -86,7 +86,7 @@ def test_a_tool_does_not_depend_on_its_fleet():
 def test_angles_err_as_the_problem_has_it():
     problem = fit(on_stand(6, 2), OPTIONS).problem
     errors = np.random.default_rng(0).normal(size=(2, 48, 3)) * 0.01
-    vectors = stand_linear.StandRuns.of(problem).vectors(errors.mT)[0]
+    vectors = uncertain_stand.StandRuns.of(problem).vectors(errors.mT)[0]
     state = replace(closed_form.start(problem), errors=errors)
     for index, target in enumerate(problem.targets(state)):
         np.testing.assert_allclose(

@@ -14,8 +14,8 @@ import pytest
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.prediction import readings_at
 from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.results import readings_at
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import reference_vectors, rotation

@@ -23,7 +23,7 @@ from cli_support import EXAMPLE, mwdcal, refused, servo_run, write_csv
 from mwdcal import pool
 from mwdcal import signals as signals_to_end
 from mwdcal.app import cli, interruption, messages
-from mwdcal.certificate import keys as key_files
+from mwdcal.certificate import signature as key_files
 from mwdcal.errors import InputError
 from mwdcal.files.formats import atomic, sinks
 from test_fleet import pa, pq

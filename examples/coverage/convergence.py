@@ -21,7 +21,7 @@ from pyproj.enums import PJType
 from world import table, turned, write
 
 from mwdcal.errors import InputError
-from mwdcal.survey.earth import LEAST_DISTORTION, grid_convergence
+from mwdcal.survey.references import LEAST_DISTORTION, grid_convergence
 
 SHARES = ((0.5, 0.5), (0.1, 0.1), (0.1, 0.9), (0.9, 0.1), (0.9, 0.9))
 """Where in the area of use, by share of latitude and longitude."""

@@ -20,7 +20,7 @@ from msgspec.structs import replace
 import mwdcal
 from mwdcal.calibration.record import Calibration
 from mwdcal.drift.document import ToolDrift
-from mwdcal.drift.forecast import RISK
+from mwdcal.drift.histories import RISK
 from mwdcal.drift.tool import MeasuredTool, TypeRates, measured, predicted
 from mwdcal.sensor.profile import Profile, StandProfile, TriadProfile
 

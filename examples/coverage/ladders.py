@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import world
 
-from mwdcal.calibration.automatic.order_selection import choose_orders
+from mwdcal.calibration.automatic.auto import choose_orders
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.options import AUTO, Options
 from mwdcal.calibration.readings import Readings

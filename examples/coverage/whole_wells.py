@@ -12,7 +12,7 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.survey.acceptance import load_survey_limits
 from mwdcal.survey.error_model import load_error_model
-from mwdcal.survey.norths import North
+from mwdcal.survey.stations import North
 from mwdcal.survey.well import Well, well
 from wells import NOISE, laboratory
 

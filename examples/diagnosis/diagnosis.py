@@ -3,7 +3,7 @@
     make diagnosis        (writes docs/diagnosis.md; hours with 1000 tools)
 
 Every case has a tool, a calibration and later readings of its own. Faults are simulated by their physics
-(`mwdcal.faults.physics`: exact, not to first order), of the sizes that `mwdcal simulate` draws. All data are
+(`mwdcal.faults.likelihood`: exact, not to first order), of the sizes that `mwdcal simulate` draws. All data are
 simulated. A script of your own needs `import mwdcal` alone; this one makes thousands of tools at once.
 """
 
@@ -23,11 +23,18 @@ from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.faults.diagnosis import diagnose
-from mwdcal.faults.physics import FAULTS, HEAT, NONE
+from mwdcal.faults.likelihood import FAULTS, HEAT, NONE
 from mwdcal.files.profiles import load_profile
-from mwdcal.planning.plans import load_plan
+from mwdcal.planning.plans import (
+    Effects,
+    FaultEffect,
+    StationPlan,
+    drawn,
+    grid,
+    load_plan,
+    simulated,
+)
 from mwdcal.planning.session import Session
-from mwdcal.planning.simulate import Effects, FaultEffect, StationPlan, drawn, grid, simulated
 
 KINDS = (NONE, *FAULTS)
 SCENES = {
@@ -105,7 +112,7 @@ def strengthened(north: float, east: float) -> float:
 
 
 def _places(name: str) -> slice:
-    from mwdcal.faults.physics import DEPARTURES
+    from mwdcal.faults.likelihood import DEPARTURES
 
     return DEPARTURES[name]
 

@@ -21,10 +21,12 @@ from scipy.stats import norm
 from mwdcal.calibration import results
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.readings import TRIADS
-from mwdcal.drift.change import CHANGE_LEVEL, Contrasts, change_test
 from mwdcal.drift.walk import (
+    CHANGE_LEVEL,
     FIELD_DIRECTIONS,
+    Contrasts,
     History,
+    change_test,
     common_noise_scale,
     factored,
     parameter_names,
@@ -33,9 +35,8 @@ from mwdcal.drift.walk import (
 from mwdcal.files.profiles import load_profile
 from mwdcal.geometry.vectors import Array, outer
 from mwdcal.planning.expected import planned_fit
-from mwdcal.planning.plans import load_plan
+from mwdcal.planning.plans import drawn, load_plan
 from mwdcal.planning.session import Session
-from mwdcal.planning.simulate import drawn
 from mwdcal.sensor.profile import Profile, StandProfile
 
 SERVO = load_profile("servo")[0]

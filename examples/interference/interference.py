@@ -15,12 +15,12 @@ import numpy as np
 
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.prediction import raw_reading
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration
+from mwdcal.calibration.results import raw_reading
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import centred, reference_vectors
-from mwdcal.planning.simulate import grid, run, servo
+from mwdcal.planning.plans import grid, run, servo
 from mwdcal.sensor.profile import Profile
 from mwdcal.survey.acceptance import SensorTerms
 from mwdcal.survey.interference_estimate import Assumed, estimate

@@ -21,8 +21,7 @@ import numpy as np
 
 from mwdcal import Calibration, Options, Profile, Readings
 from mwdcal.app.commands import calibrate as command
-from mwdcal.calibration.automatic.auto import Choice, choose
-from mwdcal.calibration.automatic.nonlinearity import ODDS, choices_of, declared, log_odds
+from mwdcal.calibration.automatic.auto import ODDS, Choice, choices_of, choose, declared, log_odds
 from mwdcal.calibration.calibrate import recorded
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.fit_options import FitArguments
@@ -30,7 +29,7 @@ from mwdcal.calibration.methods import EVIDENCE
 from mwdcal.calibration.options import USUAL, options_of
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.errors import MwdcalError
-from mwdcal.estimation.rank import free_directions
+from mwdcal.estimation.uncertainty import free_directions
 from mwdcal.files.datasets import fetch
 from mwdcal.files.formats.table import Table
 from mwdcal.files.profiles import load_profile

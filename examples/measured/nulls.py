@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from mwdcal import Options, Readings
-from mwdcal.calibration.automatic.nonlinearity import ODDS, log_odds
+from mwdcal.calibration.automatic.auto import ODDS, log_odds
 
 SIZES = {
     "sap5": {"g": 0.0006, "b": 0.0015, "gravity": 0.0002, "field": 0.0015, "dip": 0.0035, "direction": 0.0016},

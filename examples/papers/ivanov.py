@@ -21,10 +21,10 @@ import numpy as np
 
 from mwdcal import FitError, Options, Profile, Readings, calibrate
 from mwdcal.calibration.estimate import Fit, fit
-from mwdcal.estimation.rank import free_directions
+from mwdcal.estimation.uncertainty import free_directions
 from mwdcal.files.datasets import fetch
 from mwdcal.geometry.vectors import Array, centred, earth_gravity, rotation, tool_from_earth
-from mwdcal.planning.simulate import Truth, grid, run, servo
+from mwdcal.planning.plans import Truth, grid, run, servo
 from mwdcal.sensor.profile import TriadProfile
 
 DEG = np.pi / 180

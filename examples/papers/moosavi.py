@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from mwdcal.estimation.minimisers.newton import Local, Newton, compared, cost, local, newton
 from mwdcal.estimation.solvers import Status
 from mwdcal.geometry.vectors import Array, centred, reference_vectors
-from mwdcal.planning.simulate import StationPlan, Truth, grid, reading, servo
+from mwdcal.planning.plans import StationPlan, Truth, grid, reading, servo
 from mwdcal.sensor.models import Basis, Factors
 
 PAGES = Path(__file__).parents[2] / "docs" / "papers"

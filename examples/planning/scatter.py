@@ -22,18 +22,17 @@ from scipy.stats import norm
 
 from mwdcal.calibration import results
 from mwdcal.calibration.estimate import Fit, fit
-from mwdcal.calibration.prediction import TWELFTHS, accuracy_at, middle_temperature
 from mwdcal.calibration.readings import CONSTANTS, TRIADS, Readings
 from mwdcal.calibration.record import Calibration
-from mwdcal.estimation.evidence import ANGLES
+from mwdcal.calibration.results import TWELFTHS, accuracy_at, middle_temperature
+from mwdcal.estimation.problem import ANGLES
 from mwdcal.files.profiles import load_profile
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, reference_vectors
 from mwdcal.planning.expected import expected, planned_fit
 from mwdcal.planning.planned import WORKING_INCLINATIONS
-from mwdcal.planning.plans import load_plan
+from mwdcal.planning.plans import Truth, drawn, load_plan
 from mwdcal.planning.session import Session
-from mwdcal.planning.simulate import Truth, drawn
 from mwdcal.sensor.profile import Datasheet, Profile, StandProfile
 
 PLANS = ("six-state", "twelve-state", "laboratory-thermal", "moosavi-12", "moosavi-30")

@@ -21,9 +21,8 @@ from mwdcal.files.formats.table import Table
 from mwdcal.files.profiles import load_profile
 from mwdcal.files.runs import from_readings
 from mwdcal.geometry.vectors import Array
-from mwdcal.planning.plans import load_plan
+from mwdcal.planning.plans import Earth, Truth, drawn, load_plan
 from mwdcal.planning.session import Session
-from mwdcal.planning.simulate import Earth, Truth, drawn
 
 SERVO = Path(__file__).parents[1] / "servo"
 """The folder of the example tool: its profile and the file of its laboratory."""

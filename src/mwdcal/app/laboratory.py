@@ -15,7 +15,7 @@ import click
 from click.core import ParameterSource
 
 if TYPE_CHECKING:
-    from mwdcal.files.settings import LaboratorySettings, SettingsInUse
+    from mwdcal.files.profiles import LaboratorySettings, SettingsInUse
 
 SETTINGS_FILE = "mwdcal.toml"
 SETTING_OF = {
@@ -89,8 +89,7 @@ def load(path: Path) -> SettingsInUse:
     Raises:
         InputError: it is not one, or a value is impossible.
     """
-    from mwdcal.files.profiles import decoded_toml
-    from mwdcal.files.settings import LaboratorySettings, SettingsInUse
+    from mwdcal.files.profiles import LaboratorySettings, SettingsInUse, decoded_toml
 
     settings, digest = decoded_toml(str(path), LaboratorySettings, "", "settings file", "Settings")
     _check(settings, str(path))
@@ -122,8 +121,7 @@ def checked_settings(values: Mapping[str, Any], folder: Path) -> LaboratorySetti
 
     from mwdcal.errors import InputError
     from mwdcal.files.limits import load_limits
-    from mwdcal.files.profiles import load_profile
-    from mwdcal.files.settings import LaboratorySettings
+    from mwdcal.files.profiles import LaboratorySettings, load_profile
 
     try:
         settings = msgspec.convert(values, LaboratorySettings)
@@ -180,9 +178,9 @@ def using(used: SettingsInUse | None) -> Iterator[None]:
     if used is None:
         yield
         return
-    from mwdcal.files import settings
+    from mwdcal.files import profiles
 
-    with settings.using(used):
+    with profiles.using(used):
         yield
 
 

@@ -12,7 +12,9 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterable, Iterator
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -21,6 +23,7 @@ import click
 from mwdcal.app import laboratory
 from mwdcal.errors import InputError, MwdcalError, reason
 from mwdcal.presentation.text import (
+    PATIENCE,
     UNSAFE_BUT_LINES,
     escape_controls,
     laid_out,
@@ -29,10 +32,54 @@ from mwdcal.presentation.text import (
     transliterate,
     without_passwords,
 )
+from mwdcal.presentation.text import slowly as slowly
 from mwdcal.presentation.typed import with_option_names
 
 if TYPE_CHECKING:
     from mwdcal.calibration.record import Finding
+
+
+# --------------------------------------------------------------------------
+# Progress of work that takes more than two seconds: a bar where stderr is a terminal, or words.
+
+
+MOMENT = 0.1
+"""Seconds after which a bar moves."""
+
+
+@contextmanager
+def bar(label: str) -> Iterator[Callable[[int, int], None]]:
+    """A function to call with how much is done, and of how much.
+
+    The bar also moves while that is not known.
+    """
+    if quiet() or not sys.stderr.isatty():
+        yield lambda done, total: None
+        return
+    known: dict[str, Any] = {"completed": 0, "total": None}
+    over = threading.Event()
+    shows = threading.Thread(target=_show, args=(label, known, over))
+    shows.start()
+    try:
+        yield lambda done, total: known.update(completed=done, total=total)
+    finally:
+        over.set()
+        shows.join()
+
+
+def _show(label: str, known: Mapping[str, Any], over: threading.Event) -> None:
+    """Show what is known until it is over, unless that is soon."""
+    if over.wait(PATIENCE):
+        return
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as shown:
+        task = shown.add_task(escape(label), **known)
+        while not over.wait(MOMENT):
+            shown.update(task, **known)
+        shown.update(task, **known)
 
 
 LONGEST_MESSAGE = 2000
@@ -204,7 +251,7 @@ def _shown(document: str) -> str:
 @contextlib.contextmanager
 def offering_blank() -> Iterator[None]:
     """Name the option that leaves the results of a row without readings blank, where one is refused."""
-    from mwdcal.files.faults import BlankReadingError
+    from mwdcal.files.contract import BlankReadingError
 
     try:
         yield

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import mwdcal
-from mwdcal.calibration.prediction import typical_accuracy
+from mwdcal.calibration.results import typical_accuracy
 from mwdcal.errors import InputError, MwdcalError
-from mwdcal.files.settings import setting
+from mwdcal.files.profiles import setting
 
 if TYPE_CHECKING:
     from threading import RLock

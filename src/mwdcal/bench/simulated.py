@@ -10,7 +10,7 @@ import numpy as np
 
 from mwdcal.files.contract import RAW
 from mwdcal.geometry.vectors import Array
-from mwdcal.planning.simulate import StationPlan, Truth, drawn, reading
+from mwdcal.planning.plans import StationPlan, Truth, drawn, reading
 from mwdcal.sensor.profile import Profile
 
 SAMPLE_HZ = 10.0

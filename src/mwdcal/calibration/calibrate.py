@@ -13,20 +13,15 @@ import msgspec
 import numpy as np
 
 from mwdcal.calibration import results
-from mwdcal.calibration.automatic.auto import Choice, choose
+from mwdcal.calibration.automatic.auto import Choice, Progress, choose
 from mwdcal.calibration.automatic.drift import fit_run
-from mwdcal.calibration.automatic.order_selection import Progress
-from mwdcal.calibration.canonical import figures, rounded
-from mwdcal.calibration.diagnosis.findings import described, finding_flags, findings
+from mwdcal.calibration.diagnosis.findings import copies, described, finding_flags, findings
 from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag
 from mwdcal.calibration.diagnosis.identity import dated, overdue, unidentified
+from mwdcal.calibration.diagnosis.plausibility import inconsistency
 from mwdcal.calibration.diagnosis.refusals import UNSOUND_ADVICE, check, fit_refusals
-from mwdcal.calibration.diagnosis.repeats import copies
-from mwdcal.calibration.diagnosis.soundness import inconsistency
-from mwdcal.calibration.drift import Constant, Drift, UnseenDrift
 from mwdcal.calibration.estimate import Fit
-from mwdcal.calibration.options import Options
-from mwdcal.calibration.prediction import accuracy
+from mwdcal.calibration.options import ASSUMED_PRACTICE, DIRECTION, Options, is_assumed
 from mwdcal.calibration.prior import PriorInformation
 from mwdcal.calibration.readings import TRIADS, WORDS, Readings, is_simulated, serial_of
 from mwdcal.calibration.record import (
@@ -34,20 +29,24 @@ from mwdcal.calibration.record import (
     SOFTWARE,
     BudgetRow,
     Calibration,
+    Constant,
+    Drift,
     Finding,
     FitSettings,
     StandErrors,
     TriadCalibration,
     Undetermined,
+    UnseenDrift,
+    figures,
+    rounded,
     stated,
     with_checksum,
 )
 from mwdcal.calibration.residuals import error_rows, measure_rows
-from mwdcal.calibration.settings import ASSUMED_PRACTICE, DIRECTION, is_assumed
+from mwdcal.calibration.results import accuracy
 from mwdcal.errors import FitError, MwdcalError
 from mwdcal.estimation.batch import batch_of_one, mapped
-from mwdcal.estimation.evidence import STAND_ERRORS, WALKS
-from mwdcal.estimation.problem import WALK_AXES
+from mwdcal.estimation.problem import STAND_ERRORS, WALK_AXES, WALKS
 from mwdcal.geometry.vectors import Array, diagonal
 from mwdcal.sensor.models import Polynomial
 from mwdcal.sensor.profile import PRACTICES, Profile

@@ -9,18 +9,32 @@ from types import ModuleType
 
 import numpy as np
 
-from mwdcal.calibration.evidence import evidence_of, flat
-from mwdcal.calibration.methods import EVIDENCE, Solved, solve, with_stand_errors, without
+from mwdcal.calibration.methods import (
+    EVIDENCE,
+    Solved,
+    evidence_of,
+    flat,
+    solve,
+    with_stand_errors,
+    without,
+)
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prior import prior_of
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.estimation.batch import held_once, put, take
-from mwdcal.estimation.evidence import ANGLES, Evidence
 from mwdcal.estimation.minimisers import closed_form, closed_form_drift, uncertain_stand
-from mwdcal.estimation.problem import Problem, State, Triad
+from mwdcal.estimation.problem import ANGLES, Evidence, Problem, State, Triad
 from mwdcal.estimation.resetting import set_apart, with_share
-from mwdcal.estimation.robust import LOSSES, consistency, inflation, weight, weighted
-from mwdcal.estimation.solvers import Determined, Status, stepped
+from mwdcal.estimation.solvers import (
+    LOSSES,
+    Determined,
+    Status,
+    consistency,
+    inflation,
+    stepped,
+    weight,
+    weighted,
+)
 from mwdcal.estimation.start import start
 from mwdcal.estimation.uncertainty import (
     FIRST_SCATTER,

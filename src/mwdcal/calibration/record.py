@@ -6,18 +6,17 @@ a calibration in memory and one read back give the same results.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import date, datetime
+from html import escape
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 import msgspec
 import numpy as np
 
 from mwdcal import __version__
-from mwdcal.calibration.canonical import Signature, document_sha256
-from mwdcal.calibration.drift import Constant, Drift, UnseenDrift
-from mwdcal.calibration.notebooks import html_table
 from mwdcal.calibration.readings import (
     NANOTESLA,
     SOAK_GAP,
@@ -27,12 +26,282 @@ from mwdcal.calibration.readings import (
     simulated,
     stated_day,
 )
-from mwdcal.calibration.tilt import tilt_width
+from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, diagonal
 from mwdcal.sensor.models import Basis, Factors, Model, Polynomial
 from mwdcal.sensor.profile import Profile
+
+# --------------------------------------------------------------------------
+# The interval of an inclination near vertical, where its error is the length of a vector.
+
+
+def tilt_width(g: Array, spread: Array, width: Array, freedom: float, probability: float) -> Array:
+    """Half width (…, n) of inclination: `width` away from vertical, that of a tilt near it.
+
+    From gravity (…, n, 3) and the covariance `spread` (…, n, 2, 2) of its share across the tool axis.
+    Definition: the tilt (gx, gy) / |g| has two errors, and with their larger uncertainty u its
+    error is below k u, k² = ν ((1 - p)^(-2/ν) - 1), Hotelling's for two. The one takes over from
+    the other between tilts of k u and 2 k u. Reference: JCGM 102, 7.
+    """
+    half, odd = (spread[..., 0, 0] + spread[..., 1, 1]) / 2, spread[..., 0, 1]
+    largest = half + np.hypot((spread[..., 0, 0] - spread[..., 1, 1]) / 2, odd)
+    factor = freedom * np.expm1(-2 / freedom * np.log1p(-probability))
+    near = np.sqrt(np.maximum(largest, 0.0) * factor)
+    tilt = np.linalg.norm(g[..., :2], axis=-1) / np.linalg.norm(g, axis=-1)
+    share = np.clip(tilt / np.maximum(near, 1e-300) - 1, 0.0, 1.0)
+    share = share**2 * (3 - 2 * share)
+    return np.asarray(near + share * (width - near) + 0 * width)
+
+
+# --------------------------------------------------------------------------
+# How results show themselves in notebooks.
+
+
+def html_table(caption: str, rows: Iterable[tuple[str, ...]]) -> str:
+    """A table for notebooks: a heading, then the cells of each row as text."""
+    lines = ("".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows)
+    body = "".join(f"<tr>{line}</tr>" for line in lines)
+    return f"<table><caption>{escape(caption)}</caption>{body}</table>"
+
+
+# --------------------------------------------------------------------------
+# Documents as they are hashed and signed: one form for all that say the same.
+
+Record = TypeVar("Record", bound=msgspec.Struct)
+DIGITS = 12
+"""Significant digits of every number in a calibration file."""
+POWERS = np.array([10**power for power in range(23)], float)
+"""The powers of ten that are doubles."""
+HALFWAY = 1e-3
+"""What rounding may do to a whole number of that many digits, and more."""
+UNHASHED = ("time", "sha256", "signature")
+"""Fields of a calibration that its `sha256` is not of."""
+
+
+class Signature(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A signature of the document that it stands in: of its `canonical` JSON, all but `value`.
+
+    `key` is the SHA-256 of the raw public key, hexadecimal, its first 16 digits; `time` (UTC) is part
+    of what is signed; `value` in base64.
+    """
+
+    algorithm: Literal["Ed25519"] = "Ed25519"
+    key: str
+    time: str
+    value: str
+
+
+SignatureState = Literal[
+    "unsigned", "intact", "altered", "unknown", "revoked", "retired", "unchecked"
+]
+"""State of a document's signature: `mwdcal.certificate.signature.STATES` has a sentence for each."""
+
+
+class SignatureCheck(msgspec.Struct, frozen=True, kw_only=True):
+    """State of a document's signature: `state` for machines, `text` for people.
+
+    `key`, `owner` and `time` (the signer's, UTC) as far as they are known. Only `intact` shows that the document is
+    as it was signed, with a key that is trusted; `unchecked`: cryptography is not installed.
+    """
+
+    state: SignatureState
+    key: str | None = None
+    owner: str | None = None
+    time: str | None = None
+    text: str
+
+
+def canonical(fields: Mapping[str, Any]) -> bytes:
+    """The one form in which fields are hashed and signed: compact JSON in ASCII with sorted keys.
+
+    Raises:
+        InputError: a number is infinite or none.
+    """
+    try:
+        text = json.dumps(fields, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    except ValueError as error:
+        raise InputError(
+            "a number of the document is infinite, or none: values of extreme size make it so. Check the units and "
+            "uncertainties of the input."
+        ) from error
+    return text.encode()
+
+
+def signed_form(fields: Mapping[str, Any]) -> bytes:
+    """The only form that the file of a signed document may have: `canonical` with two spaces of indent."""
+    return json.dumps(fields, sort_keys=True, indent=2, allow_nan=False).encode() + b"\n"
+
+
+def document_sha256(fields: Mapping[str, Any]) -> str:
+    """The `content_sha256` of a calibration file, whose fields are these."""
+    kept = {name: value for name, value in fields.items() if name not in UNHASHED}
+    return sha256_of(canonical(kept))
+
+
+def rounded(record: Record) -> Record:
+    """The same record with every number at 12 significant digits, as files keep it.
+
+    More digits would differ from machine to machine with the threads of its linear algebra.
+    """
+    fields = msgspec.to_builtins(record)
+    return msgspec.convert(_with(iter(figures(numbers(fields))), fields), type(record))
+
+
+def numbers(document: Any) -> Array:
+    """All numbers with a fraction in a document, in their order."""
+    values: list[float] = []
+    _collect(document, values)
+    return np.array(values)
+
+
+def _collect(value: Any, values: list[float]) -> None:
+    for item in value.values() if isinstance(value, dict) else value:
+        if isinstance(item, float):
+            values.append(item)
+        elif isinstance(item, dict | list | tuple):
+            _collect(item, values)
+
+
+def _with(new: Iterator[float], value: Any) -> Any:
+    """A document with other `numbers`."""
+    items = [
+        next(new)
+        if isinstance(item, float)
+        else _with(new, item)
+        if isinstance(item, dict | list | tuple)
+        else item
+        for item in (value.values() if isinstance(value, dict) else value)
+    ]
+    return dict(zip(value, items, strict=True)) if isinstance(value, dict) else items
+
+
+@np.errstate(all="ignore")
+def figures(values: Array) -> Any:
+    """Numbers (...) at so many significant digits as a file has, each the double nearest to its decimal, as lists.
+
+    A whole number of that many digits over a power of ten, both exact doubles, is that nearest double. What is too
+    small or too large for this, or so near to halfway that the product may have crossed it, is spelled.
+    """
+    size = np.abs(values)
+    power = DIGITS - 1 - np.floor(np.log10(size))
+    known = np.abs(power) < len(POWERS)
+    scale = POWERS[np.where(known, np.abs(power), 0.0).astype(int)]
+    scaled = np.where(power >= 0, size * scale, size / scale)
+    whole = np.rint(scaled)
+    known &= (whole >= POWERS[DIGITS - 1]) & (whole < POWERS[DIGITS])
+    known &= np.abs(np.abs(scaled - whole) - 0.5) > HALFWAY
+    rounded = np.array(np.copysign(np.where(power >= 0, whole / scale, whole * scale), values))
+    spelled = [float(f"{value:.{DIGITS - 1}e}") for value in values[~known].tolist()]
+    rounded[~known] = spelled
+    return rounded.tolist()
+
+
+# --------------------------------------------------------------------------
+# Constants of a run, and drifts within it, as a calibration file states them.
+
+SHOWN_DRIFT = 3.0
+"""A drift is a finding if it is so many times its standard uncertainty; smaller ones are in the uncertainty too."""
+
+LEAST_ADDED = 5e-5
+"""Smallest effect of a drift on an angle that is named, degrees…"""
+ADDED_SHARE = 0.05
+"""…and as a share of its effect on the angle that it moves most."""
+
+STEADINESS = {
+    "accelerometer-drift": "steady accelerometer offsets",
+    "magnetometer-drift": "steady magnetometer offsets",
+    "field-drift": "steady field",
+}
+"""Assumption of a calibration whose run could not show a drift, by the name of the drift."""
+
+
+def exact_and_steady(assumed: Sequence[str]) -> tuple[list[str], str]:
+    """The references among things assumed exact, and a sentence on the steadiness; blank if none is assumed.
+
+    >>> exact_and_steady(["gravity reference", "steady field"])[1].partition(". ")[0]
+    'taken as steady during the run, whose order of stations would hide a drift: field'
+    """
+    exact = [name for name in assumed if name not in STEADINESS.values()]
+    steady = ", ".join(n.removeprefix("steady ") for n in assumed if n not in exact)
+    words = "taken as steady during the run, whose order of stations would hide a drift"
+    remedy = "Measure there and back, or declare the drift in the tool profile"
+    return exact, f"{words}: {steady}. {remedy}" if steady else ""
+
+
+class Constant(msgspec.Struct, frozen=True, kw_only=True):
+    """A constant of the run that was estimated, with its standard uncertainty."""
+
+    name: str
+    value: float
+    standard_uncertainty: float
+    unit: str
+
+
+class Drift(msgspec.Struct, frozen=True, kw_only=True):
+    """A drift within the run that is part of the fit: the largest change between two stations, 1σ, and unit.
+
+    `name`: "field", or the triad whose offsets drifted. `declared`: 1σ per axis of the change from the first station
+    to the last, as declared; absent where the drift is not declared, but seen in the residuals.
+    """
+
+    name: str
+    change: float
+    standard_uncertainty: float
+    unit: str
+    declared: float | msgspec.UnsetType = msgspec.UNSET
+
+
+class UnseenDrift(msgspec.Struct, frozen=True, kw_only=True):
+    """A drift that no residual would show, and what it would add to the accuracy to expect: 1σ at 45° inclination.
+
+    `change`: 1σ per axis from the first station to the last, an example.
+    """
+
+    name: str
+    change: float
+    unit: str
+    inclination_deg: float | None = None
+    toolface_deg: float | None = None
+    azimuth_deg: float | None = None
+
+
+def declared_drift(drifts: Sequence[Drift]) -> str:
+    """A sentence on the drifts that are declared; blank if there are none.
+
+    >>> declared_drift([Drift(name="field", change=31.0, standard_uncertainty=9.0, unit="nT", declared=40.0)])
+    'declared drift from the first station to the last, 1σ, which the uncertainty includes: field 40 nT'
+    """
+    sizes = [
+        f"{each.name} {each.declared:.3g} {each.unit}"
+        for each in drifts
+        if not isinstance(each.declared, msgspec.UnsetType)
+    ]
+    words = "declared drift from the first station to the last, 1σ, which the uncertainty includes"
+    return f"{words}: {', '.join(sizes)}" if sizes else ""
+
+
+def blindness(unseen: Sequence[UnseenDrift] | msgspec.UnsetType) -> str:
+    """A sentence on what small drifts would do that no residual would show; blank if there are none.
+
+    >>> blindness([UnseenDrift(name="field", change=10.0, unit="nT", inclination_deg=0.0, azimuth_deg=0.0213)])
+    'an unseen drift from the first station to the last, 1σ, would add: 10 nT of the field 0.0213° to azimuth'
+    """
+    each = [] if isinstance(unseen, msgspec.UnsetType) else map(_added, unseen)
+    words = "an unseen drift from the first station to the last, 1σ, would add"
+    added = "; ".join(filter(None, each))
+    return f"{words}: {added}" if added else ""
+
+
+def _added(unseen: UnseenDrift) -> str:
+    """The contribution of one drift to the angles that it moves."""
+    angles = ("inclination", "toolface", "azimuth")
+    sizes = {name: getattr(unseen, f"{name}_deg") or 0.0 for name in angles}
+    least = max(LEAST_ADDED, ADDED_SHARE * max(sizes.values()))
+    words = ", ".join(f"{size:.4f}° to {name}" for name, size in sizes.items() if size >= least)
+    return f"{unseen.change:g} {unseen.unit} of the {unseen.name} {words}" if words else ""
+
 
 SCHEMA_VERSION = 1
 DOCUMENT_VERSION = 1

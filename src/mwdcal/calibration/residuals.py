@@ -9,14 +9,12 @@ from math import erfc, gamma
 
 import numpy as np
 
-from mwdcal.calibration.canonical import figures
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import TRIADS, Readings
-from mwdcal.calibration.record import ErrorRow, Measures, StationRow, stated
+from mwdcal.calibration.record import ErrorRow, Measures, StationRow, figures, stated
 from mwdcal.estimation.batch import take
-from mwdcal.estimation.evidence import ANGLES, STAND_ERRORS
-from mwdcal.estimation.tails import normal_quantile
-from mwdcal.estimation.uncertainty import Analysis, station_misfit, without_station
+from mwdcal.estimation.problem import ANGLES, STAND_ERRORS
+from mwdcal.estimation.uncertainty import Analysis, normal_quantile, station_misfit, without_station
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, Ints
 

@@ -12,14 +12,6 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from mwdcal.calibration.drift import declared_drift
-from mwdcal.calibration.prediction import (
-    TYPICAL,
-    accuracy_at,
-    angles,
-    middle_temperature,
-    typical_accuracy,
-)
 from mwdcal.calibration.record import (
     NOISE,
     ORDER,
@@ -28,9 +20,18 @@ from mwdcal.calibration.record import (
     BudgetRow,
     Calibration,
     TriadCalibration,
+    declared_drift,
     stated,
 )
-from mwdcal.calibration.results import PRIOR, error_name
+from mwdcal.calibration.results import (
+    PRIOR,
+    TYPICAL,
+    accuracy_at,
+    angles,
+    error_name,
+    middle_temperature,
+    typical_accuracy,
+)
 from mwdcal.certificate.decisions import PROBABILITY, When, student_factor
 from mwdcal.certificate.document import Budget, BudgetLine, Quantity, ResultTable
 from mwdcal.files.verifications import Verification

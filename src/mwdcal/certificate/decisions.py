@@ -13,17 +13,17 @@ from typing import Literal, TypeAlias
 from msgspec import UNSET
 
 from mwdcal.calibration.record import Calibration, Finding
-from mwdcal.certificate.document import ConformityTest, LimitDecision, Quantity
-from mwdcal.certificate.laboratory import DecisionRule
+from mwdcal.certificate.document import ConformityTest, DecisionRule, LimitDecision, Quantity
 from mwdcal.files.verifications import Verification
 from mwdcal.geometry.vectors import Array, ArrayLike
-from mwdcal.use.risk import COVERAGE, probability_within
 from mwdcal.use.verification import (
+    COVERAGE,
     RULES,
     SETTING_PRACTICES,
     VerdictRow,
     fewest_degrees_of_freedom,
     guard,
+    probability_within,
 )
 
 When: TypeAlias = Literal["as found", "as left"]

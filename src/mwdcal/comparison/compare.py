@@ -20,24 +20,21 @@ from typing import Any, ClassVar
 import msgspec
 import numpy as np
 
-from mwdcal.calibration.automatic.auto import Choice, resolved, without
+from mwdcal.calibration.automatic.auto import Choice, Progress, resolved, without
 from mwdcal.calibration.automatic.drift import fit_run
-from mwdcal.calibration.automatic.order_selection import Progress
 from mwdcal.calibration.calibrate import recorded
 from mwdcal.calibration.diagnosis.refusals import check_readings
 from mwdcal.calibration.estimate import Fit, fit
-from mwdcal.calibration.evidence import evidence_of
-from mwdcal.calibration.methods import EVIDENCE, SWARM_ITERATIONS
+from mwdcal.calibration.methods import EVIDENCE, SWARM_ITERATIONS, evidence_of
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import CONSTANTS, TRIADS, Readings, is_simulated
 from mwdcal.calibration.record import FREE_SHARE, Calibration, Measures, TriadCalibration
 from mwdcal.calibration.residuals import SHOWN, departure, nominal, rms, shown_in, vector_measures
 from mwdcal.errors import FitError, MwdcalError
-from mwdcal.estimation.evidence import ANGLES
 from mwdcal.estimation.minimisers.swarm import least_squares_forward, swarm_forward, vector_cost
-from mwdcal.estimation.rank import Free, free_directions
+from mwdcal.estimation.problem import ANGLES
 from mwdcal.estimation.solvers import Status
-from mwdcal.estimation.uncertainty import ROTATIONS, unrotating
+from mwdcal.estimation.uncertainty import ROTATIONS, Free, free_directions, unrotating
 from mwdcal.geometry.vectors import Array, directions, group_scatter, reference_vectors
 from mwdcal.sensor.models import Model
 from mwdcal.sensor.profile import Profile

@@ -18,9 +18,8 @@ from functools import partial
 
 import numpy as np
 
-from mwdcal.estimation.evidence import WALKS, Evidence, SharedConstant
 from mwdcal.estimation.minimisers import closed_form_drift, uncertain_stand
-from mwdcal.estimation.problem import Problem, State
+from mwdcal.estimation.problem import WALKS, Evidence, Problem, SharedConstant, State
 from mwdcal.estimation.uncertainty import Analysis, whole_covariance
 from mwdcal.geometry.vectors import (
     Array,

@@ -11,8 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mwdcal.estimation.evidence import ANGLES, EARTH
-from mwdcal.estimation.problem import Problem, State
+from mwdcal.estimation.problem import ANGLES, EARTH, Problem, State
 from mwdcal.estimation.solvers import regress
 from mwdcal.geometry import observables
 from mwdcal.geometry.vectors import (

@@ -15,35 +15,33 @@ import msgspec
 import numpy as np
 
 from mwdcal.calibration.diagnosis.identity import doubts, other_tool
-from mwdcal.calibration.prediction import raw_reading
 from mwdcal.calibration.readings import CONSTANTS, LEAST_TEMPERATURE_SPAN, TRIADS, Readings
 from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.calibration.results import raw_reading
 from mwdcal.errors import InputError
-from mwdcal.estimation.evidence import ANGLES
+from mwdcal.estimation.problem import ANGLES
 from mwdcal.faults.likelihood import (
+    DEAD,
+    DEPARTURES,
     DISTINCT,
     DRAWS,
     FALSE_ALARMS,
-    LIKELY,
-    UNEXPLAINED,
-    FaultEvidence,
-    Suspect,
-    explained,
-    over_forms,
-    raw_of,
-)
-from mwdcal.faults.physics import (
-    DEAD,
-    DEPARTURES,
     FAULTS,
     HEAT,
+    LIKELY,
     NONE,
     SIZE,
     SURROUNDINGS,
+    UNEXPLAINED,
+    FaultEvidence,
     FaultForm,
     FaultTerm,
+    Suspect,
+    explained,
     faults,
     hypotheses,
+    over_forms,
+    raw_of,
 )
 from mwdcal.files.contract import CHANNELS
 from mwdcal.geometry.vectors import Array, reference_vectors

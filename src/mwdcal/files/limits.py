@@ -8,8 +8,7 @@ from msgspec.structs import replace
 
 from mwdcal.errors import InputError
 from mwdcal.files.metadata import load_toml
-from mwdcal.files.profiles import built_in, decoded_toml, read_toml
-from mwdcal.files.settings import in_use
+from mwdcal.files.profiles import built_in, decoded_toml, in_use, read_toml
 from mwdcal.use.verification import Limits
 
 

@@ -22,8 +22,16 @@ import numpy as np
 from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError, reason
 from mwdcal.files import metadata as meta
-from mwdcal.files.contract import COLUMNS, RANGES, RAW, check_columns, check_near_misses
-from mwdcal.files.faults import columns_of, range_faults, refuse
+from mwdcal.files.contract import (
+    COLUMNS,
+    RANGES,
+    RAW,
+    check_columns,
+    check_near_misses,
+    columns_of,
+    range_faults,
+    refuse,
+)
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import (
     Column,

@@ -7,7 +7,7 @@ become radians; true and grid azimuths become magnetic ones.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -22,37 +22,88 @@ from mwdcal.calibration.readings import (
     is_simulated,
     serial_of,
 )
+from mwdcal.calibration.record import Finding
 from mwdcal.errors import FitError, InputError, QuestionError
-from mwdcal.estimation.evidence import WALKS
+from mwdcal.estimation.problem import WALKS
 from mwdcal.files import synonyms
 from mwdcal.files.contract import (
     CHANNELS,
     COLUMNS,
+    RANGES,
     RAW,
     REFERENCES,
+    Cells,
     Range,
     check_columns,
-    magnetic_offset,
-    units_of,
-)
-from mwdcal.files.faults import BlankReadingError as BlankReadingError
-from mwdcal.files.faults import (
-    Cells,
     columns_of,
     faults,
     faults_beside_readings,
     is_blank,
+    magnetic_offset,
     refuse,
+    units_of,
 )
+from mwdcal.files.contract import BlankReadingError as BlankReadingError
 from mwdcal.files.formats import table as tables
-from mwdcal.files.formats.columns import LABELS, Column, shown
-from mwdcal.files.formats.dialect import holds_numbers
+from mwdcal.files.formats.columns import LABELS, Column, plain_names, shown
 from mwdcal.files.formats.layout import Layout
 from mwdcal.files.formats.table import Table, labels
+from mwdcal.files.formats.text import holds_numbers, is_formula
 from mwdcal.files.marks import UNMARKED, without_rejected
 from mwdcal.files.statements import stated_table
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import ColumnSource, Profile, TableFormat, TriadProfile
+
+# --------------------------------------------------------------------------
+# The findings about the columns that were only copied into it.
+
+_RENAMING = (".csv", ".tsv", ".xlsx")
+"""Suffixes of formats in which the name of a column is one line of a table."""
+NAMED = 10
+"""Most columns that a finding names."""
+
+
+def copied(names: Sequence[str], formulas: Collection[str], suffix: str) -> list[Finding]:
+    """Columns that a table of this format has under another name, and those with formulas."""
+    plain = plain_names(names) if suffix in _RENAMING else names
+    renamed = [
+        f"{shown(old)} is {shown(new)}" for old, new in zip(names, plain, strict=True) if old != new
+    ]
+    findings = []
+    if renamed:
+        text = f"columns renamed, as the format does not have such names: {_listed(renamed)}."
+        findings.append(Finding(id="renamed-columns", text=text))
+    if formulas:
+        text = (
+            "spreadsheet programs may run cells as formulas, which begin with =, +, -, @ or a tab "
+            f"and are written as they are: {_listed([shown(n) for n in names if n in formulas])}."
+        )
+        findings.append(Finding(id="formula-cells", text=text))
+    return findings
+
+
+def _listed(entries: Sequence[str]) -> str:
+    more = f" and {len(entries) - NAMED} more" if len(entries) > NAMED else ""
+    return ", ".join(entries[:NAMED]) + more
+
+
+def with_formulas(columns: Mapping[str, Column]) -> list[str]:
+    """Columns with a name or a text cell that spreadsheet programs would run as a formula."""
+    return [
+        name
+        for name, cells in columns.items()
+        if name not in RANGES
+        and (is_formula(name) or (isinstance(cells, list) and any(map(is_formula, cells))))
+    ]
+
+
+def stated_findings(metadata: Mapping[str, object]) -> list[str]:
+    """The findings that a table's metadata state already."""
+    stated = metadata.get("findings")
+    if stated is None:
+        return []
+    return [str(each) for each in stated] if isinstance(stated, list) else [str(stated)]
+
 
 ROWS_OF_LOG = 1000
 """Rows of a table with times from which it is a log."""

@@ -8,8 +8,7 @@ from typing import Any
 
 import msgspec
 
-from mwdcal.calibration.canonical import Signature
-from mwdcal.calibration.record import DOCUMENT_VERSION
+from mwdcal.calibration.record import DOCUMENT_VERSION, Signature
 from mwdcal.errors import InputError
 from mwdcal.files.documents import check_json, in_utf8, whole_file
 from mwdcal.use.verification import RULES, Verdict, guard

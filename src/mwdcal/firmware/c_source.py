@@ -17,10 +17,9 @@ from string import Template
 import numpy as np
 
 from mwdcal import __version__
-from mwdcal.calibration.canonical import DIGITS
-from mwdcal.calibration.prediction import readings_at
 from mwdcal.calibration.readings import NANOTESLA, SIMULATED, TRIADS, is_simulated
-from mwdcal.calibration.record import Calibration, TriadCalibration
+from mwdcal.calibration.record import DIGITS, Calibration, TriadCalibration
+from mwdcal.calibration.results import readings_at
 from mwdcal.files.contract import CHANNELS
 from mwdcal.files.formats import text
 from mwdcal.files.formats.columns import Column

@@ -15,15 +15,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mwdcal.calibration.prediction import (
+from mwdcal.calibration.readings import EARTH_RANGES, TRIADS
+from mwdcal.calibration.record import MAGNETIC, Calibration, TriadCalibration
+from mwdcal.calibration.results import (
     CORNER_SHARES,
     CORNERS,
     middle_temperature,
     raw_reading,
     readings_at,
 )
-from mwdcal.calibration.readings import EARTH_RANGES, TRIADS
-from mwdcal.calibration.record import MAGNETIC, Calibration, TriadCalibration
 from mwdcal.errors import InputError
 from mwdcal.files.contract import TEMPERATURE
 from mwdcal.geometry.observables import OBSERVABLES

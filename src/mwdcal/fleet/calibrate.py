@@ -17,20 +17,18 @@ import msgspec
 import numpy as np
 
 from mwdcal.calibration import results
-from mwdcal.calibration.automatic.auto import Choice, tables_of, with_prior
+from mwdcal.calibration.automatic.auto import Choice, offered, tables_of, with_prior
 from mwdcal.calibration.automatic.drift import with_drifts
-from mwdcal.calibration.automatic.nonlinearity import offered
 from mwdcal.calibration.calibrate import Records
-from mwdcal.calibration.diagnosis.findings import finding_flags
+from mwdcal.calibration.diagnosis.findings import copies, finding_flags
 from mwdcal.calibration.diagnosis.flags import Alone, FittedRuns, Flag
 from mwdcal.calibration.diagnosis.refusals import BAD_INPUT, fit_refusals, reading_refusals
-from mwdcal.calibration.diagnosis.repeats import copies
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.methods import ESTIMABLE
 from mwdcal.calibration.options import AUTO, Options
-from mwdcal.calibration.prediction import STATED_ANGLES, accuracy
 from mwdcal.calibration.readings import HIGHEST, TRIADS, Readings
 from mwdcal.calibration.record import StandErrors
+from mwdcal.calibration.results import STATED_ANGLES, accuracy
 from mwdcal.errors import MwdcalError
 from mwdcal.estimation.batch import put, take
 from mwdcal.fleet.choices import alike, in_chunks, tools_per_fit, with_curves, with_orders

@@ -12,8 +12,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from mwdcal.calibration.automatic.nonlinearity import compare_curves, offered, scattered
-from mwdcal.calibration.automatic.order_selection import choose_orders
+from mwdcal.calibration.automatic.auto import choose_orders, compare_curves, offered, scattered
 from mwdcal.calibration.diagnosis.refusals import check_curves, check_options
 from mwdcal.calibration.estimate import temperature_ranges
 from mwdcal.calibration.options import AUTO, Options

@@ -18,16 +18,14 @@ from mwdcal.calibration.diagnosis.flags import Alone
 from mwdcal.calibration.readings import TRIADS, Readings, group_numbers
 from mwdcal.errors import InputError, MwdcalError
 from mwdcal.estimation.batch import held_once
-from mwdcal.files.contract import COLUMNS, RANGES
-from mwdcal.files.faults import faults
+from mwdcal.files.contract import COLUMNS, RANGES, faults
 from mwdcal.files.formats import parquet
 from mwdcal.files.formats.columns import as_text, shown
 from mwdcal.files.formats.table import Table
 from mwdcal.files.runs import convert, to_readings
-from mwdcal.fleet import run_files
+from mwdcal.fleet import sources
 from mwdcal.fleet.choices import alike
-from mwdcal.fleet.run_files import FAULT, RUN_FILE
-from mwdcal.fleet.sources import AZIMUTH, OFFSET, SERIAL
+from mwdcal.fleet.sources import AZIMUTH, FAULT, OFFSET, RUN_FILE, SERIAL
 from mwdcal.fleet.tables import one_chunk
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints
 from mwdcal.sensor.profile import Profile
@@ -128,8 +126,8 @@ class Rows:
         if path is None:
             return None
         if path not in self._run_files:
-            self._run_files[path] = run_files.read(Path(path), self.profile)
-        return run_files.run_of(self._run_files[path], serial)
+            self._run_files[path] = sources.read(Path(path), self.profile)
+        return sources.run_of(self._run_files[path], serial)
 
     def _texts(self, name: str, tool: int) -> list[str | None]:
         """The different cells of a tool in a column of text."""

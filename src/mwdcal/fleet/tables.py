@@ -24,11 +24,12 @@ from mwdcal.files.contract import RANGES
 from mwdcal.files.formats import atomic, parquet
 from mwdcal.files.formats.columns import LABELS
 from mwdcal.files.formats.table import labels
-from mwdcal.fleet import kept, run_files
-from mwdcal.fleet.run_files import FAULT, RUN_FILE
+from mwdcal.fleet import kept, sources
 from mwdcal.fleet.sources import (
     DEALT,
+    FAULT,
     OFFSET,
+    RUN_FILE,
     SERIAL,
     FleetTable,
     Piece,
@@ -390,10 +391,10 @@ def _run_rows(piece: Piece, wanted: Sequence[str]) -> Any:
     if not piece.profile:
         return arrow.table({"": arrow.nulls(piece.rows)})
     profile = msgspec.json.decode(piece.profile, type=Profile)
-    table = run_files.read(Path(piece.path), profile)
+    table = sources.read(Path(piece.path), profile)
     names = [name for name in wanted if name in table.columns]
     columns = {
-        name: arrow.array(run_files.numbers(table, name), from_pandas=True)
+        name: arrow.array(sources.numbers(table, name), from_pandas=True)
         if name in RANGES
         else arrow.array(labels(table, name), arrow.string())
         for name in names

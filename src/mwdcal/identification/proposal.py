@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from itertools import permutations, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,32 +17,215 @@ import numpy as np
 from mwdcal.calibration.diagnosis.findings import MARKED_ROWS, unused_columns
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import Finding
-from mwdcal.errors import Answer, FitError, InputError, QuestionError
-from mwdcal.files.contract import CHANNELS, MAPPED, REFERENCES, units_of
+from mwdcal.errors import Answer, FitError, InputError, QuestionError, QuestionsError
+from mwdcal.files.contract import CHANNELS, MAPPED, RANGES, RAW, REFERENCES, units_of
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, looks_numeric, shown
 from mwdcal.files.formats.figures import is_figure
 from mwdcal.files.formats.layout import WORKBOOKS, Layout
-from mwdcal.files.formats.table import Table
+from mwdcal.files.formats.table import Table, cell_error, labels, numbers
 from mwdcal.files.formats.table import labels as labels_of
 from mwdcal.files.formats.text import is_preamble
-from mwdcal.files.marks import UNMARKED, marks_in, without_rejected
+from mwdcal.files.marks import UNMARKED, marks_in, place, without_rejected
 from mwdcal.files.metadata import toml
 from mwdcal.files.profiles import CHOICE_OF_AXES
 from mwdcal.files.runs import STATED_REFERENCES, check_run, renamed, to_readings
 from mwdcal.files.statements import stated_table
-from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW
+from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW, FACTORS, WARMTH
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
-from mwdcal.identification.columns import meanings_of, north_of, proposed
-from mwdcal.identification.rows import (
-    check_cells,
-    check_columns_of_rows,
-    question_on_cells,
-    question_on_mark,
-)
-from mwdcal.identification.wiring import LEAST_STATIONS, Wiring, is_clear, wiring
+from mwdcal.identification.columns import is_filler, meanings_of, north_of, proposed
 from mwdcal.sensor.profile import ColumnSource, Profile, TableFormat, TriadProfile
+
+# --------------------------------------------------------------------------
+# Questions on rows of a table: marked ones, and those with a cell that is no number.
+
+
+FAR_OUT = 4.0
+"""By how much a single reading lies farther out than all others that was mistyped."""
+_FEW_ROWS, _FEW_SHARE = 2, 0.15
+"""Rows at most that are asked about, and their share."""
+_FEW_WORDS = 2
+"""Words of a mark at most; more are a remark, which may speak of another row."""
+
+
+def question_on_mark(table: Table, name: str, cell: str, rows: Sequence[int]) -> QuestionError:
+    """Ask whether rows with a text in a column are rejected."""
+    answers = [
+        Answer("they are rejected: leave them out", (("leave_out", f"{name}={cell}"),)),
+        Answer("they count", (("keep", f"{name}={cell}"),)),
+    ]
+    few = len(cell.split()) <= _FEW_WORDS
+    more = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
+    return QuestionError(
+        f"{table.source}: {place(table, rows[0])}{more}: {shown(name)} says {shown(cell)}. Is that a rejected station?",
+        answers if few else answers[::-1],
+    )
+
+
+def question_on_cells(table: Table, name: str, row: int, cells: Sequence[str]) -> QuestionError:
+    """Ask whether the rows with some cells that are no numbers are left out; `row` is the first of them."""
+    got = shown(cells[0]) if cells[0] else "a blank cell"
+    problem = f"expected a reading; got {got}. Is its row to be left out?"
+    return QuestionError(
+        str(cell_error(table, name, row, problem)),
+        [Answer("leave such rows out", tuple(("leave_out", f"{name}={cell}") for cell in cells))],
+    )
+
+
+def check_cells(table: Table, columns: Mapping[str, ColumnSource]) -> None:
+    """Ask whether rows are left out that have no reading, a number that stands for none, or one that cannot be.
+
+    Cells of which there are many are of another unit or column: they are refused when they are read.
+    """
+    raw = {
+        column: numbers(table, source.name)
+        for column, source in columns.items()
+        if column in RANGES
+    }
+    questions = []
+    for column, values in raw.items():
+        factor, offset = (
+            FACTORS.get(columns[column].unit, (1.0, 0.0)) if units_of(column) else (1.0, 0.0)
+        )
+        wrong = is_filler(values) | RANGES[column].outside(values * factor + offset)
+        if column in (*RAW, WARMTH) and not np.isnan(values).all():
+            wrong |= np.isnan(values)
+        if column in RAW:
+            wrong |= _far_out(raw, column)
+        if 0 < wrong.sum() <= max(_FEW_ROWS, _FEW_SHARE * wrong.size):
+            rows = np.flatnonzero(wrong).tolist()
+            cells = labels(table, columns[column].name)
+            each = [*dict.fromkeys(cells[row] for row in rows)]
+            questions.append(question_on_cells(table, columns[column].name, rows[0], each))
+    if questions:
+        raise QuestionsError(table.source, questions)
+
+
+def _far_out(values: Mapping[str, Array], column: str) -> Bools:
+    """Whether a row (n,) is the one of a triad that lies far outside all others, by this channel."""
+    triad = next(names for names in CHANNELS.values() if column in names)
+    if values[column].size < LEAST_STATIONS or not all(name in values for name in triad):
+        return np.zeros(values[column].size, bool)
+    channels = np.stack([values[name] for name in triad], -1)
+    if np.isnan(channels).all(0).any():
+        return np.zeros(len(channels), bool)
+    off = np.nan_to_num(np.abs(channels - np.nanmedian(channels, 0)))
+    *_, second, largest = np.sort(off.max(-1))
+    far = off.max(-1) > FAR_OUT * second
+    return np.asarray(far & (largest > 0) & (off[:, triad.index(column)] == off.max(-1)))
+
+
+def check_columns_of_rows(table: Table, names: Collection[str]) -> None:
+    """Refuse rules on rows by a column that the table has not."""
+    absent = [name for name in names if name not in table.columns]
+    if absent:
+        raise InputError(
+            f"{table.source}: there is no column {shown(absent[0])} by whose texts rows are left out; found "
+            f"{', '.join(map(shown, [*table.columns][:24]))}."
+        )
+
+
+# --------------------------------------------------------------------------
+# Which tool axis each channel measures, and its nominal scale, from readings at known attitudes.
+#
+# Each channel is a straight line of the component of the field along its tool axis, but for misalignment:
+# raw = scale · component + offset. Of all 48 signed permutations of a triad the right one leaves a few
+# per cent of the channels' variation, any other most of it, unless the attitudes do not tell them apart.
+
+EXPLAINED = 0.3
+"""Largest share of the channels' variation that the right axes leave: misalignment, noise, bias."""
+ALTERNATIVE = 0.2
+"""By how much less they leave than any others."""
+LEAST_WITHOUT, LEAST_RATIO = 0.1, 2.0
+"""A sign is told where without the component that tells it this share would be left, and so many times as much."""
+LEAST_STATIONS = 5
+
+
+class Wiring(NamedTuple):
+    """The axes and scale of a triad, the share that they leave, and others that fit about as well."""
+
+    axes: tuple[str, ...]
+    scale: float
+    unexplained: float
+    next_best: float
+    alternatives: list[tuple[str, ...]]
+
+
+def wiring(raw: Array, *parts: Array) -> Wiring:
+    """The axes of a triad by its raw readings (n, 3) and the field along the tool axes.
+
+    `parts` (n, 3) each: components of the field at right angles to each other, which may come in unknown
+    shares; the sign of the first is known. The scale is in raw units per unit of the field.
+    Singular: a channel or a component that hardly varies explains nothing; its axis and sign stay open. So does the
+    sign where the other component explains the readings as well, as at two inclinations and one azimuth.
+    """
+    shares, sizes = np.ones((2, 3, 3)), np.zeros((3, 3))
+    moved = raw - raw.mean(0)
+    spread = np.sqrt(np.mean(moved**2, 0))
+    for axis in range(3):
+        design = np.stack([part[:, axis] - part[:, axis].mean() for part in parts], -1)
+        size = np.sqrt(np.mean(design**2, 0))
+        seen = size > 0.02 * np.sqrt(np.mean(np.square(parts), (1, 2)))
+        if not seen[0]:
+            continue
+        columns = design[:, seen]
+        slope, share = _line(columns, moved)
+        sizes[:, axis] = np.linalg.norm(slope, axis=0)
+        alive = spread > 0.02 * spread.max()
+        bare = _line(columns[:, 1:], moved)[1]
+        signed = (bare > np.maximum(LEAST_WITHOUT, LEAST_RATIO * share)) | (columns.shape[1] == 1)
+        for sign in (0, 1):
+            right = slope[0] > 0 if sign == 0 else slope[0] < 0
+            shares[sign, :, axis] = np.where(alive & (right | ~signed), share, 1.0)
+    ranked = sorted(
+        (float(np.sqrt(np.mean(shares[signs, range(3), order] ** 2))), order, signs)
+        for order in permutations(range(3))
+        for signs in product((0, 1), repeat=3)
+    )
+    if len(parts) == 2 and sum(each[0] < ranked[0][0] + ALTERNATIVE for each in ranked) > 1:
+        ranked = sorted((_joint(moved, parts, *each[1:]), *each[1:]) for each in ranked)
+    best, order, signs = ranked[0]
+    near = [each for each in ranked if each[0] < best + ALTERNATIVE]
+    scale = float(np.median(sizes[range(3), order]))
+    return Wiring(
+        _named(order, signs), scale, best, ranked[1][0], [_named(*each[1:]) for each in near]
+    )
+
+
+def _joint(
+    moved: Array, parts: Sequence[Array], order: tuple[int, ...], signs: tuple[int, ...]
+) -> float:
+    """The share of all channels' variation that is left with one scale and one share of both components for all.
+
+    Of an unknown dip the components come in the same shares on every axis; the first counts along itself.
+    """
+    axes, senses = list(order), 1.0 - 2.0 * np.array(signs)
+    columns = np.stack([((part - part.mean(0))[:, axes] * senses).ravel() for part in parts], -1)
+    slope, share = _line(columns, moved.reshape(-1, 1))
+    return float(share[0]) if slope[0, 0] > 0 else 1.0
+
+
+def _line(columns: Array, moved: Array) -> tuple[Array, Array]:
+    """Slopes (K, 3) of the channels on columns (n, K), and the share of their variation that is left (3,).
+
+    Per degree of freedom: few stations do not seem explained by many columns.
+    """
+    count, width = columns.shape
+    slope, *_ = np.linalg.lstsq(columns, moved, rcond=1e-9)
+    spread = np.sqrt(np.sum(moved**2, 0) / (count - 1))
+    left = np.sqrt(np.sum((moved - columns @ slope) ** 2, 0) / (count - 1 - width))
+    return np.asarray(slope), np.asarray(np.minimum(left / np.maximum(spread, 1e-300), 1.0))
+
+
+def _named(order: tuple[int, ...], signs: tuple[int, ...]) -> tuple[str, ...]:
+    return tuple("+-"[sign] + "xyz"[axis] for axis, sign in zip(order, signs, strict=True))
+
+
+def is_clear(result: Wiring) -> bool:
+    """Whether the readings leave no choice of axes."""
+    return len(result.alternatives) == 1 and result.unexplained < EXPLAINED
+
 
 NEEDED = {
     "accelerometer": ("inclination", "toolface"),

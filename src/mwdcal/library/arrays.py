@@ -10,7 +10,7 @@ import numpy as np
 
 from mwdcal.calibration.readings import TRIADS, Readings, fingerprints, group_numbers
 from mwdcal.errors import InputError
-from mwdcal.estimation.evidence import WALKS
+from mwdcal.estimation.problem import WALKS
 from mwdcal.files import metadata as meta
 from mwdcal.files.contract import RAW_SPREAD, REFERENCES, TEMPERATURE, Range
 from mwdcal.geometry.vectors import Array, ArrayLike, Bools, wrap

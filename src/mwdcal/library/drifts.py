@@ -11,15 +11,13 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from mwdcal.calibration.prediction import STATED_ANGLES
 from mwdcal.calibration.readings import TRIADS, serial_of
 from mwdcal.calibration.record import Calibration, Finding
-from mwdcal.drift.change import CHANGE_LEVEL
+from mwdcal.calibration.results import STATED_ANGLES
 from mwdcal.drift.document import ToolDrift
-from mwdcal.drift.fleet import fleet_drift
-from mwdcal.drift.forecast import ServiceTest
-from mwdcal.drift.tool import MeasuredTool, TypeRates, measured, predicted
-from mwdcal.drift.walk import WALK_GROUPS
+from mwdcal.drift.histories import ServiceTest
+from mwdcal.drift.tool import MeasuredTool, TypeRates, fleet_drift, measured, predicted
+from mwdcal.drift.walk import CHANGE_LEVEL, WALK_GROUPS
 from mwdcal.errors import InputError, MwdcalError
 from mwdcal.files import documents
 from mwdcal.files.formats.columns import shown
@@ -27,13 +25,13 @@ from mwdcal.files.formats.members import Member
 from mwdcal.files.limits import load_limits
 from mwdcal.geometry.units import STANDARD_GRAVITY
 from mwdcal.presentation.drift import RegistryDrift
-from mwdcal.registry import queries
+from mwdcal.registry import lookup
 from mwdcal.registry.store import Registry, open_registry
 from mwdcal.survey.acceptance import SensorTerms
 from mwdcal.survey.surveying import WellInputs
 from mwdcal.use.verification import Bounds, Verdict
 
-_Document = tuple[queries.Row, bytes]
+_Document = tuple[lookup.Row, bytes]
 Advance = Callable[[int, int], None]
 """Hears how many tools are done, and of how many."""
 PEERS_READ = 200
@@ -186,9 +184,9 @@ def _peers(
             yield measured(past.serial, calibrations, tested=False)
 
 
-def _tools(registry: Registry, **where: object) -> Iterator[queries.Row]:
+def _tools(registry: Registry, **where: object) -> Iterator[lookup.Row]:
     """All tools of a registry whose columns equal these."""
-    return _rows(partial(queries.tools_page, registry, where=where))
+    return _rows(partial(lookup.tools_page, registry, where=where))
 
 
 class _Past(NamedTuple):
@@ -197,7 +195,7 @@ class _Past(NamedTuple):
     serial: str
     files: list[_Document]
     verdicts: list[_Document]
-    runs: list[queries.Row]
+    runs: list[lookup.Row]
 
     def measured(self, level: float) -> MeasuredTool | None:
         """The tool by its calibrations and roll tests; None where it has no calibration."""
@@ -241,25 +239,25 @@ def _pasts(registry: Registry, serials: Sequence[str]) -> Iterator[_Past]:
     for first in range(0, len(serials), TOOLS_READ):
         some = [*serials[first : first + TOOLS_READ]]
         pasts = {serial: _Past(serial, [], [], []) for serial in some}
-        for row, data in queries.calibrations(registry, *some):
+        for row, data in lookup.calibrations(registry, *some):
             pasts[row["serial"]].files.append((row, data))
         where: dict[str, object] = {"serial": some}
         verdicts = list(_records(registry, "verification", where))
         for row in verdicts:
-            _, data = queries.document(registry, row["number"])
+            _, data = lookup.numbered(registry, row["number"])
             pasts[row["serial"]].verdicts.append((row, data))
         for row in _records(registry, "run", where) if verdicts else ():
             pasts[row["serial"]].runs.append(row)
         yield from pasts.values()
 
 
-def _records(registry: Registry, kind: str, where: dict[str, object]) -> Iterator[queries.Row]:
+def _records(registry: Registry, kind: str, where: dict[str, object]) -> Iterator[lookup.Row]:
     """The records of a kind that were not withdrawn."""
-    pages = partial(queries.records_page, registry, kind, where, newest_first=False)
+    pages = partial(lookup.records_page, registry, kind, where, newest_first=False)
     return (row for row in _rows(pages) if row["withdrawn"] is None)
 
 
-def _rows(page: Callable[..., queries.Page]) -> Iterator[queries.Row]:
+def _rows(page: Callable[..., lookup.Page]) -> Iterator[lookup.Row]:
     """All rows of a query that gives them in pages."""
     start, total = 0, 1
     while start < total:

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import msgspec
 
 from mwdcal import pool
-from mwdcal.calibration.automatic.nonlinearity import with_strengths
+from mwdcal.calibration.automatic.auto import with_strengths
 from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.diagnosis.refusals import check_options, no_temperature
 from mwdcal.calibration.fit_options import FitArguments, stated_arguments

@@ -10,12 +10,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mwdcal.calibration.canonical import SignatureState
-from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.calibration.record import Calibration, Finding, SignatureState
 from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError
 from mwdcal.files.formats.members import Member
-from mwdcal.files.settings import source_of_settings
+from mwdcal.files.profiles import source_of_settings
 from mwdcal.library.registries import ToolRegistry, day_of
 from mwdcal.library.results import Result
 from mwdcal.library.shown import digest_of
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
     from mwdcal.certificate.document import Certificate, SourceFile
     from mwdcal.drift.document import ToolDrift
     from mwdcal.files.verifications import Verification
-    from mwdcal.presentation.certificate_text import Picture
+    from mwdcal.presentation.certificate import Picture
     from mwdcal.presentation.signature import CheckedDocument, SignedDocument
 
 CERTIFICATE_FORMS = (".json", ".html", ".pdf", ".xml")
@@ -66,7 +65,7 @@ class Paper(Result):
         from mwdcal.presentation.page import require
 
         require("a certificate as page or PDF", "matplotlib")
-        from mwdcal.presentation.certificate_page import certificate_pictures
+        from mwdcal.presentation.certificate import certificate_pictures
 
         tests = self.order.verification, self.order.as_found
         return certificate_pictures(self.calibration, *tests, self.drift)
@@ -88,7 +87,7 @@ class Paper(Result):
 
             return to_xml(self.record)
         if suffix == ".pdf":
-            from mwdcal.presentation.certificate_page import render_pdf
+            from mwdcal.presentation.certificate import render_pdf
 
             return render_pdf(self.record, self.pictures)
         return self._page()
@@ -116,7 +115,7 @@ class Paper(Result):
         return document
 
     def _page(self) -> str:
-        from mwdcal.presentation.certificate_page import render_page
+        from mwdcal.presentation.certificate import render_page
 
         return render_page(self.record, self.pictures)
 
@@ -163,7 +162,7 @@ def certificate(
     """
     from mwdcal.certificate.contents import CertificateRequest
     from mwdcal.certificate.contents import certificate as contents
-    from mwdcal.certificate.laboratory import load_laboratory
+    from mwdcal.certificate.document import load_laboratory
 
     files = _Sources(Path(folder).resolve())
     calibration, digest, doubts = _loaded(cal, keys, files)
@@ -327,8 +326,7 @@ def sign(
 
     Example: `mwdcal.sign("C.json", "laboratory.key")`
     """
-    from mwdcal.certificate.keys import read_private
-    from mwdcal.certificate.signature import signed
+    from mwdcal.certificate.signature import read_private, signed
     from mwdcal.files import documents
     from mwdcal.files.formats import atomic
     from mwdcal.presentation import signature as screens
@@ -366,7 +364,7 @@ def _json_of(paper: Paper) -> Path:
 
 def _passphrase(given: str | Callable[[], str] | None) -> str:
     """The passphrase of a private key."""
-    from mwdcal.certificate.keys import PASSPHRASE
+    from mwdcal.certificate.signature import PASSPHRASE
 
     if callable(given):
         return given()
@@ -426,7 +424,7 @@ def check_signature(
 
     Example: `mwdcal.check_signature("C.json", keys=["laboratory.key.pub"]).state`
     """
-    from mwdcal.certificate.keys import trusted
+    from mwdcal.certificate.signature import trusted
     from mwdcal.files import documents
     from mwdcal.presentation import signature as screens
 

@@ -63,7 +63,7 @@ class PlanResult(Result):
     @property
     def accuracy_deg(self) -> dict[str, float | None]:
         """Standard uncertainty of each angle at 45° inclination, as `calibrate` states it; None: undetermined."""
-        from mwdcal.calibration.prediction import typical_accuracy
+        from mwdcal.calibration.results import typical_accuracy
 
         return typical_accuracy(self.calibration)
 
@@ -110,7 +110,7 @@ class PlanResult(Result):
         return document(*self._named())
 
     def _page(self) -> str:
-        from mwdcal.presentation.plan_page import render
+        from mwdcal.presentation.plan import render
 
         return render(self.plans)
 

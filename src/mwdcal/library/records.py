@@ -109,11 +109,11 @@ class CalibratedFleet(Result):
 
     def save_calibrations(self, folder: str | os.PathLike[str]) -> int:
         """Write the calibration file of each tool into a new or empty folder, and count them."""
-        from mwdcal.files.formats import folders
-        from mwdcal.fleet import calibration_files
+        from mwdcal.files.formats import atomic
+        from mwdcal.fleet import kept
 
-        folders.check_new(Path(folder))
-        return calibration_files.write(self.path, Path(folder))
+        atomic.check_new(Path(folder))
+        return kept.write(self.path, Path(folder))
 
     def report(self, path: str | os.PathLike[str]) -> None:
         """Write the page of the command: self-contained HTML."""

@@ -53,17 +53,16 @@ def registry(
             tools.latest("SIM-0001").uncertainty("azimuth", survey)
             tools.drift("SIM-0001").next_due
     """
-    from mwdcal.registry import copies, setup
-    from mwdcal.registry.actor import system_user
-    from mwdcal.registry.store import open_registry
+    from mwdcal.registry import exports, store
+    from mwdcal.registry.store import open_registry, system_user
 
     who = system_user() if actor is None else actor
     if restore is not None:
-        copies.restore(restore, database, who)
+        exports.restore(restore, database, who)
     elif create and _is_new(database):
-        setup.create(database, who)
+        store.create(database, who)
     elif upgrade:
-        setup.upgrade(database, who)
+        store.upgrade(database, who)
     stack = ExitStack()
     return ToolRegistry(stack.enter_context(open_registry(database)), who, stack)
 
@@ -172,7 +171,7 @@ class DriftAnswer(RegistryAnswer):
         return min(filter(None, days), default=None)
 
     def _page(self) -> str:
-        from mwdcal.presentation.drift_page import render
+        from mwdcal.presentation.drift import render
 
         return render(self.content.tool, self.content.fleet)
 
@@ -342,9 +341,9 @@ class ToolRegistry:
             InputError: it cannot be written.
         """
         from mwdcal.presentation import registry as screen
-        from mwdcal.registry import copies
+        from mwdcal.registry import exports
 
-        head = copies.backup(self.opened, path)
+        head = exports.backup(self.opened, path)
         result = screen.RegistryCopied(file=os.fspath(path), head=head)
         document = screen.document("registry backup", result)
         return RegistryAnswer(result, screen.copied_text(result), document)
@@ -355,7 +354,7 @@ class ToolRegistry:
         Raises:
             InputError: the folder is not empty, or cannot be written.
         """
-        from mwdcal.files.formats.folders import check_new
+        from mwdcal.files.formats.atomic import check_new
         from mwdcal.presentation import registry as screen
         from mwdcal.registry.exports import export
 

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any, NamedTuple, TypeVar
 
-from mwdcal.calibration.notebooks import html_table
 from mwdcal.calibration.readings import Readings
-from mwdcal.calibration.record import Calibration
+from mwdcal.calibration.record import Calibration, html_table
 from mwdcal.comparison.compare import Comparison
 from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError
@@ -137,7 +136,7 @@ def _comparison_document(comparison: Comparison) -> dict[str, Any]:
 
 
 def _comparison_page(comparison: Comparison) -> str:
-    from mwdcal.presentation.comparison_page import render
+    from mwdcal.presentation.comparison import render
 
     return render(comparison)
 
@@ -155,7 +154,7 @@ def _noise_document(noise: Noise) -> dict[str, Any]:
 
 
 def _noise_page(noise: Noise) -> str:
-    from mwdcal.presentation.noise_page import render
+    from mwdcal.presentation.noise import render
 
     return render(noise)
 
@@ -175,7 +174,7 @@ def _stations_document(stations: Stations) -> dict[str, Any]:
 
 
 def _stations_page(stations: Stations) -> str:
-    from mwdcal.presentation.stations_page import render
+    from mwdcal.presentation.stations import render
 
     return render(stations, _inputs(stations).digests.get("log", ""))
 

@@ -31,14 +31,14 @@ from mwdcal.library.planning import (
 )
 from mwdcal.library.results import Result, arrays_of
 from mwdcal.library.tasks import with_choices
-from mwdcal.planning import simulate as simulation
-from mwdcal.planning.simulate import Truth
+from mwdcal.planning import plans as simulation
+from mwdcal.planning.plans import Truth
 from mwdcal.sensor.profile import Profile
 from mwdcal.use.verification import Limits
 
 if TYPE_CHECKING:
+    from mwdcal.planning.plans import Effects
     from mwdcal.planning.procedure import Part, Procedure, Repetition, Share, Tools
-    from mwdcal.planning.simulate import Effects
 
     Mapper = Callable[[Callable[[Part], Tools], Sequence[Part]], Iterable[Tools]]
 
@@ -116,7 +116,7 @@ class RepeatedProcedure(Result):
 
     def _picture(self, suffix: str) -> bytes:
         from mwdcal.presentation.page import picture
-        from mwdcal.presentation.simulation_page import figure
+        from mwdcal.presentation.simulation import figure
 
         procedure = self.procedure
         title = procedure.calibrating.plan.source, procedure.guard
@@ -308,8 +308,8 @@ class _Scene:
         effects: FilePath | Effects | None, seed: int,
     ) -> _Scene:  # fmt: skip
         """All that is named, read."""
+        from mwdcal.planning.plans import Effects, load_effects
         from mwdcal.planning.session import calibrated_tool
-        from mwdcal.planning.simulate import Effects, load_effects
         from mwdcal.presentation.calibration_source import calibration_of
 
         check_whole("seed", seed, 0)

@@ -13,10 +13,9 @@ import numpy as np
 
 from mwdcal.calibration.calibrate import calibrate as fit_and_judge
 from mwdcal.calibration.diagnosis.findings import of_table
-from mwdcal.calibration.notebooks import html_table
 from mwdcal.calibration.options import FitChoices, Options
 from mwdcal.calibration.readings import Readings, ReadingsLike, as_readings
-from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.calibration.record import Calibration, Finding, html_table
 from mwdcal.comparison.compare import Comparison
 from mwdcal.comparison.compare import compare as compare_methods
 from mwdcal.errors import InputError

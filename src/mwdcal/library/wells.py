@@ -28,7 +28,7 @@ from mwdcal.library.tasks import Tabular, _check_readings, table_of
 from mwdcal.sensor.profile import Profile
 
 if TYPE_CHECKING:
-    from mwdcal.calibration.canonical import SignatureCheck
+    from mwdcal.calibration.record import SignatureCheck
     from mwdcal.presentation.conversion import Converted, Exported
     from mwdcal.presentation.survey import SurveySummary
     from mwdcal.survey.acceptance import SurveyLimits

@@ -15,13 +15,12 @@ from mwdcal.calibration.readings import HIGHEST, Readings
 from mwdcal.calibration.readings import highest_order as carried_order
 from mwdcal.calibration.record import Calibration, Undetermined
 from mwdcal.errors import FitError, InputError
-from mwdcal.estimation.evidence import ANGLES, EARTH
+from mwdcal.estimation.problem import ANGLES, EARTH
 from mwdcal.files.contract import REFERENCES, channels
 from mwdcal.files.formats.table import Table
 from mwdcal.files.runs import check_references, from_readings, to_readings
 from mwdcal.geometry.vectors import Array, reference_vectors
-from mwdcal.planning.plans import attitudes
-from mwdcal.planning.simulate import Earth
+from mwdcal.planning.plans import Earth, attitudes
 from mwdcal.sensor.profile import Profile, TriadProfile
 
 STILL = 1e-6

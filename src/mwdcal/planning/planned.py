@@ -23,11 +23,11 @@ from mwdcal.calibration.diagnosis.identity import UNIDENTIFIED
 from mwdcal.calibration.diagnosis.plausibility import freedom_of
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.prediction import TWELFTHS, accuracy_at, angles, readings_at
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.calibration.results import TWELFTHS, accuracy_at, angles, readings_at
 from mwdcal.errors import FitError, InputError
-from mwdcal.estimation.evidence import ANGLES
+from mwdcal.estimation.problem import ANGLES
 from mwdcal.files.formats.table import Table, labels
 from mwdcal.geometry.vectors import Array, Bools, Ints
 from mwdcal.planning.expected import carried_out, left_undetermined, planned_fit

@@ -19,12 +19,12 @@ from mwdcal.calibration.diagnosis.flags import FittedRuns
 from mwdcal.calibration.diagnosis.refusals import fit_refusals
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.prediction import STATED_ANGLES, accuracy, middle_temperature
 from mwdcal.calibration.readings import CONSTANTS, TRIADS, Readings
 from mwdcal.calibration.record import SOFTWARE, Calibration
+from mwdcal.calibration.results import STATED_ANGLES, accuracy, middle_temperature
 from mwdcal.errors import FitError, InputError
-from mwdcal.estimation.evidence import ANGLES
-from mwdcal.estimation.rank import Free
+from mwdcal.estimation.problem import ANGLES
+from mwdcal.estimation.uncertainty import Free
 from mwdcal.files.contract import REFERENCES
 from mwdcal.files.formats.columns import Column
 from mwdcal.files.formats.table import Table
@@ -32,14 +32,12 @@ from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, reference_vectors
 from mwdcal.planning.expected import left_undetermined, planned_fit
 from mwdcal.planning.planned import WORKING_INCLINATIONS
+from mwdcal.planning.plans import Effects, Truth, drawn
 from mwdcal.planning.session import Session
-from mwdcal.planning.simulate import Effects, Truth, drawn
 from mwdcal.sensor.profile import Profile
 from mwdcal.use import roll_test
-from mwdcal.use.departures import LEVEL, UNDEFINED_AT_VERTICAL, RollTest
-from mwdcal.use.risk import COVERAGE
-from mwdcal.use.roll_test import RollSet
-from mwdcal.use.verification import Limits
+from mwdcal.use.roll_test import LEVEL, UNDEFINED_AT_VERTICAL, RollSet, RollTest
+from mwdcal.use.verification import COVERAGE, Limits
 
 Part = tuple[int, int]
 """Number and size of a part of all tools."""

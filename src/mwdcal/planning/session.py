@@ -16,8 +16,17 @@ from mwdcal.files.runs import from_readings
 from mwdcal.geometry.vectors import Array
 from mwdcal.planning.expected import highest_order, nominal_run
 from mwdcal.planning.planned import Stand, move_seconds
-from mwdcal.planning.plans import ROOM_TEMPERATURE, attitudes, soak_numbers, soak_temperatures
-from mwdcal.planning.simulate import Effects, Simulation, Truth, common_errors, simulated
+from mwdcal.planning.plans import (
+    ROOM_TEMPERATURE,
+    Effects,
+    Simulation,
+    Truth,
+    attitudes,
+    common_errors,
+    simulated,
+    soak_numbers,
+    soak_temperatures,
+)
 from mwdcal.sensor.profile import Profile
 from mwdcal.use.notation import COURSE, channel_factors, convert
 

@@ -7,22 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from mwdcal.calibration.automatic.nonlinearity import CurveScore
+from mwdcal.calibration.automatic.auto import CurveScore
 from mwdcal.calibration.diagnosis.flags import listed
-from mwdcal.calibration.drift import (
-    Constant,
-    Drift,
-    UnseenDrift,
-    blindness,
-    declared_drift,
-    exact_and_steady,
-)
 from mwdcal.calibration.fit_options import unusual
-from mwdcal.calibration.prediction import typical_accuracy, without_temperature
+from mwdcal.calibration.options import ASSUMED, ASSUMED_PRACTICE
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import (
     BudgetRow,
     Calibration,
+    Constant,
+    Drift,
     ErrorRow,
     Finding,
     FitSettings,
@@ -30,8 +24,12 @@ from mwdcal.calibration.record import (
     OrderScore,
     StandErrors,
     Undetermined,
+    UnseenDrift,
+    blindness,
+    declared_drift,
+    exact_and_steady,
 )
-from mwdcal.calibration.settings import ASSUMED, ASSUMED_PRACTICE
+from mwdcal.calibration.results import typical_accuracy, without_temperature
 from mwdcal.geometry.observables import TITLES
 from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.numbers import (

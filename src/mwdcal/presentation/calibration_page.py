@@ -12,14 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal.calibration.prediction import (
-    accuracy_at,
-    angles,
-    middle_temperature,
-    without_temperature,
-)
 from mwdcal.calibration.readings import is_simulated, soaks
 from mwdcal.calibration.record import MAGNETIC, Calibration, Finding, TriadCalibration
+from mwdcal.calibration.results import accuracy_at, angles, middle_temperature, without_temperature
 from mwdcal.errors import InputError
 from mwdcal.estimation.solvers import RANK_TOLERANCE
 from mwdcal.geometry.observables import TITLES

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from mwdcal.calibration.prediction import middle_temperature
 from mwdcal.calibration.readings import Readings, simulated
 from mwdcal.calibration.record import SOFTWARE, Calibration, Finding
+from mwdcal.calibration.results import middle_temperature
 from mwdcal.errors import InputError
 from mwdcal.files.contract import TEMPERATURE
 from mwdcal.files.formats import members

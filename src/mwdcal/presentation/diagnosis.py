@@ -6,8 +6,7 @@ from collections.abc import Mapping
 
 from mwdcal.calibration.readings import simulated
 from mwdcal.faults.diagnosis import Diagnosis, Rival
-from mwdcal.faults.likelihood import FALSE_ALARMS
-from mwdcal.faults.physics import NONE, SURROUNDINGS
+from mwdcal.faults.likelihood import FALSE_ALARMS, NONE, SURROUNDINGS
 from mwdcal.presentation.numbers import capital, estimate, measured, number
 from mwdcal.presentation.page import banner, rendered
 from mwdcal.presentation.text import chance, one_line, plural, table

@@ -7,10 +7,9 @@ from typing import Any
 
 import msgspec
 
-from mwdcal.calibration.canonical import Signature, SignatureCheck
 from mwdcal.calibration.readings import head
-from mwdcal.calibration.record import DOCUMENT_VERSION, SOFTWARE
-from mwdcal.files.settings import LaboratorySettings, source_of_settings
+from mwdcal.calibration.record import DOCUMENT_VERSION, SOFTWARE, Signature, SignatureCheck
+from mwdcal.files.profiles import LaboratorySettings, source_of_settings
 
 INPUTS = {
     "apply": ("calibration", "readings"),

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal.calibration.prediction import STATED_ANGLES
 from mwdcal.calibration.readings import TRIADS
+from mwdcal.calibration.results import STATED_ANGLES
 from mwdcal.files.formats import parquet
 from mwdcal.fleet.calibrate import OK
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints

@@ -12,19 +12,19 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from mwdcal.calibration.canonical import Signature, SignatureCheck
 from mwdcal.calibration.readings import simulated
-from mwdcal.calibration.record import Calibration, Finding
-from mwdcal.certificate.keys import TrustedKey, trusted
+from mwdcal.calibration.record import Calibration, Finding, Signature, SignatureCheck
 from mwdcal.certificate.signature import (
     FINDING_OF_STATE,
     SIGNATURE_KEY,
     CheckedFile,
+    TrustedKey,
     check,
     check_files,
     document_of,
     fields_of,
     signature_doubts,
+    trusted,
 )
 from mwdcal.certificate.signature import check as check_signature
 from mwdcal.errors import InputError

@@ -13,10 +13,9 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from mwdcal.calibration.canonical import SignatureCheck
 from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.readings import serial_of, simulated
-from mwdcal.calibration.record import Finding, stated
+from mwdcal.calibration.record import Finding, SignatureCheck, stated
 from mwdcal.geometry.units import LENGTH_UNITS
 from mwdcal.presentation.contributions import (
     ContributionSummary,
@@ -28,10 +27,9 @@ from mwdcal.presentation.numbers import files_written, fixed, measured, number, 
 from mwdcal.presentation.signature import signature_status
 from mwdcal.presentation.text import chance, one_line, plural, table
 from mwdcal.survey.interference import Interference, InterferenceSize, MultiStationAnalysis
-from mwdcal.survey.norths import North
+from mwdcal.survey.stations import North
 from mwdcal.survey.surveying import BY_ROW, SurveyedWell, WellInputs
-from mwdcal.survey.well import LastStation, Well, WellCounts
-from mwdcal.survey.well_errors import WellErrors
+from mwdcal.survey.well import LastStation, Well, WellCounts, WellErrors
 from mwdcal.use.uncertainty import ErrorTerms, error_terms
 
 MOST_CORRECTED = 30

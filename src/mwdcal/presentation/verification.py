@@ -8,9 +8,8 @@ from pathlib import Path
 from msgspec import UNSET
 from msgspec.structs import replace
 
-from mwdcal.calibration.canonical import SignatureCheck
 from mwdcal.calibration.readings import simulated
-from mwdcal.calibration.record import Finding
+from mwdcal.calibration.record import Finding, SignatureCheck
 from mwdcal.presentation.numbers import measured, quantity, unit
 from mwdcal.presentation.signature import signature_status
 from mwdcal.presentation.text import NOT_STATED, WIDE, chance, one_line, table

@@ -13,13 +13,12 @@ import msgspec
 import sqlalchemy as sa
 
 from mwdcal.errors import InputError
-from mwdcal.registry.database import chain, migrating
+from mwdcal.registry.database import migrating, schema
 from mwdcal.registry.database.connections import OBJECTS_AT_ONCE, ROWS_AT_ONCE
 from mwdcal.registry.database.models import history, objects, records, tools, withdrawals
-from mwdcal.registry.database.tools import TOOL_KINDS, rows_of
-from mwdcal.registry.facts import FACTS_VERSION, facts
+from mwdcal.registry.database.schema import TOOL_KINDS, rows_of
 from mwdcal.registry.store import Registry
-from mwdcal.registry.stored import AlteredError, record_digest, unpacked
+from mwdcal.registry.stored import FACTS_VERSION, AlteredError, facts, record_digest, unpacked
 
 MOST_DISCREPANCIES = 1000
 """Discrepancies after which a check stops."""
@@ -115,7 +114,7 @@ def _events(connection: sa.Connection, progress: Progress) -> Iterator[Discrepan
         _Rows(connection, withdrawals),
         _Rows(connection, objects, OBJECTS_AT_ONCE),
     ]
-    before = (0, chain.GENESIS)
+    before = (0, schema.GENESIS)
     options = {"stream_results": True, "yield_per": ROWS_AT_ONCE}
     query = sa.select(history).order_by(history.c.number)
     for done, row in enumerate(connection.execute(query, execution_options=options).mappings()):
@@ -150,7 +149,7 @@ def _link(event: Row, before: tuple[int, str]) -> Iterator[Discrepancy]:
 def _digest(row: Row, without: str = "") -> str | None:
     """The digest of a row; None where its values are no text and numbers."""
     try:
-        return chain.digest({name: value for name, value in row.items() if name != without})
+        return schema.digest({name: value for name, value in row.items() if name != without})
     except (TypeError, ValueError):
         return None
 
@@ -168,7 +167,7 @@ def _row(
         if record is not None:
             digest = record_digest(record, stored)
         elif withdrawal is not None:
-            digest = chain.digest(withdrawal)
+            digest = schema.digest(withdrawal)
     except (TypeError, ValueError):
         digest = "of no JSON"
     surplus = withdrawal is not None if record is not None else stored is not None

@@ -5,27 +5,80 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from datetime import datetime
+from getpass import getuser
 from typing import Any, NamedTuple
 
 import msgspec
 import sqlalchemy as sa
 
 from mwdcal.errors import InputError
-from mwdcal.registry.database import chain, schema
+from mwdcal.registry.database import migrating, schema
 from mwdcal.registry.database.connections import Database, connect
 from mwdcal.registry.database.models import objects, records, withdrawals
-from mwdcal.registry.database.tools import TOOL_KINDS, portions, refresh
-from mwdcal.registry.facts import FACTS_VERSION, LONGEST_NAME, content_address, facts, plain
+from mwdcal.registry.database.schema import (
+    SCHEMA_VERSION_OF_REGISTRY,
+    TOOL_KINDS,
+    portions,
+    refresh,
+)
 from mwdcal.registry.stored import (
+    FACTS_VERSION,
     LARGEST_OBJECT,
+    LONGEST_NAME,
     Stored,
     check_complete,
+    content_address,
     documents,
+    facts,
     packed,
+    plain,
     record_digest,
     with_objects,
 )
+
+# --------------------------------------------------------------------------
+# Who acts, where nobody says it.
+
+
+def system_user() -> str:
+    """The name under which the user is known to the system; empty where there is none."""
+    with suppress(KeyError, OSError, ImportError):
+        return getuser()
+    return ""
+
+
+# --------------------------------------------------------------------------
+# Creation of a registry, and the change of its schema from version to version.
+
+
+def create(database: str | os.PathLike[str], actor: str) -> None:
+    """Create a registry in a new file, or in an empty database by its URL.
+
+    Raises:
+        InputError: it exists already, or cannot be created.
+    """
+    who, target = person(actor), connect(database, new=True)
+    try:
+        migrating.initialise(target, who)
+    finally:
+        target.engine.dispose()
+
+
+def upgrade(database: str | os.PathLike[str], actor: str) -> tuple[str, str]:
+    """Bring the schema of a registry to this program's version; from which to which."""
+    return move_to(database, SCHEMA_VERSION_OF_REGISTRY, actor)
+
+
+def move_to(database: str | os.PathLike[str], target: str, actor: str) -> tuple[str, str]:
+    """Bring the schema of a registry to a version, up or down; from which to which."""
+    who, place = person(actor), connect(database)
+    try:
+        return migrating.change(place, target, who)
+    finally:
+        place.engine.dispose()
+
 
 Draft = dict[str, Any]
 """The rows inserted for an entry: see `draft`."""
@@ -105,7 +158,7 @@ class Registry:
 
         `reasons`: of each that is withdrawn at once if it is new, why.
         """
-        who, time = person(actor), chain.instant(when)
+        who, time = person(actor), schema.instant(when)
         with self.writing() as connection:
             result = _insert(connection, drafts, who, time)
             for each, why in zip(result, reasons, strict=False):
@@ -119,7 +172,7 @@ class Registry:
         Raises:
             InputError: there is no such record, or it is withdrawn already.
         """
-        who, why, time = person(actor), plain(reason).strip(), chain.instant(when)
+        who, why, time = person(actor), plain(reason).strip(), schema.instant(when)
         if not why:
             raise InputError("`reason` must not be empty. Say why the record is withdrawn.")
         with self.writing() as connection:
@@ -162,7 +215,7 @@ class Registry:
     def head(self) -> tuple[int, str]:
         """Number and hash of the newest event of the history."""
         with self.reading() as connection:
-            return chain.head(connection)
+            return schema.head(connection)
 
 
 def person(actor: str) -> str:
@@ -205,7 +258,7 @@ def _insert(connection: sa.Connection, drafts: Sequence[Draft], who: str, time: 
     """Insert what is new, with its events; what became of each."""
     known = _known(connection, [rows_to_insert["sha256"] for rows_to_insert in drafts])
     stored = {sha256 for sha256, _ in known}
-    number, previous = chain.head(connection)
+    number, previous = schema.head(connection)
     rows, packed, events, result = [], [], [], []
     for rows_to_insert in drafts:
         row = {name: value for name, value in rows_to_insert.items() if name != "object"}
@@ -228,7 +281,7 @@ def _insert(connection: sa.Connection, drafts: Sequence[Draft], who: str, time: 
     for table, values in ((objects, packed), (records, rows)):
         if values:
             connection.execute(sa.insert(table), values)
-    chain.append(connection, previous, events)
+    schema.append(connection, previous, events)
     _refresh_tools(connection, rows)
     return result
 
@@ -243,11 +296,11 @@ def _withdraw(
     before = sa.select(withdrawals.c.number).where(withdrawals.c.record == number)
     if connection.scalar(before) is not None:
         raise InputError(f"{name}: record {number} is withdrawn already.")
-    newest, previous = chain.head(connection)
+    newest, previous = schema.head(connection)
     row = {"number": newest + 1, "record": number, "reason": why}
     connection.execute(sa.insert(withdrawals), row)
-    event = _event(row, record._mapping, who, time, "withdraw", chain.digest(row))
-    chain.append(connection, previous, [event])
+    event = _event(row, record._mapping, who, time, "withdraw", schema.digest(row))
+    schema.append(connection, previous, [event])
     _refresh_tools(connection, [record._mapping])
 
 

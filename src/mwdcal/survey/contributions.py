@@ -26,8 +26,7 @@ from mwdcal.survey.path import (
     position_covariance,
     tilts,
 )
-from mwdcal.survey.well import Start, Well
-from mwdcal.survey.well_errors import SENSOR_CAUSES, SeenHole, WellErrors, hole_of, with_depth
+from mwdcal.survey.well import SENSOR_CAUSES, SeenHole, Start, Well, WellErrors, hole_of, with_depth
 from mwdcal.use.uncertainty import AXIAL_INTERFERENCE, CORRECTED, DRIFT, OF_MODELS
 
 CORRECTION = "calibration and multi-station analysis"

@@ -17,10 +17,10 @@ from mwdcal.calibration import results
 from mwdcal.calibration.automatic.courses import OFFSETS
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.prediction import UNKNOWN_GRAVITY, unknown_gravity
 from mwdcal.calibration.prior import PriorInformation, for_run
 from mwdcal.calibration.readings import CONSTANTS, Readings
 from mwdcal.calibration.record import Calibration
+from mwdcal.calibration.results import UNKNOWN_GRAVITY, unknown_gravity
 from mwdcal.errors import InputError
 from mwdcal.estimation.uncertainty import TANGENT_STEP, analyse, tangent
 from mwdcal.geometry.observables import OBSERVABLES

@@ -22,8 +22,15 @@ from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError
 from mwdcal.files import streams, synonyms
-from mwdcal.files.contract import COLUMNS, REFERENCES, check_columns
-from mwdcal.files.faults import OPTIONAL, blank_cell, is_blank, wholly_blank
+from mwdcal.files.contract import (
+    COLUMNS,
+    OPTIONAL,
+    REFERENCES,
+    blank_cell,
+    check_columns,
+    is_blank,
+    wholly_blank,
+)
 from mwdcal.files.formats import atomic, parquet
 from mwdcal.files.formats.columns import LABELS, Column, check_names, no_stations
 from mwdcal.files.formats.sinks import ParquetSink, SpooledSink
@@ -34,9 +41,9 @@ from mwdcal.geometry.vectors import Array, ArrayLike
 from mwdcal.sensor.profile import Profile, StandProfile
 from mwdcal.survey.acceptance import SurveyLimits
 from mwdcal.survey.error_model import BUILT_IN, ErrorModel
-from mwdcal.survey.norths import DECLINATIONS, horizontal_field, norths_of
 from mwdcal.survey.path import TieIn
 from mwdcal.survey.references import Claim, EarthReference
+from mwdcal.survey.stations import DECLINATIONS, horizontal_field, norths_of
 from mwdcal.survey.surveying import (
     BY_ROW,
     MEASURED_DEPTHS,

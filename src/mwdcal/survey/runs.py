@@ -21,9 +21,8 @@ from mwdcal.files.formats.table import Table
 from mwdcal.geometry.vectors import AnyArray, Array, Bools
 from mwdcal.survey.acceptance import Blindness, Judgement
 from mwdcal.survey.interference import Interference
-from mwdcal.survey.norths import North
 from mwdcal.survey.path import TieIn
-from mwdcal.survey.stations import TOOLFACE_SWITCH, Surveys
+from mwdcal.survey.stations import TOOLFACE_SWITCH, North, Surveys
 from mwdcal.survey.surveying import SurveyedWell, WellInputs, survey_well
 from mwdcal.survey.well import Position, Well
 

@@ -23,12 +23,16 @@ from mwdcal.files.contract import (
     ROTATION,
     check_columns,
     check_near_misses,
+    chosen,
+    nothing,
+    spread,
     stated_norths,
+    wholly_blank,
+    without_reading,
 )
-from mwdcal.files.faults import chosen, nothing, spread, wholly_blank, without_reading
 from mwdcal.files.formats.table import Table, cell_error, numbers
+from mwdcal.files.profiles import setting
 from mwdcal.files.runs import renamed, to_readings
-from mwdcal.files.settings import setting
 from mwdcal.geometry.units import LENGTH_UNITS
 from mwdcal.geometry.vectors import AnyArray, Array, Bools
 from mwdcal.sensor.profile import StandProfile
@@ -37,7 +41,6 @@ from mwdcal.survey.contributions import Contributions, contributions
 from mwdcal.survey.error_model import BUILT_IN, ErrorModel, load_error_model
 from mwdcal.survey.interference import Interference, interference
 from mwdcal.survey.interference_estimate import Assumed, sensor_drift
-from mwdcal.survey.norths import DECLINATIONS, SD_KEY, North, norths_of
 from mwdcal.survey.path import PathEnd, TieIn
 from mwdcal.survey.references import (
     FROM_REFERENCE,
@@ -49,7 +52,7 @@ from mwdcal.survey.references import (
     load_reference,
     source_of,
 )
-from mwdcal.survey.stations import RANDOM, TOOLFACE_SWITCH
+from mwdcal.survey.stations import DECLINATIONS, RANDOM, SD_KEY, TOOLFACE_SWITCH, North, norths_of
 from mwdcal.survey.trajectory import TrajectoryFacts, has_stations, north_of_tie_in, trajectory
 from mwdcal.survey.well import AXES_OF_EARTH, Before, Well, WellCounts, well
 

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from mwdcal.calibration.prediction import CORNERS, CalibratedTools
 from mwdcal.calibration.record import FREE_SHARE, SOFTWARE, Calibration, stated
+from mwdcal.calibration.results import CORNERS, CalibratedTools
 from mwdcal.errors import FitError
 from mwdcal.files.formats import atomic
 from mwdcal.geometry.units import STANDARD_GRAVITY

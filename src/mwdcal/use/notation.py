@@ -19,9 +19,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mwdcal.calibration.prediction import middle_temperature
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.record import FREE_SHARE, Calibration, TriadCalibration
+from mwdcal.calibration.results import middle_temperature
 from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import AnyArray, Array, Ints
 from mwdcal.sensor.models import affine_parts, factor_parts

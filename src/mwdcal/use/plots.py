@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from mwdcal.calibration.prediction import TYPICAL, accuracy_at, accuracy_curves, middle_temperature
 from mwdcal.calibration.readings import TRIADS, soaks
 from mwdcal.calibration.record import Calibration, ErrorRow, OrderScore, StationRow
 from mwdcal.calibration.residuals import RESHOOT
+from mwdcal.calibration.results import TYPICAL, accuracy_at, accuracy_curves, middle_temperature
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import TITLES
 from mwdcal.geometry.vectors import AnyArray, Array, Ints

@@ -40,7 +40,7 @@ def command(
     Exit: 0 written, 2 input cannot be read, or does not belong to the calibration.
     """
     from mwdcal.app.correction import Applied, apply_to_any
-    from mwdcal.app.progress import bar
+    from mwdcal.app.messages import bar
     from mwdcal.calibration.readings import simulated
     from mwdcal.presentation.envelope import json_document, with_signature
     from mwdcal.presentation.signature import load_calibration, signature_status

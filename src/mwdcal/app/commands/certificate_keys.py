@@ -15,11 +15,11 @@ import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import Command, print_result
-from mwdcal.certificate.keys import PASSPHRASE
+from mwdcal.certificate.signature import PASSPHRASE
 from mwdcal.errors import InputError
 
 if TYPE_CHECKING:
-    from mwdcal.certificate.keys import TrustedKey
+    from mwdcal.certificate.signature import TrustedKey
 
 
 def known(new: bool = False) -> str:
@@ -87,10 +87,10 @@ def create(output: Path, owner: str, passphrase: bool, as_json: bool) -> None:
     """
     import os
 
-    from mwdcal.certificate import keys
+    from mwdcal.certificate import signature
 
-    encrypted = passphrase or keys.PASSPHRASE in os.environ
-    public, file = keys.create(output, owner, known(new=True) if encrypted else "")
+    encrypted = passphrase or signature.PASSPHRASE in os.environ
+    public, file = signature.create(output, owner, known(new=True) if encrypted else "")
     _print("create", file, [public], as_json, private=output, public=file)
 
 
@@ -105,7 +105,7 @@ def trust(keys: Path, public: Path, as_json: bool) -> None:
     \b
     Example: mwdcal certificate key trust keys.json laboratory.key.pub
     """
-    from mwdcal.certificate import keys as lists
+    from mwdcal.certificate import signature as lists
 
     _print("trust", keys, lists.trust(keys, lists.read_public(public)).keys, as_json)
 
@@ -122,7 +122,7 @@ def retire(keys: Path, name: str, at: str, as_json: bool) -> None:
     \b
     Example: mwdcal certificate key retire keys.json 3f9a --at 2027-01-01
     """
-    from mwdcal.certificate import keys as lists
+    from mwdcal.certificate import signature as lists
 
     _print("retire", keys, lists.retire(keys, name, at).keys, as_json)
 
@@ -139,7 +139,7 @@ def revoke(keys: Path, name: str, reason: str, as_json: bool) -> None:
     \b
     Example: mwdcal certificate key revoke keys.json 3f9a --reason "laptop stolen"
     """
-    from mwdcal.certificate import keys as lists
+    from mwdcal.certificate import signature as lists
 
     _print("revoke", keys, lists.revoke(keys, name, reason).keys, as_json)
 
@@ -152,6 +152,6 @@ def list_keys(keys: Path, as_json: bool) -> None:
     \b
     Example: mwdcal certificate key list keys.json
     """
-    from mwdcal.certificate.keys import read_trusted
+    from mwdcal.certificate.signature import read_trusted
 
     _print("list", keys, read_trusted(keys), as_json)

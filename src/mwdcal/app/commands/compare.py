@@ -56,7 +56,7 @@ def command(
     rows = tuple(replace(row, refused=with_option_names(row.refused)) for row in result.rows)
     result = replace(result, rows=rows)
     if report:
-        from mwdcal.presentation.comparison_page import render
+        from mwdcal.presentation.comparison import render
 
         sources = profile.name, readings.run_sha256, readings.profile_sha256
         time = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")

@@ -33,7 +33,7 @@ def command(
 
     from mwdcal.calibration.diagnosis.findings import of_table
     from mwdcal.faults.diagnosis import diagnose
-    from mwdcal.faults.physics import NONE
+    from mwdcal.faults.likelihood import NONE
     from mwdcal.files import runs
     from mwdcal.files.formats import atomic
     from mwdcal.presentation.calibration_source import calibration_of

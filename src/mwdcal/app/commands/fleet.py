@@ -64,8 +64,8 @@ def command(
 
     with pool.preparing(1 if scheduler else workers):  # these imports, in the workers too
         from mwdcal.calibration.options import options_of
-        from mwdcal.files.formats import atomic, folders
-        from mwdcal.fleet import calibration_files
+        from mwdcal.files.formats import atomic
+        from mwdcal.fleet import kept
         from mwdcal.library import fleet_table
         from mwdcal.presentation import fleet as screen
         from mwdcal.presentation import fleet_page
@@ -75,7 +75,7 @@ def command(
     if calibrations:
         if records is False:
             raise InputError("`calibrations` needs the whole calibrations: leave out --no-records.")
-        folders.check_new(calibrations)
+        atomic.check_new(calibrations)
         records = True
     fit = options_of(typed, fleet_table.prior_of_fleet(typed["prior"]))
     try:
@@ -83,7 +83,7 @@ def command(
             runs, output, tool, fit, typed, workers, scheduler, records, say
         )
         if calibrations:
-            count = calibration_files.write(output, calibrations)
+            count = kept.write(output, calibrations)
             say(f"wrote {plural(count, 'calibration file')} to {calibrations}")
         if report:
             atomic.write(report, fleet_page.render(output, summary))

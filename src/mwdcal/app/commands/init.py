@@ -141,9 +141,9 @@ def command(
     Example: mwdcal init --stand inclination_deg=0.02,azimuth_deg=0.05,toolface_deg=0.05 --defaults
     Exit: 0 written, 2 an answer is impossible, or settings exist, 3 questions are open (nothing is written).
     """
-    from mwdcal.app import laboratory, questions
+    from mwdcal.app import inputs, laboratory
     from mwdcal.files.formats import atomic
-    from mwdcal.files.settings import settings_toml
+    from mwdcal.files.profiles import settings_toml
     from mwdcal.presentation.envelope import WrittenSettings, json_document
     from mwdcal.presentation.text import one_line
 
@@ -157,10 +157,10 @@ def command(
     open_ones = [each for each in QUESTIONS if each.name not in given]
     if defaults:
         given |= {each.name: each.default for each in open_ones}
-    elif open_ones and not questions.on_terminal():
+    elif open_ones and not inputs.on_terminal():
         raise _open_questions(open_ones)
     for each in [] if defaults else open_ones:
-        given[each.name] = questions.ask(each.lines, each.default, partial(_check, each, folder))
+        given[each.name] = inputs.ask(each.lines, each.default, partial(_check, each, folder))
     settings = settings_of_answers(given, folder)
     atomic.write(path, settings_toml(settings))
     written = WrittenSettings(file=str(path), settings=settings)

@@ -40,7 +40,7 @@ def command(
     import numpy as np
     from msgspec.structs import replace
 
-    from mwdcal.app import progress
+    from mwdcal.app import messages
     from mwdcal.calibration.diagnosis.findings import unused_columns
     from mwdcal.files import logs, synonyms
     from mwdcal.files.contract import COLUMNS
@@ -50,13 +50,13 @@ def command(
     from mwdcal.logs.noise import check, find_noise
     from mwdcal.presentation import noise as screen
     from mwdcal.presentation.envelope import json_document
-    from mwdcal.presentation.noise_page import figure, render
+    from mwdcal.presentation.noise import figure, render
     from mwdcal.presentation.page import picture
 
     options.check_outputs([], [log, tool], picture=plot, page=report)
     between = (-np.inf if start is None else start, np.inf if end is None else end)
     check(between, **times)
-    slowly = progress.slowly(say)
+    slowly = messages.slowly(say)
     profile, digest = load_profile(tool) if tool else (None, "")
     readings = logs.read(log, options.column_names(columns), decimal=decimal, say=slowly)
     kind: Kind = "modified" if modified else "overlapping"

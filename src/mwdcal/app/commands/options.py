@@ -241,7 +241,7 @@ def _named_registry(context: click.Context, option: click.Parameter, typed: str 
 
 def _system_user() -> str:
     """The name under which the user is known to the system; empty where there is none."""
-    from mwdcal.registry.actor import system_user
+    from mwdcal.registry.store import system_user
 
     return system_user()
 
@@ -282,7 +282,7 @@ def check_outputs(
         if names & taken:
             raise _refused(path, "it is named twice")
         if file:
-            from mwdcal.files.precious import why_kept
+            from mwdcal.files.documents import why_kept
 
             if why := why_kept(target, given, calibration and path not in (picture, page)):
                 raise _refused(path, why)

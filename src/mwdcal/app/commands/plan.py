@@ -87,14 +87,14 @@ def command(
     Example: mwdcal plan --stations 24 --tool servo -o plan.csv --report sheet.html
     Exit: 0 planned, 2 input cannot be read, 3 the stations cannot give a calibration.
     """
-    from mwdcal.app import progress
+    from mwdcal.app import messages
     from mwdcal.app.inputs import prior_of
     from mwdcal.calibration.options import options_of
     from mwdcal.library import planning
     from mwdcal.presentation import plan as screen
 
     options.check_outputs([output], [tool, measured, *plans], page=report)
-    with progress.bar("planning") as show:
+    with messages.bar("planning") as show:
         result = planning.plan(
             tool or "generic", plan=plans, stations=stations, measured=measured,
             accuracy_deg=screen.wanted_accuracy(accuracy), reach=screen.reach(reach), criterion=criterion,

@@ -106,7 +106,7 @@ class Answers(dict[str, Any]):
 
 def _proposed(run: Path, answers: Answers, may_ask: bool) -> ProposedProfile:
     """The proposal, after questions on a terminal where it may ask."""
-    from mwdcal.app import questions
+    from mwdcal.app import inputs
     from mwdcal.library import planning
 
     for _ in range(MOST_ROUNDS):
@@ -115,7 +115,7 @@ def _proposed(run: Path, answers: Answers, may_ask: bool) -> ProposedProfile:
         except (QuestionError, QuestionsError) as error:
             every = error.questions if isinstance(error, QuestionsError) else (error,)
             open_ones = [each for each in every if each.answers]
-            if not open_ones or not may_ask or not questions.on_terminal():
+            if not open_ones or not may_ask or not inputs.on_terminal():
                 raise
             for each in open_ones:
                 _ask(each, answers)
@@ -124,14 +124,14 @@ def _proposed(run: Path, answers: Answers, may_ask: bool) -> ProposedProfile:
 
 def _ask(question: QuestionError, answers: Answers) -> None:
     """Ask a question, and note its answer with those given before."""
-    from mwdcal.app import questions
+    from mwdcal.app import inputs
 
-    place = questions.choose(question.text, [answer.name for answer in question.answers])
+    place = inputs.choose(question.text, [answer.name for answer in question.answers])
     chosen = question.answers[place]
     for argument, value in chosen.arguments:
         answers.take(argument, value)
     for name in chosen.numbers:
-        answers[name] = float(questions.ask([f"{name} (degrees, east is positive)"], "0", _number))
+        answers[name] = float(inputs.ask([f"{name} (degrees, east is positive)"], "0", _number))
 
 
 def _number(text: str) -> None:

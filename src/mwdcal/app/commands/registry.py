@@ -66,8 +66,7 @@ def init(database: str, actor: str, as_json: bool) -> None:
     Exit: 0 created, 2 it exists already, or cannot be written.
     """
     from mwdcal.presentation import registry as screen
-    from mwdcal.registry.setup import create
-    from mwdcal.registry.store import open_registry
+    from mwdcal.registry.store import create, open_registry
 
     create(database, actor)
     with open_registry(database) as registry:
@@ -91,12 +90,12 @@ def upgrade(database: str, actor: str, target: str | None, as_json: bool) -> Non
     Exit: 0 as it should be, 2 it cannot be opened, or a newer program made it.
     """
     from mwdcal.presentation import registry as screen
-    from mwdcal.registry import setup
+    from mwdcal.registry import store
 
     if target:
-        before, after = setup.move_to(database, target, actor)
+        before, after = store.move_to(database, target, actor)
     else:
-        before, after = setup.upgrade(database, actor)
+        before, after = store.upgrade(database, actor)
     result = screen.RegistryUpgraded(before=before, after=after)
     words = f"schema {before} → {after}" if before != after else f"schema {after}   nothing to do"
     print_result(screen.document("registry upgrade", result) if as_json else words)
@@ -120,7 +119,7 @@ def check(database: str, head: str | None, as_json: bool) -> None:
     Example: mwdcal registry check --registry tools.sqlite
     Exit: 0 sound, 1 altered, 2 it cannot be opened.
     """
-    from mwdcal.app.progress import bar
+    from mwdcal.app.messages import bar
     from mwdcal.presentation import registry as screen
     from mwdcal.registry import checking
     from mwdcal.registry.store import open_registry
@@ -148,8 +147,8 @@ def export(folder: Path, database: str, as_json: bool) -> None:
     Example: mwdcal registry export tools --registry tools.sqlite
     Exit: 0 written, 2 the folder is not empty, or cannot be written, 3 a document was altered.
     """
-    from mwdcal.app.progress import bar
-    from mwdcal.files.formats.folders import check_new
+    from mwdcal.app.messages import bar
+    from mwdcal.files.formats.atomic import check_new
     from mwdcal.presentation import registry as screen
     from mwdcal.registry.exports import export as write
     from mwdcal.registry.store import open_registry
@@ -180,12 +179,12 @@ def backup(output: Path, database: str, as_json: bool) -> None:
     Exit: 0 written, 2 the registry cannot be opened, or the file cannot be written, 3 the registry was altered.
     """
     from mwdcal.presentation import registry as screen
-    from mwdcal.registry import copies
+    from mwdcal.registry import exports
     from mwdcal.registry.store import open_registry
 
     options.check_outputs([output], [database])
     with open_registry(database) as registry:
-        result = screen.RegistryCopied(file=str(output), head=copies.backup(registry, output))
+        result = screen.RegistryCopied(file=str(output), head=exports.backup(registry, output))
     document = screen.document("registry backup", result)
     print_result(document if as_json else screen.copied_text(result))
 
@@ -203,9 +202,9 @@ def restore(source: Path, database: str, actor: str, as_json: bool) -> None:
     Exit: 0 restored, 2 the registry is not empty or cannot be written, 3 the backup was altered.
     """
     from mwdcal.presentation import registry as screen
-    from mwdcal.registry import copies
+    from mwdcal.registry import exports
 
-    head = copies.restore(source, database, actor)
+    head = exports.restore(source, database, actor)
     result = screen.RegistryCopied(file=str(source), head=head)
     text = f"restored the registry from {source}   newest event of the backup {head}"
     print_result(screen.document("registry restore", result) if as_json else one_line(text))
@@ -238,7 +237,7 @@ def add(
     Exit: 0 added, or there already; 2 a file is missing, or not one could be added.
     """
     from mwdcal import pool
-    from mwdcal.app.progress import bar
+    from mwdcal.app.messages import bar
 
     alone = workers == 1 or all(file.is_file() and file.suffix != TABLE for file in files)
     with pool.preparing(1 if alone else workers):  # these imports, in the workers too
@@ -431,11 +430,11 @@ def drift(
     Example: mwdcal registry drift --limit inclination_deg=0.1 --report fleet.html --registry tools.sqlite
     Exit: 0 compared, 2 there is no such tool, or the registry cannot be opened, 3 a document was altered.
     """
-    from mwdcal.app.progress import bar
+    from mwdcal.app.messages import bar
     from mwdcal.files.formats import atomic
     from mwdcal.library import drifts
+    from mwdcal.presentation import drift as pages
     from mwdcal.presentation import drift as screen
-    from mwdcal.presentation import drift_page as pages
     from mwdcal.registry.store import open_registry
 
     options.check_outputs([], [database], page=report)

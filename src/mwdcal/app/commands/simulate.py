@@ -147,12 +147,12 @@ def _by_workers(
     import pickle
 
     from mwdcal import pool
-    from mwdcal.app import progress
+    from mwdcal.app import messages
     from mwdcal.planning.procedure import solved
     from mwdcal.use.correction_numba import cores
 
     steps, done = pool.Steps(tuple, partial(solved, repeated)), {}
-    with progress.bar("simulating") as show:
+    with messages.bar("simulating") as show:
         for index, result in pool.results(steps, parts, workers or cores(), None):
             done[index] = pickle.loads(result)  # of our own workers
             show(len(done), len(parts))

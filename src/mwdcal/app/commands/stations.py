@@ -41,17 +41,17 @@ def command(
     """
     from dataclasses import replace
 
-    from mwdcal.app import progress
+    from mwdcal.app import messages
     from mwdcal.files import logs
     from mwdcal.files.formats import atomic, table
     from mwdcal.logs.stations import StandstillError, find_stations
     from mwdcal.presentation import stations as screen
     from mwdcal.presentation.envelope import json_document
     from mwdcal.presentation.page import picture
-    from mwdcal.presentation.stations_page import figure, render
+    from mwdcal.presentation.stations import figure, render
 
     options.check_outputs([output], [log], picture=plot, page=report)
-    slowly = progress.slowly(say)
+    slowly = messages.slowly(say)
     readings = logs.read(log, options.column_names(columns), decimal=decimal, say=slowly)
     refusal = None
     try:

@@ -15,7 +15,7 @@ from mwdcal.errors import InputError
 from mwdcal.presentation.typed import findings_with_option_names
 
 if TYPE_CHECKING:
-    from mwdcal.calibration.canonical import SignatureCheck
+    from mwdcal.calibration.record import SignatureCheck
     from mwdcal.presentation.signature import LoadedCalibration
     from mwdcal.survey.interference import Interference
     from mwdcal.survey.path import TieIn

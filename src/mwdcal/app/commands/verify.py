@@ -38,7 +38,7 @@ def command(
     from mwdcal.files import runs
     from mwdcal.files.formats import atomic
     from mwdcal.files.limits import load_limits
-    from mwdcal.files.settings import standards_of
+    from mwdcal.files.profiles import standards_of
     from mwdcal.presentation.envelope import json_document, with_signature
     from mwdcal.presentation.signature import load_calibration
     from mwdcal.presentation.verification import next_step, screen, with_next_step

@@ -17,8 +17,7 @@ from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import HIGHEST, highest_order, usable_soaks
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.problem import Problem, State
-from mwdcal.estimation.tails import fisher_tail
-from mwdcal.estimation.uncertainty import TANGENT_STEP, tangent
+from mwdcal.estimation.uncertainty import TANGENT_STEP, fisher_tail, tangent
 from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, eigen, inverse, outer, quotient
 
 TRIED = 5

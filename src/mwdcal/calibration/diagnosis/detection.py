@@ -20,7 +20,7 @@ from mwdcal.calibration.diagnosis.findings import MISFIT_CHANCE
 from mwdcal.calibration.diagnosis.plausibility import freedom_of
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.residuals import RESHOOT
-from mwdcal.estimation.evidence import ANGLES, EARTH
+from mwdcal.estimation.problem import ANGLES, EARTH
 from mwdcal.estimation.uncertainty import TESTED, whole_covariance
 from mwdcal.geometry.vectors import Array, eigen, quotient
 

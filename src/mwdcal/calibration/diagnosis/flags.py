@@ -22,7 +22,7 @@ from mwdcal.calibration.record import StationRow
 from mwdcal.calibration.residuals import Residuals
 from mwdcal.calibration.results import StatedCovariance
 from mwdcal.estimation.batch import batch_of_one, take
-from mwdcal.estimation.rank import Free, free_directions
+from mwdcal.estimation.uncertainty import Free, free_directions
 from mwdcal.geometry.vectors import Array, Bools, Ints
 from mwdcal.sensor.profile import Profile
 

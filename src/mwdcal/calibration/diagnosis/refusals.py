@@ -6,14 +6,15 @@ single run is refused by the first flag that holds, and so is each tool of a fle
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
+from itertools import permutations, product
 from typing import Any
 
 import numpy as np
 
 from mwdcal.calibration.automatic.courses import orders_of, share_beyond
-from mwdcal.calibration.diagnosis.causes import REFUSAL_ENDINGS, spanned
 from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag, listed, spaced
 from mwdcal.calibration.diagnosis.plausibility import (
     excessive_errors,
@@ -21,17 +22,19 @@ from mwdcal.calibration.diagnosis.plausibility import (
     has_sensor_gains,
     inseparable,
     is_bad,
+    is_covariance,
     off_earth,
     overturned,
     straying,
 )
-from mwdcal.calibration.diagnosis.soundness import is_covariance
-from mwdcal.calibration.diagnosis.structure import described
+from mwdcal.calibration.diagnosis.structure import COLUMN, described
+from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.methods import EVIDENCE
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import (
     CONSTANTS,
     EARTH_RANGES,
+    HIGHEST,
     TRIADS,
     Readings,
     highest_order,
@@ -39,14 +42,149 @@ from mwdcal.calibration.readings import (
 )
 from mwdcal.calibration.residuals import shown_in
 from mwdcal.calibration.results import temperature_range
-from mwdcal.errors import FitError, InputError
+from mwdcal.errors import FitError, InputError, MwdcalError
 from mwdcal.estimation.batch import batch_of_one
-from mwdcal.estimation.evidence import WALKS
-from mwdcal.estimation.robust import LOSSES
-from mwdcal.estimation.solvers import Status
+from mwdcal.estimation.problem import WALKS
+from mwdcal.estimation.solvers import LOSSES, Status
+from mwdcal.estimation.uncertainty import free_directions, station_misfit
 from mwdcal.geometry.vectors import Array, Bools
 from mwdcal.sensor.models import Basis, Factors, Polynomial, Whole, restricted
-from mwdcal.sensor.profile import COMMON
+from mwdcal.sensor.profile import COMMON, Profile
+
+# --------------------------------------------------------------------------
+# Which `axes` of the tool profile would explain a run that the declared ones do not.
+#
+# A linear triad absorbs any exchange and reversal of its channels into its gain: raw readings that
+# are fitted with their references give the gain, and the signed permutation nearest to it says how
+# the channels lie.
+
+CROSS_GAIN = 0.3
+"""Largest gain across the axes, as a share of those along them, of a triad in its right axes."""
+FITTING_SHARE = 0.05
+"""Residuals of a run in its right axes are less than this share of the field."""
+SIGNED = np.array(
+    [
+        np.eye(3)[list(order)] * np.array(signs)[:, None]
+        for order in permutations(range(3))
+        for signs in product((1.0, -1.0), repeat=3)
+    ]
+)
+"""The 48 signed permutations (48, 3, 3)."""
+
+
+def nearest(gain: Array) -> Array:
+    """The signed permutation Q (3, 3) that a gain M (3, 3) is nearest to: trace M Qᵀ is largest.
+
+    >>> nearest(np.array([[0.01, -1.1, 0], [0.9, 0.02, 0], [0, 0.01, 1.0]])).astype(int).tolist()
+    [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    """
+    return np.asarray(SIGNED[int(np.argmax(np.sum(SIGNED * gain, (-1, -2))))])
+
+
+def named(permutation: Array) -> tuple[str, ...]:
+    """The `axes` of a profile (tool axes from channels, (3, 3)).
+
+    >>> named(np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]]))
+    ('+y', '-x', '+z')
+    """
+    rows = np.argmax(np.abs(permutation), 0).tolist()
+    signs = ["+" if permutation[row, channel] > 0 else "-" for channel, row in enumerate(rows)]
+    return tuple(f"{sign}{'xyz'[row]}" for sign, row in zip(signs, rows, strict=True))
+
+
+def explaining(readings: Readings, profile: Profile) -> dict[str, tuple[str, ...]]:
+    """The `axes` with which a run fits, by triad, where they are not those of the profile."""
+    try:
+        result = fit(readings)
+    except (MwdcalError, np.linalg.LinAlgError):
+        return {}
+    free = free_directions(result.problem, result.state, result.analysis.determined)[0]
+    if result.status[0] != Status.OK or not _fits(result) or any(map(is_bad, free)):
+        return {}
+    axes, problem = {}, result.problem
+    for name, triad, where in zip(TRIADS, problem.triads, problem.slices(), strict=False):
+        slope = triad.model.slope(result.state.params[:, where], triad.raw, problem.temperature)
+        gain = slope[0].mean(0)
+        if name == "magnetometer" and np.isfinite(overturned(result)[0]):
+            gain = -gain
+        permutation = nearest(gain)
+        if not _is_near(gain @ permutation.transpose()):
+            return {}
+        if not np.array_equal(permutation, np.eye(3)):
+            axes[name] = named(permutation @ getattr(profile, name).permutation)
+    return axes
+
+
+def _is_near(gain: Array) -> bool:
+    """Whether a gain is along its axes."""
+    along = np.diagonal(gain)
+    across = np.abs(gain - np.diag(along)).max()
+    return bool(along.min() > 0 and across < CROSS_GAIN * along.min())
+
+
+def _fits(result: Fit) -> bool:
+    """Whether the readings are explained at all."""
+    triads = result.problem.triads
+    noise = np.sqrt(result.analysis.variance_factor[0]) * [triad.sd.mean() for triad in triads]
+    moved = [np.linalg.norm(t.raw[0] - t.raw[0].mean(0), axis=-1).mean() for t in triads]
+    return bool(np.all(noise < FITTING_SHARE * np.array(moved)))
+
+
+# --------------------------------------------------------------------------
+# The possible causes of a refusal: a station, wrong axes, a column that is not used, the span of temperatures.
+
+
+CULPRIT_SHARE = 0.3
+"""Share of all misfit at which a single station is named as the cause."""
+
+
+def _axes(fitted: FittedRuns, place: int) -> str:
+    """The axes with which a run would fit, in words; nothing if there are none."""
+    each = [
+        f"axes = {json.dumps(axes)} of [{name}]"
+        for name, axes in explaining(*fitted.alone(place)).items()
+    ]
+    return f" The run fits with {' and '.join(each)}." if each else ""
+
+
+def _culprit(fitted: FittedRuns, place: int) -> str:
+    """The station to look at first, if a single one has most of the misfit."""
+    square = station_misfit(fitted.member(place).analysis)[0][0]
+    worst = int(np.argmax(square))
+    share = square[worst] / max(float(square.sum()), 1e-300)
+    if share < CULPRIT_SHARE:
+        return ""
+    label = fitted.alone(place)[0].labels[worst]
+    return (
+        f" Station {label} alone has {share:.0%} of the misfit: `exclude` {label}, or fit with "
+        "`robust` student-t."
+    )
+
+
+def _column(fitted: FittedRuns, place: int) -> str:
+    """The column that the run does not use and that explains most of the residuals, in words."""
+    if not fitted.readings.others:
+        return ""
+    unit = shown_in("field", fitted.readings.relative)[1]
+    named = [effect for effect in fitted.effects(place) if effect.name.startswith(COLUMN)]
+    return "".join(f" {described(effect, unit)}" for effect in named[:1])
+
+
+REFUSAL_ENDINGS = {"culprit": _culprit, "axes": _axes, "column": _column}
+"""The possible ends of a refusal, for one run."""
+
+
+def spanned(fitted: FittedRuns, index: int) -> dict[str, Any]:
+    """The order of a triad, the span of temperatures, and what to do."""
+    temperature, order = fitted.result.problem.temperature, orders_of(fitted.result)[index]
+    higher = np.minimum(highest_order(temperature), HIGHEST) > order
+    remedy = np.where(
+        higher & (fitted.options.method != "swarm"),
+        "Use `order` auto, or a higher one",
+        "Measure over a narrower range, or let the tool come to rest at each temperature",
+    )
+    return {"order": order, "span": np.ptp(temperature, axis=-1), "remedy": remedy}
+
 
 GAIN_RANGE = (0.3, 3.0)
 """An own-axis gain outside this share of nominal is a wrong profile, not a sensor error."""

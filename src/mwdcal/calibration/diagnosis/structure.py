@@ -10,24 +10,512 @@ Reference: efficient scores, C. R. Rao, Proc. Camb. Phil. Soc. 44, 50 (1948).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, lru_cache
+from itertools import pairwise
 
 import numpy as np
 
-from mwdcal.calibration.automatic.courses import f_test, steady_columns
-from mwdcal.calibration.diagnosis.families import COURSE_SUFFIX, families, products
-from mwdcal.calibration.diagnosis.first_look import EFFECT_CHANCE, LEFT_BY_FIT, may_show
-from mwdcal.calibration.diagnosis.stand_look import on_stand_may_show
+from mwdcal.calibration.automatic.courses import TRIED, f_test, steady_columns, temperature_powers
 from mwdcal.calibration.estimate import Fit
-from mwdcal.calibration.readings import TRIADS
+from mwdcal.calibration.methods import ESTIMABLE, acts_on
+from mwdcal.calibration.readings import HIGHEST, LEAST_TEMPERATURE_SPAN, TRIADS, highest_order
 from mwdcal.calibration.residuals import chances, stations_to_remeasure
 from mwdcal.calibration.results import variance_scales
 from mwdcal.estimation.batch import take
-from mwdcal.estimation.minimisers import uncertain_stand
-from mwdcal.estimation.problem import Problem, State
+from mwdcal.estimation.minimisers import closed_form, closed_form_drift, uncertain_stand
+from mwdcal.estimation.minimisers.closed_form_drift import (
+    Alike,
+    CommonColumns,
+    are_alike,
+    are_common,
+    perfect,
+    products_of,
+    responses,
+    sensor_terms,
+    squares_of,
+)
+from mwdcal.estimation.minimisers.uncertain_stand import TRIAD_ROWS
+from mwdcal.estimation.problem import ANGLES, STAND_ERRORS, Problem, State
 from mwdcal.estimation.uncertainty import whole_covariance
-from mwdcal.geometry.vectors import Array, Bools, Ints, eigen, outer, quotient
+from mwdcal.geometry.vectors import (
+    Array,
+    Bools,
+    Ints,
+    centred,
+    diagonal,
+    eigen,
+    inverse_of_positive,
+    outer,
+    quotient,
+)
+
+# --------------------------------------------------------------------------
+# Columns of every effect that residuals may show: errors of the stand, drift, gradient, backlash, hysteresis, lag.
+
+DRIFTS = 2
+"""Degree of the polynomial of order (or of the row) that a drift is looked for as."""
+SMALLEST_SET = 3
+"""Fewest stations of one direction that may share an error of its setting."""
+SET_TURNS = ("inclination-zero", "azimuth-zero")
+COURSE_SUFFIX = "-temperature"
+"""What ends the names of the powers of temperature that the order of a triad leaves out."""
+LEAST_MOVE = 0.05
+"""Moves below this share of the run's largest have no side: of angles that are read off, noise would choose it."""
+
+
+def families(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
+    """Columns (B, n, m, k) of every effect that these runs could show, whitened; zero where one could not."""
+    turns, by_earth = problem.station_columns(state)
+    known = _turns(problem, state, turns)
+    for name, parts in ESTIMABLE.items():
+        each = [known[turn] for turn in parts if turn in known]
+        if each:
+            yield name, np.stack(each, -1)
+    sets = _sets(problem)
+    each = [known[n][..., None] * sets[..., None, :] for n in SET_TURNS if n in known]
+    if each and sets.shape[-1] > 1:
+        yield "settings", np.concatenate(each, -1)
+    place = np.linspace(-1, 1, state.attitude.shape[1])
+    order = np.asarray(np.polynomial.legendre.legvander(place, DRIFTS)[:, 1:], float)
+    down = problem.stand_column(state, "azimuth-zero", turns)
+    if len(problem.triads) > 1:
+        given = problem.evidence.is_known("dip")[..., None]
+        if given.any() and "dip" not in problem.evidence.absent:
+            yield "dip-reference", (by_earth[..., 2] * given)[..., None]
+        field = np.concatenate([by_earth[..., 1:], down[..., None]], -1)
+        field[..., :3, :] = 0.0  # the declination of a field that turns does not turn gravity
+        if not problem.walks:
+            yield "field-drift", products(field, order)
+        yield "field-gradient", products(field, state.attitude[..., 2, :])
+    steps = _approach(problem)
+    back = [known[n] * s[..., None] for n, s in steps.items() if n in known and s.any()]
+    if back:
+        yield "backlash", np.stack(back, -1)
+    yield from _courses(problem, state)
+    for index, name in enumerate(TRIADS[: len(problem.triads)]):
+        yield from _of_sensor(problem, index, name, order)
+
+
+def _sets(problem: Problem) -> Array:
+    """Membership (B, n, k) of stations in directions that several share by their references; none of a single one."""
+    known = problem.evidence.known
+    pair = np.stack([known["inclination"], known["azimuth"]], -1)
+    keys = np.round(np.nan_to_num(pair, nan=-1.0), 6)
+    alike = bool((keys == keys[:1]).all())
+    each = [_sets_of(key) for key in keys[: 1 if alike else None]]
+    members = np.zeros((len(each), keys.shape[1], max(of.shape[-1] for of in each)))
+    for place, of in enumerate(each):
+        members[place, :, : of.shape[-1]] = of if of.shape[-1] > 1 else 0.0
+    return members
+
+
+def _sets_of(key: Array) -> Array:
+    """Membership (n, k) of one run's stations in the directions (n, 2) that are not too few, nor too many."""
+    _, number, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+    usable = np.flatnonzero(count >= SMALLEST_SET)
+    if len(usable) > len(key) / SMALLEST_SET:
+        usable = usable[:0]
+    return np.asarray(number.reshape(-1)[:, None] == usable, float)
+
+
+def _courses(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
+    """Powers of temperature that a triad's order leaves out: another finding names these."""
+    varied = np.ptp(problem.temperature, -1) >= LEAST_TEMPERATURE_SPAN
+    if not varied.any():
+        return
+    highest = np.clip(highest_order(problem.temperature), HIGHEST, TRIED)
+    columns, most = steady_columns(problem, state), int(highest.max())
+    tried = (np.arange(1, most + 1) <= highest[:, None]) & varied[:, None]
+    powers = temperature_powers(problem.temperature, most) * tried[:, None]
+    for index, triad in enumerate(problem.triads):
+        order = triad.model.basis.order
+        if order < most:
+            of_triad = columns[..., 6 * index : 6 * index + 6]
+            yield f"{TRIADS[index]}{COURSE_SUFFIX}", products(of_triad, powers[..., order:])
+
+
+def _turns(problem: Problem, state: State, turns: Array) -> dict[str, Array]:
+    """Columns (B, n, m) of errors of the stand that act on references, at stations that have them."""
+    acting = {name: acts_on(problem.evidence, name)[..., None] for name in STAND_ERRORS}
+    columns = {n: problem.stand_column(state, n, turns) * acts for n, acts in acting.items()}
+    return {name: column for name, column in columns.items() if column.any()}
+
+
+def products(columns: Array, factors: Array) -> Array:
+    """Columns (B, n, m, a) times factors (n, b) or (B, n, b) of their stations: (B, n, m, a b)."""
+    product = columns[..., :, None] * factors[..., None, None, :]
+    return np.asarray(product.reshape(*columns.shape[:-1], -1))
+
+
+def _approach(problem: Problem) -> dict[str, Array]:
+    """From which side (B, n) each angle of the stand was reached: 1, -1, or 0 where it did not move."""
+    known = problem.evidence.known
+    angles = {name: known[name][..., None] for name in ("inclination", "azimuth", "toolface")}
+    steps = {name: np.nan_to_num(centred(moves(angle))) for name, angle in angles.items()}
+    return {f"{name}-zero": side(moved)[..., 0] for name, moved in steps.items()}
+
+
+def moves(values: Array) -> Array:
+    """Changes (B, n, k) of values from station to station, zero at the first."""
+    return np.diff(values, axis=1, prepend=values[:, :1])
+
+
+def side(moved: Array) -> Array:
+    """The sign of each move (B, n, k), 0 for those too small to be more than the error of a statement."""
+    least = np.maximum(LEAST_MOVE * np.abs(moved).max((1, 2), keepdims=True), 1e-6)
+    return np.where(np.abs(moved) > least, np.sign(moved), 0.0)
+
+
+def _of_sensor(
+    problem: Problem, index: int, name: str, order: Array
+) -> Iterator[tuple[str, Array]]:
+    """Drift with the order of stations, hysteresis and thermal lag of one triad's readings."""
+    triad = problem.triads[index]
+    axes = np.zeros((*problem.temperature.shape, 3 * len(problem.triads), 3))
+    weight = problem.evidence.include[..., None] / triad.sd
+    axes[:, :, 3 * index : 3 * index + 3] = np.eye(3) * weight[..., None]
+    if index == 0 and not problem.walks:
+        yield f"{name}-drift", products(axes, order)
+    yield f"{name}-hysteresis", axes * side(moves(triad.raw))[..., None, :]
+    rate = moves(problem.temperature[..., None])
+    varied = np.ptp(rate, 1, keepdims=True) > 1.0
+    if varied.any():
+        rate = quotient(rate, np.abs(rate).max(1, keepdims=True), varied)
+        reading = (triad.raw - triad.raw.mean(1, keepdims=True)) / np.std(triad.raw, (1, 2))[
+            :, None, None
+        ]
+        scale = axes * (rate * reading)[..., None, :]
+        yield f"{name}-thermal-lag", np.concatenate([axes * rate[..., None, :], scale], -1)
+
+
+# --------------------------------------------------------------------------
+# Which fits at the same exact references may show an effect: the first round of `structure` for all at once.
+
+
+EFFECT_CHANCE = 1e-4
+"""Chance of so much common structure in noise, below which an effect is named."""
+LEFT_BY_FIT = 1e-3
+"""A column counts if the fit leaves this share of its square: what is left of others is rounding."""
+HYSTERESIS = "-hysteresis"
+"""What ends the names of families whose columns are each tool's own."""
+LOOK_MARGIN = 0.99
+"""A fit is looked at from this share of the gain that would name an effect: rounding differs by far less."""
+GAINS = np.geomspace(1, 1e4, 1000)
+"""Ratios of variances at which the chance of noise is worked out."""
+
+
+def may_show(result: Fit) -> Bools:
+    """Fits (B,) that may show an effect.
+
+    All of them where the columns of effects are not common to tools, or depend on temperature.
+    """
+    problem, every = result.problem, np.ones(len(result.status), bool)
+    if problem.evidence.constants:
+        common = closed_form_drift.applies(problem)
+    else:
+        common = closed_form.applies(problem) and are_common(problem)
+    if not common:
+        return every
+    design = Alike.of(problem, result.state)
+    if any(
+        name.endswith(("-temperature", "-thermal-lag")) for name in common_effects(design).columns
+    ):
+        return every
+    scale = np.sqrt(np.maximum(variance_scales(result), 1e-12))
+    residual = result.analysis.residual / np.repeat(scale, 3, -1)[:, None]
+    response = [r / scale[:, i, None, None] for i, r in enumerate(responses(problem, result.state))]
+    drifts = _Drifts.of(problem, result.state, design, residual, response)
+    misfit, shown = np.sum(residual**2, (1, 2)) + drifts.misfit, ~every
+    rest = np.sum(problem.evidence.include[0]) * residual.shape[-1] - result.state.params.shape[-1]
+    rest = np.ceil(rest - drifts.freedom)
+    for gain, directions in _gains(problem, design, residual, response, drifts):
+        for count, left in {*zip(directions.tolist(), rest.tolist(), strict=True)}:
+            if count:
+                least = least_gain(count, left) * LOOK_MARGIN
+                shown |= (directions == count) & (rest == left) & (gain > least * misfit)
+    return np.asarray(shown)
+
+
+@dataclass(frozen=True)
+class _Drifts:
+    """Drifts that are in the fits, by triad: their columns, covariance (B, q, q), and the pull (B, q) that is left.
+
+    What they add to the `misfit` (B,), and take of its degrees of `freedom` (B,).
+    """
+
+    columns: dict[int, CommonColumns]
+    covariance: dict[int, Array]
+    pull: dict[int, Array]
+    misfit: Array
+    freedom: Array
+
+    @classmethod
+    def of(
+        cls, problem: Problem, state: State, design: Alike, residual: Array, response: list[Array]
+    ) -> _Drifts:
+        """Of a problem at its solution, with other whitened residuals (B, n, m) and responses."""
+        columns, covariance, pull = {}, {}, {}
+        misfit, freedom = np.zeros((2, len(residual)))
+        if problem.walks:
+            precision = closed_form_drift.prior_precision(problem)
+            for index, (places, each) in closed_form_drift.walk_columns(design).items():
+                known, value = precision[:, places], state.constants[:, places]
+                part = residual[..., 3 * index : 3 * index + 3]
+                information = each.information(response[index])
+                np.einsum("bii->bi", information)[...] += known
+                inner = inverse_of_positive(information)
+                force = each.score(response[index], part) + known * value
+                step = (inner @ force[..., None])[..., 0]
+                columns[index], covariance[index], pull[index] = each, inner, step
+                misfit += np.sum(known * value**2 - force * step, -1)
+                freedom += len(places) - np.sum(known * diagonal(inner), -1)
+        return cls(columns, covariance, pull, misfit, freedom)
+
+    def less(
+        self, index: int, cross: Array, score: Array, information: Array
+    ) -> tuple[Array, Array]:
+        """Score (B, k) and information (B, k, k) of effects on a triad less what drifts take.
+
+        `cross` (B, k, q) is what they have in common.
+        """
+        taken = cross @ self.covariance[index]
+        return (
+            score - (cross @ self.pull[index][..., None])[..., 0],
+            information - taken @ cross.mT,
+        )
+
+
+@dataclass(frozen=True)
+class _Families:
+    """Effects that are common to tools: what one product of all tools needs, by number of the triad.
+
+    `places` of each family's columns among the k of all, and of its products among those of all families. `left`
+    (n, 6, k), `products` (16, p) and `squares` (16, k) as of `CommonColumns`, zero where a family has no effect on the
+    triad. `sides` are names of families whose columns are each tool's own.
+    """
+
+    places: dict[str, tuple[slice, slice]]
+    left: list[Array]
+    products: list[Array]
+    squares: list[Array]
+    columns: dict[str, dict[int, CommonColumns]]
+    sides: list[str]
+
+    @classmethod
+    def of(
+        cls, columns: dict[str, dict[int, CommonColumns]], triads: int, stations: int
+    ) -> _Families:
+        """Of the effects of each family on each triad."""
+        common = {name: each for name, each in columns.items() if each}
+        counts = [next(iter(each.values())).whole.shape[-1] for each in common.values()]
+        ends, squared = np.cumsum([0, *counts]), np.cumsum([0, *(k * k for k in counts)])
+        pairs = zip(pairwise(ends.tolist()), pairwise(squared.tolist()), strict=True)
+        places = dict(zip(common, ((slice(*k), slice(*p)) for k, p in pairs), strict=True))
+        left = [np.zeros((stations, 6, ends[-1])) for _ in range(triads)]
+        products, squares = (
+            [np.zeros((16, end[-1])) for _ in range(triads)] for end in (squared, ends)
+        )
+        for name, (some, pair) in places.items():
+            for index, each in common[name].items():
+                left[index][..., some], products[index][:, pair] = each.left, each.products
+                squares[index][:, some] = each.lengths
+        sides = [name for name, each in columns.items() if not each and name.endswith(HYSTERESIS)]
+        return cls(places, left, products, squares, common, sides)
+
+    def sums(
+        self, residual: Array, response: list[Array]
+    ) -> tuple[list[Array], list[Array], Array]:
+        """By triad: scores (B, k) and products (B, p) of all families; and the squares (B, k) of whole columns."""
+        scores, information, square = [], [], np.zeros(())
+        for index, reads in enumerate(response):
+            pull = residual[..., 3 * index : 3 * index + 3] @ reads
+            scores.append(pull.reshape(len(pull), -1) @ self.left[index].reshape(pull[0].size, -1))
+            squared = squares_of(reads)
+            information.append(squared @ self.products[index])
+            square = square + squared @ self.squares[index]
+        return scores, information, square
+
+
+@lru_cache(maxsize=8)
+def common_effects(design: Alike) -> _Families:
+    """The change of the readings of the triads by each effect."""
+    one, state = perfect(design)
+    terms = [sensor_terms(one, state, index) for index in range(len(one.triads))]
+    columns: dict[str, dict[int, CommonColumns]] = {}
+    for name, family in families(one, state):
+        triad = name.partition("-")[0]
+        columns[name] = {}
+        for index, term in enumerate([] if name.endswith(HYSTERESIS) else terms):
+            rows = family[0, :, 3 * index : 3 * index + 3]
+            if rows.any():
+                of_reading = np.full(rows.shape[-1], triad in TRIADS)
+                columns[name][index] = CommonColumns.of(term, rows, of_reading)
+    return _Families.of(columns, len(terms), len(terms[0]))
+
+
+@lru_cache(maxsize=8)
+def _across(design: Alike) -> dict[int, Array]:
+    """The part of all effects that the drifts in the fit of a design can explain, by triad: (16, k q)."""
+    drifts = closed_form_drift.walk_columns(design)
+    left = common_effects(design).left
+    return {index: products_of(left[index], each.left) for index, (_, each) in drifts.items()}
+
+
+def _gains(
+    problem: Problem, design: Alike, residual: Array, response: list[Array], drifts: _Drifts
+) -> Iterator[tuple[Array, Ints]]:
+    """By how much (B,) each family lowers the misfit, and its directions, from whitened residuals (B, n, m)."""
+    effects, count = common_effects(design), len(residual)
+    scores, products, square = effects.sums(residual, response)
+    across = {
+        index: (squares_of(response[index]) @ _across(design)[index]).reshape(
+            count, square.shape[-1], -1
+        )
+        for index in drifts.columns
+    }
+    for name, (some, pair) in effects.places.items():
+        size = some.stop - some.start
+        score = information = np.zeros(())
+        for index in effects.columns[name]:
+            both = scores[index][:, some], products[index][:, pair].reshape(count, size, size)
+            if index in across:
+                both = drifts.less(index, across[index][:, some], *both)
+            score, information = score + both[0], information + both[1]
+        yield gain_of(score, information, square[:, some])
+    for name in effects.sides:
+        index = TRIADS.index(name.removesuffix(HYSTERESIS))
+        raw, include = problem.triads[index].raw, problem.evidence.include
+        sides = side(moves(raw)) * include[..., None]
+        terms = sensor_terms(*perfect(design), index)
+        part = residual[..., 3 * index : 3 * index + 3]
+        yield _gain_of_sides(terms, sides, part, index, response[index], drifts)
+
+
+def gain_of(score: Array, information: Array, square: Array) -> tuple[Array, Ints]:
+    """By how much (B,) columns of so large a `square` (B, k) lower the misfit, and their directions."""
+    length = np.sqrt(np.where(square > 0, square, 1.0))
+    if length.shape[-1] == 1:
+        value, vector = information[..., 0] / length**2, np.ones((1, 1))
+    else:
+        value, vector = eigen(information / outer(length))
+    along = (vector.mT @ (score / length)[..., None])[..., 0]
+    kept = value > LEFT_BY_FIT
+    return quotient(along**2, value, kept).sum(-1), np.count_nonzero(kept, -1)
+
+
+def _gain_of_sides(
+    terms: Array, sides: Array, residual: Array, index: int, response: Array, drifts: _Drifts
+) -> tuple[Array, Ints]:
+    """The same for a column on each axis of a triad, of which the values (B, n, 3) are each tool's."""
+    basis = np.linalg.qr(terms)[0]
+    whole = np.sum(sides**2, 1)
+    left = whole - np.sum((basis.transpose() @ sides) ** 2, 1)
+    score = np.sum(sides * residual, 1)
+    if index in drifts.columns:
+        seen = drifts.columns[index].left
+        cross = (sides.mT @ seen.reshape(len(seen), -1)).reshape(len(sides), 3, 6, -1)
+        cross = np.sum(response[..., None] * cross, 2)
+        return gain_of(*drifts.less(index, cross, score, left[..., None] * np.eye(3)), whole)
+    kept = left > LEFT_BY_FIT * whole
+    return quotient(score**2, left, kept).sum(-1), np.count_nonzero(kept, -1)
+
+
+@cache
+def least_gain(directions: int, rest: float) -> float:
+    """Share of the misfit from which a family of so many directions may be named, the `rest` being all other freedom.
+
+    >>> round(least_gain(1, 265.0), 3)
+    0.056
+    """
+    rest -= directions
+    many = np.full(GAINS.shape, float(directions))
+    chance = f_test(GAINS * directions, many, np.ones(()), np.full(GAINS.shape, rest))
+    ratio = GAINS[max(int(np.sum(~(chance < EFFECT_CHANCE))) - 1, 0)] * directions
+    return float(ratio / (ratio + max(rest, 1.0)))
+
+
+# --------------------------------------------------------------------------
+# Which fits on an uncertain stand may show an effect: the first round of `structure` for all at once.
+#
+# Tools at the same references have the columns of effects in common but for their own sensors; here they are taken
+# where
+# the stand does not err. Weights, and what the fit takes up, are each tool's own.
+
+
+STAND_MARGIN = 0.75
+"""A fit is looked at from this share of the gain that would name an effect."""
+LARGEST_ERROR = 5e-3
+"""Errors of angles, rad, up to which the columns of effects are as without them."""
+LARGEST_RESCALING = 0.1
+"""Change of the noise, as a share, up to which the weights are as in the fit."""
+
+
+def on_stand_may_show(result: Fit) -> Bools:
+    """Fits (B,) on an uncertain stand that may show an effect.
+
+    All of them where the columns of effects are not common to tools, or depend on temperature.
+    """
+    problem, every = result.problem, np.ones(len(result.status), bool)
+    if not are_alike(problem):
+        return every
+    design = _exact(problem, result.state)
+    common = common_effects(design).columns
+    if any(name.endswith(("-temperature", "-thermal-lag")) for name in common):
+        return every
+    at, errors = uncertain_stand.linear(problem, result.state), result.state.errors
+    scale = np.sqrt(variance_scales(result))
+    shown = np.any(np.abs(scale - 1) > LARGEST_RESCALING, -1)
+    shown |= np.any(np.abs(errors) > LARGEST_ERROR, (1, 2))
+    residual = at.weighed(at.left)
+    misfit = np.einsum("ibn,ibn->b", at.left, residual) + np.sum(at.precision * at.value**2, -1)
+    known = np.sum(at.covariance * at.of_data, (1, 2))
+    rest = np.ceil(6 * problem.evidence.include.sum(-1) - known)
+    for columns in _columns(problem, result, design):
+        weighed = np.einsum("ij...,jk...->ik...", at.weight, columns)
+        score = np.einsum("ikbn,ibn->bk", columns, residual)
+        crossed = at.columns.with_others(weighed)
+        information = np.einsum("ikbn,ilbn->bkl", columns, weighed)
+        square = np.einsum("bkk->bk", information).copy()
+        information -= crossed.mT @ (at.covariance @ crossed)
+        gain, directions = gain_of(score, information, square)
+        for count, left in {*zip(directions.tolist(), rest.tolist(), strict=True)}:
+            if count:
+                least = least_gain(count, left) * STAND_MARGIN
+                shown |= (directions == count) & (rest == left) & (gain > least * misfit)
+    return np.asarray(shown)
+
+
+def _exact(problem: Problem, state: State) -> Alike:
+    """The design of a problem as if its stand did not err."""
+    evidence = problem.evidence
+    sd = {n: 0 * sd if n in ANGLES else sd for n, sd in evidence.sd.items()}
+    exact = replace(problem, evidence=replace(evidence, sd=sd))
+    return Alike.of(exact, replace(state, errors=0 * state.errors))
+
+
+def _columns(problem: Problem, result: Fit, design: Alike) -> Iterator[Array]:
+    """Columns (6, k, B, n) of every effect in whitened readings."""
+    response, include = responses(problem, result.state), problem.evidence.include
+    effects = common_effects(design)
+    for columns in effects.columns.values():
+        count = next(iter(columns.values())).whole.shape[-1]
+        every = np.zeros((6, count, *include.shape))
+        for index, each in columns.items():
+            flat = each.whole.transpose(1, 2, 0).reshape(6, -1)
+            both = (response[index] @ flat).reshape(len(include), 3, count, -1)
+            every[TRIAD_ROWS[index]] = np.moveaxis(both, 0, 2)
+        yield every
+    for name in effects.sides:
+        index = TRIADS.index(name.removesuffix(HYSTERESIS))
+        one = problem.triads[index]
+        sides = side(moves(one.raw)) * include[..., None] / one.sd
+        every = np.zeros((6, 3, *include.shape))
+        for axis in range(3):
+            every[3 * index + axis, axis] = sides[..., axis]
+        yield every
+
 
 STRUCTURE_CHANCE = 0.01
 """Chance of residuals as large in declared noise, below which their structure is looked at."""

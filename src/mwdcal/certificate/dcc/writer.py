@@ -15,23 +15,21 @@ from msgspec.structs import replace
 
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.certificate.dcc.administrative import (
+    Child,
     administrative_data,
     conformity,
-    identification,
-    rule_id,
-    software,
-    tests,
-    when_id,
-)
-from mwdcal.certificate.dcc.elements import (
-    Child,
     container,
     content,
+    identification,
     leaf,
     node,
     real,
+    rule_id,
+    software,
+    tests,
     title,
     typed,
+    when_id,
     words,
 )
 from mwdcal.certificate.document import (

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from mwdcal.errors import InputError
-from mwdcal.files.formats import dialect, figures, text
+from mwdcal.files.formats import figures, text
 from mwdcal.files.formats.columns import at_most, damaged_unless_read
 from mwdcal.files.formats.layout import WORKBOOKS, Cells, Sheet
 from mwdcal.sensor.profile import TableFormat
@@ -41,8 +41,8 @@ def sheets_of(data: bytes, name: str) -> list[Sheet]:
     if suffix in WORKBOOKS:
         return list(_by_calamine(data, name))
     text.refuse_foreign(data, name, allowed=text.UTF_16)
-    encoding = dialect.encoding_of(data)
-    lines = dialect.decoded(data, encoding, name).split("\n")
+    encoding = text.encoding_of(data)
+    lines = text.decoded(data, encoding, name).split("\n")
     mark, rows = _delimited(lines, name)
     form = TableFormat(encoding=encoding, delimiter=mark if mark in DELIMITERS else ",")  # type: ignore[arg-type]
     return [Sheet("", rows, form)]
@@ -82,7 +82,7 @@ def _split(lines: Sequence[str], mark: str, source: str) -> list[list[str]]:
     if mark in (_BLANKS, _RUNS):  # a unit in brackets belongs to the name before it
         apart = r"\s{2,}|\t" if mark == _RUNS else r"\s+(?![\[(])(?![^\[(]*[\])])"
         return [re.split(apart, line.strip()) if line.strip() else [] for line in lines]
-    rows = dialect.cells_of(lines, mark, source, skip_blanks=True)
+    rows = text.cells_of(lines, mark, source, skip_blanks=True)
     return [[cell.strip() for cell in row] for row in rows]
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError, reason
 from mwdcal.files import metadata as meta
-from mwdcal.files.formats import atomic, dialect, layout, text
+from mwdcal.files.formats import atomic, layout, text
 from mwdcal.files.formats.columns import (
     LABELS,
     Column,
@@ -119,8 +119,8 @@ def parsed(
     arguments: dict[str, Any] = {"most": rows} if suffix == ".parquet" else {}
     stated: Mapping[str, object] = {}
     if export and form is text:
-        stated = stated_above(dialect.above(data, export, name)).metadata
-        data, arguments = dialect.plain(data, export, name), {"delimiter": export.delimiter}
+        stated = stated_above(text.above(data, export, name)).metadata
+        data, arguments = text.plain(data, export, name), {"delimiter": export.delimiter}
     elif suffix == ".xlsx":
         arguments = {"form": export, "serial": serial}
     decimal = export.decimal if export else decimal
@@ -254,7 +254,7 @@ def laid_out(
 
 def of_layout(where: layout.Layout, path: str | os.PathLike[str], kept: Collection[str]) -> Table:
     """The table of a layout in a file; the cells of the columns `kept` as they stand, of labels and serials."""
-    lines = [(n, line) for n, line in enumerate(where.above, 1) if dialect.is_metadata(line)]
+    lines = [(n, line) for n, line in enumerate(where.above, 1) if text.is_metadata(line)]
     stated = meta.parse(lines, Path(path).name)
     return Table(
         layout.as_columns(where, kept),
@@ -277,7 +277,7 @@ def below_names(path: str | os.PathLike[str], form: TableFormat) -> list[tuple[i
         return [(place, [as_text(cell) for cell in rows.get(place, ())]) for place in places]
     if _format(suffix) is not text:
         return []
-    return list(zip(places, dialect.below_names(data, form, file.name), strict=False))
+    return list(zip(places, text.below_names(data, form, file.name), strict=False))
 
 
 def _format(suffix: str) -> Any:

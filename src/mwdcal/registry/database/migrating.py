@@ -15,14 +15,15 @@ from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
 
 from mwdcal.errors import InputError
-from mwdcal.registry.database.chain import append_one
 from mwdcal.registry.database.connections import Database
-from mwdcal.registry.database.guards import FUNCTION_BODY, triggers_of_postgresql
 from mwdcal.registry.database.models import GUARDED, metadata
 from mwdcal.registry.database.schema import (
+    FUNCTION_BODY,
     SCHEMA_VERSION_OF_REGISTRY,
     VERSION_TABLE,
+    append_one,
     known_version,
+    triggers_of_postgresql,
 )
 
 

@@ -3,8 +3,8 @@
 import sqlalchemy as sa
 from alembic import op
 
-from mwdcal.registry.database.guards import drop_statements, guard_statements
 from mwdcal.registry.database.models import plain_text
+from mwdcal.registry.database.schema import drop_statements, guard_statements
 
 revision = "0001"
 down_revision = None

@@ -4,7 +4,7 @@ import sqlalchemy as sa
 from alembic import op
 
 from mwdcal.registry.database.models import plain_text
-from mwdcal.registry.database.tools import refresh_all
+from mwdcal.registry.database.schema import refresh_all
 
 revision = "0002"
 down_revision = "0001"
