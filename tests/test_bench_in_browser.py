@@ -45,10 +45,14 @@ class Operator:
         # axe is injected into the page, which the page's own policy would not let in
         self.context = browser.new_context(viewport={"width": 1280, "height": 900}, bypass_csp=True)
         self.page, self.complaints, self.host = self.context.new_page(), [], url.split("/?")[0]
-        self.page.on("console", lambda message: self.complaints.append(message.text))
+        self.page.on("console", lambda message: self._complaint(message.text))
         self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
         self.page.on("request", self._request)
         self.page.goto(url)
+
+    def _complaint(self, text):
+        if " 409 " not in text:  # a decision that was refused, as the page says
+            self.complaints.append(text)
 
     def _request(self, request):
         if not request.url.startswith((self.host, "data:")):
@@ -64,6 +68,16 @@ class Operator:
         self.page.get_by_role("status").filter(has_text=re.compile(pattern)).wait_for(
             timeout=LONGEST
         )
+
+    def accept_by_key(self):
+        """Press space once the tool has settled, and again where the figure shown was that of the station before."""
+        status = self.page.get_by_role("status")
+        before, settled = status.inner_text(), re.compile("^settled$")
+        until = time.monotonic() + LONGEST / 1000
+        while status.inner_text() == before and time.monotonic() < until:
+            self.page.locator("[data-live=state_text]").filter(has_text=settled).wait_for()
+            self.page.keyboard.press(" ")
+            self.page.wait_for_timeout(300)
 
     def heading(self, name):
         try:
@@ -156,23 +170,20 @@ def test_the_story_by_keyboard_alone(demo):
     operator.wait_for_status("Station 1")
     for number in range(1, 25):
         operator.wait_for_status(rf"^Station {number}\.")
-        page.locator("[data-live=state_text]").filter(has_text=re.compile("^settled$")).wait_for()
-        page.keyboard.press(" ")
+        operator.accept_by_key()
     operator.wait_for_status("All stations are measured")
     page.get_by_text(re.compile("^Stations 8, 16 do not fit")).wait_for(timeout=LONGEST)
     page.keyboard.press("r")
     for number in (8, 16):
         operator.wait_for_status(rf"^Station {number}\.")
-        page.locator("[data-live=state_text]").filter(has_text=re.compile("^settled$")).wait_for()
-        page.keyboard.press(" ")
+        operator.accept_by_key()
     operator.wait_for_status("Next: Calibrate")
     page.keyboard.press("c")
     operator.heading("^Calibrated")
     page.keyboard.press("t")
     for number in range(1, 13):
         operator.wait_for_status(rf"Station {number}\.")
-        page.locator("[data-live=state_text]").filter(has_text=re.compile("^settled$")).wait_for()
-        page.keyboard.press(" ")
+        operator.accept_by_key()
     operator.heading("^PASS")
     for _ in range(40):
         if page.evaluate("document.activeElement.id") == "b-certificate":
