@@ -158,6 +158,7 @@ def test_the_whole_story(demo, tmp_path):
     assert [tool["serial"] for tool in listed["tools"]] == ["DEMO-1"]
 
 
+@pytest.mark.study  # on a busy machine it has failed: see the step that names stations 8 and 16
 def test_the_story_by_keyboard_alone(demo):
     _, operator, _ = demo
     page = operator.page
