@@ -119,6 +119,7 @@ class BenchSession:
             part.skip(event["position"])
         elif kind == "cleared":
             part.clear()
+            self.papers.pop("verification", None)
         else:
             self._switch(kind, event)
 
@@ -365,7 +366,6 @@ class BenchSession:
             if not self.testing:
                 raise InputError("there is no roll test to measure again.")
             self._record("cleared", part=ROLLTEST_PART)
-            self.papers.pop("verification", None)
             self.verdict, self._used = None, (-1, -1)
             self._write_tables()
 
