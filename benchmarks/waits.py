@@ -1,4 +1,4 @@
-"""What users wait for, in processor time and memory: each line against what is aimed at.
+"""Processor time and memory of the jobs that users wait for, each against its target.
 
 Every command runs in a process of its own, on one core, so that its time holds its start and its memory is
 its own. The fleets are those of `fleet.py`, the long tables those of the guard: the example over and over.
@@ -53,7 +53,7 @@ class Wait(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """What the figure reaches."""
+        """The verdict: which of its targets the figure meets."""
         size = 1 / self.found if self.more else self.found
         least, aim = (1 / x if self.more else x for x in (self.least, self.aim))
         return "aim" if size <= aim else "at least" if size <= least else "**short of it**"

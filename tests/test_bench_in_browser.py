@@ -5,37 +5,25 @@ Skips where Chromium or what drives it (the extra `dev`) is missing.
 
 import json
 import re
-import shutil
 import time
-from importlib.resources import files
 from pathlib import Path
 
 import pytest
 
+import chromium
 from bench_support import EARTH, BenchProcess, Stand
+from chromium import AXE, CHROMIUM, RUN_AXE, playwright
 from cli_support import EXAMPLE, mwdcal
 
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-axe = pytest.importorskip("axe_playwright_python", reason="axe-core is not installed")
 pytest.importorskip("starlette", reason="starlette is not installed")
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
+browser = chromium.browser
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed: the bench was not looked at"),
 ]  # fmt: skip
-AXE = files(axe).joinpath("axe.min.js").read_text("utf-8")
-RUN_AXE = "axe.run(document, {resultTypes: ['violations'], selectors: false, elementRef: false})"
 VIEWS = [(1280, "light"), (800, "dark"), (1280, "dark"), (800, "light")]
 LONGEST = 60_000
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with playwright.sync_playwright() as driver:
-        chromium = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield chromium
-        chromium.close()
 
 
 class Operator:

@@ -6,7 +6,6 @@ reader could not read.
 
 import io
 import re
-import shutil
 from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
@@ -14,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import chromium
+from chromium import AXE, CHROMIUM, RUN_AXE
 from cli_support import EXAMPLE, called, commands, mwdcal, read_csv, servo_run, write_csv
 
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-axe = pytest.importorskip("axe_playwright_python", reason="axe-core is not installed")
 pypdf = pytest.importorskip("pypdf", reason="pypdf is not installed")
 pytest.importorskip("matplotlib", reason="matplotlib is not installed")
 
@@ -27,14 +26,12 @@ from PIL import Image  # noqa: E402
 from mwdcal.presentation.page import environment  # noqa: E402
 from mwdcal.use import plots  # noqa: E402
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
+browser = chromium.browser
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed: no page was looked at"),
 ]
 FAULTS = (Path(__file__).parent / "page_faults.js").read_text("utf-8")
-AXE = files(axe).joinpath("axe.min.js").read_text("utf-8")
-RUN_AXE = "axe.run(document, {resultTypes: ['violations'], selectors: false, elementRef: false})"
 WIDTHS = (1280, 420)
 SCHEMES = ("light", "dark")
 MOST_SHEETS = 16
@@ -132,14 +129,6 @@ def folder(tmp_path_factory):
     iron["mz"] = [f"{float(v) + 0.06:.6f}" for v in iron["mz"]]
     write_csv(folder / "iron.csv", iron, 'simulated = "yes"')
     return folder
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with playwright.sync_playwright() as driver:
-        chromium = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield chromium
-        chromium.close()
 
 
 class Sheet:

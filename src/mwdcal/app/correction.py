@@ -320,7 +320,7 @@ class _Worker:
         return rendered, part.size, tally
 
     def _noise(self, table: Table, channels: Channels) -> dict[str, Array]:
-        """What the table or the profile says of the noise of the readings along the tool axes."""
+        """Noise of the readings along the tool axes, as the table or the profile states it."""
         cells, noise = columns_of(table), {}
         for kind in set(TRIADS).intersection(channels):
             triad = getattr(self.calibration.profile, kind)

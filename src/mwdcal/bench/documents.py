@@ -23,12 +23,12 @@ FEWEST_STATIONS = 8
 REMEASURE = "reshoot"
 """The finding that names a station to measure again."""
 ENTERED = ("tool.json", "verification.json", "certificate.json")
-"""What is entered in the registry."""
+"""Files of the session that go into the registry."""
 
 
 @dataclass(frozen=True)
 class RunFit:
-    """What the stations so far tell: a calibration, or the reason why there is none yet."""
+    """A calibration by the stations so far, or the reason why they do not give one yet."""
 
     stations: int
     calibration: Calibration | None = None

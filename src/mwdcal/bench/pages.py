@@ -73,7 +73,7 @@ def fragment(session: BenchSession, token: str) -> str:
 
 
 def _buttons(session: BenchSession) -> dict[str, Any]:
-    """What can be done now."""
+    """The buttons and fields that the page offers now."""
     is_run = not session.testing and not session.calibrated
     measuring = not session.waiting and session.order is not None
     finished = "certificate" in session.papers
@@ -172,7 +172,7 @@ def _order_text(session: BenchSession) -> str:
 
 
 def _note(session: BenchSession) -> str:
-    """What went wrong, or which station does not fit."""
+    """The latest message, else the stations that do not fit."""
     t = texts()
     if session.message:
         return session.message

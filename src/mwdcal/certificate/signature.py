@@ -253,7 +253,7 @@ def create(path: Path, owner: str, passphrase: str) -> tuple[TrustedKey, Path]:
     public = public_key(key.public_key().public_bytes_raw(), owner, now())
     beside = path.with_name(path.name + PUBLIC_SUFFIX)
     if beside.exists():
-        raise _exists_of_keys(beside)
+        raise _key_is_there(beside)
     _write_new(path, private, 0o600)
     try:
         _write_new(beside, as_pem(public), 0o644)
@@ -272,7 +272,7 @@ def as_pem(key: TrustedKey) -> bytes:
     return "\n".join(lines).encode()
 
 
-def _exists_of_keys(path: Path) -> InputError:
+def _key_is_there(path: Path) -> InputError:
     return InputError(
         f"cannot write '{path}': there is a file, and keys are never overwritten. Name another."
     )
@@ -285,7 +285,7 @@ def _write_new(path: Path, data: bytes, mode: int) -> None:
     try:
         descriptor = os.open(path, flags, mode)
     except FileExistsError:
-        raise _exists_of_keys(path) from None
+        raise _key_is_there(path) from None
     except (OSError, ValueError) as error:
         raise InputError(f"cannot write '{path}': {reason(error)}. Choose another place.") from None
     try:

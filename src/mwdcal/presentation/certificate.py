@@ -405,7 +405,7 @@ def _sections(certificate: Certificate, pictures: Sequence[Picture]) -> Iterator
         ("item", "Item and customer", _item(certificate)),
         ("conformity", "Conformity, as found and as left", _conformity(certificate)),
         ("results", "Results", map(_results, certificate.results)),
-        ("budget", "Uncertainty budget", [_budget_of_certificate_text(certificate.budget)]),
+        ("budget", "Uncertainty budget", [_budget_block(certificate.budget)]),
         ("method", "Method and conditions", _method(certificate)),
         ("traceability", "Metrological traceability", [_traceability(certificate.traceability)]),
         ("statements", "Statements and findings", _statements(certificate)),
@@ -531,7 +531,7 @@ def _decisions(tests: Sequence[ConformityTest]) -> TableBlock:
         where = [name.name, *filter(None, [name.at])]
         row = [Cell(where), _cell(plain(each.limit) + symbol)]
         for decisions in by_test:
-            row += _decision_of_certificate_text(decisions.get(key), guarded)
+            row += _decision_cells(decisions.get(key), guarded)
         rows.append(row)
     return TableBlock(columns, rows, groups=groups, notes=_decision_notes(tests))
 
@@ -542,7 +542,7 @@ def _key(decision: LimitDecision) -> tuple[str, str, str, float]:
     return quantity.id, quantity.at, quantity.unit, decision.limit
 
 
-def _decision_of_certificate_text(decision: LimitDecision | None, guarded: bool) -> list[Cell]:
+def _decision_cells(decision: LimitDecision | None, guarded: bool) -> list[Cell]:
     """Cells of one decision: value, acceptance limit, decision, probability and risk."""
     if decision is None:
         return [Cell(["–"])] * (4 if guarded else 3)
@@ -626,7 +626,7 @@ def quantity_table(
     return TableBlock(order, rows, title, notes=[*filter(None, notes)])
 
 
-def _budget_of_certificate_text(budget: Budget) -> TableBlock:
+def _budget_block(budget: Budget) -> TableBlock:
     """Sources and their contributions to each angle, their combination, and its expansion."""
     every = [*budget.lines, budget.combined, budget.expanded]
     angles = ["inclination", "toolface", "azimuth"]

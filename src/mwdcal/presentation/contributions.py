@@ -1,4 +1,4 @@
-"""What makes the uncertainty of surveys: contributions by cause, on the screen, as a table and for machines."""
+"""Contributions to the uncertainty of surveys by cause: on the screen, as a table and for machines."""
 
 from __future__ import annotations
 

@@ -196,12 +196,12 @@ def figure(
     figure, [[errors, figures]] = plots.new_figure(label, 3.4, columns=2)
     figure.suptitle(f"{plan}, {plural(len(sound), 'tool')}   {SIMULATED}", fontsize=8)
     calibrated = {name: values[sound] for name, values in columns.items()}
-    _errors_of_simulation_page(errors, calibrated)
+    _draw_errors(errors, calibrated)
     _figures(figures, calibrated, judged, guard)
     return figure
 
 
-def _errors_of_simulation_page(axes: Axes, columns: Mapping[str, AnyArray]) -> None:
+def _draw_errors(axes: Axes, columns: Mapping[str, AnyArray]) -> None:
     """The share of tools whose largest error of an angle is below a value."""
     for name, key in ANGLE_LINES.items():
         if f"{name}_error_max_deg" not in columns:

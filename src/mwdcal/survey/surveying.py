@@ -474,7 +474,7 @@ class SurveyedWell:
 
     @cached_property
     def contributions(self) -> Contributions | None:
-        """What makes the uncertainty of each survey; None for long tables, and where azimuths are not measured."""
+        """Contributions to the uncertainty of each survey; None for long tables and without measured azimuths."""
         if self.counts.rows > MOST_CONTRIBUTED or self.counts.rows != self.well.readings.count:
             return None
         return contributions([run.well for run in self.runs] or [self.well])

@@ -92,7 +92,7 @@ def command(
 
 
 class Answers(dict[str, Any]):
-    """What the user has said, as arguments of `propose_profile`."""
+    """The options typed, as arguments of `propose_profile`."""
 
     def take(self, argument: str, value: str) -> None:
         """Note the value of an argument; of one with columns beside those noted before."""
@@ -145,7 +145,7 @@ def _number(text: str) -> None:
 
 
 def _pair(argument: str, text: str) -> tuple[str, str]:
-    """What an option says of a column: the name before the first sign, of rows before the last one."""
+    """The two parts of an option, NAME=VALUE: a column ends at the first sign, rows at the last one."""
     if "=" not in text:
         option = f"--{argument.replace('_', '-')}"
         expected = BY_COLUMN[argument]

@@ -229,7 +229,7 @@ def _pages(
     """The page, and the table of contributions, where they were asked for.
 
     Raises:
-        InputError: contributions were asked for, and there are none.
+        InputError: contributions were asked for, and this table is too long for them, or has no azimuths.
     """
     from mwdcal.files.formats import table as tables
     from mwdcal.presentation.contributions import contribution_table, station_row

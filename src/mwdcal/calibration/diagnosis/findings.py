@@ -65,7 +65,7 @@ def copies(result: Fit) -> Bools:
     its noise and its resolution; a channel whose resolution is coarser than its noise says nothing. Copies are
     named if as many pairs would agree with a chance below `COINCIDENCE`.
     """
-    noise = _noise_of_repeats(result)
+    noise = _noise_in_residuals(result)
     rows = np.concatenate(
         [t.raw / noise[:, [i], None] for i, t in enumerate(result.problem.triads)], -1
     )
@@ -79,7 +79,7 @@ def copies(result: Fit) -> Bools:
     return repeated
 
 
-def _noise_of_repeats(result: Fit) -> Array:
+def _noise_in_residuals(result: Fit) -> Array:
     """Noise (B, t) of a reading, as the residuals have it where more is declared; one where there is none."""
     less = np.minimum(np.nan_to_num(result.analysis.variance_factor, nan=1.0), 1.0)
     noise = reading_noise(result) * np.sqrt(less)
