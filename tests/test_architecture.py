@@ -19,7 +19,7 @@ SOURCE = ROOT / "src" / "mwdcal"
 # From the bottom up: a room imports from rooms below it. Rooms of one floor are strangers.
 FLOORS = (
     ("errors", "digests"),
-    ("signals",),
+    ("signals", "extras"),
     ("pool",),
     ("geometry",),
     ("sensor",),

@@ -15,6 +15,7 @@ from msgspec.structs import replace
 
 from certificate_sample import ANGLES, BUDGET, PARAMETERS, SAMPLE, quantity
 from cli_support import EXAMPLE, process
+from mwdcal import extras
 from mwdcal.calibration.record import Finding
 from mwdcal.certificate.document import Certificate, Item, Party, ResultTable, SourceFile
 from mwdcal.errors import InputError
@@ -370,7 +371,7 @@ def test_pictures_have_titles_and_texts_for_those_who_do_not_see_them(pictures):
 
 def test_without_typst_one_sentence_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "typst", None)
-    with pytest.raises(InputError, match=re.escape('pip install "mwdcal[certificate]"')) as refused:
+    with pytest.raises(InputError, match=re.escape(extras.command("certificate"))) as refused:
         render_pdf(SAMPLE)
     assert "\n" not in str(refused.value)
 

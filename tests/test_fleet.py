@@ -24,6 +24,7 @@ from cli_support import (
     servo_run,
     stations,
 )
+from mwdcal import extras
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
@@ -927,12 +928,9 @@ def test_a_cluster_of_two_of_which_one_dies_half_way(tmp_path):
 
 
 def test_a_cluster_without_its_extra(fleet, tmp_path, monkeypatch):
-    def absent(name):
-        raise ImportError(name)
-
-    monkeypatch.setattr(pool, "import_module", absent)
+    monkeypatch.setitem(sys.modules, "distributed", None)
     ran = mwdcal("fleet", fleet[0], "-o", tmp_path / "o.parquet", "--scheduler", "tcp://host:8786")
-    assert 'pip install "mwdcal[parquet,cluster]"' in refused(ran, 2)
+    assert extras.command("parquet,cluster") in refused(ran, 2)
 
 
 @pytest.mark.slow

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from cli_support import EXAMPLE, ROOT, calibrated, mwdcal, process, refused, servo_run, write_csv
+from mwdcal import extras
 from mwdcal.certificate import signature
 from mwdcal.certificate import signature as key_files
 from mwdcal.errors import InputError
@@ -731,9 +732,9 @@ def test_without_cryptography_it_says_what_to_install(tmp_path, files, key, publ
     monkeypatch.setitem(sys.modules, "cryptography.hazmat.primitives.asymmetric.ed25519", None)
     ran = mwdcal("verify", path, files[1], "--key", public)
     assert "signature not checked" in ran.out
-    assert 'pip install "mwdcal[certificate]"' in ran.err
+    assert extras.command("certificate") in ran.err
     message = refused(mwdcal("certificate", "sign", path, "--private-key", key), 2)
-    assert 'pip install "mwdcal[certificate]"' in message
+    assert extras.command("certificate") in message
     refused(mwdcal("certificate", "key", "create", "-o", tmp_path / "n.key"), 2)
     ran = mwdcal("certificate", "verify", path, "--key", public)
     assert ran.code == 1

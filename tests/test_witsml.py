@@ -1,6 +1,7 @@
 """WITSML: published examples are read, nothing is lost on the way out and back, attacks are refused."""
 
 import os
+import re
 import subprocess
 import sys
 import time
@@ -13,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from cli_support import mwdcal, stations
+from mwdcal import extras
 from mwdcal.errors import InputError
 from mwdcal.files.exchange import description, witsml
 from mwdcal.files.formats.table import Table, read, rendered, write
@@ -242,7 +244,7 @@ def test_a_missing_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "defusedxml", None)
     path = tmp_path / "t.xml"
     path.write_bytes(trajectory(station(RAW)))
-    with pytest.raises(InputError, match=r"pip install \"mwdcal\[survey\]\""):
+    with pytest.raises(InputError, match=re.escape(extras.command("survey"))):
         read(path)
 
 

@@ -21,13 +21,13 @@ from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessP
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from importlib import import_module
 from multiprocessing import forkserver, resource_tracker
 from multiprocessing.context import BaseContext
 from queue import Empty, SimpleQueue
 from types import ModuleType
 from typing import Any
 
+from mwdcal import extras
 from mwdcal.errors import InputError, reason
 from mwdcal.signals import held
 
@@ -42,6 +42,8 @@ WORKER_SETTINGS = {
 
 The process that workers are copies of has one thread: Python warns of copies of several.
 """
+CLUSTER = "parquet,cluster"
+"""The extras that a worker of a cluster needs."""
 ATTEMPTS = 3
 """How often a part whose worker died is given to another."""
 MOST_PROCESSES = 61
@@ -209,13 +211,7 @@ def _ready(running: Iterable[Future[Any]]) -> set[Future[Any]]:
 
 def _on_cluster(steps: Steps, tasks: Sequence[Any], address: str) -> Iterator[tuple[int, Any]]:
     """By the workers of a Dask scheduler, which gives a dead worker's tasks to others."""
-    try:
-        distributed: Any = import_module("distributed")
-    except ImportError:
-        raise InputError(
-            "`scheduler` needs the extra 'cluster'. Install it, here and on every worker: "
-            'pip install "mwdcal[parquet,cluster]"'
-        ) from None
+    distributed = extras.load("distributed", "`scheduler`, here and on every worker,", CLUSTER)
     with _connected(distributed, address) as client:
         futures = client.map(steps, tasks, pure=False, retries=ATTEMPTS)
         waiting = {future.key: (index, future) for index, future in enumerate(futures)}
@@ -233,8 +229,8 @@ def _on_cluster(steps: Steps, tasks: Sequence[Any], address: str) -> Iterator[tu
             ) from error
         except ModuleNotFoundError as error:
             raise InputError(
-                f"a worker of {address} has no {error.name}. Install mwdcal there: pip install "
-                '"mwdcal[parquet,cluster]"'
+                f"a worker of {address} has no {error.name}. Install mwdcal there as here: "
+                f"{extras.command(CLUSTER)}"
             ) from error
         except LOST as error:
             raise InputError(

@@ -9,11 +9,11 @@ import socket
 import webbrowser
 from collections.abc import Mapping
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import mwdcal
+from mwdcal import extras
 from mwdcal.bench.documents import tools_in
 from mwdcal.bench.journal import JOURNAL_NAME
 from mwdcal.bench.positions import SessionPlan, planned_columns
@@ -43,13 +43,7 @@ EVERYWHERE = ("0.0.0.0", "::")
 def require() -> None:
     """Refuse to serve without the libraries that serve, which the extra `bench` installs."""
     for name in ("starlette", "uvicorn", "jinja2"):
-        try:
-            import_module(name)
-        except ImportError as error:
-            raise InputError(
-                f"the bench needs {error.name}, which is not installed. Install mwdcal[bench]: "
-                'pip install "mwdcal[bench]"'
-            ) from None
+        extras.load(name, "the bench", "bench")
 
 
 def bench_of(folder: Path, given: Mapping[str, Any], host: str, port: int) -> Bench:

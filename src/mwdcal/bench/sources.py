@@ -15,6 +15,7 @@ from pathlib import Path
 from threading import Event
 from typing import Any, Protocol
 
+from mwdcal import extras
 from mwdcal.bench.stream import LINE_CHARACTERS
 from mwdcal.errors import InputError
 
@@ -104,13 +105,7 @@ class SerialPort(Connection):
 
     def __init__(self, port: str, baud: int) -> None:
         super().__init__(port)
-        try:
-            import serial
-        except ImportError:
-            raise InputError(
-                "a serial port needs pyserial, which is not installed. Install mwdcal[bench]: "
-                'pip install "mwdcal[bench]"'
-            ) from None
+        serial = extras.load("serial", "a serial port", "bench")
         self._library, self._port, self.midway = serial, (port, baud), True
 
     def open(self) -> Any:

@@ -21,6 +21,7 @@ from typing import Any, Literal, NamedTuple
 import msgspec
 from msgspec.structs import replace
 
+from mwdcal import extras
 from mwdcal.calibration.record import (
     Calibration,
     Finding,
@@ -97,13 +98,8 @@ class PrivateKey(NamedTuple):
 
 def ed25519() -> Any:
     """The Ed25519 of cryptography, or what to install."""
-    try:
-        return import_module("cryptography.hazmat.primitives.asymmetric.ed25519")
-    except ImportError:
-        raise InputError(
-            "signatures need cryptography, which is not installed. Install mwdcal[certificate]: "
-            'pip install "mwdcal[certificate]"'
-        ) from None
+    module = "cryptography.hazmat.primitives.asymmetric.ed25519"
+    return extras.load(module, "a signature", "certificate")
 
 
 def available() -> bool:
@@ -441,8 +437,8 @@ STATES = {
     "that a valid key has signed.",
     "retired": "the {document} was signed on {time} by {key}, which was retired on {retired}. Have it signed with "
     "the key that followed.",
-    "unchecked": "the {document} is signed by {key}, and not checked: cryptography is not installed. Install "
-    'mwdcal[certificate]: pip install "mwdcal[certificate]"',
+    "unchecked": "the {document} is signed by {key}, and not checked: cryptography is not installed. Install it "
+    "with: {install}",
 }
 """The statements about each state."""
 CLOCKS_APART = timedelta(minutes=5)
@@ -612,6 +608,7 @@ def _said(
         "revoked": key.revoked if key else "",
         "reason": f": {key.reason}" if key and key.reason else "",
         "retired": key.retired if key else "",
+        "install": extras.command("certificate"),
     }
     return SignatureCheck(
         state=state,

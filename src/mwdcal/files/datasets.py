@@ -10,6 +10,7 @@ import os
 from importlib import resources
 from pathlib import Path
 
+from mwdcal import extras
 from mwdcal.errors import InputError
 
 FOLDER = "MWDCAL_DATA"
@@ -38,12 +39,7 @@ def fetch(name: str) -> Path:
             f"{name}: set {FOLDER} to the folder of a local copy of the measured sets, or "
             f"{ADDRESS} to the address of one."
         )
-    try:
-        import pooch
-    except ImportError:
-        raise InputError(
-            "measured sets need the extra 'data': pip install \"mwdcal[data]\"."
-        ) from None
+    pooch = extras.load("pooch", "a measured set", "data")
     if FOLDER in os.environ:
         return _local(Path(os.environ[FOLDER]), name, known[name])
     cache = pooch.create(pooch.os_cache("mwdcal"), os.environ[ADDRESS], registry=known)

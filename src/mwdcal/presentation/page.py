@@ -10,12 +10,10 @@ import re
 from base64 import b64encode
 from collections.abc import Mapping
 from hashlib import sha256
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from mwdcal import __version__
+from mwdcal import __version__, extras
 from mwdcal.calibration.readings import head
-from mwdcal.errors import InputError
 from mwdcal.presentation.numbers import (
     UNDETERMINED,
     capital,
@@ -38,16 +36,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def require(what: str, *libraries: str, extra: str = "report") -> None:
+def require(use: str, *libraries: str, extra: str = "report") -> None:
     """Refuse to draw without the libraries that draw, which an extra installs."""
     for name in libraries:
-        try:
-            import_module(name)
-        except ImportError as error:
-            raise InputError(
-                f"{what} needs {error.name}, which is not installed. Install mwdcal[{extra}]: "
-                f'pip install "mwdcal[{extra}]"'
-            ) from None
+        extras.load(name, use, extra)
 
 
 def picture(figure: Figure, suffix: str) -> bytes:

@@ -2,9 +2,8 @@
 
 from importlib.util import find_spec
 
-from mwdcal.errors import InputError
+from mwdcal import extras
 
-if not (find_spec("sqlalchemy") and find_spec("alembic")):
-    raise InputError(
-        'the registry needs SQLAlchemy and Alembic. Install them with: pip install "mwdcal[registry]"'
-    )
+for _library in ("sqlalchemy", "alembic"):
+    if find_spec(_library) is None:
+        raise extras.missing(_library, "the registry", "registry")

@@ -23,7 +23,6 @@ from contextlib import suppress
 from dataclasses import replace
 from datetime import date
 from functools import cache
-from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -32,6 +31,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
+from mwdcal import extras
 from mwdcal.calibration.readings import EARTH_RANGES
 from mwdcal.calibration.record import DOCUMENT_VERSION, Finding
 from mwdcal.digests import sha256_of
@@ -294,38 +294,23 @@ def _square(entries: Sequence[tuple[int, int, float]]) -> Array:
     return matrix
 
 
-def optional_library(name: str, what: str) -> Any:
-    """A library of the extra 'survey', or what to install."""
-    try:
-        return import_module(name)
-    except ImportError:
-        raise _missing(name, what) from None
-
-
 def _coefficients(library: str, file: str, what: str) -> tuple[str, str]:
     """The text of a file of coefficients in a library that need not be imported, and its SHA-256."""
     spec = find_spec(library)
     if spec is None or spec.origin is None:
-        raise _missing(library, what)
+        raise extras.missing(library, what, "survey")
     try:
         data = (Path(spec.origin).parent / file).read_bytes()
     except OSError:
         raise InputError(
             f"{library} {version(library)} has no file {file}. Install another version: "
-            'pip install -U "mwdcal[survey]"'
+            f"{extras.command('survey')} -U"
         ) from None
     return data.decode("utf-8"), sha256_of(data)
 
 
 def _named(model: str, file: str, library: str) -> str:
     return f"{model}, {Path(file).name} of {library} {version(library)}"
-
-
-def _missing(name: str, what: str) -> InputError:
-    return InputError(
-        f"{what} needs {name}, which is not installed. Install the extra 'survey': "
-        'pip install "mwdcal[survey]"'
-    )
 
 
 WGS84 = "EPSG:4326"
@@ -363,7 +348,7 @@ def grid_convergence(crs: str, latitude_deg: float, longitude_deg: float) -> Gri
     Raises:
         InputError: no such projection, one that PROJ cannot compute, or a place it does not show.
     """
-    pyproj = optional_library("pyproj", "The convergence of a grid")
+    pyproj = extras.load("pyproj", "The convergence of a grid", "survey")
     system = _projected(pyproj, crs)
     longitude = (longitude_deg + 180.0) % 360.0 - 180.0
     axes = _derivatives(pyproj, crs, system, latitude_deg, longitude)

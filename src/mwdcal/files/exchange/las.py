@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mwdcal import extras
 from mwdcal.errors import InputError
 from mwdcal.files import metadata as meta
 from mwdcal.files.exchange import description
@@ -147,13 +148,7 @@ def _sections(text: str, source: str) -> _Sections:
 
 
 def _module(source: str) -> Any:
-    try:
-        import lasio
-    except ImportError:
-        raise InputError(
-            f"{source}: LAS files need the extra 'survey'. "
-            'Install it with: pip install "mwdcal[survey]"'
-        ) from None
+    lasio = extras.load("lasio", f"{source}: a LAS file", "survey")
     logging.getLogger("lasio").addHandler(logging.NullHandler())
     return lasio
 

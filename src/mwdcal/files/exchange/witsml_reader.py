@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Any
 
+from mwdcal import extras
 from mwdcal.errors import InputError
 from mwdcal.files.exchange.witsml_schema import NAMESPACE, OLD_NAMESPACE, Leaf
 from mwdcal.files.formats.columns import shown
@@ -74,14 +76,8 @@ def _problem(error: Exception) -> str:
 
 def _modules(source: str) -> tuple[Any, type[Exception]]:
     """The parser that refuses attacks, and its refusals; or what to install."""
-    try:
-        from defusedxml import DefusedXmlException, ElementTree
-    except ImportError:
-        raise InputError(
-            f"{source}: WITSML files need the extra 'survey'. "
-            'Install it with: pip install "mwdcal[survey]"'
-        ) from None
-    return ElementTree, DefusedXmlException
+    parser = extras.load("defusedxml.ElementTree", f"{source}: a WITSML file", "survey")
+    return parser, import_module("defusedxml").DefusedXmlException
 
 
 @dataclass

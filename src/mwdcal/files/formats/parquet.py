@@ -5,12 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
+from mwdcal import extras
 from mwdcal.errors import InputError
 from mwdcal.files import metadata as meta
 from mwdcal.files.formats.columns import (
@@ -174,15 +176,8 @@ def render(columns: Mapping[str, Column], metadata: Mapping[str, object], source
 
 def modules(source: str) -> tuple[Any, Any]:
     """PyArrow and its Parquet module, or what to install."""
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError:
-        raise InputError(
-            f"{source}: Parquet files need the extra 'parquet'. "
-            'Install it with: pip install "mwdcal[parquet]"'
-        ) from None
-    return pyarrow, pyarrow.parquet
+    parquet = extras.load("pyarrow.parquet", f"{source}: a Parquet file", "parquet")
+    return import_module("pyarrow"), parquet
 
 
 reading = partial(

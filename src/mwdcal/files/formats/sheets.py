@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from mwdcal import extras
 from mwdcal.errors import InputError
 from mwdcal.files.formats import figures, text
 from mwdcal.files.formats.columns import at_most, damaged_unless_read
@@ -137,11 +138,4 @@ def _check_ods(data: bytes, source: str) -> None:
 
 
 def _module(source: str) -> Any:
-    try:
-        import python_calamine
-    except ImportError:
-        raise InputError(
-            f"{source}: .ods and .xls files need the extra 'xlsx'. "
-            'Install it with: pip install "mwdcal[xlsx]"'
-        ) from None
-    return python_calamine
+    return extras.load("python_calamine", f"{source}: an .ods file", "xlsx")

@@ -15,6 +15,7 @@ from typing import IO, Any
 from xml.etree.ElementTree import iterparse
 from xml.parsers import expat
 
+from mwdcal import extras
 from mwdcal.errors import InputError
 from mwdcal.files import metadata as meta
 from mwdcal.files.formats.columns import (
@@ -208,14 +209,7 @@ def render(columns: Mapping[str, Column], metadata: Mapping[str, object], source
 
 
 def _module(source: str) -> Any:
-    try:
-        import openpyxl
-    except ImportError:
-        raise InputError(
-            f"{source}: Excel files need the extra 'xlsx'. "
-            'Install it with: pip install "mwdcal[xlsx]"'
-        ) from None
-    return openpyxl
+    return extras.load("openpyxl", f"{source}: an Excel file", "xlsx")
 
 
 def _belongs(line: int, row: Sequence[object], form: TableFormat) -> bool:

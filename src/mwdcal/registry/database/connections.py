@@ -17,6 +17,7 @@ from urllib.parse import quote
 
 import sqlalchemy as sa
 
+from mwdcal import extras
 from mwdcal.errors import InputError
 from mwdcal.files.formats.members import is_nearly_url
 
@@ -169,10 +170,7 @@ def connect(database: str | os.PathLike[str], new: bool = False, shared: bool = 
             f"`database` must be a file or a URL of PostgreSQL; got '{name}'. Correct it."
         )
     if find_spec("psycopg") is None:
-        raise InputError(
-            f"{name}: PostgreSQL needs the package psycopg. Install it with: "
-            'pip install "mwdcal[postgresql]"'
-        )
+        raise extras.missing("psycopg", f"{name}: PostgreSQL", "postgresql")
     engine = sa.create_engine(url.set(drivername="postgresql+psycopg"), hide_parameters=True)
     sa.event.listen(engine, "connect", _wait_for_the_disk)
     return Database(name, engine)
