@@ -608,7 +608,7 @@ def _said(
         "revoked": key.revoked if key else "",
         "reason": f": {key.reason}" if key and key.reason else "",
         "retired": key.retired if key else "",
-        "install": extras.command("certificate"),
+        "install": extras.command("certificate") if state == "unchecked" else "",
     }
     return SignatureCheck(
         state=state,
