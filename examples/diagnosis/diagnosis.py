@@ -1,6 +1,6 @@
 """How often `diagnose` names the right fault: simulated tools with each fault, and without.
 
-    make diagnosis        (writes docs/diagnosis.md; hours with 1000 tools)
+    make diagnosis        (writes docs/evidence/diagnosis.md; hours with 1000 tools)
 
 Every case has a tool, a calibration and later readings of its own. Faults are simulated by their physics
 (`mwdcal.faults.likelihood`: exact, not to first order), of the sizes that `mwdcal simulate` draws. All data are
@@ -219,7 +219,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--count", type=int, default=1000, help="tools; 40 take ten minutes")
     parser.add_argument(
-        "--output", type=Path, default=Path(__file__).parents[2] / "docs" / "diagnosis.md"
+        "--output", type=Path, default=Path(__file__).parents[2] / "docs" / "evidence" / "diagnosis.md"
     )
     options = parser.parse_args()
     options.output.write_text(page(studied(options.count), options.count), "utf-8")
