@@ -227,7 +227,7 @@ def power_rows(tools: int, pool: ProcessPoolExecutor) -> Iterator[str]:
 
 HEAD = """# Drift: what the tests find (simulated)
 
-Written by `examples/drift/drift.py`; SIMULATED DATA, all of it. See [drift](drift.md) for what is tested.
+Written by `examples/drift/drift.py`; SIMULATED DATA, all of it. See [drift](../howto/drift.md) for what is tested.
 
 ## False alarms
 

@@ -588,7 +588,7 @@ def _intro() -> list[str]:
         "first column; rows with the same figures are one. *default*: `--method joint`, own-axis",
         "quadratic and cubic terms where the run speaks for them (`--nonlinearity auto`), and, where",
         "the run has groups, the scatter of strengths, dip and direction from shot to shot",
-        "estimated beside the noise ([Methods](methods.md#own-axis-nonlinearity)).",
+        "estimated beside the noise ([Methods](../explanation/nonlinearity.md)).",
         "The paper's weights and restricted models are tried with every method, robust weights and",
         "own-axis terms with the default one. *Left out*: each station from a fit without it; this is",
         "the figure that counts. For the default the choice of own-axis terms, too, is made without the",
