@@ -120,7 +120,7 @@ check-docs: $(INSTALLED)
 	@$(CLOCK); $(SPHINX) -b html docs build/docs; $(SPHINX) -b man docs build/man; \
 	cmp build/man/mwdcal.1 docs/mwdcal.1 || { echo "docs/mwdcal.1, the manual page, is old: make docs"; exit 1; }
 
-bench: $(MEASURED) ## time mwdcal against SciPy and other packages, write docs/benchmarks.md (QUICK=1: two minutes)
+bench: $(MEASURED) ## time mwdcal against SciPy and other packages, write docs/evidence/benchmarks.md (QUICK=1: two minutes)
 	@$(CLOCK); $(ONE_THREAD) PYTHONPATH=tests $(BENCH)/python benchmarks/bench.py \
 		$(if $(QUICK),--quick --output build/benchmarks)
 
@@ -128,26 +128,26 @@ bench-guard: $(INSTALLED) ## compare the speed of what users wait for with a ref
 	@$(CLOCK); $(ONE_THREAD) PYTHONPATH=benchmarks $(BIN)/python benchmarks/guard.py $(if $(KEEP),--keep) \
 		$(if $(MOST),--most $(MOST))
 
-measured: $(INSTALLED) ## calibrate the measured sets (MWDCAL_DATA) and rewrite docs/measured.md
+measured: $(INSTALLED) ## calibrate the measured sets (MWDCAL_DATA) and rewrite docs/evidence/measured.md
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python examples/measured/measured.py
 
 papers: $(INSTALLED) ## recompute the papers and rewrite their pages and figures (a minute or two)
 	@$(CLOCK); for name in moradi moosavi ivanov; do $(ONE_THREAD) $(BIN)/python examples/papers/$$name.py; done
 
-verification: $(INSTALLED) ## count wrong verdicts of simulated roll tests and rewrite docs/verification.md (two minutes)
+verification: $(INSTALLED) ## count wrong verdicts of simulated roll tests and rewrite docs/evidence/verification.md (two minutes)
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python examples/verification/verification.py
 
-coverage: $(INSTALLED) ## compare stated uncertainties with simulated errors and rewrite docs/coverage (STUDY=ladders: one page)
+coverage: $(INSTALLED) ## compare stated uncertainties with simulated errors and rewrite docs/evidence/coverage (STUDY=ladders: one page)
 	@$(CLOCK); for study in $(or $(STUDY),$(filter-out world,$(basename $(notdir $(wildcard examples/coverage/*.py))))); do \
 		$(ONE_THREAD) $(BIN)/python examples/coverage/$$study.py; done
 
-drift: $(INSTALLED) ## test for changes of simulated tools and rewrite docs/drift-tables.md (twenty minutes)
+drift: $(INSTALLED) ## test for changes of simulated tools and rewrite docs/evidence/drift-tables.md (twenty minutes)
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python examples/drift/drift.py
 
-scatter: $(INSTALLED) ## compare what plans state with simulated calibrations and rewrite docs/scatter.md (a quarter of an hour)
+scatter: $(INSTALLED) ## compare what plans state with simulated calibrations and rewrite docs/evidence/scatter.md (a quarter of an hour)
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python examples/planning/scatter.py
 
-diagnosis: $(INSTALLED) ## name faults of simulated tools and rewrite docs/diagnosis.md (half an hour; COUNT=100)
+diagnosis: $(INSTALLED) ## name faults of simulated tools and rewrite docs/evidence/diagnosis.md (half an hour; COUNT=100)
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python examples/diagnosis/diagnosis.py --count $(or $(COUNT),1000)
 
 docs: $(INSTALLED) ## build the documentation into build/docs, and the manual page docs/mwdcal.1

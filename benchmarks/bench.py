@@ -1,6 +1,6 @@
 """Every benchmark side by side in one run, and the page of the ratios.
 
-    make bench            (writes docs/benchmarks.md and docs/benchmarks.svg; under 25 minutes on two cores)
+    make bench            (writes docs/evidence/benchmarks.md and docs/evidence/benchmarks.svg; under 25 minutes on two cores)
     make bench QUICK=1    (smaller sizes, under two minutes, into build/benchmarks)
 
 All comparisons are made in one environment, in which mwdcal and the alternatives are installed.
@@ -362,7 +362,7 @@ def _bar(axes: Axes, place: int, ratio: float) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--output", type=Path, default=ROOT / "docs")
+    parser.add_argument("--output", type=Path, default=ROOT / "docs" / "evidence")
     parser.add_argument("--only", help="groups with commas, whose sections of the page are renewed")
     asked = parser.parse_args()
     if os.environ.get("OMP_NUM_THREADS") != "1":

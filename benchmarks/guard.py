@@ -10,7 +10,7 @@ third longer than it did, in every one of some tries, has lost its speed unnotic
     python benchmarks/guard.py fleet      # only paths with this word in their name
     python benchmarks/guard.py --stored before.json --keep    # the same with another file of ratios
 
-With PYTHONPATH it takes the sources of another commit (docs/benchmarks.md shows one that it fails on).
+With PYTHONPATH it takes the sources of another commit (docs/evidence/benchmarks.md shows one that it fails on).
 """
 
 from __future__ import annotations

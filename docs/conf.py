@@ -20,9 +20,11 @@ version = release = mwdcal.__version__
 extensions = [
     "mathml",
     "myst_parser",
+    "screens",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "sphinx_click",
+    "sphinx_design",
 ]
 exclude_patterns = ["_build"]
 source_suffix = {".md": "markdown"}
@@ -39,7 +41,8 @@ napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 
-man_pages = [("commands", project, "calibration of MWD directional tools", [author], 1)]
+COMMANDS = "reference/commands"
+man_pages = [(COMMANDS, project, "calibration of MWD directional tools", [author], 1)]
 today = release  # in place of a date: the same sources, the same manual
 
 html_theme = "furo"
@@ -101,13 +104,32 @@ def literal_columns(app, what, name, obj, options, lines) -> None:
     lines[:] = [*"\n\n".join(kept).split("\n"), ""]
 
 
+MANUAL = """
+## Every option
+
+```{eval-rst}
+.. click:: mwdcal.app.cli:cli
+   :prog: mwdcal
+   :nested: full
+```
+"""
+"""What the manual page has beside the page of the commands: on the web each command has a page of its own."""
+
+
+def complete_the_manual(app, docname, source) -> None:
+    """Add the options of all commands to the manual page."""
+    if app.builder.name == "man" and docname == COMMANDS:
+        source[0] = source[0] + MANUAL
+
+
 def commands_are_outdated(app, env, added, changed, removed) -> list[str]:
-    """The page of the commands, which is not known to depend on the code it is read from."""
-    return ["commands"]
+    """The pages of the commands, which are not known to depend on the code they are read from."""
+    return [name for name in env.found_docs if name.startswith(COMMANDS)]
 
 
 def setup(app) -> None:
     app.connect("source-read", leave_out_missing)
+    app.connect("source-read", complete_the_manual)
     app.connect("env-get-outdated", commands_are_outdated)
     app.connect("autodoc-process-docstring", literal_columns)
     app.connect("autodoc-process-docstring", escape_docstring)

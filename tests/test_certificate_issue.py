@@ -274,7 +274,7 @@ def test_the_digest_is_that_of_the_file():
 
 def test_every_line_of_the_page_runs(tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
-    text = (ROOT / "docs" / "certificate.md").read_text("utf-8")
+    text = (ROOT / "docs" / "howto" / "certificate.md").read_text("utf-8")
     lines = re.findall(r"^mwdcal (.*)", re.search(r"^```\n(.*?)^```", text, re.S | re.M)[1], re.M)
     monkeypatch.chdir(tmp_path)
     for line in lines:

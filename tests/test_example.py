@@ -59,7 +59,7 @@ def test_an_installed_package_has_the_files(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("without_layout")
-@pytest.mark.parametrize("page", ["README.md", "docs/start.md"])
+@pytest.mark.parametrize("page", ["README.md", "docs/tutorials/start.md"])
 def test_every_line_of_the_first_pages_runs(tmp_path, monkeypatch, page):
     pytest.importorskip("matplotlib")
     text = (ROOT / page).read_text("utf-8")

@@ -146,8 +146,8 @@ def test_the_help_shows_every_command_once():
 
 
 def test_the_documented_table_has_every_command_and_function():
-    """What `docs/python.md` promises is all there, and nothing is left out of it."""
-    text = (ROOT / "docs" / "python.md").read_text("utf-8")
+    """What `docs/howto/python.md` promises is all there, and nothing is left out of it."""
+    text = (ROOT / "docs" / "howto" / "python.md").read_text("utf-8")
     rows = re.findall(r"^\| `(\w+)` \| (`mwdcal\.[^|]*) \|$", text, re.M)
     named = {name for _, functions in rows for name in re.findall(r"`mwdcal\.(\w+)`", functions)}
     assert {name for name, _ in rows} == {*cli.commands} - {

@@ -637,11 +637,11 @@ def test_the_screen_states_identity_errors_and_files(tmp_path):
 
 
 def test_the_documented_errors_are_those_of_the_example(tmp_path):
-    """The table of `docs/commands.md`, to its two digits."""
+    """The table of `docs/reference/converted.md`, to its two digits."""
     run_file, profile = EXAMPLE / "run.csv", EXAMPLE / "tool.toml"
     ran = mwdcal("calibrate", run_file, "--tool", profile, "-o", tmp_path / "cal.json")
     assert ran.code == 0, ran
-    text = (ROOT / "docs" / "commands.md").read_text("utf-8")
+    text = (ROOT / "docs" / "reference" / "converted.md").read_text("utf-8")
     rows = re.findall(r"\| (\d\d) bits \| (\S+) mg \| (\S+) nT \| (\S+)° \| (\S+)° \|", text)
     assert [bits for bits, *_ in rows] == ["32", "24", "16"]
     for bits, gravity, *others in rows:

@@ -336,7 +336,7 @@ def test_the_page_has_its_dates_and_the_same_table_gives_the_same_bytes(tmp_path
 
 
 def test_every_status_and_every_finding_has_its_sentence():
-    documented = (ROOT / "docs" / "fleet.md").read_text("utf-8")
+    documented = (ROOT / "docs" / "howto" / "fleet.md").read_text("utf-8")
     statuses, remarks = (
         part.partition("\n\n")[0]
         for part in (

@@ -281,7 +281,7 @@ def test_errors_in_angles_meet_the_bound_and_intervals_cover(lowest):
     ids=lambda value: value.title if isinstance(value, ivanov.Case) else "",
 )
 def test_where_angles_alone_win_and_where_not(instruments, case, least, most):
-    """Ratio of angular errors to those of least squares, as docs/papers/ivanov.md states them."""
+    """Ratio of angular errors to those of least squares, as docs/evidence/papers/ivanov.md states them."""
     tools, stations = instruments
     data = ivanov.simulated(case, stations, tools, 4)
     found = [

@@ -15,7 +15,7 @@ pytest.importorskip("cryptography")
 
 from test_registry_files import laboratory
 
-PAGE = ROOT / "docs" / "registry.md"
+PAGE = ROOT / "docs" / "tutorials" / "year.md"
 FAILS = "as-found.json"
 """What the roll test of the tool that was knocked is written to: it does not pass."""
 

@@ -843,7 +843,7 @@ def test_a_calibration_that_is_signed_too_late_is_named(tmp_path, files, key):
 
 def test_the_recipe_of_the_page_checks_a_certificate(chain, public, monkeypatch):
     """Python code that does without mwdcal, as the page prints it."""
-    page = (ROOT / "docs" / "signature.md").read_text("utf-8")
+    page = (ROOT / "docs" / "howto" / "signature.md").read_text("utf-8")
     (recipe,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     monkeypatch.chdir(chain.parent)
     shutil.copy(public, "laboratory.key.pub")
@@ -855,7 +855,7 @@ def test_the_recipe_of_the_page_checks_a_certificate(chain, public, monkeypatch)
 
 def test_the_commands_of_the_page_run(tmp_path, files, monkeypatch):
     """Those that make, list, rotate and revoke keys, in their order."""
-    page = (ROOT / "docs" / "signature.md").read_text("utf-8")
+    page = (ROOT / "docs" / "howto" / "signature.md").read_text("utf-8")
     monkeypatch.chdir(tmp_path)
     shutil.copy(files[0], "tool.json")
     verdict = mwdcal("verify", "tool.json", files[1], "--json").out

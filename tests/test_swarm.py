@@ -268,7 +268,7 @@ def test_moradi_page_and_figure_are_written_from_figures():
     pytest.importorskip("matplotlib")
     text = moradi.page(draws=500, seeds=1)
     assert "{" not in text
-    committed = EXAMPLE.parents[2] / "docs" / "papers" / "moradi.md"
+    committed = EXAMPLE.parents[2] / "docs" / "evidence" / "papers" / "moradi.md"
     if committed.exists():
         headings = [line for line in text.splitlines() if line.startswith("#")]
         assert [x for x in committed.read_text("utf-8").splitlines() if x[:1] == "#"] == headings

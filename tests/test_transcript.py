@@ -1,4 +1,4 @@
-"""The lines of docs/transcript.md, run again on the tables that it names: what it shows is printed."""
+"""The lines of docs/tutorials/transcript.md, run again on the tables that it names: what it shows is printed."""
 
 import re
 import shutil
@@ -9,7 +9,7 @@ import pytest
 from cli_support import ROOT, mwdcal
 from laboratories import laboratories
 
-PAGE = (ROOT / "docs" / "transcript.md").read_text("utf-8")
+PAGE = (ROOT / "docs" / "tutorials" / "transcript.md").read_text("utf-8")
 BLOCKS = re.findall(r"```console\n(.*?)```", PAGE, re.DOTALL)
 FIVE_MINUTES = 300.0
 

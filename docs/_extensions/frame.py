@@ -1,4 +1,4 @@
-"""Draw docs/frame.svg: the tool frame, its two vectors and its angles.
+"""Draw docs/reference/frame.svg: the tool frame, its two vectors and its angles.
 
     python docs/_extensions/frame.py
 
@@ -144,4 +144,4 @@ def drawing() -> str:
 
 
 if __name__ == "__main__":
-    Path(__file__).parents[1].joinpath("frame.svg").write_text(drawing(), encoding="utf-8")
+    Path(__file__).parents[1].joinpath("reference", "frame.svg").write_text(drawing(), encoding="utf-8")

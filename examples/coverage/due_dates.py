@@ -1,6 +1,6 @@
 """Are tools beyond their limits on the day they are due? Walks of 0.3 to 100 standard uncertainties a year.
 
-    python examples/coverage/due_dates.py        (writes docs/coverage/due_dates.md; a minute or two)
+    python examples/coverage/due_dates.py        (writes docs/evidence/coverage/due_dates.md; a minute or two)
 
 A tool is calibrated every year while its parameters walk, it walks on to the day on which `mwdcal registry drift` says
 that it is due, and there the last calibration is applied to what it reads. The calibrations after the first are

@@ -1,6 +1,6 @@
 """Calibrations with an earlier one of the same tool as prior, after another turn-on and a walk since.
 
-make coverage STUDY=priors        (writes docs/coverage/priors.md)
+make coverage STUDY=priors        (writes docs/evidence/coverage/priors.md)
 """
 
 from __future__ import annotations

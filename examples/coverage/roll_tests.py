@@ -1,6 +1,6 @@
 """Wrong verdicts of roll tests near their limits, against the risk that each verdict states.
 
-    make coverage STUDY=roll_tests        (writes docs/coverage/roll_tests.md)
+    make coverage STUDY=roll_tests        (writes docs/evidence/coverage/roll_tests.md)
 
 A tool is knocked after its calibration so that the worst of its true figures is 0.8 to 1.2 of its limit, and given a
 roll test. Tools, knocks, settings of the stand and true figures come from `world` alone.

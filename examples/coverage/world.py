@@ -14,7 +14,7 @@ import numpy as np
 
 Array = np.ndarray
 FIELD, DIP = 48_000.0, 63.0
-DOCS = Path(__file__).resolve().parents[2] / "docs" / "coverage"
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "evidence" / "coverage"
 
 
 def axes(inclination: Array, azimuth: Array, toolface: Array) -> Array:

@@ -1,6 +1,6 @@
 """How often `diagnose` names the right fault: simulated tools with each fault, and without.
 
-    make diagnosis        (writes docs/diagnosis.md; hours with 1000 tools)
+    make diagnosis        (writes docs/evidence/diagnosis.md; hours with 1000 tools)
 
 Every case has a tool, a calibration and later readings of its own. Faults are simulated by their physics
 (`mwdcal.faults.likelihood`: exact, not to first order), of the sizes that `mwdcal simulate` draws. All data are
@@ -204,7 +204,7 @@ HEAD = """# Which fault: the confusion tables
 
 Written by `make diagnosis`. SIMULATED DATA: {count} tools for each row, each with a calibration of its own
 (`laboratory-thermal`, profile `servo`, order 1) and later readings. Faults have the sizes of
-[the table](diagnose.md#the-faults), drawn between half and one and a half times that, of either sign; a dead channel
+[the table](../howto/diagnose.md#the-faults), drawn between half and one and a half times that, of either sign; a dead channel
 reads any constant, in half of the cases with more than one temperature only above 80 °C. Rows: what the tool has;
 columns: what `diagnose` names first, per cent. *Reported*: named first, or as a cause that these readings cannot tell
 from it, with the 95 % interval. A bias of a magnetometer channel and the field of a string along it are one thing at
@@ -219,7 +219,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--count", type=int, default=1000, help="tools; 40 take ten minutes")
     parser.add_argument(
-        "--output", type=Path, default=Path(__file__).parents[2] / "docs" / "diagnosis.md"
+        "--output", type=Path, default=Path(__file__).parents[2] / "docs" / "evidence" / "diagnosis.md"
     )
     options = parser.parse_args()
     options.output.write_text(page(studied(options.count), options.count), "utf-8")

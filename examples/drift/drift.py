@@ -1,6 +1,6 @@
 """What the test of change is worth, on simulated tools: false alarms and power.
 
-    make drift        (writes docs/drift-tables.md)
+    make drift        (writes docs/evidence/drift-tables.md)
 
 All data are simulated. It is about the statistics themselves, and imports the core for its figures.
 """
@@ -227,7 +227,7 @@ def power_rows(tools: int, pool: ProcessPoolExecutor) -> Iterator[str]:
 
 HEAD = """# Drift: what the tests find (simulated)
 
-Written by `examples/drift/drift.py`; SIMULATED DATA, all of it. See [drift](drift.md) for what is tested.
+Written by `examples/drift/drift.py`; SIMULATED DATA, all of it. See [drift](../howto/drift.md) for what is tested.
 
 ## False alarms
 
@@ -254,7 +254,7 @@ did not (directed). *Bound*: what the best test of this one parameter at this on
 def main() -> None:
     """Write the page."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("-o", "--output", type=Path, default=Path("docs/drift-tables.md"))
+    parser.add_argument("-o", "--output", type=Path, default=Path("docs/evidence/drift-tables.md"))
     parser.add_argument("--tools", type=int, default=1000)
     parser.add_argument("--steps", type=int, default=300)
     parser.add_argument("--workers", type=int)

@@ -1,6 +1,6 @@
 """Multi-station analysis of 500 simulated wells in each of several geometries, and where it refuses.
 
-    python examples/interference/interference.py        (prints the tables of docs/interference.md, a minute)
+    python examples/interference/interference.py        (prints the tables of docs/howto/interference.md, a minute)
 
 All data are simulated: tools are drawn from the covariance of one laboratory calibration, references are
 off by their uncertainties.

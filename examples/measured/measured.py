@@ -1,9 +1,9 @@
 """Calibrate measured sets of other projects and compare with what was published of them.
 
-    make measured        (writes docs/measured.md)
+    make measured        (writes docs/evidence/measured.md)
 
 Every set by every way of `mwdcal calibrate` that could apply to it. Nothing here is in sample
-only where a left-out figure is possible. See docs/measured.md. It is about the estimators, and imports
+only where a left-out figure is possible. See docs/evidence/measured.md. It is about the estimators, and imports
 the core; a script of your own needs `import mwdcal` alone.
 """
 
@@ -588,7 +588,7 @@ def _intro() -> list[str]:
         "first column; rows with the same figures are one. *default*: `--method joint`, own-axis",
         "quadratic and cubic terms where the run speaks for them (`--nonlinearity auto`), and, where",
         "the run has groups, the scatter of strengths, dip and direction from shot to shot",
-        "estimated beside the noise ([Methods](methods.md#own-axis-nonlinearity)).",
+        "estimated beside the noise ([Methods](../explanation/nonlinearity.md)).",
         "The paper's weights and restricted models are tried with every method, robust weights and",
         "own-axis terms with the default one. *Left out*: each station from a fit without it; this is",
         "the figure that counts. For the default the choice of own-axis terms, too, is made without the",
@@ -849,6 +849,6 @@ def _imucal() -> list[str]:
 
 
 if __name__ == "__main__":
-    target = Path(__file__).parents[2] / "docs" / "measured.md"
+    target = Path(__file__).parents[2] / "docs" / "evidence" / "measured.md"
     target.write_text(page(), encoding="utf-8")
     print(f"wrote {target}")

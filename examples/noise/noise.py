@@ -1,4 +1,4 @@
-"""A simulated hour of a servo tool at rest: writes the log, and the picture of docs/noise.md.
+"""A simulated hour of a servo tool at rest: writes the log, and the picture of docs/howto/noise.md.
 
 Run from the repository: .venv/bin/python examples/noise/noise.py [FOLDER]
 """
@@ -42,7 +42,7 @@ def main(folder: Path) -> None:
     head = f"# simulated = true\n# sampling_hz = {RATE:g}\n{','.join(LEVEL)}"
     np.savetxt(log, np.stack(columns, -1), "%.6f", ",", header=head, comments="")
     command = [sys.executable, "-m", "mwdcal", "noise", log, "--tool", "servo"]
-    subprocess.run([*command, "--plot", ROOT / "docs" / "noise.svg"], check=True)
+    subprocess.run([*command, "--plot", ROOT / "docs" / "howto" / "noise.svg"], check=True)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Ivanov & Lyutskanova-Zhekova (2019): calibration on toolface and inclination, reproduced.
 
-    MWDCAL_DATA=... python examples/papers/ivanov.py     (writes docs/papers/ivanov.md and its figures)
+    MWDCAL_DATA=... python examples/papers/ivanov.py     (writes docs/evidence/papers/ivanov.md and its figures)
 
 The first part is the paper's own Gauss-Newton, written from its appendix and independent of
 mwdcal: an accelerometer that reads the holding force, a = M v + b, p = (M row by row, b).
@@ -670,7 +670,7 @@ def _differences(one: Solved, other: Solved, readings: Readings) -> tuple[float,
 
 # ── Page ─────────────────────────────────────────────────────────────────────────────────────
 
-PAGE = Path(__file__).parents[2] / "docs" / "papers" / "ivanov.md"
+PAGE = Path(__file__).parents[2] / "docs" / "evidence" / "papers" / "ivanov.md"
 COLOURS = ("#6b7280", "#0072b2", "#d55e00")
 STYLE = {
     "axes.edgecolor": "#4b5563",
@@ -696,7 +696,7 @@ STYLE = {
 
 @contextmanager
 def drawn(name: str, width: float, height: float, columns: int) -> Iterator[list]:
-    """Axes side by side of a figure, written as docs/papers/ivanov-NAME.svg when left."""
+    """Axes side by side of a figure, written as docs/evidence/papers/ivanov-NAME.svg when left."""
     import matplotlib as mpl
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure

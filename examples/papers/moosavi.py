@@ -1,6 +1,6 @@
 """Reproduce Moosavi et al.: figures 5 to 8 with SIMULATED instruments, and equation 12.
 
-Writes docs/papers/moosavi.md and its figures. Same version, same bytes.
+Writes docs/evidence/papers/moosavi.md and its figures. Same version, same bytes.
 It is about the estimators, and imports the core.
 
     python examples/papers/moosavi.py
@@ -24,7 +24,7 @@ from mwdcal.geometry.vectors import Array, centred, reference_vectors
 from mwdcal.planning.plans import StationPlan, Truth, grid, reading, servo
 from mwdcal.sensor.models import Basis, Factors
 
-PAGES = Path(__file__).parents[2] / "docs" / "papers"
+PAGES = Path(__file__).parents[2] / "docs" / "evidence" / "papers"
 SEED, SEEDS = 123, 200
 NOISE, STAND = 1e-4, np.radians(0.01)
 POSITIONS, SOAKS = [0, 45, 90, 135], [25.0, 36.0, 47.0, 58.0, 69.0, 80.0]

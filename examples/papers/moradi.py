@@ -1,6 +1,6 @@
 """Tables 2 to 4 and figure 3 of Moradi and Izadi (2019), recomputed from what they print.
 
-    python examples/papers/moradi.py        (writes docs/papers/moradi.md and moradi.svg)
+    python examples/papers/moradi.py        (writes docs/evidence/papers/moradi.md and moradi.svg)
 
 The readings of the paper are not published. Table 2 is taken as the truth, six positions are
 simulated, and the residual left by the right parameters is given the size in Table 4.
@@ -379,7 +379,7 @@ The values behind the paper's figure 3 are not printed; the left panel is what T
 
 def main() -> None:
     """Write the page and its figure."""
-    folder = Path(__file__).parents[2] / "docs" / "papers"
+    folder = Path(__file__).parents[2] / "docs" / "evidence" / "papers"
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "moradi.svg").write_text(figure(), encoding="utf-8")
     (folder / "moradi.md").write_text(page(), encoding="utf-8")

@@ -1,6 +1,6 @@
 """What `plan` states beforehand against simulated calibrations: parameters and angles, plan by plan.
 
-    make scatter        (writes docs/scatter.md)
+    make scatter        (writes docs/evidence/scatter.md)
 
 All data are simulated. It is about the prediction itself, and imports the core for its figures; a script of
 your own needs `import mwdcal` alone.
@@ -255,7 +255,7 @@ def main() -> None:
         "--many", type=int, default=MANY, help="calibrations where 2,000 cannot tell"
     )
     parser.add_argument(
-        "--output", type=Path, default=Path(__file__).parents[2] / "docs/scatter.md"
+        "--output", type=Path, default=Path(__file__).parents[2] / "docs/evidence/scatter.md"
     )
     chosen, parts = parser.parse_args(), {}
     with ProcessPoolExecutor() as pool:

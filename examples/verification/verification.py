@@ -1,6 +1,6 @@
 """How often `verify` is wrong: roll tests of 1,000 good and 1,000 knocked tools, against the stated risk.
 
-    make verification        (writes docs/verification.md)
+    make verification        (writes docs/evidence/verification.md)
 
 Tools, knocks and true errors come from a forward model of this file alone; calibration and verdict
 are the package's own. All data are simulated. It is about the verdict itself, and imports the core for its
@@ -355,7 +355,7 @@ def page(count: int = 1000) -> str:
 
 def main() -> None:
     """Write the page."""
-    path = Path(__file__).parents[2] / "docs" / "verification.md"
+    path = Path(__file__).parents[2] / "docs" / "evidence" / "verification.md"
     path.write_text(page(), encoding="utf-8")
     print(f"wrote {path}")
 

@@ -508,7 +508,7 @@ class TriadCalibration(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Calibration(msgspec.Struct, frozen=True, kw_only=True):
-    """A calibrated tool: see `docs/files.md` for every field.
+    """A calibrated tool: see `docs/reference/files.md` for every field.
 
     `covariance` is of the parameters of all triads in order, scaled by s² where that is
     estimated; `free` are directions (rows) of parameter space that no evidence determines.

@@ -206,7 +206,7 @@ class Person(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A tool as its maker describes it: see `docs/files.md` for the TOML form.
+    """A tool as its maker describes it: see `docs/reference/files.md` for the TOML form.
 
     `standards` are what the references of its calibrations are traceable to.
     `table` and `columns` say how its tables are written, and which of their columns is which of the

@@ -22,7 +22,7 @@ another reference a reading of exactly vertical is taken as toolface zero, witho
 (infinite) curvature across; the first step leaves that point.
 
 Reference: S. M. Seyed Moosavi et al., Modares J. Electrical Eng. 13 (4); what is wrong in
-it is in `docs/errata.md`.
+it is in `docs/evidence/errata.md`.
 """
 
 from __future__ import annotations
