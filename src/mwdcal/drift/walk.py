@@ -404,6 +404,8 @@ FIRST_DRAWS = 999
 """Of these, those that decide where they leave no doubt: see `change_test`."""
 DECIDED_BEYOND = 6.0
 """Standard deviations of the share of the first draws above the level within which all are drawn."""
+DISAGREES = 4.0
+"""Misfit of a degree of freedom above which all draws are made at once: the first would not decide."""
 PAIR_DRAWS = 1_999
 """Of these, those that two calibrations alone are judged by."""
 LEAST_PROBABILITY = 1 / (NULL_DRAWS + 1)
@@ -487,9 +489,28 @@ class Contrasts:
         return np.asarray(np.cumsum(self.scaled[::-1], 0)[::-1][1:])
 
     @cached_property
+    def _runs(self) -> list[slice]:
+        """All calibrations, and each two successive ones."""
+        return [slice(None), *(slice(k, k + 2) for k in range(len(self.precision) - 1))]
+
+    @cached_property
+    def _own(self) -> Array:
+        """Units (n, p) of each run, in ours."""
+        known = [diagonal(self.scaled[run].sum(0)) for run in self._runs[1:]]
+        pairs = [np.where(k > 0, 1 / np.sqrt(np.where(k > 0, k, 1.0)), 0.0) for k in known]
+        return np.stack([np.ones(self.precision.shape[-1]), *pairs])
+
+    @cached_property
+    def _means(self) -> tuple[Array, Array]:
+        """Covariances (n, p, p) of the parameters, if they never changed, by each run in its own units, and in ours."""
+        sums, units = np.stack([self.scaled[run].sum(0) for run in self._runs]), outer(self._own)
+        own = np.linalg.pinv(sums * units, DEPENDENT, hermitian=True)
+        return own, own * units
+
+    @property
     def _mean(self) -> Array:
         """Covariance (p, p) of the parameters, if they never changed."""
-        return np.linalg.pinv(self.scaled.sum(0), DEPENDENT, hermitian=True)
+        return np.asarray(self._means[1][0])
 
     @cached_property
     def information(self) -> Array:
@@ -502,10 +523,20 @@ class Contrasts:
         return np.asarray(diagonal(self.information) > UNSEEN)
 
     @cached_property
-    def freedom(self) -> int:
-        """Degrees of freedom of the misfit."""
-        ranks = np.linalg.matrix_rank(self.scaled, DEPENDENT, hermitian=True)
-        return int(ranks.sum() - np.linalg.matrix_rank(self._mean, DEPENDENT, hermitian=True))
+    def freedom(self) -> Ints:
+        """Degrees of freedom (n,) of the misfits."""
+        units = outer(self._own)
+        each = [self.scaled[run] * unit for run, unit in zip(self._runs, units, strict=True)]
+        stacked = np.concatenate([*each, self._means[0]])
+        ranks = np.linalg.matrix_rank(stacked, DEPENDENT, hermitian=True)
+        ends = np.cumsum([len(one) for one in each])
+        parts = np.split(ranks, ends)
+        return np.array([part.sum() for part in parts[:-1]]) - parts[-1]
+
+    @cached_property
+    def _sizes(self) -> Array:
+        """Standard deviations (n - 1, p) of what speaks for steps; infinite where the calibrations tell none."""
+        return np.sqrt(np.where(self.known, diagonal(self.information), np.inf))
 
     def departures(self, values: Array) -> Array:
         """Values (n, p) less those of the last calibration that has them, in our units: a column (n, p, 1)."""
@@ -528,23 +559,15 @@ class Contrasts:
 
     def scores(self, pull: Array) -> Array:
         """Scores (n - 1, p, m) of a step of each parameter alone, of variance 1 under no change."""
-        size = np.sqrt(np.where(self.known, diagonal(self.information), np.inf))
-        return np.asarray(self.sums(pull) / size.astype(pull.dtype)[..., None])
+        return np.asarray(self.sums(pull) / self._sizes.astype(pull.dtype)[..., None])
 
     def misfits(self, departures: Array, pull: Array) -> Iterator[Array]:
         """Misfit (m,) of one set of parameters to all calibrations, and to each two successive ones."""
         whole = np.einsum("kim,kim->km", departures, pull)
-        means = [pair._mean * outer(pair._unit) for pair in self.pairs]
-        runs = [slice(None), *(slice(k, k + 2) for k in range(len(means)))]
-        for run, mean in zip(runs, [self._mean, *means], strict=True):
+        for run, mean in zip(self._runs, self._means[1], strict=True):
             total = pull[run].sum(0)
             by_mean = np.einsum("im,im->m", total, mean.astype(pull.dtype) @ total)
             yield np.asarray(whole[run].sum(0) - by_mean)
-
-    @cached_property
-    def pairs(self) -> list[Contrasts]:
-        """Of each two successive calibrations alone, where there are more."""
-        return [Contrasts(self.scaled[k : k + 2]) for k in range(len(self.scaled) - 1)]
 
     @cached_property
     def root(self) -> Array:
@@ -554,19 +577,17 @@ class Contrasts:
         inverse = np.where(values > DEPENDENT * largest, 1 / np.sqrt(np.maximum(values, 1e-300)), 0)
         return np.asarray(vectors * inverse[:, None, :])
 
-    def sizes(self, steps: Sequence[tuple[int, int]], departures: Array) -> tuple[Array, Array]:
-        """Sizes and standard uncertainties (s,) of steps (after, place) together, in the units of the values."""
-        after, place = np.array(steps).transpose()
-        evidence = self.sums(self.pull(departures))[after - 1, place, 0]
-        covariance = np.linalg.pinv(self._shared(after, place), DEPENDENT, hermitian=True)
-        unit = self._unit[place]
-        return covariance @ evidence * unit, np.sqrt(np.diag(covariance)) * unit
+    def sizes(
+        self, steps: Sequence[tuple[int, int]], sums: Array, moved: Array
+    ) -> tuple[Array, Array]:
+        """Sizes and standard uncertainties (s,) of steps (after, place) together, in the units of the values.
 
-    def _shared(self, after: Ints, place: Ints) -> Array:
-        """Covariance (s, s) of what speaks for steps."""
-        both = self.after[np.maximum.outer(after, after) - 1, place[:, None], place]
-        rows = self.after[after - 1, :, place]
-        return np.asarray(both - rows @ self._mean @ rows.mT)
+        By what speaks for a change (n - 1, p), and what it would be of each step by one (n - 1, p, s).
+        """
+        after, place = np.array(steps).transpose()
+        covariance = np.linalg.pinv(moved[after - 1, place], DEPENDENT, hermitian=True)
+        unit = self._unit[place]
+        return covariance @ sums[after - 1, place] * unit, np.sqrt(np.diag(covariance)) * unit
 
 
 @lru_cache(maxsize=2)
@@ -610,10 +631,19 @@ def change_test(history: History, level: float = CHANGE_LEVEL) -> ChangeTest:
     only where all draws call it so, and so with a probability of at most the level where nothing changed.
     """
     contrasts = Contrasts(history.precision)
-    first = _test(history, contrasts, level, FIRST_DRAWS)
-    doubtful = first.probability <= level + DECIDED_BEYOND * np.sqrt(level / FIRST_DRAWS)
-    rare = (first.pair_probability <= 1 / (FIRST_DRAWS + 1)).any()
-    return _test(history, contrasts, level, NULL_DRAWS) if doubtful or rare else first
+    departures = contrasts.departures(history.values)
+    misfit = next(contrasts.misfits(departures, contrasts.pull(departures)))[0]
+    if misfit <= DISAGREES * contrasts.freedom[0]:
+        first = _test(history, contrasts, level, FIRST_DRAWS)
+        doubtful = first.probability <= level + DECIDED_BEYOND * np.sqrt(level / FIRST_DRAWS)
+        if not doubtful and (first.pair_probability > 1 / (FIRST_DRAWS + 1)).all():
+            return first
+    test = _test(history, contrasts, level, NULL_DRAWS)
+    return (
+        replace(test, steps=_steps(history, contrasts, test.critical_score))
+        if test.changed
+        else test
+    )
 
 
 def _test(history: History, contrasts: Contrasts, level: float, draws: int) -> ChangeTest:
@@ -631,14 +661,12 @@ def _test(history: History, contrasts: Contrasts, level: float, draws: int) -> C
     least = min(by_step / STEP_SHARE, by_misfit / (1 - STEP_SHARE))
     critical = float(np.quantile(most, 1 - np.quantile(evidence, level) * STEP_SHARE))
     pairs = zip(drawn[1:, :PAIR_DRAWS], misfits[1:], strict=True)
-    result = ChangeTest(
+    return ChangeTest(
         level, float((1 + np.sum(evidence <= least)) / (draws + 1)), scores, largest, critical,
-        by_step, misfits[0], contrasts.freedom, by_misfit,
-        np.array(misfits[1:]), np.array([pair.freedom for pair in contrasts.pairs]),
+        by_step, misfits[0], int(contrasts.freedom[0]), by_misfit,
+        np.array(misfits[1:]), contrasts.freedom[1:],
         np.array([(1 + np.sum(each >= one)) / (len(each) + 1) for each, one in pairs]),
     )  # fmt: skip
-    steps = _steps(contrasts, departures, steady, critical) if result.changed else ()
-    return replace(result, steps=steps)
 
 
 def _drawn(history: History, contrasts: Contrasts, draws: int) -> tuple[AnyArray, AnyArray]:
@@ -646,7 +674,7 @@ def _drawn(history: History, contrasts: Contrasts, draws: int) -> tuple[AnyArray
     noise, grown = _noise(*history.values.shape), stretches(history, draws)
     root, steady = contrasts.root.astype(noise.dtype), history.steady
     most = np.zeros(draws, noise.dtype)
-    misfits = np.zeros((len(contrasts.pairs) + 1, draws), noise.dtype)
+    misfits = np.zeros((len(history.values), draws), noise.dtype)
     for first in range(0, draws, DRAWN_TOGETHER):
         part = slice(first, min(first + DRAWN_TOGETHER, draws))
         departures = root @ noise[..., part]
@@ -669,30 +697,27 @@ def _ranks(drawn: Array, value: float) -> tuple[float, Array]:
     return (1 + beyond) / (count + 1), above / count
 
 
-def _steps(
-    contrasts: Contrasts, departures: Array, steady: Ints, critical: float
-) -> tuple[Step, ...]:
+def _steps(history: History, contrasts: Contrasts, critical: float) -> tuple[Step, ...]:
     """Steps that explain the change, the largest first, each with those before taken out."""
+    steady, departures = history.steady, contrasts.departures(history.values)
     named: list[tuple[int, int]] = []
     scored: list[float] = []
-    unit = np.where(contrasts._unit > 0, contrasts._unit, 1.0)
-    left = departures
+    known, sums = contrasts.known[:, steady], contrasts.sums(contrasts.pull(departures))[..., 0]
+    unit, found = np.where(contrasts._unit > 0, contrasts._unit, 1.0), (np.zeros(0), np.zeros(0))
+    moved = np.zeros((*sums.shape, 0))
     while len(named) < MOST_NAMED_STEPS:
-        every = contrasts.scores(contrasts.pull(left))[..., 0]
-        scores = np.where(contrasts.known, every, 0.0)[:, steady]
+        left = sums - moved @ (found[0] / unit[[place for _, place in named]])
+        scores = np.where(known, (left / contrasts._sizes)[:, steady], 0.0)
         row, column = np.unravel_index(np.argmax(np.abs(scores)), scores.shape)
         if abs(scores[row, column]) <= critical:
             break
         named.append((int(row) + 1, int(steady[column])))
         scored.append(float(scores[row, column]))
-        sizes, _ = contrasts.sizes(named, departures)
-        left = departures.copy()
-        for (after, place), size in zip(named, sizes, strict=True):
-            left[after:, place] -= size / unit[place]
-    if not named:
-        return ()
-    each = zip(named, *contrasts.sizes(named, departures), scored, strict=True)
+        step = np.zeros_like(departures)
+        step[named[-1][0] :, named[-1][1]] = 1.0
+        moved = np.concatenate([moved, contrasts.sums(contrasts.pull(step))], -1)
+        found = contrasts.sizes(named, sums, moved)
     return tuple(
         Step(place, after, float(size), float(sd), score)
-        for (after, place), size, sd, score in each
+        for (after, place), size, sd, score in zip(named, *found, scored, strict=True)
     )
