@@ -85,9 +85,7 @@ def surveyed(
     raw, warmth = {}, np.full((seeds, hole.count), 30.0)
     for triad, vectors in zip(record.triads, (g + 0 * b, b + iron), strict=True):
         params = tools[:, record.places()[triad.name]]
-        exact = raw_reading(
-            triad.functions(record.reference_temperature), params, vectors, warmth, 1
-        )
+        exact = raw_reading(triad.functions(record.reference_temperature), params, vectors, warmth)
         raw[triad.name] = exact + NOISE[triad.name] * rng.normal(size=exact.shape)
     known = {"gravity": 1.0, "field": FIELD, "dip": DIP}
     sd = {**NOISE, "gravity": 1e-4, "field": SD_FIELD, "dip": SD_DIP}

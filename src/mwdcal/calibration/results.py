@@ -133,16 +133,14 @@ def _earth(calibration: Calibration) -> tuple[float, float, float]:
     return earth["gravity_g"], earth.get("field", 1.0), np.radians(earth.get("dip_deg", 0.0))
 
 
-def raw_reading(
-    model: Model, params: Array, field: Array, temperature: Array, steps: int = _STEPS
-) -> Array:
+def raw_reading(model: Model, params: Array, field: Array, temperature: Array) -> Array:
     """Readings (…, n, 3) that a triad's model turns into `field` (…, n, 3).
 
     Reference: the sensor model inverted by Newton steps, one of which is exact unless an axis is
     curved.
     """
     raw = np.zeros(field.shape)
-    for _ in range(steps):
+    for _ in range(_STEPS if model.curved else 1):
         error = field - model.fields(params, raw, temperature)
         raw = raw + np.linalg.solve(model.slope(params, raw, temperature), error[..., None])[..., 0]
     return raw
@@ -174,7 +172,7 @@ class CalibratedTools:
         result = np.zeros((len(self.earth), len(self.models), *fields[0].shape[1:], size))
         for triad, (model, params) in enumerate(zip(self.models, self.parameters, strict=True)):
             warmth = np.broadcast_to(self.temperature[:, None], fields[triad].shape[:-1])
-            raw = raw_reading(model, params, fields[triad], warmth, _STEPS if model.curved else 1)
+            raw = raw_reading(model, params, fields[triad], warmth)
             change, end = result[:, triad], ends[triad]
             change[..., end - params.shape[-1] : end] = model.jacobian(params, raw, warmth)
             if noise:

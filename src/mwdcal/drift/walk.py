@@ -13,10 +13,11 @@ compared as polynomials of temperature of the lowest order among the calibration
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 from functools import cached_property, lru_cache
+from itertools import pairwise
 
 import numpy as np
 from scipy.special import logsumexp
@@ -146,6 +147,14 @@ class History:
     def steady(self) -> Ints:
         """Places (s,) of the parameters at the middle temperature."""
         return np.flatnonzero(["·" not in name for name in self.names])
+
+    @property
+    def triads(self) -> list[slice]:
+        """Where the parameters of each triad lie, side by side."""
+        of_place = [name.partition(" ")[0] for name in self.names]
+        counts = [of_place.count(triad) for triad in TRIADS]
+        ends = np.cumsum([0, *counts]).tolist()
+        return [slice(*pair) for pair, count in zip(pairwise(ends), counts, strict=True) if count]
 
 
 def parameter_names(orders: Mapping[str, int]) -> tuple[str, ...]:
@@ -395,6 +404,8 @@ FIRST_DRAWS = 999
 """Of these, those that decide where they leave no doubt: see `change_test`."""
 DECIDED_BEYOND = 6.0
 """Standard deviations of the share of the first draws above the level within which all are drawn."""
+DISAGREES = 4.0
+"""Misfit of a degree of freedom above which all draws are made at once: the first would not decide."""
 PAIR_DRAWS = 1_999
 """Of these, those that two calibrations alone are judged by."""
 LEAST_PROBABILITY = 1 / (NULL_DRAWS + 1)
@@ -402,6 +413,8 @@ LEAST_PROBABILITY = 1 / (NULL_DRAWS + 1)
 LEAST_PAIR_PROBABILITY = 1 / (PAIR_DRAWS + 1)
 """The smallest of two calibrations alone."""
 SEED_OF_DRAWS = 15
+DRAWN_TOGETHER = 2_000
+"""Draws that are worked on at once, at least `PAIR_DRAWS`: they fit into a processor's cache."""
 MOST_NAMED_STEPS = 8
 """Most steps of one tool that are named."""
 UNSEEN = 1e-6
@@ -476,9 +489,28 @@ class Contrasts:
         return np.asarray(np.cumsum(self.scaled[::-1], 0)[::-1][1:])
 
     @cached_property
+    def _runs(self) -> list[slice]:
+        """All calibrations, and each two successive ones."""
+        return [slice(None), *(slice(k, k + 2) for k in range(len(self.precision) - 1))]
+
+    @cached_property
+    def _own(self) -> Array:
+        """Units (n, p) of each run, in ours."""
+        known = [diagonal(self.scaled[run].sum(0)) for run in self._runs[1:]]
+        pairs = [np.where(k > 0, 1 / np.sqrt(np.where(k > 0, k, 1.0)), 0.0) for k in known]
+        return np.stack([np.ones(self.precision.shape[-1]), *pairs])
+
+    @cached_property
+    def _means(self) -> tuple[Array, Array]:
+        """Covariances (n, p, p) of the parameters, if they never changed, by each run in its own units, and in ours."""
+        sums, units = np.stack([self.scaled[run].sum(0) for run in self._runs]), outer(self._own)
+        own = np.linalg.pinv(sums * units, DEPENDENT, hermitian=True)
+        return own, own * units
+
+    @property
     def _mean(self) -> Array:
         """Covariance (p, p) of the parameters, if they never changed."""
-        return np.linalg.pinv(self.scaled.sum(0), DEPENDENT, hermitian=True)
+        return np.asarray(self._means[1][0])
 
     @cached_property
     def information(self) -> Array:
@@ -491,105 +523,104 @@ class Contrasts:
         return np.asarray(diagonal(self.information) > UNSEEN)
 
     @cached_property
-    def freedom(self) -> int:
-        """Degrees of freedom of the misfit."""
-        ranks = np.linalg.matrix_rank(self.scaled, DEPENDENT, hermitian=True)
-        return int(ranks.sum() - np.linalg.matrix_rank(self._mean, DEPENDENT, hermitian=True))
+    def freedom(self) -> Ints:
+        """Degrees of freedom (n,) of the misfits."""
+        units = outer(self._own)
+        each = [self.scaled[run] * unit for run, unit in zip(self._runs, units, strict=True)]
+        stacked = np.concatenate([*each, self._means[0]])
+        ranks = np.linalg.matrix_rank(stacked, DEPENDENT, hermitian=True)
+        ends = np.cumsum([len(one) for one in each])
+        parts = np.split(ranks, ends)
+        return np.array([part.sum() for part in parts[:-1]]) - parts[-1]
+
+    @cached_property
+    def _sizes(self) -> Array:
+        """Standard deviations (n - 1, p) of what speaks for steps; infinite where the calibrations tell none."""
+        return np.sqrt(np.where(self.known, diagonal(self.information), np.inf))
 
     def departures(self, values: Array) -> Array:
-        """Values (n, p) less those of the last calibration that has them, in our units."""
+        """Values (n, p) less those of the last calibration that has them, in our units: a column (n, p, 1)."""
         latest = [column[~np.isnan(column)][-1:] for column in values.transpose()]
         middle = np.array([each[0] if each.size else 0.0 for each in latest])
         unit = np.where(self._unit > 0, self._unit, 1.0)
-        return np.asarray(np.nan_to_num((values - middle) / unit) * (self._unit > 0))
+        return np.asarray(np.nan_to_num((values - middle) / unit) * (self._unit > 0))[..., None]
 
     def pull(self, departures: Array) -> Array:
-        """What each calibration says (…, n, p) of parameters that depart so."""
-        return _each(self.scaled.astype(departures.dtype), departures)
+        """What each calibration says (n, p, m) of parameters that depart so, in each of m columns."""
+        return np.asarray(self.scaled.astype(departures.dtype) @ departures)
 
     def sums(self, pull: Array) -> Array:
-        """What speaks for a change (…, n - 1, p) at each transition, of covariance `information`."""
+        """What speaks for a change (n - 1, p, m) at each transition, of covariance `information`."""
         later = pull.copy()
-        for k in range(pull.shape[-2] - 1, 0, -1):  # a running sum, whose terms lie side by side
-            later[..., k - 1, :] += later[..., k, :]
-        rest = later[..., 1:, :]
-        mean = (later[..., 0, :] @ self._mean.astype(pull.dtype))[..., None, :]
-        after = self.after.astype(pull.dtype)
-        return np.asarray(rest - _each(after, np.broadcast_to(mean, rest.shape)))
+        for k in range(len(pull) - 1, 0, -1):
+            later[k - 1] += later[k]
+        mean = self._mean.astype(pull.dtype) @ later[0]
+        return np.asarray(later[1:] - self.after.astype(pull.dtype) @ mean)
 
     def scores(self, pull: Array) -> Array:
-        """Scores (…, n - 1, p) of a step of each parameter alone, of variance 1 under no change."""
-        size = np.sqrt(np.where(self.known, diagonal(self.information), np.inf))
-        return np.asarray(self.sums(pull) / size.astype(pull.dtype))
+        """Scores (n - 1, p, m) of a step of each parameter alone, of variance 1 under no change."""
+        return np.asarray(self.sums(pull) / self._sizes.astype(pull.dtype)[..., None])
 
-    def misfit(self, departures: Array, pull: Array) -> Array:
-        """Misfit (…,) of one set of parameters to all calibrations."""
-        total = pull[..., 0, :]
-        for k in range(1, pull.shape[-2]):
-            total = total + pull[..., k, :]
-        whole = np.einsum("...ki,...ki->...", departures, pull)
-        return np.asarray(whole - (total * (total @ self._mean.astype(pull.dtype))).sum(-1))
+    def misfits(self, departures: Array, pull: Array) -> Iterator[Array]:
+        """Misfit (m,) of one set of parameters to all calibrations, and to each two successive ones."""
+        whole = np.einsum("kim,kim->km", departures, pull)
+        for run, mean in zip(self._runs, self._means[1], strict=True):
+            total = pull[run].sum(0)
+            by_mean = np.einsum("im,im->m", total, mean.astype(pull.dtype) @ total)
+            yield np.asarray(whole[run].sum(0) - by_mean)
 
-    def drawn(self, noise: Array, stretch: Array) -> Array:
-        """Departures (…, n, p) of an unchanged tool from standard normal `noise`, grown by `stretch`."""
+    @cached_property
+    def root(self) -> Array:
+        """What makes departures (n, p, p) of an unchanged tool from standard normal numbers."""
         values, vectors = np.linalg.eigh(self.scaled)
         largest = values[:, -1:]
         inverse = np.where(values > DEPENDENT * largest, 1 / np.sqrt(np.maximum(values, 1e-300)), 0)
-        root = vectors * inverse[:, None, :]
-        return _each(root.mT.astype(noise.dtype), noise) * stretch
+        return np.asarray(vectors * inverse[:, None, :])
 
-    def pair(self, first: int, departures: Array) -> tuple[Contrasts, Array]:
-        """Of two successive calibrations alone, and their departures (…, 2, p) in its units."""
-        pair = Contrasts(self.scaled[first : first + 2])
-        inverse = np.divide(1.0, pair._unit, out=np.zeros_like(pair._unit), where=pair._unit > 0)
-        return pair, departures[..., first : first + 2, :] * inverse.astype(departures.dtype)
+    def sizes(
+        self, steps: Sequence[tuple[int, int]], sums: Array, moved: Array
+    ) -> tuple[Array, Array]:
+        """Sizes and standard uncertainties (s,) of steps (after, place) together, in the units of the values.
 
-    def sizes(self, steps: Sequence[tuple[int, int]], departures: Array) -> tuple[Array, Array]:
-        """Sizes and standard uncertainties (s,) of steps (after, place) together, in the units of the values."""
-        sums = self.sums(self.pull(departures))
-        evidence = np.array([sums[after - 1, place] for after, place in steps])
-        matrix = np.array([[self._shared(a, b) for b in steps] for a in steps])
-        covariance = np.linalg.pinv(matrix, DEPENDENT, hermitian=True)
-        unit = self._unit[[place for _, place in steps]]
-        return covariance @ evidence * unit, np.sqrt(np.diag(covariance)) * unit
-
-    def _shared(self, one: tuple[int, int], other: tuple[int, int]) -> float:
-        """Covariance of what speaks for two steps."""
-        (a, i), (b, j) = one, other
-        first, second, both = self.after[a - 1], self.after[b - 1], self.after[max(a, b) - 1]
-        return float((both - first @ self._mean @ second)[i, j])
-
-
-def _each(matrices: Array, vectors: Array) -> Array:
-    """Vectors (…, n, p) times n matrices (n, p, p), one each."""
-    flat = vectors.reshape(-1, *vectors.shape[-2:]).swapaxes(0, 1)
-    return np.asarray((flat @ matrices).swapaxes(0, 1).reshape(vectors.shape))
+        By what speaks for a change (n - 1, p), and what it would be of each step by one (n - 1, p, s).
+        """
+        after, place = np.array(steps).transpose()
+        covariance = np.linalg.pinv(moved[after - 1, place], DEPENDENT, hermitian=True)
+        unit = self._unit[place]
+        return covariance @ sums[after - 1, place] * unit, np.sqrt(np.diag(covariance)) * unit
 
 
 @lru_cache(maxsize=2)
 def _noise(count: int, size: int) -> AnyArray:
-    """Standard normal numbers (`NULL_DRAWS`, n, p), the same for every tool."""
+    """Standard normal numbers (n, p, `NULL_DRAWS`), the same for every tool."""
     rng = np.random.default_rng([SEED_OF_DRAWS, count, size])
-    return rng.standard_normal((NULL_DRAWS, count, size), np.float32)
+    drawn = rng.standard_normal((NULL_DRAWS, count, size), np.float32)
+    return np.ascontiguousarray(drawn.transpose(1, 2, 0))
 
 
 def stretches(history: History, draws: int) -> AnyArray:
-    """By how much errors (draws, n, p) exceed those of a known noise: Student's t of each noise estimate.
+    """By how much errors (triads, n, draws) exceed those of a known noise: Student's t of each noise estimate.
 
     Calibrations of a triad whose noise was estimated together (`pooled`) have one factor.
     """
-    freedom, pooled = history.freedom, history.pooled
-    result = np.ones((draws, *freedom.shape), np.float32)
-    rng = np.random.default_rng([SEED_OF_DRAWS, *freedom.shape])
-    for triad in TRIADS:
-        columns = [place for place, name in enumerate(history.names) if name.startswith(triad)]
-        if not columns:
-            continue
-        degrees, together = freedom[:, columns[0]], pooled[:, columns[0]]
+    each = (history.freedom, history.pooled)
+    estimates = [tuple(tuple(a[:, t.start].tolist()) for a in each) for t in history.triads]
+    return _stretches(history.freedom.shape, tuple(estimates), draws)
+
+
+@lru_cache(maxsize=8)
+def _stretches(
+    shape: tuple[int, ...], estimates: tuple[tuple[tuple[float, ...], ...], ...], draws: int
+) -> AnyArray:
+    """The same by degrees of freedom (n,) of each triad and which are pooled, as many tools have them."""
+    result = np.ones((len(estimates), shape[0], draws), np.float32)
+    rng = np.random.default_rng([SEED_OF_DRAWS, *shape])
+    for grown, (degrees, pooled) in zip(result, estimates, strict=True):
+        together = np.array(pooled, bool)
         groups = [np.flatnonzero(together), *np.flatnonzero(~together)[:, None]]
         for rows in (each for each in groups if each.size and np.isfinite(degrees[each[0]])):
-            grown = np.sqrt(degrees[rows[0]] / rng.chisquare(degrees[rows[0]], draws))
-            result[:, rows[:, None], columns] = grown[:, None, None]
+            freedom = degrees[rows[0]]
+            grown[rows] = np.sqrt(freedom / rng.chisquare(freedom, draws))
     return result
 
 
@@ -599,77 +630,94 @@ def change_test(history: History, level: float = CHANGE_LEVEL) -> ChangeTest:
     By `FIRST_DRAWS` where they show a tool to be unchanged, else by `NULL_DRAWS`. A tool is then called changed
     only where all draws call it so, and so with a probability of at most the level where nothing changed.
     """
-    first = _test(history, level, FIRST_DRAWS)
-    doubtful = first.probability <= level + DECIDED_BEYOND * np.sqrt(level / FIRST_DRAWS)
-    rare = (first.pair_probability <= 1 / (FIRST_DRAWS + 1)).any()
-    return _test(history, level, NULL_DRAWS) if doubtful or rare else first
-
-
-def _test(history: History, level: float, draws: int) -> ChangeTest:
-    """The test by so many draws."""
-    contrasts, steady = Contrasts(history.precision), history.steady
+    contrasts = Contrasts(history.precision)
     departures = contrasts.departures(history.values)
-    noise = _noise(*history.values.shape)[:draws]
-    null = contrasts.drawn(noise, stretches(history, draws))
-    pull, null_pull = contrasts.pull(departures), contrasts.pull(null)
-    scores = np.where(contrasts.known, contrasts.scores(pull), np.nan)
+    misfit = next(contrasts.misfits(departures, contrasts.pull(departures)))[0]
+    if misfit <= DISAGREES * contrasts.freedom[0]:
+        first = _test(history, contrasts, level, FIRST_DRAWS)
+        doubtful = first.probability <= level + DECIDED_BEYOND * np.sqrt(level / FIRST_DRAWS)
+        if not doubtful and (first.pair_probability > 1 / (FIRST_DRAWS + 1)).all():
+            return first
+    test = _test(history, contrasts, level, NULL_DRAWS)
+    return (
+        replace(test, steps=_steps(history, contrasts, test.critical_score))
+        if test.changed
+        else test
+    )
+
+
+def _test(history: History, contrasts: Contrasts, level: float, draws: int) -> ChangeTest:
+    """The test by so many draws."""
+    steady, departures = history.steady, contrasts.departures(history.values)
+    pull = contrasts.pull(departures)
+    scores = np.where(contrasts.known, contrasts.scores(pull)[..., 0], np.nan)
     largest = float(np.nanmax(np.abs(scores[:, steady]), initial=0.0))
-    most = np.abs(contrasts.scores(null_pull)[..., steady]).reshape(draws, -1).max(-1, initial=0.0)
-    misfit, misfits = float(contrasts.misfit(departures, pull)), contrasts.misfit(null, null_pull)
-    (by_step, each_step), (by_misfit, each_misfit) = _ranks(most, largest), _ranks(misfits, misfit)
+    misfits = [float(each[0]) for each in contrasts.misfits(departures, pull)]
+    most, drawn = _drawn(history, contrasts, draws)
+    (by_step, each_step), (by_misfit, each_misfit) = (
+        _ranks(most, largest), _ranks(drawn[0], misfits[0]),
+    )  # fmt: skip
     evidence = np.minimum(each_step / STEP_SHARE, each_misfit / (1 - STEP_SHARE))
     least = min(by_step / STEP_SHARE, by_misfit / (1 - STEP_SHARE))
     critical = float(np.quantile(most, 1 - np.quantile(evidence, level) * STEP_SHARE))
-    pairs = [
-        _pair(*contrasts.pair(k, departures), contrasts.pair(k, null[:PAIR_DRAWS])[1])
-        for k in range(len(scores))
-    ]
-    result = ChangeTest(
+    pairs = zip(drawn[1:, :PAIR_DRAWS], misfits[1:], strict=True)
+    return ChangeTest(
         level, float((1 + np.sum(evidence <= least)) / (draws + 1)), scores, largest, critical,
-        by_step, misfit, contrasts.freedom, by_misfit,
-        np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs]), np.array([p[2] for p in pairs]),
+        by_step, misfits[0], int(contrasts.freedom[0]), by_misfit,
+        np.array(misfits[1:]), contrasts.freedom[1:],
+        np.array([(1 + np.sum(each >= one)) / (len(each) + 1) for each, one in pairs]),
     )  # fmt: skip
-    steps = _steps(contrasts, departures, steady, critical) if result.changed else ()
-    return replace(result, steps=steps)
+
+
+def _drawn(history: History, contrasts: Contrasts, draws: int) -> tuple[AnyArray, AnyArray]:
+    """Of unchanged tools the largest score (draws,) of a steady parameter, and all misfits (n, draws)."""
+    noise, grown = _noise(*history.values.shape), stretches(history, draws)
+    root, steady = contrasts.root.astype(noise.dtype), history.steady
+    most = np.zeros(draws, noise.dtype)
+    misfits = np.zeros((len(history.values), draws), noise.dtype)
+    for first in range(0, draws, DRAWN_TOGETHER):
+        part = slice(first, min(first + DRAWN_TOGETHER, draws))
+        departures = root @ noise[..., part]
+        for triad, factors in zip(history.triads, grown, strict=True):
+            departures[:, triad] *= factors[:, None, part]
+        pull = contrasts.pull(departures)
+        most[part] = np.abs(contrasts.scores(pull)[:, steady]).max((0, 1), initial=0.0)
+        asked = misfits if first < PAIR_DRAWS else misfits[:1]
+        for row, each in zip(asked, contrasts.misfits(departures, pull), strict=False):
+            row[part] = each
+    return most, misfits
 
 
 def _ranks(drawn: Array, value: float) -> tuple[float, Array]:
     """Probability of as much as a value among draws of no change, and of as much as each of them."""
-    ascending = np.sort(drawn)
-    above = len(drawn) - np.searchsorted(ascending, np.append(value, drawn), "left")
-    return float((1 + above[0]) / (len(drawn) + 1)), above[1:] / len(drawn)
+    order, count = np.argsort(drawn), len(drawn)
+    ascending, above = drawn[order], np.empty(count)
+    above[order] = count - np.searchsorted(ascending, ascending, "left")
+    beyond = np.count_nonzero(drawn >= value)
+    return (1 + beyond) / (count + 1), above / count
 
 
-def _pair(pair: Contrasts, departures: Array, null: Array) -> tuple[float, int, float]:
-    """Misfit of two successive calibrations, its degrees of freedom and probability."""
-    misfit = float(pair.misfit(departures, pair.pull(departures)))
-    drawn = pair.misfit(null, pair.pull(null))
-    return misfit, pair.freedom, float((1 + np.sum(drawn >= misfit)) / (len(drawn) + 1))
-
-
-def _steps(
-    contrasts: Contrasts, departures: Array, steady: Ints, critical: float
-) -> tuple[Step, ...]:
+def _steps(history: History, contrasts: Contrasts, critical: float) -> tuple[Step, ...]:
     """Steps that explain the change, the largest first, each with those before taken out."""
+    steady, departures = history.steady, contrasts.departures(history.values)
     named: list[tuple[int, int]] = []
     scored: list[float] = []
-    unit = np.where(contrasts._unit > 0, contrasts._unit, 1.0)
-    left = departures
+    known, sums = contrasts.known[:, steady], contrasts.sums(contrasts.pull(departures))[..., 0]
+    unit, found = np.where(contrasts._unit > 0, contrasts._unit, 1.0), (np.zeros(0), np.zeros(0))
+    moved = np.zeros((*sums.shape, 0))
     while len(named) < MOST_NAMED_STEPS:
-        scores = np.where(contrasts.known, contrasts.scores(contrasts.pull(left)), 0.0)[:, steady]
+        left = sums - moved @ (found[0] / unit[[place for _, place in named]])
+        scores = np.where(known, (left / contrasts._sizes)[:, steady], 0.0)
         row, column = np.unravel_index(np.argmax(np.abs(scores)), scores.shape)
         if abs(scores[row, column]) <= critical:
             break
         named.append((int(row) + 1, int(steady[column])))
         scored.append(float(scores[row, column]))
-        sizes, _ = contrasts.sizes(named, departures)
-        left = departures.copy()
-        for (after, place), size in zip(named, sizes, strict=True):
-            left[after:, place] -= size / unit[place]
-    if not named:
-        return ()
-    each = zip(named, *contrasts.sizes(named, departures), scored, strict=True)
+        step = np.zeros_like(departures)
+        step[named[-1][0] :, named[-1][1]] = 1.0
+        moved = np.concatenate([moved, contrasts.sums(contrasts.pull(step))], -1)
+        found = contrasts.sizes(named, sums, moved)
     return tuple(
         Step(place, after, float(size), float(sd), score)
-        for (after, place), size, sd, score in each
+        for (after, place), size, sd, score in zip(named, *found, scored, strict=True)
     )

@@ -398,7 +398,9 @@ def _despiked(value: Array) -> Array:
 def _travels(time: Array, level: Array, start: Array, end: Array) -> Array:
     """Range of the levels (n,) within each interval (k,)."""
     places = np.searchsorted(time, np.stack([start, end], -1))
-    return np.array([np.ptp(level[a:b]) if b > a else 0.0 for a, b in places], float)
+    padded = np.append(level, 0.0)  # an interval may end after the last level
+    high, low = (f.reduceat(padded, places.ravel())[::2] for f in (np.maximum, np.minimum))
+    return np.where(places[:, 1] > places[:, 0], high - low, 0.0)
 
 
 def cut_at_steps(

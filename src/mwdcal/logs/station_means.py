@@ -35,6 +35,8 @@ SPIKE_DISTANCE = 4.0
 """Distance from the median, in robust standard deviations, above which a sample is a spike."""
 BLOCKS = 64
 """Blocks whose means give the long-run variance."""
+TOGETHER = 1 << 16
+"""Samples of standstills that are worked on at once: they fit into a processor's cache."""
 LONG = 16
 """Samples from which on the noise of a standstill is taken from itself; the most it borrows."""
 SIGNIFICANT = 1e-4
@@ -119,9 +121,45 @@ class ChannelMean(NamedTuple):
 
 def summarise(rests: Sequence[Trace], resolution: float) -> ChannelMean:
     """What a channel read at its standstills of n >= 2 samples; `resolution` is the step of its readings."""
-    noise = pooled(rests, resolution)
-    rows = [_summary(*rest, resolution, noise) for rest in rests]
-    return ChannelMean._make(np.array([row[name] for row in rows]) for name in ChannelMean._fields)
+    return summarise_alike(rests, resolution, pooled(rests, resolution))
+
+
+def summarise_alike(rests: Sequence[Trace], resolution: float, noise: SharedNoise) -> ChannelMean:
+    """What a channel of this noise read at its standstills: those with equally many samples together."""
+    parts = [
+        (places[rows], part)
+        for places, time, value in _together(rests)
+        for rows, part in _summary(time, value, resolution, noise)
+    ]
+    order = np.argsort(np.concatenate([places for places, _ in parts]))
+    columns = zip(*(part for _, part in parts), strict=True)
+    return ChannelMean._make(np.concatenate(column)[order] for column in columns)
+
+
+def _together(rests: Sequence[Trace]) -> Iterator[tuple[Ints, Array, Array]]:
+    """Standstills of equally many samples: their places (k,), times and values (k, n)."""
+    for alike in _equal(np.array([len(value) for _, value in rests])):
+        each = max(TOGETHER // len(rests[alike[0]][1]), 1)
+        for first in range(0, len(alike), each):
+            places = alike[first : first + each]
+            traces = zip(*(rests[place] for place in places), strict=True)
+            time, value = (np.concatenate(one).reshape(len(places), -1) for one in traces)
+            yield places, time, value
+
+
+def _equal(sizes: Ints) -> list[Ints]:
+    """The places of equal sizes (k,), for each size."""
+    order = np.argsort(sizes, kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(sizes[order])) + 1)
+    return parts if sizes.size else []
+
+
+def _chosen(chosen: Bools, *arrays: Array) -> Iterator[tuple[Ints, list[Array]]]:
+    """Rows with equally many chosen samples, and these (j, m), of arrays (k, n)."""
+    counts = np.count_nonzero(chosen, -1)
+    for rows in _equal(counts):
+        shape, where = (len(rows), counts[rows[0]]), chosen[rows]
+        yield rows, [array[rows][where].reshape(shape) for array in arrays]
 
 
 class Correlated(NamedTuple):
@@ -200,51 +238,76 @@ def pooled(rests: Sequence[Trace], resolution: float) -> SharedNoise:
     """
     if len(rests) < 2:
         return ALONE
-    values = [value[:: -(-len(value) // BLOCKS)] for _, value in rests]
-    middles = [float(np.median(value)) for value in values]
-    values = [value - middle for value, middle in zip(values, middles, strict=True)]
-    distances = [_distances(value) for value in values]
-    lively = [d for d in distances if d.any()] or distances
+    parts = [
+        (places, value[:, :: -(-value.shape[-1] // BLOCKS)].copy())
+        for places, _, value in _together(rests)
+    ]
+    order = np.argsort(np.concatenate([places for places, _ in parts]))
+    some = [value for _, value in parts]
+    medians = [np.median(value, -1, keepdims=True) for value in some]
+    some = [value - median for value, median in zip(some, medians, strict=True)]
+    distances = [_distances(value) for value in some]
+    lively = [distance[distance.any(-1)].ravel() for distance in distances]
+    if not any(each.size for each in lively):
+        lively = [distance.ravel() for distance in distances]
     spread = 1.4826 * float(np.median(np.concatenate(lively)))
     limit = SPIKE_DISTANCE * max(spread, resolution)
-    kept = [value[np.abs(value) <= limit] for value in values]
-    kept = [value for value in kept if len(value)]  # none where they are at two levels far apart
-    square = np.array([len(value) * value.var() for value in kept])
-    freedom = np.array([len(value) - 1 for value in kept], float)
+    square, size = np.concatenate([_squares(value, limit) for value in some])[order].transpose()
+    there = size > 0  # none where they are at two levels far apart
+    square, freedom = square[there], size[there] - 1
     usual = square <= max(spread, resolution) ** 2 * _chi_square_limit(freedom)
     usual |= freedom.sum() < 2 * LONG
     total = float(freedom[usual].sum())
     if not total:
         return ALONE
     variance = float(square[usual].sum() / total)
-    some = usual & (freedom > 0)
-    differ = float(np.var(square[some] / freedom[some]))
-    by_chance = variance**2 * float(np.mean(2 / freedom[some]))
-    scatter = max(differ - by_chance, differ / max(some.sum() - 1, 1)) ** 0.5
-    rough = [_rough(value) for _, value in rests if len(value) >= 3 * PARTS]
+    few = usual & (freedom > 0)
+    differ = float(np.var(square[few] / freedom[few]))
+    by_chance = variance**2 * float(np.mean(2 / freedom[few]))
+    scatter = max(differ - by_chance, differ / max(few.sum() - 1, 1)) ** 0.5
+    middles = np.concatenate(medians)[order, 0]
     return SharedNoise(
         spread=spread,
         sd=variance**0.5,
         least=max(variance - scatter, 0.0) ** 0.5,
         freedom=total,
-        rough=float(np.median([r for r in rough if r > 0])) if any(rough) else 0.0,
-        reach=max(middles) - min(middles),
+        rough=_usual_roughness(rests),
+        reach=float(np.ptp(middles)),
         course=_course(rests, middles, limit),
     )
 
 
-def _course(rests: Sequence[Trace], middles: Sequence[float], limit: float) -> float:
+def _squares(value: Array, limit: float) -> Array:
+    """Sum of squares about their mean of the values up to a limit, and their number (k, 2), of each row (k, n)."""
+    result = np.zeros((len(value), 2))
+    for rows, (few,) in _chosen(np.abs(value) <= limit, value):
+        size = few.shape[-1]
+        if size:
+            result[rows] = np.stack([size * few.var(-1), np.full(len(rows), size)], -1)
+    return result
+
+
+def _usual_roughness(rests: Sequence[Trace]) -> float:
+    """Standard deviation of a sample, from the steps between the means of blocks, of the usual standstill."""
+    rough = [np.zeros(0)]
+    for _, _, value in _together([rest for rest in rests if len(rest[1]) >= 3 * PARTS]):
+        steps = np.median(np.abs(np.diff(_blocks(value))), -1)
+        rough.append(steps / 0.6745 / 2**0.5 * (value.shape[-1] / PARTS) ** 0.5)
+    alive = np.concatenate(rough)
+    return float(np.median(alive[alive > 0])) if alive.any() else 0.0
+
+
+def _course(rests: Sequence[Trace], middles: Array, limit: float) -> float:
     """Change per second that standstills share, 0 unless it is plain against how it scatters.
 
     Samples further than `limit` from the middle of their standstill are left out.
     """
     weights, sums = np.zeros((2, len(rests)))
-    for i, ((time, value), middle) in enumerate(zip(rests, middles, strict=True)):
-        value = value - middle
-        fine = np.abs(value) <= limit
-        clock = (time - time[0])[fine]
-        clock = clock - clock.sum() / max(len(clock), 1)
-        weights[i], sums[i] = clock @ clock, clock @ value[fine]
+    for places, time, value in _together(rests):
+        value = value - middles[places, None]
+        for rows, (clock, few) in _chosen(np.abs(value) <= limit, time - time[:, :1], value):
+            clock = clock - clock.sum(-1, keepdims=True) / max(clock.shape[-1], 1)
+            weights[places[rows]], sums[places[rows]] = dot(clock, clock), dot(clock, few)
     some = weights > 0
     freedom = int(some.sum()) - 1
     if freedom < 1:
@@ -256,11 +319,11 @@ def _course(rests: Sequence[Trace], middles: Sequence[float], limit: float) -> f
 
 
 def _distances(value: Array) -> Array:
-    """Distances from a median of 0, as many as are free, widened for what the median took (n,)."""
+    """Distances from a median of 0, as many as are free, widened for what the median took (k, n)."""
     distance = np.abs(value)
-    if len(value) % 2:
-        return np.sort(distance)[1:]
-    return distance / (1 - 1.1 / len(value))
+    if value.shape[-1] % 2:
+        return np.sort(distance)[:, 1:]
+    return distance / (1 - 1.1 / value.shape[-1])
 
 
 def _chi_square_limit(freedom: ArrayLike) -> Array:
@@ -274,70 +337,83 @@ def _chi_square_limit(freedom: ArrayLike) -> Array:
 
 
 def _blocks(value: Array, count: int = PARTS) -> Array:
-    """Means of that many blocks."""
-    bounds = np.linspace(0, len(value), count + 1).astype(int)
-    return np.asarray(np.add.reduceat(value, bounds[:-1]) / np.diff(bounds))
+    """Means of that many blocks (k, count) of values (k, n)."""
+    bounds = np.linspace(0, value.shape[-1], count + 1).astype(int)
+    return np.asarray(np.add.reduceat(value, bounds[:-1], -1) / np.diff(bounds))
 
 
-def _rough(value: Array) -> float:
-    """Standard deviation of a sample, from the steps between the means of blocks."""
-    steps = np.abs(np.diff(_blocks(value)))
-    return float(np.median(steps) / 0.6745 / 2**0.5 * (len(value) / PARTS) ** 0.5)
+def _summary(
+    time: Array, value: Array, resolution: float, noise: SharedNoise
+) -> Iterator[tuple[Ints, ChannelMean]]:
+    """Standstills (k,) by the number of samples that are no spikes: which, and what was read there.
 
-
-def _summary(time: Array, value: Array, resolution: float, noise: SharedNoise) -> dict[str, float]:
-    """The entries of `ChannelMean` of one standstill: `time` and `value` (n,) of its samples, n >= 2.
-
-    Steps of the `resolution` hide the mean where noise is far below them (`hidden`). The mean is that of
-    the middle of the standstill: the course that all share is not part of its uncertainty. A stuck
-    channel is known to its reach/√12.
+    Shapes: `time` and `value` (k, n) of their samples, n >= 2. Steps of the `resolution` hide the mean where
+    noise is far below them (`hidden`). The mean is that of the middle of the standstill: the course that
+    all share is not part of its uncertainty. A stuck channel is known to its reach/√12.
     """
-    distance = np.abs(value - np.median(value))
-    spread = float(1.4826 * np.median(distance))
-    kept = distance <= SPIKE_DISTANCE * max(_spike_scale(len(value), spread, noise), resolution)
+    size = value.shape[-1]
+    distance = np.abs(value - np.median(value, -1, keepdims=True))
+    spread = 1.4826 * np.median(distance, -1)
+    limit = SPIKE_DISTANCE * np.maximum(_spike_scale(size, spread, noise), resolution)
     stuck = _is_stuck(value, distance, resolution, noise)
-    unsteady = _is_unsteady(value[kept], resolution, noise)
-    time, value = time[kept], value[kept]
-    clock = time - time.mean()
+    for rows, (clock, few) in _chosen(distance <= limit[:, None], time, value):
+        part = _of_kept(clock, few, resolution, noise)
+        sd = np.where(stuck[rows], noise.reach / 12**0.5, part.sd)
+        yield (
+            rows,
+            part._replace(sd=sd, spread=spread[rows], spikes=size - part.used, stuck=stuck[rows]),
+        )
+
+
+def _of_kept(time: Array, value: Array, resolution: float, noise: SharedNoise) -> ChannelMean:
+    """What was read at standstills by samples (k, n) that are no spikes."""
+    used, half = value.shape[-1], value.shape[-1] // 2
+    clock = time - time.mean(-1, keepdims=True)
     flat = value - noise.course * clock
     mean, variance, freedom = _mean_variance(flat, noise)
-    square = float(clock @ clock)
-    slope = float(clock @ value) / square if square > 0 else 0.0
-    drift = slope * float(time[-1] - time[0])
-    _, steady, left = _mean_variance(value - slope * clock, noise, 2)
+    square = dot(clock, clock)
+    slope = np.divide(dot(clock, value), square, out=np.zeros(len(value)), where=square > 0)
+    drift = slope * (time[:, -1] - time[:, 0])
+    _, steady, left = _mean_variance(value - slope[:, None] * clock, noise, 2)
     limit = student(left, SIGNIFICANT) * np.sqrt(12 * steady)
-    sd = float(np.sqrt(variance)) * student(freedom, 0.05) / NORMAL
-    sd = float(np.hypot(sd, hidden(_shared_spread(flat, resolution, noise), resolution)))
-    if stuck:
-        sd = noise.reach / 12**0.5
-    used, half = len(value), len(value) // 2
-    quarters = (_halves(flat[:half]) + _halves(flat[half:])) / 2 if half >= 4 else np.nan
-    return {
-        "mean": mean,
-        "sd": sd,
-        "spread": spread,
-        "drift": drift,
-        "drifts": abs(drift) > max(limit, resolution, 1e-12 * abs(mean)),
-        "used": used,
-        "spikes": len(kept) - used,
-        "halves": _halves(flat) * used,
-        "quarters": quarters * used,
-        "unsteady": unsteady,
-        "stuck": stuck,
-    }
+    sd = np.sqrt(variance) * student(freedom, 0.05) / NORMAL
+    quarters = np.full(len(value), np.nan)
+    if half >= 4:
+        quarters = (_halves(flat[:, :half]) + _halves(flat[:, half:])) / 2
+    no = np.zeros(len(value), bool)
+    return ChannelMean(
+        mean=mean,
+        sd=np.hypot(sd, hidden(_shared_spread(flat, resolution, noise), resolution)),
+        spread=flat.std(-1),
+        drift=drift,
+        drifts=np.abs(drift) > np.maximum(np.maximum(limit, resolution), 1e-12 * np.abs(mean)),
+        used=np.full(len(value), used),
+        spikes=no.astype(int),
+        halves=_halves(flat) * used,
+        quarters=quarters * used,
+        unsteady=_is_unsteady(value, resolution, noise),
+        stuck=no,
+    )
 
 
-def hidden(spread: float, step: float) -> float:
+def dot(a: Array, b: Array) -> Array:
+    """The products of rows (..., n), added up."""
+    return np.asarray((a[..., None, :] @ b[..., :, None])[..., 0, 0])
+
+
+def hidden(spread: ArrayLike, step: float) -> Array:
     """What readings in steps hide of the mean of many: its standard deviation.
 
-    `spread` is the standard deviation of the readings. SharedNoise of σ steps leaves of the mean, which
+    `spread` is the standard deviation of the readings. Noise of σ steps leaves of the mean, which
     lies anywhere between two steps, the variance step²/(2π²) Σ exp(-4π²k²σ²)/k² over k = 1, 2, …:
     step²/12 without noise.
     """
-    if spread >= 2 * step:
-        return 0.0
+    spread = np.asarray(spread, float)
+    if not step:
+        return 0 * spread
     variances, lost, _ = _dither()
-    return float(step * np.interp((spread / step) ** 2, variances, lost) ** 0.5)
+    share = np.sqrt(np.interp((spread / step) ** 2, variances, lost))
+    return np.where(spread >= 2 * step, 0.0, step * share)
 
 
 @cache
@@ -357,90 +433,99 @@ def _dither() -> tuple[Array, Array, Array]:
     return sigma**2 + 1 / 12 - lost, lost, least
 
 
-def _shared_spread(value: Array, step: float, noise: SharedNoise) -> float:
-    """Standard deviation of a reading: that of all standstills, unless its own is plainly less.
+def _shared_spread(value: Array, step: float, noise: SharedNoise) -> Array:
+    """Standard deviation of a reading (k,): that of all standstills, unless its own is plainly less.
 
     Where a standstill lies on a step its own is less anyway (`_dither`).
     """
     from scipy.special import chdtri
 
-    spread, freedom = float(value.std()), max(len(value) - 1, 1)
+    spread, size = value.std(-1), value.shape[-1]
     if not noise.freedom:
         return spread
     least = noise.least**2
     if noise.least < 2 * step:
         variances, _, lowest = _dither()
         least = step**2 * float(np.interp((noise.least / step) ** 2, variances, lowest))
-    quiet = least * chdtri(freedom, 1 - SIGNIFICANT) / UNUSUAL**2
-    return spread if len(value) * spread**2 < quiet else noise.least
+    quiet = least * chdtri(max(size - 1, 1), 1 - SIGNIFICANT) / UNUSUAL**2
+    return np.where(size * spread**2 < quiet, spread, noise.least)
 
 
-def _spike_scale(count: int, spread: float, noise: SharedNoise) -> float:
-    """The noise by which spikes are judged: its own where many samples tell it, else that of all."""
+def _spike_scale(count: int, spread: Array, noise: SharedNoise) -> Array:
+    """The noise (k,) by which spikes are judged: its own where many samples tell it, else that of all."""
     if count < BLOCKS and noise.freedom >= LONG:
-        return max(spread, noise.spread)
-    return spread if count >= LONG else np.inf
+        return np.maximum(spread, noise.spread)
+    return spread if count >= LONG else np.full_like(spread, np.inf)
 
 
-def _is_stuck(value: Array, distance: Array, resolution: float, noise: SharedNoise) -> bool:
-    """Whether more readings are equal than a channel of this noise and resolution can show."""
+def _is_stuck(value: Array, distance: Array, resolution: float, noise: SharedNoise) -> Bools:
+    """Whether more readings (k, n) are equal than a channel of this noise and resolution can show."""
     from scipy.special import erf
 
+    size = value.shape[-1]
     if not noise.freedom or noise.sd <= resolution:
-        return False
-    equal = [np.count_nonzero(v == 0) for v in (distance, value - value.min(), value.max() - value)]
-    count = int(max(equal))
+        return np.zeros(len(value), bool)
+    ends = (f(value, -1, keepdims=True) for f in (np.min, np.max))
+    counts = [
+        np.count_nonzero(distance == 0, -1),
+        *(np.count_nonzero(value == e, -1) for e in ends),
+    ]
+    count = np.max(counts, axis=0)
     share = float(erf(QUIETER * resolution / (8**0.5 * noise.sd)))
-    chance = share + 4 * (share * (1 - share) / len(value)) ** 0.5
-    return bool(count >= 5 and count > max(STUCK, chance) * len(value))
+    chance = share + 4 * (share * (1 - share) / size) ** 0.5
+    return np.asarray((count >= 5) & (count > max(STUCK, chance) * size))
 
 
-def _is_unsteady(value: Array, resolution: float, noise: SharedNoise) -> bool:
-    """Whether a standstill spreads more than they usually do, or has a step within."""
+def _is_unsteady(value: Array, resolution: float, noise: SharedNoise) -> Bools:
+    """Whether standstills (k, n) spread more than they usually do, or have a step within."""
+    size = value.shape[-1]
     if noise.freedom < LONG:
-        return False
+        return np.zeros(len(value), bool)
     usual = max(noise.sd, resolution)
-    if len(value) * value.var() > usual**2 * _chi_square_limit(len(value) - 1):
-        return True
-    scatter = max(noise.rough, resolution) / (len(value) / PARTS) ** 0.5
-    return len(value) >= 3 * PARTS and bool(np.ptp(_blocks(value)) > WANDERS * scatter)
+    unsteady = size * value.var(-1) > usual**2 * _chi_square_limit(size - 1)
+    if size >= 3 * PARTS:
+        scatter = max(noise.rough, resolution) / (size / PARTS) ** 0.5
+        unsteady |= np.ptp(_blocks(value), -1) > WANDERS * scatter
+    return np.asarray(unsteady)
 
 
-def _mean_variance(value: Array, noise: SharedNoise, lost: int = 1) -> tuple[float, float, float]:
-    """Mean, variance of the mean, and degrees of freedom; `lost` are those of what was fitted.
+def _mean_variance(value: Array, noise: SharedNoise, lost: int = 1) -> tuple[Array, Array, Array]:
+    """Mean, variance of the mean, and degrees of freedom (k,); `lost` are those of what was fitted.
 
     Fewer than `LONG` samples are taken as independent, and share the noise of all standstills
     unless theirs is plainly larger.
     """
     from scipy.special import chdtri
 
-    if len(value) >= LONG:
+    size = value.shape[-1]
+    if size >= LONG:
         return long_run(value)
-    mean, square = float(value.mean()), float(len(value) * value.var())
-    freedom = float(max(len(value) - lost, 1))
-    limit = float(chdtri(freedom, LENT))
-    others = min(noise.freedom - freedom, LONG)
-    if others > 0 and (others < LONG or square <= noise.sd**2 * limit):
-        square, freedom = square + others * noise.sd**2, freedom + others
-    return mean, square / freedom / len(value), freedom
+    mean, square = value.mean(-1), size * value.var(-1)
+    freedom = np.full(len(value), float(max(size - lost, 1)))
+    others = np.minimum(noise.freedom - freedom, LONG)
+    alike = (others < LONG) | (square <= noise.sd**2 * chdtri(freedom, LENT))
+    others = np.where((others > 0) & alike, others, 0.0)
+    borrowed = np.where(others > 0, others * noise.sd**2, 0.0)
+    square, freedom = square + borrowed, freedom + others
+    return mean, square / freedom / size, freedom
 
 
-def _halves(value: Array) -> float:
-    """Variance of the mean of independent samples, by the difference of the halves' means."""
-    half = len(value) // 2
-    share = half * (len(value) - half) / len(value) ** 2
-    return share * float(value[:half].mean() - value[half:].mean()) ** 2
+def _halves(value: Array) -> Array:
+    """Variance of the mean of independent samples (k, n), by the difference of the halves' means."""
+    size, half = value.shape[-1], value.shape[-1] // 2
+    share = half * (size - half) / size**2
+    return np.asarray(share * (value[:, :half].mean(-1) - value[:, half:].mean(-1)) ** 2)
 
 
-def student(freedom: float, chance: float) -> float:
+def student(freedom: ArrayLike, chance: float) -> Array:
     """Two-sided Student quantile that is exceeded with this chance."""
     from scipy.special import stdtrit
 
-    return float(stdtrit(freedom, 1 - chance / 2))
+    return np.asarray(stdtrit(freedom, 1 - chance / 2), float)
 
 
-def long_run(value: Array) -> tuple[float, float, float]:
-    """Mean of correlated samples (n,), the variance of that mean, and degrees of freedom.
+def long_run(value: Array) -> tuple[Array, Array, Array]:
+    """Means of correlated samples (k, n), the variances of these means, and degrees of freedom.
 
     Definition: autocovariances of the means of at most `BLOCKS` blocks are added up in pairs
     as long as the pairs are positive, each no larger than the one before. With n' the number
@@ -448,16 +533,20 @@ def long_run(value: Array) -> tuple[float, float, float]:
     ν = n' - 1.
     Errors: a line of drift counts as noise.
     """
-    mean = float(value.mean())
-    blocks = min(len(value), BLOCKS)
-    means = _blocks(value - mean, blocks)
-    means = means - means.mean()
-    products = np.correlate(means, means, "full")[blocks - 1 :] / blocks
-    pairs = products[: blocks // 4 * 2].reshape(-1, 2).sum(-1)
-    pairs = np.minimum.accumulate(pairs) * np.logical_and.accumulate(pairs > 0)
-    variance = max(2 * float(pairs.sum()) - products[0], products[0]) / blocks
-    independent = max(products[0] / variance, 1.5) if variance > 0 else float(blocks)
-    return mean, variance * independent / (independent - 1), max(independent - 1, 3.0)
+    mean = value.mean(-1)
+    blocks = min(value.shape[-1], BLOCKS)
+    means = _blocks(value - mean[:, None], blocks)
+    means = means - means.mean(-1, keepdims=True)
+    lags = range(blocks // 4 * 2)
+    products = np.stack([dot(means[:, k:], means[:, : blocks - k]) for k in lags], -1) / blocks
+    pairs = products.reshape(len(value), -1, 2).sum(-1)
+    positive = np.logical_and.accumulate(pairs > 0, -1)
+    pairs, single = np.minimum.accumulate(pairs, -1) * positive, products[:, 0]
+    variance = np.maximum(2 * pairs.sum(-1) - single, single) / blocks
+    independent = np.full(len(value), float(blocks))
+    np.divide(single, variance, out=independent, where=variance > 0)
+    independent = np.maximum(independent, 1.5)
+    return mean, variance * independent / (independent - 1), np.maximum(independent - 1, 3.0)
 
 
 ALL_STILL = "all-still"

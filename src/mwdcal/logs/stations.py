@@ -25,13 +25,16 @@ from mwdcal.logs import standstill
 from mwdcal.logs.regular import SECONDS, check_argument, row_times, unlikely_seconds
 from mwdcal.logs.standstill import Activity, Slow, Standstills, Trace, Traces
 from mwdcal.logs.station_means import (
+    ALONE,
     Rows,
     about,
     correlated,
     count,
+    dot,
     listed,
     noisy_rests,
     summarise,
+    summarise_alike,
     widened,
 )
 
@@ -419,9 +422,7 @@ def _temperatures(
     """The temperature of each station, and its change; blank where none was taken nearby."""
     if temperature is None:
         return {}
-    ends = zip(start, end, strict=True)
-    lag = GAP * standstill.time_step(temperature[0])
-    warmth = np.array([_temperature(*temperature, *interval, lag) for interval in ends])
+    warmth = _warmth_of(*temperature, start, end, GAP * standstill.time_step(temperature[0]))
     blank = np.flatnonzero(np.isnan(warmth[:, 0])) + 1
     if blank.size:
         text = (
@@ -432,24 +433,26 @@ def _temperatures(
     return {"temperature_c": warmth[:, 0], "drift_temperature_c": warmth[:, 1]}
 
 
-def _temperature(
-    time: Array, value: Array, start: float, end: float, lag: float
-) -> tuple[float, float]:
-    """Mean over an interval and change over it; between samples along straight lines.
+def _warmth_of(time: Array, value: Array, start: Array, end: Array, lag: float) -> Array:
+    """Mean over each interval (k,) and change over it (k, 2); between samples along straight lines.
 
     Singular: NaN where no sample is within the interval, or within `lag` seconds of it.
     """
-    first, last = np.searchsorted(time, [start, end])
-    if last - first >= standstill.WINDOW:
-        rest = summarise([(time[first:last], value[first:last])], 0.0)
-        return float(rest.mean[0]), float(rest.drift[0])
-    before = time[first - 1] if first else -np.inf
-    after = time[last] if last < len(time) else np.inf
-    if last == first and min(start - before, after - end) > lag:
-        return np.nan, np.nan
-    grid = np.linspace(start, end, 9)
-    course = np.interp(grid, time, value)
-    return float(course.mean()), float(np.polyfit(grid - start, course, 1)[0] * (end - start))
+    first, last = np.searchsorted(time, start), np.searchsorted(time, end)
+    grid = np.linspace(start, end, 9, axis=-1)
+    course, clock = np.interp(grid, time, value), grid - grid.mean(-1, keepdims=True)
+    mean = course.mean(-1)
+    slope = dot(clock, course - mean[:, None]) / dot(clock, clock)
+    warmth = np.stack([mean, slope * (end - start)], -1)
+    padded = np.concatenate([[-np.inf], time, [np.inf]])
+    away = np.minimum(start - padded[first], padded[last + 1] - end) > lag
+    warmth[(last == first) & away] = np.nan
+    many = np.flatnonzero(last - first >= standstill.WINDOW)
+    if many.size:
+        rests = [(time[a:b], value[a:b]) for a, b in zip(first[many], last[many], strict=True)]
+        made = summarise_alike(rests, 0.0, ALONE)
+        warmth[many] = np.stack([made.mean, made.drift], -1)
+    return warmth
 
 
 def _middle(value: Array) -> float:

@@ -588,7 +588,7 @@ class Truth:
         """Readings (..., n, 3) of each triad without noise, nominal units: the model, inverted."""
         pairs = zip(self.triads.items(), vectors, strict=False)
         result = {
-            name: raw_reading(model, params, vector, temperature, *() if model.curved else (1,))
+            name: raw_reading(model, params, vector, temperature)
             for (name, (model, params)), vector in pairs
         }
         for name, curve, strength in zip(
