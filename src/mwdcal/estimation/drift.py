@@ -43,6 +43,8 @@ LEAST_WALK = 1e-3
 """A walk over the run is at least this share of the noise of a reading: a smaller one is none."""
 FEWEST_USED = 2.0
 """Fewest degrees of freedom that are counted to the estimate of a walk's variance."""
+ROUNDING = 1e-13
+"""Differences of matrices, as a share of the largest element, that are rounding."""
 VARIANCE_ROUNDS = 25
 """Repetitions of the estimate of variances."""
 
@@ -300,7 +302,7 @@ class _Ridge:
     def of(cls, scores: WalkScores, some: Ints) -> _Ridge:
         """In the basis for a component of scores."""
         others = np.setdiff1d(np.arange(scores.score.shape[-1]), some)
-        values, basis = eigen(scores.information[:, some[:, None], some])
+        values, basis = _eigen_alike(scores.information[:, some[:, None], some])
         score = scores.score.copy()
         score[:, some] = (basis.mT @ scores.score[:, some, None])[..., 0]
         cross = scores.information[:, others[:, None], some] @ basis
@@ -322,6 +324,17 @@ class _Ridge:
         variance[:, self.others] = diagonal(whole)
         variance[:, self.some] = lone + np.sum(scaled * (whole @ scaled), 1)
         return value, variance
+
+
+def _eigen_alike(matrix: Array) -> tuple[Array, Array]:
+    """Eigenvalues and vectors of matrices (B, m, m), worked out once where these are alike but for rounding.
+
+    So is the information on a drift of the readings themselves, in units of their noise, of runs at equal references.
+    """
+    if np.abs(matrix - matrix[:1]).max(initial=0.0) > ROUNDING * np.abs(matrix).max(initial=0.0):
+        return eigen(matrix)
+    values, basis = eigen(matrix[:1])
+    return np.broadcast_to(values, matrix.shape[:2]), np.broadcast_to(basis, matrix.shape)
 
 
 def walk_variances(

@@ -46,10 +46,11 @@ TOOL = "#tool"
 """Column of dealt rows: number of the tool, in order of first appearance."""
 ROW = "#row"
 """Column of the number of a row in the whole table."""
-PARTITION_ROWS = (6_000, 100_000)
-"""Fewest and most rows of a partition that is not a single tool…"""
-SHARES = 32
-"""…and into how many a fleet between these is divided."""
+PARTITION_ROWS = (24_000, 100_000)
+"""Fewest and most rows of a partition that is not a single tool: what it costs by itself is little, and so is its
+memory…"""
+SHARES = 16
+"""…and into how many a fleet between these is divided. Workers do not count: another number of them finds the parts."""
 BATCH = 32_768
 """Rows that are read at once…"""
 SERIALS = 500_000

@@ -57,29 +57,35 @@ def chances(result: Fit) -> tuple[Array, Bools]:
 
     The least of those of the walks that act on a triad, times their number; and whether a trend would not show (B, t).
     """
-    scores, trends = _scores(result)
     analysis = result.analysis
     least, hidden = np.ones(analysis.freedom.shape), np.zeros(analysis.freedom.shape, bool)
-    for name, triad in drift.acting(scores.places).items():
-        scatter, rest = (x[:, triad] for x in (analysis.variance_factor, analysis.freedom))
-        total, mean, square = scores.square(scores.places[name])
-        ratio = np.where(square > 0, mean / np.where(square > 0, square, 1.0), 0.0)
-        one = f_test(total * ratio, mean * ratio, np.nan_to_num(scatter), rest)
-        one = np.nan_to_num(one, nan=1.0) * (1 + (triad > 0))
-        least[:, triad] = np.minimum(least[:, triad], one)
-        hidden[:, triad] |= trends[name] < drift.LEAST_TREND
+    for scores, trends in _scores(result):
+        for name, triad in drift.acting(scores.places).items():
+            scatter, rest = (x[:, triad] for x in (analysis.variance_factor, analysis.freedom))
+            total, mean, square = scores.square(scores.places[name])
+            ratio = np.where(square > 0, mean / np.where(square > 0, square, 1.0), 0.0)
+            one = f_test(total * ratio, mean * ratio, np.nan_to_num(scatter), rest)
+            one = np.nan_to_num(one, nan=1.0) * (1 + (triad > 0))
+            least[:, triad] = np.minimum(least[:, triad], one)
+            hidden[:, triad] |= trends[name] < drift.LEAST_TREND
     return least, hidden
 
 
-def _scores(result: Fit) -> tuple[drift.WalkScores, dict[str, Array]]:
-    """Scores of all walks, and how much of the trend of each is `shown`."""
+def _scores(result: Fit) -> Iterator[tuple[drift.WalkScores, dict[str, Array]]]:
+    """Scores of all walks, and how much of the trend of each is `shown`.
+
+    Walk by walk on a stand, where what they have in common with each other would take most of the time.
+    """
     problem, analysis = result.problem, result.analysis
-    if not (closed_form.applies(problem) and are_common(problem)):
-        scores = drift.walk_scores(problem, result.state, analysis)
-        return scores, {name: scores.shown(name) for name in scores.places}
-    residual = analysis.residual
-    units, trends = _of_units(Alike.of(problem, result.state), residual.shape[-1])
-    return replace(units, score=residual.reshape(len(residual), -1) @ units.score), trends
+    if closed_form.applies(problem) and are_common(problem):
+        residual = analysis.residual
+        units, trends = _of_units(Alike.of(problem, result.state), residual.shape[-1])
+        yield replace(units, score=residual.reshape(len(residual), -1) @ units.score), trends
+        return
+    names = drift.families(problem)
+    for walks in [names] if analysis.squares is None else [[name] for name in names]:
+        scores = drift.walk_scores(problem, result.state, analysis, walks)
+        yield scores, {name: scores.shown(name) for name in scores.places}
 
 
 @lru_cache(maxsize=16)
