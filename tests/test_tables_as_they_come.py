@@ -142,6 +142,109 @@ def test_a_cover_sheet_states_serial_and_references(tmp_path):
     assert np.degrees(run.reference("dip")) == pytest.approx(np.full(run.count, 65.0))
 
 
+NOMINAL = {
+    "Nominal field;48 500 nT": "ref_field_nt",
+    "Total field, approx.;48.5 µT": "ref_field_nt",
+    "Dip (nominal);66.2 deg": "ref_dip_deg",
+}
+
+
+@pytest.mark.parametrize("line", NOMINAL)
+def test_a_nominal_reference_is_named_where_the_run_has_no_other(tmp_path, line):
+    column = NOMINAL[line]
+    path = written(tmp_path / "a.csv", table(**{column: None}), line, delimiter=";")
+    findings = {f.id: f.text for f in library.propose_profile(path).findings}
+    assert f"'{column}'" in findings["reference-not-taken"]
+    assert line.split(";")[0] in findings["reference-not-taken"]
+    whole = written(tmp_path / "b.csv", table(), line, delimiter=";")
+    assert "reference-not-taken" not in {f.id for f in library.propose_profile(whole).findings}
+
+
+# -------------------------------------------------------------------------- sheets of one run
+
+
+def workbook_of(path, columns, sheets, *above):
+    """A workbook with the rows of a table in equal shares on these sheets."""
+    book = openpyxl.Workbook()
+    book.remove(book.active)
+    rows = [*zip(*columns.values(), strict=True)]
+    share = len(rows) // len(sheets)
+    for place, name in enumerate(sheets):
+        sheet = book.create_sheet(name)
+        for row in (*above, [*columns], *rows[place * share : (place + 1) * share]):
+            sheet.append([v.item() if hasattr(v, "item") else v for v in row])
+    book.save(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("sheets", "first"),
+    [
+        (("25C", "80 °C", "-10 degC"), 1),
+        (("Inc 5", "Inc 45", "Inc 90"), 1),
+        (("kalt", "Raumtemperatur", "heiß"), 1),
+        (("Sheet1", "Sheet2", "Sheet3"), 0),
+    ],
+)
+def test_sheets_that_are_parts_of_one_run_are_joined(tmp_path, sheets, first):
+    """Named as settings, with stations that begin anew, or numbered on from sheet to sheet."""
+    numbers = [k % 16 + 1 for k in range(48)] if first else [*range(1, 49)]
+    columns = table(station=numbers)
+    path = workbook_of(tmp_path / "a.xlsx", columns, sheets, ["Tool S/N", "DM-17"])
+    run = read(path)
+    whole = read(written(tmp_path / "b.csv", table()))
+    for kind in ("accelerometer", "magnetometer"):
+        np.testing.assert_allclose(getattr(run, kind), getattr(whole, kind), rtol=0, atol=1e-9)
+    ran, _ = calibrated(tmp_path, path)
+    assert "48 stations" in ran.out
+    ran = mwdcal("profile", path, "-o", tmp_path / "c.toml")
+    assert f"'{sheets[1]}' and '{sheets[2]}' joined as one run" in ran.out
+    assert read(path, sheet=sheets[0]).count == 16
+
+
+@pytest.mark.parametrize(
+    ("sheets", "numbers"),
+    [
+        (("as found", "as left"), range(1, 49)),
+        (("Calibration", "Roll test"), range(1, 49)),
+        (("Run 1", "Run 2"), [*range(1, 25), *range(1, 25)]),
+        (("DM-1187", "DM-1203"), [*range(1, 25), *range(1, 25)]),
+    ],
+)
+def test_sheets_that_may_be_two_runs_are_asked_about(tmp_path, sheets, numbers):
+    path = workbook_of(tmp_path / "a.xlsx", table(station=[*numbers]), sheets)
+    message = refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
+    assert all(f"--sheet '{name}'" in message or f"--sheet {name}" in message for name in sheets)
+
+
+def test_a_sheet_that_repeats_a_row_of_another_is_no_part_of_its_run(tmp_path):
+    columns = table(station=[1] * 48)
+    columns = {name: [*values[:24], *values[:24]] for name, values in columns.items()}
+    path = workbook_of(tmp_path / "a.xlsx", columns, ("25C", "80C"))
+    assert "2 tables of like columns" in refused(
+        mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3
+    )
+
+
+def test_a_bad_cell_of_a_joined_sheet_is_named_with_its_sheet(tmp_path):
+    columns = table(station=[*range(1, 49)])
+    columns["Gy (V)"] = [*columns["Gy (V)"][:30], "see note", *columns["Gy (V)"][31:]]
+    path = workbook_of(tmp_path / "a.xlsx", columns, ("25C", "80C"))
+    letter = openpyxl.utils.get_column_letter([*columns].index("Gy (V)") + 1)
+    message = refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
+    assert f"sheet '80C', cell {letter}8, column 'Gy (V)'" in message
+
+
+def test_a_number_of_a_workbook_has_no_separators_whatever_the_sign_of_its_texts(tmp_path):
+    """1.234 in a cell of numbers is no 1234, though a column of texts has decimal commas."""
+    columns = table()
+    columns["Gx (V)"] = np.round(columns["Gx (V)"], 3)
+    whole = read(written(tmp_path / "b.csv", columns))
+    columns["Temp (C)"] = [f"{v:.1f}".replace(".", ",") for v in columns["Temp (C)"]]
+    run = read(workbook_of(tmp_path / "a.xlsx", columns, ["Data"]))
+    np.testing.assert_allclose(run.accelerometer, whole.accelerometer, rtol=0, atol=1e-9)
+
+
 DECLINATIONS = (
     (["Declination: -1.62 deg"], -1.62),
     (["Declination", -1.62, "deg (E +)"], -1.62),

@@ -225,4 +225,5 @@ def _remarks(table: Table, marks: Marks) -> Iterator[str]:
 def place(table: Table, row: int) -> str:
     """The line of a row in its file."""
     number = table.lines[row] if row < len(table.lines) else row + 1
-    return f"{row_word(table)} {number}"
+    sheet = f"sheet {shown(table.parts[row])}, " if row < len(table.parts) else ""
+    return f"{sheet}{row_word(table)} {number}"

@@ -51,4 +51,5 @@ def rows_of(table: Table, rows: list[int]) -> Table:
         for name, cells in table.columns.items()
     }
     lines = [table.lines[row] for row in rows] if len(table.lines) else table.lines
-    return replace(table, columns=columns, lines=lines)
+    parts = [table.parts[row] for row in rows] if table.parts else table.parts
+    return replace(table, columns=columns, lines=lines, parts=parts)

@@ -468,8 +468,11 @@ def _as_written(
         name for name, m in meanings_of(where.names, where.units).items() if m.column in LABELS
     }
     table = tables.of_layout(where, path, labels)
-    workbook = Path(path).suffix.lower() in WORKBOOKS  # to read one twice takes seconds
-    for form in [] if placed else [None] if workbook else [None, where.form]:
+    workbook = Path(path).suffix.lower() in WORKBOOKS
+    forms = [None] if workbook else [None, where.form]
+    if placed or where.parts or (workbook and not {*CHANNELS["accelerometer"]} <= {*where.names}):
+        forms = []  # a workbook is read twice, which takes seconds, only where it may be a run file
+    for form in forms:
         if form or _is_documented(path, where):
             with suppress(InputError):
                 plain = tables.read(path, export=form)
@@ -708,6 +711,22 @@ def left_handed(proposal: Proposal) -> list[Finding]:
     ]
 
 
+def references_not_taken(proposal: Proposal) -> list[Finding]:
+    """A finding on each nominal reference above the names, where the run has no other."""
+    columns = proposal.profile.columns
+    named = {} if isinstance(columns, msgspec.UnsetType) else columns
+    lines = proposal.where.titles.not_taken if proposal.where else {}
+    return [
+        Finding(
+            id="reference-not-taken",
+            text=f"{shown(line)} is nominal, and not taken as '{column}', which the run does not state otherwise. If "
+            "it holds, state it without that word, or in a column.",
+        )
+        for column, line in lines.items()
+        if column not in named and column not in proposal.metadata
+    ]
+
+
 def findings_on(proposal: Proposal) -> list[Finding]:
     """All that the reader of a proposal should know."""
     ignored = [
@@ -715,7 +734,7 @@ def findings_on(proposal: Proposal) -> list[Finding]:
         for name, reason in proposal.ignored.items()
     ]
     marked = [Finding(id=MARKED_ROWS, text=text) for text in proposal.remarks]
-    known = axes_open(proposal) + left_handed(proposal) + marked
+    known = axes_open(proposal) + left_handed(proposal) + references_not_taken(proposal) + marked
     return known + ignored + unused_columns(proposal.unused)
 
 

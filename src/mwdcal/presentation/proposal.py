@@ -12,7 +12,7 @@ from msgspec.structs import asdict
 from mwdcal.calibration.readings import TRIADS, simulated
 from mwdcal.calibration.record import Finding
 from mwdcal.files.contract import RANGES
-from mwdcal.files.formats.layout import WORKBOOKS
+from mwdcal.files.formats.layout import WORKBOOKS, Layout
 from mwdcal.identification.proposal import Proposal, findings_on, in_order, stated_references
 from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.numbers import files_written
@@ -134,9 +134,17 @@ def _layout(proposal: Proposal, form: TableFormat, run: Path) -> str:
     if where and where.left_out:
         place += f"\nleft out: {_left_out(where.left_out, word)}"
     if workbook:
-        return f"sheet '{one_line(where.sheet)}', {place}" if where else place
+        return f"{_sheets(where)}, {place}" if where else place
     sign = "tab" if written_so.delimiter == "\t" else f"'{written_so.delimiter}'"
     return f"{written_so.encoding}, delimiter {sign}, decimal sign '{written_so.decimal}', {place}"
+
+
+def _sheets(where: Layout) -> str:
+    """The sheet of a table, or those that are joined."""
+    sheets = [f"'{one_line(each)}'" for each in dict.fromkeys(where.parts or [where.sheet])]
+    if len(sheets) == 1:
+        return f"sheet {sheets[0]}"
+    return f"sheets {', '.join(sheets[:-1])} and {sheets[-1]} joined as one run"
 
 
 def _left_out(rows: Sequence[tuple[int, str]], word: str) -> str:

@@ -93,12 +93,19 @@ def _of_sign(cells: Sequence[str], sign: str) -> int:
     return sum(looks_numeric(c, sign) or bool(_POINTED[sign].fullmatch(c)) for c in marked)
 
 
+def as_they_stand(cells: Sequence[object]) -> list[str]:
+    """The cells of a column as text, without blanks around."""
+    return [cell.strip() if isinstance(cell, str) else as_text(cell) for cell in cells]
+
+
 def column(cells: Sequence[object], sign: str) -> tuple[list[str], str]:
     """The cells as text whose numbers have a decimal point, and the unit that stands behind all of them.
 
     A column of which any cell is no number stays as it is, except where numbers stand in it.
     """
-    texts = [cell.strip() if isinstance(cell, str) else as_text(cell) for cell in cells]
+    texts = as_they_stand(cells)
+    if not any(isinstance(cell, str) and cell for cell in cells):
+        return texts, ""
     filled = [_SPACES.sub("", text) for text in texts if text]
     if filled and all(map(_DEGREES.fullmatch, filled)):
         return [_degrees(text, sign) for text in texts], "°"
@@ -107,7 +114,10 @@ def column(cells: Sequence[object], sign: str) -> tuple[list[str], str]:
     units = {match[2].strip() for match in map(_FIGURE.fullmatch, filled) if match}
     alike = len(units) == 1 and all(map(_FIGURE.fullmatch, filled))
     unit = units.pop() if alike else ""
-    return [_pointed(text, sign, unit) for text in texts], unit
+    return [
+        _pointed(text, sign, unit) if isinstance(cell, str) else text
+        for cell, text in zip(cells, texts, strict=True)
+    ], unit
 
 
 def _pointed(text: str, sign: str, unit: str) -> str:

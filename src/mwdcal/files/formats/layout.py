@@ -71,6 +71,21 @@ ADJUSTED = re.compile(
 )
 """Words of a run before or after an adjustment of the tool: two of them are two runs."""
 
+_OF_ROLL_TEST = re.compile(
+    r"(?<![^\W\d_])(roll[\s_-]*(test|over|check)|rt|verif\w*|check|valid\w*|control|kontroll\w*|(roll)?pr(ue|ü)fung|"
+    r"rulletest|prueba|провер\w*|повер\w*|контрол\w*)(?![^\W\d_])|验证|检验|複測|复测",
+    re.IGNORECASE,
+)
+"""Words of a sheet whose rows are to check a calibration."""
+_OF_SETTING = re.compile(
+    r"([+−-]?\d+([.,]\d+)?|[\W_]|(?<![^\W\d_])(°?[cf]|deg\w*|grad\w*|°|k|t|temp\w*|oven|ofen|ovn|horno|soak|"
+    r"inc\w*|incl\w*|inkl\w*|az\w*|dip|neigung|helning|hold|pos\w*|lage|plus|minus|cold|kalt|kald|fr[ií]o|froid|warm|"
+    r"varm|hot|hei(ß|ss)|caliente|chaud|room|ambient\w*|raum\w*|rom\w*|ambiente|холод\w*|тепл\w*|гор\w*|комн\w*)"
+    r"(?![^\W\d_])|[低常高]?温|℃|度)+",
+    re.IGNORECASE,
+)
+"""The name of a sheet that is a setting of the stand or the oven: 77F, Inc 45, Cold."""
+
 Cells = Sequence[object]
 
 
@@ -94,6 +109,7 @@ class Layout:
     `form` says how the table is written, `cells` are text, numbers in it with a decimal point, and `texts` the same
     as they stand there; `fractions` are columns of a workbook with numbers that are not whole. `left_out` are lines
     below the names that are no readings, `above` the texts above them;
+    `parts` the sheet of each row where several are one table;
     `titles` what the title block says of the tool, the day and the place; `places` letters of the columns in a
     workbook.
     """
@@ -111,6 +127,7 @@ class Layout:
     titles: Titles = field(default_factory=lambda: Titles({}))
     left_out: tuple[tuple[int, str], ...] = ()
     places: Mapping[str, str] = field(default_factory=dict)
+    parts: tuple[str, ...] = ()
 
     @property
     def size(self) -> int:
@@ -151,10 +168,65 @@ def laid_out(
     if not tables:
         raise _no_table(source, header_line, wanted)
     best = max(tables, key=lambda layout: layout.size)
-    alike = [t for t in tables if t is not best and _alike(t, best) and len(t.lines) >= _BESIDES]
-    if alike and not header_line:
-        raise _several([best, *alike], source, sheet)
+    alike = [t for t in tables if t is best or (_alike(t, best) and len(t.lines) >= _BESIDES)]
+    if len(alike) > 1 and not header_line:
+        if not _is_one_run(alike):
+            raise _several(alike, source, sheet)
+        best = _joined_sheets(alike)
     return _with_covers(best, covers)
+
+
+def _is_one_run(tables: Sequence[Layout]) -> bool:
+    """Whether tables of different sheets are parts of one run: alike in names, units and what stands above them.
+
+    Their rows are numbered on from sheet to sheet, or their names are settings of the stand or the oven. A sheet of a
+    roll test, or of a run after an adjustment, is no part.
+    """
+    sheets = [table.sheet for table in tables]
+    first = tables[0]
+    same = all(
+        (t.names, t.units, t.form.decimal) == (first.names, first.units, first.form.decimal)
+        and {**t.titles.metadata, "date": ""} == {**first.titles.metadata, "date": ""}
+        for t in tables
+    )
+    words = [" ".join([t.sheet, *t.above]) for t in tables]
+    apart = any(ADJUSTED.search(each) or _OF_ROLL_TEST.search(each) for each in words)
+    rows = [row for t in tables for row in zip(*t.texts, strict=True)]
+    if not same or apart or len({*sheets}) < len(sheets) or len({*rows}) < len(rows):
+        return False
+    return all(map(_OF_SETTING.fullmatch, sheets)) or _are_numbered_on(tables)
+
+
+def _are_numbered_on(tables: Sequence[Layout]) -> bool:
+    """Whether a column numbers the rows of all tables, from each to the next."""
+    columns = (
+        [cell for cells in each for cell in cells]
+        for each in zip(*(t.texts for t in tables), strict=True)
+    )
+    return any(
+        all(map(str.isdecimal, cells)) and all(int(b) == int(a) + 1 for a, b in pairwise(cells))
+        for cells in columns
+    )
+
+
+def _joined_sheets(tables: Sequence[Layout]) -> Layout:
+    """Tables of several sheets as one, in the order of the sheets."""
+    first = tables[0]
+    return replace(
+        first,
+        cells=[
+            [c for part in each for c in part]
+            for each in zip(*(t.cells for t in tables), strict=True)
+        ],
+        texts=[
+            [c for part in each for c in part]
+            for each in zip(*(t.texts for t in tables), strict=True)
+        ],
+        lines=[line for t in tables for line in t.lines],
+        parts=tuple(t.sheet for t in tables for _ in t.lines),
+        fractions=tuple({f: None for t in tables for f in t.fractions}),
+        left_out=tuple(each for t in tables for each in t.left_out),
+    )
 
 
 def _with_covers(layout: Layout, covers: Sequence[Sheet]) -> Layout:
@@ -164,8 +236,10 @@ def _with_covers(layout: Layout, covers: Sequence[Sheet]) -> Layout:
     block = layout.titles
     day = block.unclear_day or next((b.unclear_day for b in blocks if b.unclear_day), "")
     metadata = {**stated, **block.metadata}
+    not_taken = {c: line for b in [*blocks[::-1], block] for c, line in b.not_taken.items()}
     return replace(
-        layout, titles=Titles(metadata, "" if "date" in metadata else day) if blocks else block
+        layout,
+        titles=Titles(metadata, "" if "date" in metadata else day, not_taken) if blocks else block,
     )
 
 
@@ -206,10 +280,15 @@ def _several(tables: Sequence[Layout], source: str, sheet: str) -> QuestionError
 
 
 def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
-    """The tables of a sheet, one below the other."""
+    """The tables of a sheet, one below the other: a head is no row of readings, and the next row is one."""
     rows = [row for row in sheet.rows if not _is_ruler(row[1])]
     sheet = sheet._replace(rows=rows)
-    heads = [k for k in range(len(rows)) if _is_head(rows, k)]
+    readings = [_is_reading(row) for _, row in rows]
+    heads = [
+        k
+        for k, (now, below) in enumerate(pairwise(readings))
+        if below and not now and _texts(rows[k][1]) >= LEAST_COLUMNS
+    ]
     heads = [k for n, k in enumerate(heads) if n == 0 or _begins_anew(rows, heads[:n], k)]
     for head, end in pairwise([*heads, len(rows)]):
         if layout := _table(sheet, head, end, source, decimal):
@@ -219,12 +298,6 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
 def _is_ruler(row: Cells) -> bool:
     """Whether a row is a line of dashes or the like."""
     return all(isinstance(cell, str) and re.fullmatch(r"[-=_*+|\s]*", cell) for cell in row)
-
-
-def _is_head(rows: Sequence[tuple[int, Cells]], place: int) -> bool:
-    """Whether the readings begin below a row: it is not one, and the next one is."""
-    below = place + 1 < len(rows) and _is_reading(rows[place + 1][1])
-    return below and not _is_reading(rows[place][1]) and _texts(rows[place][1]) >= LEAST_COLUMNS
 
 
 def _begins_anew(rows: Sequence[tuple[int, Cells]], heads: Sequence[int], place: int) -> bool:
@@ -281,7 +354,7 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
     read = [figures.column(column, sign) for column in columns]
     above = [row for _, row in rows[:top]]
     block = stated_above(above)
-    texts = [[as_text(cell).strip() for cell in column] for column in columns]
+    texts = [figures.as_they_stand(column) for column in columns]
     whole, joined = _with_minutes(names, [cells for cells, _ in read])
     stated = {
         name: _both(unit, by_cells)

@@ -64,6 +64,7 @@ class Table:
         decimal: the decimal sign of numbers in text cells.
         places: letters of the columns in a workbook, by name, for messages.
         sheet: name of its sheet there.
+        parts: the sheet of each row, where the table is on several.
         remarks: sentences on rows that were left out, for findings.
     """
 
@@ -75,6 +76,7 @@ class Table:
     decimal: str = "."
     places: Mapping[str, str] = field(default_factory=dict)
     sheet: str = ""
+    parts: Sequence[str] = ()
     remarks: tuple[str, ...] = ()
 
     @property
@@ -206,7 +208,8 @@ def labels(table: Table, name: str) -> list[str]:
 def cell_error(table: Table, name: str, row: int, problem: str) -> InputError:
     """The error that names file, line and column before the problem."""
     number = table.lines[row] if row < len(table.lines) else row + 1
-    sheet = f", sheet {shown(table.sheet)}" if table.sheet else ""
+    of = table.parts[row] if row < len(table.parts) else table.sheet
+    sheet = f", sheet {shown(of)}" if of else ""
     place = (
         f"cell {table.places[name]}{number}"
         if name in table.places
@@ -264,6 +267,7 @@ def of_layout(where: layout.Layout, path: str | os.PathLike[str], kept: Collecti
         sha256_of(_content(Path(path))),
         places=where.places,
         sheet=where.sheet,
+        parts=where.parts,
     )
 
 

@@ -80,8 +80,14 @@ _WRITTEN_NUMBER = (
     r"[+\-−]?\d{1,3}(?:[ '’.,\u00a0\u202f]\d{3})+(?:[.,]\d+)?(?!\d)|[+\-−]?\d+(?:[.,]\d+)?"
 )
 _MINUTES = r"(?:\s*°\s*(?P<minutes>\d+(?:[.,]\d+)?)\s*['′’])?"
+_ROUGH = re.compile(
+    r"nomin\w*|approx\w*|about|circa|\bca\b|\bcca\b|≈|~|\bnenn|ungefahr|omtrent|aprox\w*|environ|пример\w*|около|"
+    r"номин\w*|约|标称",
+    re.IGNORECASE,
+)
+"""Words of a value that is a reference but for them."""
 _UNSURE = re.compile(
-    r"nomin|approx|about|circa|\bca\b|\bcca\b|≈|~|\bnenn|ungefahr|omtrent|aprox|environ|пример|около|номин|约|标称|"
+    rf"{_ROUGH.pattern}|"
     r"uncert|\bunc\b|unsicher|usikker|incert|погреш|不确定|toler|limit|grenz|range|bereich|диапазон|范围|量程|"
     r"\bmin\b|\bmax\b|\bstd|\bsd\b|sigma|σ|±|spec|resol|offset|drift|gradient|noise|toolface|survey|tool face",
     re.IGNORECASE,
@@ -113,7 +119,9 @@ _SPELT = {
 def stated_above(rows: Sequence[Sequence[object]]) -> Titles:
     """What rows above a table say of the tool, the day and the place, as metadata."""
     block = titles(rows)
-    return block._replace(metadata={**references_in(rows), **block.metadata})
+    references = references_in(rows)
+    rough = {c: text for c, text in rough_in(rows).items() if c not in references}
+    return block._replace(metadata={**references, **block.metadata}, not_taken=rough)
 
 
 def references_in(rows: Iterable[Sequence[object]]) -> dict[str, float]:
@@ -135,6 +143,23 @@ def references_in(rows: Iterable[Sequence[object]]) -> dict[str, float]:
                     dict.fromkeys(_values(quantity, match))
                 )
     return {column: next(iter(each)) for column, each in values.items() if len(each) == 1}
+
+
+def rough_in(rows: Iterable[Sequence[object]]) -> dict[str, str]:
+    """The lines above a table that state a nominal or approximate reference, by column of a run file.
+
+    >>> rough_in([["Nominal field", "48 500 nT"], ["Field uncertainty 50 nT"]])
+    {'ref_field_nt': 'Nominal field 48 500 nT'}
+    """
+    lines: dict[str, str] = {}
+    for row in rows:
+        line = " ".join(filter(None, (as_text(cell).strip() for cell in row)))
+        bare = _ROUGH.sub(" ", _plain(line))
+        if bare == _plain(line):
+            continue
+        for column in references_in([[bare]]):
+            lines.setdefault(column, line)
+    return lines
 
 
 def _plain(text: str) -> str:
