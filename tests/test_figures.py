@@ -446,7 +446,8 @@ def test_signatures_are_on_the_first_printed_page():
     outcome = page[page.index('<section id="outcome">') : page.index('<section id="verification">')]
     assert 'id="signatures"' in outcome
     printed = page[page.index("#outcome { display: flex") : page.index("</style>")]
-    assert "#outcome > .sign { order: -2" in printed
+    assert "#outcome > .sign { order: 1" in printed
+    assert "#outcome > .know { order: 2" in printed
 
 
 @pytest.mark.usefixtures("without_pictures")

@@ -169,7 +169,14 @@ class Seen:
         self.page.set_viewport_size({"width": width, "height": 900})
         self.page.emulate_media(color_scheme=scheme)
 
+    def unfold(self):
+        """Opens what is folded."""
+        self.page.eval_on_selector_all(
+            "details", "all => all.forEach((fold) => (fold.open = true))"
+        )
+
     def faults(self):
+        self.unfold()
         return self.page.evaluate(FAULTS)
 
     def accessibility_faults(self):
@@ -285,6 +292,33 @@ def test_a_page_says_the_same_without_its_script(written, open_page):
     plain = open_page(written("calibrate"), java_script_enabled=False)
     helped = open_page(written("calibrate"))
     assert plain.page.inner_text("main") == helped.page.inner_text("main")
+
+
+def test_a_station_is_shown_in_every_picture_and_table(written, open_page):
+    """Under the pointer, and by a click that opens the folded table of its row."""
+    seen = open_page(written("calibrate"))
+    seen.look(1280, "light")
+    points = seen.page.locator("#residuals figure use[data-name^='station 7:']")
+    points.first.scroll_into_view_if_needed()
+    box = points.first.bounding_box()
+    seen.page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    linked = seen.page.locator(".linked")
+    assert linked.count() > 8  # spheres, six errors after and before, the misfit, and rows
+    names = seen.page.eval_on_selector_all(
+        ".linked", "all => all.map((e) => e.dataset.name ?? e.dataset.point)"
+    )
+    assert {name.split(":")[0] for name in names} == {"station 7"}
+    row = seen.page.locator("#stations tr[data-point='station 7']")
+    assert not row.is_visible()
+    seen.page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    assert row.is_visible()
+    assert seen.complaints == []
+
+
+def test_folded_tables_are_printed(written, open_page):
+    sheets = open_page(written("calibrate"), java_script_enabled=False).paper()
+    assert any("SHA-256" in sheet.text for sheet in sheets)
+    assert any("largest change" in sheet.text for sheet in sheets)
 
 
 # ------------------------------------------------------------------ planted faults are found
@@ -445,6 +479,7 @@ def test_points_of_a_picture_say_their_station_and_value(written, open_page):
     seen = open_page(written("calibrate"))
     page = seen.page
     rows = page.locator("#stations tbody tr")
+    seen.unfold()
     expected = {row.split("\t")[0]: row.split("\t") for row in rows.all_inner_texts()}
     picture = page.locator("figure svg", has=page.locator("use[data-name]")).last
     picture.focus()

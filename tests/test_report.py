@@ -19,6 +19,7 @@ from markupsafe import Markup
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.record import Finding
 from mwdcal.calibration.results import accuracy_at, accuracy_curves, readings_at, typical_accuracy
 from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import reference_vectors
@@ -28,6 +29,7 @@ from mwdcal.presentation import calibration_page, conversion
 from mwdcal.presentation.calibration_page import render
 from mwdcal.presentation.numbers import fixed, measured, number, quantity, signed
 from mwdcal.presentation.page import css, svg
+from mwdcal.presentation.typed import leading_findings
 from mwdcal.sensor.profile import Profile, TriadProfile
 from mwdcal.use import plots
 from mwdcal.use.notation import convert
@@ -104,6 +106,10 @@ class Row:
     sets: list = field(default_factory=list)
     degrees_of_freedom: float | None = 8.0
 
+    @property
+    def freedom(self):
+        return self.degrees_of_freedom
+
 
 @dataclass
 class Outcome:
@@ -129,7 +135,7 @@ def whole():
 def words(monkeypatch):
     """`render` without its pictures, for tests of what it says."""
     for name in (
-        *("errors", "deviations", "accuracy", "orders", "temperature"),
+        *("errors", "deviations", "accuracy", "orders", "temperature", "sphere", "errors_of_all"),
         *("accuracy_over_temperature", "errors_by_temperature"),
     ):
         monkeypatch.setattr(plots.Plots, name, lambda *arguments: "")
@@ -208,6 +214,79 @@ def test_no_point_has_the_name_of_another(whole):
     assert len(names) == sum(row.reshoot for row in whole.station_rows)
 
 
+def test_spheres_show_the_readings_before_and_after(whole):
+    """The vectors that are drawn follow from angles and errors; these are the readings themselves."""
+    made = run()
+    raw = [made.accelerometer, made.magnetometer]  # in nominal units
+    fitted = whole.fields(made)
+    sizes = 1.0, whole.earth["field"]
+    for name, wanted in (("errors_before", raw), ("errors", fitted)):
+        for drawn, vector, size in zip(
+            plots._unit_vectors(whole, name), wanted, sizes, strict=True
+        ):
+            np.testing.assert_allclose(drawn, vector / size, atol=1e-9)
+
+
+def test_columns_of_panels_are_pictures_of_their_own(whole):
+    """Nothing of the picture is lost, and each part begins where the last one ends."""
+    for figure, columns, legends in (
+        (whole.plot.sphere(), 2, 1),
+        (whole.plot.errors_of_all(), 2, 0),
+        (whole.plot.accuracy(), 2, 1),
+    ):
+        drawn = svg(figure, "k")
+        parsed(drawn)
+        assert drawn.count("<svg") == columns + legends
+        assert drawn.count('class="legend"') == legends
+        assert len(re.findall(r'<g id="k-axes_\d+">', drawn)) == len(figure.axes)
+        boxes = re.findall(r'tabindex="0" viewBox="(\S+) (\S+) (\S+) (\S+)"', drawn)
+        ends = [(float(left), float(left) + float(width)) for left, _, width, _ in boxes]
+        assert ends[0][0] == 0
+        assert ends[0][1] == pytest.approx(ends[1][0], abs=0.02)
+        assert ends[1][1] == pytest.approx(72 * figure.get_figwidth(), abs=0.02)
+        used = set(re.findall(r'(?:href="#|url\(#)([^")]+)', drawn))
+        assert used <= set(parsed(drawn).ids)
+
+
+def test_gauges_show_value_and_expanded_uncertainty_against_the_limit(whole):
+    row = Row(name="error of azimuth", value=0.3, uncertainty=0.1, passed=True)
+    worse = Row(name="spread of azimuth", value=0.9, uncertainty=0.1, degrees_of_freedom=4.0)
+    inclination, toolface, azimuth = calibration_page._gauges(
+        whole, Outcome(False, [row, worse]), None
+    )
+    assert (azimuth.name, azimuth.word, azimuth.limit) == ("spread of azimuth", "FAIL", "limit 1°")
+    assert azimuth.shown == "0.90 ± 0.28°"  # t(95 %, 4) = 2.776 of a table
+    assert azimuth.value / azimuth.bound == pytest.approx(0.9)
+    assert azimuth.span[1] / azimuth.bound == pytest.approx(0.9 + 0.2776, rel=1e-3)
+    assert {each.word for each in (inclination, toolface)} == {"not tested"}
+    assert inclination.bound is None
+
+
+def test_every_limit_that_is_not_met_has_a_gauge(whole):
+    rows = [
+        Row(name="spread of gravity", unit="g", value=0.01, limit=0.003),
+        Row(passed=True, value=0.1),
+    ]
+    shown = [each.name for each in calibration_page._gauges(whole, Outcome(False, rows), None)]
+    assert shown == ["inclination", "toolface", "spread of azimuth", "spread of gravity"]
+
+
+def finding(name, text="words", station=None):
+    return Finding(id=name, text=text, station=station)
+
+
+def test_findings_are_grouped_by_cause_and_the_most_important_come_first():
+    again = [finding("reshoot", f"station {i} moved. Re-shoot it", str(i)) for i in range(3)]
+    shown, left = leading_findings(
+        [finding("not-used"), finding("settings"), *again, finding("altered")]
+    )
+    assert [each.id for each in shown] == ["altered", "reshoot", "settings", "not-used"]
+    assert shown[1].text == "station 0 moved. Re-shoot it. Also stations 1, 2"
+    assert left == 0
+    shown, left = leading_findings([finding(f"cause-{i}") for i in range(9)])
+    assert (len(shown), left) == (6, 3)
+
+
 def test_every_section_is_present(page):
     assert set(SECTIONS) <= set(parsed(page).ids)
     for words in (
@@ -221,14 +300,16 @@ def test_user_settings_of_matplotlib_change_nothing(whole, page):
     import matplotlib as mpl
 
     with mpl.rc_context({"font.size": 20, "axes.facecolor": "red", "svg.fonttype": "none"}):
-        assert svg(whole.plot.errors("gravity"), "error-gravity") in page
+        assert svg(whole.plot.errors_of_all(), "errors-after") in page
         assert mpl.rcParams["font.size"] == 20
 
 
 def test_station_to_reshoot_is_first_and_marked(page):
     assert "Fit accepted – 1 station to re-shoot" in page
-    assert page.index("Station P7: residual") < page.index('id="errors"')
-    assert re.search(r'<tr class="mark"><td>P7</td>.*?re-shoot', page, re.DOTALL)
+    assert page.index("Station P7: residual") < page.index('id="signatures"')
+    assert re.search(
+        r'<tr class="mark" data-point="station P7"><td>P7</td>.*?re-shoot', page, re.DOTALL
+    )
 
 
 def test_clean_fit_says_so(words):

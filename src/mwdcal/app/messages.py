@@ -33,7 +33,7 @@ from mwdcal.presentation.text import (
     without_passwords,
 )
 from mwdcal.presentation.text import slowly as slowly
-from mwdcal.presentation.typed import with_option_names
+from mwdcal.presentation.typed import leading_findings, with_option_names
 
 if TYPE_CHECKING:
     from mwdcal.calibration.record import Finding
@@ -232,13 +232,16 @@ def lines(findings: Iterable[Finding]) -> list[str]:
 
 
 def print_result(result: Any, findings: Iterable[Finding] = ()) -> None:
-    """The result on stdout, text for people or else JSON; then findings on stderr."""
+    """The result on stdout, text for people or else JSON; then findings on stderr, the most important first."""
     if not isinstance(result, str):
         click.echo(_shown(to_json(result)))
     elif not quiet():
         click.echo(_on_screen(escape_controls(result), sys.stdout))
-    for line in lines(findings):
+    shown, left = leading_findings(findings)
+    for line in lines(shown):
         say(line)
+    if left:
+        say(f"! and {left} more: see the report, or --json")
 
 
 def _shown(document: str) -> str:

@@ -46,8 +46,6 @@ from mwdcal.presentation.typed import findings_with_option_names
 if TYPE_CHECKING:
     from mwdcal.use.verification import Verdict
 
-MOST_RESHOOTS = 12
-"""Most stations to re-shoot that messages name."""
 MOST_EXCLUDED = 20
 """Most stations left out of the fit that the screen names."""
 PROFILE = " (see [stand] of the tool profile)"
@@ -157,15 +155,6 @@ def screen(
     files = files_written(calibration=output, report=report)
     after = f"\n\n{judged}" if judged else f"   next: mwdcal verify {one_line(output)} ROLLTEST.csv"
     return f"{body(calibration, tried)}\n{files}{after}"
-
-
-def first_findings(calibration: Calibration) -> list[Finding]:
-    """The findings; of stations to re-shoot the first ones, and how many there are besides."""
-    again = [finding for finding in calibration.findings if finding.id == "reshoot"]
-    left = again[MOST_RESHOOTS:]
-    shown = [finding for finding in calibration.findings if finding not in left]
-    more = Finding(id="reshoot", text=f"… and {len(left)} more to re-shoot")
-    return shown + ([more] if left else [])
 
 
 def remarks(calibration: Calibration) -> list[str]:

@@ -6,7 +6,8 @@ extra `report` (jinja2, matplotlib).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,14 @@ import numpy as np
 
 from mwdcal.calibration.readings import is_simulated, soaks
 from mwdcal.calibration.record import MAGNETIC, Calibration, Finding, TriadCalibration
-from mwdcal.calibration.results import accuracy_at, angles, middle_temperature, without_temperature
+from mwdcal.calibration.results import (
+    accuracy_at,
+    angles,
+    middle_temperature,
+    typical_accuracy,
+    without_temperature,
+)
+from mwdcal.certificate.decisions import coverage_of
 from mwdcal.errors import InputError
 from mwdcal.estimation.solvers import RANK_TOLERANCE
 from mwdcal.geometry.observables import TITLES
@@ -24,17 +32,25 @@ from mwdcal.presentation.calibration import (
     how,
     known_inclinations,
 )
-from mwdcal.presentation.numbers import HELD, capital, exponent, factor_places
+from mwdcal.presentation.numbers import (
+    HELD,
+    capital,
+    estimate,
+    exponent,
+    factor_places,
+    quantity,
+    uncertainty,
+)
 from mwdcal.presentation.page import banner, environment
 from mwdcal.presentation.text import plural, raised
-from mwdcal.presentation.typed import findings_with_option_names
-from mwdcal.presentation.verification import BETWEEN_SETS, freedom, noise_free
+from mwdcal.presentation.typed import findings_with_option_names, leading_findings
+from mwdcal.presentation.verification import BETWEEN_SETS, after_failure, freedom, noise_free
 from mwdcal.use import plots
 from mwdcal.use.notation import Notation, convert
-from mwdcal.use.verification import SETTING_PRACTICES
+from mwdcal.use.verification import SETTING_PRACTICES, fewest_degrees_of_freedom
 
 if TYPE_CHECKING:
-    from mwdcal.use.verification import Verdict, VerdictRow
+    from mwdcal.use.verification import Limits, Verdict, VerdictRow
 
 SHOWN_DEPARTURES = {"spread": "departure from the middle of the roll set", "error": "error"}
 """What the stations of a roll test show of each kind of limit."""
@@ -47,21 +63,31 @@ ACCURACY_INCLINATIONS = (5.0, 45.0, 90.0)
 
 
 def render(
-    calibration: Calibration, verdict: Verdict | None = None, *metadata: Mapping[str, object]
+    calibration: Calibration,
+    verdict: Verdict | None = None,
+    *metadata: Mapping[str, object],
+    limits: Limits | None = None,
 ) -> str:
     """The report as HTML: the same input gives the same text, byte for byte.
 
-    `metadata` are those of the roll test behind the verdict.
+    `metadata` are those of the roll test behind the verdict, `limits` those that a roll test will have to meet.
     """
     pages = environment()
     pages.filters |= {"freedom": freedom, "noise_free": noise_free}
     template = pages.get_template("report.html")
+    findings = _findings(calibration, verdict)
+    first, left = leading_findings(findings)
     return template.render(
         cal=calibration,
         name=calibration.tool.get("serial") or calibration.profile.name,
         verdict=verdict,
         banner=outcome(calibration, verdict),
-        findings=_findings(calibration, verdict),
+        findings=findings,
+        first_findings=first,
+        left=left,
+        spherical=_spherical(calibration),
+        gauges=list(_gauges(calibration, verdict, limits)),
+        steps=_steps(calibration, verdict),
         simulated=any(map(is_simulated, (calibration.tool, *metadata))),
         inclinations=known_inclinations(calibration),
         method="; ".join(how(calibration)),
@@ -90,10 +116,7 @@ def outcome(calibration: Calibration, verdict: Verdict | None) -> dict[str, str]
     word = "OK" if level == "good" else "Attention"
     if verdict is None:
         expected = ", ".join(accuracy_in_words(calibration))
-        after = (
-            f"{fit}. Accuracy to expect (1σ, calibration alone, typical): {expected or 'not stated'}. "
-            "Verify by a roll test that was not used in the fit: mwdcal verify."
-        )
+        after = f"{fit}. Accuracy to expect (1σ, calibration alone, typical): {expected or 'not stated'}."
         unverified = "Calibrated – not yet verified"
         return banner("open" if level == "good" else level, "Not verified", unverified, after)
     missed = [row.name for row in verdict.rows if not row.passed]
@@ -102,6 +125,98 @@ def outcome(calibration: Calibration, verdict: Verdict | None) -> dict[str, str]
         headline = f"Verification failed – {len(missed)} of {count} not met"
         return banner("bad", "Failed", headline, f"Not met: {', '.join(missed)}. {fit}.")
     return banner(level, word, f"Verification passed – {count} met", fit)
+
+
+def _spherical(calibration: Calibration) -> bool:
+    """Whether there are stations to draw on spheres: attitudes, and errors before and after."""
+    attitudes = ("inclination", "toolface", *(["azimuth"] if calibration.has_field else []))
+    return bool(calibration.errors) and any(
+        None not in [getattr(row, f"{name}_deg") for name in attitudes]
+        for row in calibration.station_rows
+    )
+
+
+@dataclass(frozen=True)
+class AngleGauge:
+    """An angle against its limit: what is shown of it, its outcome, and a bar of 100 units.
+
+    `span` is from value less U to value plus U.
+    """
+
+    name: str
+    shown: str
+    limit: str
+    level: str
+    word: str
+    value: float
+    span: tuple[float, float]
+    bound: float | None
+
+
+def _gauges(
+    calibration: Calibration, verdict: Verdict | None, limits: Limits | None
+) -> Iterator[AngleGauge]:
+    """Each angle as value ± U against the limit that is nearest, and every other limit that is not met.
+
+    An angle without a roll test, or without a limit, has the U to expect of the calibration alone.
+    """
+    rows = verdict.rows if verdict else []
+    bounds = dict([*limits.spread.items(), *limits.error.items()]) if limits and not rows else {}
+    worst = sorted(rows, key=lambda row: (row.passed, -_nearness(row)))
+    k, shown = coverage_of(fewest_degrees_of_freedom(calibration)), []
+    for name, sd in typical_accuracy(calibration).items():
+        judged = [row for row in worst if row.name.endswith(f" of {name}")]
+        if judged:
+            shown.append(judged[0])
+            yield _judged(judged[0])
+        else:
+            expanded = None if sd is None else k * sd
+            expected = f"± {uncertainty(expanded)}{'°' * (sd is not None)} expected"
+            yield _gauge(
+                name, expected, 0.0, expanded, bounds.get(name), "°", ("open", "not tested")
+            )
+    yield from (_judged(row) for row in worst if not row.passed and row not in shown)
+
+
+def _judged(row: VerdictRow) -> AngleGauge:
+    """The gauge of a limit that was tested."""
+    expanded = None if row.uncertainty is None else coverage_of(row.freedom) * row.uncertainty
+    shown = "not stated" if row.value is None else estimate(row.value, expanded, row.unit)
+    outcome = ("good", "pass") if row.passed else ("bad", "FAIL")
+    return _gauge(row.name, shown, row.value, expanded, row.limit, row.unit, outcome)
+
+
+def _nearness(row: VerdictRow) -> float:
+    """Share of the limit that a value takes with its uncertainty."""
+    return ((row.value or 0.0) + 2 * (row.uncertainty or 0.0)) / row.limit
+
+
+def _gauge(
+    name: str, shown: str, value: float | None, expanded: float | None, limit: float | None,
+    symbol: str, outcome: tuple[str, str],
+) -> AngleGauge:  # fmt: skip
+    """A gauge on which the limit stands at four fifths, unless the value needs the room."""
+    low, high = ((value or 0.0) + sign * (expanded or 0.0) for sign in (-1, 1))
+    whole = max((limit or 0.0) / 0.8, high * 1.05) or 1.0
+    said = f"limit {quantity(limit, symbol)}" if limit else "no limit"
+    span = max(100 * low / whole, 0.0), 100 * high / whole
+    bound = 100 * limit / whole if limit else None
+    return AngleGauge(name, shown, said, *outcome, 100 * (value or 0.0) / whole, span, bound)
+
+
+def _steps(calibration: Calibration, verdict: Verdict | None) -> list[str]:
+    """What to do next: stations to measure again, then the next command."""
+    again = sum(row.reshoot for row in calibration.station_rows)
+    steps = [f"Measure {plural(again, 'station')} again, and calibrate once more."] if again else []
+    if verdict is None:
+        return [
+            *steps,
+            "Verify the calibration with a roll test that the fit has not seen: mwdcal verify CAL.json ROLLTEST.csv",
+        ]
+    if verdict.passed:
+        return [*steps, "Issue the certificate: mwdcal certificate CAL.json --verification V.json"]
+    places, command = after_failure(verdict, "CAL.json", verdict.run)
+    return [*steps, f"Measure again: {places}.", f"See what the failure looks like: {command}"]
 
 
 def _fit_outcome(calibration: Calibration) -> tuple[str, str]:
@@ -128,13 +243,13 @@ def _fit_outcome(calibration: Calibration) -> tuple[str, str]:
 
 
 def _findings(calibration: Calibration, verdict: Verdict | None) -> list[Finding]:
-    """Findings and advice, each once; stations to re-shoot first."""
+    """Findings and advice, each once."""
     findings = {f.text: f for f in calibration.findings}
     ids = {f.id for f in calibration.findings}
     for extra in verdict.findings if verdict else ():
         if extra.id not in ids:
             findings.setdefault(extra.text, extra)
-    return sorted(findings_with_option_names(findings.values()), key=lambda f: f.id != "reshoot")
+    return findings_with_option_names(findings.values())
 
 
 def _when(time: str) -> str:

@@ -6,11 +6,12 @@ What all pages share: the templates, what these call, and the box on top.
 from __future__ import annotations
 
 import io
+import itertools
 import re
 from base64 import b64encode
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from hashlib import sha256
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from mwdcal import __version__, extras
 from mwdcal.calibration.readings import head
@@ -58,13 +59,14 @@ def picture(figure: Figure, suffix: str) -> bytes:
 def svg(figure: Figure, key: str) -> Markup:
     """An element to put into HTML: no prologue, no names of schemas, ids that start with `key`.
 
-    It takes the focus, so that a picture wider than the screen can be scrolled by keys.
+    Columns of panels are pictures side by side, which a narrow screen shows below each other. Each takes the focus,
+    so that a picture wider than the screen can be scrolled by keys.
     """
     from markupsafe import Markup
 
     text = "<svg" + picture(figure, ".svg").decode().partition("<svg")[2]
     text = re.sub(
-        r"<!--.*?-->\s*|<metadata>.*?</metadata>\s*|<style.*?</style>\s*", "", text, flags=re.DOTALL
+        r"<!--.*?-->\n|<metadata>.*?</metadata>\s*|<style.*?</style>\s*", "", text, flags=re.DOTALL
     )
     text = re.sub(r' xmlns(:\w+)?="[^"]*"', "", text)
     text = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{key}-", text)
@@ -76,7 +78,93 @@ def svg(figure: Figure, key: str) -> Markup:
     head, rest = escape_controls(text).split(">", 1)
     text = re.sub(r' (width|height|version)="[^"]*"', "", head) + ">" + rest
     seen = f'<svg role="img" aria-label="{figure.get_label()}" tabindex="0"'
-    return Markup(text.replace("<svg", seen, 1))
+    text = text.replace("<svg", seen, 1)
+    return Markup(_side_by_side(text, key, figure))
+
+
+Box: TypeAlias = tuple[float, float, float, float]
+"""Left, top, right and bottom of a part of a picture, in points."""
+STRIP_MARGIN = 2.0
+"""Above and below the panels of a column, points."""
+
+
+def _columns(figure: Figure) -> list[list[Any]]:
+    """The panels of each column of a figure; empty where one spans several, or there is one column."""
+    columns: dict[int, list[Any]] = {}
+    for axes in figure.axes:
+        place = axes.get_subplotspec()
+        if place is None or len(place.colspan) > 1:
+            return []
+        if axes.get_visible():
+            columns.setdefault(place.colspan.start, []).append(axes)
+    return [columns[k] for k in sorted(columns)] if len(columns) > 1 else []
+
+
+def _box(figure: Figure, *artists: Any) -> Box:
+    """The box around what was drawn."""
+    each = [artist.get_tightbbox().extents * 72 / figure.dpi for artist in artists]
+    left, low, right, high = (
+        pick(box[k] for box in each) for k, pick in enumerate((min, min, max, max))
+    )
+    height = 72 * figure.get_figheight()
+    return left, height - high, right, height - low
+
+
+@style()
+def _side_by_side(text: str, key: str, figure: Figure) -> str:
+    """A picture taken apart into its legends and its columns of panels, which a narrow screen shows below each other.
+
+    It stays whole where it has one column, or more than panels and legends above or below them.
+    """
+    columns = _columns(figure)
+    *groups, foot = re.split(r"^(?=  <g id=)|^(?= </g>\n)", text, flags=re.MULTILINE)
+    drawn = {
+        match[1]: part for part in groups if (match := re.match(rf'  <g id="{key}-(\w+)"', part))
+    }
+    drawn.pop("patch_1", None)
+    visible = [axes for axes in figure.axes if axes.get_visible()]
+    names: dict[Any, str] = {axes: f"axes_{place}" for place, axes in enumerate(visible, 1)}
+    names |= {legend: f"legend_{place}" for place, legend in enumerate(figure.legends, 1)}
+    if not columns or {*names.values()} != {*drawn}:
+        return text
+    width, height = 72 * figure.get_figwidth(), 72 * figure.get_figheight()
+    boxes = [_box(figure, *column) for column in columns]
+    top = max(min(box[1] for box in boxes) - STRIP_MARGIN, 0.0)
+    low = min(max(box[3] for box in boxes) + STRIP_MARGIN, height)
+    legends = [(legend, _box(figure, legend)) for legend in figure.legends]
+    if any(box[1] < low - STRIP_MARGIN and box[3] > top + STRIP_MARGIN for _, box in legends):
+        return text
+    edges = [0.0, *((a[2] + b[0]) / 2 for a, b in itertools.pairwise(boxes)), width]
+    label = figure.get_label()
+    panels = "".join(
+        _part(
+            (left, top, right, low), [drawn[names[axes]] for axes in column], foot * (not left)
+        ).replace(
+            "<svg",
+            f'<svg role="img" aria-label="{label}, {place} of {len(columns)}" tabindex="0"',
+            1,
+        )
+        for place, (column, left, right) in enumerate(
+            zip(columns, edges, edges[1:], strict=False), 1
+        )
+    )
+    shares = " ".join(f"{right - left:.0f}fr" for left, right in itertools.pairwise(edges))
+    panels = f'<div class="panels" style="--columns: {shares}">{panels}</div>'
+    for legend, box in legends:
+        left, wide = box[0], box[2] - box[0]
+        place = f"--left: {left / width:.1%}; --width: {wide / width:.1%}; --most: {wide:.0f}pt"
+        look = f'<svg class="legend" role="img" aria-label="legend" style="{place}"'
+        drawing = _part(box, [drawn[names[legend]]], "").replace("<svg", look, 1)
+        panels = drawing + panels if box[3] <= top + STRIP_MARGIN else panels + drawing
+    return panels
+
+
+def _part(box: Box, groups: Iterable[str], foot: str) -> str:
+    """Some groups of a picture as a picture of their own; `foot` holds what all refer to."""
+    left, top, right, low = box
+    view = f'viewBox="{left:.2f} {top:.2f} {right - left:.2f} {low - top:.2f}"'
+    shared = foot.partition("</g>\n")[2].removesuffix("</svg>\n").strip()
+    return f"<svg {view}>{''.join(groups)}{shared}</svg>"
 
 
 def _with_names(text: str, start: str, names: list[str]) -> str:

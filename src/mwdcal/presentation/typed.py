@@ -12,6 +12,19 @@ from msgspec.structs import replace
 if TYPE_CHECKING:
     from mwdcal.calibration.record import Finding
 
+MOST_FINDINGS = 6
+"""Most findings that a screen, or the first page of a report, shows."""
+MOST_ALSO = 12
+"""Most stations that a finding names besides its own."""
+IMPORTANT = (
+    "altered", "revoked", "unsound", "contradicted", "not-judged", "partly-judged", "reshoot", "repeated-readings",
+    "misfit", "accelerometer-residuals", "magnetometer-residuals", "looks-like", "column-explains",
+    "outside-temperature", "changed", "standard-overdue",
+)  # fmt: skip
+"""Beginnings of the ids of findings that come first, the most important first."""
+MINOR = ("not-used", "renamed-columns", "reference-unused", "settings-assumed", "unsigned")
+"""Beginnings of the ids of findings that come last."""
+
 
 def with_option_names(text: str) -> str:
     """A message of the library with the options of the command that runs instead of its arguments.
@@ -30,3 +43,36 @@ def with_option_names(text: str) -> str:
 def findings_with_option_names(findings: Iterable[Finding]) -> list[Finding]:
     """The findings in the words of the command that runs."""
     return [replace(finding, text=with_option_names(finding.text)) for finding in findings]
+
+
+def leading_findings(findings: Iterable[Finding]) -> tuple[list[Finding], int]:
+    """One finding for each cause, the most important first, six at most; and how many causes are left.
+
+    Findings of one id have one cause: the first speaks for all, and names the stations of the others.
+    """
+    causes: dict[str, list[Finding]] = {}
+    for finding in findings:
+        alike = f"{finding.id}: {finding.text}" if not finding.station else finding.id
+        causes.setdefault(alike, []).append(finding)
+    ordered = sorted(causes.values(), key=lambda cause: _rank(cause[0].id))
+    return [_with_others(cause) for cause in ordered[:MOST_FINDINGS]], len(ordered[MOST_FINDINGS:])
+
+
+def _rank(name: str) -> int:
+    """The place of a finding in the order of importance."""
+    for place, start in enumerate(IMPORTANT):
+        if name.startswith(start):
+            return place - len(IMPORTANT)
+    return int(name.startswith(MINOR))
+
+
+def _with_others(cause: list[Finding]) -> Finding:
+    """The first finding of a cause, with the stations of the others."""
+    first, *others = cause
+    if not others:
+        return first
+    stations = [str(finding.station) for finding in others]
+    named = ", ".join(stations[:MOST_ALSO])
+    plural = "s" * (len(stations) > 1)
+    more = f" and {len(stations) - MOST_ALSO} more" if len(stations) > MOST_ALSO else ""
+    return replace(first, text=f"{first.text.rstrip('.')}. Also station{plural} {named}{more}")

@@ -52,7 +52,7 @@ def screen(
 
 def next_step(result: Verdict, calibration: Path, run: Path) -> str:
     """Lines below a failed roll test: what to measure again, and the command that says what it looks like."""
-    again, command = _after_failure(result, calibration, run)
+    again, command = after_failure(result, calibration, run)
     if not again:
         return ""
     return f"\n\nmeasure again: {again}\nnext: {command}   (what it looks like)"
@@ -60,14 +60,14 @@ def next_step(result: Verdict, calibration: Path, run: Path) -> str:
 
 def with_next_step(result: Verdict, calibration: Path, run: Path) -> Verdict:
     """The verdict with a finding `next-step` where a value failed, for machines: files by name, wherever they lie."""
-    again, command = _after_failure(result, Path(calibration.name), Path(run.name))
+    again, command = after_failure(result, Path(calibration.name), Path(run.name))
     if not again:
         return result
     text = f"Measure again: {again}. What the failure looks like says: {command}"
     return replace(result, findings=[*result.findings, Finding(id="next-step", text=text)])
 
 
-def _after_failure(result: Verdict, calibration: Path, run: Path) -> tuple[str, str]:
+def after_failure(result: Verdict, calibration: Path | str, run: Path | str) -> tuple[str, str]:
     """Where values failed, each place once, and the command that says what it looks like; empty if none failed."""
     failed = [row for row in result.rows if row.value is not None and not row.passed]
     places = dict.fromkeys(row.note.partition(";")[0] for row in failed)

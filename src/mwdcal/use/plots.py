@@ -23,7 +23,7 @@ from mwdcal.calibration.residuals import RESHOOT
 from mwdcal.calibration.results import TYPICAL, accuracy_at, accuracy_curves, middle_temperature
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import TITLES
-from mwdcal.geometry.vectors import AnyArray, Array, Ints
+from mwdcal.geometry.vectors import AnyArray, Array, Ints, reference_vectors
 from mwdcal.use.notation import ChannelCourse, channel_courses
 from mwdcal.use.roll_test import basis
 from mwdcal.use.verification import JudgedSet, Verdict, VerdictRow
@@ -104,15 +104,16 @@ def new_figure(
     rows: int = 1,
     columns: int = 1,
     layout: Literal["constrained"] | None = "constrained",
+    width: float = WIDTH,
     **grid: Any,
 ) -> tuple[Figure, Any]:
     """A figure as wide as a page, and its empty panels (rows, columns).
 
-    `label` is what the figure shows, `height` in inches, `grid` as of `Figure.subplots`.
+    `label` is what the figure shows, `height` and `width` in inches, `grid` as of `Figure.subplots`.
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(WIDTH, height), layout=layout)
+    figure = Figure(figsize=(width, height), layout=layout)
     figure.set_label(label)
     return figure, figure.subplots(rows, columns, squeeze=False, **grid)
 
@@ -237,7 +238,8 @@ def _accuracy_axes(figure: Figure, panels: Sequence[Axes]) -> Figure:
     """The parts that both panels share: plain numbers, and one legend of all curves."""
     low, high = panels[0].get_ylim()
     plain_numbers(panels[0].yaxis, *((1.0, 2.0, 5.0) if high / low < 300 else (1.0,)))
-    panels[0].set_ylabel("1σ, °")
+    for axes in panels:
+        axes.set_ylabel("1σ, °")
     handles, labels = panels[0].get_legend_handles_labels()
     place: dict[str, Any] = {"loc": "outside upper left", "ncols": max(len(labels), 1)}
     if labels:
@@ -286,6 +288,103 @@ def reshoot_limit(calibration: Calibration) -> float:
     return float(-ndtri(RESHOOT / max(len(calibration.station_rows), 1) / 2))
 
 
+SPHERE_VIEW = np.array([[-0.5, 0.866, 0.0], [-0.296, -0.171, 0.94], [0.814, 0.47, 0.342]])
+"""Right, up and towards the reader of a sphere, in the tool's frame: its axis is upright, and leans to the reader."""
+SHOWN_DEPARTURE = 0.2
+"""Length, in radii, to which the largest departures on a sphere are drawn at most."""
+
+
+def _unit_vectors(
+    calibration: Calibration, errors: Literal["errors", "errors_before"] | None = None
+) -> Sequence[Array]:
+    """Readings (n, 3) of each triad, in shares of gravity and field: with the errors of the fit, those before, or none.
+
+    Definition: the six observables fix both vectors; an error without a reference counts as zero.
+    """
+    rows, known = calibration.station_rows, {row.observable: row for row in calibration.errors}
+    sizes: dict[str, float] = {
+        "mg": 1e-3,
+        "‰": 1e-3,
+        "°": np.radians(1.0),
+        "nT": 1 / calibration.earth.get("field", 1.0),
+    }
+
+    def error(name: str, when: str) -> Array:
+        values = np.array([getattr(row, when).get(name, 0.0) for row in rows], float)
+        unit = known[name].unit.partition(" ")[0] if name in known else ""
+        return np.asarray(values * sizes.get(unit, 0.0))
+
+    def reference(name: str) -> Array:
+        degrees = np.array([getattr(row, f"{name}_deg") for row in rows], float)
+        return np.asarray(np.radians(degrees))
+
+    inclination = reference("inclination") - error("inclination", "errors")
+    weight = np.maximum(np.sin(inclination), 1e-3)
+    values: dict[str, Any] = {"inclination": inclination, "gravity": 1.0, "field": 1.0}
+    values["dip"] = np.radians(calibration.earth.get("dip_deg", 0.0))
+    values["toolface"] = reference("toolface") - error("toolface", "errors") / weight
+    azimuth = reference("azimuth") - error("azimuth", "errors") / weight
+    values["azimuth"] = azimuth if calibration.has_field else 0.0
+    if errors:
+        weights = {"toolface": weight, "azimuth": weight}
+        values = {n: v + error(n, errors) / weights.get(n, 1.0) for n, v in values.items()}
+    return [*reference_vectors(**values)]
+
+
+def _sphere(
+    axes: Axes, triad: str, truth: Array, departures: Sequence[Array], rows: Sequence[StationRow]
+) -> None:
+    """The sphere of a triad with its stations, and how far from them it reads before and after the fit."""
+    before, _ = sizes = [np.linalg.norm(each, axis=-1) for each in departures]
+    longest = SHOWN_DEPARTURE / max(float(np.nanquantile(before, 0.9)), 1e-9)
+    decade = 10.0 ** np.floor(np.log10(longest))
+    scale = decade * max(step for step in (1, 2, 5) if step * decade <= longest)
+    _graticule(axes)
+    x, y, towards = SPHERE_VIEW @ truth.T
+    axes.plot(x, y, ".", color="#9ca3af", ms=2.5, label="reference")
+    looks = zip(("before", "after"), (BEFORE, AFTER), ("o", "s"), (3.4, 2.6), strict=True)
+    for (name, colour, marker, small), each, size in zip(looks, departures, sizes, strict=True):
+        ends = SPHERE_VIEW @ (truth + scale * each).T
+        for far in (True, False):
+            here = np.flatnonzero((towards < 0) == far).tolist()
+            look: dict[str, Any] = {"color": colour, "alpha": 0.35 if far else 1.0}
+            lines = np.stack([[x[here], y[here]], ends[:2, here], np.full((2, len(here)), np.nan)])
+            axes.plot(*lines.transpose(1, 2, 0).reshape(2, -1), lw=0.7, **look)
+            names = [f"station {rows[i].station}: {100 * size[i]:.2g} % {name}" for i in here]
+            look |= {"mfc": "white" if name == "before" else colour, "mew": 0.8, "ms": small}
+            named_points(axes, ends[0, here], ends[1, here], names, marker, **look)
+        axes.plot(
+            [], [], marker, label=name, color=colour, mfc="white" if name == "before" else colour
+        )
+    axes.set_title(f"{triad}, departures × {scale:g}", loc="center", fontsize=7)
+
+
+def _graticule(axes: Axes) -> None:
+    """The outline of a sphere, its near parallels and meridians, and the tool axis."""
+    turn = np.radians(np.arange(0, 361, 4))
+    circles = [np.stack([np.cos(turn), np.sin(turn), 0 * turn])]
+    for level in np.radians([-60, -30, 0, 30, 60]):
+        around = np.cos(level) * circles[0]
+        axes.plot(*_near(around + np.array([[0], [0], [np.sin(level)]])), color="#e5e7eb", lw=0.5)
+    for side in np.radians(range(0, 180, 30)):
+        up = [np.cos(side) * np.cos(turn), np.sin(side) * np.cos(turn), np.sin(turn)]
+        axes.plot(*_near(np.stack(up)), color="#e5e7eb", lw=0.5)
+    axes.plot(*circles[0][:2], color="#6b7280", lw=0.8)
+    foot, top = ((0.0, SPHERE_VIEW[1, 2] * length) for length in (1.0, 1.16))
+    axes.annotate(
+        "z", foot, top, arrowprops={"arrowstyle": "<-", "lw": 0.7}, ha="center", fontsize=7
+    )
+    axes.set_aspect("equal")
+    axes.set(xlim=(-1.25, 1.25), ylim=(-1.2, 1.25))
+    axes.set_axis_off()
+
+
+def _near(curve: Array) -> Array:
+    """A curve (3, n) as it is seen (2, n), without its far side."""
+    right, up, towards = SPHERE_VIEW @ curve
+    return np.where(towards > 0, [right, up], np.nan)
+
+
 @dataclass(frozen=True)
 class Plots:
     """Figures of one calibration, as `calibration.plot`: Matplotlib figures, in the style of the report.
@@ -305,6 +404,7 @@ class Plots:
         x = np.linspace(2, 178, 45)
         figure, [panels] = new_figure("Predicted 1σ over inclination", 2.5, columns=2, sharey=True)
         for axes, (title, noise) in zip(panels, ACCURACY_OF.items(), strict=True):
+            axes.tick_params(labelleft=True)  # a panel by itself on a narrow screen has numbers too
             curves = accuracy_curves(self.calibration, np.radians(x), noise)
             _accuracy_panel(axes, x, {name: curve.typical for name, curve in curves.items()})
             for curve in curves.values():
@@ -319,6 +419,7 @@ class Plots:
         x, label = self._temperatures(), "Predicted 1σ over temperature"
         figure, [panels] = new_figure(label, 2.1, columns=2, sharey=True)
         for axes, (title, noise) in zip(panels, ACCURACY_OF.items(), strict=True):
+            axes.tick_params(labelleft=True)
             each = [accuracy_at(self.calibration, [TYPICAL], noise, at) for at in x.tolist()]
             curves = {name: np.array([sd[name][0] for sd in each]) for name in each[0]}
             _accuracy_panel(axes, x, curves)
@@ -415,6 +516,49 @@ class Plots:
         band = "  (band: ±1σ expected)" if row.expected else ""
         panels[0].set_title(f"before: rms {quantity(row.before, unit)}")
         panels[1].set_title(f"after: rms {quantity(row.after, unit)}{band}")
+        return figure
+
+    @style()
+    def errors_of_all(self, before: bool = False) -> Figure:
+        """Errors of every observable at each station in small panels: those left, or those before."""
+        rows, stations = self.calibration.errors, self.calibration.station_rows
+        when = "before" if before else "after"
+        errors, *look = ("errors_before", BEFORE, "o") if before else ("errors", AFTER, "s")
+        height = -(-len(rows) // 2)
+        label = f"Errors at each station, {when} calibration"
+        figure, panels = new_figure(label, 0.1 + 1.2 * height, height, 2)
+        for axes, row in zip(panels.ravel(), rows, strict=False):
+            unit = row.unit.partition(" ")[0]
+            values = [getattr(station, errors).get(row.observable, np.nan) for station in stations]
+            _station_stems(axes, stations, values, unit, *look)
+            axes.axhline(0, color="#4b5563", lw=0.6, zorder=1)
+            if row.expected and not before:
+                axes.axhspan(-row.expected, row.expected, color=BAND, lw=0, zorder=0.5)
+            rms = quantity(getattr(row, when), unit)
+            axes.set(title=f"{TITLES[row.observable]}, {unit}: rms {rms}", xlabel="")
+        for axes in panels.ravel()[len(rows) :]:
+            axes.set_visible(False)
+        for axes in panels.ravel()[: len(rows)][-2:]:
+            axes.set_xlabel("station")
+        return figure
+
+    @style()
+    def sphere(self) -> Figure:
+        """The unit sphere of each triad in the tool's frame: where stations read before and after calibration.
+
+        A dot is the direction of the reference. Departures from it are drawn much too large, as the title says.
+        """
+        names = [triad.name for triad in self.calibration.triads]
+        truth = _unit_vectors(self.calibration)
+        before = _unit_vectors(self.calibration, "errors_before")
+        after = _unit_vectors(self.calibration, "errors")
+        label = "Unit sphere with the stations before and after calibration"
+        figure, [panels] = new_figure(label, 1.95, columns=len(names), width=1.75 * len(names))
+        for k, axes in enumerate(panels):
+            departures = [each[k] - truth[k] for each in (before, after)]
+            _sphere(axes, names[k], truth[k], departures, self.calibration.station_rows)
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
         return figure
 
     def _errors(self, observable: str) -> ErrorRow:

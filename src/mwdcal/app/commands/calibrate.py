@@ -73,9 +73,11 @@ def command(
     verdict, judged = _judged(calibration, turned, limits, (output, rolltest))
     rendered = ""
     if report:
+        from mwdcal.files.limits import load_limits
         from mwdcal.presentation.calibration_page import render
 
-        rendered = render(calibration, verdict, *([turned.metadata] if turned else []))
+        tested = [turned.metadata] if turned else []
+        rendered = render(calibration, verdict, *tested, limits=load_limits(limits)[0])
     files = output, report
     shown = (
         screen.summary(calibration, choice.curves, *files, _for_machines(verdict, output, rolltest))
@@ -84,7 +86,7 @@ def command(
     )
     atomic.write_all([(output, documents.encode(calibration)), (report, rendered)])
     _enter(registry, output, run, tool, rolltest, verdict)
-    print_result(shown, screen.first_findings(calibration) + (verdict.findings if verdict else []))
+    print_result(shown, calibration.findings + (verdict.findings if verdict else []))
     sys.exit(0 if verdict is None or verdict.passed else 1)
 
 

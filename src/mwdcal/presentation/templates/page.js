@@ -66,15 +66,34 @@ for (const table of document.querySelectorAll("table")) {
   }
 }
 
-// A point of a picture says its name under the pointer, and step by step by the arrow keys.
+// A point of a picture says its name under the pointer, and step by step by the arrow keys. The same station is marked
+// in all pictures and tables; a click, or Enter, goes to its row.
 const REACH = 14;
 const tip = document.createElement("div");
 tip.className = "tip";
 tip.role = "status";
 document.querySelector("main").append(tip);
+const places = new Map(); // what is named: its points and its rows
+const named = (point) => point.dataset.name.split(":")[0];
+const place = (name, element) => places.set(name, [...(places.get(name) ?? []), element]);
+for (const row of document.querySelectorAll("tr[data-point]")) place(row.dataset.point, row);
+
+function link(name) {
+  for (const element of document.querySelectorAll(".linked")) element.classList.remove("linked");
+  for (const element of places.get(name) ?? []) element.classList.add("linked");
+}
+
+function go(name) {
+  const row = places.get(name)?.find((element) => element.matches("tr"));
+  if (!row) return;
+  for (let fold = row.closest("details"); fold; fold = fold.parentElement.closest("details")) fold.open = true;
+  row.scrollIntoView({ block: "center" });
+  link(name);
+}
 
 function tell(point) {
   tip.replaceChildren();
+  link(point && named(point));
   if (!point) return;
   const box = point.getBoundingClientRect(), label = document.createElement("span");
   label.textContent = point.dataset.name;
@@ -90,22 +109,29 @@ for (const picture of document.querySelectorAll("figure svg")) {
     const point = title.parentElement;
     point.dataset.name = title.textContent;
     title.remove();
+    place(named(point), point);
     return point;
   });
   if (!points.length) continue;
   let at = -1;
-  picture.setAttribute("aria-description", "Arrow keys go from point to point.");
-  picture.onpointermove = (event) => {
+  picture.setAttribute("aria-description", "Arrow keys go from point to point, Enter to the row of a table.");
+  const near = (event) => {
     const far = points.map((point) => {
       const box = point.getBoundingClientRect();
       return Math.hypot(event.clientX - (box.left + box.right) / 2, event.clientY - (box.top + box.bottom) / 2);
     });
     const least = Math.min(...far);
-    tell(least <= REACH ? points[far.indexOf(least)] : null);
+    return least <= REACH ? points[far.indexOf(least)] : null;
+  };
+  picture.onpointermove = (event) => tell(near(event));
+  picture.onclick = (event) => {
+    const point = near(event);
+    if (point) go(named(point));
   };
   picture.onkeydown = (event) => {
     const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
     if (event.key === "Escape") tell(null);
+    if (event.key === "Enter" && at >= 0) go(named(points[at]));
     if (!step) return;
     event.preventDefault();
     at = Math.min(Math.max(at + step, 0), points.length - 1);
@@ -114,3 +140,11 @@ for (const picture of document.querySelectorAll("figure svg")) {
   };
   picture.onpointerleave = picture.onblur = () => tell(null);
 }
+
+for (const row of document.querySelectorAll("tr[data-point]")) {
+  row.onpointerenter = () => link(row.dataset.point);
+  row.onpointerleave = () => link(null);
+}
+
+// Paper shows what is folded, in browsers too that do not know how from the style.
+addEventListener("beforeprint", () => document.querySelectorAll("details").forEach((fold) => (fold.open = true)));
