@@ -195,8 +195,8 @@ def roll_groups() -> mwdcal.Readings:
 
 def dated(source: Path, target: Path, day: str) -> Path:
     """The runs of a fleet as those of a day."""
-    table = pq.read_table(source)
-    pq.write_table(table.append_column("date", pa.array([day] * len(table))), target)
+    stated = {"mwdcal": json.dumps({"date": day})}
+    pq.write_table(pq.read_table(source).replace_schema_metadata(stated), target)
     return target
 
 

@@ -694,7 +694,7 @@ def _ranks(drawn: Array, value: float) -> tuple[float, Array]:
     ascending, above = drawn[order], np.empty(count)
     above[order] = count - np.searchsorted(ascending, ascending, "left")
     beyond = np.count_nonzero(drawn >= value)
-    return (1 + beyond) / (count + 1), above / count
+    return float((1 + beyond) / (count + 1)), above / count
 
 
 def _steps(history: History, contrasts: Contrasts, critical: float) -> tuple[Step, ...]:
