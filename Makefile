@@ -3,7 +3,7 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: papers measured verification scatter coverage drift diagnosis mutations help demo size test test-quick test-studies test-oldest \
+.PHONY: gallery words check-words papers measured verification scatter coverage drift diagnosis mutations help demo size test test-quick test-studies test-oldest \
 	test-versions fuzz kills bench-kills registry-stress check check-lint check-types check-code check-docs bench bench-guard docs clean
 
 PYTHON ?= python3
@@ -100,8 +100,8 @@ registry-stress: $(INSTALLED) ## write to registries by 50 processes, end some a
 	@$(CLOCK); $(ONE_THREAD) PYTHONPATH=tests $(BIN)/python tests/registry_stress.py \
 		--writers 50 --seconds 60 --kills $(or $(COUNT),100)
 
-check: $(INSTALLED) ## lint, format, types, architecture, doctests, docs; two at a time
-	@$(CLOCK); $(MAKE) --no-print-directory --keep-going -j2 $(WHOLE) check-types check-docs check-lint check-code
+check: $(INSTALLED) ## lint, format, types, architecture, doctests, docs, words; two at a time
+	@$(CLOCK); $(MAKE) --no-print-directory --keep-going -j2 $(WHOLE) check-types check-docs check-lint check-code check-words
 
 # The parts of `make check` print what they find together, where make can do that.
 WHOLE := $(if $(filter output-sync,$(.FEATURES)),--output-sync=target)
@@ -115,6 +115,12 @@ check-types: $(INSTALLED)
 check-code: $(INSTALLED)
 	@$(CLOCK); $(BIN)/python -m pytest -q tests/test_architecture.py; \
 	$(ONE_THREAD) $(BIN)/python -m pytest -q --doctest-modules src --doctest-glob='*.md' docs
+
+check-words: $(INSTALLED)
+	@$(CLOCK); $(BIN)/python tests/words.py; $(BIN)/python examples/gallery/gallery.py --check
+
+words: ## count the words of the documentation, page by page
+	@$(PYTHON) tests/words.py --count
 
 check-docs: $(INSTALLED)
 	@$(CLOCK); $(SPHINX) -b html docs build/docs; $(SPHINX) -b man docs build/man; \
@@ -149,6 +155,9 @@ scatter: $(INSTALLED) ## compare what plans state with simulated calibrations an
 
 diagnosis: $(INSTALLED) ## name faults of simulated tools and rewrite docs/evidence/diagnosis.md (half an hour; COUNT=100)
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python examples/diagnosis/diagnosis.py --count $(or $(COUNT),1000)
+
+gallery: $(INSTALLED) ## take the pictures of all pages for docs/gallery.md (a minute; needs Chromium and pdftoppm)
+	@$(CLOCK); $(ONE_THREAD) $(BIN)/python examples/gallery/gallery.py
 
 docs: $(INSTALLED) ## build the documentation into build/docs, and the manual page docs/mwdcal.1
 	@$(CLOCK); $(SPHINX) -b html docs build/docs; $(SPHINX) -b man docs build/man; \

@@ -104,24 +104,6 @@ def literal_columns(app, what, name, obj, options, lines) -> None:
     lines[:] = [*"\n\n".join(kept).split("\n"), ""]
 
 
-MANUAL = """
-## Every option
-
-```{eval-rst}
-.. click:: mwdcal.app.cli:cli
-   :prog: mwdcal
-   :nested: full
-```
-"""
-"""What the manual page has beside the page of the commands: on the web each command has a page of its own."""
-
-
-def complete_the_manual(app, docname, source) -> None:
-    """Add the options of all commands to the manual page."""
-    if app.builder.name == "man" and docname == COMMANDS:
-        source[0] = source[0] + MANUAL
-
-
 def commands_are_outdated(app, env, added, changed, removed) -> list[str]:
     """The pages of the commands, which are not known to depend on the code they are read from."""
     return [name for name in env.found_docs if name.startswith(COMMANDS)]
@@ -129,7 +111,6 @@ def commands_are_outdated(app, env, added, changed, removed) -> list[str]:
 
 def setup(app) -> None:
     app.connect("source-read", leave_out_missing)
-    app.connect("source-read", complete_the_manual)
     app.connect("env-get-outdated", commands_are_outdated)
     app.connect("autodoc-process-docstring", literal_columns)
     app.connect("autodoc-process-docstring", escape_docstring)

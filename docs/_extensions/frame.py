@@ -144,4 +144,6 @@ def drawing() -> str:
 
 
 if __name__ == "__main__":
-    Path(__file__).parents[1].joinpath("reference", "frame.svg").write_text(drawing(), encoding="utf-8")
+    Path(__file__).parents[1].joinpath("reference", "frame.svg").write_text(
+        drawing(), encoding="utf-8"
+    )

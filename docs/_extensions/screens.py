@@ -20,7 +20,7 @@ WIDTH = 80
 def screen(name: str) -> str:
     """The line that was typed and the lines that it printed, as on a terminal of 80 columns."""
     sys.path.insert(0, str(TESTS))
-    from test_screens import SCREENS  # noqa: PLC0415 - only there when documents are built
+    from test_screens import SCREENS
 
     stored = (TESTS / "screens" / f"{name}-{WIDTH}.txt").read_text("utf-8")
     printed = [line for line in stored.splitlines()[1:] if line not in ("--- stdout", "--- stderr")]
