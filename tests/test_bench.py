@@ -6,12 +6,14 @@ import os
 import re
 import threading
 import time
+from itertools import pairwise
 from pathlib import Path
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
+import mwdcal as mwdcal_package
 from bench_support import (
     EARTH,
     HEADER,
@@ -23,7 +25,8 @@ from bench_support import (
 )
 from cli_support import EXAMPLE, RAW, mwdcal, process
 from mwdcal import load_profile
-from mwdcal.bench import serving
+from mwdcal.bench import documents, serving
+from mwdcal.bench.attitude import has_turned
 from mwdcal.bench.journal import Journal
 from mwdcal.bench.session import BenchSession
 from mwdcal.bench.settling import Settling
@@ -36,12 +39,13 @@ from simulation import DEG
 
 TOOL = EXAMPLE / "tool.toml"
 PLAN = "twenty-four-state"
+SERVO = Path(mwdcal_package.__file__).parent / "profiles" / "servo.toml"
 
 
-def session_in(folder, plan=PLAN, start=True, **options):
+def session_in(folder, plan=PLAN, start=True, tool=None, **options):
     """A session with a tool on the servo's scales; one that was begun there before goes on."""
     folder.mkdir(exist_ok=True)
-    (folder / "tool.toml").write_bytes(TOOL.read_bytes())
+    (folder / "tool.toml").write_text(tool or TOOL.read_text())
     profile = load_profile(folder / "tool.toml")
     planned = serving.session_plan(profile, plan)
     session = BenchSession(folder, profile, planned, serving._rolltest(), window=2.0, **options)
@@ -213,6 +217,143 @@ def test_a_standstill_is_one_station(session):
     with pytest.raises(InputError, match="has not moved"):
         session.accept(1)
     assert [*session.part.done] == [0]
+
+
+def knocked(session, stand):
+    """A knock of the tool where it stands ends the standstill; then it settles there again."""
+    here = stand.here
+    for attitude in (np.add(here, 1.5), here):
+        for line in stand.lines(tuple(attitude), move=0.5, seconds=4):
+            session.line(0.0, line)
+
+
+@pytest.mark.parametrize("axes", ['"+x", "+y", "+z"', '"-x", "+z", "+y"'])
+def test_a_tool_that_was_only_knocked_is_not_the_next_station(tmp_path, monkeypatch, axes):
+    """Nominal signs that are right, or wrong: the reading of the station before tells; also after a restart."""
+    tool = TOOL.read_text().replace('"+x", "+y", "+z"', axes, 1)
+    clock = [100.0]
+    monkeypatch.setattr("mwdcal.bench.session.monotonic", lambda: clock[0])
+    session, stand = session_in(tmp_path / "S", tool=tool), Stand()
+    session.line(0.0, HEADER)
+    for line in stand.lines(session.part.attitude(0)):
+        session.line(0.0, line)
+    if '"-x"' in axes:
+        with pytest.raises(InputError, match="nominal calibration"):
+            session.accept(0)
+        clock[0] += 2
+    session.accept(0)
+    knocked(session, stand)
+    session.switch("auto", True)
+    knocked(session, stand)
+    session.switch("auto", False)
+    assert session.settling.moves >= 2
+    assert session.away == "not_turned"
+    with pytest.raises(InputError, match="still stands at station 1. Turn it to station 2"):
+        session.accept(1)
+    clock[0] += 0.3
+    with pytest.raises(InputError, match="still stands"):  # the pedal bounces
+        session.accept(1)
+    session.close()
+    session = session_in(session.folder, tool=tool)
+    session.line(0.0, HEADER)
+    for line in stand.lines(stand.here):
+        session.line(0.0, line)
+    with pytest.raises(InputError, match="still stands"):
+        session.accept(1)
+    clock[0] += 2
+    session.accept(1)
+    assert session.journal.events[-1]["doubt"] == "not_turned"
+    assert "doubt" not in session.part.done[1].row
+    session.close()
+
+
+def test_a_tool_in_another_attitude_is_asked_about_but_not_by_wrong_signs(tmp_path, monkeypatch):
+    """The signs are wrong: the first stations are asked about, the others are not; none is taken for the one before."""
+    clock = [100.0]
+    monkeypatch.setattr("mwdcal.bench.session.monotonic", lambda: clock[0])
+    session, stand, asked = session_in(tmp_path / "A"), Stand(), 0
+    session.line(0.0, HEADER)
+    for line in stand.lines((60.0, 10.0, 10.0)):
+        session.line(0.0, line)
+    with pytest.raises(InputError, match="not at station 1 by its nominal calibration"):
+        session.accept(0)
+    session.close()
+    wrong = TOOL.read_text().replace('"+x", "+y", "+z"', '"+x", "-z", "+y"', 1)
+    session = session_in(tmp_path / "B", tool=wrong)
+    session.line(0.0, HEADER)
+    while session.order is not None:
+        clock[0] += 100.0
+        for line in stand.lines(session.part.attitude(session.order), seconds=5):
+            session.line(0.0, line)
+        far = session.away
+        assert far in ("", "not_there")
+        if far:
+            with pytest.raises(InputError, match="nominal calibration"):
+                session.accept()
+            clock[0] += 2.0
+            asked += 1
+        session.accept()
+    assert 1 <= asked <= 3
+    session.close()
+
+
+@pytest.mark.parametrize("dip", [65.0, None])
+@pytest.mark.parametrize("plan", ["twenty-four-state", "moosavi-12", "acceptance-104"])
+def test_a_turn_is_told_from_a_knock(plan, dip):
+    """Between all neighbours of a plan that are 6° apart in gravity or field, by vectors of another formula."""
+    profile, stand = load_profile(TOOL), Stand(5)
+    columns = serving.session_plan(profile, plan).columns
+    names = ("ref_inclination_deg", "ref_azimuth_deg", "ref_toolface_deg")
+    rows = zip(*(columns[name] for name in names), strict=True)
+    attitudes = [tuple(value or 0.0 for value in row) for row in rows]
+
+    def vectors(attitude):
+        inc, azi, face = (np.array([value * DEG]) for value in attitude)
+        return [v[0] / np.linalg.norm(v) for v in stand.tool.clean(inc, azi, face)]
+
+    def raw(attitude):
+        return dict(zip(RAW, map(float, stand.line(attitude).split(",")[1:7]), strict=True))
+
+    told = 0
+    for one, other in pairwise(attitudes):
+        pairs = zip(vectors(one), vectors(other), strict=True)
+        if max(np.degrees(np.arccos(np.clip(a @ b, -1, 1))) for a, b in pairs) < 6:
+            continue
+        told += 1
+        ends = other, one
+        assert has_turned(raw(other), raw(one), profile, ends, dip), ends
+        assert not has_turned(raw(np.add(one, 1.5)), raw(one), profile, ends, dip), ends
+    assert told > 10
+
+
+@pytest.mark.parametrize("size", [1.5, 5.0])
+@pytest.mark.parametrize("samples", [50, 200])
+def test_bad_stations_do_not_hide_each_other(tmp_path, size, samples):
+    """Stations 8 and 16 are off; one hides the other in a long standstill, and far off they prevent the fit.
+
+    The stand sets a roll once, as the simulated one does, so that a bad station looks like a bad setting.
+    """
+    (tmp_path / "tool.toml").write_bytes(SERVO.read_bytes())
+    plan, stand = serving.session_plan(load_profile(SERVO), PLAN).columns, Stand()
+    rng, names = np.random.default_rng(1), ("inclination", "azimuth", "toolface")
+    angles = np.transpose([plan[f"ref_{name}_deg"] for name in names]).astype(float)
+    off = rng.normal(size=(24, 3)) * (0.01, 0.05, 0.02)
+    for i in range(1, 24):
+        if (angles[i, :2] == angles[i - 1, :2]).all():
+            off[i, :2] = off[i - 1, :2]
+    off[[7, 15]] += size
+    lines = [HEADER.replace("time_s", "station") + "".join(f",sd_{name}" for name in RAW)]
+    lines[0] += (
+        "".join(f",ref_{name}_deg" for name in names) + ",ref_gravity_g,ref_field_nt,ref_dip_deg"
+    )
+    for i, attitude in enumerate(angles):
+        many = [stand.line(attitude + off[i]).split(",")[1:] for _ in range(samples)]
+        table = np.array(many, float)
+        sd = table[:, :6].std(0, ddof=1) / np.sqrt(samples)
+        lines.append(",".join(map(str, (i + 1, *table.mean(0), *sd, *attitude, *EARTH.values()))))
+    (tmp_path / "run.csv").write_text("\n".join(lines) + "\n")
+    fit = documents.fit(tmp_path, 24, threading.RLock())
+    assert {*fit.bad} == {"8", "16"}
 
 
 def test_undo_gives_a_former_station_back(session):

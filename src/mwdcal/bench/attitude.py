@@ -13,6 +13,10 @@ from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, reference_vectors
 from mwdcal.sensor.profile import Profile
 
+Attitude = tuple[float, float, float]
+"""Inclination, azimuth and toolface, degrees."""
+LEAST_TURN_DEG = 2.0
+"""A smaller turn of gravity or field cannot be told from a knock."""
 FAR_DEG, FAR_FIELD_DEG = 10.0, 30.0
 """Nominal gravity, and nominal field, farther from those of the order: the tool is not there."""
 STEEP_DEG = 1.0
@@ -45,15 +49,41 @@ def live_values(raw: Mapping[str, float], profile: Profile) -> dict[str, float]:
 
 
 def is_near(
-    raw: Mapping[str, float], profile: Profile, attitude_deg: tuple[float, float, float], dip_deg: float | None
+    raw: Mapping[str, float], profile: Profile, attitude_deg: Attitude, dip_deg: float | None
 ) -> bool:  # fmt: skip
     """Whether a sample is about one of an attitude. Without the stand's dip only gravity is compared."""
-    inclination, azimuth, toolface = np.radians(attitude_deg)
-    wanted = reference_vectors(inclination, azimuth, toolface, 1.0, 1.0, np.radians(dip_deg or 0.0))
-    vectors = nominal_vectors(raw, profile)
+    vectors, wanted = nominal_vectors(raw, profile), _wanted(attitude_deg, dip_deg or 0.0)
     limits = (FAR_DEG, FAR_FIELD_DEG if dip_deg is not None else 181.0)
     pairs = [(v, w) for v, w in zip(vectors, wanted, strict=True) if v is not None]
     return all(a < limit for a, limit in zip(starmap(_angle_deg, pairs), limits, strict=False))
+
+
+def has_turned(
+    raw: Mapping[str, float], before: Mapping[str, float], profile: Profile,
+    attitudes_deg: tuple[Attitude, Attitude], dip_deg: float | None,
+) -> bool:  # fmt: skip
+    """Whether a tool has left the sample `before` for another attitude; True too where the two cannot tell.
+
+    Gravity and field together have to have moved by half of what lies between the attitudes, now and before. A
+    difference of readings holds neither biases nor the signs of the axes.
+    """
+    now, then = nominal_vectors(raw, profile), nominal_vectors(before, profile)
+    if dip_deg is None:
+        dip_deg = live_values(raw, profile).get("dip", 0.0)
+    ends = [_wanted(attitude, dip_deg) for attitude in attitudes_deg]
+    moved = ordered = 0.0
+    for a, b, one, other in zip(now, then, *ends, strict=True):
+        if a is not None and b is not None:
+            strength = (np.linalg.norm(a) + np.linalg.norm(b)) / 2
+            moved += float(np.sum((a - b) ** 2) / (strength or 1.0) ** 2)
+            ordered += float(np.sum((one - other) ** 2))
+    return ordered < np.radians(LEAST_TURN_DEG) ** 2 or moved > ordered / 4
+
+
+def _wanted(attitude_deg: Attitude, dip_deg: float) -> tuple[Array, Array]:
+    """Directions of gravity and field along the tool axes at an attitude."""
+    inclination, azimuth, toolface = np.radians(attitude_deg)
+    return reference_vectors(inclination, azimuth, toolface, 1.0, 1.0, np.radians(dip_deg))
 
 
 def _angle_deg(one: Array, other: Array) -> float:

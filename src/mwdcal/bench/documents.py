@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import mwdcal
 from mwdcal.calibration.results import typical_accuracy
-from mwdcal.errors import InputError, MwdcalError
+from mwdcal.errors import FitError, InputError, MwdcalError
 from mwdcal.files.profiles import setting
 
 if TYPE_CHECKING:
     from threading import RLock
 
+    from mwdcal.calibration.readings import Readings
     from mwdcal.calibration.record import Calibration
     from mwdcal.use.verification import Verdict
 
@@ -34,34 +35,56 @@ class RunFit:
     calibration: Calibration | None = None
     reason: str = ""
     accuracy_deg: dict[str, float | None] = field(default_factory=dict)
-
-    @property
-    def bad(self) -> dict[str, str]:
-        """The problem of each station to measure again, by label."""
-        findings = self.calibration.findings if self.calibration else []
-        return {f.station: f.text for f in findings if f.id == REMEASURE and f.station}
+    bad: dict[str, str] = field(default_factory=dict)
+    """The problem of each station to measure again, by label."""
 
 
 def fit(folder: Path, stations: int, lock: RLock) -> RunFit:
     """The calibration of the run in a folder, as `mwdcal calibrate` makes it of run.csv and tool.toml.
 
-    Nobody who holds the `lock` writes these files while they are read.
+    A bad station hides another, and several together may prevent a calibration: a robust fit names the others. Nobody
+    who holds the `lock` writes these files while they are read.
     """
     if stations < FEWEST_STATIONS:
         return RunFit(stations)
     try:
         with lock:
             readings = mwdcal.read_run(folder / "run.csv", folder / "tool.toml")
-        calibration = mwdcal.calibrate(readings)
+        try:
+            run = _fitted(stations, mwdcal.calibrate(readings))
+            return replace(run, bad=_suspects(readings) | run.bad) if run.bad else run
+        except FitError as error:
+            return RunFit(stations, reason=str(error), bad=_suspects(readings))
     except MwdcalError as error:
         return RunFit(stations, reason=str(error))
-    return RunFit(stations, calibration, accuracy_deg=typical_accuracy(calibration))
+
+
+def _fitted(stations: int, calibration: Calibration) -> RunFit:
+    return RunFit(
+        stations, calibration, accuracy_deg=typical_accuracy(calibration), bad=_to_remeasure(calibration)
+    )  # fmt: skip
+
+
+def _to_remeasure(calibration: Calibration) -> dict[str, str]:
+    findings = calibration.findings
+    return {each.station: each.text for each in findings if each.id == REMEASURE and each.station}
+
+
+def _suspects(readings: Readings) -> dict[str, str]:
+    """Stations that do not fit those that fit each other, by a fit that a few bad ones do not spoil.
+
+    Each is judged by itself: where a roll shares its setting, a bad station looks like a bad setting.
+    """
+    each = replace(readings, settings="per-station")
+    try:
+        return _to_remeasure(mwdcal.calibrate(each, robust="student-t"))
+    except MwdcalError:
+        return {}
 
 
 def saved_fit(folder: Path, stations: int) -> RunFit:
     """The calibration that was saved."""
-    calibration = mwdcal.load(folder / "tool.json")
-    return RunFit(stations, calibration, accuracy_deg=typical_accuracy(calibration))
+    return _fitted(stations, mwdcal.load(folder / "tool.json"))
 
 
 def save_calibration(calibration: Calibration, folder: Path) -> dict[str, str]:

@@ -158,9 +158,7 @@ def _order_text(session: BenchSession) -> str:
     if session.calibrated and not session.testing:
         return t["next_rolltest"]
     if (order := session.order) is None:
-        return t[
-            "fitting" if session.is_fitting else "measure_bad" if session.bad else "all_measured"
-        ]
+        return t[_done_text(session)]
     part = session.part
     angles = zip(ORDERED_ANGLES, part.attitude(order), strict=True)
     turn = t["roll" if session.testing else "turn"].format(
@@ -169,6 +167,15 @@ def _order_text(session: BenchSession) -> str:
     soak = part.temperature(order)
     oven = f"{t['soak'].format(temperature=number(soak))} " if part.is_new_soak(order) else ""
     return f"{t['station']} {order + 1}. {oven}{turn}"
+
+
+def _done_text(session: BenchSession) -> str:
+    """The text that says what comes after the last station."""
+    if session.is_fitting:
+        return "fitting"
+    if session.bad:
+        return "measure_bad"
+    return "all_measured" if session.fit.calibration is not None else "no_calibration"
 
 
 def _note(session: BenchSession) -> str:
@@ -300,7 +307,9 @@ def _state_text(session: BenchSession, state: str, away: str) -> str:
     text = t[state] + left
     if away == "not_warm" and (minutes := session.warmth.minutes_left) is not None:
         return f"{text} – {t['warm_in'].format(minutes=number(max(minutes, 1.0), 2))}"
-    return f"{text} – {t[away]}" if away else text
+    before = session.station_before
+    station = before[1].position + 1 if before else ""
+    return f"{text} – {t[away].format(station=station)}" if away else text
 
 
 def _source_text(session: BenchSession, source: LineSource) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from mwdcal.bench.attitude import Attitude
 from mwdcal.bench.stream import TEMPERATURE_COLUMN
 from mwdcal.files.formats.table import Table
 
@@ -78,7 +79,7 @@ class Positions:
         left = (i for i in range(self.count) if i not in done and i not in self.skipped)
         return [*self.again, *(i for i in left if i not in self.again)]
 
-    def attitude(self, position: int) -> tuple[float, float, float]:
+    def attitude(self, position: int) -> Attitude:
         """Inclination, azimuth and toolface of a position, degrees; 0 where the plan states none."""
         inclination, azimuth, toolface = (
             self.columns[name][position] or 0.0 for name in PLAN_COLUMNS[:3]

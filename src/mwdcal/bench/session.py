@@ -13,12 +13,13 @@ from datetime import datetime
 from functools import partial
 from pathlib import Path
 from threading import RLock
+from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mwdcal.bench import documents
-from mwdcal.bench.attitude import is_near, live_values
+from mwdcal.bench.attitude import has_turned, is_near, live_values
 from mwdcal.bench.journal import Event, Journal
 from mwdcal.bench.positions import PLAN_COLUMNS, Positions, SessionPlan, TakenStation
 from mwdcal.bench.settling import Settling, Standstill
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
 RUN_PART, ROLLTEST_PART = "run", "rolltest"
 NOISE_SHARE = 2e-5
 """Noise of a sample, as a share of the strength of gravity or field, below which none is believed."""
+PRESSED_AGAIN = 1.0, 60.0
+"""Seconds after which, and before which, a second press means that it is meant: a pedal bounces sooner."""
 WARM_C = 3.0
 """The tool's temperature is farther from that of the order: the oven is not there."""
 
@@ -74,6 +77,8 @@ class BenchSession:
         self.papers: dict[str, str] = {}
         self.course: list[tuple[int, dict[str, float | None]]] = []
         self._used: tuple[int, int] = (-1, -1)
+        self._agreed = 0
+        self._question: tuple[object, float] = (None, 0.0)
         self._requested = self._fitted = 0
         self._unwritten = False
         self._pool, self._context = ThreadPoolExecutor(1), contextvars.copy_context()
@@ -109,7 +114,9 @@ class BenchSession:
             self.earth |= event["earth"]
             self.parts[RUN_PART] = Positions(RUN_PART, plan.columns)
         elif kind == "station":
-            part.accept(TakenStation(event["position"], event["row"]))
+            position, row = event["position"], event["row"]
+            part.accept(TakenStation(position, row))
+            self._agreed += 1 if self._is_near(part, position, row) else -1
             self.attempts += 1
         elif kind == "undone":
             part.undo()
@@ -193,7 +200,7 @@ class BenchSession:
 
     @property
     def away(self) -> str:
-        """Why the tool is not where it was ordered: "not_there", "not_warm"; empty if it is."""
+        """Why the tool is not where it was ordered: "not_there", "not_turned", "not_warm"; empty if it is."""
         order = self.order
         if order is None or not self.sample:
             return ""
@@ -201,8 +208,41 @@ class BenchSession:
         is_cold = None not in (ordered, known) and abs((known or 0) - (ordered or 0)) > WARM_C
         if is_cold or (ordered is not None and not self.warmth.is_steady):
             return "not_warm"
-        place = self.part.attitude(order), self.earth.get("dip_deg")
-        return "" if is_near(self.raw, self.profile, *place) else "not_there"
+        return self._doubt(order, self.reading)
+
+    def _doubt(self, order: int, reading: Mapping[str, float]) -> str:
+        """Why a reading is hardly that of a position: "not_turned", "not_there"; empty if it may be."""
+        part, before = self.part, self.station_before
+        if before is not None:
+            other = before[0].attitude(before[1].position)
+            ends = part.attitude(order), other
+            if not has_turned(
+                reading, before[1].row, self.profile, ends, self.earth.get("dip_deg")
+            ):
+                return "not_turned"
+        return "" if self._is_plausible(order, reading) else "not_there"
+
+    def _is_plausible(self, position: int, reading: Mapping[str, float]) -> bool:
+        """Whether a reading may be that of a position. Nominal scales that most stations contradict do not judge."""
+        return self._agreed < 0 or self._is_near(self.part, position, reading)
+
+    def _is_near(self, part: Positions, position: int, reading: Mapping[str, Any]) -> bool:
+        """Whether a reading is about that of a position, by the nominal calibration."""
+        return is_near(reading, self.profile, part.attitude(position), self.earth.get("dip_deg"))
+
+    @property
+    def station_before(self) -> tuple[Positions, TakenStation] | None:
+        """The latest station, with its part; None before the first."""
+        both = (self.part, self.parts[RUN_PART])
+        return next(((part, part.taken[-1]) for part in both if part.taken), None)
+
+    @property
+    def reading(self) -> dict[str, float]:
+        """The standstill by channel once the tool has settled, else the latest sample."""
+        settling = self.settling
+        if settling is None or settling.state != "settled":
+            return self.raw
+        return dict(zip(self.stream.channels, settling.means, strict=False))
 
     @property
     def temperature(self) -> float | None:
@@ -263,7 +303,9 @@ class BenchSession:
                     f"the tool has not moved since station {place + 1}. Move it to the next position."
                 )
             row = _measured(settling.station(), self.stream.channels)
-            self._take(order, row)
+            doubt = self._doubt(order, row)
+            self._ask({order: doubt}, settling.moves)
+            self._take(order, row, doubt)
             self._used = settling.moves, order
 
     def accept_typed(
@@ -276,8 +318,37 @@ class BenchSession:
                 raise InputError(
                     f"{len(rows)} readings, but only {many} positions are left. Paste fewer."
                 )
+            positions = self.part.open_positions[: len(rows)]
+            pairs = [*zip(positions, rows, strict=True)]
+            doubts = {positions[0]: self._doubt(*pairs[0])} if pairs else {}
+            for place, row in pairs[1:]:
+                doubts[place] = "" if self._is_plausible(place, row) else "not_there"
+            self._ask(doubts, rows)
             for row in rows:
-                self._take(self._expected(None), {"samples": 1.0, **row})
+                place = self._expected(None)
+                self._take(place, {"samples": 1.0, **row}, doubts.get(place, ""))
+
+    def _ask(self, doubts: Mapping[int, str], reading: object) -> None:
+        """Refuse readings that are hardly those of their positions, unless the same are pressed a second time."""
+        doubtful = [place for place, doubt in doubts.items() if doubt]
+        if not doubtful:
+            return
+        (soon, late), (question, since), now = PRESSED_AGAIN, self._question, monotonic()
+        is_new = question != (doubts, reading) or now - since > late
+        if not is_new and now - since > soon:
+            return
+        if is_new:
+            self._question = ((doubts, reading), now)
+        names, before = ", ".join(str(place + 1) for place in doubtful), self.station_before
+        if before is not None and doubts[doubtful[0]] == "not_turned":
+            raise InputError(
+                f"the tool still stands at station {before[1].position + 1}. Turn it to station {names}, or press "
+                "again to take it as it is."
+            )
+        raise InputError(
+            f"the tool is not at station {names} by its nominal calibration. Check inclination, toolface and azimuth, "
+            "or press again to take it as it is."
+        )
 
     def _expected(self, position: int | None) -> int:
         """The position that is asked for, which must be the one that the page has shown."""
@@ -291,15 +362,19 @@ class BenchSession:
             )
         return order
 
-    def _take(self, order: int, measured: Mapping[str, Any]) -> None:
-        """Take a station; its row holds what the plan and the stand state, and what was measured."""
+    def _take(self, order: int, measured: Mapping[str, Any], doubt: str) -> None:
+        """Take a station; its row holds what the plan and the stand state, and what was measured.
+
+        The journal keeps a `doubt` in spite of which the operator took it.
+        """
         part = self.part
         row = {"station": str(order + 1), **measured}
         if TEMPERATURE_COLUMN not in row and self.typed_temperature is not None:
             row[TEMPERATURE_COLUMN] = self.typed_temperature
         row |= {name: part.columns[name][order] for name in PLAN_COLUMNS[:3]}
         row |= {f"ref_{name}": value for name, value in self.earth.items()}
-        self._record("station", part=part.name, position=order, row=row)
+        doubted = {"doubt": doubt} if doubt else {}
+        self._record("station", part=part.name, position=order, row=row, **doubted)
         self.message = ""
         self._write_tables()
         self._refit()
@@ -377,7 +452,8 @@ class BenchSession:
         if self.testing:
             return {}
         again = self.parts[RUN_PART].again
-        return {label: text for label, text in self.fit.bad.items() if int(label) - 1 not in again}
+        named = sorted(self.fit.bad.items(), key=lambda item: int(item[0]))
+        return {label: text for label, text in named if int(label) - 1 not in again}
 
     def _write_tables(self) -> None:
         """Write the run files from the events. The stations are in the journal already: a full disk loses none."""

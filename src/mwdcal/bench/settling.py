@@ -194,13 +194,19 @@ class Settling:
             return "moving"
         return "settled" if self._settled else "settling"
 
+    @property
+    def means(self) -> tuple[float, ...]:
+        """The mean of each channel over the standstill."""
+        samples = sum(cell.count for cell in self.still)
+        weighted = ([m * cell.count / samples for m in cell.means] for cell in self.still)
+        return tuple(map(sum, zip(*weighted, strict=True)))
+
     def station(self) -> Standstill:
         """The mean over the standstill; only while settled."""
-        cells = self.still
+        cells, means = self.still, self.means
         samples = sum(cell.count for cell in cells)
         each = [*zip(*(cell.means for cell in cells), strict=True)]
         weights = [cell.count / samples for cell in cells]
-        means = tuple(sum(m * w for m, w in zip(row, weights, strict=True)) for row in each)
         sd = [_sd_of_mean(row, weights, mean) for row, mean in zip(each, means, strict=True)]
         pairs = zip(self._scatter(), self._trends(), strict=True)
         for place, (sample, (change, sigmas)) in enumerate(pairs):

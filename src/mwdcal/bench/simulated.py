@@ -8,6 +8,7 @@ from threading import Event
 
 import numpy as np
 
+from mwdcal.bench.attitude import Attitude
 from mwdcal.files.contract import RAW
 from mwdcal.geometry.vectors import Array
 from mwdcal.planning.plans import StationPlan, Truth, drawn, reading
@@ -23,8 +24,6 @@ KNOCKED_DEG = 1.5
 """How far a knocked tool stands off."""
 ROOM_C = 25.0
 """Temperature of the simulated tool, °C."""
-Attitude = tuple[float, float, float]
-"""Inclination, azimuth and toolface, degrees."""
 
 
 class DemoStand:
@@ -39,10 +38,11 @@ class DemoStand:
     ) -> None:
         self.note, self.drops = "", 0
         self.order: Callable[[], tuple[Attitude | None, int]] = lambda: (None, -1)
-        self.profile, self.speed, self.knocked = profile, speed, {*knocked}
+        self.profile, self.speed, self.seed, self.knocked = profile, speed, seed, {*knocked}
         self.rng = np.random.default_rng(seed)
         self.tool: Truth = drawn(self.rng, profile, 0)
-        self.here = np.array([10.0, 20.0, 30.0])
+        self.here, self._off = np.array([10.0, 20.0, 30.0]), np.zeros(3)
+        self._direction: tuple[float, ...] = ()
 
     @property
     def header(self) -> str:
@@ -82,10 +82,17 @@ class DemoStand:
                 stop.wait(ahead)
 
     def _setting(self, attitude: Attitude, attempt: int) -> Array:
-        """Where the tool really stands after a move: the stand has its errors."""
+        """Where the tool really stands after a move: the stand has its errors.
+
+        Those of inclination and azimuth stay in a roll, unless the profile says that the stand is set at each station.
+        They follow from the attempt alone, however long the tool has stood.
+        """
         stand = self.profile.stand
         sd = np.array([stand.inclination_deg, stand.azimuth_deg, stand.toolface_deg])
-        off = sd * self.rng.normal(size=3)
+        off = sd * np.random.default_rng((self.seed, attempt)).normal(size=3)
+        if attitude[:2] == self._direction and stand.settings != "per-station":
+            off[:2] = self._off[:2]
+        self._direction, self._off = attitude[:2], off
         if attempt in self.knocked:
             off = off + KNOCKED_DEG
         return np.asarray(attitude) + off
