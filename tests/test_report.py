@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from markupsafe import Markup
 
+from mwdcal import extras
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
@@ -582,7 +583,7 @@ def test_real_data_is_not_called_simulated(page):
 
 def test_missing_extra_says_what_to_install(whole, monkeypatch):
     monkeypatch.setitem(sys.modules, "jinja2", None)
-    with pytest.raises(InputError, match=r'install "mwdcal\[report\]"'):
+    with pytest.raises(InputError, match=re.escape(extras.command("report"))):
         render(whole)
 
 
