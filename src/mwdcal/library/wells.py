@@ -212,6 +212,16 @@ class WellSurvey(Result):
         columns = contribution_columns(parts, self.surveyed.well.length_unit).items()
         return {k: np.array(v, object) if isinstance(v, list) else v for k, v in columns}
 
+    def save_listing(self, path: FilePath) -> None:
+        """Write a survey listing for well-planning programs: MD, angles, position, section, closure, covariance.
+
+        Raises:
+            InputError: there is no path.
+        """
+        from mwdcal.presentation.listing import listing
+
+        tables.write(path, listing(self.surveyed))
+
     def to_pandas(self) -> Any:
         """The columns as a table of pandas, with what the command's table states of itself in `attrs`."""
         return frame(self.columns, self._whole_table.metadata)
@@ -444,6 +454,7 @@ def survey(
     *,
     reference: PlaceReference | EarthReference | FilePath | None = None,
     msa: bool = False,
+    axial_correction: bool = False,
     limits: FilePath | SurveyLimits = "owsg-mwd",
     sensor_drift: FilePath | None = None,
     error_model: FilePath | ErrorModel = "owsg-mwd",
@@ -469,6 +480,7 @@ def survey(
         readings: a file, columns by name, a table of pandas or polars, or `Readings` (`md_m` among their columns).
         reference: gravity, field, dip and declination of the place, from `reference` or its file.
         msa: take the interference of the drill string off the magnetometer, by multi-station analysis.
+        axial_correction: also correct each survey by itself: columns `azimuth_…_axial_deg`, with a no-go zone.
         limits: on |g|, |b| and dip: owsg-mwd, iscwsa-fixed, fixed, or a TOML file.
         sensor_drift: with `msa`, drift of the sensors since the calibration, 1σ: owsg (the default), none, or a file.
         error_model: what the standard uncertainties hold besides calibration, noise and declination: owsg-mwd,
@@ -522,11 +534,10 @@ def survey(
     ]  # fmt: skip
     inputs = [_with_walk(each, registry) for each in inputs]
     analyses = [analysed(each, sensor_drift) if msa else None for each in inputs]
-    for analysis in analyses:
-        if analysis:
-            analysis.check()
-    result = survey_runs(inputs, analyses, tie_in=start, switch=ends, outside=outside)
-    return WellSurvey(result, loaded[0].signature)
+    for analysis in filter(None, analyses):
+        analysis.check()
+    way: Any = {"tie_in": start, "switch": ends, "outside": outside, "axial": axial_correction}
+    return WellSurvey(survey_runs(inputs, analyses, **way), loaded[0].signature)
 
 
 def convert(
