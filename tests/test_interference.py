@@ -9,6 +9,7 @@ from functools import cache
 import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace as replace_struct
 
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
@@ -21,9 +22,11 @@ from mwdcal.geometry.vectors import centred
 from mwdcal.planning.plans import grid, run, servo
 from mwdcal.presentation.interference_page import render
 from mwdcal.presentation.survey import interference_screen
-from mwdcal.survey.acceptance import SensorTerms
+from mwdcal.survey.acceptance import SensorTerms, judged, load_survey_limits
 from mwdcal.survey.interference import DRIFTED, deviations, interference
 from mwdcal.survey.interference_estimate import Assumed, Estimate, estimate, misfits, sensor_drift
+from mwdcal.survey.stations import North
+from mwdcal.survey.well import well as judged_well
 from simulation import DEG, Tool, attitude
 from test_calibrate import PROFILE, make
 from wells import (
@@ -31,6 +34,7 @@ from wells import (
     DIP,
     FIELD,
     IRON,
+    SD_FIELD,
     Path,
     horizontal_east,
     joined,
@@ -173,6 +177,35 @@ def test_intervals_hold_the_truth_or_the_analysis_is_refused(course: str, times:
         sd = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1) + noise)
         inside = np.abs(centred(value - getattr(where, name))) < 1.96 * sd
         assert course in REFUSED or inside.mean() >= 0.90
+
+
+def test_limits_are_tighter_after_the_analysis() -> None:
+    """Second formula: 3σ of |b| without interference and drift but for what the analysis has left of them.
+
+    An error of one survey that the model's 220 nT and drift would cover stands out; sound surveys are accepted.
+    """
+    readings = well(seed=4)
+    gross = replace(readings, magnetometer=readings.magnetometer.copy())
+    gross.magnetometer[20] *= 1.01
+    limits, _ = load_survey_limits()
+    accepted = {}
+    for name, surveys in (("sound", readings), ("gross", gross)):
+        corrected = interference(laboratory(), readings).calibration
+        unmarked = replace(surveys, digest=())
+        after = judged_well(corrected, unmarked, limits, North())
+        accepted[name] = after.judgement.accepted
+        gradient = corrected.gradients(("field",), unmarked)[:, 0]
+        by_parameters = corrected.jacobian(unmarked)
+        spread = by_parameters @ corrected.parameter_covariance @ by_parameters.mT
+        spread = spread + corrected.noise_covariance(unmarked)
+        own = np.einsum("ni,nij,nj->n", gradient, spread, gradient)
+        bound = 3.0 * np.sqrt(own + SD_FIELD**2)
+        assert after.judgement.bound[:, 1] == pytest.approx(bound, rel=1e-3)
+    assert accepted["sound"].all()
+    assert not accepted["gross"][20]
+    assert accepted["gross"].sum() == len(DEVIATED) - 1
+    wide = SensorTerms(axial_interference_nt=220.0, magnetometer_bias_nt=70.0, magnetometer_scale=0.0016)
+    assert judged(after.surveys, after.vectors, unmarked, replace_struct(limits, sensor=wide)).accepted[20]
 
 
 def test_surveys_that_do_not_fit_are_named() -> None:

@@ -575,7 +575,11 @@ def export(
 
 @overload
 def export(
-    cal: Calibration | FilePath, kind: Literal["tool-model"], *, temperature: float | None = None
+    cal: Calibration | FilePath,
+    kind: Literal["tool-model"],
+    *,
+    temperature: float | None = None,
+    toolface_deg: float | None = None,
 ) -> ToolModelExport: ...
 
 
@@ -586,11 +590,13 @@ def export(
     form: str | None = None,
     word_bits: int | None = None,
     temperature: float | None = None,
+    toolface_deg: float | None = None,
 ) -> FirmwareExport | ToolModelExport:
     """A calibration for other programs: C sources for firmware, or a tool model for error-model programs.
 
     `form` of firmware is c (double precision) or fixed-point, with whole numbers of `word_bits` (12 to 32, by default
-    32). `temperature`, °C, is that of a tool model, by default the middle of the calibrated range.
+    32). `temperature`, °C, is that of a tool model, by default the middle of the calibrated range; `toolface_deg` the gravity
+    toolface of a tool that does not turn, whose terms are of each axis (else they are averaged over toolface).
 
     Raises:
         InputError: an unknown kind or form, or an argument of the other kind.
@@ -606,9 +612,11 @@ def export(
         for name, value in (("form", form), ("word_bits", word_bits)):
             if value is not None:
                 raise InputError(f"`{name}` goes with the kind firmware. Leave it out.")
-        return ToolModelExport(*conversion.terms_at(_source(cal), temperature))
+        return ToolModelExport(*conversion.terms_at(_source(cal), temperature, toolface_deg))
     if temperature is not None:
         raise InputError("`temperature`: sources hold for all temperatures. Leave it out.")
+    if toolface_deg is not None:
+        raise InputError("`toolface_deg` goes with the kind tool-model. Leave it out.")
     form = "c" if form is None else form
     _check_word("form", form, FORMS_OF_FIRMWARE)
     return FirmwareExport(conversion.exported(_source(cal), FORMS_OF_FIRMWARE[form], word_bits))
