@@ -9,6 +9,7 @@ from functools import cache
 import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace as replace_struct
 
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
@@ -21,9 +22,11 @@ from mwdcal.geometry.vectors import centred
 from mwdcal.planning.plans import grid, run, servo
 from mwdcal.presentation.interference_page import render
 from mwdcal.presentation.survey import interference_screen
-from mwdcal.survey.acceptance import SensorTerms
+from mwdcal.survey.acceptance import SensorTerms, judged, load_survey_limits
 from mwdcal.survey.interference import DRIFTED, deviations, interference
 from mwdcal.survey.interference_estimate import Assumed, Estimate, estimate, misfits, sensor_drift
+from mwdcal.survey.stations import North
+from mwdcal.survey.well import well as judged_well
 from simulation import DEG, Tool, attitude
 from test_calibrate import PROFILE, make
 from wells import (
@@ -31,6 +34,7 @@ from wells import (
     DIP,
     FIELD,
     IRON,
+    SD_FIELD,
     Path,
     horizontal_east,
     joined,
@@ -49,16 +53,18 @@ def laboratory(seed: int = 0) -> Calibration:
     return calibrate(make(seed), PROFILE, Options(order=0, nonlinearity=()))
 
 
-def azimuths(record: Calibration, whole: Estimate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def azimuths(
+    record: Calibration, whole: Estimate, name: str = "azimuth"
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Corrected azimuths (wells, n), their covariance (wells, n, n) from parameters, and noise variance."""
     readings, problem = whole.readings, whole.result.problem
     g, b = problem.fields(whole.result.state)
-    gradient = OBSERVABLES["azimuth"].gradient(g, b)
+    gradient = OBSERVABLES[name].gradient(g, b)
     rows = np.einsum(
         "wni,wnip->wnp", gradient, record.jacobian(readings)
     )  # linear: anywhere the same
     noise = np.einsum("wni,wnij,wnj->wn", gradient, record.noise_covariance(readings), gradient)
-    return OBSERVABLES["azimuth"].value(g, b), rows @ whole.covariance @ rows.mT, noise
+    return OBSERVABLES[name].value(g, b), rows @ whole.covariance @ rows.mT, noise
 
 
 @cache
@@ -125,6 +131,81 @@ def test_azimuth_is_within_its_uncertainty_after_drift_of_the_sensors() -> None:
         inside[drift] = np.mean(np.abs(centred(azimuth - DEVIATED.azimuth)) < 1.96 * sd)
     assert 0.93 < inside[DRIFT] < 0.97
     assert inside[SensorTerms()] < 0.9
+
+
+COURSES = {
+    "vertical": path((2, 2), (0, 300)),
+    "tangent": path((45, 45), (60, 60)),
+    "one attitude": path((45, 45), (60, 60), toolface=30),
+    "one toolface": path((5, 60), (40, 75), toolface=30),
+    "rotation shots": replace(
+        path((45, 45), (60, 60), 40), toolface=np.tile(np.array([10, 100, 190, 280]) * DEG, 10)
+    ),
+    "three surveys": path((50, 51), (120, 121), 3),
+    "lateral north": joined(path((3, 90), (8, 8), 10), path((90, 90), (8, 8), 20)),
+    "lateral east": joined(path((3, 90), (82, 90), 10), path((90, 90), (90, 95), 20)),
+    "horizontal east": path((89, 91), (88, 92)),
+    "up past horizontal": path((60, 105), (10, 190)),
+}
+"""The courses of `examples/coverage/wells.py` that differ most; that study has 22, in other fields and dips too."""
+REFUSED = ("one attitude", "horizontal east")
+TELLING = ("one attitude", "rotation shots", "lateral north")
+
+
+@pytest.mark.parametrize(
+    ("course", "times"),
+    [
+        pytest.param(c, t, marks=[] if t and c in TELLING else pytest.mark.study)
+        for c in COURSES
+        for t in (0.0, 1.0)
+    ],
+)
+def test_intervals_hold_the_truth_or_the_analysis_is_refused(course: str, times: float) -> None:
+    """60 wells; scale and bias of both triads drifted by 1σ of the error model, or not at all."""
+    where, rng = COURSES[course], np.random.default_rng(31)
+    (bias, scale), (g_bias, g_scale) = (
+        times * rng.normal(size=(2, 60, 1, 3)) * np.reshape(sizes, (2, 1, 1, 1))
+        for sizes in ((70.0, 0.0016), (4.1e-4, 0.0005))
+    )
+    iron = np.array([80.0, -60.0, 900.0]) + bias
+    drift = {"iron": iron, "scale": scale, "gravity": (g_scale, g_bias)}
+    readings = surveyed(laboratory(), where, 60, seed=23, moments=1.0, **drift)
+    whole = estimate(laboratory(), readings)
+    assert whole.separable.any() == (course not in REFUSED)
+    for name in ("inclination", "azimuth"):
+        value, covariance, noise = azimuths(laboratory(), whole, name)
+        sd = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1) + noise)
+        inside = np.abs(centred(value - getattr(where, name))) < 1.96 * sd
+        assert course in REFUSED or inside.mean() >= 0.90
+
+
+def test_limits_are_tighter_after_the_analysis() -> None:
+    """Second formula: 3σ of |b| without interference and drift but for what the analysis has left of them.
+
+    An error of one survey that the model's 220 nT and drift would cover stands out; sound surveys are accepted.
+    """
+    readings = well(seed=4)
+    gross = replace(readings, magnetometer=readings.magnetometer.copy())
+    gross.magnetometer[20] *= 1.01
+    limits, _ = load_survey_limits()
+    accepted = {}
+    for name, surveys in (("sound", readings), ("gross", gross)):
+        corrected = interference(laboratory(), readings).calibration
+        unmarked = replace(surveys, digest=())
+        after = judged_well(corrected, unmarked, limits, North())
+        accepted[name] = after.judgement.accepted
+        gradient = corrected.gradients(("field",), unmarked)[:, 0]
+        by_parameters = corrected.jacobian(unmarked)
+        spread = by_parameters @ corrected.parameter_covariance @ by_parameters.mT
+        spread = spread + corrected.noise_covariance(unmarked)
+        own = np.einsum("ni,nij,nj->n", gradient, spread, gradient)
+        bound = 3.0 * np.sqrt(own + SD_FIELD**2)
+        assert after.judgement.bound[:, 1] == pytest.approx(bound, rel=1e-3)
+    assert accepted["sound"].all()
+    assert not accepted["gross"][20]
+    assert accepted["gross"].sum() == len(DEVIATED) - 1
+    wide = SensorTerms(axial_interference_nt=220.0, magnetometer_bias_nt=70.0, magnetometer_scale=0.0016)
+    assert judged(after.surveys, after.vectors, unmarked, replace_struct(limits, sensor=wide)).accepted[20]
 
 
 def test_surveys_that_do_not_fit_are_named() -> None:

@@ -14,15 +14,18 @@ from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.errors import FitError
+from mwdcal.survey.error_model import load_error_model
 from mwdcal.survey.path import position_covariance
 from mwdcal.survey.tool_model import (
     FORMULAS,
     SENSOR_KINDS,
+    formulas_at,
     sensor_terms,
     term_shifts,
+    tool_model_text,
     write_tool_model,
 )
-from simulation import Tool
+from simulation import Tool, attitude
 from test_calibrate import PROFILE, make, many_runs
 from test_well_path import SURVEYS, needs_published_wells
 
@@ -84,6 +87,73 @@ def test_minimum_curvature_gives_the_published_uncertainty_within_one_percent():
     for name, covariance in ours.items():
         expected = published[8000, name]
         np.testing.assert_allclose(covariance[md == 8000][0], expected, rtol=0.01, atol=1e-4)
+
+
+def turned_by(name, inclination, azimuth, toolface, dip):
+    """Errors (2,) of inclination and azimuth by one unit of a term: central differences of a second forward model."""
+    triad, axis = "AM".index(name[0]), "XYZ".index(name[2])
+    fields = attitude(inclination, azimuth, toolface)(9.80665, 50_000.0, dip)
+    step = 1e-5 * (np.linalg.norm(fields[triad]) if name[1] == "B" else 1.0)
+    angles = []
+    for sign in (1, -1):
+        moved = [np.array(v, float).ravel() for v in fields]
+        v = moved[triad]
+        v[axis] += sign * step * (1.0 if name[1] == "B" else v[axis])
+        g, b = moved
+        down = g / np.linalg.norm(g)
+        east = np.cross(down, b)
+        north = np.cross(east, down)
+        angles.append((np.arccos(down[2]), np.arctan2(east[2] * np.linalg.norm(north) / np.linalg.norm(east), north[2])))
+    change = np.subtract(*angles)
+    change[1] = (change[1] + np.pi) % (2 * np.pi) - np.pi
+    return change / (2 * step)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_terms_at_one_toolface_are_the_derivatives_of_the_angles(seed):
+    rng = np.random.default_rng(seed)
+    inclination, azimuth, face = rng.uniform(0.2, 2.0), *rng.uniform(0, 2 * np.pi, 2)
+    dip = rng.uniform(-1.3, 1.3)
+    names = {
+        "Inc": inclination, "AzM": azimuth, "AzT": azimuth, "Dip": dip, "BField": 50_000.0, "Gfield": 9.80665,
+        "Sin": np.sin, "Cos": np.cos, "Tan": np.tan, "Sqr": np.sqrt, "pi": np.pi,
+    }  # fmt: skip
+    formulas = formulas_at(face)
+    assert {*formulas} == {kind + axis for kind in SENSOR_KINDS for axis in "XYZ"}
+    for name, (upward, sideways, *_) in formulas.items():
+        found = [eval(text, {"__builtins__": {}}, names) for text in (upward, sideways)]
+        expected = turned_by(name, inclination, azimuth, face, dip)
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6 * scale)
+
+
+@pytest.mark.parametrize("face", [0.0, 1.1, np.pi])
+def test_terms_at_one_toolface_near_vertical_are_those_at_vertical(face):
+    """North and east shifts of the hole's direction, an arc second from vertical, by inclination and azimuth."""
+    inclination, azimuth = 5e-6, 0.8
+    names = {
+        "Inc": inclination, "AzM": azimuth, "AzT": azimuth, "Dip": 0.0, "BField": 50_000.0, "Gfield": 9.80665,
+        "Sin": np.sin, "Cos": np.cos, "Tan": np.tan, "pi": np.pi,
+    }  # fmt: skip
+    for name in ("ABX", "ABY"):
+        upward, sideways, north, east = (
+            eval(text, {"__builtins__": {}}, names) for text in formulas_at(face)[name]
+        )
+        side = sideways * np.sin(inclination)
+        expected = (
+            upward * np.cos(azimuth) - side * np.sin(azimuth),
+            upward * np.sin(azimuth) + side * np.cos(azimuth),
+        )
+        np.testing.assert_allclose((north, east), expected, rtol=0, atol=1e-6)
+
+
+def test_the_tool_model_of_a_tool_that_does_not_turn_is_read_back(tmp_path):
+    record, path = calibrate(make(), PROFILE), tmp_path / "model.json"
+    path.write_text(tool_model_text(record, toolface=np.radians(30.0)), "utf-8")
+    model = load_error_model(path)
+    values = {term.name: term.value for term in sensor_terms(record)}
+    assert {term.name: term.size for term in model.terms} == {n: values[n] for n in formulas_at(0.5)}
+    assert "toolface 30°" in json.loads(path.read_text("utf-8"))["metadata"]["application"]
 
 
 # ── Of a calibrated tool ─────────────────────────────────────────────────────────────────────

@@ -76,11 +76,13 @@ def surveyed(
     references=1.0,
     scale=0.0,
     moments=0.0,
+    gravity=(0.0, 0.0),
 ) -> Readings:
     """Surveys (wells, n) by tools whose calibration is off, in a field that is off its references.
 
     `references` multiplies the errors of these, of standard deviations that the surveys state. The readings are
-    those of a triad field = A reading + c at one temperature. `moments`: by how much of `SD_MOMENT` field and dip
+    those of a triad field = A reading + c at one temperature. `gravity`: scale and bias by which the accelerometer
+    is off, as `scale` and `iron` the magnetometer. `moments`: by how much of `SD_MOMENT` field and dip
     also differ from station to station.
     """
     rng = np.random.default_rng(seed)
@@ -93,7 +95,10 @@ def surveyed(
         off = off + moments * rng.normal(size=off.shape) * SD_MOMENT
     fields = [vectors(1.0, FIELD + each[:, :1], DIP + each[:, 1]) for each in off]
     g, b = (np.stack(each) for each in zip(*fields, strict=True))
-    seen = [g, b * (1 + np.asarray(scale)) + np.asarray(iron)]
+    seen = [
+        g * (1 + np.asarray(gravity[0])) + gravity[1],
+        b * (1 + np.asarray(scale)) + np.asarray(iron),
+    ]
     raw = [
         np.einsum("wij,wnj->wni", np.linalg.inv(matrix[:, t]), v - offset[:, t, None])
         + NOISE[t] * rng.normal(size=v.shape)

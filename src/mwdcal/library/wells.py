@@ -212,6 +212,16 @@ class WellSurvey(Result):
         columns = contribution_columns(parts, self.surveyed.well.length_unit).items()
         return {k: np.array(v, object) if isinstance(v, list) else v for k, v in columns}
 
+    def save_listing(self, path: FilePath) -> None:
+        """Write a survey listing for well-planning programs: MD, angles, position, section, closure, covariance.
+
+        Raises:
+            InputError: there is no path.
+        """
+        from mwdcal.presentation.listing import listing
+
+        tables.write(path, listing(self.surveyed))
+
     def to_pandas(self) -> Any:
         """The columns as a table of pandas, with what the command's table states of itself in `attrs`."""
         return frame(self.columns, self._whole_table.metadata)
@@ -444,6 +454,7 @@ def survey(
     *,
     reference: PlaceReference | EarthReference | FilePath | None = None,
     msa: bool = False,
+    axial_correction: bool = False,
     limits: FilePath | SurveyLimits = "owsg-mwd",
     sensor_drift: FilePath | None = None,
     error_model: FilePath | ErrorModel = "owsg-mwd",
@@ -469,6 +480,7 @@ def survey(
         readings: a file, columns by name, a table of pandas or polars, or `Readings` (`md_m` among their columns).
         reference: gravity, field, dip and declination of the place, from `reference` or its file.
         msa: take the interference of the drill string off the magnetometer, by multi-station analysis.
+        axial_correction: also correct each survey by itself: columns `azimuth_…_axial_deg`, with a no-go zone.
         limits: on |g|, |b| and dip: owsg-mwd, iscwsa-fixed, fixed, or a TOML file.
         sensor_drift: with `msa`, drift of the sensors since the calibration, 1σ: owsg (the default), none, or a file.
         error_model: what the standard uncertainties hold besides calibration, noise and declination: owsg-mwd,
@@ -522,11 +534,10 @@ def survey(
     ]  # fmt: skip
     inputs = [_with_walk(each, registry) for each in inputs]
     analyses = [analysed(each, sensor_drift) if msa else None for each in inputs]
-    for analysis in analyses:
-        if analysis:
-            analysis.check()
-    result = survey_runs(inputs, analyses, tie_in=start, switch=ends, outside=outside)
-    return WellSurvey(result, loaded[0].signature)
+    for analysis in filter(None, analyses):
+        analysis.check()
+    way: Any = {"tie_in": start, "switch": ends, "outside": outside, "axial": axial_correction}
+    return WellSurvey(survey_runs(inputs, analyses, **way), loaded[0].signature)
 
 
 def convert(
@@ -564,7 +575,11 @@ def export(
 
 @overload
 def export(
-    cal: Calibration | FilePath, kind: Literal["tool-model"], *, temperature: float | None = None
+    cal: Calibration | FilePath,
+    kind: Literal["tool-model"],
+    *,
+    temperature: float | None = None,
+    toolface_deg: float | None = None,
 ) -> ToolModelExport: ...
 
 
@@ -575,11 +590,13 @@ def export(
     form: str | None = None,
     word_bits: int | None = None,
     temperature: float | None = None,
+    toolface_deg: float | None = None,
 ) -> FirmwareExport | ToolModelExport:
     """A calibration for other programs: C sources for firmware, or a tool model for error-model programs.
 
     `form` of firmware is c (double precision) or fixed-point, with whole numbers of `word_bits` (12 to 32, by default
-    32). `temperature`, °C, is that of a tool model, by default the middle of the calibrated range.
+    32). `temperature`, °C, is that of a tool model, by default the middle of the calibrated range; `toolface_deg` the gravity
+    toolface of a tool that does not turn, whose terms are of each axis (else they are averaged over toolface).
 
     Raises:
         InputError: an unknown kind or form, or an argument of the other kind.
@@ -595,9 +612,11 @@ def export(
         for name, value in (("form", form), ("word_bits", word_bits)):
             if value is not None:
                 raise InputError(f"`{name}` goes with the kind firmware. Leave it out.")
-        return ToolModelExport(*conversion.terms_at(_source(cal), temperature))
+        return ToolModelExport(*conversion.terms_at(_source(cal), temperature, toolface_deg))
     if temperature is not None:
         raise InputError("`temperature`: sources hold for all temperatures. Leave it out.")
+    if toolface_deg is not None:
+        raise InputError("`toolface_deg` goes with the kind tool-model. Leave it out.")
     form = "c" if form is None else form
     _check_word("form", form, FORMS_OF_FIRMWARE)
     return FirmwareExport(conversion.exported(_source(cal), FORMS_OF_FIRMWARE[form], word_bits))

@@ -130,16 +130,18 @@ def converted(
 
 
 def terms_at(
-    source: Calibration | PathLike[str] | str, temperature: float | str | None
-) -> tuple[Converted, list[SensorTerm], str]:
-    """The sensor terms of a calibration at a temperature, and the text of its tool model.
+    source: Calibration | PathLike[str] | str, temperature: float | str | None, toolface_deg: float | None = None
+) -> tuple[Converted, list[SensorTerm], str]:  # fmt: skip
+    """The sensor terms of a calibration at a temperature, and the text of its tool model; at one toolface if it stays.
 
     Raises:
         FitError: a term is undetermined.
-        InputError: a temperature that is not possible, or a file that cannot be read.
+        InputError: a temperature or toolface that is not possible, or a file that cannot be read.
     """
     name, sha256, calibration = _identified(source)
     _check_temperature(temperature)
+    if toolface_deg is not None and not -360 <= toolface_deg <= 360:
+        raise InputError(f"`toolface` must be an angle in degrees; got {toolface_deg:g}.")
     if isinstance(temperature, str):
         raise InputError(
             f"`temperature` of a tool model must be a number in °C; got {temperature!r}."
@@ -148,7 +150,9 @@ def terms_at(
     findings += calibration.change_findings()
     result = Converted(name, sha256, calibration, "", temperature, {}, findings)
     terms = sensor_terms(calibration, temperature)
-    return result, terms, tool_model_text(calibration, temperature=temperature)
+    toolface = None if toolface_deg is None else float(np.radians(toolface_deg))
+    model = tool_model_text(calibration, temperature=temperature, toolface=toolface)
+    return result, terms, model
 
 
 def _check_temperature(temperature: float | str | None) -> None:

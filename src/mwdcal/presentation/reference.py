@@ -91,6 +91,10 @@ def notes(reference: EarthReference) -> list[str]:
             f"grid azimuth = magnetic azimuth {signed(reference.offset_deg('grid'), 3)}°",
             f"convergence {signed(reference.convergence_deg, 4)}° of {reference.crs}: {sources['convergence']}",
         ]
+    if reference.grid_scale is not None:
+        lines.append(
+            f"grid scale {fixed(reference.grid_scale, 6)}: length on the map over that on the ellipsoid"
+        )
     if reference.coefficients:
         lines.append(f"field: {reference.coefficients}")
     lines += [

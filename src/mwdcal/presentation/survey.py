@@ -23,6 +23,7 @@ from mwdcal.presentation.contributions import (
     contribution_summary,
 )
 from mwdcal.presentation.envelope import json_document, with_signature
+from mwdcal.presentation.listing import closures
 from mwdcal.presentation.numbers import files_written, fixed, measured, number, signed
 from mwdcal.presentation.signature import signature_status
 from mwdcal.presentation.text import chance, one_line, plural, table
@@ -121,13 +122,18 @@ OUTCOMES = {"true": "accepted", "false": "REJECTED", "": "not judged"}
 
 
 class EndOfPath(msgspec.Struct, frozen=True, kw_only=True):
-    """The last station on the well path: metres from where the path starts, with standard uncertainties."""
+    """The last station on the well path: its coordinates, m, with standard uncertainties.
+
+    Closure is the horizontal distance from north 0, east 0, and its azimuth; null at the origin itself.
+    """
 
     station: str
     md_m: float
     north_m: float
     east_m: float
     tvd_m: float
+    closure_m: float
+    closure_azimuth_deg: float | None
     sd_north_m: float | None
     sd_east_m: float | None
     sd_tvd_m: float | None
@@ -362,12 +368,15 @@ def end_of_path(last: LastStation) -> EndOfPath:
     north, east, tvd = last.place.tolist()
     variances = np.maximum(np.diagonal(last.covariance), 0.0)
     sd_north, sd_east, sd_tvd = map(stated, np.sqrt(variances).tolist())
+    closure, bearing = closures(last.place[None])
     return EndOfPath(
         station=last.label,
         md_m=last.md,
         north_m=north,
         east_m=east,
         tvd_m=tvd,
+        closure_m=float(closure[0]),
+        closure_azimuth_deg=stated(float(bearing[0])),
         sd_north_m=sd_north,
         sd_east_m=sd_east,
         sd_tvd_m=sd_tvd,
@@ -454,7 +463,10 @@ def end_in_words(end: EndOfPath, north: str, unit: str = "m") -> str:
             ("TVD", end.tvd_m, end.sd_tvd_m),
         )
     ]
-    return f"at {fixed(end.md_m / metres, 2)} {unit} MD, from {north} north: {', '.join(parts)}"
+    closure = f"; closure {fixed(end.closure_m / metres, 2)} {unit}"
+    if end.closure_azimuth_deg is not None:
+        closure += f" at {fixed(end.closure_azimuth_deg, 2)}°"
+    return f"at {fixed(end.md_m / metres, 2)} {unit} MD, from {north} north: {', '.join(parts)}{closure}"
 
 
 def survey_table(well: Well, count: int, most: int = MOST_SURVEYS) -> str:

@@ -329,12 +329,14 @@ class Grid(NamedTuple):
 
     `convergence_deg`: angle from true to grid north, positive east. `distortion_deg`: largest error of an angle
     between two directions on the grid, zero where it is conformal. `covered`: the grid is made for that place.
+    `scale`: length on the map over that on the ellipsoid, the mean of all directions.
     """
 
     convergence_deg: float
     name: str
     covered: bool
     distortion_deg: float
+    scale: float
 
 
 def grid_convergence(crs: str, latitude_deg: float, longitude_deg: float) -> Grid:
@@ -359,6 +361,7 @@ def grid_convergence(crs: str, latitude_deg: float, longitude_deg: float) -> Gri
         name=f"{system.name}, pyproj {pyproj.__version__}",
         covered=_covers(system, longitude, latitude_deg),
         distortion_deg=float(2 * np.degrees(np.arcsin((long - short) / (long + short)))),
+        scale=float(np.sqrt(long * short) * system.axis_info[0].unit_conversion_factor),
     )
 
 
@@ -634,6 +637,7 @@ class EarthReference(msgspec.Struct, frozen=True, kw_only=True):
         altitude_m: metres above the ellipsoid, negative below.
         date: day for which the field holds.
         convergence_deg: of the grid `crs`; None where no grid was named.
+        grid_scale: of that grid: length on the map over that on the ellipsoid.
         model: word of the field model; None where field, dip and declination were all measured.
         epoch: decimal year from which its coefficients are carried forward.
         valid_to: decimal year up to which it holds.
@@ -657,6 +661,7 @@ class EarthReference(msgspec.Struct, frozen=True, kw_only=True):
     dip_deg: float
     declination_deg: float
     convergence_deg: float | None = None
+    grid_scale: float | None = None
     crs: str | None = None
     model: str | None = None
     epoch: float | None = None
@@ -746,6 +751,7 @@ def reference_at(
         **spread,
         **described,
         convergence_deg=grid.convergence_deg if grid else None,
+        grid_scale=grid.scale if grid else None,
         crs=crs or None,
         measured=[name for name in MEASURABLE if name in measured],
         sources=_sources(described.get("coefficients"), measured, grid),

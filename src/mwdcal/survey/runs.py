@@ -20,6 +20,7 @@ from mwdcal.files.formats.columns import Column
 from mwdcal.files.formats.table import Table
 from mwdcal.geometry.vectors import AnyArray, Array, Bools
 from mwdcal.survey.acceptance import Blindness, Judgement
+from mwdcal.survey.axial import AxialCorrection
 from mwdcal.survey.interference import Interference
 from mwdcal.survey.path import TieIn
 from mwdcal.survey.stations import TOOLFACE_SWITCH, North, Surveys
@@ -37,6 +38,7 @@ def survey_runs(
     tie_in: tuple[float, float, float] | TieIn | None = None,
     switch: tuple[float, float] = TOOLFACE_SWITCH,
     outside: str = "blank",
+    axial: bool = False,
 ) -> SurveyedWell:
     """The surveys of the runs of a well, in the order in which they were drilled; as of `survey_well` if it is one.
 
@@ -44,13 +46,10 @@ def survey_runs(
         InputError: runs whose azimuths count from different norths, or whose tools measure different things.
     """
     runs: list[SurveyedWell] = []
+    how: dict[str, Any] = {"tie_in": tie_in, "switch": switch, "outside": outside, "axial": axial}
     for each, analysis in zip(inputs, analyses, strict=True):
         follows = runs[-1].well.after.next_run() if runs else None
-        runs.append(
-            survey_well(
-                each, analysis, tie_in=tie_in, switch=switch, outside=outside, follows=follows
-            )
-        )
+        runs.append(survey_well(each, analysis, follows=follows, **how))
     if len(runs) == 1:
         return runs[0]
     _check_alike([run.well for run in runs])
@@ -67,7 +66,8 @@ def survey_runs(
         rows=_joined_rows(runs),
         tie_ins=_joined_tie_ins(runs),
     )
-    return SurveyedWell(first, together, together.counts, None, tuple(runs))
+    alone = AxialCorrection.joined([run.axial for run in runs if run.axial]) if axial else None
+    return SurveyedWell(first, together, together.counts, None, tuple(runs), alone)
 
 
 def _check_alike(wells: Sequence[Well]) -> None:

@@ -48,7 +48,8 @@ class North:
     None: not known. `declination_sd`: standard uncertainty that the stations share, `declination_noise` that of
     what changes from one to the next; each one value, or one for each station (n,), of which `base` has the means.
     `findings`: where they are assumed, or sources disagree. `sources`: where each comes from, by name. `section`:
-    azimuth of the vertical section, from the north of the path.
+    azimuth of the vertical section, from the north of the path. `scale` of the grid: length on the map over that on the
+    ground.
     """
 
     declination: float | Array | None = None
@@ -58,6 +59,7 @@ class North:
     findings: tuple[Finding, ...] = ()
     sources: Mapping[str, str] = field(default_factory=dict)
     section: float = 0.0
+    scale: float | None = None
     base: North | None = None
 
     @property
@@ -157,6 +159,7 @@ def norths_of(
         radians(alone),
         tuple(findings),
         sources,
+        scale=None if reference is None else reference.grid_scale,
     )
 
 

@@ -37,6 +37,7 @@ from mwdcal.geometry.units import LENGTH_UNITS
 from mwdcal.geometry.vectors import AnyArray, Array, Bools
 from mwdcal.sensor.profile import StandProfile
 from mwdcal.survey.acceptance import SensorTerms, SurveyLimits, load_survey_limits
+from mwdcal.survey.axial import AxialCorrection, axial_correction
 from mwdcal.survey.contributions import Contributions, contributions
 from mwdcal.survey.error_model import BUILT_IN, ErrorModel, load_error_model
 from mwdcal.survey.interference import Interference, interference
@@ -327,15 +328,17 @@ def surveyed_table(
     rows: Bools | None = None,
     covariance: bool = False,
     tie_ins: Mapping[int, TieIn] | None = None,
+    more: Mapping[str, AnyArray] | None = None,
 ) -> Table:
     """The table with the results beside its columns; `rows` (n,) are those of the well, by default all.
 
-    With the `covariance` of the positions if asked for. `tie_ins` have what they state at their rows.
+    With the `covariance` of the positions if asked for, and `more` columns. `tie_ins` have what they state at
+    their rows.
 
     Raises:
         InputError: a column has the name of a result already.
     """
-    results = well.columns
+    results = {**well.columns, **(more or {})}
     if covariance and well.position is not None:
         results = results | covariance_columns(well.position.covariance, well.length_unit)
     if rows is not None:
@@ -414,6 +417,8 @@ def described(well: Well) -> Mapping[str, object]:
     ):
         if angle is not None:
             stated[key] = float(np.degrees(angle))
+    if north.scale is not None:
+        stated["grid_scale"] = north.scale
     if well.sources:
         stated["reference_sources"] = dict(well.sources)
     if is_simulated(calibration.tool) or is_simulated(well.readings.metadata):
@@ -463,7 +468,7 @@ class SurveyedWell:
     """The surveys of a well with what they rest on; `analysis` is None without multi-station analysis.
 
     Of a long table that was surveyed in parts `well` has the first stations only, and `counts` is of all. `runs` are
-    those of a well in several, whose surveys `well` has together.
+    those of a well in several, whose surveys `well` has together. `axial`: each survey corrected by itself; None: not.
     """
 
     inputs: WellInputs
@@ -471,6 +476,7 @@ class SurveyedWell:
     counts: WellCounts
     analysis: Interference | None = None
     runs: tuple[SurveyedWell, ...] = ()
+    axial: AxialCorrection | None = None
 
     @cached_property
     def contributions(self) -> Contributions | None:
@@ -486,8 +492,9 @@ class SurveyedWell:
 
     def table_with(self, covariance: bool = False) -> Table:
         """The same, with the covariance of the positions too; a tie-in station has what it states."""
+        more = self.axial.columns(self.well.north.name) if self.axial else {}
         return surveyed_table(
-            self.inputs.table, self.well, self.inputs.rows, covariance, self.inputs.tie_ins
+            self.inputs.table, self.well, self.inputs.rows, covariance, self.inputs.tie_ins, more
         )
 
 
@@ -693,8 +700,12 @@ def survey_well(
     switch: tuple[float, float] = TOOLFACE_SWITCH,
     outside: str = "blank",
     follows: Before | None = None,
+    axial: bool = False,
 ) -> SurveyedWell:
-    """The surveys of a well, corrected for interference where there is an `analysis`; else as of `well`."""
+    """The surveys of a well, corrected for interference where there is an `analysis`; else as of `well`.
+
+    `axial`: also correct each survey by itself for interference along the tool.
+    """
     surveys = inputs.surveys
     stated = next(iter(inputs.tie_ins.values()), None)
     about = [] if follows is None or stated is None else tie_in_differs(stated, follows.path)
@@ -704,8 +715,10 @@ def survey_well(
         fitted, surveys.readings, inputs.limits, surveys.north, surveys.md, tie_in, switch, outside,
         model=inputs.model, follows=follows, walk=inputs.walk,
     )  # fmt: skip
-    findings = [*inputs.findings, *about, *result.findings]
+    alone = axial_correction(result) if axial else None
+    said = alone.findings(result.readings.labels, result.north.name) if alone else []
+    findings = [*inputs.findings, *about, *result.findings, *said]
     result = replace(
         result, findings=findings, sources=surveys.sources, length_unit=inputs.length_unit
     )
-    return SurveyedWell(inputs, result, result.counts, analysis)
+    return SurveyedWell(inputs, result, result.counts, analysis, axial=alone)

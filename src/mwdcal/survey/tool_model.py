@@ -68,6 +68,41 @@ at vertical, where one is infinite. `term_shifts` has the same from the geometry
 Reference: SPE 67616; ISCWSA MWD Rev 5."""
 
 
+_ACROSS = "(Cos(Inc) * Sin(AzM) * {a} {sign} Cos(AzM) * {b})"
+"""Part of the azimuth's error by a sensor across the tool, whose direction is {a} upward and {b} sideways."""
+
+
+def formulas_at(toolface: float) -> dict[str, tuple[str, ...]]:
+    """The same as `FORMULAS` for every axis of a tool that stays at one gravity toolface, rad: nothing is averaged.
+
+    Reference: SPE 67616, table 1.
+    """
+    sine, cosine = (f"({v:.12g})" for v in np.round([np.sin(toolface), np.cos(toolface)], 15) + 0.0)
+    result: dict[str, tuple[str, ...]] = {}
+    for axis, a, b, sign, back in (("X", sine, cosine, "-", "+"), ("Y", cosine, sine, "+", "-")):
+        across = _ACROSS.format(a=a, b=b, sign=sign)
+        level = f"(Cos(AzM) * {b} {sign} Cos(Inc) * Sin(AzM) * {a})"
+        start = "" if axis == "X" else "-"
+        north = f"-({a} * Cos(AzT) {back} {b} * Sin(AzT)) / Gfield"
+        east = f"({back}{b} * Cos(AzT) - {a} * Sin(AzT)) / Gfield"
+        result |= {
+            f"AB{axis}": (
+                f"-Cos(Inc) * {a} / Gfield",
+                f"({across} * Tan(Dip) {back} {b} * Tan(pi / 2 - Inc)) / Gfield", north, east,
+            ),
+            f"AS{axis}": (
+                f"Cos(Inc) * Sin(Inc) * {a} * {a}",
+                f"-(Tan(Dip) * Sin(Inc) * {across} {back} Cos(Inc) * {b}) * {a}",
+            ),
+            f"MB{axis}": ("0", f"{start}{level} / (BField * Cos(Dip))"),
+            f"MS{axis}": (
+                "0",
+                f"{start}(Cos(Inc) * Cos(AzM) * {a} - Tan(Dip) * Sin(Inc) * {a} {back} Sin(AzM) * {b}) * {level}",
+            ),
+        }  # fmt: skip
+    return {**result, **{name: texts for name, texts in FORMULAS.items() if name.endswith("Z")}}
+
+
 class SensorTerm(msgspec.Struct, frozen=True, kw_only=True):
     """1σ of one sensor term of a calibrated tool, and its ratio to that of the OWSG model; None: undetermined.
 
@@ -165,18 +200,21 @@ def _rows(calibration: Calibration, temperature: float | None) -> Array:
 
 
 def tool_model(
-    terms: Sequence[SensorTerm], name: str, source: str, date: str = "", simulated: bool = False
-) -> dict[str, Any]:
+    terms: Sequence[SensorTerm], name: str, source: str, date: str = "", simulated: bool = False,
+    toolface: float | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """The terms as a tool model in ISCWSA's JSON form, which welleng takes as an `error_model`.
 
     Of sensors alone: errors of depth, alignment, reference and interference are not the calibration's. `date`: as the
-    calibration states its time.
+    calibration states its time. `toolface`, rad, of a tool that does not turn: terms of each axis at it, where they are
+    averaged over toolface otherwise.
 
     Raises:
         FitError: a term is undetermined.
     """
+    formulas = FORMULAS if toolface is None else formulas_at(toolface)
     values = {term.name: term for term in terms}
-    exported = {each: values[each.partition("-")[0]] for each in FORMULAS}
+    exported = {each: values[each.partition("-")[0]] for each in formulas}
     lacking = sorted({term.name for term in exported.values() if term.value is None})
     if lacking:
         raise FitError(
@@ -195,13 +233,14 @@ def tool_model(
         "revision_date": date[:10],
         "revision_comment": "1 sigma of each sensor term from the covariance of a calibration.",
         "source": source,
-        "application": "Sensor terms alone: add depth, alignment, reference and interference.",
+        "application": "Sensor terms alone: add depth, alignment, reference and interference."
+        + ("" if toolface is None else f" Of a tool at gravity toolface {np.degrees(toolface):g}°."),
         "tool_type": "Magnetic",
         "author": SOFTWARE,
         "framework": "ISCWSA Rev5",
         "tags": tags,
     }
-    rows = [_row(space, each, term) for each, term in exported.items()]
+    rows = [_row(space, each, term, formulas[each]) for each, term in exported.items()]
     return {
         "$schema": "https://github.com/iscwsa/error-models/blob/main/schemas/draft.json",
         "metadata": metadata,
@@ -212,8 +251,10 @@ def tool_model(
     }
 
 
-def _row(space: uuid.UUID, name: str, term: SensorTerm) -> dict[str, Any]:
-    inclination, azimuth, *vertical = FORMULAS[name]
+def _row(
+    space: uuid.UUID, name: str, term: SensorTerm, formulas: tuple[str, ...]
+) -> dict[str, Any]:
+    inclination, azimuth, *vertical = formulas
     north, east = vertical or (None, None)
     return {
         "uuid": str(uuid.uuid5(space, name)),
@@ -233,9 +274,9 @@ def _row(space: uuid.UUID, name: str, term: SensorTerm) -> dict[str, Any]:
 
 
 def tool_model_text(
-    calibration: Calibration, name: str = "", temperature: float | None = None
-) -> str:
-    """The tool model of a calibrated tool as JSON; `name`: by default the tool's.
+    calibration: Calibration, name: str = "", temperature: float | None = None, toolface: float | None = None
+) -> str:  # fmt: skip
+    """The tool model of a calibrated tool as JSON; `name`: by default the tool's. `toolface` as of `tool_model`.
 
     Raises:
         FitError: a term is undetermined.
@@ -243,7 +284,7 @@ def tool_model_text(
     tool = name or " ".join(filter(None, ("mwdcal", calibration.tool.get("serial"))))
     terms = sensor_terms(calibration, temperature)
     source = f"calibration of {calibration.run_name}, SHA-256 {calibration.run_sha256}"
-    model = tool_model(terms, tool, source, calibration.time, calibration.simulated)
+    model = tool_model(terms, tool, source, calibration.time, calibration.simulated, toolface)
     return json.dumps(model, indent=1) + "\n"
 
 

@@ -10,6 +10,7 @@ from operator import or_
 from typing import Any, NamedTuple
 
 import numpy as np
+from msgspec.structs import replace as replace_struct
 
 from mwdcal.calibration.automatic.drift import JULIAN_YEAR
 from mwdcal.calibration.readings import Readings, stated_day
@@ -298,10 +299,12 @@ def hole_of(
     return Hole.along(md, tvd, *angles, magnetic, field, dip, last=last)
 
 
-BLIND_FROM = 1.5
+BLIND_FROM = 1.0
 """Stated standard uncertainties of azimuth by which interference that would pass turns it where acceptance is blind.
 
-Other errors add to the turn: from here on one azimuth in fifteen is off by more than three, of those that pass.
+Below it the turn is less than what is stated. With other errors of one standard uncertainty an azimuth turned by t is
+off by more than three with probability Φ(t - 3): of interference that turns by anything up to five, as five times the
+model's does, 0.4 % of the azimuths that are off have a turn below one, and 1.4 % one below 1.5.
 """
 Start = tuple[float, float, float] | TieIn | PathEnd
 """Where a path starts: position of the first station, a tie-in, or the end of the part before."""
@@ -311,7 +314,8 @@ AXES_OF_EARTH = ("north", "east", "tvd")
 WELL_FINDINGS = {
     "rejected": "{rejected} of {judged} surveys lie outside the limits '{limits}' (first: station {first}: {why}).",
     "blind-to-interference": "acceptance is blind to interference of the drill string at {blind} of {accepted} "
-    "accepted surveys. At station {blindest} {worst}. Use `msa`, or measure a check azimuth.",
+    "accepted surveys. At station {blindest} {worst}. Use `msa`: surveys at another attitude show what is along the tool, "
+    "rotation shots (four toolfaces at one depth) what is across it. Or measure a check azimuth.",
     "rejected-on-path": "surveys outside the limits are part of the well path. Leave them out of the table, or "
     "survey again.",
     "not-judged": "{unjudged} of {rows} surveys are not judged: no reference for |g|, |b| or dip. Give `reference`, or "
@@ -744,10 +748,16 @@ def _judged(
     calibration: Calibration, readings: Readings, surveys: Surveys, vectors: tuple[Array, Array],
     limits: SurveyLimits,
 ) -> tuple[Judgement, Blindness | None]:  # fmt: skip
-    """Acceptance, and what it cannot see; nothing where interference was taken off, or there is no field."""
+    """Acceptance, and what it cannot see; nothing where interference was taken off, or there is no field.
+
+    Where it was taken off, the covariance of the calibration has what is left of it and of the sensors' drift: the
+    terms of the limits for sensors do not count beside it.
+    """
     seen, known = _to_judge(calibration, readings, vectors)
-    judgement = judged(surveys, seen, known, limits)
     taken = any(finding.id == CORRECTED for finding in calibration.findings)
+    if taken:
+        limits = replace_struct(limits, sensor=SensorTerms())
+    judgement = judged(surveys, seen, known, limits)
     if taken or not calibration.has_field or judgement.tests is None:
         return judgement, None
     return judgement, blindness(judgement.tests, seen)

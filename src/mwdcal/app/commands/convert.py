@@ -36,6 +36,13 @@ from mwdcal.presentation.text import one_line, to_json
     help="One temperature, or 'course': coefficients by power of T - reference. "
     "Default: the reference temperature.",
 )
+@click.option(
+    "--toolface",
+    type=float,
+    metavar="DEG",
+    help="With tool-model: the gravity toolface of a tool that does not turn; terms are then of each axis. Default: "
+    "averaged over toolface.",
+)
 @options.output(
     metavar="OUT.json|DIR",
     required=False,
@@ -44,7 +51,7 @@ from mwdcal.presentation.text import one_line, to_json
 @options.JSON
 def command(
     calibration: Path, notation: str | None, form: str | None, word_bits: int | None,
-    temperature: str | None, output: Path | None, as_json: bool,
+    temperature: str | None, toolface: float | None, output: Path | None, as_json: bool,
 ) -> None:  # fmt: skip
     """Print a CALIBRATION in another notation, in raw units, with covariance, or write it as C sources.
 
@@ -60,8 +67,10 @@ def command(
 
     _check_choice(notation, form, temperature, output)
     check_bits(form, word_bits)
+    if toolface is not None and form != "tool-model":
+        raise InputError("`toolface` goes with `form` tool-model. Leave it out.")
     if form == "tool-model" and output:
-        _write_model(calibration, temperature, output, as_json)
+        _write_model(calibration, temperature, toolface, output, as_json)
     elif form and output:
         _write_sources(calibration, form, word_bits, output, as_json)
     elif notation:
@@ -116,13 +125,16 @@ def _write_sources(
     )
 
 
-def _write_model(calibration: Path, temperature: str | None, output: Path, as_json: bool) -> None:
+def _write_model(
+    calibration: Path, temperature: str | None, toolface: float | None, output: Path, as_json: bool
+) -> None:
     """Write the sensor terms of a calibration as a tool model, and print them."""
     from mwdcal.files.formats import atomic
     from mwdcal.presentation import conversion
 
     options.check_outputs([output], [calibration])
-    converted, terms, model = conversion.terms_at(calibration, _temperature(temperature))
+    at = _temperature(temperature)
+    converted, terms, model = conversion.terms_at(calibration, at, toolface)
     atomic.write(output, model)
     document = conversion.terms_document(converted, terms, output)
     print_result(

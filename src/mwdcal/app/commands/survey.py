@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import radians
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -47,6 +47,12 @@ Outputs = list[tuple[Path, Any]]
     metavar="owsg|none|FILE",
     help="For --msa: how far the sensors may have drifted since the calibration, 1σ: as the OWSG model (owsg, the "
     "default), not at all (none), or as the [sensor] terms of a limits file.",
+)
+@click.option(
+    "--axial-correction",
+    is_flag=True,
+    help="Also correct each survey by itself for interference along the tool, from |b| and dip of the place: azimuths "
+    "beside the others, blank in the no-go zone near horizontal east-west.",
 )
 @options.preset(
     "--error-model",
@@ -118,6 +124,13 @@ Outputs = list[tuple[Path, Any]]
     "station and cause.",
 )
 @click.option(
+    "--listing",
+    type=options.FILE,
+    metavar="FILE",
+    help="Also write a survey listing for well-planning programs such as COMPASS: MD, Inc, Azi, TVD, N/S, E/W, V.Sec, "
+    "DLS, closure, covariance; with the scale of the reference's grid the position on the map too.",
+)
+@click.option(
     "--covariance",
     is_flag=True,
     help="Add the covariance of the position to the table: covariance_nn_m2 and so on; WITSML always has it.",
@@ -134,11 +147,11 @@ Outputs = list[tuple[Path, Any]]
 @options.JSON
 def command(
     calibration: Path, readings: Path, output: Path, reference: Path | None, msa: bool,
-    msa_html: Path | None, sensor_drift: str | None, error_model: str, registry: str | None, limits: str,
-    switch: str, run: tuple[tuple[str, str], ...], tie_in: str | None, length_unit: str | None,
-    section_azimuth: float, station: str | None, contributions: Path | None, covariance: bool,
-    outside: str, missing: str, report: Path | None, decimal: str,
-    key: tuple[Path, ...], as_json: bool,
+    msa_html: Path | None, sensor_drift: str | None, axial_correction: bool, error_model: str,
+    registry: str | None, limits: str, switch: str, run: tuple[tuple[str, str], ...], tie_in: str | None,
+    length_unit: str | None, section_azimuth: float, station: str | None, contributions: Path | None,
+    listing: Path | None, covariance: bool, outside: str, missing: str, report: Path | None,
+    decimal: str, key: tuple[Path, ...], as_json: bool,
 ) -> None:  # fmt: skip
     """Surveys of a well: READINGS in their order, corrected by the CALIBRATION of their tool.
 
@@ -161,13 +174,13 @@ def command(
     check_drift(sensor_drift, msa)
     pairs = [(calibration, readings), *((Path(tool), Path(table)) for tool, table in run)]
     given = [*(file for pair in pairs for file in pair), reference, limits, error_model, *key]
-    options.check_outputs([output, msa_html, contributions], given, page=report)
+    options.check_outputs([output, msa_html, contributions, listing], given, page=report)
     unit = length_unit or ""
     start, ends = _tie_in(tie_in, unit), _switch(switch)
     loaded = [load_calibration(tool, key) for tool, _ in pairs]
     said = options.statements()
-    blank = missing == "blank"
-    whole = any((msa, report, blank, said, contributions, station, run, covariance, registry))
+    wanted = report, contributions, listing, station, covariance
+    whole = any((msa, axial_correction, missing == "blank", said, run, registry, *wanted))
     if not whole and long_table.in_parts(readings, output, loaded[0].calibration.profile):
         result = long_table.survey_file(
             loaded[0].calibration, readings, output, reference, limits, start, ends, outside, decimal,
@@ -182,15 +195,16 @@ def command(
     ]
     analyses = [analysed(each, sensor_drift) if msa else None for each in inputs]
     pages = _interference_page(inputs[0], analyses[0], msa_html)
-    for each, analysis, tool in zip(inputs, analyses, loaded, strict=True):
-        if analysis and not analysis.summary.separable:
-            atomic.write_all(pages + _interference_page(each, analysis, report))
-            _refuse(each, analysis, tool.signature, as_json)
-    result = survey_runs(inputs, analyses, tie_in=start, switch=ends, outside=outside)
-    pages += _pages(result, report, contributions, station)
+    _check_separable(inputs, analyses, loaded, pages, report, as_json)
+    way: Any = {"tie_in": start, "switch": ends, "outside": outside, "axial": axial_correction}
+    result = survey_runs(inputs, analyses, **way)
+    pages += _pages(result, report, contributions, station) + _listing(result, listing)
     atomic.write_all([_table(result, output, covariance), *pages])
-    files = str(output), str(report or "")
-    _print(result, loaded[0].signature, files, as_json, station, contributions)
+    files, more = (
+        (str(output), str(report or "")),
+        {"contributions": contributions, "listing": listing},
+    )
+    _print(result, loaded[0].signature, files, as_json, station, **more)
 
 
 def _inputs(
@@ -252,6 +266,16 @@ def _pages(
     return pages
 
 
+def _listing(result: SurveyedWell, file: Path | None) -> Outputs:
+    """The listing for well-planning programs, where one was asked for."""
+    if file is None:
+        return []
+    from mwdcal.files.formats import table as tables
+    from mwdcal.presentation.listing import listing
+
+    return [(file, tables.rendered(file, listing(result)))]
+
+
 def _interference_page(
     inputs: WellInputs, analysis: Interference | None, page: Path | None
 ) -> Outputs:
@@ -261,6 +285,19 @@ def _interference_page(
     from mwdcal.presentation.interference_page import render
 
     return [(page, render(analysis, inputs.named))]
+
+
+def _check_separable(
+    inputs: Sequence[WellInputs], analyses: Sequence[Interference | None], loaded: Sequence[LoadedCalibration],
+    pages: Outputs, report: Path | None, as_json: bool,
+) -> None:  # fmt: skip
+    """Refuse a run whose analysis cannot be used, with the pages that show it."""
+    from mwdcal.files.formats import atomic
+
+    for each, analysis, tool in zip(inputs, analyses, loaded, strict=True):
+        if analysis and not analysis.summary.separable:
+            atomic.write_all(pages + _interference_page(each, analysis, report))
+            _refuse(each, analysis, tool.signature, as_json)
 
 
 def _refuse(
@@ -281,7 +318,7 @@ def _print(
     files: tuple[str, str],
     as_json: bool,
     station: str | None = None,
-    contributions: Path | None = None,
+    **more: Path | None,
 ) -> None:
     """Print the result, with the files that were written."""
     from mwdcal.presentation import survey as screens
@@ -290,7 +327,7 @@ def _print(
     shown: object = (
         screens.document(result.inputs, facts, signature)
         if as_json
-        else screens.whole_screen(result, facts, signature, station, contributions=contributions)
+        else screens.whole_screen(result, facts, signature, station, **more)
     )
     print_result(shown, findings_with_option_names(screens.all_findings(facts)))
 
