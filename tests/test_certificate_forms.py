@@ -13,6 +13,7 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
+import mwdcal
 from certificate_sample import ANGLES, BUDGET, PARAMETERS, SAMPLE, quantity
 from cli_support import EXAMPLE, process
 from mwdcal import extras
@@ -347,26 +348,67 @@ def pictures(material):
 
 def test_the_same_certificate_gives_the_same_bytes(material, pictures):
     calibration, verdict = material
-    few = [each for each in pictures if each.id in ("error-dip", "accuracy", "as-left")]
-    again = certificate_pictures(replace(calibration, errors=calibration.errors[-1:]), verdict)
-    again = [each for each in again if each.id != "residuals"]
+    some = ("errors-after", "accuracy", "as-left")
+    few = [each for each in pictures if each.id in some]
+    again = [each for each in certificate_pictures(calibration, verdict) if each.id in some]
     assert [each.id for each in few] == [each.id for each in again]
     first = render_pdf(SAMPLE, few)
     assert render_pdf(SAMPLE, few) == render_pdf(SAMPLE, again) == first
     page = render_page(SAMPLE, few)
     assert page == render_page(SAMPLE, again)
-    assert page.count('<svg role="img"') == len(few)
+    assert page.count("<figure>") == len(few)
     assert not re.search(r"\b(src|href)=\"(?!#)", page)
 
 
 def test_pictures_have_titles_and_texts_for_those_who_do_not_see_them(pictures):
     ids = [picture.id for picture in pictures]
     assert len({*ids}) == len(ids)
-    assert {"residuals", "accuracy", "as-found", "as-left", "error-azimuth"} <= {*ids}
+    assert {"residuals", "accuracy", "as-found", "as-left", "errors-after", "errors-before"} <= {
+        *ids
+    }
     assert [p.alt for p in pictures if len(p.alt) < 15] == []
     reader = pypdf.PdfReader(io.BytesIO(render_pdf(SAMPLE, pictures)))
     shown = squeezed("".join(page.extract_text() for page in reader.pages))
     assert [p.title for p in pictures if squeezed(p.title) not in shown] == []
+
+
+def test_the_answer_is_on_two_pages_and_the_rest_in_an_annex(material, pictures):
+    calibration, verdict = material
+    paper = mwdcal.certificate(
+        calibration, verification=verdict, laboratory=EXAMPLE / "laboratory.toml"
+    )
+    read = [
+        squeezed(page.extract_text())
+        for page in pypdf.PdfReader(io.BytesIO(paper.form("C.pdf"))).pages
+    ]
+    (annex,) = [k for k, text in enumerate(read) if squeezed("Annex to certificate") in text]
+    assert annex == 2
+    main = "".join(read[:2])
+    for words in (
+        "Expanded uncertainty",
+        "noise-free value",
+        "raw",
+        "traceability",
+        "Authorised by",
+    ):
+        assert squeezed(words) in main
+
+
+@pytest.mark.parametrize(
+    "advice",
+    [
+        "State its uncertainty in [stand] of the tool profile, and calibrate again.",
+        "Re-shoot it, or --exclude 7.",
+        "What the failure looks like says: mwdcal diagnose before.json rolltest.csv.",
+        "Measure there and back, or declare the drift in the tool profile;",
+        "Give its public key by `key`, if you have it.",
+    ],
+)
+def test_a_customer_reads_no_advice_about_the_program(advice):
+    said = Finding(id="doubt", text=f"the dip is assumed exact. {advice} The rest stays.")
+    text = page_text(replace(SAMPLE, findings=[said]))
+    assert squeezed("The dip is assumed exact. The rest stays.") in text
+    assert squeezed(advice) not in squeezed(text)
 
 
 def test_without_typst_one_sentence_says_what_to_install(monkeypatch):

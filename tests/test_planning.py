@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
-from itertools import combinations, pairwise, permutations
+from itertools import combinations, groupby, pairwise, permutations
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from mwdcal.planning.planned import (
     WORKING_INCLINATIONS,
     Stand,
     best_plan,
+    hand_order,
     judged,
     measuring_order,
     move_seconds,
@@ -624,6 +626,39 @@ def test_where_the_field_is_vertical_no_azimuth_is_known():
     sd = accuracy_at(expected(vertical, SERVO), [45 * DEG])
     assert np.isnan(sd["azimuth"]).all()
     assert sd["inclination"] < 0.01 * DEG
+
+
+def test_a_stand_turned_by_hand_moves_its_slow_axes_last():
+    """Three inclinations at two azimuths: five moves of them are the fewest, however the plan is shuffled."""
+    grid = np.array(
+        [(i, a, t) for i in (5, 45, 90) for a in (0, 90) for t in (0, 90, 180, 270)], float
+    )
+    for seed in range(20):
+        shuffled = np.random.default_rng(seed).permutation(np.concatenate([grid, grid]))
+        soak = np.repeat([0, 1], 24)
+        attitude = np.concatenate([shuffled[np.unique(shuffled, axis=0, return_index=True)[1]]] * 2)
+        order = hand_order(attitude, soak)
+        assert sorted(order.tolist()) == list(range(48))
+        assert (np.diff(soak[order]) >= 0).all()
+        for some in (order[:24], order[24:]):
+            moved = np.any(np.diff(attitude[some, :2], axis=0) != 0, axis=-1)
+            assert moved.sum() == 5
+            assert np.count_nonzero(np.diff(attitude[some, :2], axis=0)) == 5  # one axis at a time
+
+
+def test_a_sheet_has_room_for_six_readings_and_no_banner_of_simulated_data(tmp_path):
+    sheet = tmp_path / "sheet.html"
+    assert (
+        mwdcal("plan", "--plan", "laboratory-thermal", "--tool", "servo", "--report", sheet).code
+        == 0
+    )
+    page = sheet.read_text("utf-8")
+    assert "SIMULATED" not in page
+    assert page.count('<td class="reading">') == 6 * 48
+    temperatures = re.findall(r'<td class="tick"></td><td>\d+</td><td>(\d+)</td>', page)
+    planned_ones = load_plan("laboratory-thermal").columns["temperature_c"].tolist()
+    visits = [key for key, _ in groupby(map(float, temperatures))]
+    assert visits == [key for key, _ in groupby(planned_ones)]  # there and back, as the plan has it
 
 
 def test_a_sheet_asks_for_the_place(tmp_path):

@@ -90,10 +90,11 @@ class TrustedKey(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 class PrivateKey(NamedTuple):
-    """A key that signs, and the public one that belongs to it."""
+    """A key that signs, the public one that belongs to it, and the key of cryptography."""
 
     sign: Callable[[bytes], bytes]
     public: TrustedKey
+    secret: Any = None
 
 
 def ed25519() -> Any:
@@ -220,7 +221,7 @@ def read_private(path: Path, passphrase: Callable[[], str]) -> PrivateKey:
         raise InputError(
             f"{path.name} is a private key of another kind than Ed25519. Use another key."
         )
-    return PrivateKey(key.sign, public_key(key.public_key().public_bytes_raw()))
+    return PrivateKey(key.sign, public_key(key.public_key().public_bytes_raw()), key)
 
 
 def _check_private(path: Path) -> None:

@@ -23,6 +23,7 @@ from mwdcal.use.verification import Verdict
 if TYPE_CHECKING:
     from mwdcal.certificate.contents import CertificateRequest
     from mwdcal.certificate.document import Certificate, SourceFile
+    from mwdcal.certificate.signature import PrivateKey
     from mwdcal.drift.document import ToolDrift
     from mwdcal.files.verifications import Verification
     from mwdcal.presentation.certificate import Picture
@@ -34,6 +35,15 @@ Place = str | os.PathLike[str]
 """The path of a file."""
 
 
+@dataclass(frozen=True, repr=False)
+class PaperSigner:
+    """What signs a certificate as it is issued: the key, its X.509 certificate (PEM) for PDF, and the signed JSON."""
+
+    key: PrivateKey
+    x509: bytes
+    signed: bytes
+
+
 @dataclass(repr=False)
 class Paper(Result):
     """A calibration certificate. `record` has all that it states; `save` writes it in any of its forms."""
@@ -42,6 +52,7 @@ class Paper(Result):
     calibration: Calibration
     order: CertificateRequest
     drift: ToolDrift | None = None
+    signer: PaperSigner | None = None
     saved: list[Path] = field(default_factory=list)
 
     @property
@@ -79,18 +90,33 @@ class Paper(Result):
         check_form(path)
         suffix = Path(path).suffix.lower()
         if suffix == ".json":
-            from mwdcal.certificate.document import encode
-
-            return encode(self.record)
+            return self._json()
         if suffix == ".xml":
             from mwdcal.certificate.dcc import to_xml
 
             return to_xml(self.record)
         if suffix == ".pdf":
-            from mwdcal.presentation.certificate import render_pdf
-
-            return render_pdf(self.record, self.pictures)
+            return self._pdf()
         return self._page()
+
+    def _json(self) -> bytes:
+        """Its JSON, signed where it is issued with a key."""
+        from mwdcal.certificate.document import encode
+
+        return self.signer.signed if self.signer else encode(self.record)
+
+    def _pdf(self) -> bytes:
+        """Its PDF, with its JSON attached, both signed where it is issued with a key."""
+        from mwdcal.presentation.certificate import render_pdf
+
+        if self.signer is None:
+            return render_pdf(self.record, self.pictures)
+        from mwdcal.certificate.pdf_signature import sign_pdf
+
+        laboratory = self.record.laboratory
+        owner = laboratory.name if laboratory else ""
+        pdf = render_pdf(self.record, self.pictures, self.signer.signed)
+        return sign_pdf(pdf, self.signer.key, owner, self.signer.x509)
 
     def save(self, path: Place) -> None:
         """Write the certificate: JSON, a page, PDF, or PTB's DCC as XML, by the suffix.
@@ -143,6 +169,9 @@ def certificate(
     date: date | str | None = None,
     keys: Sequence[Place] = (),
     folder: Place = ".",
+    private_key: Place | None = None,
+    x509: Place | None = None,
+    passphrase: str | Callable[[], str] | None = None,
 ) -> Paper:
     """The certificate of a calibration: ISO/IEC 17025 contents, uncertainty budget, decisions with their risk.
 
@@ -150,7 +179,9 @@ def certificate(
     with the calibration before: a verdict, or the file in which the JSON of `mwdcal verify` was saved. `laboratory`:
     a TOML file with what the laboratory states. `registry`: with the earlier calibrations, whose drift is then shown.
     `received` and `date` (of issue; today, UTC) are days, such as "2026-01-31". `keys`: public keys whose signatures
-    are trusted. `folder`: that of the certificate, from which its paths to other files are seen.
+    are trusted. `folder`: that of the certificate, from which its paths to other files are seen. `private_key` signs
+    the JSON, and the PDF by PAdES with the certificate in the PEM file `x509`, or one that the key signs itself;
+    `passphrase` as of `sign`.
 
     Raises:
         InputError: a file cannot be read, a roll test is of another tool or calibration, or a day is impossible.
@@ -178,18 +209,37 @@ def certificate(
     issued = day_of(date, "date") or datetime.now(UTC).date()
     drift = _drift(registry, calibration, digest, issued) if registry is not None else None
     order = CertificateRequest(
-        issued=issued,
-        number=number,
-        customer=customer,
-        condition=condition,
-        received=day_of(received, "received"),
-        verification=as_left,
-        as_found=before,
-        calibration_sha256=digest,
-        files=tuple(files.listed),
+        issued=issued, number=number, customer=customer, condition=condition, received=day_of(received, "received"),
+        verification=as_left, as_found=before, calibration_sha256=digest, files=tuple(files.listed),
         findings=(*doubts, *(drift.findings if drift else ())),
+    )  # fmt: skip
+    record, signer = _signed_record(
+        contents(calibration, order, stated), private_key, x509, passphrase
     )
-    return Paper(contents(calibration, order, stated), calibration, order, drift)
+    return Paper(record, calibration, order, drift, signer)
+
+
+def _signed_record(
+    record: Certificate,
+    private_key: Place | None,
+    x509: Place | None,
+    passphrase: str | Callable[[], str] | None,
+) -> tuple[Certificate, PaperSigner | None]:
+    """The contents of a certificate, where there is a key with their signature, and what signs its PDF."""
+    if private_key is None:
+        if x509 is not None:
+            raise InputError("`x509` needs the key that it belongs to. Name it: `private_key`.")
+        return record, None
+    from msgspec import json
+
+    from mwdcal.certificate.document import Certificate, encode
+    from mwdcal.certificate.signature import read_file, read_private, signed
+
+    key = read_private(Path(private_key), lambda: _passphrase(passphrase))
+    pem = read_file(Path(x509)) if x509 is not None else b""
+    data = encode(record)
+    whole = signed(Member(data, "C.json", sha256_of(data)), key)
+    return json.decode(whole, type=Certificate), PaperSigner(key, pem, whole)
 
 
 @dataclass
@@ -416,8 +466,8 @@ def check_signature(
 ) -> SignatureVerdict:
     """Whether a document is as it was signed, by public keys that are trusted; of a certificate also its files.
 
-    `document`: a calibration file, or the JSON of a verification or certificate. `keys`: public keys, or files of
-    trusted keys. `files`: those that the certificate rests on, where they do not lie as it says.
+    `document`: a calibration file, the JSON of a verification or certificate, or its PDF. `keys`: public keys, or
+    files of trusted keys. `files`: those that the certificate rests on, where they do not lie as it says.
 
     Raises:
         InputError: a file cannot be read, or no key is named.
@@ -433,5 +483,8 @@ def check_signature(
         raise InputError("`keys` must name a public key; got none. Name one that you trust.")
     trust, path = trusted(named), Path(document)
     file = documents.whole_file(path)
+    if path.suffix.lower() == ".pdf":
+        result, fields = screens.checked_pdf(file, path, trust, [Path(each) for each in files])
+        return SignatureVerdict(result, fields, file.digest)
     result, fields = screens.checked_document(file, path, trust, [Path(each) for each in files])
     return SignatureVerdict(result, fields, file.digest)

@@ -144,6 +144,28 @@ def measuring_order(attitude: Array, soak: Ints, stand: Stand) -> Ints:
     return np.array(order)
 
 
+def hand_order(attitude: Array, soak: Ints) -> Ints:
+    """An order (n,) of the stations of each soak for a stand turned by hand: its slow axes move last.
+
+    `attitude` (n, 3) in degrees. Toolface turns at each station, there and back; of inclination and azimuth, which are
+    levelled and aligned anew, one moves only when the other has been through all its settings, and the order of the
+    two is the one with fewer moves. The soaks keep their order.
+    """
+    both = [_serpentine(attitude[:, axes], soak) for axes in ([1, 0, 2], [0, 1, 2])]
+    moves = [int(np.count_nonzero(np.diff(attitude[order, :2], axis=0))) for order in both]
+    return both[int(np.argmin(moves))]
+
+
+def _serpentine(keys: Array, soak: Ints) -> Ints:
+    """An order (n,) by soak, then by each key (n, k): up and down in turn, so that no key jumps back to its start."""
+    if keys.shape[-1] == 0:
+        return np.argsort(soak, kind="stable")
+    order = _serpentine(keys[:, :-1], soak)
+    outer = np.column_stack([soak, keys[:, :-1]])[order]
+    group = np.cumsum(np.any(np.diff(outer, axis=0, prepend=outer[:1]) != 0, axis=-1))
+    return order[np.lexsort((keys[order, -1] * (-1.0) ** group, group))]
+
+
 def _tour(seconds: Array) -> Ints:
     """A short path through all stations, from the first on."""
     left, path = set(range(1, len(seconds))), [0]

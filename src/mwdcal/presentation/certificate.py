@@ -5,6 +5,7 @@ A certificate on the screen: what it is of, its decisions with their risk, and i
 
 from __future__ import annotations
 
+import re
 import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -32,7 +33,6 @@ from mwdcal.certificate.document import (
     TracedStandard,
 )
 from mwdcal.files.documents import laid_out
-from mwdcal.geometry.observables import TITLES
 from mwdcal.presentation.numbers import (
     UNDETERMINED,
     capital,
@@ -115,6 +115,8 @@ def probability(value: float) -> str:
     return f"{value:.{1 - exponent(missing)}f}"
 
 
+ACCURACY_TABLE = "accuracy"
+"""The id of the results that the first pages show."""
 ASSUMED_EXACT = "exact"
 """In place of the share of a source that is assumed exact."""
 
@@ -324,11 +326,12 @@ Block: TypeAlias = (
 
 
 class Section(msgspec.Struct, frozen=True):
-    """A numbered section of the certificate."""
+    """A numbered section of the certificate, or, by a letter, of its annex."""
 
     id: str
     title: str
     blocks: list[Block]
+    annex: bool = False
 
 
 class CertificateText(msgspec.Struct, frozen=True, kw_only=True):
@@ -400,22 +403,68 @@ def _cell(text: str, mark: Mark = "") -> Cell:
 
 
 def _sections(certificate: Certificate, pictures: Sequence[Picture]) -> Iterator[Section]:
-    """The sections in their order, those without contents left out."""
-    each: list[tuple[str, str, Iterable[Block]]] = [
+    """The sections in their order, those without contents left out: what a customer asks for, then the annex."""
+    main: list[tuple[str, str, Iterable[Block]]] = [
         ("item", "Item and customer", _item(certificate)),
         ("conformity", "Conformity, as found and as left", _conformity(certificate)),
-        ("results", "Results", map(_results, certificate.results)),
-        ("budget", "Uncertainty budget", [_budget_block(certificate.budget)]),
-        ("method", "Method and conditions", _method(certificate)),
+        ("results", "Expanded uncertainty of corrected angles", _accuracy_by_angle(certificate)),
+        ("method", "Method", _method(certificate)),
         ("traceability", "Metrological traceability", [_traceability(certificate.traceability)]),
-        ("statements", "Statements and findings", _statements(certificate)),
+        ("statements", "Statements", _statements(certificate)),
         ("authorisation", "Authorisation", _authorisation(certificate)),
+    ]
+    annex: list[tuple[str, str, Iterable[Block]]] = [
+        ("tables", "Results", map(_results, certificate.results)),
+        ("decisions", "Roll tests and their decisions", _decided(certificate)),
+        ("budget", "Uncertainty budget", [_budget_block(certificate.budget)]),
+        ("conditions", "Procedure and conditions", _conditions(certificate)),
+        ("remarks", "Remarks on the results", _remarks(certificate)),
         ("files", "Files that this certificate rests on", _files(certificate)),
         ("pictures", "Pictures", (PictureBlock(p.id, p.title, p.alt, p.note) for p in pictures)),
     ]
-    filled = [(key, title, blocks) for key, title, given in each if (blocks := list(given))]
-    for place, (key, title, blocks) in enumerate(filled, 1):
-        yield Section(key, f"{place}\u2002{title}", blocks)
+    for marks, sections in (("123456789", main), ("ABCDEFGHI", annex)):
+        filled = [(key, title, blocks) for key, title, given in sections if (blocks := list(given))]
+        for mark, (key, title, blocks) in zip(marks, filled, strict=False):
+            yield Section(key, f"{mark}\u2002{title}", blocks, sections is annex)
+
+
+FOR_THE_LABORATORY = re.compile(
+    r"`|--|\[[a-z]+\]|mwdcal|\.toml|profile|json|^(add|average|calibrate|check|correct|declare|give|install|leave|measure|"
+    r"name|re-shoot|save|see|state|take|use|verify|what the failure)\b",
+    re.IGNORECASE,
+)
+"""What tells advice to the laboratory from a statement about the result."""
+
+
+def without_advice(text: str) -> str:
+    """What a finding states, without what it advises the laboratory to do with the program; empty if nothing is left.
+
+    >>> without_advice("assumed exact: dip reference. State its uncertainty in [stand] of the tool profile.")
+    'assumed exact: dip reference.'
+    """
+    sentences = re.split(r"(?<=[.?;]) +", text)
+    return " ".join(each for each in sentences if not FOR_THE_LABORATORY.search(each))
+
+
+def _accuracy_by_angle(certificate: Certificate) -> Iterator[Block]:
+    """U of each angle, an attitude in each row."""
+    for result in certificate.results:
+        if result.id != ACCURACY_TABLE:
+            continue
+        names = list(dict.fromkeys(q.name for q in result.quantities))
+        places = list(dict.fromkeys(q.at for q in result.quantities))
+        shown = {(q.at, q.name): quantity_numbers(q)[2] for q in result.quantities}
+        rows = [
+            [Cell([at]), *(_cell(shown.get((at, name), NOT_STATED)) for name in names)]
+            for at in places
+        ]
+        titles = [
+            f"U, {name.removeprefix('error of ').removesuffix(' after correction')}"
+            for name in names
+        ]
+        columns = [Column("at"), *(Column(title, True) for title in titles)]
+        notes = [f"{result.note} {_coverages(result.quantities)}."]
+        yield TableBlock(columns, rows, notes=notes)
 
 
 def _laboratory(party: Party | None) -> tuple[str, list[str]]:
@@ -471,11 +520,46 @@ def _conformity(certificate: Certificate) -> Iterator[Block]:
         yield TextBlock([text])
         return
     yield OutcomesBlock([_outcome(test) for test in tests])
-    yield _decisions(tests)
-    yield _test_facts(tests)
-    findings = [f"{capital(t.when)}: {finding.text}" for t in tests for finding in t.findings]
-    if findings:
-        yield TextBlock(findings, "Findings of the roll tests", bullets=True)
+    for test in tests:
+        yield _limits(test)
+
+
+def _limits(test: ConformityTest) -> TableBlock:
+    """Each limit of a test: the noise-free value ± U, the raw figure beside it, and the decision."""
+    titles = ("limit", "noise-free value", "U", "raw", "decision")
+    columns = [
+        Column("limit on"),
+        *(Column(title, True) for title in titles[:-1]),
+        Column(titles[-1]),
+    ]
+    rows = []
+    for each in test.decisions:
+        value, _, expanded = quantity_numbers(each.quantity)
+        passed = Cell(["PASS" if each.passed else "FAIL"], "good" if each.passed else "bad")
+        limit = plain(each.limit) + unit(each.quantity.unit)
+        rows.append(
+            [Cell([each.quantity.name]), *map(_cell, (limit, value, expanded, _raw(each))), passed]
+        )
+    covered = _coverages([each.quantity for each in test.decisions])
+    noted = f"Roll test of {test.date or 'a day that is not stated'}, {test.stations} stations. "
+    meant = "Raw: with the noise of the readings in it; the noise-free value is judged"
+    return TableBlock(columns, rows, capital(test.when), notes=[f"{noted}{meant}; U: {covered}."])
+
+
+def _raw(decision: LimitDecision) -> str:
+    """The figure with the noise in it, to the digits of the value."""
+    if decision.raw is None:
+        return NOT_STATED
+    shown = measured(decision.raw, decision.quantity.expanded_uncertainty)[0]
+    return shown + unit(decision.quantity.unit)
+
+
+def _decided(certificate: Certificate) -> Iterator[Block]:
+    """What each test rests on, and the decision on each limit with its risk, side by side."""
+    tests = _tests(certificate)
+    if tests:
+        yield _test_facts(tests)
+        yield _decisions(tests)
 
 
 def _outcome(test: ConformityTest) -> TestOutcome:
@@ -521,7 +605,7 @@ def _decisions(tests: Sequence[ConformityTest]) -> TableBlock:
     keys = {_key(each): each for each in chain(*(test.decisions for test in tests))}
     guarded = any(each.acceptance_limit not in (None, each.limit) for each in keys.values())
     columns = [Column("limit on"), Column("limit", number=True)]
-    titles = ["value ± U; raw", *["acceptance limit"][:guarded], "decision", "P within; risk"]
+    titles = ["value ± U", *["acceptance limit"][:guarded], "decision", "P within; risk"]
     columns += [Column(title, True, title is titles[0]) for _ in tests for title in titles]
     groups = [("", 2), *((test.when, len(titles)) for test in tests)]
     by_test = [{_key(each): each for each in test.decisions} for test in tests]
@@ -554,15 +638,13 @@ def _decision_cells(decision: LimitDecision | None, guarded: bool) -> list[Cell]
     ]
     shown = [f"± {expanded}"] if decision.quantity.expanded_uncertainty is not None else []
     symbol, most = unit(decision.quantity.unit), decision.acceptance_limit
-    raw = measured(decision.raw or 0.0, decision.quantity.expanded_uncertainty)[0] + symbol
-    noisy = [] if decision.raw is None else [f"raw {raw}"]
     accepted = (
         NOT_STATED
         if most is None
         else measured(most, decision.quantity.expanded_uncertainty)[0] + symbol
     )
     return [
-        Cell([value, *(shown or [f"U {NOT_STATED}"]), *noisy]),
+        Cell([value, *(shown or [f"U {NOT_STATED}"])]),
         *([_cell(accepted)] if guarded else []),
         Cell(["PASS" if decision.passed else "FAIL"], "good" if decision.passed else "bad"),
         Cell(odds if within is not None or risk is not None else [NOT_STATED]),
@@ -663,13 +745,20 @@ def _angles(
 def _method(certificate: Certificate) -> Iterator[Block]:
     method = certificate.method
     facts = {
-        "Method": method.name,
         "Procedure": method.text,
-        "Sensor model": method.model,
         "Stations": str(method.stations),
+        "Deviations": method.deviations or "none from the method",
+    }
+    yield FactsBlock([_facts("", facts)])
+
+
+def _conditions(certificate: Certificate) -> Iterator[Block]:
+    method = certificate.method
+    facts = {
+        "Method": method.name,
+        "Sensor model": method.model,
         "Software": method.software,
         "References": method.references,
-        "Deviations": method.deviations or "none from the method",
     }
     yield FactsBlock([_facts("", facts)])
     if certificate.conditions:
@@ -705,9 +794,16 @@ def _traceability(standards: Sequence[TracedStandard]) -> Block:
 def _statements(certificate: Certificate) -> Iterator[Block]:
     if certificate.statements:
         yield TextBlock(certificate.statements)
-    if certificate.findings:
-        texts = [capital(finding.text) for finding in certificate.findings]
-        yield TextBlock(texts, "Findings", bullets=True)
+
+
+def _remarks(certificate: Certificate) -> Iterator[Block]:
+    """What the findings say of the results; what they advise the laboratory to do is for the laboratory."""
+    remarks = [without_advice(finding.text) for finding in certificate.findings]
+    for test in _tests(certificate):
+        about = (without_advice(finding.text) for finding in test.findings)
+        remarks += [f"{test.when}: {text}" for text in about if text]
+    if texts := [capital(text) for text in remarks if text]:
+        yield TextBlock(texts, bullets=True)
 
 
 def _person(role: str, person: Person | None) -> Signatory:
@@ -725,7 +821,7 @@ def _authorisation(certificate: Certificate) -> Iterator[Block]:
         "Key": signature.key,
         "Time": signature.time,
         "Value": signature.value,
-        "Check by": "mwdcal certificate verify, on the JSON of this certificate",
+        "Covers": "the JSON that is attached to the PDF of this certificate",
     }
     yield FactsBlock([_facts("Digital signature", facts)])
 
@@ -771,9 +867,10 @@ def _past(drift: ToolDrift | None) -> Iterator[Picture]:
 
 
 def _fit(calibration: Calibration) -> Iterator[Picture]:
-    for row in calibration.errors:
-        title = f"Error of {TITLES[row.observable]} at each station, before and after"
-        yield Picture(f"error-{row.observable}", title, calibration.plot.errors(row.observable))
+    if calibration.errors:
+        for before, when in ((False, "after"), (True, "before")):
+            title = f"Errors at each station, {when} calibration"
+            yield Picture(f"errors-{when}", title, calibration.plot.errors_of_all(before))
     if calibration.station_rows:
         title = "Residuals: misfit of each station"
         note = "A station above the dashed line should be measured again."
@@ -839,8 +936,12 @@ SCRIPTS = ((0x80, 0x530), (0x1E00, 0x2C00))
 """Latin, Greek and Cyrillic letters, and signs: what these fonts have, and where they are asked."""
 
 
-def render_pdf(certificate: Certificate, pictures: Sequence[Picture] = ()) -> bytes:
+def render_pdf(
+    certificate: Certificate, pictures: Sequence[Picture] = (), attached: bytes = b""
+) -> bytes:
     """The certificate as PDF: the same input gives the same bytes.
+
+    `attached`: its JSON as it was signed, else as it is.
 
     Characters that no font has are shown by their code, such as [U+4E2D]; the attached JSON has them as
     they are.
@@ -860,7 +961,7 @@ def render_pdf(certificate: Certificate, pictures: Sequence[Picture] = ()) -> by
         _timestamp(certificate),
         text=_json(shown),
         pictures=_json({each.id: picture(each.figure, ".svg").decode() for each in pictures}),
-        certificate=laid_out(msgspec.json.encode(certificate)).decode(),
+        certificate=(attached or laid_out(msgspec.json.encode(certificate))).decode(),
     )
 
 

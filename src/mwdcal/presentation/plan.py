@@ -14,11 +14,11 @@ from mwdcal.calibration.record import Calibration, Finding, TriadCalibration, Un
 from mwdcal.calibration.residuals import shown_in
 from mwdcal.calibration.results import accuracy_at, typical_accuracy
 from mwdcal.errors import InputError
-from mwdcal.files.contract import REFERENCES
+from mwdcal.files.contract import CHANNELS, REFERENCES
 from mwdcal.files.formats.table import Table
 from mwdcal.geometry.vectors import Array, Ints, reference_vectors
 from mwdcal.planning.expected import left_undetermined, planned_earth
-from mwdcal.planning.planned import WORKING_INCLINATIONS, Planned, station_names
+from mwdcal.planning.planned import WORKING_INCLINATIONS, Planned, hand_order, station_names
 from mwdcal.planning.plans import attitudes, soak_numbers
 from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.numbers import files_written, quantity
@@ -339,7 +339,7 @@ SOAK_MARKERS = "os^Dv"
 def render(plans: Sequence[Planned]) -> str:
     """The sheet of the first plan, and the others beside it, as HTML."""
     first, summaries = plans[0], [facts(each) for each in plans]
-    soaks = soak_numbers(first.plan)
+    titles, rows = _sheet(first.plan)
     return rendered(
         "plan.html",
         plan=first.plan.source,
@@ -347,10 +347,13 @@ def render(plans: Sequence[Planned]) -> str:
         summary=summaries[0],
         banner=_banner(first),
         findings=[*left_undetermined(first.calibration), *first.findings],
-        simulated=True,
+        simulated=False,
         place=_place(first),
-        titles=station_rows(first.plan)[0],
-        rows=zip(station_rows(first.plan)[1], np.diff(soaks, prepend=soaks[:1]) != 0, strict=True),
+        titles=titles,
+        channels=[
+            channel for triad in first.calibration.triads for channel in CHANNELS[triad.name]
+        ],
+        rows=rows,
         compared=comparison_rows(summaries),
         plans=[each.plan for each in summaries],
         accuracy=accuracy_rows(summaries[0]),
@@ -359,6 +362,17 @@ def render(plans: Sequence[Planned]) -> str:
         coverage=draw_coverage(plans),
         curves=draw_accuracy(plans),
     )
+
+
+def _sheet(plan: Table) -> tuple[list[str], list[tuple[list[str], bool]]]:
+    """Titles and cells of the stations in the order of a stand turned by hand, and where another soak begins."""
+    titles, rows = station_rows(plan)
+    if titles[0] != STATION_TITLES["station"]:
+        titles = [STATION_TITLES["station"], *titles]
+        rows = [[name, *row] for name, row in zip(station_names(plan), rows, strict=True)]
+    begins = np.diff(soak_numbers(plan), prepend=soak_numbers(plan)[:1]) != 0
+    order = hand_order(attitudes(plan), np.cumsum(begins))  # a temperature may come again
+    return titles, [(rows[k], bool(new)) for k, new in zip(order.tolist(), begins, strict=True)]
 
 
 def _place(planned: Planned) -> list[tuple[str, str]]:

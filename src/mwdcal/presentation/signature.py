@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
+from msgspec.structs import replace
 
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import Calibration, Finding, Signature, SignatureCheck
@@ -45,6 +46,13 @@ IN_SHORT = {
     "unchecked": "signature not checked, key {key}",
 }
 """The states of a calibration's signature, as part of a line."""
+PDF_UNSIGNED = (
+    "{name} carries no signature that can be checked: nothing shows that the pages are those of the JSON in it. "
+    "Issue it with `private_key`."
+)
+PDF_ALTERED = "{name} was altered after it was signed. Use the PDF as it was issued."
+PDF_OTHER_KEY = "{name} and the JSON in it are not signed by one key. Use the PDF as it was issued."
+"""What a PDF is found to be beside the JSON attached to it."""
 FILE_STATES = {"unchanged": "unchanged", "changed": "CHANGED", "missing": "not checked: not found"}
 """The statements about the files of a certificate."""
 
@@ -131,6 +139,26 @@ def checked_document(
         findings=findings,
     )
     return result, fields
+
+
+def checked_pdf(
+    file: Member, path: Path, keys: Mapping[str, TrustedKey], named: Sequence[Path]
+) -> tuple[CheckedDocument, dict[str, Any]]:
+    """The state of both signatures of a PDF: its own, and that of the JSON attached to it, by one key."""
+    from mwdcal.certificate.pdf_signature import read_pdf
+
+    parts = read_pdf(file.record, path.name, keys)
+    attached = Member(parts.attached, path.name, file.digest)
+    result, fields = checked_document(attached, path, keys, named)
+    if parts.intact and parts.key and parts.key.key == result.check.key:
+        return result, fields
+    if parts.key is None:
+        state, text = "unsigned", PDF_UNSIGNED
+    else:
+        state, text = "altered", PDF_ALTERED if not parts.intact else PDF_OTHER_KEY
+    finding = Finding(id=FINDING_OF_STATE[state], text=text.format(name=path.name))
+    check = replace(result.check, state=state, text=finding.text)
+    return replace(result, passed=False, check=check, findings=[finding, *result.findings]), fields
 
 
 def for_machines(

@@ -95,12 +95,25 @@ ISO_DAY = click.DateTime(["%Y-%m-%d"])
     metavar="YYYY-MM-DD",
     help="Day of issue; today (UTC) if not given.",
 )
+@click.option(
+    "--private-key",
+    type=options.FILE,
+    metavar="K",
+    help="Sign the certificate with this key: its JSON, and the PDF itself (PAdES).",
+)
+@click.option(
+    "--x509",
+    type=options.FILE,
+    metavar="CERT.pem",
+    help="X.509 certificate of that key, for readers of PDF; by default one that the key signs itself.",
+)
 @options.TRUSTED_KEYS
 @options.JSON
 def issue(
     calibration: Path, output: tuple[Path, ...], verification: Path | None, as_found: Path | None,
     laboratory: Path | None, registry: str | None, number: str, customer: str, condition: str,
-    received: datetime | None, day: datetime | None, key: tuple[Path, ...], as_json: bool,
+    received: datetime | None, day: datetime | None, private_key: Path | None, x509: Path | None,
+    key: tuple[Path, ...], as_json: bool,
 ) -> None:  # fmt: skip
     """Issue the certificate of a CALIBRATION: ISO/IEC 17025 contents, uncertainty budget, decisions with their risk.
 
@@ -110,16 +123,18 @@ def issue(
     Example: mwdcal certificate tool.json --verification v.json --laboratory lab.toml -o C.json -o C.pdf
     Exit: 0 written, 2 input cannot be read or does not belong to the calibration.
     """
+    from mwdcal.app.commands.certificate_keys import known
     from mwdcal.files.formats import atomic
     from mwdcal.library.papers import certificate, check_form
 
     for path in output:
         check_form(path)
-    options.check_outputs(output, [calibration, verification, as_found, laboratory, registry, *key])
+    inputs = [calibration, verification, as_found, laboratory, registry, private_key, x509, *key]
+    options.check_outputs(output, inputs)
     paper = certificate(
         calibration, verification=verification, as_found=as_found, laboratory=laboratory, registry=registry,
         number=number, customer=customer, condition=condition, received=received, date=day, keys=key,
-        folder=_folder(output),
+        folder=_folder(output), private_key=private_key, x509=x509, passphrase=known,
     )  # fmt: skip
     atomic.write_all([(path, paper.form(path)) for path in output])
     paper.saved.extend(output)
@@ -179,7 +194,7 @@ def sign(document: Path, key: Path, output: Path | None, replace: bool, as_json:
 @options.TRUSTED_KEYS
 @options.JSON
 def verify(document: Path, files: tuple[Path, ...], key: tuple[Path, ...], as_json: bool) -> None:
-    """Verify the signature of a DOCUMENT: calibration file, or JSON of a verification or certificate.
+    """Verify the signature of a DOCUMENT: calibration file, JSON of a verification or certificate, or its PDF.
 
     Of a certificate also the files that it rests on, by their SHA-256: FILES, or where the certificate
     says, seen from its folder, or beside it. What is not found is said, and no failure.
