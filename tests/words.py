@@ -1,7 +1,7 @@
 """How many words the documentation has, and the patterns that it avoids: `python tests/words.py [--count]`.
 
-A word has a letter or a digit; blocks of code, and tables of pages that scripts write, do not count. The patterns
-are those that made readers stumble. They are looked for in README, documentation, docstrings, help and messages.
+A word has a letter; formulas, blocks of code, and tables of pages that scripts write, do not count. The patterns are
+those that made readers stumble. They are looked for in README, documentation, docstrings, help and messages.
 """
 
 from __future__ import annotations
@@ -61,7 +61,8 @@ def words(page: Path) -> int:
     """Words of a page."""
     lines = prose(page).splitlines()
     kept = [line for line in lines if not (by_script(page) and line.lstrip().startswith("|"))]
-    return sum(bool(re.search(r"\w", word)) for line in kept for word in line.split())
+    text = re.sub(r"\$\$.*?\$\$|\$[^$\n]+\$", "", "\n".join(kept), flags=re.S)
+    return sum(bool(re.search(r"[^\W\d_]", word)) for word in text.split())
 
 
 def paragraphs(page: Path) -> Iterator[tuple[int, str]]:

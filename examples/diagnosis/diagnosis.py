@@ -206,9 +206,9 @@ Written by `make diagnosis`. SIMULATED DATA: {count} tools for each row, each wi
 (`laboratory-thermal`, profile `servo`, order 1) and later readings. Faults have the sizes of
 [the table](../howto/diagnose.md#the-faults), drawn between half and one and a half times that, of either sign; a dead
 channel reads any constant, in half of the cases with more than one temperature only above 80 °C. Rows: what the tool
-has; columns: what `diagnose` names first, per cent. *Reported*: named first, or as a cause that these readings cannot tell
-from it, with the 95 % interval. A bias of a magnetometer channel and the field of a string along it are one thing at
-any attitude: then the string is named first. Heat does not show at one temperature.
+has; columns: what `diagnose` names first, per cent. *Reported*: named first, or as a cause that these readings
+cannot tell from it, with the 95 % interval. A bias of a magnetometer channel and the field of a string along it are one
+thing at any attitude: then the string is named first. Heat does not show at one temperature.
 """
 SIZES = """Of the faults that are named rightly: how often the true size lies within the stated uncertainty (68.3 % and
 95 % if it is right)."""

@@ -573,8 +573,6 @@ def page() -> str:
 
 
 def _intro() -> list[str]:
-    combined = ("--method swarm --robust huber", "--method newton --robust huber")
-    combined += ("--method scalar --paper-weights --robust huber", "--paper-weights")
     return [
         "# Measured data",
         "",
@@ -595,10 +593,6 @@ def _intro() -> list[str]:
         "station (*nested*); with more words it is that of all stations. *Determined*: directions of",
         "the parameters that the run determines, of how many. *Strength of g, of b*: root mean square",
         "departure of the corrected strength from one, in %.",
-        "",
-        "These never go together, whatever the run:",
-        "",
-        *(f"- `{words}`: *{trial('imucal', words).refused}*" for words in combined),
         "",
     ]
 
