@@ -30,7 +30,6 @@ PATTERNS = {
     r"\b(?:is|are|was|were|be) told by\b": "name the source: comes from, follows from",
     r"\b(?:as|than) (?:it is )?stated\b": "declared, expected, or the figure itself",
     r"\blest\b|\bwhoever stands\b|\bhand(?:s|ed)? out\b": "plain English",
-    r"\bre-shoot\b(?!, or)": "re-measure",
     r"\bknow before you\b": "see … before you",
     r"\d\.\d{4,}e-\d\d ±": "round to the uncertainty",
     r"\bof which none\b|\bwhose \w+ (?:is|are) none\b": "say what is missing",

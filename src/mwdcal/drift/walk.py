@@ -159,7 +159,7 @@ def parameter_names(orders: Mapping[str, int]) -> tuple[str, ...]:
 
 
 def precision(covariance: Array, free: Array) -> Array:
-    """What is known (p, p): the inverse of a covariance (p, p) across free directions (f, p).
+    """Information (p, p): the inverse of a covariance (p, p) across free directions (f, p).
 
     Along them nothing is known, and nothing of a parameter without variance, which the model holds.
     """
@@ -472,7 +472,7 @@ class Contrasts:
 
     @cached_property
     def after(self) -> Array:
-        """What the calibrations from each transition on know together (n - 1, p, p)."""
+        """Information of the calibrations from each transition on (n - 1, p, p)."""
         return np.asarray(np.cumsum(self.scaled[::-1], 0)[::-1][1:])
 
     @cached_property
@@ -504,7 +504,7 @@ class Contrasts:
         return np.asarray(np.nan_to_num((values - middle) / unit) * (self._unit > 0))
 
     def pull(self, departures: Array) -> Array:
-        """What each calibration says (…, n, p) of parameters that depart so."""
+        """Information of each calibration (…, n, p) of parameters that depart so."""
         return _each(self.scaled.astype(departures.dtype), departures)
 
     def sums(self, pull: Array) -> Array:

@@ -118,14 +118,14 @@ class ChannelMean(NamedTuple):
 
 
 def summarise(rests: Sequence[Trace], resolution: float) -> ChannelMean:
-    """What a channel read at its standstills of n >= 2 samples; `resolution` is the step of its readings."""
+    """Readings of a channel at its standstills of n >= 2 samples; `resolution` is the step of its readings."""
     noise = pooled(rests, resolution)
     rows = [_summary(*rest, resolution, noise) for rest in rests]
     return ChannelMean._make(np.array([row[name] for row in rows]) for name in ChannelMean._fields)
 
 
 class Correlated(NamedTuple):
-    """What the halves of a triad's standstills tell of noise that is correlated over seconds.
+    """Evidence in the halves of a triad's standstills of noise that is correlated over seconds.
 
     Attributes:
         variance: of a sample's worth of mean, sd² times samples, of each channel; 0 for none.
@@ -470,7 +470,7 @@ STEADY = 3.0
 """Standard deviations of a cell's level by which a noisy but steady stretch may drift."""
 
 Rows = dict[str, ChannelMean]
-"""What each channel read at the stations."""
+"""Readings of each channel at the stations."""
 
 
 def count(number: int, word: str) -> str:
