@@ -26,7 +26,7 @@ PATTERNS = {
     r"(?:^|(?<=[.!] ))What (?:is|are|was|were|it|they|each|no|does|goes|comes|the|a) [^?]*?[.](?=\s|$)": (
         "begin with who does it, or with the noun"
     ),
-    r"\bstands? (?:beside|before|for that)\b(?! the stand)": "say who puts it where",
+    r"(?<!the )\bstands? (?:beside|before|for that)\b": "say who puts it where",
     r"\b(?:is|are|was|were|be) told by\b": "name the source: comes from, follows from",
     r"\b(?:as|than) (?:it is )?stated\b": "declared, expected, or the figure itself",
     r"\blest\b|\bwhoever stands\b|\bhand(?:s|ed)? out\b": "plain English",
