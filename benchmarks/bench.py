@@ -1,6 +1,6 @@
 """Every benchmark side by side in one run, and the page of the ratios.
 
-    make bench            (writes docs/evidence/benchmarks.md and docs/evidence/benchmarks.svg; under 25 minutes on two cores)
+    make bench            (writes docs/evidence/benchmarks.md and its .svg; under 25 minutes on two cores)
     make bench QUICK=1    (smaller sizes, under two minutes, into build/benchmarks)
 
 All comparisons are made in one environment, in which mwdcal and the alternatives are installed.

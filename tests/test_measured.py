@@ -127,6 +127,19 @@ def test_the_default_refuses_no_set(words, names):
     assert {name: reason for name, reason in refused.items() if reason} == {}
 
 
+def test_the_refitted_peer_is_the_published_one_in_sample():
+    """What `peers.csv` holds of each set is what the author of the peer published, and pages quote its means."""
+    path = measured.Path(measured.__file__).with_name("peers.csv")
+    rows = measured.csv.DictReader(path.read_text("utf-8").splitlines())
+    found = {(row["set"], row["routine"]): float(row["in_sample_deg"]) for row in rows}
+    for name, published in measured.SAP.items():
+        ours = found[name, "axis"], found[name, "non-linear"]
+        assert ours == pytest.approx(published, abs=5.5e-4), name
+    readme = (measured.Path(__file__).parents[1] / "README.md").read_text("utf-8")
+    for routine in ("fast non-linear", "non-linear"):
+        assert f"{measured.peers()[routine][1]:.3f}°" in readme
+
+
 @pytest.mark.parametrize("name", measured.DISTOX)
 def test_distox_scatter_below_the_peers_coefficients(name):
     peer = measured.distox_peer(name)

@@ -96,7 +96,7 @@ def main() -> None:
         "apply",
         "Corrected readings",
         "Every run is another tool, calibrated at 48 attitudes with exact references, and read at twelve random "
-        "azimuths and toolfaces at each inclination. The tables count the values within 1.96 of the σ that stands "
+        "azimuths and toolfaces at each inclination. The tables count the values within 1.96 of the σ printed "
         "beside them; *wrong* are toolfaces beyond it, as a share of all readings, blank ones included.\n",
         "Within about 3σ of vertical (here 0.02°) azimuth and toolface are blank. A tool that stands closer has a "
         "value only where noise tilts it further, and that value is often wrong: the intervals of the few that are"

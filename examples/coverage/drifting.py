@@ -180,7 +180,8 @@ INTRODUCTION = """\
 Four directions of twelve toolfaces; noise 0.1 mg and 15 nT. The drift starts at zero with the first station; its
 size is 1σ per axis of where a walk ends, or of the slope of a trend. The truth is the tool, and the field of the
 references, at the first station. "Drift fitted" counts the runs in which
-[a drift](../../explanation/effects.md#drift-within-a-run) joined the fit. Shares are of 95 % intervals that hold the truth.
+[a drift](../../explanation/effects.md#drift-within-a-run) joined the fit. Shares are of 95 % intervals that hold the
+truth.
 
 *There and back*: every second toolface of each direction on the way out, the rest on the way back, as `plan` orders
 its stations.

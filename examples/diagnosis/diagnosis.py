@@ -205,10 +205,10 @@ HEAD = """# Which fault: the confusion tables
 Written by `make diagnosis`. SIMULATED DATA: {count} tools for each row, each with a calibration of its own
 (`laboratory-thermal`, profile `servo`, order 1) and later readings. Faults have the sizes of
 [the table](../howto/diagnose.md#the-faults), drawn between half and one and a half times that, of either sign; a dead
-channel reads any constant, in half of the cases with more than one temperature only above 80 °C. Rows: what the tool has;
-columns: what `diagnose` names first, per cent. *Reported*: named first, or as a cause that these readings cannot tell
-from it, with the 95 % interval. A bias of a magnetometer channel and the field of a string along it are one thing at
-any attitude: then the string is named first. Heat does not show at one temperature.
+channel reads any constant, in half of the cases with more than one temperature only above 80 °C. Rows: what the tool
+has; columns: what `diagnose` names first, per cent. *Reported*: named first, or as a cause that these readings
+cannot tell from it, with the 95 % interval. A bias of a magnetometer channel and the field of a string along it are one
+thing at any attitude: then the string is named first. Heat does not show at one temperature.
 """
 SIZES = """Of the faults that are named rightly: how often the true size lies within the stated uncertainty (68.3 % and
 95 % if it is right)."""
@@ -219,7 +219,9 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--count", type=int, default=1000, help="tools; 40 take ten minutes")
     parser.add_argument(
-        "--output", type=Path, default=Path(__file__).parents[2] / "docs" / "evidence" / "diagnosis.md"
+        "--output",
+        type=Path,
+        default=Path(__file__).parents[2] / "docs" / "evidence" / "diagnosis.md",
     )
     options = parser.parse_args()
     options.output.write_text(page(studied(options.count), options.count), "utf-8")

@@ -433,8 +433,8 @@ less smallest value, as in criteria 13 and 15, which ask for 0.1° and 3 mg.
 
 ![Absolute errors of gravity and tilt per station, thirty factors](moosavi-30.svg)
 
-Reproduced: the error of gravity falls to what the paper calls "nearly 0", and that of tilt "to a large extent". What
-is left is the noise and the stand. The paper's text gives no numbers, and its plots were not available: no digits are
+Reproduced: the error of gravity falls to what the paper calls "nearly 0", and that of tilt "to a large extent". The
+rest is noise and stand. The paper's text gives no numbers, and its plots were not available: no digits are
 compared.
 
 ## Iterations

@@ -311,9 +311,9 @@ puts it all on the tool: a wrong PASS is rare, and a tool whose true figure is l
 the limit may fail. That is its price, and the FAIL says so where the value itself is within the limit. At
 0.5 mg one σ of the spread of inclination is a quarter of its limit: average longer before you guard.
 
-What is stated knows nothing of how many tools are good. Where all are, no PASS is wrong and more FAILs are than
-stated. And a spread far below its limit is known better than stated: it cannot be negative, and its 1σ holds the
-size of the bias taken off.
+The predicted risk does not know how many tools are good. Where all are, no PASS is wrong and more FAILs are than
+predicted. And a spread far below its limit is known better than its 1σ says: it cannot be negative, and its 1σ holds
+the size of the bias taken off.
 
 ## Each limit, knocked tools, simple rule
 

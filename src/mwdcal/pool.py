@@ -55,14 +55,14 @@ CLUSTER_TIMEOUT = 30.0
 CLOSING = 5.0
 """Seconds for the farewell to a scheduler."""
 LOST = (OSError, TimeoutError, CancelledError, asyncio.CancelledError)
-"""What is raised where a scheduler has gone or is mute."""
+"""Errors where a scheduler has gone or is mute."""
 COMMAND, WORKER = "mwdcal.app.cli", "mwdcal.app.worker_preload"
 """Modules that a worker process has loaded before it is given anything."""
 
 
 @dataclass(frozen=True)
 class Steps:
-    """What is done to a task: `solve(load(task))`; both can be sent to another process."""
+    """Work on a task: `solve(load(task))`; both can be sent to another process."""
 
     load: Callable[[Any], Any]
     solve: Callable[[Any], Any]

@@ -477,7 +477,7 @@ def apply_to_any(
 ) -> tuple[RowCounts, list[Finding], str]:
     """Correct a file into another: part by part, or whole where it is short text or a workbook.
 
-    What was seen in the rows, what the reader should know, and the SHA-256 of the readings, empty
+    Counts of the rows, what the reader should know, and the SHA-256 of the readings, empty
     where they were not read as a whole. `advance` gets how much of a long
     table is done, and the whole. An export as the calibration's profile describes it is taken whole, and
     text that comes of it is written as it is. With `uncertainty` columns of standard uncertainties. `statements`:

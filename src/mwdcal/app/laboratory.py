@@ -155,7 +155,7 @@ def _local(settings: LaboratorySettings, folder: Path) -> LaboratorySettings:
 def _defaults(command: click.Command, used: SettingsInUse, folder: Path) -> dict[str, Any]:
     """Values of a command's options by the settings.
 
-    Limits of a roll test are none of a well's surveys. Keys count only where the command runs in the folder of the
+    Limits of a roll test are no limits of surveys. Keys count only where the command runs in the folder of the
     settings or below it: trust does not come with the data.
     """
     values: dict[str, Any] = {}

@@ -301,7 +301,7 @@ class _Guard:
 
 
 def _netloc(origin: str) -> str:
-    """Host and port of an origin; blank where it is none."""
+    """Host and port of an origin; blank if it is not one."""
     try:
         return urlsplit(origin).netloc
     except ValueError:

@@ -63,7 +63,7 @@ def calibrate(
 ) -> Calibration:
     """Fit the sensor model to a run and state what it is worth.
 
-    What the options leave to the software is chosen as `mwdcal calibrate` does
+    Choices that the options leave open are made as `mwdcal calibrate` does
     (`mwdcal.calibration.automatic.auto`); `progress` gets a line for each trial.
     Raises `InputError` for options that do not go together, `FitError` where the data cannot give a
     calibration to be trusted.

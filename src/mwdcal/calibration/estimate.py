@@ -222,7 +222,7 @@ def _checks(readings: Readings, options: Options) -> int:
 
 
 def _evidence(readings: Readings, include: Array, options: Options) -> Evidence:
-    """What the options use of a run, with the stand errors and the scatter to be estimated."""
+    """The part of a run that the options use, with the stand errors and the scatter to be estimated."""
     evidence = EVIDENCE[options.method](evidence_of(readings, include))
     if options.ignore:
         evidence = without(evidence, *options.ignore)
@@ -518,7 +518,7 @@ def _noise_scale(analysis: Analysis, ahead: bool) -> Array:
 
 
 def _steady(old: Problem, new: Problem) -> Bools:
-    """Members (B,) whose scatter has settled: changed little, or is none."""
+    """Members (B,) whose scatter has settled: changed little, or is zero."""
     before, now = (p.evidence.scatter for p in (old, new))
     each = [
         (np.abs(now[name] / value - 1).max(-1) < SCATTER_SETTLED)

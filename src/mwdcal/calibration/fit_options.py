@@ -93,7 +93,7 @@ FIT_OPTIONS = {
         deviation="unweighted sums, as the method's paper has them",
     ),
     "prior": FitOption(
-        "What is known beforehand: {}.",
+        "Prior information: {}.",
         heading="prior {}",
         deviation="prior knowledge of the parameters: {}",
     ),

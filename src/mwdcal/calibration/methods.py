@@ -404,7 +404,7 @@ def _by_sums(problem: Problem, state: State, method: str) -> Solved:
 def _sums(
     problem: Problem, state: State, index: int, names: tuple[str, ...], weights: Array
 ) -> Sums:
-    """What a paper sums over one triad, with the run's references; those unknown do not count."""
+    """The paper's terms of one triad, with the run's references; those unknown do not count."""
     evidence, strength = problem.evidence, ("gravity", "field")[index]
     value = problem.constant(state, strength)
     known = [value**2 if n == STRENGTH else evidence.known[n] for n in names]

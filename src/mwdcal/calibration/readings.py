@@ -145,7 +145,7 @@ class Readings:
             to the run, and so are those of the errors of the stand in `profile.COMMON` (tilt: of
             its amplitude). Missing or NaN reference uncertainties are zero.
         group: stations of the same non-negative number share one direction of the tool
-            axis; -1 is none.
+            axis; -1: no group.
         settings: what one setting of the stand's inclination and azimuth is good for, "per-direction"
             or "per-station"; blank: not stated.
         station: labels, for messages and tables.

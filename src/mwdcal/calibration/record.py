@@ -181,7 +181,7 @@ def _with(new: Iterator[float], value: Any) -> Any:
 def figures(values: Array) -> Any:
     """Numbers (...) at so many significant digits as a file has, each the double nearest to its decimal, as lists.
 
-    A whole number of that many digits over a power of ten, both exact doubles, is that nearest double. What is too
+    A whole number of that many digits over a power of ten, both exact doubles, is that nearest double. A number too
     small or too large for this, or so near to halfway that the product may have crossed it, is spelled.
     """
     size = np.abs(values)
@@ -836,7 +836,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         """Effective degrees of freedom of the uncertainty of an observable, one or more.
 
         Definition: Welch-Satterthwaite for the sources of the budget, which are independent; the
-        triads are not, by the errors that they share. What the residuals scale has the degrees of
+        triads are not, by the errors that they share. Contributions that the residuals scale have the degrees of
         freedom of the triad with the fewest, the order of the temperature terms those of the axes
         that it is seen on, all else infinitely many: a declared noise too that the residuals agree
         with. No more are counted than that triad has, as the

@@ -47,7 +47,7 @@ def rms(values: Array) -> Array:
 
 
 def _filled(values: Array) -> Iterator[tuple[Ints, Array]]:
-    """What is not NaN of values (..., n), as rows (b, k) that are filled at the same places, and their numbers (b,)."""
+    """Values that are not NaN (..., n), as rows (b, k) that are filled at the same places, and their numbers (b,)."""
     rows = values.reshape(-1, values.shape[-1])
     blank = np.isnan(rows)
     patterns, number = blank[:1], np.zeros(len(rows), int)

@@ -1,12 +1,12 @@
 """The results of a fit for its tools, as arrays: a calibration file is one row of them, a fleet table all.
 
 Parameters, their uncertainties, constants of the run, errors of the stand; and the covariance, by
-source of error. What the readings' noise and angles that the stand sets at every station do is
-independent from station to station and scales with s² where that is above one: residuals smaller
+source of error. The effect of the readings' noise and of angles that the stand sets at every
+station is independent from station to station and scales with s² where that is above one: residuals smaller
 than declared are no evidence that a declaration was too cautious. Errors that stations have in
 common (settings of a direction, zeros and tilt of the stand, the references for gravity, field and
-dip) and a prior are as large as they were declared: no residual says how large they are. What the
-order of the temperature terms leaves out is added to both.
+dip) and a prior are as large as they were declared: no residual says how large they are. Temperature terms
+beyond the order are added to both.
 """
 
 from __future__ import annotations
@@ -382,7 +382,7 @@ class StatedCovariance:
 
     @property
     def _lone_settings(self) -> Array:
-        """The same as it is stated: times s² of both triads together if that is above one.
+        """The same, scaled: times s² of both triads together if that is above one.
 
         One turn of the stand moves both triads: one factor, so that what they share stays alike.
         """

@@ -4,7 +4,7 @@ Whatever ISO/IEC 17025:2017 asks for and nobody states becomes a finding in the 
 
 How the tool was calibrated, in the words of a certificate.
 
-What the references of a calibration are traceable to, and whether that held on its day.
+Traceability of a calibration's references, and whether that held on its day.
 """
 
 from __future__ import annotations
@@ -316,7 +316,7 @@ STATEMENTS = (
 class CertificateRequest(msgspec.Struct, frozen=True, kw_only=True):
     """The facts of one certificate, beside its calibration and the laboratory.
 
-    `customer`, `condition` and `received` stand before those of the laboratory file; `number` before its
+    `customer`, `condition` and `received` override those of the laboratory file; `number` before its
     pattern. `verification` (as left) and `as_found` are roll tests with this and with the previous calibration;
     `calibration_sha256` is of the file of this one. `findings` are about the files themselves, such as their
     signatures.

@@ -221,7 +221,7 @@ def encode(certificate: Certificate) -> bytes:
 
 
 NUMBER_FIELDS = ("serial", "date", "year", "digest")
-"""What a pattern of certificate numbers may contain, in braces."""
+"""Fields that a pattern of certificate numbers may contain, in braces."""
 LARGEST_GUARD = 5.0
 """Largest guard factor: of the expanded uncertainty, as guard band."""
 MOST_MONTHS = 1200

@@ -57,7 +57,7 @@ _PUBLIC_HEADS = {
     name: re.compile(rb"^%b: ([^\r\n]*)" % name.encode(), re.MULTILINE)
     for name in ("Owner", "Created")
 }
-"""What a file of a public key states before it."""
+"""Lines before a public key in its file."""
 
 
 class TrustedKey(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -316,7 +316,7 @@ def compare(
 ) -> Comparison:
     """Calibrate a run by every method and judge each by stations left out of its fit.
 
-    What the `options` leave to the software is chosen as the joint method does, the same for all
+    Choices that the `options` leave open are made as the joint method does, the same for all
     methods; their method does not count. A method that is refused gives its reason and leaves the
     others alone.
     """

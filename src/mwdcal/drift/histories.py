@@ -75,7 +75,7 @@ DEGREES = "°"
 
 
 def factor(unit: str) -> float:
-    """What a value in the unit of calculation is multiplied by to be in the unit that is stated."""
+    """Factor from the unit of calculation to the unit that is shown."""
     return float(np.degrees(1)) if unit == DEGREES else 1.0
 
 
@@ -243,7 +243,7 @@ class _Form:
             yield first, second, third
 
     def row(self, calibration: Calibration) -> tuple[Array, Array, Array]:
-        """Values (p,), covariance (p, p) as stated, and free directions (f, p) of one calibration."""
+        """Values (p,), covariance (p, p) of the file, and free directions (f, p) of one calibration."""
         places, parts = calibration.places(), []
         size = len(calibration.parameters)
         for name, order in self.orders.items():
@@ -502,7 +502,7 @@ def _compared(calibrated: date, left: ServiceTest, last: ServiceTest) -> Iterato
 
 
 def _change(left: VerdictRow, last: VerdictRow) -> tuple[float | None, float | None]:
-    """What a figure changed by and its standard uncertainty, the tests being independent."""
+    """Change of a figure and its standard uncertainty, the tests being independent."""
     if left.value is None or last.value is None:
         return None, None
     change = last.value - left.value
@@ -541,7 +541,7 @@ class Growth:
     changes: Array
 
     def rate(self, rates: Mapping[tuple[str, str], Array]) -> Array:
-        """What is added in a year (…,), rad², at rates (…,) by group."""
+        """Variance added in a year (…,), rad², at rates (…,) by group."""
         return np.asarray(sum(share * rates[group] for group, share in self.yearly.items()))
 
     def kept(self, paths: Paths, limit: float) -> tuple[Array, Array]:
@@ -583,7 +583,7 @@ class Paths:
 
 @dataclass(frozen=True)
 class Outlook:
-    """What a calibration lets one forecast: the growth of each angle that it determines.
+    """Forecast from a calibration: the growth of each angle that it determines.
 
     `places` of all parameters of its triads in the history, of each group among them; `covariance` (p, p) of them.
     """
@@ -661,7 +661,7 @@ class Departure:
     uncertainty: float
 
     def left(self, limits: Mapping[str, float]) -> Iterator[Left]:
-        """What it says of limits in degrees by angle."""
+        """Its forecast of limits in degrees by angle."""
         degrees = float(np.degrees(self.size))
         if degrees > limits.get(self.angle, np.inf) and self.size > CLEAR_STEP * self.uncertainty:
             yield Left(self.start, self.end, f"{self.angle} changed by {degrees:.2g}°")

@@ -474,7 +474,7 @@ def _largest(drift: ToolDrift) -> str:
 
 
 def _of_type(rates: TypeRates, members: Iterable[MeasuredTool]) -> list[WalkRate]:
-    """What a tool of a type moves by in a year, when nothing else is known of it."""
+    """Movement of a tool of a type in a year, when nothing else is known of it."""
     first = next(iter(members)).drift.parameters
     units = {(p.triad, p.name.partition("-")[0]): p.unit for p in first}
     return [

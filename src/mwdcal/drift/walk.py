@@ -168,7 +168,7 @@ def parameter_names(orders: Mapping[str, int]) -> tuple[str, ...]:
 
 
 def precision(covariance: Array, free: Array) -> Array:
-    """What is known (p, p): the inverse of a covariance (p, p) across free directions (f, p).
+    """Information (p, p): the inverse of a covariance (p, p) across free directions (f, p).
 
     Along them nothing is known, and nothing of a parameter without variance, which the model holds.
     """
@@ -485,7 +485,7 @@ class Contrasts:
 
     @cached_property
     def after(self) -> Array:
-        """What the calibrations from each transition on know together (n - 1, p, p)."""
+        """Information of the calibrations from each transition on (n - 1, p, p)."""
         return np.asarray(np.cumsum(self.scaled[::-1], 0)[::-1][1:])
 
     @cached_property

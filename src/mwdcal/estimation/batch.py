@@ -153,5 +153,5 @@ def mapped(change: Callable[..., AnyArray], *trees: Any) -> Any:
 
 @cache
 def _names(kind: type) -> tuple[str, ...]:
-    """What the constructor of a dataclass takes; nothing for any other type."""
+    """Arguments of a dataclass's constructor; nothing for any other type."""
     return tuple(f.name for f in fields(kind) if f.init) if is_dataclass(kind) else ()

@@ -40,7 +40,7 @@ STATIONS_PER_TERM = 4
 LEAST_TREND = 0.2
 """A trend does not show where residuals keep less than this share of its information."""
 LEAST_WALK = 1e-3
-"""A walk over the run is at least this share of the noise of a reading: a smaller one is none."""
+"""A walk over the run is at least this share of the noise of a reading: a smaller one does not count."""
 FEWEST_USED = 2.0
 """Fewest degrees of freedom that are counted to the estimate of a walk's variance."""
 ROUNDING = 1e-13
@@ -124,7 +124,7 @@ def noise(problem: Problem) -> dict[str, Array]:
 
 @dataclass(frozen=True)
 class WalkScores:
-    """What the residuals of a fit without drift say of its terms, in units of the noise.
+    """Evidence for drift terms in the residuals of a fit without them, in units of the noise.
 
     `score` (B, k) and its covariance `information` (B, k, k), for drifts of r = s = 1 noise of a reading, and `alone`
     (B, k, k), what that would be with all unknowns of the fit known, if asked for; `places` of the columns of each

@@ -221,7 +221,7 @@ WALK_AXES = {
 }
 """Number of the walk and of its axis by the name of a constant."""
 NOISELESS = ("state", "attitude", "group axes", "predictions", "linear True")
-"""What a problem's memo has that no noise enters."""
+"""Entries of a problem's memo that do not depend on noise."""
 
 
 @dataclass(frozen=True)
@@ -482,7 +482,7 @@ class Problem:
         return Linear(residual, blocks, shared, whole, prior, pull, held, loose)
 
     def _held(self, state: State, count: int) -> tuple[Array, Bools]:
-        """Errors of known angles in units of their σ, among `count` private unknowns, and which are none."""
+        """Errors of known angles in units of their σ, among `count` private unknowns, and which are no angles."""
         held = np.zeros((*state.errors.shape[:2], count))
         loose = np.ones(held.shape, bool)
         sd = self.evidence.held_sd

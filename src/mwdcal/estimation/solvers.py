@@ -91,7 +91,7 @@ def _moments(loss: str, k: float) -> tuple[float, float, float, float]:
 
 
 def consistency(loss: str, freedom: float) -> float:
-    """What the misfit w² d² per degree of freedom comes to with good stations: below 1.
+    """Expected misfit w² d² per degree of freedom of good stations: below 1.
 
     The square of the bounded pull w d: one bad station cannot make it large (Huber's proposal 2).
     """
@@ -99,7 +99,7 @@ def consistency(loss: str, freedom: float) -> float:
 
 
 def weighted(loss: str, freedom: float) -> float:
-    """What the misfit w d² per degree of freedom comes to with good stations: below 1."""
+    """Expected misfit w d² per degree of freedom of good stations: below 1."""
     return _moments(loss, freedom)[1]
 
 
@@ -338,7 +338,7 @@ class Determined:
     def by(cls, information: Array, norms: Array) -> Determined:
         """From the information (B, p, p) of the evidence's geometry: what is known, not how precisely.
 
-        `norms` (B, p) are those of the whole columns. What is left of a column when private
+        `norms` (B, p) are those of the whole columns. The rest of a column when private
         unknowns are taken out may be noise alone: its own norm would make much of that.
         """
         norms = np.where(norms > 0, norms, 1.0)
@@ -377,7 +377,7 @@ class Determined:
 
 
 class Linearisable(Protocol):
-    """What the solver asks of a problem; of states it asks the parameters."""
+    """Interface of a problem to the solver; of states it asks the parameters."""
 
     def linear(self, state: Any, geometry: bool = False) -> Linear:
         """Linearise; `geometry` asks for what is known, leaving out how precisely."""

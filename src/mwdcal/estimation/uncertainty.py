@@ -62,7 +62,7 @@ def free_directions(problem: Problem, state: State, determined: Determined) -> l
     """Name the free directions of every member of a batch.
 
     Each triad's own turns and scale are tried first, then common ones, then single
-    parameters; a direction that is none of these is called `weak` after its largest part.
+    parameters; any other direction is called `weak` after its largest part.
     """
     directions: list[list[Free]] = [[] for _ in determined.keep]
     missing = np.sum(~determined.keep, -1)

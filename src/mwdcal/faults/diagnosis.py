@@ -480,7 +480,7 @@ def _unexplained(evidence: FaultEvidence, fault: str, freedom: float) -> list[Fi
 
 
 def _rival(calibration: Calibration, evidence: FaultEvidence, name: str) -> Rival:
-    """What a fault that is not named would be."""
+    """A fault that is possible but not named."""
     sized = _named(calibration, evidence, name)
     return Rival(fault=name, **{key: sized[key] for key in Rival.__struct_fields__[1:]})
 

@@ -44,7 +44,7 @@ _NORTHS: dict[str, dict[str, float]] = {
     "true": {"declination_deg": 1.0},
     "grid": {"declination_deg": 1.0, "convergence_deg": -1.0},
 }
-"""What is added to magnetic azimuths, with its sign."""
+"""Angle to add to magnetic azimuths, with its sign."""
 
 
 class Range(NamedTuple):
@@ -372,7 +372,7 @@ def _blank_faults(
 def _where_filled(
     cells: Cells, starts: Ints, names: tuple[str, ...], rules: Iterator[Fault]
 ) -> Iterator[Fault]:
-    """What is broken of the rules in tools that have any cell of the columns filled in."""
+    """Broken rules in tools that have any cell of the columns filled in."""
     filled = ~np.isnan(_stacked(cells, names, starts)).all(0)
     if not filled.any():
         return

@@ -77,7 +77,7 @@ def _content(file: Path) -> bytes:
 
 
 def _document(data: bytes) -> _Document:
-    """The document in the bytes of a file; an empty one where they are none."""
+    """The document in the bytes of a file; an empty one if they are not JSON."""
     with suppress(msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return msgspec.json.decode(in_utf8(data), type=_Document)
     return _Document()

@@ -148,7 +148,7 @@ def read_toml(name: str, folder: str, kind: str) -> tuple[bytes, str]:
     meant = f" Did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
     if not names:
         raise InputError(
-            f"{kind} must be the path of a TOML file; got '{name}', which is none. Check the path."
+            f"{kind} must be the path of a TOML file; got '{name}', which does not exist. Check the path."
         )
     raise InputError(
         f"{kind} must be a built-in name ({', '.join(names)}) or the path of a TOML "
@@ -159,7 +159,7 @@ def read_toml(name: str, folder: str, kind: str) -> tuple[bytes, str]:
 def decoded_toml(
     name: str, struct: type[_Decoded], folder: str, kind: str, page: str
 ) -> tuple[_Decoded, str]:
-    """What a TOML file says as a `struct`, and the file's SHA-256; `name`, `folder`, `kind` as of `read_toml`.
+    """A TOML file as a `struct`, and the file's SHA-256; `name`, `folder`, `kind` as of `read_toml`.
 
     `page` of the documentation says what such a file holds.
     """
@@ -225,7 +225,7 @@ def _axes_of(section: object) -> object:
 
 
 def toml_problem(error: Exception) -> str:
-    """What the decoder of TOML says, also of values that Python itself refuses."""
+    """Message of the TOML decoder, also of values that Python itself refuses."""
     if isinstance(error, RecursionError):
         return "it is nested too deeply"
     if "integer string conversion" in str(error):
@@ -238,7 +238,7 @@ def _lower_first(text: str) -> str:
 
 
 def _invalid(message: str, source: str) -> InputError:
-    """What the decoder says about structure and types, with the key and what to do."""
+    """Message of the decoder about structure and types, with the key and what to do."""
     problem, _, path = message.partition(" - at `$.")
     where = path.rstrip("`")
     unknown = re.fullmatch(r"Object contains unknown field `(.*)`", problem, re.DOTALL)
@@ -321,7 +321,7 @@ def check_profile(profile: Profile, source: str) -> None:
 
 
 def _check_stream(form: StreamForm, source: str) -> None:
-    """Refuse a stream whose lines name no accelerometer, or a pattern that is none."""
+    """Refuse a stream whose lines name no accelerometer, or an invalid pattern."""
     try:
         names = {*form.columns, *re.compile(form.pattern).groupindex}
     except re.error as error:

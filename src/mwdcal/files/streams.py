@@ -1,6 +1,6 @@
 """Tables in parts: Parquet and text of any length, read in bounded memory.
 
-A source hands out pieces in order, which are cheap to make, and loads a piece, which may be
+A source gives pieces in order, which are cheap to make, and loads a piece, which may be
 done by several threads at once. Needs PyArrow. Lines of text that are not plain (quotes, blanks
 before a cell) go through the parser of `formats.text`, and so do whole pieces with numbers in unusual
 spelling or anything that is refused: one place decides what is accepted, and words it.
@@ -84,8 +84,8 @@ def open_parquet(
 ) -> StreamedTable:
     """A Parquet file in parts of `rows` rows; by default as many as memory bears.
 
-    The table of a part has the columns of numbers of the contract, and those named `also`. What is carried
-    has the type it has in the file, whatever it is; `decimal` is the sign in columns of text that are read as
+    The table of a part has the columns of numbers of the contract, and those named `also`. Columns that are
+    carried have the type it has in the file, whatever it is; `decimal` is the sign in columns of text that are read as
     numbers. `only`: those columns alone.
     """
     check_decimal(decimal)

@@ -189,7 +189,7 @@ _PLACES = {
         "umgebung",
     ),
 }
-"""What a `t` may be the temperature of: T_sens, Chamber T."""
+"""Temperatures that a `t` may mean: T_sens, Chamber T."""
 _OF_TEMPERATURES = {
     *(
         "note",
@@ -221,7 +221,7 @@ _OF_TEMPERATURES = {
     ),
     *("ppm", "per"),
 }
-"""Words of columns that say something about temperatures, and are none."""
+"""Words of columns that say something about temperatures, but not their values."""
 _NEVER = {"mtf", "magnetictoolface", "magtoolface"}
 """A magnetic toolface is not a reference of the contract."""
 NOTICED = {
@@ -273,7 +273,7 @@ class Resemblance(NamedTuple):
 
 
 def resembled(name: str) -> Resemblance | None:
-    """What a name resembles, with a unit behind it that is known or, in brackets, is not.
+    """The column that a name resembles, with a unit behind it that is known or, in brackets, is not.
 
     >>> [resembled(n) for n in ("Azi (°)", "Temp (°F)", "comment")]
     [Resemblance(column='ref_azimuth_deg', unit='°'), Resemblance(column='temperature_c', unit='°F'), None]
@@ -289,7 +289,7 @@ def resembled(name: str) -> Resemblance | None:
 
 
 def _resembled(name: str) -> Resemblance | None:
-    """What a name resembles; nothing where it has words that are none of the field."""
+    """The column that a name resembles; nothing where it has words from elsewhere."""
     every = _words(name)
     words, unit = _without_unit(every)
     spread = not _SPREADS.isdisjoint(words)
@@ -378,7 +378,7 @@ def begins_as(name: str) -> str:
 
 
 def unit_of(text: str) -> str:
-    """The unit that a text is, empty if it is none.
+    """The unit that a text is, empty if it is not a unit.
 
     >>> [unit_of(text) for text in ("deg", "°F", "m/s²", "mg", "x")]
     ['°', '°F', 'm/s²', 'mg', '']

@@ -1,4 +1,4 @@
-"""What the sources say of themselves: whose calibration, its units and range, how exact they are.
+"""Statements in the sources about themselves: whose calibration, its units and range, how exact they are.
 
 Python values as C source: text of others that stays text, numbers, initialisers and macros.
 
@@ -324,7 +324,7 @@ STATUS = {
 }
 """Bits of the status by name, and what they mean; the last of fixed-point numbers alone."""
 EXPECTED = "expected_"
-"""What stands before the name of a result in the table of test vectors."""
+"""Prefix of the name of a result in the table of test vectors."""
 _VECTOR_ATTITUDES = np.radians(
     np.array(
         [
@@ -378,7 +378,7 @@ def words(columns: Mapping[str, Array], fractions: Mapping[str, int]) -> dict[st
 
 
 def _sizes(columns: Mapping[str, Array]) -> dict[str, Array]:
-    """What the status judges: gravity across the tool axis, field across it, and horizontal field (n,)."""
+    """Strengths that the status judges: gravity across the tool axis, field across it, and horizontal field (n,)."""
     g, b = (np.stack([columns[name] for name in names], -1) for names in (VECTORS[:3], VECTORS[3:]))
     b = np.nan_to_num(b)
     level = np.linalg.norm(np.cross(g, b), axis=-1) / np.linalg.norm(g, axis=-1)

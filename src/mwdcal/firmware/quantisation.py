@@ -3,7 +3,7 @@
 A word of N bits is a value times a power of two, its `fraction`, rounded. The bound follows each operation of
 `sources/mwdcal_fixed.c`: half a step for every rounding, and the error of what comes in times its largest factor.
 
-What a correction in firmware must take, and how far errors of its vectors move the angles.
+Range of a correction in firmware, and how far errors of its vectors move the angles.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ ANGLES_OUT = ("inclination", "azimuth", "toolface", "magnetic_toolface")
 SHARE_OF = {"toolface": "gravity", "azimuth": "gravity", "magnetic_toolface": "field"}
 """The vector whose part across the tool axis, as a share of it, weights the error of an angle."""
 _HIGHER_TERMS = 1.02
-"""What a linear error leaves out, and the steps of the attitudes over which the largest is sought."""
+"""Allowance for what a linear error leaves out, and the steps of the attitudes over which the largest is sought."""
 _TURNS = np.radians(np.arange(0, 360, 15))
 _ALL_ATTITUDES = np.meshgrid(np.radians([0.5, *range(5, 180, 5), 179.5]), _TURNS, _TURNS)
 """Inclinations, azimuths and toolfaces over which the largest error is sought."""

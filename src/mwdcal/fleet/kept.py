@@ -1,7 +1,7 @@
-"""What a fleet keeps beside its output until it is done, and how that is told from what others put there.
+"""Files that a fleet keeps beside its output until it is done, and how they differ from what others put there.
 
-A part is with_checksum: its mark, length and checksum stand before its content. Rows that were dealt into
-files of whole tools have a manifest beside them. What is damaged is not used, and made again.
+A part is with_checksum: its mark, length and checksum precede its content. Rows that were dealt into
+files of whole tools have a manifest beside them. Damaged parts are not used; they are made again.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def to_disk(path: Path) -> None:
 
 
 def check_folder(folder: Path) -> None:
-    """Refuse a folder that is none, or in which a name of ours stands for something else."""
+    """Refuse a path that is no folder, or in which a name of ours stands for something else."""
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
         kind = "a link" if folder.is_symlink() else "not a folder"
         raise InputError(

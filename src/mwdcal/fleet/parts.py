@@ -38,7 +38,7 @@ WHOLE_NUMBERS = ("rank", "size", "order")
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be done to every partition.
+    """The work on every partition.
 
     `records`: the table gets the calibration file of each tool, with the digests of the profile and, where
     it is one file, of the runs.

@@ -123,7 +123,7 @@ def outer(first: Array, second: Array | None = None) -> Array:
 
 
 def quotient(numerator: Array, denominator: Array, where: Bools) -> Array:
-    """What is divided, and zero elsewhere than `where`."""
+    """The quotient, and zero elsewhere than `where`."""
     return np.where(where, numerator / np.where(where, denominator, 1.0), 0.0)
 
 

@@ -44,7 +44,7 @@ RANGES_BY_UNIT: dict[str, tuple[tuple[str, float, float], ...]] = {
 }  # fmt: skip
 """Units of quantities of which the Earth has but one range of values; 980 may be milli-g or gal."""
 LEAST_ROLLS = 5
-"""Toolfaces from which on their unit is told by their range."""
+"""Toolfaces from which on their range decides the unit."""
 _FILLER = re.compile(r"-?9{3,}(\.9+|\.25)?")
 _REGULAR = 0.8
 """Share of equal steps of numbered rows."""
@@ -279,7 +279,7 @@ HOTTEST_CELSIUS = 200.0
 
 
 def meaning(name: str, unit: str = "") -> Resemblance | None:
-    """What a column holds by its name, and its unit, stated beside the name or in it."""
+    """Content of a column by its name, and its unit, stated beside the name or in it."""
     if name in MAPPED:
         return Resemblance(name, unit_of(unit) or "".join(units_of(name)[:1]))
     if both := _two_units(name, unit):
@@ -315,7 +315,7 @@ def _two_units(name: str, unit: str) -> str:
 
 
 def _without_title(name: str) -> Resemblance | None:
-    """What a name resembles behind the title of its group, which says no other triad: Accelerometers Gx (V)."""
+    """Column that a name resembles behind the title of its group, which says no other triad: Accelerometers Gx (V)."""
     title = _TITLE.match(name)
     alike = resembled(name[title.end() :]) if title else None
     if not title or not alike:
@@ -402,7 +402,7 @@ class Questions(list[QuestionError]):
     """Open questions about names and readings, each with the option that answers it."""
 
     def ask(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """What a function returns; None where it has a question."""
+        """The result of a function; None where it has a question."""
         try:
             return function(*arguments)
         except QuestionError as question:
@@ -514,9 +514,9 @@ def _chosen(
 def _no_evidence(
     meanings: Mapping[str, Resemblance], values: Values, answers: Mapping[str, str]
 ) -> dict[str, str]:
-    """Columns that are called as references and are none, each with the reason.
+    """Columns that are named like references but hold no references, each with the reason.
 
-    That is what the user says is none; totals computed from the channels; and rolls in whole degrees beside no other
+    That is what the user excludes; totals computed from the channels; and rolls in whole degrees beside no other
     angle of the stand, which are nominal.
     """
     ignored = {}
@@ -660,7 +660,7 @@ def _check_triads(
     lacking = [name for name in RAW[3:] if name not in chosen]
     if 0 < len(lacking) < 3:
         raise QuestionError(
-            f"{source}: of the magnetometers only {', '.join(n for n in RAW[3:] if n in chosen)} can be told by "
+            f"{source}: of the magnetometers only {', '.join(n for n in RAW[3:] if n in chosen)} can be found by "
             "name.",
             channels_for(lacking[0], others, values),
         )
@@ -771,7 +771,7 @@ def _one(column: str, candidates: Sequence[str], values: Values, source: str) ->
 
 
 def _unit(column: str, name: str, stated: str, values: Array | None, source: str) -> str:
-    """The unit of a column: as stated, or the only one that its values can be in."""
+    """The unit of a column: as declared, or the only one that its values can be in."""
     allowed = units_of(column)
     if not allowed or values is None:
         return stated

@@ -260,7 +260,7 @@ class Proposal(NamedTuple):
     `by_value` columns of a run file whose
     unit no name states; `metadata` what the table says of itself; `where` the table was, if it was looked for;
     `open_axes` the triads of which the run does not tell the axes, `ignored` columns that are called as references
-    and are none, each with the reason.
+    but hold no references, each with the reason.
     """
 
     profile: Profile

@@ -102,7 +102,7 @@ def of_registry(
 def with_walk(inputs: WellInputs, database: str) -> WellInputs:
     """The inputs of surveys with the random walk of their tool, as the calibrations in a registry show it.
 
-    What a parameter moves by in a year is the median of its rate. Misalignments act as scales of the other axes.
+    The movement of a parameter in a year is the median of its rate. Misalignments act as scales of the other axes.
 
     Raises:
         InputError: the calibration has no serial, or the registry no calibration of its tool.

@@ -216,7 +216,7 @@ class ToolRegistry:
     ) -> RegistryAnswer:
         """Add files, all files of folders, or calibrations, readings and certificates that are in memory.
 
-        What a file is shows in its content. What is there already is not added again. A file that cannot be added
+        The content of a file shows its kind. Files already there are not added again. A file that cannot be added
         does not stop the others: it is among `files` and `findings`. `new` counts what was added by kind.
 
         Raises:

@@ -288,8 +288,8 @@ def moments(count: int, averaging: Sequence[int], kind: Kind = "overlapping") ->
 def freedom(moments: Moments, squares: Array, slope: Array, covariance: ArrayLike = 0.0) -> Array:
     """Equivalent degrees of freedom (..., m) of the plain variances, 2 mean²/variance.
 
-    `squares` (..., 4) are the terms of the noise, `slope` (...) its drift per sample. What the
-    slow terms add to a drift is taken larger by its standard uncertainty, from the `covariance`
+    `squares` (..., 4) are the terms of the noise, `slope` (...) its drift per sample. The part
+    of the slow terms in a drift counts larger by its standard uncertainty, from the `covariance`
     (..., 4, 4) of the squares: just there it is known least.
     """
     steady = (moments.averaging * np.asarray(slope)[..., None]) ** 2
@@ -575,7 +575,7 @@ def _absence(
 
 
 class _Used(NamedTuple):
-    """What is fitted.
+    """The quantities to fit.
 
     Variances (B, m), their mean (m, 4) and covariance (m, m, 4, 4) under unit noise, and
     averaging factors (m,) as shares of the record.

@@ -1,7 +1,7 @@
 """Noise of the raw channels of a log of a tool at rest: Allan deviation, terms, one station.
 
-A channel has a rate of its own where its cells are blank at regular places. What is wrong with
-one channel leaves it out, with a finding; what is wrong with the log is an error.
+A channel has a rate of its own where its cells are blank at regular places. A channel with a
+fault is left out, with a finding; a fault of the log is an error.
 
 The noise of a station of T seconds is the Allan deviation at T: 1 σ of a mean over T, as two
 stations show it that follow each other. It is taken from the fitted terms or, where that has
@@ -355,7 +355,7 @@ def _station(record: _Record, length: float, moments: Moments, terms: NoiseTerms
 def _findings(
     name: str, record: _Record, rate: float, station: float, moments: Moments, terms: NoiseTerms
 ) -> list[Finding]:
-    """What the reader should know about a channel."""
+    """Remarks for the reader on a channel."""
     value = record.value
     apart = np.diff(np.sort(value))
     step = float(np.min(apart, where=apart > 0, initial=np.inf))

@@ -111,8 +111,8 @@ class Activity(NamedTuple):
 class Standstills(NamedTuple):
     """Intervals that look still (k,), their edges trimmed, and what became of each.
 
-    `taken`: long enough, and no channel creeps on; `short`: not long enough. What is neither
-    moves slowly.
+    `taken`: long enough, and no channel creeps on; `short`: not long enough. Anything else moves
+    slowly.
     """
 
     start: Array

@@ -163,7 +163,7 @@ def _chosen(chosen: Bools, *arrays: Array) -> Iterator[tuple[Ints, list[Array]]]
 
 
 class Correlated(NamedTuple):
-    """What the halves of a triad's standstills tell of noise that is correlated over seconds.
+    """Evidence in the halves of a triad's standstills of noise that is correlated over seconds.
 
     Attributes:
         variance: of a sample's worth of mean, sd² times samples, of each channel; 0 for none.
@@ -559,7 +559,7 @@ STEADY = 3.0
 """Standard deviations of a cell's level by which a noisy but steady stretch may drift."""
 
 Rows = dict[str, ChannelMean]
-"""What each channel read at the stations."""
+"""Readings of each channel at the stations."""
 
 
 def count(number: int, word: str) -> str:

@@ -56,7 +56,7 @@ SUMMARIES = {"": "mean", "sd_": "sd", "spread_": "spread", "drift_": "drift", "s
 
 @dataclass(frozen=True, eq=False)
 class Stations:
-    """What a log holds.
+    """Contents of a log.
 
     Attributes:
         table: the run, one row per station.
@@ -363,7 +363,7 @@ def _with_samples(
 
 
 def _summaries(traces: Traces, start: Array, end: Array, findings: list[Finding], say: Say) -> Rows:
-    """What each channel read at each station."""
+    """Readings of each channel at each station."""
     summaries: Rows = {}
     for name, (time, value) in traces.items():
         say(f"means of {name} at {count(len(start), 'station')}")
@@ -377,7 +377,7 @@ def _summaries(traces: Traces, start: Array, end: Array, findings: list[Finding]
 
 
 def _widened(triad: Rows, findings: list[Finding]) -> Rows:
-    """What the channels of a triad read, known less well where their noise is correlated."""
+    """Readings of a triad's channels, known less well where their noise is correlated."""
     variances, plain = correlated([*triad.values()])
     each = zip(triad.items(), variances.tolist(), strict=True)
     wider = {name: widened(channel, variance) for (name, channel), variance in each}

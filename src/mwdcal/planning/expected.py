@@ -149,7 +149,7 @@ def carried_out(
 
 
 def left_undetermined(calibration: Calibration) -> list[Undetermined]:
-    """What a plan leaves undetermined, with a remedy: it states every reference, and not every method uses them."""
+    """Undetermined directions of a plan, with a remedy: it states every reference, and not every method uses them."""
     entries = calibration.undetermined()
     if calibration.method == "joint":
         return entries

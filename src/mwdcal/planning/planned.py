@@ -207,7 +207,7 @@ MOST_SEARCHED = 1_000_000
 OUT_NAMED = 5
 """Stations out of reach that are named."""
 CRITERIA = ("D", "A", "I")
-"""What a best plan is best in: all parameters together, each of them, the angles."""
+"""Aim of a best plan: all parameters together, each of them, the angles."""
 
 
 @dataclass(frozen=True)
@@ -258,7 +258,7 @@ class Planned:
 
     @property
     def findings(self) -> list[Finding]:
-        """What the calibration and the search will say, and which errors hide."""
+        """Remarks that calibration and search will make, and which errors hide."""
         stations = sorted({k for some in self.hidden.values() for k in some})
         named = [station_names(self.plan)[k] for k in stations]
         text = (
@@ -364,7 +364,7 @@ def _grown(
 
 
 def _of_search(bound: int, enough: int, count: int) -> list[Finding]:
-    """What a search that ends with a `count` of stations has to say: `enough` gave the accuracy."""
+    """Remark of a search that ends with a `count` of stations: `enough` gave the accuracy."""
     said = []
     if count > bound:
         text = (

@@ -325,14 +325,14 @@ class SensorEffects(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     saturation: float | None = None
 
     def recorded(self, reading: Array) -> Array:
-        """What the converter gives of readings: cut at the saturation, rounded to the resolution."""
+        """Readings behind the converter: cut at the saturation, rounded to the resolution."""
         most = self.saturation
         cut = reading if most is None else np.clip(reading, -most, most)
         return np.rint(cut / self.resolution) * self.resolution if self.resolution else cut
 
 
 class StandEffects(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Errors of the stand beside those that the tool profile declares, degrees.
+    """Errors of the stand besides those that the tool profile declares, degrees.
 
     `…_zero_deg`, `tilt_deg`: common to the session (1σ). `backlash_…_deg`: play of the gear; the table lags
     behind its scale by half of it, against the direction of approach (`approach`).
@@ -392,7 +392,7 @@ class FaultEffect(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     def damage(
         self, rng: np.random.Generator, profile: Profile, lead: tuple[int, ...]
     ) -> Damage | None:
-        """What the fault has done to tools (...,); None without one."""
+        """Effect of the fault on tools (...,); None without one."""
         if self.kind == NONE:
             return None
         if self.kind == "dead-channel":
@@ -660,7 +660,7 @@ def _factors(unit: Array, profile: Profile, triad: str, order: int) -> Array:
 
 
 def reading(truth: Truth, plan: StationPlan) -> tuple[Array, Array]:
-    """What the tool's channels read (n, 3) without noise, nominal units: the model, inverted."""
+    """Readings of the tool's channels (n, 3) without noise, nominal units: the model, inverted."""
     angles = plan.inclination, plan.azimuth, plan.toolface
     vectors = reference_vectors(*angles, truth.gravity, truth.field, truth.dip)
     g, b = truth.readings(vectors, plan.temperature).values()

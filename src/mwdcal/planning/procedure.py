@@ -500,7 +500,7 @@ def as_table(columns: Mapping[str, AnyArray], procedure: Procedure) -> Table:
 def summarised(
     columns: Mapping[str, AnyArray], judged: Sequence[Judged], guard: float
 ) -> Repetition:
-    """What the rows of all tools show; the verdict has kept `guard` standard uncertainties from each limit."""
+    """Summary of the rows of all tools; the verdict has kept `guard` standard uncertainties from each limit."""
     status, passed, good = (columns[name] for name in ("status", "passed", "good"))
     sound = np.asarray(status == CALIBRATED)
     refused, counts = np.unique(status[~sound].astype(str), return_counts=True)

@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from mwdcal.use.verification import Limits, Verdict, VerdictRow
 
 SHOWN_DEPARTURES = {"spread": "departure from the middle of the roll set", "error": "error"}
-"""What the stations of a roll test show of each kind of limit."""
+"""Departures of a roll test's stations for each kind of limit."""
 LONG_TABLE = 60
 """A run of more stations has its station table at the end, as an annex."""
 LARGE_RATIO = 2.0

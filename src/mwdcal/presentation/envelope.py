@@ -92,7 +92,7 @@ def json_document(
     """The document of a command: its head, the SHA-256 of its input files, and the content.
 
     `metadata` are what the inputs say of themselves, `sha256` the digests by name; one that was not
-    computed, or of a file that was not given, is None. Keys of the content stand before equal ones.
+    computed, or of a file that was not given, is None. Keys of the content override equal ones.
     """
     settings, settings_sha256 = source_of_settings()
     envelope = Envelope(

@@ -102,7 +102,7 @@ class FleetDocument(FleetCounts, frozen=True, kw_only=True):
 
 
 def summarise(target: Path, typed: FitArguments, notes: list[str], **facts: Any) -> FleetSummary:
-    """What the table of calibrations `target` says, read column by column, beside other `facts`."""
+    """Summary of the table of calibrations `target`, read column by column, beside other `facts`."""
     _, pq = parquet.modules(target.name)
     whole = pq.ParquetFile(target)
     head = whole.read([SERIAL, "status", "message", "findings"])

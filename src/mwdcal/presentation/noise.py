@@ -105,7 +105,7 @@ def _table(
 
 
 def _cells(channel: ChannelNoise, factor: float) -> list[str]:
-    """What the table says of a channel of which a raw unit is `factor` shown ones."""
+    """Row of the table for a channel of which a raw unit is `factor` shown ones."""
     doubtful = bool({*channel.doubts} - {"slow"})
     white, *others = (
         _term(channel.terms[name], factor * (HOUR if name == "drift" else 1.0), doubtful)

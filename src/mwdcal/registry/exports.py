@@ -126,7 +126,7 @@ def _written_history(connection: sa.Connection, name: str, path: Path) -> str:
 
 
 def read_manifest(folder: Path) -> Manifest | None:
-    """The manifest of an export in a folder; None where the folder is none.
+    """The manifest of an export in a folder; None if it is not a folder.
 
     Raises:
         InputError: the manifest is damaged, or names files outside of the folder.

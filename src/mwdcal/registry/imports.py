@@ -45,7 +45,7 @@ _BOM = b"\xef\xbb\xbf"
 _PRIVATE, _PUBLIC = b"PRIVATE KEY-----", b"-----BEGIN PUBLIC KEY-----"
 _NOT_KEPT = (
     "a registry keeps calibrations, verifications and certificates of mwdcal, runs, tool profiles, limits, "
-    "laboratories and public keys, and it is none of them. Leave it out."
+    "laboratories and public keys, and this is something else. Leave it out."
 )
 
 
@@ -114,7 +114,7 @@ def checked(entry: Entry) -> Calibration | None:
 
 
 def _json_text(data: bytes) -> bytes:
-    """The file in UTF-8 without what stands before its text; as it is where it is no text."""
+    """The file in UTF-8 without the mark at its beginning; as it is where it is no text."""
     with suppress(UnicodeDecodeError):
         return documents.in_utf8(data).lstrip()
     return data

@@ -137,8 +137,8 @@ class Registry:
     ) -> list[Added]:
         """Add files, all or none; what is there already is not added again.
 
-        `actor` is who adds them, `when` the time that the history states: now, if None. What the call
-        returns is on the disk. The files, compressed, are in memory at once. Where the connection breaks
+        `actor` is who adds them, `when` the time that the history states: now, if None. The result of
+        the call is on the disk. The files, compressed, are in memory at once. Where the connection breaks
         during the call, nobody can know whether it took effect: add the same again.
 
         Raises:

@@ -384,7 +384,7 @@ def _is_as_added(record: Row, stored: Row, event: Row, after: str | None) -> boo
 def check_complete(connection: sa.Connection, name: str) -> None:
     """Refuse a registry in which a record, a withdrawal or a tool was removed, added or exchanged.
 
-    What is selected rests on all of them: without a withdrawal another calibration would be the latest.
+    The selection rests on all of them: without a withdrawal another calibration would be the latest.
 
     Raises:
         AlteredError: rows and history do not fit together.

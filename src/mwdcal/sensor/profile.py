@@ -30,7 +30,7 @@ class Datasheet(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     """The maker's tolerances of a triad, 1 σ, used as a prior where the options say so.
 
     `scale` as a share, `bias` in g or nT, `misalignment_deg`; `scale_per_c` and `bias_per_c`
-    their drift per °C. What is not given is not known.
+    their drift per °C. Missing values are unknown.
     `turn_on` is the bias that each switching on leaves, `bias_walk` and `scale_walk` what bias and
     scale change by in a year; they grow with the square root of time. They age the prior that an
     earlier calibration is.
@@ -116,7 +116,7 @@ class StandProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         return self.settings if isinstance(self.settings, str) else ""
 
     def repeatability(self, column: str) -> float:
-        """What is added to the standard uncertainty of an angle in quadrature; strengths have none."""
+        """Repeatability to add to the standard uncertainty of an angle in quadrature; strengths have none."""
         return float(getattr(self, f"repeatability_{column}", 0.0))
 
     def common(self) -> dict[str, float]:
@@ -257,7 +257,7 @@ USUAL_AGEING = {
     "accelerometer": Datasheet(turn_on=4e-4, bias_walk=4e-4, scale_walk=5e-4),
     "magnetometer": Datasheet(turn_on=70.0, bias_walk=70.0, scale_walk=1.6e-3),
 }
-"""What the OWSG error model (Rev 5.1, MWD) allows a sensor between calibrations, 1σ, taken as a year's walk.
+"""Allowance of the OWSG error model (Rev 5.1, MWD) for a sensor between calibrations, 1σ, taken as a year's walk.
 
 ABXY, ABXY, ASXY; MBXY, MBXY, MSXY.
 """

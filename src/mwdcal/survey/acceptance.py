@@ -300,7 +300,7 @@ def _covariance(
 
 
 def _reference_sd(readings: Readings, limits: SurveyLimits, name: str) -> Array:
-    """Standard uncertainty (n,) of a reference: as stated, else that of the limits."""
+    """Standard uncertainty (n,) of a reference: its own, else that of the limits."""
     stated = readings.uncertainty(name)
     shared = np.where(stated > 0, stated, limits.reference.sd(name))
     return np.hypot(shared, readings.uncertainty(RANDOM + name))
@@ -388,7 +388,7 @@ _HALFWAY = np.array(
 
 
 def blindness(tests: AcceptanceTests, vectors: tuple[Array, Array]) -> Blindness:
-    """What the acceptance of surveys (n,) with these vectors (n, 3), g and nT, would let pass.
+    """Interference that acceptance of surveys (n,) with these vectors (n, 3), g and nT, lets pass.
 
     Definition: interference that shifts |g|, |b| and dip of a survey without other errors by what the tests accept.
     """

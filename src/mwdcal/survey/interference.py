@@ -137,7 +137,7 @@ FEWEST_SURVEYS = 2
 LEAST_CHANCE = 1e-3
 """Chance of as large a misfit below which the surveys do not fit."""
 LEAST_SEEN = 2.0
-"""Interference below this many standard uncertainties in every direction is none that was seen."""
+"""Interference below this many standard uncertainties in every direction was not seen."""
 FEWEST_AT_END = 2
 """Doubtful surveys in a row at the end that point at something near the hole."""
 FARTHEST_REFERENCE = 3.0
@@ -242,7 +242,7 @@ class Interference:
 
     @property
     def terms(self) -> ErrorTerms:
-        """What the standard uncertainties of magnetic azimuths hold, and what they leave out."""
+        """Sources in the standard uncertainties of magnetic azimuths, and those left out."""
         return error_terms(self.calibration.findings, declination=False)
 
     def check(self) -> None:

@@ -190,7 +190,7 @@ def estimate(
 def surveys(calibration: Calibration, readings: Readings) -> Readings:
     """The readings as stations of unknown attitude, with the noise of the calibration where none is stated.
 
-    What is new of field and dip at every station counts as noise of the magnetometer, by the larger of the two.
+    Changes of field and dip from station to station count as noise of the magnetometer, by the larger of the two.
     Raises `InputError` for a calibration or readings without a magnetometer, or without a reference.
     """
     if not calibration.has_field or readings.magnetometer is None:
@@ -235,7 +235,7 @@ def varied(readings: Readings) -> Bools:
 
 
 def _open_azimuth(calibration: Calibration, readings: Readings, result: Fit) -> Bools:
-    """Whether (B,) an azimuth rests on a direction that nothing determines; the zero of toolface is none."""
+    """Whether (B,) an azimuth rests on a direction that nothing determines; the zero of toolface does not count."""
     undetermined = (~result.analysis.determined.keep).sum(-1)
     resting = calibration.rests_on_free("azimuth", readings).any(-1)
     return np.asarray((undetermined > len(calibration.free)) | ((undetermined > 0) & resting))

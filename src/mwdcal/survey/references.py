@@ -4,10 +4,10 @@ One order for gravity, field, dip, declination and convergence: the table of the
 them; then the reference of the place, in which a measured value comes before that of a model; then a model. The
 source that does not count is still compared with the one that does.
 
-What a survey is judged and turned by at a place and date: gravity, field, dip, declination, convergence.
+References of surveys at a place and date: gravity, field, dip, declination, convergence.
 
-Values come from models of the Earth, or were measured there; a measured value always stands before a
-modelled one. Each has a standard uncertainty, and says where both come from.
+Values come from models of the Earth, or were measured there; a measured value always overrides a modelled
+one. Each has a standard uncertainty, and says where both come from.
 
 References of a place in the columns of a run: blank cells are filled, given ones stay.
 """
@@ -490,7 +490,7 @@ _LEAST_SHARE = 1e-9
 
 
 class Claim(NamedTuple):
-    """What a source states of a quantity: values (n,) in the unit of `QUANTITIES`, with standard uncertainties.
+    """Values of a quantity in a source: values (n,) in the unit of `QUANTITIES`, with standard uncertainties.
 
     NaN where it states none.
     """
@@ -711,7 +711,7 @@ def reference_at(
 ) -> EarthReference:
     """The reference of a place and date.
 
-    `measured` values by name of `MEASURABLE`, in the units of their keys, stand before those of the models,
+    `measured` values by name of `MEASURABLE`, in the units of their keys, override those of the models,
     with their standard `uncertainties`. Where none is stated it is zero, that of declination as of the model: no
     residual would ever show its error. Measured values are compared with the models. Where field, dip and declination
     were all measured that is all a field model does, and it need not be there.
@@ -896,7 +896,7 @@ def _sources(
     sources |= dict.fromkeys(measured, "measured")
     sources["sd_gravity"] = "stated" if "gravity" in measured else GRAVITY_SD_SOURCE
     sources["sd_field_dip_declination"] = (
-        OWSG if not GEOMAGNETIC & measured.keys() else f"{OWSG}; of measured values as stated"
+        OWSG if not GEOMAGNETIC & measured.keys() else f"{OWSG}; of measured values their own"
     )
     return sources | ({"convergence": grid.name} if grid else {})
 

@@ -111,7 +111,7 @@ def survey_readings(
 
     Uncertainties of the laboratory's stand and references do not count in a well.
     Stations have fingerprints where they are to be `recognised`.
-    What the table states counts before the `reference`, by `mwdcal.survey.references`.
+    Values of the table override the `reference`, by `mwdcal.survey.references`.
 
     Raises:
         InputError: a table that cannot be read, depths under another name or in another unit.
@@ -578,7 +578,7 @@ def _said_of(
 ) -> tuple[TrajectoryFacts, Bools]:
     """The statements of a table about its norths, tie-in and statuses, and its rows (n,) that are surveys.
 
-    Rows without readings are none where they may be `blank`, nor is a tie-in station.
+    Rows without readings are allowed where they may be `blank`, nor is a tie-in station.
     """
     none = np.zeros(table.count, bool)
     if not (blank or has_stations(table)):

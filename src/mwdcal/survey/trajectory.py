@@ -51,7 +51,7 @@ def trajectory(table: Table, md: Array | None, without: Bools) -> TrajectoryFact
     """The statements of a table with measured depths (n,), m; rows `without` readings may be a tie-in station.
 
     Raises:
-        InputError: a status that is none, or a number of the tie-in station that cannot be read.
+        InputError: an unknown status, or a number of the tie-in station that cannot be read.
     """
     stated, findings = _norths(table)
     table = replace(table, metadata={**stated, **table.metadata})

@@ -487,7 +487,7 @@ class Well:
 
     @property
     def terms(self) -> ErrorTerms:
-        """What the standard uncertainties hold, and what they leave out."""
+        """Sources in the standard uncertainties, and those left out."""
         modelled = () if self.errors is None else self.errors.included
         return error_terms(
             self.calibration.findings, self.north.declination is not None, modelled=modelled

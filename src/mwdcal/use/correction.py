@@ -250,7 +250,7 @@ def correct(
 
     With `uncertainty` also the 1σ of each angle and strength, of the calibration and of one reading.
     Singular: within the uncertainty of vertical azimuth and toolface are NaN (blank in files);
-    `magnetic_toolface_deg` stands beside them. A strength of zero has no direction: NaN.
+    `magnetic_toolface_deg` is there too. A strength of zero has no direction: NaN.
     Temperatures outside the calibrated range are blanked, refused or extrapolated as `outside` says.
     """
     columns, _, about = correct_and_count(calibration, readings, outside, uncertainty=uncertainty)

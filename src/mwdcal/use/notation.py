@@ -241,7 +241,7 @@ def _propagate(
 
 
 def _sizes(calibration: Calibration, triad: TriadCalibration, values: dict[str, Array]) -> Array:
-    """What each value is compared with to see whether a free direction moves it."""
+    """Scale of each value, to see whether a free direction moves it."""
     low, high = calibration.temperature_c or (0.0, 0.0)
     strength = calibration.earth.get("field", 1.0) if triad.name == TRIADS[1] else 1.0
     name, value = next((n, v) for n, v in values.items() if n in ("S", "SF", "M"))

@@ -206,7 +206,7 @@ class NoiseScale:
     `known`: degrees of freedom of the stated noise. A declared noise keeps its size: `scale` is 1. An estimated
     one is pooled with the residuals of all curves, each by its degrees of freedom; `freedom` is their sum.
     `calm`: the residuals are improbably small. Then `seen` is their noise, else `scale`: the bias is taken off
-    by it, lest too much be taken off. No uncertainty ever rests on it.
+    by it, so that not too much is taken off. No uncertainty ever rests on it.
     """
 
     known: float
@@ -233,7 +233,7 @@ def scatter(curves: Sequence[Curve], known: float = UNLIMITED) -> NoiseScale:
 
 
 def chance(square: Array, freedom: Array, known: float = UNLIMITED) -> Array:
-    """Chance (...) that noise as stated makes χ² larger; 1 without degrees of freedom.
+    """Chance (...) that the declared noise makes χ² larger; 1 without degrees of freedom.
 
     Definition: the tail of χ², or of Fisher's F where the noise was estimated with `known` degrees of freedom.
     """
@@ -734,8 +734,8 @@ class RollTest:
     def spread(self, name: str) -> Departures:
         """The widest noise-free spread over the roll sets.
 
-        A group that was not rolled cannot pass, nor can sets of equal reference directions of
-        which none was; other sets that were not rolled are left out. Toolface: of its error.
+        A group that was not rolled cannot pass, nor can sets of equal reference directions if
+        none of them was; other sets that were not rolled are left out. Toolface: of its error.
         """
         lacks = self._lacks(name)
         if lacks or not self.sets:
@@ -916,7 +916,7 @@ class RollTest:
         return ReferenceErrors(np.zeros(sd.shape), None, whole, zero)
 
     def common_errors(self, name: str, reference: ReferenceErrors, first: int) -> Array:
-        """What a set (its `first` station) shares would be off by (d,) in tests like this one."""
+        """Error that a set (its `first` station) shares (d,) in tests like this one."""
         setting = self._reference_draws(name, np.array([first]))[:, 0]
         return reference.setting * setting + reference.zero * draws(f"zero of {name}", 1)[:, 0]
 

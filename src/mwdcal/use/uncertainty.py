@@ -56,7 +56,7 @@ class ErrorTerms:
 
     @property
     def sentence(self) -> str:
-        """Both, as they stand beside every 1σ."""
+        """Both, as printed beside every 1σ."""
         lacking = f" Not in it: {', '.join(self.left_out)}." if self.left_out else ""
         return f"1σ: {', '.join(self.included)}.{lacking}"
 
@@ -112,7 +112,7 @@ def without_value(
 ) -> Bools:
     """Where (…, n, k) a direction has no value: its 1σ would exceed `LARGEST_DIRECTION_SD`.
 
-    Of `names`, with `value` and `sd` (…, n, k). What is not there, rests on a free direction or lies outside the
+    Of `names`, with `value` and `sd` (…, n, k). A result that is missing, rests on a free direction or lies outside the
     calibrated temperatures has no `sd` for other reasons.
     """
     turns = np.array([OBSERVABLES[name].period > 0 for name in names])

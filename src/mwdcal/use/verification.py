@@ -133,9 +133,9 @@ FIRST_HARMONIC = {
     "azimuth": "a bias across the tool axis of either triad, or it leans",
     "gravity": "a bias of the accelerometer across the tool axis, or its x or y is not square to z",
 }
-"""What a first harmonic of toolface comes from; as for azimuth where not named."""
+"""Causes of a first harmonic of toolface; as for azimuth where not named."""
 SECOND_HARMONIC = "a difference in scale, or a misalignment, of "
-"""What a second harmonic comes from."""
+"""Causes of a second harmonic."""
 VERDICT_FINDINGS = {
     "no-temperature": "the calibration has no temperature terms, and its run recorded no temperature: the verdict "
     "holds at the temperature of the test alone{tested}.",
@@ -269,7 +269,7 @@ class VerdictRow(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def bound(self) -> float:
-        """What a departure may be, up or down: the limit on an error, half of that on a spread."""
+        """Largest departure, up or down: the limit on an error, half of that on a spread."""
         return self.limit if self.two_sided else self.limit / 2
 
 

@@ -77,7 +77,7 @@ ISO_DAY = click.DateTime(["%Y-%m-%d"])
     "--laboratory",
     type=options.FILE,
     metavar="LAB.toml",
-    help="What the laboratory states: name, people, standards, decision rule.",
+    help="Laboratory file: name, people, standards, decision rule.",
 )
 @click.option(
     "--registry",
@@ -117,7 +117,7 @@ def issue(
 ) -> None:  # fmt: skip
     """Issue the certificate of a CALIBRATION: ISO/IEC 17025 contents, uncertainty budget, decisions with their risk.
 
-    What the laboratory file does not state is named in the certificate. A failed roll test is shown as failed.
+    The certificate names what the laboratory file leaves out. A failed roll test is shown as failed.
 
     \b
     Example: mwdcal certificate tool.json --verification v.json --laboratory lab.toml -o C.json -o C.pdf
@@ -197,7 +197,7 @@ def verify(document: Path, files: tuple[Path, ...], key: tuple[Path, ...], as_js
     """Verify the signature of a DOCUMENT: calibration file, JSON of a verification or certificate, or its PDF.
 
     Of a certificate also the files that it rests on, by their SHA-256: FILES, or where the certificate
-    says, seen from its folder, or beside it. What is not found is said, and no failure.
+    says, seen from its folder, or beside it. A file that is not there is reported, and is no failure.
 
     \b
     Example: mwdcal certificate verify certificate.json --key laboratory.key.pub

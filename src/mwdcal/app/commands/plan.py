@@ -44,7 +44,7 @@ from mwdcal.app.messages import print_result
     "--reach",
     metavar="ANGLE_deg=LOW:HIGH",
     multiple=True,
-    help="What the stand reaches, such as inclination_deg=0:120 or azimuth_deg=0:0; may be repeated. Default: "
+    help="Settings in reach of the stand, such as inclination_deg=0:120 or azimuth_deg=0:0; may be repeated. Default: "
     "every attitude.",
 )
 @options.preset(

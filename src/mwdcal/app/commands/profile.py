@@ -38,7 +38,7 @@ MOST_ROUNDS = 20
     "--column",
     multiple=True,
     metavar="OURS=THEIRS",
-    help="What a column is: ref_azimuth_deg='Azi 2', ref_field_nt='F [µT]'; blank: none is. Repeatable.",
+    help="Which column is which: ref_azimuth_deg='Azi 2', ref_field_nt='F [µT]'; blank: none is. Repeatable.",
 )
 @click.option(
     "--leave-out",
@@ -52,7 +52,7 @@ MOST_ROUNDS = 20
 @click.option(
     "--north",
     type=click.Choice(["magnetic", "true", "grid"]),
-    help="What the azimuths of the stand count from, where the table does not state it.",
+    help="North of the stand's azimuths, where the table does not say it.",
 )
 @options.number(
     "--declination-deg", "DEG", "Declination of azimuths from true or grid north, east."
@@ -69,7 +69,7 @@ def command(
     Takes .csv .tsv .txt .dat .lvm .xlsx .xls .ods. Finds sheet, names and units of the columns, the last row of
     readings, decimal sign and encoding, the meaning of each column, and, from readings at known attitudes, the axes
     and nominal scales of both triads. calibrate, verify, compare and apply then take such tables with
-    --tool TOOL.toml as they are, also where the table has moved. What is open is asked: on a terminal one question
+    --tool TOOL.toml as they are, also where the table has moved. It asks what is open: on a terminal one question
     after the other, elsewhere all at once, each with the option that answers it.
 
     \b

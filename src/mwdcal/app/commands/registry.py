@@ -229,7 +229,7 @@ def add(
 
     Calibrations, verifications (verify --json) and certificates as JSON; runs and readings as they came; tool
     profiles, limits and laboratories; public keys; tables of calibrations that fleet wrote, each tool as a
-    calibration file; a folder that export wrote. What is there already is not added again, and a file that
+    calibration file; a folder that export wrote. Files that are there already are not added again, and a file that
     cannot be added does not stop the others.
 
     \b
@@ -254,7 +254,7 @@ def add(
                 imports.add_all(adding, portions, 1 if alone else workers or cores(), advance)
             result = screen.added(registry, adding)
     except KeyboardInterrupt as stop:
-        stop.add_note("What was added stays: the same command adds the rest.")
+        stop.add_note("Added files stay: the same command adds the rest.")
         raise
     if not (result.new or result.known):
         for line in lines(result.findings):
@@ -396,7 +396,7 @@ def get(record: str, database: str, output: Path, as_json: bool) -> None:
     "limits",
     multiple=True,
     metavar="ANGLE_deg=VALUE",
-    help="What the 95 % accuracy of an angle may be until the next calibration, such as inclination_deg=0.1. "
+    help="Largest 95 % accuracy of an angle until the next calibration, such as inclination_deg=0.1. "
     "Default: the errors that the limits profile roll-test allows.",
 )
 @click.option(

@@ -18,7 +18,7 @@ from mwdcal.presentation.typed import findings_with_option_names, with_option_na
     "--min-seconds", "S", "Shortest station, trimmed. Default: 1, or 15 samples of a slow log."
 )
 @options.number(
-    "--trim-seconds", "S", "What is cut off each end. Default: 1, or 3 samples of a slow log."
+    "--trim-seconds", "S", "Seconds to cut off each end. Default: 1, or 3 samples of a slow log."
 )
 @options.number(
     "--threshold",

@@ -1,4 +1,4 @@
-"""What a calibration leaves to the software, and what it chooses: prior, order, own-axis terms."""
+"""Choices that a calibration leaves to the software: prior, order, own-axis terms."""
 
 from __future__ import annotations
 
@@ -520,7 +520,7 @@ def _left_out(readings: Readings, options: Options) -> Array:
 
 @dataclass(frozen=True)
 class Choice:
-    """What a run is calibrated with, and the tables that decided what was left to the data.
+    """The choices of a calibration, and the tables that decided what was left to the data.
 
     `readings` are without the stations left out on request, whose labels are `excluded`; `options`
     say `auto` nowhere. `orders` are empty where no temperature can be left out, `curves` where no

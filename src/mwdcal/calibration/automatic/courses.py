@@ -1,4 +1,4 @@
-"""What the temperature order of a fit leaves out: terms beyond it, their test, size and share.
+"""Temperature terms beyond the order of a fit: terms beyond it, their test, size and share.
 
 Gain and offset of each axis may vary with temperature by more than the order of the model says.
 At the solution of a fit each further power (a Chebyshev polynomial of temperature over the run, for

@@ -227,7 +227,7 @@ USUAL_FIELD = 50_000.0
 
 @dataclass(frozen=True)
 class Ageing:
-    """What a triad may have changed by, 1σ: `offset` in g or nT, `scale` as a share."""
+    """Possible change of a triad, 1σ: `offset` in g or nT, `scale` as a share."""
 
     offset: float
     scale: float

@@ -468,7 +468,7 @@ def _beyond_order(fitted: FittedRuns) -> Iterator[Flag]:
 def _course(
     fitted: FittedRuns, index: int, present: Bools, size: Callable[[], Array], place: int
 ) -> dict[str, Any]:
-    """What is left out of a triad's course of temperature, of powers `present` (B, k) and a `size` (B, t)."""
+    """Remarks on terms left out of a triad's course of temperature, of powers `present` (B, k) and a `size` (B, t)."""
     problem, state = fitted.result.problem, fitted.result.state
     order, observable = problem.triads[index].model.basis.order, ("gravity", "field")[index]
     scale, unit = shown_in(observable, fitted.readings.relative)

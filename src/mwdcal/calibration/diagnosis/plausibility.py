@@ -174,7 +174,7 @@ def _ranks(calibration: Calibration) -> Iterator[str]:
 
 
 def _covariance(calibration: Calibration) -> Iterator[str]:
-    """A covariance that is none, or not that of the standard uncertainties."""
+    """A covariance that is not valid, or not that of the standard uncertainties."""
     covariance = calibration.parameter_covariance
     if not is_covariance(covariance):
         yield (

@@ -361,7 +361,7 @@ def check_curves(readings: Readings, wanted: Iterable[str]) -> None:
 
 
 def reading_refusals(readings: Readings, options: Options, run: Run) -> Iterator[Flag]:
-    """What no fit of runs (B, n, ...) can make good, in order of precedence."""
+    """Defects that no fit of runs (B, n, ...) can repair, in order of precedence."""
 
     def source(place: int) -> str:
         return run(place).source or "the run"

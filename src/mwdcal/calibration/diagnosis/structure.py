@@ -242,7 +242,7 @@ def may_show(result: Fit) -> Bools:
 class _Drifts:
     """Drifts that are in the fits, by triad: their columns, covariance (B, q, q), and the pull (B, q) that is left.
 
-    What they add to the `misfit` (B,), and take of its degrees of `freedom` (B,).
+    Their part of the `misfit` (B,), and take of its degrees of `freedom` (B,).
     """
 
     columns: dict[int, CommonColumns]
@@ -522,7 +522,7 @@ STRUCTURE_CHANCE = 0.01
 BAD_SHARE = 0.1
 """Share of bad stations up to which they are left out."""
 COLUMN = "column "
-"""What the names of columns that the run does not use begin with."""
+"""Beginnings of the names of columns that the run does not use."""
 COLUMN_EXPLAINS = (
     "Column {name!r} is not used, and explains {effect.share:.0%} of the misfit. If it is the temperature of the tool, "
     "name it 'temperature_c' (°C), or under [columns] of the tool profile; else find out what it stands for."

@@ -156,7 +156,7 @@ _SUPERSCRIPTS = str.maketrans("⁻¹²³⁴⁵⁶⁷⁸⁹", "-123456789")
 def dsi_unit(text: str) -> DsiUnit:
     r"""The D-SI form of a unit such as "g/°C" or "nT"; "°C" by itself is `\degreecelsius`.
 
-    What a share is of, as in "‰ of the field", is no part of its unit.
+    The whole of a share, as in "‰ of the field", is no part of its unit.
 
     Singular: a unit that is not of the SI is marked with a vertical bar, as D-SI has it.
     """

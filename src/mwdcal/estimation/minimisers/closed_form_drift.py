@@ -79,7 +79,7 @@ def perfect(design: Alike) -> tuple[Problem, State]:
 
 
 def responses(problem: Problem, state: State) -> list[Array]:
-    """What a change of the field, and one of the readings, does to each triad's whitened ones: [S 1] / σ (B, 3, 6)."""
+    """Effect of a change of the field, and of the readings, on each triad's whitened ones: [S 1] / σ (B, 3, 6)."""
     each = []
     for triad, where in zip(problem.triads, problem.slices(), strict=True):
         params, at = state.params[:, where], (triad.raw[:, :1], problem.temperature[:, :1])
@@ -194,7 +194,7 @@ def applies(problem: Problem) -> bool:
 
 @lru_cache(maxsize=16)
 def walk_columns(design: Alike, alone: bool = False) -> WalkColumns:
-    """What the terms of the drifts do to the readings of the triads; `alone`: with the sensors' parameters known."""
+    """Effect of the drift terms on the readings of the triads; `alone`: with the sensors' parameters known."""
     perfect_problem, at = perfect(design)
     columns = perfect_problem.walk_columns(at)[0]
     walk = np.array([WALK_AXES[c.name][0] for c in perfect_problem.evidence.constants])

@@ -37,8 +37,8 @@ class Axes:
     """Runs of one triad (B), axis by axis: readings and references over the noise (B, 3, n).
 
     `phi` (B, 1, K, n) are the polynomials of temperature; `beside` (B, 3, K + 2, n) are the vector
-    along the two other axes and φ, over the noise of the axis as `along` and `raw` are. What is left
-    out is zero in them. `vectors` and `noise` are the references and the noise themselves.
+    along the two other axes and φ, over the noise of the axis as `along` and `raw` are. Parameters left out
+    are zero in them. `vectors` and `noise` are the references and the noise themselves.
     """
 
     phi: Array

@@ -53,7 +53,7 @@ EPSILON = float(np.finfo(float).eps)
 
 @dataclass(frozen=True)
 class Compared:
-    """What is compared: raw (B, n, 3), temperature, gravity, inclination (B, n), weights (B, n, 2).
+    """Values to compare: raw (B, n, 3), temperature, gravity, inclination (B, n), weights (B, n, 2).
 
     A reference of weight zero has a harmless value: nothing here is NaN for being unknown.
     """
@@ -281,7 +281,7 @@ def _target(g: Array, stations: Compared) -> Array:
 
 
 def _rows(target: Array, stations: Compared) -> Array:
-    """What each station compares, as rows (B, n, 3, 3) on the field, in units of gravity."""
+    """Comparisons of each station, as rows (B, n, 3, 3) on the field, in units of gravity."""
     along, up, turn = _directions(target)
     used = stations.used[..., None]
     vertical = np.abs(np.sin(stations.inclination))[..., None] <= VERTICAL

@@ -105,7 +105,7 @@ class StandColumns:
         return (self.courses[:, None] * self.courses).reshape(-1, self.courses.shape[-1])
 
     def axes_of(self, walks: Iterable[int], forward: Array, attitude: Array) -> Array:
-        """What a unit of each axis of some walks, by their numbers, adds to the whitened readings (6, a, B, n).
+        """Effect of a unit of each axis of some walks, by their numbers, on the whitened readings (6, a, B, n).
 
         At Φ (B, 2, 3, 4) and attitudes (3, 3, B, n).
         """
@@ -182,7 +182,7 @@ class StandColumns:
         return np.concatenate([part.reshape(len(part), -1) for part in each], -1)
 
     def change(self, step: Array) -> Array:
-        """What a step (B, u) of the unknowns does to the whitened readings (6, B, n)."""
+        """Effect of a step (B, u) of the unknowns on the whitened readings (6, B, n)."""
         first = step[:, :OF_PARAMETERS].reshape(-1, 2, 3, 4)
         each = [by_component(first[:, t] @ by_tool(f), 3) for t, f in enumerate(self.terms)]
         change = np.concatenate(each) * self.weight
@@ -593,7 +593,7 @@ def refined(problem: Problem, state: State) -> Solution:
 
 @dataclass(frozen=True)
 class StandWalks:
-    """What the fits of runs without drift leave of all walks, of unit terms: those of a walk axis by axis.
+    """All walks as fits without drift leave them, of unit terms: those of a walk axis by axis.
 
     `score` (B, q) of the terms, XᵀWD (B, 24, q) with the parameters, `crossed`, and what these take up, `taken`.
     """

@@ -1,4 +1,4 @@
-"""What a file in another program's format says of the table it was written from.
+"""Remarks of a file in another program's format on the table it was written from.
 
 Lines `# key = value` hold the metadata, as above a text table. One more line names the columns in
 their order, and those that are text: the format itself has other names, and no place for some.

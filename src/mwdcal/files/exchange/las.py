@@ -72,7 +72,7 @@ class _Curve(NamedTuple):
 
 
 class _Header(NamedTuple):
-    """What the header says: curves, how values are wrapped, what is blank, and the other entries."""
+    """Contents of the header: curves, how values are wrapped, what is blank, and the other entries."""
 
     curves: list[_Curve]
     wrapped: bool
@@ -178,7 +178,7 @@ def _header(lines: Sequence[str], source: str) -> _Header:
 
 
 def _entries(items: Sequence[Any]) -> dict[str, object]:
-    """What the sections ~Well and ~Parameter say, as metadata."""
+    """The sections ~Well and ~Parameter as metadata."""
     entries: dict[str, object] = {}
     for item in items:
         value = item.value.item() if isinstance(item.value, np.generic) else item.value

@@ -2,7 +2,7 @@
 
 Raw axial is az and mz, transverse 1 is ax and mx, transverse 2 is ay and my. A column that is an
 element of a station is written as that element, any other one as an extension (name and value), so
-that nothing is lost. What a file of another program says beyond md, raw readings and references is
+that nothing is lost. Elements of another program beyond md, raw readings and references are
 kept under the name of its element, verbatim.
 """
 
@@ -128,7 +128,7 @@ def parse(data: bytes, source: str) -> Parts:
 
 
 def _metadata(trajectory: Trajectory) -> dict[str, object]:
-    """What a file of another program says of its trajectory, in the words of the file but for names."""
+    """Remarks of another program's file on its trajectory, in the words of the file but for names."""
     leaves = {path: leaf for path, leaf in trajectory.leaves.items() if leaf.text.strip()}
     named = {_NAMES[path]: leaf.text.strip() for path, leaf in leaves.items() if path in _NAMES}
     uids = {_UIDS[name]: uid for name, uid in trajectory.uids.items() if name in _UIDS}

@@ -1,7 +1,7 @@
 """Atomic writing: an interrupted command leaves the old file or none, never half of one.
 
-A file grows under a temporary name beside its target, locked as long as its writer lives. What a
-killed command left under such a name is removed by the next one that writes into the folder. A link
+A file grows under a temporary name beside its target, locked as long as its writer lives. The next
+command that writes into the folder removes such a file of a killed one, if it writes into the folder. A link
 stays, and the file behind it is replaced; a replaced file keeps its group and its permissions.
 """
 
@@ -247,7 +247,7 @@ def _missing(folder: Path) -> str:
 
 
 def identity(file: Path | int) -> tuple[int, int] | None:
-    """What a file has in common under all its names: links, hard links, spellings; None for others.
+    """Identity of a file under all its names: links, hard links, spellings; None for others.
 
     An integer is an open file.
     """

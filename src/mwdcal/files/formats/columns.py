@@ -27,7 +27,7 @@ _NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?", re.ASCII)
 
 
 class Parts(NamedTuple):
-    """What a format reads from the bytes of a file."""
+    """Contents of a file as a format reads them."""
 
     columns: dict[str, Column]
     metadata: dict[str, object]

@@ -598,7 +598,7 @@ def as_columns(layout: Layout, labels: Collection[str] = ()) -> dict[str, list[s
     for name in {*labels}.intersection(layout.fractions):
         raise InputError(
             f"the column {shown(name)}: a serial or label must be text; it has numbers, of which a workbook keeps no "
-            "last zero. Say that it is none by `column` serial= or station=, and state the serial by `serial`."
+            "last zero. Say that it is not a serial by `column` serial= or station=, and state the serial by `serial`."
         )
     each = zip(layout.names, layout.cells, layout.texts, strict=True)
     return {name: texts if name in labels else cells for name, cells, texts in each}

@@ -23,7 +23,7 @@ SUFFIX = ".parquet"
 _NEARLY_URL = re.compile(
     r"postgres\w*(\+\w+)?(:|//)|://|\bpassword *=|[/\\][^/\\]*:.*@|^[^/\\:]{2,}:.*@", re.IGNORECASE
 )
-"""What the URL of a database has, however mistyped, and hardly a file's name: it may hold a password."""
+"""A mark of a database's URL, however mistyped, and hardly a file's name: it may hold a password."""
 _FILE_URL = "sqlite:///"
 _SHOWN = 5
 """Most serials that a message names."""
@@ -47,7 +47,7 @@ def is_nearly_url(text: str) -> bool:
 
 
 def files_of(inputs: Iterable[str | os.PathLike[str] | None]) -> list[Path]:
-    """The files that inputs name, without serials; a database on a server is none."""
+    """The files that inputs name, without serials; a database on a server has no file."""
     texts = [os.fspath(each) for each in inputs if each]
     return [split(t.removeprefix(_FILE_URL))[0] for t in texts if not is_nearly_url(t)]
 
@@ -138,7 +138,7 @@ def records(path: Path, some: Iterable[int] | None = None) -> Iterator[tuple[str
 
 
 class _Row(NamedTuple):
-    """What the table says of a tool besides its results."""
+    """Remarks of the table on a tool besides its results."""
 
     serial: str
     status: str

@@ -256,7 +256,7 @@ def array_of(column: Column, arrow: Any) -> Any:
 
 
 def metadata_of(schema: Mapping[bytes, bytes] | None, source: str) -> dict[str, object]:
-    """What a file's schema says of it."""
+    """Metadata in a file's schema."""
     try:
         stated = msgspec.json.decode((schema or {}).get(KEY, b"{}"), type=dict[str, object])
     except (ValueError, RecursionError) as error:

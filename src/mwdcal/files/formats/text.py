@@ -94,7 +94,7 @@ def _words_in(data: bytes, encoding: str, words: re.Pattern[str]) -> int:
 def plain(data: bytes, form: TableFormat, source: str) -> bytes:
     """The export as the UTF-8 text of a run file with the same delimiter.
 
-    What is neither metadata, column names nor readings becomes a blank line, and delimiters behind
+    Lines that are neither metadata, column names nor readings become a blank line, and delimiters behind
     the last name are cut off on all lines.
     """
     lines = decoded(data, form.encoding, source).split("\n")
@@ -163,7 +163,7 @@ def below_names(data: bytes, form: TableFormat, source: str) -> Rows:
 
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""What a cell begins with that spreadsheet programs run as a formula, unless it is a number."""
+"""Beginnings of cells that spreadsheet programs run as a formula, unless it is a number."""
 _BREAKS = "\n\r\0"
 _SMALLEST_ALIKE, _LARGEST_ALIKE = 1e-4, 1e10
 """Between these Arrow spells numbers as `repr` does, whole ones without their ".0"."""
@@ -224,7 +224,7 @@ def rows(data: bytes, top: Head, above: int, source: str) -> Parts:
 
 
 def _parts(lines: Sequence[str], top: Head, above: int, source: str) -> Parts:
-    """The rows in some lines, which `above` lines of the file stand before."""
+    """The rows in some lines, which follow `above` lines of the file."""
     entries = split(lines, above, top.delimiter, source)
     names, cells, numbers = assemble(chain([(above, top.names)], entries), source, "line")
     return Parts(of_texts(names, cells), top.metadata, numbers)

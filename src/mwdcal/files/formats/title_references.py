@@ -1,6 +1,6 @@
 """References that the title block of a table states for all its stations: field strength, dip and gravity.
 
-A value counts where its word stands before it, its unit is known or its value allows one unit alone, and it is one that
+A value counts where its word comes first, its unit is known or its value allows one unit alone, and it is one that
 the Earth has. A nominal or approximate value, a range and an uncertainty are no reference.
 """
 
@@ -199,7 +199,7 @@ def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
 
 
 def _unit(text: str) -> str:
-    """The unit that a text in small letters is; empty where it is none."""
+    """The unit that a text in small letters is; empty if it is not a unit."""
     bare = text.replace(" ", "").replace("^", "")
     if bare in _SPELT:
         return _SPELT[bare]

@@ -1,4 +1,4 @@
-"""What the title block of a table says of the tool, the day and who measured."""
+"""Statements of a table's title block about the tool, the day and who measured."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def _word(text: str) -> str:
 
 
 def day_of(text: str, day_first: bool = False) -> str:
-    """A day in ISO form; empty where it may be read in two ways, or is none. A time may stand behind it.
+    """A day in ISO form; empty where it may be read in two ways, or is no day. A time may stand behind it.
 
     `day_first`: of 03/04/2025 the 3 is the day, as everywhere but in English. With AM or PM the month is first.
     """
@@ -200,7 +200,7 @@ def dated(
 
 
 def _day_of_cells(name: str, cells: Sequence[str]) -> str:
-    """The one day of all cells of a column of times; empty where it is none, or there are several days."""
+    """The one day of all cells of a column of times; empty if there is no day, or there are several days."""
     day = ""
     for cell in filter(None, cells):
         each = day_of(cell, not _ENGLISH_DATE.match(name))

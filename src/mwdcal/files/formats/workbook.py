@@ -84,7 +84,7 @@ class _PartCheck:
         self._row = self._column = self._text = self._contents = 0
 
     def check(self, stream: IO[bytes]) -> None:
-        """Refuse what is beyond the limits; XML that is none is left to its reader."""
+        """Refuse what is beyond the limits; broken XML is left to its reader."""
         parser = expat.ParserCreate()
         parser.buffer_text = True
         parser.StartElementHandler = self._start

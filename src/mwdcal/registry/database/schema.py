@@ -23,7 +23,7 @@ from mwdcal.registry.database.models import ACCURACY, history, metadata, records
 # the event itself without `hash`.
 
 GENESIS = "0" * 64
-"""What the first event has as the hash of the one before."""
+"""Hash before the first event."""
 
 
 def digest(fields: Mapping[str, Any]) -> str:
@@ -208,7 +208,7 @@ _COMPUTED = {
         "OR EXISTS (SELECT FROM pg_attribute WHERE attrelid = pg_class.oid AND attgenerated <> '')"
     ),
 }
-"""What a database has that computes when it is read: views, virtual tables, generated columns."""
+"""Parts of a database that compute when it is read: views, virtual tables, generated columns."""
 
 
 def check_tables(connection: sa.Connection, name: str) -> None:

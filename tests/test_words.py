@@ -1,0 +1,97 @@
+"""The documentation: its words, its patterns, its search index."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+import words
+from cli_support import ROOT
+
+
+def test_the_documentation_is_short():
+    assert words.too_long() == []
+
+
+def test_no_pattern_is_found_that_made_readers_stumble():
+    assert words.stumbles() == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "A covariance that is none.",
+        "It is known. What is left counts as noise.",
+        "What it holds is written.",
+        "Two numbers stand beside it.",
+        "Axes that are told by readings.",
+        "More often than stated.",
+        "No `5.83705e-21 ± 2e-05`.",
+    ],
+)
+def test_a_pattern_is_found(text):
+    assert any(re.search(pattern, text) for pattern in words.PATTERNS)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "Empty if there is none.",
+        "What happened to it? Nothing.",
+        "Mount the stand beside the oven.",
+    ],
+)
+def test_good_english_is_left_alone(text):
+    assert not any(re.search(pattern, text) for pattern in words.PATTERNS)
+
+
+def test_code_formulas_and_results_are_no_words(tmp_path, monkeypatch):
+    page = tmp_path / "docs" / "evidence" / "scatter.md"
+    page.parent.mkdir(parents=True)
+    monkeypatch.setattr(words, "ROOT", tmp_path)
+    text = "# Two words\n\n```\nnot these three\n```\n\n$$\na b\n$$\n\nand $x y$ 0.13 four – more.\n\n| no | cells |\n"
+    page.write_text(text, "utf-8")
+    assert words.words(page) == len(["Two", "words", "and", "four", "more."])
+
+
+@pytest.fixture(scope="module")
+def index(tmp_path_factory):
+    """The search index of the pages that need no other module than Sphinx's."""
+    pytest.importorskip("sphinx")
+    pytest.importorskip("myst_parser")
+    folder = tmp_path_factory.mktemp("docs")
+    shutil.copytree(
+        ROOT / "docs", folder / "docs", ignore=shutil.ignore_patterns("*.png", "commands")
+    )
+    conf = 'extensions = ["myst_parser"]\nmyst_enable_extensions = ["dollarmath", "colon_fence"]\n'
+    (folder / "docs" / "conf.py").write_text(conf, "utf-8")
+    shutil.rmtree(folder / "docs" / "_extensions")
+    command = [sys.executable, "-m", "sphinx", "-Q", "-b", "html", folder / "docs", folder / "html"]
+    subprocess.run(command, check=True)
+    text = (folder / "html" / "searchindex.js").read_text("utf-8")
+    return json.loads(text[text.index("(") + 1 : text.rindex(")")])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("word", "page"),
+    [
+        ("feet", "howto/survey"),
+        ("temperature", "explanation/temperature"),
+        ("pandas", "howto/python"),
+        ("undetermined", "tutorials/start"),
+    ],
+)
+def test_the_search_finds(index, word, page):
+    from sphinx.search.en import SearchEnglish
+
+    stem = SearchEnglish({}).stem(word)
+    places = {}
+    for terms in ("terms", "titleterms"):
+        found = index[terms].get(stem, [])
+        places[terms] = [found] if isinstance(found, int) else found
+    names = {index["docnames"][number] for found in places.values() for number in found}
+    assert page in names
