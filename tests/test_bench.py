@@ -817,6 +817,11 @@ def post(client, bench, name, headers=None, **form):
     return client.post(f"/do/{name}", data={"token": bench.token, **form}, headers=headers or {})
 
 
+def drop(client, bench, kind, name, data):
+    given = {"params": {"name": name}, "headers": {"x-bench-token": bench.token}}
+    return client.post(f"/table/{kind}", content=data, **given)
+
+
 def test_who_has_no_token_is_refused(bench):
     with client_of.TestClient(bench.app(), base_url=f"http://{HOST}") as client:
         for path in (
@@ -912,7 +917,7 @@ def test_a_run_by_hand(client, bench):
 
 def test_no_request_is_an_internal_error(client, bench):
     rng = np.random.default_rng(int(os.environ.get("SEED", "5")))
-    names = [*bench._forms, *bench._buttons, "", "nothing", "..", "é"]
+    names = [*bench._forms, *bench._buttons, *bench._tables, "", "nothing", "..", "é"]
     values = [
         "",
         "0",
@@ -935,13 +940,17 @@ def test_no_request_is_an_internal_error(client, bench):
         "reading",
         "number",
         "temperature",
+        "question",
+        "place",
+        "name",
         *EARTH,
     ]
+    table = laboratory_table(Stand(), RUN[:16])
     for _ in range(int(os.environ.get("FUZZED", "400"))):
         chosen = rng.choice(fields, rng.integers(0, 5))
         form = {str(name): str(rng.choice(values)) for name in chosen}
-        path = f"/{rng.choice(['do', 'files', 'static', 'x'])}/{rng.choice(names)}"
-        kind = rng.integers(0, 6)
+        path = f"/{rng.choice(['do', 'files', 'static', 'table', 'table/files', 'x'])}/{rng.choice(names)}"
+        kind = rng.integers(0, 7)
         if kind == 0:
             short = {name: value[:200] for name, value in form.items()}
             answer = client.get(path.replace("\x00", ""), params=short)
@@ -949,6 +958,14 @@ def test_no_request_is_an_internal_error(client, bench):
             answer = client.request(str(rng.choice(["PUT", "DELETE", "PATCH", "OPTIONS"])), path)
         elif kind == 2:
             answer = client.post(path, content=rng.bytes(int(rng.integers(0, 200))))
+        elif kind == 3:
+            damaged = bytearray(table)
+            for _ in range(int(rng.integers(0, 9))):
+                damaged[rng.integers(len(damaged))] = rng.integers(256)
+            answer = drop(
+                client, bench, "file", str(rng.choice(["a.csv", "b.xlsx", ""])), bytes(damaged)
+            )
+            answer = client.get("/table") if answer.status_code < 500 else answer
         else:
             answer = client.post(path, data={"token": bench.token, **form})
         assert answer.status_code < 500, (path, form, answer.text)
@@ -958,11 +975,6 @@ def test_no_request_is_an_internal_error(client, bench):
 
 
 # ------------------------------------------------------------------ a table
-
-
-def drop(client, bench, kind, name, data):
-    given = {"params": {"name": name}, "headers": {"x-bench-token": bench.token}}
-    return client.post(f"/table/{kind}", content=data, **given)
 
 
 def on_table(client, bench, name, **form):

@@ -25,7 +25,7 @@ pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed: the bench was not looked at"),
 ]  # fmt: skip
 VIEWS = [(1280, "light"), (800, "dark"), (1280, "dark"), (800, "light")]
-LONGEST = 60_000
+LONGEST = 120_000
 
 
 class Operator:
@@ -35,6 +35,7 @@ class Operator:
         # axe is injected into the page, which the page's own policy would not let in
         self.context = browser.new_context(viewport={"width": 1280, "height": 900}, bypass_csp=True)
         self.page, self.complaints, self.host = self.context.new_page(), [], url.split("/?")[0]
+        self.page.set_default_timeout(LONGEST)
         self.page.on("console", lambda message: self._complaint(message.text))
         self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
         self.page.on("request", self._request)

@@ -7,6 +7,7 @@ from typing import Any
 from mwdcal.bench import pages
 from mwdcal.bench.documents import RunFit
 from mwdcal.bench.spreadsheet import DroppedTable
+from mwdcal.calibration.readings import simulated
 from mwdcal.files.contract import CHANNELS, REFERENCES
 from mwdcal.identification.columns import meanings_of
 from mwdcal.presentation.numbers import number
@@ -81,7 +82,9 @@ def _open(table: DroppedTable) -> dict[str, Any]:
         "reason": "" if any(answers for *_, answers in questions) else table.reason,
         "findings": [finding.text for finding in findings],
         "axes": [(triad, ", ".join(axes)) for triad, axes in table.axes.items()],
-        "serial": table.serial, "answered": bool(table.answers),
+        "serial": table.serial,
+        "simulated": bool(table.proposal and simulated(table.proposal.proposal.metadata)),
+        "answered": bool(table.answers),
         "can_calibrate": table.proposal is not None and not table.reason,
     }  # fmt: skip
 
