@@ -23,6 +23,7 @@ from bench_support import (
     lines_of,
     measure,
 )
+from bench_tables import ROLLS, RUN, laboratory_table
 from cli_support import EXAMPLE, RAW, mwdcal, process
 from mwdcal import load_profile
 from mwdcal.bench import documents, serving
@@ -31,6 +32,7 @@ from mwdcal.bench.journal import Journal
 from mwdcal.bench.session import BenchSession
 from mwdcal.bench.settling import Settling
 from mwdcal.bench.sources import GrowingFile, Lines, SerialPort, Socket, source_of
+from mwdcal.bench.spreadsheet import DroppedTable
 from mwdcal.bench.stream import Stream
 from mwdcal.bench.warmth import Warmth
 from mwdcal.errors import InputError
@@ -815,6 +817,11 @@ def post(client, bench, name, headers=None, **form):
     return client.post(f"/do/{name}", data={"token": bench.token, **form}, headers=headers or {})
 
 
+def drop(client, bench, kind, name, data):
+    given = {"params": {"name": name}, "headers": {"x-bench-token": bench.token}}
+    return client.post(f"/table/{kind}", content=data, **given)
+
+
 def test_who_has_no_token_is_refused(bench):
     with client_of.TestClient(bench.app(), base_url=f"http://{HOST}") as client:
         for path in (
@@ -910,7 +917,7 @@ def test_a_run_by_hand(client, bench):
 
 def test_no_request_is_an_internal_error(client, bench):
     rng = np.random.default_rng(int(os.environ.get("SEED", "5")))
-    names = [*bench._forms, *bench._buttons, "", "nothing", "..", "é"]
+    names = [*bench._forms, *bench._buttons, *bench._tables, "", "nothing", "..", "é"]
     values = [
         "",
         "0",
@@ -933,13 +940,17 @@ def test_no_request_is_an_internal_error(client, bench):
         "reading",
         "number",
         "temperature",
+        "question",
+        "place",
+        "name",
         *EARTH,
     ]
+    table = laboratory_table(Stand(), RUN[:16])
     for _ in range(int(os.environ.get("FUZZED", "400"))):
         chosen = rng.choice(fields, rng.integers(0, 5))
         form = {str(name): str(rng.choice(values)) for name in chosen}
-        path = f"/{rng.choice(['do', 'files', 'static', 'x'])}/{rng.choice(names)}"
-        kind = rng.integers(0, 6)
+        path = f"/{rng.choice(['do', 'files', 'static', 'table', 'table/files', 'x'])}/{rng.choice(names)}"
+        kind = rng.integers(0, 7)
         if kind == 0:
             short = {name: value[:200] for name, value in form.items()}
             answer = client.get(path.replace("\x00", ""), params=short)
@@ -947,12 +958,97 @@ def test_no_request_is_an_internal_error(client, bench):
             answer = client.request(str(rng.choice(["PUT", "DELETE", "PATCH", "OPTIONS"])), path)
         elif kind == 2:
             answer = client.post(path, content=rng.bytes(int(rng.integers(0, 200))))
+        elif kind == 3:
+            damaged = bytearray(table)
+            for _ in range(int(rng.integers(0, 9))):
+                damaged[rng.integers(len(damaged))] = rng.integers(256)
+            answer = drop(
+                client, bench, "file", str(rng.choice(["a.csv", "b.xlsx", ""])), bytes(damaged)
+            )
+            answer = client.get("/table") if answer.status_code < 500 else answer
         else:
             answer = client.post(path, data={"token": bench.token, **form})
         assert answer.status_code < 500, (path, form, answer.text)
         assert "internal error" not in answer.text
     bench.session.wait_for_fits()
     assert "internal error" not in bench.session.message
+
+
+# ------------------------------------------------------------------ a table
+
+
+def on_table(client, bench, name, **form):
+    return client.post(f"/table/{name}", data={"token": bench.token, **form})
+
+
+def test_a_table_to_its_certificate(client, bench, tmp_path):
+    """Dropped, asked about, calibrated, verified, documented: what the commands make of the same table."""
+    stand, folder = Stand(), bench.table.folder
+    run = laboratory_table(stand, RUN)
+    assert drop(client, bench, "file", "../Mess 1.csv", run).is_success
+    page = client.get("/table").text
+    assert "Which one does the stand show?" in page
+    assert on_table(client, bench, "calibrate").status_code == 409
+    assert drop(client, bench, "rolltest", "r.csv", run).status_code == 409
+    assert on_table(client, bench, "answer", question="7", place="0").status_code == 409
+    assert on_table(client, bench, "answer", question="0", place="0").is_success
+    page = client.get("/table").text
+    heads = re.findall(r'<th scope="col" class="k-(\w+)">(.*?)<br><small>(.*?)</small>', page)
+    kinds = {name: kind for kind, name, _ in heads}
+    assert [kinds[name] for name in ("Gx (V)", "Hz (V)", "Neigung (°)", "Azimut 2 (°)")] == [
+        "accelerometer", "magnetometer", "reference", "unused",
+    ]  # fmt: skip
+    assert ("reference", "Azimut (°)", "ref_azimuth_deg [°]") in heads
+    assert on_table(client, bench, "calibrate").is_success
+    assert bench.table.fit.reason == ""
+    given, ours = folder / "given" / "Mess 1.csv", tmp_path / "by-command.toml"
+    answers = ("--column", "ref_azimuth_deg=Azimut (°)")
+    assert mwdcal("profile", given, "-o", ours, *answers).code == 0
+    assert (folder / "tool.toml").read_text() == ours.read_text()
+    ran = mwdcal("calibrate", given, "--tool", ours, "-o", tmp_path / "t.json")
+    assert ran.code == 0
+    assert without_time(folder / "tool.json") == without_time(tmp_path / "t.json")
+    rolls = laboratory_table(stand, ROLLS, clear=True)
+    assert drop(client, bench, "rolltest", "roll.csv", rolls).is_success
+    assert "PASS" in client.get("/table").text
+    assert on_table(client, bench, "certificate", number="C-7").is_success
+    assert json.loads((folder / "certificate.json").read_text())["number"] == "C-7"
+    assert client.get("/table/files/certificate.json").is_success
+    for name in ("table.json", "tool.toml", "given", "..%2ftool.toml"):
+        assert client.get(f"/table/files/{name}").status_code == 404
+    again = DroppedTable(folder, None, None)
+    assert again.verdict.passed
+    assert again.papers == bench.table.papers
+    assert again.questions == ()
+
+
+def test_tables_that_are_none_and_uploads_of_others(client, bench):
+    for name, data in (
+        ("x.csv", b"\x00\xff" * 99),
+        ("x.xlsx", b"PK no"),
+        ("x.exe", b"1"),
+        ("", b"1"),
+        ("x.csv", b""),
+    ):
+        drop(client, bench, "file", name, data)
+        page = client.get("/table")
+        assert page.is_success
+        assert on_table(client, bench, "calibrate").status_code == 409
+    for headers in (
+        {},
+        {"x-bench-token": "x"},
+        {"x-bench-token": bench.token, "origin": "http://evil.example"},
+    ):
+        refused = client.post("/table/file?name=a.csv", content=b"1;2", headers=headers)
+        assert refused.status_code == 403
+    assert client.post("/table/file?name=a.csv", content=b"1" * 70_000).status_code == 413
+    many = {"x-bench-token": bench.token}
+    assert (
+        client.post("/table/file?name=a.csv", content=b"1" * 20_000_001, headers=many).status_code
+        == 413
+    )
+    assert on_table(client, bench, "nothing").status_code == 404
+    assert client.get(f"/table/file?token={bench.token}").status_code == 405
 
 
 @pytest.mark.slow
@@ -972,6 +1068,54 @@ def test_kills_lose_no_station(tmp_path):
     import bench_kills
 
     assert bench_kills.run(count=4, seed=1, folder=tmp_path) == []
+
+
+def read_of(process, source):
+    """How many bytes of a file a process has read."""
+    for link in (process / "fd").iterdir():
+        if link.is_symlink() and link.readlink() == source:
+            return int((process / "fdinfo" / link.name).read_text().split()[1])
+    return 0
+
+
+@pytest.mark.study
+def test_eight_hours_leave_the_memory_flat(tmp_path):
+    """Eight hours of 50 Hz from a file: memory within 20 MB after a tenth; a quarter of a core at real time."""
+    if not Path("/proc/self/statm").exists():
+        pytest.skip("memory is looked at in /proc")
+    hours, rate, folder = float(os.environ.get("HOURS", "8")), 50, tmp_path / "S"
+    count, source = int(hours * 3600 * rate), tmp_path / "stream.csv"
+    stand, rng = Stand(), np.random.default_rng(1)
+    block = [stand.line((45.0, 10.0, 20.0)).split(",", 1)[1] for _ in range(5000)]
+    with source.open("w") as stream:
+        stream.write(HEADER + "\n")
+        for number in range(count):
+            turned = number // 1500 % 2 and number % 1500 < 200  # a move now and then
+            row = block[rng.integers(len(block))] if not turned else block[number % 7]
+            stream.write(f"{number / rate},{row}\n" if rng.random() > 0.001 else "garb,age\n")
+        stream.write("end\n" * 7)
+    bench = BenchProcess("--source", f"tail:{source}", "--tool", TOOL, folder=folder)
+    bench.do("start", serial="T-1", **EARTH)
+    bench.do("auto", on="on")
+    sizes, begun = [], time.monotonic()
+    process, clock = Path("/proc") / str(bench.process.pid), os.sysconf("SC_CLK_TCK")
+    while time.monotonic() - begun < 3600 * hours:
+        time.sleep(1)
+        sizes.append(
+            int((process / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+        )
+        if read_of(process, source) == source.stat().st_size:
+            break
+    else:
+        raise AssertionError("the bench reads more slowly than in real time")
+    used = sum(map(int, (process / "stat").read_text().rsplit(")", 1)[1].split()[11:13])) / clock
+    bench.stop()
+    later = sizes[len(sizes) // 10 :]
+    print(
+        f"{count} lines: {min(later):.0f} to {max(later):.0f} MB, {used / hours / 36:.1f} % of a core"
+    )
+    assert max(later) - min(later) < 20
+    assert used < 0.25 * hours * 3600
 
 
 def test_help_tells_the_address_first():

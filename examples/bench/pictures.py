@@ -15,6 +15,7 @@ from pathlib import Path
 from playwright.sync_api import Page, sync_playwright
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "bench"
+TABLE = Path(__file__).resolve().parents[1] / "servo" / "export.csv"
 VIEWS = ((1280, "light"), (1280, "dark"), (800, "light"), (800, "dark"))
 
 
@@ -29,7 +30,6 @@ def shoot(page: Page, name: str) -> None:
 
 def story(page: Page) -> None:
     """From Start to the certificate, with a picture of each stage."""
-    shoot(page, "start")
     page.get_by_role("button", name="Start", exact=True).click()
     status = page.get_by_role("status")
     page.get_by_label("Accept when settled").check()
@@ -49,6 +49,13 @@ def story(page: Page) -> None:
     page.get_by_role("button", name="Issue certificate").click()
     page.get_by_role("link", name=re.compile("certificate.json")).wait_for(timeout=120_000)
     shoot(page, "passed")
+
+
+def table_story(page: Page) -> None:
+    """From a table of a laboratory to its calibration, with a picture of the sheet."""
+    page.get_by_label(re.compile("^Table of a run")).set_input_files(TABLE)
+    page.get_by_role("status").filter(has_text="Every column is clear").wait_for(timeout=120_000)
+    shoot(page, "table")
 
 
 def main() -> None:
@@ -73,6 +80,10 @@ def main() -> None:
         )
         page = browser.new_page()
         page.goto(str(bench.stdout and bench.stdout.readline().strip()))
+        shoot(page, "start")
+        start = page.url
+        table_story(page)
+        page.goto(start)
         story(page)
         browser.close()
         bench.send_signal(2)

@@ -31,7 +31,6 @@ ENTERED = ("tool.json", "verification.json", "certificate.json")
 class RunFit:
     """A calibration by the stations so far, or the reason why they do not give one yet."""
 
-    stations: int
     calibration: Calibration | None = None
     reason: str = ""
     accuracy_deg: dict[str, float | None] = field(default_factory=dict)
@@ -46,22 +45,27 @@ def fit(folder: Path, stations: int, lock: RLock) -> RunFit:
     who holds the `lock` writes these files while they are read.
     """
     if stations < FEWEST_STATIONS:
-        return RunFit(stations)
+        return RunFit()
     try:
         with lock:
             readings = mwdcal.read_run(folder / "run.csv", folder / "tool.toml")
-        try:
-            run = _fitted(stations, mwdcal.calibrate(readings))
-            return replace(run, bad=_suspects(readings) | run.bad) if run.bad else run
-        except FitError as error:
-            return RunFit(stations, reason=str(error), bad=_suspects(readings))
+        return fit_of(readings)
     except MwdcalError as error:
-        return RunFit(stations, reason=str(error))
+        return RunFit(reason=str(error))
 
 
-def _fitted(stations: int, calibration: Calibration) -> RunFit:
+def fit_of(readings: Readings) -> RunFit:
+    """The calibration of readings, or why they give none."""
+    try:
+        run = _fitted(mwdcal.calibrate(readings))
+        return replace(run, bad=_suspects(readings) | run.bad) if run.bad else run
+    except FitError as error:
+        return RunFit(reason=str(error), bad=_suspects(readings))
+
+
+def _fitted(calibration: Calibration) -> RunFit:
     return RunFit(
-        stations, calibration, accuracy_deg=typical_accuracy(calibration), bad=_to_remeasure(calibration)
+        calibration, accuracy_deg=typical_accuracy(calibration), bad=_to_remeasure(calibration)
     )  # fmt: skip
 
 
@@ -82,9 +86,9 @@ def _suspects(readings: Readings) -> dict[str, str]:
         return {}
 
 
-def saved_fit(folder: Path, stations: int) -> RunFit:
+def saved_fit(folder: Path) -> RunFit:
     """The calibration that was saved."""
-    return _fitted(stations, mwdcal.load(folder / "tool.json"))
+    return _fitted(mwdcal.load(folder / "tool.json"))
 
 
 def save_calibration(calibration: Calibration, folder: Path) -> dict[str, str]:
@@ -93,10 +97,16 @@ def save_calibration(calibration: Calibration, folder: Path) -> dict[str, str]:
     return {"calibration": "tool.json"}
 
 
-def verify(calibration: Calibration, folder: Path) -> tuple[Verdict, dict[str, str]]:
-    """The verdict on the roll test, and its file by what it is."""
-    limits = setting("limits") or "roll-test"
-    verdict = mwdcal.verify(calibration, folder / "rolltest.csv", limits)
+def judged(calibration: Calibration, rolltest: Path) -> Verdict:
+    """The verdict on a roll test."""
+    return mwdcal.verify(calibration, rolltest, setting("limits") or "roll-test")
+
+
+def verify(
+    calibration: Calibration, folder: Path, rolltest: str = "rolltest.csv"
+) -> tuple[Verdict, dict[str, str]]:
+    """The verdict on the roll test in a folder, and its file by what it is."""
+    verdict = judged(calibration, folder / rolltest)
     mwdcal.save(verdict, folder / "verification.json")
     return verdict, {"verification": "verification.json"}
 

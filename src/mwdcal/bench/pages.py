@@ -20,7 +20,13 @@ from mwdcal.presentation.text import one_line
 from mwdcal.presentation.verification import noise_free
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
     from jinja2 import Environment
+
+    from mwdcal.calibration.record import ErrorRow
+    from mwdcal.use.verification import VerdictRow
 
 SHOWN_ANGLES = ("inclination", "toolface", "azimuth")
 """In the order in which a stand is set."""
@@ -42,7 +48,8 @@ def texts() -> dict[str, str]:
 
 
 @cache
-def _environment() -> Environment:
+def environment() -> Environment:
+    """The templates of the bench."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     return Environment(
@@ -51,23 +58,25 @@ def _environment() -> Environment:
     )  # fmt: skip
 
 
-def page(session: BenchSession, token: str) -> str:
+def page(session: BenchSession, token: str, has_table: bool = False) -> str:
     """The whole page."""
     from markupsafe import Markup
 
     with session.lock:
-        template = _environment().get_template("page.html")
+        template = environment().get_template("page.html")
         return template.render(
-            t=texts(), simulated=session.simulated, fragment=Markup(fragment(session, token))
+            t=texts(),
+            simulated=session.simulated,
+            fragment=Markup(fragment(session, token, has_table)),
         )
 
 
-def fragment(session: BenchSession, token: str) -> str:
-    """All of the page that decisions change."""
+def fragment(session: BenchSession, token: str, has_table: bool = False) -> str:
+    """All of the page that decisions change; `has_table`: a table was dropped."""
     with session.lock:
-        template = _environment().get_template("main.html")
+        template = environment().get_template("main.html")
         return template.render(
-            t=texts(), token=token, **_buttons(session), **_start_form(session), **_words(session),
+            t=texts(), token=token, has_table=has_table, **_buttons(session), **_start_form(session), **_words(session),
             **_results(session), **_stations(session),
         )  # fmt: skip
 
@@ -216,24 +225,34 @@ def _results(session: BenchSession) -> dict[str, Any]:
         "fit_note": "" if fit.calibration else reason,
         "accuracy": [(n, degrees(latest[n]), degrees(expected.get(n))) for n in SHOWN_ANGLES if n in latest],
         "course": pictures.course(session.course, expected, session.parts[RUN_PART].count, t, t["accuracy"]),
-        "errors": [
-            (TITLES.get(row.observable, row.observable), quantity(row.before, row.unit), quantity(row.after, row.unit))
-            for row in errors
-        ],
-        "limits": [
-            (row.name, *noise_free(row, row.unit), quantity(row.limit, row.unit), t["ok" if row.passed else "bad"],
-             row.passed)
-            for row in verdict
-        ],
-        "papers": _papers(session),
+        "errors": error_rows(errors), "limits": limit_rows(verdict),
+        "papers": papers(session.papers, session.folder),
     }  # fmt: skip
 
 
-def _papers(session: BenchSession) -> list[tuple[str, str]]:
+def error_rows(errors: Sequence[ErrorRow]) -> list[tuple[str, str, str]]:
+    """Errors before and after, with their names."""
+    return [
+        (TITLES.get(row.observable, row.observable), quantity(row.before, row.unit), quantity(row.after, row.unit))
+        for row in errors
+    ]  # fmt: skip
+
+
+def limit_rows(rows: Sequence[VerdictRow]) -> list[tuple[str, str, str, str, str, bool]]:
+    """Values of a roll test, with their limits."""
+    t = texts()
+    return [
+        (row.name, *noise_free(row, row.unit), quantity(row.limit, row.unit), t["ok" if row.passed else "bad"],
+         row.passed)
+        for row in rows
+    ]  # fmt: skip
+
+
+def papers(files_by_name: Mapping[str, str], folder: Path) -> list[tuple[str, str]]:
     """Documents by name, with their file."""
     t, shown = texts(), []
-    for name, value in session.papers.items():
-        is_file = (session.folder / value).is_file()
+    for name, value in files_by_name.items():
+        is_file = (folder / value).is_file()
         title = t.get(f"paper_{name}", name)
         shown.append((f"{title}: {one_line(value)}", value if is_file else ""))
     return shown

@@ -33,9 +33,10 @@ from starlette.responses import (
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from mwdcal.bench import pages
+from mwdcal.bench import pages, spreadsheet_page
 from mwdcal.bench.session import BenchSession
 from mwdcal.bench.sources import LineSource
+from mwdcal.bench.spreadsheet import DroppedTable
 from mwdcal.bench.stream import LARGEST_VALUE, TEMPERATURE_COLUMN
 from mwdcal.errors import InputError, MwdcalError
 from mwdcal.files.contract import RAW
@@ -44,6 +45,10 @@ TICK = 0.1
 """Seconds between live figures."""
 LARGEST_FORM = 64_000
 """Bytes of a form that are read."""
+LARGEST_TABLE = 20_000_000
+"""Bytes of a table that are read."""
+TOKEN_HEADER = "x-bench-token"
+"""Carries the token where the body is a file; another site's script may not send it."""
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
     "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
@@ -58,7 +63,7 @@ HEADERS = {
 }  # fmt: skip
 UNCHANGING = ("GET", "HEAD")
 """Methods that change nothing."""
-STATIC = {"bench.js": "text/javascript", "bench.css": "text/css"}
+STATIC = {"bench.js": "text/javascript", "table.js": "text/javascript", "bench.css": "text/css"}
 
 
 class Bench:
@@ -82,6 +87,18 @@ class Bench:
         self.stop = Event()
         self.reader = Thread(target=self._read, name="bench source", daemon=True)
         self._fragment: tuple[int, str] = (-1, "")
+        self.table = table = DroppedTable(
+            session.folder / "table", session.registry, session.laboratory
+        )
+        self._tables: dict[str, Callable[[Mapping[str, str], bytes], None]] = {
+            "file": lambda form, data: table.drop(form.get("name", ""), data),
+            "rolltest": lambda form, data: table.drop_rolltest(form.get("name", ""), data),
+            "answer": lambda form, data: self._answer(form),
+            "serial": lambda form, data: table.state_serial(form.get("serial", "")[:100]),
+            "back": lambda form, data: table.take_back(),
+            "calibrate": lambda form, data: table.calibrate(),
+            "certificate": lambda form, data: table.certify(form.get("number", "").strip()[:100]),
+        }
         self._forms: dict[str, Callable[[Mapping[str, str]], None]] = {
             "start": self._start,
             "accept": lambda form: session.accept(_whole(form.get("position", ""))),
@@ -149,6 +166,16 @@ class Bench:
             raise InputError("the temperature is missing. Type it in °C.")
         self.session.state_temperature(value)
 
+    def _answer(self, form: Mapping[str, str]) -> None:
+        question, place = (_whole(form.get(name, "")) for name in ("question", "place"))
+        numbers = {
+            name: _number(form.get(name, ""), name)
+            for name in ("declination_deg", "convergence_deg")
+        }
+        if question is None or place is None:
+            raise InputError("the answer is missing. Open the page again.")
+        self.table.answer(question, place, numbers)
+
     # ------------------------------------------------------------------ requests
 
     def answers_to(self, host: str) -> bool:
@@ -159,7 +186,10 @@ class Bench:
         """The changing part of the page, made once for all browsers."""
         version = self.session.version
         if self._fragment[0] != version:
-            self._fragment = (version, pages.fragment(self.session, self.token))
+            self._fragment = (
+                version,
+                pages.fragment(self.session, self.token, bool(self.table.name)),
+            )
         return self._fragment[1]
 
     async def page(self, request: Request) -> Response:
@@ -168,7 +198,9 @@ class Bench:
             answer: Response = RedirectResponse("/", 303)
             answer.set_cookie(self.cookie, self.token, httponly=True, samesite="strict")
             return answer
-        return HTMLResponse(await run_in_threadpool(pages.page, self.session, self.token))
+        return HTMLResponse(
+            await run_in_threadpool(pages.page, self.session, self.token, bool(self.table.name))
+        )
 
     async def static(self, request: Request) -> Response:
         """Script and style."""
@@ -179,13 +211,29 @@ class Bench:
         return Response(data, media_type=STATIC[name])
 
     async def paper(self, request: Request) -> Response:
-        """A document of the session."""
+        """A document of the session, or of the table."""
         name = request.path_params["name"]
-        if name not in self.session.papers.values() or not (self.session.folder / name).is_file():
+        of = self.table if request.url.path.startswith("/table/") else self.session
+        if name not in of.papers.values() or not (of.folder / name).is_file():
             return PlainTextResponse("there is no such document", 404)
-        answer = FileResponse(self.session.folder / name)
+        answer = FileResponse(of.folder / name)
         answer.headers["Content-Security-Policy"] = PAPER_POLICY
         return answer
+
+    async def table_page(self, request: Request) -> Response:
+        """The page of a table that was dropped."""
+        return HTMLResponse(await run_in_threadpool(spreadsheet_page.page, self.table, self.token))
+
+    async def act_on_table(self, request: Request) -> Response:
+        """A decision on the table that was dropped, or the table itself."""
+        name, state = request.path_params["name"], request.state
+        if name not in self._tables:
+            return PlainTextResponse("there is nothing of this name", 404)
+        try:
+            await run_in_threadpool(self._tables[name], state.form, state.data)
+        except MwdcalError as error:
+            return PlainTextResponse(str(error), 409)
+        return PlainTextResponse("done")
 
     async def act(self, request: Request) -> Response:
         """A decision."""
@@ -234,6 +282,9 @@ class Bench:
             Route("/static/{name}", self.static),
             Route("/files/{name}", self.paper),
             Route("/do/{name}", self.act, methods=["POST"]),
+            Route("/table", self.table_page),
+            Route("/table/files/{name}", self.paper),
+            Route("/table/{name}", self.act_on_table, methods=["POST"]),
         ]
         return Starlette(routes=routes, middleware=[Middleware(_Guard, bench=self)], lifespan=life)
 
@@ -281,17 +332,23 @@ class _Guard:
         return None
 
     async def _form(self, request: Request) -> Response | None:
-        """Read the form; refuse one that is too long, or does not carry the token."""
+        """Read the form, or the file; refuse one that is too long, or does not come with the token."""
+        by_header = request.headers.get(TOKEN_HEADER, "")
+        is_file = self._is_token(by_header)
         data = bytearray()
         async for chunk in request.stream():
             data += chunk
-            if len(data) > LARGEST_FORM:
-                return PlainTextResponse("this form is too long", 413)
+            if len(data) > (LARGEST_TABLE if is_file else LARGEST_FORM):
+                return PlainTextResponse("this is too long", 413)
+        if is_file:
+            request.state.form, request.state.data = dict(request.query_params), bytes(data)
+            return None
         try:
             form = parse_qs(data.decode(), keep_blank_values=True, max_num_fields=50)
         except ValueError:
             return PlainTextResponse("this is no form", 400)
         request.state.form = {name: values[-1] for name, values in form.items()}
+        request.state.data = b""
         if not self._is_token(request.state.form.pop("token", "")):
             return PlainTextResponse("this form is not the bench's", 403)
         return None

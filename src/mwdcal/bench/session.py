@@ -72,7 +72,7 @@ class BenchSession:
         self.auto = self.paused = self.calibrated = self.testing = False
         self.typed_temperature: float | None = None
         self.attempts, self.version, self.message = 0, 0, ""
-        self.fit = documents.RunFit(0)
+        self.fit = documents.RunFit()
         self.verdict: Verdict | None = None
         self.papers: dict[str, str] = {}
         self.course: list[tuple[int, dict[str, float | None]]] = []
@@ -568,7 +568,7 @@ class BenchSession:
     def _judge(self) -> None:
         """The verdict of the roll test, once all its stations are there."""
         if self.fit.calibration is None:
-            self.fit = documents.saved_fit(self.folder, len(self.parts[RUN_PART].done))
+            self.fit = documents.saved_fit(self.folder)
         part, calibration = self.parts[ROLLTEST_PART], self.fit.calibration
         if calibration is None or part.order is not None or not part.taken:
             with self.lock:

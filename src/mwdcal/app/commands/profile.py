@@ -10,16 +10,11 @@ import click
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result
 from mwdcal.errors import InputError, QuestionError, QuestionsError
+from mwdcal.library.answers import Answers
 
 if TYPE_CHECKING:
     from mwdcal.library.planning import ProposedProfile
 
-BY_COLUMN = {
-    "column": "OURS=THEIRS, such as ref_azimuth_deg='Azi 2'",
-    "leave_out": "COLUMN=TEXT, such as 'QC=rejected'",
-    "keep": "COLUMN=TEXT, such as 'QC=second try'",
-}
-"""Options that say something of a column, and what is expected."""
 MOST_ROUNDS = 20
 """Rounds of questions: each answer may open another."""
 
@@ -91,19 +86,6 @@ def command(
     print_result(result.to_dict() if as_json else result.summary(), result.findings)
 
 
-class Answers(dict[str, Any]):
-    """The options typed, as arguments of `propose_profile`."""
-
-    def take(self, argument: str, value: str) -> None:
-        """Note the value of an argument; of one with columns beside those noted before."""
-        if argument not in BY_COLUMN:
-            self[argument] = int(value) if argument == "header_row" else value
-            return
-        name, text = _pair(argument, value)
-        known = self.setdefault(argument, {})
-        known[name] = text if argument == "column" else [*known.get(name, ()), text]
-
-
 def _proposed(run: Path, answers: Answers, may_ask: bool) -> ProposedProfile:
     """The proposal, after questions on a terminal where it may ask."""
     from mwdcal.app import inputs
@@ -142,13 +124,3 @@ def _number(text: str) -> None:
     except ValueError:
         pass
     raise InputError(f"Type a number of degrees between -180 and 180; got {text!r}.")
-
-
-def _pair(argument: str, text: str) -> tuple[str, str]:
-    """The two parts of an option, NAME=VALUE: a column ends at the first sign, rows at the last one."""
-    if "=" not in text:
-        option = f"--{argument.replace('_', '-')}"
-        expected = BY_COLUMN[argument]
-        raise InputError(f"{option} {text!r}: expected {expected}.")
-    name, _, said = text.partition("=") if argument == "column" else text.rpartition("=")
-    return name.strip(), said.strip()

@@ -71,6 +71,7 @@ async function send(form, submitter) {
 }
 
 document.addEventListener("submit", (event) => {
+  if (event.target.matches("[data-drop]")) return;
   event.preventDefault();
   send(event.target, event.submitter);
 });
