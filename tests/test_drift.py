@@ -427,7 +427,8 @@ def test_intervals_of_rates_hold_the_true_ones():
         increments = [Increments.of(tool, [BIAS]) for tool in tools]
         learnt = GroupRates.of(increments)
         ends = [
-            quantiles(learnt.rates, learnt.probability(i, True), (0.05, 0.95)) for i in increments
+            quantiles(learnt.rates, learnt.probabilities([i], [True])[0], (0.05, 0.95))
+            for i in increments
         ]
         inside.append(np.mean([a <= true <= b for (a, b), true in zip(ends, rate, strict=True)]))
         a, b = quantiles(learnt.rates, learnt.peers_probability, (0.05, 0.95))
@@ -446,6 +447,29 @@ def test_one_knocked_tool_does_not_spoil_the_rates_of_its_peers():
     quarters = [quantiles(g.rates, g.peers_probability, [0.25, 0.5, 0.75]) for g in (alone, among)]
     # Less than the centre of 20 log-normal rates is uncertain by (0.3 / √20 decades); without the share, 1.4.
     assert np.log10(quarters[1] / quarters[0]) == pytest.approx(0, abs=0.05)
+
+
+def test_rates_of_tools_together_are_those_by_the_formula_of_each():
+    """Bayes' rule by hand: a tool's likelihood times what its peers, without it, say of the type."""
+    rng = np.random.default_rng(22)
+    times, rate = np.arange(3.0), np.exp(rng.normal(size=6))
+    histories = one_group(walked(rng, rate, 1.0, times, 6), 1.0, times)
+    tools = [Increments.of(tool, [BIAS]) for tool in histories]
+    tools.append(Increments(np.zeros(0), np.zeros(0)))  # one calibration
+    learnt = GroupRates.of(tools)
+    among = [True] * 5 + [False, True]
+    together = learnt.probabilities(tools, among)
+    for tool, own, found in zip(tools, among, together, strict=True):
+        others = [t for t in tools if t.noise.size and not (own and t is tool)]
+        expected = tool.log_likelihood(learnt.rates) + np.log(
+            GroupRates(
+                learnt.unit,
+                learnt.decades,
+                np.stack([t.log_likelihood(learnt.rates) for t in others]),
+            ).peers_probability
+        )
+        expected = np.exp(expected - expected.max())
+        assert found == pytest.approx(expected / expected.sum(), rel=1e-6, abs=1e-12)
 
 
 def test_growth_begins_at_the_accuracy_that_is_stated(years):

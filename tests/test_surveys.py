@@ -27,9 +27,9 @@ from mwdcal.survey.acceptance import (
     Judgement,
     SurveyLimits,
     blindness,
-    distance,
     judged,
     load_survey_limits,
+    weighed,
 )
 from mwdcal.survey.error_model import load_error_model
 from mwdcal.survey.path import well_path
@@ -149,7 +149,7 @@ def test_distance_of_the_published_case():
     sensors = ((slope * limits.sensor.covariance(g, b)[:, None]) @ slope.mT).mean(0)
     references = np.diag([limits.reference.sd(name) ** 2 for name in STRENGTH_NAMES])
     off = np.array([0.003 / 9.80665, 46_475.6 - 46_644.9, np.radians(57.96 - 58.04)])
-    assert distance(off, sensors + references) == pytest.approx(0.9495, rel=0.02)
+    assert weighed(off, sensors + references)[1] == pytest.approx(0.9495, rel=0.02)
 
 
 def test_error_model_accepts_at_its_probability():
@@ -245,7 +245,7 @@ def test_a_distance_of_readings_of_any_uncertainty_is_a_number():
     along = np.array([3.0, 2.0, -1.0])
     for size in (1e-6, 1.0, 1e15):
         covariance = np.outer(along, along) * size**2 + 1e-24 * np.eye(3)
-        assert 0.9 < distance(along * size, covariance) < 1.1
+        assert 0.9 < weighed(along * size, covariance)[1] < 1.1
 
 
 def test_strengths_lie_where_they_are_said_to():

@@ -740,14 +740,17 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     def noise_covariance(self, readings: ReadingsLike) -> Array:
         """Covariance (…, n, 6, 6) of both vectors from the noise of one reading."""
         readings = as_readings(readings)
-        result = np.zeros((*readings.accelerometer.shape[:-1], 6, 6))
+        shape, parts = readings.accelerometer.shape[:-1], []
         for triad, model, (parameters, raw, temperature), vector in self._measured(readings):
             sd = readings.sd.get(triad.name, np.array(triad.noise))
             if not model.varies and np.ndim(sd) < raw.ndim:  # one for all readings
                 raw, temperature = raw[..., :1, :], temperature[..., :1]
             slope, sd = model.slope(parameters, raw, temperature), np.broadcast_to(sd, raw.shape)
-            result[..., vector, vector] = slope * sd[..., None, :] ** 2 @ slope.mT
-        return result
+            parts.append((vector, slope * sd[..., None, :] ** 2 @ slope.mT))
+        result = np.zeros((*np.broadcast_shapes(*(p.shape[:-2] for _, p in parts)), 6, 6))
+        for vector, part in parts:
+            result[..., vector, vector] = part
+        return np.broadcast_to(result, (*shape, 6, 6))
 
     def gradients(self, names: Sequence[str], readings: ReadingsLike) -> Array:
         """Gradients (…, n, k, 6) of k observables with respect to both vectors."""

@@ -551,12 +551,12 @@ class Growth:
         it does not come back, so that the share of paths that have left by t is the probability to be beyond at t.
         Units: radians.
         """
-        changes = self.changes.mT.astype(np.float32)
-        error, walk = paths.error @ changes, paths.walk @ changes
-        largest = np.maximum(error.max(-1), -error.min(-1))
+        changes = self.changes.astype(np.float32)
+        error, walk = changes @ paths.error.mT, changes @ paths.walk.mT
+        largest = np.maximum(error.max(0), -error.min(0))
         error *= np.sign(walk)  # in place: no new array for each step
         left, speed = np.subtract(np.float32(limit), error, out=error), np.abs(walk, out=walk)
-        span = np.min(np.divide(left, np.maximum(speed, LEAST_SPEED, out=speed), out=left), -1)
+        span = np.min(np.divide(left, np.maximum(speed, LEAST_SPEED, out=speed), out=left), 0)
         return np.where(largest > limit, 0.0, np.maximum(span, 0.0)) ** 2, largest
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import date
 from zlib import crc32
@@ -61,6 +61,8 @@ CONTROL = 3.0
 """Standard deviations within which control limits lie."""
 MOST_PEERS = 2_000
 """Most tools of a type that its rates are learnt from."""
+PREDICTED_TOGETHER = 64
+"""Tools of a type whose rates are worked out at once."""
 TIMES = np.linspace(0.0, LONGEST_INTERVAL, 21)
 """Years after a calibration for which its accuracy is forecast."""
 TOOL_AND_PEERS, PEERS = "tool and peers", "peers"
@@ -229,13 +231,39 @@ def predicted(
 
     `limits` in degrees by angle, which the 95 % accuracy is to keep; with `today`, an overdue calibration says so.
     """
+    return next(all_predicted([tool], rates, limits, today))
+
+
+def all_predicted(
+    tools: Sequence[MeasuredTool],
+    rates: TypeRates,
+    limits: Mapping[str, float],
+    today: date | None = None,
+) -> Iterator[ToolDrift]:
+    """The same of tools of one type, whose rates are worked out together."""
+    for first in range(0, len(tools), PREDICTED_TOGETHER):
+        some = tools[first : first + PREDICTED_TOGETHER]
+        known: list[dict[tuple[str, str], Distribution]] = [{} for _ in some]
+        for group, learnt in rates.groups.items():
+            having = [i for i, tool in enumerate(some) if group in tool.increments]
+            if having:
+                among = [some[i].drift.serial in rates.members for i in having]
+                each = learnt.probabilities([some[i].increments[group] for i in having], among)
+                for i, probability in zip(having, each, strict=True):
+                    known[i][group] = learnt.rates, probability
+        for tool, distributions in zip(some, known, strict=True):
+            yield _predicted(tool, rates, distributions, limits, today)
+
+
+def _predicted(
+    tool: MeasuredTool,
+    rates: TypeRates,
+    known: Mapping[tuple[str, str], Distribution],
+    limits: Mapping[str, float],
+    today: date | None,
+) -> ToolDrift:
+    """The same of one tool, whose rates are distributed as `known`."""
     drift, serial = tool.drift, tool.drift.serial
-    among = serial in rates.members
-    known = {
-        group: (learnt.rates, learnt.probability(tool.increments[group], among))
-        for group, learnt in rates.groups.items()
-        if group in tool.increments
-    }
     usable = [g for g in tool.outlook.growths if set(g.yearly) <= set(known)]
     rng = np.random.default_rng(crc32(serial.encode()))
     drawn = {group: draws(*each, DRAWN_PATHS, rng) for group, each in known.items()}
@@ -409,7 +437,10 @@ def fleet_drift(
     for tool in tools:
         types.setdefault(tool.drift.type, []).append(tool)
     rates = {name: TypeRates.of(members) for name, members in types.items()}
-    drifts = [predicted(tool, rates[tool.drift.type], limits, today) for tool in tools]
+    of_type = {
+        name: all_predicted(types[name], each, limits, today) for name, each in rates.items()
+    }
+    drifts = [next(of_type[tool.drift.type]) for tool in tools]
     rows = [fleet_tool(drift, today) for drift in drifts]
     ratios = [d.change.largest_score / d.change.critical_score for d in drifts if d.change]
     tested = [row for row in rows if row.changed is not None]

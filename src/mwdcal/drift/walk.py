@@ -344,7 +344,7 @@ class GroupRates:
         logs = self._evidence(self.log_likelihood).sum(0) + prior
         return np.asarray(np.exp(logs - logsumexp(logs)))
 
-    @property
+    @cached_property
     def peers_probability(self) -> Array:
         """Probability (r,) of each rate of a tool of the type of which nothing else is known."""
         return np.asarray(np.einsum("cs,csr->r", self.type_probability, self._members))
@@ -361,17 +361,20 @@ class GroupRates:
             int(np.argmax(likelihood))
         )
 
-    def probability(self, tool: Increments, among: bool) -> Array:
-        """Probability (r,) of each rate of a tool; `among` those that the type was learnt from or not."""
-        likelihood = tool.log_likelihood(self.rates)
-        weight = self.type_probability
-        if among and tool.noise.size:
-            logs = np.log(np.maximum(weight, 1e-300)) - self._evidence(likelihood)
-            weight = np.exp(logs - logs.max())
-        logs = likelihood + np.log(
-            np.maximum(np.einsum("cs,csr->r", weight, self._members), 1e-300)
+    def probabilities(self, tools: Sequence[Increments], among: Sequence[bool]) -> Array:
+        """Probability (t, r) of each rate of some tools; `among` those that the type was learnt from or not."""
+        likelihood = np.stack([tool.log_likelihood(self.rates) for tool in tools])
+        by_peers = np.broadcast_to(self.peers_probability, likelihood.shape).copy()
+        own = np.array(
+            [each and tool.noise.size > 0 for tool, each in zip(tools, among, strict=True)]
         )
-        return np.asarray(np.exp(logs - logsumexp(logs)))
+        if own.any():
+            prior = np.log(np.maximum(self.type_probability, 1e-300))
+            logs = (prior - self._evidence(likelihood[own])).reshape(np.count_nonzero(own), -1)
+            weight = np.exp(logs - logs.max(-1, keepdims=True))
+            by_peers[own] = weight @ self._members.reshape(weight.shape[-1], -1)
+        logs = likelihood + np.log(np.maximum(by_peers, 1e-300))
+        return np.asarray(np.exp(logs - logsumexp(logs, -1, keepdims=True)))
 
 
 def quantiles(rates: Array, probability: Array, shares: Sequence[float] | Array) -> Array:

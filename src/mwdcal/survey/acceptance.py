@@ -239,40 +239,37 @@ def judged(
     fixed = np.array(
         [np.inf if (most := limits.fixed(n)) is None else most for n in STRENGTH_NAMES]
     )
-    together = distance(departure, covariance)
+    weights, together = weighed(departure, covariance)
     largest = np.full(together.shape, np.inf)
     bound = np.broadcast_to(fixed, departure.shape)
     if limits.probability is not None:
         from scipy.special import chdtri
 
         beyond = 1 - limits.probability
-        largest = np.sqrt(chdtri(np.maximum((~missing).sum(-1), 1), beyond))
+        of_count = np.sqrt(chdtri(np.maximum(np.arange(len(STRENGTH_NAMES) + 1), 1), beyond))
+        largest = of_count[(~missing).sum(-1)]
         alone = np.sqrt(diagonal(covariance) * chdtri(1, beyond))
         bound = np.where(np.isfinite(fixed), fixed, alone)
     over = np.abs(departure) > fixed
     accepted = ~missing.all(-1) & ~over.any(-1) & (together <= largest)
-    weights = _weights(covariance, missing)
     tests = AcceptanceTests(fixed, covariance, largest, missing, weights)
     return Judgement(departure, bound, together, largest, np.asarray(accepted), tests)
 
 
-def distance(departure: Array, covariance: Array) -> Array:
-    """Mahalanobis distance (...) of departures (..., k) with a covariance (..., k, k); NaN ones are left out."""
+def weighed(departure: Array, covariance: Array) -> tuple[Array, Array]:
+    """Inverse (..., k, k) of the covariance of departures (..., k), and their Mahalanobis distance (...).
+
+    NaN ones are left out: their inverse is that of a unit matrix.
+    """
     missing = np.isnan(departure) | np.isnan(diagonal(covariance))
     blank = missing[..., :, None] | missing[..., None, :]
     whole = np.where(blank, np.eye(departure.shape[-1]), covariance)
     sd, correlation = correlations(whole)
+    inverse = np.linalg.inv(correlation)
     scaled = np.where(missing, 0.0, departure) / sd
-    solved = np.linalg.solve(correlation, scaled[..., None])[..., 0]
-    return np.asarray(np.sqrt(np.maximum(np.sum(scaled * solved, -1), 0.0)))
-
-
-def _weights(covariance: Array, missing: Bools) -> Array:
-    """Inverse (n, 3, 3) of the covariance of the departures that are judged, with ones for the others."""
-    blank = missing[:, :, None] | missing[:, None, :]
-    whole = np.where(blank, np.eye(len(STRENGTH_NAMES)), covariance)
-    sd, correlation = correlations(whole)
-    return np.asarray(np.linalg.inv(correlation) / (sd[:, :, None] * sd[:, None, :]))
+    square = np.einsum("...i,...ij,...j->...", scaled, inverse, scaled)
+    weights = inverse / (sd[..., :, None] * sd[..., None, :])
+    return np.asarray(weights), np.asarray(np.sqrt(np.maximum(square, 0.0)))
 
 
 def correlations(covariance: Array) -> tuple[Array, Array]:

@@ -275,7 +275,7 @@ def _causes(well: Well, readings: Readings, hole: Hole, rows: Bools) -> dict[Cau
 def _modelled(errors: WellErrors, fields: tuple[Array, Array], hole: Hole) -> dict[Cause, _Errors]:
     """Those of an error model: of the sensors, and by its formulas, which belong together by their names."""
     _, gradient = direction_gradient(*fields)
-    sensors = with_depth(errors.columns(*fields, errors.unit(hole)) @ gradient.mT)
+    sensors = with_depth(errors.moved(gradient, *fields, hole))
     count, modes = len(hole.md), {t.name: t.propagation_mode.lower() for t in errors.model.terms}
     result = {
         Cause(AXIAL_INTERFERENCE, SYSTEMATIC): _Errors.of(count, sensors[:, SENSOR_CAUSES - 1 :]),

@@ -255,22 +255,32 @@ class ErrorModel:
         Definition: upward is the error of inclination, sideways sin(inclination) times the error of azimuth.
         Singular: finite at vertical, as the limit for a hole that rises to the azimuth.
         """
-        values: dict[str, ArrayLike] = {**hole.quantities, **self.parameters, "pi": np.pi}
-        terms = [term for term in self.terms if term.kind == kind]
-        return {term.name: term.size * self._unit(term.name, values) for term in terms}
+        names = [term.name for term in self._of_kind(kind)]
+        return dict(zip(names, self._stacked(hole, kind).swapaxes(0, 1), strict=True))
+
+    def _of_kind(self, kind: str) -> list[ErrorTerm]:
+        return [term for term in self.terms if term.kind == kind]
 
     @np.errstate(divide="ignore", invalid="ignore")
-    def _unit(self, name: str, values: Mapping[str, ArrayLike]) -> Array:
-        depth, inclination, azimuth = self.formulas[name]
-        steep = np.maximum(np.asarray(values["inc"]), LEAST_INCLINATION)
-        sideways = np.sin(steep) * azimuth({**values, "inc": steep})
-        parts = (inclination(values), sideways, depth(values), steep)
-        return np.stack(np.broadcast_arrays(*parts)[:3], -1)
+    def _stacked(self, hole: Hole, kind: str) -> Array:
+        """The same of all terms (n, k, 3)."""
+        values: dict[str, ArrayLike] = {**hole.quantities, **self.parameters, "pi": np.pi}
+        steep = np.maximum(hole.inclination, LEAST_INCLINATION)
+        sine, inclined = np.sin(steep), {**values, "inc": steep}
+        terms = self._of_kind(kind)
+        result = np.empty((len(hole.md), len(terms), 3))
+        for place, term in enumerate(terms):
+            depth, inclination, azimuth = self.formulas[term.name]
+            parts = (inclination(values), sine * azimuth(inclined), depth(values))
+            for axis, part in enumerate(parts):
+                result[:, place, axis] = term.size * part
+        return result
 
     def errors(self, hole: Hole) -> tuple[Array, Array, Array]:
         """Shifts (n, k, 3) by terms that last, covariance (n, 3, 3) of random ones and (n, 2, 2) of courses."""
-        systematic = _stacked(self.shifts(hole, "lasting"), hole)
-        random, course = (_stacked(self.shifts(hole, kind), hole) for kind in ("random", "course"))
+        systematic, random, course = (
+            self._stacked(hole, kind) for kind in ("lasting", "random", "course")
+        )
         course = course[..., :2]
         return systematic, random.mT @ random, course.mT @ course
 
@@ -281,12 +291,6 @@ def _depth_before(md: Array, before: Array) -> Array:
     known = before[np.maximum.accumulate(np.where(np.isfinite(before), places, 0))]
     above = known[np.maximum.accumulate(np.where(known < md, places, 0))]
     return np.where(above < md, above, md - USUAL_COURSE)
-
-
-def _stacked(shifts: Mapping[str, Array], hole: Hole) -> Array:
-    """Shifts (n, k, 3) of all terms."""
-    none = np.zeros((len(hole.md), 0, 3))
-    return np.concatenate([none, *(shift[:, None] for shift in shifts.values())], -2)
 
 
 def load_error_model(name_or_path: str | os.PathLike[str] = BUILT_IN) -> ErrorModel:

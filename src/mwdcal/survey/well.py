@@ -96,27 +96,22 @@ class WellErrors:
     relative: bool = False
     by_walk: bool = False
 
-    def columns(self, g: Array, b: Array, unit: ArrayLike = 1.0) -> Array:
-        """Errors (n, 13, 6) of both vectors by 1σ of each independent cause that lasts over a run.
+    def _sizes(self, g: Array, b: Array, hole: Hole) -> tuple[Array, Array, Array]:
+        """1σ (n, 6) of the biases of all axes, of their scales in the unit of the vectors, and (n,) of interference."""
+        sensors, one = self.sensors, np.ones((len(g), 3))
+        unit = np.broadcast_to(np.asarray(self.unit(hole), float), len(g))
+        gravity = sensors.accelerometer_bias_ms2 / STANDARD_GRAVITY * one
+        field = sensors.magnetometer_bias_nt * one / unit[:, None]
+        scales = [sensors.accelerometer_scale * g, np.nan_to_num(sensors.magnetometer_scale * b)]
+        biases = np.concatenate([gravity, np.nan_to_num(field)], -1)
+        axial = np.nan_to_num(sensors.axial_interference_nt / unit)
+        return biases, np.nan_to_num(np.concatenate(scales, -1)), axial
 
-        `unit` of the field, nT: that of a magnetometer calibrated to a field of 1 is the field itself.
-        """
-        sensors, one = self.sensors, np.ones((len(g), 1))
-        bias = np.repeat(
-            [sensors.accelerometer_bias_ms2 / STANDARD_GRAVITY, sensors.magnetometer_bias_nt], 3
-        )
-        scale = np.repeat([sensors.accelerometer_scale, sensors.magnetometer_scale], 3)
-        size = one / np.broadcast_to(unit, (len(g),))[:, None]
-        biases = bias * np.concatenate([one, one, one, size, size, size], -1)
-        each = np.concatenate(
-            [
-                biases[..., None] * np.eye(6),
-                (scale * np.concatenate([g, b], -1))[..., None] * np.eye(6),
-            ],
-            1,
-        )
-        axial = (sensors.axial_interference_nt * size)[..., None] * np.eye(6)[5:]
-        return np.asarray(np.nan_to_num(np.concatenate([each, axial], 1)))
+    def moved(self, gradient: Array, g: Array, b: Array, hole: Hole) -> Array:
+        """Changes (n, 13, k) of what has a gradient (n, k, 6) by 1σ of each independent cause that lasts over a run."""
+        biases, scales, axial = self._sizes(g, b, hole)
+        each = [(gradient * size[:, None, :]).mT for size in (biases, scales)]
+        return np.concatenate([*each, (gradient[..., 5] * axial[:, None])[:, None, :]], 1)
 
     def variances(self, gradient: Array, g: Array, b: Array, hole: Hole) -> Array:
         """Variance (n, 7) that all terms add to the observables of a survey, in the order of `SURVEY_OBSERVABLES`.
@@ -124,7 +119,10 @@ class WellErrors:
         `gradient` (n, 7, 6) of these by both vectors.
         Errors of the hole's direction against the tool, such as sag, leave the toolface as it is.
         """
-        result = ((gradient @ self.columns(g, b, self.unit(hole)).mT) ** 2).sum(-1)
+        biases, scales, axial = self._sizes(g, b, hole)
+        size = biases**2 + scales**2
+        size[:, 5] += axial**2
+        result = (gradient**2 @ size[..., None])[..., 0]
         systematic, random, _ = self.model.errors(hole)
         upward, sideways = ((systematic[..., i] ** 2).sum(-1) + random[..., i, i] for i in range(2))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -144,7 +142,7 @@ class WellErrors:
         ]
 
     def unit(self, hole: Hole) -> ArrayLike:
-        """The unit of the field, nT, that `columns` take."""
+        """The unit of the field, nT: that of a magnetometer calibrated to a field of 1 is the field itself."""
         return hole.quantities["bfield"] if self.relative else 1.0
 
     def of_surveys(
@@ -171,7 +169,7 @@ class WellErrors:
     def along(self, errors: DirectionErrors, g: Array, b: Array, hole: Hole) -> DirectionErrors:
         """Errors of direction and depth along a well: those given, and those of the model."""
         _, gradient = direction_gradient(g, b)
-        sensors = with_depth(self.columns(g, b, self.unit(hole)) @ gradient.mT)
+        sensors = with_depth(self.moved(gradient, g, b, hole))
         systematic, random, course = self.model.errors(hole)
         noise = np.zeros_like(random)
         noise[:, :2, :2] = errors.random
