@@ -247,12 +247,11 @@ def may_show(result: Fit) -> Bools:
 
 def _are_enough(gains: Iterable[tuple[Array, Ints]], misfit: Array, rest: Array) -> Bools:
     """Fits (B,) of which some family lowers the misfit by so much that it may be named."""
-    shown = np.zeros(misfit.shape, bool)
+    shown, lefts = np.zeros(misfit.shape, bool), np.unique(rest).tolist()
     for gain, directions in gains:
-        for count, left in {*zip(directions.tolist(), rest.tolist(), strict=True)}:
-            if count:
-                least = least_gain(count, left) * LOOK_MARGIN
-                shown |= (directions == count) & (rest == left) & (gain > least * misfit)
+        for count in filter(None, np.unique(directions).tolist()):
+            least = np.array([least_gain(count, left) for left in lefts]) * LOOK_MARGIN
+            shown |= (directions == count) & (gain > least[np.searchsorted(lefts, rest)] * misfit)
     return shown
 
 
