@@ -31,7 +31,7 @@ from mwdcal.calibration.record import StandErrors
 from mwdcal.calibration.results import STATED_ANGLES, accuracy
 from mwdcal.errors import MwdcalError
 from mwdcal.estimation.batch import put, take
-from mwdcal.fleet.choices import alike, in_chunks, tools_per_fit, with_curves, with_orders
+from mwdcal.fleet.choices import alike, in_chunks, with_curves, with_orders
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints
 from mwdcal.sensor.models import Basis, Factors, Polynomial, Whole
 from mwdcal.sensor.profile import Profile
@@ -198,8 +198,7 @@ class _Batch:
             if chosen.order != options.order:
                 self._screen(some, chosen)
             for part, final in with_curves(readings, sound(some), chosen, self.profile, fail):
-                one_fit, size = partial(fit, options=final), tools_per_fit(readings)
-                fits = in_chunks(readings, part, one_fit, fail, size)
+                fits = in_chunks(readings, part, partial(fit, options=final), fail)
                 for few, result in with_drifts(fits, final):
                     self._note(few, final, result)
 

@@ -25,7 +25,9 @@ from mwdcal.sensor.profile import Profile
 TOOLS_PER_FIT = 320
 """Tools fitted in one call: few enough for the cache, many enough for NumPy…"""
 AT_EXACT_REFERENCES = 640
-"""…and where all references are exact: a tool then takes a fifth of the memory."""
+"""…where all references are exact: a tool then takes a fifth of the memory…"""
+USUAL_STATIONS = 48
+"""…and fewer if they have more stations than these: long runs take no more memory."""
 _T = TypeVar("_T")
 Fail = Callable[[Ints, Exception], None]
 """What becomes of tools that an exception stops."""
@@ -78,7 +80,8 @@ def with_curves(
 def tools_per_fit(readings: Readings) -> int:
     """How many tools of a batch are fitted in one call."""
     exact = not any(readings.uncertainty(name).any() for name in readings.known)
-    return AT_EXACT_REFERENCES if exact else TOOLS_PER_FIT
+    most = AT_EXACT_REFERENCES if exact else TOOLS_PER_FIT
+    return max(1, most * USUAL_STATIONS // max(readings.count, USUAL_STATIONS))
 
 
 def alike(tools: Ints, keys: AnyArray) -> list[tuple[AnyArray, Ints]]:
@@ -98,9 +101,9 @@ def in_chunks(
     tools: Ints,
     work: Callable[[Readings], _T],
     fail: Fail,
-    size: int = TOOLS_PER_FIT,
 ) -> Iterator[tuple[Ints, _T]]:
-    """The work on given members of a batch, `size` at a time; in halves where one stops the whole."""
+    """The work on given members of a batch, some at a time; in halves where one stops the whole."""
+    size = tools_per_fit(readings)
     for start in range(0, len(tools), size):
         part = tools[start : start + size]
         try:

@@ -46,11 +46,12 @@ TOOL = "#tool"
 """Column of dealt rows: number of the tool, in order of first appearance."""
 ROW = "#row"
 """Column of the number of a row in the whole table."""
-PARTITION_ROWS = (24_000, 100_000)
-"""Fewest and most rows of a partition that is not a single tool: what it costs by itself is little, and so is its
-memory…"""
-SHARES = 16
-"""…and into how many a fleet between these is divided. Workers do not count: another number of them finds the parts."""
+PARTITION_ROWS = (6_000, 100_000)
+"""Fewest and most rows of a partition that is not a single tool: memory grows with them."""
+ENOUGH_ROWS = 24_000
+"""Rows from which what a partition costs by itself, some 60 ms, is little…"""
+SHARES = (4, 16)
+"""…and into how many a fleet is divided: below these rows, and above. More would not keep more workers busy for long."""
 BATCH = 32_768
 """Rows that are read at once…"""
 SERIALS = 500_000
@@ -214,11 +215,21 @@ def _texts(column: Any, piece: Piece, name: str) -> Any:
         ) from error
 
 
+def _partition_rows(rows: int) -> int:
+    """Rows of a partition of a table; whatever the workers are, so that others go on with what is done.
+
+    >>> [_partition_rows(1000 * rows) for rows in (10, 48, 192, 960, 9600)]
+    [6000, 12000, 24000, 60000, 100000]
+    """
+    few, many = (rows // share for share in SHARES)
+    return int(np.clip(max(min(few, ENOUGH_ROWS), many), *PARTITION_ROWS))
+
+
 def partitions(
     source: FleetTable, tools: Tools, folder: Path, say: Callable[[str], None]
 ) -> list[Partition]:
     """The table in partitions of whole tools; dealt into files in `folder` where it must be."""
-    size = int(np.clip(source.rows // SHARES, *PARTITION_ROWS))
+    size = _partition_rows(source.rows)
     if not tools.together:
         return _dealt(source, tools, folder, size, say)
     ends = np.append(tools.runs[1:], source.rows)

@@ -10,7 +10,7 @@ Reference: efficient scores, C. R. Rao, Proc. Camb. Phil. Soc. 44, 50 (1948).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from itertools import pairwise
@@ -46,6 +46,7 @@ from mwdcal.geometry.vectors import (
     centred,
     diagonal,
     eigen,
+    inverse,
     inverse_of_positive,
     outer,
     quotient,
@@ -202,6 +203,10 @@ HYSTERESIS = "-hysteresis"
 """What ends the names of families whose columns are each tool's own."""
 LOOK_MARGIN = 0.99
 """A fit is looked at from this share of the gain that would name an effect: rounding differs by far less."""
+LEAST_ALIKE = 0.4
+"""Least share of the information of others that sensors have to which these are compared; the inverse is the most."""
+NOTHING_LEFT, CLEARLY_LEFT = 1e-10, 1e-2
+"""Between these it depends on the sensors whether a direction counts: a bound takes its gain, and asks for less."""
 GAINS = np.geomspace(1, 1e4, 1000)
 """Ratios of variances at which the chance of noise is worked out."""
 
@@ -227,15 +232,59 @@ def may_show(result: Fit) -> Bools:
     residual = result.analysis.residual / np.repeat(scale, 3, -1)[:, None]
     response = [r / scale[:, i, None, None] for i, r in enumerate(responses(problem, result.state))]
     drifts = _Drifts.of(problem, result.state, design, residual, response)
-    misfit, shown = np.sum(residual**2, (1, 2)) + drifts.misfit, ~every
+    misfit = np.sum(residual**2, (1, 2)) + drifts.misfit
     rest = np.sum(problem.evidence.include[0]) * residual.shape[-1] - result.state.params.shape[-1]
     rest = np.ceil(rest - drifts.freedom)
-    for gain, directions in _gains(problem, design, residual, response, drifts):
-        for count, left in {*zip(directions.tolist(), rest.tolist(), strict=True)}:
-            if count:
-                least = least_gain(count, left) * LOOK_MARGIN
-                shown |= (directions == count) & (rest == left) & (gain > least * misfit)
-    return np.asarray(shown)
+    sides = _gains_of_sides(problem, design, residual, response, drifts)
+    shown = _are_enough(sides, misfit, rest)
+    near = every if drifts.columns else _may_be_enough(design, residual, response, misfit, rest)
+    some = np.flatnonzero(near)
+    if some.size:
+        gains = _gains(design, residual[some], [r[some] for r in response], drifts)
+        shown[some] |= _are_enough(gains, misfit[some], rest[some])
+    return shown
+
+
+def _are_enough(gains: Iterable[tuple[Array, Ints]], misfit: Array, rest: Array) -> Bools:
+    """Fits (B,) of which some family lowers the misfit by so much that it may be named."""
+    shown, lefts = np.zeros(misfit.shape, bool), np.unique(rest).tolist()
+    for gain, directions in gains:
+        for count in filter(None, np.unique(directions).tolist()):
+            least = np.array([least_gain(count, left) for left in lefts]) * LOOK_MARGIN
+            shown |= (directions == count) & (gain > least[np.searchsorted(lefts, rest)] * misfit)
+    return shown
+
+
+def _may_be_enough(
+    design: Alike, residual: Array, response: list[Array], misfit: Array, rest: Array
+) -> Bools:
+    """Fits (B,) without drift of which a bound of some family's gain is enough for it to be named.
+
+    Sensors R that are M times those R₀ of the first fit have information on an effect of at least κ times as much, κ
+    being the least eigenvalue of MᵀM. A gain by the information of the first fit is thus too large by 1/κ at most.
+    """
+    first = [each[:1] for each in response]
+    least, most = np.ones((2, len(misfit)))
+    for each, one in zip(response, first, strict=True):
+        ratio, quieter = each[..., :3] @ inverse(one[..., :3]), (each[:, 0, 3] / one[:, 0, 3]) ** 2
+        away = ratio.mT @ ratio / quieter[:, None, None] - np.eye(3)
+        size = np.sqrt(np.sum(away**2, (1, 2)))
+        least = np.minimum(least, quieter * (1 - size))
+        most = np.maximum(most, quieter * (1 + size))
+    near = (least < LEAST_ALIKE) | (most > 1 / LEAST_ALIKE)
+    effects = common_effects(design)
+    _, products, square = effects.sums(0 * residual[:1], first)
+    score = np.sum(effects.scores(residual, response), 0)
+    for name, (some, pair) in effects.places.items():
+        size = some.stop - some.start
+        information = sum(products[i][0, pair] for i in effects.columns[name])
+        length = np.sqrt(np.where(square[0, some] > 0, square[0, some], 1.0))
+        value, basis = eigen(np.reshape(information, (size, size)) / outer(length))
+        kept, fewest = value > NOTHING_LEFT, max(np.count_nonzero(value > CLEARLY_LEFT), 1)
+        along = score[:, some] @ (basis / length[:, None])[:, kept] / np.sqrt(value[kept])
+        gain = np.sum(along**2, -1) / np.maximum(least, LEAST_ALIKE)
+        near |= _are_enough([(gain, np.full(gain.shape, fewest))], misfit, rest)
+    return near
 
 
 @dataclass(frozen=True)
@@ -328,14 +377,20 @@ class _Families:
         self, residual: Array, response: list[Array]
     ) -> tuple[list[Array], list[Array], Array]:
         """By triad: scores (B, k) and products (B, p) of all families; and the squares (B, k) of whole columns."""
-        scores, information, square = [], [], np.zeros(())
+        information, square = [], np.zeros(())
         for index, reads in enumerate(response):
-            pull = residual[..., 3 * index : 3 * index + 3] @ reads
-            scores.append(pull.reshape(len(pull), -1) @ self.left[index].reshape(pull[0].size, -1))
             squared = squares_of(reads)
             information.append(squared @ self.products[index])
             square = square + squared @ self.squares[index]
-        return scores, information, square
+        return self.scores(residual, response), information, square
+
+    def scores(self, residual: Array, response: list[Array]) -> list[Array]:
+        """By triad: scores (B, k) of all families."""
+        scores = []
+        for index, reads in enumerate(response):
+            pull = residual[..., 3 * index : 3 * index + 3] @ reads
+            scores.append(pull.reshape(len(pull), -1) @ self.left[index].reshape(pull[0].size, -1))
+        return scores
 
 
 @lru_cache(maxsize=8)
@@ -364,9 +419,9 @@ def _across(design: Alike) -> dict[int, Array]:
 
 
 def _gains(
-    problem: Problem, design: Alike, residual: Array, response: list[Array], drifts: _Drifts
+    design: Alike, residual: Array, response: list[Array], drifts: _Drifts
 ) -> Iterator[tuple[Array, Ints]]:
-    """By how much (B,) each family lowers the misfit, and its directions, from whitened residuals (B, n, m)."""
+    """By how much (B,) each common family lowers the misfit, and its directions, from whitened residuals (B, n, m)."""
     effects, count = common_effects(design), len(residual)
     scores, products, square = effects.sums(residual, response)
     across = {
@@ -384,7 +439,13 @@ def _gains(
                 both = drifts.less(index, across[index][:, some], *both)
             score, information = score + both[0], information + both[1]
         yield gain_of(score, information, square[:, some])
-    for name in effects.sides:
+
+
+def _gains_of_sides(
+    problem: Problem, design: Alike, residual: Array, response: list[Array], drifts: _Drifts
+) -> Iterator[tuple[Array, Ints]]:
+    """The same of the families whose columns are each tool's own."""
+    for name in common_effects(design).sides:
         index = TRIADS.index(name.removesuffix(HYSTERESIS))
         raw, include = problem.triads[index].raw, problem.evidence.include
         sides = side(moves(raw)) * include[..., None]

@@ -149,8 +149,8 @@ class CommonColumns:
 
     def change(self, response: Array, value: Array) -> Array:
         """Change (B, n, 3) of whitened readings by effects of some size (B, k)."""
-        both = (self.whole @ value[:, None, :, None])[..., 0]
-        return np.asarray(both @ response.mT)
+        both = value @ self.whole.reshape(-1, value.shape[-1]).transpose()
+        return np.asarray(both.reshape(len(value), *self.whole.shape[:2]) @ response.mT)
 
 
 def products_of(first: Array, second: Array) -> Array:
