@@ -328,7 +328,7 @@ def renamed(table: Table, profile: Profile) -> Table:
                 f"{table.source}: the column {shown(source.name)}, which is '{column}' by the tool profile, "
                 "is missing. Correct [columns] in the profile."
             )
-        if column in table.columns and source.name != column:
+        if column in table.columns and source.name != column and column not in theirs:
             raise InputError(
                 f"{table.source}: '{column}' is a column of the table, and {shown(source.name)} is '{column}' by "
                 "the tool profile. Correct [columns] in the profile, or name the former under ignore in [table] there."

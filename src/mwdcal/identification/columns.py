@@ -232,7 +232,7 @@ _MEASURED = re.compile(
 )
 """Words of angles that the tool itself has measured: no references."""
 _OTHER_NORTH = re.compile(
-    r"true|grid|geogra|wahr|gitter|rechtweisend|[qc]uadr[ií]cula|verdadero|verdadeiro|istinn|kartnord|истин|сетк|географ|真|坐标北|网格",
+    r"true|grid|geogr|wahr|gitter|rechtweisend|[qc]uadr[ií]cula|verdadero|verdadeiro|istinn|kartnord|истин|сетк|географ|géogr|真|坐标北|网格",
     re.IGNORECASE,
 )
 _GRID_NORTH = re.compile(r"grid|gitter|[qc]uadr[ií]cula|kartnord|сетк|坐标北|网格", re.IGNORECASE)
@@ -303,6 +303,8 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     near = {form: column for column in MAPPED for form in forms(column)}
     spelt = next((near[form] for form in forms(plain) if form in near), None)
     stated = IN_BRACKETS.search(plain)
+    if alike and alike.column == REFERENCES["azimuth"].column and alike.unit.startswith("mag"):
+        return alike._replace(unit="")
     return alike or (Resemblance(spelt, unit_of(stated[1]) if stated else "") if spelt else None)
 
 
@@ -596,7 +598,10 @@ def _is_total(column: str, name: str, meanings: Mapping[str, Resemblance], value
     if len(columns) != 3 or total is None:
         return False
     norm = np.linalg.norm(columns, axis=0)
-    return bool(np.ptp(norm) > 0 and np.abs(norm - total).max() < 0.02 * np.ptp(norm))
+    if not np.ptp(norm) or not np.all(norm > 0):
+        return False
+    in_its_unit = norm * np.median(total / norm)
+    return bool(np.abs(in_its_unit - total).max() < 0.02 * np.ptp(in_its_unit))
 
 
 def _check_lacking(column: str, others: Mapping[str, str], values: Values, source: str) -> None:
@@ -776,6 +781,7 @@ def _unit(column: str, name: str, stated: str, values: Array | None, source: str
     if not allowed or values is None:
         return stated
     if stated:
+        stated = _before_comment(column, stated) or stated
         if stated in allowed:
             return stated
         if BOTH_UNITS in stated:
@@ -790,6 +796,13 @@ def _unit(column: str, name: str, stated: str, values: Array | None, source: str
             [*in_units(name, column, allowed), none_of(column)],
         )
     return _unit_by_values(column, name, values[np.isfinite(values)], source)
+
+
+def _before_comment(column: str, stated: str) -> str:
+    """The unit before a comma, if what follows says the same as the column's name: deg, highside."""
+    unit, _, comment = stated.partition(",")
+    alike = resembled(spelled(comment)) if comment else None
+    return unit_of(unit) if alike and alike.column == column else ""
 
 
 def _unit_by_values(column: str, name: str, known: Array, source: str) -> str:

@@ -342,6 +342,8 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
     """The table whose last row of names, or of units, is at a place, down to the row before `end`."""
     rows = sheet.rows
     names, units, top = _head(rows, head)
+    below = rows[_other_tool(rows, head, end) : end]
+    end -= len(below)
     readings = [place for place in range(head + 1, end) if _is_reading(rows[place][1])]
     kept = _without_summary([rows[place] for place in readings])
     lines = {line for line, _ in kept}
@@ -382,10 +384,22 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
         above=tuple(" ".join(map(as_text, row)).strip() for row in above),
         titles=block._replace(metadata=dated(block.metadata, zip(names, texts, strict=True))),
         left_out=tuple(
-            (line, _words(row)) for line, row in others if not _repeats(row, rows, head)
+            (line, _words(row)) for line, row in [*others, *below] if not _repeats(row, rows, head)
         ),
         places=dict(zip(names, letters, strict=True)) if sheet.name else {},
     )
+
+
+def _other_tool(rows: Sequence[tuple[int, Cells]], head: int, end: int) -> int:
+    """The place of a row below the names that states the serial of another tool, above rows of it; else the end."""
+    ours = titles([row for _, row in rows[:head]]).metadata.get("serial")
+    for place in range(head + 1, end - 1):
+        row = rows[place][1]
+        if _is_reading(rows[place + 1][1]) and not _is_reading(row):
+            theirs = titles([row]).metadata.get("serial")
+            if theirs not in (None, ours):
+                return place
+    return end
 
 
 def _both(unit: str, by_cells: str) -> str:
