@@ -274,7 +274,7 @@ class Proposal(NamedTuple):
     `by_value` columns of a run file whose
     unit no name states; `metadata` what the table says of itself; `where` the table was, if it was looked for;
     `open_axes` the triads of which the run does not tell the axes, `ignored` columns that are called as references
-    and are none, each with the reason; `told` what the names leave open and the readings answer.
+    and are none, each with the reason; `by_readings` what the names leave open and the readings answer.
     """
 
     profile: Profile
@@ -288,7 +288,7 @@ class Proposal(NamedTuple):
     where: Layout | None = None
     open_axes: Mapping[str, OpenAxes] = {}
     ignored: Mapping[str, str] = {}
-    told: tuple[str, ...] = ()
+    by_readings: tuple[str, ...] = ()
 
 
 def propose(
@@ -324,8 +324,8 @@ def propose(
     try:
         return with_answers(answers or {})
     except (QuestionError, QuestionsError) as error:
-        if told := _told_by_readings(error, with_answers, answers or {}):
-            return told
+        if proposal := _answer_by_readings(error, with_answers, answers or {}):
+            return proposal
         raise
 
 
@@ -377,7 +377,7 @@ def _is_formulas(cells: Sequence[str]) -> bool:
 # An answer that the readings give: at known attitudes the right columns and units of angles and channels leave a few
 # per cent of the channels' variation unexplained, wrong ones most of it.
 
-_TOLD_BY_READINGS = (*RAW, *(REFERENCES[name].column for name in ("inclination", "toolface")))
+_OF_READINGS = (*RAW, *(REFERENCES[name].column for name in ("inclination", "toolface")))
 """Columns that readings tell; azimuths may count from another north."""
 _MOST_TRIES = 24
 """Answers to open questions, in all their combinations, that are tried."""
@@ -385,14 +385,14 @@ _CONFIRMED = 0.1
 """Largest share of the channels' variation that answers leave which readings confirm."""
 
 
-def _told_by_readings(
+def _answer_by_readings(
     error: QuestionError | QuestionsError,
     propose_with: Callable[[Mapping[str, str]], Proposal],
     said: Mapping[str, str],
 ) -> Proposal | None:
     """The proposal by the only answers to open questions that the readings fit; None where others fit, or none do."""
     questions = error.questions if isinstance(error, QuestionsError) else (error,)
-    choices = [[answer for answer in each.answers if _is_told(answer)] for each in questions]
+    choices = [[answer for answer in each.answers if _is_of_readings(answer)] for each in questions]
     if not all(choices) or prod(map(len, choices)) > _MOST_TRIES:
         return None
     fits = []
@@ -410,15 +410,15 @@ def _told_by_readings(
         return None
     proposal, chosen = fits[0]
     texts = [", ".join(text for _, text in answer.arguments) for answer in chosen]
-    return proposal._replace(told=tuple(texts))
+    return proposal._replace(by_readings=tuple(texts))
 
 
-def _is_told(answer: Answer) -> bool:
+def _is_of_readings(answer: Answer) -> bool:
     """Whether an answer names columns that the readings tell, or an azimuth by a mistyped name."""
     pairs = [text.partition("=") for argument, text in answer.arguments if argument == "column"]
     azimuth = REFERENCES["azimuth"].column
     return len(pairs) == len(answer.arguments) and all(
-        name and (column in _TOLD_BY_READINGS or (column == azimuth and is_near(column, name)))
+        name and (column in _OF_READINGS or (column == azimuth and is_near(column, name)))
         for column, _, name in pairs
     )
 
@@ -838,15 +838,15 @@ def references_not_taken(proposal: Proposal) -> list[Finding]:
     ]
 
 
-def told_by_readings(proposal: Proposal) -> list[Finding]:
+def answers_by_readings(proposal: Proposal) -> list[Finding]:
     """A finding on what the names of a table leave open and the readings answer."""
     return [
         Finding(
             id="told-by-readings",
-            text=f"The names leave open what is {shown(text.partition('=')[2])}. The readings fit {text} and nothing "
-            "else. If it is something else, say so by `column`.",
+            text=f"The names leave it open, and the readings fit one answer alone: {text}. If it is another, say so by "
+            "`column`.",
         )
-        for text in proposal.told
+        for text in proposal.by_readings
     ]
 
 
@@ -860,11 +860,13 @@ def units_contradicted(proposal: Proposal) -> list[Finding]:
         scale = getattr(proposal.profile, kind).scale if kind in proposal.wirings else None
         if not channel or not scale or channel.unit not in (base, *FACTORS):
             continue
+        if (kind, channel.unit) == ("accelerometer", "mG"):
+            channel = msgspec.structs.replace(channel, unit="mg")
         per_unit = 1 / FACTORS.get(channel.unit, (1.0, 0.0))[0]
         if abs(np.log(scale / per_unit)) > OFF_UNIT:
             text = (
-                f"{kind}: by its names it is in {channel.unit}, {per_unit:g} to a {base}, and by the readings and "
-                f"references {scale:g} are. It is used in the scale of the readings. Check the unit and the references."
+                f"{kind}: by its names {channel.unit}, of which {per_unit:g} make a {base}; by readings and references "
+                f"{scale:g} do. It is used in the scale of the readings. Check the unit and the references."
             )
             findings.append(Finding(id="unit-contradicted", text=text))
     return findings
@@ -878,7 +880,7 @@ def findings_on(proposal: Proposal) -> list[Finding]:
     ]
     marked = [Finding(id=MARKED_ROWS, text=text) for text in proposal.remarks]
     known = axes_open(proposal) + left_handed(proposal) + references_not_taken(proposal) + marked
-    known += told_by_readings(proposal) + units_contradicted(proposal)
+    known += answers_by_readings(proposal) + units_contradicted(proposal)
     return known + ignored + unused_columns(proposal.unused)
 
 
