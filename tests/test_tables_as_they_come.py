@@ -415,6 +415,18 @@ def test_az_beside_az_g_is_the_azimuth_in_calibrate_too(tmp_path):
     )
 
 
+def test_components_that_the_stand_states_are_no_channels(tmp_path):
+    """Beside reference vectors the channels are those that the tool has measured."""
+    run = servo_run()
+    channels = {f"meas_{'gb'[n[0] == 'm']}{n[1]}": run[n] for n in channels_of(run)}
+    vectors = {f"ref_{n[5:]}": np.round(v / 3, 2) for n, v in channels.items() if n[5] == "g"}
+    others = {n: v for n, v in table().items() if n[0] not in "GH"}
+    run = read(written(tmp_path / "a.csv", {**vectors, **others, **channels}))
+    whole = read(written(tmp_path / "b.csv", table()))
+    np.testing.assert_array_equal(run.accelerometer, whole.accelerometer)
+    np.testing.assert_array_equal(run.magnetometer, whole.magnetometer)
+
+
 def test_a_comment_behind_a_unit_says_nothing_else(tmp_path):
     columns = {("Roll (deg, highside)" if n == "TF (deg)" else n): v for n, v in table().items()}
     run = read(written(tmp_path / "a.csv", columns))

@@ -231,6 +231,8 @@ _MEASURED = re.compile(
     re.IGNORECASE,
 )
 """Words of angles that the tool itself has measured: no references."""
+_OF_CHANNELS = re.compile(r"\b(measured|meas|gemessen|ist)\b", re.IGNORECASE)
+"""Those that say nothing more of a channel."""
 _OTHER_NORTH = re.compile(
     r"true|grid|geogr|wahr|gitter|rechtweisend|[qc]uadr[ií]cula|verdadero|verdadeiro|istinn|kartnord|истин|сетк|географ|géogr|真|坐标北|网格",
     re.IGNORECASE,
@@ -298,14 +300,23 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     alike = (
         resembled(plain) or _without_title(plain) or resembled(f"{name} ({unit})" if unit else name)
     )
+    if alike and alike.column in RAW and _CALLED_REFERENCE.search(plain):
+        return None  # a component that the stand states, not the tool
     if _MEASURED.search(plain) and not (alike and alike.column == WARMTH):
-        return None
+        return _measured_channel(plain)
     near = {form: column for column in MAPPED for form in forms(column)}
     spelt = next((near[form] for form in forms(plain) if form in near), None)
     stated = IN_BRACKETS.search(plain)
     if alike and alike.column == REFERENCES["azimuth"].column and alike.unit.startswith("mag"):
         return alike._replace(unit="")
     return alike or (Resemblance(spelt, unit_of(stated[1]) if stated else "") if spelt else None)
+
+
+def _measured_channel(name: str) -> Resemblance | None:
+    """The channel that a name is but for a word that says so: meas_gx."""
+    bare = _OF_CHANNELS.sub("", name)
+    alike = resembled(bare) if bare != name else None
+    return alike if alike and alike.column in RAW else None
 
 
 def _two_units(name: str, unit: str) -> str:
