@@ -421,10 +421,34 @@ def test_components_that_the_stand_states_are_no_channels(tmp_path):
     channels = {f"meas_{'gb'[n[0] == 'm']}{n[1]}": run[n] for n in channels_of(run)}
     vectors = {f"ref_{n[5:]}": np.round(v / 3, 2) for n, v in channels.items() if n[5] == "g"}
     others = {n: v for n, v in table().items() if n[0] not in "GH"}
+    vectors.popitem()  # two components are no vector
     run = read(written(tmp_path / "a.csv", {**vectors, **others, **channels}))
     whole = read(written(tmp_path / "b.csv", table()))
     np.testing.assert_array_equal(run.accelerometer, whole.accelerometer)
     np.testing.assert_array_equal(run.magnetometer, whole.magnetometer)
+
+
+@pytest.mark.parametrize(("unit", "per_nt"), [("nT", 1.0), ("A/m", 1 / (400 * np.pi))])
+def test_reference_vectors_are_the_angles_and_strengths_of_the_stand(tmp_path, unit, per_nt):
+    """Components along the tool axes, by the definition of inclination, azimuth and toolface."""
+    run = servo_run()
+    i, a, t = (np.radians(run[n]) for n in ANGLES)
+    dip = np.radians(run["ref_dip_deg"])
+    down = np.array([-np.sin(i) * np.sin(t), -np.sin(i) * np.cos(t), np.cos(i)])
+    ca, sa, ct, st = np.cos(a), np.sin(a), np.cos(t), np.sin(t)
+    north = np.array([ca * np.cos(i) * st + sa * ct, ca * np.cos(i) * ct - sa * st, ca * np.sin(i)])
+    gravity = run["ref_gravity_g"] * down
+    field = run["ref_field_nt"] * (np.cos(dip) * north + np.sin(dip) * down)
+    vectors = {f"ref_g{n} (g)": gravity[k] for k, n in enumerate("xyz")}
+    vectors |= {f"ref_b{n} ({unit})": field[k] * per_nt for k, n in enumerate("xyz")}
+    stand = dict.fromkeys((*ANGLES, *PLACE))
+    vectored = read(written(tmp_path / "a.csv", table(**stand, **vectors)))
+    whole = read(written(tmp_path / "b.csv", table()))
+    for name in ("inclination", "azimuth", "toolface", "gravity", "field", "dip"):
+        difference = vectored.reference(name) - whole.reference(name)
+        turned = (difference + np.pi) % (2 * np.pi) - np.pi
+        off = difference if name in ("gravity", "field") else turned
+        assert np.abs(off).max() < 1e-9 * max(1.0, np.abs(whole.reference(name)).max()), name
 
 
 def test_a_comment_behind_a_unit_says_nothing_else(tmp_path):

@@ -10,7 +10,16 @@ from typing import Any
 import numpy as np
 
 from mwdcal.errors import Answer, InputError, QuestionError, QuestionsError
-from mwdcal.files.contract import CHANNELS, MAPPED, RAW, REFERENCES, forms, units_of
+from mwdcal.files.contract import (
+    CHANNELS,
+    MAPPED,
+    RAW,
+    REFERENCES,
+    VECTORS,
+    forms,
+    of_vectors,
+    units_of,
+)
 from mwdcal.files.formats.columns import LABELS, shown
 from mwdcal.files.profiles import setting
 from mwdcal.files.synonyms import (
@@ -301,7 +310,7 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
         resembled(plain) or _without_title(plain) or resembled(f"{name} ({unit})" if unit else name)
     )
     if alike and alike.column in RAW and _CALLED_REFERENCE.search(plain):
-        return None  # a component that the stand states, not the tool
+        return alike._replace(column=VECTORS[RAW.index(alike.column)])
     if _MEASURED.search(plain) and not (alike and alike.column == WARMTH):
         return _measured_channel(plain)
     near = {form: column for column in MAPPED for form in forms(column)}
@@ -457,7 +466,7 @@ def proposed(
         FitError: columns of which each may be one of the run file's, a unit that neither name nor
             values tell, azimuths from true or grid north, no accelerometer: all that is open.
     """
-    meanings = meanings_of(names, units)
+    meanings = _with_whole_vectors(meanings_of(names, units))
     _tell_dip(meanings, values)
     _tell_temperature(meanings, names, units, values)
     said, known = answers or {}, stated or {}
@@ -484,14 +493,22 @@ def proposed(
         others = [n for n in names if n not in meanings and n not in believed]
         questions.ask(_check_nameless, others, values, {*chosen, *known}, source)
     rest = {n: u for n, u in zip(names, units, strict=True) if n not in meanings}
-    lacking = [*lacking_references({*chosen, *said, *known}), *BY_NAME_ALONE]
-    for column in (each for each in lacking if each not in {*chosen, *said, *known}):
+    present = {*chosen, *said, *known, *of_vectors(chosen)}
+    lacking = [*lacking_references(present), *BY_NAME_ALONE]
+    for column in (each for each in lacking if each not in present):
         questions.ask(_check_lacking, column, rest, values, source)
     questions.raise_any(source)
     by_value = {c for c, each in chosen.items() if each.unit and not meanings[each.name].unit}
     used = {each.name for each in chosen.values()}
     ignored = {name: reason for name, reason in ignored.items() if name not in used}
     return _labels(names, chosen) | chosen, by_value, ignored
+
+
+def _with_whole_vectors(meanings: dict[str, Resemblance]) -> dict[str, Resemblance]:
+    """Columns by what they hold, without components of a vector of which others are absent."""
+    called = {m.column for m in meanings.values()}
+    whole = [c for part in (VECTORS[:3], VECTORS[3:]) if {*part} <= called for c in part]
+    return {n: m for n, m in meanings.items() if m.column not in VECTORS or m.column in whole}
 
 
 def _chosen(
