@@ -1087,7 +1087,6 @@ def bergen_soak_sheets() -> Laboratory:
     return laboratory(
         "bergen_tre_temperaturer.xlsx", layouts[0], facts(run, a, m), sheets=more, at=0, sheet="25C",
         trap="one sheet per temperature (truth: the three one after the other)",
-        question="which of the sheets 25C, 80C and 120C, or all as one run",
     )  # fmt: skip
 
 

@@ -206,7 +206,6 @@ def test_sheets_that_are_parts_of_one_run_are_joined(tmp_path, sheets, first):
     ("sheets", "numbers"),
     [
         (("as found", "as left"), range(1, 49)),
-        (("Calibration", "Roll test"), range(1, 49)),
         (("Run 1", "Run 2"), [*range(1, 25), *range(1, 25)]),
         (("DM-1187", "DM-1203"), [*range(1, 25), *range(1, 25)]),
     ],
@@ -245,12 +244,241 @@ def test_a_number_of_a_workbook_has_no_separators_whatever_the_sign_of_its_texts
     np.testing.assert_allclose(run.accelerometer, whole.accelerometer, rtol=0, atol=1e-9)
 
 
+# ------------------------------------------------------------ answers that the readings give
+
+
+def findings_of(proposal):
+    """The texts of the findings on a proposal by id."""
+    texts = {}
+    for each in proposal.findings:
+        texts[each.id] = f"{texts.get(each.id, '')} {each.text}".strip()
+    return texts
+
+
+def mixed(columns, seed=1):
+    """The rows of a table in another order: toolfaces in equal steps may be numbers of rows."""
+    order = np.random.default_rng(seed).permutation(48)
+    return {name: [*np.asarray(values)[order]] for name, values in columns.items()}
+
+
+@pytest.mark.parametrize("name", ["Kolbo (°)", "Tollface (°)"])
+def test_a_toolface_of_another_name_is_told_by_the_readings_and_named(tmp_path, name):
+    columns = {(name if n == "TF (deg)" else n): v for n, v in mixed(table()).items()}
+    path = written(tmp_path / "a.csv", columns)
+    proposal = library.propose_profile(path)
+    assert f"ref_toolface_deg={name}" in findings_of(proposal)["told-by-readings"]
+    toolface = np.degrees(library.read_run(path, proposal.profile).reference("toolface"))
+    assert toolface == pytest.approx(columns[name])
+    plain = written(tmp_path / "b.csv", mixed(table()))
+    assert "told-by-readings" not in findings_of(library.propose_profile(plain))
+
+
+def test_what_the_readings_do_not_fit_is_asked(tmp_path):
+    """Rolls that have nothing to do with the readings, and two columns that fit as well."""
+    columns = mixed(table())
+    face = np.array(columns.pop("TF (deg)"))
+    for others in (
+        {"Kolbo (°)": np.random.default_rng(3).permutation(face)},
+        {"Kolbo (°)": face, "Kolbu (°)": face + 0.01},
+    ):
+        path = written(tmp_path / "a.csv", {**columns, **others})
+        message = refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
+        assert "no column is 'ref_toolface_deg' by its name" in message
+
+
+def test_an_azimuth_of_another_name_is_asked_since_it_may_count_from_another_north(tmp_path):
+    columns = {("Kolbo (°)" if n == "Azi (deg)" else n): v for n, v in mixed(table()).items()}
+    path = written(tmp_path / "a.csv", columns)
+    message = refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
+    assert "no column is 'ref_azimuth_deg' by its name" in message
+    columns = {("Azmi (deg)" if n == "Azi (deg)" else n): v for n, v in table().items()}
+    proposal = library.propose_profile(written(tmp_path / "b.csv", columns))
+    assert "ref_azimuth_deg=Azmi (deg)" in findings_of(proposal)["told-by-readings"]
+
+
+def test_radians_under_degrees_are_told_by_the_readings(tmp_path):
+    columns = table(ref_toolface_deg=np.radians(servo_run()["ref_toolface_deg"]))
+    path = written(tmp_path / "a.csv", columns)
+    proposal = library.propose_profile(path)
+    assert "TF (deg) (rad)" in findings_of(proposal)["told-by-readings"]
+    toolface = np.degrees(library.read_run(path, proposal.profile).reference("toolface"))
+    assert toolface == pytest.approx(servo_run()["ref_toolface_deg"])
+
+
+@pytest.mark.parametrize(("factor", "contradicted"), [(1.0, False), (1e-3, True), (0.9, True)])
+def test_a_unit_that_the_readings_contradict_is_named(tmp_path, factor, contradicted):
+    """Under nT there are µT, or a field that is a tenth too small."""
+    run = servo_run()
+    names = {"Hx (V)": None, "Hy (V)": None, "Hz (V)": None}
+    channels = {f"B{i} (nT)": run[f"m{i}"] / 5e-5 * factor for i in "xyz"}
+    columns = {n: v for n, v in table().items() if n not in names} | channels
+    findings = findings_of(library.propose_profile(written(tmp_path / "a.csv", columns)))
+    assert ("unit-contradicted" in findings) == contradicted
+    if contradicted:
+        assert (
+            "magnetometer: by its names nT, of which 1 make a nT" in findings["unit-contradicted"]
+        )
+
+
+def test_a_total_that_is_computed_in_another_unit_is_no_reference(tmp_path):
+    run = servo_run()
+    total = 1000 * np.linalg.norm([run[n] for n in ("ax", "ay", "az")], axis=0) / 3
+    path = written(
+        tmp_path / "a.csv", table(ref_gravity_g=None, **{"|G| (mg)": np.round(total, 2)})
+    )
+    proposal = library.propose_profile(path)
+    assert "'|G| (mg)' is not used: it is computed" in findings_of(proposal)["not-used"]
+
+
+# ---------------------------------------------------------------------- rows and cells of a run
+
+
+def test_a_number_of_nines_among_others_like_it_is_a_reading(tmp_path):
+    """999 mg beside 998 and 1001 mg; 999 far from all others stands for no reading."""
+    mg = {n: np.round(servo_run()[n] / 3 * 1000, 1) for n in ("ax", "ay", "az")}
+    mg["az"][np.argsort(np.abs(mg["az"] - 999))[0]] = 999
+    mg["az"][np.argmax(mg["az"])] = 1003
+    path = written(tmp_path / "a.csv", table(**mg))
+    assert read(path).count == 48
+    mg["az"][5] = 9999
+    path = written(tmp_path / "b.csv", table(**mg))
+    assert "got '9999" in refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
+
+
+def test_blank_angles_of_the_stand_are_named(tmp_path):
+    cells = [f"{v:.2f}" for v in servo_run()["ref_inclination_deg"]]
+    path = written(tmp_path / "a.csv", table(ref_inclination_deg=[*cells[:7], "", *cells[8:]]))
+    assert "line 9 ('Inc (deg)')" in findings_of(library.propose_profile(path))["marked-rows"]
+
+
+def test_rows_of_another_tool_below_the_table_are_left_out_and_named(tmp_path):
+    lines = write_csv(tmp_path / "a.csv", table()).read_text().splitlines()
+    other = [line.replace(line.split(",")[1], "20.0", 1) for line in lines[1:9]]
+    path = tmp_path / "b.csv"
+    path.write_text("\n".join(["Tool S/N DM-17", *lines, "Tool S/N ZZ-2", *other]))
+    proposal = library.propose_profile(path)
+    assert library.read_run(path, proposal.profile).count == 48
+    assert "left out: line 51 (Tool S/N ZZ-2)" in proposal.summary()
+
+
+@pytest.mark.parametrize(
+    "heading", ["Roll test after calibration", "Контрольное вращение", "Verifikation"]
+)
+def test_a_roll_test_below_the_run_is_set_aside_and_named(tmp_path, heading):
+    lines = write_csv(tmp_path / "a.csv", table()).read_text().splitlines()
+    path = tmp_path / "b.csv"
+    path.write_text("\n".join(["Calibration", *lines, "", heading, *lines[:13]]))
+    proposal = library.propose_profile(path)
+    assert library.read_run(path, proposal.profile).count == 48
+    assert "(roll test, 12 rows)" in proposal.summary()
+
+
+def test_a_sheet_of_a_roll_test_is_set_aside_and_named(tmp_path):
+    path = workbook_of(
+        tmp_path / "a.xlsx", table(station=[*range(1, 49)]), ["Calibration", "Roll test"]
+    )
+    proposal = library.propose_profile(path)
+    assert library.read_run(path, proposal.profile).count == 24
+    assert "sheet 'Calibration'" in proposal.summary()
+    assert "(roll test, 24 rows)" in proposal.summary()
+
+
+def formulas(columns, name):
+    """Formulas in a column that no spreadsheet program has calculated."""
+    return {**columns, name: [f"=C{k + 2}+1" for k in range(48)]}
+
+
+def test_formulas_without_a_value_matter_only_where_they_are_needed(tmp_path):
+    path = workbook_of(tmp_path / "a.xlsx", formulas(table(), "Gtot"), ["Data"])
+    proposal = library.propose_profile(path)
+    assert "'Gtot' is not used: its formulas have no value" in findings_of(proposal)["not-used"]
+    assert library.read_run(path, proposal.profile).count == 48
+    one = table()
+    one["Gy (V)"] = [*one["Gy (V)"][:9], "=C2+1", *one["Gy (V)"][10:]]
+    path = workbook_of(tmp_path / "b.xlsx", one, ["Data"])
+    assert "got '=C2+1'" in refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
+    path = workbook_of(tmp_path / "c.xlsx", formulas(table(), "Gx (V)"), ["Data"])
+    message = refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
+    assert "could not tell which columns are the accelerometers (ax)" in message
+
+
+def test_az_beside_az_g_is_the_azimuth_in_calibrate_too(tmp_path):
+    run = servo_run()
+    columns = {n: v for n, v in table().items() if n[0] not in "GA"}
+    columns |= {"az": run["ref_azimuth_deg"], **{f"a{i}_g": run[f"a{i}"] for i in "xyz"}}
+    path = written(tmp_path / "a.csv", columns)
+    ran, _ = calibrated(tmp_path, path)
+    assert "48 stations" in ran.out
+    azimuth = np.degrees(read(path).reference("azimuth"))
+    assert (azimuth - run["ref_azimuth_deg"] + 180) % 360 - 180 == pytest.approx(
+        np.zeros(48), abs=1e-9
+    )
+
+
+def test_components_that_the_stand_states_are_no_channels(tmp_path):
+    """Beside reference vectors the channels are those that the tool has measured."""
+    run = servo_run()
+    channels = {f"meas_{'gb'[n[0] == 'm']}{n[1]}": run[n] for n in channels_of(run)}
+    vectors = {f"ref_{n[5:]}": np.round(v / 3, 2) for n, v in channels.items() if n[5] == "g"}
+    others = {n: v for n, v in table().items() if n[0] not in "GH"}
+    vectors.popitem()  # two components are no vector
+    run = read(written(tmp_path / "a.csv", {**vectors, **others, **channels}))
+    whole = read(written(tmp_path / "b.csv", table()))
+    np.testing.assert_array_equal(run.accelerometer, whole.accelerometer)
+    np.testing.assert_array_equal(run.magnetometer, whole.magnetometer)
+
+
+@pytest.mark.parametrize(("unit", "per_nt"), [("nT", 1.0), ("A/m", 1 / (400 * np.pi))])
+def test_reference_vectors_are_the_angles_and_strengths_of_the_stand(tmp_path, unit, per_nt):
+    """Components along the tool axes, by the definition of inclination, azimuth and toolface."""
+    run = servo_run()
+    i, a, t = (np.radians(run[n]) for n in ANGLES)
+    dip = np.radians(run["ref_dip_deg"])
+    down = np.array([-np.sin(i) * np.sin(t), -np.sin(i) * np.cos(t), np.cos(i)])
+    ca, sa, ct, st = np.cos(a), np.sin(a), np.cos(t), np.sin(t)
+    north = np.array([ca * np.cos(i) * st + sa * ct, ca * np.cos(i) * ct - sa * st, ca * np.sin(i)])
+    gravity = run["ref_gravity_g"] * down
+    field = run["ref_field_nt"] * (np.cos(dip) * north + np.sin(dip) * down)
+    vectors = {f"ref_g{n} (g)": gravity[k] for k, n in enumerate("xyz")}
+    vectors |= {f"ref_b{n} ({unit})": field[k] * per_nt for k, n in enumerate("xyz")}
+    stand = dict.fromkeys((*ANGLES, *PLACE))
+    vectored = read(written(tmp_path / "a.csv", table(**stand, **vectors)))
+    whole = read(written(tmp_path / "b.csv", table()))
+    for name in ("inclination", "azimuth", "toolface", "gravity", "field", "dip"):
+        difference = vectored.reference(name) - whole.reference(name)
+        turned = (difference + np.pi) % (2 * np.pi) - np.pi
+        off = difference if name in ("gravity", "field") else turned
+        assert np.abs(off).max() < 1e-9 * max(1.0, np.abs(whole.reference(name)).max()), name
+
+
+def test_a_comment_behind_a_unit_says_nothing_else(tmp_path):
+    columns = {("Roll (deg, highside)" if n == "TF (deg)" else n): v for n, v in table().items()}
+    run = read(written(tmp_path / "a.csv", columns))
+    assert np.degrees(run.reference("toolface")) == pytest.approx(servo_run()["ref_toolface_deg"])
+
+
+MORE_TITLES = (
+    ([["Inclinazione magnetica (gon)", "68,000"], ["g locale (m/s2)", "9,80665"]],
+     {"ref_dip_deg": 61.2, "ref_gravity_g": 1.0}),
+    ([["地磁总场nT", "50110"]], {"ref_field_nt": 50_110.0}),
+    ([["Feld (µT)", 48.77]], {"ref_field_nt": 48_770.0}),
+    ([["field 50050 nT, dip 67.8 deg, nominal 2500 mV/g"]], {"ref_field_nt": 50_050.0, "ref_dip_deg": 67.8}),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("rows", "place"), MORE_TITLES)
+def test_more_words_of_a_title_block(rows, place):
+    assert references_in(rows) == pytest.approx(place, rel=1e-12)
+
+
 DECLINATIONS = (
     (["Declination: -1.62 deg"], -1.62),
     (["Declination", -1.62, "deg (E +)"], -1.62),
     (["Declination 3.4 W"], -3.4),
     (["Deklination 3,4° W"], -3.4),
     (["Магнитное склонение: +13,30° (восточное)"], 13.3),
+    (["Déclinaison (°, est +)", "", 1.42], 1.42),
+    (["Declination (° W +)", 1.42], -1.42),
 )
 
 
@@ -417,9 +645,9 @@ def test_names_that_stand_twice_are_told_apart(tmp_path):
     path = tmp_path / "a.csv"
     with path.open("w", newline="") as stream:
         csv.writer(stream).writerows([names, *zip(*columns, strict=True)])
-    message = refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
-    assert "--column ax=X --column ay=Y --column az=Z" in message
-    assert "--column 'mx=X (2)' --column 'my=Y (2)' --column 'mz=Z (2)'" in message
+    proposal = library.propose_profile(path)
+    assert "ax=X, ay=Y, az=Z" in findings_of(proposal)["told-by-readings"]
+    assert "mx=X (2), my=Y (2), mz=Z (2)" in findings_of(proposal)["told-by-readings"]
     answers = dict(zip(channels_of(run), ["X", "Y", "Z", "X (2)", "Y (2)", "Z (2)"], strict=True))
     result = read(path, column=answers)
     assert result.magnetometer is not None
@@ -437,8 +665,7 @@ def channels_of(run):
     ("name", "meant"),
     [
         ("Dpi", "ref_dip_deg"), ("Inklinatoin", "ref_dip_deg"), ("Btotall", "ref_field_nt"),
-        ("Totalfedl", "ref_field_nt"), ("Azmi", "ref_azimuth_deg"), ("Tmep", "temperature_c"),
-        ("Garvity", "ref_gravity_g"),
+        ("Totalfedl", "ref_field_nt"), ("Tmep", "temperature_c"), ("Garvity", "ref_gravity_g"),
     ],
 )  # fmt: skip
 def test_a_mistyped_name_is_asked_about(tmp_path, name, meant):
@@ -476,7 +703,6 @@ def test_units_that_contradict_each_other_are_both_named(tmp_path):
     [
         ("ref_field_nt", 1e-3, "nT", "µT"),
         ("ref_gravity_g", 9.80665, "g", "m/s²"),
-        ("ref_toolface_deg", np.pi / 180, "°", "rad"),
     ],
 )
 def test_values_that_contradict_their_unit_are_asked_about(tmp_path, column, factor, stated, fits):
@@ -521,13 +747,17 @@ def test_a_wrong_cell_of_a_workbook_is_named_as_the_program_names_it(tmp_path):
     assert f"sheet 'Roll test', cell {place}, column 'Gy (V)'" in message
 
 
-def test_magnetometers_of_unknown_names_with_an_offset_are_asked_about(tmp_path):
+def test_magnetometers_of_unknown_names_with_an_offset_are_told_and_named(tmp_path):
     """The norm of channels that read 2.5 V at no field is not steady; their distance from the middle is."""
     run = servo_run()
     others = {f"CH{k} (V)": run[n] + 2.5 for k, n in enumerate(("mx", "my", "mz"), 5)}
     path = written(tmp_path / "a.csv", table(mx=None, my=None, mz=None, **others))
-    message = refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
-    assert "--column 'mx=CH5 (V)' --column 'my=CH6 (V)' --column 'mz=CH7 (V)'" in message
+    proposal = library.propose_profile(path)
+    assert "mx=CH5 (V), my=CH6 (V), mz=CH7 (V)" in findings_of(proposal)["told-by-readings"]
+    rows = read(path, column={"mx": "CH5 (V)", "my": "CH6 (V)", "mz": "CH7 (V)"})
+    np.testing.assert_array_equal(
+        library.read_run(path, proposal.profile).magnetometer, rows.magnetometer
+    )
 
 
 WORDS = {

@@ -100,12 +100,14 @@ RANGES = {
 }
 """The columns of numbers, and their accepted values."""
 COLUMNS = ("station", "group", *RANGES)
-MAPPED = (*COLUMNS, "serial")
+VECTORS = tuple(f"ref_{name}_{'g' if name[0] == 'a' else 'nt'}" for name in RAW)
+"""Components along the tool axes of gravity and field as the stand states them, instead of angles and strengths."""
+MAPPED = (*COLUMNS, "serial", *VECTORS)
 """Columns that a table may have under another name."""
 _UNITS_BY_END = {
     "deg": ("°", "rad", "gon"),
     "g": ("g", "mg", "m/s²", "gal", "mGal"),
-    "nt": ("nT", "µT", "mT", "gauss", "mG"),
+    "nt": ("nT", "µT", "mT", "gauss", "mG", "A/m"),
     "c": ("°C", "°F", "K"),
 }
 """The units of a quantity by the end of its column's name, that of the contract first."""
@@ -115,11 +117,19 @@ _UNIT = re.compile(
 )
 
 
+def of_vectors(columns: Collection[str]) -> list[str]:
+    """References that the components among some columns give: of gravity alone, or of both fields."""
+    gravity, field = ({*part} <= {*columns} for part in (VECTORS[:3], VECTORS[3:]))
+    names = ("inclination", "toolface", "gravity") if gravity else ()
+    more = ("azimuth", "field", "dip") if gravity and field else ()
+    return [REFERENCES[name].column for name in (*names, *more)]
+
+
 def units_of(column: str) -> tuple[str, ...]:
     """The units that a column may be given in, that of the contract first; any for a raw channel.
 
     >>> units_of("ref_field_nt")
-    ('nT', 'µT', 'mT', 'gauss', 'mG')
+    ('nT', 'µT', 'mT', 'gauss', 'mG', 'A/m')
     >>> units_of("ax")
     ()
     """

@@ -32,6 +32,7 @@ from mwdcal.files.contract import (
     RANGES,
     RAW,
     REFERENCES,
+    VECTORS,
     Cells,
     Range,
     check_columns,
@@ -40,6 +41,7 @@ from mwdcal.files.contract import (
     faults_beside_readings,
     is_blank,
     magnetic_offset,
+    of_vectors,
     refuse,
     units_of,
 )
@@ -51,6 +53,7 @@ from mwdcal.files.formats.table import Table, labels
 from mwdcal.files.formats.text import holds_numbers, is_formula
 from mwdcal.files.marks import UNMARKED, without_rejected
 from mwdcal.files.statements import stated_table
+from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import ColumnSource, Profile, TableFormat, TriadProfile
 
@@ -328,7 +331,7 @@ def renamed(table: Table, profile: Profile) -> Table:
                 f"{table.source}: the column {shown(source.name)}, which is '{column}' by the tool profile, "
                 "is missing. Correct [columns] in the profile."
             )
-        if column in table.columns and source.name != column:
+        if column in table.columns and source.name != column and column not in theirs:
             raise InputError(
                 f"{table.source}: '{column}' is a column of the table, and {shown(source.name)} is '{column}' by "
                 "the tool profile. Correct [columns] in the profile, or name the former under ignore in [table] there."
@@ -345,7 +348,25 @@ def renamed(table: Table, profile: Profile) -> Table:
             values = tables.numbers(table, name)
             columns[column] = values * factor + offset if (factor, offset) != (1.0, 0.0) else values
     places = {theirs.get(name, name): place for name, place in table.places.items()}
+    columns = _with_angles(columns)
     return _with_stated_references(replace(table, columns=columns, places=places))
+
+
+def _with_angles(columns: dict[str, Column]) -> dict[str, Column]:
+    """Angles and strengths instead of the components of gravity and field that the stand states, where it has none."""
+    given = of_vectors(columns)
+    if not given:
+        return columns
+    parts = [np.asarray(columns[name], float) for name in VECTORS if name in columns]
+    g = np.stack(parts[:3], -1)
+    b = np.stack(parts[3:], -1) if len(parts) == len(RAW) else g
+    names = [name for name, each in REFERENCES.items() if each.column in given]
+    values = {name: OBSERVABLES[name].value(g, b) for name in names}
+    angles = {
+        REFERENCES[n].column: v if n in ("gravity", "field") else np.degrees(v)
+        for n, v in values.items()
+    }
+    return angles | {name: cells for name, cells in columns.items() if name not in VECTORS}
 
 
 def _with_stated_references(table: Table) -> Table:

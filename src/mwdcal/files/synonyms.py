@@ -36,6 +36,7 @@ _SPELLINGS = {
     "mT": "millit",
     "gauss": "gauss oersted",
     "mG": "milligauss",
+    "A/m": "apm",
     "gon": "gon gons",
     "V": "v",
     "mV": "mv",
@@ -58,6 +59,7 @@ CONVERSIONS = {
     "mT": "nT = mT · 1e6",
     "gauss": "nT = gauss · 1e5",
     "mG": "nT = mG · 100",
+    "A/m": "nT = A/m · 400π",
     "gon": "° = gon · 0.9",
     ABOVE: f"° = {ABOVE} + 90",
     BELOW: f"° = 90 - {BELOW}",
@@ -76,6 +78,7 @@ FACTORS = {
     "mT": (1e6, 0.0),
     "gauss": (1e5, 0.0),
     "mG": (1e2, 0.0),
+    "A/m": (400 * math.pi, 0.0),
     "gon": (0.9, 0.0),
     ABOVE: (1.0, 90.0),
     BELOW: (-1.0, 90.0),
@@ -83,7 +86,7 @@ FACTORS = {
 }
 """The same in numbers: factor, and what is added to the product."""
 _WARM = ("°C", "°F", "K")
-_MAGNETIC_UNITS = ("nT", "µT", "mT", "gauss", "mG")
+_MAGNETIC_UNITS = ("nT", "µT", "mT", "gauss", "mG", "A/m")
 _GRAVITY_UNITS = ("g", "mg", "m/s²", "gal", "mGal")
 WARMTH = "temperature_c"
 _STATED = {"ref", "reference", "local", "model", "igrf", "bggm", "wmm"}
@@ -262,6 +265,7 @@ _CASED = {
     "mG": " milligauss ",
     "mGal": " mgal ",
     "mg": " millig ",
+    "мg": " millig ",
 }
 
 
@@ -380,8 +384,8 @@ def begins_as(name: str) -> str:
 def unit_of(text: str) -> str:
     """The unit that a text is, empty if it is not a unit.
 
-    >>> [unit_of(text) for text in ("deg", "°F", "m/s²", "mg", "x")]
-    ['°', '°F', 'm/s²', 'mg', '']
+    >>> [unit_of(text) for text in ("deg", "°F", "m/s²", "mg", "мg", "A/m", "x")]
+    ['°', '°F', 'm/s²', 'mg', 'mg', 'A/m', '']
     """
     words = _words(text)
     return _UNITS[words[-1]] if words and set(words) <= {*_UNITS} else ""

@@ -10,7 +10,16 @@ from typing import Any
 import numpy as np
 
 from mwdcal.errors import Answer, InputError, QuestionError, QuestionsError
-from mwdcal.files.contract import CHANNELS, MAPPED, RAW, REFERENCES, forms, units_of
+from mwdcal.files.contract import (
+    CHANNELS,
+    MAPPED,
+    RAW,
+    REFERENCES,
+    VECTORS,
+    forms,
+    of_vectors,
+    units_of,
+)
 from mwdcal.files.formats.columns import LABELS, shown
 from mwdcal.files.profiles import setting
 from mwdcal.files.synonyms import (
@@ -231,8 +240,10 @@ _MEASURED = re.compile(
     re.IGNORECASE,
 )
 """Words of angles that the tool itself has measured: no references."""
+_OF_CHANNELS = re.compile(r"\b(measured|meas|gemessen|ist)\b", re.IGNORECASE)
+"""Those that say nothing more of a channel."""
 _OTHER_NORTH = re.compile(
-    r"true|grid|geogra|wahr|gitter|rechtweisend|[qc]uadr[ií]cula|verdadero|verdadeiro|istinn|kartnord|истин|сетк|географ|真|坐标北|网格",
+    r"true|grid|geogr|wahr|gitter|rechtweisend|[qc]uadr[ií]cula|verdadero|verdadeiro|istinn|kartnord|истин|сетк|географ|géogr|真|坐标北|网格",
     re.IGNORECASE,
 )
 _GRID_NORTH = re.compile(r"grid|gitter|[qc]uadr[ií]cula|kartnord|сетк|坐标北|网格", re.IGNORECASE)
@@ -298,12 +309,23 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     alike = (
         resembled(plain) or _without_title(plain) or resembled(f"{name} ({unit})" if unit else name)
     )
+    if alike and alike.column in RAW and _CALLED_REFERENCE.search(plain):
+        return alike._replace(column=VECTORS[RAW.index(alike.column)])
     if _MEASURED.search(plain) and not (alike and alike.column == WARMTH):
-        return None
+        return _measured_channel(plain)
     near = {form: column for column in MAPPED for form in forms(column)}
     spelt = next((near[form] for form in forms(plain) if form in near), None)
     stated = IN_BRACKETS.search(plain)
+    if alike and alike.column == REFERENCES["azimuth"].column and alike.unit.startswith("mag"):
+        return alike._replace(unit="")
     return alike or (Resemblance(spelt, unit_of(stated[1]) if stated else "") if spelt else None)
+
+
+def _measured_channel(name: str) -> Resemblance | None:
+    """The channel that a name is but for a word that says so: meas_gx."""
+    bare = _OF_CHANNELS.sub("", name)
+    alike = resembled(bare) if bare != name else None
+    return alike if alike and alike.column in RAW else None
 
 
 def _two_units(name: str, unit: str) -> str:
@@ -444,7 +466,7 @@ def proposed(
         FitError: columns of which each may be one of the run file's, a unit that neither name nor
             values tell, azimuths from true or grid north, no accelerometer: all that is open.
     """
-    meanings = meanings_of(names, units)
+    meanings = _with_whole_vectors(meanings_of(names, units))
     _tell_dip(meanings, values)
     _tell_temperature(meanings, names, units, values)
     said, known = answers or {}, stated or {}
@@ -471,14 +493,22 @@ def proposed(
         others = [n for n in names if n not in meanings and n not in believed]
         questions.ask(_check_nameless, others, values, {*chosen, *known}, source)
     rest = {n: u for n, u in zip(names, units, strict=True) if n not in meanings}
-    lacking = [*lacking_references({*chosen, *said, *known}), *BY_NAME_ALONE]
-    for column in (each for each in lacking if each not in {*chosen, *said, *known}):
+    present = {*chosen, *said, *known, *of_vectors(chosen)}
+    lacking = [*lacking_references(present), *BY_NAME_ALONE]
+    for column in (each for each in lacking if each not in present):
         questions.ask(_check_lacking, column, rest, values, source)
     questions.raise_any(source)
     by_value = {c for c, each in chosen.items() if each.unit and not meanings[each.name].unit}
     used = {each.name for each in chosen.values()}
     ignored = {name: reason for name, reason in ignored.items() if name not in used}
     return _labels(names, chosen) | chosen, by_value, ignored
+
+
+def _with_whole_vectors(meanings: dict[str, Resemblance]) -> dict[str, Resemblance]:
+    """Columns by what they hold, without components of a vector of which others are absent."""
+    called = {m.column for m in meanings.values()}
+    whole = [c for part in (VECTORS[:3], VECTORS[3:]) if {*part} <= called for c in part]
+    return {n: m for n, m in meanings.items() if m.column not in VECTORS or m.column in whole}
 
 
 def _chosen(
@@ -596,7 +626,10 @@ def _is_total(column: str, name: str, meanings: Mapping[str, Resemblance], value
     if len(columns) != 3 or total is None:
         return False
     norm = np.linalg.norm(columns, axis=0)
-    return bool(np.ptp(norm) > 0 and np.abs(norm - total).max() < 0.02 * np.ptp(norm))
+    if not np.ptp(norm) or not np.all(norm > 0):
+        return False
+    in_its_unit = norm * np.median(total / norm)
+    return bool(np.abs(in_its_unit - total).max() < 0.02 * np.ptp(in_its_unit))
 
 
 def _check_lacking(column: str, others: Mapping[str, str], values: Values, source: str) -> None:
@@ -776,6 +809,7 @@ def _unit(column: str, name: str, stated: str, values: Array | None, source: str
     if not allowed or values is None:
         return stated
     if stated:
+        stated = _before_comment(column, stated) or stated
         if stated in allowed:
             return stated
         if BOTH_UNITS in stated:
@@ -790,6 +824,13 @@ def _unit(column: str, name: str, stated: str, values: Array | None, source: str
             [*in_units(name, column, allowed), none_of(column)],
         )
     return _unit_by_values(column, name, values[np.isfinite(values)], source)
+
+
+def _before_comment(column: str, stated: str) -> str:
+    """The unit before a comma, if what follows says the same as the column's name: deg, highside."""
+    unit, _, comment = stated.partition(",")
+    alike = resembled(spelled(comment)) if comment else None
+    return unit_of(unit) if alike and alike.column == column else ""
 
 
 def _unit_by_values(column: str, name: str, known: Array, source: str) -> str:

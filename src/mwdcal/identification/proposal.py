@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from itertools import permutations, product
+from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ import msgspec
 import numpy as np
 
 from mwdcal.calibration.diagnosis.findings import MARKED_ROWS, unused_columns
+from mwdcal.calibration.diagnosis.flags import listed
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import Finding
 from mwdcal.errors import Answer, FitError, InputError, QuestionError, QuestionsError
@@ -26,7 +28,7 @@ from mwdcal.files.formats.layout import WORKBOOKS, Layout
 from mwdcal.files.formats.table import Table, cell_error, labels, numbers
 from mwdcal.files.formats.table import labels as labels_of
 from mwdcal.files.formats.text import is_preamble
-from mwdcal.files.marks import UNMARKED, marks_in, place, without_rejected
+from mwdcal.files.marks import MARKS_NAMED, UNMARKED, marks_in, place, without_rejected
 from mwdcal.files.metadata import toml
 from mwdcal.files.profiles import CHOICE_OF_AXES
 from mwdcal.files.runs import STATED_REFERENCES, check_run, renamed, to_readings
@@ -34,7 +36,7 @@ from mwdcal.files.statements import stated_table
 from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW, FACTORS, WARMTH
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
-from mwdcal.identification.columns import is_filler, meanings_of, north_of, proposed
+from mwdcal.identification.columns import is_filler, is_near, meanings_of, north_of, proposed
 from mwdcal.sensor.profile import ColumnSource, Profile, TableFormat, TriadProfile
 
 # --------------------------------------------------------------------------
@@ -88,7 +90,9 @@ def check_cells(table: Table, columns: Mapping[str, ColumnSource]) -> None:
         factor, offset = (
             FACTORS.get(columns[column].unit, (1.0, 0.0)) if units_of(column) else (1.0, 0.0)
         )
-        wrong = is_filler(values) | RANGES[column].outside(values * factor + offset)
+        wrong = (is_filler(values) & _is_outside_others(values)) | RANGES[column].outside(
+            values * factor + offset
+        )
         if column in (*RAW, WARMTH) and not np.isnan(values).all():
             wrong |= np.isnan(values)
         if column in RAW:
@@ -100,6 +104,14 @@ def check_cells(table: Table, columns: Mapping[str, ColumnSource]) -> None:
             questions.append(question_on_cells(table, columns[column].name, rows[0], each))
     if questions:
         raise QuestionsError(table.source, questions)
+
+
+def _is_outside_others(values: Array) -> Bools:
+    """Which values (n,) lie outside the range of those that do not stand for none."""
+    others = values[np.isfinite(values) & ~is_filler(values)]
+    if not others.size:
+        return np.ones(values.size, bool)
+    return np.asarray((values < others.min()) | (values > others.max()))
 
 
 def _far_out(values: Mapping[str, Array], column: str) -> Bools:
@@ -243,6 +255,8 @@ SAME_GRAVITY = 2e-4
 _SELDOM = ("ignore", "azimuth_reference", "declination_deg", "convergence_deg", "leave_out", "keep")
 MOST_NAMED = 6
 """Alternatives that a message names."""
+OFF_UNIT = 0.05
+"""By how much the scale of a sound tool in a unit differs from that unit at most, as a logarithm."""
 
 
 class OpenAxes(NamedTuple):
@@ -260,7 +274,7 @@ class Proposal(NamedTuple):
     `by_value` columns of a run file whose
     unit no name states; `metadata` what the table says of itself; `where` the table was, if it was looked for;
     `open_axes` the triads of which the run does not tell the axes, `ignored` columns that are called as references
-    but hold no references, each with the reason.
+    but hold no references, each with the reason; `by_readings` what the names leave open and the readings answer.
     """
 
     profile: Profile
@@ -274,6 +288,7 @@ class Proposal(NamedTuple):
     where: Layout | None = None
     open_axes: Mapping[str, OpenAxes] = {}
     ignored: Mapping[str, str] = {}
+    by_readings: tuple[str, ...] = ()
 
 
 def propose(
@@ -305,8 +320,29 @@ def propose(
     place = {"header_line": header_row} if header_row else {}
     said = {**place, **(north or {}), "leave_out": leave_out or {}, "keep": keep or {}}
     form = _with(form, {key: value for key, value in said.items() if value not in ({}, None)})
-    names = where.names if where else [*table.columns]
-    units = where.units if where else [""] * len(names)
+    with_answers = partial(_proposal, path, where, table, form, stated or {})
+    try:
+        return with_answers(answers or {})
+    except (QuestionError, QuestionsError) as error:
+        if proposal := _answer_by_readings(error, with_answers, answers or {}):
+            return proposal
+        raise
+
+
+def _proposal(
+    path: str | os.PathLike[str],
+    where: Layout | None,
+    table: Table,
+    form: TableFormat | None,
+    stated: Mapping[str, object],
+    answers: Mapping[str, str],
+) -> Proposal:
+    """The proposal for a table that was read, with what the user says of its columns."""
+    formulas = [name for name in table.columns if _is_formulas(labels_of(table, name))]
+    table = replace(table, columns={n: c for n, c in table.columns.items() if n not in formulas})
+    units_by_name = dict(zip(where.names, where.units, strict=True)) if where else {}
+    names = [*table.columns]
+    units = [units_by_name.get(name, "") for name in names]
     table, open_rows = _without_rejected(table, form, names, units)
     problems: dict[str, QuestionError] = {}
     above = where.above if where else ()
@@ -315,17 +351,92 @@ def propose(
         names, units, values, table.source, above, table.metadata, answers, problems, open_rows
     )
     check_cells(table, columns)
+    blank = _blank_references(table, columns)
     table, form = _with_north(table, form, columns, above)
+    ignored |= dict.fromkeys(
+        formulas, "its formulas have no value, as no spreadsheet program has saved them"
+    )
     form = _with(form, {"ignore": tuple(ignored)} if ignored else {})
-    table = _of_one_tool(table, columns, stated or {})
+    table = _of_one_tool(table, columns, stated)
     profile = Profile(name=Path(path).stem, table=form or msgspec.UNSET, columns=columns)
     profile, readings, wirings, open_axes = _wired_by_elevation(table, profile)
     name, triads = str(readings.metadata.get("serial", Path(path).stem)), _triads(readings, wirings)
     profile = msgspec.structs.replace(profile, name=name, **triads)
     return Proposal(
-        _without_the_usual(profile), wirings, readings.count, readings.unused, readings.remarks, by_value,
+        _without_the_usual(profile), wirings, readings.count, readings.unused, (*readings.remarks, *blank), by_value,
         readings.metadata, readings.run_sha256, where, open_axes, ignored,
     )  # fmt: skip
+
+
+def _is_formulas(cells: Sequence[str]) -> bool:
+    """Whether all cells that are filled in are formulas without a value."""
+    filled = [*filter(None, cells)]
+    return bool(filled) and all(cell.startswith("=") and len(cell) > 1 for cell in filled)
+
+
+# An answer that the readings give: at known attitudes the right columns and units of angles and channels leave a few
+# per cent of the channels' variation unexplained, wrong ones most of it.
+
+_OF_READINGS = (*RAW, *(REFERENCES[name].column for name in ("inclination", "toolface")))
+"""Columns that readings tell; azimuths may count from another north."""
+_MOST_TRIES = 24
+"""Answers to open questions, in all their combinations, that are tried."""
+_CONFIRMED = 0.1
+"""Largest share of the channels' variation that answers leave which readings confirm."""
+
+
+def _answer_by_readings(
+    error: QuestionError | QuestionsError,
+    propose_with: Callable[[Mapping[str, str]], Proposal],
+    said: Mapping[str, str],
+) -> Proposal | None:
+    """The proposal by the only answers to open questions that the readings fit; None where others fit, or none do."""
+    questions = error.questions if isinstance(error, QuestionsError) else (error,)
+    choices = [[answer for answer in each.answers if _is_of_readings(answer)] for each in questions]
+    if not all(choices) or prod(map(len, choices)) > _MOST_TRIES:
+        return None
+    fits = []
+    for chosen in product(*choices):
+        answers = dict(said)
+        for _, text in (argument for answer in chosen for argument in answer.arguments):
+            column, _, name = text.partition("=")
+            answers[column] = name
+        with suppress(InputError, FitError):
+            proposal = propose_with(answers)
+            unexplained = [each.unexplained for each in proposal.wirings.values()]
+            if not proposal.open_axes and max(unexplained, default=1.0) < _CONFIRMED:
+                fits.append((proposal, chosen))
+    if len(fits) != 1:
+        return None
+    proposal, chosen = fits[0]
+    texts = [", ".join(text for _, text in answer.arguments) for answer in chosen]
+    return proposal._replace(by_readings=tuple(texts))
+
+
+def _is_of_readings(answer: Answer) -> bool:
+    """Whether an answer names columns that the readings tell, or an azimuth by a mistyped name."""
+    pairs = [text.partition("=") for argument, text in answer.arguments if argument == "column"]
+    azimuth = REFERENCES["azimuth"].column
+    return len(pairs) == len(answer.arguments) and all(
+        name and (column in _OF_READINGS or (column == azimuth and is_near(column, name)))
+        for column, _, name in pairs
+    )
+
+
+def _blank_references(table: Table, columns: Mapping[str, ColumnSource]) -> list[str]:
+    """A sentence on angles of the stand that are blank at some stations, which are used without them."""
+    cells = []
+    for column in (REFERENCES[name].column for name in ("inclination", "azimuth", "toolface")):
+        if column in columns:
+            values = numbers(table, columns[column].name)
+            rows = np.flatnonzero(np.isnan(values)).tolist()
+            few = len(rows) <= _FEW_SHARE * values.size
+            cells += [f"{place(table, row)} ({shown(columns[column].name)})" for row in rows if few]
+    return (
+        [f"blank angles of the stand are unknown at their stations: {listed(cells, MARKS_NAMED)}."]
+        if cells
+        else []
+    )
 
 
 def _with(form: TableFormat | None, fields: Mapping[str, Any]) -> TableFormat | None:
@@ -727,6 +838,40 @@ def references_not_taken(proposal: Proposal) -> list[Finding]:
     ]
 
 
+def answers_by_readings(proposal: Proposal) -> list[Finding]:
+    """A finding on what the names of a table leave open and the readings answer."""
+    return [
+        Finding(
+            id="told-by-readings",
+            text=f"The names leave it open, and the readings fit one answer alone: {text}. If it is another, say so by "
+            "`column`.",
+        )
+        for text in proposal.by_readings
+    ]
+
+
+def units_contradicted(proposal: Proposal) -> list[Finding]:
+    """A finding on channels of which the readings contradict the unit: they are used in the scale that is found."""
+    columns = proposal.profile.columns
+    named = {} if isinstance(columns, msgspec.UnsetType) else columns
+    findings = []
+    for kind, base in (("accelerometer", "g"), ("magnetometer", "nT")):
+        channel = named.get(CHANNELS[kind][0])
+        scale = getattr(proposal.profile, kind).scale if kind in proposal.wirings else None
+        if not channel or not scale or channel.unit not in (base, *FACTORS):
+            continue
+        if (kind, channel.unit) == ("accelerometer", "mG"):
+            channel = msgspec.structs.replace(channel, unit="mg")
+        per_unit = 1 / FACTORS.get(channel.unit, (1.0, 0.0))[0]
+        if abs(np.log(scale / per_unit)) > OFF_UNIT:
+            text = (
+                f"{kind}: by its names {channel.unit}, of which {per_unit:g} make a {base}; by readings and references "
+                f"{scale:g} do. It is used in the scale of the readings. Check the unit and the references."
+            )
+            findings.append(Finding(id="unit-contradicted", text=text))
+    return findings
+
+
 def findings_on(proposal: Proposal) -> list[Finding]:
     """All that the reader of a proposal should know."""
     ignored = [
@@ -735,6 +880,7 @@ def findings_on(proposal: Proposal) -> list[Finding]:
     ]
     marked = [Finding(id=MARKED_ROWS, text=text) for text in proposal.remarks]
     known = axes_open(proposal) + left_handed(proposal) + references_not_taken(proposal) + marked
+    known += answers_by_readings(proposal) + units_contradicted(proposal)
     return known + ignored + unused_columns(proposal.unused)
 
 

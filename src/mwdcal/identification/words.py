@@ -42,17 +42,17 @@ TRANSLATIONS = (
         r"(kat )?odchylenia|(kat )?nachylenia|ferdeseg|dolesszog|egim|kemiringan|傾斜角?|зен\w*\.?( угол\w*)?|"
         r"neigung(swinkel)?|desviacion|sapma( acisi)?|inklination|inclinaison|inclinaca?o|"
         r"inclinacion|zenith( angle)?|drift angle|deviation angle|"
-        r"inklinasjon|helning|зенит\w*( угол)?|наклон(?!ен)|井斜角?|倾角",
+        r"inklinasjon|helning|инклинация|зенит\w*( угол)?|наклон(?!ен)|井斜角?|倾角",
         "inclination ",
     ),
     (
         r"drehtisch|turn ?table|rotary table|baring|azymut|yonelim|азимут|asimut|azimute?(?!h)|acimut|方位角?|rumbo|"
-        r"richtung(?!swinkel)|peilung",
+        r"richtung(?!swinkel)|retning|peilung",
         "azimuth ",
     ),
     (
         r"rollachse|roll axis|\brulle?\b|rullning|rotasi|(kat )?ustawienia narzedzia|takim yuzu|szerszamallas|"
-        r"gereedschapsvlak|v(ae|æ)rkt(o|ø)jsflade|faccia utensile|ツールフェース|回転角|угол поворота|"
+        r"gereedschapsvlak|v(ae|æ)rkt(o|ø)jsflade|faccia utensile|ツールフェ(ー|イ)ス|тулфейс|回転角|угол поворота|"
         r"rollwinkel|roll angle|werkzeug(winkel|lage|flache)|verdrehung|verdrehwinkel|drehwinkel|rotasjon|rulle?vinkel|"
         r"verktoy(flate|vinkel)\w*|(face|angulo) d[ae] ferramenta|(face|angle)( d[e'])? ?(l'?)?outil|"
         r"ghsf?\b|угол установки( отклонител\w*)?|визир\w*( угол)?|"
@@ -61,7 +61,7 @@ TRANSLATIONS = (
         "toolface ",
     ),
     (
-        r"przysp(ieszenie)?\b\.?|gyorsulas(mero)?|ivme\w*|versn(elling)?\b\.?|accelerazione|"
+        r"accelero\b\.?|przysp(ieszenie)?\b\.?|gyorsulas(mero)?|ivme\w*|versn(elling)?\b\.?|accelerazione|"
         r"accelerometro|percepatan|加速度|γ|"
         r"beschleunigung\w*|beschl\b\.?|akselerasjon|akselerometer|akselero|aceleracion|acelerometro|acel\b|"
         r"aceleracao|accelerometre|acceleration|\bac\.|ускорен\w*|акселерометр\w*|акс\b|\baks\b|加速度计?|加计|加表",
@@ -70,7 +70,7 @@ TRANSLATIONS = (
     (
         r"pole magn\w*\.?(?=[ _]*[xyz])|magneses(?=[ _]*[xyz])|manyetik(?=[ _]*[xyz])|magneetveld(?=[ _]*[xyz])|"
         r"medan(?=[ _]*[xyz])|磁気(?=[ _]*[xyz])|magnetfalt(?=[ _]*[xyz])|campo(?=[ _]*[xyz]\b)|"
-        r"magnetometre|magn\b\.?(?=[ _]*[xyz]\b)|magnetfeld(?=[ _]*[xyz])|magnetfelt(?=[ _]*[xyz])|"
+        r"\bmagneto\b\.?|magnetometre|magn\b\.?(?=[ _]*[xyz]\b)|magnetfeld(?=[ _]*[xyz])|magnetfelt(?=[ _]*[xyz])|"
         r"magnetometro|magnetometr(?=[ _]*[xyz])|magnetometers?|магнитометр\w*|магн\b|феррозонд\w*|磁力计|"
         r"磁通门|磁强计|campo magnetico(?=[ _]*[xyz])|campo mag(?=[ _]*[xyz])|"
         r"\bmtm\b|磁(?=[ _]*[xyz])|flux[ _-]*gates?|磁场(?=[ (（_]*[xyz])",
@@ -91,6 +91,7 @@ TRANSLATIONS = (
     ),
     (r"нтл", "nT"),
     (r"мктл", "uT"),
+    (r"м[gг](?![а-яa-z])", "mg"),
     (r"мгс(?![а-я])", "mG"),
     (r"(?<![а-я])гс(?![а-я])", "gauss"),
     (
@@ -109,7 +110,12 @@ TRANSLATIONS = (
         r"sollwerte?|sollwinkel|soll|\brig\b|referenz|referanse|referencia|stand|эталон\w*|стенд|задан\w*|标准|参考|转台",
         "ref ",
     ),
-    (r"seriennummer|seriennr|serienummer|заводской номер|序列号|num\w*\.? de serie", "serial "),
+    (
+        r"seriennummer|seriennr|serienummer|заводской номер|序列号|n(um\w*|[o°º])?\.? ?[°º]? ?de serie|serie n[°ºr]\.?",
+        "serial ",
+    ),
+    (r"\bgeogr\w*\.?", "true "),
+    (r"\bu (?=[gabhm][xyz]\b)", ""),
     (r"gerat|sonde", "tool "),
     (r"(de|da) [qc]uadr[ií]cula( utm)?|gitter|kartesisch", "grid "),
     (r"achse|aksen?|eje|ось|轴", ""),

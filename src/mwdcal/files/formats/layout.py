@@ -72,8 +72,9 @@ ADJUSTED = re.compile(
 """Words of a run before or after an adjustment of the tool: two of them are two runs."""
 
 _OF_ROLL_TEST = re.compile(
-    r"(?<![^\W\d_])(roll[\s_-]*(test|over|check)|rt|verif\w*|check|valid\w*|control|kontroll\w*|(roll)?pr(ue|ü)fung|"
-    r"rulletest|prueba|провер\w*|повер\w*|контрол\w*)(?![^\W\d_])|验证|检验|複測|复测",
+    r"(?<![^\W\d_])(roll[\s_-]*(test|over|check)|rt|verif\w*|check|valid\w*|(roll)?pr(ue|ü)fung|"
+    r"[ck]ontrol\w*[- ]?(run|shot|test|roll|messung|dreh|måling|rull)\w*|rulletest|prueba|провер\w*|повер\w*|"
+    r"контрольн\w* (вращ|замер|измер)\w*)(?![^\W\d_])|验证|检验|複測|复测",
     re.IGNORECASE,
 )
 """Words of a sheet whose rows are to check a calibration."""
@@ -109,7 +110,7 @@ class Layout:
     `form` says how the table is written, `cells` are text, numbers in it with a decimal point, and `texts` the same
     as they stand there; `fractions` are columns of a workbook with numbers that are not whole. `left_out` are lines
     below the names that are no readings, `above` the texts above them;
-    `parts` the sheet of each row where several are one table;
+    `parts` the sheet of each row where several are one table; `heading` the text right above the names;
     `titles` what the title block says of the tool, the day and the place; `places` letters of the columns in a
     workbook.
     """
@@ -128,6 +129,7 @@ class Layout:
     left_out: tuple[tuple[int, str], ...] = ()
     places: Mapping[str, str] = field(default_factory=dict)
     parts: tuple[str, ...] = ()
+    heading: str = ""
 
     @property
     def size(self) -> int:
@@ -170,10 +172,23 @@ def laid_out(
     best = max(tables, key=lambda layout: layout.size)
     alike = [t for t in tables if t is best or (_alike(t, best) and len(t.lines) >= _BESIDES)]
     if len(alike) > 1 and not header_line:
-        if not _is_one_run(alike):
+        run = _the_run(alike)
+        if run is None:
             raise _several(alike, source, sheet)
-        best = _joined_sheets(alike)
+        best = run
     return _with_covers(best, covers)
+
+
+def _the_run(tables: Sequence[Layout]) -> Layout | None:
+    """The run among alike tables: their sheets joined, or the one beside which the others are roll tests."""
+    if _is_one_run(tables):
+        return _joined_sheets(tables)
+    others = [t for t in tables if _OF_ROLL_TEST.search(f"{t.sheet} {t.heading}")]
+    runs = [t for t in tables if t not in others]
+    if len(runs) != 1 or ADJUSTED.search(runs[0].heading):
+        return None
+    aside = tuple((t.form.header_line, f"roll test, {len(t.lines)} rows") for t in others)
+    return replace(runs[0], left_out=(*runs[0].left_out, *aside))
 
 
 def _is_one_run(tables: Sequence[Layout]) -> bool:
@@ -307,7 +322,7 @@ def _begins_anew(rows: Sequence[tuple[int, Cells]], heads: Sequence[int], place:
     between = [
         " ".join(map(as_text, row)) for _, row in rows[heads[-1] : place] if not _is_reading(row)
     ]
-    if any(map(ADJUSTED.search, between)):
+    if any(ADJUSTED.search(text) or _OF_ROLL_TEST.search(text) for text in between[1:]):
         return True
     ours = titles([row for _, row in rows[: heads[0]]]).metadata.get("serial")
     above = [row for _, row in rows[heads[-1] : place] if not _is_reading(row)]
@@ -342,6 +357,8 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
     """The table whose last row of names, or of units, is at a place, down to the row before `end`."""
     rows = sheet.rows
     names, units, top = _head(rows, head)
+    below = rows[_other_tool(rows, head, end) : end]
+    end -= len(below)
     readings = [place for place in range(head + 1, end) if _is_reading(rows[place][1])]
     kept = _without_summary([rows[place] for place in readings])
     lines = {line for line, _ in kept}
@@ -380,12 +397,25 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
             n for n, column in zip(names, columns, strict=True) if any(map(_is_fraction, column))
         ),
         above=tuple(" ".join(map(as_text, row)).strip() for row in above),
+        heading=_words(above[-1]) if above and not _is_reading(above[-1]) else "",
         titles=block._replace(metadata=dated(block.metadata, zip(names, texts, strict=True))),
         left_out=tuple(
-            (line, _words(row)) for line, row in others if not _repeats(row, rows, head)
+            (line, _words(row)) for line, row in [*others, *below] if not _repeats(row, rows, head)
         ),
         places=dict(zip(names, letters, strict=True)) if sheet.name else {},
     )
+
+
+def _other_tool(rows: Sequence[tuple[int, Cells]], head: int, end: int) -> int:
+    """The place of a row below the names that states the serial of another tool, above rows of it; else the end."""
+    ours = titles([row for _, row in rows[:head]]).metadata.get("serial")
+    for place in range(head + 1, end - 1):
+        row = rows[place][1]
+        if _is_reading(rows[place + 1][1]) and not _is_reading(row):
+            theirs = titles([row]).metadata.get("serial")
+            if theirs not in (None, ours):
+                return place
+    return end
 
 
 def _both(unit: str, by_cells: str) -> str:

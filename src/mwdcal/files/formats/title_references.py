@@ -31,15 +31,13 @@ _OF_PLACES = (
     _Quantity(
         "ref_field_nt",
         r"(total|mag\w*|local|earth'?s?) field|field( strength| intensity| total)?|[bfht] ?total|[bfht](tot|ref)|bt|"
-        r"totalfeld|"
-        r"erdfeld|"
-        r"gesamtfeld|feldstarke|"
+        r"(total|erd|gesamt|stand)?feld|feldstarke|"
         r"felt|totalintensitat|erdmagnetfeld|magnetfeld|flussdichte|totalfelt\w*|feltstyrke|magnetfelt|"
         r"campo( (magn\w+|totale?|local))*|totaalveld|pole calkow\w*|(teljes )?terero|toplam alan|medan total|全磁力|"
         r"magnetfalt|"
         r"intensidade?( total)?|champ( magn\w*)?( total| local)?|"
         r"(магн\w* )?поле|полн\w* (вектор|поле)|модуль( магн\w*)?( поля)?|индукци\w+|напряженност\w+( поля)?|"
-        r"(地)?磁场(总)?(强度)?|总场(强度)?|总磁场(强度)?|\|b\||tmf|tmi",
+        r"(环境|当地|地|总)?磁(总)?场(总)?(强度)?|总场(强度)?|\|b\||tmf|tmi",
         "bfhtт",
         ("nT", "µT", "mT", "gauss", "mG"),
         15_000.0,
@@ -54,7 +52,7 @@ _OF_PLACES = (
         r"inclinacion (magn\w*|del campo)|echado|buzamiento|inclinaison( magn\w*| du champ)?|"
         r"(магн\w* )?наклонени[ея]|(地)?磁倾角",
         "i",
-        ("°", "rad"),
+        ("°", "rad", "gon"),
         -90.0,
         90.0,
     ),
@@ -62,7 +60,7 @@ _OF_PLACES = (
         "ref_gravity_g",
         r"(local )?gravity( field| acceleration)?|g ?total|gtot|gref|gt|zwaartekracht|yercekimi|nehezsegi gyorsulas|"
         r"gravita|gravitasi|tyngdkraft|重力(加速度)?|ускорение силы тяжести|"
-        r"(local|site) g|g[ -]?(local|lokal|ref|tot(al)?)|\|g\||"
+        r"(local|site) g|g[ -]?(locale?|lokal|ref|tot(al)?)|\|g\||"
         r"(lokale )?(schwere(beschleunigung)?|fallbeschleunigung|erdbeschleunigung|ortsschwere)|"
         r"tyngde(akselerasjon|kraft)?\w*|(aceleracion de la )?gravedad|(aceleraca?o da )?gravidade|pesanteur|"
         r"ускорение свободного падения|сил\w тяжести|(当地)?重力(加速度)?",
@@ -73,7 +71,7 @@ _OF_PLACES = (
     ),
 )
 _WRITTEN_UNIT = (
-    r"n\s?t\b|[uµμ]\s?t\b|m\s?t\b|milli ?gauss|m\s?g(al|auss)?\b|gauss|gal\b|нтл|мктл|мтл|мгал|м/с²?|м/с2|"
+    r"n\s?t\b|[uµμ]\s?t\b|m\s?t\b|milli ?gauss|m\s?g(al|auss)?\b|gauss|gal\b|gons?\b|нтл|мктл|мтл|мгал|м/с²?|м/с2|"
     r"m\s?/\s?s\s?(?:²|\^?2)?|g\b|г\b|°|deg\w*|grad\w*|rad\b|град\w*|fok|derece|stopni|度"
 )
 _WRITTEN_NUMBER = (
@@ -103,7 +101,7 @@ _REFERRING = re.compile(
 _STATEMENTS = {
     q: re.compile(
         rf"(?<![^\W\d_])(?:(?P<word>{q.words})|(?P<letter>[{q.letters}]))(?![^\W\d_]){_BETWEEN}"
-        rf"(?P<number>{_WRITTEN_NUMBER}){_MINUTES}\s*(?P<unit>{_WRITTEN_UNIT})?(?P<behind>[^\d;]{{0,12}})",
+        rf"(?P<number>{_WRITTEN_NUMBER}){_MINUTES}\s*(?P<unit>{_WRITTEN_UNIT})?(?P<behind>[^\d;]{{0,12}})(?P<next>\d?)",
         re.IGNORECASE,
     )
     for q in _OF_PLACES
@@ -167,15 +165,16 @@ def _plain(text: str) -> str:
     kept = text.replace("°", "\0").replace("º", "\0").replace("²", "\1").replace("й", "\2")
     plain = unicodedata.normalize("NFKD", kept.lower().translate({ord("ø"): "o", ord("ß"): "ss"}))
     bare = "".join(c for c in plain if not unicodedata.combining(c))
-    return bare.replace("\0", "°").replace("\1", "²").replace("\2", "й")
+    bare = re.sub(r"(?<=[\u4e00-\u9fff])(?=[a-zµμ])", " ", bare)
+    signs = bare.replace("\0", "°").replace("\1", "²").replace("\2", "й")
+    return re.sub(r"m\s?/\s?s\s?\^?2(?!\d)", "m/s²", signs)
 
 
 def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
     """The value that a text states, in the unit of the run file, if it is one."""
     between, behind = match["between"], match["behind"]
-    if _UNSURE.search(f"{match['word'] or ''} {between}") or re.match(
-        r"\W*(nomin|номин|标称|nenn)", behind
-    ):
+    rough = re.match(r"\W*(nomin|номин|标称|nenn)", behind) and not match["next"]
+    if rough or _UNSURE.search(f"{match['word'] or ''} {between}"):
         return
     inner = re.search(rf"(?<![^\W\d_])({_WRITTEN_UNIT})(?![^\W\d_])", between)
     stated = _unit(
@@ -191,7 +190,7 @@ def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
     if stated and stated not in quantity.units:
         return
     numbers = [*_numbers(match["number"], match["minutes"])]
-    units = (stated,) if stated else quantity.units
+    units = (stated,) if stated else [unit for unit in quantity.units if unit != "gon"]
     values = {_converted(number, unit) for number in numbers for unit in units}
     inside = [v for v in values if quantity.low <= v <= quantity.high and v]
     if len(inside) == 1:

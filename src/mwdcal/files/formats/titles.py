@@ -14,6 +14,7 @@ UNITS_BY_SIGN = {
     "°": "deg",
     "μ": "u",
     "µ": "u",
+    "A/m": "apm",
     "мкТл": "ut",
     "нТл": "nt",
     "мВ": "mv",
@@ -60,12 +61,16 @@ _TRUE_NORTH = re.compile(
     r"true\s+north|geographic north|nord géographique|rechtweisend", re.IGNORECASE
 )
 _DECLINATION = re.compile(
-    r"(declination|deklination|misvisning|declinaci[oó]n|склонение|磁偏角)[^\w+−-]*([+−-]?\d+[.,]?\d*)"
+    r"(declination|deklination|misvisning|declinaci[oó]n|d[eé]clinaison|declina[cç][aã]o|declinazione|склонение|磁偏角)"
+    r"(?:\s*\(([^)]*)\))?[^\w+−-]*([+−-]?\d+[.,]?\d*)"
     r"\s*(?:°|deg\w*)?\s*\(?([EWO](?!\s*[+(])|west|зап|vest|oest)?",
     re.IGNORECASE,
 )
+_WEST_POSITIVE = re.compile(r"\b(w|west|ouest|oeste?|vest|зап\w*)\b\W*(\+|pos)", re.IGNORECASE)
+"""A sense in brackets behind the word: (° W +)."""
 _CONVERGENCE = re.compile(
-    r"(convergence|konvergenz|meridiankonvergens|convergencia|сближение меридианов|收敛角)[^\w+−-]*([+−-]?\d+[.,]?\d*)"
+    r"(convergence|konvergenz|meridiankonvergens|convergencia|сближение меридианов|收敛角)"
+    r"(?:\s*\(([^)]*)\))?[^\w+−-]*([+−-]?\d+[.,]?\d*)"
     r"\s*(?:°|deg\w*)?\s*\(?([EWO](?!\s*[+(])|west|зап|vest|oest)?",
     re.IGNORECASE,
 )
@@ -134,8 +139,10 @@ def _rotation(statement: re.Pattern[str], text: str) -> float | None:
     match = statement.search(text)
     if not match:
         return None
-    west = bool(match[3]) and match[3].upper()[0] in "WOЗV"
-    value = float(match[2].replace(",", ".").replace("−", "-"))
+    west = bool(match[4]) and match[4].upper()[0] in "WOЗV"
+    value = float(match[3].replace(",", ".").replace("−", "-"))
+    if match[2] and _WEST_POSITIVE.search(match[2]):
+        return -value
     return -abs(value) if west else value
 
 

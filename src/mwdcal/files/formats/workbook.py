@@ -259,15 +259,15 @@ def _shown(value: object, form: str) -> str | None:
     return f"{value:0{whole + decimals + bool(decimals)}.{decimals}f}"
 
 
-def _check_formulas(archive: zipfile.ZipFile, sheet: str, source: str) -> None:
-    """Refuse formulas without a value: no spreadsheet program has calculated them, and the cells look blank.
+def _formulas_without_value(archive: zipfile.ZipFile, sheet: str) -> dict[str, str]:
+    """Formulas by cell that no spreadsheet program has calculated; the cells look blank.
 
     One whose value is an empty text has one.
     """
     data = archive.read(sheet)
+    without: dict[str, str] = {}
     if not _FORMULA.search(data):
-        return
-    without = []
+        return without
     for _, cell in iterparse(io.BytesIO(data)):
         parts = {part.tag.rpartition("}")[2]: part.text for part in cell}
         if (
@@ -276,13 +276,19 @@ def _check_formulas(archive: zipfile.ZipFile, sheet: str, source: str) -> None:
             and not parts.get("v")
             and cell.get("t") != "str"
         ):
-            without.append(f"{cell.get('r', '?')} (={parts['f'] or '…'})")
+            without[cell.get("r", "?")] = f"={parts['f'] or '…'}"
         if cell.tag.endswith("}row"):
             cell.clear()
+    return without
+
+
+def _check_formulas(without: Mapping[str, str], source: str) -> None:
+    """Refuse formulas without a value."""
     if without:
+        named = [f"{cell} ({formula})" for cell, formula in [*without.items()][:_NAMED]]
         more = f" and {len(without) - _NAMED} more" if len(without) > _NAMED else ""
         raise InputError(
-            f"{source}: formulas without a value, in the cells {', '.join(without[:_NAMED])}{more}. Name a copy "
+            f"{source}: formulas without a value, in the cells {', '.join(named)}{more}. Name a copy "
             "that a spreadsheet program has saved: it calculates them."
         )
 
@@ -294,10 +300,13 @@ def read_rows(data: bytes, source: str) -> Iterator[Row]:
 
 
 def read_sheets(data: bytes, source: str) -> Iterator[tuple[str, Iterator[Row]]]:
-    """The names of all sheets, and their rows as `read_rows` gives them: each to be read before the next."""
+    """The names of all sheets, and their rows as `read_rows` gives them: each to be read before the next.
+
+    A formula without a value is its text, which is no number: it may stand in a column that no one needs.
+    """
     with _opened(data, source) as (archive, book):
         for page in book.worksheets:
-            yield page.title, _rows(archive, page, source)
+            yield page.title, _rows(archive, page, source, as_text=True)
 
 
 @contextmanager
@@ -314,15 +323,40 @@ def _opened(data: bytes, source: str) -> Iterator[tuple[zipfile.ZipFile, Any]]:
         yield archive, openpyxl.load_workbook(io.BytesIO(data), read_only=True, data_only=True)
 
 
-def _rows(archive: zipfile.ZipFile, page: Any, source: str) -> Iterator[Row]:
-    """Row numbers and cells of a sheet that are not blank."""
+def _rows(
+    archive: zipfile.ZipFile, page: Any, source: str, *, as_text: bool = False
+) -> Iterator[Row]:
+    """Row numbers and cells of a sheet that are not blank; a formula without a value is refused, or its text."""
     with damaged_unless_read(source, *_EXPECTED):
-        _check_formulas(archive, page._worksheet_path, source)
+        formulas = _formulas_without_value(archive, page._worksheet_path)
+        if not as_text:
+            _check_formulas(formulas, source)
+        by_row = _by_row(formulas)
         page.reset_dimensions()
         for line, row in enumerate(page.iter_rows(values_only=True), 1):
-            cells = _trimmed([_read(value) for value in row])
+            cells = _trimmed([_read(value) for value in _with_formulas(row, by_row.get(line, {}))])
             if cells:
                 yield line, cells
+
+
+def _by_row(formulas: Mapping[str, str]) -> dict[int, dict[int, str]]:
+    """Formulas by row from 1 and column from 0."""
+    by_row: dict[int, dict[int, str]] = {}
+    for cell, text in formulas.items():
+        if match := re.fullmatch(r"([A-Z]{1,3})(\d{1,7})", cell):
+            column = sum((ord(x) - 64) * 26**i for i, x in enumerate(reversed(match[1]))) - 1
+            by_row.setdefault(int(match[2]), {})[column] = text
+    return by_row
+
+
+def _with_formulas(row: Sequence[object], formulas: Mapping[int, str]) -> Sequence[object]:
+    """A row with the texts of formulas in their cells."""
+    if not formulas:
+        return row
+    cells = [*row, *[None] * (max(formulas) + 1 - len(row))]
+    for column, text in formulas.items():
+        cells[column] = text if cells[column] is None else cells[column]
+    return cells
 
 
 def _read(value: object) -> object:
