@@ -55,6 +55,8 @@ DEEPEST = 15_000.0
 """Measured depth of the longest well, m."""
 TOOLS, SAMPLE = 1000, 10
 """Tools of the fleets, and of the loop of SciPy that they are compared with."""
+MANY = 4000
+"""Tools of a fleet whose parts are as large as those of the largest are at least."""
 WARM = 4
 """Tools of the fleet whose temperature orders are chosen."""
 IMPORTS = "import numpy, scipy.special"
@@ -241,6 +243,11 @@ def fleets(folder: Path) -> Iterator[Guarded]:
         words = ("fleet", table, "--tool", profile, "--workers", "1", *options)
         target = folder / f"{len([*folder.iterdir()])}.parquet"
         yield Guarded(f"fleet, {name}", *loop, partial(command, *words, "-o", target))
+    many = folder / "many.parquet"
+    fleet.simulate(many, MANY)
+    words = ("fleet", many, "--tool", bare, "--workers", "1", "--no-records")
+    whole = partial(python, "-m", "mwdcal", *words, "-o", folder / "many-out.parquet")
+    yield Guarded(f"fleet, {MANY} tools from the start", *loop, whole)
 
 
 def registries(folder: Path) -> Iterator[Guarded]:

@@ -87,6 +87,8 @@ def fleets(folder: Path, share: float) -> Iterator[Wait]:
     curved = folder / "curved.toml"
     text = (guard.EXAMPLE / "tool.toml").read_text()
     curved.write_text(text.replace("noise =", f"{CURVED}noise ="))
+    exact = folder / "exact.toml"
+    exact.write_text(text.partition("[stand]")[0])
     declared, few = guard.EXAMPLE / "tool.toml", "--no-records"
 
     def each(count: int, *words: str | Path) -> tuple[float, int]:
@@ -102,7 +104,7 @@ def fleets(folder: Path, share: float) -> Iterator[Wait]:
     name = f"fleet, {count} tools, noise undeclared, whole command, against a SciPy loop per core"
     yield Wait(name, alone * count / seconds, 50, 100, "x", more=True)
     for name, size, least, aim, *words in (
-        ("noise declared, exact stand", 20_000, 0.4, 0.1, few, "--tool", "servo"),
+        ("noise declared, exact stand", 20_000, 0.4, 0.1, few, "--tool", exact),
         ("noise declared, uncertain stand", 20_000, 0.5, 0.3, few, "--tool", declared),
         ("noise undeclared, uncertain stand", 2_000, 1.5, 0.5, few, "--tool", stand),
         ("nonlinearity auto", 500, 20, 10, few, "--tool", curved, "--nonlinearity", "auto"),

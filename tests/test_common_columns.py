@@ -74,3 +74,25 @@ def test_the_first_look_leaves_out_no_effect(error, apart):
     assert [[*shown] for shown in ours] == [[*shown] for shown in theirs]
     for mine, other in zip(ours, theirs, strict=True):
         np.testing.assert_allclose([*mine.values()], [*other.values()], rtol=1e-9)
+
+
+@pytest.mark.parametrize("error", [0.0, 1e-4, 2e-4, 1e-3])
+def test_what_a_bound_leaves_out_would_not_show(error, monkeypatch):
+    """Every gain worked out says the same; sensors that differ fivefold in their noise have no bound."""
+    readings = imperfect(runs(9, 120))
+    turn = np.where(np.arange(readings.count) % 2, error, -error)
+    readings.known["inclination"] = readings.known["inclination"] + turn
+    raw = readings.magnetometer.copy()
+    raw[::10] += 60.0 * np.random.default_rng(2).normal(size=raw[::10].shape)
+    result = fit(replace(readings, magnetometer=raw), OPTIONS)
+    asked, bounded, shown = [], structure._may_be_enough, structure.may_show(result)
+    monkeypatch.setattr(
+        structure, "_may_be_enough", lambda *a: asked.append(bounded(*a)) or np.ones(120, bool)
+    )
+    np.testing.assert_array_equal(structure.may_show(result), shown)
+    (near,) = asked
+    assert near[::10].sum() >= 11
+    if error == 0.0:
+        assert np.delete(near, slice(None, None, 10)).mean() < 0.1
+    elif error == 1e-3:
+        assert shown.mean() > 0.5

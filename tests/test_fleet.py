@@ -857,6 +857,7 @@ def test_the_process_that_is_copied_has_no_thread_of_a_memory_pool(fleet, tmp_pa
 @pytest.mark.parametrize("batch", [5, 32_768])
 def test_partitions_are_of_whole_tools_and_bounded(tmp_path, monkeypatch, batch):
     monkeypatch.setattr(fleet_tables, "PARTITION_ROWS", (50, 100))
+    monkeypatch.setattr(fleet_tables, "ENOUGH_ROWS", 50)
     monkeypatch.setattr(fleet_tables, "BATCH", batch)
     path = write_fleet(
         tmp_path / "runs.parquet", {i: short_run(i) for i in range(9)}, row_group_size=37

@@ -51,7 +51,7 @@ PARTITION_ROWS = (6_000, 100_000)
 ENOUGH_ROWS = 24_000
 """Rows from which what a partition costs by itself, some 60 ms, is little…"""
 SHARES = (4, 16)
-"""…and into how many a fleet is divided: below these rows, and above. More would not keep more workers busy for long."""
+"""…and into how many a fleet is divided: below these rows, and above."""
 BATCH = 32_768
 """Rows that are read at once…"""
 SERIALS = 500_000

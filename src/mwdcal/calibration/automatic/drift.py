@@ -47,7 +47,9 @@ DISPUTED_CHANCE = 0.01
 EVERY_PARAMETER = 12
 """Parameters of a triad that are all fitted."""
 TOGETHER = 320
-"""Most fits whose drifts are fitted together: few enough for the cache."""
+"""Most fits whose drifts are fitted together: few enough for the cache…"""
+ON_A_STAND = 64
+"""…and on an uncertain stand, where a fit takes several times the memory."""
 REDUNDANCY = 36.0
 """Fewest degrees of freedom of a triad that can tell a drift from noise."""
 
@@ -177,8 +179,9 @@ def with_drifts(fits: Iterable[tuple[Ints, Fit]], options: Options) -> Iterator[
                 yield tools[places], part
     for (triads, _), parts in waiting.items():
         tools, whole = (join(each) for each in zip(*parts, strict=True))
-        for first in range(0, len(tools), TOGETHER):
-            some = slice(first, first + TOGETHER)
+        size = TOGETHER if whole.analysis.squares is None else ON_A_STAND
+        for first in range(0, len(tools), size):
+            some = slice(first, first + size)
             yield tools[some], with_drift(take(whole, some), options, np.array(triads))
 
 

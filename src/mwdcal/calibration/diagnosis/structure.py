@@ -260,10 +260,11 @@ def _may_be_enough(
 ) -> Bools:
     """Fits (B,) without drift of which a bound of some family's gain is enough for it to be named.
 
-    Sensors R that are M times those R₀ of the first fit have information on an effect of at least κ times as much, κ
-    being the least eigenvalue of MᵀM. A gain by the information of the first fit is thus too large by 1/κ at most.
+    Sensors R that are M times those R₀ of a fit of middling noise have at least κ times the information on an effect, κ
+    being the least eigenvalue of MᵀM. So no gain is more than 1/κ times that by the information of this one fit.
     """
-    first = [each[:1] for each in response]
+    middle = np.argsort(response[-1][:, 0, 3])[len(misfit) // 2 :][:1]
+    first = [each[middle] for each in response]
     least, most = np.ones((2, len(misfit)))
     for each, one in zip(response, first, strict=True):
         ratio, quieter = each[..., :3] @ inverse(one[..., :3]), (each[:, 0, 3] / one[:, 0, 3]) ** 2
