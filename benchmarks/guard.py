@@ -34,7 +34,6 @@ from typing import NamedTuple
 
 import fleet
 import numpy as np
-import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet as pq
 
@@ -279,9 +278,11 @@ def long(folder: Path) -> Iterator[Guarded]:
     for name, source, rows, *words in (
         ("apply", "surveys.csv", 50_000, tool),
         ("survey", "well.csv", 10_000, tool),
+        ("survey", "well.csv", 100_000, tool),
         ("noise", "static.csv", 100_000),
         ("noise", "static.csv", 400_000),
         ("stations", "log.csv", 50_000),
+        ("stations", "log.csv", 200_000),
     ):
         table = longer(EXAMPLE / source, folder / f"{rows}-{source}", rows)
         target = () if name == "noise" else ("-o", folder / f"{name}.csv")

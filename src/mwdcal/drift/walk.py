@@ -508,7 +508,7 @@ class Contrasts:
         """Covariances (n, p, p) of the parameters, if they never changed, by each run in its own units, and in ours."""
         sums, units = np.stack([self.scaled[run].sum(0) for run in self._runs]), outer(self._own)
         own = np.linalg.pinv(sums * units, DEPENDENT, hermitian=True)
-        return own, own * units
+        return np.asarray(own, float), np.asarray(own * units, float)
 
     @property
     def _mean(self) -> Array:
@@ -534,7 +534,7 @@ class Contrasts:
         ranks = np.linalg.matrix_rank(stacked, DEPENDENT, hermitian=True)
         ends = np.cumsum([len(one) for one in each])
         parts = np.split(ranks, ends)
-        return np.array([part.sum() for part in parts[:-1]]) - parts[-1]
+        return np.asarray(np.array([part.sum() for part in parts[:-1]]) - parts[-1], int)
 
     @cached_property
     def _sizes(self) -> Array:
@@ -667,7 +667,7 @@ def _test(history: History, contrasts: Contrasts, level: float, draws: int) -> C
     return ChangeTest(
         level, float((1 + np.sum(evidence <= least)) / (draws + 1)), scores, largest, critical,
         by_step, misfits[0], int(contrasts.freedom[0]), by_misfit,
-        np.array(misfits[1:]), contrasts.freedom[1:],
+        np.array(misfits[1:]), contrasts.freedom[1:].astype(float),
         np.array([(1 + np.sum(each >= one)) / (len(each) + 1) for each, one in pairs]),
     )  # fmt: skip
 

@@ -244,6 +244,7 @@ def pooled(rests: Sequence[Trace], resolution: float) -> SharedNoise:
     ]
     order = np.argsort(np.concatenate([places for places, _ in parts]))
     some = [value for _, value in parts]
+    del parts
     medians = [np.median(value, -1, keepdims=True) for value in some]
     some = [value - median for value, median in zip(some, medians, strict=True)]
     distances = [_distances(value) for value in some]
@@ -322,8 +323,8 @@ def _distances(value: Array) -> Array:
     """Distances from a median of 0, as many as are free, widened for what the median took (k, n)."""
     distance = np.abs(value)
     if value.shape[-1] % 2:
-        return np.sort(distance)[:, 1:]
-    return distance / (1 - 1.1 / value.shape[-1])
+        return np.asarray(np.sort(distance)[:, 1:])
+    return np.asarray(distance / (1 - 1.1 / value.shape[-1]))
 
 
 def _chi_square_limit(freedom: ArrayLike) -> Array:
@@ -442,7 +443,7 @@ def _shared_spread(value: Array, step: float, noise: SharedNoise) -> Array:
 
     spread, size = value.std(-1), value.shape[-1]
     if not noise.freedom:
-        return spread
+        return np.asarray(spread)
     least = noise.least**2
     if noise.least < 2 * step:
         variances, _, lowest = _dither()
@@ -521,7 +522,7 @@ def student(freedom: ArrayLike, chance: float) -> Array:
     """Two-sided Student quantile that is exceeded with this chance."""
     from scipy.special import stdtrit
 
-    return np.asarray(stdtrit(freedom, 1 - chance / 2), float)
+    return np.asarray(stdtrit(np.asarray(freedom, float), 1 - chance / 2))
 
 
 def long_run(value: Array) -> tuple[Array, Array, Array]:
