@@ -204,8 +204,12 @@ def test_limits_are_tighter_after_the_analysis() -> None:
     assert accepted["sound"].all()
     assert not accepted["gross"][20]
     assert accepted["gross"].sum() == len(DEVIATED) - 1
-    wide = SensorTerms(axial_interference_nt=220.0, magnetometer_bias_nt=70.0, magnetometer_scale=0.0016)
-    assert judged(after.surveys, after.vectors, unmarked, replace_struct(limits, sensor=wide)).accepted[20]
+    wide = SensorTerms(
+        axial_interference_nt=220.0, magnetometer_bias_nt=70.0, magnetometer_scale=0.0016
+    )
+    assert judged(
+        after.surveys, after.vectors, unmarked, replace_struct(limits, sensor=wide)
+    ).accepted[20]
 
 
 def test_surveys_that_do_not_fit_are_named() -> None:

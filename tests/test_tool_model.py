@@ -103,7 +103,8 @@ def turned_by(name, inclination, azimuth, toolface, dip):
         down = g / np.linalg.norm(g)
         east = np.cross(down, b)
         north = np.cross(east, down)
-        angles.append((np.arccos(down[2]), np.arctan2(east[2] * np.linalg.norm(north) / np.linalg.norm(east), north[2])))
+        ratio = np.linalg.norm(north) / np.linalg.norm(east)
+        angles.append((np.arccos(down[2]), np.arctan2(east[2] * ratio, north[2])))
     change = np.subtract(*angles)
     change[1] = (change[1] + np.pi) % (2 * np.pi) - np.pi
     return change / (2 * step)
@@ -152,7 +153,9 @@ def test_the_tool_model_of_a_tool_that_does_not_turn_is_read_back(tmp_path):
     path.write_text(tool_model_text(record, toolface=np.radians(30.0)), "utf-8")
     model = load_error_model(path)
     values = {term.name: term.value for term in sensor_terms(record)}
-    assert {term.name: term.size for term in model.terms} == {n: values[n] for n in formulas_at(0.5)}
+    assert {term.name: term.size for term in model.terms} == {
+        n: values[n] for n in formulas_at(0.5)
+    }
     assert "toolface 30°" in json.loads(path.read_text("utf-8"))["metadata"]["application"]
 
 
