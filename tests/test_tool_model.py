@@ -103,12 +103,8 @@ def turned_by(name, inclination, azimuth, toolface, dip):
         down = g / np.linalg.norm(g)
         east = np.cross(down, b)
         north = np.cross(east, down)
-        angles.append(
-            (
-                np.arccos(down[2]),
-                np.arctan2(east[2] * np.linalg.norm(north) / np.linalg.norm(east), north[2]),
-            )
-        )
+        ratio = np.linalg.norm(north) / np.linalg.norm(east)
+        angles.append((np.arccos(down[2]), np.arctan2(east[2] * ratio, north[2])))
     change = np.subtract(*angles)
     change[1] = (change[1] + np.pi) % (2 * np.pi) - np.pi
     return change / (2 * step)

@@ -595,8 +595,8 @@ def export(
     """A calibration for other programs: C sources for firmware, or a tool model for error-model programs.
 
     `form` of firmware is c (double precision) or fixed-point, with whole numbers of `word_bits` (12 to 32, by default
-    32). `temperature`, °C, is that of a tool model, by default the middle of the calibrated range; `toolface_deg` the gravity
-    toolface of a tool that does not turn, whose terms are of each axis (else they are averaged over toolface).
+    32). `temperature`, °C, is that of a tool model, by default the middle of the calibrated range; `toolface_deg` the
+    gravity toolface of a tool that does not turn, whose terms are of each axis (else they are averaged over toolface).
 
     Raises:
         InputError: an unknown kind or form, or an argument of the other kind.

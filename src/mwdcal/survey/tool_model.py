@@ -68,7 +68,7 @@ at vertical, where one is infinite. `term_shifts` has the same from the geometry
 Reference: SPE 67616; ISCWSA MWD Rev 5."""
 
 
-_ACROSS_TERM = "(Cos(Inc) * Sin(AzM) * {a} {sign} Cos(AzM) * {b})"
+_ACROSS_AZIMUTH = "(Cos(Inc) * Sin(AzM) * {a} {sign} Cos(AzM) * {b})"
 """Part of the azimuth's error by a sensor across the tool, whose direction is {a} upward and {b} sideways."""
 
 
@@ -80,7 +80,7 @@ def formulas_at(toolface: float) -> dict[str, tuple[str, ...]]:
     sine, cosine = (f"({v:.12g})" for v in np.round([np.sin(toolface), np.cos(toolface)], 15) + 0.0)
     result: dict[str, tuple[str, ...]] = {}
     for axis, a, b, sign, back in (("X", sine, cosine, "-", "+"), ("Y", cosine, sine, "+", "-")):
-        across = _ACROSS_TERM.format(a=a, b=b, sign=sign)
+        across = _ACROSS_AZIMUTH.format(a=a, b=b, sign=sign)
         level = f"(Cos(AzM) * {b} {sign} Cos(Inc) * Sin(AzM) * {a})"
         start = "" if axis == "X" else "-"
         north = f"-({a} * Cos(AzT) {back} {b} * Sin(AzT)) / Gfield"

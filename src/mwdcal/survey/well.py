@@ -312,8 +312,8 @@ AXES_OF_EARTH = ("north", "east", "tvd")
 WELL_FINDINGS = {
     "rejected": "{rejected} of {judged} surveys lie outside the limits '{limits}' (first: station {first}: {why}).",
     "blind-to-interference": "acceptance is blind to interference of the drill string at {blind} of {accepted} "
-    "accepted surveys. At station {blindest} {worst}. Use `msa`: surveys at another attitude show what is along the tool, "
-    "rotation shots (four toolfaces at one depth) what is across it. Or measure a check azimuth.",
+    "accepted surveys. At station {blindest} {worst}. Use `msa`: surveys at another attitude show what is along the "
+    "tool, rotation shots (four toolfaces at one depth) what is across it. Or measure a check azimuth.",
     "rejected-on-path": "surveys outside the limits are part of the well path. Leave them out of the table, or "
     "survey again.",
     "not-judged": "{unjudged} of {rows} surveys are not judged: no reference for |g|, |b| or dip. Give `reference`, or "
