@@ -353,7 +353,7 @@ def test_what_is_no_file_of_a_registry_is_named_and_stops_nothing(example, tmp_p
     }
     assert words.pop("sound.json") == ""
     for name, word in {
-        "notes.txt": "none of them", "other.json": "none of them", "key.pem": "private key",
+        "notes.txt": "something else", "other.json": "something else", "key.pem": "private key",
         "table.csv": "columns of a run are missing (ax, ay, az)", "edited.json": "edited.json",
     }.items():  # fmt: skip
         assert word in words[name], name

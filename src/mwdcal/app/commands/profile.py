@@ -33,7 +33,7 @@ MOST_ROUNDS = 20
     "--column",
     multiple=True,
     metavar="OURS=THEIRS",
-    help="Which column is which: ref_azimuth_deg='Azi 2', ref_field_nt='F [µT]'; blank: none is. Repeatable.",
+    help="Which column is which: ref_azimuth_deg='Azi 2', ref_field_nt='F [µT]'; blank: no column. Repeatable.",
 )
 @click.option(
     "--leave-out",
