@@ -22,6 +22,8 @@ CELLS_APART = 5.0
 """Standard deviations that the means of two cells of a standstill may lie apart."""
 CREEP_SIGMA = 3.0
 """Standard deviations of a trend over the standstill beyond which a channel creeps."""
+WANDER_SIGMA = 3.09
+"""Of the normal distribution: chance exceeds it once in a thousand times. Cells that scatter more than that wander."""
 DOUBTFUL_SIGMA = 2.0
 """Beyond these the change over the standstill counts as an uncertainty of the mean."""
 SILENCE = 3.0
@@ -195,6 +197,26 @@ class Settling:
         return "settled" if self._settled else "settling"
 
     @property
+    def wanders(self) -> bool:
+        """Whether the means of cells scatter more than the samples within them explain: no scatter then tells enough.
+
+        Their ratio is χ² over its freedom (Wilson and Hilferty). A converter too coarse for the noise is left out.
+        """
+        freedom = len(self.still) - 1
+        if freedom < FEWEST_IN_CELL:
+            return False
+        share = 2 / (9 * freedom)
+        most = (1 - share + WANDER_SIGMA * sqrt(share)) ** 3
+        count = sum(cell.count for cell in self.still) / len(self.still)
+        columns = [*zip(*(cell.means for cell in self.still), strict=True)]
+        for place, scatter in enumerate(self._scatter()):
+            mean = sum(columns[place]) / len(columns[place])
+            square = sum((each - mean) ** 2 for each in columns[place]) / freedom
+            if not scatter < self.step[place] / 2 < inf and square * count > most * scatter**2:
+                return True
+        return False
+
+    @property
     def means(self) -> tuple[float, ...]:
         """The mean of each channel over the standstill."""
         samples = sum(cell.count for cell in self.still)
@@ -235,11 +257,14 @@ def _trend(means: Sequence[float], sd: float) -> tuple[float, float]:
 
 
 def _sd_of_mean(cells: Sequence[float], weights: Sequence[float], mean: float) -> float:
-    """Standard uncertainty of a mean of cells by their scatter, which holds noise that wanders from cell to cell."""
+    """Standard uncertainty of a mean of cells by their scatter, which holds noise that wanders from cell to cell.
+
+    So few of them tell their own scatter badly: (m - 1)/(m - 3) makes up for it. Reference: JCGM 101:2008, 6.4.9.4.
+    """
     largest = 0.0
     for size in (1, 2):  # means of two cells follow noise that wanders more slowly
         batches = [slice(i, i + size) for i in range(0, len(cells) - size + 1, size)]
-        if len(batches) > 1:
+        if (many := len(batches)) > 3:
             square = sum(sum(weights[b]) * (sum(cells[b]) / size - mean) ** 2 for b in batches)
-            largest = max(largest, square / (len(batches) - 1))
+            largest = max(largest, square / (many - 3))
     return sqrt(largest)
