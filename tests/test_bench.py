@@ -905,7 +905,7 @@ def test_a_get_changes_nothing(client, bench):
 def test_everywhere_means_any_address_and_no_name():
     from mwdcal.bench.server import Bench
 
-    bench = Bench(Mock(), Mock(), ["0.0.0.0:80"], any_address=True)
+    bench = Bench(Mock(folder=Path("nowhere")), Mock(), ["0.0.0.0:80"], any_address=True)
     assert bench.answers_to("192.168.1.7:80")
     assert bench.answers_to("[fe80::1]:80")
     assert not bench.answers_to("evil.example:80")
