@@ -12,6 +12,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from scipy import stats
 
 import mwdcal as mwdcal_package
 from bench_support import (
@@ -30,7 +31,7 @@ from mwdcal.bench import documents, serving
 from mwdcal.bench.attitude import has_turned
 from mwdcal.bench.journal import Journal
 from mwdcal.bench.session import BenchSession
-from mwdcal.bench.settling import Settling
+from mwdcal.bench.settling import WANDER_SIGMA, Settling, _largest_ratio
 from mwdcal.bench.sources import GrowingFile, Lines, SerialPort, Socket, source_of
 from mwdcal.bench.spreadsheet import DroppedTable
 from mwdcal.bench.stream import Stream
@@ -618,25 +619,40 @@ def test_the_stated_uncertainty_of_a_mean_holds(kind):
 
 @pytest.mark.parametrize("seconds", [0.0, 0.3, 1.0])
 def test_noise_that_wanders_is_said(seconds):
-    """White noise, and a low pass of so many seconds: how often it is said agrees with the statistic's own odds.
+    """White noise, and a low pass of so many seconds: how often it is said lies between two odds of the statistic.
 
-    The odds are those of 20,000 windows of ten cells of five samples: five times the variance of the cells' means over
-    that within cells, above the 0.1 % point of χ² with nine degrees of freedom over nine, 27.88/9. Of 100 standstills
-    three standard deviations less, or more, are allowed; 0.5 of one counts as the least deviation.
+    Those are of 20,000 windows of ten cells of five samples: five times the variance of the cells' means over that
+    within cells, above the point of F with 9 and 40 degrees of freedom that a sixth of 0.1 % exceed. Above: of all
+    windows. Below: of those that have neither a trend of three standard deviations nor a cell that lies five away from
+    the first, for only such a window is a standstill. Three standard deviations of so many trials come on top.
     """
     share = np.exp(-0.1 / seconds) if seconds else 0.0
     noise = np.random.default_rng(1).normal(size=(20_000, 50))
     for i in range(1, 50):
         noise[:, i] = share * noise[:, i - 1] + np.sqrt(1 - share**2) * noise[:, i]
     cells = noise.reshape(-1, 10, 5)
-    ratio = 5 * cells.mean(2).var(1, ddof=1) / cells.var(2, ddof=1).mean(1)
-    odds = np.mean(ratio > 27.88 / 9)
+    means, within = cells.mean(2), cells.var(2, ddof=1).mean(1)
+    said = 5 * means.var(1, ddof=1) / within > stats.f.isf(0.001 / 6, 9, 40)
+    fits = np.polynomial.polynomial.polyfit(np.arange(10), means.T, 1)
+    left = means - np.polynomial.polynomial.polyval(np.arange(10), fits)
+    spread = np.maximum(np.sqrt(within / 5), np.sqrt(np.sum(left**2, 1) / 8))
+    steady = np.abs(fits[1]) * np.sqrt(82.5) < 3 * spread
+    apart = np.abs(means - means[:, :1]).max(1)
+    steady &= apart < 5 * np.sqrt(2 / 5 * within.mean())
     kind = f"{seconds:g} s" if seconds else "white"
     judges = [judge for judge, _ in standstills(kind) if judge.state == "settled"]
-    said = np.mean([judge.wanders for judge in judges])
+    got = np.mean([judge.wanders for judge in judges])
     assert len(judges) > 90
-    assert abs(said - odds) < 3 * max(np.sqrt(odds * (1 - odds) / len(judges)), 0.005)
-    assert (odds > 0.8) == (seconds > 0)
+    low, high = said[steady].mean(), said.mean()
+    spread = [3 * np.sqrt(odds * (1 - odds) / len(judges)) for odds in (low, high)]
+    assert low - spread[0] <= got <= high + max(spread[1], 1.5 / len(judges))
+    assert (low > 0.4) == (seconds > 0)
+
+
+def test_the_limit_of_wandering_is_that_of_fisher():
+    for freedom, within in ((9, 40), (9, 240), (39, 160), (4, 30)):
+        exact = stats.f.isf(stats.norm.sf(WANDER_SIGMA), freedom, within)
+        assert _largest_ratio(freedom, within) == pytest.approx(exact, rel=0.05)
 
 
 def test_a_coarse_converter_does_not_wander():

@@ -22,8 +22,8 @@ CELLS_APART = 5.0
 """Standard deviations that the means of two cells of a standstill may lie apart."""
 CREEP_SIGMA = 3.0
 """Standard deviations of a trend over the standstill beyond which a channel creeps."""
-WANDER_SIGMA = 3.09
-"""Of the normal distribution: chance exceeds it once in a thousand times. Cells that scatter more than that wander."""
+WANDER_SIGMA = 3.58
+"""Of the normal distribution: chance exceeds it once in a thousand times in any of six sensors."""
 DOUBTFUL_SIGMA = 2.0
 """Beyond these the change over the standstill counts as an uncertainty of the mean."""
 SILENCE = 3.0
@@ -200,19 +200,18 @@ class Settling:
     def wanders(self) -> bool:
         """Whether the means of cells scatter more than the samples within them explain: no scatter then tells enough.
 
-        Their ratio is χ² over its freedom (Wilson and Hilferty). A converter too coarse for the noise is left out.
+        A converter too coarse for the noise is left out.
         """
-        freedom = len(self.still) - 1
-        if freedom < FEWEST_IN_CELL:
+        many, count = len(self.still), sum(cell.count for cell in self.still)
+        if many <= FEWEST_IN_CELL:
             return False
-        share = 2 / (9 * freedom)
-        most = (1 - share + WANDER_SIGMA * sqrt(share)) ** 3
-        count = sum(cell.count for cell in self.still) / len(self.still)
+        most = _largest_ratio(many - 1, count - many)
         columns = [*zip(*(cell.means for cell in self.still), strict=True)]
         for place, scatter in enumerate(self._scatter()):
-            mean = sum(columns[place]) / len(columns[place])
-            square = sum((each - mean) ** 2 for each in columns[place]) / freedom
-            if not scatter < self.step[place] / 2 < inf and square * count > most * scatter**2:
+            mean = sum(columns[place]) / many
+            square = sum((each - mean) ** 2 for each in columns[place]) / (many - 1)
+            is_coarse = scatter < self.step[place] / 2 < inf
+            if not is_coarse and square * count / many > most * scatter**2:
                 return True
         return False
 
@@ -238,6 +237,22 @@ class Settling:
             if sample < (step := self.step[place]) / 2 < inf:  # its error does not average out
                 sd[place] = hypot(sd[place], step / sqrt(12))
         return Standstill(means, tuple(sd), samples, cells[0].start, cells[-1].end)
+
+
+def _largest_ratio(freedom: int, within: int) -> float:
+    """The ratio of two variances of so many degrees of freedom beyond which noise wanders.
+
+    Definition: the point of Fisher's F at `WANDER_SIGMA`, as its cube root is about normal. Singular: infinite where so
+    few samples within cells tell nothing. Reference: Paulson 1942.
+    """
+    share, other = 2 / (9 * freedom), 2 / (9 * within)
+    above, below = 1 - share, 1 - other
+    square = below**2 - WANDER_SIGMA**2 * other
+    if square <= 0:
+        return inf
+    rest = above**2 - WANDER_SIGMA**2 * share
+    root = sqrt((above * below) ** 2 - square * rest)
+    return float(((above * below + root) / square) ** 3)
 
 
 def _trend(means: Sequence[float], sd: float) -> tuple[float, float]:
