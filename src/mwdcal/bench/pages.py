@@ -299,6 +299,7 @@ def live(session: BenchSession, source: LineSource) -> dict[str, Any]:
         result: dict[str, Any] = {
             "state": "moving" if away else state, "source": _source_text(session, source),
             "state_text": _state_text(session, state, away),
+            "still_note": texts()["wanders"] if state == "settled" and settling and settling.wanders else "",
             "ready": state == "settled" and not session.waiting and session.order is not None,
         }  # fmt: skip
     for name in LIVE_DECIMALS:

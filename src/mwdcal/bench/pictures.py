@@ -138,6 +138,10 @@ def _curve(
 ) -> str:  # fmt: skip
     """The course of one angle, its name at a height that no other name has, and a ring at its end."""
     parts = [f'<circle class="course c{index}" cx="{x}" cy="{y:.1f}" r="4"/>' for x, y in ring]
+    if len(line) == 1:  # the first fit: no line yet
+        parts += [
+            f'<circle class="course c{index}" cx="{x}" cy="{y:.1f}" r="1.5"/>' for x, y in line
+        ]
     if line:
         corners = " ".join(f"{x:.1f},{y:.1f}" for x, y in line)
         parts.append(f'<polyline class="course c{index}" points="{corners}"/>')

@@ -22,6 +22,8 @@ CELLS_APART = 5.0
 """Standard deviations that the means of two cells of a standstill may lie apart."""
 CREEP_SIGMA = 3.0
 """Standard deviations of a trend over the standstill beyond which a channel creeps."""
+WANDER_SIGMA = 3.58
+"""Of the normal distribution: chance exceeds it once in a thousand times in any of six sensors."""
 DOUBTFUL_SIGMA = 2.0
 """Beyond these the change over the standstill counts as an uncertainty of the mean."""
 SILENCE = 3.0
@@ -195,6 +197,25 @@ class Settling:
         return "settled" if self._settled else "settling"
 
     @property
+    def wanders(self) -> bool:
+        """Whether the means of cells scatter more than the samples within them explain: no scatter then tells enough.
+
+        A converter too coarse for the noise is left out.
+        """
+        many, count = len(self.still), sum(cell.count for cell in self.still)
+        if many <= FEWEST_IN_CELL:
+            return False
+        most = _largest_ratio(many - 1, count - many)
+        columns = [*zip(*(cell.means for cell in self.still), strict=True)]
+        for place, scatter in enumerate(self._scatter()):
+            mean = sum(columns[place]) / many
+            square = sum((each - mean) ** 2 for each in columns[place]) / (many - 1)
+            is_coarse = scatter < self.step[place] / 2 < inf
+            if not is_coarse and square * count / many > most * scatter**2:
+                return True
+        return False
+
+    @property
     def means(self) -> tuple[float, ...]:
         """The mean of each channel over the standstill."""
         samples = sum(cell.count for cell in self.still)
@@ -218,6 +239,22 @@ class Settling:
         return Standstill(means, tuple(sd), samples, cells[0].start, cells[-1].end)
 
 
+def _largest_ratio(freedom: int, within: int) -> float:
+    """The ratio of two variances of so many degrees of freedom beyond which noise wanders.
+
+    Definition: the point of Fisher's F at `WANDER_SIGMA`, as its cube root is about normal. Singular: infinite where so
+    few samples within cells tell nothing. Reference: Paulson 1942.
+    """
+    share, other = 2 / (9 * freedom), 2 / (9 * within)
+    above, below = 1 - share, 1 - other
+    square = below**2 - WANDER_SIGMA**2 * other
+    if square <= 0:
+        return inf
+    rest = above**2 - WANDER_SIGMA**2 * share
+    root = sqrt((above * below) ** 2 - square * rest)
+    return float(((above * below + root) / square) ** 3)
+
+
 def _trend(means: Sequence[float], sd: float) -> tuple[float, float]:
     """The change along a straight line through means, and the same over its standard deviation.
 
@@ -235,11 +272,14 @@ def _trend(means: Sequence[float], sd: float) -> tuple[float, float]:
 
 
 def _sd_of_mean(cells: Sequence[float], weights: Sequence[float], mean: float) -> float:
-    """Standard uncertainty of a mean of cells by their scatter, which holds noise that wanders from cell to cell."""
+    """Standard uncertainty of a mean of cells by their scatter, which holds noise that wanders from cell to cell.
+
+    So few of them tell their own scatter badly: (m - 1)/(m - 3) makes up for it. Reference: JCGM 101:2008, 6.4.9.4.
+    """
     largest = 0.0
     for size in (1, 2):  # means of two cells follow noise that wanders more slowly
         batches = [slice(i, i + size) for i in range(0, len(cells) - size + 1, size)]
-        if len(batches) > 1:
+        if (many := len(batches)) > 3:
             square = sum(sum(weights[b]) * (sum(cells[b]) / size - mean) ** 2 for b in batches)
-            largest = max(largest, square / (len(batches) - 1))
+            largest = max(largest, square / (many - 3))
     return sqrt(largest)
