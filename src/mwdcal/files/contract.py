@@ -100,9 +100,9 @@ RANGES = {
 }
 """The columns of numbers, and their accepted values."""
 COLUMNS = ("station", "group", *RANGES)
-VECTORS = tuple(f"ref_{name}_{'g' if name[0] == 'a' else 'nt'}" for name in RAW)
+REFERENCE_VECTORS = tuple(f"ref_{name}_{'g' if name[0] == 'a' else 'nt'}" for name in RAW)
 """Components along the tool axes of gravity and field as the stand states them, instead of angles and strengths."""
-MAPPED = (*COLUMNS, "serial", *VECTORS)
+MAPPED = (*COLUMNS, "serial", *REFERENCE_VECTORS)
 """Columns that a table may have under another name."""
 _UNITS_BY_END = {
     "deg": ("°", "rad", "gon"),
@@ -119,7 +119,9 @@ _UNIT = re.compile(
 
 def of_vectors(columns: Collection[str]) -> list[str]:
     """References that the components among some columns give: of gravity alone, or of both fields."""
-    gravity, field = ({*part} <= {*columns} for part in (VECTORS[:3], VECTORS[3:]))
+    gravity, field = (
+        {*part} <= {*columns} for part in (REFERENCE_VECTORS[:3], REFERENCE_VECTORS[3:])
+    )
     names = ("inclination", "toolface", "gravity") if gravity else ()
     more = ("azimuth", "field", "dip") if gravity and field else ()
     return [REFERENCES[name].column for name in (*names, *more)]

@@ -31,8 +31,8 @@ from mwdcal.files.contract import (
     COLUMNS,
     RANGES,
     RAW,
+    REFERENCE_VECTORS,
     REFERENCES,
-    VECTORS,
     Cells,
     Range,
     check_columns,
@@ -357,7 +357,7 @@ def _with_angles(columns: dict[str, Column]) -> dict[str, Column]:
     given = of_vectors(columns)
     if not given:
         return columns
-    parts = [np.asarray(columns[name], float) for name in VECTORS if name in columns]
+    parts = [np.asarray(columns[name], float) for name in REFERENCE_VECTORS if name in columns]
     g = np.stack(parts[:3], -1)
     b = np.stack(parts[3:], -1) if len(parts) == len(RAW) else g
     names = [name for name, each in REFERENCES.items() if each.column in given]
@@ -366,7 +366,9 @@ def _with_angles(columns: dict[str, Column]) -> dict[str, Column]:
         REFERENCES[n].column: v if n in ("gravity", "field") else np.degrees(v)
         for n, v in values.items()
     }
-    return angles | {name: cells for name, cells in columns.items() if name not in VECTORS}
+    return angles | {
+        name: cells for name, cells in columns.items() if name not in REFERENCE_VECTORS
+    }
 
 
 def _with_stated_references(table: Table) -> Table:

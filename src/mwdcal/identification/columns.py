@@ -14,8 +14,8 @@ from mwdcal.files.contract import (
     CHANNELS,
     MAPPED,
     RAW,
+    REFERENCE_VECTORS,
     REFERENCES,
-    VECTORS,
     forms,
     of_vectors,
     units_of,
@@ -310,7 +310,7 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
         resembled(plain) or _without_title(plain) or resembled(f"{name} ({unit})" if unit else name)
     )
     if alike and alike.column in RAW and _CALLED_REFERENCE.search(plain):
-        return alike._replace(column=VECTORS[RAW.index(alike.column)])
+        return alike._replace(column=REFERENCE_VECTORS[RAW.index(alike.column)])
     if _MEASURED.search(plain) and not (alike and alike.column == WARMTH):
         return _measured_channel(plain)
     near = {form: column for column in MAPPED for form in forms(column)}
@@ -507,8 +507,15 @@ def proposed(
 def _with_whole_vectors(meanings: dict[str, Resemblance]) -> dict[str, Resemblance]:
     """Columns by what they hold, without components of a vector of which others are absent."""
     called = {m.column for m in meanings.values()}
-    whole = [c for part in (VECTORS[:3], VECTORS[3:]) if {*part} <= called for c in part]
-    return {n: m for n, m in meanings.items() if m.column not in VECTORS or m.column in whole}
+    whole = [
+        c
+        for part in (REFERENCE_VECTORS[:3], REFERENCE_VECTORS[3:])
+        if {*part} <= called
+        for c in part
+    ]
+    return {
+        n: m for n, m in meanings.items() if m.column not in REFERENCE_VECTORS or m.column in whole
+    }
 
 
 def _chosen(
