@@ -338,6 +338,12 @@ def test_a_total_that_is_computed_in_another_unit_is_no_reference(tmp_path):
     assert "'|G| (mg)' is not used: it is computed" in findings_of(proposal)["not-used"]
 
 
+def test_channels_too_large_for_a_norm_are_no_total(tmp_path):
+    """Cells of 1e200 are refused in words, without a warning of NumPy."""
+    path = written(tmp_path / "a.csv", table(ax=[1e200] * 48, ay=[-1e200, 1e200] * 24))
+    assert mwdcal("profile", path, "-o", tmp_path / "t.toml").code in (2, 3)
+
+
 # ---------------------------------------------------------------------- rows and cells of a run
 
 

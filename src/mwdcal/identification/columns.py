@@ -632,8 +632,9 @@ def _is_total(column: str, name: str, meanings: Mapping[str, Resemblance], value
     total = values(name)
     if len(columns) != 3 or total is None:
         return False
-    norm = np.linalg.norm(columns, axis=0)
-    if not np.ptp(norm) or not np.all(norm > 0):
+    with np.errstate(over="ignore"):
+        norm = np.linalg.norm(columns, axis=0)
+    if not np.all((norm > 0) & (norm < np.inf)) or not np.ptp(norm):
         return False
     in_its_unit = norm * np.median(total / norm)
     return bool(np.abs(in_its_unit - total).max() < 0.02 * np.ptp(in_its_unit))
