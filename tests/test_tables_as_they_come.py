@@ -189,7 +189,7 @@ def workbook_of(path, columns, sheets, *above):
 def test_sheets_that_are_parts_of_one_run_are_joined(tmp_path, sheets, first):
     """Named as settings, with stations that begin anew, or numbered on from sheet to sheet."""
     numbers = [k % 16 + 1 for k in range(48)] if first else [*range(1, 49)]
-    columns = table(station=numbers)
+    columns = table(station=numbers, temperature_c=np.repeat([25.0, 80.0, -10.0], 16))
     path = workbook_of(tmp_path / "a.xlsx", columns, sheets, ["Tool S/N", "DM-17"])
     run = read(path)
     whole = read(written(tmp_path / "b.csv", table()))
@@ -216,6 +216,14 @@ def test_sheets_that_may_be_two_runs_are_asked_about(tmp_path, sheets, numbers):
     assert all(f"--sheet '{name}'" in message or f"--sheet {name}" in message for name in sheets)
 
 
+def test_sheets_whose_names_contradict_their_temperatures_are_asked_about(tmp_path):
+    """25 and 80 °C by the sheets, and 25 in both columns."""
+    path = workbook_of(tmp_path / "a.xlsx", table(station=[*range(1, 49)]), ("25C", "80C"))
+    assert "2 tables of like columns" in refused(
+        mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3
+    )
+
+
 def test_a_sheet_that_repeats_a_row_of_another_is_no_part_of_its_run(tmp_path):
     columns = table(station=[1] * 48)
     columns = {name: [*values[:24], *values[:24]] for name, values in columns.items()}
@@ -228,10 +236,10 @@ def test_a_sheet_that_repeats_a_row_of_another_is_no_part_of_its_run(tmp_path):
 def test_a_bad_cell_of_a_joined_sheet_is_named_with_its_sheet(tmp_path):
     columns = table(station=[*range(1, 49)])
     columns["Gy (V)"] = [*columns["Gy (V)"][:30], "see note", *columns["Gy (V)"][31:]]
-    path = workbook_of(tmp_path / "a.xlsx", columns, ("25C", "80C"))
+    path = workbook_of(tmp_path / "a.xlsx", columns, ("Inc 5", "Inc 80"))
     letter = openpyxl.utils.get_column_letter([*columns].index("Gy (V)") + 1)
     message = refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
-    assert f"sheet '80C', cell {letter}8, column 'Gy (V)'" in message
+    assert f"sheet 'Inc 80', cell {letter}8, column 'Gy (V)'" in message
 
 
 def test_a_number_of_a_workbook_has_no_separators_whatever_the_sign_of_its_texts(tmp_path):
@@ -328,6 +336,12 @@ def test_a_total_that_is_computed_in_another_unit_is_no_reference(tmp_path):
     )
     proposal = library.propose_profile(path)
     assert "'|G| (mg)' is not used: it is computed" in findings_of(proposal)["not-used"]
+
+
+def test_channels_too_large_for_a_norm_are_no_total(tmp_path):
+    """Cells of 1e200 are refused in words, without a warning of NumPy."""
+    path = written(tmp_path / "a.csv", table(ax=[1e200] * 48, ay=[-1e200, 1e200] * 24))
+    assert mwdcal("profile", path, "-o", tmp_path / "t.toml").code in (2, 3)
 
 
 # ---------------------------------------------------------------------- rows and cells of a run

@@ -14,8 +14,8 @@ from mwdcal.files.contract import (
     CHANNELS,
     MAPPED,
     RAW,
+    REFERENCE_VECTORS,
     REFERENCES,
-    VECTORS,
     forms,
     of_vectors,
     units_of,
@@ -310,7 +310,7 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
         resembled(plain) or _without_title(plain) or resembled(f"{name} ({unit})" if unit else name)
     )
     if alike and alike.column in RAW and _CALLED_REFERENCE.search(plain):
-        return alike._replace(column=VECTORS[RAW.index(alike.column)])
+        return alike._replace(column=REFERENCE_VECTORS[RAW.index(alike.column)])
     if _MEASURED.search(plain) and not (alike and alike.column == WARMTH):
         return _measured_channel(plain)
     near = {form: column for column in MAPPED for form in forms(column)}
@@ -507,8 +507,15 @@ def proposed(
 def _with_whole_vectors(meanings: dict[str, Resemblance]) -> dict[str, Resemblance]:
     """Columns by what they hold, without components of a vector of which others are absent."""
     called = {m.column for m in meanings.values()}
-    whole = [c for part in (VECTORS[:3], VECTORS[3:]) if {*part} <= called for c in part]
-    return {n: m for n, m in meanings.items() if m.column not in VECTORS or m.column in whole}
+    whole = [
+        c
+        for part in (REFERENCE_VECTORS[:3], REFERENCE_VECTORS[3:])
+        if {*part} <= called
+        for c in part
+    ]
+    return {
+        n: m for n, m in meanings.items() if m.column not in REFERENCE_VECTORS or m.column in whole
+    }
 
 
 def _chosen(
@@ -625,8 +632,9 @@ def _is_total(column: str, name: str, meanings: Mapping[str, Resemblance], value
     total = values(name)
     if len(columns) != 3 or total is None:
         return False
-    norm = np.linalg.norm(columns, axis=0)
-    if not np.ptp(norm) or not np.all(norm > 0):
+    with np.errstate(over="ignore"):
+        norm = np.linalg.norm(columns, axis=0)
+    if not np.all((norm > 0) & (norm < np.inf)) or not np.ptp(norm):
         return False
     in_its_unit = norm * np.median(total / norm)
     return bool(np.abs(in_its_unit - total).max() < 0.02 * np.ptp(in_its_unit))

@@ -86,6 +86,10 @@ _OF_SETTING = re.compile(
     re.IGNORECASE,
 )
 """The name of a sheet that is a setting of the stand or the oven: 77F, Inc 45, Cold."""
+_OF_WARMTH = re.compile(r"\W*?([+−-]?\d+(?:[.,]\d+)?)\s*(?:°|deg)?\s*[cf℃]\W*", re.IGNORECASE)
+"""The name of a sheet that is a temperature with its unit."""
+_SAME_WARMTH = 10.0
+"""By how much a temperature differs at most from the one that its sheet is named by."""
 
 Cells = Sequence[object]
 
@@ -209,7 +213,19 @@ def _is_one_run(tables: Sequence[Layout]) -> bool:
     rows = [row for t in tables for row in zip(*t.texts, strict=True)]
     if not same or apart or len({*sheets}) < len(sheets) or len({*rows}) < len(rows):
         return False
+    if not all(map(_has_its_warmth, tables)):
+        return False
     return all(map(_OF_SETTING.fullmatch, sheets)) or _are_numbered_on(tables)
+
+
+def _has_its_warmth(table: Layout) -> bool:
+    """Whether a table on a sheet that is named as a temperature has a column of about that number."""
+    match = _OF_WARMTH.fullmatch(table.sheet)
+    if not match:
+        return True
+    stated = float(match[1].replace(",", ".").replace("−", "-"))
+    columns = [[float(c) for c in cells] for cells in table.cells if all(map(looks_numeric, cells))]
+    return any(max(abs(value - stated) for value in cells) < _SAME_WARMTH for cells in columns)
 
 
 def _are_numbered_on(tables: Sequence[Layout]) -> bool:
