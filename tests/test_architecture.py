@@ -37,6 +37,7 @@ FLOORS = (
     ("",),  # the package itself: its public names
     ("bench",),
     ("app",),
+    ("selftest",),
     ("__main__",),
 )
 ARRAY_ROOMS = ("geometry", "estimation", "sensor.models")
@@ -232,7 +233,7 @@ def options_in_words(tree: ast.AST) -> list[tuple[int, str]]:
 
 
 def test_messages_of_the_library_name_arguments_not_options() -> None:
-    shown = ("presentation", "app", "__main__")
+    shown = ("presentation", "app", "selftest", "__main__")
     typed = {n: options_in_words(TREES[n]) for n in PATHS if n.split(".")[0] not in shown}
     none(typed, "write `order`, of which the command makes --order")
 

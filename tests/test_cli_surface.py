@@ -66,6 +66,35 @@ def test_every_command_has_help_with_an_example(command):
         assert f"mwdcal {command} " in ran.out.split("Example", 1)[1]
 
 
+@pytest.mark.parametrize("words", [(), ("registry",), ("certificate",), ("certificate", "key")])
+def test_each_command_is_one_whole_line(words):
+    lines = mwdcal(*words, "--help").out.splitlines()
+    listed = lines[lines.index("Commands:" if words else "Calibrate:") :]
+    rows = [line for line in listed if line.startswith("  ")]
+    assert max(map(len, rows)) <= 80
+    group = cli
+    for word in words:
+        group = group.commands[word]
+    assert sorted(row.split()[0] for row in rows) == sorted(group.commands)
+    assert not [row for row in rows if row.endswith(("...", ",", " a", " the", " of"))]
+
+
+def test_options_are_grouped():
+    shown = mwdcal("calibrate", "--help").out
+    parts = re.split(
+        r"^(Options|Table options|Fit options|Output options):$", shown, flags=re.MULTILINE
+    )
+    groups = dict(zip(parts[1::2], parts[2::2], strict=True))
+    where = {
+        "Options": "--tool",
+        "Table options": "--serial",
+        "Fit options": "--order",
+        "Output options": "--report",
+    }
+    for title, option in where.items():
+        assert [name for name, text in groups.items() if f"  {option} " in text] == [title]
+
+
 def test_help_and_version_of_the_whole():
     ran = mwdcal("--help")
     assert ran.code == 0

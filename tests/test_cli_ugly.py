@@ -347,8 +347,8 @@ def test_the_screen_names_thirteen_stations_to_shoot_again(tmp_path):
     lines = [line for line in shown.err.splitlines() if line.startswith("! ")]
     assert count > 12
     (again,) = [line for line in lines if "Re-shoot it" in line]
-    assert again.endswith(f" and {count - 13} more")
-    assert len(again.rpartition("Also stations ")[2].split(", ")) == 12
+    also = again.rpartition("Also stations ")[2].partition(" and ")[0].split(", ")
+    assert len(also) == min(count - 1, 12)
     assert len(lines) == len(told) - count + 1
 
 

@@ -284,6 +284,8 @@ def test_findings_are_grouped_by_cause_and_the_most_important_come_first():
     assert [each.id for each in shown] == ["altered", "reshoot", "settings", "not-used"]
     assert shown[1].text == "station 0 moved. Re-shoot it. Also stations 1, 2"
     assert left == 0
+    many = [finding("reshoot", "moved", str(i)) for i in range(20)]
+    assert leading_findings(many)[0][0].text.endswith(", 12 and 7 more")
     shown, left = leading_findings([finding(f"cause-{i}") for i in range(9)])
     assert (len(shown), left) == (6, 3)
 

@@ -22,24 +22,39 @@ INTERNAL = 70
 COMPLETION = "_MWDCAL_COMPLETE"
 """Variable with which a shell asks for completions, which are bytes."""
 SECTIONS = {
-    "Calibrate": (
-        "bench",
-        "init",
-        "profile",
-        "stations",
-        "noise",
-        "calibrate",
-        "verify",
-        "compare",
-        "fleet",
-    ),
-    "Use": ("apply", "convert", "diagnose"),
-    "Plan": ("plan", "simulate", "list", "example"),
-    "Well": ("reference", "survey"),
-    "Records": ("certificate", "registry"),
-    "Shell": ("completion",),
+    "Calibrate": {
+        "bench": "Calibrate a tool live, in the browser, beside the stand",
+        "init": "Write the laboratory's settings once, for all commands",
+        "profile": "Propose a tool profile for a table as it comes",
+        "stations": "Turn a continuous log into a run, a row for each station",
+        "noise": "Measure the noise of every channel of a tool at rest",
+        "calibrate": "Fit the sensor model to a calibration run",
+        "verify": "Test a calibration by a roll test: pass or fail",
+        "compare": "Calibrate a run by every method, side by side",
+        "fleet": "Calibrate many tools at once",
+    },
+    "Use": {
+        "apply": "Correct readings by a calibration",
+        "convert": "Write a calibration in another notation, or for firmware",
+        "diagnose": "Name the fault of a tool that readings show",
+    },
+    "Plan": {
+        "plan": "See how accurate a calibration will be, and find stations",
+        "simulate": "Simulate a run, or a procedure many times",
+        "list": "List built-in plans, profiles, limits or methods",
+        "example": "Write the files of the example into a folder",
+    },
+    "Well": {
+        "reference": "Gravity, magnetic field and convergence at a place",
+        "survey": "Survey a well with uncertainty, and test for interference",
+    },
+    "Laboratory": {
+        "certificate": "Issue, sign and verify certificates",
+        "registry": "Keep every tool's past in a database",
+    },
+    "Shell": {"completion": "Print the completion script of a shell"},
 }
-"""Modules of `mwdcal.app.commands` with a command of their name, in the order of the work, as the help shows them."""
+"""Modules of `mwdcal.app.commands` with a command of their name, in the order of the work, and what each does."""
 _LONG = re.compile(r"([^'\n]{300})[^'\n]+")
 """A value that a message about a wrong option repeats, where it is too long to be read."""
 
@@ -48,12 +63,11 @@ class Sections(click.Group):
     """The commands, shown by section."""
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the sections of the help, each command with its first sentence."""
-        width = formatter.width - 6 - max(map(len, self.commands))
-        for title, names in SECTIONS.items():
-            rows = [(name, self.commands[name].get_short_help_str(width)) for name in names]
+        """Write the sections of the help, each command with what it does in one line."""
+        width = max(map(len, self.commands))
+        for title, commands in SECTIONS.items():
             with formatter.section(title):
-                formatter.write_dl(rows)
+                formatter.write_dl([(name.ljust(width), does) for name, does in commands.items()])
 
 
 @click.group(

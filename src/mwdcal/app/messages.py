@@ -21,6 +21,7 @@ from typing import IO, TYPE_CHECKING, Any
 import click
 
 from mwdcal.app import laboratory
+from mwdcal.calibration.fit_options import FIT_OPTIONS
 from mwdcal.errors import InputError, MwdcalError, reason
 from mwdcal.presentation.text import (
     PATIENCE,
@@ -96,6 +97,26 @@ _MARKED = re.compile(r"^(!|PASS|FAIL)(?= )|(?<=   )(pass|FAIL)(?=   |$)", re.MUL
 """A mark or verdict at the beginning of a line, or alone in a cell of a table."""
 
 
+OPTION_GROUPS = {
+    "Table options": (
+        "serial",
+        "day",
+        "date",
+        "operator",
+        "decimal",
+        "columns",
+        "missing",
+        "outside",
+        "sampling_hz",
+    ),
+    "Fit options": (*FIT_OPTIONS, "exclude"),
+    "Output options": ("output", "report", "plot", "as_json", "quiet", "help"),
+}
+"""Titles of the groups of a command's options below its own, and the names of those in each."""
+FEW_OPTIONS = 8
+"""A command with no more options shows them in one group."""
+
+
 class Command(click.Command):
     """A command whose errors name its options as they are typed, and which can be quiet."""
 
@@ -120,6 +141,21 @@ class Command(click.Command):
     def get_help(self, context: click.Context) -> str:
         """The help, as wide as the terminal."""
         return laid_out(super().get_help(context), sys.stdout)
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options in groups: those of the command first."""
+        shown = [(p.name, p.get_help_record(ctx)) for p in self.get_params(ctx)]
+        records = [(name, record) for name, record in shown if record is not None]
+        titles = {name: title for title, names in OPTION_GROUPS.items() for name in names}
+        groups: dict[str, list[tuple[str, str]]] = {"Options": []}
+        groups |= {title: [] for title in OPTION_GROUPS}
+        few = len(records) <= FEW_OPTIONS
+        for name, record in records:
+            groups["Options" if few else titles.get(name or "", "Options")].append(record)
+        for title, rows in groups.items():
+            if rows:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
 
     def invoke(self, context: click.Context) -> Any:
         """Run the command with the laboratory's settings, and say what it used of them."""

@@ -215,8 +215,8 @@ def _steps(calibration: Calibration, verdict: Verdict | None) -> list[str]:
         ]
     if verdict.passed:
         return [*steps, "Issue the certificate: mwdcal certificate CAL.json --verification V.json"]
-    places, command = after_failure(verdict, "CAL.json", verdict.run)
-    return [*steps, f"Measure again: {places}.", f"See what the failure looks like: {command}"]
+    places, command, reason = after_failure(verdict, "CAL.json", verdict.run)
+    return [*steps, f"Measure again: {places}.", f"{capital(reason)}: {command}"]
 
 
 def _fit_outcome(calibration: Calibration) -> tuple[str, str]:

@@ -128,6 +128,7 @@ def screen(certificate: Certificate, outputs: Sequence[Path]) -> str:
         "\n".join(map(one_line, heading(certificate))),
         *(_test(test) for test in tests),
         *([] if certificate.as_left else ["conformity was not tested"]),
+        *_after_failed(certificate),
         _budget(certificate.budget),
         *(
             [files_written(**{path.suffix[1:].upper(): path for path in outputs})]
@@ -136,6 +137,15 @@ def screen(certificate: Certificate, outputs: Sequence[Path]) -> str:
         ),
     ]
     return "\n\n".join(blocks)
+
+
+def _after_failed(certificate: Certificate) -> Iterator[str]:
+    """The next command where the roll test as left failed."""
+    test = certificate.as_left
+    if test and not test.passed:
+        names = [file.name for file in certificate.files if file.id == "calibration"]
+        calibration = one_line(names[0] if names else "CAL.json")
+        yield f"next: mwdcal diagnose {calibration} {one_line(test.run)}   (what the failure looks like)"
 
 
 def heading(certificate: Certificate) -> list[str]:
@@ -903,7 +913,11 @@ BREAKS = 8
 
 def render_page(certificate: Certificate, pictures: Sequence[Picture] = ()) -> str:
     """The certificate as HTML: the same input gives the same text, byte for byte."""
-    text = certificate_text(certificate, pictures)
+    return text_as_page(certificate_text(certificate, pictures), pictures)
+
+
+def text_as_page(text: CertificateText, pictures: Sequence[Picture] = ()) -> str:
+    """A document in blocks as HTML."""
     templates = environment()
     templates.filters["breakable"] = breakable
     template = templates.get_template("certificate.html")
@@ -949,8 +963,21 @@ def render_pdf(
     Raises:
         InputError: typst is not installed.
     """
+    whole = attached or laid_out(msgspec.json.encode(certificate))
+    stamp = _timestamp(certificate.issued, certificate.calibrated)
+    return text_as_pdf(certificate_text(certificate, pictures), whole, stamp, pictures)
+
+
+def text_as_pdf(
+    document: CertificateText, attached: bytes, timestamp: int, pictures: Sequence[Picture] = ()
+) -> bytes:
+    """A document in blocks as PDF, with its JSON attached; `timestamp` in seconds since 1970.
+
+    Raises:
+        InputError: typst is not installed.
+    """
     require("a certificate as PDF", "typst", extra="certificate")
-    text = msgspec.to_builtins(certificate_text(certificate, pictures))
+    text = msgspec.to_builtins(document)
     characters = _characters(text)
     odd = frozenset(filter(_odd, characters))
     lacking = odd | _lacking("".join(sorted(characters - odd)))
@@ -958,10 +985,10 @@ def render_pdf(
     template = resources.files("mwdcal.presentation").joinpath("templates", "certificate.typ")
     return _compiled(
         template.read_bytes(),
-        _timestamp(certificate),
+        timestamp,
         text=_json(shown),
         pictures=_json({each.id: picture(each.figure, ".svg").decode() for each in pictures}),
-        certificate=(attached or laid_out(msgspec.json.encode(certificate))).decode(),
+        certificate=attached.decode(),
     )
 
 
@@ -983,9 +1010,9 @@ def _compiled(source: bytes, timestamp: int, **inputs: str) -> bytes:
     return result
 
 
-def _timestamp(certificate: Certificate) -> int:
-    """The day of issue in seconds since 1970, or that of the calibration; 0 where neither is a date."""
-    for stated in (certificate.issued, certificate.calibrated):
+def _timestamp(*days: str) -> int:
+    """The first day that is a date in seconds since 1970; 0 where none is."""
+    for stated in days:
         try:
             day = datetime.fromisoformat(stated)
         except ValueError:

@@ -64,6 +64,7 @@ def svg(figure: Figure, key: str) -> Markup:
     """
     from markupsafe import Markup
 
+    _label_each(figure)
     text = "<svg" + picture(figure, ".svg").decode().partition("<svg")[2]
     text = re.sub(
         r"<!--.*?-->\n|<metadata>.*?</metadata>\s*|<style.*?</style>\s*", "", text, flags=re.DOTALL
@@ -98,6 +99,16 @@ def _columns(figure: Figure) -> list[list[Any]]:
         if axes.get_visible():
             columns.setdefault(place.colspan.start, []).append(axes)
     return [columns[k] for k in sorted(columns)] if len(columns) > 1 else []
+
+
+def _label_each(figure: Figure) -> None:
+    """Numbers and a title along the y axis of each panel that shares that of the first column."""
+    first, *others = _columns(figure) or [[]]
+    for axes in itertools.chain(*others):
+        for leader in first:
+            if axes.get_shared_y_axes().joined(axes, leader) and not axes.get_ylabel():
+                axes.tick_params(labelleft=True)
+                axes.set_ylabel(leader.get_ylabel())
 
 
 def _box(figure: Figure, *artists: Any) -> Box:

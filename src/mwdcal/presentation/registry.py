@@ -271,7 +271,8 @@ def check_text(result: RegistryChecked) -> str:
     if result.sound:
         return one_line(f"PASS   {result.registry}: sound") + _newest(result.events, result.head)
     count = len(result.discrepancies)
-    return one_line(f"FAIL   {result.registry}: altered in {plural(count, 'place')}")
+    failed = one_line(f"FAIL   {result.registry}: altered in {plural(count, 'place')}")
+    return f"{failed}\nnext: mwdcal registry restore BACKUP --registry NEW   (the last backup that is sound)"
 
 
 def list_text(listing: Listing) -> str:

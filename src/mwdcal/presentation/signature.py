@@ -189,6 +189,11 @@ def checked(result: CheckedDocument, fields: Mapping[str, Any]) -> str:
     outcome = "PASS" if result.passed else "FAIL"
     first = [outcome, one_line(result.file), *simulated(_stated(fields))]
     lines = ["   ".join(first), *[one_line(result.check.text)] * (result.check.state == "intact")]
+    if not result.passed:
+        file = one_line(result.file)
+        lines.append(
+            f"next: mwdcal certificate verify {file} --key K.pub   (the file as its owner issued it)"
+        )
     if not result.files:
         return "\n".join(lines)
     rows = [[file.name, file.id, FILE_STATES[file.state]] for file in result.files]

@@ -17,6 +17,7 @@ MOST_FINDINGS = 6
 MOST_ALSO = 12
 """Most stations that a finding names besides its own."""
 IMPORTANT = (
+    "too-few", "channel", "missing-reference", "weak-geometry", "temperature-span",
     "altered", "revoked", "unsound", "contradicted", "not-judged", "partly-judged", "reshoot", "repeated-readings",
     "misfit", "accelerometer-residuals", "magnetometer-residuals", "looks-like", "column-explains",
     "outside-temperature", "changed", "standard-overdue",

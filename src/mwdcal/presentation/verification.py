@@ -51,27 +51,36 @@ def screen(
 
 
 def next_step(result: Verdict, calibration: Path, run: Path) -> str:
-    """Lines below a failed roll test: what to measure again, and the command that says what it looks like."""
-    again, command = after_failure(result, calibration, run)
-    if not again:
+    """Lines below a failed roll test: what to measure again, and the next command."""
+    if result.passed:
         return ""
-    return f"\n\nmeasure again: {again}\nnext: {command}   (what it looks like)"
+    again, command, reason = after_failure(result, calibration, run)
+    return f"\n\nmeasure again: {again}\nnext: {command}   ({reason})"
 
 
 def with_next_step(result: Verdict, calibration: Path, run: Path) -> Verdict:
-    """The verdict with a finding `next-step` where a value failed, for machines: files by name, wherever they lie."""
-    again, command = after_failure(result, Path(calibration.name), Path(run.name))
-    if not again:
+    """The verdict with a finding `next-step` where it failed, for machines: files by name, wherever they lie."""
+    if result.passed:
         return result
-    text = f"Measure again: {again}. What the failure looks like says: {command}"
+    again, command, reason = after_failure(result, Path(calibration.name), Path(run.name))
+    text = f"Measure again: {again}. Next: {command} ({reason})"
     return replace(result, findings=[*result.findings, Finding(id="next-step", text=text)])
 
 
-def after_failure(result: Verdict, calibration: Path | str, run: Path | str) -> tuple[str, str]:
-    """Where values failed, each place once, and the command that says what it looks like; empty if none failed."""
+def after_failure(
+    result: Verdict, calibration: Path | str, run: Path | str
+) -> tuple[str, str, str]:
+    """What to measure again, the next command, and what it is good for.
+
+    Where values failed: each place once, and the fault that it looks like. Else no value could be stated.
+    """
     failed = [row for row in result.rows if row.value is not None and not row.passed]
     places = dict.fromkeys(row.note.partition(";")[0] for row in failed)
-    return "; ".join(places), f"mwdcal diagnose {one_line(calibration)} {one_line(run)}"
+    if places:
+        command = f"mwdcal diagnose {one_line(calibration)} {one_line(run)}"
+        return "; ".join(places), command, "what it looks like"
+    again = "the roll test, with what is missing in it"
+    return again, f"mwdcal verify {one_line(calibration)} ROLLTEST.csv", "the new roll test"
 
 
 def _sets(result: Verdict) -> list[str]:

@@ -238,8 +238,7 @@ def _accuracy_axes(figure: Figure, panels: Sequence[Axes]) -> Figure:
     """The parts that both panels share: plain numbers, and one legend of all curves."""
     low, high = panels[0].get_ylim()
     plain_numbers(panels[0].yaxis, *((1.0, 2.0, 5.0) if high / low < 300 else (1.0,)))
-    for axes in panels:
-        axes.set_ylabel("1σ, °")
+    panels[0].set_ylabel("1σ, °")
     handles, labels = panels[0].get_legend_handles_labels()
     place: dict[str, Any] = {"loc": "outside upper left", "ncols": max(len(labels), 1)}
     if labels:
@@ -404,7 +403,6 @@ class Plots:
         x = np.linspace(2, 178, 45)
         figure, [panels] = new_figure("Predicted 1σ over inclination", 2.5, columns=2, sharey=True)
         for axes, (title, noise) in zip(panels, ACCURACY_OF.items(), strict=True):
-            axes.tick_params(labelleft=True)  # a panel by itself on a narrow screen has numbers too
             curves = accuracy_curves(self.calibration, np.radians(x), noise)
             _accuracy_panel(axes, x, {name: curve.typical for name, curve in curves.items()})
             for curve in curves.values():
@@ -419,7 +417,6 @@ class Plots:
         x, label = self._temperatures(), "Predicted 1σ over temperature"
         figure, [panels] = new_figure(label, 2.1, columns=2, sharey=True)
         for axes, (title, noise) in zip(panels, ACCURACY_OF.items(), strict=True):
-            axes.tick_params(labelleft=True)
             each = [accuracy_at(self.calibration, [TYPICAL], noise, at) for at in x.tolist()]
             curves = {name: np.array([sd[name][0] for sd in each]) for name in each[0]}
             _accuracy_panel(axes, x, curves)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections import UserDict
 from difflib import get_close_matches
@@ -13,6 +14,17 @@ import click
 from click.shell_completion import CompletionItem
 
 from mwdcal.presentation.text import laid_out
+
+
+def summary(command: click.Command, width: int) -> str:
+    """What a command does in one line: its first sentence, if longer than a width up to a colon, or else a comma."""
+    text = " ".join((command.help or "").split("\n\n")[0].split())
+    sentence = text.partition(". ")[0].rstrip(".")
+    for end in (r"$", r"[:;]| \(", r",| and "):
+        part = re.split(end, sentence)[0]
+        if len(part) <= width:
+            return part
+    return sentence[:width]
 
 
 class Commands(UserDict[str, Any]):
@@ -51,6 +63,14 @@ class Group(click.Group):
         near = get_close_matches(word, self.commands) if word.isalpha() else []
         if near and not Path(word).exists():
             context.fail(f"No such command {word!r}. Did you mean {' or '.join(near)}?")
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the subcommands, each with what it does in one line."""
+        width = formatter.width - 6 - max(map(len, self.commands))
+        with formatter.section("Commands"):
+            formatter.write_dl(
+                [(name, summary(self.commands[name], width)) for name in sorted(self.commands)]
+            )
 
     def get_help(self, context: click.Context) -> str:
         """The help, as wide as the terminal."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mwdcal.app.commands import options
+from mwdcal.app.commands import Group, options
 from mwdcal.app.messages import Command, print_result
 from mwdcal.certificate.signature import PASSPHRASE
 from mwdcal.errors import InputError
@@ -42,7 +42,7 @@ KEYS_FILE = options.argument("keys", metavar="KEYS.json")
 ONE_KEY = click.argument("name", metavar="KEY")
 
 
-@click.group()
+@click.group(cls=Group)
 def command() -> None:
     """Make keys, and keep the list of those whose signatures are trusted.
 
