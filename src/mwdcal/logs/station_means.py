@@ -35,7 +35,7 @@ SPIKE_DISTANCE = 4.0
 """Distance from the median, in robust standard deviations, above which a sample is a spike."""
 BLOCKS = 64
 """Blocks whose means give the long-run variance."""
-TOGETHER = 1 << 16
+SUMMARISED_AT_ONCE = 1 << 16
 """Samples of standstills that are worked on at once: they fit into a processor's cache."""
 LONG = 16
 """Samples from which on the noise of a standstill is taken from itself; the most it borrows."""
@@ -139,7 +139,7 @@ def summarise_alike(rests: Sequence[Trace], resolution: float, noise: SharedNois
 def _together(rests: Sequence[Trace]) -> Iterator[tuple[Ints, Array, Array]]:
     """Standstills of equally many samples: their places (k,), times and values (k, n)."""
     for alike in _equal(np.array([len(value) for _, value in rests])):
-        each = max(TOGETHER // len(rests[alike[0]][1]), 1)
+        each = max(SUMMARISED_AT_ONCE // len(rests[alike[0]][1]), 1)
         for first in range(0, len(alike), each):
             places = alike[first : first + each]
             traces = zip(*(rests[place] for place in places), strict=True)
