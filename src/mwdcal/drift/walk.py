@@ -365,14 +365,16 @@ class GroupRates:
         """Probability (t, r) of each rate of some tools; `among` those that the type was learnt from or not."""
         likelihood = np.stack([tool.log_likelihood(self.rates) for tool in tools])
         by_peers = np.broadcast_to(self.peers_probability, likelihood.shape).copy()
-        own = np.array(
+        members = np.array(
             [each and tool.noise.size > 0 for tool, each in zip(tools, among, strict=True)]
         )
-        if own.any():
+        if members.any():
             prior = np.log(np.maximum(self.type_probability, 1e-300))
-            logs = (prior - self._evidence(likelihood[own])).reshape(np.count_nonzero(own), -1)
+            logs = (prior - self._evidence(likelihood[members])).reshape(
+                np.count_nonzero(members), -1
+            )
             weight = np.exp(logs - logs.max(-1, keepdims=True))
-            by_peers[own] = weight @ self._members.reshape(weight.shape[-1], -1)
+            by_peers[members] = weight @ self._members.reshape(weight.shape[-1], -1)
         logs = likelihood + np.log(np.maximum(by_peers, 1e-300))
         return np.asarray(np.exp(logs - logsumexp(logs, -1, keepdims=True)))
 
@@ -497,7 +499,7 @@ class Contrasts:
         return [slice(None), *(slice(k, k + 2) for k in range(len(self.precision) - 1))]
 
     @cached_property
-    def _own(self) -> Array:
+    def _run_units(self) -> Array:
         """Units (n, p) of each run, in ours."""
         known = [diagonal(self.scaled[run].sum(0)) for run in self._runs[1:]]
         pairs = [np.where(k > 0, 1 / np.sqrt(np.where(k > 0, k, 1.0)), 0.0) for k in known]
@@ -506,9 +508,12 @@ class Contrasts:
     @cached_property
     def _means(self) -> tuple[Array, Array]:
         """Covariances (n, p, p) of the parameters, if they never changed, by each run in its own units, and in ours."""
-        sums, units = np.stack([self.scaled[run].sum(0) for run in self._runs]), outer(self._own)
-        own = np.linalg.pinv(sums * units, DEPENDENT, hermitian=True)
-        return np.asarray(own, float), np.asarray(own * units, float)
+        sums, units = (
+            np.stack([self.scaled[run].sum(0) for run in self._runs]),
+            outer(self._run_units),
+        )
+        inverse = np.linalg.pinv(sums * units, DEPENDENT, hermitian=True)
+        return np.asarray(inverse, float), np.asarray(inverse * units, float)
 
     @property
     def _mean(self) -> Array:
@@ -528,7 +533,7 @@ class Contrasts:
     @cached_property
     def freedom(self) -> Ints:
         """Degrees of freedom (n,) of the misfits."""
-        units = outer(self._own)
+        units = outer(self._run_units)
         each = [self.scaled[run] * unit for run, unit in zip(self._runs, units, strict=True)]
         stacked = np.concatenate([*each, self._means[0]])
         ranks = np.linalg.matrix_rank(stacked, DEPENDENT, hermitian=True)
@@ -685,8 +690,8 @@ def _drawn(history: History, contrasts: Contrasts, draws: int) -> tuple[AnyArray
             departures[:, triad] *= factors[:, None, part]
         pull = contrasts.pull(departures)
         most[part] = np.abs(contrasts.scores(pull)[:, steady]).max((0, 1), initial=0.0)
-        asked = misfits if first < PAIR_DRAWS else misfits[:1]
-        for row, each in zip(asked, contrasts.misfits(departures, pull), strict=False):
+        rows = misfits if first < PAIR_DRAWS else misfits[:1]
+        for row, each in zip(rows, contrasts.misfits(departures, pull), strict=False):
             row[part] = each
     return most, misfits
 
@@ -706,10 +711,10 @@ def _steps(history: History, contrasts: Contrasts, critical: float) -> tuple[Ste
     named: list[tuple[int, int]] = []
     scored: list[float] = []
     known, sums = contrasts.known[:, steady], contrasts.sums(contrasts.pull(departures))[..., 0]
-    unit, found = np.where(contrasts._unit > 0, contrasts._unit, 1.0), (np.zeros(0), np.zeros(0))
+    unit, estimate = np.where(contrasts._unit > 0, contrasts._unit, 1.0), (np.zeros(0), np.zeros(0))
     moved = np.zeros((*sums.shape, 0))
     while len(named) < MOST_NAMED_STEPS:
-        left = sums - moved @ (found[0] / unit[[place for _, place in named]])
+        left = sums - moved @ (estimate[0] / unit[[place for _, place in named]])
         scores = np.where(known, (left / contrasts._sizes)[:, steady], 0.0)
         row, column = np.unravel_index(np.argmax(np.abs(scores)), scores.shape)
         if abs(scores[row, column]) <= critical:
@@ -719,8 +724,8 @@ def _steps(history: History, contrasts: Contrasts, critical: float) -> tuple[Ste
         step = np.zeros_like(departures)
         step[named[-1][0] :, named[-1][1]] = 1.0
         moved = np.concatenate([moved, contrasts.sums(contrasts.pull(step))], -1)
-        found = contrasts.sizes(named, sums, moved)
+        estimate = contrasts.sizes(named, sums, moved)
     return tuple(
         Step(place, after, float(size), float(sd), score)
-        for (after, place), size, sd, score in zip(named, *found, scored, strict=True)
+        for (after, place), size, sd, score in zip(named, *estimate, scored, strict=True)
     )

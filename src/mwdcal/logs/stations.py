@@ -450,8 +450,8 @@ def _warmth_of(time: Array, value: Array, start: Array, end: Array, lag: float) 
     many = np.flatnonzero(last - first >= standstill.WINDOW)
     if many.size:
         rests = [(time[a:b], value[a:b]) for a, b in zip(first[many], last[many], strict=True)]
-        made = summarise_alike(rests, 0.0, ALONE)
-        warmth[many] = np.stack([made.mean, made.drift], -1)
+        means = summarise_alike(rests, 0.0, ALONE)
+        warmth[many] = np.stack([means.mean, means.drift], -1)
     return warmth
 
 
