@@ -360,7 +360,7 @@ def test_the_page_is_whole_and_needs_nothing_else(whole):
     assert not re.search(r"https?:|@import|<script[^>]|url\((?!#)", page)
     assert len(parsed.ids) == len(set(parsed.ids))
     assert all(f"<th>{method}</th>" in page for method in EVIDENCE)
-    assert page.count("<svg") == 4
+    assert page.count("<figure>") == 4
     assert page.index("Use joint") < page.index("<svg")
     assert "&lt;tool&gt;" in page
     assert "ab" * 32 in page
@@ -374,7 +374,7 @@ def test_the_page_says_what_is_simulated_and_what_is_refused():
     assert "SIMULATED DATA" in page
     assert "<b>swarm refused:</b>" in page
     assert "SF x·τ" in page
-    assert page.count("<svg") == 3
+    assert page.count("<figure>") == 3
 
 
 def worse(comparison, method, factor):
