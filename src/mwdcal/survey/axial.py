@@ -20,7 +20,7 @@ from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import AnyArray, Array, ArrayLike, Bools, wrap
 from mwdcal.survey.acceptance import AXIAL
 from mwdcal.survey.interference_estimate import Assumed, surveys
-from mwdcal.survey.well import SENSOR_CAUSES, Well
+from mwdcal.survey.well import Well
 from mwdcal.use.uncertainty import CORRECTED
 
 TELLING = ("field", "dip")
@@ -131,8 +131,8 @@ def _sensors(well: Well, readings: Readings, g: Array, b: Array) -> Array:
     covariance = covariance + calibration.noise_covariance(readings)
     if well.errors is None:
         return np.asarray(covariance)
-    drift = well.errors.columns(g, b)[:, : SENSOR_CAUSES - 1]
-    return np.asarray(covariance + drift.mT @ drift)
+    biases, scales, _ = well.errors.sizes(g, b)
+    return np.asarray(covariance + (biases**2 + scales**2)[..., None] * np.eye(6))
 
 
 def _other_errors(well: Well, sensors: Array, g: Array, b: Array) -> Array:

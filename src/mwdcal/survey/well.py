@@ -96,10 +96,13 @@ class WellErrors:
     relative: bool = False
     by_walk: bool = False
 
-    def _sizes(self, g: Array, b: Array, hole: Hole) -> tuple[Array, Array, Array]:
-        """1σ (n, 6) of the biases of all axes, of their scales in the unit of the vectors, and (n,) of interference."""
+    def sizes(self, g: Array, b: Array, unit: ArrayLike = 1.0) -> tuple[Array, Array, Array]:
+        """1σ (n, 6) of the biases of all axes, of their scales in the unit of the vectors, and (n,) of interference.
+
+        `unit` of the field, nT: that of a magnetometer calibrated to a field of 1 is the field itself.
+        """
         sensors, one = self.sensors, np.ones((len(g), 3))
-        unit = np.broadcast_to(np.asarray(self.unit(hole), float), len(g))
+        unit = np.broadcast_to(np.asarray(unit, float), len(g))
         gravity = sensors.accelerometer_bias_ms2 / STANDARD_GRAVITY * one
         field = sensors.magnetometer_bias_nt * one / unit[:, None]
         scales = [sensors.accelerometer_scale * g, np.nan_to_num(sensors.magnetometer_scale * b)]
@@ -109,7 +112,7 @@ class WellErrors:
 
     def moved(self, gradient: Array, g: Array, b: Array, hole: Hole) -> Array:
         """Changes (n, 13, k) of what has a gradient (n, k, 6) by 1σ of each independent cause that lasts over a run."""
-        biases, scales, axial = self._sizes(g, b, hole)
+        biases, scales, axial = self.sizes(g, b, self.unit(hole))
         each = [(gradient * size[:, None, :]).mT for size in (biases, scales)]
         return np.concatenate([*each, (gradient[..., 5] * axial[:, None])[:, None, :]], 1)
 
@@ -119,7 +122,7 @@ class WellErrors:
         `gradient` (n, 7, 6) of these by both vectors.
         Errors of the hole's direction against the tool, such as sag, leave the toolface as it is.
         """
-        biases, scales, axial = self._sizes(g, b, hole)
+        biases, scales, axial = self.sizes(g, b, self.unit(hole))
         size = biases**2 + scales**2
         size[:, 5] += axial**2
         result = (gradient**2 @ size[..., None])[..., 0]
