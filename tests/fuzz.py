@@ -70,6 +70,8 @@ SAMPLES = {
     "key": "key",
     "keys": "key",
     "public": "key",
+    "private_key": "key",
+    "x509": "any",
     "document": "signed",
     "verification": "verification",
     "as_found": "verification",
@@ -92,6 +94,7 @@ OUTPUTS = (
     "html",
     "msa_html",
     "contributions",
+    "listing",
 )
 """Arguments and options that name what to write."""
 LIMITS = 'name = "lab"\n[spread]\ninclination_deg = 0.2\nazimuth_deg = 1.5\n'

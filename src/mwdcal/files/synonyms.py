@@ -265,7 +265,6 @@ _CASED = {
     "mG": " milligauss ",
     "mGal": " mgal ",
     "mg": " millig ",
-    "мg": " millig ",
 }
 
 

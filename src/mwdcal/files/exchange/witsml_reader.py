@@ -76,8 +76,8 @@ def _problem(error: Exception) -> str:
 
 def _modules(source: str) -> tuple[Any, type[Exception]]:
     """The parser that refuses attacks, and its refusals; or what to install."""
-    parser = extras.load("defusedxml.ElementTree", f"{source}: a WITSML file", "survey")
-    return parser, import_module("defusedxml").DefusedXmlException
+    refusal = extras.load("defusedxml", f"{source}: a WITSML file", "survey").DefusedXmlException
+    return import_module("defusedxml.ElementTree"), refusal
 
 
 @dataclass

@@ -19,6 +19,7 @@ UNITS_BY_SIGN = {
     "нТл": "nt",
     "мВ": "mv",
     "мГал": "mgal",
+    "мg": "mg",
 }
 """Spellings of units in letters, by their signs and by other alphabets."""
 _TITLE_WORDS = {
