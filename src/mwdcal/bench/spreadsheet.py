@@ -137,7 +137,7 @@ class DroppedTable:
             self._propose()
 
     def _propose(self) -> None:
-        """What the table is, or what is open."""
+        """Work out a profile of the table, or the questions that are open."""
         path = self._given(self.name)
         self.proposal, self.questions, self.reason, self.axes = None, (), "", {}
         self.sheet = self._laid_out(path)

@@ -58,7 +58,7 @@ def _sheet(table: DroppedTable) -> dict[str, Any]:
 
 
 def _meanings(table: DroppedTable) -> dict[str, tuple[str, str]]:
-    """What each column of the table is in a run file, and its unit, by its name; until all is clear as names say."""
+    """The column of a run file and the unit of each column of the table, by name; by names alone until all is clear."""
     if table.proposal is not None:
         columns = table.proposal.proposal.profile.columns
         return {each.name: (ours, each.unit) for ours, each in dict(columns or {}).items()}

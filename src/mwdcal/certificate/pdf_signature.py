@@ -25,7 +25,7 @@ YEARS = 10
 
 
 class PdfParts(NamedTuple):
-    """What a PDF holds: the attached JSON, and the key of its signature, if that is sound."""
+    """Contents of a PDF: the attached JSON, and the key of its signature, if that is sound."""
 
     attached: bytes
     key: TrustedKey | None

@@ -554,11 +554,11 @@ class Contrasts:
         return np.asarray(np.nan_to_num((values - middle) / unit) * (self._unit > 0))[..., None]
 
     def pull(self, departures: Array) -> Array:
-        """What each calibration says (n, p, m) of parameters that depart so, in each of m columns."""
+        """Evidence (n, p, m) of each calibration for these departures of the parameters, in each of m columns."""
         return np.asarray(self.scaled.astype(departures.dtype) @ departures)
 
     def sums(self, pull: Array) -> Array:
-        """What speaks for a change (n - 1, p, m) at each transition, of covariance `information`."""
+        """Evidence (n - 1, p, m) for a change at each transition, of covariance `information`."""
         later = pull.copy()
         for k in range(len(pull) - 1, 0, -1):
             later[k - 1] += later[k]

@@ -120,12 +120,12 @@ class ChannelMean(NamedTuple):
 
 
 def summarise(rests: Sequence[Trace], resolution: float) -> ChannelMean:
-    """What a channel read at its standstills of n >= 2 samples; `resolution` is the step of its readings."""
+    """Means of a channel at its standstills of n >= 2 samples; `resolution` is the step of its readings."""
     return summarise_alike(rests, resolution, pooled(rests, resolution))
 
 
 def summarise_alike(rests: Sequence[Trace], resolution: float, noise: SharedNoise) -> ChannelMean:
-    """What a channel of this noise read at its standstills: those with equally many samples together."""
+    """Means of a channel of this noise at its standstills: those with equally many samples together."""
     parts = [
         (places[rows], part)
         for places, time, value in _together(rests)
@@ -367,7 +367,7 @@ def _summary(
 
 
 def _of_kept(time: Array, value: Array, resolution: float, noise: SharedNoise) -> ChannelMean:
-    """What was read at standstills by samples (k, n) that are no spikes."""
+    """Means at standstills over samples (k, n) without spikes."""
     used, half = value.shape[-1], value.shape[-1] // 2
     clock = time - time.mean(-1, keepdims=True)
     flat = value - noise.course * clock

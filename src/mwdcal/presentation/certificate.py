@@ -447,7 +447,7 @@ FOR_THE_LABORATORY = re.compile(
 
 
 def without_advice(text: str) -> str:
-    """What a finding states, without what it advises the laboratory to do with the program; empty if nothing is left.
+    """The statement of a finding without its advice to the laboratory on the program; empty if nothing is left.
 
     >>> without_advice("assumed exact: dip reference. State its uncertainty in [stand] of the tool profile.")
     'assumed exact: dip reference.'
@@ -565,7 +565,7 @@ def _raw(decision: LimitDecision) -> str:
 
 
 def _decided(certificate: Certificate) -> Iterator[Block]:
-    """What each test rests on, and the decision on each limit with its risk, side by side."""
+    """The basis of each test, and the decision on each limit with its risk, side by side."""
     tests = _tests(certificate)
     if tests:
         yield _test_facts(tests)
@@ -807,7 +807,7 @@ def _statements(certificate: Certificate) -> Iterator[Block]:
 
 
 def _remarks(certificate: Certificate) -> Iterator[Block]:
-    """What the findings say of the results; what they advise the laboratory to do is for the laboratory."""
+    """The statements of the findings about the results, without advice that only the laboratory needs."""
     remarks = [without_advice(finding.text) for finding in certificate.findings]
     for test in _tests(certificate):
         about = (without_advice(finding.text) for finding in test.findings)

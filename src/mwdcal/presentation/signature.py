@@ -52,7 +52,7 @@ PDF_UNSIGNED = (
 )
 PDF_ALTERED = "{name} was altered after it was signed. Use the PDF as it was issued."
 PDF_OTHER_KEY = "{name} and the JSON in it are not signed by one key. Use the PDF as it was issued."
-"""What a PDF is found to be beside the JSON attached to it."""
+"""Messages about a PDF whose signature does not cover the JSON attached to it."""
 FILE_STATES = {"unchanged": "unchanged", "changed": "CHANGED", "missing": "not checked: not found"}
 """The statements about the files of a certificate."""
 

@@ -54,7 +54,7 @@ MEANING_OF_ALLOWED = (
 
 
 class SelftestRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """What was tested, when, where and with what; `passed` where no case failed.
+    """The cases of a self-test, with its time, place and software; `passed` if no case failed.
 
     `package_sha256`: SHA-256 of the lines "digest  path" of all files of the package, by path.
     """

@@ -69,7 +69,7 @@ class AxialCorrection:
         }
 
     def findings(self, labels: Sequence[str], north: str) -> list[Finding]:
-        """The findings that azimuths without it stand beside the others, and of the no-go zone."""
+        """Findings about the extra column of azimuths without it, and about the no-go zone."""
         good, bad = int(self.usable.sum()), int(self.no_go.sum())
         text = (
             f"axial correction of single surveys: azimuth_{north}_axial_deg is the azimuth without interference along "

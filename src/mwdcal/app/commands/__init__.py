@@ -17,7 +17,7 @@ from mwdcal.presentation.text import laid_out
 
 
 def summary(command: click.Command, width: int) -> str:
-    """What a command does in one line: its first sentence, if longer than a width up to a colon, or else a comma."""
+    """Purpose of a command in one line: its first sentence, if longer than a width up to a colon, or else a comma."""
     text = " ".join((command.help or "").split("\n\n")[0].split())
     sentence = text.partition(". ")[0].rstrip(".")
     for end in (r"$", r"[:;]| \(", r",| and "):
