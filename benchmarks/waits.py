@@ -181,7 +181,9 @@ def registries(folder: Path, share: float) -> Iterator[Wait]:
         fleet.simulate(runs, count, seed=year)
         guard.dated(runs, of_year, f"{year}-03-01")
         years.append(folder / f"calibrated-{year}.parquet")
-        processor("fleet", of_year, "--tool", "servo", "--workers", "1", "-o", years[-1])
+        processor(
+            "fleet", of_year, "--tool", "servo", "--records", "--workers", "1", "-o", years[-1]
+        )
     guard.command("registry", "--registry", database, "init")
     guard.command("registry", "--registry", database, "add", *years)
     page = ("--report", folder / "drift.html")

@@ -362,6 +362,20 @@ def test_what_is_no_file_of_a_registry_is_named_and_stops_nothing(example, tmp_p
     assert "not added" in alone.err
 
 
+def test_a_table_of_a_fleet_without_records_is_not_taken_for_a_run(example, tmp_path):
+    runs, table, path = (
+        example / "runs" / "2022",
+        tmp_path / "c.parquet",
+        tmp_path / "r.sqlite",
+    )
+    run("fleet", runs, "--tool", example / "tool.toml", "--no-records", "-o", table)
+    registry(path, "init")
+    ran = mwdcal("registry", "--registry", path, "add", table)
+    assert ran.code == 2
+    assert "no column 'calibration'" in ran.err
+    assert "`records`" in ran.err
+
+
 def test_a_laboratory_whose_people_have_no_name_is_not_added(tmp_path):
     lab = tmp_path / "lab.toml"
     lab.write_text(LAB.replace('name = "C. Moe"\n', ""))

@@ -141,6 +141,8 @@ def _run(data: bytes, name: str) -> Entry:
         table = tables.parsed(data, name)
     except InputError as error:
         raise UnlikeRunError(str(error), Entry("run", data, name)) from None
+    if table.metadata.get("command") == "fleet":
+        raise members.without_records(name)
     serials = runs.serials(table.metadata, tables.labels(table, "serial"))
     entry = Entry("run", data, name, serials[0] if len(serials) == 1 else None)
     if missing := {*CHANNELS["accelerometer"]} - {*table.columns}:

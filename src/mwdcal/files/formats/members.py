@@ -81,6 +81,14 @@ def is_fleet(file: Path) -> bool:
     return RECORD in parquet.opened(file, file.name)[1].names
 
 
+def without_records(source: str) -> InputError:
+    """The refusal of a fleet's table that has figures alone."""
+    return InputError(
+        f"{source} has no column '{RECORD}', which holds the whole calibration of each tool. Calibrate the fleet "
+        "again with it (mwdcal fleet, `records`)."
+    )
+
+
 def is_database(file: Path) -> bool:
     """Whether a file is a database, as a registry is."""
     try:
@@ -194,10 +202,7 @@ def _cells(table: Any, source: str, group: int, name: str) -> list[str]:
 def _record(table: Any, source: str, group: int, row: int, name: str) -> bytes:
     """The calibration in a row."""
     if RECORD not in table.schema_arrow.names:
-        raise InputError(
-            f"{source} has no column '{RECORD}', which holds the whole calibration of each tool. Calibrate the fleet "
-            "again with it (mwdcal fleet, `records`)."
-        )
+        raise without_records(source)
     record = _cells(table, source, group, RECORD)[row]
     if not record:
         raise InputError(
