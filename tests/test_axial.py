@@ -108,6 +108,18 @@ def test_no_go_zone_holds_the_published_one(azimuth: float) -> None:
     assert (result.no_go == (from_meridian > 74.9)).all()
 
 
+def test_a_survey_that_the_other_sign_explains_too_is_in_the_zone() -> None:
+    """At horizontal |b| and dip are those of both signs of the axial field: the size alone, 3,000 nT, tells."""
+    where = path((90, 90), (62, 89), 40)
+    readings = surveyed(laboratory(), where, 1, seed=3, iron=np.array([0.0, 0.0, 900.0]))
+    found = corrected(one(readings, 0))
+    _, b = laboratory().fields(one(readings, 0))
+    mirrored = 2 * np.asarray(b)[:, 2] - found.size
+    apart = (mirrored**2 - found.size**2) / 3000.0**2
+    assert found.usable.any()
+    assert not found.usable[apart < 8.5].any()
+
+
 def test_command_and_python_have_the_columns_and_the_zone(tmp_path) -> None:
     """Axial interference east-west: both say so, the path is the same, and both corrections are too many."""
     calibration, run, out = (tmp_path / name for name in ("tool.json", "well.csv", "out.csv"))

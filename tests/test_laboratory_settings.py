@@ -262,3 +262,18 @@ def test_init_asks_on_a_terminal(tmp_path):
         "°C",
     )
     assert "expected one of inclination_deg" in screen
+
+
+def test_a_certificate_takes_a_verification_that_was_made_by_the_settings(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for line in (
+        "example demo",
+        "init --defaults",
+        "calibrate demo/run.csv --tool demo/tool.toml -o tool.json",
+    ):
+        assert mwdcal(*line.split()).code == 0
+    verdict = mwdcal("verify", "tool.json", "demo/rolltest.csv", "--json")
+    assert json.loads(verdict.out)["settings_file"]
+    (tmp_path / "test.json").write_text(verdict.out, "utf-8")
+    order = ("--verification", "test.json", "--laboratory", "demo/laboratory.toml", "-o", "C.json")
+    assert mwdcal("certificate", "tool.json", *order).code == 0

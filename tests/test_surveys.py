@@ -627,7 +627,12 @@ def test_a_relative_magnetometer_is_judged_by_dip_alone(example, relative, tmp_p
         assert first["accepted"] == second["accepted"] == accepted
         assert not any("nT (at most" in finding for finding in by_ratio["finding"])
     blank = {"ref_field_nt": [""] * 36}
-    _, document = surveyed_file(relative, tmp_path, blank)
+    source = write_csv(tmp_path / "blank.csv", {**read_csv(EXAMPLE / "well.csv"), **blank})
+    refused = cli("survey", relative, source, "-o", tmp_path / "none.csv")
+    assert refused.code == 2
+    assert "ref_field_nt" in refused.err
+    assert not (tmp_path / "none.csv").exists()
+    _, document = surveyed_file(relative, tmp_path, blank, "--error-model", "none")
     [text] = [f["text"] for f in document["findings"] if f["id"] == "partly-judged"]
     assert text.startswith("dip of 36 of 36")
 

@@ -10,6 +10,7 @@ import pytest
 
 import mwdcal as library
 from cli_support import channels, mwdcal, refused, servo_run, stations, write_csv
+from mwdcal.errors import FitError
 from mwdcal.files.formats.title_references import references_in
 from mwdcal.files.formats.titles import titles
 from simulation import Tool, plan
@@ -267,6 +268,18 @@ def mixed(columns, seed=1):
     """The rows of a table in another order: toolfaces in equal steps may be numbers of rows."""
     order = np.random.default_rng(seed).permutation(48)
     return {name: [*np.asarray(values)[order]] for name, values in columns.items()}
+
+
+@pytest.mark.parametrize("sense", [1, -1])
+@pytest.mark.parametrize("unit", [1.0, 400 / 360, np.pi / 180])
+def test_of_two_columns_of_one_angle_the_readings_do_not_choose(tmp_path, sense, unit):
+    """One may be the stand's, in a unit or sense that no name tells, and the one that fits the tool's own."""
+    columns = mixed(table())
+    toolface = np.asarray(columns.pop("TF (deg)"), float)
+    columns["TF"] = [*np.round(unit * (sense * toolface % 360), 4)]
+    columns["TF 2"] = [*np.round(toolface + np.random.default_rng(3).normal(0, 0.5, 48), 2)]
+    with pytest.raises(FitError, match="TF 2"):
+        library.propose_profile(written(tmp_path / "a.csv", columns))
 
 
 @pytest.mark.parametrize("name", ["Kolbo (°)", "Tollface (°)"])

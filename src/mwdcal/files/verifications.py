@@ -13,13 +13,14 @@ from mwdcal.errors import InputError
 from mwdcal.files.documents import check_json, in_utf8, whole_file
 from mwdcal.use.verification import RULES, Verdict, guard
 
-_AS_PRINTED = "Use it as mwdcal verify printed as JSON it, or verify again."
+_AS_PRINTED = "Use the file as `mwdcal verify` printed it as JSON, or verify again."
 
 
 class Verification(Verdict, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The document that `mwdcal verify` prints as JSON: a verdict, and what it rests on.
 
-    `calibration_signature` is what it said of the signature of the calibration, `signature` its own.
+    `calibration_signature` is what it said of the signature of the calibration, `signature` its own; `settings_file`
+    and `settings_sha256` are of the laboratory's settings, where there were any.
     """
 
     schema_version: int
@@ -30,6 +31,8 @@ class Verification(Verdict, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     calibration_sha256: str
     run_sha256: str | None
     limits_sha256: str | None
+    settings_file: str | msgspec.UnsetType = msgspec.UNSET
+    settings_sha256: str | msgspec.UnsetType = msgspec.UNSET
     calibration_signature: dict[str, str | None] | msgspec.UnsetType = msgspec.UNSET
     signature: Signature | msgspec.UnsetType = msgspec.UNSET
 

@@ -324,7 +324,7 @@ def propose(
     try:
         return with_answers(answers or {})
     except (QuestionError, QuestionsError) as error:
-        if proposal := _answer_by_readings(error, with_answers, answers or {}):
+        if proposal := _answer_by_readings(error, with_answers, answers or {}, table):
             return proposal
         raise
 
@@ -383,14 +383,26 @@ _MOST_TRIES = 24
 """Answers to open questions, in all their combinations, that are tried."""
 _CONFIRMED = 0.1
 """Largest share of the channels' variation that answers leave which readings confirm."""
+ANGLES_OF_STAND = tuple(REFERENCES[name].column for name in ("inclination", "azimuth", "toolface"))
+_ANGLE_UNITS = (180 / np.pi, 0.9)
+"""Degrees of a radian and of a gon."""
+_SPREAD = 0.97
+"""Length of the mean direction of a column above which it hardly turns: 14° of scatter."""
+_ONE_ANGLE = 0.99
+"""Length of the mean direction of differences of two columns above which they tell one angle: 8° of scatter."""
 
 
 def _answer_by_readings(
     error: QuestionError | QuestionsError,
     propose_with: Callable[[Mapping[str, str]], Proposal],
     said: Mapping[str, str],
+    table: Table,
 ) -> Proposal | None:
-    """The proposal by the only answers to open questions that the readings fit; None where others fit, or none do."""
+    """The proposal by the only answers to open questions that the readings fit; None where others fit, or none do.
+
+    None too where another answer is a column of the same angle, in whatever unit, sense or zero: it may be that of
+    the stand, and the one that fits that of the tool.
+    """
     questions = error.questions if isinstance(error, QuestionsError) else (error,)
     choices = [[answer for answer in each.answers if _is_of_readings(answer)] for each in questions]
     if not all(choices) or prod(map(len, choices)) > _MOST_TRIES:
@@ -409,8 +421,39 @@ def _answer_by_readings(
     if len(fits) != 1:
         return None
     proposal, chosen = fits[0]
+    if any(_has_twin(table, text) for answer in chosen for _, text in answer.arguments):
+        return None
     texts = [", ".join(text for _, text in answer.arguments) for answer in chosen]
     return proposal._replace(by_readings=tuple(texts))
+
+
+def _has_twin(table: Table, answer: str) -> bool:
+    """Whether another column follows the angle of an answer but for unit, sense and zero."""
+    column, _, name = answer.partition("=")
+    if column not in ANGLES_OF_STAND:
+        return False
+    columns = {}
+    for each in table.columns:
+        with suppress(InputError):  # of text
+            columns[each] = numbers(table, each)
+    taken = max((each for each in columns if name.startswith(each)), key=len, default=None)
+    if taken is None:
+        return False
+    turns = [unit * columns[taken] for unit in (1.0, *_ANGLE_UNITS)]
+    return any(
+        _alike(turned - factor * values) > _ONE_ANGLE
+        for turned in turns
+        if _alike(turned) < _SPREAD
+        for other, values in columns.items()
+        for unit in (1.0, *_ANGLE_UNITS)
+        for factor in (unit, -unit)
+        if other != taken and np.isfinite(values).any()
+    )
+
+
+def _alike(angles: Array) -> float:
+    """Length of the mean direction of angles in degrees: 1 where all are one."""
+    return float(abs(np.nanmean(np.exp(1j * np.radians(angles)))))
 
 
 def _is_of_readings(answer: Answer) -> bool:

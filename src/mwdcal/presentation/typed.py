@@ -72,7 +72,9 @@ def _with_others(cause: list[Finding]) -> Finding:
     first, *others = cause
     if not others:
         return first
-    stations = [str(finding.station) for finding in others]
+    stations = [str(finding.station) for finding in others if finding.station is not None]
+    if not stations:
+        return first
     named = ", ".join(stations[:MOST_ALSO])
     plural = "s" * (len(stations) > 1)
     more = f" and {len(stations) - MOST_ALSO} more" if len(stations) > MOST_ALSO else ""

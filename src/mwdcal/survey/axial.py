@@ -25,6 +25,8 @@ from mwdcal.use.uncertainty import CORRECTED
 
 TELLING = ("field", "dip")
 """The observables that tell interference along the tool."""
+SIGN_COST = 9.0
+"""Cost of the other sign of the axial field, over that of the better one, from which a survey tells it (3σ)."""
 NEWTON_STEPS = 4
 """Steps of Newton's method from the best of the sizes that are tried: the last moves it by less than 1e-6 nT."""
 
@@ -114,6 +116,7 @@ def axial_correction(well: Well) -> AxialCorrection:
     with np.errstate(invalid="ignore"):
         usable = np.degrees(np.sqrt(variance)) <= Assumed().largest_azimuth_sd_deg
     usable &= ~np.isnan(well.sd_azimuth)
+    usable &= ~_ambiguous(readings, g, b, sensors, size)
     return AxialCorrection(
         size,
         np.sqrt(spread),
@@ -161,6 +164,20 @@ def _solved(readings: Readings, g: Array, b: Array, sensors: Array) -> tuple[Arr
         gain = spread[:, None] * weighed
         size = np.sum(gain * (slope * size[:, None] - _off(readings, g, without)), -1)
     return size, spread, gain
+
+
+def _ambiguous(readings: Readings, g: Array, b: Array, sensors: Array, size: Array) -> Bools:
+    """Surveys (n,) that the other sign of the field along the tool explains nearly as well.
+
+    |b| is the same for both signs, and so is the dip of a horizontal tool: what remains is the size assumed.
+    """
+    prior = Assumed().axial_nt ** -2
+    weights = np.linalg.inv(_of_seen(readings, g, _without(b, size), sensors))
+    here, there = (
+        _cost(_off(readings, g, _without(b, each)), weights) + prior * each**2
+        for each in (size, 2 * b[:, 2] - size)
+    )
+    return np.asarray(there - here < SIGN_COST)
 
 
 def _without(b: Array, size: ArrayLike) -> Array:

@@ -17,6 +17,7 @@ from mwdcal.calibration.readings import Readings, stated_day
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.calibration.results import UNKNOWN_GRAVITY, unknown_gravity
 from mwdcal.digests import sha256_of
+from mwdcal.errors import InputError
 from mwdcal.geometry.observables import EXTRAPOLATED, OBSERVABLES, RESULTS, VECTORS
 from mwdcal.geometry.units import LENGTH_UNITS, STANDARD_GRAVITY, USUAL_COURSES
 from mwdcal.geometry.vectors import AnyArray, Array, ArrayLike, Bools, Ints, diagonal, wrap
@@ -145,8 +146,19 @@ class WellErrors:
         ]
 
     def unit(self, hole: Hole) -> ArrayLike:
-        """The unit of the field, nT: that of a magnetometer calibrated to a field of 1 is the field itself."""
-        return hole.quantities["bfield"] if self.relative else 1.0
+        """The unit of the field, nT: that of a magnetometer calibrated to a field of 1 is the field itself.
+
+        Raises:
+            InputError: the field is not known, and so not what interference and drift of so many nT are.
+        """
+        field = hole.quantities["bfield"]
+        if self.relative and np.isnan(field).any():
+            raise InputError(
+                "the calibration has a field of 1, and the strength of the field is blank at some surveys: what "
+                "interference and drift in nT do to the azimuth cannot be stated. Give `ref_field_nt`, or "
+                "`error_model` none."
+            )
+        return field if self.relative else 1.0
 
     def of_surveys(
         self,

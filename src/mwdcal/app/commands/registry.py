@@ -81,7 +81,7 @@ def init(database: str, actor: str, as_json: bool) -> None:
 @click.option("--to", "target", metavar="VERSION", help="Of the schema. Default: the newest.")
 @options.JSON
 def upgrade(database: str, actor: str, target: str | None, as_json: bool) -> None:
-    """Bring the tables of a registry to the form of this version of the program.
+    """Bring the tables of a registry to the form of this version.
 
     All in one transaction. Back it up before.
 
