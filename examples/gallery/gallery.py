@@ -53,7 +53,10 @@ class Item:
     def digest(self) -> str:
         """SHA-256 of the lines and of what they rest on."""
         paths = sorted({path for pattern in INPUTS for path in ROOT.glob(pattern)})
-        parts = ["\n".join(self.lines).replace(str(ROOT), "").encode(), *(p.read_bytes() for p in paths if p.is_file())]
+        parts = [
+            "\n".join(self.lines).replace(str(ROOT), "").encode(),
+            *(p.read_bytes() for p in paths if p.is_file()),
+        ]
         return hashlib.sha256(b"\0".join(parts)).hexdigest()
 
 
