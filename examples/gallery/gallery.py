@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PICTURES = ROOT / "docs" / "gallery"
 STATE = PICTURES / "sources.json"
 INPUTS = ("examples/servo/*.*", "examples/registry/*.py", "src/mwdcal/presentation/templates/*")
-"""What the pictures rest on besides the commands."""
+"""Files that the pictures rest on besides the commands."""
 WIDE, HIGH, SHOWN = 860, 900, 860
 """Pixels of the browser's window, and width of a picture."""
 LARGEST = 150_000

@@ -579,7 +579,7 @@ class Contrasts:
 
     @cached_property
     def root(self) -> Array:
-        """What makes departures (n, p, p) of an unchanged tool from standard normal numbers."""
+        """Matrices (n, p, p) that turn standard normal numbers into departures of an unchanged tool."""
         values, vectors = np.linalg.eigh(self.scaled)
         largest = values[:, -1:]
         inverse = np.where(values > DEPENDENT * largest, 1 / np.sqrt(np.maximum(values, 1e-300)), 0)

@@ -469,7 +469,7 @@ def _is_of_readings(answer: Answer) -> bool:
 def _blank_references(table: Table, columns: Mapping[str, ColumnSource]) -> list[str]:
     """A sentence on angles of the stand that are blank at some stations, which are used without them."""
     cells = []
-    for column in (REFERENCES[name].column for name in ("inclination", "azimuth", "toolface")):
+    for column in ANGLES_OF_STAND:
         if column in columns:
             values = numbers(table, columns[column].name)
             rows = np.flatnonzero(np.isnan(values)).tolist()

@@ -37,7 +37,7 @@ Place = str | os.PathLike[str]
 
 @dataclass(frozen=True, repr=False)
 class PaperSigner:
-    """What signs a certificate as it is issued: the key, its X.509 certificate (PEM) for PDF, and the signed JSON."""
+    """Signing of a certificate as it is issued: the key, its X.509 certificate (PEM) for PDF, and the signed JSON."""
 
     key: PrivateKey
     x509: bytes

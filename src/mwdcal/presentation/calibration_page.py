@@ -205,7 +205,7 @@ def _gauge(
 
 
 def _steps(calibration: Calibration, verdict: Verdict | None) -> list[str]:
-    """What to do next: stations to measure again, then the next command."""
+    """Steps after the calibration: stations to measure again, then the next command."""
     again = sum(row.reshoot for row in calibration.station_rows)
     steps = [f"Measure {plural(again, 'station')} again, and calibrate once more."] if again else []
     if verdict is None:

@@ -443,7 +443,7 @@ FOR_THE_LABORATORY = re.compile(
     r"name|re-shoot|save|see|state|take|use|verify|what the failure)\b",
     re.IGNORECASE,
 )
-"""What tells advice to the laboratory from a statement about the result."""
+"""Words by which advice to the laboratory is told from a statement about the result."""
 
 
 def without_advice(text: str) -> str:

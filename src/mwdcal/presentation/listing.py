@@ -27,7 +27,9 @@ def listing(surveyed: SurveyedWell) -> Table:
     """
     well = surveyed.well
     if well.position is None or not well.position.on_path.any():
-        raise InputError("`listing` is of the well path, and there is none. Add measured depths.")
+        raise InputError(
+            "`listing` is of the well path, which these surveys do not have. Add measured depths."
+        )
     rows = np.flatnonzero(well.position.on_path)
     unit, metres = well.length_unit, LENGTH_UNITS[well.length_unit]
     course, columns = USUAL_COURSES[unit], well.columns

@@ -70,7 +70,7 @@ def with_next_step(result: Verdict, calibration: Path, run: Path) -> Verdict:
 def after_failure(
     result: Verdict, calibration: Path | str, run: Path | str
 ) -> tuple[str, str, str]:
-    """What to measure again, the next command, and what it is good for.
+    """Steps after a verdict: stations to measure again, the next command, and its purpose.
 
     Where values failed: each place once, and the fault that it looks like. Else no value could be stated.
     """
