@@ -8,7 +8,7 @@ from pathlib import Path
 def lowest(requirements):
     """`name==version` of each requirement `name>=version`."""
     for requirement in requirements:
-        match = re.fullmatch(r"([\w.-]+)>=([\w.]+)", requirement)
+        match = re.fullmatch(r"([\w.-]+)(?:\[\w+\])?>=([\w.]+)(?:,<\d+)?", requirement)
         if match:
             yield f"{match[1]}=={match[2]}"
 

@@ -95,6 +95,35 @@ def test_options_are_grouped():
         assert [name for name, text in groups.items() if f"  {option} " in text] == [title]
 
 
+def test_only_options_of_a_fit_are_grouped_as_such():
+    shown = mwdcal("reference", "--help").out
+    assert "Fit options:" not in shown
+    assert shown.index("--model") < shown.index("Table options:")
+
+
+def test_missing_arguments_are_listed_without_escapes():
+    message = mwdcal("list").err
+    assert "\\t" not in message
+    assert [line.strip(" ,") for line in message.splitlines()[-4:]] == [
+        "plans", "profiles", "limits", "methods",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (("plan", "--stations", "abc"), "'abc' is not a valid whole number"),
+        (("plan", "--stations", "2.5"), "'2.5' is not a valid whole number"),
+        (("reference", "--latitude", "abc"), "'abc' is not a valid number"),
+        (("bench", "--settle", "abc"), "'abc' is not a valid number"),
+    ],
+)
+def test_a_wrong_number_is_named_in_plain_words(words, reason):
+    ran = mwdcal(*words)
+    assert ran.code == 2
+    assert reason in ran.err
+
+
 def test_help_and_version_of_the_whole():
     ran = mwdcal("--help")
     assert ran.code == 0

@@ -13,6 +13,7 @@ import pytest
 from cli_support import EXAMPLE, ROOT, mwdcal, refused
 from mwdcal import extras
 from mwdcal.app.commands.example import CONTENTS
+from page_lines import follow_each_other, lines_of
 
 WHEEL = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["hatch"]["build"]
 INCLUDED = WHEEL["targets"]["wheel"]["force-include"]
@@ -62,24 +63,6 @@ FIRST_PAGES = (
     *(f"docs/tutorials/{name}.md" for name in ("start", "campaign", "well")),
 )
 """Pages whose every line runs, and whose outputs are those of the commands but for lines of dots."""
-
-
-def lines_of(page):
-    """The lines of a page, each with the lines that the page shows of its output, None where it shows none."""
-    text = (ROOT / page).read_text("utf-8")
-    blocks = re.findall(r"^```(\w*)\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
-    of_line = re.compile(r"^(\$ )?mwdcal (.*)\n((?:(?!\$ |mwdcal ).*\n)*)", re.MULTILINE)
-    runs = [run for language, block in blocks if not language for run in of_line.findall(block)]
-    return [(line, shown.split("\n")[:-1] if dollar else None) for dollar, line, shown in runs]
-
-
-def follow_each_other(shown, printed):
-    """Whether lines are those that were printed, in that order, with any lines in the place of dots."""
-    pieces = "\n".join(shown).split("…\n")
-    pattern = r"(?:.*\n)*".join(
-        re.escape(piece) for piece in [*pieces[:-1], pieces[-1].rstrip("…")]
-    )
-    return re.fullmatch(pattern + (r"(?:.*\n?)*" if shown[-1] == "…" else r"\n*"), printed)
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import inspect
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -666,3 +667,17 @@ def test_keywords_are_typed(name):
         for argument in inspect.signature(way).parameters.values():
             if argument.kind is inspect.Parameter.VAR_KEYWORD:
                 assert "Unpack" in str(argument.annotation)
+
+
+@pytest.mark.parametrize("plan", [(), ("moosavi-12", "servo")])
+@pytest.mark.parametrize("seed", ["a", -1, 1.5])
+def test_a_seed_is_a_whole_number(plan, seed):
+    with pytest.raises(mwdcal.InputError, match="`seed` must be a whole number"):
+        mwdcal.simulate(*plan, seed=seed)
+
+
+def test_the_changelog_begins_with_the_version():
+    text = (EXAMPLE.parents[1] / "CHANGELOG.md").read_text("utf-8")
+    dated = re.findall(r"^## \[(\d+\.\d+\.\d+)\] – \d{4}-\d\d-\d\d$", text, re.MULTILINE)
+    assert dated[0] == mwdcal.__version__
+    assert len(text.splitlines()) <= 120

@@ -130,3 +130,17 @@ def test_nine_strengths_for_nine_parameters_leave_no_noise_to_estimate(tmp_path,
     message = refused(mwdcal("calibrate", path, *options, *weights), 3)
     assert "no redundancy (0.0 degrees of freedom)" in message
     assert not (tmp_path / "cal.json").exists()
+
+
+@pytest.mark.parametrize(("unit", "field"), [("µT", 48.0), ("G", 0.48)])
+def test_a_field_in_another_unit_is_named_and_no_channel(tmp_path, unit, field):
+    message = said(tmp_path, servo_run() | {"ref_field_nt": np.full(48, field)})
+    assert f"ref_field_nt is {field:g} nT" in message, unit
+    assert "Is the reference in another unit?" in message
+    assert "wrong column" not in message
+
+
+def test_a_channel_that_moves_too_much_is_named_where_the_reference_is_good(tmp_path):
+    run = servo_run()
+    run["mx"] = 100 * np.asarray(run["mx"])
+    assert "more than any field explains" in said(tmp_path, run)

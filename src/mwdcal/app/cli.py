@@ -104,7 +104,8 @@ def _status(arguments: list[str] | None) -> int:
             return cli.main(arguments, prog_name="mwdcal", standalone_mode=False) or 0
     except click.ClickException as error:
         error.show(usage := io.StringIO())
-        text = _LONG.sub(r"\1…", escape_controls(without_passwords(usage.getvalue())))
+        indented = usage.getvalue().replace("\n\t", "\n  ")
+        text = _LONG.sub(r"\1…", escape_controls(without_passwords(indented)))
         click.echo(laid_out(text, sys.stderr), err=True, nl=False)
         return error.exit_code
     except (click.Abort, KeyboardInterrupt) as stop:

@@ -267,7 +267,11 @@ def _grid(
     plan = simulation.grid([*inclination_deg], toolfaces, [*azimuth_deg], [*temperature])
     warmed = plan.temperature + drift * np.linspace(-0.5, 0.5, len(plan.temperature))
     plan = replace(plan, temperature=warmed)
-    rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng([seed, 1])
+    if isinstance(seed, np.random.Generator):
+        rng = seed
+    else:
+        check_whole("seed", seed, 0)
+        rng = np.random.default_rng([seed, 1])
     inclination, azimuth, toolface = np.radians(stand_deg)
     off = inclination, azimuth, toolface
     return simulation.run(_truth(tool), plan, rng, noise, off, settings or "")

@@ -58,7 +58,7 @@ from mwdcal.errors import InputError
 )
 @click.option(
     "--port",
-    type=click.IntRange(0, 65535),
+    type=options.Whole(0, 65535),
     default=0,
     show_default="a free one",
     help="Port to listen at.",
@@ -66,13 +66,13 @@ from mwdcal.errors import InputError
 @click.option("--no-browser", is_flag=True, help="Do not open the browser.")
 @click.option(
     "--speed",
-    type=click.FloatRange(0.1, 1000),
+    type=options.Within(0.1, 1000),
     metavar="X",
     help="How many times as fast as real time the simulated stand goes.  [default: 1]",
 )
 @click.option(
     "--settle",
-    type=click.FloatRange(0.5, 600),
+    type=options.Within(0.5, 600),
     metavar="S",
     help="How long, in seconds, the tool has to stand still for a station.  [default: 5]",
 )

@@ -20,7 +20,7 @@ from mwdcal.errors import FitError, InputError
 @options.fit_options("0", "none", "datasheet", "the tolerances in the tool profile")
 @click.option(
     "--workers",
-    type=click.IntRange(1),
+    type=options.Whole(1),
     metavar="N",
     help="Processes on this machine. Default: one per core.",
 )

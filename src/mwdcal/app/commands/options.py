@@ -29,8 +29,22 @@ PICTURES = (".png", ".svg")
 """Suffixes of pictures."""
 
 
+class Whole(click.IntRange):
+    """A whole number in a range."""
+
+    name = "whole number"
+
+
+class Within(click.FloatRange):
+    """A number in a range."""
+
+    name = "number"
+
+
 class PointedNumber(click.types.FloatParamType):
     """A number with a decimal point."""
+
+    name = "number"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The number, or what is wrong with the word."""
@@ -189,7 +203,7 @@ def fit_option(
     kind = click.Choice(each.words) if each.words else None
     return click.option(
         f"--{name.replace('_', '-')}", is_flag=usual is False,
-        type=kind if each.least is None else click.IntRange(each.least),
+        type=kind if each.least is None else Whole(each.least),
         default=usual, show_default=usual not in (None, "", False), metavar=metavar or each.metavar,
         help=each.help.format(known),
     )  # fmt: skip

@@ -23,7 +23,7 @@ from mwdcal.app.messages import print_result
 )
 @click.option(
     "--stations",
-    type=click.IntRange(1),
+    type=options.Whole(1),
     metavar="N",
     help="The best N stations out of the candidates; with --accuracy the best for it.",
 )

@@ -24,7 +24,7 @@ MOST_ROUNDS = 20
 @options.output(metavar="TOOL.toml", help="Tool profile to write.")
 @click.option("--sheet", default="", metavar="NAME", help="Sheet of the workbook.")
 @click.option(
-    "--header-row", type=click.IntRange(1), metavar="N", help="Row or line of the column names."
+    "--header-row", type=options.Whole(1), metavar="N", help="Row or line of the column names."
 )
 @click.option("--decimal", default="", metavar="SIGN", help="Decimal sign of numbers in text.")
 @click.option("--serial", default="", metavar="S", help="Serial, where the table states none.")
@@ -61,9 +61,9 @@ def command(
 ) -> None:  # fmt: skip
     """Propose a tool profile for a RUN as a logger or spreadsheet program has written it.
 
-    Takes .csv .tsv .txt .dat .lvm .xlsx .xls .ods. Finds sheet, names and units of the columns, the last row of
-    readings, decimal sign and encoding, the meaning of each column, and, from readings at known attitudes, the axes
-    and nominal scales of both triads. calibrate, verify, compare and apply then take such tables with
+    Takes .csv .tsv .txt .dat .lvm .asc .prn .xlsx .xls .ods. Finds sheet, names and units of the columns, the last
+    row of readings, decimal sign and encoding, the meaning of each column, and, from readings at known attitudes, the
+    axes and nominal scales of both triads. calibrate, verify, compare and apply then take such tables with
     --tool TOOL.toml as they are, also where the table has moved. It asks what is open: on a terminal one question
     after the other, elsewhere all at once, each with the option that answers it.
 

@@ -57,7 +57,7 @@ def measured(function: options.Function) -> options.Function:
 )
 @click.option(
     "--date",
-    "day",
+    "field_day",
     type=click.DateTime(["%Y-%m-%d"]),
     required=True,
     metavar="YYYY-MM-DD",
@@ -65,6 +65,7 @@ def measured(function: options.Function) -> options.Function:
 )
 @options.preset(
     "--model",
+    "field_model",
     type=click.Choice(["wmm2025", "igrf14"]),
     default="wmm2025",
     help="Model of the main field: wmm2025 (2025 to 2030) or igrf14 (1900 to 2030).",
@@ -86,8 +87,8 @@ def measured(function: options.Function) -> options.Function:
 @options.DECIMAL
 @options.JSON
 def command(
-    latitude_deg: float, longitude_deg: float, altitude_m: float, day: datetime, model: str,
-    crs: str | None, run: Path | None, output: Path | None, decimal: str, as_json: bool,
+    latitude_deg: float, longitude_deg: float, altitude_m: float, field_day: datetime,
+    field_model: str, crs: str | None, run: Path | None, output: Path | None, decimal: str, as_json: bool,
     **typed: float | None,
 ) -> None:  # fmt: skip
     """Gravity, magnetic field, dip, declination and convergence at a place and date, without a network.
@@ -117,7 +118,7 @@ def command(
         {name: typed[prefix + key] for name, key in MEASURABLE.items()} for prefix in ("", "sd_")
     )
     reference = reference_at(
-        latitude_deg, longitude_deg, altitude_m, day.date(), model=model, crs=crs,
+        latitude_deg, longitude_deg, altitude_m, field_day.date(), model=field_model, crs=crs,
         measured={name: value for name, value in values.items() if value is not None},
         uncertainties={name: value for name, value in sd.items() if value is not None},
     )  # fmt: skip

@@ -219,7 +219,7 @@ TABLE = ".parquet"
 @options.DATABASE
 @options.ACTOR
 @click.option(
-    "--workers", type=click.IntRange(1), metavar="N", help="Processes. Default: one per core."
+    "--workers", type=options.Whole(1), metavar="N", help="Processes. Default: one per core."
 )
 @options.JSON
 def add(
@@ -293,8 +293,8 @@ def withdraw(record: str, reason: str, database: str, actor: str, as_json: bool)
     )
 
 
-ROWS = options.preset("--limit", type=click.IntRange(1), default=50, help="Most rows to print.")
-FIRST = options.preset("--offset", type=click.IntRange(0), default=0, help="Rows to leave out.")
+ROWS = options.preset("--limit", type=options.Whole(1), default=50, help="Most rows to print.")
+FIRST = options.preset("--offset", type=options.Whole(0), default=0, help="Rows to leave out.")
 
 
 @options.command("list")
@@ -401,7 +401,7 @@ def get(record: str, database: str, output: Path, as_json: bool) -> None:
 )
 @click.option(
     "--level",
-    type=click.FloatRange(0.001, 0.2),
+    type=options.Within(0.001, 0.2),
     default=0.01,
     show_default=True,
     help="Share of unchanged tools that are called changed.",

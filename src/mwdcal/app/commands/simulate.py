@@ -51,7 +51,7 @@ ALWAYS = ("plan", "tool", "calibration", "order", "effects", "seed", "output", "
 )
 @click.option(
     "--repeat",
-    type=click.IntRange(1, MOST_TOOLS),
+    type=options.Whole(1, MOST_TOOLS),
     metavar="N",
     help="The whole procedure for N tools: run, fit, roll test, verdict. The options of the fit count only here.",
 )
@@ -66,7 +66,7 @@ ALWAYS = ("plan", "tool", "calibration", "order", "effects", "seed", "output", "
     help="Limits of the verdict.",
 )
 @click.option(
-    "--workers", type=click.IntRange(1), metavar="N", help="Processes. Default: one per core."
+    "--workers", type=options.Whole(1), metavar="N", help="Processes. Default: one per core."
 )
 @options.plot(help="Also draw errors and figures of all tools.")
 @options.fit_options("auto", "none", "datasheet", "the tolerances in the tool profile")

@@ -261,6 +261,9 @@ OF_READINGS = {
     "column, or a wrong 'scale' of [{triad}] in the tool profile.",
     "much": "{source}: the {triad} channel on tool axis {axis} moves by {moved:.3g} {unit} over the run, more than any "
     "field explains. Look for a wrong column or cell, or a wrong 'scale' of [{triad}] in the tool profile.",
+    "reference": "{source}: {column} is {mean:.4g} {unit}, and the {triad} on tool axis {axis} moves by {moved:.3g} "
+    "{unit}. Is the reference in another unit? Give {column} in {unit}. In a coil, check 'scale' of [{triad}] in the "
+    "tool profile.",
     "noise": "the declared noise of the {triad} is {share:.2g} times the field that it measures, or more. 'noise' and "
     "'repeatability' of [{triad}] in the tool profile and the columns sd_ are in the raw units of the channels, such "
     "as V: correct them, or leave them out and the noise is estimated.",
@@ -429,6 +432,10 @@ def _channels(readings: Readings, triad: str, prior: bool, words: Words) -> Iter
     axis = np.argmax(odd, -1)
     first = np.arange(len(axis)), axis
     moving = words | {"axis": TOOL_AXES[axis], "moved": spread[first]}
+    low, high = EARTH_RANGES[name]
+    foreign = np.any(odd, -1) & ((mean < low) | (mean > high)) & (not readings.relative)
+    reference = {"column": STRENGTH_COLUMNS[name][0], "mean": mean}
+    yield Flag("earth", foreign, OF_READINGS["reference"], moving | reference)
     little = share[first] < MOTION_RANGE[0]
     yield Flag("channel", np.any(odd, -1) & little, OF_READINGS["little"], moving)
     yield Flag("channel", np.any(odd, -1) & ~little, OF_READINGS["much"], moving)
