@@ -3,7 +3,7 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: gallery words check-words papers measured verification scatter coverage drift diagnosis mutations help demo size test test-quick test-studies test-oldest \
+.PHONY: dist test-release gallery words check-words papers measured verification scatter coverage drift diagnosis mutations help demo size test test-quick test-studies test-oldest \
 	test-versions fuzz kills bench-kills registry-stress check check-lint check-types check-code check-docs bench bench-guard docs clean
 
 PYTHON ?= python3
@@ -82,6 +82,16 @@ test-versions: ## run the quick tests with other interpreters (PYTHONS="python3.
 		$$place/bin/python $(INSTALL) -c constraints.txt -e '.[all]' $(TESTED_WITH); \
 		$$place/bin/python --version; $(ONE_THREAD) $$place/bin/python $(QUICK_RUN); \
 	done
+
+dist: docs ## build sdist, wheel and the documentation as an archive into dist
+	@$(CLOCK); rm -rf dist; $(PYTHON) -m venv build/builder; build/builder/bin/python $(INSTALL) build; \
+	build/builder/bin/python -m build --quiet; \
+	version=$$(sed -n 's/^version: //p' CITATION.cff); \
+	tar -czf dist/mwdcal-docs-$$version.tar.gz --transform "s,^docs,mwdcal-docs-$$version," -C build docs; ls -l dist
+
+test-release: ## install dist's wheel in empty environments, lowest and newest, validate it, run the README (PYTHONS="…")
+	@$(CLOCK); $(PYTHON) -m venv build/builder; build/builder/bin/python $(INSTALL) uv; \
+	PATH="$(CURDIR)/build/builder/bin:$$PATH" $(PYTHON) tests/release.py dist/*.whl $(PYTHONS)
 
 fuzz: $(INSTALLED) ## run random commands on damaged files (SEEDS=0:100000 MINUTES=10), findings into build/fuzz
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python tests/fuzz.py --seeds $(or $(SEEDS),0:100000) \

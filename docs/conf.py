@@ -18,6 +18,7 @@ project_copyright = author
 version = release = mwdcal.__version__
 
 extensions = [
+    "accessible",
     "mathml",
     "myst_parser",
     "screens",
