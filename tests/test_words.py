@@ -16,6 +16,10 @@ def test_the_documentation_is_short():
     assert words.too_long() == []
 
 
+def test_no_sentence_is_long():
+    assert words.long_sentences() == []
+
+
 def test_no_pattern_is_found_that_made_readers_stumble():
     assert words.stumbles() == []
 
@@ -30,22 +34,40 @@ def test_no_pattern_is_found_that_made_readers_stumble():
         "Axes that are told by readings.",
         "More often than stated.",
         "No `5.83705e-21 ± 2e-05`.",
+        "Whoever may read it.",
+        "What differs, and it is said so.",
+        "A list, empty if there are none.",
+        "Have the owner of the database give you the right.",
+        "Its name stands in the list.",
+        "References taken as exact.",
+        "The option, which comes before it.",
     ],
 )
 def test_a_pattern_is_found(text):
-    assert any(re.search(pattern, text) for pattern in words.PATTERNS)
+    assert any(re.search(pattern, text) for pattern in words.PATTERNS | words.OF_PAGES)
 
 
 @pytest.mark.parametrize(
     "text",
     [
-        "Empty if there is none.",
+        "An empty list.",
         "What happened to it? Nothing.",
         "Mount the stand beside the oven.",
     ],
 )
 def test_good_english_is_left_alone(text):
-    assert not any(re.search(pattern, text) for pattern in words.PATTERNS)
+    assert not any(re.search(pattern, text) for pattern in words.PATTERNS | words.OF_PAGES)
+
+
+def test_a_sentence_of_a_cell_or_an_item_is_counted_alone():
+    cells = words.sentences("| one two | three. Four: five |")
+    assert [each.strip() for each in cells if each.strip()] == [
+        "one two",
+        "three.",
+        "Four:",
+        "five",
+    ]
+    assert words.sentences("- One. - Two")[1:] == ["One.", "Two"]
 
 
 def test_code_formulas_and_results_are_no_words(tmp_path, monkeypatch):

@@ -33,8 +33,24 @@ PATTERNS = {
     r"\bknow before you\b": "see … before you",
     r"\d\.\d{4,}e-\d\d ±": "round to the uncertainty",
     r"\bof which none\b|\bwhose \w+ (?:is|are) none\b": "say what is missing",
+    r"(?i)\bwhoever\b": "name the person: a user, the laboratory",
+    r"\bis said\b": "say who says it: mwdcal, the page",
+    r"\b(?:empty|blank|null|None|NaN|zero) (?:where|if) there (?:is|are) none\b": "or empty, or None",
+    r"\bHave the \w+ (?:of the \w+ )?give you\b": "ask … for",
+    r"\bin the place of\b": "instead of",
 }
 """Regular expressions, and what to write instead."""
+OF_PAGES = {
+    r"(?i)\b(?:its|the) (?:name|value|figure|text|row|column|number)s? stands?\b|\bit stands (?:in|under|on)\b": "is, has",
+    r"\btaken as exact\b": "assumed exact",
+    r"\bbut for\b": "except",
+    r"\bcomes? before (?:it|them)\b": "overrides",
+    r"\banew\b": "again",
+    r"\bis named\b(?! first| twice)|\bare mentioned\b": "say who reports it",
+    r"\bof which no\w* \w+ (?:is|are|was)\b": "without",
+}
+"""The same, for pages alone."""
+MOST_WORDS_OF_A_SENTENCE = 45
 
 
 def pages() -> list[Path]:
@@ -81,14 +97,35 @@ def strings(module: Path) -> Iterator[tuple[int, str]]:
 
 def stumbles() -> list[str]:
     """Where a pattern is found, with the words and the advice."""
-    texts = [(page, *found) for page in pages() for found in paragraphs(page)]
+    of_pages = [
+        (page, *found, PATTERNS | OF_PAGES) for page in pages() for found in paragraphs(page)
+    ]
     modules = sorted((ROOT / "src").rglob("*.py"))
-    texts += [(module, *found) for module in modules for found in strings(module)]
+    of_modules = [(module, *found, PATTERNS) for module in modules for found in strings(module)]
     return [
         f"{path.relative_to(ROOT)}:{line}: {match[0][:70]!r}: {advice}"
-        for path, line, text in texts
-        for pattern, advice in PATTERNS.items()
+        for path, line, text, patterns in of_pages + of_modules
+        for pattern, advice in patterns.items()
         for match in re.finditer(pattern, text)
+    ]
+
+
+def sentences(text: str) -> list[str]:
+    """The sentences of a paragraph, of each cell of a table, of each item of a list; formulas are left out."""
+    text = re.sub(r"\$\$.*?\$\$|\$[^$]+\$", "", text)
+    parts = re.split(r"(?<!\\)\||(?:^| )(?:[-*]|\d+\.) (?=[A-Z`*\[])", text)
+    return [each for part in parts for each in re.split(r"(?<=[.!?:;])\s+", part)]
+
+
+def long_sentences() -> list[str]:
+    """Sentences with more words than they may have."""
+    return [
+        f"{page.relative_to(ROOT)}:{line}: {count} words: {sentence[:70]!r}"
+        for page in pages()
+        for line, text in paragraphs(page)
+        for sentence in sentences(text)
+        if (count := sum(bool(re.search(r"[^\W\d_]", word)) for word in sentence.split()))
+        > MOST_WORDS_OF_A_SENTENCE
     ]
 
 
@@ -112,7 +149,7 @@ def main() -> None:
         )
         print(*(f"{number:6} {page}" for number, page in count), sep="\n")
         print(f"{sum(number for number, _ in count):6} in all, at most {MOST_WORDS}")
-    elif wrong := too_long() + stumbles():
+    elif wrong := too_long() + stumbles() + long_sentences():
         sys.exit("\n".join(wrong))
 
 

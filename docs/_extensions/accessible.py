@@ -10,7 +10,7 @@ LACKING = {
     r'<div class="(table-wrapper[^"]*)">': r'<div class="\1" tabindex="0">',
     r'<th class="head"><p></p></th>': '<td class="head"></td>',
 }
-"""Patterns of a page, and what stands there instead: labels, wide blocks that scroll by key, cells that head nothing."""
+"""Patterns of a page and their replacements: labels, wide blocks that scroll by key, cells that head nothing."""
 
 
 def mend(text):

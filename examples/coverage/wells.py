@@ -268,7 +268,7 @@ def main() -> None:
         "nT, accelerometer scale 0.0005 and bias 0.4 mg (1σ, OWSG set A Rev 5.1). References are off by 130 "
         "nT and 0.2°, and by 60 nT and 0.08° from survey to survey; the drill string adds 200 to 2,500 nT "
         "along the tool and 100 nT (1σ) in each direction across it. Intervals are of accepted wells; 95 % "
-        "means 1.96 stated standard uncertainties. 50,000 nT and dip 65° where nothing else is said.\n",
+        "means 1.96 stated standard uncertainties. 50,000 nT and dip 65° unless the name says otherwise.\n",
         *parts,
         facts={"Seed": SEED, "Wells in each row": TOOLS * WELLS},
     )

@@ -231,9 +231,9 @@ Written by `examples/drift/drift.py`; SIMULATED DATA, all of it. See [drift](../
 
 ## False alarms
 
-Unchanged tools that are called changed, of 12 parameters of each triad and all transitions together. An error of the
-noise estimate, of the settings of the stand and of what all stations of a run share is drawn anew for each calibration,
-but for the row that says otherwise.
+Unchanged tools that are called changed, of 12 parameters of each triad and all transitions together. Errors of the
+noise estimate, of the settings of the stand and of what all stations of a run share are new for each calibration,
+except in the row that says otherwise.
 
 | plan and stand | calibrations | tools | at level 1 % | 5 % | 20 % |
 |---|---|---|---|---|---|

@@ -268,7 +268,7 @@ class UnseenDrift(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def declared_drift(drifts: Sequence[Drift]) -> str:
-    """A sentence on the drifts that are declared; blank if there are none.
+    """A sentence on the drifts that are declared, or blank.
 
     >>> declared_drift([Drift(name="field", change=31.0, standard_uncertainty=9.0, unit="nT", declared=40.0)])
     'declared drift from the first station to the last, 1σ, which the uncertainty includes: field 40 nT'
@@ -283,7 +283,7 @@ def declared_drift(drifts: Sequence[Drift]) -> str:
 
 
 def blindness(unseen: Sequence[UnseenDrift] | msgspec.UnsetType) -> str:
-    """A sentence on what small drifts would do that no residual would show; blank if there are none.
+    """A sentence on what small drifts would do that no residual would show, or blank.
 
     >>> blindness([UnseenDrift(name="field", change=10.0, unit="nT", inclination_deg=0.0, azimuth_deg=0.0213)])
     'an unseen drift from the first station to the last, 1σ, would add: 10 nT of the field 0.0213° to azimuth'

@@ -575,7 +575,7 @@ class TriadResults:
     `model` is that of the calibration file, of `parameters` (B, k); `sd` (B, k) are their standard
     uncertainties, NaN where a free direction moves one. By tool (B,): `rank` of the `size` fitted
     parameters, `noise` of one reading and whether it was `declared`, s² as `variance_factor` with
-    its `degrees_of_freedom`, NaN where there are none.
+    its `degrees_of_freedom`; NaN without any.
     """
 
     model: Whole

@@ -267,7 +267,7 @@ def _scaled(triad: TriadCalibration) -> str:
 
 
 def settings_in_words(calibration: Calibration) -> str:
-    """The declared 1σ of the stand's settings, in words that follow a noun; empty where there are none."""
+    """The declared 1σ of the stand's settings, in words that follow a noun, or empty."""
     stand = calibration.profile.stand
     sd = {n: np.hypot(stand.of(f"{n}_deg"), stand.repeatability(f"{n}_deg")) for n in STAND_ANGLES}
     declared = [f"{name} {value:.2g}°" for name, value in sd.items() if value]

@@ -63,7 +63,7 @@ _PUBLIC_HEADS = {
 class TrustedKey(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A public key whose signatures are trusted: from when on no more, or, if revoked, never.
 
-    `key` as in a `Signature`; `public` its 32 bytes in base64; times in UTC, empty where there is none.
+    `key` as in a `Signature`; `public` its 32 bytes in base64; times in UTC, or empty.
     """
 
     key: str
@@ -507,7 +507,7 @@ def document_of(data: bytes, name: str) -> dict[str, Any]:
 
 
 def fields_of(data: bytes) -> dict[str, Any] | None:
-    """The object in a file; None where there is none, or it has a key twice, or a number that is not finite."""
+    """The object in a file; None without one, with a repeated key, or with a number that is not finite."""
     try:
         fields = json.loads(
             data, parse_constant=_finite, parse_float=_finite, object_pairs_hook=_object

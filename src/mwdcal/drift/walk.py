@@ -202,8 +202,8 @@ def common_noise_scale(factors: Array, freedom: Array) -> tuple[Array, Array, Bo
 
     And which of them (…, n) then are of that one estimate.
 
-    `factors` (…, n): s², the ratio of the noise of each calibration to what is declared, of `freedom` degrees;
-    NaN where there is none. Ratios that differ by more than chance (`UNLIKE`) are kept apart.
+    `factors` (…, n): s², the ratio of the noise of each calibration to what is declared, of `freedom` degrees,
+    or NaN. Ratios that differ by more than chance (`UNLIKE`) are kept apart.
     Reference: Bartlett's test of equal variances.
     """
     from scipy.special import chdtrc
@@ -467,7 +467,7 @@ class ChangeTest:
 
     @property
     def changed(self) -> bool:
-        """Whether the tool is said to have changed."""
+        """Whether the test calls the tool changed."""
         return self.probability <= self.level
 
 

@@ -466,7 +466,7 @@ def variance_factors(residual: Array, spread: Array) -> tuple[Array, Array]:
 
 
 def per_freedom(squares: Array, freedom: Array) -> Array:
-    """Sums of squares per degree of freedom; NaN where there is none, or only what rounding leaves of one."""
+    """Sums of squares per degree of freedom; NaN without any freedom beyond rounding."""
     return np.asarray(squares / np.where(freedom > LEAST_FREEDOM, freedom, np.nan))
 
 

@@ -65,7 +65,7 @@ def prepared(calibration: Calibration, readings: Readings) -> tuple[Readings, li
         readings = replace(readings, magnetometer=None)
     if calibration.has_field and readings.magnetometer is None:
         findings.append(
-            _finding("no-magnetometer", "the readings have no magnetometer: nothing is said of it.")
+            _finding("no-magnetometer", "the readings have no magnetometer: no result for it.")
         )
     whole = [getattr(readings, name) for name in readings.triads]
     sound = np.isfinite(np.concatenate(whole, -1)).all(-1)

@@ -153,7 +153,7 @@ def _empty(source: str) -> InputError:
 
 
 def _numbers(table: Table, name: str) -> Array:
-    """The column as numbers; dates and times of day in the place of seconds are refused as such."""
+    """The column as numbers; dates and times of day instead of seconds are refused as such."""
     column = table.columns[name]
     if name == TIME and isinstance(column, list):
         for row, cell in enumerate(column):

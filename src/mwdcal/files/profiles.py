@@ -436,7 +436,7 @@ def using(used: SettingsInUse | None) -> Iterator[None]:
 
 
 def in_use() -> SettingsInUse | None:
-    """The settings of the running command; None where there are none, and always outside of commands."""
+    """The settings of the running command; None without settings, and outside of commands."""
     return _IN_USE.get()
 
 

@@ -64,7 +64,7 @@ def load_verification(path: str | os.PathLike[str]) -> tuple[Verification, str]:
 
 
 def _contradiction(verification: Verification) -> str:
-    """A contradiction in a document of `verify`; empty where there is none."""
+    """A contradiction in a document of `verify`, or empty."""
     if verification.rule not in RULES.values():
         return (
             f"the decision rule must be one of {', '.join(RULES)}; got {verification.rule[:80]!r}"

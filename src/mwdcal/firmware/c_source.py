@@ -190,7 +190,7 @@ def status_macros(saturates: bool) -> str:
 
 
 def error_macros(kind: str, errors: Mapping[str, float]) -> str:
-    """Stated errors by quantity; zero where there is none."""
+    """Stated errors by quantity; zero without a statement."""
     names = (*VECTOR_NAMES, "inclination", *SHARE_OF)
     lines = [
         macro(f"MWDCAL_{kind}_ERROR_{n.upper()}", initialiser(errors.get(n, 0.0))) for n in names

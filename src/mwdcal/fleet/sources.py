@@ -90,7 +90,7 @@ def run_of(table: Table, serial: str) -> Table:
 
 
 def _stated(table: Table) -> str:
-    """The serial in the metadata of a table, empty where there is none."""
+    """The serial in the metadata of a table, or empty."""
     stated = table.metadata.get(SERIAL)
     return "" if stated is None or not str(stated).strip() else str(stated)
 

@@ -240,7 +240,7 @@ def directions(g: Array, b: Array) -> Array:
 def group_scatter(axis: Array, group: Ints) -> float:
     """Mean over groups of the norm of the (N - 1) standard deviations of `axis`, radians.
 
-    Shapes: axis (n, 3), NaN where there is none; group (n,), -1: in no group. NaN without a group
+    Shapes: axis (n, 3), NaN if unknown; group (n,), -1: in no group. NaN without a group
     of two. Reference: the accuracy measure of CircuitPython_mag_cal, so that results compare.
     """
     group = np.where(np.isnan(axis).any(-1), -1, group)

@@ -123,7 +123,7 @@ class RegistryListing(RegistryAnswer):
 
     @property
     def columns(self) -> Mapping[str, AnyArray]:
-        """Arrays by the fields of the rows: numbers, NaN where there is none, or text."""
+        """Arrays by the fields of the rows: numbers with NaN for missing ones, or text."""
         names = self.rows[0].__struct_fields__ if self.rows else ()
         return {name: _column([getattr(row, name) for row in self.rows]) for name in names}
 
@@ -132,7 +132,7 @@ class RegistryListing(RegistryAnswer):
 
 
 def _column(cells: Sequence[Any]) -> AnyArray:
-    """Numbers with NaN where there is none; text, empty where there is none."""
+    """Numbers with NaN for missing ones; text with empty ones."""
     filled = [cell for cell in cells if cell is not None]
     if filled and all(isinstance(cell, float) for cell in filled):
         return np.array([np.nan if cell is None else cell for cell in cells])

@@ -279,7 +279,7 @@ def diagnose(calibration: Calibration, later: RunSource) -> Diagnosis:
 
 @dataclass(frozen=True)
 class Corrected:
-    """Corrected readings: vectors (n, 3) in g and nT, angles (n,) in radians, NaN where there is none.
+    """Corrected readings: vectors (n, 3) in g and nT, angles (n,) in radians, or NaN.
 
     `columns` are all results by the names of files, with their units (`inclination_deg`, `gx_g`, …),
     ready for a table; `findings` are what the reader should know.
@@ -322,7 +322,7 @@ class Corrected:
 
 
 def _range(values: AnyArray) -> tuple[str, str]:
-    """The least and the largest of some numbers as text; blank where there is none."""
+    """The least and the largest of some numbers as text, or blank."""
     known = values[~np.isnan(values)] if values.dtype.kind == "f" else values[:0]
     return (f"{known.min():.6g}", f"{known.max():.6g}") if known.size else ("", "")
 

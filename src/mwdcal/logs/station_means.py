@@ -40,7 +40,7 @@ SAMPLES_OF_RESTS = 1 << 16
 LONG = 16
 """Samples from which on the noise of a standstill is taken from itself; the most it borrows."""
 SIGNIFICANT = 1e-4
-"""Chance that a steady channel is said to drift, or to be less steady than usual."""
+"""Chance that a steady channel is reported to drift, or to be less steady than usual."""
 UNUSUAL = 2.0
 """Ratio to the usual spread that is reported."""
 LENT = 0.01

@@ -317,7 +317,7 @@ def _lowered(
 
 
 def _in_place_of(information: Information, members: Bools, place: int, wanted: Array) -> Array:
-    """The largest variance (n,), negative, with each candidate in the place of a member."""
+    """The largest variance (n,), negative, with each candidate instead of a member."""
     others = members & (np.arange(len(members)) != place)
     whole = information.of(others.astype(np.float64))
     if np.linalg.cond(whole) > 1e14:  # too few without it

@@ -149,7 +149,7 @@ def unusual(options: dict[str, Any]) -> list[str]:
 
 
 def numbers(whole: Any, name: str) -> Array:
-    """One column of numbers of an opened Parquet file, NaN where there is none."""
+    """One column of numbers of an opened Parquet file, or NaN."""
     cells = whole.read([name]).column(0)
     return np.asarray(cells.cast("float64").to_numpy(), float)
 

@@ -88,7 +88,7 @@ class SoundTools:
         return self._file.read([name]).column(0)
 
     def numbers(self, name: str) -> Array:
-        """A column of numbers, NaN where there is none."""
+        """A column of numbers, or NaN."""
         return numbers(self._file, name)[self._rows]
 
     def words(self, name: str) -> AnyArray:

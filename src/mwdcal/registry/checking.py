@@ -89,7 +89,7 @@ class _Rows:
         self._next = next(self._rows, None)
 
     def of(self, number: int) -> Row | None:
-        """The row of an event; None where there is none."""
+        """The row of an event, or None."""
         row = self._next
         if row is None or row["number"] != number:
             return None

@@ -308,7 +308,7 @@ def prepared(source: Source) -> Prepared:
 
 
 def _entries(source: Source) -> Iterable[Entry]:
-    """The records that a source is said, or seen, to be."""
+    """The records that a source is by its declaration or content."""
     if source.group is not None:
         return of_fleet(source.path, source.group)
     data = source.data or content(source.path)

@@ -162,7 +162,7 @@ def _records_page(
 
 
 def record(registry: Registry, number: int) -> Row | None:
-    """The record of a number, with the columns of `past`; None where there is none."""
+    """The record of a number, with the columns of `past`, or None."""
     with registry.reading() as connection:
         row = connection.execute(with_events().where(records.c.number == number)).mappings().first()
         return dict(row) if row else None
@@ -201,7 +201,7 @@ def _calibrations_of(*serials: str) -> sa.Select[Any]:
 
 
 def latest_calibration(registry: Registry, serial: str) -> tuple[Row, bytes] | None:
-    """The newest calibration of a tool by its time, and its file's bytes; None where there is none.
+    """The newest calibration of a tool by its time, and its file's bytes, or None.
 
     Raises:
         AlteredError: it, or a calibration that it was chosen from, is not what was added.

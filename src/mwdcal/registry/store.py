@@ -43,7 +43,7 @@ from mwdcal.registry.stored import (
 
 
 def system_user() -> str:
-    """The name under which the user is known to the system; empty where there is none."""
+    """The name under which the user is known to the system, or empty."""
     with suppress(KeyError, OSError, ImportError):
         return getuser()
     return ""

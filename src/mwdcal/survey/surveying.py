@@ -281,7 +281,7 @@ def not_deeper(table: Table, row: int, depth: float, length_unit: str = "") -> I
 
 
 def depth_column(table: Table, length_unit: str = "") -> tuple[str, float]:
-    """The column of measured depths, and metres per its unit; blank where there is none.
+    """The column of measured depths, and metres per its unit, or blank.
 
     Raises:
         InputError: the column has another name, and no unit of length was chosen.

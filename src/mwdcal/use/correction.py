@@ -155,7 +155,7 @@ def _joined(one: Scatter, other: Scatter) -> Scatter:
 
 
 def unsteady(scatter: Mapping[str, Scatter]) -> str:
-    """The quantities that scatter in most of the windows, and how far; empty if there are none."""
+    """The quantities that scatter in most of the windows, and how far, or empty."""
     words = []
     for name, each in scatter.items():
         if 2 * each.scattered > each.windows:

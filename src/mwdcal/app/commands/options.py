@@ -254,7 +254,7 @@ def _named_registry(context: click.Context, option: click.Parameter, typed: str 
 
 
 def _system_user() -> str:
-    """The name under which the user is known to the system; empty where there is none."""
+    """The name under which the user is known to the system, or empty."""
     from mwdcal.registry.store import system_user
 
     return system_user()

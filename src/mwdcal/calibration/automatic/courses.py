@@ -60,7 +60,7 @@ class OmittedTerms:
 
     @property
     def chance(self) -> Array:
-        """Probability (B, t, k) of so large a term by noise alone; NaN where there is none to test."""
+        """Probability (B, t, k) of so large a term by noise alone; NaN without a term to test."""
         return f_test(self.square, self.freedom, self.scatter[..., None], self.rest[..., None])
 
     @property

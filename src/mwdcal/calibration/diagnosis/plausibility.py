@@ -77,7 +77,7 @@ def check(calibration: Calibration, name: str, advice: str) -> None:
 
 
 def inconsistency(calibration: Calibration) -> str:
-    """The contradictions in a calibration; empty if there are none."""
+    """The contradictions in a calibration, or empty."""
     rules = (_parts, _numbers, _surroundings, _ranks, _covariance, _gains)
     return next((problem for rule in rules for problem in rule(calibration)), "")
 

@@ -66,7 +66,7 @@ def _escaped(character: re.Match[str]) -> str:
 def read(
     stated: Iterable[tuple[int, str]], source: str
 ) -> tuple[dict[str, object], TableDescription | None]:
-    """Metadata of numbered lines, and the description among them; None where there is none."""
+    """Metadata of numbered lines, and the description among them, or None."""
     metadata = meta.parse(stated, source)
     described = metadata.pop(DESCRIBED, None)
     if described is None:

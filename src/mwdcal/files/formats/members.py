@@ -53,7 +53,7 @@ def files_of(inputs: Iterable[str | os.PathLike[str] | None]) -> list[Path]:
 
 
 def split(path: str | os.PathLike[str]) -> tuple[Path, str | None]:
-    """The file that a path names, and the serial behind it; None where there is none.
+    """The file that a path names, and the serial behind it, or None.
 
     A file that has the whole name is meant by it.
 
@@ -154,7 +154,7 @@ class _Row(NamedTuple):
 
 
 def _tool(table: Any, file: Path, serial: str | None) -> tuple[int, int, _Row]:
-    """Where the only tool, or that of a serial, stands: row group, row, and what is said of it.
+    """Where the only tool, or that of a serial, is: row group, row, and its entries.
 
     A path does not keep every character of a serial, such as a slash at its end: one that makes the same
     path will do.
