@@ -4,6 +4,8 @@ import errno
 import json
 import os
 import re
+import shlex
+import socket
 import threading
 import time
 from itertools import pairwise
@@ -25,7 +27,7 @@ from bench_support import (
     measure,
 )
 from bench_tables import ROLLS, RUN, laboratory_table
-from cli_support import EXAMPLE, RAW, mwdcal, process
+from cli_support import EXAMPLE, RAW, ROOT, mwdcal, process
 from mwdcal import load_profile
 from mwdcal.bench import documents, serving
 from mwdcal.bench.attitude import has_turned
@@ -1178,6 +1180,48 @@ def test_eight_hours_leave_the_memory_flat(tmp_path):
     )
     assert max(later) - min(later) < 20
     assert used < 0.25 * hours * 3600
+
+
+TUTORIAL = (ROOT / "docs" / "tutorials" / "bench.md").read_text("utf-8")
+
+
+def test_the_lines_of_the_tutorial_open_the_bench_they_describe(tmp_path, monkeypatch):
+    served, listened = [], []
+
+    def listening(host, port):
+        listened.append((host, port))
+        return socket.create_server(("127.0.0.1", 0))
+
+    def serve(bench, opened, url):
+        opened.close()
+        bench.session.close()
+        served.append((bench.session.source, bench.session.folder, url))
+
+    monkeypatch.setattr(serving, "listening", listening)
+    monkeypatch.setattr(serving, "serve", serve)
+    monkeypatch.chdir(tmp_path)
+    lines = re.findall(r"^mwdcal (bench .*)$", TUTORIAL, re.MULTILINE)
+    for line in lines:
+        ran = mwdcal(*shlex.split(line))
+        assert ran.code == 0, (line, ran)
+        assert ran.out.startswith("http://")
+    assert lines[1].split()[-1] == served[1][1].name
+    assert [source for source, _, _ in served] == ["demo", "manual", "tcp:192.168.1.20:5000"]
+    assert listened == [("127.0.0.1", 0), ("127.0.0.1", 0), ("0.0.0.0", 8000)]
+    assert all(url for _, _, url in served), "the browser opens"
+
+
+def test_the_sources_of_the_tutorial_are_taken(tmp_path):
+    table = TUTORIAL.split("| `--source` |")[1].split("\n\n")[0]
+    named = re.findall(r"^\| `([^`]+)`", table, re.MULTILINE)
+    assert len(named) == 5
+    for form in named:
+        spec = form.replace("HOST:PORT", "localhost:1").replace("FILE", str(tmp_path / "log"))
+        folder = tmp_path / form.split(":")[0]
+        folder.mkdir()
+        bench = serving.bench_of(folder, {"source": spec}, "127.0.0.1", 1)
+        bench.session.close()
+        assert bench.session.source == spec
 
 
 def test_help_tells_the_address_first():

@@ -41,7 +41,8 @@ PATTERNS = {
 }
 """Regular expressions, and what to write instead."""
 OF_PAGES = {
-    r"(?i)\b(?:its|the) (?:name|value|figure|text|row|column|number)s? stands?\b|\bit stands (?:in|under|on)\b": "is, has",
+    r"(?i)\b(?:its|the) (?:name|value|figure|text|row|column|number)s? stands?\b": "is, has",
+    r"\bit stands (?:in|under|on)\b": "is, has",
     r"\btaken as exact\b": "assumed exact",
     r"\bbut for\b": "except",
     r"\bcomes? before (?:it|them)\b": "overrides",
