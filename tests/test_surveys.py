@@ -695,6 +695,23 @@ def test_bad_input_of_a_well(example, tmp_path, columns, options, message):
     assert not (tmp_path / "out.csv").exists()
 
 
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [("MD [m]", ()), ("Measured depth (m)", ()), ("MD", ("--length-unit", "m"))],
+)
+def test_depths_in_metres_under_another_name(example, tmp_path, name, options):
+    given = read_csv(EXAMPLE / "well.csv")
+    other = {name if column == "md_m" else column: cells for column, cells in given.items()}
+    ends = []
+    for columns, chosen in ((given, ()), (other, options)):
+        source = write_csv(tmp_path / "in.csv", columns, "simulated = true")
+        ran = cli("survey", example, source, "-o", tmp_path / "out.csv", "--json", *chosen)
+        assert ran.code == 0
+        assert not any(name in finding["text"] for finding in ran.json["findings"])
+        ends.append(ran.json["end"])
+    assert ends[0] == ends[1]
+
+
 def test_long_well_is_like_its_parts(example, tmp_path):
     """Results do not depend on how many stations are worked on at once."""
     from mwdcal.survey import path, stations

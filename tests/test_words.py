@@ -105,6 +105,7 @@ def index(tmp_path_factory):
         ("temperature", "explanation/temperature"),
         ("pandas", "howto/python"),
         ("undetermined", "tutorials/start"),
+        ("undetermined", "reference/glossary"),
     ],
 )
 def test_the_search_finds(index, word, page):

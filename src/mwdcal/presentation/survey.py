@@ -29,7 +29,7 @@ from mwdcal.presentation.signature import signature_status
 from mwdcal.presentation.text import chance, one_line, plural, table
 from mwdcal.survey.interference import Interference, InterferenceSize, MultiStationAnalysis
 from mwdcal.survey.stations import North
-from mwdcal.survey.surveying import BY_ROW, SurveyedWell, WellInputs
+from mwdcal.survey.surveying import BY_ROW, SurveyedWell, WellInputs, depth_column
 from mwdcal.survey.well import LastStation, Well, WellCounts, WellErrors
 from mwdcal.use.uncertainty import ErrorTerms, error_terms
 
@@ -235,7 +235,9 @@ def result_summary(result: SurveyedWell, output: str = "", html: str = "") -> Su
     """The result for machines; `output` and `html` are the files that were written, if any."""
     msa = result.analysis.summary if result.analysis else None
     others = result.inputs.surveys.readings.unused
-    unused = unused_columns(tuple(t for t in others if not any(name in t for name in BY_ROW)))
+    depth, _ = depth_column(result.inputs.table, result.inputs.length_unit)
+    used = (*BY_ROW, f"'{depth}'")
+    unused = unused_columns(tuple(t for t in others if not any(name in t for name in used)))
     facts = summary(result.well, result.counts, output, html, msa, unused)
     budget = result.contributions and contribution_summary(result.contributions)
     runs = [_run_of_well(i, run) for i, run in enumerate(result.runs, 1)]

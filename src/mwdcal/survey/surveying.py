@@ -284,20 +284,21 @@ def depth_column(table: Table, length_unit: str = "") -> tuple[str, float]:
     """The column of measured depths, and metres per its unit, or blank.
 
     Raises:
-        InputError: the column has another name, and no unit of length was chosen.
+        InputError: the column has another name without metres in it, and no unit of length was chosen.
     """
     for name, unit in MEASURED_DEPTHS.items():
         if name in table.columns:
             return name, LENGTH_UNITS[unit]
     for name in table.columns:
         if _DEPTH_NAMES.fullmatch(name.strip().lower()):
-            if not length_unit:
+            stated = _DEPTH_UNIT.search(name.strip().lower())
+            unit = stated[1] if stated else ""
+            if not length_unit and not unit.startswith("m"):
                 raise InputError(
                     f"{table.source}: column '{name}': measured depths must be in metres, in a column 'md_m'; in feet "
                     "in 'md_ft', in US survey feet in 'md_usft'. Rename it, or give `length_unit`."
                 )
-            stated = _DEPTH_UNIT.search(name.strip().lower())
-            return name, LENGTH_UNITS[_unit_of(stated[1] if stated else "", length_unit)]
+            return name, LENGTH_UNITS[_unit_of(unit, length_unit)]
     return "", 1.0
 
 
