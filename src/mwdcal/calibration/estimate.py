@@ -22,7 +22,12 @@ from mwdcal.calibration.options import Options
 from mwdcal.calibration.prior import prior_of
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.estimation.batch import held_once, put, take
-from mwdcal.estimation.minimisers import closed_form, closed_form_drift, uncertain_stand
+from mwdcal.estimation.minimisers import (
+    closed_form,
+    closed_form_drift,
+    stand_factors,
+    uncertain_stand,
+)
 from mwdcal.estimation.problem import ANGLES, Evidence, Problem, State, Triad
 from mwdcal.estimation.resetting import set_apart, with_share
 from mwdcal.estimation.solvers import (
@@ -237,9 +242,9 @@ def _evidence(readings: Readings, include: Array, options: Options) -> Evidence:
 
 def _general(problem: Problem, options: Options, finite: Bools) -> Fit:
     """The fit by the method's minimiser, with estimated noise and station weights in turn."""
-    solved = solve(problem, start(problem), options)
+    solved = solve(problem, _start(problem, options), options)
     iterations, trust = solved.iterations, np.ones(problem.evidence.include.shape)
-    determined = Determined.of(problem, solved.state)
+    determined = _determined(problem, solved.state, solved)
     stage = _Iterate(problem, solved, trust, np.zeros_like(iterations), determined)
     if not _all_declared(problem):
         stage = _estimate_noise(stage, options)
@@ -247,6 +252,15 @@ def _general(problem: Problem, options: Options, finite: Bools) -> Fit:
     if options.robust:
         stage = _downweigh(stage, options)
     return _finished(stage, options, finite, iterations)
+
+
+def _start(problem: Problem, options: Options) -> State:
+    """Where the minimiser begins: the minimum at exact angles where that is near."""
+    if options.separate_solver or not stand_factors.applies(problem):
+        return start(problem)
+    state = stand_factors.start(problem)
+    lost = np.flatnonzero(~np.isfinite(state.params).all(-1))
+    return put(state, lost, start(take(problem, lost))) if lost.size else state
 
 
 def refitted(result: Fit, problem: Problem, state: State, scale: Array, options: Options) -> Fit:
@@ -384,6 +398,10 @@ def _determined(problem: Problem, state: State, solved: Solved) -> Determined:
     """Which directions the evidence that the method uses determines."""
     if solved.known:
         return determined_apart(problem, state, solved.known)
+    if stand_factors.applies(problem):
+        determined = stand_factors.determined(problem, state)
+        if determined.clear.all():
+            return determined
     return Determined.of(problem, state)
 
 

@@ -17,6 +17,7 @@ from mwdcal.calibration.options import DIRECTION, Options, numbered
 from mwdcal.calibration.readings import CONSTANTS, Readings
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.drift import walk_constants
+from mwdcal.estimation.minimisers import stand_factors
 from mwdcal.estimation.minimisers.unweighted import STRENGTH, Sums
 from mwdcal.estimation.problem import (
     ANGLES,
@@ -316,7 +317,8 @@ def solve(problem: Problem, state: State, options: Options) -> Solved:
         return _by_sums(problem, state, options.method)
     if options.paper_weights:
         return Solved(*gauss_newton(_alike(problem), state), unweighted=True)
-    return Solved(*gauss_newton(problem, state))
+    way = stand_factors.minimum if stand_factors.applies(problem) else gauss_newton
+    return Solved(*way(problem, state))
 
 
 def _alike(problem: Problem) -> Problem:

@@ -1,0 +1,420 @@
+"""Factors over temperature on a stand whose angles are known, each with an error: a shorter way to the same minimum.
+
+By axis a reading is s(τ) [v + u · (v of the other axes) + b(τ)] as at exact references (`closed_form_factors`), with v at
+the angles that a state holds. A row of the design then has the unknowns of its own axis alone, and the angles that a
+station has for itself are taken out as elsewhere,
+
+    W = 1 - P Pᵀ,     P = G L⁻ᵀ,  L Lᵀ = 1 + Gᵀ G
+
+of which only columns with an uncertainty count. Errors of settings and terms of drifts are further unknowns. The matrix
+of the first step serves for all of a fit: it says how far to go, not where to end.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from mwdcal.estimation.batch import put, take
+from mwdcal.estimation.minimisers import closed_form
+from mwdcal.estimation.minimisers.closed_form_factors import OTHERS, Axes, factors, known_at
+from mwdcal.estimation.minimisers.closed_form_factors import minimum as lone_minimum
+from mwdcal.estimation.minimisers.uncertain_stand import StandRuns
+from mwdcal.estimation.problem import WALK_AXES, Problem, State, Triad
+from mwdcal.estimation.solvers import Determined, Status, gauss_newton
+from mwdcal.geometry.vectors import Array, Ints, diagonal, inverse, outer, quotient
+from mwdcal.sensor.models import Factors, Polynomial, affine_parts, factor_parts
+
+MOST_STEPS = 12
+"""Most steps of a fit: a member that has not settled then goes the general way."""
+STEPS_ALIKE = 6
+"""First steps that are taken by one matrix; those of members that have not settled have their own."""
+LAST_STEP = 1e-12
+"""Square of the last step, in standard uncertainties."""
+FIELD_WALK = 2
+"""Number of the walk of the field; the others are of the offsets of a triad."""
+
+
+def applies(problem: Problem) -> bool:
+    """Whether all angles are known, and nothing but their errors, the sensors' and drifts are to be found."""
+    found = problem.evidence
+    return (
+        len(problem.triads) == 2
+        and any(isinstance(t.model, Factors) for t in problem.triads)
+        and all(_is_affine(t) or isinstance(t.model, Factors) for t in problem.triads)
+        and not (found.absent or found.scatter or found.members.size)
+        and bool(found.referenced.all())
+        and not problem.prior.precision.any()
+        and all(constant.name in WALK_AXES for constant in found.constants)
+    )
+
+
+def _is_affine(triad: Triad) -> bool:
+    model = triad.model
+    return isinstance(model, Polynomial) and not (model.basis.order or model.curved)
+
+
+# --------------------------------------------------------------------------
+# Unknowns (B, 3, 2K + 2) of each axis of a triad, s, u and b, and the parameters of its model.
+
+
+def unknowns_of(triad: Triad, params: Array) -> Array:
+    """The unknowns of parameters (B, p)."""
+    if isinstance(triad.model, Factors):
+        scale, bias, mixing = factor_parts(params)
+        back = inverse(np.eye(3) - mixing)
+        pivots = diagonal(back)[..., None]
+        scale, bias = scale * pivots, bias / pivots
+    else:
+        assert isinstance(triad.model, Polynomial)
+        slope, field = affine_parts(params)
+        back = inverse(slope / triad.model.scale)
+        offset = triad.model.centre[:, 0] - (back @ field[..., None])[..., 0]
+        scale = pivots = diagonal(back)[..., None]
+        bias = offset[..., None] / pivots
+    across = np.take_along_axis(back, np.broadcast_to(OTHERS, (len(back), 3, 2)), -1) / pivots
+    return np.concatenate([scale, across, bias], -1)
+
+
+def params_of(triad: Triad, unknowns: Array) -> Array:
+    """The parameters (B, p) of unknowns."""
+    if isinstance(triad.model, Factors):
+        return factors(unknowns)[0]
+    turn = closed_form.centred_parts(triad, _forward(unknowns))[1]
+    return np.asarray(turn[:, :3].reshape(-1, 12)[:, closed_form.PLACES])
+
+
+def _forward(unknowns: Array) -> Array:
+    """Φ (B, 3, 4) of unknowns (B, 3, 4) without a course."""
+    offset = unknowns[..., :1] * unknowns[..., -1:]
+    return np.concatenate([_shares(unknowns) * unknowns[..., :1], offset], -1)
+
+
+def _shares(unknowns: Array) -> Array:
+    """1 + u (B, 3, 3)."""
+    count = unknowns.shape[-1] // 2 - 1
+    shares = np.broadcast_to(np.eye(3), (len(unknowns), 3, 3)).copy()
+    shares[:, np.arange(3)[:, None], OTHERS] = unknowns[..., count : count + 2]
+    return shares
+
+
+# --------------------------------------------------------------------------
+# Runs linearised at a point. Arrays are (B, component, n).
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Constants of the iteration: references, φ (B, K, n) of each triad, readings and 1/noise (B, 6, n).
+
+    `lone` (B, 3, n) and `together` (B, 2k, n) are σ of the angles of each station and of each setting; `masks`
+    (B, q, n) the terms of drifts, of `precision` (B, q), that act on the `axes` (q) of walks.
+    """
+
+    stand: StandRuns
+    phi: tuple[Array, ...]
+    raw: Array
+    root: Array
+    lone: Array
+    together: Array
+    masks: Array
+    precision: Array
+    axes: tuple[tuple[int, int], ...]
+
+    @classmethod
+    def of(cls, problem: Problem) -> Runs:
+        """Of a problem."""
+        found, triads = problem.evidence, problem.triads
+        bare = replace(problem, evidence=replace(found, constants=()))
+        stand = StandRuns.of(bare)
+        phi = tuple(t.model.basis(problem.temperature).mT for t in triads)
+        constants = found.constants
+        masks = np.zeros((len(stand.raw), len(constants), stand.raw.shape[-1]))
+        precision = np.zeros(masks.shape[:2])
+        for index, constant in enumerate(constants):
+            masks[:, index], precision[:, index] = constant.mask, constant.sd**-2.0
+        axes = tuple(WALK_AXES[constant.name] for constant in constants)
+        return cls(
+            replace(stand, angle_sd=np.ones_like(stand.angles)),
+            phi,
+            stand.raw,
+            found.include[:, None] / stand.sd,
+            found.turn_sd.mT,
+            found.set_together.mT,
+            masks,
+            precision,
+            axes,
+        )
+
+    def at(self, point: Point) -> Linear:
+        """Linearised at a point."""
+        count = self.together.shape[1] // 2
+        common = self.together * point.settings[..., None]
+        total = point.errors.copy()
+        for angle in range(2):
+            total[:, angle] += common[:, angle * count : (angle + 1) * count].sum(1)
+        f, change, attitude = self.stand.vectors(total)
+        rows, gains, seen = [], [], []
+        others = np.zeros((len(total), 6, len(self.axes), total.shape[-1]))
+        for index, (phi, unknowns) in enumerate(zip(self.phi, point.unknowns, strict=True)):
+            three = slice(3 * index, 3 * index + 3)
+            root, size = self.root[:, three], phi.shape[1]
+            v = np.moveaxis(f[index, :3], 0, 1)
+            beside = np.empty((*v.shape[:2], size + 2, v.shape[-1]))
+            beside[:, :, :2], beside[:, :, 2:] = v[:, OTHERS], phi[:, None]
+            scale = unknowns[..., :size] @ phi
+            unit = v + (unknowns[..., None, size:] @ beside)[..., 0, :]
+            louder = scale * root
+            seen.append(louder * unit)
+            by = (unit * root)[:, :, None] * phi[:, None], louder[:, :, None] * beside
+            rows.append(np.concatenate(by, 2))
+            turns = np.moveaxis(change[index], 2, 0).reshape(len(v), 3, -1)
+            turned = (_shares(unknowns) @ turns).reshape(*v.shape[:2], 3, -1)
+            gains.append(turned * louder[:, :, None])
+            for column, (walk, axis) in enumerate(self.axes):
+                if min(walk, 1) != index:
+                    continue
+                if walk < FIELD_WALK:
+                    others[:, 3 * index + axis, column] = root[:, axis] * self.masks[:, column]
+                else:
+                    along = np.moveaxis(attitude[:, axis], 0, 1)
+                    moved = (_shares(unknowns) @ along) * louder
+                    others[:, three, column] = moved * self.masks[:, column, None]
+        gain = np.concatenate(gains, 1)
+        settings = [
+            gain[:, :, angle, None] * part[:, None]
+            for angle, part in enumerate(np.split(self.together, 2, 1))
+        ]
+        walks = len(self.axes)
+        others = np.concatenate([others, *settings], 2)
+        held = np.concatenate([point.constants, point.settings], -1)
+        left = self.raw * self.root - np.concatenate(seen, 1)
+        if walks:
+            left -= np.einsum("brqn,bq->brn", others[:, :, :walks], point.constants)
+        active = np.flatnonzero(self.lone.any((0, 2)))
+        sd, errors = self.lone[:, active], point.errors[:, active]
+        own = gain[:, :, active] * sd[:, None]
+        left += np.sum(own * quotient(errors, sd, sd > 0)[:, None], 2)
+        ones = np.ones(point.settings.shape)
+        precision = np.concatenate([self.precision, ones], -1)
+        return Linear(tuple(rows), others, own, left, held, precision, sd, active)
+
+
+@dataclass(frozen=True)
+class Point:
+    """Where fits are: unknowns (B, 3, 2K + 2) of each triad, errors (B, 3, n), constants (B, q), settings (B, 2k)."""
+
+    unknowns: tuple[Array, ...]
+    errors: Array
+    constants: Array
+    settings: Array
+
+    @classmethod
+    def of(cls, problem: Problem, state: State) -> Point:
+        """Of a state."""
+        pairs = zip(problem.triads, problem.slices(), strict=True)
+        each = tuple(unknowns_of(triad, state.params[:, where]) for triad, where in pairs)
+        return cls(each, np.ascontiguousarray(state.errors.mT), state.constants, state.settings)
+
+    def state(self, problem: Problem, state: State) -> State:
+        """The state, of which `state` has the references."""
+        each = [params_of(*pair) for pair in zip(problem.triads, self.unknowns, strict=True)]
+        return replace(
+            state,
+            params=np.concatenate(each, -1),
+            constants=self.constants,
+            errors=self.errors.mT,
+            settings=self.settings,
+        )
+
+    def moved(self, step: Array, errors: Array) -> Point:
+        """After a step (B, u), with the errors that follow."""
+        at, each = 0, []
+        for unknowns in self.unknowns:
+            size = unknowns[0].size
+            each.append(unknowns + step[:, at : at + size].reshape(unknowns.shape))
+            at += size
+        q = at + self.constants.shape[-1]
+        return Point(tuple(each), errors, self.constants + step[:, at:q], self.settings + step[:, q:])
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Runs at a point: `rows` (B, 3, 2K + 2, n) of each triad, other columns (B, 6, q, n), and `left` (B, 6, n).
+
+    `own` (B, 6, a, n) is what one σ of each angle that a station has for itself does, of the `active` ones.
+    """
+
+    rows: tuple[Array, ...]
+    others: Array
+    own: Array
+    left: Array
+    held: Array
+    precision: Array
+    sd: Array
+    active: Ints
+
+    @cached_property
+    def factor(self) -> Array:
+        """L (B, a, a, n), lower, of L Lᵀ = 1 + GᵀG."""
+        gain, count = self.own, self.own.shape[2]
+        factor = np.zeros((len(gain), count, count, gain.shape[-1]))
+        for k in range(count):
+            for j in range(k + 1):
+                gram = np.sum(gain[:, :, k] * gain[:, :, j], 1)
+                product = gram - np.sum(factor[:, k, :j] * factor[:, j, :j], 1)
+                factor[:, k, j] = np.sqrt(1 + product) if j == k else product / factor[:, j, j]
+        return factor
+
+    @cached_property
+    def halves(self) -> Array:
+        """P (B, 6, a, n)."""
+        halves = np.empty(self.own.shape)
+        for k in range(halves.shape[2]):
+            rest = self.own[:, :, k].copy()
+            for j in range(k):
+                rest -= halves[:, :, j] * self.factor[:, None, k, j]
+            halves[:, :, k] = rest / self.factor[:, None, k, k]
+        return halves
+
+    def weighed(self, values: Array) -> Array:
+        """W times values (B, 6, n)."""
+        return np.asarray(values - np.sum(self.halves * self.along(values)[:, None], 2))
+
+    def along(self, values: Array) -> Array:
+        """Pᵀ (B, a, n) times values (B, 6, n)."""
+        return np.sum(self.halves * values[:, :, None], 1)
+
+    @cached_property
+    def pull(self) -> Array:
+        """XᵀW times what is left, and the pull of what is known beforehand (B, u)."""
+        values, batch = self.weighed(self.left), len(self.left)
+        each = [
+            (rows @ values[:, 3 * t : 3 * t + 3, :, None]).reshape(batch, -1)
+            for t, rows in enumerate(self.rows)
+        ]
+        flat = np.swapaxes(self.others, 1, 2).reshape(batch, self.others.shape[2], 6 * self.left.shape[-1])
+        others = (flat @ values.reshape(batch, -1, 1))[..., 0] - self.precision * self.held
+        return np.concatenate([*each, others], -1)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Inverse (B, u, u) of XᵀWX and what is known beforehand."""
+        batch, stations = len(self.left), self.left.shape[-1]
+        widths = [rows.shape[2] for rows in self.rows for _ in range(3)]
+        q, count = self.others.shape[2], self.own.shape[2]
+        size = sum(widths)
+        whole = np.zeros((batch, size + q, size + q))
+        along = np.empty((batch, size + q, count, stations))
+        first = 0
+        others = np.ascontiguousarray(np.swapaxes(self.others, 1, 2))
+        for axis, width in enumerate(widths):
+            part, at = self.rows[axis // 3][:, axis % 3], slice(first, first + width)
+            whole[:, at, at] = part @ part.mT
+            across = part @ others[:, :, axis].mT
+            whole[:, at, size:], whole[:, size:, at] = across, across.mT
+            np.multiply(part[:, :, None], self.halves[:, axis, None], out=along[:, at])
+            first += width
+        flat = others.reshape(batch, q, 6 * stations)
+        whole[:, size:, size:] = flat @ flat.mT
+        for k in range(count):
+            along[:, size:, k] = np.sum(others * self.halves[:, None, :, k], 2)
+        flat = along.reshape(batch, size + q, count * stations)
+        whole -= flat @ flat.mT
+        np.einsum("bii->bi", whole)[:, size:] += self.precision
+        scale = np.sqrt(diagonal(whole))
+        return inverse(whole / outer(scale)) / outer(scale)
+
+    def step(self, covariance: Array) -> tuple[Array, Array]:
+        """Step (B, u) by a covariance, and the square of its length (B,) in σ."""
+        step = (covariance @ self.pull[..., None])[..., 0]
+        return step, np.sum(step * self.pull, -1)
+
+    def errors(self, step: Array) -> Array:
+        """Errors (B, 3, n) of the angles that stations have for themselves, after a step (B, u)."""
+        left, first = self.left.copy(), 0
+        for t, rows in enumerate(self.rows):
+            size = 3 * rows.shape[2]
+            part = step[:, first : first + size].reshape(-1, 3, 1, rows.shape[2])
+            left[:, 3 * t : 3 * t + 3] -= (part @ rows)[:, :, 0]
+            first += size
+        left -= (step[:, None, None, first:] @ self.others)[:, :, 0]
+        along, count = self.along(left), self.own.shape[2]
+        errors = np.zeros((len(left), 3, left.shape[-1]))
+        for k in reversed(range(count)):
+            for j in range(k + 1, count):
+                along[:, k] -= self.factor[:, j, k] * along[:, j]
+            along[:, k] /= self.factor[:, k, k]
+        errors[:, self.active] = along * self.sd
+        return errors
+
+
+def minimum(problem: Problem, state: State) -> tuple[State, Ints, Ints]:
+    """States at the minimum, `Status` codes and numbers of steps; what does not settle goes the general way."""
+    runs, point = Runs.of(problem), Point.of(problem, state)
+    steps, good = np.zeros(len(runs.raw), int), np.zeros(len(runs.raw), bool)
+    active, whole, covariance = np.arange(len(good)), point, None
+    for count in range(1, MOST_STEPS + 1):
+        if not active.size:
+            break
+        here = runs.at(point)
+        if covariance is None or count > STEPS_ALIKE:
+            covariance = here.covariance
+        step, square = here.step(covariance)
+        point = point.moved(step, here.errors(step))
+        steps[active] = count
+        done = square < LAST_STEP
+        if done.any():
+            good[active[done]] = True
+            at = np.flatnonzero(done)
+            whole = put(whole, active[at], take(point, at))
+            rest = np.flatnonzero(~done)
+            active = active[rest]
+            runs, point, covariance = take(runs, rest), take(point, rest), covariance[rest]
+    ended = whole.state(problem, state)
+    good &= np.isfinite(ended.params).all(-1)
+    good &= determined(problem, ended).clear
+    status = np.full(len(good), int(Status.OK))
+    if not good.all():
+        rest = np.flatnonzero(~good)
+        found, status[rest], steps[rest] = gauss_newton(*take((problem, state), rest))
+        ended = put(ended, rest, found)
+    return ended, status, steps
+
+
+def start(problem: Problem) -> State:
+    """The minimum at the known angles, as if these were exact."""
+    at = closed_form.start(problem)
+    each, include = [], problem.evidence.include
+    for triad, target in zip(problem.triads, problem.targets(at), strict=True):
+        phi = triad.model.basis(problem.temperature)
+        axes = Axes.of(phi, target, triad.raw, triad.sd, include)
+        each.append(params_of(triad, lone_minimum(axes).unknowns))
+    return replace(at, params=np.concatenate(each, -1))
+
+
+def determined(problem: Problem, state: State) -> Determined:
+    """Which directions of the parameters are determined at a state, by the geometry of its references.
+
+    The last answer is kept.
+    """
+    return problem.once("determined factors", state, lambda _: _determined(problem, state))
+
+
+def _determined(problem: Problem, state: State) -> Determined:
+    bare = replace(state, errors=0 * state.errors, settings=0 * state.settings)
+    known, include = [], problem.evidence.include
+    targets = problem.targets(bare)
+    for triad, where, target in zip(problem.triads, problem.slices(), targets, strict=True):
+        unknowns = unknowns_of(triad, state.params[:, where])
+        if isinstance(triad.model, Factors):
+            phi = triad.model.basis(problem.temperature)
+            axes = Axes.of(phi, target, triad.raw, triad.sd, include)
+            known.append(known_at(axes, unknowns))
+        else:
+            terms = np.concatenate([target, np.ones_like(target[..., :1])], -1)
+            forward = _forward(unknowns)
+            turn = closed_form.centred_parts(triad, forward)[1]
+            known.append(closed_form.known_at(include[..., None], terms, forward, turn))
+    return closed_form.determined_by(known)
