@@ -314,7 +314,24 @@ def _completed(result: Fit) -> Fit:
 
 
 def _finished(stage: _Iterate, options: Options, finite: Bools, iterations: Ints) -> Fit:
-    """The fit at the end of all turns: gauge settled, and analysed."""
+    """The fit at the end of all turns: by axis where that tells all, with the gauge settled elsewhere."""
+    if options.robust or options.separate_solver or not stand_factors.applies(stage.problem):
+        return _ended(stage, options, finite, iterations)
+    problem, state = stage.problem, stage.solved.state
+    determined = stand_factors.determined(problem, state)
+    analysis = stand_factors.analysed(problem, state, determined)
+    good = determined.clear & analysis.finite
+    status = np.where(finite, stage.solved.status, int(Status.NOT_FINITE))
+    whole = Fit(problem, state, status, iterations, _noise(problem), stage.trust, analysis)
+    if good.all():
+        return whole
+    rest = np.flatnonzero(~good)
+    other = _ended(take(stage, rest), options, finite[rest], iterations[rest])
+    return put(whole, rest, other) if good.any() else other
+
+
+def _ended(stage: _Iterate, options: Options, finite: Bools, iterations: Ints) -> Fit:
+    """The same, whatever the problem."""
     problem, solved, trust = stage.problem, stage.solved, stage.trust
     trusted, state = _trusting(problem, trust), solved.state
     determined = _determined(trusted, state, solved)

@@ -16,6 +16,7 @@ import numpy as np
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import HIGHEST, highest_order, usable_soaks
 from mwdcal.estimation.batch import take
+from mwdcal.estimation.minimisers import stand_factors
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import TANGENT_STEP, fisher_tail, tangent
 from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, eigen, inverse, outer, quotient
@@ -146,10 +147,13 @@ def _with_terms(result: Fit, shown: Bools, least: int) -> tuple[Array, Array]:
     Of each power come the three gains and three offsets of each triad.
     """
     problem, state = result.problem, result.state
-    linear = problem.linear(state)
-    columns = steady_columns(problem, state)
     every = temperature_powers(problem.temperature, least + shown.shape[-1])
     powers = every[..., least:] * shown[:, None]
+    if stand_factors.applies(problem):
+        at = stand_factors.linear(problem, state).with_courses(powers.mT)
+        return at.information, at.pull
+    linear = problem.linear(state)
+    columns = steady_columns(problem, state)
     members, stations, count = powers.shape
     weighed = linear.weigh(columns).mT
     turned = powers.mT

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from mwdcal.estimation.minimisers.closed_form_factors import minimum as lone_min
 from mwdcal.estimation.minimisers.uncertain_stand import StandRuns
 from mwdcal.estimation.problem import WALK_AXES, Problem, State, Triad
 from mwdcal.estimation.solvers import Determined, Status, gauss_newton
+from mwdcal.estimation.uncertainty import Analysis, effects_of, variance_factors
 from mwdcal.geometry.vectors import Array, Ints, diagonal, inverse, outer, quotient
 from mwdcal.sensor.models import Factors, Polynomial, affine_parts, factor_parts
 
@@ -86,6 +88,22 @@ def params_of(triad: Triad, unknowns: Array) -> Array:
     return np.asarray(turn[:, :3].reshape(-1, 12)[:, closed_form.PLACES])
 
 
+def moved_params(triad: Triad, unknowns: Array) -> Array:
+    """Change (B, p, p) of the parameters by the unknowns."""
+    batch, size = len(unknowns), unknowns[0].size
+    if isinstance(triad.model, Factors):
+        return inverse(factors(unknowns)[2].reshape(batch, size, size))
+    forward, axis = _forward(unknowns), np.arange(3)
+    by = np.zeros((batch, 3, 4, 3, 4))
+    by[:, axis, :, axis, 0] = np.moveaxis(forward / unknowns[..., :1], 1, 0)
+    for place in (0, 1):
+        by[:, axis, OTHERS[:, place], axis, 1 + place] = unknowns[..., 0]
+    by[:, axis, 3, axis, 3] = unknowns[..., 0]
+    back, turn = closed_form.centred_parts(triad, forward)
+    moved = -back[:, :, None, :, None] * turn.mT[:, None, :, None, :]
+    return moved.reshape(batch, size, size)[:, closed_form.PLACES] @ by.reshape(batch, size, size)
+
+
 def _forward(unknowns: Array) -> Array:
     """Φ (B, 3, 4) of unknowns (B, 3, 4) without a course."""
     offset = unknowns[..., :1] * unknowns[..., -1:]
@@ -98,6 +116,11 @@ def _shares(unknowns: Array) -> Array:
     shares = np.broadcast_to(np.eye(3), (len(unknowns), 3, 3)).copy()
     shares[:, np.arange(3)[:, None], OTHERS] = unknowns[..., count : count + 2]
     return shares
+
+
+def _length(vector: Array) -> Array:
+    """Lengths (B, 1, n) of vectors (B, 3, n)."""
+    return np.sqrt(np.sum(vector * vector, 1, keepdims=True))
 
 
 # --------------------------------------------------------------------------
@@ -155,7 +178,7 @@ class Runs:
         for angle in range(2):
             total[:, angle] += common[:, angle * count : (angle + 1) * count].sum(1)
         f, change, attitude = self.stand.vectors(total)
-        rows, gains, seen = [], [], []
+        rows, gains, seen, vectors, louds = [], [], [], [], []
         others = np.zeros((len(total), 6, len(self.axes), total.shape[-1]))
         for index, (phi, unknowns) in enumerate(zip(self.phi, point.unknowns, strict=True)):
             three = slice(3 * index, 3 * index + 3)
@@ -167,6 +190,8 @@ class Runs:
             unit = v + (unknowns[..., None, size:] @ beside)[..., 0, :]
             louder = scale * root
             seen.append(louder * unit)
+            vectors.append(v)
+            louds.append(louder)
             by = (unit * root)[:, :, None] * phi[:, None], louder[:, :, None] * beside
             rows.append(np.concatenate(by, 2))
             turns = np.moveaxis(change[index], 2, 0).reshape(len(v), 3, -1)
@@ -198,7 +223,11 @@ class Runs:
         left += np.sum(own * quotient(errors, sd, sd > 0)[:, None], 2)
         ones = np.ones(point.settings.shape)
         precision = np.concatenate([self.precision, ones], -1)
-        return Linear(tuple(rows), others, own, left, held, precision, sd, active)
+        shares = tuple(_shares(unknowns) for unknowns in point.unknowns)
+        return Linear(
+            tuple(rows), others, own, left, held, precision, sd, active,
+            np.concatenate(vectors, 1), np.concatenate(louds, 1), shares,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -243,7 +272,9 @@ class Point:
 class Linear:
     """Runs at a point: `rows` (B, 3, 2K + 2, n) of each triad, other columns (B, 6, q, n), and `left` (B, 6, n).
 
-    `own` (B, 6, a, n) is what one σ of each angle that a station has for itself does, of the `active` ones.
+    `own` (B, 6, a, n) is what one σ of each angle that a station has for itself does, of the `active` ones. `held`
+    and `precision` (B, q) are values of the others, and what is known of them. A reading over its noise is `louder`
+    (B, 6, n) times the row of `shares` (B, 3, 3) times the vector (B, 6, n), and what is added to it.
     """
 
     rows: tuple[Array, ...]
@@ -254,6 +285,9 @@ class Linear:
     precision: Array
     sd: Array
     active: Ints
+    vectors: Array
+    louder: Array
+    shares: tuple[Array, ...]
 
     @cached_property
     def factor(self) -> Array:
@@ -299,23 +333,25 @@ class Linear:
         return np.concatenate([*each, others], -1)
 
     @cached_property
-    def covariance(self) -> Array:
-        """Inverse (B, u, u) of XᵀWX and what is known beforehand."""
+    def places(self) -> list[slice]:
+        """Where the unknowns of each of the six axes lie."""
+        ends = np.cumsum([0, *(rows.shape[2] for rows in self.rows for _ in range(3))]).tolist()
+        return [slice(*pair) for pair in pairwise(ends)]
+
+    @cached_property
+    def information(self) -> Array:
+        """XᵀWX and what is known beforehand (B, u, u)."""
         batch, stations = len(self.left), self.left.shape[-1]
-        widths = [rows.shape[2] for rows in self.rows for _ in range(3)]
-        q, count = self.others.shape[2], self.own.shape[2]
-        size = sum(widths)
+        q, count, size = self.others.shape[2], self.own.shape[2], self.places[-1].stop
         whole = np.zeros((batch, size + q, size + q))
         along = np.empty((batch, size + q, count, stations))
-        first = 0
         others = np.ascontiguousarray(np.swapaxes(self.others, 1, 2))
-        for axis, width in enumerate(widths):
-            part, at = self.rows[axis // 3][:, axis % 3], slice(first, first + width)
-            whole[:, at, at] = part @ part.mT
+        for axis, at in enumerate(self.places):
+            part = self.rows[axis // 3][:, axis % 3]
             across = part @ others[:, :, axis].mT
+            whole[:, at, at] = part @ part.mT
             whole[:, at, size:], whole[:, size:, at] = across, across.mT
             np.multiply(part[:, :, None], self.halves[:, axis, None], out=along[:, at])
-            first += width
         flat = others.reshape(batch, q, 6 * stations)
         whole[:, size:, size:] = flat @ flat.mT
         for k in range(count):
@@ -323,8 +359,58 @@ class Linear:
         flat = along.reshape(batch, size + q, count * stations)
         whole -= flat @ flat.mT
         np.einsum("bii->bi", whole)[:, size:] += self.precision
-        scale = np.sqrt(diagonal(whole))
-        return inverse(whole / outer(scale)) / outer(scale)
+        return whole
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Its inverse (B, u, u)."""
+        scale = outer(np.sqrt(diagonal(self.information)))
+        return inverse(self.information / scale) / scale
+
+    @cached_property
+    def weight(self) -> Array:
+        """W (B, n, 6, 6)."""
+        halves = np.ascontiguousarray(np.moveaxis(self.halves, -1, 1))
+        return np.asarray(np.eye(6) - halves @ halves.mT)
+
+    @cached_property
+    def spread(self) -> Array:
+        """W - W X V Xᵀ W (B, n, 6, 6), the covariance of the weighed residuals of each station."""
+        batch, stations, size = len(self.left), self.left.shape[-1], self.places[-1].stop
+        inner = np.empty((batch, stations, 6, 6))
+        for axis, at in enumerate(self.places):
+            part = self.rows[axis // 3][:, axis % 3]
+            moved = self.covariance[:, :, at] @ part
+            if self.others.shape[2]:
+                moved += self.covariance[:, :, size:] @ self.others[:, axis]
+            for other, here in enumerate(self.places[: axis + 1]):
+                both = np.sum(self.rows[other // 3][:, other % 3] * moved[:, here], 1)
+                if self.others.shape[2]:
+                    both += np.sum(self.others[:, other] * moved[:, size:], 1)
+                inner[..., axis, other] = inner[..., other, axis] = both
+        return np.asarray(self.weight - self.weight @ inner @ self.weight)
+
+    def with_courses(self, courses: Array) -> Linear:
+        """The same with six unknowns of each triad for each of some courses (B, k, n): its gains and offsets.
+
+        They are shares of the vector, and follow the courses one by one; nothing is known of them beforehand.
+        """
+        batch, count, stations = courses.shape
+        columns = np.zeros((batch, 6, count, 2, 2, 3, stations))
+        for index, shares in enumerate(self.shares):
+            three = slice(3 * index, 3 * index + 3)
+            vector = self.vectors[:, three]
+            each = np.stack([vector, np.broadcast_to(_length(vector), vector.shape)], 1)
+            steady = self.louder[:, three, None, None] * shares[:, :, None, :, None] * each[:, None]
+            columns[:, three, :, index] = steady[:, :, None] * courses[:, None, :, None, None]
+        columns = columns.reshape(batch, 6, -1, stations)
+        nothing = np.zeros((batch, columns.shape[2]))
+        return replace(
+            self,
+            others=np.concatenate([self.others, columns], 2),
+            held=np.concatenate([self.held, nothing], -1),
+            precision=np.concatenate([self.precision, nothing], -1),
+        )
 
     def step(self, covariance: Array) -> tuple[Array, Array]:
         """Step (B, u) by a covariance, and the square of its length (B,) in σ."""
@@ -381,6 +467,38 @@ def minimum(problem: Problem, state: State) -> tuple[State, Ints, Ints]:
         found, status[rest], steps[rest] = gauss_newton(*take((problem, state), rest))
         ended = put(ended, rest, found)
     return ended, status, steps
+
+
+def linear(problem: Problem, state: State) -> Linear:
+    """The problem linearised at a state; the last answer is kept."""
+
+    def found(state: State) -> Linear:
+        return Runs.of(problem).at(Point.of(problem, state))
+
+    return problem.once("by axis", state, found)
+
+
+def analysed(problem: Problem, state: State, known: Determined) -> Analysis:
+    """The analysis of fits with all directions determined, as `analyse` has it."""
+    at, include = linear(problem, state), problem.evidence.include
+    p, q = at.places[-1].stop, len(problem.evidence.constants)
+    whole = at.covariance.copy()
+    for triad, where in zip(problem.triads, problem.slices(), strict=True):
+        moved = moved_params(triad, unknowns_of(triad, state.params[:, where]))
+        whole[:, where] = moved @ whole[:, where]
+        whole[:, :, where] = whole[:, :, where] @ moved.mT
+    spread = at.spread * include[..., None, None]
+    residual = np.ascontiguousarray(at.weighed(at.left).mT)
+    return Analysis(
+        whole[:, :p, :p],
+        known,
+        *variance_factors(residual, spread),
+        residual,
+        spread,
+        whole[:, p : p + q, p : p + q],
+        effects_of(problem, whole[:, :p, p : p + q]),
+        whole[:, :p, p + q :],
+    )
 
 
 def start(problem: Problem) -> State:
