@@ -308,7 +308,7 @@ def _refined(result: Fit, problem: Problem, state: State, options: Options) -> F
 def _completed(result: Fit) -> Fit:
     """The fit of a stand of known angles with all of its analysis."""
     problem, state, known = result.problem, result.state, result.analysis.determined
-    if known.keep.all():
+    if known.keep.all() and uncertain_stand.applies(problem):
         return replace(result, analysis=uncertain_stand.analysed(problem, state, known))
     return replace(result, analysis=completed(problem, state, result.analysis))
 
@@ -327,7 +327,7 @@ def _finished(stage: _Iterate, options: Options, finite: Bools, iterations: Ints
         return whole
     rest = np.flatnonzero(~good)
     other = _ended(take(stage, rest), options, finite[rest], iterations[rest])
-    return put(whole, rest, other) if good.any() else other
+    return put(whole, rest, _completed(other)) if good.any() else other
 
 
 def _ended(stage: _Iterate, options: Options, finite: Bools, iterations: Ints) -> Fit:

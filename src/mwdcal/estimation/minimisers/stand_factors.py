@@ -12,6 +12,7 @@ of the first step serves for all of a fit: it says how far to go, not where to e
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -178,8 +179,8 @@ class Runs:
         for angle in range(2):
             total[:, angle] += common[:, angle * count : (angle + 1) * count].sum(1)
         f, change, attitude = self.stand.vectors(total)
+        shares = tuple(_shares(unknowns) for unknowns in point.unknowns)
         rows, gains, seen, vectors, louds = [], [], [], [], []
-        others = np.zeros((len(total), 6, len(self.axes), total.shape[-1]))
         for index, (phi, unknowns) in enumerate(zip(self.phi, point.unknowns, strict=True)):
             three = slice(3 * index, 3 * index + 3)
             root, size = self.root[:, three], phi.shape[1]
@@ -195,39 +196,24 @@ class Runs:
             by = (unit * root)[:, :, None] * phi[:, None], louder[:, :, None] * beside
             rows.append(np.concatenate(by, 2))
             turns = np.moveaxis(change[index], 2, 0).reshape(len(v), 3, -1)
-            turned = (_shares(unknowns) @ turns).reshape(*v.shape[:2], 3, -1)
+            turned = (shares[index] @ turns).reshape(*v.shape[:2], 3, -1)
             gains.append(turned * louder[:, :, None])
-            for column, (walk, axis) in enumerate(self.axes):
-                if min(walk, 1) != index:
-                    continue
-                if walk < FIELD_WALK:
-                    others[:, 3 * index + axis, column] = root[:, axis] * self.masks[:, column]
-                else:
-                    along = np.moveaxis(attitude[:, axis], 0, 1)
-                    moved = (_shares(unknowns) @ along) * louder
-                    others[:, three, column] = moved * self.masks[:, column, None]
         gain = np.concatenate(gains, 1)
         settings = [
             gain[:, :, angle, None] * part[:, None]
             for angle, part in enumerate(np.split(self.together, 2, 1))
         ]
-        walks = len(self.axes)
-        others = np.concatenate([others, *settings], 2)
-        held = np.concatenate([point.constants, point.settings], -1)
         left = self.raw * self.root - np.concatenate(seen, 1)
-        if walks:
-            left -= np.einsum("brqn,bq->brn", others[:, :, :walks], point.constants)
         active = np.flatnonzero(self.lone.any((0, 2)))
         sd, errors = self.lone[:, active], point.errors[:, active]
         own = gain[:, :, active] * sd[:, None]
         left += np.sum(own * quotient(errors, sd, sd > 0)[:, None], 2)
-        ones = np.ones(point.settings.shape)
-        precision = np.concatenate([self.precision, ones], -1)
-        shares = tuple(_shares(unknowns) for unknowns in point.unknowns)
-        return Linear(
-            tuple(rows), others, own, left, held, precision, sd, active,
-            np.concatenate(vectors, 1), np.concatenate(louds, 1), shares,
+        here = Linear(
+            tuple(rows), np.concatenate(settings, 2), own, left, point.settings,
+            np.ones(point.settings.shape), sd, active, np.concatenate(vectors, 1),
+            np.concatenate(louds, 1), shares, self.root, attitude,
         )  # fmt: skip
+        return here.with_walks(self.axes, self.masks, point.constants, self.precision)
 
 
 @dataclass(frozen=True)
@@ -288,6 +274,8 @@ class Linear:
     vectors: Array
     louder: Array
     shares: tuple[Array, ...]
+    root: Array
+    attitude: Array
 
     @cached_property
     def factor(self) -> Array:
@@ -314,11 +302,11 @@ class Linear:
 
     def weighed(self, values: Array) -> Array:
         """W times values (B, 6, n)."""
-        return np.asarray(values - np.sum(self.halves * self.along(values)[:, None], 2))
+        return np.asarray(values - np.sum(self.halves * self._along(values)[:, None], 2))
 
-    def along(self, values: Array) -> Array:
+    def _along(self, values: Array) -> Array:
         """Pᵀ (B, a, n) times values (B, 6, n)."""
-        return np.sum(self.halves * values[:, :, None], 1)
+        return np.asarray(np.sum(self.halves * values[:, :, None], 1))
 
     @cached_property
     def pull(self) -> Array:
@@ -339,27 +327,76 @@ class Linear:
         return [slice(*pair) for pair in pairwise(ends)]
 
     @cached_property
-    def information(self) -> Array:
-        """XᵀWX and what is known beforehand (B, u, u)."""
+    def along(self) -> Array:
+        """XᵀP (B, u, a n)."""
         batch, stations = len(self.left), self.left.shape[-1]
         q, count, size = self.others.shape[2], self.own.shape[2], self.places[-1].stop
-        whole = np.zeros((batch, size + q, size + q))
         along = np.empty((batch, size + q, count, stations))
-        others = np.ascontiguousarray(np.swapaxes(self.others, 1, 2))
         for axis, at in enumerate(self.places):
             part = self.rows[axis // 3][:, axis % 3]
-            across = part @ others[:, :, axis].mT
-            whole[:, at, at] = part @ part.mT
-            whole[:, at, size:], whole[:, size:, at] = across, across.mT
             np.multiply(part[:, :, None], self.halves[:, axis, None], out=along[:, at])
-        flat = others.reshape(batch, q, 6 * stations)
-        whole[:, size:, size:] = flat @ flat.mT
-        for k in range(count):
-            along[:, size:, k] = np.sum(others * self.halves[:, None, :, k], 2)
-        flat = along.reshape(batch, size + q, count * stations)
-        whole -= flat @ flat.mT
+        if q:
+            each = self.others.swapaxes(1, 2)[:, :, :, None] * self.halves[:, None]
+            np.sum(each, 2, out=along[:, size:])
+        return along.reshape(batch, size + q, count * stations)
+
+    def products(self, axes: range) -> Array:
+        """Sums XᵀX (B, u, u) over some of the six axes."""
+        batch, size, q = len(self.left), self.places[-1].stop, self.others.shape[2]
+        whole = np.zeros((batch, size + q, size + q))
+        for axis in axes:
+            part, at = self.rows[axis // 3][:, axis % 3], self.places[axis]
+            whole[:, at, at] = part @ part.mT
+            if q:
+                across = part @ self.others[:, axis].mT
+                whole[:, at, size:], whole[:, size:, at] = across, across.mT
+        if q:
+            some = self.others[:, axes.start : axes.stop].swapaxes(1, 2).reshape(batch, q, -1)
+            whole[:, size:, size:] = some @ some.mT
+        return whole
+
+    @cached_property
+    def of_data(self) -> Array:
+        """XᵀWX (B, u, u)."""
+        return np.asarray(self.products(range(6)) - self.along @ self.along.mT)
+
+    @cached_property
+    def information(self) -> Array:
+        """The same, with what is known beforehand."""
+        whole = self.of_data.copy()
+        size = self.places[-1].stop
         np.einsum("bii->bi", whole)[:, size:] += self.precision
         return whole
+
+    @cached_property
+    def of_angles(self) -> Array:
+        """XᵀW G GᵀW X (B, u, u): information that errors of angles are part of."""
+        batch, u = self.along.shape[:2]
+        count, stations = self.own.shape[2], self.own.shape[-1]
+        each = self.along.reshape(batch, u, count, stations).copy()
+        for k in reversed(range(count)):  # P L⁻¹
+            for j in range(k + 1, count):
+                each[:, :, k] -= self.factor[:, None, j, k] * each[:, :, j]
+            each[:, :, k] /= self.factor[:, None, k, k]
+        flat = each.reshape(self.along.shape)
+        return np.asarray(flat @ flat.mT)
+
+    @cached_property
+    def squared(self) -> tuple[Array, Array]:
+        """XᵀW E W X (B, u, u), E being one for the readings of a triad and zero for those of the other."""
+        batch, u = self.along.shape[:2]
+        count, stations = self.own.shape[2], self.own.shape[-1]
+        gram = np.einsum("brkn,brjn->bkjn", self.halves[:, :3], self.halves[:, :3])
+        along = self.along.reshape(batch, u, count, stations)
+        part = -0.5 * np.einsum("bukn,bkjn->bujn", along, gram)
+        size, own = self.places[-1].stop, self.places[2].stop
+        part[:, :own] += along[:, :own]
+        if self.others.shape[2]:
+            others = self.others[:, :3].swapaxes(1, 2)[:, :, :, None]
+            part[:, size:] += np.sum(others * self.halves[:, None, :3], 2)
+        mixed = part.reshape(self.along.shape) @ self.along.mT
+        first = self.products(range(3)) - mixed - mixed.mT
+        return first, self.of_data - self.of_angles - first
 
     @cached_property
     def covariance(self) -> Array:
@@ -389,6 +426,52 @@ class Linear:
                     both += np.sum(self.others[:, other] * moved[:, size:], 1)
                 inner[..., axis, other] = inner[..., other, axis] = both
         return np.asarray(self.weight - self.weight @ inner @ self.weight)
+
+    def walk_axes(self, axes: Sequence[tuple[int, int]]) -> Array:
+        """Effect (B, 6, a, n) on the readings of a unit of some axes of walks, by the numbers of both."""
+        effect = np.zeros((len(self.root), 6, len(axes), self.root.shape[-1]))
+        for place, (walk, axis) in enumerate(axes):
+            if walk < FIELD_WALK:
+                effect[:, 3 * walk + axis, place] = self.root[:, 3 * walk + axis]
+            else:
+                along = np.moveaxis(self.attitude[:, axis], 0, 1)
+                effect[:, 3:, place] = (self.shares[1] @ along) * self.louder[:, 3:]
+        return effect
+
+    def with_walks(
+        self, axes: Sequence[tuple[int, int]], masks: Array, value: Array, precision: Array
+    ) -> Linear:
+        """The same with terms of walks, (B, q, n) on so many axes, at a value and known to a precision (B, q)."""
+        if not axes:
+            return self
+        each = list(dict.fromkeys(axes))
+        effect = self.walk_axes(each)[:, :, [each.index(axis) for axis in axes]] * masks[:, None]
+        return replace(
+            self,
+            others=np.concatenate([effect, self.others], 2),
+            left=self.left - (value[:, None, None] @ effect)[:, :, 0],
+            held=np.concatenate([value, self.held], -1),
+            precision=np.concatenate([precision, self.precision], -1),
+        )
+
+    def walk_sums(self, axes: Sequence[tuple[int, int]], terms: Array) -> tuple[Array, Array, Array]:
+        """Of unit walks, terms (n, K) on some axes: score (B, a, K), XᵀWD (B, u, a, K) and DᵀWD (B, a, a, K, K)."""
+        effect, batch = self.walk_axes(axes), len(self.root)
+        count, stations, size = len(axes), len(terms), self.places[-1].stop
+        along = np.sum(self.halves[:, :, :, None] * effect[:, :, None], 1)
+        weighed = effect - np.sum(self.halves[:, :, :, None] * along[:, None], 2)
+        score = np.sum(effect * self.weighed(self.left)[:, :, None], 1) @ terms
+        crossed = np.empty((batch, size + self.others.shape[2], count, terms.shape[-1]))
+        for axis, at in enumerate(self.places):
+            part = self.rows[axis // 3][:, axis % 3]
+            product = part[:, :, None] * weighed[:, axis, None]
+            crossed[:, at] = product @ terms
+        if self.others.shape[2]:
+            product = np.sum(self.others[:, :, :, None] * weighed[:, :, None], 1)
+            crossed[:, size:] = product @ terms
+        pairs = (terms[:, :, None] * terms[:, None]).reshape(stations, -1)
+        alone = np.sum(effect[:, :, :, None] * weighed[:, :, None], 1) @ pairs
+        return score, crossed, alone.reshape(batch, count, count, *2 * terms.shape[1:])
 
     def with_courses(self, courses: Array) -> Linear:
         """The same with six unknowns of each triad for each of some courses (B, k, n): its gains and offsets.
@@ -426,7 +509,7 @@ class Linear:
             left[:, 3 * t : 3 * t + 3] -= (part @ rows)[:, :, 0]
             first += size
         left -= (step[:, None, None, first:] @ self.others)[:, :, 0]
-        along, count = self.along(left), self.own.shape[2]
+        along, count = self._along(left), self.own.shape[2]
         errors = np.zeros((len(left), 3, left.shape[-1]))
         for k in reversed(range(count)):
             for j in range(k + 1, count):
@@ -482,11 +565,12 @@ def analysed(problem: Problem, state: State, known: Determined) -> Analysis:
     """The analysis of fits with all directions determined, as `analyse` has it."""
     at, include = linear(problem, state), problem.evidence.include
     p, q = at.places[-1].stop, len(problem.evidence.constants)
-    whole = at.covariance.copy()
+    whole, of_stand = at.covariance.copy(), at.covariance @ at.of_angles @ at.covariance
     for triad, where in zip(problem.triads, problem.slices(), strict=True):
         moved = moved_params(triad, unknowns_of(triad, state.params[:, where]))
-        whole[:, where] = moved @ whole[:, where]
-        whole[:, :, where] = whole[:, :, where] @ moved.mT
+        for each in (whole, of_stand):
+            each[:, where] = moved @ each[:, where]
+            each[:, :, where] = each[:, :, where] @ moved.mT
     spread = at.spread * include[..., None, None]
     residual = np.ascontiguousarray(at.weighed(at.left).mT)
     return Analysis(
@@ -498,7 +582,21 @@ def analysed(problem: Problem, state: State, known: Determined) -> Analysis:
         whole[:, p : p + q, p : p + q],
         effects_of(problem, whole[:, :p, p : p + q]),
         whole[:, :p, p + q :],
+        squares=_squares(at, spread, include),
+        of_stand=of_stand[:, :p, :p],
     )
+
+
+def _squares(at: Linear, spread: Array, include: Array) -> Array:
+    """tr(S²) (B, t) of the covariance S of the weighed residuals of a triad, of which `spread` are the stations' own."""
+    each = []
+    for index, squared in enumerate(at.squared):
+        rows = (..., slice(3 * index, 3 * index + 3), slice(3 * index, 3 * index + 3))
+        weight = at.weight[rows] * include[..., None, None]
+        part = squared @ at.covariance
+        alone = np.sum(weight * (2 * spread[rows] - weight), (1, 2, 3))
+        each.append(alone + np.sum(part * part.mT, (1, 2)))
+    return np.stack(each, -1)
 
 
 def start(problem: Problem) -> State:
