@@ -473,27 +473,40 @@ class Linear:
         alone = np.sum(effect[:, :, :, None] * weighed[:, :, None], 1) @ pairs
         return score, crossed, alone.reshape(batch, count, count, *2 * terms.shape[1:])
 
-    def with_courses(self, courses: Array) -> Linear:
-        """The same with six unknowns of each triad for each of some courses (B, k, n): its gains and offsets.
+    def with_courses(self, courses: Array) -> tuple[Array, Array]:
+        """Information (B, u + k, u + k) and pull with six more unknowns of each triad for each of some courses.
 
-        They are shares of the vector, and follow the courses one by one; nothing is known of them beforehand.
+        The courses (B, c, n) come one by one, and of each the gains and the offsets of a triad as shares of its vector;
+        nothing is known of them beforehand.
         """
         batch, count, stations = courses.shape
-        columns = np.zeros((batch, 6, count, 2, 2, 3, stations))
+        size, u, k = self.places[-1].stop, len(self.information[0]), 12 * count
+        cross, along = np.zeros((batch, u, k)), np.empty((batch, k, self.along.shape[-1]))
+        inner, pull = np.zeros((batch, k, k)), np.empty((batch, k))
+        left = self.weighed(self.left)
         for index, shares in enumerate(self.shares):
             three = slice(3 * index, 3 * index + 3)
             vector = self.vectors[:, three]
             each = np.stack([vector, np.broadcast_to(_length(vector), vector.shape)], 1)
-            steady = self.louder[:, three, None, None] * shares[:, :, None, :, None] * each[:, None]
-            columns[:, three, :, index] = steady[:, :, None] * courses[:, None, :, None, None]
-        columns = columns.reshape(batch, 6, -1, stations)
-        nothing = np.zeros((batch, columns.shape[2]))
-        return replace(
-            self,
-            others=np.concatenate([self.others, columns], 2),
-            held=np.concatenate([self.held, nothing], -1),
-            precision=np.concatenate([self.precision, nothing], -1),
-        )
+            turned = self.louder[:, None, three] * shares.mT[..., None]
+            steady = (each[:, :, :, None] * turned[:, None]).reshape(batch, 1, 6, 3, stations)
+            columns = (steady * courses[:, :, None, None]).reshape(batch, -1, 3, stations)
+            at = (12 * np.arange(count)[:, None] + 6 * index + np.arange(6)).ravel()
+            seen = np.sum(columns[:, :, :, None] * self.halves[:, None, three], 2)
+            along[:, at] = seen.reshape(batch, at.size, -1)
+            for axis in range(3):
+                place = self.places[3 * index + axis]
+                cross[:, place, at] = self.rows[index][:, axis] @ columns[:, :, axis].mT
+            flat = columns.reshape(batch, at.size, -1)
+            if u > size:
+                others = self.others[:, three].swapaxes(1, 2).reshape(batch, u - size, -1)
+                cross[:, size:, at] = others @ flat.mT
+            inner[:, at[:, None], at] = flat @ flat.mT
+            pull[:, at] = (flat @ left[:, three].reshape(batch, -1, 1))[..., 0]
+        cross -= self.along @ along.mT
+        inner -= along @ along.mT
+        whole = np.block([[self.information, cross], [cross.mT, inner]])
+        return whole, np.concatenate([self.pull, pull], -1)
 
     def step(self, covariance: Array) -> tuple[Array, Array]:
         """Step (B, u) by a covariance, and the square of its length (B,) in σ."""
