@@ -199,7 +199,7 @@ def fit(readings: Readings, options: Options | None = None, include: Array | Non
         return closed
     rest = np.flatnonzero(~good)
     other = _general(take(problem, rest), options, finite[rest])
-    return put(closed, rest, other if closed.analysis.squares is None else _completed(other))
+    return put(closed, rest, other if closed.analysis.squares is None else with_all(other))
 
 
 def scatters(readings: Readings, options: Options) -> bool:
@@ -301,16 +301,19 @@ def _refined(result: Fit, problem: Problem, state: State, options: Options) -> F
         return whole
     rest = np.flatnonzero(~good)
     return put(
-        whole, rest, _completed(_refitted_anyhow(*take((result, problem, state), rest), options))
+        whole, rest, with_all(_refitted_anyhow(*take((result, problem, state), rest), options))
     )
 
 
-def _completed(result: Fit) -> Fit:
-    """The fit of a stand of known angles with all of its analysis."""
-    problem, state, known = result.problem, result.state, result.analysis.determined
-    if known.keep.all() and uncertain_stand.applies(problem):
+def with_all(result: Fit) -> Fit:
+    """The fit, of no robust loss, with all that can be known of it where its angles are known with an error."""
+    problem, state, analysis = result.problem, result.state, result.analysis
+    known = analysis.determined
+    if uncertain_stand.applies(problem) and known.keep.all():
         return replace(result, analysis=uncertain_stand.analysed(problem, state, known))
-    return replace(result, analysis=completed(problem, state, result.analysis))
+    if stand_factors.applies(problem) and known.clear.all():
+        return replace(result, analysis=stand_factors.completed(problem, state, analysis))
+    return replace(result, analysis=completed(problem, state, analysis))
 
 
 def _finished(stage: _Iterate, options: Options, finite: Bools, iterations: Ints) -> Fit:
@@ -327,7 +330,7 @@ def _finished(stage: _Iterate, options: Options, finite: Bools, iterations: Ints
         return whole
     rest = np.flatnonzero(~good)
     other = _ended(take(stage, rest), options, finite[rest], iterations[rest])
-    return put(whole, rest, _completed(other)) if good.any() else other
+    return put(whole, rest, other) if good.any() else other
 
 
 def _ended(stage: _Iterate, options: Options, finite: Bools, iterations: Ints) -> Fit:

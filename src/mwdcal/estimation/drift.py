@@ -194,7 +194,7 @@ def walk_scores(
         return _common_scores(walking, at, sd, each, residual)
     if not old and analysis.squares is not None and uncertain_stand.applies(problem):
         return _on_stand(problem, state, each, sd)
-    if analysis.squares is not None and stand_factors.applies(problem):
+    if analysis.determined.clear.all() and stand_factors.applies(problem):
         return _by_axis(problem, state, each, sd)
     linear, base = problem.linear(state), _axes(problem, state, [*each])
     whole = whole_covariance(linear, analysis.determined)

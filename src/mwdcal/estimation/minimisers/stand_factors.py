@@ -578,12 +578,7 @@ def analysed(problem: Problem, state: State, known: Determined) -> Analysis:
     """The analysis of fits with all directions determined, as `analyse` has it."""
     at, include = linear(problem, state), problem.evidence.include
     p, q = at.places[-1].stop, len(problem.evidence.constants)
-    whole, of_stand = at.covariance.copy(), at.covariance @ at.of_angles @ at.covariance
-    for triad, where in zip(problem.triads, problem.slices(), strict=True):
-        moved = moved_params(triad, unknowns_of(triad, state.params[:, where]))
-        for each in (whole, of_stand):
-            each[:, where] = moved @ each[:, where]
-            each[:, :, where] = each[:, :, where] @ moved.mT
+    whole = _in_parameters(problem, state, at.covariance)
     spread = at.spread * include[..., None, None]
     residual = np.ascontiguousarray(at.weighed(at.left).mT)
     return Analysis(
@@ -595,21 +590,30 @@ def analysed(problem: Problem, state: State, known: Determined) -> Analysis:
         whole[:, p : p + q, p : p + q],
         effects_of(problem, whole[:, :p, p : p + q]),
         whole[:, :p, p + q :],
-        squares=_squares(at, spread, include),
-        of_stand=of_stand[:, :p, :p],
     )
 
 
-def _squares(at: Linear, spread: Array, include: Array) -> Array:
-    """tr(S²) (B, t) of the covariance S of the weighed residuals of a triad, of which `spread` are the stations' own."""
-    each = []
+def completed(problem: Problem, state: State, analysis: Analysis) -> Analysis:
+    """The analysis that `analysed` gives with all that can be known of it."""
+    at, include, squares = linear(problem, state), problem.evidence.include, []
     for index, squared in enumerate(at.squared):
         rows = (..., slice(3 * index, 3 * index + 3), slice(3 * index, 3 * index + 3))
-        weight = at.weight[rows] * include[..., None, None]
-        part = squared @ at.covariance
-        alone = np.sum(weight * (2 * spread[rows] - weight), (1, 2, 3))
-        each.append(alone + np.sum(part * part.mT, (1, 2)))
-    return np.stack(each, -1)
+        weight, part = at.weight[rows] * include[..., None, None], squared @ at.covariance
+        alone = np.sum(weight * (2 * analysis.spread[rows] - weight), (1, 2, 3))
+        squares.append(alone + np.sum(part * part.mT, (1, 2)))
+    of_stand = _in_parameters(problem, state, at.covariance @ at.of_angles @ at.covariance)
+    p = at.places[-1].stop
+    return replace(analysis, squares=np.stack(squares, -1), of_stand=of_stand[:, :p, :p])
+
+
+def _in_parameters(problem: Problem, state: State, covariance: Array) -> Array:
+    """A covariance (B, u, u) of the unknowns by axis as that of the parameters, the others as they are."""
+    whole = covariance.copy()
+    for triad, where in zip(problem.triads, problem.slices(), strict=True):
+        moved = moved_params(triad, unknowns_of(triad, state.params[:, where]))
+        whole[:, where] = moved @ whole[:, where]
+        whole[:, :, where] = whole[:, :, where] @ moved.mT
+    return whole
 
 
 def start(problem: Problem) -> State:
