@@ -40,7 +40,6 @@ from mwdcal.estimation.solvers import (
     weight,
     weighted,
 )
-from mwdcal.estimation.start import start
 from mwdcal.estimation.uncertainty import (
     FIRST_SCATTER,
     LEAST_SCATTER,
@@ -242,7 +241,7 @@ def _evidence(readings: Readings, include: Array, options: Options) -> Evidence:
 
 def _general(problem: Problem, options: Options, finite: Bools) -> Fit:
     """The fit by the method's minimiser, with estimated noise and station weights in turn."""
-    solved = solve(problem, _start(problem, options), options)
+    solved = solve(problem, None, options)
     iterations, trust = solved.iterations, np.ones(problem.evidence.include.shape)
     determined = _determined(problem, solved.state, solved)
     stage = _Iterate(problem, solved, trust, np.zeros_like(iterations), determined)
@@ -252,15 +251,6 @@ def _general(problem: Problem, options: Options, finite: Bools) -> Fit:
     if options.robust:
         stage = _downweigh(stage, options)
     return _finished(stage, options, finite, iterations)
-
-
-def _start(problem: Problem, options: Options) -> State:
-    """Where the minimiser begins: the minimum at exact angles where that is near."""
-    if options.separate_solver or not stand_factors.applies(problem):
-        return start(problem)
-    state = stand_factors.start(problem)
-    lost = np.flatnonzero(~np.isfinite(state.params).all(-1))
-    return put(state, lost, start(take(problem, lost))) if lost.size else state
 
 
 def refitted(result: Fit, problem: Problem, state: State, scale: Array, options: Options) -> Fit:

@@ -30,6 +30,7 @@ from mwdcal.estimation.problem import (
     State,
 )
 from mwdcal.estimation.solvers import Status, gauss_newton
+from mwdcal.estimation.start import start
 from mwdcal.estimation.uncertainty import readjusted, unweighted_pulls
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints, inverse
 from mwdcal.sensor.models import affine_parts
@@ -307,8 +308,11 @@ def _alone(state: State, where: slice) -> State:
     return replace(state, params=state.params[:, where])
 
 
-def solve(problem: Problem, state: State, options: Options) -> Solved:
-    """The minimum that the method is defined by, from a start."""
+def solve(problem: Problem, state: State | None, options: Options) -> Solved:
+    """The minimum that the method is defined by, from a state, or a start of its own."""
+    if not options.separate_solver and stand_factors.applies(problem):
+        return Solved(*stand_factors.minimum(problem, state))
+    state = state or start(problem)
     if options.method == "swarm":
         return _swarmed(problem, state, options.seed)
     if options.method == "newton":
@@ -317,8 +321,7 @@ def solve(problem: Problem, state: State, options: Options) -> Solved:
         return _by_sums(problem, state, options.method)
     if options.paper_weights:
         return Solved(*gauss_newton(_alike(problem), state), unweighted=True)
-    way = stand_factors.minimum if stand_factors.applies(problem) else gauss_newton
-    return Solved(*way(problem, state))
+    return Solved(*gauss_newton(problem, state))
 
 
 def _alike(problem: Problem) -> Problem:

@@ -1,7 +1,7 @@
 """Factors over temperature on a stand whose angles are known, each with an error: a shorter way to the same minimum.
 
-By axis a reading is s(τ) [v + u · (v of the other axes) + b(τ)] as at exact references (`closed_form_factors`), with v at
-the angles that a state holds. A row of the design then has the unknowns of its own axis alone, and the angles that a
+By axis a reading is s(τ) [v + u · (v of the other axes) + b(τ)] as at exact references (`closed_form_factors`), with v
+at the angles that a state holds. A row of the design then has the unknowns of its own axis alone, and the angles that a
 station has for itself are taken out as elsewhere,
 
     W = 1 - P Pᵀ,     P = G L⁻ᵀ,  L Lᵀ = 1 + Gᵀ G
@@ -26,6 +26,7 @@ from mwdcal.estimation.minimisers.closed_form_factors import minimum as lone_min
 from mwdcal.estimation.minimisers.uncertain_stand import StandRuns
 from mwdcal.estimation.problem import WALK_AXES, Problem, State, Triad
 from mwdcal.estimation.solvers import Determined, Status, gauss_newton
+from mwdcal.estimation.start import start as general_start
 from mwdcal.estimation.uncertainty import Analysis, effects_of, variance_factors
 from mwdcal.geometry.vectors import Array, Ints, diagonal, inverse, outer, quotient
 from mwdcal.sensor.models import Factors, Polynomial, affine_parts, factor_parts
@@ -121,7 +122,7 @@ def _shares(unknowns: Array) -> Array:
 
 def _length(vector: Array) -> Array:
     """Lengths (B, 1, n) of vectors (B, 3, n)."""
-    return np.sqrt(np.sum(vector * vector, 1, keepdims=True))
+    return np.asarray(np.sqrt(np.sum(vector * vector, 1, keepdims=True)))
 
 
 # --------------------------------------------------------------------------
@@ -251,7 +252,9 @@ class Point:
             each.append(unknowns + step[:, at : at + size].reshape(unknowns.shape))
             at += size
         q = at + self.constants.shape[-1]
-        return Point(tuple(each), errors, self.constants + step[:, at:q], self.settings + step[:, q:])
+        return Point(
+            tuple(each), errors, self.constants + step[:, at:q], self.settings + step[:, q:]
+        )
 
 
 @dataclass(frozen=True)
@@ -292,8 +295,8 @@ class Linear:
     @cached_property
     def halves(self) -> Array:
         """P (B, 6, a, n)."""
-        halves = np.empty(self.own.shape)
-        for k in range(halves.shape[2]):
+        halves = np.empty_like(self.own)
+        for k in range(self.own.shape[2]):
             rest = self.own[:, :, k].copy()
             for j in range(k):
                 rest -= halves[:, :, j] * self.factor[:, None, k, j]
@@ -316,7 +319,9 @@ class Linear:
             (rows @ values[:, 3 * t : 3 * t + 3, :, None]).reshape(batch, -1)
             for t, rows in enumerate(self.rows)
         ]
-        flat = np.swapaxes(self.others, 1, 2).reshape(batch, self.others.shape[2], 6 * self.left.shape[-1])
+        flat = np.swapaxes(self.others, 1, 2).reshape(
+            batch, self.others.shape[2], 6 * self.left.shape[-1]
+        )
         others = (flat @ values.reshape(batch, -1, 1))[..., 0] - self.precision * self.held
         return np.concatenate([*each, others], -1)
 
@@ -454,7 +459,9 @@ class Linear:
             precision=np.concatenate([precision, self.precision], -1),
         )
 
-    def walk_sums(self, axes: Sequence[tuple[int, int]], terms: Array) -> tuple[Array, Array, Array]:
+    def walk_sums(
+        self, axes: Sequence[tuple[int, int]], terms: Array
+    ) -> tuple[Array, Array, Array]:
         """Of unit walks, terms (n, K) on some axes: score (B, a, K), XᵀWD (B, u, a, K) and DᵀWD (B, a, a, K, K)."""
         effect, batch = self.walk_axes(axes), len(self.root)
         count, stations, size = len(axes), len(terms), self.places[-1].stop
@@ -532,8 +539,12 @@ class Linear:
         return errors
 
 
-def minimum(problem: Problem, state: State) -> tuple[State, Ints, Ints]:
-    """States at the minimum, `Status` codes and numbers of steps; what does not settle goes the general way."""
+def minimum(problem: Problem, begin: State | None = None) -> tuple[State, Ints, Ints]:
+    """States at the minimum, `Status` codes and numbers of steps; what does not settle goes the general way.
+
+    From a state, or else from the minimum at exact angles.
+    """
+    state = begin or start(problem)
     runs, point = Runs.of(problem), Point.of(problem, state)
     steps, good = np.zeros(len(runs.raw), int), np.zeros(len(runs.raw), bool)
     active, whole, covariance = np.arange(len(good)), point, None
@@ -560,7 +571,9 @@ def minimum(problem: Problem, state: State) -> tuple[State, Ints, Ints]:
     status = np.full(len(good), int(Status.OK))
     if not good.all():
         rest = np.flatnonzero(~good)
-        found, status[rest], steps[rest] = gauss_newton(*take((problem, state), rest))
+        some = take(problem, rest)
+        general = take(begin, rest) if begin else general_start(some)
+        found, status[rest], steps[rest] = gauss_newton(some, general)
         ended = put(ended, rest, found)
     return ended, status, steps
 
