@@ -23,7 +23,7 @@ from mwdcal.estimation.batch import put, take
 from mwdcal.estimation.minimisers import closed_form
 from mwdcal.estimation.minimisers.closed_form_factors import OTHERS, Axes, factors, known_at
 from mwdcal.estimation.minimisers.closed_form_factors import minimum as lone_minimum
-from mwdcal.estimation.minimisers.uncertain_stand import StandRuns
+from mwdcal.estimation.minimisers.uncertain_stand import FIELD_WALK, StandRuns
 from mwdcal.estimation.problem import WALK_AXES, Problem, State, Triad
 from mwdcal.estimation.solvers import Determined, Status, gauss_newton
 from mwdcal.estimation.start import start as general_start
@@ -31,14 +31,12 @@ from mwdcal.estimation.uncertainty import Analysis, effects_of, variance_factors
 from mwdcal.geometry.vectors import Array, Ints, diagonal, inverse, outer, quotient
 from mwdcal.sensor.models import Factors, Polynomial, affine_parts, factor_parts
 
-MOST_STEPS = 12
+MOST_AXIS_STEPS = 12
 """Most steps of a fit: a member that has not settled then goes the general way."""
-STEPS_ALIKE = 6
+STEPS_BY_ONE = 6
 """First steps that are taken by one matrix; those of members that have not settled have their own."""
-LAST_STEP = 1e-12
+LAST_AXIS_STEP = 1e-12
 """Square of the last step, in standard uncertainties."""
-FIELD_WALK = 2
-"""Number of the walk of the field; the others are of the offsets of a triad."""
 
 
 def applies(problem: Problem) -> bool:
@@ -126,11 +124,11 @@ def _length(vector: Array) -> Array:
 
 
 # --------------------------------------------------------------------------
-# Runs linearised at a point. Arrays are (B, component, n).
+# AxisRuns linearised at a point. Arrays are (B, component, n).
 
 
 @dataclass(frozen=True)
-class Runs:
+class AxisRuns:
     """Constants of the iteration: references, φ (B, K, n) of each triad, readings and 1/noise (B, 6, n).
 
     `lone` (B, 3, n) and `together` (B, 2k, n) are σ of the angles of each station and of each setting; `masks`
@@ -148,7 +146,7 @@ class Runs:
     axes: tuple[tuple[int, int], ...]
 
     @classmethod
-    def of(cls, problem: Problem) -> Runs:
+    def of(cls, problem: Problem) -> AxisRuns:
         """Of a problem."""
         found, triads = problem.evidence, problem.triads
         bare = replace(problem, evidence=replace(found, constants=()))
@@ -172,7 +170,7 @@ class Runs:
             axes,
         )
 
-    def at(self, point: Point) -> Linear:
+    def at(self, point: AxisPoint) -> AxisLinear:
         """Linearised at a point."""
         count = self.together.shape[1] // 2
         common = self.together * point.settings[..., None]
@@ -209,7 +207,7 @@ class Runs:
         sd, errors = self.lone[:, active], point.errors[:, active]
         own = gain[:, :, active] * sd[:, None]
         left += np.sum(own * quotient(errors, sd, sd > 0)[:, None], 2)
-        here = Linear(
+        here = AxisLinear(
             tuple(rows), np.concatenate(settings, 2), own, left, point.settings,
             np.ones(point.settings.shape), sd, active, np.concatenate(vectors, 1),
             np.concatenate(louds, 1), shares, self.root, attitude,
@@ -218,7 +216,7 @@ class Runs:
 
 
 @dataclass(frozen=True)
-class Point:
+class AxisPoint:
     """Where fits are: unknowns (B, 3, 2K + 2) of each triad, errors (B, 3, n), constants (B, q), settings (B, 2k)."""
 
     unknowns: tuple[Array, ...]
@@ -227,7 +225,7 @@ class Point:
     settings: Array
 
     @classmethod
-    def of(cls, problem: Problem, state: State) -> Point:
+    def of(cls, problem: Problem, state: State) -> AxisPoint:
         """Of a state."""
         pairs = zip(problem.triads, problem.slices(), strict=True)
         each = tuple(unknowns_of(triad, state.params[:, where]) for triad, where in pairs)
@@ -244,7 +242,7 @@ class Point:
             settings=self.settings,
         )
 
-    def moved(self, step: Array, errors: Array) -> Point:
+    def moved(self, step: Array, errors: Array) -> AxisPoint:
         """After a step (B, u), with the errors that follow."""
         at, each = 0, []
         for unknowns in self.unknowns:
@@ -252,14 +250,14 @@ class Point:
             each.append(unknowns + step[:, at : at + size].reshape(unknowns.shape))
             at += size
         q = at + self.constants.shape[-1]
-        return Point(
+        return AxisPoint(
             tuple(each), errors, self.constants + step[:, at:q], self.settings + step[:, q:]
         )
 
 
 @dataclass(frozen=True)
-class Linear:
-    """Runs at a point: `rows` (B, 3, 2K + 2, n) of each triad, other columns (B, 6, q, n), and `left` (B, 6, n).
+class AxisLinear:
+    """AxisRuns at a point: `rows` (B, 3, 2K + 2, n) of each triad, other columns (B, 6, q, n), and `left` (B, 6, n).
 
     `own` (B, 6, a, n) is what one σ of each angle that a station has for itself does, of the `active` ones. `held`
     and `precision` (B, q) are values of the others, and what is known of them. A reading over its noise is `louder`
@@ -445,7 +443,7 @@ class Linear:
 
     def with_walks(
         self, axes: Sequence[tuple[int, int]], masks: Array, value: Array, precision: Array
-    ) -> Linear:
+    ) -> AxisLinear:
         """The same with terms of walks, (B, q, n) on so many axes, at a value and known to a precision (B, q)."""
         if not axes:
             return self
@@ -545,19 +543,19 @@ def minimum(problem: Problem, begin: State | None = None) -> tuple[State, Ints, 
     From a state, or else from the minimum at exact angles.
     """
     state = begin or start(problem)
-    runs, point = Runs.of(problem), Point.of(problem, state)
+    runs, point = AxisRuns.of(problem), AxisPoint.of(problem, state)
     steps, good = np.zeros(len(runs.raw), int), np.zeros(len(runs.raw), bool)
     active, whole, covariance = np.arange(len(good)), point, None
-    for count in range(1, MOST_STEPS + 1):
+    for count in range(1, MOST_AXIS_STEPS + 1):
         if not active.size:
             break
         here = runs.at(point)
-        if covariance is None or count > STEPS_ALIKE:
+        if covariance is None or count > STEPS_BY_ONE:
             covariance = here.covariance
         step, square = here.step(covariance)
         point = point.moved(step, here.errors(step))
         steps[active] = count
-        done = square < LAST_STEP
+        done = square < LAST_AXIS_STEP
         if done.any():
             good[active[done]] = True
             at = np.flatnonzero(done)
@@ -578,11 +576,11 @@ def minimum(problem: Problem, begin: State | None = None) -> tuple[State, Ints, 
     return ended, status, steps
 
 
-def linear(problem: Problem, state: State) -> Linear:
+def linear(problem: Problem, state: State) -> AxisLinear:
     """The problem linearised at a state; the last answer is kept."""
 
-    def found(state: State) -> Linear:
-        return Runs.of(problem).at(Point.of(problem, state))
+    def found(state: State) -> AxisLinear:
+        return AxisRuns.of(problem).at(AxisPoint.of(problem, state))
 
     return problem.once("by axis", state, found)
 
