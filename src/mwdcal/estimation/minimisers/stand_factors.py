@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import groupby, pairwise
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from mwdcal.estimation.batch import put, take
 from mwdcal.estimation.minimisers import closed_form
 from mwdcal.estimation.minimisers.closed_form_factors import OTHERS, Axes, factors, known_at
 from mwdcal.estimation.minimisers.closed_form_factors import minimum as lone_minimum
-from mwdcal.estimation.minimisers.uncertain_stand import FIELD_WALK, StandRuns
+from mwdcal.estimation.minimisers.uncertain_stand import FIELD_WALK, TRIAD_ROWS, StandRuns
 from mwdcal.estimation.problem import WALK_AXES, Problem, State, Triad
 from mwdcal.estimation.solvers import Determined, Status, gauss_newton
 from mwdcal.estimation.start import start as general_start
@@ -118,101 +118,114 @@ def _shares(unknowns: Array) -> Array:
     return shares
 
 
-def _length(vector: Array) -> Array:
-    """Lengths (B, 1, n) of vectors (B, 3, n)."""
-    return np.asarray(np.sqrt(np.sum(vector * vector, 1, keepdims=True)))
-
-
 # --------------------------------------------------------------------------
-# AxisRuns linearised at a point. Arrays are (B, component, n).
+# Runs linearised at a point.
+#
+# A column of the design is an effect on the six readings of a station times a course over the stations. Those of an
+# axis have an effect on its reading alone; then come those of each axis of a drift and, with settings, of inclination
+# and azimuth. Sums over the stations are products of courses. Arrays are (B, component, n).
 
 
 @dataclass(frozen=True)
 class AxisRuns:
     """Constants of the iteration: references, φ (B, K, n) of each triad, readings and 1/noise (B, 6, n).
 
-    `lone` (B, 3, n) and `together` (B, 2k, n) are σ of the angles of each station and of each setting; `masks`
-    (B, q, n) the terms of drifts, of `precision` (B, q), that act on the `axes` (q) of walks.
+    `lone` (B, 3, n) are σ of the angles of each station for itself; `settings`, two or none, those (B, k, n) of each
+    setting. `terms` (B, K, n) of drifts act each on one of the `axes` of walks, and are known to a `precision` (B, q).
     """
 
     stand: StandRuns
     phi: tuple[Array, ...]
-    raw: Array
     root: Array
     lone: Array
-    together: Array
-    masks: Array
-    precision: Array
+    settings: tuple[Array, ...]
+    terms: tuple[Array, ...]
     axes: tuple[tuple[int, int], ...]
+    precision: Array
 
     @classmethod
     def of(cls, problem: Problem) -> AxisRuns:
         """Of a problem."""
-        found, triads = problem.evidence, problem.triads
-        bare = replace(problem, evidence=replace(found, constants=()))
-        stand = StandRuns.of(bare)
-        phi = tuple(t.model.basis(problem.temperature).mT for t in triads)
-        constants = found.constants
-        masks = np.zeros((len(stand.raw), len(constants), stand.raw.shape[-1]))
-        precision = np.zeros(masks.shape[:2])
-        for index, constant in enumerate(constants):
-            masks[:, index], precision[:, index] = constant.mask, constant.sd**-2.0
-        axes = tuple(WALK_AXES[constant.name] for constant in constants)
+        evidence, count = problem.evidence, len(problem.temperature)
+        stand = StandRuns.of(replace(problem, evidence=replace(evidence, constants=())))
+        walks = [list(each) for _, each in groupby(evidence.constants, lambda c: c.name)]
+        sd = [constant.sd for constant in evidence.constants]
         return cls(
             replace(stand, angle_sd=np.ones_like(stand.angles)),
-            phi,
-            stand.raw,
-            found.include[:, None] / stand.sd,
-            found.turn_sd.mT,
-            found.set_together.mT,
-            masks,
-            precision,
-            axes,
+            tuple(triad.model.basis(problem.temperature).mT for triad in problem.triads),
+            evidence.include[:, None] / stand.sd,
+            evidence.turn_sd.mT,
+            tuple(np.split(evidence.set_together.mT, 2, 1)) if evidence.settings else (),
+            tuple(np.stack([constant.mask for constant in each], 1) for each in walks),
+            tuple(WALK_AXES[each[0].name] for each in walks),
+            np.stack(sd, -1) ** -2.0 if sd else np.zeros((count, 0)),
         )
 
     def at(self, point: AxisPoint) -> AxisLinear:
         """Linearised at a point."""
-        count = self.together.shape[1] // 2
-        common = self.together * point.settings[..., None]
-        total = point.errors.copy()
-        for angle in range(2):
-            total[:, angle] += common[:, angle * count : (angle + 1) * count].sum(1)
-        f, change, attitude = self.stand.vectors(total)
-        shares = tuple(_shares(unknowns) for unknowns in point.unknowns)
-        rows, gains, seen, vectors, louds = [], [], [], [], []
+        errors = point.errors.copy()
+        shared = np.split(point.settings, 2, -1) if self.settings else []
+        for angle, (value, sd) in enumerate(zip(shared, self.settings, strict=True)):
+            errors[:, angle] += (value[:, None] @ sd)[:, 0]
+        f, change, attitude = self.stand.vectors(errors)
+        courses: list[Array] = []
+        gains, seen, vectors, louds = [], [], [], []
         for index, (phi, unknowns) in enumerate(zip(self.phi, point.unknowns, strict=True)):
-            three = slice(3 * index, 3 * index + 3)
-            root, size = self.root[:, three], phi.shape[1]
+            root, size = self.root[:, TRIAD_ROWS[index]], phi.shape[1]
             v = np.moveaxis(f[index, :3], 0, 1)
             beside = np.empty((*v.shape[:2], size + 2, v.shape[-1]))
             beside[:, :, :2], beside[:, :, 2:] = v[:, OTHERS], phi[:, None]
-            scale = unknowns[..., :size] @ phi
+            louder = (unknowns[..., :size] @ phi) * root
             unit = v + (unknowns[..., None, size:] @ beside)[..., 0, :]
-            louder = scale * root
+            by = (unit * root)[:, :, None] * phi[:, None], louder[:, :, None] * beside
+            courses.extend(np.moveaxis(np.concatenate(by, 2), 1, 0))
+            turns = np.moveaxis(change[index], 2, 0).reshape(len(v), 3, -1)
+            turned = (_shares(unknowns) @ turns).reshape(*v.shape[:2], 3, -1)
+            gains.append(turned * louder[:, :, None])
             seen.append(louder * unit)
             vectors.append(v)
             louds.append(louder)
-            by = (unit * root)[:, :, None] * phi[:, None], louder[:, :, None] * beside
-            rows.append(np.concatenate(by, 2))
-            turns = np.moveaxis(change[index], 2, 0).reshape(len(v), 3, -1)
-            turned = (shares[index] @ turns).reshape(*v.shape[:2], 3, -1)
-            gains.append(turned * louder[:, :, None])
-        gain = np.concatenate(gains, 1)
-        settings = [
-            gain[:, :, angle, None] * part[:, None]
-            for angle, part in enumerate(np.split(self.together, 2, 1))
-        ]
-        left = self.raw * self.root - np.concatenate(seen, 1)
+        gain, (louder, vector) = (
+            np.concatenate(gains, 1),
+            (np.concatenate(each, 1) for each in (louds, vectors)),
+        )
         active = np.flatnonzero(self.lone.any((0, 2)))
-        sd, errors = self.lone[:, active], point.errors[:, active]
+        sd, held = self.lone[:, active], point.errors[:, active]
         own = gain[:, :, active] * sd[:, None]
-        left += np.sum(own * quotient(errors, sd, sd > 0)[:, None], 2)
-        here = AxisLinear(
-            tuple(rows), np.concatenate(settings, 2), own, left, point.settings,
-            np.ones(point.settings.shape), sd, active, np.concatenate(vectors, 1),
-            np.concatenate(louds, 1), shares, self.root, attitude,
+        shares = tuple(_shares(unknowns) for unknowns in point.unknowns)
+        walks = _walk_effects(self.axes, self.root, louder, shares, attitude)
+        left = self.stand.raw * self.root - np.concatenate(seen, 1)
+        left += np.sum(own * quotient(held, sd, sd > 0)[:, None], 2)
+        first = 0
+        for place, terms in enumerate(self.terms):
+            value = point.constants[:, first : first + terms.shape[1]]
+            left -= walks[:, :, place] * (value[:, None] @ terms)
+            first += terms.shape[1]
+        known = np.concatenate([self.precision, np.ones(point.settings.shape)], -1)
+        return AxisLinear(
+            (*courses, *self.terms, *self.settings),
+            np.concatenate([walks, gain[:, :, : len(self.settings)]], 2),
+            own, left, np.concatenate([point.constants, point.settings], -1), known,
+            sd, active, vector, louder, shares, self.root, attitude,
         )  # fmt: skip
-        return here.with_walks(self.axes, self.masks, point.constants, self.precision)
+
+
+def _walk_effects(
+    axes: Sequence[tuple[int, int]],
+    root: Array,
+    louder: Array,
+    shares: tuple[Array, ...],
+    attitude: Array,
+) -> Array:
+    """Effect (B, 6, a, n) on the readings over their noise of a unit of some axes of walks, by the numbers of both."""
+    effect = np.zeros((len(root), 6, len(axes), root.shape[-1]))
+    for place, (walk, axis) in enumerate(axes):
+        if walk < FIELD_WALK:
+            effect[:, 3 * walk + axis, place] = root[:, 3 * walk + axis]
+        else:
+            along = np.moveaxis(attitude[:, axis], 0, 1)
+            effect[:, 3:, place] = (shares[1] @ along) * louder[:, 3:]
+    return effect
 
 
 @dataclass(frozen=True)
@@ -244,39 +257,47 @@ class AxisPoint:
 
     def moved(self, step: Array, errors: Array) -> AxisPoint:
         """After a step (B, u), with the errors that follow."""
-        at, each = 0, []
-        for unknowns in self.unknowns:
-            size = unknowns[0].size
-            each.append(unknowns + step[:, at : at + size].reshape(unknowns.shape))
-            at += size
-        q = at + self.constants.shape[-1]
-        return AxisPoint(
-            tuple(each), errors, self.constants + step[:, at:q], self.settings + step[:, q:]
-        )
+        sizes = [*(unknowns[0].size for unknowns in self.unknowns), self.constants.shape[-1]]
+        *each, constants, settings = np.split(step, np.cumsum(sizes), -1)
+        pairs = zip(self.unknowns, each, strict=True)
+        moved = tuple(unknowns + part.reshape(unknowns.shape) for unknowns, part in pairs)
+        return AxisPoint(moved, errors, self.constants + constants, self.settings + settings)
 
 
 @dataclass(frozen=True)
 class AxisLinear:
-    """AxisRuns at a point: `rows` (B, 3, 2K + 2, n) of each triad, other columns (B, 6, q, n), and `left` (B, 6, n).
+    """Runs at a point: `courses` (B, k, n) of the columns by effect, and what is `left` (B, 6, n) of the readings.
 
-    `own` (B, 6, a, n) is what one σ of each angle that a station has for itself does, of the `active` ones. `held`
-    and `precision` (B, q) are values of the others, and what is known of them. A reading over its noise is `louder`
-    (B, 6, n) times the row of `shares` (B, 3, 3) times the vector (B, 6, n), and what is added to it.
+    The first six effects are on one axis each; `effect` (B, 6, e, n) are the others, of which values `held` and their
+    `precision` (B, q) are known. `own` (B, 6, a, n) is what one σ of each angle that a station has for itself does, of
+    the `active` ones, with their σ `sd` (B, a, n). A reading over its noise is `louder` (B, 6, n) times the row of
+    `shares` (B, 3, 3) times the `vector` (B, 6, n), and what is added to it; `root` (B, 6, n) is one over the noise.
     """
 
-    rows: tuple[Array, ...]
-    others: Array
+    courses: tuple[Array, ...]
+    effect: Array
     own: Array
     left: Array
     held: Array
     precision: Array
     sd: Array
     active: Ints
-    vectors: Array
+    vector: Array
     louder: Array
     shares: tuple[Array, ...]
     root: Array
     attitude: Array
+
+    @cached_property
+    def places(self) -> list[slice]:
+        """Where the unknowns of each effect lie."""
+        ends = np.cumsum([0, *(course.shape[1] for course in self.courses)]).tolist()
+        return [slice(*pair) for pair in pairwise(ends)]
+
+    @property
+    def size(self) -> int:
+        """Number of the unknowns of the axes."""
+        return sum(course.shape[1] for course in self.courses[:6])
 
     @cached_property
     def factor(self) -> Array:
@@ -301,111 +322,118 @@ class AxisLinear:
             halves[:, :, k] = rest / self.factor[:, None, k, k]
         return halves
 
-    def weighed(self, values: Array) -> Array:
-        """W times values (B, 6, n)."""
-        return np.asarray(values - np.sum(self.halves * self._along(values)[:, None], 2))
+    @cached_property
+    def seen_halves(self) -> Array:
+        """P as the effects see it (B, 6 + e, a, n)."""
+        return self.seen(self.halves)
 
-    def _along(self, values: Array) -> Array:
-        """Pᵀ (B, a, n) times values (B, 6, n)."""
-        return np.asarray(np.sum(self.halves * values[:, :, None], 1))
+    def seen(self, values: Array) -> Array:
+        """Products (B, 6 + e, k, n) of all effects with values (B, 6, k, n)."""
+        if not self.effect.shape[2]:
+            return values
+        each = [np.sum(effect[:, :, None] * values, 1) for effect in np.moveaxis(self.effect, 2, 0)]
+        return np.concatenate([values, np.stack(each, 1)], 1)
+
+    def weighed(self, values: Array) -> Array:
+        """W times values (B, 6, k, n)."""
+        whole = values.copy()
+        for half in np.moveaxis(self.halves, 2, 0):
+            whole -= half[:, :, None] * np.sum(half[:, :, None] * values, 1, keepdims=True)
+        return whole
+
+    @cached_property
+    def score(self) -> Array:
+        """W times what is left, as the effects see it (B, 6 + e, n)."""
+        return self.seen(self.weighed(self.left[:, :, None]))[:, :, 0]
 
     @cached_property
     def pull(self) -> Array:
         """XᵀW times what is left, and the pull of what is known beforehand (B, u)."""
-        values, batch = self.weighed(self.left), len(self.left)
-        each = [
-            (rows @ values[:, 3 * t : 3 * t + 3, :, None]).reshape(batch, -1)
-            for t, rows in enumerate(self.rows)
-        ]
-        flat = np.swapaxes(self.others, 1, 2).reshape(
-            batch, self.others.shape[2], 6 * self.left.shape[-1]
-        )
-        others = (flat @ values.reshape(batch, -1, 1))[..., 0] - self.precision * self.held
-        return np.concatenate([*each, others], -1)
+        pairs = zip(self.courses, np.moveaxis(self.score, 1, 0), strict=True)
+        pull = np.concatenate([(course @ v[..., None])[..., 0] for course, v in pairs], -1)
+        pull[:, self.size :] -= self.precision * self.held
+        return pull
+
+    def along(self, values: Array) -> Array:
+        """All courses (B, u, a n) times values (B, 6 + e, a, n) of their effects."""
+        batch, _, count, stations = values.shape
+        along = np.empty((batch, self.places[-1].stop, count, stations))
+        for place, (at, course) in enumerate(zip(self.places, self.courses, strict=True)):
+            np.multiply(course[:, :, None], values[:, place, None], out=along[:, at])
+        return along.reshape(*along.shape[:2], -1)
 
     @cached_property
-    def places(self) -> list[slice]:
-        """Where the unknowns of each of the six axes lie."""
-        ends = np.cumsum([0, *(rows.shape[2] for rows in self.rows for _ in range(3))]).tolist()
-        return [slice(*pair) for pair in pairwise(ends)]
-
-    @cached_property
-    def along(self) -> Array:
+    def halved(self) -> Array:
         """XᵀP (B, u, a n)."""
-        batch, stations = len(self.left), self.left.shape[-1]
-        q, count, size = self.others.shape[2], self.own.shape[2], self.places[-1].stop
-        along = np.empty((batch, size + q, count, stations))
-        for axis, at in enumerate(self.places):
-            part = self.rows[axis // 3][:, axis % 3]
-            np.multiply(part[:, :, None], self.halves[:, axis, None], out=along[:, at])
-        if q:
-            each = self.others.swapaxes(1, 2)[:, :, :, None] * self.halves[:, None]
-            np.sum(each, 2, out=along[:, size:])
-        return along.reshape(batch, size + q, count * stations)
+        return self.along(self.seen_halves)
 
-    def products(self, axes: range) -> Array:
-        """Sums XᵀX (B, u, u) over some of the six axes."""
-        batch, size, q = len(self.left), self.places[-1].stop, self.others.shape[2]
-        whole = np.zeros((batch, size + q, size + q))
-        for axis in axes:
-            part, at = self.rows[axis // 3][:, axis % 3], self.places[axis]
-            whole[:, at, at] = part @ part.mT
-            if q:
-                across = part @ self.others[:, axis].mT
-                whole[:, at, size:], whole[:, size:, at] = across, across.mT
-        if q:
-            some = self.others[:, axes.start : axes.stop].swapaxes(1, 2).reshape(batch, q, -1)
-            whole[:, size:, size:] = some @ some.mT
+    def products(self, rows: slice) -> Array:
+        """Sums XᵀX (B, u, u) over the readings of some axes."""
+        size, each = self.places[-1].stop, np.moveaxis(self.effect, 2, 0)
+        whole = np.zeros((len(self.left), size, size))
+        for axis in range(*rows.indices(6)):
+            whole[:, self.places[axis], self.places[axis]] = (
+                self.courses[axis] @ self.courses[axis].mT
+            )
+        for place, effect in enumerate(each, 6):
+            at, course = self.places[place], self.courses[place]
+            for axis in range(*rows.indices(6)):
+                if effect[:, axis].any():
+                    across = self.courses[axis] @ (course * effect[:, axis, None]).mT
+                    whole[:, self.places[axis], at], whole[:, at, self.places[axis]] = (
+                        across,
+                        across.mT,
+                    )
+            for other, partner in enumerate(each[: place - 5], 6):
+                both = np.sum(effect[:, rows] * partner[:, rows], 1)
+                if both.any():
+                    across = self.courses[other] @ (course * both[:, None]).mT
+                    whole[:, self.places[other], at], whole[:, at, self.places[other]] = (
+                        across,
+                        across.mT,
+                    )
         return whole
 
     @cached_property
     def of_data(self) -> Array:
         """XᵀWX (B, u, u)."""
-        return np.asarray(self.products(range(6)) - self.along @ self.along.mT)
+        return np.asarray(self.products(slice(None)) - self.halved @ self.halved.mT)
 
     @cached_property
     def information(self) -> Array:
         """The same, with what is known beforehand."""
         whole = self.of_data.copy()
-        size = self.places[-1].stop
-        np.einsum("bii->bi", whole)[:, size:] += self.precision
+        np.einsum("bii->bi", whole)[:, self.size :] += self.precision
         return whole
 
     @cached_property
+    def covariance(self) -> Array:
+        """The inverse of the information (B, u, u)."""
+        scale = outer(np.sqrt(diagonal(self.information)))
+        return inverse(self.information / scale) / scale
+
+    @cached_property
     def of_angles(self) -> Array:
-        """XᵀW G GᵀW X (B, u, u): information that errors of angles are part of."""
-        batch, u = self.along.shape[:2]
-        count, stations = self.own.shape[2], self.own.shape[-1]
-        each = self.along.reshape(batch, u, count, stations).copy()
+        """XᵀWGGᵀWX (B, u, u), the information less that with W² in the place of W."""
+        each, count = self.seen_halves.copy(), self.own.shape[2]
         for k in reversed(range(count)):  # P L⁻¹
             for j in range(k + 1, count):
                 each[:, :, k] -= self.factor[:, None, j, k] * each[:, :, j]
             each[:, :, k] /= self.factor[:, None, k, k]
-        flat = each.reshape(self.along.shape)
-        return np.asarray(flat @ flat.mT)
+        moved = self.along(each)
+        return np.asarray(moved @ moved.mT)
 
     @cached_property
     def squared(self) -> tuple[Array, Array]:
-        """XᵀW E W X (B, u, u), E being one for the readings of a triad and zero for those of the other."""
-        batch, u = self.along.shape[:2]
-        count, stations = self.own.shape[2], self.own.shape[-1]
-        gram = np.einsum("brkn,brjn->bkjn", self.halves[:, :3], self.halves[:, :3])
-        along = self.along.reshape(batch, u, count, stations)
-        part = -0.5 * np.einsum("bukn,bkjn->bujn", along, gram)
-        size, own = self.places[-1].stop, self.places[2].stop
-        part[:, :own] += along[:, :own]
-        if self.others.shape[2]:
-            others = self.others[:, :3].swapaxes(1, 2)[:, :, :, None]
-            part[:, size:] += np.sum(others * self.halves[:, None, :3], 2)
-        mixed = part.reshape(self.along.shape) @ self.along.mT
-        first = self.products(range(3)) - mixed - mixed.mT
-        return first, self.of_data - self.of_angles - first
-
-    @cached_property
-    def covariance(self) -> Array:
-        """Its inverse (B, u, u)."""
-        scale = outer(np.sqrt(diagonal(self.information)))
-        return inverse(self.information / scale) / scale
+        """XᵀWEWX (B, u, u), E being one for the readings of a triad and zero for those of the other."""
+        rows = TRIAD_ROWS[0]
+        first = self.halves.copy()
+        first[:, TRIAD_ROWS[1]] = 0.0
+        gram = np.einsum("brkn,brjn->bkjn", self.halves[:, rows], self.halves[:, rows])
+        each = self.seen(first) - 0.5 * np.einsum("bekn,bkjn->bejn", self.seen_halves, gram)
+        mixed = self.along(each) @ self.halved.mT
+        one = self.products(rows) - mixed - mixed.mT
+        return one, self.of_data - self.of_angles - one
 
     @cached_property
     def weight(self) -> Array:
@@ -415,68 +443,33 @@ class AxisLinear:
 
     @cached_property
     def spread(self) -> Array:
-        """W - W X V Xᵀ W (B, n, 6, 6), the covariance of the weighed residuals of each station."""
-        batch, stations, size = len(self.left), self.left.shape[-1], self.places[-1].stop
-        inner = np.empty((batch, stations, 6, 6))
-        for axis, at in enumerate(self.places):
-            part = self.rows[axis // 3][:, axis % 3]
-            moved = self.covariance[:, :, at] @ part
-            if self.others.shape[2]:
-                moved += self.covariance[:, :, size:] @ self.others[:, axis]
-            for other, here in enumerate(self.places[: axis + 1]):
-                both = np.sum(self.rows[other // 3][:, other % 3] * moved[:, here], 1)
-                if self.others.shape[2]:
-                    both += np.sum(self.others[:, other] * moved[:, size:], 1)
-                inner[..., axis, other] = inner[..., other, axis] = both
-        return np.asarray(self.weight - self.weight @ inner @ self.weight)
-
-    def walk_axes(self, axes: Sequence[tuple[int, int]]) -> Array:
-        """Effect (B, 6, a, n) on the readings of a unit of some axes of walks, by the numbers of both."""
-        effect = np.zeros((len(self.root), 6, len(axes), self.root.shape[-1]))
-        for place, (walk, axis) in enumerate(axes):
-            if walk < FIELD_WALK:
-                effect[:, 3 * walk + axis, place] = self.root[:, 3 * walk + axis]
-            else:
-                along = np.moveaxis(self.attitude[:, axis], 0, 1)
-                effect[:, 3:, place] = (self.shares[1] @ along) * self.louder[:, 3:]
-        return effect
-
-    def with_walks(
-        self, axes: Sequence[tuple[int, int]], masks: Array, value: Array, precision: Array
-    ) -> AxisLinear:
-        """The same with terms of walks, (B, q, n) on so many axes, at a value and known to a precision (B, q)."""
-        if not axes:
-            return self
-        each = list(dict.fromkeys(axes))
-        effect = self.walk_axes(each)[:, :, [each.index(axis) for axis in axes]] * masks[:, None]
-        return replace(
-            self,
-            others=np.concatenate([effect, self.others], 2),
-            left=self.left - (value[:, None, None] @ effect)[:, :, 0],
-            held=np.concatenate([value, self.held], -1),
-            precision=np.concatenate([precision, self.precision], -1),
-        )
+        """W - WXVXᵀW (B, n, 6, 6), the covariance of the weighed residuals of each station."""
+        count = len(self.courses)
+        inner = np.empty((len(self.left), self.left.shape[-1], count, count))
+        for place, (at, course) in enumerate(zip(self.places, self.courses, strict=True)):
+            moved = self.covariance[:, : at.stop, at] @ course
+            for other, partner in enumerate(self.courses[: place + 1]):
+                both = np.sum(partner * moved[:, self.places[other]], 1)
+                inner[..., place, other] = inner[..., other, place] = both
+        moved = self.weight
+        if self.effect.shape[2]:
+            effects = np.ascontiguousarray(np.moveaxis(self.effect, -1, 1))
+            moved = np.concatenate([self.weight, self.weight @ effects], -1)
+        return np.asarray(self.weight - moved @ inner @ moved.mT)
 
     def walk_sums(
         self, axes: Sequence[tuple[int, int]], terms: Array
     ) -> tuple[Array, Array, Array]:
         """Of unit walks, terms (n, K) on some axes: score (B, a, K), XᵀWD (B, u, a, K) and DᵀWD (B, a, a, K, K)."""
-        effect, batch = self.walk_axes(axes), len(self.root)
-        count, stations, size = len(axes), len(terms), self.places[-1].stop
-        along = np.sum(self.halves[:, :, :, None] * effect[:, :, None], 1)
-        weighed = effect - np.sum(self.halves[:, :, :, None] * along[:, None], 2)
-        score = np.sum(effect * self.weighed(self.left)[:, :, None], 1) @ terms
-        crossed = np.empty((batch, size + self.others.shape[2], count, terms.shape[-1]))
-        for axis, at in enumerate(self.places):
-            part = self.rows[axis // 3][:, axis % 3]
-            product = part[:, :, None] * weighed[:, axis, None]
-            crossed[:, at] = product @ terms
-        if self.others.shape[2]:
-            product = np.sum(self.others[:, :, :, None] * weighed[:, :, None], 1)
-            crossed[:, size:] = product @ terms
-        pairs = (terms[:, :, None] * terms[:, None]).reshape(stations, -1)
-        alone = np.sum(effect[:, :, :, None] * weighed[:, :, None], 1) @ pairs
-        return score, crossed, alone.reshape(batch, count, count, *2 * terms.shape[1:])
+        effect = _walk_effects(axes, self.root, self.louder, self.shares, self.attitude)
+        weighed, batch, count = self.weighed(effect), len(effect), len(axes)
+        score = np.sum(effect * self.score[:, :6, None], 1) @ terms
+        pairs = zip(self.courses, np.moveaxis(self.seen(weighed), 1, 0), strict=True)
+        crossed = [(course[:, :, None] * each[:, None]) @ terms for course, each in pairs]
+        squares = (terms[:, :, None] * terms[:, None]).reshape(len(terms), -1)
+        alone = np.sum(effect[:, :, :, None] * weighed[:, :, None], 1) @ squares
+        alone = alone.reshape(batch, count, count, *2 * terms.shape[1:])
+        return score, np.concatenate(crossed, 1), alone
 
     def with_courses(self, courses: Array) -> tuple[Array, Array]:
         """Information (B, u + k, u + k) and pull with six more unknowns of each triad for each of some courses.
@@ -485,30 +478,29 @@ class AxisLinear:
         nothing is known of them beforehand.
         """
         batch, count, stations = courses.shape
-        size, u, k = self.places[-1].stop, len(self.information[0]), 12 * count
-        cross, along = np.zeros((batch, u, k)), np.empty((batch, k, self.along.shape[-1]))
+        u, k = len(self.pull[0]), 12 * count
+        cross, along = np.zeros((batch, u, k)), np.empty((batch, k, self.halved.shape[-1]))
         inner, pull = np.zeros((batch, k, k)), np.empty((batch, k))
-        left = self.weighed(self.left)
-        for index, shares in enumerate(self.shares):
-            three = slice(3 * index, 3 * index + 3)
-            vector = self.vectors[:, three]
-            each = np.stack([vector, np.broadcast_to(_length(vector), vector.shape)], 1)
-            turned = self.louder[:, None, three] * shares.mT[..., None]
+        for index, (rows, shares) in enumerate(zip(TRIAD_ROWS, self.shares, strict=True)):
+            vector = self.vector[:, rows]
+            strength = np.sqrt(np.sum(vector * vector, 1, keepdims=True))
+            each = np.stack([vector, np.broadcast_to(strength, vector.shape)], 1)
+            turned = self.louder[:, None, rows] * shares.mT[..., None]
             steady = (each[:, :, :, None] * turned[:, None]).reshape(batch, 1, 6, 3, stations)
             columns = (steady * courses[:, :, None, None]).reshape(batch, -1, 3, stations)
             at = (12 * np.arange(count)[:, None] + 6 * index + np.arange(6)).ravel()
-            seen = np.sum(columns[:, :, :, None] * self.halves[:, None, three], 2)
+            seen = np.sum(columns[:, :, :, None] * self.halves[:, None, rows], 2)
             along[:, at] = seen.reshape(batch, at.size, -1)
             for axis in range(3):
-                place = self.places[3 * index + axis]
-                cross[:, place, at] = self.rows[index][:, axis] @ columns[:, :, axis].mT
+                place = rows.start + axis
+                cross[:, self.places[place], at] = self.courses[place] @ columns[:, :, axis].mT
+            for place, effect in enumerate(np.moveaxis(self.effect, 2, 0), 6):
+                both = np.sum(columns * effect[:, None, rows], 2)
+                cross[:, self.places[place], at] = self.courses[place] @ both.mT
             flat = columns.reshape(batch, at.size, -1)
-            if u > size:
-                others = self.others[:, three].swapaxes(1, 2).reshape(batch, u - size, -1)
-                cross[:, size:, at] = others @ flat.mT
             inner[:, at[:, None], at] = flat @ flat.mT
-            pull[:, at] = (flat @ left[:, three].reshape(batch, -1, 1))[..., 0]
-        cross -= self.along @ along.mT
+            pull[:, at] = (flat @ self.score[:, rows].reshape(batch, -1, 1))[..., 0]
+        cross -= self.halved @ along.mT
         inner -= along @ along.mT
         whole = np.block([[self.information, cross], [cross.mT, inner]])
         return whole, np.concatenate([self.pull, pull], -1)
@@ -520,19 +512,17 @@ class AxisLinear:
 
     def errors(self, step: Array) -> Array:
         """Errors (B, 3, n) of the angles that stations have for themselves, after a step (B, u)."""
-        left, first = self.left.copy(), 0
-        for t, rows in enumerate(self.rows):
-            size = 3 * rows.shape[2]
-            part = step[:, first : first + size].reshape(-1, 3, 1, rows.shape[2])
-            left[:, 3 * t : 3 * t + 3] -= (part @ rows)[:, :, 0]
-            first += size
-        left -= (step[:, None, None, first:] @ self.others)[:, :, 0]
-        along, count = self._along(left), self.own.shape[2]
-        errors = np.zeros((len(left), 3, left.shape[-1]))
+        pairs = zip(self.places, self.courses, strict=True)
+        moved = np.concatenate([step[:, None, at] @ course for at, course in pairs], 1)
+        left, count = self.left - moved[:, :6], self.own.shape[2]
+        if self.effect.shape[2]:
+            left -= np.sum(self.effect * moved[:, None, 6:], 2)
+        along = np.sum(self.halves * left[:, :, None], 1)
         for k in reversed(range(count)):
             for j in range(k + 1, count):
                 along[:, k] -= self.factor[:, j, k] * along[:, j]
             along[:, k] /= self.factor[:, k, k]
+        errors = np.zeros((len(left), 3, left.shape[-1]))
         errors[:, self.active] = along * self.sd
         return errors
 
@@ -544,7 +534,7 @@ def minimum(problem: Problem, begin: State | None = None) -> tuple[State, Ints, 
     """
     state = begin or start(problem)
     runs, point = AxisRuns.of(problem), AxisPoint.of(problem, state)
-    steps, good = np.zeros(len(runs.raw), int), np.zeros(len(runs.raw), bool)
+    steps, good = np.zeros(len(runs.root), int), np.zeros(len(runs.root), bool)
     active, whole, covariance = np.arange(len(good)), point, None
     for count in range(1, MOST_AXIS_STEPS + 1):
         if not active.size:
@@ -588,10 +578,10 @@ def linear(problem: Problem, state: State) -> AxisLinear:
 def analysed(problem: Problem, state: State, known: Determined) -> Analysis:
     """The analysis of fits with all directions determined, as `analyse` has it."""
     at, include = linear(problem, state), problem.evidence.include
-    p, q = at.places[-1].stop, len(problem.evidence.constants)
+    p, q = at.size, len(problem.evidence.constants)
     whole = _in_parameters(problem, state, at.covariance)
     spread = at.spread * include[..., None, None]
-    residual = np.ascontiguousarray(at.weighed(at.left).mT)
+    residual = np.ascontiguousarray(at.score[:, :6].mT)
     return Analysis(
         whole[:, :p, :p],
         known,
@@ -613,7 +603,7 @@ def completed(problem: Problem, state: State, analysis: Analysis) -> Analysis:
         alone = np.sum(weight * (2 * analysis.spread[rows] - weight), (1, 2, 3))
         squares.append(alone + np.sum(part * part.mT, (1, 2)))
     of_stand = _in_parameters(problem, state, at.covariance @ at.of_angles @ at.covariance)
-    p = at.places[-1].stop
+    p = at.size
     return replace(analysis, squares=np.stack(squares, -1), of_stand=of_stand[:, :p, :p])
 
 
