@@ -22,7 +22,12 @@ from mwdcal.calibration.options import Options
 from mwdcal.calibration.prior import prior_of
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.estimation.batch import held_once, put, take
-from mwdcal.estimation.minimisers import closed_form, closed_form_drift, uncertain_stand
+from mwdcal.estimation.minimisers import (
+    closed_form,
+    closed_form_drift,
+    stand_factors,
+    uncertain_stand,
+)
 from mwdcal.estimation.problem import ANGLES, Evidence, Problem, State, Triad
 from mwdcal.estimation.resetting import set_apart, with_share
 from mwdcal.estimation.solvers import (
@@ -35,7 +40,6 @@ from mwdcal.estimation.solvers import (
     weight,
     weighted,
 )
-from mwdcal.estimation.start import start
 from mwdcal.estimation.uncertainty import (
     FIRST_SCATTER,
     LEAST_SCATTER,
@@ -194,7 +198,7 @@ def fit(readings: Readings, options: Options | None = None, include: Array | Non
         return closed
     rest = np.flatnonzero(~good)
     other = _general(take(problem, rest), options, finite[rest])
-    return put(closed, rest, other if closed.analysis.squares is None else _completed(other))
+    return put(closed, rest, other if closed.analysis.squares is None else with_all(other))
 
 
 def scatters(readings: Readings, options: Options) -> bool:
@@ -237,9 +241,9 @@ def _evidence(readings: Readings, include: Array, options: Options) -> Evidence:
 
 def _general(problem: Problem, options: Options, finite: Bools) -> Fit:
     """The fit by the method's minimiser, with estimated noise and station weights in turn."""
-    solved = solve(problem, start(problem), options)
+    solved = solve(problem, None, options)
     iterations, trust = solved.iterations, np.ones(problem.evidence.include.shape)
-    determined = Determined.of(problem, solved.state)
+    determined = _determined(problem, solved.state, solved)
     stage = _Iterate(problem, solved, trust, np.zeros_like(iterations), determined)
     if not _all_declared(problem):
         stage = _estimate_noise(stage, options)
@@ -287,20 +291,40 @@ def _refined(result: Fit, problem: Problem, state: State, options: Options) -> F
         return whole
     rest = np.flatnonzero(~good)
     return put(
-        whole, rest, _completed(_refitted_anyhow(*take((result, problem, state), rest), options))
+        whole, rest, with_all(_refitted_anyhow(*take((result, problem, state), rest), options))
     )
 
 
-def _completed(result: Fit) -> Fit:
-    """The fit of a stand of known angles with all of its analysis."""
-    problem, state, known = result.problem, result.state, result.analysis.determined
-    if known.keep.all():
+def with_all(result: Fit) -> Fit:
+    """The fit, of no robust loss, with all that can be known of it where its angles are known with an error."""
+    problem, state, analysis = result.problem, result.state, result.analysis
+    known = analysis.determined
+    if uncertain_stand.applies(problem) and known.keep.all():
         return replace(result, analysis=uncertain_stand.analysed(problem, state, known))
-    return replace(result, analysis=completed(problem, state, result.analysis))
+    if stand_factors.applies(problem) and known.clear.all():
+        return replace(result, analysis=stand_factors.completed(problem, state, analysis))
+    return replace(result, analysis=completed(problem, state, analysis))
 
 
 def _finished(stage: _Iterate, options: Options, finite: Bools, iterations: Ints) -> Fit:
-    """The fit at the end of all turns: gauge settled, and analysed."""
+    """The fit at the end of all turns: by axis where that tells all, with the gauge settled elsewhere."""
+    if options.robust or options.separate_solver or not stand_factors.applies(stage.problem):
+        return _ended(stage, options, finite, iterations)
+    problem, state = stage.problem, stage.solved.state
+    determined = stand_factors.determined(problem, state)
+    analysis = stand_factors.analysed(problem, state, determined)
+    good = determined.clear & analysis.finite
+    status = np.where(finite, stage.solved.status, int(Status.NOT_FINITE))
+    whole = Fit(problem, state, status, iterations, _noise(problem), stage.trust, analysis)
+    if good.all():
+        return whole
+    rest = np.flatnonzero(~good)
+    other = _ended(take(stage, rest), options, finite[rest], iterations[rest])
+    return put(whole, rest, other) if good.any() else other
+
+
+def _ended(stage: _Iterate, options: Options, finite: Bools, iterations: Ints) -> Fit:
+    """The same, whatever the problem."""
     problem, solved, trust = stage.problem, stage.solved, stage.trust
     trusted, state = _trusting(problem, trust), solved.state
     determined = _determined(trusted, state, solved)
@@ -384,6 +408,10 @@ def _determined(problem: Problem, state: State, solved: Solved) -> Determined:
     """Which directions the evidence that the method uses determines."""
     if solved.known:
         return determined_apart(problem, state, solved.known)
+    if stand_factors.applies(problem):
+        determined = stand_factors.determined(problem, state)
+        if determined.clear.all():
+            return determined
     return Determined.of(problem, state)
 
 

@@ -17,6 +17,7 @@ from mwdcal.calibration.options import DIRECTION, Options, numbered
 from mwdcal.calibration.readings import CONSTANTS, Readings
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.drift import walk_constants
+from mwdcal.estimation.minimisers import stand_factors
 from mwdcal.estimation.minimisers.unweighted import STRENGTH, Sums
 from mwdcal.estimation.problem import (
     ANGLES,
@@ -29,6 +30,7 @@ from mwdcal.estimation.problem import (
     State,
 )
 from mwdcal.estimation.solvers import Status, gauss_newton
+from mwdcal.estimation.start import start
 from mwdcal.estimation.uncertainty import readjusted, unweighted_pulls
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints, inverse
 from mwdcal.sensor.models import affine_parts
@@ -306,8 +308,11 @@ def _alone(state: State, where: slice) -> State:
     return replace(state, params=state.params[:, where])
 
 
-def solve(problem: Problem, state: State, options: Options) -> Solved:
-    """The minimum that the method is defined by, from a start."""
+def solve(problem: Problem, state: State | None, options: Options) -> Solved:
+    """The minimum that the method is defined by, from a state, or a start of its own."""
+    if not options.separate_solver and stand_factors.applies(problem):
+        return Solved(*stand_factors.minimum(problem, state))
+    state = state or start(problem)
     if options.method == "swarm":
         return _swarmed(problem, state, options.seed)
     if options.method == "newton":

@@ -18,8 +18,8 @@ from functools import partial
 
 import numpy as np
 
-from mwdcal.estimation.minimisers import closed_form_drift, uncertain_stand
-from mwdcal.estimation.problem import WALKS, Evidence, Problem, SharedConstant, State
+from mwdcal.estimation.minimisers import closed_form_drift, stand_factors, uncertain_stand
+from mwdcal.estimation.problem import WALK_AXES, WALKS, Evidence, Problem, SharedConstant, State
 from mwdcal.estimation.uncertainty import Analysis, whole_covariance
 from mwdcal.geometry.vectors import (
     Array,
@@ -194,6 +194,8 @@ def walk_scores(
         return _common_scores(walking, at, sd, each, residual)
     if not old and analysis.squares is not None and uncertain_stand.applies(problem):
         return _on_stand(problem, state, each, sd)
+    if analysis.determined.clear.all() and stand_factors.applies(problem):
+        return _by_axis(problem, state, each, sd)
     linear, base = problem.linear(state), _axes(problem, state, [*each])
     whole = whole_covariance(linear, analysis.determined)
     terms = terms_of(base.shape[1])[0][:, 1:]
@@ -218,6 +220,21 @@ def _on_stand(problem: Problem, state: State, places: dict[str, Ints], sd: Array
         sizes[:, by_axis[name]] = sd[:, c]
     scale = outer(sizes)
     return WalkScores(score * sizes, left * scale, lambda: alone * scale, by_axis)
+
+
+def _by_axis(problem: Problem, state: State, places: dict[str, Ints], sd: Array) -> WalkScores:
+    """The same of factors on a stand of known angles."""
+    at, scale = stand_factors.linear(problem, state), outer(sd)
+    axes = [WALK_AXES[axis] for name in places for axis in WALKS[name]]
+    terms = terms_of(problem.evidence.include.shape[-1])[0][:, 1:]
+    score, crossed, alone = at.walk_sums(axes, terms)
+    score = -score.reshape(len(sd), -1, 3, terms.shape[-1]).swapaxes(2, 3).reshape(sd.shape) * sd
+    crossed = crossed.reshape(*crossed.shape[:2], -1, 3, terms.shape[-1]).swapaxes(3, 4)
+    crossed = crossed.reshape(len(sd), -1, sd.shape[-1]) * sd[:, None]
+    alone = alone.reshape(len(sd), *2 * (len(places), 3), *2 * terms.shape[1:])
+    alone = alone.transpose(0, 1, 5, 2, 3, 6, 4).reshape(scale.shape) * scale
+    left = alone - crossed.mT @ at.covariance @ crossed
+    return WalkScores(score, left, lambda: alone, places)
 
 
 def common_scores(problem: Problem, state: State, residual: Array) -> WalkScores:

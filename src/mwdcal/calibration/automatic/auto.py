@@ -102,7 +102,8 @@ def _judged_soaks(readings: Readings, options: Options) -> Ints:
     """
     levels = usable_soaks(_temperature(readings)).max(-1) + 1
     if (levels > 1).any():
-        result = fit(readings, Options(method=options.method))
+        usual = Options(method=options.method)
+        result = fit(_bare_stand(readings, usual) or readings, usual)
         ranks = [marginal_rank(result.analysis.determined, w) for w in result.problem.slices()]
         levels = np.where(np.min(ranks, 0) < LOWEST_RANK, 1, levels)
     return np.asarray(levels)

@@ -16,6 +16,7 @@ import numpy as np
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import HIGHEST, highest_order, usable_soaks
 from mwdcal.estimation.batch import take
+from mwdcal.estimation.minimisers import stand_factors
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import TANGENT_STEP, fisher_tail, tangent
 from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, eigen, inverse, outer, quotient
@@ -43,8 +44,8 @@ class OmittedTerms:
     """Powers 1…`TRIED` of temperature that a fit has not, by member and triad: arrays (B, t, k).
 
     `square` is χ² of a term, all lower ones being fitted, `freedom` its degrees of freedom: 0 where
-    the fit has it, or no soak shows it. `left` is the least share of the information on it that the fit
-    leaves, over its coefficients: little where attitudes and temperature go together. `size` (B, t, k, 2) is
+    the fit has it, or no soak shows it. `left` (B, t) is the least share of the information on the next power that the
+    fit leaves, over its coefficients: little where attitudes and temperature go together. `size` (B, t, k, 2) is
     the mean square of its coefficients, gains and offsets, and `noise` what the declared noise adds to it.
     `scatter` (B, t) is the variance of whitened residuals that no term explains, `rest` (B, t) its degrees of
     freedom.
@@ -97,8 +98,9 @@ def orders_of(result: Fit) -> list[int]:
 def terms_beyond(result: Fit) -> OmittedTerms:
     """The powers of temperature that a fit has not."""
     each = result.problem.once("terms", result.state, lambda _: _every_term(result))
-    square, freedom, left_over = each[:3]
-    size, noise = (np.moveaxis(each[at : at + 2], 0, -1) for at in (3, 5))
+    terms, left_over = each
+    square, freedom = terms[:2]
+    size, noise = (np.moveaxis(terms[at : at + 2], 0, -1) for at in (2, 4))
     factor, known = result.analysis.variance_factor, result.analysis.freedom
     rest = known - freedom.sum(-1)
     left = np.nan_to_num(factor * known) - square.sum(-1)
@@ -119,15 +121,15 @@ def share_beyond(result: Fit, index: int, members: Bools) -> Array:
     return share
 
 
-def _every_term(result: Fit) -> Array:
-    """What `_in_turn` says (7, B, t, k) of every power and triad."""
+def _every_term(result: Fit) -> tuple[Array, Array]:
+    """What `_in_turn` says (6, B, t, k) of every power and triad, and (B, t) of the next one."""
     highest = highest_order(result.problem.temperature)
     count = min(int(highest.max()), TRIED)
     triads, orders = len(result.problem.triads), orders_of(result)
-    each = np.zeros((7, len(highest), triads, TRIED))
+    each, left = np.zeros((6, len(highest), triads, TRIED)), np.zeros((len(highest), triads))
     least = min(orders)
     if count <= least:
-        return each
+        return each, left
     shown = (np.arange(1, count + 1) <= highest[:, None])[:, least:]
     whole, pulled = _with_terms(result, shown, least)
     every = np.arange(whole.shape[-1])
@@ -136,8 +138,8 @@ def _every_term(result: Fit) -> Array:
         if order < count:
             higher = columns[:, index].ravel()
             fitted, tested = np.setdiff1d(every, higher), higher[6 * (order - least) :]
-            each[:, :, index, order:count] = _in_turn(whole, pulled, tested, fitted)
-    return each
+            each[:, :, index, order:count], left[:, index] = _in_turn(whole, pulled, tested, fitted)
+    return each, left
 
 
 def _with_terms(result: Fit, shown: Bools, least: int) -> tuple[Array, Array]:
@@ -146,10 +148,12 @@ def _with_terms(result: Fit, shown: Bools, least: int) -> tuple[Array, Array]:
     Of each power come the three gains and three offsets of each triad.
     """
     problem, state = result.problem, result.state
-    linear = problem.linear(state)
-    columns = steady_columns(problem, state)
     every = temperature_powers(problem.temperature, least + shown.shape[-1])
     powers = every[..., least:] * shown[:, None]
+    if stand_factors.applies(problem):
+        return stand_factors.linear(problem, state).with_courses(powers.mT)
+    linear = problem.linear(state)
+    columns = steady_columns(problem, state)
     members, stations, count = powers.shape
     weighed = linear.weigh(columns).mT
     turned = powers.mT
@@ -198,10 +202,11 @@ def temperature_powers(temperature: Array, count: int) -> Array:
     return np.asarray(np.polynomial.chebyshev.chebvander(scaled, count)[..., 1:])
 
 
-def _in_turn(whole: Array, pulled: Array, tested: Ints, fitted: Ints) -> Array:
-    """χ², degrees of freedom, share left, size and noise (7, B, k) of powers in turn, six coefficients each.
+def _in_turn(whole: Array, pulled: Array, tested: Ints, fitted: Ints) -> tuple[Array, Array]:
+    """χ², degrees of freedom, size and noise (6, B, k) of powers in turn, six coefficients each.
 
-    Each is what it adds to the `fitted` unknowns, and to the powers before it.
+    Each is what it adds to the `fitted` unknowns, and to the powers before it. And the share (B,) of the information
+    on the first power that these leave.
     """
     with np.errstate(invalid="ignore"):  # by rounding it may be below zero
         norm = np.sqrt(diagonal(whole))
@@ -213,9 +218,9 @@ def _in_turn(whole: Array, pulled: Array, tested: Ints, fitted: Ints) -> Array:
     base = base + (RIDGE + absent[:, :, None]) * np.eye(len(fitted))
     right = np.concatenate([cross, pulled[:, fitted, None]], -1)
     both = np.concatenate([whole[:, tested][:, :, tested], pulled[:, tested, None]], -1)
-    alone = both
+    alone = both[:, :6, :6]
     both = both - cross.mT @ np.linalg.solve(base, right)
-    terms = []
+    share, terms = _share_left(alone, both[:, :6, :6]), []
     for first in range(0, len(tested), 6):
         at = slice(first, first + 6)
         values, vectors = eigen(both[:, at, at])
@@ -227,10 +232,9 @@ def _in_turn(whole: Array, pulled: Array, tested: Ints, fitted: Ints) -> Array:
         scale = norm[:, tested[at]] ** 2
         sizes = [step[..., -1] ** 2, np.einsum("bii->bi", back)]
         means = [_mean(each / scale, worth * scale) for each in sizes]
-        left = _share_left(alone[:, at, at], both[:, at, at])
-        terms.append(np.concatenate([np.stack([square, kept.sum(-1), left]), *means]))
+        terms.append(np.concatenate([np.stack([square, kept.sum(-1)]), *means]))
         both = both - both[:, :, at] @ step
-    return np.stack(terms, -1)
+    return np.stack(terms, -1), share
 
 
 def _share_left(alone: Array, left: Array) -> Array:
@@ -246,9 +250,8 @@ def _share_left(alone: Array, left: Array) -> Array:
 def aligned(result: Fit) -> Bools:
     """Triads (B, t) whose next power of temperature other stations' attitudes hide: see `ALIGNED`."""
     highest = np.minimum(highest_order(result.problem.temperature), HIGHEST)
-    orders, left = orders_of(result), terms_beyond(result).left
-    each = [left[:, t, order] < ALIGNED for t, order in enumerate(orders)]
-    return np.stack(each, -1) & (highest[:, None] > orders)
+    left = terms_beyond(result).left
+    return np.asarray((left < ALIGNED) & (highest[:, None] > orders_of(result)))
 
 
 def untested(result: Fit) -> Bools:

@@ -16,7 +16,7 @@ import numpy as np
 
 from mwdcal.calibration.automatic.courses import f_test, terms_beyond
 from mwdcal.calibration.diagnosis.plausibility import departures
-from mwdcal.calibration.estimate import Fit, fit, refitted
+from mwdcal.calibration.estimate import Fit, fit, refitted, with_all
 from mwdcal.calibration.methods import declared_sizes
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prior import PriorInformation
@@ -25,7 +25,7 @@ from mwdcal.calibration.record import Calibration
 from mwdcal.calibration.residuals import tail
 from mwdcal.estimation import drift
 from mwdcal.estimation.batch import join, kind_of, put, take
-from mwdcal.estimation.minimisers import closed_form
+from mwdcal.estimation.minimisers import closed_form, stand_factors
 from mwdcal.estimation.minimisers.closed_form_drift import Alike, are_common, perfect
 from mwdcal.estimation.problem import Prior
 from mwdcal.estimation.solvers import Status
@@ -85,7 +85,8 @@ def _scores(result: Fit) -> Iterator[tuple[drift.WalkScores, dict[str, Array]]]:
         yield replace(units, score=residual.reshape(len(residual), -1) @ units.score), trends
         return
     names = drift.families(problem)
-    for walks in [names] if analysis.squares is None else [[name] for name in names]:
+    together = analysis.squares is None and not stand_factors.applies(problem)
+    for walks in [names] if together else [[name] for name in names]:
         scores = drift.walk_scores(problem, result.state, analysis, walks)
         yield scores, {name: scores.shown(name) for name in scores.places}
 
@@ -176,13 +177,20 @@ def with_drifts(fits: Iterable[tuple[Ints, Fit]], options: Options) -> Iterator[
                 kind = tuple(triads.tolist()), kind_of(part)
                 waiting.setdefault(kind, []).append((tools[places], part))
             else:
-                yield tools[places], part
+                yield tools[places], _whole(part, options)
     for (triads, _), parts in waiting.items():
         tools, whole = (join(each) for each in zip(*parts, strict=True))
         size = TOGETHER if whole.analysis.squares is None else ON_A_STAND
         for first in range(0, len(tools), size):
             some = slice(first, first + size)
-            yield tools[some], with_drift(take(whole, some), options, np.array(triads))
+            found = with_drift(take(whole, some), options, np.array(triads))
+            yield tools[some], _whole(found, options)
+
+
+def _whole(result: Fit, options: Options) -> Fit:
+    """The fit with all of its analysis at once where that is short."""
+    short = not _apart(result, options) and stand_factors.applies(result.problem)
+    return with_all(result) if short else result
 
 
 def _without_drift(result: Fit, options: Options) -> Fit:

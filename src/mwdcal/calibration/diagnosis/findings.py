@@ -71,10 +71,19 @@ def copies(result: Fit) -> Bools:
     )
     rows = np.nan_to_num(rows)
     weights = np.sqrt(2.0 + np.arange(rows.shape[-1]))
-    line = np.sort(np.einsum("bnk,k->bn", rows, weights), -1)
-    close = np.diff(line, axis=-1) <= AGREEING * weights.sum()
-    repeated = np.zeros(rows.shape[:-1], bool)
-    for member in np.flatnonzero(np.any(close, -1)):
+    line = np.einsum("bnk,k->bn", rows, weights)
+    order = np.argsort(line, -1)
+    in_line = np.take_along_axis(rows, order[..., None], 1)
+    line = np.take_along_axis(line, order, -1)
+    agree, repeated = np.zeros(len(rows), bool), np.zeros(rows.shape[:-1], bool)
+    for apart in range(1, line.shape[-1]):
+        close = line[:, apart:] - line[:, :-apart] <= AGREEING * weights.sum()
+        if not close.any():
+            break
+        tools, first = np.nonzero(close)
+        differ = np.abs(in_line[tools, first + apart] - in_line[tools, first]) > AGREEING
+        agree[tools[~differ.any(-1)]] = True
+    for member in np.flatnonzero(agree):
         repeated[member] = _copies(rows[member])
     return repeated
 

@@ -12,6 +12,7 @@ factors come apart by axis as well (`closed_form_factors`).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -102,17 +103,22 @@ class AffineMinimum:
 
         Normalised, the information is a Kronecker product.
         """
-        gain, batch = self.forward[..., :3], len(self.forward)
-        square = gain.mT @ gain
-        pairs = for_all(_pairs, self.terms)
-        strength = _over_stations(square.reshape(batch, 9), pairs[..., _OF_VECTOR].mT)
-        weight = self.include[..., 0] / (GEOMETRIC_NOISE**2 * strength)
-        undo = inverse(self.turn)
-        parts = [square, undo @ _over_stations(weight, pairs).reshape(batch, 4, 4) @ undo.mT]
-        sizes = [np.sqrt(diagonal(part)) for part in parts]
-        pair = [eigenvalues(m / outer(s)) for m, s in zip(parts, sizes, strict=True)]
-        squares, norms = (np.einsum("bi,bj->bij", *p).reshape(batch, 12) for p in (pair, sizes))
-        return np.sqrt(np.clip(squares, 0, None)), norms[:, PLACES]
+        return known_at(self.include, self.terms, self.forward, self.turn)
+
+
+def known_at(include: Array, terms: Array, forward: Array, turn: Array) -> tuple[Array, Array]:
+    """Singular values and norms (see `AffineMinimum`) at Φ and T."""
+    gain, batch = forward[..., :3], len(forward)
+    square = gain.mT @ gain
+    pairs = for_all(_pairs, terms)
+    strength = _over_stations(square.reshape(batch, 9), pairs[..., _OF_VECTOR].mT)
+    weight = include[..., 0] / (GEOMETRIC_NOISE**2 * strength)
+    undo = inverse(turn)
+    parts = [square, undo @ _over_stations(weight, pairs).reshape(batch, 4, 4) @ undo.mT]
+    sizes = [np.sqrt(diagonal(part)) for part in parts]
+    pair = [eigenvalues(m / outer(s)) for m, s in zip(parts, sizes, strict=True)]
+    squares, norms = (np.einsum("bi,bj->bij", *p).reshape(batch, 12) for p in (pair, sizes))
+    return np.sqrt(np.clip(squares, 0, None)), norms[:, PLACES]
 
 
 _OF_VECTOR = np.array([0, 1, 2, 4, 5, 6, 8, 9, 10])
@@ -264,9 +270,12 @@ def centred_parts(triad: Triad, forward: Array) -> tuple[Array, Array]:
 
 def determined(triads: Minima) -> Determined:
     """How well all triads' parameters are determined; the directions themselves are not worked out."""
-    values, norms = (
-        np.concatenate(each, -1) for each in zip(*(h.known for h in triads), strict=True)
-    )
+    return determined_by([triad.known for triad in triads])
+
+
+def determined_by(known: Iterable[tuple[Array, Array]]) -> Determined:
+    """The same from singular values and norms (B, p) of each triad."""
+    values, norms = (np.concatenate(each, -1) for each in zip(*known, strict=True))
     values = -np.sort(-values, -1)
     values = values / np.maximum(values[:, :1], 1e-300)
     size = values.shape[-1]

@@ -157,19 +157,29 @@ def _minimum(axes: Axes, at: Point, include: Array) -> FactorsMinimum:
     back = inverse(slope.reshape(batch, size, size))
     by_axis = np.swapaxes(back.reshape(batch, size, 3, -1), 1, 2)
     moved = np.swapaxes(by_axis @ spread, 1, 2).reshape(batch, size, size)
-    strength = np.linalg.norm(at.scale * (shares @ axes.vectors), axis=-2)[:, None]
     return FactorsMinimum(
         params,
         moved @ back.mT,
         at.left.mT,
         (include[:, None] - share).mT,
-        _evidence(at.rows, axes.noise / (GEOMETRIC_NOISE * strength), slope),
+        _evidence(axes, at.rows, at.scale, shares, slope),
         at.settled,
     )
 
 
-def _evidence(rows: Array, louder: Array, slope: Array) -> tuple[Array, Array]:
-    """Singular values and norms (see `FactorsMinimum`), at another noise: ours over it is (B, 3, n)."""
+def known_at(axes: Axes, unknowns: Array) -> tuple[Array, Array]:
+    """Singular values and norms (see `FactorsMinimum`) at some unknowns (B, 3, 2K + 2)."""
+    scale, unit = axes.predicted(unknowns)
+    _, shares, slope = factors(unknowns)
+    return _evidence(axes, axes.slopes(scale, unit), scale, shares, slope)
+
+
+def _evidence(
+    axes: Axes, rows: Array, scale: Array, shares: Array, slope: Array
+) -> tuple[Array, Array]:
+    """Singular values and norms (see `FactorsMinimum`), at a noise that is a share of the field."""
+    strength = np.linalg.norm(scale * (shares @ axes.vectors), axis=-2)[:, None]
+    louder = axes.noise / (GEOMETRIC_NOISE * strength)
     rows *= louder[..., None, :]  # in place: they are large, and done with
     by_axis = rows @ rows.mT
     information = (slope.mT @ by_axis @ slope).sum(1)
