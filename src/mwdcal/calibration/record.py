@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import date, datetime
 from html import escape
 from itertools import pairwise
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -507,6 +507,17 @@ class TriadCalibration(msgspec.Struct, frozen=True, kw_only=True):
         return Polynomial(basis, centre, radius, self.curved)
 
 
+class Slopes(NamedTuple):
+    """Derivative (…, n, 6, p) of both vectors by the parameters, and their covariance (…, n, 6, 6) by noise."""
+
+    jacobian: Array
+    noise: Array
+
+    def part(self, rows: slice | Bools) -> Slopes:
+        """Those of some readings (n,)."""
+        return Slopes(self.jacobian[rows], self.noise[rows])
+
+
 class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     """A calibrated tool: see `docs/reference/files.md` for every field.
 
@@ -752,10 +763,19 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
             result[..., vector, vector] = part
         return np.broadcast_to(result, (*shape, 6, 6))
 
-    def gradients(self, names: Sequence[str], readings: ReadingsLike) -> Array:
-        """Gradients (…, n, k, 6) of k observables with respect to both vectors."""
-        fields = self.fields(readings)
-        gradient = np.stack([OBSERVABLES[name].gradient(*fields) for name in names], -2)
+    def slopes(self, readings: ReadingsLike) -> Slopes:
+        """`jacobian` and `noise_covariance`."""
+        return Slopes(self.jacobian(readings), self.noise_covariance(readings))
+
+    def gradients(
+        self,
+        names: Sequence[str],
+        readings: ReadingsLike,
+        vectors: tuple[Array, Array] | None = None,
+    ) -> Array:
+        """Gradients (…, n, k, 6) of k observables with respect to both `vectors`, known already or of the readings."""
+        g, b = vectors or self.fields(readings)
+        gradient = np.stack([OBSERVABLES[name].gradient(g, b) for name in names], -2)
         return np.where(np.isnan(gradient), 0.0, gradient) if not self.has_field else gradient
 
     def sensitivity(self, name: str, readings: ReadingsLike) -> Array:
@@ -780,10 +800,11 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         readings: ReadingsLike,
         noise: bool = False,
         gradients: Array | None = None,
+        slopes: Slopes | None = None,
     ) -> Array:
         """Covariance (…, n, k, k) of k observables at one reading, as `uncertainty` states each.
 
-        `gradients` of the observables, where they are known already.
+        `gradients` of the observables and `slopes`, where they are known already.
         Units: products of radians, g and nT. Singular: NaN in the rows and columns of an observable
         without a stated uncertainty.
 
@@ -801,11 +822,11 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
                     "Correct the name."
                 )
         rows = self.gradients(names, readings) if gradients is None else gradients
-        moved = self.jacobian(readings)
+        moved = slopes.jacobian if slopes else self.jacobian(readings)
         flat = moved.reshape(-1, moved.shape[-1])  # one product is faster than one for each reading
         vectors = (flat @ self.parameter_covariance).reshape(moved.shape) @ moved.mT
         if noise:
-            vectors = vectors + self.noise_covariance(readings)
+            vectors += slopes.noise if slopes else self.noise_covariance(readings)
         total = rows @ vectors @ rows.mT
         lacking = () if self.has_field else MAGNETIC
         blank = np.stack([self.rests_on_free(n, readings) | (n in lacking) for n in names], -1)

@@ -217,38 +217,50 @@ class _Growing:
         return columns | dict(zip(self.names, filled, strict=True))
 
 
+class StoredNumbers:
+    """Numbers in a file without a name."""
+
+    def __init__(self) -> None:
+        self._file = TemporaryFile()  # noqa: SIM115, closed by what follows
+        finalize(self, self._file.close)
+
+    def add(self, values: Array) -> None:
+        """Append numbers (n,)."""
+        self._file.write(np.ascontiguousarray(values, float).data)
+
+    def read(self) -> Array:
+        """All of them, (n,)."""
+        self._file.seek(0)  # what was added is written before
+        return np.fromfile(self._file)
+
+
 class StoredColumns(Mapping[str, Column]):
     """Columns of a long log, each in a file without a name, from which it is read when it is asked for."""
 
     def __init__(self, others: Sequence[str], names: Sequence[str]) -> None:
         self._others = others
-        self._files = {name: TemporaryFile() for name in names}  # noqa: SIM115, closed by what follows
-        for file in self._files.values():
-            finalize(self, file.close)
+        self._stored = {name: StoredNumbers() for name in names}
 
     def add(self, values: Array, share: float) -> None:
         """Append values (rows, columns)."""
-        for file, column in zip(self._files.values(), values.transpose(), strict=True):
-            file.write(np.ascontiguousarray(column, float).data)
+        for stored, column in zip(self._stored.values(), values.transpose(), strict=True):
+            stored.add(column)
 
     def whole(self) -> Mapping[str, Column]:
         """The columns."""
-        for file in self._files.values():
-            file.flush()
         return self
 
     def __getitem__(self, name: str) -> Column:
-        if name in self._others:
-            return []
-        file = self._files[name]
-        file.seek(0)
-        return np.fromfile(file)
+        return [] if name in self._others else self._stored[name].read()
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._stored or name in self._others
 
     def __iter__(self) -> Iterator[str]:
-        return chain(self._others, self._files)
+        return chain(self._others, self._stored)
 
     def __len__(self) -> int:
-        return len(self._others) + len(self._files)
+        return len(self._others) + len(self._stored)
 
 
 def _top(stream: BinaryIO, source: str) -> tuple[list[tuple[int, str]], str, int]:

@@ -19,12 +19,13 @@ Reference: P. J. Huber, Robust Statistics, chapter 6 (medians, MAD).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain, pairwise
 from typing import NamedTuple
 
 import numpy as np
 
+from mwdcal.files.logs import StoredNumbers
 from mwdcal.geometry.vectors import Array, Bools, Ints
 
 CELL = 0.2
@@ -35,6 +36,8 @@ WINDOW = 5
 """Cells of a window."""
 QUIET = 0.05
 """Quantile of the windows' ranges that is the noise floor."""
+CELLS_AT_ONCE = 1 << 14
+"""Cells whose medians are taken at once."""
 THRESHOLDS_TRIED = 120
 """Thresholds tried."""
 CLOCK_SAMPLES = 32
@@ -93,13 +96,13 @@ class Activity(NamedTuple):
     Attributes:
         edge: start of each cell, and the end of the last (m + 1,), s.
         value: activity (m,), in noise floors; infinite where a channel has no samples.
-        cells: the channels that were looked at, cut up.
+        cells: the channels that were looked at, cut up; of a long log read when they are asked for.
         floor: noise floor of each, in its own unit.
     """
 
     edge: Array
     value: Array
-    cells: dict[str, Cells]
+    cells: Mapping[str, Cells]
     floor: Array
 
     @property
@@ -150,14 +153,19 @@ def cells_of(time: Array, value: Array, length: float) -> Cells:
 
 def filled(grid: CellGrid, value: Array) -> Cells:
     """The channel (n,) in the cells of its clock."""
-    steps = np.abs(np.diff(value))
+    steps = np.diff(value)
+    np.abs(steps, out=steps)
     rough = float(np.median(steps, overwrite_input=True)) / 0.6745 / np.sqrt(2) if steps.size else 0
-    level = [
-        np.median(value[first : first + count * size].reshape(count, size), axis=-1)
-        for first, count, size in grid.stretches
-    ]
-    whole = np.concatenate(level).astype(float)
-    return Cells(grid.start, grid.end, whole, grid.torn, grid.step, float(rough), resolution(value))
+    del steps
+    level = np.empty(len(grid.start))
+    done = 0
+    for first, count, size in grid.stretches:
+        shaped = value[first : first + count * size].reshape(count, size)
+        for start in range(0, count, CELLS_AT_ONCE):
+            part = shaped[start : start + CELLS_AT_ONCE]
+            level[done : done + len(part)] = np.median(part, axis=-1)
+            done += len(part)
+    return Cells(grid.start, grid.end, level, grid.torn, grid.step, float(rough), resolution(value))
 
 
 def cell_grid(time: Array, length: float) -> CellGrid:
@@ -229,8 +237,10 @@ def _agreed(steps: Array) -> float:
 def time_step(time: Array) -> float:
     """Median time between samples that differ in time; 0 where there are none."""
     steps = np.diff(time)
-    steps = steps[steps > 0]
-    return float(np.median(steps)) if steps.size else 0.0
+    later = steps > 0
+    if not later.all():
+        steps = steps[later]
+    return float(np.median(steps, overwrite_input=True)) if steps.size else 0.0
 
 
 def distinct(time: Array) -> Array:
@@ -246,20 +256,42 @@ def distinct(time: Array) -> Array:
     return np.asarray(np.repeat(ticks, many) + rank * np.repeat(room / many, many))
 
 
+class StoredCells(Mapping[str, Cells]):
+    """Channels in cells whose levels are not in memory: they are read when a channel is asked for."""
+
+    def __init__(self, cut: Iterable[tuple[str, Cells]]) -> None:
+        self._cells: dict[str, tuple[Cells, StoredNumbers]] = {}
+        for name, cells in cut:
+            level = StoredNumbers()
+            level.add(cells.level)
+            self._cells[name] = cells._replace(level=cells.level[:0].copy()), level
+
+    def __getitem__(self, name: str) -> Cells:
+        cells, level = self._cells[name]
+        return cells._replace(level=level.read())
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._cells
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._cells)
+
+    def __len__(self) -> int:
+        return len(self._cells)
+
+
 def activity(traces: Traces) -> Activity:
     """How much each moment moves, of channels with rates of their own.
 
     A channel too slow to have a cell within a window of the fastest is not looked at, nor one
-    that never changes. Singular: fewer samples than a window needs give no cells at all.
+    that never changes. Where traces are not all in memory, cells are not either.
+    Singular: fewer samples than a window needs give no cells at all.
     """
-    steps = {name: time_step(time) for name, (time, _) in traces.items()}
+    steps = _clock_steps(traces)
     length = max(CELL, FEWEST * min((s for s in steps.values() if s > 0), default=0.0))
-    cut = {
-        name: cells_of(*traces[name], length)
-        for name, step in steps.items()
-        if 0 < FEWEST * step <= WINDOW * length and np.ptp(traces[name][1]) > 0
-    }
-    named = {name: channel for name, channel in cut.items() if len(channel.level) >= WINDOW}
+    fast = [name for name, step in steps.items() if 0 < FEWEST * step <= WINDOW * length]
+    cut = _lively(traces, fast, length)
+    named = dict(cut) if isinstance(traces, dict) else StoredCells(cut)
     cells = named.values()
     if not cells:
         return Activity(np.zeros(1), np.zeros(0), {}, np.zeros(0))
@@ -275,6 +307,29 @@ def activity(traces: Traces) -> Activity:
         value = np.maximum(value, on_grid(edge, channel, ranges) / floor)
         floors.append(floor)
     return Activity(edge, value, named, np.array(floors))
+
+
+def _clock_steps(traces: Traces) -> dict[str, float]:
+    """Time between samples of each channel; worked out once for neighbours with one clock."""
+    clock, step, steps = np.zeros(0), 0.0, {}
+    for name, (time, _) in traces.items():
+        if time is not clock:
+            clock, step = time, time_step(time)
+        steps[name] = step
+    return steps
+
+
+def _lively(traces: Traces, names: Sequence[str], length: float) -> Iterator[tuple[str, Cells]]:
+    """Channels that change and have a window, in cells of about `length` seconds; one grid for one clock."""
+    clock: Array | None = None
+    for name in names:
+        time, value = traces[name]
+        if np.ptp(value) > 0:
+            if time is not clock:
+                clock, grid = time, cell_grid(time, length)
+            if len(grid.start) >= WINDOW:
+                yield name, filled(grid, value)
+        del value  # before the next is read
 
 
 def quietest_range(level: Array) -> Array:

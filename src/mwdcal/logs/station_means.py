@@ -246,12 +246,9 @@ def pooled(rests: Sequence[Trace], resolution: float) -> SharedNoise:
     some = [value for _, value in parts]
     del parts
     medians = [np.median(value, -1, keepdims=True) for value in some]
-    some = [value - median for value, median in zip(some, medians, strict=True)]
-    distances = [_distances(value) for value in some]
-    lively = [distance[distance.any(-1)].ravel() for distance in distances]
-    if not any(each.size for each in lively):
-        lively = [distance.ravel() for distance in distances]
-    spread = 1.4826 * float(np.median(np.concatenate(lively)))
+    for value, median in zip(some, medians, strict=True):
+        value -= median
+    spread = 1.4826 * _middle_distance(some)
     limit = SPIKE_DISTANCE * max(spread, resolution)
     square, size = np.concatenate([_squares(value, limit) for value in some])[order].transpose()
     there = size > 0  # none where they are at two levels far apart
@@ -317,6 +314,16 @@ def _course(rests: Sequence[Trace], middles: Array, limit: float) -> float:
     mean = float(weights @ slopes / weights.sum())
     error = float(weights @ (slopes - mean) ** 2 / freedom / weights.sum()) ** 0.5
     return mean if abs(mean) > student(freedom, DRIFT_CHANCE) * error else 0.0
+
+
+def _middle_distance(values: Sequence[Array]) -> float:
+    """Median distance (k, n) from medians of 0, without rows that never change unless all are such."""
+    lively = [each[each.any(-1)].ravel() for each in map(_distances, values)]
+    if not any(each.size for each in lively):
+        lively = [_distances(value).ravel() for value in values]
+    whole = np.concatenate(lively)
+    del lively
+    return float(np.median(whole, overwrite_input=True))
 
 
 def _distances(value: Array) -> Array:

@@ -26,6 +26,7 @@ from mwdcal.logs.regular import SECONDS, check_argument, row_times, unlikely_sec
 from mwdcal.logs.standstill import Activity, Slow, Standstills, Trace, Traces
 from mwdcal.logs.station_means import (
     ALONE,
+    ChannelMean,
     Rows,
     about,
     correlated,
@@ -220,12 +221,16 @@ class _StoredTraces(Mapping[str, Trace]):
     """Channels of a log whose columns are not in memory: each is read when it is asked for."""
 
     def __init__(self, log: Table, time: Array, names: Sequence[str]) -> None:
-        self._log, self._time, self._names = log, time, names
+        self._log, self._names = log, names
+        self._time, self._clock = time, standstill.distinct(time)
 
     def __getitem__(self, name: str) -> Trace:
         if name not in self._names:
             raise KeyError(name)
-        return _trace(self._log, self._time, name)
+        return _trace(self._log, self._time, self._clock, name)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._names
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)
@@ -240,20 +245,21 @@ def _traces_of(log: Table, time: Array, names: Sequence[str]) -> Traces:
     return traces if isinstance(log.columns, StoredColumns) else dict(traces)
 
 
-def _trace(log: Table, time: Array, name: str) -> Trace:
-    """Times and values where there are values; times that are equal are spread."""
+def _trace(log: Table, time: Array, clock: Array, name: str) -> Trace:
+    """Times and values where there are values; times that are equal are spread, as `clock` has those of all rows."""
     value = numbers(log, name)
-    there = ~np.isnan(value)
-    if not there.all():
-        time, value = time[there], value[there]
-    return standstill.distinct(time), value
+    blank = np.isnan(value)
+    if not blank.any():
+        return clock, value
+    there = ~blank
+    return standstill.distinct(time[there]), value[there]
 
 
 def _warmth(log: Table, time: Array, findings: list[Finding]) -> Trace | None:
     """The temperatures that are possible; others, such as -999, are left out and reported."""
     if "temperature_c" not in log.columns:
         return None
-    time, value = _trace(log, time, "temperature_c")
+    time, value = _trace(log, time, standstill.distinct(time), "temperature_c")
     fine = ~TEMPERATURE.outside(value)
     if not fine.all():
         wrong = np.flatnonzero(~fine)
@@ -266,7 +272,7 @@ def _warmth(log: Table, time: Array, findings: list[Finding]) -> Trace | None:
         text = "temperature_c is blank from end to end: the stations have no temperature."
         findings.append(Finding(id="no-temperature", text=text))
         return None
-    return time[fine], value[fine]
+    return (time, value) if fine.all() else (time[fine], value[fine])
 
 
 def _time_findings(
@@ -324,13 +330,13 @@ def _equal_times(log: Table, time: Array, names: list[str]) -> Iterator[Finding]
 
 def _limits(activity: Activity, traces: Traces) -> tuple[Array, list[Slow]]:
     """The largest range that can be rest of each channel looked at, and the others that can step."""
-    cut = {
-        name: activity.cells.get(name) or standstill.cells_of(*trace, standstill.CELL)
-        for name, trace in traces.items()
-    }
     limits, slow = [], []
     for triad in CHANNELS.values():
-        channels = {name: cut[name] for name in triad if name in cut}
+        channels = {
+            name: activity.cells.get(name) or standstill.cells_of(*traces[name], standstill.CELL)
+            for name in triad
+            if name in traces
+        }
         size = standstill.triad_size([each.level for each in channels.values()])
         for name, channel in channels.items():
             if name in activity.cells:
@@ -349,8 +355,8 @@ def _with_samples(
     standstills: Standstills, rows: Array, traces: Traces, findings: list[Finding]
 ) -> Standstills:
     """The same, without stations for which a slow channel, or the log, has hardly a sample."""
-    times = [rows, *(time for time, _ in traces.values())]
-    places = [_within(time, standstills.start, standstills.end) for time in times]
+    span = standstills.start, standstills.end
+    places = [_within(rows, *span), *(_within(traces[name][0], *span) for name in traces)]
     enough = np.all([last - first >= LEAST_SAMPLES for first, last in places], axis=0)
     poor = int(np.count_nonzero(standstills.taken & ~enough))
     if poor:
@@ -365,15 +371,20 @@ def _with_samples(
 def _summaries(traces: Traces, start: Array, end: Array, findings: list[Finding], say: Say) -> Rows:
     """Readings of each channel at each station."""
     summaries: Rows = {}
-    for name, (time, value) in traces.items():
+    for name in traces:
         say(f"means of {name} at {count(len(start), 'station')}")
-        resolution = standstill.resolution(value) or SMALLEST_RESOLUTION * abs(float(value[0]))
-        places = zip(*_within(time, start, end), strict=True)
-        rests = [(time[a:b], value[a:b]) for a, b in places]
-        summaries[name] = summarise(rests, resolution or SMALLEST_RESOLUTION)
+        summaries[name] = _summary(*traces[name], start, end)
     for triad in CHANNELS.values():
         summaries |= _widened({n: summaries[n] for n in triad if n in summaries}, findings)
     return summaries
+
+
+def _summary(time: Array, value: Array, start: Array, end: Array) -> ChannelMean:
+    """Readings of a channel at each station."""
+    resolution = standstill.resolution(value) or SMALLEST_RESOLUTION * abs(float(value[0]))
+    places = zip(*_within(time, start, end), strict=True)
+    rests = [(time[a:b], value[a:b]) for a, b in places]
+    return summarise(rests, resolution or SMALLEST_RESOLUTION)
 
 
 def _widened(triad: Rows, findings: list[Finding]) -> Rows:

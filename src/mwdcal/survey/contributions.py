@@ -19,9 +19,9 @@ from mwdcal.calibration.record import Calibration
 from mwdcal.geometry.vectors import Array, Bools
 from mwdcal.survey.error_model import Hole
 from mwdcal.survey.path import (
+    SeenDirection,
     TieIn,
     direction_errors,
-    direction_gradient,
     hole_direction,
     position_covariance,
     tilts,
@@ -168,14 +168,13 @@ def _run(well: Well) -> _Run:
     depth, offset = np.where(well.blank, np.nan, _depth(well)), north.of_path(count)[0]
     seen = SeenHole.at(well.calibration, readings)
     hole = hole_of(well.calibration, readings, seen, depth, offset, well.started)
-    causes = _causes(well, readings, hole, np.ones(count, bool))
+    causes = _causes(well, readings, seen, hole, np.ones(count, bool))
     if path.all() or not path.any():
         return _Run(well, hole, causes, path, hole, causes if path.any() else {})
     some = readings.select(path)
-    below = hole_of(
-        well.calibration, some, seen.part(path), depth[path], offset[path], well.started
-    )
-    return _Run(well, hole, causes, path, below, _causes(well, some, below, path))
+    seen = seen.part(path)
+    below = hole_of(well.calibration, some, seen, depth[path], offset[path], well.started)
+    return _Run(well, hole, causes, path, below, _causes(well, some, seen, below, path))
 
 
 def _depth(well: Well) -> Array:
@@ -249,11 +248,13 @@ def _frame(hole: Hole) -> Array:
     return np.concatenate([earth, np.stack([along, sideways, upward], 1)], 1)
 
 
-def _causes(well: Well, readings: Readings, hole: Hole, rows: Bools) -> dict[Cause, _Errors]:
+def _causes(
+    well: Well, readings: Readings, seen: SeenHole, hole: Hole, rows: Bools
+) -> dict[Cause, _Errors]:
     """Errors of direction and depth by cause at some rows; all together are those of the path of the well."""
     calibration, count = well.calibration, readings.count
     _, shared, alone = (value[rows][:, None, None] for value in well.north.of_path(len(rows)))
-    whole = direction_errors(calibration, readings, declination_sd=1.0)
+    whole = direction_errors(calibration, readings, declination_sd=1.0, seen=seen.direction)
     lasting, noise = with_depth(whole.systematic), np.zeros((count, 3, 3))
     noise[:, :2, :2] = whole.random
     turn = lasting[:, -1:]  # by 1 rad of north
@@ -268,14 +269,13 @@ def _causes(well: Well, readings: Readings, hole: Hole, rows: Bools) -> dict[Cau
         Cause("declination", RANDOM_ERRORS): _Errors.of(count, random=daily),
     }
     if well.errors is not None:
-        result |= _modelled(well.errors, calibration.fields(readings), hole)
+        result |= _modelled(well.errors, seen.direction, hole)
     return {cause: errors for cause, errors in result.items() if any(map(np.any, errors))}
 
 
-def _modelled(errors: WellErrors, fields: tuple[Array, Array], hole: Hole) -> dict[Cause, _Errors]:
+def _modelled(errors: WellErrors, seen: SeenDirection, hole: Hole) -> dict[Cause, _Errors]:
     """Those of an error model: of the sensors, and by its formulas, which belong together by their names."""
-    _, gradient = direction_gradient(*fields)
-    sensors = with_depth(errors.moved(gradient, *fields, hole))
+    sensors = with_depth(errors.moved(seen.gradient, seen.g, seen.b, hole))
     count, modes = len(hole.md), {t.name: t.propagation_mode.lower() for t in errors.model.terms}
     result = {
         Cause(AXIAL_INTERFERENCE, SYSTEMATIC): _Errors.of(count, sensors[:, SENSOR_CAUSES - 1 :]),

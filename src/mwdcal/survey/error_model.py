@@ -278,11 +278,13 @@ class ErrorModel:
 
     def errors(self, hole: Hole) -> tuple[Array, Array, Array]:
         """Shifts (n, k, 3) by terms that last, covariance (n, 3, 3) of random ones and (n, 2, 2) of courses."""
-        systematic, random, course = (
-            self._stacked(hole, kind) for kind in ("lasting", "random", "course")
-        )
-        course = course[..., :2]
-        return systematic, random.mT @ random, course.mT @ course
+        course = self._stacked(hole, "course")[..., :2]
+        return *self.errors_of_stations(hole), course.mT @ course
+
+    def errors_of_stations(self, hole: Hole) -> tuple[Array, Array]:
+        """The same without courses."""
+        systematic, random = (self._stacked(hole, kind) for kind in ("lasting", "random"))
+        return systematic, random.mT @ random
 
 
 def _depth_before(md: Array, before: Array) -> Array:

@@ -27,15 +27,17 @@ from typing import NamedTuple
 import numpy as np
 
 from mwdcal.calibration.readings import Readings
-from mwdcal.calibration.record import FREE_SHARE, Calibration
+from mwdcal.calibration.record import FREE_SHARE, Calibration, Slopes
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import VERTICAL, is_vertical
-from mwdcal.geometry.vectors import Array, ArrayLike, dot, length, outer, square_root, wrap
-from mwdcal.survey.stations import STATIONS_AT_ONCE
+from mwdcal.geometry.vectors import Array, ArrayLike, Bools, dot, length, outer, square_root, wrap
+from mwdcal.survey.stations import STATIONS_AT_ONCE, blocks
 from mwdcal.use.uncertainty import rows_of
 
 _SHORT = 0.03
 """Dogleg, rad, below which a series has more digits than the closed form."""
+SLOPES_KEPT = 1 << 14
+"""Readings whose slopes are kept, 1.4 kB each; those of more are worked out again where they are asked for."""
 
 
 def hole_direction(inclination: ArrayLike, azimuth: ArrayLike) -> Array:
@@ -318,12 +320,45 @@ def direction_gradient(g: Array, b: Array) -> tuple[Array, Array]:
     return wrap(azimuth), np.stack(rows, -2)
 
 
+class SeenDirection(NamedTuple):
+    """Vectors (…, n, 3) of readings as corrected, what `direction_gradient` makes of them, and their slopes."""
+
+    g: Array
+    b: Array
+    azimuth: Array
+    gradient: Array
+    slopes: Slopes | None
+
+    @classmethod
+    def of(cls, calibration: Calibration, readings: Readings, slopes: bool = True) -> SeenDirection:
+        """Those of some readings; `slopes` only if wanted."""
+        g, b = calibration.fields(readings)
+        return cls(
+            g, b, *direction_gradient(g, b), calibration.slopes(readings) if slopes else None
+        )
+
+    @classmethod
+    def of_many(cls, calibration: Calibration, readings: Readings) -> SeenDirection:
+        """Those of readings (n,), worked out in blocks; slopes of no more than `SLOPES_KEPT`."""
+        kept = readings.count <= SLOPES_KEPT
+        parts = [cls.of(calibration, some, kept) for some in blocks(readings)]
+        each = map(np.concatenate, zip(*(part[:4] for part in parts), strict=True))
+        slopes = zip(*(part.slopes for part in parts if part.slopes), strict=True)
+        return cls(*each, Slopes(*map(np.concatenate, slopes)) if kept else None)
+
+    def part(self, rows: slice | Bools) -> SeenDirection:
+        """Those of some of them."""
+        each = (values[rows] for values in self[:4])
+        return SeenDirection(*each, self.slopes and self.slopes.part(rows))
+
+
 def direction_errors(
     calibration: Calibration,
     readings: Readings,
     north: float | Array = 0.0,
     declination_sd: float | Array = 0.0,
     declination_noise: float | Array = 0.0,
+    seen: SeenDirection | None = None,
 ) -> DirectionErrors:
     """The direction of the hole at readings (…, n), with its errors from the calibration and from noise.
 
@@ -331,12 +366,13 @@ def direction_errors(
     station.
     Units: radians. `north`: declination, for azimuths from true north, less convergence, for those from
     grid north; `declination_sd`: its standard uncertainty, and `declination_noise` what is new at every station; each
-    one value, or one for each station (n,).
+    one value, or one for each station (n,). `seen`: the direction, where it is known already.
     Singular: finite at vertical. NaN where the direction rests on what no evidence determines, and without a field.
     """
-    g, b = calibration.fields(readings)
-    azimuth, gradient = direction_gradient(g, b)
-    change = gradient @ calibration.jacobian(readings)
+    seen = seen or SeenDirection.of(calibration, readings)
+    g, _, azimuth, gradient = seen[:4]
+    jacobian, noise = seen.slopes or calibration.slopes(readings)
+    change = gradient @ jacobian
     free = np.abs(change @ calibration.free_directions.transpose()) > FREE_SHARE
     flat = change.reshape(-1, change.shape[-1])  # one product is faster than one for each reading
     shifts = flat @ square_root(calibration.parameter_covariance)
@@ -350,7 +386,7 @@ def direction_errors(
         systematic=np.concatenate(
             [shifts, turn[..., None, :] * np.asarray(declination_sd)[..., None, None]], -2
         ),
-        random=gradient @ calibration.noise_covariance(readings) @ gradient.mT
+        random=gradient @ noise @ gradient.mT
         + np.asarray(declination_noise)[..., None, None] ** 2 * outer(turn),
     )
 
@@ -419,13 +455,14 @@ def continued_path(
     md: ArrayLike,
     norths: tuple[ArrayLike, ArrayLike, ArrayLike],
     before: ArrayLike | TieIn | PathEnd = (0.0, 0.0, 0.0),
-    more: Callable[[DirectionErrors, Readings, slice], DirectionErrors] | None = None,
+    more: Callable[[DirectionErrors, slice], DirectionErrors] | None = None,
+    seen: SeenDirection | None = None,
 ) -> tuple[Array, Array, PathEnd]:
     """The same of readings that follow others of their well, and where the path has come to.
 
     `norths` as of `direction_errors`. `before`: the position of the first station, where the path is tied in, or where
     it had come to: a well in parts has the positions that it has as a whole. `more` adds errors to those of the
-    directions at some rows.
+    directions at some rows. `seen`: directions of the readings, where they are known already.
     """
     depth = np.asarray(md, float)
     last = [np.atleast_1d(before.md)] if isinstance(before, TieIn | PathEnd) else []
@@ -438,8 +475,9 @@ def continued_path(
 
     def part(where: slice) -> tuple[Array, DirectionErrors]:
         some = rows_of(readings, where)
-        errors = direction_errors(calibration, some, *(value[where] for value in each_north))
-        return depth[where], errors if more is None else more(errors, some, where)
+        norths = (value[where] for value in each_north)
+        errors = direction_errors(calibration, some, *norths, seen and seen.part(where))
+        return depth[where], errors if more is None else more(errors, where)
 
     place, covariance, end = [], [], None
     for each in _along(len(depth), part, before):

@@ -13,7 +13,7 @@ from math import radians
 import numpy as np
 
 from mwdcal.calibration.readings import Readings
-from mwdcal.calibration.record import LARGEST_ANGLE_SD, Calibration, Finding
+from mwdcal.calibration.record import LARGEST_ANGLE_SD, Calibration, Finding, Slopes
 from mwdcal.errors import InputError
 from mwdcal.files.contract import AZIMUTH_KEYS, REFERENCES, check_near_misses, stated_norths
 from mwdcal.files.formats.columns import shown
@@ -271,6 +271,8 @@ def survey_angles(
     advance: Callable[[int, int], None] = lambda done, total: None,
     added: Callable[[Array, Array, Array, slice], Array] | None = None,
     starts_magnetic: bool = False,
+    vectors: tuple[Array, Array] | None = None,
+    slopes: Slopes | None = None,
 ) -> Surveys:
     """Surveys from readings, in the order in which they were taken.
 
@@ -278,7 +280,8 @@ def survey_angles(
 
     Shapes: `readings` of n stations without leading axes. Units: `switch` in radians. `advance` gets how many are
     done, and of how many. `added` gives the variance (m, 7) that some rows have besides, by their gradients
-    (m, 7, 6) and both vectors (m, 3).
+    (m, 7, 6) and both vectors (m, 3). `vectors` (n, 3) each as corrected and
+    `slopes`, where they are known already.
     Singular: at vertical azimuth and toolface are NaN, the toolface from magnetic north is not.
 
     Raises:
@@ -295,16 +298,18 @@ def survey_angles(
     sd, strengths, done = np.empty_like(value), np.empty((readings.count, 3, 3)), 0
     for part in blocks(readings):
         rows = slice(done, done + part.count)
-        g, b = calibration.fields(part)
+        g, b = (each[rows] for each in vectors) if vectors else calibration.fields(part)
         value[rows] = np.stack([OBSERVABLES[name].value(g, b) for name in SURVEY_OBSERVABLES], -1)
-        slopes = calibration.gradients(SURVEY_OBSERVABLES, part)
-        covariance = calibration.covariance(SURVEY_OBSERVABLES, part, True, slopes)
+        gradients = calibration.gradients(SURVEY_OBSERVABLES, part, (g, b))
+        covariance = calibration.covariance(
+            SURVEY_OBSERVABLES, part, True, gradients, slopes and slopes.part(rows)
+        )
         sd[rows] = np.sqrt(np.maximum(diagonal(covariance), 0.0))
         lost = without_value(calibration, part, SURVEY_OBSERVABLES, value[rows], sd[rows])
         value[rows] = np.where(lost, np.nan, value[rows])
         sd[rows] = np.where(lost, np.nan, sd[rows])
         if added is not None:
-            whole = np.sqrt(sd[rows] ** 2 + added(slopes, g, b, rows))
+            whole = np.sqrt(sd[rows] ** 2 + added(gradients, g, b, rows))
             sd[rows] = np.where(TURNS & (whole > LARGEST_ANGLE_SD), np.nan, whole)
         strengths[rows] = covariance[:, STRENGTHS, STRENGTHS]
         done = rows.stop

@@ -35,9 +35,9 @@ from mwdcal.survey.path import (
     CauseOrder,
     DirectionErrors,
     PathEnd,
+    SeenDirection,
     TieIn,
     continued_path,
-    direction_gradient,
     well_path,
 )
 from mwdcal.survey.stations import (
@@ -45,7 +45,6 @@ from mwdcal.survey.stations import (
     TOOLFACE_SWITCH,
     North,
     Surveys,
-    blocks,
     survey_angles,
 )
 from mwdcal.use.correction import RowCounts, tallied
@@ -70,6 +69,8 @@ from mwdcal.use.uncertainty import (
 # All other terms act through the formulas of the model. Its terms for declination are left out: the declination has its
 # own uncertainty (`mwdcal.survey.stations`).
 
+AddsErrors = Callable[[DirectionErrors, slice], DirectionErrors]
+"""Adds errors to those of directions at some rows."""
 DRIFT_YEARS = 1.0
 """Time after which the sensors may have drifted by as much as the model's terms for sensors, years."""
 SENSOR_CAUSES = 13
@@ -127,7 +128,7 @@ class WellErrors:
         size = biases**2 + scales**2
         size[:, 5] += axial**2
         result = (gradient**2 @ size[..., None])[..., 0]
-        systematic, random, _ = self.model.errors(hole)
+        systematic, random = self.model.errors_of_stations(hole)
         upward, sideways = ((systematic[..., i] ** 2).sum(-1) + random[..., i, i] for i in range(2))
         with np.errstate(divide="ignore", invalid="ignore"):
             azimuth = sideways / np.sin(hole.inclination) ** 2
@@ -173,18 +174,13 @@ class WellErrors:
         hole = hole_of(calibration, readings, seen, depth, 0.0, before)
         return lambda gradient, g, b, rows: self.variances(gradient, g, b, hole.part(rows))
 
-    def of_path(
-        self, calibration: Calibration, hole: Hole
-    ) -> Callable[[DirectionErrors, Readings, slice], DirectionErrors]:
+    def of_path(self, seen: SeenDirection, hole: Hole) -> AddsErrors:
         """Adds the errors of the model to those of directions at some rows of a well."""
-        return lambda errors, readings, rows: self.along(
-            errors, *calibration.fields(readings), hole.part(rows)
-        )
+        return lambda errors, rows: self.along(errors, seen.part(rows), hole.part(rows))
 
-    def along(self, errors: DirectionErrors, g: Array, b: Array, hole: Hole) -> DirectionErrors:
+    def along(self, errors: DirectionErrors, seen: SeenDirection, hole: Hole) -> DirectionErrors:
         """Errors of direction and depth along a well: those given, and those of the model."""
-        _, gradient = direction_gradient(g, b)
-        sensors = with_depth(self.moved(gradient, g, b, hole))
+        sensors = with_depth(self.moved(seen.gradient, seen.g, seen.b, hole))
         systematic, random, course = self.model.errors(hole)
         noise = np.zeros_like(random)
         noise[:, :2, :2] = errors.random
@@ -256,28 +252,23 @@ def _years(calibrated: date | None, surveyed: date | None) -> float | None:
 
 
 class SeenHole(NamedTuple):
-    """Inclination, azimuth from magnetic north, field and dip (n,) at readings."""
+    """Inclination, field and dip (n,) at readings, and the direction of the hole."""
 
     inclination: Array
-    magnetic: Array
     field: Array
     dip: Array
+    direction: SeenDirection
 
     @classmethod
     def at(cls, calibration: Calibration, readings: Readings) -> SeenHole:
         """Those that a calibrated tool sees."""
-        value, parts = {name: OBSERVABLES[name].value for name in OBSERVABLES}, []
-        for some in blocks(readings):
-            g, b = calibration.fields(some)
-            azimuth, _ = direction_gradient(g, b)
-            parts.append(
-                (value["inclination"](g, b), azimuth, value["field"](g, b), value["dip"](g, b))
-            )
-        return cls(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+        direction = SeenDirection.of_many(calibration, readings)
+        angles = (OBSERVABLES[n].value(*direction[:2]) for n in ("inclination", "field", "dip"))
+        return cls(*angles, direction)
 
     def part(self, rows: Bools) -> SeenHole:
         """Those of some readings."""
-        return SeenHole(*(each[rows] for each in self))
+        return SeenHole(*(each[rows] for each in self[:3]), self.direction.part(rows))
 
 
 def hole_of(
@@ -293,7 +284,8 @@ def hole_of(
     `before`: where its path has come to, or the position of the first station.
     Singular: at vertical the azimuth is the magnetic toolface, as of `path.direction_gradient`.
     """
-    inclination, magnetic, field, dip = seen
+    inclination, field, dip, direction = seen
+    magnetic = direction.azimuth
     angles = inclination, magnetic + north
     last: tuple[float, float, float] | None = None
     if isinstance(before, PathEnd):
@@ -321,8 +313,6 @@ model's does, 0.4 % of the azimuths that are off have a turn below one, and 1.4 
 """
 Start = tuple[float, float, float] | TieIn | PathEnd
 """Where a path starts: position of the first station, a tie-in, or the end of the part before."""
-AddsErrors = Callable[[DirectionErrors, Readings, slice], DirectionErrors]
-"""Adds errors to those of directions at some rows."""
 AXES_OF_EARTH = ("north", "east", "tvd")
 WELL_FINDINGS = {
     "rejected": "{rejected} of {judged} surveys lie outside the limits '{limits}' (first: station {first}: {why}).",
@@ -709,7 +699,10 @@ def part_of_well(
         errors = well_errors(model, calibration, readings, walk)
         depth = None if md is None else np.where(blank, np.nan, md)
         added = errors.of_surveys(calibration, readings, depth, before.path, seen)
-    angles = survey_angles(calibration, readings, switch, advance, added, before.magnetic)
+    angles = survey_angles(
+        calibration, readings, switch, advance, added, before.magnetic,
+        seen.direction[:2], seen.direction.slopes,
+    )  # fmt: skip
     surveys = _without(angles, blank, beyond)
     g, b = (np.stack([columns[name] for name in VECTORS[i : i + 3]], -1) for i in (0, 3))
     judgement, blind = _judged(calibration, readings, surveys, (g, b), limits)
@@ -808,15 +801,16 @@ def _positions(
         some = readings if whole.all() else readings.select(whole)
         offset, shared, alone = (value[whole] for value in north.of_path(len(md)))
         norths, at = (offset, shared, alone), md[whole]
-        hole = hole_of(calibration, some, seen.part(whole), at, offset, before)
-        more = None if errors is None else errors.of_path(calibration, hole)
+        seen = seen if whole.all() else seen.part(whole)
+        hole = hole_of(calibration, some, seen, at, offset, before)
+        more = None if errors is None else errors.of_path(seen.direction, hole)
         if order is not None and isinstance(before, PathEnd):
             before, more = before.widened(len(order.names)), _in_order(order, more)
         dogleg[whole] = hole.dogleg
         if not isinstance(before, TieIn | PathEnd):  # no course leads to the first station
             dogleg[np.argmax(whole)] = np.nan
         place[whole], covariance[whole], before = continued_path(
-            calibration, some, at, norths, before, more
+            calibration, some, at, norths, before, more, seen.direction
         )
     return Position(md, place, covariance, dogleg), before
 
@@ -824,8 +818,8 @@ def _positions(
 def _in_order(order: CauseOrder, more: AddsErrors | None) -> AddsErrors:
     """Adds errors, if there are more, and puts all lasting ones where those of the runs before have their places."""
 
-    def added(errors: DirectionErrors, readings: Readings, rows: slice) -> DirectionErrors:
-        return order.placed(errors if more is None else more(errors, readings, rows))
+    def added(errors: DirectionErrors, rows: slice) -> DirectionErrors:
+        return order.placed(errors if more is None else more(errors, rows))
 
     return added
 
