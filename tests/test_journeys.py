@@ -10,14 +10,16 @@ import mwdcal
 from cli_support import EXAMPLE
 
 PACKAGE = Path(mwdcal.__file__).parent
-MODULES, FUNCTIONS, FOLDERS = 68, 870, 17
+MODULES, FUNCTIONS, FOLDERS = 62, 745, 13
 TRACED = """
+import inspect
 import sys
 from pathlib import Path
 package, seen = sys.argv[1], set()
 def note(frame, event, argument):
     code = frame.f_code
-    if event == "call" and code.co_name[0] != "<" and code.co_filename.startswith(package):
+    named = code.co_flags & inspect.CO_OPTIMIZED and code.co_name[0] != "<"
+    if event == "call" and named and code.co_filename.startswith(package):
         seen.add((code.co_filename, code.co_firstlineno))
 from mwdcal.app import cli
 sys.setprofile(note)
@@ -33,7 +35,7 @@ finally:
 
 
 def journey(*arguments):
-    """The functions of the package that a command calls: (module, line of definition)."""
+    """The functions of the package that a command calls, without bodies of classes: (module, line)."""
     command = [sys.executable, "-c", TRACED, str(PACKAGE), *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, encoding="utf-8", check=True)
     lines = (line.rpartition(" ") for line in done.stderr.splitlines() if not line.startswith("!"))

@@ -264,6 +264,8 @@ def test_calibrate_refuses_what_is_no_run(simulated):
         mwdcal.calibrate(many)
     with pytest.raises(mwdcal.InputError, match="unknown option 'methd'.*Did you mean 'method'"):
         mwdcal.calibrate(simulated, methd="scalar")
+    with pytest.raises(mwdcal.InputError, match="given as `profile`, not as `tool`"):
+        mwdcal.calibrate(simulated, tool="servo")
 
 
 def test_options_by_name_are_those_of_options(run):

@@ -68,7 +68,7 @@ ITEMS = (
         "report.html",
         (
             "mwdcal example demo",
-            f"mwdcal calibrate {RUN} -o tool.json --rolltest demo/rolltest.csv --report report.html",
+            f"mwdcal calibrate {RUN} -o tool.json --report report.html",
         ),
     ),
     Item(

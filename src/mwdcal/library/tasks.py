@@ -213,6 +213,8 @@ def with_choices(options: Options | None, choices: Mapping[str, Any]) -> Options
     """Options with choices by name; None where nothing was chosen."""
     names = [field.name for field in fields(Options)]
     for name in choices:
+        if name == "tool":
+            raise InputError("a run's tool profile is given as `profile`, not as `tool`.")
         if name not in names:
             raise InputError(
                 f"unknown option '{name}'; expected one of {', '.join(names)}.{nearest(name, names)}"
