@@ -26,7 +26,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from mwdcal.library import *  # noqa: F403
+    from mwdcal.library.face import *  # noqa: F403
 
 __version__ = "0.2.0"
 
@@ -78,9 +78,9 @@ sys.modules[__name__].__class__ = _PublicNames
 def __getattr__(name: str) -> object:
     if name not in __all__:
         raise AttributeError(f"module 'mwdcal' has no attribute {name!r}")
-    from mwdcal import library
+    from mwdcal.library import face
 
-    return getattr(library, name)
+    return getattr(face, name)
 
 
 def __dir__() -> list[str]:

@@ -9,6 +9,7 @@ in hand, which is done again by others. Where results are large, `solve` writes 
 from __future__ import annotations
 
 import asyncio
+import ctypes
 import gc
 import logging
 import multiprocessing
@@ -32,10 +33,11 @@ from mwdcal.errors import InputError, reason
 from mwdcal.signals import held
 
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+KEPT_MEMORY = {"MALLOC_MMAP_THRESHOLD_": (-3, 2**25), "MALLOC_TRIM_THRESHOLD_": (-1, 2**29)}
+"""Limits of the GNU allocator by environment variable: parameter of `mallopt`, and bytes. Memory below is used again."""
 WORKER_SETTINGS = {
     **dict.fromkeys(ONE_THREAD, "1"),
-    "MALLOC_MMAP_THRESHOLD_": str(2**25),
-    "MALLOC_TRIM_THRESHOLD_": str(2**26),
+    **{name: str(size) for name, (_, size) in KEPT_MEMORY.items()},
     "JE_ARROW_MALLOC_CONF": "background_thread:false",
 }
 """Environment of a worker: there is one per core, and it keeps the memory that it will need again.
@@ -79,6 +81,7 @@ def preparing(workers: int | None) -> Iterator[None]:
     `workers`: None for one per core. The command computes with one thread, as they do.
     """
     context = _context()
+    _keep_memory()
     with _settings_of_workers():
         if (workers or os.cpu_count() or 1) > 1 and context.get_start_method() == "forkserver":
             resource_tracker.ensure_running()  # its start would unblock the interruption again
@@ -100,6 +103,14 @@ def results(
     if workers == 1 or len(tasks) == 1:
         return ((index, steps(task)) for index, task in enumerate(tasks))
     return _on_cores(steps, tasks, min(workers, len(tasks), MOST_PROCESSES))
+
+
+def _keep_memory() -> None:
+    """Have this process use its memory again as workers do, where the C library can be told so."""
+    with suppress(AttributeError, OSError, TypeError):  # other C libraries; TypeError: Windows
+        library = ctypes.CDLL(None)
+        for parameter, size in KEPT_MEMORY.values():
+            library.mallopt(parameter, size)
 
 
 @contextmanager

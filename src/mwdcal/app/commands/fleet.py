@@ -68,8 +68,10 @@ def command(
         from mwdcal.fleet import kept
         from mwdcal.library import fleet_table
         from mwdcal.presentation import fleet as screen
-        from mwdcal.presentation import fleet_page
         from mwdcal.presentation.text import plural
+
+        if report:
+            from mwdcal.presentation import fleet_page
 
     options.check_outputs([output], [runs, tool], page=report, calibration=True)
     if calibrations:

@@ -52,6 +52,8 @@ AGREEING = 0.03
 """Readings agree that differ on no channel by more than this share of its noise."""
 NEAR = 10.0
 """Stations of one attitude differ on no channel by more than so many times its noise."""
+ROWS_AT_ONCE = 256
+"""Stations whose distances to all others are worked out at once."""
 COINCIDENCE = 1e-3
 """Chance below which as many pairs of measurements that agree are not a coincidence."""
 LEAST_STEP = 1e-3
@@ -97,18 +99,18 @@ def _noise_in_residuals(result: Fit) -> Array:
 
 def _copies(rows: Array) -> Bools:
     """Stations (n,) of one run that agree with an earlier one, of readings (n, k) in units of their noise."""
-    from scipy.spatial import KDTree
-
-    tree = KDTree(rows)
-    within = np.asarray(tree.count_neighbors(tree, [AGREEING, NEAR], p=np.inf)).tolist()
-    pairs, near = (int(count - len(rows)) // 2 for count in within)
-    alone = float(np.prod([_agreement(resolution(each)) for each in rows.T]))
-    if not pairs or _at_least(pairs, near, alone) >= COINCIDENCE:
-        return np.zeros(len(rows), bool)
-    distinct, first, which = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    tree = KDTree(distinct)
-    earliest = [first[tree.query_ball_point(row, AGREEING, p=np.inf)].min() for row in distinct]
-    return np.asarray(np.array(earliest)[which.ravel()] < np.arange(len(rows)))
+    pairs, near, repeated = 0, 0, np.zeros(len(rows), bool)
+    for first in range(0, len(rows), ROWS_AT_ONCE):
+        some = slice(first, first + ROWS_AT_ONCE)
+        earlier = np.arange(len(rows)) < np.arange(len(rows))[some, None]
+        apart = np.max([np.abs(each[some, None] - each) for each in rows.T], axis=0)
+        agreeing = earlier & (apart <= AGREEING)
+        pairs += np.count_nonzero(agreeing)
+        near += np.count_nonzero(earlier & (apart <= NEAR))
+        repeated[some] = agreeing.any(-1)
+    alone = float(np.prod([_agreement(resolution(each)) for each in rows.T])) if pairs else 1.0
+    coincident = not pairs or _at_least(pairs, near, alone) >= COINCIDENCE
+    return np.zeros(len(rows), bool) if coincident else repeated
 
 
 def _agreement(step: float) -> float:

@@ -208,7 +208,9 @@ LEAST_ALIKE = 0.4
 NOTHING_LEFT, CLEARLY_LEFT = 1e-10, 1e-2
 """Between these it depends on the sensors whether a direction counts: a bound takes its gain, and asks for less."""
 GAINS = np.geomspace(1, 1e4, 1000)
-"""Ratios of variances at which the chance of noise is worked out."""
+"""Ratios of variances at which the chance of noise is worked out…"""
+GAIN_STRIDE = 32
+"""…at every so many of them first, and then between two."""
 
 
 def may_show(result: Fit) -> Bools:
@@ -492,9 +494,16 @@ def least_gain(directions: int, rest: float) -> float:
     0.056
     """
     rest -= directions
-    many = np.full(GAINS.shape, float(directions))
-    chance = f_test(GAINS * directions, many, np.ones(()), np.full(GAINS.shape, rest))
-    ratio = GAINS[max(int(np.sum(~(chance < EFFECT_CHANCE))) - 1, 0)] * directions
+
+    def possible(gains: Array) -> int:
+        """How many of the gains noise alone may have: the first ones."""
+        many = np.full(gains.shape, float(directions))
+        chance = f_test(gains * directions, many, np.ones(()), np.full(gains.shape, rest))
+        return int(np.sum(~(chance < EFFECT_CHANCE)))
+
+    before = max(possible(GAINS[::GAIN_STRIDE]) - 1, 0) * GAIN_STRIDE
+    last = max(before + possible(GAINS[before : before + GAIN_STRIDE]) - 1, 0)
+    ratio = GAINS[last] * directions
     return float(ratio / (ratio + max(rest, 1.0)))
 
 

@@ -64,11 +64,20 @@ class Alike:
         masks = [constant.mask for constant in evidence.constants]
         arrays = [*evidence.known.values(), evidence.include, problem.temperature, *masks]
         names = [str(len(problem.triads)), *(constant.name for constant in evidence.constants)]
-        each = [array[0].tobytes() for array in (*arrays, state.attitude)]
-        return cls((*names, *each), *take((problem, state), np.arange(1)))
+        references = (*names, *(array[0].tobytes() for array in (*arrays, state.attitude)))
+        if references not in _DESIGNS:
+            if len(_DESIGNS) >= MOST_DESIGNS:
+                _DESIGNS.clear()
+            _DESIGNS[references] = cls(references, *take((problem, state), np.arange(1)))
+        return _DESIGNS[references]
 
 
-@lru_cache(maxsize=16)
+MOST_DESIGNS = 16
+"""Designs whose first members are kept: to take these out of a batch with drifts costs as much as a product of all."""
+_DESIGNS: dict[tuple[bytes | str, ...], Alike] = {}
+
+
+@lru_cache(maxsize=MOST_DESIGNS)
 def perfect(design: Alike) -> tuple[Problem, State]:
     """A design as sensors without error and with noise of one would read it."""
     problem, state = design.problem, design.state
@@ -192,7 +201,7 @@ def applies(problem: Problem) -> bool:
     return walks and are_common(problem)
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=MOST_DESIGNS)
 def walk_columns(design: Alike, alone: bool = False) -> WalkColumns:
     """Effect of the drift terms on the readings of the triads; `alone`: with the sensors' parameters known."""
     perfect_problem, at = perfect(design)
