@@ -13,7 +13,7 @@ compared as polynomials of temperature of the lowest order among the calibration
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 from functools import cached_property, lru_cache
@@ -55,6 +55,18 @@ DAYS_PER_YEAR = 365.25
 def years(days: Sequence[date]) -> Array:
     """Years (n,) since the first of some days."""
     return np.array([(day - days[0]).days / DAYS_PER_YEAR for day in days])
+
+
+def by_kind(kinds: Iterable[Hashable]) -> list[list[int]]:
+    """The places of each kind, in the order in which the kinds first appear.
+
+    >>> by_kind("aba")
+    [[0, 2], [1]]
+    """
+    places: dict[Hashable, list[int]] = {}
+    for place, kind in enumerate(kinds):
+        places.setdefault(kind, []).append(place)
+    return list(places.values())
 
 
 @dataclass(frozen=True)
@@ -130,7 +142,7 @@ class History:
     parameters, nothing along directions that it leaves free. `freedom` (…, n, p): degrees of freedom of
     the noise estimate behind each parameter, infinite where there is none; `pooled` (…, n, p): those of a triad
     that are so marked are of one estimate. `years` (…, n) since the first.
-    `has_prior` (n,): calibrations made with another of these as their prior, or None: none.
+    `has_prior` (…, n): calibrations made with another of these as their prior, or None: none.
     `names` (p,): "accelerometer bias-x"; a name with a `·` is a power of temperature.
     """
 
@@ -142,6 +154,18 @@ class History:
     pooled: Bools
     years: Array
     has_prior: Bools | None = None
+
+    @classmethod
+    def of(cls, tools: Sequence[History]) -> History:
+        """The histories of tools with as many calibrations in the same parameters, as one."""
+        parts = (
+            np.stack([getattr(tool, part) for tool in tools])
+            for part in ("values", "covariance", "precision", "freedom", "pooled", "years")
+        )
+        prior = [
+            np.zeros(t.years.shape, bool) if t.has_prior is None else t.has_prior for t in tools
+        ]
+        return cls(tools[0].names, *parts, np.stack(prior))
 
     @property
     def steady(self) -> Ints:
@@ -262,24 +286,47 @@ class Increments:
     @classmethod
     def of(cls, history: History, places: Sequence[int]) -> Increments:
         """Those of the calibrations that have all parameters of the group and none of the others as a prior."""
-        values, covariance = history.values[:, places], history.covariance
-        block = covariance[:, places][..., places]
-        known = np.diagonal(history.precision, axis1=-2, axis2=-1)[:, places]
-        independent = True if history.has_prior is None else ~history.has_prior
-        usable = np.flatnonzero(np.isfinite(values).all(-1) & (known > 0).all(-1) & independent)
-        gaps = np.diff(history.years[usable])
-        apart = gaps > VISIT
-        count, size = int(np.count_nonzero(apart)), len(places)
-        if not count or not size:
-            return cls(np.zeros(0), np.zeros(0))
-        gaps, step = gaps[apart], np.diff(np.eye(len(usable)), axis=0)[apart]
-        noise = np.zeros((count, size, count, size))
-        for column, calibration in enumerate(usable):
-            weight = step[:, column, None] * step[:, column] / np.sqrt(np.outer(gaps, gaps))
-            noise += weight[:, None, :, None] * block[calibration][None, :, None, :]
-        spread, axes = np.linalg.eigh(noise.reshape(count * size, count * size))
-        change = (step @ values[usable] / np.sqrt(gaps)[:, None]).ravel()
-        return cls(change @ axes, np.maximum(spread, 0.0))
+        return cls.of_tools(History.of([history]), places)[0]
+
+    @classmethod
+    def of_tools(cls, history: History, places: Sequence[int]) -> list[Increments]:
+        """The same of each of the tools (t, n, p) of a history."""
+        values = history.values[..., places]
+        known = diagonal(history.precision)[..., places]
+        usable = np.isfinite(values).all(-1) & (known > 0).all(-1)
+        usable &= True if history.has_prior is None else ~history.has_prior
+        apart = [np.diff(at[use]) > VISIT for at, use in zip(history.years, usable, strict=True)]
+        result = [cls(np.zeros(0), np.zeros(0))] * len(values)
+        for tools in by_kind(
+            (u.tobytes(), a.tobytes()) for u, a in zip(usable, apart, strict=True)
+        ):
+            kept, gap = np.flatnonzero(usable[tools[0]]), apart[tools[0]]
+            if gap.any():
+                some = np.ix_(tools, kept)
+                block = history.covariance[some][..., places, :][..., places]
+                gaps = np.diff(history.years[some])[:, gap]
+                changes = cls._white(values[some], block, gaps, gap)
+                for tool, one in zip(tools, changes, strict=True):
+                    result[tool] = one
+        return result
+
+    @classmethod
+    def _white(
+        cls, values: Array, covariance: Array, gaps: Array, apart: Bools
+    ) -> list[Increments]:
+        """Of values (t, n, s) of covariance (t, n, s, s) with gaps (t, m), years, where they are `apart` (n - 1,)."""
+        step = np.diff(np.eye(values.shape[1]), axis=0)[apart]
+        root = np.sqrt(gaps)
+        weights = step[:, None] * step / (root[:, :, None, None] * root[:, None, :, None])
+        noise = np.zeros((len(values), *2 * (len(step), values.shape[-1])))
+        for weight, block in zip(
+            np.moveaxis(weights, -1, 0), covariance.swapaxes(0, 1), strict=True
+        ):
+            noise += weight[:, :, None, :, None] * block[:, None, :, None, :]
+        size = len(step) * values.shape[-1]
+        spread, axes = np.linalg.eigh(noise.reshape(-1, size, size))
+        change = (step @ values / root[..., None]).reshape(-1, 1, size) @ axes
+        return [cls(*each) for each in zip(change[:, 0], np.maximum(spread, 0.0), strict=True)]
 
     def log_likelihood(self, rates: Array) -> Array:
         """Log likelihood (r,) of rates (r,), but for a constant."""
@@ -694,9 +741,10 @@ def change_tests(histories: Sequence[History], level: float = CHANGE_LEVEL) -> l
     By `FIRST_DRAWS` where they show a tool to be unchanged, else by `NULL_DRAWS`. A tool is then called changed
     only where all draws call it so, and so with a probability of at most the level where nothing changed.
     """
-    contrasts = Contrasts(np.stack([history.precision for history in histories]))
-    departures = contrasts.departures(np.stack([history.values for history in histories]))
-    pull, steady = contrasts.pull(departures), histories[0].steady
+    together = History.of(histories)
+    contrasts, steady = Contrasts(together.precision), together.steady
+    departures = contrasts.departures(together.values)
+    pull = contrasts.pull(departures)
     sums = contrasts.sums(pull)[..., 0]
     scores = np.where(contrasts.known, sums / contrasts._sizes, np.nan)
     misfits = contrasts.misfits(departures, pull)[..., 0]
