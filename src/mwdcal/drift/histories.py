@@ -699,20 +699,21 @@ def departures(tool: ToolHistory, outlook: Outlook) -> list[Departure]:
     None of an angle that rests on what one of two calibrations lacks or leaves undetermined.
     """
     history, columns, result = tool.history, outlook.columns, []
-    days, free = tool.compared_days, [rows[:, columns] for rows in tool.free]
-    values, covariance = history.values[:, columns], history.covariance[:, columns][..., columns]
+    moved = np.diff(history.values[:, columns], axis=0)
+    covariance = history.covariance[:, columns][..., columns]
+    covariance = covariance[:-1] + covariance[1:]
+    visits = list(pairwise(tool.compared_days))
     for growth in outlook.growths:
-        seen = np.flatnonzero(np.abs(growth.changes).max(0) > 0)
-        rows, moved = growth.changes[:, seen], np.diff(values[:, seen], axis=0)
-        known = ~np.isnan(moved).any(-1)
-        alone = [not np.any(np.abs(rows @ unknown[:, seen].mT) > FREE_SHARE) for unknown in free]
-        sizes = np.abs(np.nan_to_num(moved) @ rows.mT)
-        for k, (start, end) in enumerate(pairwise(days)):
-            if (end - start).days > VISIT_DAYS and known[k] and alone[k] and alone[k + 1]:
-                place = np.argmax(sizes[k])
-                both = covariance[k : k + 2, seen][..., seen].sum(0)
-                sd = float(np.sqrt(rows[place] @ both @ rows[place]))
-                result.append(Departure(growth.angle, start, end, float(sizes[k, place]), sd))
+        rows = growth.changes
+        unknown = np.asarray(np.isnan(moved[:, np.abs(rows).max(0) > 0]).any(-1))
+        free = [bool(np.any(np.abs(rows @ each[:, columns].mT) > FREE_SHARE)) for each in tool.free]
+        changes = np.abs(np.nan_to_num(moved) @ rows.mT)
+        row = rows[np.argmax(changes, -1)]
+        sizes = changes.max(-1).tolist()
+        sd = np.sqrt(np.einsum("kp,kpq,kq->k", row, covariance, row)).tolist()
+        for k, (start, end) in enumerate(visits):
+            if (end - start).days > VISIT_DAYS and not (unknown[k] or free[k] or free[k + 1]):
+                result.append(Departure(growth.angle, start, end, sizes[k], sd[k]))
     return sorted(result, key=lambda departure: departure.start)
 
 

@@ -158,14 +158,19 @@ class History:
     @classmethod
     def of(cls, tools: Sequence[History]) -> History:
         """The histories of tools with as many calibrations in the same parameters, as one."""
-        parts = (
-            np.stack([getattr(tool, part) for tool in tools])
-            for part in ("values", "covariance", "precision", "freedom", "pooled", "years")
-        )
-        prior = [
+        priors = (
             np.zeros(t.years.shape, bool) if t.has_prior is None else t.has_prior for t in tools
-        ]
-        return cls(tools[0].names, *parts, np.stack(prior))
+        )
+        return cls(
+            names=tools[0].names,
+            values=np.stack([tool.values for tool in tools]),
+            covariance=np.stack([tool.covariance for tool in tools]),
+            precision=np.stack([tool.precision for tool in tools]),
+            freedom=np.stack([tool.freedom for tool in tools]),
+            pooled=np.stack([tool.pooled for tool in tools]),
+            years=np.stack([tool.years for tool in tools]),
+            has_prior=np.stack([*priors]),
+        )
 
     @property
     def steady(self) -> Ints:
@@ -293,8 +298,9 @@ class Increments:
         """The same of each of the tools (t, n, p) of a history."""
         values = history.values[..., places]
         known = diagonal(history.precision)[..., places]
-        usable = np.isfinite(values).all(-1) & (known > 0).all(-1)
-        usable &= True if history.has_prior is None else ~history.has_prior
+        usable = np.asarray(np.isfinite(values).all(-1) & (known > 0).all(-1))
+        if history.has_prior is not None:
+            usable &= ~history.has_prior
         apart = [np.diff(at[use]) > VISIT for at, use in zip(history.years, usable, strict=True)]
         result = [cls(np.zeros(0), np.zeros(0))] * len(values)
         for tools in by_kind(
@@ -302,7 +308,7 @@ class Increments:
         ):
             kept, gap = np.flatnonzero(usable[tools[0]]), apart[tools[0]]
             if gap.any():
-                some = np.ix_(tools, kept)
+                some = np.ix_(np.array(tools), kept)
                 block = history.covariance[some][..., places, :][..., places]
                 gaps = np.diff(history.years[some])[:, gap]
                 changes = cls._white(values[some], block, gaps, gap)
@@ -401,12 +407,16 @@ class GroupRates:
 
         That of changes within the uncertainties is, at the least rate.
         """
-        likelihood = self.log_likelihood.sum(0)
         if tool is not None and tool.noise.size:
-            likelihood = tool.log_likelihood(self.rates)
-        return {0: "walk-unseen", len(self.decades) - 1: "walk-edge"}.get(
-            int(np.argmax(likelihood))
-        )
+            likeliest = int(np.argmax(tool.log_likelihood(self.rates)))
+        else:
+            likeliest = self._likeliest
+        return {0: "walk-unseen", len(self.decades) - 1: "walk-edge"}.get(likeliest)
+
+    @cached_property
+    def _likeliest(self) -> int:
+        """The place of the rate that is likeliest of all tools together."""
+        return int(np.argmax(self.log_likelihood.sum(0)))
 
     def probabilities(self, tools: Sequence[Increments], among: Sequence[bool]) -> Array:
         """Probability (t, r) of each rate of some tools; `among` those that the type was learnt from or not."""
@@ -679,12 +689,10 @@ class _Draws:
                 departures[:, triad] *= factors[:, None, part]
             pull = self.scaled @ departures
             each = np.einsum("kim,kim->km", departures, pull)
-            if first < PAIR_DRAWS:
-                for k, row in enumerate(pairs):
-                    few = slice(0, len(row))
-                    total = pull[k, :, few] + pull[k + 1, :, few]
-                    taken = np.einsum("im,im->m", total, self.means[k + 1] @ total)
-                    row[:] = each[k, few] + each[k + 1, few] - taken
+            for k, row in enumerate(pairs[:, part]):
+                total = pull[k, :, : len(row)] + pull[k + 1, :, : len(row)]
+                taken = np.einsum("im,im->m", total, self.means[k + 1] @ total)
+                row[:] = (each[k] + each[k + 1])[: len(row)] - taken
             for k in range(count - 1, 0, -1):
                 pull[k - 1] += pull[k]
             taken = np.einsum("im,im->m", pull[0], self.means[0] @ pull[0])

@@ -215,7 +215,7 @@ class _Past(NamedTuple):
     runs: list[lookup.Row]
 
     def records(self) -> ToolRecords:
-        """The calibrations and roll tests of the tool; there may be none."""
+        """The calibrations and roll tests of the tool, if any."""
         calibrations, digests = self.calibrations()
         return ToolRecords(self.serial, calibrations, self.tests(), digests)
 
