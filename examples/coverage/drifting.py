@@ -13,6 +13,7 @@ from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.results import StatedCovariance, unseen_drifts
+from mwdcal.estimation import drift
 from mwdcal.estimation.batch import take
 
 RUNS, SEED = 200, 20260
@@ -20,6 +21,8 @@ NOISE = (1e-4, 15.0)
 PROBES = [np.array(a, float) for a in ([20, 60, 100, 150], [10, 100, 200, 300], [15, 75, 160, 301])]
 ANGLES = ("inclination", "azimuth", "toolface", "dip")
 STEP = 1e-6
+ROUNDS = (8, drift.VARIANCE_ROUNDS, 1000)
+"""Repetitions of the estimate of variances that are compared; the last is its end."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,12 @@ class Case:
     shape: str
     order: str
     declared: str = "–"
+
+    @property
+    def words(self) -> str:
+        """The drift in words."""
+        unit = "nT" if self.kind == "field" else "mg"
+        return f"{self.kind} {self.size:g} {unit}, {self.shape}" if self.size else "none"
 
 
 def cases() -> list[Case]:
@@ -108,10 +117,16 @@ def corrected(result: Fit, place: int, params: Array, raw: tuple[Array, Array]) 
     return world.angles(*vectors)
 
 
-def scores(case: Case, rng: np.random.Generator) -> tuple[dict[str, float], float, float]:
-    """Shares of intervals that hold the truth, by quantity, of runs with a drift fitted, and with one unseen."""
+def scores(
+    case: Case, rng: np.random.Generator
+) -> tuple[dict[str, float], float, float, dict[str, float]]:
+    """Shares of intervals that hold the truth, by quantity, of runs with a drift fitted, and with one unseen.
+
+    And 1σ of each angle, degrees, root mean square.
+    """
     readings, tools = simulated(rng, case)
     options, hits, drifted = Options(order=0), {name: [] for name in ("parameters", *ANGLES)}, 0
+    widths: dict[str, list[Array]] = {name: [] for name in ANGLES}
     plain = fit(readings, options)
     unseen = [unseen_drifts(take(plain, [k])) for k in range(RUNS)]
     hidden = np.mean([f"{case.kind}-drift" in each if case.size else bool(each) for each in unseen])
@@ -137,8 +152,11 @@ def scores(case: Case, rng: np.random.Generator) -> tuple[dict[str, float], floa
                     np.stack([world.turned(each[name] - middle[name]) for each in moved], -1) / STEP
                 )
                 spread = np.linalg.norm(slope @ root, axis=-1)
+                widths[name] += [spread]
                 hits[name] += [np.abs(world.turned(middle[name] - truth[name])) < 1.96 * spread]
-    return {name: float(np.mean(each)) for name, each in hits.items()}, drifted / RUNS, hidden
+    shares = {name: float(np.mean(each)) for name, each in hits.items()}
+    sigmas = {name: float(np.sqrt(np.mean(np.square(each)))) for name, each in widths.items()}
+    return shares, drifted / RUNS, hidden, sigmas
 
 
 def exact(result: Fit, row: int, pair: tuple[world.Triad, world.Triad]) -> Array:
@@ -153,13 +171,31 @@ def exact(result: Fit, row: int, pair: tuple[world.Triad, world.Triad]) -> Array
     return np.concatenate(parts)
 
 
+def by_rounds() -> list[list[str]]:
+    """Rows of some drifts, the same runs with variances after 8, 25 and 1000 rounds."""
+    there = "there and back"
+    some = [Case("field", 0, "walk", there), Case("field", 20, "walk", there)]
+    some += [Case("accelerometer", 0.1, shape, there) for shape in ("walk", "trend")]
+    some.append(Case("field", 60, "walk", "mixed"))
+    usual, rows = drift.VARIANCE_ROUNDS, []
+    for number, case in enumerate(some):
+        for rounds in ROUNDS:
+            drift.VARIANCE_ROUNDS = rounds
+            shares, _, _, sigmas = scores(case, np.random.default_rng([SEED, number]))
+            cells = [world.percent(share) for share in shares.values()]
+            cells += [f"{sigmas[name]:.4f}°" for name in ANGLES[:2]]
+            rows.append([case.words, case.order, str(rounds), *cells])
+            print(*rows[-1], sep="  ", flush=True)
+    drift.VARIANCE_ROUNDS = usual
+    return rows
+
+
 def main() -> None:
     """Simulate every row and write the page."""
     rng, rows = np.random.default_rng(SEED), []
     for case in cases():
-        shares, drifted, hidden = scores(case, rng)
-        unit = "nT" if case.kind == "field" else "mg"
-        what = f"{case.kind} {case.size:g} {unit}, {case.shape}" if case.size else "none"
+        shares, drifted, hidden, _ = scores(case, rng)
+        what = case.words
         cells = [world.percent(share) for share in shares.values()]
         rows.append([what, case.order, case.declared, f"{drifted:.0%}", f"{hidden:.0%}", *cells])
         print(*rows[-1], sep="  ", flush=True)
@@ -172,7 +208,9 @@ def main() -> None:
         "parameters",
         *ANGLES,
     ]
+    more = ["drift", "directions", "rounds", "parameters", *ANGLES, "1σ inclination", "1σ azimuth"]
     world.write("drifting", "Drift within a run", INTRODUCTION, world.table(heads, rows),
+                VARIANCES, world.table(more, by_rounds()),
                 facts={"Runs of each row": RUNS, "Seed": SEED})  # fmt: skip
 
 
@@ -197,6 +235,13 @@ attitude and hides in gains and misalignments. No residual shows it, and those i
 drift is declared. A calibration says what it takes for granted, and what a small drift would do (`unseen`). Measure
 there and back, or mix the directions; or declare the drift: the last rows hold what they state. Trends are covered
 too often, because a calibration cannot know at which moment of the run its tool will be used.
+"""
+
+VARIANCES = """
+## How long the variances are iterated
+
+mwdcal stops Schall's iteration for the variances of a drift after 25 rounds, before its maximum. The same runs with
+fewer and more rounds, 1σ as root mean square over the runs:
 """
 
 if __name__ == "__main__":

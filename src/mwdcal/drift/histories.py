@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import date, timedelta
 from functools import cached_property
 from itertools import pairwise
@@ -303,7 +303,7 @@ class _Form:
 
         The ratio, where nominal scales differ by more than a sensor's can, and by it the scales differ less.
         """
-        last = self._last(triad.name)
+        last = self._latest[triad.name]
         now, then = (getattr(c.profile, triad.name).scale or 1.0 for c in (last, calibration))
         ratio = float(then / now)
         if abs(np.log(ratio)) <= np.log1p(SCALE_CHANGE):
@@ -325,17 +325,23 @@ class _Form:
         Their readings are in a unit of which the latest's is `unit_ratio`.
         """
         x, first = self._points[name], alike[0]
-        axes = unit_ratio * (_axes(first, name) @ np.linalg.inv(_axes(self._last(name), name)))
+        axes = unit_ratio * (_axes(first, name) @ np.linalg.inv(_axes(self._latest[name], name)))
         model = getattr(first, name).functions(first.reference_temperature)
         raw, order = x @ axes.transpose(), self.orders[name]
         parameters = np.array([getattr(each, name).parameters for each in alike])
         result = factored(model, parameters, raw, self.span, order, x)
         return result.values, result.jacobian
 
-    def _last(self, triad: str) -> Calibration:
-        """The latest calibration of a triad: one in nT before one to field = 1."""
-        having = [each for each in self.compared if getattr(each, triad) is not None]
-        return next((c for c in reversed(having) if not self._unknown(c, triad)), having[-1])
+    @cached_property
+    def _latest(self) -> dict[str, Calibration]:
+        """The latest calibration of each triad: one in nT before one to field = 1."""
+        result = {}
+        for triad in TRIADS:
+            having = [each for each in self.compared if getattr(each, triad) is not None]
+            known = (each for each in reversed(having) if not self._unknown(each, triad))
+            if having:
+                result[triad] = next(known, having[-1])
+        return result
 
     @staticmethod
     def _unknown(calibration: Calibration, triad: str) -> bool:
@@ -349,7 +355,7 @@ class _Form:
 
     def _readings(self, triad: str) -> Array:
         """Those of one triad."""
-        last = self._last(triad)
+        last = self._latest[triad]
         strength = last.earth.get("field", 1.0) if triad == TRIADS[1] else last.earth["gravity_g"]
         model = getattr(last, triad).functions(last.reference_temperature)
         warmth = np.full(len(FIELD_DIRECTIONS), np.clip(sum(self.span) / 2, *_range(last)))
@@ -359,7 +365,7 @@ class _Form:
 
     def _strength(self, calibration: Calibration, triad: str) -> float:
         """The field that a triad calibrated to field = 1 is taken to have been in, where others are in nT."""
-        last = self._last(triad)
+        last = self._latest[triad]
         alike = self._unknown(calibration, triad) == self._unknown(last, triad)
         return 1.0 if alike else float(last.earth["field"])
 
@@ -374,7 +380,7 @@ class _Form:
 
     def earth(self) -> tuple[float, float, float]:
         """Gravity, g, field, in the unit of the values, and dip, radians."""
-        earth = self._last(TRIADS[-1] if TRIADS[-1] in self.orders else TRIADS[0]).earth
+        earth = self._latest[TRIADS[-1] if TRIADS[-1] in self.orders else TRIADS[0]].earth
         return (
             earth["gravity_g"],
             earth.get("field", 1.0),
@@ -407,7 +413,7 @@ class _Form:
             yield NOTES["unit"].format(triad=name)
         if triad.curved:
             yield NOTES["curved"].format(triad=name)
-        latest = getattr(self._last(name), name).model
+        latest = getattr(self._latest[name], name).model
         if compared and triad.model != latest:
             yield NOTES["model"].format(triad=name, model=triad.model, latest=latest)
         if triad.order > compared:
@@ -418,7 +424,7 @@ class _Form:
         triad, _, title = name.partition(" ")
         if title.startswith("misalignment"):
             return DEGREES
-        last = self._last(triad)
+        last = self._latest[triad]
         field = "" if last.relative and triad == TRIADS[1] else NANOTESLA
         return "" if title.startswith("scale") else ("g" if triad == TRIADS[0] else field)
 
@@ -596,32 +602,52 @@ class Outlook:
 
 def outlook(tool: ToolHistory) -> Outlook:
     """The outlook of the latest calibration; no growth of an angle that it leaves undetermined."""
-    latest, names = tool.calibrations[-1], tool.history.names
-    size, triads = 12, [triad.name for triad in latest.triads]
+    return outlooks([tool])[0]
+
+
+def outlooks(tools: Sequence[ToolHistory]) -> list[Outlook]:
+    """The outlooks of tools in the same parameters, whose latest calibrations have as many triads."""
+    latest, names = [tool.calibrations[-1] for tool in tools], tools[0].history.names
+    triads = [triad.name for triad in latest[0].triads]
     columns = [names.index(f"{triad} {title}") for triad in triads for title in FACTOR_NAMES]
-    values = tool.history.values[-1][columns].reshape(len(triads), size)
-    steady = [names[place] for place in columns]
-    places = {group: group_places(steady, *group) for group in WALK_GROUPS}
+    places = {group: group_places([names[i] for i in columns], *group) for group in WALK_GROUPS}
     units = np.zeros((len(WALK_GROUPS), len(columns)))
     for row, some in zip(units, places.values(), strict=True):
         row[some] = 1.0
-    block = tool.covariance[-1][np.ix_(columns, columns)]
-    each = np.stack([block, *map(np.diag, units)])[:, None]
-    middle = sum(tool.temperature_c) / 2
-    tools = replace(
-        CalibratedTools.of(latest, middle),
-        models=(Factors(Basis(0, middle)),) * len(triads),
-        parameters=tuple(row[None] for row in values),
-        earth=np.array([tool.earth]),
-        free=tool.free[-1][None][..., columns],
+    places = {group: some for group, some in places.items() if some}
+    blocks = np.stack([tool.covariance[-1][np.ix_(columns, columns)] for tool in tools])
+    yearly = np.broadcast_to(
+        (units[:, None] * np.eye(len(columns)))[:, None], (len(units), *blocks.shape)
     )
-    changes, growths = angle_changes(tools), []
-    for angle, sd in accuracy(tools, each).items():
-        first, *others = (sd[:, 0] ** 2).tolist()
-        if np.isfinite(first):
-            yearly = {g: v for g, v in zip(WALK_GROUPS, others, strict=True) if v > 0}
-            growths.append(Growth(angle, first, yearly, changes[angle][0]))
-    return Outlook(growths, columns, {g: p for g, p in places.items() if p}, block)
+    each = np.concatenate([blocks[None], yearly])
+    together = _as_factors(tools, columns, len(triads))
+    changes, result = angle_changes(together), [Outlook([], columns, places, b) for b in blocks]
+    for angle, sd in accuracy(together, each).items():
+        for tool, (first, *others) in enumerate((sd.mT**2).tolist()):
+            if np.isfinite(first):
+                by_group = {g: v for g, v in zip(WALK_GROUPS, others, strict=True) if v > 0}
+                growth = Growth(angle, first, by_group, changes[angle][tool])
+                result[tool].growths.append(growth)
+    return result
+
+
+def _as_factors(
+    tools: Sequence[ToolHistory], columns: Sequence[int], triads: int
+) -> CalibratedTools:
+    """The latest calibrations of tools at the middle temperature, by the parameters at `columns` of their histories."""
+    values = np.stack([tool.history.values[-1][columns] for tool in tools])
+    free = [tool.free[-1][:, columns] for tool in tools]
+    directions = np.zeros((len(tools), max(map(len, free)), len(columns)))
+    for rows, some in zip(directions, free, strict=True):
+        rows[: len(some)] = some
+    return CalibratedTools(
+        models=(Factors(Basis()),) * triads,
+        parameters=tuple(np.split(values, triads, -1)),
+        earth=np.array([tool.earth for tool in tools]),
+        temperature=np.array([sum(tool.temperature_c) / 2 for tool in tools]),
+        free=directions,
+        noise=np.zeros((len(tools), triads)),
+    )
 
 
 def day_after(start: date, span: float) -> date:
@@ -673,28 +699,22 @@ def departures(tool: ToolHistory, outlook: Outlook) -> list[Departure]:
     None of an angle that rests on what one of two calibrations lacks or leaves undetermined.
     """
     history, columns, result = tool.history, outlook.columns, []
-    days, free = tool.compared_days, [rows[:, columns] for rows in tool.free]
-    for k, (start, end) in enumerate(pairwise(days)):
-        if (end - start).days <= VISIT_DAYS:
-            continue
-        moved = np.diff(history.values[k : k + 2, columns], axis=0)[0]
-        covariance = history.covariance[k : k + 2].sum(0)[np.ix_(columns, columns)]
-        unknown = np.concatenate(free[k : k + 2])
-        each = ((g.angle, _largest(g, moved, covariance, unknown)) for g in outlook.growths)
-        result += [Departure(angle, start, end, *both) for angle, both in each if both]
-    return result
-
-
-def _largest(
-    growth: Growth, moved: Array, covariance: Array, free: Array
-) -> tuple[float, float] | None:
-    """The largest change of an angle by parameters that moved, and its standard uncertainty."""
-    seen = np.abs(growth.changes).max(0) > 0
-    rows, moved = growth.changes[:, seen], moved[seen]
-    if np.isnan(moved).any() or np.any(np.abs(rows @ free[:, seen].mT) > FREE_SHARE):
-        return None
-    row = rows[np.argmax(np.abs(rows @ moved))]
-    return abs(float(row @ moved)), float(np.sqrt(row @ covariance[np.ix_(seen, seen)] @ row))
+    moved = np.diff(history.values[:, columns], axis=0)
+    covariance = history.covariance[:, columns][..., columns]
+    covariance = covariance[:-1] + covariance[1:]
+    visits = list(pairwise(tool.compared_days))
+    for growth in outlook.growths:
+        rows = growth.changes
+        unknown = np.asarray(np.isnan(moved[:, np.abs(rows).max(0) > 0]).any(-1))
+        free = [bool(np.any(np.abs(rows @ each[:, columns].mT) > FREE_SHARE)) for each in tool.free]
+        changes = np.abs(np.nan_to_num(moved) @ rows.mT)
+        row = rows[np.argmax(changes, -1)]
+        sizes = changes.max(-1).tolist()
+        sd = np.sqrt(np.einsum("kp,kpq,kq->k", row, covariance, row)).tolist()
+        for k, (start, end) in enumerate(visits):
+            if (end - start).days > VISIT_DAYS and not (unknown[k] or free[k] or free[k + 1]):
+                result.append(Departure(growth.angle, start, end, sizes[k], sd[k]))
+    return sorted(result, key=lambda departure: departure.start)
 
 
 def failures(

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import date
+from types import MappingProxyType
+from typing import NamedTuple
 from zlib import crc32
 
 import numpy as np
 from msgspec.structs import replace
 
-from mwdcal.calibration.record import Calibration, Finding, stated
+from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.drift.document import (
     AccuracyForecast,
     ChangeVerdict,
@@ -40,7 +42,7 @@ from mwdcal.drift.histories import (
     departures,
     factor,
     failures,
-    outlook,
+    outlooks,
     service_rows,
     tool_history,
 )
@@ -49,13 +51,15 @@ from mwdcal.drift.walk import (
     WALK_GROUPS,
     ChangeTest,
     GroupRates,
+    History,
     Increments,
-    change_test,
+    by_kind,
+    change_tests,
     draws,
     group_places,
     quantiles,
 )
-from mwdcal.geometry.vectors import Array
+from mwdcal.geometry.vectors import Array, diagonal
 
 CONTROL = 3.0
 """Standard deviations within which control limits lie."""
@@ -102,36 +106,69 @@ class MeasuredTool:
     groups: list[tuple[str, str] | None]
 
 
+class ToolRecords(NamedTuple):
+    """The calibrations, one or more, and roll tests of a tool.
+
+    `digests`: the SHA-256 of the file of each calibration by that of its contents, by which tests may name it.
+    """
+
+    serial: str
+    calibrations: Sequence[Calibration]
+    tests: Sequence[ServiceTest] = ()
+    digests: Mapping[str, str] = MappingProxyType({})
+
+
 def measured(
     serial: str, calibrations: Sequence[Calibration], tests: Sequence[ServiceTest] = (),
     level: float = CHANGE_LEVEL, digests: Mapping[str, str] | None = None, tested: bool = True,
 ) -> MeasuredTool:  # fmt: skip
-    """The change test and the growth of one tool.
+    """The change test and the growth of one tool; see `ToolRecords` and `all_measured`."""
+    return all_measured([ToolRecords(serial, calibrations, tests, digests or {})], level, tested)[0]
 
-    `digests`: the SHA-256 of the file of each calibration by that of its contents, by which tests may name it.
-    Not `tested`: no change test, as of a peer.
-    """
-    tool = tool_history(calibrations)
-    names, history = tool.history.names, tool.history
-    test = change_test(history, level) if tested and len(tool.compared) > 1 else None
-    places = {group: group_places(names, *group) for group in WALK_GROUPS}
-    increments = {g: Increments.of(history, some) for g, some in places.items() if some}
-    of_place = {place: group for group, some in places.items() for place in some}
-    named = [(c, _digests(c, digests or {})) for c in tool.calibrations]
-    ahead = outlook(tool)
+
+def all_measured(
+    tools: Sequence[ToolRecords], level: float = CHANGE_LEVEL, tested: bool = True
+) -> list[MeasuredTool]:
+    """The same of many tools, those of one form together. Not `tested`: no change test, as of a peer."""
+    pasts = [tool_history(tool.calibrations) for tool in tools]
+    result: dict[int, MeasuredTool] = {}
+    forms = ((p.history.names, len(p.history.years), len(p.calibrations[-1].triads)) for p in pasts)
+    for places in by_kind(forms):
+        some = [pasts[place] for place in places]
+        histories = [past.history for past in some]
+        together, names = History.of(histories), histories[0].names
+        compared = tested and len(histories[0].years) > 1
+        tests = change_tests(histories, level) if compared else [None] * len(some)
+        groups = {group: group_places(names, *group) for group in WALK_GROUPS}
+        moves = {g: Increments.of_tools(together, some) for g, some in groups.items() if some}
+        of_place = {place: group for group, members in groups.items() for place in members}
+        parts = zip(places, some, tests, outlooks(some), strict=True)
+        for row, (place, past, test, ahead) in enumerate(parts):
+            increments = {group: each[row] for group, each in moves.items()}
+            of_steady = [of_place.get(int(each)) for each in past.history.steady]
+            result[place] = _measured(tools[place], past, test, increments, ahead, of_steady)
+    return [result[place] for place in range(len(tools))]
+
+
+def _measured(
+    records: ToolRecords, tool: ToolHistory, test: ChangeTest | None,
+    increments: dict[tuple[str, str], Increments], ahead: Outlook,
+    groups: list[tuple[str, str] | None],
+) -> MeasuredTool:  # fmt: skip
+    """One tool, of which these are known."""
+    named = [(c, _digests(c, records.digests)) for c in tool.calibrations]
     drift = ToolDrift(
-        serial=serial, type=tool.calibrations[-1].profile.name,
+        serial=records.serial, type=tool.calibrations[-1].profile.name,
         simulated=any(c.simulated for c in tool.calibrations),
         temperature_c=tool.temperature_c if np.isfinite(tool.temperature_c).all() else None,
         calibrations=_calibrations(tool), parameters=_parameters(tool, test),
         change=None if test is None else _verdict(tool, test),
         basis="", peers=0, rates=[], forecast=[], due=[], next_due=None,
-        service=service_rows(named, tests), findings=[],
+        service=service_rows(named, records.tests), findings=[],
     )  # fmt: skip
-    groups = [of_place.get(int(place)) for place in history.steady]
     return MeasuredTool(
         drift, tool.compared_days[-1], increments, ahead, departures(tool, ahead),
-        list(failures(named, tests)), np.diff(history.years), groups,
+        list(failures(named, records.tests)), np.diff(tool.history.years), groups,
     )  # fmt: skip
 
 
@@ -153,25 +190,31 @@ def _calibrations(tool: ToolHistory) -> list[ComparedCalibration]:
 
 def _parameters(tool: ToolHistory, test: ChangeTest | None) -> list[ParameterCourse]:
     """The parameters at the middle temperature; control limits are still missing."""
-    history, courses = tool.history, []
-    sd = np.sqrt(np.maximum(np.diagonal(tool.covariance, axis1=-2, axis2=-1), 0.0))
-    known = np.diagonal(history.precision, axis1=-2, axis2=-1) > 0
-    sd = np.where(known, sd, np.nan)
+    history, steady = tool.history, tool.history.steady
+    times = np.array([factor(tool.units[place]) for place in steady])
+    known = diagonal(history.precision) > 0
+    sd = np.where(known, np.sqrt(np.maximum(diagonal(tool.covariance), 0.0)), np.nan)
+    scores = np.full((1, len(known[0])), np.nan) if test is None else np.abs(test.scores)
+    largest = np.where(np.isnan(scores), -np.inf, scores).max(0)
+    columns = (_stated(each[:, steady] * times) for each in (history.values, sd))
+    rows = zip(steady.tolist(), *columns, largest[steady].tolist(), strict=True)
     nothing: list[float | None] = [None] * len(sd)
-    for place in history.steady.tolist():
+    courses = []
+    for place, values, uncertainties, score in rows:
         triad, _, name = history.names[place].partition(" ")
-        scores = np.abs(test.scores[:, place]) if test else np.full(1, np.nan)
-        times = factor(tool.units[place])
         courses.append(
             ParameterCourse(
-                triad=triad, name=name, unit=tool.units[place],
-                values=[stated(v) for v in history.values[:, place] * times],
-                standard_uncertainties=[stated(s) for s in sd[:, place] * times],
-                low=nothing, high=nothing, outside=[False] * len(sd),
-                score=None if np.isnan(scores).all() else float(np.nanmax(scores)),
+                triad=triad, name=name, unit=tool.units[place], values=values,
+                standard_uncertainties=uncertainties, low=nothing, high=nothing,
+                outside=[False] * len(sd), score=score if score >= 0 else None,
             )
         )  # fmt: skip
     return courses
+
+
+def _stated(values: Array) -> list[list[float | None]]:
+    """Columns of numbers (n, k) as a file has them: None for NaN."""
+    return [[None if v != v else v for v in column] for column in values.mT.tolist()]
 
 
 def _verdict(tool: ToolHistory, test: ChangeTest) -> ChangeVerdict:
@@ -267,24 +310,29 @@ def _predicted(
     usable = [g for g in tool.outlook.growths if set(g.yearly) <= set(known)]
     rng = np.random.default_rng(crc32(serial.encode()))
     drawn = {group: draws(*each, DRAWN_PATHS, rng) for group, each in known.items()}
+    spread = {group: quantiles(*each, INTERVAL) for group, each in known.items()}
     left = _shortest(tool, limits)
     latest = date.max if left is None else tool.calibrated + left.span
     due, days = [], [] if left is None else [latest.isoformat()]
     if judged := [g for g in usable if g.angle in limits]:
         paths = Paths.of(tool.outlook.covariance, tool.outlook.places, drawn, rng)
-        kept, error = zip(
-            *(g.kept(paths, np.radians(limits[g.angle])) for g in judged), strict=True
+        kept, error = map(
+            np.stack,
+            zip(*(g.kept(paths, np.radians(limits[g.angle])) for g in judged), strict=True),
         )
-        due = [_due(tool, *each, latest, limits) for each in zip(judged, kept, error, strict=True)]
-        days.append(_day(tool, float(np.quantile(np.min(kept, 0), RISK))))
+        spans = np.quantile([*kept, kept.min(0)], INTERVAL, axis=-1).mT
+        now = np.degrees(np.quantile(error, 1 - RISK, axis=-1)).tolist()
+        each = zip(judged, spans[:-1].tolist(), now, strict=True)
+        due = [_due(tool, *one, latest, limits) for one in each]
+        days.append(_day(tool, float(spans[-1, 0])))
     several = any(each.noise.size for each in tool.increments.values())
     drift = replace(
         drift,
         basis=(TOOL_AND_PEERS if several else PEERS) if known else "",
         peers=len(rates.members - {serial}),
-        rates=_rates(drift, known),
-        parameters=_controlled(tool, known),
-        forecast=[_forecast(g, g.rate(drawn)) for g in usable],
+        rates=_rates(drift, spread),
+        parameters=_controlled(tool, spread),
+        forecast=_forecasts(usable, drawn),
         due=due,
         next_due=min(days, default=None),
     )
@@ -309,52 +357,52 @@ def _of_the_walk(tool: MeasuredTool, rates: TypeRates) -> list[Finding]:
     return [_said(side, groups=", ".join(groups)) for side, groups in sides.items() if groups]
 
 
-def _rates(drift: ToolDrift, known: Mapping[tuple[str, str], Distribution]) -> list[WalkRate]:
+def _rates(drift: ToolDrift, spread: Mapping[tuple[str, str], Array]) -> list[WalkRate]:
     """The rates in words: what a parameter moves by in a year."""
     units = {(p.triad, p.name.partition("-")[0]): p.unit for p in drift.parameters}
-    rows = []
-    for (triad, kind), distribution in known.items():
-        rows.append(walk_rate(triad, kind, units[triad, kind], distribution))
-    return rows
+    return [walk_rate(*group, units[group], rates) for group, rates in spread.items()]
 
 
-def walk_rate(triad: str, kind: str, unit: str, distribution: Distribution) -> WalkRate:
-    """A distribution over rates in words."""
-    low, middle, high = (np.sqrt(quantiles(*distribution, INTERVAL)) * factor(unit)).tolist()
+def walk_rate(triad: str, kind: str, unit: str, rates: Array) -> WalkRate:
+    """The quantiles `INTERVAL` of a rate in words."""
+    low, middle, high = (np.sqrt(rates) * factor(unit)).tolist()
     return WalkRate(triad=triad, kind=kind, unit=unit, per_root_year=middle, low=low, high=high)
 
 
 def _controlled(
-    tool: MeasuredTool, known: Mapping[tuple[str, str], Distribution]
+    tool: MeasuredTool, spread: Mapping[tuple[str, str], Array]
 ) -> list[ParameterCourse]:
     """The parameters with control limits: from each calibration to the next, by walk and uncertainties."""
-    courses = []
-    for course, group in zip(tool.drift.parameters, tool.groups, strict=True):
-        rate = float(quantiles(*known[group], [0.5])[0]) if group and group in known else 0.0
-        rate *= factor(course.unit) ** 2
-        low: list[float | None] = [None]
-        high: list[float | None] = [None]
-        outside = [False]
-        values, sds = course.values, course.standard_uncertainties
-        for k, gap in enumerate(tool.gaps.tolist()):
-            (v, w), (s, u) = values[k : k + 2], sds[k : k + 2]
-            if v is None or w is None or s is None or u is None:
-                low, high, outside = [*low, None], [*high, None], [*outside, False]
-                continue
-            half = CONTROL * float(np.sqrt(s**2 + u**2 + rate * gap))
-            low, high, outside = [*low, v - half], [*high, v + half], [*outside, abs(w - v) > half]
-        courses.append(replace(course, low=low, high=high, outside=outside))
-    return courses
+    courses, nothing = tool.drift.parameters, np.zeros(len(INTERVAL))
+    values = np.array([course.values for course in courses], float)
+    sd = np.array([course.standard_uncertainties for course in courses], float)
+    rates = [spread.get(group, nothing)[1] if group else 0.0 for group in tool.groups]
+    yearly = np.array(rates) * np.array([factor(course.unit) ** 2 for course in courses])
+    half = CONTROL * np.sqrt(sd[:, :-1] ** 2 + sd[:, 1:] ** 2 + yearly[:, None] * tool.gaps)
+    half[np.isnan(values[:, 1:])] = np.nan
+    outside = np.abs(np.diff(values)) > half
+    limits = (_stated((values[:, :-1] + sign * half).mT) for sign in (-1, 1))
+    return [
+        replace(course, low=[None, *low], high=[None, *high], outside=[False, *beyond])
+        for course, low, high, beyond in zip(courses, *limits, outside.tolist(), strict=True)
+    ]
 
 
-def _forecast(growth: Growth, yearly: Array) -> AccuracyForecast:
-    """1σ over time: the median, and the interval of the rates."""
-    rates = np.quantile(yearly, INTERVAL)
-    sd = np.degrees(np.sqrt(growth.calibration + rates[:, None] * TIMES))
-    low, middle, high = sd.tolist()
-    return AccuracyForecast(
-        angle=growth.angle, years=TIMES.tolist(), sd_deg=middle, low_deg=low, high_deg=high
-    )
+def _forecasts(
+    growths: Sequence[Growth], drawn: Mapping[tuple[str, str], Array]
+) -> list[AccuracyForecast]:
+    """1σ of each angle over time: the median, and the interval of the rates."""
+    if not growths:
+        return []
+    rates = np.quantile([g.rate(drawn) for g in growths], INTERVAL, axis=-1)
+    now = np.array([g.calibration for g in growths])
+    sd = np.degrees(np.sqrt(now[:, None] + rates[..., None] * TIMES))
+    return [
+        AccuracyForecast(
+            angle=growth.angle, years=TIMES.tolist(), sd_deg=middle, low_deg=low, high_deg=high
+        )
+        for growth, low, middle, high in zip(growths, *sd.tolist(), strict=True)
+    ]
 
 
 def _day(tool: MeasuredTool, span: float) -> str:
@@ -363,15 +411,16 @@ def _day(tool: MeasuredTool, span: float) -> str:
 
 
 def _due(
-    tool: MeasuredTool, growth: Growth, kept: Array, error: Array, latest: date,
+    tool: MeasuredTool, growth: Growth, spans: Sequence[float], now: float, latest: date,
     limits: Mapping[str, float],
 ) -> DueDate:  # fmt: skip
-    """When the tool is beyond the limit of an angle with a probability of `RISK`, or at the `latest`."""
-    spans = np.quantile(kept, INTERVAL).tolist()
+    """When the tool is beyond the limit of an angle with a probability of `RISK`, or at the `latest`.
+
+    By the quantiles `INTERVAL` of the years for which it keeps the limit, and the bound of its error `now`, degrees.
+    """
     first, middle, last = (_day(tool, span) for span in spans)
     return DueDate(
-        angle=growth.angle, limit_deg=limits[growth.angle],
-        now_deg=float(np.degrees(np.quantile(error, 1 - RISK))),
+        angle=growth.angle, limit_deg=limits[growth.angle], now_deg=now,
         due=min(first, latest.isoformat()), risk=RISK,
         not_before=first, expected=middle, not_after=last, capped=spans[-1] >= LONGEST_INTERVAL,
     )  # fmt: skip
@@ -508,7 +557,8 @@ def _of_type(rates: TypeRates, members: Iterable[MeasuredTool]) -> list[WalkRate
     """Movement of a tool of a type in a year, when nothing else is known of it."""
     first = next(iter(members)).drift.parameters
     units = {(p.triad, p.name.partition("-")[0]): p.unit for p in first}
+    known = ((group, (each.rates, each.peers_probability)) for group, each in rates.groups.items())
     return [
-        walk_rate(triad, kind, units.get((triad, kind), ""), (each.rates, each.peers_probability))
-        for (triad, kind), each in rates.groups.items()
+        walk_rate(*group, units.get(group, ""), quantiles(*distribution, INTERVAL))
+        for group, distribution in known
     ]

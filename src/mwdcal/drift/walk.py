@@ -13,7 +13,7 @@ compared as polynomials of temperature of the lowest order among the calibration
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 from functools import cached_property, lru_cache
@@ -55,6 +55,18 @@ DAYS_PER_YEAR = 365.25
 def years(days: Sequence[date]) -> Array:
     """Years (n,) since the first of some days."""
     return np.array([(day - days[0]).days / DAYS_PER_YEAR for day in days])
+
+
+def by_kind(kinds: Iterable[Hashable]) -> list[list[int]]:
+    """The places of each kind, in the order in which the kinds first appear.
+
+    >>> by_kind("aba")
+    [[0, 2], [1]]
+    """
+    places: dict[Hashable, list[int]] = {}
+    for place, kind in enumerate(kinds):
+        places.setdefault(kind, []).append(place)
+    return list(places.values())
 
 
 @dataclass(frozen=True)
@@ -130,7 +142,7 @@ class History:
     parameters, nothing along directions that it leaves free. `freedom` (…, n, p): degrees of freedom of
     the noise estimate behind each parameter, infinite where there is none; `pooled` (…, n, p): those of a triad
     that are so marked are of one estimate. `years` (…, n) since the first.
-    `has_prior` (n,): calibrations made with another of these as their prior, or None: none.
+    `has_prior` (…, n): calibrations made with another of these as their prior, or None: none.
     `names` (p,): "accelerometer bias-x"; a name with a `·` is a power of temperature.
     """
 
@@ -142,6 +154,23 @@ class History:
     pooled: Bools
     years: Array
     has_prior: Bools | None = None
+
+    @classmethod
+    def of(cls, tools: Sequence[History]) -> History:
+        """The histories of tools with as many calibrations in the same parameters, as one."""
+        priors = (
+            np.zeros(t.years.shape, bool) if t.has_prior is None else t.has_prior for t in tools
+        )
+        return cls(
+            names=tools[0].names,
+            values=np.stack([tool.values for tool in tools]),
+            covariance=np.stack([tool.covariance for tool in tools]),
+            precision=np.stack([tool.precision for tool in tools]),
+            freedom=np.stack([tool.freedom for tool in tools]),
+            pooled=np.stack([tool.pooled for tool in tools]),
+            years=np.stack([tool.years for tool in tools]),
+            has_prior=np.stack([*priors]),
+        )
 
     @property
     def steady(self) -> Ints:
@@ -262,24 +291,48 @@ class Increments:
     @classmethod
     def of(cls, history: History, places: Sequence[int]) -> Increments:
         """Those of the calibrations that have all parameters of the group and none of the others as a prior."""
-        values, covariance = history.values[:, places], history.covariance
-        block = covariance[:, places][..., places]
-        known = np.diagonal(history.precision, axis1=-2, axis2=-1)[:, places]
-        independent = True if history.has_prior is None else ~history.has_prior
-        usable = np.flatnonzero(np.isfinite(values).all(-1) & (known > 0).all(-1) & independent)
-        gaps = np.diff(history.years[usable])
-        apart = gaps > VISIT
-        count, size = int(np.count_nonzero(apart)), len(places)
-        if not count or not size:
-            return cls(np.zeros(0), np.zeros(0))
-        gaps, step = gaps[apart], np.diff(np.eye(len(usable)), axis=0)[apart]
-        noise = np.zeros((count, size, count, size))
-        for column, calibration in enumerate(usable):
-            weight = step[:, column, None] * step[:, column] / np.sqrt(np.outer(gaps, gaps))
-            noise += weight[:, None, :, None] * block[calibration][None, :, None, :]
-        spread, axes = np.linalg.eigh(noise.reshape(count * size, count * size))
-        change = (step @ values[usable] / np.sqrt(gaps)[:, None]).ravel()
-        return cls(change @ axes, np.maximum(spread, 0.0))
+        return cls.of_tools(History.of([history]), places)[0]
+
+    @classmethod
+    def of_tools(cls, history: History, places: Sequence[int]) -> list[Increments]:
+        """The same of each of the tools (t, n, p) of a history."""
+        values = history.values[..., places]
+        known = diagonal(history.precision)[..., places]
+        usable = np.asarray(np.isfinite(values).all(-1) & (known > 0).all(-1))
+        if history.has_prior is not None:
+            usable &= ~history.has_prior
+        apart = [np.diff(at[use]) > VISIT for at, use in zip(history.years, usable, strict=True)]
+        result = [cls(np.zeros(0), np.zeros(0))] * len(values)
+        for tools in by_kind(
+            (u.tobytes(), a.tobytes()) for u, a in zip(usable, apart, strict=True)
+        ):
+            kept, gap = np.flatnonzero(usable[tools[0]]), apart[tools[0]]
+            if gap.any():
+                some = np.ix_(np.array(tools), kept)
+                block = history.covariance[some][..., places, :][..., places]
+                gaps = np.diff(history.years[some])[:, gap]
+                changes = cls._white(values[some], block, gaps, gap)
+                for tool, one in zip(tools, changes, strict=True):
+                    result[tool] = one
+        return result
+
+    @classmethod
+    def _white(
+        cls, values: Array, covariance: Array, gaps: Array, apart: Bools
+    ) -> list[Increments]:
+        """Of values (t, n, s) of covariance (t, n, s, s) with gaps (t, m), years, where they are `apart` (n - 1,)."""
+        step = np.diff(np.eye(values.shape[1]), axis=0)[apart]
+        root = np.sqrt(gaps)
+        weights = step[:, None] * step / (root[:, :, None, None] * root[:, None, :, None])
+        noise = np.zeros((len(values), *2 * (len(step), values.shape[-1])))
+        for weight, block in zip(
+            np.moveaxis(weights, -1, 0), covariance.swapaxes(0, 1), strict=True
+        ):
+            noise += weight[:, :, None, :, None] * block[:, None, :, None, :]
+        size = len(step) * values.shape[-1]
+        spread, axes = np.linalg.eigh(noise.reshape(-1, size, size))
+        change = (step @ values / root[..., None]).reshape(-1, 1, size) @ axes
+        return [cls(*each) for each in zip(change[:, 0], np.maximum(spread, 0.0), strict=True)]
 
     def log_likelihood(self, rates: Array) -> Array:
         """Log likelihood (r,) of rates (r,), but for a constant."""
@@ -354,12 +407,16 @@ class GroupRates:
 
         That of changes within the uncertainties is, at the least rate.
         """
-        likelihood = self.log_likelihood.sum(0)
         if tool is not None and tool.noise.size:
-            likelihood = tool.log_likelihood(self.rates)
-        return {0: "walk-unseen", len(self.decades) - 1: "walk-edge"}.get(
-            int(np.argmax(likelihood))
-        )
+            likeliest = int(np.argmax(tool.log_likelihood(self.rates)))
+        else:
+            likeliest = self._likeliest
+        return {0: "walk-unseen", len(self.decades) - 1: "walk-edge"}.get(likeliest)
+
+    @cached_property
+    def _likeliest(self) -> int:
+        """The place of the rate that is likeliest of all tools together."""
+        return int(np.argmax(self.log_likelihood.sum(0)))
 
     def probabilities(self, tools: Sequence[Increments], among: Sequence[bool]) -> Array:
         """Probability (t, r) of each rate of some tools; `among` those that the type was learnt from or not."""
@@ -473,129 +530,178 @@ class ChangeTest:
 
 @dataclass(frozen=True)
 class Contrasts:
-    """What differences between calibrations tell: `precision` (n, p, p) of each, in any units."""
+    """What differences between the calibrations of a tool, or of many, tell.
+
+    `precision` (…, n, p, p) of each calibration, in any units.
+    """
 
     precision: Array
 
     @cached_property
     def _unit(self) -> Array:
-        """Units (p,) in which all calibrations together know each parameter to one."""
-        known = diagonal(self.precision.sum(0))
-        return np.where(known > 0, 1 / np.sqrt(np.where(known > 0, known, 1.0)), 0.0)
+        """Units (…, p) in which all calibrations together know each parameter to one."""
+        return _units(self.precision.sum(-3))
 
     @cached_property
     def scaled(self) -> Array:
-        """The precision (n, p, p) in these units."""
-        return np.asarray(self.precision * outer(self._unit))
+        """The precision (…, n, p, p) in these units."""
+        return np.asarray(self.precision * outer(self._unit)[..., None, :, :])
 
     @cached_property
     def after(self) -> Array:
-        """Information of the calibrations from each transition on (n - 1, p, p)."""
-        return np.asarray(np.cumsum(self.scaled[::-1], 0)[::-1][1:])
+        """Information of the calibrations from each transition on (…, n - 1, p, p)."""
+        sums = np.cumsum(self.scaled[..., ::-1, :, :], -3)
+        return np.asarray(sums[..., ::-1, :, :][..., 1:, :, :])
 
     @cached_property
-    def _runs(self) -> list[slice]:
-        """All calibrations, and each two successive ones."""
-        return [slice(None), *(slice(k, k + 2) for k in range(len(self.precision) - 1))]
+    def _spectra(self) -> tuple[Array, Array, Ints]:
+        """Eigenvalues and vectors of each calibration's information, and its rank (…, n)."""
+        values, vectors = np.linalg.eigh(self.scaled)
+        return values, vectors, np.sum(_positive(values), -1)
 
     @cached_property
-    def _run_units(self) -> Array:
-        """Units (n, p) of each run, in ours."""
-        known = [diagonal(self.scaled[run].sum(0)) for run in self._runs[1:]]
-        pairs = [np.where(k > 0, 1 / np.sqrt(np.where(k > 0, k, 1.0)), 0.0) for k in known]
-        return np.stack([np.ones(self.precision.shape[-1]), *pairs])
+    def _means(self) -> tuple[Array, Ints]:
+        """Covariance (…, n, p, p) of parameters that never changed, and rank (…, n) of what is known of them.
+
+        By all calibrations, and by each two successive ones.
+        """
+        whole = self.scaled.sum(-3)[..., None, :, :]
+        pairs = self.scaled[..., :-1, :, :] + self.scaled[..., 1:, :, :]
+        known = np.concatenate([whole, pairs], -3)
+        units = outer(_units(known))
+        values, vectors = np.linalg.eigh(known * units)
+        kept = _positive(values)
+        inverse = np.where(kept, 1 / np.where(kept, values, 1.0), 0.0)
+        return (vectors * inverse[..., None, :]) @ vectors.mT * units, np.sum(kept, -1)
 
     @cached_property
-    def _means(self) -> tuple[Array, Array]:
-        """Covariances (n, p, p) of the parameters, if they never changed, by each run in its own units, and in ours."""
-        sums, units = (
-            np.stack([self.scaled[run].sum(0) for run in self._runs]),
-            outer(self._run_units),
-        )
-        inverse = np.linalg.pinv(sums * units, DEPENDENT, hermitian=True)
-        return np.asarray(inverse, float), np.asarray(inverse * units, float)
-
-    @property
-    def _mean(self) -> Array:
-        """Covariance (p, p) of the parameters, if they never changed."""
-        return np.asarray(self._means[1][0])
+    def by_mean(self) -> Array:
+        """Evidence (…, n - 1, p, p) for a change that the mean takes up of the evidence of all calibrations."""
+        return np.asarray(self.after @ self._means[0][..., :1, :, :])
 
     @cached_property
     def information(self) -> Array:
-        """Information (n - 1, p, p) about a change at each transition, the parameters being unknown."""
-        return np.asarray(self.after - self.after @ self._mean @ self.after)
+        """Information (…, n - 1, p, p) about a change at each transition, the parameters being unknown."""
+        return np.asarray(self.after - self.by_mean @ self.after)
 
     @cached_property
     def known(self) -> Bools:
-        """Which steps (n - 1, p) the calibrations tell."""
+        """Which steps (…, n - 1, p) the calibrations tell."""
         return np.asarray(diagonal(self.information) > UNSEEN)
 
     @cached_property
     def freedom(self) -> Ints:
-        """Degrees of freedom (n,) of the misfits."""
-        units = outer(self._run_units)
-        each = [self.scaled[run] * unit for run, unit in zip(self._runs, units, strict=True)]
-        stacked = np.concatenate([*each, self._means[0]])
-        ranks = np.linalg.matrix_rank(stacked, DEPENDENT, hermitian=True)
-        ends = np.cumsum([len(one) for one in each])
-        parts = np.split(ranks, ends)
-        return np.asarray(np.array([part.sum() for part in parts[:-1]]) - parts[-1], int)
+        """Degrees of freedom (…, n) of the misfits of all calibrations, and of each two successive ones."""
+        each, means = self._spectra[-1], self._means[-1]
+        runs = each.sum(-1, keepdims=True), each[..., :-1] + each[..., 1:]
+        return np.asarray(np.concatenate(runs, -1) - means)
 
     @cached_property
     def _sizes(self) -> Array:
-        """Standard deviations (n - 1, p) of what speaks for steps; infinite where the calibrations tell none."""
+        """Standard deviations (…, n - 1, p) of the evidence for steps; infinite where the calibrations tell none."""
         return np.sqrt(np.where(self.known, diagonal(self.information), np.inf))
 
     def departures(self, values: Array) -> Array:
-        """Values (n, p) less those of the last calibration that has them, in our units: a column (n, p, 1)."""
-        latest = [column[~np.isnan(column)][-1:] for column in values.transpose()]
-        middle = np.array([each[0] if each.size else 0.0 for each in latest])
-        unit = np.where(self._unit > 0, self._unit, 1.0)
-        return np.asarray(np.nan_to_num((values - middle) / unit) * (self._unit > 0))[..., None]
+        """Values (…, n, p) less those of the last calibration that has them, in our units: a column (…, n, p, 1)."""
+        latest = values[..., -1, :]
+        for k in range(values.shape[-2] - 2, -1, -1):
+            latest = np.where(np.isnan(latest), values[..., k, :], latest)
+        unit = np.where(self._unit > 0, self._unit, 1.0)[..., None, :]
+        moved = np.nan_to_num((values - np.nan_to_num(latest)[..., None, :]) / unit)
+        return np.asarray(moved * (self._unit > 0)[..., None, :])[..., None]
 
     def pull(self, departures: Array) -> Array:
-        """Evidence (n, p, m) of each calibration for these departures of the parameters, in each of m columns."""
-        return np.asarray(self.scaled.astype(departures.dtype) @ departures)
+        """Evidence (…, n, p, m) of each calibration for these departures of the parameters, in each of m columns."""
+        return np.asarray(self.scaled @ departures)
 
     def sums(self, pull: Array) -> Array:
-        """Evidence (n - 1, p, m) for a change at each transition, of covariance `information`."""
-        later = pull.copy()
-        for k in range(len(pull) - 1, 0, -1):
-            later[k - 1] += later[k]
-        mean = self._mean.astype(pull.dtype) @ later[0]
-        return np.asarray(later[1:] - self.after.astype(pull.dtype) @ mean)
+        """Evidence (…, n - 1, p, m) for a change at each transition, of covariance `information`."""
+        later = np.cumsum(pull[..., ::-1, :, :], -3)[..., ::-1, :, :]
+        return np.asarray(later[..., 1:, :, :] - self.by_mean @ later[..., :1, :, :])
 
     def scores(self, pull: Array) -> Array:
-        """Scores (n - 1, p, m) of a step of each parameter alone, of variance 1 under no change."""
-        return np.asarray(self.sums(pull) / self._sizes.astype(pull.dtype)[..., None])
+        """Scores (…, n - 1, p, m) of a step of each parameter alone, of variance 1 under no change."""
+        return np.asarray(self.sums(pull) / self._sizes[..., None])
 
-    def misfits(self, departures: Array, pull: Array) -> Iterator[Array]:
-        """Misfit (m,) of one set of parameters to all calibrations, and to each two successive ones."""
-        whole = np.einsum("kim,kim->km", departures, pull)
-        for run, mean in zip(self._runs, self._means[1], strict=True):
-            total = pull[run].sum(0)
-            by_mean = np.einsum("im,im->m", total, mean.astype(pull.dtype) @ total)
-            yield np.asarray(whole[run].sum(0) - by_mean)
+    def misfits(self, departures: Array, pull: Array) -> Array:
+        """Misfit (…, n, m) of one set of parameters to all calibrations, and to each two successive ones."""
+        each = np.sum(departures * pull, -2)
+        whole = [each.sum(-2, keepdims=True), each[..., :-1, :] + each[..., 1:, :]]
+        sums = [pull.sum(-3, keepdims=True), pull[..., :-1, :, :] + pull[..., 1:, :, :]]
+        total = np.concatenate(sums, -3)
+        return np.asarray(np.concatenate(whole, -2) - np.sum(total * (self._means[0] @ total), -2))
 
-    @cached_property
-    def root(self) -> Array:
-        """Matrices (n, p, p) that turn standard normal numbers into departures of an unchanged tool."""
-        values, vectors = np.linalg.eigh(self.scaled)
-        largest = values[:, -1:]
-        inverse = np.where(values > DEPENDENT * largest, 1 / np.sqrt(np.maximum(values, 1e-300)), 0)
-        return np.asarray(vectors * inverse[:, None, :])
+    def drawing(self, steady: Ints) -> list[_Draws]:
+        """The same of each of t tools (t, n, p, p) for draws, with scores of the parameters at places `steady`."""
+        values, vectors, _ = self._spectra
+        kept = _positive(values)
+        inverse = np.where(kept, 1 / np.sqrt(np.where(kept, values, 1.0)), 0.0)
+        root, sizes = vectors * inverse[..., None, :], self._sizes[..., steady, None]
+        by_mean = self.by_mean[..., steady, :] / sizes
+        parts = (root, self.scaled, 1 / sizes, by_mean, self._means[0])
+        each = zip(*(part.astype(np.float32) for part in parts), strict=True)
+        return [_Draws(steady, *tool) for tool in each]
 
-    def sizes(
-        self, steps: Sequence[tuple[int, int]], sums: Array, moved: Array
-    ) -> tuple[Array, Array]:
-        """Sizes and standard uncertainties (s,) of steps (after, place) together, in the units of the values.
+    def step(self, tool: int, after: int, place: int) -> Array:
+        """Evidence (n - 1, p) of one of the tools for a change at each transition, by a step of one, in our units."""
+        information, by_mean = self.after[tool], self.by_mean[tool]
+        rest = np.maximum(np.arange(1, 1 + len(information)), after) - 1
+        return np.asarray(information[rest, :, place] - by_mean @ information[after - 1, :, place])
 
-        By what speaks for a change (n - 1, p), and what it would be of each step by one (n - 1, p, s).
-        """
-        after, place = np.array(steps).transpose()
-        covariance = np.linalg.pinv(moved[after - 1, place], DEPENDENT, hermitian=True)
-        unit = self._unit[place]
-        return covariance @ sums[after - 1, place] * unit, np.sqrt(np.diag(covariance)) * unit
+
+def _units(information: Array) -> Array:
+    """Units (…, p) in which an information (…, p, p) is one of each parameter; 0 where nothing is known."""
+    known = diagonal(information)
+    return np.where(known > 0, 1 / np.sqrt(np.where(known > 0, known, 1.0)), 0.0)
+
+
+def _positive(eigenvalues: Array) -> Bools:
+    """Which eigenvalues (…, p), the largest last, are more than rounding."""
+    return np.asarray(eigenvalues > DEPENDENT * eigenvalues[..., -1:])
+
+
+@dataclass(frozen=True)
+class _Draws:
+    """The linear maps that turn normal numbers into the scores and misfits of an unchanged tool, single precision.
+
+    `root` (n, p, p) turns them into departures and `scaled` (n, p, p) these into evidence; `inverse` (n - 1, s, 1) and
+    `by_mean` (n - 1, s, p) make scores of the evidence, `means` (n, p, p) misfits. `steady` (s,): places of the scores.
+    """
+
+    steady: Ints
+    root: AnyArray
+    scaled: AnyArray
+    inverse: AnyArray
+    by_mean: AnyArray
+    means: AnyArray
+
+    def drawn(self, history: History, draws: int) -> tuple[AnyArray, AnyArray, AnyArray]:
+        """The largest score (draws,), the misfit (draws,), and those of pairs (n - 1, `PAIR_DRAWS` at most)."""
+        noise, grown = _noise(*history.values.shape), stretches(history, draws)
+        count, size = history.values.shape
+        steady: Ints | slice = slice(None) if len(self.steady) == size else self.steady
+        most, misfit = np.zeros((2, draws), np.float32)
+        pairs = np.zeros((count - 1, min(draws, PAIR_DRAWS)), np.float32)
+        for first in range(0, draws, DRAWN_TOGETHER):
+            part = slice(first, min(first + DRAWN_TOGETHER, draws))
+            departures = self.root @ noise[..., part]
+            for triad, factors in zip(history.triads, grown, strict=True):
+                departures[:, triad] *= factors[:, None, part]
+            pull = self.scaled @ departures
+            each = np.einsum("kim,kim->km", departures, pull)
+            for k, row in enumerate(pairs[:, part]):
+                total = pull[k, :, : len(row)] + pull[k + 1, :, : len(row)]
+                taken = np.einsum("im,im->m", total, self.means[k + 1] @ total)
+                row[:] = (each[k] + each[k + 1])[: len(row)] - taken
+            for k in range(count - 1, 0, -1):
+                pull[k - 1] += pull[k]
+            taken = np.einsum("im,im->m", pull[0], self.means[0] @ pull[0])
+            misfit[part] = each.sum(0) - taken
+            scores = pull[1:, steady] * self.inverse
+            scores -= (self.by_mean.reshape(-1, size) @ pull[0]).reshape(scores.shape)
+            ends = scores.max((0, 1), initial=0.0), scores.min((0, 1), initial=0.0)
+            most[part] = np.maximum(ends[0], -ends[1])
+        return most, misfit, pairs
 
 
 @lru_cache(maxsize=2)
@@ -633,99 +739,148 @@ def _stretches(
 
 
 def change_test(history: History, level: float = CHANGE_LEVEL) -> ChangeTest:
-    """The test of one tool with two calibrations or more: `History` of (n, p).
+    """The test of one tool with two calibrations or more: `History` of (n, p)."""
+    return change_tests([history], level)[0]
+
+
+def change_tests(histories: Sequence[History], level: float = CHANGE_LEVEL) -> list[ChangeTest]:
+    """The tests of tools with as many calibrations, two or more, in the same parameters.
 
     By `FIRST_DRAWS` where they show a tool to be unchanged, else by `NULL_DRAWS`. A tool is then called changed
     only where all draws call it so, and so with a probability of at most the level where nothing changed.
     """
-    contrasts = Contrasts(history.precision)
-    departures = contrasts.departures(history.values)
-    misfit = next(contrasts.misfits(departures, contrasts.pull(departures)))[0]
-    if misfit <= DISAGREES * contrasts.freedom[0]:
-        first = _test(history, contrasts, level, FIRST_DRAWS)
+    together = History.of(histories)
+    contrasts, steady = Contrasts(together.precision), together.steady
+    departures = contrasts.departures(together.values)
+    pull = contrasts.pull(departures)
+    sums = contrasts.sums(pull)[..., 0]
+    scores = np.where(contrasts.known, sums / contrasts._sizes, np.nan)
+    misfits = contrasts.misfits(departures, pull)[..., 0]
+    each = zip(
+        histories, scores, misfits, contrasts.freedom, contrasts.drawing(steady), strict=True
+    )
+    tests = [_tested(*tool, level) for tool in each]
+    return [
+        replace(test, steps=_steps(contrasts, tool, sums[tool], steady, test.critical_score))
+        if test.changed
+        else test
+        for tool, test in enumerate(tests)
+    ]
+
+
+def _tested(
+    history: History, scores: Array, misfits: Array, freedom: Ints, draws: _Draws, level: float
+) -> ChangeTest:
+    """The test of one tool by its scores (n - 1, p) and misfits (n,), without the steps."""
+    if misfits[0] <= DISAGREES * freedom[0]:
+        first = _test(
+            scores, misfits, freedom, draws.steady, draws.drawn(history, FIRST_DRAWS), level
+        )
         doubtful = first.probability <= level + DECIDED_BEYOND * np.sqrt(level / FIRST_DRAWS)
         if not doubtful and (first.pair_probability > 1 / (FIRST_DRAWS + 1)).all():
             return first
-    test = _test(history, contrasts, level, NULL_DRAWS)
-    return (
-        replace(test, steps=_steps(history, contrasts, test.critical_score))
-        if test.changed
-        else test
-    )
+    return _test(scores, misfits, freedom, draws.steady, draws.drawn(history, NULL_DRAWS), level)
 
 
-def _test(history: History, contrasts: Contrasts, level: float, draws: int) -> ChangeTest:
-    """The test by so many draws."""
-    steady, departures = history.steady, contrasts.departures(history.values)
-    pull = contrasts.pull(departures)
-    scores = np.where(contrasts.known, contrasts.scores(pull)[..., 0], np.nan)
+def _test(
+    scores: Array, misfits: Array, freedom: Ints, steady: Ints,
+    drawn: tuple[AnyArray, AnyArray, AnyArray], level: float,
+) -> ChangeTest:  # fmt: skip
+    """The test by draws of the largest score, the misfit, and those of pairs."""
     largest = float(np.nanmax(np.abs(scores[:, steady]), initial=0.0))
-    misfits = [float(each[0]) for each in contrasts.misfits(departures, pull)]
-    most, drawn = _drawn(history, contrasts, draws)
-    (by_step, each_step), (by_misfit, each_misfit) = (
-        _ranks(most, largest), _ranks(drawn[0], misfits[0]),
-    )  # fmt: skip
-    evidence = np.minimum(each_step / STEP_SHARE, each_misfit / (1 - STEP_SHARE))
-    least = min(by_step / STEP_SHARE, by_misfit / (1 - STEP_SHARE))
-    critical = float(np.quantile(most, 1 - np.quantile(evidence, level) * STEP_SHARE))
-    pairs = zip(drawn[1:, :PAIR_DRAWS], misfits[1:], strict=True)
+    evidence = _Evidence.of(*drawn[:2])
+    by_step, by_misfit = evidence.beyond(largest, float(misfits[0]))
+    probability, critical = evidence.judged(
+        min(by_step / STEP_SHARE, by_misfit / (1 - STEP_SHARE)), level
+    )
+    pairs = zip(drawn[2], misfits[1:], strict=True)
     return ChangeTest(
-        level, float((1 + np.sum(evidence <= least)) / (draws + 1)), scores, largest, critical,
-        by_step, misfits[0], int(contrasts.freedom[0]), by_misfit,
-        np.array(misfits[1:]), contrasts.freedom[1:].astype(float),
+        level, probability, scores, largest, critical,
+        by_step, float(misfits[0]), int(freedom[0]), by_misfit,
+        misfits[1:], freedom[1:].astype(float),
         np.array([(1 + np.sum(each >= one)) / (len(each) + 1) for each, one in pairs]),
     )  # fmt: skip
 
 
-def _drawn(history: History, contrasts: Contrasts, draws: int) -> tuple[AnyArray, AnyArray]:
-    """Of unchanged tools the largest score (draws,) of a steady parameter, and all misfits (n, draws)."""
-    noise, grown = _noise(*history.values.shape), stretches(history, draws)
-    root, steady = contrasts.root.astype(noise.dtype), history.steady
-    most = np.zeros(draws, noise.dtype)
-    misfits = np.zeros((len(history.values), draws), noise.dtype)
-    for first in range(0, draws, DRAWN_TOGETHER):
-        part = slice(first, min(first + DRAWN_TOGETHER, draws))
-        departures = root @ noise[..., part]
-        for triad, factors in zip(history.triads, grown, strict=True):
-            departures[:, triad] *= factors[:, None, part]
-        pull = contrasts.pull(departures)
-        most[part] = np.abs(contrasts.scores(pull)[:, steady]).max((0, 1), initial=0.0)
-        rows = misfits if first < PAIR_DRAWS else misfits[:1]
-        for row, each in zip(rows, contrasts.misfits(departures, pull), strict=False):
-            row[part] = each
-    return most, misfits
+@dataclass(frozen=True)
+class _Evidence:
+    """Draws (m,) of the largest score and of the misfit of an unchanged tool, as they come and in `order`."""
+
+    drawn: tuple[AnyArray, AnyArray]
+    order: tuple[AnyArray, AnyArray]
+
+    @classmethod
+    def of(cls, most: AnyArray, misfit: AnyArray) -> _Evidence:
+        """Of draws."""
+        return cls((most, misfit), (np.sort(most), np.sort(misfit)))
+
+    def beyond(self, *values: float) -> list[float]:
+        """Probability of as large a score, and of as large a misfit, among draws of no change."""
+        count = len(self.drawn[0])
+        return [
+            (1 + count - int(np.searchsorted(order, value))) / (count + 1)
+            for order, value in zip(self.order, values, strict=True)
+        ]
+
+    def _tail(self, limit: float) -> Bools:
+        """Which draws are evidence (m,) of at most a limit: by the share of the level that each statement has."""
+        count, result = len(self.drawn[0]), np.zeros(len(self.drawn[0]), bool)
+        for drawn, order, share in zip(
+            self.drawn, self.order, (STEP_SHARE, 1 - STEP_SHARE), strict=True
+        ):
+            rank = min(int(share * limit * count + DEPENDENT), count)
+            if rank:
+                result |= drawn >= order[count - rank]
+        return result
+
+    def judged(self, least: float, level: float) -> tuple[float, float]:
+        """Probability of as little evidence as the `least`, and the largest score below which there is no alarm."""
+        count = len(self.drawn[0])
+        probability = (1 + np.count_nonzero(self._tail(least))) / (count + 1)
+        some = self._tail((level * count + 2) / count / STEP_SHARE)
+        each = [
+            (count - np.searchsorted(order, drawn[some])) / count / share
+            for drawn, order, share in zip(
+                self.drawn, self.order, (STEP_SHARE, 1 - STEP_SHARE), strict=True
+            )
+        ]
+        alarm = _at(np.sort(np.minimum(*each)), level * (count - 1))
+        return float(probability), _at(self.order[0], (1 - alarm * STEP_SHARE) * (count - 1))
 
 
-def _ranks(drawn: Array, value: float) -> tuple[float, Array]:
-    """Probability of as much as a value among draws of no change, and of as much as each of them."""
-    order, count = np.argsort(drawn), len(drawn)
-    ascending, above = drawn[order], np.empty(count)
-    above[order] = count - np.searchsorted(ascending, ascending, "left")
-    beyond = np.count_nonzero(drawn >= value)
-    return float((1 + beyond) / (count + 1)), above / count
+def _at(order: Array, place: float) -> float:
+    """The value at a place, counted from 0, of values in order: between two of them in proportion."""
+    below = min(int(place), len(order) - 1)
+    low, high = float(order[below]), float(order[min(below + 1, len(order) - 1)])
+    return low + (place - below) * (high - low)
 
 
-def _steps(history: History, contrasts: Contrasts, critical: float) -> tuple[Step, ...]:
-    """Steps that explain the change, the largest first, each with those before taken out."""
-    steady, departures = history.steady, contrasts.departures(history.values)
+def _steps(
+    contrasts: Contrasts, tool: int, sums: Array, steady: Ints, critical: float
+) -> tuple[Step, ...]:
+    """Steps that explain the change of one of the tools, the largest first, each with those before taken out.
+
+    By the evidence `sums` (n - 1, p) for a change at each transition.
+    """
     named: list[tuple[int, int]] = []
     scored: list[float] = []
-    known, sums = contrasts.known[:, steady], contrasts.sums(contrasts.pull(departures))[..., 0]
-    unit, estimate = np.where(contrasts._unit > 0, contrasts._unit, 1.0), (np.zeros(0), np.zeros(0))
-    moved = np.zeros((*sums.shape, 0))
+    sizes, unit = contrasts._sizes[tool][:, steady], contrasts._unit[tool]
+    moved, estimate, covariance = np.zeros((*sums.shape, 0)), np.zeros(0), np.zeros((0, 0))
     while len(named) < MOST_NAMED_STEPS:
-        left = sums - moved @ (estimate[0] / unit[[place for _, place in named]])
-        scores = np.where(known, (left / contrasts._sizes)[:, steady], 0.0)
+        scores = (sums - moved @ estimate)[:, steady] / sizes
         row, column = np.unravel_index(np.argmax(np.abs(scores)), scores.shape)
         if abs(scores[row, column]) <= critical:
             break
         named.append((int(row) + 1, int(steady[column])))
         scored.append(float(scores[row, column]))
-        step = np.zeros_like(departures)
-        step[named[-1][0] :, named[-1][1]] = 1.0
-        moved = np.concatenate([moved, contrasts.sums(contrasts.pull(step))], -1)
-        estimate = contrasts.sizes(named, sums, moved)
+        moved = np.concatenate([moved, contrasts.step(tool, *named[-1])[..., None]], -1)
+        after, place = np.array(named).transpose()
+        covariance = np.linalg.pinv(moved[after - 1, place], DEPENDENT, hermitian=True)
+        estimate = covariance @ sums[after - 1, place]
+    uncertainty = np.sqrt(np.diag(covariance))
     return tuple(
-        Step(place, after, float(size), float(sd), score)
-        for (after, place), size, sd, score in zip(named, *estimate, scored, strict=True)
+        Step(place, after, float(size * unit[place]), float(sd * unit[place]), score)
+        for (after, place), size, sd, score in zip(
+            named, estimate, uncertainty, scored, strict=True
+        )
     )

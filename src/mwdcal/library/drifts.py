@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from datetime import UTC, date, datetime
 from functools import partial
+from itertools import islice
 from typing import Any, NamedTuple
 
 import msgspec
@@ -16,7 +17,15 @@ from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.calibration.results import STATED_ANGLES
 from mwdcal.drift.document import ToolDrift
 from mwdcal.drift.histories import ServiceTest
-from mwdcal.drift.tool import MeasuredTool, TypeRates, fleet_drift, measured, predicted
+from mwdcal.drift.tool import (
+    MeasuredTool,
+    ToolRecords,
+    TypeRates,
+    all_measured,
+    fleet_drift,
+    measured,
+    predicted,
+)
 from mwdcal.drift.walk import CHANGE_LEVEL, WALK_GROUPS
 from mwdcal.errors import InputError, MwdcalError
 from mwdcal.files import documents
@@ -82,15 +91,22 @@ def of_registry(
     whole = partial(RegistryDrift, registry=registry.name, limits_deg=limits)
     if serial is not None:
         return whole(tool=_of_tool(registry, serial, limits, level, today, advance))
-    tools, refused = [], {}
+    tools: list[MeasuredTool] = []
+    refused: dict[str, str] = {}
     serials = [row["serial"] for row in _tools(registry)]
-    for done, past in enumerate(_pasts(registry, serials)):
+    pasts = _pasts(registry, serials)
+    done = 0
+    while some := [*islice(pasts, TOOLS_READ)]:
+        read = []
+        for past in some:
+            try:
+                if (records := past.records()).calibrations:
+                    read.append(records)
+            except MwdcalError as error:
+                refused[past.serial] = str(error)
+        tools += all_measured(read, level)
+        done += len(some)
         advance(done, len(serials))
-        try:
-            if tool := past.measured(level):
-                tools.append(tool)
-        except MwdcalError as error:
-            refused[past.serial] = str(error)
     if not tools:
         raise InputError(
             f"{registry.name}: there is no calibration to compare. Add some: mwdcal registry add."
@@ -159,11 +175,12 @@ def drift_of(
 def _of_tool(
     registry: Registry, serial: str, limits: dict[str, float], level: float, today: date, advance: Advance,
 ) -> ToolDrift:  # fmt: skip
-    tool = _past(registry, serial).measured(level)
-    if tool is None:
+    records = _past(registry, serial).records()
+    if not records.calibrations:
         raise InputError(
             f"{registry.name} has no calibration of a tool {shown(serial)}. mwdcal registry list shows its tools."
         )
+    tool = all_measured([records], level)[0]
     peers = [tool, *_peers(registry, serial, tool.drift.type, advance)]
     return predicted(tool, TypeRates.of(peers), limits, today)
 
@@ -197,12 +214,10 @@ class _Past(NamedTuple):
     verdicts: list[_Document]
     runs: list[lookup.Row]
 
-    def measured(self, level: float) -> MeasuredTool | None:
-        """The tool by its calibrations and roll tests; None where it has no calibration."""
+    def records(self) -> ToolRecords:
+        """The calibrations and roll tests of the tool, if any."""
         calibrations, digests = self.calibrations()
-        if not calibrations:
-            return None
-        return measured(self.serial, calibrations, self.tests(), level, digests)
+        return ToolRecords(self.serial, calibrations, self.tests(), digests)
 
     def calibrations(self) -> tuple[list[Calibration], dict[str, str]]:
         """The calibrations of the tool, and the SHA-256 of each file by that of its content."""

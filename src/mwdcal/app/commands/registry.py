@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
@@ -440,6 +441,7 @@ def drift(
     options.check_outputs([], [database], page=report)
     day = (today or datetime.now(UTC)).date()
     allowed = drifts.limits_of(limits)
+    gc.freeze()  # what is loaded stays: the search for garbage among many tools need not look through it
     with open_registry(database) as registry, bar("comparing") as advance:
         result = drifts.of_registry(registry, serial, allowed, level, day, advance)
     if report:
