@@ -301,6 +301,12 @@ def depth_column(table: Table, length_unit: str = "") -> tuple[str, float]:
     return "", 1.0
 
 
+def used_in_surveys(table: Table) -> list[str]:
+    """Columns that a survey uses and a run of calibration does not: references by row, and the measured depth."""
+    depth, _ = depth_column(table, "m")
+    return [*BY_ROW, depth] if depth else [*BY_ROW]
+
+
 def _unit_of(stated: str, chosen: str) -> str:
     """The unit of depths whose title states one, or none; feet without more words are those that were chosen."""
     if stated.startswith("m"):

@@ -41,6 +41,7 @@ from mwdcal.survey.path import (
     well_path,
 )
 from mwdcal.survey.stations import (
+    STRENGTHS,
     SURVEY_OBSERVABLES,
     TOOLFACE_SWITCH,
     North,
@@ -763,17 +764,26 @@ def _judged(
 ) -> tuple[Judgement, Blindness | None]:  # fmt: skip
     """Acceptance, and what it cannot see; nothing where interference was taken off, or there is no field.
 
-    Where it was taken off, the covariance of the calibration has what is left of it and of the sensors' drift: the
-    terms of the limits for sensors do not count beside it.
+    Where it was taken off, the calibration was fitted to these surveys and their references. With S the covariance of
+    noise and references, P that of the parameters and H the departures by these, the departures have S - H P Hᵀ, which
+    is at most S: S is taken, and neither calibration nor terms for sensors are added.
     """
     seen, known = _to_judge(calibration, readings, vectors)
     taken = any(finding.id == CORRECTED for finding in calibration.findings)
     if taken:
         limits = replace_struct(limits, sensor=SensorTerms())
+        surveys = replace(surveys, strengths=_of_noise(calibration, readings, surveys.strengths))
     judgement = judged(surveys, seen, known, limits)
     if taken or not calibration.has_field or judgement.tests is None:
         return judgement, None
     return judgement, blindness(judgement.tests, seen)
+
+
+def _of_noise(calibration: Calibration, readings: Readings, strengths: Array) -> Array:
+    """The part (n, 3, 3) of the covariance of |g|, |b| and dip that is noise; NaN as the whole."""
+    slopes = calibration.gradients(SURVEY_OBSERVABLES[STRENGTHS], readings)
+    noise = slopes @ calibration.noise_covariance(readings) @ slopes.mT
+    return np.where(np.isnan(strengths), np.nan, noise)
 
 
 def _to_judge(
