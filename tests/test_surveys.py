@@ -401,6 +401,41 @@ def place(tmp_path):
     return file, made.json
 
 
+@pytest.mark.parametrize(
+    ("calibrated", "surveyed", "expected"),
+    [
+        ("2026-01-10", "2026-05-20", set()),
+        ("2025-06-01", "2026-05-20", set()),
+        ("2024-11-01", "2026-05-20", {"calibration-old"}),
+        ("2026-05-21", "2026-05-20", {"calibration-later"}),
+        ("2019-01-10", "2019-05-20", {"reference-of-another-day"}),
+    ],
+)
+def test_days_that_do_not_belong_together_are_named(
+    example, tmp_path, place, calibrated, surveyed, expected
+):
+    """The reference is of 2026-06-01."""
+    record = mwdcal.load(example)
+    record = replace_struct(record, tool={**record.tool, "date": calibrated})
+    source = write_csv(tmp_path / "in.csv", read_csv(EXAMPLE / "well.csv"), f'date = "{surveyed}"')
+    named = {"calibration-old", "calibration-later", "reference-of-another-day"}
+    whole = mwdcal.survey(record, source, reference=place[0])
+    assert {f.id for f in whole.findings} & named == expected
+
+
+@pytest.mark.parametrize(("times", "named"), [(1.0, False), (1.9, False), (1 / 0.3048, True)])
+def test_courses_as_long_as_those_of_feet_taken_for_metres_are_named(
+    example, tmp_path, times, named
+):
+    """The example has 30 m from survey to survey."""
+    depths = [repr(times * float(cell)) for cell in read_csv(EXAMPLE / "well.csv")["md_m"]]
+    _, document = surveyed_file(example, tmp_path, {"md_m": depths})
+    texts = [f["text"] for f in document["findings"] if f["id"] == "long-courses"]
+    assert [text[:48] for text in texts] == [
+        "the courses between surveys are 98 m long (media"
+    ] * named
+
+
 def table_of(document, gravity=1.0, field=48_000.0, dip=63.0, sd=(0.0001, 60.0, 0.08)):
     """Columns and metadata that state every quantity, with uncertainties."""
     cells = {"ref_gravity_g": gravity, "ref_field_nt": field, "ref_dip_deg": dip}

@@ -30,7 +30,7 @@ from mwdcal.survey.acceptance import (
     blindness,
     judged,
 )
-from mwdcal.survey.error_model import ErrorModel, Hole
+from mwdcal.survey.error_model import USUAL_COURSE, ErrorModel, Hole
 from mwdcal.survey.path import (
     CauseOrder,
     DirectionErrors,
@@ -338,6 +338,11 @@ WELL_FINDINGS = {
     "about them.",
     "laboratory-gravity": "gravity at the laboratory is unknown (1 g was assumed), so |g| is judged 1.5 mg more "
     "loosely. To tighten this, give ref_gravity_g in the calibration run.",
+    "calibration-old": "the tool was calibrated {years:.1f} years before, and 1σ allows for the drift of one year. "
+    "Verify the tool, or give `registry`, where the drift of tools has no such end.",
+    "calibration-later": "the surveys are of {day}, before the calibration of {calibrated}: is it the right one?",
+    "long-courses": "the courses between surveys are {course:.0f} m long (median), and {usual:g} m are usual: are "
+    "the depths in feet? Name their column `md_ft`, or give `length_unit`.",
     "magnetic-north": "no declination: azimuths and the well path count from magnetic north.",
     "path-from-first": "the well path starts at the first station, at north 0, east 0 and TVD 0. `tie_in` gives its "
     "position.",
@@ -855,6 +860,11 @@ def _findings(result: Well, counts: WellCounts, from_first: bool) -> list[Findin
     first, why = counts.first or ("", "")
     _, blindest, worst = counts.blindest or (0.0, "", "")
     there = counts.on_path > 0
+    calibrated, day = (
+        stated_day(each) for each in (result.calibration.tool, result.readings.metadata)
+    )
+    years, course = _years(calibrated, day) or 0.0, _usual_course(result.position)
+    walks = result.errors is not None and result.errors.by_walk
     applies = {
         "rejected": counts.rejected,
         "blind-to-interference": counts.blind,
@@ -862,6 +872,9 @@ def _findings(result: Well, counts: WellCounts, from_first: bool) -> list[Findin
         "not-judged": counts.unjudged,
         "partly-judged": counts.partly,
         "laboratory-gravity": unknown_gravity(result.calibration) and counts.weighed,
+        "calibration-old": years > DRIFT_YEARS and not walks,
+        "calibration-later": calibrated is not None and day is not None and day < calibrated,
+        "long-courses": course > 2 * USUAL_COURSE,
         "magnetic-north": result.north.declination is None and result.calibration.has_field,
         "path-from-first": there and from_first and depth > 0,
         "path-from-later": start > 0,
@@ -873,13 +886,20 @@ def _findings(result: Well, counts: WellCounts, from_first: bool) -> list[Findin
         "first": first, "why": why, "start": label, "blind": counts.blind, "accepted": counts.accepted,
         "names": " and ".join(n for n, lacks in zip(STRENGTH_NAMES, counts.lacking, strict=True) if lacks),
         "blindest": blindest, "worst": worst, "partly": counts.partly, "unjudged": counts.unjudged,
-        "count": counts.rows - counts.on_path,
+        "count": counts.rows - counts.on_path, "years": years, "day": day, "calibrated": calibrated, "course": course,
+        "usual": USUAL_COURSE,
     }  # fmt: skip
     return [*result.corrected, *result.north.findings] + [
         Finding(id=name, text=text.format(**words))
         for name, text in WELL_FINDINGS.items()
         if applies[name]
     ]
+
+
+def _usual_course(position: Position | None) -> float:
+    """The median distance of neighbouring stations on the path along the hole, m; 0 where there are no two."""
+    depth = np.empty(0) if position is None else position.md[position.on_path]
+    return float(np.median(np.diff(depth))) if len(depth) > 1 else 0.0
 
 
 def _angle(name: str, value: Array, sd: Array) -> dict[str, AnyArray]:
