@@ -146,7 +146,12 @@ def test_command_and_python_have_the_columns_and_the_zone(tmp_path) -> None:
     assert {*zone[10:]} == {"false", "true"}
     assert (np.isnan(azimuth[10:]) == (zone[10:] == "true")).all()
     plain = mwdcal.survey(calibration, run)
-    names = ("azimuth_true_deg", "north_m", "sd_north_m")
+    names = ("azimuth_true_deg", "sd_azimuth_true_deg", "north_m", "sd_north_m")
     assert all((plain.columns[n] == well.columns[n])[10:].all() for n in names)
+    np.testing.assert_array_equal(plain.path.covariance, well.path.covariance)
+    said = "azimuth_true_deg stays definitive, and with it path and covariance"
+    assert said in out.read_text("utf-8")
+    well.report(tmp_path / "page.html")
+    assert said in (tmp_path / "page.html").read_text("utf-8")
     with pytest.raises(InputError, match="Leave one of them out"):
         mwdcal.survey(calibration, run, msa=True, axial_correction=True)

@@ -127,7 +127,7 @@ def norths(columns, rng):
 
 CASES = {
     "gaps": (gaps, ["declination_deg = 2.5"], ("--json",)),
-    "reference": (gaps, ["declination_deg = 2.5"], ("--reference",)),
+    "reference": (gaps, ["declination_deg = 2.5", 'date = "2024-05-01"'], ("--reference",)),
     "hot": (hot, ["declination_deg = 2", "convergence_deg = -1"], ("--outside", "extrapolate", "--tie-in", "1,2,3")),
     "switch": (hot, [], ("--switch", "10,20", "--limits", "fixed")),
     "bare": (bare, ["declination_deg = 2.5"], ()),

@@ -117,7 +117,8 @@ def test_the_table_s_own_references_count_too(tmp_path, calibration, way):
     columns["ref_field_nt"] = np.full(COUNT, TOOL.field)
     message = refused(apply(calibration, written(tmp_path, columns, way), tmp_path)[0], 2)
     assert "at 40 of 40 rows" in message
-    assert "5% off the table's own ref_field_nt" in message
+    assert "5% off its reference ref_field_nt" in message
+    assert message.endswith("Or are latitude and longitude of the reference those of the place?")
     columns["ref_field_nt"] = np.full(COUNT, TOOL.field * 1.2)
     ran, _ = apply(calibration, written(tmp_path, columns, way), tmp_path, "--json")
     assert [f["id"] for f in ran.json["findings"]] == ["no-serial"]

@@ -22,6 +22,8 @@ from mwdcal.files.formats import table as tables
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import centred, reference_vectors
 from mwdcal.planning.plans import Earth, Truth, grid, run, servo
+from mwdcal.presentation import survey_page
+from mwdcal.presentation.page import svg
 from mwdcal.survey.acceptance import (
     STRENGTH_NAMES,
     Judgement,
@@ -399,6 +401,41 @@ def place(tmp_path):
     return file, made.json
 
 
+@pytest.mark.parametrize(
+    ("calibrated", "surveyed", "expected"),
+    [
+        ("2026-01-10", "2026-05-20", set()),
+        ("2025-06-01", "2026-05-20", set()),
+        ("2024-11-01", "2026-05-20", {"calibration-old"}),
+        ("2026-05-21", "2026-05-20", {"calibration-later"}),
+        ("2019-01-10", "2019-05-20", {"reference-of-another-day"}),
+    ],
+)
+def test_days_that_do_not_belong_together_are_named(
+    example, tmp_path, place, calibrated, surveyed, expected
+):
+    """The reference is of 2026-06-01."""
+    record = mwdcal.load(example)
+    record = replace_struct(record, tool={**record.tool, "date": calibrated})
+    source = write_csv(tmp_path / "in.csv", read_csv(EXAMPLE / "well.csv"), f'date = "{surveyed}"')
+    named = {"calibration-old", "calibration-later", "reference-of-another-day"}
+    whole = mwdcal.survey(record, source, reference=place[0])
+    assert {f.id for f in whole.findings} & named == expected
+
+
+@pytest.mark.parametrize(("times", "named"), [(1.0, False), (1.9, False), (1 / 0.3048, True)])
+def test_courses_as_long_as_those_of_feet_taken_for_metres_are_named(
+    example, tmp_path, times, named
+):
+    """The example has 30 m from survey to survey."""
+    depths = [repr(times * float(cell)) for cell in read_csv(EXAMPLE / "well.csv")["md_m"]]
+    _, document = surveyed_file(example, tmp_path, {"md_m": depths})
+    texts = [f["text"] for f in document["findings"] if f["id"] == "long-courses"]
+    assert [text[:48] for text in texts] == [
+        "the courses between surveys are 98 m long (media"
+    ] * named
+
+
 def table_of(document, gravity=1.0, field=48_000.0, dip=63.0, sd=(0.0001, 60.0, 0.08)):
     """Columns and metadata that state every quantity, with uncertainties."""
     cells = {"ref_gravity_g": gravity, "ref_field_nt": field, "ref_dip_deg": dip}
@@ -449,8 +486,8 @@ def test_every_quantity_has_a_source_on_screen_page_table_and_in_json(example, t
         "gravity, declination: table   field: table at 32 of 36 rows, else reference   "
         "dip, convergence, 1σ of declination: reference"
     )
-    for text in (screen, page.read_text("utf-8")):
-        assert " ".join(line.split()) in " ".join(text.split())
+    assert " ".join(line.split()) in " ".join(screen.split())
+    assert line.replace("   ", "; ") in " ".join(page.read_text("utf-8").split())
     assert "reference_sources" in out.read_text("utf-8").partition("station")[0]
     _, alone = surveyed_file(example, tmp_path, dict.fromkeys(columns, [""] * 36))
     assert set(alone["reference_sources"].values()) == {"none"}
@@ -1149,6 +1186,31 @@ def test_feet_of_a_tie_in_of_a_table_in_metres_and_of_the_settings(example, tmp_
     assert "tvd_usft" in stated
     chosen, _ = surveyed_file(example, tmp_path, moved, "--length-unit", "m")
     assert "tvd_m" in chosen
+
+
+@pytest.mark.parametrize("title", ["Measured Depth (ft)", "MD", "Hole depth [m]"])
+def test_a_depth_under_its_own_title_is_not_called_unused(example, tmp_path, title):
+    given = read_csv(EXAMPLE / "well.csv")
+    columns = {title: given.pop("md_m"), "pump": ["1"] * 36, **given}
+    source = write_csv(tmp_path / "titled.csv", columns, "simulated = true")
+    typed = ("--length-unit", "ft", "--json")
+    ran = cli("survey", example, source, "-o", tmp_path / "well.csv", *typed)
+    assert ran.code == 0, ran
+    assert [f["text"] for f in ran.json["findings"] if f["id"] == "unused-columns"] == [
+        "columns not used: 'pump'."
+    ]
+
+
+def test_every_depth_track_of_the_page_has_its_axis(example):
+    """A narrow screen shows the tracks below each other: all but the dial of toolfaces have depths and a title."""
+    well = mwdcal.survey(example, EXAMPLE / "well.csv").surveyed.well
+    for draw, dials in ((survey_page.strengths, 0), (survey_page.angles, 1)):
+        figure = draw(well)
+        svg(figure, "x")
+        tracks = [axes for axes in figure.axes if axes.name != "polar"]
+        assert len(figure.axes) - len(tracks) == dials
+        assert {axes.get_ylabel() for axes in tracks} == {"measured depth, m"}
+        assert all(label.get_visible() for axes in tracks for label in axes.get_yticklabels())
 
 
 def test_a_trajectory_in_feet_says_so(example, tmp_path):

@@ -16,6 +16,7 @@ from msgspec.structs import replace
 from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.readings import serial_of, simulated
 from mwdcal.calibration.record import Finding, SignatureCheck, stated
+from mwdcal.files.formats.columns import shown
 from mwdcal.geometry.units import LENGTH_UNITS
 from mwdcal.presentation.contributions import (
     ContributionSummary,
@@ -29,7 +30,7 @@ from mwdcal.presentation.signature import signature_status
 from mwdcal.presentation.text import chance, one_line, plural, table
 from mwdcal.survey.interference import Interference, InterferenceSize, MultiStationAnalysis
 from mwdcal.survey.stations import North
-from mwdcal.survey.surveying import BY_ROW, SurveyedWell, WellInputs, depth_column
+from mwdcal.survey.surveying import SurveyedWell, WellInputs, used_in_surveys
 from mwdcal.survey.well import LastStation, Well, WellCounts, WellErrors
 from mwdcal.use.uncertainty import ErrorTerms, error_terms
 
@@ -235,9 +236,8 @@ def result_summary(result: SurveyedWell, output: str = "", html: str = "") -> Su
     """The result for machines; `output` and `html` are the files that were written, if any."""
     msa = result.analysis.summary if result.analysis else None
     others = result.inputs.surveys.readings.unused
-    depth, _ = depth_column(result.inputs.table, result.inputs.length_unit)
-    used = (*BY_ROW, f"'{depth}'")
-    unused = unused_columns(tuple(t for t in others if not any(name in t for name in used)))
+    used = (*map(shown, used_in_surveys(result.inputs.table)),)
+    unused = unused_columns(tuple(text for text in others if not text.startswith(used)))
     facts = summary(result.well, result.counts, output, html, msa, unused)
     budget = result.contributions and contribution_summary(result.contributions)
     runs = [_run_of_well(i, run) for i, run in enumerate(result.runs, 1)]
@@ -404,7 +404,7 @@ def screen(
     ]
     lines += runs_in_words(facts)
     if facts.reference_sources:
-        lines.append(sources_in_words(facts))
+        lines.append("   ".join(["references", *sources_in_words(facts)]))
     if facts.end:
         lines.append(end_in_words(facts.end, facts.north, facts.length_unit))
     lines.append(well.terms.sentence)
@@ -445,13 +445,12 @@ def declination_in_words(facts: SurveySummary) -> str:
     return f" (declination {signed(facts.declination_deg, 2)}° ± {sd}°)"
 
 
-def sources_in_words(facts: SurveySummary) -> str:
+def sources_in_words(facts: SurveySummary) -> list[str]:
     """Where the references come from, those of one source together."""
     names: dict[str, list[str]] = {}
     for name, source in facts.reference_sources.items():
         names.setdefault(source, []).append(name.replace("sd_", "1σ of "))
-    parts = [f"{', '.join(each)}: {source}" for source, each in names.items()]
-    return "   ".join(["references", *parts])
+    return [f"{', '.join(each)}: {source}" for source, each in names.items()]
 
 
 def end_in_words(end: EndOfPath, north: str, unit: str = "m") -> str:

@@ -190,13 +190,14 @@ def angles(well: Well) -> Figure:
         (np.degrees(inclination[0]), np.degrees(inclination[1]), "inclination, °"),
         (*turned, f"azimuth from {north} north, °"),
     )
+    panels[0, 1].sharey(panels[0, 0])
+    panels[0, 1].tick_params(labelleft=False)
     for axes, (value, sd, name) in zip(panels[0, :2], tracks, strict=True):
         _angle_track(axes, depth, value, sd)
         for top, bottom in stretches(depth, well.blind):
             axes.axhspan(top, bottom, color=BLIND_SHADE, alpha=0.35, lw=0)
         axes.set_xlabel(name)
     panels[0, 0].set_ylabel(title)
-    panels[0, 1].set_yticklabels([])
     where = panels[0, 2].get_subplotspec()
     panels[0, 2].remove()
     _dial(figure.add_subplot(where, projection="polar"), well, depth, toolface[0])
@@ -370,7 +371,7 @@ def render(surveyed: SurveyedWell, findings: list[Finding]) -> str:
         enlarged=enlargement(well.position) if located and well.position else 1.0,
         terms=well.terms.sentence,
         declination=declination_in_words(facts),
-        sources=sources_in_words(facts).partition("   ")[2],
+        sources="; ".join(sources_in_words(facts)),
         end=end_in_words(facts.end, facts.north, facts.length_unit) if facts.end else "",
         header=header,
         rows=rows,

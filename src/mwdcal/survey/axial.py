@@ -75,7 +75,8 @@ class AxialCorrection:
         good, bad = int(self.usable.sum()), int(self.no_go.sum())
         text = (
             f"axial correction of single surveys: azimuth_{north}_axial_deg is the azimuth without interference along "
-            f"the tool at {good} of {len(labels)} surveys. The path goes by the azimuths with it; `msa` corrects both."
+            f"the tool at {good} of {len(labels)} surveys, for comparison. azimuth_{north}_deg stays definitive, and "
+            "with it path and covariance: they have the interference, and its 1σ. `msa` corrects all of them."
         )
         result = [Finding(id="axial-correction", text=text)]
         if bad:

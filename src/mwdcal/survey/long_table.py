@@ -62,6 +62,7 @@ from mwdcal.survey.surveying import (
     loaded_limits,
     loaded_reference,
     not_deeper,
+    of_another_day,
     of_reference,
     station_readings,
     typical_north,
@@ -362,6 +363,8 @@ class _LongTable:
         assert seen.first is not None
         claims = {name: _joined_claims(each) for name, each in seen.claims.items()}
         sources, about = of_reference(claims, self.north, settings.reference, self.source.name)
+        if settings.reference is not None:
+            about += of_another_day(settings.reference, self.source.metadata)
         marked = {**self.source.metadata, **({"simulated": True} if seen.simulated else {})}
         readings = replace(
             seen.first.readings, metadata=identified(marked, [*seen.serials]),

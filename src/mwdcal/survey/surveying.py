@@ -14,7 +14,8 @@ from functools import cached_property
 import numpy as np
 from msgspec.structs import replace as replace_struct
 
-from mwdcal.calibration.readings import CONSTANTS, Readings, is_simulated
+from mwdcal.calibration.automatic.drift import JULIAN_YEAR
+from mwdcal.calibration.readings import CONSTANTS, Readings, is_simulated, stated_day
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files import synonyms
@@ -126,6 +127,8 @@ def survey_readings(
         for name in judged_constants(calibration, readings)
     }
     sources, findings = of_reference(claims, north, reference, table.source)
+    if reference is not None:
+        findings += of_another_day(reference, readings.metadata)
     referenced = readings if reference is None else with_reference(readings, reference)
     return SurveyReadings(referenced, md, north, sources, findings)
 
@@ -217,6 +220,21 @@ def of_reference(
     return sources, findings
 
 
+def of_another_day(reference: EarthReference, metadata: Mapping[str, object]) -> list[Finding]:
+    """The finding that the field of a reference is not of the day of the surveys, by more than a year.
+
+    In a year declination moves by up to about 0.2°, which is less than its 1σ.
+    """
+    day = stated_day(metadata)
+    if day is None or abs((day - reference.date).days) <= JULIAN_YEAR:
+        return []
+    text = (
+        f"the reference is of {reference.date}, and the surveys are of {day}: field, dip and declination have moved "
+        f"since. Run `mwdcal reference` with --date {day}."
+    )
+    return [Finding(id="reference-of-another-day", text=text)]
+
+
 def _stated(readings: Readings, name: str) -> Array:
     """Gravity, field or dip (n,) as the table states it, NaN where it does not."""
     return np.broadcast_to(readings.known.get(name, np.nan), readings.count)
@@ -300,6 +318,12 @@ def depth_column(table: Table, length_unit: str = "") -> tuple[str, float]:
                 )
             return name, LENGTH_UNITS[_unit_of(unit, length_unit)]
     return "", 1.0
+
+
+def used_in_surveys(table: Table) -> list[str]:
+    """Columns that a survey uses and a run of calibration does not: references by row, and the measured depth."""
+    depth, _ = depth_column(table, "m")
+    return [*BY_ROW, depth] if depth else [*BY_ROW]
 
 
 def _unit_of(stated: str, chosen: str) -> str:

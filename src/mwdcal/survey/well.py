@@ -30,7 +30,7 @@ from mwdcal.survey.acceptance import (
     blindness,
     judged,
 )
-from mwdcal.survey.error_model import ErrorModel, Hole
+from mwdcal.survey.error_model import USUAL_COURSE, ErrorModel, Hole
 from mwdcal.survey.path import (
     CauseOrder,
     DirectionErrors,
@@ -41,6 +41,7 @@ from mwdcal.survey.path import (
     well_path,
 )
 from mwdcal.survey.stations import (
+    STRENGTHS,
     SURVEY_OBSERVABLES,
     TOOLFACE_SWITCH,
     North,
@@ -327,6 +328,11 @@ WELL_FINDINGS = {
     "about them.",
     "laboratory-gravity": "gravity at the laboratory is unknown (1 g was assumed), so |g| is judged 1.5 mg more "
     "loosely. To tighten this, give ref_gravity_g in the calibration run.",
+    "calibration-old": "the tool was calibrated {years:.1f} years before, and 1σ allows for the drift of one year. "
+    "Verify the tool, or give `registry`, where the drift of tools has no such end.",
+    "calibration-later": "the surveys are of {day}, before the calibration of {calibrated}: is it the right one?",
+    "long-courses": "the courses between surveys are {course:.0f} m long (median), and {usual:g} m are usual: are "
+    "the depths in feet? Name their column `md_ft`, or give `length_unit`.",
     "magnetic-north": "no declination: azimuths and the well path count from magnetic north.",
     "path-from-first": "the well path starts at the first station, at north 0, east 0 and TVD 0. `tie_in` gives its "
     "position.",
@@ -756,17 +762,26 @@ def _judged(
 ) -> tuple[Judgement, Blindness | None]:  # fmt: skip
     """Acceptance, and what it cannot see; nothing where interference was taken off, or there is no field.
 
-    Where it was taken off, the covariance of the calibration has what is left of it and of the sensors' drift: the
-    terms of the limits for sensors do not count beside it.
+    Where it was taken off, the calibration was fitted to these surveys and their references. With S the covariance of
+    noise and references, P that of the parameters and H the departures by these, the departures have S - H P Hᵀ, which
+    is at most S: S is taken, and neither calibration nor terms for sensors are added.
     """
     seen, known = _to_judge(calibration, readings, vectors)
     taken = any(finding.id == CORRECTED for finding in calibration.findings)
     if taken:
         limits = replace_struct(limits, sensor=SensorTerms())
+        surveys = replace(surveys, strengths=_of_noise(calibration, readings, surveys.strengths))
     judgement = judged(surveys, seen, known, limits)
     if taken or not calibration.has_field or judgement.tests is None:
         return judgement, None
     return judgement, blindness(judgement.tests, seen)
+
+
+def _of_noise(calibration: Calibration, readings: Readings, strengths: Array) -> Array:
+    """The part (n, 3, 3) of the covariance of |g|, |b| and dip that is noise; NaN as the whole."""
+    slopes = calibration.gradients(SURVEY_OBSERVABLES[STRENGTHS], readings)
+    noise = slopes @ calibration.noise_covariance(readings) @ slopes.mT
+    return np.where(np.isnan(strengths), np.nan, noise)
 
 
 def _to_judge(
@@ -839,6 +854,11 @@ def _findings(result: Well, counts: WellCounts, from_first: bool) -> list[Findin
     first, why = counts.first or ("", "")
     _, blindest, worst = counts.blindest or (0.0, "", "")
     there = counts.on_path > 0
+    calibrated, day = (
+        stated_day(each) for each in (result.calibration.tool, result.readings.metadata)
+    )
+    years, course = _years(calibrated, day) or 0.0, _usual_course(result.position)
+    walks = result.errors is not None and result.errors.by_walk
     applies = {
         "rejected": counts.rejected,
         "blind-to-interference": counts.blind,
@@ -846,6 +866,9 @@ def _findings(result: Well, counts: WellCounts, from_first: bool) -> list[Findin
         "not-judged": counts.unjudged,
         "partly-judged": counts.partly,
         "laboratory-gravity": unknown_gravity(result.calibration) and counts.weighed,
+        "calibration-old": years > DRIFT_YEARS and not walks,
+        "calibration-later": calibrated is not None and day is not None and day < calibrated,
+        "long-courses": course > 2 * USUAL_COURSE,
         "magnetic-north": result.north.declination is None and result.calibration.has_field,
         "path-from-first": there and from_first and depth > 0,
         "path-from-later": start > 0,
@@ -857,13 +880,20 @@ def _findings(result: Well, counts: WellCounts, from_first: bool) -> list[Findin
         "first": first, "why": why, "start": label, "blind": counts.blind, "accepted": counts.accepted,
         "names": " and ".join(n for n, lacks in zip(STRENGTH_NAMES, counts.lacking, strict=True) if lacks),
         "blindest": blindest, "worst": worst, "partly": counts.partly, "unjudged": counts.unjudged,
-        "count": counts.rows - counts.on_path,
+        "count": counts.rows - counts.on_path, "years": years, "day": day, "calibrated": calibrated, "course": course,
+        "usual": USUAL_COURSE,
     }  # fmt: skip
     return [*result.corrected, *result.north.findings] + [
         Finding(id=name, text=text.format(**words))
         for name, text in WELL_FINDINGS.items()
         if applies[name]
     ]
+
+
+def _usual_course(position: Position | None) -> float:
+    """The median distance of neighbouring stations on the path along the hole, m; 0 where there are no two."""
+    depth = np.empty(0) if position is None else position.md[position.on_path]
+    return float(np.median(np.diff(depth))) if len(depth) > 1 else 0.0
 
 
 def _angle(name: str, value: Array, sd: Array) -> dict[str, AnyArray]:

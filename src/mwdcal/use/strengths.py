@@ -100,7 +100,7 @@ def _departure(name: str, each: Strengths) -> str:
     extent = "…".join(dict.fromkeys(f"{end:.3g}" for end in (each.low, each.high)))
     reasons = {
         f"no place on Earth has it ({low:g}…{high:g} {unit})": each.earth,
-        f"it is more than {OFF_REFERENCE:.0%} off the table's own ref_{OUTPUTS[name]}": each.reference,
+        f"it is more than {OFF_REFERENCE:.0%} off its reference ref_{OUTPUTS[name]}": each.reference,
     }
     why = " and ".join(reason for reason, rows in reasons.items() if rows)
     return f"corrected {name} is {extent} {unit}, and {why}"
@@ -126,6 +126,8 @@ def _advice(calibration: Calibration, name: str, each: Strengths) -> str:
         f"The calibration ({calibration.run}) is for {triad} readings{nominal}. Give the readings in the "
         "units of its run, or the calibration that belongs to them."
     )
+    if each.reference and not each.earth:
+        text += " Or are latitude and longitude of the reference those of the place?"
     if name == "field" and each.earth:
         text += " The field of a coil is declared in the tool profile before the calibration: [stand] coil = true."
     return text
