@@ -21,9 +21,9 @@ import numpy as np
 from mwdcal.bench import documents
 from mwdcal.bench.attitude import has_turned, is_near, live_values
 from mwdcal.bench.journal import Event, Journal
-from mwdcal.bench.positions import PLAN_COLUMNS, Positions, SessionPlan, TakenStation
+from mwdcal.bench.positions import PLAN_COLUMNS, Positions, SessionPlan, TakenStation, measured_rows
 from mwdcal.bench.settling import Settling, Standstill
-from mwdcal.bench.stream import TEMPERATURE_COLUMN, Stream
+from mwdcal.bench.stream import TEMPERATURE_COLUMN, TIME_COLUMN, Stream
 from mwdcal.bench.warmth import Warmth
 from mwdcal.errors import InputError, MwdcalError
 from mwdcal.files.contract import CHANNELS
@@ -115,7 +115,7 @@ class BenchSession:
             self.parts[RUN_PART] = Positions(RUN_PART, plan.columns)
         elif kind == "station":
             position, row = event["position"], event["row"]
-            part.accept(TakenStation(position, row))
+            part.accept(TakenStation(position, row, event.get("samples", {})))
             self._agreed += 1 if self._is_near(part, position, row) else -1
             self.attempts += 1
         elif kind == "undone":
@@ -302,10 +302,11 @@ class BenchSession:
                 raise InputError(
                     f"the tool has not moved since station {place + 1}. Move it to the next position."
                 )
-            row = _measured(settling.station(), self.stream.channels)
+            samples = _samples(settling.station(), self.stream.channels)
+            row = _measured(samples, self.reading)
             doubt = self._doubt(order, row)
             self._ask({order: doubt}, settling.moves)
-            self._take(order, row, doubt)
+            self._take(order, row, doubt, samples)
             self._used = settling.moves, order
 
     def accept_typed(
@@ -362,10 +363,12 @@ class BenchSession:
             )
         return order
 
-    def _take(self, order: int, measured: Mapping[str, Any], doubt: str) -> None:
+    def _take(
+        self, order: int, measured: Mapping[str, Any], doubt: str, samples: Mapping[str, Any] | None = None
+    ) -> None:  # fmt: skip
         """Take a station; its row holds what the plan and the stand state, and what was measured.
 
-        The journal keeps a `doubt` in spite of which the operator took it.
+        The journal keeps the `samples` of the standstill, and a `doubt` in spite of which the operator took it.
         """
         part = self.part
         row = {"station": str(order + 1), **measured}
@@ -373,8 +376,8 @@ class BenchSession:
             row[TEMPERATURE_COLUMN] = self.typed_temperature
         row |= {name: part.columns[name][order] for name in PLAN_COLUMNS[:3]}
         row |= {f"ref_{name}": value for name, value in self.earth.items()}
-        doubted = {"doubt": doubt} if doubt else {}
-        self._record("station", part=part.name, position=order, row=row, **doubted)
+        more = {name: value for name, value in (("doubt", doubt), ("samples", samples)) if value}
+        self._record("station", part=part.name, position=order, row=row, **more)
         self.message = ""
         self._write_tables()
         self._refit()
@@ -458,10 +461,12 @@ class BenchSession:
     def _write_tables(self) -> None:
         """Write the run files from the events. The stations are in the journal already: a full disk loses none."""
         try:
+            earlier: list[TakenStation] = []
             for part in self.parts.values():
                 path = self.folder / f"{part.name}.csv"
                 if part.taken:
-                    tables.write(path, part.table(self.facts))
+                    tables.write(path, part.table(self.facts, earlier))
+                    earlier = [*part.done.values()]
                 else:
                     path.unlink(missing_ok=True)
             self._unwritten = False
@@ -617,9 +622,17 @@ class BenchSession:
         self.journal.close()
 
 
-def _measured(still: Standstill, channels: Sequence[str]) -> dict[str, Any]:
-    """Cells of the run file of a standstill."""
-    row: dict[str, Any] = dict(zip(channels, still.means, strict=True))
-    pairs = zip(channels, still.sd, strict=True)
-    row |= {f"sd_{name}": sd for name, sd in pairs if name != TEMPERATURE_COLUMN}
-    return row | {"samples": float(still.samples), "start_s": still.start, "end_s": still.end}
+def _samples(still: Standstill, channels: Sequence[str]) -> dict[str, Any]:
+    """A standstill as the journal holds it."""
+    columns = zip(channels, still.samples.T.tolist(), strict=True)
+    steps = dict(
+        zip([name for name in channels if name != TEMPERATURE_COLUMN], still.steps, strict=True)
+    )
+    return {TIME_COLUMN: still.time.tolist(), **dict(columns), "steps": steps}
+
+
+def _measured(samples: Mapping[str, Any], reading: Mapping[str, float]) -> dict[str, Any]:
+    """Cells of the run file of a standstill alone, with its mean `reading`."""
+    [row] = measured_rows([TakenStation(0, dict(reading), samples)])
+    time = samples[TIME_COLUMN]
+    return row | {"samples": float(len(time)), "start_s": time[0], "end_s": time[-1]}

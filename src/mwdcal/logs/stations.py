@@ -367,13 +367,31 @@ def _summaries(traces: Traces, start: Array, end: Array, findings: list[Finding]
     summaries: Rows = {}
     for name, (time, value) in traces.items():
         say(f"means of {name} at {count(len(start), 'station')}")
-        resolution = standstill.resolution(value) or SMALLEST_RESOLUTION * abs(float(value[0]))
         places = zip(*_within(time, start, end), strict=True)
         rests = [(time[a:b], value[a:b]) for a, b in places]
+        resolution = standstill.resolution(value) or SMALLEST_RESOLUTION * abs(float(value[0]))
         summaries[name] = summarise(rests, resolution or SMALLEST_RESOLUTION)
+    return _all_widened(summaries, findings)
+
+
+def means_of(rests: Mapping[str, Sequence[Trace]], steps: Mapping[str, float]) -> Rows:
+    """What each channel read at its standstills, by their samples and the steps of readings; as for a log.
+
+    A step is 0 where none is known.
+    """
+    rows: Rows = {}
+    for name, each in rests.items():
+        fine = SMALLEST_RESOLUTION * (abs(float(each[0][1][0])) or 1.0)
+        rows[name] = summarise(each, max(steps.get(name, 0.0), fine))
+    return _all_widened(rows, [])
+
+
+def _all_widened(rows: Rows, findings: list[Finding]) -> Rows:
+    """Readings of all channels, triad by triad, known less well where their noise is correlated."""
+    wider = dict(rows)
     for triad in CHANNELS.values():
-        summaries |= _widened({n: summaries[n] for n in triad if n in summaries}, findings)
-    return summaries
+        wider |= _widened({n: rows[n] for n in triad if n in rows}, findings)
+    return wider
 
 
 def _widened(triad: Rows, findings: list[Finding]) -> Rows:
