@@ -27,7 +27,7 @@ from bench_support import (
 from bench_tables import ROLLS, RUN, laboratory_table
 from cli_support import EXAMPLE, RAW, mwdcal, process
 from mwdcal import load_profile
-from mwdcal.bench import documents, serving
+from mwdcal.bench import documents, opening, serving
 from mwdcal.bench.attitude import has_turned
 from mwdcal.bench.journal import Journal
 from mwdcal.bench.session import BenchSession
@@ -57,8 +57,8 @@ def session_in(folder, plan=PLAN, start=True, tool=None, **options):
     folder.mkdir(exist_ok=True)
     (folder / "tool.toml").write_text(tool or TOOL.read_text())
     profile = load_profile(folder / "tool.toml")
-    planned = serving.session_plan(profile, plan)
-    session = BenchSession(folder, profile, planned, serving._rolltest(), window=2.0, **options)
+    planned = opening.session_plan(profile, plan)
+    session = BenchSession(folder, profile, planned, opening.rolltest_plan(), window=2.0, **options)
     if start and not session.facts:
         session.start("T-1", "A. Example", earth=EARTH)
     elif start:
@@ -312,7 +312,7 @@ def test_a_tool_in_another_attitude_is_asked_about_but_not_by_wrong_signs(tmp_pa
 def test_a_turn_is_told_from_a_knock(plan, dip):
     """Between all neighbours of a plan that are 6° apart in gravity or field, by vectors of another formula."""
     profile, stand = load_profile(TOOL), Stand(5)
-    columns = serving.session_plan(profile, plan).columns
+    columns = opening.session_plan(profile, plan).columns
     names = ("ref_inclination_deg", "ref_azimuth_deg", "ref_toolface_deg")
     rows = zip(*(columns[name] for name in names), strict=True)
     attitudes = [tuple(value or 0.0 for value in row) for row in rows]
@@ -344,7 +344,7 @@ def test_bad_stations_do_not_hide_each_other(tmp_path, size, samples):
     The stand sets a roll once, as the simulated one does, so that a bad station looks like a bad setting.
     """
     (tmp_path / "tool.toml").write_bytes(SERVO.read_bytes())
-    plan, stand = serving.session_plan(load_profile(SERVO), PLAN).columns, Stand()
+    plan, stand = opening.session_plan(load_profile(SERVO), PLAN).columns, Stand()
     rng, names = np.random.default_rng(1), ("inclination", "azimuth", "toolface")
     angles = np.transpose([plan[f"ref_{name}_deg"] for name in names]).astype(float)
     off = rng.normal(size=(24, 3)) * (0.01, 0.05, 0.02)

@@ -203,8 +203,7 @@ class Settling:
                 float(student(known, chance)), float(student(inf, chance)) * LARGEST_WANDER / change
             )
             bounds[:, triad] = [[scatter * times], [change * wander]]
-        largest, most = bounds * rough
-        return largest, most
+        return bounds[0] * rough, bounds[1] * rough
 
     @property
     def _triads(self) -> list[slice]:
@@ -214,7 +213,7 @@ class Settling:
     def _floor(self) -> Array:
         """The smallest noise of each sensor: half a step is a value between two."""
         steps = np.array(self.step)
-        return np.maximum(self.least, np.where(np.isfinite(steps), steps / 2, 0.0))
+        return np.asarray(np.maximum(self.least, np.where(np.isfinite(steps), steps / 2, 0.0)))
 
     def _look(self) -> None:
         """Drop the oldest cells until no sensor creeps; settled if what is left is long enough."""
