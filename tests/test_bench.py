@@ -29,16 +29,23 @@ from bench_support import (
 from bench_tables import ROLLS, RUN, laboratory_table
 from cli_support import EXAMPLE, RAW, ROOT, mwdcal, process
 from mwdcal import load_profile
-from mwdcal.bench import documents, serving
+from mwdcal.bench import documents, opening, serving
 from mwdcal.bench.attitude import has_turned
 from mwdcal.bench.journal import Journal
 from mwdcal.bench.session import BenchSession
-from mwdcal.bench.settling import WANDER_SIGMA, Settling, _largest_ratio
+from mwdcal.bench.settling import (
+    FALSE_CREEP,
+    FALSE_MOVE,
+    Settling,
+    _largest_scatter,
+    _trend_in_noise,
+)
 from mwdcal.bench.sources import GrowingFile, Lines, SerialPort, Socket, source_of
 from mwdcal.bench.spreadsheet import DroppedTable
 from mwdcal.bench.stream import Stream
 from mwdcal.bench.warmth import Warmth
 from mwdcal.errors import InputError
+from mwdcal.logs.stations import means_of
 from mwdcal.sensor.profile import StreamForm
 from simulation import DEG
 
@@ -52,8 +59,8 @@ def session_in(folder, plan=PLAN, start=True, tool=None, **options):
     folder.mkdir(exist_ok=True)
     (folder / "tool.toml").write_text(tool or TOOL.read_text())
     profile = load_profile(folder / "tool.toml")
-    planned = serving.session_plan(profile, plan)
-    session = BenchSession(folder, profile, planned, serving._rolltest(), window=2.0, **options)
+    planned = opening.session_plan(profile, plan)
+    session = BenchSession(folder, profile, planned, opening.rolltest_plan(), window=2.0, **options)
     if start and not session.facts:
         session.start("T-1", "A. Example", earth=EARTH)
     elif start:
@@ -307,7 +314,7 @@ def test_a_tool_in_another_attitude_is_asked_about_but_not_by_wrong_signs(tmp_pa
 def test_a_turn_is_told_from_a_knock(plan, dip):
     """Between all neighbours of a plan that are 6° apart in gravity or field, by vectors of another formula."""
     profile, stand = load_profile(TOOL), Stand(5)
-    columns = serving.session_plan(profile, plan).columns
+    columns = opening.session_plan(profile, plan).columns
     names = ("ref_inclination_deg", "ref_azimuth_deg", "ref_toolface_deg")
     rows = zip(*(columns[name] for name in names), strict=True)
     attitudes = [tuple(value or 0.0 for value in row) for row in rows]
@@ -339,7 +346,7 @@ def test_bad_stations_do_not_hide_each_other(tmp_path, size, samples):
     The stand sets a roll once, as the simulated one does, so that a bad station looks like a bad setting.
     """
     (tmp_path / "tool.toml").write_bytes(SERVO.read_bytes())
-    plan, stand = serving.session_plan(load_profile(SERVO), PLAN).columns, Stand()
+    plan, stand = opening.session_plan(load_profile(SERVO), PLAN).columns, Stand()
     rng, names = np.random.default_rng(1), ("inclination", "azimuth", "toolface")
     angles = np.transpose([plan[f"ref_{name}_deg"] for name in names]).astype(float)
     off = rng.normal(size=(24, 3)) * (0.01, 0.05, 0.02)
@@ -542,13 +549,19 @@ def fed(values, rate=10.0, window=3.0, least=None):
     return states, judge
 
 
-def test_a_tool_that_turns_or_creeps_is_never_settled():
-    rng = np.random.default_rng(1)
-    time = np.arange(1200) / 10
-    noise = rng.normal(0, 1e-4, len(time))
-    for course in (0.02 * time, np.sin(time / 3), np.sin(time / 60)):
-        assert "settled" not in fed(course + noise)[0]
-    states, _ = fed(noise)
+@pytest.mark.parametrize("seconds", [1.0, 3.0, 60.0, 300.0])
+def test_a_tool_that_turns_is_never_settled(seconds):
+    """Gravity turns about the tool axis, by a radian in so many seconds, in noise of 0.1 mg."""
+    rng, judge, states = np.random.default_rng(1), Settling(3, 3.0), []
+    for i, noise in enumerate(rng.normal(0, 1e-4, (1200, 3))):
+        angle = i / 10 / seconds
+        judge.take(i / 10, tuple(map(float, np.array([np.sin(angle), np.cos(angle), 0.3]) + noise)))
+        states.append(judge.state)
+    assert "settled" not in states
+
+
+def test_a_tool_at_rest_settles():
+    states, _ = fed(np.random.default_rng(1).normal(0, 1e-4, 1200))
     assert states[50:].count("settled") > 0.9 * len(states[50:])
 
 
@@ -573,92 +586,109 @@ def test_a_creeping_stand_is_waited_for():
             if t > 46 and judge.state == "settled":
                 break
         assert judge.state == "settled"
-        left.append(judge.station().means[0] - 1000)
+        left.append(judge.means[0] - 1000)
     assert np.max(np.abs(left)) < 4.8
     assert np.mean(np.abs(left)) < 3.1
 
 
-def standstills(kind, count=100):
-    """Standstills of a channel in noise of 0.001 whose truth is known, with that truth."""
-    for seed in range(count):
-        rng = np.random.default_rng(seed)
-        truth = rng.uniform(-1, 1)
-        move = np.linspace(truth - 2, truth, 50)  # on the way the steps of a converter show
-        noise = rng.normal(0, 1e-3, 1200)
-        course = np.concatenate([move, np.full(1150, truth)])
-        if (seconds := {"0.3 s": 0.3, "1 s": 1.0}.get(kind)) is not None:
-            share = np.exp(-0.1 / seconds)
-            for i in range(1, len(noise)):
-                noise[i] = share * noise[i - 1] + np.sqrt(1 - share**2) * noise[i]
-        step = {"quantised": 5e-3, "fine": 1e-6}.get(kind)
-        values = course + noise
-        values = np.round(values / step) * step if step else values
-        judge = Settling(1, 5.0, [0.0])
+def noisy(rng, count, rate, seconds, sensors=1):
+    """White noise, or AR(1) noise of a correlation time in seconds, of variance 1 (count, sensors)."""
+    noise = rng.normal(size=(count, sensors))
+    share = np.exp(-1 / rate / seconds) if seconds else 0.0
+    for i in range(1, count):
+        noise[i] = share * noise[i - 1] + np.sqrt(1 - share**2) * noise[i]
+    return noise
+
+
+def errors_of_means(rate, seconds=0.0, step=0.0, count=100):
+    """Errors of the means of standstills of a sensor, a tool that moves between them, over their uncertainty."""
+    rng, judge, time, here = np.random.default_rng(7), Settling(1, 5.0), 0.0, 0.0
+    rests, truths = [], []
+    for _ in range(count):
+        goal = rng.uniform(-1000, 1000)
+        course = np.concatenate([np.linspace(here, goal, 4 * rate), np.full(40 * rate, goal)])
+        values = course + noisy(rng, len(course), rate, seconds)[:, 0]
+        values, here = np.round(values / step) * step if step else values, goal
         for i, value in enumerate(values):
-            judge.take(i / 10, (float(value),))
-            if i > 100 and judge.state == "settled":
+            judge.take(time, (float(value),))
+            time += 1 / rate
+            if i > 5 * rate and judge.state == "settled":
                 break
-        yield judge, truth
+        assert judge.state == "settled"
+        still = judge.station()
+        rests.append((still.time, still.samples[:, 0]))
+        truths.append(goal)
+    row = means_of({"ax": rests}, {"ax": still.steps[0]})["ax"]
+    return (row.mean - truths) / row.sd
 
 
-@pytest.mark.parametrize("kind", ["white", "quantised", "fine"])
-def test_the_stated_uncertainty_of_a_mean_holds(kind):
-    """Means of standstills against the truth: their errors over the stated uncertainty are about one, rms.
+@pytest.mark.parametrize("rate", [5, 10, 50])
+@pytest.mark.parametrize("step", [0.0, 1e-3, 5.0])
+def test_the_stated_uncertainty_of_a_mean_holds(rate, step):
+    """Means of 100 standstills in white noise of 1 against the truth: errors over the stated uncertainty.
 
-    Above: of 100 normal errors the rms exceeds √(149.4/100) = 1.22 once in a thousand times (χ²). Below: it is under
-    √(61.9/100) = 0.79 as seldom, of what is expected at least. The stated variance is the largest of three
-    estimates of σ²/n, which expect 1, 9/7 and 2 times that: no more than their sum, 4.29, so 1/√4.29 = 0.48.
-    A converter with a step of five times the noise is stated with step/√12 = 0.289 of the step, while the noise
-    dithers it to an rms of exp(-2π²/25)/(π√2) = 0.102 (the first harmonic of its sawtooth): 0.35.
+    Their rms exceeds sqrt(149.4/100) = 1.22 once in a thousand times, and is under 0.79 as seldom (χ²). Student's
+    factor for 25 samples or more takes at most 5 % off. A step of five times the noise hides more than the noise: only
+    the upper bound holds there.
     """
-    errors = [
-        (still.means[0] - truth) / still.sd[0]
-        for still, truth in ((judge.station(), truth) for judge, truth in standstills(kind))
-    ]
-    least = 0.35 if kind == "quantised" else 0.48
-    assert 0.79 * least < np.sqrt(np.mean(np.square(errors))) < 1.22
+    errors = errors_of_means(rate, step=step)
+    assert np.sqrt(np.mean(errors**2)) < 1.22
+    if step != 5.0:
+        assert np.sqrt(np.mean(errors**2)) > 0.79 * 0.95
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("rate", [10, 50])
+@pytest.mark.parametrize("seconds", [0.05, 0.3, 1.0])
+def test_the_uncertainty_holds_correlated_noise(rate, seconds):
+    """AR(1) noise: of a hundred means 87 or more are within 1.96 of their uncertainty, as all but one in a thousand
+    samples of a hundred are where 95 % are."""
+    assert stats.binom.cdf(86, 100, 0.95) < 1e-3
+    assert np.mean(np.abs(errors_of_means(rate, seconds)) < 1.96) >= 0.87
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rate", [10, 50])
 @pytest.mark.parametrize("seconds", [0.0, 0.3, 1.0])
-def test_noise_that_wanders_is_said(seconds):
-    """White noise, and a low pass of so many seconds: how often it is said lies between two odds of the statistic.
-
-    Those are of 20,000 windows of ten cells of five samples: five times the variance of the cells' means over that
-    within cells, above the point of F with 9 and 40 degrees of freedom that a sixth of 0.1 % exceed. Above: of all
-    windows. Below: of those that have neither a trend of three standard deviations nor a cell that lies five away from
-    the first, for only such a window is a standstill. Three standard deviations of so many trials come on top.
-    """
-    share = np.exp(-0.1 / seconds) if seconds else 0.0
-    noise = np.random.default_rng(1).normal(size=(20_000, 50))
-    for i in range(1, 50):
-        noise[:, i] = share * noise[:, i - 1] + np.sqrt(1 - share**2) * noise[:, i]
-    cells = noise.reshape(-1, 10, 5)
-    means, within = cells.mean(2), cells.var(2, ddof=1).mean(1)
-    said = 5 * means.var(1, ddof=1) / within > stats.f.isf(0.001 / 6, 9, 40)
-    fits = np.polynomial.polynomial.polyfit(np.arange(10), means.T, 1)
-    left = means - np.polynomial.polynomial.polyval(np.arange(10), fits)
-    spread = np.maximum(np.sqrt(within / 5), np.sqrt(np.sum(left**2, 1) / 8))
-    steady = np.abs(fits[1]) * np.sqrt(82.5) < 3 * spread
-    apart = np.abs(means - means[:, :1]).max(1)
-    steady &= apart < 5 * np.sqrt(2 / 5 * within.mean())
-    kind = f"{seconds:g} s" if seconds else "white"
-    judges = [judge for judge, _ in standstills(kind) if judge.state == "settled"]
-    got = np.mean([judge.wanders for judge in judges])
-    assert len(judges) > 90
-    low, high = said[steady].mean(), said.mean()
-    spread = [3 * np.sqrt(odds * (1 - odds) / len(judges)) for odds in (low, high)]
-    assert low - spread[0] <= got <= high + max(spread[1], 1.5 / len(judges))
-    assert (low > 0.4) == (seconds > 0)
+def test_a_tool_at_rest_is_seldom_said_to_move_or_to_creep(rate, seconds):
+    """Of 400 cells of six sensors in white or AR(1) noise: no more than so many times chance ends a standstill, or has
+    the tool wait, as happens once in a thousand times. Neighbouring looks share nine of ten cells: of the looks a
+    tenth are independent."""
+    rng, judge, waits, looks = np.random.default_rng(11), Settling(6, 5.0), 0, 0
+    for i, row in enumerate(noisy(rng, 200 * rate, rate, seconds, 6)):
+        judge.take(i / rate, tuple(map(float, row)))
+        if i > 20 * rate and i % (rate // 2) == 0:
+            looks, waits = looks + 1, waits + (judge.state != "settled")
+    assert judge.moves <= stats.binom.isf(1e-3, 400, FALSE_MOVE)
+    assert waits <= 10 * stats.binom.isf(1e-3, looks // 10, FALSE_CREEP)
 
 
-def test_the_limit_of_wandering_is_that_of_fisher():
-    for freedom, within in ((9, 40), (9, 240), (39, 160), (4, 30)):
-        exact = stats.f.isf(stats.norm.sf(WANDER_SIGMA), freedom, within)
-        assert _largest_ratio(freedom, within) == pytest.approx(exact, rel=0.05)
+def test_the_limit_of_scatter_is_that_of_fisher():
+    for freedom, known in ((4.0, 5.0), (24.0, 20.0), (2.5, 10.0)):
+        quartile = stats.chi2.ppf(0.25, freedom) / freedom
+        exact = np.sqrt(stats.f.isf(1e-4, freedom, known * freedom) / quartile)
+        assert _largest_scatter(freedom, known, 1e-4) == pytest.approx(exact)
 
 
-def test_a_coarse_converter_does_not_wander():
-    assert not any(judge.wanders for judge, _ in standstills("quantised"))
+@pytest.mark.parametrize("correlation", [0.0, 0.5, 0.8])
+def test_a_trend_in_correlated_noise(correlation):
+    """Moments of the residuals and of the slope and curve, of simulated noise, against those that are stated."""
+    rng, form = np.random.default_rng(2), _trend_in_noise(10)
+    place = int(form.place(np.array([correlation]))[0])
+    share = form.grid[place]
+    noise = rng.normal(size=(10, 40_000))
+    for i in range(1, 10):
+        noise[i] = share * noise[i - 1] + np.sqrt(1 - share**2) * noise[i]
+    fit = np.polynomial.legendre.legfit(np.arange(10) - 4.5, noise, 2)
+    left = noise - np.polynomial.legendre.legval(np.arange(10) - 4.5, fit).T
+    squares = np.sum(left**2, 0)
+    assert form.left[place] == pytest.approx(squares.mean(), rel=0.02)
+    assert form.variance[0, place] == pytest.approx(82.5 * fit[1].var(), rel=0.03)  # Σ x² = 82.5
+    assert form.variance[1, place] == pytest.approx(1188 * fit[2].var(), rel=0.03)  # Σ (P2 - mean)²
+    assert form.ratio[place] == pytest.approx(
+        (left[1:] * left[:-1]).sum(0).mean() / squares.mean(), abs=0.01
+    )
+    assert form.freedom[place] == pytest.approx(2 * squares.mean() ** 2 / squares.var(), rel=0.05)
 
 
 def test_a_gap_ends_a_standstill():

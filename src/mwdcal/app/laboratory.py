@@ -25,13 +25,14 @@ SETTING_OF = {
     "registry": "registry",
     "key": "keys",
     "laboratory": "laboratory",
+    "countersign": "countersign",
 }
 """The setting that is the default of an option, by the name of its variable."""
 WITHOUT_SETTINGS = ("init", "list", "example", "completion")
 """Commands that no setting concerns."""
 NOTED_BY_READER = ("limits",)
 """Settings that count as used when their file is read: an option may have them and not need them."""
-_LOCAL = ("tool", "limits", "registry", "laboratory")
+_LOCAL = ("tool", "limits", "registry", "laboratory", "countersign")
 _GIVEN = {ParameterSource.COMMANDLINE: "given as {}", ParameterSource.ENVIRONMENT: "given by ${}"}
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import mwdcal
+from mwdcal.bench.opening import PREVIOUS_FILE
 from mwdcal.calibration.results import typical_accuracy
 from mwdcal.errors import FitError, InputError, MwdcalError
 from mwdcal.files.profiles import setting
@@ -23,6 +24,7 @@ FEWEST_STATIONS = 8
 """Stations before which no fit is tried."""
 REMEASURE = "reshoot"
 """The finding that names a station to measure again."""
+AS_FOUND = "as-found.json"
 ENTERED = ("tool.json", "verification.json", "certificate.json")
 """Files of the session that go into the registry."""
 
@@ -111,6 +113,41 @@ def verify(
     return verdict, {"verification": "verification.json"}
 
 
+def judge_as_found(folder: Path) -> Verdict | None:
+    """The verdict on the same roll test by the calibration before, if there is one: the tool as found.
+
+    A calibration changes figures, not the tool: its readings as found are those of the roll test.
+    """
+    if not (folder / PREVIOUS_FILE).exists():
+        return None
+    verdict = judged(mwdcal.load(folder / PREVIOUS_FILE), folder / "rolltest.csv")
+    mwdcal.save(verdict, folder / AS_FOUND)
+    return verdict
+
+
+def signers_name(key: Path) -> str:
+    """The owner of a private key, as its public key beside it states; empty if it states none."""
+    from mwdcal.certificate.signature import PUBLIC_SUFFIX, read_public
+
+    return read_public(Path(f"{key}{PUBLIC_SUFFIX}")).owner
+
+
+def countersign(folder: Path, key: Path, passphrase: str, operator: str) -> str:
+    """Sign the certificate with the key of a second person; who that is, in words.
+
+    Raises:
+        InputError: the key or its passphrase is wrong, or its owner is the operator.
+    """
+    owner = signers_name(key)
+    if owner.strip().casefold() == operator.strip().casefold():
+        whose = f"that of the operator, {operator}" if owner else "of nobody: it states no owner"
+        raise InputError(
+            f"the key {key.name} is {whose}. A second person signs, with a key of their own."
+        )
+    signed = mwdcal.sign(folder / "certificate.json", key, passphrase=passphrase, replace=True)
+    return f"{owner}, key {signed.key}"
+
+
 def certify(
     folder: Path, number: str, laboratory: Path | None, say: Callable[[str], None]
 ) -> dict[str, str]:
@@ -118,6 +155,7 @@ def certify(
     chosen: dict[str, Any] = {"number": number} if number else {}
     chosen |= {"laboratory": laboratory} if laboratory else {}
     verification = folder / "verification.json"
+    chosen |= {"as_found": folder / AS_FOUND} if (folder / AS_FOUND).exists() else {}
     paper = mwdcal.certificate(folder / "tool.json", verification=verification, **chosen)
     mwdcal.save(paper, folder / "certificate.json")
     files = {"certificate": "certificate.json"}
@@ -134,14 +172,6 @@ def enter(folder: Path, registry: str) -> str:
     """Enter the documents in the registry; what was entered, in words."""
     with mwdcal.registry(registry, create=True) as tools:
         return tools.add(*(folder / name for name in ENTERED)).summary().splitlines()[0]
-
-
-def tools_in(registry: str | None) -> Sequence[Any]:
-    """The tools of a registry, those that are due first; none where there is no registry yet."""
-    if registry is None or ("://" not in registry and not Path(registry).exists()):
-        return ()
-    with mwdcal.registry(registry) as tools:
-        return sorted(tools.list().rows, key=lambda tool: tool.next_due or "9")
 
 
 def draw(result: Any, folder: Path, name: str) -> dict[str, str]:

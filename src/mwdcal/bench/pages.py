@@ -8,11 +8,13 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 from mwdcal.bench import pictures
-from mwdcal.bench.documents import FEWEST_STATIONS
+from mwdcal.bench.documents import FEWEST_STATIONS, signers_name
+from mwdcal.bench.opening import FROM_REGISTRY, ToolPast
 from mwdcal.bench.positions import ORDERED_ANGLES, Positions
 from mwdcal.bench.session import RUN_PART, BenchSession
 from mwdcal.bench.sources import LineSource
 from mwdcal.bench.stream import TEMPERATURE_COLUMN
+from mwdcal.errors import MwdcalError
 from mwdcal.files.profiles import built_in
 from mwdcal.geometry.observables import TITLES
 from mwdcal.presentation.numbers import fixed, number, quantity, signed
@@ -34,9 +36,13 @@ LIVE_DECIMALS = {"inclination": 2, "toolface": 2, "azimuth": 2, "gravity": 5, "f
 LIVE_UNITS = {**dict.fromkeys((*ORDERED_ANGLES, "dip"), "°"), "gravity": " g", "field": " nT"}
 LEAST_WARMING = 0.05
 """°C a minute below which no rate is shown."""
+SHOWN_RECORDS = 12
+"""Records of the past of a tool that are shown."""
 STAND_REFERENCES = ("gravity_g", "field_nt", "dip_deg")
 NOT_OF_RUNS = ("candidates", "roll-test")
 """Built-in plans that are not the plan of a run."""
+FEWEST = "fewest"
+"""The plan of the fewest stations for an accuracy, in the form."""
 BEST = ("best-12", "best-24", "best-48")
 """Plans that mwdcal chooses for the tool."""
 
@@ -99,18 +105,42 @@ def _buttons(session: BenchSession) -> dict[str, Any]:
         "can_reopen": session.calibrated and not finished,
         "can_test": session.calibrated and not session.testing,
         "can_certify": session.verdict is not None and not finished,
-        "can_enter": finished and session.registry is not None and "registry" not in session.papers,
+        "signer": _signer(session),
+        "can_enter": finished and not session.waits_for_signature and session.registry is not None
+        and "registry" not in session.papers,
         "bad": bool(session.bad), "measuring": measuring, "passed": bool(session.verdict and session.verdict.passed),
     }  # fmt: skip
+
+
+def _signer(session: BenchSession) -> str:
+    """Whose key signs the certificate next; empty if nobody's does."""
+    if session.countersign is None or not session.waits_for_signature:
+        return ""
+    try:
+        return signers_name(session.countersign) or session.countersign.name
+    except MwdcalError:
+        return session.countersign.name
 
 
 def _start_form(session: BenchSession) -> dict[str, Any]:
     """Fields of the start page, and the past of the laboratory's tools."""
     if session.facts:
-        return {"serial": "", "plans": [], "earth": [], "tools": []}
+        return {
+            "serial": "",
+            "plans": [],
+            "profiles": [],
+            "earth": [],
+            "tools": [],
+            "past": None,
+            "chosen": "",
+        }
     plans = [session.plan.name, *BEST, *(n for n in built_in("plans") if n not in NOT_OF_RUNS)]
+    past = session.past
+    shown = [(name, name) for name in dict.fromkeys(plans)]
     return {
-        "serial": "DEMO-1" if session.simulated else "", "plans": [*dict.fromkeys(plans)],
+        "serial": past.serial if past else "DEMO-1" if session.simulated else "",
+        "chosen": past.serial if past else "", "plans": [shown[0], (FEWEST, texts()["fewest"]), *shown[1:]],
+        "profiles": _profiles(session), "past": _past(past),
         "earth": [
             (name, number(session.earth[name], 6) if name in session.earth else "") for name in STAND_REFERENCES
         ],
@@ -119,6 +149,39 @@ def _start_form(session: BenchSession) -> dict[str, Any]:
             for tool in session.tools
         ],
     }  # fmt: skip
+
+
+def _profiles(session: BenchSession) -> list[tuple[str, str]]:
+    """The tool profiles to choose from: that of the registry, that of the session, and the built-in ones."""
+    if session.simulated:
+        return []
+    known = session.past.profile if session.past else None
+    registry = (
+        [(FROM_REGISTRY, texts()["profile_of_registry"].format(name=known.name))] if known else []
+    )
+    return [
+        *registry,
+        ("", session.profile.name),
+        *((n, n) for n in built_in("profiles") if n != session.profile.name),
+    ]
+
+
+def _past(past: ToolPast | None) -> dict[str, Any] | None:
+    """The past of the chosen tool: what is due, and its records."""
+    if past is None:
+        return None
+    t = texts()
+    shown = past.records[:SHOWN_RECORDS]
+    rows = [
+        ((each.time or "–")[:10], t.get(f"record_{each.kind}", each.kind), each.status or "–")
+        for each in shown
+    ]
+    due = t["past_due"].format(day=past.next_due) if past.next_due else t["past_no_due"]
+    return {
+        "serial": past.serial,
+        "due": due,
+        "rows": [(time[:10], kind, status) for time, kind, status in rows],
+    }
 
 
 def _words(session: BenchSession) -> dict[str, Any]:
@@ -161,8 +224,10 @@ def _order_text(session: BenchSession) -> str:
     if session.waiting:
         return t["press_resume"] if session.facts else t["press_start"]
     if session.verdict is not None:
+        if session.waits_for_signature:
+            return t["next_signature"]
         if "certificate" in session.papers:
-            return t["finished"]
+            return t["signed" if "signature" in session.papers else "finished"]
         return t["next_certificate"] if session.verdict.passed else t["next_failed"]
     if session.calibrated and not session.testing:
         return t["next_rolltest"]
@@ -226,6 +291,8 @@ def _results(session: BenchSession) -> dict[str, Any]:
         "accuracy": [(n, degrees(latest[n]), degrees(expected.get(n))) for n in SHOWN_ANGLES if n in latest],
         "course": pictures.course(session.course, expected, session.parts[RUN_PART].count, t, t["accuracy"]),
         "errors": error_rows(errors), "limits": limit_rows(verdict),
+        "found": limit_rows(session.as_found.rows if session.as_found else []),
+        "found_passed": bool(session.as_found and session.as_found.passed),
         "papers": papers(session.papers, session.folder),
     }  # fmt: skip
 

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from mwdcal.bench.attitude import Attitude
-from mwdcal.bench.stream import TEMPERATURE_COLUMN
+from mwdcal.bench.stream import TEMPERATURE_COLUMN, TIME_COLUMN
 from mwdcal.files.formats.table import Table
+from mwdcal.logs.stations import means_of
 
 ORDERED_ANGLES = ("inclination", "azimuth", "toolface")
 PLAN_COLUMNS = (*(f"ref_{name}_deg" for name in ORDERED_ANGLES), TEMPERATURE_COLUMN)
@@ -34,10 +35,15 @@ def planned_columns(columns: Mapping[str, Any]) -> dict[str, list[float | None]]
 
 @dataclass(frozen=True)
 class TakenStation:
-    """An accepted station: its position in the plan from 0, and its row of the run file."""
+    """An accepted station: its position in the plan from 0, its row of the run file, and the samples of its standstill.
+
+    `samples` holds the times under `time_s`, the values of each channel under its name, and under `steps` the smallest
+    step of each; it is empty for a reading by hand.
+    """
 
     position: int
     row: Mapping[str, Any]
+    samples: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass
@@ -121,9 +127,10 @@ class Positions:
         """Begin again."""
         self.taken, self.again, self.skipped = [], [], set()
 
-    def table(self, facts: Mapping[str, Any]) -> Table:
-        """The run file, in order of time."""
-        rows = [station.row for station in self.done.values()]
+    def table(self, facts: Mapping[str, Any], earlier: Sequence[TakenStation] = ()) -> Table:
+        """The run file, in order of time. The noise of `earlier` stations counts as well."""
+        stations = [*self.done.values()]
+        rows = measured_rows([*earlier, *stations])[len(earlier) :]
         columns: dict[str, Any] = {}
         for name in dict.fromkeys(name for row in rows for name in row):
             cells = [row.get(name) for row in rows]
@@ -132,3 +139,31 @@ class Positions:
                 [str(cell or "") for cell in cells] if has_text else np.array(cells, dtype=float)
             )
         return Table(columns, facts, f"{self.name}.csv")
+
+
+def measured_rows(stations: Sequence[TakenStation]) -> list[dict[str, Any]]:
+    """Rows of the run file, with the means and uncertainties that all standstills together tell (`logs.stations`)."""
+    rows = [dict(station.row) for station in stations]
+    places: dict[tuple[str, ...], list[int]] = {}
+    for place, station in enumerate(stations):
+        if station.samples:
+            places.setdefault(tuple(station.samples["steps"]), []).append(place)
+    for channels, alike in places.items():
+        samples = [stations[place].samples for place in alike]
+        clocks = [np.array(each[TIME_COLUMN]) for each in samples]
+        rests = {
+            name: [
+                (clock, np.array(each[name])) for clock, each in zip(clocks, samples, strict=True)
+            ]
+            for name in channels
+        }
+        steps = {
+            name: min((s for each in samples if (s := each["steps"][name])), default=0.0)
+            for name in channels
+        }
+        for name, channel in means_of(rests, steps).items():
+            for place, mean, sd in zip(
+                alike, channel.mean.tolist(), channel.sd.tolist(), strict=True
+            ):
+                rows[place] |= {name: mean, f"sd_{name}": sd}
+    return rows

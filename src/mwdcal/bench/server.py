@@ -43,6 +43,8 @@ from mwdcal.files.contract import RAW
 
 TICK = 0.1
 """Seconds between live figures."""
+LEAST_ACCURACY = 0.001
+"""Smallest 1σ of the azimuth, degrees, for which a plan is sought."""
 LARGEST_FORM = 64_000
 """Bytes of a form that are read."""
 LARGEST_TABLE = 20_000_000
@@ -103,6 +105,8 @@ class Bench:
             "start": self._start,
             "accept": lambda form: session.accept(_whole(form.get("position", ""))),
             "again": lambda form: session.measure_again(_whole(form.get("position", ""))),
+            "choose": lambda form: session.choose(form.get("serial", "")[:100]),
+            "sign": lambda form: session.sign(form.get("passphrase", "")[:1000]),
             "auto": lambda form: session.switch("auto", "on" in form),
             "certificate": lambda form: session.certify(form.get("number", "").strip()[:100]),
             "typed": self._typed,
@@ -147,10 +151,31 @@ class Bench:
             name: _number(form.get(name, ""), pages.texts()[name])
             for name in pages.STAND_REFERENCES
         }
-        serial, operator, plan = (
-            form.get(name, "")[:100] for name in ("serial", "operator", "plan")
+        serial, operator, plan, tool, file = (
+            form.get(name, "")[:100]
+            for name in ("serial", "operator", "plan", "tool", "own_plan_name")
         )
-        self.session.start(serial, operator, plan, earth)
+        if plan == pages.FEWEST:
+            plan = self._fewest(form)
+        own = file, form.get("own_plan", "")
+        self.session.start(
+            serial,
+            operator,
+            plan,
+            earth,
+            tool=tool,
+            own_tool=form.get("own_tool", ""),
+            own_plan=own,
+        )
+
+    def _fewest(self, form: Mapping[str, str]) -> str:
+        """The plan of the fewest stations for an accuracy, by its name."""
+        wanted = _number(form.get("accuracy", ""), pages.texts()["accuracy_wanted"])
+        if wanted is None or not LEAST_ACCURACY <= wanted <= 10:
+            raise InputError(
+                f"{pages.texts()['accuracy_wanted']}: give one from {LEAST_ACCURACY} to 10."
+            )
+        return f"azimuth_deg={wanted:.6f}"
 
     def _typed(self, form: Mapping[str, str]) -> None:
         """Readings by hand are stations, one a line."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import re
 import socket
 import webbrowser
 from collections.abc import Mapping
@@ -14,26 +13,22 @@ from typing import TYPE_CHECKING, Any
 
 import mwdcal
 from mwdcal import extras
-from mwdcal.bench.documents import tools_in
 from mwdcal.bench.journal import JOURNAL_NAME
-from mwdcal.bench.positions import SessionPlan, planned_columns
+from mwdcal.bench.opening import TOOL_FILE, rolltest_plan, session_plan, tools_in
+from mwdcal.bench.positions import SessionPlan
 from mwdcal.bench.session import BenchSession
 from mwdcal.bench.simulated import DemoStand
 from mwdcal.bench.sources import source_of
-from mwdcal.errors import InputError, MwdcalError
+from mwdcal.errors import InputError
 from mwdcal.files.formats import atomic
 from mwdcal.files.profiles import read_toml
-from mwdcal.library.planning import plan_table
-from mwdcal.library.results import arrays_of
-from mwdcal.sensor.profile import Profile
 
 if TYPE_CHECKING:
     from mwdcal.bench.server import Bench
 
-TOOL_FILE = "tool.toml"
 DEFAULTS: Mapping[str, Any] = {
     "plan": "twenty-four-state", "tool": "servo", "source": "manual", "speed": 1.0, "settle": 5.0,
-    "registry": None, "laboratory": None,
+    "registry": None, "laboratory": None, "countersign": None,
 }  # fmt: skip
 """Options of a bench that nothing states."""
 EVERYWHERE = ("0.0.0.0", "::")
@@ -69,12 +64,14 @@ def bench_of(folder: Path, given: Mapping[str, Any], host: str, port: int) -> Be
     profile = mwdcal.load_profile(path)
     stand = DemoStand(profile, float(options["speed"])) if demo else None
     source = stand or source_of(str(options["source"]))
-    plans = partial(session_plan, profile)
-    laboratory, registry = options["laboratory"], options["registry"]
+    plan = SessionPlan("", {}) if before else session_plan(profile, options["plan"])
+    registry, files = (
+        options["registry"],
+        {name: _path(options[name]) for name in ("laboratory", "countersign")},
+    )
     session = BenchSession(
-        folder, profile, plans(options["plan"]) if not before else SessionPlan("", {}), _rolltest(), plans=plans,
-        window=float(options["settle"]), registry=registry, laboratory=Path(laboratory) if laboratory else None,
-        earth=stand.earth if stand else None, options=options, tools=tools_in(registry),
+        folder, profile, plan, rolltest_plan(), window=float(options["settle"]), registry=registry,
+        earth=stand.earth if stand else None, options=options, tools=tools_in(registry), **files,
     )  # fmt: skip
     if stand:
         stand.order = partial(_order, session)
@@ -82,6 +79,10 @@ def bench_of(folder: Path, given: Mapping[str, Any], host: str, port: int) -> Be
     return Bench(
         session, source, [f"{name}:{port}" for name in names], any_address=host in EVERYWHERE
     )
+
+
+def _path(name: object) -> Path | None:
+    return Path(str(name)) if name else None
 
 
 def _options_before(folder: Path) -> dict[str, Any]:
@@ -92,24 +93,6 @@ def _options_before(folder: Path) -> dict[str, Any]:
         return dict(event["options"])
     except (OSError, ValueError, KeyError, TypeError):  # the journal says what is wrong
         return {}
-
-
-def session_plan(profile: Profile, name: str) -> SessionPlan:
-    """The plan of a name or file, or the best so many stations for the tool, such as "best-24"."""
-    best = re.fullmatch(r"best-(\d{1,3})", name)
-    try:
-        choice: dict[str, Any] = {"stations": int(best[1])} if best else {"plan": name}
-        result = mwdcal.plan(profile, **choice)
-    except MwdcalError:
-        if best:
-            raise
-        return SessionPlan(name, planned_columns(arrays_of(plan_table(name))))
-    return SessionPlan(name, planned_columns(result.columns), result.accuracy_deg)
-
-
-def _rolltest() -> SessionPlan:
-    """The positions of the roll test: one roll at 45°, at azimuth 0."""
-    return SessionPlan("roll-test", planned_columns(arrays_of(plan_table("roll-test"))))
 
 
 def _order(session: BenchSession) -> tuple[tuple[float, float, float] | None, int]:

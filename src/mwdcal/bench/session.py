@@ -12,18 +12,18 @@ from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from threading import RLock
+from threading import Lock, RLock
 from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal.bench import documents
+from mwdcal.bench import documents, opening
 from mwdcal.bench.attitude import has_turned, is_near, live_values
 from mwdcal.bench.journal import Event, Journal
-from mwdcal.bench.positions import PLAN_COLUMNS, Positions, SessionPlan, TakenStation
+from mwdcal.bench.positions import PLAN_COLUMNS, Positions, SessionPlan, TakenStation, measured_rows
 from mwdcal.bench.settling import Settling, Standstill
-from mwdcal.bench.stream import TEMPERATURE_COLUMN, Stream
+from mwdcal.bench.stream import TEMPERATURE_COLUMN, TIME_COLUMN, Stream
 from mwdcal.bench.warmth import Warmth
 from mwdcal.errors import InputError, MwdcalError
 from mwdcal.files.contract import CHANNELS
@@ -46,20 +46,23 @@ WARM_C = 3.0
 class BenchSession:
     """One tool at one stand. Its methods may be called from several threads.
 
-    `plans` makes the plan of a name; `options` is what the bench was opened with, for the journal; `tools` are
-    those of the registry.
+    `options` is what the bench was opened with, for the journal; `tools` are those of the registry; `countersign` is
+    the private key with which a second person signs the certificate.
     """
 
     def __init__(
         self, folder: Path, profile: Profile, plan: SessionPlan, rolltest: SessionPlan, *,
-        plans: Callable[[str], SessionPlan] | None = None, window: float = 5.0, registry: str | None = None,
-        laboratory: Path | None = None, earth: Mapping[str, float] | None = None,
+        window: float = 5.0, registry: str | None = None, laboratory: Path | None = None,
+        countersign: Path | None = None, earth: Mapping[str, float] | None = None,
         options: Mapping[str, Any] | None = None, tools: Sequence[Any] = (),
     ) -> None:  # fmt: skip
-        self.folder, self.profile, self.plan, self.plans = folder, profile, plan, plans
-        self.registry, self.laboratory, self.options = registry, laboratory, dict(options or {})
+        self.folder, self.profile, self.plan = folder, profile, plan
+        self.registry, self.laboratory, self.countersign = registry, laboratory, countersign
+        self.options = dict(options or {})
+        self.past: opening.ToolPast | None = None
         self.source = str(self.options.get("source", "manual"))
-        self.tools, self.earth, self.lock = tools, dict(earth or {}), RLock()
+        self.tools, self.earth = tools, dict(earth or {})
+        self.lock, self._starting = RLock(), Lock()
         self.parts = {
             RUN_PART: Positions(RUN_PART, plan.columns),
             ROLLTEST_PART: Positions(ROLLTEST_PART, rolltest.columns),
@@ -74,6 +77,7 @@ class BenchSession:
         self.attempts, self.version, self.message = 0, 0, ""
         self.fit = documents.RunFit()
         self.verdict: Verdict | None = None
+        self.as_found: Verdict | None = None
         self.papers: dict[str, str] = {}
         self.course: list[tuple[int, dict[str, float | None]]] = []
         self._used: tuple[int, int] = (-1, -1)
@@ -115,7 +119,7 @@ class BenchSession:
             self.parts[RUN_PART] = Positions(RUN_PART, plan.columns)
         elif kind == "station":
             position, row = event["position"], event["row"]
-            part.accept(TakenStation(position, row))
+            part.accept(TakenStation(position, row, event.get("samples", {})))
             self._agreed += 1 if self._is_near(part, position, row) else -1
             self.attempts += 1
         elif kind == "undone":
@@ -138,7 +142,7 @@ class BenchSession:
             setattr(self, kind, True)
         elif kind == "reopened":
             self.calibrated = self.testing = False
-            self.verdict, self.papers = None, {}
+            self.verdict, self.as_found, self.papers = None, None, {}
         elif kind == "temperature":
             self.typed_temperature = event["value"]
         elif kind == "papers":
@@ -255,29 +259,61 @@ class BenchSession:
 
     # ------------------------------------------------------------------ decisions
 
-    def start(
-        self,
-        serial: str,
-        operator: str = "",
-        plan: str = "",
-        earth: Mapping[str, float | None] | None = None,
-    ) -> None:
-        """Begin: the tool's serial, who measures, the plan, and gravity, field and dip where they are known."""
-        is_other = plan not in ("", self.plan.name) and self.plans is not None
-        chosen = self.plans(plan) if is_other and self.plans else self.plan
+    def choose(self, serial: str) -> None:
+        """Show the past of a tool of the registry, and take its serial and profile for the start."""
+        past = opening.past_of(self.registry, serial)
         with self.lock:
-            if self.facts:
-                raise InputError("the session has begun already.")
-            if not (serial := serial.strip()):
-                raise InputError(
-                    "the serial of the tool is missing. Every document names the tool by it: type it."
+            self._check_new()
+            self.past, self.version = past, self.version + 1
+
+    def _check_new(self) -> None:
+        if self.facts:
+            raise InputError("the session has begun already.")
+
+    def _chosen_plan(self, profile: Profile, name: str, own: tuple[str, str]) -> SessionPlan:
+        """The plan of a name, or an `own` one by its name and text."""
+        if own[1]:
+            return opening.own_plan(self.folder, *own, profile)
+        is_other = name not in ("", self.plan.name) or profile is not self.profile
+        return opening.session_plan(profile, name or self.plan.name) if is_other else self.plan
+
+    def start(
+        self, serial: str, operator: str = "", plan: str = "", earth: Mapping[str, float | None] | None = None, *,
+        tool: str = "", own_tool: str = "", own_plan: tuple[str, str] = ("", ""),
+    ) -> None:  # fmt: skip
+        """Begin: the tool's serial, who measures, the plan, and gravity, field and dip where they are known.
+
+        `tool` is another profile by its name, `own_tool` the text of one, `own_plan` name and text of a plan.
+        """
+        if not (serial := serial.strip()):
+            raise InputError(
+                "the serial of the tool is missing. Every document names the tool by it: type it."
+            )
+        with self._starting:
+            self._check_new()
+            profile = self.profile
+            if (tool or own_tool) and not self.simulated:
+                profile = opening.choose_profile(self.folder, tool, own_tool, self.past)
+            chosen = self._chosen_plan(profile, plan, own_plan)
+            opening.keep_previous(self.folder, self.registry, serial, self.simulated)
+            self._begin(serial, operator, earth or {}, profile, chosen)
+
+    def _begin(
+        self, serial: str, operator: str, earth: Mapping[str, float | None], profile: Profile, chosen: SessionPlan
+    ) -> None:  # fmt: skip
+        """Begin with a tool and a plan."""
+        with self.lock:
+            if profile is not self.profile:
+                self.profile, self.settling = profile, None
+                self.stream = Stream(
+                    profile.stream if isinstance(profile.stream, StreamForm) else None
                 )
             facts = {"serial": serial, "date": datetime.now().date().isoformat()}
             facts |= {"operator": operator.strip()} if operator.strip() else {}
             facts |= {"plan": chosen.name} if chosen.name else {}
             stated: dict[str, Any] = {**facts, "simulated": True} if self.simulated else {**facts}
             self._record(
-                "started", facts=stated, earth={k: v for k, v in (earth or {}).items() if v is not None},
+                "started", facts=stated, earth={k: v for k, v in earth.items() if v is not None},
                 plan={"name": chosen.name, "columns": chosen.columns, "accuracy_deg": chosen.accuracy_deg},
                 options=self.options,
             )  # fmt: skip
@@ -302,10 +338,11 @@ class BenchSession:
                 raise InputError(
                     f"the tool has not moved since station {place + 1}. Move it to the next position."
                 )
-            row = _measured(settling.station(), self.stream.channels)
+            samples = _samples(settling.station(), self.stream.channels)
+            row = _measured(samples, self.reading)
             doubt = self._doubt(order, row)
             self._ask({order: doubt}, settling.moves)
-            self._take(order, row, doubt)
+            self._take(order, row, doubt, samples)
             self._used = settling.moves, order
 
     def accept_typed(
@@ -362,10 +399,12 @@ class BenchSession:
             )
         return order
 
-    def _take(self, order: int, measured: Mapping[str, Any], doubt: str) -> None:
+    def _take(
+        self, order: int, measured: Mapping[str, Any], doubt: str, samples: Mapping[str, Any] | None = None
+    ) -> None:  # fmt: skip
         """Take a station; its row holds what the plan and the stand state, and what was measured.
 
-        The journal keeps a `doubt` in spite of which the operator took it.
+        The journal keeps the `samples` of the standstill, and a `doubt` in spite of which the operator took it.
         """
         part = self.part
         row = {"station": str(order + 1), **measured}
@@ -373,8 +412,8 @@ class BenchSession:
             row[TEMPERATURE_COLUMN] = self.typed_temperature
         row |= {name: part.columns[name][order] for name in PLAN_COLUMNS[:3]}
         row |= {f"ref_{name}": value for name, value in self.earth.items()}
-        doubted = {"doubt": doubt} if doubt else {}
-        self._record("station", part=part.name, position=order, row=row, **doubted)
+        more = {name: value for name, value in (("doubt", doubt), ("samples", samples)) if value}
+        self._record("station", part=part.name, position=order, row=row, **more)
         self.message = ""
         self._write_tables()
         self._refit()
@@ -441,7 +480,8 @@ class BenchSession:
             if not self.testing:
                 raise InputError("there is no roll test to measure again.")
             self._record("cleared", part=ROLLTEST_PART)
-            self.verdict, self._used = None, (-1, -1)
+            self.verdict = self.as_found = None
+            self._used = (-1, -1)
             self._write_tables()
 
     # ------------------------------------------------------------------ results
@@ -458,10 +498,12 @@ class BenchSession:
     def _write_tables(self) -> None:
         """Write the run files from the events. The stations are in the journal already: a full disk loses none."""
         try:
+            earlier: list[TakenStation] = []
             for part in self.parts.values():
                 path = self.folder / f"{part.name}.csv"
                 if part.taken:
-                    tables.write(path, part.table(self.facts))
+                    tables.write(path, part.table(self.facts, earlier))
+                    earlier = [*part.done.values()]
                 else:
                     path.unlink(missing_ok=True)
             self._unwritten = False
@@ -575,11 +617,20 @@ class BenchSession:
                 self.verdict = None
             return
         verdict, files = documents.verify(calibration, self.folder)
+        before = self._judge_as_found()
         with self.lock:
-            self.verdict = verdict
+            self.verdict, self.as_found = verdict, before
             if not files.items() <= self.papers.items():
                 self._record("papers", files=files)
         self._submit(partial(self._draw, verdict, "rolltest"))
+
+    def _judge_as_found(self) -> Verdict | None:
+        """The verdict by the calibration before; None if there is none, or if it cannot judge."""
+        try:
+            return documents.judge_as_found(self.folder)
+        except MwdcalError as error:
+            self.say(f"no result as found: {error}")
+            return None
 
     def certify(self, number: str = "") -> None:
         """Issue the certificate, and enter all in the registry, where one is named."""
@@ -596,12 +647,37 @@ class BenchSession:
         files = documents.certify(self.folder, number, self.laboratory, self.say)
         with self.lock:
             self._record("papers", files=files)
-        self._enter()
+        if self.countersign is None:
+            self._enter()
+
+    @property
+    def waits_for_signature(self) -> bool:
+        """Whether a second person has still to sign the certificate."""
+        return (
+            self.countersign is not None
+            and "certificate" in self.papers
+            and "signature" not in self.papers
+        )
+
+    def sign(self, passphrase: str = "") -> None:
+        """Sign the certificate with the key of a second person, and enter all in the registry."""
+        with self.lock:
+            if self.countersign is None or not self.waits_for_signature:
+                raise InputError("there is no certificate that waits for a signature.")
+            who = documents.countersign(
+                self.folder, self.countersign, passphrase, self.facts.get("operator", "")
+            )
+            self._record("papers", files={"signature": who})
+        self._submit(self._enter)
 
     def enter(self) -> None:
         """Enter all in the registry, where that failed before."""
         with self.lock:
-            if self.registry is None or "certificate" not in self.papers:
+            if (
+                self.registry is None
+                or "certificate" not in self.papers
+                or self.waits_for_signature
+            ):
                 raise InputError("there is nothing to enter, or no registry is named.")
             self._submit(self._enter)
 
@@ -617,9 +693,17 @@ class BenchSession:
         self.journal.close()
 
 
-def _measured(still: Standstill, channels: Sequence[str]) -> dict[str, Any]:
-    """Cells of the run file of a standstill."""
-    row: dict[str, Any] = dict(zip(channels, still.means, strict=True))
-    pairs = zip(channels, still.sd, strict=True)
-    row |= {f"sd_{name}": sd for name, sd in pairs if name != TEMPERATURE_COLUMN}
-    return row | {"samples": float(still.samples), "start_s": still.start, "end_s": still.end}
+def _samples(still: Standstill, channels: Sequence[str]) -> dict[str, Any]:
+    """A standstill as the journal holds it."""
+    columns = zip(channels, still.samples.T.tolist(), strict=True)
+    steps = dict(
+        zip([name for name in channels if name != TEMPERATURE_COLUMN], still.steps, strict=True)
+    )
+    return {TIME_COLUMN: still.time.tolist(), **dict(columns), "steps": steps}
+
+
+def _measured(samples: Mapping[str, Any], reading: Mapping[str, float]) -> dict[str, Any]:
+    """Cells of the run file of a standstill alone, with its mean `reading`."""
+    [row] = measured_rows([TakenStation(0, dict(reading), samples)])
+    time = samples[TIME_COLUMN]
+    return row | {"samples": float(len(time)), "start_s": time[0], "end_s": time[-1]}

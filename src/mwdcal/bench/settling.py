@@ -1,84 +1,96 @@
 """Whether the tool stands still, said while it is read.
 
-The stream is cut into cells of half a second. A cell is still if no channel scatters more than three times its noise,
-nor lies farther from the first cell of the standstill than noise allows. So many still cells in a row are a station,
-whose reading is their mean. While a channel creeps, the oldest cells are dropped, until the others creep no more.
+The stream is cut into cells of half a second. A standstill is a row of cells whose scatter is that of the noise, and
+whose means do not step; it has settled when it is long enough and no sensor has a trend. The bounds of all three tests
+follow from the noise of the tool at rest, with its correlation, and from how often a tool at rest may fail them.
 """
 
 from __future__ import annotations
 
+from array import array
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from math import hypot, inf, sqrt
+from dataclasses import dataclass
+from functools import cache
+from math import comb, exp, inf, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from mwdcal.geometry.vectors import Array
+from mwdcal.logs.station_means import student
 
 CELL_SECONDS = 0.5
 """Length of a cell, seconds."""
 FEWEST_IN_CELL = 3
 """Samples of a cell at least."""
-CELL_SCATTER = 3.0
-"""Times its noise that a channel may scatter within a cell."""
-CELLS_APART = 5.0
-"""Standard deviations that the means of two cells of a standstill may lie apart."""
-CREEP_SIGMA = 3.0
-"""Standard deviations of a trend over the standstill beyond which a channel creeps."""
-WANDER_SIGMA = 3.58
-"""Of the normal distribution: chance exceeds it once in a thousand times in any of six sensors."""
-DOUBTFUL_SIGMA = 2.0
-"""Beyond these the change over the standstill counts as an uncertainty of the mean."""
+FEWEST_CELLS = 5
+"""Cells of a standstill at least: three tell a curve, the others the noise about it."""
+FALSE_MOVE = 1e-3
+"""Chance that a cell of a tool at rest ends its standstill, by any sensor."""
+FALSE_CREEP = 0.05
+"""Chance that a tool at rest looks as if it crept, by any sensor: it then waits for another cell."""
 SILENCE = 3.0
 """Seconds without a sample that end a standstill."""
-LATEST = 40
-"""Cells of which the quieter ones, their first quartile, tell the noise of a channel."""
-QUARTILE = 0.6745
-"""Of the normal distribution; so the first quartile of a scatter of χ² follows (Wilson and Hilferty)."""
+LATEST = 120
+"""Cells of which the quieter ones, their first quartile, tell the noise of a sensor."""
+QUARTILE_COST = 6.0
+"""Cells whose first quartile knows a variance as well as one degree of freedom: of the normal distribution, 6.3."""
+QUARTER_OF_NORMAL = 0.3186393639643752
+"""First quartile of the size of a normal variate."""
+SMOOTH = 3
+"""Order of the differences of samples that tell the roughness of a sensor: a movement is smooth, and hardly shows."""
+LARGEST_WANDER = 12.0
+"""Times its roughness that a sensor at rest wanders from cell to cell.
+
+AR(1) noise of 0.05 to 5 s does so up to 10.6 times, at 100 samples a second.
+"""
+RANDOM_WALK_FREEDOM = 2.5
+"""Degrees of freedom of the variance of a random walk about its mean: (Σ 1/k²)²/Σ 1/k⁴."""
+MOST_BLOCKS = 20
+"""Blocks of cells in which a trend is looked for."""
+LEARNED = 9
+"""Changes from cell to cell before which no standstill is believed."""
+REMEMBERED = 64
+"""Standstills whose noise is remembered."""
+TRIAD = 3
+
+
+class Standstill(NamedTuple):
+    """A standstill: times (n,), samples (n, channels), and the smallest step of each sensor, 0 where none was seen."""
+
+    time: Array
+    samples: Array
+    steps: tuple[float, ...]
 
 
 @dataclass
 class HalfSecond:
-    """Sums over the samples of half a second."""
+    """Samples of half a second: their times, and all channels one after the other."""
 
-    start: float
-    first: tuple[float, ...]
-    count: int = 0
-    end: float = 0.0
-    sums: list[float] = field(default_factory=list)
-    squares: list[float] = field(default_factory=list)
-
-    def add(self, time: float, values: Sequence[float]) -> None:
-        """One sample more."""
-        if not self.count:
-            self.sums, self.squares = [0.0] * len(values), [0.0] * len(values)
-        self.count, self.end = self.count + 1, time
-        for place, (value, origin) in enumerate(zip(values, self.first, strict=True)):
-            off = value - origin
-            self.sums[place] += off
-            self.squares[place] += off * off
+    times: array[float]
+    values: array[float]
 
     @property
-    def means(self) -> list[float]:
-        """The mean of each channel."""
-        return [a + total / self.count for a, total in zip(self.first, self.sums, strict=True)]
-
-    @property
-    def scatter(self) -> list[float]:
-        """The standard deviation of the samples of each channel."""
-        many = max(self.count - 1, 1)
-        return [
-            sqrt(max(square - total * total / self.count, 0.0) / many)
-            for total, square in zip(self.sums, self.squares, strict=True)
-        ]
+    def table(self) -> Array:
+        """The samples (n, channels)."""
+        return np.frombuffer(self.values).reshape(len(self.times), -1)
 
 
-@dataclass(frozen=True)
-class Standstill:
-    """Means of the channels over a standstill, the standard uncertainty of each mean, and when it was."""
+class Cell(NamedTuple):
+    """A whole half second: its samples, the means of all channels, and of each sensor the scatter and the roughness."""
 
-    means: tuple[float, ...]
-    sd: tuple[float, ...]
-    samples: int
-    start: float
-    end: float
+    samples: HalfSecond
+    means: Array
+    scatter: Array
+    rough: Array
+
+
+class Noise(NamedTuple):
+    """Noise of the cell means of a standstill: variance of each sensor, and correlation of neighbours in each triad."""
+
+    variance: Array
+    correlation: Array
 
 
 class Settling:
@@ -86,36 +98,44 @@ class Settling:
 
     The first `sensors` channels decide, those that follow, such as a temperature, do not. `window` is how long the tool
     has to stand, in seconds; `least` (k,) the smallest noise of each sensor that is believed. `moves` counts how often
-    a standstill has ended.
+    a standstill has ended. `wanders`: the correlation time of the noise is half a standstill or more, so that the
+    standstills tell the uncertainty of their means badly.
     """
 
     def __init__(self, sensors: int, window: float = 5.0, least: Sequence[float] = ()) -> None:
         self.sensors, self.window = sensors, window
-        self.least = [*least] or [0.0] * sensors
+        self.least = np.array([*least] or [0.0] * sensors, dtype=float)
         self.step = [inf] * sensors
-        self.still: list[HalfSecond] = []
-        self.recent: deque[list[float]] = deque(maxlen=LATEST)
-        self.noise = [inf] * sensors
+        self.still: list[Cell] = []
+        self.recent: deque[tuple[Array, Array, Array]] = deque(maxlen=LATEST)
+        self.past: deque[Noise] = deque(maxlen=REMEMBERED)
         self.time = -inf
         self.moves = 0
-        self._cell: HalfSecond | None = None
+        self._open: HalfSecond | None = None
+        self._last: Cell | None = None
         self._before: Sequence[float] = ()
-        self._settled = False
+        self._noise: Noise | None = None
+        self.wanders = False
 
     def take(self, time: float, values: Sequence[float]) -> None:
         """One sample of all channels at a time in seconds; a gap, or a clock set back, ends a standstill."""
         if time < self.time or time - self.time > SILENCE:
-            self._cell = None
+            self._open = self._last = None
             self._end()
         self.time = time
-        cell = self._cell
-        if cell is not None and time - cell.start >= CELL_SECONDS and cell.count >= FEWEST_IN_CELL:
-            self._judge(cell)
+        cell = self._open
+        if (
+            cell is not None
+            and time - cell.times[0] >= CELL_SECONDS
+            and len(cell.times) >= FEWEST_IN_CELL
+        ):
+            self._judge(self._closed(cell))
             cell = None
         self._learn_steps(values)
         if cell is None:
-            cell = self._cell = HalfSecond(time, tuple(values))
-        cell.add(time, values)
+            cell = self._open = HalfSecond(array("d"), array("d"))
+        cell.times.append(time)
+        cell.values.extend(values)
 
     def _learn_steps(self, values: Sequence[float]) -> None:
         """The smallest step of each sensor: that of its converter, if it is coarse."""
@@ -124,65 +144,121 @@ class Settling:
                 self.step[place] = abs(a - b)
         self._before = values
 
-    def _end(self) -> None:
-        """The standstill is over."""
-        self.moves += bool(self.still)
-        self.still, self._settled = [], False
+    def _closed(self, samples: HalfSecond) -> Cell:
+        table = samples.table
+        sensors = table[:, : self.sensors]
+        order = min(SMOOTH, len(table) - 1)
+        rough = np.sqrt(np.mean(np.diff(sensors, order, axis=0) ** 2, 0) / comb(2 * order, order))
+        return Cell(samples, table.mean(0), sensors.std(0, ddof=1), rough)
 
-    def _judge(self, cell: HalfSecond) -> None:
-        """Take a whole cell into the standstill, or end it."""
-        scatter = cell.scatter[: self.sensors]
-        self.recent.append(scatter)
-        quartiles = (sorted(each)[len(each) // 4] for each in zip(*self.recent, strict=True))
-        freedom = cell.count - 1
-        usual = (1 - 2 / (9 * freedom) - QUARTILE * sqrt(2 / (9 * freedom))) ** 1.5
-        self.noise = [
-            max(
-                each / usual, least, step / 2 if step < inf else 0.0
-            )  # half a step: a value between two
-            for each, least, step in zip(quartiles, self.least, self.step, strict=True)
-        ]
-        quiet = all(s <= CELL_SCATTER * n for s, n in zip(scatter, self.noise, strict=True))
-        ends = (self.still[0], self.still[-1]) if self.still else ()
-        if not quiet or not all(self._alike(cell, other) for other in ends):
+    def _end(self) -> None:
+        """The standstill is over. The noise of one that had settled is remembered."""
+        self.moves += bool(self.still)
+        if self._noise is not None:
+            self.past.append(self._noise)
+        self.still, self._noise = [], None
+
+    def _judge(self, cell: Cell) -> None:
+        """Take a whole cell: into the standstill, or as the end of it."""
+        last = self._last
+        self._last = cell
+        if last is not None:
+            change = np.abs(cell.means - last.means)[: self.sensors]
+            self.recent.append((cell.rough, cell.scatter, change))
+            self._cut([*self.still, cell])
+        self._look()
+
+    def _cut(self, cells: list[Cell]) -> None:
+        """The standstill: the latest cells whose scatter and changes are those of rest, as it is known by now."""
+        scatter, most = self._bounds(len(cells[-1].samples.times))
+        means = np.array([cell.means[: self.sensors] for cell in cells])
+        loud = np.any([cell.scatter > scatter for cell in cells], axis=1)
+        apart = np.any(np.abs(np.diff(means, axis=0)) > most, axis=1)
+        first = max(
+            np.flatnonzero(loud).max(initial=-1) + 1, np.flatnonzero(apart).max(initial=-1) + 1
+        )
+        if first == len(cells) or (first and apart[-1]):
             self._end()
-        if quiet:
-            self.still.append(cell)
-            del self.still[: -int(4 * self.window / CELL_SECONDS)]
-        self._settled = False
-        while self.still and self._stood >= self.window:
-            if not self._creeps():
-                self._settled = True
-                break
+        self.still = cells[max(first, len(cells) - int(4 * self.window / CELL_SECONDS)) :]
+
+    def _bounds(self, count: int) -> tuple[Array, Array]:
+        """What the scatter of a cell, and the change to the next, do not exceed at rest (k,).
+
+        Both are seen as multiples of the roughness, which movement hardly changes, and are alike in a triad. Cells of
+        correlated noise hold fewer independent samples than samples: as many as the change of their means tells, as
+        that of n independent ones has the variance 2/n.
+        """
+        recent = np.array(self.recent).transpose(1, 0, 2)
+        rough = np.maximum(np.quantile(recent[0], 0.25, axis=0), self._floor)
+        ratios = np.divide(recent[1:], rough, out=np.zeros_like(recent[1:]), where=rough > 0)
+        chance, bounds = FALSE_MOVE / 2 / self.sensors, np.zeros((2, self.sensors))
+        for triad in self._triads:
+            scatter, change = (float(np.quantile(each[:, triad], 0.25)) for each in ratios)
+            known = ratios[0][:, triad].size / QUARTILE_COST
+            scatter = max(scatter, 1.0)  # less only of coarse readings
+            change = max(change / QUARTER_OF_NORMAL, sqrt(2 / count))
+            freedom = min(max(2 * (scatter / change) ** 2, RANDOM_WALK_FREEDOM), count - 1)
+            times = _largest_scatter(round(freedom, 1), round(known, 1), chance)
+            wander = min(
+                float(student(known, chance)), float(student(inf, chance)) * LARGEST_WANDER / change
+            )
+            bounds[:, triad] = [[scatter * times], [change * wander]]
+        return bounds[0] * rough, bounds[1] * rough
+
+    @property
+    def _triads(self) -> list[slice]:
+        return [slice(i, i + TRIAD) for i in range(0, self.sensors, TRIAD)]
+
+    @property
+    def _floor(self) -> Array:
+        """The smallest noise of each sensor: half a step is a value between two."""
+        steps = np.array(self.step)
+        return np.asarray(np.maximum(self.least, np.where(np.isfinite(steps), steps / 2, 0.0)))
+
+    def _look(self) -> None:
+        """Drop the oldest cells until no sensor creeps; settled if what is left is long enough."""
+        self._noise = None
+        while len(self.recent) >= LEARNED and self._is_long:
+            noise, creeps = self._trend()
+            if not creeps:
+                self._noise = noise
+                return
             del self.still[0]
 
-    def _alike(self, one: HalfSecond, other: HalfSecond) -> bool:
-        spread = sqrt(1 / one.count + 1 / other.count)
-        pairs = zip(one.means, other.means, self.noise, strict=False)
-        return all(abs(a - b) <= CELLS_APART * n * spread for a, b, n in pairs)
-
-    def _creeps(self) -> bool:
-        """Whether a sensor has a trend that its scatter does not explain."""
-        return any(sigmas > CREEP_SIGMA for _, sigmas in self._trends())
-
-    def _trends(self) -> list[tuple[float, float]]:
-        """The change of each sensor over the standstill, and the same in standard deviations."""
-        count = sum(cell.count for cell in self.still) / len(self.still)
-        columns = [*zip(*(cell.means for cell in self.still), strict=True)]
-        return [
-            _trend(columns[place], scatter / sqrt(count))
-            for place, scatter in enumerate(self._scatter())
-        ]
-
-    def _scatter(self) -> list[float]:
-        """The standard deviation of a sample of each sensor within the cells of the standstill."""
-        each = [*zip(*(cell.scatter for cell in self.still), strict=True)][: self.sensors]
-        pooled = (sqrt(sum(s * s for s in cells) / len(cells)) for cells in each)
-        return [max(pair) for pair in zip(pooled, self.least, strict=True)]
+    def _trend(self) -> tuple[Noise, bool]:
+        """The noise of the means about their trend, and whether that is more than it explains."""
+        cells = np.array([cell.means[: self.sensors] for cell in self.still])
+        count = len(cells)
+        size = -(-count // MOST_BLOCKS)
+        means = cells[count % size :].reshape(-1, size, self.sensors).mean(1)
+        form = _trend_in_noise(len(means))
+        trend, residual = form.trend @ means, form.residual @ means
+        squares = np.sum(residual**2, 0)
+        products = np.sum(residual[1:] * residual[:-1], 0)
+        ratio = np.divide(products, squares, out=np.zeros(self.sensors), where=squares > 0)
+        now = np.array([form.correlation(float(ratio[triad].mean())) for triad in self._triads])
+        earlier = [each for each in self.past if each.variance.shape == squares.shape]
+        correlation = np.mean([now, *(each.correlation for each in earlier)], 0)
+        self.wanders = bool(np.any(correlation > exp(-2 / len(means))))
+        place = np.repeat(form.place(correlation), TRIAD)[: self.sensors]
+        samples = sum(len(cell.samples.times) for cell in self.still) / len(means)
+        noise = Noise(np.maximum(squares / form.left[place], self._floor**2 / samples), now)
+        variance = np.mean([noise.variance, *(each.variance for each in earlier)], 0)
+        freedom = form.freedom[place] * (1 + len(earlier))
+        limit = student(freedom, FALSE_CREEP / trend.size) * np.sqrt(
+            form.variance[:, place] * variance
+        )
+        return noise, bool(np.any(np.abs(trend) > limit))
 
     @property
     def _stood(self) -> float:
-        return self.still[-1].end - self.still[0].start if self.still else 0.0
+        return (
+            self.still[-1].samples.times[-1] - self.still[0].samples.times[0] if self.still else 0.0
+        )
+
+    @property
+    def _is_long(self) -> bool:
+        return self._stood >= self.window and len(self.still) >= FEWEST_CELLS
 
     @property
     def seconds_left(self) -> float:
@@ -194,92 +270,83 @@ class Settling:
         """The state in a word."""
         if not self.still:
             return "moving"
-        return "settled" if self._settled else "settling"
-
-    @property
-    def wanders(self) -> bool:
-        """Whether the means of cells scatter more than the samples within them explain: no scatter then tells enough.
-
-        A converter too coarse for the noise is left out.
-        """
-        many, count = len(self.still), sum(cell.count for cell in self.still)
-        if many <= FEWEST_IN_CELL:
-            return False
-        most = _largest_ratio(many - 1, count - many)
-        columns = [*zip(*(cell.means for cell in self.still), strict=True)]
-        for place, scatter in enumerate(self._scatter()):
-            mean = sum(columns[place]) / many
-            square = sum((each - mean) ** 2 for each in columns[place]) / (many - 1)
-            is_coarse = scatter < self.step[place] / 2 < inf
-            if not is_coarse and square * count / many > most * scatter**2:
-                return True
-        return False
+        return "settled" if self._noise is not None else "settling"
 
     @property
     def means(self) -> tuple[float, ...]:
         """The mean of each channel over the standstill."""
-        samples = sum(cell.count for cell in self.still)
-        weighted = ([m * cell.count / samples for m in cell.means] for cell in self.still)
-        return tuple(map(sum, zip(*weighted, strict=True)))
+        counts = [len(cell.samples.times) for cell in self.still]
+        means = np.average([cell.means for cell in self.still], 0, counts)
+        return tuple(map(float, means))
 
     def station(self) -> Standstill:
-        """The mean over the standstill; only while settled."""
-        cells, means = self.still, self.means
-        samples = sum(cell.count for cell in cells)
-        each = [*zip(*(cell.means for cell in cells), strict=True)]
-        weights = [cell.count / samples for cell in cells]
-        sd = [_sd_of_mean(row, weights, mean) for row, mean in zip(each, means, strict=True)]
-        pairs = zip(self._scatter(), self._trends(), strict=True)
-        for place, (sample, (change, sigmas)) in enumerate(pairs):
-            sd[place] = max(sd[place], sample / sqrt(samples))
-            if sigmas > DOUBTFUL_SIGMA:
-                sd[place] = hypot(sd[place], change)
-            if sample < (step := self.step[place]) / 2 < inf:  # its error does not average out
-                sd[place] = hypot(sd[place], step / sqrt(12))
-        return Standstill(means, tuple(sd), samples, cells[0].start, cells[-1].end)
+        """The samples of the standstill."""
+        parts = [cell.samples for cell in self.still]
+        time = np.concatenate([np.frombuffer(each.times) for each in parts])
+        steps = tuple(step if step < inf else 0.0 for step in self.step)
+        return Standstill(time, np.concatenate([each.table for each in parts]), steps)
 
 
-def _largest_ratio(freedom: int, within: int) -> float:
-    """The ratio of two variances of so many degrees of freedom beyond which noise wanders.
+@cache
+def _largest_scatter(freedom: float, known: float, chance: float) -> float:
+    """Times the first quartile of a scatter that one more exceeds with this chance.
 
-    Definition: the point of Fisher's F at `WANDER_SIGMA`, as its cube root is about normal. Singular: infinite where so
-    few samples within cells tell nothing. Reference: Paulson 1942.
+    The scatter has so many degrees of `freedom`, and the quartile, as an estimate, is as good as `known` cells.
+    Definition: the point of Fisher's F, by the quartile of χ² over its degrees of freedom.
     """
-    share, other = 2 / (9 * freedom), 2 / (9 * within)
-    above, below = 1 - share, 1 - other
-    square = below**2 - WANDER_SIGMA**2 * other
-    if square <= 0:
-        return inf
-    rest = above**2 - WANDER_SIGMA**2 * share
-    root = sqrt((above * below) ** 2 - square * rest)
-    return float(((above * below + root) / square) ** 3)
+    from scipy.special import chdtri, fdtri
+
+    quartile = chdtri(freedom, 0.75) / freedom
+    return float(sqrt(fdtri(freedom, max(known * freedom, 1.0), 1 - chance) / quartile))
 
 
-def _trend(means: Sequence[float], sd: float) -> tuple[float, float]:
-    """The change along a straight line through means, and the same over its standard deviation.
+class TrendInNoise(NamedTuple):
+    """A line and a curve through n means of AR(1) noise, for correlations of neighbours on a grid (g,).
 
-    That follows from the scatter of the means about the line, or from their `sd` if that is larger.
+    Attributes:
+        trend: weights (2, n) of the amplitudes of line and curve.
+        residual: what is left without mean, line and curve (n, n).
+        grid: the correlations.
+        ratio: expected product of neighbouring residuals over their square, of each correlation.
+        left: expected sum of squares of the residuals, of noise of variance 1.
+        variance: of the amplitudes (2, g), of noise of variance 1.
+        freedom: degrees of freedom of the sum of squares (Satterthwaite 1946).
     """
-    many = len(means)
-    if many < FEWEST_IN_CELL:
-        return 0.0, 0.0
-    middle, mean = (many - 1) / 2, sum(means) / many
-    square = many * (many * many - 1) / 12
-    slope = sum((i - middle) * (m - mean) for i, m in enumerate(means)) / square
-    left = sum((m - mean - slope * (i - middle)) ** 2 for i, m in enumerate(means)) / (many - 2)
-    spread = max(sd, sqrt(left))
-    return abs(slope) * (many - 1), abs(slope) * sqrt(square) / spread if spread else 0.0
+
+    trend: Array
+    residual: Array
+    grid: Array
+    ratio: Array
+    left: Array
+    variance: Array
+    freedom: Array
+
+    def correlation(self, ratio: float) -> float:
+        """The correlation that gives this ratio."""
+        return float(np.interp(ratio, self.ratio, self.grid))
+
+    def place(self, correlation: Array) -> Array:
+        """The nearest place on the grid."""
+        return np.asarray(np.abs(self.grid[:, None] - correlation).argmin(0))
 
 
-def _sd_of_mean(cells: Sequence[float], weights: Sequence[float], mean: float) -> float:
-    """Standard uncertainty of a mean of cells by their scatter, which holds noise that wanders from cell to cell.
-
-    So few of them tell their own scatter badly: (m - 1)/(m - 3) makes up for it. Reference: JCGM 101:2008, 6.4.9.4.
-    """
-    largest = 0.0
-    for size in (1, 2):  # means of two cells follow noise that wanders more slowly
-        batches = [slice(i, i + size) for i in range(0, len(cells) - size + 1, size)]
-        if (many := len(batches)) > 3:
-            square = sum(sum(weights[b]) * (sum(cells[b]) / size - mean) ** 2 for b in batches)
-            largest = max(largest, square / (many - 3))
-    return sqrt(largest)
+@cache
+def _trend_in_noise(count: int) -> TrendInNoise:
+    """The form of a trend of `count` means; correlation times up to all of them, which show at most."""
+    base, _ = np.linalg.qr(np.vander(np.linspace(-1, 1, count), 3, increasing=True))
+    residual, trend = np.eye(count) - base @ base.T, base[:, 1:].T
+    grid = np.linspace(0.0, exp(-1 / count), 65)
+    apart = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
+    rows = []
+    for correlation in grid:
+        noise = correlation**apart
+        left = residual @ noise @ residual
+        total = float(np.trace(left))
+        amplitudes = np.diag(trend @ noise @ trend.T)
+        rows.append(
+            (np.trace(left, 1) / total, total, total**2 / float(np.sum(left * left)), *amplitudes)
+        )
+    ratio, total, freedom, *variance = np.array(rows).T
+    return TrendInNoise(
+        trend, residual, grid, np.maximum.accumulate(ratio), total, np.array(variance), freedom
+    )

@@ -385,7 +385,8 @@ class LaboratorySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     """The content of `mwdcal.toml`: nothing in it is mandatory.
 
     `tool` and `limits` are names or files, `registry` a file or URL, `keys` public keys to trust, `laboratory` the
-    laboratory file of certificates; files as seen from the folder of `mwdcal.toml`. `decision` is the rule for limits
+    laboratory file of certificates, `countersign` the private key with which a second person signs the certificate of
+    a bench; files as seen from the folder of `mwdcal.toml`. `decision` is the rule for limits
     that state none. The units are those of columns whose unit nothing else tells. `stand` and `standards` complete
     tool profiles that do not state them.
     """
@@ -396,6 +397,7 @@ class LaboratorySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     registry: str = ""
     keys: tuple[str, ...] = ()
     laboratory: str = ""
+    countersign: str = ""
     length_unit: Literal["", "m", "ft", "usft"] = ""
     temperature_unit: Literal["", "°C", "°F", "K"] = ""
     stand: StandProfile = StandProfile()

@@ -374,9 +374,27 @@ def _summaries(traces: Traces, start: Array, end: Array, findings: list[Finding]
     for name in traces:
         say(f"means of {name} at {count(len(start), 'station')}")
         summaries[name] = _summary(*traces[name], start, end)
+    return _all_widened(summaries, findings)
+
+
+def means_of(rests: Mapping[str, Sequence[Trace]], steps: Mapping[str, float]) -> Rows:
+    """What each channel read at its standstills, by their samples and the steps of readings; as for a log.
+
+    A step is 0 where none is known.
+    """
+    rows: Rows = {}
+    for name, each in rests.items():
+        fine = SMALLEST_RESOLUTION * (abs(float(each[0][1][0])) or 1.0)
+        rows[name] = summarise(each, max(steps.get(name, 0.0), fine))
+    return _all_widened(rows, [])
+
+
+def _all_widened(rows: Rows, findings: list[Finding]) -> Rows:
+    """Readings of all channels, triad by triad, known less well where their noise is correlated."""
+    wider = dict(rows)
     for triad in CHANNELS.values():
-        summaries |= _widened({n: summaries[n] for n in triad if n in summaries}, findings)
-    return summaries
+        wider |= _widened({n: rows[n] for n in triad if n in rows}, findings)
+    return wider
 
 
 def _summary(time: Array, value: Array, start: Array, end: Array) -> ChannelMean:

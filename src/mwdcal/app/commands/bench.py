@@ -21,7 +21,8 @@ from mwdcal.errors import InputError
     "--plan",
     metavar="NAME|FILE",
     shell_complete=options.offers("plans"),
-    help="A built-in plan, a TOML file of attitudes, a run file, or best-N, the best N stations for the tool.  "
+    help="A built-in plan, a TOML file of attitudes, a run file, best-N, the best N stations for the tool, or "
+    "azimuth_deg=0.05, the fewest stations for this accuracy.  "
     "[default: twenty-four-state]",
 )
 @options.tool(help="Tool profile: a built-in name or a TOML file.  [default: servo]")
@@ -49,6 +50,12 @@ from mwdcal.errors import InputError
     type=options.FILE,
     metavar="LAB.toml",
     help="Laboratory file of the certificate.",
+)
+@click.option(
+    "--countersign",
+    type=options.FILE,
+    metavar="KEY",
+    help="Private key with which a second person signs the certificate, on the page.",
 )
 @click.option(
     "--host",
@@ -94,7 +101,7 @@ def command(
 
     serving.require()
     given = {name: value for name, value in chosen.items() if value is not None}
-    given |= {"laboratory": str(given["laboratory"])} if "laboratory" in given else {}
+    given |= {name: str(given[name]) for name in ("laboratory", "countersign") if name in given}
     given |= {"source": "demo"} if demo else {}
     folder = session or Path(datetime.now().strftime("bench-%Y-%m-%d-%H%M%S"))
     with atomic.folder(folder), atomic.holding(folder / ".bench.lock") as ours:

@@ -28,11 +28,11 @@ function replace(old, html) {
   const inside = active && old.contains(active);
   const id = inside ? active.id : "";
   const typed = new Map();
-  for (const field of old.querySelectorAll("input[type=text], textarea, select")) typed.set(field.id, field.value);
+  for (const field of old.querySelectorAll("input[type=text], textarea, select")) typed.set(field.id, [field.value, field.dataset.chosen]);
   old.innerHTML = html;
-  for (const [name, value] of typed) {
+  for (const [name, [value, chosen]] of typed) {
     const field = document.getElementById(name);
-    if (field && value) field.value = value;
+    if (field && value && field.dataset.chosen === chosen) field.value = value;
   }
   if (!inside) return;
   const again = document.getElementById(id) || document.getElementById("order");
@@ -61,6 +61,11 @@ events.onopen = () => { if (message.textContent === message.dataset.lost) messag
 
 async function send(form, submitter) {
   const body = new URLSearchParams(new FormData(form, submitter));
+  for (const field of form.querySelectorAll("input[data-text]")) {
+    if (!field.files[0]) continue;
+    body.set(field.dataset.text, await field.files[0].text());
+    body.set(`${field.dataset.text}_name`, field.files[0].name);
+  }
   try {
     const answer = await fetch(form.action, { method: "POST", body, headers: { Accept: "text/plain" } });
     message.textContent = answer.ok ? "" : await answer.text();
