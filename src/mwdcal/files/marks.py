@@ -17,27 +17,17 @@ import msgspec
 from mwdcal.calibration.diagnosis.flags import listed
 from mwdcal.errors import Answer, InputError, QuestionError
 from mwdcal.files.formats.columns import Column, looks_numeric, shown
-from mwdcal.files.formats.layout import ADJUSTED
+from mwdcal.files.formats.layout import ADJUSTED, OF_REFUSAL
 from mwdcal.files.formats.table import Table, labels, row_word
 from mwdcal.files.parting import marked_rows
 from mwdcal.files.statements import rows_of
 from mwdcal.files.synonyms import OURS
 from mwdcal.sensor.profile import TableFormat
 
-_OF_REFUSAL = (
-    r"reject(ed)?|bad|invalid|void|voided|discard(ed)?|unusable|omit(ted)?|excluded?|scrap(ped)?|do not use|dnu|"
-    r"n\.? ?ok|nok|not ok|no good|n\.o\.k\.?|verworfen|ungultig|schlecht|fehlmessung|unbrauchbar|gestrichen|"
-    r"nicht (ok|verwenden|verwertbar)|n\.? ?i\.? ?o\.?|forkastet|ugyldig|darlig|underkjent|avvist|kassert|"
-    r"strøket|stroket|feilmaling|"
-    r"ikke (ok|bruk|brukes)|rechazad[oa]|invalid[oa]|descartad[oa]|anulad[oa]|no (ok|usar|valid[oa])|mal[oa]?|"
-    r"rejeitad[oa]|ruim|nao (ok|usar)|rejete?e?|mauvaise?|annulee?|ecarte|non ok|брак|забракован[оа]?|отбракован[оа]?|"
-    r"плохо|плохая|не ?год(ен|на|но)|недейств\w*|исключ\w*|не использовать|отклонен[оа]?|не ок|"
-    r"作废|剔除|无效|废弃|舍弃|弃用|不可用|坏点?|不合格"
-)
-_REJECTED = re.compile(rf"\W*({_OF_REFUSAL})\W*|\W*({_OF_REFUSAL})\s*[-–—:;,.(/!].*", re.DOTALL)
+_REJECTED = re.compile(rf"\W*({OF_REFUSAL})\W*|\W*({OF_REFUSAL})\s*[-–—:;,.(/!].*", re.DOTALL)
 """A cell that rejects its row, whatever reason follows."""
 _MAY_REJECT = re.compile(
-    rf"(?<![^\W\d_])({_OF_REFUSAL}|fail(ed)?|outlier|suspect|questionable|doubtful|ausreißer|ausreisser|fehler|avvik|"
+    rf"(?<![^\W\d_])({OF_REFUSAL}|fail(ed)?|outlier|suspect|questionable|doubtful|ausreißer|ausreisser|fehler|avvik|"
     r"moved|bumped|disturbed|slipped|knocked|bewegt|verrutscht|gestossen|flyttet|movi(o|do)|mexeu|bouge|сдвин\w*|"
     r"толкн\w*|"
     r"nicht bestanden|falha|fallo|выброс|сбой)(?![^\W\d_])|异常|可疑|移动|碰到"

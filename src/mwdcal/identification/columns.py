@@ -240,6 +240,20 @@ _MEASURED = re.compile(
     re.IGNORECASE,
 )
 """Words of angles that the tool itself has measured: no references."""
+_NO_STAND = re.compile(
+    rf"{_MEASURED.pattern}|\b(err\w*|delta|diff\w*|dev\w*|res\w*|sd|std\w*|unc\w*|sigma|rate|last|previous|old|"
+    r"check|fehler|abw\w*|feil|avvik|desv\w*|erro\w*|ecart|погрешн\w*|откл\w*)\b|误差|偏差",
+    re.IGNORECASE,
+)
+"""Words of columns of angles that are none of the stand."""
+_NOMINAL = re.compile(
+    r"\b(nominal|target|set|setpoint|soll\w*|задан\w*|номинал\w*)\b|设定|目标", re.IGNORECASE
+)
+_ACTUAL = re.compile(
+    r"\b(actual|read|reading|ist|istwert|действит\w*|фактич\w*|измер\w*|real|faktisk)\b|实际|实测",
+    re.IGNORECASE,
+)
+"""Words of angles to which a stand was to be set, and of those that it shows."""
 _OF_CHANNELS = re.compile(r"\b(measured|meas|gemessen|ist)\b", re.IGNORECASE)
 """Those that say nothing more of a channel."""
 _OTHER_NORTH = re.compile(
@@ -360,6 +374,7 @@ def meanings_of(names: Sequence[str], units: Sequence[str]) -> dict[str, Resembl
     results = {
         name: m for name, unit in zip(names, units, strict=True) if (m := meaning(once[name], unit))
     }
+    results |= _behind_titles(names, units, results)
     every = [n for n, m in results.items() if m.column == "az"]
     lone = [n for n in every if _BARE_AZ.fullmatch(n)]
     triad = [n for n in every if n not in lone[:1]] or any(_BARE_AX.fullmatch(n) for n in names)
@@ -370,6 +385,30 @@ def meanings_of(names: Sequence[str], units: Sequence[str]) -> dict[str, Resembl
     if len(dips) == 1 and any(re.search("neigung", n, re.IGNORECASE) for n in inclined):
         results[dips[0]] = results[dips[0]]._replace(column="ref_dip_deg")
     return results
+
+
+def _behind_titles(
+    names: Sequence[str], units: Sequence[str], meanings: Mapping[str, Resemblance]
+) -> dict[str, Resemblance]:
+    """Angles of the stand behind an unknown title that two of them share, where no other column is one: Cradle Inc."""
+    angles = {REFERENCES[name].column for name in ("inclination", "azimuth", "toolface")}
+    if angles & {m.column for m in meanings.values()}:
+        return {}
+    by_title: dict[str, dict[str, Resemblance]] = {}
+    for name, unit in zip(names, units, strict=True):
+        words = name.split() if name not in meanings else []
+        for place in range(1, len(words)):
+            title, rest = " ".join(words[:place]), " ".join(words[place:])
+            alike = (
+                Resemblance("ref_azimuth_deg", "°")
+                if _BARE_AZ.fullmatch(rest)
+                else meaning(rest, unit)
+            )
+            if alike and alike.column in angles and not _NO_STAND.search(spelled(title)):
+                by_title.setdefault(title, {})[name] = alike
+                break
+    groups = [each for each in by_title.values() if len({m.column for m in each.values()}) > 1]
+    return groups[0] if len(groups) == 1 else {}
 
 
 def _follows(
@@ -799,6 +838,10 @@ def _one(column: str, candidates: Sequence[str], values: Values, source: str) ->
         of_tool = [n for n in candidates if not _SURROUNDINGS.search(n)] or candidates
         candidates = [n for n in of_tool if not _CALLED_REFERENCE.search(spelled(n))] or of_tool
     stated = [name for name in candidates if _CALLED_REFERENCE.search(spelled(name))]
+    shows = [name for name in stated if _ACTUAL.search(name) and not _NOMINAL.search(name)]
+    others = [name for name in candidates if name not in shows]
+    if len(shows) == 1 and all(map(_NOMINAL.search, others)):
+        return shows[0]
     if len(candidates) == 1 or len(stated) == 1:
         return (stated or candidates)[0]
     of = "the temperature of the tool" if column == WARMTH else f"'{column}'"

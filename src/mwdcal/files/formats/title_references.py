@@ -103,15 +103,11 @@ _REFERRING = re.compile(
 """Words and letters behind the word of a quantity that say nothing more."""
 _CHINESE = r"[\u4e00-\u9fff]"
 _BEGINNING = rf"(?:(?<![^\W\d_])|(?<={_CHINESE})(?={_CHINESE}))"
-_WITH_NUMBER = (
-    rf"(?P<number>{_WRITTEN_NUMBER}){_MINUTES}\s*(?P<unit>{_WRITTEN_UNIT})?(?P<behind>[^\d;]{{0,12}})(?P<next>\d?)"
-)
+_WITH_NUMBER = rf"(?P<number>{_WRITTEN_NUMBER}){_MINUTES}\s*(?P<unit>{_WRITTEN_UNIT})?(?P<behind>[^\d;]{{0,12}})(?P<next>\d?)"
 
 
 def _statement(head: str) -> re.Pattern[str]:
-    return re.compile(
-        rf"{_BEGINNING}{head}(?![^\W\d_]){_BETWEEN}{_WITH_NUMBER}", re.IGNORECASE
-    )
+    return re.compile(rf"{_BEGINNING}{head}(?![^\W\d_]){_BETWEEN}{_WITH_NUMBER}", re.IGNORECASE)
 
 
 _STATEMENTS = [
@@ -269,7 +265,11 @@ def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
     bare = re.sub(rf"\((?:{quantity.words})\)", "", bare)
     direct = not re.search(r"[^\W_]", bare)
     decimals = len(re.sub(r".*?(?:[.,]|$)", "", match["number"], count=1))
-    sure = stated or ("=" in bare and decimals) or (quantity.column == "ref_gravity_g" and decimals > 2)
+    sure = (
+        stated
+        or ("=" in bare and decimals)
+        or (quantity.column == "ref_gravity_g" and decimals > 2)
+    )
     if (letter and not (direct and sure)) or not (direct or stated):
         return
     if stated and stated not in quantity.units:
