@@ -33,6 +33,11 @@ _MAY_REJECT = re.compile(
     r"nicht bestanden|falha|fallo|выброс|сбой)(?![^\W\d_])|异常|可疑|移动|碰到"
 )
 """A cell that may reject its row, or speak of another one."""
+_REJECTS_PREVIOUS = re.compile(
+    r"(?<![^\W\d_])(previous|prior|last|vorige\w*|vorherige\w*|forrige|anterior|precedent\w*|предыдущ\w*)(?![^\W\d_])\W*"
+    rf"(?:\w+\W+){{0,2}}({OF_REFUSAL})(?![^\W\d_])|(上|前)一?[个点行次]\w{{0,2}}(作废|无效|剔除|不合格|坏)",
+)
+"""A cell that rejects the row before its own: repeated, the previous one is bad."""
 _ACCEPTED = re.compile(
     r"ok(ay)?|good|valid|accept(ed)?|pass(ed)?|use(d)?|i\.? ?o\.?|gut|gultig|bestanden|godkjent|gyldig|bra|bien|bueno|"
     r"buena|aceptad[oa]|valid[oa]|bom|boa|aceit[oa]|bon(ne)?|годен|годна|хорошо|норма|да|ок|合格|正常|有效|良好?"
@@ -84,12 +89,16 @@ def marks_in(table: Table, form: TableFormat, used: Collection[str]) -> Marks:
         plain = [spelt[cell] for cell in cells]
         verdicts = _verdicts(_plain(name), plain) if judged else {}
         for row, cell in enumerate(plain):
+            if judged and row and cell not in kept and _REJECTS_PREVIOUS.search(cell):
+                left_out.setdefault(row - 1, f"the next row, {shown(name)}: {cells[row]}")
+                continue
             verdict = True if cell in chosen else None if cell in kept else verdicts.get(cell)
             if verdict:
                 left_out.setdefault(row, f"{shown(name)}: {cells[row] or 'blank'}")
             elif verdict is not None:
                 doubtful.setdefault((name, cells[row]), []).append(row)
-    return Marks(left_out, doubtful)
+    open_rows = {key: [r for r in rows if r not in left_out] for key, rows in doubtful.items()}
+    return Marks(left_out, {key: rows for key, rows in open_rows.items() if rows})
 
 
 def _verdicts(name: str, cells: Sequence[str]) -> dict[str, bool]:

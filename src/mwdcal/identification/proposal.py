@@ -399,7 +399,7 @@ def _is_formulas(cells: Sequence[str]) -> bool:
 
 _OF_READINGS = (*RAW, *(REFERENCES[name].column for name in ("inclination", "toolface")))
 """Columns that readings tell; azimuths may count from another north."""
-_MOST_TRIES = 24
+_MOST_TRIES = 40
 """Answers to open questions, in all their combinations, that are tried."""
 _CONFIRMED = 0.1
 """Largest share of the channels' variation that answers leave which readings confirm."""

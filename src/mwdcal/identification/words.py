@@ -27,7 +27,7 @@ TRANSLATIONS = (
     (r"tran(s|sverse|sversal)?[ _]*2", "Y "),
     (
         r"hoehenwinkel|hohenwinkel|elevasjon|stupning|neigung.*horizontal\w*|угол места|仰角|"
-        + _ELEVATION,
+        r"(井斜|倾)?角?\W*(与|和|从|自)?水平面?的?(夹)?角|" + _ELEVATION,
         "elevation ",
     ),
     (
