@@ -17,32 +17,27 @@ import msgspec
 from mwdcal.calibration.diagnosis.flags import listed
 from mwdcal.errors import Answer, InputError, QuestionError
 from mwdcal.files.formats.columns import Column, looks_numeric, shown
-from mwdcal.files.formats.layout import ADJUSTED
+from mwdcal.files.formats.layout import ADJUSTED, OF_REFUSAL
 from mwdcal.files.formats.table import Table, labels, row_word
 from mwdcal.files.parting import marked_rows
 from mwdcal.files.statements import rows_of
 from mwdcal.files.synonyms import OURS
 from mwdcal.sensor.profile import TableFormat
 
-_OF_REFUSAL = (
-    r"reject(ed)?|bad|invalid|void|voided|discard(ed)?|unusable|omit(ted)?|excluded?|scrap(ped)?|do not use|dnu|"
-    r"n\.? ?ok|nok|not ok|no good|n\.o\.k\.?|verworfen|ungultig|schlecht|fehlmessung|unbrauchbar|gestrichen|"
-    r"nicht (ok|verwenden|verwertbar)|n\.? ?i\.? ?o\.?|forkastet|ugyldig|darlig|underkjent|avvist|kassert|"
-    r"strøket|stroket|feilmaling|"
-    r"ikke (ok|bruk|brukes)|rechazad[oa]|invalid[oa]|descartad[oa]|anulad[oa]|no (ok|usar|valid[oa])|mal[oa]?|"
-    r"rejeitad[oa]|ruim|nao (ok|usar)|rejete?e?|mauvaise?|annulee?|ecarte|non ok|брак|забракован[оа]?|отбракован[оа]?|"
-    r"плохо|плохая|не ?год(ен|на|но)|недейств\w*|исключ\w*|не использовать|отклонен[оа]?|не ок|"
-    r"作废|剔除|无效|废弃|舍弃|弃用|不可用|坏点?|不合格"
-)
-_REJECTED = re.compile(rf"\W*({_OF_REFUSAL})\W*|\W*({_OF_REFUSAL})\s*[-–—:;,.(/!].*", re.DOTALL)
+_REJECTED = re.compile(rf"\W*({OF_REFUSAL})\W*|\W*({OF_REFUSAL})\s*[-–—:;,.(/!].*", re.DOTALL)
 """A cell that rejects its row, whatever reason follows."""
 _MAY_REJECT = re.compile(
-    rf"(?<![^\W\d_])({_OF_REFUSAL}|fail(ed)?|outlier|suspect|questionable|doubtful|ausreißer|ausreisser|fehler|avvik|"
+    rf"(?<![^\W\d_])({OF_REFUSAL}|fail(ed)?|outlier|suspect|questionable|doubtful|ausreißer|ausreisser|fehler|avvik|"
     r"moved|bumped|disturbed|slipped|knocked|bewegt|verrutscht|gestossen|flyttet|movi(o|do)|mexeu|bouge|сдвин\w*|"
     r"толкн\w*|"
     r"nicht bestanden|falha|fallo|выброс|сбой)(?![^\W\d_])|异常|可疑|移动|碰到"
 )
 """A cell that may reject its row, or speak of another one."""
+_REJECTS_PREVIOUS = re.compile(
+    r"(?<![^\W\d_])(previous|prior|last|vorige\w*|vorherige\w*|forrige|anterior|precedent\w*|предыдущ\w*)(?![^\W\d_])\W*"
+    rf"(?:\w+\W+){{0,2}}({OF_REFUSAL})(?![^\W\d_])|(上|前)一?[个点行次]\w{{0,2}}(作废|无效|剔除|不合格|坏)",
+)
+"""A cell that rejects the row before its own: repeated, the previous one is bad."""
 _ACCEPTED = re.compile(
     r"ok(ay)?|good|valid|accept(ed)?|pass(ed)?|use(d)?|i\.? ?o\.?|gut|gultig|bestanden|godkjent|gyldig|bra|bien|bueno|"
     r"buena|aceptad[oa]|valid[oa]|bom|boa|aceit[oa]|bon(ne)?|годен|годна|хорошо|норма|да|ок|合格|正常|有效|良好?"
@@ -94,12 +89,16 @@ def marks_in(table: Table, form: TableFormat, used: Collection[str]) -> Marks:
         plain = [spelt[cell] for cell in cells]
         verdicts = _verdicts(_plain(name), plain) if judged else {}
         for row, cell in enumerate(plain):
+            if judged and row and cell not in kept and _REJECTS_PREVIOUS.search(cell):
+                left_out.setdefault(row - 1, f"the next row, {shown(name)}: {cells[row]}")
+                continue
             verdict = True if cell in chosen else None if cell in kept else verdicts.get(cell)
             if verdict:
                 left_out.setdefault(row, f"{shown(name)}: {cells[row] or 'blank'}")
             elif verdict is not None:
                 doubtful.setdefault((name, cells[row]), []).append(row)
-    return Marks(left_out, doubtful)
+    open_rows = {key: [r for r in rows if r not in left_out] for key, rows in doubtful.items()}
+    return Marks(left_out, {key: rows for key, rows in open_rows.items() if rows})
 
 
 def _verdicts(name: str, cells: Sequence[str]) -> dict[str, bool]:

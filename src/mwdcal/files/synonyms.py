@@ -23,8 +23,8 @@ from mwdcal.geometry.units import STANDARD_GRAVITY
 _SPELLINGS = {
     "°": "deg degree degrees grad",
     "rad": "rad radian radians",
-    "°C": "c celsius",
-    "°F": "f fahrenheit",
+    "°C": "c celsius degc gradc",
+    "°F": "f fahrenheit degf",
     "K": "k kelvin",
     "g": "g",
     "mg": "millig mg",
@@ -38,8 +38,8 @@ _SPELLINGS = {
     "mG": "milligauss",
     "A/m": "apm",
     "gon": "gon gons",
-    "V": "v",
-    "mV": "mv",
+    "V": "v volt volts",
+    "mV": "mv millivolt millivolts",
     "counts": "lsb counts count cnt cnts adc digits digit",
     "raw": "raw",
 }
@@ -286,9 +286,12 @@ def resembled(name: str) -> Resemblance | None:
     if name in _CHANNELS:
         return None
     whole, bracketed = _resembled(name), _BRACKETED.fullmatch(name.strip())
-    if whole or not bracketed or not (bare := _resembled(bracketed[1])):
+    if whole or not bracketed or not (bare := resembled(bracketed[1])):
         return whole
-    return bare._replace(unit=bracketed[2].strip())
+    again = _resembled(bracketed[2])  # Roll angle (TF): no unit
+    if again and again.column == bare.column:
+        return bare
+    return bare._replace(unit=unit_of(bracketed[2]) or bracketed[2].strip())
 
 
 def _resembled(name: str) -> Resemblance | None:
@@ -329,7 +332,7 @@ def _column(whole: str, bare: str, words: set[str], unit: str) -> str | None:
         "ref_gravity_g": bare == "g" and stated,
     }
     short = (s.removeprefix("ref").removesuffix("deg") for s in (whole, bare))
-    if bare in ("tx", "ty", "tz") and unit in _MAGNETIC_UNITS:
+    if bare in ("tx", "ty", "tz", "fx", "fy", "fz") and unit in _MAGNETIC_UNITS:
         return f"m{bare[1]}"
     if whole in ("x", "y", "z") and unit in (*_MAGNETIC_UNITS, *_GRAVITY_UNITS):
         return f"{'m' if unit in _MAGNETIC_UNITS else 'a'}{whole}"

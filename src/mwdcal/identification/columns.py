@@ -127,7 +127,7 @@ def channels_for(column: str, names: Sequence[str], values: Values) -> list[Answ
 def triples_for(
     channels: Sequence[str], names: Sequence[str], values: Values, most: float = np.inf
 ) -> list[Answer]:
-    """Neighbouring columns that may be a triad, first those of which the norm varies least.
+    """Neighbouring columns that may be a triad, first those of which the norm varies least beside each channel.
 
     A sound triad has the same norm at every attitude, but for its biases and scales, while each channel varies.
     `most`: by how much it may vary, as a share of the channels' range.
@@ -139,14 +139,16 @@ def triples_for(
         columns = np.stack([numbers[n] for n in three], -1)
         spread = np.ptp(columns, axis=0)
         if spread.min() > 0:
-            triples.append((_variation(columns) / float(spread.max()), three))
+            triples.append((_variation(columns), float(spread.max()), float(spread.min()), three))
     return [
         Answer(
             with_values(", ".join(three), values, *three),
             tuple(("column", f"{c}={n}") for c, n in zip(channels, three, strict=True)),
         )
-        for variation, three in sorted(triples, key=lambda each: each[0])[:_MOST_TRIPLES]
-        if variation <= most
+        for variation, largest, _, three in sorted(triples, key=lambda each: each[0] / each[2])[
+            :_MOST_TRIPLES
+        ]
+        if variation <= most * largest
     ]
 
 
@@ -240,6 +242,20 @@ _MEASURED = re.compile(
     re.IGNORECASE,
 )
 """Words of angles that the tool itself has measured: no references."""
+_NO_STAND = re.compile(
+    rf"{_MEASURED.pattern}|\b(err\w*|delta|diff\w*|dev\w*|res\w*|sd|std\w*|unc\w*|sigma|rate|last|previous|old|"
+    r"check|fehler|abw\w*|feil|avvik|desv\w*|erro\w*|ecart|погрешн\w*|откл\w*)\b|误差|偏差",
+    re.IGNORECASE,
+)
+"""Words of columns of angles that are none of the stand."""
+_NOMINAL = re.compile(
+    r"\b(nominal|target|set|setpoint|soll\w*|задан\w*|номинал\w*)\b|设定|目标", re.IGNORECASE
+)
+_ACTUAL = re.compile(
+    r"\b(actual|read|reading|ist|istwert|действит\w*|фактич\w*|измер\w*|real|faktisk)\b|实际|实测",
+    re.IGNORECASE,
+)
+"""Words of angles to which a stand was to be set, and of those that it shows."""
 _OF_CHANNELS = re.compile(r"\b(measured|meas|gemessen|ist)\b", re.IGNORECASE)
 """Those that say nothing more of a channel."""
 _OTHER_NORTH = re.compile(
@@ -272,6 +288,11 @@ _CCW = re.compile(
     re.IGNORECASE,
 )
 """Words of angles that count anticlockwise."""
+_DOWNWARDS = re.compile(
+    r"below|\b(down(wards?)?|nach unten|nedover|hacia abajo|para baixo|vers le bas|вниз)\b|向下|俯角",
+    re.IGNORECASE,
+)
+"""Words of angles from the horizontal that count downwards."""
 _SPOKEN = {
     "rad": re.compile(r"radian|радиан|\brad\b", re.IGNORECASE),
     "gon": re.compile(r"\bgon\b", re.IGNORECASE),
@@ -300,7 +321,7 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     name = f"{logged[1]}{logged[2] or ''}" if logged else name
     plain = spelled(f"{name} ({unit})" if unit else name)
     if "elevation" in plain:
-        return Resemblance("ref_inclination_deg", BELOW if "below" in plain else ABOVE)
+        return Resemblance("ref_inclination_deg", BELOW if _DOWNWARDS.search(plain) else ABOVE)
     if _CCW.search(plain):
         turned = resembled(_CCW.sub("", plain))
         return turned and (
@@ -360,6 +381,7 @@ def meanings_of(names: Sequence[str], units: Sequence[str]) -> dict[str, Resembl
     results = {
         name: m for name, unit in zip(names, units, strict=True) if (m := meaning(once[name], unit))
     }
+    results |= _behind_titles(names, units, results)
     every = [n for n, m in results.items() if m.column == "az"]
     lone = [n for n in every if _BARE_AZ.fullmatch(n)]
     triad = [n for n in every if n not in lone[:1]] or any(_BARE_AX.fullmatch(n) for n in names)
@@ -370,6 +392,30 @@ def meanings_of(names: Sequence[str], units: Sequence[str]) -> dict[str, Resembl
     if len(dips) == 1 and any(re.search("neigung", n, re.IGNORECASE) for n in inclined):
         results[dips[0]] = results[dips[0]]._replace(column="ref_dip_deg")
     return results
+
+
+def _behind_titles(
+    names: Sequence[str], units: Sequence[str], meanings: Mapping[str, Resemblance]
+) -> dict[str, Resemblance]:
+    """Angles of the stand behind an unknown title that two of them share, where no other column is one: Cradle Inc."""
+    angles = {REFERENCES[name].column for name in ("inclination", "azimuth", "toolface")}
+    if angles & {m.column for m in meanings.values()}:
+        return {}
+    by_title: dict[str, dict[str, Resemblance]] = {}
+    for name, unit in zip(names, units, strict=True):
+        words = name.split() if name not in meanings else []
+        for place in range(1, len(words)):
+            title, rest = " ".join(words[:place]), " ".join(words[place:])
+            alike = (
+                Resemblance("ref_azimuth_deg", "°")
+                if _BARE_AZ.fullmatch(rest)
+                else meaning(rest, unit)
+            )
+            if alike and alike.column in angles and not _NO_STAND.search(spelled(title)):
+                by_title.setdefault(title, {})[name] = alike
+                break
+    groups = [each for each in by_title.values() if len({m.column for m in each.values()}) > 1]
+    return groups[0] if len(groups) == 1 else {}
 
 
 def _follows(
@@ -484,12 +530,16 @@ def proposed(
         if not {*channels} & {*chosen, *said}:
             others = [n for n in names if n not in meanings]
             questions.ask(_check_hidden, triad, channels, others, values, source)
+    nameless = not {*RAW[:3]} & {*chosen}
     hidden = any("channels of the accelerometer" in each.text for each in questions)
     if not hidden and not any(n in damaged for n, m in meanings.items() if m.column in RAW):
         questions.ask(_check_triads, names, values, chosen, source)
     questions.ask(_check_units_of_triads, chosen, source)
-    if not {*RAW[3:]} & {*chosen, *said}:
-        believed = questions.believed()
+    beside = any("side by side" in each.text for each in questions)
+    if not beside and not {*RAW[3:]} & {*chosen, *said}:
+        believed = (
+            () if nameless else questions.believed()
+        )  # of two nameless triads either may be either
         others = [n for n in names if n not in meanings and n not in believed]
         questions.ask(_check_nameless, others, values, {*chosen, *known}, source)
     rest = {n: u for n, u in zip(names, units, strict=True) if n not in meanings}
@@ -690,6 +740,8 @@ def _check_triads(
     """Refuse a table without accelerometers, or with a part of the magnetometers."""
     absent = [name for name in RAW[:3] if name not in chosen]
     others = [n for n in names if n not in {each.name for each in chosen.values()}]
+    if len(absent) == 3:
+        _check_side_by_side(others, values, source)
     if absent:
         raise QuestionError(
             f"{source}: could not tell which columns are the accelerometers ({', '.join(absent)}); the names are "
@@ -704,6 +756,32 @@ def _check_triads(
             f"{source}: of the magnetometers only {', '.join(n for n in RAW[3:] if n in chosen)} can be found by "
             "name.",
             channels_for(lacking[0], others, values),
+        )
+
+
+def _check_side_by_side(names: Sequence[str], values: Values, source: str) -> None:
+    """Ask which of several tools is meant whose channels stand side by side, each under the tool's own title."""
+    tools: dict[str, dict[str, str]] = {}
+    for name in names:
+        words = name.split()
+        for place in range(1, len(words)):
+            alike = meaning(" ".join(words[place:]))
+            if alike and alike.column in RAW:
+                tools.setdefault(" ".join(words[:place]), {})[alike.column] = name
+                break
+    whole = {title: each for title, each in tools.items() if {*RAW[:3]} <= {*each}}
+    if len(whole) > 1:
+        answers = [
+            Answer(
+                with_values(title, values, each["ax"]),
+                tuple(("column", f"{column}={name}") for column, name in each.items()),
+            )
+            for title, each in whole.items()
+        ]
+        raise QuestionError(
+            f"{source}: the channels of {len(whole)} tools stand side by side: {', '.join(map(shown, whole))}. Which "
+            "one is meant?",
+            answers,
         )
 
 
@@ -799,6 +877,10 @@ def _one(column: str, candidates: Sequence[str], values: Values, source: str) ->
         of_tool = [n for n in candidates if not _SURROUNDINGS.search(n)] or candidates
         candidates = [n for n in of_tool if not _CALLED_REFERENCE.search(spelled(n))] or of_tool
     stated = [name for name in candidates if _CALLED_REFERENCE.search(spelled(name))]
+    shows = [name for name in stated if _ACTUAL.search(name) and not _NOMINAL.search(name)]
+    others = [name for name in candidates if name not in shows]
+    if len(shows) == 1 and all(map(_NOMINAL.search, others)):
+        return shows[0]
     if len(candidates) == 1 or len(stated) == 1:
         return (stated or candidates)[0]
     of = "the temperature of the tool" if column == WARMTH else f"'{column}'"

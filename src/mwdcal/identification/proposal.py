@@ -24,7 +24,7 @@ from mwdcal.files.contract import CHANNELS, MAPPED, RANGES, RAW, REFERENCES, uni
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, looks_numeric, shown
 from mwdcal.files.formats.figures import is_figure
-from mwdcal.files.formats.layout import WORKBOOKS, Layout
+from mwdcal.files.formats.layout import NO_VALUE, WORKBOOKS, Layout
 from mwdcal.files.formats.table import Table, cell_error, labels, numbers
 from mwdcal.files.formats.table import labels as labels_of
 from mwdcal.files.formats.text import is_preamble
@@ -324,9 +324,29 @@ def propose(
     try:
         return with_answers(answers or {})
     except (QuestionError, QuestionsError) as error:
+        if blank := _cells_without_reading(error, leave_out or {}):
+            return propose(
+                path, sheet=sheet, header_row=header_row, decimal=decimal, answers=answers, stated=stated,
+                north=north, leave_out=blank, keep=keep,
+            )  # fmt: skip
         if proposal := _answer_by_readings(error, with_answers, answers or {}, table):
             return proposal
         raise
+
+
+def _cells_without_reading(
+    error: QuestionError | QuestionsError, leave_out: Mapping[str, Sequence[str]]
+) -> dict[str, list[str]]:
+    """What rows to leave out besides, by column, for cells that are blank or say that there is no reading."""
+    questions = error.questions if isinstance(error, QuestionsError) else (error,)
+    every = {name: [*cells] for name, cells in leave_out.items()}
+    only = (each.answers[0].arguments for each in questions if len(each.answers) == 1)
+    for arguments in only:
+        pairs = [text.partition("=") for option, text in arguments if option == "leave_out"]
+        if len(pairs) == len(arguments) and all(NO_VALUE.fullmatch(cell) for *_, cell in pairs):
+            for name, _, cell in pairs:
+                every.setdefault(name, []).append(cell)
+    return {} if every == {**leave_out} else every
 
 
 def _proposal(
@@ -379,7 +399,7 @@ def _is_formulas(cells: Sequence[str]) -> bool:
 
 _OF_READINGS = (*RAW, *(REFERENCES[name].column for name in ("inclination", "toolface")))
 """Columns that readings tell; azimuths may count from another north."""
-_MOST_TRIES = 24
+_MOST_TRIES = 40
 """Answers to open questions, in all their combinations, that are tried."""
 _CONFIRMED = 0.1
 """Largest share of the channels' variation that answers leave which readings confirm."""

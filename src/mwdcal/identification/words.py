@@ -27,7 +27,7 @@ TRANSLATIONS = (
     (r"tran(s|sverse|sversal)?[ _]*2", "Y "),
     (
         r"hoehenwinkel|hohenwinkel|elevasjon|stupning|neigung.*horizontal\w*|угол места|仰角|"
-        + _ELEVATION,
+        r"(井斜|倾)?角?\W*(与|和|从|自)?水平面?的?(夹)?角|" + _ELEVATION,
         "elevation ",
     ),
     (
@@ -39,9 +39,9 @@ TRANSLATIONS = (
     ),
     (
         r"kipp(achse|winkel)|schwenkachse|\btilt\b|inclinazione|inclinatie|helling|haeldning|hældning|lutning|"
-        r"(kat )?odchylenia|(kat )?nachylenia|ferdeseg|dolesszog|egim|kemiringan|傾斜角?|зен\w*\.?( угол\w*)?|"
+        r"(kat )?odchyleni[ae]( od pionu)?|(kat )?nachyleni[ae]|ferdeseg|dolesszog|egim|kemiringan|傾斜角?|зен\w*\.?( угол\w*)?|"
         r"neigung(swinkel)?|desviacion|sapma( acisi)?|inklination|inclinaison|inclinaca?o|"
-        r"inclinacion|zenith( angle)?|drift angle|deviation angle|"
+        r"inclinacion|zenith( angle)?|drift angle|deviation angle|(?<![a-z])inkl?\b\.?|"
         r"inklinasjon|helning|инклинация|зенит\w*( угол)?|наклон(?!ен)|井斜角?|倾角",
         "inclination ",
     ),
@@ -51,19 +51,19 @@ TRANSLATIONS = (
         "azimuth ",
     ),
     (
-        r"rollachse|roll axis|\brulle?\b|rullning|rotasi|(kat )?ustawienia narzedzia|takim yuzu|szerszamallas|"
+        r"rollachse|roll axis|(kat )?obrotu|\brulle?\b|rullning|rotasi|(kat )?ustawienia narzedzia|takim yuzu|szerszamallas|"
         r"gereedschapsvlak|v(ae|æ)rkt(o|ø)jsflade|faccia utensile|ツールフェ(ー|イ)ス|тулфейс|回転角|угол поворота|"
         r"rollwinkel|roll angle|werkzeug(winkel|lage|flache)|verdrehung|verdrehwinkel|drehwinkel|rotasjon|rulle?vinkel|"
         r"verktoy(flate|vinkel)\w*|(face|angulo) d[ae] ferramenta|(face|angle)( d[e'])? ?(l'?)?outil|"
         r"ghsf?\b|угол установки( отклонител\w*)?|визир\w*( угол)?|"
-        r"angulo de giro|giro|rotacion|отклонител\w*|визирн\w* угол|поворот|工具面角?|"
-        r"cara de (la )?herramienta|gravity tool ?face|h\.?s\.?[ _-]*tool ?face|tool[ _-]*face",
+        r"angulo de giro|giro|rotacion|отклонител\w*|откл\b\.?|визирн\w* угол|поворот|工具面角?|"
+        r"cara de (la )?herr(amienta|\b\.?)|gravity tool ?face|h\.?s\.?[ _-]*tool ?face|tool[ _-]*face",
         "toolface ",
     ),
     (
         r"accelero\b\.?|przysp(ieszenie)?\b\.?|gyorsulas(mero)?|ivme\w*|versn(elling)?\b\.?|accelerazione|"
         r"accelerometro|percepatan|加速度|γ|"
-        r"beschleunigung\w*|beschl\b\.?|akselerasjon|akselerometer|akselero|aceleracion|acelerometro|acel\b|"
+        r"beschleunigung\w*|beschl\b\.?|akselerasjon|akselerometer|akselero|aceleracion|acelerometros?|acel\b|"
         r"aceleracao|accelerometre|acceleration|\bac\.|ускорен\w*|акселерометр\w*|акс\b|\baks\b|加速度计?|加计|加表",
         "acc ",
     ),
@@ -71,7 +71,7 @@ TRANSLATIONS = (
         r"pole magn\w*\.?(?=[ _]*[xyz])|magneses(?=[ _]*[xyz])|manyetik(?=[ _]*[xyz])|magneetveld(?=[ _]*[xyz])|"
         r"medan(?=[ _]*[xyz])|磁気(?=[ _]*[xyz])|magnetfalt(?=[ _]*[xyz])|campo(?=[ _]*[xyz]\b)|"
         r"\bmagneto\b\.?|magnetometre|magn\b\.?(?=[ _]*[xyz]\b)|magnetfeld(?=[ _]*[xyz])|magnetfelt(?=[ _]*[xyz])|"
-        r"magnetometro|magnetometr(?=[ _]*[xyz])|magnetometers?|магнитометр\w*|магн\b|феррозонд\w*|磁力计|"
+        r"magnetometros?|magnetometr(?=[ _]*[xyz])|magnetometers?|магнитометр\w*|магн\b|феррозонд\w*|磁力计|"
         r"磁通门|磁强计|campo magnetico(?=[ _]*[xyz])|campo mag(?=[ _]*[xyz])|"
         r"\bmtm\b|磁(?=[ _]*[xyz])|flux[ _-]*gates?|磁场(?=[ (（_]*[xyz])",
         "mag ",
@@ -107,7 +107,7 @@ TRANSLATIONS = (
         "temperature ",
     ),
     (
-        r"sollwerte?|sollwinkel|soll|\brig\b|referenz|referanse|referencia|stand|эталон\w*|стенд|задан\w*|标准|参考|转台",
+        r"sollwerte?|sollwinkel|soll|\brig\b|referenz|referanse|referencia|stand( settings?)?|(angulos? )?d[ae] (la )?(mesa|bancada)|эталон\w*|стенд|задан\w*|标准|参考|转台",
         "ref ",
     ),
     (
@@ -115,7 +115,7 @@ TRANSLATIONS = (
         "serial ",
     ),
     (r"\bgeogr\w*\.?", "true "),
-    (r"\bu (?=[gabhm][xyz]\b)", ""),
+    (r"(?<![a-z])u ?(?=[gabhm][xyz]\b)", ""),
     (r"gerat|sonde", "tool "),
     (r"(de|da) [qc]uadr[ií]cula( utm)?|gitter|kartesisch", "grid "),
     (r"achse|aksen?|eje|ось|轴", ""),

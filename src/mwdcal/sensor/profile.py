@@ -136,7 +136,16 @@ class TableFormat(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """
 
     encoding: Literal[
-        "utf-8", "utf-16", "cp1252", "cp1251", "gb18030", "cp932", "cp1250", "cp1254"
+        "utf-8",
+        "utf-16",
+        "cp1252",
+        "cp1251",
+        "gb18030",
+        "cp932",
+        "cp1250",
+        "cp1254",
+        "cp850",
+        "cp866",
     ] = "utf-8"
     delimiter: Literal[",", ";", "\t", "|"] = ","
     decimal: Literal[".", ","] = "."

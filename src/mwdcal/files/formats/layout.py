@@ -60,6 +60,8 @@ _DEGREES_OF = re.compile(
     re.IGNORECASE,
 )
 """The name of a column of degrees, or of minutes."""
+NO_VALUE = re.compile(r"n/?a|n\.a\.?|nan|null|none|[\W_]*", re.IGNORECASE)
+"""A cell that says that there is no value."""
 _BRACKETS = re.compile(r"[(\[][^)\]]*[)\]]")
 
 ADJUSTED = re.compile(
@@ -71,9 +73,26 @@ ADJUSTED = re.compile(
 )
 """Words of a run before or after an adjustment of the tool: two of them are two runs."""
 
+OF_REFUSAL = (
+    r"reject(ed)?|bad|invalid|void|voided|discard(ed)?|unusable|omit(ted)?|excluded?|scrap(ped)?|do not use|dnu|"
+    r"n\.? ?ok|nok|not ok|no good|n\.o\.k\.?|verworfen|ungultig|schlecht|fehlmessung|unbrauchbar|gestrichen|"
+    r"nicht (ok|verwenden|verwertbar)|n\.? ?i\.? ?o\.?|forkastet|ugyldig|darlig|underkjent|avvist|kassert|"
+    r"strøket|stroket|feilmaling|"
+    r"ikke (ok|bruk|brukes)|rechazad[oa]|invalid[oa]|descartad[oa]|anulad[oa]|no (ok|usar|valid[oa])|mal[oa]?|"
+    r"rejeitad[oa]|ruim|nao (ok|usar)|rejete?e?|mauvaise?|annulee?|ecarte|non ok|брак|забракован[оа]?|отбракован[оа]?|"
+    r"плохо|плохая|не ?год(ен|на|но)|недейств\w*|исключ\w*|не использовать|отклонен[оа]?|не ок|"
+    r"作废|剔除|无效|废弃|舍弃|弃用|不可用|坏点?|不合格"
+)
+"""Words by which a laboratory rejects a row, or a whole run."""
+_OF_VOID_RUN = re.compile(
+    rf"(?<![^\W\d_])({OF_REFUSAL}|abort(ed)?|cancell?ed|aborted|abgebrochen|ungültig|avbrutt|abortad[oa]|abandonn[eé]e?|"
+    r"прерван\w*)(?![^\W\d_])|作废|无效|中止|废弃",
+    re.IGNORECASE,
+)
+"""Words of the name of a sheet, or of the line above a table, of a run that does not count."""
 _OF_ROLL_TEST = re.compile(
     r"(?<![^\W\d_])(roll[\s_-]*(test|over|check)|rt|verif\w*|check|valid\w*|(roll)?pr(ue|ü)fung|"
-    r"[ck]ontrol\w*[- ]?(run|shot|test|roll|messung|dreh|måling|rull)\w*|rulletest|prueba|провер\w*|повер\w*|"
+    r"[ck]ontrol\w*[- ]?(run|shot|test|roll|messung|dreh|måling|rull)\w*|rulletest|prueba|(essai|test)s? (en|de) (roulis|rotation)|провер\w*|повер\w*|"
     r"контрольн\w* (вращ|замер|измер)\w*)(?![^\W\d_])|验证|检验|複測|复测",
     re.IGNORECASE,
 )
@@ -184,15 +203,25 @@ def laid_out(
 
 
 def _the_run(tables: Sequence[Layout]) -> Layout | None:
-    """The run among alike tables: their sheets joined, or the one beside which the others are roll tests."""
+    """The run among alike tables: their sheets joined, or the one beside which the others are void or roll tests."""
     if _is_one_run(tables):
         return _joined_sheets(tables)
-    others = [t for t in tables if _OF_ROLL_TEST.search(f"{t.sheet} {t.heading}")]
-    runs = [t for t in tables if t not in others]
+    kinds = [_kind(f"{t.sheet} {t.heading}") for t in tables]
+    runs = [t for t, kind in zip(tables, kinds, strict=True) if not kind]
     if len(runs) != 1 or ADJUSTED.search(runs[0].heading):
         return None
-    aside = tuple((t.form.header_line, f"roll test, {len(t.lines)} rows") for t in others)
+    aside = tuple(
+        (t.form.header_line, f"{kind}, {len(t.lines)} rows")
+        for t, kind in zip(tables, kinds, strict=True)
+        if kind
+    )
     return replace(runs[0], left_out=(*runs[0].left_out, *aside))
+
+
+def _kind(words: str) -> str:
+    """What a table is that is no run, by its sheet and the line above it; empty for a run."""
+    kinds = (("void run", _OF_VOID_RUN), ("roll test", _OF_ROLL_TEST))
+    return next((kind for kind, pattern in kinds if pattern.search(words)), "")
 
 
 def _is_one_run(tables: Sequence[Layout]) -> bool:
@@ -209,7 +238,7 @@ def _is_one_run(tables: Sequence[Layout]) -> bool:
         for t in tables
     )
     words = [" ".join([t.sheet, *t.above]) for t in tables]
-    apart = any(ADJUSTED.search(each) or _OF_ROLL_TEST.search(each) for each in words)
+    apart = any(ADJUSTED.search(each) or _kind(each) for each in words)
     rows = [row for t in tables for row in zip(*t.texts, strict=True)]
     if not same or apart or len({*sheets}) < len(sheets) or len({*rows}) < len(rows):
         return False
@@ -614,9 +643,7 @@ def _without_summary(rows: Sequence[tuple[int, Cells]]) -> list[tuple[int, Cells
 
 def _is_blank(cell: object) -> bool:
     """Whether a cell is blank or says that there is no value: ---, n/a."""
-    return isinstance(cell, str) and bool(
-        re.fullmatch(r"(n/?a|nan|null|none|[\W_]*)", cell, re.IGNORECASE)
-    )
+    return isinstance(cell, str) and bool(NO_VALUE.fullmatch(cell))
 
 
 def _is_summary(row: Cells, width: int) -> bool:

@@ -7,6 +7,7 @@ import re
 import zipfile
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +15,15 @@ from mwdcal import extras
 from mwdcal.errors import InputError
 from mwdcal.files.formats import figures, text
 from mwdcal.files.formats.columns import at_most, damaged_unless_read
-from mwdcal.files.formats.layout import WORKBOOKS, Cells, Sheet
+from mwdcal.files.formats.layout import LEAST_COLUMNS, WORKBOOKS, Cells, Sheet
 from mwdcal.sensor.profile import TableFormat
 
 DELIMITERS = (";", "\t", ",", "|")
 _BLANKS, _RUNS = "blanks", "runs of blanks"
 _LOOKED_AT = 400
 """Lines by which the delimiter of a text is told."""
+_LEAST_ROWS = 4
+"""Rows from which on columns of a text show by where they stand."""
 _LARGEST_CONTENTS = 100_000_000
 _REPEATED = re.compile(rb'number-(?:rows|columns)-repeated="(\d+)"')
 _MOST_REPEATED = 1_100_000
@@ -66,8 +69,59 @@ def _delimited(lines: Sequence[str], source: str) -> tuple[str, list[tuple[int, 
     best = max(DELIMITERS, key=lambda mark: counts[mark])
     if 2 * counts[best] < max(counts.values()):  # blanks may stand within cells
         best = max(marks, key=lambda mark: counts[mark])
-    rows = enumerate(_split(lines, best, source), 1)
-    return best, [(line, _trimmed(row)) for line, row in rows if any(row)]
+    cells = _split(lines, best, source)
+    if best in (_BLANKS, _RUNS):
+        cells = _in_columns(lines, cells)
+    return best, [(line, _trimmed(row)) for line, row in enumerate(cells, 1) if any(row)]
+
+
+def _in_columns(lines: Sequence[str], rows: Sequence[list[str]]) -> list[list[str]]:
+    """The rows of a text whose columns stand one below the other, each cell of a shorter row in its own column.
+
+    A row of units, or one with a blank cell, has fewer cells than the others. Where columns overlap, or the cells of
+    a row are not each below another column, the rows stay as they are.
+    """
+    spans = [_spans(line, row) for line, row in zip(lines, rows, strict=True)]
+    numbered = [s for s, row in zip(spans, rows, strict=True) if _is_of_numbers(row)]
+    usual = Counter(map(len, numbered)).most_common(1)
+    width = usual[0][0] if usual else 0
+    whole = [s for s in numbered if len(s) == width]
+    columns = [
+        (min(a for a, _ in each), max(b for _, b in each)) for each in zip(*whole, strict=True)
+    ]
+    if len(whole) < _LEAST_ROWS or any(one[1] > two[0] for one, two in pairwise(columns)):
+        return [*rows]
+    return [_placed(row, each, columns) for row, each in zip(rows, spans, strict=True)]
+
+
+def _spans(line: str, row: Sequence[str]) -> list[tuple[int, int]]:
+    """Where the cells of a line begin and end, tabs filled up."""
+    text, start, spans = line.expandtabs(), 0, []
+    for cell in row:
+        start = text.find(cell.expandtabs(), start)
+        spans.append((start, start + len(cell)))
+        start += len(cell)
+    return spans
+
+
+def _is_of_numbers(row: Sequence[str]) -> bool:
+    return sum(map(figures.is_figure, row)) >= LEAST_COLUMNS
+
+
+def _placed(
+    row: list[str], spans: Sequence[tuple[int, int]], columns: Sequence[tuple[int, int]]
+) -> list[str]:
+    """The cells of a row that is shorter than others, each in the column above or below which it stands."""
+    if not LEAST_COLUMNS <= len(row) < len(columns):
+        return row
+    places = [
+        [k for k, (start, end) in enumerate(columns) if one < end and start < other]
+        for one, other in spans
+    ]
+    if any(len(each) != 1 for each in places) or len({*map(tuple, places)}) < len(row):
+        return row
+    by_place = {place: cell for (place,), cell in zip(places, row, strict=True)}
+    return [by_place.get(place, "") for place in range(len(columns))]
 
 
 def _numbers(rows: Sequence[Sequence[str]]) -> int:

@@ -37,6 +37,14 @@ _FOREIGN_WORDS = {
     "cp1251": re.compile(
         "азимут|зенит|темп|прибор|дата|угол|ускор|магн|поле|точк|номер|град|станц", re.IGNORECASE
     ),
+    "cp866": re.compile(
+        "азимут|зенит|темп|прибор|дата|угол|ускор|магн|поле|точк|номер|град|станц", re.IGNORECASE
+    ),
+    "cp850": re.compile(
+        r"numéro|série|opérateur|étalonn|gerät|prüf|größe|übers|número|medición|calibración|ângulo|calibração|"
+        r"(?<=\d)°|(?<=[(\[ ])°[CF]?(?=[)\] ]|$)",
+        re.IGNORECASE,
+    ),
     "gb18030": re.compile("角|温度|磁|加速度|日期|序|编号|工具|方位|井斜|重力|标定|仪器"),
     "cp932": re.compile("角|温度|磁|加速度|日付|番号|センサ|ツール|方位|傾斜|重力|校正|機器|測定"),
     "cp1250": re.compile(
@@ -77,16 +85,24 @@ def encoding_of(data: bytes) -> str:
     except UnicodeDecodeError:
         counts = {e: _words_in(data, e, words) for e, words in _FOREIGN_WORDS.items()}
         best = max(counts, key=lambda e: counts[e])
-        return best if counts[best] else "cp1252"
+        return best if counts[best] else "cp1252" if _is_text(data, "cp1252") else "cp850"
     return "utf-8"
+
+
+def _is_text(data: bytes, encoding: str) -> bool:
+    """Whether bytes are text in an encoding."""
+    try:
+        data.decode(encoding)
+    except UnicodeDecodeError:
+        return False
+    return True
 
 
 def _words_in(data: bytes, encoding: str, words: re.Pattern[str]) -> int:
     """The different words of the field that some bytes hold in an encoding, of which some are no ASCII."""
-    try:
-        text = data.decode(encoding)
-    except UnicodeDecodeError:
+    if not _is_text(data, encoding):
         return 0
+    text = data.decode(encoding)
     every = {word.lower() for word in words.findall(text)}
     return len(every) if any(not word.isascii() for word in every) else 0
 

@@ -1,7 +1,8 @@
 """References that the title block of a table states for all its stations: field strength, dip and gravity.
 
 A value counts where its word comes first, its unit is known or its value allows one unit alone, and it is one that
-the Earth has. A nominal or approximate value, a range and an uncertainty are no reference.
+the Earth has. A line with a strength of the field and a gravity is that of a place: its inclination, or its only
+angle by the units, is the dip. A nominal or approximate value, a range and an uncertainty are no reference.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ _OF_PLACES = (
         r"magnetfalt|"
         r"intensidade?( total)?|champ( magn\w*)?( total| local)?|"
         r"(магн\w* )?поле|полн\w* (вектор|поле)|модуль( магн\w*)?( поля)?|индукци\w+|напряженност\w+( поля)?|"
-        r"(环境|当地|地|总)?磁(总)?场(总)?(强度)?|总场(强度)?|\|b\||tmf|tmi",
+        r"(环境|当地|地|总)?磁(总)?场(总)?(强度)?|总场(强度)?|\|b\||tmf|tmi|betrag|natezenie pola",
         "bfhtт",
         ("nT", "µT", "mT", "gauss", "mG"),
         15_000.0,
@@ -48,7 +49,7 @@ _OF_PLACES = (
         r"(mag\w*|local|field) (dip|inclination)( angle)?|dip( angle)?|dipref|manyetik egim|magn\w* inklinacio|伏角|"
         r"inklinacja( pola)?|inclinazione magn\w*|magn\w* inclinatie|"
         r"(feld|feld-|magn\w* ?)?inklination|"
-        r"(felt|magn\w* ?)?inklinasjon|mergulho( magn\w*)?|inclinaca?o (magn\w*|do campo)|"
+        r"(felt|magn\w* ?)?inklinasjon|mergulho( magn\w*)?|inclinaca?o (magn?\w*|do campo)|"
         r"inclinacion (magn\w*|del campo)|echado|buzamiento|inclinaison( magn\w*| du champ)?|"
         r"(магн\w* )?наклонени[ея]|(地)?磁倾角",
         "i",
@@ -60,6 +61,7 @@ _OF_PLACES = (
         "ref_gravity_g",
         r"(local )?gravity( field| acceleration)?|g ?total|gtot|gref|gt|zwaartekracht|yercekimi|nehezsegi gyorsulas|"
         r"gravita|gravitasi|tyngdkraft|重力(加速度)?|ускорение силы тяжести|"
+        r"przyspieszenie ziemskie|"
         r"(local|site) g|g[ -]?(locale?|lokal|ref|tot(al)?)|\|g\||"
         r"(lokale )?(schwere(beschleunigung)?|fallbeschleunigung|erdbeschleunigung|ortsschwere)|"
         r"tyngde(akselerasjon|kraft)?\w*|(aceleracion de la )?gravedad|(aceleraca?o da )?gravidade|pesanteur|"
@@ -72,7 +74,8 @@ _OF_PLACES = (
 )
 _WRITTEN_UNIT = (
     r"n\s?t\b|[uµμ]\s?t\b|m\s?t\b|milli ?gauss|m\s?g(al|auss)?\b|gauss|gal\b|gons?\b|нтл|мктл|мтл|мгал|м/с²?|м/с2|"
-    r"m\s?/\s?s\s?(?:²|\^?2)?|g\b|г\b|°|deg\w*|grad\w*|rad\b|град\w*|fok|derece|stopni|度"
+    r"m\s?/\s?s\s?(?:²|\^?2)?|[gг]\b(?!\s*[=:(\[]?\s*(?:[+-]?\d|m\s?/))|°|deg\w*|gra[ud]\w*|rad\b|град\w*|"
+    r"fok|derece|stopni|度"
 )
 _WRITTEN_NUMBER = (
     r"[+\-−]?\d{1,3}(?:[ '’.,\u00a0\u202f]\d{3})+(?:[.,]\d+)?(?!\d)|[+\-−]?\d+(?:[.,]\d+)?"
@@ -98,14 +101,38 @@ _REFERRING = re.compile(
     r"(?<![^\W\d_])(ref|reference|local|lokal|value|wert|t|f|i|g|т)(?![^\W\d_])"
 )
 """Words and letters behind the word of a quantity that say nothing more."""
-_STATEMENTS = {
-    q: re.compile(
-        rf"(?<![^\W\d_])(?:(?P<word>{q.words})|(?P<letter>[{q.letters}]))(?![^\W\d_]){_BETWEEN}"
-        rf"(?P<number>{_WRITTEN_NUMBER}){_MINUTES}\s*(?P<unit>{_WRITTEN_UNIT})?(?P<behind>[^\d;]{{0,12}})(?P<next>\d?)",
-        re.IGNORECASE,
-    )
+_CHINESE = r"[\u4e00-\u9fff]"
+_BEGINNING = rf"(?:(?<![^\W\d_])|(?<={_CHINESE})(?={_CHINESE}))"
+_WITH_NUMBER = rf"(?P<number>{_WRITTEN_NUMBER}){_MINUTES}\s*(?P<unit>{_WRITTEN_UNIT})?(?P<behind>[^\d;]{{0,12}})(?P<next>\d?)"
+
+
+def _statement(head: str) -> re.Pattern[str]:
+    return re.compile(rf"{_BEGINNING}{head}(?![^\W\d_]){_BETWEEN}{_WITH_NUMBER}", re.IGNORECASE)
+
+
+_STATEMENTS = [
+    (q, _statement(head))
     for q in _OF_PLACES
-}
+    for head in (
+        rf"(?P<word>{q.words})",
+        rf"(?P<letter>[{q.letters}])(?=\W*(?:{_WRITTEN_UNIT}|ref\w*|lo[ck]al\w*)?\W*\d)",
+    )
+]
+_INCLINATION = (_OF_PLACES[1], _statement(r"(?P<word>inc|incl\w*|ink|inkl\w*|наклон)"))
+"""An inclination in the line of a place, which is the dip."""
+_NUMBER_IN_UNIT = re.compile(
+    rf"(?<![\w.,±+-])(?P<number>[-−]?{_WRITTEN_NUMBER})\s*(?P<unit>{_WRITTEN_UNIT})", re.IGNORECASE
+)
+_OTHER_ANGLE = re.compile(
+    r"decl|deklin|misvis|conv|konv|azi|asim|tool|roll|tf\b|склон|азим|磁偏|方位|±", re.IGNORECASE
+)
+"""Words of angles that are no dip."""
+_UPWARDS = re.compile(
+    r"(?<![^\W\d_])(up|upwards?|para cima|hacia arriba|nach oben|aufwarts|oppover|vers le haut|verso l'?alto|"
+    r"вверх)(?![^\W\d_])|向上|朝上",
+    re.IGNORECASE,
+)
+"""Words of a dip whose number is that of a field that points up."""
 _SPELT = {
     "нтл": "nT", "мктл": "µT", "мтл": "mT", "м/с": "m/s²", "м/с²": "m/s²", "м/с2": "m/s²", "m/s": "m/s²", "г": "g",
     "град": "°", "度": "°", "fok": "°", "derece": "°", "stopni": "°", "gal": "gal",
@@ -118,7 +145,7 @@ def stated_above(rows: Sequence[Sequence[object]]) -> Titles:
     """What rows above a table say of the tool, the day and the place, as metadata."""
     block = titles(rows)
     references = references_in(rows)
-    rough = {c: text for c, text in rough_in(rows).items() if c not in references}
+    rough = {c: text for c, text in doubtful_in(rows).items() if c not in references}
     return block._replace(metadata={**references, **block.metadata}, not_taken=rough)
 
 
@@ -131,32 +158,86 @@ def references_in(rows: Iterable[Sequence[object]]) -> dict[str, float]:
     {}
     """
     values: dict[str, dict[float, None]] = {}
+    of_places: dict[str, dict[float, None]] = {}
     for row in rows:
-        text = _plain(" ".join(filter(None, (as_text(cell).strip() for cell in row))))
-        for quantity, pattern in _STATEMENTS.items():
-            for match in pattern.finditer(text):
-                if _UNSURE.search(text[max(match.start() - _BEFORE, 0) : match.start()]):
-                    continue
-                values.setdefault(quantity.column, {}).update(
-                    dict.fromkeys(_values(quantity, match))
-                )
-    return {column: next(iter(each)) for column, each in values.items() if len(each) == 1}
+        text = _plain(_line(row))
+        here = {column for s in _STATEMENTS for column, _ in _stated(text, *s)}
+        of_place = {"ref_field_nt", "ref_gravity_g"} <= here and "ref_dip_deg" not in here
+        for statement in [*_STATEMENTS, _INCLINATION] if of_place else _STATEMENTS:
+            for column, value in _stated(text, *statement):
+                values.setdefault(column, {})[value] = None
+        for column, value in _of_a_place(text).items():
+            of_places.setdefault(column, {})[value] = None
+    every = of_places | values
+    return {column: next(iter(each)) for column, each in every.items() if len(each) == 1}
 
 
-def rough_in(rows: Iterable[Sequence[object]]) -> dict[str, str]:
-    """The lines above a table that state a nominal or approximate reference, by column of a run file.
+def _stated(
+    text: str, quantity: _Quantity, pattern: re.Pattern[str]
+) -> Iterator[tuple[str, float]]:
+    """The values of a quantity that a line states, with its column."""
+    for match in pattern.finditer(text):
+        if not _UNSURE.search(text[max(match.start() - _BEFORE, 0) : match.start()]):
+            yield from ((quantity.column, value) for value in _values(quantity, match))
 
-    >>> rough_in([["Nominal field", "48 500 nT"], ["Field uncertainty 50 nT"]])
-    {'ref_field_nt': 'Nominal field 48 500 nT'}
+
+def _line(row: Sequence[object]) -> str:
+    return " ".join(filter(None, (as_text(cell).strip() for cell in row)))
+
+
+def _of_a_place(text: str) -> dict[str, float]:
+    """Field, dip and gravity in a line of all three, by their units; empty where the line is none.
+
+    >>> _of_a_place("ref 50400 nt 70.00 deg 9.8170 m/s²")
+    {'ref_field_nt': 50400.0, 'ref_gravity_g': 1.0010554062804322, 'ref_dip_deg': 70.0}
+    """
+    if _UNSURE.search(text):
+        return {}
+    numbers = [*_NUMBER_IN_UNIT.finditer(text)]
+    found: dict[str, float] = {}
+    for quantity in (_OF_PLACES[0], _OF_PLACES[2]):
+        inside = _in_unit(quantity, numbers) - {1.0}
+        if len(inside) != 1:
+            return {}
+        found[quantity.column] = inside.pop()
+    angles = _in_unit(_OF_PLACES[1], numbers)
+    if len(angles) == 1 and not _OTHER_ANGLE.search(text):
+        angle = angles.pop()
+        found[_OF_PLACES[1].column] = -abs(angle) if _UPWARDS.search(text) else angle
+    return found
+
+
+def _in_unit(quantity: _Quantity, numbers: Iterable[re.Match[str]]) -> set[float]:
+    """The different values that numbers with units of a quantity are, in the unit of the run file."""
+    every = ((m["number"], _stated_unit(quantity, m["unit"])) for m in numbers)
+    values = (
+        _converted(number, unit)
+        for text, unit in every
+        if unit in quantity.units
+        for number in _numbers(text, None)
+    )
+    return {v for v in values if quantity.low <= v <= quantity.high}
+
+
+def doubtful_in(rows: Iterable[Sequence[object]]) -> dict[str, str]:
+    """The lines above a table that may state a reference, by column of a run file.
+
+    They state a nominal or approximate one, or a number in a unit and of a size that the Earth's field or gravity has.
+
+    >>> doubtful_in([["Nominal field", "48 500 nT"], ["Field uncertainty 50 nT"], ["here", "9.81 m/s2"]])
+    {'ref_field_nt': 'Nominal field 48 500 nT', 'ref_gravity_g': 'here 9.81 m/s2'}
     """
     lines: dict[str, str] = {}
     for row in rows:
-        line = " ".join(filter(None, (as_text(cell).strip() for cell in row)))
-        bare = _ROUGH.sub(" ", _plain(line))
-        if bare == _plain(line):
-            continue
-        for column in references_in([[bare]]):
+        line = _line(row)
+        plain = _plain(line)
+        bare = _ROUGH.sub(" ", plain)
+        for column in references_in([[bare]]) if bare != plain else ():
             lines.setdefault(column, line)
+        numbers = [*_NUMBER_IN_UNIT.finditer(plain)]
+        for quantity in (_OF_PLACES[0], _OF_PLACES[2]):
+            if _in_unit(quantity, numbers) - {1.0}:
+                lines.setdefault(quantity.column, line)
     return lines
 
 
@@ -174,22 +255,28 @@ def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
     """The value that a text states, in the unit of the run file, if it is one."""
     between, behind = match["between"], match["behind"]
     rough = re.match(r"\W*(nomin|номин|标称|nenn)", behind) and not match["next"]
-    if rough or _UNSURE.search(f"{match['word'] or ''} {between}"):
+    letter = "letter" in match.groupdict()
+    if rough or _UNSURE.search(between if letter else f"{match['word']} {between}"):
         return
     inner = re.search(rf"(?<![^\W\d_])({_WRITTEN_UNIT})(?![^\W\d_])", between)
-    stated = _unit(
-        match["unit"] or (inner[1] if inner else "") or ("°" if match["minutes"] else "")
-    )
-    if "gauss" in quantity.units:
-        stated = {"g": "gauss", "mg": "mG"}.get(stated, stated)
+    written = match["unit"] or (inner[1] if inner else "") or ("°" if match["minutes"] else "")
+    stated = _stated_unit(quantity, written)
     bare = _REFERRING.sub("", between.replace(inner[0], "") if inner else between)
+    bare = re.sub(rf"\((?:{quantity.words})\)", "", bare)
     direct = not re.search(r"[^\W_]", bare)
-    sure = stated or ("=" in bare and "." in match["number"].replace(",", "."))
-    if (match["letter"] and not (direct and sure)) or not (direct or stated):
+    decimals = len(re.sub(r".*?(?:[.,]|$)", "", match["number"], count=1))
+    sure = (
+        stated
+        or ("=" in bare and decimals)
+        or (quantity.column == "ref_gravity_g" and decimals > 2)
+    )
+    if (letter and not (direct and sure)) or not (direct or stated):
         return
     if stated and stated not in quantity.units:
         return
     numbers = [*_numbers(match["number"], match["minutes"])]
+    if quantity.low < 0 and _UPWARDS.search(f"{between} {behind}"):
+        numbers = [-abs(number) for number in numbers]
     units = (stated,) if stated else [unit for unit in quantity.units if unit != "gon"]
     values = {_converted(number, unit) for number in numbers for unit in units}
     inside = [v for v in values if quantity.low <= v <= quantity.high and v]
@@ -197,9 +284,17 @@ def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
         yield inside[0]
 
 
+def _stated_unit(quantity: _Quantity, text: str) -> str:
+    """The unit that a text beside a quantity is: g is Gauss beside a strength of the field."""
+    unit = _unit(text)
+    return {"g": "gauss", "mg": "mG"}.get(unit, unit) if "gauss" in quantity.units else unit
+
+
 def _unit(text: str) -> str:
     """The unit that a text in small letters is; empty if it is not a unit."""
     bare = text.replace(" ", "").replace("^", "")
+    if re.fullmatch(r"(deg|gra[ud]|град)\w*", bare):
+        return "°"
     if bare in _SPELT:
         return _SPELT[bare]
     cased = {"nt": "nT", "ut": "µT", "µt": "µT", "μt": "µT", "mt": "mT"}

@@ -26,7 +26,9 @@ _TITLE_WORDS = {
     "serial": "serial sn s/n serialno serialnumber toolsn tools/n toolserial toolserialno toolserialnumber toolno "
     "toolid probesn probeno 仪器号 探管号 sondesn sensorsn seriennummer "
     "serie nserie seriennr geratenummer geratenr sondennummer sondennr serienummer "
-    "serienr verktoynr instrumentnr numerodeserie nodeserie nserie numeroserie nsserie numserie ndeserie "
+    "serienr verktoynr instrumentnr numerodeserie nodeserie noserie nserie numeroserie nsserie numserie ndeserie "
+    "matricola nrfabryczny numerfabryczny nrseryjny sondan sondano ferramentan ferramentano herramientan herramientano "
+    "製造番号 製造№ "
     "заводской№ заводскойномер серийныйномер зав№ серийный№ прибор№ 序列号 编号 仪器编号 出厂编号",
     "date": "date testdate caldate calibrationdate measured datum prufdatum messdatum dato kalibreringsdato fecha "
     "data дата датакалибровки 日期 校准日期 测试日期",
@@ -47,12 +49,19 @@ _DAYS = (
 """Forms of a day that can be read in one way only; in Germany, Norway and Russia a point stands behind the day."""
 _PARTS = re.compile(r"\s+/\s+|,\s+|;\s*|\s{3,}")
 """The separator of facts in one cell."""
+_OF_TOOLS = "tool|probe|sensor|sonde|instrument|herramienta|ferramenta|verktøy|gerät|прибор|зонд|датчик|инклинометр|仪器|探管"
 _TOOL = re.compile(
-    r"#?\s*(?:(?:tool|probe|sensor|sonde|instrument|herramienta|ferramenta|verktøy|gerät|прибор|зонд|датчик|инклинометр|仪器|探管)\s*"
+    rf"#?\s*(?:(?:{_OF_TOOLS})\s*"
     r"(?P<mark>s/?n|serial( no)?|n[°º]|no\b|nr\b|зав\.?\s*№|№|#|号|编号)?|(?P<sn>sn|s/n|serial no))\s*[.:：|=]*\s*",
     re.IGNORECASE,
 )
 _SERIAL = re.compile(r"(?=\S*\d)[^\W_][\w./-]*")
+_BEHIND_MODEL = re.compile(
+    rf"(?<![^\W\d_])(?:{_OF_TOOLS})\w*[\s:]+[\w./-]+\s+(?:s/?n|serial(?: no)?|n[°ºr]|no\b|зав\.?\s*№|№)\s*[.:]?\s*"
+    rf"({_SERIAL.pattern})",
+    re.IGNORECASE,
+)
+"""The word for the tool, its model, and its serial behind a mark: Sonde SD-9 n° 112."""
 _TELLING = re.compile(r"(?=.*\d).*[^\W\d_].*|\d+-\d+")
 """A serial that shows by itself: letters beside digits, or a dash between them."""
 _ENGLISH_DATE = re.compile(
@@ -106,7 +115,7 @@ def titles(rows: Sequence[Sequence[object]]) -> Titles:
     true = False
     for row in rows:
         whole = [as_text(cell).strip() for cell in row]
-        cells = [part.strip() for cell in whole for part in _PARTS.split(cell)]
+        cells = [part.strip() for cell in whole for part in _parts(cell)]
         text = " ".join(whole)
         declination = _rotation(_DECLINATION, text) if declination is None else declination
         convergence = _rotation(_CONVERGENCE, text) if convergence is None else convergence
@@ -114,7 +123,8 @@ def titles(rows: Sequence[Sequence[object]]) -> Titles:
         for place, cell in enumerate(cells):
             key, value = _pair(cell, cells[place + 1 :])
             days |= dict.fromkeys(filter(None, [day_of(cell)]))
-            tools |= dict.fromkeys(filter(None, [_tool(cell, cells[place + 1 :])]))
+            marked = _BEHIND_MODEL.findall(text) or [_tool(cell, cells[place + 1 :])]
+            tools |= dict.fromkeys(filter(None, marked))
             if not value or key in metadata:
                 continue
             if key == "date":
@@ -133,6 +143,13 @@ def titles(rows: Sequence[Sequence[object]]) -> Titles:
     if convergence is not None:
         metadata["convergence_deg"] = convergence
     return Titles(metadata, "" if "date" in metadata else unclear)
+
+
+def _parts(cell: str) -> list[str]:
+    """The facts in a cell; of a key in two languages (Serial / Serie) the first."""
+    parts = _PARTS.split(cell)
+    label = len(parts) > 1 and _word(parts[0]) in _MEANT and not re.search(r"[\d:=]", cell)
+    return parts[:1] if label else parts
 
 
 def _rotation(statement: re.Pattern[str], text: str) -> float | None:
