@@ -51,7 +51,7 @@ def test_there_is_a_page_of_each_kind():
     assert set(KINDS) <= set(PAGES)
 
 
-@pytest.mark.parametrize("name", map(page_of, PAGES))
+@pytest.mark.parametrize("name", [*map(page_of, PAGES)])
 def test_a_page_is_accessible_and_no_wider_than_the_window(browser, name):
     page = browser.new_page()
     page.goto((BUILT / name).as_uri())

@@ -17,7 +17,7 @@ def visit_inline(writer, node) -> None:
 def visit_block(writer, node) -> None:
     formula = latex2mathml.tex2mathml(node.astext(), as_block=True)
     writer.body.append(
-        f'<div class="math" tabindex="0" style="overflow-y: hidden; padding: 0.3em 0">{formula}</div>'
+        f'<div class="math" style="overflow-y: hidden; padding: 0.3em 0">{formula}</div>'
     )
     raise nodes.SkipNode
 
