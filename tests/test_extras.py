@@ -8,6 +8,7 @@ import pytest
 
 from mwdcal import extras
 from mwdcal.errors import InputError
+from oldest_versions import declared, lowest
 
 
 @pytest.fixture
@@ -65,3 +66,9 @@ def test_the_refusal_names_use_and_library(monkeypatch):
         "a certificate as PDF needs typst, which is not installed. Install it with: "
         f"{extras.command('certificate')}"
     )
+
+
+def test_every_requirement_has_a_lowest_version():
+    named = [each for each in declared() if not each.startswith("mwdcal")]
+    assert len([*lowest(named)]) == len(named)
+    assert "psycopg==3.2.1" in lowest(named)

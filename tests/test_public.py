@@ -680,6 +680,8 @@ def test_a_seed_is_a_whole_number(plan, seed):
 
 def test_the_changelog_begins_with_the_version():
     text = (EXAMPLE.parents[1] / "CHANGELOG.md").read_text("utf-8")
-    dated = re.findall(r"^## \[(\d+\.\d+\.\d+)\] – \d{4}-\d\d-\d\d$", text, re.MULTILINE)
-    assert dated[0] == mwdcal.__version__
+    dated = re.findall(r"^## \[(\d+\.\d+\.\d+)\] – (\d{4}-\d\d-\d\d)$", text, re.MULTILINE)
+    cited = (EXAMPLE.parents[1] / "CITATION.cff").read_text("utf-8")
+    assert dated[0][0] == mwdcal.__version__
+    assert f"date-released: {dated[0][1]}\n" in cited
     assert len(text.splitlines()) <= 120

@@ -98,9 +98,8 @@ def strings(module: Path) -> Iterator[tuple[int, str]]:
 
 def stumbles() -> list[str]:
     """Where a pattern is found, with the words and the advice."""
-    of_pages = [
-        (page, *found, PATTERNS | OF_PAGES) for page in pages() for found in paragraphs(page)
-    ]
+    read = [*pages(), ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md"]
+    of_pages = [(page, *found, PATTERNS | OF_PAGES) for page in read for found in paragraphs(page)]
     modules = sorted((ROOT / "src").rglob("*.py"))
     of_modules = [(module, *found, PATTERNS) for module in modules for found in strings(module)]
     return [

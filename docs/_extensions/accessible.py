@@ -7,7 +7,8 @@ LACKING = {
     r'<aside class="sidebar-drawer">': '<aside class="sidebar-drawer" aria-label="Site">',
     r'<aside class="(toc-drawer[^"]*)">': r'<aside class="\1" aria-label="Page">',
     r"<pre>": '<pre tabindex="0">',
-    r'<div class="(table-wrapper[^"]*)">': r'<div class="\1" tabindex="0">',
+    r'<div class="(table-wrapper[^"]*|math)"(?! tabindex)': r'<div class="\1" tabindex="0"',
+    r'(<article role="main" id="furo-main-content">)\s*(?=<noscript>)': r"\1<h1>Search</h1>",
     r'<th class="head"><p></p></th>': '<td class="head"></td>',
 }
 """Patterns of a page and their replacements: labels, wide blocks that scroll by key, cells that head nothing."""
