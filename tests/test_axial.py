@@ -120,6 +120,15 @@ def test_a_survey_that_the_other_sign_explains_too_is_in_the_zone() -> None:
     assert not found.usable[apart < 8.5].any()
 
 
+def test_both_reasons_of_the_zone_are_told_apart() -> None:
+    sd, usable = np.array([0.5, 0.6, 2.0]) * DEG, np.array([True, False, False])
+    found = AxialCorrection(np.zeros(3), np.ones(3), np.zeros(3), sd, usable)
+    text = {f.id: f.text for f in found.findings("abc", "true")}["axial-no-go"]
+    assert text.startswith("2 of 3 surveys lie in the no-go zone")
+    assert "1 would keep an azimuth uncertain by more than 1° (1σ; 2° at station c)" in text
+    assert "1 the other sign of the axial field explains nearly as well" in text
+
+
 def test_command_and_python_have_the_columns_and_the_zone(tmp_path) -> None:
     """Axial interference east-west: both say so, the path is the same, and both corrections are too many."""
     calibration, run, out = (tmp_path / name for name in ("tool.json", "well.csv", "out.csv"))

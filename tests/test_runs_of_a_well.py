@@ -74,6 +74,33 @@ def test_two_runs_of_one_tool_are_one_well_where_errors_are_of_the_tool(tools, t
     assert document["accepted"] == 36
 
 
+@pytest.mark.parametrize(
+    ("declination", "convergence", "expected"),
+    [
+        (2.4, 1.0, set()),
+        (3.2, 1.0, set()),
+        (3.3, 1.0, {"declination-disagrees"}),
+        (2.4, -1.0, {"convergence-disagrees"}),
+    ],
+)
+def test_runs_of_different_norths_are_named(tools, tmp_path, declination, convergence, expected):
+    """Declinations of ± 0.3° each: farther apart than 2σ of their difference, 0.85°."""
+    tool, given = tools[0], read_csv(EXAMPLE / "well.csv")
+    files = []
+    for rows, angles in (
+        (slice(None, CUT), (2.4, 1.0)),
+        (slice(CUT, None), (declination, convergence)),
+    ):
+        norths = (f"declination_deg = {angles[0]}", f"convergence_deg = {angles[1]}")
+        columns = {k: v[rows] for k, v in given.items()}
+        path = tmp_path / f"{len(files)}.csv"
+        files.append(write_csv(path, columns, "sd_declination_deg = 0.3", *norths))
+    _, document = surveyed(tmp_path, tool, files[0], "--run", tool, files[1])
+    found = {f["id"]: f["text"] for f in document["findings"] if f["id"].endswith("-disagrees")}
+    assert {*found} == expected
+    assert all(text.startswith("run 2: ") for text in found.values())
+
+
 def test_a_run_takes_the_errors_of_its_own_tool(tools, tmp_path):
     """Expected: independent tools in two halves of a straight hole are less uncertain than one in both."""
     given, (tool, other) = straight(10), tools

@@ -14,6 +14,7 @@ from msgspec.structs import replace as replace_struct
 from scipy.stats import chi2
 
 import mwdcal
+import published_wells
 from cli_support import EXAMPLE, read_csv, refused, write_csv
 from cli_support import mwdcal as cli
 from mwdcal.calibration.readings import Readings
@@ -35,9 +36,15 @@ from mwdcal.survey.acceptance import (
 )
 from mwdcal.survey.error_model import load_error_model
 from mwdcal.survey.path import well_path
-from mwdcal.survey.stations import STRENGTHS, SURVEY_OBSERVABLES, survey_angles, switched
+from mwdcal.survey.stations import (
+    STRENGTHS,
+    SURVEY_OBSERVABLES,
+    North,
+    survey_angles,
+    switched,
+)
 from mwdcal.survey.surveying import survey_readings
-from mwdcal.survey.well import well_errors
+from mwdcal.survey.well import well, well_errors
 
 EARTH = Earth()
 NOISE = (1e-4, 15.0)
@@ -1223,6 +1230,41 @@ def test_a_trajectory_in_feet_says_so(example, tmp_path):
     text = out.read_text("utf-8")
     assert text.count('<md uom="ft">') == text.count('<tvd uom="ft">') == 36
     assert 'uom="m"' not in text
+
+
+# ------------------------------------------------------------------ ISCWSA's example wells
+
+
+@pytest.mark.parametrize("number", [2, 3])
+def test_a_calibrated_tool_lacks_the_sensor_terms_of_the_published_wells(number):
+    """Right after its calibration: their published totals less AB, AS, MB, MS and declination, plus its own covariance.
+
+    The declination is exact here. 1 % of the total: published figures are by the balanced tangential method.
+    """
+    tool, calibration = laboratory()
+    today = {"date": "2026-05-20"}
+    calibration = replace_struct(calibration, tool={**calibration.tool, **today})
+    md, inclination, azimuth = published_wells.stations(number)
+    field, dip, declination = published_wells.EARTH[number]
+    angles = (inclination, azimuth - np.radians(declination), np.radians(67.0 * np.arange(len(md))))
+    g, b = reference_vectors(*angles, 1.0, field, np.radians(dip))
+    raw = tool.readings((g, b), np.full(len(md), 30.0))
+    surveys = Readings(
+        raw["accelerometer"], raw["magnetometer"], np.full(len(md), 30.0), metadata=today
+    )
+    limits, _ = load_survey_limits()
+    north = North(np.radians(declination))
+    own, whole = (
+        well(calibration, surveys, limits, north, md, model=model).position.covariance[-1]
+        for model in (None, load_error_model())
+    )
+    published = published_wells.published(number)
+    replaced = ("AB", "AS", "MB", "MS", "DEC", "DBH")
+    terms = [each for name, each in published.items() if name.startswith(replaced)]
+    nn, ee, vv, ne, nv, ev = published["TOTAL"] - sum(terms)
+    expected = own + np.array([[nn, ne, nv], [ne, ee, ev], [nv, ev, vv]])
+    assert whole == pytest.approx(expected, abs=0.01 * np.trace(expected))
+    assert np.trace(whole) < 0.95 * published["TOTAL"][:3].sum()
 
 
 # ------------------------------------------------------------------ references by station

@@ -80,12 +80,20 @@ class AxialCorrection:
         )
         result = [Finding(id="axial-correction", text=text)]
         if bad:
-            worst = int(np.argmax(np.where(self.no_go, self.sd_azimuth, -1.0)))
-            limit = Assumed().largest_azimuth_sd_deg
+            limit, sd, reasons = Assumed().largest_azimuth_sd_deg, np.degrees(self.sd_azimuth), []
+            if wide := int((self.no_go & (sd > limit)).sum()):
+                worst = int(np.argmax(np.where(self.no_go, sd, -1.0)))
+                reasons.append(
+                    f"{wide} would keep an azimuth uncertain by more than {limit:g}° (1σ; {sd[worst]:.2g}° at station "
+                    f"{labels[worst]})"
+                )
+            if wide < bad:
+                reasons.append(
+                    f"{bad - wide} the other sign of the axial field explains nearly as well"
+                )
             text = (
-                f"{bad} of {len(labels)} surveys lie in the no-go zone of the axial correction, which would leave "
-                f"their azimuth uncertain by more than {limit:g}° (1σ; {np.degrees(self.sd_azimuth[worst]):.2g}° at "
-                f"station {labels[worst]}): it is blank there. Use `msa` with surveys at other attitudes."
+                f"{bad} of {len(labels)} surveys lie in the no-go zone of the axial correction, and are blank there: "
+                f"{', '.join(reasons)}. Use `msa` with surveys at other attitudes."
             )
             result.append(Finding(id="axial-no-go", text=text))
         return result

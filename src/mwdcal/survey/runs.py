@@ -23,6 +23,7 @@ from mwdcal.survey.acceptance import Blindness, Judgement
 from mwdcal.survey.axial import AxialCorrection
 from mwdcal.survey.interference import Interference
 from mwdcal.survey.path import TieIn
+from mwdcal.survey.references import Claim, contradictions
 from mwdcal.survey.stations import TOOLFACE_SWITCH, North, Surveys
 from mwdcal.survey.surveying import SurveyedWell, WellInputs, survey_well
 from mwdcal.survey.well import Position, Well
@@ -57,7 +58,7 @@ def survey_runs(
     findings = [
         Finding(id=finding.id, text=f"run {i}: {finding.text}")
         for i, run in enumerate(runs, 1)
-        for finding in run.well.findings
+        for finding in (*run.well.findings, *_other_norths(run.well, runs[0].well))
     ]
     together = replace(together, findings=findings)
     first = replace(
@@ -83,6 +84,25 @@ def _check_alike(wells: Sequence[Well]) -> None:
             "the runs do not all measure the same: magnetic field, its size and depth must be in all, or in none. "
             "Survey them one by one."
         )
+
+
+def _other_norths(run: Well, first: Well) -> list[Finding]:
+    """Declination and convergence of a run that are not those of the first one: a well has one of each."""
+    return [
+        finding
+        for name in ("declination", "convergence")
+        for finding in contradictions(
+            name, _claim_of(run, name), _claim_of(first, name), "Check sign, place and date."
+        )
+    ]
+
+
+def _claim_of(well: Well, name: str) -> Claim:
+    """The declination or convergence of a run, with its 1σ, degrees."""
+    north = well.north.typical
+    angle, sd = getattr(north, name), north.declination_sd if name == "declination" else 0.0
+    value = np.nan if angle is None else np.degrees(angle)
+    return Claim(well.readings.source, [value], np.degrees(sd))
 
 
 def _joined_well(wells: Sequence[Well]) -> Well:
