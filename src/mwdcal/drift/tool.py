@@ -1,4 +1,4 @@
-"""The drift of one tool, and of many tools of one type, whose walks are estimated together."""
+"""The drift of one tool and when it is due, and of many of one type, whose walks are estimated together."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Multi-station analysis on the interference_screen: interference, what the surveys determine of it, and each survey.
-
-The surveys of a well, on the screen and for machines.
-"""
+"""The surveys of a well, and multi-station analysis of them, on the screen and for machines."""
 
 from __future__ import annotations
 
@@ -35,7 +32,7 @@ from mwdcal.survey.well import LastStation, Well, WellCounts, WellErrors
 from mwdcal.use.uncertainty import ErrorTerms, error_terms
 
 MOST_CORRECTED = 30
-"""Surveys of a table on interference_screen."""
+"""Surveys of a table on the screen of multi-station analysis."""
 DIRECTION_TITLES = ["interference", "estimate", "1σ", "unit", "assumed 1σ", "from the surveys"]
 """Titles of the table of directions."""
 CORRECTED_TITLES = [

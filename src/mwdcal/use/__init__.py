@@ -1,1 +1,1 @@
-"""Use of a calibration: correction of readings, roll test, conversion to other notations."""
+"""Use of a calibration: correction of readings, roll test, conversion to other notations, figures."""
