@@ -328,7 +328,7 @@ def test_draws_are_judged_by_their_ranks(level, equal):
     shares = [np.mean(each >= each[:, None], -1) for each in drawn]
     expected = np.minimum(shares[0] / STEP_SHARE, shares[1] / (1 - STEP_SHARE))
     alarm = np.quantile(drawn[0], 1 - STEP_SHARE * np.quantile(expected, level))
-    evidence = walk.Evidence.of(*drawn)
+    evidence = walk.NullDistribution.of(*drawn)
     for least in (0.002, level, 0.5, 1.1):
         probability, critical = evidence.judged(least, level)
         assert probability == pytest.approx((1 + np.sum(expected <= least)) / 1000)

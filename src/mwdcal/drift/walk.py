@@ -460,7 +460,7 @@ CHANGE_LEVEL = 0.01
 """Share of unchanged tools that are called changed."""
 STEP_SHARE = 0.8
 """Share of the level that steps of one parameter have; the misfit has the rest."""
-SHARES = (STEP_SHARE, 1 - STEP_SHARE)
+LEVEL_SHARES = (STEP_SHARE, 1 - STEP_SHARE)
 """The shares of both."""
 NULL_DRAWS = 9_999
 """Histories without change that the test is judged by."""
@@ -790,7 +790,7 @@ def _test(
 ) -> ChangeTest:  # fmt: skip
     """The test by draws of the largest score, the misfit, and those of pairs."""
     largest = float(np.nanmax(np.abs(scores[:, steady]), initial=0.0))
-    evidence = Evidence.of(*drawn[:2])
+    evidence = NullDistribution.of(*drawn[:2])
     by_step, by_misfit = evidence.beyond(largest, float(misfits[0]))
     probability, critical = evidence.judged(
         min(by_step / STEP_SHARE, by_misfit / (1 - STEP_SHARE)), level
@@ -805,14 +805,14 @@ def _test(
 
 
 @dataclass(frozen=True)
-class Evidence:
+class NullDistribution:
     """Draws (m,) of the largest score and of the misfit of an unchanged tool, as they come and in `order`."""
 
     drawn: tuple[AnyArray, AnyArray]
     order: tuple[AnyArray, AnyArray]
 
     @classmethod
-    def of(cls, most: AnyArray, misfit: AnyArray) -> Evidence:
+    def of(cls, most: AnyArray, misfit: AnyArray) -> NullDistribution:
         """Of draws."""
         return cls((most, misfit), (np.sort(most), np.sort(misfit)))
 
@@ -828,7 +828,7 @@ class Evidence:
         """Which draws are evidence (m,) of at most a limit: by the share of the level that each statement has."""
         count = len(self.drawn[0])
         result = np.zeros(count, bool)
-        for drawn, order, share in zip(self.drawn, self.order, SHARES, strict=True):
+        for drawn, order, share in zip(self.drawn, self.order, LEVEL_SHARES, strict=True):
             rank = int(share * limit * count + DEPENDENT)
             result |= drawn > order[count - 1 - rank] if rank < count else True
         return result
@@ -843,7 +843,7 @@ class Evidence:
             some = np.ones(count, bool)
         each = [
             (count - np.searchsorted(order, drawn[some])) / count / share
-            for drawn, order, share in zip(self.drawn, self.order, SHARES, strict=True)
+            for drawn, order, share in zip(self.drawn, self.order, LEVEL_SHARES, strict=True)
         ]
         alarm = _at(np.sort(np.minimum(*each)), place)
         return float(probability), _at(self.order[0], (1 - alarm * STEP_SHARE) * (count - 1))
