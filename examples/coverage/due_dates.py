@@ -264,8 +264,8 @@ MIXED = f"""
 ## Mixed fleets
 
 {FLEETS} fleets of {MEMBERS} tools, 3 to 8 calibrations at intervals of 0.3 to 2 years. Scales walk by 1 σ a year,
-biases by 3 σ, misalignments not at all; the rates of the tools differ by a factor of 1.33 (1σ). One tool in 20 was knocked.
-Limits: 0.025° in inclination, 0.12° in azimuth. The forecast is compared after 0.5, 1, 2 and 4 years:
+biases by 3 σ, misalignments not at all; the rates of the tools differ by a factor of 1.33 (1σ). One tool in 20 was
+knocked. Limits: 0.025° in inclination, 0.12° in azimuth. The forecast is compared after 0.5, 1, 2 and 4 years:
 """
 
 
