@@ -15,16 +15,25 @@ from mwdcal.calibration.readings import TRIADS, fingerprints
 from mwdcal.calibration.results import typical_accuracy
 from mwdcal.drift import walk
 from mwdcal.drift.histories import RISK, Paths, ServiceTest, outlook, tool_history
-from mwdcal.drift.tool import TypeRates, fleet_drift, measured, predicted
+from mwdcal.drift.tool import (
+    ToolRecords,
+    TypeRates,
+    all_measured,
+    fleet_drift,
+    measured,
+    predicted,
+)
 from mwdcal.drift.walk import (
     FACTOR_NAMES,
     NULL_DRAWS,
+    STEP_SHARE,
     WALK_GROUPS,
     Contrasts,
     GroupRates,
     History,
     Increments,
     change_test,
+    change_tests,
     common_noise_scale,
     parameter_names,
     precision,
@@ -309,6 +318,46 @@ def test_few_draws_call_the_same_tools_changed(monkeypatch, level):
             assert one.steps == other.steps
 
 
+@pytest.mark.parametrize("equal", [False, True])
+@pytest.mark.parametrize("level", [0.01, 0.2])
+def test_draws_are_judged_by_their_ranks(level, equal):
+    """Evidence is the smaller of both shares of draws that are as large, each over its part of the level."""
+    rng = np.random.default_rng(6)
+    drawn = [values.astype(np.float32) for values in rng.normal(size=(2, 999))]
+    drawn = [np.round(values, 1) for values in drawn] if equal else drawn
+    shares = [np.mean(each >= each[:, None], -1) for each in drawn]
+    expected = np.minimum(shares[0] / STEP_SHARE, shares[1] / (1 - STEP_SHARE))
+    alarm = np.quantile(drawn[0], 1 - STEP_SHARE * np.quantile(expected, level))
+    evidence = walk.NullDistribution.of(*drawn)
+    for least in (0.002, level, 0.5, 1.1):
+        probability, critical = evidence.judged(least, level)
+        assert probability == pytest.approx((1 + np.sum(expected <= least)) / 1000)
+        assert critical == pytest.approx(alarm, abs=1e-6)
+    assert evidence.beyond(0.5, -9.0) == [(1 + np.sum(drawn[0] >= 0.5)) / 1000, 1.0]
+
+
+def test_calibrations_that_have_nothing_in_common_show_no_change():
+    tool = history(np.random.default_rng(8).normal(size=(2, SIZE)), np.eye(SIZE))
+    apart = replace(tool, precision=tool.precision * np.array([0.0, 1.0])[:, None, None])
+    test = change_test(apart)
+    assert (test.changed, test.probability, test.degrees_of_freedom) == (False, 1.0, 0)
+    assert test.largest_score == test.critical_score == 0.0
+    assert np.isnan(test.scores).all()
+
+
+def test_tools_are_tested_together_as_alone():
+    rng = np.random.default_rng(7)
+    tools = [history(rng.normal(size=(3, SIZE)), random_covariance(rng), 30.0) for _ in range(3)]
+    tools[1].values[2, BIAS] += 50.0
+    together = change_tests(tools)
+    assert [test.changed for test in together] == [False, True, False]
+    for one, other in zip(together, map(change_test, tools), strict=True):
+        assert one.probability == other.probability
+        assert one.misfit == pytest.approx(other.misfit, rel=1e-9)
+        assert one.scores == pytest.approx(other.scores, rel=1e-9)
+        assert [(s.place, s.after) for s in one.steps] == [(s.place, s.after) for s in other.steps]
+
+
 def test_power_against_a_step_is_that_of_its_score():
     rng = np.random.default_rng(4)
     covariance, count, signal = random_covariance(rng), 30, 4.0
@@ -481,6 +530,29 @@ def test_growth_begins_at_the_accuracy_that_is_stated(years):
     # An error e of the gravity vector tilts it by its part along one direction: e / g, squared.
     bias = each["inclination"].yearly["accelerometer", "bias"]
     assert bias == pytest.approx(1 / calibration.earth["gravity_g"] ** 2, rel=1e-3)
+
+
+def test_tools_are_measured_together_as_alone(years):
+    """Histories of one form and of others: a single calibration, and one calibration less."""
+    each = {**years, "T-3": years["T-1"][:1], "T-4": years["T-1"][1:]}
+    together = all_measured([ToolRecords(*pair) for pair in each.items()])
+    for (serial, calibrations), tool in zip(each.items(), together, strict=True):
+        alone = measured(serial, calibrations)
+        assert tool.drift.serial == serial
+        assert [c.run for c in tool.drift.calibrations] == [c.run for c in alone.drift.calibrations]
+        assert (tool.drift.change is None) == (len(calibrations) == 1)
+        for one, other in zip(tool.outlook.growths, alone.outlook.growths, strict=True):
+            assert one.calibration == pytest.approx(other.calibration, rel=1e-9)
+            assert one.yearly == pytest.approx(other.yearly, rel=1e-9)
+        for group, moved in tool.increments.items():
+            assert moved.noise == pytest.approx(alone.increments[group].noise, rel=1e-9)
+            found, expected = (
+                i.log_likelihood(moved.noise) for i in (moved, alone.increments[group])
+            )
+            assert found == pytest.approx(expected, rel=1e-6)
+        for one, other in zip(tool.departures, alone.departures, strict=True):
+            assert (one.angle, one.start) == (other.angle, other.start)
+            assert one.size == pytest.approx(other.size, rel=1e-6)
 
 
 def test_a_tool_is_due_when_its_largest_error_is_beyond_the_limit_with_the_stated_risk(years):

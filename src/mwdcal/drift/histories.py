@@ -580,9 +580,11 @@ class Paths:
     ) -> Paths:  # fmt: skip
         """By the covariance (p, p) of a calibration, and drawn rates (n,) of groups of parameters at `places`."""
         draws, root = len(next(iter(rates.values()))), square_root(covariance)
-        walk = rng.standard_normal((draws, len(covariance)), np.float32)
+        sd = np.ones((len(covariance), draws), np.float32)
         for group, drawn in rates.items():
-            walk[:, places[group]] *= np.sqrt(drawn, dtype=np.float32)[:, None]
+            sd[places[group]] = np.sqrt(drawn, dtype=np.float32)
+        walk = rng.standard_normal((draws, len(covariance)), np.float32)
+        walk *= sd.mT
         size = draws, root.shape[1]
         return cls(rng.standard_normal(size, np.float32) @ root.mT.astype(np.float32), walk)
 

@@ -460,6 +460,8 @@ CHANGE_LEVEL = 0.01
 """Share of unchanged tools that are called changed."""
 STEP_SHARE = 0.8
 """Share of the level that steps of one parameter have; the misfit has the rest."""
+LEVEL_SHARES = (STEP_SHARE, 1 - STEP_SHARE)
+"""The shares of both."""
 NULL_DRAWS = 9_999
 """Histories without change that the test is judged by."""
 FIRST_DRAWS = 999
@@ -788,7 +790,7 @@ def _test(
 ) -> ChangeTest:  # fmt: skip
     """The test by draws of the largest score, the misfit, and those of pairs."""
     largest = float(np.nanmax(np.abs(scores[:, steady]), initial=0.0))
-    evidence = _Evidence.of(*drawn[:2])
+    evidence = NullDistribution.of(*drawn[:2])
     by_step, by_misfit = evidence.beyond(largest, float(misfits[0]))
     probability, critical = evidence.judged(
         min(by_step / STEP_SHARE, by_misfit / (1 - STEP_SHARE)), level
@@ -803,14 +805,14 @@ def _test(
 
 
 @dataclass(frozen=True)
-class _Evidence:
+class NullDistribution:
     """Draws (m,) of the largest score and of the misfit of an unchanged tool, as they come and in `order`."""
 
     drawn: tuple[AnyArray, AnyArray]
     order: tuple[AnyArray, AnyArray]
 
     @classmethod
-    def of(cls, most: AnyArray, misfit: AnyArray) -> _Evidence:
+    def of(cls, most: AnyArray, misfit: AnyArray) -> NullDistribution:
         """Of draws."""
         return cls((most, misfit), (np.sort(most), np.sort(misfit)))
 
@@ -824,27 +826,26 @@ class _Evidence:
 
     def _tail(self, limit: float) -> Bools:
         """Which draws are evidence (m,) of at most a limit: by the share of the level that each statement has."""
-        count, result = len(self.drawn[0]), np.zeros(len(self.drawn[0]), bool)
-        for drawn, order, share in zip(
-            self.drawn, self.order, (STEP_SHARE, 1 - STEP_SHARE), strict=True
-        ):
-            rank = min(int(share * limit * count + DEPENDENT), count)
-            if rank:
-                result |= drawn >= order[count - rank]
+        count = len(self.drawn[0])
+        result = np.zeros(count, bool)
+        for drawn, order, share in zip(self.drawn, self.order, LEVEL_SHARES, strict=True):
+            rank = int(share * limit * count + DEPENDENT)
+            result |= drawn > order[count - 1 - rank] if rank < count else True
         return result
 
     def judged(self, least: float, level: float) -> tuple[float, float]:
         """Probability of as little evidence as the `least`, and the largest score below which there is no alarm."""
         count = len(self.drawn[0])
         probability = (1 + np.count_nonzero(self._tail(least))) / (count + 1)
-        some = self._tail((level * count + 2) / count / STEP_SHARE)
+        place = level * (count - 1)
+        some = self._tail((place + 2) / count / STEP_SHARE)
+        if np.count_nonzero(some) < place + 2:  # draws that are equal
+            some = np.ones(count, bool)
         each = [
             (count - np.searchsorted(order, drawn[some])) / count / share
-            for drawn, order, share in zip(
-                self.drawn, self.order, (STEP_SHARE, 1 - STEP_SHARE), strict=True
-            )
+            for drawn, order, share in zip(self.drawn, self.order, LEVEL_SHARES, strict=True)
         ]
-        alarm = _at(np.sort(np.minimum(*each)), level * (count - 1))
+        alarm = _at(np.sort(np.minimum(*each)), place)
         return float(probability), _at(self.order[0], (1 - alarm * STEP_SHARE) * (count - 1))
 
 

@@ -49,7 +49,7 @@ WIDENING_DEGREE = 16
 ROUNDING = 1e-13
 """Differences of matrices, as a share of the largest element, that are rounding."""
 VARIANCE_ROUNDS = 25
-"""Repetitions of the estimate of variances."""
+"""Repetitions of the estimate of variances: they end before its maximum, which may be zero and then covers less."""
 
 
 def terms_of(count: int) -> tuple[Array, Array]:

@@ -94,19 +94,17 @@ def of_registry(
     tools: list[MeasuredTool] = []
     refused: dict[str, str] = {}
     serials = [row["serial"] for row in _tools(registry)]
-    pasts = _pasts(registry, serials)
-    done = 0
+    pasts = enumerate(_pasts(registry, serials))
     while some := [*islice(pasts, TOOLS_READ)]:
         read = []
-        for past in some:
+        for done, past in some:
+            advance(done, len(serials))
             try:
                 if (records := past.records()).calibrations:
                     read.append(records)
             except MwdcalError as error:
                 refused[past.serial] = str(error)
         tools += all_measured(read, level)
-        done += len(some)
-        advance(done, len(serials))
     if not tools:
         raise InputError(
             f"{registry.name}: there is no calibration to compare. Add some: mwdcal registry add."
