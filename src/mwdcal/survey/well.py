@@ -180,12 +180,14 @@ class WellErrors:
 
     def along(self, errors: DirectionErrors, seen: SeenDirection, hole: Hole) -> DirectionErrors:
         """Errors of direction and depth along a well: those given, and those of the model."""
-        sensors = with_depth(self.moved(seen.gradient, seen.g, seen.b, hole))
         systematic, random, course = self.model.errors(hole)
-        noise = np.zeros_like(random)
-        noise[:, :2, :2] = errors.random
-        lasting = np.concatenate([with_depth(errors.systematic), sensors, systematic], -2)
-        return DirectionErrors(errors.inclination, errors.azimuth, lasting, noise + random, course)
+        turns = errors.systematic, self.moved(seen.gradient, seen.g, seen.b, hole)
+        alone = sum(each.shape[-2] for each in turns)  # of these none shifts a depth
+        lasting = np.zeros((len(random), alone + systematic.shape[-2], 3))
+        np.concatenate(turns, -2, out=lasting[:, :alone, :2])
+        lasting[:, alone:] = systematic
+        random[:, :2, :2] += errors.random
+        return DirectionErrors(errors.inclination, errors.azimuth, lasting, random, course)
 
 
 def cause_names(calibration: Calibration, errors: WellErrors | None) -> tuple[str, ...]:
