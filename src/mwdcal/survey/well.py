@@ -265,12 +265,12 @@ class SeenHole(NamedTuple):
     def at(cls, calibration: Calibration, readings: Readings) -> SeenHole:
         """Those that a calibrated tool sees."""
         direction = SeenDirection.of_many(calibration, readings)
-        angles = (OBSERVABLES[n].value(*direction[:2]) for n in ("inclination", "field", "dip"))
-        return cls(*angles, direction)
+        angles = [OBSERVABLES[n].value(*direction[:2]) for n in ("inclination", "field", "dip")]
+        return cls._make([*angles, direction])
 
     def part(self, rows: Bools) -> SeenHole:
         """Those of some readings."""
-        return SeenHole(*(each[rows] for each in self[:3]), self.direction.part(rows))
+        return SeenHole._make([*(each[rows] for each in self[:3]), self.direction.part(rows)])
 
 
 def hole_of(
