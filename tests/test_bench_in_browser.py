@@ -24,7 +24,8 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed: the bench was not looked at"),
 ]  # fmt: skip
-VIEWS = [(1280, "light"), (800, "dark"), (1280, "dark"), (800, "light")]
+VIEWS = [(1280, "light"), (800, "dark")]
+"""Widths and schemes; a place does not depend on the colours (`test_only_colours_change_in_the_dark`)."""
 LONGEST = 120_000
 
 

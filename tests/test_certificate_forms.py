@@ -352,8 +352,7 @@ def test_the_same_certificate_gives_the_same_bytes(material, pictures):
     few = [each for each in pictures if each.id in some]
     again = [each for each in certificate_pictures(calibration, verdict) if each.id in some]
     assert [each.id for each in few] == [each.id for each in again]
-    first = render_pdf(SAMPLE, few)
-    assert render_pdf(SAMPLE, few) == render_pdf(SAMPLE, again) == first
+    assert render_pdf(SAMPLE, few) == render_pdf(SAMPLE, again)
     page = render_page(SAMPLE, few)
     assert page == render_page(SAMPLE, again)
     assert page.count("<figure>") == len(few)

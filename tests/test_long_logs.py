@@ -8,6 +8,8 @@ import pytest
 from cli_support import EXAMPLE
 from cli_support import mwdcal as cli
 from mwdcal.files import logs
+from mwdcal.logs.standstill import StoredCells
+from mwdcal.logs.stations import find_stations
 
 
 @pytest.mark.parametrize(
@@ -39,6 +41,28 @@ def test_a_column_in_a_file_is_what_was_added(monkeypatch):
         assert np.asarray(table.columns[name]).tolist() == expected
     assert [*table.columns] == rows[0]
     assert len(table.columns) == len(rows[0])
+
+
+def test_cells_of_a_long_log_share_their_clock_and_keep_their_levels_in_files(monkeypatch):
+    medians = find_stations(logs.read(EXAMPLE / "log.csv")).activity.cells
+    monkeypatch.setattr(logs, "_LONG_LOG", 1)
+    cells = find_stations(logs.read(EXAMPLE / "log.csv")).activity.cells
+    assert isinstance(cells, StoredCells)
+    assert [*cells] == [*medians]
+    first = cells["ax"]
+    for name, stored in cells.items():
+        assert stored.start is first.start
+        assert stored.end is first.end
+        assert stored.level is not cells[name].level
+        assert stored.level.tolist() == medians[name].level.tolist()
+
+
+def test_whether_a_long_log_has_a_column_does_not_read_it(monkeypatch):
+    monkeypatch.setattr(logs, "_LONG_LOG", 1)
+    columns = logs.read(EXAMPLE / "log.csv").columns
+    monkeypatch.setattr(logs.StoredNumbers, "read", None)
+    assert "ax" in columns
+    assert "temperature_c" not in columns
 
 
 @pytest.mark.parametrize("cell", ["nan", "INF", '"1"', "1\x00"])

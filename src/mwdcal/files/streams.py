@@ -248,7 +248,8 @@ def _sorted(data: bytes, delimiter: bytes) -> tuple[bytes, bytes, Ints | None]:
     Unusual: quotes, NUL, and blanks before a cell.
     """
     marks = (b'"', b"\0", delimiter + b" ")
-    if not data.startswith(b" ") and not any(mark in data for mark in (*marks, b"\n ")):
+    unusual = (*marks, b"\n ") if b" " in data else marks[:2]
+    if not data.startswith(b" ") and not any(mark in data for mark in unusual):
         return data, b"", None
     lines = np.array([line + b"\n" for line in data.split(b"\n") if line], object)
     odd = np.array([s.startswith(b" ") or any(mark in s for mark in marks) for s in lines], bool)

@@ -344,12 +344,12 @@ class SeenDirection(NamedTuple):
         parts = [cls.of(calibration, some, kept) for some in blocks(readings)]
         each = map(np.concatenate, zip(*(part[:4] for part in parts), strict=True))
         slopes = zip(*(part.slopes for part in parts if part.slopes), strict=True)
-        return cls(*each, Slopes(*map(np.concatenate, slopes)) if kept else None)
+        return cls._make([*each, Slopes(*map(np.concatenate, slopes)) if kept else None])
 
     def part(self, rows: slice | Bools) -> SeenDirection:
         """Those of some of them."""
-        each = (values[rows] for values in self[:4])
-        return SeenDirection(*each, self.slopes and self.slopes.part(rows))
+        each = [values[rows] for values in self[:4]]
+        return SeenDirection._make([*each, self.slopes and self.slopes.part(rows)])
 
 
 def direction_errors(
@@ -475,8 +475,9 @@ def continued_path(
 
     def part(where: slice) -> tuple[Array, DirectionErrors]:
         some = rows_of(readings, where)
-        norths = (value[where] for value in each_north)
-        errors = direction_errors(calibration, some, *norths, seen and seen.part(where))
+        offset, shared, alone = (value[where] for value in each_north)
+        known = seen and seen.part(where)
+        errors = direction_errors(calibration, some, offset, shared, alone, known)
         return depth[where], errors if more is None else more(errors, where)
 
     place, covariance, end = [], [], None

@@ -181,12 +181,14 @@ class WellErrors:
 
     def along(self, errors: DirectionErrors, seen: SeenDirection, hole: Hole) -> DirectionErrors:
         """Errors of direction and depth along a well: those given, and those of the model."""
-        sensors = with_depth(self.moved(seen.gradient, seen.g, seen.b, hole))
         systematic, random, course = self.model.errors(hole)
-        noise = np.zeros_like(random)
-        noise[:, :2, :2] = errors.random
-        lasting = np.concatenate([with_depth(errors.systematic), sensors, systematic], -2)
-        return DirectionErrors(errors.inclination, errors.azimuth, lasting, noise + random, course)
+        turns = errors.systematic, self.moved(seen.gradient, seen.g, seen.b, hole)
+        alone = sum(each.shape[-2] for each in turns)  # of these none shifts a depth
+        lasting = np.zeros((len(random), alone + systematic.shape[-2], 3))
+        np.concatenate(turns, -2, out=lasting[:, :alone, :2])
+        lasting[:, alone:] = systematic
+        random[:, :2, :2] += errors.random
+        return DirectionErrors(errors.inclination, errors.azimuth, lasting, random, course)
 
 
 def cause_names(calibration: Calibration, errors: WellErrors | None) -> tuple[str, ...]:
@@ -264,12 +266,12 @@ class SeenHole(NamedTuple):
     def at(cls, calibration: Calibration, readings: Readings) -> SeenHole:
         """Those that a calibrated tool sees."""
         direction = SeenDirection.of_many(calibration, readings)
-        angles = (OBSERVABLES[n].value(*direction[:2]) for n in ("inclination", "field", "dip"))
-        return cls(*angles, direction)
+        angles = [OBSERVABLES[n].value(*direction[:2]) for n in ("inclination", "field", "dip")]
+        return cls._make([*angles, direction])
 
     def part(self, rows: Bools) -> SeenHole:
         """Those of some readings."""
-        return SeenHole(*(each[rows] for each in self[:3]), self.direction.part(rows))
+        return SeenHole._make([*(each[rows] for each in self[:3]), self.direction.part(rows)])
 
 
 def hole_of(
