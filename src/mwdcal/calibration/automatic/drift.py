@@ -183,8 +183,8 @@ def with_drifts(fits: Iterable[tuple[Ints, Fit]], options: Options) -> Iterator[
         size = TOGETHER if whole.analysis.squares is None else ON_A_STAND
         for first in range(0, len(tools), size):
             some = slice(first, first + size)
-            found = with_drift(take(whole, some), options, np.array(triads))
-            yield tools[some], _whole(found, options)
+            with_walks = with_drift(take(whole, some), options, np.array(triads))
+            yield tools[some], _whole(with_walks, options)
 
 
 def _whole(result: Fit, options: Options) -> Fit:
