@@ -566,6 +566,14 @@ def minimum(problem: Problem, begin: State | None = None) -> tuple[State, Ints, 
     return ended, status, steps
 
 
+def stepped(problem: Problem, state: State) -> State:
+    """The state after one full step, whatever it does to the cost."""
+    here = linear(problem, state)
+    step, _ = here.step(here.covariance)
+    point = AxisPoint.of(problem, state).moved(step, here.errors(step))
+    return point.state(problem, state)
+
+
 def linear(problem: Problem, state: State) -> AxisLinear:
     """The problem linearised at a state; the last answer is kept."""
     return problem.once(
