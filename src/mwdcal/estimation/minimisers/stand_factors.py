@@ -28,7 +28,15 @@ from mwdcal.estimation.problem import WALK_AXES, Problem, State, Triad
 from mwdcal.estimation.solvers import Determined, Status, gauss_newton
 from mwdcal.estimation.start import start as general_start
 from mwdcal.estimation.uncertainty import Analysis, effects_of, variance_factors
-from mwdcal.geometry.vectors import Array, Ints, diagonal, inverse, outer, quotient
+from mwdcal.geometry.vectors import (
+    Array,
+    Ints,
+    diagonal,
+    inverse,
+    inverse_of_positive,
+    outer,
+    quotient,
+)
 from mwdcal.sensor.models import Factors, Polynomial, affine_parts, factor_parts
 
 MOST_AXIS_STEPS = 12
@@ -168,6 +176,7 @@ class AxisRuns:
         for angle, (value, sd) in enumerate(zip(shared, self.settings, strict=True)):
             errors[:, angle] += (value[:, None] @ sd)[:, 0]
         f, change, attitude = self.stand.vectors(errors)
+        shares = tuple(_shares(unknowns) for unknowns in point.unknowns)
         courses: list[Array] = []
         gains, seen, vectors, louds = [], [], [], []
         for index, (phi, unknowns) in enumerate(zip(self.phi, point.unknowns, strict=True)):
@@ -180,7 +189,7 @@ class AxisRuns:
             by = (unit * root)[:, :, None] * phi[:, None], louder[:, :, None] * beside
             courses.extend(np.moveaxis(np.concatenate(by, 2), 1, 0))
             turns = np.moveaxis(change[index], 2, 0).reshape(len(v), 3, -1)
-            turned = (_shares(unknowns) @ turns).reshape(*v.shape[:2], 3, -1)
+            turned = (shares[index] @ turns).reshape(*v.shape[:2], 3, -1)
             gains.append(turned * louder[:, :, None])
             seen.append(louder * unit)
             vectors.append(v)
@@ -192,7 +201,6 @@ class AxisRuns:
         active = np.flatnonzero(self.lone.any((0, 2)))
         sd, held = self.lone[:, active], point.errors[:, active]
         lone = gain[:, :, active] * sd[:, None]
-        shares = tuple(_shares(unknowns) for unknowns in point.unknowns)
         walks = _walk_effects(self.axes, self.root, louder, shares, attitude)
         left = self.stand.raw * self.root - np.concatenate(seen, 1)
         left += np.sum(lone * quotient(held, sd, sd > 0)[:, None], 2)
@@ -410,7 +418,7 @@ class AxisLinear:
     def covariance(self) -> Array:
         """The inverse of the information (B, u, u)."""
         scale = outer(np.sqrt(diagonal(self.information)))
-        return inverse(self.information / scale) / scale
+        return inverse_of_positive(self.information / scale) / scale
 
     @cached_property
     def of_angles(self) -> Array:
