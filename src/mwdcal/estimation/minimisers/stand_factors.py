@@ -315,7 +315,9 @@ class AxisLinear:
             for j in range(k + 1):
                 gram = np.sum(gain[:, :, k] * gain[:, :, j], 1)
                 product = gram - np.sum(factor[:, k, :j] * factor[:, j, :j], 1)
-                factor[:, k, j] = np.sqrt(1 + product) if j == k else product / factor[:, j, j]
+                factor[:, k, j] = (
+                    np.sqrt(np.maximum(1 + product, 1.0)) if j == k else product / factor[:, j, j]
+                )
         return factor
 
     @cached_property
@@ -416,7 +418,8 @@ class AxisLinear:
     @cached_property
     def covariance(self) -> Array:
         """The inverse of the information (B, u, u); by halves it would be less exact where drifts are large."""
-        scale = outer(np.sqrt(diagonal(self.information)))
+        with np.errstate(invalid="ignore"):  # by rounding a square may be below zero
+            scale = outer(np.sqrt(diagonal(self.information)))
         return inverse(self.information / scale) / scale
 
     @cached_property
