@@ -56,7 +56,7 @@ from mwdcal.estimation.uncertainty import (
     triad_sums,
     with_scatter,
 )
-from mwdcal.geometry.vectors import Array, Bools, Ints
+from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal
 from mwdcal.sensor.models import Basis, Factors, Polynomial, Whole, restricted
 
 LEAST_NOISE = 1e-9
@@ -313,7 +313,9 @@ def _finished(stage: _Iterate, options: Options, finite: Bools, iterations: Ints
     problem, state = stage.problem, stage.solved.state
     determined = stand_factors.determined(problem, state)
     analysis = stand_factors.analysed(problem, state, determined)
+    variances = (diagonal(each) for each in (analysis.covariance, analysis.constants))
     good = determined.clear & analysis.finite
+    good &= np.all([(each >= 0).all(-1) for each in variances], 0)  # rounding alone makes others
     status = np.where(finite, stage.solved.status, int(Status.NOT_FINITE))
     whole = Fit(problem, state, status, iterations, _noise(problem), stage.trust, analysis)
     if good.all():
