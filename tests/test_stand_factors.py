@@ -193,3 +193,40 @@ def test_copies_are_found_among_stations_that_happen_to_lie_close():
     copied = replace(readings, accelerometer=raw[0], magnetometer=raw[1])
     found = findings.copies(fit(copied, Options(order=(2, 1))))
     assert np.argwhere(found).tolist() == [[2, 70]]
+
+
+def inverse_of(matrix):
+    """An inverse (u, u) in long arithmetic: Gauss and Jordan, rows of the largest pivot first."""
+    scale = np.sqrt(np.diag(matrix))
+    whole = np.concatenate([matrix / scale[:, None] / scale, np.eye(len(matrix))], 1)
+    for k in range(len(matrix)):
+        pivot = k + np.argmax(np.abs(whole[k:, k]))
+        whole[[k, pivot]] = whole[[pivot, k]]
+        whole[k] /= whole[k, k]
+        others = np.arange(len(matrix)) != k
+        whole[others] -= whole[others, k, None] * whole[k]
+    return whole[:, len(matrix) :] / scale[:, None] / scale
+
+
+@pytest.mark.skipif(np.finfo(np.longdouble).eps > 1e-18, reason="no long arithmetic here")
+def test_residuals_of_large_drifts_spread_as_long_arithmetic_has_it():
+    readings, options = on_stand(12, count=2), Options(order=(3, 3))
+    rng = np.random.default_rng(12)
+    walk = 100 * np.cumsum(rng.normal(size=(2, 96, 6)), 1) / np.sqrt(96) * np.repeat(NOISE, 3)
+    drifted = replace(
+        readings,
+        accelerometer=readings.accelerometer + walk[..., :3],
+        magnetometer=readings.magnetometer + walk[..., 3:],
+    )
+    ours = with_drift(fit(drifted, options), options, np.array([True, True]))
+    assert stand_factors.applies(ours.problem)
+    assert ours.analysis.determined.clear.all()
+    linear = ours.problem.linear(ours.state)
+    for tool, spread in enumerate(ours.analysis.spread):
+        private, rows = (x[tool].astype(np.longdouble) for x in (linear.private, linear.design))
+        core = [inverse_of(np.eye(3) + g.mT @ g) for g in private]
+        weight = np.eye(6) - private @ np.array(core) @ private.mT
+        flat = (weight @ rows).reshape(-1, rows.shape[-1])
+        whole = inverse_of(rows.reshape(flat.shape).mT @ flat + linear.prior[tool])
+        exact = weight - (weight @ rows) @ whole @ (weight @ rows).mT
+        np.testing.assert_allclose(spread, exact.astype(float), rtol=0, atol=2e-3)

@@ -56,7 +56,7 @@ from mwdcal.estimation.uncertainty import (
     triad_sums,
     with_scatter,
 )
-from mwdcal.geometry.vectors import Array, Bools, Ints
+from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal
 from mwdcal.sensor.models import Basis, Factors, Polynomial, Whole, restricted
 
 LEAST_NOISE = 1e-9
@@ -313,7 +313,9 @@ def _finished(stage: _Iterate, options: Options, finite: Bools, iterations: Ints
     problem, state = stage.problem, stage.solved.state
     determined = stand_factors.determined(problem, state)
     analysis = stand_factors.analysed(problem, state, determined)
+    variances = (diagonal(each) for each in (analysis.covariance, analysis.constants))
     good = determined.clear & analysis.finite
+    good &= np.all([(each >= 0).all(-1) for each in variances], 0)  # rounding alone makes others
     status = np.where(finite, stage.solved.status, int(Status.NOT_FINITE))
     whole = Fit(problem, state, status, iterations, _noise(problem), stage.trust, analysis)
     if good.all():
@@ -477,7 +479,7 @@ def _set_apart(stage: _Iterate, options: Options) -> _Iterate:
     if options.separate_solver or not (evidence.assumed and evidence.set_together.any()):
         return stage
     problem, state = stage.problem, stage.solved.state
-    shown = np.flatnonzero(set_apart(problem, state, analyse(problem, state)))
+    shown = np.flatnonzero(set_apart(problem, state, _analysed(problem, state, options)))
     if not shown.size:
         return stage
     part = take(stage, shown)
@@ -512,7 +514,7 @@ def _noise_turn(
     """The noise as residuals have it, then a fit with it, or a step; and who has settled."""
     evidence, at = now.problem.evidence, now.solved.state
     free = [i for i, triad in enumerate(now.problem.triads) if not triad.declared]
-    analysis = analyse(now.problem, at, None if whole else now.determined)
+    analysis = _analysed(now.problem, at, options, None if whole else now.determined)
     scale = _noise_scale(analysis, ahead=not (whole or evidence.scatter or evidence.apart.any()))
     problem, solved, steps = _rescaled(now.problem, scale), now.solved, now.steps
     settled = ~np.any(np.abs(scale[:, free] - 1) >= least, -1)
@@ -525,12 +527,29 @@ def _noise_turn(
         before, share = (p.evidence.apart for p in (now.problem, problem))
         settled &= np.abs(share - before) <= SCATTER_SETTLED * before
     if not whole:
-        solved = replace(solved, state=stepped(now.problem, at, now.determined))
+        by_axis = stand_factors.applies(now.problem)
+        moved = (
+            stand_factors.stepped(now.problem, at)
+            if by_axis
+            else stepped(now.problem, at, now.determined)
+        )
+        solved = replace(solved, state=moved)
     elif options.method != "swarm":
         solved = solve(problem, at, options)
         steps = steps + solved.iterations
         settled |= steps > MOST_STEPS_IN_TURN
     return replace(now, problem=problem, solved=solved, steps=steps), settled
+
+
+def _analysed(
+    problem: Problem, state: State, options: Options, known: Determined | None = None
+) -> Analysis:
+    """The analysis of fits on their way, some directions of which may be `known` to be determined."""
+    if not options.separate_solver and stand_factors.applies(problem):
+        determined = stand_factors.determined(problem, state)
+        if determined.clear.all():
+            return stand_factors.analysed(problem, state, determined)
+    return analyse(problem, state, known)
 
 
 def _noise_scale(analysis: Analysis, ahead: bool) -> Array:

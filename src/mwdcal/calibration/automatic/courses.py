@@ -99,8 +99,8 @@ def terms_beyond(result: Fit) -> OmittedTerms:
     """The powers of temperature that a fit has not."""
     each = result.problem.once("terms", result.state, lambda _: _every_term(result))
     terms, left_over = each
-    square, freedom = terms[:2]
-    size, noise = (np.moveaxis(terms[at : at + 2], 0, -1) for at in (2, 4))
+    square, freedom = terms[:, 0], terms[:, 1]
+    size, noise = (np.moveaxis(terms[:, at : at + 2], 1, -1) for at in (2, 4))
     factor, known = result.analysis.variance_factor, result.analysis.freedom
     rest = known - freedom.sum(-1)
     left = np.nan_to_num(factor * known) - square.sum(-1)
@@ -109,6 +109,14 @@ def terms_beyond(result: Fit) -> OmittedTerms:
     declared = np.isnan(result.noise) & (rest < 1)
     scatter, rest = np.where(declared, 1.0, scatter), np.where(declared, 1e9, rest)
     return OmittedTerms(square, freedom, left_over, size, noise, scatter, rest)
+
+
+def members(result: Fit, places: Ints) -> Fit:
+    """The members of a batch of fits at some places, with what is known of their terms."""
+    part, memo = take(result, places), result.problem.memo
+    if memo.get("state") is result.state and "terms" in memo:
+        part.problem.memo.update(state=part.state, terms=take(memo["terms"], places))
+    return part
 
 
 def share_beyond(result: Fit, index: int, members: Bools) -> Array:
@@ -122,11 +130,11 @@ def share_beyond(result: Fit, index: int, members: Bools) -> Array:
 
 
 def _every_term(result: Fit) -> tuple[Array, Array]:
-    """What `_in_turn` says (6, B, t, k) of every power and triad, and (B, t) of the next one."""
+    """What `_in_turn` says (B, 6, t, k) of every power and triad, and (B, t) of the next one."""
     highest = highest_order(result.problem.temperature)
     count = min(int(highest.max()), TRIED)
     triads, orders = len(result.problem.triads), orders_of(result)
-    each, left = np.zeros((6, len(highest), triads, TRIED)), np.zeros((len(highest), triads))
+    each, left = np.zeros((len(highest), 6, triads, TRIED)), np.zeros((len(highest), triads))
     least = min(orders)
     if count <= least:
         return each, left
@@ -203,7 +211,7 @@ def temperature_powers(temperature: Array, count: int) -> Array:
 
 
 def _in_turn(whole: Array, pulled: Array, tested: Ints, fitted: Ints) -> tuple[Array, Array]:
-    """χ², degrees of freedom, size and noise (6, B, k) of powers in turn, six coefficients each.
+    """χ², degrees of freedom, size and noise (B, 6, k) of powers in turn, six coefficients each.
 
     Each is what it adds to the `fitted` unknowns, and to the powers before it. And the share (B,) of the information
     on the first power that these leave.
@@ -234,7 +242,7 @@ def _in_turn(whole: Array, pulled: Array, tested: Ints, fitted: Ints) -> tuple[A
         means = [_mean(each / scale, worth * scale) for each in sizes]
         terms.append(np.concatenate([np.stack([square, kept.sum(-1)]), *means]))
         both = both - both[:, :, at] @ step
-    return np.stack(terms, -1), share
+    return np.stack(terms, -1).swapaxes(0, 1), share
 
 
 def _share_left(alone: Array, left: Array) -> Array:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from mwdcal.calibration.automatic.courses import f_test, terms_beyond
+from mwdcal.calibration.automatic.courses import f_test, members, terms_beyond
 from mwdcal.calibration.diagnosis.plausibility import departures
 from mwdcal.calibration.estimate import Fit, fit, refitted, with_all
 from mwdcal.calibration.methods import declared_sizes
@@ -172,7 +172,7 @@ def with_drifts(fits: Iterable[tuple[Ints, Fit]], options: Options) -> Iterator[
         for triads in np.unique(drifted, axis=0):
             places = np.flatnonzero((drifted == triads).all(-1))
             part = steady if triads.any() else result
-            part = part if len(places) == len(drifted) else take(part, places)
+            part = part if len(places) == len(drifted) else members(part, places)
             if triads.any():
                 kind = tuple(triads.tolist()), kind_of(part)
                 waiting.setdefault(kind, []).append((tools[places], part))
@@ -183,8 +183,8 @@ def with_drifts(fits: Iterable[tuple[Ints, Fit]], options: Options) -> Iterator[
         size = TOGETHER if whole.analysis.squares is None else ON_A_STAND
         for first in range(0, len(tools), size):
             some = slice(first, first + size)
-            found = with_drift(take(whole, some), options, np.array(triads))
-            yield tools[some], _whole(found, options)
+            with_walks = with_drift(take(whole, some), options, np.array(triads))
+            yield tools[some], _whole(with_walks, options)
 
 
 def _whole(result: Fit, options: Options) -> Fit:

@@ -28,7 +28,14 @@ from mwdcal.estimation.problem import WALK_AXES, Problem, State, Triad
 from mwdcal.estimation.solvers import Determined, Status, gauss_newton
 from mwdcal.estimation.start import start as general_start
 from mwdcal.estimation.uncertainty import Analysis, effects_of, variance_factors
-from mwdcal.geometry.vectors import Array, Ints, diagonal, inverse, outer, quotient
+from mwdcal.geometry.vectors import (
+    Array,
+    Ints,
+    diagonal,
+    inverse,
+    outer,
+    quotient,
+)
 from mwdcal.sensor.models import Factors, Polynomial, affine_parts, factor_parts
 
 MOST_AXIS_STEPS = 12
@@ -41,15 +48,15 @@ LAST_AXIS_STEP = 1e-12
 
 def applies(problem: Problem) -> bool:
     """Whether all angles are known, and nothing but their errors, the sensors' and drifts are to be found."""
-    found = problem.evidence
+    evidence = problem.evidence
     return (
         len(problem.triads) == 2
         and any(isinstance(t.model, Factors) for t in problem.triads)
         and all(_is_affine(t) or isinstance(t.model, Factors) for t in problem.triads)
-        and not (found.absent or found.scatter or found.members.size)
-        and bool(found.referenced.all())
+        and not (evidence.absent or evidence.scatter or evidence.members.size)
+        and bool(evidence.referenced.all())
         and not problem.prior.precision.any()
-        and all(constant.name in WALK_AXES for constant in found.constants)
+        and all(constant.name in WALK_AXES for constant in evidence.constants)
     )
 
 
@@ -168,6 +175,7 @@ class AxisRuns:
         for angle, (value, sd) in enumerate(zip(shared, self.settings, strict=True)):
             errors[:, angle] += (value[:, None] @ sd)[:, 0]
         f, change, attitude = self.stand.vectors(errors)
+        shares = tuple(_shares(unknowns) for unknowns in point.unknowns)
         courses: list[Array] = []
         gains, seen, vectors, louds = [], [], [], []
         for index, (phi, unknowns) in enumerate(zip(self.phi, point.unknowns, strict=True)):
@@ -180,7 +188,7 @@ class AxisRuns:
             by = (unit * root)[:, :, None] * phi[:, None], louder[:, :, None] * beside
             courses.extend(np.moveaxis(np.concatenate(by, 2), 1, 0))
             turns = np.moveaxis(change[index], 2, 0).reshape(len(v), 3, -1)
-            turned = (_shares(unknowns) @ turns).reshape(*v.shape[:2], 3, -1)
+            turned = (shares[index] @ turns).reshape(*v.shape[:2], 3, -1)
             gains.append(turned * louder[:, :, None])
             seen.append(louder * unit)
             vectors.append(v)
@@ -191,11 +199,10 @@ class AxisRuns:
         )
         active = np.flatnonzero(self.lone.any((0, 2)))
         sd, held = self.lone[:, active], point.errors[:, active]
-        own = gain[:, :, active] * sd[:, None]
-        shares = tuple(_shares(unknowns) for unknowns in point.unknowns)
+        lone = gain[:, :, active] * sd[:, None]
         walks = _walk_effects(self.axes, self.root, louder, shares, attitude)
         left = self.stand.raw * self.root - np.concatenate(seen, 1)
-        left += np.sum(own * quotient(held, sd, sd > 0)[:, None], 2)
+        left += np.sum(lone * quotient(held, sd, sd > 0)[:, None], 2)
         first = 0
         for place, terms in enumerate(self.terms):
             value = point.constants[:, first : first + terms.shape[1]]
@@ -205,7 +212,7 @@ class AxisRuns:
         return AxisLinear(
             (*courses, *self.terms, *self.settings),
             np.concatenate([walks, gain[:, :, : len(self.settings)]], 2),
-            own, left, np.concatenate([point.constants, point.settings], -1), known,
+            lone, left, np.concatenate([point.constants, point.settings], -1), known,
             sd, active, vector, louder, shares, self.root, attitude,
         )  # fmt: skip
 
@@ -269,14 +276,14 @@ class AxisLinear:
     """Runs at a point: `courses` (B, k, n) of the columns by effect, and what is `left` (B, 6, n) of the readings.
 
     The first six effects are on one axis each; `effect` (B, 6, e, n) are the others, of which values `held` and their
-    `precision` (B, q) are known. `own` (B, 6, a, n) is what one σ of each angle that a station has for itself does, of
+    `precision` (B, q) are known. `gain` (B, 6, a, n) is what one σ of each angle that a station has for itself does, of
     the `active` ones, with their σ `sd` (B, a, n). A reading over its noise is `louder` (B, 6, n) times the row of
     `shares` (B, 3, 3) times the `vector` (B, 6, n), and what is added to it; `root` (B, 6, n) is one over the noise.
     """
 
     courses: tuple[Array, ...]
     effect: Array
-    own: Array
+    gain: Array
     left: Array
     held: Array
     precision: Array
@@ -302,21 +309,23 @@ class AxisLinear:
     @cached_property
     def factor(self) -> Array:
         """L (B, a, a, n), lower, of L Lᵀ = 1 + GᵀG."""
-        gain, count = self.own, self.own.shape[2]
+        gain, count = self.gain, self.gain.shape[2]
         factor = np.zeros((len(gain), count, count, gain.shape[-1]))
         for k in range(count):
             for j in range(k + 1):
                 gram = np.sum(gain[:, :, k] * gain[:, :, j], 1)
                 product = gram - np.sum(factor[:, k, :j] * factor[:, j, :j], 1)
-                factor[:, k, j] = np.sqrt(1 + product) if j == k else product / factor[:, j, j]
+                factor[:, k, j] = (
+                    np.sqrt(np.maximum(1 + product, 1.0)) if j == k else product / factor[:, j, j]
+                )
         return factor
 
     @cached_property
     def halves(self) -> Array:
         """P (B, 6, a, n)."""
-        halves = np.empty_like(self.own)
-        for k in range(self.own.shape[2]):
-            rest = self.own[:, :, k].copy()
+        halves = np.empty_like(self.gain)
+        for k in range(self.gain.shape[2]):
+            rest = self.gain[:, :, k].copy()
             for j in range(k):
                 rest -= halves[:, :, j] * self.factor[:, None, k, j]
             halves[:, :, k] = rest / self.factor[:, None, k, k]
@@ -408,14 +417,15 @@ class AxisLinear:
 
     @cached_property
     def covariance(self) -> Array:
-        """The inverse of the information (B, u, u)."""
-        scale = outer(np.sqrt(diagonal(self.information)))
+        """The inverse of the information (B, u, u); by halves it would be less exact where drifts are large."""
+        with np.errstate(invalid="ignore"):  # by rounding a square may be below zero
+            scale = outer(np.sqrt(diagonal(self.information)))
         return inverse(self.information / scale) / scale
 
     @cached_property
     def of_angles(self) -> Array:
         """XᵀWGGᵀWX (B, u, u), the information less that with W² in the place of W."""
-        each, count = self.seen_halves.copy(), self.own.shape[2]
+        each, count = self.seen_halves.copy(), self.gain.shape[2]
         for k in reversed(range(count)):  # P L⁻¹
             for j in range(k + 1, count):
                 each[:, :, k] -= self.factor[:, None, j, k] * each[:, :, j]
@@ -514,7 +524,7 @@ class AxisLinear:
         """Errors (B, 3, n) of the angles that stations have for themselves, after a step (B, u)."""
         pairs = zip(self.places, self.courses, strict=True)
         moved = np.concatenate([step[:, None, at] @ course for at, course in pairs], 1)
-        left, count = self.left - moved[:, :6], self.own.shape[2]
+        left, count = self.left - moved[:, :6], self.gain.shape[2]
         if self.effect.shape[2]:
             left -= np.sum(self.effect * moved[:, None, 6:], 2)
         along = np.sum(self.halves * left[:, :, None], 1)
@@ -561,18 +571,24 @@ def minimum(problem: Problem, begin: State | None = None) -> tuple[State, Ints, 
         rest = np.flatnonzero(~good)
         some = take(problem, rest)
         general = take(begin, rest) if begin else general_start(some)
-        found, status[rest], steps[rest] = gauss_newton(some, general)
-        ended = put(ended, rest, found)
+        general, status[rest], steps[rest] = gauss_newton(some, general)
+        ended = put(ended, rest, general)
     return ended, status, steps
+
+
+def stepped(problem: Problem, state: State) -> State:
+    """The state after one full step, whatever it does to the cost."""
+    here = linear(problem, state)
+    step, _ = here.step(here.covariance)
+    point = AxisPoint.of(problem, state).moved(step, here.errors(step))
+    return point.state(problem, state)
 
 
 def linear(problem: Problem, state: State) -> AxisLinear:
     """The problem linearised at a state; the last answer is kept."""
-
-    def found(state: State) -> AxisLinear:
-        return AxisRuns.of(problem).at(AxisPoint.of(problem, state))
-
-    return problem.once("by axis", state, found)
+    return problem.once(
+        "by axis", state, lambda _: AxisRuns.of(problem).at(AxisPoint.of(problem, state))
+    )
 
 
 def analysed(problem: Problem, state: State, known: Determined) -> Analysis:
