@@ -27,7 +27,7 @@ from mwdcal.estimation.minimisers.closed_form import AffineMinimum
 from mwdcal.estimation.problem import WALK_AXES, WALKS, Problem, State
 from mwdcal.estimation.solvers import Determined
 from mwdcal.estimation.uncertainty import Analysis, effects_of, variance_factors
-from mwdcal.geometry.vectors import Array, Bools, Ints, inverse, quotient
+from mwdcal.geometry.vectors import Array, Bools, Ints, inverse, inverse_of_positive, quotient
 from mwdcal.sensor.models import Polynomial, affine_parts
 
 # --------------------------------------------------------------------------
@@ -392,13 +392,13 @@ class StandLinear:
         A drift's mean is an offset: of the sums of both together only rounding would be left.
         """
         p, information = OF_PARAMETERS, self.of_data
-        alone = inverse(information[:, :p, :p])
+        alone = inverse_of_positive(information[:, :p, :p])
         if not self.precision.size:
             return alone, information[:, :p, p:], information[:, p:, p:]
         taken = alone @ information[:, :p, p:]
         rest = information[:, p:, p:] - information[:, p:, :p] @ taken
         np.einsum("bii->bi", rest)[...] += self.precision
-        return alone, taken, inverse(rest)
+        return alone, taken, inverse_of_positive(rest)
 
     @cached_property
     def covariance(self) -> Array:
