@@ -55,6 +55,15 @@ def summed(*factors: Array) -> Array:
     return np.asarray(sum(each.reshape(-1, each.shape[-1])))
 
 
+def symmetric(first: Array, second: Array) -> Array:
+    """Products (6, 6, B, n) of components (6, k, B, n), summed over k, that are symmetric: one half is copied."""
+    whole = np.empty((6, *first.shape[:1], *first.shape[2:]))
+    for row in range(6):
+        whole[row, row:] = np.einsum("k...,jk...->j...", first[row], second[row:])
+        whole[row:, row] = whole[row, row:]
+    return whole
+
+
 def by_tool(components: Array) -> Array:
     """Components (..., B, n) as (B, k, n)."""
     flat = components.reshape(-1, *components.shape[-2:])
@@ -364,7 +373,7 @@ class StandLinear:
     @cached_property
     def weight(self) -> Array:
         """W (6, 6, B, n)."""
-        weight = -np.einsum("ik...,jk...->ij...", self.halves, self.halves)
+        weight = -symmetric(self.halves, self.halves)
         for row in range(6):
             weight[row, row] += 1
         return np.asarray(weight)
@@ -377,12 +386,8 @@ class StandLinear:
     @cached_property
     def squared(self) -> tuple[Array, Array]:
         """XᵀW E W X (B, u, u), E being one for the readings of a triad and zero for those of the other."""
-        first, second = (
-            self.columns.gram(
-                np.einsum("ik...,kj...->ij...", self.weight[:, rows], self.weight[rows])
-            )
-            for rows in TRIAD_ROWS
-        )
+        parts = (self.weight[:, rows] for rows in TRIAD_ROWS)
+        first, second = (self.columns.gram(symmetric(part, part)) for part in parts)
         return first, second
 
     @cached_property
@@ -420,7 +425,7 @@ class StandLinear:
                 (left @ inner[:, None] @ left.mT).reshape(*left.shape[:2], 36).mT, 6, 6
             )
         moved = np.einsum("ij...,jk...->ik...", self.weight, both)
-        return np.asarray(self.weight - np.einsum("ij...,jk...->ik...", moved, self.weight))
+        return np.asarray(self.weight - symmetric(moved, self.weight))
 
     @cached_property
     def apart(self) -> tuple[Array, ...]:
