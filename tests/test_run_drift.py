@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.special import stdtrit
 
 from cli_support import calibrated, mwdcal, servo_run, write_csv
 from mwdcal.calibration.automatic.drift import by_drift, chances
@@ -15,8 +14,7 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.results import StatedCovariance, drifts
 from mwdcal.certificate.budget import budget
 from mwdcal.errors import FitError
-from mwdcal.estimation.drift import _widened, terms_of, walk_scores
-from mwdcal.estimation.uncertainty import student_quantile
+from mwdcal.estimation.drift import terms_of, walk_scores
 from mwdcal.files.formats.table import Table
 from mwdcal.geometry.vectors import earth_field, earth_gravity, tool_from_earth
 from mwdcal.planning.expected import expected
@@ -353,22 +351,3 @@ def test_a_plan_includes_a_declared_drift_and_a_simulation_draws_it():
     moved = drifted(np.random.default_rng(1), session, "accelerometer-drift", (4000,))
     assert np.all(moved[:, 0] == 0)
     assert moved[:, -1].std() == pytest.approx(2e-4, rel=0.03)
-
-
-def test_quantiles_of_student_are_those_of_scipy():
-    freedom = np.concatenate([np.linspace(1, 60, 200), np.geomspace(60, 1e6, 30)])
-    for chance in (0.5, 0.05, 1e-4):
-        found = student_quantile(freedom, chance)
-        np.testing.assert_allclose(found, stdtrit(freedom, 1 - chance / 2), rtol=1e-12)
-    assert np.isnan(student_quantile(np.array([np.nan]), 0.05)).all()
-
-
-def test_drifts_are_widened_by_the_printed_quantiles_of_student():
-    """Table of Student's t at 0.975, NIST/SEMATECH e-Handbook 1.3.6.7.2; fewer than two degrees count as two."""
-    printed = {0.5: 4.303, 2: 4.303, 5: 2.571, 10: 2.228, 30: 2.042, 100: 1.984}
-    found = 1.959964 * np.sqrt(_widened(np.array([*printed], float)))
-    np.testing.assert_allclose(found, [*printed.values()], atol=5.1e-4)
-    freedom = np.linspace(2, 60, 500)
-    np.testing.assert_allclose(
-        _widened(freedom), (stdtrit(freedom, 0.975) / 1.959964) ** 2, rtol=1e-12
-    )
