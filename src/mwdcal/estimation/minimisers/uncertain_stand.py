@@ -27,7 +27,7 @@ from mwdcal.estimation.minimisers.closed_form import AffineMinimum
 from mwdcal.estimation.problem import WALK_AXES, WALKS, Problem, State
 from mwdcal.estimation.solvers import Determined
 from mwdcal.estimation.uncertainty import Analysis, effects_of, variance_factors
-from mwdcal.geometry.vectors import Array, Bools, Ints, inverse, inverse_of_positive, quotient
+from mwdcal.geometry.vectors import Array, Bools, Ints, inverse, quotient
 from mwdcal.sensor.models import Polynomial, affine_parts
 
 # --------------------------------------------------------------------------
@@ -53,15 +53,6 @@ def summed(*factors: Array) -> Array:
     """The product of arrays (..., B, n) summed for each tool (B,), in one order whatever the number of tools."""
     each = np.sum(prod(factors), -1)
     return np.asarray(sum(each.reshape(-1, each.shape[-1])))
-
-
-def symmetric(first: Array, second: Array) -> Array:
-    """Products (6, 6, B, n) of components (6, k, B, n), summed over k, that are symmetric: one half is copied."""
-    whole = np.empty((6, *first.shape[:1], *first.shape[2:]))
-    for row in range(6):
-        whole[row, row:] = np.einsum("k...,jk...->j...", first[row], second[row:])
-        whole[row:, row] = whole[row, row:]
-    return whole
 
 
 def by_tool(components: Array) -> Array:
@@ -373,7 +364,7 @@ class StandLinear:
     @cached_property
     def weight(self) -> Array:
         """W (6, 6, B, n)."""
-        weight = -symmetric(self.halves, self.halves)
+        weight = -np.einsum("ik...,jk...->ij...", self.halves, self.halves)
         for row in range(6):
             weight[row, row] += 1
         return np.asarray(weight)
@@ -386,8 +377,12 @@ class StandLinear:
     @cached_property
     def squared(self) -> tuple[Array, Array]:
         """XᵀW E W X (B, u, u), E being one for the readings of a triad and zero for those of the other."""
-        parts = (self.weight[:, rows] for rows in TRIAD_ROWS)
-        first, second = (self.columns.gram(symmetric(part, part)) for part in parts)
+        first, second = (
+            self.columns.gram(
+                np.einsum("ik...,kj...->ij...", self.weight[:, rows], self.weight[rows])
+            )
+            for rows in TRIAD_ROWS
+        )
         return first, second
 
     @cached_property
@@ -397,13 +392,13 @@ class StandLinear:
         A drift's mean is an offset: of the sums of both together only rounding would be left.
         """
         p, information = OF_PARAMETERS, self.of_data
-        alone = inverse_of_positive(information[:, :p, :p])
+        alone = inverse(information[:, :p, :p])
         if not self.precision.size:
             return alone, information[:, :p, p:], information[:, p:, p:]
         taken = alone @ information[:, :p, p:]
         rest = information[:, p:, p:] - information[:, p:, :p] @ taken
         np.einsum("bii->bi", rest)[...] += self.precision
-        return alone, taken, inverse_of_positive(rest)
+        return alone, taken, inverse(rest)
 
     @cached_property
     def covariance(self) -> Array:
@@ -425,7 +420,7 @@ class StandLinear:
                 (left @ inner[:, None] @ left.mT).reshape(*left.shape[:2], 36).mT, 6, 6
             )
         moved = np.einsum("ij...,jk...->ik...", self.weight, both)
-        return np.asarray(self.weight - symmetric(moved, self.weight))
+        return np.asarray(self.weight - np.einsum("ij...,jk...->ik...", moved, self.weight))
 
     @cached_property
     def apart(self) -> tuple[Array, ...]:
