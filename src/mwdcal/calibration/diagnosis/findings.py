@@ -96,8 +96,8 @@ def _copies(rows: Array) -> Bools:
         earlier = np.arange(len(rows)) < np.arange(len(rows))[some, None]
         apart = np.max([np.abs(each[some, None] - each) for each in rows.T], axis=0)
         agreeing = earlier & (apart <= AGREEING)
-        pairs += np.count_nonzero(agreeing)
-        near += np.count_nonzero(earlier & (apart <= NEAR))
+        pairs += int(np.count_nonzero(agreeing))
+        near += int(np.count_nonzero(earlier & (apart <= NEAR)))
         repeated[some] = agreeing.any(-1)
     alone = float(np.prod([_agreement(resolution(each)) for each in rows.T])) if pairs else 1.0
     coincident = not pairs or _at_least(pairs, near, alone) >= COINCIDENCE
