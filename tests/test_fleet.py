@@ -984,3 +984,18 @@ def test_a_scheduler_that_falls_silent_ends_the_fleet_and_leaves_its_parts(
         )
     assert "the scheduler no longer answers. Finished parts are kept" in refused(ran, 2)
     assert len(list((tmp_path / "o.parquet.parts").glob("*.arrow"))) >= 2
+
+
+def test_a_fleet_without_records_loads_only_what_it_uses(tmp_path):
+    path = write_fleet(tmp_path / "runs.parquet", {"T1": short_run(1), "T2": short_run(2)})
+    script = (
+        "import sys\nfrom mwdcal.app.cli import main\n"
+        "try:\n    main(sys.argv[1:])\nexcept SystemExit as end:\n    assert not end.code\n"
+        "unused = {'scipy.spatial', 'mwdcal.library.face', 'mwdcal.library.tasks', 'mwdcal.comparison',"
+        " 'mwdcal.logs', 'mwdcal.planning', 'mwdcal.presentation.fleet_page'}\n"
+        "sys.exit(str(sorted(unused & set(sys.modules))))\n"
+    )
+    command = [sys.executable, "-c", script, "fleet", str(path), "--tool", "servo"]
+    command += ["--workers", "1", "--no-records", "-o", str(tmp_path / "cals.parquet")]
+    done = subprocess.run(command, capture_output=True, encoding="utf-8", check=False)
+    assert done.stderr.strip().splitlines()[-1] == "[]"

@@ -71,9 +71,9 @@ def test_drawing_and_its_library_wait_until_they_are_used():
 
 
 def test_every_public_name_is_there_and_has_a_docstring():
-    from mwdcal import library
+    from mwdcal.library import face
 
-    assert all(hasattr(library, name) for name in mwdcal.__all__)
+    assert all(hasattr(face, name) for name in mwdcal.__all__)
     assert len(mwdcal.__all__) <= 32
     for name in mwdcal.__all__:
         assert getattr(mwdcal, name).__doc__, name

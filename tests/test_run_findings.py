@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mwdcal.calibration.calibrate import calibrate
-from mwdcal.calibration.diagnosis.findings import resolution
+from mwdcal.calibration.diagnosis.findings import AGREEING, _copies, resolution
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings, fingerprints
 from mwdcal.errors import FitError
@@ -227,3 +227,20 @@ def test_gravity_of_one_that_is_stated_is_known(gravity):
     known = data.known if gravity is None else {**data.known, "gravity": gravity}
     record = calibrate(replace(data, known=known), PROFILE)
     assert unknown_gravity(record) == (gravity is None)
+
+
+@pytest.mark.parametrize("count", [20, 256, 600])
+def test_copies_are_the_stations_near_an_earlier_one(count):
+    """Against a tree of neighbours; some stations are there twice, and one three times."""
+    from scipy.spatial import KDTree
+
+    rng = np.random.default_rng(count)
+    rows = 300.0 * rng.standard_normal((count, 6))
+    rows[[3, count // 2, count - 1]] = rows[[1, 0, 0]]
+    rows[count - 2] = rows[2] + 0.9 * AGREEING * rng.choice([-1, 1], 6)
+    rows[count - 3] = rows[2] + 1.1 * AGREEING
+    pairs = KDTree(rows).query_pairs(AGREEING, p=np.inf)
+    expected = np.isin(np.arange(count), [max(pair) for pair in pairs])
+    np.testing.assert_array_equal(_copies(rows), expected)
+    assert expected.sum() == 4
+    assert not _copies(300.0 * rng.standard_normal((count, 6))).any()

@@ -34,7 +34,7 @@ from mwdcal.signals import held
 
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 KEPT_MEMORY = {"MALLOC_MMAP_THRESHOLD_": (-3, 2**25), "MALLOC_TRIM_THRESHOLD_": (-1, 2**29)}
-"""Limits of the GNU allocator by environment variable: parameter of `mallopt`, and bytes. Memory below is used again."""
+"""Sizes below which the GNU allocator uses memory again, by environment variable: number for `mallopt`, and bytes."""
 WORKER_SETTINGS = {
     **dict.fromkeys(ONE_THREAD, "1"),
     **{name: str(size) for name, (_, size) in KEPT_MEMORY.items()},

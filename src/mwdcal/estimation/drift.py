@@ -14,14 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
-from typing import cast
+from functools import partial
 
 import numpy as np
 
 from mwdcal.estimation.minimisers import closed_form_drift, stand_factors, uncertain_stand
 from mwdcal.estimation.problem import WALK_AXES, WALKS, Evidence, Problem, SharedConstant, State
-from mwdcal.estimation.uncertainty import Analysis, student_quantile, whole_covariance
+from mwdcal.estimation.uncertainty import Analysis, whole_covariance
 from mwdcal.geometry.vectors import (
     Array,
     Bools,
@@ -44,8 +43,6 @@ LEAST_WALK = 1e-3
 """A walk over the run is at least this share of the noise of a reading: a smaller one does not count."""
 FEWEST_USED = 2.0
 """Fewest degrees of freedom that are counted to the estimate of a walk's variance."""
-WIDENING_DEGREE = 16
-"""Degree of the polynomial in 1/ν for the square of Student's t."""
 ROUNDING = 1e-13
 """Differences of matrices, as a share of the largest element, that are rounding."""
 VARIANCE_ROUNDS = 25
@@ -402,19 +399,9 @@ def walk_variances(
 
 def _widened(freedom: Array) -> Array:
     """What makes a normal 95 % interval as wide as Student's t for a variance of so many degrees of freedom."""
-    return np.asarray(_widening()(1 / np.maximum(freedom, FEWEST_USED)))
+    from scipy.special import stdtrit
 
-
-@cache
-def _widening() -> Callable[[Array], Array]:
-    """The same as a polynomial in the inverse of the degrees of freedom, right to 1e-13."""
-    from numpy.polynomial import Chebyshev
-
-    square = Chebyshev.interpolate(
-        lambda inverted: (student_quantile(1 / inverted, 0.05) / 1.959964) ** 2,
-        WIDENING_DEGREE, [0, 1 / FEWEST_USED],
-    )  # fmt: skip
-    return cast("Callable[[Array], Array]", square)
+    return np.asarray((stdtrit(np.maximum(freedom, FEWEST_USED), 0.975) / 1.959964) ** 2)
 
 
 def trend_effect(problem: Problem, state: State, analysis: Analysis, name: str) -> Array:

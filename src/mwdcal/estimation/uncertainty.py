@@ -145,10 +145,6 @@ EXACT_FROM = 10
 """Argument from which Stirling's series is exact to the last digit."""
 
 
-NEWTON_ROUNDS = 6
-"""Steps from the normal quantile to that of Student's t, to the last digits from one degree of freedom on."""
-
-
 def fisher_tail(over: Array, under: Array, ratio: Array) -> Array:
     """Chance of a larger ratio of two variances with `over` and `under` degrees of freedom: Fisher's F.
 
@@ -208,24 +204,6 @@ def _stirling(z: Array) -> Array:
     steps = z[..., None] + np.arange(EXACT_FROM)
     series = sum(c / (z + EXACT_FROM) ** (2 * k + 1) for k, c in enumerate(STIRLING))
     return np.asarray(series + ((steps + 0.5) * np.log1p(1 / steps) - 1).sum(-1))
-
-
-def student_quantile(freedom: Array, chance: float) -> Array:
-    """Size (...) that Student's t of some degrees of freedom (...) exceeds, on either side, with a chance: NaN for NaN.
-
-    By Newton's method for the logarithm of the chance over that of the size, which is concave: it comes from above.
-
-    >>> student_quantile(np.array([2.0, 10.0, np.nan]), 0.05).round(4)
-    array([4.3027, 2.2281,    nan])
-    """
-    under, one = np.nan_to_num(np.asarray(freedom, float), nan=1.0), np.ones(np.shape(freedom))
-    log = np.full(under.shape, np.log(normal_quantile(np.array([chance]))[0]))
-    for _ in range(NEWTON_ROUNDS):
-        square = np.exp(2 * log)
-        tail = fisher_tail(one, under, square)
-        slope = 2 * _density(under / 2, one / 2, square, (under + square) / 2)
-        log = log + np.log(tail / chance) * tail / slope
-    return np.where(np.isnan(freedom), np.nan, np.exp(log))
 
 
 def normal_quantile(chance: Array) -> Array:

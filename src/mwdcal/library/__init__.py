@@ -1,1 +1,1 @@
-"""One function for each task of `import mwdcal`: `face` has them all, a command loads its own alone."""
+"""The face of `import mwdcal`: arrays converted and checked, and one function for each task."""

@@ -1,4 +1,4 @@
-"""The face of `import mwdcal`: arrays converted and checked, and one function for each task."""
+"""The public names: a command loads the modules that it needs, not all of these."""
 
 from mwdcal.calibration.options import Options as Options
 from mwdcal.calibration.readings import Readings as Readings

@@ -13,13 +13,14 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from mwdcal import errors, library
+from mwdcal import errors
 from mwdcal.certificate.decisions import student_factor
 from mwdcal.certificate.signature import public_key
 from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array
+from mwdcal.library import face
 from mwdcal.logs import allan
 from mwdcal.survey import references
 from mwdcal.survey.error_model import Hole, load_error_model
@@ -166,11 +167,11 @@ def _calibrated(triad: int) -> Both:
     fitted, other = _attitudes(), (first, second, third)
     inclination, azimuth, toolface = fitted
     a, m = raw(fitted)
-    run = library.readings(
+    run = face.readings(
         a, m, inclination=inclination, azimuth=azimuth, toolface=toolface, field=sizes[1], dip=float(dip)
     )  # fmt: skip
-    calibration = library.calibrate(run, order=0)
-    computed = calibration.fields(library.readings(*raw(other)))
+    calibration = face.calibrate(run, order=0)
+    computed = calibration.fields(face.readings(*raw(other)))
     return _textbook(other, float(dip))[triad], np.asarray(computed[triad]) / sizes[triad]
 
 

@@ -52,7 +52,7 @@ AGREEING = 0.03
 """Readings agree that differ on no channel by more than this share of its noise."""
 NEAR = 10.0
 """Stations of one attitude differ on no channel by more than so many times its noise."""
-ROWS_AT_ONCE = 256
+BLOCK_OF_STATIONS = 256
 """Stations whose distances to all others are worked out at once."""
 COINCIDENCE = 1e-3
 """Chance below which as many pairs of measurements that agree are not a coincidence."""
@@ -100,13 +100,13 @@ def _noise_in_residuals(result: Fit) -> Array:
 def _copies(rows: Array) -> Bools:
     """Stations (n,) of one run that agree with an earlier one, of readings (n, k) in units of their noise."""
     pairs, near, repeated = 0, 0, np.zeros(len(rows), bool)
-    for first in range(0, len(rows), ROWS_AT_ONCE):
-        some = slice(first, first + ROWS_AT_ONCE)
+    for first in range(0, len(rows), BLOCK_OF_STATIONS):
+        some = slice(first, first + BLOCK_OF_STATIONS)
         earlier = np.arange(len(rows)) < np.arange(len(rows))[some, None]
         apart = np.max([np.abs(each[some, None] - each) for each in rows.T], axis=0)
         agreeing = earlier & (apart <= AGREEING)
-        pairs += np.count_nonzero(agreeing)
-        near += np.count_nonzero(earlier & (apart <= NEAR))
+        pairs += int(np.count_nonzero(agreeing))
+        near += int(np.count_nonzero(earlier & (apart <= NEAR)))
         repeated[some] = agreeing.any(-1)
     alone = float(np.prod([_agreement(resolution(each)) for each in rows.T])) if pairs else 1.0
     coincident = not pairs or _at_least(pairs, near, alone) >= COINCIDENCE
