@@ -424,7 +424,7 @@ class AxisLinear:
 
     @cached_property
     def of_angles(self) -> Array:
-        """XᵀWGGᵀWX (B, u, u), the information less that with W² in the place of W."""
+        """XᵀWGGᵀWX (B, u, u), the information less that with W² instead of W."""
         each, count = self.seen_halves.copy(), self.gain.shape[2]
         for k in reversed(range(count)):  # P L⁻¹
             for j in range(k + 1, count):
