@@ -81,7 +81,7 @@ def _to_remeasure(calibration: Calibration) -> dict[str, str]:
 
 
 def _misfit(row: StationRow, relative: bool) -> str:
-    """What is wrong with a station, in words."""
+    """The fault of a station, in words."""
     worst = row.worst or "gravity"
     _, unit = shown_in(worst, relative)
     size = f"{min(row.deviation, LARGEST_DEVIATION):.1f}"

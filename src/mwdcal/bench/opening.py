@@ -34,7 +34,7 @@ PLAN_SUFFIXES = (".toml", ".csv", ".tsv", ".txt")
 
 @dataclass(frozen=True)
 class ToolPast:
-    """What a registry holds of a tool: its records, newest first, when it is due, and its latest profile, if any."""
+    """The past of a tool in a registry: its records, newest first, when it is due, and its latest profile, if any."""
 
     serial: str
     records: Sequence[Any]

@@ -182,7 +182,7 @@ class Settling:
         self.still = cells[max(first, len(cells) - int(4 * self.window / CELL_SECONDS)) :]
 
     def _bounds(self, count: int) -> tuple[Array, Array]:
-        """What the scatter of a cell, and the change to the next, do not exceed at rest (k,).
+        """The largest scatter of a cell, and the largest change to the next, at rest (k,).
 
         Both are seen as multiples of the roughness, which movement hardly changes, and are alike in a triad. Cells of
         correlated noise hold fewer independent samples than samples: as many as the change of their means tells, as
