@@ -64,7 +64,7 @@ def past_of(registry: str | None, serial: str) -> ToolPast:
     if registry is None or not is_there(registry):
         raise InputError("no registry is named, so no tool has a past. Type the serial.")
     with mwdcal.registry(registry) as tools:
-        records = tools.history(serial).rows[::-1]
+        records = tools.history(serial, limit=1000).rows[::-1]
         listed = [tool for tool in tools.list(search=serial).rows if tool.serial == serial]
         try:
             profile = tools.latest(serial).profile
