@@ -31,6 +31,8 @@ WATCH = """() => {
     last = next;
   }).observe(document.getElementById("main"), { childList: true, subtree: true, characterData: true });
 }"""
+PAUSE = 2000
+"""Milliseconds after a key before the next."""
 LONGEST = 240_000
 """Milliseconds that a station may take."""
 
@@ -43,10 +45,10 @@ def measure(page: Page, stations: int) -> list[tuple[int, float]]:
     for number in range(1, stations + 1):
         settled = "() => document.querySelector('[data-live=state_text]').textContent === 'settled'"
         page.wait_for_function(settled, timeout=LONGEST)
-        page.keyboard.press(" ")
-        shown = f"() => document.querySelector('[data-part=stations] h3').textContent.includes(' {number} /')"
-        page.wait_for_function(shown, timeout=LONGEST)
-        page.wait_for_timeout(300)
+        heading = page.locator("[data-part=stations] h3")
+        while f": {number} /" not in heading.inner_text():  # one that is refused is pressed again
+            page.keyboard.press(" ")
+            page.wait_for_timeout(PAUSE)
     page.wait_for_timeout(3000)
     return [(int(kind), float(time)) for kind, time in page.evaluate("window.times")]
 

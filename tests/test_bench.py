@@ -274,13 +274,13 @@ def test_the_tool_of_a_registry_brings_its_profile(finished, tmp_path):
 def test_an_own_profile_and_an_own_plan(tmp_path):
     session = session_in(tmp_path / "S", start=False)
     with pytest.raises(InputError, match="axes"):
-        session.start("T-1", own_tool='name = "x"\n[accelerometer]\naxes = ["+x"]\n')
+        session.start("T-1", tool_text='name = "x"\n[accelerometer]\naxes = ["+x"]\n')
     assert session.profile.name == load_profile(TOOL).name
     plan = "ref_inclination_deg,ref_azimuth_deg,ref_toolface_deg\n" + "10,20,30\n40,50,60\n" * 6
     with pytest.raises(InputError, match=r"\.csv"):
-        session.start("T-1", own_plan=("mine.exe", plan))
+        session.start("T-1", plan_file=("mine.exe", plan))
     own = TOOL.read_text().replace('name = "', 'name = "own ', 1)
-    session.start("T-1", own_tool=own, own_plan=("mine.csv", plan))
+    session.start("T-1", tool_text=own, plan_file=("mine.csv", plan))
     assert load_profile(session.folder / "tool.toml").name.startswith("own ")
     assert session.plan.name == "mine"
     assert session.part.attitude(1) == (40.0, 50.0, 60.0)

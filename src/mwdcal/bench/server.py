@@ -155,17 +155,17 @@ class Bench:
             form.get(name, "")[:100]
             for name in ("serial", "operator", "plan", "tool", "own_plan_name")
         )
-        if plan == pages.FEWEST:
+        if plan == pages.FEWEST_PLAN:
             plan = self._fewest(form)
-        own = file, form.get("own_plan", "")
+        plan_file = file, form.get("own_plan", "")
         self.session.start(
             serial,
             operator,
             plan,
             earth,
             tool=tool,
-            own_tool=form.get("own_tool", ""),
-            own_plan=own,
+            tool_text=form.get("own_tool", ""),
+            plan_file=plan_file,
         )
 
     def _fewest(self, form: Mapping[str, str]) -> str:
