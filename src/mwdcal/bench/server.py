@@ -90,7 +90,9 @@ class Bench:
         self.reader = Thread(target=self._read, name="bench source", daemon=True)
         self._fragment: tuple[int, str] = (-1, "")
         self.table = table = DroppedTable(
-            session.folder / "table", session.registry, session.laboratory
+            session.folder / "table",
+            None if session.countersign else session.registry,  # not before the second signature
+            session.laboratory,
         )
         self._tables: dict[str, Callable[[Mapping[str, str], bytes], None]] = {
             "file": lambda form, data: table.drop(form.get("name", ""), data),
