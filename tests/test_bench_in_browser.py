@@ -267,18 +267,17 @@ def test_readings_by_hand(tmp_path, browser):
 def test_a_tool_of_the_registry_and_an_own_plan(tmp_path, browser):
     """The past of a tool is shown; its profile, and a plan by its file, are those of the session."""
     database = tmp_path / "tools.sqlite"
-    ran = mwdcal(
-        *(
-            "calibrate",
-            EXAMPLE / "run.csv",
-            "--tool",
-            EXAMPLE / "tool.toml",
-            "-o",
-            tmp_path / "c.json",
-        ),
-        *("--registry", database),
+    fit = (
+        "calibrate",
+        EXAMPLE / "run.csv",
+        "--tool",
+        EXAMPLE / "tool.toml",
+        "-o",
+        tmp_path / "c.json",
     )
-    assert ran.code == 0, ran
+    for words in (fit, ("registry", "init"), ("registry", "add", tmp_path / "c.json")):
+        ran = mwdcal(*words, *(("--registry", database) if words[0] == "registry" else ()))
+        assert ran.code == 0, ran
     serial = json.loads((tmp_path / "c.json").read_text())["tool"]["serial"]
     plan = "ref_inclination_deg,ref_azimuth_deg,ref_toolface_deg\n" + "10,20,30\n40,50,60\n" * 6
     (tmp_path / "mine.csv").write_text(plan)
