@@ -11,12 +11,16 @@ from __future__ import annotations
 import argparse
 import os
 import shutil
-import subprocess
-import sys
 import tempfile
+from pathlib import Path
+from threading import Thread
+from typing import cast
 
 import numpy as np
 from playwright.sync_api import Page, sync_playwright
+
+from mwdcal.bench import serving
+from mwdcal.bench.simulated import DemoStand
 
 WATCH = """() => {
   window.times = [];
@@ -31,7 +35,8 @@ WATCH = """() => {
     last = next;
   }).observe(document.getElementById("main"), { childList: true, subtree: true, characterData: true });
 }"""
-PAUSE = 2000
+HOST = "127.0.0.1"
+PAUSE = 1500
 """Milliseconds after a key before the next."""
 LONGEST = 240_000
 """Milliseconds that a station may take."""
@@ -58,30 +63,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--plan", default="best-48")
     parser.add_argument("--stations", type=int, default=48)
-    parser.add_argument("--speed", default="50")
+    parser.add_argument("--speed", type=float, default=50.0)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as driver:
-        command = [
-            sys.executable,
-            "-m",
-            "mwdcal",
-            "bench",
-            "--demo",
-            "--no-browser",
-            "--plan",
-            given.plan,
-        ]
-        command += ["--speed", given.speed, "--session", f"{folder}/S"]
-        bench = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        options = {"source": "demo", "plan": given.plan, "speed": given.speed}
+        opened = serving.listening(HOST, 0)
+        port = opened.getsockname()[1]
+        bench = serving.bench_of(Path(folder), options, HOST, port)
+        cast(DemoStand, bench.source).knocked = set()  # a bad station may prevent the fit
+        Thread(target=serving.serve, args=(bench, opened, ""), daemon=True).start()
         browser = driver.chromium.launch(
             executable_path=shutil.which("chromium"), args=["--no-sandbox"]
         )
         page = browser.new_page()
-        page.goto(str(bench.stdout and bench.stdout.readline().strip()))
+        page.goto(serving.address(HOST, port, bench.token))
         times = measure(page, given.stations)
         browser.close()
-        bench.send_signal(2)
-        bench.wait(30)
+        bench.stop.set()
     for kind, name in ((0, "station shown"), (1, "new fit shown")):
         each = [time / 1000 for which, time in times if which == kind]
         median, most = np.median(each), np.quantile(each, 0.95)
