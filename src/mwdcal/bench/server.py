@@ -89,11 +89,9 @@ class Bench:
         self.stop = Event()
         self.reader = Thread(target=self._read, name="bench source", daemon=True)
         self._fragment: tuple[int, str] = (-1, "")
-        self.table = table = DroppedTable(
-            session.folder / "table",
-            None if session.countersign else session.registry,  # not before the second signature
-            session.laboratory,
-        )
+        entered = None if session.countersign else session.registry  # not before the signature
+        folder = session.folder / "table"
+        self.table = table = DroppedTable(folder, entered, session.laboratory)
         self._tables: dict[str, Callable[[Mapping[str, str], bytes], None]] = {
             "file": lambda form, data: table.drop(form.get("name", ""), data),
             "rolltest": lambda form, data: table.drop_rolltest(form.get("name", ""), data),
