@@ -164,6 +164,140 @@ def test_roll_test_certificate_and_registry(finished, tmp_path):
         session.reopen()
 
 
+# ------------------------------------------------------------------ the start and the end
+
+
+def key_of(folder, owner):
+    created = mwdcal("certificate", "key", "create", "-o", folder / "k.key", "--owner", owner)
+    assert created.code == 0, created
+    return folder / "k.key"
+
+
+def to_the_verdict(finished, folder, **options):
+    """A session that goes on with the run of another, up to the verdict of its roll test."""
+    done, stand, _ = finished
+    folder.mkdir()
+    kept = [e for e in done.journal.events if e["event"] in ("started", "station", "again")]
+    kept = [event for event in kept if event.get("part", "run") == "run"]
+    (folder / "session.jsonl").write_text("".join(json.dumps(event) + "\n" for event in kept))
+    session = session_in(folder, **options)
+    session.line(0.0, HEADER)
+    session.calibrate()
+    session.wait_for_fits()
+    session.start_rolltest()
+    while session.order is not None:
+        measure(session, stand, seconds=3)
+    session.wait_for_fits()
+    return session
+
+
+@pytest.mark.slow
+def test_as_found_and_a_second_signature(finished, tmp_path):
+    """The calibration before judges the same roll test; the operator's own key is refused, the second person's signs,
+    and only then the registry is written."""
+    done, _, _ = finished
+    database = str(tmp_path / "tools.sqlite")
+    before = json.loads((done.folder / "tool.json").read_text())
+    with mwdcal_package.registry(database, create=True) as tools:
+        tools.add(done.folder / "tool.json")
+    (tmp_path / "S").mkdir()
+    opening.keep_previous(tmp_path / "S", database, "T-1", simulated=False)
+    previous = (tmp_path / "S/previous.json").read_bytes()
+    (tmp_path / "S/previous.json").unlink()
+    (tmp_path / "S").rmdir()
+    assert json.loads(previous)["sha256"] == before["sha256"]
+    key = key_of(tmp_path, "A. Example")
+    session = to_the_verdict(finished, tmp_path / "S", registry=database, countersign=key)
+    assert session.as_found is None
+    (session.folder / "previous.json").write_bytes(previous)
+    session._judge()
+    expected = mwdcal_package.verify(
+        previous_of(tmp_path, previous), session.folder / "rolltest.csv", "roll-test"
+    )
+    assert [row.value for row in session.as_found.rows] == [row.value for row in expected.rows]
+    session.certify("C-2")
+    session.wait_for_fits()
+    certificate = json.loads((session.folder / "certificate.json").read_text())
+    assert certificate["as_found"]
+    assert session.waits_for_signature
+    with pytest.raises(InputError, match="nothing to enter"):
+        session.enter()
+    with pytest.raises(InputError, match="that of the operator"):
+        session.sign()
+    key.unlink()
+    (tmp_path / "k.key.pub").unlink()
+    session.countersign = key_of(tmp_path, "B. Second")
+    session.sign()
+    session.wait_for_fits()
+    assert "registry" in session.papers
+    checked = mwdcal(
+        "certificate",
+        "verify",
+        session.folder / "certificate.json",
+        "--key",
+        tmp_path / "k.key.pub",
+    )
+    assert checked.code == 0, checked
+    with pytest.raises(InputError, match="waits for a signature"):
+        session.sign()
+    session.close()
+
+
+def previous_of(folder, data):
+    (folder / "before.json").write_bytes(data)
+    return mwdcal_package.load(folder / "before.json")
+
+
+def test_the_tool_of_a_registry_brings_its_profile(finished, tmp_path):
+    """Its past is shown, newest first, and its profile is that of its latest calibration."""
+    done, *_ = finished
+    database = str(tmp_path / "tools.sqlite")
+    with mwdcal_package.registry(database, create=True) as tools:
+        tools.add(done.folder / "tool.json", done.folder / "run.csv")
+    folder = tmp_path / "S"
+    folder.mkdir()
+    (folder / "tool.toml").write_bytes(SERVO.read_bytes())
+    servo, test = load_profile(SERVO), opening.rolltest_plan()
+    session = BenchSession(
+        folder, servo, opening.session_plan(servo, PLAN), test, registry=database
+    )
+    with pytest.raises(InputError, match="no calibration of this tool"):
+        session.start("T-1", tool="registry")
+    session.choose("T-1")
+    assert {each.kind for each in session.past.records} == {"calibration", "run"}
+    with pytest.raises(InputError, match="serial"):
+        session.start(" ", tool="registry")
+    session.start("T-1", tool="registry", plan="moosavi-12")
+    assert session.profile == load_profile(folder / "tool.toml") == done.profile
+    assert session.plan.name == "moosavi-12"
+    session.close()
+
+
+def test_an_own_profile_and_an_own_plan(tmp_path):
+    session = session_in(tmp_path / "S", start=False)
+    with pytest.raises(InputError, match="axes"):
+        session.start("T-1", tool_text='name = "x"\n[accelerometer]\naxes = ["+x"]\n')
+    assert session.profile.name == load_profile(TOOL).name
+    plan = "ref_inclination_deg,ref_azimuth_deg,ref_toolface_deg\n" + "10,20,30\n40,50,60\n" * 6
+    with pytest.raises(InputError, match=r"\.csv"):
+        session.start("T-1", plan_file=("mine.exe", plan))
+    own = TOOL.read_text().replace('name = "', 'name = "own ', 1)
+    session.start("T-1", tool_text=own, plan_file=("mine.csv", plan))
+    assert load_profile(session.folder / "tool.toml").name.startswith("own ")
+    assert session.plan.name == "mine"
+    assert session.part.attitude(1) == (40.0, 50.0, 60.0)
+    session.close()
+
+
+@pytest.mark.slow
+def test_the_fewest_stations_reach_the_accuracy():
+    profile = load_profile(SERVO)
+    plan = opening.session_plan(profile, "azimuth_deg=0.05")
+    assert plan.accuracy_deg["azimuth"] <= 0.05
+    rougher = opening.session_plan(profile, "azimuth_deg=0.2")
+    assert len(rougher.columns["ref_inclination_deg"]) <= len(plan.columns["ref_inclination_deg"])
+
+
 # ------------------------------------------------------------------ decisions
 
 

@@ -101,7 +101,11 @@ class Operator:
 @pytest.fixture
 def demo(tmp_path, browser):
     folder = tmp_path / "S"
+    key = tmp_path / "second.key"
+    created = mwdcal("certificate", "key", "create", "-o", key, "--owner", "B. Second")
+    assert created.code == 0, created
     laboratory = (
+        *("--countersign", key),
         "--laboratory",
         EXAMPLE / "laboratory.toml",
         "--registry",
@@ -138,7 +142,11 @@ def test_the_whole_story(demo, tmp_path):
     operator.button("Start roll test").click()
     operator.heading("^PASS")
     operator.button("Issue certificate").click()
+    operator.wait_for_status("Next: a second person checks the certificate")
+    faults += operator.look()
+    operator.button("Sign certificate").click()
     page.get_by_text("Registry:").wait_for(timeout=LONGEST)
+    page.get_by_text("Signed by: B. Second").wait_for(timeout=LONGEST)
     faults += operator.look()
     assert faults == []
     assert operator.complaints == []
@@ -185,6 +193,9 @@ def test_the_story_by_keyboard_alone(demo):
         if page.evaluate("document.activeElement.id") == "b-certificate":
             break
         page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    operator.button("Sign certificate").wait_for(timeout=LONGEST)
+    operator.button("Sign certificate").focus()
     page.keyboard.press("Enter")
     page.get_by_text("Registry:").wait_for(timeout=LONGEST)
     assert operator.complaints == []
@@ -250,6 +261,43 @@ def test_readings_by_hand(tmp_path, browser):
     page.get_by_label(re.compile("^Reading")).fill(rows[47])
     operator.button("Take reading").click()
     operator.wait_for_status("Next: Calibrate")
+    operator.context.close()
+    bench.stop()
+
+
+def test_a_tool_of_the_registry_and_an_own_plan(tmp_path, browser):
+    """The past of a tool is shown; its profile, and a plan by its file, are those of the session."""
+    database = tmp_path / "tools.sqlite"
+    fit = (
+        "calibrate",
+        EXAMPLE / "run.csv",
+        "--tool",
+        EXAMPLE / "tool.toml",
+        "-o",
+        tmp_path / "c.json",
+    )
+    for words in (fit, ("registry", "init"), ("registry", "add", tmp_path / "c.json")):
+        ran = mwdcal(*words, *(("--registry", database) if words[0] == "registry" else ()))
+        assert ran.code == 0, ran
+    serial = json.loads((tmp_path / "c.json").read_text())["tool"]["serial"]
+    plan = "ref_inclination_deg,ref_azimuth_deg,ref_toolface_deg\n" + "10,20,30\n40,50,60\n" * 6
+    (tmp_path / "mine.csv").write_text(plan)
+    bench = BenchProcess("--registry", database, folder=tmp_path / "S")
+    operator = Operator(browser, bench.url)
+    page = operator.page
+    page.get_by_label("Operator").fill("A. First")
+    operator.button(f"Choose {serial}").click()
+    page.get_by_role("heading", name=f"Past of {serial}").wait_for(timeout=LONGEST)
+    page.locator("summary").click()
+    assert operator.look() == []
+    assert page.get_by_label("Serial of the tool").input_value() == serial
+    assert page.get_by_label("Operator").input_value() == "A. First"
+    assert page.locator("#f-tool").input_value() == "registry"
+    page.get_by_label("Your own plan").set_input_files(tmp_path / "mine.csv")
+    operator.button("Start").click()
+    operator.wait_for_status(r"^Station 1\. Go to inclination 10°, toolface 30°, azimuth 20°")
+    assert "mine" in page.inner_text("[data-part=head]")
+    assert operator.complaints == []
     operator.context.close()
     bench.stop()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -9,21 +10,24 @@ from typing import TYPE_CHECKING, Any
 
 import mwdcal
 from mwdcal.bench.opening import PREVIOUS_FILE
+from mwdcal.calibration.diagnosis.findings import LARGEST_DEVIATION
+from mwdcal.calibration.diagnosis.flags import spaced
+from mwdcal.calibration.residuals import REASONS, shown_in
 from mwdcal.calibration.results import typical_accuracy
 from mwdcal.errors import FitError, InputError, MwdcalError
 from mwdcal.files.profiles import setting
+from mwdcal.geometry.observables import TITLES
+from mwdcal.presentation.numbers import signed
 
 if TYPE_CHECKING:
     from threading import RLock
 
     from mwdcal.calibration.readings import Readings
-    from mwdcal.calibration.record import Calibration
+    from mwdcal.calibration.record import Calibration, StationRow
     from mwdcal.use.verification import Verdict
 
 FEWEST_STATIONS = 8
 """Stations before which no fit is tried."""
-REMEASURE = "reshoot"
-"""The finding that names a station to measure again."""
 AS_FOUND = "as-found.json"
 ENTERED = ("tool.json", "verification.json", "certificate.json")
 """Files of the session that go into the registry."""
@@ -72,8 +76,17 @@ def _fitted(calibration: Calibration) -> RunFit:
 
 
 def _to_remeasure(calibration: Calibration) -> dict[str, str]:
-    findings = calibration.findings
-    return {each.station: each.text for each in findings if each.id == REMEASURE and each.station}
+    relative = "field-unknown" in {finding.id for finding in calibration.findings}
+    return {row.station: _misfit(row, relative) for row in calibration.station_rows if row.reshoot}
+
+
+def _misfit(row: StationRow, relative: bool) -> str:
+    """The fault of a station, in words."""
+    worst = row.worst or "gravity"
+    _, unit = shown_in(worst, relative)
+    size = f"{min(row.deviation, LARGEST_DEVIATION):.1f}"
+    value = f"{signed(row.errors.get(worst, math.nan), 2)}{spaced(unit)}"
+    return f"off by {size}σ, mostly in {TITLES.get(worst, worst)} ({value}): {REASONS[worst]}"
 
 
 def _suspects(readings: Readings) -> dict[str, str]:

@@ -27,14 +27,14 @@ PREVIOUS_FILE = "previous.json"
 """The latest calibration of the tool before this session."""
 FROM_REGISTRY = "registry"
 """Stands for the profile of the latest calibration, where a tool profile is chosen."""
-ACCURACIES = ("inclination_deg", "toolface_deg", "azimuth_deg")
+PLANNED_ANGLES = ("inclination_deg", "toolface_deg", "azimuth_deg")
 PLAN_SUFFIXES = (".toml", ".csv", ".tsv", ".txt")
 """Suffixes of a plan that is given on the page."""
 
 
 @dataclass(frozen=True)
 class ToolPast:
-    """What a registry holds of a tool: its records, newest first, when it is due, and its latest profile, if any."""
+    """The past of a tool in a registry: its records, newest first, when it is due, and its latest profile, if any."""
 
     serial: str
     records: Sequence[Any]
@@ -64,7 +64,7 @@ def past_of(registry: str | None, serial: str) -> ToolPast:
     if registry is None or not is_there(registry):
         raise InputError("no registry is named, so no tool has a past. Type the serial.")
     with mwdcal.registry(registry) as tools:
-        records = tools.history(serial).rows[::-1]
+        records = tools.history(serial, limit=1000).rows[::-1]
         listed = [tool for tool in tools.list(search=serial).rows if tool.serial == serial]
         try:
             profile = tools.latest(serial).profile
@@ -74,7 +74,7 @@ def past_of(registry: str | None, serial: str) -> ToolPast:
 
 
 def keep_previous(folder: Path, registry: str | None, serial: str, simulated: bool) -> None:
-    """Copy the latest calibration of a tool from the registry, if there is one: the roll test as found needs it.
+    """Copy the latest calibration of a tool from the registry, if there is one: the roll test as pairs needs it.
 
     Simulated and real readings do not mix: one of the other kind stays where it is.
     """
@@ -89,10 +89,10 @@ def keep_previous(folder: Path, registry: str | None, serial: str, simulated: bo
             tools.get(serial, folder / PREVIOUS_FILE)
 
 
-def choose_profile(folder: Path, name: str, own: str, past: ToolPast | None) -> Profile:
-    """Write the tool profile of the session: an `own` text, else that of the registry, else the one of a name."""
-    if own:
-        data = own.encode()
+def choose_profile(folder: Path, name: str, text: str, past: ToolPast | None) -> Profile:
+    """Write the tool profile of the session: that of a `text`, else that of the registry, else the one of a name."""
+    if text:
+        data = text.encode()
     elif name == FROM_REGISTRY:
         if past is None or past.profile is None:
             raise InputError(
@@ -123,7 +123,7 @@ def _stated(fields: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in pairs if value is not None}
 
 
-def own_plan(folder: Path, name: str, text: str, profile: Profile) -> SessionPlan:
+def plan_of_text(folder: Path, name: str, text: str, profile: Profile) -> SessionPlan:
     """A plan that is given on the page, as a file of the session."""
     suffix = Path(name).suffix.lower()
     if suffix not in PLAN_SUFFIXES:
@@ -159,11 +159,11 @@ def session_plan(profile: Profile, name: str) -> SessionPlan:
 
 def _accuracy(name: str) -> dict[str, float]:
     """The accuracies in a name such as "azimuth_deg=0.05,inclination_deg=0.1"; none if it is another."""
-    found = re.findall(r"([a-z_]+)=(\d*\.?\d+)(?:,|$)", name)
-    is_one = found and name == ",".join(f"{key}={value}" for key, value in found)
-    if not is_one or not {key for key, _ in found} <= {*ACCURACIES}:
+    pairs = re.findall(r"([a-z_]+)=(\d*\.?\d+)(?:,|$)", name)
+    is_one = pairs and name == ",".join(f"{key}={value}" for key, value in pairs)
+    if not is_one or not {key for key, _ in pairs} <= {*PLANNED_ANGLES}:
         return {}
-    return {key.removesuffix("_deg"): float(value) for key, value in found}
+    return {key.removesuffix("_deg"): float(value) for key, value in pairs}
 
 
 def rolltest_plan() -> SessionPlan:

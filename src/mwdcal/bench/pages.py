@@ -41,7 +41,7 @@ SHOWN_RECORDS = 12
 STAND_REFERENCES = ("gravity_g", "field_nt", "dip_deg")
 NOT_OF_RUNS = ("candidates", "roll-test")
 """Built-in plans that are not the plan of a run."""
-FEWEST = "fewest"
+FEWEST_PLAN = "fewest"
 """The plan of the fewest stations for an accuracy, in the form."""
 BEST = ("best-12", "best-24", "best-48")
 """Plans that mwdcal chooses for the tool."""
@@ -139,7 +139,7 @@ def _start_form(session: BenchSession) -> dict[str, Any]:
     shown = [(name, name) for name in dict.fromkeys(plans)]
     return {
         "serial": past.serial if past else "DEMO-1" if session.simulated else "",
-        "chosen": past.serial if past else "", "plans": [shown[0], (FEWEST, texts()["fewest"]), *shown[1:]],
+        "chosen": past.serial if past else "", "plans": [shown[0], (FEWEST_PLAN, texts()["fewest"]), *shown[1:]],
         "profiles": _profiles(session), "past": _past(past),
         "earth": [
             (name, number(session.earth[name], 6) if name in session.earth else "") for name in STAND_REFERENCES

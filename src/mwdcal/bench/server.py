@@ -89,9 +89,9 @@ class Bench:
         self.stop = Event()
         self.reader = Thread(target=self._read, name="bench source", daemon=True)
         self._fragment: tuple[int, str] = (-1, "")
-        self.table = table = DroppedTable(
-            session.folder / "table", session.registry, session.laboratory
-        )
+        entered = None if session.countersign else session.registry  # not before the signature
+        folder = session.folder / "table"
+        self.table = table = DroppedTable(folder, entered, session.laboratory)
         self._tables: dict[str, Callable[[Mapping[str, str], bytes], None]] = {
             "file": lambda form, data: table.drop(form.get("name", ""), data),
             "rolltest": lambda form, data: table.drop_rolltest(form.get("name", ""), data),
@@ -155,17 +155,17 @@ class Bench:
             form.get(name, "")[:100]
             for name in ("serial", "operator", "plan", "tool", "own_plan_name")
         )
-        if plan == pages.FEWEST:
+        if plan == pages.FEWEST_PLAN:
             plan = self._fewest(form)
-        own = file, form.get("own_plan", "")
+        plan_file = file, form.get("own_plan", "")
         self.session.start(
             serial,
             operator,
             plan,
             earth,
             tool=tool,
-            own_tool=form.get("own_tool", ""),
-            own_plan=own,
+            tool_text=form.get("own_tool", ""),
+            plan_file=plan_file,
         )
 
     def _fewest(self, form: Mapping[str, str]) -> str:

@@ -270,20 +270,20 @@ class BenchSession:
         if self.facts:
             raise InputError("the session has begun already.")
 
-    def _chosen_plan(self, profile: Profile, name: str, own: tuple[str, str]) -> SessionPlan:
-        """The plan of a name, or an `own` one by its name and text."""
-        if own[1]:
-            return opening.own_plan(self.folder, *own, profile)
+    def _chosen_plan(self, profile: Profile, name: str, file: tuple[str, str]) -> SessionPlan:
+        """The plan of a name, or one from a file, by its name and text."""
+        if file[1]:
+            return opening.plan_of_text(self.folder, *file, profile)
         is_other = name not in ("", self.plan.name) or profile is not self.profile
         return opening.session_plan(profile, name or self.plan.name) if is_other else self.plan
 
     def start(
         self, serial: str, operator: str = "", plan: str = "", earth: Mapping[str, float | None] | None = None, *,
-        tool: str = "", own_tool: str = "", own_plan: tuple[str, str] = ("", ""),
+        tool: str = "", tool_text: str = "", plan_file: tuple[str, str] = ("", ""),
     ) -> None:  # fmt: skip
         """Begin: the tool's serial, who measures, the plan, and gravity, field and dip where they are known.
 
-        `tool` is another profile by its name, `own_tool` the text of one, `own_plan` name and text of a plan.
+        `tool` is another profile by its name, `tool_text` the text of one, `plan_file` name and text of a plan.
         """
         if not (serial := serial.strip()):
             raise InputError(
@@ -292,9 +292,9 @@ class BenchSession:
         with self._starting:
             self._check_new()
             profile = self.profile
-            if (tool or own_tool) and not self.simulated:
-                profile = opening.choose_profile(self.folder, tool, own_tool, self.past)
-            chosen = self._chosen_plan(profile, plan, own_plan)
+            if (tool or tool_text) and not self.simulated:
+                profile = opening.choose_profile(self.folder, tool, tool_text, self.past)
+            chosen = self._chosen_plan(profile, plan, plan_file)
             opening.keep_previous(self.folder, self.registry, serial, self.simulated)
             self._begin(serial, operator, earth or {}, profile, chosen)
 

@@ -49,7 +49,7 @@ RANDOM_WALK_FREEDOM = 2.5
 """Degrees of freedom of the variance of a random walk about its mean: (Σ 1/k²)²/Σ 1/k⁴."""
 MOST_BLOCKS = 20
 """Blocks of cells in which a trend is looked for."""
-LEARNED = 9
+LEAST_CHANGES = 9
 """Changes from cell to cell before which no standstill is believed."""
 REMEMBERED = 64
 """Standstills whose noise is remembered."""
@@ -77,7 +77,7 @@ class HalfSecond:
         return np.frombuffer(self.values).reshape(len(self.times), -1)
 
 
-class Cell(NamedTuple):
+class StreamCell(NamedTuple):
     """A whole half second: its samples, the means of all channels, and of each sensor the scatter and the roughness."""
 
     samples: HalfSecond
@@ -86,8 +86,8 @@ class Cell(NamedTuple):
     rough: Array
 
 
-class Noise(NamedTuple):
-    """Noise of the cell means of a standstill: variance of each sensor, and correlation of neighbours in each triad."""
+class RestNoise(NamedTuple):
+    """Noise of the cell means of a standstill: its variance in each sensor, and its correlation in each triad."""
 
     variance: Array
     correlation: Array
@@ -106,15 +106,15 @@ class Settling:
         self.sensors, self.window = sensors, window
         self.least = np.array([*least] or [0.0] * sensors, dtype=float)
         self.step = [inf] * sensors
-        self.still: list[Cell] = []
+        self.still: list[StreamCell] = []
         self.recent: deque[tuple[Array, Array, Array]] = deque(maxlen=LATEST)
-        self.past: deque[Noise] = deque(maxlen=REMEMBERED)
+        self.past: deque[RestNoise] = deque(maxlen=REMEMBERED)
         self.time = -inf
         self.moves = 0
         self._open: HalfSecond | None = None
-        self._last: Cell | None = None
+        self._last: StreamCell | None = None
         self._before: Sequence[float] = ()
-        self._noise: Noise | None = None
+        self._noise: RestNoise | None = None
         self.wanders = False
 
     def take(self, time: float, values: Sequence[float]) -> None:
@@ -144,12 +144,12 @@ class Settling:
                 self.step[place] = abs(a - b)
         self._before = values
 
-    def _closed(self, samples: HalfSecond) -> Cell:
+    def _closed(self, samples: HalfSecond) -> StreamCell:
         table = samples.table
         sensors = table[:, : self.sensors]
         order = min(SMOOTH, len(table) - 1)
         rough = np.sqrt(np.mean(np.diff(sensors, order, axis=0) ** 2, 0) / comb(2 * order, order))
-        return Cell(samples, table.mean(0), sensors.std(0, ddof=1), rough)
+        return StreamCell(samples, table.mean(0), sensors.std(0, ddof=1), rough)
 
     def _end(self) -> None:
         """The standstill is over. The noise of one that had settled is remembered."""
@@ -158,7 +158,7 @@ class Settling:
             self.past.append(self._noise)
         self.still, self._noise = [], None
 
-    def _judge(self, cell: Cell) -> None:
+    def _judge(self, cell: StreamCell) -> None:
         """Take a whole cell: into the standstill, or as the end of it."""
         last = self._last
         self._last = cell
@@ -168,7 +168,7 @@ class Settling:
             self._cut([*self.still, cell])
         self._look()
 
-    def _cut(self, cells: list[Cell]) -> None:
+    def _cut(self, cells: list[StreamCell]) -> None:
         """The standstill: the latest cells whose scatter and changes are those of rest, as it is known by now."""
         scatter, most = self._bounds(len(cells[-1].samples.times))
         means = np.array([cell.means[: self.sensors] for cell in cells])
@@ -182,7 +182,7 @@ class Settling:
         self.still = cells[max(first, len(cells) - int(4 * self.window / CELL_SECONDS)) :]
 
     def _bounds(self, count: int) -> tuple[Array, Array]:
-        """What the scatter of a cell, and the change to the next, do not exceed at rest (k,).
+        """The largest scatter of a cell, and the largest change to the next, at rest (k,).
 
         Both are seen as multiples of the roughness, which movement hardly changes, and are alike in a triad. Cells of
         correlated noise hold fewer independent samples than samples: as many as the change of their means tells, as
@@ -218,14 +218,14 @@ class Settling:
     def _look(self) -> None:
         """Drop the oldest cells until no sensor creeps; settled if what is left is long enough."""
         self._noise = None
-        while len(self.recent) >= LEARNED and self._is_long:
+        while len(self.recent) >= LEAST_CHANGES and self._is_long:
             noise, creeps = self._trend()
             if not creeps:
                 self._noise = noise
                 return
             del self.still[0]
 
-    def _trend(self) -> tuple[Noise, bool]:
+    def _trend(self) -> tuple[RestNoise, bool]:
         """The noise of the means about their trend, and whether that is more than it explains."""
         cells = np.array([cell.means[: self.sensors] for cell in self.still])
         count = len(cells)
@@ -242,7 +242,7 @@ class Settling:
         self.wanders = bool(np.any(correlation > exp(-2 / len(means))))
         place = np.repeat(form.place(correlation), TRIAD)[: self.sensors]
         samples = sum(len(cell.samples.times) for cell in self.still) / len(means)
-        noise = Noise(np.maximum(squares / form.left[place], self._floor**2 / samples), now)
+        noise = RestNoise(np.maximum(squares / form.left[place], self._floor**2 / samples), now)
         variance = np.mean([noise.variance, *(each.variance for each in earlier)], 0)
         freedom = form.freedom[place] * (1 + len(earlier))
         limit = student(freedom, FALSE_CREEP / trend.size) * np.sqrt(

@@ -378,7 +378,7 @@ def _summaries(traces: Traces, start: Array, end: Array, findings: list[Finding]
 
 
 def means_of(rests: Mapping[str, Sequence[Trace]], steps: Mapping[str, float]) -> Rows:
-    """What each channel read at its standstills, by their samples and the steps of readings; as for a log.
+    """Readings of each channel at its standstills, by their samples and the steps of readings; as for a log.
 
     A step is 0 where none is known.
     """
