@@ -342,6 +342,7 @@ def _several(tables: Sequence[Layout], source: str, sheet: str) -> QuestionError
 def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
     """The tables of a sheet, one below the other: a head is no row of readings, and the next row is one."""
     rows = [row for row in sheet.rows if not _is_ruler(row[1])]
+    rows = [row for k, row in enumerate(rows) if not _is_remark_below_names(rows, k)]
     sheet = sheet._replace(rows=rows)
     readings = [_is_reading(row) for _, row in rows]
     heads = [
@@ -358,6 +359,20 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
 def _is_ruler(row: Cells) -> bool:
     """Whether a row is a line of dashes or the like."""
     return all(isinstance(cell, str) and re.fullmatch(r"[-=_*+|\s]*", cell) for cell in row)
+
+
+def _is_remark_below_names(rows: Sequence[tuple[int, Cells]], place: int) -> bool:
+    """Whether a row is a remark between the names of a table and its readings."""
+    if not 0 < place < len(rows) - 1 or not _is_reading(rows[place + 1][1]):
+        return False
+    row, above = rows[place][1], rows[place - 1][1]
+    short = sum(cell != "" for cell in row) < min(LEAST_COLUMNS - 1, _texts(above))
+    return (
+        short
+        and _texts(above) >= LEAST_COLUMNS
+        and not _is_reading(above)
+        and not titles([row]).metadata
+    )
 
 
 def _begins_anew(rows: Sequence[tuple[int, Cells]], heads: Sequence[int], place: int) -> bool:
@@ -657,13 +672,21 @@ def _is_mean(row: Cells, above: Sequence[Cells]) -> bool:
     """Whether numbers of a row are the means of the columns above, in four columns that vary or more."""
     equal = varied = 0
     for place, cell in enumerate(row):
-        column: Array = np.array(
-            [r[place] for r in above if place < len(r) and isinstance(r[place], float | int)], float
-        )
-        if isinstance(cell, float | int) and len(column) > 2 and np.ptp(column) > 0:
+        numbers = (_number(r[place]) for r in above if place < len(r))
+        column: Array = np.array([n for n in numbers if n is not None], float)
+        value = _number(cell)
+        if value is not None and len(column) > 2 and np.ptp(column) > 0:
             varied += 1
-            equal += bool(abs(cell - column.mean()) < 1e-6 * np.ptp(column))
+            last = 10.0 ** -len(f"{cell}".replace(",", ".").partition(".")[2]) / 2
+            near = max(1e-6 * np.ptp(column), min(last, 1e-3 * np.ptp(column)))
+            equal += bool(abs(value - column.mean()) <= 1.01 * near)
     return varied >= LEAST_COLUMNS and equal >= varied - 1
+
+
+def _number(cell: object) -> float | None:
+    """The number that a cell is, with either decimal sign; None of one with separators of thousands or with a unit."""
+    text = as_text(cell).replace(",", ".")
+    return float(text) if looks_numeric(text) else None
 
 
 def as_columns(layout: Layout, labels: Collection[str] = ()) -> dict[str, list[str]]:
