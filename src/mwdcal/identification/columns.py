@@ -306,6 +306,8 @@ _SURROUNDINGS = re.compile(
 """What has a temperature of its own that is not the tool's."""
 COOLEST_FAHRENHEIT = 45.0
 """Numbers below it are degrees Celsius: no tool is calibrated below 7 °C alone."""
+COLDEST_KELVIN = 200.0
+"""Numbers below it are no kelvins: hardly a tool works below -73 °C."""
 HOTTEST_CELSIUS = 200.0
 """Numbers above it may be degrees Fahrenheit: hardly a tool works above 200 °C."""
 
@@ -530,7 +532,6 @@ def proposed(
         if not {*channels} & {*chosen, *said}:
             others = [n for n in names if n not in meanings]
             questions.ask(_check_hidden, triad, channels, others, values, source)
-    nameless = not {*RAW[:3]} & {*chosen}
     hidden = any("channels of the accelerometer" in each.text for each in questions)
     if not hidden and not any(n in damaged for n, m in meanings.items() if m.column in RAW):
         questions.ask(_check_triads, names, values, chosen, source)
@@ -538,8 +539,8 @@ def proposed(
     beside = any("side by side" in each.text for each in questions)
     if not beside and not {*RAW[3:]} & {*chosen, *said}:
         believed = (
-            () if nameless else questions.believed()
-        )  # of two nameless triads either may be either
+            questions.believed() if {*RAW[:3]} & {*chosen} else ()
+        )  # else either may be either
         others = [n for n in names if n not in meanings and n not in believed]
         questions.ask(_check_nameless, others, values, {*chosen, *known}, source)
     rest = {n: u for n, u in zip(names, units, strict=True) if n not in meanings}
@@ -953,6 +954,8 @@ def _check_range(column: str, name: str, unit: str, values: Array | None, source
         fits = ["rad"] if np.ptp(known) > 3 else []
     if unit == "°C" and known.min() > HOTTEST_CELSIUS:
         fits = ["K"]
+    if unit == "K" and known.max() < COLDEST_KELVIN:
+        fits = ["°C", "°F"]
     if fits and unit not in fits:
         raise QuestionError(
             f"{source}: {shown(name)} is in {unit}, and its values ({first_values(known)}) are those of "

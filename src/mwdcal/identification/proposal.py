@@ -24,7 +24,7 @@ from mwdcal.files.contract import CHANNELS, MAPPED, RANGES, RAW, REFERENCES, uni
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, looks_numeric, shown
 from mwdcal.files.formats.figures import is_figure
-from mwdcal.files.formats.layout import NO_VALUE, WORKBOOKS, Layout
+from mwdcal.files.formats.layout import WITHOUT_VALUE, WORKBOOKS, Layout
 from mwdcal.files.formats.table import Table, cell_error, labels, numbers
 from mwdcal.files.formats.table import labels as labels_of
 from mwdcal.files.formats.text import is_preamble
@@ -358,7 +358,9 @@ def _cells_without_reading(
     only = (each.answers[0].arguments for each in questions if len(each.answers) == 1)
     for arguments in only:
         pairs = [text.partition("=") for option, text in arguments if option == "leave_out"]
-        if len(pairs) == len(arguments) and all(NO_VALUE.fullmatch(cell) for *_, cell in pairs):
+        if len(pairs) == len(arguments) and all(
+            WITHOUT_VALUE.fullmatch(cell) for *_, cell in pairs
+        ):
             for name, _, cell in pairs:
                 every.setdefault(name, []).append(cell)
     return {} if every == {**leave_out} else every
@@ -847,8 +849,8 @@ def _check_sense(
         wirings, open_axes = _wirings(run, turned, scaled)
     except FitError:
         return
-    told = len(wirings) == len(TRIADS) and not open_axes
-    if told and not all(map(_is_left_handed, wirings.values())):  # else another angle is turned
+    sound = len(wirings) == len(TRIADS) and not open_axes
+    if sound and not all(map(_is_left_handed, wirings.values())):  # else another angle is turned
         raise QuestionError(
             f"{run.source}: the readings fit only if {shown(source.name)} counts anticlockwise looking down the hole. "
             "Does it?",

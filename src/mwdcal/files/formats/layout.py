@@ -60,7 +60,7 @@ _DEGREES_OF = re.compile(
     re.IGNORECASE,
 )
 """The name of a column of degrees, or of minutes."""
-NO_VALUE = re.compile(r"n/?a|n\.a\.?|nan|null|none|[\W_]*", re.IGNORECASE)
+WITHOUT_VALUE = re.compile(r"n/?a|n\.a\.?|nan|null|none|[\W_]*", re.IGNORECASE)
 """A cell that says that there is no value."""
 _BRACKETS = re.compile(r"[(\[][^)\]]*[)\]]")
 
@@ -92,7 +92,8 @@ _OF_VOID_RUN = re.compile(
 """Words of the name of a sheet, or of the line above a table, of a run that does not count."""
 _OF_ROLL_TEST = re.compile(
     r"(?<![^\W\d_])(roll[\s_-]*(test|over|check)|rt|verif\w*|check|valid\w*|(roll)?pr(ue|ü)fung|"
-    r"[ck]ontrol\w*[- ]?(run|shot|test|roll|messung|dreh|måling|rull)\w*|rulletest|prueba|(essai|test)s? (en|de) (roulis|rotation)|провер\w*|повер\w*|"
+    r"[ck]ontrol\w*[- ]?(run|shot|test|roll|messung|dreh|måling|rull)\w*|rulletest|prueba|"
+    r"(essai|test)s? (en|de) (roulis|rotation)|провер\w*|повер\w*|"
     r"контрольн\w* (вращ|замер|измер)\w*)(?![^\W\d_])|验证|检验|複測|复测",
     re.IGNORECASE,
 )
@@ -658,7 +659,7 @@ def _without_summary(rows: Sequence[tuple[int, Cells]]) -> list[tuple[int, Cells
 
 def _is_blank(cell: object) -> bool:
     """Whether a cell is blank or says that there is no value: ---, n/a."""
-    return isinstance(cell, str) and bool(NO_VALUE.fullmatch(cell))
+    return isinstance(cell, str) and bool(WITHOUT_VALUE.fullmatch(cell))
 
 
 def _is_summary(row: Cells, width: int) -> bool:
