@@ -11,7 +11,9 @@ from laboratories import laboratories, mutated
 from mwdcal.errors import InputError
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats import workbook
-from mwdcal.files.runs import read_export, renamed
+from mwdcal.files.formats.title_references import doubtful_in, references_in
+from mwdcal.files.formats.titles import titles
+from mwdcal.files.runs import read_export, run_table
 
 LABORATORIES = {each.name: each for each in laboratories()}
 OPEN = {
@@ -30,7 +32,7 @@ FACTS = ("serial", "date")
 def taken(path):
     """The table of a laboratory under the names of a run file, by the profile proposed for it."""
     profile = mwdcal.propose_profile(path).profile
-    return renamed(read_export(path, profile), profile)
+    return run_table(read_export(path, profile), profile)
 
 
 def differences(run, truth):
@@ -66,6 +68,59 @@ def test_an_error_in_a_cell_of_any_workbook_names_its_row(tmp_path):
     path = tmp_path / laboratory.file
     path.write_bytes(laboratory.content)
     assert ", row " in str(tables.cell_error(taken(path), "gx", 0, "no number"))
+
+
+@pytest.mark.parametrize(
+    ("line", "dip"),
+    [
+        ("Ref|50400 nT||70.00 deg dip||9.8170 m/s2", 70.0),
+        ("#REF: 50400 nT / 70.00 deg / 9.8170 m/s2", 70.0),
+        ("Feld 50400 nT, Inkl. 70,00°, g 9,8170", 70.0),
+        ("FIELD 50400 NT||DIP 70.00||G 9.8170", 70.0),
+        ("T. Leblanc||Bt=50400 nT; Inkl=70,00 Grad; g=9,8170 m/s2", 70.0),
+        ("F (µT)|50,4||Incl. (°)|70||g (m/s²)|9,817", 70.0),
+        ("Field 50400 nT, dip 70.00 deg up, g 9.8170", -70.0),
+        ("磁场强度(nT)|50400|磁倾角|70.0°|重力加速度(m/s2)|9.8170", 70.0),
+    ],
+)
+def test_the_references_of_a_place_stand_in_one_line(line, dip):
+    stated = references_in([line.split("|")])
+    assert stated == {
+        "ref_field_nt": 50400.0,
+        "ref_dip_deg": dip,
+        "ref_gravity_g": pytest.approx(9.8170 / 9.80665),
+    }
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "Cradle inclination 90 deg, field 50400 nT",
+        "50400 nT / 3.5 deg declination / 9.8170 m/s2",
+        "sensor range 60000 nT, 9.81 m/s2, 45 deg",
+        "Inc 45 deg",
+    ],
+)
+def test_another_angle_is_no_dip(line):
+    assert "ref_dip_deg" not in references_in([[line]])
+
+
+def test_a_reference_that_is_not_understood_is_named():
+    assert doubtful_in([["Geomagnet 50400 nT"]]) == {"ref_field_nt": "Geomagnet 50400 nT"}
+
+
+@pytest.mark.parametrize(
+    ("cells", "serial"),
+    [
+        (["Sonde", "SD-9 n° 112"], "112"),
+        (["Ferramenta: DIR-175 nº 44"], "44"),
+        (["Serial / الرقم التسلسلي", "SA-5520", "Date / التاريخ", "2024-01-22"], "SA-5520"),
+        (["Matricola", "IT-0914"], "IT-0914"),
+        (["инклинометр ИММН-42 зав. № 1187"], "1187"),
+    ],
+)
+def test_a_serial_is_the_one_behind_its_mark(cells, serial):
+    assert titles([cells]).metadata["serial"] == serial
 
 
 @pytest.mark.parametrize("sign", [";", "point"])
@@ -145,3 +200,58 @@ def test_no_mutation_changes_a_number_in_silence(tmp_path):
         wrong += [(changed.name, changed.mutation, off)] if off else []
     assert wrong == []
     assert read > 30
+
+
+def test_tools_side_by_side_are_asked_about_one_by_one(tmp_path):
+    """The answers take all channels of one tool; neither tool is believed to have channels of the other."""
+    rows = (EXAMPLE / "run.csv").read_text("utf-8").splitlines()
+    body = [row.split(",") for row in rows if row and not row.startswith("#")]
+    names = body[0]
+    raw = [names.index(f"{triad}{axis}") for triad in "am" for axis in "xyz"]
+    ends = ["Gx", "Gy", "Gz", "Bx", "By", "Bz"]
+    angles = [names.index(f"ref_{n}_deg") for n in ("inclination", "azimuth", "toolface")]
+    head = ["Inc", "Azi", "TF", *(f"S/N {tool} {end}" for tool in ("11A", "12B") for end in ends)]
+    cells = [[*(r[k] for k in angles), *(r[k] for k in raw * 2)] for r in body[1:]]
+    path = tmp_path / "two.csv"
+    path.write_text("\n".join(map(",".join, [head, *cells])), "utf-8")
+    with pytest.raises(mwdcal.FitError, match="stand side by side: 'S/N 11A', 'S/N 12B'") as error:
+        mwdcal.propose_profile(path)
+    assert "ax=S/N 11A Gx" in str(error.value)
+    columns = {f"{'am'[k // 3]}{'xyz'[k % 3]}": f"S/N 12B {end}" for k, end in enumerate(ends)}
+    assert mwdcal.propose_profile(path, column=columns).profile.columns["mz"].name == "S/N 12B Bz"
+
+
+def test_angles_in_gons_under_degrees_are_named(tmp_path):
+    path = tmp_path / "run.csv"
+    names, *rows = [
+        row.split(",")
+        for row in (EXAMPLE / "run.csv").read_text("utf-8").splitlines()
+        if not row.startswith("#")
+    ]
+    place = names.index("ref_inclination_deg")
+    for row in rows:
+        row[place] = repr(float(row[place]) / 0.9)
+    path.write_text("\n".join(map(",".join, [names, *rows])), "utf-8")
+    proposal = mwdcal.propose_profile(path)
+    assert proposal.profile.columns["ref_inclination_deg"].unit == "gon"
+    assert "told-by-readings" in [finding.id for finding in proposal.findings]
+
+
+def test_a_total_that_varies_is_no_reference_beside_the_field_of_the_place(tmp_path):
+    """A channel of another scale hides that the column is computed; the field of a place hardly varies."""
+    names, *rows = [
+        row.split(",")
+        for row in (EXAMPLE / "run.csv").read_text("utf-8").splitlines()
+        if not row.startswith("#")
+    ]
+    place = names.index("ref_field_nt")
+    names[place] = "Btot (nT)"
+    for k, row in enumerate(rows):
+        row[place] = str(49000 + 700 * (k % 3))
+    path = tmp_path / "run.csv"
+    path.write_text(
+        "\n".join(map(",".join, [["Total field (nT)", "50000"], names, *rows])), "utf-8"
+    )
+    proposal = mwdcal.propose_profile(path)
+    assert "ref_field_nt" not in proposal.profile.columns
+    assert "not-used" in [finding.id for finding in proposal.findings]

@@ -59,6 +59,8 @@ _REGULAR = 0.8
 """Share of equal steps of numbered rows."""
 _FEW = 4
 """Values of a column that a question shows."""
+_OF_PLACE = 0.01
+"""By how much the field or gravity of a place varies at most, as a share."""
 _STEADY_DIP, _STEADY_FIELD = 3.0, 0.1
 """A dip varies by less at one place, degrees, and a field by a smaller share."""
 STEADY_NORM = 0.15
@@ -247,7 +249,7 @@ _NO_STAND = re.compile(
     r"check|fehler|abw\w*|feil|avvik|desv\w*|erro\w*|ecart|погрешн\w*|откл\w*)\b|误差|偏差",
     re.IGNORECASE,
 )
-"""Words of columns of angles that are none of the stand."""
+"""Words of columns of angles that do not belong to the stand."""
 _NOMINAL = re.compile(
     r"\b(nominal|target|set|setpoint|soll\w*|задан\w*|номинал\w*)\b|设定|目标", re.IGNORECASE
 )
@@ -519,7 +521,7 @@ def proposed(
     _tell_temperature(meanings, names, units, values)
     said, known = answers or {}, stated or {}
     _tell_numbers(meanings, values, said)
-    ignored = _no_evidence(meanings, values, said)
+    ignored = _no_evidence(meanings, values, said, known)
     _answered(said, names, meanings, source)
     questions = Questions(besides)
     damaged = {} if problems is None else problems  # filled while values are read
@@ -600,12 +602,15 @@ def _chosen(
 
 
 def _no_evidence(
-    meanings: Mapping[str, Resemblance], values: Values, answers: Mapping[str, str]
+    meanings: Mapping[str, Resemblance],
+    values: Values,
+    answers: Mapping[str, str],
+    stated: Collection[str],
 ) -> dict[str, str]:
     """Columns that are named like references but hold no references, each with the reason.
 
-    That is what the user excludes; totals computed from the channels; and rolls in whole degrees beside no other
-    angle of the stand, which are nominal.
+    That is what the user excludes; totals computed from the channels, and those that vary beside the one `stated`
+    for the place; and rolls in whole degrees beside no other angle of the stand, which are nominal.
     """
     ignored = {}
     called = {m.column for m in meanings.values()}
@@ -617,12 +622,23 @@ def _no_evidence(
             continue
         elif _is_total(m.column, name, meanings, values):
             ignored[name] = "it is computed from the channels"
+        elif m.column in stated and _varies(m.column, name, values(name)):
+            ignored[name] = (
+                "it varies from station to station, and the title states that of the place"
+            )
         elif m.column == REFERENCES["toolface"].column and lone and _is_whole(values(name)):
             ignored[name] = (
                 f"its rolls are nominal, in whole degrees without other angles of the stand; if they were set, say so "
                 f"by `column` {m.column}={name!r}"
             )
     return ignored
+
+
+def _varies(column: str, name: str, values: Array | None) -> bool:
+    """Whether a strength that is not called a reference varies by more than that of a place does."""
+    if values is None or column not in RANGES_BY_UNIT or _CALLED_REFERENCE.search(spelled(name)):
+        return False
+    return bool(np.nanmax(values) - np.nanmin(values) > _OF_PLACE * np.nanmax(np.abs(values)))
 
 
 def _is_whole(values: Array | None) -> bool:

@@ -944,8 +944,8 @@ def references_not_taken(proposal: Proposal) -> list[Finding]:
     return [
         Finding(
             id="reference-not-taken",
-            text=f"{shown(line)} is nominal, and not taken as '{column}', which the run does not state otherwise. If "
-            "it holds, state it without that word, or in a column.",
+            text=f"{shown(line)} is nominal or unclear, and not taken as '{column}', which the run does not state "
+            "otherwise. If it holds, state it plainly, or in a column.",
         )
         for column, line in lines.items()
         if column not in named and column not in proposal.metadata

@@ -220,7 +220,7 @@ def _the_run(tables: Sequence[Layout]) -> Layout | None:
 
 
 def _kind(words: str) -> str:
-    """What a table is that is no run, by its sheet and the line above it; empty for a run."""
+    """A void run or a roll test, by the sheet of a table and the line above it; empty for a run."""
     kinds = (("void run", _OF_VOID_RUN), ("roll test", _OF_ROLL_TEST))
     return next((kind for kind, pattern in kinds if pattern.search(words)), "")
 

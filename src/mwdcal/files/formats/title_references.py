@@ -189,7 +189,7 @@ def _line(row: Sequence[object]) -> str:
 
 
 def _of_a_place(text: str) -> dict[str, float]:
-    """Field, dip and gravity in a line of all three, by their units; empty where the line is none.
+    """Field, dip and gravity in a line of all three, by their units; empty where one is absent.
 
     >>> _of_a_place("ref 50400 nt 70.00 deg 9.8170 m/s²")
     {'ref_field_nt': 50400.0, 'ref_gravity_g': 1.0010554062804322, 'ref_dip_deg': 70.0}
