@@ -29,9 +29,9 @@ TURNING = ("ref_azimuth_deg", "ref_toolface_deg")
 FACTS = ("serial", "date")
 
 
-def taken(path):
+def taken(path, **answers):
     """The table of a laboratory under the names of a run file, by the profile proposed for it."""
-    profile = mwdcal.propose_profile(path).profile
+    profile = mwdcal.propose_profile(path, **answers).profile
     return run_table(read_export(path, profile), profile)
 
 
@@ -255,3 +255,34 @@ def test_a_total_that_varies_is_no_reference_beside_the_field_of_the_place(tmp_p
     proposal = mwdcal.propose_profile(path)
     assert "ref_field_nt" not in proposal.profile.columns
     assert "not-used" in [finding.id for finding in proposal.findings]
+
+
+@pytest.mark.parametrize(
+    ("off", "repeats", "asked"), [(0.03, 1, True), (0.0002, 1, False), (0.03, 9, False)]
+)
+def test_two_readings_at_one_attitude_are_asked_about(tmp_path, off, repeats, asked):
+    """Not where they differ by noise, nor where repeated rows are usual; the second is believed."""
+    names, *rows = [
+        row.split(",")
+        for row in (EXAMPLE / "run.csv").read_text("utf-8").splitlines()
+        if not row.startswith("#")
+    ]
+    place, every, rows = names.index("ax"), [], [row for row in rows if all(row)]
+    for k, row in enumerate(rows):
+        row[0] = str(k)
+        again = [str(100 + k), *row[1:]]
+        again[place] = repr(float(row[place]) + 3 * off)
+        every += [row, again] if 5 <= k < 5 + repeats else [row]
+    path = tmp_path / "run.csv"
+    path.write_text("\n".join(map(",".join, [names, *every])), "utf-8")
+    if not asked:
+        mwdcal.propose_profile(path)
+        return
+    with pytest.raises(
+        mwdcal.FitError, match="at one attitude, and their readings differ"
+    ) as error:
+        mwdcal.propose_profile(path)
+    first, *_ = error.value.answers[0].arguments
+    assert first == ("leave_out", "station=5")
+    assert taken(path, leave_out={"station": ["5"]}).count == len(rows)
+    assert taken(path, keep={"station": ["5"]}).count == len(rows) + 1

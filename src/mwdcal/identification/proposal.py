@@ -398,6 +398,7 @@ def _proposal(
     profile = Profile(name=Path(path).stem, table=form or msgspec.UNSET, columns=columns)
     profile, readings, wirings, open_axes = _wired_by_elevation(table, profile)
     _check_gons(table, profile, wirings, answers)
+    _check_repeats(table, columns, form or TableFormat())
     name, triads = str(readings.metadata.get("serial", Path(path).stem)), _triads(readings, wirings)
     profile = msgspec.structs.replace(profile, name=name, **triads)
     return Proposal(
@@ -671,6 +672,46 @@ def _check_gons(
                 "Which unit holds?",
                 in_units(source.name, column, units),
             )
+
+
+_APART, _WARMER = 0.005, 3.0
+"""By how much readings at one attitude differ of which one is bad, as a share, and temperatures that explain it, °C."""
+
+
+def _check_repeats(table: Table, columns: Mapping[str, ColumnSource], form: TableFormat) -> None:
+    """Ask which of two rows counts that follow each other at one attitude and differ by more than noise.
+
+    Where more rows are repeated, all count. Rows are told apart by a column of labels or times.
+    """
+    angles = [columns[c].name for c in ANGLES_OF_STAND if c in columns]
+    channels = [columns[c].name for c in CHANNELS["accelerometer"] if c in columns]
+    if len(angles) < 2 or REFERENCES["toolface"].column not in columns or len(channels) < 3:
+        return
+    stand, raw = (np.stack([numbers(table, n) for n in names], -1) for names in (angles, channels))
+    same = np.all(stand[1:] == stand[:-1], -1)
+    if WARMTH in columns:
+        same &= np.abs(np.diff(numbers(table, columns[WARMTH].name))) <= _WARMER
+    apart = np.linalg.norm(np.diff(raw, axis=0), axis=-1)
+    apart /= np.linalg.norm(raw - raw.mean(0), axis=-1).max()
+    rows = np.flatnonzero(same & (apart > _APART)).tolist()
+    if not rows or same.sum() > _FEW_ROWS:
+        return
+    row, measured = rows[0], {s.name for c, s in columns.items() if c not in LABELS}
+    texts = {n: labels_of(table, n) for n in table.columns if n not in measured}
+    labels = (n for n, each in texts.items() if len({*each}) == len(each))
+    name = next(labels, "")
+    one, two = (texts[name][k] if name else "" for k in (row, row + 1))
+    if not name or {one, two} & {*form.keep.get(name, ())}:
+        return
+    raise QuestionError(
+        f"{table.source}: {place(table, row)} and {place(table, row + 1)} are at one attitude, and their readings "
+        f"differ by {apart[row]:.1%}. Which counts?",
+        [
+            Answer("the second", (("leave_out", f"{name}={one}"),)),
+            Answer("the first", (("leave_out", f"{name}={two}"),)),
+            Answer("both", (("keep", f"{name}={one}"),)),
+        ],
+    )
 
 
 def _is_left_handed(result: Wiring) -> bool:
