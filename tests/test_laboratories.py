@@ -286,3 +286,25 @@ def test_two_readings_at_one_attitude_are_asked_about(tmp_path, off, repeats, as
     assert first == ("leave_out", "station=5")
     assert taken(path, leave_out={"station": ["5"]}).count == len(rows)
     assert taken(path, keep={"station": ["5"]}).count == len(rows) + 1
+
+
+@pytest.mark.parametrize("numbered", [True, False])
+def test_a_line_that_numbers_the_columns_names_them(tmp_path, numbered):
+    """A script writes no names above its numbers; a line that skips a column is not understood."""
+    rows = [
+        row.split(",")
+        for row in (EXAMPLE / "run.csv").read_text("utf-8").splitlines()
+        if not row.startswith("#")
+    ]
+    names, *rows = [[*row[8:11], *row[2:8], row[1]] for row in rows if all(row)]
+    line = "# cols: 1 inc(deg) 2 az(deg, mag) 3 gtf(deg) 4-6 accel x y z (V) 7-9 mag x y z (V) 10 temp(C)"
+    path = tmp_path / "run.dat"
+    text = [line if numbered else line.replace(" 10 ", " 11 "), "# z is down the tool axis"]
+    path.write_text("\n".join([*text, *map(" ".join, rows)]), "utf-8")
+    if not numbered:
+        with pytest.raises((mwdcal.FitError, InputError)):
+            mwdcal.propose_profile(path)
+        return
+    run = taken(path)
+    for column, cells in zip(names, zip(*rows, strict=True), strict=True):
+        assert np.allclose(tables.numbers(run, column), np.array(cells, float))

@@ -276,7 +276,7 @@ _TITLE = re.compile(
     r"(acc|mag|accelerometers?|magnetometers?)?(?:s|ref|sensors?)? +", re.IGNORECASE
 )
 """The title of a group of columns before the name of one."""
-_BARE_AZ = re.compile(r"az\W*(deg|°)?\W*", re.IGNORECASE)
+_BARE_AZ = re.compile(r"az\W*(deg|°)?\W*(mag(netic)?|true|grid)?\W*", re.IGNORECASE)
 _BARE_AX = re.compile(r"a[xy]\b.*", re.IGNORECASE)
 _OF_LOGGER = re.compile(
     r"\s*(?:channel|chan|ch|input|ai|kanal|eingang|canal|voie|канал|通道)\W*\d*\s*[(\[:]\s*"

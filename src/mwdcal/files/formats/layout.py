@@ -10,7 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import pairwise, zip_longest
 from typing import NamedTuple
 
 import msgspec
@@ -344,6 +344,7 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
     """The tables of a sheet, one below the other: a head is no row of readings, and the next row is one."""
     rows = [row for row in sheet.rows if not _is_ruler(row[1])]
     rows = [row for k, row in enumerate(rows) if not _is_remark_below_names(rows, k)]
+    rows = _with_legend(rows)
     sheet = sheet._replace(rows=rows)
     readings = [_is_reading(row) for _, row in rows]
     heads = [
@@ -360,6 +361,41 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
 def _is_ruler(row: Cells) -> bool:
     """Whether a row is a line of dashes or the like."""
     return all(isinstance(cell, str) and re.fullmatch(r"[-=_*+|\s]*", cell) for cell in row)
+
+
+_NUMBER_OF_COLUMN = re.compile(r"(?<![\w.,])(\d{1,2})(?:\s*[-–]\s*(\d{1,2}))?[\s:=.)]+(?=[^\W\d_])")
+"""The number of a column in a line that says what each is, or the first and the last of several: 4-6 acc x y z."""
+
+
+def _with_legend(rows: list[tuple[int, Cells]]) -> list[tuple[int, Cells]]:
+    """The rows with names above the first readings, where a line above numbers all columns and says what each is.
+
+    >>> rows = [(1, ["# 1 inc(deg) 2 tf(deg) 3-5 acc x y z (g)"]), (2, [10, 0, 0.1, 0.1, 1])]
+    >>> _with_legend(rows)[0]
+    (1, ['inc (deg)', 'tf (deg)', 'acc x (g)', 'acc y (g)', 'acc z (g)'])
+    """
+    first = next((k for k, (_, row) in enumerate(rows) if _is_reading(row)), 0)
+    for k in range(first - 1, -1, -1):
+        names = _legend(" ".join(map(as_text, rows[k][1])))
+        if len(names) == len(rows[first][1]):
+            return [*rows[:k], *rows[k + 1 : first], (rows[k][0], names), *rows[first:]]
+    return rows
+
+
+def _legend(text: str) -> list[str]:
+    """The names of columns that a line numbers from 1 on without a gap; empty where it does not."""
+    names: list[str] = []
+    marks = [*_NUMBER_OF_COLUMN.finditer(text)]
+    for mark, behind in zip_longest(marks, marks[1:]):
+        end = behind.start() if behind else len(text)
+        head, bracket, unit = text[mark.end() : end].strip(" ,;").partition("(")
+        words, count = head.split(), int(mark[2] or mark[1]) - int(mark[1]) + 1
+        if int(mark[1]) != len(names) + 1 or not 0 < count <= len(words):
+            return []
+        names += [
+            " ".join([*words[:-count], each, bracket + unit]).strip() for each in words[-count:]
+        ]
+    return names
 
 
 def _is_remark_below_names(rows: Sequence[tuple[int, Cells]], place: int) -> bool:
