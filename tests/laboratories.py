@@ -1414,6 +1414,131 @@ def chengdu_workbook() -> Laboratory:
     return laboratory("chengdu_cd88.xlsx", layout, truth, sheet="标定", merged=merged)
 
 
+# --- A fourth hand: kinds of tables that another person's forty had -----------------------------
+
+
+def _one_line(place: Place, form: str) -> list[list[Cell]]:
+    """The references of a place, all in one line."""
+    return [[form.format(place.field, place.dip, place.gravity * STANDARD_GRAVITY)]]
+
+
+def regina_pages() -> Laboratory:
+    """A printed listing: fixed columns, the first without a unit, and the head again on each page."""
+    run = measure(rolls(SIX, 4), CALGARY, 51)
+    run = replace(run, field=np.full(len(run), 56120.0), dip=np.full(len(run), 73.21))
+    a, m = run.accelerometer(2_000_000, 0), run.magnetometer(80, 0)
+    columns = [
+        numbers(run, "STN"), *references(run, "IAF", ["INC", "AZI", "TF"], 2), *triad("a", "A{}", a, 0),
+        *triad("m", "M{}", m, 0), *references(run, "T", ["TEMP"], 1),
+    ]  # fmt: skip
+    title = [
+        ["REGINA DIRECTIONAL"],
+        ["TOOL S/N 7741D"],
+        *_one_line(CALGARY, "REF FIELD {:.0f} NT DIP {:.2f} G {:.4f}"),
+    ]
+    units = ["   ", "DEG", "DEG", "DEG", *["CNT"] * 6, "DEGC"]
+    again: Rows = [[], *title, [each.header for each in columns], units]
+    layout = laid_out(columns, before=title, under=[units], breaks={16: again})
+    truth = facts(run, a, m, "TIAFBD", serial="7741D")
+    return laboratory("regina.prn", layout, truth, text=Text("  ", padded=True))
+
+
+def pau_dos() -> Laboratory:
+    """Written by a program for DOS: ° and é as there; a roll test below the run."""
+    run = measure(rolls(FIVE, 4), CELLE, 52)
+    a, m = run.accelerometer(1000, 2), run.magnetometer(1, 0)
+    columns = [
+        numbers(run, "N°"), *references(run, "IAF", ["Incl (°)", "Azim (°)", "TF (°)"], 2, ","),
+        *triad("a", "G{} (mg)", a, 2, ","), *triad("m", "B{} (nT)", m, 0, ","),
+        *references(run, "T", ["T (°C)"], 1, ","),
+    ]  # fmt: skip
+    before: Rows = [["Étalonnage d'une sonde"], ["Numéro de série : PA-3307"], ["1. Positions"]]
+    below = [[*row] for row in zip(*(each.cells[:12] for each in columns), strict=True)]
+    after: Rows = [[], ["2. Essai en roulis"], [each.header for each in columns], *below]
+    layout = laid_out(columns, before=before, after=after)
+    truth = facts(run, a, m, serial="PA-3307")
+    return laboratory("pau.txt", layout, truth, text=Text(";", encoding="cp850"))
+
+
+def natal_upwards() -> Laboratory:
+    """South of the magnetic equator: a dip in words, titles in plural, a title over the angles of the table."""
+    run = measure(rolls(FIVE, 4), MACAE, 53)
+    run = replace(run, field=np.full(len(run), 23127.0), dip=np.full(len(run), -39.87))
+    a, m = run.accelerometer(1, 5), run.magnetometer(1, 0)
+    columns = [
+        other("Estação", range(1, len(run) + 1)), *references(run, "IAF", ["Incl.", "Azim.", "TF"]),
+        *triad("a", "{}", a), *triad("m", "{}", m), *references(run, "T", [""]),
+    ]  # fmt: skip
+    over = ["Ponto", "Ângulos da mesa (°)", None, None, "Acelerômetros (g)", None, None,
+            "Magnetômetros (nT)", None, None, "Temp. (°C)"]  # fmt: skip
+    columns[0] = columns[0]._replace(header="")
+    cover = Sheet("Capa", (
+        ("CERTIFICADO", None), ("Nº de série", "RN-2051"), ("Campo magnético total", "23.127 nT"),
+        ("Inclinação magnética", "39,87° para cima"), ("Gravidade local", "9,7873 m/s²"),
+    ))  # fmt: skip
+    truth = facts(run, a, m, "TIAFBD", serial="RN-2051")
+    return laboratory(
+        "natal.xlsx", laid_out(columns, over=[over]), truth, sheet="Leituras", sheets=(cover,), at=1
+    )
+
+
+def reynosa_remarks() -> Laboratory:
+    """Stations measured twice: a remark rejects the row, or the row before it."""
+    run = measure(rolls(FIVE, 4), VILLAHERMOSA, 54)
+    a, m = run.accelerometer(3, 4), run.magnetometer(5e-5, 4)
+    said = {
+        4: "mala - pasó un montacargas",
+        11: "se movió la base",
+        12: "repetida, la anterior es mala",
+    }
+    columns = [
+        numbers(run, "Est."),
+        *references(run, "IAF", ["Inclinación (grados)", "Azimut (grados)", "Cara de herr. (grados)"], 2),
+        *triad("a", "A{} volts", a.copy(), 4), *triad("m", "M{} volts", m, 4), remarks(run, "Observaciones", said),
+    ]  # fmt: skip
+    kept = [k for k in range(len(run)) if k not in (4, 11)]
+    truth = {key: np.asarray(each)[kept] for key, each in facts(run, a, m, "IAF").items()}
+    return laboratory("reynosa.csv", laid_out(columns), truth, text=Text(","))
+
+
+def dongying_void() -> Laboratory:
+    """An aborted run on a sheet that says so; inclinations from the horizontal, downwards."""
+    run = measure(rolls(FIVE, 4), XIAN, 55)
+    a, m = run.accelerometer(20_000, 0), run.magnetometer(1 / 3, 0)
+    columns = [
+        other("序号", range(1, len(run) + 1)), other("倾角(与水平面夹角,向下为正)", (90 - run.inclination).tolist()),
+        *references(run, "AF", ["磁方位", "工具面"]), *triad("a", "加速度计{}(码值)", a),
+        *triad("m", "磁通门{}(码值)", m),
+        *references(run, "T", ["温度℃"]),
+    ]  # fmt: skip
+    title: Rows = [["随钻测斜仪标定"], ["仪器编号", "CD-131"]]
+    layout = laid_out(columns, before=title)
+    void = Sheet("第一次(作废)", (*layout.grid[:14], ("电源故障,中止",)))
+    truth = facts(run, a, m, serial="CD-131")
+    return laboratory("dongying.xlsx", layout, truth, sheet="第二次", sheets=(void,), at=1)
+
+
+def jubail_gaps() -> Laboratory:
+    """Two stations without a reading, as cells say; the set and the read angles of the stand."""
+    run = measure(rolls(FIVE, 4), DUBAI, 56, setting=0.2)
+    a, m = run.accelerometer(1, 4), run.magnetometer(1, 0)
+    cells = triad("a", "G{} (g)", a, 4), triad("m", "B{} (nT)", m, 0)
+    cells[0][1] = cells[0][1]._replace(cells=[*cells[0][1].cells[:6], "", *cells[0][1].cells[7:]])
+    cells[1][1] = cells[1][1]._replace(
+        cells=[*cells[1][1].cells[:13], "N/A", *cells[1][1].cells[14:]]
+    )
+    plan = rolls(FIVE, 4)
+    columns = [
+        numbers(run, "Station"),
+        *[other(f"Set {n} (deg)", typed(plan[:, k], 0)) for k, n in enumerate(["Inc", "Azi", "TF"])],
+        *references(run, "IAF", ["Stand actual Inc (deg)", "Stand actual Azi (deg)", "Stand actual TF (deg)"], 2),
+        *cells[0], *cells[1], *references(run, "T", ["Temp (degC)"], 1),
+    ]  # fmt: skip
+    kept = [k for k in range(len(run)) if k not in (6, 13)]
+    truth = {key: np.asarray(each)[kept] for key, each in facts(run, a, m).items()}
+    return laboratory("jubail.csv", laid_out(columns), truth, text=Text(","))
+
+
 # --- All of them ------------------------------------------------------------------------------
 
 TABLES: tuple[Callable[[], Laboratory], ...] = (
@@ -1425,6 +1550,7 @@ TABLES: tuple[Callable[[], Laboratory], ...] = (
     haugesund_commas, forus_rejected, neuquen_semicolons, macae_text_numbers, comodoro_repeated_header,
     villahermosa_field_units, bogota_radians, salvador_grid_north, perm_semicolons, ufa_workbook,
     tyumen_minutes, izhevsk_set_and_read, xian_gb18030, chengdu_workbook,
+    regina_pages, pau_dos, natal_upwards, reynosa_remarks, dongying_void, jubail_gaps,
 )  # fmt: skip
 
 

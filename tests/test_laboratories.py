@@ -11,7 +11,9 @@ from laboratories import laboratories, mutated
 from mwdcal.errors import InputError
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats import workbook
-from mwdcal.files.runs import read_export, renamed
+from mwdcal.files.formats.title_references import doubtful_in, references_in
+from mwdcal.files.formats.titles import titles
+from mwdcal.files.runs import read_export, run_table
 
 LABORATORIES = {each.name: each for each in laboratories()}
 OPEN = {
@@ -27,10 +29,10 @@ TURNING = ("ref_azimuth_deg", "ref_toolface_deg")
 FACTS = ("serial", "date")
 
 
-def taken(path):
+def taken(path, **answers):
     """The table of a laboratory under the names of a run file, by the profile proposed for it."""
-    profile = mwdcal.propose_profile(path).profile
-    return renamed(read_export(path, profile), profile)
+    profile = mwdcal.propose_profile(path, **answers).profile
+    return run_table(read_export(path, profile), profile)
 
 
 def differences(run, truth):
@@ -66,6 +68,59 @@ def test_an_error_in_a_cell_of_any_workbook_names_its_row(tmp_path):
     path = tmp_path / laboratory.file
     path.write_bytes(laboratory.content)
     assert ", row " in str(tables.cell_error(taken(path), "gx", 0, "no number"))
+
+
+@pytest.mark.parametrize(
+    ("line", "dip"),
+    [
+        ("Ref|50400 nT||70.00 deg dip||9.8170 m/s2", 70.0),
+        ("#REF: 50400 nT / 70.00 deg / 9.8170 m/s2", 70.0),
+        ("Feld 50400 nT, Inkl. 70,00°, g 9,8170", 70.0),
+        ("FIELD 50400 NT||DIP 70.00||G 9.8170", 70.0),
+        ("T. Leblanc||Bt=50400 nT; Inkl=70,00 Grad; g=9,8170 m/s2", 70.0),
+        ("F (µT)|50,4||Incl. (°)|70||g (m/s²)|9,817", 70.0),
+        ("Field 50400 nT, dip 70.00 deg up, g 9.8170", -70.0),
+        ("磁场强度(nT)|50400|磁倾角|70.0°|重力加速度(m/s2)|9.8170", 70.0),
+    ],
+)
+def test_the_references_of_a_place_stand_in_one_line(line, dip):
+    stated = references_in([line.split("|")])
+    assert stated == {
+        "ref_field_nt": 50400.0,
+        "ref_dip_deg": dip,
+        "ref_gravity_g": pytest.approx(9.8170 / 9.80665),
+    }
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "Cradle inclination 90 deg, field 50400 nT",
+        "50400 nT / 3.5 deg declination / 9.8170 m/s2",
+        "sensor range 60000 nT, 9.81 m/s2, 45 deg",
+        "Inc 45 deg",
+    ],
+)
+def test_another_angle_is_no_dip(line):
+    assert "ref_dip_deg" not in references_in([[line]])
+
+
+def test_a_reference_that_is_not_understood_is_named():
+    assert doubtful_in([["Geomagnet 50400 nT"]]) == {"ref_field_nt": "Geomagnet 50400 nT"}
+
+
+@pytest.mark.parametrize(
+    ("cells", "serial"),
+    [
+        (["Sonde", "SD-9 n° 112"], "112"),
+        (["Ferramenta: DIR-175 nº 44"], "44"),
+        (["Serial / الرقم التسلسلي", "SA-5520", "Date / التاريخ", "2024-01-22"], "SA-5520"),
+        (["Matricola", "IT-0914"], "IT-0914"),
+        (["инклинометр ИММН-42 зав. № 1187"], "1187"),
+    ],
+)
+def test_a_serial_is_the_one_behind_its_mark(cells, serial):
+    assert titles([cells]).metadata["serial"] == serial
 
 
 @pytest.mark.parametrize("sign", [";", "point"])
@@ -145,3 +200,111 @@ def test_no_mutation_changes_a_number_in_silence(tmp_path):
         wrong += [(changed.name, changed.mutation, off)] if off else []
     assert wrong == []
     assert read > 30
+
+
+def test_tools_side_by_side_are_asked_about_one_by_one(tmp_path):
+    """The answers take all channels of one tool; neither tool is believed to have channels of the other."""
+    rows = (EXAMPLE / "run.csv").read_text("utf-8").splitlines()
+    body = [row.split(",") for row in rows if row and not row.startswith("#")]
+    names = body[0]
+    raw = [names.index(f"{triad}{axis}") for triad in "am" for axis in "xyz"]
+    ends = ["Gx", "Gy", "Gz", "Bx", "By", "Bz"]
+    angles = [names.index(f"ref_{n}_deg") for n in ("inclination", "azimuth", "toolface")]
+    head = ["Inc", "Azi", "TF", *(f"S/N {tool} {end}" for tool in ("11A", "12B") for end in ends)]
+    cells = [[*(r[k] for k in angles), *(r[k] for k in raw * 2)] for r in body[1:]]
+    path = tmp_path / "two.csv"
+    path.write_text("\n".join(map(",".join, [head, *cells])), "utf-8")
+    with pytest.raises(mwdcal.FitError, match="stand side by side: 'S/N 11A', 'S/N 12B'") as error:
+        mwdcal.propose_profile(path)
+    assert "ax=S/N 11A Gx" in str(error.value)
+    columns = {f"{'am'[k // 3]}{'xyz'[k % 3]}": f"S/N 12B {end}" for k, end in enumerate(ends)}
+    assert mwdcal.propose_profile(path, column=columns).profile.columns["mz"].name == "S/N 12B Bz"
+
+
+def test_angles_in_gons_under_degrees_are_named(tmp_path):
+    path = tmp_path / "run.csv"
+    names, *rows = [
+        row.split(",")
+        for row in (EXAMPLE / "run.csv").read_text("utf-8").splitlines()
+        if not row.startswith("#")
+    ]
+    place = names.index("ref_inclination_deg")
+    for row in rows:
+        row[place] = repr(float(row[place]) / 0.9)
+    path.write_text("\n".join(map(",".join, [names, *rows])), "utf-8")
+    proposal = mwdcal.propose_profile(path)
+    assert proposal.profile.columns["ref_inclination_deg"].unit == "gon"
+    assert "told-by-readings" in [finding.id for finding in proposal.findings]
+
+
+def test_a_total_that_varies_is_no_reference_beside_the_field_of_the_place(tmp_path):
+    """A channel of another scale hides that the column is computed; the field of a place hardly varies."""
+    names, *rows = [
+        row.split(",")
+        for row in (EXAMPLE / "run.csv").read_text("utf-8").splitlines()
+        if not row.startswith("#")
+    ]
+    place = names.index("ref_field_nt")
+    names[place] = "Btot (nT)"
+    for k, row in enumerate(rows):
+        row[place] = str(49000 + 700 * (k % 3))
+    path = tmp_path / "run.csv"
+    path.write_text(
+        "\n".join(map(",".join, [["Total field (nT)", "50000"], names, *rows])), "utf-8"
+    )
+    proposal = mwdcal.propose_profile(path)
+    assert "ref_field_nt" not in proposal.profile.columns
+    assert "not-used" in [finding.id for finding in proposal.findings]
+
+
+@pytest.mark.parametrize(
+    ("off", "repeats", "asked"), [(0.03, 1, True), (0.0002, 1, False), (0.03, 9, False)]
+)
+def test_two_readings_at_one_attitude_are_asked_about(tmp_path, off, repeats, asked):
+    """Not where they differ by noise, nor where repeated rows are usual; the second is believed."""
+    names, *rows = [
+        row.split(",")
+        for row in (EXAMPLE / "run.csv").read_text("utf-8").splitlines()
+        if not row.startswith("#")
+    ]
+    place, every, rows = names.index("ax"), [], [row for row in rows if all(row)]
+    for k, row in enumerate(rows):
+        row[0] = str(k)
+        again = [str(100 + k), *row[1:]]
+        again[place] = repr(float(row[place]) + 3 * off)
+        every += [row, again] if 5 <= k < 5 + repeats else [row]
+    path = tmp_path / "run.csv"
+    path.write_text("\n".join(map(",".join, [names, *every])), "utf-8")
+    if not asked:
+        mwdcal.propose_profile(path)
+        return
+    with pytest.raises(
+        mwdcal.FitError, match="at one attitude, and their readings differ"
+    ) as error:
+        mwdcal.propose_profile(path)
+    first, *_ = error.value.answers[0].arguments
+    assert first == ("leave_out", "station=5")
+    assert taken(path, leave_out={"station": ["5"]}).count == len(rows)
+    assert taken(path, keep={"station": ["5"]}).count == len(rows) + 1
+
+
+@pytest.mark.parametrize("numbered", [True, False])
+def test_a_line_that_numbers_the_columns_names_them(tmp_path, numbered):
+    """A script writes no names above its numbers; a line that skips a column is not understood."""
+    rows = [
+        row.split(",")
+        for row in (EXAMPLE / "run.csv").read_text("utf-8").splitlines()
+        if not row.startswith("#")
+    ]
+    names, *rows = [[*row[8:11], *row[2:8], row[1]] for row in rows if all(row)]
+    line = "# cols: 1 inc(deg) 2 az(deg, mag) 3 gtf(deg) 4-6 accel x y z (V) 7-9 mag x y z (V) 10 temp(C)"
+    path = tmp_path / "run.dat"
+    text = [line if numbered else line.replace(" 10 ", " 11 "), "# z is down the tool axis"]
+    path.write_text("\n".join([*text, *map(" ".join, rows)]), "utf-8")
+    if not numbered:
+        with pytest.raises((mwdcal.FitError, InputError)):
+            mwdcal.propose_profile(path)
+        return
+    run = taken(path)
+    for column, cells in zip(names, zip(*rows, strict=True), strict=True):
+        assert np.allclose(tables.numbers(run, column), np.array(cells, float))

@@ -59,6 +59,8 @@ _REGULAR = 0.8
 """Share of equal steps of numbered rows."""
 _FEW = 4
 """Values of a column that a question shows."""
+_OF_PLACE = 0.01
+"""By how much the field or gravity of a place varies at most, as a share."""
 _STEADY_DIP, _STEADY_FIELD = 3.0, 0.1
 """A dip varies by less at one place, degrees, and a field by a smaller share."""
 STEADY_NORM = 0.15
@@ -247,7 +249,7 @@ _NO_STAND = re.compile(
     r"check|fehler|abw\w*|feil|avvik|desv\w*|erro\w*|ecart|погрешн\w*|откл\w*)\b|误差|偏差",
     re.IGNORECASE,
 )
-"""Words of columns of angles that are none of the stand."""
+"""Words of columns of angles that do not belong to the stand."""
 _NOMINAL = re.compile(
     r"\b(nominal|target|set|setpoint|soll\w*|задан\w*|номинал\w*)\b|设定|目标", re.IGNORECASE
 )
@@ -274,7 +276,7 @@ _TITLE = re.compile(
     r"(acc|mag|accelerometers?|magnetometers?)?(?:s|ref|sensors?)? +", re.IGNORECASE
 )
 """The title of a group of columns before the name of one."""
-_BARE_AZ = re.compile(r"az\W*(deg|°)?\W*", re.IGNORECASE)
+_BARE_AZ = re.compile(r"az\W*(deg|°)?\W*(mag(netic)?|true|grid)?\W*", re.IGNORECASE)
 _BARE_AX = re.compile(r"a[xy]\b.*", re.IGNORECASE)
 _OF_LOGGER = re.compile(
     r"\s*(?:channel|chan|ch|input|ai|kanal|eingang|canal|voie|канал|通道)\W*\d*\s*[(\[:]\s*"
@@ -306,6 +308,8 @@ _SURROUNDINGS = re.compile(
 """What has a temperature of its own that is not the tool's."""
 COOLEST_FAHRENHEIT = 45.0
 """Numbers below it are degrees Celsius: no tool is calibrated below 7 °C alone."""
+COLDEST_KELVIN = 200.0
+"""Numbers below it are no kelvins: hardly a tool works below -73 °C."""
 HOTTEST_CELSIUS = 200.0
 """Numbers above it may be degrees Fahrenheit: hardly a tool works above 200 °C."""
 
@@ -517,7 +521,7 @@ def proposed(
     _tell_temperature(meanings, names, units, values)
     said, known = answers or {}, stated or {}
     _tell_numbers(meanings, values, said)
-    ignored = _no_evidence(meanings, values, said)
+    ignored = _no_evidence(meanings, values, said, known)
     _answered(said, names, meanings, source)
     questions = Questions(besides)
     damaged = {} if problems is None else problems  # filled while values are read
@@ -530,7 +534,6 @@ def proposed(
         if not {*channels} & {*chosen, *said}:
             others = [n for n in names if n not in meanings]
             questions.ask(_check_hidden, triad, channels, others, values, source)
-    nameless = not {*RAW[:3]} & {*chosen}
     hidden = any("channels of the accelerometer" in each.text for each in questions)
     if not hidden and not any(n in damaged for n, m in meanings.items() if m.column in RAW):
         questions.ask(_check_triads, names, values, chosen, source)
@@ -538,8 +541,8 @@ def proposed(
     beside = any("side by side" in each.text for each in questions)
     if not beside and not {*RAW[3:]} & {*chosen, *said}:
         believed = (
-            () if nameless else questions.believed()
-        )  # of two nameless triads either may be either
+            questions.believed() if {*RAW[:3]} & {*chosen} else ()
+        )  # else either may be either
         others = [n for n in names if n not in meanings and n not in believed]
         questions.ask(_check_nameless, others, values, {*chosen, *known}, source)
     rest = {n: u for n, u in zip(names, units, strict=True) if n not in meanings}
@@ -599,12 +602,15 @@ def _chosen(
 
 
 def _no_evidence(
-    meanings: Mapping[str, Resemblance], values: Values, answers: Mapping[str, str]
+    meanings: Mapping[str, Resemblance],
+    values: Values,
+    answers: Mapping[str, str],
+    stated: Collection[str],
 ) -> dict[str, str]:
     """Columns that are named like references but hold no references, each with the reason.
 
-    That is what the user excludes; totals computed from the channels; and rolls in whole degrees beside no other
-    angle of the stand, which are nominal.
+    That is what the user excludes; totals computed from the channels, and those that vary beside the one `stated`
+    for the place; and rolls in whole degrees beside no other angle of the stand, which are nominal.
     """
     ignored = {}
     called = {m.column for m in meanings.values()}
@@ -616,12 +622,23 @@ def _no_evidence(
             continue
         elif _is_total(m.column, name, meanings, values):
             ignored[name] = "it is computed from the channels"
+        elif m.column in stated and _varies(m.column, name, values(name)):
+            ignored[name] = (
+                "it varies from station to station, and the title states that of the place"
+            )
         elif m.column == REFERENCES["toolface"].column and lone and _is_whole(values(name)):
             ignored[name] = (
                 f"its rolls are nominal, in whole degrees without other angles of the stand; if they were set, say so "
                 f"by `column` {m.column}={name!r}"
             )
     return ignored
+
+
+def _varies(column: str, name: str, values: Array | None) -> bool:
+    """Whether a strength that is not called a reference varies by more than that of a place does."""
+    if values is None or column not in RANGES_BY_UNIT or _CALLED_REFERENCE.search(spelled(name)):
+        return False
+    return bool(np.nanmax(values) - np.nanmin(values) > _OF_PLACE * np.nanmax(np.abs(values)))
 
 
 def _is_whole(values: Array | None) -> bool:
@@ -953,6 +970,8 @@ def _check_range(column: str, name: str, unit: str, values: Array | None, source
         fits = ["rad"] if np.ptp(known) > 3 else []
     if unit == "°C" and known.min() > HOTTEST_CELSIUS:
         fits = ["K"]
+    if unit == "K" and known.max() < COLDEST_KELVIN:
+        fits = ["°C", "°F"]
     if fits and unit not in fits:
         raise QuestionError(
             f"{source}: {shown(name)} is in {unit}, and its values ({first_values(known)}) are those of "

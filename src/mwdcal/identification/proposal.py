@@ -24,7 +24,7 @@ from mwdcal.files.contract import CHANNELS, MAPPED, RANGES, RAW, REFERENCES, uni
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, looks_numeric, shown
 from mwdcal.files.formats.figures import is_figure
-from mwdcal.files.formats.layout import NO_VALUE, WORKBOOKS, Layout
+from mwdcal.files.formats.layout import WITHOUT_VALUE, WORKBOOKS, Layout
 from mwdcal.files.formats.table import Table, cell_error, labels, numbers
 from mwdcal.files.formats.table import labels as labels_of
 from mwdcal.files.formats.text import is_preamble
@@ -36,7 +36,14 @@ from mwdcal.files.statements import stated_table
 from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW, FACTORS, WARMTH
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
-from mwdcal.identification.columns import is_filler, is_near, meanings_of, north_of, proposed
+from mwdcal.identification.columns import (
+    in_units,
+    is_filler,
+    is_near,
+    meanings_of,
+    north_of,
+    proposed,
+)
 from mwdcal.sensor.profile import ColumnSource, Profile, TableFormat, TriadProfile
 
 # --------------------------------------------------------------------------
@@ -155,13 +162,17 @@ LEAST_STATIONS = 5
 
 
 class Wiring(NamedTuple):
-    """The axes and scale of a triad, the share that they leave, and others that fit about as well."""
+    """The axes and scale of a triad, the share that they leave, and others that fit about as well.
+
+    `apart` is the largest scale of a channel as a multiple of the smallest.
+    """
 
     axes: tuple[str, ...]
     scale: float
     unexplained: float
     next_best: float
     alternatives: list[tuple[str, ...]]
+    apart: float = 1.0
 
 
 def wiring(raw: Array, *parts: Array) -> Wiring:
@@ -199,9 +210,11 @@ def wiring(raw: Array, *parts: Array) -> Wiring:
         ranked = sorted((_joint(moved, parts, *each[1:]), *each[1:]) for each in ranked)
     best, order, signs = ranked[0]
     near = [each for each in ranked if each[0] < best + ALTERNATIVE]
-    scale = float(np.median(sizes[range(3), order]))
+    each = sizes[range(3), order]
+    apart = float(each.max() / each.min()) if each.min() > 0 else 1.0
+    alternatives = [_named(*each[1:]) for each in near]
     return Wiring(
-        _named(order, signs), scale, best, ranked[1][0], [_named(*each[1:]) for each in near]
+        _named(order, signs), float(np.median(each)), best, ranked[1][0], alternatives, apart
     )
 
 
@@ -255,6 +268,8 @@ SAME_GRAVITY = 2e-4
 _SELDOM = ("ignore", "azimuth_reference", "declination_deg", "convergence_deg", "leave_out", "keep")
 MOST_NAMED = 6
 """Alternatives that a message names."""
+MOST_APART = 1.5
+"""How many times the smallest scale of a channel the largest of its triad is at most, in a sound tool."""
 OFF_UNIT = 0.05
 """By how much the scale of a sound tool in a unit differs from that unit at most, as a logarithm."""
 
@@ -343,7 +358,9 @@ def _cells_without_reading(
     only = (each.answers[0].arguments for each in questions if len(each.answers) == 1)
     for arguments in only:
         pairs = [text.partition("=") for option, text in arguments if option == "leave_out"]
-        if len(pairs) == len(arguments) and all(NO_VALUE.fullmatch(cell) for *_, cell in pairs):
+        if len(pairs) == len(arguments) and all(
+            WITHOUT_VALUE.fullmatch(cell) for *_, cell in pairs
+        ):
             for name, _, cell in pairs:
                 every.setdefault(name, []).append(cell)
     return {} if every == {**leave_out} else every
@@ -380,6 +397,8 @@ def _proposal(
     table = _of_one_tool(table, columns, stated)
     profile = Profile(name=Path(path).stem, table=form or msgspec.UNSET, columns=columns)
     profile, readings, wirings, open_axes = _wired_by_elevation(table, profile)
+    _check_gons(table, profile, wirings, answers)
+    _check_repeats(table, columns, form or TableFormat())
     name, triads = str(readings.metadata.get("serial", Path(path).stem)), _triads(readings, wirings)
     profile = msgspec.structs.replace(profile, name=name, **triads)
     return Proposal(
@@ -623,6 +642,78 @@ def _wired_by_elevation(
     return _wired(table, msgspec.structs.replace(profile, columns=below))
 
 
+_MUCH_BETTER = 0.5
+"""Share of what an angle leaves unexplained that it leaves at most in the other unit, where it is in that."""
+
+
+def _check_gons(
+    table: Table, profile: Profile, wirings: Mapping[str, Wiring], answers: Collection[str]
+) -> None:
+    """Ask about an angle of the stand in degrees that the readings fit far better in gons, or the other way."""
+    columns = profile.columns
+    assert not isinstance(columns, msgspec.UnsetType)
+    for column in ANGLES_OF_STAND:
+        source = columns.get(column)
+        if not wirings or not source or source.unit not in ("", "°", "gon") or column in answers:
+            continue
+        units = ["°", "gon"] if source.unit == "gon" else ["gon", "°"]
+        other = {**columns, column: ColumnSource(name=source.name, unit=units[0])}
+        try:
+            *_, fits, _ = _wired(table, msgspec.structs.replace(profile, columns=other))
+        except (InputError, FitError):
+            continue
+        turned = [kind for kind in wirings if kind == "magnetometer" or "azimuth" not in column]
+        if turned and all(
+            kind in fits and fits[kind].unexplained < _MUCH_BETTER * wirings[kind].unexplained
+            for kind in turned
+        ):
+            raise QuestionError(
+                f"{table.source}: the readings fit {shown(source.name)} far better in {units[0]} than in {units[1]}. "
+                "Which unit holds?",
+                in_units(source.name, column, units),
+            )
+
+
+_APART, _WARMER = 0.005, 3.0
+"""By how much readings at one attitude differ of which one is bad, as a share, and temperatures that explain it, °C."""
+
+
+def _check_repeats(table: Table, columns: Mapping[str, ColumnSource], form: TableFormat) -> None:
+    """Ask which of two rows counts that follow each other at one attitude and differ by more than noise.
+
+    Where more rows are repeated, all count. Rows are told apart by a column of labels or times.
+    """
+    angles = [columns[c].name for c in ANGLES_OF_STAND if c in columns]
+    channels = [columns[c].name for c in CHANNELS["accelerometer"] if c in columns]
+    if len(angles) < 2 or REFERENCES["toolface"].column not in columns or len(channels) < 3:
+        return
+    stand, raw = (np.stack([numbers(table, n) for n in names], -1) for names in (angles, channels))
+    same = np.all(stand[1:] == stand[:-1], -1)
+    if WARMTH in columns:
+        same &= np.abs(np.diff(numbers(table, columns[WARMTH].name))) <= _WARMER
+    apart = np.linalg.norm(np.diff(raw, axis=0), axis=-1)
+    apart /= np.linalg.norm(raw - raw.mean(0), axis=-1).max()
+    rows = np.flatnonzero(same & (apart > _APART)).tolist()
+    if not rows or same.sum() > _FEW_ROWS:
+        return
+    row, measured = rows[0], {s.name for c, s in columns.items() if c not in LABELS}
+    texts = {n: labels_of(table, n) for n in table.columns if n not in measured}
+    labels = (n for n, each in texts.items() if len({*each}) == len(each))
+    name = next(labels, "")
+    one, two = (texts[name][k] if name else "" for k in (row, row + 1))
+    if not name or {one, two} & {*form.keep.get(name, ())}:
+        return
+    raise QuestionError(
+        f"{table.source}: {place(table, row)} and {place(table, row + 1)} are at one attitude, and their readings "
+        f"differ by {apart[row]:.1%}. Which counts?",
+        [
+            Answer("the second", (("leave_out", f"{name}={one}"),)),
+            Answer("the first", (("leave_out", f"{name}={two}"),)),
+            Answer("both", (("keep", f"{name}={one}"),)),
+        ],
+    )
+
+
 def _is_left_handed(result: Wiring) -> bool:
     permutation = TriadProfile(axes=result.axes).permutation  # type: ignore[arg-type]
     return bool(np.linalg.det(permutation) < 0)
@@ -799,7 +890,8 @@ def _check_sense(
         wirings, open_axes = _wirings(run, turned, scaled)
     except FitError:
         return
-    if len(wirings) == len(TRIADS) and not open_axes:
+    sound = len(wirings) == len(TRIADS) and not open_axes
+    if sound and not all(map(_is_left_handed, wirings.values())):  # else another angle is turned
         raise QuestionError(
             f"{run.source}: the readings fit only if {shown(source.name)} counts anticlockwise looking down the hole. "
             "Does it?",
@@ -893,8 +985,8 @@ def references_not_taken(proposal: Proposal) -> list[Finding]:
     return [
         Finding(
             id="reference-not-taken",
-            text=f"{shown(line)} is nominal, and not taken as '{column}', which the run does not state otherwise. If "
-            "it holds, state it without that word, or in a column.",
+            text=f"{shown(line)} is nominal or unclear, and not taken as '{column}', which the run does not state "
+            "otherwise. If it holds, state it plainly, or in a column.",
         )
         for column, line in lines.items()
         if column not in named and column not in proposal.metadata
@@ -920,6 +1012,12 @@ def units_contradicted(proposal: Proposal) -> list[Finding]:
     findings = []
     for kind, base in (("accelerometer", "g"), ("magnetometer", "nT")):
         channel = named.get(CHANNELS[kind][0])
+        if kind in proposal.wirings and proposal.wirings[kind].apart > MOST_APART:
+            text = (
+                f"{kind}: by the readings the scale of one channel is {proposal.wirings[kind].apart:.3g} times that of "
+                "another. Is a column in another unit?"
+            )
+            findings.append(Finding(id="unit-contradicted", text=text))
         scale = getattr(proposal.profile, kind).scale if kind in proposal.wirings else None
         if not channel or not scale or channel.unit not in (base, *FACTORS):
             continue

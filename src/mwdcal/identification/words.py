@@ -39,7 +39,8 @@ TRANSLATIONS = (
     ),
     (
         r"kipp(achse|winkel)|schwenkachse|\btilt\b|inclinazione|inclinatie|helling|haeldning|hældning|lutning|"
-        r"(kat )?odchyleni[ae]( od pionu)?|(kat )?nachyleni[ae]|ferdeseg|dolesszog|egim|kemiringan|傾斜角?|зен\w*\.?( угол\w*)?|"
+        r"(kat )?odchyleni[ae]( od pionu)?|(kat )?nachyleni[ae]|ferdeseg|dolesszog|egim|kemiringan|傾斜角?|"
+        r"зен\w*\.?( угол\w*)?|"
         r"neigung(swinkel)?|desviacion|sapma( acisi)?|inklination|inclinaison|inclinaca?o|"
         r"inclinacion|zenith( angle)?|drift angle|deviation angle|(?<![a-z])inkl?\b\.?|"
         r"inklinasjon|helning|инклинация|зенит\w*( угол)?|наклон(?!ен)|井斜角?|倾角",
@@ -51,7 +52,8 @@ TRANSLATIONS = (
         "azimuth ",
     ),
     (
-        r"rollachse|roll axis|(kat )?obrotu|\brulle?\b|rullning|rotasi|(kat )?ustawienia narzedzia|takim yuzu|szerszamallas|"
+        r"rollachse|roll axis|(kat )?obrotu|"
+        r"\brulle?\b|rullning|rotasi|(kat )?ustawienia narzedzia|takim yuzu|szerszamallas|"
         r"gereedschapsvlak|v(ae|æ)rkt(o|ø)jsflade|faccia utensile|ツールフェ(ー|イ)ス|тулфейс|回転角|угол поворота|"
         r"rollwinkel|roll angle|werkzeug(winkel|lage|flache)|verdrehung|verdrehwinkel|drehwinkel|rotasjon|rulle?vinkel|"
         r"verktoy(flate|vinkel)\w*|(face|angulo) d[ae] ferramenta|(face|angle)( d[e'])? ?(l'?)?outil|"
@@ -107,7 +109,8 @@ TRANSLATIONS = (
         "temperature ",
     ),
     (
-        r"sollwerte?|sollwinkel|soll|\brig\b|referenz|referanse|referencia|stand( settings?)?|(angulos? )?d[ae] (la )?(mesa|bancada)|эталон\w*|стенд|задан\w*|标准|参考|转台",
+        r"sollwerte?|sollwinkel|soll|\brig\b|referenz|referanse|referencia|stand( settings?)?|"
+        r"(angulos? )?d[ae] (la )?(mesa|bancada)|эталон\w*|стенд|задан\w*|标准|参考|转台",
         "ref ",
     ),
     (

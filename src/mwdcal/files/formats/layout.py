@@ -10,7 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import pairwise, zip_longest
 from typing import NamedTuple
 
 import msgspec
@@ -60,7 +60,7 @@ _DEGREES_OF = re.compile(
     re.IGNORECASE,
 )
 """The name of a column of degrees, or of minutes."""
-NO_VALUE = re.compile(r"n/?a|n\.a\.?|nan|null|none|[\W_]*", re.IGNORECASE)
+WITHOUT_VALUE = re.compile(r"n/?a|n\.a\.?|nan|null|none|[\W_]*", re.IGNORECASE)
 """A cell that says that there is no value."""
 _BRACKETS = re.compile(r"[(\[][^)\]]*[)\]]")
 
@@ -92,7 +92,8 @@ _OF_VOID_RUN = re.compile(
 """Words of the name of a sheet, or of the line above a table, of a run that does not count."""
 _OF_ROLL_TEST = re.compile(
     r"(?<![^\W\d_])(roll[\s_-]*(test|over|check)|rt|verif\w*|check|valid\w*|(roll)?pr(ue|ü)fung|"
-    r"[ck]ontrol\w*[- ]?(run|shot|test|roll|messung|dreh|måling|rull)\w*|rulletest|prueba|(essai|test)s? (en|de) (roulis|rotation)|провер\w*|повер\w*|"
+    r"[ck]ontrol\w*[- ]?(run|shot|test|roll|messung|dreh|måling|rull)\w*|rulletest|prueba|"
+    r"(essai|test)s? (en|de) (roulis|rotation)|провер\w*|повер\w*|"
     r"контрольн\w* (вращ|замер|измер)\w*)(?![^\W\d_])|验证|检验|複測|复测",
     re.IGNORECASE,
 )
@@ -219,7 +220,7 @@ def _the_run(tables: Sequence[Layout]) -> Layout | None:
 
 
 def _kind(words: str) -> str:
-    """What a table is that is no run, by its sheet and the line above it; empty for a run."""
+    """A void run or a roll test, by the sheet of a table and the line above it; empty for a run."""
     kinds = (("void run", _OF_VOID_RUN), ("roll test", _OF_ROLL_TEST))
     return next((kind for kind, pattern in kinds if pattern.search(words)), "")
 
@@ -342,6 +343,8 @@ def _several(tables: Sequence[Layout], source: str, sheet: str) -> QuestionError
 def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
     """The tables of a sheet, one below the other: a head is no row of readings, and the next row is one."""
     rows = [row for row in sheet.rows if not _is_ruler(row[1])]
+    rows = [row for k, row in enumerate(rows) if not _is_remark_below_names(rows, k)]
+    rows = _with_legend(rows)
     sheet = sheet._replace(rows=rows)
     readings = [_is_reading(row) for _, row in rows]
     heads = [
@@ -358,6 +361,55 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
 def _is_ruler(row: Cells) -> bool:
     """Whether a row is a line of dashes or the like."""
     return all(isinstance(cell, str) and re.fullmatch(r"[-=_*+|\s]*", cell) for cell in row)
+
+
+_NUMBER_OF_COLUMN = re.compile(r"(?<![\w.,])(\d{1,2})(?:\s*[-–]\s*(\d{1,2}))?[\s:=.)]+(?=[^\W\d_])")
+"""The number of a column in a line that says what each is, or the first and the last of several: 4-6 acc x y z."""
+
+
+def _with_legend(rows: list[tuple[int, Cells]]) -> list[tuple[int, Cells]]:
+    """The rows with names above the first readings, where a line above numbers all columns and says what each is.
+
+    >>> rows = [(1, ["# 1 inc(deg) 2 tf(deg) 3-5 acc x y z (g)"]), (2, [10, 0, 0.1, 0.1, 1])]
+    >>> _with_legend(rows)[0]
+    (1, ['inc (deg)', 'tf (deg)', 'acc x (g)', 'acc y (g)', 'acc z (g)'])
+    """
+    first = next((k for k, (_, row) in enumerate(rows) if _is_reading(row)), 0)
+    for k in range(first - 1, -1, -1):
+        names = _legend(" ".join(map(as_text, rows[k][1])))
+        if len(names) == len(rows[first][1]):
+            return [*rows[:k], *rows[k + 1 : first], (rows[k][0], names), *rows[first:]]
+    return rows
+
+
+def _legend(text: str) -> list[str]:
+    """The names of columns that a line numbers from 1 on without a gap; empty where it does not."""
+    names: list[str] = []
+    marks = [*_NUMBER_OF_COLUMN.finditer(text)]
+    for mark, behind in zip_longest(marks, marks[1:]):
+        end = behind.start() if behind else len(text)
+        head, bracket, unit = text[mark.end() : end].strip(" ,;").partition("(")
+        words, count = head.split(), int(mark[2] or mark[1]) - int(mark[1]) + 1
+        if int(mark[1]) != len(names) + 1 or not 0 < count <= len(words):
+            return []
+        names += [
+            " ".join([*words[:-count], each, bracket + unit]).strip() for each in words[-count:]
+        ]
+    return names
+
+
+def _is_remark_below_names(rows: Sequence[tuple[int, Cells]], place: int) -> bool:
+    """Whether a row is a remark between the names of a table and its readings."""
+    if not 0 < place < len(rows) - 1 or not _is_reading(rows[place + 1][1]):
+        return False
+    row, above = rows[place][1], rows[place - 1][1]
+    short = sum(cell != "" for cell in row) < min(LEAST_COLUMNS - 1, _texts(above))
+    return (
+        short
+        and _texts(above) >= LEAST_COLUMNS
+        and not _is_reading(above)
+        and not titles([row]).metadata
+    )
 
 
 def _begins_anew(rows: Sequence[tuple[int, Cells]], heads: Sequence[int], place: int) -> bool:
@@ -643,7 +695,7 @@ def _without_summary(rows: Sequence[tuple[int, Cells]]) -> list[tuple[int, Cells
 
 def _is_blank(cell: object) -> bool:
     """Whether a cell is blank or says that there is no value: ---, n/a."""
-    return isinstance(cell, str) and bool(NO_VALUE.fullmatch(cell))
+    return isinstance(cell, str) and bool(WITHOUT_VALUE.fullmatch(cell))
 
 
 def _is_summary(row: Cells, width: int) -> bool:
@@ -657,13 +709,21 @@ def _is_mean(row: Cells, above: Sequence[Cells]) -> bool:
     """Whether numbers of a row are the means of the columns above, in four columns that vary or more."""
     equal = varied = 0
     for place, cell in enumerate(row):
-        column: Array = np.array(
-            [r[place] for r in above if place < len(r) and isinstance(r[place], float | int)], float
-        )
-        if isinstance(cell, float | int) and len(column) > 2 and np.ptp(column) > 0:
+        numbers = (_number(r[place]) for r in above if place < len(r))
+        column: Array = np.array([n for n in numbers if n is not None], float)
+        value = _number(cell)
+        if value is not None and len(column) > 2 and np.ptp(column) > 0:
             varied += 1
-            equal += bool(abs(cell - column.mean()) < 1e-6 * np.ptp(column))
+            last = 10.0 ** -len(f"{cell}".replace(",", ".").partition(".")[2]) / 2
+            near = max(1e-6 * np.ptp(column), min(last, 1e-3 * np.ptp(column)))
+            equal += bool(abs(value - column.mean()) <= 1.01 * near)
     return varied >= LEAST_COLUMNS and equal >= varied - 1
+
+
+def _number(cell: object) -> float | None:
+    """The number that a cell is, with either decimal sign; None of one with separators of thousands or with a unit."""
+    text = as_text(cell).replace(",", ".")
+    return float(text) if looks_numeric(text) else None
 
 
 def as_columns(layout: Layout, labels: Collection[str] = ()) -> dict[str, list[str]]:

@@ -103,7 +103,10 @@ _REFERRING = re.compile(
 """Words and letters behind the word of a quantity that say nothing more."""
 _CHINESE = r"[\u4e00-\u9fff]"
 _BEGINNING = rf"(?:(?<![^\W\d_])|(?<={_CHINESE})(?={_CHINESE}))"
-_WITH_NUMBER = rf"(?P<number>{_WRITTEN_NUMBER}){_MINUTES}\s*(?P<unit>{_WRITTEN_UNIT})?(?P<behind>[^\d;]{{0,12}})(?P<next>\d?)"
+_WITH_NUMBER = (
+    rf"(?P<number>{_WRITTEN_NUMBER}){_MINUTES}\s*(?P<unit>{_WRITTEN_UNIT})?"
+    r"(?P<behind>[^\d;]{0,12})(?P<next>\d?)"
+)
 
 
 def _statement(head: str) -> re.Pattern[str]:
@@ -186,7 +189,7 @@ def _line(row: Sequence[object]) -> str:
 
 
 def _of_a_place(text: str) -> dict[str, float]:
-    """Field, dip and gravity in a line of all three, by their units; empty where the line is none.
+    """Field, dip and gravity in a line of all three, by their units; empty where one is absent.
 
     >>> _of_a_place("ref 50400 nt 70.00 deg 9.8170 m/s²")
     {'ref_field_nt': 50400.0, 'ref_gravity_g': 1.0010554062804322, 'ref_dip_deg': 70.0}
@@ -194,17 +197,17 @@ def _of_a_place(text: str) -> dict[str, float]:
     if _UNSURE.search(text):
         return {}
     numbers = [*_NUMBER_IN_UNIT.finditer(text)]
-    found: dict[str, float] = {}
+    references: dict[str, float] = {}
     for quantity in (_OF_PLACES[0], _OF_PLACES[2]):
         inside = _in_unit(quantity, numbers) - {1.0}
         if len(inside) != 1:
             return {}
-        found[quantity.column] = inside.pop()
+        references[quantity.column] = inside.pop()
     angles = _in_unit(_OF_PLACES[1], numbers)
     if len(angles) == 1 and not _OTHER_ANGLE.search(text):
         angle = angles.pop()
-        found[_OF_PLACES[1].column] = -abs(angle) if _UPWARDS.search(text) else angle
-    return found
+        references[_OF_PLACES[1].column] = -abs(angle) if _UPWARDS.search(text) else angle
+    return references
 
 
 def _in_unit(quantity: _Quantity, numbers: Iterable[re.Match[str]]) -> set[float]:

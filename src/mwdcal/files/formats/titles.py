@@ -49,7 +49,10 @@ _DAYS = (
 """Forms of a day that can be read in one way only; in Germany, Norway and Russia a point stands behind the day."""
 _PARTS = re.compile(r"\s+/\s+|,\s+|;\s*|\s{3,}")
 """The separator of facts in one cell."""
-_OF_TOOLS = "tool|probe|sensor|sonde|instrument|herramienta|ferramenta|verktøy|gerät|прибор|зонд|датчик|инклинометр|仪器|探管"
+_OF_TOOLS = (
+    "tool|probe|sensor|sonde|instrument|herramienta|ferramenta|verktøy|gerät|"
+    "прибор|зонд|датчик|инклинометр|仪器|探管"
+)
 _TOOL = re.compile(
     rf"#?\s*(?:(?:{_OF_TOOLS})\s*"
     r"(?P<mark>s/?n|serial( no)?|n[°º]|no\b|nr\b|зав\.?\s*№|№|#|号|编号)?|(?P<sn>sn|s/n|serial no))\s*[.:：|=]*\s*",
