@@ -625,7 +625,7 @@ class BenchSession:
         self._submit(partial(self._draw, verdict, "rolltest"))
 
     def _judge_as_found(self) -> Verdict | None:
-        """The verdict by the calibration before; None if there is none, or if it cannot judge."""
+        """The verdict by the calibration before, if there is one that can judge."""
         try:
             return documents.judge_as_found(self.folder)
         except MwdcalError as error:
