@@ -461,8 +461,7 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
         return None
     names, units, columns, letters = _used(kept, names, units, sheet.first_column)
     sign = decimal or figures.decimal_sign([c for column in columns for c in column], source)
-    signs = figures.signs_of(columns, sign)
-    read = [figures.column(column, each) for column, each in zip(columns, signs, strict=True)]
+    read = [*map(figures.column, columns, figures.signs_of(columns, sign))]
     above = [row for _, row in rows[:top]]
     block = stated_above(above)
     texts = [figures.as_they_stand(column) for column in columns]
