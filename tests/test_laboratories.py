@@ -308,3 +308,18 @@ def test_a_line_that_numbers_the_columns_names_them(tmp_path, numbered):
     run = taken(path)
     for column, cells in zip(names, zip(*rows, strict=True), strict=True):
         assert np.allclose(tables.numbers(run, column), np.array(cells, float))
+
+
+def test_a_column_of_another_decimal_sign_is_read_by_its_own(tmp_path):
+    """In a table of decimal commas 2.248 may be 2248, but not in a column that has 0.254."""
+    laboratory = LABORATORIES["pau"]
+    lines = laboratory.content.decode("cp850").split("\r\n")
+    rows = [k for k, line in enumerate(lines) if line.count(";") == 10 and line[0].isdigit()][:20]
+    for k in rows:
+        cells = lines[k].split(";")
+        cells[7:10] = [f"{int(cell) / 1000:.3f}" for cell in cells[7:10]]
+        lines[k] = ";".join(cells)
+    path = tmp_path / "pau.txt"
+    path.write_bytes("\r\n".join(lines[: rows[-1] + 1]).encode("cp850"))
+    run = taken(path)
+    assert np.allclose(tables.numbers(run, "mx"), np.array(laboratory.truth["mx"]) / 1000)

@@ -771,12 +771,12 @@ def _same(one: Table, other: Table) -> bool:
     return all(_cells(one, name) == _cells(other, name) for name in one.columns)
 
 
-def _cells(table: Table, name: str) -> list[str]:
-    """The cells of a column as numbers in their shortest form, or as they are."""
+def _cells(table: Table, name: str) -> tuple[bool, list[str]]:
+    """Whether a column is of numbers, and its cells, numbers in their shortest form."""
     try:
-        return [repr(value) for value in tables.numbers(table, name).tolist()]
+        return True, [repr(value) for value in tables.numbers(table, name).tolist()]
     except InputError:
-        return labels_of(table, name)
+        return False, labels_of(table, name)
 
 
 def _rounded(scale: float) -> float | None:

@@ -20,6 +20,7 @@ TRANSLATIONS = (
     (r"\|\s*g\s*\|", "Gtotal"),
     (r"pruf(?=stand)|mess(?=stand)", ""),
     (r"(?<=[°º] )[СсC]\b|(?<=[°º])[СсC]\b", "C"),
+    (r"(?<![^\W\d_])([CF])°", r"°\1"),
     (r"\bm(illi)?gauss\b", "mG"),
     (r"grav(?=axial|tran)", "acc "),
     (r"axial", "Z "),

@@ -120,6 +120,26 @@ def column(cells: Sequence[object], sign: str) -> tuple[list[str], str]:
     ], unit
 
 
+def signs_of(columns: Sequence[Sequence[object]], sign: str) -> list[str]:
+    """The decimal sign of each column: the other one where it cannot separate thousands in each of its numbers.
+
+    Where a column has the other one, so have all columns with that sign alone.
+
+    >>> signs_of([["19,9"], ["-2.248", "0.254"], ["52.003"]], ","), signs_of([["19,9"], ["52.003"]], ",")
+    ([',', '.', '.'], [',', ','])
+    """
+    other = "." if sign == "," else ","
+    signs, sure = [], False
+    for cells in columns:
+        texts = [_SPACES.sub("", cell) for cell in cells if isinstance(cell, str) and cell]
+        plain = [m[1].replace("−", "-") for m in map(_FIGURE.fullmatch, texts) if m]
+        marked = [each for each in plain if other in each]
+        alone = bool(marked) and all(looks_numeric(each, other) for each in plain)
+        sure |= alone and not all(map(_POINTED[sign].fullmatch, marked))
+        signs.append(other if alone else sign)
+    return signs if sure else [sign] * len(signs)
+
+
 def _pointed(text: str, sign: str, unit: str) -> str:
     """A cell with the decimal point, without separators and its unit, if it is a number; else as it is."""
     bare = _SPACES.sub("", text).replace("−", "-")

@@ -400,16 +400,12 @@ def _legend(text: str) -> list[str]:
 
 def _is_remark_below_names(rows: Sequence[tuple[int, Cells]], place: int) -> bool:
     """Whether a row is a remark between the names of a table and its readings."""
-    if not 0 < place < len(rows) - 1 or not _is_reading(rows[place + 1][1]):
+    row = rows[place][1]
+    if not 0 < place < len(rows) - 1 or sum(cell != "" for cell in row) >= LEAST_COLUMNS - 1:
         return False
-    row, above = rows[place][1], rows[place - 1][1]
-    short = sum(cell != "" for cell in row) < min(LEAST_COLUMNS - 1, _texts(above))
-    return (
-        short
-        and _texts(above) >= LEAST_COLUMNS
-        and not _is_reading(above)
-        and not titles([row]).metadata
-    )
+    above, below = rows[place - 1][1], rows[place + 1][1]
+    between = _texts(above) >= LEAST_COLUMNS and not _is_reading(above) and _is_reading(below)
+    return between and not titles([row]).metadata
 
 
 def _begins_anew(rows: Sequence[tuple[int, Cells]], heads: Sequence[int], place: int) -> bool:
@@ -465,7 +461,7 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
         return None
     names, units, columns, letters = _used(kept, names, units, sheet.first_column)
     sign = decimal or figures.decimal_sign([c for column in columns for c in column], source)
-    read = [figures.column(column, sign) for column in columns]
+    read = [*map(figures.column, columns, figures.signs_of(columns, sign))]
     above = [row for _, row in rows[:top]]
     block = stated_above(above)
     texts = [figures.as_they_stand(column) for column in columns]
@@ -722,6 +718,8 @@ def _is_mean(row: Cells, above: Sequence[Cells]) -> bool:
 
 def _number(cell: object) -> float | None:
     """The number that a cell is, with either decimal sign; None of one with separators of thousands or with a unit."""
+    if isinstance(cell, float | int):
+        return float(cell)
     text = as_text(cell).replace(",", ".")
     return float(text) if looks_numeric(text) else None
 
