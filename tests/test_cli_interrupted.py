@@ -100,7 +100,7 @@ def test_a_killed_first_run_leaves_no_file_of_that_name(tmp_path):
 def test_ctrl_c_ends_with_130_and_one_line(tmp_path, when):
     target = tmp_path / "cal.json"
     transliterate = (
-        "import mwdcal.calibration.estimate as e, time\nreal = e.start\ndef slow(p):\n"
+        "import mwdcal.estimation.minimisers.closed_form as e, time\nreal = e.start\ndef slow(p):\n"
         + (
             "    print('writing', flush=True)\n    for _ in range(2000):\n        time.sleep(0.01)\n"
             "    return real(p)\ne.start = slow\n"

@@ -26,7 +26,7 @@ from mwdcal.files.formats.columns import (
     shown,
 )
 from mwdcal.files.formats.title_references import stated_above
-from mwdcal.files.formats.titles import Titles, dated, titles
+from mwdcal.files.formats.titles import OF_REFUSAL, Titles, dated, titles
 from mwdcal.files.synonyms import unit_of
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import TableFormat
@@ -73,19 +73,8 @@ ADJUSTED = re.compile(
 )
 """Words of a run before or after an adjustment of the tool: two of them are two runs."""
 
-OF_REFUSAL = (
-    r"reject(ed)?|bad|invalid|void|voided|discard(ed)?|unusable|omit(ted)?|excluded?|scrap(ped)?|do not use|dnu|"
-    r"n\.? ?ok|nok|not ok|no good|n\.o\.k\.?|verworfen|ungultig|schlecht|fehlmessung|unbrauchbar|gestrichen|"
-    r"nicht (ok|verwenden|verwertbar)|n\.? ?i\.? ?o\.?|forkastet|ugyldig|darlig|underkjent|avvist|kassert|"
-    r"strøket|stroket|feilmaling|"
-    r"ikke (ok|bruk|brukes)|rechazad[oa]|invalid[oa]|descartad[oa]|anulad[oa]|no (ok|usar|valid[oa])|mal[oa]?|"
-    r"rejeitad[oa]|ruim|nao (ok|usar)|rejete?e?|mauvaise?|annulee?|ecarte|non ok|брак|забракован[оа]?|отбракован[оа]?|"
-    r"плохо|плохая|не ?год(ен|на|но)|недейств\w*|исключ\w*|не использовать|отклонен[оа]?|не ок|"
-    r"作废|剔除|无效|废弃|舍弃|弃用|不可用|坏点?|不合格"
-)
-"""Words by which a laboratory rejects a row, or a whole run."""
 _OF_VOID_RUN = re.compile(
-    rf"(?<![^\W\d_])({OF_REFUSAL}|abort(ed)?|cancell?ed|aborted|abgebrochen|ungültig|avbrutt|abortad[oa]|abandonn[eé]e?|"
+    rf"(?<![^\W\d_])({OF_REFUSAL}|abort(ed)?|cancell?ed|abgebrochen|ungültig|avbrutt|abortad[oa]|abandonn[eé]e?|"
     r"прерван\w*)(?![^\W\d_])|作废|无效|中止|废弃",
     re.IGNORECASE,
 )

@@ -47,6 +47,17 @@ _DAYS = (
     "%Y年%m月%d日",
 )
 """Forms of a day that can be read in one way only; in Germany, Norway and Russia a point stands behind the day."""
+OF_REFUSAL = (
+    r"reject(ed)?|bad|invalid|void|voided|discard(ed)?|unusable|omit(ted)?|excluded?|scrap(ped)?|do not use|dnu|"
+    r"n\.? ?ok|nok|not ok|no good|n\.o\.k\.?|verworfen|ungultig|schlecht|fehlmessung|unbrauchbar|gestrichen|"
+    r"nicht (ok|verwenden|verwertbar)|n\.? ?i\.? ?o\.?|forkastet|ugyldig|darlig|underkjent|avvist|kassert|"
+    r"strøket|stroket|feilmaling|"
+    r"ikke (ok|bruk|brukes)|rechazad[oa]|invalid[oa]|descartad[oa]|anulad[oa]|no (ok|usar|valid[oa])|mal[oa]?|"
+    r"rejeitad[oa]|ruim|nao (ok|usar)|rejete?e?|mauvaise?|annulee?|ecarte|non ok|брак|забракован[оа]?|отбракован[оа]?|"
+    r"плохо|плохая|не ?год(ен|на|но)|недейств\w*|исключ\w*|не использовать|отклонен[оа]?|не ок|"
+    r"作废|剔除|无效|废弃|舍弃|弃用|不可用|坏点?|不合格"
+)
+"""Words by which a laboratory rejects a row, or a whole run."""
 _PARTS = re.compile(r"\s+/\s+|,\s+|;\s*|\s{3,}")
 """The separator of facts in one cell."""
 _OF_TOOLS = (
