@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypedDict, cast
 
@@ -188,6 +188,9 @@ class Options:
             value = getattr(self, name)
             if isinstance(value, str) and value != AUTO:
                 object.__setattr__(self, name, () if value == "none" else (value,))
+        if not isinstance(self.exclude, Iterable):
+            object.__setattr__(self, "exclude", (self.exclude,))
+        object.__setattr__(self, "exclude", tuple(map(str, self.exclude)))  # labels are text
         if self.model not in (None, *MODELS):
             raise InputError(f"`model` must be {' or '.join(MODELS)}; got {self.model!r}.")
         if isinstance(self.prior, str) and self.prior != DATASHEET:
