@@ -188,9 +188,9 @@ class Options:
             value = getattr(self, name)
             if isinstance(value, str) and value != AUTO:
                 object.__setattr__(self, name, () if value == "none" else (value,))
-        if not isinstance(self.exclude, Iterable):
-            object.__setattr__(self, "exclude", (self.exclude,))
-        object.__setattr__(self, "exclude", tuple(map(str, self.exclude)))  # labels are text
+        given: Any = self.exclude
+        labels = given if isinstance(given, Iterable) else (given,)
+        object.__setattr__(self, "exclude", tuple(map(str, labels)))  # labels are text
         if self.model not in (None, *MODELS):
             raise InputError(f"`model` must be {' or '.join(MODELS)}; got {self.model!r}.")
         if isinstance(self.prior, str) and self.prior != DATASHEET:
