@@ -238,6 +238,14 @@ def test_as_found_and_a_second_signature(finished, tmp_path):
         tmp_path / "k.key.pub",
     )
     assert checked.code == 0, checked
+    listed = json.loads((session.folder / "certificate.json").read_text())["files"]
+    assert {"tool.json", "verification.json"} <= {
+        file["name"] for file in listed
+    }  # from its folder
+    pdf = session.folder / "certificate.pdf"
+    assert pdf.exists()
+    checked = mwdcal("certificate", "verify", pdf, "--key", tmp_path / "k.key.pub")
+    assert checked.code == 0, checked
     with pytest.raises(InputError, match="waits for a signature"):
         session.sign()
     session.close()

@@ -156,3 +156,24 @@ def test_the_documented_table_has_every_command_and_function():
     assert named <= {*mwdcal.__all__}
     helpers = {"load", "load_profile", "read_run", "readings", "save"}
     assert {n for n in mwdcal.__all__ if n.islower()} - named == helpers
+
+
+def test_a_calibration_takes_no_table_by_the_place_of_its_columns(calibrated):
+    """Else the fields would silently be those of other columns."""
+    made, _, _ = calibrated
+    names = ["mz", "my", "mx", "az", "ay", "ax"]
+    for table in (
+        pytest.importorskip("pandas").DataFrame(np.ones((2, 6)), columns=names),
+        {name: [1.0, 1.0] for name in names},
+    ):
+        for ask in (made.fields, lambda t: made.uncertainty("azimuth", t)):
+            with pytest.raises(mwdcal.InputError, match=r"mwdcal\.read_run\(table, cal\.profile\)"):
+                ask(table)
+
+
+def test_stations_left_out_may_be_given_as_numbers():
+    run = mwdcal.simulate(tool=4, seed=1)
+    for exclude, left in ((3, ["3"]), ([3, 4], ["3", "4"]), ("34", ["34"])):
+        assert mwdcal.calibrate(run, exclude=exclude).excluded == left
+    with pytest.raises(mwdcal.InputError, match="no such station in the readings; .*by itself"):
+        mwdcal.calibrate(run, exclude="8,21")

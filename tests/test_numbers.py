@@ -41,3 +41,18 @@ def test_a_contribution_below_a_thousandth_is_zero(combined, share):
         assert text == "0"
     elif share > 1.001e-3:
         np.testing.assert_allclose(value_of(text), share * combined, rtol=0.051)
+
+
+def test_many_degrees_of_freedom_are_no_power_of_ten():
+    from types import SimpleNamespace
+
+    from mwdcal.presentation.verification import freedom
+
+    for value, shown in (
+        (2961.4, "2960"),
+        (7.0, "7"),
+        (139.2, "139"),
+        (60.24, "60.2"),
+        (None, "∞"),
+    ):
+        assert freedom(SimpleNamespace(uncertainty=1.0, degrees_of_freedom=value)) == shown

@@ -623,6 +623,15 @@ def test_a_path_that_cannot_begin_at_the_first_station_says_so(
     assert any(f["id"] == "path-from-first" for f in document["findings"]) is not bool(options)
 
 
+def test_a_tie_in_at_a_point_is_no_position_of_a_station(example, tmp_path):
+    """The first station lies at the depth of the point: the path begins there, not at the second."""
+    depths = {"md_m": [*map(str, range(1000, 1360, 10))]}
+    _, document = surveyed_file(example, tmp_path, depths, "--tie-in", "1000,0,0,100,-20,900")
+    found = {finding["id"] for finding in document["findings"]}
+    assert "left-out" in found
+    assert not found & {"path-from-later", "path-from-first"}
+
+
 def test_what_is_not_judged_is_named(example, tmp_path):
     blank = dict.fromkeys(("ref_field_nt", "ref_dip_deg"), [""] * 36)
     columns, document = surveyed_file(example, tmp_path, blank)

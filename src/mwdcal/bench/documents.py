@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
     from mwdcal.calibration.readings import Readings
     from mwdcal.calibration.record import Calibration, StationRow
+    from mwdcal.library.papers import Paper
     from mwdcal.use.verification import Verdict
 
 FEWEST_STATIONS = 8
@@ -165,11 +167,7 @@ def certify(
     folder: Path, number: str, laboratory: Path | None, say: Callable[[str], None]
 ) -> dict[str, str]:
     """Issue the certificate in all forms that can be made here; files by what they are."""
-    chosen: dict[str, Any] = {"number": number} if number else {}
-    chosen |= {"laboratory": laboratory} if laboratory else {}
-    verification = folder / "verification.json"
-    chosen |= {"as_found": folder / AS_FOUND} if (folder / AS_FOUND).exists() else {}
-    paper = mwdcal.certificate(folder / "tool.json", verification=verification, **chosen)
+    paper = _paper(folder, number, laboratory)
     mwdcal.save(paper, folder / "certificate.json")
     files = {"certificate": "certificate.json"}
     for kind in ("html", "pdf"):
@@ -179,6 +177,37 @@ def certify(
         except InputError as error:
             say(str(error))
     return files
+
+
+def _paper(folder: Path, number: str, laboratory: Path | None, **chosen: Any) -> Paper:
+    """The certificate of the session's files."""
+    as_found = folder / AS_FOUND
+    return mwdcal.certificate(
+        folder / "tool.json", verification=folder / "verification.json", laboratory=laboratory, number=number,
+        as_found=as_found if as_found.exists() else None, folder=folder, **chosen,
+    )  # fmt: skip
+
+
+def sign_pdf(folder: Path, laboratory: Path | None, key: Path, passphrase: str) -> None:
+    """Issue the PDF, if there is one, again, with the signature of the second person in it.
+
+    Raises:
+        InputError: the certificate would no longer be the one that was signed.
+    """
+    pdf = folder / "certificate.pdf"
+    if not pdf.exists():
+        return
+    issued = json.loads((folder / "certificate.json").read_bytes())
+    signing = {"date": issued["issued"], "private_key": key, "passphrase": passphrase}
+    paper = _paper(folder, issued["number"], laboratory, **signing)
+    unsigned, written = (
+        {k: v for k, v in d.items() if k != "signature"} for d in (paper.to_dict(), issued)
+    )
+    if json.loads(json.dumps(unsigned, default=str)) != written:
+        raise InputError(
+            "certificate.pdf stays unsigned: files of the session changed after the certificate. Send certificate.json."
+        )
+    mwdcal.save(paper, pdf)
 
 
 def enter(folder: Path, registry: str) -> str:

@@ -175,7 +175,7 @@ class Bench:
             raise InputError(
                 f"{pages.texts()['accuracy_wanted']}: give one from {LEAST_ACCURACY} to 10."
             )
-        return f"azimuth_deg={wanted:.6f}"
+        return f"azimuth_deg={wanted:g}"
 
     def _typed(self, form: Mapping[str, str]) -> None:
         """Readings by hand are stations, one a line."""
@@ -437,7 +437,7 @@ def _number(text: str, name: str) -> float | None:
             return value
     except ValueError:
         pass
-    raise InputError(f"{name}: '{text[:40]}' is not a number that can be. Correct it.")
+    raise InputError(f"{name}: '{text[:40]}' is not a number, or too large. Correct it.")
 
 
 def _whole(text: str) -> int | None:

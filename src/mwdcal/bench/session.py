@@ -668,6 +668,11 @@ class BenchSession:
                 self.folder, self.countersign, passphrase, self.facts.get("operator", "")
             )
             self._record("papers", files={"signature": who})
+            self._submit(
+                partial(
+                    documents.sign_pdf, self.folder, self.laboratory, self.countersign, passphrase
+                )
+            )
         self._submit(self._enter)
 
     def enter(self) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypedDict, cast
 
@@ -188,6 +188,9 @@ class Options:
             value = getattr(self, name)
             if isinstance(value, str) and value != AUTO:
                 object.__setattr__(self, name, () if value == "none" else (value,))
+        given: Any = self.exclude
+        labels = given if isinstance(given, Iterable) else (given,)
+        object.__setattr__(self, "exclude", tuple(map(str, labels)))  # labels are text
         if self.model not in (None, *MODELS):
             raise InputError(f"`model` must be {' or '.join(MODELS)}; got {self.model!r}.")
         if isinstance(self.prior, str) and self.prior != DATASHEET:

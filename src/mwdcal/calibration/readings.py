@@ -333,10 +333,15 @@ def as_readings(source: ReadingsLike) -> Readings:
     Columns: accelerometer x, y, z; magnetometer x, y, z; temperature. Units: nominal g and nT along the tool axes, °C.
 
     Raises:
-        InputError: an array of another shape, or of something else than numbers.
+        InputError: an array of another shape, or of something else than numbers; a table, whose names would not count.
     """
     if isinstance(source, Readings):
         return source
+    if hasattr(source, "columns") or isinstance(source, Mapping):
+        raise InputError(
+            "a table is read by the names of its columns: make readings of it by mwdcal.read_run(table, cal.profile). "
+            "Or give an array, whose columns count by their place: table[[…]].to_numpy()."
+        )
     try:
         array: Array = np.asarray(np.ma.filled(np.ma.array(source, dtype=float), np.nan))
     except (TypeError, ValueError):

@@ -28,7 +28,8 @@ def listing(surveyed: SurveyedWell) -> Table:
     well = surveyed.well
     if well.position is None or not well.position.on_path.any():
         raise InputError(
-            "`listing` is of the well path, which these surveys do not have. Add measured depths."
+            "`listing` is of the well path, which these surveys do not have. Add measured depths, and see that "
+            "stations have results: outside the calibrated temperatures they have none."
         )
     rows = np.flatnonzero(well.position.on_path)
     unit, metres = well.length_unit, LENGTH_UNITS[well.length_unit]

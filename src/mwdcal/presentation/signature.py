@@ -48,7 +48,7 @@ IN_SHORT = {
 """The states of a calibration's signature, as part of a line."""
 PDF_UNSIGNED = (
     "{name} carries no signature that can be checked: nothing shows that the pages are those of the JSON in it. "
-    "Issue it with `private_key`."
+    "Issue it with the private key: mwdcal certificate … --private-key."
 )
 PDF_ALTERED = "{name} was altered after it was signed. Use the PDF as it was issued."
 PDF_OTHER_KEY = "{name} and the JSON in it are not signed by one key. Use the PDF as it was issued."

@@ -112,4 +112,4 @@ def freedom(judged: VerdictRow | JudgedSet) -> str:
     if judged.uncertainty is None or judged.degrees_of_freedom is UNSET:
         return "–"
     many = judged.degrees_of_freedom is None or judged.degrees_of_freedom >= MANY
-    return "∞" if many else f"{judged.degrees_of_freedom:.3g}"
+    return "∞" if many else f"{float(f'{judged.degrees_of_freedom:.3g}'):g}"

@@ -873,7 +873,7 @@ def _findings(result: Well, counts: WellCounts, from_first: bool) -> list[Findin
         "long-courses": course > 2 * USUAL_COURSE,
         "magnetic-north": result.north.declination is None and result.calibration.has_field,
         "path-from-first": there and from_first and depth > 0,
-        "path-from-later": start > 0,
+        "path-from-later": start > 0 and not isinstance(result.started, TieIn),
         "left-out": there and counts.on_path < counts.rows,
         "no-path": counts.located and not there,
     }

@@ -884,7 +884,8 @@ class RollTest:
         at = f"toolface {farthest:.0f}°" if error else f"toolfaces {least:.0f}° to {most:.0f}°"
         where = f"{roll_set.label}; {at}"
         if curve.rough(noise.known):
-            where += f"; raw figure judged: {float(curve.scale):.2g} × the noise is left about a smooth curve"
+            left = float(f"{curve.scale:.2g}")
+            where += f"; raw figure judged: {left:g} × the noise is left about a smooth curve"
         if not error:
             curve, middle = about_middle(curve)
             part = part - middle

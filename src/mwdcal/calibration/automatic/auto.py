@@ -628,13 +628,15 @@ def without(readings: Readings, exclude: tuple[str, ...]) -> Readings:
     twice = [label for label in exclude if labels.count(label) > 1]
     if twice:
         raise InputError(
-            f"`exclude` {twice[0]}: {labels.count(twice[0])} stations of {readings.source} "
+            f"`exclude` {twice[0]}: {labels.count(twice[0])} stations of {readings.name} "
             "have this label. Give each its own in the column 'station'."
         )
     missing = [label for label in exclude if label not in labels]
     if missing:
+        each = [part.strip() for part in missing[0].split(",")]
+        apart = " Name each by itself." if len(each) > 1 and {*each} <= {*labels} else ""
         raise InputError(
-            f"`exclude` {missing[0]}: no such station in {readings.source}; "
-            f"stations are {labels[0]} … {labels[-1]}."
+            f"`exclude` {missing[0]}: no such station in {readings.name}; "
+            f"stations are {labels[0]} … {labels[-1]}.{apart}"
         )
     return readings.select(np.array([label not in exclude for label in labels]))
