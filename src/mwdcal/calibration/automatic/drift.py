@@ -16,6 +16,7 @@ import numpy as np
 
 from mwdcal.calibration.automatic.courses import f_test, members, terms_beyond
 from mwdcal.calibration.diagnosis.plausibility import departures
+from mwdcal.calibration.diagnosis.structure import effects, shown_effects
 from mwdcal.calibration.estimate import Fit, fit, refitted, with_all
 from mwdcal.calibration.methods import declared_sizes
 from mwdcal.calibration.options import Options
@@ -50,6 +51,8 @@ TOGETHER = 320
 """Most fits whose drifts are fitted together: few enough for the cache…"""
 ON_A_STAND = 64
 """…and on an uncertain stand, where a fit takes several times the memory."""
+WRONG_DIP, WRONG_CHANCE = np.radians(0.25), 1e-12
+"""A dip that is off by more, where noise looks so less often, is a wrong reference: no field turns so far in a run."""
 REDUNDANCY = 36.0
 """Fewest degrees of freedom of a triad that can tell a drift from noise."""
 
@@ -119,8 +122,27 @@ def drifting(result: Fit, options: Options) -> Bools:
     chance, hidden = chances(alone)
     limit = np.where(hidden, HIDDEN_CHANCE, ORDER_CHANCE)
     limit = np.where(disputed[:, None], DISPUTED_CHANCE, limit)
-    drifted[sound] = chance < limit
+    found = chance < limit
+    places = np.flatnonzero(found.any(-1))
+    if places.size:
+        found[places[_wrong_dip(take(part, places))]] = False
+    drifted[sound] = found
     return drifted
+
+
+def _wrong_dip(result: Fit) -> Bools:
+    """Fits (B,) whose residuals a wrong reference of the dip explains best, without any drift.
+
+    It leaves residuals that go with attitude, and attitude may go with the order of the stations. A walk would follow
+    them too, so uncertain that the error does not show.
+    """
+    wrong = np.zeros(len(result.status), bool)
+    for place, shown in enumerate(shown_effects(result, {})):
+        name = next(iter(shown), "")
+        if name == "dip-reference" and shown[name][0] < WRONG_CHANCE:
+            [effect] = effects(take(result, np.array([place])), shown={name: shown[name]})
+            wrong[place] = abs(effect.values[0]) > WRONG_DIP
+    return wrong
 
 
 def _apart(result: Fit, options: Options) -> bool:
