@@ -330,8 +330,7 @@ WELL_FINDINGS = {
     "about them.",
     "laboratory-gravity": "gravity at the laboratory is unknown (1 g was assumed), so |g| is judged 1.5 mg more "
     "loosely. To tighten this, give ref_gravity_g in the calibration run.",
-    "calibration-old": "the tool was calibrated {years:.1f} years before, and 1σ allows for the drift of one year. "
-    "Verify the tool, or give `registry`, where the drift of tools has no such end.",
+    "calibration-old": "the tool was calibrated {years:.1f} years before, and 1σ {drift}",
     "calibration-later": "the surveys are of {day}, before the calibration of {calibrated}: is it the right one?",
     "long-courses": "the courses between surveys are {course:.0f} m long (median), and {usual:g} m are usual: are "
     "the depths in feet? Name their column `md_ft`, or give `length_unit`.",
@@ -345,6 +344,13 @@ WELL_FINDINGS = {
     "no-path": "no well path: no station has both a measured depth and a direction with azimuth.",
 }
 """The texts of the findings about a well, in their order."""
+OLD_DRIFT = {
+    True: "allows for the drift of one year. Verify the tool, or give `registry`, where the drift of tools has no such "
+    "end.",
+    False: "has nothing of the drift since. Verify the tool, or survey with an error model, and after `msa` a "
+    "`sensor_drift`, that has one.",
+}
+"""What 1σ has of the drift since an old calibration: that of one year, or none."""
 
 
 @dataclass(frozen=True)
@@ -883,7 +889,7 @@ def _findings(result: Well, counts: WellCounts, from_first: bool) -> list[Findin
         "names": " and ".join(n for n, lacks in zip(STRENGTH_NAMES, counts.lacking, strict=True) if lacks),
         "blindest": blindest, "worst": worst, "partly": counts.partly, "unjudged": counts.unjudged,
         "count": counts.rows - counts.on_path, "years": years, "day": day, "calibrated": calibrated, "course": course,
-        "usual": USUAL_COURSE,
+        "usual": USUAL_COURSE, "drift": OLD_DRIFT[DRIFT in result.terms.included],
     }  # fmt: skip
     return [*result.corrected, *result.north.findings] + [
         Finding(id=name, text=text.format(**words))
