@@ -291,7 +291,9 @@ def hole_of(
     magnetic = direction.azimuth
     angles = inclination, magnetic + north
     last: tuple[float, float, float] | None = None
+    above = np.nan
     if isinstance(before, PathEnd):
+        above = before.above.item()
         end = before.md, before.errors.inclination, before.errors.azimuth
         before = TieIn(end[0].item(), end[1].item(), end[2].item(), before.sums.position)
     if isinstance(before, TieIn):
@@ -304,7 +306,7 @@ def hole_of(
         tvd = well_path(whole[0], whole[1], whole[2], start)[-len(md) :, 2]
     if calibration.relative:
         field = np.broadcast_to(readings.reference("field"), md.shape)
-    return Hole.along(md, tvd, *angles, magnetic, field, dip, last=last)
+    return Hole.along(md, tvd, *angles, magnetic, field, dip, last=last, above=above)
 
 
 BLIND_FROM = 1.0
