@@ -226,6 +226,40 @@ def test_along_a_free_direction_nothing_is_known():
     np.testing.assert_allclose(known, wide, atol=1e-6)
 
 
+def test_a_value_along_a_free_direction_is_no_walk():
+    """Where a run leaves a turn free its value is a convention: as if its uncertainty were without bounds."""
+    rng = np.random.default_rng(2)
+    covariance, places = random_covariance(rng), [6, 7, 8, 9, 10, 11]
+    steady = history(rng.normal(size=(3, SIZE)), covariance)
+    free = np.zeros(SIZE)
+    free[[6, 8, 12 + 6, 12 + 8]] = 1.0, -1.0, 0.5, -0.5
+
+    def first_free(moved, known, wide):
+        values, whole, each = (
+            steady.values.copy(),
+            steady.covariance.copy(),
+            steady.precision.copy(),
+        )
+        values[0] += moved * free
+        whole[0] += wide * np.outer(free, free)
+        each[0] = known
+        return replace(steady, values=values, covariance=whole, precision=each)
+
+    known = precision(covariance, free[None])
+    rates = np.geomspace(1e-3, 1e3, 30)
+    limit = first_free(0.0, np.linalg.inv(covariance + 1e7 * np.outer(free, free)), 1e7)
+    expected = Increments.of(limit, places).log_likelihood(rates)
+    for moved in (0.0, 50.0):
+        ours = Increments.of(first_free(moved, known, 0.0), places)
+        assert len(ours.change) == 2 * len(places) - 1
+        found = ours.log_likelihood(rates)
+        np.testing.assert_allclose(found - found[0], expected - expected[0], atol=1e-4)
+    together = History.of([steady, first_free(50.0, known, 0.0), steady])
+    alone, _, also = Increments.of_tools(together, places)
+    np.testing.assert_allclose(alone.change, Increments.of(steady, places).change)
+    np.testing.assert_allclose(also.noise, alone.noise)
+
+
 def test_what_cannot_be_compared_is_said():
     bench = Bench("twelve-state", 6)
     plain = bench.calibration("2024-01-01")

@@ -125,6 +125,11 @@ def norths(columns, rng):
     columns["sd_random_ref_declination_deg"] = ["0.2"] * ROWS
 
 
+def repeated(columns, rng):
+    """Two surveys at each depth, 8.6 m apart: below 10 m a term grows as the course gets shorter."""
+    columns["md_m"] = [columns["md_m"][row - row % 2] for row in range(ROWS)]
+
+
 CASES = {
     "gaps": (gaps, ["declination_deg = 2.5"], ("--json",)),
     "reference": (gaps, ["declination_deg = 2.5", 'date = "2024-05-01"'], ("--reference",)),
@@ -134,6 +139,7 @@ CASES = {
     "swapped": (swapped, [], ()),
     "unmagnetic": (unmagnetic, [], ()),
     "norths": (norths, [], ()),
+    "repeated": (repeated, ["declination_deg = 2"], ("--tie-in", "0,0,40,0,0,0")),
 }  # fmt: skip
 
 

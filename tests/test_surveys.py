@@ -430,6 +430,26 @@ def test_days_that_do_not_belong_together_are_named(
     assert {f.id for f in whole.findings} & named == expected
 
 
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({}, "allows for the drift of one year"),
+        ({"msa": True}, "allows for the drift of one year"),
+        ({"error_model": "none"}, "has nothing of the drift since"),
+        ({"msa": True, "sensor_drift": "none"}, "has nothing of the drift since"),
+    ],
+)
+def test_an_old_calibration_says_whether_its_drift_is_in_the_uncertainty(
+    example, tmp_path, place, options, words
+):
+    record = mwdcal.load(example)
+    record = replace_struct(record, tool={**record.tool, "date": "2024-01-10"})
+    source = write_csv(tmp_path / "in.csv", read_csv(EXAMPLE / "well.csv"), 'date = "2026-05-20"')
+    whole = mwdcal.survey(record, source, reference=place[0], **options)
+    (text,) = [f.text for f in whole.findings if f.id == "calibration-old"]
+    assert words in text
+
+
 @pytest.mark.parametrize(("times", "named"), [(1.0, False), (1.9, False), (1 / 0.3048, True)])
 def test_courses_as_long_as_those_of_feet_taken_for_metres_are_named(
     example, tmp_path, times, named

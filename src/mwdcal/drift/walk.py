@@ -172,6 +172,18 @@ class History:
             has_prior=np.stack([*priors]),
         )
 
+    @cached_property
+    def free_directions(self) -> tuple[Array, Array]:
+        """Units (…, n, p) in which each parameter is known to one, and directions (…, n, p, p) of which nothing is.
+
+        The latter are columns of length one in these units; other columns are zero. A parameter of which nothing is
+        known whatever the others are is no part of them.
+        """
+        units = _units(self.precision)
+        values, vectors = np.linalg.eigh(self.precision * outer(units))
+        known = _positive(values)[..., None, :] | (units == 0)[..., None]
+        return units, np.where(known, 0.0, vectors)
+
     @property
     def steady(self) -> Ints:
         """Places (s,) of the parameters at the middle temperature."""
@@ -278,6 +290,30 @@ def group_places(names: Sequence[str], triad: str, kind: str) -> list[int]:
     return [place for place, name in enumerate(names) if name in members]
 
 
+FREE_SHARE_OF_GROUP = 1e-6
+"""Share of a free direction, in the units in which each parameter is known to one, that a group has at least."""
+FREE_OF_LARGEST = 1e-4
+"""Share of the largest of the free directions of a tool up to which one is a small turn of the others."""
+
+
+def _free_directions(history: History, places: Sequence[int]) -> Array:
+    """Sums (…, n, s, s) of the products of the directions of a group that each calibration leaves free."""
+    units, directions = history.free_directions
+    some = directions[..., places, :]
+    some = np.where(np.sum(some**2, -2, keepdims=True) > FREE_SHARE_OF_GROUP, some, 0.0)
+    some = some * units[..., places, None]
+    return np.asarray(some @ some.mT)
+
+
+def _of_steps(weights: Array, blocks: Array) -> Array:
+    """Covariances (t, m s, m s) of steps by those of calibrations (t, n, s, s), with weights (t, m, m, n)."""
+    steps, size = weights.shape[1], blocks.shape[-1]
+    noise = np.zeros((len(blocks), steps, size, steps, size))
+    for weight, block in zip(np.moveaxis(weights, -1, 0), blocks.swapaxes(0, 1), strict=True):
+        noise += weight[:, :, None, :, None] * block[:, None, :, None, :]
+    return noise.reshape(-1, steps * size, steps * size)
+
+
 @dataclass(frozen=True)
 class Increments:
     """Changes (m,) of a group from visit to visit, in axes in which walk and noise are both white.
@@ -303,35 +339,43 @@ class Increments:
             usable &= ~history.has_prior
         apart = [np.diff(at[use]) > VISIT for at, use in zip(history.years, usable, strict=True)]
         result = [cls(np.zeros(0), np.zeros(0))] * len(values)
+        free = _free_directions(history, places)
+        open_ = free.any((-2, -1)) & usable
         for tools in by_kind(
-            (u.tobytes(), a.tobytes()) for u, a in zip(usable, apart, strict=True)
+            (u.tobytes(), a.tobytes(), tool if some.any() else -1)
+            for tool, (u, a, some) in enumerate(zip(usable, apart, open_, strict=True))
         ):
             kept, gap = np.flatnonzero(usable[tools[0]]), apart[tools[0]]
             if gap.any():
                 some = np.ix_(np.array(tools), kept)
                 block = history.covariance[some][..., places, :][..., places]
                 gaps = np.diff(history.years[some])[:, gap]
-                changes = cls._white(values[some], block, gaps, gap)
+                lost = free[some] if open_[tools].any() else None
+                changes = cls._white(values[some], block, gaps, gap, lost)
                 for tool, one in zip(tools, changes, strict=True):
                     result[tool] = one
         return result
 
     @classmethod
     def _white(
-        cls, values: Array, covariance: Array, gaps: Array, apart: Bools
+        cls, values: Array, covariance: Array, gaps: Array, apart: Bools, free: Array | None = None
     ) -> list[Increments]:
-        """Of values (t, n, s) of covariance (t, n, s, s) with gaps (t, m), years, where they are `apart` (n - 1,)."""
+        """Of values (t, n, s) of covariance (t, n, s, s) with gaps (t, m), years, where they are `apart` (n - 1,).
+
+        Without what follows directions that calibrations leave free, whose products are `free` (1, n, s, s): a value
+        there is a convention.
+        """
         step = np.diff(np.eye(values.shape[1]), axis=0)[apart]
         root = np.sqrt(gaps)
         weights = step[:, None] * step / (root[:, :, None, None] * root[:, None, :, None])
-        noise = np.zeros((len(values), *2 * (len(step), values.shape[-1])))
-        for weight, block in zip(
-            np.moveaxis(weights, -1, 0), covariance.swapaxes(0, 1), strict=True
-        ):
-            noise += weight[:, :, None, :, None] * block[:, None, :, None, :]
-        size = len(step) * values.shape[-1]
-        spread, axes = np.linalg.eigh(noise.reshape(-1, size, size))
-        change = (step @ values / root[..., None]).reshape(-1, 1, size) @ axes
+        noise = _of_steps(weights, covariance)
+        change = (step @ values / root[..., None]).reshape(len(noise), 1, -1)
+        if free is not None:
+            sizes, axes = np.linalg.eigh(_of_steps(weights, free))
+            across = axes[..., sizes[0] <= FREE_OF_LARGEST * sizes[0, -1]]
+            noise, change = across.mT @ noise @ across, change @ across
+        spread, axes = np.linalg.eigh(noise)
+        change = change @ axes
         return [cls(*each) for each in zip(change[:, 0], np.maximum(spread, 0.0), strict=True)]
 
     def log_likelihood(self, rates: Array) -> Array:

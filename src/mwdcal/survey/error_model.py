@@ -187,11 +187,13 @@ class Hole:
         dip: ArrayLike,
         gravity: ArrayLike = STANDARD_GRAVITY,
         last: tuple[float, float, float] | None = None,
+        above: float = np.nan,
     ) -> Hole:
         """A hole from its stations in their order; `azimuth` from the north of the path, `magnetic` from magnetic.
 
         `last`: depth, inclination and azimuth of the station before; None: a straight course of 30 m leads to the
         first, as to a station without depth. Where the hole was vertical the azimuth before is that of the station.
+        `above`: depth of the station before the last, from which the course to one at the depth of the last counts.
         """
         last = (np.nan, inclination[0], azimuth[0]) if last is None else last
         each = zip(last, (md, inclination, azimuth), strict=True)
@@ -199,7 +201,7 @@ class Hole:
         straight = np.abs(np.sin(before[1])) <= VERTICAL
         before[2] = np.where(straight, azimuth, before[2])
         md = np.where(np.isfinite(md), md, 0.0)
-        before[0] = _depth_before(md, before[0])
+        before[0] = _depth_before(np.append(last[0], md), np.append(above, before[0]))[1:]
         values = (md, tvd, inclination, azimuth, magnetic, field, dip, gravity, *before)
         return Hole({n: np.asarray(v, float) for n, v in zip(OF_STATIONS, values, strict=True)})
 

@@ -227,23 +227,27 @@ class TieIn(NamedTuple):
         sums = _no_sums(md, exact, self.place)
         if self.covariance is not None:
             sums = sums._replace(settled=self.covariance)
-        return PathEnd(md, exact, sums)
+        return PathEnd(md, exact, sums, np.full(md.shape, np.nan))
 
 
 class PathEnd(NamedTuple):
-    """Where a path has come to: depth (…, 1) and errors of its last station, and what has added up there."""
+    """Where a path has come to: depth (…, 1) and errors of its last station, and what has added up there.
+
+    `above` (…, 1) is the depth of the station before the last, NaN where there is none.
+    """
 
     md: Array
     errors: DirectionErrors
     sums: _Sums
+    above: Array
 
     def widened(self, causes: int) -> PathEnd:
         """The same with room for more lasting causes, which so far have done nothing."""
         errors, sums = self.errors, self.sums
-        return PathEnd(
-            self.md, replace(errors, systematic=_widened(errors.systematic, causes)),
-            sums._replace(shift=_widened(sums.shift, causes)),
-        )  # fmt: skip
+        return self._replace(
+            errors=replace(errors, systematic=_widened(errors.systematic, causes)),
+            sums=sums._replace(shift=_widened(sums.shift, causes)),
+        )
 
 
 def _widened(shifts: Array, causes: int) -> Array:
@@ -508,7 +512,8 @@ def _along(
         else:
             sums = _no_sums(md, errors, before)
         position, covariance, sums = _part_of_path(md, errors, sums, balanced)
-        before = PathEnd(md[..., -1:], errors.stations(slice(-1, None)), sums)
+        above = md[..., -2:-1] if md.shape[-1] > 1 else np.full(md.shape, np.nan)
+        before = PathEnd(md[..., -1:], errors.stations(slice(-1, None)), sums, above)
         yield position[..., new, :], covariance[..., new, :, :], before
 
 

@@ -291,7 +291,9 @@ def hole_of(
     magnetic = direction.azimuth
     angles = inclination, magnetic + north
     last: tuple[float, float, float] | None = None
+    above = np.nan
     if isinstance(before, PathEnd):
+        above = before.above.item()
         end = before.md, before.errors.inclination, before.errors.azimuth
         before = TieIn(end[0].item(), end[1].item(), end[2].item(), before.sums.position)
     if isinstance(before, TieIn):
@@ -304,7 +306,7 @@ def hole_of(
         tvd = well_path(whole[0], whole[1], whole[2], start)[-len(md) :, 2]
     if calibration.relative:
         field = np.broadcast_to(readings.reference("field"), md.shape)
-    return Hole.along(md, tvd, *angles, magnetic, field, dip, last=last)
+    return Hole.along(md, tvd, *angles, magnetic, field, dip, last=last, above=above)
 
 
 BLIND_FROM = 1.0
@@ -330,8 +332,7 @@ WELL_FINDINGS = {
     "about them.",
     "laboratory-gravity": "gravity at the laboratory is unknown (1 g was assumed), so |g| is judged 1.5 mg more "
     "loosely. To tighten this, give ref_gravity_g in the calibration run.",
-    "calibration-old": "the tool was calibrated {years:.1f} years before, and 1σ allows for the drift of one year. "
-    "Verify the tool, or give `registry`, where the drift of tools has no such end.",
+    "calibration-old": "the tool was calibrated {years:.1f} years before, and 1σ {drift}",
     "calibration-later": "the surveys are of {day}, before the calibration of {calibrated}: is it the right one?",
     "long-courses": "the courses between surveys are {course:.0f} m long (median), and {usual:g} m are usual: are "
     "the depths in feet? Name their column `md_ft`, or give `length_unit`.",
@@ -345,6 +346,13 @@ WELL_FINDINGS = {
     "no-path": "no well path: no station has both a measured depth and a direction with azimuth.",
 }
 """The texts of the findings about a well, in their order."""
+OLD_DRIFT = {
+    True: "allows for the drift of one year. Verify the tool, or give `registry`, where the drift of tools has no such "
+    "end.",
+    False: "has nothing of the drift since. Verify the tool, or survey with an error model, and after `msa` a "
+    "`sensor_drift`, that has one.",
+}
+"""What 1σ has of the drift since an old calibration: that of one year, or none."""
 
 
 @dataclass(frozen=True)
@@ -883,7 +891,7 @@ def _findings(result: Well, counts: WellCounts, from_first: bool) -> list[Findin
         "names": " and ".join(n for n, lacks in zip(STRENGTH_NAMES, counts.lacking, strict=True) if lacks),
         "blindest": blindest, "worst": worst, "partly": counts.partly, "unjudged": counts.unjudged,
         "count": counts.rows - counts.on_path, "years": years, "day": day, "calibrated": calibrated, "course": course,
-        "usual": USUAL_COURSE,
+        "usual": USUAL_COURSE, "drift": OLD_DRIFT[DRIFT in result.terms.included],
     }  # fmt: skip
     return [*result.corrected, *result.north.findings] + [
         Finding(id=name, text=text.format(**words))
