@@ -1,5 +1,6 @@
 """Slow drift within a run: seen, of the right size, in the uncertainty, and not seen in noise."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -173,6 +174,34 @@ def test_a_wrong_prior_is_no_drift(tmp_path):
     found = {finding["id"] for finding in made.json["findings"]}
     assert "prior-conflict" in found
     assert not found & {"accelerometer-drift", "magnetometer-drift", "field-drift"}
+
+
+@pytest.mark.parametrize("wrong", [0.3, -0.5, 1.0])
+def test_a_wrong_dip_is_named_and_no_drift(wrong):
+    """A walk would follow the residuals of a wrong dip too, and be so uncertain that nothing shows."""
+    right = runs(31, 20)
+    known = {**right.known, "dip": right.known["dip"] + np.radians(wrong)}
+    for place in range(20):
+        alone = replace(
+            right,
+            accelerometer=right.accelerometer[place],
+            magnetometer=right.magnetometer[place],
+            known=known,
+        )
+        calibration = calibrate(alone, Profile(name="x"), Options(order=0))
+        [finding] = [f for f in calibration.findings if f.id == "looks-like-dip-reference"]
+        size, sd = (float(x) for x in re.findall(r"Size (\S+)° ± (\S+)°", finding.text)[0])
+        assert abs(size + wrong) < 4 * sd + 0.005
+        assert not calibration.drift
+
+
+def test_a_drift_of_the_field_is_no_wrong_dip():
+    for straight in (False, True):
+        for _, result in by_drift(
+            fit(runs(32, 100, field=60.0, straight=straight), Options(order=0)), Options(order=0)
+        ):
+            if len(result.status) > 50:
+                assert result.problem.walks
 
 
 def test_what_held_parameters_leave_is_no_drift():
