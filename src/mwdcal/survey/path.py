@@ -233,7 +233,7 @@ class TieIn(NamedTuple):
 class PathEnd(NamedTuple):
     """Where a path has come to: depth (…, 1) and errors of its last station, and what has added up there.
 
-    `above` (…, 1) is the depth of the station before the last, NaN where there is none.
+    `above` (…, 1) is the depth of the station before the last, or NaN.
     """
 
     md: Array
