@@ -122,11 +122,10 @@ def drifting(result: Fit, options: Options) -> Bools:
     chance, hidden = chances(alone)
     limit = np.where(hidden, HIDDEN_CHANCE, ORDER_CHANCE)
     limit = np.where(disputed[:, None], DISPUTED_CHANCE, limit)
-    found = chance < limit
-    places = np.flatnonzero(found.any(-1))
+    drifted[sound] = chance < limit
+    places = np.flatnonzero(drifted.any(-1))
     if places.size:
-        found[places[_wrong_dip(take(part, places))]] = False
-    drifted[sound] = found
+        drifted[places[_wrong_dip(take(result, places))]] = False
     return drifted
 
 
