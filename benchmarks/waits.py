@@ -10,7 +10,6 @@ its own. The fleets are those of `fleet.py`, the long tables those of the guard:
 from __future__ import annotations
 
 import argparse
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -36,6 +35,16 @@ YEARS, DRIFTING = range(2022, 2026), 2_000
 """Years in which the tools of a registry were calibrated, and how many there are; their time is scaled."""
 CURVED = "nonlinearity = 0.005\n"
 """A line of a triad's section in a profile: its own-axis terms may be fitted."""
+
+LAUNCH = """
+import resource, subprocess, sys
+status = subprocess.call(sys.argv[1:])
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+print()
+print(used.ru_utime + used.ru_stime, used.ru_maxrss)
+sys.exit(status)
+"""
+"""A small process in between: the memory of a command would hold that of the process which starts it."""
 
 Command = tuple[str | Path, ...]
 
@@ -63,15 +72,13 @@ def processor(*command: str | Path) -> tuple[float, float]:
     """Processor time of a command and of the processes that it waits for, s, and the memory of the largest, MB."""
     words = [sys.executable, "-m", "mwdcal", *map(str, command)]
     with TemporaryFile() as said:
-        process = subprocess.Popen(words, stdout=said, stderr=said)
-        _, status, used = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        if process.returncode:
-            said.seek(0)
-            sys.exit(
-                f"{' '.join(words[2:])} ended with {process.returncode}:\n{said.read().decode()}"
-            )
-    return used.ru_utime + used.ru_stime, used.ru_maxrss / 1024
+        status = subprocess.call([sys.executable, "-c", LAUNCH, *words], stdout=said, stderr=said)
+        said.seek(0)
+        text = said.read().decode()
+    if status:
+        sys.exit(f"{' '.join(words[2:])} ended with {status}:\n{text}")
+    seconds, kilobytes = map(float, text.split()[-2:])
+    return seconds, kilobytes / 1024
 
 
 def sized(count: int, share: float, least: int = 20) -> int:
