@@ -43,6 +43,7 @@ from mwdcal.errors import InputError
 from mwdcal.files import documents
 from mwdcal.files.formats.members import Member
 from mwdcal.files.profiles import load_profile
+from mwdcal.library import drifts
 from mwdcal.planning.plans import drawn, load_plan
 from mwdcal.planning.session import Session
 from mwdcal.use.notation import convert
@@ -906,3 +907,16 @@ def test_surveys_drift_by_the_random_walk_of_their_tool(years, tmp_path):
     other = with_changes(latest, tool={**latest.tool, "serial": ""})
     with pytest.raises(InputError, match="no serial"):
         mc.survey(other, replace(stations, metadata={"date": later.isoformat()}), registry=where[1])
+
+
+def test_a_tool_that_cannot_be_measured_does_not_stop_the_others(monkeypatch):
+    def refusing(tools, level):
+        if any(tool.serial == "odd" for tool in tools):
+            raise InputError("not comparable")
+        return [tool.serial for tool in tools]
+
+    monkeypatch.setattr(drifts, "all_measured", refusing)
+    refused = {}
+    read = [ToolRecords(serial, (), (), {}) for serial in ("a", "odd", "c")]
+    assert drifts._measured(read, 0.05, refused) == ["a", "c"]
+    assert refused == {"odd": "not comparable"}

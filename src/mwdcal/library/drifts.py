@@ -104,7 +104,7 @@ def of_registry(
                     read.append(records)
             except MwdcalError as error:
                 refused[past.serial] = str(error)
-        tools += all_measured(read, level)
+        tools += _measured(read, level, refused)
     if not tools:
         raise InputError(
             f"{registry.name}: there is no calibration to compare. Add some: mwdcal registry add."
@@ -145,6 +145,17 @@ def with_walk(inputs: WellInputs, database: str) -> WellInputs:
         magnetometer_bias_nt=rates["magnetometer", "bias"], magnetometer_scale=scale["magnetometer"],
     )  # fmt: skip
     return replace(inputs, walk=walk)
+
+
+def _measured(read: list[ToolRecords], level: float, refused: dict[str, str]) -> list[MeasuredTool]:
+    """Tools measured together; if one cannot be, each by itself, and why it cannot."""
+    try:
+        return all_measured(read, level)
+    except MwdcalError as error:
+        if len(read) > 1:
+            return [tool for one in read for tool in _measured([one], level, refused)]
+        refused[read[0].serial] = str(error)
+        return []
 
 
 def drift_of(
