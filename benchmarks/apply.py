@@ -8,7 +8,6 @@ does is shared; times are the best of several, memory is the worst.
 
 from __future__ import annotations
 
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -17,6 +16,7 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import numpy as np
+from measuring import used_by
 
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
@@ -50,16 +50,6 @@ for name, values in reference(made, readings).items():
 pyarrow.parquet.write_table(table, sys.argv[3])
 """
 """What one would write without mwdcal's loops: whole columns, plain NumPy, default Parquet."""
-
-LAUNCH = """
-import os, subprocess, sys, time
-start = time.perf_counter()
-process = subprocess.Popen(sys.argv[1:], stdout=subprocess.DEVNULL)
-_, status, usage = os.wait4(process.pid, 0)
-print(time.perf_counter() - start, usage.ru_maxrss)
-sys.exit(status != 0)
-"""
-"""Starts a command from a small process: its peak memory begins with that of who starts it."""
 
 
 class Row(NamedTuple):
@@ -134,9 +124,9 @@ def in_files(rows: int, folder: Path, repeats: int = 3) -> Iterator[Row]:
         [str(MWDCAL), "apply", *names[:2], "-o", names[2]],
         [sys.executable, "-c", PLAIN, *names],
     ]
-    rounds = np.array([[child(command) for command in commands] for _ in range(repeats)])
-    (ours, _), (theirs, _) = rounds.min(axis=0).tolist()
-    (_, our_peak), (_, their_peak) = rounds.max(axis=0).tolist()
+    rounds = np.array([[used_by(command) for command in commands] for _ in range(repeats)])
+    (ours, *_), (theirs, *_) = rounds.min(axis=0).tolist()
+    (*_, our_peak), (*_, their_peak) = rounds.max(axis=0).tolist()
     yield Row(f"Parquet to Parquet, {rows} rows", ours, theirs, theirs / ours)
     yield Row(f"peak memory, {rows} rows", our_peak, their_peak, their_peak / our_peak, "MB")
 
@@ -155,17 +145,6 @@ def write_log(path: Path, rows: int) -> None:
             raw = [c * NOMINAL[i // 3] for i, c in enumerate(_columns(readings))]
             cells = [times, readings.temperature, *raw]
             writer.write_table(arrow.table(dict(zip(names, cells, strict=True)), schema=schema))
-
-
-def child(command: list[str]) -> tuple[float, float]:
-    """Wall time (s) and peak memory (MB) of a command; stops the benchmark when it fails."""
-    done = subprocess.run(
-        [sys.executable, "-c", LAUNCH, *command], capture_output=True, text=True, check=False
-    )
-    if done.returncode:
-        sys.exit(f"{' '.join(command)} failed:\n{done.stderr.strip()}")
-    wall, peak = map(float, done.stdout.split()[-2:])
-    return wall, peak * (1.0 if sys.platform == "darwin" else 1024.0) / 1e6
 
 
 def main() -> None:

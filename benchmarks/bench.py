@@ -39,10 +39,10 @@ PACKAGES = (
     "circuitpython-mag-cal", "imucal", "pandas", "welleng",
 )  # fmt: skip
 ORDER = (
-    *("waits", "fleet", "apply", "fits", "procedures", "surveys", "registry", "swarms", "peers"),
-    *("allan", "commands"),
+    *("fleet", "apply", "fits", "procedures", "surveys", "registry", "swarms", "peers", "allan"),
+    *("commands", "waits"),
 )
-"""Order of the runs: memory counts that of the largest process so far, and a child's that of this one at its start."""
+"""Order of the runs: the memory of a fleet is that of the largest process so far."""
 PLOTTED = (
     "fits",
     "procedures",

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 import tracemalloc
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +16,35 @@ FEWEST, MOST = 3, 25
 """Rounds of a comparison."""
 BUDGET = {"seconds": 4.0}
 """Time that a comparison may take; at least `FEWEST` rounds are made."""
+
+
+LAUNCH = """
+import os, subprocess, sys, time
+start = time.perf_counter()
+process = subprocess.Popen(sys.argv[1:], stdout=subprocess.DEVNULL)
+_, status, used = os.wait4(process.pid, 0)
+print(time.perf_counter() - start, used.ru_utime + used.ru_stime, used.ru_maxrss)
+sys.exit(status != 0)
+"""
+"""Starts a command from a small process: its peak memory begins with that of who starts it."""
+
+
+class Used(NamedTuple):
+    """Wall time and processor time of a command with the processes that it waits for, s; the largest memory, MB."""
+
+    wall: float
+    processor: float
+    memory: float
+
+
+def used_by(command: Sequence[str]) -> Used:
+    """Time and memory of a command; ends the benchmark when it fails."""
+    launched = [sys.executable, "-c", LAUNCH, *command]
+    done = subprocess.run(launched, capture_output=True, text=True, check=False)
+    if done.returncode:
+        sys.exit(f"{' '.join(command)} failed:\n{done.stderr.strip()}")
+    wall, processor, memory = map(float, done.stdout.split()[-3:])
+    return Used(wall, processor, memory * (1.0 if sys.platform == "darwin" else 1024.0) / 1e6)
 
 
 class Row(NamedTuple):

@@ -10,12 +10,11 @@ its own. The fleets are those of `fleet.py`, the long tables those of the guard:
 from __future__ import annotations
 
 import argparse
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory, TemporaryFile
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import fleet
@@ -24,6 +23,7 @@ import numpy as np
 import peers
 import pyarrow as pa
 import pyarrow.parquet as pq
+from measuring import used_by
 
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.readings import Readings
@@ -35,16 +35,6 @@ YEARS, DRIFTING = range(2022, 2026), 2_000
 """Years in which the tools of a registry were calibrated, and how many there are; their time is scaled."""
 CURVED = "nonlinearity = 0.005\n"
 """A line of a triad's section in a profile: its own-axis terms may be fitted."""
-
-LAUNCH = """
-import resource, subprocess, sys
-status = subprocess.call(sys.argv[1:])
-used = resource.getrusage(resource.RUSAGE_CHILDREN)
-print()
-print(used.ru_utime + used.ru_stime, used.ru_maxrss)
-sys.exit(status)
-"""
-"""A small process in between: the memory of a command would hold that of the process which starts it."""
 
 Command = tuple[str | Path, ...]
 
@@ -70,15 +60,8 @@ class Wait(NamedTuple):
 
 def processor(*command: str | Path) -> tuple[float, float]:
     """Processor time of a command and of the processes that it waits for, s, and the memory of the largest, MB."""
-    words = [sys.executable, "-m", "mwdcal", *map(str, command)]
-    with TemporaryFile() as said:
-        status = subprocess.call([sys.executable, "-c", LAUNCH, *words], stdout=said, stderr=said)
-        said.seek(0)
-        text = said.read().decode()
-    if status:
-        sys.exit(f"{' '.join(words[2:])} ended with {status}:\n{text}")
-    seconds, kilobytes = map(float, text.split()[-2:])
-    return seconds, kilobytes / 1024
+    used = used_by([sys.executable, "-m", "mwdcal", *map(str, command)])
+    return used.processor, used.memory
 
 
 def sized(count: int, share: float, least: int = 20) -> int:
