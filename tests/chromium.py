@@ -14,7 +14,7 @@ axe = pytest.importorskip("axe_playwright_python", reason="axe-core is not insta
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
 AXE = files(axe).joinpath("axe.min.js").read_text("utf-8")
 ALIKE = ("svg *", "tbody tr:nth-child(n+7):not([class])")
-"""What axe-core would look at for minutes: the insides of pictures, rows like others."""
+"""Elements that axe-core would look at for minutes: the insides of pictures, rows like others."""
 RUN_AXE = (
     f"axe.run({{exclude: {[[each] for each in ALIKE]}}}, "
     "{resultTypes: ['violations'], selectors: false, elementRef: false})"

@@ -21,11 +21,11 @@ EXAMPLE = (
     "calibrate demo/run.csv --tool demo/tool.toml -o tool.json",
     "verify tool.json demo/rolltest.csv",
 )
-"""What `make demo` shows, without its page."""
+"""The lines that `make demo` shows, without its page."""
 
 
 def output(*command: str | Path, folder: Path) -> str:
-    """What a command prints; a failure ends the run with what it said."""
+    """The output of a command; a failure ends the run with its message."""
     options = {"cwd": folder, "capture_output": True, "encoding": "utf-8"}
     done = subprocess.run([*map(str, command)], check=False, **options)
     if done.returncode:

@@ -33,7 +33,7 @@ pytestmark = [
 
 
 def violations(page):
-    """What axe finds on a page, a line for each rule: the rule, and the first elements."""
+    """Faults that axe finds on a page, a line for each rule: the rule, and the first elements."""
     page.evaluate(AXE)
     found = page.evaluate(RUN_AXE)["violations"]
     return [

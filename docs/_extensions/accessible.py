@@ -1,4 +1,4 @@
-"""What the theme's pages lack for readers with a keyboard or a screen reader."""
+"""Labels and focus for readers with a keyboard or a screen reader, which the theme's pages lack."""
 
 import re
 from pathlib import Path

@@ -576,7 +576,7 @@ class ChangeTest:
 
 @dataclass(frozen=True)
 class Contrasts:
-    """What differences between the calibrations of a tool, or of many, tell.
+    """Statistics of differences between the calibrations of a tool, or of many.
 
     `precision` (…, n, p, p) of each calibration, in any units.
     """

@@ -352,7 +352,7 @@ def propose(
 def _cells_without_reading(
     error: QuestionError | QuestionsError, leave_out: Mapping[str, Sequence[str]]
 ) -> dict[str, list[str]]:
-    """What rows to leave out besides, by column, for cells that are blank or say that there is no reading."""
+    """Rows to leave out besides, by column, for cells that are blank or say that there is no reading."""
     questions = error.questions if isinstance(error, QuestionsError) else (error,)
     every = {name: [*cells] for name, cells in leave_out.items()}
     only = (each.answers[0].arguments for each in questions if len(each.answers) == 1)

@@ -352,7 +352,7 @@ OLD_DRIFT = {
     False: "has nothing of the drift since. Verify the tool, or survey with an error model, and after `msa` a "
     "`sensor_drift`, that has one.",
 }
-"""What 1σ has of the drift since an old calibration: that of one year, or none."""
+"""The drift since an old calibration that 1σ includes: that of one year, or none."""
 
 
 @dataclass(frozen=True)

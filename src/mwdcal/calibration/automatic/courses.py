@@ -130,7 +130,7 @@ def share_beyond(result: Fit, index: int, members: Bools) -> Array:
 
 
 def _every_term(result: Fit) -> tuple[Array, Array]:
-    """What `_in_turn` says (B, 6, t, k) of every power and triad, and (B, t) of the next one."""
+    """The answers of `_in_turn` (B, 6, t, k) for every power and triad, and (B, t) for the next one."""
     highest = highest_order(result.problem.temperature)
     count = min(int(highest.max()), TRIED)
     triads, orders = len(result.problem.triads), orders_of(result)
