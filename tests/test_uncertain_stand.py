@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mwdcal.calibration.automatic import drift as automatic
 from mwdcal.calibration.automatic.drift import with_drift
 from mwdcal.calibration.diagnosis import structure
 from mwdcal.calibration.estimate import fit, refitted
@@ -210,3 +211,26 @@ def test_misfit_counts_what_is_tested_alone(least):
     np.testing.assert_allclose(square, np.sum(left * analysis.residual, -1), rtol=1e-8)
     assert freedom[0, 5] == 4
     assert (np.delete(freedom.ravel(), 5) == 6).all()
+
+
+@pytest.mark.parametrize("declared", [True, False])
+@pytest.mark.parametrize("stand", [True, False])
+def test_no_wrong_dip_is_taken_for_a_drift(declared, stand, monkeypatch):
+    """Dips about the limit of 0.25°, each other tool with a bad station: the same drifts as if all were searched."""
+    alike = replace(imperfect(runs(21, 12)), sd=NOISE if declared else {})
+    raw = alike.magnetometer.copy()
+    raw[::2, 7] += 300.0
+    readings = replace(alike, magnetometer=raw)
+    if stand:
+        angles = {name: np.radians(sd) for name, sd in STAND.items()}
+        readings = replace(readings, sd=readings.sd | angles, settings="per-station")
+    for off in (0.0, 0.2, 0.24, 0.26, 0.4):
+        dip = readings.known["dip"] + np.radians(off)
+        result = fit(replace(readings, known=readings.known | {"dip": dip}), OPTIONS)
+        with monkeypatch.context() as patch:
+            patch.setattr(automatic, "dip_may_be_off", lambda *a: np.ones(12, bool))
+            searched = automatic.drifting(result, OPTIONS)
+        np.testing.assert_array_equal(automatic.drifting(result, OPTIONS), searched)
+        may_be = structure.dip_may_be_off(result, automatic.WRONG_DIP)
+        assert may_be[1::2].any() == (off > 0.1)
+    assert not searched.any()

@@ -16,7 +16,7 @@ import numpy as np
 
 from mwdcal.calibration.automatic.courses import f_test, members, terms_beyond
 from mwdcal.calibration.diagnosis.plausibility import departures
-from mwdcal.calibration.diagnosis.structure import effects, shown_effects
+from mwdcal.calibration.diagnosis.structure import dip_may_be_off, effects, shown_effects
 from mwdcal.calibration.estimate import Fit, fit, refitted, with_all
 from mwdcal.calibration.methods import declared_sizes
 from mwdcal.calibration.options import Options
@@ -123,7 +123,7 @@ def drifting(result: Fit, options: Options) -> Bools:
     limit = np.where(hidden, HIDDEN_CHANCE, ORDER_CHANCE)
     limit = np.where(disputed[:, None], DISPUTED_CHANCE, limit)
     drifted[sound] = chance < limit
-    places = np.flatnonzero(drifted.any(-1))
+    places = np.flatnonzero(drifted.any(-1) & dip_may_be_off(result, WRONG_DIP))
     if places.size:
         drifted[places[_wrong_dip(take(result, places))]] = False
     return drifted

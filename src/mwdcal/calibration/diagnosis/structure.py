@@ -588,6 +588,28 @@ def _columns(problem: Problem, result: Fit, design: Alike) -> Iterator[Array]:
         yield every
 
 
+def dip_may_be_off(result: Fit, size: float) -> Bools:
+    """Fits (B,) whose misfit allows the reference of the dip to be off by more than a size, radians.
+
+    An error explains the square of its size times the information on it. Readings of the magnetometer alone tell no
+    more, nor a stand as unsure at all stations as at one; half of that is left without the bad stations.
+    """
+    problem, analysis = result.problem, result.analysis
+    stand = analysis.squares is not None
+    if not ((uncertain_stand if stand else closed_form).applies(problem) and are_alike(problem)):
+        return np.ones(len(result.status), bool)
+    columns = common_effects(_exact(problem, result.state)).columns.get("dip-reference")
+    if not columns:
+        return np.zeros(len(result.status), bool)
+    information = columns[1].information(responses(problem, result.state)[1])[:, 0, 0] / 2
+    misfit, scale = np.sum(analysis.residual**2, (1, 2)), variance_scales(result)
+    if stand:
+        at = uncertain_stand.linear(problem, result.state)
+        information /= 1 + np.sum(at.gain[TRIAD_ROWS[1]] ** 2, (0, 1)).max(-1)
+        misfit = np.einsum("ibn,ibn->b", at.left, at.weighed(at.left))
+    return np.asarray(size**2 * information * scale.min(-1) <= misfit * scale.max(-1))
+
+
 STRUCTURE_CHANCE = 0.01
 """Chance of residuals as large in declared noise, below which their structure is looked at."""
 BAD_SHARE = 0.1
