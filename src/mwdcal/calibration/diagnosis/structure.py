@@ -541,7 +541,7 @@ def on_stand_may_show(result: Fit) -> Bools:
     shown |= np.any(np.abs(errors) > LARGEST_ERROR, (1, 2))
     residual = at.weighed(at.left)
     misfit = np.einsum("ibn,ibn->b", at.left, residual) + np.sum(at.precision * at.value**2, -1)
-    known = np.sum(at.covariance * at.of_data, (1, 2))
+    known, covariance = at.covariance.trace(at.of_data), at.covariance.whole
     rest = np.ceil(6 * problem.evidence.include.sum(-1) - known)
     for columns in _columns(problem, result, design):
         weighed = np.einsum("ij...,jk...->ik...", at.weight, columns)
@@ -549,7 +549,7 @@ def on_stand_may_show(result: Fit) -> Bools:
         crossed = at.columns.with_others(weighed)
         information = np.einsum("ikbn,ilbn->bkl", columns, weighed)
         square = np.einsum("bkk->bk", information).copy()
-        information -= crossed.mT @ (at.covariance @ crossed)
+        information -= crossed.mT @ (covariance @ crossed)
         gain, directions = gain_of(score, information, square)
         for count, left in {*zip(directions.tolist(), rest.tolist(), strict=True)}:
             if count:

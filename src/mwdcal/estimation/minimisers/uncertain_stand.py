@@ -67,22 +67,60 @@ def by_component(values: Array, *shape: int) -> Array:
 
 
 @dataclass(frozen=True)
+class Blocks:
+    """A symmetric matrix of all unknowns: of Φ (B, 24, 24), of the terms of drifts (B, q, q), and across (B, 24, q)."""
+
+    params: Array
+    across: Array
+    drifts: Array
+
+    @property
+    def whole(self) -> Array:
+        """The matrix (B, u, u)."""
+        if not self.drifts.size:
+            return self.params
+        return np.block([[self.params, self.across], [self.across.mT, self.drifts]])
+
+    def less(self, taken: Array) -> Blocks:
+        """XᵀMX where the columns of drifts are less what Φ takes of each, (B, 24, q)."""
+        across = self.across - self.params @ taken
+        drifts = self.drifts - taken.mT @ self.across - across.mT @ taken
+        return Blocks(self.params, across, drifts)
+
+    def product(self, values: Array) -> Array:
+        """The matrix times values (B, u)."""
+        first, second = np.split(values[..., None], [OF_PARAMETERS], 1)
+        above = self.params @ first + self.across @ second
+        return np.concatenate([above, self.across.mT @ first + self.drifts @ second], 1)[..., 0]
+
+    def trace(self, other: Blocks) -> Array:
+        """Trace (B,) of the product with another one."""
+        pairs = (
+            (self.params, other.params),
+            (self.across, other.across),
+            (self.drifts, other.drifts),
+        )
+        first, across, drifts = (np.einsum("bij,bij->b", *pair) for pair in pairs)
+        return np.asarray(first + 2 * across + drifts)
+
+
+@dataclass(frozen=True)
 class StandColumns:
     """Columns of the elements of Φ of both triads, then of the terms of drifts, axis by axis.
 
-    `terms` (2, 4, B, n) are f̃ of each triad, `weight` (6, B, n) is one over the noise of a reading. `axes` (6, a, B, n)
-    are what a unit of each axis of the drifts adds to the whitened readings, `courses` (K, n) their terms.
+    `terms` (2, 4, B, n) are f̃ of each triad, `weight` (6, B, n) is one over the noise of a reading. `axes`, by triad
+    (3, a, B, n), are what a unit of each axis of its drifts adds to its whitened readings; `courses` (K, n) its terms.
     """
 
     terms: Array
     weight: Array
-    axes: Array
+    axes: tuple[Array, Array]
     courses: Array
 
     @property
     def of_drifts(self) -> tuple[int, int]:
         """Number of axes of the drifts, and of the terms of each."""
-        return self.axes.shape[1], len(self.courses)
+        return sum(axes.shape[1] for axes in self.axes), len(self.courses)
 
     @cached_property
     def _pairs(self) -> dict[tuple[int, int], Array]:
@@ -104,22 +142,23 @@ class StandColumns:
         """Products (K K, n) of the courses."""
         return (self.courses[:, None] * self.courses).reshape(-1, self.courses.shape[-1])
 
-    def axes_of(self, walks: Iterable[int], forward: Array, attitude: Array) -> Array:
-        """Effect of a unit of each axis of some walks, by their numbers, on the whitened readings (6, a, B, n).
+    def axes_of(self, walks: Iterable[int], forward: Array, attitude: Array) -> tuple[Array, Array]:
+        """Effect of a unit of each axis of some walks, by their numbers, on the whitened readings of each triad.
 
         At Φ (B, 2, 3, 4) and attitudes (3, 3, B, n).
         """
-        numbers = [*walks]
-        axes = np.zeros((6, 3 * len(numbers), *self.weight.shape[1:]))
-        for place, walk in enumerate(numbers):
-            rows, unit = TRIAD_ROWS[min(walk, 1)], np.eye(3)[..., None, None]
+        units: tuple[list[Array], list[Array]] = ([], [])
+        for walk in walks:
+            unit = np.eye(3)[..., None, None]
             if walk == FIELD_WALK:
                 unit = np.einsum("bij,jabn->iabn", forward[:, 1, :, :3], attitude)
-            axes[rows, 3 * place : 3 * place + 3] = unit * self.weight[rows, None]
-        return axes
+            units[min(walk, 1)].append(unit * self.weight[TRIAD_ROWS[min(walk, 1)], None])
+        nothing = np.zeros((3, 0, *self.weight.shape[1:]))
+        first, second = (np.concatenate([nothing, *each], 1) for each in units)
+        return first, second
 
-    def gram(self, inner: Array) -> Array:
-        """Sums XᵀMX (B, u, u) for the symmetric M (6, 6, B, n) of each station."""
+    def gram(self, inner: Array) -> Blocks:
+        """Sums XᵀMX for the symmetric M (6, 6, B, n) of each station."""
         count = self.weight.shape[1]
         heavy = inner * self.weight[:, None]
         whole = np.empty((count, 2, 3, 4, 2, 3, 4))
@@ -130,21 +169,42 @@ class StandColumns:
             whole[:, one, :, :, other] = each.transpose(0, 1, 3, 2, 4)
             if one != other:
                 whole[:, other, :, :, one] = each.transpose(0, 2, 4, 1, 3)
+        moved = self.moved(inner)
         of_params = whole.reshape(count, OF_PARAMETERS, OF_PARAMETERS)
-        if not self.axes.size:
-            return of_params
-        across = self.crossed(inner)
-        return np.block([[of_params, across], [across.mT, self.of_axes(inner)]])
+        return Blocks(of_params, self.crossed(moved), self.of_axes(self.onto_axes(moved)))
 
-    def crossed(self, inner: Array) -> Array:
-        """Sums (B, 24, q) of XᵀMD over the stations, D being the columns of the drifts alone."""
+    def moved(self, inner: Array) -> Array:
+        """M times the axes of the drifts (6, a, B, n), for the M (6, 6, B, n) of each station."""
+        each = [
+            np.einsum("ij...,ja...->ia...", inner[:, rows], axes)
+            for rows, axes in zip(TRIAD_ROWS, self.axes, strict=True)
+        ]
+        return np.concatenate(each, 1)
+
+    def onto_axes(self, values: Array) -> Array:
+        """The transpose of the axes (a, k, B, n) times values (6, k, B, n) of each station."""
+        each = [
+            np.einsum("ia...,ik...->ak...", axes, values[rows])
+            for rows, axes in zip(TRIAD_ROWS, self.axes, strict=True)
+        ]
+        return np.concatenate(each)
+
+    def crossed(self, moved: Array) -> Array:
+        """Sums (B, 24, q) of XᵀMD over the stations, D being the columns of the drifts, from M times their axes."""
         axes, terms = self.of_drifts
-        moved = np.einsum("ij...,ja...->ia...", inner, self.axes) * self.weight[:, None]
+        heavy = moved * self.weight[:, None]
         count, across = moved.shape[-2], []
         for rows, along in zip(TRIAD_ROWS, self._along, strict=True):
-            each = by_tool(moved[rows]) @ along.mT
+            each = by_tool(heavy[rows]) @ along.mT
             across.append(each.reshape(count, 3, axes, 4, terms).swapaxes(2, 3))
         return np.stack(across, 1).reshape(count, OF_PARAMETERS, axes * terms)
+
+    def of_axes(self, products: Array) -> Array:
+        """Sums DᵀMD (B, q, q) over the stations, from the products (a, a, B, n) of the axes by M."""
+        (axes, _, count, _), terms = products.shape, len(self.courses)
+        each = by_tool(products) @ self._courses.transpose()
+        each = each.reshape(count, axes, axes, terms, terms).swapaxes(2, 3)
+        return each.reshape(count, axes * terms, axes * terms)
 
     def with_others(self, weighed: Array) -> Array:
         """Sums (B, u, k) of Xᵀ times other columns (6, k, B, n), weighed, over the stations."""
@@ -154,19 +214,10 @@ class StandColumns:
             (by_tool(heavy[rows]) @ by_tool(f).mT).reshape(count, 3, others, 4).swapaxes(2, 3)
             for rows, f in zip(TRIAD_ROWS, self.terms, strict=True)
         ]
-        if self.axes.size:
-            moved = np.einsum("ia...,ik...->ak...", self.axes, weighed)
-            terms = by_tool(moved) @ self.courses.transpose()
-            each.append(terms.reshape(count, len(self.axes[0]), others, -1).swapaxes(2, 3))
+        terms = by_tool(self.onto_axes(weighed)) @ self.courses.transpose()
+        axes, courses = self.of_drifts
+        each.append(terms.reshape(count, axes, others, courses).swapaxes(2, 3))
         return np.concatenate([part.reshape(count, -1, others) for part in each], 1)
-
-    def of_axes(self, inner: Array) -> Array:
-        """Sums DᵀMD (B, q, q) over the stations."""
-        axes, terms = self.of_drifts
-        moved = np.einsum("ij...,ja...->ia...", inner, self.axes)
-        products = by_tool(np.einsum("ia...,ib...->ab...", self.axes, moved))
-        each = (products @ self._courses.transpose()).reshape(-1, axes, axes, terms, terms)
-        return each.swapaxes(2, 3).reshape(-1, axes * terms, axes * terms)
 
     def pull(self, values: Array) -> Array:
         """Sums (B, u) of Xᵀ times values (6, B, n) over the stations."""
@@ -175,22 +226,22 @@ class StandColumns:
             by_tool(heavy[rows]) @ by_tool(f).mT
             for rows, f in zip(TRIAD_ROWS, self.terms, strict=True)
         ]
-        if self.axes.size:
-            each.append(
-                by_tool(np.einsum("ia...,i...->a...", self.axes, values)) @ self.courses.transpose()
-            )
-        return np.concatenate([part.reshape(len(part), -1) for part in each], -1)
+        if self.courses.size:
+            each.append(by_tool(self.onto_axes(values[:, None])) @ self.courses.transpose())
+        return np.concatenate([part.reshape(values.shape[1], -1) for part in each], -1)
 
     def change(self, step: Array) -> Array:
         """Effect of a step (B, u) of the unknowns on the whitened readings (6, B, n)."""
         first = step[:, :OF_PARAMETERS].reshape(-1, 2, 3, 4)
         each = [by_component(first[:, t] @ by_tool(f), 3) for t, f in enumerate(self.terms)]
-        change = np.concatenate(each) * self.weight
-        if self.axes.size:
-            of_drifts = step[:, OF_PARAMETERS:].reshape(-1, *self.of_drifts) @ self.courses
-            change += np.einsum(
-                "ia...,a...->i...", self.axes, by_component(of_drifts, len(self.axes[0]))
-            )
+        change, done = np.concatenate(each) * self.weight, 0
+        if not self.courses.size:
+            return change
+        of_drifts = step[:, OF_PARAMETERS:].reshape(len(step), *self.of_drifts) @ self.courses
+        for rows, axes in zip(TRIAD_ROWS, self.axes, strict=True):
+            some = of_drifts[:, done : done + axes.shape[1]]
+            change[rows] += np.einsum("ia...,a...->i...", axes, by_component(some, axes.shape[1]))
+            done += axes.shape[1]
         return change
 
     def spread(self, covariance: Array) -> Array:
@@ -207,15 +258,18 @@ class StandColumns:
         return spread
 
     def less(self, taken: Array) -> Array:
-        """Columns (B, n, 6, q) of the drifts less what Φ takes of each, (B, 24, q)."""
-        count, axes = len(taken), np.moveaxis(self.axes, (0, 1), (2, 3))
-        whole = axes[..., None] * self.courses.transpose()[:, None, None]
-        whole = whole.reshape(*whole.shape[:3], -1)
-        each = taken.reshape(count, 2, 3, 4, -1).swapaxes(2, 3)
+        """Columns (B, 6, n, q) of the drifts less what Φ takes of each, (B, 24, q)."""
+        count, stations = self.weight.shape[1:]
+        whole, done = np.empty((count, 6, stations, taken.shape[-1])), 0
+        each = taken.reshape(count, 2, 3, 4, -1)
         for index, (rows, f) in enumerate(zip(TRIAD_ROWS, self.terms, strict=True)):
-            part = by_tool(f).mT @ each[:, index].reshape(count, 4, -1)
-            part = part.reshape(count, -1, 3, taken.shape[-1])
-            whole[:, :, rows] -= part * by_tool(self.weight[rows]).mT[..., None]
+            heavy = -f * self.weight[rows, None]
+            whole[:, rows] = heavy.transpose(2, 0, 3, 1) @ each[:, index]
+            axes = np.moveaxis(self.axes[index], 1, -1).swapaxes(0, 1)
+            own = axes[..., None] * self.courses.transpose()[:, None]
+            own = own.reshape(*own.shape[:3], -1)
+            whole[:, rows, :, done : done + own.shape[-1]] += own
+            done += own.shape[-1]
         return whole
 
 
@@ -309,8 +363,10 @@ class StandRuns:
         noise = self.sd * np.repeat(scale, 3, -1)[..., None]
         weight = by_component(self.include[:, None] / noise, 6)
         courses = self.courses[0] if self.walks else np.zeros((0, weight.shape[-1]))
-        columns = StandColumns(f, weight, np.zeros((6, 0, *weight.shape[1:])), courses)
-        columns = replace(columns, axes=columns.axes_of(self.walks, forward, attitude))
+        nothing = np.zeros((3, 0, *weight.shape[1:]))
+        columns = StandColumns(f, weight, (nothing, nothing), courses)
+        if self.walks:
+            columns = replace(columns, axes=columns.axes_of(self.walks, forward, attitude))
         held = quotient(errors, self.angle_sd, self.angle_sd > 0)
         each = [
             np.einsum("bij,jabn->iabn", forward[:, t, :, :3], change[t]) * weight[rows, None]
@@ -370,13 +426,13 @@ class StandLinear:
         return np.asarray(weight)
 
     @cached_property
-    def of_data(self) -> Array:
-        """XᵀWX (B, u, u)."""
+    def of_data(self) -> Blocks:
+        """XᵀWX."""
         return self.columns.gram(self.weight)
 
     @cached_property
-    def squared(self) -> tuple[Array, Array]:
-        """XᵀW E W X (B, u, u), E being one for the readings of a triad and zero for those of the other."""
+    def squared(self) -> tuple[Blocks, Blocks]:
+        """XᵀW E W X, E being one for the readings of a triad and zero for those of the other."""
         first, second = (
             self.columns.gram(
                 np.einsum("ik...,kj...->ij...", self.weight[:, rows], self.weight[rows])
@@ -391,23 +447,19 @@ class StandLinear:
 
         A drift's mean is an offset: of the sums of both together only rounding would be left.
         """
-        p, information = OF_PARAMETERS, self.of_data
-        alone = inverse(information[:, :p, :p])
-        if not self.precision.size:
-            return alone, information[:, :p, p:], information[:, p:, p:]
-        taken = alone @ information[:, :p, p:]
-        rest = information[:, p:, p:] - information[:, p:, :p] @ taken
+        data = self.of_data
+        alone = inverse(data.params)
+        taken = alone @ data.across
+        rest = data.drifts - data.across.mT @ taken
         np.einsum("bii->bi", rest)[...] += self.precision
         return alone, taken, inverse(rest)
 
     @cached_property
-    def covariance(self) -> Array:
-        """Covariance (B, u, u) of Φ and the terms of drifts."""
+    def covariance(self) -> Blocks:
+        """Covariance of Φ and the terms of drifts."""
         alone, taken, inner = self.parts
-        if not self.precision.size:
-            return alone
         across = -taken @ inner
-        return np.block([[alone - across @ taken.mT, across], [across.mT, inner]])
+        return Blocks(alone - across @ taken.mT, across, inner)
 
     @cached_property
     def spread(self) -> Array:
@@ -416,52 +468,48 @@ class StandLinear:
         both = self.columns.spread(alone)
         if self.precision.size:
             left = self.columns.less(taken)
-            both += by_component(
-                (left @ inner[:, None] @ left.mT).reshape(*left.shape[:2], 36).mT, 6, 6
-            )
+            known = (left.reshape(len(left), -1, left.shape[-1]) @ inner).reshape(left.shape)
+            each = known.swapaxes(1, 2) @ left.transpose(0, 2, 3, 1)
+            both += np.moveaxis(each, (0, 1), (2, 3))
         moved = np.einsum("ij...,jk...->ik...", self.weight, both)
         return np.asarray(self.weight - np.einsum("ij...,jk...->ik...", moved, self.weight))
 
     @cached_property
-    def apart(self) -> tuple[Array, ...]:
+    def apart(self) -> tuple[Blocks, Blocks, Blocks]:
         """XᵀWX, then both of `squared`, where the columns of drifts are less what Φ takes of them."""
-        each, p = (self.of_data, *self.squared), OF_PARAMETERS
-        if not self.precision.size:
-            return each
-        taken, changed = self.parts[1], []
-        for whole in each:
-            across = whole[:, :p, p:] - whole[:, :p, :p] @ taken
-            among = whole[:, p:, p:] - taken.mT @ whole[:, :p, p:] - across.mT @ taken
-            changed.append(np.block([[whole[:, :p, :p], across], [across.mT, among]]))
-        return tuple(changed)
+        data, first, second = (m.less(self.parts[1]) for m in (self.of_data, *self.squared))
+        return data, first, second
 
     @cached_property
     def of_angles(self) -> Array:
         """Covariance (B, 24, 24) of Φ from the errors of angles alone."""
         alone, taken, inner = self.parts
-        data, *squared = self.apart
-        reach = np.concatenate([alone, -taken @ inner], -1) if self.precision.size else alone
-        return reach @ (data - sum(squared)) @ reach.mT
+        follow, (data, first, second) = taken @ inner, self.apart
+        across = data.across - first.across - second.across
+        reach = alone @ (data.params - first.params - second.params) - follow @ across.mT
+        further = alone @ across - follow @ (data.drifts - first.drifts - second.drifts)
+        return np.asarray(reach @ alone - further @ follow.mT)
 
     @cached_property
     def shared_squares(self) -> Array:
         """tr((XᵀW E W X V)²) (B, t)."""
         alone, _, inner = self.parts
-        each, p = [], OF_PARAMETERS
-        for squared in self.apart[1:]:
-            part = np.concatenate([squared[..., :p] @ alone, squared[..., p:] @ inner], -1)
-            each.append(np.sum(part * part.mT, (1, 2)))
+        each = []
+        for m in self.apart[1:]:
+            part = Blocks(m.params @ alone, m.across @ inner, m.drifts @ inner)
+            other = Blocks(part.params.mT, alone @ m.across, part.drifts.mT)
+            each.append(part.trace(other))
         return np.stack(each, -1)
 
     def weighed(self, values: Array) -> Array:
         """W times values (6, B, n)."""
         return np.asarray(values - np.einsum("ik...,k...->i...", self.halves, self._along(values)))
 
-    def step(self, covariance: Array) -> tuple[Array, Array, Array]:
+    def step(self, covariance: Blocks) -> tuple[Array, Array, Array]:
         """Step (B, u) by a covariance, the errors (B, 3, n) after it, and the square of its length (B,) in σ."""
         pull = self.columns.pull(self.weighed(self.left))
         pull[:, pull.shape[-1] - self.value.shape[-1] :] -= self.precision * self.value
-        step = (covariance @ pull[..., None])[..., 0]
+        step = covariance.product(pull)
         along = by_tool(self._back(self._along(self.after(step))))
         return step, self.angle_sd * along, np.sum(step * pull, -1)
 
@@ -490,7 +538,7 @@ class StandLinear:
         for rows, squared in zip(TRIAD_ROWS, self.squared, strict=True):
             block = self.weight[rows, rows]
             share = whole - summed(np.einsum("iibn->ibn", block), include)
-            taken = np.sum(self.covariance * squared, (1, 2))
+            taken = self.covariance.trace(squared)
             squares = summed(block, block, include)
             freedom = whole - share - taken
             misfit = summed(left[rows], left[rows])
@@ -538,7 +586,7 @@ def _are_drifts(problem: Problem) -> bool:
     masks = [constants[place % terms].mask[:1] for place in range(len(names))]
     return (
         all(name in WALK_AXES for name in names)
-        and names == [name for name in dict.fromkeys(names) for _ in range(terms)]
+        and names == [name for name in WALK_AXES if name in names for _ in range(terms)]
         and all(
             np.array_equal(constant.mask, np.broadcast_to(mask, constant.mask.shape))
             for constant, mask in zip(constants, masks, strict=True)
@@ -595,11 +643,12 @@ def refined(problem: Problem, state: State) -> Solution:
 class StandWalks:
     """All walks as fits without drift leave them, of unit terms: those of a walk axis by axis.
 
-    `score` (B, q) of the terms, XᵀWD (B, 24, q) with the parameters, `crossed`, and what these take up, `taken`.
+    `products` (a, a, B, n) of the axes by W, `score` (B, q) of the terms, `crossed`, XᵀWD (B, 24, q) with the
+    parameters, and what these take up, `taken`.
     """
 
-    weight: Array
     columns: StandColumns
+    products: Array
     score: Array
     crossed: Array
     taken: Array
@@ -611,15 +660,16 @@ class StandWalks:
         axes = here.columns.axes_of(range(len(WALKS)), _forward(problem, state), here.attitude)
         columns = replace(here.columns, axes=axes, courses=courses)
         score = -columns.pull(here.weighed(here.left))[:, OF_PARAMETERS:]
-        crossed = columns.crossed(here.weight)
-        return cls(here.weight, columns, score, crossed, here.covariance @ crossed)
+        moved = columns.moved(here.weight)
+        crossed, products = columns.crossed(moved), columns.onto_axes(moved)
+        return cls(columns, products, score, crossed, here.covariance.params @ crossed)
 
     def among(self, walks: Sequence[int]) -> tuple[Array, Array, Array]:
         """Scores (B, q) of some walks by their numbers, their covariance, and what that is with all else known."""
         axes = np.array([3 * walk + axis for walk in walks for axis in range(3)])
         terms = len(self.columns.courses)
         places = (axes[:, None] * terms + np.arange(terms)).ravel()
-        alone = replace(self.columns, axes=self.columns.axes[:, axes]).of_axes(self.weight)
+        alone = self.columns.of_axes(self.products[axes[:, None], axes])
         left = alone - self.crossed[:, :, places].mT @ self.taken[:, :, places]
         return self.score[:, places], left, alone
 
@@ -664,11 +714,8 @@ def moved_params(problem: Problem, forward: Array) -> Array:
 
 def analysed(problem: Problem, state: State, determined: Determined) -> Analysis:
     """The analysis of fits with all directions determined, as `analyse` has it, with what the stand does."""
-    at, include, p = linear(problem, state), problem.evidence.include, OF_PARAMETERS
-    moved = moved_params(problem, _forward(problem, state))
-    whole = at.covariance.copy()
-    whole[:, :p] = moved @ whole[:, :p]
-    whole[:, :, :p] = whole[:, :, :p] @ moved.mT
+    at, include = linear(problem, state), problem.evidence.include
+    moved, covariance = moved_params(problem, _forward(problem, state)), at.covariance
     spread, residual = at.spread * include, at.weighed(at.left)
     pairs = [(at.weight[rows, rows], spread[rows, rows]) for rows in TRIAD_ROWS]
     lone = [summed(w, 2 * left - w * include) for w, left in pairs]
@@ -676,14 +723,14 @@ def analysed(problem: Problem, state: State, determined: Determined) -> Analysis
         np.ascontiguousarray(np.moveaxis(each, (-2, -1), (0, 1))) for each in (spread, residual)
     )
     return Analysis(
-        whole[:, :p, :p],
+        moved @ covariance.params @ moved.mT,
         determined,
         *variance_factors(residual, spread),
         residual,
         spread,
-        whole[:, p:, p:],
-        effects_of(problem, whole[:, :p, p:]),
-        np.zeros((len(whole), p, 0)),
+        covariance.drifts,
+        effects_of(problem, moved @ covariance.across),
+        np.zeros((len(moved), OF_PARAMETERS, 0)),
         squares=np.stack(lone, -1) + at.shared_squares,
         of_stand=moved @ at.of_angles @ moved.mT,
     )
@@ -736,7 +783,7 @@ def _first_noise(problem: Problem, minima: Sequence[AffineMinimum]) -> Array:
 class _Turn:
     """Where fits have come to: Φ (B, 2, 3, 4), errors (B, 3, n), drifts (B, q), the noise over the problem's (B, t).
 
-    `covariance` (B, u, u) is that of the unknowns, by which steps are taken. `excess` (B, t) is the logarithm of s as
+    `covariance` is that of the unknowns, by which steps are taken. `excess` (B, t) is the logarithm of s as
     it was, `change` that of the noise since: their secant says the next one.
     """
 
@@ -747,7 +794,7 @@ class _Turn:
     scale: Array
     excess: Array
     change: Array
-    covariance: Array | None = None
+    covariance: Blocks | None = None
 
     def next(self, estimated: Bools, anew: bool) -> tuple[_Turn, Bools]:
         """A step of the fit, and of the noise where it is estimated (t,); and which members (B,) have not settled.
