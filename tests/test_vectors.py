@@ -13,6 +13,7 @@ from mwdcal.geometry.vectors import (
     inverse_of_three,
     length,
     nearest_rotation,
+    quadratic_form,
     reference_vectors,
     rotation,
     skew,
@@ -158,6 +159,18 @@ def test_inverses_of_symmetric_matrices_give_one(shape, size):
             back @ matrix, np.broadcast_to(np.eye(size), matrix.shape), atol=1e-10
         )
         np.testing.assert_allclose(back, back.mT, atol=1e-12 * np.abs(back).max())
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("size", [1, 3, 6])
+def test_quadratic_forms_are_those_of_the_inverse(shape, size):
+    rng = np.random.default_rng(size)
+    rows, vector = rng.standard_normal((*shape, size, 9)), rng.standard_normal((*shape, size))
+    matrix = rows @ rows.mT
+    expected = np.einsum("...i,...ij,...j->...", vector, np.linalg.inv(matrix), vector)
+    np.testing.assert_allclose(quadratic_form(matrix, vector), expected, rtol=1e-9)
+    matrix = matrix - 1.01 * np.linalg.eigvalsh(matrix)[..., :1, None] * np.eye(size)
+    assert not np.isfinite(quadratic_form(matrix, vector)).any()
 
 
 def test_positive_matrices_are_those_without_a_negative_eigenvalue():

@@ -172,6 +172,22 @@ def inverse_of_three(matrix: Array) -> Array:
     return np.asarray(back.reshape(matrix.shape))
 
 
+@np.errstate(invalid="ignore", divide="ignore", over="ignore")
+def quadratic_form(matrix: Array, vector: Array) -> Array:
+    """xᵀM⁻¹x (...) of vectors (..., k) and symmetric matrices (..., k, k), by elimination.
+
+    Not finite where a matrix is not positive. Half the time of `inverse` for six rows.
+    """
+    rows, right = np.moveaxis(matrix, (-2, -1), (0, 1)).copy(), np.moveaxis(vector, -1, 0).copy()
+    total = np.zeros(right.shape[1:])
+    for k in range(len(right)):
+        total += right[k] ** 2 / np.where(rows[k, k] > 0, rows[k, k], np.nan)
+        share = rows[k, k + 1 :] / rows[k, k]
+        right[k + 1 :] -= share * right[k]
+        rows[k + 1 :, k + 1 :] -= share[:, None] * rows[k, k + 1 :]
+    return total
+
+
 def are_positive(matrix: Array) -> Bools:
     """Which symmetric matrices (..., 3, 3) have positive eigenvalues alone: their minors are positive."""
     (a, b, c), (_, d, e), (_, _, f) = np.moveaxis(matrix, (-2, -1), (0, 1))

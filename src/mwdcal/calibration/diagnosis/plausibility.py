@@ -45,6 +45,7 @@ from mwdcal.geometry.vectors import (
     eigen,
     inverse,
     outer,
+    quadratic_form,
     quotient,
 )
 
@@ -494,7 +495,7 @@ def _suspects(result: Fit) -> Bools:
     """Members (B,) of which some station's misfit may be too large.
 
     With declared noise and no robust weights χ² itself must be. It is bounded from above by what
-    the trace of the residuals' covariance says, whose eigenvalues are 0…1.
+    the trace of the residuals' covariance says, whose eigenvalues are 0…1, then by that of all directions.
     """
     analysis = result.analysis
     residual, spread = analysis.residual, analysis.spread
@@ -504,6 +505,9 @@ def _suspects(result: Fit) -> Bools:
     good = np.sum(residual**2, -1) < likely(size, chance) * smallest
     good &= (smallest > TESTED) & (analysis.influence is None)
     tool, station = np.nonzero(~good & ~suspect[:, None])
+    square = quadratic_form(spread[tool, station], residual[tool, station])
+    over = ~(square < likely(1, chance))
+    tool, station = tool[over], station[over]
     left = residual[None, tool, station]
     some = replace(analysis, residual=left, spread=spread[None, tool, station])
     suspect[tool[tail(*station_misfit(some))[0] < LEEWAY * chance]] = True
