@@ -30,7 +30,7 @@ from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, diagonal
-from mwdcal.sensor.models import Basis, Factors, Model, Polynomial
+from mwdcal.sensor.models import Basis, Factors, Polynomial, Whole
 from mwdcal.sensor.profile import Profile
 
 # --------------------------------------------------------------------------
@@ -498,7 +498,7 @@ class TriadCalibration(msgspec.Struct, frozen=True, kw_only=True):
         agrees = (self.misfit_probability or 0.0) > DOUBT and self.noise_source == "declared"
         return MOST_FREEDOM if agrees else self.degrees_of_freedom
 
-    def functions(self, reference: float) -> Model:
+    def functions(self, reference: float) -> Whole:
         """The model that these parameters belong to."""
         basis = Basis(self.order, reference)
         if self.model == "factors":
@@ -717,7 +717,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
 
     def _measured(
         self, readings: Readings
-    ) -> Iterator[tuple[TriadCalibration, Model, tuple[Array, Array, Array], slice]]:
+    ) -> Iterator[tuple[TriadCalibration, Whole, tuple[Array, Array, Array], slice]]:
         """Triads with readings, their models and what these take, and where their vectors lie."""
         temperature = self._temperature(readings)
         for index, triad in enumerate(self.triads):
@@ -828,12 +828,18 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         if noise:
             vectors += slopes.noise if slopes else self.noise_covariance(readings)
         total = rows @ vectors @ rows.mT
+        blank = self.without_uncertainty(names, readings, diagonal(total))
+        return np.where(blank[..., :, None] | blank[..., None, :], np.nan, total)
+
+    def without_uncertainty(
+        self, names: Sequence[str], readings: Readings, variances: Array
+    ) -> Bools:
+        """Where (…, n, k) no uncertainty of observables with these variances can be stated, as in `uncertainty`."""
         lacking = () if self.has_field else MAGNETIC
         blank = np.stack([self.rests_on_free(n, readings) | (n in lacking) for n in names], -1)
         turns = np.array([OBSERVABLES[n].period > 0 for n in names])
-        blank |= turns & (diagonal(total) > LARGEST_ANGLE_SD**2)
-        blank |= self.outside(readings)[..., None]
-        return np.where(blank[..., :, None] | blank[..., None, :], np.nan, total)
+        blank |= turns & (variances > LARGEST_ANGLE_SD**2)
+        return np.asarray(blank | self.outside(readings)[..., None])
 
     def expanded_uncertainty(
         self, name: str, readings: ReadingsLike, probability: float = 0.95
