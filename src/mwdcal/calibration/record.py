@@ -835,11 +835,14 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         self, names: Sequence[str], readings: Readings, variances: Array
     ) -> Bools:
         """Where (…, n, k) no uncertainty of observables with these variances can be stated, as in `uncertainty`."""
-        lacking = () if self.has_field else MAGNETIC
-        blank = np.stack([self.rests_on_free(n, readings) | (n in lacking) for n in names], -1)
         turns = np.array([OBSERVABLES[n].period > 0 for n in names])
-        blank |= turns & (variances > LARGEST_ANGLE_SD**2)
-        return np.asarray(blank | self.outside(readings)[..., None])
+        blank = turns & (variances > LARGEST_ANGLE_SD**2)
+        blank |= self.outside(readings)[..., None]
+        if self.free:
+            blank |= np.stack([self.rests_on_free(n, readings) for n in names], -1)
+        if not self.has_field:
+            blank |= np.isin(names, MAGNETIC)
+        return np.asarray(blank)
 
     def expanded_uncertainty(
         self, name: str, readings: ReadingsLike, probability: float = 0.95

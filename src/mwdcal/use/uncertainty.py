@@ -20,9 +20,9 @@ from mwdcal.geometry.vectors import AnyArray, Array, Bools, diagonal
 
 RESULT_OBSERVABLES = tuple(OUTPUTS)
 """Observables of a corrected reading, in the order of their columns."""
-COVARIANCES_AT_ONCE = 1 << 12
+COVARIANCES_AT_ONCE = 1 << 13
 """Rows whose covariances are computed at once, so that they stay in fast memory."""
-_TERMS_AT_ONCE = 1 << 9
+_TERMS_AT_ONCE = 1 << 10
 """Rows whose products of readings and powers of temperature are formed at once, for the same reason."""
 _STEP = 2.0**20
 _STEPS = _STEP * np.eye(4)[:, 1:]
