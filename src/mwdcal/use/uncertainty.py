@@ -25,7 +25,7 @@ COVARIANCES_AT_ONCE = 1 << 13
 _TERMS_AT_ONCE = 1 << 10
 """Rows whose products of readings and powers of temperature are formed at once, for the same reason."""
 _STEP = 2.0**20
-_STEPS = _STEP * np.eye(4)[:, 1:]
+_ENDS = _STEP * np.eye(4)[:, 1:]
 """Readings between which a Jacobian is affine: far beyond any bias, so that their differences keep their digits."""
 _PAIRS, _TERMS = np.triu_indices(3), np.triu_indices(4)
 """Pairs of components of a triad, and of the terms 1, y."""
@@ -149,26 +149,26 @@ class VectorCovariance:
         nodes = np.cos(np.pi * (self.powers + 0.5) / len(self.powers))
         self._by_power = np.linalg.inv(nodes[:, None] ** self.powers)
         covariance, places = calibration.parameter_covariance, calibration.places()
-        self.divisors, self.own, errors = [], [], []
+        self.divisors, self.triad_terms, errors = [], [], []
         for triad in self.triads:
             divisor, error, noise = self._triad(triad, self.middle + self.half * nodes)
             place = places[triad.name]
             part = _products(error, covariance[place, place], error)[:, *_PAIRS]
             part = (part + part.mT * (1.0 - np.eye(4)))[..., *_TERMS]
             self.divisors.append((self._by_power @ divisor).transpose())
-            self.own.append(self._coefficients(np.concatenate([part, noise], -1)))
+            self.triad_terms.append(self._coefficients(np.concatenate([part, noise], -1)))
             errors.append((error, place))
         if len(errors) == len(TRIADS):
             (first, here), (second, there) = errors
             part = _products(first, covariance[here, there], second)
-            self.both = self._coefficients(part.reshape(-1, 9, 16))
+            self.cross_terms = self._coefficients(part.reshape(-1, 9, 16))
 
     def _triad(self, triad: TriadCalibration, temperature: Array) -> tuple[Array, Array, Array]:
         """At some temperatures (m,): divisors (m, 3), e (m, 3, 4, p), and factors of the noise (m, 6, 3)."""
         model, params = triad.functions(self.zero), np.array(triad.parameters)
-        warmth = np.broadcast_to(temperature[:, None], (len(temperature), len(_STEPS)))
+        warmth = np.broadcast_to(temperature[:, None], (len(temperature), len(_ENDS)))
         divisor = model.divisor(params, warmth)
-        raw = _STEPS * divisor**2
+        raw = _ENDS * divisor**2
         error = model.jacobian(params, raw, warmth)
         error[:, 1:] = (error[:, 1:] - error[:, :1]) / _STEP
         slope = (model.slope(params, raw, warmth) * divisor[..., None, :])[:, 0]
@@ -201,11 +201,13 @@ class VectorCovariance:
                 divisor = self.divisors[k] @ powers
                 y = np.concatenate([powers[:1], raw[:, rows] / divisor**2])
                 terms = [y[_TERMS[0]] * y[_TERMS[1]], (sd[:, rows] / divisor) ** 2]
-                result[6 * k : 6 * k + 6, rows] = _total(self.own[k], powers, np.concatenate(terms))
+                result[6 * k : 6 * k + 6, rows] = _total(
+                    self.triad_terms[k], powers, np.concatenate(terms)
+                )
                 affine.append(y)
             if len(affine) == len(TRIADS):
                 terms = (affine[0][:, None] * affine[1]).reshape(16, -1)
-                result[12:, rows] = _total(self.both, powers, terms)
+                result[12:, rows] = _total(self.cross_terms, powers, terms)
         return result.reshape(21, *shape)
 
 
@@ -231,9 +233,11 @@ def result_uncertainties(
     if covariances is None:
         return np.moveaxis(standard_uncertainties(calibration, readings), -1, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        found = variances(vectors[:3], vectors[3:], covariances(readings))
-    blank = calibration.without_uncertainty(RESULT_OBSERVABLES, readings, np.moveaxis(found, 0, -1))
-    return np.sqrt(np.maximum(np.where(np.moveaxis(blank, -1, 0), np.nan, found), 0.0))
+        variance = variances(vectors[:3], vectors[3:], covariances(readings))
+    blank = calibration.without_uncertainty(
+        RESULT_OBSERVABLES, readings, np.moveaxis(variance, 0, -1)
+    )
+    return np.sqrt(np.maximum(np.where(np.moveaxis(blank, -1, 0), np.nan, variance), 0.0))
 
 
 def with_uncertainty(

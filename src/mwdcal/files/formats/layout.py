@@ -25,14 +25,8 @@ from mwdcal.files.formats.columns import (
     plain_names,
     shown,
 )
-from mwdcal.files.formats.titles import (
-    ADJUSTED,
-    OF_REFUSAL,
-    Titles,
-    dated,
-    stated_above,
-    titles,
-)
+from mwdcal.files.formats.title_references import stated_above
+from mwdcal.files.formats.titles import ADJUSTED, OF_REFUSAL, Titles, dated, titles
 from mwdcal.files.synonyms import unit_of
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import TableFormat

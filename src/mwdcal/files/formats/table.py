@@ -28,7 +28,7 @@ from mwdcal.files.formats.columns import (
     looks_numeric,
 )
 from mwdcal.files.formats.columns import shown as shown
-from mwdcal.files.formats.titles import dated, stated_above
+from mwdcal.files.formats.titles import dated
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import TableFormat
 
@@ -124,6 +124,8 @@ def parsed(
     arguments: dict[str, Any] = {"most": rows} if suffix == ".parquet" else {}
     stated: Mapping[str, object] = {}
     if export and form is text:
+        from mwdcal.files.formats.title_references import stated_above
+
         stated = stated_above(text.above(data, export, name)).metadata
         data, arguments = text.plain(data, export, name), {"delimiter": export.delimiter}
     elif suffix == ".xlsx":

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from mwdcal.files.formats.columns import as_text, looks_numeric
+from mwdcal.files.formats.titles import Titles, titles
 from mwdcal.files.synonyms import FACTORS, unit_of
 
 
@@ -141,6 +142,14 @@ _SPELT = {
     "mgal": "mGal", "мгал": "mGal", "mg": "mg", "mgauss": "mG", "milligauss": "mG",
 }  # fmt: skip
 """Units in small letters, where `unit_of` does not know them or goes by capitals."""
+
+
+def stated_above(rows: Sequence[Sequence[object]]) -> Titles:
+    """What rows above a table say of the tool, the day and the place, as metadata."""
+    block = titles(rows)
+    references = references_in(rows)
+    rough = {c: text for c, text in doubtful_in(rows).items() if c not in references}
+    return block._replace(metadata={**references, **block.metadata}, not_taken=rough)
 
 
 def references_in(rows: Iterable[Sequence[object]]) -> dict[str, float]:

@@ -167,19 +167,6 @@ def titles(rows: Sequence[Sequence[object]]) -> Titles:
     return Titles(metadata, "" if "date" in metadata else unclear)
 
 
-def stated_above(rows: Sequence[Sequence[object]]) -> Titles:
-    """What rows above a table say of the tool, the day and the place, as metadata."""
-    block = titles(rows)
-    if not rows:
-        return block
-    # a third of a short command's time is the compilation of these words
-    from mwdcal.files.formats.title_references import doubtful_in, references_in
-
-    references = references_in(rows)
-    rough = {c: text for c, text in doubtful_in(rows).items() if c not in references}
-    return block._replace(metadata={**references, **block.metadata}, not_taken=rough)
-
-
 def _parts(cell: str) -> list[str]:
     """The facts in a cell; of a key in two languages (Serial / Serie) the first."""
     parts = _PARTS.split(cell)

@@ -30,7 +30,7 @@ from mwdcal.files.formats.columns import (
     typed,
 )
 from mwdcal.files.formats.text import is_metadata
-from mwdcal.files.formats.titles import stated_above
+from mwdcal.files.formats.title_references import stated_above
 from mwdcal.sensor.profile import TableFormat
 
 # --------------------------------------------------------------------------
