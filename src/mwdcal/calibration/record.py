@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import date, datetime
-from html import escape
 from itertools import pairwise
 from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 
@@ -61,6 +60,8 @@ def tilt_width(g: Array, spread: Array, width: Array, freedom: float, probabilit
 
 def html_table(caption: str, rows: Iterable[tuple[str, ...]]) -> str:
     """A table for notebooks: a heading, then the cells of each row as text."""
+    from html import escape
+
     lines = ("".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows)
     body = "".join(f"<tr>{line}</tr>" for line in lines)
     return f"<table><caption>{escape(caption)}</caption>{body}</table>"
