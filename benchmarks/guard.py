@@ -32,6 +32,7 @@ from statistics import median
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
+import apply
 import fleet
 import numpy as np
 import pyarrow.csv
@@ -39,6 +40,7 @@ import pyarrow.parquet as pq
 
 import mwdcal
 from mwdcal.app import cli
+from mwdcal.files import documents
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "servo"
 STORED = Path(__file__).with_name("guard.json")
@@ -56,6 +58,8 @@ TOOLS, SAMPLE = 1000, 10
 """Tools of the fleets, and of the loop of SciPy that they are compared with."""
 MANY = 4000
 """Tools of a fleet whose parts are as large as those of the largest are at least."""
+PARQUET_ROWS = 300_000
+"""Rows of the table from Parquet to Parquet."""
 WARM = 4
 """Tools of the fleet whose temperature orders are chosen."""
 IMPORTS = "import numpy, scipy.special"
@@ -289,6 +293,12 @@ def long(folder: Path) -> Iterator[Guarded]:
         ours = partial(command, name, *words, table, *target)
         reading = "NumPy, reading the numbers", partial(read_numbers, table)
         yield Guarded(f"{name}, {rows} rows", *reading, ours)
+    documents.write(folder / "warm.json", apply.sixty())
+    apply.write_log(folder / "log.parquet", PARQUET_ROWS)
+    files = (folder / "warm.json", folder / "log.parquet", folder / "out.parquet")
+    whole = partial(python, "-m", "mwdcal", "apply", *files[:2], "-o", files[2])
+    plain = partial(python, "-c", apply.PLAIN, *files)
+    yield Guarded(f"apply, {PARQUET_ROWS} rows of Parquet", "plain NumPy, no 1σ", plain, whole)
 
 
 def small(folder: Path) -> Iterator[Guarded]:

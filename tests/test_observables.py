@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.geometry.observables import OBSERVABLES, OUTPUTS, variances
 from mwdcal.geometry.vectors import reference_vectors
 
 SHAPES = [(), (1,), (3, 1, 2)]
@@ -65,6 +65,26 @@ def test_gradients_by_complex_step(name, shape):
     )
     got = OBSERVABLES[name].gradient(g, b)
     np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+
+
+def test_variances_are_gradients_on_both_sides_of_the_covariance():
+    rng = np.random.default_rng(6)
+    g, b = rng.normal(size=(2, 300, 3))
+    g[:7] = [(0, 0, 1), (0, 0, -1), (1e-13, 0, 1), (1e-5, 0, 1), (0, 1, 0), (0, 0, 0), (1, 2, 3)]
+    b[6:9], b[9] = [(2, 4, 6), (0, 0, 1), (0, 0, 0)], g[9]
+    roots = rng.normal(size=(300, 6, 6))
+    whole = roots @ roots.mT
+    rows, columns = np.triu_indices(3)
+    own = (whole[:, k : k + 3, k : k + 3][:, rows, columns] for k in (0, 3))
+    flat = np.concatenate([*own, whole[:, :3, 3:].reshape(-1, 9)], -1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        got = variances(*(np.moveaxis(each, -1, 0) for each in (g, b, flat)))
+        gradients = np.stack([OBSERVABLES[name].gradient(g, b) for name in OUTPUTS], -2)
+    expected = np.einsum("nki,nij,nkj->kn", gradients, whole, gradients)
+    along = np.isin(np.arange(300), (6, 9))  # g along b: azimuth and dip turn by rounding alone
+    got[1::4, along] = expected[1::4, along] = np.nan
+    np.testing.assert_allclose(got, expected, rtol=1e-12)
+    assert np.isfinite(expected[:, 10:]).all()
 
 
 def weighting_functions(G, B, I, A, T, D):  # noqa: E741

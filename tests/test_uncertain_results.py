@@ -7,11 +7,15 @@ import pytest
 
 import mwdcal
 from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
+from mwdcal.files import profiles
 from mwdcal.files.formats import table
 from mwdcal.geometry.observables import OUTPUTS, UNCERTAINTIES
+from mwdcal.planning.plans import grid, run, servo
 from mwdcal.sensor.profile import Profile, TriadProfile
 from mwdcal.use import correction
+from mwdcal.use.uncertainty import with_uncertainty
 from simulation import DEG, Tool, attitude, plan
 
 NOISE = {"accelerometer": np.array(1e-4), "magnetometer": np.array(15.0)}
@@ -91,6 +95,26 @@ def test_uncertainties_are_those_of_calibration_and_noise(cal):
         np.testing.assert_allclose(columns[SD[column]], expected, rtol=1e-9)
     louder = replace(readings, sd={"accelerometer": np.array(1e-2)})
     assert (correction.correct(cal, louder)[0]["sd_gravity_g"] > 0.009).all()
+
+
+@pytest.mark.parametrize("model", ["polynomial", "factors"])
+@pytest.mark.parametrize("order", [0, 1, 3])
+def test_uncertainties_of_all_models_are_those_of_each_row(model, order):
+    profile, _ = profiles.load_profile("servo")
+    rng = np.random.default_rng(order)
+    stations = grid([5, 45, 90, 135], 8, [0, 90, 180, 270], [-10.0, 30.0, 75.0, 120.0])
+    made = calibrate(run(servo(rng), stations, rng), profile, Options(model=model, order=order))
+    g, b = rng.normal(size=(2, 50, 40, 3))
+    noise = {"accelerometer": rng.uniform(1e-5, 1e-3, (50, 40, 3)), "magnetometer": np.array(9.0)}
+    readings = Readings(g, 4e4 * b, rng.uniform(-12, 122, (50, 40)), sd=noise)
+    columns = correction.reference(made, readings)
+    stated, _ = with_uncertainty(made, readings, columns, True)
+    for name, column in OUTPUTS.items():
+        factor = 1.0 if name in ("gravity", "field") else 1 / DEG
+        expected = factor * made.uncertainty(name, readings, noise=True)
+        expected[np.isnan(stated[column])] = np.nan  # near vertical
+        np.testing.assert_allclose(stated[SD[column]], expected, rtol=1e-9)
+        assert np.isfinite(expected).mean() > 0.9
 
 
 def test_nothing_is_stated_outside_the_calibrated_temperatures(cal):

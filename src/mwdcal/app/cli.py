@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import io
 import os
 import re
@@ -21,6 +22,8 @@ INTERNAL = 70
 """Exit status of a defect of the program."""
 COMPLETION = "_MWDCAL_COMPLETE"
 """Variable with which a shell asks for completions, which are bytes."""
+NEW_OBJECTS = 50_000
+"""Objects after which garbage is looked for: many times as often, it would take 5 % of a short command."""
 SECTIONS = {
     "Calibrate": {
         "bench": "Calibrate a tool live, in the browser, beside the stand",
@@ -92,6 +95,7 @@ def main(arguments: list[str] | None = None) -> None:
     Without `arguments` those of this process, which then runs nothing else.
     """
     if arguments is None:
+        gc.set_threshold(NEW_OBJECTS)
         without_pandas()
     with contextlib.nullcontext() if COMPLETION in os.environ else screens():
         sys.exit(_status(arguments))

@@ -32,7 +32,7 @@ from mwdcal.estimation.problem import (
 from mwdcal.estimation.solvers import Status, gauss_newton
 from mwdcal.estimation.start import start
 from mwdcal.estimation.uncertainty import readjusted, unweighted_pulls
-from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints, inverse
+from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints, distinct, inverse
 from mwdcal.sensor.models import affine_parts
 from mwdcal.sensor.profile import COMMON
 
@@ -121,7 +121,7 @@ def _shared_groups(group: Ints) -> Ints:
     keys = compact.reshape(group.shape) + len(labels) * np.arange(len(group))[:, None]
     _, where, counts = np.unique(keys, return_inverse=True, return_counts=True)
     shared = (counts[where].reshape(group.shape) > 1) & (group >= 0)
-    kept = np.unique(group[shared])
+    kept = distinct(group[shared])
     return np.where(shared, np.searchsorted(kept, group), -1)
 
 

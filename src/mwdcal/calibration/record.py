@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import date, datetime
-from html import escape
 from itertools import pairwise
 from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 
@@ -30,7 +29,7 @@ from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, diagonal
-from mwdcal.sensor.models import Basis, Factors, Model, Polynomial
+from mwdcal.sensor.models import Basis, Factors, Polynomial, Whole
 from mwdcal.sensor.profile import Profile
 
 # --------------------------------------------------------------------------
@@ -61,6 +60,8 @@ def tilt_width(g: Array, spread: Array, width: Array, freedom: float, probabilit
 
 def html_table(caption: str, rows: Iterable[tuple[str, ...]]) -> str:
     """A table for notebooks: a heading, then the cells of each row as text."""
+    from html import escape
+
     lines = ("".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows)
     body = "".join(f"<tr>{line}</tr>" for line in lines)
     return f"<table><caption>{escape(caption)}</caption>{body}</table>"
@@ -498,7 +499,7 @@ class TriadCalibration(msgspec.Struct, frozen=True, kw_only=True):
         agrees = (self.misfit_probability or 0.0) > DOUBT and self.noise_source == "declared"
         return MOST_FREEDOM if agrees else self.degrees_of_freedom
 
-    def functions(self, reference: float) -> Model:
+    def functions(self, reference: float) -> Whole:
         """The model that these parameters belong to."""
         basis = Basis(self.order, reference)
         if self.model == "factors":
@@ -717,7 +718,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
 
     def _measured(
         self, readings: Readings
-    ) -> Iterator[tuple[TriadCalibration, Model, tuple[Array, Array, Array], slice]]:
+    ) -> Iterator[tuple[TriadCalibration, Whole, tuple[Array, Array, Array], slice]]:
         """Triads with readings, their models and what these take, and where their vectors lie."""
         temperature = self._temperature(readings)
         for index, triad in enumerate(self.triads):
@@ -828,12 +829,21 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         if noise:
             vectors += slopes.noise if slopes else self.noise_covariance(readings)
         total = rows @ vectors @ rows.mT
-        lacking = () if self.has_field else MAGNETIC
-        blank = np.stack([self.rests_on_free(n, readings) | (n in lacking) for n in names], -1)
-        turns = np.array([OBSERVABLES[n].period > 0 for n in names])
-        blank |= turns & (diagonal(total) > LARGEST_ANGLE_SD**2)
-        blank |= self.outside(readings)[..., None]
+        blank = self.without_uncertainty(names, readings, diagonal(total))
         return np.where(blank[..., :, None] | blank[..., None, :], np.nan, total)
+
+    def without_uncertainty(
+        self, names: Sequence[str], readings: Readings, variances: Array
+    ) -> Bools:
+        """Where (…, n, k) no uncertainty of observables with these variances can be stated, as in `uncertainty`."""
+        turns = np.array([OBSERVABLES[n].period > 0 for n in names])
+        blank = turns & (variances > LARGEST_ANGLE_SD**2)
+        blank |= self.outside(readings)[..., None]
+        if self.free:
+            blank |= np.stack([self.rests_on_free(n, readings) for n in names], -1)
+        if not self.has_field:
+            blank |= np.isin(names, MAGNETIC)
+        return np.asarray(blank)
 
     def expanded_uncertainty(
         self, name: str, readings: ReadingsLike, probability: float = 0.95

@@ -16,7 +16,7 @@ from mwdcal.estimation.batch import take
 from mwdcal.estimation.problem import ANGLES, STAND_ERRORS
 from mwdcal.estimation.uncertainty import Analysis, normal_quantile, station_misfit, without_station
 from mwdcal.geometry.observables import OBSERVABLES
-from mwdcal.geometry.vectors import Array, Bools, Ints
+from mwdcal.geometry.vectors import Array, Bools, Ints, distinct
 
 SHOWN = ("gravity", "inclination", "toolface", "azimuth", "field", "dip")
 RESHOOT = 0.01
@@ -250,7 +250,7 @@ class Residuals:
     @cached_property
     def influence(self) -> dict[str, Array]:
         """Largest change that each station makes to an observable, at stations of the run."""
-        some = np.unique(np.linspace(0, self.readings.count - 1, PROBES).astype(int))
+        some = distinct(np.linspace(0, self.readings.count - 1, PROBES).astype(int))
         problem, params, influence = self.fit.problem, self.fit.state.params, {}
         rows = [
             t.model.jacobian(params[:, where], t.raw[:, some], problem.temperature[:, some])
@@ -429,7 +429,7 @@ def tail(square: Array, freedom: Array) -> Array:
     array([0.05, 0.05])
     """
     chance = np.ones(square.shape)
-    for degrees in np.unique(freedom[freedom > 0]):
+    for degrees in distinct(freedom[freedom > 0]):
         some = freedom == degrees
         half = np.clip(square[some] / 2, 0, 700)
         power = 0.5 if degrees % 2 else 1.0

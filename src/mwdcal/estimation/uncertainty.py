@@ -26,6 +26,7 @@ from mwdcal.geometry.vectors import (
     Ints,
     are_positive,
     diagonal,
+    distinct,
     eigen,
     finite,
     inverse,
@@ -66,7 +67,7 @@ def free_directions(problem: Problem, state: State, determined: Determined) -> l
     """
     directions: list[list[Free]] = [[] for _ in determined.keep]
     missing = np.sum(~determined.keep, -1)
-    for count in np.unique(missing[missing > 0]):
+    for count in distinct(missing[missing > 0]):
         index = np.flatnonzero(missing == count)
         every = _named(*take((problem, state, determined), index), int(count))
         for place, each in zip(index, every, strict=True):

@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Iterable
 from contextlib import suppress
 from functools import partial
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,7 @@ from mwdcal.calibration.record import (
 from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import atomic, members
-from mwdcal.files.profiles import check_profile
+from mwdcal.files.profiles import PACKAGE, check_profile
 
 # --------------------------------------------------------------------------
 # Files that no output replaces: keys, calibrations, and those on which a certificate rests.
@@ -216,5 +215,5 @@ def published_schema(command: str = "") -> dict[str, Any]:
         if command
         else ("calibration.schema.json",)
     )
-    text = resources.files("mwdcal").joinpath(*place).read_text("utf-8")
+    text = PACKAGE.joinpath(*place).read_text("utf-8")
     return msgspec.json.decode(text, type=dict[str, Any])

@@ -17,9 +17,8 @@ import msgspec
 from mwdcal.calibration.diagnosis.flags import listed
 from mwdcal.errors import Answer, InputError, QuestionError
 from mwdcal.files.formats.columns import Column, looks_numeric, shown
-from mwdcal.files.formats.layout import ADJUSTED
 from mwdcal.files.formats.table import Table, labels, row_word
-from mwdcal.files.formats.titles import OF_REFUSAL
+from mwdcal.files.formats.titles import ADJUSTED, OF_REFUSAL
 from mwdcal.files.parting import marked_rows
 from mwdcal.files.statements import rows_of
 from mwdcal.files.synonyms import OURS

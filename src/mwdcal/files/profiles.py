@@ -10,9 +10,8 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from datetime import date
-from importlib import resources
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import msgspec
 
@@ -34,6 +33,8 @@ from mwdcal.sensor.profile import (
 )
 
 _Decoded = TypeVar("_Decoded", bound=msgspec.Struct)
+PACKAGE = Path(__file__).parents[1]
+"""The folder of this package: `importlib.resources` takes longer to load than its profiles to read."""
 _SUFFIX = ".toml"
 _DATES = (datetime.datetime, datetime.date, datetime.time)
 _SECTIONS: dict[str, type[msgspec.Struct]] = {
@@ -115,7 +116,7 @@ def built_in(folder: str) -> list[str]:
     """
     if not folder:
         return []
-    files = (file.name for file in resources.files("mwdcal").joinpath(folder).iterdir())
+    files = (file.name for file in PACKAGE.joinpath(folder).iterdir())
     return sorted(name.removesuffix(_SUFFIX) for name in files if name.endswith(_SUFFIX))
 
 
@@ -124,9 +125,9 @@ def read_toml(name: str, folder: str, kind: str) -> tuple[bytes, str]:
 
     Without a byte order mark; with it the SHA-256 of the file. `kind` is what the file should hold.
     """
-    path: Any = Path(name)
+    path = Path(name)
     if name in built_in(folder):
-        path = resources.files("mwdcal").joinpath(folder, name + _SUFFIX)
+        path = PACKAGE.joinpath(folder, name + _SUFFIX)
     try:
         if path.is_file():
             with path.open("rb") as stream:

@@ -11,6 +11,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -48,7 +49,6 @@ from mwdcal.files.contract import (
 from mwdcal.files.contract import BlankReadingError as BlankReadingError
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, Column, plain_names, shown
-from mwdcal.files.formats.layout import Layout
 from mwdcal.files.formats.table import Table, labels
 from mwdcal.files.formats.text import holds_numbers, is_formula
 from mwdcal.files.marks import UNMARKED, without_rejected
@@ -56,6 +56,9 @@ from mwdcal.files.statements import stated_table
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import ColumnSource, Profile, TableFormat, TriadProfile
+
+if TYPE_CHECKING:
+    from mwdcal.files.formats.layout import Layout
 
 # --------------------------------------------------------------------------
 # The findings about the columns that were only copied into it.

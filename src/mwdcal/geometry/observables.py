@@ -10,7 +10,7 @@ inclination does, and its gradient there is the limit taken along toolface zero.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -177,6 +177,77 @@ def _dip_gradient(g: Array, b: Array) -> Array:
     return _six(
         (north - sine * down) / (strength * cosine), (down - sine * north) / (total * cosine)
     )
+
+
+def variances(g: Array, b: Array, covariance: Array) -> Array:
+    """Variances (7, …) of the observables of `OUTPUTS`, in their order.
+
+    Definition: the gradients of `OBSERVABLES` on both sides of the covariance, written out with c = g × b, s = g · b:
+    azimuth c |g| / c² by b and (g_z t - s c / c²) / |g| by g, t = (g_y, -g_x, 0) / (g_x² + g_y²), sign aside; dip
+    (b - s g / g²) / |c| by g and (g - s b / b²) / |c| by b.
+    Shapes: components first, g and b (3, …), as arrays of whole columns are; covariance (21, …): xx, xy, xz, yy, yz, zz
+    of gravity, the same of the field, then xx, xy, xz, yx, … of gravity with the field.
+    Units: squares of radians, g and nT. Singular: as the gradients.
+    """
+    of_g, of_b, of_both = covariance[:6], covariance[6:12], covariance[12:]
+    (x, y, z), (bx, by, _) = g, b
+    vertical = is_vertical(np.moveaxis(g, 0, -1))
+    level, square, field_square = x * x + y * y, _product(g, g), _product(b, b)
+    across = np.sqrt(level)
+    safe = np.where(vertical, 1.0, across)
+    steepest = np.where(vertical, 0.0, x / safe), np.where(vertical, -1.0, y / safe)
+    level = np.where(vertical, np.nan, level)
+    inclined = z * steepest[0], z * steepest[1], -across
+    normal = g[1] * b[2] - z * by, z * bx - x * b[2], x * by - y * bx
+    down, area = _product(g, b), _product(normal, normal)
+    area = np.where(area == 0.0, np.nan, area)
+    lean, tilt = z / level, -down / area
+    turning = lean * y + tilt * normal[0], tilt * normal[1] - lean * x, tilt * normal[2]
+    of_g_dip = [b[k] - down / square * g[k] for k in range(3)]
+    of_b_dip = [g[k] - down / field_square * b[k] for k in range(3)]
+    azimuths = (
+        _form(of_g, turning) / square
+        + _between(of_both, turning, normal) * (2.0 / area)
+        + _form(of_b, normal) * (square / area**2)
+    )
+    dips = _form(of_g, of_g_dip) + 2.0 * _between(of_both, of_g_dip, of_b_dip)
+    return np.stack(
+        [
+            _form(of_g, inclined) / square**2,
+            azimuths,
+            _turn(of_g, x, y) / level**2,
+            _form(of_g, g) / square,
+            _form(of_b, b) / field_square,
+            (dips + _form(of_b, of_b_dip)) / area,
+            _turn(of_b, bx, by) / (bx * bx + by * by) ** 2,
+        ]
+    )
+
+
+_Triple = Array | Sequence[Array]
+"""Three components (3, …)."""
+
+
+def _product(v: _Triple, w: _Triple) -> Array:
+    return np.asarray(v[0] * w[0] + v[1] * w[1] + v[2] * w[2])
+
+
+def _form(symmetric: Array, v: _Triple) -> Array:
+    """Form v · S v with S as its upper triangle (6, …)."""
+    xx, xy, xz, yy, yz, zz = symmetric
+    x, y, z = v
+    tail = y * (y * yy + 2.0 * z * yz) + z * z * zz
+    return np.asarray(x * (x * xx + 2.0 * (y * xy + z * xz)) + tail)
+
+
+def _between(matrix: Array, v: _Triple, w: _Triple) -> Array:
+    """Form v · M w with M (9, …) row by row."""
+    return _product(v, [_product(matrix[k : k + 3], w) for k in (0, 3, 6)])
+
+
+def _turn(symmetric: Array, x: Array, y: Array) -> Array:
+    """The form of (y, -x, 0)."""
+    return np.asarray(y * (y * symmetric[0] - 2.0 * x * symmetric[1]) + x * x * symmetric[3])
 
 
 def _component(index: int, unit: str) -> Observable:

@@ -22,9 +22,9 @@ from mwdcal.calibration.record import Finding
 from mwdcal.errors import Answer, FitError, InputError, QuestionError, QuestionsError
 from mwdcal.files.contract import CHANNELS, MAPPED, RANGES, RAW, REFERENCES, units_of
 from mwdcal.files.formats import table as tables
-from mwdcal.files.formats.columns import LABELS, looks_numeric, shown
+from mwdcal.files.formats.columns import LABELS, WORKBOOKS, looks_numeric, shown
 from mwdcal.files.formats.figures import is_figure
-from mwdcal.files.formats.layout import WITHOUT_VALUE, WORKBOOKS, Layout
+from mwdcal.files.formats.layout import WITHOUT_VALUE, Layout
 from mwdcal.files.formats.table import Table, cell_error, labels, numbers
 from mwdcal.files.formats.table import labels as labels_of
 from mwdcal.files.formats.text import is_preamble

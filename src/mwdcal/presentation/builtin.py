@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import re
 import tomllib
-from importlib import resources
 from typing import Any
 
 import msgspec
 
-from mwdcal.files.profiles import built_in
+from mwdcal.files.profiles import PACKAGE, built_in
 from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.text import one_line
 
@@ -62,7 +61,7 @@ def entries(kind: str) -> list[BuiltIn]:
 
 def _what(folder: str, name: str) -> str:
     """The comment at the head of a file as one sentence, or the source that it states."""
-    text = resources.files("mwdcal").joinpath(folder, f"{name}.toml").read_text("utf-8")
+    text = PACKAGE.joinpath(folder, f"{name}.toml").read_text("utf-8")
     lines = text.splitlines()
     head = next((i for i, line in enumerate(lines) if not line.startswith("#")), len(lines))
     comment = " ".join(line.lstrip("# ") for line in lines[:head])

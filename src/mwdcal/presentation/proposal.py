@@ -12,7 +12,8 @@ from msgspec.structs import asdict
 from mwdcal.calibration.readings import TRIADS, simulated
 from mwdcal.calibration.record import Finding
 from mwdcal.files.contract import RANGES
-from mwdcal.files.formats.layout import WORKBOOKS, Layout
+from mwdcal.files.formats.columns import WORKBOOKS
+from mwdcal.files.formats.layout import Layout
 from mwdcal.identification.proposal import Proposal, findings_on, in_order, stated_references
 from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.numbers import files_written

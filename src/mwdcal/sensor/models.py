@@ -164,6 +164,10 @@ class Polynomial:
             result = np.concatenate([result, *curves], -1)
         return np.asarray(result)
 
+    def divisor(self, params: Array, temperature: Array) -> Array:
+        """Factor (..., n, 3) that each reading is divided by: one."""
+        return np.ones((*temperature.shape, 3))
+
     def curvature(self, params: Array, raw: Array, temperature: Array, covector: Array) -> Array:
         """Second derivatives (..., p, p) of Σ covector (..., n, 3) · field: none, it is linear."""
         vectors = np.broadcast_shapes(raw.shape, covector.shape, (*temperature.shape, 3))
@@ -269,6 +273,13 @@ class Factors:
         by_bias = np.broadcast_to(-column[..., None] * values[..., None, None, :], by_scale.shape)
         by_misalignment = -np.einsum("ij,...k->...ijk", np.eye(3), raw / scale - bias)
         return factor_params(by_scale, by_bias, by_misalignment)
+
+    def divisor(self, params: Array, temperature: Array) -> Array:
+        """Factor (..., n, 3) that each reading is divided by: SF(T).
+
+        The Jacobian is a polynomial of temperature times one affine in reading / SF².
+        """
+        return self._split(params, temperature)[0]
 
     def curvature(self, params: Array, raw: Array, temperature: Array, covector: Array) -> Array:
         """Second derivatives (..., p, p) of Σ covector (..., n, 3) · field, summed over stations."""

@@ -32,7 +32,14 @@ from mwdcal.estimation.uncertainty import (
     readjusted,
     without_station,
 )
-from mwdcal.geometry.vectors import Array, Bools, Ints, directions, group_scatter
+from mwdcal.geometry.vectors import (
+    Array,
+    Bools,
+    Ints,
+    directions,
+    distinct,
+    group_scatter,
+)
 from mwdcal.sensor.profile import Profile
 
 # --------------------------------------------------------------------------
@@ -79,7 +86,7 @@ def choose_orders(readings: Readings, options: Options) -> Ints:
     """Orders (B, 2) of accelerometer and magnetometer of a batch, as `choose_order` has them."""
     levels = _judged_soaks(readings, options)
     orders = np.zeros((len(levels), 2), int)
-    for count in np.unique(levels[levels > 1]):
+    for count in distinct(levels[levels > 1]):
         alike = np.flatnonzero(levels == count)
         some = take(readings, alike)
         orders[alike] = _tested(some, options, _bare_stand(some, options))[0][:, [0, -1]]

@@ -30,7 +30,7 @@ from mwdcal.estimation.minimisers import closed_form, stand_factors
 from mwdcal.estimation.minimisers.closed_form_drift import Alike, are_common, perfect
 from mwdcal.estimation.problem import Prior
 from mwdcal.estimation.solvers import Status
-from mwdcal.geometry.vectors import Array, Bools, Ints
+from mwdcal.geometry.vectors import Array, Bools, Ints, distinct
 from mwdcal.sensor.profile import AGEING, Profile, ageing
 
 ORDER_CHANCE = 0.2
@@ -190,7 +190,7 @@ def with_drifts(fits: Iterable[tuple[Ints, Fit]], options: Options) -> Iterator[
         declared = bool(result.problem.walks) and not _apart(result, options)
         steady = _without_drift(result, options) if declared else result
         drifted = drifting(steady, options)
-        for triads in np.unique(drifted, axis=0):
+        for triads in distinct(drifted, axis=0):
             places = np.flatnonzero((drifted == triads).all(-1))
             part = steady if triads.any() else result
             part = part if len(places) == len(drifted) else members(part, places)

@@ -45,6 +45,7 @@ from mwdcal.geometry.vectors import (
     Ints,
     centred,
     diagonal,
+    distinct,
     eigen,
     inverse,
     inverse_of_positive,
@@ -249,9 +250,9 @@ def may_show(result: Fit) -> Bools:
 
 def _are_enough(gains: Iterable[tuple[Array, Ints]], misfit: Array, rest: Array) -> Bools:
     """Fits (B,) of which some family lowers the misfit by so much that it may be named."""
-    shown, lefts = np.zeros(misfit.shape, bool), np.unique(rest).tolist()
+    shown, lefts = np.zeros(misfit.shape, bool), distinct(rest).tolist()
     for gain, directions in gains:
-        for count in filter(None, np.unique(directions).tolist()):
+        for count in filter(None, distinct(directions).tolist()):
             least = np.array([least_gain(count, left) for left in lefts]) * LOOK_MARGIN
             shown |= (directions == count) & (gain > least[np.searchsorted(lefts, rest)] * misfit)
     return shown

@@ -20,6 +20,8 @@ Column = list[str] | Array
 LABELS = ("station", "group", "serial")
 
 MAX_COLUMNS = 1000
+WORKBOOKS = (".xlsx", ".xls", ".ods")
+"""Suffixes of files whose tables have rows, not lines."""
 _LONGEST_SHOWN = 40
 
 _CONTROLS = re.compile(r"[\x00-\x1f\x7f\x85\u2028\u2029\ufeff]+")

@@ -26,13 +26,11 @@ from mwdcal.files.formats.columns import (
     shown,
 )
 from mwdcal.files.formats.title_references import stated_above
-from mwdcal.files.formats.titles import OF_REFUSAL, Titles, dated, titles
+from mwdcal.files.formats.titles import ADJUSTED, OF_REFUSAL, Titles, dated, titles
 from mwdcal.files.synonyms import unit_of
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import TableFormat
 
-WORKBOOKS = (".xlsx", ".xls", ".ods")
-"""Suffixes of files whose tables have rows, not lines."""
 LEAST_COLUMNS = 4
 """Columns that a table with three channels and a reference has at least."""
 _MOST_HEADER_ROWS = 3
@@ -63,15 +61,6 @@ _DEGREES_OF = re.compile(
 WITHOUT_VALUE = re.compile(r"n/?a|n\.a\.?|nan|null|none|[\W_]*", re.IGNORECASE)
 """A cell that says that there is no value."""
 _BRACKETS = re.compile(r"[(\[][^)\]]*[)\]]")
-
-ADJUSTED = re.compile(
-    r"as[- ]?left|(before|after|pre|post)[- ]?(adjust|calib)\w*|(vor|nach) (der )?(justier|abgleich|kalibrier)\w*|"
-    r"(f(ø|o)r|etter|efter) (juster|kalibrer)\w*|(antes|despu[eé]s|depois) (del?a?|do|da) (ajust|calibr)\w*|"
-    r"(avant|apr[eè]s) (ajust|r[eé]glage|[eé]talonn)\w*|(до|после) (регулир|настрой|юстир|калибр)\w*|"
-    r"(校准|调整|调校)(前|后)|(調整|校正)(前|後)",
-    re.IGNORECASE,
-)
-"""Words of a run before or after an adjustment of the tool: two of them are two runs."""
 
 _OF_VOID_RUN = re.compile(
     rf"(?<![^\W\d_])({OF_REFUSAL}|abort(ed)?|cancell?ed|abgebrochen|ungültig|avbrutt|abortad[oa]|abandonn[eé]e?|"

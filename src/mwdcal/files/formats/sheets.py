@@ -14,8 +14,8 @@ from typing import Any
 from mwdcal import extras
 from mwdcal.errors import InputError
 from mwdcal.files.formats import figures, text
-from mwdcal.files.formats.columns import at_most, damaged_unless_read
-from mwdcal.files.formats.layout import LEAST_COLUMNS, WORKBOOKS, Cells, Sheet
+from mwdcal.files.formats.columns import WORKBOOKS, at_most, damaged_unless_read
+from mwdcal.files.formats.layout import LEAST_COLUMNS, Cells, Sheet
 from mwdcal.sensor.profile import TableFormat
 
 DELIMITERS = (";", "\t", ",", "|")

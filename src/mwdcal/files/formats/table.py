@@ -8,16 +8,17 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError, reason
 from mwdcal.files import metadata as meta
-from mwdcal.files.formats import atomic, layout, text
+from mwdcal.files.formats import atomic, text
 from mwdcal.files.formats.columns import (
     LABELS,
+    WORKBOOKS,
     Column,
     Parts,
     as_text,
@@ -27,10 +28,12 @@ from mwdcal.files.formats.columns import (
     looks_numeric,
 )
 from mwdcal.files.formats.columns import shown as shown
-from mwdcal.files.formats.title_references import stated_above
 from mwdcal.files.formats.titles import dated
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import TableFormat
+
+if TYPE_CHECKING:
+    from mwdcal.files.formats.layout import Layout
 
 _TABLES = {
     ".csv": "formats.text",
@@ -41,7 +44,7 @@ _TABLES = {
 _FORMATS = {**_TABLES, ".xml": "exchange.witsml", ".las": "exchange.las"}
 SUFFIXES = tuple(_TABLES)
 """Of tables as documented; those of other programs are `EXCHANGED`."""
-LAID_OUT = (".csv", ".tsv", ".txt", ".dat", ".lvm", ".asc", ".prn", *layout.WORKBOOKS)
+LAID_OUT = (".csv", ".tsv", ".txt", ".dat", ".lvm", ".asc", ".prn", *WORKBOOKS)
 """Suffixes of files in which a table is looked for; those that are no tables as documented need a profile."""
 EXCHANGED = (".xml", ".las")
 """Suffixes of WITSML and LAS, whose columns are taken from the format's own names."""
@@ -121,6 +124,8 @@ def parsed(
     arguments: dict[str, Any] = {"most": rows} if suffix == ".parquet" else {}
     stated: Mapping[str, object] = {}
     if export and form is text:
+        from mwdcal.files.formats.title_references import stated_above
+
         stated = stated_above(text.above(data, export, name)).metadata
         data, arguments = text.plain(data, export, name), {"delimiter": export.delimiter}
     elif suffix == ".xlsx":
@@ -221,7 +226,7 @@ def cell_error(table: Table, name: str, row: int, problem: str) -> InputError:
 def row_word(table: Table) -> str:
     """The word for a row of a table in its file: texts have lines."""
     suffix = Path(table.source).suffix.lower()
-    return "row" if suffix in ("", ".parquet", *layout.WORKBOOKS) else "line"
+    return "row" if suffix in ("", ".parquet", *WORKBOOKS) else "line"
 
 
 def laid_out(
@@ -231,14 +236,14 @@ def laid_out(
     header_row: int = 0,
     wanted: Collection[str] = (),
     decimal: str = "",
-) -> layout.Layout | None:
+) -> Layout | None:
     """Where the table is in a text or workbook as a laboratory keeps it; None of a format without a layout.
 
     Raises:
         InputError: the file cannot be read, or holds no such table.
         FitError: several tables that may be meant, or an open decimal sign.
     """
-    from mwdcal.files.formats import sheets
+    from mwdcal.files.formats import layout, sheets
 
     if decimal:
         check_decimal(decimal)
@@ -255,8 +260,10 @@ def laid_out(
     )
 
 
-def of_layout(where: layout.Layout, path: str | os.PathLike[str], kept: Collection[str]) -> Table:
+def of_layout(where: Layout, path: str | os.PathLike[str], kept: Collection[str]) -> Table:
     """The table of a layout in a file; the cells of the columns `kept` as they stand, of labels and serials."""
+    from mwdcal.files.formats import layout
+
     lines = [(n, line) for n, line in enumerate(where.above, 1) if text.is_metadata(line)]
     stated = meta.parse(lines, Path(path).name)
     return Table(

@@ -58,6 +58,14 @@ OF_REFUSAL = (
     r"作废|剔除|无效|废弃|舍弃|弃用|不可用|坏点?|不合格"
 )
 """Words by which a laboratory rejects a row, or a whole run."""
+ADJUSTED = re.compile(
+    r"as[- ]?left|(before|after|pre|post)[- ]?(adjust|calib)\w*|(vor|nach) (der )?(justier|abgleich|kalibrier)\w*|"
+    r"(f(ø|o)r|etter|efter) (juster|kalibrer)\w*|(antes|despu[eé]s|depois) (del?a?|do|da) (ajust|calibr)\w*|"
+    r"(avant|apr[eè]s) (ajust|r[eé]glage|[eé]talonn)\w*|(до|после) (регулир|настрой|юстир|калибр)\w*|"
+    r"(校准|调整|调校)(前|后)|(調整|校正)(前|後)",
+    re.IGNORECASE,
+)
+"""Words of a run before or after an adjustment of the tool: two of them are two runs."""
 _PARTS = re.compile(r"\s+/\s+|,\s+|;\s*|\s{3,}")
 """The separator of facts in one cell."""
 _OF_TOOLS = (
