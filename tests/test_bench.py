@@ -68,6 +68,14 @@ def session_in(folder, plan=PLAN, start=True, tool=None, **options):
     return session
 
 
+@pytest.fixture(autouse=True)
+def papers_without_pictures(without_pictures, monkeypatch):
+    """Those of `finished` are drawn, and those in the browser."""
+    from mwdcal.presentation import certificate
+
+    monkeypatch.setattr(certificate, "certificate_pictures", lambda *given: [])
+
+
 @pytest.fixture
 def session(tmp_path):
     opened = session_in(tmp_path / "S")
