@@ -38,6 +38,7 @@ from mwdcal.bench.settling import (
     FALSE_MOVE,
     Settling,
     _largest_scatter,
+    _lower_quartile,
     _trend_in_noise,
 )
 from mwdcal.bench.sources import GrowingFile, Lines, SerialPort, Socket, source_of
@@ -66,6 +67,14 @@ def session_in(folder, plan=PLAN, start=True, tool=None, **options):
     elif start:
         session.resume()
     return session
+
+
+@pytest.fixture(autouse=True)
+def plans_once_and_papers_without_pictures(computed_once, without_pictures, monkeypatch):
+    """Papers of `finished` are drawn, and those in the browser."""
+    from mwdcal.presentation import certificate
+
+    monkeypatch.setattr(certificate, "certificate_pictures", lambda *given: [])
 
 
 @pytest.fixture
@@ -803,6 +812,13 @@ def test_a_tool_at_rest_is_seldom_said_to_move_or_to_creep(rate, seconds):
             looks, waits = looks + 1, waits + (judge.state != "settled")
     assert judge.moves <= stats.binom.isf(1e-3, 400, FALSE_MOVE)
     assert waits <= 10 * stats.binom.isf(1e-3, looks // 10, FALSE_CREEP)
+
+
+@pytest.mark.parametrize("count", range(1, 10))
+def test_lower_quartiles_are_those_of_numpy(count):
+    values = np.random.default_rng(count).normal(size=(count, 6))
+    expected = np.quantile(values, 0.25, axis=0)
+    np.testing.assert_allclose(_lower_quartile(values), expected, rtol=1e-14)
 
 
 def test_the_limit_of_scatter_is_that_of_fisher():

@@ -93,6 +93,14 @@ class RestNoise(NamedTuple):
     correlation: Array
 
 
+def _lower_quartile(values: Array) -> Array:
+    """The lower quartiles of columns (n, ...), in an eighth of the time of `numpy.quantile`."""
+    place, share = divmod((len(values) - 1) / 4, 1)
+    low, high = int(place), min(int(place) + 1, len(values) - 1)
+    ordered = np.partition(values, (low, high), axis=0)
+    return np.asarray(ordered[low] + share * (ordered[high] - ordered[low]))
+
+
 class Settling:
     """The state of the tool: "moving", "settling" or "settled".
 
@@ -189,11 +197,11 @@ class Settling:
         that of n independent ones has the variance 2/n.
         """
         recent = np.array(self.recent).transpose(1, 0, 2)
-        rough = np.maximum(np.quantile(recent[0], 0.25, axis=0), self._floor)
+        rough = np.maximum(_lower_quartile(recent[0]), self._floor)
         ratios = np.divide(recent[1:], rough, out=np.zeros_like(recent[1:]), where=rough > 0)
         chance, bounds = FALSE_MOVE / 2 / self.sensors, np.zeros((2, self.sensors))
         for triad in self._triads:
-            scatter, change = (float(np.quantile(each[:, triad], 0.25)) for each in ratios)
+            scatter, change = (float(_lower_quartile(each[:, triad].ravel())) for each in ratios)
             known = ratios[0][:, triad].size / QUARTILE_COST
             scatter = max(scatter, 1.0)  # less only of coarse readings
             change = max(change / QUARTER_OF_NORMAL, sqrt(2 / count))

@@ -103,7 +103,8 @@ def in_chunks(
     fail: Fail,
 ) -> Iterator[tuple[Ints, _T]]:
     """The work on given members of a batch, some at a time; in halves where one stops the whole."""
-    size = tools_per_fit(readings)
+    count = max(1, int(len(tools) / tools_per_fit(readings) + 2 / 3))
+    size = max(1, -(-len(tools) // count))
     for start in range(0, len(tools), size):
         part = tools[start : start + size]
         try:

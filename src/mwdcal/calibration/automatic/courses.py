@@ -16,7 +16,7 @@ import numpy as np
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import HIGHEST, highest_order, usable_soaks
 from mwdcal.estimation.batch import take
-from mwdcal.estimation.minimisers import stand_factors
+from mwdcal.estimation.minimisers import closed_form, stand_factors
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import TANGENT_STEP, fisher_tail, tangent
 from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, eigen, inverse, outer, quotient
@@ -158,7 +158,8 @@ def _with_terms(result: Fit, shown: Bools, least: int) -> tuple[Array, Array]:
     problem, state = result.problem, result.state
     every = temperature_powers(problem.temperature, least + shown.shape[-1])
     powers = every[..., least:] * shown[:, None]
-    if stand_factors.applies(problem):
+    exact = closed_form.applies(problem) and stand_factors.comes_apart(problem)
+    if exact or stand_factors.applies(problem):
         return stand_factors.linear(problem, state).with_courses(powers.mT)
     linear = problem.linear(state)
     columns = steady_columns(problem, state)

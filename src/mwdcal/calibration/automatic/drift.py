@@ -16,7 +16,12 @@ import numpy as np
 
 from mwdcal.calibration.automatic.courses import f_test, members, terms_beyond
 from mwdcal.calibration.diagnosis.plausibility import departures
-from mwdcal.calibration.diagnosis.structure import dip_may_be_off, effects, shown_effects
+from mwdcal.calibration.diagnosis.structure import (
+    chance_alone,
+    dip_may_be_off,
+    effects,
+    shown_effects,
+)
 from mwdcal.calibration.estimate import Fit, fit, refitted, with_all
 from mwdcal.calibration.methods import declared_sizes
 from mwdcal.calibration.options import Options
@@ -135,11 +140,12 @@ def _wrong_dip(result: Fit) -> Bools:
     It leaves residuals that go with attitude, and attitude may go with the order of the stations. A walk would follow
     them too, so uncertain that the error does not show.
     """
-    wrong = np.zeros(len(result.status), bool)
-    for place, shown in enumerate(shown_effects(result, {})):
-        name = next(iter(shown), "")
-        if name == "dip-reference" and shown[name][0] < WRONG_CHANCE:
-            [effect] = effects(take(result, np.array([place])), shown={name: shown[name]})
+    wrong, name = np.zeros(len(result.status), bool), "dip-reference"
+    for place in np.flatnonzero(chance_alone(result, name) < WRONG_CHANCE).tolist():
+        part = take(result, np.array([place]))
+        [shown] = shown_effects(part, {})
+        if next(iter(shown), "") == name and shown[name][0] < WRONG_CHANCE:
+            [effect] = effects(part, shown={name: shown[name]})
             wrong[place] = abs(effect.values[0]) > WRONG_DIP
     return wrong
 

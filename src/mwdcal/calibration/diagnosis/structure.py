@@ -743,13 +743,7 @@ def shown_effects(result: Fit, others: Mapping[str, Array]) -> list[Shown]:
 
 def _searched(result: Fit, others: Mapping[str, Array]) -> list[Shown]:
     """Effects that residuals show: the least likely by chance first, then what its fit leaves, and so on."""
-    scales = np.maximum(variance_scales(result), 1e-12)
-    triads = [
-        replace(t, sd=t.sd * np.sqrt(scales[:, i, None, None]))
-        for i, t in enumerate(result.problem.triads)
-    ]
-    problem = replace(result.problem, triads=tuple(triads))
-    scores = _scores(problem, result, others)
+    scores = _scores(_with_noise_found(result), result, others)
     shown: list[Shown] = [{} for _ in result.status]
     left = scores.misfit.copy()
     searched: dict[tuple[str, ...], Ints] = {(): np.arange(len(shown))}
@@ -770,6 +764,30 @@ def _searched(result: Fit, others: Mapping[str, Array]) -> list[Shown]:
         whole = len(scores.places)
         searched = {names: np.array(m) for names, m in further.items() if len(names) < whole}
     return shown
+
+
+def _with_noise_found(result: Fit) -> Problem:
+    """The problem of a fit with the noise that its residuals show."""
+    scales = np.maximum(variance_scales(result), 1e-12)
+    triads = [
+        replace(t, sd=t.sd * np.sqrt(scales[:, i, None, None]))
+        for i, t in enumerate(result.problem.triads)
+    ]
+    return replace(result.problem, triads=tuple(triads))
+
+
+def chance_alone(result: Fit, name: str) -> Array:
+    """Chance (B,) in noise of one effect beside no other, as `shown_effects` has that of the first; 1 without it."""
+    result, chance = _without_bad_stations(result), np.ones(len(result.status))
+    for first in range(0, len(chance), AT_ONCE):
+        part = take(result, np.arange(first, min(first + AT_ONCE, len(chance))))
+        problem = _with_noise_found(part)
+        found = next((c for n, c in families(problem, part.state) if n == name), None)
+        if found is not None:
+            scores = _scores_of(problem, part, {name: found})
+            one = _trials(scores, (), (name,), scores.misfit)[0][0]
+            chance[first : first + AT_ONCE] = one
+    return chance
 
 
 def effects(
@@ -859,11 +877,16 @@ def _described(result: Fit, shown: Shown, others: Mapping[str, Array]) -> list[E
 
 
 def _scores(problem: Problem, result: Fit, others: Mapping[str, Array]) -> _Scores:
-    """Efficient scores of the columns (B, n, m, k) of all families: what the fit's unknowns cannot take up."""
+    """Efficient scores of all families, and of columns that the fit does not use."""
     columns = dict(families(problem, result.state))
     if tested := _testable(problem, result.state, others):
         steady = steady_columns(problem, result.state)
         columns |= {COLUMN + n: products(steady, v[..., None]) for n, v in tested.items()}
+    return _scores_of(problem, result, columns)
+
+
+def _scores_of(problem: Problem, result: Fit, columns: Mapping[str, Array]) -> _Scores:
+    """Efficient scores of the columns (B, n, m, k) of some families: what the fit's unknowns cannot take up."""
     linear = problem.linear(result.state)
     whole, normal = whole_covariance(linear, result.analysis.determined), linear.normal
     every = np.concatenate([*columns.values()], -1)

@@ -47,11 +47,15 @@ LAST_AXIS_STEP = 1e-12
 
 
 def applies(problem: Problem) -> bool:
+    """Whether there are factors, and what is to be found comes apart by axis but for errors of known angles."""
+    return any(isinstance(t.model, Factors) for t in problem.triads) and comes_apart(problem)
+
+
+def comes_apart(problem: Problem) -> bool:
     """Whether all angles are known, and nothing but their errors, the sensors' and drifts are to be found."""
     evidence = problem.evidence
     return (
         len(problem.triads) == 2
-        and any(isinstance(t.model, Factors) for t in problem.triads)
         and all(_is_affine(t) or isinstance(t.model, Factors) for t in problem.triads)
         and not (evidence.absent or evidence.scatter or evidence.members.size)
         and bool(evidence.referenced.all())
