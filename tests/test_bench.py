@@ -320,6 +320,7 @@ def test_a_session_goes_on_after_a_restart(session):
     accept_some(session, stand, 3)
     session.skip()
     session.switch("auto", True)
+    session.wait_for_fits()
     rows = lines_of(session.folder / "run.csv")
     session.close()
     again = session_in(
@@ -506,7 +507,7 @@ def test_bad_stations_do_not_hide_each_other(tmp_path, size, samples):
         sd = table[:, :6].std(0, ddof=1) / np.sqrt(samples)
         lines.append(",".join(map(str, (i + 1, *table.mean(0), *sd, *attitude, *EARTH.values()))))
     (tmp_path / "run.csv").write_text("\n".join(lines) + "\n")
-    fit = documents.fit(tmp_path, 24, threading.RLock())
+    fit = documents.fit(tmp_path, 24)
     assert {*fit.bad} == {"8", "16"}
 
 
@@ -525,6 +526,7 @@ def test_undo_gives_a_former_station_back(session):
     session.undo()
     session.undo()
     assert session.part.done == {}
+    session.wait_for_fits()
     assert not (session.folder / "run.csv").exists()
     with pytest.raises(InputError, match="no station to take back"):
         session.undo()
@@ -604,6 +606,7 @@ def test_a_station_in_the_journal_is_safe_where_the_run_file_cannot_be_written(
         session.wait_for_fits()
         assert "safe in session.jsonl" in session.message
     accept_some(session, stand, 1)
+    session.wait_for_fits()
     rows = [line for line in lines_of(session.folder / "run.csv") if line[:1].isdigit()]
     assert len(rows) == 3
 
@@ -803,6 +806,21 @@ def test_a_tool_at_rest_is_seldom_said_to_move_or_to_creep(rate, seconds):
             looks, waits = looks + 1, waits + (judge.state != "settled")
     assert judge.moves <= stats.binom.isf(1e-3, 400, FALSE_MOVE)
     assert waits <= 10 * stats.binom.isf(1e-3, looks // 10, FALSE_CREEP)
+
+
+@pytest.mark.parametrize("step", [3.0, 10.0])
+@pytest.mark.parametrize("turn", [0.0, 1.0])
+def test_readings_coarser_than_correlated_noise(step, turn):
+    """One sensor rests between two steps, and flips in AR(1) noise of 0.3 s, five read the same: the tool has settled.
+
+    One that turns by a step a second has not.
+    """
+    rng, judge, looks = np.random.default_rng(5), Settling(6, 5.0), []
+    course = step * turn * np.arange(3000)[:, None] / 50 + [step / 2, 0, 0, 0, 0, 0]
+    for i, row in enumerate(noisy(rng, 3000, 50, 0.3, 6) + course):
+        judge.take(i / 50, tuple(map(float, np.round(row / step) * step)))
+        looks += [judge.state == "settled"] if i > 500 else []
+    assert np.mean(looks) == 0.0 if turn else np.mean(looks) > 0.8
 
 
 def test_the_limit_of_scatter_is_that_of_fisher():

@@ -21,8 +21,6 @@ from mwdcal.geometry.observables import TITLES
 from mwdcal.presentation.numbers import signed
 
 if TYPE_CHECKING:
-    from threading import RLock
-
     from mwdcal.calibration.readings import Readings
     from mwdcal.calibration.record import Calibration, StationRow
     from mwdcal.library.papers import Paper
@@ -46,18 +44,15 @@ class RunFit:
     """The problem of each station to measure again, by label."""
 
 
-def fit(folder: Path, stations: int, lock: RLock) -> RunFit:
+def fit(folder: Path, stations: int) -> RunFit:
     """The calibration of the run in a folder, as `mwdcal calibrate` makes it of run.csv and tool.toml.
 
-    A bad station hides another, and several together may prevent a calibration: a robust fit names the others. Nobody
-    who holds the `lock` writes these files while they are read.
+    A bad station hides another, and several together may prevent a calibration: a robust fit names the others.
     """
     if stations < FEWEST_STATIONS:
         return RunFit()
     try:
-        with lock:
-            readings = mwdcal.read_run(folder / "run.csv", folder / "tool.toml")
-        return fit_of(readings)
+        return fit_of(mwdcal.read_run(folder / "run.csv", folder / "tool.toml"))
     except MwdcalError as error:
         return RunFit(reason=str(error))
 

@@ -12,6 +12,7 @@ import json
 import re
 import secrets
 from collections.abc import AsyncIterator, Callable, Collection, Mapping, Sequence
+from functools import partial
 from importlib.resources import files
 from ipaddress import ip_address
 from threading import Event, Thread
@@ -89,6 +90,7 @@ class Bench:
         self.stop = Event()
         self.reader = Thread(target=self._read, name="bench source", daemon=True)
         self._fragment: tuple[int, str] = (-1, "")
+        self._changed = asyncio.Event()
         entered = None if session.countersign else session.registry  # not before the signature
         folder = session.folder / "table"
         self.table = table = DroppedTable(folder, entered, session.laboratory)
@@ -279,6 +281,7 @@ class Bench:
     async def _events(self, request: Request) -> AsyncIterator[str]:
         seen, last = -1, ""
         while not self.stop.is_set():
+            changed = self._changed
             if self.session.version != seen:
                 seen = self.session.version
                 yield _event("page", await run_in_threadpool(self.fragment))
@@ -288,13 +291,21 @@ class Bench:
                 yield f"event: live\ndata: {text}\n\n"
             if await request.is_disconnected():
                 return
-            await asyncio.sleep(TICK)
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(changed.wait(), TICK)
+
+    def _wake(self) -> None:
+        """Wake the event streams: the page is another one."""
+        self._changed.set()
+        self._changed = asyncio.Event()
 
     def app(self) -> Starlette:
         """The server."""
 
         @contextlib.asynccontextmanager
         async def life(app: Starlette) -> AsyncIterator[None]:
+            loop = asyncio.get_running_loop()
+            self.session.on_change = partial(loop.call_soon_threadsafe, self._wake)
             self.reader.start()
             yield
             self.stop.set()

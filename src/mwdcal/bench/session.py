@@ -10,6 +10,7 @@ import contextvars
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from threading import Lock, RLock
@@ -47,7 +48,7 @@ class BenchSession:
     """One tool at one stand. Its methods may be called from several threads.
 
     `options` is what the bench was opened with, for the journal; `tools` are those of the registry; `countersign` is
-    the private key with which a second person signs the certificate.
+    the private key with which a second person signs the certificate. `on_change` is called whenever `version` has grown.
     """
 
     def __init__(
@@ -75,6 +76,7 @@ class BenchSession:
         self.auto = self.paused = self.calibrated = self.testing = False
         self.typed_temperature: float | None = None
         self.attempts, self.version, self.message = 0, 0, ""
+        self.on_change: Callable[[], object] = lambda: None
         self.fit = documents.RunFit()
         self.verdict: Verdict | None = None
         self.as_found: Verdict | None = None
@@ -91,7 +93,6 @@ class BenchSession:
             self._apply(event)
         self.waiting = True
         if self.facts:
-            self._write_tables()
             self._refit()
 
     @property
@@ -106,7 +107,12 @@ class BenchSession:
         event: Event = {"event": kind, "at": datetime.now().astimezone().isoformat(), **facts}
         self.journal.add(event)
         self._apply(event)
+        self._change()
+
+    def _change(self) -> None:
+        """Tell who watches that the page is another one."""
         self.version += 1
+        self.on_change()
 
     def _apply(self, event: Event) -> None:
         """Let an event happen, now or again after a restart."""
@@ -172,7 +178,7 @@ class BenchSession:
             self.sample = sample.values
             if self.settling is None:
                 self.settling = self._new_settling()
-                self.version += 1
+                self._change()
             self.settling.take(now, sample.values)
             if TEMPERATURE_COLUMN in self.stream.channels:
                 self.warmth.take(now, self.raw[TEMPERATURE_COLUMN])
@@ -264,7 +270,8 @@ class BenchSession:
         past = opening.past_of(self.registry, serial)
         with self.lock:
             self._check_new()
-            self.past, self.version = past, self.version + 1
+            self.past = past
+            self._change()
 
     def _check_new(self) -> None:
         if self.facts:
@@ -324,7 +331,8 @@ class BenchSession:
         with self.lock:
             if not self.facts:
                 raise InputError("the session has not begun. Press Start.")
-            self.waiting, self.version = False, self.version + 1
+            self.waiting = False
+            self._change()
 
     def accept(self, position: int | None = None) -> None:
         """Take the standstill as the station that is asked for; `position`: the one that the page has shown."""
@@ -415,7 +423,6 @@ class BenchSession:
         more = {name: value for name, value in (("doubt", doubt), ("samples", samples)) if value}
         self._record("station", part=part.name, position=order, row=row, **more)
         self.message = ""
-        self._write_tables()
         self._refit()
 
     def undo(self) -> None:
@@ -426,7 +433,6 @@ class BenchSession:
                 raise InputError("there is no station to take back.")
             self._record("undone", part=self.part.name)
             self._used = (-1, -1)
-            self._write_tables()
             self._refit()
 
     def measure_again(self, position: int | None = None) -> None:
@@ -482,7 +488,7 @@ class BenchSession:
             self._record("cleared", part=ROLLTEST_PART)
             self.verdict = self.as_found = None
             self._used = (-1, -1)
-            self._write_tables()
+            self._refit()
 
     # ------------------------------------------------------------------ results
 
@@ -497,22 +503,25 @@ class BenchSession:
 
     def _write_tables(self) -> None:
         """Write the run files from the events. The stations are in the journal already: a full disk loses none."""
+        with self.lock:
+            parts = [replace(part, taken=[*part.taken]) for part in self.parts.values()]
+            self._unwritten = False
         try:
             earlier: list[TakenStation] = []
-            for part in self.parts.values():
+            for part in parts:
                 path = self.folder / f"{part.name}.csv"
                 if part.taken:
                     tables.write(path, part.table(self.facts, earlier))
                     earlier = [*part.done.values()]
                 else:
                     path.unlink(missing_ok=True)
-            self._unwritten = False
         except (MwdcalError, OSError) as error:
             self._unwritten = True
             self.say(f"{error} The station is safe in session.jsonl.")
 
     def _refit(self) -> None:
-        """Fit what there is, beside the stream."""
+        """Write the run files, and fit what there is, beside the stream."""
+        self._unwritten = True
         self._requested += 1
         task = self._judge if self.testing else self._fit_run
         self._submit(partial(self._if_latest, self._requested, task))
@@ -546,13 +555,14 @@ class BenchSession:
                 f"internal error ({type(error).__name__}: {error}). Nothing accepted is lost; please report it."
             )
         with self.lock:
-            self.version += 1
+            self._change()
 
     def say(self, message: str) -> None:
         """Show a message on the page."""
         with self.lock:
             if message != self.message:
-                self.message, self.version = message, self.version + 1
+                self.message = message
+                self._change()
 
     def wait_for_fits(self) -> None:
         """Wait until all that was requested is done, and what that has requested."""
@@ -561,7 +571,7 @@ class BenchSession:
 
     def _fit_run(self) -> None:
         count = len(self.parts[RUN_PART].done)
-        fit = documents.fit(self.folder, count, self.lock)
+        fit = documents.fit(self.folder, count)
         with self.lock:
             self.fit = fit
             if fit.calibration is not None:
@@ -580,7 +590,7 @@ class BenchSession:
             self._submit(self._calibrate)
 
     def _calibrate(self) -> None:
-        fit = documents.fit(self.folder, len(self.parts[RUN_PART].done), self.lock)
+        fit = documents.fit(self.folder, len(self.parts[RUN_PART].done))
         if fit.calibration is None:
             raise InputError(fit.reason)
         files = documents.save_calibration(fit.calibration, self.folder)

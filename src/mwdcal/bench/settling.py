@@ -40,6 +40,8 @@ QUARTER_OF_NORMAL = 0.3186393639643752
 """First quartile of the size of a normal variate."""
 SMOOTH = 3
 """Order of the differences of samples that tell the roughness of a sensor: a movement is smooth, and hardly shows."""
+FLIP = 1.001
+"""Steps by which a coarse reading at rest changes at most: between two, rounded."""
 LARGEST_WANDER = 12.0
 """Times its roughness that a sensor at rest wanders from cell to cell.
 
@@ -203,7 +205,8 @@ class Settling:
                 float(student(known, chance)), float(student(inf, chance)) * LARGEST_WANDER / change
             )
             bounds[:, triad] = [[scatter * times], [change * wander]]
-        return bounds[0] * rough, bounds[1] * rough
+        coarse = np.where(rough > self._steps / 2, 0.0, FLIP * self._steps)
+        return bounds[0] * rough, np.maximum(bounds[1] * rough, coarse)
 
     @property
     def _triads(self) -> list[slice]:
@@ -212,8 +215,12 @@ class Settling:
     @property
     def _floor(self) -> Array:
         """The smallest noise of each sensor: half a step is a value between two."""
-        steps = np.array(self.step)
-        return np.asarray(np.maximum(self.least, np.where(np.isfinite(steps), steps / 2, 0.0)))
+        return np.asarray(np.maximum(self.least, self._steps / 2))
+
+    @property
+    def _steps(self) -> Array:
+        """The smallest step of each sensor; 0 where none was seen."""
+        return np.where(np.isfinite(self.step), self.step, 0.0)
 
     def _look(self) -> None:
         """Drop the oldest cells until no sensor creeps; settled if what is left is long enough."""
