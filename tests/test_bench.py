@@ -745,21 +745,27 @@ def noisy(rng, count, rate, seconds, sensors=1):
     return noise
 
 
-def errors_of_means(rate, seconds=0.0, step=0.0, count=100):
-    """Errors of the means of standstills of a sensor, a tool that moves between them, over their uncertainty."""
-    rng, judge, time, here = np.random.default_rng(7), Settling(1, 5.0), 0.0, 0.0
-    rests, truths = [], []
+def standstills(rate, seconds=0.0, step=0.0, count=100, sensors=1):
+    """The judge of sensors, settled after each of so many moves, and where they really stand."""
+    rng, judge, time, here = np.random.default_rng(7), Settling(sensors, 5.0), 0.0, 0.0
     for _ in range(count):
         goal = rng.uniform(-1000, 1000)
         course = np.concatenate([np.linspace(here, goal, 4 * rate), np.full(40 * rate, goal)])
-        values = course + noisy(rng, len(course), rate, seconds)[:, 0]
+        values = course[:, None] + noisy(rng, len(course), rate, seconds, sensors)
         values, here = np.round(values / step) * step if step else values, goal
-        for i, value in enumerate(values):
-            judge.take(time, (float(value),))
+        for i, row in enumerate(values.tolist()):
+            judge.take(time, row)
             time += 1 / rate
             if i > 5 * rate and judge.state == "settled":
                 break
         assert judge.state == "settled"
+        yield judge, goal
+
+
+def errors_of_means(rate, seconds=0.0, step=0.0):
+    """Errors of the means of standstills of a sensor, a tool that moves between them, over their uncertainty."""
+    rests, truths = [], []
+    for judge, goal in standstills(rate, seconds, step):
         still = judge.station()
         rests.append((still.time, still.samples[:, 0]))
         truths.append(goal)
@@ -790,6 +796,14 @@ def test_the_uncertainty_holds_correlated_noise(rate, seconds):
     samples of a hundred are where 95 % are."""
     assert stats.binom.cdf(86, 100, 0.95) < 1e-3
     assert np.mean(np.abs(errors_of_means(rate, seconds)) < 1.96) >= 0.87
+
+
+@pytest.mark.parametrize("rate", [10, 50])
+def test_noise_that_wanders_is_said(rate):
+    """Its correlation time is a whole standstill: most standstills say so, and hardly one in white noise."""
+    said = [np.mean([j.wanders for j, _ in standstills(rate, s, 0.0, 24, 6)]) for s in (5.0, 0.0)]
+    assert said[0] > 0.7
+    assert said[1] < 0.1
 
 
 @pytest.mark.slow

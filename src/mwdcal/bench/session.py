@@ -9,8 +9,8 @@ from __future__ import annotations
 import contextvars
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from datetime import datetime
 from dataclasses import replace
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from threading import Lock, RLock
@@ -48,7 +48,7 @@ class BenchSession:
     """One tool at one stand. Its methods may be called from several threads.
 
     `options` is what the bench was opened with, for the journal; `tools` are those of the registry; `countersign` is
-    the private key with which a second person signs the certificate. `on_change` is called whenever `version` has grown.
+    the private key with which a second person signs the certificate; `on_change` is called when `version` has grown.
     """
 
     def __init__(

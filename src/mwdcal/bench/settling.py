@@ -47,6 +47,8 @@ LARGEST_WANDER = 12.0
 
 AR(1) noise of 0.05 to 5 s does so up to 10.6 times, at 100 samples a second.
 """
+WANDERS = 3.0
+"""Correlation times in a standstill below which the noise is said to wander."""
 RANDOM_WALK_FREEDOM = 2.5
 """Degrees of freedom of the variance of a random walk about its mean: (Σ 1/k²)²/Σ 1/k⁴."""
 MOST_BLOCKS = 20
@@ -100,8 +102,8 @@ class Settling:
 
     The first `sensors` channels decide, those that follow, such as a temperature, do not. `window` is how long the tool
     has to stand, in seconds; `least` (k,) the smallest noise of each sensor that is believed. `moves` counts how often
-    a standstill has ended. `wanders`: the correlation time of the noise is half a standstill or more, so that the
-    standstills tell the uncertainty of their means badly.
+    a standstill has ended. `wanders`: the correlation time of the noise is more than a third of a standstill, so
+    that the standstills tell the uncertainty of their means badly.
     """
 
     def __init__(self, sensors: int, window: float = 5.0, least: Sequence[float] = ()) -> None:
@@ -246,7 +248,7 @@ class Settling:
         now = np.array([form.correlation(float(ratio[triad].mean())) for triad in self._triads])
         earlier = [each for each in self.past if each.variance.shape == squares.shape]
         correlation = np.mean([now, *(each.correlation for each in earlier)], 0)
-        self.wanders = bool(np.any(correlation > exp(-2 / len(means))))
+        self.wanders = bool(np.any(correlation > exp(-WANDERS / len(means))))
         place = np.repeat(form.place(correlation), TRIAD)[: self.sensors]
         samples = sum(len(cell.samples.times) for cell in self.still) / len(means)
         noise = RestNoise(np.maximum(squares / form.left[place], self._floor**2 / samples), now)
