@@ -29,7 +29,7 @@ from bench_support import (
 from bench_tables import ROLLS, RUN, laboratory_table
 from cli_support import EXAMPLE, RAW, ROOT, mwdcal, process
 from mwdcal import load_profile
-from mwdcal.bench import documents, opening, serving
+from mwdcal.bench import documents, opening, pages, serving
 from mwdcal.bench.attitude import has_turned
 from mwdcal.bench.journal import Journal
 from mwdcal.bench.session import BenchSession
@@ -44,6 +44,7 @@ from mwdcal.bench.sources import GrowingFile, Lines, SerialPort, Socket, source_
 from mwdcal.bench.spreadsheet import DroppedTable
 from mwdcal.bench.stream import Stream
 from mwdcal.bench.warmth import Warmth
+from mwdcal.certificate import signature
 from mwdcal.errors import InputError
 from mwdcal.logs.stations import means_of
 from mwdcal.sensor.profile import StreamForm
@@ -173,8 +174,11 @@ def key_of(folder, owner):
     return folder / "k.key"
 
 
-def to_the_verdict(finished, folder, **options):
-    """A session that goes on with the run of another, up to the verdict of its roll test."""
+def to_the_verdict(finished, folder, knocked=(), **options):
+    """A session that goes on with the run of another, up to the verdict of its roll test.
+
+    The tool is knocked at some positions of the test.
+    """
     done, stand, _ = finished
     folder.mkdir()
     kept = [e for e in done.journal.events if e["event"] in ("started", "station", "again")]
@@ -185,10 +189,27 @@ def to_the_verdict(finished, folder, **options):
     session.calibrate()
     session.wait_for_fits()
     session.start_rolltest()
-    while session.order is not None:
-        measure(session, stand, seconds=3)
+    while (order := session.order) is not None:
+        measure(session, stand, (1.5, 1.5, 1.5) if order in knocked else (0, 0, 0), seconds=3)
     session.wait_for_fits()
     return session
+
+
+def test_a_failed_roll_test_names_the_station_to_look_at(finished, tmp_path):
+    """The station that was knocked, what the readings look like, the next step; measured again, the test passes."""
+    session = to_the_verdict(finished, tmp_path / "S", knocked=(3,))
+    assert not session.verdict.passed
+    page = pages.fragment(session, "")
+    assert "A limit is exceeded, most at station 4. Check the setting of the stand there" in page
+    assert "farthest off: spread of inclination" in page
+    assert "No single fault explains these readings" in page
+    session.measure_again()
+    assert (session.order, session.verdict, session.bad) == (3, None, {})
+    measure(session, finished[1], seconds=3)
+    session.wait_for_fits()
+    assert session.verdict.passed
+    assert "station 4." not in pages.fragment(session, "")
+    session.close()
 
 
 @pytest.mark.slow
@@ -216,6 +237,11 @@ def test_as_found_and_a_second_signature(finished, tmp_path):
     )
     assert [row.value for row in session.as_found.rows] == [row.value for row in expected.rows]
     session.certify("C-2")
+    page = pages.fragment(session, "")
+    assert "Certificate as PDF: being written" in page
+    assert "Passphrase" not in page  # the key has none
+    signature.create(tmp_path / "safe.key", "C. Third", "a word")
+    assert documents.asks_passphrase(tmp_path / "safe.key")
     session.wait_for_fits()
     certificate = json.loads((session.folder / "certificate.json").read_text())
     assert certificate["as_found"]
@@ -248,6 +274,25 @@ def test_as_found_and_a_second_signature(finished, tmp_path):
     assert checked.code == 0, checked
     with pytest.raises(InputError, match="waits for a signature"):
         session.sign()
+    session.close()
+
+
+@pytest.mark.slow
+def test_a_certificate_that_was_cut_off_gets_its_page_and_pdf(finished, tmp_path, monkeypatch):
+    """Power goes after the certificate: the next start writes its page and its PDF."""
+    session = to_the_verdict(finished, tmp_path / "S")
+    with monkeypatch.context() as patch:
+        patch.setattr(BenchSession, "_draw_certificate", lambda session: None)
+        session.certify("C-3")
+        session.wait_for_fits()
+    assert {name for name in session.papers if "certificate" in name} == {"certificate"}
+    session.close()
+    issued = (session.folder / "certificate.json").read_bytes()
+    session = session_in(session.folder)
+    session.wait_for_fits()
+    assert session.papers["certificate_pdf"] == "certificate.pdf"
+    assert "C-3" in (session.folder / session.papers["certificate_html"]).read_text("utf-8")
+    assert (session.folder / "certificate.json").read_bytes() == issued
     session.close()
 
 

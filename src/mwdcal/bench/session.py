@@ -80,7 +80,9 @@ class BenchSession:
         self.fit = documents.RunFit()
         self.verdict: Verdict | None = None
         self.as_found: Verdict | None = None
+        self.failure = documents.Failure()
         self.papers: dict[str, str] = {}
+        self.pending: list[str] = []
         self.course: list[tuple[int, dict[str, float | None]]] = []
         self._used: tuple[int, int] = (-1, -1)
         self._agreed = 0
@@ -94,6 +96,8 @@ class BenchSession:
         self.waiting = True
         if self.facts:
             self._refit()
+        if "certificate" in self.papers:
+            self._draw_certificate()
 
     @property
     def simulated(self) -> bool:
@@ -118,6 +122,8 @@ class BenchSession:
         """Let an event happen, now or again after a restart."""
         kind = event["event"]
         part = self.parts[event.get("part", RUN_PART)]
+        if part.name == ROLLTEST_PART:
+            self._forget_verdict()
         if kind == "started":
             plan = SessionPlan(**event["plan"])
             self.plan, self.facts = plan, dict(event["facts"])
@@ -148,11 +154,16 @@ class BenchSession:
             setattr(self, kind, True)
         elif kind == "reopened":
             self.calibrated = self.testing = False
-            self.verdict, self.as_found, self.papers = None, None, {}
+            self.papers = {}
+            self._forget_verdict()
         elif kind == "temperature":
             self.typed_temperature = event["value"]
         elif kind == "papers":
             self.papers |= event["files"]
+
+    def _forget_verdict(self) -> None:
+        self.verdict = self.as_found = None
+        self.failure = documents.Failure()
 
     @property
     def part(self) -> Positions:
@@ -453,6 +464,7 @@ class BenchSession:
         """Leave a position out."""
         with self.lock:
             self._record("skipped", part=self.part.name, position=self._expected(None))
+            self._refit()
 
     def switch(self, name: str, on: bool) -> None:
         """Turn "auto", accept when settled, or "paused" on or off."""
@@ -486,7 +498,6 @@ class BenchSession:
             if not self.testing:
                 raise InputError("there is no roll test to measure again.")
             self._record("cleared", part=ROLLTEST_PART)
-            self.verdict = self.as_found = None
             self._used = (-1, -1)
             self._refit()
 
@@ -494,11 +505,12 @@ class BenchSession:
 
     @property
     def bad(self) -> dict[str, str]:
-        """The problem of each station of the run that does not fit, by label, but for those asked for again."""
-        if self.testing:
-            return {}
-        again = self.parts[RUN_PART].again
-        named = sorted(self.fit.bad.items(), key=lambda item: int(item[0]))
+        """The problem of each bad station of the part, by label, but for those asked for again.
+
+        Stations of the run that do not fit, or those of a failed roll test that are farthest off.
+        """
+        again, found = self.part.again, self.failure.stations if self.testing else self.fit.bad
+        named = sorted(found.items(), key=lambda item: int(item[0]))
         return {label: text for label, text in named if int(label) - 1 not in again}
 
     def _write_tables(self) -> None:
@@ -539,10 +551,12 @@ class BenchSession:
         """Whether a fit is still to come that knows the latest station."""
         return self._fitted != self._requested
 
-    def _submit(self, task: Callable[[], None]) -> None:
-        self._pool.submit(self._context.copy().run, self._guarded, task)
+    def _submit(self, task: Callable[[], None], *papers: str) -> None:
+        """Have a task done beside the stream; `papers` are pending until then."""
+        self.pending += papers
+        self._pool.submit(self._context.copy().run, self._guarded, task, papers)
 
-    def _guarded(self, task: Callable[[], None]) -> None:
+    def _guarded(self, task: Callable[[], None], papers: Sequence[str]) -> None:
         """Do a task; what goes wrong is shown, and the session goes on."""
         try:
             if self._unwritten:
@@ -555,6 +569,8 @@ class BenchSession:
                 f"internal error ({type(error).__name__}: {error}). Nothing accepted is lost; please report it."
             )
         with self.lock:
+            for name in papers:
+                self.pending.remove(name)
             self._change()
 
     def say(self, message: str) -> None:
@@ -599,7 +615,7 @@ class BenchSession:
             if not self.calibrated:
                 self._record("papers", files=files)
                 self._record("calibrated")
-        self._submit(partial(self._draw, fit.calibration, "report"))
+        self._submit(partial(self._draw, fit.calibration, "report"), "report_html")
 
     def _draw(self, result: object, name: str) -> None:
         """Write the page of a result, which takes longer than the result."""
@@ -624,15 +640,19 @@ class BenchSession:
         part, calibration = self.parts[ROLLTEST_PART], self.fit.calibration
         if calibration is None or part.order is not None or not part.taken:
             with self.lock:
-                self.verdict = None
+                self._forget_verdict()
             return
         verdict, files = documents.verify(calibration, self.folder)
-        before = self._judge_as_found()
+        before, failure = self._judge_as_found(), documents.Failure()
+        if not verdict.passed:
+            failure = documents.failure(verdict, calibration, self.folder)
         with self.lock:
-            self.verdict, self.as_found = verdict, before
+            if part.order is not None:  # asked for again meanwhile
+                return
+            self.verdict, self.as_found, self.failure = verdict, before, failure
             if not files.items() <= self.papers.items():
                 self._record("papers", files=files)
-        self._submit(partial(self._draw, verdict, "rolltest"))
+        self._submit(partial(self._draw, verdict, "rolltest"), "rolltest_html")
 
     def _judge_as_found(self) -> Verdict | None:
         """The verdict by the calibration before, if there is one that can judge."""
@@ -649,16 +669,23 @@ class BenchSession:
                 raise InputError("the certificate needs the roll test. Measure it first.")
             if "certificate" in self.papers:
                 raise InputError("the certificate is issued already.")
-            self._submit(partial(self._certify, number))
+            if self.is_fitting:
+                raise InputError("the roll test is being judged. Try again in a moment.")
+            self._record("papers", files=documents.certify(self.folder, number, self.laboratory))
+            if self.countersign is None:
+                self._enter()
+            self._draw_certificate()
 
-    def _certify(self, number: str) -> None:
-        if "certificate" in self.papers:
-            return
-        files = documents.certify(self.folder, number, self.laboratory, self.say)
+    def _draw_certificate(self) -> None:
+        """Write the certificate as a page and as a PDF, which take longer than the certificate."""
+        for kind in ("html", "pdf"):
+            if (name := f"certificate_{kind}") not in self.papers:
+                self._submit(partial(self._draw_form, kind), name)
+
+    def _draw_form(self, kind: str, **signing: Any) -> None:
+        files = documents.draw_certificate(self.folder, self.laboratory, kind, **signing)
         with self.lock:
             self._record("papers", files=files)
-        if self.countersign is None:
-            self._enter()
 
     @property
     def waits_for_signature(self) -> bool:
@@ -678,12 +705,9 @@ class BenchSession:
                 self.folder, self.countersign, passphrase, self.facts.get("operator", "")
             )
             self._record("papers", files={"signature": who})
-            self._submit(
-                partial(
-                    documents.sign_pdf, self.folder, self.laboratory, self.countersign, passphrase
-                )
-            )
-        self._submit(self._enter)
+            self._enter()
+            signing = {"private_key": self.countersign, "passphrase": passphrase}
+            self._submit(partial(self._draw_form, "pdf", **signing))
 
     def enter(self) -> None:
         """Enter all in the registry, where that failed before."""
@@ -694,13 +718,16 @@ class BenchSession:
                 or self.waits_for_signature
             ):
                 raise InputError("there is nothing to enter, or no registry is named.")
-            self._submit(self._enter)
+            self._enter()
 
     def _enter(self) -> None:
         if self.registry is not None:
-            text = documents.enter(self.folder, self.registry)
-            with self.lock:
-                self._record("papers", files={"registry": text})
+            self._submit(partial(self._add_to, self.registry), "registry")
+
+    def _add_to(self, registry: str) -> None:
+        text = documents.enter(self.folder, registry)
+        with self.lock:
+            self._record("papers", files={"registry": text})
 
     def close(self) -> None:
         """End: what is written stays."""
