@@ -12,6 +12,7 @@ from itertools import pairwise
 from pathlib import Path
 from unittest.mock import Mock
 
+import msgspec
 import numpy as np
 import pytest
 from scipy import stats
@@ -339,6 +340,26 @@ def test_an_own_profile_and_an_own_plan(tmp_path):
     assert load_profile(session.folder / "tool.toml").name.startswith("own ")
     assert session.plan.name == "mine"
     assert session.part.attitude(1) == (40.0, 50.0, 60.0)
+    session.close()
+
+
+def test_another_uncertainty_of_the_stand(tmp_path):
+    """A 1σ that is typed goes into the tool profile of the session, with which the plan is judged; no other changes."""
+    from mwdcal.bench.server import Bench
+
+    session = session_in(tmp_path / "S", start=False)
+    before, expected = session.profile, session.plan.accuracy_deg["azimuth"]
+    bench = Bench(session, source_of("manual"), ["localhost:1"])
+    shown = dict(pages.stand_fields(session))
+    for text in ("-1", "0", "x"):
+        with pytest.raises(InputError, match="1σ of azimuth"):
+            bench.decide("start", {"serial": "T-1", **shown, "stand_azimuth_deg": text})
+    assert (session.folder / "tool.toml").read_text() == TOOL.read_text()
+    bench.decide("start", {"serial": "T-1", **shown, "stand_azimuth_deg": "0.7"})
+    stand = msgspec.structs.replace(before.stand, azimuth_deg=0.7)
+    assert load_profile(session.folder / "tool.toml") == session.profile
+    assert session.profile == msgspec.structs.replace(before, stand=stand)
+    assert session.plan.accuracy_deg["azimuth"] > expected  # the plan is planned anew
     session.close()
 
 
@@ -1373,6 +1394,14 @@ def test_two_benches_on_one_folder_are_refused(tmp_path):
         assert "another bench" in second.stderr
     finally:
         first.stop()
+
+
+def test_the_start_says_which_settings_are_used(tmp_path, monkeypatch):
+    (tmp_path / "mwdcal.toml").write_text("[stand]\ntilt_deg = 0.01\n")
+    monkeypatch.chdir(tmp_path)
+    bench = BenchProcess("--demo", folder=tmp_path / "S")
+    assert f"Settings of {tmp_path / 'mwdcal.toml'}: stand.tilt_deg" in bench.page()
+    bench.stop()
 
 
 @pytest.mark.slow

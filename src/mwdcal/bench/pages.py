@@ -17,7 +17,7 @@ from mwdcal.bench.stream import TEMPERATURE_COLUMN
 from mwdcal.errors import MwdcalError
 from mwdcal.files.profiles import built_in
 from mwdcal.geometry.observables import TITLES
-from mwdcal.presentation.numbers import fixed, number, quantity, signed
+from mwdcal.presentation.numbers import capital, fixed, number, quantity, signed
 from mwdcal.presentation.text import one_line
 from mwdcal.presentation.verification import noise_free
 
@@ -131,6 +131,8 @@ def _start_form(session: BenchSession) -> dict[str, Any]:
             "plans": [],
             "profiles": [],
             "earth": [],
+            "stand": [],
+            "settings_used": "",
             "tools": [],
             "past": None,
             "chosen": "",
@@ -145,11 +147,19 @@ def _start_form(session: BenchSession) -> dict[str, Any]:
         "earth": [
             (name, number(session.earth[name], 6) if name in session.earth else "") for name in STAND_REFERENCES
         ],
+        "stand": stand_fields(session), "settings_used": capital(session.settings_used),
         "tools": [
             (tool.serial, tool.calibrated or "–", tool.next_due or "–", tool.status or "–")
             for tool in session.tools
         ],
     }  # fmt: skip
+
+
+def stand_fields(session: BenchSession) -> list[tuple[str, str]]:
+    """The 1σ of the stand by the tool profile that is shown first, in the order of a stand's angles."""
+    known = session.past.profile if session.past and not session.simulated else None
+    stand = (known or session.profile).stand
+    return [(f"stand_{name}_deg", f"{stand.of(f'{name}_deg'):g}") for name in SHOWN_ANGLES]
 
 
 def _profiles(session: BenchSession) -> list[tuple[str, str]]:

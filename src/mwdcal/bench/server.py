@@ -160,6 +160,7 @@ class Bench:
         if plan == pages.FEWEST_PLAN:
             plan = self._fewest(form)
         plan_file = file, form.get("own_plan", "")
+        stand = self._stand(form)
         self.session.start(
             serial,
             operator,
@@ -168,7 +169,20 @@ class Bench:
             tool=tool,
             tool_text=form.get("own_tool", ""),
             plan_file=plan_file,
+            stand=stand,
         )
+
+    def _stand(self, form: Mapping[str, str]) -> dict[str, float]:
+        """The 1σ of the stand that differ from those that the form has shown."""
+        changed = {}
+        for name, shown in pages.stand_fields(self.session):
+            value = _number(form.get(name, ""), pages.texts()[name])
+            if value is None or f"{value:g}" == shown:
+                continue
+            if not 0 < value < 90:
+                raise InputError(f"{pages.texts()[name]}: give one above 0 and below 90.")
+            changed[name.removeprefix("stand_")] = value
+        return changed
 
     def _fewest(self, form: Mapping[str, str]) -> str:
         """The plan of the fewest stations for an accuracy, by its name."""

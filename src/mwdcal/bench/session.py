@@ -28,6 +28,7 @@ from mwdcal.bench.stream import TEMPERATURE_COLUMN, TIME_COLUMN, Stream
 from mwdcal.bench.warmth import Warmth
 from mwdcal.errors import InputError, MwdcalError
 from mwdcal.files.contract import CHANNELS
+from mwdcal.files.formats import atomic
 from mwdcal.files.formats import table as tables
 from mwdcal.sensor.profile import StreamForm
 
@@ -48,7 +49,8 @@ class BenchSession:
     """One tool at one stand. Its methods may be called from several threads.
 
     `options` is what the bench was opened with, for the journal; `tools` are those of the registry; `countersign` is
-    the private key with which a second person signs the certificate; `on_change` is called when `version` has grown.
+    the private key with which a second person signs the certificate; `on_change` is called when `version` has grown,
+    `settings_used` says what was taken from the laboratory's settings.
     """
 
     def __init__(
@@ -62,6 +64,7 @@ class BenchSession:
         self.options = dict(options or {})
         self.past: opening.ToolPast | None = None
         self.source = str(self.options.get("source", "manual"))
+        self.settings_used = ""
         self.tools, self.earth = tools, dict(earth or {})
         self.lock, self._starting = RLock(), Lock()
         self.parts = {
@@ -298,10 +301,12 @@ class BenchSession:
     def start(
         self, serial: str, operator: str = "", plan: str = "", earth: Mapping[str, float | None] | None = None, *,
         tool: str = "", tool_text: str = "", plan_file: tuple[str, str] = ("", ""),
+        stand: Mapping[str, float] | None = None,
     ) -> None:  # fmt: skip
         """Begin: the tool's serial, who measures, the plan, and gravity, field and dip where they are known.
 
-        `tool` is another profile by its name, `tool_text` the text of one, `plan_file` name and text of a plan.
+        `tool` is another profile by its name, `tool_text` the text of one, `plan_file` name and text of a plan, `stand`
+        other 1σ of the stand than those of the profile.
         """
         if not (serial := serial.strip()):
             raise InputError(
@@ -310,10 +315,16 @@ class BenchSession:
         with self._starting:
             self._check_new()
             profile = self.profile
-            if (tool or tool_text) and not self.simulated:
-                profile = opening.choose_profile(self.folder, tool, tool_text, self.past)
+            if self.simulated:
+                tool = tool_text = ""
+            if is_other := bool(tool or tool_text or stand):
+                profile, data = opening.chosen_profile(
+                    self.folder, tool, tool_text, self.past, stand or {}
+                )
             chosen = self._chosen_plan(profile, plan, plan_file)
             opening.keep_previous(self.folder, self.registry, serial, self.simulated)
+            if is_other:
+                atomic.write(self.folder / opening.TOOL_FILE, data)
             self._begin(serial, operator, earth or {}, profile, chosen)
 
     def _begin(
@@ -321,11 +332,12 @@ class BenchSession:
     ) -> None:  # fmt: skip
         """Begin with a tool and a plan."""
         with self.lock:
-            if profile is not self.profile:
-                self.profile, self.settling = profile, None
+            if profile.stream != self.profile.stream:
+                self.settling = None
                 self.stream = Stream(
                     profile.stream if isinstance(profile.stream, StreamForm) else None
                 )
+            self.profile = profile
             facts = {"serial": serial, "date": datetime.now().date().isoformat()}
             facts |= {"operator": operator.strip()} if operator.strip() else {}
             facts |= {"plan": chosen.name} if chosen.name else {}
@@ -647,7 +659,7 @@ class BenchSession:
         if not verdict.passed:
             failure = documents.failure(verdict, calibration, self.folder)
         with self.lock:
-            if part.order is not None:  # asked for again meanwhile
+            if part.open_positions:  # asked for again meanwhile
                 return
             self.verdict, self.as_found, self.failure = verdict, before, failure
             if not files.items() <= self.papers.items():
