@@ -48,7 +48,7 @@ LARGEST_WANDER = 12.0
 AR(1) noise of 0.05 to 5 s does so up to 10.6 times, at 100 samples a second.
 """
 WANDERS = 3.0
-"""Correlation times in a standstill below which the noise is said to wander."""
+"""A standstill holds at least so many correlation times of its noise, or the noise wanders."""
 RANDOM_WALK_FREEDOM = 2.5
 """Degrees of freedom of the variance of a random walk about its mean: (Σ 1/k²)²/Σ 1/k⁴."""
 MOST_BLOCKS = 20
