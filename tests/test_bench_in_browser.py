@@ -88,8 +88,7 @@ class Operator:
             self.page.evaluate(AXE)
             found = self.page.evaluate(RUN_AXE)["violations"]
             faults += [
-                f"{width} {scheme} {rule['id']}: {rule['nodes'][0]['html'][:200]}"
-                for rule in found
+                f"{width} {scheme} {rule['id']}: {rule['nodes'][0]['html'][:200]}" for rule in found
             ]
             if self.page.evaluate("document.documentElement.scrollWidth > innerWidth"):
                 faults.append(f"{width} {scheme}: wider than the screen")

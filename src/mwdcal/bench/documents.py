@@ -148,8 +148,8 @@ def failure(verdict: Verdict, calibration: Calibration, folder: Path) -> Failure
             farthest.setdefault(max(off, key=off.__getitem__), []).append(row.name)
     missing = "; ".join(f"{row.name}: {row.note}" for row in failed if row.value is None)
     try:
-        found = mwdcal.diagnose(calibration, folder / "rolltest.csv")
-        cause = f"{capital(cause_in_words(found))}. {capital(next_step(found))}."
+        likeness = mwdcal.diagnose(calibration, folder / "rolltest.csv")
+        cause = f"{capital(cause_in_words(likeness))}. {capital(next_step(likeness))}."
     except MwdcalError:
         cause = ""
     stations = {label: ", ".join(names) for label, names in farthest.items()}

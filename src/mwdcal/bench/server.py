@@ -92,8 +92,7 @@ class Bench:
         self._fragment: tuple[int, str] = (-1, "")
         self._changed = asyncio.Event()
         entered = None if session.countersign else session.registry  # not before the signature
-        folder = session.folder / "table"
-        self.table = table = DroppedTable(folder, entered, session.laboratory)
+        self.table = table = DroppedTable(session.folder / "table", entered, session.laboratory)
         self._tables: dict[str, Callable[[Mapping[str, str], bytes], None]] = {
             "file": lambda form, data: table.drop(form.get("name", ""), data),
             "rolltest": lambda form, data: table.drop_rolltest(form.get("name", ""), data),

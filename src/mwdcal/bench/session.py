@@ -521,8 +521,8 @@ class BenchSession:
 
         Stations of the run that do not fit, or those of a failed roll test that are farthest off.
         """
-        again, found = self.part.again, self.failure.stations if self.testing else self.fit.bad
-        named = sorted(found.items(), key=lambda item: int(item[0]))
+        again, suspects = self.part.again, self.failure.stations if self.testing else self.fit.bad
+        named = sorted(suspects.items(), key=lambda item: int(item[0]))
         return {label: text for label, text in named if int(label) - 1 not in again}
 
     def _write_tables(self) -> None:

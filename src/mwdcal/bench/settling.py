@@ -47,7 +47,7 @@ LARGEST_WANDER = 12.0
 
 AR(1) noise of 0.05 to 5 s does so up to 10.6 times, at 100 samples a second.
 """
-WANDERS = 3.0
+LEAST_TIMES = 3.0
 """A standstill holds at least so many correlation times of its noise, or the noise wanders."""
 RANDOM_WALK_FREEDOM = 2.5
 """Degrees of freedom of the variance of a random walk about its mean: (Σ 1/k²)²/Σ 1/k⁴."""
@@ -248,7 +248,7 @@ class Settling:
         now = np.array([form.correlation(float(ratio[triad].mean())) for triad in self._triads])
         earlier = [each for each in self.past if each.variance.shape == squares.shape]
         correlation = np.mean([now, *(each.correlation for each in earlier)], 0)
-        self.wanders = bool(np.any(correlation > exp(-WANDERS / len(means))))
+        self.wanders = bool(np.any(correlation > exp(-LEAST_TIMES / len(means))))
         place = np.repeat(form.place(correlation), TRIAD)[: self.sensors]
         samples = sum(len(cell.samples.times) for cell in self.still) / len(means)
         noise = RestNoise(np.maximum(squares / form.left[place], self._floor**2 / samples), now)
