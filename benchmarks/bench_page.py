@@ -26,7 +26,7 @@ WATCH = """() => {
   window.times = [];
   const now = () => performance.now();
   document.addEventListener("keydown", (e) => { if (e.key === " ") window.pressed = now(); }, true);
-  const count = () => document.querySelector("[data-part=stations] h3").textContent;
+  const count = () => document.querySelector("[data-part=stations] h2").textContent;
   const fit = () => document.querySelector("[data-part=side] dl")?.textContent || "";
   let last = [count(), fit()];
   new MutationObserver(() => {
@@ -50,7 +50,7 @@ def measure(page: Page, stations: int) -> list[tuple[int, float]]:
     for number in range(1, stations + 1):
         settled = "() => document.querySelector('[data-live=state_text]').textContent === 'settled'"
         page.wait_for_function(settled, timeout=LONGEST)
-        heading = page.locator("[data-part=stations] h3")
+        heading = page.locator("[data-part=stations] h2")
         while f": {number} /" not in heading.inner_text():  # one that is refused is pressed again
             page.keyboard.press(" ")
             page.wait_for_timeout(PAUSE)

@@ -12,6 +12,7 @@ from itertools import pairwise
 from pathlib import Path
 from unittest.mock import Mock
 
+import msgspec
 import numpy as np
 import pytest
 from scipy import stats
@@ -29,7 +30,7 @@ from bench_support import (
 from bench_tables import ROLLS, RUN, laboratory_table
 from cli_support import EXAMPLE, RAW, ROOT, mwdcal, process
 from mwdcal import load_profile
-from mwdcal.bench import documents, opening, serving
+from mwdcal.bench import documents, opening, pages, serving
 from mwdcal.bench.attitude import has_turned
 from mwdcal.bench.journal import Journal
 from mwdcal.bench.session import BenchSession
@@ -45,6 +46,7 @@ from mwdcal.bench.sources import GrowingFile, Lines, SerialPort, Socket, source_
 from mwdcal.bench.spreadsheet import DroppedTable
 from mwdcal.bench.stream import Stream
 from mwdcal.bench.warmth import Warmth
+from mwdcal.certificate import signature
 from mwdcal.errors import InputError
 from mwdcal.logs.stations import means_of
 from mwdcal.sensor.profile import StreamForm
@@ -182,8 +184,11 @@ def key_of(folder, owner):
     return folder / "k.key"
 
 
-def to_the_verdict(finished, folder, **options):
-    """A session that goes on with the run of another, up to the verdict of its roll test."""
+def to_the_verdict(finished, folder, knocked=(), **options):
+    """A session that goes on with the run of another, up to the verdict of its roll test.
+
+    The tool is knocked at some positions of the test.
+    """
     done, stand, _ = finished
     folder.mkdir()
     kept = [e for e in done.journal.events if e["event"] in ("started", "station", "again")]
@@ -194,10 +199,27 @@ def to_the_verdict(finished, folder, **options):
     session.calibrate()
     session.wait_for_fits()
     session.start_rolltest()
-    while session.order is not None:
-        measure(session, stand, seconds=3)
+    while (order := session.order) is not None:
+        measure(session, stand, (1.5, 1.5, 1.5) if order in knocked else (0, 0, 0), seconds=3)
     session.wait_for_fits()
     return session
+
+
+def test_a_failed_roll_test_names_the_station_to_look_at(finished, tmp_path):
+    """The station that was knocked, what the readings look like, the next step; measured again, the test passes."""
+    session = to_the_verdict(finished, tmp_path / "S", knocked=(3,))
+    assert not session.verdict.passed
+    page = pages.fragment(session, "")
+    assert "A limit is exceeded, most at station 4. Check the setting of the stand there" in page
+    assert "farthest off: spread of inclination" in page
+    assert "No single fault explains these readings" in page
+    session.measure_again()
+    assert (session.order, session.verdict, session.bad) == (3, None, {})
+    measure(session, finished[1], seconds=3)
+    session.wait_for_fits()
+    assert session.verdict.passed
+    assert "station 4." not in pages.fragment(session, "")
+    session.close()
 
 
 @pytest.mark.slow
@@ -225,6 +247,11 @@ def test_as_found_and_a_second_signature(finished, tmp_path):
     )
     assert [row.value for row in session.as_found.rows] == [row.value for row in expected.rows]
     session.certify("C-2")
+    page = pages.fragment(session, "")
+    assert "Certificate as PDF: being written" in page
+    assert "Passphrase" not in page  # the key has none
+    signature.create(tmp_path / "safe.key", "C. Third", "a word")
+    assert documents.asks_passphrase(tmp_path / "safe.key")
     session.wait_for_fits()
     certificate = json.loads((session.folder / "certificate.json").read_text())
     assert certificate["as_found"]
@@ -257,6 +284,25 @@ def test_as_found_and_a_second_signature(finished, tmp_path):
     assert checked.code == 0, checked
     with pytest.raises(InputError, match="waits for a signature"):
         session.sign()
+    session.close()
+
+
+@pytest.mark.slow
+def test_a_certificate_that_was_cut_off_gets_its_page_and_pdf(finished, tmp_path, monkeypatch):
+    """Power goes after the certificate: the next start writes its page and its PDF."""
+    session = to_the_verdict(finished, tmp_path / "S")
+    with monkeypatch.context() as patch:
+        patch.setattr(BenchSession, "_draw_certificate", lambda session: None)
+        session.certify("C-3")
+        session.wait_for_fits()
+    assert {name for name in session.papers if "certificate" in name} == {"certificate"}
+    session.close()
+    issued = (session.folder / "certificate.json").read_bytes()
+    session = session_in(session.folder)
+    session.wait_for_fits()
+    assert session.papers["certificate_pdf"] == "certificate.pdf"
+    assert "C-3" in (session.folder / session.papers["certificate_html"]).read_text("utf-8")
+    assert (session.folder / "certificate.json").read_bytes() == issued
     session.close()
 
 
@@ -306,6 +352,26 @@ def test_an_own_profile_and_an_own_plan(tmp_path):
     session.close()
 
 
+def test_another_uncertainty_of_the_stand(tmp_path):
+    """A 1σ that is typed goes into the tool profile of the session, with which the plan is judged; no other changes."""
+    from mwdcal.bench.server import Bench
+
+    session = session_in(tmp_path / "S", start=False)
+    before, expected = session.profile, session.plan.accuracy_deg["azimuth"]
+    bench = Bench(session, source_of("manual"), ["localhost:1"])
+    shown = dict(pages.stand_fields(session))
+    for text in ("-1", "0", "x"):
+        with pytest.raises(InputError, match="1σ of azimuth"):
+            bench.decide("start", {"serial": "T-1", **shown, "stand_azimuth_deg": text})
+    assert (session.folder / "tool.toml").read_text() == TOOL.read_text()
+    bench.decide("start", {"serial": "T-1", **shown, "stand_azimuth_deg": "0.7"})
+    stand = msgspec.structs.replace(before.stand, azimuth_deg=0.7)
+    assert load_profile(session.folder / "tool.toml") == session.profile
+    assert session.profile == msgspec.structs.replace(before, stand=stand)
+    assert session.plan.accuracy_deg["azimuth"] > expected  # the plan is planned anew
+    session.close()
+
+
 @pytest.mark.slow
 def test_the_fewest_stations_reach_the_accuracy():
     profile = load_profile(SERVO)
@@ -329,6 +395,7 @@ def test_a_session_goes_on_after_a_restart(session):
     accept_some(session, stand, 3)
     session.skip()
     session.switch("auto", True)
+    session.wait_for_fits()
     rows = lines_of(session.folder / "run.csv")
     session.close()
     again = session_in(
@@ -515,7 +582,7 @@ def test_bad_stations_do_not_hide_each_other(tmp_path, size, samples):
         sd = table[:, :6].std(0, ddof=1) / np.sqrt(samples)
         lines.append(",".join(map(str, (i + 1, *table.mean(0), *sd, *attitude, *EARTH.values()))))
     (tmp_path / "run.csv").write_text("\n".join(lines) + "\n")
-    fit = documents.fit(tmp_path, 24, threading.RLock())
+    fit = documents.fit(tmp_path, 24)
     assert {*fit.bad} == {"8", "16"}
 
 
@@ -534,6 +601,7 @@ def test_undo_gives_a_former_station_back(session):
     session.undo()
     session.undo()
     assert session.part.done == {}
+    session.wait_for_fits()
     assert not (session.folder / "run.csv").exists()
     with pytest.raises(InputError, match="no station to take back"):
         session.undo()
@@ -613,6 +681,7 @@ def test_a_station_in_the_journal_is_safe_where_the_run_file_cannot_be_written(
         session.wait_for_fits()
         assert "safe in session.jsonl" in session.message
     accept_some(session, stand, 1)
+    session.wait_for_fits()
     rows = [line for line in lines_of(session.folder / "run.csv") if line[:1].isdigit()]
     assert len(rows) == 3
 
@@ -751,21 +820,27 @@ def noisy(rng, count, rate, seconds, sensors=1):
     return noise
 
 
-def errors_of_means(rate, seconds=0.0, step=0.0, count=100):
-    """Errors of the means of standstills of a sensor, a tool that moves between them, over their uncertainty."""
-    rng, judge, time, here = np.random.default_rng(7), Settling(1, 5.0), 0.0, 0.0
-    rests, truths = [], []
+def standstills(rate, seconds=0.0, step=0.0, count=100, sensors=1):
+    """The judge of sensors, settled after each of so many moves, and where they really stand."""
+    rng, judge, time, here = np.random.default_rng(7), Settling(sensors, 5.0), 0.0, 0.0
     for _ in range(count):
         goal = rng.uniform(-1000, 1000)
         course = np.concatenate([np.linspace(here, goal, 4 * rate), np.full(40 * rate, goal)])
-        values = course + noisy(rng, len(course), rate, seconds)[:, 0]
+        values = course[:, None] + noisy(rng, len(course), rate, seconds, sensors)
         values, here = np.round(values / step) * step if step else values, goal
-        for i, value in enumerate(values):
-            judge.take(time, (float(value),))
+        for i, row in enumerate(values.tolist()):
+            judge.take(time, row)
             time += 1 / rate
             if i > 5 * rate and judge.state == "settled":
                 break
         assert judge.state == "settled"
+        yield judge, goal
+
+
+def errors_of_means(rate, seconds=0.0, step=0.0):
+    """Errors of the means of standstills of a sensor, a tool that moves between them, over their uncertainty."""
+    rests, truths = [], []
+    for judge, goal in standstills(rate, seconds, step):
         still = judge.station()
         rests.append((still.time, still.samples[:, 0]))
         truths.append(goal)
@@ -798,6 +873,14 @@ def test_the_uncertainty_holds_correlated_noise(rate, seconds):
     assert np.mean(np.abs(errors_of_means(rate, seconds)) < 1.96) >= 0.87
 
 
+@pytest.mark.parametrize("rate", [10, 50])
+def test_noise_that_wanders_is_said(rate):
+    """Its correlation time is a whole standstill: most standstills say so, and hardly one in white noise."""
+    said = [np.mean([j.wanders for j, _ in standstills(rate, s, 0.0, 24, 6)]) for s in (5.0, 0.0)]
+    assert said[0] > 0.7
+    assert said[1] < 0.1
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("rate", [10, 50])
 @pytest.mark.parametrize("seconds", [0.0, 0.3, 1.0])
@@ -819,6 +902,21 @@ def test_lower_quartiles_are_those_of_numpy(count):
     values = np.random.default_rng(count).normal(size=(count, 6))
     expected = np.quantile(values, 0.25, axis=0)
     np.testing.assert_allclose(_lower_quartile(values), expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize("step", [3.0, 10.0])
+@pytest.mark.parametrize("turn", [0.0, 1.0])
+def test_readings_coarser_than_correlated_noise(step, turn):
+    """One sensor rests between two steps, and flips in AR(1) noise of 0.3 s, five read the same: the tool has settled.
+
+    One that turns by a step a second has not.
+    """
+    rng, judge, looks = np.random.default_rng(5), Settling(6, 5.0), []
+    course = step * turn * np.arange(3000)[:, None] / 50 + [step / 2, 0, 0, 0, 0, 0]
+    for i, row in enumerate(noisy(rng, 3000, 50, 0.3, 6) + course):
+        judge.take(i / 50, tuple(map(float, np.round(row / step) * step)))
+        looks += [judge.state == "settled"] if i > 500 else []
+    assert np.mean(looks) == 0.0 if turn else np.mean(looks) > 0.8
 
 
 def test_the_limit_of_scatter_is_that_of_fisher():
@@ -1312,6 +1410,14 @@ def test_two_benches_on_one_folder_are_refused(tmp_path):
         assert "another bench" in second.stderr
     finally:
         first.stop()
+
+
+def test_the_start_says_which_settings_are_used(tmp_path, monkeypatch):
+    (tmp_path / "mwdcal.toml").write_text("[stand]\ntilt_deg = 0.01\n")
+    monkeypatch.chdir(tmp_path)
+    bench = BenchProcess("--demo", folder=tmp_path / "S")
+    assert f"Settings of {tmp_path / 'mwdcal.toml'}: stand.tilt_deg" in bench.page()
+    bench.stop()
 
 
 @pytest.mark.slow

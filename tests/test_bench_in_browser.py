@@ -24,7 +24,7 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed: the bench was not looked at"),
 ]  # fmt: skip
-VIEWS = [(1280, "light"), (800, "dark")]
+VIEWS = [(1280, "light"), (800, "dark"), (420, "light")]
 """Widths and schemes; a place does not depend on the colours (`test_only_colours_change_in_the_dark`)."""
 LONGEST = 120_000
 
@@ -80,7 +80,7 @@ class Operator:
             raise AssertionError(self.page.inner_text("body")) from None
 
     def look(self):
-        """What axe-core calls serious, or worse, and what does not fit in, at each width and scheme."""
+        """What axe-core complains of, and what does not fit in, at each width and scheme."""
         faults = []
         for width, scheme in VIEWS:
             self.page.set_viewport_size({"width": width, "height": 900})
@@ -88,9 +88,7 @@ class Operator:
             self.page.evaluate(AXE)
             found = self.page.evaluate(RUN_AXE)["violations"]
             faults += [
-                f"{width} {scheme} {rule['id']}: {rule['nodes'][0]['html'][:200]}"
-                for rule in found
-                if rule["impact"] in ("serious", "critical")
+                f"{width} {scheme} {rule['id']}: {rule['nodes'][0]['html'][:200]}" for rule in found
             ]
             if self.page.evaluate("document.documentElement.scrollWidth > innerWidth"):
                 faults.append(f"{width} {scheme}: wider than the screen")
@@ -145,12 +143,12 @@ def test_the_whole_story(demo, tmp_path):
     operator.wait_for_status("Next: a second person checks the certificate")
     faults += operator.look()
     operator.button("Sign certificate").click()
-    page.get_by_text("Registry:").wait_for(timeout=LONGEST)
+    page.get_by_text(re.compile("^Registry: (?!being)")).wait_for(timeout=LONGEST)
     page.get_by_text("Signed by: B. Second").wait_for(timeout=LONGEST)
     faults += operator.look()
     assert faults == []
     assert operator.complaints == []
-    assert page.get_by_role("link", name=re.compile("certificate.pdf")).count() == 1
+    page.get_by_role("link", name=re.compile("certificate.pdf")).wait_for(timeout=LONGEST)
     ran = mwdcal(
         "calibrate", folder / "run.csv", "--tool", folder / "tool.toml", "-o", tmp_path / "t.json"
     )
@@ -197,7 +195,7 @@ def test_the_story_by_keyboard_alone(demo):
     operator.button("Sign certificate").wait_for(timeout=LONGEST)
     operator.button("Sign certificate").focus()
     page.keyboard.press("Enter")
-    page.get_by_text("Registry:").wait_for(timeout=LONGEST)
+    page.get_by_text(re.compile("^Registry: (?!being)")).wait_for(timeout=LONGEST)
     assert operator.complaints == []
     events = [json.loads(line) for line in (folder / "session.jsonl").read_text().splitlines()]
     taken = [event for event in events if event["event"] == "station"]

@@ -47,7 +47,7 @@ def story(page: Page) -> None:
     page.get_by_role("button", name="Start roll test").click(timeout=120_000)
     page.get_by_role("heading", name="PASS").wait_for(timeout=120_000)
     page.get_by_role("button", name="Issue certificate").click()
-    page.get_by_role("link", name=re.compile("certificate.json")).wait_for(timeout=120_000)
+    page.get_by_role("link", name=re.compile("certificate.pdf")).wait_for(timeout=120_000)
     shoot(page, "passed")
 
 

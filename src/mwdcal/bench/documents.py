@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,11 +17,11 @@ from mwdcal.calibration.results import typical_accuracy
 from mwdcal.errors import FitError, InputError, MwdcalError
 from mwdcal.files.profiles import setting
 from mwdcal.geometry.observables import TITLES
-from mwdcal.presentation.numbers import signed
+from mwdcal.presentation.diagnosis import next_step
+from mwdcal.presentation.diagnosis import verdict as cause_in_words
+from mwdcal.presentation.numbers import capital, signed
 
 if TYPE_CHECKING:
-    from threading import RLock
-
     from mwdcal.calibration.readings import Readings
     from mwdcal.calibration.record import Calibration, StationRow
     from mwdcal.library.papers import Paper
@@ -46,18 +45,15 @@ class RunFit:
     """The problem of each station to measure again, by label."""
 
 
-def fit(folder: Path, stations: int, lock: RLock) -> RunFit:
+def fit(folder: Path, stations: int) -> RunFit:
     """The calibration of the run in a folder, as `mwdcal calibrate` makes it of run.csv and tool.toml.
 
-    A bad station hides another, and several together may prevent a calibration: a robust fit names the others. Nobody
-    who holds the `lock` writes these files while they are read.
+    A bad station hides another, and several together may prevent a calibration: a robust fit names the others.
     """
     if stations < FEWEST_STATIONS:
         return RunFit()
     try:
-        with lock:
-            readings = mwdcal.read_run(folder / "run.csv", folder / "tool.toml")
-        return fit_of(readings)
+        return fit_of(mwdcal.read_run(folder / "run.csv", folder / "tool.toml"))
     except MwdcalError as error:
         return RunFit(reason=str(error))
 
@@ -128,6 +124,38 @@ def verify(
     return verdict, {"verification": "verification.json"}
 
 
+@dataclass(frozen=True)
+class Failure:
+    """Why a roll test has failed: `stations` farthest off, by label, with what exceeds its limit there.
+
+    `cause` says what the readings look like and what to do, `missing` why a limit could not be judged.
+    """
+
+    stations: dict[str, str] = field(default_factory=dict)
+    cause: str = ""
+    missing: str = ""
+
+
+def failure(verdict: Verdict, calibration: Calibration, folder: Path) -> Failure:
+    """Why the roll test in a folder has failed, as `mwdcal verify` and `mwdcal diagnose` say."""
+    failed = [row for row in verdict.rows if not row.passed]
+    farthest: dict[str, list[str]] = {}
+    for row in failed:
+        off = {
+            each.station: abs(each.departures.get(row.name, 0.0)) for each in verdict.station_rows
+        }
+        if row.value is not None and off:
+            farthest.setdefault(max(off, key=off.__getitem__), []).append(row.name)
+    missing = "; ".join(f"{row.name}: {row.note}" for row in failed if row.value is None)
+    try:
+        likeness = mwdcal.diagnose(calibration, folder / "rolltest.csv")
+        cause = f"{capital(cause_in_words(likeness))}. {capital(next_step(likeness))}."
+    except MwdcalError:
+        cause = ""
+    stations = {label: ", ".join(names) for label, names in farthest.items()}
+    return Failure(stations, cause, missing)
+
+
 def judge_as_found(folder: Path) -> Verdict | None:
     """The verdict on the same roll test by the calibration before, if there is one: the tool as found.
 
@@ -163,20 +191,20 @@ def countersign(folder: Path, key: Path, passphrase: str, operator: str) -> str:
     return f"{owner}, key {signed.key}"
 
 
-def certify(
-    folder: Path, number: str, laboratory: Path | None, say: Callable[[str], None]
-) -> dict[str, str]:
-    """Issue the certificate in all forms that can be made here; files by what they are."""
-    paper = _paper(folder, number, laboratory)
-    mwdcal.save(paper, folder / "certificate.json")
-    files = {"certificate": "certificate.json"}
-    for kind in ("html", "pdf"):
-        try:
-            mwdcal.save(paper, folder / f"certificate.{kind}")
-            files[f"certificate_{kind}"] = f"certificate.{kind}"
-        except InputError as error:
-            say(str(error))
-    return files
+def asks_passphrase(key: Path) -> bool:
+    """Whether a private key needs its passphrase; one that cannot be read may."""
+    from mwdcal.certificate.signature import is_encrypted
+
+    try:
+        return is_encrypted(key)
+    except InputError:
+        return True
+
+
+def certify(folder: Path, number: str, laboratory: Path | None) -> dict[str, str]:
+    """Issue the certificate; its file by what it is."""
+    mwdcal.save(_paper(folder, number, laboratory), folder / "certificate.json")
+    return {"certificate": "certificate.json"}
 
 
 def _paper(folder: Path, number: str, laboratory: Path | None, **chosen: Any) -> Paper:
@@ -188,26 +216,26 @@ def _paper(folder: Path, number: str, laboratory: Path | None, **chosen: Any) ->
     )  # fmt: skip
 
 
-def sign_pdf(folder: Path, laboratory: Path | None, key: Path, passphrase: str) -> None:
-    """Issue the PDF, if there is one, again, with the signature of the second person in it.
+def draw_certificate(
+    folder: Path, laboratory: Path | None, kind: str, **signing: Any
+) -> dict[str, str]:
+    """Write the issued certificate in another form, "html" or "pdf"; its file by what it is.
 
     Raises:
-        InputError: the certificate would no longer be the one that was signed.
+        InputError: it would no longer be the one that was issued; what draws this form is not installed.
     """
-    pdf = folder / "certificate.pdf"
-    if not pdf.exists():
-        return
+    name = f"certificate.{kind}"
     issued = json.loads((folder / "certificate.json").read_bytes())
-    signing = {"date": issued["issued"], "private_key": key, "passphrase": passphrase}
-    paper = _paper(folder, issued["number"], laboratory, **signing)
+    paper = _paper(folder, issued["number"], laboratory, date=issued["issued"], **signing)
     unsigned, written = (
         {k: v for k, v in d.items() if k != "signature"} for d in (paper.to_dict(), issued)
     )
     if json.loads(json.dumps(unsigned, default=str)) != written:
         raise InputError(
-            "certificate.pdf stays unsigned: files of the session changed after the certificate. Send certificate.json."
+            f"{name} is not written: files of the session changed after the certificate. Send certificate.json."
         )
-    mwdcal.save(paper, pdf)
+    mwdcal.save(paper, folder / name)
+    return {f"certificate_{kind}": name}
 
 
 def enter(folder: Path, registry: str) -> str:

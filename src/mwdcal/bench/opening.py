@@ -15,7 +15,7 @@ from mwdcal.bench.positions import SessionPlan, planned_columns
 from mwdcal.errors import InputError, MwdcalError
 from mwdcal.files.formats import atomic
 from mwdcal.files.metadata import toml
-from mwdcal.files.profiles import read_toml
+from mwdcal.files.profiles import completed, decoded_profile, read_toml
 from mwdcal.library.planning import plan_table
 from mwdcal.library.results import arrays_of
 
@@ -89,8 +89,13 @@ def keep_previous(folder: Path, registry: str | None, serial: str, simulated: bo
             tools.get(serial, folder / PREVIOUS_FILE)
 
 
-def choose_profile(folder: Path, name: str, text: str, past: ToolPast | None) -> Profile:
-    """Write the tool profile of the session: that of a `text`, else that of the registry, else the one of a name."""
+def chosen_profile(
+    folder: Path, name: str, text: str, past: ToolPast | None, stand: Mapping[str, float]
+) -> tuple[Profile, bytes]:
+    """A tool profile with its text: that of a `text`, else of the registry, else of a name, else of the session.
+
+    `stand` are other 1σ of the stand, by their names in a profile.
+    """
     if text:
         data = text.encode()
     elif name == FROM_REGISTRY:
@@ -100,15 +105,13 @@ def choose_profile(folder: Path, name: str, text: str, past: ToolPast | None) ->
             )
         data = profile_text(past.profile).encode()
     else:
-        data, _ = read_toml(name, "profiles", "tool profile")
-    trial = folder / f"chosen-{TOOL_FILE}"
-    atomic.write(trial, data)
-    try:
-        mwdcal.load_profile(trial)  # one that is not valid does not replace the other
-    finally:
-        trial.unlink()
-    atomic.write(folder / TOOL_FILE, data)
-    return mwdcal.load_profile(folder / TOOL_FILE)
+        data, _ = read_toml(name or str(folder / TOOL_FILE), "profiles", "tool profile")
+    profile = decoded_profile(data, TOOL_FILE)
+    if stand:
+        changed = msgspec.structs.replace(profile.stand, **stand)
+        data = profile_text(msgspec.structs.replace(profile, stand=changed)).encode()
+        profile = decoded_profile(data, TOOL_FILE)
+    return completed(profile), data
 
 
 def profile_text(profile: Profile) -> str:

@@ -8,7 +8,7 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 from mwdcal.bench import pictures
-from mwdcal.bench.documents import FEWEST_STATIONS, signers_name
+from mwdcal.bench.documents import FEWEST_STATIONS, asks_passphrase, signers_name
 from mwdcal.bench.opening import FROM_REGISTRY, ToolPast
 from mwdcal.bench.positions import ORDERED_ANGLES, Positions
 from mwdcal.bench.session import RUN_PART, BenchSession
@@ -17,7 +17,7 @@ from mwdcal.bench.stream import TEMPERATURE_COLUMN
 from mwdcal.errors import MwdcalError
 from mwdcal.files.profiles import built_in
 from mwdcal.geometry.observables import TITLES
-from mwdcal.presentation.numbers import fixed, number, quantity, signed
+from mwdcal.presentation.numbers import capital, fixed, number, quantity, signed
 from mwdcal.presentation.text import one_line
 from mwdcal.presentation.verification import noise_free
 
@@ -106,6 +106,7 @@ def _buttons(session: BenchSession) -> dict[str, Any]:
         "can_test": session.calibrated and not session.testing,
         "can_certify": session.verdict is not None and not finished,
         "signer": _signer(session),
+        "asks_passphrase": session.countersign is not None and asks_passphrase(session.countersign),
         "can_enter": finished and not session.waits_for_signature and session.registry is not None
         and "registry" not in session.papers,
         "bad": bool(session.bad), "measuring": measuring, "passed": bool(session.verdict and session.verdict.passed),
@@ -130,6 +131,8 @@ def _start_form(session: BenchSession) -> dict[str, Any]:
             "plans": [],
             "profiles": [],
             "earth": [],
+            "stand": [],
+            "settings_used": "",
             "tools": [],
             "past": None,
             "chosen": "",
@@ -144,11 +147,19 @@ def _start_form(session: BenchSession) -> dict[str, Any]:
         "earth": [
             (name, number(session.earth[name], 6) if name in session.earth else "") for name in STAND_REFERENCES
         ],
+        "stand": stand_fields(session), "settings_used": capital(session.settings_used),
         "tools": [
             (tool.serial, tool.calibrated or "–", tool.next_due or "–", tool.status or "–")
             for tool in session.tools
         ],
     }  # fmt: skip
+
+
+def stand_fields(session: BenchSession) -> list[tuple[str, str]]:
+    """The 1σ of the stand by the tool profile that is shown first, in the order of a stand's angles."""
+    known = session.past.profile if session.past and not session.simulated else None
+    stand = (known or session.profile).stand
+    return [(f"stand_{name}_deg", f"{stand.of(f'{name}_deg'):g}") for name in SHOWN_ANGLES]
 
 
 def _profiles(session: BenchSession) -> list[tuple[str, str]]:
@@ -228,7 +239,7 @@ def _order_text(session: BenchSession) -> str:
             return t["next_signature"]
         if "certificate" in session.papers:
             return t["signed" if "signature" in session.papers else "finished"]
-        return t["next_certificate"] if session.verdict.passed else t["next_failed"]
+        return t["next_certificate"] if session.verdict.passed else _next_after_failure(session)
     if session.calibrated and not session.testing:
         return t["next_rolltest"]
     if (order := session.order) is None:
@@ -241,6 +252,16 @@ def _order_text(session: BenchSession) -> str:
     soak = part.temperature(order)
     oven = f"{t['soak'].format(temperature=number(soak))} " if part.is_new_soak(order) else ""
     return f"{t['station']} {order + 1}. {oven}{turn}"
+
+
+def _next_after_failure(session: BenchSession) -> str:
+    """What to do after a failed roll test: the stations to look at first, or what is missing."""
+    t, failure = texts(), session.failure
+    if not failure.stations:
+        return t["next_missing"].format(reason=failure.missing)
+    labels = [*failure.stations]
+    word = t["at_station" if len(labels) == 1 else "at_stations"]
+    return t["next_failed"].format(stations=word.format(labels=", ".join(labels)))
 
 
 def _done_text(session: BenchSession) -> str:
@@ -257,6 +278,8 @@ def _note(session: BenchSession) -> str:
     t = texts()
     if session.message:
         return session.message
+    if session.testing:
+        return session.failure.cause
     if session.bad:
         labels = [*session.bad]
         key = "bad_station" if len(labels) == 1 else "bad_stations"
@@ -293,7 +316,7 @@ def _results(session: BenchSession) -> dict[str, Any]:
         "errors": error_rows(errors), "limits": limit_rows(verdict),
         "found": limit_rows(session.as_found.rows if session.as_found else []),
         "found_passed": bool(session.as_found and session.as_found.passed),
-        "papers": papers(session.papers, session.folder),
+        "papers": papers(session.papers, session.folder, session.pending),
     }  # fmt: skip
 
 
@@ -315,14 +338,17 @@ def limit_rows(rows: Sequence[VerdictRow]) -> list[tuple[str, str, str, str, str
     ]  # fmt: skip
 
 
-def papers(files_by_name: Mapping[str, str], folder: Path) -> list[tuple[str, str]]:
-    """Documents by name, with their file."""
+def papers(
+    files_by_name: Mapping[str, str], folder: Path, pending: Sequence[str] = ()
+) -> list[tuple[str, str]]:
+    """Documents by name, with their file; those that are `pending` without."""
     t, shown = texts(), []
     for name, value in files_by_name.items():
         is_file = (folder / value).is_file()
         title = t.get(f"paper_{name}", name)
         shown.append((f"{title}: {one_line(value)}", value if is_file else ""))
-    return shown
+    new = [name for name in pending if name not in files_by_name]
+    return [*shown, *((f"{t[f'paper_{name}']}: {t['pending']}", "") for name in new)]
 
 
 def _stations(session: BenchSession) -> dict[str, Any]:
@@ -342,6 +368,8 @@ def _row(session: BenchSession, part: Positions, position: int) -> dict[str, Any
     t, label = texts(), str(position + 1)
     angles = dict(zip(ORDERED_ANGLES, part.attitude(position), strict=True))
     bad = session.bad.get(label, "")
+    if bad and session.testing:
+        bad = t["farthest"].format(limits=bad)
     judged = session.fit.calibration is not None and not session.testing
     states = (
         (bool(bad), bad),

@@ -12,6 +12,7 @@ import json
 import re
 import secrets
 from collections.abc import AsyncIterator, Callable, Collection, Mapping, Sequence
+from functools import partial
 from importlib.resources import files
 from ipaddress import ip_address
 from threading import Event, Thread
@@ -89,9 +90,9 @@ class Bench:
         self.stop = Event()
         self.reader = Thread(target=self._read, name="bench source", daemon=True)
         self._fragment: tuple[int, str] = (-1, "")
+        self._changed = asyncio.Event()
         entered = None if session.countersign else session.registry  # not before the signature
-        folder = session.folder / "table"
-        self.table = table = DroppedTable(folder, entered, session.laboratory)
+        self.table = table = DroppedTable(session.folder / "table", entered, session.laboratory)
         self._tables: dict[str, Callable[[Mapping[str, str], bytes], None]] = {
             "file": lambda form, data: table.drop(form.get("name", ""), data),
             "rolltest": lambda form, data: table.drop_rolltest(form.get("name", ""), data),
@@ -158,6 +159,7 @@ class Bench:
         if plan == pages.FEWEST_PLAN:
             plan = self._fewest(form)
         plan_file = file, form.get("own_plan", "")
+        stand = self._stand(form)
         self.session.start(
             serial,
             operator,
@@ -166,7 +168,20 @@ class Bench:
             tool=tool,
             tool_text=form.get("own_tool", ""),
             plan_file=plan_file,
+            stand=stand,
         )
+
+    def _stand(self, form: Mapping[str, str]) -> dict[str, float]:
+        """The 1σ of the stand that differ from those that the form has shown."""
+        changed = {}
+        for name, shown in pages.stand_fields(self.session):
+            value = _number(form.get(name, ""), pages.texts()[name])
+            if value is None or f"{value:g}" == shown:
+                continue
+            if not 0 < value < 90:
+                raise InputError(f"{pages.texts()[name]}: give one above 0 and below 90.")
+            changed[name.removeprefix("stand_")] = value
+        return changed
 
     def _fewest(self, form: Mapping[str, str]) -> str:
         """The plan of the fewest stations for an accuracy, by its name."""
@@ -279,6 +294,7 @@ class Bench:
     async def _events(self, request: Request) -> AsyncIterator[str]:
         seen, last = -1, ""
         while not self.stop.is_set():
+            changed = self._changed
             if self.session.version != seen:
                 seen = self.session.version
                 yield _event("page", await run_in_threadpool(self.fragment))
@@ -288,13 +304,21 @@ class Bench:
                 yield f"event: live\ndata: {text}\n\n"
             if await request.is_disconnected():
                 return
-            await asyncio.sleep(TICK)
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(changed.wait(), TICK)
+
+    def _wake(self) -> None:
+        """Wake the event streams: the page is another one."""
+        self._changed.set()
+        self._changed = asyncio.Event()
 
     def app(self) -> Starlette:
         """The server."""
 
         @contextlib.asynccontextmanager
         async def life(app: Starlette) -> AsyncIterator[None]:
+            loop = asyncio.get_running_loop()
+            self.session.on_change = partial(loop.call_soon_threadsafe, self._wake)
             self.reader.start()
             yield
             self.stop.set()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextvars
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -27,6 +28,7 @@ from mwdcal.bench.stream import TEMPERATURE_COLUMN, TIME_COLUMN, Stream
 from mwdcal.bench.warmth import Warmth
 from mwdcal.errors import InputError, MwdcalError
 from mwdcal.files.contract import CHANNELS
+from mwdcal.files.formats import atomic
 from mwdcal.files.formats import table as tables
 from mwdcal.sensor.profile import StreamForm
 
@@ -47,7 +49,8 @@ class BenchSession:
     """One tool at one stand. Its methods may be called from several threads.
 
     `options` is what the bench was opened with, for the journal; `tools` are those of the registry; `countersign` is
-    the private key with which a second person signs the certificate.
+    the private key with which a second person signs the certificate; `on_change` is called when `version` has grown,
+    `settings_used` says what was taken from the laboratory's settings.
     """
 
     def __init__(
@@ -61,6 +64,7 @@ class BenchSession:
         self.options = dict(options or {})
         self.past: opening.ToolPast | None = None
         self.source = str(self.options.get("source", "manual"))
+        self.settings_used = ""
         self.tools, self.earth = tools, dict(earth or {})
         self.lock, self._starting = RLock(), Lock()
         self.parts = {
@@ -75,10 +79,13 @@ class BenchSession:
         self.auto = self.paused = self.calibrated = self.testing = False
         self.typed_temperature: float | None = None
         self.attempts, self.version, self.message = 0, 0, ""
+        self.on_change: Callable[[], object] = lambda: None
         self.fit = documents.RunFit()
         self.verdict: Verdict | None = None
         self.as_found: Verdict | None = None
+        self.failure = documents.Failure()
         self.papers: dict[str, str] = {}
+        self.pending: list[str] = []
         self.course: list[tuple[int, dict[str, float | None]]] = []
         self._used: tuple[int, int] = (-1, -1)
         self._agreed = 0
@@ -91,8 +98,9 @@ class BenchSession:
             self._apply(event)
         self.waiting = True
         if self.facts:
-            self._write_tables()
             self._refit()
+        if "certificate" in self.papers:
+            self._draw_certificate()
 
     @property
     def simulated(self) -> bool:
@@ -106,12 +114,19 @@ class BenchSession:
         event: Event = {"event": kind, "at": datetime.now().astimezone().isoformat(), **facts}
         self.journal.add(event)
         self._apply(event)
+        self._change()
+
+    def _change(self) -> None:
+        """Tell who watches that the page is another one."""
         self.version += 1
+        self.on_change()
 
     def _apply(self, event: Event) -> None:
         """Let an event happen, now or again after a restart."""
         kind = event["event"]
         part = self.parts[event.get("part", RUN_PART)]
+        if part.name == ROLLTEST_PART:
+            self._forget_verdict()
         if kind == "started":
             plan = SessionPlan(**event["plan"])
             self.plan, self.facts = plan, dict(event["facts"])
@@ -142,11 +157,16 @@ class BenchSession:
             setattr(self, kind, True)
         elif kind == "reopened":
             self.calibrated = self.testing = False
-            self.verdict, self.as_found, self.papers = None, None, {}
+            self.papers = {}
+            self._forget_verdict()
         elif kind == "temperature":
             self.typed_temperature = event["value"]
         elif kind == "papers":
             self.papers |= event["files"]
+
+    def _forget_verdict(self) -> None:
+        self.verdict = self.as_found = None
+        self.failure = documents.Failure()
 
     @property
     def part(self) -> Positions:
@@ -172,7 +192,7 @@ class BenchSession:
             self.sample = sample.values
             if self.settling is None:
                 self.settling = self._new_settling()
-                self.version += 1
+                self._change()
             self.settling.take(now, sample.values)
             if TEMPERATURE_COLUMN in self.stream.channels:
                 self.warmth.take(now, self.raw[TEMPERATURE_COLUMN])
@@ -264,7 +284,8 @@ class BenchSession:
         past = opening.past_of(self.registry, serial)
         with self.lock:
             self._check_new()
-            self.past, self.version = past, self.version + 1
+            self.past = past
+            self._change()
 
     def _check_new(self) -> None:
         if self.facts:
@@ -280,10 +301,12 @@ class BenchSession:
     def start(
         self, serial: str, operator: str = "", plan: str = "", earth: Mapping[str, float | None] | None = None, *,
         tool: str = "", tool_text: str = "", plan_file: tuple[str, str] = ("", ""),
+        stand: Mapping[str, float] | None = None,
     ) -> None:  # fmt: skip
         """Begin: the tool's serial, who measures, the plan, and gravity, field and dip where they are known.
 
-        `tool` is another profile by its name, `tool_text` the text of one, `plan_file` name and text of a plan.
+        `tool` is another profile by its name, `tool_text` the text of one, `plan_file` name and text of a plan, `stand`
+        other 1σ of the stand than those of the profile.
         """
         if not (serial := serial.strip()):
             raise InputError(
@@ -292,10 +315,16 @@ class BenchSession:
         with self._starting:
             self._check_new()
             profile = self.profile
-            if (tool or tool_text) and not self.simulated:
-                profile = opening.choose_profile(self.folder, tool, tool_text, self.past)
+            if self.simulated:
+                tool = tool_text = ""
+            if is_other := bool(tool or tool_text or stand):
+                profile, data = opening.chosen_profile(
+                    self.folder, tool, tool_text, self.past, stand or {}
+                )
             chosen = self._chosen_plan(profile, plan, plan_file)
             opening.keep_previous(self.folder, self.registry, serial, self.simulated)
+            if is_other:
+                atomic.write(self.folder / opening.TOOL_FILE, data)
             self._begin(serial, operator, earth or {}, profile, chosen)
 
     def _begin(
@@ -303,11 +332,12 @@ class BenchSession:
     ) -> None:  # fmt: skip
         """Begin with a tool and a plan."""
         with self.lock:
-            if profile is not self.profile:
-                self.profile, self.settling = profile, None
+            if profile.stream != self.profile.stream:
+                self.settling = None
                 self.stream = Stream(
                     profile.stream if isinstance(profile.stream, StreamForm) else None
                 )
+            self.profile = profile
             facts = {"serial": serial, "date": datetime.now().date().isoformat()}
             facts |= {"operator": operator.strip()} if operator.strip() else {}
             facts |= {"plan": chosen.name} if chosen.name else {}
@@ -324,7 +354,8 @@ class BenchSession:
         with self.lock:
             if not self.facts:
                 raise InputError("the session has not begun. Press Start.")
-            self.waiting, self.version = False, self.version + 1
+            self.waiting = False
+            self._change()
 
     def accept(self, position: int | None = None) -> None:
         """Take the standstill as the station that is asked for; `position`: the one that the page has shown."""
@@ -415,7 +446,6 @@ class BenchSession:
         more = {name: value for name, value in (("doubt", doubt), ("samples", samples)) if value}
         self._record("station", part=part.name, position=order, row=row, **more)
         self.message = ""
-        self._write_tables()
         self._refit()
 
     def undo(self) -> None:
@@ -426,7 +456,6 @@ class BenchSession:
                 raise InputError("there is no station to take back.")
             self._record("undone", part=self.part.name)
             self._used = (-1, -1)
-            self._write_tables()
             self._refit()
 
     def measure_again(self, position: int | None = None) -> None:
@@ -447,6 +476,7 @@ class BenchSession:
         """Leave a position out."""
         with self.lock:
             self._record("skipped", part=self.part.name, position=self._expected(None))
+            self._refit()
 
     def switch(self, name: str, on: bool) -> None:
         """Turn "auto", accept when settled, or "paused" on or off."""
@@ -480,39 +510,42 @@ class BenchSession:
             if not self.testing:
                 raise InputError("there is no roll test to measure again.")
             self._record("cleared", part=ROLLTEST_PART)
-            self.verdict = self.as_found = None
             self._used = (-1, -1)
-            self._write_tables()
+            self._refit()
 
     # ------------------------------------------------------------------ results
 
     @property
     def bad(self) -> dict[str, str]:
-        """The problem of each station of the run that does not fit, by label, but for those asked for again."""
-        if self.testing:
-            return {}
-        again = self.parts[RUN_PART].again
-        named = sorted(self.fit.bad.items(), key=lambda item: int(item[0]))
+        """The problem of each bad station of the part, by label, but for those asked for again.
+
+        Stations of the run that do not fit, or those of a failed roll test that are farthest off.
+        """
+        again, suspects = self.part.again, self.failure.stations if self.testing else self.fit.bad
+        named = sorted(suspects.items(), key=lambda item: int(item[0]))
         return {label: text for label, text in named if int(label) - 1 not in again}
 
     def _write_tables(self) -> None:
         """Write the run files from the events. The stations are in the journal already: a full disk loses none."""
+        with self.lock:
+            parts = [replace(part, taken=[*part.taken]) for part in self.parts.values()]
+            self._unwritten = False
         try:
             earlier: list[TakenStation] = []
-            for part in self.parts.values():
+            for part in parts:
                 path = self.folder / f"{part.name}.csv"
                 if part.taken:
                     tables.write(path, part.table(self.facts, earlier))
                     earlier = [*part.done.values()]
                 else:
                     path.unlink(missing_ok=True)
-            self._unwritten = False
         except (MwdcalError, OSError) as error:
             self._unwritten = True
             self.say(f"{error} The station is safe in session.jsonl.")
 
     def _refit(self) -> None:
-        """Fit what there is, beside the stream."""
+        """Write the run files, and fit what there is, beside the stream."""
+        self._unwritten = True
         self._requested += 1
         task = self._judge if self.testing else self._fit_run
         self._submit(partial(self._if_latest, self._requested, task))
@@ -530,10 +563,12 @@ class BenchSession:
         """Whether a fit is still to come that knows the latest station."""
         return self._fitted != self._requested
 
-    def _submit(self, task: Callable[[], None]) -> None:
-        self._pool.submit(self._context.copy().run, self._guarded, task)
+    def _submit(self, task: Callable[[], None], *papers: str) -> None:
+        """Have a task done beside the stream; `papers` are pending until then."""
+        self.pending += papers
+        self._pool.submit(self._context.copy().run, self._guarded, task, papers)
 
-    def _guarded(self, task: Callable[[], None]) -> None:
+    def _guarded(self, task: Callable[[], None], papers: Sequence[str]) -> None:
         """Do a task; what goes wrong is shown, and the session goes on."""
         try:
             if self._unwritten:
@@ -546,13 +581,16 @@ class BenchSession:
                 f"internal error ({type(error).__name__}: {error}). Nothing accepted is lost; please report it."
             )
         with self.lock:
-            self.version += 1
+            for name in papers:
+                self.pending.remove(name)
+            self._change()
 
     def say(self, message: str) -> None:
         """Show a message on the page."""
         with self.lock:
             if message != self.message:
-                self.message, self.version = message, self.version + 1
+                self.message = message
+                self._change()
 
     def wait_for_fits(self) -> None:
         """Wait until all that was requested is done, and what that has requested."""
@@ -561,7 +599,7 @@ class BenchSession:
 
     def _fit_run(self) -> None:
         count = len(self.parts[RUN_PART].done)
-        fit = documents.fit(self.folder, count, self.lock)
+        fit = documents.fit(self.folder, count)
         with self.lock:
             self.fit = fit
             if fit.calibration is not None:
@@ -580,7 +618,7 @@ class BenchSession:
             self._submit(self._calibrate)
 
     def _calibrate(self) -> None:
-        fit = documents.fit(self.folder, len(self.parts[RUN_PART].done), self.lock)
+        fit = documents.fit(self.folder, len(self.parts[RUN_PART].done))
         if fit.calibration is None:
             raise InputError(fit.reason)
         files = documents.save_calibration(fit.calibration, self.folder)
@@ -589,7 +627,7 @@ class BenchSession:
             if not self.calibrated:
                 self._record("papers", files=files)
                 self._record("calibrated")
-        self._submit(partial(self._draw, fit.calibration, "report"))
+        self._submit(partial(self._draw, fit.calibration, "report"), "report_html")
 
     def _draw(self, result: object, name: str) -> None:
         """Write the page of a result, which takes longer than the result."""
@@ -614,15 +652,19 @@ class BenchSession:
         part, calibration = self.parts[ROLLTEST_PART], self.fit.calibration
         if calibration is None or part.order is not None or not part.taken:
             with self.lock:
-                self.verdict = None
+                self._forget_verdict()
             return
         verdict, files = documents.verify(calibration, self.folder)
-        before = self._judge_as_found()
+        before, failure = self._judge_as_found(), documents.Failure()
+        if not verdict.passed:
+            failure = documents.failure(verdict, calibration, self.folder)
         with self.lock:
-            self.verdict, self.as_found = verdict, before
+            if part.open_positions:  # asked for again meanwhile
+                return
+            self.verdict, self.as_found, self.failure = verdict, before, failure
             if not files.items() <= self.papers.items():
                 self._record("papers", files=files)
-        self._submit(partial(self._draw, verdict, "rolltest"))
+        self._submit(partial(self._draw, verdict, "rolltest"), "rolltest_html")
 
     def _judge_as_found(self) -> Verdict | None:
         """The verdict by the calibration before, if there is one that can judge."""
@@ -639,16 +681,23 @@ class BenchSession:
                 raise InputError("the certificate needs the roll test. Measure it first.")
             if "certificate" in self.papers:
                 raise InputError("the certificate is issued already.")
-            self._submit(partial(self._certify, number))
+            if self.is_fitting:
+                raise InputError("the roll test is being judged. Try again in a moment.")
+            self._record("papers", files=documents.certify(self.folder, number, self.laboratory))
+            if self.countersign is None:
+                self._enter()
+            self._draw_certificate()
 
-    def _certify(self, number: str) -> None:
-        if "certificate" in self.papers:
-            return
-        files = documents.certify(self.folder, number, self.laboratory, self.say)
+    def _draw_certificate(self) -> None:
+        """Write the certificate as a page and as a PDF, which take longer than the certificate."""
+        for kind in ("html", "pdf"):
+            if (name := f"certificate_{kind}") not in self.papers:
+                self._submit(partial(self._draw_form, kind), name)
+
+    def _draw_form(self, kind: str, **signing: Any) -> None:
+        files = documents.draw_certificate(self.folder, self.laboratory, kind, **signing)
         with self.lock:
             self._record("papers", files=files)
-        if self.countersign is None:
-            self._enter()
 
     @property
     def waits_for_signature(self) -> bool:
@@ -668,12 +717,9 @@ class BenchSession:
                 self.folder, self.countersign, passphrase, self.facts.get("operator", "")
             )
             self._record("papers", files={"signature": who})
-            self._submit(
-                partial(
-                    documents.sign_pdf, self.folder, self.laboratory, self.countersign, passphrase
-                )
-            )
-        self._submit(self._enter)
+            self._enter()
+            signing = {"private_key": self.countersign, "passphrase": passphrase}
+            self._submit(partial(self._draw_form, "pdf", **signing))
 
     def enter(self) -> None:
         """Enter all in the registry, where that failed before."""
@@ -684,13 +730,16 @@ class BenchSession:
                 or self.waits_for_signature
             ):
                 raise InputError("there is nothing to enter, or no registry is named.")
-            self._submit(self._enter)
+            self._enter()
 
     def _enter(self) -> None:
         if self.registry is not None:
-            text = documents.enter(self.folder, self.registry)
-            with self.lock:
-                self._record("papers", files={"registry": text})
+            self._submit(partial(self._add_to, self.registry), "registry")
+
+    def _add_to(self, registry: str) -> None:
+        text = documents.enter(self.folder, registry)
+        with self.lock:
+            self._record("papers", files={"registry": text})
 
     def close(self) -> None:
         """End: what is written stays."""

@@ -40,11 +40,15 @@ QUARTER_OF_NORMAL = 0.3186393639643752
 """First quartile of the size of a normal variate."""
 SMOOTH = 3
 """Order of the differences of samples that tell the roughness of a sensor: a movement is smooth, and hardly shows."""
+FLIP = 1.001
+"""Steps by which a coarse reading at rest changes at most: between two, rounded."""
 LARGEST_WANDER = 12.0
 """Times its roughness that a sensor at rest wanders from cell to cell.
 
 AR(1) noise of 0.05 to 5 s does so up to 10.6 times, at 100 samples a second.
 """
+LEAST_TIMES = 3.0
+"""A standstill holds at least so many correlation times of its noise, or the noise wanders."""
 RANDOM_WALK_FREEDOM = 2.5
 """Degrees of freedom of the variance of a random walk about its mean: (Σ 1/k²)²/Σ 1/k⁴."""
 MOST_BLOCKS = 20
@@ -106,8 +110,8 @@ class Settling:
 
     The first `sensors` channels decide, those that follow, such as a temperature, do not. `window` is how long the tool
     has to stand, in seconds; `least` (k,) the smallest noise of each sensor that is believed. `moves` counts how often
-    a standstill has ended. `wanders`: the correlation time of the noise is half a standstill or more, so that the
-    standstills tell the uncertainty of their means badly.
+    a standstill has ended. `wanders`: the correlation time of the noise is more than a third of a standstill, so
+    that the standstills tell the uncertainty of their means badly.
     """
 
     def __init__(self, sensors: int, window: float = 5.0, least: Sequence[float] = ()) -> None:
@@ -211,7 +215,8 @@ class Settling:
                 float(student(known, chance)), float(student(inf, chance)) * LARGEST_WANDER / change
             )
             bounds[:, triad] = [[scatter * times], [change * wander]]
-        return bounds[0] * rough, bounds[1] * rough
+        coarse = np.where(rough > self._steps / 2, 0.0, FLIP * self._steps)
+        return bounds[0] * rough, np.maximum(bounds[1] * rough, coarse)
 
     @property
     def _triads(self) -> list[slice]:
@@ -220,8 +225,12 @@ class Settling:
     @property
     def _floor(self) -> Array:
         """The smallest noise of each sensor: half a step is a value between two."""
-        steps = np.array(self.step)
-        return np.asarray(np.maximum(self.least, np.where(np.isfinite(steps), steps / 2, 0.0)))
+        return np.asarray(np.maximum(self.least, self._steps / 2))
+
+    @property
+    def _steps(self) -> Array:
+        """The smallest step of each sensor; 0 where none was seen."""
+        return np.where(np.isfinite(self.step), self.step, 0.0)
 
     def _look(self) -> None:
         """Drop the oldest cells until no sensor creeps; settled if what is left is long enough."""
@@ -247,7 +256,7 @@ class Settling:
         now = np.array([form.correlation(float(ratio[triad].mean())) for triad in self._triads])
         earlier = [each for each in self.past if each.variance.shape == squares.shape]
         correlation = np.mean([now, *(each.correlation for each in earlier)], 0)
-        self.wanders = bool(np.any(correlation > exp(-2 / len(means))))
+        self.wanders = bool(np.any(correlation > exp(-LEAST_TIMES / len(means))))
         place = np.repeat(form.place(correlation), TRIAD)[: self.sensors]
         samples = sum(len(cell.samples.times) for cell in self.still) / len(means)
         noise = RestNoise(np.maximum(squares / form.left[place], self._floor**2 / samples), now)

@@ -212,10 +212,12 @@ class DroppedTable:
         with self.lock:
             if self.verdict is None:
                 raise InputError("the certificate needs the roll test. Drop its table first.")
-            self.papers |= documents.certify(self.folder, number, self.laboratory, self._say)
+            self.papers |= documents.certify(self.folder, number, self.laboratory)
+            for kind in ("html", "pdf"):
+                try:
+                    self.papers |= documents.draw_certificate(self.folder, self.laboratory, kind)
+                except InputError as error:
+                    self.message = str(error)
             if self.registry is not None:
                 self.papers["registry"] = documents.enter(self.folder, self.registry)
             self._keep()
-
-    def _say(self, message: str) -> None:
-        self.message = message

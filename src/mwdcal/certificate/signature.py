@@ -186,6 +186,15 @@ def read_public(path: Path) -> TrustedKey:
     return public_key(content[len(_PREFIX) :], **words)
 
 
+def is_encrypted(path: Path) -> bool:
+    """Whether the private key in a file needs a passphrase.
+
+    Raises:
+        InputError: the file cannot be read, or is not a key.
+    """
+    return _block(read_file(path), path.name)[0].startswith("ENCRYPTED")
+
+
 def read_private(path: Path, passphrase: Callable[[], str]) -> PrivateKey:
     """A private key; `passphrase` is asked for that of an encrypted one.
 

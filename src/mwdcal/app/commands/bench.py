@@ -96,8 +96,10 @@ def command(
     Example: mwdcal bench --tool tool.toml --plan moosavi-12 --source serial:/dev/ttyUSB0@115200 --session S-117
     Exit: 0 ended, 2 input cannot be read.
     """
+    from mwdcal.app.laboratory import line_on
     from mwdcal.bench import serving
     from mwdcal.files.formats import atomic
+    from mwdcal.files.profiles import in_use
 
     serving.require()
     given = {name: value for name, value in chosen.items() if value is not None}
@@ -112,9 +114,13 @@ def command(
         opened = serving.listening(host, port)
         port = opened.getsockname()[1]
         bench = serving.bench_of(folder, given, host, port)
+        if used := in_use():
+            bench.session.settings_used = line_on(used)
         url = serving.address(host, port, bench.token)
         click.echo(url)
         click.echo(
             f"session {folder}   Ctrl-C ends; mwdcal bench --session {folder} goes on", err=True
         )
+        if bench.session.settings_used:
+            click.echo(bench.session.settings_used, err=True)
         serving.serve(bench, opened, "" if no_browser else url)

@@ -28,6 +28,7 @@ document.addEventListener("change", (event) => {
 document.addEventListener("submit", (event) => {
   if (!event.target.action.includes("/table/")) return;
   event.preventDefault();
+  note.textContent = note.dataset.working;
   ask(event.target.action, new URLSearchParams(new FormData(event.target, event.submitter)));
 });
 
