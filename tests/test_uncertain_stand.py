@@ -210,3 +210,18 @@ def test_misfit_counts_what_is_tested_alone(least):
     np.testing.assert_allclose(square, np.sum(left * analysis.residual, -1), rtol=1e-8)
     assert freedom[0, 5] == 4
     assert (np.delete(freedom.ravel(), 5) == 6).all()
+
+
+@pytest.mark.parametrize("noise", [1e-7, 1e-8])
+def test_steps_that_run_away_go_the_general_way(noise, general):
+    """Noise of 1e-7 g, and a scale that grows by 1 % meanwhile: steps get longer until squares overflow."""
+    readings = on_stand(3, 6)
+    sd = {**readings.sd, "accelerometer": np.full(3, noise)}
+    warmed = readings.accelerometer * np.linspace(1, 1.01, 48)[:, None]
+    readings = replace(readings, accelerometer=warmed, sd=sd)
+    ours = fit(readings, OPTIONS)
+    general()
+    theirs = fit(readings, OPTIONS)
+    factors = ours.analysis.variance_factor, theirs.analysis.variance_factor
+    assert np.sqrt(factors[1][:, 0]).min() > 1e3
+    np.testing.assert_allclose(*factors, rtol=1e-3)
