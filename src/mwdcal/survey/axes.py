@@ -25,13 +25,18 @@ LEAST_CHANCE = 1e-3
 """Chance of as large a misfit below which surveys do not fit."""
 FALSE_ALARMS = 1e-3
 """Largest share of sound runs that fit other axes so much better."""
-MOST_SURVEYS = 60
+AS_LIKELY = 100.0
+"""Exchanges of which the likelihood is less than so many times smaller fit as well: the simplest is named."""
+MOST_SURVEYS = 40
 """Surveys of a run that are looked at: offsets and scales are the same at all."""
 _SAME = np.broadcast_to(np.eye(3), SIGNED.shape)
 EXCHANGES = np.concatenate(
     [np.stack(pair, 1) for pair in ((SIGNED, SIGNED), (SIGNED, _SAME), (_SAME, SIGNED))]
 )
 """Signed permutations (k, 2, 3, 3) of the tool axes in accelerometer and magnetometer: in both alike, or in one."""
+
+CHANGED = (np.eye(3) != EXCHANGES).any(-1).sum((1, 2))
+"""Axes (k,) that each changes."""
 
 
 def exchanged_axes(calibration: Calibration, readings: Readings) -> list[Finding]:
@@ -50,9 +55,10 @@ def exchanged_axes(calibration: Calibration, readings: Readings) -> list[Finding
     places = np.flatnonzero(rows)
     if not places.size:
         return []
-    places = places[np.unique(np.linspace(0, places.size - 1, MOST_SURVEYS).round().astype(int))]
+    chosen = places[np.linspace(0, places.size - 1, MOST_SURVEYS).round().astype(int)]
+    rows = np.isin(np.arange(readings.count), chosen)
     try:
-        some = surveys(calibration, readings.select(places))
+        some = surveys(calibration, readings.select(rows))
         named = chi_square(calibration, some, Assumed())[0]
         freedom = 3 * some.count
         if chdtrc(freedom, named) >= LEAST_CHANCE:
@@ -64,9 +70,12 @@ def exchanged_axes(calibration: Calibration, readings: Readings) -> list[Finding
     likelier = (named - others[best]) / 2 > np.log(len(EXCHANGES) / FALSE_ALARMS)
     if not likelier or chdtrc(freedom, others[best]) < LEAST_CHANCE:
         return []
+    alike = others - others[best] < 2 * np.log(AS_LIKELY)
+    simplest = EXCHANGES[int(np.argmin(np.where(alike, CHANGED, np.inf)))]
+    like = ", or with others like it" if alike.sum() > 1 else ""
     text = (
-        f"the readings fit the calibration with {_columns(calibration, EXCHANGES[best])}, and not as the columns are "
-        "named. Correct the columns: azimuth and toolface are wrong."
+        f"the readings fit the calibration with {_columns(calibration, simplest)}{like}, and not as their "
+        "columns are named. Are columns exchanged, or a sign wrong? Azimuth and toolface are wrong then."
     )
     return [Finding(id=EXCHANGED, text=text)]
 
