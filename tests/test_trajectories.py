@@ -222,3 +222,54 @@ def test_statuses_of_a_table(tool, tmp_path):
     ]
     write_csv(source, rows | {"status": ["final"] * 8}, *metadata)
     assert "'final'" in refused(mwdcal("survey", tool, source, "-o", out), 2)
+
+
+def test_a_sag_correction_of_the_trajectory_is_named(tool, tmp_path):
+    """Its inclinations are of another program; ours come of the raw readings, without sag."""
+    [file, *_] = trajectories(tmp_path, WELLS["metres"])
+    text = file.read_text("utf-8")
+    sags = iter(("0.07", "-0.12"))
+    parts = text.split("<rawData>")
+    for k in (1, 3):
+        parts[k] = parts[k].replace(
+            "</rawData>",
+            f'</rawData><corUsed><sagIncCor uom="dega">{next(sags)}</sagIncCor></corUsed>',
+            1,
+        )
+    file.write_text("<rawData>".join(parts), "utf-8")
+    done = mwdcal("survey", tool, file, "-o", tmp_path / "well.csv")
+    assert done.code == 0
+    assert "corrects inclinations for sag, by up to -0.12°. mwdcal corrects no sag" in done.err
+    assert (
+        "sag-not"
+        not in mwdcal(
+            "survey", tool, trajectories(tmp_path, WELLS["metres"])[0], "-o", tmp_path / "w.csv"
+        ).err
+    )
+
+
+def test_the_screen_says_where_and_from_which_north_the_path_is_tied_in(tool, tmp_path):
+    """A tie-in turned by 3°, as from another north, bends the first course by 3° sin(inclination)."""
+    [file, *_] = trajectories(tmp_path, WELLS["feet"])
+    md, inclination, azimuth, place = drilled(WELLS["feet"])
+    for turn in (0.0, 40.0):
+        numbers = (md[0] / 0.3048, inclination[0], azimuth[0] + turn, *(place[0] / 0.3048))
+        start = ",".join(f"{float(number):.6f}" for number in numbers)
+        done = mwdcal(
+            "survey",
+            tool,
+            file,
+            "-o",
+            tmp_path / "w.csv",
+            "--length-unit",
+            "ft",
+            f"--tie-in={start}",
+        )
+        assert done.code == 0, done.err
+        a, b = (np.radians([inclination[k], azimuth[k] + turn * (k == 0)]) for k in (0, 1))
+        cosine = np.cos(a[0]) * np.cos(b[0]) + np.sin(a[0]) * np.sin(b[0]) * np.cos(b[1] - a[1])
+        severity = np.degrees(np.arccos(cosine)) / ((md[1] - md[0]) / 30.48)
+        north = f"azimuth {azimuth[0] + turn:.2f}° taken from grid north"
+        words = f"{north}; {severity:.1f}°/100 ft from there to station 1-1"
+        assert words in done.out.replace("\n", " ")
+        assert "convergence +1.50°: magnetic −5.50°" in done.out.replace("\n", " ")

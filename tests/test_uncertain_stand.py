@@ -234,3 +234,18 @@ def test_no_wrong_dip_is_taken_for_a_drift(declared, stand, monkeypatch):
         may_be = structure.dip_may_be_off(result, automatic.WRONG_DIP)
         assert may_be[1::2].any() == (off > 0.1)
     assert not searched.any()
+
+
+@pytest.mark.parametrize("noise", [1e-7, 1e-8])
+def test_steps_that_run_away_go_the_general_way(noise, general):
+    """Noise of 1e-7 g, and a scale that grows by 1 % meanwhile: steps get longer until squares overflow."""
+    readings = on_stand(3, 6)
+    sd = {**readings.sd, "accelerometer": np.full(3, noise)}
+    warmed = readings.accelerometer * np.linspace(1, 1.01, 48)[:, None]
+    readings = replace(readings, accelerometer=warmed, sd=sd)
+    ours = fit(readings, OPTIONS)
+    general()
+    theirs = fit(readings, OPTIONS)
+    factors = ours.analysis.variance_factor, theirs.analysis.variance_factor
+    assert np.sqrt(factors[1][:, 0]).min() > 1e3
+    np.testing.assert_allclose(*factors, rtol=1e-3)

@@ -14,7 +14,7 @@ from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.readings import serial_of, simulated
 from mwdcal.calibration.record import Finding, SignatureCheck, stated
 from mwdcal.files.formats.columns import shown
-from mwdcal.geometry.units import LENGTH_UNITS
+from mwdcal.geometry.units import LENGTH_UNITS, USUAL_COURSES
 from mwdcal.presentation.contributions import (
     ContributionSummary,
     contribution_screen,
@@ -26,6 +26,7 @@ from mwdcal.presentation.numbers import files_written, fixed, measured, number, 
 from mwdcal.presentation.signature import signature_status
 from mwdcal.presentation.text import chance, one_line, plural, table
 from mwdcal.survey.interference import Interference, InterferenceSize, MultiStationAnalysis
+from mwdcal.survey.path import TieIn
 from mwdcal.survey.stations import North
 from mwdcal.survey.surveying import SurveyedWell, WellInputs, used_in_surveys
 from mwdcal.survey.well import LastStation, Well, WellCounts, WellErrors
@@ -394,14 +395,15 @@ def screen(
         counts.append(f"{facts.blind} blind to interference")
     heading = [well.readings.source, plural(facts.rows, "survey"), *counts]
     heading += [signature_status(signature), *simulated(*metadata)]
-    source = f" ({facts.source})" if facts.source else ""
     lines = [
         "   ".join(heading),
-        f"azimuths from {facts.north} north{declination_in_words(facts)}   limits {facts.limits}{source}",
+        f"azimuths from {facts.north} north{declination_in_words(facts)}   limits {limits_in_words(well, facts)}",
     ]
     lines += runs_in_words(facts)
     if facts.reference_sources:
         lines.append("   ".join(["references", *sources_in_words(facts)]))
+    if tie_in := tie_in_in_words(well):
+        lines.append(tie_in)
     if facts.end:
         lines.append(end_in_words(facts.end, facts.north, facts.length_unit))
     lines.append(well.terms.sentence)
@@ -420,7 +422,7 @@ def model_in_words(errors: WellErrors, runs: bool = False) -> str:
     """The error model, and the time over which the sensors may have drifted; that of several runs stands with these."""
     if runs:
         walk = "; drift by the random walk of each tool" if errors.by_walk else ""
-        return f"error model {errors.model.name} ({errors.model.source}){walk}"
+        return f"error model {errors.model.name} ({errors.model.source}); no sag is corrected{walk}"
     time = (
         "an unknown time since the calibration, taken as a year"
         if errors.years is None
@@ -431,7 +433,8 @@ def model_in_words(errors: WellErrors, runs: bool = False) -> str:
         if errors.by_walk
         else "drift of the sensors"
     )
-    return f"error model {errors.model.name} ({errors.model.source}); {drift} over {time}"
+    model = f"error model {errors.model.name} ({errors.model.source})"
+    return f"{model}; no sag is corrected; {drift} over {time}"
 
 
 def declination_in_words(facts: SurveySummary) -> str:
@@ -439,7 +442,34 @@ def declination_in_words(facts: SurveySummary) -> str:
     if facts.declination_deg is None or facts.sd_declination_deg is None:
         return ""
     sd = fixed(facts.sd_declination_deg, 2)
-    return f" (declination {signed(facts.declination_deg, 2)}° ± {sd}°)"
+    declination = f"declination {signed(facts.declination_deg, 2)}° ± {sd}°"
+    if facts.convergence_deg is None:
+        return f" ({declination})"
+    added = signed(facts.declination_deg - facts.convergence_deg, 2)
+    return f" ({declination}, convergence {signed(facts.convergence_deg, 2)}°: magnetic {added}°)"
+
+
+def limits_in_words(well: Well, facts: SurveySummary) -> str:
+    """The limits and their terms: after multi-station analysis those of noise and references alone."""
+    if well.corrected and well.limits.probability is not None:
+        return f"{facts.limits}: noise and references alone, as the analysis fitted the sensors to these"
+    return f"{facts.limits}{f' ({facts.source})' if facts.source else ''}"
+
+
+def tie_in_in_words(well: Well) -> str:
+    """Where the path is tied in, and the dogleg severity that leads from there to its first station; or empty."""
+    start, position = well.started, well.position
+    if not isinstance(start, TieIn) or position is None or not position.on_path.any():
+        return ""
+    unit, row = well.length_unit, int(np.argmax(position.on_path))
+    course = USUAL_COURSES[unit]
+    severity = np.degrees(position.dogleg[row]) * course * LENGTH_UNITS[unit]
+    return (
+        f"tied in at {fixed(start.md / LENGTH_UNITS[unit], 2)} {unit} MD: inclination "
+        f"{fixed(np.degrees(start.inclination), 2)}°, azimuth {fixed(np.degrees(start.azimuth), 2)}° taken from "
+        f"{well.north.name} north; {fixed(severity, 1)}°/{course:g} {unit} from there to station "
+        f"{well.readings.labels[row]}"
+    )
 
 
 def sources_in_words(facts: SurveySummary) -> list[str]:

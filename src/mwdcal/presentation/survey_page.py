@@ -19,10 +19,12 @@ from mwdcal.presentation.survey import (
     SurveySummary,
     declination_in_words,
     end_in_words,
+    limits_in_words,
     result_summary,
     runs_in_words,
     sources_in_words,
     survey_rows,
+    tie_in_in_words,
 )
 from mwdcal.presentation.text import plural
 from mwdcal.survey.acceptance import SURVEY_UNITS
@@ -372,6 +374,8 @@ def render(surveyed: SurveyedWell, findings: list[Finding]) -> str:
         terms=well.terms.sentence,
         declination=declination_in_words(facts),
         sources="; ".join(sources_in_words(facts)),
+        limits=limits_in_words(well, facts),
+        tie_in=tie_in_in_words(well),
         end=end_in_words(facts.end, facts.north, facts.length_unit) if facts.end else "",
         header=header,
         rows=rows,

@@ -154,11 +154,8 @@ def estimate(
     Raises `InputError` where calibration and readings do not belong together, or lack a reference.
     """
     assumed, readings = assumed or Assumed(), surveys(calibration, readings)
-    known = _drifted(calibration, for_run(calibration, readings), assumed.drift)
-    field_changes = _unit_changes(calibration, known, 1)
-    released, gain, left = _loosened(known, field_changes[:, : len(assumed.sd)], assumed.sd)
-    options = _options(calibration, assumed)
-    result = fit(readings, replace(options, prior=released))
+    known, (released, gain, left) = _known(calibration, readings, assumed)
+    result = fit(readings, replace(_options(calibration, assumed), prior=released))
     reference = calibration.reference_temperature
     maps = results.to_file(result, reference)
     parameters = np.einsum("bkp,bp->bk", maps, result.state.params)
@@ -339,7 +336,30 @@ def misfits(calibration: Calibration, whole: Estimate) -> tuple[Array, Array]:
 
     Of three degrees of freedom for each station: |g|, |b| and dip.
     """
-    options = replace(_options(calibration, whole.assumed), robust=None)
-    fits = [fit(whole.readings, replace(options, prior=p)) for p in (whole.bound, whole.released)]
-    before, after = (each.problem.linear(each.state).normal.cost for each in fits)
+    before, after = (
+        _misfit(calibration, whole.readings, whole.assumed, prior)
+        for prior in (whole.bound, whole.released)
+    )
     return before, after
+
+
+def chi_square(calibration: Calibration, readings: Readings, assumed: Assumed) -> Array:
+    """χ² (B,) of `surveys` (B, n) or of those of one well (n,), as the second of `misfits`."""
+    _, (released, *_) = _known(calibration, readings, assumed)
+    return _misfit(calibration, readings, assumed, released)
+
+
+def _misfit(
+    calibration: Calibration, readings: Readings, assumed: Assumed, prior: PriorInformation
+) -> Array:
+    result = fit(readings, replace(_options(calibration, assumed), robust=None, prior=prior))
+    return result.problem.linear(result.state).normal.cost
+
+
+def _known(
+    calibration: Calibration, readings: Readings, assumed: Assumed
+) -> tuple[PriorInformation, tuple[PriorInformation, Array, Array]]:
+    """What is known of the tool without interference, and with it as of `_loosened`."""
+    known = _drifted(calibration, for_run(calibration, readings), assumed.drift)
+    field_changes = _unit_changes(calibration, known, 1)
+    return known, _loosened(known, field_changes[:, : len(assumed.sd)], assumed.sd)

@@ -40,6 +40,7 @@ from mwdcal.files.streams import Part, StreamedTable
 from mwdcal.geometry.vectors import Array, ArrayLike
 from mwdcal.sensor.profile import Profile, StandProfile
 from mwdcal.survey.acceptance import SurveyLimits
+from mwdcal.survey.axes import exchanged_axes
 from mwdcal.survey.error_model import BUILT_IN, ErrorModel
 from mwdcal.survey.path import TieIn
 from mwdcal.survey.references import Claim, EarthReference
@@ -381,7 +382,8 @@ class _LongTable:
         tally = joined(seen.tallies)._replace(scatter=self._scatter(), metadata=readings.metadata)
         first = replace(seen.first, readings=readings, sources=sources)
         first = with_findings(first, tally, counts, settings.outside, settings.tie_in is None)
-        first = replace(first, findings=[*inputs.findings, *first.findings])
+        exchanged = exchanged_axes(settings.calibration, readings)
+        first = replace(first, findings=[*inputs.findings, *exchanged, *first.findings])
         return SurveyedWell(inputs, first, counts, None)
 
     def _scatter(self) -> dict[str, Scatter]:

@@ -38,6 +38,7 @@ from mwdcal.geometry.units import LENGTH_UNITS
 from mwdcal.geometry.vectors import AnyArray, Array, Bools
 from mwdcal.sensor.profile import StandProfile
 from mwdcal.survey.acceptance import SensorTerms, SurveyLimits, load_survey_limits
+from mwdcal.survey.axes import exchanged_axes
 from mwdcal.survey.axial import AxialCorrection, axial_correction
 from mwdcal.survey.contributions import Contributions, contributions
 from mwdcal.survey.error_model import BUILT_IN, ErrorModel, load_error_model
@@ -743,7 +744,9 @@ def survey_well(
     )  # fmt: skip
     alone = axial_correction(result) if axial else None
     said = alone.findings(result.readings.labels, result.north.name) if alone else []
-    findings = [*inputs.findings, *about, *result.findings, *said]
+    used = surveys.readings if inputs.unused is None else surveys.readings.select(~inputs.unused)
+    exchanged = exchanged_axes(inputs.calibration, used)
+    findings = [*inputs.findings, *about, *exchanged, *result.findings, *said]
     result = replace(
         result, findings=findings, sources=surveys.sources, length_unit=inputs.length_unit
     )

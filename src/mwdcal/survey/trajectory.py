@@ -24,6 +24,7 @@ STATUS_COLUMN = "status"
 DEFINITIVE, REJECTED, SUPERSEDED = "definitive", "rejected", "superseded"
 _ELEMENT = re.compile(r"witsml (\S+)(?: \((\S+)\))?")
 _TIE_IN = "tie in point"
+_SAG = "corUsed/sagIncCor"
 _NORTH_ELEMENTS = {
     "declination_deg": ("magDeclUsed",),
     "convergence_deg": ("gridConUsed", "gridCorUsed"),
@@ -56,6 +57,7 @@ def trajectory(table: Table, md: Array | None, without: Bools) -> TrajectoryFact
     stated, findings = _norths(table)
     table = replace(table, metadata={**stated, **table.metadata})
     tie_in, row, about = _tie_in(table, md, without)
+    findings += _sag(table)
     status = _status(table)
     unused = np.isin(status, (REJECTED, SUPERSEDED))
     if unused.any():
@@ -87,6 +89,22 @@ def _norths(table: Table) -> tuple[dict[str, object], list[Finding]]:
     words = [f"{key.removesuffix('_deg')} {value:+.4g}°" for key, value in stated.items()]
     text = f"{table.source}: the trajectory's {' and '.join(words)} count; grid azimuths are true less convergence."
     return stated, [Finding(id="norths-of-trajectory", text=text)]
+
+
+def _sag(table: Table) -> list[Finding]:
+    """The finding that a trajectory corrected its inclinations for sag, which results of its raw readings are not."""
+    there = _elements(table.columns)
+    if _SAG not in there:
+        return []
+    corrections = [_cell(table, there, _SAG, row, "dega") or 0.0 for row in range(table.count)]
+    largest = max(corrections, key=abs, default=0.0)
+    if not largest:
+        return []
+    text = (
+        f"{table.source}: the trajectory corrects inclinations for sag, by up to {largest:+.2f}°. mwdcal corrects no "
+        "sag: its inclinations are those of the tool."
+    )
+    return [Finding(id="sag-not-corrected", text=text)]
 
 
 def _elements(names: Mapping[str, object]) -> dict[str, tuple[str, str]]:

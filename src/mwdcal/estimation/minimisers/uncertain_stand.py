@@ -808,7 +808,8 @@ class _Turn:
             covariance = here.covariance
         step, errors, length = here.step(covariance)
         moved = step[:, :OF_PARAMETERS].reshape(self.forward.shape)
-        value, moving = self.value + step[:, OF_PARAMETERS:], length >= LEAST_SQUARE
+        value = self.value + step[:, OF_PARAMETERS:]
+        moving = ~(np.abs(length) < LEAST_SQUARE)  # where steps run away it is any number
         now = replace(
             self, forward=self.forward + moved, errors=errors, value=value, covariance=covariance
         )
