@@ -452,7 +452,8 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
     sign = decimal or figures.decimal_sign([c for column in columns for c in column], source)
     read = [*map(figures.column, columns, figures.signs_of(columns, sign))]
     above = [row for _, row in rows[:top]]
-    block = stated_above(above)
+    beside = [*_beside(columns), *(row for _, row in others)]
+    block = stated_above(above, beside)
     texts = [figures.as_they_stand(column) for column in columns]
     whole, joined = _with_minutes(names, [cells for cells, _ in read])
     stated = {
@@ -486,6 +487,13 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
         ),
         places=dict(zip(names, letters, strict=True)) if sheet.name else {},
     )
+
+
+def _beside(columns: Sequence[Sequence[object]]) -> list[list[object]]:
+    """What stands in the rows of a table in columns that are hardly filled in: remarks, and a block to the right."""
+    rare = [c for c in columns if 2 * sum(cell != "" for cell in c) < len(c)]
+    rows = [[cell for cell in row if cell != ""] for row in zip(*rare, strict=True)]
+    return [row for row in rows if any(isinstance(cell, str) for cell in row)]
 
 
 def _other_tool(rows: Sequence[tuple[int, Cells]], head: int, end: int) -> int:
