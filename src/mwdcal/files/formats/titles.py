@@ -85,7 +85,7 @@ _TRUE_NORTH = re.compile(
     r"true\s+north|geographic north|nord géographique|rechtweisend", re.IGNORECASE
 )
 _DECLINATION = re.compile(
-    r"(declination|deklination|misvisning|declinaci[oó]n|d[eé]clinaison|declina[cç][aã]o|declinazione|склонение|磁偏角)"
+    r"((?:decl|dekl|décl)\w*|misvisning|склонени\w*|схилення|偏角|manyetik sapma|odchylenie magn\w*)"
     r"(?:\s*\(([^)]*)\))?[^\w+−-]*([+−-]?\d+[.,]?\d*)"
     r"\s*(?:°|deg\w*)?\s*\(?([EWO](?!\s*[+(])|west|зап|vest|oest)?",
     re.IGNORECASE,
