@@ -329,7 +329,7 @@ COOLEST_FAHRENHEIT = 45.0
 """Numbers below it are degrees Celsius: no tool is calibrated below 7 °C alone."""
 COLDEST_KELVIN = 200.0
 """Numbers below it are no kelvins: hardly a tool works below -73 °C."""
-OVER_CELSIUS = 240.0
+OVER_CELSIUS = 260.0
 """Numbers above it, beside some that are no kelvins, are degrees Fahrenheit."""
 HOTTEST_CELSIUS = 200.0
 """Numbers above it may be degrees Fahrenheit: hardly a tool works above 200 °C."""

@@ -452,7 +452,8 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
     sign = decimal or figures.decimal_sign([c for column in columns for c in column], source)
     read = [*map(figures.column, columns, figures.signs_of(columns, sign))]
     above = [row for _, row in rows[:top]]
-    beside = [*_beside(columns), *(row for _, row in others)]
+    below_names = [row for _, row in others if sum(map(figures.is_figure, row)) < LEAST_COLUMNS]
+    beside = [*_beside(columns), *below_names]
     block = stated_above(above, beside)
     texts = [figures.as_they_stand(column) for column in columns]
     whole, joined = _with_minutes(names, [cells for cells, _ in read])

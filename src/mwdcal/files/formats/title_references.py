@@ -186,14 +186,15 @@ _SPELT = {
 def stated_above(rows: Sequence[Sequence[object]], besides: Rows = ()) -> Titles:
     """What rows above a table say of the tool, the day and the place, as metadata; `besides` of the place alone."""
     block = titles(rows)
-    every = [*rows, *besides]
-    references = references_in(every)
-    rough = {c: text for c, text in doubtful_in(every).items() if c not in references}
+    references = references_in(rows, besides)
+    rough = {c: text for c, text in doubtful_in(rows, besides).items() if c not in references}
     return block._replace(metadata={**references, **block.metadata}, not_taken=rough)
 
 
-def references_in(rows: Rows) -> dict[str, float]:
-    """The references that rows beside a table state, by column of a run file, in its unit; none that is stated twice.
+def references_in(rows: Rows, besides: Rows = ()) -> dict[str, float]:
+    """The references that rows above a table state, and lines `besides`, by column of a run file, in its unit.
+
+    None that is stated twice.
 
     >>> references_in([["Local field:", "48 912 nT", "Dip", "66,2°"], ["g (m/s²)", 9.80665]])
     {'ref_field_nt': 48912.0, 'ref_dip_deg': 66.2, 'ref_gravity_g': 1.0}
@@ -202,7 +203,7 @@ def references_in(rows: Rows) -> dict[str, float]:
     >>> references_in([["local field 46.8 uT nominal"], ["field uncertainty 50 nT"]])
     {}
     """
-    texts = [_clauses(row) for row in _with_columns(rows)]
+    texts = [_clauses(row) for row in [*_with_columns(rows), *besides]]
     by_word, of_places, by_unit = (dict[str, dict[float, None]]() for _ in range(3))
     for text in texts:
         here = {column for s in _STATEMENTS for column, _ in _stated(text, *s)}
@@ -337,7 +338,7 @@ def _in_unit(quantity: _Quantity, numbers: Iterable[re.Match[str]]) -> set[float
     return {v for v in values if quantity.low <= v <= quantity.high}
 
 
-def doubtful_in(rows: Rows) -> dict[str, str]:
+def doubtful_in(rows: Rows, besides: Rows = ()) -> dict[str, str]:
     """The lines above a table that may state a reference, by column of a run file.
 
     They state a nominal or approximate one, a number in a unit and of a size that the Earth's field or gravity has, or
@@ -347,7 +348,7 @@ def doubtful_in(rows: Rows) -> dict[str, str]:
     {'ref_field_nt': 'Nominal field 48 500 nT', 'ref_gravity_g': 'here 9.81 m/s2'}
     """
     lines: dict[str, str] = {}
-    for row in _with_columns(rows):
+    for row in [*_with_columns(rows), *besides]:
         line, plain = _line(row), _clauses(row)
         bare = _ROUGH.sub(" ", plain)
         for column in references_in([[bare]]) if bare != plain else ():
