@@ -108,6 +108,15 @@ def is_of_tool(name: str) -> bool:
     return bool(_MEASURED.search(spelled(name)))
 
 
+def is_of_surroundings(name: str) -> bool:
+    """Whether a column is called the temperature of an oven or a room.
+
+    >>> is_of_surroundings("Oven temp"), is_of_surroundings("Temp")
+    (True, False)
+    """
+    return bool(_SURROUNDINGS.search(name))
+
+
 def is_numbering(values: Array) -> bool:
     """Whether numbers go on in equal steps but for a few, as those of rows and times do.
 
@@ -280,13 +289,18 @@ _OF_NORTH = re.compile(r"north|nord|norte|azi|azm|heading|азим|север|�
 _TWICE = re.compile(r" \(\d+\)$")
 """The end of a name that stands in a table more than once."""
 _NUMBERED = re.compile(r"(.*?[A-Za-z])[ _-]*([123])((?:\W.*|_[A-Za-z]+)?)")
-_ANGLES_AND_WARMTH = (*(REFERENCES[name].column for name in ("inclination", "azimuth", "toolface")), WARMTH)
+_ANGLES_AND_WARMTH = (
+    *(REFERENCES[name].column for name in ("inclination", "azimuth", "toolface")),
+    WARMTH,
+)
 """Columns of which values tell the unit where a word that is none stands for it, such as deg of a temperature."""
 BY_NAME_ALONE = (WARMTH, REFERENCES["gravity"].column)
 """Columns that a run may lack, and that values alone do not tell."""
 _OF_PLACE_ALONE = tuple(REFERENCES[name].column for name in ("gravity", "field", "dip"))
 """Columns of what a place has, and no setting of the stand changes."""
-_OF_TOOL = re.compile(r"(?<![^\W\d_])(tool|probe|sonde|sonda|mwd|firmware|fw)(?![^\W\d_])", re.IGNORECASE)
+_OF_TOOL = re.compile(
+    r"(?<![^\W\d_])(tool|probe|sonde|sonda|mwd|firmware|fw)(?![^\W\d_])", re.IGNORECASE
+)
 _TITLE = re.compile(
     r"(acc|mag|accelerometers?|magnetometers?)?(?:s|ref|sensors?)? +", re.IGNORECASE
 )
@@ -306,7 +320,8 @@ _CCW = re.compile(
 )
 """Words of angles that count anticlockwise."""
 _FROM_HORIZONTAL = re.compile(
-    r"hori[sz]|orizz|горизонт|обрі|waag\w*recht|v(a|å|aa)n+ret|vaaka|poziom|vodorovn|vizszint|yatay|水平", re.IGNORECASE
+    r"hori[sz]|orizz|горизонт|обрі|waag\w*recht|v(a|å|aa)n+ret|vaaka|poziom|vodorovn|vizszint|yatay|水平",
+    re.IGNORECASE,
 )
 """Words of angles that count from the horizontal."""
 _DOWNWARDS = re.compile(
@@ -440,7 +455,11 @@ def _beside_nominal(
         for name, m in meanings.items()
         if m.column in _ANGLES_AND_WARMTH[:3] and _NOMINAL.search(name)
     }
-    shown_ones = ((name, _OF_CHANNELS.sub("", _ACTUAL.sub("", name))) for name in names if name not in meanings)
+    shown_ones = (
+        (name, _OF_CHANNELS.sub("", _ACTUAL.sub("", name)))
+        for name in names
+        if name not in meanings
+    )
     return {name: nominal[bare] for name, bare in shown_ones if bare != name and bare in nominal}
 
 
@@ -666,7 +685,9 @@ def _no_evidence(
             ignored[name] = "as you say"
         elif m.column in answers:
             continue
-        elif _is_total(m.column, name, meanings, values) or _is_dip_of(m.column, name, meanings, values):
+        elif _is_total(m.column, name, meanings, values) or _is_dip_of(
+            m.column, name, meanings, values
+        ):
             ignored[name] = "it is computed from the channels"
         elif m.column in _OF_PLACE_ALONE and _OF_TOOL.search(name):
             ignored[name] = "by its name the tool has measured it"
@@ -768,7 +789,9 @@ def _is_dip_of(column: str, name: str, meanings: Mapping[str, Resemblance], valu
         return False
     g, b = (np.array(triad, float) for triad in triads)
     with np.errstate(all="ignore"):
-        computed = np.degrees(np.arcsin(np.sum(g * b, 0) / (np.linalg.norm(g, axis=0) * np.linalg.norm(b, axis=0))))
+        computed = np.degrees(
+            np.arcsin(np.sum(g * b, 0) / (np.linalg.norm(g, axis=0) * np.linalg.norm(b, axis=0)))
+        )
         alike = np.corrcoef(dip, computed)[0, 1]
     return bool(alike > _FOLLOWS)
 
@@ -985,7 +1008,11 @@ def _unit(column: str, name: str, stated: str, values: Array | None, source: str
         stated = _before_comment(column, stated) or stated
         if stated in allowed:
             return ABOVE if stated == "°" and _is_elevation(column, values) else stated
-        if column in _ANGLES_AND_WARMTH and unit_of(stated) in ("", "°") and BOTH_UNITS not in stated:
+        if (
+            column in _ANGLES_AND_WARMTH
+            and unit_of(stated) in ("", "°")
+            and BOTH_UNITS not in stated
+        ):
             return _unit_by_values(column, name, values[np.isfinite(values)], source)
         if BOTH_UNITS in stated:
             raise QuestionError(
@@ -1027,7 +1054,12 @@ def _unit_by_values(column: str, name: str, known: Array, source: str) -> str:
         raise _open(name, column, ("gon", "°"), known, source)
     if known.size and _is_elevation(column, known):
         return ABOVE
-    if allowed[0] == "°C" and known.size and known.min() < COLDEST_KELVIN and known.max() > OVER_CELSIUS:
+    if (
+        allowed[0] == "°C"
+        and known.size
+        and known.min() < COLDEST_KELVIN
+        and known.max() > OVER_CELSIUS
+    ):
         return "°F"
     both = {"°": _maybe_radians, "°C": _maybe_fahrenheit}.get(allowed[0])
     if both and known.size and both(known):

@@ -39,6 +39,7 @@ from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
 from mwdcal.identification.columns import (
     in_units,
     is_filler,
+    is_of_surroundings,
     is_of_tool,
     meanings_of,
     north_of,
@@ -97,9 +98,8 @@ def check_cells(table: Table, columns: Mapping[str, ColumnSource]) -> None:
         factor, offset = (
             FACTORS.get(columns[column].unit, (1.0, 0.0)) if units_of(column) else (1.0, 0.0)
         )
-        wrong = (is_filler(values) & _is_outside_others(values)) | RANGES[column].outside(
-            values * factor + offset
-        )
+        filler = is_filler(values) & (_is_outside_others(values) | (values % 1 != 0))
+        wrong = filler | RANGES[column].outside(values * factor + offset)
         if column in (*RAW, WARMTH) and not np.isnan(values).all():
             wrong |= np.isnan(values)
         if column in RAW:
@@ -397,7 +397,7 @@ def _proposal(
     table = _of_one_tool(table, columns, stated)
     profile = Profile(name=Path(path).stem, table=form or msgspec.UNSET, columns=columns)
     profile, readings, wirings, open_axes = _wired_by_elevation(table, profile)
-    _check_gons(table, profile, wirings, answers)
+    _check_gons(table, profile, readings, wirings, answers)
     _check_twins(table, profile, readings, wirings, answers)
     _check_magnetic(table, readings, wirings, columns)
     _check_repeats(table, columns, form or TableFormat())
@@ -642,31 +642,27 @@ def _wired_by_elevation(
     return _wired(table, msgspec.structs.replace(profile, columns=below))
 
 
-_MUCH_BETTER = 0.5
-"""Share of what an angle leaves unexplained that it leaves at most in the other unit, where it is in that."""
-
-
 def _check_gons(
-    table: Table, profile: Profile, wirings: Mapping[str, Wiring], answers: Collection[str]
+    table: Table,
+    profile: Profile,
+    readings: Readings,
+    wirings: Mapping[str, Wiring],
+    answers: Collection[str],
 ) -> None:
     """Ask about an angle of the stand in degrees that the readings fit far better in gons, or the other way."""
     columns = profile.columns
     assert not isinstance(columns, msgspec.UnsetType)
     for column in ANGLES_OF_STAND:
         source = columns.get(column)
-        if not wirings or not source or source.unit not in ("", "°", "gon") or column in answers:
+        if not source or source.unit not in ("", "°", "gon") or column in answers:
             continue
         units = ["°", "gon"] if source.unit == "gon" else ["gon", "°"]
-        other = {**columns, column: ColumnSource(name=source.name, unit=units[0])}
-        try:
-            *_, fits, _ = _wired(table, msgspec.structs.replace(profile, columns=other))
-        except (InputError, FitError):
-            continue
-        turned = [kind for kind in wirings if kind == "magnetometer" or "azimuth" not in column]
-        if turned and all(
-            kind in fits and fits[kind].unexplained < _MUCH_BETTER * wirings[kind].unexplained
-            for kind in turned
-        ):
+        angles = numbers(table, source.name)
+        left = [
+            _left(readings, wirings, column, angles * FACTORS.get(unit, (1.0,))[0])
+            for unit in units
+        ]
+        if left[0] < _FAR_BETTER * left[1]:
             raise QuestionError(
                 f"{table.source}: the readings fit {shown(source.name)} far better in {units[0]} than in {units[1]}. "
                 "Which unit holds?",
@@ -675,7 +671,7 @@ def _check_gons(
 
 
 _FAR_BETTER = 0.5
-"""Share of what an angle leaves of the readings that another one leaves at most which is that of the stand."""
+"""Share of what an angle leaves of the readings that the right one, or the right unit, leaves at most."""
 
 
 def _check_twins(
@@ -692,24 +688,32 @@ def _check_twins(
     """
     columns = profile.columns
     assert not isinstance(columns, msgspec.UnsetType)
-    named = {source.name for source in columns.values()}
-    others = {n: v for n in table.columns if n not in named and not is_of_tool(n) for v in [_plain_numbers(table, n)] if v is not None}
+    used = {source.name for source in columns.values()}
+    numbered = {n: v for n in table.columns if (v := _plain_numbers(table, n)) is not None}
     for column in ANGLES_OF_STAND:
-        if not wirings or column not in columns or column in answers or columns[column].unit not in ("", "°"):
+        source = columns.get(column)
+        if not wirings or not source or column in answers or source.unit not in ("", "°"):
             continue
-        stand = numbers(table, columns[column].name)
-        twins = [n for n, v in others.items() if _alike(v - stand) > _ONE_ANGLE and np.nanmax(np.abs(np.sin(np.radians(v - stand) / 2))) > 0]
-        left = {n: _left(readings, wirings, column, v) for n, v in [(columns[column].name, stand), *((n, others[n]) for n in twins)]}
-        best = min(left, key=lambda name: left[name])
-        if left[best] < _FAR_BETTER * left[columns[column].name]:
+        stand = numbers(table, source.name)
+        twins = {
+            n: v
+            for n, v in numbered.items()
+            if n not in used and not is_of_tool(n) and _alike(v - stand) > _ONE_ANGLE
+        }
+        left = {
+            n: _left(readings, wirings, column, v) for n, v in {source.name: stand, **twins}.items()
+        }
+        best, *others = sorted(left, key=lambda name: left[name])
+        if left[best] < _FAR_BETTER * left[source.name]:
             raise QuestionError(
-                f"{table.source}: {shown(best)} and {shown(columns[column].name)} tell one angle, and the readings fit the former far better. "
-                "Which one does the stand show?",
-                [Answer(n, (("column", f"{column}={n}"),)) for n in sorted(left, key=lambda name: left[name])],
+                f"{table.source}: {shown(best)} and {shown(source.name)} tell one angle, and the readings fit the "
+                "former far better. Which one does the stand show?",
+                [Answer(n, (("column", f"{column}={n}"),)) for n in (best, *others)],
             )
 
 
 def _plain_numbers(table: Table, name: str) -> Array | None:
+    """The numbers of a column; None where a cell has none."""
     with suppress(InputError):
         values = numbers(table, name)
         return values if np.isfinite(values).all() else None
@@ -717,7 +721,10 @@ def _plain_numbers(table: Table, name: str) -> Array | None:
 
 
 def _left(readings: Readings, wirings: Mapping[str, Wiring], column: str, values: Array) -> float:
-    """What an angle of the stand leaves of the readings of a triad, with any offsets and gains of its axes, as a share."""
+    """What an angle of the stand leaves of the readings of a triad, with any offsets and gains of its axes, as a share.
+
+    Offsets and gains may change with temperature.
+    """
     kind = "magnetometer" if "azimuth" in column else "accelerometer"
     if kind not in wirings:
         return 1.0
@@ -725,11 +732,19 @@ def _left(readings: Readings, wirings: Mapping[str, Wiring], column: str, values
     turned = replace(readings, known={**readings.known, name: np.radians(values)})
     whole = np.all([~np.isnan(turned.reference(n)) for n in NEEDED[kind]], 0)
     parts = np.concatenate(_parts(kind, turned, whole), -1)
+    if readings.temperature is not None:
+        warmth = readings.temperature[whole, None]
+        if np.ptp(warmth) > 0 and np.isfinite(warmth).all():
+            parts = np.concatenate([parts, warmth, (warmth - warmth.mean()) * parts], -1)
     raw = getattr(readings, kind)[whole]
+    if len(raw) < _MOST_COLUMNS * parts.shape[-1]:
+        return 1.0
     return float(np.sqrt(np.mean(_line(parts - parts.mean(0), raw - raw.mean(0))[1] ** 2)))
 
 
-_OTHER_NORTH = 2.0
+_MOST_COLUMNS = 2
+"""Stations for each column that is fitted, at least."""
+_ANOTHER_NORTH = 2.0
 """By how much the north of azimuths differs from that of the readings where it is another, degrees."""
 
 
@@ -766,7 +781,7 @@ def _check_magnetic(
     """Ask about azimuths that by the readings count from another north than magnetic, where no one says which."""
     azimuth = columns.get(REFERENCES["azimuth"].column)
     seen = magnetic_azimuth(readings, wirings) if azimuth else 0.0
-    if not azimuth or "azimuth_reference" in table.metadata or not abs(seen) > _OTHER_NORTH:
+    if not azimuth or "azimuth_reference" in table.metadata or not abs(seen) > _ANOTHER_NORTH:
         return
     raise QuestionError(
         f"{table.source}: by the readings magnetic north is at {seen:.1f}° of {shown(azimuth.name)}. From which north "
@@ -1138,6 +1153,19 @@ def units_contradicted(proposal: Proposal) -> list[Finding]:
     return findings
 
 
+def warmth_around(proposal: Proposal) -> list[Finding]:
+    """A finding on a temperature that is by its name that of the oven or the room, not of the sensors."""
+    columns = proposal.profile.columns
+    source = None if isinstance(columns, msgspec.UnsetType) else columns.get(WARMTH)
+    if source is None or not is_of_surroundings(source.name):
+        return []
+    text = (
+        f"{shown(source.name)} is taken as the temperature of the tool, of which there is no other column. It lags "
+        "behind the sensors: wait until it is steady, or state the tool's own."
+    )
+    return [Finding(id="oven-temperature", text=text)]
+
+
 def findings_on(proposal: Proposal) -> list[Finding]:
     """All that the reader of a proposal should know."""
     ignored = [
@@ -1146,7 +1174,7 @@ def findings_on(proposal: Proposal) -> list[Finding]:
     ]
     marked = [Finding(id=MARKED_ROWS, text=text) for text in proposal.remarks]
     known = axes_open(proposal) + left_handed(proposal) + references_not_taken(proposal) + marked
-    known += answers_by_readings(proposal) + units_contradicted(proposal)
+    known += answers_by_readings(proposal) + warmth_around(proposal) + units_contradicted(proposal)
     return known + ignored + unused_columns(proposal.unused)
 
 

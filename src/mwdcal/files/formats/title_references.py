@@ -18,7 +18,6 @@ from mwdcal.files.formats.columns import as_text, looks_numeric
 from mwdcal.files.formats.titles import Titles, titles
 from mwdcal.files.synonyms import FACTORS, unit_of
 
-
 EARTH_FIELD = (15_000.0, 80_000.0)
 """The least and the largest strength of the Earth's field, nT, with room for what is built around a stand."""
 EARTH_GRAVITY = (0.995, 1.004)
@@ -82,7 +81,8 @@ _OF_PLACES = (
     ),
 )
 _WRITTEN_UNIT = (
-    r"n\s?t\b|[uµμ]\s?t\b|m\s?t\b|milli ?gauss|m\s?g(al|auss)?\b|gauss|oe\b|a\s?/\s?m\b|gal\b|gons?\b|нтл|мктл|мтл|мгал|м/с²?|м/с2|"
+    r"n\s?t\b|[uµμ]\s?t\b|m\s?t\b|milli ?gauss|m\s?g(al|auss)?\b|gauss|oe\b|a\s?/\s?m\b|gal\b|gons?\b|нтл|мктл|мтл|"
+    r"мгал|м/с²?|м/с2|"
     r"m\s?/\s?s\s?(?:²|\^?2)?|[gг]\b(?!\s*[=:(\[]?\s*(?:[+-]?\d|m\s?/))|°|deg\w*|gra[ud]\w*|rad\b|град\w*|"
     r"fok|derece|stopni|度"
 )
@@ -228,9 +228,14 @@ def _with_columns(rows: Rows) -> list[Sequence[object]]:
     for above, below in pairwise(every):
         words = [as_text(cell).strip() for cell in above]
         cells = [as_text(cell).strip() for cell in below]
-        if not any(re.match(r"[-−+]?\d", word) for word in words) and len([*filter(None, words)]) > 1:
+        if (
+            not any(re.match(r"[-−+]?\d", word) for word in words)
+            and len([*filter(None, words)]) > 1
+        ):
             paired += [
-                [f"{word} {cell}"] for word, cell in zip(words, cells, strict=False) if word and re.match(r"[-−+]?\d", cell)
+                [f"{word} {cell}"]
+                for word, cell in zip(words, cells, strict=False)
+                if word and re.match(r"[-−+]?\d", cell)
             ]
     return [*every, *paired]
 
@@ -252,18 +257,30 @@ def _figures(text: str) -> Iterator[_Figure]:
         words = text[before.end() if before else 0 : match.start()].rpartition(";")[2]
         inner = [each[1] for each in _UNIT_ALONE.finditer(words)]
         behind = text[match.end() : after.start() if after else None].partition(";")[0]
-        yield _Figure(words, match["number"], _minutes(match), match["unit"] or (inner[-1] if inner else ""), behind)
+        yield _Figure(
+            words,
+            match["number"],
+            _minutes(match),
+            match["unit"] or (inner[-1] if inner else ""),
+            behind,
+        )
 
 
 def _by_unit(text: str) -> Iterator[tuple[str, float]]:
     """Strengths of field and gravity that a line states in whatever words, by their units and sizes."""
     for figure in _figures(text):
         said = figure.words if re.search(r"[^\W\d_]", figure.words) else text
-        if _NO_PLACE.search(f"{said} {figure.behind}") or re.match(r"\s*/\s*[^\W\d_]", figure.behind):
+        if _NO_PLACE.search(f"{said} {figure.behind}") or re.match(
+            r"\s*/\s*[^\W\d_]", figure.behind
+        ):
             continue
         for quantity in (_OF_PLACES[0], _OF_PLACES[2]):
             unit = _stated_unit(quantity, figure.unit)
-            values = {_converted(n, unit) for n in _numbers(figure.number)} if unit in quantity.units else set()
+            values = (
+                {_converted(n, unit) for n in _numbers(figure.number)}
+                if unit in quantity.units
+                else set()
+            )
             inside = {v for v in values if quantity.low <= v <= quantity.high} - {1.0}
             if len(inside) == 1:
                 yield quantity.column, inside.pop()
@@ -273,7 +290,11 @@ def _inclinations(text: str) -> Iterator[float]:
     """The angles that a line calls an inclination in some language, and not that of a stand or a hole."""
     for figure in _figures(text):
         word = _INCLINED.search(figure.words)
-        if not word or _OF_STAND.search(figure.words) or _NO_PLACE.search(f"{figure.words} {figure.behind}"):
+        if (
+            not word
+            or _OF_STAND.search(figure.words)
+            or _NO_PLACE.search(f"{figure.words} {figure.behind}")
+        ):
             continue
         if _stated_unit(_OF_PLACES[1], figure.unit) in ("", "°"):
             inside = {n for n in _numbers(figure.number, figure.minutes) if 0 < abs(n) < 90}
@@ -300,7 +321,7 @@ def _clauses(row: Sequence[object]) -> str:
     for cell in filter(None, (_plain(as_text(each)).strip() for each in row)):
         unit = re.fullmatch(rf"[(\[]?({_WRITTEN_UNIT})[)\]]?", cell)
         text += f"; {cell}" if ends and not unit else f" {cell}"
-        ends = not unit and bool(re.search(rf"(?<![\w.,])[+\-−]?\d[^;]*$", cell))
+        ends = not unit and bool(re.search(r"(?<![\w.,])[+\-−]?\d[^;]*$", cell))
     return text.strip()
 
 
@@ -358,7 +379,9 @@ def doubtful_in(rows: Rows, besides: Rows = ()) -> dict[str, str]:
             if _in_unit(quantity, numbers) - {1.0}:
                 lines.setdefault(quantity.column, line)
         for quantity, figure in product(_OF_PLACES, _figures(plain)):
-            if _is_called(quantity, figure) and not _UNSURE.search(f"{figure.words} {figure.behind}"):
+            if _is_called(quantity, figure) and not _UNSURE.search(
+                f"{figure.words} {figure.behind}"
+            ):
                 lines.setdefault(quantity.column, line)
     return lines
 
@@ -366,18 +389,30 @@ def doubtful_in(rows: Rows, besides: Rows = ()) -> dict[str, str]:
 def _is_called(quantity: _Quantity, figure: _Figure) -> bool:
     """Whether words right before a number are those of a quantity, and the number is no count: dip 97.2."""
     words = _UNIT_ALONE.sub("", figure.words)
-    called = re.search(rf"{_BEGINNING}({quantity.words})\W*(?:{_REFERRING.pattern}\W*)*$", words, re.IGNORECASE)
+    called = re.search(
+        rf"{_BEGINNING}({quantity.words})\W*(?:{_REFERRING.pattern}\W*)*$", words, re.IGNORECASE
+    )
     return bool(called) and bool(figure.unit or len(figure.number) > 2)
 
 
 def _plain(text: str) -> str:
     """Small letters without marks; the signs of units stay."""
-    kept = text.replace("_", " ").replace("°", "\0").replace("º", "\0").replace("²", "\1").replace("й", "\2")
+    kept = (
+        text.replace("_", " ")
+        .replace("°", "\0")
+        .replace("º", "\0")
+        .replace("²", "\1")
+        .replace("й", "\2")
+    )
     plain = unicodedata.normalize("NFKD", kept.lower().translate({ord("ø"): "o", ord("ß"): "ss"}))
     bare = "".join(c for c in plain if not unicodedata.combining(c))
     bare = re.sub(r"(?<=[\u4e00-\u9fff])(?=[a-zµμ])", " ", bare)
     signs = bare.replace("\0", "°").replace("\1", "²").replace("\2", "й")
-    return re.sub(r"(?<![a-zа-я])(?:[mм]\s?/\s?[sс]\s?(?:\^?2|²)|m\s?[.·*]?\s?s\^?[-−]2|mps2?)(?!\d)", "m/s²", signs)
+    return re.sub(
+        r"(?<![a-zа-я])(?:[mм]\s?/\s?[sс]\s?(?:\^?2|²)|m\s?[.·*]?\s?s\^?[-−]2|mps2?)(?!\d)",
+        "m/s²",
+        signs,
+    )
 
 
 def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
