@@ -307,14 +307,35 @@ def test_what_the_readings_do_not_fit_is_asked(tmp_path):
         assert "no column is 'ref_toolface_deg' by its name" in message
 
 
-def test_an_azimuth_of_another_name_is_asked_since_it_may_count_from_another_north(tmp_path):
-    columns = {("Kolbo (°)" if n == "Azi (deg)" else n): v for n, v in mixed(table()).items()}
-    path = written(tmp_path / "a.csv", columns)
+@pytest.mark.parametrize("name", ["Kolbo (°)", "Azmi (deg)"])
+def test_an_azimuth_of_another_name_is_told_by_the_readings_where_its_north_is_magnetic(
+    tmp_path, name
+):
+    columns = {(name if n == "Azi (deg)" else n): v for n, v in mixed(table()).items()}
+    proposal = library.propose_profile(written(tmp_path / "a.csv", columns))
+    assert f"ref_azimuth_deg={name}" in findings_of(proposal)["told-by-readings"]
+    columns[name] = [azimuth + 5.0 for azimuth in columns[name]]
+    path = written(tmp_path / "b.csv", columns)
     message = refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
     assert "no column is 'ref_azimuth_deg' by its name" in message
-    columns = {("Azmi (deg)" if n == "Azi (deg)" else n): v for n, v in table().items()}
-    proposal = library.propose_profile(written(tmp_path / "b.csv", columns))
-    assert "ref_azimuth_deg=Azmi (deg)" in findings_of(proposal)["told-by-readings"]
+
+
+@pytest.mark.parametrize(("declination", "asked"), [(5.0, True), (-4.0, True), (0.5, False)])
+def test_azimuths_from_another_north_are_asked_about_by_the_readings(tmp_path, declination, asked):
+    """True azimuth is magnetic azimuth plus declination: magnetic north is at that azimuth."""
+    columns = table()
+    columns["Azi (deg)"] = (np.asarray(columns["Azi (deg)"]) + declination) % 360
+    path = written(tmp_path / "a.csv", columns)
+    if not asked:
+        library.propose_profile(path)
+        return
+    with pytest.raises(FitError, match="by the readings magnetic north is at") as error:
+        library.propose_profile(path)
+    seen = float(re.search(r"north is at (\S+)°", str(error.value))[1])
+    assert seen == pytest.approx(declination, abs=0.3)
+    run = read(path, north="true", declination_deg=declination)
+    plain = read(written(tmp_path / "b.csv", table()))
+    assert run.reference("azimuth") == pytest.approx(plain.reference("azimuth"))
 
 
 def test_radians_under_degrees_are_told_by_the_readings(tmp_path):

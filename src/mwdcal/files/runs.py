@@ -284,7 +284,9 @@ def _check_below_names(path: str | os.PathLike[str], form: TableFormat, profile:
 def _alike_units(written: str, stated: str) -> bool:
     """Whether a unit as it is written may be the one of a profile: G is also Gauss, and ° any sense of an angle."""
     return (
-        written == stated or stated.startswith(f"{written} ") or (written, stated) == ("g", "gauss")
+        written == stated
+        or stated.startswith(f"{written} ")
+        or (written, stated) in (("g", "gauss"), ("°", "°F"), ("°", "°C"))
     )
 
 

@@ -21,6 +21,7 @@ from mwdcal.files.contract import (
     units_of,
 )
 from mwdcal.files.formats.columns import LABELS, shown
+from mwdcal.files.formats.title_references import EARTH_FIELD, EARTH_GRAVITY
 from mwdcal.files.profiles import setting
 from mwdcal.files.synonyms import (
     ABOVE,
@@ -45,10 +46,10 @@ BOTH_UNITS = " and "
 IN_BRACKETS = re.compile(r"[(\[]([^)\]]*)[)\]]\s*$")
 RANGES_BY_UNIT: dict[str, tuple[tuple[str, float, float], ...]] = {
     "ref_gravity_g": (
-        ("g", 0.9, 1.1), ("m/s²", 9.0, 10.5), ("mg", 990.0, 1010.0), ("mGal", 970_000.0, 990_000.0),
+        ("g", *EARTH_GRAVITY), ("m/s²", 9.757, 9.846), ("mg", 995.0, 1004.0), ("mGal", 975_700.0, 984_600.0),
     ),
     "ref_field_nt": (
-        ("nT", 15_000.0, 80_000.0), ("µT", 15.0, 80.0), ("gauss", 0.15, 0.8), ("mT", 0.015, 0.08),
+        ("nT", *EARTH_FIELD), ("µT", 15.0, 80.0), ("gauss", 0.15, 0.8), ("mT", 0.015, 0.08),
     ),
 }  # fmt: skip
 """Units of quantities of which the Earth has but one range of values; 980 may be milli-g or gal."""
@@ -61,6 +62,10 @@ _FEW = 4
 """Values of a column that a question shows."""
 _OF_PLACE = 0.01
 """By how much the field or gravity of a place varies at most, as a share."""
+_SAME_DIP = 0.2
+"""By how much the dip of a place varies at most, degrees."""
+_FOLLOWS = 0.9
+"""Correlation from which on a column follows what is computed."""
 _STEADY_DIP, _STEADY_FIELD = 3.0, 0.1
 """A dip varies by less at one place, degrees, and a field by a smaller share."""
 STEADY_NORM = 0.15
@@ -96,6 +101,20 @@ def is_filler(values: Array) -> Bools:
     [True, True, False, False]
     """
     return np.asarray([_FILLER.fullmatch(f"{value:.12g}") is not None for value in values], bool)
+
+
+def is_of_tool(name: str) -> bool:
+    """Whether a column is called what the tool has measured, or a program computed."""
+    return bool(_MEASURED.search(spelled(name)))
+
+
+def is_of_surroundings(name: str) -> bool:
+    """Whether a column is called the temperature of an oven or a room.
+
+    >>> is_of_surroundings("Oven temp"), is_of_surroundings("Temp")
+    (True, False)
+    """
+    return bool(_SURROUNDINGS.search(name))
 
 
 def is_numbering(values: Array) -> bool:
@@ -226,7 +245,7 @@ def may_be(column: str, name: str, unit: str, values: Array | None) -> bool:
         ranges = {unit: (least, most) for unit, least, most in RANGES_BY_UNIT[column]}
         least, most = ranges.get("nT" if not stated and not foreign else stated, (np.inf, -np.inf))
         return least <= low and high <= most and high - low < _STEADY_FIELD * high
-    if foreign or stated not in ("", "°", "rad", "gon") or high - low < _LEAST_TURN:
+    if stated not in ("", "°", "rad", "gon") or high - low < _LEAST_TURN:
         return False
     inside = 0 <= low <= high <= 180 if "inclination" in column else -360 <= low <= high <= 360
     return inside and not is_numbering(known)
@@ -270,8 +289,18 @@ _OF_NORTH = re.compile(r"north|nord|norte|azi|azm|heading|азим|север|�
 _TWICE = re.compile(r" \(\d+\)$")
 """The end of a name that stands in a table more than once."""
 _NUMBERED = re.compile(r"(.*?[A-Za-z])[ _-]*([123])((?:\W.*|_[A-Za-z]+)?)")
+_ANGLES_AND_WARMTH = (
+    *(REFERENCES[name].column for name in ("inclination", "azimuth", "toolface")),
+    WARMTH,
+)
+"""Columns of which values tell the unit where a word that is none stands for it, such as deg of a temperature."""
 BY_NAME_ALONE = (WARMTH, REFERENCES["gravity"].column)
 """Columns that a run may lack, and that values alone do not tell."""
+_OF_PLACE_ALONE = tuple(REFERENCES[name].column for name in ("gravity", "field", "dip"))
+"""Columns of what a place has, and no setting of the stand changes."""
+_OF_TOOL = re.compile(
+    r"(?<![^\W\d_])(tool|probe|sonde|sonda|mwd|firmware|fw)(?![^\W\d_])", re.IGNORECASE
+)
 _TITLE = re.compile(
     r"(acc|mag|accelerometers?|magnetometers?)?(?:s|ref|sensors?)? +", re.IGNORECASE
 )
@@ -290,6 +319,11 @@ _CCW = re.compile(
     re.IGNORECASE,
 )
 """Words of angles that count anticlockwise."""
+_FROM_HORIZONTAL = re.compile(
+    r"hori[sz]|orizz|горизонт|обрі|waag\w*recht|v(a|å|aa)n+ret|vaaka|poziom|vodorovn|vizszint|yatay|水平",
+    re.IGNORECASE,
+)
+"""Words of angles that count from the horizontal."""
 _DOWNWARDS = re.compile(
     r"below|\b(down(wards?)?|nach unten|nedover|hacia abajo|para baixo|vers le bas|вниз)\b|向下|俯角",
     re.IGNORECASE,
@@ -310,6 +344,8 @@ COOLEST_FAHRENHEIT = 45.0
 """Numbers below it are degrees Celsius: no tool is calibrated below 7 °C alone."""
 COLDEST_KELVIN = 200.0
 """Numbers below it are no kelvins: hardly a tool works below -73 °C."""
+OVER_CELSIUS = 260.0
+"""Numbers above it, beside some that are no kelvins, are degrees Fahrenheit."""
 HOTTEST_CELSIUS = 200.0
 """Numbers above it may be degrees Fahrenheit: hardly a tool works above 200 °C."""
 
@@ -334,6 +370,10 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     alike = (
         resembled(plain) or _without_title(plain) or resembled(f"{name} ({unit})" if unit else name)
     )
+    if level := _FROM_HORIZONTAL.search(name):
+        bare = alike or meaning(_bare(name, level), unit)
+        if bare and bare.column == REFERENCES["inclination"].column:
+            return bare._replace(unit=BELOW if _DOWNWARDS.search(plain) else ABOVE)
     if alike and alike.column in RAW and _CALLED_REFERENCE.search(plain):
         return alike._replace(column=REFERENCE_VECTORS[RAW.index(alike.column)])
     if _MEASURED.search(plain) and not (alike and alike.column == WARMTH):
@@ -344,6 +384,13 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     if alike and alike.column == REFERENCES["azimuth"].column and alike.unit.startswith("mag"):
         return alike._replace(unit="")
     return alike or (Resemblance(spelt, unit_of(stated[1]) if stated else "") if spelt else None)
+
+
+def _bare(name: str, level: re.Match[str]) -> str:
+    """A name without its words from one such as "from" before the horizontal on, but with its unit."""
+    head = re.sub(r"\W+[^\W\d_]{1,4}\W*$", "", name[: level.start()])
+    unit = IN_BRACKETS.search(name)
+    return f"{head} {unit[0] if unit and level.start() < unit.start() else ''}".strip()
 
 
 def _measured_channel(name: str) -> Resemblance | None:
@@ -386,6 +433,7 @@ def meanings_of(names: Sequence[str], units: Sequence[str]) -> dict[str, Resembl
         name: m for name, unit in zip(names, units, strict=True) if (m := meaning(once[name], unit))
     }
     results |= _behind_titles(names, units, results)
+    results |= _beside_nominal(names, results)
     every = [n for n, m in results.items() if m.column == "az"]
     lone = [n for n in every if _BARE_AZ.fullmatch(n)]
     triad = [n for n in every if n not in lone[:1]] or any(_BARE_AX.fullmatch(n) for n in names)
@@ -396,6 +444,23 @@ def meanings_of(names: Sequence[str], units: Sequence[str]) -> dict[str, Resembl
     if len(dips) == 1 and any(re.search("neigung", n, re.IGNORECASE) for n in inclined):
         results[dips[0]] = results[dips[0]]._replace(column="ref_dip_deg")
     return results
+
+
+def _beside_nominal(
+    names: Sequence[str], meanings: Mapping[str, Resemblance]
+) -> dict[str, Resemblance]:
+    """Angles that the stand shows, beside those of the same name to which it was to be set: Ist beside Soll."""
+    nominal = {
+        _NOMINAL.sub("", name): m
+        for name, m in meanings.items()
+        if m.column in _ANGLES_AND_WARMTH[:3] and _NOMINAL.search(name)
+    }
+    shown_ones = (
+        (name, _OF_CHANNELS.sub("", _ACTUAL.sub("", name)))
+        for name in names
+        if name not in meanings
+    )
+    return {name: nominal[bare] for name, bare in shown_ones if bare != name and bare in nominal}
 
 
 def _behind_titles(
@@ -620,8 +685,12 @@ def _no_evidence(
             ignored[name] = "as you say"
         elif m.column in answers:
             continue
-        elif _is_total(m.column, name, meanings, values):
+        elif _is_total(m.column, name, meanings, values) or _is_dip_of(
+            m.column, name, meanings, values
+        ):
             ignored[name] = "it is computed from the channels"
+        elif m.column in _OF_PLACE_ALONE and _OF_TOOL.search(name):
+            ignored[name] = "by its name the tool has measured it"
         elif m.column in stated and _varies(m.column, name, values(name)):
             ignored[name] = (
                 "it varies from station to station, and the title states that of the place"
@@ -636,8 +705,10 @@ def _no_evidence(
 
 def _varies(column: str, name: str, values: Array | None) -> bool:
     """Whether a strength that is not called a reference varies by more than that of a place does."""
-    if values is None or column not in RANGES_BY_UNIT or _CALLED_REFERENCE.search(spelled(name)):
+    if values is None or column not in _OF_PLACE_ALONE or _CALLED_REFERENCE.search(spelled(name)):
         return False
+    if column not in RANGES_BY_UNIT:
+        return bool(np.nanmax(values) - np.nanmin(values) > _SAME_DIP)
     return bool(np.nanmax(values) - np.nanmin(values) > _OF_PLACE * np.nanmax(np.abs(values)))
 
 
@@ -705,6 +776,24 @@ def _is_total(column: str, name: str, meanings: Mapping[str, Resemblance], value
         return False
     in_its_unit = norm * np.median(total / norm)
     return bool(np.abs(in_its_unit - total).max() < 0.02 * np.ptp(in_its_unit))
+
+
+def _is_dip_of(column: str, name: str, meanings: Mapping[str, Resemblance], values: Values) -> bool:
+    """Whether a dip varies as the one that the channels give, whose biases turn it from station to station."""
+    dip = values(name) if column == REFERENCES["dip"].column else None
+    called = {m.column: n for n, m in meanings.items()}
+    if dip is None or not {*RAW} <= {*called} or not np.isfinite(dip).all() or np.ptp(dip) == 0:
+        return False
+    triads = [[values(called[each]) for each in names] for names in CHANNELS.values()]
+    if any(cells is None for triad in triads for cells in triad):
+        return False
+    g, b = (np.array(triad, float) for triad in triads)
+    with np.errstate(all="ignore"):
+        computed = np.degrees(
+            np.arcsin(np.sum(g * b, 0) / (np.linalg.norm(g, axis=0) * np.linalg.norm(b, axis=0)))
+        )
+        alike = np.corrcoef(dip, computed)[0, 1]
+    return bool(alike > _FOLLOWS)
 
 
 def _check_lacking(column: str, others: Mapping[str, str], values: Values, source: str) -> None:
@@ -894,7 +983,7 @@ def _one(column: str, candidates: Sequence[str], values: Values, source: str) ->
         of_tool = [n for n in candidates if not _SURROUNDINGS.search(n)] or candidates
         candidates = [n for n in of_tool if not _CALLED_REFERENCE.search(spelled(n))] or of_tool
     stated = [name for name in candidates if _CALLED_REFERENCE.search(spelled(name))]
-    shows = [name for name in stated if _ACTUAL.search(name) and not _NOMINAL.search(name)]
+    shows = [name for name in candidates if _ACTUAL.search(name) and not _NOMINAL.search(name)]
     others = [name for name in candidates if name not in shows]
     if len(shows) == 1 and all(map(_NOMINAL.search, others)):
         return shows[0]
@@ -918,7 +1007,13 @@ def _unit(column: str, name: str, stated: str, values: Array | None, source: str
     if stated:
         stated = _before_comment(column, stated) or stated
         if stated in allowed:
-            return stated
+            return ABOVE if stated == "°" and _is_elevation(column, values) else stated
+        if (
+            column in _ANGLES_AND_WARMTH
+            and unit_of(stated) in ("", "°")
+            and BOTH_UNITS not in stated
+        ):
+            return _unit_by_values(column, name, values[np.isfinite(values)], source)
         if BOTH_UNITS in stated:
             raise QuestionError(
                 f"{source}: {shown(name)} is in {stated}: its name, the row below it and its cells say different "
@@ -931,6 +1026,13 @@ def _unit(column: str, name: str, stated: str, values: Array | None, source: str
             [*in_units(name, column, allowed), none_of(column)],
         )
     return _unit_by_values(column, name, values[np.isfinite(values)], source)
+
+
+def _is_elevation(column: str, values: Array) -> bool:
+    """Whether an inclination has values that only an angle from the horizontal has."""
+    if column != REFERENCES["inclination"].column or not np.isfinite(values).any():
+        return False
+    return bool(-90 <= np.nanmin(values) < 0 and np.nanmax(values) <= 90)
 
 
 def _before_comment(column: str, stated: str) -> str:
@@ -950,6 +1052,15 @@ def _unit_by_values(column: str, name: str, known: Array, source: str) -> str:
         raise _open(name, column, allowed, known, source)
     if allowed[0] == "°" and 360 < np.abs(known).max(initial=0) <= 400:
         raise _open(name, column, ("gon", "°"), known, source)
+    if known.size and _is_elevation(column, known):
+        return ABOVE
+    if (
+        allowed[0] == "°C"
+        and known.size
+        and known.min() < COLDEST_KELVIN
+        and known.max() > OVER_CELSIUS
+    ):
+        return "°F"
     both = {"°": _maybe_radians, "°C": _maybe_fahrenheit}.get(allowed[0])
     if both and known.size and both(known):
         if allowed[0] == "°C" and (usual := setting("temperature_unit")):

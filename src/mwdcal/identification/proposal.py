@@ -39,7 +39,8 @@ from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
 from mwdcal.identification.columns import (
     in_units,
     is_filler,
-    is_near,
+    is_of_surroundings,
+    is_of_tool,
     meanings_of,
     north_of,
     proposed,
@@ -97,9 +98,8 @@ def check_cells(table: Table, columns: Mapping[str, ColumnSource]) -> None:
         factor, offset = (
             FACTORS.get(columns[column].unit, (1.0, 0.0)) if units_of(column) else (1.0, 0.0)
         )
-        wrong = (is_filler(values) & _is_outside_others(values)) | RANGES[column].outside(
-            values * factor + offset
-        )
+        filler = is_filler(values) & (_is_outside_others(values) | (values % 1 != 0))
+        wrong = filler | RANGES[column].outside(values * factor + offset)
         if column in (*RAW, WARMTH) and not np.isnan(values).all():
             wrong |= np.isnan(values)
         if column in RAW:
@@ -397,7 +397,9 @@ def _proposal(
     table = _of_one_tool(table, columns, stated)
     profile = Profile(name=Path(path).stem, table=form or msgspec.UNSET, columns=columns)
     profile, readings, wirings, open_axes = _wired_by_elevation(table, profile)
-    _check_gons(table, profile, wirings, answers)
+    _check_gons(table, profile, readings, wirings, answers)
+    _check_twins(table, profile, readings, wirings, answers)
+    _check_magnetic(table, readings, wirings, columns)
     _check_repeats(table, columns, form or TableFormat())
     name, triads = str(readings.metadata.get("serial", Path(path).stem)), _triads(readings, wirings)
     profile = msgspec.structs.replace(profile, name=name, **triads)
@@ -416,8 +418,8 @@ def _is_formulas(cells: Sequence[str]) -> bool:
 # An answer that the readings give: at known attitudes the right columns and units of angles and channels leave a few
 # per cent of the channels' variation unexplained, wrong ones most of it.
 
-_OF_READINGS = (*RAW, *(REFERENCES[name].column for name in ("inclination", "toolface")))
-"""Columns that readings tell; azimuths may count from another north."""
+_OF_READINGS = (*RAW, *(REFERENCES[name].column for name in ("inclination", "azimuth", "toolface")))
+"""Columns that readings tell."""
 _MOST_TRIES = 40
 """Answers to open questions, in all their combinations, that are tried."""
 _CONFIRMED = 0.1
@@ -427,8 +429,8 @@ _ANGLE_UNITS = (180 / np.pi, 0.9)
 """Degrees of a radian and of a gon."""
 _SPREAD = 0.97
 """Length of the mean direction of a column above which it hardly turns: 14° of scatter."""
-_ONE_ANGLE = 0.99
-"""Length of the mean direction of differences of two columns above which they tell one angle: 8° of scatter."""
+_ONE_ANGLE = 0.999
+"""Length of the mean direction of differences of two columns above which they tell one angle: 2.6° of scatter."""
 
 
 def _answer_by_readings(
@@ -496,12 +498,10 @@ def _alike(angles: Array) -> float:
 
 
 def _is_of_readings(answer: Answer) -> bool:
-    """Whether an answer names columns that the readings tell, or an azimuth by a mistyped name."""
+    """Whether an answer names columns that the readings tell; of azimuths they tell the north as well."""
     pairs = [text.partition("=") for argument, text in answer.arguments if argument == "column"]
-    azimuth = REFERENCES["azimuth"].column
     return len(pairs) == len(answer.arguments) and all(
-        name and (column in _OF_READINGS or (column == azimuth and is_near(column, name)))
-        for column, _, name in pairs
+        name and column in _OF_READINGS for column, _, name in pairs
     )
 
 
@@ -642,36 +642,156 @@ def _wired_by_elevation(
     return _wired(table, msgspec.structs.replace(profile, columns=below))
 
 
-_MUCH_BETTER = 0.5
-"""Share of what an angle leaves unexplained that it leaves at most in the other unit, where it is in that."""
-
-
 def _check_gons(
-    table: Table, profile: Profile, wirings: Mapping[str, Wiring], answers: Collection[str]
+    table: Table,
+    profile: Profile,
+    readings: Readings,
+    wirings: Mapping[str, Wiring],
+    answers: Collection[str],
 ) -> None:
     """Ask about an angle of the stand in degrees that the readings fit far better in gons, or the other way."""
     columns = profile.columns
     assert not isinstance(columns, msgspec.UnsetType)
     for column in ANGLES_OF_STAND:
         source = columns.get(column)
-        if not wirings or not source or source.unit not in ("", "°", "gon") or column in answers:
+        if not source or source.unit not in ("", "°", "gon") or column in answers:
             continue
         units = ["°", "gon"] if source.unit == "gon" else ["gon", "°"]
-        other = {**columns, column: ColumnSource(name=source.name, unit=units[0])}
-        try:
-            *_, fits, _ = _wired(table, msgspec.structs.replace(profile, columns=other))
-        except (InputError, FitError):
-            continue
-        turned = [kind for kind in wirings if kind == "magnetometer" or "azimuth" not in column]
-        if turned and all(
-            kind in fits and fits[kind].unexplained < _MUCH_BETTER * wirings[kind].unexplained
-            for kind in turned
-        ):
+        angles = numbers(table, source.name)
+        left = [
+            _left(readings, wirings, column, angles * FACTORS.get(unit, (1.0,))[0])
+            for unit in units
+        ]
+        if left[0] < _FAR_BETTER * left[1]:
             raise QuestionError(
                 f"{table.source}: the readings fit {shown(source.name)} far better in {units[0]} than in {units[1]}. "
                 "Which unit holds?",
                 in_units(source.name, column, units),
             )
+
+
+_FAR_BETTER = 0.5
+"""Share of what an angle leaves of the readings that the right one, or the right unit, leaves at most."""
+
+
+def _check_twins(
+    table: Table,
+    profile: Profile,
+    readings: Readings,
+    wirings: Mapping[str, Wiring],
+    answers: Collection[str],
+) -> None:
+    """Ask about an angle of the stand beside which another column tells the same and fits the readings far better.
+
+    One may be what the stand was set to, the other what it shows. A column that is called measured or computed is
+    the tool's.
+    """
+    columns = profile.columns
+    assert not isinstance(columns, msgspec.UnsetType)
+    used = {source.name for source in columns.values()}
+    numbered = {n: v for n in table.columns if (v := _plain_numbers(table, n)) is not None}
+    for column in ANGLES_OF_STAND:
+        source = columns.get(column)
+        if not wirings or not source or column in answers or source.unit not in ("", "°"):
+            continue
+        stand = numbers(table, source.name)
+        twins = {
+            n: v
+            for n, v in numbered.items()
+            if n not in used and not is_of_tool(n) and _alike(v - stand) > _ONE_ANGLE
+        }
+        left = {
+            n: _left(readings, wirings, column, v) for n, v in {source.name: stand, **twins}.items()
+        }
+        best, *others = sorted(left, key=lambda name: left[name])
+        if left[best] < _FAR_BETTER * left[source.name]:
+            raise QuestionError(
+                f"{table.source}: {shown(best)} and {shown(source.name)} tell one angle, and the readings fit the "
+                "former far better. Which one does the stand show?",
+                [Answer(n, (("column", f"{column}={n}"),)) for n in (best, *others)],
+            )
+
+
+def _plain_numbers(table: Table, name: str) -> Array | None:
+    """The numbers of a column; None where a cell has none."""
+    with suppress(InputError):
+        values = numbers(table, name)
+        return values if np.isfinite(values).all() else None
+    return None
+
+
+def _left(readings: Readings, wirings: Mapping[str, Wiring], column: str, values: Array) -> float:
+    """What an angle of the stand leaves of the readings of a triad, with any offsets and gains of its axes, as a share.
+
+    Offsets and gains may change with temperature.
+    """
+    kind = "magnetometer" if "azimuth" in column else "accelerometer"
+    if kind not in wirings:
+        return 1.0
+    name = column.removeprefix("ref_").removesuffix("_deg")
+    turned = replace(readings, known={**readings.known, name: np.radians(values)})
+    whole = np.all([~np.isnan(turned.reference(n)) for n in NEEDED[kind]], 0)
+    parts = np.concatenate(_parts(kind, turned, whole), -1)
+    if readings.temperature is not None:
+        warmth = readings.temperature[whole, None]
+        if np.ptp(warmth) > 0 and np.isfinite(warmth).all():
+            parts = np.concatenate([parts, warmth, (warmth - warmth.mean()) * parts], -1)
+    raw = getattr(readings, kind)[whole]
+    if len(raw) < _MOST_COLUMNS * parts.shape[-1]:
+        return 1.0
+    return float(np.sqrt(np.mean(_line(parts - parts.mean(0), raw - raw.mean(0))[1] ** 2)))
+
+
+_MOST_COLUMNS = 2
+"""Stations for each column that is fitted, at least."""
+_ANOTHER_NORTH = 2.0
+"""By how much the north of azimuths differs from that of the readings where it is another, degrees."""
+
+
+def magnetic_azimuth(readings: Readings, wirings: Mapping[str, Wiring]) -> float:
+    """The azimuth (degrees) of magnetic north by the readings, from where the azimuths of the stand count.
+
+    Definition: the angle of the horizontal part of the field, fitted to the magnetometers with one offset on each axis.
+    NaN where the attitudes do not tell its east from its north part.
+    """
+    if "magnetometer" not in wirings or readings.magnetometer is None:
+        return np.nan
+    angles = [readings.reference(name) for name in NEEDED["magnetometer"]]
+    whole = np.all([~np.isnan(angle) for angle in angles], 0)
+    permutation = TriadProfile(axes=wirings["magnetometer"].axes).permutation  # type: ignore[arg-type]
+    field = (readings.magnetometer @ permutation.transpose())[whole]
+    turn = tool_from_earth(*(angle[whole] for angle in angles))
+    moved = (turn - turn.mean(0)).reshape(-1, 3)
+    if np.linalg.cond(moved) > _SINGULAR:
+        return np.nan
+    north, east, _ = np.linalg.lstsq(moved, (field - field.mean(0)).ravel(), rcond=None)[0]
+    return float(np.degrees(np.arctan2(east, north)))
+
+
+_SINGULAR = 20.0
+"""Ratio of the best to the least determined part of a field above which attitudes do not tell it."""
+
+
+def _check_magnetic(
+    table: Table,
+    readings: Readings,
+    wirings: Mapping[str, Wiring],
+    columns: Mapping[str, ColumnSource],
+) -> None:
+    """Ask about azimuths that by the readings count from another north than magnetic, where no one says which."""
+    azimuth = columns.get(REFERENCES["azimuth"].column)
+    seen = magnetic_azimuth(readings, wirings) if azimuth else 0.0
+    if not azimuth or "azimuth_reference" in table.metadata or not abs(seen) > _ANOTHER_NORTH:
+        return
+    raise QuestionError(
+        f"{table.source}: by the readings magnetic north is at {seen:.1f}° of {shown(azimuth.name)}. From which north "
+        "does it count, and what is the declination, degrees east?",
+        [
+            Answer("true north", (("north", "true"),), ("declination_deg",)),
+            Answer("grid north", (("north", "grid"),), ("declination_deg", "convergence_deg")),
+            Answer("magnetic north after all", (("north", "magnetic"),)),
+        ],
+    )
 
 
 _APART, _WARMER = 0.005, 3.0
@@ -1033,6 +1153,19 @@ def units_contradicted(proposal: Proposal) -> list[Finding]:
     return findings
 
 
+def warmth_around(proposal: Proposal) -> list[Finding]:
+    """A finding on a temperature that is by its name that of the oven or the room, not of the sensors."""
+    columns = proposal.profile.columns
+    source = None if isinstance(columns, msgspec.UnsetType) else columns.get(WARMTH)
+    if source is None or not is_of_surroundings(source.name):
+        return []
+    text = (
+        f"{shown(source.name)} is taken as the temperature of the tool, of which there is no other column. It lags "
+        "behind the sensors: wait until it is steady, or state the tool's own."
+    )
+    return [Finding(id="oven-temperature", text=text)]
+
+
 def findings_on(proposal: Proposal) -> list[Finding]:
     """All that the reader of a proposal should know."""
     ignored = [
@@ -1041,7 +1174,7 @@ def findings_on(proposal: Proposal) -> list[Finding]:
     ]
     marked = [Finding(id=MARKED_ROWS, text=text) for text in proposal.remarks]
     known = axes_open(proposal) + left_handed(proposal) + references_not_taken(proposal) + marked
-    known += answers_by_readings(proposal) + units_contradicted(proposal)
+    known += answers_by_readings(proposal) + warmth_around(proposal) + units_contradicted(proposal)
     return known + ignored + unused_columns(proposal.unused)
 
 

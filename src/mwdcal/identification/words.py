@@ -143,6 +143,7 @@ def spelled(name: str) -> str:
     text = unicodedata.normalize("NFKD", text)
     text = "".join(c for c in text if not unicodedata.combining(c)).replace("_", " ")
     text = text.replace("\0", "°").replace("\1", "²")
+    text = re.sub(r"(?<![^\W_])([^\W\d_])\.(?=[^\W\d_](?![^\W_]))", r"\1", text)  # T.F.
     for pattern, word in TRANSLATIONS:
         text = re.sub(pattern, word, text, flags=re.IGNORECASE)
     return text.strip()

@@ -441,7 +441,7 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
     sign = decimal or figures.decimal_sign([c for column in columns for c in column], source)
     read = [*map(figures.column, columns, figures.signs_of(columns, sign))]
     above = [row for _, row in rows[:top]]
-    block = stated_above(above)
+    block = stated_above(above, _beside(columns, others))
     texts = [figures.as_they_stand(column) for column in columns]
     whole, joined = _with_minutes(names, [cells for cells, _ in read])
     stated = {
@@ -475,6 +475,16 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
         ),
         places=dict(zip(names, letters, strict=True)) if sheet.name else {},
     )
+
+
+def _beside(
+    columns: Sequence[Sequence[object]], others: Sequence[tuple[int, Cells]]
+) -> list[Cells]:
+    """What stands beside readings, in columns that are hardly filled in, and in `others` of the rows but numbers."""
+    rare = [c for c in columns if 2 * sum(cell != "" for cell in c) < len(c)]
+    rows = [[cell for cell in row if cell != ""] for row in zip(*rare, strict=True)]
+    remarks = [row for row in rows if any(isinstance(cell, str) for cell in row)]
+    return [*remarks, *(r for _, r in others if sum(map(figures.is_figure, r)) < LEAST_COLUMNS)]
 
 
 def _other_tool(rows: Sequence[tuple[int, Cells]], head: int, end: int) -> int:

@@ -1,8 +1,9 @@
 """References that the title block of a table states for all its stations: field strength, dip and gravity.
 
 A value counts where its word comes first, its unit is known or its value allows one unit alone, and it is one that
-the Earth has. A line with a strength of the field and a gravity is that of a place: its inclination, or its only
-angle by the units, is the dip. A nominal or approximate value, a range and an uncertainty are no reference.
+the Earth has. In whatever words, the only number in a unit and of a size that the Earth's field or gravity alone has is
+that of the place, and the only inclination beside it is the dip. A nominal or approximate value, a range, a component,
+an uncertainty and what was measured are no reference.
 """
 
 from __future__ import annotations
@@ -10,11 +11,20 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise, product
 from typing import NamedTuple
 
 from mwdcal.files.formats.columns import as_text, looks_numeric
 from mwdcal.files.formats.titles import Titles, titles
 from mwdcal.files.synonyms import FACTORS, unit_of
+
+EARTH_FIELD = (15_000.0, 80_000.0)
+"""The least and the largest strength of the Earth's field, nT, with room for what is built around a stand."""
+EARTH_GRAVITY = (0.995, 1.004)
+"""The least and the largest gravity on land, in standard gravity: 9.764 to 9.834 m/s², and a little more."""
+
+
+Rows = Sequence[Sequence[object]]
 
 
 class _Quantity(NamedTuple):
@@ -40,9 +50,8 @@ _OF_PLACES = (
         r"(магн\w* )?поле|полн\w* (вектор|поле)|модуль( магн\w*)?( поля)?|индукци\w+|напряженност\w+( поля)?|"
         r"(环境|当地|地|总)?磁(总)?场(总)?(强度)?|总场(强度)?|\|b\||tmf|tmi|betrag|natezenie pola",
         "bfhtт",
-        ("nT", "µT", "mT", "gauss", "mG"),
-        15_000.0,
-        80_000.0,
+        ("nT", "µT", "mT", "gauss", "mG", "A/m"),
+        *EARTH_FIELD,
     ),
     _Quantity(
         "ref_dip_deg",
@@ -68,19 +77,22 @@ _OF_PLACES = (
         r"ускорение свободного падения|сил\w тяжести|(当地)?重力(加速度)?",
         "g",
         ("g", "mg", "m/s²", "gal", "mGal"),
-        0.97,
-        1.03,
+        *EARTH_GRAVITY,
     ),
 )
 _WRITTEN_UNIT = (
-    r"n\s?t\b|[uµμ]\s?t\b|m\s?t\b|milli ?gauss|m\s?g(al|auss)?\b|gauss|gal\b|gons?\b|нтл|мктл|мтл|мгал|м/с²?|м/с2|"
+    r"n\s?t\b|[uµμ]\s?t\b|m\s?t\b|milli ?gauss|m\s?g(al|auss)?\b|gauss|oe\b|a\s?/\s?m\b|gal\b|gons?\b|нтл|мктл|мтл|"
+    r"мгал|м/с²?|м/с2|"
     r"m\s?/\s?s\s?(?:²|\^?2)?|[gг]\b(?!\s*[=:(\[]?\s*(?:[+-]?\d|m\s?/))|°|deg\w*|gra[ud]\w*|rad\b|град\w*|"
     r"fok|derece|stopni|度"
 )
 _WRITTEN_NUMBER = (
     r"[+\-−]?\d{1,3}(?:[ '’.,\u00a0\u202f]\d{3})+(?:[.,]\d+)?(?!\d)|[+\-−]?\d+(?:[.,]\d+)?"
 )
-_MINUTES = r"(?:\s*°\s*(?P<minutes>\d+(?:[.,]\d+)?)\s*['′’])?"
+_MINUTES = (
+    r"(?:\s*(?:°|deg\w*|grad\w*)\s*(?P<minutes>\d+(?:[.,]\d+)?)\s*(?:['′’](?!['′’])|min\w*)"
+    r"(?:\s*(?P<seconds>\d+(?:[.,]\d+)?)\s*(?:[\"″”]|''|sec\w*))?)?"
+)
 _ROUGH = re.compile(
     r"nomin\w*|approx\w*|about|circa|\bca\b|\bcca\b|≈|~|\bnenn|ungefahr|omtrent|aprox\w*|environ|пример\w*|около|"
     r"номин\w*|约|标称",
@@ -118,14 +130,41 @@ _STATEMENTS = [
     for q in _OF_PLACES
     for head in (
         rf"(?P<word>{q.words})",
-        rf"(?P<letter>[{q.letters}])(?=\W*(?:{_WRITTEN_UNIT}|ref\w*|lo[ck]al\w*)?\W*\d)",
+        rf"(?P<letter>[{q.letters}]0?)(?=\W*(?:{_WRITTEN_UNIT}|ref\w*|lo[ck]al\w*)?\W*\d)",
     )
 ]
 _INCLINATION = (_OF_PLACES[1], _statement(r"(?P<word>inc|incl\w*|ink|inkl\w*|наклон)"))
 """An inclination in the line of a place, which is the dip."""
 _NUMBER_IN_UNIT = re.compile(
-    rf"(?<![\w.,±+-])(?P<number>[-−]?{_WRITTEN_NUMBER})\s*(?P<unit>{_WRITTEN_UNIT})", re.IGNORECASE
+    rf"(?<![\w.,±+-])(?P<number>[-−]?{_WRITTEN_NUMBER})\s*(?P<unit>{_WRITTEN_UNIT})(?!\s*\d+(?:[.,]\d+)?\s*(?:['′’]|min))",
+    re.IGNORECASE,
 )
+_NUMBER_ANYWHERE = re.compile(
+    rf"(?<![\w.,])(?P<number>[+\-−]?{_WRITTEN_NUMBER}){_MINUTES}\s*(?P<unit>(?:{_WRITTEN_UNIT})(?![^\W\d_]))?",
+    re.IGNORECASE,
+)
+_UNIT_ALONE = re.compile(rf"(?<![^\W\d_])({_WRITTEN_UNIT})(?![^\W\d_])", re.IGNORECASE)
+_NO_PLACE = re.compile(
+    rf"{_UNSURE.pattern}|"
+    r"horizont\w*|vertical\w*|vertik\w*|compon\w*|kompon\w*|north|nord|south|sud|coil\w*|spule\w*|scale|sens\w*|full|"
+    r"measured|\bmeas\b|mean|average|\bavg|mittel|gemessen|malt|medid\w*|mesur\w*|media|medio|moyen\w*|средн\w*|измер\w*|"
+    r"calc\w*|comput\w*|\bat\b|\bbei\b|\bper\b|\bto\s*$|\bbis\s*$|change|variation|shift|bias|previous|last|old|"
+    r"equipment|model|thermo\w*|горизонт\w*|верти\w*|компон\w*|水平|垂直|分量|平均|测得|灵敏度|\d\s*m?v\b|[<>]",
+    re.IGNORECASE,
+)
+"""Words of a strength that is not that of the place."""
+_INCLINED = re.compile(
+    r"dip|(?<![^\W\d_])[iеe]n[ck]l\w*|inklin\w*|inclin\w*|наклон\w*|нахил\w*|倾|伏角|傾|egim|duzalimi|sklon\w*|nachyleni\w*|"
+    r"hajlas\w*|lutning|kallistuma|helling|mergulho|buzamiento|echado",
+    re.IGNORECASE,
+)
+"""Words of an inclination, which is the field's among what is said of a place."""
+_OF_STAND = re.compile(
+    r"cradle|stand|rig|table|tool|bench|fixture|setting|setup|hole|well|plat|banco|banc\b|mesa|cuna|stativ|sonde|probe|"
+    r"стенд|стол|скваж|зенит|转台|台|井|azi\w*|decl\w*|error|acc?uracy|genau\w*|resid\w*",
+    re.IGNORECASE,
+)
+"""Words of an inclination that is not the field's."""
 _OTHER_ANGLE = re.compile(
     r"decl|deklin|misvis|conv|konv|azi|asim|tool|roll|tf\b|склон|азим|磁偏|方位|±", re.IGNORECASE
 )
@@ -139,40 +178,128 @@ _UPWARDS = re.compile(
 _SPELT = {
     "нтл": "nT", "мктл": "µT", "мтл": "mT", "м/с": "m/s²", "м/с²": "m/s²", "м/с2": "m/s²", "m/s": "m/s²", "г": "g",
     "град": "°", "度": "°", "fok": "°", "derece": "°", "stopni": "°", "gal": "gal",
-    "mgal": "mGal", "мгал": "mGal", "mg": "mg", "mgauss": "mG", "milligauss": "mG",
+    "a/m": "A/m", "oe": "gauss", "mgal": "mGal", "мгал": "mGal", "mg": "mg", "mgauss": "mG", "milligauss": "mG",
 }  # fmt: skip
 """Units in small letters, where `unit_of` does not know them or goes by capitals."""
 
 
-def stated_above(rows: Sequence[Sequence[object]]) -> Titles:
-    """What rows above a table say of the tool, the day and the place, as metadata."""
+def stated_above(rows: Sequence[Sequence[object]], besides: Rows = ()) -> Titles:
+    """What rows above a table say of the tool, the day and the place, as metadata; `besides` of the place alone."""
     block = titles(rows)
-    references = references_in(rows)
-    rough = {c: text for c, text in doubtful_in(rows).items() if c not in references}
+    references = references_in(rows, besides)
+    rough = {c: text for c, text in doubtful_in(rows, besides).items() if c not in references}
     return block._replace(metadata={**references, **block.metadata}, not_taken=rough)
 
 
-def references_in(rows: Iterable[Sequence[object]]) -> dict[str, float]:
-    """The references that rows above a table state, by column of a run file, in its unit; none that is stated twice.
+def references_in(rows: Rows, besides: Rows = ()) -> dict[str, float]:
+    """The references that rows above a table state, and lines `besides`, by column of a run file, in its unit.
+
+    None that is stated twice.
 
     >>> references_in([["Local field:", "48 912 nT", "Dip", "66,2°"], ["g (m/s²)", 9.80665]])
     {'ref_field_nt': 48912.0, 'ref_dip_deg': 66.2, 'ref_gravity_g': 1.0}
+    >>> references_in([["B at site / inclination"], ["Geomagnet [µT]", "Incl."], [48.9, 66.2]])
+    {'ref_field_nt': 48900.0, 'ref_dip_deg': 66.2}
     >>> references_in([["local field 46.8 uT nominal"], ["field uncertainty 50 nT"]])
     {}
     """
-    values: dict[str, dict[float, None]] = {}
-    of_places: dict[str, dict[float, None]] = {}
-    for row in rows:
-        text = _plain(_line(row))
+    texts = [_clauses(row) for row in [*_with_columns(rows), *besides]]
+    by_word, of_places, by_unit = (dict[str, dict[float, None]]() for _ in range(3))
+    for text in texts:
         here = {column for s in _STATEMENTS for column, _ in _stated(text, *s)}
         of_place = {"ref_field_nt", "ref_gravity_g"} <= here and "ref_dip_deg" not in here
         for statement in [*_STATEMENTS, _INCLINATION] if of_place else _STATEMENTS:
             for column, value in _stated(text, *statement):
-                values.setdefault(column, {})[value] = None
+                by_word.setdefault(column, {})[value] = None
         for column, value in _of_a_place(text).items():
             of_places.setdefault(column, {})[value] = None
-    every = of_places | values
+        for column, value in _by_unit(text):
+            by_unit.setdefault(column, {})[value] = None
+    every = by_unit | of_places | {c: each | by_unit.get(c, {}) for c, each in by_word.items()}
+    if "ref_field_nt" in every and "ref_dip_deg" not in every:
+        every["ref_dip_deg"] = dict.fromkeys(v for text in texts for v in _inclinations(text))
     return {column: next(iter(each)) for column, each in every.items() if len(each) == 1}
+
+
+def _with_columns(rows: Rows) -> list[Sequence[object]]:
+    """The rows, with each value below a row of words as a row of both."""
+    every = [*rows]
+    paired: list[Sequence[object]] = []
+    for above, below in pairwise(every):
+        words = [as_text(cell).strip() for cell in above]
+        cells = [as_text(cell).strip() for cell in below]
+        if (
+            not any(re.match(r"[-−+]?\d", word) for word in words)
+            and len([*filter(None, words)]) > 1
+        ):
+            paired += [
+                [f"{word} {cell}"]
+                for word, cell in zip(words, cells, strict=False)
+                if word and re.match(r"[-−+]?\d", cell)
+            ]
+    return [*every, *paired]
+
+
+class _Figure(NamedTuple):
+    """A number of a line with the words before it, its unit, and what follows up to the next number."""
+
+    words: str
+    number: str
+    minutes: float
+    unit: str
+    behind: str
+
+
+def _figures(text: str) -> Iterator[_Figure]:
+    """The numbers of a line of clauses; the words before each reach back to the number or semicolon before."""
+    matches = [*_NUMBER_ANYWHERE.finditer(text)]
+    for before, match, after in zip([None, *matches], matches, [*matches[1:], None], strict=False):
+        words = text[before.end() if before else 0 : match.start()].rpartition(";")[2]
+        inner = [each[1] for each in _UNIT_ALONE.finditer(words)]
+        behind = text[match.end() : after.start() if after else None].partition(";")[0]
+        yield _Figure(
+            words,
+            match["number"],
+            _minutes(match),
+            match["unit"] or (inner[-1] if inner else ""),
+            behind,
+        )
+
+
+def _by_unit(text: str) -> Iterator[tuple[str, float]]:
+    """Strengths of field and gravity that a line states in whatever words, by their units and sizes."""
+    for figure in _figures(text):
+        said = figure.words if re.search(r"[^\W\d_]", figure.words) else text
+        if _NO_PLACE.search(f"{said} {figure.behind}") or re.match(
+            r"\s*/\s*[^\W\d_]", figure.behind
+        ):
+            continue
+        for quantity in (_OF_PLACES[0], _OF_PLACES[2]):
+            unit = _stated_unit(quantity, figure.unit)
+            values = (
+                {_converted(n, unit) for n in _numbers(figure.number)}
+                if unit in quantity.units
+                else set()
+            )
+            inside = {v for v in values if quantity.low <= v <= quantity.high} - {1.0}
+            if len(inside) == 1:
+                yield quantity.column, inside.pop()
+
+
+def _inclinations(text: str) -> Iterator[float]:
+    """The angles that a line calls an inclination in some language, and not that of a stand or a hole."""
+    for figure in _figures(text):
+        word = _INCLINED.search(figure.words)
+        if (
+            not word
+            or _OF_STAND.search(figure.words)
+            or _NO_PLACE.search(f"{figure.words} {figure.behind}")
+        ):
+            continue
+        if _stated_unit(_OF_PLACES[1], figure.unit) in ("", "°"):
+            inside = {n for n in _numbers(figure.number, figure.minutes) if 0 < abs(n) < 90}
+            up = _UPWARDS.search(f"{figure.words} {figure.behind}")
+            yield from (-abs(n) if up else n for n in inside if len(inside) == 1)
 
 
 def _stated(
@@ -180,12 +307,22 @@ def _stated(
 ) -> Iterator[tuple[str, float]]:
     """The values of a quantity that a line states, with its column."""
     for match in pattern.finditer(text):
-        if not _UNSURE.search(text[max(match.start() - _BEFORE, 0) : match.start()]):
+        if not _NO_PLACE.search(text[max(match.start() - _BEFORE, 0) : match.start()]):
             yield from ((quantity.column, value) for value in _values(quantity, match))
 
 
 def _line(row: Sequence[object]) -> str:
     return " ".join(filter(None, (as_text(cell).strip() for cell in row)))
+
+
+def _clauses(row: Sequence[object]) -> str:
+    """The cells of a row in small letters, a semicolon behind each that ends a statement: a number with its unit."""
+    text, ends = "", False
+    for cell in filter(None, (_plain(as_text(each)).strip() for each in row)):
+        unit = re.fullmatch(rf"[(\[]?({_WRITTEN_UNIT})[)\]]?", cell)
+        text += f"; {cell}" if ends and not unit else f" {cell}"
+        ends = not unit and bool(re.search(r"(?<![\w.,])[+\-−]?\d[^;]*$", cell))
+    return text.strip()
 
 
 def _of_a_place(text: str) -> dict[str, float]:
@@ -217,23 +354,23 @@ def _in_unit(quantity: _Quantity, numbers: Iterable[re.Match[str]]) -> set[float
         _converted(number, unit)
         for text, unit in every
         if unit in quantity.units
-        for number in _numbers(text, None)
+        for number in _numbers(text)
     )
     return {v for v in values if quantity.low <= v <= quantity.high}
 
 
-def doubtful_in(rows: Iterable[Sequence[object]]) -> dict[str, str]:
+def doubtful_in(rows: Rows, besides: Rows = ()) -> dict[str, str]:
     """The lines above a table that may state a reference, by column of a run file.
 
-    They state a nominal or approximate one, or a number in a unit and of a size that the Earth's field or gravity has.
+    They state a nominal or approximate one, a number in a unit and of a size that the Earth's field or gravity has, or
+    one that no place has.
 
     >>> doubtful_in([["Nominal field", "48 500 nT"], ["Field uncertainty 50 nT"], ["here", "9.81 m/s2"]])
     {'ref_field_nt': 'Nominal field 48 500 nT', 'ref_gravity_g': 'here 9.81 m/s2'}
     """
     lines: dict[str, str] = {}
-    for row in rows:
-        line = _line(row)
-        plain = _plain(line)
+    for row in [*_with_columns(rows), *besides]:
+        line, plain = _line(row), _clauses(row)
         bare = _ROUGH.sub(" ", plain)
         for column in references_in([[bare]]) if bare != plain else ():
             lines.setdefault(column, line)
@@ -241,17 +378,41 @@ def doubtful_in(rows: Iterable[Sequence[object]]) -> dict[str, str]:
         for quantity in (_OF_PLACES[0], _OF_PLACES[2]):
             if _in_unit(quantity, numbers) - {1.0}:
                 lines.setdefault(quantity.column, line)
+        for quantity, figure in product(_OF_PLACES, _figures(plain)):
+            if _is_called(quantity, figure) and not _UNSURE.search(
+                f"{figure.words} {figure.behind}"
+            ):
+                lines.setdefault(quantity.column, line)
     return lines
+
+
+def _is_called(quantity: _Quantity, figure: _Figure) -> bool:
+    """Whether words right before a number are those of a quantity, and the number is no count: dip 97.2."""
+    words = _UNIT_ALONE.sub("", figure.words)
+    called = re.search(
+        rf"{_BEGINNING}({quantity.words})\W*(?:{_REFERRING.pattern}\W*)*$", words, re.IGNORECASE
+    )
+    return bool(called) and bool(figure.unit or len(figure.number) > 2)
 
 
 def _plain(text: str) -> str:
     """Small letters without marks; the signs of units stay."""
-    kept = text.replace("°", "\0").replace("º", "\0").replace("²", "\1").replace("й", "\2")
+    kept = (
+        text.replace("_", " ")
+        .replace("°", "\0")
+        .replace("º", "\0")
+        .replace("²", "\1")
+        .replace("й", "\2")
+    )
     plain = unicodedata.normalize("NFKD", kept.lower().translate({ord("ø"): "o", ord("ß"): "ss"}))
     bare = "".join(c for c in plain if not unicodedata.combining(c))
     bare = re.sub(r"(?<=[\u4e00-\u9fff])(?=[a-zµμ])", " ", bare)
     signs = bare.replace("\0", "°").replace("\1", "²").replace("\2", "й")
-    return re.sub(r"m\s?/\s?s\s?\^?2(?!\d)", "m/s²", signs)
+    return re.sub(
+        r"(?<![a-zа-я])(?:[mм]\s?/\s?[sс]\s?(?:\^?2|²)|m\s?[.·*]?\s?s\^?[-−]2|mps2?)(?!\d)",
+        "m/s²",
+        signs,
+    )
 
 
 def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
@@ -270,17 +431,17 @@ def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
     decimals = len(re.sub(r".*?(?:[.,]|$)", "", match["number"], count=1))
     sure = (
         stated
-        or ("=" in bare and decimals)
+        or ("=" in bare and (decimals or len(match["number"]) > 4))
         or (quantity.column == "ref_gravity_g" and decimals > 2)
     )
     if (letter and not (direct and sure)) or not (direct or stated):
         return
     if stated and stated not in quantity.units:
         return
-    numbers = [*_numbers(match["number"], match["minutes"])]
+    numbers = [*_numbers(match["number"], _minutes(match))]
     if quantity.low < 0 and _UPWARDS.search(f"{between} {behind}"):
         numbers = [-abs(number) for number in numbers]
-    units = (stated,) if stated else [unit for unit in quantity.units if unit != "gon"]
+    units = (stated,) if stated else [unit for unit in quantity.units if unit not in ("gon", "A/m")]
     values = {_converted(number, unit) for number in numbers for unit in units}
     inside = [v for v in values if quantity.low <= v <= quantity.high and v]
     if len(inside) == 1:
@@ -304,10 +465,16 @@ def _unit(text: str) -> str:
     return cased.get(bare) or unit_of("m/s2" if bare.startswith("m/s") else bare)
 
 
-def _numbers(text: str, minutes: str | None) -> Iterator[float]:
+def _minutes(match: re.Match[str]) -> float:
+    """The minutes and seconds behind degrees, in minutes."""
+    one, two = (float((match[name] or "0").replace(",", ".")) for name in ("minutes", "seconds"))
+    return one + two / 60
+
+
+def _numbers(text: str, minutes: float = 0.0) -> Iterator[float]:
     """The numbers that digits may be: a point or a comma may be the decimal sign, or separate thousands."""
     plain = re.sub(r"[ '’\u00a0\u202f](?=\d{3})", "", text.replace("−", "-"))
-    part = float(minutes.replace(",", ".")) / 60 if minutes else 0.0
+    part = minutes / 60
     for sign, other in (".,", ",."):
         bare = plain.replace(other, "") if re.search(rf"\{other}\d{{3}}(?!\d)", plain) else plain
         if looks_numeric(bare, sign):

@@ -84,6 +84,21 @@ _BEHIND_MODEL = re.compile(
     re.IGNORECASE,
 )
 """The word for the tool, its model, and its serial behind a mark: Sonde SD-9 n° 112."""
+_MARKED = re.compile(
+    r"(?:(?<![^\W\d_])|(?<=[\u4e00-\u9fff]))(?:(?P<word>serial(?:[ -]?(?:number|num|no|nr))?|(?:[^\W\d_]+-?)?serien?-?(?:nummer|nr)|"
+    r"(?:n[°ºo.r]*|n[uú]m\w*|nr)\.? (?:d[ei] )?(?:s[eé]ri[ea]l?|fabr\w*|seryjny)|s[eé]rie|fabr(?:ik)?\.?[ -]?(?:nr|nummer)|matricola|"
+    r"зав\w*\.? ?(?:№|номер|n)|серийн\w* ?(?:№|номер)|seri ?no|序列号|编号|製造番号)|s\.?/?n|[^\W\d_]+[ -]sn|"
+    r"(?<=[,(;] )(?:n[°ºr]\.?|num[eé]ro|№))\.?"
+    rf"(?:\s+(?:{_OF_TOOLS}))?[\s.:：=#|;]*(?P<serial>{_SERIAL.pattern})",
+    re.IGNORECASE,
+)
+"""A word of a serial number in a line, and the serial behind it."""
+_OF_EQUIPMENT = re.compile(
+    r"stand|table|tisch|bench|banco|oven|ofen|chamber|thermo|logger|volt|multimeter|gauss|magnetom|theodol|reference|normal|"
+    r"стенд|печь|эталон|转台|参考",
+    re.IGNORECASE,
+)
+"""Words of what is not the tool, and has a serial as well."""
 _TELLING = re.compile(r"(?=.*\d).*[^\W\d_].*|\d+-\d+")
 """A serial that shows by itself: letters beside digits, or a dash between them."""
 _ENGLISH_DATE = re.compile(
@@ -93,7 +108,7 @@ _TRUE_NORTH = re.compile(
     r"true\s+north|geographic north|nord géographique|rechtweisend", re.IGNORECASE
 )
 _DECLINATION = re.compile(
-    r"(declination|deklination|misvisning|declinaci[oó]n|d[eé]clinaison|declina[cç][aã]o|declinazione|склонение|磁偏角)"
+    r"((?:decl|dekl|décl)\w*|misvisning|склонени\w*|схилення|偏角|manyetik sapma|odchylenie magn\w*)"
     r"(?:\s*\(([^)]*)\))?[^\w+−-]*([+−-]?\d+[.,]?\d*)"
     r"\s*(?:°|deg\w*)?\s*\(?([EWO](?!\s*[+(])|west|зап|vest|oest)?",
     re.IGNORECASE,
@@ -145,7 +160,8 @@ def titles(rows: Sequence[Sequence[object]]) -> Titles:
         for place, cell in enumerate(cells):
             key, value = _pair(cell, cells[place + 1 :])
             days |= dict.fromkeys(filter(None, [day_of(cell)]))
-            marked = _BEHIND_MODEL.findall(text) or [_tool(cell, cells[place + 1 :])]
+            marked = _marked_in(" ; ".join(whole)) or _BEHIND_MODEL.findall(text)
+            marked = marked or [_tool(cell, cells[place + 1 :])]
             tools |= dict.fromkeys(filter(None, marked))
             if not value or key in metadata:
                 continue
@@ -184,6 +200,16 @@ def _rotation(statement: re.Pattern[str], text: str) -> float | None:
     if match[2] and _WEST_POSITIVE.search(match[2]):
         return -value
     return -abs(value) if west else value
+
+
+def _marked_in(text: str) -> list[str]:
+    """The serials behind a word for one in a line; those behind a whole word before those behind letters."""
+    every = [
+        m
+        for m in (() if text.startswith("TOA5") else _MARKED.finditer(text))
+        if not _OF_EQUIPMENT.search(re.split("[;,]", text[: m.start()].rstrip(" ;,"))[-1])
+    ]
+    return [m["serial"] for m in every if m["word"]] or [m["serial"] for m in every]
 
 
 def _tool(cell: str, right: Sequence[str]) -> str:
