@@ -1359,6 +1359,14 @@ def test_a_table_to_its_certificate(client, bench, tmp_path):
     assert ran.code == 0
     assert without_time(folder / "tool.json") == without_time(tmp_path / "t.json")
     rolls = laboratory_table(stand, ROLLS, clear=True)
+    off = laboratory_table(stand, [*ROLLS[:3], (61.5, 31.5, 91.5)], clear=True).splitlines()[-1]
+    lines = rolls.splitlines()
+    lines[6] = b";".join([*off.split(b";")[:8], *lines[6].split(b";")[8:]])  # knocked
+    assert drop(client, bench, "rolltest", "off.csv", b"\n".join(lines)).is_success
+    page = client.get("/table").text
+    assert "FAIL" in page
+    assert "A limit is exceeded, most at station 4." in page
+    assert "No single fault explains these readings" in page
     assert drop(client, bench, "rolltest", "roll.csv", rolls).is_success
     assert "PASS" in client.get("/table").text
     assert on_table(client, bench, "certificate", number="C-7").is_success

@@ -136,8 +136,8 @@ class Failure:
     missing: str = ""
 
 
-def failure(verdict: Verdict, calibration: Calibration, folder: Path) -> Failure:
-    """Why the roll test in a folder has failed, as `mwdcal verify` and `mwdcal diagnose` say."""
+def failure(verdict: Verdict, calibration: Calibration, rolltest: Path) -> Failure:
+    """Why a roll test has failed, as `mwdcal verify` and `mwdcal diagnose` say."""
     failed = [row for row in verdict.rows if not row.passed]
     farthest: dict[str, list[str]] = {}
     for row in failed:
@@ -148,7 +148,7 @@ def failure(verdict: Verdict, calibration: Calibration, folder: Path) -> Failure
             farthest.setdefault(max(off, key=off.__getitem__), []).append(row.name)
     missing = "; ".join(f"{row.name}: {row.note}" for row in failed if row.value is None)
     try:
-        likeness = mwdcal.diagnose(calibration, folder / "rolltest.csv")
+        likeness = mwdcal.diagnose(calibration, rolltest)
         cause = f"{capital(cause_in_words(likeness))}. {capital(next_step(likeness))}."
     except MwdcalError:
         cause = ""

@@ -8,7 +8,7 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 from mwdcal.bench import pictures
-from mwdcal.bench.documents import FEWEST_STATIONS, asks_passphrase, signers_name
+from mwdcal.bench.documents import FEWEST_STATIONS, Failure, asks_passphrase, signers_name
 from mwdcal.bench.opening import FROM_REGISTRY, ToolPast
 from mwdcal.bench.positions import ORDERED_ANGLES, Positions
 from mwdcal.bench.session import RUN_PART, BenchSession
@@ -239,7 +239,9 @@ def _order_text(session: BenchSession) -> str:
             return t["next_signature"]
         if "certificate" in session.papers:
             return t["signed" if "signature" in session.papers else "finished"]
-        return t["next_certificate"] if session.verdict.passed else _next_after_failure(session)
+        if session.verdict.passed:
+            return t["next_certificate"]
+        return after_failure(session.failure, "next_failed")
     if session.calibrated and not session.testing:
         return t["next_rolltest"]
     if (order := session.order) is None:
@@ -254,14 +256,13 @@ def _order_text(session: BenchSession) -> str:
     return f"{t['station']} {order + 1}. {oven}{turn}"
 
 
-def _next_after_failure(session: BenchSession) -> str:
-    """What to do after a failed roll test: the stations to look at first, or what is missing."""
-    t, failure = texts(), session.failure
-    if not failure.stations:
+def after_failure(failure: Failure, advice: str) -> str:
+    """What to do after a failed roll test: the stations to look at first, with an `advice`, or what is missing."""
+    t, labels = texts(), [*failure.stations]
+    if not labels:
         return t["next_missing"].format(reason=failure.missing)
-    labels = [*failure.stations]
     word = t["at_station" if len(labels) == 1 else "at_stations"]
-    return t["next_failed"].format(stations=word.format(labels=", ".join(labels)))
+    return t[advice].format(stations=word.format(labels=", ".join(labels)))
 
 
 def _done_text(session: BenchSession) -> str:

@@ -657,7 +657,7 @@ class BenchSession:
         verdict, files = documents.verify(calibration, self.folder)
         before, failure = self._judge_as_found(), documents.Failure()
         if not verdict.passed:
-            failure = documents.failure(verdict, calibration, self.folder)
+            failure = documents.failure(verdict, calibration, self.folder / "rolltest.csv")
         with self.lock:
             if part.open_positions:  # asked for again meanwhile
                 return

@@ -207,6 +207,14 @@ class DroppedTable:
         self.papers = {k: v for k, v in self.papers.items() if "certificate" not in k} | files
         self.papers |= documents.draw(self.verdict, self.folder, "rolltest")
 
+    @property
+    def failure(self) -> documents.Failure:
+        """Why the roll test has failed; empty if it has not."""
+        calibration = self.fit.calibration if self.fit else None
+        if calibration is None or self.verdict is None or self.verdict.passed:
+            return documents.Failure()
+        return documents.failure(self.verdict, calibration, self._given(self.rolltest))
+
     def certify(self, number: str) -> None:
         """Issue the certificate, and enter all in the registry, where one is named."""
         with self.lock:

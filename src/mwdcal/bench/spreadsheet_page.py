@@ -97,6 +97,7 @@ def _results(table: DroppedTable) -> dict[str, Any]:
         heading, style = (t["passed"], "pass") if verdict.passed else (t["failed"], "fail")
     elif fit.calibration is not None:
         heading = t["calibrated"].format(serial=table.serial)
+    failure = table.failure
     accuracy = [
         (t[name], f"{number(value, 2)}°") for name, value in fit.accuracy_deg.items() if value
     ]
@@ -106,5 +107,6 @@ def _results(table: DroppedTable) -> dict[str, Any]:
         "errors": pages.error_rows(fit.calibration.errors if fit.calibration else []),
         "limits": pages.limit_rows(verdict.rows if verdict else []),
         "can_certify": verdict is not None and "certificate" not in table.papers,
-        "passed": bool(verdict and verdict.passed),
+        "passed": bool(verdict and verdict.passed), "cause": failure.cause,
+        "after_failure": pages.after_failure(failure, "table_failed"),
     }  # fmt: skip
