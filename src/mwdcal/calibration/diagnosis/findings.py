@@ -488,8 +488,8 @@ def _course(
     powers = np.flatnonzero(present[place]) + 1
     cause = "readings differ from one temperature to the next as no course of order 3 does"
     remedy = (
-        "Let the tool come to rest at each temperature and look for hysteresis or a reference "
-        "that moved; more temperatures make the mean better"
+        "Let the tool come to rest at each temperature, and return to one of them: that tells hysteresis or a "
+        "reference that moved from a drift, which no fit includes beside this; more temperatures make the mean better"
     )
     if order < HIGHEST and powers.min() <= HIGHEST:
         cause = f"powers of temperature above order {order} are there"
