@@ -171,15 +171,14 @@ class WalkScores:
         return np.asarray(np.linalg.eigvals(finite(inverse(alone) @ left)).real.min(-1))
 
     def trend(self, name: str) -> Array:
-        """χ² (B,) of the three trends of a drift, three degrees of freedom; zero where a fit takes one up whole.
+        """χ² (B,) of the three trends of a drift, of three degrees of freedom; rounding where `shown` is below `LEAST_KEPT`.
 
         However little of a trend residuals keep, which in the sum of squares of all terms would drown.
         """
         index = self.places[name][:3]
         information, score = self.information[:, index[:, None], index], self.score[:, index]
         step = finite(inverse(information)) @ score[..., None]
-        kept = self.shown(name) > LEAST_KEPT
-        return np.where(kept, np.maximum(np.sum(score * step[..., 0], -1), 0.0), 0.0)
+        return np.asarray(np.sum(score * step[..., 0], -1))
 
     def components(self) -> dict[tuple[str, int], Ints]:
         """Columns of the trend (0) and of the walk (1) of each drift."""

@@ -78,9 +78,12 @@ def chances(result: Fit) -> tuple[Array, Bools]:
             one = f_test(total * ratio, mean * ratio, np.nan_to_num(scatter), rest)
             one = np.nan_to_num(one, nan=1.0) * (1 + (triad > 0))
             little = trends[name] < drift.LEAST_TREND
-            trend = f_test(scores.trend(name), np.full(1, 3.0), np.nan_to_num(scatter), rest)
-            trend = np.nan_to_num(trend, nan=1.0) * (1 + (triad > 0))
-            one = np.where(little & (trend < TREND_CHANCE), np.minimum(one, trend), one)
+            if little.any():
+                seen = little & (trends[name] > drift.LEAST_KEPT)
+                three, factor = np.full(1, 3.0), np.nan_to_num(scatter)
+                trend = np.nan_to_num(f_test(scores.trend(name), three, factor, rest), nan=1.0)
+                trend *= 1 + (triad > 0)
+                one = np.where(seen & (trend < TREND_CHANCE), np.minimum(one, trend), one)
             least[:, triad] = np.minimum(least[:, triad], one)
             hidden[:, triad] |= little
     return least, hidden
