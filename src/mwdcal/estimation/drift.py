@@ -171,7 +171,7 @@ class WalkScores:
         return np.asarray(np.linalg.eigvals(finite(inverse(alone) @ left)).real.min(-1))
 
     def trend(self, name: str) -> Array:
-        """χ² (B,) of the three trends of a drift, of three degrees of freedom; rounding where `shown` is below `LEAST_KEPT`.
+        """χ² (B,) of the three trends of a drift, of three degrees of freedom, where `shown` is above `LEAST_KEPT`.
 
         However little of a trend residuals keep, which in the sum of squares of all terms would drown.
         """
