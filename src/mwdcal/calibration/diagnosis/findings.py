@@ -217,8 +217,8 @@ REMARKS = {
     "changed, or the prior is too narrow. Leave `prior` out, or widen it.",
     "nonlinearity-ignored": "nonlinearity of the {triads} is not fitted: the model of factors has no such terms. Use "
     "`model` polynomial for it.",
-    "field-unknown": "field strength is known at no station: the magnetometer is calibrated to field = 1. Give "
-    "ref_field_nt to have nT.",
+    "field-unknown": "no station states the strength of the field, so the magnetometer is calibrated to field = 1 "
+    "instead of nT. Give ref_field_nt to have nT.",
     "restricted": "{parameters} parameters: {lost} of the sensors in the tool is taken as none, and no uncertainty "
     "here includes it. Use `parameters` 12 to fit it.",
     "reshoot": "station {of[station]}: residual {of[size]}σ, most in {of[worst]} ({of[value]:+.3g}{of[unit]}; "
