@@ -180,7 +180,9 @@ class Command(click.Command):
         needed = {name for answer in error.answers for name, _ in answer.arguments}
         if needed <= options:
             return str(error)
-        first = " ".join(f"`{name}` {value}" for name, value in error.answers[0].arguments)
+        first = " ".join(
+            f"--{name.replace('_', '-')} {value}" for name, value in error.answers[0].arguments
+        )
         made = f"mwdcal profile TABLE {first} -o TOOL.toml"
         return f"{error.text} Say it in a profile ({made}), and give `tool` TOOL.toml."
 
