@@ -166,13 +166,13 @@ class Command(click.Command):
             with laboratory.using(used):
                 return super().invoke(context)
         except MwdcalError as error:
-            error.args = (with_option_names(self._answered(error)),)
+            error.args = (with_option_names(self._with_remedy(error)),)
             raise
         finally:
             if used and (line := laboratory.line_on(used)):
                 say(line)
 
-    def _answered(self, error: MwdcalError) -> str:
+    def _with_remedy(self, error: MwdcalError) -> str:
         """The text of an error; of a question that only a profile can answer here, with how to make one."""
         options = {parameter.name for parameter in self.params}
         if not isinstance(error, QuestionError) or not error.answers:
@@ -183,8 +183,8 @@ class Command(click.Command):
         first = " ".join(
             f"--{name.replace('_', '-')} {value}" for name, value in error.answers[0].arguments
         )
-        made = f"mwdcal profile TABLE {first} -o TOOL.toml"
-        return f"{error.text} Say it in a profile ({made}), and give `tool` TOOL.toml."
+        remedy = f"mwdcal profile TABLE {first} -o TOOL.toml"
+        return f"{error.text} Say it in a profile ({remedy}), and give `tool` TOOL.toml."
 
 
 def _be_quiet(context: click.Context, option: click.Parameter, typed: bool) -> None:
