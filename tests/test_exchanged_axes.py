@@ -12,7 +12,7 @@ from msgspec.structs import replace as replace_struct
 from cli_support import EXAMPLE, mwdcal
 from mwdcal.calibration.record import Calibration
 from mwdcal.survey import long_table
-from mwdcal.survey.axes import FALSE_ALARMS, exchanged_axes
+from mwdcal.survey.axes import NAMED_BY_CHANCE, exchanged_axes
 from test_interference import laboratory
 from wells import DEVIATED, Path, horizontal_east, one, path, surveyed
 
@@ -101,7 +101,7 @@ def test_sound_runs_are_not_named(count, offsets):
             readings = wells(calibration, where, 10, 100 + seed)
             alarms += sum(bool(named(calibration, one(readings, k))) for k in range(10))
             total += 10
-    assert alarms <= np.ceil(FALSE_ALARMS * total) - (total < 1 / FALSE_ALARMS)
+    assert alarms <= np.ceil(NAMED_BY_CHANCE * total) - (total < 1 / NAMED_BY_CHANCE)
 
 
 def test_axes_alike_cannot_be_told_apart():

@@ -390,7 +390,7 @@ def test_a_measured_value_is_compared_with_the_model(name, sign):
 @pytest.mark.parametrize(
     ("measured", "words"),
     [
-        ({"dip": 63.0}, "`dip_deg` must be those of the place; got 63 °, the model -63."),
+        ({"dip": 63.0}, "`dip_deg`: 63 ° cannot be of this place, where the model has -63."),
         (
             {"field": 80_000.0, "dip": 20.0, "declination": 100.0},
             "`field_nt`, `dip_deg`, `declination_deg`",

@@ -164,6 +164,46 @@ def test_the_share_of_a_trend_is_that_of_a_regression():
     assert share == pytest.approx(left @ left / (trend @ trend), rel=1e-3)
 
 
+def test_the_misfit_of_a_trend_is_that_of_a_regression():
+    """Second formula: what an accelerometer trend takes off the squares of residuals, axis by axis."""
+    readings = runs(2, 3, offset=3e-4, straight=True)
+    readings = replace(
+        readings, sd={"accelerometer": np.full(3, 1e-4), "magnetometer": np.full(3, 15.0)}
+    )
+    result = fit(readings, Options(order=0))
+    g = np.einsum("nij,nj->ni", result.state.attitude[0], earth_gravity(np.ones(COUNT)))
+    known, trend = np.column_stack([g, np.ones(COUNT)]), np.arange(COUNT, dtype=float)
+    scores = walk_scores(result.problem, result.state, result.analysis)
+    for place, raw in enumerate(readings.accelerometer):
+        whole = np.column_stack([known, trend])
+        squares = [np.sum(np.linalg.lstsq(each, raw, rcond=None)[1]) for each in (known, whole)]
+        expected = (squares[0] - squares[1]) / 1e-8
+        assert scores.trend("accelerometer-drift")[place] == pytest.approx(expected, rel=1e-2)
+
+
+def thermal(seed, tools, offset):
+    """Nominal tools at four directions, four temperatures one after the other, with an accelerometer trend, 1σ in g."""
+    rng = np.random.default_rng(seed)
+    parts = [runs(seed * 10 + k, tools) for k in range(4)]
+    raw = [
+        np.concatenate([getattr(p, n) for p in parts], 1) for n in ("accelerometer", "magnetometer")
+    ]
+    trend = np.linspace(-0.5, 0.5, 4 * COUNT)[:, None] * rng.normal(size=(tools, 1, 3))
+    known = {n: np.tile(v, 4) for n, v in parts[0].known.items()}
+    warmth = np.broadcast_to(np.repeat([25.0, 45.0, 65.0, 85.0], COUNT), (tools, 4 * COUNT))
+    return Readings(raw[0] + offset * trend, raw[1], warmth, known=known, sd={})
+
+
+def test_a_trend_that_a_term_of_temperature_takes_up_is_seen_within_the_soaks():
+    """2 mg over a run that only warms: most of it looks like the first power of temperature."""
+    options = Options(order=1, model="polynomial")
+    for offset, low, high in ((2e-3, 0.9, 1.0), (0.0, 0.0, 0.25)):
+        named = 0
+        for _, result in by_drift(fit(thermal(7, 60, offset), options), options):
+            named += len(result.status) * ("accelerometer-drift" in drifts(result))
+        assert low <= named / 60 <= high
+
+
 def test_a_wrong_prior_is_no_drift(tmp_path):
     """The calibration of another tool leaves residuals that go with attitude, and so with the order of stations."""
     previous = calibrated(tmp_path, servo_run(1))

@@ -225,6 +225,16 @@ def test_sheets_whose_names_contradict_their_temperatures_are_asked_about(tmp_pa
     )
 
 
+def test_a_question_that_a_command_has_no_option_for_names_the_profile_that_answers_it(tmp_path):
+    """`calibrate` has no --sheet: the profile says which sheet is meant."""
+    columns, profile = table(station=[*range(1, 49)]), tmp_path / "t.toml"
+    one = workbook_of(tmp_path / "one.xlsx", columns, ("25C",))
+    assert mwdcal("profile", one, "-o", profile).code == 0
+    two = workbook_of(tmp_path / "two.xlsx", columns, ("25C", "80C"))
+    message = refused(mwdcal("calibrate", two, "--tool", profile, "-o", tmp_path / "t.json"), 2, 3)
+    assert "mwdcal profile TABLE --sheet 25C -o TOOL.toml), and give --tool TOOL.toml" in message
+
+
 def test_a_sheet_that_repeats_a_row_of_another_is_no_part_of_its_run(tmp_path):
     columns = table(station=[1] * 48)
     columns = {name: [*values[:24], *values[:24]] for name, values in columns.items()}

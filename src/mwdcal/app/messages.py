@@ -22,7 +22,7 @@ import click
 
 from mwdcal.app import laboratory
 from mwdcal.calibration.fit_options import FIT_OPTIONS
-from mwdcal.errors import InputError, MwdcalError, reason
+from mwdcal.errors import InputError, MwdcalError, QuestionError, reason
 from mwdcal.presentation.text import (
     PATIENCE,
     UNSAFE_BUT_LINES,
@@ -166,11 +166,25 @@ class Command(click.Command):
             with laboratory.using(used):
                 return super().invoke(context)
         except MwdcalError as error:
-            error.args = (with_option_names(str(error)),)
+            error.args = (with_option_names(self._with_remedy(error)),)
             raise
         finally:
             if used and (line := laboratory.line_on(used)):
                 say(line)
+
+    def _with_remedy(self, error: MwdcalError) -> str:
+        """The text of an error; of a question that only a profile can answer here, with how to make one."""
+        options = {parameter.name for parameter in self.params}
+        if not isinstance(error, QuestionError) or not error.answers:
+            return str(error)
+        needed = {name for answer in error.answers for name, _ in answer.arguments}
+        if needed <= options:
+            return str(error)
+        first = " ".join(
+            f"--{name.replace('_', '-')} {value}" for name, value in error.answers[0].arguments
+        )
+        remedy = f"mwdcal profile TABLE {first} -o TOOL.toml"
+        return f"{error.text} Say it in a profile ({remedy}), and give `tool` TOOL.toml."
 
 
 def _be_quiet(context: click.Context, option: click.Parameter, typed: bool) -> None:

@@ -122,6 +122,10 @@ def noise(problem: Problem) -> dict[str, Array]:
     return dict(zip(WALKS, [*each, *each[1:]], strict=False))
 
 
+LEAST_KEPT = 1e-6
+"""Share of the information about a trend that is more than rounding."""
+
+
 @dataclass(frozen=True)
 class WalkScores:
     """Evidence for drift terms in the residuals of a fit without them, in units of the noise.
@@ -165,6 +169,16 @@ class WalkScores:
         index = self.places[name][:3]
         left, alone = (m[:, index[:, None], index] for m in (self.information, self.alone()))
         return np.asarray(np.linalg.eigvals(finite(inverse(alone) @ left)).real.min(-1))
+
+    def trend(self, name: str) -> Array:
+        """χ² (B,) of the three trends of a drift, of three degrees of freedom, where `shown` is above `LEAST_KEPT`.
+
+        However little of a trend residuals keep, which in the sum of squares of all terms would drown.
+        """
+        index = self.places[name][:3]
+        information, score = self.information[:, index[:, None], index], self.score[:, index]
+        step = finite(inverse(information)) @ score[..., None]
+        return np.asarray(np.sum(score * step[..., 0], -1))
 
     def components(self) -> dict[tuple[str, int], Ints]:
         """Columns of the trend (0) and of the walk (1) of each drift."""

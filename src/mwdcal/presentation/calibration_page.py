@@ -67,10 +67,12 @@ def render(
     verdict: Verdict | None = None,
     *metadata: Mapping[str, object],
     limits: Limits | None = None,
+    file: str = "CAL.json",
 ) -> str:
     """The report as HTML: the same input gives the same text, byte for byte.
 
-    `metadata` are those of the roll test behind the verdict, `limits` those that a roll test will have to meet.
+    `metadata` are those of the roll test behind the verdict, `limits` those that a roll test will have to meet. `file`
+    is the name of the calibration in the next commands.
     """
     pages = environment()
     pages.filters |= {"freedom": freedom, "noise_free": noise_free}
@@ -87,7 +89,7 @@ def render(
         left=left,
         spherical=_spherical(calibration),
         gauges=list(_gauges(calibration, verdict, limits)),
-        steps=_steps(calibration, verdict),
+        steps=_steps(calibration, verdict, file),
         simulated=any(map(is_simulated, (calibration.tool, *metadata))),
         inclinations=known_inclinations(calibration),
         method="; ".join(how(calibration)),
@@ -204,18 +206,18 @@ def _gauge(
     return AngleGauge(name, shown, said, *outcome, 100 * (value or 0.0) / whole, span, bound)
 
 
-def _steps(calibration: Calibration, verdict: Verdict | None) -> list[str]:
+def _steps(calibration: Calibration, verdict: Verdict | None, file: str) -> list[str]:
     """Steps after the calibration: stations to measure again, then the next command."""
     again = sum(row.reshoot for row in calibration.station_rows)
     steps = [f"Measure {plural(again, 'station')} again, and calibrate once more."] if again else []
     if verdict is None:
         return [
             *steps,
-            "Verify the calibration with a roll test that the fit has not seen: mwdcal verify CAL.json ROLLTEST.csv",
+            f"Verify the calibration with a roll test that the fit has not seen: mwdcal verify {file} ROLLTEST.csv",
         ]
     if verdict.passed:
-        return [*steps, "Issue the certificate: mwdcal certificate CAL.json --verification V.json"]
-    places, command, reason = after_failure(verdict, "CAL.json", verdict.run)
+        return [*steps, f"Issue the certificate: mwdcal certificate {file} --verification V.json"]
+    places, command, reason = after_failure(verdict, file, verdict.run)
     return [*steps, f"Measure again: {places}.", f"{capital(reason)}: {command}"]
 
 

@@ -16,18 +16,14 @@ from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import MwdcalError
 from mwdcal.geometry.vectors import Array
-from mwdcal.survey.interference import usable
+from mwdcal.survey.interference import LEAST_CHANCE, usable
 from mwdcal.survey.interference_estimate import Assumed, chi_square, surveys
 
-EXCHANGED = "axes-exchanged"
-"""The finding that surveys fit with other axes: id."""
-LEAST_CHANCE = 1e-3
-"""Chance of as large a misfit below which surveys do not fit."""
-FALSE_ALARMS = 1e-3
+NAMED_BY_CHANCE = 1e-3
 """Largest share of sound runs that fit other axes so much better."""
 AS_LIKELY = 100.0
 """Exchanges of which the likelihood is less than so many times smaller fit as well: the simplest is named."""
-MOST_SURVEYS = 40
+SURVEYS_COMPARED = 40
 """Surveys of a run that are looked at: offsets and scales are the same at all."""
 _SAME = np.broadcast_to(np.eye(3), SIGNED.shape)
 EXCHANGES = np.concatenate(
@@ -44,7 +40,7 @@ def exchanged_axes(calibration: Calibration, readings: Readings) -> list[Finding
 
     Definition: χ² as of `interference_estimate.chi_square`, with interference and drift. Other axes are named if the
     surveys fit with them, do not fit without, and their likelihood ratio exp(Δχ²/2) exceeds the number of alternatives
-    over `FALSE_ALARMS`. The mean of such a ratio over sound runs is one, so that by Markov's inequality at most that
+    over `NAMED_BY_CHANCE`. The mean of such a ratio over sound runs is one, so that by Markov's inequality at most that
     share of them is named. None where references lack, or nothing tells the axes apart.
     """
     from scipy.special import chdtrc
@@ -55,7 +51,7 @@ def exchanged_axes(calibration: Calibration, readings: Readings) -> list[Finding
     places = np.flatnonzero(rows)
     if not places.size:
         return []
-    chosen = places[np.linspace(0, places.size - 1, MOST_SURVEYS).round().astype(int)]
+    chosen = places[np.linspace(0, places.size - 1, SURVEYS_COMPARED).round().astype(int)]
     rows = np.isin(np.arange(readings.count), chosen)
     try:
         some = surveys(calibration, readings.select(rows))
@@ -67,7 +63,7 @@ def exchanged_axes(calibration: Calibration, readings: Readings) -> list[Finding
     except (MwdcalError, np.linalg.LinAlgError):
         return []
     best = int(np.nanargmin(others))
-    likelier = (named - others[best]) / 2 > np.log(len(EXCHANGES) / FALSE_ALARMS)
+    likelier = (named - others[best]) / 2 > np.log(len(EXCHANGES) / NAMED_BY_CHANCE)
     if not likelier or chdtrc(freedom, others[best]) < LEAST_CHANCE:
         return []
     alike = others - others[best] < 2 * np.log(AS_LIKELY)
@@ -77,7 +73,7 @@ def exchanged_axes(calibration: Calibration, readings: Readings) -> list[Finding
         f"the readings fit the calibration with {_columns(calibration, simplest)}{like}, and not as their "
         "columns are named. Are columns exchanged, or a sign wrong? Azimuth and toolface are wrong then."
     )
-    return [Finding(id=EXCHANGED, text=text)]
+    return [Finding(id="axes-exchanged", text=text)]
 
 
 def with_axes(calibration: Calibration, readings: Readings, axes: Array) -> Readings:

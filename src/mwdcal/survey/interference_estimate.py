@@ -359,7 +359,7 @@ def _misfit(
 def _known(
     calibration: Calibration, readings: Readings, assumed: Assumed
 ) -> tuple[PriorInformation, tuple[PriorInformation, Array, Array]]:
-    """What is known of the tool without interference, and with it as of `_loosened`."""
+    """The information on the tool without interference, and with it as of `_loosened`."""
     known = _drifted(calibration, for_run(calibration, readings), assumed.drift)
     field_changes = _unit_changes(calibration, known, 1)
     return known, _loosened(known, field_changes[:, : len(assumed.sd)], assumed.sd)

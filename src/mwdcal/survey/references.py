@@ -840,8 +840,9 @@ def _check_possible(modelled: Mapping[str, float], given: Mapping[str, float]) -
             ", ".join(f"{each[key]:g} {_unit(key)}" for key in keys) for each in (given, modelled)
         )
         raise InputError(
-            f"{', '.join(f'`{key}`' for key in keys)} must be those of the place; got {typed}, the model {model}: "
-            f"{apart:.0f} nT apart, which no place there has (at most {most:.0f} nT). Check sign, unit, "
+            f"{', '.join(f'`{key}`' for key in keys)}: {typed} cannot be of this place, where the model has "
+            f"{model}. "
+            f"The two fields are {apart:.0f} nT apart, and at most {most:.0f} nT is possible. Check sign, unit, "
             "hemisphere and date."
         )
 

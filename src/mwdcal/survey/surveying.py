@@ -418,6 +418,11 @@ def _of_tie_in(start: TieIn, well: Well) -> dict[str, float]:
 def check_free(table: Table, results: Collection[str]) -> None:
     """Refuse a table that has a column of the name of a result."""
     taken = [name for name in results if name in table.columns]
+    if taken and "calibration_run" in table.metadata:
+        raise InputError(
+            f"{table.source}: this is a result of `survey` already: it has the column '{taken[0]}'. Give the table of "
+            "readings that it was made of."
+        )
     if taken:
         raise InputError(
             f"{table.source}: the column '{taken[0]}' is there already, and would be lost under the result of that "

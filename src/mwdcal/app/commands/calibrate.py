@@ -77,7 +77,8 @@ def command(
         from mwdcal.presentation.calibration_page import render
 
         tested = [turned.metadata] if turned else []
-        rendered = render(calibration, verdict, *tested, limits=load_limits(limits)[0])
+        bounds = load_limits(limits)[0]
+        rendered = render(calibration, verdict, *tested, limits=bounds, file=output.name)
     files = output, report
     shown = (
         screen.summary(calibration, choice.curves, *files, _for_machines(verdict, output, rolltest))

@@ -66,7 +66,7 @@ def command(
     if report:
         from mwdcal.presentation.calibration_page import render
 
-        rendered = render(fitted, result, *stated)
+        rendered = render(fitted, result, *stated, file=calibration.name)
     atomic.write_all([(output, to_json(document) + "\n"), (report, rendered)])
     shown = screen(result, loaded.signature, *stated) + next_step(result, calibration, run)
     print_result(document if as_json else shown, result.findings)

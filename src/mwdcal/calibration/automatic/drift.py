@@ -46,6 +46,11 @@ of 0.1 and 93 % at 0.2. One that is not there costs width, 9 % on average over t
 """
 HIDDEN_CHANCE = 0.1
 """The same chance where a trend would not show: a drift then widens the uncertainty many times, on less evidence."""
+TREND_CHANCE = 0.05
+"""Chance of as much of a trend, of which little would show, below which it is a drift whatever its walk says.
+
+A trend of a run that goes from soak to soak looks like a term of temperature, but for what is left within the soaks.
+"""
 PRIOR_CHANCE = 1e-3
 """Chance of so large a departure from the prior, at which a drift is looked for in the run alone."""
 DISPUTED_CHANCE = 0.01
@@ -66,6 +71,7 @@ def chances(result: Fit) -> tuple[Array, Bools]:
     """Probability (B, t) that noise alone follows the order of stations as the residuals of a triad do.
 
     The least of those of the walks that act on a triad, times their number; and whether a trend would not show (B, t).
+    That of a trend counts where little of it would show, if it is below `TREND_CHANCE`.
     """
     analysis = result.analysis
     least, hidden = np.ones(analysis.freedom.shape), np.zeros(analysis.freedom.shape, bool)
@@ -76,8 +82,15 @@ def chances(result: Fit) -> tuple[Array, Bools]:
             ratio = np.where(square > 0, mean / np.where(square > 0, square, 1.0), 0.0)
             one = f_test(total * ratio, mean * ratio, np.nan_to_num(scatter), rest)
             one = np.nan_to_num(one, nan=1.0) * (1 + (triad > 0))
+            little = trends[name] < drift.LEAST_TREND
+            if little.any():
+                seen = little & (trends[name] > drift.LEAST_KEPT)
+                three, factor = np.full(1, 3.0), np.nan_to_num(scatter)
+                trend = np.nan_to_num(f_test(scores.trend(name), three, factor, rest), nan=1.0)
+                trend *= 1 + (triad > 0)
+                one = np.where(seen & (trend < TREND_CHANCE), np.minimum(one, trend), one)
             least[:, triad] = np.minimum(least[:, triad], one)
-            hidden[:, triad] |= trends[name] < drift.LEAST_TREND
+            hidden[:, triad] |= little
     return least, hidden
 
 

@@ -217,8 +217,8 @@ REMARKS = {
     "changed, or the prior is too narrow. Leave `prior` out, or widen it.",
     "nonlinearity-ignored": "nonlinearity of the {triads} is not fitted: the model of factors has no such terms. Use "
     "`model` polynomial for it.",
-    "field-unknown": "field strength is known at no station: the magnetometer is calibrated to field = 1. Give "
-    "ref_field_nt to have nT.",
+    "field-unknown": "no station states the strength of the field, so the magnetometer is calibrated to field = 1 "
+    "instead of nT. Give ref_field_nt to have nT.",
     "restricted": "{parameters} parameters: {lost} of the sensors in the tool is taken as none, and no uncertainty "
     "here includes it. Use `parameters` 12 to fit it.",
     "reshoot": "station {of[station]}: residual {of[size]}σ, most in {of[worst]} ({of[value]:+.3g}{of[unit]}; "
@@ -488,8 +488,8 @@ def _course(
     powers = np.flatnonzero(present[place]) + 1
     cause = "readings differ from one temperature to the next as no course of order 3 does"
     remedy = (
-        "Let the tool come to rest at each temperature and look for hysteresis or a reference "
-        "that moved; more temperatures make the mean better"
+        "Let the tool come to rest at each temperature, and return to one of them: that tells hysteresis or a "
+        "reference that moved from a drift, which no fit includes beside this; more temperatures make the mean better"
     )
     if order < HIGHEST and powers.min() <= HIGHEST:
         cause = f"powers of temperature above order {order} are there"

@@ -942,10 +942,10 @@ def described(effect: Effect, unit: str) -> str:
         reference = effect.name == "dip-reference"
         size += " (dip less its reference)" if reference else " (reading less true)"
     elif effect.name == "tilt":
-        size = f"{np.degrees(np.linalg.norm(effect.values)):.3g}°"
+        size = f"{np.degrees(np.linalg.norm(effect.values)):.2g}°"
     else:
         parts = [(1e3, "mg"), (1.0, unit)][: len(effect.size)]
-        each = [f"{s * f:.3g} {u} rms" for s, (f, u) in zip(effect.size, parts, strict=True)]
+        each = [f"{s * f:.2g} {u} rms" for s, (f, u) in zip(effect.size, parts, strict=True)]
         size = " and ".join(each[TRIADS.index(triad) :][:1] if of_triad else each)
     whose = f"{triad}: the" if of_triad else "The"
     return (
