@@ -402,7 +402,7 @@ def walk_variances(
 
 def _widened(freedom: Array) -> Array:
     """What makes a normal 95 % interval as wide as Student's t for a variance of so many degrees of freedom."""
-    return student_squares()(1 / np.maximum(freedom, FEWEST_USED)) / 1.959964**2
+    return np.asarray(student_squares()(1 / np.maximum(freedom, FEWEST_USED)) / 1.959964**2)
 
 
 @cache
