@@ -419,7 +419,7 @@ def student_squares() -> np.polynomial.Chebyshev:
             here = np.log(fisher_tail(np.ones(inverse.shape), 1 / inverse, now) / 0.05)
             step = quotient(here * (now - before), here - left, here != left)
             before, left, now = now, here, now - step
-        return now
+        return np.asarray(now)
 
     return np.polynomial.Chebyshev.interpolate(squares, STUDENT_DEGREE, domain=[0, 1 / FEWEST_USED])
 
