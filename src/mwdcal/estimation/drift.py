@@ -326,7 +326,7 @@ class _Ridge:
         score = scores.score.copy()
         score[:, some] = (basis.mT @ scores.score[:, some, None])[..., 0]
         cross = scores.information[:, others[:, None], some] @ basis
-        rest = scores.information[:, others[:, None], others]
+        rest = np.ascontiguousarray(scores.information[:, others[:, None], others])
         return cls(score, values, cross, rest, some, others)
 
     def at(self, ratio: Array) -> tuple[Array, Array]:
@@ -342,7 +342,7 @@ class _Ridge:
         value[:, self.others] = shared[..., 0]
         value[:, self.some] = lone * self.score[:, self.some] - (scaled.mT @ shared)[..., 0]
         variance[:, self.others] = diagonal(whole)
-        variance[:, self.some] = lone + np.sum(scaled * (whole @ scaled), 1)
+        variance[:, self.some] = lone + np.einsum("bij,bij->bj", scaled, whole @ scaled)
         return value, variance
 
 
