@@ -266,10 +266,10 @@ class StandColumns:
             heavy = -f * self.weight[rows, None]
             whole[:, rows] = heavy.transpose(2, 0, 3, 1) @ each[:, index]
             axes = np.moveaxis(self.axes[index], 1, -1).swapaxes(0, 1)
-            own = axes[..., None] * self.courses.transpose()[:, None]
-            own = own.reshape(*own.shape[:3], -1)
-            whole[:, rows, :, done : done + own.shape[-1]] += own
-            done += own.shape[-1]
+            effect = axes[..., None] * self.courses.transpose()[:, None]
+            effect = effect.reshape(*effect.shape[:3], -1)
+            whole[:, rows, :, done : done + effect.shape[-1]] += effect
+            done += effect.shape[-1]
         return whole
 
 
