@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import special
 
 from cli_support import calibrated, mwdcal, servo_run, write_csv
 from mwdcal.calibration.automatic.drift import by_drift, chances
@@ -15,7 +16,7 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.results import StatedCovariance, drifts
 from mwdcal.certificate.budget import budget
 from mwdcal.errors import FitError
-from mwdcal.estimation.drift import terms_of, walk_scores
+from mwdcal.estimation.drift import FEWEST_USED, student_squares, terms_of, walk_scores
 from mwdcal.files.formats.table import Table
 from mwdcal.geometry.vectors import earth_field, earth_gravity, tool_from_earth
 from mwdcal.planning.expected import expected
@@ -420,3 +421,10 @@ def test_a_plan_includes_a_declared_drift_and_a_simulation_draws_it():
     moved = drifted(np.random.default_rng(1), session, "accelerometer-drift", (4000,))
     assert np.all(moved[:, 0] == 0)
     assert moved[:, -1].std() == pytest.approx(2e-4, rel=0.03)
+
+
+def test_student_s_t_is_that_of_scipy():
+    freedom = np.geomspace(FEWEST_USED, 1e9, 500)
+    np.testing.assert_allclose(
+        student_squares()(1 / freedom), special.stdtrit(freedom, 0.975) ** 2, rtol=1e-13
+    )

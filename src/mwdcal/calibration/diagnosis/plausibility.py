@@ -303,8 +303,9 @@ def has_sensor_gains(result: Fit, temperature: Array) -> Bools:
     """Fits (B,) whose gains at temperatures (B, k) are such as a sensor has."""
     problem, gains = result.problem, []
     for triad, where in zip(problem.triads, problem.slices(), strict=True):
-        middle = np.broadcast_to(triad.raw.mean(1, keepdims=True), (*temperature.shape, 3))
-        slope = triad.model.slope(result.state.params[:, where], middle, temperature)
+        at = temperature if triad.model.varies else temperature[:, :1]
+        middle = np.broadcast_to(triad.raw.mean(1, keepdims=True), (*at.shape, 3))
+        slope = triad.model.slope(result.state.params[:, where], middle, at)
         gains.append(invertible(slope) & ~mirrored(slope))
     return np.asarray(np.all(gains, 0))
 

@@ -48,7 +48,7 @@ def but_for_constants(problem: Problem) -> bool:
     evidence = problem.evidence
     angles = ("inclination", "toolface", "azimuth")[: 1 + len(problem.triads)]
     return (
-        all(_is_closed(triad) for triad in problem.triads)
+        all(is_closed(triad) for triad in problem.triads)
         and not evidence.absent
         and all(evidence.is_known(name).all() for name in angles)
         and not any(evidence.sd[name].any() for name in angles)
@@ -56,11 +56,14 @@ def but_for_constants(problem: Problem) -> bool:
     )
 
 
-def _is_closed(triad: Triad) -> bool:
-    model = triad.model
-    if isinstance(model, Polynomial):
-        return model.basis.order == 0 and not model.curved
-    return isinstance(model, Factors)
+def is_affine(triad: Triad) -> bool:
+    """Whether a triad's model is a gain and an offset that do not vary."""
+    return isinstance(triad.model, Polynomial) and not triad.model.varies
+
+
+def is_closed(triad: Triad) -> bool:
+    """Whether a triad's model comes apart by axis."""
+    return is_affine(triad) or isinstance(triad.model, Factors)
 
 
 @dataclass(frozen=True)

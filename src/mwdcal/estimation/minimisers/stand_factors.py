@@ -23,7 +23,12 @@ from mwdcal.estimation.batch import put, take
 from mwdcal.estimation.minimisers import closed_form
 from mwdcal.estimation.minimisers.closed_form_factors import OTHERS, Axes, factors, known_at
 from mwdcal.estimation.minimisers.closed_form_factors import minimum as lone_minimum
-from mwdcal.estimation.minimisers.uncertain_stand import FIELD_WALK, TRIAD_ROWS, StandRuns
+from mwdcal.estimation.minimisers.uncertain_stand import (
+    FIELD_WALK,
+    TRIAD_ROWS,
+    StandRuns,
+    has_known_angles,
+)
 from mwdcal.estimation.problem import WALK_AXES, Problem, State, Triad
 from mwdcal.estimation.solvers import Determined, Status, gauss_newton
 from mwdcal.estimation.start import start as general_start
@@ -52,21 +57,12 @@ def applies(problem: Problem) -> bool:
 
 
 def comes_apart(problem: Problem) -> bool:
-    """Whether all angles are known, and nothing but their errors, the sensors' and drifts are to be found."""
-    evidence = problem.evidence
+    """Whether angles are known, with errors of their own or of settings, and the sensors are affine or factors."""
     return (
-        len(problem.triads) == 2
-        and all(_is_affine(t) or isinstance(t.model, Factors) for t in problem.triads)
-        and not (evidence.absent or evidence.scatter or evidence.members.size)
-        and bool(evidence.referenced.all())
-        and not problem.prior.precision.any()
-        and all(constant.name in WALK_AXES for constant in evidence.constants)
+        all(closed_form.is_closed(triad) for triad in problem.triads)
+        and has_known_angles(problem)
+        and not problem.evidence.members.size
     )
-
-
-def _is_affine(triad: Triad) -> bool:
-    model = triad.model
-    return isinstance(model, Polynomial) and not (model.basis.order or model.curved)
 
 
 # --------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from math import prod
 
 import numpy as np
 
-from mwdcal.estimation.batch import take
+from mwdcal.estimation.batch import is_once, take
 from mwdcal.estimation.minimisers import closed_form
 from mwdcal.estimation.minimisers.closed_form import AffineMinimum
 from mwdcal.estimation.problem import WALK_AXES, WALKS, Problem, State
@@ -266,10 +266,10 @@ class StandColumns:
             heavy = -f * self.weight[rows, None]
             whole[:, rows] = heavy.transpose(2, 0, 3, 1) @ each[:, index]
             axes = np.moveaxis(self.axes[index], 1, -1).swapaxes(0, 1)
-            own = axes[..., None] * self.courses.transpose()[:, None]
-            own = own.reshape(*own.shape[:3], -1)
-            whole[:, rows, :, done : done + own.shape[-1]] += own
-            done += own.shape[-1]
+            effect = axes[..., None] * self.courses.transpose()[:, None]
+            effect = effect.reshape(*effect.shape[:3], -1)
+            whole[:, rows, :, done : done + effect.shape[-1]] += effect
+            done += effect.shape[-1]
         return whole
 
 
@@ -564,33 +564,36 @@ LEAST_OF_SIGNAL = 1e-6
 
 
 def applies(problem: Problem) -> bool:
-    """Whether all angles are known, and nothing but their own errors, the sensors' and drifts are to be found."""
-    evidence = problem.evidence
+    """Whether angles are known with errors of their own alone, and both sensors' gains and offsets do not vary."""
     return (
-        len(problem.triads) == 2
-        and all(isinstance(t.model, Polynomial) for t in problem.triads)
-        and not any(t.model.varies for t in problem.triads)
-        and not (evidence.absent or evidence.scatter)
-        and not evidence.set_together.any()
-        and bool(evidence.referenced.all())
-        and not problem.prior.precision.any()
-        and _are_drifts(problem)
+        has_known_angles(problem)
+        and all(closed_form.is_affine(triad) for triad in problem.triads)
+        and not problem.evidence.set_together.any()
+        and _have_common_terms(problem)
     )
 
 
-def _are_drifts(problem: Problem) -> bool:
-    """Whether all constants are terms of drifts, those of each axis the same, at all tools."""
+def has_known_angles(problem: Problem) -> bool:
+    """Whether all angles are known, and nothing but their errors, two sensors and drifts are to be found."""
+    evidence = problem.evidence
+    return (
+        len(problem.triads) == 2
+        and not (evidence.absent or evidence.scatter)
+        and bool(evidence.referenced.all())
+        and not problem.prior.precision.any()
+        and all(constant.name in WALK_AXES for constant in evidence.constants)
+    )
+
+
+def _have_common_terms(problem: Problem) -> bool:
+    """Whether the terms of drifts are in the order of their axes, and the same for each, at all tools."""
     constants = problem.evidence.constants
     names = [constant.name for constant in constants]
     terms = names.count(names[0]) if names else 1
     masks = [constants[place % terms].mask[:1] for place in range(len(names))]
-    return (
-        all(name in WALK_AXES for name in names)
-        and names == [name for name in WALK_AXES if name in names for _ in range(terms)]
-        and all(
-            np.array_equal(constant.mask, np.broadcast_to(mask, constant.mask.shape))
-            for constant, mask in zip(constants, masks, strict=True)
-        )
+    return names == [name for name in WALK_AXES if name in names for _ in range(terms)] and all(
+        bool((constant.mask[: 1 if is_once(constant.mask) else None] == mask).all())
+        for constant, mask in zip(constants, masks, strict=True)
     )
 
 
