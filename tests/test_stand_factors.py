@@ -48,7 +48,7 @@ def on_stand(seed, count=4, practice="per-station", declared=True, size=1.0, ord
 @pytest.fixture
 def general(monkeypatch):
     """Lets every tool go the general way from now on."""
-    return lambda: monkeypatch.setattr(stand_factors, "applies", lambda problem: False)
+    return lambda: monkeypatch.setattr(stand_factors, "comes_apart", lambda problem: False)
 
 
 def sigma(result):
@@ -153,6 +153,15 @@ def test_further_terms_are_the_general_ones(order, practice, general):
     other = courses.terms_beyond(result)
     for name, theirs in vars(other).items():
         np.testing.assert_allclose(getattr(mine, name), theirs, rtol=1e-6, atol=1e-12, err_msg=name)
+
+
+def test_terms_beyond_order_0_at_exact_angles_are_the_general_ones(general):
+    readings = on_stand(14, 3)
+    exact = replace(readings, sd={n: sd for n, sd in readings.sd.items() if n not in STAND})
+    mine = courses.terms_beyond(fit(exact, Options(order=0)))
+    general()
+    other = courses.terms_beyond(fit(exact, Options(order=0)))
+    assert_alike(mine, other, 1e-6)
 
 
 @pytest.mark.parametrize("order", range(4))
