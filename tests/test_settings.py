@@ -1,10 +1,14 @@
 """Settings of the stand: which stations share one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from mwdcal.calibration.options import is_assumed, settings_of
+from mwdcal.calibration.diagnosis.refusals import BAD_INPUT, reading_refusals
+from mwdcal.calibration.options import Options, is_assumed, settings_of
 from mwdcal.errors import InputError
+from mwdcal.estimation.batch import batch_of_one
 from mwdcal.library.arrays import readings
 
 
@@ -66,3 +70,19 @@ def test_the_assumption_is_one_where_nobody_states_the_practice(more, expected):
 def test_an_unknown_practice_is_refused():
     with pytest.raises(InputError, match="per-direction or per-station; got 'daily'"):
         run([5, 5], [0, 0], settings="daily")
+
+
+@pytest.mark.parametrize("practice", ["per-direction", "per-station"])
+def test_more_settings_than_memory_holds_are_refused_with_a_remedy(practice):
+    directions, each = 1250, 8
+    rng = np.random.default_rng(1)
+    inclination, azimuth = rng.uniform([5, 0], [135, 360], (directions, 2)).repeat(each, 0).T
+    long = run(inclination, azimuth, settings=practice)
+    vectors = rng.normal(size=(len(inclination), 3))
+    long = replace(long, accelerometer=vectors, sd={"inclination": np.array(1e-4)})
+    whole = batch_of_one(long)
+    refused = [f for f in reading_refusals(whole, Options(), lambda _: long) if f.members.any()]
+    assert [f.id for f in refused] == [BAD_INPUT] * (practice == "per-direction")
+    for flag in refused:
+        assert "10000 stations share 1250 settings" in flag.sentence(0)
+        assert 'settings = "per-station"' in flag.sentence(0)

@@ -308,7 +308,7 @@ class _Worker:
             results.append(self.calibration.outside(readings))
         if whole is not None:
             results = [spread(values, whole) for values in results]
-        empty = corrected.empty or valueless or (self.stated and np.isnan(results).any())
+        empty = corrected.empty or valueless or any(np.isnan(each).any() for each in results)
         rendered = sink.render(part.carried, results, bool(empty) or whole is not None)
         self._judge(channels, table.count)
         tally = RowCounts(

@@ -13,11 +13,11 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from mwdcal import errors
 from mwdcal.certificate.decisions import student_factor
 from mwdcal.certificate.signature import public_key
 from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError
+from mwdcal.files.profiles import PACKAGE
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array
 from mwdcal.library import face
@@ -32,8 +32,6 @@ Attitudes = tuple[Array, Array, Array]
 """Inclination, azimuth and toolface (n,), radians."""
 Both = tuple[Any, Any]
 """Expected and computed values."""
-PACKAGE = Path(errors.__file__).parent
-"""The folder of the installed package."""
 
 
 class SelftestRow(msgspec.Struct, frozen=True, kw_only=True):

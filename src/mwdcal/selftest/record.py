@@ -12,6 +12,7 @@ import msgspec
 
 from mwdcal import __version__
 from mwdcal.digests import sha256_of
+from mwdcal.files.profiles import PACKAGE
 from mwdcal.presentation.certificate import (
     Cell,
     CertificateText,
@@ -30,7 +31,7 @@ from mwdcal.presentation.certificate import (
 )
 from mwdcal.presentation.numbers import number, unit
 from mwdcal.presentation.text import one_line, plural, table
-from mwdcal.selftest.cases import PACKAGE, SelftestRow, cases
+from mwdcal.selftest.cases import SelftestRow, cases
 
 LIBRARIES = (
     "numpy", "scipy", "msgspec", "click", "rich", "numba", "pyarrow", "jinja2", "matplotlib", "typst", "cryptography",

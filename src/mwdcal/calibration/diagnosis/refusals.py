@@ -30,7 +30,7 @@ from mwdcal.calibration.diagnosis.plausibility import (
 from mwdcal.calibration.diagnosis.structure import COLUMN, described
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.methods import EVIDENCE
-from mwdcal.calibration.options import Options
+from mwdcal.calibration.options import DIRECTION, Options, settings_of
 from mwdcal.calibration.readings import (
     CONSTANTS,
     EARTH_RANGES,
@@ -198,6 +198,8 @@ ABSURD_RATIO = 30.0
 """Residuals of more than this many times the declared noise mean that something is plain wrong."""
 COARSE_NOISE = 0.05
 """Estimated noise of more than this share of the field likewise."""
+MOST_SETTINGS = 6_000_000
+"""Most stations times settings that they share: 6,000 times 250 take 10 s and 1.3 GB, and memory goes with both."""
 BAD_INPUT = "bad-input"
 """The status of what is wrong with the input itself: an `InputError` of a single run."""
 NEEDS = {
@@ -249,6 +251,9 @@ UNSOUND_ADVICE = (
 OF_READINGS = {
     "few": "{source} has {count} stations; the model has {size} parameters per triad and needs {needed} or more. Add "
     "stations at other attitudes{remedy}.",
+    "settings": "{source}: {count} stations share {settings} settings of the stand. To fit the errors of so many takes "
+    'minutes and many GB of memory. If the stand is set anew at every station, say settings = "per-station" under '
+    "[stand] in the tool profile; if not, calibrate a part of the run.",
     "common": "{takes} the stand as exact and the run as steady, and the tool profile declares {declared}: no "
     "uncertainty would include it. Use `method` least-squares or joint without `paper_weights`, or take it out of "
     "the profile.",
@@ -371,6 +376,7 @@ def reading_refusals(readings: Readings, options: Options, run: Run) -> Iterator
 
     words = {"source": source, "count": readings.count}
     yield _few_stations(readings, options, words)
+    yield _many_settings(readings, words)
     yield _common_errors(readings, options)
     yield _field_in_nanotesla(readings)
     for triad in readings.triads:
@@ -397,6 +403,17 @@ def _few_stations(readings: Readings, options: Options, words: Words) -> Flag:
     remedy = ", or lower `order`" if order else ""
     values = words | {"size": size, "needed": -(-size // 3), "remedy": remedy}
     return Flag("too-few-stations", _all(readings, few), OF_READINGS["few"], values)
+
+
+def _many_settings(readings: Readings, words: Words) -> Flag:
+    """Errors of settings of an uncertain stand that are too many to be fitted at once."""
+    uncertain = any(bool((readings.uncertainty(name) > 0).any()) for name in DIRECTION)
+    members, several = _all(readings, False), np.zeros(len(readings.accelerometer), int)
+    if uncertain and readings.count**2 > 2 * MOST_SETTINGS:
+        number = np.broadcast_to(settings_of(readings), readings.accelerometer.shape[:-1])
+        several = np.array([np.count_nonzero(np.bincount(each) > 1) for each in number])
+        members = several * readings.count > MOST_SETTINGS
+    return Flag(BAD_INPUT, members, OF_READINGS["settings"], words | {"settings": several})
 
 
 def _common_errors(readings: Readings, options: Options) -> Flag:

@@ -149,7 +149,10 @@ def dense(table: Any, schema: Any, source: str, arrow: Any, most: int = MAX_TEXT
             f"{source}: texts of rows that are read at once must have at most {most} bytes; "
             f"got {size}. Shorten or remove the columns with long texts."
         )
-    return table.cast(arrow.schema([schema.field(name) for name in table.column_names]))
+    wanted = arrow.schema([schema.field(name) for name in table.column_names])
+    if table.schema.equals(wanted):  # a cast loads `pyarrow.compute`
+        return arrow.Table.from_arrays(table.columns, schema=wanted)
+    return table.cast(wanted)
 
 
 def _size_of(cells: Any) -> int:
@@ -203,7 +206,9 @@ def as_column(name: str, cells: Any, arrow: Any) -> Column:
     whole = types.is_integer(kind) and not _is_code(cells)
     if (name in LABELS and not (name == "serial" and numeric)) or not (numeric or whole):
         return texts(cells, arrow)
-    return np.array(cells.cast(arrow.float64(), safe=False).to_numpy(), float)
+    if not types.is_float64(kind):
+        cells = cells.cast(arrow.float64(), safe=False)
+    return np.array(cells.to_numpy(), float)
 
 
 def _is_code(cells: Any) -> bool:
