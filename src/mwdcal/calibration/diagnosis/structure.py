@@ -743,7 +743,7 @@ def shown_effects(result: Fit, others: Mapping[str, Array]) -> list[Shown]:
 
 def _searched(result: Fit, others: Mapping[str, Array]) -> list[Shown]:
     """Effects that residuals show: the least likely by chance first, then what its fit leaves, and so on."""
-    scores = _scores(_with_noise_found(result), result, others)
+    scores = _scores(_at_noise_of(result), result, others)
     shown: list[Shown] = [{} for _ in result.status]
     left = scores.misfit.copy()
     searched: dict[tuple[str, ...], Ints] = {(): np.arange(len(shown))}
@@ -766,7 +766,7 @@ def _searched(result: Fit, others: Mapping[str, Array]) -> list[Shown]:
     return shown
 
 
-def _with_noise_found(result: Fit) -> Problem:
+def _at_noise_of(result: Fit) -> Problem:
     """The problem of a fit with the noise that its residuals show."""
     scales = np.maximum(variance_scales(result), 1e-12)
     triads = [
@@ -781,10 +781,10 @@ def chance_alone(result: Fit, name: str) -> Array:
     result, chance = _without_bad_stations(result), np.ones(len(result.status))
     for first in range(0, len(chance), AT_ONCE):
         part = take(result, np.arange(first, min(first + AT_ONCE, len(chance))))
-        problem = _with_noise_found(part)
-        found = next((c for n, c in families(problem, part.state) if n == name), None)
-        if found is not None:
-            scores = _scores_of(problem, part, {name: found})
+        problem = _at_noise_of(part)
+        columns = next((c for n, c in families(problem, part.state) if n == name), None)
+        if columns is not None:
+            scores = _scores_of(problem, part, {name: columns})
             one = _trials(scores, (), (name,), scores.misfit)[0][0]
             chance[first : first + AT_ONCE] = one
     return chance
