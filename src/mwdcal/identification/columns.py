@@ -70,6 +70,8 @@ _STEADY_DIP, _STEADY_FIELD = 3.0, 0.1
 """A dip varies by less at one place, degrees, and a field by a smaller share."""
 STEADY_NORM = 0.15
 """By how much the norm of a triad varies at most, as a share of the range of its channels."""
+OF_ONE_SPHERE = 0.05
+"""The same of three channels that belong together by their readings alone."""
 _LEAST_TURN = 20.0
 """By how much an angle of the stand varies at least, degrees."""
 _MOST_TRIPLES = 6
@@ -288,7 +290,9 @@ _OF_NORTH = re.compile(r"north|nord|norte|azi|azm|heading|азим|север|�
 """Words of the north that azimuths count from."""
 _TWICE = re.compile(r" \(\d+\)$")
 """The end of a name that stands in a table more than once."""
-_NUMBERED = re.compile(r"(.*?[A-Za-z])[ _-]*([123])((?:\W.*|_[A-Za-z]+)?)")
+_LONE_AXIS = re.compile(r"(?<![^\W_])([xyzXYZ])(?![^\W_])")
+"""An axis that stands alone in a name."""
+_NUMBERED = re.compile(r"(.*?[^\W\d_])[ _\-\[]*([0-3])\]?((?:\W.*|_[A-Za-z]+)?)")
 _ANGLES_AND_WARMTH = (
     *(REFERENCES[name].column for name in ("inclination", "azimuth", "toolface")),
     WARMTH,
@@ -383,7 +387,24 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     stated = IN_BRACKETS.search(plain)
     if alike and alike.column == REFERENCES["azimuth"].column and alike.unit.startswith("mag"):
         return alike._replace(unit="")
-    return alike or (Resemblance(spelt, unit_of(stated[1]) if stated else "") if spelt else None)
+    if not alike and not spelt:
+        return _by_axis_and_unit(name, unit or (stated[1] if stated else ""))
+    return alike or Resemblance(spelt or "", unit_of(stated[1]) if stated else "")
+
+
+def _by_axis_and_unit(name: str, unit: str) -> Resemblance | None:
+    """The channel that a name in whatever words is by its axis and a unit that one triad alone has: Kiihtyvyys X (g)."""
+    axes = _LONE_AXIS.findall(IN_BRACKETS.sub("", name))
+    kinds = {"g": "a", "mg": "a", "m/s²": "a", "nT": "m", "µT": "m", "gauss": "m", "mG": "m"}
+    known = unit_of(spelled(unit))
+    if (
+        len(axes) != 1
+        or known not in kinds
+        or unit.strip() in ("G", "mG")
+        or _CALLED_REFERENCE.search(spelled(name))
+    ):
+        return None
+    return Resemblance(f"{kinds[known]}{axes[0].lower()}", known)
 
 
 def _bare(name: str, level: re.Match[str]) -> str:
@@ -500,14 +521,14 @@ def _follows(
 
 
 def _numbered(names: Sequence[str]) -> dict[str, str]:
-    """Names that end in 1, 2 and 3, where all three are there, with x, y and z instead."""
+    """Names that end in 1, 2 and 3, or 0, 1 and 2, where all three are there, with x, y and z instead."""
     parts = {name: match for name in names if (match := _NUMBERED.fullmatch(name))}
     stems = {(m[1], m[3]) for m in parts.values()}
-    whole = {s for s in stems if {m[2] for m in parts.values() if (m[1], m[3]) == s} == {*"123"}}
+    numbers = {s: "".join(sorted(m[2] for m in parts.values() if (m[1], m[3]) == s)) for s in stems}
     return {
-        name: f"{m[1]} {'xyz'[int(m[2]) - 1]} {m[3]}".strip()
+        name: f"{m[1]} {'xyz'[numbers[m[1], m[3]].index(m[2])]} {m[3]}".strip()
         for name, m in parts.items()
-        if (m[1], m[3]) in whole
+        if numbers[m[1], m[3]] in ("123", "012")
     }
 
 
@@ -612,7 +633,10 @@ def proposed(
         questions.ask(_check_nameless, others, values, {*chosen, *known}, source)
     rest = {n: u for n, u in zip(names, units, strict=True) if n not in meanings}
     present = {*chosen, *said, *known, *of_vectors(chosen)}
-    lacking = [*lacking_references(present), *BY_NAME_ALONE]
+    magnetic = (
+        RAW[3:] if any("Are these the magnetometers" in each.text for each in questions) else ()
+    )
+    lacking = [*lacking_references({*present, *magnetic}), *BY_NAME_ALONE]
     for column in (each for each in lacking if each not in present):
         questions.ask(_check_lacking, column, rest, values, source)
     questions.raise_any(source)
@@ -852,7 +876,7 @@ def _check_triads(
         raise QuestionError(
             f"{source}: could not tell which columns are the accelerometers ({', '.join(absent)}); the names are "
             f"{', '.join(map(shown, names[:20]))}.",
-            triples_for(RAW[:3], others, values)
+            triples_for(RAW[:3], others, values, OF_ONE_SPHERE) or triples_for(RAW[:3], others, values)
             if len(absent) == 3
             else channels_for(absent[0], others, values),
         )
@@ -915,7 +939,8 @@ def _check_nameless(
     of_field = [REFERENCES[name].column for name in ("field", "dip", "azimuth")]
     if not {*of_field} & {*known}:
         return
-    if triples := triples_for(RAW[3:], unused, values, STEADY_NORM):
+    triples = triples_for(RAW[3:], unused, values, OF_ONE_SPHERE)
+    if triples := triples or triples_for(RAW[3:], unused, values, STEADY_NORM):
         raise QuestionError(
             f"{source}: no column is a magnetometer by its name, and the table states the field. Are these the "
             "magnetometers?",

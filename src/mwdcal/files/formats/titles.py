@@ -76,7 +76,7 @@ _BEHIND_MODEL = re.compile(
     re.IGNORECASE,
 )
 """The word for the tool, its model, and its serial behind a mark: Sonde SD-9 n° 112."""
-_MARKED = re.compile(
+_WITH_MARK = re.compile(
     r"(?:(?<![^\W\d_])|(?<=[\u4e00-\u9fff]))(?:(?P<word>serial(?:[ -]?(?:number|num|no|nr))?|(?:[^\W\d_]+-?)?serien?-?(?:nummer|nr)|"
     r"(?:n[°ºo.r]*|n[uú]m\w*|nr)\.? (?:d[ei] )?(?:s[eé]ri[ea]l?|fabr\w*|seryjny)|s[eé]rie|fabr(?:ik)?\.?[ -]?(?:nr|nummer)|matricola|"
     r"зав\w*\.? ?(?:№|номер|n)|серийн\w* ?(?:№|номер)|seri ?no|序列号|编号|製造番号)|s\.?/?n|[^\W\d_]+[ -]sn|"
@@ -198,7 +198,7 @@ def _marked_in(text: str) -> list[str]:
     """The serials behind a word for one in a line; those behind a whole word before those behind letters."""
     every = [
         m
-        for m in (() if text.startswith("TOA5") else _MARKED.finditer(text))
+        for m in (() if text.startswith("TOA5") else _WITH_MARK.finditer(text))
         if not _OF_EQUIPMENT.search(re.split("[;,]", text[: m.start()].rstrip(" ;,"))[-1])
     ]
     return [m["serial"] for m in every if m["word"]] or [m["serial"] for m in every]
