@@ -364,8 +364,8 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     logged = _OF_LOGGER.fullmatch(name)
     name = f"{logged[1]}{logged[2] or ''}" if logged else name
     plain = spelled(f"{name} ({unit})" if unit else name)
-    if "elevation" in plain:
-        return Resemblance("ref_inclination_deg", BELOW if _DOWNWARDS.search(plain) else ABOVE)
+    if elevation := _elevation(name, plain, unit):
+        return elevation
     if _CCW.search(plain):
         turned = resembled(_CCW.sub("", plain))
         return turned and (
@@ -374,10 +374,6 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     alike = (
         resembled(plain) or _without_title(plain) or resembled(f"{name} ({unit})" if unit else name)
     )
-    if level := _FROM_HORIZONTAL.search(name):
-        bare = alike or meaning(_bare(name, level), unit)
-        if bare and bare.column == REFERENCES["inclination"].column:
-            return bare._replace(unit=BELOW if _DOWNWARDS.search(plain) else ABOVE)
     if alike and alike.column in RAW and _CALLED_REFERENCE.search(plain):
         return alike._replace(column=REFERENCE_VECTORS[RAW.index(alike.column)])
     if _MEASURED.search(plain) and not (alike and alike.column == WARMTH):
@@ -392,8 +388,19 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     return alike or Resemblance(spelt or "", unit_of(stated[1]) if stated else "")
 
 
+def _elevation(name: str, plain: str, unit: str) -> Resemblance | None:
+    """The inclination that a name says to count from the horizontal, in whatever words."""
+    sense = BELOW if _DOWNWARDS.search(plain) else ABOVE
+    if "elevation" in plain:
+        return Resemblance(REFERENCES["inclination"].column, sense)
+    level = _FROM_HORIZONTAL.search(name)
+    bare = level and (resembled(plain) or meaning(_bare(name, level), unit))
+    inclined = bare and bare.column == REFERENCES["inclination"].column
+    return bare._replace(unit=sense) if bare and inclined else None
+
+
 def _by_axis_and_unit(name: str, unit: str) -> Resemblance | None:
-    """The channel that a name in whatever words is by its axis and a unit that one triad alone has: Kiihtyvyys X (g)."""
+    """The channel that a name in whatever words is by its axis and a unit that one triad alone has."""
     axes = _LONE_AXIS.findall(IN_BRACKETS.sub("", name))
     kinds = {"g": "a", "mg": "a", "m/s²": "a", "nT": "m", "µT": "m", "gauss": "m", "mG": "m"}
     known = unit_of(spelled(unit))
@@ -632,18 +639,26 @@ def proposed(
         others = [n for n in names if n not in meanings and n not in believed]
         questions.ask(_check_nameless, others, values, {*chosen, *known}, source)
     rest = {n: u for n, u in zip(names, units, strict=True) if n not in meanings}
-    present = {*chosen, *said, *known, *of_vectors(chosen)}
-    magnetic = (
-        RAW[3:] if any("Are these the magnetometers" in each.text for each in questions) else ()
-    )
-    lacking = [*lacking_references({*present, *magnetic}), *BY_NAME_ALONE]
-    for column in (each for each in lacking if each not in present):
-        questions.ask(_check_lacking, column, rest, values, source)
+    _ask_lacking({*chosen, *said, *known, *of_vectors(chosen)}, rest, values, questions, source)
     questions.raise_any(source)
     by_value = {c for c, each in chosen.items() if each.unit and not meanings[each.name].unit}
     used = {each.name for each in chosen.values()}
     ignored = {name: reason for name, reason in ignored.items() if name not in used}
     return _labels(names, chosen) | chosen, by_value, ignored
+
+
+def _ask_lacking(
+    present: Collection[str],
+    others: Mapping[str, str],
+    values: Values,
+    questions: Questions,
+    source: str,
+) -> None:
+    """Questions on references and a temperature that are absent, among other columns with their units."""
+    magnetic = any("Are these the magnetometers" in each.text for each in questions)
+    lacking = [*lacking_references({*present, *(RAW[3:] if magnetic else ())}), *BY_NAME_ALONE]
+    for column in (each for each in lacking if each not in present):
+        questions.ask(_check_lacking, column, others, values, source)
 
 
 def _with_whole_vectors(meanings: dict[str, Resemblance]) -> dict[str, Resemblance]:
@@ -778,7 +793,7 @@ def _tell_temperature(
     cells = values(lone[0]) if len(lone) == 1 else None
     known = cells[np.isfinite(cells)] if cells is not None else np.empty(0)
     known = known[~is_filler(known)]
-    if known.size and np.all(np.abs(known - 70) <= 130) and not is_numbering(known):
+    if known.size and np.all((known >= -60) & (known <= 500)) and not is_numbering(known):
         meanings[lone[0]] = Resemblance(WARMTH)
 
 
@@ -876,7 +891,8 @@ def _check_triads(
         raise QuestionError(
             f"{source}: could not tell which columns are the accelerometers ({', '.join(absent)}); the names are "
             f"{', '.join(map(shown, names[:20]))}.",
-            triples_for(RAW[:3], others, values, OF_ONE_SPHERE) or triples_for(RAW[:3], others, values)
+            triples_for(RAW[:3], others, values, OF_ONE_SPHERE)
+            or triples_for(RAW[:3], others, values)
             if len(absent) == 3
             else channels_for(absent[0], others, values),
         )
