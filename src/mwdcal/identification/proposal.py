@@ -15,7 +15,11 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from mwdcal.calibration.diagnosis.findings import MARKED_ROWS, unused_columns
+from mwdcal.calibration.diagnosis.findings import (
+    MARKED_ROWS,
+    references_not_taken,
+    unused_columns,
+)
 from mwdcal.calibration.diagnosis.flags import listed
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import Finding
@@ -1126,20 +1130,18 @@ def left_handed(proposal: Proposal) -> list[Finding]:
     ]
 
 
-def references_not_taken(proposal: Proposal) -> list[Finding]:
-    """A finding on each nominal reference above the names, where the run has no other."""
+def lines_not_taken(proposal: Proposal) -> list[Finding]:
+    """A finding on each nominal or unclear reference beside the table, where the run has no other."""
     columns = proposal.profile.columns
     named = {} if isinstance(columns, msgspec.UnsetType) else columns
     lines = proposal.where.titles.not_taken if proposal.where else {}
-    return [
-        Finding(
-            id="reference-not-taken",
-            text=f"{shown(line)} is nominal or unclear, and not taken as '{column}', which the run does not state "
-            "otherwise. If it holds, state it plainly, or in a column.",
-        )
-        for column, line in lines.items()
-        if column not in named and column not in proposal.metadata
-    ]
+    return references_not_taken(
+        {
+            c: shown(t)[1:-1]
+            for c, t in lines.items()
+            if c not in named and c not in proposal.metadata
+        }
+    )
 
 
 def answers_by_readings(proposal: Proposal) -> list[Finding]:
@@ -1202,7 +1204,7 @@ def findings_on(proposal: Proposal) -> list[Finding]:
         for name, reason in proposal.ignored.items()
     ]
     marked = [Finding(id=MARKED_ROWS, text=text) for text in proposal.remarks]
-    known = axes_open(proposal) + left_handed(proposal) + references_not_taken(proposal) + marked
+    known = axes_open(proposal) + left_handed(proposal) + lines_not_taken(proposal) + marked
     known += answers_by_readings(proposal) + warmth_around(proposal) + units_contradicted(proposal)
     return known + ignored + unused_columns(proposal.unused)
 
