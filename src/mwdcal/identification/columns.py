@@ -297,7 +297,7 @@ _ANGLES_AND_WARMTH = (
     *(REFERENCES[name].column for name in ("inclination", "azimuth", "toolface")),
     WARMTH,
 )
-"""Columns of which values tell the unit where a word that is none stands for it, such as deg of a temperature."""
+"""Columns of which values tell the unit beside a word that is not a unit, such as deg of a temperature."""
 BY_NAME_ALONE = (WARMTH, REFERENCES["gravity"].column)
 """Columns that a run may lack, and that values alone do not tell."""
 _OF_PLACE_ALONE = tuple(REFERENCES[name].column for name in ("gravity", "field", "dip"))

@@ -162,7 +162,7 @@ _INCLINED = re.compile(
     r"dip|(?<![^\W\d_])[iеe]n[ck]l\w*|inklin\w*|inclin\w*|наклон\w*|нахил\w*|倾|伏角|傾|egim|duzalimi|sklon\w*|nachyleni\w*|"
     r"hajlas\w*|lutning|kallistuma|helling|mergulho|buzamiento|echado",
 )
-"""Words of an inclination, which is the field's among what is said of a place."""
+"""Words of an inclination, which is the field's in a line about a place."""
 _OF_STAND = re.compile(
     r"cradle|stand|rig|table|tool|bench|fixture|setting|setup|hole|well|plat|banco|banc\b|mesa|cuna|stativ|sonde|probe|"
     r"стенд|стол|скваж|зенит|转台|台|井|azi\w*|decl\w*|error|acc?uracy|genau\w*|resid\w*",
