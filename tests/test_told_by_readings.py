@@ -110,6 +110,21 @@ def test_of_what_a_stand_was_set_to_and_shows_it_is_what_it_shows(tmp_path, word
     assert reference(path) == pytest.approx(np.asarray(servo_run()["ref_toolface_deg"]))
 
 
+def test_an_angle_that_was_set_among_others_that_the_stand_shows_is_named(tmp_path):
+    columns = {n.replace(" (deg)", " Ist (deg)"): v for n, v in table().items()}
+    columns["Azi Soll (deg)"] = columns.pop("Azi Ist (deg)")
+    columns["Dip (deg)"] = columns.pop("Dip Ist (deg)")
+    columns |= {
+        "Inc Soll (deg)": columns["Inc Ist (deg)"],
+        "TF Soll (deg)": columns["TF Ist (deg)"],
+    }
+    proposal = library.propose_profile(written(tmp_path / "a.csv", columns))
+    assert "ref_azimuth_deg=Azi Soll (deg)" in findings_of(proposal)["told-by-readings"]
+    columns["Azi Ist (deg)"] = columns["Azi Soll (deg)"]
+    whole = library.propose_profile(written(tmp_path / "b.csv", columns))
+    assert "told-by-readings" not in findings_of(whole)
+
+
 def test_an_angle_that_the_readings_fit_far_worse_than_its_twin_is_asked_about(tmp_path):
     """The column that a stand shows has lost its name; the ones that it was set to have theirs."""
     columns = table()

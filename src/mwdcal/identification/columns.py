@@ -631,6 +631,9 @@ def proposed(
     if not hidden and not any(n in damaged for n, m in meanings.items() if m.column in RAW):
         questions.ask(_check_triads, names, values, chosen, source)
     questions.ask(_check_units_of_triads, chosen, source)
+    questions.ask(
+        _check_nominal, {c: e for c, e in chosen.items() if c not in said}, values, source
+    )
     beside = any("side by side" in each.text for each in questions)
     if not beside and not {*RAW[3:]} & {*chosen, *said}:
         believed = (
@@ -979,6 +982,19 @@ def _check_units_of_triads(chosen: Mapping[str, ColumnSource], source: str) -> N
                     Answer(u, tuple(("column", f"{c}={e.name} ({u})") for c, e in stated.items()))
                     for u in units
                 ],
+            )
+
+
+def _check_nominal(chosen: Mapping[str, ColumnSource], values: Values, source: str) -> None:
+    """Ask about an angle that the stand was to be set to, among others that it shows."""
+    angles = {c: chosen[c].name for c in _ANGLES_AND_WARMTH[:3] if c in chosen}
+    shows = [n for n in angles.values() if _ACTUAL.search(n) and not _NOMINAL.search(n)]
+    for column, name in angles.items():
+        if shows and _NOMINAL.search(name) and not _ACTUAL.search(name):
+            raise QuestionError(
+                f"{source}: {shown(name)} is what the stand was to be set to, and {shown(shows[0])} what it shows. Is "
+                f"there no column of what it shows as '{column}'?",
+                candidates_for(column, [name], values),
             )
 
 
