@@ -155,6 +155,7 @@ class Readings:
         source: name of the file.
         unused: columns of the file that are not used, each with what it resembles.
         remarks: sentences on rows of the file that are left out.
+        not_taken: lines of the file with a reference that is not read, by column of a run file.
         others: the numbers (..., n) in those of them that have one at every station, by name.
         table: all columns (n,) of the file or table that was read, as they stand there.
         profile: the tool profile by which raw channels became these readings, if there was one.
@@ -176,6 +177,7 @@ class Readings:
     source: str = ""
     unused: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
+    not_taken: Mapping[str, str] = field(default_factory=dict)
     others: Mapping[str, Array] = field(default_factory=dict)
     table: Mapping[str, AnyArray] = field(default_factory=dict)
     columns: ClassVar[Mapping[str, AnyArray]]

@@ -469,6 +469,7 @@ def to_readings(
         run_sha256=table.digest,
         unused=synonyms.unused(list(table.columns), COLUMNS),
         remarks=table.remarks,
+        not_taken={c: line for c, line in table.not_taken.items() if c not in table.columns},
     )
     triads = {
         kind: msgspec.structs.replace(getattr(profile, kind), scale=float(np.squeeze(scale)))

@@ -164,6 +164,7 @@ _WARMTH = {
 }
 """Words that make a column a temperature, whatever it is the temperature of."""
 _PLACES = {
+    *("tool", "sonde", "degc", "degf"),
     *(
         "sens",
         "sensor",

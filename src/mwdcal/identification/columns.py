@@ -70,6 +70,8 @@ _STEADY_DIP, _STEADY_FIELD = 3.0, 0.1
 """A dip varies by less at one place, degrees, and a field by a smaller share."""
 STEADY_NORM = 0.15
 """By how much the norm of a triad varies at most, as a share of the range of its channels."""
+OF_ONE_SPHERE = 0.05
+"""The same of three channels that belong together by their readings alone."""
 _LEAST_TURN = 20.0
 """By how much an angle of the stand varies at least, degrees."""
 _MOST_TRIPLES = 6
@@ -288,12 +290,14 @@ _OF_NORTH = re.compile(r"north|nord|norte|azi|azm|heading|азим|север|�
 """Words of the north that azimuths count from."""
 _TWICE = re.compile(r" \(\d+\)$")
 """The end of a name that stands in a table more than once."""
-_NUMBERED = re.compile(r"(.*?[A-Za-z])[ _-]*([123])((?:\W.*|_[A-Za-z]+)?)")
+_LONE_AXIS = re.compile(r"(?<![^\W_])([xyzXYZ])(?![^\W_])")
+"""An axis that stands alone in a name."""
+_NUMBERED = re.compile(r"(.*?[^\W\d_])[ _\-\[]*([0-3])\]?((?:\W.*|_[A-Za-z]+)?)")
 _ANGLES_AND_WARMTH = (
     *(REFERENCES[name].column for name in ("inclination", "azimuth", "toolface")),
     WARMTH,
 )
-"""Columns of which values tell the unit where a word that is none stands for it, such as deg of a temperature."""
+"""Columns of which values tell the unit beside a word that is not a unit, such as deg of a temperature."""
 BY_NAME_ALONE = (WARMTH, REFERENCES["gravity"].column)
 """Columns that a run may lack, and that values alone do not tell."""
 _OF_PLACE_ALONE = tuple(REFERENCES[name].column for name in ("gravity", "field", "dip"))
@@ -360,8 +364,8 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     logged = _OF_LOGGER.fullmatch(name)
     name = f"{logged[1]}{logged[2] or ''}" if logged else name
     plain = spelled(f"{name} ({unit})" if unit else name)
-    if "elevation" in plain:
-        return Resemblance("ref_inclination_deg", BELOW if _DOWNWARDS.search(plain) else ABOVE)
+    if elevation := _elevation(name, plain, unit):
+        return elevation
     if _CCW.search(plain):
         turned = resembled(_CCW.sub("", plain))
         return turned and (
@@ -370,10 +374,6 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     alike = (
         resembled(plain) or _without_title(plain) or resembled(f"{name} ({unit})" if unit else name)
     )
-    if level := _FROM_HORIZONTAL.search(name):
-        bare = alike or meaning(_bare(name, level), unit)
-        if bare and bare.column == REFERENCES["inclination"].column:
-            return bare._replace(unit=BELOW if _DOWNWARDS.search(plain) else ABOVE)
     if alike and alike.column in RAW and _CALLED_REFERENCE.search(plain):
         return alike._replace(column=REFERENCE_VECTORS[RAW.index(alike.column)])
     if _MEASURED.search(plain) and not (alike and alike.column == WARMTH):
@@ -383,7 +383,35 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     stated = IN_BRACKETS.search(plain)
     if alike and alike.column == REFERENCES["azimuth"].column and alike.unit.startswith("mag"):
         return alike._replace(unit="")
-    return alike or (Resemblance(spelt, unit_of(stated[1]) if stated else "") if spelt else None)
+    if not alike and not spelt:
+        return _by_axis_and_unit(name, unit or (stated[1] if stated else ""))
+    return alike or Resemblance(spelt or "", unit_of(stated[1]) if stated else "")
+
+
+def _elevation(name: str, plain: str, unit: str) -> Resemblance | None:
+    """The inclination that a name says to count from the horizontal, in whatever words."""
+    sense = BELOW if _DOWNWARDS.search(plain) else ABOVE
+    if "elevation" in plain:
+        return Resemblance(REFERENCES["inclination"].column, sense)
+    level = _FROM_HORIZONTAL.search(name)
+    bare = level and (resembled(plain) or meaning(_bare(name, level), unit))
+    inclined = bare and bare.column == REFERENCES["inclination"].column
+    return bare._replace(unit=sense) if bare and inclined else None
+
+
+def _by_axis_and_unit(name: str, unit: str) -> Resemblance | None:
+    """The channel that a name in whatever words is by its axis and a unit that one triad alone has."""
+    axes = _LONE_AXIS.findall(IN_BRACKETS.sub("", name))
+    kinds = {"g": "a", "mg": "a", "m/s²": "a", "nT": "m", "µT": "m", "gauss": "m", "mG": "m"}
+    known = unit_of(spelled(unit))
+    if (
+        len(axes) != 1
+        or known not in kinds
+        or unit.strip() in ("G", "mG")
+        or _CALLED_REFERENCE.search(spelled(name))
+    ):
+        return None
+    return Resemblance(f"{kinds[known]}{axes[0].lower()}", known)
 
 
 def _bare(name: str, level: re.Match[str]) -> str:
@@ -500,14 +528,14 @@ def _follows(
 
 
 def _numbered(names: Sequence[str]) -> dict[str, str]:
-    """Names that end in 1, 2 and 3, where all three are there, with x, y and z instead."""
+    """Names that end in 1, 2 and 3, or 0, 1 and 2, where all three are there, with x, y and z instead."""
     parts = {name: match for name in names if (match := _NUMBERED.fullmatch(name))}
     stems = {(m[1], m[3]) for m in parts.values()}
-    whole = {s for s in stems if {m[2] for m in parts.values() if (m[1], m[3]) == s} == {*"123"}}
+    numbers = {s: "".join(sorted(m[2] for m in parts.values() if (m[1], m[3]) == s)) for s in stems}
     return {
-        name: f"{m[1]} {'xyz'[int(m[2]) - 1]} {m[3]}".strip()
+        name: f"{m[1]} {'xyz'[numbers[m[1], m[3]].index(m[2])]} {m[3]}".strip()
         for name, m in parts.items()
-        if (m[1], m[3]) in whole
+        if numbers[m[1], m[3]] in ("123", "012")
     }
 
 
@@ -603,6 +631,9 @@ def proposed(
     if not hidden and not any(n in damaged for n, m in meanings.items() if m.column in RAW):
         questions.ask(_check_triads, names, values, chosen, source)
     questions.ask(_check_units_of_triads, chosen, source)
+    questions.ask(
+        _check_nominal, {c: e for c, e in chosen.items() if c not in said}, values, source
+    )
     beside = any("side by side" in each.text for each in questions)
     if not beside and not {*RAW[3:]} & {*chosen, *said}:
         believed = (
@@ -611,15 +642,26 @@ def proposed(
         others = [n for n in names if n not in meanings and n not in believed]
         questions.ask(_check_nameless, others, values, {*chosen, *known}, source)
     rest = {n: u for n, u in zip(names, units, strict=True) if n not in meanings}
-    present = {*chosen, *said, *known, *of_vectors(chosen)}
-    lacking = [*lacking_references(present), *BY_NAME_ALONE]
-    for column in (each for each in lacking if each not in present):
-        questions.ask(_check_lacking, column, rest, values, source)
+    _ask_lacking({*chosen, *said, *known, *of_vectors(chosen)}, rest, values, questions, source)
     questions.raise_any(source)
     by_value = {c for c, each in chosen.items() if each.unit and not meanings[each.name].unit}
     used = {each.name for each in chosen.values()}
     ignored = {name: reason for name, reason in ignored.items() if name not in used}
     return _labels(names, chosen) | chosen, by_value, ignored
+
+
+def _ask_lacking(
+    present: Collection[str],
+    others: Mapping[str, str],
+    values: Values,
+    questions: Questions,
+    source: str,
+) -> None:
+    """Questions on references and a temperature that are absent, among other columns with their units."""
+    magnetic = any("Are these the magnetometers" in each.text for each in questions)
+    lacking = [*lacking_references({*present, *(RAW[3:] if magnetic else ())}), *BY_NAME_ALONE]
+    for column in (each for each in lacking if each not in present):
+        questions.ask(_check_lacking, column, others, values, source)
 
 
 def _with_whole_vectors(meanings: dict[str, Resemblance]) -> dict[str, Resemblance]:
@@ -754,7 +796,7 @@ def _tell_temperature(
     cells = values(lone[0]) if len(lone) == 1 else None
     known = cells[np.isfinite(cells)] if cells is not None else np.empty(0)
     known = known[~is_filler(known)]
-    if known.size and np.all(np.abs(known - 70) <= 130) and not is_numbering(known):
+    if known.size and np.all((known >= -60) & (known <= 500)) and not is_numbering(known):
         meanings[lone[0]] = Resemblance(WARMTH)
 
 
@@ -852,7 +894,8 @@ def _check_triads(
         raise QuestionError(
             f"{source}: could not tell which columns are the accelerometers ({', '.join(absent)}); the names are "
             f"{', '.join(map(shown, names[:20]))}.",
-            triples_for(RAW[:3], others, values)
+            triples_for(RAW[:3], others, values, OF_ONE_SPHERE)
+            or triples_for(RAW[:3], others, values)
             if len(absent) == 3
             else channels_for(absent[0], others, values),
         )
@@ -915,7 +958,8 @@ def _check_nameless(
     of_field = [REFERENCES[name].column for name in ("field", "dip", "azimuth")]
     if not {*of_field} & {*known}:
         return
-    if triples := triples_for(RAW[3:], unused, values, STEADY_NORM):
+    triples = triples_for(RAW[3:], unused, values, OF_ONE_SPHERE)
+    if triples := triples or triples_for(RAW[3:], unused, values, STEADY_NORM):
         raise QuestionError(
             f"{source}: no column is a magnetometer by its name, and the table states the field. Are these the "
             "magnetometers?",
@@ -938,6 +982,19 @@ def _check_units_of_triads(chosen: Mapping[str, ColumnSource], source: str) -> N
                     Answer(u, tuple(("column", f"{c}={e.name} ({u})") for c, e in stated.items()))
                     for u in units
                 ],
+            )
+
+
+def _check_nominal(chosen: Mapping[str, ColumnSource], values: Values, source: str) -> None:
+    """Ask about an angle that the stand was to be set to, among others that it shows."""
+    angles = {c: chosen[c].name for c in _ANGLES_AND_WARMTH[:3] if c in chosen}
+    shows = [n for n in angles.values() if _ACTUAL.search(n) and not _NOMINAL.search(n)]
+    for column, name in angles.items():
+        if shows and _NOMINAL.search(name) and not _ACTUAL.search(name):
+            raise QuestionError(
+                f"{source}: {shown(name)} is what the stand was to be set to, and {shown(shows[0])} what it shows. Is "
+                f"there no column of what it shows as '{column}'?",
+                candidates_for(column, [name], values),
             )
 
 

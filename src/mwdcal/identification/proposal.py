@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -15,7 +15,11 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from mwdcal.calibration.diagnosis.findings import MARKED_ROWS, unused_columns
+from mwdcal.calibration.diagnosis.findings import (
+    MARKED_ROWS,
+    references_not_taken,
+    unused_columns,
+)
 from mwdcal.calibration.diagnosis.flags import listed
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import Finding
@@ -420,8 +424,8 @@ def _is_formulas(cells: Sequence[str]) -> bool:
 
 _OF_READINGS = (*RAW, *(REFERENCES[name].column for name in ("inclination", "azimuth", "toolface")))
 """Columns that readings tell."""
-_MOST_TRIES = 40
-"""Answers to open questions, in all their combinations, that are tried."""
+_MOST_TRIES, _MOST_COMBINED = 40, 100_000
+"""Answers to open questions, in combinations that name no column twice, that are tried, and those looked at."""
 _CONFIRMED = 0.1
 """Largest share of the channels' variation that answers leave which readings confirm."""
 ANGLES_OF_STAND = tuple(REFERENCES[name].column for name in ("inclination", "azimuth", "toolface"))
@@ -446,14 +450,11 @@ def _answer_by_readings(
     """
     questions = error.questions if isinstance(error, QuestionsError) else (error,)
     choices = [[answer for answer in each.answers if _is_of_readings(answer)] for each in questions]
-    if not all(choices) or prod(map(len, choices)) > _MOST_TRIES:
+    if not all(choices) or prod(map(len, choices)) > _MOST_COMBINED:
         return None
-    fits = []
-    for chosen in product(*choices):
-        answers = dict(said)
-        for _, text in (argument for answer in chosen for argument in answer.arguments):
-            column, _, name = text.partition("=")
-            answers[column] = name
+    fits, tries = [], [*filter(_is_of_different_columns, product(*choices))]
+    for chosen in tries if len(tries) <= _MOST_TRIES else ():
+        answers = dict(said) | dict(_columns_of(chosen))
         with suppress(InputError, FitError):
             proposal = propose_with(answers)
             unexplained = [each.unexplained for each in proposal.wirings.values()]
@@ -466,6 +467,19 @@ def _answer_by_readings(
         return None
     texts = [", ".join(text for _, text in answer.arguments) for answer in chosen]
     return proposal._replace(by_readings=tuple(texts))
+
+
+def _columns_of(answers: Iterable[Answer]) -> Iterator[tuple[str, str]]:
+    """Columns of a run file with the column of the table that answers say."""
+    for _, text in (argument for answer in answers for argument in answer.arguments):
+        column, _, name = text.partition("=")
+        yield column, name
+
+
+def _is_of_different_columns(answers: Sequence[Answer]) -> bool:
+    """Whether answers name no column of the table twice."""
+    names = [name for _, name in _columns_of(answers)]
+    return len({*names}) == len(names)
 
 
 def _has_twin(table: Table, answer: str) -> bool:
@@ -659,7 +673,7 @@ def _check_gons(
         units = ["°", "gon"] if source.unit == "gon" else ["gon", "°"]
         angles = numbers(table, source.name)
         left = [
-            _left(readings, wirings, column, angles * FACTORS.get(unit, (1.0,))[0])
+            _left(readings, wirings, {column: angles * FACTORS.get(unit, (1.0,))[0]})
             for unit in units
         ]
         if left[0] < _FAR_BETTER * left[1]:
@@ -690,26 +704,45 @@ def _check_twins(
     assert not isinstance(columns, msgspec.UnsetType)
     used = {source.name for source in columns.values()}
     numbered = {n: v for n in table.columns if (v := _plain_numbers(table, n)) is not None}
+    tried: dict[str, list[str]] = {}
     for column in ANGLES_OF_STAND:
         source = columns.get(column)
-        if not wirings or not source or column in answers or source.unit not in ("", "°"):
-            continue
-        stand = numbers(table, source.name)
-        twins = {
-            n: v
-            for n, v in numbered.items()
-            if n not in used and not is_of_tool(n) and _alike(v - stand) > _ONE_ANGLE
-        }
-        left = {
-            n: _left(readings, wirings, column, v) for n, v in {source.name: stand, **twins}.items()
-        }
-        best, *others = sorted(left, key=lambda name: left[name])
-        if left[best] < _FAR_BETTER * left[source.name]:
-            raise QuestionError(
-                f"{table.source}: {shown(best)} and {shown(source.name)} tell one angle, and the readings fit the "
-                "former far better. Which one does the stand show?",
-                [Answer(n, (("column", f"{column}={n}"),)) for n in (best, *others)],
+        if (
+            source
+            and column not in answers
+            and source.unit in ("", "°")
+            and source.name in numbered
+        ):
+            twins = [
+                n
+                for n, v in numbered.items()
+                if n not in used
+                and not is_of_tool(n)
+                and _alike(v - numbered[source.name]) > _ONE_ANGLE
+            ]
+            tried[column] = [source.name, *twins][:_MOST_TWINS]
+    if not wirings or all(len(each) < 2 for each in tried.values()):
+        return
+    left = {
+        names: _left(readings, wirings, {c: numbered[n] for c, n in zip(tried, names, strict=True)})
+        for names in product(*tried.values())
+    }
+    stand, best = next(iter(left)), min(left, key=lambda names: left[names])
+    if left[best] < _FAR_BETTER * left[stand]:
+        questions = [
+            QuestionError(
+                f"{table.source}: {shown(one)} and {shown(other)} tell one angle, and the readings fit the former far "
+                "better. Which one does the stand show?",
+                [Answer(n, (("column", f"{column}={n}"),)) for n in (one, other)],
             )
+            for column, one, other in zip(tried, best, stand, strict=True)
+            if one != other
+        ]
+        raise QuestionsError(table.source, questions)
+
+
+_MOST_TWINS = 3
+"""Columns of one angle that are compared."""
 
 
 def _plain_numbers(table: Table, name: str) -> Array | None:
@@ -720,16 +753,16 @@ def _plain_numbers(table: Table, name: str) -> Array | None:
     return None
 
 
-def _left(readings: Readings, wirings: Mapping[str, Wiring], column: str, values: Array) -> float:
-    """What an angle of the stand leaves of the readings of a triad, with any offsets and gains of its axes, as a share.
+def _left(readings: Readings, wirings: Mapping[str, Wiring], angles: Mapping[str, Array]) -> float:
+    """What angles of the stand leave of the readings of a triad, with any offsets and gains of its axes, as a share.
 
     Offsets and gains may change with temperature.
     """
-    kind = "magnetometer" if "azimuth" in column else "accelerometer"
+    kind = "magnetometer" if REFERENCES["azimuth"].column in angles else "accelerometer"
     if kind not in wirings:
         return 1.0
-    name = column.removeprefix("ref_").removesuffix("_deg")
-    turned = replace(readings, known={**readings.known, name: np.radians(values)})
+    known = {c.removeprefix("ref_").removesuffix("_deg"): np.radians(v) for c, v in angles.items()}
+    turned = replace(readings, known={**readings.known, **known})
     whole = np.all([~np.isnan(turned.reference(n)) for n in NEEDED[kind]], 0)
     parts = np.concatenate(_parts(kind, turned, whole), -1)
     if readings.temperature is not None:
@@ -1097,20 +1130,18 @@ def left_handed(proposal: Proposal) -> list[Finding]:
     ]
 
 
-def references_not_taken(proposal: Proposal) -> list[Finding]:
-    """A finding on each nominal reference above the names, where the run has no other."""
+def lines_not_taken(proposal: Proposal) -> list[Finding]:
+    """A finding on each nominal or unclear reference beside the table, where the run has no other."""
     columns = proposal.profile.columns
     named = {} if isinstance(columns, msgspec.UnsetType) else columns
     lines = proposal.where.titles.not_taken if proposal.where else {}
-    return [
-        Finding(
-            id="reference-not-taken",
-            text=f"{shown(line)} is nominal or unclear, and not taken as '{column}', which the run does not state "
-            "otherwise. If it holds, state it plainly, or in a column.",
-        )
-        for column, line in lines.items()
-        if column not in named and column not in proposal.metadata
-    ]
+    return references_not_taken(
+        {
+            c: shown(t)[1:-1]
+            for c, t in lines.items()
+            if c not in named and c not in proposal.metadata
+        }
+    )
 
 
 def answers_by_readings(proposal: Proposal) -> list[Finding]:
@@ -1173,7 +1204,7 @@ def findings_on(proposal: Proposal) -> list[Finding]:
         for name, reason in proposal.ignored.items()
     ]
     marked = [Finding(id=MARKED_ROWS, text=text) for text in proposal.remarks]
-    known = axes_open(proposal) + left_handed(proposal) + references_not_taken(proposal) + marked
+    known = axes_open(proposal) + left_handed(proposal) + lines_not_taken(proposal) + marked
     known += answers_by_readings(proposal) + warmth_around(proposal) + units_contradicted(proposal)
     return known + ignored + unused_columns(proposal.unused)
 

@@ -105,6 +105,7 @@ TRANSLATIONS = (
     (r"код\w* ацп|ацп|отсч\w*|码值", "adc"),
     (r"мв(?![а-я])", "mV"),
     (
+        r"lampotila|teplota|درجة الحرارة|θερμοκρασια|온도|nhiet do|"
         r"temp-ra|темп-ра|sicaklik|homerseklet|temperatuur|suhu|pt100(0)?\b|temperatura|"
         r"temperature?n?|температура|темп\b\.?|温度",
         "temperature ",

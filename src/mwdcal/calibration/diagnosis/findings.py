@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from math import erf
@@ -250,10 +250,23 @@ def unused_columns(columns: Sequence[str]) -> list[Finding]:
     return [Finding(id=UNUSED, text=f"columns not used: {listed(columns, COLUMNS_NAMED)}.")]
 
 
+def references_not_taken(lines: Mapping[str, str]) -> list[Finding]:
+    """A finding on each line that may state a reference, by column of a run file, which is not stated otherwise."""
+    return [
+        Finding(
+            id="reference-not-taken",
+            text=f"'{line}' is nominal or unclear, and not taken as '{column}', which the run does not state "
+            "otherwise. If it holds, state it plainly, or in a column.",
+        )
+        for column, line in lines.items()
+    ]
+
+
 def of_table(readings: Readings) -> list[Finding]:
-    """Rows of the table that its laboratory has marked, and columns that are not used."""
+    """Rows of the table that its laboratory has marked, references that are not read, and columns not used."""
     marked = [Finding(id=MARKED_ROWS, text=text) for text in readings.remarks]
-    return [*marked, *unused_columns(readings.unused)]
+    unread = references_not_taken(readings.not_taken)
+    return [*marked, *unread, *unused_columns(readings.unused)]
 
 
 def findings(flags: Iterable[Flag], place: int, labels: Sequence[str]) -> list[Finding]:

@@ -480,7 +480,7 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
 def _beside(
     columns: Sequence[Sequence[object]], others: Sequence[tuple[int, Cells]]
 ) -> list[Cells]:
-    """What stands beside readings, in columns that are hardly filled in, and in `others` of the rows but numbers."""
+    """Remarks in columns with few cells that are filled in, and `others` of the rows without numbers."""
     rare = [c for c in columns if 2 * sum(cell != "" for cell in c) < len(c)]
     rows = [[cell for cell in row if cell != ""] for row in zip(*rare, strict=True)]
     remarks = [row for row in rows if any(isinstance(cell, str) for cell in row)]

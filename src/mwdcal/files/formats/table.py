@@ -28,7 +28,7 @@ from mwdcal.files.formats.columns import (
     looks_numeric,
 )
 from mwdcal.files.formats.columns import shown as shown
-from mwdcal.files.formats.titles import dated
+from mwdcal.files.formats.titles import Titles, dated
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import TableFormat
 
@@ -69,6 +69,7 @@ class Table:
         sheet: name of its sheet there.
         parts: the sheet of each row, where the table is on several.
         remarks: sentences on rows that were left out, for findings.
+        not_taken: lines with a reference that is not read, by column of a run file.
     """
 
     columns: Mapping[str, Column]
@@ -81,6 +82,7 @@ class Table:
     sheet: str = ""
     parts: Sequence[str] = ()
     remarks: tuple[str, ...] = ()
+    not_taken: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def count(self) -> int:
@@ -122,24 +124,33 @@ def parsed(
     suffix = _suffix(Path(name))
     form = _format(suffix)
     arguments: dict[str, Any] = {"most": rows} if suffix == ".parquet" else {}
-    stated: Mapping[str, object] = {}
+    block = Titles({})
     if export and form is text:
         from mwdcal.files.formats.title_references import stated_above
 
-        stated = stated_above(text.above(data, export, name)).metadata
+        block = stated_above(text.above(data, export, name))
         data, arguments = text.plain(data, export, name), {"delimiter": export.delimiter}
     elif suffix == ".xlsx":
         arguments = {"form": export, "serial": serial}
     decimal = export.decimal if export else decimal
     parts: Parts = form.parse(data, name, **arguments)
-    metadata = {**stated, **parts.metadata}
+    metadata = {**block.metadata, **parts.metadata}
     if export:
         metadata = dated(
             metadata, ((n, c) for n, c in parts.columns.items() if isinstance(c, list))
         )
     letters = map(letters_of, range(len(parts.columns))) if suffix == ".xlsx" else ()
     places = dict(zip(parts.columns, letters, strict=False))
-    return Table(parts.columns, metadata, name, parts.lines, digest, decimal, places)
+    return Table(
+        parts.columns,
+        metadata,
+        name,
+        parts.lines,
+        digest,
+        decimal,
+        places,
+        not_taken=block.not_taken,
+    )
 
 
 def check_decimal(decimal: str) -> None:
@@ -275,6 +286,7 @@ def of_layout(where: Layout, path: str | os.PathLike[str], kept: Collection[str]
         places=where.places,
         sheet=where.sheet,
         parts=where.parts,
+        not_taken=where.titles.not_taken,
     )
 
 

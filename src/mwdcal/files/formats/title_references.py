@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Iterable, Iterator, Sequence
+from functools import cache
 from itertools import pairwise, product
 from typing import NamedTuple
 
@@ -96,14 +97,12 @@ _MINUTES = (
 _ROUGH = re.compile(
     r"nomin\w*|approx\w*|about|circa|\bca\b|\bcca\b|≈|~|\bnenn|ungefahr|omtrent|aprox\w*|environ|пример\w*|около|"
     r"номин\w*|约|标称",
-    re.IGNORECASE,
 )
 """Words of a value that is a reference but for them."""
 _UNSURE = re.compile(
     rf"{_ROUGH.pattern}|"
     r"uncert|\bunc\b|unsicher|usikker|incert|погреш|不确定|toler|limit|grenz|range|bereich|диапазон|范围|量程|"
     r"\bmin\b|\bmax\b|\bstd|\bsd\b|sigma|σ|±|spec|resol|offset|drift|gradient|noise|toolface|survey|tool face",
-    re.IGNORECASE,
 )
 """Words by which a value is no reference."""
 _BEFORE = 8
@@ -122,57 +121,60 @@ _WITH_NUMBER = (
 
 
 def _statement(head: str) -> re.Pattern[str]:
-    return re.compile(rf"{_BEGINNING}{head}(?![^\W\d_]){_BETWEEN}{_WITH_NUMBER}", re.IGNORECASE)
+    return re.compile(rf"{_BEGINNING}{head}(?![^\W\d_]){_BETWEEN}{_WITH_NUMBER}")
 
 
-_STATEMENTS = [
-    (q, _statement(head))
-    for q in _OF_PLACES
-    for head in (
-        rf"(?P<word>{q.words})",
-        rf"(?P<letter>[{q.letters}]0?)(?=\W*(?:{_WRITTEN_UNIT}|ref\w*|lo[ck]al\w*)?\W*\d)",
-    )
-]
-_INCLINATION = (_OF_PLACES[1], _statement(r"(?P<word>inc|incl\w*|ink|inkl\w*|наклон)"))
-"""An inclination in the line of a place, which is the dip."""
+@cache
+def _statements() -> list[tuple[_Quantity, re.Pattern[str]]]:
+    """The forms in which a line states each quantity; made when they are needed, as that takes a while."""
+    return [
+        (q, _statement(head))
+        for q in _OF_PLACES
+        for head in (
+            rf"(?P<word>{q.words})",
+            rf"(?P<letter>[{q.letters}]0?)(?=\W*(?:{_WRITTEN_UNIT}|ref\w*|lo[ck]al\w*)?\W*\d)",
+        )
+    ]
+
+
+@cache
+def _inclination() -> tuple[_Quantity, re.Pattern[str]]:
+    """An inclination in the line of a place, which is the dip."""
+    return _OF_PLACES[1], _statement(r"(?P<word>inc|incl\w*|ink|inkl\w*|наклон)")
+
+
 _NUMBER_IN_UNIT = re.compile(
     rf"(?<![\w.,±+-])(?P<number>[-−]?{_WRITTEN_NUMBER})\s*(?P<unit>{_WRITTEN_UNIT})(?!\s*\d+(?:[.,]\d+)?\s*(?:['′’]|min))",
-    re.IGNORECASE,
 )
 _NUMBER_ANYWHERE = re.compile(
     rf"(?<![\w.,])(?P<number>[+\-−]?{_WRITTEN_NUMBER}){_MINUTES}\s*(?P<unit>(?:{_WRITTEN_UNIT})(?![^\W\d_]))?",
-    re.IGNORECASE,
 )
-_UNIT_ALONE = re.compile(rf"(?<![^\W\d_])({_WRITTEN_UNIT})(?![^\W\d_])", re.IGNORECASE)
+_UNIT_ALONE = re.compile(rf"(?<![^\W\d_])({_WRITTEN_UNIT})(?![^\W\d_])")
 _NO_PLACE = re.compile(
     rf"{_UNSURE.pattern}|"
     r"horizont\w*|vertical\w*|vertik\w*|compon\w*|kompon\w*|north|nord|south|sud|coil\w*|spule\w*|scale|sens\w*|full|"
     r"measured|\bmeas\b|mean|average|\bavg|mittel|gemessen|malt|medid\w*|mesur\w*|media|medio|moyen\w*|средн\w*|измер\w*|"
     r"calc\w*|comput\w*|\bat\b|\bbei\b|\bper\b|\bto\s*$|\bbis\s*$|change|variation|shift|bias|previous|last|old|"
-    r"equipment|model|thermo\w*|горизонт\w*|верти\w*|компон\w*|水平|垂直|分量|平均|测得|灵敏度|\d\s*m?v\b|[<>]",
-    re.IGNORECASE,
+    r"fluxgate|\bfs\b|\btype|satur\w*|overload|capacity|thermo\w*|горизонт\w*|верти\w*|компон\w*|水平|垂直|分量|平均|测得|灵敏度|\d\s*m?v\b|[<>]",
 )
 """Words of a strength that is not that of the place."""
 _INCLINED = re.compile(
     r"dip|(?<![^\W\d_])[iеe]n[ck]l\w*|inklin\w*|inclin\w*|наклон\w*|нахил\w*|倾|伏角|傾|egim|duzalimi|sklon\w*|nachyleni\w*|"
     r"hajlas\w*|lutning|kallistuma|helling|mergulho|buzamiento|echado",
-    re.IGNORECASE,
 )
-"""Words of an inclination, which is the field's among what is said of a place."""
+"""Words of an inclination, which is the field's in a line about a place."""
 _OF_STAND = re.compile(
     r"cradle|stand|rig|table|tool|bench|fixture|setting|setup|hole|well|plat|banco|banc\b|mesa|cuna|stativ|sonde|probe|"
     r"стенд|стол|скваж|зенит|转台|台|井|azi\w*|decl\w*|error|acc?uracy|genau\w*|resid\w*",
-    re.IGNORECASE,
 )
 """Words of an inclination that is not the field's."""
 _OTHER_ANGLE = re.compile(
-    r"decl|deklin|misvis|conv|konv|azi|asim|tool|roll|tf\b|склон|азим|磁偏|方位|±", re.IGNORECASE
+    r"decl|deklin|misvis|conv|konv|azi|asim|tool|roll|tf\b|склон|азим|磁偏|方位|±"
 )
 """Words of angles that are no dip."""
 _UPWARDS = re.compile(
     r"(?<![^\W\d_])(up|upwards?|para cima|hacia arriba|nach oben|aufwarts|oppover|vers le haut|verso l'?alto|"
     r"вверх)(?![^\W\d_])|向上|朝上",
-    re.IGNORECASE,
 )
 """Words of a dip whose number is that of a field that points up."""
 _SPELT = {
@@ -206,9 +208,9 @@ def references_in(rows: Rows, besides: Rows = ()) -> dict[str, float]:
     texts = [_clauses(row) for row in [*_with_columns(rows), *besides]]
     by_word, of_places, by_unit = (dict[str, dict[float, None]]() for _ in range(3))
     for text in texts:
-        here = {column for s in _STATEMENTS for column, _ in _stated(text, *s)}
+        here = {column for s in _statements() for column, _ in _stated(text, *s)}
         of_place = {"ref_field_nt", "ref_gravity_g"} <= here and "ref_dip_deg" not in here
-        for statement in [*_STATEMENTS, _INCLINATION] if of_place else _STATEMENTS:
+        for statement in [*_statements(), _inclination()] if of_place else _statements():
             for column, value in _stated(text, *statement):
                 by_word.setdefault(column, {})[value] = None
         for column, value in _of_a_place(text).items():
@@ -389,9 +391,7 @@ def doubtful_in(rows: Rows, besides: Rows = ()) -> dict[str, str]:
 def _is_called(quantity: _Quantity, figure: _Figure) -> bool:
     """Whether words right before a number are those of a quantity, and the number is no count: dip 97.2."""
     words = _UNIT_ALONE.sub("", figure.words)
-    called = re.search(
-        rf"{_BEGINNING}({quantity.words})\W*(?:{_REFERRING.pattern}\W*)*$", words, re.IGNORECASE
-    )
+    called = re.search(rf"{_BEGINNING}({quantity.words})\W*(?:{_REFERRING.pattern}\W*)*$", words)
     return bool(called) and bool(figure.unit or len(figure.number) > 2)
 
 

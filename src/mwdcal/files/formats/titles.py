@@ -84,9 +84,11 @@ _BEHIND_MODEL = re.compile(
     re.IGNORECASE,
 )
 """The word for the tool, its model, and its serial behind a mark: Sonde SD-9 n° 112."""
-_MARKED = re.compile(
-    r"(?:(?<![^\W\d_])|(?<=[\u4e00-\u9fff]))(?:(?P<word>serial(?:[ -]?(?:number|num|no|nr))?|(?:[^\W\d_]+-?)?serien?-?(?:nummer|nr)|"
-    r"(?:n[°ºo.r]*|n[uú]m\w*|nr)\.? (?:d[ei] )?(?:s[eé]ri[ea]l?|fabr\w*|seryjny)|s[eé]rie|fabr(?:ik)?\.?[ -]?(?:nr|nummer)|matricola|"
+_WITH_MARK = re.compile(
+    r"(?:(?<![^\W\d_])|(?<=[\u4e00-\u9fff]))(?:(?P<word>serial(?:[ -]?(?:number|num|no|nr))?|"
+    r"(?:[^\W\d_]+-?)?serien?-?(?:nummer|nr)|"
+    r"(?:n[°ºo.r]*|n[uú]m\w*|nr)\.? (?:d[ei] )?(?:s[eé]ri[ea]l?|fabr\w*|seryjny)|s[eé]rie|"
+    r"fabr(?:ik)?\.?[ -]?(?:nr|nummer)|matricola|"
     r"зав\w*\.? ?(?:№|номер|n)|серийн\w* ?(?:№|номер)|seri ?no|序列号|编号|製造番号)|s\.?/?n|[^\W\d_]+[ -]sn|"
     r"(?<=[,(;] )(?:n[°ºr]\.?|num[eé]ro|№))\.?"
     rf"(?:\s+(?:{_OF_TOOLS}))?[\s.:：=#|;]*(?P<serial>{_SERIAL.pattern})",
@@ -94,7 +96,8 @@ _MARKED = re.compile(
 )
 """A word of a serial number in a line, and the serial behind it."""
 _OF_EQUIPMENT = re.compile(
-    r"stand|table|tisch|bench|banco|oven|ofen|chamber|thermo|logger|volt|multimeter|gauss|magnetom|theodol|reference|normal|"
+    r"stand|table|tisch|bench|banco|oven|ofen|chamber|thermo|logger|volt|multimeter|gauss|"
+    r"magnetom|theodol|reference|normal|"
     r"стенд|печь|эталон|转台|参考",
     re.IGNORECASE,
 )
@@ -206,7 +209,7 @@ def _marked_in(text: str) -> list[str]:
     """The serials behind a word for one in a line; those behind a whole word before those behind letters."""
     every = [
         m
-        for m in (() if text.startswith("TOA5") else _MARKED.finditer(text))
+        for m in (() if text.startswith("TOA5") else _WITH_MARK.finditer(text))
         if not _OF_EQUIPMENT.search(re.split("[;,]", text[: m.start()].rstrip(" ;,"))[-1])
     ]
     return [m["serial"] for m in every if m["word"]] or [m["serial"] for m in every]

@@ -1,0 +1,231 @@
+"""What the readings of a table tell where its words do not: units, angles, north, the stand's columns; and references
+of a place in whatever words.
+
+Expected values are those of the simulated run, rewritten as another laboratory would have it.
+"""
+
+import numpy as np
+import pytest
+
+import mwdcal as library
+from cli_support import mwdcal, refused, servo_run, write_csv
+from mwdcal.errors import FitError
+from mwdcal.files.formats.title_references import doubtful_in, references_in
+from mwdcal.files.formats.titles import titles
+from test_tables_as_they_come import findings_of, mixed, read, table, written
+
+FIELD, DIP, GRAVITY = 50_123.0, 66.12, 9.8123 / 9.80665
+WORDS = (
+    [["Earth field: 50.123 uT", "Field dip: 66.12 deg", "9.8123 m/s2"]],
+    [["Magnetfält (totalt)", 50.123, "µT"], ["Inklination", "66,12 grader"], ["Tyngdacceleration", "9,8123 m/s²"]],
+    [["Toplam manyetik alan: 50.123 nT; eğim 66,12°; yerçekimi 9,8123 m/s²"]],
+    [["Kenttävoimakkuus 50,123 µT; inklinaatio 66,12°; painovoima 9,8123 m/s2"]],
+    [["Bez. pole geomagn. 50123 nT, sklon 66,12°, tíhové zrychlení 9,8123 m/s2"]],
+    [["地磁总强度：50123nT，磁倾角：66.12°，g=9.8123m/s²"]],
+    [["Campo terrestre (IGRF) : 0,50123 G / 66,12 ° / 981,23 gal"]],
+    [["F_ref=50123"], ["I_ref=66.12"], ["g_ref=9.8123"]],
+    [["B0 [nT]", "I0 [deg]", "g0 [m/s^2]"], ["50123", "66.12", "9.8123"]],
+    [["Магнітна індукція, нТл", 50123, "", "Магнітне нахилення, °", 66.12, "", "g, м/с²", 9.8123]],
+    [["Feldstärke 501.23 mG", "Inkl. 66°07'12\"", "Erdschwere 9,8123 m/s²"]],
+)  # fmt: skip
+NO_PLACE = (
+    "Horizontal intensity 20123 nT", "Bias field 20000 nT", "Coil field: 25000 nT", "field 50120 nT, end 50131 nT",
+    "Mean field measured 50123 nT", "sensitivity 20000 nT/V", "Total field (uT) 50630", "dip 97.2", "Gravity 1.0123 g",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("rows", WORDS)
+def test_references_of_a_place_are_told_by_unit_and_size_in_whatever_words(rows):
+    stated = references_in(rows)
+    expected = {"ref_field_nt": FIELD, "ref_dip_deg": DIP, "ref_gravity_g": GRAVITY}
+    assert stated == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("line", NO_PLACE)
+def test_what_is_no_reference_of_the_place_is_not_read(line):
+    assert references_in([[line]]) == {}
+
+
+@pytest.mark.parametrize(
+    "line", ["Total field (uT);50630", "Dip;97.2", "Gravity;1.0123;g", "Coil field;25000 nT"]
+)
+def test_a_reference_that_no_place_has_is_named_by_profile_and_calibrate(tmp_path, line):
+    assert len(doubtful_in([line.split(";")])) == 1
+    absent = dict.fromkeys(("ref_field_nt", "ref_dip_deg", "ref_gravity_g"))
+    path = written(tmp_path / "a.csv", table(**absent), line, delimiter=";")
+    tool = tmp_path / "t.toml"
+    for ran in (
+        mwdcal("profile", path, "-o", tool),
+        mwdcal("calibrate", path, "--tool", tool, "-o", tmp_path / "c.json"),
+    ):
+        assert ran.code == 0
+        assert f"{line.replace(';', ' ')}' is nominal or unclear, and not taken" in ran.err
+
+
+def test_a_remark_beside_the_first_row_states_the_place(tmp_path):
+    """As a logger's comment does, in a column that is otherwise blank, or a line below the table."""
+    absent = dict.fromkeys(("ref_field_nt", "ref_dip_deg"))
+    remark = "Bt 50123 nT dip 66.12"
+    columns = table(**absent, Comment=[remark, *[""] * 47])
+    run = read(written(tmp_path / "a.csv", columns))
+    assert run.reference("field") == pytest.approx(np.full(48, FIELD))
+    path = written(tmp_path / "b.csv", table(**absent))
+    path.write_text(f"{path.read_text()}\n{remark}\n")
+    assert np.degrees(read(path).reference("dip")) == pytest.approx(np.full(48, DIP))
+
+
+@pytest.mark.parametrize(
+    ("cells", "serial"),
+    [
+        (["Инклинометр ИН-60, заводской номер 60-0318"], "60-0318"),
+        (["Sonden-SN", "FR-3008"], "FR-3008"),
+        (["Appareil : sonde DIR 4, numéro 4-118"], "4-118"),
+        (["Stand S/N 44", "Tool S/N 45"], "45"),
+        (["Reference magnetometer s/n 3344"], None),
+    ],
+)
+def test_a_serial_is_the_tools_anywhere_in_a_line(cells, serial):
+    assert titles([cells]).metadata.get("serial") == serial
+
+
+def reference(path, name="toolface", **answers):
+    return np.degrees(read(path, **answers).reference(name))
+
+
+def rounded(step, seed=4):
+    """Angles of the stand to the next step, as it was to be set, beside where it stopped."""
+    rng = np.random.default_rng(seed)
+    run = servo_run()
+    names = ("ref_inclination_deg", "ref_azimuth_deg", "ref_toolface_deg")
+    return [np.asarray(run[n]) + rng.uniform(-step, step, 48) for n in names]
+
+
+@pytest.mark.parametrize("word", ["Ist", "actual"])
+def test_of_what_a_stand_was_set_to_and_shows_it_is_what_it_shows(tmp_path, word):
+    columns = table()
+    for name, values in zip(("Inc", "Azi", "TF"), rounded(0.5), strict=True):
+        shown = columns.pop(f"{name} (deg)")
+        columns |= {f"{name} Soll (deg)": np.round(values), f"{name} {word} (deg)": shown}
+    path = written(tmp_path / "a.csv", columns)
+    assert reference(path) == pytest.approx(np.asarray(servo_run()["ref_toolface_deg"]))
+
+
+def test_an_angle_that_was_set_among_others_that_the_stand_shows_is_named(tmp_path):
+    columns = {n.replace(" (deg)", " Ist (deg)"): v for n, v in table().items()}
+    columns["Azi Soll (deg)"] = columns.pop("Azi Ist (deg)")
+    columns["Dip (deg)"] = columns.pop("Dip Ist (deg)")
+    columns |= {
+        "Inc Soll (deg)": columns["Inc Ist (deg)"],
+        "TF Soll (deg)": columns["TF Ist (deg)"],
+    }
+    proposal = library.propose_profile(written(tmp_path / "a.csv", columns))
+    assert "ref_azimuth_deg=Azi Soll (deg)" in findings_of(proposal)["told-by-readings"]
+    columns["Azi Ist (deg)"] = columns["Azi Soll (deg)"]
+    whole = library.propose_profile(written(tmp_path / "b.csv", columns))
+    assert "told-by-readings" not in findings_of(whole)
+
+
+def test_an_angle_that_the_readings_fit_far_worse_than_its_twin_is_asked_about(tmp_path):
+    """The column that a stand shows has lost its name; the ones that it was set to have theirs."""
+    columns = table()
+    for name, values in zip(("Inc", "Azi", "TF"), rounded(0.5), strict=True):
+        columns[f"{name} 2"] = columns.pop(f"{name} (deg)")
+        columns[f"{name} set (deg)"] = values
+    path = written(tmp_path / "a.csv", columns)
+    message = refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
+    assert "'TF 2' and 'TF set (deg)' tell one angle" in message
+    assert "--column 'ref_toolface_deg=TF 2' or --column" in message
+
+
+def test_what_the_tool_gives_of_the_dip_is_no_reference(tmp_path):
+    """It follows the biases of the channels from station to station; the dip of a place does not."""
+    run = servo_run()
+    g, b = (np.array([run[n] for n in names]) for names in (("ax", "ay", "az"), ("mx", "my", "mz")))
+    norms = np.linalg.norm(g, axis=0) * np.linalg.norm(b, axis=0)
+    computed = np.degrees(np.arcsin(np.sum(g * b, 0) / norms))
+    columns = table(**{"ref_dip_deg": None, "Dip angle (deg)": np.round(computed, 2)})
+    proposal = library.propose_profile(written(tmp_path / "a.csv", columns))
+    assert "ref_dip_deg" not in proposal.profile.columns
+    assert "computed from the channels" in findings_of(proposal)["not-used"]
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_negative_inclinations_count_from_the_horizontal(tmp_path, sign):
+    columns = table()
+    columns["Inc (deg)"] = sign * (90 - np.asarray(columns["Inc (deg)"]))
+    inclination = reference(written(tmp_path / "a.csv", columns), "inclination")
+    assert inclination == pytest.approx(np.asarray(servo_run()["ref_inclination_deg"]))
+
+
+def test_an_unknown_word_for_degrees_is_told_by_the_values_and_gons_by_the_readings(tmp_path):
+    """Grade is Romanian for degrees, and French for gons."""
+    columns = {n.replace("(deg)", "[grade]"): v for n, v in table(ref_dip_deg=None).items()}
+    path = written(tmp_path / "a.csv", columns)
+    face = np.asarray(servo_run()["ref_toolface_deg"])
+    assert reference(path) == pytest.approx(face)
+    hot = servo_run(temperatures=(25.0, 90.0, 150.0), toolfaces=4)
+    hot["ref_inclination_deg"] = np.asarray(hot["ref_inclination_deg"]) / 0.9
+    proposal = library.propose_profile(write_csv(tmp_path / "b.csv", hot))
+    assert (
+        "ref_inclination_deg=ref_inclination_deg (gon)" in findings_of(proposal)["told-by-readings"]
+    )
+
+
+def test_temperatures_of_a_unit_that_is_none_are_fahrenheit_where_they_can_be_no_other(tmp_path):
+    hot = servo_run(temperatures=(25.0, 90.0, 150.0), toolfaces=4)
+    celsius = np.asarray(hot.pop("temperature_c"))
+    hot["Temp (deg)"] = celsius * 9 / 5 + 32
+    assert read(write_csv(tmp_path / "a.csv", hot)).temperature == pytest.approx(celsius)
+    hot["Temp (deg)"] = np.minimum(hot["Temp (deg)"], 100)
+    with pytest.raises(FitError, match="whether it is in °C or °F or K"):
+        library.propose_profile(write_csv(tmp_path / "b.csv", hot))
+
+
+def test_the_temperature_of_the_oven_is_named(tmp_path):
+    columns = {("Oven temp (C)" if n == "Temp (C)" else n): v for n, v in table().items()}
+    proposal = library.propose_profile(written(tmp_path / "a.csv", columns))
+    assert "'Oven temp (C)' is taken" in findings_of(proposal)["oven-temperature"]
+    plain = library.propose_profile(written(tmp_path / "b.csv", table()))
+    assert "oven-temperature" not in findings_of(plain)
+
+
+def test_a_number_that_stands_for_no_reading_is_asked_about_among_readings_of_its_size(tmp_path):
+    columns = table()
+    columns["Hy (V)"] = np.round(np.asarray(columns["Hy (V)"]) * 20_000, 1)
+    columns["Hx (V)"], columns["Hz (V)"] = (
+        np.asarray(columns[n]) * 20_000 for n in ("Hx (V)", "Hz (V)")
+    )
+    columns["Hy (V)"][5] = 9999.99
+    path = written(tmp_path / "a.csv", columns)
+    assert "got '9999.99'" in refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
+
+
+@pytest.mark.parametrize("indices", ["XYZ", "123", "012"])
+def test_a_table_of_words_that_no_one_knows_is_told_by_the_readings(tmp_path, indices):
+    """Triads by their spheres, angles by what they explain; the temperature stays unknown, and is named."""
+    words = {
+        "Inc (deg)": "Kallistus", "Azi (deg)": "Suunta", "TF (deg)": "Kierto", "Temp (C)": "Lampo",
+        "Gx (V)": f"Voima {indices[0]}", "Gy (V)": f"Voima {indices[1]}", "Gz (V)": f"Voima {indices[2]}",
+        "Hx (V)": f"Rauta {indices[0]}", "Hy (V)": f"Rauta {indices[1]}", "Hz (V)": f"Rauta {indices[2]}",
+    }  # fmt: skip
+    columns = {words.get(n, n): v for n, v in mixed(table()).items()}
+    path = written(tmp_path / "a.csv", columns)
+    proposal = library.propose_profile(path)
+    assert "told-by-readings" in findings_of(proposal)
+    assert "Lampo" in findings_of(proposal)["unused-columns"]
+    run, names = library.read_run(path, proposal.profile), proposal.profile.columns
+    assert [names[c].name for c in ("ax", "ay", "az")] == [words[f"G{i} (V)"] for i in "xyz"]
+    assert [names[c].name for c in ("mx", "my", "mz")] == [words[f"H{i} (V)"] for i in "xyz"]
+    for angle, name in (
+        ("inclination", "Kallistus"),
+        ("azimuth", "Suunta"),
+        ("toolface", "Kierto"),
+    ):
+        assert np.degrees(run.reference(angle)) == pytest.approx(np.asarray(columns[name]))
+
+
+def test_abbreviations_with_points_are_read(tmp_path):
+    columns = {("T.F. (°)" if n == "TF (deg)" else n): v for n, v in table().items()}
+    assert reference(written(tmp_path / "a.csv", columns)) == pytest.approx(
+        np.asarray(servo_run()["ref_toolface_deg"])
+    )
