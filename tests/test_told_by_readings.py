@@ -10,7 +10,7 @@ import pytest
 import mwdcal as library
 from cli_support import mwdcal, refused, servo_run, write_csv
 from mwdcal.errors import FitError
-from mwdcal.files.formats.title_references import doubtful_in, references_in
+from mwdcal.files.formats.title_references import doubtful_in, references_in, stated_above
 from mwdcal.files.formats.titles import titles
 from test_tables_as_they_come import findings_of, mixed, read, table, written
 
@@ -229,3 +229,32 @@ def test_abbreviations_with_points_are_read(tmp_path):
     assert reference(written(tmp_path / "a.csv", columns)) == pytest.approx(
         np.asarray(servo_run()["ref_toolface_deg"])
     )
+
+
+@pytest.mark.parametrize(
+    ("row", "stated"),
+    [
+        (["Total field: 56", "870 nT"], {"ref_field_nt": 56870.0}),
+        (["Total field", "56", "870.5", "nT"], {"ref_field_nt": 56870.5}),
+        (["Field: 56", "9 µT"], {"ref_field_nt": 56900.0}),
+        (["Gravity: 1", "0006 g"], {"ref_gravity_g": 1.0006}),
+        (["Dip: 70", "5 deg"], {"ref_dip_deg": 70.5}),
+        (["Declination: 1", "5 W"], {"declination_deg": -1.5}),
+        (["Declination (W): 3.5"], {"declination_deg": -3.5}),
+        (["Declination: 3° 30' W"], {"declination_deg": -3.5}),
+        (["Convergence 1° 12' West"], {"convergence_deg": -1.2}),
+        (["Declination 2010: 3.5, 2026: 1.9 W"], {}),
+        (["Total field at site: 56870 +/- 45 nT"], {"ref_field_nt": 56870.0}),
+    ],
+)
+def test_title_lines_whose_numbers_commas_split_and_turns_to_the_west(row, stated):
+    assert stated_above([row]).metadata == stated
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["Horizontal field 18980 nT", "Hz: 53000 nT", "Expected field 48,000-58,000 nT", "Gravity: 0.9986 kg",
+     "Gravity correction: 0.9986 g"],
+)  # fmt: skip
+def test_components_ranges_and_corrections_are_no_references(line):
+    assert stated_above([[line]]).metadata == {}

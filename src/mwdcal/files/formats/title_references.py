@@ -102,11 +102,12 @@ _ROUGH = re.compile(
 _UNSURE = re.compile(
     rf"{_ROUGH.pattern}|"
     r"uncert|\bunc\b|unsicher|usikker|incert|погреш|不确定|toler|limit|grenz|range|bereich|диапазон|范围|量程|"
-    r"\bmin\b|\bmax\b|\bstd|\bsd\b|sigma|σ|±|spec|resol|offset|drift|gradient|noise|toolface|survey|tool face",
+    r"\bmin\b|\bmax\b|\bstd|\bsd\b|sigma|σ|±|spec|resol|correct|korrek|offset|drift|gradient|noise|"
+    r"toolface|survey|tool face",
 )
 """Words by which a value is no reference."""
-_BEFORE = 8
-"""Characters before a quantity in which a word may stand by which its value is no reference."""
+_BEFORE = re.compile(r"[^\W\d_]*\W{0,2}[^\W\d_]*\W*$")
+"""The two words before a quantity, of which one may say that its value is no reference."""
 _BETWEEN = r"(?P<between>[^\d+\-−;]{0,30}?)"
 _REFERRING = re.compile(
     r"(?<![^\W\d_])(ref|reference|local|lokal|value|wert|t|f|i|g|т)(?![^\W\d_])"
@@ -118,6 +119,17 @@ _WITH_NUMBER = (
     rf"(?P<number>{_WRITTEN_NUMBER}){_MINUTES}\s*(?P<unit>{_WRITTEN_UNIT})?"
     r"(?P<behind>[^\d;]{0,12})(?P<next>\d?)"
 )
+
+
+_RANGE = re.compile(
+    rf"(?<![\w.,])(?:{_WRITTEN_NUMBER})\s*(?:{_WRITTEN_UNIT})?(?:[-–]|\s[-–…]\s|\s?\.\.\.?\s?|\s(?:to|bis)\s)"
+    rf"(?:{_WRITTEN_NUMBER})\s*(?={_WRITTEN_UNIT})"
+)
+"""A range in a unit: 48,000-58,000 nT."""
+_WITH_SPREAD = re.compile(
+    rf"({_WRITTEN_NUMBER})\s*(±|\+/-|\+-)\s*({_WRITTEN_NUMBER})\s*({_WRITTEN_UNIT})"
+)
+"""A value whose unit stands behind its uncertainty alone: 56870 +/- 45 nT."""
 
 
 def _statement(head: str) -> re.Pattern[str]:
@@ -155,7 +167,7 @@ _NO_PLACE = re.compile(
     r"horizont\w*|vertical\w*|vertik\w*|compon\w*|kompon\w*|north|nord|south|sud|coil\w*|spule\w*|scale|sens\w*|full|"
     r"measured|\bmeas\b|mean|average|\bavg|mittel|gemessen|malt|medid\w*|mesur\w*|media|medio|moyen\w*|средн\w*|измер\w*|"
     r"calc\w*|comput\w*|\bat\b|\bbei\b|\bper\b|\bto\s*$|\bbis\s*$|change|variation|shift|bias|previous|last|old|"
-    r"fluxgate|\bfs\b|\btype|satur\w*|overload|capacity|thermo\w*|горизонт\w*|верти\w*|компон\w*|水平|垂直|分量|平均|测得|灵敏度|\d\s*m?v\b|[<>]",
+    r"(?<![^\W\d_])[hbfg][xyz](?![^\W\d_])|fluxgate|\bfs\b|\btype|satur\w*|overload|capacity|thermo\w*|горизонт\w*|верти\w*|компон\w*|水平|垂直|分量|平均|测得|灵敏度|\d\s*m?v\b|[<>]",
 )
 """Words of a strength that is not that of the place."""
 _INCLINED = re.compile(
@@ -187,10 +199,48 @@ _SPELT = {
 
 def stated_above(rows: Sequence[Sequence[object]], besides: Rows = ()) -> Titles:
     """What rows above a table say of the tool, the day and the place, as metadata; `besides` of the place alone."""
+    rows = [_unsplit(row) for row in rows]
     block = titles(rows)
     references = references_in(rows, besides)
     rough = {c: text for c, text in doubtful_in(rows, besides).items() if c not in references}
     return block._replace(metadata={**references, **block.metadata}, not_taken=rough)
+
+
+_SPLIT_BEFORE = re.compile(r"(?P<words>.*?)(?P<digits>(?<![\d.,])\d+)$")
+_SPLIT_BEHIND = re.compile(r"(?P<digits>\d+)(?P<point>\.\d+)?(?!\d)(?P<text>.*)")
+
+
+def _unsplit(row: Sequence[object]) -> list[object]:
+    """A row of texts whose numbers a comma has split, as they were written: Field: 56 | 870 nT, Dip: 70 | 5 deg.
+
+    Words before or a unit behind tell; of bare numbers, three digits behind one to three. Cells of a workbook are
+    never split.
+
+    >>> _unsplit(["Total field: 56", "870 nT", "Dip", "70.5"])
+    ['Total field: 56,870 nT', 'Dip', '70.5']
+    >>> _unsplit(["Field, dip", "50000", "65"])
+    ['Field, dip', '50000', '65']
+    """
+    whole: list[object] = []
+    for cell in row:
+        before = whole and isinstance(whole[-1], str) and _SPLIT_BEFORE.fullmatch(whole[-1])
+        behind = isinstance(cell, str) and _SPLIT_BEHIND.fullmatch(cell)
+        if before and behind and _belong_together(before, behind, len(whole) > 1):
+            whole[-1] = f"{whole[-1]},{cell}"
+        else:
+            whole.append(cell)
+    return whole
+
+
+def _belong_together(before: re.Match[str], behind: re.Match[str], labelled: bool) -> bool:
+    """Whether the ends of two cells are one number."""
+    thousands = len(before["digits"]) <= 3 and len(behind["digits"]) == 3
+    if behind["point"] and not thousands:
+        return False
+    told = re.search(r"[^\W\d_]", before["words"]) or re.match(
+        rf"\s*(?:{_WRITTEN_UNIT})", _plain(behind["text"])
+    )
+    return bool(told) or (thousands and labelled)
 
 
 def references_in(rows: Rows, besides: Rows = ()) -> dict[str, float]:
@@ -309,7 +359,8 @@ def _stated(
 ) -> Iterator[tuple[str, float]]:
     """The values of a quantity that a line states, with its column."""
     for match in pattern.finditer(text):
-        if not _NO_PLACE.search(text[max(match.start() - _BEFORE, 0) : match.start()]):
+        before = _BEFORE.search(text, 0, match.start())
+        if not (before and _NO_PLACE.search(before[0])):
             yield from ((quantity.column, value) for value in _values(quantity, match))
 
 
@@ -324,7 +375,8 @@ def _clauses(row: Sequence[object]) -> str:
         unit = re.fullmatch(rf"[(\[]?({_WRITTEN_UNIT})[)\]]?", cell)
         text += f"; {cell}" if ends and not unit else f" {cell}"
         ends = not unit and bool(re.search(r"(?<![\w.,])[+\-−]?\d[^;]*$", cell))
-    return text.strip()
+    text = _WITH_SPREAD.sub(r"\1 \4 \2 \3 \4", text)
+    return _RANGE.sub("range ", text).strip()
 
 
 def _of_a_place(text: str) -> dict[str, float]:
@@ -418,7 +470,7 @@ def _plain(text: str) -> str:
 def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
     """The value that a text states, in the unit of the run file, if it is one."""
     between, behind = match["between"], match["behind"]
-    rough = re.match(r"\W*(nomin|номин|标称|nenn)", behind) and not match["next"]
+    rough = re.match(r"\W*(nomin|номин|标称|nenn|k\s?g\b)", behind) and not match["next"]
     letter = "letter" in match.groupdict()
     if rough or _UNSURE.search(between if letter else f"{match['word']} {between}"):
         return

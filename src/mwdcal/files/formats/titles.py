@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
@@ -110,18 +111,21 @@ _ENGLISH_DATE = re.compile(
 _TRUE_NORTH = re.compile(
     r"true\s+north|geographic north|nord géographique|rechtweisend", re.IGNORECASE
 )
+_TURN = (
+    r"(?:\s*\((?P<note>[^)]*)\))?[^\w+−-]*(?P<degrees>[+−-]?\d+[.,]?\d*)\s*(?:°|deg\w*)?"
+    r"(?:\s*(?P<minutes>\d+(?:[.,]\d+)?)\s*(?:['′’]|min\w*))?\s*\(?(?P<sense>[EWO](?!\s*[+(])|west|зап|vest|oest)?"
+)
 _DECLINATION = re.compile(
     r"((?:decl|dekl|décl)\w*|misvisning|склонени\w*|схилення|偏角|manyetik sapma|odchylenie magn\w*)"
-    r"(?:\s*\(([^)]*)\))?[^\w+−-]*([+−-]?\d+[.,]?\d*)"
-    r"\s*(?:°|deg\w*)?\s*\(?([EWO](?!\s*[+(])|west|зап|vest|oest)?",
+    + _TURN,
     re.IGNORECASE,
 )
 _WEST_POSITIVE = re.compile(r"\b(w|west|ouest|oeste?|vest|зап\w*)\b\W*(\+|pos)", re.IGNORECASE)
 """A sense in brackets behind the word: (° W +)."""
+_WEST = re.compile(r"\W*(deg\w*)?\W*(w|west|ouest|oeste?|vest|зап\w*)\W*", re.IGNORECASE)
+"""The whole of such brackets: (W), (° west)."""
 _CONVERGENCE = re.compile(
-    r"(convergence|konvergenz|meridiankonvergens|convergencia|сближение меридианов|收敛角)"
-    r"(?:\s*\(([^)]*)\))?[^\w+−-]*([+−-]?\d+[.,]?\d*)"
-    r"\s*(?:°|deg\w*)?\s*\(?([EWO](?!\s*[+(])|west|зап|vest|oest)?",
+    r"(convergence|konvergenz|meridiankonvergens|convergencia|сближение меридианов|收敛角)" + _TURN,
     re.IGNORECASE,
 )
 _SPECIAL_LETTERS = str.maketrans({"ø": "o", "Ø": "O", "ß": "ss", "º": "", "ª": "", "°": ""})
@@ -198,10 +202,16 @@ def _rotation(statement: re.Pattern[str], text: str) -> float | None:
     match = statement.search(text)
     if not match:
         return None
-    west = bool(match[4]) and match[4].upper()[0] in "WOЗV"
-    value = float(match[3].replace(",", ".").replace("−", "-"))
-    if match[2] and _WEST_POSITIVE.search(match[2]):
+    degrees, minutes = (
+        float((match[n] or "0").replace(",", ".").replace("−", "-")) for n in ("degrees", "minutes")
+    )
+    value = math.copysign(abs(degrees) + minutes / 60, -1 if match["degrees"][0] in "-−" else 1)
+    if abs(value) > 180:
+        return None
+    note, sense = match["note"] or "", match["sense"] or ""
+    if _WEST_POSITIVE.search(note):
         return -value
+    west = sense.upper()[:1] in tuple("WOЗV") or _WEST.fullmatch(note)
     return -abs(value) if west else value
 
 
