@@ -100,14 +100,71 @@ def rounded(step, seed=4):
     return [np.asarray(run[n]) + rng.uniform(-step, step, 48) for n in names]
 
 
-@pytest.mark.parametrize("word", ["Ist", "actual"])
-def test_of_what_a_stand_was_set_to_and_shows_it_is_what_it_shows(tmp_path, word):
+SET_AND_READ = (
+    ("Soll", "Ist"), ("Soll", "actual"), ("Target", "Encoder"), ("Set", "Read"), ("Nom", "Act"),
+    ("consigne", "mesurée"), ("comandada", "medida (banco)"), ("zadane", "zmierzone"),
+    ("börvärde", "ärvärde"), ("指令値", "実測値"),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("word", "other"), SET_AND_READ)
+def test_of_what_a_stand_was_set_to_and_shows_it_is_what_it_shows(tmp_path, word, other):
     columns = table()
     for name, values in zip(("Inc", "Azi", "TF"), rounded(0.5), strict=True):
         shown = columns.pop(f"{name} (deg)")
-        columns |= {f"{name} Soll (deg)": np.round(values), f"{name} {word} (deg)": shown}
+        columns |= {f"{name} {word} (deg)": np.round(values), f"{name} {other} (deg)": shown}
     path = written(tmp_path / "a.csv", columns)
     assert reference(path) == pytest.approx(np.asarray(servo_run()["ref_toolface_deg"]))
+
+
+def test_measured_angles_beside_commanded_ones_may_be_the_tools_and_are_asked_about(tmp_path):
+    columns = table()
+    for name, values in zip(("Inc", "Azi", "TF"), rounded(0.5), strict=True):
+        columns[f"Meas {name} (deg)"] = columns.pop(f"{name} (deg)")
+        columns[f"Cmd {name} (deg)"] = np.round(values)
+    message = refused(
+        mwdcal("profile", written(tmp_path / "a.csv", columns), "-o", tmp_path / "t"), 3
+    )
+    assert "'Cmd TF (deg)' and 'Meas TF (deg)' may each be" in message
+
+
+@pytest.mark.parametrize(
+    "name", ["Ref total field, base station (nT)", "Campo total de referencia (nT)"]
+)
+def test_a_reference_field_of_each_row_is_taken_in_whatever_words(tmp_path, name):
+    field = np.round(50_100 + 5 * np.sin(np.arange(48)), 1)
+    columns = table(**{"ref_field_nt": None, name: field})
+    assert read(written(tmp_path / "a.csv", columns)).reference("field") == pytest.approx(field)
+
+
+@pytest.mark.parametrize("spread", ["s {}", "СКО {}", "σ({})", "s({})"])
+def test_the_scatter_of_a_channel_is_no_channel(tmp_path, spread):
+    columns = table()
+    for name in [n for n in columns if n[0] in "GH" and n[1] in "xyz"]:
+        columns[spread.format(name[:2])] = np.full(48, 1e-4)
+    run = read(written(tmp_path / "a.csv", columns))
+    assert run.accelerometer == pytest.approx(
+        read(written(tmp_path / "b.csv", table())).accelerometer
+    )
+
+
+def test_a_unit_may_stand_behind_a_preposition(tmp_path):
+    columns = {
+        n.replace(" (V)", " in V").replace(" (deg)", " in deg"): v for n, v in table().items()
+    }
+    path = written(tmp_path / "a.csv", columns)
+    assert library.propose_profile(path).profile.columns["ax"].unit == "V"
+
+
+def test_azimuths_from_geographic_north_with_a_stated_declination_are_true(tmp_path):
+    azimuth = np.asarray(servo_run()["ref_azimuth_deg"]) + 5.86
+    columns = {
+        ("Azimut, coğrafi kuzeyden (°)" if n == "Azi (deg)" else n): v for n, v in table().items()
+    }
+    columns["Azimut, coğrafi kuzeyden (°)"] = np.round(azimuth, 2) % 360
+    run = read(written(tmp_path / "a.csv", columns, "Manyetik sapma (°. doğu +),5.86"))
+    turned = np.degrees(run.reference("azimuth")) - (azimuth - 5.86)
+    assert (turned + 180) % 360 - 180 == pytest.approx(0, abs=0.006)
 
 
 def test_an_angle_that_was_set_among_others_that_the_stand_shows_is_named(tmp_path):

@@ -56,7 +56,8 @@ TRANSLATIONS = (
         r"rollachse|roll axis|(kat )?obrotu|"
         r"\brulle?\b|rullning|rotasi|(kat )?ustawienia narzedzia|takim yuzu|szerszamallas|"
         r"gereedschapsvlak|v(ae|æ)rkt(o|ø)jsflade|faccia utensile|ツールフェ(ー|イ)ス|тулфейс|回転角|угол поворота|"
-        r"rollwinkel|roll angle|werkzeug(winkel|lage|flache)|verdrehung|verdrehwinkel|drehwinkel|rotasjon|rulle?vinkel|"
+        r"roll[vw]inkel|roll angle|"
+        r"werkzeug(winkel|lage|flache)|verdrehung|verdrehwinkel|drehwinkel|rotasjon|rulle?vinkel|"
         r"verktoy(flate|vinkel)\w*|(face|angulo) d[ae] ferramenta|(face|angle)( d[e'])? ?(l'?)?outil|"
         r"ghsf?\b|угол установки( отклонител\w*)?|визир\w*( угол)?|"
         r"angulo de giro|giro|rotacion|отклонител\w*|откл\b\.?|визирн\w* угол|поворот|工具面角?|"
@@ -111,7 +112,8 @@ TRANSLATIONS = (
         "temperature ",
     ),
     (
-        r"sollwerte?|sollwinkel|soll|\brig\b|referenz|referanse|referencia|stand( settings?)?|"
+        r"sollwerte?|sollwinkel|soll|\brig\b|referenz|referanse|(\b(de|di|do) )?(referencia|riferimento)|"
+        r"(\bde )?reference|stand( settings?)?|"
         r"(angulos? )?d[ae] (la )?(mesa|bancada)|эталон\w*|стенд|задан\w*|标准|参考|转台",
         "ref ",
     ),
@@ -119,7 +121,7 @@ TRANSLATIONS = (
         r"seriennummer|seriennr|serienummer|заводской номер|序列号|n(um\w*|[o°º])?\.? ?[°º]? ?de serie|serie n[°ºr]\.?",
         "serial ",
     ),
-    (r"\bgeogr\w*\.?", "true "),
+    (r"(\bgeogr\w*|географічн\w*)\.?|cografi( kuzey\w*)?", "true "),
     (r"(?<![a-z])u ?(?=[gabhm][xyz]\b)", ""),
     (r"gerat|sonde", "tool "),
     (r"(de|da) [qc]uadr[ií]cula( utm)?|gitter|kartesisch", "grid "),
