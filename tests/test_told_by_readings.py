@@ -10,7 +10,7 @@ import pytest
 import mwdcal as library
 from cli_support import mwdcal, refused, servo_run, write_csv
 from mwdcal.errors import FitError
-from mwdcal.files.formats.title_references import doubtful_in, references_in
+from mwdcal.files.formats.title_references import doubtful_in, references_in, stated_above
 from mwdcal.files.formats.titles import titles
 from test_tables_as_they_come import findings_of, mixed, read, table, written
 
@@ -286,3 +286,38 @@ def test_abbreviations_with_points_are_read(tmp_path):
     assert reference(written(tmp_path / "a.csv", columns)) == pytest.approx(
         np.asarray(servo_run()["ref_toolface_deg"])
     )
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("Type", ("CAL", "VER")), ("Status", ("OK", "CHECK")), ("Art", ("", "Prüfung"))],
+)
+def test_rows_that_check_a_calibration_are_no_part_of_it_and_are_named(tmp_path, name, words):
+    columns = {name: [words[k >= 42] for k in range(48)], **table()}
+    path = written(tmp_path / "a.csv", columns)
+    proposal = library.propose_profile(path)
+    assert f"'{name}': {words[1]}" in findings_of(proposal)["marked-rows"]
+    assert library.read_run(path, proposal.profile).count == 42
+    assert read(path, keep={name: [words[1]]}).count == 48
+
+
+def test_rows_below_a_line_that_calls_them_check_shots_are_no_part_of_the_run(tmp_path):
+    path = written(tmp_path / "a.csv", table())
+    lines = path.read_text().splitlines()
+    line = '"Check shots - for verification only, not to be used in the calibration"'
+    path.write_text("\n".join([*lines[:43], line, *lines[43:]]))
+    assert read(path).count == 42
+    assert "Check shots" in mwdcal("profile", path, "-o", tmp_path / "t.toml").out
+
+
+def test_a_rejected_row_is_left_out_beside_check_rows(tmp_path):
+    status = ["void" if k == 5 else "CHECK" if k >= 42 else "OK" for k in range(48)]
+    path = written(tmp_path / "a.csv", {"Status": status, **table()})
+    assert read(path).count == 41
+
+
+@pytest.mark.parametrize(
+    "line", ["Total field: 56,870 nT", "# Btotal: 56,870 nT, Dip: 74.6 deg", "F = 56,870.0 gamma"]
+)
+def test_a_number_that_a_comma_table_cuts_at_its_thousands_is_one(line):
+    assert stated_above([[c.strip() for c in line.split(",")]]).metadata["ref_field_nt"] == 56_870

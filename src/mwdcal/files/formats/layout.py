@@ -428,7 +428,7 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
     """The table whose last row of names, or of units, is at a place, down to the row before `end`."""
     rows = sheet.rows
     names, units, top = _head(rows, head)
-    below = rows[_other_tool(rows, head, end) : end]
+    below = rows[_another_part(rows, head, end) : end]
     end -= len(below)
     readings = [place for place in range(head + 1, end) if _is_reading(rows[place][1])]
     kept = _without_summary([rows[place] for place in readings])
@@ -487,14 +487,14 @@ def _beside(
     return [*remarks, *(r for _, r in others if sum(map(figures.is_figure, r)) < LEAST_COLUMNS)]
 
 
-def _other_tool(rows: Sequence[tuple[int, Cells]], head: int, end: int) -> int:
-    """The place of a row below the names that states the serial of another tool, above rows of it; else the end."""
+def _another_part(rows: Sequence[tuple[int, Cells]], head: int, end: int) -> int:
+    """The place of a line below the names, above rows of another tool by its serial, or of a check; else the end."""
     ours = titles([row for _, row in rows[:head]]).metadata.get("serial")
     for place in range(head + 1, end - 1):
         row = rows[place][1]
         if _is_reading(rows[place + 1][1]) and not _is_reading(row):
             theirs = titles([row]).metadata.get("serial")
-            if theirs not in (None, ours):
+            if theirs not in (None, ours) or _OF_ROLL_TEST.search(" ".join(map(as_text, row))):
                 return place
     return end
 

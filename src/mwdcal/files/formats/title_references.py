@@ -187,10 +187,29 @@ _SPELT = {
 
 def stated_above(rows: Sequence[Sequence[object]], besides: Rows = ()) -> Titles:
     """What rows above a table say of the tool, the day and the place, as metadata; `besides` of the place alone."""
+    rows = [*map(_with_thousands, rows)]
     block = titles(rows)
     references = references_in(rows, besides)
     rough = {c: text for c, text in doubtful_in(rows, besides).items() if c not in references}
     return block._replace(metadata={**references, **block.metadata}, not_taken=rough)
+
+
+def _with_thousands(row: Sequence[object]) -> list[object]:
+    """The cells of a row, two of which are one number that a comma table cuts at its thousands: Field: 56 | 870 nT."""
+    cells: list[object] = []
+    for cell in row:
+        before = cells[-1] if cells else ""
+        cut = isinstance(before, str) and isinstance(cell, str) and _CUT_BEHIND.match(cell)
+        if cut and _CUT_BEFORE.search(str(before)):
+            cells[-1] = f"{before},{cell}"
+        else:
+            cells.append(cell)
+    return cells
+
+
+_CUT_BEFORE = re.compile(r"[^\W\d_].*(?<![\d.,])\d{1,3}$", re.DOTALL)
+_CUT_BEHIND = re.compile(r"\d{3}(\.\d+)?\s*(nT|gammas?|γ|mGal)(?![^\W\d_])", re.IGNORECASE)
+"""A number before the separator of its thousands, behind words, and what follows with a unit."""
 
 
 def references_in(rows: Rows, besides: Rows = ()) -> dict[str, float]:
