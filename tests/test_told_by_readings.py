@@ -6,6 +6,7 @@ Expected values are those of the simulated run, rewritten as another laboratory 
 
 import numpy as np
 import pytest
+from openpyxl import Workbook
 
 import mwdcal as library
 from cli_support import mwdcal, refused, servo_run, write_csv
@@ -321,3 +322,32 @@ def test_a_rejected_row_is_left_out_beside_check_rows(tmp_path):
 )
 def test_a_number_that_a_comma_table_cuts_at_its_thousands_is_one(line):
     assert stated_above([[c.strip() for c in line.split(",")]]).metadata["ref_field_nt"] == 56_870
+
+
+@pytest.mark.parametrize("comment", [True, False])
+def test_a_line_above_says_what_the_channels_of_a_logger_are(tmp_path, comment):
+    channels = ("Gx (V)", "Gy (V)", "Gz (V)", "Hx (V)", "Hy (V)", "Hz (V)", "Temp (C)")
+    ours = {name: f"CH{k}" for k, name in enumerate(channels, 1)}
+    columns = {ours.get(n, n): v for n, v in table().items()}
+    line = "CH1=Gx CH2=Gy CH3=Gz (V); CH4=Hx; CH5=Hy; CH6=Hz, V; CH7 = temperature of probe, degC"
+    path = written(tmp_path / "a.csv", columns, f"# {line}" if comment else f'"{line}"')
+    proposal = library.propose_profile(path)
+    names = proposal.profile.columns
+    assert [names[c].name for c in ("ax", "mz", "temperature_c")] == ["CH1", "CH6", "CH7"]
+    assert [names[c].unit for c in ("ax", "mx")] == ["V", "V"]
+
+
+def test_sheets_of_one_temperature_each_are_one_run_with_the_temperature_above_them(tmp_path):
+    columns = servo_run(temperatures=(25.0, 85.0), toolfaces=4)
+    celsius = np.asarray(columns["temperature_c"])
+    names = [n for n in columns if n not in ("temperature_c", "group")]
+    book = Workbook()
+    book.remove(book.active)
+    for warmth in (25, 85):
+        sheet = book.create_sheet(f"+{warmth} °C")
+        sheet.append(["Temperature, °C", warmth])
+        sheet.append(names)
+        for row in np.flatnonzero(np.abs(celsius - warmth) < 10).tolist():
+            sheet.append([float(columns[n][row]) for n in names])
+    book.save(tmp_path / "a.xlsx")
+    assert {*read(tmp_path / "a.xlsx").temperature} == {25.0, 85.0}

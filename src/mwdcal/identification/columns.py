@@ -463,8 +463,10 @@ def _without_title(name: str) -> Resemblance | None:
     return None if triad and alike.column[0] != triad[0] else alike
 
 
-def meanings_of(names: Sequence[str], units: Sequence[str]) -> dict[str, Resemblance]:
-    """What columns hold by their names, those of the others considered.
+def meanings_of(
+    names: Sequence[str], units: Sequence[str], above: Sequence[str] = ()
+) -> dict[str, Resemblance]:
+    """What columns hold by their names, those of the others considered, and by the lines above them.
 
     Channels may be numbered: G1, G2, G3. `AZ` without `AX` and `AY` is the azimuth. Inklination is the dip where
     there is a Neigung.
@@ -477,6 +479,7 @@ def meanings_of(names: Sequence[str], units: Sequence[str]) -> dict[str, Resembl
     results = {
         name: m for name, unit in zip(names, units, strict=True) if (m := meaning(once[name], unit))
     }
+    results = _by_legend(names, above) | results
     results |= _behind_titles(names, units, results)
     results |= _beside_nominal(names, units, results)
     every = [n for n, m in results.items() if m.column == "az"]
@@ -489,6 +492,25 @@ def meanings_of(names: Sequence[str], units: Sequence[str]) -> dict[str, Resembl
     if len(dips) == 1 and any(re.search("neigung", n, re.IGNORECASE) for n in inclined):
         results[dips[0]] = results[dips[0]]._replace(column="ref_dip_deg")
     return results
+
+
+def _by_legend(names: Sequence[str], above: Sequence[str]) -> dict[str, Resemblance]:
+    """What columns hold by a line that says so of three or more: CH1 = Gx; CH2 = Gy; CH3 = Gz, mg."""
+    every = "|".join(map(re.escape, sorted(names, key=len, reverse=True)))
+    found: dict[str, Resemblance] = {}
+    for line in above:
+        _, *parts = re.split(rf"(?<!\w)({every})\s*=\s*", line)
+        for name, text in zip(parts[::2], parts[1::2], strict=True):
+            words, _, unit = text.strip(' ,;"').rpartition(", ")
+            alike = meaning(words, unit) if words and unit_of(unit) else meaning(words or unit)
+            if alike:
+                found[name] = alike
+    for channels in CHANNELS.values():
+        triad = {name: m for name, m in found.items() if m.column in channels}
+        stated = {m.unit for m in triad.values() if m.unit}
+        if len(stated) == 1:
+            found |= {name: m._replace(unit=min(stated)) for name, m in triad.items()}
+    return found if len(found) > 2 else {}
 
 
 def _beside_nominal(
@@ -639,7 +661,7 @@ def proposed(
         FitError: columns of which each may be one of the run file's, a unit that neither name nor
             values tell, azimuths from true or grid north, no accelerometer: all that is open.
     """
-    meanings = _with_whole_vectors(meanings_of(names, units))
+    meanings = _with_whole_vectors(meanings_of(names, units, above))
     _tell_by_values(meanings, names, units, values)
     said, known = answers or {}, stated or {}
     _tell_numbers(meanings, values, said)

@@ -39,7 +39,7 @@ TRANSLATIONS = (
         "dip ",
     ),
     (
-        r"kipp(achse|winkel)|schwenkachse|\btilt\b|inclinazione|inclinatie|helling|haeldning|hældning|lutning|"
+        r"\bdevi\b|kipp(achse|winkel)|schwenkachse|\btilt\b|inclinazione|inclinatie|helling|haeldning|hældning|lutning|"
         r"(kat )?odchyleni[ae]( od pionu)?|(kat )?nachyleni[ae]|ferdeseg|dolesszog|egim|kemiringan|傾斜角?|"
         r"зен\w*\.?( угол\w*)?|"
         r"neigung(swinkel)?|desviacion|sapma( acisi)?|inklination|inclinaison|inclinaca?o|"
@@ -48,12 +48,12 @@ TRANSLATIONS = (
         "inclination ",
     ),
     (
-        r"drehtisch|turn ?table|rotary table|baring|azymut|yonelim|азимут|asimut|azimute?(?!h)|acimut|方位角?|rumbo|"
-        r"richtung(?!swinkel)|retning|peilung",
+        r"\bhazi\b|drehtisch|turn ?table|rotary table|baring|azymut|yonelim|азимут|asimut|azimute?(?!h)|acimut|方位角?|"
+        r"rumbo|richtung(?!swinkel)|retning|peilung",
         "azimuth ",
     ),
     (
-        r"rollachse|roll axis|(kat )?obrotu|"
+        r"\brb\b|^t/f\b|rollachse|roll axis|(kat )?obrotu|"
         r"\brulle?\b|rullning|rotasi|(kat )?ustawienia narzedzia|takim yuzu|szerszamallas|"
         r"gereedschapsvlak|v(ae|æ)rkt(o|ø)jsflade|faccia utensile|ツールフェ(ー|イ)ス|тулфейс|回転角|угол поворота|"
         r"roll[vw]inkel|roll angle|"
@@ -106,7 +106,7 @@ TRANSLATIONS = (
     (r"код\w* ацп|ацп|отсч\w*|码值", "adc"),
     (r"мв(?![а-я])", "mV"),
     (
-        r"lampotila|teplota|درجة الحرارة|θερμοκρασια|온도|nhiet do|"
+        r"\bttmp\b|lampotila|teplota|درجة الحرارة|θερμοκρασια|온도|nhiet do|"
         r"temp-ra|темп-ра|sicaklik|homerseklet|temperatuur|suhu|pt100(0)?\b|temperatura|"
         r"temperature?n?|температура|темп\b\.?|温度",
         "temperature ",

@@ -221,7 +221,7 @@ def _is_one_run(tables: Sequence[Layout]) -> bool:
     rows = [row for t in tables for row in zip(*t.texts, strict=True)]
     if not same or apart or len({*sheets}) < len(sheets) or len({*rows}) < len(rows):
         return False
-    if not all(map(_has_its_warmth, tables)):
+    if not all(map(_has_its_warmth, tables)) and not _is_warmth_above(tables):
         return False
     return all(map(_OF_SETTING.fullmatch, sheets)) or _are_numbered_on(tables)
 
@@ -234,6 +234,38 @@ def _has_its_warmth(table: Layout) -> bool:
     stated = float(match[1].replace(",", ".").replace("−", "-"))
     columns = [[float(c) for c in cells] for cells in table.cells if all(map(looks_numeric, cells))]
     return any(max(abs(value - stated) for value in cells) < _SAME_WARMTH for cells in columns)
+
+
+def _is_warmth_above(tables: Sequence[Layout]) -> bool:
+    """Whether the temperatures that sheets are named as stand above their tables, and in no column."""
+    return all(map(_states_its_warmth, tables)) and not any(map(_has_its_warmth, tables))
+
+
+def _states_its_warmth(table: Layout) -> bool:
+    """Whether a line above a table states the temperature that its sheet is named as."""
+    match = _OF_WARMTH.fullmatch(table.sheet)
+    number = re.escape(match[1].lstrip("+")) if match else ""
+    return bool(match) and any(
+        re.search(
+            rf"°\s*[cf℃]\W+{number}(?![\d.,])|(?<![\d.,]){number}\s*°\s*[cf℃]", line, re.IGNORECASE
+        )
+        for line in table.above
+    )
+
+
+def _with_stated_warmth(table: Layout) -> Layout:
+    """A table with the temperature that its sheet is named as in a column of its own."""
+    match = _OF_WARMTH.fullmatch(table.sheet)
+    assert match
+    unit = "°F" if "f" in table.sheet.lower() else "°C"
+    cells = [match[1].replace(",", ".").replace("−", "-").lstrip("+")] * len(table.lines)
+    return replace(
+        table,
+        names=[*table.names, f"Temperature of sheet ({unit})"],
+        units=[*table.units, ""],
+        cells=[*table.cells, cells],
+        texts=[*table.texts, cells],
+    )
 
 
 def _are_numbered_on(tables: Sequence[Layout]) -> bool:
@@ -250,6 +282,8 @@ def _are_numbered_on(tables: Sequence[Layout]) -> bool:
 
 def _joined_sheets(tables: Sequence[Layout]) -> Layout:
     """Tables of several sheets as one, in the order of the sheets."""
+    if _is_warmth_above(tables):
+        tables = [*map(_with_stated_warmth, tables)]
     first = tables[0]
     return replace(
         first,
