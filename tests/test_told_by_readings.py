@@ -6,6 +6,7 @@ Expected values are those of the simulated run, rewritten as another laboratory 
 
 import numpy as np
 import pytest
+from openpyxl import Workbook
 
 import mwdcal as library
 from cli_support import mwdcal, refused, servo_run, write_csv
@@ -100,14 +101,71 @@ def rounded(step, seed=4):
     return [np.asarray(run[n]) + rng.uniform(-step, step, 48) for n in names]
 
 
-@pytest.mark.parametrize("word", ["Ist", "actual"])
-def test_of_what_a_stand_was_set_to_and_shows_it_is_what_it_shows(tmp_path, word):
+SET_AND_READ = (
+    ("Soll", "Ist"), ("Soll", "actual"), ("Target", "Encoder"), ("Set", "Read"), ("Nom", "Act"),
+    ("consigne", "mesurée"), ("comandada", "medida (banco)"), ("zadane", "zmierzone"),
+    ("börvärde", "ärvärde"), ("指令値", "実測値"),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("word", "other"), SET_AND_READ)
+def test_of_what_a_stand_was_set_to_and_shows_it_is_what_it_shows(tmp_path, word, other):
     columns = table()
     for name, values in zip(("Inc", "Azi", "TF"), rounded(0.5), strict=True):
         shown = columns.pop(f"{name} (deg)")
-        columns |= {f"{name} Soll (deg)": np.round(values), f"{name} {word} (deg)": shown}
+        columns |= {f"{name} {word} (deg)": np.round(values), f"{name} {other} (deg)": shown}
     path = written(tmp_path / "a.csv", columns)
     assert reference(path) == pytest.approx(np.asarray(servo_run()["ref_toolface_deg"]))
+
+
+def test_measured_angles_beside_commanded_ones_may_be_the_tools_and_are_asked_about(tmp_path):
+    columns = table()
+    for name, values in zip(("Inc", "Azi", "TF"), rounded(0.5), strict=True):
+        columns[f"Meas {name} (deg)"] = columns.pop(f"{name} (deg)")
+        columns[f"Cmd {name} (deg)"] = np.round(values)
+    message = refused(
+        mwdcal("profile", written(tmp_path / "a.csv", columns), "-o", tmp_path / "t"), 3
+    )
+    assert "'Cmd TF (deg)' and 'Meas TF (deg)' may each be" in message
+
+
+@pytest.mark.parametrize(
+    "name", ["Ref total field, base station (nT)", "Campo total de referencia (nT)"]
+)
+def test_a_reference_field_of_each_row_is_taken_in_whatever_words(tmp_path, name):
+    field = np.round(50_100 + 5 * np.sin(np.arange(48)), 1)
+    columns = table(**{"ref_field_nt": None, name: field})
+    assert read(written(tmp_path / "a.csv", columns)).reference("field") == pytest.approx(field)
+
+
+@pytest.mark.parametrize("spread", ["s {}", "СКО {}", "σ({})", "s({})"])
+def test_the_scatter_of_a_channel_is_no_channel(tmp_path, spread):
+    columns = table()
+    for name in [n for n in columns if n[0] in "GH" and n[1] in "xyz"]:
+        columns[spread.format(name[:2])] = np.full(48, 1e-4)
+    run = read(written(tmp_path / "a.csv", columns))
+    assert run.accelerometer == pytest.approx(
+        read(written(tmp_path / "b.csv", table())).accelerometer
+    )
+
+
+def test_a_unit_may_stand_behind_a_preposition(tmp_path):
+    columns = {
+        n.replace(" (V)", " in V").replace(" (deg)", " in deg"): v for n, v in table().items()
+    }
+    path = written(tmp_path / "a.csv", columns)
+    assert library.propose_profile(path).profile.columns["ax"].unit == "V"
+
+
+def test_azimuths_from_geographic_north_with_a_stated_declination_are_true(tmp_path):
+    azimuth = np.asarray(servo_run()["ref_azimuth_deg"]) + 5.86
+    columns = {
+        ("Azimut, coğrafi kuzeyden (°)" if n == "Azi (deg)" else n): v for n, v in table().items()
+    }
+    columns["Azimut, coğrafi kuzeyden (°)"] = np.round(azimuth, 2) % 360
+    run = read(written(tmp_path / "a.csv", columns, "Manyetik sapma (°. doğu +),5.86"))
+    turned = np.degrees(run.reference("azimuth")) - (azimuth - 5.86)
+    assert (turned + 180) % 360 - 180 == pytest.approx(0, abs=0.006)
 
 
 def test_an_angle_that_was_set_among_others_that_the_stand_shows_is_named(tmp_path):
@@ -258,3 +316,66 @@ def test_title_lines_whose_numbers_commas_split_and_turns_to_the_west(row, state
 )  # fmt: skip
 def test_components_ranges_and_corrections_are_no_references(line):
     assert stated_above([[line]]).metadata == {}
+
+
+    ("name", "words"),
+    [("Type", ("CAL", "VER")), ("Status", ("OK", "CHECK")), ("Art", ("", "Prüfung"))],
+)
+def test_rows_that_check_a_calibration_are_no_part_of_it_and_are_named(tmp_path, name, words):
+    columns = {name: [words[k >= 42] for k in range(48)], **table()}
+    path = written(tmp_path / "a.csv", columns)
+    proposal = library.propose_profile(path)
+    assert f"'{name}': {words[1]}" in findings_of(proposal)["marked-rows"]
+    assert library.read_run(path, proposal.profile).count == 42
+    assert read(path, keep={name: [words[1]]}).count == 48
+
+
+def test_rows_below_a_line_that_calls_them_check_shots_are_no_part_of_the_run(tmp_path):
+    path = written(tmp_path / "a.csv", table())
+    lines = path.read_text().splitlines()
+    line = '"Check shots - for verification only, not to be used in the calibration"'
+    path.write_text("\n".join([*lines[:43], line, *lines[43:]]))
+    assert read(path).count == 42
+    assert "Check shots" in mwdcal("profile", path, "-o", tmp_path / "t.toml").out
+
+
+def test_a_rejected_row_is_left_out_beside_check_rows(tmp_path):
+    status = ["void" if k == 5 else "CHECK" if k >= 42 else "OK" for k in range(48)]
+    path = written(tmp_path / "a.csv", {"Status": status, **table()})
+    assert read(path).count == 41
+
+
+@pytest.mark.parametrize(
+    "line", ["Total field: 56,870 nT", "# Btotal: 56,870 nT, Dip: 74.6 deg", "F = 56,870.0 gamma"]
+)
+def test_a_number_that_a_comma_table_cuts_at_its_thousands_is_one(line):
+    assert stated_above([[c.strip() for c in line.split(",")]]).metadata["ref_field_nt"] == 56_870
+
+
+@pytest.mark.parametrize("comment", [True, False])
+def test_a_line_above_says_what_the_channels_of_a_logger_are(tmp_path, comment):
+    channels = ("Gx (V)", "Gy (V)", "Gz (V)", "Hx (V)", "Hy (V)", "Hz (V)", "Temp (C)")
+    ours = {name: f"CH{k}" for k, name in enumerate(channels, 1)}
+    columns = {ours.get(n, n): v for n, v in table().items()}
+    line = "CH1=Gx CH2=Gy CH3=Gz (V); CH4=Hx; CH5=Hy; CH6=Hz, V; CH7 = temperature of probe, degC"
+    path = written(tmp_path / "a.csv", columns, f"# {line}" if comment else f'"{line}"')
+    proposal = library.propose_profile(path)
+    names = proposal.profile.columns
+    assert [names[c].name for c in ("ax", "mz", "temperature_c")] == ["CH1", "CH6", "CH7"]
+    assert [names[c].unit for c in ("ax", "mx")] == ["V", "V"]
+
+
+def test_sheets_of_one_temperature_each_are_one_run_with_the_temperature_above_them(tmp_path):
+    columns = servo_run(temperatures=(25.0, 85.0), toolfaces=4)
+    celsius = np.asarray(columns["temperature_c"])
+    names = [n for n in columns if n not in ("temperature_c", "group")]
+    book = Workbook()
+    book.remove(book.active)
+    for warmth in (25, 85):
+        sheet = book.create_sheet(f"+{warmth} °C")
+        sheet.append(["Temperature, °C", warmth])
+        sheet.append(names)
+        for row in np.flatnonzero(np.abs(celsius - warmth) < 10).tolist():
+            sheet.append([float(columns[n][row]) for n in names])
+    book.save(tmp_path / "a.xlsx")
+    assert {*read(tmp_path / "a.xlsx").temperature} == {25.0, 85.0}

@@ -19,7 +19,7 @@ from mwdcal.errors import Answer, InputError, QuestionError
 from mwdcal.files.formats.columns import Column, looks_numeric, shown
 from mwdcal.files.formats.table import Table, labels, row_word
 from mwdcal.files.formats.titles import ADJUSTED, OF_REFUSAL
-from mwdcal.files.parting import marked_rows
+from mwdcal.files.parting import check_rows, marked_rows
 from mwdcal.files.statements import rows_of
 from mwdcal.files.synonyms import OURS
 from mwdcal.sensor.profile import TableFormat
@@ -83,10 +83,16 @@ def marks_in(table: Table, form: TableFormat, used: Collection[str]) -> Marks:
         chosen, kept = ({*map(_plain, each.get(name, ()))} for each in (form.leave_out, form.keep))
         judged = name not in used and name not in form.ignore and not name.startswith("witsml ")
         judged = judged and (_holds_words(table.columns[name]) or _names_judgements(_plain(name)))
-        judged = judged and not marked_rows(table, name)
+        checks = {*check_rows(table, name)} if judged else set[int]()
+        judged = judged and checks == {*marked_rows(table, name)}
         cells = labels(table, name) if chosen or kept or judged else []
+        left_out |= {
+            r: f"{shown(name)}: {cells[r]}"
+            for r in checks
+            if judged and _plain(cells[r]) not in kept
+        }
         spelt = {cell: _plain(cell) for cell in {*cells}}
-        plain = [spelt[cell] for cell in cells]
+        plain = ["" if r in checks else spelt[cell] for r, cell in enumerate(cells)]
         verdicts = _verdicts(_plain(name), plain) if judged else {}
         for row, cell in enumerate(plain):
             if judged and row and cell not in kept and _REJECTS_PREVIOUS.search(cell):
@@ -207,7 +213,7 @@ def _remarks(table: Table, marks: Marks) -> Iterator[str]:
     """A sentence on the rows that are left out, and one on those that may have to be."""
     if marks.left_out:
         each = [f"{place(table, row)} ({said})" for row, said in sorted(marks.left_out.items())]
-        yield f"rows that are rejected, or copies of others, are left out: {listed(each, MARKS_NAMED)}."
+        yield f"rows that are rejected, for a check, or copies of others, are left out: {listed(each, MARKS_NAMED)}."
     doubtful = {
         row: f"{shown(name)}: {cell}"
         for (name, cell), rows in marks.doubtful.items()

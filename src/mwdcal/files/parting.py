@@ -10,10 +10,15 @@ from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.table import Table, labels
 from mwdcal.files.statements import rows_of
 
+_OF_CHECKS = (
+    r"ver(if(y|ication|iziert)?)?|verifikation|check|validation|control|kontrolle|pr(ue|ü)fung|kontroll|"
+    r"verificaci[oó]n|verifica[cç][aã]o|проверка|поверка|контроль|验证|检验"
+)
+_BEHIND = r"[\s_-]*(run|shot|station|row|test|\d*)\W*"
+_CHECK = re.compile(rf"\W*({_OF_CHECKS}){_BEHIND}", re.IGNORECASE)
+"""A cell of a row that is to check a calibration, and is no part of it."""
 _ROLL_TEST = re.compile(
-    r"\W*(roll([\s_-]*(test|over|check|set))|rt|verif(y|ication|iziert)?|verifikation|check|validation|control|kontrolle|"
-    r"(roll)?pruefung|(roll)?prüfung|rulletest|kontroll|prueba( de giro)?|verificaci[oó]n|verifica[cç][aã]o|проверка|"
-    r"поверка|контроль|验证|检验)[\s_-]*(run|shot|station|row|test|\d*)\W*",
+    rf"\W*(roll([\s_-]*(test|over|check|set))|rt|rollpr(ue|ü)fung|rulletest|prueba( de giro)?|{_OF_CHECKS}){_BEHIND}",
     re.IGNORECASE,
 )
 """Names of the roll test, in a cell or as the name of a column."""
@@ -58,3 +63,9 @@ def marked_rows(table: Table, name: str) -> list[int]:
     else:
         rows = [row for row, cell in enumerate(cells) if cell and _ROLL_TEST.fullmatch(cell)]
     return rows if len(rows) < len(cells) else []
+
+
+def check_rows(table: Table, name: str) -> list[int]:
+    """The rows that a cell in a column calls a check of the calibration; none where they are half of all or more."""
+    rows = [row for row, cell in enumerate(labels(table, name)) if cell and _CHECK.fullmatch(cell)]
+    return rows if 2 * len(rows) < table.count else []

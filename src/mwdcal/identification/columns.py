@@ -260,6 +260,7 @@ _LABELS = {
 }
 """Names of columns of labels; a column is one only where no other is."""
 _CALLED_REFERENCE = re.compile(r"\b(ref|reference|nominal|target|set)\b", re.IGNORECASE)
+_REFERRED = re.compile(r"\b(ref|reference)\b", re.IGNORECASE)
 _MEASURED = re.compile(
     r"\b(measured|meas|calc|calculated|computed|corr|corrected|gemessen|berechnet|ist|mwd|survey)\b",
     re.IGNORECASE,
@@ -272,10 +273,13 @@ _NO_STAND = re.compile(
 )
 """Words of columns of angles that do not belong to the stand."""
 _NOMINAL = re.compile(
-    r"\b(nominal|target|set|setpoint|soll\w*|задан\w*|номинал\w*)\b|设定|目标", re.IGNORECASE
+    r"\b(nominale?|target|set|set ?point|soll\w*|cmd|command(ed)?|demand(ed)?|required|nom|consigne|comandad[oa]|"
+    r"zadan\w*|b[öo]rv[äa]rde|задан\w*|номинал\w*)\b|设定|目标|指令値?|目標値?|設定値?",
+    re.IGNORECASE,
 )
 _ACTUAL = re.compile(
-    r"\b(actual|read|reading|ist|istwert|действит\w*|фактич\w*|измер\w*|real|faktisk)\b|实际|实测",
+    r"\b(actual|act|achieved|read|reading|encoder|ist|istwert|effettiv[oa]|mesur[ée]e?s?|medid[oa]|zmierzon\w*|"
+    r"[äa]rv[äa]rde|действит\w*|фактич\w*|измер\w*|real|faktisk)\b|实际|实测|编码器|実測値?|実際",
     re.IGNORECASE,
 )
 """Words of angles to which a stand was to be set, and of those that it shows."""
@@ -317,6 +321,10 @@ _OF_LOGGER = re.compile(
     re.IGNORECASE,
 )
 """A channel of a logger, with what it is in brackets or behind a colon."""
+_SCATTER = re.compile(r"s (?=[gabhm][xyz]\b)|[sσ] ?\(|σ|ско\b", re.IGNORECASE)
+"""How the name of the scatter of the samples of a channel begins, which is no channel."""
+_IN_UNIT = re.compile(r"(.*\w) (?:in|en|i|w|в) (\S+)", re.IGNORECASE)
+"""A name with its unit behind a preposition: Gx in mg."""
 _BARE_T = re.compile(r"t\W*(°|deg)?\W*", re.IGNORECASE)
 _CCW = re.compile(
     r"\(?(counter|anti)[ -]?clockwise\)?|\bccw\b|gegen (den )?uhrzeiger\w*|против час\w*",
@@ -339,7 +347,7 @@ _SPOKEN = {
 }
 """Units of angles in a line above a table."""
 _SURROUNDINGS = re.compile(
-    r"oven|chamber|ambient|(?<![a-z])(air|room|bath|lab)(?![a-z])|ofen|kammer|umgebung|raum|ovn|rom|horno|ambiente|"
+    r"oven|chamber|ambient|kamer\b|(?<![a-z])(air|room|bath|lab)(?![a-z])|ofen|kammer|umgebung|raum|ovn|rom|horno|ambiente|"
     r"камер|печ|термостат|环境|烘箱|室温",
     re.IGNORECASE,
 )
@@ -361,8 +369,9 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     if both := _two_units(name, unit):
         once = meaning(name)
         return once and once._replace(unit=both if units_of(once.column) else unit)
-    logged = _OF_LOGGER.fullmatch(name)
-    name = f"{logged[1]}{logged[2] or ''}" if logged else name
+    if _SCATTER.match(name):
+        return None
+    name = _bracketed(name)
     plain = spelled(f"{name} ({unit})" if unit else name)
     if elevation := _elevation(name, plain, unit):
         return elevation
@@ -386,6 +395,14 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     if not alike and not spelt:
         return _by_axis_and_unit(name, unit or (stated[1] if stated else ""))
     return alike or Resemblance(spelt or "", unit_of(stated[1]) if stated else "")
+
+
+def _bracketed(name: str) -> str:
+    """A name without what a logger writes before it, and with its unit in brackets."""
+    logged = _OF_LOGGER.fullmatch(name)
+    name = f"{logged[1]}{logged[2] or ''}" if logged else name
+    worded = _IN_UNIT.fullmatch(name)
+    return f"{worded[1]} ({worded[2]})" if worded and unit_of(spelled(worded[2])) else name
 
 
 def _elevation(name: str, plain: str, unit: str) -> Resemblance | None:
@@ -446,8 +463,10 @@ def _without_title(name: str) -> Resemblance | None:
     return None if triad and alike.column[0] != triad[0] else alike
 
 
-def meanings_of(names: Sequence[str], units: Sequence[str]) -> dict[str, Resemblance]:
-    """What columns hold by their names, those of the others considered.
+def meanings_of(
+    names: Sequence[str], units: Sequence[str], above: Sequence[str] = ()
+) -> dict[str, Resemblance]:
+    """What columns hold by their names, those of the others considered, and by the lines above them.
 
     Channels may be numbered: G1, G2, G3. `AZ` without `AX` and `AY` is the azimuth. Inklination is the dip where
     there is a Neigung.
@@ -460,8 +479,9 @@ def meanings_of(names: Sequence[str], units: Sequence[str]) -> dict[str, Resembl
     results = {
         name: m for name, unit in zip(names, units, strict=True) if (m := meaning(once[name], unit))
     }
+    results = _by_legend(names, above) | results
     results |= _behind_titles(names, units, results)
-    results |= _beside_nominal(names, results)
+    results |= _beside_nominal(names, units, results)
     every = [n for n, m in results.items() if m.column == "az"]
     lone = [n for n in every if _BARE_AZ.fullmatch(n)]
     triad = [n for n in every if n not in lone[:1]] or any(_BARE_AX.fullmatch(n) for n in names)
@@ -474,21 +494,53 @@ def meanings_of(names: Sequence[str], units: Sequence[str]) -> dict[str, Resembl
     return results
 
 
+def _by_legend(names: Sequence[str], above: Sequence[str]) -> dict[str, Resemblance]:
+    """What columns hold by a line that says so of three or more: CH1 = Gx; CH2 = Gy; CH3 = Gz, mg."""
+    every = "|".join(map(re.escape, sorted(names, key=len, reverse=True)))
+    found: dict[str, Resemblance] = {}
+    for line in above:
+        _, *parts = re.split(rf"(?<!\w)({every})\s*=\s*", line)
+        for name, text in zip(parts[::2], parts[1::2], strict=True):
+            words, _, unit = text.strip(' ,;"').rpartition(", ")
+            alike = meaning(words, unit) if words and unit_of(unit) else meaning(words or unit)
+            if alike:
+                found[name] = alike
+    for channels in CHANNELS.values():
+        triad = {name: m for name, m in found.items() if m.column in channels}
+        stated = {m.unit for m in triad.values() if m.unit}
+        if len(stated) == 1:
+            found |= {name: m._replace(unit=min(stated)) for name, m in triad.items()}
+    return found if len(found) > 2 else {}
+
+
 def _beside_nominal(
-    names: Sequence[str], meanings: Mapping[str, Resemblance]
+    names: Sequence[str], units: Sequence[str], meanings: Mapping[str, Resemblance]
 ) -> dict[str, Resemblance]:
-    """Angles that the stand shows, beside those of the same name to which it was to be set: Ist beside Soll."""
-    nominal = {
-        _NOMINAL.sub("", name): m
-        for name, m in meanings.items()
-        if m.column in _ANGLES_AND_WARMTH[:3] and _NOMINAL.search(name)
+    """Angles that the stand shows, each beside one to which it was to be set: Ist beside Soll.
+
+    An inclination that a stand was set to is not the dip, whatever its name.
+    """
+    dip, inclination = (REFERENCES[name].column for name in ("dip", "inclination"))
+    nominal, shown_ones = set[str](), dict[str, dict[str, Resemblance]]()
+    for name, unit in zip(names, units, strict=True):
+        is_nominal = bool(_NOMINAL.search(name))
+        words = _NOMINAL if is_nominal else _ACTUAL
+        bare = _OF_CHANNELS.sub("", " ".join(words.sub(" ", name).split())).strip()
+        alike = meaning(bare, unit) if bare not in ("", name) else None
+        if alike and alike.column == dip:
+            alike = alike._replace(column=inclination)
+        if alike and alike.column in _ANGLES_AND_WARMTH[:3]:
+            if is_nominal:
+                nominal.add(alike.column)
+            else:
+                shown_ones.setdefault(alike.column, {})[name] = alike
+    return {
+        name: alike
+        for column, each in shown_ones.items()
+        if column in nominal and len(each) == 1
+        for name, alike in each.items()
+        if name not in meanings or meanings[name].column == dip
     }
-    shown_ones = (
-        (name, _OF_CHANNELS.sub("", _ACTUAL.sub("", name)))
-        for name in names
-        if name not in meanings
-    )
-    return {name: nominal[bare] for name, bare in shown_ones if bare != name and bare in nominal}
 
 
 def _behind_titles(
@@ -609,9 +661,8 @@ def proposed(
         FitError: columns of which each may be one of the run file's, a unit that neither name nor
             values tell, azimuths from true or grid north, no accelerometer: all that is open.
     """
-    meanings = _with_whole_vectors(meanings_of(names, units))
-    _tell_dip(meanings, values)
-    _tell_temperature(meanings, names, units, values)
+    meanings = _with_whole_vectors(meanings_of(names, units, above))
+    _tell_by_values(meanings, names, units, values)
     said, known = answers or {}, stated or {}
     _tell_numbers(meanings, values, said)
     ignored = _no_evidence(meanings, values, said, known)
@@ -758,6 +809,15 @@ def _is_whole(values: Array | None) -> bool:
     return values is not None and bool(np.all(np.isnan(values) | (values == np.round(values))))
 
 
+def _tell_by_values(
+    meanings: dict[str, Resemblance], names: Sequence[str], units: Sequence[str], values: Values
+) -> None:
+    """What names leave open and values tell: dip, temperature, a reference of each row."""
+    _tell_dip(meanings, values)
+    _tell_temperature(meanings, names, units, values)
+    _tell_references(meanings, names, units, values)
+
+
 def _tell_dip(meanings: dict[str, Resemblance], values: Values) -> None:
     """Of several inclinations the one that hardly varies is the dip, where no column is called so."""
     inclined = [n for n, m in meanings.items() if m.column == REFERENCES["inclination"].column]
@@ -798,6 +858,27 @@ def _tell_temperature(
     known = known[~is_filler(known)]
     if known.size and np.all((known >= -60) & (known <= 500)) and not is_numbering(known):
         meanings[lone[0]] = Resemblance(WARMTH)
+
+
+def _tell_references(
+    meanings: dict[str, Resemblance], names: Sequence[str], units: Sequence[str], values: Values
+) -> None:
+    """A column in whatever words that is called a reference is field or dip by its unit and its steady values."""
+    for column in (REFERENCES[name].column for name in ("field", "dip")):
+        named = [
+            (n, unit)
+            for n, unit in zip(names, units, strict=True)
+            if n not in meanings
+            and _REFERRED.search(spelled(n))
+            and not is_of_tool(n)
+            and may_be(column, n, unit, values(n))
+        ]
+        if len(named) == 1 and all(m.column != column for m in meanings.values()):
+            ((name, unit),) = named
+            bracketed = IN_BRACKETS.search(spelled(name))
+            meanings[name] = Resemblance(
+                column, unit_of(unit or (bracketed[1] if bracketed else ""))
+            )
 
 
 def _is_total(column: str, name: str, meanings: Mapping[str, Resemblance], values: Values) -> bool:

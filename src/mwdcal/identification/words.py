@@ -39,7 +39,7 @@ TRANSLATIONS = (
         "dip ",
     ),
     (
-        r"kipp(achse|winkel)|schwenkachse|\btilt\b|inclinazione|inclinatie|helling|haeldning|hældning|lutning|"
+        r"\bdevi\b|kipp(achse|winkel)|schwenkachse|\btilt\b|inclinazione|inclinatie|helling|haeldning|hældning|lutning|"
         r"(kat )?odchyleni[ae]( od pionu)?|(kat )?nachyleni[ae]|ferdeseg|dolesszog|egim|kemiringan|傾斜角?|"
         r"зен\w*\.?( угол\w*)?|"
         r"neigung(swinkel)?|desviacion|sapma( acisi)?|inklination|inclinaison|inclinaca?o|"
@@ -48,15 +48,16 @@ TRANSLATIONS = (
         "inclination ",
     ),
     (
-        r"drehtisch|turn ?table|rotary table|baring|azymut|yonelim|азимут|asimut|azimute?(?!h)|acimut|方位角?|rumbo|"
-        r"richtung(?!swinkel)|retning|peilung",
+        r"\bhazi\b|drehtisch|turn ?table|rotary table|baring|azymut|yonelim|азимут|asimut|azimute?(?!h)|acimut|方位角?|"
+        r"rumbo|richtung(?!swinkel)|retning|peilung",
         "azimuth ",
     ),
     (
-        r"rollachse|roll axis|(kat )?obrotu|"
+        r"\brb\b|^t/f\b|rollachse|roll axis|(kat )?obrotu|"
         r"\brulle?\b|rullning|rotasi|(kat )?ustawienia narzedzia|takim yuzu|szerszamallas|"
         r"gereedschapsvlak|v(ae|æ)rkt(o|ø)jsflade|faccia utensile|ツールフェ(ー|イ)ス|тулфейс|回転角|угол поворота|"
-        r"rollwinkel|roll angle|werkzeug(winkel|lage|flache)|verdrehung|verdrehwinkel|drehwinkel|rotasjon|rulle?vinkel|"
+        r"roll[vw]inkel|roll angle|"
+        r"werkzeug(winkel|lage|flache)|verdrehung|verdrehwinkel|drehwinkel|rotasjon|rulle?vinkel|"
         r"verktoy(flate|vinkel)\w*|(face|angulo) d[ae] ferramenta|(face|angle)( d[e'])? ?(l'?)?outil|"
         r"ghsf?\b|угол установки( отклонител\w*)?|визир\w*( угол)?|"
         r"angulo de giro|giro|rotacion|отклонител\w*|откл\b\.?|визирн\w* угол|поворот|工具面角?|"
@@ -105,13 +106,14 @@ TRANSLATIONS = (
     (r"код\w* ацп|ацп|отсч\w*|码值", "adc"),
     (r"мв(?![а-я])", "mV"),
     (
-        r"lampotila|teplota|درجة الحرارة|θερμοκρασια|온도|nhiet do|"
+        r"\bttmp\b|lampotila|teplota|درجة الحرارة|θερμοκρασια|온도|nhiet do|"
         r"temp-ra|темп-ра|sicaklik|homerseklet|temperatuur|suhu|pt100(0)?\b|temperatura|"
         r"temperature?n?|температура|темп\b\.?|温度",
         "temperature ",
     ),
     (
-        r"sollwerte?|sollwinkel|soll|\brig\b|referenz|referanse|referencia|stand( settings?)?|"
+        r"sollwerte?|sollwinkel|soll|\brig\b|referenz|referanse|(\b(de|di|do) )?(referencia|riferimento)|"
+        r"(\bde )?reference|stand( settings?)?|"
         r"(angulos? )?d[ae] (la )?(mesa|bancada)|эталон\w*|стенд|задан\w*|标准|参考|转台",
         "ref ",
     ),
@@ -119,7 +121,7 @@ TRANSLATIONS = (
         r"seriennummer|seriennr|serienummer|заводской номер|序列号|n(um\w*|[o°º])?\.? ?[°º]? ?de serie|serie n[°ºr]\.?",
         "serial ",
     ),
-    (r"\bgeogr\w*\.?", "true "),
+    (r"(\bgeogr\w*|географічн\w*)\.?|cografi( kuzey\w*)?", "true "),
     (r"(?<![a-z])u ?(?=[gabhm][xyz]\b)", ""),
     (r"gerat|sonde", "tool "),
     (r"(de|da) [qc]uadr[ií]cula( utm)?|gitter|kartesisch", "grid "),

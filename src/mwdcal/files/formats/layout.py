@@ -221,7 +221,7 @@ def _is_one_run(tables: Sequence[Layout]) -> bool:
     rows = [row for t in tables for row in zip(*t.texts, strict=True)]
     if not same or apart or len({*sheets}) < len(sheets) or len({*rows}) < len(rows):
         return False
-    if not all(map(_has_its_warmth, tables)):
+    if not all(map(_has_its_warmth, tables)) and not _is_warmth_above(tables):
         return False
     return all(map(_OF_SETTING.fullmatch, sheets)) or _are_numbered_on(tables)
 
@@ -234,6 +234,38 @@ def _has_its_warmth(table: Layout) -> bool:
     stated = float(match[1].replace(",", ".").replace("−", "-"))
     columns = [[float(c) for c in cells] for cells in table.cells if all(map(looks_numeric, cells))]
     return any(max(abs(value - stated) for value in cells) < _SAME_WARMTH for cells in columns)
+
+
+def _is_warmth_above(tables: Sequence[Layout]) -> bool:
+    """Whether the temperatures that sheets are named as stand above their tables, and in no column."""
+    return all(map(_states_its_warmth, tables)) and not any(map(_has_its_warmth, tables))
+
+
+def _states_its_warmth(table: Layout) -> bool:
+    """Whether a line above a table states the temperature that its sheet is named as."""
+    match = _OF_WARMTH.fullmatch(table.sheet)
+    number = re.escape(match[1].lstrip("+")) if match else ""
+    return bool(match) and any(
+        re.search(
+            rf"°\s*[cf℃]\W+{number}(?![\d.,])|(?<![\d.,]){number}\s*°\s*[cf℃]", line, re.IGNORECASE
+        )
+        for line in table.above
+    )
+
+
+def _with_stated_warmth(table: Layout) -> Layout:
+    """A table with the temperature that its sheet is named as in a column of its own."""
+    match = _OF_WARMTH.fullmatch(table.sheet)
+    assert match
+    unit = "°F" if "f" in table.sheet.lower() else "°C"
+    cells = [match[1].replace(",", ".").replace("−", "-").lstrip("+")] * len(table.lines)
+    return replace(
+        table,
+        names=[*table.names, f"Temperature of sheet ({unit})"],
+        units=[*table.units, ""],
+        cells=[*table.cells, cells],
+        texts=[*table.texts, cells],
+    )
 
 
 def _are_numbered_on(tables: Sequence[Layout]) -> bool:
@@ -250,6 +282,8 @@ def _are_numbered_on(tables: Sequence[Layout]) -> bool:
 
 def _joined_sheets(tables: Sequence[Layout]) -> Layout:
     """Tables of several sheets as one, in the order of the sheets."""
+    if _is_warmth_above(tables):
+        tables = [*map(_with_stated_warmth, tables)]
     first = tables[0]
     return replace(
         first,
@@ -428,7 +462,7 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
     """The table whose last row of names, or of units, is at a place, down to the row before `end`."""
     rows = sheet.rows
     names, units, top = _head(rows, head)
-    below = rows[_other_tool(rows, head, end) : end]
+    below = rows[_another_part(rows, head, end) : end]
     end -= len(below)
     readings = [place for place in range(head + 1, end) if _is_reading(rows[place][1])]
     kept = _without_summary([rows[place] for place in readings])
@@ -487,14 +521,14 @@ def _beside(
     return [*remarks, *(r for _, r in others if sum(map(figures.is_figure, r)) < LEAST_COLUMNS)]
 
 
-def _other_tool(rows: Sequence[tuple[int, Cells]], head: int, end: int) -> int:
-    """The place of a row below the names that states the serial of another tool, above rows of it; else the end."""
+def _another_part(rows: Sequence[tuple[int, Cells]], head: int, end: int) -> int:
+    """The place of a line below the names, above rows of another tool by its serial, or of a check; else the end."""
     ours = titles([row for _, row in rows[:head]]).metadata.get("serial")
     for place in range(head + 1, end - 1):
         row = rows[place][1]
         if _is_reading(rows[place + 1][1]) and not _is_reading(row):
             theirs = titles([row]).metadata.get("serial")
-            if theirs not in (None, ours):
+            if theirs not in (None, ours) or _OF_ROLL_TEST.search(" ".join(map(as_text, row))):
                 return place
     return end
 

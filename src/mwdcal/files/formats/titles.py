@@ -55,6 +55,7 @@ OF_REFUSAL = (
     r"strøket|stroket|feilmaling|"
     r"ikke (ok|bruk|brukes)|rechazad[oa]|invalid[oa]|descartad[oa]|anulad[oa]|no (ok|usar|valid[oa])|mal[oa]?|"
     r"rejeitad[oa]|ruim|nao (ok|usar)|rejete?e?|mauvaise?|annulee?|ecarte|non ok|брак|забракован[оа]?|отбракован[оа]?|"
+    r"a rejeter|not used|unused|odrzucon[aey]|scartat[aeio]|ongeldig|afgekeurd|無効|除外|"
     r"плохо|плохая|не ?год(ен|на|но)|недейств\w*|исключ\w*|не использовать|отклонен[оа]?|не ок|"
     r"作废|剔除|无效|废弃|舍弃|弃用|不可用|坏点?|不合格"
 )
