@@ -318,6 +318,7 @@ def test_components_ranges_and_corrections_are_no_references(line):
     assert stated_above([[line]]).metadata == {}
 
 
+@pytest.mark.parametrize(
     ("name", "words"),
     [("Type", ("CAL", "VER")), ("Status", ("OK", "CHECK")), ("Art", ("", "Prüfung"))],
 )

@@ -237,10 +237,10 @@ def _belong_together(before: re.Match[str], behind: re.Match[str], labelled: boo
     thousands = len(before["digits"]) <= 3 and len(behind["digits"]) == 3
     if behind["point"] and not thousands:
         return False
-    told = re.search(r"[^\W\d_]", before["words"]) or re.match(
+    labels = re.search(r"[^\W\d_]", before["words"]) or re.match(
         rf"\s*(?:{_WRITTEN_UNIT})", _plain(behind["text"])
     )
-    return bool(told) or (thousands and labelled)
+    return bool(labels) or (thousands and labelled)
 
 
 def references_in(rows: Rows, besides: Rows = ()) -> dict[str, float]:

@@ -112,13 +112,13 @@ _ENGLISH_DATE = re.compile(
 _TRUE_NORTH = re.compile(
     r"true\s+north|geographic north|nord géographique|rechtweisend", re.IGNORECASE
 )
-_TURN = (
+_TURN_EAST = (
     r"(?:\s*\((?P<note>[^)]*)\))?[^\w+−-]*(?P<degrees>[+−-]?\d+[.,]?\d*)\s*(?:°|deg\w*)?"
     r"(?:\s*(?P<minutes>\d+(?:[.,]\d+)?)\s*(?:['′’]|min\w*))?\s*\(?(?P<sense>[EWO](?!\s*[+(])|west|зап|vest|oest)?"
 )
 _DECLINATION = re.compile(
     r"((?:decl|dekl|décl)\w*|misvisning|склонени\w*|схилення|偏角|manyetik sapma|odchylenie magn\w*)"
-    + _TURN,
+    + _TURN_EAST,
     re.IGNORECASE,
 )
 _WEST_POSITIVE = re.compile(r"\b(w|west|ouest|oeste?|vest|зап\w*)\b\W*(\+|pos)", re.IGNORECASE)
@@ -126,7 +126,8 @@ _WEST_POSITIVE = re.compile(r"\b(w|west|ouest|oeste?|vest|зап\w*)\b\W*(\+|pos
 _WEST = re.compile(r"\W*(deg\w*)?\W*(w|west|ouest|oeste?|vest|зап\w*)\W*", re.IGNORECASE)
 """The whole of such brackets: (W), (° west)."""
 _CONVERGENCE = re.compile(
-    r"(convergence|konvergenz|meridiankonvergens|convergencia|сближение меридианов|收敛角)" + _TURN,
+    r"(convergence|konvergenz|meridiankonvergens|convergencia|сближение меридианов|收敛角)"
+    + _TURN_EAST,
     re.IGNORECASE,
 )
 _SPECIAL_LETTERS = str.maketrans({"ø": "o", "Ø": "O", "ß": "ss", "º": "", "ª": "", "°": ""})
