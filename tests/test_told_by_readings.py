@@ -29,6 +29,9 @@ WORDS = (
     [["Магнітна індукція, нТл", 50123, "", "Магнітне нахилення, °", 66.12, "", "g, м/с²", 9.8123]],
     [["Feldstärke 501.23 mG", "Inkl. 66°07'12\"", "Erdschwere 9,8123 m/s²"]],
 )  # fmt: skip
+GAMMAS = (
+    ["Intensidad del campo", "50 123 gamma"], ["Mag field (kγ)", 50.123], ["Field", "50123 gammas"], ["F (γ)", 50123],
+)  # fmt: skip
 NO_PLACE = (
     "Horizontal intensity 20123 nT", "Bias field 20000 nT", "Coil field: 25000 nT", "field 50120 nT, end 50131 nT",
     "Mean field measured 50123 nT", "sensitivity 20000 nT/V", "Total field (uT) 50630", "dip 97.2", "Gravity 1.0123 g",
@@ -40,6 +43,20 @@ def test_references_of_a_place_are_told_by_unit_and_size_in_whatever_words(rows)
     stated = references_in(rows)
     expected = {"ref_field_nt": FIELD, "ref_dip_deg": DIP, "ref_gravity_g": GRAVITY}
     assert stated == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("row", GAMMAS)
+def test_a_gamma_is_a_nanotesla(row):
+    assert references_in([row]) == {"ref_field_nt": pytest.approx(FIELD, rel=1e-12)}
+    assert references_in([["Gamma ray probe 20311"], ["Serial 20311 gamma ray"]]) == {}
+
+
+def test_the_dip_of_a_hole_is_its_inclination_from_the_horizontal(tmp_path):
+    columns = table()
+    columns["Hole dip (deg)"] = np.asarray(columns.pop("Inc (deg)")) - 90
+    path = written(tmp_path / "a.csv", columns)
+    inclination = np.asarray(servo_run()["ref_inclination_deg"])
+    assert reference(path, "inclination") == pytest.approx(inclination)
 
 
 @pytest.mark.parametrize("line", NO_PLACE)

@@ -28,7 +28,7 @@ _SPELLINGS = {
     "K": "k kelvin",
     "g": "g",
     "mg": "millig mg",
-    "m/s²": "mss",
+    "m/s²": "mss mps",
     "gal": "gal gals",
     "mGal": "mgal",
     "nT": "nt gamma",

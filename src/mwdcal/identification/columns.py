@@ -497,20 +497,20 @@ def meanings_of(
 def _by_legend(names: Sequence[str], above: Sequence[str]) -> dict[str, Resemblance]:
     """What columns hold by a line that says so of three or more: CH1 = Gx; CH2 = Gy; CH3 = Gz, mg."""
     every = "|".join(map(re.escape, sorted(names, key=len, reverse=True)))
-    seen: dict[str, Resemblance] = {}
+    results: dict[str, Resemblance] = {}
     for line in above:
         _, *parts = re.split(rf"(?<!\w)({every})\s*=\s*", line)
         for name, text in zip(parts[::2], parts[1::2], strict=True):
             words, _, unit = text.strip(' ,;"').rpartition(", ")
             alike = meaning(words, unit) if words and unit_of(unit) else meaning(words or unit)
             if alike:
-                seen[name] = alike
+                results[name] = alike
     for channels in CHANNELS.values():
-        triad = {name: m for name, m in seen.items() if m.column in channels}
+        triad = {name: m for name, m in results.items() if m.column in channels}
         stated = {m.unit for m in triad.values() if m.unit}
         if len(stated) == 1:
-            seen |= {name: m._replace(unit=min(stated)) for name, m in triad.items()}
-    return seen if len(seen) > 2 else {}
+            results |= {name: m._replace(unit=min(stated)) for name, m in triad.items()}
+    return results if len(results) > 2 else {}
 
 
 def _beside_nominal(
@@ -526,6 +526,7 @@ def _beside_nominal(
         is_nominal = bool(_NOMINAL.search(name))
         words = _NOMINAL if is_nominal else _ACTUAL
         bare = _OF_CHANNELS.sub("", " ".join(words.sub(" ", name).split())).strip()
+        bare = re.sub(r"^\([^)]*\)\s*", "", bare)
         alike = meaning(bare, unit) if bare not in ("", name) else None
         if alike and alike.column == dip:
             alike = alike._replace(column=inclination)
