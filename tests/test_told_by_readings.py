@@ -120,7 +120,7 @@ def rounded(step, seed=4):
 
 SET_AND_READ = (
     ("Soll", "Ist"), ("Soll", "actual"), ("Target", "Encoder"), ("Set", "Read"), ("Nom", "Act"),
-    ("consigne", "mesurée"), ("comandada", "medida (banco)"), ("zadane", "zmierzone"), 
+    ("consigne", "mesurée"), ("comandada", "medida (banco)"), ("zadane", "zmierzone"),
     ("börvärde", "ärvärde"), ("指令値", "実測値"),
 )  # fmt: skip
 
