@@ -397,3 +397,15 @@ def test_sheets_of_one_temperature_each_are_one_run_with_the_temperature_above_t
             sheet.append([float(columns[n][row]) for n in names])
     book.save(tmp_path / "a.xlsx")
     assert {*read(tmp_path / "a.xlsx").temperature} == {25.0, 85.0}
+
+
+def test_an_angle_that_was_set_beside_one_that_was_measured_is_asked_about(tmp_path):
+    """The stand or the tool may have measured it: nothing but the laboratory knows."""
+    columns = {("Set " + n if n == "Inc (deg)" else n): v for n, v in table().items()}
+    columns["Measured Inc (deg)"] = [x + 0.1 for x in columns["Set Inc (deg)"]]
+    path = written(tmp_path / "a.csv", columns)
+    stated = refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
+    assert "Set Inc (deg)" in stated
+    assert "Measured Inc (deg)" in stated
+    answer = ("--column", "ref_inclination_deg=Measured Inc (deg)")
+    assert mwdcal("profile", path, "-o", tmp_path / "t.toml", *answer).code == 0

@@ -684,7 +684,7 @@ def proposed(
         questions.ask(_check_triads, names, values, chosen, source)
     questions.ask(_check_units_of_triads, chosen, source)
     questions.ask(
-        _check_nominal, {c: e for c, e in chosen.items() if c not in said}, values, source
+        _check_nominal, {c: e for c, e in chosen.items() if c not in said}, names, values, source
     )
     beside = any("side by side" in each.text for each in questions)
     if not beside and not {*RAW[3:]} & {*chosen, *said}:
@@ -1067,8 +1067,10 @@ def _check_units_of_triads(chosen: Mapping[str, ColumnSource], source: str) -> N
             )
 
 
-def _check_nominal(chosen: Mapping[str, ColumnSource], values: Values, source: str) -> None:
-    """Ask about an angle that the stand was to be set to, among others that it shows."""
+def _check_nominal(
+    chosen: Mapping[str, ColumnSource], names: Sequence[str], values: Values, source: str
+) -> None:
+    """Ask about an angle that the stand was to be set to, among others that it shows or beside one that is measured."""
     angles = {c: chosen[c].name for c in _ANGLES_AND_WARMTH[:3] if c in chosen}
     shows = [n for n in angles.values() if _ACTUAL.search(n) and not _NOMINAL.search(n)]
     for column, name in angles.items():
@@ -1078,6 +1080,20 @@ def _check_nominal(chosen: Mapping[str, ColumnSource], values: Values, source: s
                 f"there no column of what it shows as '{column}'?",
                 candidates_for(column, [name], values),
             )
+        beside = [n for n in names if _NOMINAL.search(name) and _is_measured(n, column)]
+        if beside:
+            raise QuestionError(
+                f"{source}: {shown(name)} is what the stand was to be set to. Did the stand measure "
+                f"{shown(beside[0])}, or the tool? Which one is '{column}'?",
+                candidates_for(column, [name, *beside], values),
+            )
+
+
+def _is_measured(name: str, column: str) -> bool:
+    """Whether a column is an angle that something measured, the stand or the tool itself: Measured Inc."""
+    bare = " ".join(_OF_CHANNELS.sub(" ", name).split())
+    alike = meaning(bare, "") if bare != name else None
+    return alike is not None and alike.column == column
 
 
 def _check_north(name: str, above: Sequence[str], source: str) -> None:
