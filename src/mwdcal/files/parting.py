@@ -10,15 +10,16 @@ from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.table import Table, labels
 from mwdcal.files.statements import rows_of
 
-_OF_CHECKS = (
+_OF_CHECKS = re.compile(
     r"ver(if(y|ication|iziert)?)?|verifikation|check|validation|control|kontrolle|pr(ue|ü)fung|kontroll|"
     r"verificaci[oó]n|verifica[cç][aã]o|проверка|поверка|контроль|验证|检验"
 )
 _BEHIND = r"[\s_-]*(run|shot|station|row|test|\d*)\W*"
-_CHECK = re.compile(rf"\W*({_OF_CHECKS}){_BEHIND}", re.IGNORECASE)
+_CHECK = re.compile(rf"\W*({_OF_CHECKS.pattern}){_BEHIND}", re.IGNORECASE)
 """A cell of a row that is to check a calibration, and is no part of it."""
 _ROLL_TEST = re.compile(
-    rf"\W*(roll([\s_-]*(test|over|check|set))|rt|rollpr(ue|ü)fung|rulletest|prueba( de giro)?|{_OF_CHECKS}){_BEHIND}",
+    rf"\W*(roll([\s_-]*(test|over|check|set))|rt|rollpr(ue|ü)fung|rulletest|prueba( de giro)?|"
+    rf"{_OF_CHECKS.pattern}){_BEHIND}",
     re.IGNORECASE,
 )
 """Names of the roll test, in a cell or as the name of a column."""

@@ -245,12 +245,10 @@ def _states_its_warmth(table: Layout) -> bool:
     """Whether a line above a table states the temperature that its sheet is named as."""
     match = _OF_WARMTH.fullmatch(table.sheet)
     number = re.escape(match[1].lstrip("+")) if match else ""
-    return bool(match) and any(
-        re.search(
-            rf"°\s*[cf℃]\W+{number}(?![\d.,])|(?<![\d.,]){number}\s*°\s*[cf℃]", line, re.IGNORECASE
-        )
-        for line in table.above
+    stated = re.compile(
+        rf"°\s*[cf℃]\W+{number}(?![\d.,])|(?<![\d.,]){number}\s*°\s*[cf℃]", re.IGNORECASE
     )
+    return bool(match) and any(map(stated.search, table.above))
 
 
 def _with_stated_warmth(table: Layout) -> Layout:
