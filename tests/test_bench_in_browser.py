@@ -80,7 +80,7 @@ class Operator:
             raise AssertionError(self.page.inner_text("body")) from None
 
     def look(self):
-        """What axe-core complains of, and what does not fit in, at each width and scheme."""
+        """Faults by axe-core and pages wider than the screen, at each width and scheme."""
         faults = []
         for width, scheme in VIEWS:
             self.page.set_viewport_size({"width": width, "height": 900})

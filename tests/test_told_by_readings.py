@@ -1,5 +1,4 @@
-"""What the readings of a table tell where its words do not: units, angles, north, the stand's columns; and references
-of a place in whatever words.
+"""Units, angles, north and columns of the stand that are found from the readings, and references in unusual words.
 
 Expected values are those of the simulated run, rewritten as another laboratory would have it.
 """

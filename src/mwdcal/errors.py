@@ -39,6 +39,12 @@ class Answer(NamedTuple):
     arguments: tuple[tuple[str, str], ...]
     numbers: tuple[str, ...] = ()
 
+    @property
+    def options(self) -> str:
+        """The arguments with their values, ready to be pasted into a command."""
+        every = (*self.arguments, *((name, "NUMBER") for name in self.numbers))
+        return " ".join(f"`{argument}` {_quoted(value)}" for argument, value in every)
+
 
 class QuestionError(FitError):
     """Something that the data leave open, with the answers that there are; the first is what is believed."""
@@ -51,13 +57,7 @@ class QuestionError(FitError):
 
 def _said_by(answers: Sequence[Answer]) -> str:
     """How answers are given, the first few, ready to be pasted."""
-    each = [
-        " ".join(
-            f"`{argument}` {_quoted(value)}"
-            for argument, value in (*answer.arguments, *((n, "NUMBER") for n in answer.numbers))
-        )
-        for answer in answers[:_MOST_NAMED]
-    ]
+    each = [answer.options for answer in answers[:_MOST_NAMED]]
     more = f" or {len(answers) - len(each)} others" if len(answers) > len(each) else ""
     return f" Answer by {' or '.join(each)}{more}." if each else ""
 

@@ -180,10 +180,7 @@ class Command(click.Command):
         needed = {name for answer in error.answers for name, _ in answer.arguments}
         if needed <= options:
             return str(error)
-        first = " ".join(
-            f"--{name.replace('_', '-')} {value}" for name, value in error.answers[0].arguments
-        )
-        remedy = f"mwdcal profile TABLE {first} -o TOOL.toml"
+        remedy = f"mwdcal profile TABLE {error.answers[0].options} -o TOOL.toml"
         return f"{error.text} Say it in a profile ({remedy}), and give `tool` TOOL.toml."
 
 

@@ -257,7 +257,7 @@ def _order_text(session: BenchSession) -> str:
 
 
 def after_failure(failure: Failure, advice: str) -> str:
-    """What to do after a failed roll test: the stations to look at first, with an `advice`, or what is missing."""
+    """The next step after a failed roll test: `advice` with the stations farthest off, or why none is named."""
     t, labels = texts(), [*failure.stations]
     if not labels:
         return t["next_missing"].format(reason=failure.missing)

@@ -40,6 +40,8 @@ STATIONS_PER_TERM = 4
 """Fewest stations for each cosine."""
 LEAST_TREND = 0.2
 """A trend does not show where residuals keep less than this share of its information."""
+LEAST_KEPT = 1e-6
+"""Share of the information about a trend that is more than rounding."""
 LEAST_WALK = 1e-3
 """A walk over the run is at least this share of the noise of a reading: a smaller one does not count."""
 FEWEST_USED = 2.0
@@ -123,10 +125,6 @@ def noise(problem: Problem) -> dict[str, Array]:
     """Noise (B,) of a reading of the triad that each walk acts on."""
     each = [np.sqrt(np.mean(triad.sd**2, (1, 2))) for triad in problem.triads]
     return dict(zip(WALKS, [*each, *each[1:]], strict=False))
-
-
-LEAST_KEPT = 1e-6
-"""Share of the information about a trend that is more than rounding."""
 
 
 @dataclass(frozen=True)

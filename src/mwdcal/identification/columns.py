@@ -466,7 +466,7 @@ def _without_title(name: str) -> Resemblance | None:
 def meanings_of(
     names: Sequence[str], units: Sequence[str], above: Sequence[str] = ()
 ) -> dict[str, Resemblance]:
-    """What columns hold by their names, those of the others considered, and by the lines above them.
+    """The meaning of each column, by its name, the names of the others and the lines above them.
 
     Channels may be numbered: G1, G2, G3. `AZ` without `AX` and `AY` is the azimuth. Inklination is the dip where
     there is a Neigung.
@@ -495,7 +495,7 @@ def meanings_of(
 
 
 def _by_legend(names: Sequence[str], above: Sequence[str]) -> dict[str, Resemblance]:
-    """What columns hold by a line that says so of three or more: CH1 = Gx; CH2 = Gy; CH3 = Gz, mg."""
+    """The meaning of columns by a legend of three or more in one line: CH1 = Gx; CH2 = Gy; CH3 = Gz, mg."""
     every = "|".join(map(re.escape, sorted(names, key=len, reverse=True)))
     results: dict[str, Resemblance] = {}
     for line in above:
@@ -813,7 +813,7 @@ def _is_whole(values: Array | None) -> bool:
 def _tell_by_values(
     meanings: dict[str, Resemblance], names: Sequence[str], units: Sequence[str], values: Values
 ) -> None:
-    """What names leave open and values tell: dip, temperature, a reference of each row."""
+    """Add the dip, the temperature and references of each row that values show where names do not."""
     _tell_dip(meanings, values)
     _tell_temperature(meanings, names, units, values)
     _tell_references(meanings, names, units, values)
@@ -922,7 +922,7 @@ def _is_dip_of(column: str, name: str, meanings: Mapping[str, Resemblance], valu
 
 def _check_lacking(column: str, others: Mapping[str, str], values: Values, source: str) -> None:
     """Ask whether columns that are not understood are one that is absent, by a mistyped name or by unit and values."""
-    numbers = {n: values(n) for n in others if not _MEASURED.search(spelled(n))}
+    numbers = {n: values(n) for n in others if not is_of_tool(n)}
     near = [n for n, cells in numbers.items() if cells is not None and is_near(column, n)]
     by_values = column not in BY_NAME_ALONE
     fits = near + [
@@ -1105,18 +1105,21 @@ def _check_north(name: str, above: Sequence[str], source: str) -> None:
         return
     said = f"by the line {shown(line)}" if line else "by its name"
     grid = bool(_GRID_NORTH.search(f"{line or name} {spelled(name)}"))
+    raise QuestionError(
+        f"{source}: {shown(name)} counts from true or grid north {said}, and the readings from magnetic north. "
+        "Which is it, and what is the declination, degrees east?",
+        answers_of_north(grid),
+    )
+
+
+def answers_of_north(grid: bool = False) -> list[Answer]:
+    """The norths that azimuths may count from, where it is not magnetic by its name or the readings; `grid` first."""
     norths = [
         Answer("true north", (("north", "true"),), ("declination_deg",)),
         Answer("grid north", (("north", "grid"),), ("declination_deg", "convergence_deg")),
     ]
-    raise QuestionError(
-        f"{source}: {shown(name)} counts from true or grid north {said}, and the readings from magnetic north. "
-        "Which is it, and what is the declination, degrees east?",
-        [
-            *(norths[::-1] if grid else norths),
-            Answer("magnetic north after all", (("north", "magnetic"),)),
-        ],
-    )
+    norths = norths[::-1] if grid else norths
+    return [*norths, Answer("magnetic north after all", (("north", "magnetic"),))]
 
 
 def north_of(name: str, above: Sequence[str], stated: Mapping[str, object]) -> str:
@@ -1135,7 +1138,7 @@ def _one(column: str, candidates: Sequence[str], values: Values, source: str) ->
     if column in candidates:
         return column
     if column == WARMTH:
-        of_tool = [n for n in candidates if not _SURROUNDINGS.search(n)] or candidates
+        of_tool = [n for n in candidates if not is_of_surroundings(n)] or candidates
         candidates = [n for n in of_tool if not _CALLED_REFERENCE.search(spelled(n))] or of_tool
     stated = [name for name in candidates if _CALLED_REFERENCE.search(spelled(name))]
     shows = [name for name in candidates if _ACTUAL.search(name) and not _NOMINAL.search(name)]

@@ -41,6 +41,7 @@ from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW, FACTORS, WARMTH
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
 from mwdcal.identification.columns import (
+    answers_of_north,
     in_units,
     is_filler,
     is_of_surroundings,
@@ -401,8 +402,9 @@ def _proposal(
     table = _of_one_tool(table, columns, stated)
     profile = Profile(name=Path(path).stem, table=form or msgspec.UNSET, columns=columns)
     profile, readings, wirings, open_axes = _wired_by_elevation(table, profile)
-    _check_gons(table, profile, readings, wirings, answers)
-    _check_twins(table, profile, readings, wirings, answers)
+    angles = _open_angles(profile, answers)
+    _check_gons(table, angles, readings, wirings)
+    _check_twins(table, angles, columns, readings, wirings)
     _check_magnetic(table, readings, wirings, columns)
     _check_repeats(table, columns, form or TableFormat())
     name, triads = str(readings.metadata.get("serial", Path(path).stem)), _triads(readings, wirings)
@@ -656,20 +658,27 @@ def _wired_by_elevation(
     return _wired(table, msgspec.structs.replace(profile, columns=below))
 
 
-def _check_gons(
-    table: Table,
-    profile: Profile,
-    readings: Readings,
-    wirings: Mapping[str, Wiring],
-    answers: Collection[str],
-) -> None:
-    """Ask about an angle of the stand in degrees that the readings fit far better in gons, or the other way."""
+def _open_angles(profile: Profile, answers: Collection[str]) -> dict[str, ColumnSource]:
+    """The angles of the stand in degrees or gons, but for those that the user has named."""
     columns = profile.columns
     assert not isinstance(columns, msgspec.UnsetType)
-    for column in ANGLES_OF_STAND:
-        source = columns.get(column)
-        if not source or source.unit not in ("", "°", "gon") or column in answers:
-            continue
+    return {
+        column: source
+        for column in ANGLES_OF_STAND
+        if column not in answers
+        and (source := columns.get(column))
+        and source.unit in ("", "°", "gon")
+    }
+
+
+def _check_gons(
+    table: Table,
+    of_stand: Mapping[str, ColumnSource],
+    readings: Readings,
+    wirings: Mapping[str, Wiring],
+) -> None:
+    """Ask about an angle of the stand in degrees that the readings fit far better in gons, or the other way."""
+    for column, source in of_stand.items():
         units = ["°", "gon"] if source.unit == "gon" else ["gon", "°"]
         angles = numbers(table, source.name)
         left = [
@@ -690,37 +699,30 @@ _FAR_BETTER = 0.5
 
 def _check_twins(
     table: Table,
-    profile: Profile,
+    of_stand: Mapping[str, ColumnSource],
+    columns: Mapping[str, ColumnSource],
     readings: Readings,
     wirings: Mapping[str, Wiring],
-    answers: Collection[str],
 ) -> None:
     """Ask about an angle of the stand beside which another column tells the same and fits the readings far better.
 
     One may be what the stand was set to, the other what it shows. A column that is called measured or computed is
     the tool's.
     """
-    columns = profile.columns
-    assert not isinstance(columns, msgspec.UnsetType)
     used = {source.name for source in columns.values()}
     numbered = {n: v for n in table.columns if (v := _plain_numbers(table, n)) is not None}
     tried: dict[str, list[str]] = {}
-    for column in ANGLES_OF_STAND:
-        source = columns.get(column)
-        if (
-            source
-            and column not in answers
-            and source.unit in ("", "°")
-            and source.name in numbered
-        ):
-            twins = [
-                n
-                for n, v in numbered.items()
-                if n not in used
-                and not is_of_tool(n)
-                and _alike(v - numbered[source.name]) > _ONE_ANGLE
-            ]
-            tried[column] = [source.name, *twins][:_MOST_TWINS]
+    for column, source in of_stand.items():
+        if source.unit == "gon" or source.name not in numbered:
+            continue
+        twins = [
+            n
+            for n, v in numbered.items()
+            if n not in used
+            and not is_of_tool(n)
+            and _alike(v - numbered[source.name]) > _ONE_ANGLE
+        ]
+        tried[column] = [source.name, *twins][:_MOST_TWINS]
     if not wirings or all(len(each) < 2 for each in tried.values()):
         return
     left = {
@@ -754,7 +756,7 @@ def _plain_numbers(table: Table, name: str) -> Array | None:
 
 
 def _left(readings: Readings, wirings: Mapping[str, Wiring], angles: Mapping[str, Array]) -> float:
-    """What angles of the stand leave of the readings of a triad, with any offsets and gains of its axes, as a share.
+    """The share of a triad's readings that angles of the stand leave, with any offsets and gains of its axes.
 
     Offsets and gains may change with temperature.
     """
@@ -819,11 +821,7 @@ def _check_magnetic(
     raise QuestionError(
         f"{table.source}: by the readings magnetic north is at {seen:.1f}° of {shown(azimuth.name)}. From which north "
         "does it count, and what is the declination, degrees east?",
-        [
-            Answer("true north", (("north", "true"),), ("declination_deg",)),
-            Answer("grid north", (("north", "grid"),), ("declination_deg", "convergence_deg")),
-            Answer("magnetic north after all", (("north", "magnetic"),)),
-        ],
+        answers_of_north(),
     )
 
 

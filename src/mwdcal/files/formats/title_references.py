@@ -200,7 +200,7 @@ _SPELT = {
 
 
 def stated_above(rows: Sequence[Sequence[object]], besides: Rows = ()) -> Titles:
-    """What rows above a table say of the tool, the day and the place, as metadata; `besides` of the place alone."""
+    """Metadata on tool, day and place from the rows above a table, and on the place from the lines `besides` it."""
     rows = [_unsplit(row) for row in rows]
     block = titles(rows)
     references = references_in(rows, besides)

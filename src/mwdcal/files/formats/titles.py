@@ -166,12 +166,11 @@ def titles(rows: Sequence[Sequence[object]]) -> Titles:
         declination = _rotation(_DECLINATION, text) if declination is None else declination
         convergence = _rotation(_CONVERGENCE, text) if convergence is None else convergence
         true = true or bool(_TRUE_NORTH.search(text))
+        marked = _marked_in(" ; ".join(whole)) or _BEHIND_MODEL.findall(text)
         for place, cell in enumerate(cells):
             key, value = _pair(cell, cells[place + 1 :])
             days |= dict.fromkeys(filter(None, [day_of(cell)]))
-            marked = _marked_in(" ; ".join(whole)) or _BEHIND_MODEL.findall(text)
-            marked = marked or [_tool(cell, cells[place + 1 :])]
-            tools |= dict.fromkeys(filter(None, marked))
+            tools |= dict.fromkeys(filter(None, marked or [_tool(cell, cells[place + 1 :])]))
             if not value or key in metadata:
                 continue
             if key == "date":
