@@ -40,10 +40,12 @@ class Answer(NamedTuple):
     numbers: tuple[str, ...] = ()
 
     @property
-    def options(self) -> str:
-        """The arguments with their values, ready to be pasted into a command."""
-        every = (*self.arguments, *((name, "NUMBER") for name in self.numbers))
-        return " ".join(f"`{argument}` {_quoted(value)}" for argument, value in every)
+    def typed(self) -> list[tuple[str, str]]:
+        """The arguments with their values as a shell takes them; NUMBER for a number that has to be added."""
+        return [
+            *((n, _quoted(v)) for n, v in self.arguments),
+            *((n, "NUMBER") for n in self.numbers),
+        ]
 
 
 class QuestionError(FitError):
@@ -57,7 +59,10 @@ class QuestionError(FitError):
 
 def _said_by(answers: Sequence[Answer]) -> str:
     """How answers are given, the first few, ready to be pasted."""
-    each = [answer.options for answer in answers[:_MOST_NAMED]]
+    each = [
+        " ".join(f"`{name}` {value}" for name, value in answer.typed)
+        for answer in answers[:_MOST_NAMED]
+    ]
     more = f" or {len(answers) - len(each)} others" if len(answers) > len(each) else ""
     return f" Answer by {' or '.join(each)}{more}." if each else ""
 

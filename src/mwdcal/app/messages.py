@@ -180,7 +180,8 @@ class Command(click.Command):
         needed = {name for answer in error.answers for name, _ in answer.arguments}
         if needed <= options:
             return str(error)
-        remedy = f"mwdcal profile TABLE {error.answers[0].options} -o TOOL.toml"
+        first = " ".join(f"--{n.replace('_', '-')} {value}" for n, value in error.answers[0].typed)
+        remedy = f"mwdcal profile TABLE {first} -o TOOL.toml"
         return f"{error.text} Say it in a profile ({remedy}), and give `tool` TOOL.toml."
 
 
