@@ -70,9 +70,13 @@ LINES = {name: (name, *arguments) for name, arguments in COMMANDS.items()} | {
 }
 
 
-@functools.cache
 def shown(encoding, *arguments):
-    """Exit status, stdout and stderr of a command, in streams of an encoding."""
+    """Exit status, stdout and stderr of a command, in streams of an encoding, at the width that is set."""
+    return shown_at(os.environ.get("COLUMNS"), encoding, *arguments)
+
+
+@functools.cache
+def shown_at(_width, encoding, *arguments):
     out, err = (io.TextIOWrapper(io.BytesIO(), encoding, newline="\n") for _ in range(2))
     with redirect_stdout(out), redirect_stderr(err), pytest.raises(SystemExit) as stop:
         cli.main(list(arguments))
