@@ -280,7 +280,7 @@ def _refitted_anyhow(result: Fit, problem: Problem, state: State, options: Optio
 def _refined(result: Fit, problem: Problem, state: State, options: Options) -> Fit:
     """The same on a stand of known angles; by the method's minimiser where not all directions are determined."""
     there = uncertain_stand.refined(problem, state)
-    analysis = uncertain_stand.analysed(problem, there.state, there.determined)
+    analysis = uncertain_stand.analysis_of(problem, there)
     good = there.good & analysis.finite & (result.status != int(Status.NOT_FINITE))
     status, steps = (
         np.where(good, int(Status.OK), int(Status.NOT_FINITE)),
@@ -365,7 +365,7 @@ def _on_stand(problem: Problem, finite: Bools) -> tuple[Fit, Bools]:
     """The fit on a stand of known angles, and for which members (B,) it holds: all directions are determined."""
     there = uncertain_stand.solution(problem)
     problem = _rescaled(problem, there.scale)
-    analysis = uncertain_stand.analysed(problem, there.state, there.determined)
+    analysis = uncertain_stand.analysis_of(problem, there)
     good = there.good & finite & analysis.finite
     status = np.where(good, int(Status.OK), int(Status.NOT_FINITE))
     trust = np.ones(problem.evidence.include.shape)

@@ -58,9 +58,7 @@ DISPUTED_CHANCE = 0.01
 EVERY_PARAMETER = 12
 """Parameters of a triad that are all fitted."""
 TOGETHER = 320
-"""Most fits whose drifts are fitted together: few enough for the cache…"""
-ON_A_STAND = 64
-"""…and on an uncertain stand, where a fit takes several times the memory."""
+"""Most fits whose drifts are fitted together: few enough for the cache."""
 WRONG_DIP, WRONG_CHANCE = np.radians(0.25), 1e-12
 """A dip that is off by more, where noise looks so less often, is a wrong reference: no field turns so far in a run."""
 REDUNDANCY = 36.0
@@ -220,9 +218,8 @@ def with_drifts(fits: Iterable[tuple[Ints, Fit]], options: Options) -> Iterator[
                 yield tools[places], _whole(part, options)
     for (triads, _), parts in waiting.items():
         tools, whole = (join(each) for each in zip(*parts, strict=True))
-        size = TOGETHER if whole.analysis.squares is None else ON_A_STAND
-        for first in range(0, len(tools), size):
-            some = slice(first, first + size)
+        for first in range(0, len(tools), TOGETHER):
+            some = slice(first, first + TOGETHER)
             with_walks = with_drift(take(whole, some), options, np.array(triads))
             yield tools[some], _whole(with_walks, options)
 

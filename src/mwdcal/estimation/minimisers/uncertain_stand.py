@@ -27,7 +27,7 @@ from mwdcal.estimation.minimisers.closed_form import AffineMinimum
 from mwdcal.estimation.problem import WALK_AXES, WALKS, Problem, State
 from mwdcal.estimation.solvers import Determined
 from mwdcal.estimation.uncertainty import Analysis, effects_of, variance_factors
-from mwdcal.geometry.vectors import Array, Bools, Ints, inverse, quotient
+from mwdcal.geometry.vectors import Array, Bools, Ints, inverse, inverse_of_positive, quotient
 from mwdcal.sensor.models import Polynomial, affine_parts
 
 # --------------------------------------------------------------------------
@@ -452,7 +452,7 @@ class StandLinear:
         taken = alone @ data.across
         rest = data.drifts - data.across.mT @ taken
         np.einsum("bii->bi", rest)[...] += self.precision
-        return alone, taken, inverse(rest)
+        return alone, taken, inverse_of_positive(rest)
 
     @cached_property
     def covariance(self) -> Blocks:
@@ -517,6 +517,13 @@ class StandLinear:
         """Readings (6, B, n) less those explained by a step (B, u)."""
         return np.asarray(self.left - self.columns.change(step))
 
+    def moved(self, step: Array) -> StandLinear:
+        """The same after a step (B, u) that changes nothing but what is left of the readings."""
+        moved = replace(self)
+        left, value = self.after(step), self.value + step[:, OF_PARAMETERS:]
+        vars(moved).update(vars(self) | {"left": left, "value": value})
+        return moved
+
     def _along(self, values: Array) -> Array:
         """Pᵀ times values (6, B, n)."""
         return np.asarray(np.einsum("ik...,i...->k...", self.halves, values))
@@ -553,8 +560,8 @@ MOST_STAND_STEPS = 12
 """Most steps of a fit: a member that has not settled then goes the general way."""
 STEPS_ALIKE = 4
 """First steps that are taken by one covariance; those of members that have not settled have their own."""
-LEAST_SQUARE = 1e-10
-"""Square of the last step, in standard uncertainties."""
+LEAST_SQUARE = 1e-4
+"""Square of the last step but one, in standard uncertainties: each comes several hundred times closer."""
 LEAST_NOISE_CHANGE = 1e-5
 """Largest last change of the noise, as a share."""
 LEAST_SECANT = 1e-9
@@ -601,10 +608,11 @@ def _have_common_terms(problem: Problem) -> bool:
 class Solution:
     """Where the fits have come to: state, the noise over that of the problem (B, t), the minima, and steps.
 
-    `good` (B,): the members that have settled with all directions clearly determined.
+    `good` (B,): the members that have settled with all directions clearly determined. `linear`: the runs there.
     """
 
     state: State
+    linear: StandLinear
     scale: Array
     determined: Determined
     steps: Ints
@@ -622,10 +630,11 @@ def solution(problem: Problem) -> Solution:
     stand, scale = StandRuns.of(problem), _first_noise(problem, first)
     start = _Turn(stand, forward, at.errors.mT, at.constants, scale, 0 * scale, 0 * scale)
     there, steps, settled = _settled(start, estimated, good)
+    there, here = there.last()
     state, determined = _ended(problem, there, first, at)
     good &= settled & np.isfinite(state.params).all(-1) & np.isfinite(there.scale).all(-1)
     good &= np.all((there.scale * stand.noise_share > LEAST_OF_SIGNAL) | ~estimated, -1)
-    return Solution(state, there.scale, determined, steps, good)
+    return Solution(state, here, there.scale, determined, steps, good)
 
 
 def refined(problem: Problem, state: State) -> Solution:
@@ -637,9 +646,10 @@ def refined(problem: Problem, state: State) -> Solution:
     start = _Turn(stand, forward, state.errors.mT, state.constants, one, zero, zero)
     sound = np.asarray(np.isfinite(state.params).all(-1))
     there, steps, good = _settled(start, np.zeros(2, bool), sound)
+    there, here = there.last()
     state, determined = _ended(problem, there, first, at)
     good &= determined.clear & np.isfinite(state.params).all(-1)
-    return Solution(state, one, determined, steps, good)
+    return Solution(state, here, one, determined, steps, good)
 
 
 @dataclass(frozen=True)
@@ -713,6 +723,12 @@ def moved_params(problem: Problem, forward: Array) -> Array:
         each = -back[:, :, None, :, None] * turn.mT[:, None, :, None, :]
         moved[:, where, where] = each.reshape(-1, 12, 12)[:, closed_form.PLACES]
     return moved
+
+
+def analysis_of(problem: Problem, there: Solution) -> Analysis:
+    """The analysis of fits that have come to a solution, their runs linearised once."""
+    problem.once("on stand", there.state, lambda _: there.linear)
+    return analysed(problem, there.state, there.determined)
 
 
 def analysed(problem: Problem, state: State, determined: Determined) -> Analysis:
@@ -805,17 +821,12 @@ class _Turn:
         While the noise stays, so does the covariance unless it is asked for `anew`: it says how far to go, not where to
         end.
         """
-        here = self.stand.at(self.forward, self.errors, self.value, self.scale)
-        covariance = self.covariance
+        here, covariance = self.linear, self.covariance
         if covariance is None or anew or estimated.any():
             covariance = here.covariance
         step, errors, length = here.step(covariance)
-        moved = step[:, :OF_PARAMETERS].reshape(self.forward.shape)
-        value = self.value + step[:, OF_PARAMETERS:]
         moving = ~(np.abs(length) < LEAST_SQUARE)  # where steps run away it is any number
-        now = replace(
-            self, forward=self.forward + moved, errors=errors, value=value, covariance=covariance
-        )
+        now = replace(self._after(step, errors), covariance=covariance)
         if not estimated.any():
             return now, moving
         excess, power = here.excess(step, self.stand.include)
@@ -824,3 +835,20 @@ class _Turn:
         change = np.where(estimated, excess / slope, 0.0)
         moving |= np.any(np.abs(change) >= LEAST_NOISE_CHANGE, -1)
         return replace(now, scale=self.scale * np.exp(change), excess=excess, change=change), moving
+
+    def last(self) -> tuple[_Turn, StandLinear]:
+        """A short last step, and the runs linearised at its end."""
+        here = self.linear
+        step, errors, _ = here.step(here.covariance)
+        return self._after(step, errors), here.moved(step)
+
+    @property
+    def linear(self) -> StandLinear:
+        """The runs linearised here."""
+        return self.stand.at(self.forward, self.errors, self.value, self.scale)
+
+    def _after(self, step: Array, errors: Array) -> _Turn:
+        """After a step (B, u) that leaves these errors."""
+        forward = self.forward + step[:, :OF_PARAMETERS].reshape(self.forward.shape)
+        value = self.value + step[:, OF_PARAMETERS:]
+        return replace(self, forward=forward, errors=errors, value=value)
