@@ -199,7 +199,8 @@ def _budget(budget: Budget) -> str:
         if n != "azimuth" or any(line.azimuth_deg is not None for line in lines)
     ]
     rows = [_source(line, names, budget.combined) for line in lines]
-    head = f"uncertainty budget (1σ), {budget.at}; k = {budget.coverage_factor:.3g}, {_percent(budget.coverage_probability)}"
+    covered = f"k = {budget.coverage_factor:.3g}, {_percent(budget.coverage_probability)}"
+    head = f"uncertainty budget (1σ), {budget.at}; {covered}"
     return f"{one_line(head)}\n{table(rows, ['', 'kind', *names])}"
 
 

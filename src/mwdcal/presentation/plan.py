@@ -284,8 +284,8 @@ def detectable_rows(each: PlanSummary) -> list[list[str]]:
     return [
         [
             row.observable,
-            quantity(row.noticed, row.unit, 2),
-            "never" if row.named is None else quantity(row.named, row.unit, 2),
+            quantity(float(f"{row.noticed:.2g}"), row.unit, 2),
+            "never" if row.named is None else quantity(float(f"{row.named:.2g}"), row.unit, 2),
         ]
         for row in each.detectable_errors
     ]
@@ -388,7 +388,9 @@ def _banner(planned: Planned) -> dict[str, str]:
     """How long it takes, and what it will give."""
     summary, free = facts(planned), planned.calibration.undetermined()
     expected = ", ".join(
-        f"{name} {quantity(sd, '°', 2)}" for name, sd in summary.accuracy_deg.items() if sd is not None
+        f"{name} {quantity(sd, '°', 2)}"
+        for name, sd in summary.accuracy_deg.items()
+        if sd is not None
     )
     headline = (
         f"{plural(summary.stations, 'station')} – about {summary.session_hours:.1f} h at the stand"
