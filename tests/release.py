@@ -97,10 +97,13 @@ def snippet(python: Path, folder: Path) -> None:
 def bench(python: Path, folder: Path) -> None:
     """Start the README's bench on the simulated tool, and ask for its page."""
     command = [str(python), "-m", "mwdcal", "bench", "--demo", "--no-browser"]
-    with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, encoding="utf-8") as process:
+    with subprocess.Popen(
+        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, encoding="utf-8"
+    ) as process:
         try:
             address = process.stdout.readline().strip()
-            with urllib.request.urlopen(address, timeout=60) as page:
+            visitor = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+            with visitor.open(address, timeout=60) as page:
                 shown = page.read().decode()
         finally:
             process.terminate()
