@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 ROOT = Path(__file__).resolve().parents[1]
-TEXTS = Path(__file__).with_name("benchmarks.md")
+TEXTS = Path(__file__).with_name("page.txt")
 """The page without its figures: a paragraph per group under its heading."""
 PACKAGES = (
     "mwdcal", "numpy", "scipy", "numba", "pyarrow", "pyswarms", "AllanTools",

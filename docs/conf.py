@@ -47,6 +47,9 @@ man_pages = [(COMMANDS, project, "calibration of MWD directional tools", [author
 today = release  # in place of a date: the same sources, the same manual
 
 html_theme = "furo"
+html_static_path = ["_static"]
+html_css_files = ["print.css"]
+smartquotes_action = "qe"  # two hyphens begin an option
 html_title = f"mwdcal {release}"
 html_math_renderer = "mathml"
 html_copy_source = False
@@ -89,8 +92,10 @@ def escape_docstring(app, what, name, obj, options, lines) -> None:
 
 
 def escape_command(app, context, lines) -> None:
-    """The same for the help texts of commands."""
-    lines[:] = [line if line.lstrip().startswith("..") else escaped(line) for line in lines]
+    """The same for the help texts of commands, whose lines that stand for themselves begin with a bar."""
+    for index, line in enumerate(lines):
+        bar = re.match(r"\s*(?:\.\..*|\| )?", line)[0]
+        lines[index] = bar + escaped(line[len(bar) :])
 
 
 def literal_columns(app, what, name, obj, options, lines) -> None:

@@ -118,3 +118,19 @@ def test_the_search_finds(index, word, page):
         places[terms] = [found] if isinstance(found, int) else found
     names = {index["docnames"][number] for found in places.values() for number in found}
     assert page in names
+
+
+LINK = re.compile(r"\]\((?![a-z]+:|#)([^)#\s]+)")
+
+
+def test_links_between_pages_lead_to_files():
+    """Sphinx follows those of the documentation; here also those of README and the other pages beside it."""
+    pages = {*words.pages(), *ROOT.glob("*.md"), *ROOT.glob("design/*.md")}
+    dead = [
+        f"{page.relative_to(ROOT)}: {link}"
+        for page in sorted(pages)
+        for link in LINK.findall(page.read_text("utf-8"))
+        if not (page.parent / link).exists()
+    ]
+    assert dead == []
+    assert len(pages) > 80

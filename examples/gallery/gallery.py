@@ -30,7 +30,7 @@ STATE = PICTURES / "sources.json"
 INPUTS = ("examples/servo/*.*", "examples/registry/*.py", "src/mwdcal/presentation/templates/*")
 """Files that the pictures rest on besides the commands."""
 WIDE, HIGH, SHOWN = 860, 900, 860
-"""Pixels of the browser's window, and width of a picture."""
+"""Usual pixels of the browser's window, and width of a picture."""
 LARGEST = 150_000
 FIGURES = 8
 """Most figures of a page that get a picture of their own."""
@@ -43,6 +43,8 @@ class Item:
     title: str
     page: str
     lines: tuple[str, ...]
+    wide: int = WIDE
+    """Pixels of the browser's window."""
 
     @property
     def name(self) -> str:
@@ -89,6 +91,7 @@ ITEMS = (
         "Run sheet of a plan",
         "sheet.html",
         ("mwdcal plan --stations 24 --tool demo/tool.toml -o plan.csv --report sheet.html",),
+        wide=1125,
     ),
     Item(
         "A procedure, a hundred times",
@@ -202,6 +205,7 @@ def pictures(item: Item, folder: Path, browser: Page) -> Iterator[str]:
         command = ["pdftoppm", "-png", "-r", "90", "-f", "1", "-l", "1", path]
         yield store(item.name, subprocess.run(command, capture_output=True, check=True).stdout)
     else:
+        browser.set_viewport_size({"width": item.wide, "height": HIGH})
         browser.goto(path.as_uri())
         browser.wait_for_timeout(300)
         yield store(item.name, browser.screenshot())

@@ -134,7 +134,7 @@ def budget(calibration: Calibration) -> Budget:
     )
     grown = {key: None if sd is None else largest * sd for key, sd in sums.items()}
     freedom = min(calibration.effective_freedom(name) for name in names)
-    basis = f"k = {largest:.3g}, {PROBABILITY:.0%}, {freedom:.3g} degrees of freedom"
+    basis = f"k = {largest:.3g}, {100 * PROBABILITY:.0f} %, {freedom:.3g} degrees of freedom"
     expanded = BudgetLine(
         id="expanded", source="expanded uncertainty", kind="B", basis=basis, **grown
     )

@@ -608,8 +608,9 @@ def _out_of_date(standard: TracedStandard, calibrated: str) -> Iterator[Finding]
 def _exact(calibration: Calibration) -> Iterator[Finding]:
     names, steady = exact_and_steady(assumed_exact(calibration))
     if steady:
-        text = "; ".join(filter(None, (steady, blindness(calibration.unseen))))
-        yield Finding(id="assumed-steady", text=f"{text}.")
+        unseen = blindness(calibration.unseen)
+        text = f"{steady}. {unseen[:1].upper()}{unseen[1:]}." if unseen else f"{steady}."
+        yield Finding(id="assumed-steady", text=text)
     if names:
         text = (
             f"assumed exact in the budget: {', '.join(names)}. State their uncertainty in [stand] of the tool "

@@ -526,7 +526,9 @@ class Search:
         new = new[np.argsort(soak_numbers(taken(self.plan, new)), kind="stable")]
         some = taken(self.plan, new)
         new = new[measuring_order(attitudes(some), soak_numbers(some), self.stand)]
-        plan = replace(taken(self.plan, new), source=f"{len(new)} of {self.plan.source}")
+        plan = replace(
+            taken(self.plan, new), source=f"Best {len(new)} station{'s' * (len(new) > 1)}"
+        )
         whole = taken(self.plan, np.append(design.chosen[: self.before], new))
         options = replace(self.options or Options(), order=self.choice.options.order)
         carried = carried_out(whole, self.profile, options)

@@ -199,7 +199,8 @@ def _budget(budget: Budget) -> str:
         if n != "azimuth" or any(line.azimuth_deg is not None for line in lines)
     ]
     rows = [_source(line, names, budget.combined) for line in lines]
-    head = f"uncertainty budget (1σ), {budget.at}; k = {budget.coverage_factor:.3g}, {budget.coverage_probability:.0%}"
+    covered = f"k = {budget.coverage_factor:.3g}, {_percent(budget.coverage_probability)}"
+    head = f"uncertainty budget (1σ), {budget.at}; {covered}"
     return f"{one_line(head)}\n{table(rows, ['', 'kind', *names])}"
 
 
@@ -401,7 +402,7 @@ def _percent(share: float) -> str:
 
 def _coverage(factor: float | None, covered: float | None) -> str:
     """Coverage factor and probability: k = 2.00, 95.45 %."""
-    parts = [f"k = {factor:.2f}" if factor else "", _percent(covered) if covered else ""]
+    parts = [f"k\u00a0=\u00a0{factor:.2f}" if factor else "", _percent(covered) if covered else ""]
     return ", ".join(filter(None, parts))
 
 

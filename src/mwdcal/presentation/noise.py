@@ -180,8 +180,8 @@ def render(noise: Noise, log_sha256: str = "", profile: str = "", profile_sha256
         simulated=noise.simulated,
         banner=_banner(noise),
         findings=[f for f in noise.findings if f.id != NOT_AT_REST],
-        heading=heading(noise),
-        figure=figure(noise),
+        heading=[part for part in heading(noise) if part != SIMULATED],  # a banner says so
+        figure=figure(noise, titled=False),
         tables=tables(noise),
         toml=profile_lines(noise),
         rounded=rounded,
@@ -213,13 +213,14 @@ def _banner(noise: Noise) -> dict[str, str]:
 
 
 @plots.style()
-def figure(noise: Noise) -> Figure:
-    """One panel for each triad of the log."""
+def figure(noise: Noise, titled: bool = True) -> Figure:
+    """One panel for each triad of the log; a page has the title already."""
     triads = channels_of(noise.channels)
     label = "Allan deviation of every channel over averaging time"
     figure, [panels] = plots.new_figure(label, 3.5, columns=len(triads))
     simulated = f"   {SIMULATED}" if noise.simulated else ""
-    figure.suptitle(f"{noise.log}, {noise.seconds:.4g} s{simulated}", fontsize=8)
+    if titled:
+        figure.suptitle(f"{noise.log}, {noise.seconds:.4g} s{simulated}", fontsize=8)
     modified = "" if noise.kind == "overlapping" else "modified "
     for axes, (kind, names) in zip(panels, triads.items(), strict=True):
         _draw(axes, noise, names)

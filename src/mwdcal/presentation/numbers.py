@@ -52,12 +52,15 @@ def fixed(value: float | None, decimals: int) -> str:
 
 
 def quantity(value: float | None, symbol: str, digits: int | None = None) -> str:
-    """A number with its unit.
+    """A number with its unit, which is apart from a power of ten.
 
-    >>> [quantity(0.25, "°"), quantity(3, "nT"), quantity(0.03, "°", 2), quantity(None, "nT")]
-    ['0.25°', '3 nT', '0.030°', '–']
+    >>> [quantity(0.25, "°"), quantity(3, "nT"), quantity(0.03, "°", 2), quantity(1e-9, "°", 2), quantity(None, "nT")]
+    ['0.25°', '3 nT', '0.030°', '1.0×10⁻⁹ °', '–']
     """
-    return number(value, digits) + (unit(symbol) if value is not None else "")
+    shown = number(value, digits)
+    if value is None:
+        return shown
+    return f"{shown}\u00a0°" if symbol == "°" and "×" in shown else shown + unit(symbol)
 
 
 def signed(value: float | None, decimals: int) -> str:

@@ -85,12 +85,14 @@ def svg(figure: Figure, key: str) -> Markup:
 
 Box: TypeAlias = tuple[float, float, float, float]
 """Left, top, right and bottom of a part of a picture, in points."""
+MOST_STACKED = 4
+"""Columns of panels that a narrow screen shows below each other; more stay beside each other."""
 STRIP_MARGIN = 2.0
 """Above and below the panels of a column, points."""
 
 
 def _columns(figure: Figure) -> list[list[Any]]:
-    """The panels of each column of a figure; empty where one spans several, or there is one column."""
+    """The panels of each column of a figure; empty where one spans several, or there is one column, or very many."""
     columns: dict[int, list[Any]] = {}
     for axes in figure.axes:
         place = axes.get_subplotspec()
@@ -98,7 +100,7 @@ def _columns(figure: Figure) -> list[list[Any]]:
             return []
         if axes.get_visible():
             columns.setdefault(place.colspan.start, []).append(axes)
-    return [columns[k] for k in sorted(columns)] if len(columns) > 1 else []
+    return [columns[k] for k in sorted(columns)] if 1 < len(columns) <= MOST_STACKED else []
 
 
 def _label_each(figure: Figure) -> None:
@@ -159,7 +161,7 @@ def _side_by_side(text: str, key: str, figure: Figure) -> str:
             zip(columns, edges, edges[1:], strict=False), 1
         )
     )
-    shares = " ".join(f"{right - left:.0f}fr" for left, right in itertools.pairwise(edges))
+    shares = " ".join(f"{right - left:.2f}fr" for left, right in itertools.pairwise(edges))
     panels = f'<div class="panels" style="--columns: {shares}">{panels}</div>'
     for legend, box in legends:
         left, wide = box[0], box[2] - box[0]

@@ -256,7 +256,7 @@ def comparison_rows(facts: Sequence[PlanSummary]) -> list[list[str]]:
         ["D-efficiency, at least", *(f"{100 * each.efficiency_bound:.0f} %" for each in facts)],
     ]
     for name in facts[0].accuracy_deg:
-        cells = [quantity(each.accuracy_deg[name], "°") for each in facts]
+        cells = [quantity(each.accuracy_deg[name], "°", 2) for each in facts]
         lines.append([f"{name}, 1σ at 45° inclination", *cells])
     return lines
 
@@ -265,7 +265,7 @@ def accuracy_rows(each: PlanSummary) -> list[list[str]]:
     """1σ of the angles, a working inclination in each row."""
     columns = each.accuracy_by_inclination_deg
     return [
-        [f"{inclination:g}°", *(quantity(columns[name][place], "°") for name in columns)]
+        [f"{inclination:g}°", *(quantity(columns[name][place], "°", 2) for name in columns)]
         for place, inclination in enumerate(each.inclinations_deg)
     ]
 
@@ -284,8 +284,8 @@ def detectable_rows(each: PlanSummary) -> list[list[str]]:
     return [
         [
             row.observable,
-            quantity(float(f"{row.noticed:.2g}"), row.unit),
-            "never" if row.named is None else quantity(float(f"{row.named:.2g}"), row.unit),
+            quantity(float(f"{row.noticed:.2g}"), row.unit, 2),
+            "never" if row.named is None else quantity(float(f"{row.named:.2g}"), row.unit, 2),
         ]
         for row in each.detectable_errors
     ]
@@ -388,7 +388,9 @@ def _banner(planned: Planned) -> dict[str, str]:
     """How long it takes, and what it will give."""
     summary, free = facts(planned), planned.calibration.undetermined()
     expected = ", ".join(
-        f"{name} {quantity(sd, '°')}" for name, sd in summary.accuracy_deg.items() if sd is not None
+        f"{name} {quantity(sd, '°', 2)}"
+        for name, sd in summary.accuracy_deg.items()
+        if sd is not None
     )
     headline = (
         f"{plural(summary.stations, 'station')} – about {summary.session_hours:.1f} h at the stand"

@@ -75,6 +75,7 @@ def strengths(well: Well) -> Figure:
     ):
         _track(axes, well, depth, k, factor)
         axes.set_xlabel(STRENGTH_TITLES[name])
+        axes.locator_params(axis="x", nbins=5)
     panels[0, 0].set_ylabel(title)
     _downwards(panels[0, 0], depth)
     handles = {

@@ -153,7 +153,7 @@ VERDICT_FINDINGS = {
     "the stand (then give them one group: it is counted once). The 1σ rests on the stated noise.",
     "settings-doubted": "{title}: the readings scatter about the curves as if the stand was set at every station. Its "
     "error is counted both ways. State [stand] settings in the profile.",
-    "weak-test": "{row.name}: its 1σ of {row.uncertainty:.2g} {row.unit} is more than half of the limit: this "
+    "weak-test": "{row.name}: its 1σ of {size} is more than half of the limit: this "
     "test can hardly tell a good tool from a bad one. Average longer at each station, or take more toolfaces.",
     "roll-harmonics": "{row.name} over a turn of toolface: {causes}.",
 }
@@ -547,7 +547,8 @@ def _judged(title: str, name: str, limit: float, outcome: Departures, guarded: b
     within = probability_within(value, sd, limit, row.two_sided, freedom)
     row = msgspec.structs.replace(row, probability_within=within)
     if sd > WEAK * limit:
-        findings.append(_finding("weak-test", row=row))
+        size = f"{sd:.2g}{'' if row.unit == '°' else ' '}{row.unit}"
+        findings.append(_finding("weak-test", row=row, size=size))
     if causes := _causes(row, name, worst):
         findings.append(_finding("roll-harmonics", row=row, causes="; ".join(causes)))
     return _Judged(row, findings, remarks, overall.errors)
