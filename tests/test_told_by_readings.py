@@ -176,7 +176,13 @@ def test_a_dip_in_the_south_is_negative(row):
 
 
 @pytest.mark.parametrize(
-    "row", [["Dip 66.12 N"], ["Dip 66.12 S/N 4471"], ["Dip", 66.12, "S/N", "4471"]]
+    "row",
+    [
+        ["Dip 66.12 N"],
+        ["Dip 66.12 S/N 4471"],
+        ["Dip", 66.12, "S/N", "4471"],
+        ["Inclinaison magnétique : 66,12 degrés"],
+    ],
 )
 def test_other_words_behind_a_dip_do_not_turn_it(row):
     assert references_in([row]) == {"ref_dip_deg": pytest.approx(DIP, rel=1e-12)}
