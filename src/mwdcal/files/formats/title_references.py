@@ -194,9 +194,9 @@ _OTHER_ANGLE = re.compile(
 """Words of angles that are no dip."""
 _UPWARDS = re.compile(
     r"(?<![^\W\d_])(up|upwards?|para cima|hacia arriba|nach oben|aufwarts|oppover|vers le haut|verso l'?alto|"
-    r"вверх)(?![^\W\d_])|向上|朝上|"
-    r"[(\[]s[)\]]|"
-    r"(\d|[°'′\"″]|(?:deg|gra[du])\w*(?!\w))\W{0,3}(s(?! ?/)|south\w*|sud|sul|sur|syd|sor|zuid|юг|ю|южн\w*)(?![^\W\d_])|南",
+    r"вверх)(?![^\W\d_])|向上|朝上|南|[(\[]s[)\]]|"
+    r"(\d|[°'′\"″]|(?:deg|gra[du])\w*(?!\w))\W{0,3}"
+    r"(s(?! ?/)|south\w*|sud|sul|sur|syd|sor|zuid|юг|ю|южн\w*)(?![^\W\d_])",
 )
 """Words of a dip whose number is that of a field that points up, and behind it those of the south, where it does."""
 _SPELT = {
