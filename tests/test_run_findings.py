@@ -244,3 +244,12 @@ def test_copies_are_the_stations_near_an_earlier_one(count):
     np.testing.assert_array_equal(_copies(rows), expected)
     assert expected.sum() == 4
     assert not _copies(300.0 * rng.standard_normal((count, 6))).any()
+
+
+@pytest.mark.parametrize("gravity", [1.0, 0.9965, 1.0036, 1.0123, 0.98066])
+def test_a_gravity_that_no_place_on_land_has_is_named(gravity):
+    """On land 9.764 to 9.834 m/s²: Hirt et al., Geophys. Res. Lett. 40 (2013) 4279."""
+    data = run()
+    data = replace(data, known={**data.known, "gravity": np.full(data.count, gravity)})
+    outside = not 9.764 <= 9.80665 * gravity <= 9.834
+    assert ("gravity-reference" in found(data)) == (outside and gravity != 1.0036)

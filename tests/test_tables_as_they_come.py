@@ -391,6 +391,18 @@ def test_channels_too_large_for_a_norm_are_no_total(tmp_path):
 # ---------------------------------------------------------------------- rows and cells of a run
 
 
+def test_a_number_too_large_for_a_mean_is_named(tmp_path):
+    """Without a warning of NumPy's, which the test session turns into an error."""
+    columns = table()
+    cells = [*map(str, columns["Gx (V)"])]
+    cells[3] = cells[-1] = "1e309"
+    columns["Gx (V)"] = cells
+    message = refused(
+        mwdcal("profile", written(tmp_path / "a.csv", columns), "-o", tmp_path / "t"), 2, 3
+    )
+    assert "Gx (V)" in message
+
+
 def test_a_number_of_nines_among_others_like_it_is_a_reading(tmp_path):
     """999 mg beside 998 and 1001 mg; 999 far from all others stands for no reading."""
     mg = {n: np.round(servo_run()[n] / 3 * 1000, 1) for n in ("ax", "ay", "az")}

@@ -3,6 +3,8 @@
 Expected values are those of the simulated run, rewritten as another laboratory would have it.
 """
 
+import re
+
 import numpy as np
 import pytest
 from openpyxl import Workbook
@@ -12,7 +14,7 @@ from cli_support import mwdcal, refused, servo_run, write_csv
 from mwdcal.errors import FitError
 from mwdcal.files.formats.title_references import doubtful_in, references_in, stated_above
 from mwdcal.files.formats.titles import titles
-from test_tables_as_they_come import findings_of, mixed, read, table, written
+from test_tables_as_they_come import calibrated, findings_of, mixed, read, table, written
 
 FIELD, DIP, GRAVITY = 50_123.0, 66.12, 9.8123 / 9.80665
 WORDS = (
@@ -143,6 +145,119 @@ def test_measured_angles_beside_commanded_ones_may_be_the_tools_and_are_asked_ab
         mwdcal("profile", written(tmp_path / "a.csv", columns), "-o", tmp_path / "t"), 3
     )
     assert "'Cmd TF (deg)' and 'Meas TF (deg)' may each be" in message
+    behind = {
+        " ".join([*reversed(n.partition(" (")[0].split()), "(deg)"])
+        if n[:4] in ("Cmd ", "Meas")
+        else n: v
+        for n, v in columns.items()
+    }  # Inc Meas, Inc Cmd
+    message = refused(
+        mwdcal("profile", written(tmp_path / "b.csv", behind), "-o", tmp_path / "t.toml"), 3
+    )
+    assert "3 questions are open" in message
+    for name in ("Inc", "Azi", "TF"):
+        assert (
+            f"'{name} Cmd (deg)' is what the stand was to be set to. Did the stand measure"
+            in message
+        )
+
+
+# ---------------------------------------------------------- what the readings contradict
+
+SOUTHERN = (
+    ["Dip 66.12 S"], ["Dip", 66.12, "S"], ["Dip (S)", "66.12 deg"], ["Mergulho magnético", "66,12° Sul"],
+    ["Inclinación magnética 66,12 grados (sur)"], ["Inklination 66,12° Süd"], ["Dip -66.12 S"], ["磁倾角 66.12° 南"],
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("row", SOUTHERN)
+def test_a_dip_in_the_south_is_negative(row):
+    assert references_in([row]) == {"ref_dip_deg": pytest.approx(-DIP, rel=1e-12)}
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        ["Dip 66.12 N"],
+        ["Dip 66.12 S/N 4471"],
+        ["Dip", 66.12, "S/N", "4471"],
+        ["Inclinaison magnétique : 66,12 degrés"],
+    ],
+)
+def test_other_words_behind_a_dip_do_not_turn_it(row):
+    assert references_in([row]) == {"ref_dip_deg": pytest.approx(DIP, rel=1e-12)}
+
+
+TWO_PLACES = (
+    ["Field: 50123 / 48210 nT"], ["Field at Lab A 50123 nT, at Lab B 48210 nT"], ["Field (nT)", 50123, 48210],
+    ["Dip: 66.12° / 58.30°"], ["Dip 66.12 and 58.30"], ["Dip", 66.12, 58.3], ["gravity 9.81234 and 9.79321"],
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("row", TWO_PLACES)
+def test_of_two_places_in_one_line_none_is_taken_and_the_line_is_named(row):
+    assert references_in([row]) == {}
+    assert len(doubtful_in([row])) == 1
+
+
+@pytest.mark.parametrize(
+    "row", [["Dip", 66.12, "25 °C"], ["Dip 66.12 12.03.2024"], ["Dip 66.12, decl 3.2"]]
+)
+def test_a_number_of_another_kind_behind_a_dip_is_no_second_one(row):
+    assert references_in([row]) == {"ref_dip_deg": pytest.approx(DIP, rel=1e-12)}
+
+
+@pytest.mark.parametrize("wrong", [5.0, -10.0, -30.0, None])
+@pytest.mark.parametrize("titled", [True, False], ids=["title", "column"])
+def test_a_dip_of_another_place_or_sign_is_asked_about_by_the_readings(tmp_path, wrong, titled):
+    """The stations determine the dip themselves; left out, it is estimated."""
+    dip = float(servo_run()["ref_dip_deg"][0])
+    stated = -dip if wrong is None else dip + wrong
+    lines = [f"Dip {stated:.3f} deg"] if titled else []
+    columns = table(ref_dip_deg=None if titled else np.full(48, stated))
+    path = written(tmp_path / "a.csv", columns, *lines)
+    with pytest.raises(FitError, match="by the readings the dip is") as error:
+        library.propose_profile(path)
+    assert float(re.search(r"the dip is (\S+)°", str(error.value))[1]) == pytest.approx(
+        dip, abs=0.2
+    )
+    assert f"{stated:.1f}°" in str(error.value)
+    assert np.isnan(reference(path, "dip", column={"ref_dip_deg": ""})).all()
+    _, calibration = calibrated(tmp_path, path, "--column", "ref_dip_deg=")
+    [estimated] = [c for c in calibration["constants"] if c["name"] == "dip"]
+    assert calibration["earth"]["dip_deg"] == pytest.approx(dip, abs=0.1), estimated
+
+
+def test_a_dip_that_differs_by_less_is_taken(tmp_path):
+    dip = float(servo_run()["ref_dip_deg"][0]) + 1.0
+    path = written(tmp_path / "a.csv", table(ref_dip_deg=None), f"Dip {dip:.3f} deg")
+    assert reference(path, "dip") == pytest.approx(np.full(48, dip), abs=1e-3)
+
+
+UNITS_OF_OTHERS = ("Dip 1.1540 rad", "Dose 12 rad/h", "Radian Sensors Ltd", "Dip 73.467 gon")
+
+
+@pytest.mark.parametrize("line", UNITS_OF_OTHERS)
+def test_a_unit_of_angles_in_a_title_is_not_that_of_columns_which_it_cannot_be(tmp_path, line):
+    path = written(tmp_path / "a.csv", table(ref_dip_deg=None), line)
+    columns = {n.replace(" (deg)", ""): v for n, v in table(ref_dip_deg=None).items()}
+    bare = written(tmp_path / "b.csv", columns, line)
+    for each in (path, bare):
+        assert reference(each) == pytest.approx(np.asarray(servo_run()["ref_toolface_deg"]))
+
+
+def test_gons_of_a_title_that_the_readings_do_not_fit_are_asked_about(tmp_path):
+    columns = {n.replace(" (deg)", ""): v for n, v in table(ref_dip_deg=None).items()}
+    path = written(tmp_path / "a.csv", columns, "theodolite with gon circle")
+    message = refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
+    assert "'TF' is in gons by a line above the table, and the readings do not fit" in message
+    answers = {f"ref_{n}_deg": f"{c} (°)" for n, c in ANGLE_COLUMNS.items()}
+    assert reference(path, column=answers) == pytest.approx(
+        np.asarray(servo_run()["ref_toolface_deg"])
+    )
+
+
+ANGLE_COLUMNS = {"inclination": "Inc", "azimuth": "Azi", "toolface": "TF"}
 
 
 @pytest.mark.parametrize(

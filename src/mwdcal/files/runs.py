@@ -325,7 +325,11 @@ def renamed(table: Table, profile: Profile) -> Table:
     """
     form = profile.table
     ignored = () if isinstance(form, msgspec.UnsetType) else form.ignore
-    table = replace(table, columns={n: c for n, c in table.columns.items() if n not in ignored})
+    table = replace(
+        table,
+        columns={n: c for n, c in table.columns.items() if n not in ignored},
+        metadata={n: c for n, c in table.metadata.items() if n not in ignored},
+    )
     if not is_export(table.columns, profile):
         return _with_stated_references(table)
     sources = _sources(profile)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cache
 from typing import Any
 
 import numpy as np
 
+from mwdcal.calibration.readings import EARTH_GRAVITY
 from mwdcal.errors import Answer, InputError, QuestionError, QuestionsError
 from mwdcal.files.contract import (
     CHANNELS,
@@ -21,7 +22,7 @@ from mwdcal.files.contract import (
     units_of,
 )
 from mwdcal.files.formats.columns import LABELS, shown
-from mwdcal.files.formats.title_references import EARTH_FIELD, EARTH_GRAVITY
+from mwdcal.files.formats.title_references import EARTH_FIELD
 from mwdcal.files.profiles import setting
 from mwdcal.files.synonyms import (
     ABOVE,
@@ -135,7 +136,7 @@ def first_values(values: Array) -> str:
     return ", ".join(f"{value:.6g}" for value in values[:_FEW].tolist())
 
 
-def candidates_for(column: str, names: Sequence[str], values: Values) -> list[Answer]:
+def candidates_for(column: str, names: Iterable[str], values: Values) -> list[Answer]:
     """Each of the names as the answer to which one a column is, and that none is."""
     each = [Answer(with_values(n, values, n), (("column", f"{column}={n}"),)) for n in names]
     return [*each, none_of(column)]
@@ -342,10 +343,10 @@ _DOWNWARDS = re.compile(
 )
 """Words of angles from the horizontal that count downwards."""
 _SPOKEN = {
-    "rad": re.compile(r"radian|радиан|\brad\b", re.IGNORECASE),
-    "gon": re.compile(r"\bgon\b", re.IGNORECASE),
+    "rad": re.compile(r"radian|радиан|(?<!\d)(?<!\d )\brad\b", re.IGNORECASE),
+    "gon": re.compile(r"(?<!\d)(?<!\d )\bgon\b", re.IGNORECASE),
 }
-"""Units of angles in a line above a table."""
+"""Units of angles in a line above a table, not those of a number."""
 _SURROUNDINGS = re.compile(
     r"oven|chamber|ambient|kamer\b|(?<![a-z])(air|room|bath|lab)(?![a-z])|ofen|kammer|umgebung|raum|ovn|rom|horno|ambiente|"
     r"камер|печ|термостат|环境|烘箱|室温",
@@ -683,9 +684,9 @@ def proposed(
     if not hidden and not any(n in damaged for n, m in meanings.items() if m.column in RAW):
         questions.ask(_check_triads, names, values, chosen, source)
     questions.ask(_check_units_of_triads, chosen, source)
-    questions.ask(
-        _check_nominal, {c: e for c, e in chosen.items() if c not in said}, names, values, source
-    )
+    angles = {c: chosen[c].name for c in _ANGLES_AND_WARMTH[:3] if c in chosen and c not in said}
+    for column in angles:
+        questions.ask(_check_nominal, column, angles, names, values, source)
     beside = any("side by side" in each.text for each in questions)
     if not beside and not {*RAW[3:]} & {*chosen, *said}:
         believed = (
@@ -945,17 +946,18 @@ def _stated_among(names: Sequence[str]) -> bool:
 def _spoken(meanings: Mapping[str, Resemblance], values: Values, above: Sequence[str]) -> str:
     """The unit of angles that a line above the table states, or that toolfaces can only have.
 
-    A run needs rolls: toolfaces that are all below 6.3 are in radians.
+    A run needs rolls: toolfaces that are all below 6.3 are in radians, and others are not, whatever a line states.
     """
     text = " ".join(above)
-    stated = (unit for unit, words in _SPOKEN.items() if words.search(text))
-    if unit := next(stated, ""):
-        return unit
+    stated = next((unit for unit, words in _SPOKEN.items() if words.search(text)), "")
     rolls = [
         values(n) for n, m in meanings.items() if m.column == "ref_toolface_deg" and not m.unit
     ]
     known = [roll[np.isfinite(roll)] for roll in rolls if roll is not None]
-    return "rad" if any(r.size > LEAST_ROLLS and _maybe_radians(r) for r in known) else ""
+    radians = [_maybe_radians(r) for r in known if r.size > LEAST_ROLLS]
+    if stated == "rad":
+        return stated if all(radians) else ""
+    return stated or ("rad" if any(radians) else "")
 
 
 def _angles(column: str, unit: str) -> str:
@@ -1068,30 +1070,34 @@ def _check_units_of_triads(chosen: Mapping[str, ColumnSource], source: str) -> N
 
 
 def _check_nominal(
-    chosen: Mapping[str, ColumnSource], names: Sequence[str], values: Values, source: str
+    column: str, angles: Mapping[str, str], names: Sequence[str], values: Values, source: str
 ) -> None:
-    """Ask about an angle that the stand was to be set to, among others that it shows or beside one that is measured."""
-    angles = {c: chosen[c].name for c in _ANGLES_AND_WARMTH[:3] if c in chosen}
+    """Ask about an angle that the stand was to be set to, among others that it shows or beside one that is measured.
+
+    `angles`: the names of all angles of the stand.
+    """
+    name = angles[column]
     shows = [n for n in angles.values() if _ACTUAL.search(n) and not _NOMINAL.search(n)]
-    for column, name in angles.items():
-        if shows and _NOMINAL.search(name) and not _ACTUAL.search(name):
-            raise QuestionError(
-                f"{source}: {shown(name)} is what the stand was to be set to, and {shown(shows[0])} what it shows. Is "
-                f"there no column of what it shows as '{column}'?",
-                candidates_for(column, [name], values),
-            )
-        beside = [n for n in names if _NOMINAL.search(name) and _is_measured(n, column)]
-        if beside:
-            raise QuestionError(
-                f"{source}: {shown(name)} is what the stand was to be set to. Did the stand measure "
-                f"{shown(beside[0])}, or the tool? Which one is '{column}'?",
-                candidates_for(column, [name, *beside], values),
-            )
+    if shows and _NOMINAL.search(name) and not _ACTUAL.search(name):
+        raise QuestionError(
+            f"{source}: {shown(name)} is what the stand was to be set to, and {shown(shows[0])} what it shows. Is "
+            f"there no column of what it shows as '{column}'?",
+            candidates_for(column, [name], values),
+        )
+    nominal = [n for n in names if _NOMINAL.search(n) and _is_but(_NOMINAL, n, column)]
+    measured = [n for n in names if _is_but(_OF_CHANNELS, n, column)]
+    unclear = name in measured and not _ACTUAL.search(name)
+    if nominal and measured and (name in nominal or unclear):
+        raise QuestionError(
+            f"{source}: {shown(nominal[0])} is what the stand was to be set to. Did the stand measure "
+            f"{shown(measured[0])}, or the tool? Which one is '{column}'?",
+            candidates_for(column, dict.fromkeys([name, *nominal, *measured]), values),
+        )
 
 
-def _is_measured(name: str, column: str) -> bool:
-    """Whether a column is an angle that something measured, the stand or the tool itself: Measured Inc."""
-    bare = " ".join(_OF_CHANNELS.sub(" ", name).split())
+def _is_but(words: re.Pattern[str], name: str, column: str) -> bool:
+    """Whether a name is one of a column's but for some words: Measured Inc."""
+    bare = " ".join(words.sub(" ", name).split())
     alike = meaning(bare, "") if bare != name else None
     return alike is not None and alike.column == column
 

@@ -398,10 +398,17 @@ def _proposal(
     ignored |= dict.fromkeys(
         formulas, "its formulas have no value, as no spreadsheet program has saved them"
     )
-    form = _with(form, {"ignore": tuple(ignored)} if ignored else {})
+    denied = [c for c, name in answers.items() if not name and c in table.metadata]
+    form = _with(form, {"ignore": (*ignored, *denied)} if ignored or denied else {})
     table = _of_one_tool(table, columns, stated)
     profile = Profile(name=Path(path).stem, table=form or msgspec.UNSET, columns=columns)
-    profile, readings, wirings, open_axes = _wired_by_elevation(table, profile)
+    try:
+        profile, readings, wirings, open_axes = _wired_by_elevation(table, profile)
+    except FitError:
+        _ask_gons(table, {c: columns[c] for c in by_value & {*ANGLES_OF_STAND}})
+        _check_dip(table, profile, answers)
+        raise
+    _check_dip(table, profile, answers)
     angles = _open_angles(profile, answers)
     _check_gons(table, angles, readings, wirings)
     _check_twins(table, angles, columns, readings, wirings)
@@ -693,6 +700,20 @@ def _check_gons(
             )
 
 
+def _ask_gons(table: Table, of_stand: Mapping[str, ColumnSource]) -> None:
+    """Ask about angles that are in gons by a line above the table, where the readings do not fit them."""
+    if questions := [
+        QuestionError(
+            f"{table.source}: {shown(source.name)} is in gons by a line above the table, and the readings do not fit "
+            "it. Which unit holds?",
+            in_units(source.name, column, ("°", "gon")),
+        )
+        for column, source in of_stand.items()
+        if source.unit == "gon"
+    ]:
+        raise QuestionsError(table.source, questions)
+
+
 _FAR_BETTER = 0.5
 """Share of what an angle leaves of the readings that the right one, or the right unit, leaves at most."""
 
@@ -783,24 +804,27 @@ _ANOTHER_NORTH = 2.0
 """By how much the north of azimuths differs from that of the readings where it is another, degrees."""
 
 
-def magnetic_azimuth(readings: Readings, wirings: Mapping[str, Wiring]) -> float:
-    """The azimuth (degrees) of magnetic north by the readings, from where the azimuths of the stand count.
+def field_direction(readings: Readings, wirings: Mapping[str, Wiring]) -> tuple[float, float]:
+    """Magnetic north and dip by the readings: azimuth from where the azimuths of the stand count, and dip, in degrees.
 
-    Definition: the angle of the horizontal part of the field, fitted to the magnetometers with one offset on each axis.
-    NaN where the attitudes do not tell its east from its north part.
+    Definition: direction of the field fitted to the magnetometers, each with an offset and a gain of its own. NaN where
+    the attitudes do not tell its parts on any axis.
     """
     if "magnetometer" not in wirings or readings.magnetometer is None:
-        return np.nan
+        return np.nan, np.nan
     angles = [readings.reference(name) for name in NEEDED["magnetometer"]]
     whole = np.all([~np.isnan(angle) for angle in angles], 0)
     permutation = TriadProfile(axes=wirings["magnetometer"].axes).permutation  # type: ignore[arg-type]
     field = (readings.magnetometer @ permutation.transpose())[whole]
     turn = tool_from_earth(*(angle[whole] for angle in angles))
-    moved = (turn - turn.mean(0)).reshape(-1, 3)
-    if np.linalg.cond(moved) > _SINGULAR:
-        return np.nan
-    north, east, _ = np.linalg.lstsq(moved, (field - field.mean(0)).ravel(), rcond=None)[0]
-    return float(np.degrees(np.arctan2(east, north)))
+    field, turn = field - field.mean(0), turn - turn.mean(0)
+    seen = [axis for axis in range(3) if np.linalg.cond(turn[:, axis]) < _SINGULAR]
+    if not seen:
+        return np.nan, np.nan
+    parts = [np.linalg.lstsq(turn[:, axis], field[:, axis], rcond=None)[0] for axis in seen]
+    north, east, down = np.sum(parts, 0)
+    azimuth, dip = np.arctan2(east, north), np.arctan2(down, np.hypot(north, east))
+    return float(np.degrees(azimuth)), float(np.degrees(dip))
 
 
 _SINGULAR = 20.0
@@ -815,7 +839,7 @@ def _check_magnetic(
 ) -> None:
     """Ask about azimuths that by the readings count from another north than magnetic, where no one says which."""
     azimuth = columns.get(REFERENCES["azimuth"].column)
-    seen = magnetic_azimuth(readings, wirings) if azimuth else 0.0
+    seen, _ = field_direction(readings, wirings) if azimuth else (0.0, 0.0)
     if not azimuth or "azimuth_reference" in table.metadata or not abs(seen) > _ANOTHER_NORTH:
         return
     raise QuestionError(
@@ -823,6 +847,40 @@ def _check_magnetic(
         "does it count, and what is the declination, degrees east?",
         answers_of_north(),
     )
+
+
+_ANOTHER_DIP = 3.0
+"""By how much a dip that is stated differs from that of the readings where it is of another place, degrees."""
+
+
+def _check_dip(table: Table, profile: Profile, answers: Collection[str]) -> None:
+    """Ask about a dip of which the readings, whose axes are told without it, give another."""
+    column, columns = REFERENCES["dip"].column, profile.columns
+    assert not isinstance(columns, msgspec.UnsetType)
+    named = columns.get(column)
+    if column in answers or not (named or column in table.metadata):
+        return
+    form = TableFormat() if isinstance(profile.table, msgspec.UnsetType) else profile.table
+    without = msgspec.structs.replace(
+        profile,
+        columns={c: source for c, source in columns.items() if c != column},
+        table=_with(form, {"ignore": (*form.ignore, named.name if named else column)}),
+    )
+    seen, stated = np.nan, float(np.nanmedian(numbers(renamed(table, profile), column)))
+    with suppress(FitError, InputError):
+        _, readings, wirings, open_axes = _wired_by_elevation(table, without)
+        _, seen = field_direction(readings, {} if open_axes else wirings)
+    if abs(seen - stated) > _ANOTHER_DIP:
+        where = shown(named.name) if named else "a line above the table"
+        raise QuestionError(
+            f"{table.source}: by the readings the dip is {seen:.1f}°, and by {where} {stated:.1f}°. Is the latter that "
+            "of another place or sign?",
+            [
+                Answer(
+                    "yes, leave it out: the calibration finds the dip", (("column", f"{column}="),)
+                )
+            ],
+        )
 
 
 _APART, _WARMER = 0.005, 3.0

@@ -87,6 +87,7 @@ REMARKED = {
     "no-redundancy": "nothing in the run checks the fit",
     "few-degrees-of-freedom": "the residuals are too few to know the uncertainties better than to a quarter",
     "hemisphere": "the dip is negative: a southern site, or a magnetometer with reversed signs",
+    "gravity-reference": "the reference of gravity is one that no place on land has",
     "scatter": "strengths, dip or directions vary from station to station beyond the noise",
     "repeated-readings": "some stations are copies of others, and left out of the fit",
     "temperature-misfit": "the {triad} varies with temperature as its order does not follow",

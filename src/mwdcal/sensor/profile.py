@@ -131,8 +131,9 @@ class TableFormat(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     `header_line` holds the column names, `first_line` the first readings; what stands above and
     between is not read. A workbook has only these two, which count its rows. Where `find` is set, the table is
     looked for by the names of its columns instead, on the sheet named, if any. `azimuth_reference` and its angles are
-    those of tables that do not state them. `ignore` are columns that are no evidence whatever they are called.
-    `leave_out` and `keep` say by the texts of a column which rows of a run are rejected, and which are not.
+    those of tables that do not state them. `ignore` are columns, and references above them, that are no evidence
+    whatever they are called. `leave_out` and `keep` say by the texts of a column which rows of a run are rejected, and
+    which are not.
     """
 
     encoding: Literal[

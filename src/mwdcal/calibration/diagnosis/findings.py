@@ -30,7 +30,7 @@ from mwdcal.calibration.diagnosis.structure import COLUMN, is_shown, suspected
 from mwdcal.calibration.diagnosis.structure import described as seen_as
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import DIRECTION
-from mwdcal.calibration.readings import EARTH_RANGES, HIGHEST, TRIADS, Readings
+from mwdcal.calibration.readings import EARTH_GRAVITY, EARTH_RANGES, HIGHEST, TRIADS, Readings
 from mwdcal.calibration.record import SHOWN_DRIFT, Finding
 from mwdcal.calibration.residuals import REASONS, shown_in, tail
 from mwdcal.calibration.results import (
@@ -197,6 +197,8 @@ REMARKS = {
     "hemisphere": "the dip comes out negative ({dip:.1f}°) and no reference confirms it: either the site is in the "
     "southern hemisphere, or all signs of the magnetometer are reversed and azimuths are wrong by 180°. "
     "Give ref_dip_deg, or ref_azimuth_deg at one direction.",
+    "gravity-reference": "ref_gravity_g gives {value:.6g} g, and no place on land has less than {low} or more than "
+    "{high}: the accelerometers are scaled to it. Check it, and its unit.",
     "repeated-readings": "station {stations}: the same readings as an earlier station, closer than noise allows. "
     "Copies are no measurements of their own. Left out of the fit: {count} of {of} stations. Remove them from the run, "
     "or measure anew.",
@@ -290,6 +292,7 @@ def finding_flags(fitted: FittedRuns) -> Iterator[Flag]:
     yield _few_degrees(fitted)
     yield from _settings(fitted)
     yield _hemisphere(fitted)
+    yield _gravity(fitted)
     yield from _drifts(fitted)
     yield from _followed(fitted)
     yield from _structure(fitted)
@@ -397,6 +400,15 @@ def _hemisphere(fitted: FittedRuns) -> Flag:
     """A negative dip that only the signs of the magnetometer tell from a positive one."""
     dip = np.degrees(unconfirmed_dip(fitted.result))
     return _remark("hemisphere", dip < 0, dip=dip)
+
+
+def _gravity(fitted: FittedRuns) -> Flag:
+    """A reference of gravity that no place on land has."""
+    evidence, (low, high) = fitted.result.problem.evidence, EARTH_GRAVITY
+    given = np.broadcast_to(evidence.known["gravity"], evidence.include.shape)
+    outside = evidence.is_known("gravity") & ~((given >= low) & (given <= high))
+    first = given[np.arange(fitted.count), np.argmax(outside, -1)]
+    return _remark("gravity-reference", np.any(outside, -1), value=first, low=low, high=high)
 
 
 def _drifts(fitted: FittedRuns) -> Iterator[Flag]:

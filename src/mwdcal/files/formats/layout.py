@@ -721,6 +721,7 @@ def _is_summary(row: Cells, width: int) -> bool:
     return any(_SUMMARY.fullmatch(text) for text in texts if text)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of numbers too large for a mean
 def _is_mean(row: Cells, above: Sequence[Cells]) -> bool:
     """Whether numbers of a row are the means of the columns above, in four columns that vary or more."""
     equal = varied = 0

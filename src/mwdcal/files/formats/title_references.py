@@ -10,19 +10,18 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from functools import cache
 from itertools import pairwise, product
 from typing import NamedTuple
 
+from mwdcal.calibration.readings import EARTH_GRAVITY
 from mwdcal.files.formats.columns import as_text, looks_numeric
 from mwdcal.files.formats.titles import Titles, titles
 from mwdcal.files.synonyms import FACTORS, unit_of
 
 EARTH_FIELD = (15_000.0, 80_000.0)
 """The least and the largest strength of the Earth's field, nT, with room for what is built around a stand."""
-EARTH_GRAVITY = (0.995, 1.004)
-"""The least and the largest gravity on land, in standard gravity: 9.764 to 9.834 m/s², and a little more."""
 
 
 Rows = Sequence[Sequence[object]]
@@ -132,6 +131,12 @@ _WITH_SPREAD = re.compile(
 )
 """A value whose unit stands behind its uncertainty alone: 56870 +/- 45 nT."""
 
+_ANOTHER = re.compile(
+    rf"[\s;,/|)]*(?:(?:and|or|und|oder|bzw|og|eller|y|o|e|ou|et|и|или|resp)(?![^\W\d_])\s*)?"
+    rf"(?P<number>{_WRITTEN_NUMBER})(?![./-]?\d)\s*(?:{_WRITTEN_UNIT}|(?!°|[^\W\d_]))"
+)
+"""A second value right behind one: 70.5 / 66.0."""
+
 
 def _statement(head: str) -> re.Pattern[str]:
     return re.compile(rf"{_BEGINNING}{head}(?![^\W\d_]){_BETWEEN}{_WITH_NUMBER}")
@@ -167,10 +172,12 @@ _NO_PLACE = re.compile(
     rf"{_UNSURE.pattern}|"
     r"horizont\w*|vertical\w*|vertik\w*|compon\w*|kompon\w*|north|nord|south|sud|coil\w*|spule\w*|scale|sens\w*|full|"
     r"measured|\bmeas\b|mean|average|\bavg|mittel|gemessen|malt|medid\w*|mesur\w*|media|medio|moyen\w*|средн\w*|измер\w*|"
-    r"calc\w*|comput\w*|\bat\b|\bbei\b|\bper\b|\bto\s*$|\bbis\s*$|change|variation|shift|bias|previous|last|old|"
+    r"calc\w*|comput\w*|\bper\b|\bto\s*$|\bbis\s*$|change|variation|shift|bias|previous|last|old|"
     r"(?<![^\W\d_])[hbfg][xyz](?![^\W\d_])|fluxgate|\bfs\b|\btype|satur\w*|overload|capacity|thermo\w*|горизонт\w*|верти\w*|компон\w*|水平|垂直|分量|平均|测得|灵敏度|\d\s*m?v\b|[<>]",
 )
 """Words of a strength that is not that of the place."""
+_AT = re.compile(r"\bat\b|\bbei\b")
+"""Words before a strength at which something was checked, unless it is one of several places."""
 _INCLINED = re.compile(
     r"dip|(?<![^\W\d_])[iеe]n[ck]l\w*|inklin\w*|inclin\w*|наклон\w*|нахил\w*|倾|伏角|傾|egim|duzalimi|sklon\w*|nachyleni\w*|"
     r"hajlas\w*|lutning|kallistuma|helling|mergulho|buzamiento|echado",
@@ -187,9 +194,11 @@ _OTHER_ANGLE = re.compile(
 """Words of angles that are no dip."""
 _UPWARDS = re.compile(
     r"(?<![^\W\d_])(up|upwards?|para cima|hacia arriba|nach oben|aufwarts|oppover|vers le haut|verso l'?alto|"
-    r"вверх)(?![^\W\d_])|向上|朝上",
+    r"вверх)(?![^\W\d_])|向上|朝上|南|[(\[]s[)\]]|"
+    r"(\d|[°'′\"″]|(?:deg|gra[du])\w*(?!\w))\W{0,3}"
+    r"(s(?! ?/)|south\w*|sud|sul|sur|syd|sor|zuid|юг|ю|южн\w*)(?![^\W\d_])",
 )
-"""Words of a dip whose number is that of a field that points up."""
+"""Words of a dip whose number is that of a field that points up, and behind it those of the south, where it does."""
 _SPELT = {
     "нтл": "nT", "мктл": "µT", "мтл": "mT", "м/с": "m/s²", "м/с²": "m/s²", "м/с2": "m/s²", "m/s": "m/s²", "г": "g",
     "град": "°", "度": "°", "fok": "°", "derece": "°", "stopni": "°", "gal": "gal",
@@ -267,7 +276,7 @@ def references_in(rows: Rows, besides: Rows = ()) -> dict[str, float]:
                 by_word.setdefault(column, {})[value] = None
         for column, value in _of_a_place(text).items():
             of_places.setdefault(column, {})[value] = None
-        for column, value in _by_unit(text):
+        for column, value in _by_unit(text, here):
             by_unit.setdefault(column, {})[value] = None
     every = by_unit | of_places | {c: each | by_unit.get(c, {}) for c, each in by_word.items()}
     if "ref_field_nt" in every and "ref_dip_deg" not in every:
@@ -320,8 +329,11 @@ def _figures(text: str) -> Iterator[_Figure]:
         )
 
 
-def _by_unit(text: str) -> Iterator[tuple[str, float]]:
-    """Strengths of field and gravity that a line states in whatever words, by their units and sizes."""
+def _by_unit(text: str, here: Collection[str]) -> Iterator[tuple[str, float]]:
+    """Strengths of field and gravity that a line states in whatever words, by their units and sizes.
+
+    `here`: columns of those that it states by their words, beside which any other is of another place.
+    """
     for figure in _figures(text):
         said = figure.words if re.search(r"[^\W\d_]", figure.words) else text
         if _NO_PLACE.search(f"{said} {figure.behind}") or re.match(
@@ -336,7 +348,7 @@ def _by_unit(text: str) -> Iterator[tuple[str, float]]:
                 else set()
             )
             inside = {v for v in values if quantity.low <= v <= quantity.high} - {1.0}
-            if len(inside) == 1:
+            if len(inside) == 1 and (quantity.column in here or not _AT.search(said)):
                 yield quantity.column, inside.pop()
 
 
@@ -352,7 +364,7 @@ def _inclinations(text: str) -> Iterator[float]:
             continue
         if _stated_unit(_OF_PLACES[1], figure.unit) in ("", "°"):
             inside = {n for n in _numbers(figure.number, figure.minutes) if 0 < abs(n) < 90}
-            up = _UPWARDS.search(f"{figure.words} {figure.behind}")
+            up = _UPWARDS.search(f"{figure.words} {figure.number} {figure.behind}")
             yield from (-abs(n) if up else n for n in inside if len(inside) == 1)
 
 
@@ -374,7 +386,7 @@ def _clauses(row: Sequence[object]) -> str:
     """The cells of a row in small letters, a semicolon behind each that ends a statement: a number with its unit."""
     text, ends = "", False
     for cell in filter(None, (_plain(as_text(each)).strip() for each in row)):
-        unit = re.fullmatch(rf"[(\[]?({_WRITTEN_UNIT})[)\]]?", cell)
+        unit = re.fullmatch(rf"[(\[]?({_WRITTEN_UNIT}|[ns])[)\]]?", cell)
         text += f"; {cell}" if ends and not unit else f" {cell}"
         ends = not unit and bool(re.search(r"(?<![\w.,])[+\-−]?\d[^;]*$", cell))
     text = _WITH_SPREAD.sub(r"\1 \4 \2 \3 \4", text)
@@ -470,7 +482,7 @@ def _plain(text: str) -> str:
 
 
 def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
-    """The value that a text states, in the unit of the run file, if it is one."""
+    """The value that a text states, in the unit of the run file, if it is one, and another right behind it."""
     between, behind = match["between"], match["behind"]
     rough = re.match(r"\W*(nomin|номин|标称|nenn|k\s?g\b)", behind) and not match["next"]
     letter = "letter" in match.groupdict()
@@ -493,13 +505,21 @@ def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
     if stated and stated not in quantity.units:
         return
     numbers = [*_numbers(match["number"], _minutes(match))]
-    if quantity.low < 0 and _UPWARDS.search(f"{between} {behind}"):
+    if quantity.low < 0 and _UPWARDS.search(match[0]):
         numbers = [-abs(number) for number in numbers]
     units = (stated,) if stated else [unit for unit in quantity.units if unit not in ("gon", "A/m")]
-    values = {_converted(number, unit) for number in numbers for unit in units}
-    inside = [v for v in values if quantity.low <= v <= quantity.high and v]
+    inside = [*_inside(quantity, numbers, units)]
+    other = _ANOTHER.match(match.string, match.end("unit" if match["unit"] else "number"))
+    others = _inside(quantity, _numbers(other["number"]), units) if other else ()
     if len(inside) == 1:
         yield inside[0]
+        yield from (v for v in others if abs(v - inside[0]) < abs(inside[0]) / 2)
+
+
+def _inside(quantity: _Quantity, numbers: Iterable[float], units: Sequence[str]) -> Iterator[float]:
+    """The different values, in the unit of the run file, that numbers in some units are and that the Earth has."""
+    values = {_converted(number, unit) for number, unit in product(numbers, units)}
+    return (v for v in values if quantity.low <= v <= quantity.high and v)
 
 
 def _stated_unit(quantity: _Quantity, text: str) -> str:
