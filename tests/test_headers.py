@@ -118,3 +118,41 @@ def test_toolfaces_round_a_turn_are_offered_as_such(tmp_path):
     questions = getattr(error.value, "questions", (error.value,))
     offered = [a for each in questions for answer in each.answers for a in answer.arguments]
     assert ("column", "ref_toolface_deg=q") in offered
+
+
+def in_series(rows):
+    """Rows sorted to series of rolls, with the angles of each direction in its first row alone."""
+    rows = sorted(rows, key=lambda row: row[:2])
+    return rows, [
+        row if not n or row[:2] != rows[n - 1][:2] else ["", "", *row[2:]]
+        for n, row in enumerate(rows)
+    ]
+
+
+NAMES = ["Inc", "Azi", "TF", "Gx (V)", "Gy (V)", "Gz (V)", "Bx (V)", "By (V)", "Bz (V)", "T C"]
+
+
+def test_angles_written_once_for_a_series_are_those_of_the_row_above(tmp_path):
+    """The readings fit them; the profile says so, and calibrate reads the same table, each naming how many."""
+    rows, once = in_series(stations())
+    path = text(tmp_path / "run.csv", [*TITLES, NAMES, *once])
+    proposed = mwdcal.propose_profile(path)
+    blank = sum(row[0] == "" for row in once)
+    said = [each.text for each in proposed.findings if "from the row above" in each.text]
+    assert [each.split(" rows")[0] for each in said] == [f"{blank} of {len(rows)}"] * 2
+    assert proposed.profile.table.fill_down == ("Inc", "Azi")
+    run = taken(path)
+    assert same(run, rows)
+    assert [each for each in run.remarks if "from the row above" in each] == said
+
+
+def test_blank_angles_that_the_readings_do_not_fit_are_unknown_and_counted(tmp_path):
+    """Angles in a few rows alone, which are not those of the rows below: none is filled in, and the rest is told."""
+    rows = sorted(stations(), key=lambda row: row[2])
+    some = [row if n % 4 == 0 else ["", "", *row[2:]] for n, row in enumerate(rows)]
+    proposed = mwdcal.propose_profile(text(tmp_path / "run.csv", [*TITLES, NAMES, *some]))
+    blank = sum(row[0] == "" for row in some)
+    texts = [each.text for each in proposed.findings]
+    for name in ("Inc", "Azi"):
+        assert f"{blank} of {len(rows)} stations have no '{name}': it is unknown there." in texts
+    assert not any("from the row above" in each for each in texts)

@@ -720,7 +720,21 @@ def proposed(
     by_value = {c for c, each in chosen.items() if each.unit and not meanings[each.name].unit}
     used = {each.name for each in chosen.values()}
     ignored = {name: reason for name, reason in ignored.items() if name not in used}
+    chosen = _with_wrong_units(chosen, said, dict(zip(names, units, strict=True)))
     return _labels(names, chosen) | chosen, by_value, ignored
+
+
+def _with_wrong_units(
+    chosen: Mapping[str, ColumnSource], said: Collection[str], units: Mapping[str, str]
+) -> dict[str, ColumnSource]:
+    """The columns that the user says with the unit that the table states for each, where it is another."""
+    wrong = {c: unit_of(units[each.name]) for c, each in chosen.items() if c in said}
+    return {
+        c: ColumnSource(name=each.name, unit=each.unit, instead_of=wrong[c])
+        if wrong.get(c) and each.unit and wrong[c] != each.unit
+        else each
+        for c, each in chosen.items()
+    }
 
 
 def _ask_lacking(
