@@ -171,9 +171,23 @@ def read_export(
     if isinstance(form, msgspec.UnsetType):
         table = tables.read(path, decimal=decimal, rows=rows)
     else:
-        table = _exported(path, form, profile, decimal, rows)
+        table = filled_down(_exported(path, form, profile, decimal, rows), form.fill_down)
         table = replace(table, metadata={**form.north, **table.metadata})
     return stated_table(table, statements or {}, _serial_column(table, profile))
+
+
+def filled_down(table: Table, names: Collection[str]) -> Table:
+    """A table with the cell of the row above in blank cells of some columns; `remarks` of it say in how many."""
+    columns, remarks = dict(table.columns), []
+    for name in (each for each in table.columns if each in names):
+        cells, column = labels(table, name), table.columns[name]
+        rows = np.maximum.accumulate([row if cell else 0 for row, cell in enumerate(cells)])
+        columns[name] = [column[row] for row in rows] if isinstance(column, list) else column[rows]
+        count = sum(not cell for cell in cells)
+        remarks += [
+            f"{count} of {table.count} rows take {shown(name)} from the row above, as it is written once for a series."
+        ] * bool(count)
+    return replace(table, columns=columns, remarks=(*table.remarks, *remarks))
 
 
 def _serial_column(table: Table, profile: Profile) -> str:
@@ -252,8 +266,9 @@ def _of_layout(where: Layout, path: str | os.PathLike[str], profile: Profile) ->
     """
     named = {each.name: column for column, each in _sources(profile).items()}
     for name, unit in zip(where.names, map(synonyms.unit_of, where.units), strict=True):
-        stated = _sources(profile)[named[name]].unit if name in named else ""
-        if unit and stated and not _alike_units(unit, stated):
+        source = _sources(profile)[named[name]] if name in named else ColumnSource(name=name)
+        stated = source.unit
+        if unit and stated and unit != source.instead_of and not _alike_units(unit, stated):
             raise InputError(
                 f"{Path(path).name}: {shown(name)} is in {unit}, by the tool profile in {stated}. Correct "
                 "[columns] there, or propose a profile for this table: mwdcal profile."
@@ -267,6 +282,7 @@ def _check_below_names(path: str | os.PathLike[str], form: TableFormat, profile:
         return
     (_, names), *skipped = tables.below_names(path, form) or [(0, [])]
     theirs = {each.name: each.unit for each in _sources(profile).values() if each.unit}
+    wrong = {(each.name, each.instead_of) for each in _sources(profile).values()}
     for line, cells in skipped:
         where = f"{Path(path).name}, line {line}"
         if holds_numbers(cells):
@@ -274,6 +290,8 @@ def _check_below_names(path: str | os.PathLike[str], form: TableFormat, profile:
                 f"{where}: readings that by first_line = {form.first_line} of the tool profile would not be read."
             )
         for name, unit in zip(names, map(synonyms.unit_of, cells), strict=False):
+            if (name.strip(), unit) in wrong:
+                continue
             if unit and not _alike_units(unit, theirs.get(name.strip(), unit)):
                 raise InputError(
                     f"{where}: {shown(name.strip())} is in {unit}, by the tool profile in "

@@ -121,14 +121,15 @@ def is_of_surroundings(name: str) -> bool:
 
 
 def is_numbering(values: Array) -> bool:
-    """Whether numbers go on in equal steps but for a few, as those of rows and times do.
+    """Whether numbers go on in equal steps but for a few, as those of rows and times do, and do not run round a turn.
 
-    >>> is_numbering(np.array([1.0, 2, 3, 3, 4, 5, 6])), is_numbering(np.array([0.0, 90, 180, 270, 0, 90]))
+    >>> is_numbering(np.array([1.0, 2, 3, 3, 4, 5, 6])), is_numbering(np.array([*range(0, 360, 45)] * 2))
     (True, False)
     """
-    steps = np.diff(values)
+    steps, different = np.diff(values), np.unique(values).size
     usual = float(np.median(steps)) if steps.size else 0.0
-    return usual != 0.0 and float(np.isclose(steps, usual).mean()) > _REGULAR
+    turns = different < values.size and np.isclose(abs(usual) * different, 360)
+    return usual != 0.0 and not turns and float(np.isclose(steps, usual).mean()) > _REGULAR
 
 
 def first_values(values: Array) -> str:
@@ -255,8 +256,8 @@ def may_be(column: str, name: str, unit: str, values: Array | None) -> bool:
 
 
 _LABELS = {
-    "station": "station stn stationnr stationno stationnumber position pos posnr messpunkt punkt point shot nr no "
-    "stasjon estacion punto lage row id",
+    "station": "station stn sta stationnr stationno stationnumber position pos posnr messpunkt messpunktnr punkt "
+    "punktnr point shot nr no stasjon estacion punto lage row id",
     "group": "group gruppe set rollset",
 }
 """Names of columns of labels; a column is one only where no other is."""
@@ -274,7 +275,7 @@ _NO_STAND = re.compile(
 )
 """Words of columns of angles that do not belong to the stand."""
 _NOMINAL = re.compile(
-    r"\b(nominale?|target|set|set ?point|soll\w*|cmd|command(ed)?|demand(ed)?|required|nom|consigne|comandad[oa]|"
+    r"\b(nominale?|target|set|set ?point|soll\w*|cmd|command(ed)?|demand(ed)?|required|nom|consign[ea]|comandad[oa]|"
     r"zadan\w*|b[öo]rv[äa]rde|задан\w*|номинал\w*)\b|设定|目标|指令値?|目標値?|設定値?",
     re.IGNORECASE,
 )
@@ -384,6 +385,7 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     alike = (
         resembled(plain) or _without_title(plain) or resembled(f"{name} ({unit})" if unit else name)
     )
+    alike = alike or _twice(plain)
     if alike and alike.column in RAW and _CALLED_REFERENCE.search(plain):
         return alike._replace(column=REFERENCE_VECTORS[RAW.index(alike.column)])
     if _MEASURED.search(plain) and not (alike and alike.column == WARMTH):
@@ -444,6 +446,25 @@ def _measured_channel(name: str) -> Resemblance | None:
     bare = _OF_CHANNELS.sub("", name)
     alike = resembled(bare) if bare != name else None
     return alike if alike and alike.column in RAW else None
+
+
+def _twice(name: str) -> Resemblance | None:
+    """What a name says twice, in words and in short: Inclination Inc (°), or by a symbol: Azimuth A (°)."""
+    words, unit = name.split(), ""
+    if len(words) > 2 and IN_BRACKETS.search(words[-1]):
+        unit = words.pop()
+    if len(words) < 2:
+        return None
+    one, two = (resembled(f"{text} {unit}".strip()) for text in (" ".join(words[:-1]), words[-1]))
+    same = one and two and one.column == two.column
+    return one if same or (one and _is_symbol(words[-1], one.column)) else None
+
+
+def _is_symbol(word: str, column: str) -> bool:
+    """Whether a word is a letter, of no axis and no north, behind the name of a reference or a temperature."""
+    others = "xyz" + ("mtg" if column == REFERENCES["azimuth"].column else "")
+    referred = column in (WARMTH, *(each.column for each in REFERENCES.values()))
+    return referred and len(word) == 1 and word.isalpha() and word.lower() not in others
 
 
 def _two_units(name: str, unit: str) -> str:
@@ -700,7 +721,21 @@ def proposed(
     by_value = {c for c, each in chosen.items() if each.unit and not meanings[each.name].unit}
     used = {each.name for each in chosen.values()}
     ignored = {name: reason for name, reason in ignored.items() if name not in used}
+    chosen = _with_wrong_units(chosen, said, dict(zip(names, units, strict=True)))
     return _labels(names, chosen) | chosen, by_value, ignored
+
+
+def _with_wrong_units(
+    chosen: Mapping[str, ColumnSource], said: Collection[str], units: Mapping[str, str]
+) -> dict[str, ColumnSource]:
+    """The columns that the user says with the unit that the table states for each, where it is another."""
+    wrong = {c: unit_of(units[each.name]) for c, each in chosen.items() if c in said}
+    return {
+        c: ColumnSource(name=each.name, unit=each.unit, instead_of=wrong[c])
+        if wrong.get(c) and each.unit and wrong[c] != each.unit
+        else each
+        for c, each in chosen.items()
+    }
 
 
 def _ask_lacking(

@@ -35,7 +35,7 @@ from mwdcal.files.formats.text import is_preamble
 from mwdcal.files.marks import MARKS_NAMED, UNMARKED, marks_in, place, without_rejected
 from mwdcal.files.metadata import toml
 from mwdcal.files.profiles import CHOICE_OF_AXES
-from mwdcal.files.runs import STATED_REFERENCES, check_run, renamed, to_readings
+from mwdcal.files.runs import STATED_REFERENCES, check_run, filled_down, renamed, to_readings
 from mwdcal.files.statements import stated_table
 from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW, FACTORS, WARMTH
 from mwdcal.geometry.observables import OBSERVABLES
@@ -380,6 +380,7 @@ def _proposal(
     answers: Mapping[str, str],
 ) -> Proposal:
     """The proposal for a table that was read, with what the user says of its columns."""
+    whole = table
     formulas = [name for name in table.columns if _is_formulas(labels_of(table, name))]
     table = replace(table, columns={n: c for n, c in table.columns.items() if n not in formulas})
     units_by_name = dict(zip(where.names, where.units, strict=True)) if where else {}
@@ -392,6 +393,12 @@ def _proposal(
     columns, by_value, ignored = proposed(
         names, units, values, table.source, above, table.metadata, answers, problems, open_rows
     )
+    if names := _written_once(table, columns):
+        filled = filled_down(whole, names), _with(form, {"fill_down": names})
+        with suppress(InputError, FitError):
+            proposal = _proposal(path, where, *filled, stated, answers)
+            if _is_confirmed(proposal):
+                return proposal
     check_cells(table, columns)
     blank = _blank_references(table, columns)
     table, form = _with_north(table, form, columns, above)
@@ -466,8 +473,7 @@ def _answer_by_readings(
         answers = dict(said) | dict(_columns_of(chosen))
         with suppress(InputError, FitError):
             proposal = propose_with(answers)
-            unexplained = [each.unexplained for each in proposal.wirings.values()]
-            if not proposal.open_axes and max(unexplained, default=1.0) < _CONFIRMED:
+            if _is_confirmed(proposal):
                 fits.append((proposal, chosen))
     if len(fits) != 1:
         return None
@@ -476,6 +482,25 @@ def _answer_by_readings(
         return None
     texts = [", ".join(text for _, text in answer.arguments) for answer in chosen]
     return proposal._replace(by_readings=tuple(texts))
+
+
+def _is_confirmed(proposal: Proposal) -> bool:
+    """Whether the readings tell the axes of all triads, and leave little of their variation."""
+    unexplained = [each.unexplained for each in proposal.wirings.values()]
+    return not proposal.open_axes and max(unexplained, default=1.0) < _CONFIRMED
+
+
+def _written_once(table: Table, columns: Mapping[str, ColumnSource]) -> tuple[str, ...]:
+    """Angles of the stand that may be written once for a series of rolls: filled in above blanks, beside toolfaces."""
+    *directions, roll = ANGLES_OF_STAND
+    rolls = labels_of(table, columns[roll].name) if roll in columns else [""]
+    names = [columns[each].name for each in directions if each in columns]
+    cells = {name: labels_of(table, name) for name in names}
+    return tuple(
+        name
+        for name, each in cells.items()
+        if all(rolls) and each[0] and each.count("") > _FEW_SHARE * len(each)
+    )
 
 
 def _columns_of(answers: Iterable[Answer]) -> Iterator[tuple[str, str]]:
@@ -530,18 +555,21 @@ def _is_of_readings(answer: Answer) -> bool:
 
 def _blank_references(table: Table, columns: Mapping[str, ColumnSource]) -> list[str]:
     """A sentence on angles of the stand that are blank at some stations, which are used without them."""
-    cells = []
+    cells, many = [], []
     for column in ANGLES_OF_STAND:
         if column in columns:
             values = numbers(table, columns[column].name)
             rows = np.flatnonzero(np.isnan(values)).tolist()
             few = len(rows) <= _FEW_SHARE * values.size
             cells += [f"{place(table, row)} ({shown(columns[column].name)})" for row in rows if few]
-    return (
-        [f"blank angles of the stand are unknown at their stations: {listed(cells, MARKS_NAMED)}."]
-        if cells
-        else []
-    )
+            many += [
+                f"{len(rows)} of {values.size} stations have no {shown(columns[column].name)}: it is unknown there."
+            ] * (not few)
+    if cells:
+        many.append(
+            f"blank angles of the stand are unknown at their stations: {listed(cells, MARKS_NAMED)}."
+        )
+    return many
 
 
 def _with(form: TableFormat | None, fields: Mapping[str, Any]) -> TableFormat | None:

@@ -75,12 +75,13 @@ TRANSLATIONS = (
     ),
     (
         r"pole magn\w*\.?(?=[ _]*[xyz])|magneses(?=[ _]*[xyz])|manyetik(?=[ _]*[xyz])|magneetveld(?=[ _]*[xyz])|"
-        r"medan(?=[ _]*[xyz])|磁気(?=[ _]*[xyz])|magnetfalt(?=[ _]*[xyz])|campo(?=[ _]*[xyz]\b)|"
-        r"\bmagneto\b\.?|magnetometre|magn\b\.?(?=[ _]*[xyz]\b)|magnetfeld(?=[ _]*[xyz])|magnetfelt(?=[ _]*[xyz])|"
+        r"medan(?=[ _]*[xyz])|磁気(?=[ _]*[xyz])|magnetfalt(?=[ _]*[xyz])|campo(?=[ _]*[bhm]?[xyz]\b)|"
+        r"\bmagneto\b\.?|magnetometre|magn\b\.?(?=[ _]*[xyz]\b)|magnet(feld|felt)(?=[ _]*[bhm]?[xyz]\b)|"
+        r"(magnetic|магнитн\w*) (field|поле)(?=[ _]*[bhm]?[xyz]\b)|champ( magn\w*)?(?=[ _]*[bhm]?[xyz]\b)|"
         r"magnetometry|magnetometros?|"
         r"magnetometr(?=[ _]*[xyz])|magnetometers?|магнитометр\w*|магн\b|феррозонд\w*|磁力计|"
-        r"磁通门|磁强计|campo magnetico(?=[ _]*[xyz])|campo mag(?=[ _]*[xyz])|"
-        r"\bmtm\b|磁(?=[ _]*[xyz])|flux[ _-]*gates?|磁场(?=[ (（_]*[xyz])",
+        r"磁通门|磁强计|campo magnetico(?=[ _]*[bhm]?[xyz]\b)|campo mag(?=[ _]*[xyz])|"
+        r"\bmtm\b|磁(?=[ _]*[xyz])|flux[ _-]*gates?|磁场(?=[ (（_]*[bhm]?[xyz])",
         "mag ",
     ),
     (

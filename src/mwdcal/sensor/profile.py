@@ -133,7 +133,8 @@ class TableFormat(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     looked for by the names of its columns instead, on the sheet named, if any. `azimuth_reference` and its angles are
     those of tables that do not state them. `ignore` are columns, and references above them, that are no evidence
     whatever they are called. `leave_out` and `keep` say by the texts of a column which rows of a run are rejected, and
-    which are not.
+    which are not. A blank cell in the columns of `fill_down` is that of the row above: angles written once for a
+    series of rolls.
     """
 
     encoding: Literal[
@@ -160,6 +161,7 @@ class TableFormat(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     ignore: tuple[str, ...] = ()
     leave_out: dict[str, tuple[str, ...]] = {}
     keep: dict[str, tuple[str, ...]] = {}
+    fill_down: tuple[str, ...] = ()
 
     @property
     def north(self) -> dict[str, object]:
@@ -171,11 +173,12 @@ class TableFormat(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 class ColumnSource(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The column of a table that holds a quantity under another name, and the unit it is in there.
 
-    Without `unit` it is in the unit of the run file.
+    Without `unit` it is in the unit of the run file. `instead_of` is the unit that the table states for it wrongly.
     """
 
     name: str
     unit: str = ""
+    instead_of: str = ""
 
 
 class StreamForm(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

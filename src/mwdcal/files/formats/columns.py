@@ -121,6 +121,30 @@ def plain_names(names: Sequence[str]) -> list[str]:
     return plain
 
 
+Merged = Sequence[tuple[tuple[int, int], tuple[int, int]]]
+"""Ranges of merged cells: the first and the last, each by row from 1 and column from 0."""
+
+
+def with_merged(
+    rows: Iterable[tuple[int, Sequence[object]]], merged: Merged
+) -> Iterator[tuple[int, Sequence[object]]]:
+    """Rows by number, with the value of cells that are merged downwards in each of their rows.
+
+    >>> [*with_merged([(1, [10, 0]), (2, [None, 90])], [((1, 0), (2, 0))])]
+    [(1, [10, 0]), (2, [10, 90])]
+    """
+    ends = {place: last for place, (last, _) in merged if last > place[0]}
+    running: dict[int, tuple[int, object]] = {}
+    for line, row in rows:
+        running = {c: each for c, each in running.items() if each[0] >= line}
+        if blank := [c for c in running if c >= len(row) or row[c] in (None, "")]:
+            row = [*row, *[None] * (max(blank) + 1 - len(row))]
+            for column in blank:
+                row[column] = running[column][1]
+        running |= {c: (ends[line, c], cell) for c, cell in enumerate(row) if (line, c) in ends}
+        yield line, row
+
+
 def letters_of(place: int) -> str:
     """The letters of a column of a workbook by its place from 0.
 

@@ -19,6 +19,7 @@ import numpy as np
 from mwdcal.errors import Answer, InputError, QuestionError
 from mwdcal.files.formats import figures
 from mwdcal.files.formats.columns import (
+    Merged,
     as_text,
     letters_of,
     looks_numeric,
@@ -53,6 +54,10 @@ _OF_LOGGERS = re.compile(
 _UNIT_BEHIND = re.compile(r"(.*?)\s*([(\[][^)\]]*[)\]]|,\s*[^\s,]{1,5})")
 _AXIS = re.compile(r"\W*([xyz123])\W*([(\[].*)?", re.IGNORECASE)
 """A name that is an axis alone, and says nothing without the title above it."""
+_OF_AXIS = re.compile(r"\W*\w{0,6}[xyz123]\W*([(\[].*)?", re.IGNORECASE)
+"""A name that ends in an axis."""
+_SYMBOL = re.compile(r"[^\W\d_]")
+"""A name that is the symbol of a quantity."""
 _DEGREES_OF = re.compile(
     r"(.+?)[\s,(\[_]+(?:(?P<d>deg|grad|град|°|grados|graus|度)|(?P<m>min|мин|minutos|'|′|分))\W*",
     re.IGNORECASE,
@@ -95,7 +100,8 @@ Cells = Sequence[object]
 class Sheet(NamedTuple):
     """The rows of a sheet that are not blank, by number, each without blank cells at its end.
 
-    `form`: encoding and delimiter of a text; `number` of the sheet in its file, and `first_column` of its rows, from 0.
+    `form`: encoding and delimiter of a text; `number` of the sheet in its file, and `first_column` of its rows, from 0;
+    `merged` cells.
     """
 
     name: str
@@ -103,6 +109,7 @@ class Sheet(NamedTuple):
     form: TableFormat = TableFormat()
     number: int = 0
     first_column: int = 0
+    merged: Merged = ()
 
 
 @dataclass(frozen=True)
@@ -459,7 +466,7 @@ def _is_reading(row: Cells) -> bool:
 def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layout | None:
     """The table whose last row of names, or of units, is at a place, down to the row before `end`."""
     rows = sheet.rows
-    names, units, top = _head(rows, head)
+    names, units, top = _head(rows, head, sheet.merged)
     below = rows[_another_part(rows, head, end) : end]
     end -= len(below)
     readings = [place for place in range(head + 1, end) if _is_reading(rows[place][1])]
@@ -617,26 +624,52 @@ def _words(row: Cells) -> str:
     return " ".join(filter(None, map(as_text, row)))[:60]
 
 
-def _head(rows: Sequence[tuple[int, Cells]], place: int) -> tuple[list[str], list[str], int]:
+def _head(
+    rows: Sequence[tuple[int, Cells]], place: int, merged: Merged
+) -> tuple[list[str], list[str], int]:
     """Names and units of the columns above the readings, and the place of the first row of them."""
     units: list[str] = []
+    readings = rows[place + 1][1] if place + 1 < len(rows) else ()
     if place and all(_OF_LOGGERS.fullmatch(as_text(c)) for c in rows[place][1] if c != ""):
         place -= 1
     if place and _is_units(rows[place][1]) and _texts(rows[place - 1][1]) >= LEAST_COLUMNS:
         units = [as_text(cell).strip(" []()") for cell in rows[place][1]]
         place -= 1
     names = [" ".join(as_text(cell).split()) for cell in rows[place][1]]
+    units = ["" if unit == name else unit for unit, name in zip_longest(units, names, fillvalue="")]
     top = place
     while (
         top
         and place - top < _MOST_HEADER_ROWS - 1
         and rows[top - 1][0] == rows[top][0] - 1
-        and (_need_titles(names) or _stands_over_units(rows[top - 1][1], names))
         and _is_title(rows[top - 1][1])
     ):
+        line, row = rows[top - 1]
+        spans = {k: end - k for (at, k), (_, end) in merged if at == line and end > k}
+        if not _is_of_names(row, names, readings, spans):
+            break
         top -= 1
-        names = _joined(rows[top][1], names)
+        names = _joined(row, names, spans)
     return names, [*units, *[""] * len(names)][: len(names)], top
+
+
+def _is_of_names(
+    row: Cells, names: Sequence[str], readings: Cells, spans: Mapping[int, int]
+) -> bool:
+    """Whether a row above names is one of them too: they need its titles, or it names what they leave open.
+
+    That is a column of readings without a name, a symbol, or the units; and a title that is merged over columns is
+    one of their group.
+    """
+    if _need_titles(names) or _stands_over_units(row, names):
+        return True
+    if titles([row]).metadata:
+        return False
+    each = zip_longest(row, names, readings, fillvalue="")
+    lone = any(isinstance(c, str) and c and not name and r != "" for c, name, r in each)
+    symbols = any(map(_SYMBOL.fullmatch, names))
+    stated = [m[2] for c in row if (m := _UNIT_BEHIND.fullmatch(as_text(c))) and unit_of(m[2])]
+    return len(spans) > 1 or len(stated) > 1 or (_texts(row) >= LEAST_COLUMNS and (lone or symbols))
 
 
 def _need_titles(names: Sequence[str]) -> bool:
@@ -664,16 +697,24 @@ def _is_title(row: Cells) -> bool:
     return _texts(row) >= 2 and not any(map(figures.is_figure, row))
 
 
-def _joined(row: Cells, names: Sequence[str]) -> list[str]:
-    """Names with the title above each: that of the column, or of the nearest column to the left that has one."""
+def _joined(row: Cells, names: Sequence[str], spans: Mapping[int, int]) -> list[str]:
+    """Names with the title above each: that of the column, or of the nearest column to the left that has one.
+
+    A title goes on over names of axes, or over any until a blank one; where cells of its row are merged, by `spans`
+    of columns, over these alone.
+    """
     above = [" ".join(as_text(cell).split()) for cell in row]
     above += [""] * (len(names) - len(above))
-    title, of_axes, joined = "", False, []
-    for upper, name in zip(above, [*names, *[""] * len(above)], strict=False):
-        is_axis = bool(_AXIS.fullmatch(name))
+    title, of_axes, end, joined = "", False, 0, []
+    for place, (upper, name) in enumerate(zip(above, [*names, *[""] * len(above)], strict=False)):
+        of_axis = bool(_OF_AXIS.fullmatch(name))
         if upper:
-            title, of_axes = upper, is_axis
-        elif not name or (of_axes and not is_axis):
+            title, of_axes, end = upper, of_axis, place + spans.get(place, 0)
+        elif (
+            (spans and place > end)
+            or not name
+            or (of_axes and not of_axis and names.count(name) == 1)
+        ):
             title = ""
         joined.append(_with_title(title, name) if title != name else name)
     return joined[: max(len(names), len(above))]
@@ -684,7 +725,9 @@ def _with_title(title: str, name: str) -> str:
     if _is_unit(name):
         return f"{title} ({name.strip(' []()')})"
     match = _UNIT_BEHIND.fullmatch(title) if "(" not in name and "[" not in name else None
-    return " ".join([match[1], name, match[2]]).strip() if match else f"{title} {name}".strip()
+    if not match:
+        return f"{title} {name}".strip()
+    return f"{match[1]} {name}".strip() + f" {match[2]}".replace(" ,", ",")
 
 
 def _is_units(row: Cells) -> bool:

@@ -14,7 +14,7 @@ from typing import Any
 from mwdcal import extras
 from mwdcal.errors import InputError
 from mwdcal.files.formats import figures, text
-from mwdcal.files.formats.columns import WORKBOOKS, at_most, damaged_unless_read
+from mwdcal.files.formats.columns import WORKBOOKS, at_most, damaged_unless_read, with_merged
 from mwdcal.files.formats.layout import LEAST_COLUMNS, Cells, Sheet
 from mwdcal.sensor.profile import TableFormat
 
@@ -41,7 +41,10 @@ def sheets_of(data: bytes, name: str) -> list[Sheet]:
         from mwdcal.files.formats import workbook
 
         pages = workbook.read_sheets(data, name)
-        return [Sheet(title, _rows(page), number=n) for n, (title, page) in enumerate(pages)]
+        return [
+            Sheet(title, _rows(page), number=n, merged=merged)
+            for n, (title, page, merged) in enumerate(pages)
+        ]
     if suffix in WORKBOOKS:
         return list(_by_calamine(data, name))
     text.refuse_foreign(data, name, allowed=text.UTF_16)
@@ -165,12 +168,17 @@ def _by_calamine(data: bytes, source: str) -> Iterator[Sheet]:
                 "cells",
                 "Save the sheet with the run alone.",
             )
-            first = page.start[0] if page.start else 0
-            rows = enumerate(page.to_python(skip_empty_area=True), first + 1)
+            first, left = page.start or (0, 0)
+            merged = [
+                ((top + 1, one - left), (bottom + 1, other - left))
+                for (top, one), (bottom, other) in page.merged_cell_ranges or ()
+            ]
+            rows = with_merged(enumerate(page.to_python(skip_empty_area=True), first + 1), merged)
             yield Sheet(
                 name,
                 [(line, cells) for line, row in rows if (cells := _trimmed(_plain(row)))],
-                first_column=page.start[1] if page.start else 0,
+                first_column=left,
+                merged=merged,
             )
 
 

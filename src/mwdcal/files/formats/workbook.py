@@ -21,6 +21,7 @@ from mwdcal.files import metadata as meta
 from mwdcal.files.formats.columns import (
     MAX_COLUMNS,
     Column,
+    Merged,
     Parts,
     as_text,
     assemble,
@@ -28,6 +29,7 @@ from mwdcal.files.formats.columns import (
     number,
     plain_names,
     typed,
+    with_merged,
 )
 from mwdcal.files.formats.text import is_metadata
 from mwdcal.files.formats.title_references import stated_above
@@ -158,6 +160,9 @@ _EXPECTED = "an Excel workbook (.xlsx)", "Save it again as .xlsx, or as CSV UTF-
 LONGEST_CELL = 32_767
 _MOST_DIGITS = 15
 _FORMULA = re.compile(rb"<(\w+:)?f[\s/>]")
+_MERGED = re.compile(
+    rb'<(?:\w+:)?mergeCell\s[^>]*ref="([A-Z]{1,3})(\d{1,7}):([A-Z]{1,3})(\d{1,7})"'
+)
 _NAMED = 5
 """Most cells that a message names."""
 _UNWRITABLE = re.compile(r"[\x00-\x08\x0b-\x1f\ufffe\uffff]")
@@ -299,14 +304,28 @@ def read_rows(data: bytes, source: str) -> Iterator[Row]:
         yield from _rows(archive, book.worksheets[0], source)
 
 
-def read_sheets(data: bytes, source: str) -> Iterator[tuple[str, Iterator[Row]]]:
-    """The names of all sheets, and their rows as `read_rows` gives them: each to be read before the next.
+def read_sheets(data: bytes, source: str) -> Iterator[tuple[str, Iterator[Row], Merged]]:
+    """The names of all sheets, their rows as `read_rows` gives them, and their merged cells: each to be read in turn.
 
     A formula without a value is its text, which is no number: it may stand in a column that no one needs.
     """
     with _opened(data, source) as (archive, book):
         for page in book.worksheets:
-            yield page.title, _rows(archive, page, source, as_text=True)
+            yield page.title, _rows(archive, page, source, as_text=True), _merged(archive, page)
+
+
+def _merged(archive: zipfile.ZipFile, page: Any) -> Merged:
+    """The merged cells of a sheet."""
+    return [
+        ((int(top), _place(first)), (int(bottom), _place(last)))
+        for first, top, last, bottom in _MERGED.findall(archive.read(page._worksheet_path))
+    ]
+
+
+def _place(letters: str | bytes) -> int:
+    """The place from 0 of a column by its letters."""
+    text = letters if isinstance(letters, str) else letters.decode()
+    return sum((ord(x) - 64) * 26**i for i, x in enumerate(reversed(text))) - 1
 
 
 @contextmanager
@@ -333,8 +352,10 @@ def _rows(
             _check_formulas(formulas, source)
         by_row = _by_row(formulas)
         page.reset_dimensions()
-        for line, row in enumerate(page.iter_rows(values_only=True), 1):
-            cells = _trimmed([_read(value) for value in _with_formulas(row, by_row.get(line, {}))])
+        rows = enumerate(page.iter_rows(values_only=True), 1)
+        calculated = ((line, _with_formulas(row, by_row.get(line, {}))) for line, row in rows)
+        for line, row in with_merged(calculated, _merged(archive, page)):
+            cells = _trimmed([_read(value) for value in row])
             if cells:
                 yield line, cells
 
@@ -344,8 +365,7 @@ def _by_row(formulas: Mapping[str, str]) -> dict[int, dict[int, str]]:
     by_row: dict[int, dict[int, str]] = {}
     for cell, text in formulas.items():
         if match := re.fullmatch(r"([A-Z]{1,3})(\d{1,7})", cell):
-            column = sum((ord(x) - 64) * 26**i for i, x in enumerate(reversed(match[1]))) - 1
-            by_row.setdefault(int(match[2]), {})[column] = text
+            by_row.setdefault(int(match[2]), {})[_place(match[1])] = text
     return by_row
 
 

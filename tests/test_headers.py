@@ -1,0 +1,158 @@
+"""Tables whose columns are named in several rows, whose cells are merged or written once, and what is said of them."""
+
+import csv
+
+import numpy as np
+import openpyxl
+import pytest
+
+import mwdcal
+from cli_support import EXAMPLE
+from mwdcal.files.formats import table as tables
+from mwdcal.files.runs import read_export, run_table
+
+COLUMNS = [
+    *("ref_inclination_deg", "ref_azimuth_deg", "ref_toolface_deg"),
+    *("ax", "ay", "az", "mx", "my", "mz", "temperature_c"),
+]
+TITLES = [["Field (nT)", 50000, "", "Dip (deg)", 60, "", "Serial", "AB-12"], []]
+
+
+def stations():
+    """Rows of a simulated run, in the order of COLUMNS: numbers."""
+    lines = (EXAMPLE / "run.csv").read_text("utf-8").splitlines()
+    rows = csv.DictReader(line for line in lines if not line.startswith("#"))
+    return [[float(row[name]) for name in COLUMNS] for row in rows if all(row.values())]
+
+
+def workbook(path, rows, merged=()):
+    """A workbook of one sheet with these rows, and cells that are merged."""
+    book = openpyxl.Workbook()
+    for row in rows:
+        book.active.append([None if cell == "" else cell for cell in row])
+    for cells in merged:
+        book.active.merge_cells(cells)
+    book.save(path)
+    return path
+
+
+def text(path, rows):
+    """A text table of these rows."""
+    path.write_text("\n".join(",".join(map(str, row)) for row in rows), "utf-8")
+    return path
+
+
+def taken(path, **answers):
+    """The table under the names of a run file, by the profile proposed for it."""
+    profile = mwdcal.propose_profile(path, **answers).profile
+    return run_table(read_export(path, profile), profile)
+
+
+def same(run, rows):
+    """Whether a run has all numbers of these rows."""
+    return all(
+        np.allclose(tables.numbers(run, name), cells, rtol=1e-12)
+        for name, cells in zip(COLUMNS, zip(*rows, strict=True), strict=True)
+    )
+
+
+HEADS = {
+    "triads in the lower row": [
+        ["Inc", "Azi", "TF", "Accelerometer (V)", "", "", "Magnetometer (V)", "", "", "Temp C"],
+        ["", "", "", "Gx", "Gy", "Gz", "Bx", "By", "Bz"],
+    ],
+    "names, symbols, units": [
+        *[["Neigung", "Azimut", "Toolface", "Beschleunigung", "", "", "Magnetfeld", "", ""]],
+        *[["I", "A", "TF", "ax", "ay", "az", "mx", "my", "mz", "T"]],
+        ["°", "°", "°", "V", "V", "V", "V", "V", "V", "°C"],
+    ],
+    "in words and in short": [
+        *[["Inclinación", "Azimut", "Cara de herramienta", "Acelerómetro", "", ""]],
+        *[["Inc (°)", "Az (°)", "TF (°)", "Gx (V)", "Gy (V)", "Gz (V)"]],
+    ],
+}
+HEADS["names, symbols, units"][0].append("Temperatur")
+HEADS["in words and in short"][0] += ["Campo magnético", "", "", "Temperatura"]
+HEADS["in words and in short"][1] += ["Bx (V)", "By (V)", "Bz (V)", "T (°C)"]
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_a_column_is_named_by_all_rows_above_it(tmp_path, head):
+    """Unmerged cells; the rows of a run come back by the names of both rows together."""
+    rows = stations()
+    assert same(taken(text(tmp_path / "run.csv", [*TITLES, *HEADS[head], *rows])), rows)
+
+
+def test_names_merged_over_the_units_of_a_group_go_no_further(tmp_path):
+    """Cells of names merged downwards, titles over three columns each; the rolls of a series share merged angles."""
+    rows = stations()
+    upper, lower = HEADS["triads in the lower row"]
+    table, merged = [*TITLES, upper, lower], ["D3:F3", "G3:I3", *(f"{c}3:{c}4" for c in "ABCJ")]
+    begun = 0
+    for place, row in enumerate([*rows, [None] * len(COLUMNS)]):
+        if row[:2] != rows[begun][:2]:
+            merged += [f"{c}{begun + 5}:{c}{place + 4}" for c in "AB" if place - begun > 1]
+            begun = place
+        table.append(row if place == begun else ["", "", *row[2:]])
+    path = workbook(tmp_path / "run.xlsx", table, merged)
+    assert same(taken(path), rows)
+
+
+def test_a_line_above_names_is_not_of_them(tmp_path):
+    """A title block right above the names, of texts alone, changes no name."""
+    rows = stations()
+    names = ["Inc", "Azi", "TF", "Gx (V)", "Gy (V)", "Gz (V)", "Bx (V)", "By (V)", "Bz (V)", "T C"]
+    above = ["Operator", "A. Smith", "Customer", "Acme Ltd", "Tool S/N", "AB-12"]
+    path = text(tmp_path / "run.csv", [["Field 50000 nT, dip 60 deg"], above, names, *rows])
+    where = tables.laid_out(path)
+    assert where.names == names
+    assert where.titles.metadata["serial"] == "AB-12"
+
+
+def test_toolfaces_round_a_turn_are_offered_as_such(tmp_path):
+    """Rolls in equal steps are no numbers of rows: a column without a name is offered as the toolface."""
+    rows = [[*row[:2], 45.0 * (n % 8), *row[3:]] for n, row in enumerate(stations())]
+    names = ["Inc", "Azi", "q", "Gx (V)", "Gy (V)", "Gz (V)", "Bx (V)", "By (V)", "Bz (V)", "T C"]
+    with pytest.raises(mwdcal.FitError) as error:
+        mwdcal.propose_profile(text(tmp_path / "run.csv", [*TITLES, names, *rows]))
+    questions = getattr(error.value, "questions", (error.value,))
+    offered = [a for each in questions for answer in each.answers for a in answer.arguments]
+    assert ("column", "ref_toolface_deg=q") in offered
+
+
+def in_series(rows):
+    """Rows sorted to series of rolls, with the angles of each direction in its first row alone."""
+    rows = sorted(rows, key=lambda row: row[:2])
+    return rows, [
+        row if not n or row[:2] != rows[n - 1][:2] else ["", "", *row[2:]]
+        for n, row in enumerate(rows)
+    ]
+
+
+NAMES = ["Inc", "Azi", "TF", "Gx (V)", "Gy (V)", "Gz (V)", "Bx (V)", "By (V)", "Bz (V)", "T C"]
+
+
+def test_angles_written_once_for_a_series_are_those_of_the_row_above(tmp_path):
+    """The readings fit them; the profile says so, and calibrate reads the same table, each naming how many."""
+    rows, once = in_series(stations())
+    path = text(tmp_path / "run.csv", [*TITLES, NAMES, *once])
+    proposed = mwdcal.propose_profile(path)
+    blank = sum(row[0] == "" for row in once)
+    said = [each.text for each in proposed.findings if "from the row above" in each.text]
+    assert [each.split(" rows")[0] for each in said] == [f"{blank} of {len(rows)}"] * 2
+    assert proposed.profile.table.fill_down == ("Inc", "Azi")
+    run = taken(path)
+    assert same(run, rows)
+    assert [each for each in run.remarks if "from the row above" in each] == said
+
+
+def test_blank_angles_that_the_readings_do_not_fit_are_unknown_and_counted(tmp_path):
+    """Angles in a few rows alone, which are not those of the rows below: none is filled in, and the rest is told."""
+    rows = sorted(stations(), key=lambda row: row[2])
+    some = [row if n % 4 == 0 else ["", "", *row[2:]] for n, row in enumerate(rows)]
+    proposed = mwdcal.propose_profile(text(tmp_path / "run.csv", [*TITLES, NAMES, *some]))
+    blank = sum(row[0] == "" for row in some)
+    texts = [each.text for each in proposed.findings]
+    for name in ("Inc", "Azi"):
+        assert f"{blank} of {len(rows)} stations have no '{name}': it is unknown there." in texts
+    assert not any("from the row above" in each for each in texts)
