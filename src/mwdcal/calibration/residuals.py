@@ -13,8 +13,18 @@ from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import ErrorRow, Measures, StationRow, figures, stated
 from mwdcal.estimation.batch import take
-from mwdcal.estimation.problem import ANGLES, STAND_ERRORS
-from mwdcal.estimation.uncertainty import Analysis, normal_quantile, station_misfit, without_station
+from mwdcal.estimation.minimisers import closed_form
+from mwdcal.estimation.problem import ANGLES, STAND_ERRORS, Problem
+from mwdcal.estimation.uncertainty import (
+    Analysis,
+    by_triad,
+    fisher_tail,
+    left_out_variances,
+    normal_quantile,
+    per_freedom,
+    station_misfit,
+    without_station,
+)
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, Ints, distinct
 
@@ -408,11 +418,65 @@ def chances(fit: Fit) -> Array:
 
 
 def _chances(fit: Fit) -> Array:
+    by_left_out = is_by_left_out(fit)
+    if by_left_out.all():
+        return _left_out_chances(fit)
     square, freedom = station_misfit(_judged(fit))
     others = np.maximum(freedom.sum(-1, keepdims=True) - freedom, 1)
     variance = np.maximum((square.sum(-1, keepdims=True) - square) / others, 1e-30)
     declared = np.isnan(fit.noise).all(-1, keepdims=True)
-    return tail(square / np.where(declared, np.maximum(variance, 1.0), variance), freedom)
+    chance = tail(square / np.where(declared, np.maximum(variance, 1.0), variance), freedom)
+    some = np.flatnonzero(by_left_out)
+    if some.size:
+        chance[some] = _left_out_chances(take(fit, some))
+    return chance
+
+
+def is_by_left_out(fit: Fit) -> Bools:
+    """Fits (B,) whose stations are judged by the noise that the others show: it is estimated, and all count alike."""
+    estimated = np.isfinite(fit.noise).any(-1) & (fit.trust == 1).all(-1)
+    return np.asarray(estimated & (fit.analysis.influence is None))
+
+
+def _left_out_chances(fit: Fit) -> Array:
+    """Chances (B, n) by the residuals of each triad against the noise in the fit without the station: Fisher's F.
+
+    The least of the triads', times their number. A gross error of a station is in the estimated noise, and hides
+    there: with few stations no residual can exceed it three times.
+
+    Reference: R. D. Cook and S. Weisberg, Residuals and Influence in Regression (1982), section 2.2: externally
+    studentised residuals.
+    """
+    exact = None if closed_form.applies(fit.problem) else fit.problem
+    chance, tests = np.ones(fit.analysis.residual.shape[:2]), left_out_tests(fit, exact)
+    for index, (square, freedom, variance, rest) in enumerate(tests):
+        declared = np.isnan(fit.noise[:, index])
+        by_noise = tail(square / np.maximum(np.nan_to_num(variance), 1.0), freedom)
+        tested = (freedom > 0) & (rest >= 1)
+        ratio = square / np.maximum(np.where(tested, freedom * variance, 1.0), 1e-300)
+        by_others = fisher_tail(np.maximum(freedom, 1.0), np.maximum(rest, 1.0), ratio)
+        one = np.where(declared[:, None], by_noise, np.where(tested, by_others, 1.0))
+        chance = np.minimum(chance, one)
+    return np.minimum(chance * len(tests), 1.0)
+
+
+def left_out_tests(fit: Fit, problem: Problem | None = None) -> list[tuple[Array, ...]]:
+    """χ² of each station in each triad, s² in the fit without it, and the degrees of freedom of both (B, n).
+
+    s² is exact with the `problem` of the fit. Without, S of `left_out_variances` is taken as a projection of each
+    triad, as it is where references are exact: the sum of squares falls by the χ² of the station.
+    """
+    each = [station_misfit(analysis) for analysis in by_triad(fit.analysis)]
+    if problem:
+        variance, rest = left_out_variances(problem, fit.state, fit.analysis)
+        return [(*one, variance[..., i], rest[..., i]) for i, one in enumerate(each)]
+    totals = fit.analysis.variance_factor, fit.analysis.freedom
+    tests: list[tuple[Array, ...]] = []
+    for (square, tested), factor, freedom in zip(each, *(x.mT for x in totals), strict=True):
+        rest = freedom[:, None] - tested
+        squares = (np.nan_to_num(factor) * freedom)[:, None] - square
+        tests.append((square, tested, np.maximum(per_freedom(squares, rest), 0.0), rest))
+    return tests
 
 
 def stations_to_remeasure(chance: Array) -> Bools:

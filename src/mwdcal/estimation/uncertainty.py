@@ -11,6 +11,7 @@ Reference: D. A. Harville, J. Am. Stat. Assoc. 72, 320 (1977).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import chain, product
 from math import erfc
@@ -571,6 +572,50 @@ def left_out_residual(analysis: Analysis) -> Array:
     Exact for a linear problem. Directions of a station's readings that nothing else tests have none.
     """
     return _along(_tested_inverse(analysis.spread)[0], analysis.residual)
+
+
+def left_out_variances(problem: Problem, state: State, analysis: Analysis) -> tuple[Array, Array]:
+    """s² and degrees of freedom (B, n, t) of each triad in the fit without one station, for each station.
+
+    Exact for a linear problem: a station left out moves the residuals of the others by -S_ji S_ii⁺ C⁻¹ρ, S being the
+    covariance of all residuals. s² is NaN where the others leave no freedom.
+    """
+    linear, factor, freedom = problem.linear(state), analysis.variance_factor, analysis.freedom
+    taken = [np.stack(part, -1) for part in zip(*_taken(linear, analysis), strict=True)]
+    squares = (np.nan_to_num(factor) * freedom)[:, None] - taken[0]
+    left = freedom[:, None] - taken[1]
+    return np.maximum(per_freedom(squares, left), 0.0), left
+
+
+def _taken(linear: Linear, analysis: Analysis) -> Iterator[tuple[Array, Array]]:
+    """What a station left out takes of each triad's sum of squares and of its degrees of freedom, (B, n) each."""
+    whole, weighed = whole_covariance(linear, analysis.determined), linear.weighed[..., :-1]
+    residual, spread, back = analysis.residual, analysis.spread, _tested_inverse(analysis.spread)[0]
+    pulled = _along(back, residual)
+    moved = (weighed.mT @ pulled[..., None])[..., 0] @ whole
+    reach = weighed @ whole[:, None]
+    for first in range(0, residual.shape[-1], 3):
+        axes = slice(first, first + 3)
+        rows = weighed[..., axes, :]
+        flat = rows.reshape(len(rows), -1, rows.shape[-1])
+        gram = flat.mT @ flat
+        before = flat.mT @ residual[..., axes].reshape(len(rows), -1, 1)
+        own = residual[..., axes] + (rows @ moved[..., None])[..., 0]
+        change = 2 * (moved @ before)[..., 0] + np.sum((moved @ gram) * moved, -1)
+        cross = reach @ rows.mT
+        inner = reach @ (gram[:, None] @ reach.mT) - cross @ cross.mT
+        trace = np.trace(spread[..., axes, axes], axis1=-2, axis2=-1)
+        yield np.sum(own**2, -1) - change, trace + np.sum(back * inner, (-2, -1))
+
+
+def by_triad(analysis: Analysis) -> list[Analysis]:
+    """The residuals of each triad by itself, with their covariance."""
+    residual, spread = analysis.residual, analysis.spread
+    axes = [slice(first, first + 3) for first in range(0, residual.shape[-1], 3)]
+    return [
+        replace(analysis, residual=residual[..., each], spread=spread[..., each, each])
+        for each in axes
+    ]
 
 
 def _along(back: Array, residual: Array) -> Array:

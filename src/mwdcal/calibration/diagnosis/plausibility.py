@@ -19,6 +19,8 @@ from mwdcal.calibration.residuals import (
     Residuals,
     chances,
     chi_chance,
+    is_by_left_out,
+    left_out_tests,
     stations_to_remeasure,
     tail,
 )
@@ -275,6 +277,8 @@ SMALLEST_EXPECTATION = 1e-12
 """Expectations below this, in the unit of the observable, are rounding."""
 NOISE_RATIO = 3.0
 """Residuals of a robust fit that exceed the declared noise this many times are reported."""
+NEARLY = 0.75
+"""Share of a limit of χ² from which a station's is worked out exactly."""
 LEEWAY = 1.01
 """A station is suspect already if a bound is as unlikely as this many times the limit."""
 
@@ -497,15 +501,21 @@ def _suspects(result: Fit) -> Bools:
 
     With declared noise and no robust weights χ² itself must be. It is bounded from above by what
     the trace of the residuals' covariance says, whose eigenvalues are 0…1, then by that of all directions.
+    With estimated noise χ² must be for the noise without the station, as if that were known.
     """
     analysis = result.analysis
     residual, spread = analysis.residual, analysis.spread
     size, chance = spread.shape[-1], RESHOOT / len(result.trust[0])
     suspect = np.any(~np.isnan(result.noise), -1) | robust(result)
+    by_left_out = is_by_left_out(result)
+    if by_left_out.any():
+        suspect &= ~by_left_out | _stand_out(result, chance)
+    if suspect.all() or by_left_out.all():
+        return np.asarray(suspect)
     smallest = np.trace(spread, axis1=-2, axis2=-1) - (size - 1)
     good = np.sum(residual**2, -1) < likely(size, chance) * smallest
     good &= (smallest > TESTED) & (analysis.influence is None)
-    tool, station = np.nonzero(~good & ~suspect[:, None])
+    tool, station = np.nonzero(~good & ~(suspect | by_left_out)[:, None])
     square = quadratic_form(spread[tool, station], residual[tool, station])
     over = ~(square < likely(1, chance))
     tool, station = tool[over], station[over]
@@ -513,6 +523,19 @@ def _suspects(result: Fit) -> Bools:
     some = replace(analysis, residual=left, spread=spread[None, tool, station])
     suspect[tool[tail(*station_misfit(some))[0] < LEEWAY * chance]] = True
     return np.asarray(suspect)
+
+
+def _stand_out(result: Fit, chance: float) -> Bools:
+    """Fits (B,) of which a station has a triad whose χ² is as unlikely, or nearly so, for the noise of the others.
+
+    Fisher's F is never as unlikely as χ². Where references are uncertain the noise without a station is approximate.
+    """
+    limit = likely(3, chance / result.noise.shape[-1])
+    limit *= 1.0 if closed_form.applies(result.problem) else NEARLY
+    out = np.zeros(len(result.status), bool)
+    for square, _, variance, _ in left_out_tests(result):
+        out |= ~(square <= limit * np.nan_to_num(variance, nan=1.0)).all(-1)
+    return out
 
 
 @cache
