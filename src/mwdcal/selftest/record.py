@@ -29,7 +29,7 @@ from mwdcal.presentation.certificate import (
     TextBlock,
     plain,
 )
-from mwdcal.presentation.numbers import number, unit
+from mwdcal.presentation.numbers import quantity
 from mwdcal.presentation.text import one_line, plural, table
 from mwdcal.selftest.cases import SelftestRow, cases
 
@@ -107,13 +107,9 @@ def _versions() -> Iterator[tuple[str, str]]:
 
 
 def _cells(row: SelftestRow) -> list[str]:
-    symbol = unit(row.unit)
     count = str(row.count) if row.count else "–"
     shown = "–" if row.expected is None else plain(row.expected)
-    sizes = [
-        number(row.difference, 2) + symbol * (row.difference is not None),
-        number(row.allowed, 2) + symbol,
-    ]
+    sizes = [quantity(size, row.unit, 2) for size in (row.difference, row.allowed)]
     return [row.name, row.authority, count, shown, *sizes, row.outcome]
 
 
