@@ -191,6 +191,7 @@ def test_other_words_behind_a_dip_do_not_turn_it(row):
 TWO_PLACES = (
     ["Field: 50123 / 48210 nT"], ["Field at Lab A 50123 nT, at Lab B 48210 nT"], ["Field (nT)", 50123, 48210],
     ["Dip: 66.12° / 58.30°"], ["Dip 66.12 and 58.30"], ["Dip", 66.12, 58.3], ["gravity 9.81234 and 9.79321"],
+    ["g, м/с2", "9.8141; 9.7931"], ["Campo de referencia (nT)", "44870 / 42178"],
 )  # fmt: skip
 
 

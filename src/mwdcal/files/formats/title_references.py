@@ -266,6 +266,12 @@ def references_in(rows: Rows, besides: Rows = ()) -> dict[str, float]:
     >>> references_in([["local field 46.8 uT nominal"], ["field uncertainty 50 nT"]])
     {}
     """
+    every = _values_in(rows, besides)
+    return {column: next(iter(each)) for column, each in every.items() if len(each) == 1}
+
+
+def _values_in(rows: Rows, besides: Rows = ()) -> dict[str, dict[float, None]]:
+    """The different values of each reference that rows above a table and lines `besides` state."""
     texts = [_clauses(row) for row in [*_with_columns(rows), *besides]]
     by_word, of_places, by_unit = (dict[str, dict[float, None]]() for _ in range(3))
     for text in texts:
@@ -281,7 +287,7 @@ def references_in(rows: Rows, besides: Rows = ()) -> dict[str, float]:
     every = by_unit | of_places | {c: each | by_unit.get(c, {}) for c, each in by_word.items()}
     if "ref_field_nt" in every and "ref_dip_deg" not in every:
         every["ref_dip_deg"] = dict.fromkeys(v for text in texts for v in _inclinations(text))
-    return {column: next(iter(each)) for column, each in every.items() if len(each) == 1}
+    return every
 
 
 def _with_columns(rows: Rows) -> list[Sequence[object]]:
@@ -430,8 +436,8 @@ def _in_unit(quantity: _Quantity, numbers: Iterable[re.Match[str]]) -> set[float
 def doubtful_in(rows: Rows, besides: Rows = ()) -> dict[str, str]:
     """The lines above a table that may state a reference, by column of a run file.
 
-    They state a nominal or approximate one, a number in a unit and of a size that the Earth's field or gravity has, or
-    one that no place has.
+    They state a nominal or approximate one, two, a number in a unit and of a size that the Earth's field or gravity
+    has, or one that no place has.
 
     >>> doubtful_in([["Nominal field", "48 500 nT"], ["Field uncertainty 50 nT"], ["here", "9.81 m/s2"]])
     {'ref_field_nt': 'Nominal field 48 500 nT', 'ref_gravity_g': 'here 9.81 m/s2'}
@@ -442,6 +448,9 @@ def doubtful_in(rows: Rows, besides: Rows = ()) -> dict[str, str]:
         bare = _ROUGH.sub(" ", plain)
         for column in references_in([[bare]]) if bare != plain else ():
             lines.setdefault(column, line)
+        for column, each in _values_in([row]).items():
+            if len(each) > 1:
+                lines.setdefault(column, line)
         numbers = [*_NUMBER_IN_UNIT.finditer(plain)]
         for quantity in (_OF_PLACES[0], _OF_PLACES[2]):
             if _in_unit(quantity, numbers) - {1.0}:
