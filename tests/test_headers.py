@@ -156,3 +156,47 @@ def test_blank_angles_that_the_readings_do_not_fit_are_unknown_and_counted(tmp_p
     for name in ("Inc", "Azi"):
         assert f"{blank} of {len(rows)} stations have no '{name}': it is unknown there." in texts
     assert not any("from the row above" in each for each in texts)
+
+
+def listing(path, names, units, rows, remarks=()):
+    """A listing of columns one below the other, each filled up with blanks, and remarks behind some rows."""
+    lines = ["".join(f"{cell:>14}" for cell in row) for row in [names, units, *rows]]
+    for row, remark in remarks:
+        lines[row + 2] += f"   {remark}"
+    path.write_text("\n".join(["FIELD 50000 NT  DIP 60 DEG", "", *lines]), "utf-8")
+    return path
+
+
+WORDS = ["INC", "AZI", "HS", "GX", "GY", "GZ", "HX", "HY", "HZ", "TEMP"]
+
+
+def test_a_unit_of_two_words_is_that_of_the_column_above_it(tmp_path):
+    """With a blank unit before it the units are as many words as there are columns."""
+    rows = [[n + 1, *row] for n, row in enumerate(stations())]
+    units = ["", "DEG", "DEG", "DEG", *["VOLTS"] * 6, "DEG C"]
+    path = listing(tmp_path / "run.txt", ["STN", *WORDS], units, rows)
+    assert tables.laid_out(path).units == units
+    assert same(taken(path), stations())
+
+
+def test_words_behind_the_last_column_are_one_remark(tmp_path):
+    """A question on it names its column, of which there is no name."""
+    units = ["DEG", "DEG", "DEG", *["V"] * 6, "DEGC"]
+    remarks = [(3, "bumped table, retaken")]
+    path = listing(tmp_path / "run.txt", WORDS, units, stations(), remarks)
+    with pytest.raises(mwdcal.FitError, match="'column 11' says 'bumped table, retaken'") as error:
+        mwdcal.propose_profile(path)
+    first, *_ = error.value.questions[0].answers[0].arguments
+    assert first == ("keep", "column 11=bumped table, retaken")
+    assert same(taken(path, keep={"column 11": ["bumped table, retaken"]}), stations())
+
+
+@pytest.mark.parametrize("answers", [{}, {"column": {"ref_toolface_deg": "TF (°)"}}])
+def test_a_unit_that_an_answer_corrects_holds_when_the_table_is_read_again(tmp_path, answers):
+    """Toolfaces under V: told by the readings or the user, and read with the profile of the answer."""
+    units = ["°", "°", "V", "V", "V", "V", "V", "V", "V", "°C"]
+    names = ["Inc", "Azi", "TF", "Gx", "Gy", "Gz", "Bx", "By", "Bz", "Temp"]
+    path = text(tmp_path / "run.csv", [*TITLES, names, units, *stations()])
+    profile = mwdcal.propose_profile(path, **answers).profile
+    assert profile.columns["ref_toolface_deg"].instead_of == "V"
+    assert same(taken(path, **answers), stations())

@@ -393,8 +393,8 @@ def _proposal(
     columns, by_value, ignored = proposed(
         names, units, values, table.source, above, table.metadata, answers, problems, open_rows
     )
-    if names := _written_once(table, columns):
-        filled = filled_down(whole, names), _with(form, {"fill_down": names})
+    if once := _written_once(table, columns):
+        filled = filled_down(whole, once), _with(form, {"fill_down": once})
         with suppress(InputError, FitError):
             proposal = _proposal(path, where, *filled, stated, answers)
             if _is_confirmed(proposal):

@@ -632,7 +632,7 @@ def _head(
     readings = rows[place + 1][1] if place + 1 < len(rows) else ()
     if place and all(_OF_LOGGERS.fullmatch(as_text(c)) for c in rows[place][1] if c != ""):
         place -= 1
-    if place and _is_units(rows[place][1]) and _texts(rows[place - 1][1]) >= LEAST_COLUMNS:
+    if place and is_units(rows[place][1]) and _texts(rows[place - 1][1]) >= LEAST_COLUMNS:
         units = [as_text(cell).strip(" []()") for cell in rows[place][1]]
         place -= 1
     names = [" ".join(as_text(cell).split()) for cell in rows[place][1]]
@@ -730,7 +730,7 @@ def _with_title(title: str, name: str) -> str:
     return f"{match[1]} {name}".strip() + f" {match[2]}".replace(" ,", ",")
 
 
-def _is_units(row: Cells) -> bool:
+def is_units(row: Cells) -> bool:
     """Whether a row holds units: of its cells that are filled in two or more are known, and all are short."""
     cells = [as_text(cell).strip() for cell in row if cell != ""]
     bare = [cell.strip("[]()").strip() for cell in cells]
