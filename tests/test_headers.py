@@ -129,6 +129,7 @@ def in_series(rows):
     ]
 
 
+CHANNELS = ["Gx", "Gy", "Gz", "Bx", "By", "Bz"]
 NAMES = ["Inc", "Azi", "TF", "Gx (V)", "Gy (V)", "Gz (V)", "Bx (V)", "By (V)", "Bz (V)", "T C"]
 
 
@@ -200,3 +201,28 @@ def test_a_unit_that_an_answer_corrects_holds_when_the_table_is_read_again(tmp_p
     profile = mwdcal.propose_profile(path, **answers).profile
     assert profile.columns["ref_toolface_deg"].instead_of == "V"
     assert same(taken(path, **answers), stations())
+
+
+@pytest.mark.parametrize(
+    ("form", "unit"),
+    [("Temperature: {} °C", 1.0), ("温度点：{}℃", 1.0), ("Oven at {} ± 2 F", 5 / 9)],
+)
+def test_temperatures_in_lines_between_the_rows_are_those_of_the_rows_below(tmp_path, form, unit):
+    """Said with their rows, in whatever order names and the first of them stand."""
+    rows = [row[:9] for row in stations()]
+    half = len(rows) // 2
+    blocks = [[form.format(20)], *rows[:half], [form.format(80)], *rows[half:]]
+    stated = [unit * (t - (32 if unit < 1 else 0)) for t in (20, 80)]
+    expected = [stated[n >= half] for n in range(len(rows))]
+    above, names, units = blocks[:1], [["Inc", "Azi", "TF", *CHANNELS]], [["°"] * 3 + ["V"] * 6]
+    for head in ([*names, *units, *above], [*above, *names, *units]):
+        path = text(tmp_path / "run.csv", [*TITLES, *head, *blocks[1:]])
+        run = taken(path)
+        assert np.allclose(tables.numbers(run, "temperature_c"), expected)
+        assert any(f"({half} rows)" in each for each in run.remarks)
+
+
+def test_lines_of_temperatures_beside_a_column_of_them_are_not_taken(tmp_path):
+    rows, half = stations(), len(stations()) // 2
+    table = [NAMES, ["Oven 20 °C"], *rows[:half], ["Oven 80 °C"], *rows[half:]]
+    assert same(taken(text(tmp_path / "run.csv", [*TITLES, *table])), rows)

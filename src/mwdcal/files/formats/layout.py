@@ -91,6 +91,19 @@ _OF_SETTING = re.compile(
 """The name of a sheet that is a setting of the stand or the oven: 77F, Inc 45, Cold."""
 _OF_WARMTH = re.compile(r"\W*?([+−-]?\d+(?:[.,]\d+)?)\s*(?:°|deg)?\s*[cf℃]\W*", re.IGNORECASE)
 """The name of a sheet that is a temperature with its unit."""
+_WARMTH_IN_WORDS = re.compile(
+    r"(?<![^\W\d_])(t(?![^\W\d_])|temp\w*|temperat\w*|oven|ofen|ovn|horno|forno|four|темп\w*|т-ра|термо\w*|печ\w*)|"
+    r"t[eé]mp[eé]rat|sıcaklık|温",
+    re.IGNORECASE,
+)
+"""Words of a temperature, in a line between rows or in the name of a column."""
+_WARMTH_IN_LINE = re.compile(
+    r"(?P<number>(?<![\d.,])[+−-]?\d+(?:[.,]\d+)?)(?:\s*(?:±|\+/?-)\s*\d+(?:[.,]\d+)?)?\s*"
+    r"(?:(?:°|º|deg\w*\.?)\s*(?P<unit>[cfсCFС])(?![^\W\d_])|(?P<sign>[℃℉])|(?P<bare>[CFС])(?![^\W\d_]))"
+)
+"""A temperature in a line: its number, a tolerance, and its unit, which is a bare letter only behind a word."""
+_WARMTH_OF_LINES = "Temperature of the line above"
+"""The name of a column of temperatures that stand in lines between the rows."""
 _SAME_WARMTH = 10.0
 """By how much a temperature differs at most from the one that its sheet is named by."""
 
@@ -121,7 +134,7 @@ class Layout:
     below the names that are no readings, `above` the texts above them;
     `parts` the sheet of each row where several are one table; `heading` the text right above the names;
     `titles` what the title block says of the tool, the day and the place; `places` letters of the columns in a
-    workbook.
+    workbook; `remarks` are sentences on what is taken from other places than the columns.
     """
 
     sheet: str
@@ -139,6 +152,7 @@ class Layout:
     places: Mapping[str, str] = field(default_factory=dict)
     parts: tuple[str, ...] = ()
     heading: str = ""
+    remarks: tuple[str, ...] = ()
 
     @property
     def size(self) -> int:
@@ -360,7 +374,9 @@ def _several(tables: Sequence[Layout], source: str, sheet: str) -> QuestionError
 def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
     """The tables of a sheet, one below the other: a head is no row of readings, and the next row is one."""
     rows = [row for row in sheet.rows if not _is_ruler(row[1])]
-    rows = [row for k, row in enumerate(rows) if not _is_remark_below_names(rows, k)]
+    remarks = [row for k, row in enumerate(rows) if _is_remark_below_names(rows, k)]
+    aside = {line for line, _ in remarks}
+    rows = [row for row in rows if row[0] not in aside]
     rows = _with_legend(rows)
     sheet = sheet._replace(rows=rows)
     readings = [_is_reading(row) for _, row in rows]
@@ -371,7 +387,7 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
     ]
     heads = [k for n, k in enumerate(heads) if n == 0 or _begins_anew(rows, heads[:n], k)]
     for head, end in pairwise([*heads, len(rows)]):
-        if layout := _table(sheet, head, end, source, decimal):
+        if layout := _table(sheet, head, end, source, decimal, remarks):
             yield layout
 
 
@@ -463,8 +479,18 @@ def _is_reading(row: Cells) -> bool:
     return numbers >= LEAST_COLUMNS and 2 * numbers >= sum(cell != "" for cell in row)
 
 
-def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layout | None:
-    """The table whose last row of names, or of units, is at a place, down to the row before `end`."""
+def _table(
+    sheet: Sheet,
+    head: int,
+    end: int,
+    source: str,
+    decimal: str,
+    remarks: Sequence[tuple[int, Cells]],
+) -> Layout | None:
+    """The table whose last row of names, or of units, is at a place, down to the row before `end`.
+
+    `remarks` are rows that stand between names and readings.
+    """
     rows = sheet.rows
     names, units, top = _head(rows, head, sheet.merged)
     below = rows[_another_part(rows, head, end) : end]
@@ -487,7 +513,7 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
         name: _both(unit, by_cells)
         for name, unit, (_, by_cells) in zip(names, units, read, strict=True)
     }
-    return Layout(
+    layout = Layout(
         sheet=sheet.name,
         form=msgspec.structs.replace(
             sheet.form,
@@ -514,6 +540,65 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
         ),
         places=dict(zip(names, letters, strict=True)) if sheet.name else {},
     )
+    return _with_warmth_of_lines(layout, [*rows[max(top - 1, 0) : top], *remarks, *others])
+
+
+def _with_warmth_of_lines(layout: Layout, lines: Sequence[tuple[int, Cells]]) -> Layout:
+    """A table with the temperatures that stand in lines between its rows, and above all, where it has no others."""
+    stated = {n: each for n, row in lines if (each := _warmth_in(" ".join(map(as_text, row))))}
+    above = [max((n for n in stated if n < line), default=0) for line in layout.lines]
+    if (
+        len({*stated.values()}) < 2
+        or not all(above)
+        or any(map(_WARMTH_IN_WORDS.search, layout.names))
+    ):
+        return layout
+    cells = [stated[n][0] for n in above]
+    numbers = [[*map(_number, column)] for column in layout.cells]
+    if any(
+        all(
+            v is not None and abs(v - float(c)) < _SAME_WARMTH
+            for v, c in zip(column, cells, strict=True)
+        )
+        for column in numbers
+    ):
+        return layout
+    units = {unit for _, unit in stated.values()}
+    counts = Counter(f"{number} {unit}" for number, unit in (stated[n] for n in above))
+    listed = ", ".join(f"{text} ({count} rows)" for text, count in counts.items())
+    name = f"{_WARMTH_OF_LINES} ({min(units)})"
+    return (
+        layout
+        if len(units) > 1
+        else replace(
+            layout,
+            names=[*layout.names, name],
+            units=[*layout.units, ""],
+            cells=[*layout.cells, cells],
+            texts=[*layout.texts, cells],
+            left_out=tuple(each for each in layout.left_out if each[0] not in stated),
+            remarks=(
+                *layout.remarks,
+                f"the temperatures are those of the lines above the rows: {listed}.",
+            ),
+        )
+    )
+
+
+def _warmth_in(text: str) -> tuple[str, str] | None:
+    """The one temperature that a line states, and its unit.
+
+    >>> [_warmth_in(t) for t in ("温度点：80℃", "Set 2: T = 20,5 ± 0.5 °C", "Oven 176 F", "20 to 80 °C", "Run C")]
+    [('80', '°C'), ('20.5', '°C'), ('176', '°F'), None, None]
+    """
+    word = _WARMTH_IN_WORDS.search(text)
+    every = [m for m in _WARMTH_IN_LINE.finditer(text) if word or not m["bare"]]
+    others = re.findall(r"(?:to|bis|til|до|[-–…])\s*$", text[: every[0].start()]) if every else []
+    if len(every) != 1 or others:
+        return None
+    letter = every[0]["unit"] or every[0]["sign"] or every[0]["bare"]
+    number = every[0]["number"].replace(",", ".").replace("−", "-").lstrip("+")
+    return number, "°F" if letter in "fF℉" else "°C"
 
 
 def _beside(
