@@ -226,3 +226,42 @@ def test_lines_of_temperatures_beside_a_column_of_them_are_not_taken(tmp_path):
     rows, half = stations(), len(stations()) // 2
     table = [NAMES, ["Oven 20 °C"], *rows[:half], ["Oven 80 °C"], *rows[half:]]
     assert same(taken(text(tmp_path / "run.csv", [*TITLES, *table])), rows)
+
+
+def two_sheets(path, rows, first=NAMES, other=NAMES):
+    """A workbook with the accelerometers of the stations on one sheet and the magnetometers on another."""
+    book = openpyxl.Workbook()
+    book.active.append(["Field (nT)", 50000, "", "Dip (deg)", 60, "", "Serial", "AB-12"])
+    for title, names, (start, end) in (("Acc", first, (3, 6)), ("Mag", other, (6, 9))):
+        page = book.create_sheet(title)
+        page.append([*names[:3], *names[start:end], names[9]])
+        for row in rows:
+            page.append([*row[:3], *row[start:end], row[9]])
+    book.save(path)
+    return path
+
+
+def test_two_triads_on_two_sheets_of_the_same_stations_are_one_table(tmp_path):
+    """Joined and said, in profile and calibrate; the one sheet that is named says what is not read."""
+    rows = stations()
+    path = two_sheets(tmp_path / "run.xlsx", rows)
+    run = taken(path)
+    assert same(run, rows)
+    assert any("'Acc' and 'Mag' are one table" in each for each in run.remarks)
+    one = mwdcal.propose_profile(path, sheet="Acc")
+    found = {each.id: each.text for each in one.findings}
+    assert "on 'Mag' are not read" in found["marked-rows"]
+    assert found["magnetometer-absent"].startswith("field and dip of the field are stated")
+    again = mwdcal.calibrate(path, one.profile)
+    assert {"marked-rows", "magnetometer-absent"} <= {each.id for each in again.findings}
+
+
+def test_sheets_of_other_stations_are_not_joined(tmp_path):
+    """One angle that differs: another station."""
+    rows = stations()
+    path = two_sheets(tmp_path / "run.xlsx", rows)
+    book = openpyxl.load_workbook(path)
+    book["Mag"]["A3"] = book["Mag"]["A3"].value + 1
+    book.save(path)
+    with pytest.raises(mwdcal.FitError, match="holds 2 tables of like columns"):
+        mwdcal.propose_profile(path)

@@ -17,6 +17,7 @@ import numpy as np
 
 from mwdcal.calibration.diagnosis.findings import (
     MARKED_ROWS,
+    magnetometer_absent,
     references_not_taken,
     unused_columns,
 )
@@ -1231,6 +1232,9 @@ def findings_on(proposal: Proposal) -> list[Finding]:
     ]
     marked = [Finding(id=MARKED_ROWS, text=text) for text in proposal.remarks]
     known = axes_open(proposal) + left_handed(proposal) + lines_not_taken(proposal) + marked
+    if proposal.profile.columns is not msgspec.UNSET and RAW[3] not in proposal.profile.columns:
+        stated = {*proposal.profile.columns, *proposal.metadata}
+        known += magnetometer_absent(n for n in STATED_REFERENCES if REFERENCES[n].column in stated)
     known += answers_by_readings(proposal) + warmth_around(proposal) + units_contradicted(proposal)
     return known + ignored + unused_columns(proposal.unused)
 

@@ -9,14 +9,16 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import pairwise, zip_longest
+from operator import eq
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
-from mwdcal.errors import Answer, InputError, QuestionError
+from mwdcal.errors import Answer, FitError, InputError, QuestionError
 from mwdcal.files.formats import figures
 from mwdcal.files.formats.columns import (
     Merged,
@@ -37,6 +39,8 @@ LEAST_COLUMNS = 4
 _MOST_HEADER_ROWS = 3
 _BESIDES = 8
 """Rows of readings from which another table in the file is one to be asked about."""
+_MOST_DIFFERENT = 2
+"""Columns of one name, such as times or temperatures, in which two sheets of the same stations differ at most."""
 _SHARED = 0.6
 """Share of columns that two tables have in common if each may be meant."""
 _SUMMARY = re.compile(
@@ -185,11 +189,8 @@ def laid_out(
     for each in sheets:
         layouts = list(_tables(each, source, decimal)) if each in candidates else []
         covers += [] if layouts or any(_is_reading(row) for _, row in each.rows) else [each]
-        tables += [
-            layout
-            for layout in layouts
-            if header_line in (0, layout.form.header_line) and {*wanted} <= {*layout.names}
-        ]
+        tables += [t for t in layouts if header_line in (0, t.form.header_line)]
+    tables = [t for t in _with_same_stations(tables) if {*wanted} <= {*t.names}]
     if not tables:
         raise _no_table(source, header_line, wanted)
     best = max(tables, key=lambda layout: layout.size)
@@ -199,7 +200,77 @@ def laid_out(
         if run is None:
             raise _several(alike, source, sheet)
         best = run
+    if sheet:
+        best = _beside_other_sheets(
+            best, [s for s in sheets if s not in candidates], source, decimal
+        )
     return _with_covers(best, covers)
+
+
+def _with_same_stations(tables: Sequence[Layout]) -> list[Layout]:
+    """Tables, each with the channels that another sheet has of the same stations: of two triads on two sheets."""
+    joined: list[Layout] = []
+    for table in tables:
+        place = next((k for k, t in enumerate(joined) if _have_same_stations(t, table)), None)
+        if place is None:
+            joined.append(table)
+        else:
+            joined[place] = _side_by_side(joined[place], table)
+    return joined
+
+
+def _shared(one: Layout, other: Layout) -> tuple[set[str], set[str]]:
+    """The names that two tables share, and those of them with equal cells."""
+    ours, theirs = (dict(zip(t.names, t.cells, strict=True)) for t in (one, other))
+    shared = {*ours} & {*theirs}
+    return shared, {name for name in shared if ours[name] == theirs[name]}
+
+
+def _have_same_stations(one: Layout, other: Layout) -> bool:
+    """Whether sheets have the same stations, by three columns or more that vary, and each a triad of its own."""
+    if one.sheet == other.sheet or len(one.lines) != len(other.lines):
+        return False
+    shared, equal = _shared(one, other)
+    varied = [n for n, c in zip(one.names, one.cells, strict=True) if n in equal and len({*c}) > 1]
+    own = [sum(map(bool, map(_OF_AXIS.fullmatch, {*t.names} - shared))) for t in (one, other)]
+    ours, theirs = (dict(zip(t.names, t.cells, strict=True)) for t in (one, other))
+    alike = [sum(map(eq, ours[n], theirs[n])) for n in shared - equal]  # else another station
+    few = len(alike) <= _MOST_DIFFERENT and all(2 * n < len(one.lines) for n in alike)
+    return len(varied) >= LEAST_COLUMNS - 1 and few and min(own) >= LEAST_COLUMNS - 1
+
+
+def _side_by_side(one: Layout, other: Layout) -> Layout:
+    """A table with the columns of another sheet that it does not have."""
+    _, equal = _shared(one, other)
+    more = [k for k, name in enumerate(other.names) if name not in equal]
+    names = plain_names([*one.names, *(other.names[k] for k in more)])
+    said = (
+        f"the sheets {shown(one.sheet)} and {shown(other.sheet)} are one table: in all {len(one.lines)} rows they have "
+        f"the same {', '.join(n for n in one.names if n in equal)}."
+    )
+    return replace(
+        one,
+        names=names,
+        units=[*one.units, *(other.units[k] for k in more)],
+        cells=[*one.cells, *(other.cells[k] for k in more)],
+        texts=[*one.texts, *(other.texts[k] for k in more)],
+        fractions=tuple(dict.fromkeys([*one.fractions, *other.fractions])),
+        left_out=(*one.left_out, *other.left_out),
+        remarks=(*one.remarks, *other.remarks, said),
+    )
+
+
+def _beside_other_sheets(
+    table: Layout, others: Sequence[Sheet], source: str, decimal: str
+) -> Layout:
+    """A table of the sheet that the user names, with a remark on those of the same stations that are not read."""
+    unread = []
+    for each in others:
+        with suppress(InputError, FitError):
+            layouts = list(_tables(each, source, decimal))
+            unread += [shown(each.name)] * any(_have_same_stations(table, t) for t in layouts)
+    said = f"channels of the same stations on {', '.join(unread)} are not read: without `sheet` they are joined."
+    return replace(table, remarks=(*table.remarks, said)) if unread else table
 
 
 def _the_run(tables: Sequence[Layout]) -> Layout | None:
