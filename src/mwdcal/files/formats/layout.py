@@ -232,11 +232,17 @@ def _have_same_stations(one: Layout, other: Layout) -> bool:
         return False
     shared, equal = _shared(one, other)
     varied = [n for n, c in zip(one.names, one.cells, strict=True) if n in equal and len({*c}) > 1]
-    own = [sum(map(bool, map(_OF_AXIS.fullmatch, {*t.names} - shared))) for t in (one, other)]
     ours, theirs = (dict(zip(t.names, t.cells, strict=True)) for t in (one, other))
     alike = [sum(map(eq, ours[n], theirs[n])) for n in shared - equal]  # else another station
     few = len(alike) <= _MOST_DIFFERENT and all(2 * n < len(one.lines) for n in alike)
-    return len(varied) >= LEAST_COLUMNS - 1 and few and min(own) >= LEAST_COLUMNS - 1
+    return len(varied) >= LEAST_COLUMNS - 1 and few and _have_own_triads(one, other)
+
+
+def _have_own_triads(one: Layout, other: Layout) -> bool:
+    """Whether two tables share three columns or more by name, and each has three of axes that the other has not."""
+    names = {*one.names}, {*other.names}
+    own = [sum(map(bool, map(_OF_AXIS.fullmatch, a - b))) for a, b in (names, names[::-1])]
+    return min(len(names[0] & names[1]), *own) >= LEAST_COLUMNS - 1
 
 
 def _side_by_side(one: Layout, other: Layout) -> Layout:
@@ -407,9 +413,10 @@ def _with_covers(layout: Layout, covers: Sequence[Sheet]) -> Layout:
 
 
 def _alike(one: Layout, other: Layout) -> bool:
-    """Whether two tables share most of their columns, in whatever spelling."""
+    """Whether two tables share most of their columns, in whatever spelling, or are of one triad each."""
     ours, theirs = ({*_spelling(each.names)} for each in (one, other))
-    return len(ours & theirs) >= _SHARED * max(len(ours), len(theirs))
+    most = len(ours & theirs) >= _SHARED * max(len(ours), len(theirs))
+    return most or _have_own_triads(one, other)
 
 
 def _no_table(source: str, header_line: int, wanted: Collection[str]) -> InputError:
