@@ -129,6 +129,7 @@ def in_series(rows):
     ]
 
 
+CHANNELS = ["Gx", "Gy", "Gz", "Bx", "By", "Bz"]
 NAMES = ["Inc", "Azi", "TF", "Gx (V)", "Gy (V)", "Gz (V)", "Bx (V)", "By (V)", "Bz (V)", "T C"]
 
 
@@ -156,3 +157,111 @@ def test_blank_angles_that_the_readings_do_not_fit_are_unknown_and_counted(tmp_p
     for name in ("Inc", "Azi"):
         assert f"{blank} of {len(rows)} stations have no '{name}': it is unknown there." in texts
     assert not any("from the row above" in each for each in texts)
+
+
+def listing(path, names, units, rows, remarks=()):
+    """A listing of columns one below the other, each filled up with blanks, and remarks behind some rows."""
+    lines = ["".join(f"{cell:>14}" for cell in row) for row in [names, units, *rows]]
+    for row, remark in remarks:
+        lines[row + 2] += f"   {remark}"
+    path.write_text("\n".join(["FIELD 50000 NT  DIP 60 DEG", "", *lines]), "utf-8")
+    return path
+
+
+WORDS = ["INC", "AZI", "HS", "GX", "GY", "GZ", "HX", "HY", "HZ", "TEMP"]
+
+
+def test_a_unit_of_two_words_is_that_of_the_column_above_it(tmp_path):
+    """With a blank unit before it the units are as many words as there are columns."""
+    rows = [[n + 1, *row] for n, row in enumerate(stations())]
+    units = ["", "DEG", "DEG", "DEG", *["VOLTS"] * 6, "DEG C"]
+    path = listing(tmp_path / "run.txt", ["STN", *WORDS], units, rows)
+    assert tables.laid_out(path).units == units
+    assert same(taken(path), stations())
+
+
+def test_words_behind_the_last_column_are_one_remark(tmp_path):
+    """A question on it names its column, of which there is no name."""
+    units = ["DEG", "DEG", "DEG", *["V"] * 6, "DEGC"]
+    remarks = [(3, "bumped table, retaken")]
+    path = listing(tmp_path / "run.txt", WORDS, units, stations(), remarks)
+    with pytest.raises(mwdcal.FitError, match="'column 11' says 'bumped table, retaken'") as error:
+        mwdcal.propose_profile(path)
+    first, *_ = error.value.questions[0].answers[0].arguments
+    assert first == ("keep", "column 11=bumped table, retaken")
+    assert same(taken(path, keep={"column 11": ["bumped table, retaken"]}), stations())
+
+
+@pytest.mark.parametrize("answers", [{}, {"column": {"ref_toolface_deg": "TF (°)"}}])
+def test_a_unit_that_an_answer_corrects_holds_when_the_table_is_read_again(tmp_path, answers):
+    """Toolfaces under V: told by the readings or the user, and read with the profile of the answer."""
+    units = ["°", "°", "V", "V", "V", "V", "V", "V", "V", "°C"]
+    names = ["Inc", "Azi", "TF", "Gx", "Gy", "Gz", "Bx", "By", "Bz", "Temp"]
+    path = text(tmp_path / "run.csv", [*TITLES, names, units, *stations()])
+    profile = mwdcal.propose_profile(path, **answers).profile
+    assert profile.columns["ref_toolface_deg"].instead_of == "V"
+    assert same(taken(path, **answers), stations())
+
+
+@pytest.mark.parametrize(
+    ("form", "unit"),
+    [("Temperature: {} °C", 1.0), ("温度点：{}℃", 1.0), ("Oven at {} ± 2 F", 5 / 9)],
+)
+def test_temperatures_in_lines_between_the_rows_are_those_of_the_rows_below(tmp_path, form, unit):
+    """Said with their rows, in whatever order names and the first of them stand."""
+    rows = [row[:9] for row in stations()]
+    half = len(rows) // 2
+    blocks = [[form.format(20)], *rows[:half], [form.format(80)], *rows[half:]]
+    stated = [unit * (t - (32 if unit < 1 else 0)) for t in (20, 80)]
+    expected = [stated[n >= half] for n in range(len(rows))]
+    above, names, units = blocks[:1], [["Inc", "Azi", "TF", *CHANNELS]], [["°"] * 3 + ["V"] * 6]
+    for head in ([*names, *units, *above], [*above, *names, *units]):
+        path = text(tmp_path / "run.csv", [*TITLES, *head, *blocks[1:]])
+        run = taken(path)
+        assert np.allclose(tables.numbers(run, "temperature_c"), expected)
+        assert any(f"({half} rows)" in each for each in run.remarks)
+
+
+def test_lines_of_temperatures_beside_a_column_of_them_are_not_taken(tmp_path):
+    rows, half = stations(), len(stations()) // 2
+    table = [NAMES, ["Oven 20 °C"], *rows[:half], ["Oven 80 °C"], *rows[half:]]
+    assert same(taken(text(tmp_path / "run.csv", [*TITLES, *table])), rows)
+
+
+def two_sheets(path, rows, first=NAMES, other=NAMES):
+    """A workbook with the accelerometers of the stations on one sheet and the magnetometers on another."""
+    book = openpyxl.Workbook()
+    book.active.append(["Field (nT)", 50000, "", "Dip (deg)", 60, "", "Serial", "AB-12"])
+    for title, names, (start, end) in (("Acc", first, (3, 6)), ("Mag", other, (6, 9))):
+        page = book.create_sheet(title)
+        page.append([*names[:3], *names[start:end], names[9]])
+        for row in rows:
+            page.append([*row[:3], *row[start:end], row[9]])
+    book.save(path)
+    return path
+
+
+def test_two_triads_on_two_sheets_of_the_same_stations_are_one_table(tmp_path):
+    """Joined and said, in profile and calibrate; the one sheet that is named says what is not read."""
+    rows = stations()
+    path = two_sheets(tmp_path / "run.xlsx", rows)
+    run = taken(path)
+    assert same(run, rows)
+    assert any("'Acc' and 'Mag' are one table" in each for each in run.remarks)
+    one = mwdcal.propose_profile(path, sheet="Acc")
+    found = {each.id: each.text for each in one.findings}
+    assert "on 'Mag' are not read" in found["marked-rows"]
+    assert found["magnetometer-absent"].startswith("field and dip of the field are stated")
+    again = mwdcal.calibrate(path, one.profile)
+    assert {"marked-rows", "magnetometer-absent"} <= {each.id for each in again.findings}
+
+
+def test_sheets_of_other_stations_are_not_joined(tmp_path):
+    """One angle that differs: another station."""
+    rows = stations()
+    path = two_sheets(tmp_path / "run.xlsx", rows)
+    book = openpyxl.load_workbook(path)
+    book["Mag"]["A3"] = book["Mag"]["A3"].value + 1
+    book.save(path)
+    with pytest.raises(mwdcal.FitError, match="holds 2 tables of like columns"):
+        mwdcal.propose_profile(path)

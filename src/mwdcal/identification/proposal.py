@@ -17,6 +17,7 @@ import numpy as np
 
 from mwdcal.calibration.diagnosis.findings import (
     MARKED_ROWS,
+    magnetometer_absent,
     references_not_taken,
     unused_columns,
 )
@@ -393,8 +394,8 @@ def _proposal(
     columns, by_value, ignored = proposed(
         names, units, values, table.source, above, table.metadata, answers, problems, open_rows
     )
-    if names := _written_once(table, columns):
-        filled = filled_down(whole, names), _with(form, {"fill_down": names})
+    if once := _written_once(table, columns):
+        filled = filled_down(whole, once), _with(form, {"fill_down": once})
         with suppress(InputError, FitError):
             proposal = _proposal(path, where, *filled, stated, answers)
             if _is_confirmed(proposal):
@@ -1289,6 +1290,9 @@ def findings_on(proposal: Proposal) -> list[Finding]:
     ]
     marked = [Finding(id=MARKED_ROWS, text=text) for text in proposal.remarks]
     known = axes_open(proposal) + left_handed(proposal) + lines_not_taken(proposal) + marked
+    if proposal.profile.columns is not msgspec.UNSET and RAW[3] not in proposal.profile.columns:
+        stated = {*proposal.profile.columns, *proposal.metadata}
+        known += magnetometer_absent(n for n in STATED_REFERENCES if REFERENCES[n].column in stated)
     known += answers_by_readings(proposal) + warmth_around(proposal) + units_contradicted(proposal)
     return known + ignored + unused_columns(proposal.unused)
 

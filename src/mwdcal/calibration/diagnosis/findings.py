@@ -264,11 +264,20 @@ def references_not_taken(lines: Mapping[str, str]) -> list[Finding]:
     ]
 
 
+def magnetometer_absent(references: Iterable[str]) -> list[Finding]:
+    """A finding on references of the field that a table states which has no magnetometers."""
+    stated = " and ".join(sorted({*references} & {"field", "dip"}, reverse=True))
+    text = f"{stated} of the field are stated, and the table has no magnetometers: the accelerometers alone are used."
+    return [Finding(id="magnetometer-absent", text=text)] if stated else []
+
+
 def of_table(readings: Readings) -> list[Finding]:
     """Rows of the table that its laboratory has marked, references that are not read, and columns not used."""
     marked = [Finding(id=MARKED_ROWS, text=text) for text in readings.remarks]
     unread = references_not_taken(readings.not_taken)
-    return [*marked, *unread, *unused_columns(readings.unused)]
+    known = [name for name, values in readings.known.items() if not np.isnan(values).all()]
+    absent = magnetometer_absent(known) if readings.magnetometer is None else []
+    return [*marked, *unread, *absent, *unused_columns(readings.unused)]
 
 
 def findings(flags: Iterable[Flag], place: int, labels: Sequence[str]) -> list[Finding]:

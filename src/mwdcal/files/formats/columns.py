@@ -108,14 +108,14 @@ def plain_names(names: Sequence[str]) -> list[str]:
     One line without control characters and blanks around, no '#' before the first, none blank, no
     two alike.
 
-    >>> plain_names(["#ax", "Temp\\n(C)", " ", "note", "note ", "note"])
+    >>> plain_names(["#ax", "Temp\\n(C)", "", "note", "note ", "note"])
     ['ax', 'Temp (C)', 'column 3', 'note', 'note (2)', 'note (3)']
     """
     plain = [_CONTROLS.sub(" ", name).strip() for name in names]
     plain[:1] = [name.lstrip("# ") for name in plain[:1]]
     taken = {name for name, wanted in zip(names, plain, strict=True) if name == wanted}
     for place, (name, wanted) in enumerate(zip(names, plain, strict=True)):
-        if name != wanted or name in names[:place]:
+        if not wanted or name != wanted or name in names[:place]:
             plain[place] = _free(wanted or f"column {place + 1}", taken)
             taken.add(plain[place])
     return plain

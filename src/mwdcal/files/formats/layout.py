@@ -9,14 +9,16 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import pairwise, zip_longest
+from operator import eq
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
-from mwdcal.errors import Answer, InputError, QuestionError
+from mwdcal.errors import Answer, FitError, InputError, QuestionError
 from mwdcal.files.formats import figures
 from mwdcal.files.formats.columns import (
     Merged,
@@ -37,6 +39,8 @@ LEAST_COLUMNS = 4
 _MOST_HEADER_ROWS = 3
 _BESIDES = 8
 """Rows of readings from which another table in the file is one to be asked about."""
+_MOST_DIFFERENT = 2
+"""Columns of one name, such as times or temperatures, in which two sheets of the same stations differ at most."""
 _SHARED = 0.6
 """Share of columns that two tables have in common if each may be meant."""
 _SUMMARY = re.compile(
@@ -91,6 +95,19 @@ _OF_SETTING = re.compile(
 """The name of a sheet that is a setting of the stand or the oven: 77F, Inc 45, Cold."""
 _OF_WARMTH = re.compile(r"\W*?([+−-]?\d+(?:[.,]\d+)?)\s*(?:°|deg)?\s*[cf℃]\W*", re.IGNORECASE)
 """The name of a sheet that is a temperature with its unit."""
+_WARMTH_IN_WORDS = re.compile(
+    r"(?<![^\W\d_])(t(?![^\W\d_])|temp\w*|temperat\w*|oven|ofen|ovn|horno|forno|four|темп\w*|т-ра|термо\w*|печ\w*)|"
+    r"t[eé]mp[eé]rat|sıcaklık|温",
+    re.IGNORECASE,
+)
+"""Words of a temperature, in a line between rows or in the name of a column."""
+_WARMTH_IN_LINE = re.compile(
+    r"(?P<number>(?<![\d.,])[+−-]?\d+(?:[.,]\d+)?)(?:\s*(?:±|\+/?-)\s*\d+(?:[.,]\d+)?)?\s*"
+    r"(?:(?:°|º|deg\w*\.?)\s*(?P<unit>[cfсCFС])(?![^\W\d_])|(?P<sign>[℃℉])|(?P<bare>[CFС])(?![^\W\d_]))"
+)
+"""A temperature in a line: its number, a tolerance, and its unit, which is a bare letter only behind a word."""
+_WARMTH_OF_LINES = "Temperature of the line above"
+"""The name of a column of temperatures that stand in lines between the rows."""
 _SAME_WARMTH = 10.0
 """By how much a temperature differs at most from the one that its sheet is named by."""
 
@@ -121,7 +138,7 @@ class Layout:
     below the names that are no readings, `above` the texts above them;
     `parts` the sheet of each row where several are one table; `heading` the text right above the names;
     `titles` what the title block says of the tool, the day and the place; `places` letters of the columns in a
-    workbook.
+    workbook; `remarks` are sentences on what is taken from other places than the columns.
     """
 
     sheet: str
@@ -139,6 +156,7 @@ class Layout:
     places: Mapping[str, str] = field(default_factory=dict)
     parts: tuple[str, ...] = ()
     heading: str = ""
+    remarks: tuple[str, ...] = ()
 
     @property
     def size(self) -> int:
@@ -171,11 +189,8 @@ def laid_out(
     for each in sheets:
         layouts = list(_tables(each, source, decimal)) if each in candidates else []
         covers += [] if layouts or any(_is_reading(row) for _, row in each.rows) else [each]
-        tables += [
-            layout
-            for layout in layouts
-            if header_line in (0, layout.form.header_line) and {*wanted} <= {*layout.names}
-        ]
+        tables += [t for t in layouts if header_line in (0, t.form.header_line)]
+    tables = [t for t in _with_same_stations(tables) if {*wanted} <= {*t.names}]
     if not tables:
         raise _no_table(source, header_line, wanted)
     best = max(tables, key=lambda layout: layout.size)
@@ -185,7 +200,83 @@ def laid_out(
         if run is None:
             raise _several(alike, source, sheet)
         best = run
+    if sheet:
+        best = _beside_other_sheets(
+            best, [s for s in sheets if s not in candidates], source, decimal
+        )
     return _with_covers(best, covers)
+
+
+def _with_same_stations(tables: Sequence[Layout]) -> list[Layout]:
+    """Tables, each with the channels that another sheet has of the same stations: of two triads on two sheets."""
+    joined: list[Layout] = []
+    for table in tables:
+        place = next((k for k, t in enumerate(joined) if _have_same_stations(t, table)), None)
+        if place is None:
+            joined.append(table)
+        else:
+            joined[place] = _side_by_side(joined[place], table)
+    return joined
+
+
+def _shared(one: Layout, other: Layout) -> tuple[set[str], set[str]]:
+    """The names that two tables share, and those of them with equal cells."""
+    ours, theirs = (dict(zip(t.names, t.cells, strict=True)) for t in (one, other))
+    shared = {*ours} & {*theirs}
+    return shared, {name for name in shared if ours[name] == theirs[name]}
+
+
+def _have_same_stations(one: Layout, other: Layout) -> bool:
+    """Whether sheets have the same stations, by three columns or more that vary, and each a triad of its own."""
+    if one.sheet == other.sheet or len(one.lines) != len(other.lines):
+        return False
+    shared, equal = _shared(one, other)
+    varied = [n for n, c in zip(one.names, one.cells, strict=True) if n in equal and len({*c}) > 1]
+    ours, theirs = (dict(zip(t.names, t.cells, strict=True)) for t in (one, other))
+    alike = [sum(map(eq, ours[n], theirs[n])) for n in shared - equal]  # else another station
+    few = len(alike) <= _MOST_DIFFERENT and all(2 * n < len(one.lines) for n in alike)
+    return len(varied) >= LEAST_COLUMNS - 1 and few and _have_own_triads(one, other)
+
+
+def _have_own_triads(one: Layout, other: Layout) -> bool:
+    """Whether two tables share three columns or more by name, and each has three of axes that the other has not."""
+    names = {*one.names}, {*other.names}
+    own = [sum(map(bool, map(_OF_AXIS.fullmatch, a - b))) for a, b in (names, names[::-1])]
+    return min(len(names[0] & names[1]), *own) >= LEAST_COLUMNS - 1
+
+
+def _side_by_side(one: Layout, other: Layout) -> Layout:
+    """A table with the columns of another sheet that it does not have."""
+    _, equal = _shared(one, other)
+    more = [k for k, name in enumerate(other.names) if name not in equal]
+    names = plain_names([*one.names, *(other.names[k] for k in more)])
+    said = (
+        f"the sheets {shown(one.sheet)} and {shown(other.sheet)} are one table: in all {len(one.lines)} rows they have "
+        f"the same {', '.join(n for n in one.names if n in equal)}."
+    )
+    return replace(
+        one,
+        names=names,
+        units=[*one.units, *(other.units[k] for k in more)],
+        cells=[*one.cells, *(other.cells[k] for k in more)],
+        texts=[*one.texts, *(other.texts[k] for k in more)],
+        fractions=tuple(dict.fromkeys([*one.fractions, *other.fractions])),
+        left_out=(*one.left_out, *other.left_out),
+        remarks=(*one.remarks, *other.remarks, said),
+    )
+
+
+def _beside_other_sheets(
+    table: Layout, others: Sequence[Sheet], source: str, decimal: str
+) -> Layout:
+    """A table of the sheet that the user names, with a remark on those of the same stations that are not read."""
+    unread = []
+    for each in others:
+        with suppress(InputError, FitError):
+            layouts = list(_tables(each, source, decimal))
+            unread += [shown(each.name)] * any(_have_same_stations(table, t) for t in layouts)
+    said = f"channels of the same stations on {', '.join(unread)} are not read: without `sheet` they are joined."
+    return replace(table, remarks=(*table.remarks, said)) if unread else table
 
 
 def _the_run(tables: Sequence[Layout]) -> Layout | None:
@@ -322,9 +413,10 @@ def _with_covers(layout: Layout, covers: Sequence[Sheet]) -> Layout:
 
 
 def _alike(one: Layout, other: Layout) -> bool:
-    """Whether two tables share most of their columns, in whatever spelling."""
+    """Whether two tables share most of their columns, in whatever spelling, or are of one triad each."""
     ours, theirs = ({*_spelling(each.names)} for each in (one, other))
-    return len(ours & theirs) >= _SHARED * max(len(ours), len(theirs))
+    most = len(ours & theirs) >= _SHARED * max(len(ours), len(theirs))
+    return most or _have_own_triads(one, other)
 
 
 def _no_table(source: str, header_line: int, wanted: Collection[str]) -> InputError:
@@ -360,7 +452,9 @@ def _several(tables: Sequence[Layout], source: str, sheet: str) -> QuestionError
 def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
     """The tables of a sheet, one below the other: a head is no row of readings, and the next row is one."""
     rows = [row for row in sheet.rows if not _is_ruler(row[1])]
-    rows = [row for k, row in enumerate(rows) if not _is_remark_below_names(rows, k)]
+    remarks = [row for k, row in enumerate(rows) if _is_remark_below_names(rows, k)]
+    aside = {line for line, _ in remarks}
+    rows = [row for row in rows if row[0] not in aside]
     rows = _with_legend(rows)
     sheet = sheet._replace(rows=rows)
     readings = [_is_reading(row) for _, row in rows]
@@ -371,7 +465,7 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
     ]
     heads = [k for n, k in enumerate(heads) if n == 0 or _begins_anew(rows, heads[:n], k)]
     for head, end in pairwise([*heads, len(rows)]):
-        if layout := _table(sheet, head, end, source, decimal):
+        if layout := _table(sheet, head, end, source, decimal, remarks):
             yield layout
 
 
@@ -463,8 +557,18 @@ def _is_reading(row: Cells) -> bool:
     return numbers >= LEAST_COLUMNS and 2 * numbers >= sum(cell != "" for cell in row)
 
 
-def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layout | None:
-    """The table whose last row of names, or of units, is at a place, down to the row before `end`."""
+def _table(
+    sheet: Sheet,
+    head: int,
+    end: int,
+    source: str,
+    decimal: str,
+    remarks: Sequence[tuple[int, Cells]],
+) -> Layout | None:
+    """The table whose last row of names, or of units, is at a place, down to the row before `end`.
+
+    `remarks` are rows that stand between names and readings.
+    """
     rows = sheet.rows
     names, units, top = _head(rows, head, sheet.merged)
     below = rows[_another_part(rows, head, end) : end]
@@ -487,7 +591,7 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
         name: _both(unit, by_cells)
         for name, unit, (_, by_cells) in zip(names, units, read, strict=True)
     }
-    return Layout(
+    layout = Layout(
         sheet=sheet.name,
         form=msgspec.structs.replace(
             sheet.form,
@@ -514,6 +618,65 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
         ),
         places=dict(zip(names, letters, strict=True)) if sheet.name else {},
     )
+    return _with_warmth_of_lines(layout, [*rows[max(top - 1, 0) : top], *remarks, *others])
+
+
+def _with_warmth_of_lines(layout: Layout, lines: Sequence[tuple[int, Cells]]) -> Layout:
+    """A table with the temperatures that stand in lines between its rows, and above all, where it has no others."""
+    stated = {n: each for n, row in lines if (each := _warmth_in(" ".join(map(as_text, row))))}
+    above = [max((n for n in stated if n < line), default=0) for line in layout.lines]
+    if (
+        len({*stated.values()}) < 2
+        or not all(above)
+        or any(map(_WARMTH_IN_WORDS.search, layout.names))
+    ):
+        return layout
+    cells = [stated[n][0] for n in above]
+    numbers = [[*map(_number, column)] for column in layout.cells]
+    if any(
+        all(
+            v is not None and abs(v - float(c)) < _SAME_WARMTH
+            for v, c in zip(column, cells, strict=True)
+        )
+        for column in numbers
+    ):
+        return layout
+    units = {unit for _, unit in stated.values()}
+    counts = Counter(f"{number} {unit}" for number, unit in (stated[n] for n in above))
+    listed = ", ".join(f"{text} ({count} rows)" for text, count in counts.items())
+    name = f"{_WARMTH_OF_LINES} ({min(units)})"
+    return (
+        layout
+        if len(units) > 1
+        else replace(
+            layout,
+            names=[*layout.names, name],
+            units=[*layout.units, ""],
+            cells=[*layout.cells, cells],
+            texts=[*layout.texts, cells],
+            left_out=tuple(each for each in layout.left_out if each[0] not in stated),
+            remarks=(
+                *layout.remarks,
+                f"the temperatures are those of the lines above the rows: {listed}.",
+            ),
+        )
+    )
+
+
+def _warmth_in(text: str) -> tuple[str, str] | None:
+    """The one temperature that a line states, and its unit.
+
+    >>> [_warmth_in(t) for t in ("温度点：80℃", "Set 2: T = 20,5 ± 0.5 °C", "Oven 176 F", "20 to 80 °C", "Run C")]
+    [('80', '°C'), ('20.5', '°C'), ('176', '°F'), None, None]
+    """
+    word = _WARMTH_IN_WORDS.search(text)
+    every = [m for m in _WARMTH_IN_LINE.finditer(text) if word or not m["bare"]]
+    others = re.findall(r"(?:to|bis|til|до|[-–…])\s*$", text[: every[0].start()]) if every else []
+    if len(every) != 1 or others:
+        return None
+    letter = every[0]["unit"] or every[0]["sign"] or every[0]["bare"]
+    number = every[0]["number"].replace(",", ".").replace("−", "-").lstrip("+")
+    return number, "°F" if letter in "fF℉" else "°C"
 
 
 def _beside(
@@ -632,7 +795,7 @@ def _head(
     readings = rows[place + 1][1] if place + 1 < len(rows) else ()
     if place and all(_OF_LOGGERS.fullmatch(as_text(c)) for c in rows[place][1] if c != ""):
         place -= 1
-    if place and _is_units(rows[place][1]) and _texts(rows[place - 1][1]) >= LEAST_COLUMNS:
+    if place and is_units(rows[place][1]) and _texts(rows[place - 1][1]) >= LEAST_COLUMNS:
         units = [as_text(cell).strip(" []()") for cell in rows[place][1]]
         place -= 1
     names = [" ".join(as_text(cell).split()) for cell in rows[place][1]]
@@ -730,7 +893,7 @@ def _with_title(title: str, name: str) -> str:
     return f"{match[1]} {name}".strip() + f" {match[2]}".replace(" ,", ",")
 
 
-def _is_units(row: Cells) -> bool:
+def is_units(row: Cells) -> bool:
     """Whether a row holds units: of its cells that are filled in two or more are known, and all are short."""
     cells = [as_text(cell).strip() for cell in row if cell != ""]
     bare = [cell.strip("[]()").strip() for cell in cells]

@@ -15,7 +15,7 @@ from mwdcal import extras
 from mwdcal.errors import InputError
 from mwdcal.files.formats import figures, text
 from mwdcal.files.formats.columns import WORKBOOKS, at_most, damaged_unless_read, with_merged
-from mwdcal.files.formats.layout import LEAST_COLUMNS, Cells, Sheet
+from mwdcal.files.formats.layout import LEAST_COLUMNS, Cells, Sheet, is_units
 from mwdcal.sensor.profile import TableFormat
 
 DELIMITERS = (";", "\t", ",", "|")
@@ -114,17 +114,27 @@ def _is_of_numbers(row: Sequence[str]) -> bool:
 def _placed(
     row: list[str], spans: Sequence[tuple[int, int]], columns: Sequence[tuple[int, int]]
 ) -> list[str]:
-    """The cells of a row that is shorter than others, each in the column above or below which it stands."""
-    if not LEAST_COLUMNS <= len(row) < len(columns):
+    """The cells of a row that is shorter than others, or of units, each in the column above or below which it stands.
+
+    A unit may be of several words: DEG C. What stands behind the last column is one remark.
+    """
+    behind = next((k for k, (start, _) in enumerate(spans) if start >= columns[-1][1]), len(row))
+    if len(row) - behind > 1:
+        return [*row[:behind], " ".join(row[behind:])]
+    if len(row) < LEAST_COLUMNS:
         return row
     places = [
         [k for k, (start, end) in enumerate(columns) if one < end and start < other]
         for one, other in spans
     ]
-    if any(len(each) != 1 for each in places) or len({*map(tuple, places)}) < len(row):
+    if any(len(each) != 1 for each in places):
         return row
-    by_place = {place: cell for (place,), cell in zip(places, row, strict=True)}
-    return [by_place.get(place, "") for place in range(len(columns))]
+    by_place: dict[int, list[str]] = {}
+    for (place,), cell in zip(places, row, strict=True):
+        by_place.setdefault(place, []).append(cell)
+    placed = [" ".join(by_place.get(place, ())) for place in range(len(columns))]
+    apart = len(by_place) == len(row) < len(columns)
+    return placed if apart or is_units(placed) else row
 
 
 def _numbers(rows: Sequence[Sequence[str]]) -> int:

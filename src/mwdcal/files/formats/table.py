@@ -286,6 +286,7 @@ def of_layout(where: Layout, path: str | os.PathLike[str], kept: Collection[str]
         places=where.places,
         sheet=where.sheet,
         parts=where.parts,
+        remarks=where.remarks,
         not_taken=where.titles.not_taken,
     )
 

@@ -325,7 +325,7 @@ def _merged(archive: zipfile.ZipFile, page: Any) -> Merged:
 def _place(letters: str | bytes) -> int:
     """The place from 0 of a column by its letters."""
     text = letters if isinstance(letters, str) else letters.decode()
-    return sum((ord(x) - 64) * 26**i for i, x in enumerate(reversed(text))) - 1
+    return sum((ord(x) - 64) * int(26**i) for i, x in enumerate(reversed(text))) - 1
 
 
 @contextmanager
