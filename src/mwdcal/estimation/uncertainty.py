@@ -235,7 +235,7 @@ LEAST_SHARE = 0.05
 """A free direction with less than this share on a triad does not move the triad."""
 TESTED = 1e-3
 """A direction of a station's readings counts if this share of its variance is left by the fit."""
-STATIONS_AT_ONCE = 1024
+LEFT_OUT_AT_ONCE = 1024
 """Stations that are left out at once, each by itself."""
 ROTATIONS = ("rotation-x", "rotation-y", "toolface-zero")
 """Names of the turns of a triad about the tool's three axes."""
@@ -603,8 +603,8 @@ def left_out_variances(
 
 def _blocks(tool: Ints, station: Ints) -> Iterator[tuple[Ints, Ints]]:
     """Tools (k,) and stations (k,), so many at once that their matrices fit the cache."""
-    for first in range(0, len(tool), STATIONS_AT_ONCE):
-        yield tool[first : first + STATIONS_AT_ONCE], station[first : first + STATIONS_AT_ONCE]
+    for first in range(0, len(tool), LEFT_OUT_AT_ONCE):
+        yield tool[first : first + LEFT_OUT_AT_ONCE], station[first : first + STATIONS_AT_ONCE]
 
 
 def _taken(
