@@ -604,7 +604,7 @@ def left_out_variances(
 def _blocks(tool: Ints, station: Ints) -> Iterator[tuple[Ints, Ints]]:
     """Tools (k,) and stations (k,), so many at once that their matrices fit the cache."""
     for first in range(0, len(tool), LEFT_OUT_AT_ONCE):
-        yield tool[first : first + LEFT_OUT_AT_ONCE], station[first : first + STATIONS_AT_ONCE]
+        yield tool[first : first + LEFT_OUT_AT_ONCE], station[first : first + LEFT_OUT_AT_ONCE]
 
 
 def _taken(
