@@ -591,7 +591,7 @@ def left_out_variances(
         rows = weighed[:, :, axes].reshape(len(weighed), -1, weighed.shape[-1])
         normal = rows[..., :-1].mT @ rows
         parts = [
-            _taken(weighed[t, s], whole[t], normal[t], analysis.spread[t, s], axes)
+            _shares_of_stations(weighed[t, s], whole[t], normal[t], analysis.spread[t, s], axes)
             for t, s in _blocks(tool, station)
         ]
         each = [np.concatenate(part) for part in zip(*parts, strict=True)]
@@ -607,7 +607,7 @@ def _blocks(tool: Ints, station: Ints) -> Iterator[tuple[Ints, Ints]]:
         yield tool[first : first + LEFT_OUT_AT_ONCE], station[first : first + LEFT_OUT_AT_ONCE]
 
 
-def _taken(
+def _shares_of_stations(
     weighed: Array, whole: Array, normal: Array, spread: Array, axes: slice
 ) -> tuple[Array, Array]:
     """What stations (k,) that are left out take of sum of squares and degrees of freedom of a triad, its `axes`.
