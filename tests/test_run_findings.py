@@ -5,15 +5,20 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from scipy import stats
 
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.diagnosis.findings import AGREEING, _copies, resolution
+from mwdcal.calibration.diagnosis.plausibility import stations_to_reshoot
+from mwdcal.calibration.estimate import fit, solve
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings, fingerprints
+from mwdcal.calibration.residuals import chances
 from mwdcal.errors import FitError
+from mwdcal.estimation.uncertainty import analyse, left_out_variances
 from mwdcal.sensor.profile import Profile
 from mwdcal.survey.well import unknown_gravity
-from simulation import DEG, Tool, plan
+from simulation import DEG, Tool, attitude, plan
 
 PROFILE = Profile(name="test tool")
 NOISE = {"accelerometer": np.array(1e-4), "magnetometer": np.array(15.0)}
@@ -253,3 +258,69 @@ def test_a_gravity_that_no_place_on_land_has_is_named(gravity):
     data = replace(data, known={**data.known, "gravity": np.full(data.count, gravity)})
     outside = not 9.764 <= 9.80665 * gravity <= 9.834
     assert ("gravity-reference" in found(data)) == (outside and gravity != 1.0036)
+
+
+def few_stations(seeds, sd, error=0.0):
+    """Runs of eight stations, one of which is off by `error` noises on every axis of the magnetometer."""
+    runs = [run(seed, toolfaces=4, inclinations=(45, 100), sd=sd) for seed in range(seeds)]
+    station = np.arange(seeds) % 8
+    magnetometer = np.stack([data.magnetometer for data in runs])
+    magnetometer[np.arange(seeds), station] += error * float(NOISE["magnetometer"])
+    known = {name: np.stack([data.known[name] for data in runs]) for name in runs[0].known}
+    sd = {name: np.full((seeds, 1, 1), value) for name, value in sd.items()}
+    accelerometer = np.stack([data.accelerometer for data in runs])
+    return Readings(accelerometer, magnetometer, known=known, sd=sd), station
+
+
+def chance_left_out(raw, target, station):
+    """Chance of a station's residual by the linear fits with it and without: Fisher's F of the extra sum of squares."""
+    design = np.column_stack([target, np.ones(len(target))])
+    squares = []
+    for rows in (np.ones(len(raw), bool), np.arange(len(raw)) != station):
+        left = raw[rows] - design[rows] @ np.linalg.lstsq(design[rows], raw[rows])[0]
+        squares.append(np.sum(left**2))
+    rest = 3 * (len(raw) - 1 - 4)
+    return stats.f.sf((squares[0] - squares[1]) / 3 / (squares[1] / rest), 3, rest)
+
+
+def test_a_station_is_judged_by_the_noise_in_the_fit_without_it():
+    """The model of a triad is its inverse: what the readings are of the field, to first order the same F."""
+    data, station = few_stations(6, {}, 20.0)
+    found = chances(fit(data))
+    inc, azi, face = (data.known[name][0] for name in ("inclination", "azimuth", "toolface"))
+    dip, field = data.known["dip"][0, 0], data.known["field"][0, 0]
+    targets = attitude(inc, azi, face)(1.0, field, dip)
+    raws = data.accelerometer, data.magnetometer
+    for place, bad in enumerate(station):
+        pair = [chance_left_out(raw[place], t, bad) for raw, t in zip(raws, targets, strict=True)]
+        assert np.log(found[place, bad]) == pytest.approx(np.log(2 * min(pair)), abs=0.1)
+
+
+@pytest.mark.parametrize("stand", [0.0, 0.02])
+def test_noise_without_a_station_is_that_of_a_fit_without_it(stand):
+    data, station = few_stations(3, {}, 20.0)
+    data = replace(
+        data, sd={name: np.full((3, 8), stand * DEG) for name in ("inclination", "azimuth")}
+    )
+    result, tools = fit(data), np.arange(3)
+    problem, state = result.problem, result.state
+    found = left_out_variances(problem, state, result.analysis, tools, station)
+    include = problem.evidence.include.copy()
+    include[tools, station] = 0.0
+    fewer = replace(problem, evidence=replace(problem.evidence, include=include))
+    again = analyse(fewer, solve(fewer, state, Options()).state)
+    np.testing.assert_allclose(found[0], again.variance_factor, rtol=2e-3)
+    np.testing.assert_allclose(found[1], again.freedom, rtol=1e-3)
+
+
+@pytest.mark.parametrize("sd", [NOISE, {}], ids=["declared", "estimated"])
+def test_a_gross_error_of_one_of_eight_stations_is_named(sd):
+    data, station = few_stations(40, sd, 50.0)
+    named = stations_to_reshoot(fit(data))
+    assert named[np.arange(40), station].all()
+
+
+def test_sound_runs_of_eight_stations_rarely_name_one():
+    """One in a hundred: more than 12 of 400 would happen with a chance of 0.1 %."""
+    named = stations_to_reshoot(fit(few_stations(400, {})[0])).any(-1)
+    assert 0 < named.sum() <= 12

@@ -14,7 +14,7 @@ from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import ErrorRow, Measures, StationRow, figures, stated
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.minimisers import closed_form
-from mwdcal.estimation.problem import ANGLES, STAND_ERRORS, Problem
+from mwdcal.estimation.problem import ANGLES, STAND_ERRORS
 from mwdcal.estimation.uncertainty import (
     Analysis,
     by_triad,
@@ -420,15 +420,16 @@ def chances(fit: Fit) -> Array:
 def _chances(fit: Fit) -> Array:
     by_left_out = is_by_left_out(fit)
     if by_left_out.all():
-        return _left_out_chances(fit)
+        chance = left_out_chances(fit, *np.indices(fit.trust.shape).reshape(2, -1))
+        return chance.reshape(fit.trust.shape)
     square, freedom = station_misfit(_judged(fit))
     others = np.maximum(freedom.sum(-1, keepdims=True) - freedom, 1)
     variance = np.maximum((square.sum(-1, keepdims=True) - square) / others, 1e-30)
     declared = np.isnan(fit.noise).all(-1, keepdims=True)
     chance = tail(square / np.where(declared, np.maximum(variance, 1.0), variance), freedom)
-    some = np.flatnonzero(by_left_out)
-    if some.size:
-        chance[some] = _left_out_chances(take(fit, some))
+    if by_left_out.any():
+        some = np.flatnonzero(by_left_out)
+        chance[some] = _chances(take(fit, some))
     return chance
 
 
@@ -438,43 +439,44 @@ def is_by_left_out(fit: Fit) -> Bools:
     return np.asarray(estimated & (fit.analysis.influence is None))
 
 
-def _left_out_chances(fit: Fit) -> Array:
-    """Chances (B, n) by the residuals of each triad against the noise in the fit without the station: Fisher's F.
+def left_out_chances(fit: Fit, tool: Ints, station: Ints) -> Array:
+    """Chances (k,) of some stations of some tools, by each triad's residuals and its noise without the station.
 
-    The least of the triads', times their number. A gross error of a station is in the estimated noise, and hides
-    there: with few stations no residual can exceed it three times.
+    By Fisher's F; the least of the triads', times their number. A gross error of a station is in the noise that is
+    estimated with it, and hides there: with few stations no residual can exceed that three times.
 
     Reference: R. D. Cook and S. Weisberg, Residuals and Influence in Regression (1982), section 2.2: externally
     studentised residuals.
     """
-    exact = None if closed_form.applies(fit.problem) else fit.problem
-    chance, tests = np.ones(fit.analysis.residual.shape[:2]), left_out_tests(fit, exact)
+    analysis, noise = fit.analysis, fit.noise[tool]
+    tests = left_out_tests(fit, tool, station)
+    if not closed_form.applies(fit.problem):
+        exact = left_out_variances(fit.problem, fit.state, analysis, tool, station)
+        others = zip(*(each.mT for each in exact), strict=True)
+        tests = [(*one[:2], *other) for one, other in zip(tests, others, strict=True)]
+    chance = np.ones(len(tool))
     for index, (square, freedom, variance, rest) in enumerate(tests):
-        declared = np.isnan(fit.noise[:, index])
         by_noise = tail(square / np.maximum(np.nan_to_num(variance), 1.0), freedom)
         tested = (freedom > 0) & (rest >= 1)
         ratio = square / np.maximum(np.where(tested, freedom * variance, 1.0), 1e-300)
         by_others = fisher_tail(np.maximum(freedom, 1.0), np.maximum(rest, 1.0), ratio)
-        one = np.where(declared[:, None], by_noise, np.where(tested, by_others, 1.0))
-        chance = np.minimum(chance, one)
+        by_others = np.where(tested, by_others, 1.0)
+        chance = np.minimum(chance, np.where(np.isnan(noise[:, index]), by_noise, by_others))
     return np.minimum(chance * len(tests), 1.0)
 
 
-def left_out_tests(fit: Fit, problem: Problem | None = None) -> list[tuple[Array, ...]]:
-    """χ² of each station in each triad, s² in the fit without it, and the degrees of freedom of both (B, n).
+def left_out_tests(fit: Fit, tool: Ints, station: Ints) -> list[tuple[Array, ...]]:
+    """χ² of some stations in each triad, s² in the fit without them, and the degrees of freedom of both, (k,) each.
 
-    s² is exact with the `problem` of the fit. Without, S of `left_out_variances` is taken as a projection of each
-    triad, as it is where references are exact: the sum of squares falls by the χ² of the station.
+    The covariance of a triad's residuals is taken as a projection, which it is where references are exact: the sum
+    of squares falls by the χ² of the station.
     """
-    each = [station_misfit(analysis) for analysis in by_triad(fit.analysis)]
-    if problem:
-        variance, rest = left_out_variances(problem, fit.state, fit.analysis)
-        return [(*one, variance[..., i], rest[..., i]) for i, one in enumerate(each)]
-    totals = fit.analysis.variance_factor, fit.analysis.freedom
-    tests: list[tuple[Array, ...]] = []
-    for (square, tested), factor, freedom in zip(each, *(x.mT for x in totals), strict=True):
-        rest = freedom[:, None] - tested
-        squares = (np.nan_to_num(factor) * freedom)[:, None] - square
+    analysis, tests = fit.analysis, list[tuple[Array, ...]]()
+    for index, each in enumerate(by_triad(analysis)):
+        square, tested = (part[tool, station] for part in station_misfit(each))
+        freedom = analysis.freedom[tool, index]
+        squares = np.nan_to_num(analysis.variance_factor[tool, index]) * freedom - square
+        rest = freedom - tested
         tests.append((square, tested, np.maximum(per_freedom(squares, rest), 0.0), rest))
     return tests
 

@@ -235,6 +235,8 @@ LEAST_SHARE = 0.05
 """A free direction with less than this share on a triad does not move the triad."""
 TESTED = 1e-3
 """A direction of a station's readings counts if this share of its variance is left by the fit."""
+LEFT_OUT_AT_ONCE = 1024
+"""Stations that are left out at once, each by itself."""
 ROTATIONS = ("rotation-x", "rotation-y", "toolface-zero")
 """Names of the turns of a triad about the tool's three axes."""
 TANGENT_STEP = 1e-5
@@ -574,38 +576,54 @@ def left_out_residual(analysis: Analysis) -> Array:
     return _along(_tested_inverse(analysis.spread)[0], analysis.residual)
 
 
-def left_out_variances(problem: Problem, state: State, analysis: Analysis) -> tuple[Array, Array]:
-    """s² and degrees of freedom (B, n, t) of each triad in the fit without one station, for each station.
+def left_out_variances(
+    problem: Problem, state: State, analysis: Analysis, tool: Ints, station: Ints
+) -> tuple[Array, Array]:
+    """s² and degrees of freedom (k, t) of each triad in the fits of some tools (k,), each without one station (k,).
 
     Exact for a linear problem: a station left out moves the residuals of the others by -S_ji S_ii⁺ C⁻¹ρ, S being the
     covariance of all residuals. s² is NaN where the others leave no freedom.
     """
-    linear, factor, freedom = problem.linear(state), analysis.variance_factor, analysis.freedom
-    taken = [np.stack(part, -1) for part in zip(*_taken(linear, analysis), strict=True)]
-    squares = (np.nan_to_num(factor) * freedom)[:, None] - taken[0]
-    left = freedom[:, None] - taken[1]
-    return np.maximum(per_freedom(squares, left), 0.0), left
+    linear, squares, freedom = problem.linear(state), [], []
+    weighed, whole = linear.weighed, whole_covariance(linear, analysis.determined)
+    for index, factor in enumerate(np.nan_to_num(analysis.variance_factor).mT):
+        axes, left = slice(3 * index, 3 * index + 3), analysis.freedom[:, index]
+        rows = weighed[:, :, axes].reshape(len(weighed), -1, weighed.shape[-1])
+        normal = rows[..., :-1].mT @ rows
+        parts = [
+            _shares_of_stations(weighed[t, s], whole[t], normal[t], analysis.spread[t, s], axes)
+            for t, s in _blocks(tool, station)
+        ]
+        each = [np.concatenate(part) for part in zip(*parts, strict=True)]
+        squares.append((factor * left)[tool] - each[0])
+        freedom.append(left[tool] - each[1])
+    rest = np.stack(freedom, -1)
+    return np.maximum(per_freedom(np.stack(squares, -1), rest), 0.0), rest
 
 
-def _taken(linear: Linear, analysis: Analysis) -> Iterator[tuple[Array, Array]]:
-    """What a station left out takes of each triad's sum of squares and of its degrees of freedom, (B, n) each."""
-    whole, weighed = whole_covariance(linear, analysis.determined), linear.weighed[..., :-1]
-    residual, spread, back = analysis.residual, analysis.spread, _tested_inverse(analysis.spread)[0]
-    pulled = _along(back, residual)
-    moved = (weighed.mT @ pulled[..., None])[..., 0] @ whole
-    reach = weighed @ whole[:, None]
-    for first in range(0, residual.shape[-1], 3):
-        axes = slice(first, first + 3)
-        rows = weighed[..., axes, :]
-        flat = rows.reshape(len(rows), -1, rows.shape[-1])
-        gram = flat.mT @ flat
-        before = flat.mT @ residual[..., axes].reshape(len(rows), -1, 1)
-        own = residual[..., axes] + (rows @ moved[..., None])[..., 0]
-        change = 2 * (moved @ before)[..., 0] + np.sum((moved @ gram) * moved, -1)
-        cross = reach @ rows.mT
-        inner = reach @ (gram[:, None] @ reach.mT) - cross @ cross.mT
-        trace = np.trace(spread[..., axes, axes], axis1=-2, axis2=-1)
-        yield np.sum(own**2, -1) - change, trace + np.sum(back * inner, (-2, -1))
+def _blocks(tool: Ints, station: Ints) -> Iterator[tuple[Ints, Ints]]:
+    """Tools (k,) and stations (k,), so many at once that their matrices fit the cache."""
+    for first in range(0, len(tool), LEFT_OUT_AT_ONCE):
+        yield tool[first : first + LEFT_OUT_AT_ONCE], station[first : first + LEFT_OUT_AT_ONCE]
+
+
+def _shares_of_stations(
+    weighed: Array, whole: Array, normal: Array, spread: Array, axes: slice
+) -> tuple[Array, Array]:
+    """What stations (k,) that are left out take of sum of squares and degrees of freedom of a triad, its `axes`.
+
+    By the rows C⁻¹ (X ρ) (k, m, p + 1) of the station and their products `normal` (k, p, p + 1) over all stations.
+    """
+    rows, residual, back = weighed[..., :-1], weighed[..., -1:], _inverse_of_tested(spread)[0]
+    reach = rows @ whole
+    moved = reach.mT @ (back @ residual)
+    gram, before = normal[..., :-1], normal[..., -1:]
+    own = residual[:, axes] + rows[:, axes] @ moved
+    change = np.sum(moved * (2 * before + gram @ moved), (-2, -1))
+    cross = reach @ rows[:, axes].mT
+    inner = reach @ gram @ reach.mT - cross @ cross.mT
+    trace = np.trace(spread[:, axes, axes], axis1=-2, axis2=-1)
+    return np.sum(own**2, (-2, -1)) - change, trace + np.sum(back * inner, (-2, -1))
 
 
 def by_triad(analysis: Analysis) -> list[Analysis]:

@@ -20,6 +20,7 @@ from mwdcal.calibration.residuals import (
     chances,
     chi_chance,
     is_by_left_out,
+    left_out_chances,
     left_out_tests,
     stations_to_remeasure,
     tail,
@@ -488,34 +489,61 @@ def departures(result: Fit) -> tuple[Array, Ints]:
 
 def stations_to_reshoot(result: Fit) -> Bools:
     """Stations (B, n) to take again: `stations_to_remeasure`, evaluated only where a bound allows it to be true."""
+    return result.problem.once("to reshoot", result.state, lambda _: _to_reshoot(result))
+
+
+def _to_reshoot(result: Fit) -> Bools:
+    """Stations (B, n) to take again, by the chances of those near the limit."""
     again = np.zeros(result.analysis.residual.shape[:2], bool)
-    some = np.flatnonzero(_suspects(result))
+    by_left_out = is_by_left_out(result)
+    if by_left_out.any():
+        again = _standing_out(result) & by_left_out[:, None]
+    some = np.flatnonzero(~by_left_out)
     if some.size:
         part = result if some.size == len(again) else take(result, some)
-        again[some] = stations_to_remeasure(chances(part))
+        places = np.flatnonzero(_suspects(part))
+        if places.size:
+            part = part if places.size == len(again) else take(part, places)
+            again[some[places]] = stations_to_remeasure(chances(part))
+    return again
+
+
+def _standing_out(result: Fit) -> Bools:
+    """Stations (B, n) that stand out from the noise that the others show.
+
+    Fisher's F is never as unlikely as χ², which is tried first; where references are uncertain, with some margin, as
+    the noise of the others is approximate there.
+    """
+    again = np.zeros(result.trust.shape, bool)
+    tool, station = np.nonzero(~again)
+    chance = RESHOOT / result.trust.shape[-1]
+    limit = likely(3, chance / result.noise.shape[-1])
+    limit *= 1.0 if closed_form.applies(result.problem) else NEARLY
+    out = np.zeros(again.size, bool)
+    for square, _, variance, _ in left_out_tests(result, tool, station):
+        out |= ~(square <= limit * np.nan_to_num(variance, nan=1.0))
+    tools, place = np.unique(tool[out], return_inverse=True)
+    if tools.size:
+        part = take(result, tools)
+        unlikely = left_out_chances(part, place, station[out]) < chance
+        again.reshape(-1)[np.flatnonzero(out)[unlikely]] = True
     return again
 
 
 def _suspects(result: Fit) -> Bools:
-    """Members (B,) of which some station's misfit may be too large.
+    """Members (B,) of which some station's misfit may be too large, where noise is declared, or a fit robust.
 
-    With declared noise and no robust weights χ² itself must be. It is bounded from above by what
+    Without robust weights χ² itself must be. It is bounded from above by what
     the trace of the residuals' covariance says, whose eigenvalues are 0…1, then by that of all directions.
-    With estimated noise χ² must be for the noise without the station, as if that were known.
     """
     analysis = result.analysis
     residual, spread = analysis.residual, analysis.spread
     size, chance = spread.shape[-1], RESHOOT / len(result.trust[0])
     suspect = np.any(~np.isnan(result.noise), -1) | robust(result)
-    by_left_out = is_by_left_out(result)
-    if by_left_out.any():
-        suspect &= ~by_left_out | _stand_out(result, chance)
-    if suspect.all() or by_left_out.all():
-        return np.asarray(suspect)
     smallest = np.trace(spread, axis1=-2, axis2=-1) - (size - 1)
     good = np.sum(residual**2, -1) < likely(size, chance) * smallest
     good &= (smallest > TESTED) & (analysis.influence is None)
-    tool, station = np.nonzero(~good & ~(suspect | by_left_out)[:, None])
+    tool, station = np.nonzero(~good & ~suspect[:, None])
     square = quadratic_form(spread[tool, station], residual[tool, station])
     over = ~(square < likely(1, chance))
     tool, station = tool[over], station[over]
@@ -523,19 +551,6 @@ def _suspects(result: Fit) -> Bools:
     some = replace(analysis, residual=left, spread=spread[None, tool, station])
     suspect[tool[tail(*station_misfit(some))[0] < LEEWAY * chance]] = True
     return np.asarray(suspect)
-
-
-def _stand_out(result: Fit, chance: float) -> Bools:
-    """Fits (B,) of which a station has a triad whose χ² is as unlikely, or nearly so, for the noise of the others.
-
-    Fisher's F is never as unlikely as χ². Where references are uncertain the noise without a station is approximate.
-    """
-    limit = likely(3, chance / result.noise.shape[-1])
-    limit *= 1.0 if closed_form.applies(result.problem) else NEARLY
-    out = np.zeros(len(result.status), bool)
-    for square, _, variance, _ in left_out_tests(result):
-        out |= ~(square <= limit * np.nan_to_num(variance, nan=1.0)).all(-1)
-    return out
 
 
 @cache

@@ -18,10 +18,10 @@ from itertools import pairwise
 import numpy as np
 
 from mwdcal.calibration.automatic.courses import TRIED, f_test, steady_columns, temperature_powers
+from mwdcal.calibration.diagnosis.plausibility import stations_to_reshoot
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.methods import ESTIMABLE, acts_on
 from mwdcal.calibration.readings import HIGHEST, LEAST_TEMPERATURE_SPAN, TRIADS, highest_order
-from mwdcal.calibration.residuals import chances, stations_to_remeasure
 from mwdcal.calibration.results import variance_scales
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.minimisers import closed_form, closed_form_drift, uncertain_stand
@@ -833,7 +833,7 @@ def _testable(problem: Problem, state: State, others: Mapping[str, Array]) -> di
 
 def _without_bad_stations(result: Fit) -> Fit:
     """The fits less their stations to take again, if they are few: one bad station looks like anything."""
-    bad = stations_to_remeasure(chances(result))
+    bad = stations_to_reshoot(result)
     bad &= bad.mean(-1, keepdims=True) <= BAD_SHARE
     evidence = result.problem.evidence
     fewer = replace(evidence, include=evidence.include * ~bad)
