@@ -8,9 +8,10 @@ import os
 import pickle
 import signal
 from functools import wraps
-from inspect import isfunction
 
 import pytest
+
+import pictures
 
 for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
@@ -19,6 +20,11 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else every command compiles t
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_xdist_auto_num_workers():
+    """Half as many again as cores: while one waits for a process, a port or a browser, another computes."""
+    return max((os.cpu_count() or 1) * 3 // 2, 1)
 
 
 def pytest_configure(config):
@@ -67,16 +73,7 @@ def templates_compiled_once():
 @pytest.fixture
 def without_pictures(monkeypatch):
     """Pages with empty pictures: drawing takes most of the time of a page that is read for its text."""
-    from markupsafe import Markup
-
-    from mwdcal.presentation import page
-    from mwdcal.use.plots import Plots
-
-    for name, method in vars(Plots).items():
-        if isfunction(method) and not name.startswith("_"):
-            monkeypatch.setattr(Plots, name, lambda *given: "")
-    monkeypatch.setattr(page, "picture", lambda figure, suffix: b"<svg></svg>")
-    monkeypatch.setattr(page, "svg", lambda figure, key: Markup("<svg></svg>"))
+    pictures.leave_out(monkeypatch.setattr)
 
 
 @pytest.fixture

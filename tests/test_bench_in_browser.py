@@ -27,6 +27,8 @@ pytestmark = [
 VIEWS = [(1280, "light"), (800, "dark"), (420, "light")]
 """Widths and schemes; a place does not depend on the colours (`test_only_colours_change_in_the_dark`)."""
 LONGEST = 120_000
+DEMO = ("--demo", "--speed", "30")
+"""Faster, and the simulated readings take a whole core while the browser and the papers are waited for."""
 
 
 class Operator:
@@ -97,7 +99,7 @@ class Operator:
 
 
 @pytest.fixture
-def demo(tmp_path, browser):
+def demo(tmp_path, browser, request):
     folder = tmp_path / "S"
     key = tmp_path / "second.key"
     created = mwdcal("certificate", "key", "create", "-o", key, "--owner", "B. Second")
@@ -109,7 +111,8 @@ def demo(tmp_path, browser):
         "--registry",
         tmp_path / "tools.sqlite",
     )
-    bench = BenchProcess("--demo", "--speed", "100", *laboratory, folder=folder)
+    pictures = "keyboard" not in request.node.name  # once is enough
+    bench = BenchProcess(*DEMO, *laboratory, folder=folder, pictures=pictures)
     operator = Operator(browser, bench.url)
     yield bench, operator, folder
     operator.context.close()
@@ -208,7 +211,7 @@ def test_the_story_by_keyboard_alone(demo):
 
 def test_two_browsers_and_a_restart(tmp_path, browser):
     """The office sees what the tablet accepts; after a kill the session goes on where it was."""
-    bench = BenchProcess("--demo", "--speed", "100", folder=tmp_path / "S")
+    bench = BenchProcess(*DEMO, folder=tmp_path / "S")
     tablet, office = Operator(browser, bench.url), Operator(browser, bench.url)
     tablet.button("Start").click()
     tablet.page.get_by_label("Accept when settled").check()
@@ -216,7 +219,7 @@ def test_two_browsers_and_a_restart(tmp_path, browser):
     shown = int(re.search(r"Stations: (\d+)", office.page.inner_text("#main"))[1])
     bench.kill()
     tablet.page.get_by_text("The bench does not answer").wait_for(timeout=LONGEST)
-    again = BenchProcess("--speed", "100", folder=tmp_path / "S")
+    again = BenchProcess(*DEMO[1:], folder=tmp_path / "S")
     late = Operator(browser, again.url)
     assert int(re.search(r"Stations: (\d+)", late.page.inner_text("#main"))[1]) >= shown
     late.button("Resume").click()
@@ -310,7 +313,7 @@ DROP = """([text, name]) => {
 
 def test_a_table_by_drag_and_drop_and_by_keyboard(tmp_path, browser):
     """Dropped on the start page, its question answered, calibrated, verified by a file that was chosen, certified."""
-    bench = BenchProcess("--source", "manual", folder=tmp_path / "S")
+    bench = BenchProcess("--source", "manual", folder=tmp_path / "S", pictures=False)
     operator, stand = Operator(browser, bench.url), Stand()
     page = operator.page
     page.evaluate(DROP, [[*laboratory_table(stand, RUN)], "Mess 1.csv"])

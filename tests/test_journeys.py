@@ -22,6 +22,11 @@ def note(frame, event, argument):
     if event == "call" and named and code.co_filename.startswith(package):
         seen.add((code.co_filename, code.co_firstlineno))
 from mwdcal.app import cli
+try:  # places of panels are found by Matplotlib alone, which takes most of the time
+    from matplotlib.figure import Figure
+    Figure.set_layout_engine = lambda *given, **options: None
+except ImportError:
+    pass
 sys.setprofile(note)
 try:
     cli.main(sys.argv[2:])
