@@ -52,6 +52,7 @@ from mwdcal.files.formats.columns import LABELS, Column, plain_names, shown
 from mwdcal.files.formats.table import Table, labels
 from mwdcal.files.formats.text import holds_numbers, is_formula
 from mwdcal.files.marks import UNMARKED, without_rejected
+from mwdcal.files.repeats import means, repeats
 from mwdcal.files.statements import stated_table
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array
@@ -137,7 +138,12 @@ def read_run(
         source = read_export(
             source, profile, decimal=decimal, rows=MOST_ROWS, statements=statements
         )
-    table = run_table(source, profile)
+    return read_stations(station_table(source, profile), profile)
+
+
+def read_stations(stations: Table, profile: Profile) -> tuple[Readings, Profile]:
+    """The readings of the rows of `station_table`, and the profile with its nominal scales filled in."""
+    table = renamed(stations, profile)
     check_run(table)
     readings, profile = to_readings(table, profile)
     return replace(readings, others=_other_numbers(table)), profile
@@ -328,11 +334,26 @@ def _not_as_stated(table: Table, profile: Profile) -> InputError:
 
 
 def run_table(table: Table, profile: Profile) -> Table:
-    """The rows of a run that its laboratory has not rejected, under the names and in the units of the run file."""
-    exported = is_export(table.columns, profile)
-    named = {each.name: column for column, each in _sources(profile).items()} if exported else {}
+    """The stations of a run, as `station_table` has them, under the names and in the units of the run file."""
+    return renamed(station_table(table, profile), profile)
+
+
+def station_table(table: Table, profile: Profile) -> Table:
+    """The rows of a run that its laboratory has not rejected; of an export with one row for each station.
+
+    Its `remarks` say which rows are left out, and of which the means are taken.
+    """
+    sources = _sources(profile) if is_export(table.columns, profile) else {}
+    named = {each.name: column for column, each in sources.items()}
     used = [n for n in table.columns if named.get(n, n) in UNMARKED]
-    return renamed(without_rejected(table, profile.table, used), profile)
+    table = without_rejected(table, profile.table, used)
+    sets = repeats(table, sources)
+    if sets is None:
+        return table
+    if not sources or sets.numbered:
+        return replace(table, remarks=(*table.remarks, sets.advice()))
+    scales = {kind: getattr(profile, kind).scale for kind in CHANNELS}
+    return replace(means(table, sources, sets), remarks=(*table.remarks, sets.sentence(scales)))
 
 
 def renamed(table: Table, profile: Profile) -> Table:

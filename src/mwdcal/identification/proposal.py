@@ -36,6 +36,7 @@ from mwdcal.files.formats.text import is_preamble
 from mwdcal.files.marks import MARKS_NAMED, UNMARKED, marks_in, place, without_rejected
 from mwdcal.files.metadata import toml
 from mwdcal.files.profiles import CHOICE_OF_AXES
+from mwdcal.files.repeats import means, repeats
 from mwdcal.files.runs import STATED_REFERENCES, check_run, filled_down, renamed, to_readings
 from mwdcal.files.statements import stated_table
 from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW, FACTORS, WARMTH
@@ -409,6 +410,9 @@ def _proposal(
     denied = [c for c, name in answers.items() if not name and c in table.metadata]
     form = _with(form, {"ignore": (*ignored, *denied)} if ignored or denied else {})
     table = _of_one_tool(table, columns, stated)
+    sets = repeats(table, columns)
+    if sets and not sets.numbered:
+        table = means(table, columns, sets)
     profile = Profile(name=Path(path).stem, table=form or msgspec.UNSET, columns=columns)
     try:
         profile, readings, wirings, open_axes = _wired_by_elevation(table, profile)
@@ -424,8 +428,12 @@ def _proposal(
     _check_repeats(table, columns, form or TableFormat())
     name, triads = str(readings.metadata.get("serial", Path(path).stem)), _triads(readings, wirings)
     profile = msgspec.structs.replace(profile, name=name, **triads)
+    remarks = [*readings.remarks, *blank]
+    if sets:
+        scales = {kind: triad.scale for kind, triad in triads.items()}
+        remarks.append(sets.advice() if sets.numbered else sets.sentence(scales))
     return Proposal(
-        _without_the_usual(profile), wirings, readings.count, readings.unused, (*readings.remarks, *blank), by_value,
+        _without_the_usual(profile), wirings, readings.count, readings.unused, tuple(remarks), by_value,
         readings.metadata, readings.run_sha256, where, open_axes, ignored,
     )  # fmt: skip
 

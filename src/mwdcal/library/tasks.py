@@ -84,7 +84,8 @@ def read_run(
     table = table_of(source, "the run", read)
     if metadata:
         table = replace(table, metadata={**table.metadata, **meta.plain(metadata, table.source)})
-    readings, profile = runs.read_run(table, profile)
+    table = runs.station_table(table, profile)
+    readings, profile = runs.read_stations(table, profile)
     whole = arrays_of(table)
     return replace(readings, profile=profile, profile_sha256=profile_sha256, table=whole)
 

@@ -1,0 +1,245 @@
+"""Rows that are readings of one station: their means are the station.
+
+Readings at one setting of the stand share its error. As stations of their own they would count it again and again, and
+their residuals, alike from row to row, would look like a drift. A row of a documented run file is a station; in a
+table that is read through a tool profile, rows that follow each other are readings of one where label and stand are
+the same. Without labels they are where all of them come in sets of one size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mwdcal.calibration.readings import SOAK_GAP
+from mwdcal.estimation.problem import ANGLES
+from mwdcal.files import synonyms
+from mwdcal.files.contract import CHANNELS, RAW, REFERENCES
+from mwdcal.files.formats.columns import LABELS, Column
+from mwdcal.files.formats.table import Table, labels, numbers
+from mwdcal.files.statements import rows_of
+from mwdcal.geometry.vectors import Array, Bools, Ints
+from mwdcal.sensor.profile import ColumnSource
+
+_ONE_SETTING = 0.05
+"""Degrees by which an encoder of the stand shows one setting differently at most."""
+_ONE_READING = 0.03
+"""Share of a triad's range by which readings of one station depart from their mean at most."""
+_MILLI = {"accelerometer": (1e3, "mg"), "magnetometer": (1.0, "nT")}
+
+
+@dataclass(frozen=True)
+class Repeats:
+    """Rows of a table that are readings of stations: `starts` (m,) is the first row of each, of `rows`.
+
+    `labelled`: by their label; otherwise only by the angles of the stand. `numbered`: each row has a label of its own.
+    `scatter`: standard deviation of one reading about its station, raw, by triad.
+    """
+
+    starts: Ints
+    rows: int
+    labelled: bool
+    numbered: bool
+    scatter: Mapping[str, float]
+
+    @property
+    def sizes(self) -> Ints:
+        """Readings (m,) of each station."""
+        return np.diff(self.starts, append=self.rows)
+
+    def counted(self) -> str:
+        """How many stations have how many readings.
+
+        >>> Repeats(np.array([0, 5]), 10, True, False, {}).counted()
+        '2 stations of 5 readings each'
+        """
+        least, most = int(self.sizes.min()), int(self.sizes.max())
+        each = f"{most} readings each" if least == most else f"{least} to {most} readings"
+        return f"{len(self.starts)} stations of {each}"
+
+    def sentence(self, scales: Mapping[str, float | None]) -> str:
+        """The stations and the scatter of their readings; `scales` are raw units per g and nT, where known."""
+        sizes = [
+            f"{float(f'{sd / scale * _MILLI[kind][0]:.2g}'):g} {_MILLI[kind][1]}"
+            for kind, sd in self.scatter.items()
+            if (scale := scales.get(kind)) and np.isfinite(sd)
+        ]
+        scatter = f"; scatter of a reading {', '.join(sizes)}" if sizes else ""
+        by_angles = (
+            ""
+            if self.labelled
+            else " Equal angles of the stand alone say so: if it was set anew for each row, number the rows in a "
+            "column `station`."
+        )
+        return f"{self.counted()}: their means are taken{scatter}.{by_angles}"
+
+    def advice(self) -> str:
+        """The advice where the rows stay stations."""
+        how = (
+            "give the readings of a station one label in the column `station`, and read the table through a tool "
+            "profile (mwdcal profile)"
+            if self.numbered or not self.labelled
+            else "read the table through a tool profile (mwdcal profile)"
+        )
+        return (
+            f"every row counts as a station, and label or stand angles are those of {self.counted()}. Readings of one "
+            f"setting share its error and look like a drift. If they are such, average them: {how}."
+        )
+
+
+def repeats(table: Table, sources: Mapping[str, ColumnSource]) -> Repeats | None:
+    """The rows that are readings of one station; None where every row is a station of its own.
+
+    `sources`: columns of the run file that the table has under other names.
+    """
+    names = {c: sources[c].name if c in sources else c for c in (*LABELS, *_NUMBERS)}
+    names = {c: name for c, name in names.items() if name in table.columns}
+    if table.count < 2 or not {*CHANNELS["accelerometer"]} <= {*names}:
+        return None
+    station = np.array(labels(table, names.get("station", "station")) or [""] * table.count)
+    angles = {
+        n: numbers(table, names[c]) * _factor(sources, c)
+        for n in ANGLES
+        if (c := REFERENCES[n].column) in names
+    }
+    same = np.ones(table.count - 1, bool)
+    for name in ("group", "serial"):
+        if name in names:
+            same &= _equal(np.array(labels(table, names[name])))
+    alike = _equal(station) & (station[1:] != "")
+    labelled = bool(alike.any())
+    numbered = len({*station.tolist()}) == table.count
+    if labelled:
+        same &= alike & ~_set_anew(angles)
+    elif {"inclination", "toolface"} <= {*angles} and (numbered or not station.any()):
+        same &= np.all([_equal(each) for each in angles.values()], 0)
+    else:
+        return None
+    if not same.any():
+        return None
+    starts = _without_differing(table, names, sources, _starts(same), labelled)
+    sizes = np.diff(starts, append=table.count)
+    if sizes.max() < 2 or (not labelled and (len(starts) < 2 or np.ptp(sizes) > 0)):
+        return None
+    return Repeats(starts, table.count, labelled, numbered, _scatters(table, names, starts))
+
+
+_NUMBERS = (*RAW, synonyms.WARMTH, *(REFERENCES[name].column for name in ANGLES))
+
+
+def _factor(sources: Mapping[str, ColumnSource], column: str) -> float:
+    """What one of the unit of a column is in the unit of the run file."""
+    unit = sources[column].unit if column in sources else ""
+    return abs(synonyms.FACTORS.get(unit, (1.0, 0.0))[0])
+
+
+def _equal(values: np.ndarray) -> Bools:
+    """Whether each value (n,) but the first is equal to the one before."""
+    return np.asarray(values[1:] == values[:-1])
+
+
+def _set_anew(angles: Mapping[str, Array]) -> Bools:
+    """Whether an angle of a row but the first is another than before; a blank one is not."""
+    turned = [np.abs((np.diff(each) + 180.0) % 360.0 - 180.0) for each in angles.values()]
+    return np.any([each > _ONE_SETTING for each in turned], 0) if turned else np.array(False)
+
+
+def _starts(same: Bools) -> Ints:
+    """First rows of the sets that follow each other; `same` (n - 1,): a row goes with the one before."""
+    return np.flatnonzero(np.r_[True, ~same])
+
+
+def _without_differing(
+    table: Table,
+    names: Mapping[str, str],
+    sources: Mapping[str, ColumnSource],
+    starts: Ints,
+    partly: bool,
+) -> Ints:
+    """The sets without those whose readings or temperatures differ by too much: their rows are stations each.
+
+    Unless `partly`, one such set splits all.
+    """
+    sizes = np.diff(starts, append=table.count)
+    differ = np.zeros(len(starts), bool)
+    for raw in _triads(table, names).values():
+        radius = np.linalg.norm(raw - (raw.max(0) + raw.min(0)) / 2, axis=-1).max()
+        apart = np.linalg.norm(_departures(raw, starts), axis=-1)
+        differ |= np.maximum.reduceat(apart, starts) > _ONE_READING * radius
+    if synonyms.WARMTH in names:
+        warmth = numbers(table, names[synonyms.WARMTH]) * _factor(sources, synonyms.WARMTH)
+        span = np.maximum.reduceat(warmth, starts) - np.minimum.reduceat(warmth, starts)
+        differ |= span > SOAK_GAP
+    if differ.any() and not partly:
+        return np.arange(table.count)
+    goes_on = ~np.isin(np.arange(table.count), starts) & ~np.repeat(differ, sizes)
+    return _starts(goes_on[1:])
+
+
+def _triads(table: Table, names: Mapping[str, str]) -> dict[str, Array]:
+    """Raw readings (n, 3) by triad."""
+    return {
+        kind: np.stack([numbers(table, names[c]) for c in channels], -1)
+        for kind, channels in CHANNELS.items()
+        if {*channels} <= {*names}
+    }
+
+
+def _means(values: Array, starts: Ints) -> Array:
+    """Means (m, ...) of sets of values (n, ...)."""
+    sizes = np.diff(starts, append=len(values))
+    return np.asarray(
+        np.add.reduceat(values, starts, 0) / sizes.reshape(-1, *[1] * (values[0].size > 1))
+    )
+
+
+def _departures(values: Array, starts: Ints) -> Array:
+    """Values (n, ...) less the means of their sets."""
+    sizes = np.diff(starts, append=len(values))
+    return np.asarray(values - np.repeat(_means(values, starts), sizes, axis=0))
+
+
+def _scatters(table: Table, names: Mapping[str, str], starts: Ints) -> dict[str, float]:
+    """Standard deviation of one reading of a channel about the mean of its station, by triad."""
+    freedom = 3 * (table.count - len(starts))
+    return {
+        kind: float(np.sqrt((_departures(raw, starts) ** 2).sum() / freedom))
+        for kind, raw in _triads(table, names).items()
+    }
+
+
+def means(table: Table, sources: Mapping[str, ColumnSource], sets: Repeats) -> Table:
+    """The table with one row for each station: means of its numbers, the first of its texts.
+
+    The uncertainty of a raw mean is that of independent readings.
+    """
+    ours = {each.name: column for column, each in sources.items()}
+    first = rows_of(table, sets.starts.tolist())
+    columns: dict[str, Column] = dict(first.columns)
+    for name, cells in table.columns.items():
+        column = ours.get(name, name)
+        if column in LABELS or (isinstance(cells, list) and name not in ours):
+            continue
+        columns[name] = _mean_column(column, numbers(table, name), sources, sets)
+    return replace(first, columns=columns)
+
+
+def _mean_column(
+    column: str, values: Array, sources: Mapping[str, ColumnSource], sets: Repeats
+) -> Array:
+    """The values (m,) of stations, of a column (n,) of their readings."""
+    starts, sizes = sets.starts, sets.sizes
+    if column.removeprefix("sd_") in RAW and column not in RAW:
+        return np.asarray(np.sqrt(np.add.reduceat(values**2, starts)) / sizes)
+    if column.startswith("sd_ref_"):
+        return np.asarray(np.fmax.reduceat(values, starts))
+    if column in RAW or not column.startswith("ref_"):
+        return _means(values, starts)
+    first = np.repeat(values[starts], sizes)
+    above = np.where(np.isnan(values), first, values) - first
+    if column.endswith("_deg"):
+        turn = 360.0 / _factor(sources, column)
+        above = (above + turn / 2) % turn - turn / 2
+    return np.asarray(values[starts] + _means(above, starts))

@@ -1,0 +1,176 @@
+"""Rows that are readings of one station: expected values are means by NumPy, and the truth of simulated tools."""
+
+import msgspec
+import numpy as np
+import pytest
+
+import mwdcal as library
+from cli_support import RAW, channels, mwdcal, refused, stations, write_csv
+from mwdcal.sensor.profile import ColumnSource, Profile, StandProfile, TriadProfile
+from simulation import DEG, Tool, plan
+from test_tables_as_they_come import NAMES, findings_of
+
+COUNT, READINGS = 24, 5
+STAND = 0.02 * DEG
+"""Error of a setting of the stand, 1 sigma."""
+
+
+def repeated(seed=1, readings=READINGS, stand=STAND, noise=(1e-4, 15.0)):
+    """A run of 24 attitudes, and the tool: the readings of an attitude share what the stand is off there."""
+    rng = np.random.default_rng(seed)
+    tool = Tool.random(seed, noise=noise)
+    attitudes = plan((5, 45, 90, 130), COUNT // 4)
+    at_stand = [np.repeat(each + stand * rng.normal(size=COUNT), readings) for each in attitudes]
+    g, b = (
+        clean + sd * rng.normal(size=(COUNT * readings, 3))
+        for clean, sd in zip(tool.clean(*at_stand), noise, strict=True)
+    )
+    run = stations(*(np.repeat(each, readings) for each in attitudes), **channels(g, b))
+    run["station"] = np.repeat(np.arange(1, COUNT + 1), readings)
+    return run | {"temperature_c": np.full(COUNT * readings, 24.0)}, tool
+
+
+def profile():
+    """A tool profile that reads the columns by other names."""
+    columns = {ours: ColumnSource(name=theirs) for ours, theirs in NAMES.items()}
+    scales = {"accelerometer": 3.0, "magnetometer": 5e-5}
+    triads = {kind: TriadProfile(axes=("+x", "+y", "+z"), scale=s) for kind, s in scales.items()}
+    return Profile(name="tool", columns=columns, **triads)
+
+
+def read(run, tool=None):
+    """The readings of a run under other names."""
+    return library.read_run(
+        {NAMES.get(n, n): values for n, values in run.items()}, tool or profile()
+    )
+
+
+def test_rows_of_one_label_and_setting_are_one_station_at_their_means(tmp_path):
+    run, _ = repeated()
+    path, tool, cal = tmp_path / "a.csv", tmp_path / "t.toml", tmp_path / "c.json"
+    write_csv(path, {NAMES.get(name, name): values for name, values in run.items()})
+    proposed = mwdcal("profile", path, "-o", tool)
+    ran = mwdcal("calibrate", path, "--tool", tool, "-o", cal, "--exclude", 7)
+    sets = {name: np.reshape(run[name], (COUNT, READINGS)) for name in RAW}
+    variance = np.array([each.var(1, ddof=1).mean() for each in sets.values()])
+    mg, nt = np.sqrt([variance[:3].mean(), variance[3:].mean()]) / [3e-3, 5e-5]
+    assert (mg, nt) == pytest.approx((0.1, 15.0), rel=0.15)
+    sentence = (
+        "24 stations of 5 readings each: their means are taken; scatter of a reading "
+        f"{mg:.2g} mg, {nt:.2g} nT."
+    )
+    for each in (proposed, ran):
+        assert each.code == 0
+        assert f"! {sentence}\n" in each.err
+    assert "24 stations" in proposed.out
+    calibration = library.load(cal)
+    assert (calibration.stations, calibration.excluded) == (23, ["7"])
+    assert sentence in [finding.text for finding in calibration.findings]
+    got = read(run)
+    means = np.stack([each.mean(1) for each in sets.values()], -1)
+    assert got.labels == tuple(map(str, range(1, COUNT + 1)))
+    assert got.accelerometer == pytest.approx(means[:, :3] / 3.0, rel=1e-12)
+    assert got.magnetometer == pytest.approx(means[:, 3:] / 5e-5, rel=1e-12)
+    assert {len(column) for column in got.columns.values()} == {COUNT}
+
+
+@pytest.mark.parametrize("seeds", [30, pytest.param(300, marks=pytest.mark.study)])
+def test_stated_uncertainty_covers_the_errors_that_readings_of_a_setting_share(seeds):
+    inc, azi, face = np.radians([[40.0, 75.0, 120.0], [70.0, 200.0, 310.0], [33.0, 160.0, 250.0]])
+    stand = dict.fromkeys(("inclination_deg", "azimuth_deg", "toolface_deg"), STAND / DEG)
+    declared = StandProfile(**stand, settings="per-station")
+    with_stand = msgspec.structs.replace(profile(), stand=declared)
+    errors, stated = [], []
+    for seed in range(seeds):
+        run, tool = repeated(seed)
+        cal = library.calibrate(read(run, with_stand))
+        point = library.readings(*tool.clean(inc, azi, face), temperature=np.full(3, 24.0))
+        found = library.apply(cal, point)
+        for name, true in (("inclination", inc), ("azimuth", azi)):
+            errors.append((getattr(found, name) - true + np.pi) % (2 * np.pi) - np.pi)
+            stated.append(cal.uncertainty(name, point))
+        assert cal.drift == []
+    share = np.mean(np.abs(errors) <= 1.96 * np.array(stated))
+    assert share == pytest.approx(0.95, abs=4 * np.sqrt(0.95 * 0.05 / (2 * seeds)))
+    assert np.sqrt(np.mean((np.array(errors) / stated) ** 2)) == pytest.approx(1.0, abs=0.25)
+
+
+def test_rows_that_are_numbered_stay_stations_and_are_asked_about():
+    run, _ = repeated()
+    run["station"] = np.arange(1, COUNT * READINGS + 1)
+    got = read(run)
+    assert got.count == COUNT * READINGS
+    assert "24 stations of 5 readings each" in got.remarks[0]
+    assert "one label" in got.remarks[0]
+
+
+def test_rows_without_labels_are_stations_where_all_come_in_sets_of_one_size():
+    run, _ = repeated()
+    del run["station"]
+    got = read(run)
+    assert (got.count, got.labels[-1]) == (COUNT, "24")
+    assert "number the rows" in got.remarks[0]
+    uneven = {name: np.asarray(values)[:-1] for name, values in run.items()}
+    assert read(uneven).count == COUNT * READINGS - 1
+
+
+def test_a_row_of_a_documented_run_file_is_a_station_and_repeats_are_named(tmp_path):
+    run, _ = repeated()
+    write_csv(tmp_path / "a.csv", run)
+    ran = mwdcal("calibrate", tmp_path / "a.csv", "--tool", "servo", "-o", tmp_path / "c.json")
+    assert "24 stations of 5 readings each" in ran.err
+    assert library.load(tmp_path / "c.json").stations == COUNT * READINGS
+    refused(mwdcal("calibrate", tmp_path / "a.csv", "-o", tmp_path / "d.json", "--exclude", 7), 2)
+
+
+def test_angles_are_those_of_the_first_reading_or_the_mean_of_an_encoder():
+    run, _ = repeated(stand=0.0)
+    first = np.arange(COUNT * READINGS) % READINGS == 0
+    blank = {n: np.where(first, v, np.nan) for n, v in run.items() if n.startswith("ref_")}
+    known, angles = read(run).known, ("inclination", "azimuth", "toolface")
+    for name in angles:
+        assert read(run | blank).known[name] == pytest.approx(known[name], abs=1e-12)
+    shown = np.tile([359.99, 0.01, 0.0, 359.98, 0.02], COUNT)
+    azimuth = np.asarray(run["ref_azimuth_deg"])
+    got = read(run | {"ref_azimuth_deg": (azimuth + shown) % 360.0}).known["azimuth"]
+    turned = (got - known["azimuth"] + np.pi) % (2 * np.pi) - np.pi
+    assert turned == pytest.approx(0.0, abs=1e-9)
+
+
+def test_what_moves_under_one_label_is_no_station_of_many_readings():
+    run, tool = repeated()
+    rolled = {**run, "ref_toolface_deg": np.full(len(run["station"]), np.nan)}
+    clean = tool.clean(
+        *(np.radians(run[f"ref_{n}_deg"]) for n in ("inclination", "azimuth")),
+        np.tile(np.arange(READINGS) * 72 * DEG, COUNT),
+    )
+    warming = np.tile(np.arange(READINGS) * 20.0, COUNT)
+    for moved in (rolled | channels(*clean), run | {"temperature_c": warming}):
+        got = read(moved)
+        assert got.count == COUNT * READINGS
+        assert not got.remarks
+    turned = run | {"ref_toolface_deg": np.arange(COUNT * READINGS) * 3.0}
+    assert read(turned).count == COUNT * READINGS
+
+
+def test_the_noise_of_a_mean_is_that_of_its_readings_over_their_root():
+    run, _ = repeated()
+    run |= {f"sd_{name}": np.full(COUNT * READINGS, 3e-4) for name in ("ax", "ay", "az")}
+    assert read(run).sd["accelerometer"] == pytest.approx(1e-4 / np.sqrt(READINGS))
+
+
+def test_a_roll_test_in_repeated_rows_is_judged_by_its_means(tmp_path):
+    run, tool = repeated()
+    angles = (np.full(12, 55 * DEG), np.full(12, 140 * DEG), np.arange(12) * 30 * DEG)
+    rng = np.random.default_rng(5)
+    g, b = (
+        each + sd * rng.normal(size=(36, 3))
+        for each, sd in zip(
+            tool.clean(*(np.repeat(a, 3) for a in angles)), (1e-4, 15.0), strict=True
+        )
+    )
+    test = stations(*(np.repeat(a, 3) for a in angles), **channels(g, b))
+    test |= {"station": np.repeat(np.arange(1, 13), 3), "temperature_c": np.full(36, 24.0)}
+    verdict = library.verify(library.calibrate(read(run)), read(test))
+    assert verdict.stations == 12
+    assert "12 stations of 3 readings each" in findings_of(verdict)["marked-rows"]
