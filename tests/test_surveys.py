@@ -597,6 +597,36 @@ def test_without_reference_nothing_is_accepted(example, tmp_path):
     assert "azimuth_true_deg" not in columns
 
 
+def test_a_well_outside_the_calibrated_temperatures_has_the_reason_and_no_blank_tables(
+    example, tmp_path
+):
+    """The example's run is of 24.8…25.3 °C without temperature terms, which count 5 °C farther."""
+    given = read_csv(EXAMPLE / "well.csv")
+    low, high = mwdcal.load(example).temperature_c
+    hot = {**given, "temperature_c": ["90"] * len(given["md_m"])}
+    source, page = write_csv(tmp_path / "in.csv", hot), tmp_path / "p.html"
+    ran = cli("survey", example, source, "-o", tmp_path / "out.csv", "--report", page)
+    assert ran.code == 0
+    told = (
+        f"are blank. Rows have results within 5 °C of it ({low - 5:.1f}…{high + 5:.1f} °C). Calibrate at several "
+        "temperatures, or choose --outside extrapolate (no uncertainty)."
+    )
+    assert told in ran.err
+    assert "36 without a result" in ran.out
+    assert "–    –" not in ran.out
+    assert "contributions" not in ran.out
+    html = page.read_text("utf-8")
+    assert "No survey has a result" in html
+    assert told in html
+    assert "<svg" not in html[html.index('id="outcome"') :]
+    with pytest.warns(UserWarning, match="are blank. Rows have results within 5 °C") as warned:
+        mwdcal.survey(mwdcal.load(example), source)
+    assert warned[0].filename == __file__
+    with pytest.warns(UserWarning, match="choose `outside` extrapolate") as warned:
+        mwdcal.apply(mwdcal.load(example), source)
+    assert warned[0].filename == __file__
+
+
 def test_hot_stations_have_no_result_and_no_position(example, tmp_path):
     warm = ["25.1"] * 36
     warm[5] = "90"
@@ -745,11 +775,10 @@ def test_tie_in_moves_the_path(example, tmp_path):
             (),
             "line 5, column 'md_m': must not decrease",
         ),
-        ({"DEPT": ["1"] * 36}, (), "measured depths must be in metres"),
-        ({"Hole Depth (ft)": ["1"] * 36}, (), "measured depths must be in metres"),
+        ({"DEPT": ["1"] * 36}, (), r"does not state the unit.*'DEPT \(ft\)', or give --length-unit"),
+        ({"Bit depth": ["1"] * 36}, (), "column 'Bit depth' does not state the unit"),
         ({"md_m": ["-5", *map(str, range(35))]}, (), "between 0 and 20000"),
         ({"accepted": ["x"] * 36}, (), "'accepted' is there already"),
-        ({"MD (ft)": ["1"] * 36}, (), "column 'md_m' twice|measured depths must be in metres"),
         ({}, ("--switch", "5"), "--switch"),
         ({}, ("--switch", "6,5"), "--switch"),
         ({}, ("--tie-in", "1,2"), "--tie-in"),
@@ -760,7 +789,7 @@ def test_tie_in_moves_the_path(example, tmp_path):
 )
 def test_bad_input_of_a_well(example, tmp_path, columns, options, message):
     given = read_csv(EXAMPLE / "well.csv")
-    if {"MD (ft)", "DEPT", "Hole Depth (ft)"} & {*columns}:
+    if {"DEPT", "Bit depth"} & {*columns}:
         del given["md_m"]
     source = write_csv(tmp_path / "in.csv", {**given, **columns}, "simulated = true")
     ran = cli("survey", example, source, "-o", tmp_path / "out.csv", *options)
@@ -783,6 +812,29 @@ def test_depths_in_metres_under_another_name(example, tmp_path, name, options):
         assert not any(name in finding["text"] for finding in ran.json["findings"])
         ends.append(ran.json["end"])
     assert ends[0] == ends[1]
+
+
+@pytest.mark.parametrize(
+    ("name", "foot", "options"),
+    [
+        ("Depth (ft)", 0.3048, ()),
+        ("Bit depth [ft]", 0.3048, ()),
+        ("MD ft", 0.3048, ("--length-unit", "ft")),
+        ("Hole depth (usft)", 1200 / 3937, ()),
+        ("Depth (ft)", 1200 / 3937, ("--length-unit", "usft")),
+        ("Bit depth", 0.3048, ("--length-unit", "ft")),
+    ],
+)
+def test_depths_in_feet_by_the_title_of_their_column(example, tmp_path, name, foot, options):
+    """Courses of 90 m: nobody asks for feet where the unit is stated."""
+    given = read_csv(EXAMPLE / "well.csv")
+    metres = 3 * np.array(given.pop("md_m"), float)
+    columns = {**given, name: [repr(md / foot) for md in metres.tolist()]}
+    source = write_csv(tmp_path / "in.csv", columns, "simulated = true")
+    ran = cli("survey", example, source, "-o", tmp_path / "out.csv", "--json", *options)
+    assert ran.code == 0, ran.err
+    assert ran.json["end"]["md_m"] == pytest.approx(metres[-1], abs=1e-9)
+    assert not [f for f in ran.json["findings"] if f["id"] == "long-courses" or name in f["text"]]
 
 
 def test_long_well_is_like_its_parts(example, tmp_path):

@@ -915,6 +915,14 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         """
         return MARGIN if self.thermal else SOAK_GAP
 
+    @property
+    def valid_temperatures(self) -> tuple[float, float] | None:
+        """Lowest and highest temperature, °C, at which readings have results; None: none was recorded."""
+        if self.temperature_c is None:
+            return None
+        low, high = self.temperature_c
+        return low - self.margin, high + self.margin
+
     def outside(self, readings: ReadingsLike, margin: float | None = None) -> Bools:
         """Stations (…, n) outside the calibrated temperature range by more than a margin, °C.
 

@@ -35,7 +35,7 @@ from mwdcal.logs.noise import Noise, find_noise
 from mwdcal.logs.stations import Stations, find_stations
 from mwdcal.sensor.profile import NOMINAL as NOMINAL
 from mwdcal.sensor.profile import Profile
-from mwdcal.use.correction import correct
+from mwdcal.use.correction import correct, warn_if_blank
 from mwdcal.use.verification import Limits, Verdict
 from mwdcal.use.verification import verify as judge
 
@@ -345,6 +345,7 @@ def apply(
     """
     survey = readings_of(survey, "survey", calibration.profile, single=False)
     columns, findings = correct(calibration, survey, outside)
+    warn_if_blank(columns, findings)
     return Corrected(
         gravity=np.stack([columns[f"g{axis}_g"] for axis in "xyz"], -1),
         field=np.stack([columns[f"b{axis}_nt"] for axis in "xyz"], -1),

@@ -26,6 +26,7 @@ from mwdcal.library.arrays import nearest
 from mwdcal.library.results import Result, frame
 from mwdcal.library.tasks import Tabular, _check_readings, table_of
 from mwdcal.sensor.profile import Profile
+from mwdcal.use.correction import warn_if_blank
 
 if TYPE_CHECKING:
     from mwdcal.calibration.record import SignatureCheck
@@ -537,7 +538,9 @@ def survey(
     for analysis in filter(None, analyses):
         analysis.check()
     way: Any = {"tie_in": start, "switch": ends, "outside": outside, "axial": axial_correction}
-    return WellSurvey(survey_runs(inputs, analyses, **way), loaded[0].signature)
+    result = survey_runs(inputs, analyses, **way)
+    warn_if_blank(result.well.columns, result.well.findings)
+    return WellSurvey(result, loaded[0].signature)
 
 
 def convert(

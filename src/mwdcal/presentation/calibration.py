@@ -48,6 +48,8 @@ if TYPE_CHECKING:
 
 MOST_EXCLUDED = 20
 """Most stations left out of the fit that the screen names."""
+VALID = "good for {:.1f}…{:.1f} °C: readings beyond have no results (--outside of apply and survey)"
+"""The temperatures of readings."""
 PROFILE = " (see [stand] of the tool profile)"
 ORDERS = "error: rms per axis, with the noise; inside: interpolation, at the ends: extrapolation"
 COMPARED = """
@@ -165,6 +167,7 @@ def remarks(calibration: Calibration) -> list[str]:
     return [
         *residuals(calibration),
         f"accuracy to expect (1σ, calibration alone, typical): {'  '.join(accuracy)}",
+        *([VALID.format(*valid)] if (valid := calibration.valid_temperatures) else []),
         *([f"Assumed exact; this run cannot check it: {exact}{PROFILE}"] if exact else []),
         *([steady] if steady else []),
         *drift_remarks(calibration),

@@ -296,7 +296,7 @@ def whole_screen(
     analyses = [run.analysis for run in result.runs] or [result.analysis]
     parts = [interference_screen(each, *stated) for each in analyses if each]
     parts.append(screen(result.well, facts, signature, *stated))
-    if result.contributions:
+    if result.contributions and facts.blank < facts.rows:
         unit = result.well.length_unit
         parts.append(contribution_screen(result.contributions, station, unit))
     written = files_written(table=facts.output, page=facts.html, **files) if facts.output else ""
@@ -389,8 +389,7 @@ def screen(
 ) -> str:
     """The surveys for people; `signature` of the calibration, `metadata` of it and of the readings."""
     counts = [f"{facts.accepted} accepted", f"{facts.rejected} rejected"]
-    if facts.not_judged:
-        counts.append(f"{facts.not_judged} not judged")
+    counts += without_verdict(facts)
     if facts.blind:
         counts.append(f"{facts.blind} blind to interference")
     heading = [well.readings.source, plural(facts.rows, "survey"), *counts]
@@ -412,10 +411,15 @@ def screen(
     return "\n".join(
         [
             *map(one_line, lines),
-            "",
-            survey_table(well, facts.rows),
+            *(["", survey_table(well, facts.rows)] if facts.blank < facts.rows else []),
         ]
     )
+
+
+def without_verdict(facts: SurveySummary) -> list[str]:
+    """Numbers of surveys that have a result and no verdict, and of those without a result, in words."""
+    words = {"not judged": facts.not_judged - facts.blank, "without a result": facts.blank}
+    return [f"{count} {word}" for word, count in words.items() if count]
 
 
 def model_in_words(errors: WellErrors, runs: bool = False) -> str:

@@ -25,6 +25,7 @@ from mwdcal.presentation.survey import (
     sources_in_words,
     survey_rows,
     tie_in_in_words,
+    without_verdict,
 )
 from mwdcal.presentation.text import plural
 from mwdcal.survey.acceptance import SURVEY_UNITS
@@ -346,8 +347,9 @@ MOST_ROWS_OF_PAGE = 2000
 
 def render(surveyed: SurveyedWell, findings: list[Finding]) -> str:
     """The surveys as HTML, with the multi-station analysis if there is one."""
-    well, analysis, budget = surveyed.well, surveyed.analysis, surveyed.contributions
+    well, analysis = surveyed.well, surveyed.analysis
     facts = result_summary(surveyed)
+    budget = surveyed.contributions if facts.blank < facts.rows else None
     digests = dict(surveyed.inputs.named)
     for i, run in enumerate(surveyed.runs[1:], 2):
         digests |= {
@@ -365,7 +367,7 @@ def render(surveyed: SurveyedWell, findings: list[Finding]) -> str:
         banner=_banner(facts),
         findings=findings,
         strengths=strengths(well) if facts.not_judged < facts.rows else None,
-        angles=angles(well),
+        angles=angles(well) if facts.blank < facts.rows else None,
         path=path(well) if located else None,
         contributions=shares(well, budget) if budget else None,
         causes=share_rows(budget, station_row(budget, None), well.length_unit) if budget else [],
@@ -396,8 +398,12 @@ def _banner(facts: SurveySummary) -> dict[str, str]:
     north = f"Azimuths count from {facts.north} north"
     if facts.rejected:
         return banner("bad", "Rejected", headline, f"{facts.rejected} outside. {north}")
-    if facts.not_judged or facts.blank:
-        return banner("attention", "Attention", headline, f"{facts.not_judged} not judged. {north}")
+    if facts.blank == facts.rows:
+        outside = any(finding.id == "outside-temperature" for finding in facts.findings)
+        reason = "they lie outside the calibrated temperatures" if outside else "readings are missing"
+        return banner("bad", "No result", "No survey has a result", f"See below: {reason}")
+    if without := ", ".join(without_verdict(facts)):
+        return banner("attention", "Attention", headline, f"{without}. {north}")
     if facts.blind:
         return banner(
             "attention", "Attention", headline, f"{facts.blind} blind to interference. {north}"

@@ -69,6 +69,7 @@ from mwdcal.survey.surveying import (
     typical_north,
     with_reference,
     with_section,
+    with_stated_unit,
 )
 from mwdcal.survey.well import Before, Well, WellCounts, part_of_well, with_findings
 from mwdcal.use.correction import (
@@ -383,7 +384,7 @@ class _LongTable:
         first = replace(seen.first, readings=readings, sources=sources)
         first = with_findings(first, tally, counts, settings.outside, settings.tie_in is None)
         exchanged = exchanged_axes(settings.calibration, readings)
-        first = replace(first, findings=[*inputs.findings, *exchanged, *first.findings])
+        first = replace(first, findings=[*inputs.findings, *exchanged, *with_stated_unit(first.findings, self.head)])
         return SurveyedWell(inputs, first, counts, None)
 
     def _scatter(self) -> dict[str, Scatter]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -304,7 +304,7 @@ def depth_column(table: Table, length_unit: str = "") -> tuple[str, float]:
     """The column of measured depths, and metres per its unit, or blank.
 
     Raises:
-        InputError: the column has another name without metres in it, and no unit of length was chosen.
+        InputError: the column has another name without a unit in it, and no unit of length was chosen.
     """
     for name, unit in MEASURED_DEPTHS.items():
         if name in table.columns:
@@ -313,13 +313,19 @@ def depth_column(table: Table, length_unit: str = "") -> tuple[str, float]:
         if _DEPTH_NAMES.fullmatch(name.strip().lower()):
             stated = _DEPTH_UNIT.search(name.strip().lower())
             unit = stated[1] if stated else ""
-            if not length_unit and not unit.startswith("m"):
+            if not length_unit and not unit:
                 raise InputError(
-                    f"{table.source}: column '{name}': measured depths must be in metres, in a column 'md_m'; in feet "
-                    "in 'md_ft', in US survey feet in 'md_usft'. Rename it, or give `length_unit`."
+                    f"{table.source}: column '{name}' does not state the unit of measured depths. Rename it, as in "
+                    f"'{name} (m)' or '{name} (ft)', or give `length_unit`."
                 )
             return name, LENGTH_UNITS[_unit_of(unit, length_unit)]
     return "", 1.0
+
+
+def with_stated_unit(findings: Iterable[Finding], table: Table) -> list[Finding]:
+    """The findings without the question for feet, where the title of the depths or `length_unit` answers it."""
+    asked = depth_column(table, "m")[0] == "md_m"
+    return [finding for finding in findings if asked or finding.id != "long-courses"]
 
 
 def used_in_surveys(table: Table) -> list[str]:
@@ -334,7 +340,7 @@ def _unit_of(stated: str, chosen: str) -> str:
         return "m"
     if stated in LENGTH_UNITS and (stated, chosen) != ("ft", "usft"):
         return stated
-    return "ft" if stated and chosen == "m" else chosen
+    return "ft" if stated and chosen in ("", "m") else chosen
 
 
 def length_unit_of(given: str) -> tuple[str, str]:
@@ -751,7 +757,8 @@ def survey_well(
     said = alone.findings(result.readings.labels, result.north.name) if alone else []
     used = surveys.readings if inputs.unused is None else surveys.readings.select(~inputs.unused)
     exchanged = exchanged_axes(inputs.calibration, used)
-    findings = [*inputs.findings, *about, *exchanged, *result.findings, *said]
+    told = with_stated_unit(result.findings, inputs.table)
+    findings = [*inputs.findings, *about, *exchanged, *told, *said]
     result = replace(
         result, findings=findings, sources=surveys.sources, length_unit=inputs.length_unit
     )

@@ -8,6 +8,7 @@ attitude of the tool. A table that goes slowly from place to place changes littl
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain
 from typing import NamedTuple
@@ -192,7 +193,7 @@ ROW_FINDINGS = {
     "no-magnetometer": "no columns mx, my, mz: magnetic results are blank.",
     "other-tool": "the readings are of tool {tools[1]}, the calibration of tool {tools[0]}: is it the right one?",
     "missing-reading": "{tally.lacking} of {tally.rows} rows lack a reading: their results are blank.",
-    "outside-temperature": "{beyond}: their results are {results}.",
+    "outside-temperature": "{beyond}: their results are {results}",
     "no-temperature": "the calibration has no temperature terms, and its run recorded no temperature{readings_at}.",
     "implausible-gravity": "{off[gravity]}: the tool moved while it was read, or a reading is in another unit.",
     "implausible-field": "{off[field]}: iron or a current was near, or a reading is in another unit.",
@@ -208,8 +209,9 @@ ROW_FINDINGS = {
 }
 """The texts of the findings about corrected rows, in their order."""
 RESULTS_BEYOND = (
-    "blank",
-    f"extrapolated, with no statement of accuracy, and marked in the column '{EXTRAPOLATED}'",
+    "blank. Rows have results within {margin:g} °C of it ({low:.1f}…{high:.1f} °C). {advice}, or choose `outside` "
+    "extrapolate (no uncertainty).",
+    f"extrapolated, with no statement of accuracy, and marked in the column '{EXTRAPOLATED}'.",
 )
 """The treatment of results outside the calibrated temperatures."""
 COMPILED_ROWS = 300_000
@@ -411,7 +413,7 @@ def findings(
     unknown = f": nothing says how good the results are at the readings' {warm} °C"
     words = {
         "beyond": beyond,
-        "results": RESULTS_BEYOND[outside == "extrapolate"],
+        "results": _results_beyond(calibration, outside),
         "readings_at": unknown if calibration.unrecorded(readings) else "",
         "unsteady": changing,
         "odd": odd_rows(tally.scatter),
@@ -428,6 +430,24 @@ def findings(
             if applies[name]
         ]
     )
+
+
+def _results_beyond(calibration: Calibration, outside: str) -> str:
+    """The treatment of results outside the calibrated temperatures, with the remedy."""
+    low, high = calibration.valid_temperatures or (np.nan, np.nan)
+    advice = (
+        "Calibrate over a wider range" if calibration.thermal else "Calibrate at several temperatures"
+    )
+    text = RESULTS_BEYOND[outside == "extrapolate"]
+    return text.format(margin=calibration.margin, low=low, high=high, advice=advice)
+
+
+def warn_if_blank(columns: Mapping[str, AnyArray], findings: Iterable[Finding]) -> None:
+    """Warn the caller's caller where no row has a result and temperatures are the reason."""
+    if np.isnan(columns["gravity_g"]).all():
+        for finding in findings:
+            if finding.id == "outside-temperature":
+                warnings.warn(finding.text, stacklevel=3)
 
 
 def undetermined(
