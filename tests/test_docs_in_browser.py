@@ -3,6 +3,8 @@
 Looks at build/docs, which `make docs` and `make check` build; without it the tests are skipped.
 """
 
+import re
+
 import pytest
 
 from chromium import AXE, CHROMIUM, RUN_AXE, browser
@@ -49,6 +51,15 @@ def page_of(name):
 
 def test_there_is_a_page_of_each_kind():
     assert set(KINDS) <= set(PAGES)
+
+
+def test_options_of_commands_keep_their_hyphens_and_examples_their_lines():
+    pages = [*(BUILT / "reference" / "commands").glob("*.html")]
+    assert len(pages) > 15
+    for page in pages:
+        text = page.read_text("utf-8")
+        assert "Example: mwdcal" in text or "Examples: mwdcal" in text, page.name
+        assert not re.search(r"\| Examples?:|–[a-z]+ [a-z]+\.", text), page.name
 
 
 @pytest.mark.parametrize("name", [*map(page_of, PAGES)])

@@ -421,6 +421,22 @@ def test_heads_are_repeated_on_paper(planted):
     assert all("label" in sheet.text and "first" in sheet.text for sheet in paper)
 
 
+def test_a_caption_is_on_the_sheet_of_its_picture(planted):
+    """Even if a table follows that has no room there."""
+    picture = "<figure>picture<div style='height: 120mm'></div></figure><p class='soft'>caption</p>"
+    table = f"<div class='keep' style='height: 150mm'>{table_of([('P1', '1')])}</div>"
+    paper = planted(picture + table).paper()
+    assert len(paper) == 2
+    assert "picture" in paper[0].text
+    assert "caption" in paper[0].text
+
+
+def test_a_narrow_screen_shows_the_values_of_a_table_of_few_columns(planted):
+    content = "<div class='scroll'>" + table_of([("a quantity", "1")]) + "</div>"
+    few = planted(content.replace("<table", "<table class='full'")).page
+    assert few.locator("td").last.bounding_box()["x"] < 420
+
+
 # ------------------------------------------------------------------ a closer look
 
 

@@ -55,7 +55,7 @@ def quantity(value: float | None, symbol: str, digits: int | None = None) -> str
     """A number with its unit, which is apart from a power of ten.
 
     >>> [quantity(0.25, "°"), quantity(3, "nT"), quantity(0.03, "°", 2), quantity(1e-9, "°", 2), quantity(None, "nT")]
-    ['0.25°', '3 nT', '0.030°', '1.0×10⁻⁹ °', '–']
+    ['0.25°', '3 nT', '0.030°', '1.0×10⁻⁹\\xa0°', '–']
     """
     shown = number(value, digits)
     if value is None:
