@@ -78,6 +78,8 @@ SCATTER_ROUNDS = 16
 """Most repetitions where a scatter from station to station is estimated too…"""
 SCATTER_SETTLED = 0.02
 """…and the change of it, as a share, at which they end."""
+ROUNDS_WITHOUT = 3
+"""Rounds in which noise is estimated without stations that are left out."""
 
 
 @dataclass(frozen=True)
@@ -293,6 +295,17 @@ def _refined(result: Fit, problem: Problem, state: State, options: Options) -> F
     return put(
         whole, rest, with_all(_refitted_anyhow(*take((result, problem, state), rest), options))
     )
+
+
+def without_stations(result: Fit, left: Bools) -> Fit:
+    """The fits without the stations `left` out (B, n), to first order, with noise estimated anew where it was."""
+    evidence = result.problem.evidence
+    fewer = replace(evidence, include=evidence.include * ~left)
+    problem = replace(result.problem, evidence=fewer)
+    state = stepped(problem, result.state, Determined.of(problem, result.state))
+    for _ in range(ROUNDS_WITHOUT):
+        problem = _rescaled(problem, _noise_scale(analyse(problem, state), ahead=False))
+    return replace(result, problem=problem, state=state, analysis=analyse(problem, state))
 
 
 def with_all(result: Fit) -> Fit:

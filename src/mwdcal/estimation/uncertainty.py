@@ -618,12 +618,12 @@ def _shares_of_stations(
     reach = rows @ whole
     moved = reach.mT @ (back @ residual)
     gram, before = normal[..., :-1], normal[..., -1:]
-    own = residual[:, axes] + rows[:, axes] @ moved
+    itself = residual[:, axes] + rows[:, axes] @ moved
     change = np.sum(moved * (2 * before + gram @ moved), (-2, -1))
     cross = reach @ rows[:, axes].mT
     inner = reach @ gram @ reach.mT - cross @ cross.mT
     trace = np.trace(spread[:, axes, axes], axis1=-2, axis2=-1)
-    return np.sum(own**2, (-2, -1)) - change, trace + np.sum(back * inner, (-2, -1))
+    return np.sum(itself**2, (-2, -1)) - change, trace + np.sum(back * inner, (-2, -1))
 
 
 def by_triad(analysis: Analysis) -> list[Analysis]:

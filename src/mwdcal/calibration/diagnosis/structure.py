@@ -19,11 +19,11 @@ import numpy as np
 
 from mwdcal.calibration.automatic.courses import TRIED, f_test, steady_columns, temperature_powers
 from mwdcal.calibration.diagnosis.plausibility import stations_to_reshoot
-from mwdcal.calibration.estimate import Fit
+from mwdcal.calibration.estimate import Fit, without_stations
 from mwdcal.calibration.methods import ESTIMABLE, acts_on
 from mwdcal.calibration.readings import HIGHEST, LEAST_TEMPERATURE_SPAN, TRIADS, highest_order
 from mwdcal.calibration.results import variance_scales
-from mwdcal.estimation.batch import take
+from mwdcal.estimation.batch import put, take
 from mwdcal.estimation.minimisers import closed_form, closed_form_drift, uncertain_stand
 from mwdcal.estimation.minimisers.closed_form_drift import (
     Alike,
@@ -614,7 +614,7 @@ def dip_may_be_off(result: Fit, size: float) -> Bools:
 STRUCTURE_CHANCE = 0.01
 """Chance of residuals as large in declared noise, below which their structure is looked at."""
 BAD_SHARE = 0.1
-"""Share of bad stations up to which they are left out."""
+"""Share of bad stations up to which they are left out; a single one always is."""
 COLUMN = "column "
 """Beginnings of the names of columns that the run does not use."""
 COLUMN_EXPLAINS = (
@@ -832,12 +832,16 @@ def _testable(problem: Problem, state: State, others: Mapping[str, Array]) -> di
 
 
 def _without_bad_stations(result: Fit) -> Fit:
-    """The fits less their stations to take again, if they are few: one bad station looks like anything."""
+    """The fits less their stations to take again, if they are few: one bad station looks like anything.
+
+    And with the noise of the others: with that of a bad station in one triad, the other looks as if it had structure.
+    """
     bad = stations_to_reshoot(result)
-    bad &= bad.mean(-1, keepdims=True) <= BAD_SHARE
-    evidence = result.problem.evidence
-    fewer = replace(evidence, include=evidence.include * ~bad)
-    return replace(result, problem=replace(result.problem, evidence=fewer)) if bad.any() else result
+    bad = bad & (np.sum(bad, -1, keepdims=True) <= max(1.0, BAD_SHARE * bad.shape[-1]))
+    places = np.flatnonzero(bad.any(-1))
+    if not places.size:
+        return result
+    return put(result, places, without_stations(take(result, places), bad[places]))
 
 
 def _trials(
