@@ -1,6 +1,7 @@
 """Tables whose columns are named in several rows, whose cells are merged or written once, and what is said of them."""
 
 import csv
+import json
 
 import numpy as np
 import openpyxl
@@ -8,6 +9,7 @@ import pytest
 
 import mwdcal
 from cli_support import EXAMPLE
+from cli_support import mwdcal as command
 from mwdcal.files.formats import table as tables
 from mwdcal.files.runs import read_export, run_table
 
@@ -265,3 +267,26 @@ def test_sheets_of_other_stations_are_not_joined(tmp_path):
     book.save(path)
     with pytest.raises(mwdcal.FitError, match="holds 2 tables of like columns"):
         mwdcal.propose_profile(path)
+
+
+def test_a_roll_test_on_another_sheet_of_the_run_is_that_of_the_run(tmp_path):
+    """It was no part of the fit, and the verdict is that of the same rows in a file of their own."""
+    rows = stations()
+    path = workbook(tmp_path / "run.xlsx", [*TITLES, NAMES, *rows[:32]])
+    book = openpyxl.load_workbook(path)
+    page = book.create_sheet("Roll test")
+    for row in [*TITLES, NAMES, *rows[32:]]:
+        page.append(row)
+    book.save(path)
+    alone = workbook(tmp_path / "alone.xlsx", [*TITLES, NAMES, *rows[32:]])
+    command("profile", path, "-o", tmp_path / "tool.toml")
+    both = [
+        command(
+            *("calibrate", path, "--tool", tmp_path / "tool.toml", "--json"),
+            *("-o", tmp_path / f"{test.stem}.json", "--rolltest", test),
+        )
+        for test in (path, alone)
+    ]
+    verdicts = [json.loads(each.out)["verification"] for each in both]
+    assert verdicts[0]["stations"] == verdicts[1]["stations"] == 16
+    assert verdicts[0]["rows"] == verdicts[1]["rows"]

@@ -176,6 +176,24 @@ def read_export(
     return stated_table(table, statements or {}, _serial_column(table, profile))
 
 
+def read_roll_test(
+    path: str | os.PathLike[str], run: Table, profile: Profile, statements: Mapping[str, str]
+) -> Table | None:
+    """The roll test in the file of a run, on a sheet or below a line that says so; None where there is none."""
+    from mwdcal.files.formats.layout import ROLL_TEST
+
+    form = TableFormat() if isinstance(profile.table, msgspec.UnsetType) else profile.table
+    decimal = "," if form.decimal == "," else ""
+    wanted = _channels_of(profile) or CHANNELS["accelerometer"]
+    with suppress(InputError, FitError):
+        where = tables.laid_out(path, wanted=wanted, decimal=decimal, kind=ROLL_TEST)
+        if where and (where.sheet, where.lines[0]) != (run.sheet, run.lines[0]):
+            table = filled_down(_of_layout(where, path, profile), form.fill_down)
+            table = replace(table, metadata={**form.north, **table.metadata})
+            return stated_table(table, statements, _serial_column(table, profile))
+    return None
+
+
 def filled_down(table: Table, names: Collection[str]) -> Table:
     """A table with the cell of the row above in blank cells of some columns; `remarks` of it say in how many."""
     columns, remarks = dict(table.columns), []

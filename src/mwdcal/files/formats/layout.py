@@ -85,6 +85,8 @@ _OF_ROLL_TEST = re.compile(
     re.IGNORECASE,
 )
 """Words of a sheet whose rows are to check a calibration."""
+ROLL_TEST = "roll test"
+"""The kind of such a table."""
 _OF_SETTING = re.compile(
     r"([+−-]?\d+([.,]\d+)?|[\W_]|(?<![^\W\d_])(°?[cf]|deg\w*|grad\w*|°|k|t|temp\w*|oven|ofen|ovn|horno|soak|"
     r"inc\w*|incl\w*|inkl\w*|az\w*|dip|neigung|helning|hold|pos\w*|lage|plus|minus|cold|kalt|kald|fr[ií]o|froid|warm|"
@@ -172,10 +174,12 @@ def laid_out(
     header_line: int = 0,
     wanted: Collection[str] = (),
     decimal: str = "",
+    kind: str = "",
 ) -> Layout:
     """The table of readings in the sheets of a file.
 
-    `sheet` and `header_line` say where it is, `wanted` what columns it has; otherwise the largest one is meant.
+    `sheet` and `header_line` say where it is, `wanted` what columns it has; otherwise the largest one is meant, or of
+    those of a `kind`, such as `ROLL_TEST`, the largest.
 
     Raises:
         InputError: no such sheet, row or columns, or no table.
@@ -191,11 +195,12 @@ def laid_out(
         covers += [] if layouts or any(_is_reading(row) for _, row in each.rows) else [each]
         tables += [t for t in layouts if header_line in (0, t.form.header_line)]
     tables = [t for t in _with_same_stations(tables) if {*wanted} <= {*t.names}]
+    tables = [t for t in tables if not kind or _kind(f"{t.sheet} {t.heading}") == kind]
     if not tables:
         raise _no_table(source, header_line, wanted)
     best = max(tables, key=lambda layout: layout.size)
     alike = [t for t in tables if t is best or (_alike(t, best) and len(t.lines) >= _BESIDES)]
-    if len(alike) > 1 and not header_line:
+    if len(alike) > 1 and not header_line and not kind:
         run = _the_run(alike)
         if run is None:
             raise _several(alike, source, sheet)
@@ -297,7 +302,7 @@ def _the_run(tables: Sequence[Layout]) -> Layout | None:
 
 def _kind(words: str) -> str:
     """A void run or a roll test, by the sheet of a table and the line above it; empty for a run."""
-    kinds = (("void run", _OF_VOID_RUN), ("roll test", _OF_ROLL_TEST))
+    kinds = (("void run", _OF_VOID_RUN), (ROLL_TEST, _OF_ROLL_TEST))
     return next((kind for kind, pattern in kinds if pattern.search(words)), "")
 
 

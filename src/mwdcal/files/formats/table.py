@@ -247,6 +247,7 @@ def laid_out(
     header_row: int = 0,
     wanted: Collection[str] = (),
     decimal: str = "",
+    kind: str = "",
 ) -> Layout | None:
     """Where the table is in a text or workbook as a laboratory keeps it; None of a format without a layout.
 
@@ -268,6 +269,7 @@ def laid_out(
         header_line=header_row,
         wanted=wanted,
         decimal=decimal,
+        kind=kind,
     )
 
 
