@@ -11,6 +11,7 @@ import mwdcal
 from cli_support import EXAMPLE
 from cli_support import mwdcal as command
 from mwdcal.files.formats import table as tables
+from mwdcal.files.formats.titles import titles
 from mwdcal.files.runs import read_export, run_table
 
 COLUMNS = [
@@ -290,3 +291,37 @@ def test_a_roll_test_on_another_sheet_of_the_run_is_that_of_the_run(tmp_path):
     verdicts = [json.loads(each.out)["verification"] for each in both]
     assert verdicts[0]["stations"] == verdicts[1]["stations"] == 16
     assert verdicts[0]["rows"] == verdicts[1]["rows"]
+
+
+@pytest.mark.parametrize(
+    ("cells", "stated"),
+    [
+        (["Serienummer:", "BHX-72 / 0091"], {"serial": "BHX-72 / 0091"}),
+        (["Serial no BHX-72 / 0091"], {"serial": "BHX-72 / 0091"}),
+        (["Serial:", "A-17 / 14.03.2025"], {"serial": "A-17", "date": "2025-03-14"}),
+        (["S/N", "SD-9, 112"], {"serial": "SD-9, 112"}),
+        (["Gerät-Nr.:", "RS2-0175"], {"serial": "RS2-0175"}),
+        (["Probe number", 41], {"serial": "41"}),
+    ],
+)
+def test_a_serial_is_whole(cells, stated):
+    """Of two numbers, and behind whatever word for the number of a tool; a day beside it is the date."""
+    assert titles([cells]).metadata == stated
+
+
+@pytest.mark.parametrize(("name", "asked"), [("Série", "Are these tools"), ("Serial", "2 tools")])
+def test_tools_one_below_the_other_are_asked_about(tmp_path, name, asked):
+    """The serial that is stated takes its rows, whatever the column is called."""
+    rows = stations()
+    both = [[tool, *row] for tool in ("A-101", "A-102") for row in rows]
+    path = text(tmp_path / "run.csv", [TITLES[0][:5], [], [name, *NAMES], *both])
+    with pytest.raises(mwdcal.FitError, match=asked) as error:
+        mwdcal.propose_profile(path)
+    assert [each.arguments for each in error.value.answers][:2] == [
+        (("serial", "A-101"),),
+        (("serial", "A-102"),),
+    ]
+    profile = mwdcal.propose_profile(path, serial="A-102").profile
+    run = run_table(read_export(path, profile, statements={"serial": "A-102"}), profile)
+    assert same(run, rows)
+    assert len(rows) == run.count
