@@ -325,3 +325,42 @@ def test_tools_one_below_the_other_are_asked_about(tmp_path, name, asked):
     run = run_table(read_export(path, profile, statements={"serial": "A-102"}), profile)
     assert same(run, rows)
     assert len(rows) == run.count
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".xlsx"])
+def test_a_table_is_missed_by_calibrate_with_what_to_do_first(tmp_path, suffix):
+    """Not by its delimiters: a profile is to be proposed."""
+    write = text if suffix == ".csv" else workbook
+    path = write(tmp_path / f"run{suffix}", [*TITLES, NAMES, *stations()])
+    ran = command("calibrate", path, "-o", tmp_path / "tool.json")
+    assert ran.code == 2
+    assert f"mwdcal profile run{suffix} -o tool.toml" in ran.err
+    assert "3, not written as a run file" in ran.err
+
+
+@pytest.mark.parametrize("units", [True, False])
+@pytest.mark.parametrize("write", [text, workbook])
+def test_stations_in_columns_are_turned(tmp_path, units, write):
+    """Said; a fault names the column of its station."""
+    rows = stations()
+    bare = [name.partition(" (")[0] for name in NAMES]
+    table = [["Station", *NAMES], *([n + 1, *row] for n, row in enumerate(rows))]
+    if units:
+        table[:1] = [["Station", *bare], ["", "°", "°", "°", *["V"] * 6, "°C"]]
+    turned = [[*column] for column in zip(*table, strict=True)]
+    path = write(tmp_path / f"run.{'csv' if write is text else 'xlsx'}", [*TITLES, *turned])
+    run = taken(path)
+    assert same(run, rows)
+    assert any("stations stand in columns" in each for each in run.remarks)
+    turned[4][9] = "0.1x"
+    write(path, [*TITLES, *turned])
+    with pytest.raises((mwdcal.InputError, mwdcal.FitError), match="column 10, column "):
+        mwdcal.propose_profile(path)
+
+
+def test_labels_of_axes_in_front_of_rows_are_no_names(tmp_path):
+    """A table of six positions, called by the axis that is up, goes down the sheet as any other."""
+    rows = stations()
+    labelled = [[("+X", "-Y", "+Z")[n % 3], *row] for n, row in enumerate(rows)]
+    path = text(tmp_path / "run.csv", [*TITLES, ["Up", *NAMES], *labelled])
+    assert same(taken(path), rows)
