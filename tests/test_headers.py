@@ -1,6 +1,7 @@
 """Tables whose columns are named in several rows, whose cells are merged or written once, and what is said of them."""
 
 import csv
+import json
 
 import numpy as np
 import openpyxl
@@ -8,7 +9,9 @@ import pytest
 
 import mwdcal
 from cli_support import EXAMPLE
+from cli_support import mwdcal as command
 from mwdcal.files.formats import table as tables
+from mwdcal.files.formats.titles import titles
 from mwdcal.files.runs import read_export, run_table
 
 COLUMNS = [
@@ -265,3 +268,99 @@ def test_sheets_of_other_stations_are_not_joined(tmp_path):
     book.save(path)
     with pytest.raises(mwdcal.FitError, match="holds 2 tables of like columns"):
         mwdcal.propose_profile(path)
+
+
+def test_a_roll_test_on_another_sheet_of_the_run_is_that_of_the_run(tmp_path):
+    """It was no part of the fit, and the verdict is that of the same rows in a file of their own."""
+    rows = stations()
+    path = workbook(tmp_path / "run.xlsx", [*TITLES, NAMES, *rows[:32]])
+    book = openpyxl.load_workbook(path)
+    page = book.create_sheet("Roll test")
+    for row in [*TITLES, NAMES, *rows[32:]]:
+        page.append(row)
+    book.save(path)
+    alone = workbook(tmp_path / "alone.xlsx", [*TITLES, NAMES, *rows[32:]])
+    command("profile", path, "-o", tmp_path / "tool.toml")
+    both = [
+        command(
+            *("calibrate", path, "--tool", tmp_path / "tool.toml", "--json"),
+            *("-o", tmp_path / f"{test.stem}.json", "--rolltest", test),
+        )
+        for test in (path, alone)
+    ]
+    verdicts = [json.loads(each.out)["verification"] for each in both]
+    assert verdicts[0]["stations"] == verdicts[1]["stations"] == 16
+    assert verdicts[0]["rows"] == verdicts[1]["rows"]
+
+
+@pytest.mark.parametrize(
+    ("cells", "stated"),
+    [
+        (["Serienummer:", "BHX-72 / 0091"], {"serial": "BHX-72 / 0091"}),
+        (["Serial no BHX-72 / 0091"], {"serial": "BHX-72 / 0091"}),
+        (["Serial:", "A-17 / 14.03.2025"], {"serial": "A-17", "date": "2025-03-14"}),
+        (["S/N", "SD-9, 112"], {"serial": "SD-9, 112"}),
+        (["Gerät-Nr.:", "RS2-0175"], {"serial": "RS2-0175"}),
+        (["Probe number", 41], {"serial": "41"}),
+    ],
+)
+def test_a_serial_is_whole(cells, stated):
+    """Of two numbers, and behind whatever word for the number of a tool; a day beside it is the date."""
+    assert titles([cells]).metadata == stated
+
+
+@pytest.mark.parametrize(("name", "asked"), [("Série", "Are these tools"), ("Serial", "2 tools")])
+def test_tools_one_below_the_other_are_asked_about(tmp_path, name, asked):
+    """The serial that is stated takes its rows, whatever the column is called."""
+    rows = stations()
+    both = [[tool, *row] for tool in ("A-101", "A-102") for row in rows]
+    path = text(tmp_path / "run.csv", [TITLES[0][:5], [], [name, *NAMES], *both])
+    with pytest.raises(mwdcal.FitError, match=asked) as error:
+        mwdcal.propose_profile(path)
+    assert [each.arguments for each in error.value.answers][:2] == [
+        (("serial", "A-101"),),
+        (("serial", "A-102"),),
+    ]
+    profile = mwdcal.propose_profile(path, serial="A-102").profile
+    run = run_table(read_export(path, profile, statements={"serial": "A-102"}), profile)
+    assert same(run, rows)
+    assert len(rows) == run.count
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".xlsx"])
+def test_a_table_is_missed_by_calibrate_with_what_to_do_first(tmp_path, suffix):
+    """Not by its delimiters: a profile is to be proposed."""
+    write = text if suffix == ".csv" else workbook
+    path = write(tmp_path / f"run{suffix}", [*TITLES, NAMES, *stations()])
+    ran = command("calibrate", path, "-o", tmp_path / "tool.json")
+    assert ran.code == 2
+    assert f"mwdcal profile run{suffix} -o tool.toml" in ran.err
+    assert "3, not written as a run file" in ran.err
+
+
+@pytest.mark.parametrize("units", [True, False])
+@pytest.mark.parametrize("write", [text, workbook])
+def test_stations_in_columns_are_turned(tmp_path, units, write):
+    """Said; a fault names the column of its station."""
+    rows = stations()
+    bare = [name.partition(" (")[0] for name in NAMES]
+    table = [["Station", *NAMES], *([n + 1, *row] for n, row in enumerate(rows))]
+    if units:
+        table[:1] = [["Station", *bare], ["", "°", "°", "°", *["V"] * 6, "°C"]]
+    turned = [[*column] for column in zip(*table, strict=True)]
+    path = write(tmp_path / f"run.{'csv' if write is text else 'xlsx'}", [*TITLES, *turned])
+    run = taken(path)
+    assert same(run, rows)
+    assert any("stations stand in columns" in each for each in run.remarks)
+    turned[4][9] = "0.1x"
+    write(path, [*TITLES, *turned])
+    with pytest.raises((mwdcal.InputError, mwdcal.FitError), match="column 10, column "):
+        mwdcal.propose_profile(path)
+
+
+def test_labels_of_axes_in_front_of_rows_are_no_names(tmp_path):
+    """A table of six positions, called by the axis that is up, goes down the sheet as any other."""
+    rows = stations()
+    labelled = [[("+X", "-Y", "+Z")[n % 3], *row] for n, row in enumerate(rows)]
+    path = text(tmp_path / "run.csv", [*TITLES, ["Up", *NAMES], *labelled])
+    assert same(taken(path), rows)

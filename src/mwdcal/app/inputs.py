@@ -80,7 +80,7 @@ def load_runs(
 ) -> tuple[Readings, Readings | None, Profile]:
     """A run and its roll test, if there is one, and the tool profile: see `load_run`.
 
-    Both may be in one table, with a column that marks the roll test.
+    Both may be in one file: on two sheets, or in one table with a column that marks the roll test.
     """
     if rolltest is None or not (rolltest.exists() and run.exists() and run.samefile(rolltest)):
         readings, profile = load_run(run, tool, decimal, prior, statements)
@@ -95,7 +95,8 @@ def load_runs(
     whole = runs.read_export(
         run, stated, decimal=decimal, rows=runs.MOST_ROWS, statements=statements
     )
-    first, second = parted(whole)
+    other = runs.read_roll_test(run, whole, stated, statements)
+    first, second = (whole, other) if other else parted(whole)
     readings, profile = runs.read_run(first, stated)
     source = source_of_settings()
     readings = replace(readings, profile_sha256=digest, settings_source=source)

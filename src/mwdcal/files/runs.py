@@ -175,11 +175,53 @@ def read_export(
     """
     form = profile.table
     if isinstance(form, msgspec.UnsetType):
-        table = tables.read(path, decimal=decimal, rows=rows)
+        try:
+            table = tables.read(path, decimal=decimal, rows=rows)
+        except InputError as error:
+            raise _undocumented(path, error) from None
     else:
         table = filled_down(_exported(path, form, profile, decimal, rows), form.fill_down)
         table = replace(table, metadata={**form.north, **table.metadata})
     return stated_table(table, statements or {}, _serial_column(table, profile))
+
+
+def _undocumented(path: str | os.PathLike[str], error: InputError) -> InputError:
+    """Why a file is no run file, if it holds a table of another layout: else the error that it was read with."""
+    where = "other tables than a run file"
+    try:
+        layout = tables.laid_out(path)
+        if layout is None or {*CHANNELS["accelerometer"]} <= {*layout.names}:
+            return error
+        sheet = f"sheet {shown(layout.sheet)}, " if layout.sheet else ""
+        word = "row" if layout.sheet else "line"
+        where = f"a table with its names in {sheet}{word} {layout.form.header_line}"
+    except InputError:
+        return error
+    except FitError:
+        pass
+    name = Path(path).name
+    return InputError(
+        f"{name} holds {where}, not written as a run file is. Propose a tool profile for it first, `mwdcal profile "
+        f"{name} -o tool.toml`, and name that by `tool`."
+    )
+
+
+def read_roll_test(
+    path: str | os.PathLike[str], run: Table, profile: Profile, statements: Mapping[str, str]
+) -> Table | None:
+    """The roll test in the file of a run, on a sheet or below a line that says so; None where there is none."""
+    from mwdcal.files.formats.layout import ROLL_TEST
+
+    form = TableFormat() if isinstance(profile.table, msgspec.UnsetType) else profile.table
+    decimal = "," if form.decimal == "," else ""
+    wanted = _channels_of(profile) or CHANNELS["accelerometer"]
+    with suppress(InputError, FitError):
+        where = tables.laid_out(path, wanted=wanted, decimal=decimal, kind=ROLL_TEST)
+        if where and (where.sheet, where.lines[0]) != (run.sheet, run.lines[0]):
+            table = filled_down(_of_layout(where, path, profile), form.fill_down)
+            table = replace(table, metadata={**form.north, **table.metadata})
+            return stated_table(table, statements, _serial_column(table, profile))
+    return None
 
 
 def filled_down(table: Table, names: Collection[str]) -> Table:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from itertools import permutations, product
+from itertools import groupby, permutations, product
 from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -409,6 +411,7 @@ def _proposal(
     )
     denied = [c for c, name in answers.items() if not name and c in table.metadata]
     form = _with(form, {"ignore": (*ignored, *denied)} if ignored or denied else {})
+    columns |= _stacked_tools(table, columns, stated, answers)
     table = _of_one_tool(table, columns, stated)
     sets = repeats(table, columns)
     if sets and not sets.numbered:
@@ -601,6 +604,44 @@ def _with_north(
         return table, form
     metadata = {**table.metadata, "azimuth_reference": north}
     return replace(table, metadata=metadata), _with(form, {"azimuth_reference": north})
+
+
+_OF_TOOLS = re.compile(
+    r"s[eé]rie|serial|s/?n\b|tool|probe|sond[ea]|ger[äa]t|instrument|equip|ferram|herram|verkt(ø|oe?)y|matr[ií]c|"
+    r"прибор|зонд|зав|仪器|探管|编号",
+    re.IGNORECASE,
+)
+"""Words of a column that may tell several tools apart."""
+
+
+def _stacked_tools(
+    table: Table,
+    columns: Mapping[str, ColumnSource],
+    stated: Mapping[str, object],
+    answers: Collection[str],
+) -> dict[str, ColumnSource]:
+    """The column of serials in whatever words: of which one is stated; of tools one below the other it is asked."""
+    if "serial" in columns or "serial" in answers:
+        return {}
+    used = {each.name for each in columns.values()}
+    for name in (each for each in table.columns if each not in used):
+        cells = [*filter(None, labels_of(table, name))]
+        tools = Counter(cells)
+        if len(tools) < 2 or len(cells) < table.count:
+            continue
+        if stated.get("serial") in tools:
+            return {"serial": ColumnSource(name=name)}
+        stacked = len([*groupby(cells)]) == len(tools) and min(tools.values()) >= LEAST_STATIONS
+        if stacked and _OF_TOOLS.search(name) and _numbers_of(table, {}, name) is None:
+            raise QuestionError(
+                f"{table.source}: {shown(name)} has {', '.join(map(shown, [*tools][:MOST_NAMED]))}, one below the "
+                "other. Are these tools, and which one is meant?",
+                [
+                    *(Answer(tool, (("serial", tool),)) for tool in tools),
+                    Answer("it is one tool", (("column", "serial="),)),
+                ],
+            )
+    return {}
 
 
 def _of_one_tool(

@@ -130,6 +130,8 @@ def _layout(proposal: Proposal, form: TableFormat, run: Path) -> str:
     place = (
         f"names in {word} {written_so.header_line}, readings from {word} {written_so.first_line}"
     )
+    if where and where.across:
+        place = f"stations in columns, the first names in {word} {written_so.header_line}"
     if form.find:
         place += "; looked for by its names whenever it is read"
     if where and where.left_out:

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     "--rolltest",
     type=options.FILE,
     metavar="TABLE",
-    help="Verify the result by this roll test at once; the RUN itself where a column marks the roll test.",
+    help="Verify the result by this roll test at once; the RUN itself where a sheet or a column marks it.",
 )
 @options.LIMITS
 @click.option(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import pairwise, zip_longest
@@ -85,6 +85,8 @@ _OF_ROLL_TEST = re.compile(
     re.IGNORECASE,
 )
 """Words of a sheet whose rows are to check a calibration."""
+ROLL_TEST = "roll test"
+"""The kind of such a table."""
 _OF_SETTING = re.compile(
     r"([+−-]?\d+([.,]\d+)?|[\W_]|(?<![^\W\d_])(°?[cf]|deg\w*|grad\w*|°|k|t|temp\w*|oven|ofen|ovn|horno|soak|"
     r"inc\w*|incl\w*|inkl\w*|az\w*|dip|neigung|helning|hold|pos\w*|lage|plus|minus|cold|kalt|kald|fr[ií]o|froid|warm|"
@@ -138,7 +140,8 @@ class Layout:
     below the names that are no readings, `above` the texts above them;
     `parts` the sheet of each row where several are one table; `heading` the text right above the names;
     `titles` what the title block says of the tool, the day and the place; `places` letters of the columns in a
-    workbook; `remarks` are sentences on what is taken from other places than the columns.
+    workbook; `remarks` are sentences on what is taken from other places than the columns. Of a table that goes `across`
+    the stations stand in columns, and `lines` are these.
     """
 
     sheet: str
@@ -157,6 +160,7 @@ class Layout:
     parts: tuple[str, ...] = ()
     heading: str = ""
     remarks: tuple[str, ...] = ()
+    across: bool = False
 
     @property
     def size(self) -> int:
@@ -172,10 +176,12 @@ def laid_out(
     header_line: int = 0,
     wanted: Collection[str] = (),
     decimal: str = "",
+    kind: str = "",
 ) -> Layout:
     """The table of readings in the sheets of a file.
 
-    `sheet` and `header_line` say where it is, `wanted` what columns it has; otherwise the largest one is meant.
+    `sheet` and `header_line` say where it is, `wanted` what columns it has; otherwise the largest one is meant, or of
+    those of a `kind`, such as `ROLL_TEST`, the largest.
 
     Raises:
         InputError: no such sheet, row or columns, or no table.
@@ -188,14 +194,21 @@ def laid_out(
     tables, covers = [], []
     for each in sheets:
         layouts = list(_tables(each, source, decimal)) if each in candidates else []
+        across = not any(_has_axes(t.names) for t in layouts)
+        if each in candidates and across and (turned := _turned(each)):
+            layouts = [
+                replace(t, across=True, places={}, remarks=(*t.remarks, _ACROSS))
+                for t in _tables(turned, source, decimal)
+            ]
         covers += [] if layouts or any(_is_reading(row) for _, row in each.rows) else [each]
         tables += [t for t in layouts if header_line in (0, t.form.header_line)]
     tables = [t for t in _with_same_stations(tables) if {*wanted} <= {*t.names}]
+    tables = [t for t in tables if not kind or _kind(f"{t.sheet} {t.heading}") == kind]
     if not tables:
         raise _no_table(source, header_line, wanted)
     best = max(tables, key=lambda layout: layout.size)
     alike = [t for t in tables if t is best or (_alike(t, best) and len(t.lines) >= _BESIDES)]
-    if len(alike) > 1 and not header_line:
+    if len(alike) > 1 and not header_line and not kind:
         run = _the_run(alike)
         if run is None:
             raise _several(alike, source, sheet)
@@ -297,7 +310,7 @@ def _the_run(tables: Sequence[Layout]) -> Layout | None:
 
 def _kind(words: str) -> str:
     """A void run or a roll test, by the sheet of a table and the line above it; empty for a run."""
-    kinds = (("void run", _OF_VOID_RUN), ("roll test", _OF_ROLL_TEST))
+    kinds = (("void run", _OF_VOID_RUN), (ROLL_TEST, _OF_ROLL_TEST))
     return next((kind for kind, pattern in kinds if pattern.search(words)), "")
 
 
@@ -467,6 +480,43 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
     for head, end in pairwise([*heads, len(rows)]):
         if layout := _table(sheet, head, end, source, decimal, remarks):
             yield layout
+
+
+_ACROSS = "the stations stand in columns, with the names in the first one: the table is read so."
+_ENDS_IN_AXIS = re.compile(r"\W*\w{0,6}([xyz])\W*([(\[].*)?", re.IGNORECASE)
+
+
+def _turned(sheet: Sheet) -> Sheet | None:
+    """A sheet whose stations stand in columns, with a row for each of these; None of any other.
+
+    Names stand in the first column, three of them of axes, and numbers alone behind them or behind their units.
+    """
+    rows = sheet.rows
+    block = [k for k, (_, row) in enumerate(rows) if _is_reading(row[1:]) and _is_name(row[0])]
+    if len(block) <= LEAST_COLUMNS or not block[-1] - block[0] < 2 * len(block):
+        return None
+    inside = [row for _, row in rows[block[0] : block[-1] + 1]]
+    width = max(map(len, inside))
+    padded = [[*row, *[""] * (width - len(row))] for row in inside]
+    names, *columns = (list(column) for column in zip(*padded, strict=True))
+    if not _has_axes(names):
+        return None
+    units = columns[:1] if all(not figures.is_figure(cell) for cell in columns[0]) else []
+    line = rows[block[0]][0]
+    stations = [(k, column) for k, column in enumerate(columns, 2 + sheet.first_column)]
+    head = [(line, names), *((line, each) for each in units)]
+    others = [*rows[: block[0]], *rows[block[-1] + 1 :]]
+    return sheet._replace(rows=[*others, *head, *stations[len(units) :]], merged=())
+
+
+def _has_axes(names: Iterable[object]) -> bool:
+    """Whether names of all three axes are among some."""
+    ends = (_ENDS_IN_AXIS.fullmatch(as_text(name)) for name in names)
+    return len({m[1].lower() for m in ends if m}) == len("xyz")
+
+
+def _is_name(cell: object) -> bool:
+    return isinstance(cell, str) and cell != "" and not figures.is_figure(cell)
 
 
 def _is_ruler(row: Cells) -> bool:

@@ -68,6 +68,7 @@ class Table:
         places: letters of the columns in a workbook, by name, for messages.
         sheet: name of its sheet there.
         parts: the sheet of each row, where the table is on several.
+        across: whether its stations stand in columns of the file; `lines` are these.
         remarks: sentences on rows that were left out, for findings.
         not_taken: lines with a reference that is not read, by column of a run file.
     """
@@ -81,6 +82,7 @@ class Table:
     places: Mapping[str, str] = field(default_factory=dict)
     sheet: str = ""
     parts: Sequence[str] = ()
+    across: bool = False
     remarks: tuple[str, ...] = ()
     not_taken: Mapping[str, str] = field(default_factory=dict)
 
@@ -237,6 +239,8 @@ def cell_error(table: Table, name: str, row: int, problem: str) -> InputError:
 def row_word(table: Table) -> str:
     """The word for a row of a table in its file: texts have lines."""
     suffix = Path(table.source).suffix.lower()
+    if table.across:
+        return "column"
     return "row" if suffix in ("", ".parquet", *WORKBOOKS) else "line"
 
 
@@ -247,6 +251,7 @@ def laid_out(
     header_row: int = 0,
     wanted: Collection[str] = (),
     decimal: str = "",
+    kind: str = "",
 ) -> Layout | None:
     """Where the table is in a text or workbook as a laboratory keeps it; None of a format without a layout.
 
@@ -268,6 +273,7 @@ def laid_out(
         header_line=header_row,
         wanted=wanted,
         decimal=decimal,
+        kind=kind,
     )
 
 
@@ -286,6 +292,7 @@ def of_layout(where: Layout, path: str | os.PathLike[str], kept: Collection[str]
         places=where.places,
         sheet=where.sheet,
         parts=where.parts,
+        across=where.across,
         remarks=where.remarks,
         not_taken=where.titles.not_taken,
     )

@@ -80,6 +80,15 @@ _TOOL = re.compile(
     re.IGNORECASE,
 )
 _SERIAL = re.compile(r"(?=\S*\d)[^\W_][\w./-]*")
+_OF_TWO = r"(?!\d{1,4}[./-]\d\d?[./-]\d{1,4}(?!\d))(?=\S*\d)[^\W_][\w./-]*"
+_WHOLE_SERIAL = rf"{_SERIAL.pattern}(?:\s+/\s+{_OF_TWO})?"
+"""A serial, which may be of two numbers, a model and its own: BHX-72 / 0091; a day is none."""
+_TWO_NUMBERS = re.compile(rf"(?<!\S)({_OF_TWO})(\s+/|,)\s+(?={_OF_TWO}\s*$)")
+_NUMBER_OF_TOOL = re.compile(
+    r"(tool|probe|sensor|sonde|instrument|herramienta|ferramenta|equipo|equipamento|verktoy|gerat|прибор|зонд|датчик)"
+    r"(s|n|e|en)?(s/?n|serial\w*|n|no|nr|num|number|nummer|numero|№|номер|id)"
+)
+"""The word for the tool and one for a number, without marks and blanks."""
 _BEHIND_MODEL = re.compile(
     rf"(?<![^\W\d_])(?:{_OF_TOOLS})\w*[\s:]+[\w./-]+\s+(?:s/?n|serial(?: no)?|n[°ºr]|no\b|зав\.?\s*№|№)\s*[.:]?\s*"
     rf"({_SERIAL.pattern})",
@@ -93,7 +102,7 @@ _WITH_MARK = re.compile(
     r"fabr(?:ik)?\.?[ -]?(?:nr|nummer)|matricola|"
     r"зав\w*\.? ?(?:№|номер|n)|серийн\w* ?(?:№|номер)|seri ?no|序列号|编号|製造番号)|s\.?/?n|[^\W\d_]+[ -]sn|"
     r"(?<=[,(;] )(?:n[°ºr]\.?|num[eé]ro|№))\.?"
-    rf"(?:\s+(?:{_OF_TOOLS}))?[\s.:：=#|;]*(?P<serial>{_SERIAL.pattern})",
+    rf"(?:\s+(?:{_OF_TOOLS}))?[\s.:：=#|;]*(?P<serial>{_WHOLE_SERIAL})",
     re.IGNORECASE,
 )
 """A word of a serial number in a line, and the serial behind it."""
@@ -193,7 +202,8 @@ def titles(rows: Sequence[Sequence[object]]) -> Titles:
 
 def _parts(cell: str) -> list[str]:
     """The facts in a cell; of a key in two languages (Serial / Serie) the first."""
-    parts = _PARTS.split(cell)
+    whole = _TWO_NUMBERS.sub("\\1\\2\0", cell)
+    parts = [part.replace("\0", " ") for part in _PARTS.split(whole)]
     label = len(parts) > 1 and _word(parts[0]) in _MEANT and not re.search(r"[\d:=]", cell)
     return parts[:1] if label else parts
 
@@ -241,7 +251,8 @@ def _tool(cell: str, right: Sequence[str]) -> str:
 def _pair(cell: str, right: Sequence[str]) -> tuple[str, str]:
     """The key that a cell is, and its value behind a colon, a sign or in the next cell that is filled in."""
     head, *tail = re.split(r"\s*[:：=|]\s*", cell, maxsplit=1)
-    key = _MEANT.get(_word(head.lstrip("#")), "")
+    word = _word(head.lstrip("#"))
+    key = _MEANT.get(word, "serial" if _NUMBER_OF_TOOL.fullmatch(word) else "")
     if not key:
         return "", ""
     return key, "".join(tail).strip(' "') or next(
