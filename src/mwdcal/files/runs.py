@@ -6,6 +6,7 @@ become radians; true and grid azimuths become magnetic ones.
 
 from __future__ import annotations
 
+import difflib
 import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -25,7 +26,7 @@ from mwdcal.calibration.readings import (
 )
 from mwdcal.calibration.record import Finding
 from mwdcal.errors import FitError, InputError, QuestionError
-from mwdcal.estimation.problem import WALKS
+from mwdcal.estimation.problem import ANGLES, WALKS
 from mwdcal.files import synonyms
 from mwdcal.files.contract import (
     CHANNELS,
@@ -40,6 +41,7 @@ from mwdcal.files.contract import (
     columns_of,
     faults,
     faults_beside_readings,
+    forms,
     is_blank,
     magnetic_offset,
     of_vectors,
@@ -118,6 +120,7 @@ MOST_ROWS = 1_000_000
 """Rows that a run may have at most, as many as a text table."""
 MOST_OTHERS = 20
 """Unused columns of numbers that are kept to see whether they explain the residuals."""
+ANGLES_OF_STAND = tuple(REFERENCES[name].column for name in ANGLES)
 STATED_REFERENCES = ("gravity", "field", "dip")
 """References that may be the same at all stations, and be stated once."""
 _TURN = 360.0
@@ -180,8 +183,10 @@ def read_export(
         except InputError as error:
             raise _undocumented(path, error) from None
     else:
-        table = filled_down(_exported(path, form, profile, decimal, rows), form.fill_down)
-        table = replace(table, metadata={**form.north, **table.metadata})
+        table = _exported(path, form, profile, decimal, rows)
+        if is_export(table.columns, profile):
+            table = filled_down(table, form.fill_down)
+            table = replace(table, metadata={**form.north, **table.metadata})
     return stated_table(table, statements or {}, _serial_column(table, profile))
 
 
@@ -249,8 +254,13 @@ def _exported(
 ) -> Table:
     """The table in a file that is written as a form says, or as documented."""
     if form.find:
-        decimal = "," if form.decimal == "," else ""
-        where = _laid_out(path, form, _channels_of(profile), decimal)
+        sign = "," if form.decimal == "," else ""
+        try:
+            where = _laid_out(path, form, _channels_of(profile), sign)
+        except InputError as error:
+            if table := _as_documented(path, decimal, rows):
+                return table
+            raise _unlike_profile(error) from None
         return _of_layout(where, path, profile) if where else tables.read(path)
     try:
         serial = _sources(profile).get("serial", ColumnSource(name="serial")).name
@@ -261,15 +271,26 @@ def _exported(
         problem = _not_as_stated(table, profile)
     except InputError as error:
         problem = error
+    if documented := _as_documented(path, decimal, rows):
+        return documented
+    if moved := _moved(path, form, profile):
+        return _of_layout(moved, path, profile)
+    raise _unlike_profile(problem)
+
+
+def _as_documented(path: str | os.PathLike[str], decimal: str, rows: int) -> Table | None:
+    """The table in a file with the names of a run file; None where it is none."""
     with suppress(InputError):
         table = tables.read(path, decimal=decimal, rows=rows)
         if set(CHANNELS["accelerometer"]) <= {*table.columns}:
             return table
-    if moved := _moved(path, form, profile):
-        return _of_layout(moved, path, profile)
-    raise InputError(
-        f"{problem} If the table is laid out otherwise than the tool profile says, correct [table] there, "
-        "or propose a profile for it: mwdcal profile."
+    return None
+
+
+def _unlike_profile(problem: InputError) -> InputError:
+    return InputError(
+        f"{problem} If the table is laid out otherwise than the tool profile says, or names its columns otherwise, "
+        "correct [table] and [columns] there, or propose a profile for it: mwdcal profile."
     )
 
 
@@ -388,7 +409,9 @@ def station_table(table: Table, profile: Profile) -> Table:
     sources = _sources(profile) if is_export(table.columns, profile) else {}
     named = {each.name: column for column, each in sources.items()}
     used = [n for n in table.columns if named.get(n, n) in UNMARKED]
+    _check_names(table, sources)
     table = without_rejected(table, profile.table, used)
+    table = replace(table, remarks=(*table.remarks, *_absent_angles(table, sources)))
     sets = repeats(table, sources)
     if sets is None:
         return table
@@ -396,6 +419,34 @@ def station_table(table: Table, profile: Profile) -> Table:
         return replace(table, remarks=(*table.remarks, sets.advice()))
     scales = {kind: getattr(profile, kind).scale for kind in CHANNELS}
     return replace(means(table, sources, sets), remarks=(*table.remarks, sets.sentence(scales)))
+
+
+def _check_names(table: Table, sources: Mapping[str, ColumnSource]) -> None:
+    """Refuse a column whose name differs from one of the profile that is absent only in case, separators or unit."""
+    named = {each.name for each in sources.values()}
+    others = {forms(name)[0]: name for name in table.columns if name not in named}
+    for column, each in sources.items():
+        theirs = others.get(forms(each.name)[0])
+        if each.name not in table.columns and theirs:
+            raise InputError(
+                f"{table.source}: the tool profile's column {shown(each.name)} ({column}) is not in the table. Did you "
+                f"mean {shown(theirs)}? Rename one of them, or correct [columns] in the profile."
+            )
+
+
+def _absent_angles(table: Table, sources: Mapping[str, ColumnSource]) -> list[str]:
+    """A sentence on each angle of the stand that the profile names and a table with another of them does not have."""
+    angles = {c: sources[c].name for c in ANGLES_OF_STAND if c in sources}
+    absent = {c: name for c, name in angles.items() if name not in table.columns}
+    if len(absent) == len(angles):
+        return []
+    others = [name for name in table.columns if name not in {s.name for s in sources.values()}]
+    near = {c: difflib.get_close_matches(name, others, n=1) for c, name in absent.items()}
+    meant = {c: f" Did you mean {shown(each[0])}?" if each else "" for c, each in near.items()}
+    return [
+        f"the tool profile's column {shown(name)} ({c}) is not in the table.{meant[c]}"
+        for c, name in absent.items()
+    ]
 
 
 def renamed(table: Table, profile: Profile) -> Table:

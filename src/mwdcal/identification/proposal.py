@@ -39,7 +39,14 @@ from mwdcal.files.marks import MARKS_NAMED, UNMARKED, marks_in, place, without_r
 from mwdcal.files.metadata import toml
 from mwdcal.files.profiles import CHOICE_OF_AXES
 from mwdcal.files.repeats import means, repeats
-from mwdcal.files.runs import STATED_REFERENCES, check_run, filled_down, renamed, to_readings
+from mwdcal.files.runs import (
+    ANGLES_OF_STAND,
+    STATED_REFERENCES,
+    check_run,
+    filled_down,
+    renamed,
+    to_readings,
+)
 from mwdcal.files.statements import stated_table
 from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW, FACTORS, WARMTH
 from mwdcal.geometry.observables import OBSERVABLES
@@ -456,7 +463,6 @@ _MOST_TRIES, _MOST_COMBINED = 40, 100_000
 """Answers to open questions, in combinations that name no column twice, that are tried, and those looked at."""
 _CONFIRMED = 0.1
 """Largest share of the channels' variation that answers leave which readings confirm."""
-ANGLES_OF_STAND = tuple(REFERENCES[name].column for name in ("inclination", "azimuth", "toolface"))
 _ANGLE_UNITS = (180 / np.pi, 0.9)
 """Degrees of a radian and of a gon."""
 _SPREAD = 0.97

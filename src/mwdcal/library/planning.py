@@ -14,10 +14,11 @@ from mwdcal.calibration.options import FitChoices, Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import FitError, InputError
-from mwdcal.files import profiles, runs
+from mwdcal.files import documents, profiles, runs
 from mwdcal.files.formats.table import Table
 from mwdcal.geometry.vectors import AnyArray
 from mwdcal.library.results import Result, arrays_of
+from mwdcal.library.shown import digest_of
 from mwdcal.library.tasks import NOMINAL, Tabular, table_of, with_choices
 from mwdcal.sensor.profile import Profile
 
@@ -26,8 +27,8 @@ if TYPE_CHECKING:
     from mwdcal.planning.planned import Planned
 
 FilePath = str | os.PathLike[str]
-ToolSource = FilePath | Profile
-"""A tool profile: built in by name, a TOML file by path, or the profile itself."""
+ToolSource = FilePath | Profile | Calibration
+"""A tool profile: built in by name, a TOML file by path, or the profile itself; or a calibration, with its noise."""
 
 
 def silent(done: int, total: int) -> None:
@@ -226,7 +227,13 @@ def _ends(reach: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, fl
 
 
 def profile_of(tool: object) -> tuple[Profile, str]:
-    """A profile and the SHA-256 of its file; without one for a profile in memory."""
+    """A profile and the SHA-256 of its file, or of its calibration; without one for a profile in memory."""
+    if isinstance(tool, str | os.PathLike) and Path(tool).suffix.lower() == ".json":
+        tool = documents.read(tool)
+    if isinstance(tool, Calibration):
+        from mwdcal.planning.session import calibrated_profile
+
+        return calibrated_profile(tool), digest_of(tool)
     if isinstance(tool, Profile):
         return tool, ""
     if not isinstance(tool, str | os.PathLike):

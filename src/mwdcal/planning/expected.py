@@ -35,7 +35,8 @@ def _check_noise(profile: Profile, kind: str) -> None:
     if triad.noise is None:
         raise InputError(
             f"the profile '{profile.name}' does not state the noise of the {kind}, on which every "
-            f"uncertainty rests. Add 'noise' to its [{kind}]; mwdcal noise measures it."
+            f"uncertainty rests. Add 'noise' to its [{kind}], which mwdcal noise measures; or name a calibration of "
+            "the tool by `tool`, which has estimated it."
         )
 
 

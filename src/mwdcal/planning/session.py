@@ -137,20 +137,30 @@ def session_facts(
     }
 
 
-def calibrated_tool(calibration: Calibration) -> tuple[Truth, Profile]:
-    """The tool that a calibration describes exactly, and its profile with the noise that was estimated."""
-    triads, reference = calibration.triads, calibration.reference_temperature
+def calibrated_profile(calibration: Calibration) -> Profile:
+    """The tool profile of a calibration, with the noise that was estimated where it states none.
+
+    Raises:
+        InputError: the magnetometer is calibrated to a field of 1.
+    """
     if calibration.relative and calibration.has_field:
         raise InputError(
             f"`calibration`: the magnetometer of {calibration.run_name} is calibrated to field = 1, and reads no "
             "nT. Calibrate with ref_field_nt."
         )
     profile = calibration.profile
-    for triad in triads:
+    for triad in calibration.triads:
         part = getattr(profile, triad.name)
         if part.noise is None:
             noise = replace_struct(part, noise=triad.noise * (part.scale or 1.0))
             profile = replace_struct(profile, **{triad.name: noise})
+    return profile
+
+
+def calibrated_tool(calibration: Calibration) -> tuple[Truth, Profile]:
+    """The tool that a calibration describes exactly, and its `calibrated_profile`."""
+    profile, triads = calibrated_profile(calibration), calibration.triads
+    reference = calibration.reference_temperature
     first, *second = (np.array(triad.parameters) for triad in triads)
     tool = Truth(
         first, second[0] if second else None, order=max(triad.order for triad in triads), reference=reference,

@@ -1,0 +1,117 @@
+"""The way of a table through a tool profile to plan, simulation and correction, and where a name goes wrong."""
+
+import json
+
+import numpy as np
+import pytest
+
+import mwdcal as library
+from cli_support import mwdcal, refused, servo_run, write_csv
+from test_tables_as_they_come import NAMES, table, written
+
+ABSENT = NAMES["ref_toolface_deg"]
+
+
+@pytest.fixture(scope="module")
+def own(tmp_path_factory):
+    """A folder with a laboratory's table, the profile proposed for it, and the calibration."""
+    folder = tmp_path_factory.mktemp("own")
+    written(folder / "a.csv", table())
+    assert mwdcal("profile", folder / "a.csv", "-o", folder / "t.toml").code == 0
+    files = ("--tool", folder / "t.toml", "-o", folder / "c.json")
+    assert mwdcal("calibrate", folder / "a.csv", *files).code == 0
+    return folder
+
+
+def test_a_proposed_profile_reads_run_files_with_documented_names(own, tmp_path):
+    """Expected: the calibration of the same readings in the laboratory's table."""
+    run = servo_run()
+    write_csv(tmp_path / "run.csv", run)
+    ran = mwdcal(
+        "calibrate", tmp_path / "run.csv", "--tool", own / "t.toml", "-o", tmp_path / "c.json"
+    )
+    assert ran.code == 0, ran.err
+    theirs, ours = library.load(own / "c.json"), library.load(tmp_path / "c.json")
+    assert ours.accelerometer.parameters == pytest.approx(theirs.accelerometer.parameters, rel=1e-9)
+    raw = {name: values for name, values in run.items() if not name.startswith("ref_")}
+    write_csv(tmp_path / "well.csv", raw)
+    assert (
+        mwdcal("apply", own / "c.json", tmp_path / "well.csv", "-o", tmp_path / "o.csv").code == 0
+    )
+
+
+def test_the_north_of_a_profile_is_not_that_of_a_documented_run_file(tmp_path):
+    written(tmp_path / "a.csv", table())
+    said = ("--north", "true", "--declination-deg", "10")
+    mwdcal("profile", tmp_path / "a.csv", "-o", tmp_path / "t.toml", *said)
+    write_csv(tmp_path / "run.csv", servo_run())
+    tool = tmp_path / "t.toml"
+    ours, theirs = (
+        library.read_run(tmp_path / n, tool).known["azimuth"] for n in ("run.csv", "a.csv")
+    )
+    turned = np.degrees(ours - theirs) % 360.0
+    assert turned == pytest.approx(10.0)
+
+
+def test_a_table_unlike_the_profile_and_the_documented_form_is_refused_with_what_to_do(
+    own, tmp_path
+):
+    written(tmp_path / "b.csv", {f"{name} 2": values for name, values in table().items()})
+    message = refused(
+        mwdcal(
+            "calibrate", tmp_path / "b.csv", "--tool", own / "t.toml", "-o", tmp_path / "c.json"
+        ),
+        2,
+    )
+    assert "mwdcal profile" in message
+
+
+@pytest.mark.parametrize("name", ["TF(deg)", "tf [deg]"])
+def test_a_column_of_the_profile_under_almost_its_name_is_refused(own, tmp_path, name):
+    columns = {name if each == ABSENT else each: values for each, values in table().items()}
+    written(tmp_path / "b.csv", columns)
+    message = refused(
+        mwdcal(
+            "calibrate", tmp_path / "b.csv", "--tool", own / "t.toml", "-o", tmp_path / "c.json"
+        ),
+        2,
+    )
+    assert (
+        f"column '{ABSENT}' (ref_toolface_deg) is not in the table. Did you mean '{name}'?"
+        in message
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"), [("FT (deg)", " Did you mean 'FT (deg)'?"), ("Remark", "")]
+)
+def test_an_angle_of_the_profile_that_is_not_in_the_table_is_named(own, tmp_path, name, meant):
+    columns = {name if each == ABSENT else each: values for each, values in table().items()}
+    written(tmp_path / "b.csv", columns)
+    ran = mwdcal(
+        "calibrate", tmp_path / "b.csv", "--tool", own / "t.toml", "-o", tmp_path / "c.json"
+    )
+    assert (
+        f"! the tool profile's column '{ABSENT}' (ref_toolface_deg) is not in the table.{meant}\n"
+        in ran.err
+    )
+    findings = json.loads((tmp_path / "c.json").read_text())["findings"]
+    assert any(ABSENT in finding["text"] for finding in findings)
+
+
+def test_a_calibration_as_the_tool_of_a_plan_brings_the_noise_that_it_estimated(own, tmp_path):
+    """Expected: the plan by the profile with that noise written into it."""
+    assert "calibration of the tool by --tool" in refused(
+        mwdcal("plan", "--tool", own / "t.toml"), 2
+    )
+    cal, text = json.loads((own / "c.json").read_text()), (own / "t.toml").read_text()
+    for kind in ("accelerometer", "magnetometer"):
+        noise = cal[kind]["noise"] * cal["profile"][kind]["scale"]
+        text = text.replace(f"[{kind}]", f"[{kind}]\nnoise = {noise!r}")
+    (tmp_path / "t.toml").write_text(text)
+    ours, theirs = (
+        mwdcal("plan", "--tool", tool, "--json").json
+        for tool in (own / "c.json", tmp_path / "t.toml")
+    )
+    for angle, value in theirs["accuracy_deg"].items():
+        assert ours["accuracy_deg"][angle] == pytest.approx(value, rel=1e-6)
