@@ -254,11 +254,7 @@ def _assumed(planned: Planned) -> list[str]:
     _, field, dip = (float(values[0]) for values in planned_earth(planned.plan))
     words = {"field": f"field_nt {field:,.0f}", "dip": f"dip_deg {np.degrees(dip):g}"}
     blank = [word for name, word in words.items() if _is_blank(planned.plan, name)]
-    return (
-        [f"the plan does not state the place; assumed: {', '.join(blank)}"]
-        if blank
-        else []
-    )
+    return [f"the plan does not state the place; assumed: {', '.join(blank)}"] if blank else []
 
 
 def _is_blank(plan: Table, name: str) -> bool:
