@@ -313,6 +313,41 @@ def test_a_limit_on_an_undetermined_direction_cannot_be_passed(tmp_path):
     assert said.code == 1
     assert "! accelerometer: toolface zero is undetermined" in said.err
     assert "not stated" in next(s for s in said.out.splitlines() if s.startswith("error of toolf"))
+    opened = "FAIL: nothing wrong was found; the calibration leaves toolface zero open   roll.csv"
+    assert said.out.startswith(opened)
+    assert "measure again" not in said.out
+    advice = "not determined: toolface zero. Give reference toolfaces in the calibration run"
+    assert (
+        f"{advice}\nnext: mwdcal calibrate RUN -o {calibration}   (with these references)"
+        in said.out
+    )
+    machine = mwdcal(
+        "verify", calibration, test, "--limits", tmp_path / "limits.toml", "--json"
+    ).json
+    assert machine["passed"] is False
+    assert advice[1:] in machine["findings"][-1]["text"]
+
+
+def test_a_calibration_without_reference_inclinations_leaves_rotations_open(tmp_path):
+    """Nobody is told that the tool is bad; a tool that is knocked fails all the same."""
+    run = simulated(PLAN, 1)
+    for name in ("inclination", "azimuth", "toolface"):
+        run[f"ref_{name}_deg"] = np.full(48, np.nan)
+    calibration = calibrated(tmp_path, run)
+    opened = json.loads(calibration.read_bytes())["accelerometer"]["undetermined"]
+    assert {"rotation-x", "rotation-y"} <= {entry["id"] for entry in opened}
+    roll = simulated(ROLL, 8)
+    said = mwdcal("verify", calibration, write_csv(tmp_path / "roll.csv", roll))
+    assert said.code == 1
+    assert said.out.startswith(
+        "FAIL: nothing wrong was found; the calibration leaves rotation about x and y open"
+    )
+    assert "cannot be passed: the calibration does not determine rotation about x and y" in said.out
+    assert "not determined: rotation about x and y. Give reference inclinations in the" in said.out
+    knocked = {**roll, "ax": roll["ax"] + 30e-3 * SCALE[0]}
+    said = mwdcal("verify", calibration, write_csv(tmp_path / "k.csv", knocked))
+    assert said.out.startswith("FAIL   k.csv")
+    assert "next: mwdcal diagnose" in said.out
 
 
 LIMITS = {

@@ -8,8 +8,10 @@ import subprocess
 import sys
 import tomllib
 
+import numpy as np
 import pytest
 
+import mwdcal as library
 from cli_support import EXAMPLE, ROOT, mwdcal, refused
 from mwdcal import extras
 from mwdcal.app.commands.example import CONTENTS
@@ -80,6 +82,29 @@ def test_every_line_of_the_first_pages_runs(tmp_path, monkeypatch, page):
         if shown:
             printed = "\n".join(map(str.rstrip, ran.out.splitlines()))
             assert follow_each_other(shown, printed), (line, shown, printed)
+
+
+def test_the_python_tutorial_calibrates_a_table_with_its_own_names(tmp_path, monkeypatch, capsys):
+    """The references of the export are those of the stand; its last digits and the stand's σ leave 0.1°."""
+    pytest.importorskip("pandas")
+    page = (ROOT / "docs" / "tutorials" / "python.md").read_text("utf-8")
+    lines = page.split("```python\n")[1].split("```")[0]
+    assert len([line for line in lines.splitlines()[2:] if line]) <= 9
+    monkeypatch.chdir(tmp_path)
+    assert mwdcal("example", "demo").code == 0
+    seen = {}
+    exec(lines, seen)
+    printed = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert [row[:2] for row in printed] == [
+        [f"{triad}", name] for triad in ("accelerometer", "magnetometer")
+        for name in (*(f"gain-{a}{b}" for a in "xyz" for b in "xyz"), *(f"offset-{a}" for a in "xyz"))
+    ]  # fmt: skip
+    assert all(float(sd) > 0 for *_, sd in printed)
+    table = seen["df"]
+    assert table["Messpunkt"].tolist() == list(range(1, 49))
+    assert (table["inclination_deg"] - table["Neigung Soll (°)"]).abs().max() < 0.1
+    again = library.calibrate(table, seen["profile"])
+    np.testing.assert_allclose(again.accelerometer.parameters, seen["cal"].accelerometer.parameters)
 
 
 def test_a_page_that_shows_another_line_is_noticed():

@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
-from itertools import combinations, groupby, pairwise, permutations
+from importlib.resources import files
+from itertools import combinations, groupby
 
 import numpy as np
 import pytest
 from msgspec.structs import replace as with_changes
 from scipy.stats import chi2
 
-from cli_support import mwdcal, refused
+from cli_support import mwdcal, read_csv, refused
 from mwdcal.calibration import results
 from mwdcal.calibration.diagnosis.detection import detections
 from mwdcal.calibration.diagnosis.plausibility import misfit_chances, stations_to_reshoot
@@ -29,10 +30,8 @@ from mwdcal.planning.planned import (
     WORKING_INCLINATIONS,
     Stand,
     best_plan,
-    hand_order,
     judged,
     measuring_order,
-    move_seconds,
     session_seconds,
     smallest_plan,
 )
@@ -337,19 +336,6 @@ def test_a_stand_reaches_from_the_least_setting_to_the_largest(reach):
         Stand(reach=reach)
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_an_order_with_short_moves_there_and_back(seed):
-    stations = np.random.default_rng(seed).integers(0, 13, (7, 3)) * 15.0
-    soak = np.zeros(7, int)
-    order = measuring_order(stations, soak, STAND)
-    assert sorted(order.tolist()) == list(range(7))
-    every = [(0, *rest) for rest in permutations(range(1, 7))]
-    seconds = move_seconds(stations, STAND)
-    least = min(sum(seconds[a, b] for a, b in pairwise(o)) for o in every)
-    found = sum(seconds[a, b] for a, b in pairwise(order))
-    assert least <= found <= 2 * 1.15 * least  # each move passes over one station of a short path
-
-
 def test_a_slow_trend_does_not_keep_step_with_attitude():
     """Of a linear trend over the session gravity along the axes explains little."""
     inclination, azimuth, toolface = np.meshgrid(
@@ -367,13 +353,13 @@ def test_a_slow_trend_does_not_keep_step_with_attitude():
 
     by_direction = np.lexsort(stations.T[::-1])
     assert explained(by_direction) > 0.8
-    assert explained(measuring_order(stations, np.zeros(len(stations), int), STAND)) < 0.2
+    assert explained(measuring_order(stations, np.zeros(len(stations), int))) < 0.2
 
 
 def test_soaks_keep_their_order():
     stations = np.random.default_rng(0).uniform(0, 180, (30, 3))
     soak = np.repeat([2, 0, 1], 10)
-    order = measuring_order(stations, soak, STAND)
+    order = measuring_order(stations, soak)
     assert soak[order].tolist() == soak.tolist()
 
 
@@ -637,7 +623,7 @@ def test_a_stand_turned_by_hand_moves_its_slow_axes_last():
         shuffled = np.random.default_rng(seed).permutation(np.concatenate([grid, grid]))
         soak = np.repeat([0, 1], 24)
         attitude = np.concatenate([shuffled[np.unique(shuffled, axis=0, return_index=True)[1]]] * 2)
-        order = hand_order(attitude, soak)
+        order = measuring_order(attitude, soak)
         assert sorted(order.tolist()) == list(range(48))
         assert (np.diff(soak[order]) >= 0).all()
         for some in (order[:24], order[24:]):
@@ -654,11 +640,51 @@ def test_a_sheet_has_room_for_six_readings_and_no_banner_of_simulated_data(tmp_p
     )
     page = sheet.read_text("utf-8")
     assert "SIMULATED" not in page
-    assert page.count('<td class="reading">') == 6 * 48
+    assert page.count('<td class="reading">') == 6 * 49
+    assert "<th>ax, raw</th>" in page
     temperatures = re.findall(r'<td class="tick"></td><td>\d+</td><td>(\d+)</td>', page)
     planned_ones = load_plan("laboratory-thermal").columns["temperature_c"].tolist()
     visits = [key for key, _ in groupby(map(float, temperatures))]
     assert visits == [key for key, _ in groupby(planned_ones)]  # there and back, as the plan has it
+
+
+def test_file_screen_and_sheet_have_one_order_and_the_sheet_repeats_the_first_station(tmp_path):
+    profile, plan, sheet = (tmp_path / name for name in ("p.toml", "plan.csv", "sheet.html"))
+    text = (files("mwdcal") / "profiles" / "servo.toml").read_text("utf-8")
+    columns = "".join(f'{c} = {{name = "{c}", unit = "V"}}\n' for c in ("ax", "ay", "az"))
+    profile.write_text(f"{text}\n[columns]\n{columns}", "utf-8")
+    ran = mwdcal("plan", "--stations", 24, "--tool", profile, "-o", plan, "--report", sheet)
+    assert ran.code == 0, ran
+    written = read_csv(plan)
+    angles = [written[f"ref_{name}_deg"] for name in ("inclination", "azimuth", "toolface")]
+    stations = [
+        [name, "25", *(f"{float(cell):g}" for cell in cells)]
+        for name, *cells in zip(written["station"], *angles, strict=True)
+    ]
+    assert [row[0] for row in stations] == [str(k) for k in range(1, 25)]
+    shown = ran.out[ran.out.index("station   T") :].splitlines()[2:26]
+    assert [line.split() for line in shown] == stations
+    page = sheet.read_text("utf-8")
+    rows = re.findall(r'<td class="tick"></td>' + r"<td>([^<]*)</td>" * 5, page)
+    assert [list(row) for row in rows] == [*stations, ["1 again", *stations[0][1:]]]
+    assert re.findall(r"<th>([am][xyz], [^<]+)</th>", page) == [
+        "ax, V", "ay, V", "az, V", "mx, raw", "my, raw", "mz, raw"
+    ]  # fmt: skip
+    blocks = [float(key) for key, _ in groupby(row[3] for row in stations)]
+    assert sorted(blocks) != blocks != sorted(blocks, reverse=True)
+
+
+def test_the_screen_says_what_is_assumed_and_how_long_the_soak_is(tmp_path):
+    plan = tmp_path / "p.toml"
+    plan.write_text('name = "p"\ndip_deg = 60\n[[stations]]\ninclination_deg = [5, 60, 120]\n'
+                    "azimuth_deg = [0, 120]\ntoolface_deg = [0, 90, 180, 270]\n", "utf-8")  # fmt: skip
+    shown = mwdcal("plan", "--plan", plan, "--tool", "servo", "--soak", 90).out
+    assert "the plan does not state the place; assumed: field_nt 48,000\n" in shown
+    assert re.search(r"of which soak \(--soak\) +1\.5 h", shown)
+    assert "SIMULATED" not in shown
+    assert "the plan does not state the place; assumed: field_nt 48,000, dip_deg 63\n" in mwdcal(
+        "plan", "--plan", "six-state", "--tool", "servo"
+    ).out  # fmt: skip
 
 
 def test_a_sheet_asks_for_the_place(tmp_path):

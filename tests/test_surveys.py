@@ -775,7 +775,11 @@ def test_tie_in_moves_the_path(example, tmp_path):
             (),
             "line 5, column 'md_m': must not decrease",
         ),
-        ({"DEPT": ["1"] * 36}, (), r"does not state the unit.*'DEPT \(ft\)', or give --length-unit"),
+        (
+            {"DEPT": ["1"] * 36},
+            (),
+            r"does not state the unit.*'DEPT \(ft\)', or give --length-unit",
+        ),
         ({"Bit depth": ["1"] * 36}, (), "column 'Bit depth' does not state the unit"),
         ({"md_m": ["-5", *map(str, range(35))]}, (), "between 0 and 20000"),
         ({"accepted": ["x"] * 36}, (), "'accepted' is there already"),

@@ -93,7 +93,7 @@ COLOURS = {"!": "yellow", "PASS": "green", "pass": "green", "FAIL": "red"}
 """Colours of marks and verdicts on a terminal, where the words alone say the same."""
 READER_HAS_LEFT = {errno.EPIPE, errno.EINVAL} if sys.platform == "win32" else {errno.EPIPE}
 """Numbers of the error of a pipe that nobody reads; Windows calls it an invalid argument."""
-_MARKED = re.compile(r"^(!|PASS|FAIL)(?= )|(?<=   )(pass|FAIL)(?=   |$)", re.MULTILINE)
+_MARKED = re.compile(r"^(!|PASS|FAIL)(?=:? )|(?<=   )(pass|FAIL)(?=   |$)", re.MULTILINE)
 """A mark or verdict at the beginning of a line, or alone in a cell of a table."""
 
 

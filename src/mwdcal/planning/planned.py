@@ -43,8 +43,6 @@ from mwdcal.planning.plans import (
 )
 from mwdcal.sensor.profile import Profile
 
-MOST_ORDERED = 2_000
-"""Stations of one soak that are put in order; a longer plan keeps its own."""
 AT_ENDS_WITHIN = 1e-6
 """A setting so little beyond what the stand reaches is within it, degrees."""
 
@@ -123,37 +121,42 @@ def session_seconds(attitude: Array, soak: Ints, stand: Stand) -> float:
     """
     seconds = move_seconds(attitude, stand)
     moves = float(seconds[np.arange(len(soak) - 1), np.arange(1, len(soak))].sum())
-    soaks = 1 + int(np.count_nonzero(np.diff(soak)))
-    return stand.settle_seconds + moves + 60.0 * stand.soak_minutes * soaks
+    return stand.settle_seconds + moves + soak_seconds(soak, stand)
 
 
-def measuring_order(attitude: Array, soak: Ints, stand: Stand) -> Ints:
-    """An order (n,) of the stations of each soak with short moves that go there and back; the soaks keep theirs.
-
-    Method: a short path by the nearest station next and 2-opt, of which every other station is measured on
-    the way out and the rest on the way back. Neighbours on the path then lie alike before and after the
-    middle of the session, so that a slow drift does not keep step with the attitude.
-    """
-    order: list[int] = []
-    for each in dict.fromkeys(soak.tolist()):
-        some = np.flatnonzero(soak == each)
-        if len(some) > MOST_ORDERED:
-            return np.arange(len(soak))
-        path = some[_tour(move_seconds(attitude[some], stand))]
-        order += [*path[::2].tolist(), *path[1::2][::-1].tolist()]
-    return np.array(order)
+def soak_seconds(soak: Ints, stand: Stand) -> float:
+    """Duration of all soaks of a session."""
+    return 60.0 * stand.soak_minutes * (1 + int(np.count_nonzero(np.diff(soak))))
 
 
-def hand_order(attitude: Array, soak: Ints) -> Ints:
+def measuring_order(attitude: Array, soak: Ints) -> Ints:
     """An order (n,) of the stations of each soak for a stand turned by hand: its slow axes move last.
 
-    `attitude` (n, 3) in degrees. Toolface turns at each station, there and back; of inclination and azimuth, which are
-    levelled and aligned anew, one moves only when the other has been through all its settings, and the order of the
-    two is the one with fewer moves. The soaks keep their order.
+    `attitude` (n, 3) in degrees. Toolface turns at each station; of inclination and azimuth, which are levelled and
+    aligned anew, one moves only when the other has been through all its settings, and the order of the two is the one
+    with fewer moves. The slowest axis visits every other setting on its way out and the rest on its way back, the
+    others go up and down in turn: a slow drift does not keep step with the attitude. The soaks keep their order.
     """
-    both = [_serpentine(attitude[:, axes], soak) for axes in ([1, 0, 2], [0, 1, 2])]
+    _, first, number = np.unique(soak, return_index=True, return_inverse=True)
+    visit, both = np.argsort(np.argsort(first))[number], []
+    for axes in ([1, 0, 2], [0, 1, 2]):
+        keys = attitude[:, axes]
+        keys[:, 0] = _out_and_back(keys[:, 0])
+        both.append(_serpentine(keys, visit))
     moves = [int(np.count_nonzero(np.diff(attitude[order, :2], axis=0))) for order in both]
     return both[int(np.argmin(moves))]
+
+
+def _out_and_back(setting: Array) -> Ints:
+    """The place (n,) of each setting among those visited: every other one upwards, the rest downwards.
+
+    >>> _out_and_back(np.array([5.0, 30, 60, 90, 120])).tolist()
+    [0, 4, 1, 3, 2]
+    """
+    levels, rank = np.unique(setting, return_inverse=True)
+    upwards = np.arange(len(levels))
+    visits = np.concatenate([upwards[::2], upwards[1::2][::-1]])
+    return np.asarray(np.argsort(visits)[rank])
 
 
 def _serpentine(keys: Array, soak: Ints) -> Ints:
@@ -164,34 +167,6 @@ def _serpentine(keys: Array, soak: Ints) -> Ints:
     outer = np.column_stack([soak, keys[:, :-1]])[order]
     group = np.cumsum(np.any(np.diff(outer, axis=0, prepend=outer[:1]) != 0, axis=-1))
     return order[np.lexsort((keys[order, -1] * (-1.0) ** group, group))]
-
-
-def _tour(seconds: Array) -> Ints:
-    """A short path through all stations, from the first on."""
-    left, path = set(range(1, len(seconds))), [0]
-    while left:
-        path.append(min(left, key=lambda other: (seconds[path[-1], other], other)))
-        left.remove(path[-1])
-    tour = np.array(path)
-    while _turned(tour, seconds):
-        pass
-    return tour
-
-
-def _turned(tour: Ints, seconds: Array) -> bool:
-    """Turn round, in place, each stretch whose turning shortens the path; whether one was."""
-    improved = False
-    for first in range(1, len(tour) - 1):
-        before, start, ends = tour[first - 1], tour[first], tour[first + 1 :]
-        after = np.append(tour[first + 2 :], -1)
-        gain = seconds[before, start] - seconds[before, ends]
-        leave = np.where(after >= 0, seconds[ends, after] - seconds[start, after], 0.0)
-        best = int(np.argmax(gain + leave))
-        if gain[best] + leave[best] > 1e-9:
-            last = first + 1 + best
-            tour[first : last + 1] = tour[first : last + 1][::-1]
-            improved = True
-    return improved
 
 
 WORKING_INCLINATIONS = np.radians([5.0, 30.0, 60.0, 90.0, 120.0])
@@ -215,10 +190,10 @@ class Planned:
     """A plan and the calibration that it will give.
 
     `efficiency` is at least the share of the best possible D-value, per parameter, that as many stations
-    could have; `seconds` the session at the stand. `freedom` (t,) are the degrees of freedom of each triad's s, and
-    `detections` (1, n) the errors of one station that `calibrate` will report, those `measured` already before the
-    plan's. No plan of fewer than `bound` stations gives the wanted accuracy, if one is; `search` says what the
-    search has to say.
+    could have; `seconds` the session at the stand, `soaking` those of them in soaks. `freedom` (t,) are the degrees of
+    freedom of each triad's s, and `detections` (1, n) the errors of one station that `calibrate` will report, those
+    `measured` already before the plan's. No plan of fewer than `bound` stations gives the wanted accuracy, if one is;
+    `search` says what the search has to say.
     """
 
     plan: Table
@@ -226,6 +201,7 @@ class Planned:
     efficiency: float
     seconds: float
     freedom: Array
+    soaking: float
     detections: Mapping[str, Detection]
     measured: int = 0
     bound: int | None = None
@@ -237,9 +213,18 @@ class Planned:
     ) -> Planned:  # fmt: skip
         """A plan with the calibration and the fit that it will give."""
         calibration, result = carried
-        seconds = session_seconds(attitudes(plan), soak_numbers(plan), stand)
-        freedom = freedom_of(result)[0]
-        return cls(plan, calibration, efficiency, seconds, freedom, detections(result), measured)
+        soak = soak_numbers(plan)
+        times = session_seconds(attitudes(plan), soak, stand), soak_seconds(soak, stand)
+        return cls(
+            plan,
+            calibration,
+            efficiency,
+            times[0],
+            freedom_of(result)[0],
+            times[1],
+            detections(result),
+            measured,
+        )
 
     @property
     def hidden(self) -> dict[str, list[int]]:
@@ -521,11 +506,11 @@ class Search:
             )
 
     def planned(self, design: Design) -> Planned:
-        """The chosen stations, but those measured, in an order of short moves, there and back."""
+        """The chosen stations, but those measured, in the order to measure them."""
         new = design.chosen[self.before :]
         new = new[np.argsort(soak_numbers(taken(self.plan, new)), kind="stable")]
         some = taken(self.plan, new)
-        new = new[measuring_order(attitudes(some), soak_numbers(some), self.stand)]
+        new = new[measuring_order(self.stand.settings(attitudes(some)), soak_numbers(some))]
         plan = replace(
             taken(self.plan, new), source=f"Best {len(new)} station{'s' * (len(new) > 1)}"
         )

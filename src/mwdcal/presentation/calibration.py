@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 MOST_EXCLUDED = 20
 """Most stations left out of the fit that the screen names."""
-VALID = "good for {:.1f}…{:.1f} °C: readings beyond have no results (--outside of apply and survey)"
+VALID = "good for {:.1f}…{:.1f} °C: beyond, results are blank (--outside of apply)"
 """The temperatures of readings."""
 PROFILE = " (see [stand] of the tool profile)"
 ORDERS = "error: rms per axis, with the noise; inside: interpolation, at the ends: extrapolation"

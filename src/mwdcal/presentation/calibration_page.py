@@ -123,6 +123,9 @@ def outcome(calibration: Calibration, verdict: Verdict | None) -> dict[str, str]
         return banner("open" if level == "good" else level, "Not verified", unverified, after)
     missed = [row.name for row in verdict.rows if not row.passed]
     count = plural(len(verdict.rows), "limit")
+    if free := verdict.left_open:
+        headline = f"Not verified – nothing wrong was found, {free} left open"
+        return banner("attention", "Open", headline, f"Not judged: {', '.join(missed)}. {fit}.")
     if not verdict.passed:
         headline = f"Verification failed – {len(missed)} of {count} not met"
         return banner("bad", "Failed", headline, f"Not met: {', '.join(missed)}. {fit}.")
@@ -216,9 +219,13 @@ def _steps(calibration: Calibration, verdict: Verdict | None, file: str) -> list
             f"Verify the calibration with a roll test that the fit has not seen: mwdcal verify {file} ROLLTEST.csv",
         ]
     if verdict.passed:
-        return [*steps, f"Issue the certificate: mwdcal certificate {file} --verification V.json"]
-    places, command, reason = after_failure(verdict, file, verdict.run)
-    return [*steps, f"Measure again: {places}.", f"{capital(reason)}: {command}"]
+        return [
+            *steps,
+            f"Keep the verdict: mwdcal verify {file} {verdict.run} -o verdict.json",
+            f"Issue the certificate: mwdcal certificate {file} --verification verdict.json -o certificate.pdf",
+        ]
+    again, command, reason = after_failure(verdict, file, verdict.run)
+    return [*steps, f"{capital(again)}.", f"{capital(reason)}: {command}"]
 
 
 def _fit_outcome(calibration: Calibration) -> tuple[str, str]:

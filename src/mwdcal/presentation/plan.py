@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from mwdcal.calibration.readings import SIMULATED
 from mwdcal.calibration.record import Calibration, Finding, TriadCalibration, Undetermined
 from mwdcal.calibration.residuals import shown_in
 from mwdcal.calibration.results import accuracy_at, typical_accuracy
@@ -18,7 +17,7 @@ from mwdcal.files.contract import CHANNELS, REFERENCES
 from mwdcal.files.formats.table import Table
 from mwdcal.geometry.vectors import Array, Ints, reference_vectors
 from mwdcal.planning.expected import left_undetermined, planned_earth
-from mwdcal.planning.planned import WORKING_INCLINATIONS, Planned, hand_order, station_names
+from mwdcal.planning.planned import WORKING_INCLINATIONS, Planned, station_names
 from mwdcal.planning.plans import attitudes, soak_numbers
 from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.numbers import files_written, quantity
@@ -68,15 +67,16 @@ class DetectableError(msgspec.Struct, frozen=True, kw_only=True):
 class PlanSummary(msgspec.Struct, frozen=True, kw_only=True):
     """The output of `plan` for one plan.
 
-    `accuracy_deg` at 45° inclination, as `calibrate` states it; `accuracy_by_inclination_deg` by angle at
-    `inclinations_deg`. `efficiency_bound`: at least this share of the best D-value per parameter. Without
-    `magnetometer` the profile says nothing of one. No plan of fewer than `fewest_stations` gives the wanted accuracy;
-    None where none is wanted.
+    `soak_hours` are part of `session_hours`. `accuracy_deg` at 45° inclination, as `calibrate` states it;
+    `accuracy_by_inclination_deg` by angle at `inclinations_deg`. `efficiency_bound`: at least this share of the best
+    D-value per parameter. Without `magnetometer` the profile says nothing of one. No plan of fewer than
+    `fewest_stations` gives the wanted accuracy; None where none is wanted.
     """
 
     plan: str
     stations: int
     session_hours: float
+    soak_hours: float
     accelerometer: PlannedTriad
     magnetometer: PlannedTriad | None = None
     accuracy_deg: dict[str, float | None]
@@ -145,6 +145,7 @@ def _fields(each: Planned) -> dict[str, Any]:
         "plan": each.plan.source,
         "stations": each.plan.count,
         "session_hours": each.seconds / 3600,
+        "soak_hours": each.soaking / 3600,
         **by_triad,
         "accuracy_deg": typical_accuracy(calibration),
         "inclinations_deg": np.degrees(WORKING_INCLINATIONS).round(9).tolist(),
@@ -233,11 +234,12 @@ def screen(
 ) -> str:
     """The result for people."""
     summaries = [facts(each) for each in plans]
-    head = f"{plans[0].calibration.profile.name}   expected of a nominal tool, nothing measured   {SIMULATED}"
+    head = f"{plans[0].calibration.profile.name}   expected of a nominal tool, nothing measured"
     blocks = [
         one_line(head),
         table(comparison_rows(summaries), ["", *(one_line(each.plan) for each in summaries)]),
     ]
+    blocks += _assumed(plans[0])
     if len(plans) == 1:
         blocks += [accuracy(summaries[0]), detectable(summaries[0]), stations(plans[0])]
     if output or html:
@@ -245,11 +247,29 @@ def screen(
     return "\n\n".join(blocks)
 
 
+def _assumed(planned: Planned) -> list[str]:
+    """Field and dip that the prediction assumes because the plan does not state them, as a line; none if it does."""
+    if not planned.calibration.has_field:
+        return []
+    _, field, dip = (float(values[0]) for values in planned_earth(planned.plan))
+    words = {"field": f"field_nt {field:,.0f}", "dip": f"dip_deg {np.degrees(dip):g}"}
+    blank = [word for name, word in words.items() if _is_blank(planned.plan, name)]
+    return [f"the plan does not state the place; assumed: {', '.join(blank)}"] if blank else []
+
+
+def _is_blank(plan: Table, name: str) -> bool:
+    """Whether a plan states a reference at no station."""
+    return bool(
+        np.isnan(np.asarray(plan.columns.get(REFERENCES[name].column, np.nan), float)).all()
+    )
+
+
 def comparison_rows(facts: Sequence[PlanSummary]) -> list[list[str]]:
     """The results of the plans, a plan in each column."""
     lines = [
         ["stations", *(str(each.stations) for each in facts)],
         ["at the stand", *(f"{each.session_hours:.1f} h" for each in facts)],
+        ["of which soak (--soak)", *(f"{each.soak_hours:.1f} h" for each in facts)],
         ["temperature order", *(_orders(each) for each in facts)],
         ["determined", *(f"{each.rank} of {each.size}" for each in facts)],
         ["degrees of freedom", *(_freedom(each) for each in facts)],
@@ -350,10 +370,9 @@ def render(plans: Sequence[Planned]) -> str:
         simulated=False,
         place=_place(first),
         titles=titles,
-        channels=[
-            channel for triad in first.calibration.triads for channel in CHANNELS[triad.name]
-        ],
+        channels=_channels(first.calibration),
         rows=rows,
+        soaks=any(begins for _, begins in rows),
         compared=comparison_rows(summaries),
         plans=[each.plan for each in summaries],
         accuracy=accuracy_rows(summaries[0]),
@@ -365,14 +384,26 @@ def render(plans: Sequence[Planned]) -> str:
 
 
 def _sheet(plan: Table) -> tuple[list[str], list[tuple[list[str], bool]]]:
-    """Titles and cells of the stations in the order of a stand turned by hand, and where another soak begins."""
+    """Titles and cells of the stations in order, and where another soak begins.
+
+    The last row is the first station of the last soak again: what has changed since is drift.
+    """
     titles, rows = station_rows(plan)
     if titles[0] != STATION_TITLES["station"]:
         titles = [STATION_TITLES["station"], *titles]
         rows = [[name, *row] for name, row in zip(station_names(plan), rows, strict=True)]
     begins = np.diff(soak_numbers(plan), prepend=soak_numbers(plan)[:1]) != 0
-    order = hand_order(attitudes(plan), np.cumsum(begins))  # a temperature may come again
-    return titles, [(rows[k], bool(new)) for k, new in zip(order.tolist(), begins, strict=True)]
+    first, *others = rows[int(np.flatnonzero(begins)[-1]) if begins.any() else 0]
+    stations = [*rows, [f"{first} again", *others]]
+    return titles, list(zip(stations, [*begins.tolist(), False], strict=True))
+
+
+def _channels(calibration: Calibration) -> list[str]:
+    """The raw channels, with the unit that the profile's table has."""
+    columns = calibration.profile.columns or {}
+    names = [channel for triad in calibration.triads for channel in CHANNELS[triad.name]]
+    units = {name: column.unit for name, column in columns.items() if column.unit}
+    return [f"{name}, {units.get(name, 'raw')}" for name in names]
 
 
 def _place(planned: Planned) -> list[tuple[str, str]]:

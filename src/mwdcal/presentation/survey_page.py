@@ -400,7 +400,9 @@ def _banner(facts: SurveySummary) -> dict[str, str]:
         return banner("bad", "Rejected", headline, f"{facts.rejected} outside. {north}")
     if facts.blank == facts.rows:
         outside = any(finding.id == "outside-temperature" for finding in facts.findings)
-        reason = "they lie outside the calibrated temperatures" if outside else "readings are missing"
+        reason = (
+            "they lie outside the calibrated temperatures" if outside else "readings are missing"
+        )
         return banner("bad", "No result", "No survey has a result", f"See below: {reason}")
     if without := ", ".join(without_verdict(facts)):
         return banner("attention", "Attention", headline, f"{without}. {north}")

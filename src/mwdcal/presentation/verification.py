@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import Finding, SignatureCheck
-from mwdcal.presentation.numbers import measured, quantity, unit
+from mwdcal.presentation.numbers import capital, measured, quantity, unit
 from mwdcal.presentation.signature import signature_status
 from mwdcal.presentation.text import NOT_STATED, WIDE, chance, one_line, table
 from mwdcal.use.verification import SETTING_PRACTICES, JudgedSet, Verdict, VerdictRow
@@ -19,6 +19,10 @@ FREEDOM = "DoF"
 """Title of a column of degrees of freedom."""
 MANY = 10_000
 """As good as unlimited degrees of freedom."""
+REFERENCES_OF = {
+    "rotation": "reference inclinations", "toolface zero": "reference toolfaces", "scale": "reference strengths",
+}  # fmt: skip
+"""The references of a calibration run that determine a direction, by a word of its name."""
 BETWEEN_SETS = "stations outside of roll sets"
 VERDICT_RISK = "risk of a wrong verdict, all roll sets and limits together"
 
@@ -37,6 +41,8 @@ def screen(
         verdict = "pass" if row.passed else "FAIL"
         rows.append([row.name, raw, value, sd, freedom(row), limit, verdict, row.note])
     outcome = "PASS" if result.passed else "FAIL"
+    if free := result.left_open:
+        outcome += f": nothing wrong was found; the calibration leaves {free} open"
     first = [outcome, result.run, f"{result.stations} stations"]
     first += [signature_status(signature)] if signature else []
     first += simulated(*metadata)
@@ -55,7 +61,7 @@ def next_step(result: Verdict, calibration: Path, run: Path) -> str:
     if result.passed:
         return ""
     again, command, reason = after_failure(result, calibration, run)
-    return f"\n\nmeasure again: {again}\nnext: {command}   ({reason})"
+    return f"\n\n{again}\nnext: {command}   ({reason})"
 
 
 def with_next_step(result: Verdict, calibration: Path, run: Path) -> Verdict:
@@ -63,23 +69,27 @@ def with_next_step(result: Verdict, calibration: Path, run: Path) -> Verdict:
     if result.passed:
         return result
     again, command, reason = after_failure(result, Path(calibration.name), Path(run.name))
-    text = f"Measure again: {again}. Next: {command} ({reason})"
+    text = f"{capital(again)}. Next: {command} ({reason})"
     return replace(result, findings=[*result.findings, Finding(id="next-step", text=text)])
 
 
 def after_failure(
     result: Verdict, calibration: Path | str, run: Path | str
 ) -> tuple[str, str, str]:
-    """Steps after a verdict: stations to measure again, the next command, and its purpose.
+    """Steps after a verdict: what to measure again or to add, the next command, and its purpose.
 
     Where values failed: each place once, and the fault that it looks like. Else no value could be stated.
     """
-    failed = [row for row in result.rows if row.value is not None and not row.passed]
+    failed = [row for row in result.rows if row.uncertainty is not None and not row.passed]
     places = dict.fromkeys(row.note.partition(";")[0] for row in failed)
     if places:
         command = f"mwdcal diagnose {one_line(calibration)} {one_line(run)}"
-        return "; ".join(places), command, "what it looks like"
-    again = "the roll test, with what is missing in it"
+        return f"measure again: {'; '.join(places)}", command, "what it looks like"
+    if free := result.left_open:
+        missing = [word for direction, word in REFERENCES_OF.items() if direction in free]
+        again = f"not determined: {free}. Give {' and '.join(missing)} in the calibration run"
+        return again, f"mwdcal calibrate RUN -o {one_line(calibration)}", "with these references"
+    again = "measure again: the roll test, with what is missing in it"
     return again, f"mwdcal verify {one_line(calibration)} ROLLTEST.csv", "the new roll test"
 
 

@@ -384,7 +384,10 @@ class _LongTable:
         first = replace(seen.first, readings=readings, sources=sources)
         first = with_findings(first, tally, counts, settings.outside, settings.tie_in is None)
         exchanged = exchanged_axes(settings.calibration, readings)
-        first = replace(first, findings=[*inputs.findings, *exchanged, *with_stated_unit(first.findings, self.head)])
+        first = replace(
+            first,
+            findings=[*inputs.findings, *exchanged, *with_stated_unit(first.findings, self.head)],
+        )
         return SurveyedWell(inputs, first, counts, None)
 
     def _scatter(self) -> dict[str, Scatter]:

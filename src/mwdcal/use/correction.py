@@ -436,7 +436,9 @@ def _results_beyond(calibration: Calibration, outside: str) -> str:
     """The treatment of results outside the calibrated temperatures, with the remedy."""
     low, high = calibration.valid_temperatures or (np.nan, np.nan)
     advice = (
-        "Calibrate over a wider range" if calibration.thermal else "Calibrate at several temperatures"
+        "Calibrate over a wider range"
+        if calibration.thermal
+        else "Calibrate at several temperatures"
     )
     text = RESULTS_BEYOND[outside == "extrapolate"]
     return text.format(margin=calibration.margin, low=low, high=high, advice=advice)

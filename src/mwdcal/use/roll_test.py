@@ -11,7 +11,7 @@ Roll sets: stations in one direction of the tool axis and at one temperature.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 
@@ -527,7 +527,8 @@ REFERENCE_COLUMNS = {name: f"ref_{column}" for name, column in OUTPUTS.items()}
 NO_TOOLFACE = (
     f"the toolface of exactly vertical stations is not known. Give {REFERENCE_COLUMNS['toolface']}"
 )
-NOT_DETERMINED = "it rests on a direction that the calibration leaves undetermined"
+NOT_DETERMINED = "the calibration does not determine "
+"""Beginning of the reason why a limit cannot be passed where the calibration leaves a direction open."""
 SEEN = 0.7
 """Least share of the amplitude of each harmonic that stations should show."""
 WORST_CONDITION = 1e10
@@ -535,6 +536,23 @@ WORST_CONDITION = 1e10
 TINY = 1e-15
 LEAST_ALONE = 1e-6
 """Least noise of a value beside errors that it shares with others, in sizes of these: their matrix stays regular."""
+
+
+def directions_in_words(ids: Iterable[str]) -> str:
+    """Undetermined directions as people name them, each once.
+
+    >>> directions_in_words(["rotation-x", "rotation-y", "toolface-zero", "rotation-x"])
+    'rotation about x and y, toolface zero'
+    """
+    axes = [
+        name.removeprefix("rotation-")
+        for name in dict.fromkeys(ids)
+        if name.startswith("rotation-")
+    ]
+    others = [
+        name.replace("-", " ") for name in dict.fromkeys(ids) if not name.startswith("rotation-")
+    ]
+    return ", ".join([*([f"rotation about {' and '.join(axes)}"] if axes else []), *others])
 
 
 @dataclass(frozen=True)
@@ -797,8 +815,14 @@ class RollTest:
         """The statistics, and why no limit can be passed: `free` and `unrolled` are reasons."""
         if name == "field" and self.calibration.relative:
             return Departures(blocked="the calibration is relative: field = 1, not nT", apart=apart)
-        blocked = NOT_DETERMINED if free else unrolled
+        blocked = NOT_DETERMINED + self._open_directions(name) if free else unrolled
         return Departures(tuple(statistics), "", blocked, bool(unrolled), apart, unseen, remarks)
+
+    def _open_directions(self, name: str) -> str:
+        """Undetermined directions in words; the zero of toolface where an angle rests on it, or on nothing else."""
+        ids = [entry.id for entry in self.calibration.undetermined()]
+        others = [each for each in ids if each != "toolface-zero" or name.endswith("toolface")]
+        return directions_in_words(others or ids)
 
     def _errors(self, name: str, judged: Ints) -> tuple[list[Statistic], tuple[str, ...]]:
         """Largest errors of rolled sets, and of each station outside of them."""

@@ -22,6 +22,7 @@ from mwdcal.use.roll_test import (
     HARMONICS,
     LEVEL,
     NO_ERROR_OF_A_TOOL,
+    NOT_DETERMINED,
     Departures,
     Largest,
     RollTest,
@@ -230,6 +231,10 @@ class VerifiedStation(msgspec.Struct, frozen=True, kw_only=True):
     over: list[str]
 
 
+CANNOT_BE_PASSED = "cannot be passed: "
+"""Beginning of the note of a limit that no value could meet."""
+
+
 class VerdictRow(msgspec.Struct, frozen=True, kw_only=True):
     """One limit: the noise-free value, its standard uncertainty, and the decision.
 
@@ -302,6 +307,15 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     summary: ClassVar[Callable[..., str]]
     to_dict: ClassVar[Callable[..., dict[str, Any]]]
     """As of `Calibration`."""
+
+    @property
+    def left_open(self) -> str:
+        """Directions that the calibration leaves undetermined, where these alone make it fail; else empty."""
+        start = CANNOT_BE_PASSED + NOT_DETERMINED
+        notes = [row.note for row in self.rows if not row.passed]
+        if not notes or not all(note.startswith(start) for note in notes):
+            return ""
+        return max((note.removeprefix(start) for note in notes), key=len)
 
     def __repr__(self) -> str:
         failed = ", ".join(row.name for row in self.rows if not row.passed)
@@ -526,7 +540,7 @@ def _judged(title: str, name: str, limit: float, outcome: Departures, guarded: b
     if outcome.blocked:
         row = VerdictRow(
             name=title, unit=unit, value=None if outcome.unrolled else most, uncertainty=None,
-            limit=limit, passed=False, note=f"cannot be passed: {outcome.blocked}", raw=most,
+            limit=limit, passed=False, note=CANNOT_BE_PASSED + outcome.blocked, raw=most,
             sets=sets, degrees_of_freedom=None,
         )  # fmt: skip
         return _Judged(row, findings, remarks)
