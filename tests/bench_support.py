@@ -112,8 +112,6 @@ import sys
 sys.path.insert(0, {str(Path(__file__).parent)!r})
 import pictures
 pictures.leave_out(setattr)
-from mwdcal.presentation import certificate
-certificate.certificate_pictures = lambda *given: []
 from mwdcal.app.cli import main
 main()
 """

@@ -120,6 +120,7 @@ def computed_once(results, monkeypatch):
     long = (
         (planned, "judged"),
         (planned, "best_plan"),
+        (planned, "smallest_plan"),
         (compare, "compare"),
         (noise, "find_noise"),
         (allan, "fit"),

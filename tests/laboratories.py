@@ -18,6 +18,7 @@ import zipfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 from xml.sax.saxutils import escape
@@ -1554,6 +1555,7 @@ TABLES: tuple[Callable[[], Laboratory], ...] = (
 )  # fmt: skip
 
 
+@cache
 def laboratories() -> list[Laboratory]:
     """Every table, the same bytes each time."""
     return [table() for table in TABLES]

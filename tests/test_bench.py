@@ -72,11 +72,8 @@ def session_in(folder, plan=PLAN, start=True, tool=None, **options):
 
 
 @pytest.fixture(autouse=True)
-def plans_once_and_papers_without_pictures(computed_once, without_pictures, monkeypatch):
+def plans_once_and_papers_without_pictures(computed_once, without_pictures):
     """Papers of `finished` are drawn, and those in the browser."""
-    from mwdcal.presentation import certificate
-
-    monkeypatch.setattr(certificate, "certificate_pictures", lambda *given: [])
 
 
 @pytest.fixture

@@ -272,6 +272,7 @@ def test_the_digest_is_that_of_the_file():
     assert load_laboratory(EXAMPLE / "laboratory.toml")[1] == sha256(EXAMPLE / "laboratory.toml")
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_every_line_of_the_page_runs(tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
     text = (ROOT / "docs" / "howto" / "certificate.md").read_text("utf-8")

@@ -453,7 +453,7 @@ def test_a_conversion_to_a_file_prints_json_where_json_is_asked_for(folder):
     assert mwdcal(*arguments, "--json").json == json.loads((folder / "out.json").read_bytes())
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("without_pictures")
 def test_a_report_that_cannot_be_written_leaves_no_calibration(folder, monkeypatch):
     real, replaced = os.fsync, []
 

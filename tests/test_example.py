@@ -68,7 +68,7 @@ FIRST_PAGES = (
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("without_layout")
+@pytest.mark.usefixtures("without_pictures")
 @pytest.mark.parametrize("page", FIRST_PAGES)
 def test_every_line_of_the_first_pages_runs(tmp_path, monkeypatch, page):
     pytest.importorskip("matplotlib")

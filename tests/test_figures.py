@@ -274,6 +274,7 @@ def test_what_is_undetermined_is_said_in_words():
     assert "azimuth" not in texts(calibrated(magnetometer=False).plot.accuracy())
 
 
+@pytest.mark.usefixtures("without_layout")
 def test_a_calibration_without_any_angle_has_no_picture_of_them():
     drop = ("inclination", "azimuth", "toolface", "dip")
     loose = calibrate(run(drop, moved=False), SERVO, Options(method="scalar"))
@@ -392,6 +393,7 @@ def test_more_roll_sets_than_looks_show_the_worst():
     assert {"worst roll set", "other roll sets"} <= set(curves(result.plot.toolface().axes[0]))
 
 
+@pytest.mark.usefixtures("without_layout")
 def test_vertical_stations_have_no_azimuth_to_draw():
     plan = plans.grid([0.0, 45.0], 12, [0.0, 60.0], [25.0])
     result = verify(sound(), readings(plan, 5), LIMITS)
@@ -406,6 +408,7 @@ def test_vertical_stations_have_no_azimuth_to_draw():
     Page().feed(render(sound(), result))
 
 
+@pytest.mark.usefixtures("without_layout")
 def test_a_relative_calibration_draws_everything_but_the_field():
     result = verify(sound("field"), readings(ONE, 3), LIMITS)
     row = next(row for row in result.rows if row.name == "error of field")

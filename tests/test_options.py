@@ -272,7 +272,8 @@ SOURCE = Path(fit_options.__file__).parents[1]
 
 def declares(path, name):
     """Whether a module has a field or a string of a name."""
-    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+    text = path.read_text("utf-8")
+    for node in ast.walk(ast.parse(text)) if name in text else ():
         target = node.target if isinstance(node, ast.AnnAssign) else None
         if getattr(target, "id", "") == name or getattr(node, "value", None) == name:
             return True

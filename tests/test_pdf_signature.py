@@ -16,6 +16,7 @@ from cli_support import EXAMPLE, mwdcal, refused
 from mwdcal.certificate.pdf_signature import ATTACHMENT
 
 pypdf = pytest.importorskip("pypdf", reason="pypdf is not installed")
+pytestmark = pytest.mark.usefixtures("without_pictures")  # but for those of the signed certificate
 
 
 @pytest.fixture(scope="module")

@@ -632,6 +632,7 @@ def test_a_stand_turned_by_hand_moves_its_slow_axes_last():
             assert np.count_nonzero(np.diff(attitude[some, :2], axis=0)) == 5  # one axis at a time
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_a_sheet_has_room_for_six_readings_and_no_banner_of_simulated_data(tmp_path):
     sheet = tmp_path / "sheet.html"
     assert (

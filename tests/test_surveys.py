@@ -1063,6 +1063,7 @@ def test_msa_near_horizontal_east_west_is_refused(example, tmp_path):
     assert cli("survey", example, north, "-o", out, "--msa", "--json").json["separable"] is True
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_the_page_shows_the_analysis_of_msa_alone(example, tmp_path):
     line = ("survey", example, EXAMPLE / "well.csv", "-o", tmp_path / "o.csv")
     page, alone = tmp_path / "s.html", tmp_path / "m.html"
