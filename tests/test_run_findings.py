@@ -252,21 +252,6 @@ def test_copies_are_the_stations_near_an_earlier_one(count):
     assert not _copies(300.0 * rng.standard_normal((count, 6))).any()
 
 
-@pytest.mark.parametrize("gravity", [1.0, 0.9965, 1.0036, 1.0123, 0.98066])
-def test_a_gravity_that_no_place_on_land_has_is_named(gravity):
-    """On land 9.764 to 9.834 m/s²: Hirt et al., Geophys. Res. Lett. 40 (2013) 4279."""
-    data = run()
-    data = replace(data, known={**data.known, "gravity": np.full(data.count, gravity)})
-    outside = not 9.764 <= 9.80665 * gravity <= 9.834
-    assert ("gravity-reference" in found(data)) == (outside and gravity != 1.0036)
-
-
-def few_stations(seeds, sd, error=0.0):
-    """Runs of eight stations, one of which is off by `error` noises on every axis of the magnetometer."""
-    runs = [run(seed, toolfaces=4, inclinations=(45, 100), sd=sd) for seed in range(seeds)]
-    station = np.arange(seeds) % 8
-
-
 def few_stations(seeds, sd, error=0.0, inclinations=(45, 100)):
     """Runs of four toolfaces, one station of which is off by `error` noises on every axis of the magnetometer."""
     runs = [run(seed, toolfaces=4, inclinations=inclinations, sd=sd) for seed in range(seeds)]
