@@ -67,7 +67,7 @@ ALIASES = {
     "test": "mwdcal verify",
     "fit": "mwdcal calibrate",
 }
-"""What is typed for a command or option of another name."""
+"""Commands and options by other names that people type for them."""
 _LONG = re.compile(r"([^'\n]{300})[^'\n]+")
 """A value that a message about a wrong option repeats, where it is too long to be read."""
 
