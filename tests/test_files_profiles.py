@@ -59,7 +59,7 @@ def test_a_left_handed_instrument_is_a_real_one(tmp_path):
     [
         ("servoo", "distox, generic, moosavi-servo, sap5, sap6, servo)"),
         ("servoo", "Did you mean 'servo'"),
-        ("nowhere/tool.toml", "or the path of a TOML file; got 'nowhere/tool.toml'"),
+        ("nowhere/tool.toml", "there is no file 'nowhere/tool.toml'"),
         ("", "is not a tool profile"),
         ("x" * 5000, "File name too long"),
     ],

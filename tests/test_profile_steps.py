@@ -115,3 +115,72 @@ def test_a_calibration_as_the_tool_of_a_plan_brings_the_noise_that_it_estimated(
     )
     for angle, value in theirs["accuracy_deg"].items():
         assert ours["accuracy_deg"][angle] == pytest.approx(value, rel=1e-6)
+
+
+def test_a_proposed_profile_has_lines_for_noise_and_stand_and_says_that_the_stand_counts_as_exact(
+    own, tmp_path
+):
+    """The lines filled in and without their marks are a profile with these values."""
+    ran = mwdcal("profile", own / "a.csv", "-o", tmp_path / "t.toml")
+    assert "The angles of the stand count as exact until [stand] in" in ran.out
+    text = (tmp_path / "t.toml").read_text().replace("# [stand]", "[stand]")
+    for name in ("noise", "inclination_deg", "azimuth_deg", "toolface_deg"):
+        assert f"# {name} =" in text
+        text = text.replace(f"# {name} =", f"{name} = 0.01 #")
+    (tmp_path / "t.toml").write_text(text)
+    profile = library.load_profile(tmp_path / "t.toml")
+    assert (profile.accelerometer.noise, profile.stand.azimuth_deg) == (0.01, 0.01)
+    (tmp_path / "mwdcal.toml").write_text("[stand]\nazimuth_deg = 0.05\n")
+    written(tmp_path / "b.csv", table())
+    ran = mwdcal("profile", tmp_path / "b.csv", "-o", tmp_path / "u.toml")
+    assert (ran.code, "count as exact" in ran.out) == (0, False)
+
+
+@pytest.mark.parametrize(
+    ("typed", "message"),
+    [
+        ("calibrate a.csv --tool t.toml -o a.xlsx", "Write to 'a.json'."),
+        ("calibrate a.csv --tool t.toml -o x.json --report a.pdf", "Write to 'a.html'."),
+        ("verify c.json a.csv -o v.html", "Write to 'v.json'."),
+        ("profile a.csv -o a.json", "Write to 'a.toml'."),
+        ("apply c.json a.csv -o c.xls", "Write to 'c.csv', for example."),
+        ("apply c.json a.csv -o c", ".csv, .tsv, .parquet, .xlsx"),
+        ("apply a.csv c.json -o o.csv", "CALIBRATION comes first"),
+        ("verify a.csv c.json", "CALIBRATION comes first"),
+        ("calibrate a.csv --tool few.toml -o x.json", "there is no file 'few.toml'"),
+        ("calibrate a.csv --raport r.html -o x.json", "Did you mean '--report'?"),
+        ("calibrate a.csv b.csv -o x.json", "--rolltest b.csv"),
+        ("help", "mwdcal --help"),
+        ("correct", "mwdcal apply"),
+        ("report", "--report R.html"),
+        ("calibrat a.csv", "Did you mean calibrate?"),
+    ],
+)  # fmt: skip
+def test_a_slip_on_the_command_line_is_refused_with_what_to_type(own, monkeypatch, typed, message):
+    monkeypatch.chdir(own)
+    before = sorted(own.iterdir())
+    ran = mwdcal(*typed.split())
+    assert (ran.code, ran.out) == (2, "")
+    assert message in ran.err
+    assert sorted(own.iterdir()) == before
+
+
+def test_a_file_in_whose_place_a_calibration_comes_is_said(own, tmp_path):
+    said = [
+        mwdcal("calibrate", own / "a.csv", "--tool", own / "t.toml", "-o", tmp_path / "c.json").out
+        for _ in range(2)
+    ]
+    assert ["in place of an earlier file" in each for each in said] == [False, True]
+
+
+def test_a_single_cell_with_the_other_decimal_sign_is_not_that_of_the_table(tmp_path):
+    write_csv(tmp_path / "a.csv", servo_run())
+    lines = (tmp_path / "a.csv").read_text().splitlines()
+    cells = lines[9].split(",")
+    cells[lines[0].split(",").index("ay")] = '"0,13472"'
+    lines[9] = ",".join(cells)
+    (tmp_path / "a.csv").write_text("\n".join(lines))
+    message = refused(mwdcal("calibrate", tmp_path / "a.csv", "-o", tmp_path / "c.json"), 2)
+    assert "line 10" in message
+    assert "Correct this one" in message
+    assert "--decimal" not in message

@@ -543,5 +543,5 @@ def test_bad_input_ends_in_a_sentence(tmp_path, options, word):
 
 def test_an_output_of_a_strange_kind_is_refused(tmp_path):
     ran = command("simulate", "-o", tmp_path / "run.doc", "--truth", tmp_path / "t.json")
-    assert "the suffix must be one of" in refused(ran, 2)
+    assert "the suffix of a table must be one of" in refused(ran, 2)
     assert not list(tmp_path.iterdir())

@@ -8,6 +8,7 @@ import io
 import os
 import re
 import sys
+from difflib import get_close_matches
 
 import click
 
@@ -58,12 +59,31 @@ SECTIONS = {
     "Shell": {"completion": "Print the completion script of a shell"},
 }
 """Modules of `mwdcal.app.commands` with a command of their name, in the order of the work, and what each does."""
+_EXTRA = re.compile(r"Got unexpected extra argument \((.*)\)")
+ALIASES = {
+    "help": "mwdcal --help",
+    "correct": "mwdcal apply",
+    "report": "mwdcal calibrate … --report R.html",
+    "test": "mwdcal verify",
+    "fit": "mwdcal calibrate",
+}
+"""Commands and options by other names that people type for them."""
 _LONG = re.compile(r"([^'\n]{300})[^'\n]+")
 """A value that a message about a wrong option repeats, where it is too long to be read."""
 
 
 class Sections(click.Group):
     """The commands, shown by section."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """The command of a name; of another name, which is like it or means it, say so."""
+        name = args[0]
+        near = ALIASES.get(name) or next(iter(get_close_matches(name, self.commands, n=1)), "")
+        if near and name not in self.commands:
+            ctx.fail(f"No such command {name!r}. Did you mean {near}?")
+        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the sections of the help, each command with what it does in one line."""
@@ -107,6 +127,7 @@ def _status(arguments: list[str] | None) -> int:
         with interruption.orderly_end():
             return cli.main(arguments, prog_name="mwdcal", standalone_mode=False) or 0
     except click.ClickException as error:
+        error = _with_nearest(error)
         error.show(usage := io.StringIO())
         indented = usage.getvalue().replace("\n\t", "\n  ")
         text = _LONG.sub(r"\1…", escape_controls(without_passwords(indented)))
@@ -132,6 +153,19 @@ def _status(arguments: list[str] | None) -> int:
             "mwdcal: please report it with the command and the file. MWDCAL_DEBUG=1 shows where.",
             INTERNAL,
         )
+
+
+def _with_nearest(error: click.ClickException) -> click.ClickException:
+    """The same error; of a wrong option with the one that is nearest, of a second file with its option."""
+    if isinstance(error, click.NoSuchOption) and error.possibilities:
+        nearest = get_close_matches(error.option_name, error.possibilities, n=1)
+        return click.NoSuchOption(error.option_name, None, nearest, error.ctx)
+    context = error.ctx if isinstance(error, click.UsageError) else None
+    extra = _EXTRA.fullmatch(error.message)
+    if context and extra and any(p.name == "rolltest" for p in context.command.params):
+        question = f"{error.message}. Is it the roll test? --rolltest {extra[1]}"
+        return click.UsageError(question, context)
+    return error
 
 
 def _ended(message: str, status: int, *notes: str) -> int:

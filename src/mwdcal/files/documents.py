@@ -25,6 +25,7 @@ from mwdcal.calibration.record import (
 from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import atomic, members
+from mwdcal.files.formats.table import EXCHANGED, LAID_OUT
 from mwdcal.files.profiles import PACKAGE, check_profile
 
 # --------------------------------------------------------------------------
@@ -141,8 +142,10 @@ def decoded(file: members.Member) -> Calibration:
     try:
         calibration = _decoded(file.record, file.name)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        is_table = Path(file.name).suffix.lower() in (*LAID_OUT, *EXCHANGED)
+        order = " CALIBRATION comes first: are the two files exchanged?" if is_table else ""
         raise InputError(
-            f"{file.name} is not a calibration file: {error}. Use a file that mwdcal calibrate wrote."
+            f"{file.name} is not a calibration file: {error}. Use a file that mwdcal calibrate wrote.{order}"
         ) from None
     check(calibration, file.name, _AS_WRITTEN)
     check_profile(calibration.profile, file.name)

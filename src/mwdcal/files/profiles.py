@@ -144,6 +144,9 @@ def read_toml(name: str, folder: str, kind: str) -> tuple[bytes, str]:
             f"'{name}' is not a {kind}: expected a TOML file of at most {LARGEST_TOML} bytes. "
             "Name a file such as tool.toml."
         )
+    if path.suffix.lower() == _SUFFIX:
+        remedy = f", or make one: mwdcal profile TABLE -o {name}" if folder == "profiles" else ""
+        raise InputError(f"{kind}: there is no file '{name}'. Check the path{remedy}.")
     names = built_in(folder)
     near = difflib.get_close_matches(name.lower(), names, n=2)
     meant = f" Did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
@@ -456,6 +459,12 @@ def setting(name: str) -> str:
     if used and value:
         used.take(name)
     return value
+
+
+def stand_in_settings() -> bool:
+    """Whether the settings of the running command state anything of the stand."""
+    used = in_use()
+    return used is not None and used.settings.stand != StandProfile()
 
 
 def standards_of(profile: Profile) -> tuple[MeasurementStandard, ...] | msgspec.UnsetType:

@@ -279,7 +279,7 @@ def _exported(
 
 
 def _as_documented(path: str | os.PathLike[str], decimal: str, rows: int) -> Table | None:
-    """The table in a file with the names of a run file; None where it is none."""
+    """The table in a file with the names of a run file; None where it has other names."""
     with suppress(InputError):
         table = tables.read(path, decimal=decimal, rows=rows)
         if set(CHANNELS["accelerometer"]) <= {*table.columns}:

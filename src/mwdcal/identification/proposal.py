@@ -1370,8 +1370,12 @@ def as_toml(proposal: Proposal, source: str) -> str:
             ]
             if scale := getattr(profile, kind).scale:
                 lines.append(f"scale = {scale!r}   # raw units per {unit}")
+            lines.append(
+                "# noise =    # raw units, 1σ of a station's mean; without it the fit estimates it"
+            )
         elif kind in proposal.open_axes:
             lines += _open_section(kind, proposal.open_axes[kind], unit)
+    lines += _STAND if has_angles(proposal) else []
     if not isinstance(profile.table, msgspec.UnsetType):
         lines += ["", "[table]"]
         fields = msgspec.structs.asdict(profile.table)
@@ -1387,14 +1391,34 @@ def as_toml(proposal: Proposal, source: str) -> str:
         }
         lines += [f"{key} = {toml(value)}" for key, value in fields.items()]
     if not isinstance(profile.columns, msgspec.UnsetType):
-        lines += [
-            "",
-            "[columns]   # of a run file = of this table; ref_ are angles of the stand, not the tool's",
-        ]
-        for column, each in in_order(profile.columns):
-            guess = "   # unit by its values" if column in proposal.by_value else ""
-            lines.append(f"{column} = {toml(_stated(each))}{guess}")
+        lines += _columns_section(profile.columns, proposal.by_value)
     return "\n".join(lines) + "\n"
+
+
+def _columns_section(columns: dict[str, ColumnSource], by_value: Collection[str]) -> list[str]:
+    """The section of the columns, and whose unit only the values tell."""
+    lines = [
+        "",
+        "[columns]   # of a run file = of this table; ref_ are angles of the stand, not the tool's",
+    ]
+    for column, each in in_order(columns):
+        guess = "   # unit by its values" if column in by_value else ""
+        lines.append(f"{column} = {toml(_stated(each))}{guess}")
+    return lines
+
+
+_STAND = [
+    "",
+    "# [stand]   # 1σ of one setting, degrees, by the stand's certificate; until stated its angles count as exact",
+    *(f"# {name} =" for name in ("inclination_deg", "azimuth_deg", "toolface_deg")),
+]
+"""Lines to fill in: the uncertainty of the stand, which no table states."""
+
+
+def has_angles(proposal: Proposal) -> bool:
+    """Whether the table states angles of a stand."""
+    columns = proposal.profile.columns
+    return not isinstance(columns, msgspec.UnsetType) and not {*columns}.isdisjoint(ANGLES_OF_STAND)
 
 
 def _open_section(kind: str, axes: OpenAxes, unit: str) -> list[str]:

@@ -154,7 +154,8 @@ def screen(
     judged: str = "",
 ) -> str:
     """The result for people, the files that were written, and what to do next or what `judged` says of it."""
-    files = files_written(calibration=output, report=report)
+    what = "calibration, in place of an earlier file" if output.exists() else "calibration"
+    files = files_written(**{what: output, "report": report})
     after = f"\n\n{judged}" if judged else f"   next: mwdcal verify {one_line(output)} ROLLTEST.csv"
     return f"{body(calibration, tried)}\n{files}{after}"
 

@@ -14,7 +14,14 @@ from mwdcal.calibration.record import Finding
 from mwdcal.files.contract import RANGES
 from mwdcal.files.formats.columns import WORKBOOKS
 from mwdcal.files.formats.layout import Layout
-from mwdcal.identification.proposal import Proposal, findings_on, in_order, stated_references
+from mwdcal.files.profiles import stand_in_settings
+from mwdcal.identification.proposal import (
+    Proposal,
+    findings_on,
+    has_angles,
+    in_order,
+    stated_references,
+)
 from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.numbers import files_written
 from mwdcal.presentation.text import one_line, plural, table
@@ -113,7 +120,12 @@ def screen(proposal: Proposal, run: Path, output: Path | None) -> str:
         )
         if proposal.open_axes:
             command = f"fill in the axes in {one_line(str(output))}, then {command}"
-        blocks.append(f"{files_written(profile=output)}   next: {command}")
+        exact = (
+            f"The angles of the stand count as exact until [stand] in {one_line(str(output))} states their 1σ.\n"
+            if has_angles(proposal) and not stand_in_settings()
+            else ""
+        )
+        blocks.append(f"{exact}{files_written(profile=output)}   next: {command}")
     return "\n\n".join(blocks)
 
 

@@ -64,7 +64,7 @@ def command(
     from mwdcal.presentation import calibration as screen
 
     inputs = [run, tool, typed["prior"], rolltest, limits, registry]
-    options.check_outputs([output], inputs, page=report, calibration=True)
+    options.check_outputs([output], inputs, page=report, calibration=True, form=".json")
     _enter(registry)
     prior, digest = prior_of(typed["prior"])
     readings, turned, profile = load_runs(run, rolltest, tool, decimal, prior, options.statements())

@@ -40,7 +40,7 @@ def command(
     from mwdcal.presentation.diagnosis import render, screen
     from mwdcal.presentation.envelope import json_document
 
-    options.check_outputs([output], [calibration, readings], page=report)
+    options.check_outputs([output], [calibration, readings], page=report, form=".json")
     fitted, digest = calibration_of(calibration)
     later, _ = runs.read_run(readings, fitted.profile, decimal=decimal)
     result = diagnose(fitted, later)

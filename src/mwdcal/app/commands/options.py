@@ -273,14 +273,17 @@ def check_outputs(
     picture: Path | None = None,
     page: Path | None = None,
     calibration: bool = False,
+    form: str = "",
 ) -> None:
     """Refuse, before any work, an output that cannot be made or written, or would replace what must stay.
 
     That is an input, with every file in an input folder; a key; a file that a certificate lists; and a calibration,
-    which another `calibration` alone may replace.
+    which another `calibration` alone may replace. `form` is the suffix of the outputs, where they have one form: with
+    that of another they would be taken for it, as a page would.
     """
     from mwdcal.files.formats import atomic, members
 
+    outputs = list(outputs)
     named = list(filter(None, [*outputs, picture, page]))
     targets = [atomic.target(path) for path in named]
     given = members.files_of(inputs)
@@ -301,6 +304,8 @@ def check_outputs(
             if why := why_kept(target, given, calibration and path not in (picture, page)):
                 raise _refused(path, why)
         taken |= names
+    _check_forms(outputs, form)
+    _check_forms([page], ".html")
     if picture:
         from mwdcal.presentation.page import require
 
@@ -314,8 +319,24 @@ def check_outputs(
         environment()
 
 
-def _refused(path: Path, why: str) -> InputError:
-    return InputError(f"cannot write '{path}': {why}. Name another file.")
+KNOWN_SUFFIXES = (
+    ".json", ".toml", ".html", ".htm", ".pdf", ".png", ".svg", ".csv", ".tsv", ".xlsx", ".xls", ".ods", ".parquet",
+)  # fmt: skip
+"""Suffixes that say what a file holds."""
+
+
+def _check_forms(paths: Iterable[Path | None], form: str) -> None:
+    """Refuse the suffix of another form than what is written."""
+    for path in filter(None, paths if form else ()):
+        suffix = path.suffix.lower()
+        if suffix in KNOWN_SUFFIXES and not suffix.startswith(form[:4]):
+            why = f"it would hold {form[1:].upper()}, and its suffix says otherwise"
+            raise _refused(path, why, path.with_suffix(form))
+
+
+def _refused(path: Path, why: str, better: Path | None = None) -> InputError:
+    remedy = f"Write to '{better}'" if better else "Name another file"
+    return InputError(f"cannot write '{path}': {why}. {remedy}.")
 
 
 def _files(paths: Iterable[Path]) -> set[tuple[int, int] | None]:

@@ -71,7 +71,7 @@ def command(
     Example: mwdcal profile export.xlsx -o tool.toml --column temperature_c="Oven temp"
     Exit: 0 written, 2 input cannot be read, 3 questions are open (nothing is written).
     """
-    options.check_outputs([output], [run])
+    options.check_outputs([output], [run], form=".toml")
     stated = {name: value for name, value in given.items() if value is not None}
     answers = Answers(stated)
     for name, texts in (("column", column), ("leave_out", leave_out), ("keep", keep)):

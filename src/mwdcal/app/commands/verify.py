@@ -44,7 +44,7 @@ def command(
     from mwdcal.presentation.verification import next_step, screen, with_next_step
     from mwdcal.use.verification import verify
 
-    options.check_outputs([output], [calibration, run, limits, *key], page=report)
+    options.check_outputs([output], [calibration, run, limits, *key], page=report, form=".json")
     loaded = load_calibration(calibration, key)
     fitted = loaded.calibration
     readings, _ = runs.read_run(

@@ -174,7 +174,7 @@ def rendered(
     `export`: text with that delimiter, decimal sign and encoding.
     """
     file = Path(path)
-    form = _format(_suffix(file))
+    form = _format(check_written(file))
     check_names(list(table.columns), file.name)
     content: bytes | str
     if export and form is text:
@@ -193,7 +193,7 @@ def rendered(
 def streamed(path: str | os.PathLike[str], table: Table) -> bytes | str | Iterator[str]:
     """What `rendered` makes of the table; as text in pieces, which are made while they are written."""
     file = Path(path)
-    if _format(_suffix(file)) is not text:
+    if _format(check_written(file)) is not text:
         return rendered(path, table)
     check_names(list(table.columns), file.name)
     return _lines(file, table)
@@ -316,6 +316,17 @@ def _format(suffix: str) -> Any:
     return import_module(f"mwdcal.files.{_FORMATS[suffix]}")
 
 
+def check_written(path: Path) -> str:
+    """The suffix of a table to write, which must be that of a format."""
+    suffix = path.suffix.lower()
+    if suffix not in _FORMATS:
+        raise InputError(
+            f"cannot write '{path}': the suffix of a table must be one of {', '.join(_FORMATS)}; got "
+            f"'{suffix or 'none'}'. Write to '{path.with_suffix('.csv') if path.name else path}', for example."
+        )
+    return suffix
+
+
 def _suffix(path: Path) -> str:
     suffix = path.suffix.lower()
     if suffix in LAID_OUT and suffix not in _FORMATS:
@@ -377,13 +388,29 @@ def _one_by_one(table: Table, name: str, cells: Sequence[str]) -> Array:
         if not stripped:
             continue
         if not looks_numeric(stripped, table.decimal):
-            problem = f"expected a number; got {shown(cell)}. {_advice(stripped, table.decimal)}"
+            several = any(
+                looks_numeric(c.strip(), table.decimal) for c in cells[:row] if "." in c or "," in c
+            )
+            advice = (
+                _SINGLE
+                if several and _is_other_sign(stripped, table.decimal)
+                else _advice(stripped, table.decimal)
+            )
+            problem = f"expected a number; got {shown(cell)}. {advice}"
             raise cell_error(table, name, row, problem)
         values[row] = float(stripped.replace(",", "."))
         if np.isinf(values[row]):
             problem = f"expected a finite number; got {shown(cell)}, which is too large."
             raise cell_error(table, name, row, problem)
     return values
+
+
+_SINGLE = "Other cells of the column have the other decimal sign. Correct this one."
+
+
+def _is_other_sign(cell: str, decimal: str) -> bool:
+    """Whether a cell is a number with the decimal sign that its table does not have."""
+    return looks_numeric(cell, "," if decimal == "." else ".")
 
 
 def _advice(cell: str, decimal: str) -> str:
