@@ -235,6 +235,11 @@ def test_a_dip_that_differs_by_less_is_taken(tmp_path):
     assert reference(path, "dip") == pytest.approx(np.full(48, dip), abs=1e-3)
 
 
+def test_a_column_of_dips_that_is_blank_is_no_other_place(tmp_path):
+    path = written(tmp_path / "a.csv", table(ref_dip_deg=np.full(48, np.nan)))
+    assert np.isnan(reference(path, "dip")).all()
+
+
 UNITS_OF_OTHERS = ("Dip 1.1540 rad", "Dose 12 rad/h", "Radian Sensors Ltd", "Dip 73.467 gon")
 
 

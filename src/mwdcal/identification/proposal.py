@@ -950,7 +950,10 @@ def _check_dip(table: Table, profile: Profile, answers: Collection[str]) -> None
         columns={c: source for c, source in columns.items() if c != column},
         table=_with(form, {"ignore": (*form.ignore, named.name if named else column)}),
     )
-    seen, stated = np.nan, float(np.nanmedian(numbers(renamed(table, profile), column)))
+    dips = numbers(renamed(table, profile), column)
+    if np.isnan(dips).all():
+        return
+    seen, stated = np.nan, float(np.nanmedian(dips))
     with suppress(FitError, InputError):
         _, readings, wirings, open_axes = _wired_by_elevation(table, without)
         _, seen = field_direction(readings, {} if open_axes else wirings)
