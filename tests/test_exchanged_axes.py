@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from functools import cache
 
@@ -141,3 +142,15 @@ def test_the_command_says_so(tmp_path, monkeypatch, parts):
     )
     assert done.code == 0
     assert "fit the calibration with ax = ay, ay = ax, mx = my, my = mx, and not" in done.err
+
+
+def test_an_estimate_that_fails_is_said(monkeypatch):
+    def fails(*_):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    right = one(wells(tool(2), DEVIATED, 1, 2))
+    monkeypatch.setattr(sys.modules[exchanged_axes.__module__], "chi_square", fails)
+    [finding] = exchanged_axes(tool(2), right)
+    assert finding.id == "not-judged"
+    assert "could not be judged: Singular" in finding.text
+    assert exchanged_axes(tool(2), replace(right, magnetometer=None)) == []

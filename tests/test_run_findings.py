@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from mwdcal.calibration.automatic.auto import choose_order
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.diagnosis.findings import AGREEING, _copies, resolution
 from mwdcal.calibration.diagnosis.plausibility import stations_to_reshoot
@@ -334,3 +335,29 @@ def test_a_gravity_that_no_place_on_land_has_is_named(gravity):
     data = replace(data, known={**data.known, "gravity": np.full(data.count, gravity)})
     outside = not 9.764 <= 9.80665 * gravity <= 9.834
     assert ("gravity-reference" in found(data)) == (outside and gravity != 1.0036)
+
+
+@pytest.mark.parametrize(("curved", "orders"), [(200.0, (2, 2)), (0.0, (2, 0))])
+def test_a_precise_accelerometer_does_not_hide_terms_of_the_magnetometer(curved, orders):
+    """Offsets follow the square of the temperature on an uncertain stand; 1e-8 g is far less than its angles show."""
+    tool, rng = Tool.random(0, noise=(1e-8, 15.0)), np.random.default_rng(5)
+    angles = [np.tile(each, 5) for each in plan((5, 60, 120), 6)]
+    warmth = np.repeat([20.0, 45.0, 70.0, 95.0, 120.0], 18)
+    stand = 0.02 * DEG
+    attitudes = [each + stand * rng.normal(size=90) for each in angles]
+    course = np.outer((warmth - 70) / 50, [1, -1, 0.5]) + np.outer(
+        ((warmth - 70) / 50) ** 2, [0.5, 0.6, -0.4]
+    )
+    accelerometer, magnetometer = (each[0] for each in tool.readings(rng, 1, *attitudes))
+    known = dict(zip(("inclination", "azimuth", "toolface"), angles, strict=True))
+    sd = dict.fromkeys(known, np.full(90, stand))
+    known |= {"field": np.full(90, tool.field), "dip": np.full(90, tool.dip)}
+    data = Readings(
+        accelerometer + 1e-3 * course,
+        magnetometer + curved * course,
+        known={**known, "gravity": np.ones(90)},
+        sd={**sd, "accelerometer": np.array(1e-8), "magnetometer": np.array(15.0)},
+        temperature=warmth,
+    )
+    chosen, _ = choose_order(data, Options(model="polynomial"), lambda text: None)
+    assert chosen == orders

@@ -55,6 +55,7 @@ class DroppedTable:
     def _forget_fit(self) -> None:
         self.fit: documents.RunFit | None = None
         self.verdict: Verdict | None = None
+        self._diagnosis: tuple[Verdict, documents.Failure] | None = None
         self.papers: dict[str, str] = {}
 
     def _restore(self) -> None:
@@ -209,11 +210,14 @@ class DroppedTable:
 
     @property
     def failure(self) -> documents.Failure:
-        """Why the roll test has failed; empty if it has not."""
-        calibration = self.fit.calibration if self.fit else None
-        if calibration is None or self.verdict is None or self.verdict.passed:
+        """Why the roll test has failed, worked out once for each verdict; empty if it has not."""
+        calibration, verdict = self.fit.calibration if self.fit else None, self.verdict
+        if calibration is None or verdict is None or verdict.passed:
             return documents.Failure()
-        return documents.failure(self.verdict, calibration, self._given(self.rolltest))
+        if self._diagnosis is None or self._diagnosis[0] is not verdict:
+            failure = documents.failure(verdict, calibration, self._given(self.rolltest))
+            self._diagnosis = verdict, failure
+        return self._diagnosis[1]
 
     def certify(self, number: str) -> None:
         """Issue the certificate, and enter all in the registry, where one is named."""

@@ -41,9 +41,13 @@ def exchanged_axes(calibration: Calibration, readings: Readings) -> list[Finding
     Definition: χ² as of `interference_estimate.chi_square`, with interference and drift. Other axes are named if the
     surveys fit with them, do not fit without, and their likelihood ratio exp(Δχ²/2) exceeds the number of alternatives
     over `NAMED_BY_CHANCE`. The mean of such a ratio over sound runs is one, so that by Markov's inequality at most that
-    share of them is named. None where references lack, or nothing tells the axes apart.
+    share of them is named. None where a magnetometer or references lack, the field is relative, or nothing tells the
+    axes apart; where the estimate fails, the finding says so.
     """
     from scipy.special import chdtrc
+
+    if not calibration.has_field or readings.magnetometer is None or calibration.relative:
+        return []
 
     rows = usable(calibration, readings)
     for name in ("field", "dip"):
@@ -60,9 +64,10 @@ def exchanged_axes(calibration: Calibration, readings: Readings) -> list[Finding
         if chdtrc(freedom, named) >= LEAST_CHANCE:
             return []
         others = chi_square(calibration, with_axes(calibration, some, EXCHANGES), Assumed())
-    except (MwdcalError, np.linalg.LinAlgError):
-        return []
-    best = int(np.nanargmin(others))
+        best = int(np.nanargmin(others))
+    except (MwdcalError, ValueError) as error:  # LinAlgError is a ValueError
+        text = f"whether columns are exchanged could not be judged: {error}"
+        return [Finding(id="not-judged", text=text)]
     likelier = (named - others[best]) / 2 > np.log(len(EXCHANGES) / NAMED_BY_CHANCE)
     if not likelier or chdtrc(freedom, others[best]) < LEAST_CHANCE:
         return []

@@ -154,7 +154,31 @@ def _tested(
         wanted = np.any(terms.present[..., :HIGHEST] & within[:, None], -1)
         closed = (chosen < 0) & ~(wanted & (order < most)[:, None])
         orders[some] = np.where(closed, order, chosen)
-    return orders, chance
+    coupled = any(readings.sd.get(name, np.zeros(1)).any() for name in ANGLES)
+    return (_raised(readings, options, orders, limit) if coupled else orders), chance
+
+
+def _raised(readings: Readings, options: Options, orders: Ints, limit: Ints) -> Ints:
+    """The orders (B, t), raised where a triad has terms beyond its own once the other has its order.
+
+    On an uncertain stand the errors of the angles take up terms that a precise triad lacks, and spread them over the
+    residuals of the other, where they hide its terms.
+    """
+    orders, powers = orders.copy(), np.arange(1, HIGHEST + 1)
+    open_ = np.flatnonzero(orders.min(-1) < orders.max(-1))
+    while open_.size:
+        further: list[Ints] = []
+        for pair in distinct(orders[open_], axis=0):
+            some = open_[(orders[open_] == pair).all(-1)]
+            result = fit(take(readings, some), replace(options, order=(int(pair[0]), int(pair[1]))))
+            within = (powers <= limit[some, None])[:, None] & (powers > pair[:, None])
+            wanted = np.any(terms_beyond(result).present[..., :HIGHEST] & within, -1)
+            wanted &= pair < pair.max()
+            orders[some] += wanted
+            further.append(some[wanted.any(-1)])
+        open_ = np.concatenate(further)
+        open_ = open_[orders[open_].min(-1) < orders[open_].max(-1)]
+    return orders
 
 
 def _without_doubt(bare: Readings, options: Options, limit: Ints, orders: Ints) -> Bools:
