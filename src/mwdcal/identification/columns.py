@@ -659,17 +659,18 @@ class Questions(list[QuestionError]):
         first = [each.answers[0].arguments for each in self if each.answers]
         return {value.partition("=")[2] for arguments in first for _, value in arguments}
 
-    def settle(self, words: str) -> None:
-        """Leave out questions on columns that each answer to the one of these words takes as well."""
-        asked = next((each for each in self if words in each.text), None)
-        taken = [_columns_of(each) for each in asked.answers] if asked else []
+    def settle(self, words: str) -> bool:
+        """Whether there is a question of these words; others on columns that each of its answers takes are left out."""
+        question = next((each for each in self if words in each.text), None)
+        taken = [_columns_of(each) for each in question.answers] if question else []
         self[:] = [
             each
             for each in self
-            if each is asked
+            if each is question
             or not (taken and each.answers)
             or not set[str]().union(*map(_columns_of, each.answers)) <= set.intersection(*taken)
         ]
+        return question is not None
 
     def raise_any(self, source: str) -> None:
         """Raise all questions together."""
@@ -725,8 +726,7 @@ def proposed(
     questions.ask(
         _check_nominal, {c: e for c, e in chosen.items() if c not in said}, names, values, source
     )
-    beside = any("side by side" in each.text for each in questions)
-    questions.settle("side by side")
+    beside = questions.settle("side by side")
     if not beside and not {*RAW[3:]} & {*chosen, *said}:
         believed = (
             questions.believed() if {*RAW[:3]} & {*chosen} else ()
