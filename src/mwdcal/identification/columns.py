@@ -449,7 +449,7 @@ def _measured_channel(name: str) -> Resemblance | None:
 
 
 def _twice(name: str) -> Resemblance | None:
-    """What a name says twice, in words and in short: Inclination Inc (°), or by a symbol: Azimuth A (°)."""
+    """The column that a name says in words and in short, Inclination Inc (°), or by its symbol, Azimuth A (°)."""
     words, unit = name.split(), ""
     if len(words) > 2 and IN_BRACKETS.search(words[-1]):
         unit = words.pop()
