@@ -364,3 +364,32 @@ def test_labels_of_axes_in_front_of_rows_are_no_names(tmp_path):
     labelled = [[("+X", "-Y", "+Z")[n % 3], *row] for n, row in enumerate(rows)]
     path = text(tmp_path / "run.csv", [*TITLES, ["Up", *NAMES], *labelled])
     assert same(taken(path), rows)
+
+
+def test_angles_under_two_titles_are_offered_by_their_names(tmp_path):
+    """Neither title is understood: each question offers the two columns that end in its angle, and no others."""
+    rows = [[*row[:3], *(value + 0.2 for value in row[:3]), *row[3:]] for row in stations()]
+    names = [f"{title} {angle}" for title in ("Qq", "Zz") for angle in ("Inc", "Azi", "TF")]
+    path = text(tmp_path / "run.csv", [*TITLES, [*names, *NAMES[3:]], *rows])
+    with pytest.raises(mwdcal.FitError, match="behind a title that is not understood") as error:
+        mwdcal.propose_profile(path)
+    offered = [[a.arguments[0][1] for a in each.answers] for each in error.value.questions]
+    assert offered == [
+        [f"{column}={title} {angle}" for title in ("Qq", "Zz")] + [f"{column}="]
+        for column, angle in zip(
+            (COLUMNS[0], COLUMNS[2], COLUMNS[1]), ("Inc", "TF", "Azi"), strict=True
+        )
+    ]
+
+
+def test_one_question_asks_which_of_two_tools_side_by_side_is_meant(tmp_path):
+    """Its answers take the tool's own temperature and serial; the sheet says no other."""
+    rows = [[*row, *row[3:]] for row in stations()]
+    names = [f"Cradle S/N {tool} {end}" for tool in (11, 12) for end in [*CHANNELS, "Temp"]]
+    path = text(tmp_path / "run.csv", [TITLES[0][:5], [], ["Inc", "Azi", "TF", *names], *rows])
+    with pytest.raises(mwdcal.FitError, match="2 tools stand side by side") as error:
+        mwdcal.propose_profile(path)
+    (question,) = error.value.questions
+    assert {("column", "temperature_c=Cradle S/N 12 Temp"), ("serial", "12")} < {
+        *question.answers[1].arguments
+    }

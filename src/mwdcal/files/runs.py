@@ -214,7 +214,7 @@ def _undocumented(path: str | os.PathLike[str], error: InputError) -> InputError
 def read_roll_test(
     path: str | os.PathLike[str], run: Table, profile: Profile, statements: Mapping[str, str]
 ) -> Table | None:
-    """The roll test in the file of a run, on a sheet or below a line that says so; None where there is none."""
+    """The roll test in the file of a run, on a sheet or below a line that says so; None without one."""
     from mwdcal.files.formats.layout import ROLL_TEST
 
     form = TableFormat() if isinstance(profile.table, msgspec.UnsetType) else profile.table

@@ -22,7 +22,8 @@ from mwdcal.files.contract import (
     units_of,
 )
 from mwdcal.files.formats.columns import LABELS, shown
-from mwdcal.files.formats.title_references import EARTH_FIELD
+from mwdcal.files.formats.title_references import EARTH_FIELD, EARTH_GRAVITY
+from mwdcal.files.formats.titles import titles
 from mwdcal.files.profiles import setting
 from mwdcal.files.synonyms import (
     ABOVE,
@@ -449,7 +450,7 @@ def _measured_channel(name: str) -> Resemblance | None:
 
 
 def _twice(name: str) -> Resemblance | None:
-    """What a name says twice, in words and in short: Inclination Inc (°), or by a symbol: Azimuth A (°)."""
+    """The column that a name says in words and in short, Inclination Inc (°), or by its symbol, Azimuth A (°)."""
     words, unit = name.split(), ""
     if len(words) > 2 and IN_BRACKETS.search(words[-1]):
         unit = words.pop()
@@ -638,6 +639,11 @@ def _answered(
             meanings[name] = Resemblance(ours, unit_of(unit) or unit or stated)
 
 
+def _columns_of(answer: Answer) -> set[str]:
+    """The columns of a run file of which an answer speaks; all of what it says where that is no column."""
+    return {value.partition("=")[0] for _, value in answer.arguments}
+
+
 class Questions(list[QuestionError]):
     """Open questions about names and readings, each with the option that answers it."""
 
@@ -653,6 +659,19 @@ class Questions(list[QuestionError]):
         """The columns of a table that the first answers to open questions take."""
         first = [each.answers[0].arguments for each in self if each.answers]
         return {value.partition("=")[2] for arguments in first for _, value in arguments}
+
+    def settle(self, words: str) -> bool:
+        """Whether there is a question of these words; others on columns that each of its answers takes are left out."""
+        question = next((each for each in self if words in each.text), None)
+        taken = [_columns_of(each) for each in question.answers] if question else []
+        self[:] = [
+            each
+            for each in self
+            if each is question
+            or not (taken and each.answers)
+            or not set[str]().union(*map(_columns_of, each.answers)) <= set.intersection(*taken)
+        ]
+        return question is not None
 
     def raise_any(self, source: str) -> None:
         """Raise all questions together."""
@@ -708,7 +727,7 @@ def proposed(
     angles = {c: chosen[c].name for c in _ANGLES_AND_WARMTH[:3] if c in chosen and c not in said}
     for column in angles:
         questions.ask(_check_nominal, column, angles, names, values, source)
-    beside = any("side by side" in each.text for each in questions)
+    beside = questions.settle("side by side")
     if not beside and not {*RAW[3:]} & {*chosen, *said}:
         believed = (
             questions.believed() if {*RAW[:3]} & {*chosen} else ()
@@ -959,6 +978,13 @@ def _is_dip_of(column: str, name: str, meanings: Mapping[str, Resemblance], valu
 def _check_lacking(column: str, others: Mapping[str, str], values: Values, source: str) -> None:
     """Ask whether columns that are not understood are one that is absent, by a mistyped name or by unit and values."""
     numbers = {n: values(n) for n in others if not is_of_tool(n)}
+    named = [n for n, cells in numbers.items() if cells is not None and _ends_as(n, column)]
+    if named:
+        raise QuestionError(
+            f"{source}: {' and '.join(map(shown, named))} may be '{column}' by the end of the name, behind a title "
+            "that is not understood. Which one does the stand show?",
+            candidates_for(column, named, values),
+        )
     near = [n for n, cells in numbers.items() if cells is not None and is_near(column, n)]
     by_values = column not in BY_NAME_ALONE
     fits = near + [
@@ -971,6 +997,16 @@ def _check_lacking(column: str, others: Mapping[str, str], values: Values, sourc
             f"{source}: no column is '{column}' by its name. Is it one of these?",
             candidates_for(column, fits, values),
         )
+
+
+def _ends_as(name: str, column: str) -> bool:
+    """Whether a name ends as that of a column, behind a title that says of no other: Cradle Inc."""
+    words = name.split()
+    ends = ((" ".join(words[:k]), meaning(" ".join(words[k:]))) for k in range(1, len(words)))
+    return any(
+        m is not None and m.column == column and not _NO_STAND.search(spelled(title))
+        for title, m in ends
+    )
 
 
 def _stated_among(names: Sequence[str]) -> bool:
@@ -1032,9 +1068,9 @@ def _check_side_by_side(names: Sequence[str], values: Values, source: str) -> No
     tools: dict[str, dict[str, str]] = {}
     for name in names:
         words = name.split()
-        for place in range(1, len(words)):
+        for place in range(len(words) - 1, 0, -1):
             alike = meaning(" ".join(words[place:]))
-            if alike and alike.column in RAW:
+            if alike and alike.column in (*RAW, WARMTH):
                 tools.setdefault(" ".join(words[:place]), {})[alike.column] = name
                 break
     whole = {title: each for title, each in tools.items() if {*RAW[:3]} <= {*each}}
@@ -1042,7 +1078,10 @@ def _check_side_by_side(names: Sequence[str], values: Values, source: str) -> No
         answers = [
             Answer(
                 with_values(title, values, each["ax"]),
-                tuple(("column", f"{column}={name}") for column, name in each.items()),
+                (
+                    *(("column", f"{column}={name}") for column, name in each.items()),
+                    *(("serial", str(s)) for s in [titles([[title]]).metadata.get("serial")] if s),
+                ),
             )
             for title, each in whole.items()
         ]

@@ -612,7 +612,7 @@ def _with_north(
     return replace(table, metadata=metadata), _with(form, {"azimuth_reference": north})
 
 
-_OF_TOOLS = re.compile(
+_WORDS_OF_TOOLS = re.compile(
     r"s[eé]rie|serial|s/?n\b|tool|probe|sond[ea]|ger[äa]t|instrument|equip|ferram|herram|verkt(ø|oe?)y|matr[ií]c|"
     r"прибор|зонд|зав|仪器|探管|编号",
     re.IGNORECASE,
@@ -638,7 +638,7 @@ def _stacked_tools(
         if stated.get("serial") in tools:
             return {"serial": ColumnSource(name=name)}
         stacked = len([*groupby(cells)]) == len(tools) and min(tools.values()) >= LEAST_STATIONS
-        if stacked and _OF_TOOLS.search(name) and _numbers_of(table, {}, name) is None:
+        if stacked and _WORDS_OF_TOOLS.search(name) and _numbers_of(table, {}, name) is None:
             raise QuestionError(
                 f"{table.source}: {shown(name)} has {', '.join(map(shown, [*tools][:MOST_NAMED]))}, one below the "
                 "other. Are these tools, and which one is meant?",

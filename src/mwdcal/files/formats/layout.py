@@ -197,7 +197,7 @@ def laid_out(
         across = not any(_has_axes(t.names) for t in layouts)
         if each in candidates and across and (turned := _turned(each)):
             layouts = [
-                replace(t, across=True, places={}, remarks=(*t.remarks, _ACROSS))
+                replace(t, across=True, places={}, remarks=(*t.remarks, _STATIONS_IN_COLUMNS))
                 for t in _tables(turned, source, decimal)
             ]
         covers += [] if layouts or any(_is_reading(row) for _, row in each.rows) else [each]
@@ -248,14 +248,14 @@ def _have_same_stations(one: Layout, other: Layout) -> bool:
     ours, theirs = (dict(zip(t.names, t.cells, strict=True)) for t in (one, other))
     alike = [sum(map(eq, ours[n], theirs[n])) for n in shared - equal]  # else another station
     few = len(alike) <= _MOST_DIFFERENT and all(2 * n < len(one.lines) for n in alike)
-    return len(varied) >= LEAST_COLUMNS - 1 and few and _have_own_triads(one, other)
+    return len(varied) >= LEAST_COLUMNS - 1 and few and _are_of_one_triad_each(one, other)
 
 
-def _have_own_triads(one: Layout, other: Layout) -> bool:
+def _are_of_one_triad_each(one: Layout, other: Layout) -> bool:
     """Whether two tables share three columns or more by name, and each has three of axes that the other has not."""
     names = {*one.names}, {*other.names}
-    own = [sum(map(bool, map(_OF_AXIS.fullmatch, a - b))) for a, b in (names, names[::-1])]
-    return min(len(names[0] & names[1]), *own) >= LEAST_COLUMNS - 1
+    triads = [sum(map(bool, map(_OF_AXIS.fullmatch, a - b))) for a, b in (names, names[::-1])]
+    return min(len(names[0] & names[1]), *triads) >= LEAST_COLUMNS - 1
 
 
 def _side_by_side(one: Layout, other: Layout) -> Layout:
@@ -429,7 +429,7 @@ def _alike(one: Layout, other: Layout) -> bool:
     """Whether two tables share most of their columns, in whatever spelling, or are of one triad each."""
     ours, theirs = ({*_spelling(each.names)} for each in (one, other))
     most = len(ours & theirs) >= _SHARED * max(len(ours), len(theirs))
-    return most or _have_own_triads(one, other)
+    return most or _are_of_one_triad_each(one, other)
 
 
 def _no_table(source: str, header_line: int, wanted: Collection[str]) -> InputError:
@@ -478,11 +478,14 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
     ]
     heads = [k for n, k in enumerate(heads) if n == 0 or _begins_anew(rows, heads[:n], k)]
     for head, end in pairwise([*heads, len(rows)]):
-        if layout := _table(sheet, head, end, source, decimal, remarks):
-            yield layout
+        if layout := _table(sheet, head, end, source, decimal):
+            below = [row for row in remarks if rows[head][0] < row[0] < layout.lines[0]]
+            yield _with_warmth_of_lines(layout, [*below, *rows[head + 1 : end]])
 
 
-_ACROSS = "the stations stand in columns, with the names in the first one: the table is read so."
+_STATIONS_IN_COLUMNS = (
+    "the stations stand in columns, with the names in the first one: the table is read so."
+)
 _ENDS_IN_AXIS = re.compile(r"\W*\w{0,6}([xyz])\W*([(\[].*)?", re.IGNORECASE)
 
 
@@ -607,18 +610,8 @@ def _is_reading(row: Cells) -> bool:
     return numbers >= LEAST_COLUMNS and 2 * numbers >= sum(cell != "" for cell in row)
 
 
-def _table(
-    sheet: Sheet,
-    head: int,
-    end: int,
-    source: str,
-    decimal: str,
-    remarks: Sequence[tuple[int, Cells]],
-) -> Layout | None:
-    """The table whose last row of names, or of units, is at a place, down to the row before `end`.
-
-    `remarks` are rows that stand between names and readings.
-    """
+def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layout | None:
+    """The table whose last row of names, or of units, is at a place, down to the row before `end`."""
     rows = sheet.rows
     names, units, top = _head(rows, head, sheet.merged)
     below = rows[_another_part(rows, head, end) : end]
@@ -641,7 +634,7 @@ def _table(
         name: _both(unit, by_cells)
         for name, unit, (_, by_cells) in zip(names, units, read, strict=True)
     }
-    layout = Layout(
+    return Layout(
         sheet=sheet.name,
         form=msgspec.structs.replace(
             sheet.form,
@@ -668,16 +661,18 @@ def _table(
         ),
         places=dict(zip(names, letters, strict=True)) if sheet.name else {},
     )
-    return _with_warmth_of_lines(layout, [*rows[max(top - 1, 0) : top], *remarks, *others])
 
 
 def _with_warmth_of_lines(layout: Layout, lines: Sequence[tuple[int, Cells]]) -> Layout:
     """A table with the temperatures that stand in lines between its rows, and above all, where it has no others."""
-    stated = {n: each for n, row in lines if (each := _warmth_in(" ".join(map(as_text, row))))}
-    above = [max((n for n in stated if n < line), default=0) for line in layout.lines]
+    readings = {*layout.lines}
+    texts = {n: " ".join(map(as_text, row)) for n, row in lines if n not in readings}
+    texts = {0: layout.heading} | texts
+    stated = {n: each for n, text in texts.items() if (each := _warmth_in(text))}
+    above = [max((n for n in stated if n < line), default=-1) for line in layout.lines]
     if (
-        len({*stated.values()}) < 2
-        or not all(above)
+        -1 in above
+        or len({stated[n] for n in above}) < 2
         or any(map(_WARMTH_IN_WORDS.search, layout.names))
     ):
         return layout

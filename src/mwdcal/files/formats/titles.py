@@ -82,7 +82,7 @@ _TOOL = re.compile(
 _SERIAL = re.compile(r"(?=\S*\d)[^\W_][\w./-]*")
 _OF_TWO = r"(?!\d{1,4}[./-]\d\d?[./-]\d{1,4}(?!\d))(?=\S*\d)[^\W_][\w./-]*"
 _WHOLE_SERIAL = rf"{_SERIAL.pattern}(?:\s+/\s+{_OF_TWO})?"
-"""A serial, which may be of two numbers, a model and its own: BHX-72 / 0091; a day is none."""
+"""A serial, which may be of two numbers, a model and its own: BHX-72 / 0091. A day is not a number."""
 _TWO_NUMBERS = re.compile(rf"(?<!\S)({_OF_TWO})(\s+/|,)\s+(?={_OF_TWO}\s*$)")
 _NUMBER_OF_TOOL = re.compile(
     r"(tool|probe|sensor|sonde|instrument|herramienta|ferramenta|equipo|equipamento|verktoy|gerat|прибор|зонд|датчик)"
