@@ -352,3 +352,12 @@ def test_a_precise_accelerometer_does_not_hide_terms_of_the_magnetometer(curved,
     )
     chosen, _ = choose_order(data, Options(model="polynomial"), lambda text: None)
     assert chosen == orders
+
+
+@pytest.mark.parametrize("gravity", [1.0, 0.9965, 1.0036, 1.0123, 0.98066])
+def test_a_gravity_that_no_place_on_land_has_is_named(gravity):
+    """On land 9.764 to 9.834 m/s²: Hirt et al., Geophys. Res. Lett. 40 (2013) 4279."""
+    data = run()
+    data = replace(data, known={**data.known, "gravity": np.full(data.count, gravity)})
+    outside = not 9.764 <= 9.80665 * gravity <= 9.834
+    assert ("gravity-reference" in found(data)) == (outside and gravity != 1.0036)

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from mwdcal.calibration.readings import EARTH_GRAVITY
 from mwdcal.errors import Answer, InputError, QuestionError, QuestionsError
 from mwdcal.files.contract import (
     CHANNELS,
