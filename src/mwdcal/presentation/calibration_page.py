@@ -211,8 +211,8 @@ def _gauge(
 
 def _steps(calibration: Calibration, verdict: Verdict | None, file: str) -> list[str]:
     """Steps after the calibration: stations to measure again, then the next command."""
-    again = sum(row.reshoot for row in calibration.station_rows)
-    steps = [f"Measure {plural(again, 'station')} again, and calibrate once more."] if again else []
+    count = sum(row.reshoot for row in calibration.station_rows)
+    steps = [f"Measure {plural(count, 'station')} again, and calibrate once more."] if count else []
     if verdict is None:
         return [
             *steps,
