@@ -53,6 +53,7 @@ smartquotes_action = "qe"  # two hyphens begin an option
 html_title = f"mwdcal {release}"
 html_math_renderer = "mathml"
 html_copy_source = False
+html_search_scorer = str(Path(__file__).with_name("search.js"))
 html_show_sphinx = False
 
 # A section of a page whose only content is the documentation of one module.

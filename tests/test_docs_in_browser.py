@@ -75,3 +75,31 @@ def test_a_page_is_accessible_and_no_wider_than_the_window(browser, name):
         wrong += [f"{width} {scheme}: {wide} px wide"] if wide > width else []
     page.close()
     assert wrong == []
+
+
+@pytest.mark.parametrize(
+    ("word", "page"),
+    [
+        ("temperature", "explanation/temperature.html"),
+        ("noise", "howto/noise.html"),
+        ("uncertainty", "explanation/uncertainty.html"),
+        ("pandas", "tutorials/python.html"),
+        ("undetermined", "explanation/decisions.html"),
+        ("feet", "howto/survey.html"),
+        ("fahrenheit", "reference/tables.html"),
+        ("merged", "reference/exports.html"),
+    ],
+)
+def test_a_search_finds_the_page_before_objects_of_the_python_interface(browser, word, page):
+    opened = browser.new_page()
+    opened.goto(f"{(BUILT / 'search.html').as_uri()}?q={word}")
+    opened.wait_for_selector("#search-results .search-summary, #search-results > p:not(:empty)")
+    opened.wait_for_timeout(1500)
+    places = opened.eval_on_selector_all(
+        "#search-results ul.search li > a", "links => links.map(link => link.href)"
+    )
+    opened.close()
+    found = [place.partition("/build/docs/")[2] for place in places]
+    pages = [place.partition("#")[0].partition("?")[0] for place in found]
+    assert page in pages[:8], found[:8]
+    assert not pages[0].startswith("reference/api"), found[:8]

@@ -125,6 +125,7 @@ class Outcome:
     settings: str = "assumed"
     findings: list = field(default_factory=list)
     station_rows: list = field(default_factory=list)
+    left_open: str = ""
 
 
 @pytest.fixture(scope="module")
@@ -414,6 +415,11 @@ def test_verdict_comes_first(whole, words):
     assert "Not verified" not in failed
     passed = words(whole, Outcome(True, [Row(passed=True, value=0.5, uncertainty=None)]))
     assert "Verification passed – 1 limit met" in passed
+    assert "roll.csv -o verdict.json" in passed
+    assert "--verification verdict.json -o certificate.pdf" in passed
+    free = words(whole, Outcome(False, [Row(uncertainty=None)], left_open="toolface zero"))
+    assert "Not verified – nothing wrong was found, toolface zero left open" in free
+    assert "Give reference toolfaces in the calibration run" in free
     assert "not stated" in passed
 
 

@@ -222,12 +222,12 @@ def exact_and_steady(assumed: Sequence[str]) -> tuple[list[str], str]:
     """The references among things assumed exact, and a sentence on the steadiness; blank if none is assumed.
 
     >>> exact_and_steady(["gravity reference", "steady field"])[1].partition(". ")[0]
-    'taken as steady during the run, whose order of stations would hide a drift: field'
+    'Assumed steady, as the order of the stations would hide a drift: field'
     """
     exact = [name for name in assumed if name not in STEADINESS.values()]
     steady = ", ".join(n.removeprefix("steady ") for n in assumed if n not in exact)
-    words = "taken as steady during the run, whose order of stations would hide a drift"
-    remedy = "Measure there and back, or declare the drift in the tool profile"
+    words = "Assumed steady, as the order of the stations would hide a drift"
+    remedy = "Measure out and back, or declare the drift in the tool profile"
     return exact, f"{words}: {steady}. {remedy}" if steady else ""
 
 

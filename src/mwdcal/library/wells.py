@@ -516,11 +516,8 @@ def survey(
 
     check_drift(sensor_drift, msa)
     ends: Any = tuple(np.radians(_finite("switch", switch, 2)).tolist())
-    start = (
-        None
-        if tie_in is None
-        else start_of(_finite("tie_in", tie_in, len(tie_in)), length_unit or "m")
-    )
+    numbers = None if tie_in is None else _finite("tie_in", tie_in, len(tie_in))
+    start = None if numbers is None else start_of(numbers, length_unit or "m")
     loaded = [
         load_calibration(_source(tool), [Path(key) for key in keys])
         for tool in (cal, *(tool for tool, _ in runs))

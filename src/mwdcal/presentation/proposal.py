@@ -112,7 +112,7 @@ def screen(proposal: Proposal, run: Path, output: Path | None) -> str:
         for kind, each in proposal.open_axes.items()
     ]
     blocks.append(
-        table(rows, ["triad", "axes", "nominal scale", "unexplained", "by the next best"])
+        table(rows, ["triad", "axes", "nominal scale", "variation left", "by the next best axes"])
     )
     if output:
         command = (

@@ -167,7 +167,7 @@ def _doubts(registry: Registry, adding: Adding) -> list[Finding]:
     if adding.unidentified:
         text = (
             f"{plural(len(adding.unidentified), 'record')} without a serial, such as {adding.unidentified[0]}: nothing "
-            'shows of which tool, and no tool lists them. State it in the run, as in serial = "MWD-17", calibrate '
+            "shows of which tool, and no tool lists them. State it in the run (--serial), calibrate "
             "again, and withdraw these."
         )
         findings.append(Finding(id=UNIDENTIFIED, text=text))

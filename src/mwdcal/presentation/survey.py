@@ -534,4 +534,4 @@ def survey_rows(well: Well, most: int) -> tuple[list[str], list[list[str]]]:
         model = [fixed(distance, 1) if well.judgement.judged[i] else "–"] if modelled else []
         outcome = OUTCOMES[str(columns["accepted"][i])] + (", blind" if well.blind[i] else "")
         rows.append([*row, kind, *model, outcome])
-    return [*header, "from", *(["distance"] if modelled else []), ""], rows
+    return [*header, "toolface from", *(["off, σ"] if modelled else []), ""], rows

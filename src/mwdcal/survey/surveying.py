@@ -324,8 +324,9 @@ def depth_column(table: Table, length_unit: str = "") -> tuple[str, float]:
 
 def with_stated_unit(findings: Iterable[Finding], table: Table) -> list[Finding]:
     """The findings without the question for feet, where the title of the depths or `length_unit` answers it."""
-    asked = depth_column(table, "m")[0] == "md_m"
-    return [finding for finding in findings if asked or finding.id != "long-courses"]
+    if depth_column(table, "m")[0] == "md_m":
+        return [*findings]
+    return [finding for finding in findings if finding.id != "long-courses"]
 
 
 def used_in_surveys(table: Table) -> list[str]:
@@ -757,8 +758,8 @@ def survey_well(
     said = alone.findings(result.readings.labels, result.north.name) if alone else []
     used = surveys.readings if inputs.unused is None else surveys.readings.select(~inputs.unused)
     exchanged = exchanged_axes(inputs.calibration, used)
-    told = with_stated_unit(result.findings, inputs.table)
-    findings = [*inputs.findings, *about, *exchanged, *told, *said]
+    others = with_stated_unit(result.findings, inputs.table)
+    findings = [*inputs.findings, *about, *exchanged, *others, *said]
     result = replace(
         result, findings=findings, sources=surveys.sources, length_unit=inputs.length_unit
     )

@@ -31,7 +31,7 @@ from mwdcal.app.messages import print_result
     "--accuracy",
     metavar="ANGLE_deg=VALUE",
     multiple=True,
-    help="The fewest stations that give an accuracy (1σ), such as azimuth_deg=0.1, and enough "
+    help="The fewest stations that give an accuracy (1σ), such as azimuth_deg=0.1 or azimuth=0.1, and enough "
     "redundancy; may be repeated.",
 )
 @click.option(
