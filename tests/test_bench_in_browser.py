@@ -313,7 +313,7 @@ DROP = """([text, name]) => {
 
 def test_a_table_by_drag_and_drop_and_by_keyboard(tmp_path, browser):
     """Dropped on the start page, its question answered, calibrated, verified by a file that was chosen, certified."""
-    bench = BenchProcess("--source", "manual", folder=tmp_path / "S", pictures=False)
+    bench = BenchProcess("--source", "manual", folder=tmp_path / "S")
     operator, stand = Operator(browser, bench.url), Stand()
     page = operator.page
     page.evaluate(DROP, [[*laboratory_table(stand, RUN)], "Mess 1.csv"])
