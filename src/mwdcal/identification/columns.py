@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from mwdcal.calibration.readings import EARTH_GRAVITY
 from mwdcal.errors import Answer, InputError, QuestionError, QuestionsError
 from mwdcal.files.contract import (
     CHANNELS,
@@ -21,7 +22,7 @@ from mwdcal.files.contract import (
     units_of,
 )
 from mwdcal.files.formats.columns import LABELS, shown
-from mwdcal.files.formats.title_references import EARTH_FIELD, EARTH_GRAVITY
+from mwdcal.files.formats.title_references import EARTH_FIELD
 from mwdcal.files.formats.titles import titles
 from mwdcal.files.profiles import setting
 from mwdcal.files.synonyms import (

@@ -404,12 +404,8 @@ def _proposal(
     columns, by_value, ignored = proposed(
         names, units, values, table.source, above, table.metadata, answers, problems, open_rows
     )
-    if once := _written_once(table, columns):
-        filled = filled_down(whole, once), _with(form, {"fill_down": once})
-        with suppress(InputError, FitError):
-            proposal = _proposal(path, where, *filled, stated, answers)
-            if _is_confirmed(proposal):
-                return proposal
+    if filled := _with_angles_filled(path, where, (table, whole), columns, form, stated, answers):
+        return filled
     check_cells(table, columns)
     blank = _blank_references(table, columns)
     table, form = _with_north(table, form, columns, above)
@@ -424,6 +420,48 @@ def _proposal(
     if sets and not sets.numbered:
         table = means(table, columns, sets)
     profile = Profile(name=Path(path).stem, table=form or msgspec.UNSET, columns=columns)
+    profile, readings, wirings, open_axes = _wired_and_checked(table, profile, by_value, answers)
+    name, triads = str(readings.metadata.get("serial", Path(path).stem)), _triads(readings, wirings)
+    profile = msgspec.structs.replace(profile, name=name, **triads)
+    remarks = [*readings.remarks, *blank]
+    if sets:
+        scales = {kind: triad.scale for kind, triad in triads.items()}
+        remarks.append(sets.advice() if sets.numbered else sets.sentence(scales))
+    return Proposal(
+        _without_the_usual(profile), wirings, readings.count, readings.unused, tuple(remarks), by_value,
+        readings.metadata, readings.run_sha256, where, open_axes, ignored,
+    )  # fmt: skip
+
+
+def _with_angles_filled(
+    path: str | os.PathLike[str],
+    where: Layout | None,
+    pair: tuple[Table, Table],
+    columns: Mapping[str, ColumnSource],
+    form: TableFormat | None,
+    stated: Mapping[str, object],
+    answers: Mapping[str, str],
+) -> Proposal | None:
+    """The proposal for a table with angles that are written once for a series filled down, if readings confirm it.
+
+    `pair`: the table as it is judged, and as it was read.
+    """
+    table, whole = pair
+    if once := _written_once(table, columns):
+        form = _with(form, {"fill_down": once})
+        with suppress(InputError, FitError):
+            proposal = _proposal(path, where, filled_down(whole, once), form, stated, answers)
+            if _is_confirmed(proposal):
+                return proposal
+    return None
+
+
+def _wired_and_checked(
+    table: Table, profile: Profile, by_value: Collection[str], answers: Mapping[str, str]
+) -> tuple[Profile, Readings, dict[str, Wiring], dict[str, OpenAxes]]:
+    """The profile with the axes that readings tell, once nothing that they contradict is left to ask about."""
+    assert not isinstance(profile.columns, msgspec.UnsetType)
+    columns = profile.columns
     try:
         profile, readings, wirings, open_axes = _wired_by_elevation(table, profile)
     except FitError:
@@ -435,17 +473,9 @@ def _proposal(
     _check_gons(table, angles, readings, wirings)
     _check_twins(table, angles, columns, readings, wirings)
     _check_magnetic(table, readings, wirings, columns)
-    _check_repeats(table, columns, form or TableFormat())
-    name, triads = str(readings.metadata.get("serial", Path(path).stem)), _triads(readings, wirings)
-    profile = msgspec.structs.replace(profile, name=name, **triads)
-    remarks = [*readings.remarks, *blank]
-    if sets:
-        scales = {kind: triad.scale for kind, triad in triads.items()}
-        remarks.append(sets.advice() if sets.numbered else sets.sentence(scales))
-    return Proposal(
-        _without_the_usual(profile), wirings, readings.count, readings.unused, tuple(remarks), by_value,
-        readings.metadata, readings.run_sha256, where, open_axes, ignored,
-    )  # fmt: skip
+    form = TableFormat() if isinstance(profile.table, msgspec.UnsetType) else profile.table
+    _check_repeats(table, columns, form)
+    return profile, readings, wirings, open_axes
 
 
 def _is_formulas(cells: Sequence[str]) -> bool:
