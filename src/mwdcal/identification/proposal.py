@@ -465,7 +465,7 @@ def _wired_and_checked(
     try:
         profile, readings, wirings, open_axes = _wired_by_elevation(table, profile)
     except FitError:
-        _ask_gons(table, {c: columns[c] for c in by_value & {*ANGLES_OF_STAND}})
+        _ask_gons(table, {c: columns[c] for c in ANGLES_OF_STAND if c in by_value})
         _check_dip(table, profile, answers)
         raise
     _check_dip(table, profile, answers)
