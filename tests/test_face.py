@@ -79,7 +79,8 @@ def test_pages_of_a_verdict_and_a_diagnosis_are_those_of_the_commands(calibrated
         page = theirs.read_text("utf-8")
         if name == "verify":  # the command knows the file, which its next step names
             assert f"mwdcal certificate {path.name} --verification" in page
-            page = page.replace(f"certificate {path.name}", "certificate CAL.json")
+            for step in ("verify", "certificate"):
+                page = page.replace(f"mwdcal {step} {path.name}", f"mwdcal {step} CAL.json")
         assert ours.read_text("utf-8") == page
         assert "<h1>SIM-0001</h1>" in ours.read_text("utf-8")
 

@@ -448,7 +448,7 @@ def test_signatures_are_on_the_first_printed_page():
     page = render(sound(), verdict("one"))
     outcome = page[page.index('<section id="outcome">') : page.index('<section id="verification">')]
     assert 'id="signatures"' in outcome
-    printed = page[page.index("#outcome { display: flex") : page.index("</style>")]
+    printed = page[page.index("#outcome { min-height") : page.index("</style>")]
     assert "#outcome > .sign { order: 1" in printed
     assert "#outcome > .know { order: 2" in printed
 

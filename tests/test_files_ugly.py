@@ -132,7 +132,11 @@ CELLS = [
     ("ax", "12 545", "Write numbers without thousands separators"),
     ("ax", "12'545.5", "Write numbers without thousands separators"),
     ("ax", '"1,234.5"', "Write numbers without thousands separators"),
-    ("ax", '"0,998"', "got '0,998'. Is the decimal comma intended? Use `decimal` ','"),
+    (
+        "ax",
+        '"0,998"',
+        "got '0,998'. Other cells of the column have the other decimal sign. Correct this one.",
+    ),
     ("ax", "1.2.3", "Write a plain number"),
     ("ax", "0.98 g", "Write the number without its unit"),
     ("ax", "0.98g", "Write the number without its unit"),

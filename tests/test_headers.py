@@ -18,7 +18,7 @@ COLUMNS = [
     *("ref_inclination_deg", "ref_azimuth_deg", "ref_toolface_deg"),
     *("ax", "ay", "az", "mx", "my", "mz", "temperature_c"),
 ]
-TITLES = [["Field (nT)", 50000, "", "Dip (deg)", 60, "", "Serial", "AB-12"], []]
+TITLES = [["Field (nT)", 50000, "", "Dip (deg)", 63, "", "Serial", "AB-12"], []]
 
 
 def stations():
@@ -106,7 +106,7 @@ def test_a_line_above_names_is_not_of_them(tmp_path):
     rows = stations()
     names = ["Inc", "Azi", "TF", "Gx (V)", "Gy (V)", "Gz (V)", "Bx (V)", "By (V)", "Bz (V)", "T C"]
     above = ["Operator", "A. Smith", "Customer", "Acme Ltd", "Tool S/N", "AB-12"]
-    path = text(tmp_path / "run.csv", [["Field 50000 nT, dip 60 deg"], above, names, *rows])
+    path = text(tmp_path / "run.csv", [["Field 50000 nT, dip 63 deg"], above, names, *rows])
     where = tables.laid_out(path)
     assert where.names == names
     assert where.titles.metadata["serial"] == "AB-12"
@@ -167,7 +167,7 @@ def listing(path, names, units, rows, remarks=()):
     lines = ["".join(f"{cell:>14}" for cell in row) for row in [names, units, *rows]]
     for row, remark in remarks:
         lines[row + 2] += f"   {remark}"
-    path.write_text("\n".join(["FIELD 50000 NT  DIP 60 DEG", "", *lines]), "utf-8")
+    path.write_text("\n".join(["FIELD 50000 NT  DIP 63 DEG", "", *lines]), "utf-8")
     return path
 
 
@@ -234,7 +234,7 @@ def test_lines_of_temperatures_beside_a_column_of_them_are_not_taken(tmp_path):
 def two_sheets(path, rows, first=NAMES, other=NAMES):
     """A workbook with the accelerometers of the stations on one sheet and the magnetometers on another."""
     book = openpyxl.Workbook()
-    book.active.append(["Field (nT)", 50000, "", "Dip (deg)", 60, "", "Serial", "AB-12"])
+    book.active.append(["Field (nT)", 50000, "", "Dip (deg)", 63, "", "Serial", "AB-12"])
     for title, names, (start, end) in (("Acc", first, (3, 6)), ("Mag", other, (6, 9))):
         page = book.create_sheet(title)
         page.append([*names[:3], *names[start:end], names[9]])
@@ -254,9 +254,9 @@ def test_two_triads_on_two_sheets_of_the_same_stations_are_one_table(tmp_path):
     one = mwdcal.propose_profile(path, sheet="Acc")
     found = {each.id: each.text for each in one.findings}
     assert "on 'Mag' are not read" in found["marked-rows"]
-    assert found["magnetometer-absent"].startswith("field and dip of the field are stated")
+    assert found["no-magnetometer"].startswith("field and dip of the field are stated")
     again = mwdcal.calibrate(path, one.profile)
-    assert {"marked-rows", "magnetometer-absent"} <= {each.id for each in again.findings}
+    assert {"marked-rows", "no-magnetometer"} <= {each.id for each in again.findings}
 
 
 def test_sheets_of_other_stations_are_not_joined(tmp_path):

@@ -80,7 +80,15 @@ def test_a_fleet_refuses_the_same_noise_in_the_same_words(tmp_path):
     run, output = strengths_alone(), tmp_path / "cals.parquet"
     tool = noisy(tmp_path, "15")
     alone = refused(
-        command("calibrate", write_csv(tmp_path / "r.csv", run), "--tool", tool, "-o", output), 3
+        command(
+            "calibrate",
+            write_csv(tmp_path / "r.csv", run),
+            "--tool",
+            tool,
+            "-o",
+            tmp_path / "cal.json",
+        ),
+        3,
     )
     runs = write_fleet(tmp_path / "runs.parquet", {"A": run})
     command("fleet", runs, "-o", output, "--tool", tool, "--workers", 1)

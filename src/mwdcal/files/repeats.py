@@ -151,6 +151,7 @@ def _starts(same: Bools) -> Ints:
     return np.flatnonzero(np.r_[True, ~same])
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of numbers that are refused later
 def _without_differing(
     table: Table,
     names: Mapping[str, str],

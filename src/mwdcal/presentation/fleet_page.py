@@ -99,6 +99,7 @@ REMARKED = {
     "prior-conflict": "the run departs from the prior",
     "nonlinearity-ignored": "the model leaves out a nonlinearity that the profile declares",
     "field-unknown": "the strength of the field is unknown: the magnetometer is calibrated to field = 1",
+    "no-magnetometer": "field or dip is stated, and the table has no magnetometers",
     "restricted": "the model leaves out misalignments",
     "reshoot": "one or more stations should be re-measured; chance alone gives one such tool in a hundred",
     "distrusted": "the robust fit gives some stations little weight",

@@ -268,7 +268,7 @@ def magnetometer_absent(references: Iterable[str]) -> list[Finding]:
     """A finding on references of the field that a table states which has no magnetometers."""
     stated = " and ".join(sorted({*references} & {"field", "dip"}, reverse=True))
     text = f"{stated} of the field are stated, and the table has no magnetometers: the accelerometers alone are used."
-    return [Finding(id="magnetometer-absent", text=text)] if stated else []
+    return [Finding(id="no-magnetometer", text=text)] if stated else []
 
 
 def of_table(readings: Readings) -> list[Finding]:

@@ -31,8 +31,8 @@ def unidentified(serials: Mapping[str, str | None]) -> list[Finding]:
     states = "states" if len(lacking) == 1 else "state"
     unknown = "that they are of the same tool" if len(serials) > 1 else "which tool it is of"
     text = (
-        f"{' and '.join(lacking)} {states} no serial: nothing shows {unknown}. State it in each run: a line "
-        '# serial = "MWD-17" above the names, or option `serial`.'
+        f"{' and '.join(lacking)} {states} no serial: nothing shows {unknown}. State it above the names of "
+        'each run: serial = "MWD-17".'
     )
     return [Finding(id=UNIDENTIFIED, text=text)]
 

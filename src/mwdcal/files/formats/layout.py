@@ -108,6 +108,10 @@ _WARMTH_IN_LINE = re.compile(
     r"(?:(?:°|º|deg\w*\.?)\s*(?P<unit>[cfсCFС])(?![^\W\d_])|(?P<sign>[℃℉])|(?P<bare>[CFС])(?![^\W\d_]))"
 )
 """A temperature in a line: its number, a tolerance, and its unit, which is a bare letter only behind a word."""
+_FAHRENHEIT = re.compile("[fF℉]")
+"""A letter of degrees Fahrenheit."""
+_RANGE_BEFORE = re.compile(r"(?:to|bis|til|до|[-–…])\s*$")
+"""What stands before the upper end of a range."""
 _WARMTH_OF_LINES = "Temperature of the line above"
 """The name of a column of temperatures that stand in lines between the rows."""
 _SAME_WARMTH = 10.0
@@ -716,12 +720,11 @@ def _warmth_in(text: str) -> tuple[str, str] | None:
     """
     word = _WARMTH_IN_WORDS.search(text)
     every = [m for m in _WARMTH_IN_LINE.finditer(text) if word or not m["bare"]]
-    others = re.findall(r"(?:to|bis|til|до|[-–…])\s*$", text[: every[0].start()]) if every else []
-    if len(every) != 1 or others:
+    if len(every) != 1 or _RANGE_BEFORE.search(text[: every[0].start()]):
         return None
     letter = every[0]["unit"] or every[0]["sign"] or every[0]["bare"]
     number = every[0]["number"].replace(",", ".").replace("−", "-").lstrip("+")
-    return number, "°F" if letter in "fF℉" else "°C"
+    return number, "°F" if _FAHRENHEIT.match(letter) else "°C"
 
 
 def _beside(
