@@ -89,6 +89,7 @@ class Repeats:
         )
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of numbers that are refused later
 def repeats(table: Table, sources: Mapping[str, ColumnSource]) -> Repeats | None:
     """The rows that are readings of one station; None where every row is a station of its own.
 
@@ -151,7 +152,6 @@ def _starts(same: Bools) -> Ints:
     return np.flatnonzero(np.r_[True, ~same])
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of numbers that are refused later
 def _without_differing(
     table: Table,
     names: Mapping[str, str],
