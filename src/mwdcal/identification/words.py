@@ -10,7 +10,8 @@ from mwdcal.files.synonyms import resembled
 _LATIN = str.maketrans({"ø": "o", "Ø": "O", "æ": "ae", "ß": "ss", "ł": "l", "ı": "i", "İ": "i"})
 """Letters that do not come apart into a plain letter and a mark."""
 _ELEVATION = (
-    r"\b(elev(ation)?|hole dip|elevacion|inc\w* (from|to|above|over) (the )?horiz\w*|pitch)\b"
+    r"\b(elev(ation)?|hole dip|elevacion|elevacao|elevazione|hoydevinkel|"
+    r"inc\w* (from|to|above|over) (the )?horiz\w*|pitch)\b"
 )
 """Names of angles that count from the horizontal."""
 TRANSLATIONS = (

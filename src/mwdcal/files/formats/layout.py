@@ -6,6 +6,7 @@ of means, remarks and signatures follow. `laid_out` finds the readings among the
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -69,6 +70,12 @@ _DEGREES_OF = re.compile(
 """The name of a column of degrees, or of minutes."""
 WITHOUT_VALUE = re.compile(r"n/?a|n\.a\.?|nan|null|none|[\W_]*", re.IGNORECASE)
 """A cell that says that there is no value."""
+_NO_READING = re.compile(
+    r"n/?a|n\.a\.?|#n/?a|nan|-?1\.#\w+|null|none|-+|[–—]+|#+|err(or)?|#err|fault|fail(ed)?|overrange|ovr|ovl|ol|"
+    r"inval(id)?|bad|timeout|no ?data|feil|fehler",
+    re.IGNORECASE,
+)
+"""What a logger writes in place of a number that it has not."""
 _BRACKETS = re.compile(r"[(\[][^)\]]*[)\]]")
 
 _OF_VOID_RUN = re.compile(
@@ -470,7 +477,9 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
     """The tables of a sheet, one below the other: a head is no row of readings, and the next row is one."""
     rows = [row for row in sheet.rows if not _is_ruler(row[1])]
     remarks = [row for k, row in enumerate(rows) if _is_remark_below_names(rows, k)]
-    aside = {line for line, _ in remarks}
+    names = next((k for k, (_, row) in enumerate(rows) if _is_of_texts(row)), len(rows))
+    without = [row for row in rows[names:] if _is_without_reading(row[1])]
+    aside = {line for line, _ in [*remarks, *without]}
     rows = [row for row in rows if row[0] not in aside]
     rows = _with_legend(rows)
     sheet = sheet._replace(rows=rows)
@@ -483,7 +492,10 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
     heads = [k for n, k in enumerate(heads) if n == 0 or _begins_anew(rows, heads[:n], k)]
     for head, end in pairwise([*heads, len(rows)]):
         if layout := _table(sheet, head, end, source, decimal):
+            last = rows[end][0] if end < len(rows) else math.inf
             below = [row for row in remarks if rows[head][0] < row[0] < layout.lines[0]]
+            void = [(n, _words(row)) for n, row in without if rows[head][0] < n < last]
+            layout = replace(layout, left_out=tuple(sorted([*layout.left_out, *void])))
             yield _with_warmth_of_lines(layout, [*below, *rows[head + 1 : end]])
 
 
@@ -612,6 +624,27 @@ def _is_reading(row: Cells) -> bool:
     """Whether a row has numbers in at least half of its cells that are filled in, and in at least four."""
     numbers = sum(map(figures.is_figure, row))
     return numbers >= LEAST_COLUMNS and 2 * numbers >= sum(cell != "" for cell in row)
+
+
+def _is_of_texts(row: Cells) -> bool:
+    """Whether a row may be names: it has as many texts as a table has columns, and is no row without a reading."""
+    return _texts(row) >= LEAST_COLUMNS and not _is_without_reading(row)
+
+
+def _is_without_reading(row: Cells) -> bool:
+    """Whether a row is a station whose channels have no value: besides words for that, numbers, times and one text.
+
+    >>> _is_without_reading(["09:28:00", 19, 4.93, 120.2, "NaN", "NaN", "NaN"])
+    True
+    >>> _is_without_reading(["Stn", "Inc", "-", "-", "-", "Ax", "Ay"])
+    False
+    """
+    cells = [as_text(cell).strip() for cell in row]
+    filled = [cell for cell in cells if cell and not _NO_READING.fullmatch(cell)]
+    lacking = sum(map(bool, cells)) - len(filled)
+    worded = sum(not re.search(r"\d", cell) for cell in filled)
+    alone = worded == 0 or (worded == 1 and len(filled) > 1)
+    return lacking >= LEAST_COLUMNS - 1 and alone and not _is_reading(row)
 
 
 def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layout | None:

@@ -98,7 +98,8 @@ _BEHIND_MODEL = re.compile(
 _WITH_MARK = re.compile(
     r"(?:(?<![^\W\d_])|(?<=[\u4e00-\u9fff]))(?:(?P<word>serial(?:[ -]?(?:number|num|no|nr))?|"
     r"(?:[^\W\d_]+-?)?serien?-?(?:nummer|nr)|"
-    r"(?:n[°ºo.r]*|n[uú]m\w*|nr)\.? (?:d[ei] )?(?:s[eé]ri[ea]l?|fabr\w*|seryjny)|s[eé]rie|"
+    r"(?:n[°ºo.r]*|n[uú]m\w*|nr)\.? (?:d[ei] )?(?:s[eé]ri[ea]l?|fabr\w*|seryjny)|"
+    r"s[eé]rie(?!\s+\d{1,2}(?![\w./-]))|"
     r"fabr(?:ik)?\.?[ -]?(?:nr|nummer)|matricola|"
     r"зав\w*\.? ?(?:№|номер|n)|серийн\w* ?(?:№|номер)|seri ?no|序列号|编号|製造番号)|s\.?/?n|[^\W\d_]+[ -]sn|"
     r"(?<=[,(;] )(?:n[°ºr]\.?|num[eé]ro|№))\.?"

@@ -1,0 +1,70 @@
+"""Rows of a table that hold no reading: a station that the logger lost, and a line that names a series."""
+
+import pytest
+
+from mwdcal.files.formats import table as tables
+from mwdcal.files.formats.titles import titles
+from test_headers import COLUMNS, TITLES, same, stations, taken, workbook
+
+NAMES = [
+    *("Time", "Stn", "Inc (deg)", "Azi (deg)", "TF (deg)"),
+    *("Ax (g)", "Ay (g)", "Az (g)", "Mx (nT)", "My (nT)", "Mz (nT)", "Temp (C)"),
+]
+
+
+UNLIKE = ["Azi", "TF", "Gx (g)", "Gy (g)", "Gz (g)", "Bx (nT)", "By (nT)", "Bz (nT)", "T (C)"]
+
+
+def numbered():
+    return [[f"09:{n:02}:00", n, *row] for n, row in enumerate(stations(), 1)]
+
+
+def layout(path, rows):
+    return tables.laid_out(workbook(path, [*TITLES, *rows]))
+
+
+@pytest.mark.parametrize("word", ["NaN", "-", "ERR", "n/a", "#N/A"])
+@pytest.mark.parametrize("temperature", [21.5, ""])
+@pytest.mark.parametrize("place", [0, 9, -1])
+def test_a_station_of_words_without_value_is_left_out_and_said(tmp_path, word, temperature, place):
+    rows = numbered()
+    lost = ["09:59:00", 99, 5.0, 120.0, 180.0, *[word] * 6, temperature or word]
+    place = place if place >= 0 else len(rows)
+    read = layout(tmp_path / "run.xlsx", [NAMES, *rows[:place], lost, *rows[place:]])
+    assert read.names == NAMES
+    assert len(read.lines) == len(rows)
+    line = len(TITLES) + 1 + place + 1
+    assert line not in read.lines
+    assert any(n == line and said.startswith("09:59:00 99") for n, said in read.left_out)
+
+
+@pytest.mark.parametrize("places", [(0,), (8,), (0, 8, 16)])
+def test_a_line_that_numbers_a_series_is_no_end_of_the_table(tmp_path, places):
+    rows, units = stations(), ["deg"] * 3 + ["g"] * 3 + ["nT"] * 3 + ["C"]
+    for n, place in reversed([*enumerate(places, 1)]):
+        rows.insert(place, [f"Serie {n}: Neigung 15°, Sonde 360° gerollt"])
+    read = layout(tmp_path / "run.xlsx", [COLUMNS, units, *rows])
+    assert len(read.lines) == len(rows) - len(places)
+    assert read.titles.metadata["serial"] == "AB-12"
+
+
+@pytest.mark.parametrize(
+    ("line", "serial"),
+    [
+        ("Serie 1: Neigung", None),
+        ("Série 2", None),
+        ("Serie: 12", "12"),
+        ("Serie 0447/19", "0447/19"),
+    ],
+)
+def test_the_number_of_a_series_is_no_serial(line, serial):
+    assert titles([[line]]).metadata.get("serial") == serial
+
+
+@pytest.mark.parametrize(
+    "name", ["Elevação", "Elevación", "Élévation", "Elevazione", "Høydevinkel"]
+)
+def test_an_elevation_is_one_in_the_languages_of_the_laboratories(tmp_path, name):
+    rows = [[90 - inclination, *rest] for inclination, *rest in stations()]
+    file = workbook(tmp_path / "run.xlsx", [*TITLES, [f"{name} (°)", *UNLIKE], *rows])
+    assert same(taken(file), stations())
