@@ -107,6 +107,17 @@ def test_rows_that_are_numbered_stay_stations_and_are_asked_about():
     assert "one label" in got.remarks[0]
 
 
+@pytest.mark.parametrize(
+    "reading", [["a", "b", "c", "d", "e"], [f".{k + 1}" for k in range(READINGS)]]
+)
+def test_labels_of_readings_are_those_of_stations_where_the_angles_agree(reading):
+    run, _ = repeated()
+    names = [f"{k + 1}{each}" for k in range(COUNT) for each in reading]
+    assert read(run | {"station": names}).count == COUNT
+    shifted = [*names[1:], "25" + reading[0]]
+    assert read(run | {"station": shifted}).count == COUNT * READINGS
+
+
 def test_rows_without_labels_are_stations_where_most_come_in_sets_at_equal_angles():
     run, _ = repeated()
     del run["station"]

@@ -8,6 +8,7 @@ the same. Without labels they are where most of them come in sets at equal angle
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -29,6 +30,8 @@ _ONE_READING = 0.03
 """Share of a triad's range by which readings of one station depart from their mean at most."""
 _MOSTLY = 0.75
 """Share of rows in sets at equal angles from which these are stations of several readings."""
+_OF_READING = re.compile(r"(.*\d)(?:[ ._/-]?[A-Za-z]|[ ._/-]\d{1,2})")
+"""The label of a reading at a station: 1a, 1b, 2.1, 2.2."""
 _MILLI = {"accelerometer": (1e3, "mg"), "magnetometer": (1.0, "nT")}
 
 
@@ -110,6 +113,7 @@ def repeats(table: Table, sources: Mapping[str, ColumnSource]) -> Repeats | None
     for name in ("group", "serial"):
         if name in names:
             same &= _equal(np.array(labels(table, names[name])))
+    station = _without_readings(station, angles)
     alike = _equal(station) & (station[1:] != "")
     labelled = bool(alike.any())
     numbered = len({*station.tolist()}) == table.count
@@ -149,6 +153,16 @@ def station_by_angles(table: Table, columns: Mapping[str, ColumnSource]) -> str:
         if np.array_equal(_equal(cells), same) and len(firsts) == len(starts) and "" not in firsts:
             return name
     return ""
+
+
+def _without_readings(station: np.ndarray, angles: Mapping[str, Array]) -> np.ndarray:
+    """Labels (n,) without the letter or number of a reading behind, where the rest changes as the angles do."""
+    parts = [_OF_READING.fullmatch(label) for label in station.tolist()]
+    rest = np.array([part[1] for part in parts if part])
+    if len(rest) < len(station) or len({*station.tolist()}) < len(station) or not angles:
+        return station
+    same = np.all([_equal(each) for each in angles.values()], 0)
+    return rest if np.array_equal(_equal(rest), same) else station
 
 
 def _are_most(sizes: Ints) -> bool:
