@@ -6,11 +6,14 @@ import pytest
 
 import mwdcal as library
 from cli_support import RAW, channels, mwdcal, refused, stations, write_csv
+from mwdcal.files.formats.table import numbers
+from mwdcal.files.runs import read_export, run_table
 from mwdcal.sensor.profile import ColumnSource, Profile, StandProfile, TriadProfile
 from simulation import DEG, Tool, plan
 from test_tables_as_they_come import NAMES, findings_of
 
 COUNT, READINGS = 24, 5
+ANGLES = tuple(f"ref_{name}_deg" for name in ("inclination", "azimuth", "toolface"))
 STAND = 0.02 * DEG
 """Error of a setting of the stand, 1 sigma."""
 
@@ -104,14 +107,63 @@ def test_rows_that_are_numbered_stay_stations_and_are_asked_about():
     assert "one label" in got.remarks[0]
 
 
-def test_rows_without_labels_are_stations_where_all_come_in_sets_of_one_size():
+@pytest.mark.parametrize(
+    "reading", [["a", "b", "c", "d", "e"], [f".{k + 1}" for k in range(READINGS)]]
+)
+def test_labels_of_readings_are_those_of_stations_where_the_angles_agree(reading):
+    run, _ = repeated()
+    names = [f"{k + 1}{each}" for k in range(COUNT) for each in reading]
+    assert read(run | {"station": names}).count == COUNT
+    shifted = [*names[1:], "25" + reading[0]]
+    assert read(run | {"station": shifted}).count == COUNT * READINGS
+
+
+def test_rows_without_labels_are_stations_where_most_come_in_sets_at_equal_angles():
     run, _ = repeated()
     del run["station"]
     got = read(run)
     assert (got.count, got.labels[-1]) == (COUNT, "24")
     assert "number the rows" in got.remarks[0]
-    uneven = {name: np.asarray(values)[:-1] for name, values in run.items()}
-    assert read(uneven).count == COUNT * READINGS - 1
+    rows = np.arange(COUNT * READINGS)
+    uneven = rows % READINGS < 3 + rows // READINGS % 3
+    few = rows % READINGS < 1 + (rows // READINGS % 5 == 0)
+    for kept, count in ((uneven, COUNT), (few, few.sum())):
+        assert read({name: np.asarray(v)[kept] for name, v in run.items()}).count == count
+
+
+@pytest.mark.parametrize("name", ["Posición", "Stellung", "№ точки", "测点号", "Lfd"])
+def test_a_column_of_stations_is_known_by_its_name_or_by_the_angles(tmp_path, name):
+    """`Lfd` is no word of ours: its cells change where the angles do."""
+    run, _ = repeated()
+    rows = np.arange(COUNT * READINGS)
+    kept = rows % READINGS < 3 + rows // READINGS % 3
+    names = {**NAMES, "station": name}
+    columns = {names.get(n, n): np.asarray(v)[kept] for n, v in run.items()}
+    write_csv(tmp_path / "a.csv", columns | {"Reading": (rows % READINGS + 1)[kept]})
+    proposed = library.propose_profile(tmp_path / "a.csv")
+    assert proposed.profile.columns["station"].name == name
+    assert library.read_run(tmp_path / "a.csv", proposed.profile).count == COUNT
+
+
+def test_settings_written_once_and_rows_of_means_leave_the_stations_of_the_readings(tmp_path):
+    run, _ = repeated()
+    raw = {name: np.reshape(run[name], (COUNT, READINGS)) for name in RAW}
+    names = [*(NAMES[n] for n in ("station", *ANGLES)), "Reading", *(NAMES[n] for n in RAW)]
+    lines = [names]
+    for k in range(COUNT):
+        setting = [str(run[n][k * READINGS]) for n in ("station", *ANGLES)]
+        for reading in range(READINGS):
+            cells = [repr(float(raw[n][k, reading])) for n in RAW]
+            lines.append([*(setting if not reading else [""] * 4), str(reading + 1), *cells])
+        lines.append([*setting, "MW", *(repr(float(raw[n][k].mean()) + 1.0) for n in RAW)])
+    for means in (False, True):
+        kept = [line for line in lines if means or line[4] != "MW"]
+        path = tmp_path / f"{means}.csv"
+        path.write_text("\n".join(map(",".join, kept)), "utf-8")
+        proposed = library.propose_profile(path)
+        assert set(proposed.profile.table.fill_down) == {NAMES[n] for n in ("station", *ANGLES)}
+        got = run_table(read_export(path, proposed.profile), proposed.profile)
+        assert numbers(got, "ax") == pytest.approx(raw["ax"].mean(1), rel=1e-12)
 
 
 def test_a_row_of_a_documented_run_file_is_a_station_and_repeats_are_named(tmp_path):

@@ -3,11 +3,12 @@
 Readings at one setting of the stand share its error. As stations of their own they would count it again and again, and
 their residuals, alike from row to row, would look like a drift. A row of a documented run file is a station; in a
 table that is read through a tool profile, rows that follow each other are readings of one where label and stand are
-the same. Without labels they are where all of them come in sets of one size.
+the same. Without labels they are where most of them come in sets at equal angles.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -27,6 +28,10 @@ _ONE_SETTING = 0.05
 """Degrees by which an encoder of the stand shows one setting differently at most."""
 _ONE_READING = 0.03
 """Share of a triad's range by which readings of one station depart from their mean at most."""
+_MOSTLY = 0.75
+"""Share of rows in sets at equal angles from which these are stations of several readings."""
+_OF_READING = re.compile(r"(.*\d)(?:[ ._/-]?[A-Za-z]|[ ._/-]\d{1,2})")
+"""The label of a reading at a station: 1a, 1b, 2.1, 2.2."""
 _MILLI = {"accelerometer": (1e3, "mg"), "magnetometer": (1.0, "nT")}
 
 
@@ -109,6 +114,7 @@ def repeats(table: Table, sources: Mapping[str, ColumnSource]) -> Repeats | None
     for name in ("group", "serial"):
         if name in names:
             same &= _equal(np.array(labels(table, names[name])))
+    station = _without_readings(station, angles)
     alike = _equal(station) & (station[1:] != "")
     labelled = bool(alike.any())
     numbered = len({*station.tolist()}) == table.count
@@ -122,12 +128,47 @@ def repeats(table: Table, sources: Mapping[str, ColumnSource]) -> Repeats | None
         return None
     starts = _without_differing(table, names, sources, _starts(same), labelled)
     sizes = np.diff(starts, append=table.count)
-    if sizes.max() < 2 or (not labelled and (len(starts) < 2 or np.ptp(sizes) > 0)):
+    if sizes.max() < 2 or (not labelled and not _are_most(sizes)):
         return None
     return Repeats(starts, table.count, labelled, numbered, _scatters(table, names, starts))
 
 
 _NUMBERS = (*RAW, synonyms.WARMTH, *(REFERENCES[name].column for name in ANGLES))
+
+
+def station_by_angles(table: Table, columns: Mapping[str, ColumnSource]) -> str:
+    """The column, not used yet, of labels that change exactly where the angles of the stand do; empty without one.
+
+    Most rows come in sets of several at equal angles, each of which has a label of its own.
+    """
+    angles = [columns[c].name for n in ANGLES if (c := REFERENCES[n].column) in columns]
+    if len(angles) < len(ANGLES) - 1 or table.count < 2:
+        return ""
+    same = np.all([_equal(numbers(table, name)) for name in angles], 0)
+    starts, used = _starts(same), {each.name for each in columns.values()}
+    if not _are_most(np.diff(starts, append=table.count)):
+        return ""
+    for name in (each for each in table.columns if each not in used):
+        cells = np.array(labels(table, name))
+        firsts = {*cells[starts].tolist()}
+        if np.array_equal(_equal(cells), same) and len(firsts) == len(starts) and "" not in firsts:
+            return name
+    return ""
+
+
+def _without_readings(station: np.ndarray, angles: Mapping[str, Array]) -> np.ndarray:
+    """Labels (n,) without the letter or number of a reading behind, where the rest changes as the angles do."""
+    parts = [_OF_READING.fullmatch(label) for label in station.tolist()]
+    rest = np.array([part[1] for part in parts if part])
+    if len(rest) < len(station) or len({*station.tolist()}) < len(station) or not angles:
+        return station
+    same = np.all([_equal(each) for each in angles.values()], 0)
+    return rest if np.array_equal(_equal(rest), same) else station
+
+
+def _are_most(sizes: Ints) -> bool:
+    """Whether most rows are in sets of several, and there are several sets (m,)."""
+    return len(sizes) > 1 and float(sizes[sizes > 1].sum()) >= _MOSTLY * float(sizes.sum())
 
 
 def _factor(sources: Mapping[str, ColumnSource], column: str) -> float:

@@ -37,7 +37,7 @@ from mwdcal.files.synonyms import (
     unit_of,
 )
 from mwdcal.geometry.vectors import Array, Bools
-from mwdcal.identification.words import spelled, translated
+from mwdcal.identification.words import letters, spelled, translated
 from mwdcal.sensor.profile import ColumnSource
 
 # --------------------------------------------------------------------------
@@ -258,7 +258,8 @@ def may_be(column: str, name: str, unit: str, values: Array | None) -> bool:
 
 _LABELS = {
     "station": "station stn sta stationnr stationno stationnumber position pos posnr messpunkt messpunktnr punkt "
-    "punktnr point shot nr no stasjon estacion punto lage row id",
+    "punktnr pkt point shot setting nr no stasjon posisjon stellung estacion posicion punto estacao posicao ponto lage "
+    "row id точка точки noточки позиция станция 测点 测点号 序号 位置",
     "group": "group gruppe set rollset",
 }
 """Names of columns of labels; a column is one only where no other is."""
@@ -1352,8 +1353,7 @@ def _labels(names: Sequence[str], chosen: Mapping[str, ColumnSource]) -> dict[st
     taken = {source.name for source in chosen.values()}
     labels = {}
     for column, words in _LABELS.items():
-        forms = {name: re.sub(r"[^a-z]", "", name.lower()) for name in names if name not in taken}
-        matching = [name for name, form in forms.items() if form in words.split()]
+        matching = [n for n in names if n not in taken and letters(n) in words.split()]
         if len(matching) == 1 and column not in chosen:
             labels[column] = ColumnSource(name=matching[0])
     return labels

@@ -38,7 +38,7 @@ from mwdcal.files.formats.text import is_preamble
 from mwdcal.files.marks import MARKS_NAMED, UNMARKED, marks_in, place, without_rejected
 from mwdcal.files.metadata import toml
 from mwdcal.files.profiles import CHOICE_OF_AXES
-from mwdcal.files.repeats import means, repeats
+from mwdcal.files.repeats import means, repeats, station_by_angles
 from mwdcal.files.runs import (
     ANGLES_OF_STAND,
     STATED_REFERENCES,
@@ -416,6 +416,7 @@ def _proposal(
     form = _with(form, {"ignore": (*ignored, *denied)} if ignored or denied else {})
     columns |= _stacked_tools(table, columns, stated, answers)
     table = _of_one_tool(table, columns, stated)
+    columns |= _station(table, columns, answers)
     sets = repeats(table, columns)
     if sets and not sets.numbered:
         table = means(table, columns, sets)
@@ -442,12 +443,12 @@ def _with_angles_filled(
     stated: Mapping[str, object],
     answers: Mapping[str, str],
 ) -> Proposal | None:
-    """The proposal for a table with angles that are written once for a series filled down, if readings confirm it.
+    """The proposal for a table whose angles are written once filled down, if readings confirm it.
 
     `pair`: the table as it is judged, and as it was read.
     """
     table, whole = pair
-    if once := _written_once(table, columns):
+    if once := _once_for_setting(table, columns) or _written_once(table, columns):
         form = _with(form, {"fill_down": once})
         with suppress(InputError, FitError):
             proposal = _proposal(path, where, filled_down(whole, once), form, stated, answers)
@@ -549,6 +550,30 @@ def _written_once(table: Table, columns: Mapping[str, ColumnSource]) -> tuple[st
         for name, each in cells.items()
         if all(rolls) and each[0] and each.count("") > _FEW_SHARE * len(each)
     )
+
+
+def _once_for_setting(table: Table, columns: Mapping[str, ColumnSource]) -> tuple[str, ...]:
+    """Angles and labels that are written once for all readings of a setting: the rows below, filled, are such."""
+    names = [columns[c].name for c in ("station", *ANGLES_OF_STAND) if c in columns]
+    blank = {name: np.array([not cell for cell in labels_of(table, name)]) for name in names}
+    once = {n: each for n, each in blank.items() if not each[0] and each.mean() > _FEW_SHARE}
+    last = next((each for n in (names[-1:] + names[:1]) if (each := once.get(n)) is not None), None)
+    if last is None or any((last & ~each).any() for each in once.values()):
+        return ()
+    sets = repeats(filled_down(table, once), columns)
+    return tuple(once) if sets and np.array_equal(sets.starts, np.flatnonzero(~last)) else ()
+
+
+def _station(
+    table: Table, columns: Mapping[str, ColumnSource], answers: Mapping[str, str]
+) -> dict[str, ColumnSource]:
+    """The column of stations that the angles of the stand tell, where none has a name that tells those apart."""
+    named = columns["station"].name if "station" in columns else ""
+    cells = labels_of(table, named)
+    if "station" in answers or len({*cells}) < len(cells):
+        return {}
+    name = station_by_angles(table, columns)
+    return {"station": ColumnSource(name=name)} if name else {}
 
 
 def _columns_of(answers: Iterable[Answer]) -> Iterator[tuple[str, str]]:

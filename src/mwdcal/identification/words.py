@@ -157,6 +157,16 @@ def spelled(name: str) -> str:
     return text.strip()
 
 
+def letters(name: str) -> str:
+    """The letters of a name, small and plain.
+
+    >>> letters("Posición"), letters("Nr."), letters("№ точки")
+    ('posicion', 'nr', 'noточки')
+    """
+    text = unicodedata.normalize("NFKD", name.translate(_LATIN)).lower()
+    return "".join(c for c in text if c.isalpha())
+
+
 def translated(column: str) -> frozenset[str]:
     """Words of other languages for what a column of a run file holds."""
     patterns = (

@@ -46,12 +46,14 @@ _SHARED = 0.6
 """Share of columns that two tables have in common if each may be meant."""
 _SUMMARY = re.compile(
     r"\W*(mean|average|avg|median|std\w*|st\.?\s?dev\w*|standard deviation|rms|min(imum)?|max(imum)?|sum|total|range|"
-    r"span|mittel(wert)?|durchschnitt|stabw\w*|standardabw\w*\.?|summe|snitt|gjennomsnitt|standardavvik|media|"
+    r"span|mittel(wert)?|mw|durchschnitt|stabw\w*|standardabw\w*\.?|summe|snitt|gjennomsnitt|standardavvik|media|"
     r"promedio|desv\w*( est\w*)?|m[eé]dia|desvio( padr[aã]o)?|moyenne|[eé]cart[- ]type|среднее|ско|мин|макс|сумма|"
-    r"平均(值)?|标准差|最大值?|最小值?|合计|spread|σ|µ)\W*",
+    r"平均(值)?|均值|标准差|最大值?|最小值?|合计|spread|σ|µ)\W*",
     re.IGNORECASE,
 )
-"""The name of a row of statistics, in its first cell."""
+"""The name of a row of statistics, in its first cell or the place of the number of a reading."""
+_READING = re.compile(r"[^\W\d]{0,12}[ ._#-]*\d{1,2}\W*")
+"""The number of a reading at a station."""
 _OF_LOGGERS = re.compile(
     r"(avg|smp|min|max|std|tot|float|double|int\d*|real|string|-+|=+)", re.IGNORECASE
 )
@@ -815,7 +817,11 @@ def _check_cut(
     cut = [
         r
         for r in others
-        if r[1] and form and _form(r[1][0]) == form and any(map(figures.is_figure, r[1][1:]))
+        if r[1]
+        and form
+        and _form(r[1][0]) == form
+        and any(map(figures.is_figure, r[1][1:]))
+        and not any(_SUMMARY.fullmatch(as_text(cell).strip()) for cell in r[1])
     ]
     *before, (last, row) = kept
     width = min(len(cells) for _, cells in before)
@@ -988,12 +994,26 @@ def _without_summary(rows: Sequence[tuple[int, Cells]]) -> list[tuple[int, Cells
     widths = Counter(sum(cell != "" for cell in row) for _, row in rows)
     usual = max(widths, key=lambda width: widths[width], default=0)
     kept = [row for row in rows if not _is_summary(row[1], usual)]
+    statistics = _rows_among_readings([row for _, row in kept])
+    kept = [row for place, row in enumerate(kept) if place not in statistics]
     numbered = sum(bool(row) and figures.is_figure(row[0]) for _, row in kept)
     if numbered >= 0.8 * len(kept):  # rows are numbered: one with a word instead is none of them
         kept = [(n, row) for n, row in kept if _is_blank(row[0]) or figures.is_figure(row[0])]
     while len(kept) > LEAST_COLUMNS and _is_mean(kept[-1][1], [row for _, row in kept[:-1]]):
         kept.pop()
     return kept
+
+
+def _rows_among_readings(rows: Sequence[Cells]) -> set[int]:
+    """Rows of statistics by a column that numbers the readings of a station: 1, 2, 3, mean."""
+    statistics = set[int]()
+    for column in zip_longest(*rows, fillvalue=""):
+        cells = [as_text(cell).strip() for cell in column]
+        places = {k for k, cell in enumerate(cells) if _SUMMARY.fullmatch(cell)}
+        others = [cell for k, cell in enumerate(cells) if k not in places]
+        if places and len(others) >= len(places) and all(map(_READING.fullmatch, others)):
+            statistics |= places
+    return statistics
 
 
 def _is_blank(cell: object) -> bool:
