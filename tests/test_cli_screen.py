@@ -140,7 +140,8 @@ def no_progress(monkeypatch):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_status_and_result_are_the_same_in_every_encoding(files, monkeypatch, no_progress, command):
     monkeypatch.chdir(files)
-    shown("utf-8", command, *COMMANDS[command])  # the next ones say that they replace its file
+    # the next ones say that they replace the file of the first
+    shown_at("0", "utf-8", command, *COMMANDS[command])
     code, *said = shown("utf-8", command, *COMMANDS[command])
     assert code == 0, said
     for encoding in ENCODINGS:

@@ -77,7 +77,7 @@ _NO_READING = re.compile(
     r"inval(id)?|bad|timeout|no ?data|feil|fehler",
     re.IGNORECASE,
 )
-"""What a logger writes in place of a number that it has not."""
+"""Words of a logger in place of a number that it lacks."""
 _BRACKETS = re.compile(r"[(\[][^)\]]*[)\]]")
 
 _OF_VOID_RUN = re.compile(
@@ -120,7 +120,7 @@ _WARMTH_IN_LINE = re.compile(
 _FAHRENHEIT = re.compile("[fF℉]")
 """A letter of degrees Fahrenheit."""
 _RANGE_BEFORE = re.compile(r"(?:to|bis|til|до|[-–…])\s*$")
-"""What stands before the upper end of a range."""
+"""The end of a text before the upper end of a range."""
 _WARMTH_OF_LINES = "Temperature of the line above"
 """The name of a column of temperatures that stand in lines between the rows."""
 _SAME_WARMTH = 10.0
