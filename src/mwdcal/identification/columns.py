@@ -37,7 +37,7 @@ from mwdcal.files.synonyms import (
     unit_of,
 )
 from mwdcal.geometry.vectors import Array, Bools
-from mwdcal.identification.words import letters, spelled, translated
+from mwdcal.identification.words import STATIONS_ELSEWHERE, letters, spelled, translated
 from mwdcal.sensor.profile import ColumnSource
 
 # --------------------------------------------------------------------------
@@ -259,7 +259,7 @@ def may_be(column: str, name: str, unit: str, values: Array | None) -> bool:
 _LABELS = {
     "station": "station stn sta stationnr stationno stationnumber position pos posnr messpunkt messpunktnr punkt "
     "punktnr pkt point shot setting nr no stasjon posisjon stellung estacion posicion punto estacao posicao ponto lage "
-    "row id точка точки noточки позиция станция 测点 测点号 序号 位置",
+    "row id " + STATIONS_ELSEWHERE,
     "group": "group gruppe set rollset",
 }
 """Names of columns of labels; a column is one only where no other is."""

@@ -157,6 +157,10 @@ def spelled(name: str) -> str:
     return text.strip()
 
 
+STATIONS_ELSEWHERE = "точка точки noточки позиция станция 测点 测点号 序号 位置"
+"""Names of a column of stations in other alphabets, as `letters` gives them."""
+
+
 def letters(name: str) -> str:
     """The letters of a name, small and plain.
 
