@@ -158,6 +158,7 @@ def test_a_terminal_sees_what_a_file_holds(files, monkeypatch, no_progress, argu
     monkeypatch.chdir(files)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "160")
+    shown_at("0", encoding, *arguments)  # both say that they replace its file
     code, *printed = shown_on_a_terminal(encoding, *arguments)
     other, *said = shown(encoding, *arguments)
     assert code == other
