@@ -23,7 +23,7 @@ from mwdcal.calibration.estimate import Fit, without_stations
 from mwdcal.calibration.methods import ESTIMABLE, acts_on
 from mwdcal.calibration.readings import HIGHEST, LEAST_TEMPERATURE_SPAN, TRIADS, highest_order
 from mwdcal.calibration.results import variance_scales
-from mwdcal.estimation.batch import put, take
+from mwdcal.estimation.batch import kind_of, put, take
 from mwdcal.estimation.minimisers import closed_form, closed_form_drift, uncertain_stand
 from mwdcal.estimation.minimisers.closed_form_drift import (
     Alike,
@@ -841,7 +841,12 @@ def _without_bad_stations(result: Fit) -> Fit:
     places = np.flatnonzero(bad.any(-1))
     if not places.size:
         return result
-    return put(result, places, without_stations(take(result, places), bad[places]))
+    fewer = without_stations(take(result, places), bad[places])
+    if kind_of(fewer) != kind_of(result):  # of a method with an analysis of its own
+        evidence = result.problem.evidence
+        fewer_stations = replace(evidence, include=evidence.include * ~bad)
+        return replace(result, problem=replace(result.problem, evidence=fewer_stations))
+    return put(result, places, fewer)
 
 
 def _trials(
