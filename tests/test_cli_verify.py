@@ -329,7 +329,7 @@ def test_a_limit_on_an_undetermined_direction_cannot_be_passed(tmp_path):
 
 
 def test_a_calibration_without_reference_inclinations_leaves_rotations_open(tmp_path):
-    """Nobody is told that the tool is bad; a tool that is knocked fails all the same."""
+    """The first line does not call the tool bad; a bad tool fails as before."""
     run = simulated(PLAN, 1)
     for name in ("inclination", "azimuth", "toolface"):
         run[f"ref_{name}_deg"] = np.full(48, np.nan)

@@ -151,7 +151,7 @@ def test_angles_written_once_for_a_series_are_those_of_the_row_above(tmp_path):
 
 
 def test_blank_angles_that_the_readings_do_not_fit_are_unknown_and_counted(tmp_path):
-    """Angles in a few rows alone, which are not those of the rows below: none is filled in, and the rest is told."""
+    """Angles in a few rows that do not hold for the rows below: mwdcal fills none in, and says how many lack one."""
     rows = sorted(stations(), key=lambda row: row[2])
     some = [row if n % 4 == 0 else ["", "", *row[2:]] for n, row in enumerate(rows)]
     proposed = mwdcal.propose_profile(text(tmp_path / "run.csv", [*TITLES, NAMES, *some]))

@@ -8,7 +8,7 @@ import io
 import os
 import re
 import sys
-from difflib import get_close_matches
+from collections.abc import Iterable
 
 import click
 
@@ -67,7 +67,7 @@ ALIASES = {
     "test": "mwdcal verify",
     "fit": "mwdcal calibrate",
 }
-"""Commands and options by other names that people type for them."""
+"""Commands by other names that people type for them."""
 _LONG = re.compile(r"([^'\n]{300})[^'\n]+")
 """A value that a message about a wrong option repeats, where it is too long to be read."""
 
@@ -80,8 +80,9 @@ class Sections(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """The command of a name; of another name, which is like it or means it, say so."""
         name = args[0]
-        near = ALIASES.get(name) or next(iter(get_close_matches(name, self.commands, n=1)), "")
-        if near and name not in self.commands:
+        if name not in self.commands and (
+            near := ALIASES.get(name) or _nearest(name, self.commands)
+        ):
             ctx.fail(f"No such command {name!r}. Did you mean {near}?")
         return super().resolve_command(ctx, args)
 
@@ -155,11 +156,18 @@ def _status(arguments: list[str] | None) -> int:
         )
 
 
+def _nearest(word: str, names: Iterable[str]) -> str:
+    """The name that is most like a word; empty if none is."""
+    from difflib import get_close_matches
+
+    return next(iter(get_close_matches(word, [*names], n=1)), "")
+
+
 def _with_nearest(error: click.ClickException) -> click.ClickException:
     """The same error; of a wrong option with the one that is nearest, of a second file with its option."""
     if isinstance(error, click.NoSuchOption) and error.possibilities:
-        nearest = get_close_matches(error.option_name, error.possibilities, n=1)
-        return click.NoSuchOption(error.option_name, None, nearest, error.ctx)
+        nearest = _nearest(error.option_name, error.possibilities)
+        return click.NoSuchOption(error.option_name, None, [nearest] if nearest else [], error.ctx)
     context = error.ctx if isinstance(error, click.UsageError) else None
     extra = _EXTRA.fullmatch(error.message)
     if context and extra and any(p.name == "rolltest" for p in context.command.params):

@@ -297,11 +297,15 @@ def _refined(result: Fit, problem: Problem, state: State, options: Options) -> F
     )
 
 
+def fewer_stations(problem: Problem, left: Bools) -> Problem:
+    """The problem without the stations `left` out (B, n)."""
+    evidence = problem.evidence
+    return replace(problem, evidence=replace(evidence, include=evidence.include * ~left))
+
+
 def without_stations(result: Fit, left: Bools) -> Fit:
     """The fits without the stations `left` out (B, n), to first order, with noise estimated anew where it was."""
-    evidence = result.problem.evidence
-    fewer = replace(evidence, include=evidence.include * ~left)
-    problem = replace(result.problem, evidence=fewer)
+    problem = fewer_stations(result.problem, left)
     state = stepped(problem, result.state, Determined.of(problem, result.state))
     for _ in range(ROUNDS_WITHOUT):
         problem = _rescaled(problem, _noise_scale(analyse(problem, state), ahead=False))

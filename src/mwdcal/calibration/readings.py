@@ -26,9 +26,9 @@ TRIADS = ("accelerometer", "magnetometer")
 SIMULATED = "SIMULATED DATA"
 CONSTANTS = ("gravity", "field", "dip")
 EARTH_RANGES = {"gravity": (0.9, 1.1), "field": (15_000.0, 80_000.0)}
+"""Least and greatest strength of any place on Earth, with room for a doubtful unit: g, nT."""
 EARTH_GRAVITY = (0.995, 1.004)
 """The least and the largest gravity on land, in standard gravity: 9.764 to 9.834 m/s², and a little more."""
-"""Least and greatest strength of any place on Earth, with room for a doubtful unit: g, nT."""
 DIGEST_LENGTH = 16
 NANOTESLA = "nT"
 RELATIVE = "relative (field = 1)"

@@ -610,7 +610,7 @@ def _blocks(tool: Ints, station: Ints) -> Iterator[tuple[Ints, Ints]]:
 def _shares_of_stations(
     weighed: Array, whole: Array, normal: Array, spread: Array, axes: slice
 ) -> tuple[Array, Array]:
-    """What stations (k,) that are left out take of sum of squares and degrees of freedom of a triad, its `axes`.
+    """Shares of stations (k,), each left out, in the sum of squares and degrees of freedom of a triad, its `axes`.
 
     By the rows C⁻¹ (X ρ) (k, m, p + 1) of the station and their products `normal` (k, p, p + 1) over all stations.
     """

@@ -172,7 +172,7 @@ def _are_most(sizes: Ints) -> bool:
 
 
 def _factor(sources: Mapping[str, ColumnSource], column: str) -> float:
-    """What one of the unit of a column is in the unit of the run file."""
+    """The factor from the unit of a column to that of the run file."""
     unit = sources[column].unit if column in sources else ""
     return abs(synonyms.FACTORS.get(unit, (1.0, 0.0))[0])
 

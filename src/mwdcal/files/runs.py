@@ -185,8 +185,7 @@ def read_export(
     else:
         table = _exported(path, form, profile, decimal, rows)
         if is_export(table.columns, profile):
-            table = filled_down(table, form.fill_down)
-            table = replace(table, metadata={**form.north, **table.metadata})
+            table = _with_form(table, form)
     return stated_table(table, statements or {}, _serial_column(table, profile))
 
 
@@ -217,16 +216,21 @@ def read_roll_test(
     """The roll test in the file of a run, on a sheet or below a line that says so; None without one."""
     from mwdcal.files.formats.layout import ROLL_TEST
 
-    form = TableFormat() if isinstance(profile.table, msgspec.UnsetType) else profile.table
+    form = profile.form
     decimal = "," if form.decimal == "," else ""
     wanted = _channels_of(profile) or CHANNELS["accelerometer"]
     with suppress(InputError, FitError):
         where = tables.laid_out(path, wanted=wanted, decimal=decimal, kind=ROLL_TEST)
         if where and (where.sheet, where.lines[0]) != (run.sheet, run.lines[0]):
-            table = filled_down(_of_layout(where, path, profile), form.fill_down)
-            table = replace(table, metadata={**form.north, **table.metadata})
+            table = _with_form(_of_layout(where, path, profile), form)
             return stated_table(table, statements, _serial_column(table, profile))
     return None
+
+
+def _with_form(table: Table, form: TableFormat) -> Table:
+    """An export with the cells and the north that the form of its tables adds."""
+    table = filled_down(table, form.fill_down)
+    return replace(table, metadata={**form.north, **table.metadata})
 
 
 def filled_down(table: Table, names: Collection[str]) -> Table:
@@ -455,8 +459,7 @@ def renamed(table: Table, profile: Profile) -> Table:
     Raises:
         InputError: a channel of the profile that the table has not, or a name that is taken.
     """
-    form = profile.table
-    ignored = () if isinstance(form, msgspec.UnsetType) else form.ignore
+    ignored = profile.form.ignore
     table = replace(
         table,
         columns={n: c for n, c in table.columns.items() if n not in ignored},

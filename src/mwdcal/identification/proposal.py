@@ -474,8 +474,7 @@ def _wired_and_checked(
     _check_gons(table, angles, readings, wirings)
     _check_twins(table, angles, columns, readings, wirings)
     _check_magnetic(table, readings, wirings, columns)
-    form = TableFormat() if isinstance(profile.table, msgspec.UnsetType) else profile.table
-    _check_repeats(table, columns, form)
+    _check_repeats(table, columns, profile.form)
     return profile, readings, wirings, open_axes
 
 
@@ -993,13 +992,13 @@ _ANOTHER_DIP = 3.0
 
 
 def _check_dip(table: Table, profile: Profile, answers: Collection[str]) -> None:
-    """Ask about a dip of which the readings, whose axes are told without it, give another."""
+    """Ask about a dip that differs from the one by the readings, with axes found without it."""
     column, columns = REFERENCES["dip"].column, profile.columns
     assert not isinstance(columns, msgspec.UnsetType)
     named = columns.get(column)
     if column in answers or not (named or column in table.metadata):
         return
-    form = TableFormat() if isinstance(profile.table, msgspec.UnsetType) else profile.table
+    form = profile.form
     without = msgspec.structs.replace(
         profile,
         columns={c: source for c, source in columns.items() if c != column},

@@ -214,16 +214,15 @@ class Planned:
         """A plan with the calibration and the fit that it will give."""
         calibration, result = carried
         soak = soak_numbers(plan)
-        times = session_seconds(attitudes(plan), soak, stand), soak_seconds(soak, stand)
         return cls(
             plan,
             calibration,
             efficiency,
-            times[0],
-            freedom_of(result)[0],
-            times[1],
-            detections(result),
-            measured,
+            seconds=session_seconds(attitudes(plan), soak, stand),
+            freedom=freedom_of(result)[0],
+            soaking=soak_seconds(soak, stand),
+            detections=detections(result),
+            measured=measured,
         )
 
     @property

@@ -237,6 +237,11 @@ class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     stream: StreamForm | msgspec.UnsetType = msgspec.UNSET
 
     @property
+    def form(self) -> TableFormat:
+        """How its tables are written; the usual form where it does not say."""
+        return TableFormat() if isinstance(self.table, msgspec.UnsetType) else self.table
+
+    @property
     def has_magnetometer(self) -> bool:
         """Whether it says anything of a magnetometer; with readings of one it may still say nothing."""
         return self.magnetometer != TriadProfile()

@@ -165,19 +165,19 @@ def _raised(readings: Readings, options: Options, orders: Ints, limit: Ints) -> 
     residuals of the other, where they hide its terms.
     """
     orders, powers = orders.copy(), np.arange(1, HIGHEST + 1)
-    open_ = np.flatnonzero(orders.min(-1) < orders.max(-1))
-    while open_.size:
+    unequal = np.flatnonzero(orders.min(-1) < orders.max(-1))
+    while unequal.size:
         further: list[Ints] = []
-        for pair in distinct(orders[open_], axis=0):
-            some = open_[(orders[open_] == pair).all(-1)]
+        for pair in distinct(orders[unequal], axis=0):
+            some = unequal[(orders[unequal] == pair).all(-1)]
             result = fit(take(readings, some), replace(options, order=(int(pair[0]), int(pair[1]))))
             within = (powers <= limit[some, None])[:, None] & (powers > pair[:, None])
             wanted = np.any(terms_beyond(result).present[..., :HIGHEST] & within, -1)
             wanted &= pair < pair.max()
             orders[some] += wanted
             further.append(some[wanted.any(-1)])
-        open_ = np.concatenate(further)
-        open_ = open_[orders[open_].min(-1) < orders[open_].max(-1)]
+        unequal = np.concatenate(further)
+        unequal = unequal[orders[unequal].min(-1) < orders[unequal].max(-1)]
     return orders
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from mwdcal.calibration.automatic.courses import TRIED, f_test, steady_columns, temperature_powers
 from mwdcal.calibration.diagnosis.plausibility import stations_to_reshoot
-from mwdcal.calibration.estimate import Fit, without_stations
+from mwdcal.calibration.estimate import Fit, fewer_stations, without_stations
 from mwdcal.calibration.methods import ESTIMABLE, acts_on
 from mwdcal.calibration.readings import HIGHEST, LEAST_TEMPERATURE_SPAN, TRIADS, highest_order
 from mwdcal.calibration.results import variance_scales
@@ -843,9 +843,7 @@ def _without_bad_stations(result: Fit) -> Fit:
         return result
     fewer = without_stations(take(result, places), bad[places])
     if kind_of(fewer) != kind_of(result):  # of a method with an analysis of its own
-        evidence = result.problem.evidence
-        fewer_stations = replace(evidence, include=evidence.include * ~bad)
-        return replace(result, problem=replace(result.problem, evidence=fewer_stations))
+        return replace(result, problem=fewer_stations(result.problem, bad))
     return put(result, places, fewer)
 
 

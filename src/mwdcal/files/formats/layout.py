@@ -61,7 +61,7 @@ _OF_LOGGERS = re.compile(
 _UNIT_BEHIND = re.compile(r"(.*?)\s*([(\[][^)\]]*[)\]]|,\s*[^\s,]{1,5})")
 _AXIS = re.compile(r"\W*([xyz123])\W*([(\[].*)?", re.IGNORECASE)
 """A name that is an axis alone, and says nothing without the title above it."""
-_OF_AXIS = re.compile(r"\W*\w{0,6}[xyz123]\W*([(\[].*)?", re.IGNORECASE)
+_OF_AXIS = re.compile(r"\W*\w{0,6}(?P<axis>[xyz123])\W*([(\[].*)?", re.IGNORECASE)
 """A name that ends in an axis."""
 _SYMBOL = re.compile(r"[^\W\d_]")
 """A name that is the symbol of a quantity."""
@@ -504,7 +504,6 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
 _STATIONS_IN_COLUMNS = (
     "the stations stand in columns, with the names in the first one: the table is read so."
 )
-_ENDS_IN_AXIS = re.compile(r"\W*\w{0,6}([xyz])\W*([(\[].*)?", re.IGNORECASE)
 
 
 def _turned(sheet: Sheet) -> Sheet | None:
@@ -532,8 +531,8 @@ def _turned(sheet: Sheet) -> Sheet | None:
 
 def _has_axes(names: Iterable[object]) -> bool:
     """Whether names of all three axes are among some."""
-    ends = (_ENDS_IN_AXIS.fullmatch(as_text(name)) for name in names)
-    return len({m[1].lower() for m in ends if m}) == len("xyz")
+    ends = (_OF_AXIS.fullmatch(as_text(name)) for name in names)
+    return {*"xyz"} <= {m["axis"].lower() for m in ends if m}
 
 
 def _is_name(cell: object) -> bool:
@@ -715,36 +714,28 @@ def _with_warmth_of_lines(layout: Layout, lines: Sequence[tuple[int, Cells]]) ->
         or any(map(_WARMTH_IN_WORDS.search, layout.names))
     ):
         return layout
-    cells = [stated[n][0] for n in above]
-    numbers = [[*map(_number, column)] for column in layout.cells]
-    if any(
-        all(
-            v is not None and abs(v - float(c)) < _SAME_WARMTH
-            for v, c in zip(column, cells, strict=True)
-        )
-        for column in numbers
-    ):
-        return layout
     units = {unit for _, unit in stated.values()}
+    cells = [stated[n][0] for n in above]
+    if len(units) > 1 or any(_are_near(column, cells) for column in layout.cells):
+        return layout
     counts = Counter(f"{number} {unit}" for number, unit in (stated[n] for n in above))
     listed = ", ".join(f"{text} ({count} rows)" for text, count in counts.items())
-    name = f"{_WARMTH_OF_LINES} ({min(units)})"
-    return (
-        layout
-        if len(units) > 1
-        else replace(
-            layout,
-            names=[*layout.names, name],
-            units=[*layout.units, ""],
-            cells=[*layout.cells, cells],
-            texts=[*layout.texts, cells],
-            left_out=tuple(each for each in layout.left_out if each[0] not in stated),
-            remarks=(
-                *layout.remarks,
-                f"the temperatures are those of the lines above the rows: {listed}.",
-            ),
-        )
+    said = f"the temperatures are those of the lines above the rows: {listed}."
+    return replace(
+        layout,
+        names=[*layout.names, f"{_WARMTH_OF_LINES} ({min(units)})"],
+        units=[*layout.units, ""],
+        cells=[*layout.cells, cells],
+        texts=[*layout.texts, cells],
+        left_out=tuple(each for each in layout.left_out if each[0] not in stated),
+        remarks=(*layout.remarks, said),
     )
+
+
+def _are_near(column: Cells, stated: Sequence[str]) -> bool:
+    """Whether the numbers of a column are all near the temperatures that lines state."""
+    pairs = ((_number(cell), float(number)) for cell, number in zip(column, stated, strict=True))
+    return all(value is not None and abs(value - number) < _SAME_WARMTH for value, number in pairs)
 
 
 def _warmth_in(text: str) -> tuple[str, str] | None:

@@ -301,7 +301,8 @@ def _check_formulas(without: Mapping[str, str], source: str) -> None:
 def read_rows(data: bytes, source: str) -> Iterator[Row]:
     """Row numbers and cells of the first sheet, without blank cells at the end and blank rows."""
     with _opened(data, source) as (archive, book):
-        yield from _rows(archive, book.worksheets[0], source)
+        page = book.worksheets[0]
+        yield from _rows(archive, page, source, _merged(archive, page))
 
 
 def read_sheets(data: bytes, source: str) -> Iterator[tuple[str, Iterator[Row], Merged]]:
@@ -311,7 +312,8 @@ def read_sheets(data: bytes, source: str) -> Iterator[tuple[str, Iterator[Row], 
     """
     with _opened(data, source) as (archive, book):
         for page in book.worksheets:
-            yield page.title, _rows(archive, page, source, as_text=True), _merged(archive, page)
+            merged = _merged(archive, page)
+            yield page.title, _rows(archive, page, source, merged, as_text=True), merged
 
 
 def _merged(archive: zipfile.ZipFile, page: Any) -> Merged:
@@ -343,7 +345,7 @@ def _opened(data: bytes, source: str) -> Iterator[tuple[zipfile.ZipFile, Any]]:
 
 
 def _rows(
-    archive: zipfile.ZipFile, page: Any, source: str, *, as_text: bool = False
+    archive: zipfile.ZipFile, page: Any, source: str, merged: Merged, *, as_text: bool = False
 ) -> Iterator[Row]:
     """Row numbers and cells of a sheet that are not blank; a formula without a value is refused, or its text."""
     with damaged_unless_read(source, *_EXPECTED):
@@ -354,7 +356,7 @@ def _rows(
         page.reset_dimensions()
         rows = enumerate(page.iter_rows(values_only=True), 1)
         calculated = ((line, _with_formulas(row, by_row.get(line, {}))) for line, row in rows)
-        for line, row in with_merged(calculated, _merged(archive, page)):
+        for line, row in with_merged(calculated, merged):
             cells = _trimmed([_read(value) for value in row])
             if cells:
                 yield line, cells
