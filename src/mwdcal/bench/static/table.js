@@ -2,15 +2,26 @@
 "use strict";
 const note = document.getElementById("message");
 
+// One decision at a time: while the bench works on one, and until its page has come, no other is taken.
+function accept(decisions) {
+  for (const each of document.querySelectorAll("button, input[type=file]")) each.disabled = !decisions;
+}
+
+addEventListener("pageshow", () => accept(true));
+
 async function ask(address, body, token) {
+  const focus = document.activeElement;
+  accept(false);
   const headers = { Accept: "text/plain", ...(token ? { "X-Bench-Token": token } : {}) };
   try {
     const answer = await fetch(address, { method: "POST", body, headers });
-    if (answer.ok) location.assign("/table");
-    else note.textContent = await answer.text();
+    if (answer.ok) return location.assign("/table");
+    note.textContent = await answer.text();
   } catch {
     note.textContent = note.dataset.lost;
   }
+  accept(true);
+  focus.focus();
 }
 
 function give(form, file) {
