@@ -15,6 +15,7 @@ from mwdcal.calibration.prior import DATASHEET, profile_for
 from mwdcal.calibration.readings import Readings
 from mwdcal.errors import InputError
 from mwdcal.files import profiles, runs
+from mwdcal.files.formats.table import Table
 from mwdcal.files.parting import parted
 from mwdcal.files.profiles import source_of_settings
 from mwdcal.presentation.calibration_source import calibration_of
@@ -77,30 +78,28 @@ def load_runs(
     decimal: str,
     prior: Prior,
     statements: Mapping[str, str],
-) -> tuple[Readings, Readings | None, Profile]:
-    """A run and its roll test, if there is one, and the tool profile: see `load_run`.
+) -> tuple[Readings, Readings | None, Profile, bool]:
+    """A run and its roll test, if there is one, the tool profile, and whether the file of the run has a roll test.
 
     Both may be in one file: on two sheets, or in one table with a column that marks the roll test.
     """
-    if rolltest is None or not (rolltest.exists() and run.exists() and run.samefile(rolltest)):
-        readings, profile = load_run(run, tool, decimal, prior, statements)
-        test = (
-            runs.read_run(rolltest, profile, decimal=decimal, statements=statements)[0]
-            if rolltest
-            else None
-        )
-        return readings, test, profile
     stated, digest = profiles.load_profile(tool)
     stated = profile_for(prior, stated)
-    whole = runs.read_export(
+    first = runs.read_export(
         run, stated, decimal=decimal, rows=runs.MOST_ROWS, statements=statements
     )
-    other = runs.read_roll_test(run, whole, stated, statements)
-    first, second = (whole, other) if other else parted(whole)
+    same = rolltest is not None and rolltest.exists() and run.exists() and run.samefile(rolltest)
+    beside = None
+    if same or (rolltest is None and stated.form.find):
+        beside = runs.read_roll_test(run, first, stated, statements)
+    second: Path | Table | None = beside if same else rolltest
+    if same and beside is None:
+        first, second = parted(first)
     readings, profile = runs.read_run(first, stated)
+    test = second and runs.read_run(second, profile, decimal=decimal, statements=statements)[0]
     source = source_of_settings()
     readings = replace(readings, profile_sha256=digest, settings_source=source)
-    return readings, runs.read_run(second, profile)[0], profile
+    return readings, test or None, profile, beside is not None
 
 
 def prior_of(word: str | None) -> tuple[Prior, str]:

@@ -1468,8 +1468,9 @@ _STAND = [
     "",
     "# [stand]   # 1σ of one setting, degrees, by the stand's certificate; until stated its angles count as exact",
     *(f"# {name} =" for name in ("inclination_deg", "azimuth_deg", "toolface_deg")),
+    '# settings = "per-station"   # or "per-direction": set once, then the tool is rolled',
 ]
-"""Lines to fill in: the uncertainty of the stand, which no table states."""
+"""Lines to fill in: uncertainty and practice of the stand, which no table states."""
 
 
 def has_angles(proposal: Proposal) -> bool:

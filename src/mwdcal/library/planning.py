@@ -142,7 +142,7 @@ def plan(
     plans are compared. With `stations` the best so many out of the candidates in `plan`, with `accuracy_deg` (1σ)
     the fewest that give it, with `measured` the best to add to a run that exists. `criterion` says what `stations`
     are best in: "D", all parameters together; "A", each of them; "I", the angles. `options` and `choices` are those
-    of `calibrate`.
+    of `calibrate`. Where the plan does not state the place, it is that of the run of a calibration given as `tool`.
 
     Units: degrees for accuracies and for `reach` of the stand, degrees per second for its `speed`; `settle` in
     seconds from the end of a move to the reading, `soak` in minutes to reach a temperature.
@@ -160,17 +160,22 @@ def plan(
     """
     from mwdcal.planning import planned
     from mwdcal.planning.planned import Stand
+    from mwdcal.planning.plans import at_place_of
 
     several = plan if isinstance(plan, list | tuple) else [] if plan is None else [plan]
     if len(several) > 1 and (accuracy_deg or stations or measured is not None):
         raise InputError("`plan`: one plan holds the candidates to choose from. Name it alone.")
     _check_wanted(stations, accuracy_deg or {})
     planned.check_criterion(criterion)
+    tool = _loaded(tool)
     profile, digest = profile_of(tool)
     chosen, ends = with_choices(options, choices), _ends(reach or {})
     stand = Stand(speed, settle, soak, ends)
     tables = [plan_table(cast(PlanSource, each)) for each in several]
     done = None if measured is None else _measured(measured, profile)
+    if isinstance(tool, Calibration) and done is None:
+        usual = "candidates" if accuracy_deg or stations else "twenty-four-state"
+        tables = [at_place_of(each, tool) for each in tables or [plan_table(usual)]]
     candidates = tables[0] if tables else None
     if accuracy_deg:
         result = [
@@ -226,10 +231,15 @@ def _ends(reach: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, fl
     return ends
 
 
+def _loaded(tool: Any) -> Any:
+    """A tool as it is given, or the calibration in the file that it names."""
+    file = isinstance(tool, str | os.PathLike) and Path(tool).suffix.lower() == ".json"
+    return documents.read(tool) if file else tool
+
+
 def profile_of(tool: object) -> tuple[Profile, str]:
     """A profile and the SHA-256 of its file, or of its calibration; without one for a profile in memory."""
-    if isinstance(tool, str | os.PathLike) and Path(tool).suffix.lower() == ".json":
-        tool = documents.read(tool)
+    tool = _loaded(tool)
     if isinstance(tool, Calibration):
         from mwdcal.planning.session import calibrated_profile
 
@@ -318,7 +328,9 @@ class ProposedProfile(Result):
     def _text(self) -> str:
         from mwdcal.presentation.proposal import screen
 
-        return screen(self.proposal, self.path, self.files.get("output"))
+        where, output = self.proposal.where, self.files.get("output")
+        test = where and output and runs.read_roll_test(self.path, where, self.proposal.profile, {})
+        return screen(self.proposal, self.path, output, bool(test))
 
     def _document(self) -> dict[str, Any]:
         from mwdcal.presentation.proposal import summary

@@ -33,8 +33,9 @@ def _check_noise(profile: Profile, kind: str) -> None:
     """Refuse a triad without noise."""
     triad: TriadProfile = getattr(profile, kind)
     if triad.noise is None:
+        default = " (the default without `tool`)" if profile.name == "generic" else ""
         raise InputError(
-            f"the profile '{profile.name}' does not state the noise of the {kind}, on which every "
+            f"the profile '{profile.name}'{default} does not state the noise of the {kind}, on which every "
             f"uncertainty rests. Add 'noise' to its [{kind}], which mwdcal noise measures; or name a calibration of "
             "the tool by `tool`, which has estimated it."
         )

@@ -16,7 +16,8 @@ import numpy as np
 
 from mwdcal.calibration.options import DIRECTION, settings_of
 from mwdcal.calibration.readings import CONSTANTS, TRIADS, Readings, soaks
-from mwdcal.calibration.results import raw_reading
+from mwdcal.calibration.record import Calibration
+from mwdcal.calibration.results import raw_reading, unknown_gravity
 from mwdcal.errors import InputError
 from mwdcal.estimation.problem import ANGLES
 from mwdcal.faults.likelihood import (
@@ -245,6 +246,20 @@ def at_place(plan: Table, other: Table) -> Table:
         stated = np.asarray(other.columns.get(name, ()), float)
         for value in stated[~np.isnan(stated)][:1]:
             place[name] = np.full(plan.count, value)
+    return replace(plan, columns={**plan.columns, **place})
+
+
+def at_place_of(plan: Table, calibration: Calibration) -> Table:
+    """A plan with the gravity, field and dip that the run of a calibration stated, where the plan states none."""
+    estimated = {constant.name for constant in calibration.constants}
+    place = {}
+    for name in CONSTANTS:
+        column = REFERENCES[name].column
+        value = calibration.earth.get("field" if name == "field" else column.removeprefix("ref_"))
+        unknown = name in estimated or (name == "gravity" and unknown_gravity(calibration))
+        given = np.asarray(plan.columns.get(column, ()), float)
+        if value is not None and not unknown and np.isnan(given).all():
+            place[column] = np.full(plan.count, value)
     return replace(plan, columns={**plan.columns, **place})
 
 

@@ -27,6 +27,7 @@ from mwdcal.errors import InputError
 from mwdcal.estimation.solvers import RANK_TOLERANCE
 from mwdcal.geometry.observables import TITLES
 from mwdcal.presentation.calibration import (
+    ROLL_TEST,
     accuracy_in_words,
     drift_remarks,
     how,
@@ -68,11 +69,12 @@ def render(
     *metadata: Mapping[str, object],
     limits: Limits | None = None,
     file: str = "CAL.json",
+    rolltest: str = ROLL_TEST,
 ) -> str:
     """The report as HTML: the same input gives the same text, byte for byte.
 
     `metadata` are those of the roll test behind the verdict, `limits` those that a roll test will have to meet. `file`
-    is the name of the calibration in the next commands.
+    and `rolltest` are the names of the calibration and of a roll test in the next commands.
     """
     pages = environment()
     pages.filters |= {"freedom": freedom, "noise_free": noise_free}
@@ -89,7 +91,7 @@ def render(
         left=left,
         spherical=_spherical(calibration),
         gauges=list(_gauges(calibration, verdict, limits)),
-        steps=_steps(calibration, verdict, file),
+        steps=_steps(calibration, verdict, file, rolltest),
         simulated=any(map(is_simulated, (calibration.tool, *metadata))),
         inclinations=known_inclinations(calibration),
         method="; ".join(how(calibration)),
@@ -209,14 +211,16 @@ def _gauge(
     return AngleGauge(name, shown, said, *outcome, 100 * (value or 0.0) / whole, span, bound)
 
 
-def _steps(calibration: Calibration, verdict: Verdict | None, file: str) -> list[str]:
+def _steps(
+    calibration: Calibration, verdict: Verdict | None, file: str, rolltest: str
+) -> list[str]:
     """Steps after the calibration: stations to measure again, then the next command."""
     count = sum(row.reshoot for row in calibration.station_rows)
     steps = [f"Measure {plural(count, 'station')} again, and calibrate once more."] if count else []
     if verdict is None:
         return [
             *steps,
-            f"Verify the calibration with a roll test that the fit has not seen: mwdcal verify {file} ROLLTEST.csv",
+            f"Verify the calibration with a roll test that the fit has not seen: mwdcal verify {file} {rolltest}",
         ]
     if verdict.passed:
         return [

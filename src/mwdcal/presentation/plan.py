@@ -248,13 +248,15 @@ def screen(
 
 
 def _assumed(planned: Planned) -> list[str]:
-    """Field and dip that the prediction assumes because the plan does not state them, as a line; none if it does."""
+    """Field and dip of the prediction as a line: those that the plan does not state, if there are any."""
     if not planned.calibration.has_field:
         return []
     _, field, dip = (float(values[0]) for values in planned_earth(planned.plan))
     words = {"field": f"field_nt {field:,.0f}", "dip": f"dip_deg {np.degrees(dip):g}"}
     blank = [word for name, word in words.items() if _is_blank(planned.plan, name)]
-    return [f"the plan does not state the place; assumed: {', '.join(blank)}"] if blank else []
+    if blank:
+        return [f"the plan does not state the place; assumed: {', '.join(blank)}"]
+    return [f"place: {', '.join(words.values())}"]
 
 
 def _is_blank(plan: Table, name: str) -> bool:

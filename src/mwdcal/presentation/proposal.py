@@ -79,8 +79,8 @@ def _triad(proposal: Proposal, kind: str) -> ProposedTriad:
     return ProposedTriad(**each, unexplained=result.unexplained, next_best=result.next_best)
 
 
-def screen(proposal: Proposal, run: Path, output: Path | None) -> str:
-    """The result for people."""
+def screen(proposal: Proposal, run: Path, output: Path | None, has_roll_test: bool = False) -> str:
+    """The result for people; `has_roll_test`: whether the file of the run has one beside it."""
     profile = proposal.profile
     head = [run.name, profile.name, plural(proposal.stations, "station")]
     blocks = ["   ".join(map(one_line, [*head, *simulated(proposal.metadata)]))]
@@ -118,6 +118,7 @@ def screen(proposal: Proposal, run: Path, output: Path | None) -> str:
         command = (
             f"mwdcal calibrate {one_line(str(run))} --tool {one_line(str(output))} -o tool.json"
         )
+        command += f" --rolltest {one_line(str(run))}" if has_roll_test else ""
         if proposal.open_axes:
             command = f"fill in the axes in {one_line(str(output))}, then {command}"
         exact = (

@@ -905,8 +905,8 @@ class RollTest:
         first, reference = int(roll_set.index[0]), rolled.reference
         judged = figure(part, curve, noise, error, drawn(curve, name, first))
         most, least, farthest = np.degrees(ends(curve))
-        at = f"toolface {farthest:.0f}°" if error else f"toolfaces {least:.0f}° to {most:.0f}°"
-        where = f"{roll_set.label}; {at}"
+        at = f" {farthest:.0f}°" if error else f"s {least:.0f}° to {most:.0f}°"
+        where = f"{roll_set.label}; curve at toolface{at}"
         if curve.rough(noise.known):
             left = float(f"{curve.scale:.2g}")
             where += f"; raw figure judged: {left:g} × the noise is left about a smooth curve"

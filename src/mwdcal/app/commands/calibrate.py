@@ -67,7 +67,9 @@ def command(
     options.check_outputs([output], inputs, page=report, calibration=True, form=".json")
     _enter(registry)
     prior, digest = prior_of(typed["prior"])
-    readings, turned, profile = load_runs(run, rolltest, tool, decimal, prior, options.statements())
+    readings, turned, profile, beside = load_runs(
+        run, rolltest, tool, decimal, prior, options.statements()
+    )
     choice, result = chosen_fit(readings, profile, options_of(typed, prior, exclude, digest), say)
     calibration = recorded(choice, result)
     verdict, judged = _judged(calibration, turned, limits, (output, rolltest))
@@ -78,12 +80,13 @@ def command(
 
         tested = [turned.metadata] if turned else []
         bounds = load_limits(limits)[0]
-        rendered = render(calibration, verdict, *tested, limits=bounds, file=output.name)
+        names = {"file": output.name, "rolltest": run.name if beside else screen.ROLL_TEST}
+        rendered = render(calibration, verdict, *tested, limits=bounds, **names)
     files = output, report
     shown = (
         screen.summary(calibration, choice.curves, *files, _for_machines(verdict, output, rolltest))
         if as_json
-        else screen.screen(calibration, choice.curves, *files, judged)
+        else screen.screen(calibration, choice.curves, *files, judged, run if beside else None)
     )
     atomic.write_all([(output, documents.encode(calibration)), (report, rendered)])
     _enter(registry, output, run, tool, rolltest, verdict)

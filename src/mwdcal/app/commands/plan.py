@@ -60,7 +60,13 @@ from mwdcal.app.messages import print_result
 @options.preset(
     "--settle", type=float, default=30.0, metavar="S", help="From the end of a move to its reading."
 )
-@options.preset("--soak", type=float, default=90.0, metavar="MIN", help="To reach a temperature.")
+@options.preset(
+    "--soak",
+    type=float,
+    default=90.0,
+    metavar="MIN",
+    help="To reach a temperature; 0 at room temperature.",
+)
 @options.tool()
 @options.fit_options("auto", "none", "datasheet", "the tolerances in the tool profile")
 @click.option(

@@ -314,11 +314,16 @@ def _the_run(tables: Sequence[Layout]) -> Layout | None:
     if len(runs) != 1 or ADJUSTED.search(runs[0].heading):
         return None
     aside = tuple(
-        (t.form.header_line, f"{kind}, {len(t.lines)} rows")
+        (t.form.header_line, f"{kind}{_on_sheet(t, runs[0])}, {len(t.lines)} rows")
         for t, kind in zip(tables, kinds, strict=True)
         if kind
     )
     return replace(runs[0], left_out=(*runs[0].left_out, *aside))
+
+
+def _on_sheet(table: Layout, run: Layout) -> str:
+    """The sheet of a table in words, where it is another than that of the run."""
+    return f" on sheet {shown(table.sheet)}" if table.sheet != run.sheet else ""
 
 
 def _kind(words: str) -> str:
