@@ -381,6 +381,10 @@ def propose_profile(
     """
     from mwdcal.identification.proposal import propose
 
+    if not isinstance(table_path, str | os.PathLike):
+        raise InputError(
+            f"`table_path` must be a file; got {type(table_path).__name__}. Write the table to one, such as by to_csv."
+        )
     stated = {"serial": serial, "date": date}
     norths = {
         "azimuth_reference": north,

@@ -42,6 +42,19 @@ from mwdcal.use.verification import verify as judge
 CORRECTED_ANGLES = ("inclination", "azimuth", "toolface", "dip", "magnetic_toolface")
 """Angles of corrected readings."""
 Path = str | os.PathLike[str]
+
+
+class WithProfile(Protocol):
+    """What has a tool profile: a proposed one, or a calibration."""
+
+    @property
+    def profile(self) -> Profile:
+        """The tool profile."""
+        ...
+
+
+ProfileSource = Path | Profile | WithProfile
+"""A tool profile: built in by name, a TOML file by path, the profile itself, or what has one."""
 Tabular = Path | Table | Mapping[str, Any]
 """A file, a table, or columns by name: a dictionary of arrays, a pandas or a polars table."""
 RunSource = ReadingsLike | Tabular
@@ -59,7 +72,7 @@ def load_profile(name: Path = "generic") -> Profile:
 
 def read_run(
     source: Tabular,
-    profile: Path | Profile = "generic",
+    profile: ProfileSource = "generic",
     *,
     decimal: str = ".",
     metadata: Mapping[str, object] | None = None,
@@ -77,9 +90,7 @@ def read_run(
     Raises:
         InputError: a file that cannot be read, or a cell that is missing or out of range.
     """
-    profile_sha256 = ""
-    if not isinstance(profile, Profile):
-        profile, profile_sha256 = profiles.load_profile(os.fspath(profile))
+    profile, profile_sha256 = _loaded(profile)
     read = partial(runs.read_export, profile=profile, decimal=decimal)
     table = table_of(source, "the run", read)
     if metadata:
@@ -135,7 +146,7 @@ def _column(name: str, values: Any) -> Column:
 
 def calibrate(
     run: RunSource,
-    profile: Path | Profile | None = None,
+    profile: ProfileSource | None = None,
     options: Options | None = None,
     **choices: Unpack[FitChoices],
 ) -> Calibration:
@@ -144,7 +155,7 @@ def calibrate(
     `run` is what `read_run` or `readings` has given, or what they take: a file, columns by name, or an array (n, 3),
     (n, 6) or (n, 7) of accelerometer, magnetometer and temperature, as in all that follows.
 
-    `profile` is by default the one that the run was read with, else a nominal one: channels along
+    `profile` (also what `propose_profile` gives) is by default the one that the run was read with, else a nominal one: channels along
     the tool axes in g and nT. `choices` are attributes of `Options` by name, such as
     `method="scalar"` or `robust="huber"`; what is not chosen is chosen as by the command.
 
@@ -157,6 +168,19 @@ def calibrate(
     return fit_and_judge(whole, _profile(run, profile), with_choices(options, choices))
 
 
+def _loaded(profile: object) -> tuple[Profile, str]:
+    """A tool profile, and the SHA-256 of the file that it was read from; refuses what has none."""
+    profile = getattr(profile, "profile", profile)
+    if isinstance(profile, Profile):
+        return profile, ""
+    if not isinstance(profile, str | os.PathLike):
+        raise InputError(
+            f"`profile` must be a tool profile, or the name or file of one; got {type(profile).__name__}. Read one by "
+            "mwdcal.load_profile(…)."
+        )
+    return profiles.load_profile(os.fspath(profile))
+
+
 def _profile(run: Readings, profile: object) -> Profile:
     """A profile as it is given, else that of the run, else `NOMINAL`."""
     if profile is None:
@@ -165,7 +189,7 @@ def _profile(run: Readings, profile: object) -> Profile:
         raise InputError(
             "`profile` must be a tool profile; got options. Give them as options=…, or by name."
         )
-    return profile if isinstance(profile, Profile) else load_profile(cast(Path, profile))
+    return _loaded(profile)[0]
 
 
 def _check_readings(readings: object, name: str = "run", single: bool = True) -> None:
@@ -196,7 +220,7 @@ def _check_readings(readings: object, name: str = "run", single: bool = True) ->
 
 
 def readings_of(
-    source: RunSource, name: str, profile: Path | Profile, single: bool = True
+    source: RunSource, name: str, profile: ProfileSource, single: bool = True
 ) -> Readings:
     """The readings of a run: as they are, of an array as `as_readings` takes it, or by `read_run` of a table."""
     if isinstance(source, Readings):
@@ -225,7 +249,7 @@ def with_choices(options: Options | None, choices: Mapping[str, Any]) -> Options
 
 def compare(
     run: RunSource,
-    profile: Path | Profile | None = None,
+    profile: ProfileSource | None = None,
     options: Options | None = None,
     *,
     progress: Callable[[str], None] = lambda text: None,
@@ -242,10 +266,22 @@ def compare(
     return with_inputs(result, run.metadata, run=run.run_sha256, profile=run.profile_sha256)
 
 
+def calibration_of(source: object) -> Calibration:
+    """A calibration as it is, or read from its file; refuses anything else."""
+    if isinstance(source, str | os.PathLike):
+        return documents.read(source)
+    if isinstance(source, Calibration):
+        return source
+    raise InputError(
+        f"`calibration` must be a calibration or its file; got {type(source).__name__}. Make one by "
+        "mwdcal.calibrate(…)."
+    )
+
+
 def verify(
-    calibration: Calibration, rolltest: RunSource, limits: Path | Limits = "roll-test"
+    calibration: Calibration | Path, rolltest: RunSource, limits: Path | Limits = "roll-test"
 ) -> Verdict:
-    """Judge a calibration by readings that its fit has not seen: `.passed`, and `.rows` with each figure.
+    """Judge a calibration, or its file, by readings that its fit has not seen: `.passed`, and `.rows` with each figure.
 
     `limits` is a shipped limits profile by name, a TOML file by path, or `Limits`.
 
@@ -253,6 +289,7 @@ def verify(
         InputError: stations of the fit, temperatures outside the calibrated range, or readings to
             which no limit applies.
     """
+    calibration = calibration_of(calibration)
     rolltest = readings_of(rolltest, "rolltest", calibration.profile)
     bounds, digest = (limits, "") if isinstance(limits, Limits) else load_limits(limits)
     verdict = judge(calibration, rolltest, bounds)
@@ -263,7 +300,7 @@ def verify(
     return with_inputs(verdict, *stated, of=calibration, run=rolltest.run_sha256, **digests)
 
 
-def diagnose(calibration: Calibration, later: RunSource) -> Diagnosis:
+def diagnose(calibration: Calibration | Path, later: RunSource) -> Diagnosis:
     """Say which fault explains later readings of a calibrated tool best: `.fault` is "none" where none is needed.
 
     Definition: faults are compared by the density of the readings, all that is uncertain being integrated out;
@@ -272,6 +309,7 @@ def diagnose(calibration: Calibration, later: RunSource) -> Diagnosis:
     Raises:
         InputError: readings of another tool or of the fit itself, or none that can be used.
     """
+    calibration = calibration_of(calibration)
     later = readings_of(later, "later", calibration.profile)
     result = explain(calibration, later)
     findings = [*calibration.change_findings(), *result.findings, *of_table(later)]
@@ -331,11 +369,11 @@ def _range(values: AnyArray) -> tuple[str, str]:
 
 
 def apply(
-    calibration: Calibration,
+    calibration: Calibration | Path,
     survey: RunSource,
     outside: Literal["blank", "refuse", "extrapolate"] = "blank",
 ) -> Corrected:
-    """Correct readings: vectors and angles.
+    """Correct readings by a calibration or its file: vectors and angles.
 
     `outside`: what becomes of readings outside the calibrated temperatures. Singular: azimuth and
     toolface are NaN exactly at vertical; the magnetic toolface is not.
@@ -343,6 +381,7 @@ def apply(
     Raises:
         InputError: readings that do not belong to the calibration.
     """
+    calibration = calibration_of(calibration)
     survey = readings_of(survey, "survey", calibration.profile, single=False)
     columns, findings = correct(calibration, survey, outside)
     warn_if_blank(columns, findings)

@@ -392,9 +392,10 @@ def render(surveyed: SurveyedWell, findings: list[Finding]) -> str:
 
 def _banner(facts: SurveySummary) -> dict[str, str]:
     """How many surveys may be used."""
-    headline = (
-        f"{facts.accepted} of {plural(facts.rows, 'survey')} within the limits {facts.limits}"
-    )
+    surveys = plural(facts.rows, "survey")
+    headline = f"{facts.accepted} of {surveys} within the limits {facts.limits}"
+    if facts.not_judged == facts.rows:
+        headline = f"{surveys} not judged by the limits {facts.limits}"
     north = f"Azimuths count from {facts.north} north"
     if facts.rejected:
         return banner("bad", "Rejected", headline, f"{facts.rejected} outside. {north}")

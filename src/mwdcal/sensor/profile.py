@@ -15,6 +15,7 @@ from typing import Literal
 import msgspec
 import numpy as np
 
+from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import Array
 
 COMMON = ("azimuth-zero", "toolface-zero", "inclination-zero", "tilt")
@@ -245,6 +246,24 @@ class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     def has_magnetometer(self) -> bool:
         """Whether it says anything of a magnetometer; with readings of one it may still say nothing."""
         return self.magnetometer != TriadProfile()
+
+    def with_stand(self, **values: float | str) -> Profile:
+        """The profile with other values of its stand, by the names and in the units of `StandProfile`.
+
+        Raises:
+            InputError: a name or a value that a stand cannot have.
+
+        >>> NOMINAL.with_stand(inclination_deg=0.02, settings="per-station").stand.inclination_deg
+        0.02
+        """
+        stated = {**msgspec.to_builtins(self.stand), **values}
+        try:
+            stand = msgspec.convert(stated, StandProfile)
+        except msgspec.ValidationError as error:
+            raise InputError(
+                f"the stand: {error}. Give it as in [stand] of a tool profile."
+            ) from None
+        return msgspec.structs.replace(self, stand=stand)
 
 
 _UNSCALED = TriadProfile(scale=1.0)

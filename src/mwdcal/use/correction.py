@@ -272,7 +272,7 @@ def correct_and_count(
     """
     columns, tally = tallied(calibration, readings, outside, lacking, uncertainty)
     about = findings(calibration, readings, tally, outside)
-    strengths.check(calibration, tally.strengths, readings.name)
+    strengths.check(calibration, tally.strengths, readings.name, nominal=not readings.source)
     return columns, tally, about
 
 

@@ -106,24 +106,28 @@ def _departure(name: str, each: Strengths) -> str:
     return f"corrected {name} is {extent} {unit}, and {why}"
 
 
-def check(calibration: Calibration, strengths: Mapping[str, Strengths], source: str) -> None:
-    """Refuse a table of which most rows have a strength that is off."""
+def check(
+    calibration: Calibration, strengths: Mapping[str, Strengths], source: str, nominal: bool = False
+) -> None:
+    """Refuse a table, or `nominal` arrays, of which most rows have a strength that is off."""
     for name, each in strengths.items():
         if each.off > MOST_OFF * each.rows:
             raise InputError(
                 f"{source}: at {each.off} of {each.rows} rows "
-                f"{_departure(name, each)}. {_advice(calibration, name, each)}"
+                f"{_departure(name, each)}. {_advice(calibration, name, each, nominal)}"
             )
 
 
-def _advice(calibration: Calibration, name: str, each: Strengths) -> str:
+def _advice(calibration: Calibration, name: str, each: Strengths, nominal: bool) -> str:
     """The likely cause, and what to do."""
     triad, unit = TRIADS[name == "field"], OBSERVABLES[name].unit
-    scale, nominal = getattr(calibration.profile, triad).scale, ""
+    if nominal:
+        return f"Arrays are in {unit}; give readings in other units as a table, by the names of the columns."
+    scale, about = getattr(calibration.profile, triad).scale, ""
     if scale is not None:
-        nominal = f" of about {scale:.4g} raw units per {unit}{_likely(name, each, scale)}"
+        about = f" of about {scale:.4g} raw units per {unit}{_likely(name, each, scale)}"
     text = (
-        f"The calibration ({calibration.run}) is for {triad} readings{nominal}. Give the readings in the "
+        f"The calibration ({calibration.run}) is for {triad} readings{about}. Give the readings in the "
         "units of its run, or the calibration that belongs to them."
     )
     if each.reference and not each.earth:

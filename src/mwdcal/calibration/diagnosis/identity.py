@@ -28,11 +28,10 @@ def unidentified(serials: Mapping[str, str | None]) -> list[Finding]:
     lacking = [name for name, serial in serials.items() if serial is None]
     if not lacking:
         return []
-    states = "states" if len(lacking) == 1 else "state"
     unknown = "that they are of the same tool" if len(serials) > 1 else "which tool it is of"
     text = (
-        f"{' and '.join(lacking)} {states} no serial: nothing shows {unknown}. State it above the names of "
-        'each run: serial = "MWD-17".'
+        f"no serial in {' and '.join(lacking)}: nothing shows {unknown}. State it in each run: in a line above the "
+        'names, # serial = "MWD-17", or in a column serial.'
     )
     return [Finding(id=UNIDENTIFIED, text=text)]
 
