@@ -155,8 +155,8 @@ def calibrate(
     `run` is what `read_run` or `readings` has given, or what they take: a file, columns by name, or an array (n, 3),
     (n, 6) or (n, 7) of accelerometer, magnetometer and temperature, as in all that follows.
 
-    `profile` (also what `propose_profile` gives) is by default the one that the run was read with, else a nominal one: channels along
-    the tool axes in g and nT. `choices` are attributes of `Options` by name, such as
+    `profile` (also what `propose_profile` gives) is by default the one that the run was read with, else a nominal one:
+    channels along the tool axes in g and nT. `choices` are attributes of `Options` by name, such as
     `method="scalar"` or `robust="huber"`; what is not chosen is chosen as by the command.
 
     Raises:
