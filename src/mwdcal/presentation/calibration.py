@@ -50,7 +50,7 @@ MOST_EXCLUDED = 20
 """Most stations left out of the fit that the screen names."""
 VALID = "good for {:.1f}…{:.1f} °C: beyond, results are blank (--outside of apply)"
 """The temperatures of readings."""
-ROLL_TEST = "ROLLTEST.csv"
+NEXT_ROLL_TEST = "ROLLTEST.csv"
 """The file of a roll test that is still to be made, in the next commands."""
 PROFILE = " (see [stand] of the tool profile)"
 ORDERS = "error: rms per axis, with the noise; inside: interpolation, at the ends: extrapolation"
@@ -159,7 +159,7 @@ def screen(
     """The result for people, the files that were written, and what to do next or what `judged` says of it."""
     what = "calibration, in place of an earlier file" if output.exists() else "calibration"
     files = files_written(**{what: output, "report": report})
-    command = f"mwdcal verify {one_line(output)} {one_line(rolltest or ROLL_TEST)}"
+    command = f"mwdcal verify {one_line(output)} {one_line(rolltest or NEXT_ROLL_TEST)}"
     after = f"\n\n{judged}" if judged else f"   next: {command}"
     return f"{body(calibration, tried)}\n{files}{after}"
 

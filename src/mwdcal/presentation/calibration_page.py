@@ -27,7 +27,7 @@ from mwdcal.errors import InputError
 from mwdcal.estimation.solvers import RANK_TOLERANCE
 from mwdcal.geometry.observables import TITLES
 from mwdcal.presentation.calibration import (
-    ROLL_TEST,
+    NEXT_ROLL_TEST,
     accuracy_in_words,
     drift_remarks,
     how,
@@ -69,7 +69,7 @@ def render(
     *metadata: Mapping[str, object],
     limits: Limits | None = None,
     file: str = "CAL.json",
-    rolltest: str = ROLL_TEST,
+    rolltest: str = NEXT_ROLL_TEST,
 ) -> str:
     """The report as HTML: the same input gives the same text, byte for byte.
 

@@ -116,7 +116,7 @@ def interference_screen(result: Interference, *metadata: Mapping[str, object]) -
 
 MOST_SURVEYS = 30
 """Surveys of a table on screen."""
-OFF = "\noff: how far |g|, |b| and dip together are from their references"
+OFF_IN_WORDS = "\noff: how far |g|, |b| and dip together are from their references"
 """The meaning of a column."""
 OUTCOMES = {"true": "accepted", "false": "REJECTED", "": "not judged"}
 """The column `accepted` in words."""
@@ -507,7 +507,7 @@ def survey_table(well: Well, count: int, most: int = MOST_SURVEYS) -> str:
     """The first of so many surveys, each angle with its standard uncertainty."""
     header, rows = survey_rows(well, most)
     more = count - len(rows)
-    note = OFF if "off, σ" in header and well.judgement.judged.any() else ""
+    note = OFF_IN_WORDS if "off, σ" in header and well.judgement.judged.any() else ""
     return table(rows, header) + (f"\n… and {more} more" if more > 0 else "") + note
 
 

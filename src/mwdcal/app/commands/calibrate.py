@@ -80,7 +80,7 @@ def command(
 
         tested = [turned.metadata] if turned else []
         bounds = load_limits(limits)[0]
-        names = {"file": output.name, "rolltest": run.name if beside else screen.ROLL_TEST}
+        names = {"file": output.name, "rolltest": run.name if beside else screen.NEXT_ROLL_TEST}
         rendered = render(calibration, verdict, *tested, limits=bounds, **names)
     files = output, report
     shown = (
