@@ -65,7 +65,7 @@ from mwdcal.app.messages import print_result
     type=float,
     default=90.0,
     metavar="MIN",
-    help="To reach a temperature; 0 at room temperature.",
+    help="To reach a temperature; 0 without an oven.",
 )
 @options.tool()
 @options.fit_options("auto", "none", "datasheet", "the tolerances in the tool profile")
