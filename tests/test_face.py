@@ -176,6 +176,25 @@ def test_a_calibration_takes_no_table_by_the_place_of_its_columns(calibrated):
                 ask(table)
 
 
+def test_a_calibration_may_be_its_file(calibrated, tmp_path):
+    made, _, _ = calibrated
+    mwdcal.save(made, tmp_path / "tool.json")
+    roll = mwdcal.simulate([45], 12, [60], tool=4, seed=3)
+    for task in (mwdcal.apply, mwdcal.verify, mwdcal.diagnose):
+        assert task(tmp_path / "tool.json", roll).to_dict() == task(made, roll).to_dict()
+        with pytest.raises(mwdcal.InputError, match="`calibration` must be a calibration or its f"):
+            task(3, roll)
+
+
+def test_arrays_in_another_unit_are_refused_by_theirs(calibrated):
+    """Raw readings, which the unit of the calibration's run would explain, are no arrays."""
+    made, _, _ = calibrated
+    roll = mwdcal.simulate([45], 12, [60], tool=4, seed=3)
+    arrays = np.hstack([roll.accelerometer, roll.magnetometer / 1000])
+    with pytest.raises(mwdcal.InputError, match="Arrays are in nT; give"):
+        mwdcal.apply(made, arrays)
+
+
 def test_stations_left_out_may_be_given_as_numbers():
     run = mwdcal.simulate(tool=4, seed=1)
     for exclude, left in ((3, ["3"]), ([3, 4], ["3", "4"]), ("34", ["34"])):

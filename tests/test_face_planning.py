@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import typing
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -167,6 +168,36 @@ def test_the_tool_of_a_calibration(tmp_path):
     )
 
 
+def test_a_plan_is_at_the_place_of_the_calibration_unless_it_states_one():
+    """What the run only estimated, as its dip here, is not stated in the plan."""
+    run = mwdcal.simulate("twenty-four-state", seed=3)
+    known = {"field": np.full(len(run), 51_000.0), "gravity": np.full(len(run), 0.998)}
+    angles = {name: run.known[name] for name in ("inclination", "azimuth", "toolface")}
+    place = mwdcal.calibrate(replace(run, known=angles | known))
+    for made in (mwdcal.plan(place), mwdcal.plan(place, stations=12)):
+        columns = made.columns
+        assert set(columns["ref_field_nt"]) == {51_000.0}
+        assert set(columns["ref_gravity_g"]) == {0.998}
+        assert np.isnan(columns.get("ref_dip_deg", [np.nan])).all()
+        assert "assumed: dip_deg 63" in made.summary()
+    stated = {**mwdcal.plan(place).columns, "ref_field_nt": np.full(24, 45_000.0)}
+    assert set(mwdcal.plan(place, plan=stated).columns["ref_field_nt"]) == {45_000.0}
+
+
+def test_what_has_a_profile_is_taken_for_it():
+    table = EXAMPLE / "export.csv"
+    proposed = mwdcal.propose_profile(table)
+    stand = proposed.profile.with_stand(inclination_deg=0.01, settings="per-station").stand
+    assert (stand.inclination_deg, stand.azimuth_deg, stand.practice) == (0.01, 0.0, "per-station")
+    for profile in (proposed, mwdcal.calibrate(table, proposed)):
+        assert (
+            mwdcal.calibrate(table, profile).profile
+            == mwdcal.calibrate(table, proposed.profile).profile
+        )
+    with pytest.raises(mwdcal.InputError, match="`profile` must be a tool profile.*got int"):
+        mwdcal.read_run(table, 3)
+
+
 def test_a_procedure_is_that_of_the_command(tmp_path, monkeypatch):
     monkeypatch.setattr(procedure, "TOOLS_AT_ONCE", 3)
     output = tmp_path / "tools.parquet"
@@ -255,6 +286,10 @@ REFUSED = {
     "order": (lambda: mwdcal.simulate("moosavi-12", order=7), r"`order` must be 0, 1, 2, 3 or auto; got 7"),
     "both": (lambda: mwdcal.simulate("moosavi-12", "servo", calibration="c.json"), r"Leave out `tool`"),
     "table": (lambda: mwdcal.propose_profile("nowhere.csv"), r"nowhere.csv"),
+    "no file": (lambda: mwdcal.propose_profile({"ax": [1.0]}), r"`table_path` must be a file; got dict"),
+    "no tool": (lambda: mwdcal.plan("generic"), r"'generic' \(the default without `tool`\) does not state the noise"),
+    "stand": (lambda: mwdcal.load_profile("servo").with_stand(tilt=1.0), r"the stand: .*unknown field `tilt`"),
+    "stand's 1σ": (lambda: mwdcal.load_profile("servo").with_stand(azimuth_deg="1"), r"the stand: Expected `float`"),
 }  # fmt: skip
 
 

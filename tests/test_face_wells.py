@@ -229,6 +229,19 @@ def test_surveys_as_a_table_of_pandas(cal):
     )
 
 
+def test_surveys_without_references_are_not_judged_and_a_serial_is_a_column(cal, tmp_path):
+    names = ("md_m", "temperature_c", "ax", "ay", "az", "mx", "my", "mz")
+    table = {name: read_csv(EXAMPLE / "well.csv")[name] for name in names}
+    well = mc.survey(cal, table)
+    assert "off:" not in well.summary()
+    well.report(tmp_path / "well.html")
+    assert "36 surveys not judged by the limits owsg-mwd" in (tmp_path / "well.html").read_text()
+    said = {finding.id: finding.text for finding in well.findings}
+    assert said["no-serial"].startswith("no serial in the readings: nothing shows")
+    with_serial = mc.survey(cal, {**table, "serial": ["SIM-0001"] * 36})
+    assert said.keys() - {f.id for f in with_serial.findings} == {"no-serial"}
+
+
 def test_options_of_surveys_are_those_of_the_command(folder, tmp_path):
     typed = ran(
         *("survey", folder / "tool.json", WELL, "--limits", "fixed", "--tie-in", "1,2,3"),

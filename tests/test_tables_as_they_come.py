@@ -450,7 +450,19 @@ def test_a_sheet_of_a_roll_test_is_set_aside_and_named(tmp_path):
     proposal = library.propose_profile(path)
     assert library.read_run(path, proposal.profile).count == 24
     assert "sheet 'Calibration'" in proposal.summary()
-    assert "(roll test, 24 rows)" in proposal.summary()
+    assert "(roll test on sheet 'Roll test', 24 rows)" in proposal.summary()
+
+
+@pytest.mark.parametrize(("other", "named"), [("Roll test", True), ("Old void", False)])
+def test_the_next_commands_name_a_roll_test_in_the_file_of_the_run(tmp_path, other, named):
+    path = workbook_of(tmp_path / "a.xlsx", table(station=[*range(1, 49)]), ["Calibration", other])
+    tool, page = tmp_path / "tool.toml", tmp_path / "cal.html"
+    ran = mwdcal("profile", path, "-o", tool)
+    assert (f"--rolltest {path}" in ran.out) == named, ran
+    ran = mwdcal("calibrate", path, "--tool", tool, "-o", tmp_path / "cal.json", "--report", page)
+    verify = f"mwdcal verify {tmp_path / 'cal.json'} {path if named else 'ROLLTEST.csv'}"
+    assert f"next: {verify}\n" in ran.out, ran
+    assert f"mwdcal verify cal.json {'a.xlsx' if named else 'ROLLTEST.csv'}" in page.read_text()
 
 
 def formulas(columns, name):
