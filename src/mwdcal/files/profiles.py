@@ -201,7 +201,7 @@ def decoded_profile(data: bytes, source: str) -> Profile:
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
         raise InputError(
             f"{source}: a tool profile must be TOML; {_lower_first(toml_problem(error))}. Correct the "
-            'file; numbers have a decimal point, text needs quotes, axes are a list such as ["+x", "+y", "+z"].'
+            'file; text needs quotes, axes are a list such as ["+x", "+y", "+z"].'
         ) from None
     check_profile(profile, source)
     return profile

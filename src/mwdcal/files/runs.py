@@ -211,12 +211,9 @@ def _undocumented(path: str | os.PathLike[str], error: InputError) -> InputError
 
 
 def read_roll_test(
-    path: str | os.PathLike[str],
-    run: Table | Layout,
-    profile: Profile,
-    statements: Mapping[str, str],
+    path: str | os.PathLike[str], run: Table, profile: Profile, statements: Mapping[str, str]
 ) -> Table | None:
-    """The roll test in the file of a `run`, on a sheet or below a line that says so; None without one."""
+    """The roll test in the file of a run, on a sheet or below a line that says so; None without one."""
     from mwdcal.files.formats.layout import ROLL_TEST
 
     form = profile.form

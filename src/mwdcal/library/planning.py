@@ -328,9 +328,11 @@ class ProposedProfile(Result):
     def _text(self) -> str:
         from mwdcal.presentation.proposal import screen
 
-        where, output = self.proposal.where, self.files.get("output")
-        test = where and output and runs.read_roll_test(self.path, where, self.proposal.profile, {})
-        return screen(self.proposal, self.path, output, bool(test))
+        profile, output, test = self.proposal.profile, self.files.get("output"), None
+        if output and self.proposal.where:
+            run = runs.read_export(self.path, profile)
+            test = runs.read_roll_test(self.path, run, profile, {})
+        return screen(self.proposal, self.path, output, test is not None)
 
     def _document(self) -> dict[str, Any]:
         from mwdcal.presentation.proposal import summary

@@ -469,12 +469,8 @@ def _findings(test: RollTest, skipped: Sequence[str]) -> Iterator[Finding]:
         where = f"{beyond} of {readings.count} stations ({tested} °C)"
         calibrated = _span(*calibration.temperature_c or (np.nan, np.nan))
         yield _finding("outside-temperature", where=where, calibrated=calibrated)
-    triads: dict[tuple[str, str], list[str]] = {}
     for free in calibration.undetermined():
-        triad, _, text = free.text.partition(": ")
-        triads.setdefault((free.id, text), []).append(triad)
-    for (name, text), each in triads.items():
-        yield Finding(id=name, text=f"{' and '.join(each)}: {text}.")
+        yield Finding(id=free.id, text=f"{free.text}.")
     if skipped:
         yield _finding("not-judged", limits="; ".join(skipped))
     if not test.sets:
