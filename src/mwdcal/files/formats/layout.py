@@ -321,11 +321,6 @@ def _the_run(tables: Sequence[Layout]) -> Layout | None:
     return replace(runs[0], left_out=(*runs[0].left_out, *aside))
 
 
-def _on_sheet(table: Layout, run: Layout) -> str:
-    """The sheet of a table in words, where it is another than that of the run."""
-    return f" on sheet {shown(table.sheet)}" if table.sheet != run.sheet else ""
-
-
 def _kind(words: str) -> str:
     """A void run or a roll test, by the sheet of a table and the line above it; empty for a run."""
     kinds = (("void run", _OF_VOID_RUN), (ROLL_TEST, _OF_ROLL_TEST))
@@ -405,6 +400,11 @@ def _are_numbered_on(tables: Sequence[Layout]) -> bool:
         all(map(str.isdecimal, cells)) and all(int(b) == int(a) + 1 for a, b in pairwise(cells))
         for cells in columns
     )
+
+
+def _on_sheet(table: Layout, run: Layout) -> str:
+    """The sheet of a table in words, where it is another than that of the run."""
+    return f" on sheet {shown(table.sheet)}" if table.sheet != run.sheet else ""
 
 
 def _joined_sheets(tables: Sequence[Layout]) -> Layout:
