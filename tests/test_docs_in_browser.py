@@ -84,7 +84,7 @@ def test_a_page_is_accessible_and_no_wider_than_the_window(browser, name):
         ("noise", "howto/noise.html"),
         ("uncertainty", "explanation/uncertainty.html"),
         ("pandas", "tutorials/python.html"),
-        ("undetermined", "explanation/decisions.html"),
+        ("undetermined", "reference/glossary.html"),
         ("feet", "howto/survey.html"),
         ("fahrenheit", "reference/tables.html"),
         ("merged", "reference/exports.html"),
