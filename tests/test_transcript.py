@@ -16,7 +16,7 @@ FIVE_MINUTES = 300.0
 
 def commands_of(block):
     """The command lines of a block, each with the lines that it shows of its output."""
-    parts = re.split(r"^\$ mwdcal ", block, flags=re.MULTILINE)[1:]
+    parts = re.split(r"^\$ mwdcal ", block.replace("\\\n", ""), flags=re.MULTILINE)[1:]
     return [(part.split("\n")[0].split(), part.strip().split("\n")[1:]) for part in parts]
 
 
