@@ -119,6 +119,8 @@ def test_a_column_marks_the_roll_test(tmp_path, case):
         parts[1],
         "--json",
     )
+    later = mwdcal("verify", tmp_path / "a.json", table, "--json")
+    assert later.json["rows"] == ran.json["verification"]["rows"]
     assert ran.json["stations"] == counts[0]
     assert ran.json["verification"]["stations"] == counts[1]
     rows = [

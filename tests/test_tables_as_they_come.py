@@ -465,6 +465,26 @@ def test_the_next_commands_name_a_roll_test_in_the_file_of_the_run(tmp_path, oth
     assert f"mwdcal verify cal.json {'a.xlsx' if named else 'ROLLTEST.csv'}" in page.read_text()
 
 
+def test_verify_and_diagnose_take_the_roll_test_in_the_file_of_the_run(tmp_path):
+    """The verdict is that of `calibrate --rolltest` and of the sheet alone; a file without one is refused."""
+    whole, channels = table(station=[*range(1, 49)]), ["Calibration", "Roll test"]
+    path = workbook_of(tmp_path / "a.xlsx", whole, channels)
+    half = {name: cells[24:] for name, cells in whole.items()}
+    alone = workbook_of(tmp_path / "roll.xlsx", half, ["Roll test"])
+    calibrated(tmp_path, path)
+    tool, cal = tmp_path / "tool.toml", tmp_path / "cal.json"
+    at_once = mwdcal("calibrate", path, "--tool", tool, "-o", cal, "--rolltest", path, "--json")
+    rows = [mwdcal("verify", cal, file, "--json").json["rows"] for file in (path, alone)] + [
+        at_once.json["verification"]["rows"]
+    ]
+    assert rows[0] == rows[1] == rows[2]
+    faults = [mwdcal("diagnose", cal, file, "--json").json["likelihoods"] for file in (path, alone)]
+    assert faults[0] == faults[1]
+    assert library.verify(cal, path).to_dict()["stations"] == 24
+    first = workbook_of(tmp_path / "b.xlsx", {n: c[:24] for n, c in whole.items()}, ["Calibration"])
+    assert "24 of 24 stations were in the fit" in refused(mwdcal("verify", cal, first), 2)
+
+
 def formulas(columns, name):
     """Formulas in a column that no spreadsheet program has calculated."""
     return {**columns, name: [f"=C{k + 2}+1" for k in range(48)]}

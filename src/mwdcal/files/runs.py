@@ -24,7 +24,7 @@ from mwdcal.calibration.readings import (
     is_simulated,
     serial_of,
 )
-from mwdcal.calibration.record import Finding
+from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import FitError, InputError, QuestionError
 from mwdcal.estimation.problem import ANGLES, WALKS
 from mwdcal.files import synonyms
@@ -54,6 +54,7 @@ from mwdcal.files.formats.columns import LABELS, Column, plain_names, shown
 from mwdcal.files.formats.table import Table, labels
 from mwdcal.files.formats.text import holds_numbers, is_formula
 from mwdcal.files.marks import UNMARKED, without_rejected
+from mwdcal.files.parting import parted
 from mwdcal.files.repeats import means, repeats
 from mwdcal.files.statements import stated_table
 from mwdcal.geometry.observables import OBSERVABLES
@@ -225,6 +226,28 @@ def read_roll_test(
             table = _with_form(_of_layout(where, path, profile), form)
             return stated_table(table, statements, _serial_column(table, profile))
     return None
+
+
+def read_later(
+    path: str | os.PathLike[str],
+    calibration: Calibration,
+    *,
+    decimal: str = ".",
+    statements: Mapping[str, str] | None = None,
+) -> Table:
+    """The table of readings after a calibration: of the file of its own run the roll test in it, if there is one.
+
+    `decimal` and `statements` as for `read_export`.
+    """
+    profile, said = calibration.profile, statements or {}
+    table = read_export(path, profile, decimal=decimal, rows=MOST_ROWS, statements=said)
+    if not any(calibration.used(read_run(table, profile)[0].digest)):
+        return table
+    test = read_roll_test(path, table, profile, said)
+    if test is None:
+        with suppress(InputError):
+            test = parted(table)[1]
+    return test or table
 
 
 def _with_form(table: Table, form: TableFormat) -> Table:

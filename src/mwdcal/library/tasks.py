@@ -278,11 +278,18 @@ def calibration_of(source: object) -> Calibration:
     )
 
 
+def _later(source: RunSource, calibration: Calibration) -> RunSource:
+    """Readings after a calibration as they are given; the table of a file, of that of the run its roll test."""
+    file = isinstance(source, str | os.PathLike)
+    return runs.read_later(cast(Path, source), calibration) if file else source
+
+
 def verify(
     calibration: Calibration | Path, rolltest: RunSource, limits: Path | Limits = "roll-test"
 ) -> Verdict:
-    """Judge a calibration, or its file, by readings that its fit has not seen: `.passed`, and `.rows` with each figure.
+    """Judge a calibration by readings that its fit has not seen: `.passed`, and `.rows` with each figure.
 
+    `calibration` may be its file, and `rolltest` the file of its run, where that has a roll test too.
     `limits` is a shipped limits profile by name, a TOML file by path, or `Limits`.
 
     Raises:
@@ -290,7 +297,7 @@ def verify(
             which no limit applies.
     """
     calibration = calibration_of(calibration)
-    rolltest = readings_of(rolltest, "rolltest", calibration.profile)
+    rolltest = readings_of(_later(rolltest, calibration), "rolltest", calibration.profile)
     bounds, digest = (limits, "") if isinstance(limits, Limits) else load_limits(limits)
     verdict = judge(calibration, rolltest, bounds)
     findings = [*verdict.findings, *of_table(rolltest)]
@@ -310,7 +317,7 @@ def diagnose(calibration: Calibration | Path, later: RunSource) -> Diagnosis:
         InputError: readings of another tool or of the fit itself, or none that can be used.
     """
     calibration = calibration_of(calibration)
-    later = readings_of(later, "later", calibration.profile)
+    later = readings_of(_later(later, calibration), "later", calibration.profile)
     result = explain(calibration, later)
     findings = [*calibration.change_findings(), *result.findings, *of_table(later)]
     result = msgspec.structs.replace(result, findings=findings)

@@ -42,7 +42,8 @@ def command(
 
     options.check_outputs([output], [calibration, readings], page=report, form=".json")
     fitted, digest = calibration_of(calibration)
-    later, _ = runs.read_run(readings, fitted.profile, decimal=decimal)
+    table = runs.read_later(readings, fitted, decimal=decimal)
+    later, _ = runs.read_run(table, fitted.profile)
     result = diagnose(fitted, later)
     findings = findings_with_option_names(
         [*fitted.change_findings(), *result.findings, *of_table(later)]

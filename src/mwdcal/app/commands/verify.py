@@ -25,7 +25,7 @@ def command(
     calibration: Path, run: Path, limits: str, output: Path | None, report: Path | None, decimal: str,
     key: tuple[Path, ...], as_json: bool,
 ) -> None:  # fmt: skip
-    """Verify a CALIBRATION by a roll test: a RUN whose stations were not in the fit.
+    """Verify a CALIBRATION by a roll test: a RUN whose stations were not in the fit, or the roll test in its file.
 
     \b
     Example: mwdcal verify tool.json rolltest.csv --limits roll-test
@@ -47,9 +47,8 @@ def command(
     options.check_outputs([output], [calibration, run, limits, *key], page=report, form=".json")
     loaded = load_calibration(calibration, key)
     fitted = loaded.calibration
-    readings, _ = runs.read_run(
-        run, fitted.profile, decimal=decimal, statements=options.statements()
-    )
+    table = runs.read_later(run, fitted, decimal=decimal, statements=options.statements())
+    readings, _ = runs.read_run(table, fitted.profile)
     bounds, limits_digest = load_limits(limits)
     result = verify(fitted, readings, bounds)
     late = overdue(standards_of(fitted.profile), readings.metadata)
