@@ -294,7 +294,7 @@ def _as_documented(path: str | os.PathLike[str], decimal: str, rows: int) -> Tab
 def _unlike_profile(problem: InputError) -> InputError:
     return InputError(
         f"{problem} If the table is laid out otherwise than the tool profile says, or names its columns otherwise, "
-        "correct [table] and [columns] there, or propose a profile for it: mwdcal profile."
+        "rename them, correct [table] and [columns] there, or propose a profile for it: mwdcal profile."
     )
 
 

@@ -17,6 +17,7 @@ from mwdcal.calibration.record import MARGIN, Calibration, Finding, html_table, 
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, eigen
+from mwdcal.use.correction import UNKNOWN_TEMPERATURE
 from mwdcal.use.roll_test import (
     DEPARTURE_CHANCE,
     HARMONICS,
@@ -142,6 +143,7 @@ VERDICT_FINDINGS = {
     "holds at the temperature of the test alone{tested}.",
     "outside-temperature": "{where} lie outside the calibrated range {calibrated} °C. The calibration has no "
     "temperature terms: drift over the difference counts as its error.",
+    "temperature-unknown": f"{UNKNOWN_TEMPERATURE}.",
     "not-judged": "not judged: {limits}.",
     "contradicted": "the readings contradict references of the run that no limit judges: {what}. Check their unit, "
     "sign and place; or signs or axes of a sensor are exchanged. The verdict says nothing about it.",
@@ -469,8 +471,14 @@ def _findings(test: RollTest, skipped: Sequence[str]) -> Iterator[Finding]:
         where = f"{beyond} of {readings.count} stations ({tested} °C)"
         calibrated = _span(*calibration.temperature_c or (np.nan, np.nan))
         yield _finding("outside-temperature", where=where, calibrated=calibrated)
-    for free in calibration.undetermined():
-        yield Finding(id=free.id, text=f"{free.text}.")
+    if warmth is None and calibration.temperature_c:
+        yield _finding("temperature-unknown", calibrated=f"{_span(*calibration.temperature_c)} °C")
+    free: dict[tuple[str, str], list[str]] = {}  # what both triads leave free is said once
+    for entry in calibration.undetermined():
+        triad, colon, text = entry.text.partition(": ")
+        free.setdefault((entry.id, colon + text), []).append(triad)
+    for (name, text), triads in free.items():
+        yield Finding(id=name, text=f"{' and '.join(triads)}{text}.")
     if skipped:
         yield _finding("not-judged", limits="; ".join(skipped))
     if not test.sets:
