@@ -724,6 +724,18 @@ class RollTest:
             "at right angles, or more"
         )
 
+    def off_plane(self, index: Ints) -> float:
+        """Root mean square distance of gravity at stations from their plane, g, without the station that helps most.
+
+        A tool rolled about a fixed axis shows gravity in one plane, whatever its biases, scales and axes.
+        """
+        g = self.fields[0][index]
+        g = g - g.mean(0)
+        count = len(g) - 1
+        each = (count + 1) / count * g[:, :, None] * g[:, None]
+        least = np.linalg.eigvalsh(g.T @ g - each)[:, 0].min()
+        return float(np.sqrt(max(least, 0.0) / count))
+
     def harmonics(self, roll_set: RollSet) -> int:
         """Harmonics of the curve that a rolled set determines, 1 or 2."""
         return int(self._coverage(roll_set.index).harmonics)
@@ -929,6 +941,8 @@ class RollTest:
         index = roll_set.index
         sd, number = self.readings.uncertainty(name)[index], self.settings[index]
         zero = float(self._common(name)[index].max()) if error else 0.0
+        if name in DIRECTION and self._set_unseen(name, index):
+            return ReferenceErrors(np.full(sd.shape, self._setting_error(name)), None, 0.0, zero)
         if name == "toolface":
             return ReferenceErrors(sd, None, 0.0, zero)
         if name in ANGLES and not roll_set.declared and len(set(number.tolist())) > 1:
@@ -939,6 +953,16 @@ class RollTest:
         most = float(sd.max()) if error else 0.0
         whole = most * float(np.sqrt(np.mean((sd / most) ** 2))) if most else 0.0
         return ReferenceErrors(np.zeros(sd.shape), None, whole, zero)
+
+    def _set_unseen(self, name: str, index: Ints) -> bool:
+        """Whether the stand was set at each of some stations, and the run has not to what angle."""
+        unknown = np.isnan(self.readings.reference(name)[index]).all()
+        return self.readings.settings == "per-station" and bool(unknown)
+
+    def _setting_error(self, name: str) -> float:
+        """Standard uncertainty of one setting of an angle by the profile, radians."""
+        stand, angle = self.calibration.profile.stand, f"{name}_deg"
+        return float(np.radians(np.hypot(stand.of(angle), stand.repeatability(angle))))
 
     def common_errors(self, name: str, reference: ReferenceErrors, first: int) -> Array:
         """Error that a set (its `first` station) shares (d,) in tests like this one."""

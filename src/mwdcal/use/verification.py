@@ -354,6 +354,7 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
     for check in (_check_tool, _check_independent, _check_temperature):
         check(calibration, readings)
     test = RollTest(calibration, readings)
+    _check_rolled(test)
     outcomes = [(SPREAD_OF + n, n, most, test.spread(n)) for n, most in limits.spread.items()]
     outcomes += [(f"error of {n}", n, most, test.error(n)) for n, most in limits.error.items()]
     skipped = _skipped({title: outcome.skipped for title, *_, outcome in outcomes})
@@ -535,6 +536,21 @@ def _check_temperature(calibration: Calibration, readings: Readings) -> None:
             f"{readings.name}: {outside.size} {lie} outside the calibrated range {low:.1f}…{high:.1f} °C "
             f"(first: station {readings.labels[outside[0]]}). Verify within the range, or calibrate over a wider one."
         )
+
+
+def _check_rolled(test: RollTest) -> None:
+    """Refuse stations of a run that names no direction, where they are of several."""
+    readings = test.readings
+    named = (readings.groups >= 0).any() or np.isfinite(readings.reference("inclination")).any()
+    most = np.sin(NO_ERROR_OF_A_TOOL["inclination"])
+    if named or not any(test.off_plane(s.index) > most for s in test.sets):
+        return
+    angles = np.degrees(test.value("inclination"))
+    raise InputError(
+        f"{readings.name}: stations at inclinations from {angles.min():.1f}° to {angles.max():.1f}° are no roll test, "
+        "in which the tool is rolled about an axis that stands still. Name another table, or give "
+        "ref_inclination_deg and ref_azimuth_deg, or a group for each direction."
+    )
 
 
 def _judged(title: str, name: str, limit: float, outcome: Departures, guarded: bool) -> _Judged:
