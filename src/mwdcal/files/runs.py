@@ -213,18 +213,38 @@ def _undocumented(path: str | os.PathLike[str], error: InputError) -> InputError
 def read_roll_test(
     path: str | os.PathLike[str], run: Table, profile: Profile, statements: Mapping[str, str]
 ) -> Table | None:
-    """The roll test in the file of a run, on a sheet or below a line that says so; None without one."""
+    """The roll test in the file of a run: on a sheet or below a line that says so, or on the only other sheet like it.
+
+    None without one.
+    """
     from mwdcal.files.formats.layout import ROLL_TEST
 
     form = profile.form
     decimal = "," if form.decimal == "," else ""
     wanted = _channels_of(profile) or CHANNELS["accelerometer"]
     with suppress(InputError, FitError):
-        where = tables.laid_out(path, wanted=wanted, decimal=decimal, kind=ROLL_TEST)
+        try:
+            where = tables.laid_out(path, wanted=wanted, decimal=decimal, kind=ROLL_TEST)
+        except InputError:
+            where = _other_sheet(path, run, wanted, decimal)
         if where and (where.sheet, where.lines[0]) != (run.sheet, run.lines[0]):
             table = _with_form(_of_layout(where, path, profile), form)
             return stated_table(table, statements, _serial_column(table, profile))
     return None
+
+
+def _other_sheet(
+    path: str | os.PathLike[str], run: Table, wanted: Sequence[str], decimal: str
+) -> Layout | None:
+    """The table on the only sheet of columns like those of a run beside it; None where there is none, or several."""
+    try:
+        return tables.laid_out(path, wanted=wanted, decimal=decimal)
+    except QuestionError as question:
+        said = [value for answer in question.answers for _, value in answer.arguments]
+        others = [sheet for sheet in said if sheet != run.sheet]
+    if len(others) != 1:
+        return None
+    return tables.laid_out(path, sheet=others[0], wanted=wanted, decimal=decimal)
 
 
 def _with_form(table: Table, form: TableFormat) -> Table:

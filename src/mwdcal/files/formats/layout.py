@@ -450,8 +450,8 @@ def _no_table(
     source: str, header_line: int, wanted: Collection[str], found: Sequence[Layout]
 ) -> InputError:
     nearest = max(found, key=lambda t: len({*wanted} & {*t.names}), default=None)
-    if nearest and not {*wanted}.isdisjoint(nearest.names):
-        absent = [name for name in wanted if name not in nearest.names]
+    absent = [name for name in wanted if nearest and name not in nearest.names]
+    if nearest and 0 < len(absent) < len(wanted):
         others = [name for name in nearest.names if name not in wanted]
         listed = f"; its others are {', '.join(map(shown, others[:8]))}" if others else ""
         columns = "column" if len(absent) == 1 else "columns"
