@@ -171,7 +171,9 @@ def _with_nearest(error: click.ClickException) -> click.ClickException:
     context = error.ctx if isinstance(error, click.UsageError) else None
     extra = _EXTRA.fullmatch(error.message)
     if context and extra and any(p.name == "rolltest" for p in context.command.params):
-        question = f"{error.message}. Is it the roll test? --rolltest {extra[1]}"
+        profile = extra[1].lower().endswith(".toml")
+        meant = "the tool profile? --tool" if profile else "the roll test? --rolltest"
+        question = f"{error.message}. Is it {meant} {extra[1]}"
         return click.UsageError(question, context)
     return error
 

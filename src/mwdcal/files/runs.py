@@ -284,7 +284,7 @@ def _exported(
         except InputError as error:
             if table := _as_documented(path, decimal, rows):
                 return table
-            raise _unlike_profile(error) from None
+            raise _unlike_profile(error, path) from None
         return _of_layout(where, path, profile) if where else tables.read(path)
     try:
         serial = _sources(profile).get("serial", ColumnSource(name="serial")).name
@@ -299,7 +299,7 @@ def _exported(
         return documented
     if moved := _moved(path, form, profile):
         return _of_layout(moved, path, profile)
-    raise _unlike_profile(problem)
+    raise _unlike_profile(problem, path)
 
 
 def _as_documented(path: str | os.PathLike[str], decimal: str, rows: int) -> Table | None:
@@ -311,7 +311,10 @@ def _as_documented(path: str | os.PathLike[str], decimal: str, rows: int) -> Tab
     return None
 
 
-def _unlike_profile(problem: InputError) -> InputError:
+def _unlike_profile(problem: InputError, path: str | os.PathLike[str]) -> InputError:
+    """The problem with a table, with what to do where it is another than the profile's; of no file as it is."""
+    if not Path(path).is_file():
+        return problem
     return InputError(
         f"{problem} If the table is laid out otherwise than the tool profile says, or names its columns otherwise, "
         "rename them, correct [table] and [columns] there, or propose a profile for it: mwdcal profile."
