@@ -1312,19 +1312,32 @@ def _alternatives(axes: OpenAxes) -> str:
 def left_handed(proposal: Proposal) -> list[Finding]:
     """A finding on triads whose channels x, y, z are a left-handed set by the axes proposed.
 
-    Not on an accelerometer alone beside a right-handed magnetometer: it reads positive upwards, as many do.
+    Not on an accelerometer whose channels all read opposite to those of the magnetometer: positive upwards, as many do.
     """
     triads = [kind for kind, result in proposal.wirings.items() if _is_left_handed(result)]
-    if not triads or (triads != [*proposal.wirings] and triads == ["accelerometer"]):
-        return []  # of the other polarity: a reversed angle would turn the magnetometer as well
+    others = [kind for kind in proposal.wirings if kind not in triads]
+    reversed_axes = [
+        tuple(axis.translate(_OTHER_SIGN) for axis in proposal.wirings[kind].axes)
+        for kind in triads
+    ]
+    if not triads or (others and reversed_axes == [proposal.wirings[others[0]].axes]):
+        return []
+    reason = (
+        f"two channels are exchanged or one is reversed, other than in the {others[0]}: correct that, or read roll "
+        "test and surveys with the same wiring"
+        if others
+        else "a reference angle counts the other way: toolface anticlockwise, or inclination from below"
+    )
     return [
         Finding(
             id="left-handed",
             text=f"{' and '.join(triads)}: by the axes proposed the channels x, y, z are a left-handed set. If the "
-            "tool is not built so, a reference angle counts the other way: toolface anticlockwise, or inclination "
-            "from below.",
+            f"tool is not built so, {reason}.",
         )
     ]
+
+
+_OTHER_SIGN = str.maketrans("+-", "-+")
 
 
 def lines_not_taken(proposal: Proposal) -> list[Finding]:
