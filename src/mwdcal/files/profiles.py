@@ -213,7 +213,7 @@ def _unreadable(data: bytes, error: Exception, source: str) -> InputError:
         )
     return InputError(
         f"{source}: a tool profile must be TOML; {_lower_first(toml_problem(error))}. Correct the "
-        'file; text needs quotes, axes are a list such as ["+x", "+y", "+z"].'
+        'file; text needs quotes, numbers a decimal point, axes are a list such as ["+x", "+y", "+z"].'
     )
 
 

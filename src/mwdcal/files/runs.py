@@ -25,7 +25,7 @@ from mwdcal.calibration.readings import (
     serial_of,
 )
 from mwdcal.calibration.record import Finding
-from mwdcal.errors import FitError, InputError, QuestionError
+from mwdcal.errors import FitError, InputError, QuestionError, UnreadableFileError
 from mwdcal.estimation.problem import ANGLES, WALKS
 from mwdcal.files import synonyms
 from mwdcal.files.contract import (
@@ -284,7 +284,7 @@ def _exported(
         except InputError as error:
             if table := _as_documented(path, decimal, rows):
                 return table
-            raise _unlike_profile(error, path) from None
+            raise _unlike_profile(error) from None
         return _of_layout(where, path, profile) if where else tables.read(path)
     try:
         serial = _sources(profile).get("serial", ColumnSource(name="serial")).name
@@ -299,7 +299,7 @@ def _exported(
         return documented
     if moved := _moved(path, form, profile):
         return _of_layout(moved, path, profile)
-    raise _unlike_profile(problem, path)
+    raise _unlike_profile(problem)
 
 
 def _as_documented(path: str | os.PathLike[str], decimal: str, rows: int) -> Table | None:
@@ -311,9 +311,9 @@ def _as_documented(path: str | os.PathLike[str], decimal: str, rows: int) -> Tab
     return None
 
 
-def _unlike_profile(problem: InputError, path: str | os.PathLike[str]) -> InputError:
-    """The problem with a table, with what to do where it is another than the profile's; of no file as it is."""
-    if not Path(path).is_file():
+def _unlike_profile(problem: InputError) -> InputError:
+    """The problem with a table, and what to do where it is another than the profile's."""
+    if isinstance(problem, UnreadableFileError):
         return problem
     return InputError(
         f"{problem} If the table is laid out otherwise than the tool profile says, or names its columns otherwise, "

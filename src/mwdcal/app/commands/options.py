@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from unicodedata import normalize
 
 import click
@@ -39,6 +39,26 @@ class Within(click.FloatRange):
     """A number in a range."""
 
     name = "number"
+
+
+class Day(click.DateTime):
+    """A day, year first."""
+
+    def __init__(self) -> None:
+        super().__init__(["%Y-%m-%d"])
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> datetime:
+        """The day that a text states; refuse another form in words that name this one."""
+        try:
+            return cast("datetime", super().convert(value, param, ctx))
+        except click.BadParameter:
+            self.fail(f"expected a day such as 2026-11-28; got '{value}'.", param, ctx)
+
+
+DAY = Day()
+"""A day as it is typed."""
 
 
 class PointedNumber(click.types.FloatParamType):
@@ -167,7 +187,7 @@ def of_run(function: Function) -> Function:
         noted("--operator", metavar="NAME", help="Who measured; comes before the table's own."),
         noted(
             "--date",
-            type=click.DateTime(["%Y-%m-%d"]),
+            type=DAY,
             metavar="YYYY-MM-DD",
             help="Day of the run; likewise.",
         ),

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from mwdcal.errors import Answer, FitError, InputError, QuestionError
+from mwdcal.errors import Answer, FitError, InputError, QuestionError, UnreadableFileError
 from mwdcal.files.formats import figures
 from mwdcal.files.formats.columns import (
     Merged,
@@ -832,7 +832,7 @@ def _check_cut(
         cut.append((last, row))
     if cut:
         line, row = cut[0]
-        raise InputError(
+        raise UnreadableFileError(
             f"{source}, row {line}: '{_words(row)}' begins as a station and ends before the numbers of the other "
             "rows. Was the file cut? Export the whole of it."
         )
