@@ -236,7 +236,7 @@ def read_roll_test(
 def _other_sheet(
     path: str | os.PathLike[str], run: Table, wanted: Sequence[str], decimal: str
 ) -> Layout | None:
-    """The table on the only sheet of columns like those of a run beside it; None where there is none, or several."""
+    """The table on the only sheet of columns like those of a run beside it; None of several, or without one."""
     try:
         return tables.laid_out(path, wanted=wanted, decimal=decimal)
     except QuestionError as question:
@@ -492,11 +492,13 @@ def renamed(table: Table, profile: Profile) -> Table:
         return _with_stated_references(table)
     sources = _sources(profile)
     theirs = {s.name: column for column, s in sources.items() if s.name in table.columns}
+    others = [name for name in table.columns if name not in theirs]
     for column, source in sources.items():
         if column in RAW and source.name not in table.columns:
             raise InputError(
-                f"{table.source}: the column {shown(source.name)}, which is '{column}' by the tool profile, "
-                "is missing. Correct [columns] in the profile."
+                f"{table.source}: the table has no column {shown(source.name)}, which is '{column}' by the tool "
+                f"profile; its others are {', '.join(map(shown, others[:8])) or 'none'}. Rename one of them, or "
+                "correct [columns] in the profile."
             )
         if column in table.columns and source.name != column and column not in theirs:
             raise InputError(

@@ -168,9 +168,7 @@ def is_of_one_sphere(names: Sequence[str], values: Values) -> bool:
     centred, largest = columns - columns.mean(0), float(np.ptp(columns, axis=0).max())
     middle, squares = _sphere(centred)
     left = np.sum(centred**2, -1) - squares
-    return bool(
-        np.abs(middle).max() <= largest and np.std(left) <= _OFF_SPHERE * largest**2
-    )
+    return bool(np.abs(middle).max() <= largest and np.std(left) <= _OFF_SPHERE * largest**2)
 
 
 def triples_for(
@@ -1073,7 +1071,7 @@ def _check_triads(
     said: Collection[str],
     source: str,
 ) -> None:
-    """Refuse a table without accelerometers, with a part of the magnetometers, or with channels said that are none."""
+    """Refuse a table without accelerometers, with a part of the magnetometers, or with a wrong channel said."""
     others = [n for n in names if n not in {each.name for each in chosen.values()}]
     listed = f"the names are {', '.join(map(shown, names[:20]))}"
     if {*RAW[:3]}.isdisjoint(chosen):

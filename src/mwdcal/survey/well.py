@@ -350,7 +350,7 @@ LACKING_PATH = {
     True: "no station has both a measured depth and a direction with azimuth",
     False: "no column has the measured depth (md_m, md_ft or md_usft)",
 }
-"""What a well path lacks, where stations have depths and where none has."""
+"""Lack that leaves a well without a path, where stations have depths and where none has."""
 OLD_DRIFT = {
     True: "allows for the drift of one year. Verify the tool, or give `registry`, where the drift of tools has no such "
     "end.",
@@ -896,7 +896,8 @@ def _findings(result: Well, counts: WellCounts, from_first: bool) -> list[Findin
         "names": " and ".join(n for n, lacks in zip(STRENGTH_NAMES, counts.lacking, strict=True) if lacks),
         "blindest": blindest, "worst": worst, "partly": counts.partly, "unjudged": counts.unjudged,
         "count": counts.rows - counts.on_path, "years": years, "day": day, "calibrated": calibrated, "course": course,
-        "usual": USUAL_COURSE, "lacking_path": LACKING_PATH[counts.located], "drift": OLD_DRIFT[DRIFT in result.terms.included],
+        "usual": USUAL_COURSE, "lacking_path": LACKING_PATH[counts.located],
+        "drift": OLD_DRIFT[DRIFT in result.terms.included],
     }  # fmt: skip
     return [*result.corrected, *result.north.findings] + [
         Finding(id=name, text=text.format(**words))

@@ -190,9 +190,10 @@ DIRECTIONS = {
 }
 """Directions that do not exist where a strength is zero."""
 UNKNOWN_TEMPERATURE = (
-    "the readings have no temperature: nothing shows that they lie in the calibrated range {calibrated}"
+    "the readings have no temperature: nothing shows that they lie in the calibrated range "
+    "{calibrated}"
 )
-"""What is not checked of readings without a temperature."""
+"""Sentence on readings without a temperature."""
 ROW_FINDINGS = {
     "no-magnetometer": "no columns mx, my, mz: magnetic results are blank.",
     "other-tool": "the readings are of tool {tools[1]}, the calibration of tool {tools[0]}: is it the right one?",

@@ -725,16 +725,20 @@ class RollTest:
         )
 
     def off_plane(self, index: Ints) -> float:
-        """Root mean square distance of gravity at stations from their plane, g, without the station that helps most.
+        """Root mean square distance of gravity or field at stations from their plane, as a share of its strength.
 
-        A tool rolled about a fixed axis shows gravity in one plane, whatever its biases, scales and axes.
+        A tool rolled about a fixed axis shows both in a plane, whatever its biases, scales and axes. Without the
+        station that is farthest off: a single wrong reading is not the set's.
         """
-        g = self.fields[0][index]
-        g = g - g.mean(0)
-        count = len(g) - 1
-        each = (count + 1) / count * g[:, :, None] * g[:, None]
-        least = np.linalg.eigvalsh(g.T @ g - each)[:, 0].min()
-        return float(np.sqrt(max(least, 0.0) / count))
+        shares, count = [0.0], len(index) - 1
+        for vectors in (each[index] for each in self.fields):
+            strength = np.linalg.norm(vectors, axis=-1)
+            v = vectors - vectors.mean(0)
+            without = v.T @ v - (count + 1) / count * v[:, :, None] * v[:, None]
+            if np.isfinite(without).all() and strength.any():
+                least = max(float(np.linalg.eigvalsh(without)[:, 0].min()), 0.0)
+                shares.append(float(np.sqrt(least / count) / np.median(strength)))
+        return max(shares)
 
     def harmonics(self, roll_set: RollSet) -> int:
         """Harmonics of the curve that a rolled set determines, 1 or 2."""

@@ -523,7 +523,7 @@ def _check_independent(calibration: Calibration, readings: Readings) -> None:
         raise InputError(
             f"{readings.name}: {used.size} of {readings.count} stations were in the fit (first: "
             f"station {readings.labels[used[0]]}). Verification needs data that the fit has not seen: take a roll "
-            "test of its own. One in the same file is read by mwdcal calibrate, with `rolltest`."
+            "test of its own. One in the file of the run is read by mwdcal calibrate --rolltest."
         )
 
 
@@ -547,9 +547,9 @@ def _check_rolled(test: RollTest) -> None:
         return
     angles = np.degrees(test.value("inclination"))
     raise InputError(
-        f"{readings.name}: stations at inclinations from {angles.min():.1f}° to {angles.max():.1f}° are no roll test, "
-        "in which the tool is rolled about an axis that stands still. Name another table, or give "
-        "ref_inclination_deg and ref_azimuth_deg, or a group for each direction."
+        f"{readings.name} is no roll test, in which the tool is rolled about an axis that stands still: its stations, "
+        f"at inclinations from {angles.min():.1f}° to {angles.max():.1f}°, are of several directions. Name another "
+        "table, or give ref_inclination_deg and ref_azimuth_deg, or a group for each direction."
     )
 
 

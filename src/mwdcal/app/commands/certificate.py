@@ -83,7 +83,9 @@ def command() -> None:
 @click.option("--number", default="", metavar="N", help="Number of the certificate.")
 @click.option("--customer", default="", metavar="NAME", help="Customer.")
 @click.option("--condition", default="", metavar="TEXT", help="Condition of the tool when it came.")
-@click.option("--received", type=options.DAY, metavar="YYYY-MM-DD", help="Day of receipt of the tool.")
+@click.option(
+    "--received", type=options.DAY, metavar="YYYY-MM-DD", help="Day of receipt of the tool."
+)
 @click.option(
     "--date",
     "day",

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 from unicodedata import normalize
 
 import click
@@ -52,7 +52,7 @@ class Day(click.DateTime):
     ) -> datetime:
         """The day that a text states; refuse another form in words that name this one."""
         try:
-            return cast("datetime", super().convert(value, param, ctx))
+            return super().convert(value, param, ctx)
         except click.BadParameter:
             self.fail(f"expected a day such as 2026-11-28; got '{value}'.", param, ctx)
 
