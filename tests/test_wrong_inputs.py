@@ -258,8 +258,8 @@ def test_a_file_of_another_kind_is_named_with_what_is_wanted(laboratory, tmp_pat
         ("plan", "four-by-six"): "Is it a plan? --plan",
         ("calibrate", book, "--tool", book, *output): "mwdcal profile book.xlsx -o tool.toml",
         ("calibrate", run, "--tool", cal, *output): "cal.json is no tool profile",
-        ("apply", tool, run, "-o", tmp_path / "o.csv"): "mwdcal calibrate RUN --tool tool.toml",
-        ("verify", cal, run): "mwdcal calibrate --rolltest",
+        ("apply", tool, run, "-o", tmp_path / "o.csv"): "Calibrate a run with it first",
+        ("verify", cal, run): "mwdcal calibrate judges one",
         ("survey", cal, run, "--date", "28.11.2026", "-o", tmp_path / "o.csv"): "such as 2026-11-28",
     }  # fmt: skip
     for arguments, words in asked.items():

@@ -1082,20 +1082,20 @@ def _check_triads(
             or triples_for(RAW[:3], others, values),
         )
     for triad, channels in CHANNELS.items():
-        found = {c: chosen[c].name for c in channels if c in chosen}
-        absent = [c for c in channels if c not in found]
-        if found and absent:
-            answers = channels_for(absent[0], others, values, [*found.values()])
+        names_of = {c: chosen[c].name for c in channels if c in chosen}
+        absent = [c for c in channels if c not in names_of]
+        if names_of and absent:
+            answers = channels_for(absent[0], others, values, [*names_of.values()])
             missing = "" if answers else f" No column can be {absent[0]}: the channel is missing."
             raise QuestionError(
                 f"{source}: could not tell which columns are the {triad}s ({', '.join(absent)}); {listed}.{missing}",
                 answers,
             )
-        told = [c for c in found if c in said]
-        if told and not is_of_one_sphere([*found.values()], values):
+        theirs = [c for c in names_of if c in said]
+        if theirs and not is_of_one_sphere([*names_of.values()], values):
             raise QuestionError(
-                f"{source}: {' and '.join(shown(found[c]) for c in told)} as {', '.join(told)} cannot be: the three "
-                f"columns of the {triad} are far from one strength at all stations. Which column is it?"
+                f"{source}: {' and '.join(shown(names_of[c]) for c in theirs)} as {', '.join(theirs)} cannot be: the "
+                f"three columns of the {triad} are far from one strength at all stations. Which column is it?"
             )
 
 

@@ -84,12 +84,12 @@ def command() -> None:
 @click.option("--customer", default="", metavar="NAME", help="Customer.")
 @click.option("--condition", default="", metavar="TEXT", help="Condition of the tool when it came.")
 @click.option(
-    "--received", type=options.DAY, metavar="YYYY-MM-DD", help="Day of receipt of the tool."
+    "--received", type=options.Day(), metavar="YYYY-MM-DD", help="Day of receipt of the tool."
 )
 @click.option(
     "--date",
     "day",
-    type=options.DAY,
+    type=options.Day(),
     metavar="YYYY-MM-DD",
     help="Day of issue; today (UTC) if not given.",
 )

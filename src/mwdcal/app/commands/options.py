@@ -57,10 +57,6 @@ class Day(click.DateTime):
             self.fail(f"expected a day such as 2026-11-28; got '{value}'.", param, ctx)
 
 
-DAY = Day()
-"""A day as it is typed."""
-
-
 class PointedNumber(click.types.FloatParamType):
     """A number with a decimal point."""
 
@@ -187,7 +183,7 @@ def of_run(function: Function) -> Function:
         noted("--operator", metavar="NAME", help="Who measured; comes before the table's own."),
         noted(
             "--date",
-            type=DAY,
+            type=Day(),
             metavar="YYYY-MM-DD",
             help="Day of the run; likewise.",
         ),

@@ -215,11 +215,11 @@ def laid_out(
             ]
         covers += [] if layouts or any(_is_reading(row) for _, row in each.rows) else [each]
         tables += [t for t in layouts if header_line in (0, t.form.header_line)]
-    found = _with_same_stations(tables)
-    tables = [t for t in found if {*wanted} <= {*t.names}]
+    every = _with_same_stations(tables)
+    tables = [t for t in every if {*wanted} <= {*t.names}]
     tables = [t for t in tables if not kind or _kind(f"{t.sheet} {t.heading}") == kind]
     if not tables:
-        raise _no_table(source, header_line, wanted, found)
+        raise _no_table(source, header_line, wanted, every)
     best = max(tables, key=lambda layout: layout.size)
     alike = [t for t in tables if t is best or (_alike(t, best) and len(t.lines) >= _BESIDES)]
     if len(alike) > 1 and not header_line and not kind:
@@ -447,9 +447,9 @@ def _alike(one: Layout, other: Layout) -> bool:
 
 
 def _no_table(
-    source: str, header_line: int, wanted: Collection[str], found: Sequence[Layout]
+    source: str, header_line: int, wanted: Collection[str], tables: Sequence[Layout]
 ) -> InputError:
-    nearest = max(found, key=lambda t: len({*wanted} & {*t.names}), default=None)
+    nearest = max(tables, key=lambda t: len({*wanted} & {*t.names}), default=None)
     absent = [name for name in wanted if nearest and name not in nearest.names]
     if nearest and 0 < len(absent) < len(wanted):
         others = [name for name in nearest.names if name not in wanted]
