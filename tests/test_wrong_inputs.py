@@ -3,6 +3,8 @@
 The tables are those of a laboratory under names of its own, made by the forward model of `simulation`.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import openpyxl
 import pytest
@@ -37,9 +39,9 @@ def named(columns, **others):
     return {names[n]: column for n, column in columns.items() if names[n]}
 
 
-def measured(inclinations, toolfaces, noise=2, scatter=0.0, azimuth=None):
+def measured(inclinations, toolfaces, noise=2, scatter=0.0, azimuth=None, tool=None):
     """A run of the tool of `servo_run`, with other noise; `scatter` of the stand's inclinations, degrees."""
-    tool = Tool.random(1, noise=SERVO_NOISE)
+    tool = tool or Tool.random(1, noise=SERVO_NOISE)
     inc, azi, face = plan(inclinations, toolfaces)
     azi = azi if azimuth is None else np.full(len(inc), azimuth)
     rng = np.random.default_rng(noise)
@@ -285,3 +287,17 @@ def test_what_both_triads_leave_free_is_said_once(tmp_path):
     ran = mwdcal("verify", cal, write_csv(tmp_path / "roll.csv", rolled()))
     assert ran.err.count("toolface zero is undetermined") == 1
     assert "accelerometer and magnetometer: toolface zero" in ran.err
+
+
+def test_gravity_that_nobody_states_is_no_fault(tmp_path):
+    """The laboratory's gravity is 1.4 mg above 1 g, and the table of the well states none: the tool is sound."""
+    tool = replace(Tool.random(1, noise=SERVO_NOISE), gravity=1.0014)
+    run = write_csv(tmp_path / "run.csv", servo_run(tool=tool))
+    assert mwdcal("calibrate", run, "--tool", "servo", "-o", tmp_path / "cal.json").code == 0
+    well = measured((5, 30, 60, 90), 6, tool=tool)
+    well = {n: c for n, c in well.items() if not n.startswith("ref_")}
+    ran = mwdcal(
+        "diagnose", tmp_path / "cal.json", write_csv(tmp_path / "well.csv", well), "--json"
+    )
+    assert ran.code == 0, ran
+    assert "1.0014 g" in findings(ran)["assumed-gravity"]
