@@ -301,3 +301,10 @@ def test_gravity_that_nobody_states_is_no_fault(tmp_path):
     )
     assert ran.code == 0, ran
     assert "1.0014 g" in findings(ran)["assumed-gravity"]
+
+
+def test_a_channel_that_stands_still_is_named(tmp_path):
+    run = write_csv(tmp_path / "run.csv", named({**servo_run(), "ay": np.full(48, 0.125)}))
+    message = refused(mwdcal("profile", run, "-o", tmp_path / "t.toml"), 3)
+    assert "ay of the accelerometer" in message
+    assert "48 stations" in message

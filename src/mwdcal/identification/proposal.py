@@ -1150,10 +1150,16 @@ def _wirings(
 ) -> tuple[dict[str, Wiring], dict[str, OpenAxes]]:
     """The axes of the triads that the run has, and why those of others are open; `scaled` has their scales."""
     known = {name: readings.reference(name) for name in NEEDED["magnetometer"]}
-    if readings.count < LEAST_STATIONS or not np.ptp(readings.accelerometer, axis=0).all():
+    if readings.count < LEAST_STATIONS:
         raise FitError(
             f"{run.source}: a profile is proposed for at least {LEAST_STATIONS} stations whose readings vary; got "
             f"{readings.count}. Measure more stations."
+        )
+    still = [n for n in CHANNELS["accelerometer"] if not np.ptp(tables.numbers(run, n))]
+    if still:
+        raise FitError(
+            f"{run.source}: no change in {' and '.join(still)} of the accelerometer: the same value at all "
+            f"{readings.count} stations. A dead sensor, a wrong column, or one attitude: check the wiring and the columns."
         )
     results: dict[str, Wiring] = {}
     open_axes: dict[str, OpenAxes] = {}
