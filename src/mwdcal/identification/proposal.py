@@ -1159,7 +1159,7 @@ def _wirings(
     if still:
         raise FitError(
             f"{run.source}: no change in {' and '.join(still)} of the accelerometer: the same value at all "
-            f"{readings.count} stations. A dead sensor, a wrong column, or one attitude: check the wiring and the columns."
+            f"{readings.count} stations. A dead sensor, a wrong column, or one attitude: check wiring and columns."
         )
     results: dict[str, Wiring] = {}
     open_axes: dict[str, OpenAxes] = {}
