@@ -147,7 +147,7 @@ OPEN = {
                                               for k, n in enumerate(exports.RAW[:3])}),
         "could not tell which columns are the accelerometers (ax, ay, az)",
     ),
-    "two magnetometers": (changed(mz=None), "only mx, my"),
+    "two magnetometers": (changed(mz=None), "the magnetometers (mz)"),
     "no relation": (
         changed(**{k: np.random.default_rng(1).normal(size=48) for k in exports.RAW}),
         "no axes of the accelerometer explain",

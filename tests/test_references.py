@@ -447,7 +447,7 @@ def test_near_a_magnetic_pole_azimuths_are_reported_as_unreliable():
         (("--altitude-m", 900_000), "Give it in metres above the ellipsoid"),
         (("--latitude", "nan"), "--latitude must be"),
         (("--longitude", "3,5"), "decimal comma"),
-        (("--date", "1.7.2026"), "does not match the format"),
+        (("--date", "1.7.2026"), "expected a day such as 2026-11-28"),
         (("--date", "2024-12-31"), "wmm2025 holds from 2025.0 to 2030.0; got 2024.997. Use --model igrf14"),
         (("--date", "2031-01-01"), "got 2031.000. Give measured values"),
         (("--date", "1899-12-31", "--model", "igrf14"), "igrf14 holds from 1900.0"),

@@ -360,7 +360,8 @@ def test_wholly_blank_columns_are_absent_and_not_missing(tmp_path, cold):
     columns, _ = gappy(3000, dict.fromkeys(names, slice(0, 3000)))
     source, out = write_parquet(tmp_path / "log.parquet", columns), tmp_path / "out.parquet"
     ran = mwdcal("apply", cold[0], source, "-o", out, "--missing", "blank", "--json")
-    assert [f["id"] for f in ran.json["findings"]] == ["no-serial", "no-magnetometer"]
+    ids = [f["id"] for f in ran.json["findings"]]
+    assert ids == ["no-serial", "no-magnetometer", "temperature-unknown"]
     assert_same(out, whole(cold[1], source)[0])
 
 

@@ -23,6 +23,10 @@ class InputError(MwdcalError):
     """A file, a profile or an option cannot be read or understood (exit code 2)."""
 
 
+class UnreadableFileError(InputError):
+    """A file that is absent, damaged or cut: no profile reads it (exit code 2)."""
+
+
 class FitError(MwdcalError):
     """The input is understood but not calibratable or not trustworthy (exit code 3)."""
 

@@ -60,6 +60,8 @@ SECTIONS = {
 }
 """Modules of `mwdcal.app.commands` with a command of their name, in the order of the work, and what each does."""
 _EXTRA = re.compile(r"Got unexpected extra argument \((.*)\)")
+_EXTRA_FILES = {"--tool": "the tool profile", "--rolltest": "the roll test", "--plan": "a plan"}
+"""Options of a file that may be meant where a command takes no more files, and what each is."""
 ALIASES = {
     "help": "mwdcal --help",
     "correct": "mwdcal apply",
@@ -170,9 +172,12 @@ def _with_nearest(error: click.ClickException) -> click.ClickException:
         return click.NoSuchOption(error.option_name, None, [nearest] if nearest else [], error.ctx)
     context = error.ctx if isinstance(error, click.UsageError) else None
     extra = _EXTRA.fullmatch(error.message)
-    if context and extra and any(p.name == "rolltest" for p in context.command.params):
-        question = f"{error.message}. Is it the roll test? --rolltest {extra[1]}"
-        return click.UsageError(question, context)
+    if context and extra:
+        known = {name for parameter in context.command.params for name in parameter.opts}
+        wanted = ("--tool",) if extra[1].lower().endswith(".toml") else ("--rolltest", "--plan")
+        for option in (name for name in wanted if name in known):
+            question = f"{error.message}. Is it {_EXTRA_FILES[option]}? {option} {extra[1]}"
+            return click.UsageError(question, context)
     return error
 
 

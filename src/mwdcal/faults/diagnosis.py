@@ -17,7 +17,7 @@ import numpy as np
 from mwdcal.calibration.diagnosis.identity import doubts, other_tool
 from mwdcal.calibration.readings import CONSTANTS, LEAST_TEMPERATURE_SPAN, TRIADS, Readings
 from mwdcal.calibration.record import Calibration, Finding
-from mwdcal.calibration.results import raw_reading
+from mwdcal.calibration.results import UNKNOWN_GRAVITY, raw_reading, unknown_gravity
 from mwdcal.errors import InputError
 from mwdcal.estimation.problem import ANGLES
 from mwdcal.faults.likelihood import (
@@ -90,9 +90,8 @@ def prepared(calibration: Calibration, readings: Readings) -> tuple[Readings, li
             _finding("no-temperature", "the tool was calibrated at unrecorded temperatures.")
         )
     if "gravity" not in readings.known:
-        findings.append(
-            _finding("assumed-gravity", "no ref_gravity_g: gravity is taken to be exactly 1 g.")
-        )
+        readings, text = _with_gravity(calibration, readings)
+        findings.append(_finding("assumed-gravity", text))
     return _with_field(calibration, readings, findings), findings
 
 
@@ -118,6 +117,20 @@ def _check(calibration: Calibration, readings: Readings) -> None:
             f"{readings.name}: stations of the calibration's own fit cannot show what has changed since. Give "
             "later readings."
         )
+
+
+def _with_gravity(calibration: Calibration, readings: Readings) -> tuple[Readings, str]:
+    """The readings with the gravity that the calibration states, which is uncertain at their place, and the finding.
+
+    Where that states none either, both are in units of the same gravity.
+    """
+    if unknown_gravity(calibration):
+        return readings, "no ref_gravity_g: gravity is taken to be exactly 1 g."
+    shape, gravity = readings.accelerometer.shape[:-1], calibration.earth["gravity_g"]
+    known = {**readings.known, "gravity": np.full(shape, gravity)}
+    sd = {**readings.sd, "gravity": np.full(shape, UNKNOWN_GRAVITY)}
+    text = f"no ref_gravity_g: that of the calibration is taken, {gravity:.5g} g, 1σ {1000 * UNKNOWN_GRAVITY:g} mg."
+    return replace(readings, known=known, sd=sd), text
 
 
 def _with_field(calibration: Calibration, readings: Readings, findings: list[Finding]) -> Readings:

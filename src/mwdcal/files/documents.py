@@ -144,6 +144,11 @@ def decoded(file: members.Member) -> Calibration:
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         is_table = Path(file.name).suffix.lower() in (*LAID_OUT, *EXCHANGED)
         order = " CALIBRATION comes first: are the two files exchanged?" if is_table else ""
+        if Path(file.name).suffix.lower() == ".toml":
+            raise InputError(
+                f"{file.name} is a tool profile by its name, and no calibration. Calibrate a run with it first: mwdcal "
+                "calibrate."
+            ) from None
         raise InputError(
             f"{file.name} is not a calibration file: {error}. Use a file that mwdcal calibrate wrote.{order}"
         ) from None

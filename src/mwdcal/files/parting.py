@@ -48,7 +48,7 @@ def parted(table: Table) -> tuple[Table, Table]:
         )
         raise InputError(
             f"{table.source} holds both run and roll test, and {which}. Mark the roll test in one column, such as "
-            "'Roll test' with yes at its rows, or name another table by `rolltest`."
+            "'Roll test' with yes at its rows, call its sheet 'Roll test', or name another table by `rolltest`."
         )
     rows = next(iter(marks.values()))
     others = [row for row in range(table.count) if row not in {*rows}]

@@ -192,19 +192,29 @@ def decoded_profile(data: bytes, source: str) -> Profile:
         profile = _decoded(data, Profile)
     except msgspec.ValidationError as error:
         raise _invalid(str(error), source) from None
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        raise InputError(
-            f"{source}, line {line}: expected UTF-8 text; got byte 0x{data[error.start]:02X}. "
-            "Save the file as UTF-8."
-        ) from None
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
-        raise InputError(
-            f"{source}: a tool profile must be TOML; {_lower_first(toml_problem(error))}. Correct the "
-            'file; text needs quotes, axes are a list such as ["+x", "+y", "+z"].'
-        ) from None
+        if Path(source).suffix.lower() != _SUFFIX:
+            raise InputError(
+                f"{source} is no tool profile, which is a TOML file. For a table make one: mwdcal profile {source} "
+                "-o tool.toml."
+            ) from None
+        raise _unreadable(data, error, source) from None
     check_profile(profile, source)
     return profile
+
+
+def _unreadable(data: bytes, error: Exception, source: str) -> InputError:
+    """Why the bytes of a TOML file hold no profile."""
+    if isinstance(error, UnicodeDecodeError):
+        line = data.count(b"\n", 0, error.start) + 1
+        return InputError(
+            f"{source}, line {line}: expected UTF-8 text; got byte 0x{data[error.start]:02X}. "
+            "Save the file as UTF-8."
+        )
+    return InputError(
+        f"{source}: a tool profile must be TOML; {_lower_first(toml_problem(error))}. Correct the "
+        'file; text needs quotes, numbers a decimal point, axes are a list such as ["+x", "+y", "+z"].'
+    )
 
 
 def _check_axes_stated(text: str, source: str) -> None:

@@ -25,7 +25,7 @@ from mwdcal.calibration.readings import (
     serial_of,
 )
 from mwdcal.calibration.record import Calibration, Finding
-from mwdcal.errors import FitError, InputError, QuestionError
+from mwdcal.errors import FitError, InputError, QuestionError, UnreadableFileError
 from mwdcal.estimation.problem import ANGLES, WALKS
 from mwdcal.files import synonyms
 from mwdcal.files.contract import (
@@ -214,14 +214,20 @@ def _undocumented(path: str | os.PathLike[str], error: InputError) -> InputError
 def read_roll_test(
     path: str | os.PathLike[str], run: Table, profile: Profile, statements: Mapping[str, str]
 ) -> Table | None:
-    """The roll test in the file of a run, on a sheet or below a line that says so; None without one."""
+    """The roll test in the file of a run: on a sheet or below a line that says so, or on the only other sheet like it.
+
+    None without one.
+    """
     from mwdcal.files.formats.layout import ROLL_TEST
 
     form = profile.form
     decimal = "," if form.decimal == "," else ""
     wanted = _channels_of(profile) or CHANNELS["accelerometer"]
     with suppress(InputError, FitError):
-        where = tables.laid_out(path, wanted=wanted, decimal=decimal, kind=ROLL_TEST)
+        try:
+            where = tables.laid_out(path, wanted=wanted, decimal=decimal, kind=ROLL_TEST)
+        except InputError:
+            where = _other_sheet(path, run, wanted, decimal)
         if where and (where.sheet, where.lines[0]) != (run.sheet, run.lines[0]):
             table = _with_form(_of_layout(where, path, profile), form)
             return stated_table(table, statements, _serial_column(table, profile))
@@ -248,6 +254,20 @@ def read_later(
         with suppress(InputError):
             test = parted(table)[1]
     return test or table
+
+
+def _other_sheet(
+    path: str | os.PathLike[str], run: Table | Layout, wanted: Sequence[str], decimal: str
+) -> Layout | None:
+    """The table on the only sheet of columns like those of a run beside it; None of several, or without one."""
+    try:
+        return tables.laid_out(path, wanted=wanted, decimal=decimal)
+    except QuestionError as question:
+        said = [value for answer in question.answers for _, value in answer.arguments]
+        others = [sheet for sheet in said if sheet != run.sheet]
+    if len(others) != 1:
+        return None
+    return tables.laid_out(path, sheet=others[0], wanted=wanted, decimal=decimal)
 
 
 def _with_form(table: Table, form: TableFormat) -> Table:
@@ -315,9 +335,12 @@ def _as_documented(path: str | os.PathLike[str], decimal: str, rows: int) -> Tab
 
 
 def _unlike_profile(problem: InputError) -> InputError:
+    """The problem with a table, and what to do where it is another than the profile's."""
+    if isinstance(problem, UnreadableFileError):
+        return problem
     return InputError(
         f"{problem} If the table is laid out otherwise than the tool profile says, or names its columns otherwise, "
-        "correct [table] and [columns] there, or propose a profile for it: mwdcal profile."
+        "rename them, correct [table] and [columns] there, or propose a profile for it: mwdcal profile."
     )
 
 
@@ -492,11 +515,13 @@ def renamed(table: Table, profile: Profile) -> Table:
         return _with_stated_references(table)
     sources = _sources(profile)
     theirs = {s.name: column for column, s in sources.items() if s.name in table.columns}
+    others = [name for name in table.columns if name not in theirs]
     for column, source in sources.items():
         if column in RAW and source.name not in table.columns:
             raise InputError(
-                f"{table.source}: the column {shown(source.name)}, which is '{column}' by the tool profile, "
-                "is missing. Correct [columns] in the profile."
+                f"{table.source}: the table has no column {shown(source.name)}, which is '{column}' by the tool "
+                f"profile; its others are {', '.join(map(shown, others[:8])) or 'none'}. Rename one of them, or "
+                "correct [columns] in the profile."
             )
         if column in table.columns and source.name != column and column not in theirs:
             raise InputError(

@@ -74,6 +74,8 @@ STEADY_NORM = 0.15
 """By how much the norm of a triad varies at most, as a share of the range of its channels."""
 OF_ONE_SPHERE = 0.05
 """The same of three channels that belong together by their readings alone."""
+_OFF_SPHERE = 0.05
+"""By how much the squares of norms of a triad differ from a sphere's, as a share of the channels' range squared."""
 _LEAST_TURN = 20.0
 """By how much an angle of the stand varies at least, degrees."""
 _MOST_TRIPLES = 6
@@ -144,10 +146,29 @@ def candidates_for(column: str, names: Iterable[str], values: Values) -> list[An
     return [*each, none_of(column)]
 
 
-def channels_for(column: str, names: Sequence[str], values: Values) -> list[Answer]:
-    """Columns of numbers that may be a channel."""
-    numbers = [n for n in names if values(n) is not None]
-    return [Answer(with_values(n, values, n), (("column", f"{column}={n}"),)) for n in numbers]
+def channels_for(
+    column: str, names: Sequence[str], values: Values, others: Sequence[str]
+) -> list[Answer]:
+    """Columns of numbers that may be a channel: with the `others` of its triad, where both are known, on one sphere."""
+    numbers = {n: v for n in names if (v := values(n)) is not None and not is_numbering(v)}
+    fits = [n for n in numbers if len(others) < 2 or is_of_one_sphere([*others, n], values)]
+    return [Answer(with_values(n, values, n), (("column", f"{column}={n}"),)) for n in fits]
+
+
+def is_of_one_sphere(names: Sequence[str], values: Values) -> bool:
+    """Whether three columns are vectors on a sphere, as channels of a sound triad are but for biases and scales.
+
+    The centre lies no farther from their mean than their range, or any smooth numbers would do: a centre far away
+    makes of the sphere a plane.
+    """
+    columns = np.stack([np.full(0, np.nan) if (v := values(n)) is None else v for n in names], -1)
+    columns = columns[np.isfinite(columns).all(-1)]
+    if len(columns) <= LEAST_ROLLS:
+        return True
+    centred, largest = columns - columns.mean(0), float(np.ptp(columns, axis=0).max())
+    middle, squares = _sphere(centred)
+    left = np.sum(centred**2, -1) - squares
+    return bool(np.abs(middle).max() <= largest and np.std(left) <= _OFF_SPHERE * largest**2)
 
 
 def triples_for(
@@ -181,10 +202,15 @@ def triples_for(
 def _variation(columns: Array) -> float:
     """The standard deviation of the distance (n,) of vectors (n, 3) from the centre of the sphere nearest to them."""
     centred = columns - columns.mean(0)
+    middle, _ = _sphere(centred)
+    return float(np.std(np.linalg.norm(centred - middle, axis=-1)))
+
+
+def _sphere(centred: Array) -> tuple[Array, Array]:
+    """The centre (3,) of the sphere nearest to vectors (n, 3), and the squares of their norms on it (n,)."""
     design = np.column_stack([2 * centred, np.ones(len(centred))])
-    squares = np.sum(centred**2, -1)
-    middle, *_ = np.linalg.lstsq(design, squares, rcond=1e-9)
-    return float(np.std(np.linalg.norm(centred - middle[:3], axis=-1)))
+    solution, *_ = np.linalg.lstsq(design, np.sum(centred**2, -1), rcond=1e-9)
+    return solution[:3], design @ solution
 
 
 def in_units(name: str, column: str, allowed: Sequence[str]) -> list[Answer]:
@@ -723,7 +749,7 @@ def proposed(
             questions.ask(_check_hidden, triad, channels, others, values, source)
     hidden = any("channels of the accelerometer" in each.text for each in questions)
     if not hidden and not any(n in damaged for n, m in meanings.items() if m.column in RAW):
-        questions.ask(_check_triads, names, values, chosen, source)
+        questions.ask(_check_triads, names, values, chosen, said, source)
     questions.ask(_check_units_of_triads, chosen, source)
     angles = {c: chosen[c].name for c in _ANGLES_AND_WARMTH[:3] if c in chosen and c not in said}
     for column in angles:
@@ -1039,29 +1065,38 @@ def _angles(column: str, unit: str) -> str:
 
 
 def _check_triads(
-    names: Sequence[str], values: Values, chosen: Mapping[str, ColumnSource], source: str
+    names: Sequence[str],
+    values: Values,
+    chosen: Mapping[str, ColumnSource],
+    said: Collection[str],
+    source: str,
 ) -> None:
-    """Refuse a table without accelerometers, or with a part of the magnetometers."""
-    absent = [name for name in RAW[:3] if name not in chosen]
+    """Refuse a table without accelerometers, with a part of the magnetometers, or with a wrong channel said."""
     others = [n for n in names if n not in {each.name for each in chosen.values()}]
-    if len(absent) == 3:
+    listed = f"the names are {', '.join(map(shown, names[:20]))}"
+    if {*RAW[:3]}.isdisjoint(chosen):
         _check_side_by_side(others, values, source)
-    if absent:
         raise QuestionError(
-            f"{source}: could not tell which columns are the accelerometers ({', '.join(absent)}); the names are "
-            f"{', '.join(map(shown, names[:20]))}.",
+            f"{source}: could not tell which columns are the accelerometers ({', '.join(RAW[:3])}); {listed}.",
             triples_for(RAW[:3], others, values, OF_ONE_SPHERE)
-            or triples_for(RAW[:3], others, values)
-            if len(absent) == 3
-            else channels_for(absent[0], others, values),
+            or triples_for(RAW[:3], others, values),
         )
-    lacking = [name for name in RAW[3:] if name not in chosen]
-    if 0 < len(lacking) < 3:
-        raise QuestionError(
-            f"{source}: of the magnetometers only {', '.join(n for n in RAW[3:] if n in chosen)} can be found by "
-            "name.",
-            channels_for(lacking[0], others, values),
-        )
+    for triad, channels in CHANNELS.items():
+        names_of = {c: chosen[c].name for c in channels if c in chosen}
+        absent = [c for c in channels if c not in names_of]
+        if names_of and absent:
+            answers = channels_for(absent[0], others, values, [*names_of.values()])
+            missing = "" if answers else f" No column can be {absent[0]}: the channel is missing."
+            raise QuestionError(
+                f"{source}: could not tell which columns are the {triad}s ({', '.join(absent)}); {listed}.{missing}",
+                answers,
+            )
+        theirs = [c for c in names_of if c in said]
+        if theirs and not is_of_one_sphere([*names_of.values()], values):
+            raise QuestionError(
+                f"{source}: {' and '.join(shown(names_of[c]) for c in theirs)} as {', '.join(theirs)} cannot be: the "
+                f"three columns of the {triad} are far from one strength at all stations. Which column is it?"
+            )
 
 
 def _check_side_by_side(names: Sequence[str], values: Values, source: str) -> None:

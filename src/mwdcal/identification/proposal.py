@@ -1150,10 +1150,16 @@ def _wirings(
 ) -> tuple[dict[str, Wiring], dict[str, OpenAxes]]:
     """The axes of the triads that the run has, and why those of others are open; `scaled` has their scales."""
     known = {name: readings.reference(name) for name in NEEDED["magnetometer"]}
-    if readings.count < LEAST_STATIONS or not np.ptp(readings.accelerometer, axis=0).all():
+    if readings.count < LEAST_STATIONS:
         raise FitError(
             f"{run.source}: a profile is proposed for at least {LEAST_STATIONS} stations whose readings vary; got "
             f"{readings.count}. Measure more stations."
+        )
+    still = [n for n in CHANNELS["accelerometer"] if not np.ptp(tables.numbers(run, n))]
+    if still:
+        raise FitError(
+            f"{run.source}: no change in {' and '.join(still)} of the accelerometer: the same value at all "
+            f"{readings.count} stations. A dead sensor, a wrong column, or one attitude: check wiring and columns."
         )
     results: dict[str, Wiring] = {}
     open_axes: dict[str, OpenAxes] = {}
@@ -1312,19 +1318,32 @@ def _alternatives(axes: OpenAxes) -> str:
 def left_handed(proposal: Proposal) -> list[Finding]:
     """A finding on triads whose channels x, y, z are a left-handed set by the axes proposed.
 
-    Not on an accelerometer alone beside a right-handed magnetometer: it reads positive upwards, as many do.
+    Not on an accelerometer whose channels all read opposite to those of the magnetometer: positive upwards, as many do.
     """
     triads = [kind for kind, result in proposal.wirings.items() if _is_left_handed(result)]
-    if not triads or (triads != [*proposal.wirings] and triads == ["accelerometer"]):
-        return []  # of the other polarity: a reversed angle would turn the magnetometer as well
+    others = [kind for kind in proposal.wirings if kind not in triads]
+    reversed_axes = [
+        tuple(axis.translate(_OTHER_SIGN) for axis in proposal.wirings[kind].axes)
+        for kind in triads
+    ]
+    if not triads or (others and reversed_axes == [proposal.wirings[others[0]].axes]):
+        return []
+    reason = (
+        f"two channels are exchanged or one is reversed, other than in the {others[0]}: correct that, or read roll "
+        "test and surveys with the same wiring"
+        if others
+        else "a reference angle counts the other way: toolface anticlockwise, or inclination from below"
+    )
     return [
         Finding(
             id="left-handed",
             text=f"{' and '.join(triads)}: by the axes proposed the channels x, y, z are a left-handed set. If the "
-            "tool is not built so, a reference angle counts the other way: toolface anticlockwise, or inclination "
-            "from below.",
+            f"tool is not built so, {reason}.",
         )
     ]
+
+
+_OTHER_SIGN = str.maketrans("+-", "-+")
 
 
 def lines_not_taken(proposal: Proposal) -> list[Finding]:

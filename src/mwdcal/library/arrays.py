@@ -56,8 +56,8 @@ def readings(
 
     NaN, None and what a mask hides are missing.
 
-    Units: g and nT along the tool axes, °C, radians; `inclination_deg`, `azimuth_deg`, `toolface_deg`
-    and `dip_deg` take degrees instead. Azimuths are magnetic.
+    Units: nominal g and nT along the tool axes (raw over the `scale` of the profile), °C, radians;
+    `inclination_deg`, `azimuth_deg`, `toolface_deg` and `dip_deg` take degrees instead. Azimuths are magnetic.
 
     Args:
         accelerometer: gravity, positive along an axis that points down.

@@ -343,9 +343,14 @@ WELL_FINDINGS = {
     "`tie_in` gives the position of station {start}.",
     "left-out": "left out of the well path, without a result, without a measured depth, or at the depth of the "
     "station before: {count} of {rows} stations.",
-    "no-path": "no well path: no station has both a measured depth and a direction with azimuth.",
+    "no-path": "no well path: {lacking_path}.",
 }
 """The texts of the findings about a well, in their order."""
+LACKING_PATH = {
+    True: "no station has both a measured depth and a direction with azimuth",
+    False: "no column has the measured depth (md_m, md_ft or md_usft)",
+}
+"""Lack that leaves a well without a path, where stations have depths and where none has."""
 OLD_DRIFT = {
     True: "allows for the drift of one year. Verify the tool, or give `registry`, where the drift of tools has no such "
     "end.",
@@ -883,7 +888,7 @@ def _findings(result: Well, counts: WellCounts, from_first: bool) -> list[Findin
         "path-from-first": there and from_first and depth > 0,
         "path-from-later": start > 0 and not isinstance(result.started, TieIn),
         "left-out": there and counts.on_path < counts.rows,
-        "no-path": counts.located and not there,
+        "no-path": not there,
     }
     words = {
         "rejected": counts.rejected, "judged": counts.judged, "limits": result.limits.name, "rows": counts.rows,
@@ -891,7 +896,8 @@ def _findings(result: Well, counts: WellCounts, from_first: bool) -> list[Findin
         "names": " and ".join(n for n, lacks in zip(STRENGTH_NAMES, counts.lacking, strict=True) if lacks),
         "blindest": blindest, "worst": worst, "partly": counts.partly, "unjudged": counts.unjudged,
         "count": counts.rows - counts.on_path, "years": years, "day": day, "calibrated": calibrated, "course": course,
-        "usual": USUAL_COURSE, "drift": OLD_DRIFT[DRIFT in result.terms.included],
+        "usual": USUAL_COURSE, "lacking_path": LACKING_PATH[counts.located],
+        "drift": OLD_DRIFT[DRIFT in result.terms.included],
     }  # fmt: skip
     return [*result.corrected, *result.north.findings] + [
         Finding(id=name, text=text.format(**words))

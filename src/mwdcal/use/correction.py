@@ -189,12 +189,18 @@ DIRECTIONS = {
     "field_nt": ("azimuth_deg", "dip_deg", "magnetic_toolface_deg"),
 }
 """Directions that do not exist where a strength is zero."""
+UNKNOWN_TEMPERATURE = (
+    "the readings have no temperature: nothing shows that they lie in the calibrated range "
+    "{calibrated}"
+)
+"""Sentence on readings without a temperature."""
 ROW_FINDINGS = {
     "no-magnetometer": "no columns mx, my, mz: magnetic results are blank.",
     "other-tool": "the readings are of tool {tools[1]}, the calibration of tool {tools[0]}: is it the right one?",
     "missing-reading": "{tally.lacking} of {tally.rows} rows lack a reading: their results are blank.",
     "outside-temperature": "{beyond}: their results are {results}",
     "no-temperature": "the calibration has no temperature terms, and its run recorded no temperature{readings_at}.",
+    "temperature-unknown": f"{UNKNOWN_TEMPERATURE}.",
     "implausible-gravity": "{off[gravity]}: the tool moved while it was read, or a reading is in another unit.",
     "implausible-field": "{off[field]}: iron or a current was near, or a reading is in another unit.",
     "unsteady": "from row to row {unsteady} change more than any place does: are two axes swapped, or a sign wrong? A "
@@ -401,6 +407,7 @@ def findings(
         "missing-reading": tally.lacking,
         "outside-temperature": tally.beyond,
         "no-temperature": calibration.temperature_c is None,
+        "temperature-unknown": bool(calibration.temperature_c) and tally.warmth[0] == np.inf,
         "implausible-gravity": "gravity" in off,
         "implausible-field": "field" in off,
         "unsteady": changing,
@@ -413,6 +420,7 @@ def findings(
     unknown = f": nothing says how good the results are at the readings' {warm} °C"
     words = {
         "beyond": beyond,
+        "calibrated": f"{low:.1f}…{high:.1f} °C",
         "results": _results_beyond(calibration, outside),
         "readings_at": unknown if calibration.unrecorded(readings) else "",
         "unsteady": changing,

@@ -724,6 +724,22 @@ class RollTest:
             "at right angles, or more"
         )
 
+    def off_plane(self, index: Ints) -> float:
+        """Root mean square distance of gravity or field at stations from their plane, as a share of its strength.
+
+        A tool rolled about a fixed axis shows both in a plane, whatever its biases, scales and axes. Without the
+        station that is farthest off: a single wrong reading is not the set's.
+        """
+        shares, count = [0.0], len(index) - 1
+        for vectors in (each[index] for each in self.fields):
+            strength = np.linalg.norm(vectors, axis=-1)
+            v = vectors - vectors.mean(0)
+            without = v.T @ v - (count + 1) / count * v[:, :, None] * v[:, None]
+            if np.isfinite(without).all() and strength.any():
+                least = max(float(np.linalg.eigvalsh(without)[:, 0].min()), 0.0)
+                shares.append(float(np.sqrt(least / count) / np.median(strength)))
+        return max(shares)
+
     def harmonics(self, roll_set: RollSet) -> int:
         """Harmonics of the curve that a rolled set determines, 1 or 2."""
         return int(self._coverage(roll_set.index).harmonics)
@@ -929,6 +945,8 @@ class RollTest:
         index = roll_set.index
         sd, number = self.readings.uncertainty(name)[index], self.settings[index]
         zero = float(self._common(name)[index].max()) if error else 0.0
+        if name in DIRECTION and self._set_unseen(name, index):
+            return ReferenceErrors(np.full(sd.shape, self._setting_error(name)), None, 0.0, zero)
         if name == "toolface":
             return ReferenceErrors(sd, None, 0.0, zero)
         if name in ANGLES and not roll_set.declared and len(set(number.tolist())) > 1:
@@ -939,6 +957,16 @@ class RollTest:
         most = float(sd.max()) if error else 0.0
         whole = most * float(np.sqrt(np.mean((sd / most) ** 2))) if most else 0.0
         return ReferenceErrors(np.zeros(sd.shape), None, whole, zero)
+
+    def _set_unseen(self, name: str, index: Ints) -> bool:
+        """Whether the stand was set at each of some stations, and the run has not to what angle."""
+        unknown = np.isnan(self.readings.reference(name)[index]).all()
+        return self.readings.settings == "per-station" and bool(unknown)
+
+    def _setting_error(self, name: str) -> float:
+        """Standard uncertainty of one setting of an angle by the profile, radians."""
+        stand, angle = self.calibration.profile.stand, f"{name}_deg"
+        return float(np.radians(np.hypot(stand.of(angle), stand.repeatability(angle))))
 
     def common_errors(self, name: str, reference: ReferenceErrors, first: int) -> Array:
         """Error that a set (its `first` station) shares (d,) in tests like this one."""

@@ -17,6 +17,7 @@ from mwdcal.calibration.record import MARGIN, Calibration, Finding, html_table, 
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, eigen
+from mwdcal.use.correction import UNKNOWN_TEMPERATURE
 from mwdcal.use.roll_test import (
     DEPARTURE_CHANCE,
     HARMONICS,
@@ -142,6 +143,7 @@ VERDICT_FINDINGS = {
     "holds at the temperature of the test alone{tested}.",
     "outside-temperature": "{where} lie outside the calibrated range {calibrated} °C. The calibration has no "
     "temperature terms: drift over the difference counts as its error.",
+    "temperature-unknown": f"{UNKNOWN_TEMPERATURE}.",
     "not-judged": "not judged: {limits}.",
     "contradicted": "the readings contradict references of the run that no limit judges: {what}. Check their unit, "
     "sign and place; or signs or axes of a sensor are exchanged. The verdict says nothing about it.",
@@ -352,6 +354,7 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
     for check in (_check_tool, _check_independent, _check_temperature):
         check(calibration, readings)
     test = RollTest(calibration, readings)
+    _check_rolled(test)
     outcomes = [(SPREAD_OF + n, n, most, test.spread(n)) for n, most in limits.spread.items()]
     outcomes += [(f"error of {n}", n, most, test.error(n)) for n, most in limits.error.items()]
     skipped = _skipped({title: outcome.skipped for title, *_, outcome in outcomes})
@@ -469,8 +472,14 @@ def _findings(test: RollTest, skipped: Sequence[str]) -> Iterator[Finding]:
         where = f"{beyond} of {readings.count} stations ({tested} °C)"
         calibrated = _span(*calibration.temperature_c or (np.nan, np.nan))
         yield _finding("outside-temperature", where=where, calibrated=calibrated)
-    for free in calibration.undetermined():
-        yield Finding(id=free.id, text=f"{free.text}.")
+    if warmth is None and calibration.temperature_c:
+        yield _finding("temperature-unknown", calibrated=f"{_span(*calibration.temperature_c)} °C")
+    free: dict[tuple[str, str], list[str]] = {}  # what both triads leave free is said once
+    for entry in calibration.undetermined():
+        triad, colon, text = entry.text.partition(": ")
+        free.setdefault((entry.id, colon + text), []).append(triad)
+    for (name, text), triads in free.items():
+        yield Finding(id=name, text=f"{' and '.join(triads)}{text}.")
     if skipped:
         yield _finding("not-judged", limits="; ".join(skipped))
     if not test.sets:
@@ -514,7 +523,7 @@ def _check_independent(calibration: Calibration, readings: Readings) -> None:
         raise InputError(
             f"{readings.name}: {used.size} of {readings.count} stations were in the fit (first: "
             f"station {readings.labels[used[0]]}). Verification needs data that the fit has not seen: take a roll "
-            "test of its own."
+            "test of its own. mwdcal calibrate judges one that is in the file of the run."
         )
 
 
@@ -527,6 +536,21 @@ def _check_temperature(calibration: Calibration, readings: Readings) -> None:
             f"{readings.name}: {outside.size} {lie} outside the calibrated range {low:.1f}…{high:.1f} °C "
             f"(first: station {readings.labels[outside[0]]}). Verify within the range, or calibrate over a wider one."
         )
+
+
+def _check_rolled(test: RollTest) -> None:
+    """Refuse stations of a run that names no direction, where they are of several."""
+    readings = test.readings
+    named = (readings.groups >= 0).any() or np.isfinite(readings.reference("inclination")).any()
+    most = np.sin(NO_ERROR_OF_A_TOOL["inclination"])
+    if named or not any(test.off_plane(s.index) > most for s in test.sets):
+        return
+    angles = np.degrees(test.value("inclination"))
+    raise InputError(
+        f"{readings.name} is no roll test, in which the tool is rolled about an axis that stands still: its stations, "
+        f"at inclinations from {angles.min():.1f}° to {angles.max():.1f}°, are of several directions. Name another "
+        "table, or give ref_inclination_deg and ref_azimuth_deg, or a group for each direction."
+    )
 
 
 def _judged(title: str, name: str, limit: float, outcome: Departures, guarded: bool) -> _Judged:

@@ -47,10 +47,6 @@ def command() -> None:
     """
 
 
-ISO_DAY = click.DateTime(["%Y-%m-%d"])
-"""A day as it is typed."""
-
-
 @options.command()
 @options.CALIBRATION
 @click.option(
@@ -87,11 +83,13 @@ ISO_DAY = click.DateTime(["%Y-%m-%d"])
 @click.option("--number", default="", metavar="N", help="Number of the certificate.")
 @click.option("--customer", default="", metavar="NAME", help="Customer.")
 @click.option("--condition", default="", metavar="TEXT", help="Condition of the tool when it came.")
-@click.option("--received", type=ISO_DAY, metavar="YYYY-MM-DD", help="Day of receipt of the tool.")
+@click.option(
+    "--received", type=options.Day(), metavar="YYYY-MM-DD", help="Day of receipt of the tool."
+)
 @click.option(
     "--date",
     "day",
-    type=ISO_DAY,
+    type=options.Day(),
     metavar="YYYY-MM-DD",
     help="Day of issue; today (UTC) if not given.",
 )

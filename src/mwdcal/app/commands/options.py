@@ -41,6 +41,22 @@ class Within(click.FloatRange):
     name = "number"
 
 
+class Day(click.DateTime):
+    """A day, year first."""
+
+    def __init__(self) -> None:
+        super().__init__(["%Y-%m-%d"])
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> datetime:
+        """The day that a text states; refuse another form in words that name this one."""
+        try:
+            return super().convert(value, param, ctx)
+        except click.BadParameter:
+            self.fail(f"expected a day such as 2026-11-28; got '{value}'.", param, ctx)
+
+
 class PointedNumber(click.types.FloatParamType):
     """A number with a decimal point."""
 
@@ -167,7 +183,7 @@ def of_run(function: Function) -> Function:
         noted("--operator", metavar="NAME", help="Who measured; comes before the table's own."),
         noted(
             "--date",
-            type=click.DateTime(["%Y-%m-%d"]),
+            type=Day(),
             metavar="YYYY-MM-DD",
             help="Day of the run; likewise.",
         ),

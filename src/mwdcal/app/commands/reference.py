@@ -58,7 +58,7 @@ def measured(function: options.Function) -> options.Function:
 @click.option(
     "--date",
     "field_day",
-    type=click.DateTime(["%Y-%m-%d"]),
+    type=options.Day(),
     required=True,
     metavar="YYYY-MM-DD",
     help="Day for which the field is wanted.",

@@ -309,7 +309,7 @@ FIRST = options.preset("--offset", type=options.Whole(0), default=0, help="Rows 
 )
 @click.option(
     "--due",
-    type=click.DateTime(["%Y-%m-%d"]),
+    type=options.Day(),
     metavar="YYYY-MM-DD",
     help="Only tools and measurement standards whose calibration is due before this day.",
 )
@@ -411,7 +411,7 @@ def get(record: str, database: str, output: Path, as_json: bool) -> None:
     "--date",
     "today",
     old=("--today",),
-    type=click.DateTime(["%Y-%m-%d"]),
+    type=options.Day(),
     metavar="YYYY-MM-DD",
     help="Day by which tools are overdue. Default: today.",
 )

@@ -284,7 +284,8 @@ OF_FITS = {
     "other azimuths and inclinations with references, or leave it out.",
     "unsettled": "the fit failed: {message}.{axes}",
     "residuals": "the {triad}'s residuals are {much}: no sensor model explains these readings. Check that columns, "
-    "reference angles and groups belong to the stations they stand at, and 'axes' and 'noise' in the tool "
+    "reference angles and groups belong to the stations they stand at, the gravity, field and dip that are stated, "
+    "and 'axes' and 'noise' in the tool "
     "profile.{column}{culprit}{axes}",
     "temperature": "the {triad}'s residuals are {much}, because its readings vary with temperature more than `order` "
     "{order} follows: this run spans {span:.0f} °C. {remedy}.",

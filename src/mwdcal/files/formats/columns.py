@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mwdcal.errors import InputError
+from mwdcal.errors import InputError, UnreadableFileError
 from mwdcal.geometry.vectors import Array
 
 # Text as it was read, or numbers with NaN where the cell is blank.
@@ -52,7 +52,7 @@ def damaged_unless_read(source: str, expected: str, advice: str) -> Iterator[Non
     except Exception as error:
         reason = (str(error).strip() or type(error).__name__).splitlines()[0][:120]
         reason = re.sub(r"<class '([\w.]+)'>", r"\1", reason)
-        raise InputError(
+        raise UnreadableFileError(
             f"{source}: expected {expected}; reading it failed ({reason}). {advice}"
         ) from error
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from mwdcal.errors import Answer, FitError, InputError, QuestionError
+from mwdcal.errors import Answer, FitError, InputError, QuestionError, UnreadableFileError
 from mwdcal.files.formats import figures
 from mwdcal.files.formats.columns import (
     Merged,
@@ -215,10 +215,11 @@ def laid_out(
             ]
         covers += [] if layouts or any(_is_reading(row) for _, row in each.rows) else [each]
         tables += [t for t in layouts if header_line in (0, t.form.header_line)]
-    tables = [t for t in _with_same_stations(tables) if {*wanted} <= {*t.names}]
+    every = _with_same_stations(tables)
+    tables = [t for t in every if {*wanted} <= {*t.names}]
     tables = [t for t in tables if not kind or _kind(f"{t.sheet} {t.heading}") == kind]
     if not tables:
-        raise _no_table(source, header_line, wanted)
+        raise _no_table(source, header_line, wanted, every)
     best = max(tables, key=lambda layout: layout.size)
     alike = [t for t in tables if t is best or (_alike(t, best) and len(t.lines) >= _BESIDES)]
     if len(alike) > 1 and not header_line and not kind:
@@ -450,7 +451,18 @@ def _alike(one: Layout, other: Layout) -> bool:
     return most or _are_of_one_triad_each(one, other)
 
 
-def _no_table(source: str, header_line: int, wanted: Collection[str]) -> InputError:
+def _no_table(
+    source: str, header_line: int, wanted: Collection[str], tables: Sequence[Layout]
+) -> InputError:
+    nearest = max(tables, key=lambda t: len({*wanted} & {*t.names}), default=None)
+    absent = [name for name in wanted if nearest and name not in nearest.names]
+    if nearest and 0 < len(absent) < len(wanted):
+        others = [name for name in nearest.names if name not in wanted]
+        listed = f"; its others are {', '.join(map(shown, others[:8]))}" if others else ""
+        columns = "column" if len(absent) == 1 else "columns"
+        return InputError(
+            f"{source}: the table has no {columns} {', '.join(map(shown, absent))}{listed}."
+        )
     if wanted:
         names = ", ".join(shown(name) for name in [*wanted][:8])
         return InputError(f"{source}: no table with the columns {names} was found.")
@@ -825,7 +837,7 @@ def _check_cut(
         cut.append((last, row))
     if cut:
         line, row = cut[0]
-        raise InputError(
+        raise UnreadableFileError(
             f"{source}, row {line}: '{_words(row)}' begins as a station and ends before the numbers of the other "
             "rows. Was the file cut? Export the whole of it."
         )

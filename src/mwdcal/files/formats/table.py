@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mwdcal.digests import sha256_of
-from mwdcal.errors import InputError, reason
+from mwdcal.errors import InputError, UnreadableFileError, reason
 from mwdcal.files import metadata as meta
 from mwdcal.files.formats import atomic, text
 from mwdcal.files.formats.columns import (
@@ -361,11 +361,11 @@ def _content(path: Path) -> bytes:
 def check_file(path: Path) -> None:
     """Refuse a path at which there is no regular file."""
     if path.is_dir():
-        raise InputError(f"'{path}' is a folder. Name a file in it.")
+        raise UnreadableFileError(f"'{path}' is a folder. Name a file in it.")
     if not path.exists():
-        raise InputError(f"'{path}': no such file. Check the name and the folder.")
+        raise UnreadableFileError(f"'{path}': no such file. Check the name and the folder.")
     if not path.is_file():
-        raise InputError(f"'{path}' is not a regular file. Name a file with readings.")
+        raise UnreadableFileError(f"'{path}' is not a regular file. Name a file with readings.")
 
 
 def _floats(cells: Sequence[str], decimal: str) -> Array | None:

@@ -1,0 +1,310 @@
+"""Inputs that a technician gets wrong: each answer names what is wrong and what to do, or nothing is said to be right.
+
+The tables are those of a laboratory under names of its own, made by the forward model of `simulation`.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import openpyxl
+import pytest
+
+import mwdcal as library
+from cli_support import (
+    SCALE,
+    SERVO_NOISE,
+    channels,
+    mwdcal,
+    read_csv,
+    refused,
+    servo_run,
+    stations,
+    write_csv,
+)
+from mwdcal.use.roll_test import RollTest
+from simulation import DEG, Tool, plan
+
+NAMES = {
+    "station": "Pos.", "temperature_c": "Temp (°C)", "ax": "Accel X (V)", "ay": "Accel Y (V)", "az": "Accel Z (V)",
+    "mx": "Fluxgate X (V)", "my": "Fluxgate Y (V)", "mz": "Fluxgate Z (V)",
+    "ref_inclination_deg": "Gimbal tilt (°)", "ref_azimuth_deg": "Gimbal heading (°)",
+    "ref_toolface_deg": "Gimbal roll (°)", "ref_gravity_g": "Local G (g)", "ref_field_nt": "Btotal (nT)",
+    "ref_dip_deg": "Dip (°)",
+}  # fmt: skip
+
+
+def named(columns, **others):
+    """A table under the laboratory's names; None takes a column away, another name changes it."""
+    names = {**NAMES, **others}
+    return {names[n]: column for n, column in columns.items() if names[n]}
+
+
+def measured(inclinations, toolfaces, noise=2, scatter=0.0, azimuth=None, tool=None):
+    """A run of the tool of `servo_run`, with other noise; `scatter` of the stand's inclinations, degrees."""
+    tool = tool or Tool.random(1, noise=SERVO_NOISE)
+    inc, azi, face = plan(inclinations, toolfaces)
+    azi = azi if azimuth is None else np.full(len(inc), azimuth)
+    rng = np.random.default_rng(noise)
+    shown = inc + np.radians(scatter) * rng.normal(size=len(inc))
+    g, b = (v[0] for v in tool.readings(rng, 1, shown, azi, face))
+    earth = (tool.gravity, tool.field, tool.dip / DEG)
+    warmth = np.full(len(inc), 25.0)
+    return {**stations(inc, azi, face, earth=earth, temperature_c=warmth), **channels(g, b)}
+
+
+def rolled(noise=2, scatter=0.0):
+    """A roll test in one direction."""
+    return measured((60,), 24, noise, scatter, azimuth=1.0)
+
+
+def workbook(path, **sheets):
+    """A workbook with a table on each sheet."""
+    book = openpyxl.Workbook()
+    book.remove(book.active)
+    for name, columns in sheets.items():
+        sheet = book.create_sheet(name)
+        sheet.append([*columns])
+        for row in zip(*(np.asarray(c).tolist() for c in columns.values()), strict=True):
+            sheet.append(row)
+    book.save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def laboratory(tmp_path_factory):
+    """A folder with a run, the profile proposed for it, its calibration and a table of readings of a well."""
+    folder = tmp_path_factory.mktemp("laboratory")
+    run = write_csv(folder / "run.csv", named(servo_run()))
+    assert mwdcal("profile", run, "-o", folder / "tool.toml").code == 0
+    ran = mwdcal("calibrate", run, "--tool", folder / "tool.toml", "-o", folder / "cal.json")
+    assert ran.code == 0, ran
+    well = {n: c for n, c in measured((5, 30, 60), 8).items() if not n.startswith("ref_")}
+    write_csv(folder / "well.csv", {**named(well), "Depth (m)": np.arange(24) * 10.0})
+    return folder
+
+
+def changed(folder, name, **columns):
+    """The table of the well with other columns; None takes one away, a text renames it."""
+    table = {n: np.array(c, float) for n, c in read_csv(folder / "well.csv").items()}
+    for column, new in columns.items():
+        old = table.pop(NAMES.get(column, column))
+        if isinstance(new, str):
+            table[new] = old
+        elif new is not None:
+            table[NAMES.get(column, column)] = new
+    return write_csv(folder / f"{name}.csv", table)
+
+
+# ------------------------------------------------------------------------------- a channel is missing
+
+
+def test_a_number_of_the_row_is_never_proposed_as_a_channel(tmp_path):
+    run = write_csv(tmp_path / "run.csv", named(servo_run(), az=None))
+    message = refused(mwdcal("profile", run, "-o", tmp_path / "t.toml"), 3)
+    assert "accelerometers (az)" in message
+    assert "the channel is missing" in message
+    assert "--column" not in message
+    message = refused(mwdcal("profile", run, "-o", tmp_path / "t.toml", "--column", "az=Pos."), 3)
+    assert "'Pos.' as az cannot be" in message
+    assert not (tmp_path / "t.toml").exists()
+
+
+@pytest.mark.parametrize("noise", [300.0, 0.01])
+def test_a_channel_that_was_said_is_tested_by_the_strength_of_gravity(tmp_path, noise):
+    """Neither large nor small random numbers are on a sphere with the other two; the channel itself is."""
+    run = servo_run()
+    other = np.random.default_rng(1).normal(size=48) * noise
+    run = write_csv(tmp_path / "run.csv", {**named(run, az="Third"), "Fourth": other})
+    said = ("--column", "az=Fourth")
+    assert "cannot be" in refused(mwdcal("profile", run, "-o", tmp_path / "t.toml", *said), 3)
+    ran = mwdcal("profile", run, "-o", tmp_path / "t.toml", "--column", "az=Third")
+    assert ran.code == 0, ran
+    assert library.load_profile(tmp_path / "t.toml").columns["az"].name == "Third"
+
+
+@pytest.mark.parametrize("command", ["survey", "apply"])
+@pytest.mark.parametrize(("new", "others"), [(None, "'Depth (m)'"), ("Gx [V]", "'Gx [V]'")])
+def test_a_missing_channel_of_a_well_is_named_with_the_other_columns(laboratory, command, new, others):  # fmt: skip
+    well = changed(laboratory, "lacking", ax=new)
+    message = refused(mwdcal(command, laboratory / "cal.json", well, "-o", laboratory / "o.csv"), 2)
+    assert "no column 'Accel X (V)'" in message
+    assert others in message
+    assert "Accel Y" not in message
+
+
+# ------------------------------------------------------- what a table lacks without being refused
+
+
+def findings(ran):
+    assert ran.code in (0, 1), ran
+    return {each["id"]: each["text"] for each in ran.json["findings"]}
+
+
+@pytest.mark.parametrize("command", ["survey", "apply", "verify"])
+def test_a_table_without_temperatures_is_not_in_the_calibrated_range_for_sure(laboratory, command):
+    cal, output = laboratory / "cal.json", ("-o", laboratory / "o.csv")
+    write_csv(laboratory / "roll.csv", named(rolled()))
+    for warm in (True, False):
+        table = changed(laboratory, "cold", **({} if warm else {"temperature_c": None}))
+        if command == "verify":
+            table = write_csv(
+                laboratory / "cold.csv", named(rolled(), **({} if warm else {"temperature_c": ""}))
+            )
+        ran = mwdcal(command, cal, table, *(() if command == "verify" else output), "--json")
+        assert ("temperature-unknown" in findings(ran)) is not warm
+        assert warm or "25.0" in findings(ran)["temperature-unknown"]
+
+
+def test_a_well_without_depths_is_said_to_have_no_path(laboratory):
+    for name, lacks in (("whole", False), ("flat", True)):
+        well = changed(laboratory, name, **({"Depth (m)": None} if lacks else {}))
+        ran = mwdcal("survey", laboratory / "cal.json", well, "-o", laboratory / "o.csv", "--json")
+        assert ("no-path" in findings(ran)) is lacks
+    assert "measured depth" in findings(ran)["no-path"]
+
+
+# ------------------------------------------------------------------------------------- left-handed
+
+
+@pytest.mark.parametrize(
+    ("signs", "said"),
+    [((-1, -1, -1), False), ((1, 1, -1), True), (None, True)],
+    ids=["upwards", "one reversed", "exchanged"],
+)
+def test_a_left_handed_accelerometer_alone_is_said_unless_it_counts_upwards(tmp_path, signs, said):
+    run = servo_run()
+    if signs is None:
+        run["ax"], run["ay"] = run["ay"], run["ax"]
+    else:
+        for axis, sign in zip("xyz", signs, strict=True):
+            run[f"a{axis}"] = sign * run[f"a{axis}"]
+    ran = mwdcal("profile", write_csv(tmp_path / "r.csv", run), "-o", tmp_path / "t.toml", "--json")
+    assert ("left-handed" in findings(ran)) is said
+
+
+# --------------------------------------------------------------------------------------- roll test
+
+
+@pytest.mark.parametrize("inclinations", [(5, 30, 60), (60,)], ids=["well", "azimuths"])
+def test_stations_of_several_directions_are_no_roll_test(laboratory, inclinations):
+    table = {n: c for n, c in measured(inclinations, 9).items() if not n.startswith("ref_")}
+    table = write_csv(laboratory / "several.csv", named(table))
+    message = refused(mwdcal("verify", laboratory / "cal.json", table), 2)
+    assert "several.csv is no roll test" in message
+    assert "60." in message
+
+
+def test_vectors_of_a_rolled_tool_lie_in_a_plane_whatever_one_reading_says():
+    """Scales, biases and exchanged axes keep them there; a single wrong reading is not the set's."""
+    roll = rolled()
+    g, b = (np.stack([roll[f"{kind}{axis}"] for axis in "xyz"], -1) for kind in "am")
+    g, b = g / SCALE[0], b / SCALE[1]
+    g[4], b[4] = -g[4], -b[4]
+    for matrix in (np.eye(3), np.diag([1.3, 0.9, 1.0])[[2, 0, 1]]):
+        test = RollTest(None, library.readings(g @ matrix, b))
+        test.__dict__["fields"] = g @ matrix + 0.2, b @ matrix + 5000
+        assert test.off_plane(np.arange(24)) < 0.001
+    assert np.linalg.svd(g - g.mean(0), compute_uv=False)[2] > 0.2
+
+
+def test_the_declared_error_of_settings_counts_where_no_angle_is_given(tmp_path):
+    """Settings drawn with the 0.2° declared: spread and 1σ are those of the same readings with angles."""
+    tool, cal = tmp_path / "tool.toml", tmp_path / "cal.json"
+    axes = 'axes = ["+x", "+y", "+z"]'
+    tool.write_text(
+        f'name = "servo"\n[accelerometer]\n{axes}\nscale = 3.0\nnoise = 3e-4\n[magnetometer]\n{axes}\n'
+        'scale = 5e-5\nnoise = 7.5e-4\n[stand]\nsettings = "per-station"\ninclination_deg = 0.2\n'
+    )
+    run = write_csv(tmp_path / "run.csv", servo_run())
+    assert mwdcal("calibrate", run, "--tool", tool, "-o", cal).code == 0
+    roll = rolled(scatter=0.2)
+    rows = []
+    for known in (True, False):
+        lacks = () if known else ("ref_inclination_deg", "ref_azimuth_deg")
+        table = {n: c for n, c in roll.items() if n not in lacks}
+        ran = mwdcal("verify", cal, write_csv(tmp_path / "roll.csv", table), "--json")
+        assert ran.code in (0, 1), ran
+        rows += [r for r in ran.json["rows"] if r["name"] == "spread of inclination"]
+    given, unknown = rows
+    assert "raw figure" not in unknown["note"]
+    for each in ("value", "uncertainty", "raw"):
+        assert unknown[each] == pytest.approx(given[each], rel=1e-6)
+    assert 0.2 * np.sqrt(5 / 24) / 2 < unknown["uncertainty"] < 2 * 0.2 * np.sqrt(5 / 24)
+
+
+def test_the_only_other_sheet_like_that_of_the_run_is_its_roll_test(tmp_path):
+    book = workbook(tmp_path / "a.xlsx", Cal=named(servo_run()), Sheet2=named(rolled()))
+    tool, cal = tmp_path / "tool.toml", tmp_path / "cal.json"
+    assert "--sheet" in refused(mwdcal("profile", book, "-o", tool), 3)
+    assert mwdcal("profile", book, "--sheet", "Cal", "-o", tool).code == 0
+    ran = mwdcal("calibrate", book, "--tool", tool, "--rolltest", book, "-o", cal, "--json")
+    assert ran.code == 0, ran
+    assert ran.json["verification"]["stations"] == 24
+    more = workbook(
+        tmp_path / "b.xlsx", Cal=named(servo_run()), A=named(rolled()), B=named(rolled(noise=3))
+    )
+    message = refused(mwdcal("calibrate", more, "--tool", tool, "--rolltest", more, "-o", cal), 2)
+    assert "call its sheet 'Roll test'" in message
+
+
+# -------------------------------------------------------------------------- one file for another
+
+
+def test_a_file_of_another_kind_is_named_with_what_is_wanted(laboratory, tmp_path):
+    run, tool, cal = (laboratory / name for name in ("run.csv", "tool.toml", "cal.json"))
+    output = ("-o", tmp_path / "out.json")
+    book = workbook(tmp_path / "book.xlsx", Cal=named(servo_run()))
+    asked = {
+        ("calibrate", run, tool, *output): "Is it the tool profile? --tool",
+        ("calibrate", run, run, *output): "Is it the roll test? --rolltest",
+        ("plan", "four-by-six"): "Is it a plan? --plan",
+        ("calibrate", book, "--tool", book, *output): "mwdcal profile book.xlsx -o tool.toml",
+        ("calibrate", run, "--tool", cal, *output): "cal.json is no tool profile",
+        ("apply", tool, run, "-o", tmp_path / "o.csv"): "Calibrate a run with it first",
+        ("verify", cal, run): "mwdcal calibrate judges one",
+        ("survey", cal, run, "--date", "28.11.2026", "-o", tmp_path / "o.csv"): "such as 2026-11-28",
+    }  # fmt: skip
+    for arguments, words in asked.items():
+        assert words in refused(mwdcal(*arguments), 2, 3), arguments
+
+
+def test_a_file_that_no_profile_reads_is_no_matter_of_the_profile(laboratory, tmp_path):
+    tool, output = laboratory / "tool.toml", ("-o", tmp_path / "out.json")
+    whole = (laboratory / "well.csv").read_text("utf-8")
+    book = workbook(tmp_path / "book.xlsx", Cal=named(servo_run())).read_bytes()
+    (tmp_path / "cut.xlsx").write_bytes(book[:3000])
+    (tmp_path / "cut.csv").write_text(whole[: len(whole) // 2], "utf-8")
+    (tmp_path / "page.xls").write_text("<html></html>")
+    for name in ("absent.csv", "cut.xlsx", "cut.csv", "page.xls"):
+        message = refused(mwdcal("calibrate", tmp_path / name, "--tool", tool, *output), 2)
+        assert "[columns]" not in message, name
+
+
+def test_what_both_triads_leave_free_is_said_once(tmp_path):
+    run = {n: c for n, c in servo_run().items() if n != "ref_toolface_deg"}
+    run, cal = write_csv(tmp_path / "run.csv", run), tmp_path / "cal.json"
+    assert mwdcal("calibrate", run, "--tool", "servo", "-o", cal).code == 0
+    ran = mwdcal("verify", cal, write_csv(tmp_path / "roll.csv", rolled()))
+    assert ran.err.count("toolface zero is undetermined") == 1
+    assert "accelerometer and magnetometer: toolface zero" in ran.err
+
+
+def test_gravity_that_nobody_states_is_no_fault(tmp_path):
+    """The laboratory's gravity is 1.4 mg above 1 g, and the table of the well states none: the tool is sound."""
+    tool = replace(Tool.random(1, noise=SERVO_NOISE), gravity=1.0014)
+    run = write_csv(tmp_path / "run.csv", servo_run(tool=tool))
+    assert mwdcal("calibrate", run, "--tool", "servo", "-o", tmp_path / "cal.json").code == 0
+    well = measured((5, 30, 60, 90), 6, tool=tool)
+    well = {n: c for n, c in well.items() if not n.startswith("ref_")}
+    ran = mwdcal(
+        "diagnose", tmp_path / "cal.json", write_csv(tmp_path / "well.csv", well), "--json"
+    )
+    assert ran.code == 0, ran
+    assert "1.0014 g" in findings(ran)["assumed-gravity"]
+
+
+def test_a_channel_that_stands_still_is_named(tmp_path):
+    run = write_csv(tmp_path / "run.csv", named({**servo_run(), "ay": np.full(48, 0.125)}))
+    message = refused(mwdcal("profile", run, "-o", tmp_path / "t.toml"), 3)
+    assert "ay of the accelerometer" in message
+    assert "48 stations" in message
