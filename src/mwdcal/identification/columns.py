@@ -37,7 +37,7 @@ from mwdcal.files.synonyms import (
     unit_of,
 )
 from mwdcal.geometry.vectors import Array, Bools
-from mwdcal.identification.words import STATIONS_ELSEWHERE, letters, spelled, translated
+from mwdcal.files.words import STATIONS_ELSEWHERE, letters, spelled, translated
 from mwdcal.sensor.profile import ColumnSource
 
 # --------------------------------------------------------------------------

@@ -29,6 +29,12 @@ from mwdcal.files.formats.columns import (
     plain_names,
     shown,
 )
+from mwdcal.files.formats.settings import (
+    angles_among,
+    columns_of_codes,
+    columns_of_lines,
+    settings_in,
+)
 from mwdcal.files.formats.title_references import stated_above
 from mwdcal.files.formats.titles import ADJUSTED, OF_REFUSAL, Titles, dated, titles
 from mwdcal.files.synonyms import unit_of
@@ -390,6 +396,23 @@ def _with_stated_warmth(table: Layout) -> Layout:
     )
 
 
+def _with_settings_of_sheets(tables: Sequence[Layout]) -> Sequence[Layout]:
+    """Tables with the settings of the stand that their sheets are named as, where no column states them."""
+    stated = [settings_in(t.sheet) for t in tables]
+    present = angles_among(tables[0].names)
+    angles = [a for a in stated[0] if a not in present and all(a in each for each in stated)]
+    if not angles:
+        return tables
+    return [
+        _with_columns(
+            t,
+            {stated[0][a][0]: [each[a][1]] * len(t.lines) for a in angles},
+            "sheets by their names",
+        )
+        for t, each in zip(tables, stated, strict=True)
+    ]
+
+
 def _are_numbered_on(tables: Sequence[Layout]) -> bool:
     """Whether a column numbers the rows of all tables, from each to the next."""
     columns = (
@@ -406,6 +429,7 @@ def _joined_sheets(tables: Sequence[Layout]) -> Layout:
     """Tables of several sheets as one, in the order of the sheets."""
     if _is_warmth_above(tables):
         tables = [*map(_with_stated_warmth, tables)]
+    tables = _with_settings_of_sheets(tables)
     first = tables[0]
     return replace(
         first,
@@ -498,7 +522,9 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
             below = [row for row in remarks if rows[head][0] < row[0] < layout.lines[0]]
             void = [(n, _words(row)) for n, row in without if rows[head][0] < n < last]
             layout = replace(layout, left_out=tuple(sorted([*layout.left_out, *void])))
-            yield _with_warmth_of_lines(layout, [*below, *rows[head + 1 : end]])
+            between = [*below, *rows[head + 1 : end]]
+            above = rows[max(0, head - 4) : head]
+            yield _with_settings(_with_warmth_of_lines(layout, between), [*above, *between])
 
 
 _STATIONS_IN_COLUMNS = (
@@ -580,13 +606,22 @@ def _legend(text: str) -> list[str]:
 
 
 def _is_remark_below_names(rows: Sequence[tuple[int, Cells]], place: int) -> bool:
-    """Whether a row is a remark between the names of a table and its readings."""
-    row = rows[place][1]
-    if not 0 < place < len(rows) - 1 or sum(cell != "" for cell in row) >= LEAST_COLUMNS - 1:
+    """Whether a row is a remark, or one of a few, between the names of a table and its readings."""
+    first, last = place, place
+    while first > 0 and _is_short(rows[first][1]):
+        first -= 1
+    while last < len(rows) - 1 and _is_short(rows[last][1]):
+        last += 1
+    if not first < place < last or last - first > _MOST_HEADER_ROWS:
         return False
-    above, below = rows[place - 1][1], rows[place + 1][1]
+    above, below = rows[first][1], rows[last][1]
     between = _texts(above) >= LEAST_COLUMNS and not _is_reading(above) and _is_reading(below)
-    return between and not titles([row]).metadata
+    return between and not titles([rows[place][1]]).metadata
+
+
+def _is_short(row: Cells) -> bool:
+    """Whether a row has too few cells for readings or their names."""
+    return sum(cell != "" for cell in row) < LEAST_COLUMNS - 1
 
 
 def _begins_anew(rows: Sequence[tuple[int, Cells]], heads: Sequence[int], place: int) -> bool:
@@ -728,6 +763,41 @@ def _with_warmth_of_lines(layout: Layout, lines: Sequence[tuple[int, Cells]]) ->
         cells=[*layout.cells, cells],
         texts=[*layout.texts, cells],
         left_out=tuple(each for each in layout.left_out if each[0] not in stated),
+        remarks=(*layout.remarks, said),
+    )
+
+
+def _with_settings(layout: Layout, rows: Sequence[tuple[int, Cells]]) -> Layout:
+    """A table with the settings of the stand that lines between its rows, or codes of stations, state.
+
+    A line above the names is one of these if it is like one below.
+    """
+    texts = {n: _text(row) for n, row in rows if n not in {*layout.lines}}
+    first = layout.lines[0]
+    between = {_form(text) for n, text in texts.items() if n > first}
+    texts = {n: text for n, text in texts.items() if n > first or _form(text) in between}
+    columns = columns_of_lines(texts, layout.lines, layout.names)
+    source = "lines above the rows"
+    if not columns:
+        columns, source = columns_of_codes(layout.names, layout.cells), "codes of the stations"
+    return _with_columns(layout, columns, source)
+
+
+def _text(row: Cells) -> str:
+    return " ".join(filter(None, map(as_text, row)))
+
+
+def _with_columns(layout: Layout, columns: Mapping[str, list[str]], source: str) -> Layout:
+    """A table with columns of settings that stand elsewhere, and a remark on where they are from."""
+    if not columns:
+        return layout
+    said = f"{', '.join(map(shown, columns))} of each row is that of the {source}."
+    return replace(
+        layout,
+        names=[*layout.names, *columns],
+        units=[*layout.units, *[""] * len(columns)],
+        cells=[*layout.cells, *columns.values()],
+        texts=[*layout.texts, *columns.values()],
         remarks=(*layout.remarks, said),
     )
 
