@@ -31,7 +31,7 @@ from mwdcal.files.contract import CHANNELS, MAPPED, RANGES, RAW, REFERENCES, uni
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, WORKBOOKS, looks_numeric, shown
 from mwdcal.files.formats.figures import is_figure
-from mwdcal.files.formats.layout import WITHOUT_VALUE, Layout
+from mwdcal.files.formats.layout import NO_READING, WITHOUT_VALUE, Layout
 from mwdcal.files.formats.table import Table, cell_error, labels, numbers
 from mwdcal.files.formats.table import labels as labels_of
 from mwdcal.files.formats.text import is_preamble
@@ -375,7 +375,7 @@ def _cells_without_reading(
     for arguments in only:
         pairs = [text.partition("=") for option, text in arguments if option == "leave_out"]
         if len(pairs) == len(arguments) and all(
-            WITHOUT_VALUE.fullmatch(cell) for *_, cell in pairs
+            WITHOUT_VALUE.fullmatch(cell) or NO_READING.fullmatch(cell) for *_, cell in pairs
         ):
             for name, _, cell in pairs:
                 every.setdefault(name, []).append(cell)

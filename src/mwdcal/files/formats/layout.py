@@ -33,6 +33,7 @@ from mwdcal.files.formats.settings import (
     angles_among,
     columns_of_codes,
     columns_of_lines,
+    headings_in,
     settings_in,
 )
 from mwdcal.files.formats.title_references import stated_above
@@ -78,7 +79,7 @@ _DEGREES_OF = re.compile(
 """The name of a column of degrees, or of minutes."""
 WITHOUT_VALUE = re.compile(r"n/?a|n\.a\.?|nan|null|none|[\W_]*", re.IGNORECASE)
 """A cell that says that there is no value."""
-_NO_READING = re.compile(
+NO_READING = re.compile(
     r"n/?a|n\.a\.?|#n/?a|nan|-?1\.#\w+|null|none|-+|[–—]+|#+|err(or)?|#err|fault|fail(ed)?|overrange|ovr|ovl|ol|"
     r"inval(id)?|bad|timeout|no ?data|feil|fehler",
     re.IGNORECASE,
@@ -524,7 +525,8 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
             layout = replace(layout, left_out=tuple(sorted([*layout.left_out, *void])))
             between = [*below, *rows[head + 1 : end]]
             above = rows[max(0, head - 4) : head]
-            yield _with_settings(_with_warmth_of_lines(layout, between), [*above, *between])
+            layout = _with_settings(_with_warmth_of_lines(layout, between), [*above, *between])
+            yield _with_rows_of_headings(layout)
 
 
 _STATIONS_IN_COLUMNS = (
@@ -676,7 +678,7 @@ def _is_without_reading(row: Cells) -> bool:
     False
     """
     cells = [as_text(cell).strip() for cell in row]
-    filled = [cell for cell in cells if cell and not _NO_READING.fullmatch(cell)]
+    filled = [cell for cell in cells if cell and not NO_READING.fullmatch(cell)]
     lacking = sum(map(bool, cells)) - len(filled)
     worded = sum(not re.search(r"\d", cell) for cell in filled)
     alone = worded == 0 or (worded == 1 and len(filled) > 1)
@@ -781,6 +783,39 @@ def _with_settings(layout: Layout, rows: Sequence[tuple[int, Cells]]) -> Layout:
     if not columns:
         columns, source = columns_of_codes(layout.names, layout.cells), "codes of the stations"
     return _with_columns(layout, columns, source)
+
+
+def _with_rows_of_headings(layout: Layout) -> Layout:
+    """A table with a row for each setting of the stand that headings of groups of columns state: TF 0, TF 90."""
+    headings = headings_in(layout.names)
+    if not headings or not _has_axes(headings.places):
+        return layout
+    channels = {k for each in headings.places.values() for k in each.values()}
+    others = [k for k in range(len(layout.names)) if k not in channels]
+    places = {s: [each[s] for each in headings.places.values()] for s in headings.settings}
+    rows = [
+        (row, setting)
+        for row in range(len(layout.lines))
+        for setting in places
+        if any(layout.cells[k][row] for k in places[setting])
+    ]
+
+    def below(columns: Sequence[Sequence[str]]) -> list[list[str]]:
+        each = [[columns[k][row] for row, _ in rows] for k in others]
+        each += [[columns[p[s]][row] for row, s in rows] for p in headings.places.values()]
+        return [*each, [setting for _, setting in rows]]
+
+    units = [next(iter(each.values())) for each in headings.places.values()]
+    said = f"the groups of columns of {', '.join(places)} are rows, with {shown(headings.name)} by their headings."
+    return replace(
+        layout,
+        names=plain_names([*(layout.names[k] for k in others), *headings.places, headings.name]),
+        units=[*(layout.units[k] for k in [*others, *units]), ""],
+        cells=below(layout.cells),
+        texts=below(layout.texts),
+        lines=[layout.lines[row] for row, _ in rows],
+        remarks=(*layout.remarks, said),
+    )
 
 
 def _text(row: Cells) -> str:

@@ -7,7 +7,9 @@ or as the name of the sheet. `with_settings_of_lines` gives such words columns o
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 from mwdcal.files.formats.columns import as_text
 from mwdcal.files.synonyms import resembled
@@ -98,6 +100,71 @@ def columns_of_lines(
         if -1 not in above and len({cells[n][1] for n in above}) > 1:
             columns[cells[above[0]][0]] = [cells[n][1] for n in above]
     return columns
+
+
+_IN_HEADING = re.compile(
+    r"(?:(?<![\w.,])|(?<=_)|(?<=[a-z@]))(?P<number>[+-]?\d{1,3})(?P<unit>\s?(?:°\s?[CF]?|℃|deg|[CF](?=\b)))?(?![\w.,])"
+)
+"""The setting that a heading of a group of columns states: TF 90, 180°, Gx_270, 60 °C."""
+_LEAST_SPAN = 90.0
+"""By how much the angles of such headings differ at least, degrees."""
+
+
+class Headings(NamedTuple):
+    """Groups of columns for each setting of a stand or an oven: of each channel the place of its column by setting."""
+
+    name: str
+    places: dict[str, dict[str, int]]
+
+    @property
+    def settings(self) -> list[str]:
+        """The numbers of the settings, in the order of the columns."""
+        return [*next(iter(self.places.values()))]
+
+
+def headings_in(names: Sequence[str]) -> Headings | None:
+    """The settings that the headings of equal groups of columns state; None where there are no such groups.
+
+    Words of them say that it is an angle of the stand, or none is there and numbers are of a turn; no other column is
+    the same angle.
+
+    >>> headings_in(["Inc", *(f"TF {t} {axis}" for t in (0, 90, 180) for axis in ("Gx", "Gy", "Gz"))])
+    Headings(name='TF (°)', places={'Gx': {'0': 1, '90': 4, '180': 7}, 'Gy': {'0': 2, '90': 5, '180': 8}, \
+'Gz': {'0': 3, '90': 6, '180': 9}})
+    >>> headings_in([f"Tool 0{n} {axis}" for n in (71, 74) for axis in ("Gx", "Gy", "Gz")])
+    """
+    found = {k: m for k, name in enumerate(names) if (m := _IN_HEADING.search(name))}
+    bare = {k: f"{names[k][: m.start()].rstrip('_@')} {names[k][m.end() :]}".split() for k, m in found.items()}
+    counts = Counter(tuple(each) for each in bare.values())
+    grouped = {k: words for k, words in bare.items() if counts[tuple(words)] > 1}
+    common = [
+        word
+        for word in next(iter(grouped.values()), [])
+        if not re.search(r"[(\[]", word) and all(word in each for each in grouped.values())
+    ]
+    places: dict[str, dict[str, int]] = {}
+    for k, words in grouped.items():
+        channel = " ".join(word for word in words if word not in common)
+        places.setdefault(channel, {})[found[k]["number"].lstrip("+")] = k
+    settings = [*next(iter(places.values()), ())]
+    units = {"".join((found[k]["unit"] or "").split()) for k in grouped}
+    if len(settings) < 2 or any([*each] != settings for each in places.values()) or len(units) > 1:
+        return None
+    name = _name_of_headings(" ".join(common), units.pop(), [*map(float, settings)])
+    others = [n for k, n in enumerate(names) if k not in grouped]
+    if not name or angles_among([name]) & angles_among(others):
+        return None
+    return Headings(name, places)
+
+
+def _name_of_headings(words: str, unit: str, numbers: Sequence[float]) -> str:
+    """The name of the column of the settings that headings state; empty where they may be something else."""
+    if unit[-1:] in ("C", "F", "℃"):
+        return f"Temperature (°{'F' if unit.endswith('F') else 'C'})"
+    turn = max(numbers) - min(numbers) >= _LEAST_SPAN and all(-180 <= n <= 360 for n in numbers)
+    if _angle(words):
+        return f"{words} (°)"
+    return "Setting of the heading (°)" if turn and not words and (unit or len(numbers) > 2) else ""
 
 
 def columns_of_codes(

@@ -45,7 +45,7 @@ _OF_PLACES = (
         r"(total|erd|gesamt|stand)?feld|feldstarke|"
         r"felt|totalintensitat|erdmagnetfeld|magnetfeld|flussdichte|totalfelt\w*|feltstyrke|magnetfelt|"
         r"campo( (magn\w+|totale?|local))*|totaalveld|pole calkow\w*|(teljes )?terero|toplam alan|medan total|全磁力|"
-        r"magnetfalt|"
+        r"magnetfalt|kokonaiskentta|magneettikentta|celkove pole|(전|총)?자기장|전자력|camp( magn\w*)? total|"
         r"intensidade?( total)?|champ( magn\w*)?( total| local)?|"
         r"(магн\w* )?поле|полн\w* (вектор|поле)|модуль( магн\w*)?( поля)?|индукци\w+|напряженност\w+( поля)?|"
         r"(环境|当地|地|总)?磁(总)?场(总)?(强度)?|总场(强度)?|\|b\||tmf|tmi|betrag|natezenie pola",
@@ -55,7 +55,7 @@ _OF_PLACES = (
     ),
     _Quantity(
         "ref_dip_deg",
-        r"(mag\w*|local|field) (dip|inclination)( angle)?|dip( angle)?|dipref|manyetik egim|magn\w* inklinacio|伏角|"
+        r"(mag\w*|local|field) (dip|inclination)( angle)?|dip( angle)?|dipref|복각|magn\w* kaltevuus|inklinaatio|magn\w* inklinace|manyetik egim|magn\w* inklinacio|伏角|"
         r"inklinacja( pola)?|inclinazione magn\w*|magn\w* inclinatie|"
         r"(feld|feld-|magn\w* ?)?inklination|"
         r"(felt|magn\w* ?)?inklinasjon|mergulho( magn\w*)?|inclinaca?o (magn?\w*|do campo)|"
@@ -68,7 +68,7 @@ _OF_PLACES = (
     ),
     _Quantity(
         "ref_gravity_g",
-        r"(local )?gravity( field| acceleration)?|g ?total|gtot|gref|gt|zwaartekracht|yercekimi|nehezsegi gyorsulas|"
+        r"(local )?gravity( field| acceleration)?|g ?total|gtot|gref|gt|중력(가속도)?|painovoima\w*|tihove zrychleni|zwaartekracht|yercekimi|nehezsegi gyorsulas|"
         r"gravita|gravitasi|tyngdkraft|重力(加速度)?|ускорение силы тяжести|"
         r"przyspieszenie ziemskie|"
         r"(local|site) g|g[ -]?(locale?|lokal|ref|tot(al)?)|\|g\||"
@@ -480,7 +480,7 @@ def _plain(text: str) -> str:
         .replace("й", "\2")
     )
     plain = unicodedata.normalize("NFKD", kept.lower().translate({ord("ø"): "o", ord("ß"): "ss"}))
-    bare = "".join(c for c in plain if not unicodedata.combining(c))
+    bare = unicodedata.normalize("NFC", "".join(c for c in plain if not unicodedata.combining(c)))
     bare = re.sub(r"(?<=[\u4e00-\u9fff])(?=[a-zµμ])", " ", bare)
     signs = bare.replace("\0", "°").replace("\1", "²").replace("\2", "й")
     return re.sub(

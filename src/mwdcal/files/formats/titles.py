@@ -29,7 +29,7 @@ _TITLE_WORDS = {
     "serie nserie seriennr geratenummer geratenr sondennummer sondennr serienummer "
     "serienr verktoynr instrumentnr numerodeserie nodeserie noserie nserie numeroserie nsserie numserie ndeserie "
     "matricola nrfabryczny numerfabryczny nrseryjny sondan sondano ferramentan ferramentano herramientan herramientano "
-    "製造番号 製造№ "
+    "製造番号 製造№ sarjanumero sarjano vyrobnicislo vyrc seriovecislo 일련번호 serino numardeserie serienummer "
     "заводской№ заводскойномер серийныйномер зав№ серийный№ прибор№ 序列号 编号 仪器编号 出厂编号",
     "date": "date testdate caldate calibrationdate measured datum prufdatum messdatum dato kalibreringsdato fecha "
     "data дата датакалибровки 日期 校准日期 测试日期",
@@ -264,7 +264,8 @@ def _pair(cell: str, right: Sequence[str]) -> tuple[str, str]:
 def _word(text: str) -> str:
     """Letters of a text in lower case without marks and blanks."""
     plain = unicodedata.normalize("NFKD", text.translate(_SPECIAL_LETTERS).lower())
-    return re.sub(r"[^\w/№]|_", "", "".join(c for c in plain if not unicodedata.combining(c)))
+    bare = "".join(c for c in plain if not unicodedata.combining(c))
+    return re.sub(r"[^\w/№]|_", "", unicodedata.normalize("NFC", bare))
 
 
 def day_of(text: str, day_first: bool = False) -> str:
