@@ -375,7 +375,8 @@ def _cells_without_reading(
     for arguments in only:
         pairs = [text.partition("=") for option, text in arguments if option == "leave_out"]
         if len(pairs) == len(arguments) and all(
-            WITHOUT_VALUE.fullmatch(cell) or NO_READING.fullmatch(cell) for *_, cell in pairs
+            WITHOUT_VALUE.fullmatch(cell) or (cell[:1] != "#" and NO_READING.fullmatch(cell))
+            for *_, cell in pairs
         ):
             for name, _, cell in pairs:
                 every.setdefault(name, []).append(cell)

@@ -261,7 +261,7 @@ def _shared(one: Layout, other: Layout) -> tuple[set[str], set[str]]:
 
 def _have_same_stations(one: Layout, other: Layout) -> bool:
     """Whether sheets have the same stations, by three columns or more that vary, and each a triad of its own."""
-    if one.sheet == other.sheet or len(one.lines) != len(other.lines):
+    if len(one.lines) != len(other.lines):
         return False
     shared, equal = _shared(one, other)
     varied = [n for n, c in zip(one.names, one.cells, strict=True) if n in equal and len({*c}) > 1]
@@ -283,8 +283,9 @@ def _side_by_side(one: Layout, other: Layout) -> Layout:
     _, equal = _shared(one, other)
     more = [k for k, name in enumerate(other.names) if name not in equal]
     names = plain_names([*one.names, *(other.names[k] for k in more)])
+    places = [shown(t.sheet if one.sheet != other.sheet else t.heading) for t in (one, other)]
     said = (
-        f"the sheets {shown(one.sheet)} and {shown(other.sheet)} are one table: in all {len(one.lines)} rows they have "
+        f"{' and '.join(places)} are one table: in all {len(one.lines)} rows they have "
         f"the same {', '.join(n for n in one.names if n in equal)}."
     )
     return replace(
@@ -526,7 +527,7 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
             between = [*below, *rows[head + 1 : end]]
             above = rows[max(0, head - 4) : head]
             layout = _with_settings(_with_warmth_of_lines(layout, between), [*above, *between])
-            yield _with_rows_of_headings(layout)
+            yield _with_triads_beside(_with_rows_of_headings(layout))
 
 
 _STATIONS_IN_COLUMNS = (
@@ -698,7 +699,7 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
     _check_cut(kept, others, source)
     if not kept or max(len(names), *(len(row) for _, row in kept)) < LEAST_COLUMNS:
         return None
-    names, units, columns, letters = _used(kept, names, units, sheet.first_column)
+    names, units, columns, letters = _apart(*_used(kept, names, units, sheet.first_column))
     sign = decimal or figures.decimal_sign([c for column in columns for c in column], source)
     read = [*map(figures.column, columns, figures.signs_of(columns, sign))]
     above = [row for _, row in rows[:top]]
@@ -818,6 +819,48 @@ def _with_rows_of_headings(layout: Layout) -> Layout:
     )
 
 
+def _with_triads_beside(layout: Layout) -> Layout:
+    """A table with a column for each channel, of one with a row for each triad of a station: Acc, Mag, Acc, Mag.
+
+    A column of two texts names the triads, as many rows each in the same order of stations, by three columns or more.
+    """
+    axes = [k for k, name in enumerate(layout.names) if _AXIS.fullmatch(name)]
+    for place, column in enumerate(layout.texts if len(axes) == LEAST_COLUMNS - 1 else ()):
+        one, *others = dict.fromkeys(column)
+        if len(others) != 1 or place in axes or figures.is_figure(one):
+            continue
+        ours, theirs = ([k for k, c in enumerate(column) if c == v] for v in (one, *others))
+        pairs = [([c[k] for k in ours], [c[k] for k in theirs[: len(ours)]]) for c in layout.texts]
+        shared = [k for k, pair in enumerate(pairs) if pair[0] == pair[1]]
+        if len(ours) == len(theirs) and len(shared) >= LEAST_COLUMNS - 2:
+            return _pivoted(layout, place, shared, {one: ours, others[0]: theirs})
+    return layout
+
+
+def _pivoted(
+    layout: Layout, place: int, shared: Sequence[int], rows: Mapping[str, Sequence[int]]
+) -> Layout:
+    """A table with the `rows` of each text in the column at a place side by side; `shared` columns stand once."""
+    first, *_ = rows.values()
+    more = [(k, v) for v in rows for k in range(len(layout.names)) if k not in (*shared, place)]
+
+    def beside(columns: Sequence[Sequence[str]]) -> list[list[str]]:
+        own = [[columns[k][row] for row in first] for k in shared]
+        return own + [[columns[k][row] for row in rows[v]] for k, v in more]
+
+    said = f"the rows of {' and '.join(map(shown, rows))} in {shown(layout.names[place])} are those of one station."
+    names = [_with_title(value, layout.names[k]) for k, value in more]
+    return replace(
+        layout,
+        names=plain_names([*(layout.names[k] for k in shared), *names]),
+        units=[layout.units[k] for k in (*shared, *(k for k, _ in more))],
+        cells=beside(layout.cells),
+        texts=beside(layout.texts),
+        lines=[layout.lines[row] for row in first],
+        remarks=(*layout.remarks, said),
+    )
+
+
 def _text(row: Cells) -> str:
     return " ".join(filter(None, map(as_text, row)))
 
@@ -900,6 +943,26 @@ def _used(
         [units[k] for k in used],
         [columns[k] for k in used],
         [letters_of(first + k) for k in used],
+    )
+
+
+def _apart(
+    names: Sequence[str],
+    units: Sequence[str],
+    columns: Sequence[list[object]],
+    letters: Sequence[str],
+) -> tuple[list[str], list[str], list[list[object]], list[str]]:
+    """The same with a column for each number of cells that have several: Inc/Azi/TF, G xyz."""
+    whole: list[tuple[str, str, list[object], str]] = []
+    for name, unit, column, letter in zip(names, units, columns, letters, strict=True):
+        each, cells = figures.apart(name, column)
+        parts = zip(each, [list(c) for c in cells] or [column], strict=True)
+        whole += [(part, unit, list(c), letter) for part, c in parts]
+    return (
+        plain_names([each[0] for each in whole]),
+        [each[1] for each in whole],
+        [each[2] for each in whole],
+        [each[3] for each in whole],
     )
 
 
