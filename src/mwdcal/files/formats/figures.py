@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from mwdcal.errors import Answer, InputError, QuestionError
 from mwdcal.files.formats.columns import as_text, looks_numeric
+from mwdcal.files.synonyms import unit_of
 
 _SPACES = re.compile(r"(?<=\d)[ '’\u00a0\u202f\u2009](?=\d{3}(\D|$))")
 """What separates thousands and is never a decimal sign."""
@@ -127,7 +128,7 @@ def column(cells: Sequence[object], sign: str) -> tuple[list[str], str]:
 _OF_AXES = re.compile(r"(.*?)[\s_(\[]*x\W*y\W*z[)\]]*(?![^\W\d_])(.*)", re.IGNORECASE)
 """A name of all three axes: G xyz (g), B (x, y, z)."""
 _UNIT_LAST = re.compile(r"(.*?)\s*([(\[][^()\[\]]*[)\]])?\s*")
-_SEPARATORS = ("/", ";", "|", ", ", " ", ",")
+_SEPARATORS = ("/", ";", "|", ", ", " ")
 
 
 def apart(name: str, cells: Sequence[object]) -> tuple[list[str], list[list[str]]]:
@@ -155,7 +156,8 @@ def _names_apart(name: str, count: int) -> list[str]:
         return [f"{axes[1]} {axis}{axes[2]}".strip() for axis in "xyz"]
     head, unit = _UNIT_LAST.fullmatch(name).groups("")  # type: ignore[union-attr]
     each = [part.strip() for part in re.split(r"[/;|,]", head)]
-    return [f"{part} {unit}".strip() for part in each] if len(each) == count and all(each) else []
+    named = len(each) == count and all(each) and not any(map(unit_of, each))
+    return [f"{part} {unit}".strip() for part in each] if named else []
 
 
 def signs_of(columns: Sequence[Sequence[object]], sign: str) -> list[str]:
