@@ -35,7 +35,7 @@ from mwdcal.files.formats.layout import NO_READING, WITHOUT_VALUE, Layout
 from mwdcal.files.formats.table import Table, cell_error, labels, numbers
 from mwdcal.files.formats.table import labels as labels_of
 from mwdcal.files.formats.text import is_preamble
-from mwdcal.files.marks import MARKS_NAMED, UNMARKED, marks_in, place, without_rejected
+from mwdcal.files.marks import MARKS_NAMED, UNMARKED, is_the_repeat, marks_in, place, without_rejected
 from mwdcal.files.metadata import toml
 from mwdcal.files.profiles import CHOICE_OF_AXES
 from mwdcal.files.repeats import means, repeats, station_by_angles
@@ -729,7 +729,9 @@ def _without_rejected(
     used = [n for n, m in meanings.items() if m.column in UNMARKED]
     marks = marks_in(table, form or TableFormat(), used)
     questions = [
-        question_on_mark(table, name, cell, rows) for (name, cell), rows in marks.doubtful.items()
+        question_on_mark(table, name, cell, rows)
+        for (name, cell), rows in marks.doubtful.items()
+        if not all(is_the_repeat(table, row, cell) for row in rows)
     ]
     return without_rejected(table, form or msgspec.UNSET, used), questions
 
