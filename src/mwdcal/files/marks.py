@@ -51,6 +51,8 @@ _ACCEPTED = re.compile(
     r"ok(ay)?|good|valid|accept(ed)?|pass(ed)?|use(d)?|i\.? ?o\.?|gut|gultig|bestanden|godkjent|gyldig|bra|bien|bueno|"
     r"buena|aceptad[oa]|valid[oa]|bom|boa|aceit[oa]|bon(ne)?|годен|годна|хорошо|норма|да|ок|合格|正常|有效|良好?"
 )
+_REMARK_BEHIND = re.compile(r"\s*[(\[][^)\]]*[)\]]$|\s*[,;–-]\s+.*$")
+"""A remark behind a judgement: ok (repeated)."""
 _OF_ACCEPTANCE = re.compile(
     r"(is )?(ok|valid|use|used|accept|accepted|good|gultig|gyldig|valid[oa]|годен|有效|io)\W*"
 )
@@ -149,7 +151,7 @@ def _verdicts(name: str, cells: Sequence[str]) -> dict[str, bool]:
         return dict.fromkeys(filled & _AFFIRMED, True)
     verdicts = {c: True for c in filled if _REJECTED.fullmatch(c)}
     verdicts |= {c: False for c in filled if c not in verdicts and _MAY_REJECT.search(c)}
-    accepted = {c for c in filled if _ACCEPTED.fullmatch(c)}
+    accepted = {c for c in filled if _ACCEPTED.fullmatch(_REMARK_BEHIND.sub("", c))}
     if 2 * sum(map(accepted.__contains__, cells)) < len(cells):
         accepted = set()
     named = _OF_STATUS.fullmatch(name) or _OF_ACCEPTANCE.fullmatch(name)

@@ -93,6 +93,13 @@ _OF_VOID_RUN = re.compile(
     re.IGNORECASE,
 )
 """Words of the name of a sheet, or of the line above a table, of a run that does not count."""
+_OF_PAST_RUN = re.compile(
+    r"(?<![^\W\d_])(superseded|obsolete|outdated|replaced by|veraltet|überholt|ersetzt durch|utgått|erstattet av|"
+    r"reemplazad[oa] por|sustituid[oa]|substitu[ií]d[oa]|périmé|remplacée? par|устарел\w*|заменен\w* на)(?![^\W\d_])|"
+    r"已作废|已取代|旧版",
+    re.IGNORECASE,
+)
+"""Words of a run that another one superseded."""
 _OF_ROLL_TEST = re.compile(
     r"(?<![^\W\d_])(roll[\s_-]*(test|over|check)|rt|verif\w*|check|valid\w*|(roll)?pr(ue|ü)fung|"
     r"[ck]ontrol\w*[- ]?(run|shot|test|roll|messung|dreh|måling|rull)\w*|rulletest|prueba|"
@@ -243,13 +250,52 @@ def laid_out(
 def _with_same_stations(tables: Sequence[Layout]) -> list[Layout]:
     """Tables, each with the channels that another sheet has of the same stations: of two triads on two sheets."""
     joined: list[Layout] = []
-    for table in tables:
+    for table in _with_stand(tables):
         place = next((k for k, t in enumerate(joined) if _have_same_stations(t, table)), None)
         if place is None:
             joined.append(table)
         else:
             joined[place] = _side_by_side(joined[place], table)
     return joined
+
+
+def _with_stand(tables: Sequence[Layout]) -> list[Layout]:
+    """Tables, each of channels alone with the angles of the one other that has the same stations and no channels.
+
+    The stations of both are told by a column of one name in which no two rows are alike.
+    """
+    stands = [t for t in tables if angles_among(t.names) and not _has_axes(t.names)]
+    tools = [t for t in tables if _has_axes(t.names) and not angles_among(t.names)]
+    if len(stands) != 1 or not tools:
+        return [*tables]
+    (stand,) = stands
+    joined = {id(tool): pair for tool in tools if (pair := _of_stations(tool, stand))}
+    if len(joined) != len(tools):
+        return [*tables]
+    return [joined.get(id(t), t) for t in tables if t is not stand]
+
+
+def _of_stations(tool: Layout, stand: Layout) -> Layout | None:
+    """The table of a tool with the columns of the stand at the same stations; None where none tells these."""
+    for name in (each for each in tool.names if each in stand.names):
+        ours, theirs = (t.texts[t.names.index(name)] for t in (tool, stand))
+        places = {station: row for row, station in enumerate(theirs)}
+        if len(places) == len(theirs) and {*ours} <= {*places} and len({*ours}) == len(ours):
+            rows = [places[station] for station in ours]
+            more = [k for k, other in enumerate(stand.names) if other not in tool.names]
+            said = (
+                f"the angles of the stand are those of {shown(stand.sheet or stand.heading)} at the same "
+                f"{shown(name)}."
+            )
+            return replace(
+                tool,
+                names=plain_names([*tool.names, *(stand.names[k] for k in more)]),
+                units=[*tool.units, *(stand.units[k] for k in more)],
+                cells=[*tool.cells, *([stand.cells[k][row] for row in rows] for k in more)],
+                texts=[*tool.texts, *([stand.texts[k][row] for row in rows] for k in more)],
+                remarks=(*tool.remarks, said),
+            )
+    return None
 
 
 def _shared(one: Layout, other: Layout) -> tuple[set[str], set[str]]:
@@ -317,7 +363,7 @@ def _the_run(tables: Sequence[Layout]) -> Layout | None:
     """The run among alike tables: their sheets joined, or the one beside which the others are void or roll tests."""
     if _is_one_run(tables):
         return _joined_sheets(tables)
-    kinds = [_kind(f"{t.sheet} {t.heading}") for t in tables]
+    kinds = [_kind(f"{t.sheet} {t.heading}", t.above) for t in tables]
     runs = [t for t, kind in zip(tables, kinds, strict=True) if not kind]
     if len(runs) != 1 or ADJUSTED.search(runs[0].heading):
         return None
@@ -329,8 +375,13 @@ def _the_run(tables: Sequence[Layout]) -> Layout | None:
     return replace(runs[0], left_out=(*runs[0].left_out, *aside))
 
 
-def _kind(words: str) -> str:
-    """A void run or a roll test, by the sheet of a table and the line above it; empty for a run."""
+def _kind(words: str, above: Sequence[str] = ()) -> str:
+    """A void run or a roll test, by the sheet of a table and the line above it; empty for a run.
+
+    A run is one of the past where any line `above` says that another superseded it.
+    """
+    if any(map(_OF_PAST_RUN.search, above)):
+        return "superseded run"
     kinds = (("void run", _OF_VOID_RUN), (ROLL_TEST, _OF_ROLL_TEST))
     return next((kind for kind, pattern in kinds if pattern.search(words)), "")
 
@@ -586,7 +637,8 @@ def _with_legend(rows: list[tuple[int, Cells]]) -> list[tuple[int, Cells]]:
     """
     first = next((k for k, (_, row) in enumerate(rows) if _is_reading(row)), 0)
     for k in range(first - 1, -1, -1):
-        names = _legend(" ".join(map(as_text, rows[k][1])))
+        text = " ".join(map(as_text, rows[k][1]))
+        names = _legend(text) or _listed(text)
         if len(names) == len(rows[first][1]):
             return [*rows[:k], *rows[k + 1 : first], (rows[k][0], names), *rows[first:]]
     return rows
@@ -606,6 +658,25 @@ def _legend(text: str) -> list[str]:
             " ".join([*words[:-count], each, bracket + unit]).strip() for each in words[-count:]
         ]
     return names
+
+
+_LIST_OF_COLUMNS = re.compile(
+    r"\W*(columns?|cols?|fields?|header|spalten?|kolonner?|kolumner|columnas?|colunas?|campos|colonnes?|colonne|kolumny|"
+    r"столбцы|колонки|列|字段)\W*[:：=]\s*",
+    re.IGNORECASE,
+)
+"""What stands before the names of all columns in one line."""
+
+
+def _listed(text: str) -> list[str]:
+    """The names of columns behind a word for these, apart by blanks or commas; a unit in brackets belongs to its name.
+
+    >>> _listed("% columns: stn inc(deg) tf (deg)")
+    ['stn', 'inc(deg)', 'tf (deg)']
+    """
+    match = _LIST_OF_COLUMNS.match(text)
+    bare = re.sub(r"\s+(?=[(\[])", "\0", text[match.end() :]) if match else ""
+    return [name.replace("\0", " ") for name in re.split(r"[\s,;|]+", bare.strip()) if name]
 
 
 def _is_remark_below_names(rows: Sequence[tuple[int, Cells]], place: int) -> bool:

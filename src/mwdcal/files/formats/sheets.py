@@ -85,8 +85,18 @@ def _delimited(lines: Sequence[str], source: str) -> tuple[str, list[tuple[int, 
         best = max(marks, key=lambda mark: counts[mark])
     cells = _split(lines, best, source)
     if best in (_BLANKS, _RUNS):
-        cells = _in_columns(lines, cells)
+        cells = _in_columns(lines, _without_marks(cells))
     return best, [(line, _trimmed(row)) for line, row in enumerate(cells, 1) if any(row)]
+
+
+def _without_marks(rows: Sequence[list[str]]) -> list[list[str]]:
+    """The rows without the mark of a comment before names, of which there is one cell more than of readings."""
+    widths = Counter(len(row) for row in rows if _is_of_numbers(row))
+    usual = widths.most_common(1)[0][0] if widths else 0
+    return [
+        row[1:] if len(row) == usual + 1 and re.fullmatch(r"[#%;!/*]+", row[0]) else row
+        for row in rows
+    ]
 
 
 def _in_columns(lines: Sequence[str], rows: Sequence[list[str]]) -> list[list[str]]:

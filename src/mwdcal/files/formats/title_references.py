@@ -208,13 +208,70 @@ _SPELT = {
 """Units in small letters, where `unit_of` does not know them or goes by capitals."""
 
 
+_NO_LONGER = re.compile(
+    r"(?<![^\W\d_])(prev(ious)?|former(ly)?|old|obsolete|superseded|no longer|last (cal\w*|site|year)|gammel\w*|gamle|"
+    r"utgatt|tidligere|forrige|alte[rsn]?|ehemalig\w*|vorherig\w*|fruher\w*|antigu[oa]|antig[oa]|anterior|ancien\w*|"
+    r"precedent\w*|vecchi[oa]|precedente|dawn\w*|poprzedni\w*|stary|stara|стар\w*|прежн\w*|прошл\w*|предыдущ\w*)(?![^\W\d_])|"
+    r"旧|以前|上次",
+)
+"""Words of a place or a calibration whose references no longer hold."""
+_LIMITS = re.compile(
+    r"\W*(\w+ )?(limits?|tolerances?|acceptance( criteria| limits)?|criteria|grenzwerte?|toleranz(en)?|grenser?|"
+    r"toleranser?|limites?|tolerancias?|tolerancias?|limiti|tolleranze|допуск\w*|пределы|限差|公差)\W*"
+)
+"""A line above limits, which are no references."""
+
+
 def stated_above(rows: Sequence[Sequence[object]], besides: Rows = ()) -> Titles:
     """Metadata on tool, day and place from the rows above a table, and on the place from the lines `besides` it."""
     rows = [_unsplit(row) for row in rows]
     block = titles(rows)
-    references = references_in(rows, besides)
+    here = _of_this_place(_without_limits(rows))
+    references = references_in(here, _without_limits(besides))
     rough = {c: text for c, text in doubtful_in(rows, besides).items() if c not in references}
     return block._replace(metadata={**references, **block.metadata}, not_taken=rough)
+
+
+def _without_limits(rows: Rows) -> list[Sequence[object]]:
+    """The rows without those below a line that says that limits follow, each with a number."""
+    kept, limits = list[Sequence[object]](), False
+    for row in rows:
+        text = _plain(_line(row)).strip()
+        numbered = bool(re.search(r"\d", text))
+        limits = bool(_LIMITS.fullmatch(text)) or (limits and numbered)
+        kept += [] if limits else [row]
+    return kept
+
+
+def _of_this_place(rows: Rows) -> list[Sequence[object]]:
+    """The rows without those of other places: of a list of places below names, and lines on what no longer holds.
+
+    Of a list the row counts whose place is named in another row of the title block too, or the only one that is not
+    said to hold no longer. Where none does, or several do, the list stays, and its values differ.
+    """
+    kept = [row for row in rows if not _NO_LONGER.search(_plain(_line(row)))]
+    lists = [k for k, row in enumerate(kept) if k and _is_of_place(row)]
+    for first in (k for k in lists if not _is_of_place(kept[k - 1])):
+        block = [kept[k] for k in range(first, len(kept)) if {*range(first, k + 1)} <= {*lists}]
+        others = " ".join(_line(row) for row in kept if row not in block)
+        named = [row for row in block if _first_word(row) in others]
+        if len(block) > 1 and len(named) == 1:
+            kept = [row for row in kept if row not in block or row in named]
+    return kept
+
+
+def _first_word(row: Sequence[object]) -> str:
+    """The first word of a row, with the blank or mark behind it."""
+    match = re.match(r"[^\W\d_]+", _line(row))
+    return match[0] if match else ""
+
+
+def _is_of_place(row: Sequence[object]) -> bool:
+    """Whether a row is a name with two numbers or more behind it, and nothing else."""
+    first, *cells = [as_text(cell).strip() for cell in row] or [""]
+    filled = [*filter(None, cells)]
+    numbers = all(re.fullmatch(rf"{_WRITTEN_NUMBER}", cell) for cell in filled)
+    return bool(re.match(r"[^\W\d_]", first)) and len(filled) > 1 and numbers
 
 
 _SPLIT_BEFORE = re.compile(r"(?P<words>.*?)(?P<digits>(?<![\d.,])\d+)$")
@@ -294,8 +351,10 @@ def _with_columns(rows: Rows) -> list[Sequence[object]]:
     """The rows, with each value below a row of words as a row of both."""
     every = [*rows]
     paired: list[Sequence[object]] = []
+    words: list[str] = []
     for above, below in pairwise(every):
-        words = [as_text(cell).strip() for cell in above]
+        if not (words and _is_of_place(above)):
+            words = [as_text(cell).strip() for cell in above]
         cells = [as_text(cell).strip() for cell in below]
         if (
             not any(re.match(r"[-−+]?\d", word) for word in words)
