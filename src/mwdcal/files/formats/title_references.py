@@ -8,6 +8,7 @@ an uncertainty and what was measured are no reference.
 
 from __future__ import annotations
 
+import math
 import re
 import unicodedata
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -342,6 +343,8 @@ def _values_in(rows: Rows, besides: Rows = ()) -> dict[str, dict[float, None]]:
         for column, value in _by_unit(text, here):
             by_unit.setdefault(column, {})[value] = None
     every = by_unit | of_places | {c: each | by_unit.get(c, {}) for c, each in by_word.items()}
+    if {"ref_field_nt", "ref_dip_deg"}.isdisjoint(every):
+        every |= {column: {value: None} for column, value in _by_components(texts).items()}
     if "ref_field_nt" in every and "ref_dip_deg" not in every:
         every["ref_dip_deg"] = dict.fromkeys(v for text in texts for v in _inclinations(text))
     return every
@@ -376,6 +379,34 @@ class _Figure(NamedTuple):
     minutes: float
     unit: str
     behind: str
+
+
+_HORIZONTAL = re.compile(r"horizont\w*|poziom\w*|гориз\w*|vodorovn\w*|水平|\bh\b")
+_VERTICAL = re.compile(r"vertik\w*|vertical\w*|pionow\w*|верти\w*|svisl\w*|垂直|竖直|\b[zv]\b")
+_COMPONENT = re.compile(r"compon\w*|kompon\w*|komp\b|skladow\w*|состав\w*|компон\w*|slozk\w*|intensit\w*|分量|part\b|anteil")
+"""Words of the two components of a field, of which strength and dip follow."""
+
+
+def _by_components(texts: Sequence[str]) -> dict[str, float]:
+    """Field and dip of the horizontal and the vertical component that lines state, the latter positive downwards.
+
+    >>> _by_components(["field, horizontal component 3.0 ut; vertical component 4.0 ut"])["ref_field_nt"]
+    5000.0
+    """
+    parts: dict[bool, set[float]] = {True: set(), False: set()}
+    for text in (t for t in texts if _COMPONENT.search(t)):
+        for figure in _figures(text):
+            unit = _stated_unit(_OF_PLACES[0], figure.unit)
+            flat, steep = _HORIZONTAL.search(figure.words), _VERTICAL.search(figure.words)
+            if unit in _OF_PLACES[0].units and bool(flat) != bool(steep):
+                parts[bool(flat)] |= {_converted(n, unit) for n in _numbers(figure.number)}
+    if any(len(each) != 1 for each in parts.values()):
+        return {}
+    (horizontal,), (vertical,) = parts[True], parts[False]
+    return {
+        "ref_field_nt": math.hypot(horizontal, vertical),
+        "ref_dip_deg": math.degrees(math.atan2(vertical, horizontal)),
+    }
 
 
 def _figures(text: str) -> Iterator[_Figure]:
@@ -538,7 +569,7 @@ def _plain(text: str) -> str:
         .replace("²", "\1")
         .replace("й", "\2")
     )
-    plain = unicodedata.normalize("NFKD", kept.lower().translate({ord("ø"): "o", ord("ß"): "ss"}))
+    plain = unicodedata.normalize("NFKD", kept.lower().translate({ord("ø"): "o", ord("ß"): "ss", ord("ł"): "l"}))
     bare = unicodedata.normalize("NFC", "".join(c for c in plain if not unicodedata.combining(c)))
     bare = re.sub(r"(?<=[\u4e00-\u9fff])(?=[a-zµμ])", " ", bare)
     signs = bare.replace("\0", "°").replace("\1", "²").replace("\2", "й")

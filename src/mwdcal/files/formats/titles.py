@@ -71,12 +71,12 @@ ADJUSTED = re.compile(
 _PARTS = re.compile(r"\s+/\s+|,\s+|;\s*|\s{3,}")
 """The separator of facts in one cell."""
 _OF_TOOLS = (
-    "tool|probe|sensor|sonde|instrument|herramienta|ferramenta|verktøy|gerät|"
+    "tool|probe|sensor|sonde|sonda|prüfling|instrument|herramienta|ferramenta|verktøy|gerät|"
     "прибор|зонд|датчик|инклинометр|仪器|探管"
 )
 _TOOL = re.compile(
     rf"#?\s*(?:(?:{_OF_TOOLS})\s*"
-    r"(?P<mark>s/?n|serial( no)?|n[°º]|no\b|nr\b|зав\.?\s*№|№|#|号|编号)?|(?P<sn>sn|s/n|serial no))\s*[.:：|=]*\s*",
+    r"(?P<mark>s/?n|serial( no)?|n[°º]|n(?=\s+\d)|no\b|nr\b|зав\.?\s*№|№|#|号|编号)?|(?P<sn>sn|s/n|serial no))\s*[.:：|=]*\s*",
     re.IGNORECASE,
 )
 _SERIAL = re.compile(r"(?=\S*\d)[^\W_][\w./-]*")
@@ -239,7 +239,7 @@ def _marked_in(text: str) -> list[str]:
 
 def _tool(cell: str, right: Sequence[str]) -> str:
     """The serial behind a word for the tool, in a cell or the next one; empty where that may be something else."""
-    match = _TOOL.match(cell)
+    match = _TOOL.match(cell) or _TOOL.fullmatch(cell, max(cell.rfind(" "), cell.rfind("-")) + 1)
     if not match:
         return ""
     behind = cell[match.end() :].strip() or next((each for each in right[:2] if each), "")
