@@ -171,7 +171,7 @@ _NUMBER_ANYWHERE = re.compile(
 _UNIT_ALONE = re.compile(rf"(?<![^\W\d_])({_WRITTEN_UNIT})(?![^\W\d_])")
 _NO_PLACE = re.compile(
     rf"{_UNSURE.pattern}|"
-    r"horizont\w*|vertical\w*|vertik\w*|compon\w*|kompon\w*|north|nord|south|sud|coil\w*|spule\w*|scale|sens\w*|full|"
+    r"horizont\w*|poziom\w*|pionow\w*|skladow\w*|slozk\w*|vertical\w*|vertik\w*|compon\w*|kompon\w*|north|nord|south|sud|coil\w*|spule\w*|scale|sens\w*|full|"
     r"measured|\bmeas\b|mean|average|\bavg|mittel|gemessen|malt|medid\w*|mesur\w*|media|medio|moyen\w*|средн\w*|измер\w*|"
     r"calc\w*|comput\w*|\bper\b|\bto\s*$|\bbis\s*$|change|variation|shift|bias|previous|last|old|"
     r"(?<![^\W\d_])[hbfg][xyz](?![^\W\d_])|fluxgate|\bfs\b|\btype|satur\w*|overload|capacity|thermo\w*|горизонт\w*|верти\w*|компон\w*|水平|垂直|分量|平均|测得|灵敏度|\d\s*m?v\b|[<>]",
