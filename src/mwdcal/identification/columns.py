@@ -36,8 +36,8 @@ from mwdcal.files.synonyms import (
     synonyms_of,
     unit_of,
 )
-from mwdcal.geometry.vectors import Array, Bools
 from mwdcal.files.words import STATIONS_ELSEWHERE, letters, spelled, translated
+from mwdcal.geometry.vectors import Array, Bools
 from mwdcal.sensor.profile import ColumnSource
 
 # --------------------------------------------------------------------------
@@ -337,7 +337,8 @@ _CCW = re.compile(
 )
 """Words of angles that count anticlockwise."""
 _UPHOLE = re.compile(
-    r"look\w* up|up ?hole|from (the )?(below|bottom)|von unten|nedenfra|desde abajo|снизу|向上看", re.IGNORECASE
+    r"look\w* up|up ?hole|from (the )?(below|bottom)|von unten|nedenfra|desde abajo|снизу|向上看",
+    re.IGNORECASE,
 )
 """Words of one who looks up the hole, to whom a clockwise angle is an anticlockwise one."""
 _FROM_HORIZONTAL = re.compile(

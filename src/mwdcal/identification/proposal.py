@@ -35,7 +35,14 @@ from mwdcal.files.formats.layout import NO_READING, WITHOUT_VALUE, Layout
 from mwdcal.files.formats.table import Table, cell_error, labels, numbers
 from mwdcal.files.formats.table import labels as labels_of
 from mwdcal.files.formats.text import is_preamble
-from mwdcal.files.marks import MARKS_NAMED, UNMARKED, is_the_repeat, marks_in, place, without_rejected
+from mwdcal.files.marks import (
+    MARKS_NAMED,
+    UNMARKED,
+    is_the_repeat,
+    marks_in,
+    place,
+    without_rejected,
+)
 from mwdcal.files.metadata import toml
 from mwdcal.files.profiles import CHOICE_OF_AXES
 from mwdcal.files.repeats import means, repeats, station_by_angles
@@ -990,7 +997,7 @@ def _check_magnetic(
     )
 
 
-_ANOTHER_DIP = 3.0
+_ANOTHER_DIP = 1.0
 """By how much a dip that is stated differs from that of the readings where it is of another place, degrees."""
 
 

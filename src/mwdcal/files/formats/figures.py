@@ -20,7 +20,9 @@ _DEGREES = re.compile(
 """Degrees, minutes and seconds."""
 _BEARING = re.compile(r"([NS])\s*(\d+(?:[.,]\d+)?)\s*°?\s*([EWO])", re.IGNORECASE)
 """A bearing by quadrants, such as N45E."""
-_POINTS = {point: f"{45 * k}" for k, point in enumerate(("N", "NE", "E", "SE", "S", "SW", "W", "NW"))}
+_POINTS = {
+    point: f"{45 * k}" for k, point in enumerate(("N", "NE", "E", "SE", "S", "SW", "W", "NW"))
+}
 """Points of the compass, and their azimuths; O is west in Spanish, and east in German."""
 _POINTED_DAY = re.compile(r"\s*\d{1,2}\.\d{1,2}\.(\d{4}|\d{2})([ T].*)?")
 """A day as in Germany or Russia, which is no number."""
@@ -139,12 +141,16 @@ def apart(name: str, cells: Sequence[object]) -> tuple[list[str], list[list[str]
     >>> apart("Inc/Azi (deg)", ["30/90", "45/180"]), apart("G xyz", ["(0.1, 0.2, 0.9)"])[0], apart("Day", ["1/2"])
     ((['Inc (deg)', 'Azi (deg)'], [['30', '45'], ['90', '180']]), ['G x', 'G y', 'G z'], (['Day'], []))
     """
-    texts = [re.sub(r"[\[\](){}°º]", "", cell).strip() if isinstance(cell, str) else "" for cell in cells]
+    texts = [
+        re.sub(r"[\[\](){}°º]", "", cell).strip() if isinstance(cell, str) else "" for cell in cells
+    ]
     for separator in _SEPARATORS if all(texts) else ():
         parts = [[part.strip() for part in text.split(separator)] for text in texts]
         parts = [[*filter(None, each)] for each in parts] if separator == " " else parts
         names = _names_apart(name, len(parts[0])) if 1 < len(parts[0]) < 4 else []
-        whole = all(len(each) == len(names) and all(map(_BARE_FIGURE.fullmatch, each)) for each in parts)
+        whole = all(
+            len(each) == len(names) and all(map(_BARE_FIGURE.fullmatch, each)) for each in parts
+        )
         if names and whole:
             return names, [list(column) for column in zip(*parts, strict=True)]
     return [name], []

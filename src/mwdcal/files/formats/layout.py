@@ -1027,8 +1027,8 @@ def _apart(
     whole: list[tuple[str, str, list[object], str]] = []
     for name, unit, column, letter in zip(names, units, columns, letters, strict=True):
         each, cells = figures.apart(name, column)
-        parts = zip(each, [list(c) for c in cells] or [column], strict=True)
-        whole += [(part, unit, list(c), letter) for part, c in parts]
+        parts: Iterable[Cells] = cells or [column]
+        whole += [(part, unit, [*c], letter) for part, c in zip(each, parts, strict=True)]
     return (
         plain_names([each[0] for each in whole]),
         [each[1] for each in whole],

@@ -21,9 +21,7 @@ from mwdcal.files.formats import figures
 Rows = list[tuple[int, list[object]]]
 _LEAST_PAIRS, _LEAST_RECORDS = 4, 5
 """Names with values in a record at least, and records of the same names."""
-_PAIR = re.compile(
-    r"(?<![^\s,;|])([^\W\d_][\w./°-]*)\s*[=:]\s*([+−-]?[\w.,+−-]*\w)(?=[\s,;|]|$)"
-)
+_PAIR = re.compile(r"(?<![^\s,;|])([^\W\d_][\w./°-]*)\s*[=:]\s*([+−-]?[\w.,+−-]*\w)(?=[\s,;|]|$)")
 _LINE = re.compile(r"\s*([^\W\d_][^=:;]{0,30}?)\s*[=:]\s*(\S.*?)\s*")
 _SPREADSHEET = "{urn:schemas-microsoft-com:office:spreadsheet}"
 IS_XML = _SPREADSHEET[1:-1].encode()
@@ -36,8 +34,8 @@ def rows_of_records(lines: Sequence[str]) -> Rows | None:
     >>> rows_of_records(["probe 7", *(f"N={n} AX=0.1 AY=0.2 AZ=0.9" for n in range(1, 6))])[:3]
     [(1, ['probe 7']), (2, ['N', 'AX', 'AY', 'AZ']), (2, ['1', '0.1', '0.2', '0.9'])]
     """
-    each = {n: record for n, line in enumerate(lines, 1) if (record := _record(line))}
-    each = each or _records_by_lines(lines)
+    by_line = {n: named for n, line in enumerate(lines, 1) if (named := _record(line))}
+    each = by_line or _records_by_lines(lines)
     names = Counter(tuple(record) for record in each.values())
     usual, count = names.most_common(1)[0] if names else ((), 0)
     if count < _LEAST_RECORDS or len(usual) < _LEAST_PAIRS or 2 * count < len(each):
@@ -64,10 +62,10 @@ def _record(line: str) -> dict[str, object]:
             record = json.loads(line.strip().rstrip(","))
             return {key: _cell(value) for key, value in record.items()}
     pairs = _PAIR.findall(line)
-    named = {name: value for name, value in pairs}
+    named: dict[str, object] = dict(pairs)
     numbers = sum(map(figures.is_figure, named.values()))
     whole = len(named) == len(pairs) >= _LEAST_PAIRS and 2 * numbers >= len(pairs)
-    return {**named} if whole and not re.search(r"[^\s,;|]", _PAIR.sub(" ", line)) else {}
+    return named if whole and not re.search(r"[^\s,;|]", _PAIR.sub(" ", line)) else {}
 
 
 def _cell(value: object) -> object:
@@ -184,4 +182,3 @@ def _value(data: ElementTree.Element | None) -> object:
         with suppress(ValueError):
             return float(text)
     return text
-

@@ -38,7 +38,13 @@ _TO = re.compile(r"\s*(?:to|bis|til|до|[-–…]|\.\.)\s*[\d+]", re.IGNORECASE
 _CODE = re.compile(r"(?:[^\W\d_]{1,3}[ ._=-]?-?\d{1,3}(?:\.\d+)?[°]?[ _,;/-]?){2,4}")
 """A code of a station that states its setting: I30A090T180."""
 _PART_OF_CODE = re.compile(r"([^\W\d_]{1,3})[ ._=-]?(-?\d{1,3}(?:\.\d+)?)")
-_LETTERS = {"i": "inclination", "a": "azimuth", "t": "toolface", "r": "toolface", "n": "inclination"}
+_LETTERS = {
+    "i": "inclination",
+    "a": "azimuth",
+    "t": "toolface",
+    "r": "toolface",
+    "n": "inclination",
+}
 """What a letter in such a code is short for; n of Neigung."""
 
 
@@ -134,7 +140,10 @@ def headings_in(names: Sequence[str]) -> Headings | None:
     >>> headings_in([f"Tool 0{n} {axis}" for n in (71, 74) for axis in ("Gx", "Gy", "Gz")])
     """
     found = {k: m for k, name in enumerate(names) if (m := _IN_HEADING.search(name))}
-    bare = {k: f"{names[k][: m.start()].rstrip('_@')} {names[k][m.end() :]}".split() for k, m in found.items()}
+    bare = {
+        k: f"{names[k][: m.start()].rstrip('_@')} {names[k][m.end() :]}".split()
+        for k, m in found.items()
+    }
     counts = Counter(tuple(each) for each in bare.values())
     grouped = {k: words for k, words in bare.items() if counts[tuple(words)] > 1}
     common = [

@@ -383,7 +383,9 @@ class _Figure(NamedTuple):
 
 _HORIZONTAL = re.compile(r"horizont\w*|poziom\w*|гориз\w*|vodorovn\w*|水平|\bh\b")
 _VERTICAL = re.compile(r"vertik\w*|vertical\w*|pionow\w*|верти\w*|svisl\w*|垂直|竖直|\b[zv]\b")
-_COMPONENT = re.compile(r"compon\w*|kompon\w*|komp\b|skladow\w*|состав\w*|компон\w*|slozk\w*|intensit\w*|分量|part\b|anteil")
+_COMPONENT = re.compile(
+    r"compon\w*|kompon\w*|komp\b|skladow\w*|состав\w*|компон\w*|slozk\w*|intensit\w*|分量|part\b|anteil"
+)
 """Words of the two components of a field, of which strength and dip follow."""
 
 
@@ -569,7 +571,9 @@ def _plain(text: str) -> str:
         .replace("²", "\1")
         .replace("й", "\2")
     )
-    plain = unicodedata.normalize("NFKD", kept.lower().translate({ord("ø"): "o", ord("ß"): "ss", ord("ł"): "l"}))
+    plain = unicodedata.normalize(
+        "NFKD", kept.lower().translate({ord("ø"): "o", ord("ß"): "ss", ord("ł"): "l"})
+    )
     bare = unicodedata.normalize("NFC", "".join(c for c in plain if not unicodedata.combining(c)))
     bare = re.sub(r"(?<=[\u4e00-\u9fff])(?=[a-zµμ])", " ", bare)
     signs = bare.replace("\0", "°").replace("\1", "²").replace("\2", "й")
