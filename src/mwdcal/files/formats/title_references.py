@@ -56,7 +56,8 @@ _OF_PLACES = (
     ),
     _Quantity(
         "ref_dip_deg",
-        r"(mag\w*|local|field) (dip|inclination)( angle)?|dip( angle)?|dipref|복각|magn\w* kaltevuus|inklinaatio|magn\w* inklinace|manyetik egim|magn\w* inklinacio|伏角|"
+        r"(mag\w*|local|field) (dip|inclination)( angle)?|dip( angle)?|dipref|복각|magn\w* kaltevuus|inklinaatio|"
+        r"magn\w* inklinace|manyetik egim|magn\w* inklinacio|伏角|"
         r"inklinacja( pola)?|inclinazione magn\w*|magn\w* inclinatie|"
         r"(feld|feld-|magn\w* ?)?inklination|"
         r"(felt|magn\w* ?)?inklinasjon|mergulho( magn\w*)?|inclinaca?o (magn?\w*|do campo)|"
@@ -69,7 +70,8 @@ _OF_PLACES = (
     ),
     _Quantity(
         "ref_gravity_g",
-        r"(local )?gravity( field| acceleration)?|g ?total|gtot|gref|gt|중력(가속도)?|painovoima\w*|tihove zrychleni|zwaartekracht|yercekimi|nehezsegi gyorsulas|"
+        r"(local )?gravity( field| acceleration)?|g ?total|gtot|gref|gt|중력(가속도)?|painovoima\w*|tihove zrychleni|"
+        r"zwaartekracht|yercekimi|nehezsegi gyorsulas|"
         r"gravita|gravitasi|tyngdkraft|重力(加速度)?|ускорение силы тяжести|"
         r"przyspieszenie ziemskie|"
         r"(local|site) g|g[ -]?(locale?|lokal|ref|tot(al)?)|\|g\||"
@@ -171,16 +173,20 @@ _NUMBER_ANYWHERE = re.compile(
 _UNIT_ALONE = re.compile(rf"(?<![^\W\d_])({_WRITTEN_UNIT})(?![^\W\d_])")
 _NO_PLACE = re.compile(
     rf"{_UNSURE.pattern}|"
-    r"horizont\w*|poziom\w*|pionow\w*|skladow\w*|slozk\w*|vertical\w*|vertik\w*|compon\w*|kompon\w*|north|nord|south|sud|coil\w*|spule\w*|scale|sens\w*|full|"
-    r"measured|\bmeas\b|mean|average|\bavg|mittel|gemessen|malt|medid\w*|mesur\w*|media|medio|moyen\w*|средн\w*|измер\w*|"
+    r"horizont\w*|poziom\w*|pionow\w*|skladow\w*|slozk\w*|vertical\w*|vertik\w*|compon\w*|kompon\w*|north|nord|"
+    r"south|sud|coil\w*|spule\w*|scale|sens\w*|full|"
+    r"measured|\bmeas\b|mean|average|\bavg|mittel|gemessen|malt|medid\w*|mesur\w*|media|medio|moyen\w*|средн\w*|"
+    r"измер\w*|"
     r"calc\w*|comput\w*|\bper\b|\bto\s*$|\bbis\s*$|change|variation|shift|bias|previous|last|old|"
-    r"(?<![^\W\d_])[hbfg][xyz](?![^\W\d_])|fluxgate|\bfs\b|\btype|satur\w*|overload|capacity|thermo\w*|горизонт\w*|верти\w*|компон\w*|水平|垂直|分量|平均|测得|灵敏度|\d\s*m?v\b|[<>]",
+    r"(?<![^\W\d_])[hbfg][xyz](?![^\W\d_])|fluxgate|\bfs\b|\btype|satur\w*|overload|capacity|thermo\w*|"
+    r"горизонт\w*|верти\w*|компон\w*|水平|垂直|分量|平均|测得|灵敏度|\d\s*m?v\b|[<>]",
 )
 """Words of a strength that is not that of the place."""
 _AT = re.compile(r"\bat\b|\bbei\b")
 """Words before a strength at which something was checked, unless it is one of several places."""
 _INCLINED = re.compile(
-    r"dip|(?<![^\W\d_])[iеe]n[ck]l\w*|inklin\w*|inclin\w*|наклон\w*|нахил\w*|倾|伏角|傾|egim|duzalimi|sklon\w*|nachyleni\w*|"
+    r"dip|(?<![^\W\d_])[iеe]n[ck]l\w*|inklin\w*|inclin\w*|наклон\w*|нахил\w*|倾|伏角|傾|egim|duzalimi|sklon\w*|"
+    r"nachyleni\w*|"
     r"hajlas\w*|lutning|kallistuma|helling|mergulho|buzamiento|echado",
 )
 """Words of an inclination, which is the field's in a line about a place."""
@@ -212,7 +218,8 @@ _SPELT = {
 _NO_LONGER = re.compile(
     r"(?<![^\W\d_])(prev(ious)?|former(ly)?|old|obsolete|superseded|no longer|last (cal\w*|site|year)|gammel\w*|gamle|"
     r"utgatt|tidligere|forrige|alte[rsn]?|ehemalig\w*|vorherig\w*|fruher\w*|antigu[oa]|antig[oa]|anterior|ancien\w*|"
-    r"precedent\w*|vecchi[oa]|precedente|dawn\w*|poprzedni\w*|stary|stara|стар\w*|прежн\w*|прошл\w*|предыдущ\w*)(?![^\W\d_])|"
+    r"precedent\w*|vecchi[oa]|precedente|dawn\w*|poprzedni\w*|stary|stara|стар\w*|прежн\w*|прошл\w*|"
+    r"предыдущ\w*)(?![^\W\d_])|"
     r"旧|以前|上次",
 )
 """Words of a place or a calibration whose references no longer hold."""

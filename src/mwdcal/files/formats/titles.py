@@ -76,7 +76,8 @@ _OF_TOOLS = (
 )
 _TOOL = re.compile(
     rf"#?\s*(?:(?:{_OF_TOOLS})\s*"
-    r"(?P<mark>s/?n|serial( no)?|n[°º]|n(?=\s+\d)|no\b|nr\b|зав\.?\s*№|№|#|号|编号)?|(?P<sn>sn|s/n|serial no))\s*[.:：|=]*\s*",
+    r"(?P<mark>s/?n|serial( no)?|n[°º]|n(?=\s+\d)|no\b|nr\b|зав\.?\s*№|№|#|号|编号)?|(?P<sn>sn|s/n|"
+    r"serial no))\s*[.:：|=]*\s*",
     re.IGNORECASE,
 )
 _SERIAL = re.compile(r"(?=\S*\d)[^\W_][\w./-]*")
