@@ -400,7 +400,8 @@ def _is_one_run(tables: Sequence[Layout]) -> bool:
         for t in tables
     )
     words = [" ".join([t.sheet, *t.above]) for t in tables]
-    apart = any(ADJUSTED.search(each) or _kind(each) for each in words)
+    past = any(_kind("", t.above) for t in tables)
+    apart = past or any(ADJUSTED.search(each) or _kind(each) for each in words)
     rows = [row for t in tables for row in zip(*t.texts, strict=True)]
     if not same or apart or len({*sheets}) < len(sheets) or len({*rows}) < len(rows):
         return False

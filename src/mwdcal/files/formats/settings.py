@@ -48,12 +48,13 @@ _LETTERS = {
 """What a letter in such a code is short for; n of Neigung."""
 
 
-def _angle(words: str) -> str:
-    """The angle of the stand that words say, or the last of them; empty of others."""
+def _angle(words: str, first: bool = False) -> str:
+    """The angle of the stand that words say, or the last of them, or the `first`; empty of others."""
     each = words.split()
     if each and each[-1].lower() == "az":
         return "ref_azimuth_deg"
-    alike = (resembled(spelled(" ".join(each[k:]))) for k in range(len(each)))
+    parts = [each[: k + 1] if first else each[k:] for k in range(len(each))]
+    alike = (resembled(spelled(" ".join(part))) for part in parts)
     return next((a.column for a in alike if a and a.column in _ANGLES), "")
 
 
@@ -67,7 +68,8 @@ def settings_in(text: str) -> dict[str, tuple[str, str]]:
     """
     settings: dict[str, tuple[str, str]] = {}
     for form in _FORMS:
-        each = [(match, _angle(match["words"])) for match in form.finditer(text)]
+        behind = form is _FORMS[1]
+        each = [(match, _angle(match["words"], behind)) for match in form.finditer(text)]
         each = [(m, angle) for m, angle in each if angle and not _TO.match(text, m.end("number"))]
         if len({angle for _, angle in each}) < len(each):
             return {}

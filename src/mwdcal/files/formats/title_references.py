@@ -111,6 +111,11 @@ _UNSURE = re.compile(
 """Words by which a value is no reference."""
 _BEFORE = re.compile(r"[^\W\d_]*\W{0,2}[^\W\d_]*\W*$")
 """The two words before a quantity, of which one may say that its value is no reference."""
+_OF_COMPONENT = re.compile(
+    r"horizont\w*|vertical\w*|vertik\w*|compon\w*|kompon\w*|poziom\w*|pionow\w*|skladow\w*|горизонт\w*|верти\w*|"
+    r"компон\w*|水平|垂直|分量"
+)
+"""Words of a part of a field between its word and a number."""
 _BETWEEN = r"(?P<between>[^\d+\-−;]{0,30}?)"
 _REFERRING = re.compile(
     r"(?<![^\W\d_])(ref|reference|local|lokal|value|wert|t|f|i|g|т)(?![^\W\d_])"
@@ -596,7 +601,11 @@ def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
     between, behind = match["between"], match["behind"]
     rough = re.match(r"\W*(nomin|номин|标称|nenn|k\s?g\b)", behind) and not match["next"]
     letter = "letter" in match.groupdict()
-    if rough or _UNSURE.search(between if letter else f"{match['word']} {between}"):
+    if (
+        rough
+        or _OF_COMPONENT.search(between)
+        or _UNSURE.search(between if letter else f"{match['word']} {between}")
+    ):
         return
     inner = re.search(rf"(?<![^\W\d_])({_WRITTEN_UNIT})(?![^\W\d_])", between)
     written = match["unit"] or (inner[1] if inner else "") or ("°" if match["minutes"] else "")
