@@ -35,7 +35,7 @@ _MAY_REJECT = re.compile(
     r"nicht bestanden|falha|fallo|выброс|сбой)(?![^\W\d_])|异常|可疑|移动|碰到"
 )
 """A cell that may reject its row, or speak of another one."""
-_REPEATED = re.compile(
+_MEASURED_AGAIN = re.compile(
     r"repeat(ed)?|re-?(taken|shot|shoot|read|done|measured|run)|again|wiederh\w*|gjentatt|omm[aå]lt|repetid[oa]|repet\w*|"
     r"повтор\w*|重测|重新"
 )
@@ -75,7 +75,7 @@ _MOST_VALUES = 5
 """Values of a column of a status at most; one of more tells something else."""
 
 
-_NEAR, _SELDOM = 0.005, 0.2
+_NEAR, _RARE = 0.005, 0.2
 """A share of the range of a column within which numbers are near, and of rows that are near the next seldom."""
 UNMARKED = ("group", "serial", *OURS)
 """Columns of a run file that mark no row."""
@@ -125,13 +125,13 @@ def is_the_repeat(table: Table, row: int, cell: str) -> bool:
 
     Such a row would be near it in a column, such as the rolls, in which neighbours seldom are.
     """
-    if not _REPEATED.search(_plain(cell)) or _REFUSED.search(_plain(cell)):
+    if not _MEASURED_AGAIN.search(_plain(cell)) or _REFUSED.search(_plain(cell)):
         return False
     for name in table.columns:
         with suppress(InputError):
             values = numbers(table, name)
             near = np.abs(np.diff(values)) <= _NEAR * np.ptp(values)
-            if near.mean() < _SELDOM and near[max(0, row - 1) : row + 1].any():
+            if near.mean() < _RARE and near[max(0, row - 1) : row + 1].any():
                 return False
     return True
 

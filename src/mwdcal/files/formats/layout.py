@@ -917,8 +917,8 @@ def _pivoted(
     more = [(k, v) for v in rows for k in range(len(layout.names)) if k not in (*shared, place)]
 
     def beside(columns: Sequence[Sequence[str]]) -> list[list[str]]:
-        own = [[columns[k][row] for row in first] for k in shared]
-        return own + [[columns[k][row] for row in rows[v]] for k, v in more]
+        once = [[columns[k][row] for row in first] for k in shared]
+        return once + [[columns[k][row] for row in rows[v]] for k, v in more]
 
     said = f"the rows of {' and '.join(map(shown, rows))} in {shown(layout.names[place])} are those of one station."
     names = [_with_title(value, layout.names[k]) for k, value in more]

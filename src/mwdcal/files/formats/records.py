@@ -21,8 +21,10 @@ from mwdcal.files.formats import figures
 Rows = list[tuple[int, list[object]]]
 _LEAST_PAIRS, _LEAST_RECORDS = 4, 5
 """Names with values in a record at least, and records of the same names."""
-_PAIR = re.compile(r"(?<![^\s,;|])([^\W\d_][\w./°-]*)\s*[=:]\s*([+−-]?[\w.,+−-]*\w)(?=[\s,;|]|$)")
-_LINE = re.compile(r"\s*([^\W\d_][^=:;]{0,30}?)\s*[=:]\s*(\S.*?)\s*")
+_PAIR_IN_LINE = re.compile(
+    r"(?<![^\s,;|])([^\W\d_][\w./°-]*)\s*[=:]\s*([+−-]?[\w.,+−-]*\w)(?=[\s,;|]|$)"
+)
+_PAIR_ALONE = re.compile(r"\s*([^\W\d_][^=:;]{0,30}?)\s*[=:]\s*(\S.*?)\s*")
 _SPREADSHEET = "{urn:schemas-microsoft-com:office:spreadsheet}"
 IS_XML = _SPREADSHEET[1:-1].encode()
 """What a workbook in Excel's XML of 2003 has in its first lines."""
@@ -61,11 +63,11 @@ def _record(line: str) -> dict[str, object]:
         with suppress(ValueError, RecursionError):
             record = json.loads(line.strip().rstrip(","))
             return {key: _cell(value) for key, value in record.items()}
-    pairs = _PAIR.findall(line)
+    pairs = _PAIR_IN_LINE.findall(line)
     named: dict[str, object] = dict(pairs)
     numbers = sum(map(figures.is_figure, named.values()))
     whole = len(named) == len(pairs) >= _LEAST_PAIRS and 2 * numbers >= len(pairs)
-    return named if whole and not re.search(r"[^\s,;|]", _PAIR.sub(" ", line)) else {}
+    return named if whole and not re.search(r"[^\s,;|]", _PAIR_IN_LINE.sub(" ", line)) else {}
 
 
 def _cell(value: object) -> object:
@@ -74,7 +76,9 @@ def _cell(value: object) -> object:
 
 def _records_by_lines(lines: Sequence[str]) -> dict[int, dict[str, object]]:
     """Records of which each name stands with its value in a line of its own, by the line of the first."""
-    pairs = [(n, m[1], m[2]) for n, text in enumerate(lines, 1) if (m := _LINE.fullmatch(text))]
+    pairs = [
+        (n, m[1], m[2]) for n, text in enumerate(lines, 1) if (m := _PAIR_ALONE.fullmatch(text))
+    ]
     counts = Counter(name for _, name, _ in pairs)
     repeated = [(n, name, value) for n, name, value in pairs if counts[name] >= _LEAST_RECORDS]
     if not repeated:
@@ -155,12 +159,12 @@ def sheets_of_xml(data: bytes, source: str) -> Iterator[tuple[str, Rows]]:
                 place: _value(cell.find(f"{_SPREADSHEET}Data"))
                 for place, cell in _indexed(row.iter(f"{_SPREADSHEET}Cell"))
             }
-            if cells and max(cells) <= _MOST_COLUMNS:
+            if cells and max(cells) <= _WIDEST_SHEET:
                 rows.append((number, [cells.get(k, "") for k in range(1, max(cells) + 1)]))
         yield page.get(f"{_SPREADSHEET}Name", ""), [r for r in rows if any(c != "" for c in r[1])]
 
 
-_MOST_COLUMNS = 16_384
+_WIDEST_SHEET = 16_384
 """Columns of a sheet at most."""
 
 

@@ -15,30 +15,30 @@ from mwdcal.files.formats.columns import as_text
 from mwdcal.files.synonyms import resembled
 from mwdcal.files.words import spelled
 
-_ANGLES = {
+_ANGLES_OF_STAND = {
     "ref_inclination_deg": "Inclination",
     "ref_azimuth_deg": "Azimuth",
     "ref_toolface_deg": "Toolface",
 }
-_WORDS = r"(?P<words>[^\W\d_](?:[^\W\d_]|[ ./_-])*{more})"
-_NUMBER = (
+_WORDS_BEFORE = r"(?P<words>[^\W\d_](?:[^\W\d_]|[ ./_-])*{more})"
+_NUMBER_OF_SETTING = (
     r"(?P<number>(?<![\d.,/-])[+−-]?\d+(?:[.,]\d+)?)(?![\d.,]*\d)(?![/-]\d)\s*"
     r"(?P<unit>(?:°|º|deg\w*|grad\w*|gon|rad|град\w*|度)(?![^\W\d_]))?"
 )
-_FORMS = (
+_STATEMENTS = (
     re.compile(
-        rf"(?<![^\W\d_]){_WORDS.format(more='?')}\.?\s*(?:[=:：]\s*)?{_NUMBER}(?![^\W\d_]*\d*[^\W\d_])",
+        rf"(?<![^\W\d_]){_WORDS_BEFORE.format(more='?')}\.?\s*(?:[=:：]\s*)?{_NUMBER_OF_SETTING}(?![^\W\d_]*\d*[^\W\d_])",
         re.IGNORECASE,
     ),
-    re.compile(rf"{_NUMBER}\s*{_WORDS.format(more='')}", re.IGNORECASE),
+    re.compile(rf"{_NUMBER_OF_SETTING}\s*{_WORDS_BEFORE.format(more='')}", re.IGNORECASE),
 )
 """A number with its unit behind words, and before them: Inclination 30°, 30° inclination."""
 _TO = re.compile(r"\s*(?:to|bis|til|до|[-–…]|\.\.)\s*[\d+]", re.IGNORECASE)
 """The end of a range behind a number."""
-_CODE = re.compile(r"(?:[^\W\d_]{1,3}[ ._=-]?-?\d{1,3}(?:\.\d+)?[°]?[ _,;/-]?){2,4}")
+_CODE_OF_STATION = re.compile(r"(?:[^\W\d_]{1,3}[ ._=-]?-?\d{1,3}(?:\.\d+)?[°]?[ _,;/-]?){2,4}")
 """A code of a station that states its setting: I30A090T180."""
 _PART_OF_CODE = re.compile(r"([^\W\d_]{1,3})[ ._=-]?(-?\d{1,3}(?:\.\d+)?)")
-_LETTERS = {
+_SHORT_FOR = {
     "i": "inclination",
     "a": "azimuth",
     "t": "toolface",
@@ -55,7 +55,7 @@ def _angle(words: str, first: bool = False) -> str:
         return "ref_azimuth_deg"
     parts = [each[: k + 1] if first else each[k:] for k in range(len(each))]
     alike = (resembled(spelled(" ".join(part))) for part in parts)
-    return next((a.column for a in alike if a and a.column in _ANGLES), "")
+    return next((a.column for a in alike if a and a.column in _ANGLES_OF_STAND), "")
 
 
 def settings_in(text: str) -> dict[str, tuple[str, str]]:
@@ -67,8 +67,8 @@ def settings_in(text: str) -> dict[str, tuple[str, str]]:
     ({}, {'ref_inclination_deg': ('inclination (°)', '30')})
     """
     settings: dict[str, tuple[str, str]] = {}
-    for form in _FORMS:
-        behind = form is _FORMS[1]
+    for form in _STATEMENTS:
+        behind = form is _STATEMENTS[1]
         each = [(match, _angle(match["words"], behind)) for match in form.finditer(text)]
         each = [(m, angle) for m, angle in each if angle and not _TO.match(text, m.end("number"))]
         if len({angle for _, angle in each}) < len(each):
@@ -76,7 +76,7 @@ def settings_in(text: str) -> dict[str, tuple[str, str]]:
         for match, angle in each:
             words = " ".join(match["words"].split())
             alike = resembled(spelled(words))
-            name = words if alike and alike.column == angle else _ANGLES[angle]
+            name = words if alike and alike.column == angle else _ANGLES_OF_STAND[angle]
             unit = f" ({match['unit']})" if match["unit"] else ""
             settings.setdefault(angle, (f"{name}{unit}", _pointed(match["number"])))
     return settings
@@ -88,7 +88,9 @@ def _pointed(number: str) -> str:
 
 def angles_among(names: Iterable[str]) -> set[str]:
     """The angles of the stand that columns of these names are."""
-    return {alike.column for name in names if (alike := resembled(spelled(name)))} & _ANGLES.keys()
+    return {
+        alike.column for name in names if (alike := resembled(spelled(name)))
+    } & _ANGLES_OF_STAND.keys()
 
 
 def columns_of_lines(
@@ -102,7 +104,7 @@ def columns_of_lines(
     present = angles_among(names)
     stated = {n: each for n, text in texts.items() if (each := settings_in(text))}
     columns: dict[str, list[str]] = {}
-    for angle in (each for each in _ANGLES if each not in present):
+    for angle in (each for each in _ANGLES_OF_STAND if each not in present):
         cells = {n: each[angle] for n, each in stated.items() if angle in each}
         above = [max((n for n in cells if n < line), default=-1) for line in lines]
         if -1 not in above and len({cells[n][1] for n in above}) > 1:
@@ -141,10 +143,10 @@ def headings_in(names: Sequence[str]) -> Headings | None:
 'Gz': {'0': 3, '90': 6, '180': 9}})
     >>> headings_in([f"Tool 0{n} {axis}" for n in (71, 74) for axis in ("Gx", "Gy", "Gz")])
     """
-    found = {k: m for k, name in enumerate(names) if (m := _IN_HEADING.search(name))}
+    marks = {k: m for k, name in enumerate(names) if (m := _IN_HEADING.search(name))}
     bare = {
         k: f"{names[k][: m.start()].rstrip('_@')} {names[k][m.end() :]}".split()
-        for k, m in found.items()
+        for k, m in marks.items()
     }
     counts = Counter(tuple(each) for each in bare.values())
     grouped = {k: words for k, words in bare.items() if counts[tuple(words)] > 1}
@@ -156,9 +158,9 @@ def headings_in(names: Sequence[str]) -> Headings | None:
     places: dict[str, dict[str, int]] = {}
     for k, words in grouped.items():
         channel = " ".join(word for word in words if word not in common)
-        places.setdefault(channel, {})[found[k]["number"].lstrip("+")] = k
+        places.setdefault(channel, {})[marks[k]["number"].lstrip("+")] = k
     settings = [*next(iter(places.values()), ())]
-    units = {"".join((found[k]["unit"] or "").split()) for k in grouped}
+    units = {"".join((marks[k]["unit"] or "").split()) for k in grouped}
     if len(settings) < 2 or any([*each] != settings for each in places.values()) or len(units) > 1:
         return None
     name = _name_of_headings(" ".join(common), units.pop(), [*map(float, settings)])
@@ -186,11 +188,11 @@ def columns_of_codes(
         return {}
     for cells in columns:
         texts = [as_text(cell) for cell in cells]
-        if not all(map(_CODE.fullmatch, texts)):
+        if not all(map(_CODE_OF_STATION.fullmatch, texts)):
             continue
         parts = [_PART_OF_CODE.findall(text) for text in texts]
         words = [word for word, _ in parts[0]]
-        angles = [_LETTERS.get(word.lower(), word) for word in words]
+        angles = [_SHORT_FOR.get(word.lower(), word) for word in words]
         meant = [_angle(each) for each in angles]
         alike = all([word for word, _ in each] == words for each in parts)
         if alike and all(meant) and len({*meant}) == len(meant):

@@ -228,7 +228,7 @@ _NO_LONGER = re.compile(
     r"旧|以前|上次",
 )
 """Words of a place or a calibration whose references no longer hold."""
-_LIMITS = re.compile(
+_OF_LIMITS = re.compile(
     r"\W*(\w+ )?(limits?|tolerances?|acceptance( criteria| limits)?|criteria|grenzwerte?|toleranz(en)?|grenser?|"
     r"toleranser?|limites?|tolerancias?|tolerancias?|limiti|tolleranze|допуск\w*|пределы|限差|公差)\W*"
 )
@@ -251,7 +251,7 @@ def _without_limits(rows: Rows) -> list[Sequence[object]]:
     for row in rows:
         text = _plain(_line(row)).strip()
         numbered = bool(re.search(r"\d", text))
-        limits = bool(_LIMITS.fullmatch(text)) or (limits and numbered)
+        limits = bool(_OF_LIMITS.fullmatch(text)) or (limits and numbered)
         kept += [] if limits else [row]
     return kept
 
@@ -395,7 +395,7 @@ class _Figure(NamedTuple):
 
 _HORIZONTAL = re.compile(r"horizont\w*|poziom\w*|гориз\w*|vodorovn\w*|水平|\bh\b")
 _VERTICAL = re.compile(r"vertik\w*|vertical\w*|pionow\w*|верти\w*|svisl\w*|垂直|竖直|\b[zv]\b")
-_COMPONENT = re.compile(
+_COMPONENTS = re.compile(
     r"compon\w*|kompon\w*|komp\b|skladow\w*|состав\w*|компон\w*|slozk\w*|intensit\w*|分量|part\b|anteil"
 )
 """Words of the two components of a field, of which strength and dip follow."""
@@ -408,7 +408,7 @@ def _by_components(texts: Sequence[str]) -> dict[str, float]:
     5000.0
     """
     parts: dict[bool, set[float]] = {True: set(), False: set()}
-    for text in (t for t in texts if _COMPONENT.search(t)):
+    for text in (t for t in texts if _COMPONENTS.search(t)):
         for figure in _figures(text):
             unit = _stated_unit(_OF_PLACES[0], figure.unit)
             flat, steep = _HORIZONTAL.search(figure.words), _VERTICAL.search(figure.words)
