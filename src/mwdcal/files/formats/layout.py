@@ -262,7 +262,7 @@ def _with_same_stations(tables: Sequence[Layout]) -> list[Layout]:
 def _with_stand(tables: Sequence[Layout]) -> list[Layout]:
     """Tables, each of channels alone with the angles of the one other that has the same stations and no channels.
 
-    The stations of both are told by a column of one name in which no two rows are alike.
+    A column of one name in which no two rows are alike tells the stations of both.
     """
     stands = [t for t in tables if angles_among(t.names) and not _has_axes(t.names)]
     tools = [t for t in tables if _has_axes(t.names) and not angles_among(t.names)]
@@ -666,7 +666,7 @@ _LIST_OF_COLUMNS = re.compile(
     r"столбцы|колонки|列|字段)\W*[:：=]\s*",
     re.IGNORECASE,
 )
-"""What stands before the names of all columns in one line."""
+"""The word before the names of all columns in one line."""
 
 
 def _listed(text: str) -> list[str]:

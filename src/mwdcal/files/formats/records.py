@@ -27,7 +27,7 @@ _PAIR_IN_LINE = re.compile(
 _PAIR_ALONE = re.compile(r"\s*([^\W\d_][^=:;]{0,30}?)\s*[=:]\s*(\S.*?)\s*")
 _SPREADSHEET = "{urn:schemas-microsoft-com:office:spreadsheet}"
 IS_XML = _SPREADSHEET[1:-1].encode()
-"""What a workbook in Excel's XML of 2003 has in its first lines."""
+"""The name space in the first lines of a workbook in Excel's XML of 2003."""
 
 
 def rows_of_records(lines: Sequence[str]) -> Rows | None:
@@ -58,7 +58,7 @@ def rows_of_records(lines: Sequence[str]) -> Rows | None:
 
 
 def _record(line: str) -> dict[str, object]:
-    """The names with values of one line; empty where it is none of a record."""
+    """The names with values of one line; empty where it has no record."""
     if line.lstrip().startswith("{"):
         with suppress(ValueError, RecursionError):
             record = json.loads(line.strip().rstrip(","))

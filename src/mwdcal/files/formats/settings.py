@@ -1,4 +1,4 @@
-"""Settings of the stand that stand beside the columns: in lines between the rows, names of sheets, codes of stations.
+"""Settings of the stand that have no column: in lines between the rows, names of sheets, codes of stations.
 
 A technician who turns a tool at one inclination after the other writes the inclination once, in a line above its rows,
 or as the name of the sheet. `with_settings_of_lines` gives such words columns of their own.
@@ -45,7 +45,7 @@ _SHORT_FOR = {
     "r": "toolface",
     "n": "inclination",
 }
-"""What a letter in such a code is short for; n of Neigung."""
+"""Angles by their letter in such a code; n of Neigung."""
 
 
 def _angle(words: str, first: bool = False) -> str:
