@@ -141,6 +141,8 @@ def apart(name: str, cells: Sequence[object]) -> tuple[list[str], list[list[str]
     >>> apart("Inc/Azi (deg)", ["30/90", "45/180"]), apart("G xyz", ["(0.1, 0.2, 0.9)"])[0], apart("Day", ["1/2"])
     ((['Inc (deg)', 'Azi (deg)'], [['30', '45'], ['90', '180']]), ['G x', 'G y', 'G z'], (['Day'], []))
     """
+    if not any(_names_apart(name, count) for count in (2, 3)):
+        return [name], []
     texts = [
         re.sub(r"[\[\](){}°º]", "", cell).strip() if isinstance(cell, str) else "" for cell in cells
     ]

@@ -847,7 +847,8 @@ def _with_settings(layout: Layout, rows: Sequence[tuple[int, Cells]]) -> Layout:
 
     A line above the names is one of these if it is like one below.
     """
-    texts = {n: _text(row) for n, row in rows if n not in {*layout.lines}}
+    readings = {*layout.lines}
+    texts = {n: _text(row) for n, row in rows if n not in readings}
     first = layout.lines[0]
     between = {_form(text) for n, text in texts.items() if n > first}
     texts = {n: text for n, text in texts.items() if n > first or _form(text) in between}
