@@ -9,15 +9,17 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
 import msgspec
+import numpy as np
 
 from mwdcal.calibration.diagnosis.flags import listed
 from mwdcal.errors import Answer, InputError, QuestionError
 from mwdcal.files.formats.columns import Column, looks_numeric, shown
-from mwdcal.files.formats.table import Table, labels, row_word
+from mwdcal.files.formats.table import Table, labels, numbers, row_word
 from mwdcal.files.formats.titles import ADJUSTED, OF_REFUSAL
 from mwdcal.files.parting import check_rows, marked_rows
 from mwdcal.files.statements import rows_of
@@ -33,6 +35,13 @@ _MAY_REJECT = re.compile(
     r"nicht bestanden|falha|fallo|выброс|сбой)(?![^\W\d_])|异常|可疑|移动|碰到"
 )
 """A cell that may reject its row, or speak of another one."""
+_MEASURED_AGAIN = re.compile(
+    r"repeat(ed)?|re-?(taken|shot|shoot|read|done|measured|run)|again|wiederh\w*|gjentatt|omm[aå]lt|repetid[oa]|repet\w*|"
+    r"повтор\w*|重测|重新"
+)
+"""Words of a row that was measured again: it counts where no row beside it is of the same setting."""
+_REFUSED = re.compile(rf"(?<![^\W\d_])({OF_REFUSAL}|fail(ed)?|outlier)(?![^\W\d_])")
+"""Words that reject a row whatever was done then."""
 _REJECTS_PREVIOUS = re.compile(
     r"(?<![^\W\d_])(previous|prior|last|vorige\w*|vorherige\w*|forrige|anterior|precedent\w*|предыдущ\w*)(?![^\W\d_])\W*"
     rf"(?:\w+\W+){{0,2}}({OF_REFUSAL})(?![^\W\d_])|(上|前)一?[个点行次]\w{{0,2}}(作废|无效|剔除|不合格|坏)",
@@ -42,6 +51,8 @@ _ACCEPTED = re.compile(
     r"ok(ay)?|good|valid|accept(ed)?|pass(ed)?|use(d)?|i\.? ?o\.?|gut|gultig|bestanden|godkjent|gyldig|bra|bien|bueno|"
     r"buena|aceptad[oa]|valid[oa]|bom|boa|aceit[oa]|bon(ne)?|годен|годна|хорошо|норма|да|ок|合格|正常|有效|良好?"
 )
+_REMARK_BEHIND = re.compile(r"\s*[(\[][^)\]]*[)\]]$|\s*[,;–-]\s+.*$")
+"""A remark behind a judgement: ok (repeated)."""
 _OF_ACCEPTANCE = re.compile(
     r"(is )?(ok|valid|use|used|accept|accepted|good|gultig|gyldig|valid[oa]|годен|有效|io)\W*"
 )
@@ -64,6 +75,8 @@ _MOST_VALUES = 5
 """Values of a column of a status at most; one of more tells something else."""
 
 
+_NEAR, _RARE = 0.005, 0.2
+"""A share of the range of a column within which numbers are near, and of rows that are near the next seldom."""
 UNMARKED = ("group", "serial", *OURS)
 """Columns of a run file that mark no row."""
 
@@ -107,6 +120,22 @@ def marks_in(table: Table, form: TableFormat, used: Collection[str]) -> Marks:
     return Marks(left_out, {key: rows for key, rows in open_rows.items() if rows})
 
 
+def is_the_repeat(table: Table, row: int, cell: str) -> bool:
+    """Whether a cell says that its row was measured again, and no row beside it is another one of its setting.
+
+    Such a row would be near it in a column, such as the rolls, in which neighbours seldom are.
+    """
+    if not _MEASURED_AGAIN.search(_plain(cell)) or _REFUSED.search(_plain(cell)):
+        return False
+    for name in table.columns:
+        with suppress(InputError):
+            values = numbers(table, name)
+            near = np.abs(np.diff(values)) <= _NEAR * np.ptp(values)
+            if near.mean() < _RARE and near[max(0, row - 1) : row + 1].any():
+                return False
+    return True
+
+
 def _verdicts(name: str, cells: Sequence[str]) -> dict[str, bool]:
     """The cells of a column that reject their rows (true), or may do so (false)."""
     different = {*cells}
@@ -122,7 +151,7 @@ def _verdicts(name: str, cells: Sequence[str]) -> dict[str, bool]:
         return dict.fromkeys(filled & _AFFIRMED, True)
     verdicts = {c: True for c in filled if _REJECTED.fullmatch(c)}
     verdicts |= {c: False for c in filled if c not in verdicts and _MAY_REJECT.search(c)}
-    accepted = {c for c in filled if _ACCEPTED.fullmatch(c)}
+    accepted = {c for c in filled if _ACCEPTED.fullmatch(_REMARK_BEHIND.sub("", c))}
     if 2 * sum(map(accepted.__contains__, cells)) < len(cells):
         accepted = set()
     named = _OF_STATUS.fullmatch(name) or _OF_ACCEPTANCE.fullmatch(name)

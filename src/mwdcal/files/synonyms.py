@@ -359,7 +359,7 @@ def _is_warmth(words: Sequence[str], whole: str) -> bool:
 def _words(name: str) -> list[str]:
     """The words of a name in lower case, its units spelled without signs."""
     text = unicodedata.normalize("NFKC", name.replace("º", "°"))
-    text = re.sub(r"m\s*/\s*s\s*(\^\s*)?2|ms-2", " mss ", text)
+    text = re.sub(r"m\s*/\s*s\s*(\^\s*)?2|(?<![A-Za-z])mp?s\^?-?2", " mss ", text)
     for sign, word in UNITS_BY_SIGN.items():
         text = text.replace(sign, word if len(word) == 1 else f" {word} ")
     for cased, word in _CASED.items():

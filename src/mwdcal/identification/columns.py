@@ -36,8 +36,8 @@ from mwdcal.files.synonyms import (
     synonyms_of,
     unit_of,
 )
+from mwdcal.files.words import STATIONS_ELSEWHERE, letters, spelled, translated
 from mwdcal.geometry.vectors import Array, Bools
-from mwdcal.identification.words import STATIONS_ELSEWHERE, letters, spelled, translated
 from mwdcal.sensor.profile import ColumnSource
 
 # --------------------------------------------------------------------------
@@ -357,10 +357,16 @@ _IN_UNIT = re.compile(r"(.*\w) (?:in|en|i|w|в) (\S+)", re.IGNORECASE)
 """A name with its unit behind a preposition: Gx in mg."""
 _BARE_T = re.compile(r"t\W*(°|deg)?\W*", re.IGNORECASE)
 _CCW = re.compile(
-    r"\(?(counter|anti)[ -]?clockwise\)?|\bccw\b|gegen (den )?uhrzeiger\w*|против час\w*",
+    r"\(?(counter|anti)[ -]?clockwise\)?|\bccw\b|gegen (den )?uhrzeiger\w*|против час\w*|"
+    r"mot(urs| ?klok\w*)|anti-?hor[aá]ri\w*|antihoraire|antiorari\w*|inverse des aiguilles|逆时针|反時計",
     re.IGNORECASE,
 )
 """Words of angles that count anticlockwise."""
+_UPHOLE = re.compile(
+    r"look\w* up|up ?hole|from (the )?(below|bottom)|von unten|nedenfra|desde abajo|снизу|向上看",
+    re.IGNORECASE,
+)
+"""Words of one who looks up the hole, to whom a clockwise angle is an anticlockwise one."""
 _FROM_HORIZONTAL = re.compile(
     r"hori[sz]|orizz|горизонт|обрі|waag\w*recht|v(a|å|aa)n+ret|vaaka|poziom|vodorovn|vizszint|yatay|水平",
     re.IGNORECASE,
@@ -541,7 +547,20 @@ def meanings_of(
     dips = [n for n in inclined if re.search("inklination", n, re.IGNORECASE)]
     if len(dips) == 1 and any(re.search("neigung", n, re.IGNORECASE) for n in inclined):
         results[dips[0]] = results[dips[0]]._replace(column="ref_dip_deg")
+    if any(map(_says_anticlockwise, above)):
+        results |= {
+            n: m._replace(unit=ANTICLOCKWISE)
+            for n, m in results.items()
+            if m.column == REFERENCES["toolface"].column and m.unit in ("", "°")
+        }
     return results
+
+
+def _says_anticlockwise(line: str) -> bool:
+    """Whether a line says that toolfaces count anticlockwise, looking down the hole."""
+    text = spelled(line)
+    of_toolface = re.search(r"toolface|\broll|\btf\b", text, re.IGNORECASE)
+    return bool(of_toolface and _CCW.search(text)) and not _UPHOLE.search(text)
 
 
 def _by_legend(names: Sequence[str], above: Sequence[str]) -> dict[str, Resemblance]:

@@ -31,11 +31,18 @@ from mwdcal.files.contract import CHANNELS, MAPPED, RANGES, RAW, REFERENCES, uni
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, WORKBOOKS, looks_numeric, shown
 from mwdcal.files.formats.figures import is_figure
-from mwdcal.files.formats.layout import WITHOUT_VALUE, Layout
+from mwdcal.files.formats.layout import NO_READING, WITHOUT_VALUE, Layout
 from mwdcal.files.formats.table import Table, cell_error, labels, numbers
 from mwdcal.files.formats.table import labels as labels_of
 from mwdcal.files.formats.text import is_preamble
-from mwdcal.files.marks import MARKS_NAMED, UNMARKED, marks_in, place, without_rejected
+from mwdcal.files.marks import (
+    MARKS_NAMED,
+    UNMARKED,
+    is_the_repeat,
+    marks_in,
+    place,
+    without_rejected,
+)
 from mwdcal.files.metadata import toml
 from mwdcal.files.profiles import CHOICE_OF_AXES
 from mwdcal.files.repeats import means, repeats, station_by_angles
@@ -375,7 +382,8 @@ def _cells_without_reading(
     for arguments in only:
         pairs = [text.partition("=") for option, text in arguments if option == "leave_out"]
         if len(pairs) == len(arguments) and all(
-            WITHOUT_VALUE.fullmatch(cell) for *_, cell in pairs
+            WITHOUT_VALUE.fullmatch(cell) or (cell[:1] != "#" and NO_READING.fullmatch(cell))
+            for *_, cell in pairs
         ):
             for name, _, cell in pairs:
                 every.setdefault(name, []).append(cell)
@@ -728,7 +736,9 @@ def _without_rejected(
     used = [n for n, m in meanings.items() if m.column in UNMARKED]
     marks = marks_in(table, form or TableFormat(), used)
     questions = [
-        question_on_mark(table, name, cell, rows) for (name, cell), rows in marks.doubtful.items()
+        question_on_mark(table, name, cell, rows)
+        for (name, cell), rows in marks.doubtful.items()
+        if not all(is_the_repeat(table, row, cell) for row in rows)
     ]
     return without_rejected(table, form or msgspec.UNSET, used), questions
 
@@ -987,7 +997,7 @@ def _check_magnetic(
     )
 
 
-_ANOTHER_DIP = 3.0
+_ANOTHER_DIP = 1.0
 """By how much a dip that is stated differs from that of the readings where it is of another place, degrees."""
 
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from mwdcal.errors import Answer, InputError, QuestionError
 from mwdcal.files.formats.columns import as_text, looks_numeric
+from mwdcal.files.synonyms import unit_of
 
 _SPACES = re.compile(r"(?<=\d)[ '’\u00a0\u202f\u2009](?=\d{3}(\D|$))")
 """What separates thousands and is never a decimal sign."""
@@ -19,6 +20,10 @@ _DEGREES = re.compile(
 """Degrees, minutes and seconds."""
 _BEARING = re.compile(r"([NS])\s*(\d+(?:[.,]\d+)?)\s*°?\s*([EWO])", re.IGNORECASE)
 """A bearing by quadrants, such as N45E."""
+_POINTS = {
+    point: f"{45 * k}" for k, point in enumerate(("N", "NE", "E", "SE", "S", "SW", "W", "NW"))
+}
+"""Points of the compass, and their azimuths; O is west in Spanish, and east in German."""
 _POINTED_DAY = re.compile(r"\s*\d{1,2}\.\d{1,2}\.(\d{4}|\d{2})([ T].*)?")
 """A day as in Germany or Russia, which is no number."""
 _GROUPED = re.compile(r"[+\-−]?[1-9]\d{0,2}([.,]\d{3})+")
@@ -111,6 +116,8 @@ def column(cells: Sequence[object], sign: str) -> tuple[list[str], str]:
         return [_degrees(text, sign) for text in texts], "°"
     if filled and all(map(_BEARING.fullmatch, filled)):
         return [_azimuth(text, sign) for text in texts], "°"
+    if {*filled} <= {*_POINTS} and len({*filled}) > 2:
+        return [_POINTS.get(text, text) for text in texts], "°"
     units = {match[2].strip() for match in map(_FIGURE.fullmatch, filled) if match}
     alike = len(units) == 1 and all(map(_FIGURE.fullmatch, filled))
     unit = units.pop() if alike else ""
@@ -118,6 +125,47 @@ def column(cells: Sequence[object], sign: str) -> tuple[list[str], str]:
         _pointed(text, sign, unit) if isinstance(cell, str) else text
         for cell, text in zip(cells, texts, strict=True)
     ], unit
+
+
+_OF_AXES = re.compile(r"(.*?)[\s_(\[]*x\W*y\W*z[)\]]*(?![^\W\d_])(.*)", re.IGNORECASE)
+"""A name of all three axes: G xyz (g), B (x, y, z)."""
+_UNIT_LAST = re.compile(r"(.*?)\s*([(\[][^()\[\]]*[)\]])?\s*")
+_SEPARATORS = ("/", ";", "|", ", ", " ")
+
+
+def apart(name: str, cells: Sequence[object]) -> tuple[list[str], list[list[str]]]:
+    """Names and cells of a column of which each cell has two or three numbers, and its name as many parts.
+
+    Any other column has one name, and no cells here.
+
+    >>> apart("Inc/Azi (deg)", ["30/90", "45/180"]), apart("G xyz", ["(0.1, 0.2, 0.9)"])[0], apart("Day", ["1/2"])
+    ((['Inc (deg)', 'Azi (deg)'], [['30', '45'], ['90', '180']]), ['G x', 'G y', 'G z'], (['Day'], []))
+    """
+    if not any(_names_apart(name, count) for count in (2, 3)):
+        return [name], []
+    texts = [
+        re.sub(r"[\[\](){}°º]", "", cell).strip() if isinstance(cell, str) else "" for cell in cells
+    ]
+    for separator in _SEPARATORS if all(texts) else ():
+        parts = [[part.strip() for part in text.split(separator)] for text in texts]
+        parts = [[*filter(None, each)] for each in parts] if separator == " " else parts
+        names = _names_apart(name, len(parts[0])) if 1 < len(parts[0]) < 4 else []
+        whole = all(
+            len(each) == len(names) and all(map(_BARE_FIGURE.fullmatch, each)) for each in parts
+        )
+        if names and whole:
+            return names, [list(column) for column in zip(*parts, strict=True)]
+    return [name], []
+
+
+def _names_apart(name: str, count: int) -> list[str]:
+    """The names of so many columns that one name says; none where it does not."""
+    if count == 3 and (axes := _OF_AXES.fullmatch(name)):
+        return [f"{axes[1]} {axis}{axes[2]}".strip() for axis in "xyz"]
+    head, unit = _UNIT_LAST.fullmatch(name).groups("")  # type: ignore[union-attr]
+    each = [part.strip() for part in re.split(r"[/;|,]", head)]
+    named = len(each) == count and all(each) and not any(map(unit_of, each))
+    return [f"{part} {unit}".strip() for part in each] if named else []
 
 
 def signs_of(columns: Sequence[Sequence[object]], sign: str) -> list[str]:

@@ -29,6 +29,13 @@ from mwdcal.files.formats.columns import (
     plain_names,
     shown,
 )
+from mwdcal.files.formats.settings import (
+    angles_among,
+    columns_of_codes,
+    columns_of_lines,
+    headings_in,
+    settings_in,
+)
 from mwdcal.files.formats.title_references import stated_above
 from mwdcal.files.formats.titles import ADJUSTED, OF_REFUSAL, Titles, dated, titles
 from mwdcal.files.synonyms import unit_of
@@ -72,7 +79,7 @@ _DEGREES_OF = re.compile(
 """The name of a column of degrees, or of minutes."""
 WITHOUT_VALUE = re.compile(r"n/?a|n\.a\.?|nan|null|none|[\W_]*", re.IGNORECASE)
 """A cell that says that there is no value."""
-_NO_READING = re.compile(
+NO_READING = re.compile(
     r"n/?a|n\.a\.?|#n/?a|nan|-?1\.#\w+|null|none|-+|[–—]+|#+|err(or)?|#err|fault|fail(ed)?|overrange|ovr|ovl|ol|"
     r"inval(id)?|bad|timeout|no ?data|feil|fehler",
     re.IGNORECASE,
@@ -86,6 +93,13 @@ _OF_VOID_RUN = re.compile(
     re.IGNORECASE,
 )
 """Words of the name of a sheet, or of the line above a table, of a run that does not count."""
+_OF_PAST_RUN = re.compile(
+    r"(?<![^\W\d_])(superseded|obsolete|outdated|replaced by|veraltet|überholt|ersetzt durch|utgått|erstattet av|"
+    r"reemplazad[oa] por|sustituid[oa]|substitu[ií]d[oa]|périmé|remplacée? par|устарел\w*|заменен\w* на)(?![^\W\d_])|"
+    r"已作废|已取代|旧版",
+    re.IGNORECASE,
+)
+"""Words of a run that another one superseded."""
 _OF_ROLL_TEST = re.compile(
     r"(?<![^\W\d_])(roll[\s_-]*(test|over|check)|rt|verif\w*|check|valid\w*|(roll)?pr(ue|ü)fung|"
     r"[ck]ontrol\w*[- ]?(run|shot|test|roll|messung|dreh|måling|rull)\w*|rulletest|prueba|"
@@ -237,13 +251,52 @@ def laid_out(
 def _with_same_stations(tables: Sequence[Layout]) -> list[Layout]:
     """Tables, each with the channels that another sheet has of the same stations: of two triads on two sheets."""
     joined: list[Layout] = []
-    for table in tables:
+    for table in _with_stand(tables):
         place = next((k for k, t in enumerate(joined) if _have_same_stations(t, table)), None)
         if place is None:
             joined.append(table)
         else:
             joined[place] = _side_by_side(joined[place], table)
     return joined
+
+
+def _with_stand(tables: Sequence[Layout]) -> list[Layout]:
+    """Tables, each of channels alone with the angles of the one other that has the same stations and no channels.
+
+    A column of one name in which no two rows are alike tells the stations of both.
+    """
+    stands = [t for t in tables if angles_among(t.names) and not _has_axes(t.names)]
+    tools = [t for t in tables if _has_axes(t.names) and not angles_among(t.names)]
+    if len(stands) != 1 or not tools:
+        return [*tables]
+    (stand,) = stands
+    joined = {id(tool): pair for tool in tools if (pair := _of_stations(tool, stand))}
+    if len(joined) != len(tools):
+        return [*tables]
+    return [joined.get(id(t), t) for t in tables if t is not stand]
+
+
+def _of_stations(tool: Layout, stand: Layout) -> Layout | None:
+    """The table of a tool with the columns of the stand at the same stations; None where none tells these."""
+    for name in (each for each in tool.names if each in stand.names):
+        ours, theirs = (t.texts[t.names.index(name)] for t in (tool, stand))
+        places = {station: row for row, station in enumerate(theirs)}
+        if len(places) == len(theirs) and {*ours} <= {*places} and len({*ours}) == len(ours):
+            rows = [places[station] for station in ours]
+            more = [k for k, other in enumerate(stand.names) if other not in tool.names]
+            said = (
+                f"the angles of the stand are those of {shown(stand.sheet or stand.heading)} at the same "
+                f"{shown(name)}."
+            )
+            return replace(
+                tool,
+                names=plain_names([*tool.names, *(stand.names[k] for k in more)]),
+                units=[*tool.units, *(stand.units[k] for k in more)],
+                cells=[*tool.cells, *([stand.cells[k][row] for row in rows] for k in more)],
+                texts=[*tool.texts, *([stand.texts[k][row] for row in rows] for k in more)],
+                remarks=(*tool.remarks, said),
+            )
+    return None
 
 
 def _shared(one: Layout, other: Layout) -> tuple[set[str], set[str]]:
@@ -255,7 +308,7 @@ def _shared(one: Layout, other: Layout) -> tuple[set[str], set[str]]:
 
 def _have_same_stations(one: Layout, other: Layout) -> bool:
     """Whether sheets have the same stations, by three columns or more that vary, and each a triad of its own."""
-    if one.sheet == other.sheet or len(one.lines) != len(other.lines):
+    if len(one.lines) != len(other.lines):
         return False
     shared, equal = _shared(one, other)
     varied = [n for n, c in zip(one.names, one.cells, strict=True) if n in equal and len({*c}) > 1]
@@ -277,8 +330,9 @@ def _side_by_side(one: Layout, other: Layout) -> Layout:
     _, equal = _shared(one, other)
     more = [k for k, name in enumerate(other.names) if name not in equal]
     names = plain_names([*one.names, *(other.names[k] for k in more)])
+    places = [shown(t.sheet if one.sheet != other.sheet else t.heading) for t in (one, other)]
     said = (
-        f"the sheets {shown(one.sheet)} and {shown(other.sheet)} are one table: in all {len(one.lines)} rows they have "
+        f"{' and '.join(places)} are one table: in all {len(one.lines)} rows they have "
         f"the same {', '.join(n for n in one.names if n in equal)}."
     )
     return replace(
@@ -310,7 +364,7 @@ def _the_run(tables: Sequence[Layout]) -> Layout | None:
     """The run among alike tables: their sheets joined, or the one beside which the others are void or roll tests."""
     if _is_one_run(tables):
         return _joined_sheets(tables)
-    kinds = [_kind(f"{t.sheet} {t.heading}") for t in tables]
+    kinds = [_kind(f"{t.sheet} {t.heading}", t.above) for t in tables]
     runs = [t for t, kind in zip(tables, kinds, strict=True) if not kind]
     if len(runs) != 1 or ADJUSTED.search(runs[0].heading):
         return None
@@ -322,8 +376,13 @@ def _the_run(tables: Sequence[Layout]) -> Layout | None:
     return replace(runs[0], left_out=(*runs[0].left_out, *aside))
 
 
-def _kind(words: str) -> str:
-    """A void run or a roll test, by the sheet of a table and the line above it; empty for a run."""
+def _kind(words: str, above: Sequence[str] = ()) -> str:
+    """A void run or a roll test, by the sheet of a table and the line above it; empty for a run.
+
+    A run is one of the past where any line `above` says that another superseded it.
+    """
+    if any(map(_OF_PAST_RUN.search, above)):
+        return "superseded run"
     kinds = (("void run", _OF_VOID_RUN), (ROLL_TEST, _OF_ROLL_TEST))
     return next((kind for kind, pattern in kinds if pattern.search(words)), "")
 
@@ -342,7 +401,8 @@ def _is_one_run(tables: Sequence[Layout]) -> bool:
         for t in tables
     )
     words = [" ".join([t.sheet, *t.above]) for t in tables]
-    apart = any(ADJUSTED.search(each) or _kind(each) for each in words)
+    past = any(_kind("", t.above) for t in tables)
+    apart = past or any(ADJUSTED.search(each) or _kind(each) for each in words)
     rows = [row for t in tables for row in zip(*t.texts, strict=True)]
     if not same or apart or len({*sheets}) < len(sheets) or len({*rows}) < len(rows):
         return False
@@ -391,6 +451,23 @@ def _with_stated_warmth(table: Layout) -> Layout:
     )
 
 
+def _with_settings_of_sheets(tables: Sequence[Layout]) -> Sequence[Layout]:
+    """Tables with the settings of the stand that their sheets are named as, where no column states them."""
+    stated = [settings_in(t.sheet) for t in tables]
+    present = angles_among(tables[0].names)
+    angles = [a for a in stated[0] if a not in present and all(a in each for each in stated)]
+    if not angles:
+        return tables
+    return [
+        _with_columns(
+            t,
+            {stated[0][a][0]: [each[a][1]] * len(t.lines) for a in angles},
+            "sheets by their names",
+        )
+        for t, each in zip(tables, stated, strict=True)
+    ]
+
+
 def _are_numbered_on(tables: Sequence[Layout]) -> bool:
     """Whether a column numbers the rows of all tables, from each to the next."""
     columns = (
@@ -412,6 +489,7 @@ def _joined_sheets(tables: Sequence[Layout]) -> Layout:
     """Tables of several sheets as one, in the order of the sheets."""
     if _is_warmth_above(tables):
         tables = [*map(_with_stated_warmth, tables)]
+    tables = _with_settings_of_sheets(tables)
     first = tables[0]
     return replace(
         first,
@@ -515,7 +593,10 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
             below = [row for row in remarks if rows[head][0] < row[0] < layout.lines[0]]
             void = [(n, _words(row)) for n, row in without if rows[head][0] < n < last]
             layout = replace(layout, left_out=tuple(sorted([*layout.left_out, *void])))
-            yield _with_warmth_of_lines(layout, [*below, *rows[head + 1 : end]])
+            between = [*below, *rows[head + 1 : end]]
+            above = rows[max(0, head - 4) : head]
+            layout = _with_settings(_with_warmth_of_lines(layout, between), [*above, *between])
+            yield _with_triads_beside(_with_rows_of_headings(layout))
 
 
 _STATIONS_IN_COLUMNS = (
@@ -574,7 +655,8 @@ def _with_legend(rows: list[tuple[int, Cells]]) -> list[tuple[int, Cells]]:
     """
     first = next((k for k, (_, row) in enumerate(rows) if _is_reading(row)), 0)
     for k in range(first - 1, -1, -1):
-        names = _legend(" ".join(map(as_text, rows[k][1])))
+        text = " ".join(map(as_text, rows[k][1]))
+        names = _legend(text) or _listed(text)
         if len(names) == len(rows[first][1]):
             return [*rows[:k], *rows[k + 1 : first], (rows[k][0], names), *rows[first:]]
     return rows
@@ -596,14 +678,42 @@ def _legend(text: str) -> list[str]:
     return names
 
 
+_LIST_OF_COLUMNS = re.compile(
+    r"\W*(columns?|cols?|fields?|header|spalten?|kolonner?|kolumner|columnas?|colunas?|campos|colonnes?|colonne|kolumny|"
+    r"столбцы|колонки|列|字段)\W*[:：=]\s*",
+    re.IGNORECASE,
+)
+"""The word before the names of all columns in one line."""
+
+
+def _listed(text: str) -> list[str]:
+    """The names of columns behind a word for these, apart by blanks or commas; a unit in brackets belongs to its name.
+
+    >>> _listed("% columns: stn inc(deg) tf (deg)")
+    ['stn', 'inc(deg)', 'tf (deg)']
+    """
+    match = _LIST_OF_COLUMNS.match(text)
+    bare = re.sub(r"\s+(?=[(\[])", "\0", text[match.end() :]) if match else ""
+    return [name.replace("\0", " ") for name in re.split(r"[\s,;|]+", bare.strip()) if name]
+
+
 def _is_remark_below_names(rows: Sequence[tuple[int, Cells]], place: int) -> bool:
-    """Whether a row is a remark between the names of a table and its readings."""
-    row = rows[place][1]
-    if not 0 < place < len(rows) - 1 or sum(cell != "" for cell in row) >= LEAST_COLUMNS - 1:
+    """Whether a row is a remark, or one of a few, between the names of a table and its readings."""
+    first, last = place, place
+    while first > 0 and _is_short(rows[first][1]):
+        first -= 1
+    while last < len(rows) - 1 and _is_short(rows[last][1]):
+        last += 1
+    if not first < place < last or last - first > _MOST_HEADER_ROWS:
         return False
-    above, below = rows[place - 1][1], rows[place + 1][1]
+    above, below = rows[first][1], rows[last][1]
     between = _texts(above) >= LEAST_COLUMNS and not _is_reading(above) and _is_reading(below)
-    return between and not titles([row]).metadata
+    return between and not titles([rows[place][1]]).metadata
+
+
+def _is_short(row: Cells) -> bool:
+    """Whether a row has too few cells for readings or their names."""
+    return sum(cell != "" for cell in row) < LEAST_COLUMNS - 1
 
 
 def _begins_anew(rows: Sequence[tuple[int, Cells]], heads: Sequence[int], place: int) -> bool:
@@ -658,7 +768,7 @@ def _is_without_reading(row: Cells) -> bool:
     False
     """
     cells = [as_text(cell).strip() for cell in row]
-    filled = [cell for cell in cells if cell and not _NO_READING.fullmatch(cell)]
+    filled = [cell for cell in cells if cell and not NO_READING.fullmatch(cell)]
     lacking = sum(map(bool, cells)) - len(filled)
     worded = sum(not re.search(r"\d", cell) for cell in filled)
     alone = worded == 0 or (worded == 1 and len(filled) > 1)
@@ -678,7 +788,7 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
     _check_cut(kept, others, source)
     if not kept or max(len(names), *(len(row) for _, row in kept)) < LEAST_COLUMNS:
         return None
-    names, units, columns, letters = _used(kept, names, units, sheet.first_column)
+    names, units, columns, letters = _apart(*_used(kept, names, units, sheet.first_column))
     sign = decimal or figures.decimal_sign([c for column in columns for c in column], source)
     read = [*map(figures.column, columns, figures.signs_of(columns, sign))]
     above = [row for _, row in rows[:top]]
@@ -749,6 +859,117 @@ def _with_warmth_of_lines(layout: Layout, lines: Sequence[tuple[int, Cells]]) ->
     )
 
 
+def _with_settings(layout: Layout, rows: Sequence[tuple[int, Cells]]) -> Layout:
+    """A table with the settings of the stand that lines between its rows, or codes of stations, state.
+
+    A line above the names is one of these if it is like one below.
+    """
+    readings = {*layout.lines}
+    texts = {n: _text(row) for n, row in rows if n not in readings}
+    first = layout.lines[0]
+    between = {_form(text) for n, text in texts.items() if n > first}
+    texts = {n: text for n, text in texts.items() if n > first or _form(text) in between}
+    columns = columns_of_lines(texts, layout.lines, layout.names)
+    source = "lines above the rows"
+    if not columns:
+        columns, source = columns_of_codes(layout.names, layout.cells), "codes of the stations"
+    return _with_columns(layout, columns, source)
+
+
+def _with_rows_of_headings(layout: Layout) -> Layout:
+    """A table with a row for each setting of the stand that headings of groups of columns state: TF 0, TF 90."""
+    headings = headings_in(layout.names)
+    if not headings or not _has_axes(headings.places):
+        return layout
+    channels = {k for each in headings.places.values() for k in each.values()}
+    others = [k for k in range(len(layout.names)) if k not in channels]
+    places = {s: [each[s] for each in headings.places.values()] for s in headings.settings}
+    rows = [
+        (row, setting)
+        for row in range(len(layout.lines))
+        for setting in places
+        if any(layout.cells[k][row] for k in places[setting])
+    ]
+
+    def below(columns: Sequence[Sequence[str]]) -> list[list[str]]:
+        each = [[columns[k][row] for row, _ in rows] for k in others]
+        each += [[columns[p[s]][row] for row, s in rows] for p in headings.places.values()]
+        return [*each, [setting for _, setting in rows]]
+
+    units = [next(iter(each.values())) for each in headings.places.values()]
+    said = f"the groups of columns of {', '.join(places)} are rows, with {shown(headings.name)} by their headings."
+    return replace(
+        layout,
+        names=plain_names([*(layout.names[k] for k in others), *headings.places, headings.name]),
+        units=[*(layout.units[k] for k in [*others, *units]), ""],
+        cells=below(layout.cells),
+        texts=below(layout.texts),
+        lines=[layout.lines[row] for row, _ in rows],
+        remarks=(*layout.remarks, said),
+    )
+
+
+def _with_triads_beside(layout: Layout) -> Layout:
+    """A table with a column for each channel, of one with a row for each triad of a station: Acc, Mag, Acc, Mag.
+
+    A column of two texts names the triads, as many rows each in the same order of stations, by three columns or more.
+    """
+    axes = [k for k, name in enumerate(layout.names) if _AXIS.fullmatch(name)]
+    for place, column in enumerate(layout.texts if len(axes) == LEAST_COLUMNS - 1 else ()):
+        one, *others = dict.fromkeys(column)
+        if len(others) != 1 or place in axes or figures.is_figure(one):
+            continue
+        ours, theirs = ([k for k, c in enumerate(column) if c == v] for v in (one, *others))
+        pairs = [([c[k] for k in ours], [c[k] for k in theirs[: len(ours)]]) for c in layout.texts]
+        shared = [k for k, pair in enumerate(pairs) if pair[0] == pair[1]]
+        if len(ours) == len(theirs) and len(shared) >= LEAST_COLUMNS - 2:
+            return _pivoted(layout, place, shared, {one: ours, others[0]: theirs})
+    return layout
+
+
+def _pivoted(
+    layout: Layout, place: int, shared: Sequence[int], rows: Mapping[str, Sequence[int]]
+) -> Layout:
+    """A table with the `rows` of each text in the column at a place side by side; `shared` columns stand once."""
+    first, *_ = rows.values()
+    more = [(k, v) for v in rows for k in range(len(layout.names)) if k not in (*shared, place)]
+
+    def beside(columns: Sequence[Sequence[str]]) -> list[list[str]]:
+        once = [[columns[k][row] for row in first] for k in shared]
+        return once + [[columns[k][row] for row in rows[v]] for k, v in more]
+
+    said = f"the rows of {' and '.join(map(shown, rows))} in {shown(layout.names[place])} are those of one station."
+    names = [_with_title(value, layout.names[k]) for k, value in more]
+    return replace(
+        layout,
+        names=plain_names([*(layout.names[k] for k in shared), *names]),
+        units=[layout.units[k] for k in (*shared, *(k for k, _ in more))],
+        cells=beside(layout.cells),
+        texts=beside(layout.texts),
+        lines=[layout.lines[row] for row in first],
+        remarks=(*layout.remarks, said),
+    )
+
+
+def _text(row: Cells) -> str:
+    return " ".join(filter(None, map(as_text, row)))
+
+
+def _with_columns(layout: Layout, columns: Mapping[str, list[str]], source: str) -> Layout:
+    """A table with columns of settings that stand elsewhere, and a remark on where they are from."""
+    if not columns:
+        return layout
+    said = f"{', '.join(map(shown, columns))} of each row is that of the {source}."
+    return replace(
+        layout,
+        names=[*layout.names, *columns],
+        units=[*layout.units, *[""] * len(columns)],
+        cells=[*layout.cells, *columns.values()],
+        texts=[*layout.texts, *columns.values()],
+        remarks=(*layout.remarks, said),
+    )
+
+
 def _are_near(column: Cells, stated: Sequence[str]) -> bool:
     """Whether the numbers of a column are all near the temperatures that lines state."""
     pairs = ((_number(cell), float(number)) for cell, number in zip(column, stated, strict=True))
@@ -812,6 +1033,26 @@ def _used(
         [units[k] for k in used],
         [columns[k] for k in used],
         [letters_of(first + k) for k in used],
+    )
+
+
+def _apart(
+    names: Sequence[str],
+    units: Sequence[str],
+    columns: Sequence[list[object]],
+    letters: Sequence[str],
+) -> tuple[list[str], list[str], list[list[object]], list[str]]:
+    """The same with a column for each number of cells that have several: Inc/Azi/TF, G xyz."""
+    whole: list[tuple[str, str, list[object], str]] = []
+    for name, unit, column, letter in zip(names, units, columns, letters, strict=True):
+        each, cells = figures.apart(name, column)
+        parts: Iterable[Cells] = cells or [column]
+        whole += [(part, unit, [*c], letter) for part, c in zip(each, parts, strict=True)]
+    return (
+        plain_names([each[0] for each in whole]),
+        [each[1] for each in whole],
+        [each[2] for each in whole],
+        [each[3] for each in whole],
     )
 
 

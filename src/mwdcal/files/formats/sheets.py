@@ -13,7 +13,7 @@ from typing import Any
 
 from mwdcal import extras
 from mwdcal.errors import InputError
-from mwdcal.files.formats import figures, text
+from mwdcal.files.formats import figures, records, text
 from mwdcal.files.formats.columns import WORKBOOKS, at_most, damaged_unless_read, with_merged
 from mwdcal.files.formats.layout import LEAST_COLUMNS, Cells, Sheet, is_units
 from mwdcal.sensor.profile import TableFormat
@@ -21,7 +21,10 @@ from mwdcal.sensor.profile import TableFormat
 DELIMITERS = (";", "\t", ",", "|")
 _BLANKS, _RUNS = "blanks", "runs of blanks"
 _LOOKED_AT = 400
-"""Lines by which the delimiter of a text is told."""
+"""Lines by which the delimiter of a text is told, and signs by which a page is."""
+_ARCHIVES = (b"\xd0\xcf\x11\xe0", b"PK")
+"""What workbooks begin with; programs write pages and texts under the name of an old one."""
+_IS_PAGE = re.compile(r"<(html|table|!doctype html)\b", re.IGNORECASE)
 _LEAST_ROWS = 4
 """Rows from which on columns of a text show by where they stand."""
 _LARGEST_CONTENTS = 100_000_000
@@ -45,11 +48,19 @@ def sheets_of(data: bytes, name: str) -> list[Sheet]:
             Sheet(title, _rows(page), number=n, merged=merged)
             for n, (title, page, merged) in enumerate(pages)
         ]
-    if suffix in WORKBOOKS:
+    if records.IS_XML in data[:_LOOKED_AT]:
+        pages_of_xml = enumerate(records.sheets_of_xml(data, name))
+        return [Sheet(title, _rows(rows), number=n) for n, (title, rows) in pages_of_xml]
+    if suffix in WORKBOOKS and (suffix != ".xls" or data.startswith(_ARCHIVES)):
         return list(_by_calamine(data, name))
     text.refuse_foreign(data, name, allowed=text.UTF_16)
     encoding = text.encoding_of(data)
-    lines = text.decoded(data, encoding, name).split("\n")
+    content = text.decoded(data, encoding, name)
+    if _IS_PAGE.search(content[:_LOOKED_AT]):
+        return [Sheet("", _rows(records.rows_of_page(content)))]
+    lines = content.split("\n")
+    if rows_of_records := records.rows_of_records(lines):
+        return [Sheet("", _rows(rows_of_records))]
     mark, rows = _delimited(lines, name)
     form = TableFormat(encoding=encoding, delimiter=mark if mark in DELIMITERS else ",")  # type: ignore[arg-type]
     return [Sheet("", rows, form)]
@@ -74,8 +85,18 @@ def _delimited(lines: Sequence[str], source: str) -> tuple[str, list[tuple[int, 
         best = max(marks, key=lambda mark: counts[mark])
     cells = _split(lines, best, source)
     if best in (_BLANKS, _RUNS):
-        cells = _in_columns(lines, cells)
+        cells = _in_columns(lines, _without_marks(cells))
     return best, [(line, _trimmed(row)) for line, row in enumerate(cells, 1) if any(row)]
+
+
+def _without_marks(rows: Sequence[list[str]]) -> list[list[str]]:
+    """The rows without the mark of a comment before names, of which there is one cell more than of readings."""
+    widths = Counter(len(row) for row in rows if _is_of_numbers(row))
+    usual = widths.most_common(1)[0][0] if widths else 0
+    return [
+        row[1:] if len(row) == usual + 1 and re.fullmatch(r"[#%;!/*]+", row[0]) else row
+        for row in rows
+    ]
 
 
 def _in_columns(lines: Sequence[str], rows: Sequence[list[str]]) -> list[list[str]]:

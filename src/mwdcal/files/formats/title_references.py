@@ -8,6 +8,7 @@ an uncertainty and what was measured are no reference.
 
 from __future__ import annotations
 
+import math
 import re
 import unicodedata
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -45,7 +46,7 @@ _OF_PLACES = (
         r"(total|erd|gesamt|stand)?feld|feldstarke|"
         r"felt|totalintensitat|erdmagnetfeld|magnetfeld|flussdichte|totalfelt\w*|feltstyrke|magnetfelt|"
         r"campo( (magn\w+|totale?|local))*|totaalveld|pole calkow\w*|(teljes )?terero|toplam alan|medan total|全磁力|"
-        r"magnetfalt|"
+        r"magnetfalt|kokonaiskentta|magneettikentta|celkove pole|(전|총)?자기장|전자력|camp( magn\w*)? total|"
         r"intensidade?( total)?|champ( magn\w*)?( total| local)?|"
         r"(магн\w* )?поле|полн\w* (вектор|поле)|модуль( магн\w*)?( поля)?|индукци\w+|напряженност\w+( поля)?|"
         r"(环境|当地|地|总)?磁(总)?场(总)?(强度)?|总场(强度)?|\|b\||tmf|tmi|betrag|natezenie pola",
@@ -55,7 +56,8 @@ _OF_PLACES = (
     ),
     _Quantity(
         "ref_dip_deg",
-        r"(mag\w*|local|field) (dip|inclination)( angle)?|dip( angle)?|dipref|manyetik egim|magn\w* inklinacio|伏角|"
+        r"(mag\w*|local|field) (dip|inclination)( angle)?|dip( angle)?|dipref|복각|magn\w* kaltevuus|inklinaatio|"
+        r"magn\w* inklinace|manyetik egim|magn\w* inklinacio|伏角|"
         r"inklinacja( pola)?|inclinazione magn\w*|magn\w* inclinatie|"
         r"(feld|feld-|magn\w* ?)?inklination|"
         r"(felt|magn\w* ?)?inklinasjon|mergulho( magn\w*)?|inclinaca?o (magn?\w*|do campo)|"
@@ -68,7 +70,8 @@ _OF_PLACES = (
     ),
     _Quantity(
         "ref_gravity_g",
-        r"(local )?gravity( field| acceleration)?|g ?total|gtot|gref|gt|zwaartekracht|yercekimi|nehezsegi gyorsulas|"
+        r"(local )?gravity( field| acceleration)?|g ?total|gtot|gref|gt|중력(가속도)?|painovoima\w*|tihove zrychleni|"
+        r"zwaartekracht|yercekimi|nehezsegi gyorsulas|"
         r"gravita|gravitasi|tyngdkraft|重力(加速度)?|ускорение силы тяжести|"
         r"przyspieszenie ziemskie|"
         r"(local|site) g|g[ -]?(locale?|lokal|ref|tot(al)?)|\|g\||"
@@ -108,6 +111,11 @@ _UNSURE = re.compile(
 """Words by which a value is no reference."""
 _BEFORE = re.compile(r"[^\W\d_]*\W{0,2}[^\W\d_]*\W*$")
 """The two words before a quantity, of which one may say that its value is no reference."""
+_OF_COMPONENT = re.compile(
+    r"horizont\w*|vertical\w*|vertik\w*|compon\w*|kompon\w*|poziom\w*|pionow\w*|skladow\w*|горизонт\w*|верти\w*|"
+    r"компон\w*|水平|垂直|分量"
+)
+"""Words of a part of a field between its word and a number."""
 _BETWEEN = r"(?P<between>[^\d+\-−;]{0,30}?)"
 _REFERRING = re.compile(
     r"(?<![^\W\d_])(ref|reference|local|lokal|value|wert|t|f|i|g|т)(?![^\W\d_])"
@@ -170,16 +178,20 @@ _NUMBER_ANYWHERE = re.compile(
 _UNIT_ALONE = re.compile(rf"(?<![^\W\d_])({_WRITTEN_UNIT})(?![^\W\d_])")
 _NO_PLACE = re.compile(
     rf"{_UNSURE.pattern}|"
-    r"horizont\w*|vertical\w*|vertik\w*|compon\w*|kompon\w*|north|nord|south|sud|coil\w*|spule\w*|scale|sens\w*|full|"
-    r"measured|\bmeas\b|mean|average|\bavg|mittel|gemessen|malt|medid\w*|mesur\w*|media|medio|moyen\w*|средн\w*|измер\w*|"
+    r"horizont\w*|poziom\w*|pionow\w*|skladow\w*|slozk\w*|vertical\w*|vertik\w*|compon\w*|kompon\w*|north|nord|"
+    r"south|sud|coil\w*|spule\w*|scale|sens\w*|full|"
+    r"measured|\bmeas\b|mean|average|\bavg|mittel|gemessen|malt|medid\w*|mesur\w*|media|medio|moyen\w*|средн\w*|"
+    r"измер\w*|"
     r"calc\w*|comput\w*|\bper\b|\bto\s*$|\bbis\s*$|change|variation|shift|bias|previous|last|old|"
-    r"(?<![^\W\d_])[hbfg][xyz](?![^\W\d_])|fluxgate|\bfs\b|\btype|satur\w*|overload|capacity|thermo\w*|горизонт\w*|верти\w*|компон\w*|水平|垂直|分量|平均|测得|灵敏度|\d\s*m?v\b|[<>]",
+    r"(?<![^\W\d_])[hbfg][xyz](?![^\W\d_])|fluxgate|\bfs\b|\btype|satur\w*|overload|capacity|thermo\w*|"
+    r"горизонт\w*|верти\w*|компон\w*|水平|垂直|分量|平均|测得|灵敏度|\d\s*m?v\b|[<>]",
 )
 """Words of a strength that is not that of the place."""
 _AT = re.compile(r"\bat\b|\bbei\b")
 """Words before a strength at which something was checked, unless it is one of several places."""
 _INCLINED = re.compile(
-    r"dip|(?<![^\W\d_])[iеe]n[ck]l\w*|inklin\w*|inclin\w*|наклон\w*|нахил\w*|倾|伏角|傾|egim|duzalimi|sklon\w*|nachyleni\w*|"
+    r"dip|(?<![^\W\d_])[iеe]n[ck]l\w*|inklin\w*|inclin\w*|наклон\w*|нахил\w*|倾|伏角|傾|egim|duzalimi|sklon\w*|"
+    r"nachyleni\w*|"
     r"hajlas\w*|lutning|kallistuma|helling|mergulho|buzamiento|echado",
 )
 """Words of an inclination, which is the field's in a line about a place."""
@@ -208,13 +220,71 @@ _SPELT = {
 """Units in small letters, where `unit_of` does not know them or goes by capitals."""
 
 
+_NO_LONGER = re.compile(
+    r"(?<![^\W\d_])(prev(ious)?|former(ly)?|old|obsolete|superseded|no longer|last (cal\w*|site|year)|gammel\w*|gamle|"
+    r"utgatt|tidligere|forrige|alte[rsn]?|ehemalig\w*|vorherig\w*|fruher\w*|antigu[oa]|antig[oa]|anterior|ancien\w*|"
+    r"precedent\w*|vecchi[oa]|precedente|dawn\w*|poprzedni\w*|stary|stara|стар\w*|прежн\w*|прошл\w*|"
+    r"предыдущ\w*)(?![^\W\d_])|"
+    r"旧|以前|上次",
+)
+"""Words of a place or a calibration whose references no longer hold."""
+_OF_LIMITS = re.compile(
+    r"\W*(\w+ )?(limits?|tolerances?|acceptance( criteria| limits)?|criteria|grenzwerte?|toleranz(en)?|grenser?|"
+    r"toleranser?|limites?|tolerancias?|tolerancias?|limiti|tolleranze|допуск\w*|пределы|限差|公差)\W*"
+)
+"""A line above limits, which are no references."""
+
+
 def stated_above(rows: Sequence[Sequence[object]], besides: Rows = ()) -> Titles:
     """Metadata on tool, day and place from the rows above a table, and on the place from the lines `besides` it."""
     rows = [_unsplit(row) for row in rows]
     block = titles(rows)
-    references = references_in(rows, besides)
+    here = _of_this_place(_without_limits(rows))
+    references = references_in(here, _without_limits(besides))
     rough = {c: text for c, text in doubtful_in(rows, besides).items() if c not in references}
     return block._replace(metadata={**references, **block.metadata}, not_taken=rough)
+
+
+def _without_limits(rows: Rows) -> list[Sequence[object]]:
+    """The rows without those below a line that says that limits follow, each with a number."""
+    kept, limits = list[Sequence[object]](), False
+    for row in rows:
+        text = _plain(_line(row)).strip()
+        numbered = bool(re.search(r"\d", text))
+        limits = bool(_OF_LIMITS.fullmatch(text)) or (limits and numbered)
+        kept += [] if limits else [row]
+    return kept
+
+
+def _of_this_place(rows: Rows) -> list[Sequence[object]]:
+    """The rows without those of other places: of a list of places below names, and lines on what no longer holds.
+
+    Of a list the row counts whose place is named in another row of the title block too, or the only one that is not
+    said to hold no longer. Where none does, or several do, the list stays, and its values differ.
+    """
+    kept = [row for row in rows if not _NO_LONGER.search(_plain(_line(row)))]
+    lists = [k for k, row in enumerate(kept) if k and _is_of_place(row)]
+    for first in (k for k in lists if not _is_of_place(kept[k - 1])):
+        block = [kept[k] for k in range(first, len(kept)) if {*range(first, k + 1)} <= {*lists}]
+        others = " ".join(_line(row) for row in kept if row not in block)
+        named = [row for row in block if _first_word(row) in others]
+        if len(block) > 1 and len(named) == 1:
+            kept = [row for row in kept if row not in block or row in named]
+    return kept
+
+
+def _first_word(row: Sequence[object]) -> str:
+    """The first word of a row, with the blank or mark behind it."""
+    match = re.match(r"[^\W\d_]+", _line(row))
+    return match[0] if match else ""
+
+
+def _is_of_place(row: Sequence[object]) -> bool:
+    """Whether a row is a name with two numbers or more behind it, and nothing else."""
+    first, *cells = [as_text(cell).strip() for cell in row] or [""]
+    filled = [*filter(None, cells)]
+    numbers = all(re.fullmatch(rf"{_WRITTEN_NUMBER}", cell) for cell in filled)
+    return bool(re.match(r"[^\W\d_]", first)) and len(filled) > 1 and numbers
 
 
 _SPLIT_BEFORE = re.compile(r"(?P<words>.*?)(?P<digits>(?<![\d.,])\d+)$")
@@ -285,6 +355,8 @@ def _values_in(rows: Rows, besides: Rows = ()) -> dict[str, dict[float, None]]:
         for column, value in _by_unit(text, here):
             by_unit.setdefault(column, {})[value] = None
     every = by_unit | of_places | {c: each | by_unit.get(c, {}) for c, each in by_word.items()}
+    if {"ref_field_nt", "ref_dip_deg"}.isdisjoint(every):
+        every |= {column: {value: None} for column, value in _by_components(texts).items()}
     if "ref_field_nt" in every and "ref_dip_deg" not in every:
         every["ref_dip_deg"] = dict.fromkeys(v for text in texts for v in _inclinations(text))
     return every
@@ -294,8 +366,10 @@ def _with_columns(rows: Rows) -> list[Sequence[object]]:
     """The rows, with each value below a row of words as a row of both."""
     every = [*rows]
     paired: list[Sequence[object]] = []
+    words: list[str] = []
     for above, below in pairwise(every):
-        words = [as_text(cell).strip() for cell in above]
+        if not (words and _is_of_place(above)):
+            words = [as_text(cell).strip() for cell in above]
         cells = [as_text(cell).strip() for cell in below]
         if (
             not any(re.match(r"[-−+]?\d", word) for word in words)
@@ -317,6 +391,36 @@ class _Figure(NamedTuple):
     minutes: float
     unit: str
     behind: str
+
+
+_HORIZONTAL = re.compile(r"horizont\w*|poziom\w*|гориз\w*|vodorovn\w*|水平|\bh\b")
+_VERTICAL = re.compile(r"vertik\w*|vertical\w*|pionow\w*|верти\w*|svisl\w*|垂直|竖直|\b[zv]\b")
+_COMPONENTS = re.compile(
+    r"compon\w*|kompon\w*|komp\b|skladow\w*|состав\w*|компон\w*|slozk\w*|intensit\w*|分量|part\b|anteil"
+)
+"""Words of the two components of a field, of which strength and dip follow."""
+
+
+def _by_components(texts: Sequence[str]) -> dict[str, float]:
+    """Field and dip of the horizontal and the vertical component that lines state, the latter positive downwards.
+
+    >>> _by_components(["field, horizontal component 3.0 ut; vertical component 4.0 ut"])["ref_field_nt"]
+    5000.0
+    """
+    parts: dict[bool, set[float]] = {True: set(), False: set()}
+    for text in (t for t in texts if _COMPONENTS.search(t)):
+        for figure in _figures(text):
+            unit = _stated_unit(_OF_PLACES[0], figure.unit)
+            flat, steep = _HORIZONTAL.search(figure.words), _VERTICAL.search(figure.words)
+            if unit in _OF_PLACES[0].units and bool(flat) != bool(steep):
+                parts[bool(flat)] |= {_converted(n, unit) for n in _numbers(figure.number)}
+    if any(len(each) != 1 for each in parts.values()):
+        return {}
+    (horizontal,), (vertical,) = parts[True], parts[False]
+    return {
+        "ref_field_nt": math.hypot(horizontal, vertical),
+        "ref_dip_deg": math.degrees(math.atan2(vertical, horizontal)),
+    }
 
 
 def _figures(text: str) -> Iterator[_Figure]:
@@ -479,8 +583,10 @@ def _plain(text: str) -> str:
         .replace("²", "\1")
         .replace("й", "\2")
     )
-    plain = unicodedata.normalize("NFKD", kept.lower().translate({ord("ø"): "o", ord("ß"): "ss"}))
-    bare = "".join(c for c in plain if not unicodedata.combining(c))
+    plain = unicodedata.normalize(
+        "NFKD", kept.lower().translate({ord("ø"): "o", ord("ß"): "ss", ord("ł"): "l"})
+    )
+    bare = unicodedata.normalize("NFC", "".join(c for c in plain if not unicodedata.combining(c)))
     bare = re.sub(r"(?<=[\u4e00-\u9fff])(?=[a-zµμ])", " ", bare)
     signs = bare.replace("\0", "°").replace("\1", "²").replace("\2", "й")
     return re.sub(
@@ -495,7 +601,11 @@ def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
     between, behind = match["between"], match["behind"]
     rough = re.match(r"\W*(nomin|номин|标称|nenn|k\s?g\b)", behind) and not match["next"]
     letter = "letter" in match.groupdict()
-    if rough or _UNSURE.search(between if letter else f"{match['word']} {between}"):
+    if (
+        rough
+        or _OF_COMPONENT.search(between)
+        or _UNSURE.search(between if letter else f"{match['word']} {between}")
+    ):
         return
     inner = re.search(rf"(?<![^\W\d_])({_WRITTEN_UNIT})(?![^\W\d_])", between)
     written = match["unit"] or (inner[1] if inner else "") or ("°" if match["minutes"] else "")

@@ -29,7 +29,7 @@ _TITLE_WORDS = {
     "serie nserie seriennr geratenummer geratenr sondennummer sondennr serienummer "
     "serienr verktoynr instrumentnr numerodeserie nodeserie noserie nserie numeroserie nsserie numserie ndeserie "
     "matricola nrfabryczny numerfabryczny nrseryjny sondan sondano ferramentan ferramentano herramientan herramientano "
-    "製造番号 製造№ "
+    "製造番号 製造№ sarjanumero sarjano vyrobnicislo vyrc seriovecislo 일련번호 serino numardeserie serienummer "
     "заводской№ заводскойномер серийныйномер зав№ серийный№ прибор№ 序列号 编号 仪器编号 出厂编号",
     "date": "date testdate caldate calibrationdate measured datum prufdatum messdatum dato kalibreringsdato fecha "
     "data дата датакалибровки 日期 校准日期 测试日期",
@@ -71,12 +71,13 @@ ADJUSTED = re.compile(
 _PARTS = re.compile(r"\s+/\s+|,\s+|;\s*|\s{3,}")
 """The separator of facts in one cell."""
 _OF_TOOLS = (
-    "tool|probe|sensor|sonde|instrument|herramienta|ferramenta|verktøy|gerät|"
+    "tool|probe|sensor|sonde|sonda|prüfling|instrument|herramienta|ferramenta|verktøy|gerät|"
     "прибор|зонд|датчик|инклинометр|仪器|探管"
 )
 _TOOL = re.compile(
     rf"#?\s*(?:(?:{_OF_TOOLS})\s*"
-    r"(?P<mark>s/?n|serial( no)?|n[°º]|no\b|nr\b|зав\.?\s*№|№|#|号|编号)?|(?P<sn>sn|s/n|serial no))\s*[.:：|=]*\s*",
+    r"(?P<mark>s/?n|serial( no)?|n[°º]|n(?=\s+\d)|no\b|nr\b|зав\.?\s*№|№|#|号|编号)?|(?P<sn>sn|s/n|"
+    r"serial no))\s*[.:：|=]*\s*",
     re.IGNORECASE,
 )
 _SERIAL = re.compile(r"(?=\S*\d)[^\W_][\w./-]*")
@@ -239,7 +240,7 @@ def _marked_in(text: str) -> list[str]:
 
 def _tool(cell: str, right: Sequence[str]) -> str:
     """The serial behind a word for the tool, in a cell or the next one; empty where that may be something else."""
-    match = _TOOL.match(cell)
+    match = _TOOL.match(cell) or _TOOL.fullmatch(cell, max(cell.rfind(" "), cell.rfind("-")) + 1)
     if not match:
         return ""
     behind = cell[match.end() :].strip() or next((each for each in right[:2] if each), "")
@@ -264,7 +265,8 @@ def _pair(cell: str, right: Sequence[str]) -> tuple[str, str]:
 def _word(text: str) -> str:
     """Letters of a text in lower case without marks and blanks."""
     plain = unicodedata.normalize("NFKD", text.translate(_SPECIAL_LETTERS).lower())
-    return re.sub(r"[^\w/№]|_", "", "".join(c for c in plain if not unicodedata.combining(c)))
+    bare = "".join(c for c in plain if not unicodedata.combining(c))
+    return re.sub(r"[^\w/№]|_", "", unicodedata.normalize("NFC", bare))
 
 
 def day_of(text: str, day_first: bool = False) -> str:

@@ -35,14 +35,16 @@ TRANSLATIONS = (
         "elevation ",
     ),
     (
-        r"manyetik egim|inklinacja( pola| magn\w*)?|magn\w* inklinacio|inclinazione magn\w*|magn\w* inclinatie|"
+        r"복각|magneettinen kaltevuus|magn\w* kaltevuus|magneticka inklinace|manyetik egim|inklinacja( pola|"
+        r" magn\w*)?|magn\w* inklinacio|inclinazione magn\w*|magn\w* inclinatie|"
         r"magn\w* (inklination|lutning)|inklinasi( magnet\w*)?|伏角|"
         r"(угол )?(магнитн\w* )?наклонени[ея]|(地磁|磁)倾角?|incl\w*\.? magn\w*\.?|"
         r"(magn\w*|felt|feld|field) ?[-_ ]?inkl\w*|mergulho( magn\w*)?|echado|buzamiento|(field|magnetic) inclination",
         "dip ",
     ),
     (
-        r"\bdevi\b|kipp(achse|winkel)|schwenkachse|\btilt\b|inclinazione|inclinatie|helling|haeldning|hældning|lutning|"
+        r"kallistus(kulma)?|kallistuma(kulma)?|경사각?|inclinare|naklon\b|nagib\b|sklon\b|klison\b|\bdevi\b|"
+        r"kipp(achse|winkel)|schwenkachse|\btilt\b|inclinazione|inclinatie|helling|haeldning|hældning|lutning|"
         r"(kat )?odchyleni[ae]( od pionu)?|(kat )?nachyleni[ae]|ferdeseg|dolesszog|egim|kemiringan|傾斜角?|"
         r"зен\w*\.?( угол\w*)?|"
         r"neigung(swinkel)?|desviacion|sapma( acisi)?|inklination|inclinaison|inclinaca?o|"
@@ -51,12 +53,14 @@ TRANSLATIONS = (
         "inclination ",
     ),
     (
-        r"\bhazi\b|drehtisch|turn ?table|rotary table|baring|azymut|yonelim|азимут|asimut|azimute?(?!h)|acimut|方位角?|"
+        r"atsimuutti|suuntakulma|방위각?|\bhazi\b|drehtisch|turn ?table|rotary table|baring|azymut|yonelim|азимут|"
+        r"asimut|azimute?(?!h)|acimut|方位角?|"
         r"rumbo|richtung(?!swinkel)|retning|peilung",
         "azimuth ",
     ),
     (
-        r"\brb\b|^t/f\b|rollachse|roll axis|(kat )?obrotu|"
+        r"\brol(le?|lio|lo)?\b|kierto(kulma)?\b|natoceni|rotire|vridning|툴페이스|공구면각?|롤각?|\brb\b|^t/f\b|rollachse|"
+        r"roll axis|(kat )?obrotu|"
         r"\brulle?\b|rullning|rotasi|(kat )?ustawienia narzedzia|takim yuzu|szerszamallas|"
         r"gereedschapsvlak|v(ae|æ)rkt(o|ø)jsflade|faccia utensile|ツールフェ(ー|イ)ス|тулфейс|回転角|угол поворота|"
         r"roll[vw]inkel|roll angle|"
@@ -68,13 +72,15 @@ TRANSLATIONS = (
         "toolface ",
     ),
     (
-        r"akcelerometry?\b|accelero\b\.?|przysp(ieszenie)?\b\.?|gyorsulas(mero)?|ivme\w*|versn(elling)?\b\.?|accelerazione|"
+        r"kiiht\b\.?|kiihtyvyys|zrychl(eni)?\b\.?|가속도계?|acceleratie|acceleratia|akcelerometry?\b|accelero\b\.?|"
+        r"przysp(ieszenie)?\b\.?|gyorsulas(mero)?|ivme\w*|versn(elling)?\b\.?|accelerazione|"
         r"accelerometro|percepatan|加速度|γ|"
         r"beschleunigung\w*|beschl\b\.?|akselerasjon|akselerometer|akselero|aceleracion|acelerometros?|acel\b|"
         r"aceleracao|accelerometre|acceleration|\bac\.|ускорен\w*|акселерометр\w*|акс\b|\baks\b|加速度计?|加计|加表",
         "acc ",
     ),
     (
+        r"자기장?(?=[ _]*[xyz])|kentta(?=[ _]*[xyz])|pole(?=[ _]*[xyz])|camp(?=[ _]*[xyz])|"
         r"pole magn\w*\.?(?=[ _]*[xyz])|magneses(?=[ _]*[xyz])|manyetik(?=[ _]*[xyz])|magneetveld(?=[ _]*[xyz])|"
         r"medan(?=[ _]*[xyz])|磁気(?=[ _]*[xyz])|magnetfalt(?=[ _]*[xyz])|campo(?=[ _]*[bhm]?[xyz]\b)|"
         r"\bmagneto\b\.?|magnetometre|magn\b\.?(?=[ _]*[xyz]\b)|magnet(feld|felt)(?=[ _]*[bhm]?[xyz]\b)|"
@@ -86,7 +92,8 @@ TRANSLATIONS = (
         "mag ",
     ),
     (
-        r"natezenie pola|pole calkow\w*|calkowite pole|(teljes )?terero|toplam alan|totaalveld|"
+        r"kokonaiskentta|celkove pole|전자기장|전자력|camp total|natezenie pola|pole calkow\w*|calkowite pole|"
+        r"(teljes )?terero|toplam alan|totaalveld|"
         r"campo totale|medan total|全磁力|"
         r"feldstarke|gesamtfeld|totalfeld|totalfelt|champ( magn\w*)?( total)?|campo (total|local|magn\w*)|"
         r"intensidad total|полн\w* (магн\w* )?(поле|вектор\w*)|"
@@ -94,7 +101,8 @@ TRANSLATIONS = (
         "total field ",
     ),
     (
-        r"zwaartekracht|yercekimi|nehezsegi gyorsulas|gravita\b|gravitasi\b|tyngdkraft|"
+        r"중력(가속도)?|painovoima|tihove zrychleni|zwaartekracht|yercekimi|nehezsegi gyorsulas|gravita\b|"
+        r"gravitasi\b|tyngdkraft|"
         r"schwere|gravitation|pesanteur|tyngde\w*|gravedad|gravidade|сила тяжести|重力(加速度)?",
         "gravity ",
     ),
@@ -123,7 +131,8 @@ TRANSLATIONS = (
         "ref ",
     ),
     (
-        r"seriennummer|seriennr|serienummer|заводской номер|序列号|n(um\w*|[o°º])?\.? ?[°º]? ?de serie|serie n[°ºr]\.?",
+        r"sarjanumero|vyrobni cislo|일련번호|seriennummer|seriennr|serienummer|заводской номер|序列号|n(um\w*|"
+        r"[o°º])?\.? ?[°º]? ?de serie|serie n[°ºr]\.?",
         "serial ",
     ),
     (r"(\bgeogr\w*|географічн\w*)\.?|cografi( kuzey\w*)?", "true "),
@@ -149,7 +158,8 @@ def spelled(name: str) -> str:
     """
     text = name.translate(_LATIN).replace("º", "°").replace("°", "\0").replace("²", "\1")
     text = unicodedata.normalize("NFKD", text)
-    text = "".join(c for c in text if not unicodedata.combining(c)).replace("_", " ")
+    text = unicodedata.normalize("NFC", "".join(c for c in text if not unicodedata.combining(c)))
+    text = text.replace("_", " ")
     text = text.replace("\0", "°").replace("\1", "²")
     text = re.sub(r"(?<![^\W_])([^\W\d_])\.(?=[^\W\d_](?![^\W_]))", r"\1", text)  # T.F.
     for pattern, word in TRANSLATIONS:
@@ -168,7 +178,7 @@ def letters(name: str) -> str:
     ('posicion', 'nr', 'noточки')
     """
     text = unicodedata.normalize("NFKD", name.translate(_LATIN)).lower()
-    return "".join(c for c in text if c.isalpha())
+    return unicodedata.normalize("NFC", "".join(c for c in text if c.isalpha()))
 
 
 def translated(column: str) -> frozenset[str]:
