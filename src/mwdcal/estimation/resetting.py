@@ -69,9 +69,9 @@ def set_apart(problem: Problem, state: State, analysis: Analysis) -> Bools:
     apart = (expected > 0) & (square > expected)
     places = np.flatnonzero(apart)
     if places.size:
-        part = (take(each, places) for each in (problem, state, analysis, by_triad))
-        mean = expected[places]
-        freedom = 2 * mean**2 / np.maximum(_variance(*part), LEAST_VARIANCE * mean**2)
+        mean, at, means = expected[places], take(state, places), by_triad[places]
+        variance = _variance(take(problem, places), at, take(analysis, places), means)
+        freedom = 2 * mean**2 / np.maximum(variance, LEAST_VARIANCE * mean**2)
         apart[places] = fisher_tail(freedom, EXACT_VARIANCE, square[places] / mean) < APART_CHANCE
     return np.asarray(apart)
 

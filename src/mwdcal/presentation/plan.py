@@ -400,7 +400,7 @@ def render(plans: Sequence[Planned]) -> str:
         channels=_channels(first.calibration),
         rows=rows,
         soaks=any(begins for _, begins in rows),
-        settings=SETTING_WORDS.get(first.calibration.settings, ""),
+        settings=SETTING_WORDS.get(str(first.calibration.settings), ""),
         compared=comparison_rows(summaries),
         plans=[each.plan for each in summaries],
         accuracy=accuracy_rows(summaries[0]),
