@@ -135,10 +135,11 @@ def main() -> None:
     rng = np.random.default_rng(SEED)
     text = (
         "The best stations of `mwdcal plan` in its order, with the noise of `servo`. *Stand σ* is of inclination, "
-        "azimuth and toolface. *Set apart*: runs with the finding `settings-apart`, 1 % of those where it is wrong. "
-        "*Drift*: runs whose fit allows for a drift; no run has one. *σ / plan* is the stated 1σ of inclination / azimuth / "
-        "toolface at 45° over that of the plan, the mean of the runs without and with such a drift, and *error / plan* the root "
-        "mean square error. The last columns are the errors within 1.96 stated standard uncertainties.\n"
+        "azimuth and toolface. *Set apart*: runs with the finding `settings-apart`, 1 % of those where it is "
+        "wrong. *Drift*: runs whose fit allows for a drift; no run has one. *σ / plan* is the stated 1σ of "
+        "inclination / azimuth / toolface at 45° over that of the plan, the mean of the runs without and with such "
+        "a drift, and *error / plan* the root mean square error. The last columns are the errors within 1.96 "
+        "stated standard uncertainties.\n"
     )
     facts = {"Runs per row": RUNS, "Seed": SEED}
     parts = [text, world.table(HEADS, [row(case, rng) for case in cases()])]
