@@ -37,8 +37,7 @@ from mwdcal.planning.planned import (
     smallest_plan,
 )
 from mwdcal.planning.plans import load_plan, run_sheet, taken
-from mwdcal.presentation.plan import SETTING_WORDS
-from mwdcal.sensor.profile import PRACTICES, TriadProfile
+from mwdcal.sensor.profile import TriadProfile
 from simulation import DEG, attitude
 
 SERVO = load_profile("servo")[0]
@@ -709,15 +708,15 @@ def test_a_plan_says_on_which_practice_of_the_stand_it_rests(tmp_path):
     assert ASSUMED in shown
     assert "azimuth, 1σ if set at every station" in shown
     by_practice = {}
-    for practice, words in SETTING_WORDS.items():
-        if practice in PRACTICES:
-            stand = f'\n[stand]\nsettings = "{practice}"\n'
-            profile.write_text(text.replace("\n[stand]\n", stand), "utf-8")
-            each = mwdcal(*command, profile, "--report", sheet, "--json").json
-            assert each["settings"] == practice
-            assert "accuracy_per_station_deg" not in each
-            assert words in sheet.read_text("utf-8")
-            by_practice[practice] = each["accuracy_deg"]
+    asked = {"per-direction": "turn the toolface alone", "per-station": "anew at every station"}
+    for practice, words in asked.items():
+        stand = f'\n[stand]\nsettings = "{practice}"\n'
+        profile.write_text(text.replace("\n[stand]\n", stand), "utf-8")
+        each = mwdcal(*command, profile, "--report", sheet, "--json").json
+        assert each["settings"] == practice
+        assert "accuracy_per_station_deg" not in each
+        assert [w for w in asked.values() if w in sheet.read_text("utf-8")] == [words]
+        by_practice[practice] = each["accuracy_deg"]
     assert by_practice["per-direction"] == open_["accuracy_deg"]
     assert by_practice["per-station"] == open_["accuracy_per_station_deg"]
     assert open_["accuracy_deg"] != open_["accuracy_per_station_deg"]
