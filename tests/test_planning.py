@@ -18,6 +18,7 @@ from mwdcal.calibration import results
 from mwdcal.calibration.diagnosis.detection import detections
 from mwdcal.calibration.diagnosis.plausibility import misfit_chances, stations_to_reshoot
 from mwdcal.calibration.estimate import fit
+from mwdcal.calibration.options import ASSUMED, settings_of
 from mwdcal.calibration.results import accuracy_at, readings_at
 from mwdcal.errors import FitError, InputError
 from mwdcal.files.documents import read
@@ -477,12 +478,17 @@ def test_a_plan_says_how_well_its_uncertainties_will_be_known():
 
 
 def noisy_runs(plan, profile, count, errors=(), seed=0):
-    """Fits of simulated runs by a plan, with errors (observable, station, size) of single stations."""
+    """Fits of simulated runs by a plan, with errors (observable, station, size) of single stations.
+
+    Stations of one setting share its errors of inclination and azimuth, as the plan takes it.
+    """
     choice, _ = planned_fit(plan, profile)
     readings, rng = choice.readings, np.random.default_rng(seed)
+    shared, each = settings_of(readings), np.arange(readings.count)
     true = {
         name: readings.known[name]
-        + readings.uncertainty(name) * rng.normal(size=(count, readings.count))
+        + readings.uncertainty(name)
+        * rng.normal(size=(count, readings.count))[:, each if name == "toolface" else shared]
         for name in ANGLES
     } | {name: np.tile(readings.known[name], (count, 1)) for name in ("gravity", "field", "dip")}
     for name, station, size in errors:
@@ -686,6 +692,34 @@ def test_the_screen_says_what_is_assumed_and_how_long_the_soak_is(tmp_path):
     assert "the plan does not state the place; assumed: field_nt 48,000, dip_deg 63\n" in mwdcal(
         "plan", "--plan", "six-state", "--tool", "servo"
     ).out  # fmt: skip
+
+
+@pytest.mark.usefixtures("without_pictures")
+def test_a_plan_says_on_which_practice_of_the_stand_it_rests(tmp_path):
+    """The same figures as from a profile that states the practice, and the sheet asks the operator for it."""
+    text = (files("mwdcal") / "profiles" / "servo.toml").read_text("utf-8")
+    assert "\n[stand]\n" in text
+    profile, sheet = tmp_path / "p.toml", tmp_path / "sheet.html"
+    command = ("plan", "--plan", "moosavi-12", "--tool")
+    profile.write_text(text, "utf-8")
+    open_ = mwdcal(*command, profile, "--json").json
+    shown = mwdcal(*command, profile).out
+    assert open_["settings"] == "assumed"
+    assert ASSUMED in shown
+    assert "azimuth, 1σ if set at every station" in shown
+    by_practice = {}
+    asked = {"per-direction": "turn the toolface alone", "per-station": "anew at every station"}
+    for practice, words in asked.items():
+        stand = f'\n[stand]\nsettings = "{practice}"\n'
+        profile.write_text(text.replace("\n[stand]\n", stand), "utf-8")
+        each = mwdcal(*command, profile, "--report", sheet, "--json").json
+        assert each["settings"] == practice
+        assert "accuracy_per_station_deg" not in each
+        assert [w for w in asked.values() if w in sheet.read_text("utf-8")] == [words]
+        by_practice[practice] = each["accuracy_deg"]
+    assert by_practice["per-direction"] == open_["accuracy_deg"]
+    assert by_practice["per-station"] == open_["accuracy_per_station_deg"]
+    assert open_["accuracy_deg"] != open_["accuracy_per_station_deg"]
 
 
 def test_a_sheet_asks_for_the_place(tmp_path):

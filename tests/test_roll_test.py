@@ -178,7 +178,7 @@ def test_a_few_small_residuals_never_replace_a_stated_noise():
     """Six toolfaces, one degree of freedom: whatever is left, the 1σ is that of the declared noise."""
     rng = np.random.default_rng(6)
     six = np.arange(6) * 60 * DEG
-    _, curve = rolls(rng, 3000, 0.1, 0.02, toolface=six)
+    _, curve = rolls(rng, 500, 0.1, 0.02, toolface=six)
     noise = scatter([curve])
     assert noise.scale == pytest.approx(1.0)
     found = extent(curve, noise)

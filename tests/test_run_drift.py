@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace as with_changes
 from scipy import special
 
 from cli_support import calibrated, mwdcal, servo_run, write_csv
@@ -13,14 +14,16 @@ from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.record import Drift, Finding
 from mwdcal.calibration.results import StatedCovariance, drifts
 from mwdcal.certificate.budget import budget
 from mwdcal.errors import FitError
 from mwdcal.estimation.drift import FEWEST_USED, student_squares, terms_of, walk_scores
 from mwdcal.files.formats.table import Table
+from mwdcal.files.profiles import load_profile
 from mwdcal.geometry.vectors import earth_field, earth_gravity, tool_from_earth
 from mwdcal.planning.expected import expected
-from mwdcal.planning.plans import drifted
+from mwdcal.planning.plans import drifted, load_plan
 from mwdcal.presentation.calibration import remarks
 from mwdcal.sensor.profile import Profile, StandProfile, TriadProfile
 
@@ -108,6 +111,24 @@ def test_the_size_of_a_drift_is_stated():
     (finding,) = [f for f in record.findings if f.id == "accelerometer-drift"]
     assert "uncertainty includes it" in finding.text
     assert "drift of the accelerometer during the run" in {row.source for row in record.budget}
+
+
+def test_a_drift_that_no_finding_names_is_on_the_screen_too():
+    """Small ones may be noise, and widen the uncertainty beyond what a plan has said."""
+    steady = expected(load_plan("twelve-state"), load_profile("servo")[0])
+    drift = Drift(name="field", change=31.0, standard_uncertainty=11.0, unit="nT")
+    finding = Finding(id="field-drift", text="readings follow the order")
+    possible = "a possible drift within the run"
+    for more, shown in (
+        ({"drift": []}, False),
+        ({"drift": [drift]}, True),
+        ({"drift": [drift], "findings": [finding]}, False),
+        ({"drift": [with_changes(drift, declared=40.0)]}, False),
+    ):
+        said = [line for line in remarks(with_changes(steady, **more)) if possible in line]
+        assert [line.endswith("does not foresee: field 31 ± 11 nT") for line in said] == [
+            True
+        ] * shown
 
 
 def test_a_member_of_a_batch_drifts_as_it_does_alone():

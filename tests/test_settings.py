@@ -4,12 +4,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
+from scipy.stats import binom
 
 from mwdcal.calibration.diagnosis.refusals import BAD_INPUT, reading_refusals
+from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options, is_assumed, settings_of
+from mwdcal.calibration.readings import TRIADS
 from mwdcal.errors import InputError
 from mwdcal.estimation.batch import batch_of_one
+from mwdcal.estimation.resetting import _variance
+from mwdcal.files.profiles import load_profile
 from mwdcal.library.arrays import readings
+from mwdcal.planning.planned import best_plan
+from mwdcal.planning.plans import drawn, simulated
+from mwdcal.planning.session import Session
+
+SERVO = load_profile("servo")[0]
 
 
 def run(inclination, azimuth, **more):
@@ -86,3 +97,48 @@ def test_more_settings_than_memory_holds_are_refused_with_a_remedy(practice):
     for flag in refused:
         assert "10000 stations share 1250 settings" in flag.sentence(0)
         assert 'settings = "per-station"' in flag.sentence(0)
+
+
+def planned_runs(practice, runs, count=16, seed=0):
+    """Runs of the best stations in the order of `plan`, on a stand of a practice that nobody states."""
+    session = Session.of(best_plan(None, count, SERVO).plan, SERVO)
+    rng = np.random.default_rng(seed)
+    tools = drawn(rng, SERVO, 0, (runs,))
+    made = simulated(tools, replace(session.readings, settings=practice), rng).readings
+    return replace(made, settings="")
+
+
+def test_scatter_within_settings_has_the_variance_of_the_whole_matrix_of_residuals():
+    """2 tr(GG) with G = ZᵀPZ of all stations at once, P = W - WX(XᵀWX + prior)⁻¹XᵀW."""
+    fitted = fit(planned_runs("per-direction", 3), Options(order=0))
+    problem, state = fitted.problem, fitted.state
+    linear = problem.linear(state)
+    for run in range(3):
+        stations = linear.weight.shape[1]
+        whole = block_diag(*linear.weight[run])
+        x = linear.design[run].reshape(whole.shape[0], -1)
+        z = block_diag(*problem.resetting_columns(state)[run])
+        wx = whole @ x
+        p = whole - wx @ np.linalg.inv(x.T @ wx + linear.prior[run]) @ wx.T
+        variance = 2 * np.sum((z.T @ p @ z) ** 2)
+        assert z.shape == (6 * stations, 2 * stations)
+        given = _variance(problem, state, fitted.analysis, np.zeros((3, 2)))[run]
+        np.testing.assert_allclose(given, variance, rtol=1e-6)
+
+
+def set_apart(practice, runs, declared=True):
+    """How many runs of a practice have a share of their own."""
+    made = planned_runs(practice, runs, count=24)
+    sd = made.sd if declared else {n: each for n, each in made.sd.items() if n not in TRIADS}
+    return int((fit(replace(made, sd=sd), Options(order=0)).problem.evidence.apart > 0).sum())
+
+
+@pytest.mark.parametrize("declared", [True, False])
+def test_one_sound_run_in_a_hundred_is_taken_as_set_apart(declared):
+    """Of 500 runs, many of whose settings are pairs, 1 to 13 by the binomial distribution (99 %)."""
+    low, high = binom.ppf([0.005, 0.995], 500, 0.01)
+    assert low <= set_apart("per-direction", 500, declared) <= high
+
+
+def test_most_runs_that_were_set_apart_are_taken_so():
+    assert set_apart("per-station", 60) > 40

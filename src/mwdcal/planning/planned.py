@@ -6,9 +6,9 @@ How long a session at the stand takes, and the order of stations that makes it s
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from msgspec.structs import replace as with_fields
@@ -22,7 +22,7 @@ from mwdcal.calibration.diagnosis.flags import listed
 from mwdcal.calibration.diagnosis.identity import UNIDENTIFIED
 from mwdcal.calibration.diagnosis.plausibility import freedom_of
 from mwdcal.calibration.estimate import Fit
-from mwdcal.calibration.options import Options
+from mwdcal.calibration.options import ASSUMED_PRACTICE, Options
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.calibration.results import TWELFTHS, accuracy_at, angles, readings_at
@@ -30,7 +30,7 @@ from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.problem import ANGLES
 from mwdcal.files.formats.table import Table, labels
 from mwdcal.geometry.vectors import Array, Bools, Ints
-from mwdcal.planning.expected import carried_out, left_undetermined, planned_fit
+from mwdcal.planning.expected import carried_out, expected, left_undetermined, planned_fit
 from mwdcal.planning.optimal import Design, Information, best, exchanged, least_count, least_worst
 from mwdcal.planning.plans import (
     at_place,
@@ -41,7 +41,7 @@ from mwdcal.planning.plans import (
     soak_numbers,
     taken,
 )
-from mwdcal.sensor.profile import Profile
+from mwdcal.sensor.profile import PRACTICES, Profile
 
 AT_ENDS_WITHIN = 1e-6
 """A setting so little beyond what the stand reaches is within it, degrees."""
@@ -193,7 +193,8 @@ class Planned:
     could have; `seconds` the session at the stand, `soaking` those of them in soaks. `freedom` (t,) are the degrees of
     freedom of each triad's s, and `detections` (1, n) the errors of one station that `calibrate` will report, those
     `measured` already before the plan's. No plan of fewer than `bound` stations gives the wanted accuracy, if one is;
-    `search` says what the search has to say.
+    `search` says what the search has to say. `set_anew` works out the calibration on a stand that is set at every
+    station.
     """
 
     plan: Table
@@ -203,17 +204,20 @@ class Planned:
     freedom: Array
     soaking: float
     detections: Mapping[str, Detection]
+    set_anew: Callable[[], Calibration]
     measured: int = 0
     bound: int | None = None
     search: list[Finding] = field(default_factory=list)
 
     @classmethod
     def of(
-        cls, plan: Table, carried: tuple[Calibration, Fit], efficiency: float, stand: Stand, measured: int = 0
+        cls, plan: Table, whole: Table, profile: Profile, options: Options | None, efficiency: float,
+        stand: Stand, measured: int = 0,
     ) -> Planned:  # fmt: skip
-        """A plan with the calibration and the fit that it will give."""
-        calibration, result = carried
+        """A plan with the calibration that it will give; `whole` also has the stations measured already."""
+        calibration, result = carried_out(whole, profile, options)
         soak = soak_numbers(plan)
+        anew = with_fields(profile, stand=with_fields(profile.stand, settings=PRACTICES[1]))
         return cls(
             plan,
             calibration,
@@ -222,8 +226,14 @@ class Planned:
             freedom=freedom_of(result)[0],
             soaking=soak_seconds(soak, stand),
             detections=detections(result),
+            set_anew=partial(expected, whole, anew, options),
             measured=measured,
         )
+
+    @cached_property
+    def per_station(self) -> Calibration | None:
+        """The calibration on a stand that is set at every station, where nobody says how often it is."""
+        return self.set_anew() if self.calibration.settings == ASSUMED_PRACTICE else None
 
     @property
     def hidden(self) -> dict[str, list[int]]:
@@ -269,12 +279,11 @@ def judged(
         FitError: no calibration can come of the plan; the message says what to add.
     """
     _check_reached(plan, stand)
-    carried = carried_out(plan, profile, options)
     others = at_temperatures(_reached(candidates or load_plan("candidates"), stand), plan)
     whole = joined(plan, others)
     information, _ = Information.of_fit(planned_fit(whole, _set_anew(profile), options)[1])
     share = Design(information, np.arange(whole.count) < plan.count).efficiency
-    return Planned.of(plan, carried, share, stand)
+    return Planned.of(plan, plan, profile, options, share, stand)
 
 
 def best_plan(
@@ -515,8 +524,9 @@ class Search:
         )
         whole = taken(self.plan, np.append(design.chosen[: self.before], new))
         options = replace(self.options or Options(), order=self.choice.options.order)
-        carried = carried_out(whole, self.profile, options)
-        return Planned.of(plan, carried, design.efficiency, self.stand, self.before)
+        return Planned.of(
+            plan, whole, self.profile, options, design.efficiency, self.stand, self.before
+        )
 
 
 def check_criterion(criterion: str) -> None:

@@ -186,8 +186,21 @@ def remarks(calibration: Calibration) -> list[str]:
 
 
 def drift_remarks(calibration: Calibration) -> list[str]:
-    """Drifts within the run: what one that is not seen would do, and those that are declared."""
-    return [*filter(None, (blindness(calibration.unseen), declared_drift(calibration.drift)))]
+    """Drifts within the run: what one that is not seen would do, declared ones, and those that may be noise."""
+    each = blindness(calibration.unseen), declared_drift(calibration.drift), _possible(calibration)
+    return [*filter(None, each)]
+
+
+def _possible(calibration: Calibration) -> str:
+    """A sentence on drifts that the fit allows for and no finding names, or blank."""
+    named = {finding.id for finding in calibration.findings}
+    sizes = [
+        f"{each.name} {estimate(each.change, each.standard_uncertainty, each.unit)}"
+        for each in calibration.drift
+        if each.declared is msgspec.UNSET and f"{each.name}-drift" not in named
+    ]
+    words = "a possible drift within the run, which the uncertainty includes and a plan does not foresee"
+    return f"{words}: {', '.join(sizes)}" if sizes else ""
 
 
 def heading(calibration: Calibration) -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
+from mwdcal.calibration.options import ASSUMED, ASSUMED_PRACTICE
 from mwdcal.calibration.record import Calibration, Finding, TriadCalibration, Undetermined
 from mwdcal.calibration.residuals import shown_in
 from mwdcal.calibration.results import accuracy_at, typical_accuracy
@@ -32,6 +33,14 @@ if TYPE_CHECKING:
 
 PLACE = "1σ, calibration alone, at 45° inclination"
 """The conditions of the accuracy of a plan."""
+SETTING_WORDS = {
+    "per-station": "Set inclination and azimuth anew at every station, also where they stay the same.",
+    **dict.fromkeys(
+        ("per-direction", ASSUMED_PRACTICE),
+        "Leave inclination and azimuth untouched while they stay the same: turn the toolface alone.",
+    ),
+}
+"""Instructions to the operator by the practice on which a plan rests."""
 STATION_TITLES = {
     "station": "station", "temperature_c": "T, °C", "ref_inclination_deg": "inclination, °",
     "ref_azimuth_deg": "azimuth, °", "ref_toolface_deg": "toolface, °",
@@ -67,7 +76,9 @@ class DetectableError(msgspec.Struct, frozen=True, kw_only=True):
 class PlanSummary(msgspec.Struct, frozen=True, kw_only=True):
     """The output of `plan` for one plan.
 
-    `soak_hours` are part of `session_hours`. `accuracy_deg` at 45° inclination, as `calibrate` states it;
+    `soak_hours` are part of `session_hours`. `accuracy_deg` at 45° inclination, as `calibrate` states it without drift;
+    `settings`: the practice of the stand that it rests on, as in a calibration file, and where that is "assumed"
+    `accuracy_per_station_deg`, the same on a stand that is set at every station;
     `accuracy_by_inclination_deg` by angle at `inclinations_deg`. `efficiency_bound`: at least this share of the best
     D-value per parameter. Without `magnetometer` the profile says nothing of one. No plan of fewer than
     `fewest_stations` gives the wanted accuracy; None where none is wanted.
@@ -80,6 +91,8 @@ class PlanSummary(msgspec.Struct, frozen=True, kw_only=True):
     accelerometer: PlannedTriad
     magnetometer: PlannedTriad | None = None
     accuracy_deg: dict[str, float | None]
+    settings: str | msgspec.UnsetType = msgspec.UNSET
+    accuracy_per_station_deg: dict[str, float | None] | msgspec.UnsetType = msgspec.UNSET
     inclinations_deg: list[float]
     accuracy_by_inclination_deg: dict[str, list[float | None]]
     rank: int
@@ -148,6 +161,10 @@ def _fields(each: Planned) -> dict[str, Any]:
         "soak_hours": each.soaking / 3600,
         **by_triad,
         "accuracy_deg": typical_accuracy(calibration),
+        "settings": calibration.settings,
+        "accuracy_per_station_deg": typical_accuracy(each.per_station)
+        if each.per_station
+        else msgspec.UNSET,
         "inclinations_deg": np.degrees(WORKING_INCLINATIONS).round(9).tolist(),
         "accuracy_by_inclination_deg": _by_inclination(calibration),
         "rank": sum(triad.rank for triad in calibration.triads),
@@ -239,7 +256,7 @@ def screen(
         one_line(head),
         table(comparison_rows(summaries), ["", *(one_line(each.plan) for each in summaries)]),
     ]
-    blocks += _assumed(plans[0])
+    blocks += filter(None, ["\n".join([*_assumed(plans[0]), *_practice(summaries)])])
     if len(plans) == 1:
         blocks += [accuracy(summaries[0]), detectable(summaries[0]), stations(plans[0])]
     if output or html:
@@ -257,6 +274,11 @@ def _assumed(planned: Planned) -> list[str]:
     if blank:
         return [f"the plan does not state the place; assumed: {', '.join(blank)}"]
     return [f"place: {', '.join(words.values())}"]
+
+
+def _practice(facts: Sequence[PlanSummary]) -> list[str]:
+    """The assumption on the stand's settings as a line, if there is one."""
+    return [ASSUMED] if any(each.settings == ASSUMED_PRACTICE for each in facts) else []
 
 
 def _is_blank(plan: Table, name: str) -> bool:
@@ -280,6 +302,11 @@ def comparison_rows(facts: Sequence[PlanSummary]) -> list[list[str]]:
     for name in facts[0].accuracy_deg:
         cells = [quantity(each.accuracy_deg[name], "°", 2) for each in facts]
         lines.append([f"{name}, 1σ at 45° inclination", *cells])
+    anew = [each.accuracy_per_station_deg for each in facts]
+    if any(anew):
+        for name in facts[0].accuracy_deg:
+            cells = [quantity(each[name], "°", 2) if each else "–" for each in anew]
+            lines.append([f"{name}, 1σ if set at every station", *cells])
     return lines
 
 
@@ -375,6 +402,7 @@ def render(plans: Sequence[Planned]) -> str:
         channels=_channels(first.calibration),
         rows=rows,
         soaks=any(begins for _, begins in rows),
+        settings=SETTING_WORDS.get(str(first.calibration.settings), ""),
         compared=comparison_rows(summaries),
         plans=[each.plan for each in summaries],
         accuracy=accuracy_rows(summaries[0]),
