@@ -448,13 +448,17 @@ def left_out_chances(fit: Fit, tool: Ints, station: Ints) -> Array:
     Reference: R. D. Cook and S. Weisberg, Residuals and Influence in Regression (1982), section 2.2: externally
     studentised residuals.
     """
-    analysis, noise = fit.analysis, fit.noise[tool]
     tests = left_out_tests(fit, tool, station)
     if not closed_form.applies(fit.problem):
-        exact = left_out_variances(fit.problem, fit.state, analysis, tool, station)
+        exact = left_out_variances(fit.problem, fit.state, fit.analysis, tool, station)
         others = zip(*(each.mT for each in exact), strict=True)
         tests = [(*one[:2], *other) for one, other in zip(tests, others, strict=True)]
-    chance = np.ones(len(tool))
+    return chances_of_tests(tests, fit.noise[tool])
+
+
+def chances_of_tests(tests: list[tuple[Array, ...]], noise: Array) -> Array:
+    """The same (k,) of the `left_out_tests` of each triad; `noise` (k, t) is NaN where it is declared."""
+    chance = np.ones(len(noise))
     for index, (square, freedom, variance, rest) in enumerate(tests):
         by_noise = tail(square / np.maximum(np.nan_to_num(variance), 1.0), freedom)
         tested = (freedom > 0) & (rest >= 1)
