@@ -54,6 +54,7 @@ from mwdcal.estimation.uncertainty import (
     station_misfit,
     triad_squares,
     triad_sums,
+    variance_factors_at,
     with_scatter,
 )
 from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal
@@ -307,9 +308,12 @@ def without_stations(result: Fit, left: Bools) -> Fit:
     """The fits without the stations `left` out (B, n), to first order, with noise estimated anew where it was."""
     problem = fewer_stations(result.problem, left)
     state = stepped(problem, result.state, Determined.of(problem, result.state))
-    for _ in range(ROUNDS_WITHOUT):
-        problem = _rescaled(problem, _noise_scale(analyse(problem, state), ahead=False))
-    return replace(result, problem=problem, state=state, analysis=analyse(problem, state))
+    determined = Determined.of(problem, state)
+    for _ in range(0 if _all_declared(problem) else ROUNDS_WITHOUT):
+        factor, freedom = variance_factors_at(problem, state, determined)
+        problem = _rescaled(problem, np.sqrt(np.where(freedom >= 1, factor, np.nan)))
+    analysis = analyse(problem, state, determined)
+    return replace(result, problem=problem, state=state, analysis=analysis)
 
 
 def with_all(result: Fit) -> Fit:
