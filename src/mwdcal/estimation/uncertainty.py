@@ -584,7 +584,7 @@ def station_misfit(analysis: Analysis) -> tuple[Array, Array]:
 
     Directions of a station's readings that nothing tests (share below `TESTED`) do not count.
     """
-    back, freedom = _tested_inverse(analysis.spread)
+    back, freedom = tested_inverse(analysis.spread)
     return np.sum(analysis.residual * _along(back, analysis.residual), -1), freedom
 
 
@@ -593,7 +593,7 @@ def left_out_residual(analysis: Analysis) -> Array:
 
     Exact for a linear problem. Directions of a station's readings that nothing else tests have none.
     """
-    return _along(_tested_inverse(analysis.spread)[0], analysis.residual)
+    return _along(tested_inverse(analysis.spread)[0], analysis.residual)
 
 
 def left_out_variances(
@@ -661,7 +661,7 @@ def _along(back: Array, residual: Array) -> Array:
     return np.asarray((back @ residual[..., None])[..., 0])
 
 
-def _tested_inverse(spread: Array) -> tuple[Array, Array]:
+def tested_inverse(spread: Array) -> tuple[Array, Array]:
     """Inverse (B, n, m, m) along the directions that are tested, and their number (B, n)."""
     if is_once(spread):
         back, freedom = _inverse_of_tested(spread[:1])

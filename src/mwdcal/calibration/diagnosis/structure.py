@@ -834,7 +834,8 @@ def _testable(problem: Problem, state: State, others: Mapping[str, Array]) -> di
 def _bad_stations(result: Fit) -> Bools:
     """The stations (B, n) to take again of fits of which they are few: one bad station looks like anything."""
     bad = stations_to_reshoot(result)
-    return bad & (np.sum(bad, -1, keepdims=True) <= max(1.0, BAD_SHARE * bad.shape[-1]))
+    few = np.sum(bad, -1, keepdims=True) <= max(1.0, BAD_SHARE * bad.shape[-1])
+    return np.asarray(bad & few)
 
 
 def _without(result: Fit, bad: Bools) -> Fit:
