@@ -407,7 +407,9 @@ class StatedCovariance:
         whole = maps @ self.total @ maps.mT
         sd = np.sqrt(np.maximum(diagonal(whole), 1e-300))
         uneven = np.any(np.abs(whole - whole.mT) > EVEN * outer(sd), (-1, -2))
-        return np.asarray(np.where(uneven[:, None, None], (whole + whole.mT) / 2, whole))
+        if uneven.any():
+            whole = np.where(uneven[:, None, None], (whole + whole.mT) / 2, whole)
+        return np.asarray(whole)
 
     def by_source(self, repeatability: Array | None = None) -> dict[str, Array]:
         """Covariance (B, p, p) by source; all together they are `total`.

@@ -54,7 +54,7 @@ FEWEST_SOAKS = 3
 """Fewest soaks among which one can be left out."""
 LOUDER = 1.1
 """Variance of residuals, that of the declared noise being 1, from which terms may hide in them…"""
-NEAR = 0.01
+NEARLY_THERE = 0.01
 """…and chance of a term below which it may be there after all."""
 UNDOUBTED = 1e-12
 """A term is there without doubt if noise alone gives one as large with a probability below this."""
@@ -160,7 +160,7 @@ def _tested(
         orders[some] = np.where(closed, order, chosen)
         louder = np.isfinite(result.noise) | (terms.scatter > LOUDER)
         tried = np.where(within[:, None], terms.chance[..., :HIGHEST], np.nan)
-        near = np.any(np.nan_to_num(tried, nan=1.0) < NEAR, -1)
+        near = np.any(np.nan_to_num(tried, nan=1.0) < NEARLY_THERE, -1)
         hidden[some] = np.where(closed, louder | near, hidden[some])
     coupled = any(readings.sd.get(name, np.zeros(1)).any() for name in ANGLES)
     return (_raised(readings, options, orders, limit, hidden) if coupled else orders), chance

@@ -570,7 +570,8 @@ def _absurd(fitted: FittedRuns, index: int) -> Iterator[Flag]:
     result, raw = fitted.result, fitted.result.problem.triads[index].raw
     excess = np.sqrt(np.nan_to_num(result.analysis.variance_factor[:, index]))
     noise = result.noise[:, index]
-    declared, signal = np.isnan(noise), np.minimum(_strength(raw), 2 * raw.std(axis=1).max(-1))
+    spread = np.ascontiguousarray(raw.mT).std(-1).max(-1)
+    declared, signal = np.isnan(noise), np.minimum(_strength(raw), 2 * spread)
 
     def is_absurd(share: Array | float) -> Bools:
         return np.where(
