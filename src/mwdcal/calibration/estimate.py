@@ -57,7 +57,7 @@ from mwdcal.estimation.uncertainty import (
     variance_factors_at,
     with_scatter,
 )
-from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal
+from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, over_stations
 from mwdcal.sensor.models import Basis, Factors, Polynomial, Whole, restricted
 
 LEAST_NOISE = 1e-9
@@ -114,7 +114,7 @@ def model_of(
     if kind == "factors":
         return Factors(basis)
     weight = include[..., None] / include.sum(-1)[:, None, None]
-    centre = np.sum(raw * weight, -2, keepdims=True)
+    centre = over_stations(raw * weight)[..., None, :]
     radius = np.sqrt(np.sum((raw - centre) ** 2 * weight, (-2, -1)))
     radius = np.where(radius > 0, radius, 1.0)
     return Polynomial(
@@ -178,7 +178,8 @@ def _bound_curves(problem: Problem, curved: Mapping[str, float]) -> None:
 
 def _size(raw: Array) -> Array:
     """Root mean square departure of readings from their mean (B, 1, 1)."""
-    size = np.sqrt(np.mean((raw - raw.mean(-2, keepdims=True)) ** 2, (-2, -1), keepdims=True))
+    mean = over_stations(raw)[..., None, :] / raw.shape[-2]
+    size = np.sqrt(np.mean((raw - mean) ** 2, (-2, -1), keepdims=True))
     return np.where(size > 0, size, 1.0)
 
 

@@ -28,6 +28,7 @@ from mwdcal.geometry.vectors import (
     are_positive,
     diagonal,
     distinct,
+    dot,
     eigen,
     finite,
     inverse,
@@ -585,7 +586,10 @@ def station_misfit(analysis: Analysis) -> tuple[Array, Array]:
     Directions of a station's readings that nothing tests (share below `TESTED`) do not count.
     """
     back, freedom = tested_inverse(analysis.spread)
-    return np.sum(analysis.residual * _along(back, analysis.residual), -1), freedom
+    along = _along(back, analysis.residual)
+    if along.shape[-1] == 3:
+        return dot(analysis.residual, along), freedom
+    return np.sum(analysis.residual * along, -1), freedom
 
 
 def left_out_residual(analysis: Analysis) -> Array:

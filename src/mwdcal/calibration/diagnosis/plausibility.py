@@ -49,6 +49,7 @@ from mwdcal.geometry.vectors import (
     eigen,
     inverse,
     outer,
+    over_stations,
     quadratic_form,
     quotient,
 )
@@ -310,7 +311,8 @@ def has_sensor_gains(result: Fit, temperature: Array) -> Bools:
     problem, gains = result.problem, []
     for triad, where in zip(problem.triads, problem.slices(), strict=True):
         at = temperature if triad.model.varies else temperature[:, :1]
-        middle = np.broadcast_to(triad.raw.mean(1, keepdims=True), (*at.shape, 3))
+        mean = over_stations(triad.raw)[:, None] / triad.raw.shape[1]
+        middle = np.broadcast_to(mean, (*at.shape, 3))
         slope = triad.model.slope(result.state.params[:, where], middle, at)
         gains.append(invertible(slope) & ~mirrored(slope))
     return np.asarray(np.all(gains, 0))

@@ -47,7 +47,7 @@ from mwdcal.estimation.batch import batch_of_one
 from mwdcal.estimation.problem import WALKS
 from mwdcal.estimation.solvers import LOSSES, Status
 from mwdcal.estimation.uncertainty import free_directions, station_misfit
-from mwdcal.geometry.vectors import Array, Bools
+from mwdcal.geometry.vectors import Array, Bools, length
 from mwdcal.sensor.models import Basis, Factors, Polynomial, Whole, restricted
 from mwdcal.sensor.profile import COMMON, Profile
 
@@ -469,7 +469,7 @@ def _coarse_noise(readings: Readings, triad: str) -> Flag:
 
 def _strength(raw: Array) -> Array:
     """Mean strength (...) of readings (..., n, 3), at least 1e-30."""
-    return np.asarray(np.maximum(np.linalg.norm(raw, axis=-1).mean(-1), 1e-30))
+    return np.asarray(np.maximum(length(raw).mean(-1), 1e-30))
 
 
 def no_temperature(order: int) -> InputError:

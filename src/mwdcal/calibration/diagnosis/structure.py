@@ -50,6 +50,7 @@ from mwdcal.geometry.vectors import (
     inverse,
     inverse_of_positive,
     outer,
+    over_stations,
     quotient,
 )
 
@@ -204,6 +205,8 @@ HYSTERESIS = "-hysteresis"
 """What ends the names of families whose columns are each tool's own."""
 LOOK_MARGIN = 0.99
 """A fit is looked at from this share of the gain that would name an effect: rounding differs by far less."""
+FREEDOM_STEP = 8
+"""Degrees of freedom are counted up to a multiple of these, which asks for less gain: few limits are worked out."""
 LEAST_ALIKE = 0.4
 """Least share of the information of others that sensors have to which these are compared; the inverse is the most."""
 NOTHING_LEFT, CLEARLY_LEFT = 1e-10, 1e-2
@@ -237,7 +240,7 @@ def may_show(result: Fit) -> Bools:
     drifts = _Drifts.of(problem, result.state, design, residual, response)
     misfit = np.sum(residual**2, (1, 2)) + drifts.misfit
     rest = np.sum(problem.evidence.include[0]) * residual.shape[-1] - result.state.params.shape[-1]
-    rest = np.ceil(rest - drifts.freedom)
+    rest = FREEDOM_STEP * np.ceil((rest - drifts.freedom) / FREEDOM_STEP)
     sides = _gains_of_sides(problem, design, residual, response, drifts)
     shown = _are_enough(sides, misfit, rest)
     near = every if drifts.columns else _may_be_enough(design, residual, response, misfit, rest)
@@ -475,9 +478,9 @@ def _gain_of_sides(
 ) -> tuple[Array, Ints]:
     """The same for a column on each axis of a triad, of which the values (B, n, 3) are each tool's."""
     basis = np.linalg.qr(terms)[0]
-    whole = np.sum(sides**2, 1)
-    left = whole - np.sum((basis.transpose() @ sides) ** 2, 1)
-    score = np.sum(sides * residual, 1)
+    whole = over_stations(sides**2)
+    left = whole - over_stations((basis.transpose() @ sides) ** 2)
+    score = over_stations(sides * residual)
     if index in drifts.columns:
         seen = drifts.columns[index].left
         cross = (sides.mT @ seen.reshape(len(seen), -1)).reshape(len(sides), 3, 6, -1)
