@@ -32,7 +32,7 @@ from mwdcal.files.profiles import PACKAGE, check_profile
 # Files that no output replaces: keys, calibrations, and those on which a certificate rests.
 
 
-PARQUET = b"PAR1"
+PARQUET_START = b"PAR1"
 """How a table begins that is no document, and need not be read to see that."""
 LARGEST_DOCUMENT = 50_000_000
 """Bytes of the largest file in which a document is looked for."""
@@ -75,8 +75,8 @@ def _content(file: Path) -> bytes:
     with suppress(OSError):
         if file.is_file() and file.stat().st_size <= LARGEST_DOCUMENT:
             with file.open("rb") as stream:
-                start = stream.read(len(PARQUET))
-                return b"" if start == PARQUET else start + stream.read()
+                start = stream.read(len(PARQUET_START))
+                return b"" if start == PARQUET_START else start + stream.read()
     return b""
 
 
