@@ -9,7 +9,7 @@ from msgspec.structs import replace as with_changes
 from scipy import special
 
 from cli_support import calibrated, mwdcal, servo_run, write_csv
-from mwdcal.calibration.automatic.drift import by_drift, chances
+from mwdcal.calibration.automatic.drift import by_drift, chances, with_drift
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
@@ -19,6 +19,8 @@ from mwdcal.calibration.results import StatedCovariance, drifts
 from mwdcal.certificate.budget import budget
 from mwdcal.errors import FitError
 from mwdcal.estimation.drift import FEWEST_USED, student_squares, terms_of, walk_scores
+from mwdcal.estimation.minimisers import closed_form_drift
+from mwdcal.estimation.uncertainty import left_out_variances
 from mwdcal.files.formats.table import Table
 from mwdcal.files.profiles import load_profile
 from mwdcal.geometry.vectors import earth_field, earth_gravity, tool_from_earth
@@ -346,6 +348,19 @@ def test_the_closed_form_of_a_declared_drift_is_the_general_fit():
     a, b = (np.diag(each.analysis.covariance[0]) for each in (closed, general))
     np.testing.assert_allclose(a, b, rtol=1e-6)
     assert closed.analysis.freedom[0] == pytest.approx(general.analysis.freedom[0], rel=1e-6)
+
+
+def test_noise_without_a_station_of_a_run_that_drifted_is_by_the_sums_over_the_others():
+    """Against the general way, for drifts of one triad and of both."""
+    for offset, field in ((2e-3, 0.0), (0.0, 300.0), (2e-3, 300.0)):
+        result = fit(runs(3, 5, field, offset))
+        triads = np.array([offset > 0, field > 0])
+        drifted = with_drift(result, Options(), triads)
+        assert closed_form_drift.applies(drifted.problem)
+        at = drifted.problem, drifted.state, drifted.analysis, np.arange(5), np.arange(0, 45, 9)
+        found = closed_form_drift.left_out_variances(*at)
+        for ours, general in zip(found, left_out_variances(*at), strict=True):
+            np.testing.assert_allclose(ours, general, rtol=1e-9)
 
 
 @pytest.mark.parametrize(

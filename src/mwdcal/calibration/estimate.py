@@ -54,9 +54,10 @@ from mwdcal.estimation.uncertainty import (
     station_misfit,
     triad_squares,
     triad_sums,
+    variance_factors_at,
     with_scatter,
 )
-from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal
+from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, over_stations
 from mwdcal.sensor.models import Basis, Factors, Polynomial, Whole, restricted
 
 LEAST_NOISE = 1e-9
@@ -113,7 +114,7 @@ def model_of(
     if kind == "factors":
         return Factors(basis)
     weight = include[..., None] / include.sum(-1)[:, None, None]
-    centre = np.sum(raw * weight, -2, keepdims=True)
+    centre = over_stations(raw * weight)[..., None, :]
     radius = np.sqrt(np.sum((raw - centre) ** 2 * weight, (-2, -1)))
     radius = np.where(radius > 0, radius, 1.0)
     return Polynomial(
@@ -177,7 +178,8 @@ def _bound_curves(problem: Problem, curved: Mapping[str, float]) -> None:
 
 def _size(raw: Array) -> Array:
     """Root mean square departure of readings from their mean (B, 1, 1)."""
-    size = np.sqrt(np.mean((raw - raw.mean(-2, keepdims=True)) ** 2, (-2, -1), keepdims=True))
+    mean = over_stations(raw)[..., None, :] / raw.shape[-2]
+    size = np.sqrt(np.mean((raw - mean) ** 2, (-2, -1), keepdims=True))
     return np.where(size > 0, size, 1.0)
 
 
@@ -307,9 +309,12 @@ def without_stations(result: Fit, left: Bools) -> Fit:
     """The fits without the stations `left` out (B, n), to first order, with noise estimated anew where it was."""
     problem = fewer_stations(result.problem, left)
     state = stepped(problem, result.state, Determined.of(problem, result.state))
-    for _ in range(ROUNDS_WITHOUT):
-        problem = _rescaled(problem, _noise_scale(analyse(problem, state), ahead=False))
-    return replace(result, problem=problem, state=state, analysis=analyse(problem, state))
+    determined = Determined.of(problem, state)
+    for _ in range(0 if _all_declared(problem) else ROUNDS_WITHOUT):
+        factor, freedom = variance_factors_at(problem, state, determined)
+        problem = _rescaled(problem, np.sqrt(np.where(freedom >= 1, factor, np.nan)))
+    analysis = analyse(problem, state, determined)
+    return replace(result, problem=problem, state=state, analysis=analysis)
 
 
 def with_all(result: Fit) -> Fit:

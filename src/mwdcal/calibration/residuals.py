@@ -13,7 +13,7 @@ from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import ErrorRow, Measures, StationRow, figures, stated
 from mwdcal.estimation.batch import take
-from mwdcal.estimation.minimisers import closed_form
+from mwdcal.estimation.minimisers import closed_form, closed_form_drift
 from mwdcal.estimation.problem import ANGLES, STAND_ERRORS
 from mwdcal.estimation.uncertainty import (
     Analysis,
@@ -448,21 +448,31 @@ def left_out_chances(fit: Fit, tool: Ints, station: Ints) -> Array:
     Reference: R. D. Cook and S. Weisberg, Residuals and Influence in Regression (1982), section 2.2: externally
     studentised residuals.
     """
-    analysis, noise = fit.analysis, fit.noise[tool]
     tests = left_out_tests(fit, tool, station)
     if not closed_form.applies(fit.problem):
-        exact = left_out_variances(fit.problem, fit.state, analysis, tool, station)
+        exact = _left_out_variances(fit, tool, station)
         others = zip(*(each.mT for each in exact), strict=True)
         tests = [(*one[:2], *other) for one, other in zip(tests, others, strict=True)]
-    chance = np.ones(len(tool))
-    for index, (square, freedom, variance, rest) in enumerate(tests):
+    return chances_of_tests(tests, fit.noise[tool])
+
+
+def _left_out_variances(fit: Fit, tool: Ints, station: Ints) -> tuple[Array, Array]:
+    drifted = closed_form_drift.applies(fit.problem)
+    variances = closed_form_drift.left_out_variances if drifted else left_out_variances
+    return variances(fit.problem, fit.state, fit.analysis, tool, station)
+
+
+def chances_of_tests(tests: list[tuple[Array, ...]], noise: Array) -> Array:
+    """The same (k,) of the `left_out_tests` of each triad; `noise` (k, t) is NaN where it is declared."""
+    square, freedom, variance, rest = (np.stack(each) for each in zip(*tests, strict=True))
+    declared, tested = np.isnan(noise.mT), (freedom > 0) & (rest >= 1)
+    ratio = square / np.maximum(np.where(tested, freedom * variance, 1.0), 1e-300)
+    by_others = fisher_tail(np.maximum(freedom, 1.0), np.maximum(rest, 1.0), ratio)
+    chance = np.where(tested, by_others, 1.0)
+    if declared.any():
         by_noise = tail(square / np.maximum(np.nan_to_num(variance), 1.0), freedom)
-        tested = (freedom > 0) & (rest >= 1)
-        ratio = square / np.maximum(np.where(tested, freedom * variance, 1.0), 1e-300)
-        by_others = fisher_tail(np.maximum(freedom, 1.0), np.maximum(rest, 1.0), ratio)
-        by_others = np.where(tested, by_others, 1.0)
-        chance = np.minimum(chance, np.where(np.isnan(noise[:, index]), by_noise, by_others))
-    return np.minimum(chance * len(tests), 1.0)
+        chance = np.where(declared, by_noise, chance)
+    return np.asarray(np.minimum(chance.min(0) * len(tests), 1.0))
 
 
 def left_out_tests(fit: Fit, tool: Ints, station: Ints) -> list[tuple[Array, ...]]:

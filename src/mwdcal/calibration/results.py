@@ -50,6 +50,8 @@ from mwdcal.geometry.vectors import (
     Bools,
     Ints,
     diagonal,
+    dot,
+    length,
     outer,
     reference_vectors,
 )
@@ -407,7 +409,9 @@ class StatedCovariance:
         whole = maps @ self.total @ maps.mT
         sd = np.sqrt(np.maximum(diagonal(whole), 1e-300))
         uneven = np.any(np.abs(whole - whole.mT) > EVEN * outer(sd), (-1, -2))
-        return np.asarray(np.where(uneven[:, None, None], (whole + whole.mT) / 2, whole))
+        if uneven.any():
+            whole = np.where(uneven[:, None, None], (whole + whole.mT) / 2, whole)
+        return np.asarray(whole)
 
     def by_source(self, repeatability: Array | None = None) -> dict[str, Array]:
         """Covariance (B, p, p) by source; all together they are `total`.
@@ -705,13 +709,13 @@ def drifts(result: Fit) -> dict[str, tuple[Array, Array]]:
     changes = {}
     for name in drift.places(result.problem.evidence):
         path, terms = drift.walk(result.problem, result.state, name)
-        size = np.sum(path**2, -1)
+        size = dot(path, path)
         square = size[:, :, None] + size[:, None] - 2 * (path @ path.mT)
         far = square.reshape(len(path), -1).argmax(-1)
         first, second = np.unravel_index(far, square.shape[1:])
         every = np.arange(len(path))
         apart = path[every, first] - path[every, second]
-        change = np.linalg.norm(apart, axis=-1)
+        change = length(apart)
         along = apart / np.maximum(change, 1e-300)[:, None]
         pull = outer(along, terms[first] - terms[second]).reshape(len(path), -1)
         spread = drift.walk_covariance(result.problem, result.analysis, name)

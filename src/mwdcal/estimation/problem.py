@@ -281,6 +281,11 @@ class Prior:
     precision: Array
     expected: Array
 
+    @cached_property
+    def is_none(self) -> bool:
+        """Whether nothing is known beforehand."""
+        return not self.precision.any()
+
     def informed(self, norms: Array) -> Array:
         """Precision (B, p, p) as large as the data's wherever it is not zero.
 
@@ -606,7 +611,7 @@ class Problem:
             if not constant.unknown:
                 pull[:, p + index] = state.constants[:, index] - constant.value
         pull[:, pull.shape[-1] - state.settings.shape[-1] :] = state.settings
-        if not (geometry and self.prior.precision.any()):
+        if not geometry or self.prior.is_none:
             return self.precision, pull
         norms = [np.sqrt(np.sum(block**2, (1, 2))) for block in blocks]
         precision = self.precision.copy()

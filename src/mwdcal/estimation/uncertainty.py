@@ -28,6 +28,7 @@ from mwdcal.geometry.vectors import (
     are_positive,
     diagonal,
     distinct,
+    dot,
     eigen,
     finite,
     inverse,
@@ -469,6 +470,26 @@ def variance_factors(residual: Array, spread: Array) -> tuple[Array, Array]:
     return per_freedom(triad_sums(residual**2), freedom), freedom
 
 
+def variance_factors_at(
+    problem: Problem, state: State, determined: Determined
+) -> tuple[Array, Array]:
+    """The s² and degrees of freedom (B, t) of `analyse`, without the covariance of each station's residuals."""
+    linear = problem.linear(state)
+    whole, weighed = whole_covariance(linear, determined), linear.weighed
+    each = [np.sum(whole * normal[..., :-1], (1, 2)) for _, normal in _triad_normals(weighed)]
+    whole_freedom = diagonal(linear.weight) * problem.evidence.include[..., None]
+    freedom = triad_sums(whole_freedom) - np.stack(each, -1)
+    return per_freedom(triad_sums(weighed[..., -1] ** 2), freedom), freedom
+
+
+def _triad_normals(weighed: Array) -> Iterator[tuple[slice, Array]]:
+    """Axes of each triad, and sums (B, u, u + 1) over its rows of C⁻¹X times C⁻¹(X ρ), both of (B, n, m, u + 1)."""
+    for first in range(0, weighed.shape[-2], 3):
+        axes = slice(first, first + 3)
+        rows = weighed[:, :, axes].reshape(len(weighed), -1, weighed.shape[-1])
+        yield axes, rows[..., :-1].mT @ rows
+
+
 def per_freedom(squares: Array, freedom: Array) -> Array:
     """Sums of squares per degree of freedom; NaN without any freedom beyond rounding."""
     return np.asarray(squares / np.where(freedom > LEAST_FREEDOM, freedom, np.nan))
@@ -564,8 +585,11 @@ def station_misfit(analysis: Analysis) -> tuple[Array, Array]:
 
     Directions of a station's readings that nothing tests (share below `TESTED`) do not count.
     """
-    back, freedom = _tested_inverse(analysis.spread)
-    return np.sum(analysis.residual * _along(back, analysis.residual), -1), freedom
+    back, freedom = tested_inverse(analysis.spread)
+    along = _along(back, analysis.residual)
+    if along.shape[-1] == 3:
+        return dot(analysis.residual, along), freedom
+    return np.sum(analysis.residual * along, -1), freedom
 
 
 def left_out_residual(analysis: Analysis) -> Array:
@@ -573,7 +597,7 @@ def left_out_residual(analysis: Analysis) -> Array:
 
     Exact for a linear problem. Directions of a station's readings that nothing else tests have none.
     """
-    return _along(_tested_inverse(analysis.spread)[0], analysis.residual)
+    return _along(tested_inverse(analysis.spread)[0], analysis.residual)
 
 
 def left_out_variances(
@@ -586,10 +610,8 @@ def left_out_variances(
     """
     linear, squares, freedom = problem.linear(state), [], []
     weighed, whole = linear.weighed, whole_covariance(linear, analysis.determined)
-    for index, factor in enumerate(np.nan_to_num(analysis.variance_factor).mT):
-        axes, left = slice(3 * index, 3 * index + 3), analysis.freedom[:, index]
-        rows = weighed[:, :, axes].reshape(len(weighed), -1, weighed.shape[-1])
-        normal = rows[..., :-1].mT @ rows
+    for index, (axes, normal) in enumerate(_triad_normals(weighed)):
+        factor, left = np.nan_to_num(analysis.variance_factor[:, index]), analysis.freedom[:, index]
         parts = [
             _shares_of_stations(weighed[t, s], whole[t], normal[t], analysis.spread[t, s], axes)
             for t, s in _blocks(tool, station)
@@ -643,7 +665,7 @@ def _along(back: Array, residual: Array) -> Array:
     return np.asarray((back @ residual[..., None])[..., 0])
 
 
-def _tested_inverse(spread: Array) -> tuple[Array, Array]:
+def tested_inverse(spread: Array) -> tuple[Array, Array]:
     """Inverse (B, n, m, m) along the directions that are tested, and their number (B, n)."""
     if is_once(spread):
         back, freedom = _inverse_of_tested(spread[:1])

@@ -32,6 +32,8 @@ from mwdcal.files.profiles import PACKAGE, check_profile
 # Files that no output replaces: keys, calibrations, and those on which a certificate rests.
 
 
+PARQUET_START = b"PAR1"
+"""How a table begins that is no document, and need not be read to see that."""
 LARGEST_DOCUMENT = 50_000_000
 """Bytes of the largest file in which a document is looked for."""
 _KEYS = b"PRIVATE KEY-----", b"-----BEGIN PUBLIC KEY-----"
@@ -72,7 +74,9 @@ def _content(file: Path) -> bytes:
     """The bytes of a file that may be a key or a document; none of another."""
     with suppress(OSError):
         if file.is_file() and file.stat().st_size <= LARGEST_DOCUMENT:
-            return file.read_bytes()
+            with file.open("rb") as stream:
+                start = stream.read(len(PARQUET_START))
+                return b"" if start == PARQUET_START else start + stream.read()
     return b""
 
 

@@ -86,6 +86,8 @@ def tools_per_fit(readings: Readings) -> int:
 
 def alike(tools: Ints, keys: AnyArray) -> list[tuple[AnyArray, Ints]]:
     """The given tools by their keys (T, k), and each key once."""
+    if (keys == keys[:1]).all():
+        return [(keys[0], tools)] if len(tools) else []
     kinds, number = np.unique(keys, axis=0, return_inverse=True)
     return [(kind, tools[number == place]) for place, kind in enumerate(kinds)]
 

@@ -52,6 +52,10 @@ Progress = Callable[[str], None]
 """What gets a line for each trial."""
 FEWEST_SOAKS = 3
 """Fewest soaks among which one can be left out."""
+LOUDER = 1.1
+"""Variance of residuals, that of the declared noise being 1, from which terms may hide in them…"""
+NEARLY_THERE = 0.01
+"""…and chance of a term below which it may be there after all."""
 UNDOUBTED = 1e-12
 """A term is there without doubt if noise alone gives one as large with a probability below this."""
 LOWEST_RANK = 8
@@ -127,7 +131,7 @@ def _tested(
     """
     limit = _highest(readings, options)
     orders = np.full((len(limit), len(readings.triads)), -1)
-    chance = np.full((*orders.shape, HIGHEST), np.nan)
+    chance, hidden = np.full((*orders.shape, HIGHEST), np.nan), np.zeros(orders.shape, bool)
     powers = np.arange(1, HIGHEST + 1)
     for order in range(int(limit.max()) + 1):
         some = np.flatnonzero((orders < 0).any(-1))
@@ -154,18 +158,23 @@ def _tested(
         wanted = np.any(terms.present[..., :HIGHEST] & within[:, None], -1)
         closed = (chosen < 0) & ~(wanted & (order < most)[:, None])
         orders[some] = np.where(closed, order, chosen)
+        louder = np.isfinite(result.noise) | (terms.scatter > LOUDER)
+        tried = np.where(within[:, None], terms.chance[..., :HIGHEST], np.nan)
+        near = np.any(np.nan_to_num(tried, nan=1.0) < NEARLY_THERE, -1)
+        hidden[some] = np.where(closed, louder | near, hidden[some])
     coupled = any(readings.sd.get(name, np.zeros(1)).any() for name in ANGLES)
-    return (_raised(readings, options, orders, limit) if coupled else orders), chance
+    return (_raised(readings, options, orders, limit, hidden) if coupled else orders), chance
 
 
-def _raised(readings: Readings, options: Options, orders: Ints, limit: Ints) -> Ints:
+def _raised(readings: Readings, options: Options, orders: Ints, limit: Ints, hidden: Bools) -> Ints:
     """The orders (B, t), raised where a triad has terms beyond its own once the other has its order.
 
     On an uncertain stand the errors of the angles take up terms that a precise triad lacks, and spread them over the
-    residuals of the other, where they hide its terms.
+    residuals of the other, where they hide its terms. `hidden` (B, t): these residuals exceed the declared noise, or
+    none is declared, or there is nearly a term.
     """
     orders, powers = orders.copy(), np.arange(1, HIGHEST + 1)
-    unequal = np.flatnonzero(orders.min(-1) < orders.max(-1))
+    unequal = np.flatnonzero(np.any((orders < orders.max(-1, keepdims=True)) & hidden, -1))
     while unequal.size:
         further: list[Ints] = []
         for pair in distinct(orders[unequal], axis=0):

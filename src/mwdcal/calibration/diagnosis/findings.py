@@ -75,7 +75,6 @@ def copies(result: Fit) -> Bools:
     weights = np.sqrt(2.0 + np.arange(rows.shape[-1]))
     line = np.einsum("bnk,k->bn", rows, weights)
     order = np.argsort(line, -1)
-    in_line = np.take_along_axis(rows, order[..., None], 1)
     line = np.take_along_axis(line, order, -1)
     agree, repeated = np.zeros(len(rows), bool), np.zeros(rows.shape[:-1], bool)
     for apart in range(1, line.shape[-1]):
@@ -83,7 +82,8 @@ def copies(result: Fit) -> Bools:
         if not close.any():
             break
         tools, first = np.nonzero(close)
-        differ = np.abs(in_line[tools, first + apart] - in_line[tools, first]) > AGREEING
+        one, other = (rows[tools, order[tools, at]] for at in (first, first + apart))
+        differ = np.abs(one - other) > AGREEING
         agree[tools[~differ.any(-1)]] = True
     for member in np.flatnonzero(agree):
         repeated[member] = _copies(rows[member])

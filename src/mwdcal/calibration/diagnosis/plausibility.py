@@ -18,6 +18,7 @@ from mwdcal.calibration.residuals import (
     RESHOOT,
     Residuals,
     chances,
+    chances_of_tests,
     chi_chance,
     is_by_left_out,
     left_out_chances,
@@ -48,6 +49,7 @@ from mwdcal.geometry.vectors import (
     eigen,
     inverse,
     outer,
+    over_stations,
     quadratic_form,
     quotient,
 )
@@ -279,7 +281,7 @@ SMALLEST_EXPECTATION = 1e-12
 NOISE_RATIO = 3.0
 """Residuals of a robust fit that exceed the declared noise this many times are reported."""
 NEARLY = 0.75
-"""Share of a limit of χ² from which a station's is worked out exactly."""
+"""Share of its variance from which the noise of the others is worked out exactly."""
 LEEWAY = 1.01
 """A station is suspect already if a bound is as unlikely as this many times the limit."""
 
@@ -309,7 +311,8 @@ def has_sensor_gains(result: Fit, temperature: Array) -> Bools:
     problem, gains = result.problem, []
     for triad, where in zip(problem.triads, problem.slices(), strict=True):
         at = temperature if triad.model.varies else temperature[:, :1]
-        middle = np.broadcast_to(triad.raw.mean(1, keepdims=True), (*at.shape, 3))
+        mean = over_stations(triad.raw)[:, None] / triad.raw.shape[1]
+        middle = np.broadcast_to(mean, (*at.shape, 3))
         slope = triad.model.slope(result.state.params[:, where], middle, at)
         gains.append(invertible(slope) & ~mirrored(slope))
     return np.asarray(np.all(gains, 0))
@@ -511,22 +514,27 @@ def _to_reshoot(result: Fit) -> Bools:
 def _standing_out(result: Fit) -> Bools:
     """Stations (B, n) that stand out from the noise that the others show.
 
-    Fisher's F is never as unlikely as χ², which is tried first; where references are uncertain, with some margin, as
-    the noise of the others is approximate there.
+    Fisher's F is never as unlikely as χ², which is tried first. Where references are uncertain, or drifts fitted, the
+    noise of the others is approximate at first: it is worked out exactly where F with some margin asks for it.
     """
-    again = np.zeros(result.trust.shape, bool)
-    tool, station = np.nonzero(~again)
-    chance = RESHOOT / result.trust.shape[-1]
+    exact, shape = closed_form.applies(result.problem), result.trust.shape
+    tool, station = np.indices(shape).reshape(2, -1)
+    chance = RESHOOT / shape[-1]
     limit = likely(3, chance / result.noise.shape[-1])
-    limit *= 1.0 if closed_form.applies(result.problem) else NEARLY
-    out = np.zeros(again.size, bool)
-    for square, _, variance, _ in left_out_tests(result, tool, station):
-        out |= ~(square <= limit * np.nan_to_num(variance, nan=1.0))
-    tools, place = np.unique(tool[out], return_inverse=True)
-    if tools.size:
+    out, tests = np.zeros(tool.size, bool), list[tuple[Array, ...]]()
+    for square, freedom, variance, rest in left_out_tests(result, tool, station):
+        least = variance if exact else NEARLY * variance
+        tests.append((square, freedom, least, rest))
+        out |= ~(square <= limit * np.nan_to_num(least, nan=1.0))
+    some = np.flatnonzero(out)
+    few = [tuple(part[some] for part in test) for test in tests]
+    some = some[chances_of_tests(few, result.noise[tool[some]]) < chance]
+    if some.size and not exact:
+        tools, place = np.unique(tool[some], return_inverse=True)
         part = take(result, tools)
-        unlikely = left_out_chances(part, place, station[out]) < chance
-        again.reshape(-1)[np.flatnonzero(out)[unlikely]] = True
+        some = some[left_out_chances(part, place, station[some]) < chance]
+    again = np.zeros(shape, bool)
+    again.reshape(-1)[some] = True
     return again
 
 

@@ -47,7 +47,7 @@ from mwdcal.estimation.batch import batch_of_one
 from mwdcal.estimation.problem import WALKS
 from mwdcal.estimation.solvers import LOSSES, Status
 from mwdcal.estimation.uncertainty import free_directions, station_misfit
-from mwdcal.geometry.vectors import Array, Bools
+from mwdcal.geometry.vectors import Array, Bools, length
 from mwdcal.sensor.models import Basis, Factors, Polynomial, Whole, restricted
 from mwdcal.sensor.profile import COMMON, Profile
 
@@ -470,7 +470,7 @@ def _coarse_noise(readings: Readings, triad: str) -> Flag:
 
 def _strength(raw: Array) -> Array:
     """Mean strength (...) of readings (..., n, 3), at least 1e-30."""
-    return np.asarray(np.maximum(np.linalg.norm(raw, axis=-1).mean(-1), 1e-30))
+    return np.asarray(np.maximum(length(raw).mean(-1), 1e-30))
 
 
 def no_temperature(order: int) -> InputError:
@@ -571,7 +571,8 @@ def _absurd(fitted: FittedRuns, index: int) -> Iterator[Flag]:
     result, raw = fitted.result, fitted.result.problem.triads[index].raw
     excess = np.sqrt(np.nan_to_num(result.analysis.variance_factor[:, index]))
     noise = result.noise[:, index]
-    declared, signal = np.isnan(noise), np.minimum(_strength(raw), 2 * raw.std(axis=1).max(-1))
+    spread = np.ascontiguousarray(raw.mT).std(-1).max(-1)
+    declared, signal = np.isnan(noise), np.minimum(_strength(raw), 2 * spread)
 
     def is_absurd(share: Array | float) -> Bools:
         return np.where(

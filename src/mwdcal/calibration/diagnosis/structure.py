@@ -50,6 +50,7 @@ from mwdcal.geometry.vectors import (
     inverse,
     inverse_of_positive,
     outer,
+    over_stations,
     quotient,
 )
 
@@ -204,6 +205,8 @@ HYSTERESIS = "-hysteresis"
 """What ends the names of families whose columns are each tool's own."""
 LOOK_MARGIN = 0.99
 """A fit is looked at from this share of the gain that would name an effect: rounding differs by far less."""
+FREEDOM_STEP = 8
+"""Degrees of freedom are counted up to a multiple of these, which asks for less gain: few limits are worked out."""
 LEAST_ALIKE = 0.4
 """Least share of the information of others that sensors have to which these are compared; the inverse is the most."""
 NOTHING_LEFT, CLEARLY_LEFT = 1e-10, 1e-2
@@ -237,7 +240,7 @@ def may_show(result: Fit) -> Bools:
     drifts = _Drifts.of(problem, result.state, design, residual, response)
     misfit = np.sum(residual**2, (1, 2)) + drifts.misfit
     rest = np.sum(problem.evidence.include[0]) * residual.shape[-1] - result.state.params.shape[-1]
-    rest = np.ceil(rest - drifts.freedom)
+    rest = FREEDOM_STEP * np.ceil((rest - drifts.freedom) / FREEDOM_STEP)
     sides = _gains_of_sides(problem, design, residual, response, drifts)
     shown = _are_enough(sides, misfit, rest)
     near = every if drifts.columns else _may_be_enough(design, residual, response, misfit, rest)
@@ -475,9 +478,9 @@ def _gain_of_sides(
 ) -> tuple[Array, Ints]:
     """The same for a column on each axis of a triad, of which the values (B, n, 3) are each tool's."""
     basis = np.linalg.qr(terms)[0]
-    whole = np.sum(sides**2, 1)
-    left = whole - np.sum((basis.transpose() @ sides) ** 2, 1)
-    score = np.sum(sides * residual, 1)
+    whole = over_stations(sides**2)
+    left = whole - over_stations((basis.transpose() @ sides) ** 2)
+    score = over_stations(sides * residual)
     if index in drifts.columns:
         seen = drifts.columns[index].left
         cross = (sides.mT @ seen.reshape(len(seen), -1)).reshape(len(sides), 3, 6, -1)
@@ -726,16 +729,15 @@ def shown_effects(result: Fit, others: Mapping[str, Array]) -> list[Shown]:
     """
     if result.analysis.influence is not None:
         return [{} for _ in result.status]
-    include = result.problem.evidence.include
     every: list[Shown] = [{} for _ in result.status]
     stand = result.analysis.squares is not None and uncertain_stand.applies(result.problem)
     looked_at = (on_stand_may_show(result) if stand else may_show(result)) | bool(others)
-    result = _without_bad_stations(result)
-    looked_at |= (result.problem.evidence.include != include).any(-1)
-    places = np.flatnonzero(looked_at)
+    bad = _bad_stations(result)
+    places = np.flatnonzero(looked_at | bad.any(-1))
     for first in range(0, len(places), AT_ONCE):
         some = places[first : first + AT_ONCE]
-        shown = _searched(take(result, some), {n: v[some] for n, v in others.items()})
+        part = _without(take(result, some), bad[some])
+        shown = _searched(part, {n: v[some] for n, v in others.items()})
         for place, each in zip(some.tolist(), shown, strict=True):
             every[place] = each
     return every
@@ -778,9 +780,10 @@ def _at_noise_of(result: Fit) -> Problem:
 
 def chance_alone(result: Fit, name: str) -> Array:
     """Chance (B,) in noise of one effect beside no other, as `shown_effects` has that of the first; 1 without it."""
-    result, chance = _without_bad_stations(result), np.ones(len(result.status))
+    bad, chance = _bad_stations(result), np.ones(len(result.status))
     for first in range(0, len(chance), AT_ONCE):
-        part = take(result, np.arange(first, min(first + AT_ONCE, len(chance))))
+        some = np.arange(first, min(first + AT_ONCE, len(chance)))
+        part = _without(take(result, some), bad[some])
         problem = _at_noise_of(part)
         columns = next((c for n, c in families(problem, part.state) if n == name), None)
         if columns is not None:
@@ -801,7 +804,7 @@ def effects(
     shown = shown_effects(result, others)[0] if shown is None else shown
     if not shown:
         return []
-    every = _described(_without_bad_stations(result), shown, others)
+    every = _described(_without(result, _bad_stations(result)), shown, others)
     return [effect for effect in every if is_shown(shown, effect.name)]
 
 
@@ -831,13 +834,18 @@ def _testable(problem: Problem, state: State, others: Mapping[str, Array]) -> di
     return columns
 
 
-def _without_bad_stations(result: Fit) -> Fit:
-    """The fits less their stations to take again, if they are few: one bad station looks like anything.
-
-    And with the noise of the others: with that of a bad station in one triad, the other looks as if it had structure.
-    """
+def _bad_stations(result: Fit) -> Bools:
+    """The stations (B, n) to take again of fits of which they are few: one bad station looks like anything."""
     bad = stations_to_reshoot(result)
-    bad = bad & (np.sum(bad, -1, keepdims=True) <= max(1.0, BAD_SHARE * bad.shape[-1]))
+    few = np.sum(bad, -1, keepdims=True) <= max(1.0, BAD_SHARE * bad.shape[-1])
+    return np.asarray(bad & few)
+
+
+def _without(result: Fit, bad: Bools) -> Fit:
+    """The fits less their bad stations, and with the noise of the others.
+
+    With that of a bad station in one triad, the other looks as if it had structure.
+    """
     places = np.flatnonzero(bad.any(-1))
     if not places.size:
         return result

@@ -52,7 +52,7 @@ def but_for_constants(problem: Problem) -> bool:
         and not evidence.absent
         and all(evidence.is_known(name).all() for name in angles)
         and not any(evidence.sd[name].any() for name in angles)
-        and not problem.prior.precision.any()
+        and problem.prior.is_none
     )
 
 

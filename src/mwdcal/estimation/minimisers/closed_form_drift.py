@@ -14,7 +14,13 @@ import numpy as np
 from mwdcal.estimation.batch import held_once, is_once, take
 from mwdcal.estimation.minimisers import closed_form
 from mwdcal.estimation.problem import WALK_AXES, Problem, State
-from mwdcal.estimation.uncertainty import Analysis, scaled_freedom, variance_factors
+from mwdcal.estimation.uncertainty import (
+    Analysis,
+    per_freedom,
+    scaled_freedom,
+    tested_inverse,
+    variance_factors,
+)
 from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, inverse, inverse_of_positive
 from mwdcal.sensor.models import Polynomial, affine_parts
 
@@ -281,6 +287,36 @@ def effective_freedom(problem: Problem, analysis: Analysis) -> Array:
         np.einsum("bii->bi", known)[...] += 1
         square[:, index] += np.sum(known * known.mT, (-1, -2)) - diagonal(known).sum(-1)
     return scaled_freedom(analysis.freedom, square)
+
+
+def left_out_variances(
+    problem: Problem, state: State, analysis: Analysis, tool: Ints, station: Ints
+) -> tuple[Array, Array]:
+    """The same (k, t) as `uncertainty.left_out_variances`, by the covariance of a triad's residuals.
+
+    That is S = 1 - H - D V Dᵀ: H projects on f̃, D is what the drifts do to the readings, and V their covariance.
+    """
+    design, reads = Alike.of(problem, state), responses(problem, state)
+    columns, every = walk_columns(design), np.arange(len(tool))
+    squares, freedom = np.empty((2, len(tool), len(reads)))
+    for index, response in enumerate(reads):
+        axes = slice(3 * index, 3 * index + 3)
+        basis = np.linalg.qr(sensor_terms(*perfect(design), index))[0]
+        hat = np.eye(len(basis)) - basis @ basis.transpose()
+        across = hat[station][..., None, None] * np.eye(3)
+        if index in columns:
+            places, each = columns[index]
+            seen = each.seen(response[tool])
+            follow = analysis.constants[tool][:, places[:, None], places] @ seen[every, station].mT
+            flat = seen.reshape(len(seen), -1, seen.shape[-1])
+            across = across - (flat @ follow).reshape(across.shape)
+        residual = analysis.residual[tool, :, axes]
+        back = tested_inverse(analysis.spread[tool, station, axes, axes])[0]
+        moved = across @ (back @ residual[every, station, :, None])[:, None]
+        squares[:, index] = np.sum((residual - moved[..., 0]) ** 2, (1, 2))
+        shares = np.sum(back * np.sum(across.mT @ across, 1), (1, 2))
+        freedom[:, index] = analysis.freedom[tool, index] - shares
+    return np.maximum(per_freedom(squares, freedom), 0.0), freedom
 
 
 def prior_precision(problem: Problem) -> Array:

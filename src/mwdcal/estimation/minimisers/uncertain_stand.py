@@ -587,7 +587,7 @@ def has_known_angles(problem: Problem) -> bool:
         len(problem.triads) == 2
         and not (evidence.absent or evidence.scatter)
         and bool(evidence.referenced.all())
-        and not problem.prior.precision.any()
+        and problem.prior.is_none
         and all(constant.name in WALK_AXES for constant in evidence.constants)
     )
 
