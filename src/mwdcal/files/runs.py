@@ -24,7 +24,7 @@ from mwdcal.calibration.readings import (
     is_simulated,
     serial_of,
 )
-from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.calibration.record import Finding
 from mwdcal.errors import FitError, InputError, QuestionError, UnreadableFileError
 from mwdcal.estimation.problem import ANGLES, WALKS
 from mwdcal.files import synonyms
@@ -62,6 +62,7 @@ from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import ColumnSource, Profile, TableFormat, TriadProfile
 
 if TYPE_CHECKING:
+    from mwdcal.calibration.record import Calibration
     from mwdcal.files.formats.layout import Layout
 
 # --------------------------------------------------------------------------
@@ -153,6 +154,28 @@ def read_stations(stations: Table, profile: Profile) -> tuple[Readings, Profile]
     return replace(readings, others=_other_numbers(table)), profile
 
 
+def read_later(
+    path: str | os.PathLike[str],
+    calibration: Calibration,
+    *,
+    decimal: str = ".",
+    statements: Mapping[str, str] | None = None,
+) -> Table:
+    """The table of readings after a calibration: of the file of its own run the roll test in it, if there is one.
+
+    `decimal` and `statements` as for `read_export`.
+    """
+    profile, said = calibration.profile, statements or {}
+    table = read_export(path, profile, decimal=decimal, rows=MOST_ROWS, statements=said)
+    if not any(calibration.used(read_run(table, profile)[0].digest)):
+        return table
+    test = read_roll_test(path, table, profile, said)
+    if test is None:
+        with suppress(InputError):
+            test = parted(table)[1]
+    return test or table
+
+
 def _other_numbers(table: Table) -> dict[str, Array]:
     """The numbers (n,) in columns that are not used and have one at every station."""
     others: dict[str, Array] = {}
@@ -232,28 +255,6 @@ def read_roll_test(
             table = _with_form(_of_layout(where, path, profile), form)
             return stated_table(table, statements, _serial_column(table, profile))
     return None
-
-
-def read_later(
-    path: str | os.PathLike[str],
-    calibration: Calibration,
-    *,
-    decimal: str = ".",
-    statements: Mapping[str, str] | None = None,
-) -> Table:
-    """The table of readings after a calibration: of the file of its own run the roll test in it, if there is one.
-
-    `decimal` and `statements` as for `read_export`.
-    """
-    profile, said = calibration.profile, statements or {}
-    table = read_export(path, profile, decimal=decimal, rows=MOST_ROWS, statements=said)
-    if not any(calibration.used(read_run(table, profile)[0].digest)):
-        return table
-    test = read_roll_test(path, table, profile, said)
-    if test is None:
-        with suppress(InputError):
-            test = parted(table)[1]
-    return test or table
 
 
 def _other_sheet(
