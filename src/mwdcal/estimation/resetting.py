@@ -61,12 +61,17 @@ def _variance(problem: Problem, state: State, analysis: Analysis, expected: Arra
 def set_apart(problem: Problem, state: State, analysis: Analysis) -> Bools:
     """Members (B,) whose stations of one setting scatter as much as in noise they do with a chance of `APART_CHANCE`.
 
-    The chance is that of the χ² with mean and variance of Q.
+    The chance is that of the χ² with mean and variance of Q. Of declared noise it has no more degrees of freedom than
+    there are errors that a setting shares: that many, and so at least that chance, clear most members at once.
     Reference: F. E. Satterthwaite, Biometrics Bulletin 2, 110 (1946).
     """
     square, by_triad = _scores(problem, state, analysis)
     expected = by_triad.sum(-1)
     apart = (expected > 0) & (square > expected)
+    if all(triad.declared for triad in problem.triads):
+        errors = np.count_nonzero(problem.evidence.set_together, (1, 2))
+        ratio = square / np.where(apart, expected, 1.0)
+        apart &= fisher_tail(np.maximum(errors, 1), EXACT_VARIANCE, ratio) < APART_CHANCE
     places = np.flatnonzero(apart)
     if places.size:
         mean, at, means = expected[places], take(state, places), by_triad[places]
