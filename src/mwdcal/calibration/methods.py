@@ -259,6 +259,26 @@ def with_stand_errors(evidence: Evidence, names: tuple[str, ...]) -> Evidence:
     return replace(evidence, constants=tuple(shared))
 
 
+def with_constant_errors(
+    problem: Problem, state: State, names: Sequence[str]
+) -> tuple[Problem, State]:
+    """The problem with unknown errors of the stand (see `ESTIMABLE`) or of "dip-reference", and the state for it."""
+    old = problem.evidence.constants
+    evidence = with_stand_errors(problem.evidence, tuple(n for n in names if n in ESTIMABLE))
+    if "dip-reference" in names:
+        mask, zero = evidence.is_known("dip").astype(float), np.zeros(len(evidence.include))
+        error = SharedConstant("dip", mask, zero, zero + UNKNOWN, unknown=True)
+        others = (c for c in evidence.constants if c.name != "dip" or c.unknown)
+        evidence = replace(evidence, constants=(*others, error))
+    values = {(c.name, c.unknown): v for c, v in zip(old, state.constants.T, strict=True)}
+    constants = [
+        values.get((c.name, c.unknown), values.get((c.name, False), c.value))
+        for c in evidence.constants
+    ]
+    there = replace(state, constants=np.stack(constants, -1))
+    return replace(problem, evidence=evidence), there
+
+
 EVIDENCE: dict[str, Callable[[Evidence], Evidence]] = {
     "joint": lambda evidence: evidence,
     "least-squares": whole_vectors,
