@@ -269,6 +269,18 @@ def test_a_drift_beside_a_constant_error_is_fitted_and_the_error_named():
     assert named["azimuth-zero"] >= 48
 
 
+def test_no_drift_is_larger_than_the_fiftieth_part_of_the_field():
+    """A second half of the run at another place: half of the field away, or with the axes exchanged."""
+    readings = runs(34, 10)
+    raw = readings.magnetometer.copy()
+    raw[:5, COUNT // 2 :] += 24_000.0
+    raw[5:, COUNT // 2 :] = raw[5:, COUNT // 2 :, ::-1]
+    result = fit(replace(readings, magnetometer=raw), Options(order=0))
+    assert np.all(chances(result)[0][:, 1] < 1e-3)
+    drifted, _ = found(replace(readings, magnetometer=raw))
+    assert not drifted
+
+
 def test_a_drift_of_the_field_is_no_wrong_dip():
     for straight in (False, True):
         for _, result in by_drift(

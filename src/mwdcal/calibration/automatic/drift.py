@@ -59,6 +59,8 @@ EVERY_PARAMETER = 12
 """Parameters of a triad that are all fitted."""
 TOGETHER = 320
 """Most fits whose drifts are fitted together: few enough for the cache."""
+LARGEST_DRIFT = 0.02
+"""A drift of more than this share of gravity, or of the field, is none (1σ)."""
 REDUNDANCY = 36.0
 """Fewest degrees of freedom of a triad that can tell a drift from noise."""
 
@@ -228,11 +230,41 @@ def with_drifts(fits: Iterable[tuple[Ints, Fit]], options: Options) -> Iterator[
             else:
                 yield tools[places], _whole(part, options)
     for (triads, off, _), parts in waiting.items():
-        tools, whole = (join(each) for each in zip(*parts, strict=True))
-        for first in range(0, len(tools), TOGETHER):
+        every, whole = (join(each) for each in zip(*parts, strict=True))
+        for first in range(0, len(every), TOGETHER):
             some = slice(first, first + TOGETHER)
-            with_walks = with_drift(take(whole, some), options, np.array(triads), off)
-            yield tools[some], _whole(with_walks, options)
+            for places, result in _with_possible_drift(
+                take(whole, some), options, np.array(triads), off
+            ):
+                yield every[some][places], _whole(result, options)
+
+
+def _with_possible_drift(
+    result: Fit, options: Options, triads: Bools, wrong: bool
+) -> Iterator[tuple[Ints, Fit]]:
+    """Places and fits with walks, then those of fits whose walks would be larger than any drift, without them."""
+    walking = with_drift(result, options, triads, wrong)
+    possible = _is_possible(walking)
+    if possible.all():
+        yield np.arange(len(possible)), walking
+        return
+    declared = result.problem.evidence.drift
+    other = with_drift(result, options, np.zeros_like(triads)) if declared else result
+    for places, each in ((np.flatnonzero(possible), walking), (np.flatnonzero(~possible), other)):
+        if places.size:
+            yield places, take(each, places)
+
+
+def _is_possible(result: Fit) -> Bools:
+    """Fits (B,) whose drifts are no larger than one may be: a larger one is something else, and takes up anything."""
+    problem, possible = result.problem, np.ones(len(result.status), bool)
+    strength = [problem.constant(result.state, name).mean(-1) for name in ("gravity", "field")]
+    places = drift.places(problem.evidence)
+    for name, triad in drift.acting(places).items():
+        if name not in problem.evidence.drift:
+            size = np.max([problem.evidence.constants[i].sd for i in places[name].ravel()], 0)
+            possible &= size <= LARGEST_DRIFT * strength[triad]
+    return possible
 
 
 def _whole(result: Fit, options: Options) -> Fit:

@@ -897,7 +897,7 @@ def _scores_of(problem: Problem, result: Fit, columns: Mapping[str, Array]) -> _
     every = np.concatenate([linear.residual[..., None][..., :0], *columns.values()], -1)
     ends = np.cumsum([0, *(each.shape[-1] for each in columns.values())])
     places = {n: np.arange(*each) for n, each in zip(columns, pairwise(ends), strict=True)}
-    flat = every.reshape(len(every), -1, every.shape[-1])
+    flat = every.reshape(len(every), linear.residual[0].size, every.shape[-1])
     weighed = linear.weigh(every).reshape(flat.shape)
     square = np.einsum("bik,bik->bk", flat, weighed)
     length = np.sqrt(np.maximum(square, 0.0))  # rounding may leave less where the noise is tiny
