@@ -39,8 +39,8 @@ from mwdcal.sensor.profile import COMMON
 # --------------------------------------------------------------------------
 # What a run's readings say about its stations: references, uncertainties, groups, constants.
 
-STAND_TURNS = {"tilt": ("stand-north", "stand-east")}
-"""Errors of the stand that consist of several turns of its frame."""
+STAND_TURNS = {"tilt": ("stand-north", "stand-east"), "tool-axis": ("tool-axis-x", "tool-axis-y")}
+"""Errors of the stand that consist of several turns."""
 
 
 def flat(value: AnyArray, lead: tuple[int, ...], *tail: int) -> AnyArray:
@@ -92,7 +92,7 @@ def _settings(
 def _stand(readings: Readings, lead: tuple[int, ...]) -> dict[str, Array]:
     """Standard uncertainties (B,) of errors of the stand, of each turn that they consist of.
 
-    A tilt of known size leans to any azimuth: each of its two turns has half the variance.
+    A tilt of known size leans to any azimuth, a tool's axis to any side: each of the two turns has half the variance.
     """
     turn_sd: dict[str, Array] = {}
     for name, size in _declared(readings, COMMON, lead).items():

@@ -218,6 +218,12 @@ STEADINESS = {
 """Assumption of a calibration whose run could not show a drift, by the name of the drift."""
 
 
+ALIGNMENT = "alignment of the tool in the stand"
+"""The name of what a tool's axis that is not the one it is rolled about does."""
+LEAN = "A tool that leans by 0.05° in the stand is off by up to 0.05° in inclination, 0.07° in azimuth at 45°"
+"""The consequence: an error δ of inclination and δ / sin I of azimuth."""
+
+
 def exact_and_steady(assumed: Sequence[str]) -> tuple[list[str], str]:
     """The references among things assumed exact, and a sentence on the steadiness; blank if none is assumed.
 

@@ -24,6 +24,7 @@ from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.prior import PriorInformation
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import (
+    ALIGNMENT,
     FREE_SHARE,
     NOISE,
     ORDER,
@@ -447,11 +448,17 @@ def constants_covariance(result: Fit) -> Array:
     return np.asarray(scaled * outer(less))
 
 
+TWO_TURNS = {"stand-": "tilt of the stand", "tool-axis-": ALIGNMENT}
+"""The names of errors of two turns each, by how the names of these begin."""
+
+
 def error_name(constant: str) -> str:
     """The name of a common error: of a reference, of the stand, or a drift.
 
     >>> [error_name(name) for name in ("dip", "azimuth-zero", "stand-north")]
     ['dip reference error', 'azimuth zero of the stand', 'tilt of the stand about north']
+    >>> error_name("tool-axis-x")
+    'alignment of the tool in the stand about x'
     >>> error_name("field-drift-north")
     'drift of the field during the run'
     """
@@ -459,34 +466,37 @@ def error_name(constant: str) -> str:
         return f"drift of the {constant.partition('-')[0]} during the run"
     if constant.endswith("-zero"):
         return f"{constant.replace('-', ' ')} of the stand"
-    if constant.startswith("stand-"):
-        return f"tilt of the stand about {constant.removeprefix('stand-')}"
+    for prefix, words in TWO_TURNS.items():
+        if constant.startswith(prefix):
+            return f"{words} about {constant.removeprefix(prefix)}"
     return f"{constant} reference error"
 
 
 def common_source(name: str) -> str:
-    """The name of a source of error in a budget: a tilt is one source.
+    """The name of a source of error in a budget: two turns are one source.
 
     >>> [common_source(name) for name in ("stand-north", "azimuth-zero", "gravity", "prior")]
     ['tilt of the stand', 'azimuth zero of the stand', 'gravity reference error', 'prior']
     """
     if name in (NOISE, REPEATABILITY, SETTINGS, ORDER, PRIOR):
         return name
-    return "tilt of the stand" if name.startswith("stand-") else error_name(name)
+    return error_name(name).partition(" about ")[0]
 
 
 def assumed_exact(result: Fit, relative: bool) -> list[list[str]]:
     """References and conditions that each run assumes exact whose error moves no residual, but the calibration.
 
-    A toolface zero turns both triads, and a strength scales one, as sensors of other mounting or
-    scale would have it. The field = 1 of a `relative` magnetometer is no reference. The signs of the magnetometer
-    are assumed where nothing confirms the hemisphere: see `unconfirmed_dip`. Offsets are taken as steady where
-    attitudes follow the order of the stations so closely that a trend would look like the sensors: see `unseen_drifts`.
+    A toolface zero, or a tool that leans in the stand, turns both triads, and a strength scales one, as sensors of
+    other mounting or scale would have it. The field = 1 of a `relative` magnetometer is no reference. The signs of the
+    magnetometer are assumed where nothing confirms the hemisphere: see `unconfirmed_dip`. Offsets are
+    taken as steady where attitudes follow the order of the stations so closely that a trend would look like the
+    sensors: see `unseen_drifts`.
     """
     evidence, quantities = result.problem.evidence, ("toolface", "gravity", "field")
     declared = {c.name.removesuffix("-zero") for c in evidence.constants} | set(evidence.absent)
     if relative:
         declared.add("field")
+    aligned = evidence.is_known("inclination").any(-1) & ("tool-axis-x" not in declared)
     holds = {
         "toolface zero of the stand" if name == "toolface" else f"{name} reference": (
             evidence.is_known(name).any(-1)
@@ -494,6 +504,7 @@ def assumed_exact(result: Fit, relative: bool) -> list[list[str]]:
         for name in quantities[: 1 + len(result.problem.triads)]
         if name not in declared
     }
+    holds[ALIGNMENT] = aligned
     dip = unconfirmed_dip(result)
     holds |= {SIGNS[0]: dip >= 0, SIGNS[1]: dip < 0}
     holds |= {STEADINESS[name]: members for name, members in unseen_drifts(result).items()}

@@ -28,9 +28,9 @@ from mwdcal.estimation.solvers import RANK_TOLERANCE
 from mwdcal.geometry.observables import TITLES
 from mwdcal.presentation.calibration import (
     accuracy_in_words,
-    drift_remarks,
     how,
     known_inclinations,
+    unseen_remarks,
 )
 from mwdcal.presentation.numbers import (
     HELD,
@@ -102,7 +102,7 @@ def render(
         accuracy=_accuracy(calibration),
         soaked=_soaked(calibration),
         kinds=_kinds(verdict),
-        drifts=list(map(capital, drift_remarks(calibration))),
+        drifts=list(map(capital, unseen_remarks(calibration))),
         settings=SETTING_PRACTICES,
         outside=BETWEEN_SETS,
         titles=TITLES,

@@ -60,7 +60,7 @@ EVERY_PARAMETER = 12
 TOGETHER = 320
 """Most fits whose drifts are fitted together: few enough for the cache."""
 LARGEST_DRIFT = 0.02
-"""A drift of more than this share of gravity, or of the field, is none (1σ)."""
+"""Largest drift within a run (1σ), as a share of gravity or of the field."""
 REDUNDANCY = 36.0
 """Fewest degrees of freedom of a triad that can tell a drift from noise."""
 

@@ -20,7 +20,7 @@ import numpy as np
 from mwdcal.calibration.automatic.courses import TRIED, f_test, steady_columns, temperature_powers
 from mwdcal.calibration.diagnosis.plausibility import stations_to_reshoot
 from mwdcal.calibration.estimate import Fit, fewer_stations, without_stations
-from mwdcal.calibration.methods import ESTIMABLE, acts_on
+from mwdcal.calibration.methods import ESTIMABLE, STAND_TURNS, acts_on
 from mwdcal.calibration.readings import HIGHEST, LEAST_TEMPERATURE_SPAN, TRIADS, highest_order
 from mwdcal.calibration.results import variance_scales
 from mwdcal.estimation.batch import kind_of, put, take
@@ -140,7 +140,8 @@ def _courses(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
 
 def _turns(problem: Problem, state: State, turns: Array) -> dict[str, Array]:
     """Columns (B, n, m) of errors of the stand that act on references, at stations that have them."""
-    acting = {name: acts_on(problem.evidence, name)[..., None] for name in STAND_ERRORS}
+    visible = [name for name in STAND_ERRORS if name not in STAND_TURNS["tool-axis"]]
+    acting = {name: acts_on(problem.evidence, name)[..., None] for name in visible}
     columns = {n: problem.stand_column(state, n, turns) * acts for n, acts in acting.items()}
     return {name: column for name, column in columns.items() if column.any()}
 
