@@ -18,7 +18,7 @@ from mwdcal.calibration.prior import from_calibration
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.results import StatedCovariance, assumed_exact, typical_accuracy
 from mwdcal.errors import FitError
-from mwdcal.estimation.batch import take
+from mwdcal.estimation.batch import batch_of_one, take
 from mwdcal.files import documents
 from mwdcal.files.runs import read_run as runs_of
 from mwdcal.geometry.observables import OBSERVABLES
@@ -164,6 +164,25 @@ def test_a_tool_that_leans_in_the_stand_is_understated_where_it_is_not_declared(
     left = {name for names in assumed_exact(fit(data), relative=False) for name in names}
     assert "toolface zero of the stand" in left
     assert "alignment of the tool in the stand" not in left
+
+
+def test_a_thermometer_is_trusted_where_temperatures_go_one_way():
+    """Ahead of the sensors by as much at every station, it shifts the model: the run cannot show it."""
+    words = "sensors at the temperature of the thermometer"
+    for temperatures, trusted in (
+        ((20, 50, 80), True),
+        ((80, 50, 20), True),
+        ((20, 80, 50), False),
+    ):
+        run = servo_run(temperatures=temperatures)
+        raw = [np.stack([run[f"{t}{axis}"] for axis in "xyz"], -1) for t in "am"]
+        names = ("inclination", "azimuth", "toolface")
+        known = {name: np.radians(run[f"ref_{name}_deg"]) for name in names}
+        known["gravity"] = np.ones(len(raw[0]))
+        for order in (0, 1):
+            data = Readings(*raw, np.asarray(run["temperature_c"]), known=known, sd={})
+            [found] = assumed_exact(fit(batch_of_one(data), Options(order=order)), relative=True)
+            assert (words in found) == (trusted and order > 0)
 
 
 def test_the_lean_of_a_tool_turns_what_a_roll_test_reads():

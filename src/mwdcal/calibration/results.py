@@ -19,7 +19,7 @@ from itertools import compress
 import numpy as np
 from msgspec import UNSET
 
-from mwdcal.calibration.automatic.courses import misfit_covariance
+from mwdcal.calibration.automatic.courses import misfit_covariance, orders_of
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.prior import PriorInformation
 from mwdcal.calibration.readings import Readings
@@ -31,6 +31,7 @@ from mwdcal.calibration.record import (
     REPEATABILITY,
     SETTINGS,
     STEADINESS,
+    THERMOMETER,
     Calibration,
     stated,
 )
@@ -448,6 +449,8 @@ def constants_covariance(result: Fit) -> Array:
     return np.asarray(scaled * outer(less))
 
 
+LEAST_RETURN = 0.2
+"""Share of the span of temperatures by which they return where a lag of the thermometer would show."""
 TWO_TURNS = {"stand-": "tilt of the stand", "tool-axis-": ALIGNMENT}
 """The names of errors of two turns each, by how the names of these begin."""
 
@@ -488,7 +491,9 @@ def assumed_exact(result: Fit, relative: bool) -> list[list[str]]:
 
     A toolface zero, or a tool that leans in the stand, turns both triads, and a strength scales one, as sensors of
     other mounting or scale would have it. The field = 1 of a `relative` magnetometer is no reference. The signs of the
-    magnetometer are assumed where nothing confirms the hemisphere: see `unconfirmed_dip`. Offsets are
+    magnetometer are assumed where nothing confirms the hemisphere: see `unconfirmed_dip`. The sensors of a
+    model of order 1 or more have the temperature of the thermometer: one that is ahead of them by as much at all
+    stations shifts the model alone. Offsets are
     taken as steady where attitudes follow the order of the stations so closely that a trend would look like the
     sensors: see `unseen_drifts`.
     """
@@ -507,8 +512,16 @@ def assumed_exact(result: Fit, relative: bool) -> list[list[str]]:
     holds[ALIGNMENT] = aligned
     dip = unconfirmed_dip(result)
     holds |= {SIGNS[0]: dip >= 0, SIGNS[1]: dip < 0}
+    holds[THERMOMETER] = _goes_one_way(result.problem.temperature) & any(orders_of(result))
     holds |= {STEADINESS[name]: members for name, members in unseen_drifts(result).items()}
     return [[*compress(holds, each)] for each in np.stack([*holds.values()], -1).tolist()]
+
+
+def _goes_one_way(temperature: Array) -> Bools:
+    """Whether temperatures (B, n) of stations in their order go no way back worth `LEAST_RETURN` of their span."""
+    fall = np.max(np.maximum.accumulate(temperature, -1) - temperature, -1)
+    rise = np.max(temperature - np.minimum.accumulate(temperature, -1), -1)
+    return np.asarray(np.minimum(rise, fall) < LEAST_RETURN * np.ptp(temperature, -1))
 
 
 def unseen_drifts(result: Fit) -> dict[str, Bools]:

@@ -53,7 +53,7 @@ DISPUTED_CHANCE = 0.01
 
 A drift there would take up what is a conflict, or that error.
 """
-NOISE_ROUNDS = 3
+ERROR_ROUNDS = 3
 """Repetitions of fit and estimate of the noise that such an error leaves."""
 EVERY_PARAMETER = 12
 """Parameters of a triad that are all fitted."""
@@ -165,7 +165,7 @@ def _with_constant_errors(result: Fit, names: Sequence[str], options: Options) -
     """The fits with constant errors of the references as unknowns, and noise estimated anew where it was."""
     problem, state = with_constant_errors(result.problem, result.state, names)
     scale = np.ones(result.noise.shape)
-    for _ in range(1 + NOISE_ROUNDS):
+    for _ in range(1 + ERROR_ROUNDS):
         result = refitted(result, problem, state, scale, options)
         scale = np.where(np.isnan(result.noise), 1.0, np.sqrt(result.analysis.variance_factor))
         problem, state = result.problem, result.state
