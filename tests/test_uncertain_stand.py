@@ -4,10 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
+from scipy.spatial.transform import Rotation
 
 from mwdcal.calibration.automatic import drift as automatic
 from mwdcal.calibration.automatic.drift import with_drift
 from mwdcal.calibration.diagnosis import structure
+from mwdcal.calibration.diagnosis.plausibility import toolface_agreement
 from mwdcal.calibration.estimate import fit, refitted
 from mwdcal.calibration.options import Options
 from mwdcal.estimation import drift, uncertainty
@@ -238,6 +241,40 @@ def test_no_constant_error_is_taken_for_a_drift(declared, stand, monkeypatch):
     drifted, wrong = searched
     assert not drifted.any()
     assert wrong[1::2].all()
+
+
+@pytest.mark.parametrize("by", ["station", "direction", "toolface"])
+@pytest.mark.parametrize("practice", ["per-station", "per-direction"])
+def test_toolfaces_that_were_set_less_often_than_at_every_station_are_named(by, practice):
+    """The chance is that of SciPy's analysis of variance of the errors that were put in, 0.3° at noise of 0.006°."""
+    tools, sd = 20, np.radians(0.3)
+    alike, rng = runs(41, tools), np.random.default_rng(41)
+    number = {
+        "station": np.arange(48),
+        "direction": np.arange(48) // 12,
+        "toolface": np.arange(48) % 12,
+    }
+    errors = sd * rng.normal(size=(tools, 48))[:, number[by]]
+    turn = (
+        Rotation.from_rotvec(errors.ravel()[:, None] * [0, 0, -1.0])
+        .as_matrix()
+        .reshape(tools, 48, 3, 3)
+    )
+    raw = [(turn @ v[..., None])[..., 0] for v in (alike.accelerometer, alike.magnetometer)]
+    angles = {"inclination": 1e-5, "azimuth": 1e-5, "toolface": sd}
+    readings = replace(alike, accelerometer=raw[0], magnetometer=raw[1], sd=angles | NOISE)
+    result = fit(replace(readings, settings=practice), OPTIONS)
+    for kind in ("direction", "toolface"):
+        chance, count = toolface_agreement(result, kind)
+        assert set(count[by != "station" :]) <= {0, 4, 12}
+        if kind == by:
+            assert np.all(chance < 1e-9)
+        elif by == "station" and kind == "direction":
+            expected = [
+                stats.f_oneway(*np.split(error, 4)).pvalue
+                for error in errors - errors.mean(-1)[:, None]
+            ]
+            assert np.all(np.abs(np.log(chance / expected)) < 0.7)
 
 
 @pytest.mark.parametrize("noise", [1e-7, 1e-8])
