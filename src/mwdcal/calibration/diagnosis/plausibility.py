@@ -469,7 +469,8 @@ def toolface_agreement(result: Fit, by: str) -> tuple[Array, Ints]:
     """Chance (B,) of errors of toolface that agree so much within groups of stations, and the number of groups.
 
     Groups are those of one "direction", by setting where the stand has settings, or of one "toolface".
-    Definition: analysis of variance of the estimated errors in units of their σ, which count as independent.
+    Definition: analysis of variance of the estimated errors in units of their σ, which count as independent; 1 where
+    the means of groups scatter no more than independent errors of σ would let them.
     Reference: R. A. Fisher, Statistical Methods for Research Workers (1925).
     """
     evidence, errors = result.problem.evidence, result.state.errors[..., 2]
@@ -491,7 +492,8 @@ def toolface_agreement(result: Fit, by: str) -> tuple[Array, Ints]:
     between, within = means.sum(-1) - grand, np.sum(several * square - means, -1)
     freedom, rest = np.maximum(groups - 1.0, 0.0), stations - groups
     scatter = np.maximum(quotient(within, rest, rest > 0), 1e-300)
-    return np.nan_to_num(f_test(between, freedom, scatter, rest), nan=1.0), groups
+    chance = f_test(between, freedom, scatter, rest)
+    return np.where(between > freedom, np.nan_to_num(chance, nan=1.0), 1.0), groups
 
 
 def _numbered(evidence: Evidence, by: str) -> Ints:
