@@ -388,12 +388,17 @@ def _toolfaces(result: Fit) -> Iterator[Flag]:
     """Toolfaces that were set less often than at every station, and whose error in common is not declared."""
     evidence, shown = result.problem.evidence, np.zeros(len(result.status), bool)
     declared = evidence.stand.get("toolface-zero", np.zeros(1))
-    for by in ("direction", "toolface"):
+    for by in ("setting", "direction", "toolface"):
         chance, groups = toolface_agreement(result, by)
         size = evidence.sd["toolface"].max(-1) / np.sqrt(np.maximum(groups, 1))
         members = (chance < AGREEMENT_CHANCE) & (declared < NEARLY_ALL * size) & ~shown
         shown |= members
-        words = {"by": by, "chance": chance, "groups": groups, "size": np.degrees(size)}
+        words = {
+            "by": by.replace("setting", "direction"),
+            "chance": chance,
+            "groups": groups,
+            "size": np.degrees(size),
+        }
         yield _remark("toolface-shared", members, **words)
 
 

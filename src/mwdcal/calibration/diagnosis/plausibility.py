@@ -468,7 +468,7 @@ def setting_chances(result: Fit) -> Array:
 def toolface_agreement(result: Fit, by: str) -> tuple[Array, Ints]:
     """Chance (B,) of errors of toolface that agree so much within groups of stations, and the number of groups.
 
-    Groups are those of one "direction", by setting where the stand has settings, or of one "toolface".
+    Groups are those of one "setting" of the stand, one "direction", or one "toolface".
     Definition: analysis of variance of the estimated errors in units of their σ, which count as independent; 1 where
     the means of groups scatter no more than independent errors of σ would let them.
     Reference: R. A. Fisher, Statistical Methods for Research Workers (1925).
@@ -497,8 +497,8 @@ def toolface_agreement(result: Fit, by: str) -> tuple[Array, Ints]:
 
 
 def _numbered(evidence: Evidence, by: str) -> Ints:
-    """Number (B, n) of the stations' "direction", that of their setting where there are settings, or "toolface"."""
-    if by == "direction" and evidence.settings:
+    """Number (B, n) of the stations' "setting" of the stand, "direction" or "toolface"; -1 of a station alone."""
+    if by == "setting":
         return evidence.setting
     names = ("inclination", "azimuth") if by == "direction" else ("toolface",)
     keys = np.stack([np.round(evidence.known_or_zero[name], 6) for name in names], -1)
