@@ -49,6 +49,7 @@ def thermal(tmp_path_factory):
         "azimuth_zero_deg": 0.03,
         "toolface_zero_deg": 0.02,
         "tilt_deg": 0.01,
+        "tool_axis_deg": 0.03,
         "gravity_g": 2e-5,
     }
     stand = replace(profile.stand, field_nt=30.0, dip_deg=0.02, **common)
@@ -144,13 +145,22 @@ def test_every_source_that_is_declared_has_a_line_and_the_others_are_named_as_ex
     declared = {
         *("noise-of-the-readings", "settings-of-the-stand", "tilt-of-the-stand"),
         *("azimuth-zero-of-the-stand", "toolface-zero-of-the-stand"),
+        "alignment-of-the-tool-in-the-stand",
         *("gravity-reference-error", "field-reference-error", "dip-reference-error"),
     }
     assert declared <= {*lines}
     assert lines["toolface-zero-of-the-stand"].toolface_deg == pytest.approx(0.02, rel=1e-3)
+    lean = 0.03 / math.sqrt(
+        2
+    )  # one of two turns: inclination by it, azimuth by it over the sine of 45°
+    assert lines["alignment-of-the-tool-in-the-stand"].inclination_deg == pytest.approx(
+        lean, rel=1e-3
+    )
+    assert lines["alignment-of-the-tool-in-the-stand"].azimuth_deg == pytest.approx(0.03, rel=1e-3)
     exact = {key for key, line in lines.items() if line.basis.startswith("assumed exact")}
     steady = {key for key in exact if key.startswith("steady-")}
-    assert exact - steady == {"inclination-zero-of-the-stand"}
+    warmed = "sensors-at-the-temperature-of-the-thermometer"
+    assert exact - steady == {"inclination-zero-of-the-stand", warmed}
     assert len(steady) == 3  # its soaks only become hotter: a drift looks like temperature
     assert lines["noise-of-the-readings"].kind == "A"
     assert {lines[key].kind for key in declared - {"noise-of-the-readings"}} == {"B"}

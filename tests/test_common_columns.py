@@ -35,7 +35,9 @@ def apart(monkeypatch):
     def general():
         for module in (closed_form_drift, closed_form_drift):
             monkeypatch.setattr(module, "are_common", lambda problem: False)
-        monkeypatch.setattr(structure, "may_show", lambda result: np.ones(len(result.status), bool))
+        monkeypatch.setattr(
+            structure, "may_show", lambda result, _: np.ones(len(result.status), bool)
+        )
 
     return general
 

@@ -7,6 +7,7 @@ of the package is used for it.
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.spatial.transform import Rotation
 
 from cli_support import EXAMPLE, mwdcal, servo_run, write_csv
 from mwdcal.calibration.calibrate import calibrate
@@ -17,7 +18,7 @@ from mwdcal.calibration.prior import from_calibration
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.results import StatedCovariance, assumed_exact, typical_accuracy
 from mwdcal.errors import FitError
-from mwdcal.estimation.batch import take
+from mwdcal.estimation.batch import batch_of_one, take
 from mwdcal.files import documents
 from mwdcal.files.runs import read_run as runs_of
 from mwdcal.geometry.observables import OBSERVABLES
@@ -32,6 +33,7 @@ SIZES = {
     "toolface-zero": 0.1 * DEG,
     "inclination-zero": 0.03 * DEG,
     "tilt": 0.02 * DEG,
+    "tool-axis": 0.05 * DEG,
     "gravity": 1e-3,
     "field": 50.0,
     "dip": 0.1 * DEG,
@@ -60,6 +62,11 @@ def runs(name, size, declared=True, seed=0, count=COUNT, stations=None, noise_de
     earth = {k: v + (error if k == name else 0.0) + 0 * error for k, v in strengths.items()}
     g, b = attitude(*true)(1.0, 1.0, earth["dip"])
     pair = (g * earth["gravity"][..., None], b * earth["field"][..., None])
+    if name == "tool-axis":
+        side = rng.uniform(0, 2 * np.pi, (count, 1))
+        lean = error * np.concatenate([np.cos(side), np.sin(side), 0 * side], -1)
+        turn = Rotation.from_rotvec(lean).as_matrix()
+        pair = tuple(np.einsum("bij,bnj->bni", turn, v) for v in pair)
     raw = [v @ tool.matrix[t].T + tool.offset[t] for t, v in enumerate(pair)]
     raw = [r + s * rng.normal(size=r.shape) for r, s in zip(raw, tool.noise, strict=True)]
     angles = ("inclination", "azimuth", "toolface")
@@ -129,6 +136,68 @@ def test_a_toolface_zero_is_understated_where_it_is_not_declared_and_said_to_be_
     left = {name for names in assumed_exact(fit(data), relative=False) for name in names}
     assert left
     assert "toolface zero of the stand" not in left
+
+
+def test_a_tool_that_leans_in_the_stand_is_understated_where_it_is_not_declared():
+    """No residual shows it: tool and stand cannot be told apart, so it is among what is assumed exact."""
+    tool, data = runs("tool-axis", SIZES["tool-axis"], declared=False)
+    result = fit(data)
+    assert ratios(tool, result)["inclination"] > 5
+    assert np.nanmean(result.analysis.variance_factor) == pytest.approx(1.0, abs=0.05)
+    assert all(
+        "alignment of the tool in the stand" in names for names in assumed_exact(result, False)
+    )
+    _, data = runs("tool-axis", SIZES["tool-axis"])
+    problem, state = result.problem, result.state
+    turns, _ = problem.station_columns(state)
+    parameters = np.zeros((len(state.params), *turns.shape[1:3], 24))
+    for where, block in zip(problem.slices(), problem.linear(state).blocks, strict=True):
+        rows = slice(where.start // 4, where.stop // 4)
+        parameters[..., rows, where] = block
+    flat = parameters[0].reshape(-1, 24)
+    for name in ("tool-axis-x", "tool-axis-y"):
+        column = problem.stand_column(state, name, turns)[0].ravel()
+        left = column - flat @ np.linalg.lstsq(flat, column)[0]
+        assert np.linalg.norm(left) < 1e-3 * np.linalg.norm(
+            column
+        )  # the noise, as a share of the field
+    left = {name for names in assumed_exact(fit(data), relative=False) for name in names}
+    assert "toolface zero of the stand" in left
+    assert "alignment of the tool in the stand" not in left
+
+
+def test_a_thermometer_is_trusted_where_temperatures_go_one_way():
+    """Ahead of the sensors by as much at every station, it shifts the model: the run cannot show it."""
+    words = "sensors at the temperature of the thermometer"
+    for temperatures, trusted in (
+        ((20, 50, 80), True),
+        ((80, 50, 20), True),
+        ((20, 80, 50), False),
+    ):
+        run = servo_run(temperatures=temperatures)
+        raw = [np.stack([run[f"{t}{axis}"] for axis in "xyz"], -1) for t in "am"]
+        names = ("inclination", "azimuth", "toolface")
+        known = {name: np.radians(run[f"ref_{name}_deg"]) for name in names}
+        known["gravity"] = np.ones(len(raw[0]))
+        for order in (0, 1):
+            data = Readings(*raw, np.asarray(run["temperature_c"]), known=known, sd={})
+            [found] = assumed_exact(fit(batch_of_one(data), Options(order=order)), relative=True)
+            assert (words in found) == (trusted and order > 0)
+
+
+def test_the_lean_of_a_tool_turns_what_a_roll_test_reads():
+    """Errors of tools of any lean, to any side, at one inclination, over what their references state."""
+    size, inc = 0.1 * DEG, 50 * DEG
+    side, face = np.meshgrid(np.arange(24) * 15 * DEG, np.arange(12) * 30 * DEG, indexing="ij")
+    g, b = attitude(np.full(face.shape, inc), 0 * face, face)(1.0, 1.0, 1.2)
+    lean = size * np.stack([np.cos(side), np.sin(side), 0 * side], -1).reshape(-1, 3)
+    turn = Rotation.from_rotvec(lean).as_matrix().reshape(*side.shape, 3, 3)
+    g, b = (np.einsum("...ij,...j->...i", turn, v) for v in (g, b))
+    stated = Readings(g[0], b[0], sd={"tool-axis": np.array(size)})
+    for name, true in (("inclination", inc), ("azimuth", 0.0), ("toolface", face)):
+        error = centred(OBSERVABLES[name].value(g, b) - true)
+        sd = stated.common_uncertainty(name, np.full(12, inc))
+        assert np.sqrt(np.mean(error**2)) == pytest.approx(sd[0], rel=0.01)
 
 
 def test_shares_add_up_to_the_stated_covariance():

@@ -1,6 +1,7 @@
 """Slow drift within a run: seen, of the right size, in the uncertainty, and not seen in noise."""
 
 import re
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy import special
 from cli_support import calibrated, mwdcal, servo_run, write_csv
 from mwdcal.calibration.automatic.drift import by_drift, chances, with_drift
 from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.diagnosis.structure import shown_effects
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
@@ -240,23 +242,66 @@ def test_a_wrong_prior_is_no_drift(tmp_path):
     assert not found & {"accelerometer-drift", "magnetometer-drift", "field-drift"}
 
 
-@pytest.mark.parametrize("wrong", [0.3, -0.5, 1.0])
-def test_a_wrong_dip_is_named_and_no_drift(wrong):
-    """A walk would follow the residuals of a wrong dip too, and be so uncertain that nothing shows."""
-    right = runs(31, 20)
-    known = {**right.known, "dip": right.known["dip"] + np.radians(wrong)}
-    for place in range(20):
-        alone = replace(
-            right,
-            accelerometer=right.accelerometer[place],
-            magnetometer=right.magnetometer[place],
-            known=known,
-        )
-        calibration = calibrate(alone, Profile(name="x"), Options(order=0))
-        [finding] = [f for f in calibration.findings if f.id == "looks-like-dip-reference"]
-        size, sd = (float(x) for x in re.findall(r"Size (\S+)° ± (\S+)°", finding.text)[0])
-        assert abs(size + wrong) < 4 * sd + 0.005
-        assert not calibration.drift
+def off(readings, name, degrees):
+    """The readings with all references of one name off by so many degrees."""
+    return replace(
+        readings, known={**readings.known, name: readings.known[name] + np.radians(degrees)}
+    )
+
+
+def found(readings):
+    """The number of runs with a drift in their fit, and how often each effect is named."""
+    drifted, named = 0, Counter()
+    for places, result in by_drift(fit(readings, Options(order=0)), Options(order=0)):
+        drifted += len(places) * bool(result.problem.walks)
+        named.update(name for shown in shown_effects(result, {}) for name in shown)
+    return drifted, named
+
+
+CONSTANT = {"azimuth": "azimuth-zero", "inclination": "inclination-zero", "dip": "dip-reference"}
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [("azimuth", 0.1), ("azimuth", 2.0), ("inclination", 0.05), ("dip", 0.1), ("dip", -0.5)],
+)
+def test_a_constant_error_of_the_references_is_named_and_no_drift(name, wrong):
+    """A walk would follow its residuals too, and be so uncertain that nothing shows.
+
+    Noise alone gives each of two triads a drift beside it with a chance of 0.01: 4 of 200 runs, 2 of them 1σ.
+    """
+    readings = off(runs(31, 200), name, wrong)
+    drifted, named = found(readings)
+    assert drifted <= 10
+    assert named[CONSTANT[name]] >= 196
+    one = replace(
+        readings,
+        accelerometer=readings.accelerometer[0],
+        magnetometer=readings.magnetometer[0],
+    )
+    calibration = calibrate(one, Profile(name="x"), Options(order=0))
+    [finding] = [f for f in calibration.findings if f.id == f"looks-like-{CONSTANT[name]}"]
+    size, sd = (float(x) for x in re.findall(r"Size (\S+)° ± (\S+)°", finding.text)[0])
+    true = -wrong if name == "dip" else wrong
+    assert abs(size - true) < 4 * sd + 0.01 * abs(wrong)
+
+
+def test_a_drift_beside_a_constant_error_is_fitted_and_the_error_named():
+    drifted, named = found(off(runs(33, 50, field=60.0), "azimuth", 1.0))
+    assert drifted >= 45
+    assert named["azimuth-zero"] >= 48
+
+
+def test_no_drift_is_larger_than_the_fiftieth_part_of_the_field():
+    """A second half of the run at another place: half of the field away, or with the axes exchanged."""
+    readings = runs(34, 10)
+    raw = readings.magnetometer.copy()
+    raw[:5, COUNT // 2 :] += 24_000.0
+    raw[5:, COUNT // 2 :] = raw[5:, COUNT // 2 :, ::-1]
+    result = fit(replace(readings, magnetometer=raw), Options(order=0))
+    assert np.all(chances(result)[0][:, 1] < 1e-3)
+    drifted, _ = found(replace(readings, magnetometer=raw))
+    assert not drifted
 
 
 def test_a_drift_of_the_field_is_no_wrong_dip():

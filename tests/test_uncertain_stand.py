@@ -4,10 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
+from scipy.spatial.transform import Rotation
 
 from mwdcal.calibration.automatic import drift as automatic
 from mwdcal.calibration.automatic.drift import with_drift
 from mwdcal.calibration.diagnosis import structure
+from mwdcal.calibration.diagnosis.plausibility import toolface_agreement
 from mwdcal.calibration.estimate import fit, refitted
 from mwdcal.calibration.options import Options
 from mwdcal.estimation import drift, uncertainty
@@ -178,7 +181,7 @@ def test_the_first_look_leaves_out_no_effect(declared, monkeypatch):
     readings = replace(known, magnetometer=raw, sd=angles | (NOISE if declared else {}))
     result = fit(readings, OPTIONS)
     ours, looked_at = structure.shown_effects(result, {}), structure.on_stand_may_show(result)
-    monkeypatch.setattr(structure, "on_stand_may_show", lambda result: np.ones(48, bool))
+    monkeypatch.setattr(structure, "on_stand_may_show", lambda *a: np.ones(48, bool))
     theirs = structure.shown_effects(result, {})
     assert [[*each] for each in ours] == [[*each] for each in theirs]
     assert any(theirs)
@@ -215,8 +218,8 @@ def test_misfit_counts_what_is_tested_alone(least):
 
 @pytest.mark.parametrize("declared", [True, False])
 @pytest.mark.parametrize("stand", [True, False])
-def test_no_wrong_dip_is_taken_for_a_drift(declared, stand, monkeypatch):
-    """Dips about the limit of 0.25°, each other tool with a bad station: the same drifts as if all were searched."""
+def test_no_constant_error_is_taken_for_a_drift(declared, stand, monkeypatch):
+    """Dips that are off, each other tool with a bad station: the same drifts as if all tools were searched."""
     alike = replace(imperfect(runs(21, 12)), sd=NOISE if declared else {})
     raw = alike.magnetometer.copy()
     raw[::2, 7] += 300.0
@@ -224,16 +227,56 @@ def test_no_wrong_dip_is_taken_for_a_drift(declared, stand, monkeypatch):
     if stand:
         angles = {name: np.radians(sd) for name, sd in STAND.items()}
         readings = replace(readings, sd=readings.sd | angles, settings="per-station")
-    for off in (0.0, 0.2, 0.24, 0.26, 0.4):
+    look = "on_stand_may_show" if stand else "may_show"
+    for off in (0.0, 0.01, 0.02, 0.04, 0.4):
         dip = readings.known["dip"] + np.radians(off)
         result = fit(replace(readings, known=readings.known | {"dip": dip}), OPTIONS)
+        looked_at = getattr(structure, look)(result, structure.CONSTANT_ERRORS)
         with monkeypatch.context() as patch:
-            patch.setattr(automatic, "dip_may_be_off", lambda *a: np.ones(12, bool))
+            patch.setattr(structure, look, lambda result, _: np.ones(len(result.status), bool))
             searched = automatic.drifting(result, OPTIONS)
-        np.testing.assert_array_equal(automatic.drifting(result, OPTIONS), searched)
-        may_be = structure.dip_may_be_off(result, automatic.WRONG_DIP)
-        assert may_be[1::2].any() == (off > 0.1)
-    assert not searched.any()
+        for ours, theirs in zip(automatic.drifting(result, OPTIONS), searched, strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+        assert not looked_at[1::2].all() or off
+    drifted, wrong = searched
+    assert not drifted.any()
+    assert wrong[1::2].all()
+
+
+@pytest.mark.parametrize("by", ["station", "direction", "toolface"])
+@pytest.mark.parametrize("practice", ["per-station", "per-direction"])
+def test_toolfaces_that_were_set_less_often_than_at_every_station_are_named(by, practice):
+    """The chance is that of SciPy's analysis of variance of the errors that were put in, 0.3° at noise of 0.006°."""
+    tools, sd = 20, np.radians(0.3)
+    alike, rng = runs(41, tools), np.random.default_rng(41)
+    number = {
+        "station": np.arange(48),
+        "direction": np.arange(48) // 12,
+        "toolface": np.arange(48) % 12,
+    }
+    errors = sd * rng.normal(size=(tools, 48))[:, number[by]]
+    turn = (
+        Rotation.from_rotvec(errors.ravel()[:, None] * [0, 0, -1.0])
+        .as_matrix()
+        .reshape(tools, 48, 3, 3)
+    )
+    raw = [(turn @ v[..., None])[..., 0] for v in (alike.accelerometer, alike.magnetometer)]
+    angles = {"inclination": 1e-5, "azimuth": 1e-5, "toolface": sd}
+    readings = replace(alike, accelerometer=raw[0], magnetometer=raw[1], sd=angles | NOISE)
+    result = fit(replace(readings, settings=practice), OPTIONS)
+    for kind in ("direction", "toolface"):
+        chance, count = toolface_agreement(result, kind)
+        assert set(count[by != "station" :]) <= {0, 4, 12}
+        if kind == by:
+            assert np.all(chance < 1e-9)
+        elif by == "station" and kind == "direction":
+            expected = [
+                stats.f_oneway(*np.split(error, 4)).pvalue
+                for error in errors - errors.mean(-1)[:, None]
+            ]
+            known = chance < 1
+            assert known.any()
+            assert np.all(np.abs(np.log(chance / expected)[known]) < 0.7)
 
 
 @pytest.mark.parametrize("noise", [1e-7, 1e-8])

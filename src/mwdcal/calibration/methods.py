@@ -39,8 +39,8 @@ from mwdcal.sensor.profile import COMMON
 # --------------------------------------------------------------------------
 # What a run's readings say about its stations: references, uncertainties, groups, constants.
 
-STAND_TURNS = {"tilt": ("stand-north", "stand-east")}
-"""Errors of the stand that consist of several turns of its frame."""
+STAND_TURNS = {"tilt": ("stand-north", "stand-east"), "tool-axis": ("tool-axis-x", "tool-axis-y")}
+"""Errors of the stand that consist of several turns."""
 
 
 def flat(value: AnyArray, lead: tuple[int, ...], *tail: int) -> AnyArray:
@@ -92,7 +92,7 @@ def _settings(
 def _stand(readings: Readings, lead: tuple[int, ...]) -> dict[str, Array]:
     """Standard uncertainties (B,) of errors of the stand, of each turn that they consist of.
 
-    A tilt of known size leans to any azimuth: each of its two turns has half the variance.
+    A tilt of known size leans to any azimuth, a tool's axis to any side: each of the two turns has half the variance.
     """
     turn_sd: dict[str, Array] = {}
     for name, size in _declared(readings, COMMON, lead).items():
@@ -257,6 +257,26 @@ def with_stand_errors(evidence: Evidence, names: tuple[str, ...]) -> Evidence:
         sd, mask = np.full(len(zero), UNKNOWN), acts_on(evidence, name)
         shared.append(SharedConstant(name, mask, zero, sd, unknown=True))
     return replace(evidence, constants=tuple(shared))
+
+
+def with_constant_errors(
+    problem: Problem, state: State, names: Sequence[str]
+) -> tuple[Problem, State]:
+    """The problem with unknown errors of the stand (see `ESTIMABLE`) or of "dip-reference", and the state for it."""
+    old = problem.evidence.constants
+    evidence = with_stand_errors(problem.evidence, tuple(n for n in names if n in ESTIMABLE))
+    if "dip-reference" in names:
+        mask, zero = evidence.is_known("dip").astype(float), np.zeros(len(evidence.include))
+        error = SharedConstant("dip", mask, zero, zero + UNKNOWN, unknown=True)
+        others = (c for c in evidence.constants if c.name != "dip" or c.unknown)
+        evidence = replace(evidence, constants=(*others, error))
+    values = {(c.name, c.unknown): v for c, v in zip(old, state.constants.T, strict=True)}
+    constants = [
+        values.get((c.name, c.unknown), values.get((c.name, False), c.value))
+        for c in evidence.constants
+    ]
+    there = replace(state, constants=np.stack(constants, -1))
+    return replace(problem, evidence=evidence), there
 
 
 EVIDENCE: dict[str, Callable[[Evidence], Evidence]] = {

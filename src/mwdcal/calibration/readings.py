@@ -261,18 +261,17 @@ class Readings:
         """Standard uncertainty of the reference `name` (..., n) by what all stations of a stand share.
 
         The zero of its scale, and the lean of its vertical towards any azimuth: at `inclination`
-        (..., n) that turns azimuths by its cotangent and toolfaces by its cosecant. Singular: at
-        vertical these two are held to those of 0.1°.
+        (..., n) that turns azimuths by its cotangent and toolfaces by its cosecant. The lean of the tool in the
+        stand turns azimuths by the cosecant and toolfaces by the cotangent. Singular: at
+        vertical these are held to those of 0.1°.
         """
-        zero, tilt = self.uncertainty(f"{name}-zero"), self.uncertainty("tilt")
+        zero, tilt, lean = (self.uncertainty(n) for n in (f"{name}-zero", "tilt", "tool-axis"))
         across = np.maximum(np.abs(np.sin(inclination)), 2e-3)
-        shares = {
-            "inclination": 1.0,
-            "azimuth": np.cos(inclination) / across,
-            "toolface": 1 / across,
-        }
-        lean = tilt * np.asarray(shares.get(name, 0.0), float)
-        return np.asarray(np.sqrt(zero**2 + lean**2 / 2))
+        cotangent, cosecant = np.cos(inclination) / across, 1 / across
+        shares = {"azimuth": (cotangent, cosecant), "toolface": (cosecant, cotangent)}
+        same = float(name == "inclination") + 0 * across
+        by_tilt, by_lean = shares.get(name, (same, same))
+        return np.asarray(np.sqrt(zero**2 + ((tilt * by_tilt) ** 2 + (lean * by_lean) ** 2) / 2))
 
     def _per_station(self, value: ArrayLike) -> Array:
         whole, shape = np.asarray(value, float), self.accelerometer.shape[:-1]

@@ -218,17 +218,33 @@ STEADINESS = {
 """Assumption of a calibration whose run could not show a drift, by the name of the drift."""
 
 
+ALIGNMENT = "alignment of the tool in the stand"
+"""The name of what a tool's axis that is not the one it is rolled about does."""
+LEAN = "A tool that leans by 0.05° in the stand is off by up to 0.05° in inclination, 0.07° in azimuth at 45°"
+"""The consequence: an error δ of inclination and δ / sin I of azimuth."""
+THERMOMETER = "sensors at the temperature of the thermometer"
+"""Assumption of a calibration over temperatures that went one way."""
+
+
 def exact_and_steady(assumed: Sequence[str]) -> tuple[list[str], str]:
-    """The references among things assumed exact, and a sentence on the steadiness; blank if none is assumed.
+    """The references among things assumed exact, and sentences on other conditions; blank if none is assumed.
 
     >>> exact_and_steady(["gravity reference", "steady field"])[1].partition(". ")[0]
     'Assumed steady, as the order of the stations would hide a drift: field'
     """
-    exact = [name for name in assumed if name not in STEADINESS.values()]
-    steady = ", ".join(n.removeprefix("steady ") for n in assumed if n not in exact)
-    words = "Assumed steady, as the order of the stations would hide a drift"
-    remedy = "Measure out and back, or declare the drift in the tool profile"
-    return exact, f"{words}: {steady}. {remedy}" if steady else ""
+    conditions = {*STEADINESS.values(), THERMOMETER}
+    exact = [name for name in assumed if name not in conditions]
+    steady = ", ".join(n.removeprefix("steady ") for n in assumed if n in STEADINESS.values())
+    sentences = []
+    if steady:
+        words = "Assumed steady, as the order of the stations would hide a drift"
+        remedy = "Measure out and back, or declare the drift in the tool profile"
+        sentences.append(f"{words}: {steady}. {remedy}")
+    if THERMOMETER in assumed:
+        words = "as temperatures that go one way would hide a lead or lag"
+        remedy = "Measure on the way back too"
+        sentences.append(f"Assumed, {words}: {THERMOMETER}. {remedy}")
+    return exact, ". ".join(sentences)
 
 
 class Constant(msgspec.Struct, frozen=True, kw_only=True):

@@ -19,17 +19,19 @@ from itertools import compress
 import numpy as np
 from msgspec import UNSET
 
-from mwdcal.calibration.automatic.courses import misfit_covariance
+from mwdcal.calibration.automatic.courses import misfit_covariance, orders_of
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.prior import PriorInformation
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import (
+    ALIGNMENT,
     FREE_SHARE,
     NOISE,
     ORDER,
     REPEATABILITY,
     SETTINGS,
     STEADINESS,
+    THERMOMETER,
     Calibration,
     stated,
 )
@@ -451,11 +453,19 @@ def constants_covariance(result: Fit) -> Array:
     return np.asarray(scaled * outer(less))
 
 
+LEAST_RETURN = 0.2
+"""Share of the span of temperatures by which they return where a lag of the thermometer would show."""
+TWO_TURNS = {"stand-": "tilt of the stand", "tool-axis-": ALIGNMENT}
+"""The names of errors of two turns each, by how the names of these begin."""
+
+
 def error_name(constant: str) -> str:
     """The name of a common error: of a reference, of the stand, or a drift.
 
     >>> [error_name(name) for name in ("dip", "azimuth-zero", "stand-north")]
     ['dip reference error', 'azimuth zero of the stand', 'tilt of the stand about north']
+    >>> error_name("tool-axis-x")
+    'alignment of the tool in the stand about x'
     >>> error_name("field-drift-north")
     'drift of the field during the run'
     """
@@ -463,34 +473,39 @@ def error_name(constant: str) -> str:
         return f"drift of the {constant.partition('-')[0]} during the run"
     if constant.endswith("-zero"):
         return f"{constant.replace('-', ' ')} of the stand"
-    if constant.startswith("stand-"):
-        return f"tilt of the stand about {constant.removeprefix('stand-')}"
+    for prefix, words in TWO_TURNS.items():
+        if constant.startswith(prefix):
+            return f"{words} about {constant.removeprefix(prefix)}"
     return f"{constant} reference error"
 
 
 def common_source(name: str) -> str:
-    """The name of a source of error in a budget: a tilt is one source.
+    """The name of a source of error in a budget: two turns are one source.
 
     >>> [common_source(name) for name in ("stand-north", "azimuth-zero", "gravity", "prior")]
     ['tilt of the stand', 'azimuth zero of the stand', 'gravity reference error', 'prior']
     """
     if name in (NOISE, REPEATABILITY, SETTINGS, ORDER, PRIOR):
         return name
-    return "tilt of the stand" if name.startswith("stand-") else error_name(name)
+    return error_name(name).partition(" about ")[0]
 
 
 def assumed_exact(result: Fit, relative: bool) -> list[list[str]]:
     """References and conditions that each run assumes exact whose error moves no residual, but the calibration.
 
-    A toolface zero turns both triads, and a strength scales one, as sensors of other mounting or
-    scale would have it. The field = 1 of a `relative` magnetometer is no reference. The signs of the magnetometer
-    are assumed where nothing confirms the hemisphere: see `unconfirmed_dip`. Offsets are taken as steady where
-    attitudes follow the order of the stations so closely that a trend would look like the sensors: see `unseen_drifts`.
+    A toolface zero, or a tool that leans in the stand, turns both triads, and a strength scales one, as sensors of
+    other mounting or scale would have it. The field = 1 of a `relative` magnetometer is no reference. The signs of the
+    magnetometer are assumed where nothing confirms the hemisphere: see `unconfirmed_dip`. The sensors of a
+    model of order 1 or more have the temperature of the thermometer: one that is ahead of them by as much at all
+    stations shifts the model alone. Offsets are
+    taken as steady where attitudes follow the order of the stations so closely that a trend would look like the
+    sensors: see `unseen_drifts`.
     """
     evidence, quantities = result.problem.evidence, ("toolface", "gravity", "field")
     declared = {c.name.removesuffix("-zero") for c in evidence.constants} | set(evidence.absent)
     if relative:
         declared.add("field")
+    aligned = evidence.is_known("inclination").any(-1) & ("tool-axis-x" not in declared)
     holds = {
         "toolface zero of the stand" if name == "toolface" else f"{name} reference": (
             evidence.is_known(name).any(-1)
@@ -498,10 +513,19 @@ def assumed_exact(result: Fit, relative: bool) -> list[list[str]]:
         for name in quantities[: 1 + len(result.problem.triads)]
         if name not in declared
     }
+    holds[ALIGNMENT] = aligned
     dip = unconfirmed_dip(result)
     holds |= {SIGNS[0]: dip >= 0, SIGNS[1]: dip < 0}
+    holds[THERMOMETER] = _goes_one_way(result.problem.temperature) & any(orders_of(result))
     holds |= {STEADINESS[name]: members for name, members in unseen_drifts(result).items()}
     return [[*compress(holds, each)] for each in np.stack([*holds.values()], -1).tolist()]
+
+
+def _goes_one_way(temperature: Array) -> Bools:
+    """Whether temperatures (B, n) of stations in their order go no way back worth `LEAST_RETURN` of their span."""
+    fall = np.max(np.maximum.accumulate(temperature, -1) - temperature, -1)
+    rise = np.max(temperature - np.minimum.accumulate(temperature, -1), -1)
+    return np.asarray(np.minimum(rise, fall) < LEAST_RETURN * np.ptp(temperature, -1))
 
 
 def unseen_drifts(result: Fit) -> dict[str, Bools]:

@@ -33,6 +33,8 @@ from mwdcal.calibration.readings import (
     stated_day,
 )
 from mwdcal.calibration.record import (
+    ALIGNMENT,
+    LEAN,
     SOFTWARE,
     Calibration,
     Finding,
@@ -614,7 +616,7 @@ def _exact(calibration: Calibration) -> Iterator[Finding]:
     if names:
         text = (
             f"assumed exact in the budget: {', '.join(names)}. State their uncertainty in [stand] of the tool "
-            "profile, and calibrate again."
+            f"profile, and calibrate again.{f' {LEAN}.' if ALIGNMENT in names else ''}"
         )
         yield Finding(id="assumed-exact", text=text)
 

@@ -53,8 +53,11 @@ STAND = {
     "azimuth-zero": np.array([0.0, 0.0, 1.0]),
 }
 """Turns of the stand's frame, by the earth axis (north, east, down) they are about."""
-STAND_ERRORS = (*STAND, "inclination-zero", "toolface-zero")
-"""All errors of the stand that are common to its stations: turns of its frame, zeros of its scales."""
+TOOL_TURNS = {"tool-axis-x": 0, "tool-axis-y": 1, "toolface-zero": 2}
+"""Turns of the tool in the stand, by the axis of the tool that they are about."""
+STAND_ERRORS = (*STAND, "inclination-zero", *TOOL_TURNS)
+"""All errors of the stand that are common to its stations: turns of its frame, and of the tool in it, zeros of its
+scales."""
 WALKS = {
     "accelerometer-drift": tuple(f"accelerometer-drift-{axis}" for axis in "xyz"),
     "magnetometer-drift": tuple(f"magnetometer-drift-{axis}" for axis in "xyz"),
@@ -586,8 +589,8 @@ class Problem:
         """Earth axis (B, n, 3) about which a station is turned by an error of the stand."""
         if name == "inclination-zero":
             return -self._across(state)
-        if name == "toolface-zero":
-            return np.asarray(state.attitude[..., 2, :])
+        if name in TOOL_TURNS:
+            return np.asarray(state.attitude[..., TOOL_TURNS[name], :])
         return np.broadcast_to(STAND[name], state.attitude.shape[:-1])
 
     def _absent_scales(self, state: State) -> Array:

@@ -14,6 +14,7 @@ from typing import Literal, NamedTuple
 import msgspec
 import numpy as np
 
+from mwdcal.calibration.methods import STAND_TURNS
 from mwdcal.calibration.options import DIRECTION, settings_of
 from mwdcal.calibration.readings import CONSTANTS, TRIADS, Readings, soaks
 from mwdcal.calibration.record import Calibration
@@ -349,14 +350,15 @@ class SensorEffects(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 class StandEffects(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Errors of the stand besides those that the tool profile declares, degrees.
 
-    `…_zero_deg`, `tilt_deg`: common to the session (1σ). `backlash_…_deg`: play of the gear; the table lags
-    behind its scale by half of it, against the direction of approach (`approach`).
+    `…_zero_deg`, `tilt_deg`, `tool_axis_deg`: common to the session (1σ). `backlash_…_deg`: play of the gear; the table
+    lags behind its scale by half of it, against the direction of approach (`approach`).
     """
 
     inclination_zero_deg: float = 0.0
     azimuth_zero_deg: float = 0.0
     toolface_zero_deg: float = 0.0
     tilt_deg: float = 0.0
+    tool_axis_deg: float = 0.0
     backlash_inclination_deg: float = 0.0
     backlash_azimuth_deg: float = 0.0
     backlash_toolface_deg: float = 0.0
@@ -730,14 +732,15 @@ def common_errors(
     """Errors (...,) that all stations of a stand have in common, of standard deviations that `session` states.
 
     Zeros of the scales in radians, such that reading = value + zero; `stand-north` and `stand-east`, turns of
-    the stand's frame, of a tilt; by what gravity, field and dip exceed their references.
+    the stand's frame, of a tilt; `tool-axis-x` and `tool-axis-y`, turns of the tool; by what gravity,
+    field and dip exceed their references.
     """
     errors: dict[str, Array] = {}
     for name in (*COMMON, *CONSTANTS):
         size = float(session.uncertainty(name).max(initial=0.0))
         if name not in CONSTANTS:
             size = float(np.hypot(size, effects.stand.common(name)))
-        turns = ("stand-north", "stand-east") if name == "tilt" else (name,)
+        turns = STAND_TURNS.get(name, (name,))
         if size:
             share = size / np.sqrt(len(turns))
             errors |= {turn: share * rng.normal(size=lead) for turn in turns}
@@ -820,6 +823,11 @@ def _vectors(
             [common["stand-north"], common["stand-east"], 0 * common["stand-north"]], -1
         )
         attitude = attitude @ rotation(turn)[..., None, :, :]
+    if "tool-axis-x" in common:
+        lean = np.stack(
+            [common["tool-axis-x"], common["tool-axis-y"], 0 * common["tool-axis-x"]], -1
+        )
+        attitude = rotation(lean)[..., None, :, :] @ attitude
     earth = [earth_gravity(gravity), earth_field(field, dip)]
     earth[1] = earth[1] + drifted(rng, session, "field-drift", attitude.shape[:-3])
     if effects.earth.variation_nt:

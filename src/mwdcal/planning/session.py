@@ -120,6 +120,9 @@ def session_facts(
         north, east = (float(common[name]) for name in TILT)
         stand["tilt_deg"] = float(np.degrees(np.hypot(north, east)))
         stand["tilt_azimuth_deg"] = float(np.degrees(np.arctan2(-north, east)) % 360)
+    if "tool-axis-x" in common:
+        lean = np.hypot(common["tool-axis-x"], common["tool-axis-y"])
+        stand["tool_axis_deg"] = float(np.degrees(lean))
     known = session.readings.known
     earth = {
         name: float(np.mean(known[name]) + common.get(name, 0.0)) for name in ("gravity", "field")

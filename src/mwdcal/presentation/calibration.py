@@ -13,6 +13,8 @@ from mwdcal.calibration.fit_options import unusual
 from mwdcal.calibration.options import ASSUMED, ASSUMED_PRACTICE
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import (
+    ALIGNMENT,
+    LEAN,
     BudgetRow,
     Calibration,
     Constant,
@@ -175,7 +177,7 @@ def remarks(calibration: Calibration) -> list[str]:
         *([VALID.format(*valid)] if (valid := calibration.valid_temperatures) else []),
         *([f"Assumed exact; this run cannot check it: {exact}{PROFILE}"] if exact else []),
         *([steady] if steady else []),
-        *drift_remarks(calibration),
+        *unseen_remarks(calibration),
         *([ASSUMED] if calibration.settings == ASSUMED_PRACTICE else []),
         *(
             f"estimated constant of the run: {c.name} {estimate(c.value, c.standard_uncertainty, c.unit)}"
@@ -185,10 +187,15 @@ def remarks(calibration: Calibration) -> list[str]:
     ]
 
 
-def drift_remarks(calibration: Calibration) -> list[str]:
-    """Drifts within the run: what one that is not seen would do, declared ones, and those that may be noise."""
-    each = blindness(calibration.unseen), declared_drift(calibration.drift), _possible(calibration)
-    return [*filter(None, each)]
+def unseen_remarks(calibration: Calibration) -> list[str]:
+    """Lines on a tool that leans and a drift, which no residual shows, and on drifts declared or possible."""
+    lean = LEAN if ALIGNMENT in calibration.assumed_exact else ""
+    drifts = (
+        blindness(calibration.unseen),
+        declared_drift(calibration.drift),
+        _possible(calibration),
+    )
+    return [*filter(None, (lean, *drifts))]
 
 
 def _possible(calibration: Calibration) -> str:

@@ -29,9 +29,9 @@ from mwdcal.geometry.observables import TITLES
 from mwdcal.presentation.calibration import (
     NEXT_ROLL_TEST,
     accuracy_in_words,
-    drift_remarks,
     how,
     known_inclinations,
+    unseen_remarks,
 )
 from mwdcal.presentation.numbers import (
     HELD,
@@ -104,7 +104,7 @@ def render(
         accuracy=_accuracy(calibration),
         soaked=_soaked(calibration),
         kinds=_kinds(verdict),
-        drifts=list(map(capital, drift_remarks(calibration))),
+        drifts=list(map(capital, unseen_remarks(calibration))),
         settings=SETTING_PRACTICES,
         outside=BETWEEN_SETS,
         titles=TITLES,

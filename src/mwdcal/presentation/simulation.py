@@ -29,6 +29,7 @@ SIZES = {
     "azimuth_zero_deg": ("azimuth zero", "°"),
     "toolface_zero_deg": ("toolface zero", "°"),
     "tilt_deg": ("tilt", "°"),
+    "tool_axis_deg": ("lean of the tool", "°"),
     "tilt_azimuth_deg": ("tilt towards azimuth", "°"),
 }
 """Errors of the stand in words, and their unit."""

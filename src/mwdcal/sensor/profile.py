@@ -18,7 +18,7 @@ import numpy as np
 from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import Array
 
-COMMON = ("azimuth-zero", "toolface-zero", "inclination-zero", "tilt")
+COMMON = ("azimuth-zero", "toolface-zero", "inclination-zero", "tilt", "tool-axis")
 """Errors of the stand that all its stations have in common; in a profile `azimuth_zero_deg` …"""
 
 PRACTICES = ("per-direction", "per-station")
@@ -82,8 +82,9 @@ class StandProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
     `inclination_deg` … are of one setting, where the run does not state its own; `repeatability_…` is
     added to either in quadrature. Toolface is set at every station. The others are errors
-    that all stations have in common: zeros of the three scales, the lean of the stand's vertical,
-    and the references for gravity, field and dip where the run does not state their uncertainty.
+    that all stations have in common: zeros of the three scales, the lean of the stand's vertical, that of the tool's
+    axis from the one that the stand rolls it about, and the references for gravity, field and dip where the run does
+    not state their uncertainty.
     `field_drift_nt` is how far north, east and down of the field move from the first station to the last.
     `coil`: the field is made by a coil or simulated, and may be of any strength.
     `settings`: "per-direction" where the operator sets inclination and azimuth once and rolls the
@@ -100,6 +101,7 @@ class StandProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     azimuth_zero_deg: float = 0.0
     toolface_zero_deg: float = 0.0
     tilt_deg: float = 0.0
+    tool_axis_deg: float = 0.0
     gravity_g: float = 0.0
     field_nt: float = 0.0
     field_drift_nt: float = 0.0

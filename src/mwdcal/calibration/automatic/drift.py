@@ -7,7 +7,7 @@ A declared drift is part of every fit, and no smaller than declared.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -16,14 +16,9 @@ import numpy as np
 
 from mwdcal.calibration.automatic.courses import f_test, members, terms_beyond
 from mwdcal.calibration.diagnosis.plausibility import departures
-from mwdcal.calibration.diagnosis.structure import (
-    chance_alone,
-    dip_may_be_off,
-    effects,
-    shown_effects,
-)
+from mwdcal.calibration.diagnosis.structure import CONSTANT_ERRORS, shown_effects
 from mwdcal.calibration.estimate import Fit, fit, refitted, with_all
-from mwdcal.calibration.methods import declared_sizes
+from mwdcal.calibration.methods import declared_sizes, with_constant_errors
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prior import PriorInformation
 from mwdcal.calibration.readings import TRIADS, Readings, stated_day
@@ -54,13 +49,18 @@ A trend of a run that goes from soak to soak looks like a term of temperature, b
 PRIOR_CHANCE = 1e-3
 """Chance of so large a departure from the prior, at which a drift is looked for in the run alone."""
 DISPUTED_CHANCE = 0.01
-"""The same chance where the run departs from its prior: a drift there would take up what is a conflict."""
+"""The same chance where the run departs from its prior, or shows a constant error of its references.
+
+A drift there would take up what is a conflict, or that error.
+"""
+ERROR_ROUNDS = 3
+"""Repetitions of fit and estimate of the noise that such an error leaves."""
 EVERY_PARAMETER = 12
 """Parameters of a triad that are all fitted."""
 TOGETHER = 320
 """Most fits whose drifts are fitted together: few enough for the cache."""
-WRONG_DIP, WRONG_CHANCE = np.radians(0.25), 1e-12
-"""A dip that is off by more, where noise looks so less often, is a wrong reference: no field turns so far in a run."""
+LARGEST_DRIFT = 0.02
+"""Largest drift within a run (1σ), as a share of gravity or of the field."""
 REDUNDANCY = 36.0
 """Fewest degrees of freedom of a triad that can tell a drift from noise."""
 
@@ -120,45 +120,56 @@ def _of_units(design: Alike, axes: int) -> tuple[drift.WalkScores, dict[str, Arr
     return scores, {name: scores.shown(name) for name in scores.places}
 
 
-def drifting(result: Fit, options: Options) -> Bools:
-    """Triads (B, t) whose readings drifted within the run.
+def drifting(result: Fit, options: Options) -> tuple[Bools, Bools]:
+    """Triads (B, t) whose readings drifted within the run, and whether (B,) the run shows constant errors besides.
 
     None where parameters are held: what these would take up follows the attitudes, and so the order of stations.
     """
     drifted = np.zeros(result.analysis.freedom.shape, bool)
+    wrong = np.zeros(len(drifted), bool)
     if _apart(result, options):
-        return drifted
+        return drifted, wrong
     sound = (result.status == int(Status.OK)) & result.analysis.finite
     sound &= result.analysis.freedom.min(-1) >= REDUNDANCY
     sound &= ~terms_beyond(result).present.any((1, 2))
     if not sound.any():
-        return drifted
+        return drifted, wrong
     part = result if sound.all() else take(result, np.flatnonzero(sound))
     alone, disputed = _undisputed(part, options)
     chance, hidden = chances(alone)
     limit = np.where(hidden, HIDDEN_CHANCE, ORDER_CHANCE)
     limit = np.where(disputed[:, None], DISPUTED_CHANCE, limit)
-    drifted[sound] = chance < limit
-    places = np.flatnonzero(drifted.any(-1) & dip_may_be_off(result, WRONG_DIP))
-    if places.size:
-        drifted[places[_wrong_dip(take(result, places))]] = False
-    return drifted
+    shown, off = chance < limit, np.zeros(len(limit), bool)
+    for places, free in _by_constant_errors(alone, np.flatnonzero(shown.any(-1)), options):
+        shown[places], off[places] = chances(free)[0] < DISPUTED_CHANCE, True
+    drifted[sound], wrong[sound] = shown, off
+    return drifted, wrong
 
 
-def _wrong_dip(result: Fit) -> Bools:
-    """Fits (B,) whose residuals a wrong reference of the dip explains best, without any drift.
+def _by_constant_errors(result: Fit, some: Ints, options: Options) -> Iterator[tuple[Ints, Fit]]:
+    """Those of some fits whose residuals show constant errors of the references: places, and the fit with these.
 
-    It leaves residuals that go with attitude, and attitude may go with the order of the stations. A walk would follow
-    them too, so uncertain that the error does not show.
+    Such an error leaves residuals that go with attitude, and attitude may go with the order of the stations. A walk
+    would follow them too, so uncertain that the error does not show.
     """
-    wrong, name = np.zeros(len(result.status), bool), "dip-reference"
-    for place in np.flatnonzero(chance_alone(result, name) < WRONG_CHANCE).tolist():
-        part = take(result, np.array([place]))
-        [shown] = shown_effects(part, {})
-        if next(iter(shown), "") == name and shown[name][0] < WRONG_CHANCE:
-            [effect] = effects(part, shown={name: shown[name]})
-            wrong[place] = abs(effect.values[0]) > WRONG_DIP
-    return wrong
+    if not some.size:
+        return
+    each = [tuple(shown) for shown in shown_effects(take(result, some), {}, CONSTANT_ERRORS)]
+    for names in sorted({*each} - {()}):
+        places = some[[shown == names for shown in each]]
+        yield places, _with_constant_errors(take(result, places), names, options)
+
+
+@np.errstate(invalid="ignore", divide="ignore", over="ignore")
+def _with_constant_errors(result: Fit, names: Sequence[str], options: Options) -> Fit:
+    """The fits with constant errors of the references as unknowns, and noise estimated anew where it was."""
+    problem, state = with_constant_errors(result.problem, result.state, names)
+    scale = np.ones(result.noise.shape)
+    for _ in range(1 + ERROR_ROUNDS):
+        result = refitted(result, problem, state, scale, options)
+        scale = np.where(np.isnan(result.noise), 1.0, np.sqrt(result.analysis.variance_factor))
+        problem, state = result.problem, result.state
+    return result
 
 
 def _apart(result: Fit, options: Options) -> bool:
@@ -202,26 +213,58 @@ def with_drifts(fits: Iterable[tuple[Ints, Fit]], options: Options) -> Iterator[
 
     A drift that is declared is looked for in a fit without it, and stays as declared where none is seen.
     """
-    waiting: dict[tuple[Any, Any], list[tuple[Ints, Fit]]] = {}
+    waiting: dict[tuple[Any, ...], list[tuple[Ints, Fit]]] = {}
     for tools, result in fits:
         declared = bool(result.problem.walks) and not _apart(result, options)
         steady = _without_drift(result, options) if declared else result
-        drifted = drifting(steady, options)
-        for triads in distinct(drifted, axis=0):
-            places = np.flatnonzero((drifted == triads).all(-1))
+        drifted, wrong = drifting(steady, options)
+        wrong &= drifted.any(-1)
+        kinds = np.column_stack([drifted, wrong])
+        for kind in distinct(kinds, axis=0):
+            places, triads = np.flatnonzero((kinds == kind).all(-1)), kind[:-1]
             part = steady if triads.any() else result
             part = part if len(places) == len(drifted) else members(part, places)
             if triads.any():
-                kind = tuple(triads.tolist()), kind_of(part)
-                waiting.setdefault(kind, []).append((tools[places], part))
+                same = tuple(triads.tolist()), bool(kind[-1]), kind_of(part)
+                waiting.setdefault(same, []).append((tools[places], part))
             else:
                 yield tools[places], _whole(part, options)
-    for (triads, _), parts in waiting.items():
-        tools, whole = (join(each) for each in zip(*parts, strict=True))
-        for first in range(0, len(tools), TOGETHER):
+    for (triads, off, _), parts in waiting.items():
+        every, whole = (join(each) for each in zip(*parts, strict=True))
+        for first in range(0, len(every), TOGETHER):
             some = slice(first, first + TOGETHER)
-            with_walks = with_drift(take(whole, some), options, np.array(triads))
-            yield tools[some], _whole(with_walks, options)
+            for places, result in _with_possible_drift(
+                take(whole, some), options, np.array(triads), off
+            ):
+                yield every[some][places], _whole(result, options)
+
+
+def _with_possible_drift(
+    result: Fit, options: Options, triads: Bools, wrong: bool
+) -> Iterator[tuple[Ints, Fit]]:
+    """Places and fits with walks, then those of fits whose walks would be larger than any drift, without them."""
+    walking = with_drift(result, options, triads, wrong)
+    possible = _is_possible(walking)
+    if possible.all():
+        yield np.arange(len(possible)), walking
+        return
+    declared = result.problem.evidence.drift
+    other = with_drift(result, options, np.zeros_like(triads)) if declared else result
+    for places, each in ((np.flatnonzero(possible), walking), (np.flatnonzero(~possible), other)):
+        if places.size:
+            yield places, take(each, places)
+
+
+def _is_possible(result: Fit) -> Bools:
+    """Fits (B,) whose drifts are no larger than one may be: a larger one is something else, and takes up anything."""
+    problem, possible = result.problem, np.ones(len(result.status), bool)
+    strength = [problem.constant(result.state, name).mean(-1) for name in ("gravity", "field")]
+    places = drift.places(problem.evidence)
+    for name, triad in drift.acting(places).items():
+        if name not in problem.evidence.drift:
+            size = np.max([problem.evidence.constants[i].sd for i in places[name].ravel()], 0)
+            possible &= size <= LARGEST_DRIFT * strength[triad]
+    return possible
 
 
 def _whole(result: Fit, options: Options) -> Fit:
@@ -237,24 +280,39 @@ def _without_drift(result: Fit, options: Options) -> Fit:
 
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
-def with_drift(result: Fit, options: Options, triads: Bools) -> Fit:
-    """A fit with walks of estimated size that act on some triads (t,), from one without."""
-    problem, (alone, _) = result.problem, _undisputed(result, options)
-    declared, analysis = np.isnan(result.noise), alone.analysis
+def with_drift(result: Fit, options: Options, triads: Bools, wrong: bool = False) -> Fit:
+    """A fit with walks of estimated size that act on some triads (t,), from one without.
+
+    Where the references are `wrong` by constant errors the noise stays as the fit without walks has it: they are part
+    of it.
+    """
+    alone, _ = _undisputed(result, options)
+    sizes, left = _sized(alone, triads)
+    some = np.arange(len(left) if wrong else 0)
+    for places, free in _by_constant_errors(alone, some, options):
+        left[places] = 1.0
+        for name, size in _sized(free, triads)[0].items():
+            sizes[name][places] = size
+    walking, state = drift.with_walks(result.problem, result.state, sizes)
+    return refitted(result, walking, state, np.sqrt(left), options)
+
+
+def _sized(result: Fit, triads: Bools) -> tuple[dict[str, Array], Array]:
+    """Trend and walk (B, 2) of each drift that acts on some triads (t,), and the variance of the noise left (B, t)."""
+    problem, analysis = result.problem, result.analysis
     known, noise = declared_sizes(problem.evidence), drift.noise(problem)
     acting = drift.acting(drift.families(problem)).items()
     walks = [name for name, triad in acting if triads[triad] or name in known]
-    scores = drift.walk_scores(alone.problem, alone.state, analysis, walks)
+    scores = drift.walk_scores(problem, result.state, analysis, walks)
     parts = [(known.get(n, np.zeros((1, 2)))[:, i], noise[n]) for n, i in scores.components()]
     least = np.stack([(size / one) ** 2 for size, one in parts], -1)
     theta, left = drift.walk_variances(
-        scores, analysis.variance_factor, analysis.freedom, declared, least
+        scores, analysis.variance_factor, analysis.freedom, np.isnan(result.noise), least
     )
     sizes = {name: np.zeros((len(theta), 2)) for name in scores.places}
     for (name, part), variance in zip(scores.components(), theta.T, strict=True):
         sizes[name][:, part] = np.sqrt(variance) * noise[name]
-    walking, state = drift.with_walks(problem, result.state, sizes)
-    return refitted(result, walking, state, np.sqrt(left), options)
+    return sizes, left
 
 
 # --------------------------------------------------------------------------

@@ -24,6 +24,7 @@ from mwdcal.calibration.diagnosis.plausibility import (
     robust,
     setting_chances,
     stations_to_reshoot,
+    toolface_agreement,
     unchecked,
 )
 from mwdcal.calibration.diagnosis.structure import COLUMN, is_shown, suspected
@@ -140,6 +141,10 @@ def resolution(values: Array) -> float:
 MISFIT_CHANCE = 1e-3
 """Chance of so large or so small residuals, or of so large a departure of what is declared, below which it is
 reported."""
+NEARLY_ALL = 0.9
+"""Share of an error to declare from which it is declared."""
+AGREEMENT_CHANCE = 1e-4
+"""Chance of as much agreement between errors of toolface, below which it is reported."""
 LEAST_SHOWN = 0.1
 """A smaller share of the stand's σ by which stations of one setting scatter is no finding."""
 FEW_FREEDOM = 8.0
@@ -176,6 +181,9 @@ REMARKS = {
     "reference, or declare a larger σ.",
     "settings-apart": "stations of one direction scatter by {share:.0%} of the stand's σ, as if the stand had been set "
     'anew at each. If so, state settings = "per-station" in [stand] of the profile.',
+    "toolface-shared": "errors of the stand's toolface agree within each {by} (chance in noise {chance:.0e}), as if it "
+    "had been set {groups} times in all. The stated uncertainty of toolface counts one error a station, and is too "
+    "small: declare toolface_zero_deg = {size:.2g} under [stand] of the profile beside toolface_deg.",
     "residuals": "{triad}: residuals are {times:.2f} times the declared noise{rare}: the noise figure, a reference, or "
     "the model is wrong. The uncertainty is scaled up as if each station had an error of its own; an error that "
     "stations share may be larger than it says.",
@@ -373,6 +381,25 @@ def _settings(fitted: FittedRuns) -> Iterator[Flag]:
         yield Flag("settings", members, "{of}", {"of": words})
     share = result.problem.evidence.apart
     yield _remark("settings-apart", share > LEAST_SHOWN, share=share)
+    yield from _toolfaces(result)
+
+
+def _toolfaces(result: Fit) -> Iterator[Flag]:
+    """Toolfaces that were set less often than at every station, and whose error in common is not declared."""
+    evidence, shown = result.problem.evidence, np.zeros(len(result.status), bool)
+    declared = evidence.stand.get("toolface-zero", np.zeros(1))
+    for by in ("setting", "direction", "toolface"):
+        chance, groups = toolface_agreement(result, by)
+        size = evidence.sd["toolface"].max(-1) / np.sqrt(np.maximum(groups, 1))
+        members = (chance < AGREEMENT_CHANCE) & (declared < NEARLY_ALL * size) & ~shown
+        shown |= members
+        words = {
+            "by": by.replace("setting", "direction"),
+            "chance": chance,
+            "groups": groups,
+            "size": np.degrees(size),
+        }
+        yield _remark("toolface-shared", members, **words)
 
 
 def _setting(fitted: FittedRuns, column: int, place: int) -> str:

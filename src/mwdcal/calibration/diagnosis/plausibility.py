@@ -11,6 +11,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from mwdcal.calibration.automatic.courses import f_test
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import EARTH_RANGES, HIGHEST, TRIADS, Readings
 from mwdcal.calibration.record import Calibration, numbers
@@ -30,7 +31,7 @@ from mwdcal.calibration.results import variance_scales
 from mwdcal.errors import InputError
 from mwdcal.estimation.batch import batch_of_one, take
 from mwdcal.estimation.minimisers import closed_form, closed_form_drift
-from mwdcal.estimation.problem import STAND_ERRORS, UNKNOWN
+from mwdcal.estimation.problem import STAND_ERRORS, UNKNOWN, Evidence
 from mwdcal.estimation.solvers import Determined
 from mwdcal.estimation.uncertainty import (
     ROTATIONS,
@@ -465,6 +466,48 @@ def setting_chances(result: Fit) -> Array:
     scale = np.maximum(variance_scales(result).max(-1, keepdims=True), 1.0)
     square = quotient(settings**2, expected * scale, tested)
     return tail(square, np.where(tested, 1, 0))
+
+
+def toolface_agreement(result: Fit, by: str) -> tuple[Array, Ints]:
+    """Chance (B,) of errors of toolface that agree so much within groups of stations, and the number of groups.
+
+    Groups are those of one "setting" of the stand, one "direction", or one "toolface".
+    Definition: analysis of variance of the estimated errors in units of their σ, which count as independent; 1 where
+    the means of groups scatter no more than independent errors of σ would let them.
+    Reference: R. A. Fisher, Statistical Methods for Research Workers (1925).
+    """
+    evidence, errors = result.problem.evidence, result.state.errors[..., 2]
+    sd = np.where(evidence.is_known("toolface"), evidence.sd["toolface"], 0.0)
+    number = _numbered(evidence, by)
+    some = (sd > 0) & (evidence.include > 0) & (number >= 0)
+    tools, kinds = len(errors), int(number.max(initial=0)) + 1
+    if not some.any():
+        return np.ones(tools), np.zeros(tools, int)
+    flat, error = (number + kinds * np.arange(tools)[:, None])[some], errors[some] / sd[some]
+    count, total, square = (
+        np.asarray(np.bincount(flat, w, tools * kinds), float).reshape(tools, kinds)
+        for w in (np.ones(error.size), error, error**2)
+    )
+    several = count > 1
+    groups, stations = np.count_nonzero(several, -1), (several * count).sum(-1)
+    means = quotient(total**2, count, several)
+    grand = quotient((several * total).sum(-1) ** 2, stations, stations > 0)
+    between, within = means.sum(-1) - grand, np.sum(several * square - means, -1)
+    freedom, rest = np.maximum(groups - 1.0, 0.0), stations - groups
+    scatter = np.maximum(quotient(within, rest, rest > 0), 1e-300)
+    chance = f_test(between, freedom, scatter, rest)
+    return np.where(between > freedom, np.nan_to_num(chance, nan=1.0), 1.0), groups
+
+
+def _numbered(evidence: Evidence, by: str) -> Ints:
+    """Number (B, n) of the stations' "setting" of the stand, "direction" or "toolface"; -1 of a station alone."""
+    if by == "setting":
+        return evidence.setting
+    names = ("inclination", "azimuth") if by == "direction" else ("toolface",)
+    keys = np.stack([np.round(evidence.known_or_zero[name], 6) for name in names], -1)
+    alike = bool((keys == keys[:1]).all())
+    each = [np.unique(key, axis=0, return_inverse=True)[1] for key in keys[: 1 if alike else None]]
+    return np.broadcast_to(np.reshape(each, (len(each), -1)), keys.shape[:2])
 
 
 def robust(result: Fit) -> Bools:

@@ -194,6 +194,8 @@ DECLARED_NOISE = 0.3
 """Declared noise of more than this share of the field at every station is a wrong unit."""
 PARAMETERS_NAMED = 4
 """Most undetermined parameters that a message lists."""
+MOST_SHOWN = 1000.0
+"""Ratios beyond this, or its inverse, have no figures in a message."""
 ABSURD_RATIO = 30.0
 """Residuals of more than this many times the declared noise mean that something is plain wrong."""
 COARSE_NOISE = 0.05
@@ -294,7 +296,7 @@ OF_FITS = {
     "angles{lower}.{axes}",
     "no-redundancy": "the {triad} has no redundancy ({freedom:.1f} degrees of freedom): its noise cannot be estimated. "
     "Add stations, or declare 'noise' in the tool profile.",
-    "gain": "the {triad}'s gain on tool axis {axis} comes out at {gain:.3g} times nominal and {wrong} (accepted: "
+    "gain": "the {triad}'s gain on tool axis {axis} comes out at {gain} times nominal and {wrong} (accepted: "
     "{range[0]}…{range[1]}). Check 'axes' and 'scale' of [{triad}] in the tool profile, and the reference "
     "angles.{axes}",
     "overturned": "the dip comes out at {dip:.1f}°, beyond vertical (accepted: -90…90): the magnetometer reads the "
@@ -581,8 +583,8 @@ def _absurd(fitted: FittedRuns, index: int) -> Iterator[Flag]:
 
     def much(place: int) -> str:
         if declared[place]:
-            return f"{excess[place]:.0f} times the declared noise"
-        return f"{noise[place] / signal[place]:.0%} of the field"
+            return f"{_bounded(excess[place], '{:.0f}')} times the declared noise"
+        return f"{_bounded(noise[place] / signal[place], '{:.0%}')} of the field"
 
     absurd = is_absurd(1.0) & (result.analysis.freedom[:, index] >= 1)
     absurd &= declared | (result.status == int(Status.OK))  # an unfinished fit estimates no noise
@@ -592,6 +594,19 @@ def _absurd(fitted: FittedRuns, index: int) -> Iterator[Flag]:
         fitted, "temperature", warmed, "temperature-order", **words, **spanned(fitted, index)
     )
     yield _refusal(fitted, "residuals", absurd & ~warmed, **words)
+
+
+def _bounded(ratio: float, form: str) -> str:
+    """A ratio in words: beyond `MOST_SHOWN`, or its inverse, its figures mean nothing.
+
+    >>> _bounded(3.5e150, "{:.0f}"), _bounded(-4e-124, "{:.3g}"), _bounded(0.25, "{:.3g}")
+    ('more than 1000', '0', '0.25')
+    """
+    if abs(ratio) < 1 / MOST_SHOWN:
+        return form.format(0)
+    if abs(ratio) <= MOST_SHOWN:
+        return form.format(ratio)
+    return f"{'less than -' if ratio < 0 else 'more than '}{form.format(MOST_SHOWN)}"
 
 
 def _too_weak(fitted: FittedRuns) -> Flag:
@@ -617,7 +632,8 @@ def _odd_gain(fitted: FittedRuns, index: int) -> Flag:
     axis = np.argmax(odd, -1)
     first = value[np.arange(len(axis)), axis]
     wrong = np.where(first < 0, "has the wrong sign", "is far from nominal")
-    values = {"triad": name, "axis": TOOL_AXES[axis], "gain": first, "wrong": wrong}
+    shown = np.array([_bounded(each, "{:.3g}") for each in first])
+    values = {"triad": name, "axis": TOOL_AXES[axis], "gain": shown, "wrong": wrong}
     return _refusal(fitted, "gain", np.any(odd, -1), range=GAIN_RANGE, **values)
 
 

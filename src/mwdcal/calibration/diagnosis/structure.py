@@ -10,7 +10,7 @@ Reference: efficient scores, C. R. Rao, Proc. Camb. Phil. Soc. 44, 50 (1948).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from itertools import pairwise
@@ -20,7 +20,7 @@ import numpy as np
 from mwdcal.calibration.automatic.courses import TRIED, f_test, steady_columns, temperature_powers
 from mwdcal.calibration.diagnosis.plausibility import stations_to_reshoot
 from mwdcal.calibration.estimate import Fit, fewer_stations, without_stations
-from mwdcal.calibration.methods import ESTIMABLE, acts_on
+from mwdcal.calibration.methods import ESTIMABLE, STAND_TURNS, acts_on
 from mwdcal.calibration.readings import HIGHEST, LEAST_TEMPERATURE_SPAN, TRIADS, highest_order
 from mwdcal.calibration.results import variance_scales
 from mwdcal.estimation.batch import kind_of, put, take
@@ -141,7 +141,8 @@ def _courses(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
 
 def _turns(problem: Problem, state: State, turns: Array) -> dict[str, Array]:
     """Columns (B, n, m) of errors of the stand that act on references, at stations that have them."""
-    acting = {name: acts_on(problem.evidence, name)[..., None] for name in STAND_ERRORS}
+    visible = [name for name in STAND_ERRORS if name not in STAND_TURNS["tool-axis"]]
+    acting = {name: acts_on(problem.evidence, name)[..., None] for name in visible}
     columns = {n: problem.stand_column(state, n, turns) * acts for n, acts in acting.items()}
     return {name: column for name, column in columns.items() if column.any()}
 
@@ -217,8 +218,8 @@ GAIN_STRIDE = 32
 """…at every so many of them first, and then between two."""
 
 
-def may_show(result: Fit) -> Bools:
-    """Fits (B,) that may show an effect.
+def may_show(result: Fit, among: Collection[str] = ()) -> Bools:
+    """Fits (B,) that may show an effect, `among` some if any are given.
 
     All of them where the columns of effects are not common to tools, or depend on temperature.
     """
@@ -230,9 +231,8 @@ def may_show(result: Fit) -> Bools:
     if not common:
         return every
     design = Alike.of(problem, result.state)
-    if any(
-        name.endswith(("-temperature", "-thermal-lag")) for name in common_effects(design).columns
-    ):
+    names = common_effects(design).among(among)
+    if any(name.endswith(("-temperature", "-thermal-lag")) for name in names):
         return every
     scale = np.sqrt(np.maximum(variance_scales(result), 1e-12))
     residual = result.analysis.residual / np.repeat(scale, 3, -1)[:, None]
@@ -241,12 +241,14 @@ def may_show(result: Fit) -> Bools:
     misfit = np.sum(residual**2, (1, 2)) + drifts.misfit
     rest = np.sum(problem.evidence.include[0]) * residual.shape[-1] - result.state.params.shape[-1]
     rest = FREEDOM_STEP * np.ceil((rest - drifts.freedom) / FREEDOM_STEP)
-    sides = _gains_of_sides(problem, design, residual, response, drifts)
+    sides = _gains_of_sides(problem, design, names, residual, response, drifts)
     shown = _are_enough(sides, misfit, rest)
-    near = every if drifts.columns else _may_be_enough(design, residual, response, misfit, rest)
+    near = every
+    if not drifts.columns:
+        near = _may_be_enough(design, names, residual, response, misfit, rest)
     some = np.flatnonzero(near)
     if some.size:
-        gains = _gains(design, residual[some], [r[some] for r in response], drifts)
+        gains = _gains(design, names, residual[some], [r[some] for r in response], drifts)
         shown[some] |= _are_enough(gains, misfit[some], rest[some])
     return shown
 
@@ -262,7 +264,12 @@ def _are_enough(gains: Iterable[tuple[Array, Ints]], misfit: Array, rest: Array)
 
 
 def _may_be_enough(
-    design: Alike, residual: Array, response: list[Array], misfit: Array, rest: Array
+    design: Alike,
+    names: Collection[str],
+    residual: Array,
+    response: list[Array],
+    misfit: Array,
+    rest: Array,
 ) -> Bools:
     """Fits (B,) without drift of which a bound of some family's gain is enough for it to be named.
 
@@ -282,7 +289,8 @@ def _may_be_enough(
     effects = common_effects(design)
     _, products, square = effects.sums(0 * residual[:1], first)
     score = np.sum(effects.scores(residual, response), 0)
-    for name, (some, pair) in effects.places.items():
+    for name in (each for each in effects.places if each in names):
+        some, pair = effects.places[name]
         size = some.stop - some.start
         information = sum(products[i][0, pair] for i in effects.columns[name])
         length = np.sqrt(np.where(square[0, some] > 0, square[0, some], 1.0))
@@ -380,6 +388,10 @@ class _Families:
         sides = [name for name, each in columns.items() if not each and name.endswith(HYSTERESIS)]
         return cls(places, left, products, squares, common, sides)
 
+    def among(self, some: Collection[str]) -> list[str]:
+        """Names of the families that are `some`; of all where none are given."""
+        return [name for name in (*self.places, *self.sides) if not some or name in some]
+
     def sums(
         self, residual: Array, response: list[Array]
     ) -> tuple[list[Array], list[Array], Array]:
@@ -426,9 +438,16 @@ def _across(design: Alike) -> dict[int, Array]:
 
 
 def _gains(
-    design: Alike, residual: Array, response: list[Array], drifts: _Drifts
+    design: Alike,
+    names: Collection[str],
+    residual: Array,
+    response: list[Array],
+    drifts: _Drifts,
 ) -> Iterator[tuple[Array, Ints]]:
-    """By how much (B,) each common family lowers the misfit, and its directions, from whitened residuals (B, n, m)."""
+    """By how much (B,) each common family of some names lowers the misfit, and its directions.
+
+    From whitened residuals (B, n, m).
+    """
     effects, count = common_effects(design), len(residual)
     scores, products, square = effects.sums(residual, response)
     across = {
@@ -437,7 +456,8 @@ def _gains(
         )
         for index in drifts.columns
     }
-    for name, (some, pair) in effects.places.items():
+    for name in (each for each in effects.places if each in names):
+        some, pair = effects.places[name]
         size = some.stop - some.start
         score = information = np.zeros(())
         for index in effects.columns[name]:
@@ -449,10 +469,15 @@ def _gains(
 
 
 def _gains_of_sides(
-    problem: Problem, design: Alike, residual: Array, response: list[Array], drifts: _Drifts
+    problem: Problem,
+    design: Alike,
+    names: Collection[str],
+    residual: Array,
+    response: list[Array],
+    drifts: _Drifts,
 ) -> Iterator[tuple[Array, Ints]]:
     """The same of the families whose columns are each tool's own."""
-    for name in common_effects(design).sides:
+    for name in (each for each in common_effects(design).sides if each in names):
         index = TRIADS.index(name.removesuffix(HYSTERESIS))
         raw, include = problem.triads[index].raw, problem.evidence.include
         sides = side(moves(raw)) * include[..., None]
@@ -527,8 +552,8 @@ LARGEST_RESCALING = 0.1
 """Change of the noise, as a share, up to which the weights are as in the fit."""
 
 
-def on_stand_may_show(result: Fit) -> Bools:
-    """Fits (B,) on an uncertain stand that may show an effect.
+def on_stand_may_show(result: Fit, among: Collection[str] = ()) -> Bools:
+    """Fits (B,) on an uncertain stand that may show an effect, `among` some if any are given.
 
     All of them where the columns of effects are not common to tools, or depend on temperature.
     """
@@ -536,8 +561,8 @@ def on_stand_may_show(result: Fit) -> Bools:
     if not are_alike(problem):
         return every
     design = _exact(problem, result.state)
-    common = common_effects(design).columns
-    if any(name.endswith(("-temperature", "-thermal-lag")) for name in common):
+    names = common_effects(design).among(among)
+    if any(name.endswith(("-temperature", "-thermal-lag")) for name in names):
         return every
     at, errors = uncertain_stand.linear(problem, result.state), result.state.errors
     scale = np.sqrt(variance_scales(result))
@@ -547,7 +572,7 @@ def on_stand_may_show(result: Fit) -> Bools:
     misfit = np.einsum("ibn,ibn->b", at.left, residual) + np.sum(at.precision * at.value**2, -1)
     known, covariance = at.covariance.trace(at.of_data), at.covariance.whole
     rest = np.ceil(6 * problem.evidence.include.sum(-1) - known)
-    for columns in _columns(problem, result, design):
+    for columns in _columns(problem, result, design, names):
         weighed = np.einsum("ij...,jk...->ik...", at.weight, columns)
         score = np.einsum("ikbn,ibn->bk", columns, residual)
         crossed = at.columns.with_others(weighed)
@@ -570,11 +595,13 @@ def _exact(problem: Problem, state: State) -> Alike:
     return Alike.of(exact, replace(state, errors=0 * state.errors))
 
 
-def _columns(problem: Problem, result: Fit, design: Alike) -> Iterator[Array]:
-    """Columns (6, k, B, n) of every effect in whitened readings."""
+def _columns(
+    problem: Problem, result: Fit, design: Alike, names: Collection[str]
+) -> Iterator[Array]:
+    """Columns (6, k, B, n) of the effects of some names in whitened readings."""
     response, include = responses(problem, result.state), problem.evidence.include
     effects = common_effects(design)
-    for columns in effects.columns.values():
+    for columns in (effects.columns[name] for name in effects.places if name in names):
         count = next(iter(columns.values())).whole.shape[-1]
         every = np.zeros((6, count, *include.shape))
         for index, each in columns.items():
@@ -582,7 +609,7 @@ def _columns(problem: Problem, result: Fit, design: Alike) -> Iterator[Array]:
             both = (response[index] @ flat).reshape(len(include), 3, count, -1)
             every[TRIAD_ROWS[index]] = np.moveaxis(both, 0, 2)
         yield every
-    for name in effects.sides:
+    for name in (each for each in effects.sides if each in names):
         index = TRIADS.index(name.removesuffix(HYSTERESIS))
         one = problem.triads[index]
         sides = side(moves(one.raw)) * include[..., None] / one.sd
@@ -590,28 +617,6 @@ def _columns(problem: Problem, result: Fit, design: Alike) -> Iterator[Array]:
         for axis in range(3):
             every[3 * index + axis, axis] = sides[..., axis]
         yield every
-
-
-def dip_may_be_off(result: Fit, size: float) -> Bools:
-    """Fits (B,) whose misfit allows the reference of the dip to be off by more than a size, radians.
-
-    An error explains the square of its size times the information on it. Readings of the magnetometer alone tell no
-    more, nor a stand as unsure at all stations as at one; half of that is left without the bad stations.
-    """
-    problem, analysis = result.problem, result.analysis
-    stand = analysis.squares is not None
-    if not ((uncertain_stand if stand else closed_form).applies(problem) and are_alike(problem)):
-        return np.ones(len(result.status), bool)
-    columns = common_effects(_exact(problem, result.state)).columns.get("dip-reference")
-    if not columns:
-        return np.zeros(len(result.status), bool)
-    information = columns[1].information(responses(problem, result.state)[1])[:, 0, 0] / 2
-    misfit, scale = np.sum(analysis.residual**2, (1, 2)), variance_scales(result)
-    if stand:
-        at = uncertain_stand.linear(problem, result.state)
-        information /= 1 + np.sum(at.gain[TRIAD_ROWS[1]] ** 2, (0, 1)).max(-1)
-        misfit = np.einsum("ibn,ibn->b", at.left, at.weighed(at.left))
-    return np.asarray(size**2 * information * scale.min(-1) <= misfit * scale.max(-1))
 
 
 STRUCTURE_CHANCE = 0.01
@@ -636,6 +641,8 @@ AT_ONCE = 32
 """Fits that are looked at together: few enough for the cache."""
 ZEROS = ("azimuth-zero", "inclination-zero", "dip-reference")
 """Effects that are one angle."""
+CONSTANT_ERRORS = (*ZEROS, "tilt")
+"""Effects that are errors of the references, the same at all stations."""
 EFFECTS = {
     "azimuth-zero": "an azimuth zero of the stand: set the index, or fit it with `estimate` azimuth-zero, or declare "
     "its uncertainty (azimuth_zero_deg under [stand])",
@@ -722,33 +729,37 @@ Shown = dict[str, tuple[float, float]]
 """Chance and share of the misfit of each effect that a fit shows, by name."""
 
 
-def shown_effects(result: Fit, others: Mapping[str, Array]) -> list[Shown]:
+def shown_effects(
+    result: Fit, others: Mapping[str, Array], among: Collection[str] = ()
+) -> list[Shown]:
     """Effects that the residuals of each fit (B) show, in the order in which they are found.
 
-    `others` (B, n) are numbers of columns that the fit does not use: each may explain the residuals too.
+    `others` (B, n) are numbers of columns that the fit does not use: each may explain the residuals too. The effects
+    are `among` some if any are given.
     """
     if result.analysis.influence is not None:
         return [{} for _ in result.status]
     every: list[Shown] = [{} for _ in result.status]
     stand = result.analysis.squares is not None and uncertain_stand.applies(result.problem)
-    looked_at = (on_stand_may_show(result) if stand else may_show(result)) | bool(others)
+    look = on_stand_may_show if stand else may_show
+    looked_at = look(result, among) | bool(others)
     bad = _bad_stations(result)
     places = np.flatnonzero(looked_at | bad.any(-1))
     for first in range(0, len(places), AT_ONCE):
         some = places[first : first + AT_ONCE]
         part = _without(take(result, some), bad[some])
-        shown = _searched(part, {n: v[some] for n, v in others.items()})
+        shown = _searched(part, {n: v[some] for n, v in others.items()}, among)
         for place, each in zip(some.tolist(), shown, strict=True):
             every[place] = each
     return every
 
 
-def _searched(result: Fit, others: Mapping[str, Array]) -> list[Shown]:
+def _searched(result: Fit, others: Mapping[str, Array], among: Collection[str]) -> list[Shown]:
     """Effects that residuals show: the least likely by chance first, then what its fit leaves, and so on."""
-    scores = _scores(_at_noise_of(result), result, others)
+    scores = _scores(_at_noise_of(result), result, others, among)
     shown: list[Shown] = [{} for _ in result.status]
     left = scores.misfit.copy()
-    searched: dict[tuple[str, ...], Ints] = {(): np.arange(len(shown))}
+    searched: dict[tuple[str, ...], Ints] = {(): np.arange(len(shown))} if scores.places else {}
     while searched:
         further: dict[tuple[str, ...], list[int]] = {}
         for chosen, members in searched.items():
@@ -776,21 +787,6 @@ def _at_noise_of(result: Fit) -> Problem:
         for i, t in enumerate(result.problem.triads)
     ]
     return replace(result.problem, triads=tuple(triads))
-
-
-def chance_alone(result: Fit, name: str) -> Array:
-    """Chance (B,) in noise of one effect beside no other, as `shown_effects` has that of the first; 1 without it."""
-    bad, chance = _bad_stations(result), np.ones(len(result.status))
-    for first in range(0, len(chance), AT_ONCE):
-        some = np.arange(first, min(first + AT_ONCE, len(chance)))
-        part = _without(take(result, some), bad[some])
-        problem = _at_noise_of(part)
-        columns = next((c for n, c in families(problem, part.state) if n == name), None)
-        if columns is not None:
-            scores = _scores_of(problem, part, {name: columns})
-            one = _trials(scores, (), (name,), scores.misfit)[0][0]
-            chance[first : first + AT_ONCE] = one
-    return chance
 
 
 def effects(
@@ -891,9 +887,11 @@ def _described(result: Fit, shown: Shown, others: Mapping[str, Array]) -> list[E
     return sized
 
 
-def _scores(problem: Problem, result: Fit, others: Mapping[str, Array]) -> _Scores:
-    """Efficient scores of all families, and of columns that the fit does not use."""
-    columns = dict(families(problem, result.state))
+def _scores(
+    problem: Problem, result: Fit, others: Mapping[str, Array], among: Collection[str] = ()
+) -> _Scores:
+    """Efficient scores of all families, or `among` some, and of columns that the fit does not use."""
+    columns = {n: c for n, c in families(problem, result.state) if not among or n in among}
     if tested := _testable(problem, result.state, others):
         steady = steady_columns(problem, result.state)
         columns |= {COLUMN + n: products(steady, v[..., None]) for n, v in tested.items()}
@@ -904,10 +902,10 @@ def _scores_of(problem: Problem, result: Fit, columns: Mapping[str, Array]) -> _
     """Efficient scores of the columns (B, n, m, k) of some families: what the fit's unknowns cannot take up."""
     linear = problem.linear(result.state)
     whole, normal = whole_covariance(linear, result.analysis.determined), linear.normal
-    every = np.concatenate([*columns.values()], -1)
-    ends = np.cumsum([each.shape[-1] for each in columns.values()])
-    places = dict(zip(columns, np.split(np.arange(ends[-1]), ends[:-1]), strict=True))
-    flat = every.reshape(len(every), -1, every.shape[-1])
+    every = np.concatenate([linear.residual[..., None][..., :0], *columns.values()], -1)
+    ends = np.cumsum([0, *(each.shape[-1] for each in columns.values())])
+    places = {n: np.arange(*each) for n, each in zip(columns, pairwise(ends), strict=True)}
+    flat = every.reshape(len(every), linear.residual[0].size, every.shape[-1])
     weighed = linear.weigh(every).reshape(flat.shape)
     square = np.einsum("bik,bik->bk", flat, weighed)
     length = np.sqrt(np.maximum(square, 0.0))  # rounding may leave less where the noise is tiny
