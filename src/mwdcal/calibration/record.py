@@ -394,11 +394,13 @@ class StationRow(msgspec.Struct, frozen=True, kw_only=True):
     `deviation` is the station's χ² put as an equivalent number of standard deviations of one
     normal variable; `reshoot` marks the ones to take again. `errors_left_out` are the errors
     when the station has no part in the fit, `influence` the largest change it makes by itself
-    at any station of the run, `weight` its share in a robust fit.
+    at any station of the run, `weight` its share in a robust fit. `readings` of the accelerometer, g, and of the
+    magnetometer, nT, are nominal, x, y and z of each; absent in earlier versions.
     """
 
     station: str
     digest: str
+    readings: list[float] | msgspec.UnsetType = msgspec.UNSET
     temperature_c: float | None
     inclination_deg: float | None
     toolface_deg: float | None

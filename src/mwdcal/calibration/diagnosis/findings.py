@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
-from math import erf
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from mwdcal.calibration.automatic.courses import (
     terms_beyond,
     untested,
 )
+from mwdcal.calibration.copies import AGREEING, repeated
 from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag, listed, spaced
 from mwdcal.calibration.diagnosis.plausibility import (
     NOISE_RATIO,
@@ -48,24 +48,11 @@ from mwdcal.geometry.vectors import Array, Bools
 # --------------------------------------------------------------------------
 # Stations that repeat the readings of an earlier one more closely than noise allows: copies, not measurements.
 
-AGREEING = 0.03
-"""Readings agree that differ on no channel by more than this share of its noise."""
-NEAR = 10.0
-"""Stations of one attitude differ on no channel by more than so many times its noise."""
-BLOCK_OF_STATIONS = 256
-"""Stations whose distances to all others are worked out at once."""
-COINCIDENCE = 1e-3
-"""Chance below which as many pairs of measurements that agree are not a coincidence."""
-LEAST_STEP = 1e-3
-"""A resolution below this share of the noise is as good as none."""
-
 
 def copies(result: Fit) -> Bools:
     """Stations (B, n) whose readings agree with those of an earlier one, where noise does not explain it.
 
-    Definition: two measurements at one attitude agree on a channel by chance with a probability that follows from
-    its noise and its resolution; a channel whose resolution is coarser than its noise says nothing. Copies are
-    named if as many pairs would agree with a chance below `COINCIDENCE`.
+    All stations are compared only in runs where two agree that are near each other on one line through the readings.
     """
     noise = _noise_in_residuals(result)
     rows = np.concatenate(
@@ -77,17 +64,18 @@ def copies(result: Fit) -> Bools:
     order = np.argsort(line, -1)
     in_line = np.take_along_axis(rows, order[..., None], 1)
     line = np.take_along_axis(line, order, -1)
-    agree, repeated = np.zeros(len(rows), bool), np.zeros(rows.shape[:-1], bool)
+    farthest = len(weights) * AGREEING**2
+    agree, again = np.zeros(len(rows), bool), np.zeros(rows.shape[:-1], bool)
     for apart in range(1, line.shape[-1]):
-        close = line[:, apart:] - line[:, :-apart] <= AGREEING * weights.sum()
+        close = (line[:, apart:] - line[:, :-apart]) ** 2 <= farthest * np.sum(weights**2)
         if not close.any():
             break
         tools, first = np.nonzero(close)
-        differ = np.abs(in_line[tools, first + apart] - in_line[tools, first]) > AGREEING
-        agree[tools[~differ.any(-1)]] = True
+        differ = in_line[tools, first + apart] - in_line[tools, first]
+        agree[tools[np.sum(differ**2, -1) <= farthest]] = True
     for member in np.flatnonzero(agree):
-        repeated[member] = _copies(rows[member])
-    return repeated
+        again[member] = repeated(rows[member])
+    return again
 
 
 def _noise_in_residuals(result: Fit) -> Array:
@@ -95,46 +83,6 @@ def _noise_in_residuals(result: Fit) -> Array:
     less = np.minimum(np.nan_to_num(result.analysis.variance_factor, nan=1.0), 1.0)
     noise = reading_noise(result) * np.sqrt(less)
     return np.where(noise > 0, noise, 1.0)
-
-
-def _copies(rows: Array) -> Bools:
-    """Stations (n,) of one run that agree with an earlier one, of readings (n, k) in units of their noise."""
-    pairs, near, repeated = 0, 0, np.zeros(len(rows), bool)
-    for first in range(0, len(rows), BLOCK_OF_STATIONS):
-        some = slice(first, first + BLOCK_OF_STATIONS)
-        earlier = np.arange(len(rows)) < np.arange(len(rows))[some, None]
-        apart = np.max([np.abs(each[some, None] - each) for each in rows.T], axis=0)
-        agreeing = earlier & (apart <= AGREEING)
-        pairs += int(np.count_nonzero(agreeing))
-        near += int(np.count_nonzero(earlier & (apart <= NEAR)))
-        repeated[some] = agreeing.any(-1)
-    alone = float(np.prod([_agreement(resolution(each)) for each in rows.T])) if pairs else 1.0
-    coincident = not pairs or _at_least(pairs, near, alone) >= COINCIDENCE
-    return np.zeros(len(rows), bool) if coincident else repeated
-
-
-def _agreement(step: float) -> float:
-    """Chance that two measurements of one value agree on a channel of this resolution, in units of its noise."""
-    return 1.0 if step >= 1.0 else erf(max(AGREEING, step / 2) / 2)
-
-
-def _at_least(pairs: int, of: int, chance: float) -> float:
-    """Chance of as many successes in so many trials: binomial."""
-    from scipy.special import bdtrc
-
-    return float(bdtrc(pairs - 1, of, chance))
-
-
-def resolution(values: Array) -> float:
-    """Largest step of which all differences of values (n,) are multiples; 0 where none is above `LEAST_STEP`.
-
-    Reference: Euclid's algorithm, to `LEAST_STEP`.
-    """
-    rest, step = np.abs(values - values[0]), 0.0
-    while (left := rest[rest > LEAST_STEP]).size:
-        step = float(left.min())
-        rest = np.abs(rest - step * np.round(rest / step))
-    return step if step > 10 * LEAST_STEP else 0.0
 
 
 MISFIT_CHANCE = 1e-3
