@@ -1,5 +1,6 @@
 """Findings about what a run cannot show: copies of stations, the hemisphere, unknown gravity."""
 
+import re
 from dataclasses import replace
 
 import msgspec
@@ -24,6 +25,7 @@ from mwdcal.calibration.readings import Readings, fingerprints
 from mwdcal.calibration.residuals import chances
 from mwdcal.errors import FitError
 from mwdcal.estimation.uncertainty import analyse, left_out_variances
+from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.sensor.profile import Profile
 from mwdcal.survey.well import unknown_gravity
 from simulation import DEG, Tool, attitude, plan
@@ -350,6 +352,71 @@ def test_the_chance_that_a_sound_test_is_refused_is_the_one_stated():
             for _ in range(draws)
         )
         assert 0.1 * 0.05 < refused / draws < 0.05 + 3 * np.sqrt(0.05 / draws)
+
+
+def with_noise(data, seed, **times):
+    """The run with so many times the noise on the axes of some triads."""
+    rng = np.random.default_rng(seed)
+    moved = {
+        name: getattr(data, name)
+        + np.sqrt(np.array(more) ** 2 - 1.0) * float(NOISE[name]) * rng.standard_normal((48, 3))
+        for name, more in times.items()
+    }
+    return replace(data, **moved)
+
+
+@pytest.mark.parametrize("sd", [NOISE, {}], ids=["declared", "estimated"])
+@pytest.mark.parametrize(
+    ("triad", "times"), [("accelerometer", (1, 1, 4)), ("magnetometer", (2, 5, 1))]
+)
+def test_an_axis_of_another_noise_is_named(triad, times, sd):
+    """With the ratio that regressions of each channel on the reference vectors leave, and SciPy's F."""
+    data = with_noise(run(sd=sd), 1, **{triad: times})
+    text = found(data)[f"{triad}-axis-noise"]
+    vectors = attitude(*(data.known[n] for n in ("inclination", "azimuth", "toolface")))
+    vector = vectors(1.0, 1.0, data.known["dip"][0])[triad == "magnetometer"]
+    design = np.c_[vector, np.ones(48)]
+    left = np.linalg.lstsq(design, getattr(data, triad))[1] / 44
+    most, least = "xyz"[left.argmax()], "xyz"[left.argmin()]
+    ratio = left.max() / left.min()
+    figures = r".* along (.) are ([0-9.]+) times those along (.) \(chance in equal noise (.*?)\)"
+    larger, times, smaller, chance = re.match(figures, text).groups()
+    assert (larger, smaller) == (most, least)
+    assert float(times) == pytest.approx(ratio**0.5, rel=0.1)  # stations to re-shoot are left out
+    assert np.log(float(chance)) == pytest.approx(np.log(6 * stats.f.sf(ratio, 44, 44)), rel=0.1)
+    other = {"accelerometer": "magnetometer", "magnetometer": "accelerometer"}[triad]
+    assert f"{other}-axis-noise" not in found(data)
+
+
+def test_axes_of_one_noise_are_not_named():
+    for seed in range(10):
+        for sd in (NOISE, {}):
+            assert not [name for name in found(run(seed, sd=sd)) if name.endswith("axis-noise")]
+
+
+def test_noise_by_axis_that_is_declared_is_not_named():
+    times = {"accelerometer": (1, 1, 4)}
+    sd = {**NOISE, "accelerometer": np.tile([1e-4, 1e-4, 4e-4], (48, 1))}
+    assert "accelerometer-axis-noise" not in found(with_noise(run(sd=sd), 1, **times))
+
+
+@pytest.mark.parametrize("own", [False, True], ids=["of the run", "of the readings"])
+def test_readings_have_the_noise_that_the_run_shows(own):
+    """Not the third of it that the run declares; where residuals agree with what is declared, just that."""
+    loud = dict.fromkeys(NOISE, (3, 3, 3))
+    for data, times in ((with_noise(run(), 1, **loud), 3.0), (run(), 1.0)):
+        record = calibrate(data, PROFILE)
+        still = replace(data[20:21], known={}, sd=NOISE if own else {})
+        many = Readings(*(np.repeat(getattr(still, n), 4000, 0) for n in NOISE), sd=still.sd)
+        noisy = {
+            n: getattr(many, n)
+            + times * float(NOISE[n]) * np.random.default_rng(k).standard_normal((4000, 3))
+            for k, n in enumerate(NOISE)
+        }
+        for name in ("inclination", "azimuth", "gravity", "field"):
+            scatter = np.std(OBSERVABLES[name].value(*record.fields(replace(many, **noisy))))
+            sd = [record.uncertainty(name, still, noise=noise)[0] for noise in (True, False)]
+            assert np.sqrt(sd[0] ** 2 - sd[1] ** 2) == pytest.approx(scatter, rel=0.15)
 
 
 def few_stations(seeds, sd, error=0.0, inclinations=(45, 100)):

@@ -501,6 +501,15 @@ class TriadCalibration(msgspec.Struct, frozen=True, kw_only=True):
         agrees = (self.misfit_probability or 0.0) > DOUBT and self.noise_source == "declared"
         return MOST_FREEDOM if agrees else self.degrees_of_freedom
 
+    def noise_of(self, readings: Readings) -> Array:
+        """Standard uncertainty (..., n, 3) of readings as they state it, or (), as the run does.
+
+        Times s where residuals of the run are too large for the noise that it declares.
+        """
+        doubtful = self.misfit_probability is not None and self.misfit_probability <= DOUBT
+        excess = max(self.variance_factor or 1.0, 1.0) if doubtful else 1.0
+        return np.asarray(readings.sd.get(self.name, self.noise) * np.sqrt(excess))
+
     def functions(self, reference: float) -> Whole:
         """The model that these parameters belong to."""
         basis = Basis(self.order, reference)
@@ -756,7 +765,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         readings = as_readings(readings)
         shape, parts = readings.accelerometer.shape[:-1], []
         for triad, model, (parameters, raw, temperature), vector in self._measured(readings):
-            sd = readings.sd.get(triad.name, np.array(triad.noise))
+            sd = triad.noise_of(readings)
             if not model.varies and np.ndim(sd) < raw.ndim:  # one for all readings
                 raw, temperature = raw[..., :1, :], temperature[..., :1]
             slope, sd = model.slope(parameters, raw, temperature), np.broadcast_to(sd, raw.shape)

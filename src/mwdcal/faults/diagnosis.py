@@ -359,7 +359,7 @@ def _rolled(
             getattr(readings, triad.name),
         )
         added = raw_reading(model, np.array(triad.parameters), vector, warmth)
-        stated = np.broadcast_to(readings.sd.get(triad.name, triad.noise), before.shape)
+        stated = np.broadcast_to(triad.noise_of(readings), before.shape)
         raw[triad.name] = np.concatenate([before, added])
         sd[triad.name] = np.concatenate([stated, np.tile(stated.mean(0), (4, 1))])
     return raw, sd

@@ -42,8 +42,8 @@ from mwdcal.calibration.results import (
 )
 from mwdcal.estimation.problem import WALK_AXES, Prior
 from mwdcal.estimation.solvers import Determined
-from mwdcal.estimation.uncertainty import free_directions
-from mwdcal.geometry.vectors import Array, Bools
+from mwdcal.estimation.uncertainty import fisher_tail, free_directions, per_freedom
+from mwdcal.geometry.vectors import Array, Bools, diagonal, quotient
 
 # --------------------------------------------------------------------------
 # Stations that repeat the readings of an earlier one more closely than noise allows: copies, not measurements.
@@ -90,6 +90,8 @@ MISFIT_CHANCE = 1e-3
 reported."""
 LEAST_SHOWN = 0.1
 """A smaller share of the stand's σ by which stations of one setting scatter is no finding."""
+LEAST_UNEQUAL = 1.5
+"""A smaller ratio of the noises of two axes is no finding: a 95 % interval then still holds 88 %."""
 FEW_FREEDOM = 8.0
 """Fewer degrees of freedom are reported: from them s is known no better than to a quarter."""
 LOW_WEIGHT = 0.1
@@ -120,6 +122,9 @@ REMARKS = {
     "noise": "{triad}: residuals are only {times:.2f} of what noise and stand as declared would leave (chance "
     "{small:.0e}): the declared noise is too large, readings are copies of each other, or they were corrected by a "
     "fit before. Uncertainties stay as declared; check the noise of the profile and the columns sd_.",
+    "axis-noise": "{triad}: residuals along {of[most]} are {of[times]:.1f} times those along {of[least]} (chance in "
+    "equal noise {of[chance]:.0e}). Uncertainties take the axes as equal: they are too small where {of[most]} counts "
+    "most. State the noise of each axis in the columns sd_ of run and readings, or find what acts along it.",
     "settings": "the stand at {where}: {angle} is off by {size:.1f} σ of a setting ({value:+.3g}°). Check this "
     "reference, or declare a larger σ.",
     "settings-apart": "stations of one direction scatter by {share:.0%} of the stand's σ, as if the stand had been set "
@@ -244,6 +249,7 @@ def findings(flags: Iterable[Flag], place: int, labels: Sequence[str]) -> list[F
 def finding_flags(fitted: FittedRuns) -> Iterator[Flag]:
     """All findings of a batch, in order of weight: some ids come more than once."""
     yield from _noise(fitted)
+    yield from _axis_noise(fitted)
     bare = unchecked(fitted.result)
     yield _remark("no-redundancy", np.any(bare, -1), triads=partial(_joined, bare))
     yield _few_degrees(fitted)
@@ -307,6 +313,42 @@ def _noise(fitted: FittedRuns) -> Iterator[Flag]:
             of_triad = {"times": times[:, index], "small": small[:, index]}
             values = {"triad": triad, "rare": partial(rare, index=index), **of_triad}
             yield Flag(f"{triad}-{end}", holds[:, index], REMARKS[end], values)
+
+
+def _axis_variances(result: Fit) -> tuple[Array, Array]:
+    """s² and degrees of freedom (B, t, 3) of the residuals along each axis, without the stations to take again."""
+    good = ~stations_to_reshoot(result)[..., None]
+    square = np.sum(result.analysis.residual**2 * good, 1)
+    freedom = np.sum(diagonal(result.analysis.spread) * good, 1)
+    shape = (len(square), -1, 3)
+    return per_freedom(square, freedom).reshape(shape), freedom.reshape(shape)
+
+
+def _axis_noise(fitted: FittedRuns) -> Iterator[Flag]:
+    """Triads of which one axis has larger residuals than another, beyond what noise explains.
+
+    Definition: Fisher's F of the largest and the smallest s² of an axis, for the six ordered pairs of axes, without the
+    stations to take again.
+    """
+    variance, freedom = _axis_variances(fitted.result)
+    checked = (freedom.min(-1) >= 1) & ~robust(fitted.result)[:, None]
+    ends = variance.argmax(-1), variance.argmin(-1)
+    (most, over), (least, under) = (
+        [np.take_along_axis(each, end[..., None], -1)[..., 0] for each in (variance, freedom)]
+        for end in ends
+    )
+    ratio = quotient(most, least, checked & (least > 0))
+    chance = 6 * fisher_tail(np.maximum(over, 1.0), np.maximum(under, 1.0), ratio)
+    unequal = checked & (chance < MISFIT_CHANCE) & (ratio > LEAST_UNEQUAL**2)
+
+    def of(index: int, place: int) -> dict[str, Any]:
+        names = ("xyz"[end[place, index]] for end in ends)
+        times, rare = np.sqrt(ratio[place, index]), chance[place, index]
+        return dict(zip(("most", "least", "times", "chance"), (*names, times, rare), strict=True))
+
+    for index, triad in enumerate(TRIADS[: variance.shape[1]]):
+        values = {"triad": triad, "of": partial(of, index)}
+        yield Flag(f"{triad}-axis-noise", unequal[:, index], REMARKS["axis-noise"], values)
 
 
 def _settings(fitted: FittedRuns) -> Iterator[Flag]:
