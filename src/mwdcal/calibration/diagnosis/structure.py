@@ -784,10 +784,15 @@ def chance_alone(result: Fit, name: str) -> Array:
         problem = _at_noise_of(part)
         columns = next((c for n, c in families(problem, part.state) if n == name), None)
         if columns is not None:
-            scores = _scores_of(problem, part, {name: columns})
-            one = _trials(scores, (), (name,), scores.misfit)[0][0]
-            chance[first : first + AT_ONCE] = one
+            chance[first : first + AT_ONCE] = chance_of(problem, part, columns)
     return chance
+
+
+def chance_of(problem: Problem, result: Fit, columns: Array) -> Array:
+    """Chance (B,) in noise that columns (B, n, m, k) explain as much of the residuals of a fit to a problem."""
+    scores = _scores_of(problem, result, {"": columns})
+    chance, _ = _trials(scores, (), ("",), scores.misfit)
+    return np.asarray(chance[0])
 
 
 def effects(
