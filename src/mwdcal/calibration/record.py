@@ -320,6 +320,9 @@ MOST_FREEDOM = 1e6
 """Degrees of freedom that stand for infinitely many."""
 DOUBT = 0.05
 """Chance of residuals so large, if all is as declared, from which on a declared noise counts as known."""
+MISFIT_CHANCE = 1e-3
+"""Chance of so large or so small residuals, or of so large a departure of what is declared, below which it is
+reported."""
 SCALED = (NOISE, REPEATABILITY, SETTINGS)
 """Sources whose variance is scaled by that of the residuals."""
 AXES_OF_A_TERM = 3
@@ -504,9 +507,10 @@ class TriadCalibration(msgspec.Struct, frozen=True, kw_only=True):
     def noise_of(self, readings: Readings) -> Array:
         """Standard uncertainty (..., n, 3) of readings as they state it, or (), as the run does.
 
-        Times s where residuals of the run are too large for the noise that it declares.
+        Times s where residuals of the run are reported as too large for the noise that it declares.
         """
-        doubtful = self.misfit_probability is not None and self.misfit_probability <= DOUBT
+        chance = self.misfit_probability
+        doubtful = chance is not None and chance < MISFIT_CHANCE
         excess = max(self.variance_factor or 1.0, 1.0) if doubtful else 1.0
         return np.asarray(readings.sd.get(self.name, self.noise) * np.sqrt(excess))
 

@@ -31,7 +31,7 @@ from mwdcal.calibration.diagnosis.structure import described as seen_as
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import DIRECTION
 from mwdcal.calibration.readings import EARTH_GRAVITY, EARTH_RANGES, HIGHEST, TRIADS, Readings
-from mwdcal.calibration.record import SHOWN_DRIFT, Finding
+from mwdcal.calibration.record import MISFIT_CHANCE, SHOWN_DRIFT, Finding
 from mwdcal.calibration.residuals import REASONS, shown_in, tail
 from mwdcal.calibration.results import (
     common_source,
@@ -85,9 +85,6 @@ def _noise_in_residuals(result: Fit) -> Array:
     return np.where(noise > 0, noise, 1.0)
 
 
-MISFIT_CHANCE = 1e-3
-"""Chance of so large or so small residuals, or of so large a departure of what is declared, below which it is
-reported."""
 LEAST_SHOWN = 0.1
 """A smaller share of the stand's σ by which stations of one setting scatter is no finding."""
 LEAST_UNEQUAL = 1.5
@@ -328,7 +325,7 @@ def _axis_noise(fitted: FittedRuns) -> Iterator[Flag]:
     """Triads of which one axis has larger residuals than another, beyond what noise explains.
 
     Definition: Fisher's F of the largest and the smallest s² of an axis, for the six ordered pairs of axes, without the
-    stations to take again.
+    stations to take again. Of less noise than is declared an uncertainty makes no use.
     """
     variance, freedom = _axis_variances(fitted.result)
     checked = (freedom.min(-1) >= 1) & ~robust(fitted.result)[:, None]
@@ -339,7 +336,7 @@ def _axis_noise(fitted: FittedRuns) -> Iterator[Flag]:
     )
     ratio = quotient(most, least, checked & (least > 0))
     chance = 6 * fisher_tail(np.maximum(over, 1.0), np.maximum(under, 1.0), ratio)
-    unequal = checked & (chance < MISFIT_CHANCE) & (ratio > LEAST_UNEQUAL**2)
+    unequal = checked & (chance < MISFIT_CHANCE) & (ratio > LEAST_UNEQUAL**2) & (most > 1)
 
     def of(index: int, place: int) -> dict[str, Any]:
         names = ("xyz"[end[place, index]] for end in ends)
