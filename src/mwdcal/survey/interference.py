@@ -523,7 +523,7 @@ def _misfit(calibration: Calibration, whole: Estimate) -> dict[str, str]:
 def _chance_of_change(whole: Estimate) -> float:
     """Chance in noise, as the surveys have it, of axial residuals of one well that follow its order as much.
 
-    Definition: Fisher's F of a polynomial of the second degree in the place of a survey.
+    Definition: Fisher's F of a polynomial of the second degree in the number of a survey.
     """
     result, problem = whole.result, whole.result.problem
     place = np.linspace(-1, 1, whole.readings.count)
