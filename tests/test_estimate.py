@@ -334,10 +334,12 @@ def test_a_fit_that_starts_near_its_end_goes_all_the_way(away):
     sd = np.sqrt(np.diagonal(result.analysis.covariance, axis1=1, axis2=2))
     start = replace(result.state, params=result.state.params + away * sd)
     state, status, iterations = gauss_newton(result.problem, start)
-    before, after = (result.problem.linear(at).normal.cost for at in (result.state, state))
+    left = (state.params - result.state.params)[0]
+    [information] = result.problem.linear(result.state).normal.reduced[0]
     assert status == 0
     assert iterations >= 2
-    assert after - before < 1e-10 * away**2
+    # by the information: the difference of the costs is rounding; the first fit stops at 3e-8 σ
+    assert left @ information @ left < 1e-10 * away**2 + 1e-15
 
 
 @pytest.mark.parametrize("options", [Options(), Options(nonlinearity={"magnetometer": 0.005})])

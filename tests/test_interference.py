@@ -23,7 +23,7 @@ from mwdcal.planning.plans import grid, run, servo
 from mwdcal.presentation.interference_page import render
 from mwdcal.presentation.survey import interference_screen
 from mwdcal.survey.acceptance import SensorTerms, judged, load_survey_limits
-from mwdcal.survey.interference import DRIFTED, deviations, interference
+from mwdcal.survey.interference import DRIFTED, _chance_of_change, deviations, interference
 from mwdcal.survey.interference_estimate import Assumed, Estimate, estimate, misfits, sensor_drift
 from mwdcal.survey.stations import North
 from mwdcal.survey.well import well as judged_well
@@ -424,6 +424,44 @@ def test_casing_at_the_last_surveys_is_named() -> None:
     assert result.interference.axial_nt == pytest.approx(
         1500, abs=4 * result.interference.sd_axial_nt
     )
+
+
+def changed(size: float, seed: int, start: int = len(DEVIATED) // 2) -> Readings:
+    """A well whose axial interference is another from a survey on, nT."""
+    readings = well(DEVIATED, seed)
+    moved = np.array(readings.magnetometer)
+    moved[start:, 2] += size
+    return replace(readings, magnetometer=moved)
+
+
+def test_interference_that_changes_along_the_well_is_refused() -> None:
+    """Sound wells are not, nor those whose field wanders to and fro: 5 % of these are."""
+    wander = 150 * np.sin(6 * np.pi * np.linspace(0, 1, len(DEVIATED)))[:, None] / FIELD
+    refused = {0: 0, 200: 0, 500: 0, "wanders": 0}
+    for seed in range(40):
+        for size in (0, 200, 500):
+            refused[size] += bool(interference(laboratory(), changed(size, seed)).refusal)
+        sound = changed(0, seed)
+        moved = replace(sound, magnetometer=sound.magnetometer * (1 + wander))
+        analysis = interference(laboratory(), moved)
+        refused["wanders"] += bool(analysis.refusal)
+        assert "surveys-do-not-fit" in {each.id for each in analysis.summary.findings}
+    assert refused[0] == 0
+    assert refused[200] >= 38
+    assert refused[500] == 40
+    assert refused["wanders"] <= 6
+    with pytest.raises(FitError, match="axial interference that changes along the well"):
+        interference(laboratory(), changed(500, 0)).check()
+
+
+def test_the_chance_of_a_change_is_no_smaller_than_it_is_in_noise() -> None:
+    readings = surveyed(laboratory(), DEVIATED, 150, seed=8)
+    chances = [
+        _chance_of_change(estimate(laboratory(), part(readings, slice(k, k + 1)), PLAIN))
+        for k in range(150)
+    ]
+    for level in (0.02, 0.1, 0.3):
+        assert np.mean(np.array(chances) < level) < level + 3 * np.sqrt(level / 150)
 
 
 def test_good_surveys_are_seldom_called_doubtful() -> None:

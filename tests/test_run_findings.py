@@ -1,5 +1,6 @@
 """Findings about what a run cannot show: copies of stations, the hemisphere, unknown gravity."""
 
+import re
 from dataclasses import replace
 
 import msgspec
@@ -9,7 +10,13 @@ from scipy import stats
 
 from mwdcal.calibration.automatic.auto import choose_order
 from mwdcal.calibration.calibrate import calibrate
-from mwdcal.calibration.diagnosis.findings import AGREEING, _copies, resolution
+from mwdcal.calibration.copies import (
+    AGREEING,
+    agreement,
+    in_fit,
+    repeated,
+    resolution,
+)
 from mwdcal.calibration.diagnosis.plausibility import stations_to_reshoot
 from mwdcal.calibration.diagnosis.structure import shown_effects
 from mwdcal.calibration.estimate import fit, solve
@@ -18,6 +25,7 @@ from mwdcal.calibration.readings import Readings, fingerprints
 from mwdcal.calibration.residuals import chances
 from mwdcal.errors import FitError
 from mwdcal.estimation.uncertainty import analyse, left_out_variances
+from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.sensor.profile import Profile
 from mwdcal.survey.well import unknown_gravity
 from simulation import DEG, Tool, attitude, plan
@@ -246,11 +254,169 @@ def test_copies_are_the_stations_near_an_earlier_one(count):
     rows[[3, count // 2, count - 1]] = rows[[1, 0, 0]]
     rows[count - 2] = rows[2] + 0.9 * AGREEING * rng.choice([-1, 1], 6)
     rows[count - 3] = rows[2] + 1.1 * AGREEING
-    pairs = KDTree(rows).query_pairs(AGREEING, p=np.inf)
+    pairs = KDTree(rows).query_pairs(AGREEING * 6**0.5)
     expected = np.isin(np.arange(count), [max(pair) for pair in pairs])
-    np.testing.assert_array_equal(_copies(rows), expected)
+    np.testing.assert_array_equal(repeated(rows), expected)
     assert expected.sum() == 4
-    assert not _copies(300.0 * rng.standard_normal((count, 6))).any()
+    assert not repeated(300.0 * rng.standard_normal((count, 6))).any()
+
+
+@pytest.mark.parametrize("steps", [(0, 0, 0), (2, 0, 0), (0.6, 2, 0)])
+def test_the_chance_that_two_measurements_agree_is_that_of_pairs_that_are_drawn(steps, monkeypatch):
+    """Of readings in counts, by the largest chance at any place between two counts."""
+    monkeypatch.setattr("mwdcal.calibration.copies.AGREEING", 0.15)
+    rng, size = np.random.default_rng(0), 400_000
+    drawn = []
+    for place in (0.0, 0.5):
+        pair = rng.standard_normal((2, size, 3)) + place * np.array(steps)
+        for k, step in enumerate(steps):
+            if step:
+                pair[..., k] = np.round(pair[..., k] / step) * step
+        drawn.append(np.mean(np.sum((pair[0] - pair[1]) ** 2, -1) <= 3 * 0.15**2))
+    chance = agreement(np.array(steps, float))
+    assert chance > max(drawn) - 3 * np.sqrt(max(drawn) / size)
+    assert chance < 2.5 * max(drawn)
+
+
+def test_a_run_pasted_twice_is_calibrated_as_it_was_measured_once():
+    """Last digits changed by a hundredth of the noise, by a tenth of it, and by all of it."""
+    data, rng, labels = run(sd={}), np.random.default_rng(1), []
+    for share in (0.02, 1.0):
+        jitter = {n: share * float(NOISE[n]) * rng.standard_normal((48, 3)) for n in NOISE}
+        triads = {
+            n: np.concatenate([getattr(data, n), getattr(data, n) + jitter[n]]) for n in NOISE
+        }
+        known = {n: np.tile(v, 2) for n, v in data.known.items()}
+        made = calibrate(replace(data, **triads, known=known), PROFILE)
+        labels.append(made.excluded)
+    assert labels == [[str(n) for n in range(49, 97)], []]
+
+
+TEST = np.arange(12, 24)
+"""Stations of the run of 48 that a roll test repeats: a turn of toolface at 45°."""
+
+
+def rolled_again(data, change):
+    """A calibration of a run, and readings of `TEST` after a `change` of both triads."""
+    digest = fingerprints([data.accelerometer, data.magnetometer])
+    record = calibrate(replace(data, digest=digest), PROFILE)
+    triads = [change(getattr(data, name)[TEST], float(NOISE[name])) for name in NOISE]
+    known = {n: v[TEST] for n, v in data.known.items()}
+    return record, Readings(*triads, known=known, digest=fingerprints(triads))
+
+
+CHANGES = {
+    "as it is": lambda v, noise: v,
+    "rounded to a tenth of the noise": lambda v, noise: np.round(v / noise, 1) * noise,
+    "another unit and back": lambda v, noise: np.round(v * 9.80665, 7) / 9.80665,
+    "backwards, with jitter": lambda v, noise: v[::-1] + 1e-2 * noise * np.sin(np.arange(36)).reshape(12, 3),
+    "one triad rounded to the noise": lambda v, noise: np.round(v / noise, 1 if noise > 1 else 0) * noise,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("sd", [NOISE, {}], ids=["declared", "estimated"])
+@pytest.mark.parametrize("change", CHANGES)
+def test_rows_of_the_fit_are_known_whatever_their_digits(change, sd):
+    record, test = rolled_again(run(sd=sd), CHANGES[change])
+    assert in_fit(record, test).all()
+    rows = [msgspec.structs.replace(r, readings=msgspec.UNSET) for r in record.station_rows]
+    earlier = msgspec.structs.replace(record, station_rows=rows)
+    assert in_fit(earlier, test).all() == (change == "as it is")
+
+
+@pytest.mark.parametrize(("counts", "times"), [(None, 1), (None, 9), (0.3, 1), (1.0, 1)])
+def test_readings_anew_at_the_settings_of_the_fit_are_no_copies(counts, times):
+    """Also where they repeat nine times better than the noise that is declared, and residuals show."""
+    for seed in range(20):
+        data, rng = run(seed, counts=counts), np.random.default_rng(100 + seed)
+
+        def anew(values, noise, rng=rng):
+            clean = values + np.sqrt(2) / times * noise * rng.standard_normal(values.shape)
+            return np.round(clean / (counts * noise)) * counts * noise if counts else clean
+
+        record, test = rolled_again(data, anew)
+        assert not in_fit(record, test).any()
+
+
+def test_the_chance_that_a_sound_test_is_refused_is_the_one_stated():
+    """At readings that repeat as well as `REPEATING` allows, of both triads and of one, in many draws."""
+    from mwdcal.calibration.copies import _agreeing
+
+    rng, draws = np.random.default_rng(5), 4000
+    for size in (3, 6):
+        others = 1e4 * rng.standard_normal((48, size))
+        refused = sum(
+            _agreeing(
+                others[TEST] + np.sqrt(2) * rng.standard_normal((12, size)), others, 0.05
+            ).any()
+            for _ in range(draws)
+        )
+        assert 0.1 * 0.05 < refused / draws < 0.05 + 3 * np.sqrt(0.05 / draws)
+
+
+def with_noise(data, seed, **times):
+    """The run with so many times the noise on the axes of some triads."""
+    rng = np.random.default_rng(seed)
+    moved = {
+        name: getattr(data, name)
+        + np.sqrt(np.array(more) ** 2 - 1.0) * float(NOISE[name]) * rng.standard_normal((48, 3))
+        for name, more in times.items()
+    }
+    return replace(data, **moved)
+
+
+@pytest.mark.parametrize("sd", [NOISE, {}], ids=["declared", "estimated"])
+@pytest.mark.parametrize(
+    ("triad", "times"), [("accelerometer", (1, 1, 4)), ("magnetometer", (2, 5, 1))]
+)
+def test_an_axis_of_another_noise_is_named(triad, times, sd):
+    """With the ratio that regressions of each channel on the reference vectors leave, and SciPy's F."""
+    data = with_noise(run(sd=sd), 1, **{triad: times})
+    text = found(data)[f"{triad}-axis-noise"]
+    vectors = attitude(*(data.known[n] for n in ("inclination", "azimuth", "toolface")))
+    vector = vectors(1.0, 1.0, data.known["dip"][0])[triad == "magnetometer"]
+    design = np.c_[vector, np.ones(48)]
+    left = np.linalg.lstsq(design, getattr(data, triad))[1] / 44
+    most, least = "xyz"[left.argmax()], "xyz"[left.argmin()]
+    ratio = left.max() / left.min()
+    figures = r".* along (.) are ([0-9.]+) times those along (.) \(chance in equal noise (.*?)\)"
+    larger, times, smaller, chance = re.match(figures, text).groups()
+    assert (larger, smaller) == (most, least)
+    assert float(times) == pytest.approx(ratio**0.5, rel=0.1)  # stations to re-shoot are left out
+    assert np.log(float(chance)) == pytest.approx(np.log(6 * stats.f.sf(ratio, 44, 44)), rel=0.1)
+    other = {"accelerometer": "magnetometer", "magnetometer": "accelerometer"}[triad]
+    assert f"{other}-axis-noise" not in found(data)
+
+
+def test_axes_of_one_noise_are_not_named():
+    for seed in range(10):
+        for sd in (NOISE, {}):
+            assert not [name for name in found(run(seed, sd=sd)) if name.endswith("axis-noise")]
+
+
+def test_noise_by_axis_that_is_declared_is_not_named():
+    times = {"accelerometer": (1, 1, 4)}
+    sd = {**NOISE, "accelerometer": np.tile([1e-4, 1e-4, 4e-4], (48, 1))}
+    assert "accelerometer-axis-noise" not in found(with_noise(run(sd=sd), 1, **times))
+
+
+@pytest.mark.parametrize("own", [False, True], ids=["of the run", "of the readings"])
+def test_readings_have_the_noise_that_the_run_shows(own):
+    """Not the third of it that the run declares; where residuals agree with what is declared, just that."""
+    loud = dict.fromkeys(NOISE, (3, 3, 3))
+    for data, times in ((with_noise(run(), 1, **loud), 3.0), (run(), 1.0)):
+        record = calibrate(data, PROFILE)
+        still = replace(data[20:21], known={}, sd=NOISE if own else {})
+        many = Readings(*(np.repeat(getattr(still, n), 4000, 0) for n in NOISE), sd=still.sd)
+        noisy = {
+            n: getattr(many, n)
+            + times * float(NOISE[n]) * np.random.default_rng(k).standard_normal((4000, 3))
+            for k, n in enumerate(NOISE)
+        }
+        for name in ("inclination", "azimuth", "gravity", "field"):
+            scatter = np.std(OBSERVABLES[name].value(*record.fields(replace(many, **noisy))))
+            sd = [record.uncertainty(name, still, noise=noise)[0] for noise in (True, False)]
+            assert np.sqrt(sd[0] ** 2 - sd[1] ** 2) == pytest.approx(scatter, rel=0.15)
 
 
 def few_stations(seeds, sd, error=0.0, inclinations=(45, 100)):

@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 from msgspec.structs import replace as replace_struct
 
+from mwdcal.calibration.copies import in_fit
 from mwdcal.calibration.diagnosis.identity import other_tool, unidentified
 from mwdcal.calibration.readings import HIGHEST, TRIADS, Readings, is_simulated, serial_of
 from mwdcal.calibration.record import Calibration, Finding
@@ -164,7 +165,7 @@ def for_run(previous: Calibration, readings: Readings) -> PriorInformation:
             f"{where} is of tool {other[0]}, the run is of {other[1]}. Give the previous calibration "
             "of the same tool."
         )
-    if any(previous.used(readings.digest)):
+    if in_fit(previous, readings).any():
         raise InputError(
             f"{where} was made from stations of this run, which would count twice. Give a "
             "calibration from an earlier run."

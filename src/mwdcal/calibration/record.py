@@ -336,6 +336,9 @@ MOST_FREEDOM = 1e6
 """Degrees of freedom that stand for infinitely many."""
 DOUBT = 0.05
 """Chance of residuals so large, if all is as declared, from which on a declared noise counts as known."""
+MISFIT_CHANCE = 1e-3
+"""Chance of so large or so small residuals, or of so large a departure of what is declared, below which it is
+reported."""
 SCALED = (NOISE, REPEATABILITY, SETTINGS)
 """Sources whose variance is scaled by that of the residuals."""
 AXES_OF_A_TERM = 3
@@ -410,11 +413,13 @@ class StationRow(msgspec.Struct, frozen=True, kw_only=True):
     `deviation` is the station's χ² put as an equivalent number of standard deviations of one
     normal variable; `reshoot` marks the ones to take again. `errors_left_out` are the errors
     when the station has no part in the fit, `influence` the largest change it makes by itself
-    at any station of the run, `weight` its share in a robust fit.
+    at any station of the run, `weight` its share in a robust fit. `readings` of the accelerometer, g, and of the
+    magnetometer, nT, are nominal, x, y and z of each; absent in earlier versions.
     """
 
     station: str
     digest: str
+    readings: list[float] | msgspec.UnsetType = msgspec.UNSET
     temperature_c: float | None
     inclination_deg: float | None
     toolface_deg: float | None
@@ -514,6 +519,16 @@ class TriadCalibration(msgspec.Struct, frozen=True, kw_only=True):
         """Degrees of freedom of the residuals, or of a declared noise where these agree with it."""
         agrees = (self.misfit_probability or 0.0) > DOUBT and self.noise_source == "declared"
         return MOST_FREEDOM if agrees else self.degrees_of_freedom
+
+    def noise_of(self, readings: Readings) -> Array:
+        """Standard uncertainty (..., n, 3) of readings as they state it, or (), as the run does.
+
+        Times s where residuals of the run are reported as too large for the noise that it declares.
+        """
+        chance = self.misfit_probability
+        doubtful = chance is not None and chance < MISFIT_CHANCE
+        excess = max(self.variance_factor or 1.0, 1.0) if doubtful else 1.0
+        return np.asarray(readings.sd.get(self.name, self.noise) * np.sqrt(excess))
 
     def functions(self, reference: float) -> Whole:
         """The model that these parameters belong to."""
@@ -770,7 +785,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         readings = as_readings(readings)
         shape, parts = readings.accelerometer.shape[:-1], []
         for triad, model, (parameters, raw, temperature), vector in self._measured(readings):
-            sd = readings.sd.get(triad.name, np.array(triad.noise))
+            sd = triad.noise_of(readings)
             if not model.varies and np.ndim(sd) < raw.ndim:  # one for all readings
                 raw, temperature = raw[..., :1, :], temperature[..., :1]
             slope, sd = model.slope(parameters, raw, temperature), np.broadcast_to(sd, raw.shape)

@@ -309,6 +309,7 @@ class Residuals:
         rows = zip(
             run.labels,
             run.digest or [""] * run.count,
+            figures(np.concatenate([getattr(run, name) for name in run.triads], -1)),
             [None] * run.count if run.temperature is None else figures(run.temperature),
             figures(self._angles[place]),
             *(_named(names, each[place]) for each in self._shown),
@@ -321,6 +322,7 @@ class Residuals:
             StationRow(
                 station=label,
                 digest=digest,
+                readings=readings,
                 temperature_c=warmth,
                 **{f"{name}_deg": stated(angle) for name, angle in zip(ANGLES, angles, strict=True)},
                 errors=errors,
@@ -333,7 +335,7 @@ class Residuals:
                 worst=self._worst(place, number, errors) if bad else None,
             )
             for number, (
-                label, digest, warmth, angles, errors, before, left_out, influence, weight, far, bad
+                label, digest, readings, warmth, angles, errors, before, left_out, influence, weight, far, bad,
             ) in enumerate(rows)
         ]  # fmt: skip
 

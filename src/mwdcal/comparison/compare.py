@@ -534,5 +534,7 @@ def advice(rows: tuple[Row, ...]) -> str:
         winner = joint if scores["joint"] <= NEAR_BEST * scores[winner.method] else winner
     why = f"{winner.method}: held-out errors {scores.pop(winner.method):.2f} times the best of each"
     free = f"; leaves {', '.join(winner.undetermined)} undetermined" if winner.undetermined else ""
-    others = ", ".join(f"{m} {s:.2f}" for m, s in sorted(scores.items(), key=lambda pair: pair[1]))
+    others = ", ".join(
+        f"{m} {s:.2f}" for m, s in sorted(scores.items(), key=lambda x: round(x[1], 2))
+    )
     return f"use {why}{free}" + (f" (others: {others})." if others else ".")

@@ -14,6 +14,7 @@ from typing import Any, ClassVar, NamedTuple
 import msgspec
 import numpy as np
 
+from mwdcal.calibration.copies import in_fit
 from mwdcal.calibration.diagnosis.identity import doubts, other_tool
 from mwdcal.calibration.readings import CONSTANTS, LEAST_TEMPERATURE_SPAN, TRIADS, Readings
 from mwdcal.calibration.record import Calibration, Finding
@@ -112,7 +113,7 @@ def _check(calibration: Calibration, readings: Readings) -> None:
             f"{readings.name} is of tool {other[1]}, the calibration of tool {other[0]}. Give readings of the "
             "same tool, or correct 'serial' in the file."
         )
-    if any(calibration.used(readings.digest)):
+    if in_fit(calibration, readings).any():
         raise InputError(
             f"{readings.name}: stations of the calibration's own fit cannot show what has changed since. Give "
             "later readings."
@@ -371,7 +372,7 @@ def _rolled(
             getattr(readings, triad.name),
         )
         added = raw_reading(model, np.array(triad.parameters), vector, warmth)
-        stated = np.broadcast_to(readings.sd.get(triad.name, triad.noise), before.shape)
+        stated = np.broadcast_to(triad.noise_of(readings), before.shape)
         raw[triad.name] = np.concatenate([before, added])
         sd[triad.name] = np.concatenate([stated, np.tile(stated.mean(0), (4, 1))])
     return raw, sd

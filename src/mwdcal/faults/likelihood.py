@@ -328,7 +328,7 @@ class Suspect:
         triads = []
         for triad in calibration.triads[: len(readings.triads)]:
             raw = getattr(readings, triad.name)
-            sd = np.broadcast_to(readings.sd.get(triad.name, triad.noise), raw.shape)
+            sd = np.broadcast_to(triad.noise_of(readings), raw.shape)
             floor = LEAST_SD * np.sqrt(np.mean(raw**2) + 1e-12)
             model = batch_of_one(triad.functions(calibration.reference_temperature))
             triads.append(Triad(model, raw[None], np.maximum(sd, floor)[None]))

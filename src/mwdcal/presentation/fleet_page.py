@@ -81,6 +81,7 @@ REMARKED = {
     "residuals": "residuals of the {triad} are larger than the declared noise explains",
     "settings": "the stand at one or more of its settings is off by far more than declared",
     "toolface-shared": "errors of the stand's toolface agree as if it had been set less often than at every station",
+    "axis-noise": "residuals along one axis are far larger than along another",
     "settings-apart": "stations of one direction scatter as if the stand had been set anew at each",
     "field-drift": "the field drifted during the run: fit and uncertainty include it",
     "drift": "offsets of the {triad} drifted during the run: fit and uncertainty include it",

@@ -18,7 +18,12 @@ from mwdcal.presentation.survey import (
     misfit_in_words,
 )
 from mwdcal.presentation.text import plural
-from mwdcal.survey.interference import Interference, InterferenceStation, MultiStationAnalysis
+from mwdcal.survey.interference import (
+    CHANGED_ALONG,
+    Interference,
+    InterferenceStation,
+    MultiStationAnalysis,
+)
 from mwdcal.use import plots
 
 if TYPE_CHECKING:
@@ -72,6 +77,10 @@ def _banner(summary: MultiStationAnalysis) -> dict[str, str]:
     if not summary.separable:
         headline = "Interference cannot be separated from azimuth"
         return banner("bad", "Refused", headline, f"Azimuth would be uncertain by {left}.")
+    if changes := [each.text for each in summary.findings if each.id == CHANGED_ALONG]:
+        return banner(
+            "bad", "Refused", "Surveys do not have one interference", changes[0].capitalize()
+        )
     headline = (
         f"Axial {estimate(size.axial_nt, size.sd_axial_nt, 'nT')}, "
         f"cross-axial {estimate(size.cross_axial_nt, size.sd_cross_axial_nt, 'nT')}"

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 
 from mwdcal.calibration import results
+from mwdcal.calibration.diagnosis.structure import chance_of, products
 from mwdcal.calibration.readings import CONSTANTS, Readings, is_simulated
 from mwdcal.calibration.record import Calibration, Finding, rounded, stated, with_checksum
 from mwdcal.calibration.residuals import RESHOOT
@@ -136,6 +137,9 @@ FEWEST_SURVEYS = 2
 """Surveys below which nothing can be said of several stations."""
 LEAST_CHANCE = 1e-3
 """Chance of as large a misfit below which the surveys do not fit."""
+CHANGED_ALONG = "interference-changes"
+CHANGE_CHANCE = 0.05
+"""Chance below which the misfit of surveys that do not fit is a change of the interference along the well."""
 LEAST_SEEN = 2.0
 """Interference below this many standard uncertainties in every direction was not seen."""
 FEWEST_AT_END = 2
@@ -245,15 +249,23 @@ class Interference:
         """Sources in the standard uncertainties of magnetic azimuths, and those left out."""
         return error_terms(self.calibration.findings, declination=False)
 
-    def check(self) -> None:
-        """Refuse to go on with what cannot be trusted; raises `FitError`."""
-        if not self.summary.separable:
-            summary = self.summary
-            raise FitError(
+    @property
+    def refusal(self) -> str:
+        """Why the result cannot be trusted, in sentences; empty if it can."""
+        summary = self.summary
+        if not summary.separable:
+            return (
                 f"{self.readings.name}: the surveys do not separate interference from azimuth, which would "
                 f"stay uncertain by {summary.azimuth_sd_deg:.2g}° (1σ; {summary.largest_azimuth_sd_deg:g}° is "
                 f"allowed). {summary.missing}"
             )
+        changes = [each.text for each in summary.findings if each.id == CHANGED_ALONG]
+        return f"{self.readings.name}: {changes[0]}" if changes else ""
+
+    def check(self) -> None:
+        """Refuse to go on with what cannot be trusted; raises `FitError`."""
+        if self.refusal:
+            raise FitError(self.refusal)
 
 
 def interference(
@@ -267,7 +279,7 @@ def interference(
     `depth` (n,) is measured depth, m, for tables and pictures. Surveys without a reading, and those outside
     the calibrated temperatures, are left out.
     Raises `InputError` where something is missing, `FitError` for too few surveys; whether the result is to be
-    trusted is `separable`: see `Interference.check`.
+    trusted: see `Interference.check`.
     """
     used = usable(calibration, readings)
     count = int(np.count_nonzero(used))
@@ -494,10 +506,31 @@ def _misfit(calibration: Calibration, whole: Estimate) -> dict[str, str]:
         return {}
     factor = float(np.sqrt(results.variance_scales(whole.result)[0].max()))
     widened = f" Uncertainties are widened {factor:.2g} times." if factor > 1.05 else ""
-    return {
+    texts = {
         "surveys-do-not-fit": f"the surveys do not fit (chance {chance:.1g}): the sensors have changed by more than "
         "`sensor_drift` allows, or field and dip are not those of the references." + widened
     }
+    if (changing := _chance_of_change(whole)) < CHANGE_CHANCE:
+        texts[CHANGED_ALONG] = (
+            "the surveys do not fit, and what is left along the axis follows their order (chance "
+            f"{changing:.1g}): axial interference that changes along the well, or a drift of the sensors. No "
+            "uncertainty covers it. Give the surveys before and after a change of the drill string as runs of their "
+            "own, or do without multi-station analysis."
+        )
+    return texts
+
+
+def _chance_of_change(whole: Estimate) -> float:
+    """Chance in noise, as the surveys have it, of axial residuals of one well that follow its order as much.
+
+    Definition: Fisher's F of a polynomial of the second degree in the number of a survey.
+    """
+    result, problem = whole.result, whole.result.problem
+    place = np.linspace(-1, 1, whole.readings.count)
+    order = np.asarray(np.polynomial.legendre.legvander(place, 2)[:, 1:], float)
+    axial = np.zeros((*problem.temperature.shape, 6, 1))
+    axial[..., 5, 0] = problem.evidence.include / problem.triads[1].sd[..., 2]
+    return float(chance_of(problem, result, products(axial, order))[0])
 
 
 def _doubtful_references(whole: Estimate) -> dict[str, str]:

@@ -207,9 +207,7 @@ def surveys(calibration: Calibration, readings: Readings) -> Readings:
             )
     calibration.fields(readings)
     shape = readings.accelerometer.shape
-    sd = {
-        t.name: np.broadcast_to(readings.sd.get(t.name, t.noise), shape) for t in calibration.triads
-    }
+    sd = {t.name: np.broadcast_to(t.noise_of(readings), shape) for t in calibration.triads}
     random = [readings.uncertainty(RANDOM + name) for name in ("field", "dip")]
     moved = np.maximum(random[0], readings.reference("field") * random[1])
     sd["magnetometer"] = np.hypot(sd["magnetometer"], moved[..., None])

@@ -188,7 +188,7 @@ class VectorCovariance:
         for triad in self.triads:
             raw = getattr(readings, triad.name)
             if raw is not None:
-                sd = np.broadcast_to(readings.sd.get(triad.name, np.array(triad.noise)), raw.shape)
+                sd = np.broadcast_to(triad.noise_of(readings), raw.shape)
                 channels.append([np.moveaxis(v, -1, 0).reshape(3, -1) for v in (raw, sd)])
         result = np.full((21, scaled.size), np.nan)
         for start in range(0, scaled.size, _TERMS_AT_ONCE):

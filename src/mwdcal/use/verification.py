@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Literal
 import msgspec
 import numpy as np
 
+from mwdcal.calibration.copies import in_fit
 from mwdcal.calibration.diagnosis.identity import doubts, other_tool
 from mwdcal.calibration.options import ASSUMED, is_assumed
 from mwdcal.calibration.readings import Readings
@@ -518,13 +519,20 @@ def _check_tool(calibration: Calibration, readings: Readings) -> None:
 
 
 def _check_independent(calibration: Calibration, readings: Readings) -> None:
-    used = np.flatnonzero(calibration.used(readings.digest))
-    if used.size:
-        raise InputError(
-            f"{readings.name}: {used.size} of {readings.count} stations were in the fit (first: "
-            f"station {readings.labels[used[0]]}). Verification needs data that the fit has not seen: take a roll "
-            "test of its own. mwdcal calibrate judges one that is in the file of the run."
+    used = np.flatnonzero(in_fit(calibration, readings))
+    if not used.size:
+        return
+    known, again = np.array(calibration.used(readings.digest), bool), ""
+    if not known.any():
+        again = (
+            ", or repeat its readings more closely than noise allows: copies with other digits. If they are "
+            "measurements, state the noise and the uncertainties of the stand in the tool profile of the calibration"
         )
+    raise InputError(
+        f"{readings.name}: {used.size} of {readings.count} stations were in the fit (first: "
+        f"station {readings.labels[used[0]]}){again}. Verification needs data that the fit has not seen: take a roll "
+        "test of its own. mwdcal calibrate judges one that is in the file of the run."
+    )
 
 
 def _check_temperature(calibration: Calibration, readings: Readings) -> None:

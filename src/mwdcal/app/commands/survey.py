@@ -195,7 +195,7 @@ def command(
     ]
     analyses = [analysed(each, sensor_drift) if msa else None for each in inputs]
     pages = _interference_page(inputs[0], analyses[0], msa_html)
-    _check_separable(inputs, analyses, loaded, pages, report, as_json)
+    _check_analyses(inputs, analyses, loaded, pages, report, as_json)
     way: Any = {"tie_in": start, "switch": ends, "outside": outside, "axial": axial_correction}
     result = survey_runs(inputs, analyses, **way)
     pages += _pages(result, report, contributions, station) + _listing(result, listing)
@@ -287,7 +287,7 @@ def _interference_page(
     return [(page, render(analysis, inputs.named))]
 
 
-def _check_separable(
+def _check_analyses(
     inputs: Sequence[WellInputs], analyses: Sequence[Interference | None], loaded: Sequence[LoadedCalibration],
     pages: Outputs, report: Path | None, as_json: bool,
 ) -> None:  # fmt: skip
@@ -295,7 +295,7 @@ def _check_separable(
     from mwdcal.files.formats import atomic
 
     for each, analysis, tool in zip(inputs, analyses, loaded, strict=True):
-        if analysis and not analysis.summary.separable:
+        if analysis and analysis.refusal:
             atomic.write_all(pages + _interference_page(each, analysis, report))
             _refuse(each, analysis, tool.signature, as_json)
 

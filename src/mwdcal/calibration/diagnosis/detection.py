@@ -16,9 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mwdcal.calibration.diagnosis.findings import MISFIT_CHANCE
 from mwdcal.calibration.diagnosis.plausibility import freedom_of
 from mwdcal.calibration.estimate import Fit
+from mwdcal.calibration.record import MISFIT_CHANCE
 from mwdcal.calibration.residuals import RESHOOT
 from mwdcal.estimation.problem import ANGLES, EARTH
 from mwdcal.estimation.uncertainty import TESTED, whole_covariance

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
-from math import erf
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from mwdcal.calibration.automatic.courses import (
     terms_beyond,
     untested,
 )
+from mwdcal.calibration.copies import AGREEING, repeated
 from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag, listed, spaced
 from mwdcal.calibration.diagnosis.plausibility import (
     NOISE_RATIO,
@@ -32,7 +32,7 @@ from mwdcal.calibration.diagnosis.structure import described as seen_as
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import DIRECTION
 from mwdcal.calibration.readings import EARTH_GRAVITY, EARTH_RANGES, HIGHEST, TRIADS, Readings
-from mwdcal.calibration.record import SHOWN_DRIFT, Finding
+from mwdcal.calibration.record import MISFIT_CHANCE, SHOWN_DRIFT, Finding
 from mwdcal.calibration.residuals import REASONS, shown_in, tail
 from mwdcal.calibration.results import (
     common_source,
@@ -43,30 +43,17 @@ from mwdcal.calibration.results import (
 )
 from mwdcal.estimation.problem import WALK_AXES, Prior
 from mwdcal.estimation.solvers import Determined
-from mwdcal.estimation.uncertainty import free_directions
-from mwdcal.geometry.vectors import Array, Bools
+from mwdcal.estimation.uncertainty import fisher_tail, free_directions, per_freedom
+from mwdcal.geometry.vectors import Array, Bools, diagonal, quotient
 
 # --------------------------------------------------------------------------
 # Stations that repeat the readings of an earlier one more closely than noise allows: copies, not measurements.
-
-AGREEING = 0.03
-"""Readings agree that differ on no channel by more than this share of its noise."""
-NEAR = 10.0
-"""Stations of one attitude differ on no channel by more than so many times its noise."""
-BLOCK_OF_STATIONS = 256
-"""Stations whose distances to all others are worked out at once."""
-COINCIDENCE = 1e-3
-"""Chance below which as many pairs of measurements that agree are not a coincidence."""
-LEAST_STEP = 1e-3
-"""A resolution below this share of the noise is as good as none."""
 
 
 def copies(result: Fit) -> Bools:
     """Stations (B, n) whose readings agree with those of an earlier one, where noise does not explain it.
 
-    Definition: two measurements at one attitude agree on a channel by chance with a probability that follows from
-    its noise and its resolution; a channel whose resolution is coarser than its noise says nothing. Copies are
-    named if as many pairs would agree with a chance below `COINCIDENCE`.
+    All stations are compared only in runs where two agree that are near each other on one line through the readings.
     """
     noise = _noise_in_residuals(result)
     rows = np.concatenate(
@@ -77,18 +64,18 @@ def copies(result: Fit) -> Bools:
     line = np.einsum("bnk,k->bn", rows, weights)
     order = np.argsort(line, -1)
     line = np.take_along_axis(line, order, -1)
-    agree, repeated = np.zeros(len(rows), bool), np.zeros(rows.shape[:-1], bool)
+    farthest = len(weights) * AGREEING**2
+    agree, again = np.zeros(len(rows), bool), np.zeros(rows.shape[:-1], bool)
     for apart in range(1, line.shape[-1]):
-        close = line[:, apart:] - line[:, :-apart] <= AGREEING * weights.sum()
+        close = (line[:, apart:] - line[:, :-apart]) ** 2 <= farthest * np.sum(weights**2)
         if not close.any():
             break
         tools, first = np.nonzero(close)
         one, other = (rows[tools, order[tools, at]] for at in (first, first + apart))
-        differ = np.abs(one - other) > AGREEING
-        agree[tools[~differ.any(-1)]] = True
+        agree[tools[np.sum((other - one) ** 2, -1) <= farthest]] = True
     for member in np.flatnonzero(agree):
-        repeated[member] = _copies(rows[member])
-    return repeated
+        again[member] = repeated(rows[member])
+    return again
 
 
 def _noise_in_residuals(result: Fit) -> Array:
@@ -98,55 +85,14 @@ def _noise_in_residuals(result: Fit) -> Array:
     return np.where(noise > 0, noise, 1.0)
 
 
-def _copies(rows: Array) -> Bools:
-    """Stations (n,) of one run that agree with an earlier one, of readings (n, k) in units of their noise."""
-    pairs, near, repeated = 0, 0, np.zeros(len(rows), bool)
-    for first in range(0, len(rows), BLOCK_OF_STATIONS):
-        some = slice(first, first + BLOCK_OF_STATIONS)
-        earlier = np.arange(len(rows)) < np.arange(len(rows))[some, None]
-        apart = np.max([np.abs(each[some, None] - each) for each in rows.T], axis=0)
-        agreeing = earlier & (apart <= AGREEING)
-        pairs += int(np.count_nonzero(agreeing))
-        near += int(np.count_nonzero(earlier & (apart <= NEAR)))
-        repeated[some] = agreeing.any(-1)
-    alone = float(np.prod([_agreement(resolution(each)) for each in rows.T])) if pairs else 1.0
-    coincident = not pairs or _at_least(pairs, near, alone) >= COINCIDENCE
-    return np.zeros(len(rows), bool) if coincident else repeated
-
-
-def _agreement(step: float) -> float:
-    """Chance that two measurements of one value agree on a channel of this resolution, in units of its noise."""
-    return 1.0 if step >= 1.0 else erf(max(AGREEING, step / 2) / 2)
-
-
-def _at_least(pairs: int, of: int, chance: float) -> float:
-    """Chance of as many successes in so many trials: binomial."""
-    from scipy.special import bdtrc
-
-    return float(bdtrc(pairs - 1, of, chance))
-
-
-def resolution(values: Array) -> float:
-    """Largest step of which all differences of values (n,) are multiples; 0 where none is above `LEAST_STEP`.
-
-    Reference: Euclid's algorithm, to `LEAST_STEP`.
-    """
-    rest, step = np.abs(values - values[0]), 0.0
-    while (left := rest[rest > LEAST_STEP]).size:
-        step = float(left.min())
-        rest = np.abs(rest - step * np.round(rest / step))
-    return step if step > 10 * LEAST_STEP else 0.0
-
-
-MISFIT_CHANCE = 1e-3
-"""Chance of so large or so small residuals, or of so large a departure of what is declared, below which it is
-reported."""
 NEARLY_ALL = 0.9
 """Share of an error to declare from which it is declared."""
 AGREEMENT_CHANCE = 1e-4
 """Chance of as much agreement between errors of toolface, below which it is reported."""
 LEAST_SHOWN = 0.1
 """A smaller share of the stand's σ by which stations of one setting scatter is no finding."""
+LEAST_UNEQUAL = 1.5
+"""A smaller ratio of the noises of two axes is no finding: a 95 % interval then still holds 88 %."""
 FEW_FREEDOM = 8.0
 """Fewer degrees of freedom are reported: from them s is known no better than to a quarter."""
 LOW_WEIGHT = 0.1
@@ -177,6 +123,9 @@ REMARKS = {
     "noise": "{triad}: residuals are only {times:.2f} of what noise and stand as declared would leave (chance "
     "{small:.0e}): the declared noise is too large, readings are copies of each other, or they were corrected by a "
     "fit before. Uncertainties stay as declared; check the noise of the profile and the columns sd_.",
+    "axis-noise": "{triad}: residuals along {of[most]} are {of[times]:.1f} times those along {of[least]} (chance in "
+    "equal noise {of[chance]:.0e}). Uncertainties take the axes as equal: they are too small where {of[most]} counts "
+    "most. State the noise of each axis in the columns sd_ of run and readings, or find what acts along it.",
     "settings": "the stand at {where}: {angle} is off by {size:.1f} σ of a setting ({value:+.3g}°). Check this "
     "reference, or declare a larger σ.",
     "settings-apart": "stations of one direction scatter by {share:.0%} of the stand's σ, as if the stand had been set "
@@ -304,6 +253,7 @@ def findings(flags: Iterable[Flag], place: int, labels: Sequence[str]) -> list[F
 def finding_flags(fitted: FittedRuns) -> Iterator[Flag]:
     """All findings of a batch, in order of weight: some ids come more than once."""
     yield from _noise(fitted)
+    yield from _axis_noise(fitted)
     bare = unchecked(fitted.result)
     yield _remark("no-redundancy", np.any(bare, -1), triads=partial(_joined, bare))
     yield _few_degrees(fitted)
@@ -367,6 +317,42 @@ def _noise(fitted: FittedRuns) -> Iterator[Flag]:
             of_triad = {"times": times[:, index], "small": small[:, index]}
             values = {"triad": triad, "rare": partial(rare, index=index), **of_triad}
             yield Flag(f"{triad}-{end}", holds[:, index], REMARKS[end], values)
+
+
+def _axis_variances(result: Fit) -> tuple[Array, Array]:
+    """s² and degrees of freedom (B, t, 3) of the residuals along each axis, without the stations to take again."""
+    good = ~stations_to_reshoot(result)[..., None]
+    square = np.sum(result.analysis.residual**2 * good, 1)
+    freedom = np.sum(diagonal(result.analysis.spread) * good, 1)
+    shape = (len(square), -1, 3)
+    return per_freedom(square, freedom).reshape(shape), freedom.reshape(shape)
+
+
+def _axis_noise(fitted: FittedRuns) -> Iterator[Flag]:
+    """Triads of which one axis has larger residuals than another, beyond what noise explains.
+
+    Definition: Fisher's F of the largest and the smallest s² of an axis, for the six ordered pairs of axes, without the
+    stations to take again. Of less noise than is declared an uncertainty makes no use.
+    """
+    variance, freedom = _axis_variances(fitted.result)
+    checked = (freedom.min(-1) >= 1) & ~robust(fitted.result)[:, None]
+    ends = variance.argmax(-1), variance.argmin(-1)
+    (most, over), (least, under) = (
+        [np.take_along_axis(each, end[..., None], -1)[..., 0] for each in (variance, freedom)]
+        for end in ends
+    )
+    ratio = quotient(most, least, checked & (least > 0))
+    chance = 6 * fisher_tail(np.maximum(over, 1.0), np.maximum(under, 1.0), ratio)
+    unequal = checked & (chance < MISFIT_CHANCE) & (ratio > LEAST_UNEQUAL**2) & (most > 1)
+
+    def of(index: int, place: int) -> dict[str, Any]:
+        names = ("xyz"[end[place, index]] for end in ends)
+        times, rare = np.sqrt(ratio[place, index]), chance[place, index]
+        return dict(zip(("most", "least", "times", "chance"), (*names, times, rare), strict=True))
+
+    for index, triad in enumerate(TRIADS[: variance.shape[1]]):
+        values = {"triad": triad, "of": partial(of, index)}
+        yield Flag(f"{triad}-axis-noise", unequal[:, index], REMARKS["axis-noise"], values)
 
 
 def _settings(fitted: FittedRuns) -> Iterator[Flag]:

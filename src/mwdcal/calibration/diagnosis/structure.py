@@ -789,6 +789,13 @@ def _at_noise_of(result: Fit) -> Problem:
     return replace(result.problem, triads=tuple(triads))
 
 
+def chance_of(problem: Problem, result: Fit, columns: Array) -> Array:
+    """Chance (B,) in noise that columns (B, n, m, k) explain as much of the residuals of a fit to a problem."""
+    scores = _scores_of(problem, result, {"": columns})
+    chance, _ = _trials(scores, (), ("",), scores.misfit)
+    return np.asarray(chance[0])
+
+
 def effects(
     result: Fit, others: Mapping[str, Array] | None = None, shown: Shown | None = None
 ) -> list[Effect]:
