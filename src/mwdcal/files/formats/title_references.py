@@ -590,7 +590,7 @@ def _plain(text: str) -> str:
     bare = re.sub(r"(?<=[\u4e00-\u9fff])(?=[a-zµμ])", " ", bare)
     signs = bare.replace("\0", "°").replace("\1", "²").replace("\2", "й")
     return re.sub(
-        r"(?<![a-zа-я])(?:[mм]\s?/\s?[sс]\s?(?:\^?2|²)|m\s?[.·*]?\s?s\^?[-−]2|mps2?)(?!\d)",
+        r"(?<![a-zа-я])(?:[mм]\s?/\s?[sс]\s?(?:\^?2|²)|m\s?[.·*]?\s?s\^?[-−]2|m s2|mps2?)(?!\d)",
         "m/s²",
         signs,
     )

@@ -49,11 +49,11 @@ _DAYS = (
 )
 """Forms of a day that can be read in one way only; in Germany, Norway and Russia a point stands behind the day."""
 OF_REFUSAL = (
-    r"reject(ed)?|bad|invalid|void|voided|discard(ed)?|unusable|omit(ted)?|excluded?|scrap(ped)?|do not use|dnu|"
+    r"reject(ed)?|bad|invalid|void|voided|discard(ed)?|unusable|omit(ted)?|excluded?|scrap(ped)?|do not use|(not|never) to be used|dnu|"
     r"n\.? ?ok|nok|not ok|no good|n\.o\.k\.?|verworfen|ungultig|schlecht|fehlmessung|unbrauchbar|gestrichen|"
-    r"nicht (ok|verwenden|verwertbar)|n\.? ?i\.? ?o\.?|forkastet|ugyldig|darlig|underkjent|avvist|kassert|"
+    r"nicht (zu )?(verwend\w*|benutz\w*|verwertbar|werten)|nicht ok|n\.? ?i\.? ?o\.?|forkastet|ugyldig|darlig|underkjent|avvist|kassert|"
     r"strøket|stroket|feilmaling|"
-    r"ikke (ok|bruk|brukes)|rechazad[oa]|invalid[oa]|descartad[oa]|anulad[oa]|no (ok|usar|valid[oa])|mal[oa]?|"
+    r"ikke (ok|bruk\w*|gyldig)|rechazad[oa]|invalid[oa]|descartad[oa]|anulad[oa]|no (ok|usar|valid[oa])|mal[oa]?|"
     r"rejeitad[oa]|ruim|nao (ok|usar)|rejete?e?|mauvaise?|annulee?|ecarte|non ok|брак|забракован[оа]?|отбракован[оа]?|"
     r"a rejeter|not used|unused|odrzucon[aey]|scartat[aeio]|ongeldig|afgekeurd|無効|除外|"
     r"плохо|плохая|не ?год(ен|на|но)|недейств\w*|исключ\w*|не использовать|отклонен[оа]?|не ок|"
