@@ -20,7 +20,7 @@ from mwdcal.calibration.diagnosis.flags import listed
 from mwdcal.errors import Answer, InputError, QuestionError
 from mwdcal.files.formats.columns import Column, looks_numeric, shown
 from mwdcal.files.formats.table import Table, labels, numbers, row_word
-from mwdcal.files.formats.titles import ADJUSTED, OF_REFUSAL
+from mwdcal.files.formats.titles import ADJUSTED, NOT_TO_USE, OF_REFUSAL
 from mwdcal.files.parting import check_rows, marked_rows
 from mwdcal.files.statements import rows_of
 from mwdcal.files.synonyms import OURS
@@ -28,8 +28,10 @@ from mwdcal.sensor.profile import TableFormat
 
 _REJECTED = re.compile(rf"\W*({OF_REFUSAL})\W*|\W*({OF_REFUSAL})\s*[-–—:;,.(/!].*", re.DOTALL)
 """A cell that rejects its row, whatever reason follows."""
+_DOES_NOT_COUNT = re.compile(rf"(\D*[,;:–(/-]\s*)?({NOT_TO_USE})\W*")
+"""A cell that says so, whatever stands before it but the number of another row: warm-up, not used."""
 _MAY_REJECT = re.compile(
-    rf"(?<![^\W\d_])({OF_REFUSAL}|fail(ed)?|outlier|suspect|questionable|doubtful|ausreißer|ausreisser|fehler|avvik|"
+    rf"(?<![^\W\d_])({OF_REFUSAL}|{NOT_TO_USE}|fail(ed)?|outlier|suspect|questionable|doubtful|ausreißer|ausreisser|fehler|avvik|"
     r"moved|bumped|disturbed|slipped|knocked|bewegt|verrutscht|gestossen|flyttet|movi(o|do)|mexeu|bouge|сдвин\w*|"
     r"толкн\w*|"
     r"nicht bestanden|falha|fallo|выброс|сбой)(?![^\W\d_])|异常|可疑|移动|碰到"
@@ -149,7 +151,7 @@ def _verdicts(name: str, cells: Sequence[str]) -> dict[str, bool]:
         return dict.fromkeys(filled & _DENIED, True)
     if judges and _OF_REJECTION.fullmatch(name) and filled <= _AFFIRMED | _DENIED:
         return dict.fromkeys(filled & _AFFIRMED, True)
-    verdicts = {c: True for c in filled if _REJECTED.fullmatch(c)}
+    verdicts = {c: True for c in filled if _REJECTED.fullmatch(c) or _does_not_count(c)}
     verdicts |= {c: False for c in filled if c not in verdicts and _MAY_REJECT.search(c)}
     accepted = {c for c in filled if _ACCEPTED.fullmatch(_REMARK_BEHIND.sub("", c))}
     if 2 * sum(map(accepted.__contains__, cells)) < len(cells):
@@ -159,6 +161,30 @@ def _verdicts(name: str, cells: Sequence[str]) -> dict[str, bool]:
         usual = accepted or {max(sorted(different), key=cells.count)}
         verdicts |= dict.fromkeys(filled - usual - {*verdicts}, False)
     return verdicts
+
+
+def _does_not_count(text: str) -> bool:
+    """Whether a text says that its row does not count, and nothing of one that was measured again."""
+    return bool(_DOES_NOT_COUNT.fullmatch(text)) and not _MEASURED_AGAIN.search(text)
+
+
+def by_legend(
+    table: Table, form: TableFormat, used: Collection[str], lines: Collection[str]
+) -> TableFormat:
+    """The form with the cells left out of which a legend in `lines` says that they do not count.
+
+    Of cells that may reject their rows, one is meant by a line such as "M = stand moving, not for calibration".
+    """
+    every = {name: [*cells] for name, cells in form.leave_out.items()}
+    for name, cell in marks_in(table, form, used).doubtful if lines else ():
+        mark = re.compile(rf"(?<!\w){re.escape(cell)}\s*[=:–-]\s*([^;|=]*)(?![^;|]*=)")
+        meanings = [_plain(m[1]) for m in map(mark.search, lines) if m and cell]
+        if len(meanings) == 1 and (
+            _REJECTED.fullmatch(meanings[0]) or _DOES_NOT_COUNT.fullmatch(meanings[0])
+        ):
+            every.setdefault(name, []).append(cell)
+    leave_out = {name: tuple(cells) for name, cells in every.items()}
+    return msgspec.structs.replace(form, leave_out=leave_out)
 
 
 def _holds_words(column: Column) -> bool:

@@ -38,6 +38,7 @@ from mwdcal.files.formats.text import is_preamble
 from mwdcal.files.marks import (
     MARKS_NAMED,
     UNMARKED,
+    by_legend,
     is_the_repeat,
     marks_in,
     place,
@@ -405,9 +406,11 @@ def _proposal(
     units_by_name = dict(zip(where.names, where.units, strict=True)) if where else {}
     names = [*table.columns]
     units = [units_by_name.get(name, "") for name in names]
-    table, open_rows = _without_rejected(table, form, names, units)
-    problems: dict[str, QuestionError] = {}
     above = where.above if where else ()
+    used = [n for n, m in meanings_of(names, units).items() if m.column in UNMARKED]
+    form = by_legend(table, form, used, above) if form and above else form
+    table, open_rows = _without_rejected(table, form, used)
+    problems: dict[str, QuestionError] = {}
     values = partial(_numbers_of, table, problems)
     columns, by_value, ignored = proposed(
         names, units, values, table.source, above, table.metadata, answers, problems, open_rows
@@ -700,7 +703,9 @@ def _stacked_tools(
         if stated.get("serial") in tools:
             return {"serial": ColumnSource(name=name)}
         stacked = len([*groupby(cells)]) == len(tools) and min(tools.values()) >= LEAST_STATIONS
-        if stacked and _WORDS_OF_TOOLS.search(name) and _numbers_of(table, {}, name) is None:
+        named = bool(_WORDS_OF_TOOLS.search(name))
+        numbered = _numbers_of(table, {}, name) is not None
+        if stacked and named and (not numbered or _begins_again(table, cells)):
             raise QuestionError(
                 f"{table.source}: {shown(name)} has {', '.join(map(shown, [*tools][:MOST_NAMED]))}, one below the "
                 "other. Are these tools, and which one is meant?",
@@ -710,6 +715,18 @@ def _stacked_tools(
                 ],
             )
     return {}
+
+
+def _begins_again(table: Table, tools: Sequence[str]) -> bool:
+    """Whether a column counts the stations of each of some tools, one below the other, from the same number on."""
+    starts = [k for k, tool in enumerate(tools) if k == 0 or tool != tools[k - 1]]
+    ends = [*starts[1:], len(tools)]
+    for column in map(partial(labels_of, table), table.columns):
+        blocks = [column[one:other] for one, other in zip(starts, ends, strict=True)]
+        alike = all(each[:LEAST_STATIONS] == blocks[0][:LEAST_STATIONS] for each in blocks)
+        if alike and all(len({*each}) == len(each) for each in blocks):
+            return True
+    return False
 
 
 def _of_one_tool(
@@ -729,11 +746,9 @@ def _of_one_tool(
 
 
 def _without_rejected(
-    table: Table, form: TableFormat | None, names: Sequence[str], units: Sequence[str]
+    table: Table, form: TableFormat | None, used: Collection[str]
 ) -> tuple[Table, list[QuestionError]]:
     """The rows of a table that are not marked as rejected, and a question on each mark that is not plain."""
-    meanings = meanings_of(names, units)
-    used = [n for n, m in meanings.items() if m.column in UNMARKED]
     marks = marks_in(table, form or TableFormat(), used)
     questions = [
         question_on_mark(table, name, cell, rows)

@@ -602,7 +602,10 @@ def _without_dittos(rows: Sequence[tuple[int, Cells]]) -> list[tuple[int, Cells]
         marks = [isinstance(c, str) and bool(_DITTO.fullmatch(c)) for c in row]
         known = all(k < len(above) and above[k] != "" for k, mark in enumerate(marks) if mark)
         if any(marks) and known and any(map(figures.is_figure, row)):
-            row = [above[k] if mark else cell for k, (cell, mark) in enumerate(zip(row, marks, strict=True))]
+            row = [
+                above[k] if mark else cell
+                for k, (cell, mark) in enumerate(zip(row, marks, strict=True))
+            ]
         whole.append((line, row))
     return whole
 
