@@ -175,16 +175,30 @@ def by_legend(
 
     Of cells that may reject their rows, one is meant by a line such as "M = stand moving, not for calibration".
     """
-    every = {name: [*cells] for name, cells in form.leave_out.items()}
-    for name, cell in marks_in(table, form, used).doubtful if lines else ():
-        mark = re.compile(rf"(?<!\w){re.escape(cell)}\s*[=:–-]\s*([^;|=]*)(?![^;|]*=)")
-        meanings = [_plain(m[1]) for m in map(mark.search, lines) if m and cell]
-        if len(meanings) == 1 and (
-            _REJECTED.fullmatch(meanings[0]) or _DOES_NOT_COUNT.fullmatch(meanings[0])
-        ):
-            every.setdefault(name, []).append(cell)
-    leave_out = {name: tuple(cells) for name, cells in every.items()}
-    return msgspec.structs.replace(form, leave_out=leave_out)
+    leave_out, keep = ({n: [*c] for n, c in each.items()} for each in (form.leave_out, form.keep))
+    doubtful = marks_in(table, form, used).doubtful if lines else {}
+    for name in dict.fromkeys(name for name, _ in doubtful):
+        meanings = {cell: _meaning(cell, lines) for cell in {*labels(table, name)} - {""}}
+        out = [c for c, m in meanings.items() if _REJECTED.fullmatch(m) or _does_not_count(m)]
+        if out:
+            leave_out.setdefault(name, []).extend(sorted(out))
+            keep.setdefault(name, []).extend(c for c in sorted({*meanings} - {*out}) if meanings[c])
+    return msgspec.structs.replace(
+        form,
+        leave_out={name: tuple(cells) for name, cells in leave_out.items()},
+        keep={name: tuple(cells) for name, cells in keep.items() if cells},
+    )
+
+
+def _meaning(cell: str, lines: Collection[str]) -> str:
+    """What a legend in one of some lines says of a cell, without marks; empty where none or several do.
+
+    >>> _meaning("M", ["S = stable", "State M = moving, not used"]), _meaning("M", ["M = a, S = b"])
+    ('moving, not used', '')
+    """
+    mark = re.compile(rf"(?<!\w){re.escape(cell)}\s*[=:]\s*([^;|=:]*)(?![^;|]*[=:])")
+    meanings = [_plain(m[1]) for m in map(mark.search, lines) if m]
+    return meanings[0] if len(meanings) == 1 else ""
 
 
 def _holds_words(column: Column) -> bool:

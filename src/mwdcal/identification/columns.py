@@ -531,6 +531,7 @@ def meanings_of(
     results = _by_legend(names, above) | results
     results |= _behind_titles(names, units, results)
     results |= _beside_nominal(names, units, results)
+    results |= _beside_tool(names, units, results)
     every = [n for n, m in results.items() if m.column == "az"]
     lone = [n for n in every if _BARE_AZ.fullmatch(n)]
     triad = [n for n in every if n not in lone[:1]] or any(_BARE_AX.fullmatch(n) for n in names)
@@ -604,6 +605,24 @@ def _beside_nominal(
         for name, alike in each.items()
         if name not in meanings or meanings[name].column == dip
     }
+
+
+def _beside_tool(
+    names: Sequence[str], units: Sequence[str], meanings: Mapping[str, Resemblance]
+) -> dict[str, Resemblance]:
+    """Angles that the stand shows, each beside one that the tool tells: Bench Inc beside Probe Inc."""
+    of_tool = {n for n in meanings if _BY_TOOL.search(spelled(n))}
+    alone = {meanings[n].column for n in of_tool} - {
+        m.column for n, m in meanings.items() if n not in of_tool
+    }
+    results = {}
+    for name, unit in zip(names, units, strict=True):
+        plain = spelled(name)
+        if name not in meanings and _BY_STAND.search(plain) and not _BY_TOOL.search(plain):
+            alike = meaning(" ".join(_BY_STAND.sub(" ", plain).split()), unit)
+            if alike and alike.column in alone & {*_ANGLES_AND_WARMTH[:3]}:
+                results[name] = alike
+    return results
 
 
 def _behind_titles(

@@ -65,6 +65,7 @@ from mwdcal.identification.columns import (
     is_filler,
     is_of_surroundings,
     is_of_tool,
+    meaning,
     meanings_of,
     north_of,
     proposed,
@@ -407,9 +408,7 @@ def _proposal(
     names = [*table.columns]
     units = [units_by_name.get(name, "") for name in names]
     above = where.above if where else ()
-    used = [n for n, m in meanings_of(names, units).items() if m.column in UNMARKED]
-    form = by_legend(table, form, used, above) if form and above else form
-    table, open_rows = _without_rejected(table, form, used)
+    table, form, open_rows = _without_rejected(table, form, names, units, above)
     problems: dict[str, QuestionError] = {}
     values = partial(_numbers_of, table, problems)
     columns, by_value, ignored = proposed(
@@ -705,7 +704,11 @@ def _stacked_tools(
         stacked = len([*groupby(cells)]) == len(tools) and min(tools.values()) >= LEAST_STATIONS
         named = bool(_WORDS_OF_TOOLS.search(name))
         numbered = _numbers_of(table, {}, name) is not None
-        if stacked and named and (not numbered or _begins_again(table, cells)):
+        if (
+            stacked
+            and named
+            and (not numbered or (not meaning(name) and _begins_again(table, cells)))
+        ):
             raise QuestionError(
                 f"{table.source}: {shown(name)} has {', '.join(map(shown, [*tools][:MOST_NAMED]))}, one below the "
                 "other. Are these tools, and which one is meant?",
@@ -718,14 +721,14 @@ def _stacked_tools(
 
 
 def _begins_again(table: Table, tools: Sequence[str]) -> bool:
-    """Whether a column counts the stations of each of some tools, one below the other, from the same number on."""
+    """Whether a column numbers the stations of each of some tools, one below the other, from the same number on."""
     starts = [k for k, tool in enumerate(tools) if k == 0 or tool != tools[k - 1]]
-    ends = [*starts[1:], len(tools)]
-    for column in map(partial(labels_of, table), table.columns):
-        blocks = [column[one:other] for one, other in zip(starts, ends, strict=True)]
-        alike = all(each[:LEAST_STATIONS] == blocks[0][:LEAST_STATIONS] for each in blocks)
-        if alike and all(len({*each}) == len(each) for each in blocks):
-            return True
+    for name in table.columns:
+        numbers = _numbers_of(table, {}, name)
+        if numbers is not None and np.isfinite(numbers).all():
+            blocks = np.split(numbers, starts[1:])
+            if all(np.array_equal(b, blocks[0][0] + np.arange(len(b))) for b in blocks):
+                return True
     return False
 
 
@@ -746,16 +749,23 @@ def _of_one_tool(
 
 
 def _without_rejected(
-    table: Table, form: TableFormat | None, used: Collection[str]
-) -> tuple[Table, list[QuestionError]]:
-    """The rows of a table that are not marked as rejected, and a question on each mark that is not plain."""
+    table: Table,
+    form: TableFormat | None,
+    names: Sequence[str],
+    units: Sequence[str],
+    above: Sequence[str],
+) -> tuple[Table, TableFormat | None, list[QuestionError]]:
+    """The rows of a table that are not marked as rejected, its form, and a question on each mark that is not plain."""
+    meanings = meanings_of(names, units)
+    used = [n for n, m in meanings.items() if m.column in UNMARKED]
+    form = by_legend(table, form, used, above) if form else form
     marks = marks_in(table, form or TableFormat(), used)
     questions = [
         question_on_mark(table, name, cell, rows)
         for (name, cell), rows in marks.doubtful.items()
         if not all(is_the_repeat(table, row, cell) for row in rows)
     ]
-    return without_rejected(table, form or msgspec.UNSET, used), questions
+    return without_rejected(table, form or msgspec.UNSET, used), form, questions
 
 
 def _numbers_of(table: Table, problems: dict[str, QuestionError], name: str) -> Array | None:
