@@ -95,6 +95,7 @@ def test_a_line_of_settings_is_no_dip():
     assert metadata["ref_dip_deg"] == 59.71
     assert metadata["ref_field_nt"] == 46195
     assert "ref_dip_deg" not in stated_above([*above, ["Inclinaison 10°"]]).metadata
+    assert "ref_dip_deg" in stated_above(settings).not_taken
 
 
 def test_gravity_in_a_unit_without_signs():

@@ -29,7 +29,7 @@ from mwdcal.sensor.profile import TableFormat
 _REJECTED = re.compile(rf"\W*({OF_REFUSAL})\W*|\W*({OF_REFUSAL})\s*[-–—:;,.(/!].*", re.DOTALL)
 """A cell that rejects its row, whatever reason follows."""
 _DOES_NOT_COUNT = re.compile(rf"(\D*[,;:–(/-]\s*)?({NOT_TO_USE})\W*")
-"""A cell that says so, whatever stands before it but the number of another row: warm-up, not used."""
+"""A cell that says so, behind a reason without the number of another row: warm-up, not used."""
 _MAY_REJECT = re.compile(
     rf"(?<![^\W\d_])({OF_REFUSAL}|{NOT_TO_USE}|fail(ed)?|outlier|suspect|questionable|doubtful|ausreißer|ausreisser|fehler|avvik|"
     r"moved|bumped|disturbed|slipped|knocked|bewegt|verrutscht|gestossen|flyttet|movi(o|do)|mexeu|bouge|сдвин\w*|"
@@ -191,7 +191,7 @@ def by_legend(
 
 
 def _meaning(cell: str, lines: Collection[str]) -> str:
-    """What a legend in one of some lines says of a cell, without marks; empty where none or several do.
+    """The meaning of a cell by a legend in one of some lines, in small letters; empty where none or several have it.
 
     >>> _meaning("M", ["S = stable", "State M = moving, not used"]), _meaning("M", ["M = a, S = b"])
     ('moving, not used', '')

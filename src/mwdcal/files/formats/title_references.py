@@ -240,9 +240,9 @@ def stated_above(rows: Sequence[Sequence[object]], besides: Rows = ()) -> Titles
     """Metadata on tool, day and place from the rows above a table, and on the place from the lines `besides` it."""
     rows = [_unsplit(row) for row in rows]
     block = titles(rows)
-    rows, besides = ([r for r in each if not _is_of_settings(r)] for each in (rows, besides))
-    here = _of_this_place(_without_limits(rows))
-    references = references_in(here, _without_limits(besides))
+    above, beside = ([r for r in each if not _is_of_settings(r)] for each in (rows, besides))
+    here = _of_this_place(_without_limits(above))
+    references = references_in(here, _without_limits(beside))
     rough = {c: text for c, text in doubtful_in(rows, besides).items() if c not in references}
     return block._replace(metadata={**references, **block.metadata}, not_taken=rough)
 
