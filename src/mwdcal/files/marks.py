@@ -178,7 +178,8 @@ def by_legend(
     leave_out, keep = ({n: [*c] for n, c in each.items()} for each in (form.leave_out, form.keep))
     doubtful = marks_in(table, form, used).doubtful if lines else {}
     for name in dict.fromkeys(name for name, _ in doubtful):
-        meanings = {cell: _meaning(cell, lines) for cell in {*labels(table, name)} - {""}}
+        codes = {*labels(table, name)} - {""}
+        meanings = {c: _meaning(c, lines) for c in codes if len(codes) <= _MOST_VALUES}
         out = [c for c, m in meanings.items() if _REJECTED.fullmatch(m) or _does_not_count(m)]
         if out:
             leave_out.setdefault(name, []).extend(sorted(out))
