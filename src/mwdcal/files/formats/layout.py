@@ -717,9 +717,10 @@ def _listed(text: str) -> list[str]:
 def _is_remark_below_names(rows: Sequence[tuple[int, Cells]], place: int) -> bool:
     """Whether a row is a remark, or one of a few, between the names of a table and its readings."""
     first, last = place, place
-    while first > 0 and _is_short(rows[first][1]):
+    lowest, highest = place - _MOST_HEADER_ROWS, place + _MOST_HEADER_ROWS
+    while first > max(0, lowest) and _is_short(rows[first][1]):
         first -= 1
-    while last < len(rows) - 1 and _is_short(rows[last][1]):
+    while last < min(len(rows) - 1, highest) and _is_short(rows[last][1]):
         last += 1
     if not first < place < last or last - first > _MOST_HEADER_ROWS:
         return False
