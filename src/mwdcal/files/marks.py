@@ -20,7 +20,7 @@ from mwdcal.calibration.diagnosis.flags import listed
 from mwdcal.errors import Answer, InputError, QuestionError
 from mwdcal.files.formats.columns import Column, looks_numeric, shown
 from mwdcal.files.formats.table import Table, labels, numbers, row_word
-from mwdcal.files.formats.titles import ADJUSTED, OF_REFUSAL
+from mwdcal.files.formats.titles import ADJUSTED, NOT_TO_USE, OF_REFUSAL
 from mwdcal.files.parting import check_rows, marked_rows
 from mwdcal.files.statements import rows_of
 from mwdcal.files.synonyms import OURS
@@ -28,8 +28,10 @@ from mwdcal.sensor.profile import TableFormat
 
 _REJECTED = re.compile(rf"\W*({OF_REFUSAL})\W*|\W*({OF_REFUSAL})\s*[-–—:;,.(/!].*", re.DOTALL)
 """A cell that rejects its row, whatever reason follows."""
+_DOES_NOT_COUNT = re.compile(rf"(\D*[,;:–(/-]\s*)?({NOT_TO_USE})\W*")
+"""A cell that says so, behind a reason without the number of another row: warm-up, not used."""
 _MAY_REJECT = re.compile(
-    rf"(?<![^\W\d_])({OF_REFUSAL}|fail(ed)?|outlier|suspect|questionable|doubtful|ausreißer|ausreisser|fehler|avvik|"
+    rf"(?<![^\W\d_])({OF_REFUSAL}|{NOT_TO_USE}|fail(ed)?|outlier|suspect|questionable|doubtful|ausreißer|ausreisser|fehler|avvik|"
     r"moved|bumped|disturbed|slipped|knocked|bewegt|verrutscht|gestossen|flyttet|movi(o|do)|mexeu|bouge|сдвин\w*|"
     r"толкн\w*|"
     r"nicht bestanden|falha|fallo|выброс|сбой)(?![^\W\d_])|异常|可疑|移动|碰到"
@@ -149,7 +151,7 @@ def _verdicts(name: str, cells: Sequence[str]) -> dict[str, bool]:
         return dict.fromkeys(filled & _DENIED, True)
     if judges and _OF_REJECTION.fullmatch(name) and filled <= _AFFIRMED | _DENIED:
         return dict.fromkeys(filled & _AFFIRMED, True)
-    verdicts = {c: True for c in filled if _REJECTED.fullmatch(c)}
+    verdicts = {c: True for c in filled if _REJECTED.fullmatch(c) or _does_not_count(c)}
     verdicts |= {c: False for c in filled if c not in verdicts and _MAY_REJECT.search(c)}
     accepted = {c for c in filled if _ACCEPTED.fullmatch(_REMARK_BEHIND.sub("", c))}
     if 2 * sum(map(accepted.__contains__, cells)) < len(cells):
@@ -159,6 +161,45 @@ def _verdicts(name: str, cells: Sequence[str]) -> dict[str, bool]:
         usual = accepted or {max(sorted(different), key=cells.count)}
         verdicts |= dict.fromkeys(filled - usual - {*verdicts}, False)
     return verdicts
+
+
+def _does_not_count(text: str) -> bool:
+    """Whether a text says that its row does not count, and nothing of one that was measured again."""
+    return bool(_DOES_NOT_COUNT.fullmatch(text)) and not _MEASURED_AGAIN.search(text)
+
+
+def by_legend(
+    table: Table, form: TableFormat, used: Collection[str], lines: Collection[str]
+) -> TableFormat:
+    """The form with the cells left out of which a legend in `lines` says that they do not count.
+
+    Of cells that may reject their rows, one is meant by a line such as "M = stand moving, not for calibration".
+    """
+    leave_out, keep = ({n: [*c] for n, c in each.items()} for each in (form.leave_out, form.keep))
+    doubtful = marks_in(table, form, used).doubtful if lines else {}
+    for name in dict.fromkeys(name for name, _ in doubtful):
+        codes = {*labels(table, name)} - {""}
+        meanings = {c: _meaning(c, lines) for c in codes if len(codes) <= _MOST_VALUES}
+        out = [c for c, m in meanings.items() if _REJECTED.fullmatch(m) or _does_not_count(m)]
+        if out:
+            leave_out.setdefault(name, []).extend(sorted(out))
+            keep.setdefault(name, []).extend(c for c in sorted({*meanings} - {*out}) if meanings[c])
+    return msgspec.structs.replace(
+        form,
+        leave_out={name: tuple(cells) for name, cells in leave_out.items()},
+        keep={name: tuple(cells) for name, cells in keep.items() if cells},
+    )
+
+
+def _meaning(cell: str, lines: Collection[str]) -> str:
+    """The meaning of a cell by a legend in one of some lines, in small letters; empty where none or several have it.
+
+    >>> _meaning("M", ["S = stable", "State M = moving, not used"]), _meaning("M", ["M = a, S = b"])
+    ('moving, not used', '')
+    """
+    mark = re.compile(rf"(?<!\w){re.escape(cell)}\s*[=:]\s*([^;|=:]*)(?![^;|]*[=:])")
+    meanings = [_plain(m[1]) for m in map(mark.search, lines) if m]
+    return meanings[0] if len(meanings) == 1 else ""
 
 
 def _holds_words(column: Column) -> bool:

@@ -384,12 +384,18 @@ def begins_as(name: str) -> str:
     return next((column for column in known if column in _CHANNELS), "")
 
 
+_OF_MINUTES = re.compile(r"[°º]\s*['′’]\s*([\"″”]|'')?")
+"""The unit of angles in degrees, minutes and seconds."""
+
+
 def unit_of(text: str) -> str:
     """The unit that a text is, empty if it is not a unit.
 
     >>> [unit_of(text) for text in ("deg", "°F", "m/s²", "mg", "мg", "A/m", "x")]
     ['°', '°F', 'm/s²', 'mg', 'mg', 'A/m', '']
     """
+    if _OF_MINUTES.fullmatch(text):
+        return "°"
     words = _words(text)
     return _UNITS[words[-1]] if words and set(words) <= {*_UNITS} else ""
 

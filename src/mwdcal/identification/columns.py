@@ -313,6 +313,17 @@ _ACTUAL = re.compile(
     re.IGNORECASE,
 )
 """Words of angles to which a stand was to be set, and of those that it shows."""
+_BY_STAND = re.compile(
+    r"\b(stand|bench|fixture|rig|cradle|turn ?table|encoder|enc|pr(ü|ue)fstand|drehtisch|benk|banco|mesa|banc|"
+    r"banchetto|стенд\w*|стол\w*|установк\w*|энкодер\w*)\b|台架|转台|校验台|编码器",
+    re.IGNORECASE,
+)
+_BY_TOOL = re.compile(
+    r"\b(tool(?! ?face)|probe|sonde|sonda|mwd|instrument\w*|ger(ä|ae)t\w*|verkt(ø|oe?)y|ferramenta|herramienta|outil|"
+    r"прибор\w*|зонд\w*|инклинометр\w*)\b|探管|仪器|探头",
+    re.IGNORECASE,
+)
+"""Words of an angle that a stand shows, and of one that the tool tells."""
 _OF_CHANNELS = re.compile(r"\b(measured|meas|gemessen|ist)\b", re.IGNORECASE)
 """Those that say nothing more of a channel."""
 _OTHER_NORTH = re.compile(
@@ -353,6 +364,14 @@ _OF_LOGGER = re.compile(
 """A channel of a logger, with what it is in brackets or behind a colon."""
 _SCATTER = re.compile(r"s (?=[gabhm][xyz]\b)|[sσ] ?\(|σ|ско\b", re.IGNORECASE)
 """How the name of the scatter of the samples of a channel begins, which is no channel."""
+_OF_SAMPLES = re.compile(
+    r"(of|over|from|aus|von|av|de|из|по) (the )?(last )?\d+ (samples|readings|scans|messwerte\w*|m[åa]linger|muestras|"
+    r"lecturas|amostras|leituras|mesures|отсч[её]т\w*|измерени\w*)|^\W*n_?(avg|samples|smp)\W*$|"
+    r"\b(num(ber)?|no|count)\W*(of)?\W*samples\b",
+    re.IGNORECASE,
+)
+"""How many samples a mean is of, in a line or as the name of a column."""
+_SPREADS_OF_CHANNELS = tuple(f"sd_{name}" for name in RAW)
 _IN_UNIT = re.compile(r"(.*\w) (?:in|en|i|w|в) (\S+)", re.IGNORECASE)
 """A name with its unit behind a preposition: Gx in mg."""
 _BARE_T = re.compile(r"t\W*(°|deg)?\W*", re.IGNORECASE)
@@ -538,6 +557,7 @@ def meanings_of(
     results = _by_legend(names, above) | results
     results |= _behind_titles(names, units, results)
     results |= _beside_nominal(names, units, results)
+    results |= _beside_tool(names, units, results)
     every = [n for n, m in results.items() if m.column == "az"]
     lone = [n for n in every if _BARE_AZ.fullmatch(n)]
     triad = [n for n in every if n not in lone[:1]] or any(_BARE_AX.fullmatch(n) for n in names)
@@ -611,6 +631,24 @@ def _beside_nominal(
         for name, alike in each.items()
         if name not in meanings or meanings[name].column == dip
     }
+
+
+def _beside_tool(
+    names: Sequence[str], units: Sequence[str], meanings: Mapping[str, Resemblance]
+) -> dict[str, Resemblance]:
+    """Angles that the stand shows, each beside one that the tool tells: Bench Inc beside Probe Inc."""
+    of_tool = {n for n in meanings if _BY_TOOL.search(spelled(n))}
+    alone = {meanings[n].column for n in of_tool} - {
+        m.column for n, m in meanings.items() if n not in of_tool
+    }
+    results = {}
+    for name, unit in zip(names, units, strict=True):
+        plain = spelled(name)
+        if name not in meanings and _BY_STAND.search(plain) and not _BY_TOOL.search(plain):
+            alike = meaning(" ".join(_BY_STAND.sub(" ", plain).split()), unit)
+            if alike and alike.column in alone & {*_ANGLES_AND_WARMTH[:3]}:
+                results[name] = alike
+    return results
 
 
 def _behind_titles(
@@ -753,7 +791,7 @@ def proposed(
     _tell_by_values(meanings, names, units, values)
     said, known = answers or {}, stated or {}
     _tell_numbers(meanings, values, said)
-    ignored = _no_evidence(meanings, values, said, known)
+    ignored = _no_evidence(meanings, values, said, known, [*names, *above])
     _answered(said, names, meanings, source)
     questions = Questions(besides)
     damaged = {} if problems is None else problems  # filled while values are read
@@ -866,13 +904,16 @@ def _no_evidence(
     values: Values,
     answers: Mapping[str, str],
     stated: Collection[str],
+    lines: Sequence[str],
 ) -> dict[str, str]:
     """Columns that are named like references but hold no references, each with the reason.
 
     That is what the user excludes; totals computed from the channels, and those that vary beside the one `stated`
-    for the place; and rolls in whole degrees beside no other angle of the stand, which are nominal.
+    for the place; and rolls in whole degrees beside no other angle of the stand, which are nominal. Neither is a
+    spread of the samples of which `lines`, the names too, speak the uncertainty of their mean.
     """
     ignored = {}
+    sampled = any(map(_OF_SAMPLES.search, lines))
     called = {m.column for m in meanings.values()}
     lone = called.isdisjoint(REFERENCES[name].column for name in ("inclination", "azimuth"))
     for name, m in meanings.items():
@@ -880,6 +921,8 @@ def _no_evidence(
             ignored[name] = "as you say"
         elif m.column in answers:
             continue
+        elif sampled and m.column in _SPREADS_OF_CHANNELS and name != m.column:
+            ignored[name] = "it is the spread of samples, not the uncertainty of their mean"
         elif _is_total(m.column, name, meanings, values) or _is_dip_of(
             m.column, name, meanings, values
         ):
@@ -1280,6 +1323,10 @@ def _one(column: str, candidates: Sequence[str], values: Values, source: str) ->
     others = [name for name in candidates if name not in shows]
     if len(shows) == 1 and all(map(_NOMINAL.search, others)):
         return shows[0]
+    by_tool = [name for name in candidates if _BY_TOOL.search(spelled(name))]
+    by_stand = [n for n in candidates if n not in by_tool and _BY_STAND.search(spelled(n))]
+    if column in _ANGLES_AND_WARMTH[:3] and len(by_stand) == 1 == len(candidates) - len(by_tool):
+        return by_stand[0]
     if len(candidates) == 1 or len(stated) == 1:
         return (stated or candidates)[0]
     of = "the temperature of the tool" if column == WARMTH else f"'{column}'"

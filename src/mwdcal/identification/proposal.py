@@ -38,6 +38,7 @@ from mwdcal.files.formats.text import is_preamble
 from mwdcal.files.marks import (
     MARKS_NAMED,
     UNMARKED,
+    by_legend,
     is_the_repeat,
     marks_in,
     place,
@@ -64,6 +65,7 @@ from mwdcal.identification.columns import (
     is_filler,
     is_of_surroundings,
     is_of_tool,
+    meaning,
     meanings_of,
     north_of,
     proposed,
@@ -405,9 +407,9 @@ def _proposal(
     units_by_name = dict(zip(where.names, where.units, strict=True)) if where else {}
     names = [*table.columns]
     units = [units_by_name.get(name, "") for name in names]
-    table, open_rows = _without_rejected(table, form, names, units)
-    problems: dict[str, QuestionError] = {}
     above = where.above if where else ()
+    table, form, open_rows = _without_rejected(table, form, names, units, above)
+    problems: dict[str, QuestionError] = {}
     values = partial(_numbers_of, table, problems)
     columns, by_value, ignored = proposed(
         names, units, values, table.source, above, table.metadata, answers, problems, open_rows
@@ -700,7 +702,13 @@ def _stacked_tools(
         if stated.get("serial") in tools:
             return {"serial": ColumnSource(name=name)}
         stacked = len([*groupby(cells)]) == len(tools) and min(tools.values()) >= LEAST_STATIONS
-        if stacked and _WORDS_OF_TOOLS.search(name) and _numbers_of(table, {}, name) is None:
+        named = bool(_WORDS_OF_TOOLS.search(name))
+        numbered = _numbers_of(table, {}, name) is not None
+        if (
+            stacked
+            and named
+            and (not numbered or (not meaning(name) and _begins_again(table, cells)))
+        ):
             raise QuestionError(
                 f"{table.source}: {shown(name)} has {', '.join(map(shown, [*tools][:MOST_NAMED]))}, one below the "
                 "other. Are these tools, and which one is meant?",
@@ -710,6 +718,18 @@ def _stacked_tools(
                 ],
             )
     return {}
+
+
+def _begins_again(table: Table, tools: Sequence[str]) -> bool:
+    """Whether a column numbers the stations of each of some tools, one below the other, from the same number on."""
+    starts = [k for k, tool in enumerate(tools) if k == 0 or tool != tools[k - 1]]
+    for name in table.columns:
+        numbers = _numbers_of(table, {}, name)
+        if numbers is not None and np.isfinite(numbers).all():
+            blocks = np.split(numbers, starts[1:])
+            if all(np.array_equal(b, blocks[0][0] + np.arange(len(b))) for b in blocks):
+                return True
+    return False
 
 
 def _of_one_tool(
@@ -729,18 +749,23 @@ def _of_one_tool(
 
 
 def _without_rejected(
-    table: Table, form: TableFormat | None, names: Sequence[str], units: Sequence[str]
-) -> tuple[Table, list[QuestionError]]:
-    """The rows of a table that are not marked as rejected, and a question on each mark that is not plain."""
+    table: Table,
+    form: TableFormat | None,
+    names: Sequence[str],
+    units: Sequence[str],
+    above: Sequence[str],
+) -> tuple[Table, TableFormat | None, list[QuestionError]]:
+    """The rows of a table that are not marked as rejected, its form, and a question on each mark that is not plain."""
     meanings = meanings_of(names, units)
     used = [n for n, m in meanings.items() if m.column in UNMARKED]
+    form = by_legend(table, form, used, above) if form else form
     marks = marks_in(table, form or TableFormat(), used)
     questions = [
         question_on_mark(table, name, cell, rows)
         for (name, cell), rows in marks.doubtful.items()
         if not all(is_the_repeat(table, row, cell) for row in rows)
     ]
-    return without_rejected(table, form or msgspec.UNSET, used), questions
+    return without_rejected(table, form or msgspec.UNSET, used), form, questions
 
 
 def _numbers_of(table: Table, problems: dict[str, QuestionError], name: str) -> Array | None:

@@ -61,11 +61,11 @@ def command(
 ) -> None:  # fmt: skip
     """Propose a tool profile for a RUN as a logger or spreadsheet program has written it.
 
-    Takes .csv .tsv .txt .dat .lvm .asc .prn .xlsx .xls .ods. Finds sheet, names and units of the columns, the last
-    row of readings, decimal sign and encoding, the meaning of each column, and, from readings at known attitudes, the
-    axes and nominal scales of both triads. calibrate, verify, compare and apply then take such tables with
-    --tool TOOL.toml as they are, also where the table has moved. It asks what is open: on a terminal one question
-    after the other, elsewhere all at once, each with the option that answers it.
+    Takes .csv .tsv .txt .dat .lvm .asc .prn .log .out .xlsx .xls .ods. Finds sheet, names and units of the columns, the
+    last row of readings, decimal sign and encoding, the meaning of each column, and, from readings at known attitudes,
+    the axes and nominal scales of both triads. calibrate, verify, compare and apply then take such tables with --tool
+    TOOL.toml as they are, also where the table has moved. It asks what is open: on a terminal one question after the
+    other, elsewhere all at once, each with the option that answers it.
 
     \b
     Example: mwdcal profile export.xlsx -o tool.toml --column temperature_c="Oven temp"

@@ -68,7 +68,9 @@ _OF_LOGGERS = re.compile(
 _UNIT_BEHIND = re.compile(r"(.*?)\s*([(\[][^)\]]*[)\]]|,\s*[^\s,]{1,5})")
 _AXIS = re.compile(r"\W*([xyz123])\W*([(\[].*)?", re.IGNORECASE)
 """A name that is an axis alone, and says nothing without the title above it."""
-_OF_AXIS = re.compile(r"\W*\w{0,6}(?P<axis>[xyz123])\W*([(\[].*)?", re.IGNORECASE)
+_OF_AXIS = re.compile(
+    r"\W*(\w{0,6}|[^()\[\]]*[\W_](?=[xyz]))(?P<axis>[xyz123])\W*([(\[].*)?", re.IGNORECASE
+)
 """A name that ends in an axis."""
 _SYMBOL = re.compile(r"[^\W\d_]")
 """A name that is the symbol of a quantity."""
@@ -572,7 +574,7 @@ def _several(tables: Sequence[Layout], source: str, sheet: str) -> QuestionError
 
 def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
     """The tables of a sheet, one below the other: a head is no row of readings, and the next row is one."""
-    rows = [row for row in sheet.rows if not _is_ruler(row[1])]
+    rows = _without_dittos([row for row in sheet.rows if not _is_ruler(row[1])])
     remarks = [row for k, row in enumerate(rows) if _is_remark_below_names(rows, k)]
     names = next((k for k, (_, row) in enumerate(rows) if _is_of_texts(row)), len(rows))
     without = [row for row in rows[names:] if _is_without_reading(row[1])]
@@ -584,7 +586,7 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
     heads = [
         k
         for k, (now, below) in enumerate(pairwise(readings))
-        if below and not now and _texts(rows[k][1]) >= LEAST_COLUMNS
+        if below and not now and (_texts(rows[k][1]) >= LEAST_COLUMNS or _is_below_names(rows, k))
     ]
     heads = [k for n, k in enumerate(heads) if n == 0 or _begins_anew(rows, heads[:n], k)]
     for head, end in pairwise([*heads, len(rows)]):
@@ -597,6 +599,38 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
             above = rows[max(0, head - 4) : head]
             layout = _with_settings(_with_warmth_of_lines(layout, between), [*above, *between])
             yield _with_triads_beside(_with_rows_of_headings(layout))
+
+
+_DITTO = re.compile(
+    r"[-–—\s]*(\"|″|”|“|„|''|〃|,,|»)[-–—\s]*|ditto|do\.|dto\.?|idem|id\.|то же|同上", re.IGNORECASE
+)
+"""A cell that says that it is as the one above."""
+
+
+def _without_dittos(rows: Sequence[tuple[int, Cells]]) -> list[tuple[int, Cells]]:
+    """The rows with the cell above in place of a ditto mark, among readings.
+
+    >>> _without_dittos([(1, [30, 90, 0.1, 0.9]), (2, ['"', "〃", 0.2, 0.8])])[1]
+    (2, [30, 90, 0.2, 0.8])
+    """
+    whole: list[tuple[int, Cells]] = []
+    for line, row in rows:
+        above = whole[-1][1] if whole else ()
+        marks = [isinstance(c, str) and bool(_DITTO.fullmatch(c)) for c in row]
+        known = all(k < len(above) and above[k] != "" for k, mark in enumerate(marks) if mark)
+        if any(marks) and known and any(map(figures.is_figure, row)):
+            row = [
+                above[k] if mark else cell
+                for k, (cell, mark) in enumerate(zip(row, marks, strict=True))
+            ]
+        whole.append((line, row))
+    return whole
+
+
+def _is_below_names(rows: Sequence[tuple[int, Cells]], place: int) -> bool:
+    """Whether a row is one of units, of a few columns alone, below names."""
+    above = rows[place - 1][1] if place else ()
+    return is_units(rows[place][1]) and _is_of_texts(above) and not _is_reading(above)
 
 
 _STATIONS_IN_COLUMNS = (
@@ -700,9 +734,10 @@ def _listed(text: str) -> list[str]:
 def _is_remark_below_names(rows: Sequence[tuple[int, Cells]], place: int) -> bool:
     """Whether a row is a remark, or one of a few, between the names of a table and its readings."""
     first, last = place, place
-    while first > 0 and _is_short(rows[first][1]):
+    lowest, highest = place - _MOST_HEADER_ROWS, place + _MOST_HEADER_ROWS
+    while first > max(0, lowest) and _is_short(rows[first][1]):
         first -= 1
-    while last < len(rows) - 1 and _is_short(rows[last][1]):
+    while last < min(len(rows) - 1, highest) and _is_short(rows[last][1]):
         last += 1
     if not first < place < last or last - first > _MOST_HEADER_ROWS:
         return False

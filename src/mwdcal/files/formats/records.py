@@ -24,6 +24,10 @@ _LEAST_PAIRS, _LEAST_RECORDS = 4, 5
 _PAIR_IN_LINE = re.compile(
     r"(?<![^\s,;|])([^\W\d_][\w./°-]*)\s*[=:]\s*([+−-]?[\w.,+−-]*\w)(?=[\s,;|]|$)"
 )
+_TIME_BEFORE = re.compile(
+    r"\W*(\d{1,4}([-./])\d{1,2}\2\d{1,4})?[T ,;]*(\d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?)?Z?[\s,;|\]]+"
+)
+"""A day, a time or both before the first name of a line."""
 _PAIR_ALONE = re.compile(r"\s*([^\W\d_][^=:;]{0,30}?)\s*[=:]\s*(\S.*?)\s*")
 _SPREADSHEET = "{urn:schemas-microsoft-com:office:spreadsheet}"
 IS_XML = _SPREADSHEET[1:-1].encode()
@@ -63,11 +67,15 @@ def _record(line: str) -> dict[str, object]:
         with suppress(ValueError, RecursionError):
             record = json.loads(line.strip().rstrip(","))
             return {key: _cell(value) for key, value in record.items()}
+    time = match[0] if (match := _TIME_BEFORE.match(line)) else ""
+    line = line[len(time) :]
     pairs = _PAIR_IN_LINE.findall(line)
     named: dict[str, object] = dict(pairs)
     numbers = sum(map(figures.is_figure, named.values()))
     whole = len(named) == len(pairs) >= _LEAST_PAIRS and 2 * numbers >= len(pairs)
-    return named if whole and not re.search(r"[^\s,;|]", _PAIR_IN_LINE.sub(" ", line)) else {}
+    if not whole or re.search(r"[^\s,;|]", _PAIR_IN_LINE.sub(" ", line)):
+        return {}
+    return {"Time": time.strip(), **named} if re.search(r"\d", time) else named
 
 
 def _cell(value: object) -> object:

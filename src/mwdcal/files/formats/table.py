@@ -44,7 +44,7 @@ _TABLES = {
 _FORMATS = {**_TABLES, ".xml": "exchange.witsml", ".las": "exchange.las"}
 SUFFIXES = tuple(_TABLES)
 """Of tables as documented; those of other programs are `EXCHANGED`."""
-LAID_OUT = (".csv", ".tsv", ".txt", ".dat", ".lvm", ".asc", ".prn", *WORKBOOKS)
+LAID_OUT = (".csv", ".tsv", ".txt", ".dat", ".lvm", ".asc", ".prn", ".log", ".out", *WORKBOOKS)
 """Suffixes of files in which a table is looked for; those that are no tables as documented need a profile."""
 EXCHANGED = (".xml", ".las")
 """Suffixes of WITSML and LAS, whose columns are taken from the format's own names."""

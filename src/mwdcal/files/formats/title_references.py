@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 from mwdcal.calibration.readings import EARTH_GRAVITY
 from mwdcal.files.formats.columns import as_text, looks_numeric
+from mwdcal.files.formats.settings import settings_in
 from mwdcal.files.formats.titles import Titles, titles
 from mwdcal.files.synonyms import FACTORS, unit_of
 
@@ -239,8 +240,9 @@ def stated_above(rows: Sequence[Sequence[object]], besides: Rows = ()) -> Titles
     """Metadata on tool, day and place from the rows above a table, and on the place from the lines `besides` it."""
     rows = [_unsplit(row) for row in rows]
     block = titles(rows)
-    here = _of_this_place(_without_limits(rows))
-    references = references_in(here, _without_limits(besides))
+    above, beside = ([r for r in each if not _is_of_settings(r)] for each in (rows, besides))
+    here = _of_this_place(_without_limits(above))
+    references = references_in(here, _without_limits(beside))
     rough = {c: text for c, text in doubtful_in(rows, besides).items() if c not in references}
     return block._replace(metadata={**references, **block.metadata}, not_taken=rough)
 
@@ -254,6 +256,13 @@ def _without_limits(rows: Rows) -> list[Sequence[object]]:
         limits = bool(_OF_LIMITS.fullmatch(text)) or (limits and numbered)
         kept += [] if limits else [row]
     return kept
+
+
+def _is_of_settings(row: Sequence[object]) -> bool:
+    """Whether a row states settings of the stand: an inclination beside an azimuth or a toolface, and no field."""
+    settings = settings_in(_line(row))
+    inclined = len(settings) > 1 and "ref_inclination_deg" in settings
+    return inclined and references_in([row]).keys() <= {"ref_dip_deg"}
 
 
 def _of_this_place(rows: Rows) -> list[Sequence[object]]:
@@ -590,7 +599,7 @@ def _plain(text: str) -> str:
     bare = re.sub(r"(?<=[\u4e00-\u9fff])(?=[a-zµμ])", " ", bare)
     signs = bare.replace("\0", "°").replace("\1", "²").replace("\2", "й")
     return re.sub(
-        r"(?<![a-zа-я])(?:[mм]\s?/\s?[sс]\s?(?:\^?2|²)|m\s?[.·*]?\s?s\^?[-−]2|mps2?)(?!\d)",
+        r"(?<![a-zа-я])(?:[mм]\s?/\s?[sс]\s?(?:\^?2|²)|m\s?[.·*]?\s?s\^?[-−]2|m s2|mps2?)(?!\d)",
         "m/s²",
         signs,
     )

@@ -60,6 +60,19 @@ OF_REFUSAL = (
     r"作废|剔除|无效|废弃|舍弃|弃用|不可用|坏点?|不合格"
 )
 """Words by which a laboratory rejects a row, or a whole run."""
+NOT_TO_USE = (
+    r"(do|does|is|was|are)? ?not (to be )?used?|not? for (the )?(cal\w*|use|evaluation|fit)|never (to be )?used?|"
+    r"unused|disregard|"
+    r"nicht (zu )?(verwend\w*|benutz\w*|werten)|nicht (fur|zur) (die )?(kal\w*|auswertung)|"
+    r"ikke (bruk\w*|benytt\w*)|(brukes|benyttes|skal) ikke( brukes| benyttes)?|ikke (for|til) kal\w*|"
+    r"(brukes|benyttes) ikke (for|til) kal\w*|"
+    r"no (usar|utilizar|usad[oa]|utilizad[oa])|no se (usa|utiliza)|no para (la )?cal\w*|"
+    r"nao (usar|utilizar|usad[oa]|utilizad[oa])|nao para (a )?cal\w*|"
+    r"ne pas (utiliser|prendre)|non utilisee?|pas pour l.(etalonnage|ajustage)|non (usare|usat[oa]|utilizzat[oa])|"
+    r"не (использовать|используется|учитывать|учитывается)|не для (калибр|град)\w*|"
+    r"不用|不使用|不采用|不参与(校准|标定|计算)?|不用于(校准|标定|计算)"
+)
+"""Words by which a laboratory says that a row does not count."""
 ADJUSTED = re.compile(
     r"as[- ]?left|(before|after|pre|post)[- ]?(adjust|calib)\w*|(vor|nach) (der )?(justier|abgleich|kalibrier)\w*|"
     r"(f(ø|o)r|etter|efter) (juster|kalibrer)\w*|(antes|despu[eé]s|depois) (del?a?|do|da) (ajust|calibr)\w*|"

@@ -1,0 +1,195 @@
+"""Notes in a table on which rows, columns and values count, and short forms of hand-written tables."""
+
+import math
+
+import openpyxl
+import pytest
+
+import mwdcal
+from mwdcal.files.formats.title_references import stated_above
+from test_arrangements import CHANNELS, NAMES, lines_of, written
+from test_headers import same, stations, taken
+
+WARM_UP = [*stations()[0][:3], 0.5, *stations()[0][4:]]
+"""A station with a reading that no other has."""
+
+
+def noted(rows, name, cells):
+    """The lines of a table with a column more behind the others."""
+    return lines_of([[*row, cell] for row, cell in zip(rows, cells, strict=True)], [*NAMES, name])
+
+
+@pytest.mark.parametrize(
+    "note",
+    [
+        "warm-up, not to be used",
+        "oppvarming, brukes ikke",
+        "Aufwärmen – nicht verwenden",
+        "calentamiento; no usar",
+        "aquecimento (não usar)",
+        "прогрев, не использовать",
+        "预热，不用",
+    ],
+)
+def test_a_row_that_does_not_count_by_its_note_is_left_out(tmp_path, note):
+    rows = stations()
+    lines = noted([WARM_UP, *rows], "Remark", [note, *[""] * len(rows)])
+    assert same(taken(written(tmp_path / "run.csv", lines)), rows)
+
+
+@pytest.mark.parametrize(
+    "note", ["first shot of 7 not used", "repeat, first one not used", "power supply was moved"]
+)
+def test_a_note_that_may_speak_of_another_row_is_asked_about(tmp_path, note):
+    rows = stations()
+    lines = noted(rows, "Remark", [note, *[""] * (len(rows) - 1)])
+    with pytest.raises(mwdcal.FitError, match="rejected station"):
+        mwdcal.propose_profile(written(tmp_path / "run.csv", lines))
+
+
+def in_motion(tmp_path, *legend):
+    """A table in which every second row is marked M, below a legend."""
+    rows = stations()
+    pairs = [
+        each for row in rows for each in (row, [*row[:3], *(c + 0.3 for c in row[3:9]), row[9]])
+    ]
+    lines = noted(pairs, "State", ["S", "M"] * len(rows))
+    return written(tmp_path / "run.csv", [*legend, "", *lines]), rows
+
+
+def test_a_legend_says_which_rows_do_not_count(tmp_path):
+    path, rows = in_motion(tmp_path, "S = stable", "State M = stand moving, not for calibration")
+    assert same(taken(path), rows)
+
+
+@pytest.mark.parametrize(
+    "legend", ["State M = perhaps not for calibration", "M = manual", "M = bad, S = good"]
+)
+def test_another_legend_leaves_the_question(tmp_path, legend):
+    path, _ = in_motion(tmp_path, legend)
+    with pytest.raises(mwdcal.FitError, match="rejected station"):
+        mwdcal.propose_profile(path)
+
+
+@pytest.mark.parametrize("mark", ['"', "〃", "''", "- '' -", "ditto", "idem", "то же"])
+def test_a_ditto_mark_is_the_cell_above(tmp_path, mark):
+    rows = stations()
+    book = openpyxl.Workbook()
+    sheet = book.active
+    sheet.append(NAMES)
+    for k, row in enumerate(rows):
+        above = rows[k - 1] if k else ["", ""]
+        sheet.append([*(mark if row[n] == above[n] else row[n] for n in (0, 1)), *row[2:]])
+    book.save(tmp_path / "run.xlsx")
+    assert same(taken(tmp_path / "run.xlsx"), rows)
+    lines = lines_of(map(list, sheet.iter_rows(min_row=2, values_only=True)))
+    if mark != '"':  # which quotes in a text
+        assert same(taken(written(tmp_path / "run.csv", lines)), rows)
+
+
+def test_a_line_of_settings_is_no_dip():
+    """The inclination beside an azimuth is the stand's; alone it may be the field's, and differs from the dip."""
+    above = [["Champ total : 46195 nT", "Inclinaison magnétique (dip) : 59,71°"]]
+    settings = [["Inclinaison 10° – Azimut 20°"], ["Inclinaison 50° – Azimut 20°"]]
+    metadata = stated_above([*above, settings[0]], settings[1:]).metadata
+    assert metadata["ref_dip_deg"] == 59.71
+    assert metadata["ref_field_nt"] == 46195
+    assert "ref_dip_deg" not in stated_above([*above, ["Inclinaison 10°"]]).metadata
+    assert "ref_dip_deg" in stated_above(settings).not_taken
+
+
+def test_gravity_in_a_unit_without_signs():
+    metadata = stated_above([["#gravity_m_s2=9.7940"]]).metadata
+    assert metadata["ref_gravity_g"] == pytest.approx(9.7940 / 9.80665, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("stand", "tool"), [("台架{}", "探管{}"), ("Bench {}", "Probe {}"), ("{} стенда", "{} прибора")]
+)
+def test_angles_of_the_tool_beside_those_of_the_stand(tmp_path, stand, tool):
+    words = {"台": ("井斜(°)", "方位(°)", "工具面(°)")}.get(
+        stand[0], ("Inc (deg)", "Azi (deg)", "Toolface (deg)")
+    )
+    rows = stations()
+    names = [*(tool.format(w) for w in words), *(stand.format(w) for w in words), *NAMES[3:]]
+    lines = lines_of([[*(a + 0.4 for a in row[:3]), *row] for row in rows], names)
+    assert same(taken(written(tmp_path / "run.csv", lines)), rows)
+
+
+def test_the_spread_of_samples_is_no_uncertainty_of_their_mean(tmp_path):
+    rows = stations()
+    names = [*NAMES, *(f"{name[:2]} std (V)" for name in CHANNELS)]
+    lines = lines_of([[*row, *[0.001] * 6] for row in rows], names)
+    of_samples = written(
+        tmp_path / "run.csv", ["mean and standard deviation of 200 samples", "", *lines]
+    )
+    proposal = mwdcal.propose_profile(of_samples)
+    assert not [name for name in proposal.profile.columns if name.startswith("sd_")]
+    plain = mwdcal.propose_profile(written(tmp_path / "plain.csv", lines))
+    assert len([name for name in plain.profile.columns if name.startswith("sd_")]) == 6
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        "20/05/2026 08:31:{0:02d} ",
+        "2026-03-11T08:41:{0:02d} ",
+        "[08:41:{0:02d}] ",
+        "08:41:{0:02d}.25, ",
+    ],
+)
+@pytest.mark.parametrize("suffix", ["txt", "log", "out"])
+def test_records_behind_a_time(tmp_path, form, suffix):
+    rows = stations()
+    names = ("INC", "AZI", "TF", "AX", "AY", "AZ", "BX", "BY", "BZ", "TEMP")
+    path = tmp_path / f"run.{suffix}"
+    lines = [
+        form.format(k % 60) + " ".join(f"{n}={v}" for n, v in zip(names, row, strict=True))
+        for k, row in enumerate(rows)
+    ]
+    path.write_text("\n".join(["; INC AZI TF in deg; AX AY AZ in V; TEMP in C", *lines]), "utf-8")
+    assert same(taken(path), rows)
+
+
+def test_minutes_and_seconds_below_a_few_names(tmp_path):
+    """Whole minutes of each angle."""
+    rows = [[*(math.floor(a * 60) / 60 for a in row[:3]), *row[3:]] for row in stations()]
+
+    def written_out(angle):
+        minutes = round(angle * 60)
+        return f"{minutes // 60}°{minutes % 60:02d}'00\""
+
+    book = openpyxl.Workbook()
+    sheet = book.active
+    sheet.append(["Inclination", "Azimuth", "Toolface", *NAMES[3:]])
+    sheet.append(["° ' \""] * 3)
+    for row in rows:
+        sheet.append([*map(written_out, row[:3]), *row[3:]])
+    book.save(tmp_path / "run.xlsx")
+    assert same(taken(tmp_path / "run.xlsx"), rows)
+
+
+def test_stations_in_columns_below_long_names(tmp_path):
+    rows = stations()
+    names = [
+        *("Inclinaison (°)", "Azimut (°)", "Toolface (°)"),
+        *(f"{word} {axis} (V)" for word in ("Accéléromètre", "Magnétomètre") for axis in "XYZ"),
+        "Température (°C)",
+    ]
+    book = openpyxl.Workbook()
+    sheet = book.active
+    for name, *values in zip(names, *rows, strict=True):
+        sheet.append([name, *values])
+    book.save(tmp_path / "run.xlsx")
+    assert same(taken(tmp_path / "run.xlsx"), rows)
+
+
+def test_tools_by_number_one_below_the_other_are_asked_about(tmp_path):
+    rows = stations()
+    tools = [[tool, k, *row] for tool in (2301, 2302) for k, row in enumerate(rows, 1)]
+    path = written(tmp_path / "run.csv", lines_of(tools, ["Sonda", "Station", *NAMES]))
+    with pytest.raises(mwdcal.FitError, match="Are these tools"):
+        mwdcal.propose_profile(path)
+    on = [[2301 + (k > len(rows)), k, *row[2:]] for k, row in enumerate(tools, 1)]
+    path = written(tmp_path / "on.csv", lines_of(on[: len(rows)], ["Sonda", "Station", *NAMES]))
+    assert taken(path).count == len(rows)
