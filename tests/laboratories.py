@@ -1140,11 +1140,12 @@ def forus_rejected() -> Laboratory:
         remarks(run, "Merknad", {20: "FORKASTET - truck utenfor, målt på nytt", 21: "ny måling av 21"}),
     ]  # fmt: skip
     columns = [c._replace(cells=["OVL" if v == "nan" else v for v in c.cells]) for c in columns]
+    kept = [k for k in range(len(run)) if k not in (9, 20)]
+    truth = {key: np.asarray(each)[kept] for key, each in facts(run, a, m).items()}
     return laboratory(
         "forus_forkastet.csv", laid_out(columns, before=[["Verktøy", "FO-12"], []]),
-        facts(run, a, m, serial="FO-12"), text=Text(",", newline="\n"),
-        trap="station 10 has OVL for ay (truth: NaN); station 21 is marked as rejected",
-        question="leave out station 10 (OVL) and station 21 (FORKASTET)?",
+        truth | {"serial": "FO-12"}, text=Text(",", newline="\n"),
+        trap="station 10 has OVL for ay, station 21 is marked as rejected: both are left out",
     )  # fmt: skip
 
 

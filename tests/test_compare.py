@@ -642,7 +642,7 @@ def test_exactly_vertical_references_have_no_error_of_azimuth_and_toolface(verti
 def test_a_channel_of_no_noise_ends_in_refusals(tmp_path):
     """Information of one channel so far above all other that rounding makes their squares negative."""
     columns = servo_run(2, (10, 60, 110), 6, (25.0, 75.0, 130.0))
-    run = write_csv(tmp_path / "run.csv", {**columns, "sd_mx": np.full(54, 5e-9)})
+    run = write_csv(tmp_path / "run.csv", {**columns, "sd_mx": np.full(54, 1e-11)})
     ran = mwdcal("compare", run, "--tool", "servo")
     assert ran.code == 3
     assert "newton refused" in ran.out

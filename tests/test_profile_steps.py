@@ -100,7 +100,7 @@ def test_an_angle_of_the_profile_that_is_not_in_the_table_is_named(own, tmp_path
 
 
 def test_a_calibration_as_the_tool_of_a_plan_brings_the_noise_that_it_estimated(own, tmp_path):
-    """Expected: the plan by the profile with that noise written into it."""
+    """Expected: the plan by the profile with that noise written into it, at one place."""
     assert "calibration of the tool by --tool" in refused(
         mwdcal("plan", "--tool", own / "t.toml"), 2
     )
@@ -109,8 +109,14 @@ def test_a_calibration_as_the_tool_of_a_plan_brings_the_noise_that_it_estimated(
         noise = cal[kind]["noise"] * cal["profile"][kind]["scale"]
         text = text.replace(f"[{kind}]", f"[{kind}]\nnoise = {noise!r}")
     (tmp_path / "t.toml").write_text(text)
+    plan = tmp_path / "place.toml"
+    plan.write_text(
+        "field_nt = 50000.0\ndip_deg = 66.0\n\n[[stations]]\ninclination_deg = [30, 90, 120]\n"
+        "azimuth_deg = [0, 120]\ntoolface_deg = [0, 90, 180, 270]\n",
+        "utf-8",
+    )
     ours, theirs = (
-        mwdcal("plan", "--tool", tool, "--json").json
+        mwdcal("plan", "--plan", plan, "--tool", tool, "--json").json
         for tool in (own / "c.json", tmp_path / "t.toml")
     )
     for angle, value in theirs["accuracy_deg"].items():

@@ -1022,7 +1022,7 @@ def _check_magnetic(
     )
 
 
-_ANOTHER_DIP = 1.0
+_ANOTHER_DIP = 3.0
 """By how much a dip that is stated differs from that of the readings where it is of another place, degrees."""
 
 
