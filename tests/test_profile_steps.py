@@ -111,7 +111,8 @@ def test_a_calibration_as_the_tool_of_a_plan_brings_the_noise_that_it_estimated(
     (tmp_path / "t.toml").write_text(text)
     plan = tmp_path / "place.toml"
     plan.write_text(
-        "field_nt = 50000.0\ndip_deg = 66.0\n\n[[stations]]\ninclination_deg = [30, 90, 120]\n"
+        'name = "here"'
+        "\nfield_nt = 50000.0\ndip_deg = 66.0\n\n[[stations]]\ninclination_deg = [30, 90, 120]\n"
         "azimuth_deg = [0, 120]\ntoolface_deg = [0, 90, 180, 270]\n",
         "utf-8",
     )
