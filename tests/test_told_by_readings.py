@@ -235,6 +235,17 @@ def test_a_dip_that_differs_by_less_is_taken(tmp_path):
     assert reference(path, "dip") == pytest.approx(np.full(48, dip), abs=1e-3)
 
 
+def test_rolls_in_whole_degrees_count_beside_angles_in_words_that_are_not_understood(tmp_path):
+    """The readings tell which of these is which; the rolls are not nominal for want of other angles."""
+    words = {"Inc (deg)": "Tilt of cradle (deg)", "Azi (deg)": "Way of cradle (deg)"}
+    columns = {words.get(name, name): values for name, values in table().items()}
+    columns["TF (deg)"] = np.round(np.asarray(columns["TF (deg)"], float))
+    path = written(tmp_path / "a.csv", columns)
+    assert reference(path) == pytest.approx(columns["TF (deg)"])
+    for name in ("inclination", "azimuth"):
+        assert reference(path, name) == pytest.approx(np.asarray(servo_run()[f"ref_{name}_deg"]))
+
+
 def test_a_column_of_dips_that_is_blank_is_no_other_place(tmp_path):
     path = written(tmp_path / "a.csv", table(ref_dip_deg=np.full(48, np.nan)))
     assert np.isnan(reference(path, "dip")).all()

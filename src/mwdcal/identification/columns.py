@@ -791,7 +791,8 @@ def proposed(
     _tell_by_values(meanings, names, units, values)
     said, known = answers or {}, stated or {}
     _tell_numbers(meanings, values, said)
-    ignored = _no_evidence(meanings, values, said, known, [*names, *above])
+    unknown = {n: unit for n, unit in zip(names, units, strict=True) if n not in meanings}
+    ignored = _no_evidence(meanings, values, said, known, [*names, *above], unknown)
     _answered(said, names, meanings, source)
     questions = Questions(besides)
     damaged = {} if problems is None else problems  # filled while values are read
@@ -905,17 +906,24 @@ def _no_evidence(
     answers: Mapping[str, str],
     stated: Collection[str],
     lines: Sequence[str],
+    others: Mapping[str, str],
 ) -> dict[str, str]:
     """Columns that are named like references but hold no references, each with the reason.
 
     That is what the user excludes; totals computed from the channels, and those that vary beside the one `stated`
-    for the place; and rolls in whole degrees beside no other angle of the stand, which are nominal. Neither is a
-    spread of the samples of which `lines`, the names too, speak the uncertainty of their mean.
+    for the place; and rolls in whole degrees beside no other angle of the stand, which are nominal; `others`, columns
+    that are not understood, may be such angles. Neither is a spread of the samples of which `lines`, the names too,
+    speak the uncertainty of their mean.
     """
     ignored = {}
     sampled = any(map(_OF_SAMPLES.search, lines))
     called = {m.column for m in meanings.values()}
-    lone = called.isdisjoint(REFERENCES[name].column for name in ("inclination", "azimuth"))
+    beside = [REFERENCES[name].column for name in ("inclination", "azimuth")]
+    lone = (
+        called.isdisjoint(beside)
+        and not any(map(answers.get, beside))
+        and not any(may_be(c, n, unit, values(n)) for c in beside for n, unit in others.items())
+    )
     for name, m in meanings.items():
         if answers.get(m.column) == "":
             ignored[name] = "as you say"
