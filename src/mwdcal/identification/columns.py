@@ -791,8 +791,8 @@ def proposed(
     _tell_by_values(meanings, names, units, values)
     said, known = answers or {}, stated or {}
     _tell_numbers(meanings, values, said)
-    unknown = {n: unit for n, unit in zip(names, units, strict=True) if n not in meanings}
-    ignored = _no_evidence(meanings, values, said, known, [*names, *above], unknown)
+    every = dict(zip(names, units, strict=True))
+    ignored = _no_evidence(meanings, values, said, known, above, every)
     _answered(said, names, meanings, source)
     questions = Questions(besides)
     damaged = {} if problems is None else problems  # filled while values are read
@@ -819,13 +819,13 @@ def proposed(
         )  # else either may be either
         others = [n for n in names if n not in meanings and n not in believed]
         questions.ask(_check_nameless, others, values, {*chosen, *known}, source)
-    rest = {n: u for n, u in zip(names, units, strict=True) if n not in meanings}
+    rest = {n: u for n, u in every.items() if n not in meanings}
     _ask_lacking({*chosen, *said, *known, *of_vectors(chosen)}, rest, values, questions, source)
     questions.raise_any(source)
     by_value = {c for c, each in chosen.items() if each.unit and not meanings[each.name].unit}
     used = {each.name for each in chosen.values()}
     ignored = {name: reason for name, reason in ignored.items() if name not in used}
-    chosen = _with_wrong_units(chosen, said, dict(zip(names, units, strict=True)))
+    chosen = _with_wrong_units(chosen, said, every)
     return _labels(names, chosen) | chosen, by_value, ignored
 
 
@@ -906,24 +906,22 @@ def _no_evidence(
     answers: Mapping[str, str],
     stated: Collection[str],
     lines: Sequence[str],
-    others: Mapping[str, str],
+    units: Mapping[str, str],
 ) -> dict[str, str]:
     """Columns that are named like references but hold no references, each with the reason.
 
     That is what the user excludes; totals computed from the channels, and those that vary beside the one `stated`
-    for the place; and rolls in whole degrees beside no other angle of the stand, which are nominal; `others`, columns
-    that are not understood, may be such angles. Neither is a spread of the samples of which `lines`, the names too,
+    for the place; and rolls in whole degrees beside no other angle of the stand, which are nominal; columns that are
+    not understood, of `units` by name, may be such angles. Neither is a spread of the samples of which `lines` or names
     speak the uncertainty of their mean.
     """
     ignored = {}
-    sampled = any(map(_OF_SAMPLES.search, lines))
+    sampled = any(map(_OF_SAMPLES.search, [*units, *lines]))
     called = {m.column for m in meanings.values()}
     beside = [REFERENCES[name].column for name in ("inclination", "azimuth")]
-    lone = (
-        called.isdisjoint(beside)
-        and not any(map(answers.get, beside))
-        and not any(may_be(c, n, unit, values(n)) for c in beside for n, unit in others.items())
-    )
+    lone = called.isdisjoint(beside) and not any(map(answers.get, beside))
+    unclear = [(n, unit) for n, unit in units.items() if n not in meanings]
+    lone &= not any(may_be(c, n, unit, values(n)) for c in beside for n, unit in unclear)
     for name, m in meanings.items():
         if answers.get(m.column) == "":
             ignored[name] = "as you say"
