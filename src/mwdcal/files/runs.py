@@ -250,7 +250,7 @@ def read_roll_test(
         try:
             where = tables.laid_out(path, wanted=wanted, decimal=decimal, kind=ROLL_TEST)
         except InputError:
-            where = _other_sheet(path, run, wanted, decimal)
+            where = _other_sheet(path, run, wanted, decimal) if run.sheet else None
         if where and (where.sheet, where.lines[0]) != (run.sheet, run.lines[0]):
             table = _with_form(_of_layout(where, path, profile), form)
             return stated_table(table, statements, _serial_column(table, profile))

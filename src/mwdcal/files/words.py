@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from functools import lru_cache
 
 from mwdcal.files.synonyms import resembled
 
@@ -150,6 +151,7 @@ TRANSLATIONS = (
 """Words of other languages and of WITSML, and the word of the field for each."""
 
 
+@lru_cache(maxsize=4096)
 def spelled(name: str) -> str:
     """A name in plain letters, with the words of the field.
 

@@ -814,9 +814,8 @@ def proposed(
         questions.ask(_check_nominal, column, angles, names, values, source)
     beside = questions.settle("side by side")
     if not beside and not {*RAW[3:]} & {*chosen, *said}:
-        believed = (
-            questions.believed() if {*RAW[:3]} & {*chosen} else ()
-        )  # else either may be either
+        # Without accelerometers either triad may be either.
+        believed = questions.believed() if {*RAW[:3]} & {*chosen} else ()
         others = [n for n in names if n not in meanings and n not in believed]
         questions.ask(_check_nameless, others, values, {*chosen, *known}, source)
     rest = {n: u for n, u in every.items() if n not in meanings}

@@ -326,13 +326,12 @@ class ProposedProfile(Result):
         self.files["output"] = Path(path)
 
     def _text(self) -> str:
+        from mwdcal.files.formats.layout import ROLL_TEST
         from mwdcal.presentation.proposal import screen
 
-        profile, output, test = self.proposal.profile, self.files.get("output"), None
-        if output and self.proposal.where:
-            run = runs.read_export(self.path, profile)
-            test = runs.read_roll_test(self.path, run, profile, {})
-        return screen(self.proposal, self.path, output, test is not None)
+        where = self.proposal.where
+        test = where is not None and any(why.startswith(ROLL_TEST) for _, why in where.left_out)
+        return screen(self.proposal, self.path, self.files.get("output"), test)
 
     def _document(self) -> dict[str, Any]:
         from mwdcal.presentation.proposal import summary
