@@ -277,6 +277,41 @@ def test_a_superseded_run_is_not_meant(tmp_path, state):
     assert same(taken(tmp_path / "run.xlsx"), rows)
 
 
+MINUTES = [
+    ["Inclination", "deg", "min", "sec"],
+    ["Neigung", "Grad", "Min", "Sek"],
+    ["Зенитный угол", "град", "мин", "сек"],
+    ["井斜角", "度", "分", "秒"],
+    ["Inc.", "°", "'", '"'],
+]
+
+
+@pytest.mark.parametrize("words", MINUTES, ids=lambda words: words[0])
+@pytest.mark.parametrize("parts", [2, 3])
+def test_degrees_minutes_and_seconds_below_merged_names(tmp_path, words, parts):
+    """0.26° is 15' 36\", and 0.25° is 15'."""
+    share, below = (0.26, [15, 36]) if parts == 3 else (0.25, [15])
+    rows = [[row[0] // 1 + share, *row[1:]] for row in stations()]
+    book = openpyxl.Workbook()
+    page = book.active
+    page.append(
+        ["No.", words[0], *[""] * (parts - 1), *NAMES[1:3], *(n.split()[0] for n in NAMES[3:])]
+    )
+    page.append(["", *words[1 : parts + 1], "", "", *["V"] * 6, "C"])
+    page.merge_cells(start_row=1, start_column=2, end_row=1, end_column=1 + parts)
+    for number, row in enumerate(rows, 1):
+        page.append([number, row[0] // 1, *below, *row[1:]])
+    book.save(tmp_path / "run.xlsx")
+    assert same(taken(tmp_path / "run.xlsx"), rows)
+
+
+def test_a_least_and_a_largest_value_are_no_minutes(tmp_path):
+    rows = stations()
+    names = ["Inc (deg)", "Inc min", "Inc max", *NAMES[1:]]
+    table = lines_of([[row[0], row[0] - 1, row[0] + 1, *row[1:]] for row in rows], names)
+    assert same(taken(written(tmp_path / "run.csv", table)), rows)
+
+
 PLACES = [
     ["Reference", "Total field (nT)", "Dip (°)"],
     ["Stavanger", 50948, 72.61],
