@@ -336,6 +336,28 @@ def test_limits_and_former_calibrations_are_no_references():
     assert stated_above(rows, limits).metadata == {"ref_field_nt": 50480.0, "ref_dip_deg": 70.0}
 
 
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [["Local gravity", 9.79285, "m/s²", "(= 0.99859 g, 1 g = 9.80665 m/s²)"]],
+        [["Gravedad local:", 9.79285, "m/s²", "(1 g = 9,80665 m/s²)"]],
+        [["g ref.", 9.79285, "m/s²"], ["Unidad g = 9,80665 m/s²"]],
+        [["Ускорение свободного падения, м/с²:", 9.79285], ["1 g = 9,80665 м/с²"]],
+    ],
+)
+def test_what_a_unit_is_states_no_reference(rows):
+    """Standard gravity defines the unit; a second value is one that differs."""
+    gravity = 9.79285 / 9.80665
+    assert stated_above(rows).metadata == {"ref_gravity_g": pytest.approx(gravity, rel=1e-12)}
+    assert stated_above(rows[1:]).metadata == {}
+    assert stated_above([["Local gravity 9.81 m/s² (= 9.83 m/s²)"]]).metadata == {}
+
+
+def test_a_station_is_no_unit():
+    rows = [["Station 1 g = 9.79285 m/s²"]]
+    assert stated_above(rows).metadata["ref_gravity_g"] == pytest.approx(9.79285 / 9.80665)
+
+
 def test_field_and_dip_of_components():
     """A right triangle of 30, 40 and 50 µT; the tangent of its dip is 4/3."""
     line = "Field: horizontal component 30000 nT, vertical component 40000 nT"
