@@ -69,9 +69,10 @@ _UNIT_BEHIND = re.compile(r"(.*?)\s*([(\[][^)\]]*[)\]]|,\s*[^\s,]{1,5})")
 _AXIS = re.compile(r"\W*([xyz123])\W*([(\[].*)?", re.IGNORECASE)
 """A name that is an axis alone, and says nothing without the title above it."""
 _OF_AXIS = re.compile(
-    r"\W*(\w{0,6}|[^()\[\]]*[\W_](?=[xyz]))(?P<axis>[xyz123])\W*([(\[].*)?", re.IGNORECASE
+    r"\W*(\w{0,6}|[^()\[\]]*[\W_](?=[xyz]))(?P<axis>[xyz123])\W*([(\[].*|(?<=,)\s*(?![xyz]\b)[^\s,]{1,5})?",
+    re.IGNORECASE,
 )
-"""A name that ends in an axis."""
+"""A name that ends in an axis, but for its unit."""
 _SYMBOL = re.compile(r"[^\W\d_]")
 """A name that is the symbol of a quantity."""
 _DEGREES_OF = re.compile(
