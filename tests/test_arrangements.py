@@ -305,6 +305,32 @@ def test_degrees_minutes_and_seconds_below_merged_names(tmp_path, words, parts):
     assert same(taken(tmp_path / "run.xlsx"), rows)
 
 
+@pytest.mark.parametrize(
+    ("names", "below"),
+    [
+        (["Inc (°)", "min", "sec"], None),
+        (["Inc deg", "Inc arcmin", "Inc arcsec"], None),
+        (["Inc", "", ""], ["[deg]", "[min]", "[s]"]),
+        (["Inclinaison", "", ""], ["degrés", "minutes", "secondes"]),
+        (["Зенит", "", ""], ["гр.", "мин.", "сек."]),
+    ],
+    ids=lambda words: words and words[0],
+)
+def test_degrees_minutes_and_seconds_of_one_angle_alone(tmp_path, names, below):
+    """All other columns have their names in the upper row: 0.26° is 15' 36\"."""
+    rows = [[row[0] // 1 + 0.26, *row[1:]] for row in stations()]
+    book = openpyxl.Workbook()
+    page = book.active
+    page.append([*names, *NAMES[1:]])
+    if below:
+        page.append(below)
+        page.merge_cells("A1:C1")
+    for row in rows:
+        page.append([row[0] // 1, 15, 36, *row[1:]])
+    book.save(tmp_path / "run.xlsx")
+    assert same(taken(tmp_path / "run.xlsx"), rows)
+
+
 def test_a_least_and_a_largest_value_are_no_minutes(tmp_path):
     rows = stations()
     names = ["Inc (deg)", "Inc min", "Inc max", *NAMES[1:]]

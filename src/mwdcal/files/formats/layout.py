@@ -76,9 +76,9 @@ _OF_AXIS = re.compile(
 _SYMBOL = re.compile(r"[^\W\d_]")
 """A name that is the symbol of a quantity."""
 _DEGREES_OF = re.compile(
-    r"(?P<of>.*?)(?:^|[\s,(\[_]+)(?:(?P<d>deg(rees?)?|gra[du]s?|grad(er|en|os|us|i)|град(ус\w*)?|[°º]|度)|"
-    r"(?P<s>sec(onds?)?|sek(unden|under)?|seg(undos)?|сек(унд\w*)?|\"|″|”|''|′′|’’|秒)|"
-    r"(?P<m>min(utes?|uten|utter|utos)?|мин(ут\w*)?|['′’]|分)|(?P<largest>max|макс))[\s.,)\]]*",
+    r"(?P<of>.*?)(?:^|[\s,(\[_]+)(?:(?P<d>deg(r[eé]e?s?)?|gra[du]s?|grad(er|en|os|us|i)|гр|град(ус\w*)?|[°º]|度)|"
+    r"(?P<s>(arc[- ]?)?sec(onds?|ondes)?|sek(unden|under)?|seg(undos)?|s|сек(унд\w*)?|\"|″|”|''|′′|’’|秒)|"
+    r"(?P<m>(arc[- ]?)?min(utes?|uten|utter|utos)?|мин(ут\w*)?|['′’]|分)|(?P<largest>max|макс))[\s.,)\]]*",
     re.IGNORECASE,
 )
 """The name of a column of degrees, of minutes or of seconds of an angle, or of a largest value beside the least."""
@@ -633,7 +633,9 @@ def _without_dittos(rows: Sequence[tuple[int, Cells]]) -> list[tuple[int, Cells]
 def _is_below_names(rows: Sequence[tuple[int, Cells]], place: int) -> bool:
     """Whether a row is one of units, of a few columns alone, below names."""
     above = rows[place - 1][1] if place else ()
-    return is_units(rows[place][1]) and _is_of_texts(above) and not _is_reading(above)
+    row = rows[place][1]
+    units = is_units(row) or _are_parts_of_degrees(map(as_text, row))
+    return units and _is_of_texts(above) and not _is_reading(above)
 
 
 _STATIONS_IN_COLUMNS = (
@@ -1140,9 +1142,11 @@ def _with_minutes(
     (['Inc (°)', 'T'], [['30.26'], ['20']])
     """
     angles: dict[str, dict[str, int]] = {}
+    angle = ""
     for place, match in enumerate(map(_DEGREES_OF.fullmatch, names)):
-        if match and match["of"]:
-            angles.setdefault(match["of"], {})[str(match.lastgroup)] = place
+        angle = match["of"] or (angle if not match["d"] else "") if match else ""
+        if match and angle:
+            angles.setdefault(angle, {})[str(match.lastgroup)] = place
     whole, joined = [*names], [*cells]
     for angle, places in angles.items():
         if {"d", "m"} <= {*places} and "largest" not in places:
@@ -1220,9 +1224,8 @@ def _is_of_names(
 def _need_titles(names: Sequence[str]) -> bool:
     """Whether names say nothing alone: axes only, or one name for several columns."""
     bare = [_BRACKETS.sub("", name).strip().lower() for name in names if name]
-    return (
-        any(_AXIS.fullmatch(name) for name in names) or max(Counter(bare).values(), default=0) > 1
-    )
+    axes = any(_AXIS.fullmatch(name) for name in names)
+    return axes or max(Counter(bare).values(), default=0) > 1 or _are_parts_of_degrees(names)
 
 
 def _is_unit(name: str) -> bool:
@@ -1292,7 +1295,7 @@ def _are_parts_of_degrees(names: Iterable[str]) -> bool:
     >>> _are_parts_of_degrees(["deg", "min", "sec", "g"]), _are_parts_of_degrees(["deg", "g"])
     (True, False)
     """
-    each = (_DEGREES_OF.fullmatch(name) for name in names)
+    each = (_DEGREES_OF.fullmatch(name.strip("[]()")) for name in names)
     parts = [str(m.lastgroup) if m and not m["of"] else " " for m in each]
     return "dm" in "".join(parts)
 
