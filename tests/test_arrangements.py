@@ -277,6 +277,67 @@ def test_a_superseded_run_is_not_meant(tmp_path, state):
     assert same(taken(tmp_path / "run.xlsx"), rows)
 
 
+MINUTES = [
+    ["Inclination", "deg", "min", "sec"],
+    ["Neigung", "Grad", "Min", "Sek"],
+    ["Зенитный угол", "град", "мин", "сек"],
+    ["井斜角", "度", "分", "秒"],
+    ["Inc.", "°", "'", '"'],
+]
+
+
+@pytest.mark.parametrize("words", MINUTES, ids=lambda words: words[0])
+@pytest.mark.parametrize("parts", [2, 3])
+def test_degrees_minutes_and_seconds_below_merged_names(tmp_path, words, parts):
+    """0.26° is 15' 36\", and 0.25° is 15'."""
+    share, below = (0.26, [15, 36]) if parts == 3 else (0.25, [15])
+    rows = [[row[0] // 1 + share, *row[1:]] for row in stations()]
+    book = openpyxl.Workbook()
+    page = book.active
+    page.append(
+        ["No.", words[0], *[""] * (parts - 1), *NAMES[1:3], *(n.split()[0] for n in NAMES[3:])]
+    )
+    page.append(["", *words[1 : parts + 1], "", "", *["V"] * 6, "C"])
+    page.merge_cells(start_row=1, start_column=2, end_row=1, end_column=1 + parts)
+    for number, row in enumerate(rows, 1):
+        page.append([number, row[0] // 1, *below, *row[1:]])
+    book.save(tmp_path / "run.xlsx")
+    assert same(taken(tmp_path / "run.xlsx"), rows)
+
+
+@pytest.mark.parametrize(
+    ("names", "below"),
+    [
+        (["Inc (°)", "min", "sec"], None),
+        (["Inc deg", "Inc arcmin", "Inc arcsec"], None),
+        (["Inc", "", ""], ["[deg]", "[min]", "[s]"]),
+        (["Inclinaison", "", ""], ["degrés", "minutes", "secondes"]),
+        (["Зенит", "", ""], ["гр.", "мин.", "сек."]),
+    ],
+    ids=lambda words: words and words[0],
+)
+def test_degrees_minutes_and_seconds_of_one_angle_alone(tmp_path, names, below):
+    """All other columns have their names in the upper row: 0.26° is 15' 36\"."""
+    rows = [[row[0] // 1 + 0.26, *row[1:]] for row in stations()]
+    book = openpyxl.Workbook()
+    page = book.active
+    page.append([*names, *NAMES[1:]])
+    if below:
+        page.append(below)
+        page.merge_cells("A1:C1")
+    for row in rows:
+        page.append([row[0] // 1, 15, 36, *row[1:]])
+    book.save(tmp_path / "run.xlsx")
+    assert same(taken(tmp_path / "run.xlsx"), rows)
+
+
+def test_a_least_and_a_largest_value_are_no_minutes(tmp_path):
+    rows = stations()
+    names = ["Inc (deg)", "Inc min", "Inc max", *NAMES[1:]]
+    table = lines_of([[row[0], row[0] - 1, row[0] + 1, *row[1:]] for row in rows], names)
+    assert same(taken(written(tmp_path / "run.csv", table)), rows)
+
+
 PLACES = [
     ["Reference", "Total field (nT)", "Dip (°)"],
     ["Stavanger", 50948, 72.61],
@@ -299,6 +360,28 @@ def test_limits_and_former_calibrations_are_no_references():
     rows = [["Previous cal", "Bref 50391 nT"], ["Bref", 50480, "nT", "", "Dip", 70.0, "deg"]]
     limits = [["Limits"], ["Btotal", 300, "nT"], ["Dip", 0.3, "deg"]]
     assert stated_above(rows, limits).metadata == {"ref_field_nt": 50480.0, "ref_dip_deg": 70.0}
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [["Local gravity", 9.79285, "m/s²", "(= 0.99859 g, 1 g = 9.80665 m/s²)"]],
+        [["Gravedad local:", 9.79285, "m/s²", "(1 g = 9,80665 m/s²)"]],
+        [["g ref.", 9.79285, "m/s²"], ["Unidad g = 9,80665 m/s²"]],
+        [["Ускорение свободного падения, м/с²:", 9.79285], ["1 g = 9,80665 м/с²"]],
+    ],
+)
+def test_what_a_unit_is_states_no_reference(rows):
+    """Standard gravity defines the unit; a second value is one that differs."""
+    gravity = 9.79285 / 9.80665
+    assert stated_above(rows).metadata == {"ref_gravity_g": pytest.approx(gravity, rel=1e-12)}
+    assert stated_above(rows[1:]).metadata == {}
+    assert stated_above([["Local gravity 9.81 m/s² (= 9.83 m/s²)"]]).metadata == {}
+
+
+def test_a_station_is_no_unit():
+    rows = [["Station 1 g = 9.79285 m/s²"]]
+    assert stated_above(rows).metadata["ref_gravity_g"] == pytest.approx(9.79285 / 9.80665)
 
 
 def test_field_and_dip_of_components():

@@ -169,12 +169,14 @@ def test_minutes_and_seconds_below_a_few_names(tmp_path):
     assert same(taken(tmp_path / "run.xlsx"), rows)
 
 
-def test_stations_in_columns_below_long_names(tmp_path):
+@pytest.mark.parametrize("form", ["{} ({})", "{}, {}"])
+def test_stations_in_columns_below_long_names(tmp_path, form):
     rows = stations()
+    words = [f"{each} {axis}" for each in ("Accéléromètre", "Magnétomètre") for axis in "XYZ"]
     names = [
-        *("Inclinaison (°)", "Azimut (°)", "Toolface (°)"),
-        *(f"{word} {axis} (V)" for word in ("Accéléromètre", "Magnétomètre") for axis in "XYZ"),
-        "Température (°C)",
+        *(form.format(word, "°") for word in ("Inclinaison", "Azimut", "Toolface")),
+        *(form.format(word, "V") for word in words),
+        form.format("Température", "°C"),
     ]
     book = openpyxl.Workbook()
     sheet = book.active
@@ -182,6 +184,23 @@ def test_stations_in_columns_below_long_names(tmp_path):
         sheet.append([name, *values])
     book.save(tmp_path / "run.xlsx")
     assert same(taken(tmp_path / "run.xlsx"), rows)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("Toolface gravité (°)", "Toolface de gravité (°)", "Toolface gravitatorio (°)"),
+        *("Tool face de gravedad (°)", "Toolface (grav.) (°)"),
+    ],
+)
+def test_a_toolface_by_gravity_is_no_gravity(tmp_path, name):
+    """Its name tells, without a look at the readings."""
+    rows = stations()
+    path = written(tmp_path / "run.csv", lines_of(rows, [*NAMES[:2], name, *NAMES[3:]]))
+    proposal = mwdcal.propose_profile(path)
+    assert proposal.profile.columns["ref_toolface_deg"].name == name
+    assert "told-by-readings" not in {finding.id for finding in proposal.findings}
+    assert same(taken(path), rows)
 
 
 def test_tools_by_number_one_below_the_other_are_asked_about(tmp_path):

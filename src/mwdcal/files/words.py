@@ -69,7 +69,8 @@ TRANSLATIONS = (
         r"verktoy(flate|vinkel)\w*|(face|angulo) d[ae] ferramenta|(face|angle)( d[e'])? ?(l'?)?outil|"
         r"ghsf?\b|угол установки( отклонител\w*)?|визир\w*( угол)?|"
         r"angulo de giro|giro|rotacion|отклонител\w*|откл\b\.?|визирн\w* угол|поворот|工具面角?|"
-        r"cara de (la )?herr(amienta|\b\.?)|gravity tool ?face|h\.?s\.?[ _-]*tool ?face|tool[ _-]*face",
+        r"cara de (la )?herr(amienta|\b\.?)|gravity tool ?face|h\.?s\.?[ _-]*tool ?face|"
+        r"tool[ _-]*face( (d[ae] )?(la )?grav\w*| ?\(grav\w*\.?\))?",
         "toolface ",
     ),
     (

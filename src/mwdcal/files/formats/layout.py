@@ -69,16 +69,19 @@ _UNIT_BEHIND = re.compile(r"(.*?)\s*([(\[][^)\]]*[)\]]|,\s*[^\s,]{1,5})")
 _AXIS = re.compile(r"\W*([xyz123])\W*([(\[].*)?", re.IGNORECASE)
 """A name that is an axis alone, and says nothing without the title above it."""
 _OF_AXIS = re.compile(
-    r"\W*(\w{0,6}|[^()\[\]]*[\W_](?=[xyz]))(?P<axis>[xyz123])\W*([(\[].*)?", re.IGNORECASE
+    r"\W*(\w{0,6}|[^()\[\]]*[\W_](?=[xyz]))(?P<axis>[xyz123])\W*([(\[].*|(?<=,)\s*(?![xyz]\b)[^\s,]{1,5})?",
+    re.IGNORECASE,
 )
-"""A name that ends in an axis."""
+"""A name that ends in an axis, but for its unit."""
 _SYMBOL = re.compile(r"[^\W\d_]")
 """A name that is the symbol of a quantity."""
 _DEGREES_OF = re.compile(
-    r"(.+?)[\s,(\[_]+(?:(?P<d>deg|grad|град|°|grados|graus|度)|(?P<m>min|мин|minutos|'|′|分))\W*",
+    r"(?P<of>.*?)(?:^|[\s,(\[_]+)(?:(?P<d>deg(r[eé]e?s?)?|gra[du]s?|grad(er|en|os|us|i)|гр|град(ус\w*)?|[°º]|度)|"
+    r"(?P<s>(arc[- ]?)?sec(onds?|ondes)?|sek(unden|under)?|seg(undos)?|s|сек(унд\w*)?|\"|″|”|''|′′|’’|秒)|"
+    r"(?P<m>(arc[- ]?)?min(utes?|uten|utter|utos)?|мин(ут\w*)?|['′’]|分)|(?P<largest>max|макс))[\s.,)\]]*",
     re.IGNORECASE,
 )
-"""The name of a column of degrees, or of minutes."""
+"""The name of a column of degrees, of minutes or of seconds of an angle, or of a largest value beside the least."""
 WITHOUT_VALUE = re.compile(r"n/?a|n\.a\.?|nan|null|none|[\W_]*", re.IGNORECASE)
 """A cell that says that there is no value."""
 NO_READING = re.compile(
@@ -630,7 +633,9 @@ def _without_dittos(rows: Sequence[tuple[int, Cells]]) -> list[tuple[int, Cells]
 def _is_below_names(rows: Sequence[tuple[int, Cells]], place: int) -> bool:
     """Whether a row is one of units, of a few columns alone, below names."""
     above = rows[place - 1][1] if place else ()
-    return is_units(rows[place][1]) and _is_of_texts(above) and not _is_reading(above)
+    row = rows[place][1]
+    units = is_units(row) or _are_parts_of_degrees(map(as_text, row))
+    return units and _is_of_texts(above) and not _is_reading(above)
 
 
 _STATIONS_IN_COLUMNS = (
@@ -1131,27 +1136,37 @@ def _is_fraction(cell: object) -> bool:
 def _with_minutes(
     names: Sequence[str], cells: Sequence[list[str]]
 ) -> tuple[list[str], list[list[str]]]:
-    """Names and cells; degrees and minutes in two columns of one name become one column of degrees."""
-    whole, joined, place = [], [], 0
-    while place < len(names):
-        name, column = names[place], cells[place]
-        one, two = (_DEGREES_OF.fullmatch(n) for n in (name, [*names, ""][place + 1]))
-        if one and two and one[1] == two[1] and one["d"] and two["m"]:
-            pairs = zip(column, cells[place + 1], strict=True)
-            name, column = f"{one[1]} (°)", [_sum(*pair) for pair in pairs]
-            place += 1
-        whole.append(name)
-        joined.append(column)
-        place += 1
-    return whole, joined
+    """Names and cells; degrees, minutes and seconds in columns of one name become one column of degrees.
+
+    >>> _with_minutes(["Inc deg", "Inc min", "Inc sec", "T"], [["30"], ["15"], ["36"], ["20"]])
+    (['Inc (°)', 'T'], [['30.26'], ['20']])
+    """
+    angles: dict[str, dict[str, int]] = {}
+    angle = ""
+    for place, match in enumerate(map(_DEGREES_OF.fullmatch, names)):
+        angle = match["of"] or (angle if not match["d"] else "") if match else ""
+        if match and angle:
+            angles.setdefault(angle, {})[str(match.lastgroup)] = place
+    whole, joined = [*names], [*cells]
+    for angle, places in angles.items():
+        if {"d", "m"} <= {*places} and "largest" not in places:
+            every = [places[part] for part in "dms" if part in places]
+            first = every[0]
+            whole[first] = f"{angle} (°)"
+            joined[first] = [_sum(*each) for each in zip(*(cells[k] for k in every), strict=True)]
+            for place in every[1:]:
+                whole[place] = ""
+    kept = [place for place, name in enumerate(whole) if name]
+    return [whole[k] for k in kept], [joined[k] for k in kept]
 
 
-def _sum(degrees: str, minutes: str) -> str:
-    """Degrees and minutes in degrees; as they stand where either is no number."""
-    if not looks_numeric(degrees) or not looks_numeric(minutes):
-        return f"{degrees} {minutes}".strip()
-    part = float(minutes) / 60
-    return repr(float(degrees) + (-part if degrees.startswith("-") else part))
+def _sum(degrees: str, *parts: str) -> str:
+    """Degrees, minutes and seconds in degrees; as they stand where one is no number."""
+    texts = [degrees, *parts]
+    if not all(map(looks_numeric, texts)):
+        return " ".join(texts).strip()
+    size = sum(abs(float(text)) / 60**power for power, text in enumerate(texts))
+    return repr(-size if any(text.startswith("-") for text in texts) else size)
 
 
 def _words(row: Cells) -> str:
@@ -1209,9 +1224,8 @@ def _is_of_names(
 def _need_titles(names: Sequence[str]) -> bool:
     """Whether names say nothing alone: axes only, or one name for several columns."""
     bare = [_BRACKETS.sub("", name).strip().lower() for name in names if name]
-    return (
-        any(_AXIS.fullmatch(name) for name in names) or max(Counter(bare).values(), default=0) > 1
-    )
+    axes = any(_AXIS.fullmatch(name) for name in names)
+    return axes or max(Counter(bare).values(), default=0) > 1 or _are_parts_of_degrees(names)
 
 
 def _is_unit(name: str) -> bool:
@@ -1268,9 +1282,22 @@ def is_units(row: Cells) -> bool:
     """Whether a row holds units: of its cells that are filled in two or more are known, and all are short."""
     cells = [as_text(cell).strip() for cell in row if cell != ""]
     bare = [cell.strip("[]()").strip() for cell in cells]
+    if _are_parts_of_degrees(bare):
+        return False
     known = [cell for cell in bare if unit_of(cell)]
     short = all(len(cell) <= 8 and not re.search(r"[xyz]\b", cell, re.I) for cell in bare)
     return len(known) >= 2 and short and 2 * len(known) >= len([c for c in bare if c.strip("-–")])
+
+
+def _are_parts_of_degrees(names: Iterable[str]) -> bool:
+    """Whether names are of degrees and of minutes right behind them, without the angle whose they are.
+
+    >>> _are_parts_of_degrees(["deg", "min", "sec", "g"]), _are_parts_of_degrees(["deg", "g"])
+    (True, False)
+    """
+    each = (_DEGREES_OF.fullmatch(name.strip("[]()")) for name in names)
+    parts = [str(m.lastgroup) if m and not m["of"] else " " for m in each]
+    return "dm" in "".join(parts)
 
 
 def _without_summary(rows: Sequence[tuple[int, Cells]]) -> list[tuple[int, Cells]]:

@@ -140,6 +140,18 @@ _WITH_SPREAD = re.compile(
 )
 """A value whose unit stands behind its uncertainty alone: 56870 +/- 45 nT."""
 
+_OF_A_UNIT = re.compile(
+    r"(?:(?:^|[(\[,;:])\s*1|(?<![^\W\d_])(?:unit\w*|unidade?|einheit|enhet|enhed|eenheid|jednostka|единиц\w*)|单位)"
+    rf"\s*(?:{_WRITTEN_UNIT}|[gг])\s*[=≙≈]\s*(?:{_WRITTEN_NUMBER})\s*(?:{_WRITTEN_UNIT})"
+)
+"""What a unit is: 1 g = 9.80665 m/s²."""
+_IN_OTHER_UNIT = re.compile(
+    rf"(?P<value>(?P<number>{_WRITTEN_NUMBER})\s*(?P<unit>{_WRITTEN_UNIT}))[\s;]*"
+    rf"[(\[]\s*=\s*(?P<again>{_WRITTEN_NUMBER})\s*(?P<other>{_WRITTEN_UNIT})[^)\]]*[)\]]"
+)
+"""A value, and in brackets the same in another unit."""
+_ROUNDED = 5e-4
+"""By how much these differ at most, as a share: half a digit in the third place."""
 _ANOTHER = re.compile(
     rf"[\s;,/|)]*(?:(?:and|or|und|oder|bzw|og|eller|y|o|e|ou|et|и|или|resp)(?![^\W\d_])\s*)?"
     rf"(?P<number>{_WRITTEN_NUMBER})(?![./-]?\d)\s*(?:{_WRITTEN_UNIT}|(?!°|[^\W\d_]))"
@@ -508,8 +520,19 @@ def _clauses(row: Sequence[object]) -> str:
         unit = re.fullmatch(rf"[(\[]?({_WRITTEN_UNIT}|[ns])[)\]]?", cell)
         text += f"; {cell}" if ends and not unit else f" {cell}"
         ends = not unit and bool(re.search(r"(?<![\w.,])[+\-−]?\d[^;]*$", cell))
+    text = _IN_OTHER_UNIT.sub(_said_once, _OF_A_UNIT.sub("", text))
     text = _WITH_SPREAD.sub(r"\1 \4 \2 \3 \4", text)
     return _RANGE.sub("range ", text).strip()
+
+
+def _said_once(match: re.Match[str]) -> str:
+    """A value without the brackets behind it that say the same in another unit; all of it where they do not."""
+    one, other = (
+        [_converted(number, _unit(match[unit])) for number in _numbers(match[text])]
+        for text, unit in (("number", "unit"), ("again", "other"))
+    )
+    same = any(abs(b - a) <= _ROUNDED * abs(a) for a, b in product(one, other))
+    return match["value"] if same else match[0]
 
 
 def _of_a_place(text: str) -> dict[str, float]:
