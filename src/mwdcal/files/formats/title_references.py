@@ -144,7 +144,7 @@ _OF_A_UNIT = re.compile(
     r"(?:(?:^|[(\[,;:])\s*1|(?<![^\W\d_])(?:unit\w*|unidade?|einheit|enhet|enhed|eenheid|jednostka|единиц\w*)|单位)"
     rf"\s*(?:{_WRITTEN_UNIT}|[gг])\s*[=≙≈]\s*(?:{_WRITTEN_NUMBER})\s*(?:{_WRITTEN_UNIT})"
 )
-"""What a unit is: 1 g = 9.80665 m/s²."""
+"""Definition of a unit: 1 g = 9.80665 m/s²."""
 _IN_OTHER_UNIT = re.compile(
     rf"(?P<value>(?P<number>{_WRITTEN_NUMBER})\s*(?P<unit>{_WRITTEN_UNIT}))[\s;]*"
     rf"[(\[]\s*=\s*(?P<again>{_WRITTEN_NUMBER})\s*(?P<other>{_WRITTEN_UNIT})[^)\]]*[)\]]"
