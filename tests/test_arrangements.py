@@ -309,6 +309,7 @@ def test_degrees_minutes_and_seconds_below_merged_names(tmp_path, words, parts):
     ("names", "below"),
     [
         (["Inc (°)", "min", "sec"], None),
+        (["Inc", "min", "sec"], None),
         (["Inc deg", "Inc arcmin", "Inc arcsec"], None),
         (["Inc", "", ""], ["[deg]", "[min]", "[s]"]),
         (["Inclinaison", "", ""], ["degrés", "minutes", "secondes"]),
@@ -329,6 +330,13 @@ def test_degrees_minutes_and_seconds_of_one_angle_alone(tmp_path, names, below):
         page.append([row[0] // 1, 15, 36, *row[1:]])
     book.save(tmp_path / "run.xlsx")
     assert same(taken(tmp_path / "run.xlsx"), rows)
+
+
+def test_a_time_behind_an_angle_is_no_part_of_it(tmp_path):
+    rows = stations()
+    names = [*NAMES[:3], "min", *NAMES[3:]]
+    table = lines_of([[*row[:3], k % 50 + 1, *row[3:]] for k, row in enumerate(rows)], names)
+    assert same(taken(written(tmp_path / "run.csv", table)), rows)
 
 
 def test_a_least_and_a_largest_value_are_no_minutes(tmp_path):

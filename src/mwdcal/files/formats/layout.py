@@ -38,7 +38,8 @@ from mwdcal.files.formats.settings import (
 )
 from mwdcal.files.formats.title_references import stated_above
 from mwdcal.files.formats.titles import ADJUSTED, OF_REFUSAL, Titles, dated, titles
-from mwdcal.files.synonyms import unit_of
+from mwdcal.files.synonyms import resembled, unit_of
+from mwdcal.files.words import spelled
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import TableFormat
 
@@ -1142,14 +1143,27 @@ def _with_minutes(
     (['Inc (°)', 'T'], [['30.26'], ['20']])
     """
     angles: dict[str, dict[str, int]] = {}
-    angle = ""
-    for place, match in enumerate(map(_DEGREES_OF.fullmatch, names)):
-        angle = match["of"] or (angle if not match["d"] else "") if match else ""
-        if match and angle:
-            angles.setdefault(angle, {})[str(match.lastgroup)] = place
+    angle, certain = "", set[str]()
+    for place, (name, match) in enumerate(
+        zip(names, map(_DEGREES_OF.fullmatch, names), strict=True)
+    ):
+        if match:
+            angle = match["of"] or ("" if match["d"] else angle)
+            part = str(match.lastgroup)
+        else:
+            meant = resembled(spelled(name))
+            angle, part = name if meant and meant.column.endswith("_deg") else "", "d"
+        if angle:
+            angles.setdefault(angle, {}).setdefault(part, place)
+        if match and match["m"] and (match["of"] or not name.isalpha()):
+            certain.add(angle)  # a lone "min" may be the time
     whole, joined = [*names], [*cells]
     for angle, places in angles.items():
-        if {"d", "m"} <= {*places} and "largest" not in places:
+        if (
+            {"d", "m"} <= {*places}
+            and "largest" not in places
+            and (angle in certain or "s" in places)
+        ):
             every = [places[part] for part in "dms" if part in places]
             first = every[0]
             whole[first] = f"{angle} (°)"
