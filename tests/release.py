@@ -25,29 +25,21 @@ EXAMPLE = (
     "verify tool.json demo/rolltest.csv",
 )
 """The lines that `make demo` shows, without its page."""
-ARRAYS = """
+TABLES = """
+import shutil
 import numpy as np
 
-def table(name):
-    return np.genfromtxt(f"demo/{name}.csv", delimiter=",", skip_header=4, names=True)
+class Table(dict):
+    def assign(self, **more):
+        return Table(self, **more)
 
-def channels(rows):
-    a, m = (np.stack([rows[f"{kind}{axis}"] for axis in "xyz"], -1) for kind in "am")
-    return a / 3.0, m / 5e-5  # the nominal scales of the tool profile
-
-def angles(rows):
-    return (rows[f"ref_{name}_deg"] for name in ("inclination", "azimuth", "toolface"))
-
-rows = table("run")
-(a, m), (inc, azi, tf) = channels(rows), angles(rows)
+shutil.copy("demo/run.csv", "cal.csv")
+shutil.copy("demo/rolltest.csv", "rolltest.csv")
+lines = [line for line in open("demo/surveys.csv") if not line.startswith("#")]
+rows = np.genfromtxt(lines, delimiter=",", names=True)
+df = Table({name: rows[name] for name in rows.dtype.names})
 """
-"""The arrays that the README's lines of Python begin with, from the example; then a survey and a roll test."""
-READINGS = """
-rows = table("rolltest")
-(a, m), (inc, azi, tf) = channels(rows), angles(rows)
-rolltest = mwdcal.readings(a, m, inclination_deg=inc, azimuth_deg=azi, toolface_deg=tf)
-survey = mwdcal.readings(*channels(table("surveys")))
-"""
+"""The tables that the README's lines of Python speak of, from the example; what of pandas they need."""
 
 
 def output(*command: str | Path, folder: Path) -> str:
@@ -84,14 +76,11 @@ def readme(python: Path, folder: Path) -> int:
 
 
 def snippet(python: Path, folder: Path) -> None:
-    """Run the README's lines of Python on the arrays of the example, whose roll test must pass."""
+    """Run the README's lines of Python on the tables of the example, whose roll test must pass."""
     text = (ROOT / "README.md").read_text("utf-8")
-    first, *others = re.search(r"^```python\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)[1].split(
-        "\n\n", 1
-    )
-    lines = "".join(others).rstrip().splitlines()
-    program = "\n".join([first, ARRAYS, lines[0], READINGS, *lines[1:-1], f"assert {lines[-1]}"])
-    output(python, "-c", program, folder=folder)
+    code = re.search(r"^```python\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)[1]
+    *lines, last = code.rstrip().splitlines()
+    output(python, "-c", "\n".join([TABLES, *lines, f"assert {last}"]), folder=folder)
 
 
 def bench(python: Path, folder: Path) -> None:
