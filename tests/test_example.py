@@ -100,10 +100,10 @@ def test_the_python_tutorial_calibrates_a_table_with_its_own_names(tmp_path, mon
         for name in (*(f"gain-{a}{b}" for a in "xyz" for b in "xyz"), *(f"offset-{a}" for a in "xyz"))
     ]  # fmt: skip
     assert all(float(sd) > 0 for *_, sd in printed)
-    table = seen["df"]
-    assert table["Messpunkt"].tolist() == list(range(1, 49))
-    assert (table["inclination_deg"] - table["Neigung Soll (°)"]).abs().max() < 0.1
-    again = library.calibrate(table, seen["profile"])
+    angles = seen["angles"]
+    assert angles["Messpunkt"].tolist() == list(range(1, 49))
+    assert (angles["inclination_deg"] - angles["Neigung Soll (°)"]).abs().max() < 0.1
+    again = library.calibrate(seen["df"], seen["profile"])
     np.testing.assert_allclose(again.accelerometer.parameters, seen["cal"].accelerometer.parameters)
 
 
