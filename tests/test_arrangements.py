@@ -64,7 +64,7 @@ def test_a_line_of_settings_above_names_that_repeat(tmp_path):
 
 
 def test_lines_between_rows_give_way_to_columns(tmp_path):
-    """Where a column states the inclination, a nominal one in lines is none."""
+    """A column of inclinations overrides the nominal ones in lines."""
     rows = stations()
     head, *table = lines_of(rows)
     for place in range(0, len(table), 13):

@@ -169,7 +169,7 @@ def test_the_tool_of_a_calibration(tmp_path):
 
 
 def test_a_plan_is_at_the_place_of_the_calibration_unless_it_states_one():
-    """What the run only estimated, as its dip here, is not stated in the plan."""
+    """The plan states no value that the run only estimated, such as the dip here."""
     run = mwdcal.simulate("twenty-four-state", seed=3)
     known = {"field": np.full(len(run), 51_000.0), "gravity": np.full(len(run), 0.998)}
     angles = {name: run.known[name] for name in ("inclination", "azimuth", "toolface")}

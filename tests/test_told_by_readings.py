@@ -236,7 +236,7 @@ def test_a_dip_that_differs_by_less_is_taken(tmp_path):
 
 
 def test_rolls_in_whole_degrees_count_beside_angles_in_words_that_are_not_understood(tmp_path):
-    """The readings tell which of these is which; the rolls are not nominal for want of other angles."""
+    """The readings identify inclination and azimuth, so the rolls are not the only angles of the stand."""
     words = {"Inc (deg)": "Tilt of cradle (deg)", "Azi (deg)": "Way of cradle (deg)"}
     columns = {words.get(name, name): values for name, values in table().items()}
     columns["TF (deg)"] = np.round(np.asarray(columns["TF (deg)"], float))

@@ -6,6 +6,7 @@ import re
 import unicodedata
 from functools import lru_cache
 
+from mwdcal.files.formats.columns import without_marks
 from mwdcal.files.synonyms import resembled
 
 _LATIN = str.maketrans({"ø": "o", "Ø": "O", "æ": "ae", "ß": "ss", "ł": "l", "ı": "i", "İ": "i"})
@@ -160,9 +161,7 @@ def spelled(name: str) -> str:
     ('inclination ref (°)', 'acc X Raw')
     """
     text = name.translate(_LATIN).replace("º", "°").replace("°", "\0").replace("²", "\1")
-    text = unicodedata.normalize("NFKD", text)
-    text = unicodedata.normalize("NFC", "".join(c for c in text if not unicodedata.combining(c)))
-    text = text.replace("_", " ")
+    text = without_marks(text).replace("_", " ")
     text = text.replace("\0", "°").replace("\1", "²")
     text = re.sub(r"(?<![^\W_])([^\W\d_])\.(?=[^\W\d_](?![^\W_]))", r"\1", text)  # T.F.
     for pattern, word in TRANSLATIONS:

@@ -14,12 +14,12 @@ from mwdcal.calibration.options import FitChoices, Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import FitError, InputError
-from mwdcal.files import documents, profiles, runs
+from mwdcal.files import documents, runs
 from mwdcal.files.formats.table import Table
 from mwdcal.geometry.vectors import AnyArray
 from mwdcal.library.results import Result, arrays_of
 from mwdcal.library.shown import digest_of
-from mwdcal.library.tasks import NOMINAL, Tabular, table_of, with_choices
+from mwdcal.library.tasks import NOMINAL, Tabular, loaded_profile, table_of, with_choices
 from mwdcal.sensor.profile import Profile
 
 if TYPE_CHECKING:
@@ -244,14 +244,7 @@ def profile_of(tool: object) -> tuple[Profile, str]:
         from mwdcal.planning.session import calibrated_profile
 
         return calibrated_profile(tool), digest_of(tool)
-    if isinstance(tool, Profile):
-        return tool, ""
-    if not isinstance(tool, str | os.PathLike):
-        raise InputError(
-            f"`tool` must be a tool profile, or the name or file of one; got {type(tool).__name__}. Read one by "
-            "mwdcal.load_profile(…)."
-        )
-    return profiles.load_profile(os.fspath(tool))
+    return loaded_profile(tool, "tool")
 
 
 def plan_table(source: PlanSource) -> Table:

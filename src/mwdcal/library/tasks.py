@@ -45,7 +45,7 @@ Path = str | os.PathLike[str]
 
 
 class WithProfile(Protocol):
-    """What has a tool profile: a proposed one, or a calibration."""
+    """A proposed profile, a calibration, or anything else with a tool profile."""
 
     @property
     def profile(self) -> Profile:
@@ -170,15 +170,19 @@ def calibrate(
 
 def _loaded(profile: object) -> tuple[Profile, str]:
     """A tool profile, and the SHA-256 of the file that it was read from; refuses what has none."""
-    profile = getattr(profile, "profile", profile)
-    if isinstance(profile, Profile):
-        return profile, ""
-    if not isinstance(profile, str | os.PathLike):
+    return loaded_profile(getattr(profile, "profile", profile), "profile")
+
+
+def loaded_profile(source: object, name: str) -> tuple[Profile, str]:
+    """A tool profile that an argument of this `name` is or names, and the SHA-256 of its file; blank without one."""
+    if isinstance(source, Profile):
+        return source, ""
+    if not isinstance(source, str | os.PathLike):
         raise InputError(
-            f"`profile` must be a tool profile, or the name or file of one; got {type(profile).__name__}. Read one by "
+            f"`{name}` must be a tool profile, or the name or file of one; got {type(source).__name__}. Read one by "
             "mwdcal.load_profile(…)."
         )
-    return profiles.load_profile(os.fspath(profile))
+    return profiles.load_profile(os.fspath(source))
 
 
 def _profile(run: Readings, profile: object) -> Profile:

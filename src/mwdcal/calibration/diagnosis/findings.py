@@ -319,23 +319,18 @@ def _noise(fitted: FittedRuns) -> Iterator[Flag]:
             yield Flag(f"{triad}-{end}", holds[:, index], REMARKS[end], values)
 
 
-def _axis_variances(result: Fit) -> tuple[Array, Array]:
-    """s² and degrees of freedom (B, t, 3) of the residuals along each axis, without the stations to take again."""
-    good = ~stations_to_reshoot(result)[..., None]
-    square = np.sum(result.analysis.residual**2 * good, 1)
-    freedom = np.sum(diagonal(result.analysis.spread) * good, 1)
-    shape = (len(square), -1, 3)
-    return per_freedom(square, freedom).reshape(shape), freedom.reshape(shape)
-
-
 def _axis_noise(fitted: FittedRuns) -> Iterator[Flag]:
     """Triads of which one axis has larger residuals than another, beyond what noise explains.
 
     Definition: Fisher's F of the largest and the smallest s² of an axis, for the six ordered pairs of axes, without the
     stations to take again. Of less noise than is declared an uncertainty makes no use.
     """
-    variance, freedom = _axis_variances(fitted.result)
-    checked = (freedom.min(-1) >= 1) & ~robust(fitted.result)[:, None]
+    result = fitted.result
+    good = ~stations_to_reshoot(result)[..., None]
+    shape = (len(good), -1, 3)  # members, triads, axes
+    freedom = np.sum(diagonal(result.analysis.spread) * good, 1).reshape(shape)
+    variance = per_freedom(np.sum(result.analysis.residual**2 * good, 1).reshape(shape), freedom)
+    checked = (freedom.min(-1) >= 1) & ~robust(result)[:, None]
     ends = variance.argmax(-1), variance.argmin(-1)
     (most, over), (least, under) = (
         [np.take_along_axis(each, end[..., None], -1)[..., 0] for each in (variance, freedom)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import date, time
@@ -213,6 +214,16 @@ def typed(name: str, cells: Iterable[object]) -> Column:
     if name in LABELS or not {type(value) for value in values} <= {int, float, type(None)}:
         return [as_text(value) for value in values]
     return np.array([np.nan if value is None else value for value in values], float)
+
+
+def without_marks(text: str) -> str:
+    """A text with plain letters in place of those with accents and other marks.
+
+    >>> without_marks("Posición"), without_marks("자기장")
+    ('Posicion', '자기장')
+    """
+    apart = unicodedata.normalize("NFKD", text)
+    return unicodedata.normalize("NFC", "".join(c for c in apart if not unicodedata.combining(c)))
 
 
 def as_text(value: object) -> str:

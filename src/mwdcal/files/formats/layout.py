@@ -34,6 +34,7 @@ from mwdcal.files.formats.settings import (
     columns_of_codes,
     columns_of_lines,
     headings_in,
+    pointed,
     settings_in,
 )
 from mwdcal.files.formats.title_references import stated_above
@@ -447,13 +448,8 @@ def _with_stated_warmth(table: Layout) -> Layout:
     match = _OF_WARMTH.fullmatch(table.sheet)
     assert match
     unit = "°F" if "f" in table.sheet.lower() else "°C"
-    cells = [match[1].replace(",", ".").replace("−", "-").lstrip("+")] * len(table.lines)
-    return replace(
-        table,
-        names=[*table.names, f"Temperature of sheet ({unit})"],
-        units=[*table.units, ""],
-        cells=[*table.cells, cells],
-        texts=[*table.texts, cells],
+    return _with_more_columns(
+        table, {f"Temperature of sheet ({unit})": [pointed(match[1])] * len(table.lines)}
     )
 
 
@@ -889,14 +885,10 @@ def _with_warmth_of_lines(layout: Layout, lines: Sequence[tuple[int, Cells]]) ->
     counts = Counter(f"{number} {unit}" for number, unit in (stated[n] for n in above))
     listed = ", ".join(f"{text} ({count} rows)" for text, count in counts.items())
     said = f"the temperatures are those of the lines above the rows: {listed}."
+    left_out = tuple(each for each in layout.left_out if each[0] not in stated)
+    warmth = {f"{_WARMTH_OF_LINES} ({min(units)})": cells}
     return replace(
-        layout,
-        names=[*layout.names, f"{_WARMTH_OF_LINES} ({min(units)})"],
-        units=[*layout.units, ""],
-        cells=[*layout.cells, cells],
-        texts=[*layout.texts, cells],
-        left_out=tuple(each for each in layout.left_out if each[0] not in stated),
-        remarks=(*layout.remarks, said),
+        _with_more_columns(layout, warmth), left_out=left_out, remarks=(*layout.remarks, said)
     )
 
 
@@ -1001,13 +993,17 @@ def _with_columns(layout: Layout, columns: Mapping[str, list[str]], source: str)
     if not columns:
         return layout
     said = f"{', '.join(map(shown, columns))} of each row is that of the {source}."
+    return replace(_with_more_columns(layout, columns), remarks=(*layout.remarks, said))
+
+
+def _with_more_columns(layout: Layout, columns: Mapping[str, list[str]]) -> Layout:
+    """A table with more columns, by their names, beside its own."""
     return replace(
         layout,
         names=[*layout.names, *columns],
         units=[*layout.units, *[""] * len(columns)],
         cells=[*layout.cells, *columns.values()],
         texts=[*layout.texts, *columns.values()],
-        remarks=(*layout.remarks, said),
     )
 
 

@@ -1,7 +1,7 @@
 """Settings of the stand that have no column: in lines between the rows, names of sheets, codes of stations.
 
 A technician who turns a tool at one inclination after the other writes the inclination once, in a line above its rows,
-or as the name of the sheet. `with_settings_of_lines` gives such words columns of their own.
+or as the name of the sheet. `columns_of_lines` gives such words columns of their own.
 """
 
 from __future__ import annotations
@@ -78,11 +78,12 @@ def settings_in(text: str) -> dict[str, tuple[str, str]]:
             alike = resembled(spelled(words))
             name = words if alike and alike.column == angle else _ANGLES_OF_STAND[angle]
             unit = f" ({match['unit']})" if match["unit"] else ""
-            settings.setdefault(angle, (f"{name}{unit}", _pointed(match["number"])))
+            settings.setdefault(angle, (f"{name}{unit}", pointed(match["number"])))
     return settings
 
 
-def _pointed(number: str) -> str:
+def pointed(number: str) -> str:
+    """A number as it is typed, with a decimal point and a plain minus."""
     return number.replace(",", ".").replace("−", "-").lstrip("+")
 
 

@@ -21,9 +21,9 @@ from mwdcal.sensor.profile import TableFormat
 DELIMITERS = (";", "\t", ",", "|")
 _BLANKS, _RUNS = "blanks", "runs of blanks"
 _LOOKED_AT = 400
-"""Lines by which the delimiter of a text is told, and signs by which a page is."""
+"""Most lines that tell the delimiter of a text, and most characters that tell a page."""
 _ARCHIVES = (b"\xd0\xcf\x11\xe0", b"PK")
-"""What workbooks begin with; programs write pages and texts under the name of an old one."""
+"""First bytes of workbooks; some programs name pages and texts .xls."""
 _IS_PAGE = re.compile(r"<(html|table|!doctype html)\b", re.IGNORECASE)
 _LEAST_ROWS = 4
 """Rows from which on columns of a text show by where they stand."""

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import math
 import re
-import unicodedata
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from functools import cache
 from itertools import pairwise, product
 from typing import NamedTuple
 
 from mwdcal.calibration.readings import EARTH_GRAVITY
-from mwdcal.files.formats.columns import as_text, looks_numeric
+from mwdcal.files.formats.columns import as_text, looks_numeric, without_marks
 from mwdcal.files.formats.settings import settings_in
 from mwdcal.files.formats.titles import Titles, titles
 from mwdcal.files.synonyms import FACTORS, unit_of
@@ -243,7 +242,7 @@ _NO_LONGER = re.compile(
 """Words of a place or a calibration whose references no longer hold."""
 _OF_LIMITS = re.compile(
     r"\W*(\w+ )?(limits?|tolerances?|acceptance( criteria| limits)?|criteria|grenzwerte?|toleranz(en)?|grenser?|"
-    r"toleranser?|limites?|tolerancias?|tolerancias?|limiti|tolleranze|допуск\w*|пределы|限差|公差)\W*"
+    r"toleranser?|limites?|tolerancias?|limiti|tolleranze|допуск\w*|пределы|限差|公差)\W*"
 )
 """A line above limits, which are no references."""
 
@@ -615,10 +614,7 @@ def _plain(text: str) -> str:
         .replace("²", "\1")
         .replace("й", "\2")
     )
-    plain = unicodedata.normalize(
-        "NFKD", kept.lower().translate({ord("ø"): "o", ord("ß"): "ss", ord("ł"): "l"})
-    )
-    bare = unicodedata.normalize("NFC", "".join(c for c in plain if not unicodedata.combining(c)))
+    bare = without_marks(kept.lower().translate({ord("ø"): "o", ord("ß"): "ss", ord("ł"): "l"}))
     bare = re.sub(r"(?<=[\u4e00-\u9fff])(?=[a-zµμ])", " ", bare)
     signs = bare.replace("\0", "°").replace("\1", "²").replace("\2", "й")
     return re.sub(

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 import re
-import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from typing import NamedTuple
 
-from mwdcal.files.formats.columns import as_text
+from mwdcal.files.formats.columns import as_text, without_marks
 
 UNITS_BY_SIGN = {
     "°": "deg",
@@ -277,9 +276,7 @@ def _pair(cell: str, right: Sequence[str]) -> tuple[str, str]:
 
 def _word(text: str) -> str:
     """Letters of a text in lower case without marks and blanks."""
-    plain = unicodedata.normalize("NFKD", text.translate(_SPECIAL_LETTERS).lower())
-    bare = "".join(c for c in plain if not unicodedata.combining(c))
-    return re.sub(r"[^\w/№]|_", "", unicodedata.normalize("NFC", bare))
+    return re.sub(r"[^\w/№]|_", "", without_marks(text.translate(_SPECIAL_LETTERS).lower()))
 
 
 def day_of(text: str, day_first: bool = False) -> str:
