@@ -1332,7 +1332,9 @@ def test_a_table_to_its_certificate(client, bench, tmp_path):
     """Dropped, asked about, calibrated, verified, documented: what the commands make of the same table."""
     stand, folder = Stand(), bench.table.folder
     run = laboratory_table(stand, RUN)
+    assert "/table" not in re.findall('href="(.*?)"', bench.fragment())
     assert drop(client, bench, "file", "../Mess 1.csv", run).is_success
+    assert "/table" in re.findall('href="(.*?)"', bench.fragment())  # what browsers are sent
     page = client.get("/table").text
     assert "Which one does the stand show?" in page
     assert on_table(client, bench, "calibrate").status_code == 409

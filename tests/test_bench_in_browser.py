@@ -335,6 +335,7 @@ def test_a_table_by_drag_and_drop_and_by_keyboard(tmp_path, browser):
     assert faults == []
     assert operator.complaints == []
     page.get_by_role("link", name="To the stand").click()
+    page.wait_for_function("document.body.dataset.state")  # the first event has come
     page.get_by_role("link", name="Go on with the table").wait_for(timeout=LONGEST)
     operator.context.close()
     bench.stop()

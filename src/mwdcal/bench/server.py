@@ -89,7 +89,7 @@ class Bench:
         self.cookie = f"mwdcal_bench_{next(iter(hosts)).rpartition(':')[2]}"
         self.stop = Event()
         self.reader = Thread(target=self._read, name="bench source", daemon=True)
-        self._fragment: tuple[int, str] = (-1, "")
+        self._fragment: tuple[tuple[int, bool] | None, str] = (None, "")
         self._changed = asyncio.Event()
         entered = None if session.countersign else session.registry  # not before the signature
         self.table = table = DroppedTable(session.folder / "table", entered, session.laboratory)
@@ -222,14 +222,16 @@ class Bench:
         """Whether a host with port is the bench's. Another site can give its name our address, no more."""
         return host in self.hosts or (self.any_address and _is_address(host))
 
+    @property
+    def shown(self) -> tuple[int, bool]:
+        """What the page depends on: the version of the session, and whether there is a table."""
+        return self.session.version, bool(self.table.name)
+
     def fragment(self) -> str:
         """The changing part of the page, made once for all browsers."""
-        version = self.session.version
-        if self._fragment[0] != version:
-            self._fragment = (
-                version,
-                pages.fragment(self.session, self.token, bool(self.table.name)),
-            )
+        shown = self.shown
+        if self._fragment[0] != shown:
+            self._fragment = shown, pages.fragment(self.session, self.token, shown[1])
         return self._fragment[1]
 
     async def page(self, request: Request) -> Response:
@@ -292,11 +294,12 @@ class Bench:
         return StreamingResponse(self._events(request), media_type="text/event-stream")
 
     async def _events(self, request: Request) -> AsyncIterator[str]:
-        seen, last = -1, ""
+        seen: tuple[int, bool] | None = None
+        last = ""
         while not self.stop.is_set():
             changed = self._changed
-            if self.session.version != seen:
-                seen = self.session.version
+            if self.shown != seen:
+                seen = self.shown
                 yield _event("page", await run_in_threadpool(self.fragment))
             now = pages.live(self.session, self.source)
             if (text := json.dumps(now)) != last:
