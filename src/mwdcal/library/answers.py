@@ -14,7 +14,7 @@ BY_COLUMN = {
 }
 """Options that say something of a column, and what is expected."""
 Said = str | Iterable[str]
-"""What is said of columns as a command takes it: one text NAME=VALUE, or several."""
+"""Answers about columns as a command takes them: one text NAME=VALUE, or several."""
 
 
 class Answers(dict[str, Any]):
@@ -31,7 +31,7 @@ class Answers(dict[str, Any]):
 
 
 def by_column(argument: str, said: Mapping[str, Any] | Said | None) -> Mapping[str, Any]:
-    """What an argument says of columns, by their names, from texts as a command takes them.
+    """The answers of an argument by column, from texts as a command takes them or from a mapping.
 
     Raises:
         InputError: a text without a sign of equality, or what is no text.
