@@ -766,11 +766,11 @@ def test_tie_in_moves_the_path(example, tmp_path):
     [
         (
             (),
-            "path from station 1 at 0.00 m MD, taken as north 0.00, east 0.00, TVD 0.00 m",
+            "path counted from station 1 at 0.00 m MD: north 0.00, east 0.00, TVD 0.00 m",
         ),
         (
             ("--tie-in", "1,-2,30", "--length-unit", "ft"),
-            "path from station 1 at 0.00 ft MD, taken as north 1.00, east −2.00, TVD 30.00 ft",
+            "path counted from station 1 at 0.00 ft MD: north 1.00, east −2.00, TVD 30.00 ft",
         ),
         (("--tie-in", "0,0,0,1,-2,30"), "path tied in at 0.00 m MD"),
     ],

@@ -484,7 +484,7 @@ def start_in_words(well: Well) -> str:
         places = zip(("north", "east", "TVD"), start, strict=True)
         taken = ", ".join(f"{name} {fixed(value / metres, 2)}" for name, value in places)
         md = fixed(position.md[row] / metres, 2)
-        return f"from station {label} at {md} {unit} MD, taken as {taken} {unit}"
+        return f"counted from station {label} at {md} {unit} MD: {taken} {unit}"
     course = USUAL_COURSES[unit]
     severity = np.degrees(position.dogleg[row]) * course * metres
     return (

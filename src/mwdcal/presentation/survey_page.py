@@ -378,7 +378,7 @@ def render(surveyed: SurveyedWell, findings: list[Finding]) -> str:
         declination=declination_in_words(facts),
         sources="; ".join(sources_in_words(facts)),
         limits=limits_in_words(well, facts),
-        start=start_in_words(well),
+        tie_in=start_in_words(well),
         end=end_in_words(facts.end, facts.north, facts.length_unit) if facts.end else "",
         header=header,
         rows=rows,
