@@ -22,6 +22,7 @@ extensions = [
     "mathml",
     "myst_parser",
     "screens",
+    "search_index",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "sphinx_click",

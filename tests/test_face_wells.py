@@ -234,6 +234,10 @@ def test_surveys_without_references_are_not_judged_and_a_serial_is_a_column(cal,
     table = {name: read_csv(EXAMPLE / "well.csv")[name] for name in names}
     well = mc.survey(cal, table)
     assert "off:" not in well.summary()
+    reason = "36 not judged: gravity, field and dip of the place are not given"
+    assert reason in well.summary()
+    known = mc.survey(cal, {**table, "ref_gravity_g": [1.0, *["" for _ in range(35)]]}).summary()
+    assert "35 not judged " in known.replace("\n", " ")
     well.report(tmp_path / "well.html")
     assert "36 surveys not judged by the limits owsg-mwd" in (tmp_path / "well.html").read_text()
     said = {finding.id: finding.text for finding in well.findings}

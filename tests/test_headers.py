@@ -10,6 +10,7 @@ import pytest
 import mwdcal
 from cli_support import EXAMPLE
 from cli_support import mwdcal as command
+from mwdcal.errors import Answer, QuestionError, QuestionsError
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.titles import titles
 from mwdcal.files.runs import read_export, run_table
@@ -257,6 +258,46 @@ def test_two_triads_on_two_sheets_of_the_same_stations_are_one_table(tmp_path):
     assert found["no-magnetometer"].startswith("field and dip of the field are stated")
     again = mwdcal.calibrate(path, one.profile)
     assert {"marked-rows", "no-magnetometer"} <= {each.id for each in again.findings}
+
+
+def test_an_answer_is_given_in_python_as_the_error_says_it(tmp_path):
+    """What stands behind *Answer by* are keywords; texts as the command takes them say the same as a mapping."""
+    rows = stations()
+    for row in rows:
+        row[1] = (row[1] + 8) % 360
+    path = text(tmp_path / "run.csv", [[COLUMNS[0], "Lage 2", *COLUMNS[2:]], *rows])
+    with pytest.raises(mwdcal.FitError) as error:
+        mwdcal.propose_profile(path)
+    assert "Answer by column='ref_azimuth_deg=Lage 2' or column='ref_azimuth_deg='." in str(
+        error.value
+    )
+    north = {"north": "true", "declination_deg": 8.0}
+    said = {"ref_azimuth_deg": "Lage 2"}
+    profile = mwdcal.propose_profile(path, column=said, **north).profile
+    for each in ("ref_azimuth_deg=Lage 2", ["ref_azimuth_deg=Lage 2"]):
+        assert mwdcal.propose_profile(path, column=each, **north).profile == profile
+    with pytest.raises(mwdcal.InputError, match="`column` 'ax': expected OURS=THEIRS"):
+        mwdcal.propose_profile(path, column="ax")
+    with pytest.raises(mwdcal.InputError, match="`keep` 3: expected COLUMN=TEXT"):
+        mwdcal.propose_profile(path, keep=3)
+
+
+def test_the_answers_of_a_choice_are_one_call_or_one_command():
+    """Two columns in one list for Python, a row as a number; each its own option for a shell."""
+    several = Answer("A", (("column", "ax=A x"), ("column", "ay=A y"), ("serial", "17")))
+    row = Answer("7", (("header_row", "7"),), ("declination_deg",))
+    question = QuestionError("Which?", [several, row])
+    called = "column=['ax=A x', 'ay=A y'], serial='17' or header_row=7, declination_deg=NUMBER"
+    typed = (
+        "--column 'ax=A x' --column 'ay=A y' --serial 17 or --header-row 7 --declination-deg NUMBER"
+    )
+    assert str(question) == f"Which? Answer by {called}."
+    assert question.with_options == f"Which? Answer by {typed}."
+    both = QuestionsError("run.csv", [question, QuestionError("And?")])
+    assert str(both) == f"run.csv: 2 questions are open. (1) {question} (2) And?"
+    assert both.with_options.startswith(
+        f"run.csv: 2 questions are open. (1) Which? Answer by {typed}"
+    )
 
 
 def test_sheets_of_other_stations_are_not_joined(tmp_path):

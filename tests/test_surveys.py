@@ -762,6 +762,26 @@ def test_tie_in_moves_the_path(example, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (
+            (),
+            "path counted from station 1 at 0.00 m MD: north 0.00, east 0.00, TVD 0.00 m",
+        ),
+        (
+            ("--tie-in", "1,-2,30", "--length-unit", "ft"),
+            "path counted from station 1 at 0.00 ft MD: north 1.00, east −2.00, TVD 30.00 ft",
+        ),
+        (("--tie-in", "0,0,0,1,-2,30"), "path tied in at 0.00 m MD"),
+    ],
+)
+def test_the_screen_says_where_north_east_and_tvd_count_from(example, tmp_path, options, words):
+    screen = cli("survey", example, EXAMPLE / "well.csv", "-o", tmp_path / "o.csv", *options).out
+    [line] = [line for line in screen.splitlines() if line.startswith("path ")]
+    assert line.startswith(words)
+
+
+@pytest.mark.parametrize(
     ("columns", "options", "message"),
     [
         ({"md_m": [str(1000 - i) for i in range(36)]}, (), "must not decrease"),

@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import openpyxl
+import pandas
 import pytest
 
 import mwdcal as library
@@ -700,6 +701,23 @@ def test_a_row_that_repeats_another_in_every_cell_counts_once(tmp_path):
     _, two = calibrated(tmp_path, written(tmp_path / "b.csv", table()))
     assert one["magnetometer"]["parameters"] == two["magnetometer"]["parameters"]
     assert "left out: line 50 (every cell as in line 12)" in ran.err
+
+
+@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
+def test_apply_marks_utf_8_at_its_start_alone(tmp_path, mark):
+    """A spreadsheet needs the mark for the degree; in front of a name it would hide the column from a reader."""
+    columns = table()
+    columns["Temp (°C)"] = columns.pop("Temp (C)")
+    path = written(tmp_path / "a.csv", columns, delimiter=";")
+    path.write_bytes(mark + path.read_bytes())
+    calibrated(tmp_path, path)
+    out = tmp_path / "out.csv"
+    assert mwdcal("apply", tmp_path / "cal.json", path, "-o", out).code == 0
+    content = out.read_bytes()
+    assert content.startswith(b"\xef\xbb\xbf")
+    assert content.count(b"\xef\xbb\xbf") == 1
+    names = [*pandas.read_csv(out, comment="#", sep=";")]
+    assert names[: len(columns)] == [*columns]
 
 
 def test_apply_keeps_every_row(tmp_path):

@@ -33,6 +33,11 @@ class FitError(MwdcalError):
     exit_code = 3
 
 
+def argument_of(name: str, text: str) -> str | int:
+    """The value of an argument of Python from its text: a row is a number."""
+    return int(text) if name == "header_row" else text
+
+
 class Answer(NamedTuple):
     """A choice that answers a question: what it is called, and the arguments that say it, each with its value.
 
@@ -44,29 +49,42 @@ class Answer(NamedTuple):
     numbers: tuple[str, ...] = ()
 
     @property
-    def typed(self) -> list[tuple[str, str]]:
-        """The arguments with their values as a shell takes them; NUMBER for a number that has to be added."""
-        return [
+    def options(self) -> str:
+        """The arguments as options of a command, as a shell takes them; NUMBER for a number that has to be added."""
+        said = [
             *((n, _quoted(v)) for n, v in self.arguments),
             *((n, "NUMBER") for n in self.numbers),
         ]
+        return " ".join(f"--{name.replace('_', '-')} {value}" for name, value in said)
+
+    @property
+    def keywords(self) -> str:
+        """The arguments as Python takes them, those of one name in a list; NUMBER likewise."""
+        values: dict[str, list[str | int]] = {}
+        for name, value in self.arguments:
+            values.setdefault(name, []).append(argument_of(name, value))
+        said = {name: repr(each if each[1:] else each[0]) for name, each in values.items()}
+        said |= dict.fromkeys(self.numbers, "NUMBER")
+        return ", ".join(f"{name}={value}" for name, value in said.items())
 
 
 class QuestionError(FitError):
     """Something that the data leave open, with the answers that there are; the first is what is believed."""
 
     def __init__(self, text: str, answers: Sequence[Answer] = ()) -> None:
-        super().__init__(f"{text}{_said_by(answers)}")
+        super().__init__(f"{text}{_said_by([answer.keywords for answer in answers])}")
         self.text = text
         self.answers = tuple(answers)
 
+    @property
+    def with_options(self) -> str:
+        """The message for a command, whose options answer it."""
+        return f"{self.text}{_said_by([answer.options for answer in self.answers])}"
 
-def _said_by(answers: Sequence[Answer]) -> str:
+
+def _said_by(answers: Sequence[str]) -> str:
     """How answers are given, the first few, ready to be pasted."""
-    each = [
-        " ".join(f"`{name}` {value}" for name, value in answer.typed)
-        for answer in answers[:_MOST_NAMED]
-    ]
+    each = answers[:_MOST_NAMED]
     more = f" or {len(answers) - len(each)} others" if len(answers) > len(each) else ""
     return f" Answer by {' or '.join(each)}{more}." if each else ""
 
@@ -84,15 +102,23 @@ class QuestionsError(FitError):
     """All questions that are open together."""
 
     def __init__(self, source: str, questions: Sequence[QuestionError]) -> None:
-        texts = [re.sub(rf"^{re.escape(source)}[:,] ", "", str(each)) for each in questions]
-        listed = " ".join(f"({n}) {text}" for n, text in enumerate(texts, 1))
-        one = len(texts) == 1
-        super().__init__(
-            f"{source}: {texts[0]}"
-            if one
-            else f"{source}: {len(texts)} questions are open. {listed}"
-        )
+        super().__init__(_listed(source, [*map(str, questions)]))
+        self.source = source
         self.questions = tuple(questions)
+
+    @property
+    def with_options(self) -> str:
+        """The message for a command, whose options answer it."""
+        return _listed(self.source, [each.with_options for each in self.questions])
+
+
+def _listed(source: str, questions: Sequence[str]) -> str:
+    """Questions about a file in one message."""
+    texts = [re.sub(rf"^{re.escape(source)}[:,] ", "", each) for each in questions]
+    if len(texts) == 1:
+        return f"{source}: {texts[0]}"
+    listed = " ".join(f"({n}) {text}" for n, text in enumerate(texts, 1))
+    return f"{source}: {len(texts)} questions are open. {listed}"
 
 
 def reason(error: Exception) -> str:

@@ -22,7 +22,7 @@ import click
 
 from mwdcal.app import laboratory
 from mwdcal.calibration.fit_options import FIT_OPTIONS
-from mwdcal.errors import InputError, MwdcalError, QuestionError, reason
+from mwdcal.errors import InputError, MwdcalError, QuestionError, QuestionsError, reason
 from mwdcal.presentation.text import (
     PATIENCE,
     UNSAFE_BUT_LINES,
@@ -174,14 +174,15 @@ class Command(click.Command):
 
     def _with_remedy(self, error: MwdcalError) -> str:
         """The text of an error; of a question that only a profile can answer here, with how to make one."""
-        options = {parameter.name for parameter in self.params}
-        if not isinstance(error, QuestionError) or not error.answers:
+        if not isinstance(error, QuestionError | QuestionsError):
             return str(error)
+        options = {parameter.name for parameter in self.params}
+        if isinstance(error, QuestionsError) or not error.answers:
+            return error.with_options
         needed = {name for answer in error.answers for name, _ in answer.arguments}
         if needed <= options:
-            return str(error)
-        first = " ".join(f"--{n.replace('_', '-')} {value}" for n, value in error.answers[0].typed)
-        remedy = f"mwdcal profile TABLE {first} -o TOOL.toml"
+            return error.with_options
+        remedy = f"mwdcal profile TABLE {error.answers[0].options} -o TOOL.toml"
         return f"{error.text} Say it in a profile ({remedy}), and give `tool` TOOL.toml."
 
 

@@ -941,7 +941,7 @@ def _no_evidence(
         elif m.column == REFERENCES["toolface"].column and lone and _is_whole(values(name)):
             ignored[name] = (
                 f"its rolls are nominal, in whole degrees without other angles of the stand; if they were set, say so "
-                f"by `column` {m.column}={name!r}"
+                f"by `column` {f'{m.column}={name}'!r}"
             )
     return ignored
 

@@ -17,6 +17,7 @@ from mwdcal.errors import FitError, InputError
 from mwdcal.files import documents, runs
 from mwdcal.files.formats.table import Table
 from mwdcal.geometry.vectors import AnyArray
+from mwdcal.library.answers import Said, by_column
 from mwdcal.library.results import Result, arrays_of
 from mwdcal.library.shown import digest_of
 from mwdcal.library.tasks import NOMINAL, Tabular, loaded_profile, table_of, with_choices
@@ -340,12 +341,12 @@ def propose_profile(
     decimal: str = "",
     serial: str = "",
     date: str = "",
-    column: Mapping[str, str] | None = None,
+    column: Mapping[str, str] | Said | None = None,
     north: str = "",
     declination_deg: float | None = None,
     convergence_deg: float | None = None,
-    leave_out: Mapping[str, Sequence[str]] | None = None,
-    keep: Mapping[str, Sequence[str]] | None = None,
+    leave_out: Mapping[str, Sequence[str]] | Said | None = None,
+    keep: Mapping[str, Sequence[str]] | Said | None = None,
 ) -> ProposedProfile:
     """Propose a tool profile for a table as a laboratory keeps it: text or workbook, of any layout.
 
@@ -358,7 +359,8 @@ def propose_profile(
     behind the name where the table does not state it; a blank name for a column that is absent. `serial` and `date`
     of the run where the table states none. `north` ("magnetic", "true" or "grid") is what its azimuths count from,
     with the declination and the convergence (degrees east) that turn them magnetic. `leave_out` says by the texts of a
-    column which rows are rejected, {"QC": ["X"]}, and `keep` which are not.
+    column which rows are rejected, {"QC": ["X"]}, and `keep` which are not. These three also take texts as the
+    command does: "ref_azimuth_deg=Azi 2", or a list of such.
 
     Where the table does not tell the axes of a triad, as one of rolls alone, a finding `axes-open` says so, and the
     profile that is saved has lines to fill in.
@@ -390,10 +392,10 @@ def propose_profile(
         sheet=sheet,
         header_row=header_row,
         decimal=decimal,
-        answers=column,
+        answers=by_column("column", column),
         stated={key: value for key, value in stated.items() if value},
         north={key: value for key, value in norths.items() if value not in ("", None)},
-        leave_out=leave_out,
-        keep=keep,
+        leave_out=by_column("leave_out", leave_out),
+        keep=by_column("keep", keep),
     )
     return ProposedProfile(proposal, Path(table_path))

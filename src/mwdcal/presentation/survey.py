@@ -26,7 +26,8 @@ from mwdcal.presentation.numbers import files_written, fixed, measured, number, 
 from mwdcal.presentation.signature import signature_status
 from mwdcal.presentation.text import chance, one_line, plural, table
 from mwdcal.survey.interference import Interference, InterferenceSize, MultiStationAnalysis
-from mwdcal.survey.path import TieIn
+from mwdcal.survey.path import PathEnd, TieIn
+from mwdcal.survey.references import NO_SOURCE
 from mwdcal.survey.stations import North
 from mwdcal.survey.surveying import SurveyedWell, WellInputs, used_in_surveys
 from mwdcal.survey.well import LastStation, Well, WellCounts, WellErrors
@@ -403,8 +404,8 @@ def screen(
     lines += runs_in_words(facts)
     if facts.reference_sources:
         lines.append("   ".join(["references", *sources_in_words(facts)]))
-    if tie_in := tie_in_in_words(well):
-        lines.append(tie_in)
+    if start := start_in_words(well):
+        lines.append(f"path {start}")
     if facts.end:
         lines.append(end_in_words(facts.end, facts.north, facts.length_unit))
     lines.append(well.terms.sentence)
@@ -420,7 +421,14 @@ def screen(
 
 def without_verdict(facts: SurveySummary) -> list[str]:
     """Numbers of surveys that have a result and no verdict, and of those without a result, in words."""
-    words = {"not judged": facts.not_judged - facts.blank, "without a result": facts.blank}
+    lacks = {facts.reference_sources.get(name) for name in ("gravity", "field", "dip")} == {
+        NO_SOURCE
+    }
+    why = ": gravity, field and dip of the place are not given" if lacks else ""
+    words = {
+        f"not judged{why}": facts.not_judged - facts.blank,
+        "without a result": facts.blank,
+    }
     return [f"{count} {word}" for word, count in words.items() if count]
 
 
@@ -462,19 +470,27 @@ def limits_in_words(well: Well, facts: SurveySummary) -> str:
     return f"{facts.limits}{f' ({facts.source})' if facts.source else ''}"
 
 
-def tie_in_in_words(well: Well) -> str:
-    """Where the path is tied in, and the dogleg severity that leads from there to its first station; or empty."""
+def start_in_words(well: Well) -> str:
+    """Where the path starts: at its first station, or where it is tied in, with the dogleg severity from there.
+
+    Empty for a run that goes on where another ended.
+    """
     start, position = well.started, well.position
-    if not isinstance(start, TieIn) or position is None or not position.on_path.any():
+    if isinstance(start, PathEnd) or position is None or not position.on_path.any():
         return ""
     unit, row = well.length_unit, int(np.argmax(position.on_path))
+    metres, label = LENGTH_UNITS[unit], well.readings.labels[row]
+    if not isinstance(start, TieIn):
+        places = zip(("north", "east", "TVD"), start, strict=True)
+        taken = ", ".join(f"{name} {fixed(value / metres, 2)}" for name, value in places)
+        md = fixed(position.md[row] / metres, 2)
+        return f"counted from station {label} at {md} {unit} MD: {taken} {unit}"
     course = USUAL_COURSES[unit]
-    severity = np.degrees(position.dogleg[row]) * course * LENGTH_UNITS[unit]
+    severity = np.degrees(position.dogleg[row]) * course * metres
     return (
-        f"tied in at {fixed(start.md / LENGTH_UNITS[unit], 2)} {unit} MD: inclination "
+        f"tied in at {fixed(start.md / metres, 2)} {unit} MD: inclination "
         f"{fixed(np.degrees(start.inclination), 2)}°, azimuth {fixed(np.degrees(start.azimuth), 2)}° taken from "
-        f"{well.north.name} north; {fixed(severity, 1)}°/{course:g} {unit} from there to station "
-        f"{well.readings.labels[row]}"
+        f"{well.north.name} north; {fixed(severity, 1)}°/{course:g} {unit} from there to station {label}"
     )
 
 

@@ -23,8 +23,8 @@ from mwdcal.presentation.survey import (
     result_summary,
     runs_in_words,
     sources_in_words,
+    start_in_words,
     survey_rows,
-    tie_in_in_words,
     without_verdict,
 )
 from mwdcal.presentation.text import plural
@@ -378,7 +378,7 @@ def render(surveyed: SurveyedWell, findings: list[Finding]) -> str:
         declination=declination_in_words(facts),
         sources="; ".join(sources_in_words(facts)),
         limits=limits_in_words(well, facts),
-        tie_in=tie_in_in_words(well),
+        tie_in=start_in_words(well),
         end=end_in_words(facts.end, facts.north, facts.length_unit) if facts.end else "",
         header=header,
         rows=rows,

@@ -67,7 +67,10 @@ from mwdcal.app.messages import print_result
     metavar="MIN",
     help="To reach a temperature; 0 without an oven.",
 )
-@options.tool()
+@options.tool(
+    help="Tool profile: a name that mwdcal list profiles shows, or a TOML file. Or a calibration (JSON): its profile, "
+    "the place of its run, and the noise that it estimated if the profile states none."
+)
 @options.fit_options("auto", "none", "datasheet", "the tolerances in the tool profile")
 @click.option(
     "-o",
