@@ -312,7 +312,11 @@ def _resembled(name: str) -> Resemblance | None:
         return None
     if column in _CALLED_G and unit == "g" and name.rstrip(" )]").endswith("G"):
         unit = "gauss"
-    if column in ("ax", "ay", "az") and unit == "gauss" and name.rstrip(" )]").lower().endswith("gs"):
+    if (
+        column in ("ax", "ay", "az")
+        and unit == "gauss"
+        and name.rstrip(" )]").lower().endswith("gs")
+    ):
         unit = "g"
     if column in _CALLED_G and unit == "mg":
         unit = "mG"

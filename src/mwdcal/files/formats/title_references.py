@@ -527,7 +527,9 @@ def _clauses(row: Sequence[object]) -> str:
     return _RANGE.sub("range ", text).strip()
 
 
-_SENTENCE = re.compile(r"(?:(?<=[^\W\d_]{5})|(?<=\d)|(?<=\d [^\W\d_]{2}))\.\s+(?=[^\W\d_a-zа-яß-ÿ])")
+_SENTENCE = re.compile(
+    r"(?:(?<=[^\W\d_]{5})|(?<=\d)|(?<=\d [^\W\d_]{2}))\.\s+(?=[^\W\d_a-zа-яß-ÿ])"
+)
 """The end of a sentence: a point behind a whole word or a number with its unit, and a capital letter."""
 
 

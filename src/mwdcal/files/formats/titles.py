@@ -87,7 +87,7 @@ _OF_TOOLS = (
     "прибор|зонд|датчик|инклинометр|仪器|探管"
 )
 _TOOL = re.compile(
-    rf"#?\s*(?:(?:{_OF_TOOLS})\s*"
+    rf"#?\s*(?:(?:{_OF_TOOLS})(?:n?-|\s*)"
     r"(?P<mark>s/?n|n/s|serial( no)?|n[°º]|n(?=\s+\d)|no\b|nr\b|зав\.?\s*№|№|#|号|编号)?|(?P<sn>sn|s/n|"
     r"serial no))\s*[.:：|=]*\s*",
     re.IGNORECASE,
