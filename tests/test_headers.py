@@ -343,6 +343,9 @@ def test_a_roll_test_on_another_sheet_of_the_run_is_that_of_the_run(tmp_path):
         (["S/N", "SD-9, 112"], {"serial": "SD-9, 112"}),
         (["Gerät-Nr.:", "RS2-0175"], {"serial": "RS2-0175"}),
         (["Probe number", 41], {"serial": "41"}),
+        (["Herramienta N/S:", "MX-4471"], {"serial": "MX-4471"}),
+        (["Sonden-Nr. 880214"], {"serial": "880214"}),
+        (["Calibration, tool serial MWD-5533, stand B"], {"serial": "MWD-5533"}),
     ],
 )
 def test_a_serial_is_whole(cells, stated):
@@ -350,11 +353,20 @@ def test_a_serial_is_whole(cells, stated):
     assert titles([cells]).metadata == stated
 
 
-@pytest.mark.parametrize(("name", "asked"), [("Série", "Are these tools"), ("Serial", "2 tools")])
-def test_tools_one_below_the_other_are_asked_about(tmp_path, name, asked):
-    """The serial that is stated takes its rows, whatever the column is called."""
+@pytest.mark.parametrize("in_turn", [False, True])
+@pytest.mark.parametrize(
+    ("name", "asked"),
+    [("Série", "Are these tools"), ("仪器号", "Are these tools"), ("Serial", "2 tools")],
+)
+def test_tools_in_the_rows_of_one_table_are_asked_about(tmp_path, name, asked, in_turn):
+    """The serial that is stated takes its rows, whatever the column is called and in whatever order they stand."""
     rows = stations()
     both = [[tool, *row] for tool in ("A-101", "A-102") for row in rows]
+    both = (
+        [row for pair in zip(both[: len(rows)], both[len(rows) :], strict=True) for row in pair]
+        if in_turn
+        else both
+    )
     path = text(tmp_path / "run.csv", [TITLES[0][:5], [], [name, *NAMES], *both])
     with pytest.raises(mwdcal.FitError, match=asked) as error:
         mwdcal.propose_profile(path)
@@ -366,6 +378,86 @@ def test_tools_one_below_the_other_are_asked_about(tmp_path, name, asked):
     run = run_table(read_export(path, profile, statements={"serial": "A-102"}), profile)
     assert same(run, rows)
     assert len(rows) == run.count
+
+
+def test_two_triads_one_below_the_other_are_one_table(tmp_path):
+    """Each with the angles of the stand; the names are an axis and its unit alone."""
+    rows = stations()
+    angles = ["Pos.", "Neigung °", "Toolface °", "Azimut °"]
+    parts = [
+        [[n, inc, face, azimuth, *triad] for n, (inc, azimuth, face, *triad) in enumerate(half, 1)]
+        for half in ([[*r[:6], r[9]] for r in rows], [[*r[:3], *r[6:9]] for r in rows])
+    ]
+    path = workbook(
+        tmp_path / "run.xlsx",
+        [
+            *(
+                TITLES[0],
+                [],
+                ["A. Beschleunigung"],
+                [*angles, "X V", "Y V", "Z V", "Temp °C"],
+                *parts[0],
+            ),
+            *([], ["B. Magnetometer"], [*angles, "X nT", "Y nT", "Z nT"], *parts[1]),
+        ],
+    )
+    assert same(taken(path), rows)
+
+
+def test_one_blank_between_names_over_columns_parts_them(tmp_path):
+    """Of right-aligned columns: `Neigung Toolface` are two names where two columns stand below."""
+    widths = [8, 9, 9, *[12] * 6, 7]
+    names = ["Neigung", "Azimut", "Toolface", *("Gx", "Gy", "Gz", "Bx", "By", "Bz"), "Temp"]
+    lines = [
+        "".join(f"{c:>{w}}" for c, w in zip(row, widths, strict=True))
+        for row in [names, *stations()]
+    ]
+    lines[0] = lines[0].replace("  Toolface", " Toolface")
+    path = tmp_path / "run.txt"
+    path.write_text("\n".join(["FIELD 50000 NT  DIP 63 DEG", "", *lines]), "utf-8")
+    assert "Azimut Toolface" in path.read_text("utf-8")
+    assert same(taken(path), stations())
+
+
+RECORDS = {
+    "label": ("P{n:02d}: Inc={0},Azi={1},TF={2},Gx={3},Gy={4},Gz={5},Bx={6},By={7},Bz={8},T={9}",),
+    "lines": (
+        *("Station {n}", "  Inclination: {0} deg", "  Azimuth: {1} deg", "  Toolface: {2} deg"),
+        *("  Accel (V):  X {3}  Y {4}  Z {5}", "  Magnetometer (V): X {6}  Y {7}  Z {8}"),
+        *("  Temperature: {9} C", ""),
+    ),
+}
+
+
+@pytest.mark.parametrize("form", RECORDS)
+def test_records_of_stations_are_rows(tmp_path, form):
+    """A label before the names of a line, or a block of lines with three axes in one; a title may share a name."""
+    block = "\n".join(RECORDS[form])
+    each = [block.format(*row, n=n) for n, row in enumerate(stations(), 1)]
+    titled = ["// Probe: A-17", "// Field: 50000 nT, Dip: 63 deg", "Azimuth: magnetic", ""]
+    path = tmp_path / "run.txt"
+    path.write_text("\n".join([*titled, *each, "End"]), "utf-8")
+    assert same(taken(path), stations())
+    assert mwdcal.propose_profile(path).proposal.metadata["serial"] == "A-17"
+
+
+@pytest.mark.parametrize("title", ["Toolface", "Visier (Toolface)"])
+def test_minutes_below_a_title_are_those_of_its_angle(tmp_path, title):
+    """In columns below °, ', ": brackets behind the title are no unit."""
+    seconds = [[round(3600 * angle) for angle in row[:3]] for row in stations()]
+    channels_of = [row[3:] for row in stations()]
+    parts = [
+        [part for s in each for part in (s // 3600, s // 60 % 60, s % 60)] + channels
+        for each, channels in zip(seconds, channels_of, strict=True)
+    ]
+    rows = [[s / 3600 for s in e] + c for e, c in zip(seconds, channels_of, strict=True)]
+    channels = ["Gx (V)", "Gy (V)", "Gz (V)", "Bx (V)", "By (V)", "Bz (V)", "T (°C)"]
+    head = [
+        [w for name in ("Inc", "Azi", title) for w in (name, "", "")] + channels,
+        ["°", "'", '"'] * 3,
+    ]
+    path = workbook(tmp_path / "run.xlsx", [TITLES[0], [], *head, *parts])
+    assert same(taken(path), rows)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".xlsx"])

@@ -58,6 +58,11 @@ def calibrated(folder, path, *options):
 PLACE = {"ref_field_nt": 48_912.0, "ref_dip_deg": 66.25, "ref_gravity_g": 9.8123 / 9.80665}
 TITLES = {
     "English": [["Local field: 48912 nT", "Dip 66.25 deg", "g = 9.8123 m/s2"]],
+    "sentences": [
+        [
+            "Accelerometer scale 2.5 V/g nominal. 1 V = 20 uT. Field 48912 nT, dip 66.25 deg, g = 9.8123 m/s2."
+        ],
+    ],
     "cells": [["Total field", 48.912, "µT"], ["Dip", "66°15'"], ["Gravity", 981.23, "gal"]],
     "German": [["Erdfeld 48,912 µT; Inklination 66,25°; Fallbeschleunigung 9,8123 m/s²"]],
     "Norwegian": [

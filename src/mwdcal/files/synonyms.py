@@ -34,13 +34,14 @@ _SPELLINGS = {
     "nT": "nt gamma",
     "µT": "ut",
     "mT": "millit",
-    "gauss": "gauss oersted",
-    "mG": "milligauss",
+    "gauss": "gauss gs oersted",
+    "mG": "milligauss mgs",
     "A/m": "apm",
     "gon": "gon gons",
     "V": "v volt volts",
     "mV": "mv millivolt millivolts",
-    "counts": "lsb counts count cnt cnts adc digits digit",
+    "counts": "lsb counts count cnt cnts adc digits digit bits bit cuentas cuenta contagens contagem ink inkremente "
+    "zahlwert zahlwerte tellinger",
     "raw": "raw",
 }
 _UNITS = {word: unit for unit, words in _SPELLINGS.items() for word in words.split()}
@@ -264,6 +265,7 @@ _CASED = {
     "uT": " ut ",
     "mT": " millit ",
     "mG": " milligauss ",
+    "mGs": " milligauss ",
     "mGal": " mgal ",
     "mg": " millig ",
 }
@@ -310,6 +312,12 @@ def _resembled(name: str) -> Resemblance | None:
         return None
     if column in _CALLED_G and unit == "g" and name.rstrip(" )]").endswith("G"):
         unit = "gauss"
+    if (
+        column in ("ax", "ay", "az")
+        and unit == "gauss"
+        and name.rstrip(" )]").lower().endswith("gs")
+    ):
+        unit = "g"
     if column in _CALLED_G and unit == "mg":
         unit = "mG"
     if not spread:

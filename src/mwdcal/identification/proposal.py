@@ -690,7 +690,7 @@ def _stacked_tools(
     stated: Mapping[str, object],
     answers: Collection[str],
 ) -> dict[str, ColumnSource]:
-    """The column of serials in whatever words: of which one is stated; of tools one below the other it is asked."""
+    """The column of serials in whatever words: of which one is stated; of several tools it is asked."""
     if "serial" in columns or "serial" in answers:
         return {}
     used = {each.name for each in columns.values()}
@@ -701,17 +701,14 @@ def _stacked_tools(
             continue
         if stated.get("serial") in tools:
             return {"serial": ColumnSource(name=name)}
-        stacked = len([*groupby(cells)]) == len(tools) and min(tools.values()) >= LEAST_STATIONS
-        named = bool(_WORDS_OF_TOOLS.search(name))
+        many = min(tools.values()) >= LEAST_STATIONS and _WORDS_OF_TOOLS.search(name)
+        stacked = len([*groupby(cells)]) == len(tools)
         numbered = _numbers_of(table, {}, name) is not None
-        if (
-            stacked
-            and named
-            and (not numbered or (not meaning(name) and _begins_again(table, cells)))
-        ):
+        anew = stacked and not meaning(name) and _begins_again(table, cells)
+        if many and (anew or not numbered):
             raise QuestionError(
-                f"{table.source}: {shown(name)} has {', '.join(map(shown, [*tools][:MOST_NAMED]))}, one below the "
-                "other. Are these tools, and which one is meant?",
+                f"{table.source}: {shown(name)} has {', '.join(map(shown, [*tools][:MOST_NAMED]))}. Are these tools, "
+                "and which one is meant?",
                 [
                     *(Answer(tool, (("serial", tool),)) for tool in tools),
                     Answer("it is one tool", (("column", "serial="),)),

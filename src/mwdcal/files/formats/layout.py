@@ -328,7 +328,7 @@ def _have_same_stations(one: Layout, other: Layout) -> bool:
 def _are_of_one_triad_each(one: Layout, other: Layout) -> bool:
     """Whether two tables share three columns or more by name, and each has three of axes that the other has not."""
     names = {*one.names}, {*other.names}
-    triads = [sum(map(bool, map(_OF_AXIS.fullmatch, a - b))) for a, b in (names, names[::-1])]
+    triads = [sum(map(bool, map(_axis, a - b))) for a, b in (names, names[::-1])]
     return min(len(names[0] & names[1]), *triads) >= LEAST_COLUMNS - 1
 
 
@@ -665,8 +665,19 @@ def _turned(sheet: Sheet) -> Sheet | None:
 
 def _has_axes(names: Iterable[object]) -> bool:
     """Whether names of all three axes are among some."""
-    ends = (_OF_AXIS.fullmatch(as_text(name)) for name in names)
-    return {*"xyz"} <= {m["axis"].lower() for m in ends if m}
+    return {*"xyz"} <= {*map(_axis, names)}
+
+
+def _axis(name: object) -> str:
+    """The axis that a name ends in, but for its unit, in lower case; empty where it ends in none.
+
+    >>> _axis("Gx (g)"), _axis("X nT"), _axis("Gx max")
+    ('x', 'x', '')
+    """
+    words = as_text(name).rsplit(maxsplit=1)
+    bare = words[0] if len(words) > 1 and unit_of(words[1]) else " ".join(words)
+    match = _OF_AXIS.fullmatch(as_text(name)) or _OF_AXIS.fullmatch(bare)
+    return match["axis"].lower() if match else ""
 
 
 def _is_name(cell: object) -> bool:
@@ -1265,7 +1276,7 @@ def _joined(row: Cells, names: Sequence[str], spans: Mapping[int, int]) -> list[
     above += [""] * (len(names) - len(above))
     title, of_axes, end, joined = "", False, 0, []
     for place, (upper, name) in enumerate(zip(above, [*names, *[""] * len(above)], strict=False)):
-        of_axis = bool(_OF_AXIS.fullmatch(name))
+        of_axis = bool(_axis(name))
         if upper:
             title, of_axes, end = upper, of_axis, place + spans.get(place, 0)
         elif (
@@ -1283,7 +1294,7 @@ def _with_title(title: str, name: str) -> str:
     if _is_unit(name):
         return f"{title} ({name.strip(' []()')})"
     match = _UNIT_BEHIND.fullmatch(title) if "(" not in name and "[" not in name else None
-    if not match:
+    if not match or _DEGREES_OF.fullmatch(name):
         return f"{title} {name}".strip()
     return f"{match[1]} {name}".strip() + f" {match[2]}".replace(" ,", ",")
 

@@ -28,6 +28,12 @@ _TIME_BEFORE = re.compile(
     r"\W*(\d{1,4}([-./])\d{1,2}\2\d{1,4})?[T ,;]*(\d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?)?Z?[\s,;|\]]+"
 )
 """A day, a time or both before the first name of a line."""
+_LABEL_BEFORE = re.compile(r"\W*([^\W\d_]*[\s#_-]*\d+)\s*[:：]\s*(?=[^\W\d_])")
+"""The number of a station before the first name of a line: P01: Inc=30.0."""
+_ROW_OF_AXES = re.compile(
+    r"((?:[xyz]\s*[=:]?\s*[+−-]?\d+(?:[.,]\d+)?[\s,;]*){3})([^\W\d_][\w/²]{0,5})?", re.IGNORECASE
+)
+"""The values of three axes in a row, and their unit: X 0.01 Y -0.02 Z 0.99 g."""
 _PAIR_ALONE = re.compile(r"\s*([^\W\d_][^=:;]{0,30}?)\s*[=:]\s*(\S.*?)\s*")
 _SPREADSHEET = "{urn:schemas-microsoft-com:office:spreadsheet}"
 IS_XML = _SPREADSHEET[1:-1].encode()
@@ -56,8 +62,8 @@ def rows_of_records(lines: Sequence[str]) -> Rows | None:
             inside = True
         elif record:
             rows.append((n, [f"{name}: {value}" for name, value in record.items()]))
-        elif line.strip() and not inside:
-            rows.append((n, [line.strip()]))
+        elif (words := line.strip(" \t\r/#%*")) and not inside:
+            rows.append((n, [words]))
     return rows
 
 
@@ -69,13 +75,16 @@ def _record(line: str) -> dict[str, object]:
             return {key: _cell(value) for key, value in record.items()}
     time = match[0] if (match := _TIME_BEFORE.match(line)) else ""
     line = line[len(time) :]
+    label = _LABEL_BEFORE.match(line)
+    line = line[label.end() if label else 0 :]
     pairs = _PAIR_IN_LINE.findall(line)
     named: dict[str, object] = dict(pairs)
     numbers = sum(map(figures.is_figure, named.values()))
     whole = len(named) == len(pairs) >= _LEAST_PAIRS and 2 * numbers >= len(pairs)
     if not whole or re.search(r"[^\s,;|]", _PAIR_IN_LINE.sub(" ", line)):
         return {}
-    return {"Time": time.strip(), **named} if re.search(r"\d", time) else named
+    before = {"Time": time.strip()} if re.search(r"\d", time) else {}
+    return before | ({"Station": label[1]} if label else {}) | named
 
 
 def _cell(value: object) -> object:
@@ -85,18 +94,37 @@ def _cell(value: object) -> object:
 def _records_by_lines(lines: Sequence[str]) -> dict[int, dict[str, object]]:
     """Records of which each name stands with its value in a line of its own, by the line of the first."""
     pairs = [
-        (n, m[1], m[2]) for n, text in enumerate(lines, 1) if (m := _PAIR_ALONE.fullmatch(text))
+        (n, *pair)
+        for n, text in enumerate(lines, 1)
+        if (m := _PAIR_ALONE.fullmatch(text))
+        for pair in _by_axis(m[1], m[2])
     ]
     counts = Counter(name for _, name, _ in pairs)
     repeated = [(n, name, value) for n, name, value in pairs if counts[name] >= _LEAST_RECORDS]
     if not repeated:
         return {}
-    first = repeated[0][1]
+    usual = Counter(counts[name] for _, name, _ in repeated).most_common(1)[0][0]
+    first = next(name for _, name, _ in repeated if counts[name] == usual)  # others: titles, too
     starts = [k for k, (_, name, _) in enumerate(repeated) if name == first]
     return {
         repeated[one][0]: {name: value for _, name, value in repeated[one:other]}
         for one, other in pairwise([*starts, len(repeated)])
     }
+
+
+def _by_axis(name: str, value: str) -> list[tuple[str, str]]:
+    """A name with its value, or three of them where the values of three axes stand in a row.
+
+    >>> _by_axis("Accel (g)", "X 0.01 Y -0.02  Z 0.99")
+    [('Accel X (g)', '0.01'), ('Accel Y (g)', '-0.02'), ('Accel Z (g)', '0.99')]
+    """
+    row = _ROW_OF_AXES.fullmatch(value)
+    if not row:
+        return [(name, value)]
+    words, _, unit = name.rstrip(")] ").partition("(" if "(" in name else "[")
+    unit = f" ({unit or row[2]})" if unit or row[2] else ""
+    each = re.findall(r"([xyzXYZ])\s*[=:]?\s*([^\s;=:xyzXYZ]*[^\s;,])", row[1])
+    return [(f"{words.strip()} {axis}{unit}", number) for axis, number in each]
 
 
 class _Page(HTMLParser):

@@ -144,10 +144,8 @@ def _placed(
         return [*row[:behind], " ".join(row[behind:])]
     if len(row) < LEAST_COLUMNS:
         return row
-    places = [
-        [k for k, (start, end) in enumerate(columns) if one < end and start < other]
-        for one, other in spans
-    ]
+    row, spans = _over_one(row, spans, columns)
+    places = [_below(span, columns) for span in spans]
     if any(len(each) != 1 for each in places):
         return row
     by_place: dict[int, list[str]] = {}
@@ -156,6 +154,23 @@ def _placed(
     placed = [" ".join(by_place.get(place, ())) for place in range(len(columns))]
     apart = len(by_place) == len(row) < len(columns)
     return placed if apart or is_units(placed) else row
+
+
+def _below(span: tuple[int, int], columns: Sequence[tuple[int, int]]) -> list[int]:
+    """The columns that stand below or above a cell."""
+    return [k for k, (start, end) in enumerate(columns) if span[0] < end and start < span[1]]
+
+
+def _over_one(
+    row: Sequence[str], spans: Sequence[tuple[int, int]], columns: Sequence[tuple[int, int]]
+) -> tuple[list[str], list[tuple[int, int]]]:
+    """Cells and their places, with each word apart of a cell over several columns: one blank parts two names."""
+    cells, places = list[str](), list[tuple[int, int]]()
+    for cell, span in zip(row, spans, strict=True):
+        words = [*re.finditer(r"\S+", cell)] if len(_below(span, columns)) > 1 else []
+        cells += [word[0] for word in words] or [cell]
+        places += [(span[0] + w.start(), span[0] + w.end()) for w in words] or [span]
+    return cells, places
 
 
 def _numbers(rows: Sequence[Sequence[str]]) -> int:

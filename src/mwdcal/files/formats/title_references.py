@@ -141,9 +141,12 @@ _WITH_SPREAD = re.compile(
 
 _OF_A_UNIT = re.compile(
     r"(?:(?:^|[(\[,;:])\s*1|(?<![^\W\d_])(?:unit\w*|unidade?|einheit|enhet|enhed|eenheid|jednostka|единиц\w*)|单位)"
-    rf"\s*(?:{_WRITTEN_UNIT}|[gг])\s*[=≙≈]\s*(?:{_WRITTEN_NUMBER})\s*(?:{_WRITTEN_UNIT})"
+    rf"\s*(?:{_WRITTEN_UNIT}|[gг])\s*[=≙≈]\s*(?:{_WRITTEN_NUMBER})\s*(?:{_WRITTEN_UNIT})|"
+    r"(?<![\w.,])1\s*(?:m?v(?:olts?)?|в|мв|lsb|cnts?|counts?|digits?|bits?|cuentas?|contage[mn]s?|"
+    r"zahlwert\w*|ink\w*|tell\w*|отсч\w*|код\w*|ед\w*|码\w?|计数)\.?\s*"
+    rf"[=≙≈:]\s*(?:{_WRITTEN_NUMBER})\s*(?:{_WRITTEN_UNIT})"
 )
-"""Definition of a unit: 1 g = 9.80665 m/s²."""
+"""Definition of a unit: 1 g = 9.80665 m/s²; the size of a volt or of a count: 1 V = 20 µT."""
 _IN_OTHER_UNIT = re.compile(
     rf"(?P<value>(?P<number>{_WRITTEN_NUMBER})\s*(?P<unit>{_WRITTEN_UNIT}))[\s;]*"
     rf"[(\[]\s*=\s*(?P<again>{_WRITTEN_NUMBER})\s*(?P<other>{_WRITTEN_UNIT})[^)\]]*[)\]]"
@@ -515,13 +518,19 @@ def _line(row: Sequence[object]) -> str:
 def _clauses(row: Sequence[object]) -> str:
     """The cells of a row in small letters, a semicolon behind each that ends a statement: a number with its unit."""
     text, ends = "", False
-    for cell in filter(None, (_plain(as_text(each)).strip() for each in row)):
+    for cell in filter(None, (_plain(_SENTENCE.sub("; ", as_text(c))).strip() for c in row)):
         unit = re.fullmatch(rf"[(\[]?({_WRITTEN_UNIT}|[ns])[)\]]?", cell)
         text += f"; {cell}" if ends and not unit else f" {cell}"
         ends = not unit and bool(re.search(r"(?<![\w.,])[+\-−]?\d[^;]*$", cell))
     text = _IN_OTHER_UNIT.sub(_said_once, _OF_A_UNIT.sub("", text))
     text = _WITH_SPREAD.sub(r"\1 \4 \2 \3 \4", text)
     return _RANGE.sub("range ", text).strip()
+
+
+_SENTENCE = re.compile(
+    r"(?:(?<=[^\W\d_]{5})|(?<=\d)|(?<=\d [^\W\d_]{2}))\.\s+(?=[^\W\d_a-zа-яß-ÿ])"
+)
+"""The end of a sentence: a point behind a whole word or a number with its unit, and a capital letter."""
 
 
 def _said_once(match: re.Match[str]) -> str:

@@ -23,7 +23,7 @@ UNITS_BY_SIGN = {
 }
 """Spellings of units in letters, by their signs and by other alphabets."""
 _TITLE_WORDS = {
-    "serial": "serial sn s/n serialno serialnumber toolsn tools/n toolserial toolserialno toolserialnumber toolno "
+    "serial": "serial sn s/n n/s serialno serialnumber toolsn tools/n toolserial toolserialno toolserialnumber toolno "
     "toolid probesn probeno 仪器号 探管号 sondesn sensorsn seriennummer "
     "serie nserie seriennr geratenummer geratenr sondennummer sondennr serienummer "
     "serienr verktoynr instrumentnr numerodeserie nodeserie noserie nserie numeroserie nsserie numserie ndeserie "
@@ -87,8 +87,8 @@ _OF_TOOLS = (
     "прибор|зонд|датчик|инклинометр|仪器|探管"
 )
 _TOOL = re.compile(
-    rf"#?\s*(?:(?:{_OF_TOOLS})\s*"
-    r"(?P<mark>s/?n|serial( no)?|n[°º]|n(?=\s+\d)|no\b|nr\b|зав\.?\s*№|№|#|号|编号)?|(?P<sn>sn|s/n|"
+    rf"#?\s*(?:(?:{_OF_TOOLS})(?:n?-|\s*)"
+    r"(?P<mark>s/?n|n/s|serial( no)?|n[°º]|n(?=\s+\d)|no\b|nr\b|зав\.?\s*№|№|#|号|编号)?|(?P<sn>sn|s/n|"
     r"serial no))\s*[.:：|=]*\s*",
     re.IGNORECASE,
 )
@@ -98,8 +98,8 @@ _WHOLE_SERIAL = rf"{_SERIAL.pattern}(?:\s+/\s+{_OF_TWO})?"
 """A serial, which may be of two numbers, a model and its own: BHX-72 / 0091. A day is not a number."""
 _TWO_NUMBERS = re.compile(rf"(?<!\S)({_OF_TWO})(\s+/|,)\s+(?={_OF_TWO}\s*$)")
 _NUMBER_OF_TOOL = re.compile(
-    r"(tool|probe|sensor|sonde|instrument|herramienta|ferramenta|equipo|equipamento|verktoy|gerat|прибор|зонд|датчик)"
-    r"(s|n|e|en)?(s/?n|serial\w*|n|no|nr|num|number|nummer|numero|№|номер|id)"
+    r"(tool|probe|sensor|sonde|modul[eo]?|instrument|herramienta|ferramenta|equipo|equipamento|verktoy|gerat|прибор|зонд|датчик)"
+    r"(s|n|e|en)?(s/?n|n/s|serial(n|no|nr|num|number)?|n|no|nr|num|number|nummer|numero|№|номер|id)"
 )
 """The word for the tool and one for a number, without marks and blanks."""
 _BEHIND_MODEL = re.compile(
