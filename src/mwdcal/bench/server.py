@@ -224,7 +224,7 @@ class Bench:
 
     @property
     def shown(self) -> tuple[int, bool]:
-        """What the page depends on: the version of the session, and whether there is a table."""
+        """Version of the session, and whether there is a table: the page is of both."""
         return self.session.version, bool(self.table.name)
 
     def fragment(self) -> str:
