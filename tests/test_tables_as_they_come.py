@@ -416,6 +416,8 @@ def test_a_number_of_nines_among_others_like_it_is_a_reading(tmp_path):
     mg["az"][np.argmax(mg["az"])] = 1003
     path = written(tmp_path / "a.csv", table(**mg))
     assert read(path).count == 48
+    mg["az"][np.argmax(mg["az"])] = 999.99  # beyond the others by little
+    assert read(written(tmp_path / "c.csv", table(**mg))).count == 48
     mg["az"][5] = 9999
     path = written(tmp_path / "b.csv", table(**mg))
     assert "got '9999" in refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)

@@ -51,7 +51,7 @@ TRANSLATIONS = (
         r"зен\w*\.?( угол\w*)?|"
         r"neigung(swinkel)?|desviacion|sapma( acisi)?|inklination|inclinaison|inclinaca?o|"
         r"inclinacion|zenith( angle)?|drift angle|deviation angle|(?<![a-z])inkl?\b\.?|"
-        r"inklinasjon|helning|инклинация|зенит\w*( угол)?|наклон(?!ен)|井斜角?|倾角",
+        r"inklinasjon|helning|инклинация|зенит\w*( угол)?|наклон(?!ен)|井斜角?|倾角|顶角|天顶角",
         "inclination ",
     ),
     (

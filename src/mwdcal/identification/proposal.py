@@ -80,6 +80,10 @@ FAR_OUT = 4.0
 """By how much a single reading lies farther out than all others that was mistyped."""
 _FEW_ROWS, _FEW_SHARE = 2, 0.15
 """Rows at most that are asked about, and their share."""
+_BEYOND = 0.1
+"""How far a number of nines lies beyond all others that stands for none, as a share of their range."""
+_OF_NULL = 0.25
+"""The fraction of a number of nines that does so wherever it lies: -999.25."""
 _FEW_WORDS = 2
 """Words of a mark at most; more are a remark, which may speak of another row."""
 
@@ -123,7 +127,7 @@ def check_cells(table: Table, columns: Mapping[str, ColumnSource]) -> None:
         factor, offset = (
             FACTORS.get(columns[column].unit, (1.0, 0.0)) if units_of(column) else (1.0, 0.0)
         )
-        filler = is_filler(values) & (_is_outside_others(values) | (values % 1 != 0))
+        filler = is_filler(values) & (_is_beyond_others(values) | (np.abs(values) % 1 == _OF_NULL))
         wrong = filler | RANGES[column].outside(values * factor + offset)
         if column in (*RAW, WARMTH) and not np.isnan(values).all():
             wrong |= np.isnan(values)
@@ -138,12 +142,13 @@ def check_cells(table: Table, columns: Mapping[str, ColumnSource]) -> None:
         raise QuestionsError(table.source, questions)
 
 
-def _is_outside_others(values: Array) -> Bools:
-    """Which values (n,) lie outside the range of those that do not stand for none."""
+def _is_beyond_others(values: Array) -> Bools:
+    """Which values (n,) lie far outside the range of those that do not stand for none."""
     others = values[np.isfinite(values) & ~is_filler(values)]
     if not others.size:
         return np.ones(values.size, bool)
-    return np.asarray((values < others.min()) | (values > others.max()))
+    beyond = _BEYOND * np.ptp(others)
+    return np.asarray((values < others.min() - beyond) | (values > others.max() + beyond))
 
 
 def _far_out(values: Mapping[str, Array], column: str) -> Bools:
