@@ -345,6 +345,12 @@ def test_a_roll_test_on_another_sheet_of_the_run_is_that_of_the_run(tmp_path):
         (["Probe number", 41], {"serial": "41"}),
         (["Herramienta N/S:", "MX-4471"], {"serial": "MX-4471"}),
         (["Sonden-Nr. 880214"], {"serial": "880214"}),
+        (["Kalibrering sonde nr. 27"], {"serial": "27"}),
+        (["Прибор: 1200417"], {"serial": "1200417"}),
+        (["Номер прибора", "МК-17"], {"serial": "МК-17"}),
+        (["Equipo", "MX-12"], {"serial": "MX-12"}),
+        (["Roll stand cal. Tool S/N: HT-0092. Field 46510 nT"], {"serial": "HT-0092"}),
+        (["Sensor: 24 V"], {}),
         (["Calibration, tool serial MWD-5533, stand B"], {"serial": "MWD-5533"}),
     ],
 )

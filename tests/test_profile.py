@@ -391,7 +391,7 @@ WORDS_OF_THE_FIELD = {
     "Accelerometers Gx (V)": "ax", "Magnetometers Hy (nT)": "my", "Accéléromètre Z (g)": "az", "Z (mg)": "az",
     "X (nT)": "mx", "Mag. X (G)": "mx", "Température (°С)": "temperature_c", "Face outil (°)": "ref_toolface_deg",
     "Mergulho (°)": "ref_dip_deg", "Feltinklinasjon (grader)": "ref_dip_deg", "地磁倾角(°)": "ref_dip_deg",
-    "顶角(°)": "ref_inclination_deg", "参考总磁场/Gs": "ref_field_nt",
+    "Т, град С": "temperature_c", "顶角(°)": "ref_inclination_deg", "参考总磁场/Gs": "ref_field_nt",
     "Угол установки, °": "ref_toolface_deg", "CAMPO_TOTAL_mGauss": "ref_field_nt", "Az (gon)": "ref_azimuth_deg",
 }  # fmt: skip
 

@@ -84,6 +84,11 @@ TITLES = {
         ["g", "9,8123 m/s²"],
     ],
     "Russian": [["Т = 48,912 мкТл, наклонение 66,25°, g = 9,8123 м/с²"]],
+    "Norwegian, of the field": [
+        ["Feltstyrke:", "48912 nT"],
+        ["Felthelning:", "66,25°"],
+        ["Tyngde:", "9,8123 m/s2"],
+    ],
     "Chinese": [["总磁场强度", 48912, "nT", "磁倾角", "66.25°", "重力加速度", 9.8123, "m/s²"]],
 }
 NO_REFERENCES = (
@@ -407,6 +412,27 @@ def test_a_number_too_large_for_a_mean_is_named(tmp_path):
         mwdcal("profile", written(tmp_path / "a.csv", columns), "-o", tmp_path / "t"), 2, 3
     )
     assert "Gx (V)" in message
+
+
+@pytest.mark.parametrize(
+    ("line", "unit"),
+    [
+        ("Temperatura en grados Fahrenheit", "°F"),
+        ("G's in g, temp deg C.", "°C"),
+        ("Temp 77 °F", ""),
+    ],
+)
+def test_a_line_above_says_the_unit_of_temperatures(tmp_path, line, unit):
+    """Not where it is the unit of a number: 76.6 may then be of either, and is asked about."""
+    warm = table(**{"Temp (C)": None, "Temp": np.linspace(76.0, 77.5, 48)})
+    path = written(tmp_path / "a.csv", warm, line, "")
+    if not unit:
+        with pytest.raises(FitError, match="whether it is in °C or °F"):
+            library.propose_profile(path)
+        return
+    given = np.linspace(76.0, 77.5, 48)
+    expected = (given - 32) / 1.8 if unit == "°F" else given
+    assert np.allclose(read(path).temperature, expected)
 
 
 def test_a_number_of_nines_among_others_like_it_is_a_reading(tmp_path):

@@ -109,6 +109,8 @@ TRANSLATIONS = (
         r"schwere|gravitation|pesanteur|tyngde\w*|gravedad|gravidade|сила тяжести|重力(加速度)?",
         "gravity ",
     ),
+    (r"(град\w*\.?|°)\s?[сc](?![а-яa-z])", "degc"),
+    (r"^т(?=\W)", "T"),
     (r"нтл", "nT"),
     (r"мктл", "uT"),
     (r"м[gг](?![а-яa-z])", "mg"),

@@ -60,7 +60,7 @@ _OF_PLACES = (
         r"magn\w* inklinace|manyetik egim|magn\w* inklinacio|伏角|"
         r"inklinacja( pola)?|inclinazione magn\w*|magn\w* inclinatie|"
         r"(feld|feld-|magn\w* ?)?inklination|"
-        r"(felt|magn\w* ?)?inklinasjon|mergulho( magn\w*)?|inclinaca?o (magn?\w*|do campo)|"
+        r"(felt|magn\w* ?)?inklinasjon|(felt|magn\w* ?)helning|mergulho( magn\w*)?|inclinaca?o (magn?\w*|do campo)|"
         r"inclinacion (magn\w*|del campo)|echado|buzamiento|inclinaison( magn\w*| du champ)?|"
         r"(магн\w* )?наклонени[ея]|(地)?磁倾角",
         "i",

@@ -83,7 +83,7 @@ ADJUSTED = re.compile(
 _PARTS = re.compile(r"\s+/\s+|,\s+|;\s*|\s{3,}")
 """The separator of facts in one cell."""
 _OF_TOOLS = (
-    "tool|probe|sensor|sonde|sonda|prüfling|instrument|herramienta|ferramenta|verktøy|gerät|"
+    "tool|probe|sensor|sonde|sonda|prüfling|instrument|herramienta|ferramenta|verktøy|gerät|equipo|equipamento|"
     "прибор|зонд|датчик|инклинометр|仪器|探管"
 )
 _TOOL = re.compile(
@@ -92,14 +92,16 @@ _TOOL = re.compile(
     r"serial no))\s*[.:：|=]*\s*",
     re.IGNORECASE,
 )
-_SERIAL = re.compile(r"(?=\S*\d)[^\W_][\w./-]*")
+_SERIAL = re.compile(r"(?=\S*\d)[^\W_](?:[\w./-]*[^\W_])?")
 _OF_TWO = r"(?!\d{1,4}[./-]\d\d?[./-]\d{1,4}(?!\d))(?=\S*\d)[^\W_][\w./-]*"
 _WHOLE_SERIAL = rf"{_SERIAL.pattern}(?:\s+/\s+{_OF_TWO})?"
 """A serial, which may be of two numbers, a model and its own: BHX-72 / 0091. A day is not a number."""
 _TWO_NUMBERS = re.compile(rf"(?<!\S)({_OF_TWO})(\s+/|,)\s+(?={_OF_TWO}\s*$)")
 _NUMBER_OF_TOOL = re.compile(
     r"(tool|probe|sensor|sonde|modul[eo]?|instrument|herramienta|ferramenta|equipo|equipamento|verktoy|gerat|прибор|зонд|датчик)"
-    r"(s|n|e|en)?(s/?n|n/s|serial(n|no|nr|num|number)?|n|no|nr|num|number|nummer|numero|№|номер|id)"
+    r"(s|n|e|en)?(s/?n|n/s|serial(n|no|nr|num|number)?|n|no|nr|num|number|nummer|numero|№|номер|id)|"
+    r"(номер|numero|nummer|number|n|no|№)(d[eao]l?a?|of|der|des)?"
+    r"(прибора|зонда|датчика|инклинометра|herramienta|ferramenta|equipo|equipamento|sonda|sonde|tool|probe)"
 )
 """The word for the tool and one for a number, without marks and blanks."""
 _BEHIND_MODEL = re.compile(
@@ -245,21 +247,23 @@ def _marked_in(text: str) -> list[str]:
     every = [
         m
         for m in (() if text.startswith("TOA5") else _WITH_MARK.finditer(text))
-        if not _OF_EQUIPMENT.search(re.split("[;,]", text[: m.start()].rstrip(" ;,"))[-1])
+        if not _OF_EQUIPMENT.search(re.split(r"[;,]|\.\s", text[: m.start()].rstrip(" ;,"))[-1])
     ]
     return [m["serial"] for m in every if m["word"]] or [m["serial"] for m in every]
 
 
 def _tool(cell: str, right: Sequence[str]) -> str:
     """The serial behind a word for the tool, in a cell or the next one; empty where that may be something else."""
-    match = _TOOL.match(cell) or _TOOL.fullmatch(cell, max(cell.rfind(" "), cell.rfind("-")) + 1)
+    marked = (m for m in _TOOL.finditer(f" {cell}") if m["mark"] and m[0][0].isspace())
+    last = _TOOL.fullmatch(cell, max(cell.rfind(" "), cell.rfind("-")) + 1)
+    match = _TOOL.match(cell) or last or next(marked, None)
     if not match:
         return ""
-    behind = cell[match.end() :].strip() or next((each for each in right[:2] if each), "")
+    behind = match.string[match.end() :].strip() or next((each for each in right[:2] if each), "")
     number = _SERIAL.match(behind)
-    return (
-        number[0] if number and (match["mark"] or match["sn"] or _TELLING.search(number[0])) else ""
-    )
+    alone = number and number[0] == behind and re.search(r"[:：=|]\s*$", match[0])
+    clear = match["mark"] or match["sn"] or alone
+    return number[0] if number and (clear or _TELLING.search(number[0])) else ""
 
 
 def _pair(cell: str, right: Sequence[str]) -> tuple[str, str]:
