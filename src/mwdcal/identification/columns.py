@@ -401,7 +401,7 @@ _SPOKEN = {
     "gon": re.compile(r"(?<!\d)(?<!\d )\bgon\b", re.IGNORECASE),
 }
 """Units of angles in a line above a table, not those of a number."""
-_OF_WARMTH = re.compile(
+_WARMTH_ABOVE = re.compile(
     r"(?:temp\w*|темп\w*|温度)[^\d;.]{0,30}?(?:(?P<f>fahrenheit|фаренгейт\w*|华氏|℉|(?:°|deg\w*\.?|gra[du]\w*)\s?F\b)|"
     r"(?P<c>celsius|centigra\w*|цельси\w*|摄氏|℃|(?:°|deg\w*\.?|gra[du]\w*)\s?C\b))",
     re.IGNORECASE,
@@ -573,7 +573,7 @@ def meanings_of(
     dips = [n for n in inclined if re.search("inklination", n, re.IGNORECASE)]
     if len(dips) == 1 and any(re.search("neigung", n, re.IGNORECASE) for n in inclined):
         results[dips[0]] = results[dips[0]]._replace(column="ref_dip_deg")
-    warmth = {m.lastgroup for line in above if (m := _OF_WARMTH.search(line))}
+    warmth = {m.lastgroup for line in above if (m := _WARMTH_ABOVE.search(line))}
     if len(warmth) == 1:
         unit = "°F" if warmth == {"f"} else "°C"
         results |= {

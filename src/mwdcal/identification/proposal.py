@@ -82,8 +82,8 @@ _FEW_ROWS, _FEW_SHARE = 2, 0.15
 """Rows at most that are asked about, and their share."""
 _BEYOND = 0.1
 """How far a number of nines lies beyond all others that stands for none, as a share of their range."""
-_OF_NULL = 0.25
-"""The fraction of a number of nines that does so wherever it lies: -999.25."""
+_OFF_NORM = 0.15
+"""By how much the norm of its row differs from the others' where it lies among them, as a share."""
 _FEW_WORDS = 2
 """Words of a mark at most; more are a remark, which may speak of another row."""
 
@@ -127,7 +127,7 @@ def check_cells(table: Table, columns: Mapping[str, ColumnSource]) -> None:
         factor, offset = (
             FACTORS.get(columns[column].unit, (1.0, 0.0)) if units_of(column) else (1.0, 0.0)
         )
-        filler = is_filler(values) & (_is_beyond_others(values) | (np.abs(values) % 1 == _OF_NULL))
+        filler = is_filler(values) & (_is_unlike_others(values) | _is_off_norm(raw, column))
         wrong = filler | RANGES[column].outside(values * factor + offset)
         if column in (*RAW, WARMTH) and not np.isnan(values).all():
             wrong |= np.isnan(values)
@@ -142,13 +142,24 @@ def check_cells(table: Table, columns: Mapping[str, ColumnSource]) -> None:
         raise QuestionsError(table.source, questions)
 
 
-def _is_beyond_others(values: Array) -> Bools:
-    """Which values (n,) lie far outside the range of those that do not stand for none."""
+def _is_unlike_others(values: Array) -> Bools:
+    """Which values (n,) lie far outside the range of those that do not stand for none, or have more digits."""
     others = values[np.isfinite(values) & ~is_filler(values)]
     if not others.size:
         return np.ones(values.size, bool)
     beyond = _BEYOND * np.ptp(others)
-    return np.asarray((values < others.min() - beyond) | (values > others.max() + beyond))
+    digits = max(len(f"{value:.12g}".partition(".")[2]) for value in others)
+    outside = (values < others.min() - beyond) | (values > others.max() + beyond)
+    return np.asarray(outside | (np.round(values, digits) != values))
+
+
+def _is_off_norm(values: Mapping[str, Array], column: str) -> Bools:
+    """Rows (n,) whose norm is not that of the others, by the triad of a channel; all of any other column."""
+    triad = next((t for t in CHANNELS.values() if column in t and {*t} <= {*values}), None)
+    if triad is None:
+        return np.ones(values[column].size, bool)
+    norms = np.linalg.norm([values[name] for name in triad], axis=0)
+    return np.asarray(~(np.abs(norms - np.nanmedian(norms)) <= _OFF_NORM * np.nanmedian(norms)))
 
 
 def _far_out(values: Mapping[str, Array], column: str) -> Bools:
