@@ -437,7 +437,7 @@ def test_a_line_above_says_the_unit_of_temperatures(tmp_path, line, unit):
 
 def test_a_number_of_nines_among_others_like_it_is_a_reading(tmp_path):
     """999 mg beside 998 and 1001 mg; 999 far from all others stands for no reading."""
-    mg = {n: np.round(servo_run()[n] / 3 * 1000, 1) for n in ("ax", "ay", "az")}
+    mg = {n: np.round(servo_run()[n] / 3 * 1000, 2) for n in ("ax", "ay", "az")}
     mg["az"][np.argsort(np.abs(mg["az"] - 999))[0]] = 999
     mg["az"][np.argmax(mg["az"])] = 1003
     path = written(tmp_path / "a.csv", table(**mg))
