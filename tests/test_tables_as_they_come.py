@@ -421,14 +421,18 @@ def test_blank_angles_of_the_stand_are_named(tmp_path):
     assert "line 9 ('Inc (deg)')" in findings_of(library.propose_profile(path))["marked-rows"]
 
 
-def test_rows_of_another_tool_below_the_table_are_left_out_and_named(tmp_path):
-    lines = write_csv(tmp_path / "a.csv", table()).read_text().splitlines()
-    other = [line.replace(line.split(",")[1], "20.0", 1) for line in lines[1:9]]
+@pytest.mark.parametrize("below_names", [False, True])
+def test_rows_of_two_tools_below_lines_with_their_serials_are_asked_about(tmp_path, below_names):
+    names, *rows = write_csv(tmp_path / "a.csv", table()).read_text().splitlines()
+    other = [line.replace(line.split(",")[1], "20.0", 1) for line in rows[:24]]
+    first = [names, "Tool S/N DM-17"] if below_names else ["Tool S/N DM-17", names]
     path = tmp_path / "b.csv"
-    path.write_text("\n".join(["Tool S/N DM-17", *lines, "Tool S/N ZZ-2", *other]))
-    proposal = library.propose_profile(path)
-    assert library.read_run(path, proposal.profile).count == 48
-    assert "left out: line 51 (Tool S/N ZZ-2)" in proposal.summary()
+    path.write_text("\n".join([*first, *rows, "Tool S/N ZZ-2", *other]))
+    with pytest.raises(FitError, match="rows of 2 tools"):
+        library.propose_profile(path)
+    for serial, count in (("DM-17", 48), ("ZZ-2", 24)):
+        proposal = library.propose_profile(path, serial=serial)
+        assert library.read_run(path, proposal.profile, serial=serial).count == count
 
 
 @pytest.mark.parametrize(

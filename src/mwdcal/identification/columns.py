@@ -303,13 +303,15 @@ _NO_STAND = re.compile(
 )
 """Words of columns of angles that do not belong to the stand."""
 _NOMINAL = re.compile(
-    r"\b(nominale?|target|set|set ?point|soll\w*|cmd|command(ed)?|demand(ed)?|required|nom|consign[ea]|comandad[oa]|"
-    r"zadan\w*|b[öo]rv[äa]rde|задан\w*|номинал\w*)\b|设定|目标|指令値?|目標値?|設定値?",
+    r"\b(nominale?|target|set|set ?point|soll\w*|eingestellt\w*|vorgabe|satt|innstilt|ajustad[oa]|fijad[oa]|definid[oa]|"
+    r"programad[oa]|te[óo]ric[oa]|th[ée]orique|r[ée]gl[ée]e?|vis[ée]e?|установ(ка|лен\w*)|уставк\w*|cmd|command(ed)?|demand(ed)?|required|nom|consign[ea]|comandad[oa]|"
+    r"zadan\w*|b[öo]rv[äa]rde|задан\w*|номинал\w*)\b|[设给]定|设置|理论|名义|目标|指令値?|目標値?|設定値?",
     re.IGNORECASE,
 )
 _ACTUAL = re.compile(
-    r"\b(actual|act|achieved|read|reading|encoder|ist|istwert|effettiv[oa]|mesur[ée]e?s?|medid[oa]|zmierzon\w*|"
-    r"[äa]rv[äa]rde|действит\w*|фактич\w*|измер\w*|real|faktisk)\b|实际|实测|编码器|実測値?|実際",
+    r"\b(actual|act|achieved|as read|read ?back|read ?out|observed|abgelesen\w*|avlest|le[íi]d[oa]|lid[oa]|lue?|relev[ée]e?|"
+    r"r[ée]el(le)?|efetiv[oa]|efectiv[oa]|отсч[её]т\w*|read|reading|encoder|ist|istwert|effettiv[oa]|mesur[ée]e?s?|medid[oa]|zmierzon\w*|"
+    r"[äa]rv[äa]rde|действит\w*|фактич\w*|измер\w*|real|faktisk)\b|实际|实测|测得|读数|编码器|実測値?|実際",
     re.IGNORECASE,
 )
 """Words of angles to which a stand was to be set, and of those that it shows."""

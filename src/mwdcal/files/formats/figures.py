@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from datetime import datetime, time, timedelta
 
 from mwdcal.errors import Answer, InputError, QuestionError
 from mwdcal.files.formats.columns import as_text, looks_numeric
@@ -18,6 +19,15 @@ _DEGREES = re.compile(
     r"([+\-−]?)(\d+)\s*[°º]\s*(\d+(?:[.,]\d+)?)\s*['′’]\s*(?:(\d+(?:[.,]\d+)?)\s*(?:[\"″”]|''))?"
 )
 """Degrees, minutes and seconds."""
+_PARTS_OF_DEGREES = re.compile(
+    r"([+\-−]?)(\d{1,3})(?:\s*[°ºdD:\-–]\s*|\s+)([0-5]?\d(?:[.,]\d+)?)(?:(?:\s*['′’mM:\-–]\s*|\s+)([0-5]?\d(?:[.,]\d+)?)\s*"
+    r"(?:[\"″”sS]|'')?|\s*['′’mM])?"
+)
+"""The same with other signs, or none: 30-15-36, 30:15:36, 30 15 36, 30d15m."""
+_PACKED = re.compile(r"(?<![^\W\d_])[dg]{1,3}[.,]mm(ss)?(?![^\W\d_])", re.IGNORECASE)
+"""What says that minutes and seconds are the decimals of degrees: D.MMSS."""
+_FIRST_DAY = datetime(1899, 12, 31)
+"""The day 0 of workbooks."""
 _BEARING = re.compile(r"([NS])\s*(\d+(?:[.,]\d+)?)\s*°?\s*([EWO])", re.IGNORECASE)
 """A bearing by quadrants, such as N45E."""
 _POINTS = {
@@ -127,6 +137,47 @@ def column(cells: Sequence[object], sign: str) -> tuple[list[str], str]:
     ], unit
 
 
+def sexagesimal(cells: Sequence[object], said: str) -> list[object]:
+    """The cells of a column of angles in degrees, where they are degrees, minutes and seconds; else as they are.
+
+    A workbook keeps 30:15:36 as a time. `said`: what the table says of these angles, which may be D.MMSS.
+
+    >>> sexagesimal(["30-15-36", ""], ""), sexagesimal([30.1536], "Inc (D.MMSS)"), sexagesimal([30.15], "Inc")
+    (['30.26', ''], ['30.26'], [30.15])
+    """
+    packed = _PACKED.search(said)
+    values = [
+        cell
+        if cell == ""
+        else _unpacked(as_text(cell), 4 if packed[1] else 2)
+        if packed
+        else _of_parts(cell)
+        for cell in cells
+    ]
+    return [*cells] if None in values or not any(values) else [*values]
+
+
+def _of_parts(cell: object) -> str | None:
+    """Degrees, minutes and seconds, or the time that a workbook keeps of them, in degrees; None of other cells."""
+    if isinstance(cell, datetime):
+        cell = cell - _FIRST_DAY
+    if isinstance(cell, time):
+        cell = timedelta(hours=cell.hour, minutes=cell.minute, seconds=cell.second)
+    if isinstance(cell, timedelta):
+        return repr(cell.total_seconds() / 3600)
+    match = _PARTS_OF_DEGREES.fullmatch(cell.strip()) if isinstance(cell, str) else None
+    return _in_degrees(match, ",") if match else None
+
+
+def _unpacked(text: str, digits: int) -> str | None:
+    """Degrees of D.MMSS, or of D.MM; None where minutes or seconds are 60 or more."""
+    whole, _, decimals = text.replace(",", ".").partition(".")
+    packed = decimals.ljust(digits, "0")
+    parts = f"{whole} {packed[:2]} {packed[2:digits] or 0}.{packed[digits:] or 0}"
+    match = _PARTS_OF_DEGREES.fullmatch(parts)
+    return _in_degrees(match, ".") if match else None
+
+
 _OF_AXES = re.compile(r"(.*?)[\s_(\[]*x\W*y\W*z[)\]]*(?![^\W\d_])(.*)", re.IGNORECASE)
 """A name of all three axes: G xyz (g), B (x, y, z)."""
 _UNIT_LAST = re.compile(r"(.*?)\s*([(\[][^()\[\]]*[)\]])?\s*")
@@ -213,8 +264,11 @@ def _azimuth(text: str, sign: str) -> str:
 def _degrees(text: str, sign: str) -> str:
     """Degrees, minutes and seconds in degrees; blank stays blank."""
     match = _DEGREES.fullmatch(text)
-    if not match:
-        return text
+    return _in_degrees(match, sign) if match else text
+
+
+def _in_degrees(match: re.Match[str], sign: str) -> str:
+    """Sign, degrees, minutes and seconds as a number."""
     minus, *parts = match.groups()
     degrees, minutes, seconds = (float((part or "0").replace(sign, ".")) for part in parts)
     value = degrees + minutes / 60 + seconds / 3600
