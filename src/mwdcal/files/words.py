@@ -11,22 +11,21 @@ from mwdcal.files.synonyms import resembled
 
 _LATIN = str.maketrans({"ø": "o", "Ø": "O", "æ": "ae", "ß": "ss", "ł": "l", "ı": "i", "İ": "i"})
 """Letters that do not come apart into a plain letter and a mark."""
-_LOOKALIKE = re.compile(
-    r"(?<![^\W\d_])([GABHMАВНМ]?[ХхУу]|[АВНМ][xyzXYZ])(?![^\W\d_])"
-)
+_LOOKALIKE = re.compile(r"(?<![^\W\d_])([GABHMАВНМ]?[ХхУу]|[АВНМ][xyzXYZ])(?![^\W\d_])")
 """An axis in Cyrillic letters, or a channel in letters of both alphabets."""
-_LATIN_AXES = str.maketrans("АВНМХхУу", "ABHMXxYy")
+LATIN_AXES = str.maketrans("АВНМХхУу", "ABHMXxYy")
+"""Cyrillic letters of axes and channels, and those that they look like."""
 _ELEVATION = (
     r"\b(elev(ation)?|hole dip|elevacion|elevacao|elevazione|hoydevinkel|"
     r"inc\w* (from|to|above|over) (the )?horiz\w*|pitch)\b"
 )
 """Names of angles that count from the horizontal."""
-_ACROSS = (
+_CROSSWISE = (
     r"(tran(s|sv|sverse|sversal\w*)?|radiale?|lateral|cross|quer(achse)?|tverr|радиальн\w*|поперечн\w*|径向|横向)"
     r"\.?[ _-]*"
 )
 """Words of an axis across the tool, before its number."""
-_VERTICAL = (
+_FROM_VERTICAL = (
     r"(from|to|zur|von der|fra|av|de la|a la|da|par rapport a la|от) (the )?"
     r"(vertical\w*|vertikal\w*|lotrechten|lotlini?e|loddlinjen?|вертикали)"
 )
@@ -44,18 +43,22 @@ TRANSLATIONS = (
     (r"\bm(illi)?gauss\b", "mG"),
     (r"grav(?=axial|tran)", "acc "),
     (r"axiale?|aksial|longitudinal\w*|langsachse|осев\w*|轴向", "Z "),
-    (rf"{_ACROSS}1", "X "),
-    (rf"{_ACROSS}2", "Y "),
-    (rf"{_ACROSS}(?=[xyz]\b)|\baxe(?=[ _]*[xyz]\b)", ""),
+    (rf"{_CROSSWISE}1", "X "),
+    (rf"{_CROSSWISE}2", "Y "),
+    (rf"{_CROSSWISE}(?=[xyz]\b)|\baxe(?=[ _]*[xyz]\b)", ""),
     (r"\b(angulo|angle|ang)\b\.?( d[ae]l?\b)?( d')? *(?=inclin|azim|acim|rot|rol|roul|giro)", ""),
-    (r"(?<=[xyz][ -])(magnet(feld|felt)|magn\b\.?)|(?<=[xyz])轴?磁(场强度|场|通门|力计|力|强计)?", " mag "),
+    (
+        r"(?<=[xyz][ -])(magnet(feld|felt)|magn\b\.?)|(?<=[xyz])轴?磁(场强度|场|通门|力计|力|强计)?",
+        " mag ",
+    ),
     (
         r"hoehenwinkel|hohenwinkel|elevasjon|stupning|neigung.*horizontal\w*|угол места|仰角|"
         r"(井斜|倾)?角?\W*(与|和|从|自)?水平面?的?(夹)?角|" + _ELEVATION,
         "elevation ",
     ),
     (
-        r"inklination( des)? (erd)?(magnet)?felde?s?|복각|magneettinen kaltevuus|magn\w* kaltevuus|magneticka inklinace|manyetik egim|inklinacja( pola|"
+        r"inklination( des)? (erd)?(magnet)?felde?s?|"
+        r"복각|magneettinen kaltevuus|magn\w* kaltevuus|magneticka inklinace|manyetik egim|inklinacja( pola|"
         r" magn\w*)?|magn\w* inklinacio|inclinazione magn\w*|magn\w* inclinatie|"
         r"magn\w* (inklination|lutning)|inklinasi( magnet\w*)?|伏角|"
         r"(угол )?(магнитн\w* )?наклонени[ея]|(地磁|磁)倾角?|incl\w*\.? magn\w*\.?|"
@@ -63,7 +66,7 @@ TRANSLATIONS = (
         "dip ",
     ),
     (
-        rf"(angul[oe]|angle|ang\.|winkel|vinkel|угол|dip|abweichung|avvik|desvio|ecart|отклонение) {_VERTICAL}|"
+        rf"(angul[oe]|angle|ang\.|winkel|vinkel|угол|dip|abweichung|avvik|desvio|ecart|отклонение) {_FROM_VERTICAL}|"
         r"(angulo |angle )?(zenithal|cenital|zenital)|hole angle|zenitwinkel|bohrlochneigung|kippung|schwenkwinkel|"
         r"hel+ningsvinkel|hellning|天?顶角|kallistus(kulma)?|kallistuma(kulma)?|경사각?|inclinare|naklon\b|nagib\b|sklon\b|klison\b|\bdevi\b|"
         r"kipp(achse|winkel)|schwenkachse|\btilt\b|inclinazione|inclinatie|helling|haeldning|hældning|lutning|"
@@ -74,10 +77,11 @@ TRANSLATIONS = (
         r"inklinasjon|helning|инклинация|зенит\w*( угол)?|наклон(?!ен)|井斜角?|倾角",
         "inclination ",
     ),
-    (_VERTICAL, ""),
+    (_FROM_VERTICAL, ""),
     (
-        r"azimutwinkel|\bkurs\b|\bdire(ccion|cao|ction)\b|\brumo\b|\bcap\b|\bаз(им)?\b\.?|направление|курс|"
-        r"方向角?|atsimuutti|suuntakulma|방위각?|\bhazi\b|drehtisch|turn ?table|rotary table|baring|azymut|yonelim|азимут|"
+        r"azimutwinkel|\bkurs\b|\bdire(ccion|cao|ction)\b|\brumo\b|\bcap\b|\bаз(им)?\b\.?|направление|"
+        r"курс|方向角?|"
+        r"atsimuutti|suuntakulma|방위각?|\bhazi\b|drehtisch|turn ?table|rotary table|baring|azymut|yonelim|азимут|"
         r"asimut|azimute?(?!h)|acimut|方位角?|"
         r"rumbo|richtung(?!swinkel)|retning|peilung",
         "azimuth ",
@@ -125,7 +129,8 @@ TRANSLATIONS = (
         "mag ",
     ),
     (
-        r"поле полное|地?磁场总强度|kokonaiskentta|celkove pole|전자기장|전자력|camp total|natezenie pola|pole calkow\w*|calkowite pole|"
+        r"поле полное|地?磁场总强度|"
+        r"kokonaiskentta|celkove pole|전자기장|전자력|camp total|natezenie pola|pole calkow\w*|calkowite pole|"
         r"(teljes )?terero|toplam alan|totaalveld|"
         r"campo totale|medan total|全磁力|"
         r"feldstarke|gesamtfeld|totalfeld|totalfelt|champ( magn\w*)?( total)?|campo (total|local|magn\w*)|"
@@ -190,7 +195,7 @@ def spelled(name: str) -> str:
     >>> spelled("Neigung Soll (°)"), spelled("gravTran1Raw")
     ('inclination ref (°)', 'acc X Raw')
     """
-    text = _LOOKALIKE.sub(lambda m: m[0].translate(_LATIN_AXES), name)
+    text = _LOOKALIKE.sub(lambda m: m[0].translate(LATIN_AXES), name)
     text = text.translate(_LATIN).replace("º", "°").replace("°", "\0").replace("²", "\1")
     text = without_marks(text).replace("_", " ")
     text = text.replace("\0", "°").replace("\1", "²")

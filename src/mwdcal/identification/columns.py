@@ -303,14 +303,14 @@ _NO_STAND = re.compile(
 )
 """Words of columns of angles that do not belong to the stand."""
 _NOMINAL = re.compile(
-    r"\b(nominale?|target|set|set ?point|soll\w*|eingestellt\w*|vorgabe|satt|innstilt|ajustad[oa]|fijad[oa]|definid[oa]|"
-    r"programad[oa]|te[óo]ric[oa]|th[ée]orique|r[ée]gl[ée]e?|vis[ée]e?|установ(ка|лен\w*)|уставк\w*|cmd|command(ed)?|demand(ed)?|required|nom|consign[ea]|comandad[oa]|"
+    r"\b(nominale?|target|set|set ?point|soll\w*|eingestellt\w*|vorgabe|satt|innstilt|ajustad[oa]|fijad[oa]|"
+    r"definid[oa]|programad[oa]|te[óo]ric[oa]|th[ée]orique|r[ée]gl[ée]e?|vis[ée]e?|установ(ка|лен\w*)|уставк\w*|cmd|command(ed)?|demand(ed)?|required|nom|consign[ea]|comandad[oa]|"
     r"zadan\w*|b[öo]rv[äa]rde|задан\w*|номинал\w*)\b|[设给]定|设置|理论|名义|目标|指令値?|目標値?|設定値?",
     re.IGNORECASE,
 )
 _ACTUAL = re.compile(
-    r"\b(actual|act|achieved|as read|read ?back|read ?out|observed|abgelesen\w*|avlest|le[íi]d[oa]|lid[oa]|lue?|relev[ée]e?|"
-    r"r[ée]el(le)?|efetiv[oa]|efectiv[oa]|отсч[её]т\w*|read|reading|encoder|ist|istwert|effettiv[oa]|mesur[ée]e?s?|medid[oa]|zmierzon\w*|"
+    r"\b(actual|act|achieved|as read|read ?back|read ?out|observed|abgelesen\w*|avlest|le[íi]d[oa]|lid[oa]|lue?|"
+    r"relev[ée]e?|r[ée]el(le)?|efetiv[oa]|efectiv[oa]|отсч[её]т\w*|read|reading|encoder|ist|istwert|effettiv[oa]|mesur[ée]e?s?|medid[oa]|zmierzon\w*|"
     r"[äa]rv[äa]rde|действит\w*|фактич\w*|измер\w*|real|faktisk)\b|实际|实测|测得|读数|编码器|実測値?|実際",
     re.IGNORECASE,
 )
@@ -1174,7 +1174,8 @@ def _check_side_by_side(names: Sequence[str], values: Values, source: str) -> No
     for name in names:
         words = name.split()
         for place in range(len(words) - 1, 0, -1):
-            alike = meaning(" ".join(words[place:]))
+            rest = " ".join(words[place:])
+            alike = Resemblance(WARMTH) if _BARE_T.fullmatch(rest) else meaning(rest)
             if alike and alike.column in (*RAW, WARMTH):
                 tools.setdefault(" ".join(words[:place]), {})[alike.column] = name
                 break

@@ -40,7 +40,7 @@ from mwdcal.files.formats.settings import (
 from mwdcal.files.formats.title_references import stated_above
 from mwdcal.files.formats.titles import ADJUSTED, OF_REFUSAL, Titles, dated, titles
 from mwdcal.files.synonyms import resembled, unit_of
-from mwdcal.files.words import spelled
+from mwdcal.files.words import LATIN_AXES, spelled
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import TableFormat
 
@@ -75,8 +75,6 @@ _OF_AXIS = re.compile(
     re.IGNORECASE,
 )
 """A name that ends in an axis, but for its unit."""
-_LATIN_AXES = str.maketrans("ху", "xy")
-"""Axes in Cyrillic letters, and those that they look like."""
 _SYMBOL = re.compile(r"[^\W\d_]")
 """A name that is the symbol of a quantity."""
 _DEGREES_OF = re.compile(
@@ -120,7 +118,7 @@ _OF_ROLL_TEST = re.compile(
 ROLL_TEST = "roll test"
 """The kind of such a table."""
 _OF_SETTING = re.compile(
-    r"([+−-]?\d+([.,]\d+)?|[\W_]|(?<![^\W\d_])(°?[cf]|deg\w*|grad\w*|°|k|t|temp\w*|oven|ofen|ovn|horno|soak|"
+    r"(?!(19|20)\d\d\W*$)([+−-]?\d+([.,]\d+)?|[\W_]|(?<![^\W\d_])(°?[cf]|deg\w*|grad\w*|°|k|t|temp\w*|oven|ofen|ovn|horno|soak|"
     r"inc\w*|incl\w*|inkl\w*|az\w*|dip|neigung|helning|hold|pos\w*|lage|plus|minus|cold|kalt|kald|fr[ií]o|froid|warm|"
     r"varm|hot|hei(ß|ss)|caliente|chaud|room|ambient\w*|raum\w*|rom\w*|ambiente|холод\w*|тепл\w*|гор\w*|комн\w*)"
     r"(?![^\W\d_])|[低常高]?温|℃|度)+",
@@ -165,6 +163,7 @@ class Sheet(NamedTuple):
     number: int = 0
     first_column: int = 0
     merged: Merged = ()
+    hidden: bool = False
 
 
 @dataclass(frozen=True)
@@ -238,6 +237,7 @@ def laid_out(
             ]
         covers += [] if layouts or any(_is_reading(row) for _, row in each.rows) else [each]
         tables += [t for t in layouts if header_line in (0, t.form.header_line)]
+    tables, unread = _of_shown_sheets(tables, {s.name for s in candidates if s.hidden})
     every = _with_same_stations(tables)
     tables = [t for t in every if {*wanted} <= {*t.names}]
     tables = [t for t in tables if not kind or _kind(f"{t.sheet} {t.heading}") == kind]
@@ -254,7 +254,18 @@ def laid_out(
         best = _beside_other_sheets(
             best, [s for s in sheets if s not in candidates], source, decimal
         )
-    return _with_covers(best, covers)
+    return _with_covers(replace(best, remarks=(*best.remarks, *unread)), covers)
+
+
+def _of_shown_sheets(
+    tables: list[Layout], hidden: Collection[str]
+) -> tuple[list[Layout], list[str]]:
+    """The tables of sheets that are not hidden, where there are such, and a remark on the others."""
+    shown_ones = [t for t in tables if t.sheet not in hidden]
+    unread = [shown(t.sheet) for t in tables if t.sheet in hidden]
+    if not shown_ones or not unread:
+        return tables, []
+    return shown_ones, [f"the tables on hidden sheets are not read: {', '.join(unread)}."]
 
 
 def _with_same_stations(tables: Sequence[Layout]) -> list[Layout]:
@@ -697,7 +708,7 @@ def _turned(sheet: Sheet) -> Sheet | None:
 def _has_axes(names: Iterable[object]) -> bool:
     """Whether names of all three axes are among some."""
     ends = (_OF_AXIS.fullmatch(as_text(name)) for name in names)
-    return {*"xyz"} <= {m["axis"].lower().translate(_LATIN_AXES) for m in ends if m}
+    return {*"xyz"} <= {m["axis"].lower().translate(LATIN_AXES) for m in ends if m}
 
 
 def _is_name(cell: object) -> bool:
@@ -849,8 +860,7 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
     above = [row for _, row in rows[:top]]
     below = rows[_another_part(rows, head, end) : end]
     end -= len(below)
-    readings = [place for place in range(head + 1, end) if _is_reading(rows[place][1])]
-    kept = _without_summary([rows[place] for place in readings])
+    kept = _without_summary([row for row in rows[head + 1 : end] if _is_reading(row[1])])
     lines = {line for line, _ in kept}
     others = [row for row in rows[head + 1 : end] if row[0] not in lines]
     _check_cut(kept, others, source)
@@ -1340,7 +1350,7 @@ def _with_title(title: str, name: str) -> str:
     if _is_unit(name):
         return f"{title} ({name.strip(' []()')})"
     match = _UNIT_BEHIND.fullmatch(title) if "(" not in name and "[" not in name else None
-    if not match:
+    if not match or re.search(r"\d{2}", match[2]):  # a serial
         return f"{title} {name}".strip()
     return f"{match[1]} {name}".strip() + f" {match[2]}".replace(" ,", ",")
 
