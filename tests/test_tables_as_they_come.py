@@ -496,8 +496,9 @@ def test_a_table_on_a_hidden_sheet_is_not_read(tmp_path):
     book["2023"].sheet_state = "hidden"
     book.save(path)
     proposal = library.propose_profile(path)
-    assert library.read_run(path, proposal.profile).lines == tuple(range(2, 26))
-    assert "hidden sheets are not read: '2023'" in proposal.summary()
+    assert library.read_run(path, proposal.profile).count == 24
+    assert "sheet '2024'" in proposal.summary()
+    assert "hidden sheets are not read: '2023'" in findings_of(proposal)["marked-rows"]
 
 
 def test_sheets_of_temperatures_beside_one_of_a_roll_test(tmp_path):
@@ -521,6 +522,15 @@ def test_toolfaces_to_the_right_and_left_of_the_high_side(tmp_path):
 def test_a_row_in_whose_place_another_one_stands_is_left_out(tmp_path, mark):
     path = write_csv(tmp_path / "a.csv", table(Remarks=["", mark, *[""] * 46]))
     assert read(path).count == 47
+
+
+@pytest.mark.parametrize("tools", [("Tool 4091", "Tool 4092"), ("Sonde A", "Sonde B")])
+def test_pages_of_two_tools_are_no_one_run(tmp_path, tools):
+    names, *rows = write_csv(tmp_path / "a.csv", table()).read_text().splitlines()
+    path = tmp_path / "b.csv"
+    path.write_text("\n".join([tools[0], names, *rows[:24], "", tools[1], names, *rows[24:]]))
+    with pytest.raises(FitError, match="2 tables of like columns"):
+        library.propose_profile(path)
 
 
 @pytest.mark.parametrize("below_names", [False, True])

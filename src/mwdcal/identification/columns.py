@@ -393,8 +393,12 @@ _FROM_HORIZONTAL = re.compile(
     re.IGNORECASE,
 )
 """Words of angles that count from the horizontal."""
+_ANGLE_ALONE = re.compile(
+    r"\W*(angle|winkel|vinkel|[áâ]ngulo|угол)( ([^\W\d_]{1,4}|with|par|rapport))*\W*", re.IGNORECASE
+)
+"""The word for an angle and none of which, before that of the horizontal."""
 _DOWNWARDS = re.compile(
-    r"below|\b(down(wards?)?|nach unten|nedover|hacia abajo|para baixo|vers le bas|вниз)\b|向下|俯角",
+    r"below|\b(down(wards?)?|nach unten|abwärts|ned(over)?|hacia abajo|para baixo|vers le bas|вниз)\b|向下|俯角",
     re.IGNORECASE,
 )
 """Words of angles from the horizontal that count downwards."""
@@ -469,6 +473,8 @@ def _elevation(name: str, plain: str, unit: str) -> Resemblance | None:
     if "elevation" in plain:
         return Resemblance(REFERENCES["inclination"].column, sense)
     level = _FROM_HORIZONTAL.search(name)
+    if level and _ANGLE_ALONE.fullmatch(name[: level.start()]):
+        return Resemblance(REFERENCES["inclination"].column, sense)
     bare = level and (resembled(plain) or meaning(_bare(name, level), unit))
     inclined = bare and bare.column == REFERENCES["inclination"].column
     return bare._replace(unit=sense) if bare and inclined else None

@@ -38,7 +38,7 @@ from mwdcal.files.formats.settings import (
     settings_in,
 )
 from mwdcal.files.formats.title_references import stated_above
-from mwdcal.files.formats.titles import ADJUSTED, OF_REFUSAL, Titles, dated, titles
+from mwdcal.files.formats.titles import ADJUSTED, OF_REFUSAL, Titles, dated, titles, tool_in
 from mwdcal.files.synonyms import resembled, unit_of
 from mwdcal.files.words import LATIN_AXES, spelled
 from mwdcal.geometry.vectors import Array
@@ -803,10 +803,11 @@ def _begins_anew(rows: Sequence[tuple[int, Cells]], heads: Sequence[int], place:
     ]
     if any(ADJUSTED.search(text) or _OF_ROLL_TEST.search(text) for text in between[1:]):
         return True
-    ours = titles([row for _, row in rows[: heads[0]]]).metadata.get("serial")
-    above = [row for _, row in rows[heads[-1] : place] if not _is_reading(row)]
-    theirs = titles(above).metadata.get("serial")
-    return theirs is not None and theirs != ours
+    ours, theirs = (
+        {tool for _, row in part if not _is_reading(row) and (tool := tool_in(row))}
+        for part in (rows[: heads[0]], rows[heads[-1] : place])
+    )
+    return bool(theirs - ours)
 
 
 def _repeats(row: Cells, rows: Sequence[tuple[int, Cells]], head: int) -> bool:
@@ -953,8 +954,8 @@ def _with_settings(layout: Layout, rows: Sequence[tuple[int, Cells]]) -> Layout:
 def _with_serials(layout: Layout, lines: Sequence[tuple[int, Cells]]) -> Layout:
     """A table with the serials that lines above and between its rows state, where these are of several tools."""
     readings = {*layout.lines}
-    stated = {n: titles([row]).metadata.get("serial") for n, row in lines if n not in readings}
-    every = {n: str(serial) for n, serial in stated.items() if serial}
+    stated = {n: tool_in(row) for n, row in lines if n not in readings}
+    every = {n: serial for n, serial in stated.items() if serial}
     above = [max((n for n in every if n < line), default=-1) for line in layout.lines]
     if -1 in above or len({every[n] for n in above}) < 2:
         return layout
