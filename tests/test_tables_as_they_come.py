@@ -501,6 +501,25 @@ def test_a_table_on_a_hidden_sheet_is_not_read(tmp_path):
     assert "hidden sheets are not read: '2023'" in findings_of(proposal)["marked-rows"]
 
 
+def test_sheets_of_few_rows_each_are_one_run(tmp_path):
+    run = servo_run(inclinations=(20, 60, 100, 140), toolfaces=6)
+    names = [f"Inc {inc}" for inc in (20, 60, 100, 140)]
+    columns = {NAMES[name]: values for name, values in run.items()}
+    del columns["Inc (deg)"]
+    path = workbook_of(tmp_path / "a.xlsx", columns, names)
+    inclination = np.degrees(read(path).reference("inclination"))
+    np.testing.assert_allclose(inclination, run["ref_inclination_deg"])
+
+
+def test_a_unit_of_temperatures_in_a_line(tmp_path):
+    run = table()
+    warm = np.asarray(run.pop("Temp (C)"), float)
+    path = written(
+        tmp_path / "a.csv", run | {"Temp": warm * 1.8 + 32}, "All temperatures in degrees F"
+    )
+    np.testing.assert_allclose(read(path).temperature, warm)
+
+
 def test_sheets_of_temperatures_beside_one_of_a_roll_test(tmp_path):
     run = table(station=[*range(1, 49)])
     run["Temp (C)"] = np.repeat([20.0, 60.0, 40.0], 16)

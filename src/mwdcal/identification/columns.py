@@ -407,6 +407,14 @@ _SPOKEN = {
     "gon": re.compile(r"(?<!\d)(?<!\d )\bgon\b", re.IGNORECASE),
 }
 """Units of angles in a line above a table, not those of a number."""
+_SPOKEN_WARMTH = {
+    f"°{letter}": re.compile(
+        rf"(?<![\d.,])(?<![\d.,] )(°\s*{letter}|\bdeg(rees)? ?{letter}|\b(in|en|em|i|в) {letter}|{word})(?![^\W\d_])",
+        re.IGNORECASE,
+    )
+    for letter, word in (("C", "celsius"), ("F", "fahrenheit"))
+}
+"""Units of temperatures in a line above a table, not those of a number."""
 _SURROUNDINGS = re.compile(
     r"oven|chamber|ambient|kamer\b|(?<![a-z])(air|room|bath|lab)(?![a-z])|ofen|kammer|umgebung|raum|ovn|rom|horno|ambiente|"
     r"камер|печ|термостат|环境|烘箱|室温",
@@ -805,7 +813,7 @@ def proposed(
     questions = Questions(besides)
     damaged = {} if problems is None else problems  # filled while values are read
     spoken = _spoken(meanings, values, above)
-    chosen = _chosen(meanings, values, damaged, spoken, ignored, said, questions, source)
+    chosen = _chosen(meanings, values, damaged, spoken, above, ignored, said, questions, source)
     azimuth = chosen.get(REFERENCES["azimuth"].column)
     if azimuth and "azimuth_reference" not in known and not north_of(azimuth.name, above, known):
         questions.ask(_check_north, azimuth.name, above, source)
@@ -882,6 +890,7 @@ def _chosen(
     values: Values,
     problems: Mapping[str, QuestionError],
     spoken: str,
+    above: Sequence[str],
     ignored: Collection[str],
     said: Collection[str],
     questions: Questions,
@@ -889,6 +898,7 @@ def _chosen(
 ) -> dict[str, ColumnSource]:
     """The columns of a run file that the names of a table are, each with its unit; questions where they may be two."""
     chosen: dict[str, ColumnSource] = {}
+    warmth = _spoken_warmth(above)
     for column in dict.fromkeys(m.column for m in meanings.values()):
         alike = [name for name, m in meanings.items() if m.column == column]
         candidates = [n for n in alike if column in LABELS or values(n) is not None]
@@ -899,6 +909,7 @@ def _chosen(
         name = questions.ask(_one, column, candidates, values, source) if candidates else None
         if name:
             stated = meanings[name].unit or _angles(column, spoken)
+            stated = stated or (warmth if column == WARMTH else "")
             cells = values(name)
             unit = questions.ask(_unit, column, name, stated, cells, source)
             if unit and stated and column not in said:
@@ -1131,6 +1142,17 @@ def _spoken(meanings: Mapping[str, Resemblance], values: Values, above: Sequence
     if stated == "rad":
         return stated if all(radians) else ""
     return stated or ("rad" if any(radians) else "")
+
+
+def _spoken_warmth(above: Sequence[str]) -> str:
+    """The unit of temperatures that lines above a table state, not that of a number; empty where they state two.
+
+    >>> _spoken_warmth(["All temperatures in degrees F"]), _spoken_warmth(["Room temperature 72 °F"])
+    ('°F', '')
+    """
+    text = " ".join(line for line in above if "temperature" in spelled(line))
+    units = [unit for unit, words in _SPOKEN_WARMTH.items() if words.search(spelled(text))]
+    return units[0] if len(units) == 1 else ""
 
 
 def _angles(column: str, unit: str) -> str:

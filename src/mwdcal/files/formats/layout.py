@@ -244,7 +244,7 @@ def laid_out(
     if not tables:
         raise _no_table(source, header_line, wanted, every)
     best = max(tables, key=lambda layout: layout.size)
-    alike = [t for t in tables if t is best or (_alike(t, best) and len(t.lines) >= _BESIDES)]
+    alike = _alike_among(tables, best)
     if len(alike) > 1 and not header_line and not kind:
         run = _the_run(alike)
         if run is None:
@@ -537,6 +537,15 @@ def _with_covers(layout: Layout, covers: Sequence[Sheet]) -> Layout:
         layout,
         titles=Titles(metadata, "" if "date" in metadata else day, not_taken) if blocks else block,
     )
+
+
+def _alike_among(tables: Sequence[Layout], best: Layout) -> list[Layout]:
+    """The tables that may be meant as well as the largest, `best`: those of some size, or all that are one run."""
+    alike = [t for t in tables if t is best or _alike(t, best)]
+    runs = [t for t in alike if not _kind(f"{t.sheet} {t.heading}", t.above)]
+    if len(runs) > 1 and _is_one_run(runs):
+        return alike
+    return [t for t in alike if t is best or len(t.lines) >= _BESIDES]
 
 
 def _alike(one: Layout, other: Layout) -> bool:
