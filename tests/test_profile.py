@@ -391,7 +391,16 @@ WORDS_OF_THE_FIELD = {
     "Accelerometers Gx (V)": "ax", "Magnetometers Hy (nT)": "my", "Accéléromètre Z (g)": "az", "Z (mg)": "az",
     "X (nT)": "mx", "Mag. X (G)": "mx", "Température (°С)": "temperature_c", "Face outil (°)": "ref_toolface_deg",
     "Mergulho (°)": "ref_dip_deg", "Feltinklinasjon (grader)": "ref_dip_deg", "地磁倾角(°)": "ref_dip_deg",
-    "Т, град С": "temperature_c", "顶角(°)": "ref_inclination_deg", "参考总磁场/Gs": "ref_field_nt",
+    "Т, град С": "temperature_c", "参考总磁场/Gs": "ref_field_nt",
+
+
+    "Angle from vertical (deg)": "ref_inclination_deg", "Helningsvinkel (°)": "ref_inclination_deg",
+    "Ángulo de inclinación (°)": "ref_inclination_deg", "Отклонение от вертикали, °": "ref_inclination_deg",
+    "顶角(°)": "ref_inclination_deg", "Kurs (°)": "ref_azimuth_deg", "Direção (°)": "ref_azimuth_deg",
+    "TFO": "ref_toolface_deg", "Høyside (°)": "ref_toolface_deg", "Lado alto (°)": "ref_toolface_deg",
+    "Угол крена": "ref_toolface_deg", "横滚角": "ref_toolface_deg", "Inklination Erdfeld (°)": "ref_dip_deg",
+    "磁场总强度": "ref_field_nt", "Акс. Х": "ax", "Gу": "ay", "重力加速度Z": "az", "G axial (mg)": "az",
+    "M radial 1 (uT)": "mx", "Felt X (nT)": "mx", "X轴磁场(nT)": "mx", "Eje X magn.": "mx", "Campo magn. Y": "my",
     "Угол установки, °": "ref_toolface_deg", "CAMPO_TOTAL_mGauss": "ref_field_nt", "Az (gon)": "ref_azimuth_deg",
 }  # fmt: skip
 

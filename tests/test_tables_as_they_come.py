@@ -1,6 +1,7 @@
 """What a laboratory's table says beside its readings: references, marks, adjustments, mistyped cells and names."""
 
 import csv
+import datetime
 import json
 import re
 
@@ -455,14 +456,152 @@ def test_blank_angles_of_the_stand_are_named(tmp_path):
     assert "line 9 ('Inc (deg)')" in findings_of(library.propose_profile(path))["marked-rows"]
 
 
-def test_rows_of_another_tool_below_the_table_are_left_out_and_named(tmp_path):
-    lines = write_csv(tmp_path / "a.csv", table()).read_text().splitlines()
-    other = [line.replace(line.split(",")[1], "20.0", 1) for line in lines[1:9]]
-    path = tmp_path / "b.csv"
-    path.write_text("\n".join(["Tool S/N DM-17", *lines, "Tool S/N ZZ-2", *other]))
+def of_seconds(angle, form):
+    """An angle in degrees, minutes and seconds."""
+    minutes, seconds = divmod(round(angle * 3600), 60)
+    return form.format(minutes // 60, minutes % 60, seconds)
+
+
+@pytest.mark.parametrize(
+    ("form", "said"),
+    [
+        ("{}-{:02}-{:02}", ""),
+        ("{}:{:02}:{:02}", ""),
+        ("{} {:02} {:02}", ""),
+        ("{}d{:02}m{:02}s", ""),
+        ("{}.{:02}{:02}", "Angles are D.MMSS"),
+    ],
+)
+def test_degrees_minutes_and_seconds_with_other_signs(tmp_path, form, said):
+    columns = table()
+    names = ["Inc (deg)", "Azi (deg)", "TF (deg)"]
+    exact = {name: np.round(np.asarray(columns[name]) * 3600) / 3600 for name in names}
+    typed = {name: [of_seconds(angle, form) for angle in exact[name]] for name in names}
+    path = written(tmp_path / "a.csv", columns | typed, said)
+    run = read(path)
+    for angle, name in zip(("inclination", "azimuth", "toolface"), names, strict=True):
+        np.testing.assert_allclose(np.degrees(run.reference(angle)), exact[name], atol=1e-9)
+
+
+def test_degrees_and_minutes_that_a_workbook_keeps_as_times(tmp_path):
+    path = workbook_of(tmp_path / "a.xlsx", table(), ["run"])
+    book = openpyxl.load_workbook(path)
+    place = [*table()].index("Inc (deg)") + 1
+    for (cell,) in book["run"].iter_rows(min_row=2, min_col=place, max_col=place):
+        cell.value = datetime.timedelta(hours=cell.value)
+        cell.number_format = "[h]:mm:ss"
+    book.save(path)
+    inclination = np.degrees(read(path).reference("inclination"))
+    np.testing.assert_allclose(inclination, servo_run()["ref_inclination_deg"], atol=1e-9)
+
+
+def test_a_title_block_beside_the_table(tmp_path):
+    path = workbook_of(tmp_path / "a.xlsx", table(), ["run"])
+    book = openpyxl.load_workbook(path)
+    beside = [("Tool:", "DM"), ("Serial:", "DM-17"), ("Ref. dip:", "66.25 deg")]
+    first = book["run"].max_column + 2
+    for row, cells in enumerate(beside, 1):
+        for column, cell in enumerate(cells, first):
+            book["run"].cell(row, column, cell)
+    book.save(path)
     proposal = library.propose_profile(path)
-    assert library.read_run(path, proposal.profile).count == 48
-    assert "left out: line 51 (Tool S/N ZZ-2)" in proposal.summary()
+    run = library.read_run(path, proposal.profile)
+    assert (run.count, run.metadata["serial"]) == (48, "DM-17")
+
+
+def test_rows_that_are_struck_out_are_left_out(tmp_path):
+    path = workbook_of(tmp_path / "a.xlsx", table(), ["run"])
+    book = openpyxl.load_workbook(path)
+    for row in (2, 7):
+        for cell in book["run"][row]:
+            cell.font = openpyxl.styles.Font(strike=True)
+    book.save(path)
+    proposal = library.propose_profile(path)
+    assert library.read_run(path, proposal.profile).count == 46
+    assert "row 7 (struck out" in proposal.summary()
+
+
+def test_a_table_on_a_hidden_sheet_is_not_read(tmp_path):
+    run = table(station=[*range(1, 25)] * 2)
+    path = workbook_of(tmp_path / "a.xlsx", run, ["2023", "2024"])
+    with pytest.raises(FitError, match="2 tables of like columns"):
+        library.propose_profile(path)
+    book = openpyxl.load_workbook(path)
+    book["2023"].sheet_state = "hidden"
+    book.save(path)
+    proposal = library.propose_profile(path)
+    assert library.read_run(path, proposal.profile).count == 24
+    assert "sheet '2024'" in proposal.summary()
+    assert "hidden sheets are not read: '2023'" in findings_of(proposal)["marked-rows"]
+
+
+def test_sheets_of_few_rows_each_are_one_run(tmp_path):
+    run = servo_run(inclinations=(20, 60, 100, 140), toolfaces=6)
+    names = [f"Inc {inc}" for inc in (20, 60, 100, 140)]
+    columns = {NAMES[name]: values for name, values in run.items()}
+    del columns["Inc (deg)"]
+    path = workbook_of(tmp_path / "a.xlsx", columns, names)
+    inclination = np.degrees(read(path).reference("inclination"))
+    np.testing.assert_allclose(inclination, run["ref_inclination_deg"])
+
+
+def test_a_unit_of_temperatures_in_a_line(tmp_path):
+    run = table()
+    warm = np.asarray(run.pop("Temp (C)"), float)
+    path = written(
+        tmp_path / "a.csv", run | {"Temp": warm * 1.8 + 32}, "All temperatures in degrees F"
+    )
+    np.testing.assert_allclose(read(path).temperature, warm)
+
+
+def test_sheets_of_temperatures_beside_one_of_a_roll_test(tmp_path):
+    run = table(station=[*range(1, 49)])
+    run["Temp (C)"] = np.repeat([20.0, 60.0, 40.0], 16)
+    path = workbook_of(tmp_path / "a.xlsx", run, ["20 C", "60 C", "Rulletest"])
+    proposal = library.propose_profile(path)
+    assert library.read_run(path, proposal.profile).count == 32
+    assert "roll test on sheet 'Rulletest', 16 rows" in proposal.summary()
+
+
+def test_toolfaces_to_the_right_and_left_of_the_high_side(tmp_path):
+    columns = table()
+    exact = np.asarray(columns["TF (deg)"], float) % 360
+    columns["TF (deg)"] = [f"{t}R" if t <= 180 else f"{360 - t}L" for t in exact.tolist()]
+    path = write_csv(tmp_path / "a.csv", columns)
+    np.testing.assert_allclose(np.degrees(read(path).reference("toolface")) % 360, exact, atol=1e-9)
+
+
+@pytest.mark.parametrize("mark", ["superseded by line 12", "replaced by shot 7", "ersetzt durch 8"])
+def test_a_row_in_whose_place_another_one_stands_is_left_out(tmp_path, mark):
+    path = write_csv(tmp_path / "a.csv", table(Remarks=["", mark, *[""] * 46]))
+    assert read(path).count == 47
+
+
+@pytest.mark.parametrize("tools", [("Tool 4091", "Tool 4092"), ("Sonde A", "Sonde B")])
+def test_pages_of_two_tools_are_no_one_run(tmp_path, tools):
+    names, *rows = write_csv(tmp_path / "a.csv", table()).read_text().splitlines()
+    path = tmp_path / "b.csv"
+    path.write_text("\n".join([tools[0], names, *rows[:24], "", tools[1], names, *rows[24:]]))
+    with pytest.raises(FitError, match="2 tables of like columns"):
+        library.propose_profile(path)
+
+
+@pytest.mark.parametrize("below_names", [False, True])
+def test_rows_of_two_tools_below_lines_with_their_serials_are_asked_about(tmp_path, below_names):
+    names, *rows = write_csv(tmp_path / "a.csv", table()).read_text().splitlines()
+    other = [line.replace(line.split(",")[1], "20.0", 1) for line in rows[:24]]
+    first = [names, "Tool S/N DM-17"] if below_names else ["Tool S/N DM-17", names]
+    path = tmp_path / "b.csv"
+    path.write_text("\n".join([*first, *rows, "Tool S/N ZZ-2", *other]))
+    with pytest.raises(FitError, match="rows of 2 tools"):
+        library.propose_profile(path)
+    tool = tmp_path / "tool.toml"
+    for serial, count in (("DM-17", 48), ("ZZ-2", 24)):
+        assert mwdcal("profile", path, "-o", tool, "--replace", "--serial", serial).code == 0
+        ran = mwdcal(
+            "calibrate", path, "--tool", tool, "--serial", serial, "-o", tmp_path / "c.json"
+        )
+        assert f"{count} stations" in ran.out
 
 
 @pytest.mark.parametrize(

@@ -30,6 +30,11 @@ _REJECTED = re.compile(rf"\W*({OF_REFUSAL})\W*|\W*({OF_REFUSAL})\s*[-–—:;,.(
 """A cell that rejects its row, whatever reason follows."""
 _DOES_NOT_COUNT = re.compile(rf"(\D*[,;:–(/-]\s*)?({NOT_TO_USE})\W*")
 """A cell that says so, behind a reason without the number of another row: warm-up, not used."""
+_SUPERSEDED = re.compile(
+    r"\W*(superseded.*|(replaced|ersetzt|erstattet|reemplazad[oa]|sustituid[oa]|substituid[oa]|remplacee?|"
+    r"замен[еи]н[оаы]?) (by|with|durch|av|por|pel[oa]|par|на)\D{0,15}\d{1,3}\W*)"
+)
+"""A cell that names the row instead of its own: superseded by line 12."""
 _MAY_REJECT = re.compile(
     rf"(?<![^\W\d_])({OF_REFUSAL}|{NOT_TO_USE}|fail(ed)?|outlier|suspect|questionable|doubtful|ausreißer|ausreisser|fehler|avvik|"
     r"moved|bumped|disturbed|slipped|knocked|bewegt|verrutscht|gestossen|flyttet|movi(o|do)|mexeu|bouge|сдвин\w*|"
@@ -151,7 +156,11 @@ def _verdicts(name: str, cells: Sequence[str]) -> dict[str, bool]:
         return dict.fromkeys(filled & _DENIED, True)
     if judges and _OF_REJECTION.fullmatch(name) and filled <= _AFFIRMED | _DENIED:
         return dict.fromkeys(filled & _AFFIRMED, True)
-    verdicts = {c: True for c in filled if _REJECTED.fullmatch(c) or _does_not_count(c)}
+    verdicts = {
+        c: True
+        for c in filled
+        if _REJECTED.fullmatch(c) or _SUPERSEDED.fullmatch(c) or _does_not_count(c)
+    }
     verdicts |= {c: False for c in filled if c not in verdicts and _MAY_REJECT.search(c)}
     accepted = {c for c in filled if _ACCEPTED.fullmatch(_REMARK_BEHIND.sub("", c))}
     if 2 * sum(map(accepted.__contains__, cells)) < len(cells):

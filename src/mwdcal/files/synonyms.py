@@ -94,6 +94,7 @@ _STATED = {"ref", "reference", "local", "model", "igrf", "bggm", "wmm"}
 """Words of columns that are known, not measured."""
 _BYWORDS = _STATED | {
     *("true", "grid", "mag", "magnetic", "stand", "nominal", "target", "given", "set", "angle"),
+    *("winkel", "vinkel"),
     *("value", "tool", "mwd", "survey", "measured", "meas", "calc", "calculated", "computed"),
     *("corr", "corrected", "avg", "mean", "median", "sensor", "board", "internal", "electronics"),
     *(

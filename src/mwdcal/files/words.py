@@ -11,11 +11,25 @@ from mwdcal.files.synonyms import resembled
 
 _LATIN = str.maketrans({"ø": "o", "Ø": "O", "æ": "ae", "ß": "ss", "ł": "l", "ı": "i", "İ": "i"})
 """Letters that do not come apart into a plain letter and a mark."""
+_LOOKALIKE = re.compile(r"(?<![^\W\d_])([GABHMАВНМ]?[ХхУу]|[АВНМ][xyzXYZ])(?![^\W\d_])")
+"""An axis in Cyrillic letters, or a channel in letters of both alphabets."""
+LATIN_AXES = str.maketrans("АВНМХхУу", "ABHMXxYy")
+"""Cyrillic letters of axes and channels, and those that they look like."""
 _ELEVATION = (
     r"\b(elev(ation)?|hole dip|elevacion|elevacao|elevazione|hoydevinkel|"
     r"inc\w* (from|to|above|over) (the )?horiz\w*|pitch)\b"
 )
 """Names of angles that count from the horizontal."""
+_CROSSWISE = (
+    r"(tran(s|sv|sverse|sversal\w*)?|radiale?|lateral|cross|quer(achse)?|tverr|радиальн\w*|поперечн\w*|径向|横向)"
+    r"\.?[ _-]*"
+)
+"""Words of an axis across the tool, before its number."""
+_FROM_VERTICAL = (
+    r"(from|to|zur|von der|fra|av|de la|a la|da|par rapport a la|от) (the )?"
+    r"(vertical\w*|vertikal\w*|lotrechten|lotlini?e|loddlinjen?|вертикали)"
+)
+"""Words of an angle that counts from the vertical, as an inclination does."""
 TRANSLATIONS = (
     (r"(roll|rulle|dreh)[ _-]?(sett?|gruppe|satz)|\bsett\b|serie de giro|серия|组号", "group "),
     (r"\bdeg(rees|\.)? ?(m|mag)\b", "deg"),
@@ -28,15 +42,22 @@ TRANSLATIONS = (
     (r"(?<![^\W\d_])([CF])°", r"°\1"),
     (r"\bm(illi)?gauss\b", "mG"),
     (r"grav(?=axial|tran)", "acc "),
-    (r"axial", "Z "),
-    (r"tran(s|sverse|sversal)?[ _]*1", "X "),
-    (r"tran(s|sverse|sversal)?[ _]*2", "Y "),
+    (r"axiale?|aksial|longitudinal\w*|langsachse|осев\w*|轴向", "Z "),
+    (rf"{_CROSSWISE}1", "X "),
+    (rf"{_CROSSWISE}2", "Y "),
+    (rf"{_CROSSWISE}(?=[xyz]\b)|\baxe(?=[ _]*[xyz]\b)", ""),
+    (r"\b(angulo|angle|ang)\b\.?( d[ae]l?\b)?( d')? *(?=inclin|azim|acim|rot|rol|roul|giro)", ""),
+    (
+        r"(?<=[xyz][ -])(magnet(feld|felt)|magn\b\.?)|(?<=[xyz])轴?磁(场强度|场|通门|力计|力|强计)?",
+        " mag ",
+    ),
     (
         r"hoehenwinkel|hohenwinkel|elevasjon|stupning|neigung.*horizontal\w*|угол места|仰角|"
         r"(井斜|倾)?角?\W*(与|和|从|自)?水平面?的?(夹)?角|" + _ELEVATION,
         "elevation ",
     ),
     (
+        r"inklination( des)? (erd)?(magnet)?felde?s?|"
         r"복각|magneettinen kaltevuus|magn\w* kaltevuus|magneticka inklinace|manyetik egim|inklinacja( pola|"
         r" magn\w*)?|magn\w* inklinacio|inclinazione magn\w*|magn\w* inclinatie|"
         r"magn\w* (inklination|lutning)|inklinasi( magnet\w*)?|伏角|"
@@ -45,7 +66,9 @@ TRANSLATIONS = (
         "dip ",
     ),
     (
-        r"kallistus(kulma)?|kallistuma(kulma)?|경사각?|inclinare|naklon\b|nagib\b|sklon\b|klison\b|\bdevi\b|"
+        rf"(angul[oe]|angle|ang\.|winkel|vinkel|угол|dip|abweichung|avvik|desvio|ecart|отклонение) {_FROM_VERTICAL}|"
+        r"(angulo |angle )?(zenithal|cenital|zenital)|hole angle|zenitwinkel|bohrlochneigung|kippung|schwenkwinkel|"
+        r"hel+ningsvinkel|hellning|天?顶角|kallistus(kulma)?|kallistuma(kulma)?|경사각?|inclinare|naklon\b|nagib\b|sklon\b|klison\b|\bdevi\b|"
         r"kipp(achse|winkel)|schwenkachse|\btilt\b|inclinazione|inclinatie|helling|haeldning|hældning|lutning|"
         r"(kat )?odchyleni[ae]( od pionu)?|(kat )?nachyleni[ae]|ferdeseg|dolesszog|egim|kemiringan|傾斜角?|"
         r"зен\w*\.?( угол\w*)?|"
@@ -54,13 +77,20 @@ TRANSLATIONS = (
         r"inklinasjon|helning|инклинация|зенит\w*( угол)?|наклон(?!ен)|井斜角?|倾角|顶角|天顶角",
         "inclination ",
     ),
+    (_FROM_VERTICAL, ""),
     (
+        r"azimutwinkel|\bkurs\b|\bdire(ccion|cao|ction)\b|\brumo\b|\bcap\b|\bаз(им)?\b\.?|направление|"
+        r"курс|方向角?|"
         r"atsimuutti|suuntakulma|방위각?|\bhazi\b|drehtisch|turn ?table|rotary table|baring|azymut|yonelim|азимут|"
         r"asimut|azimute?(?!h)|acimut|方位角?|"
         r"rumbo|richtung(?!swinkel)|retning|peilung",
         "azimuth ",
     ),
     (
+        r"\bg?tf[oa]\b|tool ?face orientation|relative bearing|\brot\.? angle|toolface[- ]winkel|hochseite(nwinkel)?|"
+        r"hoyside(vinkel)?|cara herr(amienta|\b\.?)|rolido|alabeo|lado alto|face ferramenta|rolagem|rolamento|rotacao|"
+        r"roulis|rotation propre|orientation (de l')?outil|апсид\w*( угол)?|виз\b\.?( угол)?|(угол )?крена?\b|"
+        r"(重力)?高边(工具面)?角?|[滚自旋]转角?|横滚角?|面向角|"
         r"\brol(le?|lio|lo)?\b|kierto(kulma)?\b|natoceni|rotire|vridning|툴페이스|공구면각?|롤각?|\brb\b|^t/f\b|rollachse|"
         r"roll axis|(kat )?obrotu|"
         r"\brulle?\b|rullning|rotasi|(kat )?ustawienia narzedzia|takim yuzu|szerszamallas|"
@@ -75,6 +105,7 @@ TRANSLATIONS = (
         "toolface ",
     ),
     (
+        r"重力(加速度计?|分量|传感器)(?=[ (（_]*[xyz])|аксел\w*\.?|\bуск\b\.?|\bграв\b\.?(?=[ _]*[xyz]\b)|"
         r"kiiht\b\.?|kiihtyvyys|zrychl(eni)?\b\.?|가속도계?|acceleratie|acceleratia|akcelerometry?\b|accelero\b\.?|"
         r"przysp(ieszenie)?\b\.?|gyorsulas(mero)?|ivme\w*|versn(elling)?\b\.?|accelerazione|"
         r"accelerometro|percepatan|加速度|γ|"
@@ -83,6 +114,9 @@ TRANSLATIONS = (
         "acc ",
     ),
     (
+        r"(\bb-?)?\bfel[dt](?=[ _]*[xyz]\b)|magnetsensor|(campo|champ) mag\w*\.?(?=[ _]*[xyz]\b)|"
+        r"(\bмаг\w*\.? ?)?\bполе(?=[ _]*[xyz]\b)|\bмаг\b\.?(?=[ _]*[xyz]\b)|"
+        r"磁(场强度|传感器|分量|通|力)(?=[ (（_]*[bhm]?[xyz])|"
         r"자기장?(?=[ _]*[xyz])|kentta(?=[ _]*[xyz])|pole(?=[ _]*[xyz])|camp(?=[ _]*[xyz])|"
         r"pole magn\w*\.?(?=[ _]*[xyz])|magneses(?=[ _]*[xyz])|manyetik(?=[ _]*[xyz])|magneetveld(?=[ _]*[xyz])|"
         r"medan(?=[ _]*[xyz])|磁気(?=[ _]*[xyz])|magnetfalt(?=[ _]*[xyz])|campo(?=[ _]*[bhm]?[xyz]\b)|"
@@ -95,6 +129,7 @@ TRANSLATIONS = (
         "mag ",
     ),
     (
+        r"поле полное|地?磁场总强度|"
         r"kokonaiskentta|celkove pole|전자기장|전자력|camp total|natezenie pola|pole calkow\w*|calkowite pole|"
         r"(teljes )?terero|toplam alan|totaalveld|"
         r"campo totale|medan total|全磁力|"
@@ -162,7 +197,8 @@ def spelled(name: str) -> str:
     >>> spelled("Neigung Soll (°)"), spelled("gravTran1Raw")
     ('inclination ref (°)', 'acc X Raw')
     """
-    text = name.translate(_LATIN).replace("º", "°").replace("°", "\0").replace("²", "\1")
+    text = _LOOKALIKE.sub(lambda m: m[0].translate(LATIN_AXES), name)
+    text = text.translate(_LATIN).replace("º", "°").replace("°", "\0").replace("²", "\1")
     text = without_marks(text).replace("_", " ")
     text = text.replace("\0", "°").replace("\1", "²")
     text = re.sub(r"(?<![^\W_])([^\W\d_])\.(?=[^\W\d_](?![^\W_]))", r"\1", text)  # T.F.

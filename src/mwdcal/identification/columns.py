@@ -303,13 +303,15 @@ _NO_STAND = re.compile(
 )
 """Words of columns of angles that do not belong to the stand."""
 _NOMINAL = re.compile(
-    r"\b(nominale?|target|set|set ?point|soll\w*|cmd|command(ed)?|demand(ed)?|required|nom|consign[ea]|comandad[oa]|"
-    r"zadan\w*|b[öo]rv[äa]rde|задан\w*|номинал\w*)\b|设定|目标|指令値?|目標値?|設定値?",
+    r"\b(nominale?|target|set|set ?point|soll\w*|eingestellt\w*|vorgabe|satt|innstilt|ajustad[oa]|fijad[oa]|"
+    r"definid[oa]|programad[oa]|te[óo]ric[oa]|th[ée]orique|r[ée]gl[ée]e?|vis[ée]e?|установ(ка|лен\w*)|уставк\w*|cmd|command(ed)?|demand(ed)?|required|nom|consign[ea]|comandad[oa]|"
+    r"zadan\w*|b[öo]rv[äa]rde|задан\w*|номинал\w*)\b|[设给]定|设置|理论|名义|目标|指令値?|目標値?|設定値?",
     re.IGNORECASE,
 )
 _ACTUAL = re.compile(
-    r"\b(actual|act|achieved|read|reading|encoder|ist|istwert|effettiv[oa]|mesur[ée]e?s?|medid[oa]|zmierzon\w*|"
-    r"[äa]rv[äa]rde|действит\w*|фактич\w*|измер\w*|real|faktisk)\b|实际|实测|编码器|実測値?|実際",
+    r"\b(actual|act|achieved|as read|read ?back|read ?out|observed|abgelesen\w*|avlest|le[íi]d[oa]|lid[oa]|lue?|"
+    r"relev[ée]e?|r[ée]el(le)?|efetiv[oa]|efectiv[oa]|отсч[её]т\w*|read|reading|encoder|ist|istwert|effettiv[oa]|mesur[ée]e?s?|medid[oa]|zmierzon\w*|"
+    r"[äa]rv[äa]rde|действит\w*|фактич\w*|измер\w*|real|faktisk)\b|实际|实测|测得|读数|编码器|実測値?|実際",
     re.IGNORECASE,
 )
 """Words of angles to which a stand was to be set, and of those that it shows."""
@@ -391,8 +393,12 @@ _FROM_HORIZONTAL = re.compile(
     re.IGNORECASE,
 )
 """Words of angles that count from the horizontal."""
+_ANGLE_ALONE = re.compile(
+    r"\W*(angle|winkel|vinkel|[áâ]ngulo|угол)( ([^\W\d_]{1,4}|with|par|rapport))*\W*", re.IGNORECASE
+)
+"""The word for an angle and none of which, before that of the horizontal."""
 _DOWNWARDS = re.compile(
-    r"below|\b(down(wards?)?|nach unten|nedover|hacia abajo|para baixo|vers le bas|вниз)\b|向下|俯角",
+    r"below|\b(down(wards?)?|nach unten|abwärts|ned(over)?|hacia abajo|para baixo|vers le bas|вниз)\b|向下|俯角",
     re.IGNORECASE,
 )
 """Words of angles from the horizontal that count downwards."""
@@ -401,12 +407,14 @@ _SPOKEN = {
     "gon": re.compile(r"(?<!\d)(?<!\d )\bgon\b", re.IGNORECASE),
 }
 """Units of angles in a line above a table, not those of a number."""
-_WARMTH_ABOVE = re.compile(
-    r"(?:temp\w*|темп\w*|温度)[^\d;.]{0,30}?(?:(?P<f>fahrenheit|фаренгейт\w*|华氏|℉|(?:°|deg\w*\.?|gra[du]\w*)\s?F\b)|"
-    r"(?P<c>celsius|centigra\w*|цельси\w*|摄氏|℃|(?:°|deg\w*\.?|gra[du]\w*)\s?C\b))",
-    re.IGNORECASE,
-)
-"""Unit of temperatures in a line above a table, not that of a number."""
+_SPOKEN_WARMTH = {
+    f"°{letter}": re.compile(
+        rf"(?<![\d.,])(?<![\d.,] )(°\s*{letter}|\bdeg(rees)? ?{letter}|\b(in|en|em|i|в) {letter}|{word})(?![^\W\d_])",
+        re.IGNORECASE,
+    )
+    for letter, word in (("C", "celsius"), ("F", "fahrenheit"))
+}
+"""Units of temperatures in a line above a table, not those of a number."""
 _SURROUNDINGS = re.compile(
     r"oven|chamber|ambient|kamer\b|(?<![a-z])(air|room|bath|lab)(?![a-z])|ofen|kammer|umgebung|raum|ovn|rom|horno|ambiente|"
     r"камер|печ|термостат|环境|烘箱|室温",
@@ -473,6 +481,8 @@ def _elevation(name: str, plain: str, unit: str) -> Resemblance | None:
     if "elevation" in plain:
         return Resemblance(REFERENCES["inclination"].column, sense)
     level = _FROM_HORIZONTAL.search(name)
+    if level and _ANGLE_ALONE.fullmatch(name[: level.start()]):
+        return Resemblance(REFERENCES["inclination"].column, sense)
     bare = level and (resembled(plain) or meaning(_bare(name, level), unit))
     inclined = bare and bare.column == REFERENCES["inclination"].column
     return bare._replace(unit=sense) if bare and inclined else None
@@ -573,12 +583,6 @@ def meanings_of(
     dips = [n for n in inclined if re.search("inklination", n, re.IGNORECASE)]
     if len(dips) == 1 and any(re.search("neigung", n, re.IGNORECASE) for n in inclined):
         results[dips[0]] = results[dips[0]]._replace(column="ref_dip_deg")
-    warmth = {m.lastgroup for line in above if (m := _WARMTH_ABOVE.search(line))}
-    if len(warmth) == 1:
-        unit = "°F" if warmth == {"f"} else "°C"
-        results |= {
-            n: m._replace(unit=unit) for n, m in results.items() if m == Resemblance(WARMTH)
-        }
     if any(map(_says_anticlockwise, above)):
         results |= {
             n: m._replace(unit=ANTICLOCKWISE)
@@ -809,7 +813,7 @@ def proposed(
     questions = Questions(besides)
     damaged = {} if problems is None else problems  # filled while values are read
     spoken = _spoken(meanings, values, above)
-    chosen = _chosen(meanings, values, damaged, spoken, ignored, said, questions, source)
+    chosen = _chosen(meanings, values, damaged, spoken, above, ignored, said, questions, source)
     azimuth = chosen.get(REFERENCES["azimuth"].column)
     if azimuth and "azimuth_reference" not in known and not north_of(azimuth.name, above, known):
         questions.ask(_check_north, azimuth.name, above, source)
@@ -886,6 +890,7 @@ def _chosen(
     values: Values,
     problems: Mapping[str, QuestionError],
     spoken: str,
+    above: Sequence[str],
     ignored: Collection[str],
     said: Collection[str],
     questions: Questions,
@@ -893,6 +898,7 @@ def _chosen(
 ) -> dict[str, ColumnSource]:
     """The columns of a run file that the names of a table are, each with its unit; questions where they may be two."""
     chosen: dict[str, ColumnSource] = {}
+    warmth = _spoken_warmth(above)
     for column in dict.fromkeys(m.column for m in meanings.values()):
         alike = [name for name, m in meanings.items() if m.column == column]
         candidates = [n for n in alike if column in LABELS or values(n) is not None]
@@ -903,6 +909,7 @@ def _chosen(
         name = questions.ask(_one, column, candidates, values, source) if candidates else None
         if name:
             stated = meanings[name].unit or _angles(column, spoken)
+            stated = stated or (warmth if column == WARMTH else "")
             cells = values(name)
             unit = questions.ask(_unit, column, name, stated, cells, source)
             if unit and stated and column not in said:
@@ -1137,6 +1144,17 @@ def _spoken(meanings: Mapping[str, Resemblance], values: Values, above: Sequence
     return stated or ("rad" if any(radians) else "")
 
 
+def _spoken_warmth(above: Sequence[str]) -> str:
+    """The unit of temperatures that lines above a table state, not that of a number; empty where they state two.
+
+    >>> _spoken_warmth(["All temperatures in degrees F"]), _spoken_warmth(["Room temperature 72 °F"])
+    ('°F', '')
+    """
+    text = " ".join(line for line in above if re.search(r"\btemp", spelled(line), re.IGNORECASE))
+    units = [unit for unit, words in _SPOKEN_WARMTH.items() if words.search(spelled(text))]
+    return units[0] if len(units) == 1 else ""
+
+
 def _angles(column: str, unit: str) -> str:
     """The unit of angles for a column of angles of the stand; empty for others."""
     stand = column in [REFERENCES[name].column for name in ("inclination", "azimuth", "toolface")]
@@ -1184,7 +1202,8 @@ def _check_side_by_side(names: Sequence[str], values: Values, source: str) -> No
     for name in names:
         words = name.split()
         for place in range(len(words) - 1, 0, -1):
-            alike = meaning(" ".join(words[place:]))
+            rest = " ".join(words[place:])
+            alike = Resemblance(WARMTH) if _BARE_T.fullmatch(rest) else meaning(rest)
             if alike and alike.column in (*RAW, WARMTH):
                 tools.setdefault(" ".join(words[:place]), {})[alike.column] = name
                 break

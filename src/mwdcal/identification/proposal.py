@@ -153,6 +153,7 @@ def _is_unlike_others(values: Array) -> Bools:
     return np.asarray(outside | (np.round(values, digits) != values))
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def _is_off_norm(values: Mapping[str, Array], column: str) -> Bools:
     """Rows (n,) whose norm is not that of the others, by the triad of a channel; all of any other column."""
     triad = next((t for t in CHANNELS.values() if column in t and {*t} <= {*values}), None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from datetime import datetime, time, timedelta
 
 from mwdcal.errors import Answer, InputError, QuestionError
 from mwdcal.files.formats.columns import as_text, looks_numeric
@@ -18,8 +19,19 @@ _DEGREES = re.compile(
     r"([+\-−]?)(\d+)\s*[°º]\s*(\d+(?:[.,]\d+)?)\s*['′’]\s*(?:(\d+(?:[.,]\d+)?)\s*(?:[\"″”]|''))?"
 )
 """Degrees, minutes and seconds."""
+_PARTS_OF_DEGREES = re.compile(
+    r"([+\-−]?)(\d{1,3})(?:\s*[°ºdD:\-–]\s*|\s+)([0-5]?\d(?:[.,]\d+)?)(?:(?:\s*['′’mM:\-–]\s*|\s+)([0-5]?\d(?:[.,]\d+)?)\s*"
+    r"(?:[\"″”sS]|'')?|\s*['′’mM])?"
+)
+"""The same with other signs, or none: 30-15-36, 30:15:36, 30 15 36, 30d15m."""
+_PACKED = re.compile(r"(?<![^\W\d_])[dg]{1,3}[.,]mm(ss)?(?![^\W\d_])", re.IGNORECASE)
+"""What says that minutes and seconds are the decimals of degrees: D.MMSS."""
+_FIRST_DAY = datetime(1899, 12, 31)
+"""The day 0 of workbooks."""
 _BEARING = re.compile(r"([NS])\s*(\d+(?:[.,]\d+)?)\s*°?\s*([EWO])", re.IGNORECASE)
 """A bearing by quadrants, such as N45E."""
+_SIDE = re.compile(r"(\d+(?:[.,]\d+)?)\s*°?\s*([RL])", re.IGNORECASE)
+"""A toolface to the right or the left of the high side, such as 45R."""
 _POINTS = {
     point: f"{45 * k}" for k, point in enumerate(("N", "NE", "E", "SE", "S", "SW", "W", "NW"))
 }
@@ -116,6 +128,9 @@ def column(cells: Sequence[object], sign: str) -> tuple[list[str], str]:
         return [_degrees(text, sign) for text in texts], "°"
     if filled and all(map(_BEARING.fullmatch, filled)):
         return [_azimuth(text, sign) for text in texts], "°"
+    sides = [m for text in filled if (m := _SIDE.fullmatch(text))]
+    if len(sides) == len(filled) and {m[2].upper() for m in sides} == {"R", "L"}:
+        return [_toolface(text, sign) for text in texts], "°"
     if {*filled} <= {*_POINTS} and len({*filled}) > 2:
         return [_POINTS.get(text, text) for text in texts], "°"
     units = {match[2].strip() for match in map(_FIGURE.fullmatch, filled) if match}
@@ -125,6 +140,47 @@ def column(cells: Sequence[object], sign: str) -> tuple[list[str], str]:
         _pointed(text, sign, unit) if isinstance(cell, str) else text
         for cell, text in zip(cells, texts, strict=True)
     ], unit
+
+
+def sexagesimal(cells: Sequence[object], said: str) -> list[object]:
+    """The cells of a column of angles in degrees, where they are degrees, minutes and seconds; else as they are.
+
+    A workbook keeps 30:15:36 as a time. `said`: what the table says of these angles, which may be D.MMSS.
+
+    >>> sexagesimal(["30-15-36", ""], ""), sexagesimal([30.1536], "Inc (D.MMSS)"), sexagesimal([30.15], "Inc")
+    ([30.26, ''], [30.26], [30.15])
+    """
+    packed = _PACKED.search(said)
+    values = [
+        cell
+        if cell == ""
+        else _unpacked(as_text(cell), 4 if packed[1] else 2)
+        if packed
+        else _of_parts(cell)
+        for cell in cells
+    ]
+    return [*cells] if None in values or all(value == "" for value in values) else [*values]
+
+
+def _of_parts(cell: object) -> float | None:
+    """Degrees, minutes and seconds, or the time that a workbook keeps of them, in degrees; None of other cells."""
+    if isinstance(cell, datetime):
+        cell = cell - _FIRST_DAY
+    if isinstance(cell, time):
+        cell = timedelta(hours=cell.hour, minutes=cell.minute, seconds=cell.second)
+    if isinstance(cell, timedelta):
+        return cell.total_seconds() / 3600
+    match = _PARTS_OF_DEGREES.fullmatch(cell.strip()) if isinstance(cell, str) else None
+    return _in_degrees(match, ",") if match else None
+
+
+def _unpacked(text: str, digits: int) -> float | None:
+    """Degrees of D.MMSS, or of D.MM; None where minutes or seconds are 60 or more."""
+    whole, _, decimals = text.replace(",", ".").partition(".")
+    packed = decimals.ljust(digits, "0")
+    parts = f"{whole} {packed[:2]} {packed[2:digits] or 0}.{packed[digits:] or 0}"
+    match = _PARTS_OF_DEGREES.fullmatch(parts)
+    return _in_degrees(match, ".") if match else None
 
 
 _OF_AXES = re.compile(r"(.*?)[\s_(\[]*x\W*y\W*z[)\]]*(?![^\W\d_])(.*)", re.IGNORECASE)
@@ -210,12 +266,24 @@ def _azimuth(text: str, sign: str) -> str:
     return repr((east if pole.upper() == "N" else 180 - east) % 360)
 
 
+def _toolface(text: str, sign: str) -> str:
+    """A toolface to the right or the left as one that counts clockwise; blank stays blank."""
+    match = _SIDE.fullmatch(_SPACES.sub("", text))
+    if not match:
+        return text
+    angle = float(match[1].replace(sign, "."))
+    return repr((angle if match[2].upper() == "R" else -angle) % 360)
+
+
 def _degrees(text: str, sign: str) -> str:
     """Degrees, minutes and seconds in degrees; blank stays blank."""
     match = _DEGREES.fullmatch(text)
-    if not match:
-        return text
+    return repr(_in_degrees(match, sign)) if match else text
+
+
+def _in_degrees(match: re.Match[str], sign: str) -> float:
+    """Sign, degrees, minutes and seconds as a number."""
     minus, *parts = match.groups()
     degrees, minutes, seconds = (float((part or "0").replace(sign, ".")) for part in parts)
     value = degrees + minutes / 60 + seconds / 3600
-    return repr(-value if minus in ("-", "−") else value)
+    return -value if minus in ("-", "−") else value

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import pairwise, zip_longest
+from itertools import groupby, pairwise, zip_longest
 from operator import eq
 from typing import NamedTuple
 
@@ -38,9 +38,9 @@ from mwdcal.files.formats.settings import (
     settings_in,
 )
 from mwdcal.files.formats.title_references import stated_above
-from mwdcal.files.formats.titles import ADJUSTED, OF_REFUSAL, Titles, dated, titles
+from mwdcal.files.formats.titles import ADJUSTED, OF_REFUSAL, Titles, dated, titles, tool_in
 from mwdcal.files.synonyms import resembled, unit_of
-from mwdcal.files.words import spelled
+from mwdcal.files.words import LATIN_AXES, spelled
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import TableFormat
 
@@ -68,10 +68,10 @@ _OF_LOGGERS = re.compile(
 )
 """What loggers write below names and units: how a value was sampled, of what type it is, rules."""
 _UNIT_BEHIND = re.compile(r"(.*?)\s*([(\[][^)\]]*[)\]]|,\s*[^\s,]{1,5})")
-_AXIS = re.compile(r"\W*([xyz123])\W*([(\[].*)?", re.IGNORECASE)
+_AXIS = re.compile(r"\W*([xyz123ху])\W*([(\[].*)?", re.IGNORECASE)
 """A name that is an axis alone, and says nothing without the title above it."""
 _OF_AXIS = re.compile(
-    r"\W*(\w{0,6}|[^()\[\]]*[\W_](?=[xyz]))(?P<axis>[xyz123])\W*([(\[].*|(?<=,)\s*(?![xyz]\b)[^\s,]{1,5})?",
+    r"\W*(\w{0,6}|[^()\[\]]*[\W_](?=[xyzху]))(?P<axis>[xyz123ху])\W*([(\[].*|(?<=,)\s*(?![xyz]\b)[^\s,]{1,5})?",
     re.IGNORECASE,
 )
 """A name that ends in an axis, but for its unit."""
@@ -118,7 +118,7 @@ _OF_ROLL_TEST = re.compile(
 ROLL_TEST = "roll test"
 """The kind of such a table."""
 _OF_SETTING = re.compile(
-    r"([+−-]?\d+([.,]\d+)?|[\W_]|(?<![^\W\d_])(°?[cf]|deg\w*|grad\w*|°|k|t|temp\w*|oven|ofen|ovn|horno|soak|"
+    r"(?!(19|20)\d\d\W*$)([+−-]?\d+([.,]\d+)?|[\W_]|(?<![^\W\d_])(°?[cf]|deg\w*|grad\w*|°|k|t|temp\w*|oven|ofen|ovn|horno|soak|"
     r"inc\w*|incl\w*|inkl\w*|az\w*|dip|neigung|helning|hold|pos\w*|lage|plus|minus|cold|kalt|kald|fr[ií]o|froid|warm|"
     r"varm|hot|hei(ß|ss)|caliente|chaud|room|ambient\w*|raum\w*|rom\w*|ambiente|холод\w*|тепл\w*|гор\w*|комн\w*)"
     r"(?![^\W\d_])|[低常高]?温|℃|度)+",
@@ -163,6 +163,7 @@ class Sheet(NamedTuple):
     number: int = 0
     first_column: int = 0
     merged: Merged = ()
+    hidden: bool = False
 
 
 @dataclass(frozen=True)
@@ -236,13 +237,14 @@ def laid_out(
             ]
         covers += [] if layouts or any(_is_reading(row) for _, row in each.rows) else [each]
         tables += [t for t in layouts if header_line in (0, t.form.header_line)]
+    tables, unread = _of_shown_sheets(tables, {s.name for s in candidates if s.hidden})
     every = _with_same_stations(tables)
     tables = [t for t in every if {*wanted} <= {*t.names}]
     tables = [t for t in tables if not kind or _kind(f"{t.sheet} {t.heading}") == kind]
     if not tables:
         raise _no_table(source, header_line, wanted, every)
     best = max(tables, key=lambda layout: layout.size)
-    alike = [t for t in tables if t is best or (_alike(t, best) and len(t.lines) >= _BESIDES)]
+    alike = _alike_among(tables, best)
     if len(alike) > 1 and not header_line and not kind:
         run = _the_run(alike)
         if run is None:
@@ -252,7 +254,18 @@ def laid_out(
         best = _beside_other_sheets(
             best, [s for s in sheets if s not in candidates], source, decimal
         )
-    return _with_covers(best, covers)
+    return _with_covers(replace(best, remarks=(*best.remarks, *unread)), covers)
+
+
+def _of_shown_sheets(
+    tables: list[Layout], hidden: Collection[str]
+) -> tuple[list[Layout], list[str]]:
+    """The tables of sheets that are not hidden, where there are such, and a remark on the others."""
+    shown_ones = [t for t in tables if t.sheet not in hidden]
+    unread = [shown(t.sheet) for t in tables if t.sheet in hidden]
+    if not shown_ones or not unread:
+        return tables, []
+    return shown_ones, [f"the tables on hidden sheets are not read: {', '.join(unread)}."]
 
 
 def _with_same_stations(tables: Sequence[Layout]) -> list[Layout]:
@@ -373,6 +386,8 @@ def _the_run(tables: Sequence[Layout]) -> Layout | None:
         return _joined_sheets(tables)
     kinds = [_kind(f"{t.sheet} {t.heading}", t.above) for t in tables]
     runs = [t for t, kind in zip(tables, kinds, strict=True) if not kind]
+    if 1 < len(runs) < len(tables) and _is_one_run(runs):
+        runs = [_joined_sheets(runs)]
     if len(runs) != 1 or ADJUSTED.search(runs[0].heading):
         return None
     aside = tuple(
@@ -524,6 +539,15 @@ def _with_covers(layout: Layout, covers: Sequence[Sheet]) -> Layout:
     )
 
 
+def _alike_among(tables: Sequence[Layout], best: Layout) -> list[Layout]:
+    """The tables that may be meant as well as the largest, `best`: those of some size, or all that are one run."""
+    alike = [t for t in tables if t is best or _alike(t, best)]
+    runs = [t for t in alike if not _kind(f"{t.sheet} {t.heading}", t.above)]
+    if len(runs) > 1 and _is_one_run(runs):
+        return alike
+    return [t for t in alike if t is best or len(t.lines) >= _BESIDES]
+
+
 def _alike(one: Layout, other: Layout) -> bool:
     """Whether two tables share most of their columns, in whatever spelling, or are of one triad each."""
     ours, theirs = ({*_spelling(each.names)} for each in (one, other))
@@ -575,11 +599,13 @@ def _several(tables: Sequence[Layout], source: str, sheet: str) -> QuestionError
 def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
     """The tables of a sheet, one below the other: a head is no row of readings, and the next row is one."""
     rows = _without_dittos([row for row in sheet.rows if not _is_ruler(row[1])])
+    rows = _with_side_blocks_above(rows)
     remarks = [row for k, row in enumerate(rows) if _is_remark_below_names(rows, k)]
     names = next((k for k, (_, row) in enumerate(rows) if _is_of_texts(row)), len(rows))
     without = [row for row in rows[names:] if _is_without_reading(row[1])]
     aside = {line for line, _ in [*remarks, *without]}
-    rows = [row for row in rows if row[0] not in aside]
+    stated = [row for row in remarks if titles([row[1]]).metadata]
+    rows = [*stated, *(row for row in rows if row[0] not in aside)]
     rows = _with_legend(rows)
     sheet = sheet._replace(rows=rows)
     readings = [_is_reading(row) for _, row in rows]
@@ -598,7 +624,32 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
             between = [*below, *rows[head + 1 : end]]
             above = rows[max(0, head - 4) : head]
             layout = _with_settings(_with_warmth_of_lines(layout, between), [*above, *between])
+            layout = _with_serials(layout, [*above, *between])
             yield _with_triads_beside(_with_rows_of_headings(layout))
+
+
+def _with_side_blocks_above(rows: list[tuple[int, Cells]]) -> list[tuple[int, Cells]]:
+    """The rows with a title block that stands beside the table above it instead.
+
+    It is of two columns or more behind or before a blank one, each filled in beside less than half of the readings,
+    and says something of the tool, the day or the place.
+    """
+    readings = [k for k, (_, row) in enumerate(rows) if _is_reading(row)]
+    first = max(readings[0] - 1, 0) if readings else len(rows)
+    inside = [row for _, row in rows[first : readings[-1] + 1]] if readings else []
+    counts = [sum(c != "" for c in column) for column in zip_longest(*inside, fillvalue="")]
+    above: list[tuple[int, Cells]] = []
+    for filled, each in groupby(range(len(counts)), key=lambda k: counts[k] > 0):
+        block = [*each]
+        if not filled or len(block) < 2 or 2 * max(counts[k] for k in block) >= len(readings):
+            continue
+        stated = [(-1, [row[k] for k in block if k < len(row)]) for _, row in rows[first:]]
+        if stated_above([row for _, row in stated]).metadata:
+            above += [each for each in stated if any(each[1])]
+            rows = rows[:first] + [
+                (n, ["" if k in block else c for k, c in enumerate(row)]) for n, row in rows[first:]
+            ]
+    return above + [row for row in rows if any(cell != "" for cell in row[1])]
 
 
 _DITTO = re.compile(
@@ -677,7 +728,7 @@ def _axis(name: object) -> str:
     words = as_text(name).rsplit(maxsplit=1)
     bare = words[0] if len(words) > 1 and unit_of(words[1]) else " ".join(words)
     match = _OF_AXIS.fullmatch(as_text(name)) or _OF_AXIS.fullmatch(bare)
-    return match["axis"].lower() if match else ""
+    return match["axis"].lower().translate(LATIN_AXES) if match else ""
 
 
 def _is_name(cell: object) -> bool:
@@ -755,8 +806,7 @@ def _is_remark_below_names(rows: Sequence[tuple[int, Cells]], place: int) -> boo
     if not first < place < last or last - first > _MOST_HEADER_ROWS:
         return False
     above, below = rows[first][1], rows[last][1]
-    between = _texts(above) >= LEAST_COLUMNS and not _is_reading(above) and _is_reading(below)
-    return between and not titles([rows[place][1]]).metadata
+    return _texts(above) >= LEAST_COLUMNS and not _is_reading(above) and _is_reading(below)
 
 
 def _is_short(row: Cells) -> bool:
@@ -773,10 +823,11 @@ def _begins_anew(rows: Sequence[tuple[int, Cells]], heads: Sequence[int], place:
     ]
     if any(ADJUSTED.search(text) or _OF_ROLL_TEST.search(text) for text in between[1:]):
         return True
-    ours = titles([row for _, row in rows[: heads[0]]]).metadata.get("serial")
-    above = [row for _, row in rows[heads[-1] : place] if not _is_reading(row)]
-    theirs = titles(above).metadata.get("serial")
-    return theirs is not None and theirs != ours
+    ours, theirs = (
+        {tool for _, row in part if not _is_reading(row) and (tool := tool_in(row))}
+        for part in (rows[: heads[0]], rows[heads[-1] : place])
+    )
+    return bool(theirs - ours)
 
 
 def _repeats(row: Cells, rows: Sequence[tuple[int, Cells]], head: int) -> bool:
@@ -827,19 +878,19 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
     """The table whose last row of names, or of units, is at a place, down to the row before `end`."""
     rows = sheet.rows
     names, units, top = _head(rows, head, sheet.merged)
+    above = [row for _, row in rows[:top]]
     below = rows[_another_part(rows, head, end) : end]
     end -= len(below)
-    readings = [place for place in range(head + 1, end) if _is_reading(rows[place][1])]
-    kept = _without_summary([rows[place] for place in readings])
+    kept = _without_summary([row for row in rows[head + 1 : end] if _is_reading(row[1])])
     lines = {line for line, _ in kept}
     others = [row for row in rows[head + 1 : end] if row[0] not in lines]
     _check_cut(kept, others, source)
     if not kept or max(len(names), *(len(row) for _, row in kept)) < LEAST_COLUMNS:
         return None
     names, units, columns, letters = _apart(*_used(kept, names, units, sheet.first_column))
+    names, units, columns = _in_degrees(names, units, columns, " ".join(map(_text, above)))
     sign = decimal or figures.decimal_sign([c for column in columns for c in column], source)
     read = [*map(figures.column, columns, figures.signs_of(columns, sign))]
-    above = [row for _, row in rows[:top]]
     block = stated_above(above, _beside(columns, others))
     texts = [figures.as_they_stand(column) for column in columns]
     whole, joined = _with_minutes(names, [cells for cells, _ in read])
@@ -918,6 +969,19 @@ def _with_settings(layout: Layout, rows: Sequence[tuple[int, Cells]]) -> Layout:
     if not columns:
         columns, source = columns_of_codes(layout.names, layout.cells), "codes of the stations"
     return _with_columns(layout, columns, source)
+
+
+def _with_serials(layout: Layout, lines: Sequence[tuple[int, Cells]]) -> Layout:
+    """A table with the serials that lines above and between its rows state, where these are of several tools."""
+    readings = {*layout.lines}
+    stated = {n: tool_in(row) for n, row in lines if n not in readings}
+    every = {n: serial for n, serial in stated.items() if serial}
+    above = [max((n for n in every if n < line), default=-1) for line in layout.lines]
+    if -1 in above or len({every[n] for n in above}) < 2:
+        return layout
+    metadata = {k: v for k, v in layout.titles.metadata.items() if k != "serial"}
+    layout = replace(layout, titles=layout.titles._replace(metadata=metadata))
+    return _with_columns(layout, {"Serial": [every[n] for n in above]}, "lines above the rows")
 
 
 def _with_rows_of_headings(layout: Layout) -> Layout:
@@ -1050,14 +1114,12 @@ def _beside(
 
 
 def _another_part(rows: Sequence[tuple[int, Cells]], head: int, end: int) -> int:
-    """The place of a line below the names, above rows of another tool by its serial, or of a check; else the end."""
-    ours = titles([row for _, row in rows[:head]]).metadata.get("serial")
+    """The place of a line below the names, above rows of a check; else the end."""
     for place in range(head + 1, end - 1):
         row = rows[place][1]
-        if _is_reading(rows[place + 1][1]) and not _is_reading(row):
-            theirs = titles([row]).metadata.get("serial")
-            if theirs not in (None, ours) or _OF_ROLL_TEST.search(" ".join(map(as_text, row))):
-                return place
+        between = _is_reading(rows[place + 1][1]) and not _is_reading(row)
+        if between and _OF_ROLL_TEST.search(" ".join(map(as_text, row))):
+            return place
     return end
 
 
@@ -1102,6 +1164,21 @@ def _apart(
         [each[2] for each in whole],
         [each[3] for each in whole],
     )
+
+
+def _in_degrees(
+    names: Sequence[str], units: Sequence[str], columns: Sequence[list[object]], said: str
+) -> tuple[list[str], list[str], list[list[object]]]:
+    """The same with degrees, minutes and seconds of angles as degrees; lines `said` above may tell how they stand."""
+    whole = [*zip(names, units, columns, strict=True)]
+    for place, (name, unit, column) in enumerate(whole):
+        plain = _BRACKETS.sub("", name).strip()
+        meant = resembled(spelled(plain))
+        if meant and (meant.column.endswith("_deg") or plain.lower() == "az"):
+            cells = figures.sexagesimal(column, f"{name} {unit} {said}")
+            if cells != column:
+                whole[place] = (f"{plain} (°)", "", cells)
+    return tuple(map(list, zip(*whole, strict=True)))  # type: ignore[return-value]
 
 
 def _check_cut(
@@ -1294,7 +1371,8 @@ def _with_title(title: str, name: str) -> str:
     if _is_unit(name):
         return f"{title} ({name.strip(' []()')})"
     match = _UNIT_BEHIND.fullmatch(title) if "(" not in name and "[" not in name else None
-    if not match or _DEGREES_OF.fullmatch(name):
+    serial = match and re.search(r"\d{2}", match[2])
+    if not match or serial or _DEGREES_OF.fullmatch(name):
         return f"{title} {name}".strip()
     return f"{match[1]} {name}".strip() + f" {match[2]}".replace(" ,", ",")
 

@@ -45,8 +45,8 @@ def sheets_of(data: bytes, name: str) -> list[Sheet]:
 
         pages = workbook.read_sheets(data, name)
         return [
-            Sheet(title, _rows(page), number=n, merged=merged)
-            for n, (title, page, merged) in enumerate(pages)
+            Sheet(title, _rows(page), number=n, merged=merged, hidden=hidden)
+            for n, (title, page, merged, hidden) in enumerate(pages)
         ]
     if records.IS_XML in data[:_LOOKED_AT]:
         pages_of_xml = enumerate(records.sheets_of_xml(data, name))
@@ -204,6 +204,11 @@ def _by_calamine(data: bytes, source: str) -> Iterator[Sheet]:
         _check_ods(data, source)
     with damaged_unless_read(source, "a workbook", "Save it again as .xlsx, or as CSV UTF-8."):
         book = calamine.CalamineWorkbook.from_filelike(io.BytesIO(data))
+        hidden = {
+            each.name
+            for each in book.sheets_metadata
+            if each.visible != calamine.SheetVisibleEnum.Visible
+        }
         for name in book.sheet_names:
             page = book.get_sheet_by_name(name)
             at_most(
@@ -225,6 +230,7 @@ def _by_calamine(data: bytes, source: str) -> Iterator[Sheet]:
                 [(line, cells) for line, row in rows if (cells := _trimmed(_plain(row)))],
                 first_column=left,
                 merged=merged,
+                hidden=name in hidden,
             )
 
 

@@ -92,6 +92,11 @@ _TOOL = re.compile(
     r"serial no))\s*[.:：|=]*\s*",
     re.IGNORECASE,
 )
+_TOOL_ALONE = re.compile(
+    rf"\W*(?:{_OF_TOOLS}|unit|outil)\s*\W{{0,3}}\s*(?P<name>[A-Z]|(?=\S*\d)\w[\w./-]*)\W*",
+    re.IGNORECASE,
+)
+"""A line that is the word for the tool and a number, or a letter, and nothing else."""
 _SERIAL = re.compile(r"(?=\S*\d)[^\W_](?:[\w./-]*[^\W_])?")
 _OF_TWO = r"(?!\d{1,4}[./-]\d\d?[./-]\d{1,4}(?!\d))(?=\S*\d)[^\W_][\w./-]*"
 _WHOLE_SERIAL = rf"{_SERIAL.pattern}(?:\s+/\s+{_OF_TWO})?"
@@ -214,6 +219,16 @@ def titles(rows: Sequence[Sequence[object]]) -> Titles:
     if convergence is not None:
         metadata["convergence_deg"] = convergence
     return Titles(metadata, "" if "date" in metadata else unclear)
+
+
+def tool_in(row: Sequence[object]) -> str:
+    """The tool that a line between rows of readings states: its serial, or a number alone; empty where it is none.
+
+    >>> tool_in(["Tool 4092"]), tool_in(["S/N A-17"]), tool_in(["Tool warm"])
+    ('4092', 'A-17', '')
+    """
+    match = _TOOL_ALONE.fullmatch(" ".join(filter(None, map(as_text, row))))
+    return match["name"] if match else str(titles([row]).metadata.get("serial", ""))
 
 
 def _parts(cell: str) -> list[str]:

@@ -305,15 +305,41 @@ def read_rows(data: bytes, source: str) -> Iterator[Row]:
         yield from _rows(archive, page, source, _merged(archive, page))
 
 
-def read_sheets(data: bytes, source: str) -> Iterator[tuple[str, Iterator[Row], Merged]]:
-    """The names of all sheets, their rows as `read_rows` gives them, and their merged cells: each to be read in turn.
+def read_sheets(data: bytes, source: str) -> Iterator[tuple[str, Iterator[Row], Merged, bool]]:
+    """The names of all sheets, their rows as `read_rows` gives them, their merged cells, and whether each is hidden.
 
-    A formula without a value is its text, which is no number: it may stand in a column that no one needs.
+    Each is to be read in turn. A formula without a value is its text, which is no number: it may stand in a column
+    that no one needs. A row that is struck out is one text.
     """
     with _opened(data, source) as (archive, book):
         for page in book.worksheets:
             merged = _merged(archive, page)
-            yield page.title, _rows(archive, page, source, merged, as_text=True), merged
+            rows = _rows(archive, page, source, merged, as_text=True)
+            struck = _struck_out(archive, page._worksheet_path, book._fonts, book._cell_styles)
+            each = ((n, _as_one_text(row) if n in struck else row) for n, row in rows)
+            yield page.title, each, merged, page.sheet_state != "visible"
+
+
+def _as_one_text(row: Sequence[object]) -> Sequence[object]:
+    return [f"struck out: {' '.join(map(as_text, row))}"]
+
+
+def _struck_out(
+    archive: zipfile.ZipFile, sheet: str, fonts: Sequence[Any], styles: Sequence[Any]
+) -> set[int]:
+    """The rows of a sheet of whose cells most are struck out."""
+    struck = {n for n, style in enumerate(styles) if fonts[style.fontId].strike}
+    if not struck:
+        return set()
+    rows = set[int]()
+    for _, row in iterparse(io.BytesIO(archive.read(sheet))):
+        if row.tag.endswith("}row"):
+            filled = [cell for cell in row if len(cell)]
+            out = sum(int(cell.get("s", 0)) in struck for cell in filled)
+            if filled and 2 * out > len(filled):
+                rows.add(int(row.get("r", 0)))
+            row.clear()
+    return rows
 
 
 def _merged(archive: zipfile.ZipFile, page: Any) -> Merged:
