@@ -518,10 +518,9 @@ def _with_covers(layout: Layout, covers: Sequence[Sheet]) -> Layout:
     day = block.unclear_day or next((b.unclear_day for b in blocks if b.unclear_day), "")
     metadata = {**stated, **block.metadata}
     not_taken = {c: line for b in [*blocks[::-1], block] for c, line in b.not_taken.items()}
-    return replace(
-        layout,
-        titles=Titles(metadata, "" if "date" in metadata else day, not_taken) if blocks else block,
-    )
+    choices = {c: each for b in [*blocks[::-1], block] for c, each in b.choices.items()}
+    whole = Titles(metadata, "" if "date" in metadata else day, not_taken, choices)
+    return replace(layout, titles=whole if blocks else block)
 
 
 def _alike(one: Layout, other: Layout) -> bool:
