@@ -397,6 +397,7 @@ def _cells_without_reading(
     return {} if every == {**leave_out} else every
 
 
+_OF_THE_PLACE = tuple(REFERENCES[name].column for name in STATED_REFERENCES)
 _WITHOUT_RESULT = "its formulas have no value, as no spreadsheet program has saved them"
 
 
@@ -434,7 +435,7 @@ def _proposal(
     columns |= _stacked_tools(table, columns, stated, answers)
     table = _of_one_tool(table, columns, stated)
     columns |= _station(table, columns, answers)
-    columns |= {c: ColumnSource(name=f"{stated[c]}") for c in MAPPED if c in stated}
+    columns |= {c: ColumnSource(name=f"{stated[c]}") for c in _OF_THE_PLACE if c in stated}
     sets = repeats(table, columns)
     if sets and not sets.numbered:
         table = means(table, columns, sets)

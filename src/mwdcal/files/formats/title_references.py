@@ -633,7 +633,7 @@ def _clauses(row: Sequence[object]) -> str:
     if len(cells) == 2 and re.fullmatch(r"[fbi]", cells[0]):
         cells.insert(1, "=")
     for cell in cells:
-        unit = re.fullmatch(rf"[(\[]?({_WRITTEN_UNIT}|[ns])[)\]]?", cell)
+        unit = re.fullmatch(rf"[(\[]?({_WRITTEN_UNIT}|[ns])[)\]]?[;,.]?", cell)
         text += f"; {cell}" if ends and not unit else f" {cell}"
         ends = not unit and bool(re.search(r"(?<![\w.,])[+\-−]?\d[^;]*$", cell))
     text = _GROUPED_DECIMALS.sub("", text)
