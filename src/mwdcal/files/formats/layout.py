@@ -838,7 +838,7 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
     above = [row for _, row in rows[:top]]
     block = stated_above(above, _beside(columns, others))
     texts = [figures.as_they_stand(column) for column in columns]
-    names, read = _read(_as_stated_above(names, above), columns, texts, sign)
+    names, read = _read(names, columns, texts, sign)
     whole, joined = _with_minutes(names, [cells for cells, _ in read])
     stated = {
         name: _both(unit, by_cells)
@@ -1178,29 +1178,6 @@ def _of_sexagesimal(cell: str) -> str:
         return cell
     sign = "-" if cell[0] in "-−" else ""
     return _sum(*(part.replace(",", ".") for part in (sign + match[1], match[3], match[4] or "0")))
-
-
-def _as_stated_above(names: Sequence[str], above: Iterable[Cells]) -> list[str]:
-    """Names with what lines above say that each channel is, of three or more: CH1 = Gx (2.5 V/g), CH2 = Gy.
-
-    >>> _as_stated_above(["Stn", "CH1 (V)", "CH2 (V)", "CH3"], [["# CH1=Gx CH2=Gy", "CH3: Temp (C)"]])
-    ['Stn', 'Gx (V)', 'Gy (V)', 'Temp (C)']
-    """
-    text = " ; ".join(" ".join(map(as_text, row)) for row in above)
-    stated = dict[str, str]()
-    for name in names:
-        bare = _BRACKETS.sub("", name).strip()
-        match = re.search(
-            rf"(?<!\w){re.escape(bare)}\s*[=:：→]\s*([^\W\d_][^\s,;=:()\[\]]*(?: ?[xyz](?![^\W_]))?)"
-            r"(\s*[(\[][^)\]/]*[)\]])?",
-            text,
-            re.IGNORECASE,
-        )
-        if match and re.search(r"\d", bare):
-            unit = "".join(_BRACKETS.findall(name)) or (match[2] or "").strip()
-            stated[name] = f"{match[1]} {unit}".strip()
-    whole = [stated.get(name, name) for name in names]
-    return whole if len(stated) >= LEAST_COLUMNS - 1 and len({*whole}) == len(whole) else [*names]
 
 
 def _with_minutes(
