@@ -1139,7 +1139,7 @@ def _is_fraction(cell: object) -> bool:
 
 
 _SEXAGESIMAL = re.compile(
-    r"[+\-−]?(\d{1,3})\s*(?P<mark>[-:/ ])\s*([0-5]?\d)(?:\s*(?P=mark)\s*([0-5]?\d(?:[.,]\d+)?))?"
+    r"[+\-−]?(\d{1,3})\s*(?P<mark>[-: ])\s*([0-5]?\d)(?:\s*(?P=mark)\s*([0-5]?\d(?:[.,]\d+)?))?"
 )
 """Degrees, minutes and seconds without their signs: 30-15-20, 30 15 20, 30:15."""
 
