@@ -404,6 +404,7 @@ def test_references_of_a_list_of_places():
     """Those of the place that the title block names, or of the one that still holds; else none."""
     here = {"ref_field_nt": 51904.0, "ref_dip_deg": 74.12}
     assert stated_above([["Site", "Trondheim"], *PLACES]).metadata == here
+    assert stated_above(PLACES, (), "Site Trondheim").metadata == here
     old = [PLACES[0], ["Stavanger (old stand)", 50948, 72.61], PLACES[2]]
     assert stated_above(old).metadata == here
     open_list = stated_above(PLACES)

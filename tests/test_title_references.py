@@ -71,6 +71,8 @@ STATED = [
     ([['Champ magnétique terrestre au banc (calculé IGRF-13) : 47210 nT, inclinaison 61,05°']], (None, 47210, 61.05)),
     ([['Computed by BGGM: total 49812 nT, dip 69.73°']], (None, 49812, 69.73)),
     ([['Grav:', 9.8145, 'Mag:', 49812, 'Dip:', 69.73]], (9.8145, 49812, 69.73)),
+    ([["F", "49812", "nT"], ["I", "69.73", "deg"], ["H", "17258.6", "nT"], ["Z", "46727.1", "nT"]],
+     (None, 49812, 69.73)),
 ]
 # fmt: on
 

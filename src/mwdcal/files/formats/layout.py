@@ -518,7 +518,8 @@ def _joined_sheets(tables: Sequence[Layout]) -> Layout:
 
 def _with_covers(layout: Layout, covers: Sequence[Sheet]) -> Layout:
     """A table with what sheets without readings say, where its own title block does not."""
-    blocks = [stated_above([row for _, row in sheet.rows]) for sheet in covers]
+    words = " ".join([*layout.above, *(_text(row) for each in covers for _, row in each.rows[:1])])
+    blocks = [stated_above([row for _, row in sheet.rows], (), words) for sheet in covers]
     stated = {key: value for block in blocks[::-1] for key, value in block.metadata.items()}
     block = layout.titles
     day = block.unclear_day or next((b.unclear_day for b in blocks if b.unclear_day), "")

@@ -169,6 +169,9 @@ _TOTAL = re.compile(
     r"(?<![^\W\d_])[hxyz]\s*[=:]?\s*[-−]?\d.*(?<![^\W\d_])f\s*[=:]?\s*\d{2}"
 )
 """The strength of a field beside its components by their letters, as models give them."""
+_TOTAL_ALONE = re.compile(r"f(?![^\W\d_])[^\d;]*\d")
+_COMPONENT_ALONE = re.compile(r"[hxyz](?![^\W\d_])[^\d;]*\d")
+"""The same in lines of their own."""
 _COMPONENT = re.compile(
     rf"(?<![^\W\d_])[hxyz]\s*[=:]?\s*(?:[-−]?{_WRITTEN_NUMBER})\s*(?:{_WRITTEN_UNIT})?,?"
 )
@@ -316,12 +319,17 @@ _OF_LIMITS = re.compile(
 """A line above limits, which are no references."""
 
 
-def stated_above(rows: Sequence[Sequence[object]], besides: Rows = ()) -> Titles:
-    """Metadata on tool, day and place from the rows above a table, and on the place from the lines `besides` it."""
+def stated_above(
+    rows: Sequence[Sequence[object]], besides: Rows = (), elsewhere: str = ""
+) -> Titles:
+    """Metadata on tool, day and place from the rows above a table, and on the place from the lines `besides` it.
+
+    Words `elsewhere` in the file may name the place, of a list of several.
+    """
     rows = [_unsplit(row) for row in rows]
     block = titles(rows)
     above, beside = ([r for r in each if not _is_of_settings(r)] for each in (rows, besides))
-    here = _of_this_place(_without_limits(above))
+    here = _of_this_place(_without_limits(above), elsewhere)
     values = _values_in(here, _without_limits(beside))
     references = _only(values)
     rough = {c: text for c, text in doubtful_in(rows, besides).items() if c not in references}
@@ -348,22 +356,23 @@ def _is_of_settings(row: Sequence[object]) -> bool:
     return inclined and references_in([row]).keys() <= {"ref_dip_deg"}
 
 
-def _of_this_place(rows: Rows) -> list[Sequence[object]]:
+def _of_this_place(rows: Rows, elsewhere: str = "") -> list[Sequence[object]]:
     """The rows without those of other places: of a list of places below names, and lines on what no longer holds.
 
     Of a list the row counts whose place is named in another row of the title block too, or the only one that is not
     said to hold no longer. Where none does, or several do, the list stays, and its values differ.
     """
-    kept = [
+    valid = [
         row
         for row in rows
         if not _NO_LONGER.search(_plain(_line(row)))
         and not _OF_UNCERTAINTY.match(_plain(_line(row)))
     ]
-    lists = [k for k, row in enumerate(kept) if k and _is_of_place(row)]
-    for first in (k for k in lists if not _is_of_place(kept[k - 1])):
-        block = [kept[k] for k in range(first, len(kept)) if {*range(first, k + 1)} <= {*lists}]
-        others = " ".join(_line(row) for row in kept if row not in block)
+    kept = [*valid]
+    lists = [k for k, row in enumerate(valid) if k and _is_of_place(row)]
+    for first in (k for k in lists if not _is_of_place(valid[k - 1])):
+        block = [valid[k] for k in range(first, len(valid)) if {*range(first, k + 1)} <= {*lists}]
+        others = " ".join([elsewhere, *(_line(row) for row in valid if row not in block)])
         named = [row for row in block if re.search(rf"(?<!\w){_first_word(row)}(?!\w)", others)]
         if len(block) > 1 and len(named) == 1:
             kept = [row for row in kept if row not in block or row in named]
@@ -447,6 +456,8 @@ def _only(values: Mapping[str, Collection[float]]) -> dict[str, float]:
 def _values_in(rows: Rows, besides: Rows = ()) -> dict[str, dict[float, None]]:
     """The different values of each reference that rows above a table and lines `besides` state."""
     texts = [_clauses(row) for row in [*_with_columns(rows), *besides]]
+    if any(map(_TOTAL_ALONE.match, texts)):
+        texts = [text for text in texts if not _COMPONENT_ALONE.match(text)]
     by_word, of_places, by_unit = (dict[str, dict[float, None]]() for _ in range(3))
     for text in texts:
         here = {column for s in _statements() for column, _ in _stated(text, *s)}
