@@ -586,7 +586,7 @@ def _says_anticlockwise(line: str) -> bool:
 _UNIT_BEHIND_NAME = re.compile(r"\s*[(\[][^)\]]*[)\]]\s*$")
 """The unit behind the name of a channel."""
 _SENSITIVITY = re.compile(r"[(\[][^)\]]*\d[^)\]]*[)\]]")
-"""What a legend says of a channel in brackets with a number: its sensitivity."""
+"""Brackets with a number in a legend: the sensitivity of a channel."""
 
 
 def _by_legend(names: Sequence[str], above: Sequence[str]) -> dict[str, Resemblance]:
