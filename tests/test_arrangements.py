@@ -311,6 +311,8 @@ def test_degrees_minutes_and_seconds_below_merged_names(tmp_path, words, parts):
         (["Inc (°)", "min", "sec"], None),
         (["Inc", "min", "sec"], None),
         (["Inc deg", "Inc arcmin", "Inc arcsec"], None),
+        (["deg Inc", "min Inc", "sec Inc"], None),
+        (["Inc_D", "Inc_M", "Inc_S"], None),
         (["Inc", "", ""], ["[deg]", "[min]", "[s]"]),
         (["Inclinaison", "", ""], ["degrés", "minutes", "secondes"]),
         (["Зенит", "", ""], ["гр.", "мин.", "сек."]),
@@ -330,6 +332,51 @@ def test_degrees_minutes_and_seconds_of_one_angle_alone(tmp_path, names, below):
         page.append([row[0] // 1, 15, 36, *row[1:]])
     book.save(tmp_path / "run.xlsx")
     assert same(taken(tmp_path / "run.xlsx"), rows)
+
+
+@pytest.mark.parametrize("form", ["{}-15-36", "{} 15 36", "{}:15:36"])
+def test_degrees_minutes_and_seconds_in_a_cell_without_their_signs(tmp_path, form):
+    rows = [[row[0] // 1 + 0.26, *row[1:]] for row in stations()]
+    table = lines_of([[form.format(int(row[0])), *row[1:]] for row in rows])
+    assert same(taken(written(tmp_path / "run.csv", table)), rows)
+
+
+def test_a_line_says_what_each_channel_is(tmp_path):
+    """Of a logger, whose names are those of its inputs."""
+    rows = stations()
+    inputs = [f"CH{k}" for k in range(1, 8)]
+    said = ["Gx", "Gy", "Gz", "Bx", "By", "Bz", "Temp (C)"]
+    line = ", ".join(f"{one} = {other}" for one, other in zip(inputs, said, strict=True))
+    names = [*NAMES[:3], *(f"{each} (V)" for each in inputs[:6]), "CH7"]
+    assert same(taken(written(tmp_path / "run.csv", [line, *lines_of(rows, names)])), rows)
+
+
+def test_lines_of_a_log_begin_with_their_time(tmp_path):
+    rows = stations()
+    stamp = "2024-05-21 08:00:02.000"
+    lines = [f"{stamp} [INFO] columns: inc azi tf gx(V) gy(V) gz(V) bx(V) by(V) bz(V) temp(C)"]
+    lines += [f"{stamp} [DATA] {' '.join(map(str, row))}" for row in rows]
+    path = tmp_path / "run.log"
+    path.write_text("\n".join(["tool SN AB-12, B = 50000 nT, dip 63 deg", *lines]), "utf-8")
+    assert same(taken(path), rows)
+
+
+@pytest.mark.parametrize("fact", ["仪器编号;CD-131", "# units: deg;g;nT;C"])
+def test_a_fact_right_above_names_of_axes_is_no_title_of_theirs(tmp_path, fact):
+    rows = stations()
+    names = [
+        *NAMES[:3],
+        "加速度计X",
+        "加速度计Y",
+        "加速度计Z",
+        "磁通门X",
+        "磁通门Y",
+        "磁通门Z",
+        "n",
+    ]
+    path = tmp_path / "run.csv"
+    path.write_text("\n".join(["Field 50000 nT", fact, *lines_of(rows, names)]), "utf-8")
+    assert {*names[3:9]} <= {s.name for s in mwdcal.propose_profile(path).profile.columns.values()}
 
 
 def test_a_time_behind_an_angle_is_no_part_of_it(tmp_path):
@@ -357,6 +404,7 @@ def test_references_of_a_list_of_places():
     """Those of the place that the title block names, or of the one that still holds; else none."""
     here = {"ref_field_nt": 51904.0, "ref_dip_deg": 74.12}
     assert stated_above([["Site", "Trondheim"], *PLACES]).metadata == here
+    assert stated_above(PLACES, (), "Site Trondheim").metadata == here
     old = [PLACES[0], ["Stavanger (old stand)", 50948, 72.61], PLACES[2]]
     assert stated_above(old).metadata == here
     open_list = stated_above(PLACES)

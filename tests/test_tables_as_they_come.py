@@ -173,6 +173,25 @@ def test_a_nominal_reference_is_named_where_the_run_has_no_other(tmp_path, line)
     assert "reference-not-taken" not in {f.id for f in library.propose_profile(whole).findings}
 
 
+TWO_PLACES = {
+    "Dip 65.0 Aberdeen, 58.1 Houston": ("ref_dip_deg", 65.0),
+    "Field in hut A;50 000 nT;Field in hut B;49 100 nT": ("ref_field_nt", 50_000.0),
+}
+
+
+@pytest.mark.parametrize("line", TWO_PLACES)
+def test_two_values_of_a_reference_are_asked_about_and_a_number_answers(tmp_path, line):
+    column, value = TWO_PLACES[line]
+    path = written(tmp_path / "a.csv", table(**{column: None}), line, delimiter=";")
+    ran = mwdcal("profile", path, "-o", tmp_path / "tool.toml")
+    assert ran.code == 3
+    assert f"--column {column}={value}" in ran.err
+    assert f"--column {column}= " in ran.err or ran.err.rstrip().endswith(f"--column {column}=.")
+    _, stored = calibrated(tmp_path, path, "--column", f"{column}={value}")
+    assert stored["earth"]["dip_deg" if "dip" in column else "field"] == pytest.approx(value)
+    calibrated(tmp_path, path, "--column", f"{column}=")
+
+
 # -------------------------------------------------------------------------- sheets of one run
 
 

@@ -50,7 +50,7 @@ from mwdcal.files.contract import (
 )
 from mwdcal.files.contract import BlankReadingError as BlankReadingError
 from mwdcal.files.formats import table as tables
-from mwdcal.files.formats.columns import LABELS, Column, plain_names, shown
+from mwdcal.files.formats.columns import LABELS, Column, looks_numeric, plain_names, shown
 from mwdcal.files.formats.table import Table, labels
 from mwdcal.files.formats.text import holds_numbers, is_formula
 from mwdcal.files.marks import UNMARKED, without_rejected
@@ -540,9 +540,23 @@ def renamed(table: Table, profile: Profile) -> Table:
             factor, offset = synonyms.FACTORS.get(unit, (1.0, 0.0))
             values = tables.numbers(table, name)
             columns[column] = values * factor + offset if (factor, offset) != (1.0, 0.0) else values
+    columns |= {
+        column: np.full(table.count, float(sources[column].name))
+        for column in stated_numbers({c: s.name for c, s in sources.items()}, table.columns)
+    }
     places = {theirs.get(name, name): place for name, place in table.places.items()}
     columns = _with_angles(columns)
     return _with_stated_references(replace(table, columns=columns, places=places))
+
+
+def stated_numbers(sources: Mapping[str, str], names: Collection[str]) -> dict[str, float]:
+    """The references of all stations that are given as a number, in the unit of a run file, instead of a column."""
+    columns = (REFERENCES[name].column for name in STATED_REFERENCES)
+    return {
+        c: float(sources[c])
+        for c in columns
+        if c in sources and sources[c] not in names and looks_numeric(sources[c])
+    }
 
 
 def _with_angles(columns: dict[str, Column]) -> dict[str, Column]:

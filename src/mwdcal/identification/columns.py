@@ -599,17 +599,25 @@ def _says_anticlockwise(line: str) -> bool:
     return bool(of_toolface and _CCW.search(text)) and not _UPHOLE.search(text)
 
 
+_UNIT_BEHIND_NAME = re.compile(r"\s*[(\[][^)\]]*[)\]]\s*$")
+"""The unit behind the name of a channel."""
+_SENSITIVITY = re.compile(r"[(\[][^)\]]*\d[^)\]]*[)\]]")
+"""Brackets with a number in a legend: the sensitivity of a channel."""
+
+
 def _by_legend(names: Sequence[str], above: Sequence[str]) -> dict[str, Resemblance]:
     """The meaning of columns by a legend of three or more in one line: CH1 = Gx; CH2 = Gy; CH3 = Gz, mg."""
-    every = "|".join(map(re.escape, sorted(names, key=len, reverse=True)))
+    bare = {_UNIT_BEHIND_NAME.sub("", name): name for name in names} | {n: n for n in names}
+    every = "|".join(map(re.escape, sorted(filter(None, bare), key=len, reverse=True)))
     results: dict[str, Resemblance] = {}
     for line in above:
-        _, *parts = re.split(rf"(?<!\w)({every})\s*=\s*", line)
+        _, *parts = re.split(rf"(?<!\w)({every})(?:\s*=|(?<=\d)\s*[:：])\s*", line)
         for name, text in zip(parts[::2], parts[1::2], strict=True):
-            words, _, unit = text.strip(' ,;"').rpartition(", ")
+            plain = _SENSITIVITY.sub("", text)
+            words, _, unit = plain.strip(' ,;"').rpartition(", ")
             alike = meaning(words, unit) if words and unit_of(unit) else meaning(words or unit)
             if alike:
-                results[name] = alike
+                results[bare[name]] = alike
     for channels in CHANNELS.values():
         triad = {name: m for name, m in results.items() if m.column in channels}
         stated = {m.unit for m in triad.values() if m.unit}

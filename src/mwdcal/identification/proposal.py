@@ -53,6 +53,7 @@ from mwdcal.files.runs import (
     check_run,
     filled_down,
     renamed,
+    stated_numbers,
     to_readings,
 )
 from mwdcal.files.statements import stated_table
@@ -363,7 +364,8 @@ def propose(
     """The profile with which a table of stations at known attitudes is a calibration run.
 
     `sheet`, `header_row` and `decimal` say where the table is and how its numbers are written, `answers` which
-    column holds what, `stated` what the table does not say of the tool, as metadata, `north` what its azimuths count
+    column holds what, or the number of a reference,
+    `stated` what the table does not say of the tool, as metadata, `north` what its azimuths count
     from, as metadata too; `leave_out` and `keep` which rows are rejected by the texts of a column, and which are not.
 
     Raises:
@@ -372,21 +374,24 @@ def propose(
     """
     where = tables.laid_out(path, sheet=sheet, header_row=header_row, decimal=decimal)
     table, form = _as_written(path, where, bool(sheet or header_row or decimal))
-    table = replace(table, metadata={**table.metadata, **(stated or {}), **(north or {})})
+    given = stated_numbers(answers or {}, table.columns)
+    names = {column: name for column, name in (answers or {}).items() if column not in given}
+    stated = {**(stated or {}), **given}
+    table = replace(table, metadata={**table.metadata, **stated, **(north or {})})
     check_columns_of_rows(table, {**(leave_out or {}), **(keep or {})})
     place = {"header_line": header_row} if header_row else {}
     said = {**place, **(north or {}), "leave_out": leave_out or {}, "keep": keep or {}}
     form = _with(form, {key: value for key, value in said.items() if value not in ({}, None)})
-    with_answers = partial(_proposal, path, where, table, form, stated or {})
+    with_answers = partial(_proposal, path, where, table, form, stated)
     try:
-        return with_answers(answers or {})
+        return with_answers(names)
     except (QuestionError, QuestionsError) as error:
         if blank := _cells_without_reading(error, leave_out or {}):
             return propose(
                 path, sheet=sheet, header_row=header_row, decimal=decimal, answers=answers, stated=stated,
                 north=north, leave_out=blank, keep=keep,
             )  # fmt: skip
-        if proposal := _answer_by_readings(error, with_answers, answers or {}, table):
+        if proposal := _answer_by_readings(error, with_answers, names, table):
             return proposal
         raise
 
@@ -407,6 +412,10 @@ def _cells_without_reading(
             for name, _, cell in pairs:
                 every.setdefault(name, []).append(cell)
     return {} if every == {**leave_out} else every
+
+
+_OF_THE_PLACE = tuple(REFERENCES[name].column for name in STATED_REFERENCES)
+_WITHOUT_RESULT = "its formulas have no value, as no spreadsheet program has saved them"
 
 
 def _proposal(
@@ -433,22 +442,23 @@ def _proposal(
     )
     if filled := _with_angles_filled(path, where, (table, whole), columns, form, stated, answers):
         return filled
+    _check_choices(where, {*columns, *table.metadata, *answers}, table.source)
     check_cells(table, columns)
     blank = _blank_references(table, columns)
     table, form = _with_north(table, form, columns, above)
-    ignored |= dict.fromkeys(
-        formulas, "its formulas have no value, as no spreadsheet program has saved them"
-    )
+    ignored |= dict.fromkeys(formulas, _WITHOUT_RESULT)
     denied = [c for c, name in answers.items() if not name and c in table.metadata]
     form = _with(form, {"ignore": (*ignored, *denied)} if ignored or denied else {})
     columns |= _stacked_tools(table, columns, stated, answers)
     table = _of_one_tool(table, columns, stated)
     columns |= _station(table, columns, answers)
+    columns |= {c: ColumnSource(name=f"{stated[c]}") for c in _OF_THE_PLACE if c in stated}
     sets = repeats(table, columns)
     if sets and not sets.numbered:
         table = means(table, columns, sets)
     profile = Profile(name=Path(path).stem, table=form or msgspec.UNSET, columns=columns)
-    profile, readings, wirings, open_axes = _wired_and_checked(table, profile, by_value, answers)
+    said = {*answers, *stated}
+    profile, readings, wirings, open_axes = _wired_and_checked(table, profile, by_value, said)
     name, triads = str(readings.metadata.get("serial", Path(path).stem)), _triads(readings, wirings)
     profile = msgspec.structs.replace(profile, name=name, **triads)
     remarks = [*readings.remarks, *blank]
@@ -459,6 +469,26 @@ def _proposal(
         _without_the_usual(profile), wirings, readings.count, readings.unused, tuple(remarks), by_value,
         readings.metadata, readings.run_sha256, where, open_axes, ignored,
     )  # fmt: skip
+
+
+def _check_choices(where: Layout | None, known: Collection[str], source: str) -> None:
+    """Ask about references of which lines beside the table state different values, where nothing else states them."""
+    choices = where.titles.choices if where else {}
+    magnetic = not {*RAW[3:]}.isdisjoint(known)
+    questions = [
+        QuestionError(
+            f"{source}: lines beside the table state {' and '.join(f'{v:.7g}' for v in values)} as '{column}'. Which "
+            "one is that of the stand?",
+            [
+                *(Answer(f"{v:.7g}", (("column", f"{column}={v!r}"),)) for v in values),
+                Answer("none of them: the calibration does without", (("column", f"{column}="),)),
+            ],
+        )
+        for column, values in choices.items()
+        if column not in known and (magnetic or column == REFERENCES["gravity"].column)
+    ]
+    if questions:
+        raise QuestionsError(source, questions)
 
 
 def _with_angles_filled(
@@ -485,7 +515,7 @@ def _with_angles_filled(
 
 
 def _wired_and_checked(
-    table: Table, profile: Profile, by_value: Collection[str], answers: Mapping[str, str]
+    table: Table, profile: Profile, by_value: Collection[str], answers: Collection[str]
 ) -> tuple[Profile, Readings, dict[str, Wiring], dict[str, OpenAxes]]:
     """The profile with the axes that readings tell, once nothing that they contradict is left to ask about."""
     assert not isinstance(profile.columns, msgspec.UnsetType)

@@ -356,7 +356,8 @@ def propose_profile(
 
     `sheet`, `header_row` (of the column names) and `decimal` ("." or ",") say what is open about the table, `column`
     which column holds what, by the name of the run file: {"ref_azimuth_deg": "Azi 2"}, with the unit in brackets
-    behind the name where the table does not state it; a blank name for a column that is absent. `serial` and `date`
+    behind the name where the table does not state it; a blank name for a column that is absent, a number for a
+    reference of all stations. `serial` and `date`
     of the run where the table states none. `north` ("magnetic", "true" or "grid") is what its azimuths count from,
     with the declination and the convergence (degrees east) that turn them magnetic. `leave_out` says by the texts of a
     column which rows are rejected, {"QC": ["X"]}, and `keep` which are not. These three also take texts as the

@@ -84,6 +84,12 @@ _DEGREES_OF = re.compile(
     re.IGNORECASE,
 )
 """The name of a column of degrees, of minutes or of seconds of an angle, or of a largest value beside the least."""
+_PART_OF_ANGLE = (
+    re.compile(r"(?P<part>deg|min|sec|[dms])[._ ]+(?P<of>[^\W\d_][^()\[\]]*)", re.IGNORECASE),
+    re.compile(r"(?P<of>[^\W\d_][^()\[\]]*?)[._ ]+\(?(?P<part>[dms])\)?", re.IGNORECASE),
+)
+"""The name of a part of an angle: deg Inc, Inc_D."""
+_PARTS_OF_ANGLE = {"d": "deg", "m": "min", "s": "sec"}
 WITHOUT_VALUE = re.compile(r"n/?a|n\.a\.?|nan|null|none|[\W_]*", re.IGNORECASE)
 """A cell that says that there is no value."""
 NO_READING = re.compile(
@@ -527,16 +533,16 @@ def _joined_sheets(tables: Sequence[Layout]) -> Layout:
 
 def _with_covers(layout: Layout, covers: Sequence[Sheet]) -> Layout:
     """A table with what sheets without readings say, where its own title block does not."""
-    blocks = [stated_above([row for _, row in sheet.rows]) for sheet in covers]
+    words = " ".join([*layout.above, *(_text(row) for each in covers for _, row in each.rows[:1])])
+    blocks = [stated_above([row for _, row in sheet.rows], (), words) for sheet in covers]
     stated = {key: value for block in blocks[::-1] for key, value in block.metadata.items()}
     block = layout.titles
     day = block.unclear_day or next((b.unclear_day for b in blocks if b.unclear_day), "")
     metadata = {**stated, **block.metadata}
     not_taken = {c: line for b in [*blocks[::-1], block] for c, line in b.not_taken.items()}
-    return replace(
-        layout,
-        titles=Titles(metadata, "" if "date" in metadata else day, not_taken) if blocks else block,
-    )
+    choices = {c: each for b in [*blocks[::-1], block] for c, each in b.choices.items()}
+    whole = Titles(metadata, "" if "date" in metadata else day, not_taken, choices)
+    return replace(layout, titles=whole if blocks else block)
 
 
 def _alike_among(tables: Sequence[Layout], best: Layout) -> list[Layout]:
@@ -755,6 +761,9 @@ def _with_legend(rows: list[tuple[int, Cells]]) -> list[tuple[int, Cells]]:
     for k in range(first - 1, -1, -1):
         text = " ".join(map(as_text, rows[k][1]))
         names = _legend(text) or _listed(text)
+        before = rows[first][1][: -len(names) or None]
+        if names and not any(map(figures.is_figure, before)):  # such as the time of a line of a log
+            names = [*(f"Text {k}" for k in range(1, 1 + len(before))), *names]
         if len(names) == len(rows[first][1]):
             return [*rows[:k], *rows[k + 1 : first], (rows[k][0], names), *rows[first:]]
     return rows
@@ -777,7 +786,7 @@ def _legend(text: str) -> list[str]:
 
 
 _LIST_OF_COLUMNS = re.compile(
-    r"\W*(columns?|cols?|fields?|header|spalten?|kolonner?|kolumner|columnas?|colunas?|campos|colonnes?|colonne|kolumny|"
+    r"(?:^[\W\d]*|\]\s*)(columns?|cols?|fields?|header|spalten?|kolonner?|kolumner|columnas?|colunas?|campos|colonnes?|colonne|kolumny|"
     r"столбцы|колонки|列|字段)\W*[:：=]\s*",
     re.IGNORECASE,
 )
@@ -790,7 +799,7 @@ def _listed(text: str) -> list[str]:
     >>> _listed("% columns: stn inc(deg) tf (deg)")
     ['stn', 'inc(deg)', 'tf (deg)']
     """
-    match = _LIST_OF_COLUMNS.match(text)
+    match = _LIST_OF_COLUMNS.search(text)
     bare = re.sub(r"\s+(?=[(\[])", "\0", text[match.end() :]) if match else ""
     return [name.replace("\0", " ") for name in re.split(r"[\s,;|]+", bare.strip()) if name]
 
@@ -890,9 +899,9 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
     names, units, columns, letters = _apart(*_used(kept, names, units, sheet.first_column))
     names, units, columns = _in_degrees(names, units, columns, " ".join(map(_text, above)))
     sign = decimal or figures.decimal_sign([c for column in columns for c in column], source)
-    read = [*map(figures.column, columns, figures.signs_of(columns, sign))]
     block = stated_above(above, _beside(columns, others))
     texts = [figures.as_they_stand(column) for column in columns]
+    names, read = _read(names, columns, texts, sign)
     whole, joined = _with_minutes(names, [cells for cells, _ in read])
     stated = {
         name: _both(unit, by_cells)
@@ -1218,6 +1227,48 @@ def _is_fraction(cell: object) -> bool:
     return isinstance(cell, float) and not cell.is_integer()
 
 
+_SEXAGESIMAL = re.compile(
+    r"[+\-−]?(\d{1,3})\s*(?P<mark>[-: ])\s*([0-5]?\d)(?:\s*(?P=mark)\s*([0-5]?\d(?:[.,]\d+)?))?"
+)
+"""Degrees, minutes and seconds without their signs: 30-15-20, 30 15 20, 30:15."""
+
+
+def _read(
+    names: Sequence[str], columns: Sequence[Cells], texts: Sequence[list[str]], sign: str
+) -> tuple[list[str], list[tuple[list[str], str]]]:
+    """Names, and cells with a decimal point and the unit in all of them.
+
+    An angle of the stand in degrees, minutes and seconds without their signs is one in degrees.
+
+    >>> _read(["Inc (d m s)", "Time"], [["30 15 36"], ["08:15"]], [["30 15 36"], ["08:15"]], ".")
+    (['Inc (°)', 'Time'], [(['30.26'], '°'), (['08:15'], '')])
+    """
+    whole = [*names]
+    read = [*map(figures.column, columns, figures.signs_of(columns, sign))]
+    for place, (name, cells) in enumerate(zip(names, texts, strict=True)):
+        bare = _BRACKETS.sub("", name).strip()
+        if (bare.lower() == "az" or angles_among([bare])) and _are_sexagesimal(cells):
+            whole[place] = f"{bare} (°)"
+            read[place] = [_of_sexagesimal(cell) for cell in cells], "°"
+    return whole, read
+
+
+def _are_sexagesimal(cells: Iterable[str]) -> bool:
+    """Whether all cells that are filled in are of two parts, or of three, with the same sign between them."""
+    parts = [_SEXAGESIMAL.fullmatch(cell) for cell in cells if cell]
+    counts = {part and (part["mark"], part[4] is None) for part in parts}
+    return len(counts) == 1 and None not in counts
+
+
+def _of_sexagesimal(cell: str) -> str:
+    """Degrees of such a cell; blank stays blank."""
+    match = _SEXAGESIMAL.fullmatch(cell)
+    if not match:
+        return cell
+    sign = "-" if cell[0] in "-−" else ""
+    return _sum(*(part.replace(",", ".") for part in (sign + match[1], match[3], match[4] or "0")))
+
+
 def _with_minutes(
     names: Sequence[str], cells: Sequence[list[str]]
 ) -> tuple[list[str], list[list[str]]]:
@@ -1229,7 +1280,7 @@ def _with_minutes(
     angles: dict[str, dict[str, int]] = {}
     angle, certain = "", set[str]()
     for place, (name, match) in enumerate(
-        zip(names, map(_DEGREES_OF.fullmatch, names), strict=True)
+        zip(names, map(_DEGREES_OF.fullmatch, _with_part_last(names)), strict=True)
     ):
         if match:
             angle = match["of"] or ("" if match["d"] else angle)
@@ -1256,6 +1307,24 @@ def _with_minutes(
                 whole[place] = ""
     kept = [place for place, name in enumerate(whole) if name]
     return [whole[k] for k in kept], [joined[k] for k in kept]
+
+
+def _with_part_last(names: Sequence[str]) -> list[str]:
+    """Names with the part of an angle behind it: deg Inc, Inc_D, where the same angle has another part.
+
+    >>> _with_part_last(["deg Inc", "min Inc", "Az_D", "Az_M", "M_x", "deg"])
+    ['Inc deg', 'Inc min', 'Az deg', 'Az min', 'M_x', 'deg']
+    """
+    forms = ([form.fullmatch(name) for form in _PART_OF_ANGLE] for name in names)
+    parts = {k: m for k, each in enumerate(forms) if (m := next(filter(None, each), None))}
+    counts = Counter(m["of"].lower() for m in parts.values())
+    whole = [*names]
+    for place, match in parts.items():
+        angle = match["of"]
+        known = angle.lower() in ("az", "a", "i") or angles_among([angle])
+        if known and counts[angle.lower()] in (2, 3):
+            whole[place] = f"{angle} {_PARTS_OF_ANGLE[match['part'][0].lower()]}"
+    return whole
 
 
 def _sum(degrees: str, *parts: str) -> str:
@@ -1308,6 +1377,8 @@ def _is_of_names(
     That is a column of readings without a name, a symbol, or the units; and a title that is merged over columns is
     one of their group.
     """
+    if _is_of_facts(row):
+        return False
     if _need_titles(names) or _stands_over_units(row, names):
         return True
     if titles([row]).metadata:
@@ -1317,6 +1388,19 @@ def _is_of_names(
     symbols = any(map(_SYMBOL.fullmatch, names))
     stated = [m[2] for c in row if (m := _UNIT_BEHIND.fullmatch(as_text(c))) and unit_of(m[2])]
     return len(spans) > 1 or len(stated) > 1 or (_texts(row) >= LEAST_COLUMNS and (lone or symbols))
+
+
+def _is_of_facts(row: Cells) -> bool:
+    """Whether a row says something of the tool in its first three cells alone, or of a key and a value in one cell.
+
+    >>> _is_of_facts(["Tool S/N", "A-17"]), _is_of_facts(["# units: deg", "g"]), _is_of_facts(["", "Accel", "Mag"])
+    (True, True, False)
+    """
+    first = as_text(next(filter(None, row), ""))
+    few = not any(cell != "" for cell in row[LEAST_COLUMNS - 1 :])
+    return bool(re.match(r"\W*[^\W\d_][^:：=]*[:：=]\s*[^\W\d_]", first)) or (
+        few and bool(titles([row]).metadata)
+    )
 
 
 def _need_titles(names: Sequence[str]) -> bool:

@@ -153,7 +153,18 @@ def _placed(
         by_place.setdefault(place, []).append(cell)
     placed = [" ".join(by_place.get(place, ())) for place in range(len(columns))]
     apart = len(by_place) == len(row) < len(columns)
-    return placed if apart or is_units(placed) else row
+    return placed if apart or is_units(placed) or _is_of_words(row, spans, places) else row
+
+
+def _is_of_words(
+    row: Sequence[str], spans: Sequence[tuple[int, int]], places: Sequence[list[int]]
+) -> bool:
+    """Whether a row is of names of most columns, of which some have several words, one blank apart."""
+    pairs = zip(pairwise(spans), pairwise(places), strict=True)
+    close = all(two[0] - one[1] == 1 for (one, two), (a, b) in pairs if a == b)
+    named = len({place for (place,) in places})
+    words = not any(re.search(r"\d", cell) for cell in row)
+    return words and close and named >= LEAST_COLUMNS and 2 * named > len(row)
 
 
 def _below(span: tuple[int, int], columns: Sequence[tuple[int, int]]) -> list[int]:

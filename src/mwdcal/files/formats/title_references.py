@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import cache
-from itertools import pairwise, product
+from itertools import pairwise, product, zip_longest
 from typing import NamedTuple
 
 from mwdcal.calibration.readings import EARTH_GRAVITY
@@ -42,13 +42,15 @@ class _Quantity(NamedTuple):
 _OF_PLACES = (
     _Quantity(
         "ref_field_nt",
-        r"(total|mag\w*|local|earth'?s?) field|field( strength| intensity| total)?|[bfht] ?total|[bfht](tot|ref)|bt|"
+        r"(local|site|ref\w*) [bf]|mag(?=\W*\d)|(total|mag\w*|local|earth'?s?) field|field( strength| intensity|"
+        r" total)?|[bfht] ?total|[bfht](tot|ref)|bt|"
         r"(total|erd|gesamt|stand)?feld|feldstarke|"
         r"felt|totalintensitat|erdmagnetfeld|magnetfeld|flussdichte|totalfelt\w*|feltstyrke|magnetfelt|"
         r"campo( (magn\w+|totale?|local))*|totaalveld|pole calkow\w*|(teljes )?terero|toplam alan|medan total|全磁力|"
         r"magnetfalt|kokonaiskentta|magneettikentta|celkove pole|(전|총)?자기장|전자력|camp( magn\w*)? total|"
         r"intensidade?( total)?|champ( magn\w*)?( total| local)?|"
-        r"(магн\w* )?поле|полн\w* (вектор|поле)|модуль( магн\w*)?( поля)?|индукци\w+|напряженност\w+( поля)?|"
+        r"(магн\w* )?поле|полн\w* (вектор|поле)|модуль( магн\w*)?( поля| мпз)?|индукци\w+( мпз)?|"
+        r"напряженност\w+( поля)?|"
         r"(环境|当地|地|总)?磁(总)?场(总)?(强度)?|总场(强度)?|\|b\||tmf|tmi|betrag|natezenie pola",
         "bfhtт",
         ("nT", "µT", "mT", "gauss", "mG", "A/m"),
@@ -58,11 +60,11 @@ _OF_PLACES = (
         "ref_dip_deg",
         r"(mag\w*|local|field) (dip|inclination)( angle)?|dip( angle)?|dipref|복각|magn\w* kaltevuus|inklinaatio|"
         r"magn\w* inklinace|manyetik egim|magn\w* inklinacio|伏角|"
-        r"inklinacja( pola)?|inclinazione magn\w*|magn\w* inclinatie|"
+        r"inklinacja( pola)?|inclinazione (magn\w*|del campo)|plongement|pendage|magn\w* inclinatie|"
         r"(feld|feld-|magn\w* ?)?inklination|"
         r"(felt|magn\w* ?)?inklinasjon|(felt|magn\w* ?)helning|mergulho( magn\w*)?|inclinaca?o (magn?\w*|do campo)|"
         r"inclinacion (magn\w*|del campo)|echado|buzamiento|inclinaison( magn\w*| du champ)?|"
-        r"(магн\w* )?наклонени[ея]|(地)?磁倾角",
+        r"(магн\w* |угол )?накл(онени[ея])?\.?( мпз)?|(地)?磁倾角",
         "i",
         ("°", "rad", "gon"),
         -90.0,
@@ -70,7 +72,8 @@ _OF_PLACES = (
     ),
     _Quantity(
         "ref_gravity_g",
-        r"(local )?gravity( field| acceleration)?|g ?total|gtot|gref|gt|중력(가속도)?|painovoima\w*|tihove zrychleni|"
+        r"(local )?gravity( field| acceleration)?|grav(?=\W*\d)|g ?total|gtot|gref|gt|중력(가속도)?|painovoima\w*|"
+        r"tihove zrychleni|"
         r"zwaartekracht|yercekimi|nehezsegi gyorsulas|"
         r"gravita|gravitasi|tyngdkraft|重力(加速度)?|ускорение силы тяжести|"
         r"przyspieszenie ziemskie|"
@@ -85,8 +88,8 @@ _OF_PLACES = (
 )
 _WRITTEN_UNIT = (
     r"k?γ|(?:(?<=\d)|(?<=\d )|(?<=[(\[]))k?gammas?\b(?! ?ray)|"
-    r"n\s?t\b|[uµμ]\s?t\b|m\s?t\b|milli ?gauss|m\s?g(al|auss)?\b|gauss|oe\b|a\s?/\s?m\b|gal\b|gons?\b|нтл|мктл|мтл|"
-    r"мгал|м/с²?|м/с2|"
+    r"n\s?t\b|[uµμ]\s?t\b|m\s?t\b|milli ?gauss|m\s?g(al|auss)?\b|gauss|gs\b|oe\b|a\s?/\s?m\b|gals?\b|gons?\b|"
+    r"nano ?teslas?\b|micro ?teslas?\b|нтл|мктл|мтл|м?гал|гс\b|э\b|м/с²?|м/с2|"
     r"m\s?/\s?s\s?(?:²|\^?2)?|[gг]\b(?!\s*[=:(\[]?\s*(?:[+-]?\d|m\s?/))|°|deg\w*|gra[ud]\w*|rad\b|град\w*|"
     r"fok|derece|stopni|度"
 )
@@ -106,7 +109,8 @@ _UNSURE = re.compile(
     rf"{_ROUGH.pattern}|"
     r"uncert|\bunc\b|unsicher|usikker|incert|погреш|不确定|toler|limit|grenz|range|bereich|диапазон|范围|量程|"
     r"\bmin\b|\bmax\b|\bstd|\bsd\b|sigma|σ|±|spec|resol|correct|korrek|offset|drift|gradient|noise|"
-    r"toolface|survey|tool face",
+    r"toolface|survey|tool face|"
+    r"(?<![^\W\d_])(mean|average|avg|mittelwert|moyenne|promedio|media|medio)(?![^\W\d_])|средн\w*|平均",
 )
 """Words by which a value is no reference."""
 _BEFORE = re.compile(r"[^\W\d_]*\W{0,2}[^\W\d_]*\W*$")
@@ -125,7 +129,7 @@ _CHINESE = r"[\u4e00-\u9fff]"
 _BEGINNING = rf"(?:(?<![^\W\d_])|(?<={_CHINESE})(?={_CHINESE}))"
 _WITH_NUMBER = (
     rf"(?P<number>{_WRITTEN_NUMBER}){_MINUTES}\s*(?P<unit>{_WRITTEN_UNIT})?"
-    r"(?P<behind>[^\d;]{0,12})(?P<next>\d?)"
+    r"(?P<behind>[^\d;]{0,16})(?P<next>\d?)"
 )
 
 
@@ -139,6 +143,55 @@ _WITH_SPREAD = re.compile(
 )
 """A value whose unit stands behind its uncertainty alone: 56870 +/- 45 nT."""
 
+_GROUPED_DECIMALS = re.compile(r"(?<=(?<![\d.,])\d[.,]\d{3}) (?=\d{1,3}(?![\d.,])\s*(?:[^\d\s]|$))")
+"""A blank that groups digits behind a decimal sign: 9.814 52 m/s²."""
+_INSTRUMENT = re.compile(
+    r"proton\w*|overhauser|gsm|scintrex|gravimet\w*|theodol\w*|variomet\w*|observator\w*|c(a)?esium|absolut\w*|"
+    r"igrf|wmm|bggm|hdgm|wgs|grs|model\w*|modell\w*|modele|map\b|formula|модел\w*|карт[аеы]|模型|计算值|"
+    r"dim\b|протон\w*|гравиметр\w*|оверхауз\w*|质子|重力仪|绝对"
+)
+"""Words of instruments and models by which the references of a place are known."""
+_OF_INSTRUMENT = re.compile(
+    r"calculated|computed|calc\.?|berechnet\w*|beregnet|calculad[oa]s?|calcule?e?s?|calcolat\w*|рассчит\w*|"
+    r"расчет\w*|计算值?|"
+    r"measured|\bmeas\b|mean|gemessen|mittel\w*|malt|medid\w*|mesur\w*|misurat\w*|moyen\w*|измер\w*|测得|平均|"
+    r"(?<![^\W\d_])[a-z]{2,6}-?\d{1,3}\w*(?![\w.,])"
+)
+"""Words that do not make such a value that of the tool: measured, calculated, and the type of an instrument."""
+_DAY_OR_MODEL = re.compile(
+    r"(?<![\w.,/-])(?:\d{1,2}([./-])\d{1,2}\1(?:\d{4}|\d\d)|\d{4}([-./])\d{1,2}\2\d{1,2}|"
+    r"\d{1,2}[-. ]{1,2}[^\W\d_]{3,9}\.?[-. ,]{1,2}\d{4})(?![\w/-])|"
+    r"(?<=igrf|bggm|hdgm)[- ]?(?:\d{1,2}(?![\d.,])|\d{4}(?:\.\d+)?)|(?<=wmm|ifr)[- ]?\d{1,4}(?![\d.,])"
+)
+"""A day, and the number of a model of the field."""
+_TOTAL = re.compile(
+    r"(?<![^\W\d_])f\s*[=:]?\s*\d{2}.*(?<![^\W\d_])[hxyz]\s*[=:]?\s*[-−]?\d|"
+    r"(?<![^\W\d_])[hxyz]\s*[=:]?\s*[-−]?\d.*(?<![^\W\d_])f\s*[=:]?\s*\d{2}"
+)
+"""The strength of a field beside its components by their letters, as models give them."""
+_TOTAL_ALONE = re.compile(r"f(?![^\W\d_])[^\d;]*\d")
+_COMPONENT_ALONE = re.compile(r"[hxyz](?![^\W\d_])[^\d;]*\d")
+"""The same in lines of their own."""
+_COMPONENT = re.compile(
+    rf"(?<![^\W\d_])[hxyz]\s*[=:]?\s*(?:[-−]?{_WRITTEN_NUMBER})\s*(?:{_WRITTEN_UNIT})?,?"
+)
+_UNCERTAIN = re.compile(
+    rf"(?P<value>(?:{_WRITTEN_NUMBER})\s*(?:{_WRITTEN_UNIT})?)[\s,;]*[(\[]?\s*"
+    r"(?:±|\+/-|\+-|(?<![^\W\d_])(?:expanded |std |standard |erw\w* )?(?:uncert\w*|unc|u|u95|incert\w*|"
+    r"mess?unsicher\w*|"
+    r"unsicher\w*|usikker\w*|погрешн\w*|неопред\w*)(?![^\W\d_])|不确定度|测量误差)"
+    rf"[^\w+\-−]*(?:\([^)]*\)|[+\-−±]*)\W*(?:{_WRITTEN_NUMBER})\s*(?:{_WRITTEN_UNIT}|"
+    rf"%)?\s*(?:\(?k\s*=\s*\d[.,]?\d*\)?)?"
+)
+"""A value and its uncertainty: 56870 nT ± 45 nT, 9.8112 m/s² (uncertainty 0.0001)."""
+
+_OF_UNCERTAINTY = re.compile(
+    r"\W*(?:expanded |std |standard |erw\w* )?(?:uncert\w*|unc|u(?:95)?|incert\w*|mess?unsicher\w*|unsicher\w*|"
+    r"usikker\w*|"
+    r"погрешн\w*|неопред\w*|不确定度|±)(?![^\W\d_])(?!\s*[=:]?\s*\d+ ?v)"
+)
+"""The beginning of a line of uncertainties."""
+
 _OF_A_UNIT = re.compile(
     r"(?:(?:^|[(\[,;:])\s*1|(?<![^\W\d_])(?:unit\w*|unidade?|einheit|enhet|enhed|eenheid|jednostka|единиц\w*)|单位)"
     rf"\s*(?:{_WRITTEN_UNIT}|[gг])\s*[=≙≈]\s*(?:{_WRITTEN_NUMBER})\s*(?:{_WRITTEN_UNIT})|"
@@ -148,17 +201,21 @@ _OF_A_UNIT = re.compile(
 )
 """Definition of a unit: 1 g = 9.80665 m/s²; the size of a volt or of a count: 1 V = 20 µT."""
 _IN_OTHER_UNIT = re.compile(
-    rf"(?P<value>(?P<number>{_WRITTEN_NUMBER})\s*(?P<unit>{_WRITTEN_UNIT}))[\s;]*"
-    rf"[(\[]\s*=\s*(?P<again>{_WRITTEN_NUMBER})\s*(?P<other>{_WRITTEN_UNIT})[^)\]]*[)\]]"
+    rf"(?P<value>(?P<number>{_WRITTEN_NUMBER})\s*(?P<unit>{_WRITTEN_UNIT}|g\b))[\s;]*"
+    rf"(?:[(\[]\s*(?:=|i\.?e\.?|or)?|"
+    rf"=)\s*(?P<again>{_WRITTEN_NUMBER})\s*(?P<other>{_WRITTEN_UNIT})(?:[^()\[\]\d;]*[)\]]|(?![^\W\d_]))"
 )
 """A value, and in brackets the same in another unit."""
 _ROUNDED = 5e-4
 """By how much these differ at most, as a share: half a digit in the third place."""
+_ANOTHER_UNIT = re.compile(r"\s*[^\W\d_]{1,3}(?![^\W\d_])(?!\W*\d)")
+"""Letters behind a number that are a unit of something else, or not known: 50 Hz."""
 _ANOTHER = re.compile(
-    rf"[\s;,/|)]*(?:(?:and|or|und|oder|bzw|og|eller|y|o|e|ou|et|и|или|resp)(?![^\W\d_])\s*)?"
+    rf"[\s;,/|)]*(?:[^\W\d_]{{3,}}[,;/]\s*(?={_WRITTEN_NUMBER}\W{{0,2}}\s[^\W\d_]{{3,}}))?(?:(?:and|or|und|oder|bzw|"
+    rf"og|eller|y|o|e|ou|et|и|или|resp)(?![^\W\d_])\s*)?"
     rf"(?P<number>{_WRITTEN_NUMBER})(?![./-]?\d)\s*(?:{_WRITTEN_UNIT}|(?!°|[^\W\d_]))"
 )
-"""A second value right behind one: 70.5 / 66.0."""
+"""A second value right behind one, or behind a name as the first is: 70.5 / 66.0, 70.5 Aberdeen, 58.1 Houston."""
 
 
 def _statement(head: str) -> re.Pattern[str]:
@@ -185,7 +242,8 @@ def _inclination() -> tuple[_Quantity, re.Pattern[str]]:
 
 
 _NUMBER_IN_UNIT = re.compile(
-    rf"(?<![\w.,±+-])(?P<number>[-−]?{_WRITTEN_NUMBER})\s*(?P<unit>{_WRITTEN_UNIT})(?!\s*\d+(?:[.,]\d+)?\s*(?:['′’]|min))",
+    rf"(?<![\w.,±+-])(?P<number>[-−]?{_WRITTEN_NUMBER})\s*(?P<unit>{_WRITTEN_UNIT})(?!\s*\d+(?:[.,]\d+)?\s*(?:['′’]|"
+    rf"min))",
 )
 _NUMBER_ANYWHERE = re.compile(
     rf"(?<![\w.,])(?P<number>[+\-−]?{_WRITTEN_NUMBER}){_MINUTES}\s*(?P<unit>(?:{_WRITTEN_UNIT})(?![^\W\d_]))?",
@@ -197,26 +255,38 @@ _NO_PLACE = re.compile(
     r"south|sud|coil\w*|spule\w*|scale|sens\w*|full|"
     r"measured|\bmeas\b|mean|average|\bavg|mittel|gemessen|malt|medid\w*|mesur\w*|media|medio|moyen\w*|средн\w*|"
     r"измер\w*|"
-    r"calc\w*|comput\w*|\bper\b|\bto\s*$|\bbis\s*$|change|variation|shift|bias|previous|last|old|"
-    r"(?<![^\W\d_])[hbfg][xyz](?![^\W\d_])|fluxgate|\bfs\b|\btype|satur\w*|overload|capacity|thermo\w*|"
+    r"vibr\w*|shock|\brms\b|"
+    r"calc\w*|comput\w*|\bper (volt|m?v|count|cnt|bit|lsb|digit|div|deg\w*)\b|\bto\s*$|\bbis\s*$|change|variation|"
+    r"shift|bias|previous|last|old|"
+    r"(?<![^\W\d_])(?!by\s+[^\W\d_])[hbfg][xyz](?![^\W\d_])|fluxgate|\bfs\b|\btype|satur\w*|overload|capacity|"
+    r"thermo\w*|"
     r"горизонт\w*|верти\w*|компон\w*|水平|垂直|分量|平均|测得|灵敏度|\d\s*m?v\b|[<>]",
 )
 """Words of a strength that is not that of the place."""
+_PER = re.compile(
+    r"\s*/\s*(?:k?[mu]?[vah]|lsb|count|cnt|bit|digit|div|k?m|°\s?c?|k|c|deg\w*|min|s|h|day)(?![^\W\d_])"
+)
+"""A unit behind a slash: of a sensitivity, a gradient or a drift."""
+_STANDARD = re.compile(
+    r"(?<![^\W\d_])(g[0n]|standard\w*|std|norm\w*|unit\w*|einheit\w*|enhet\w*|unidade?s?|unite\w*|estandar|padrao|"
+    r"стандарт\w*|норм\w*|единиц\w*)(?![^\W\d_])|标准|单位"
+)
+"""Words of the standard gravity, which is a unit."""
 _AT = re.compile(r"\bat\b|\bbei\b")
 """Words before a strength at which something was checked, unless it is one of several places."""
 _INCLINED = re.compile(
     r"dip|(?<![^\W\d_])[iеe]n[ck]l\w*|inklin\w*|inclin\w*|наклон\w*|нахил\w*|倾|伏角|傾|egim|duzalimi|sklon\w*|"
     r"nachyleni\w*|"
-    r"hajlas\w*|lutning|kallistuma|helling|mergulho|buzamiento|echado",
+    r"(?<![^\W\d_])fall(?:vinkel)?(?![^\W\d_])|hajlas\w*|lutning|kallistuma|helling|mergulho|buzamiento|echado",
 )
 """Words of an inclination, which is the field's in a line about a place."""
 _OF_STAND = re.compile(
     r"cradle|stand|rig|table|tool|bench|fixture|setting|setup|hole|well|plat|banco|banc\b|mesa|cuna|stativ|sonde|probe|"
-    r"стенд|стол|скваж|зенит|转台|台|井|azi\w*|decl\w*|error|acc?uracy|genau\w*|resid\w*",
+    r"стенд|стол|скваж|зенит|转台|台|井|(?<![^\W\d_])azi\w*|decl\w*|error|acc?uracy|genau\w*|resid\w*",
 )
 """Words of an inclination that is not the field's."""
 _OTHER_ANGLE = re.compile(
-    r"decl|deklin|misvis|conv|konv|azi|asim|tool|roll|tf\b|склон|азим|磁偏|方位|±"
+    r"decl|deklin|misvis|conv|konv|(?<![^\W\d_])azi|asim|tool|roll|tf\b|склон|азим|磁偏|方位|±"
 )
 """Words of angles that are no dip."""
 _UPWARDS = re.compile(
@@ -230,7 +300,9 @@ _SPELT = {
     "нтл": "nT", "мктл": "µT", "мтл": "mT", "м/с": "m/s²", "м/с²": "m/s²", "м/с2": "m/s²", "m/s": "m/s²", "г": "g",
     "град": "°", "度": "°", "fok": "°", "derece": "°", "stopni": "°", "gal": "gal",
     "γ": "nT", "gammas": "nT", "kγ": "µT", "kgamma": "µT",
-    "a/m": "A/m", "oe": "gauss", "mgal": "mGal", "мгал": "mGal", "mg": "mg", "mgauss": "mG", "milligauss": "mG",
+    "nanotesla": "nT", "nanoteslas": "nT", "microtesla": "µT", "microteslas": "µT",
+    "a/m": "A/m", "oe": "gauss", "э": "gauss", "гс": "gauss", "gs": "gauss", "gals": "gal", "гал": "gal",
+    "mgal": "mGal", "мгал": "mGal", "mg": "mg", "mgauss": "mG", "milligauss": "mG",
 }  # fmt: skip
 """Units in small letters, where `unit_of` does not know them or goes by capitals."""
 
@@ -250,15 +322,23 @@ _OF_LIMITS = re.compile(
 """A line above limits, which are no references."""
 
 
-def stated_above(rows: Sequence[Sequence[object]], besides: Rows = ()) -> Titles:
-    """Metadata on tool, day and place from the rows above a table, and on the place from the lines `besides` it."""
+def stated_above(
+    rows: Sequence[Sequence[object]], besides: Rows = (), elsewhere: str = ""
+) -> Titles:
+    """Metadata on tool, day and place from the rows above a table, and on the place from the lines `besides` it.
+
+    Words `elsewhere` in the file may name the place, of a list of several.
+    """
     rows = [_unsplit(row) for row in rows]
     block = titles(rows)
     above, beside = ([r for r in each if not _is_of_settings(r)] for each in (rows, besides))
-    here = _of_this_place(_without_limits(above))
-    references = references_in(here, _without_limits(beside))
+    here = _of_this_place(_without_limits(above), elsewhere)
+    values = _values_in(here, _without_limits(beside))
+    references = _only(values)
     rough = {c: text for c, text in doubtful_in(rows, besides).items() if c not in references}
-    return block._replace(metadata={**references, **block.metadata}, not_taken=rough)
+    choices = {c: tuple(each) for c, each in values.items() if len(each) > 1}
+    metadata = {**references, **block.metadata}
+    return block._replace(metadata=metadata, not_taken=rough, choices=choices)
 
 
 def _without_limits(rows: Rows) -> list[Sequence[object]]:
@@ -279,25 +359,31 @@ def _is_of_settings(row: Sequence[object]) -> bool:
     return inclined and references_in([row]).keys() <= {"ref_dip_deg"}
 
 
-def _of_this_place(rows: Rows) -> list[Sequence[object]]:
+def _of_this_place(rows: Rows, elsewhere: str = "") -> list[Sequence[object]]:
     """The rows without those of other places: of a list of places below names, and lines on what no longer holds.
 
     Of a list the row counts whose place is named in another row of the title block too, or the only one that is not
     said to hold no longer. Where none does, or several do, the list stays, and its values differ.
     """
-    kept = [row for row in rows if not _NO_LONGER.search(_plain(_line(row)))]
-    lists = [k for k, row in enumerate(kept) if k and _is_of_place(row)]
-    for first in (k for k in lists if not _is_of_place(kept[k - 1])):
-        block = [kept[k] for k in range(first, len(kept)) if {*range(first, k + 1)} <= {*lists}]
-        others = " ".join(_line(row) for row in kept if row not in block)
-        named = [row for row in block if _first_word(row) in others]
+    valid = [
+        row
+        for row in rows
+        if not _NO_LONGER.search(_plain(_line(row)))
+        and not _OF_UNCERTAINTY.match(_plain(_line(row)))
+    ]
+    kept = [*valid]
+    lists = [k for k, row in enumerate(valid) if k and _is_of_place(row)]
+    for first in (k for k in lists if not _is_of_place(valid[k - 1])):
+        block = [valid[k] for k in range(first, len(valid)) if {*range(first, k + 1)} <= {*lists}]
+        others = " ".join([elsewhere, *(_line(row) for row in valid if row not in block)])
+        named = [row for row in block if re.search(rf"(?<!\w){_first_word(row)}(?!\w)", others)]
         if len(block) > 1 and len(named) == 1:
             kept = [row for row in kept if row not in block or row in named]
     return kept
 
 
 def _first_word(row: Sequence[object]) -> str:
-    """The first word of a row, with the blank or mark behind it."""
+    """The first word of a row."""
     match = re.match(r"[^\W\d_]+", _line(row))
     return match[0] if match else ""
 
@@ -326,20 +412,23 @@ def _unsplit(row: Sequence[object]) -> list[object]:
     ['Field, dip', '50000', '65']
     """
     whole: list[object] = []
+    pointed = any(re.fullmatch(r"\d+\.\d+", as_text(cell).strip()) for cell in row)
     for cell in row:
         before = whole and isinstance(whole[-1], str) and _SPLIT_BEFORE.fullmatch(whole[-1])
         behind = isinstance(cell, str) and _SPLIT_BEHIND.fullmatch(cell)
-        if before and behind and _belong_together(before, behind, len(whole) > 1):
+        if before and behind and _belong_together(before, behind, len(whole) > 1, pointed):
             whole[-1] = f"{whole[-1]},{cell}"
         else:
             whole.append(cell)
     return whole
 
 
-def _belong_together(before: re.Match[str], behind: re.Match[str], labelled: bool) -> bool:
-    """Whether the ends of two cells are one number."""
+def _belong_together(
+    before: re.Match[str], behind: re.Match[str], labelled: bool, pointed: bool
+) -> bool:
+    """Whether the ends of two cells are one number, in a row of numbers with a decimal point or without."""
     thousands = len(before["digits"]) <= 3 and len(behind["digits"]) == 3
-    if behind["point"] and not thousands:
+    if (behind["point"] or pointed) and not thousands:
         return False
     labels = re.search(r"[^\W\d_]", before["words"]) or re.match(
         rf"\s*(?:{_WRITTEN_UNIT})", _plain(behind["text"])
@@ -359,13 +448,19 @@ def references_in(rows: Rows, besides: Rows = ()) -> dict[str, float]:
     >>> references_in([["local field 46.8 uT nominal"], ["field uncertainty 50 nT"]])
     {}
     """
-    every = _values_in(rows, besides)
-    return {column: next(iter(each)) for column, each in every.items() if len(each) == 1}
+    return _only(_values_in(rows, besides))
+
+
+def _only(values: Mapping[str, Collection[float]]) -> dict[str, float]:
+    """The references of one value."""
+    return {column: next(iter(each)) for column, each in values.items() if len(each) == 1}
 
 
 def _values_in(rows: Rows, besides: Rows = ()) -> dict[str, dict[float, None]]:
     """The different values of each reference that rows above a table and lines `besides` state."""
     texts = [_clauses(row) for row in [*_with_columns(rows), *besides]]
+    if any(map(_TOTAL_ALONE.match, texts)):
+        texts = [text for text in texts if not _COMPONENT_ALONE.match(text)]
     by_word, of_places, by_unit = (dict[str, dict[float, None]]() for _ in range(3))
     for text in texts:
         here = {column for s in _statements() for column, _ in _stated(text, *s)}
@@ -381,7 +476,10 @@ def _values_in(rows: Rows, besides: Rows = ()) -> dict[str, dict[float, None]]:
     if {"ref_field_nt", "ref_dip_deg"}.isdisjoint(every):
         every |= {column: {value: None} for column, value in _by_components(texts).items()}
     if "ref_field_nt" in every and "ref_dip_deg" not in every:
-        every["ref_dip_deg"] = dict.fromkeys(v for text in texts for v in _inclinations(text))
+        inclinations = [v for text in texts for v in _inclinations(text)]
+        every["ref_dip_deg"] = dict.fromkeys(
+            inclinations or [v for text in texts for v in _beside_field(text)]
+        )
     return every
 
 
@@ -391,8 +489,14 @@ def _with_columns(rows: Rows) -> list[Sequence[object]]:
     paired: list[Sequence[object]] = []
     words: list[str] = []
     for above, below in pairwise(every):
-        if not (words and _is_of_place(above)):
-            words = [as_text(cell).strip() for cell in above]
+        texts = [as_text(cell).strip() for cell in above]
+        if words and sum(map(_is_a_unit, texts)) > 1:
+            words = [
+                f"{word} {text}" if _is_a_unit(text) else word
+                for word, text in zip_longest(words, texts, fillvalue="")
+            ]
+        elif not (words and _is_of_place(above)):
+            words = texts
         cells = [as_text(cell).strip() for cell in below]
         if (
             not any(re.match(r"[-−+]?\d", word) for word in words)
@@ -404,6 +508,11 @@ def _with_columns(rows: Rows) -> list[Sequence[object]]:
                 if word and re.match(r"[-−+]?\d", cell)
             ]
     return [*every, *paired]
+
+
+def _is_a_unit(text: str) -> bool:
+    """Whether a text is a unit in brackets or without: [nT], deg."""
+    return bool(re.fullmatch(_WRITTEN_UNIT, _plain(text).strip("[]() ")))
 
 
 class _Figure(NamedTuple):
@@ -462,6 +571,19 @@ def _figures(text: str) -> Iterator[_Figure]:
         )
 
 
+def _beside_field(text: str) -> Iterator[float]:
+    """The angle right behind the strength of a field in a line of both: 51.23 µT @ 72.9°, field/dip 49812 nT / 70°."""
+    figures = [*_figures(text)]
+    named = any(re.search(rf"(?:{_OF_PLACES[1].words})", f"{f.words} {f.behind}") for f in figures)
+    for one, other in pairwise(figures):
+        strength = _stated_unit(_OF_PLACES[0], one.unit) in _OF_PLACES[0].units
+        behind = re.fullmatch(r"\W*(?:@|/|at)\W*" if not named else r"\W*", other.words)
+        if strength and behind and _unit(other.unit) == "°" and not _OTHER_ANGLE.search(text):
+            inside = {n for n in _numbers(other.number, other.minutes) if 0 < abs(n) < 90}
+            up = _UPWARDS.search(f"{other.number} {other.behind}")
+            yield from (-abs(n) if up else n for n in inside if len(inside) == 1)
+
+
 def _by_unit(text: str, here: Collection[str]) -> Iterator[tuple[str, float]]:
     """Strengths of field and gravity that a line states in whatever words, by their units and sizes.
 
@@ -469,9 +591,7 @@ def _by_unit(text: str, here: Collection[str]) -> Iterator[tuple[str, float]]:
     """
     for figure in _figures(text):
         said = figure.words if re.search(r"[^\W\d_]", figure.words) else text
-        if _NO_PLACE.search(f"{said} {figure.behind}") or re.match(
-            r"\s*/\s*[^\W\d_]", figure.behind
-        ):
+        if _NO_PLACE.search(f"{said} {figure.behind}") or _PER.match(figure.behind):
             continue
         for quantity in (_OF_PLACES[0], _OF_PLACES[2]):
             unit = _stated_unit(quantity, figure.unit)
@@ -488,7 +608,9 @@ def _by_unit(text: str, here: Collection[str]) -> Iterator[tuple[str, float]]:
 def _inclinations(text: str) -> Iterator[float]:
     """The angles that a line calls an inclination in some language, and not that of a stand or a hole."""
     for figure in _figures(text):
-        word = _INCLINED.search(figure.words)
+        word = _INCLINED.search(figure.words) or re.match(
+            r"\W*(?:mag\w* )?dip(?![^\W\d_])", figure.behind
+        )
         if (
             not word
             or _OF_STAND.search(figure.words)
@@ -508,7 +630,9 @@ def _stated(
     for match in pattern.finditer(text):
         before = _BEFORE.search(text, 0, match.start())
         if not (before and _NO_PLACE.search(before[0])):
-            yield from ((quantity.column, value) for value in _values(quantity, match))
+            values = _values(quantity, match)
+            standard = _STANDARD.search(text)
+            yield from ((quantity.column, v) for v in values if not (standard and v == 1.0))
 
 
 def _line(row: Sequence[object]) -> str:
@@ -518,13 +642,22 @@ def _line(row: Sequence[object]) -> str:
 def _clauses(row: Sequence[object]) -> str:
     """The cells of a row in small letters, a semicolon behind each that ends a statement: a number with its unit."""
     text, ends = "", False
-    for cell in filter(None, (_plain(_SENTENCE.sub("; ", as_text(c))).strip() for c in row)):
-        unit = re.fullmatch(rf"[(\[]?({_WRITTEN_UNIT}|[ns])[)\]]?", cell)
+    each = (_SENTENCE.sub("; ", as_text(cell)) for cell in row)
+    cells = [*filter(None, (_DAY_OR_MODEL.sub(" ", _plain(text)).strip() for text in each))]
+    if len(cells) == 2 and re.fullmatch(r"[fbi]", cells[0]):
+        cells.insert(1, "=")
+    for cell in cells:
+        unit = re.fullmatch(rf"[(\[]?({_WRITTEN_UNIT}|[ns])[)\]]?[;,.]?", cell)
         text += f"; {cell}" if ends and not unit else f" {cell}"
         ends = not unit and bool(re.search(r"(?<![\w.,])[+\-−]?\d[^;]*$", cell))
+    text = _GROUPED_DECIMALS.sub("", text)
+    if _INSTRUMENT.search(text):
+        text = _OF_INSTRUMENT.sub(" ", text)
+    if _TOTAL.search(text):
+        text = _COMPONENT.sub(" ", text)
     text = _IN_OTHER_UNIT.sub(_said_once, _OF_A_UNIT.sub("", text))
     text = _WITH_SPREAD.sub(r"\1 \4 \2 \3 \4", text)
-    return _RANGE.sub("range ", text).strip()
+    return _RANGE.sub("range ", _UNCERTAIN.sub(r"\g<value> ", text)).strip()
 
 
 _SENTENCE = re.compile(
@@ -540,7 +673,7 @@ def _said_once(match: re.Match[str]) -> str:
         for text, unit in (("number", "unit"), ("again", "other"))
     )
     same = any(abs(b - a) <= _ROUNDED * abs(a) for a, b in product(one, other))
-    return match["value"] if same else match[0]
+    return f"{match['value']};" if same and match["unit"] != match["other"] else match[0]
 
 
 def _of_a_place(text: str) -> dict[str, float]:
@@ -617,7 +750,8 @@ def _is_called(quantity: _Quantity, figure: _Figure) -> bool:
 def _plain(text: str) -> str:
     """Small letters without marks; the signs of units stay."""
     kept = (
-        text.replace("_", " ")
+        re.sub(r"(?<=[a-z]{2})(?=[A-Z][a-z]{2})", " ", text)
+        .replace("_", " ")
         .replace("°", "\0")
         .replace("º", "\0")
         .replace("²", "\1")
@@ -626,8 +760,11 @@ def _plain(text: str) -> str:
     bare = without_marks(kept.lower().translate({ord("ø"): "o", ord("ß"): "ss", ord("ł"): "l"}))
     bare = re.sub(r"(?<=[\u4e00-\u9fff])(?=[a-zµμ])", " ", bare)
     signs = bare.replace("\0", "°").replace("\1", "²").replace("\2", "й")
+    signs = re.sub(r"(?<![a-z])cm\s?/\s?s\s?(?:\^?2|²)(?!\d)", "gal", signs).replace("n/kg", "m/s²")
     return re.sub(
-        r"(?<![a-zа-я])(?:[mм]\s?/\s?[sс]\s?(?:\^?2|²)|m\s?[.·*]?\s?s\^?[-−]2|m s2|mps2?)(?!\d)",
+        r"(?<![a-zа-я])(?:[mм]\s?/\s?[sс]\s?(?:\^?2|²)|m\s?[.·∙⋅*]?\s?s\s?\^?[-−⁻][2²]|m ?s2|mps2?|"
+        r"met(?:er|re)s?\s?(?:/|per )\s?s(?:ec(?:ond)?)?\s?(?:\^?2|²|squared)|m\s?/\s?sec\s?(?:\^?2|²)|"
+        r"m\s?/\s?s\s?/\s?s)(?!\d)",
         "m/s²",
         signs,
     )
@@ -658,12 +795,15 @@ def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
     )
     if (letter and not (direct and sure)) or not (direct or stated):
         return
+    if letter and not stated and _ANOTHER_UNIT.match(match.string, match.end("number")):
+        return
     if stated and stated not in quantity.units:
         return
     numbers = [*_numbers(match["number"], _minutes(match))]
     if quantity.low < 0 and _UPWARDS.search(match[0]):
         numbers = [-abs(number) for number in numbers]
     units = (stated,) if stated else [unit for unit in quantity.units if unit not in ("gon", "A/m")]
+    units = units[:1] if letter and not stated and quantity.low > EARTH_FIELD[0] - 1 else units
     inside = [*_inside(quantity, numbers, units)]
     other = _ANOTHER.match(match.string, match.end("unit" if match["unit"] else "number"))
     others = _inside(quantity, _numbers(other["number"]), units) if other else ()

@@ -166,12 +166,14 @@ _SPECIAL_LETTERS = str.maketrans({"ø": "o", "Ø": "O", "ß": "ss", "º": "", "�
 class Titles(NamedTuple):
     """Metadata by key, and a day that may be read in two ways, as it stands.
 
-    `not_taken` are lines with a nominal or approximate reference, by column of a run file.
+    `not_taken` are lines with a nominal or approximate reference, by column of a run file; `choices` are references
+    of which lines state different values.
     """
 
     metadata: Mapping[str, object]
     unclear_day: str = ""
     not_taken: Mapping[str, str] = {}
+    choices: Mapping[str, tuple[float, ...]] = {}
 
 
 def titles(rows: Sequence[Sequence[object]]) -> Titles:
