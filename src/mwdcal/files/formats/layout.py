@@ -635,10 +635,10 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
 
 
 def _with_side_blocks_above(rows: list[tuple[int, Cells]]) -> list[tuple[int, Cells]]:
-    """The rows with a title block that stands beside the table above it instead.
+    """The rows, in which a title block to the left or right of the table is moved above it.
 
-    It is of two columns or more behind or before a blank one, each filled in beside less than half of the readings,
-    and says something of the tool, the day or the place.
+    Such a block is of two columns or more behind or before a blank one, each filled in beside less than half of the
+    readings, and says something of the tool, the day or the place.
     """
     readings = [k for k, (_, row) in enumerate(rows) if _is_reading(row)]
     first = max(readings[0] - 1, 0) if readings else len(rows)

@@ -224,7 +224,7 @@ def titles(rows: Sequence[Sequence[object]]) -> Titles:
 
 
 def tool_in(row: Sequence[object]) -> str:
-    """The tool that a line between rows of readings states: its serial, or a number alone; empty where it is none.
+    """The tool that a line between rows of readings states: its serial or a number alone, or else empty.
 
     >>> tool_in(["Tool 4092"]), tool_in(["S/N A-17"]), tool_in(["Tool warm"])
     ('4092', 'A-17', '')
