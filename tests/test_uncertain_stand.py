@@ -122,7 +122,8 @@ def test_no_step_of_the_general_way_leads_further(triads):
 
 
 @pytest.mark.parametrize("triads", DRIFTING, ids=str)
-def test_its_analysis_is_the_general_one(triads):
+def test_its_analysis_is_the_general_one(triads, monkeypatch):
+    monkeypatch.setattr(uncertain_stand, "NUMBERS_AT_ONCE", 10_000)  # five tools in pieces
     ours = drifting(9, triads)
     problem, state, mine = ours.problem, ours.state, ours.analysis
     other = uncertainty.analyse(problem, state, mine.determined)
@@ -147,6 +148,11 @@ def test_scores_of_drifts_are_the_general_ones():
         np.testing.assert_allclose(mine.information[some], theirs.information, atol=1e-9 * size)
         np.testing.assert_allclose(mine.alone()[some], theirs.alone(), rtol=1e-9, atol=1e-9 * size)
         np.testing.assert_allclose(mine.shown(name), other.shown(name), rtol=1e-7)
+    apart = [*mine.places][::2]
+    mine, theirs = drift.walk_scores(*given, result.analysis, apart).of(apart), other.of(apart)
+    size = np.abs(theirs.information).max()
+    np.testing.assert_allclose(mine.score, theirs.score, atol=1e-9 * np.sqrt(size))
+    np.testing.assert_allclose(mine.information, theirs.information, atol=1e-9 * size)
 
 
 def test_what_a_huge_drift_leaves_is_not_lost_in_rounding():

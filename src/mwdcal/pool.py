@@ -8,7 +8,6 @@ in hand, which is done again by others. Where results are large, `solve` writes 
 
 from __future__ import annotations
 
-import asyncio
 import ctypes
 import gc
 import logging
@@ -56,8 +55,6 @@ CLUSTER_TIMEOUT = 30.0
 """Seconds in which a scheduler must answer, and have a worker; asked again after as long a silence."""
 CLOSING = 5.0
 """Seconds for the farewell to a scheduler."""
-LOST = (OSError, TimeoutError, CancelledError, asyncio.CancelledError)
-"""Errors where a scheduler has gone or is mute."""
 COMMAND, WORKER = "mwdcal.app.cli", "mwdcal.app.worker_preload"
 """Modules that a worker process has loaded before it is given anything."""
 
@@ -243,15 +240,22 @@ def _on_cluster(steps: Steps, tasks: Sequence[Any], address: str) -> Iterator[tu
                 f"a worker of {address} has no {error.name}. Install mwdcal there as here: "
                 f"{extras.command(CLUSTER)}"
             ) from error
-        except LOST as error:
+        except lost() as error:
             raise InputError(
                 f"`scheduler` {address}: the scheduler no longer answers. Finished parts are kept: start it "
                 "and its workers again, and run the same command."
             ) from error
 
 
+def lost() -> tuple[type[BaseException], ...]:
+    """Errors where a scheduler has gone or is mute; without a cluster nothing loads `asyncio`, 20 ms."""
+    import asyncio
+
+    return OSError, TimeoutError, CancelledError, asyncio.CancelledError
+
+
 def _finished(client: Any, waiting: Mapping[str, tuple[int, Any]]) -> Iterator[str]:
-    """Keys of futures as they end; raises one of `LOST` where the scheduler has fallen silent."""
+    """Keys of futures as they end; raises one of `lost` where the scheduler has fallen silent."""
     ended: SimpleQueue[str] = SimpleQueue()
     for _, future in list(waiting.values()):
         future.add_done_callback(lambda each: ended.put(each.key))
@@ -270,6 +274,8 @@ def _connected(distributed: Any, address: str) -> Iterator[Any]:
             logging.getLogger(name).setLevel(
                 logging.CRITICAL + 1
             )  # its tracebacks; errors are raised
+    import asyncio
+
     try:
         asyncio.run(_greet(distributed, address))
         client = distributed.Client(address, timeout=CLUSTER_TIMEOUT)
@@ -288,12 +294,14 @@ def _connected(distributed: Any, address: str) -> Iterator[Any]:
             f"`scheduler` {address}: the scheduler has no workers. Start some: dask worker {address}"
         ) from error
     finally:
-        with suppress(*LOST):
+        with suppress(*lost()):
             client.close(timeout=CLOSING)
 
 
 async def _greet(distributed: Any, address: str) -> None:
     """Exchange greetings with a scheduler: a client waits without end for one that is mute."""
+    import asyncio
+
     arguments = distributed.Security().get_connection_args("client")
     greeting = distributed.comm.connect(address, timeout=CLUSTER_TIMEOUT, **arguments)
     comm = await asyncio.wait_for(greeting, 2 * CLUSTER_TIMEOUT)

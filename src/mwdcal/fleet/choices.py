@@ -22,10 +22,8 @@ from mwdcal.estimation.batch import take
 from mwdcal.geometry.vectors import AnyArray, Bools, Ints
 from mwdcal.sensor.profile import Profile
 
-TOOLS_PER_FIT = 320
-"""Tools fitted in one call: few enough for the cache, many enough for NumPy…"""
-AT_EXACT_REFERENCES = 640
-"""…where all references are exact: a tool then takes a fifth of the memory…"""
+TOOLS_PER_FIT = 640
+"""Tools fitted in one call: few enough for the memory, many enough for NumPy…"""
 USUAL_STATIONS = 48
 """…and fewer if they have more stations than these: long runs take no more memory."""
 _T = TypeVar("_T")
@@ -79,9 +77,7 @@ def with_curves(
 
 def tools_per_fit(readings: Readings) -> int:
     """How many tools of a batch are fitted in one call."""
-    exact = not any(readings.uncertainty(name).any() for name in readings.known)
-    most = AT_EXACT_REFERENCES if exact else TOOLS_PER_FIT
-    return max(1, most * USUAL_STATIONS // max(readings.count, USUAL_STATIONS))
+    return max(1, TOOLS_PER_FIT * USUAL_STATIONS // max(readings.count, USUAL_STATIONS))
 
 
 def alike(tools: Ints, keys: AnyArray) -> list[tuple[AnyArray, Ints]]:

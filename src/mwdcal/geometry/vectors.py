@@ -33,6 +33,12 @@ def distinct(values: AnyArray, axis: int | None = None) -> AnyArray:
     return np.unique(values, return_counts=True, axis=axis)[0]
 
 
+def as_slice(index: Ints) -> Ints | slice:
+    """Places in order as a slice where no other is between them: what is there is then a view, not a copy."""
+    first, last = int(index[0]), int(index[-1])
+    return slice(first, last + 1) if last - first == len(index) - 1 else index
+
+
 def wrap(angle: ArrayLike, period: float = 2 * np.pi) -> Array:
     """An angle in [0, period): azimuths and toolfaces as the industry writes them."""
     return np.asarray(np.mod(angle, period), float)

@@ -14,7 +14,7 @@ Reference: D. A. Harville, J. Am. Stat. Assoc. 72, 320 (1977), of the noise.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import prod
@@ -27,7 +27,15 @@ from mwdcal.estimation.minimisers.closed_form import AffineMinimum
 from mwdcal.estimation.problem import WALK_AXES, WALKS, Problem, State
 from mwdcal.estimation.solvers import Determined
 from mwdcal.estimation.uncertainty import Analysis, effects_of, variance_factors
-from mwdcal.geometry.vectors import Array, Bools, Ints, inverse, inverse_of_positive, quotient
+from mwdcal.geometry.vectors import (
+    Array,
+    Bools,
+    Ints,
+    as_slice,
+    inverse,
+    inverse_of_positive,
+    quotient,
+)
 from mwdcal.sensor.models import Polynomial, affine_parts
 
 # --------------------------------------------------------------------------
@@ -160,12 +168,12 @@ class StandColumns:
     def gram(self, inner: Array) -> Blocks:
         """Sums XᵀMX for the symmetric M (6, 6, B, n) of each station."""
         count = self.weight.shape[1]
-        heavy = inner * self.weight[:, None]
         whole = np.empty((count, 2, 3, 4, 2, 3, 4))
         for (one, other), pair in self._pairs.items():
             rows, columns = TRIAD_ROWS[one], TRIAD_ROWS[other]
-            each = by_tool(heavy[rows, columns] * self.weight[columns]) @ pair
-            each = each.reshape(count, 3, 3, 4, 4)
+            heavy = inner[rows, columns] * self.weight[rows, None]
+            heavy *= self.weight[columns]
+            each = (by_tool(heavy) @ pair).reshape(count, 3, 3, 4, 4)
             whole[:, one, :, :, other] = each.transpose(0, 1, 3, 2, 4)
             if one != other:
                 whole[:, other, :, :, one] = each.transpose(0, 2, 4, 1, 3)
@@ -192,12 +200,12 @@ class StandColumns:
     def crossed(self, moved: Array) -> Array:
         """Sums (B, 24, q) of XᵀMD over the stations, D being the columns of the drifts, from M times their axes."""
         axes, terms = self.of_drifts
-        heavy = moved * self.weight[:, None]
-        count, across = moved.shape[-2], []
-        for rows, along in zip(TRIAD_ROWS, self._along, strict=True):
-            each = by_tool(heavy[rows]) @ along.mT
-            across.append(each.reshape(count, 3, axes, 4, terms).swapaxes(2, 3))
-        return np.stack(across, 1).reshape(count, OF_PARAMETERS, axes * terms)
+        count = moved.shape[-2]
+        across = np.empty((count, 2, 3, 4, axes, terms))
+        for index, (rows, along) in enumerate(zip(TRIAD_ROWS, self._along, strict=True)):
+            each = by_tool(moved[rows] * self.weight[rows, None]) @ along.mT
+            across[:, index] = each.reshape(count, 3, axes, 4, terms).swapaxes(2, 3)
+        return across.reshape(count, OF_PARAMETERS, axes * terms)
 
     def of_axes(self, products: Array) -> Array:
         """Sums DᵀMD (B, q, q) over the stations, from the products (a, a, B, n) of the axes by M."""
@@ -244,28 +252,29 @@ class StandColumns:
             done += axes.shape[1]
         return change
 
-    def spread(self, covariance: Array) -> Array:
-        """Covariance (6, 6, B, n) of what Φ of a covariance (B, 24, 24) does to each station."""
-        count, spread = len(covariance), np.empty((6, *self.weight.shape))
+    def spread(self, covariance: Array, some: slice) -> Array:
+        """Covariance (6, 6, b, n) of what Φ of a covariance (b, 24, 24) does to each station of `some` tools."""
+        weight, count = self.weight[:, some], len(covariance)
+        spread = np.empty((6, *weight.shape))
         of_params = covariance.reshape(count, 2, 3, 4, 2, 3, 4)
         for (one, other), pair in self._pairs.items():
             rows, columns = TRIAD_ROWS[one], TRIAD_ROWS[other]
             flat = of_params[:, one, :, :, other].transpose(0, 1, 3, 2, 4).reshape(count, 9, 16)
-            each = by_component(flat @ pair.mT, 3, 3)
-            each = each * self.weight[rows, None] * self.weight[columns]
+            each = by_component(flat @ pair[some].mT, 3, 3)
+            each = each * weight[rows, None] * weight[columns]
             spread[rows, columns] = each
             spread[columns, rows] = each.swapaxes(0, 1)
         return spread
 
-    def less(self, taken: Array) -> Array:
-        """Columns (B, 6, n, q) of the drifts less what Φ takes of each, (B, 24, q)."""
-        count, stations = self.weight.shape[1:]
-        whole, done = np.empty((count, 6, stations, taken.shape[-1])), 0
+    def less(self, taken: Array, some: slice) -> Array:
+        """Columns (b, 6, n, q) of the drifts of `some` tools less what Φ takes of each, (b, 24, q)."""
+        weight, count = self.weight[:, some], len(taken)
+        whole, done = np.empty((count, 6, weight.shape[-1], taken.shape[-1])), 0
         each = taken.reshape(count, 2, 3, 4, -1)
-        for index, (rows, f) in enumerate(zip(TRIAD_ROWS, self.terms, strict=True)):
-            heavy = -f * self.weight[rows, None]
+        for index, (rows, f) in enumerate(zip(TRIAD_ROWS, self.terms[:, :, some], strict=True)):
+            heavy = -f * weight[rows, None]
             whole[:, rows] = heavy.transpose(2, 0, 3, 1) @ each[:, index]
-            axes = np.moveaxis(self.axes[index], 1, -1).swapaxes(0, 1)
+            axes = np.moveaxis(self.axes[index][:, :, some], 1, -1).swapaxes(0, 1)
             effect = axes[..., None] * self.courses.transpose()[:, None]
             effect = effect.reshape(*effect.shape[:3], -1)
             whole[:, rows, :, done : done + effect.shape[-1]] += effect
@@ -281,6 +290,8 @@ class StandColumns:
 
 MOST_AT_ONCE = 3.0
 """Largest power of s that the noise takes at once."""
+NUMBERS_AT_ONCE = 2**18
+"""Elements of the columns of drifts, or of the weights, that are worked on together: few enough for the cache."""
 ERROR_SIGNS = np.array([1.0, -1.0, -1.0])[:, None]
 """How inclination, azimuth and toolface follow the errors of a state."""
 
@@ -368,11 +379,11 @@ class StandRuns:
         if self.walks:
             columns = replace(columns, axes=columns.axes_of(self.walks, forward, attitude))
         held = quotient(errors, self.angle_sd, self.angle_sd > 0)
-        each = [
-            np.einsum("bij,jabn->iabn", forward[:, t, :, :3], change[t]) * weight[rows, None]
-            for t, rows in enumerate(TRIAD_ROWS)
-        ]
-        gain = np.concatenate(each)
+        gain = np.empty((6, 3, *weight.shape[1:]))
+        for row, by in enumerate(forward.reshape(-1, 6, 4).swapaxes(0, 1)[..., None]):
+            first, second, third = change[row // 3]
+            each = by[:, 0] * first + by[:, 1] * second + by[:, 2] * third
+            np.multiply(each, weight[row], out=gain[row])
         unknowns = np.concatenate([forward.reshape(len(forward), -1), value], -1)
         left = by_component(self.raw, 6) * weight - columns.change(unknowns)
         left += np.einsum("ik...,k...->i...", gain, by_component(held, 3))
@@ -464,42 +475,48 @@ class StandLinear:
     @cached_property
     def spread(self) -> Array:
         """W - WX V XᵀW (6, 6, B, n), the covariance of the weighed residuals of each station."""
-        alone, taken, inner = self.parts
-        both = self.columns.spread(alone)
-        if self.precision.size:
-            left = self.columns.less(taken)
-            known = (left.reshape(len(left), -1, left.shape[-1]) @ inner).reshape(left.shape)
-            each = known.swapaxes(1, 2) @ left.transpose(0, 2, 3, 1)
-            both += np.moveaxis(each, (0, 1), (2, 3))
-        moved = np.einsum("ij...,jk...->ik...", self.weight, both)
-        return np.asarray(self.weight - np.einsum("ij...,jk...->ik...", moved, self.weight))
+        spread = np.empty(self.weight.shape)
+        for some in self._pieces:
+            weight, (alone, taken, inner) = self.weight[:, :, some], take(self.parts, some)
+            both = self.columns.spread(alone, some)
+            if self.precision.size:
+                left = self.columns.less(taken, some)
+                known = (left.reshape(len(left), -1, left.shape[-1]) @ inner).reshape(left.shape)
+                each = known.swapaxes(1, 2) @ left.transpose(0, 2, 3, 1)
+                both += np.moveaxis(each, (0, 1), (2, 3))
+            moved = np.einsum("ij...,jk...->ik...", weight, both)
+            spread[:, :, some] = weight - np.einsum("ij...,jk...->ik...", moved, weight)
+        return spread
 
     @cached_property
-    def apart(self) -> tuple[Blocks, Blocks, Blocks]:
-        """XᵀWX, then both of `squared`, where the columns of drifts are less what Φ takes of them."""
-        data, first, second = (m.less(self.parts[1]) for m in (self.of_data, *self.squared))
-        return data, first, second
+    def beside(self) -> tuple[Array, Array]:
+        """Covariance (B, 24, 24) of Φ from the errors of angles alone, and tr((XᵀW E W X V)²) (B, t)."""
+        each = [self._beside(some) for some in self._pieces]
+        of_angles, squares = (np.concatenate(parts) for parts in zip(*each, strict=True))
+        return of_angles, squares
 
-    @cached_property
-    def of_angles(self) -> Array:
-        """Covariance (B, 24, 24) of Φ from the errors of angles alone."""
-        alone, taken, inner = self.parts
-        follow, (data, first, second) = taken @ inner, self.apart
+    def _beside(self, some: slice) -> tuple[Array, Array]:
+        """The same of `some` tools, the columns of drifts being less what Φ takes of them."""
+        alone, taken, inner = take(self.parts, some)
+        whole = (take(matrix, some).less(taken) for matrix in (self.of_data, *self.squared))
+        follow, (data, *squared) = taken @ inner, whole
+        first, second = squared
         across = data.across - first.across - second.across
         reach = alone @ (data.params - first.params - second.params) - follow @ across.mT
         further = alone @ across - follow @ (data.drifts - first.drifts - second.drifts)
-        return np.asarray(reach @ alone - further @ follow.mT)
-
-    @cached_property
-    def shared_squares(self) -> Array:
-        """tr((XᵀW E W X V)²) (B, t)."""
-        alone, _, inner = self.parts
         each = []
-        for m in self.apart[1:]:
+        for m in squared:
             part = Blocks(m.params @ alone, m.across @ inner, m.drifts @ inner)
             other = Blocks(part.params.mT, alone @ m.across, part.drifts.mT)
             each.append(part.trace(other))
-        return np.stack(each, -1)
+        return reach @ alone - further @ follow.mT, np.stack(each, -1)
+
+    @property
+    def _pieces(self) -> Iterator[slice]:
+        """The tools, so many at once that what is worked on for them stays in the cache."""
+        count, stations = self.angle_sd.shape[0], self.angle_sd.shape[-1]
+        size = max(1, NUMBERS_AT_ONCE // (6 * stations * (12 + self.value.shape[-1])))
+        return (slice(first, first + size) for first in range(0, count, size))
 
     def weighed(self, values: Array) -> Array:
         """W times values (6, B, n)."""
@@ -681,8 +698,9 @@ class StandWalks:
         """Scores (B, q) of some walks by their numbers, their covariance, and what that is with all else known."""
         axes = np.array([3 * walk + axis for walk in walks for axis in range(3)])
         terms = len(self.columns.courses)
-        places = (axes[:, None] * terms + np.arange(terms)).ravel()
-        alone = self.columns.of_axes(self.products[axes[:, None], axes])
+        places = as_slice((axes[:, None] * terms + np.arange(terms)).ravel())
+        some = as_slice(axes)
+        alone = self.columns.of_axes(self.products[some][:, some])
         left = alone - self.crossed[:, :, places].mT @ self.taken[:, :, places]
         return self.score[:, places], left, alone
 
@@ -741,6 +759,7 @@ def analysed(problem: Problem, state: State, determined: Determined) -> Analysis
     spread, residual = (
         np.ascontiguousarray(np.moveaxis(each, (-2, -1), (0, 1))) for each in (spread, residual)
     )
+    of_angles, squares = at.beside
     return Analysis(
         moved @ covariance.params @ moved.mT,
         determined,
@@ -750,8 +769,8 @@ def analysed(problem: Problem, state: State, determined: Determined) -> Analysis
         covariance.drifts,
         effects_of(problem, moved @ covariance.across),
         np.zeros((len(moved), OF_PARAMETERS, 0)),
-        squares=np.stack(lone, -1) + at.shared_squares,
-        of_stand=moved @ at.of_angles @ moved.mT,
+        squares=np.stack(lone, -1) + squares,
+        of_stand=moved @ of_angles @ moved.mT,
     )
 
 
