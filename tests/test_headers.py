@@ -425,7 +425,66 @@ def test_one_blank_between_names_over_columns_parts_them(tmp_path):
     assert same(taken(path), stations())
 
 
+def test_a_row_of_dashes_with_one_remark_parts_no_table(tmp_path):
+    """A station without a reading is left out, and the rows below it are read."""
+    rows = stations()
+    gap = ["–"] * len(NAMES) + ["power cut, no reading"]
+    path = workbook(
+        tmp_path / "run.xlsx", [TITLES[0], [], [*NAMES, "Remark"], *rows[:20], gap, *rows[20:]]
+    )
+    assert same(taken(path), rows)
+
+
+@pytest.mark.parametrize("name", ["temp", "T"])
+def test_units_below_the_names_of_other_columns_widths_are_theirs(tmp_path, name):
+    """Left-aligned names and units, the last of which does not stand above its numbers."""
+    rows = [[n, *row] for n, row in enumerate(stations(), 1)]
+    names = ["est", "inc", "azim", "face", "Gx", "Gy", "Gz", "Bx", "By", "Bz", name]
+    units = ["", "graus", "graus", "graus", *["V"] * 6, "C"]
+    width = [6, *[13] * 9, 0]
+    lines = (
+        [f"{cell:<{w}}" for w, cell in zip(width, names, strict=True)],
+        [f"{c:<{w}}" for w, c in zip(width, units, strict=True)],
+    )
+    body = [
+        "".join(f"{cell:<{w}}" for w, cell in zip([*width[:-2], 17, 0], row, strict=True))
+        for row in rows
+    ]
+    head = ["".join(line) for line in lines]
+    path = tmp_path / "run.txt"
+    path.write_text("\n".join(["FIELD 50000 NT  DIP 63 DEG", "", *head, *body]), "utf-8")
+    assert tables.laid_out(path).units == units
+    assert same(taken(path), stations())
+
+
+def test_a_triad_on_a_sheet_of_its_own_is_that_of_the_same_stations(tmp_path):
+    """Angles and one triad on one sheet, the station and the other triad on the next."""
+    rows = stations()
+    book = openpyxl.Workbook()
+    book.active.append(TITLES[0])
+    first, other = book.create_sheet("Acc"), book.create_sheet("Mag")
+    first.append(
+        ["Station", "Inc (°)", "Azi (°)", "TF (°)", "Gx (V)", "Gy (V)", "Gz (V)", "Temp (°C)"]
+    )
+    other.append(["Station", "Bx (V)", "By (V)", "Bz (V)"])
+    for n, row in enumerate(rows, 1):
+        first.append([n, *row[:6], row[9]])
+    for n, row in reversed([*enumerate(rows, 1)]):
+        other.append([n, *row[6:9]])
+    book.save(tmp_path / "run.xlsx")
+    run = taken(tmp_path / "run.xlsx")
+    order = np.argsort(tables.numbers(run, "station"))
+    assert np.allclose(
+        [tables.numbers(run, name)[order] for name in COLUMNS],
+        [*zip(*rows, strict=True)],
+        rtol=1e-12,
+    )
+
+
 RECORDS = {
+    "time": (
+        "ST={n:02d} TIME=08:17:{n:02d} Inc={0} Azi={1} TF={2} Gx={3} Gy={4} Gz={5} Bx={6} By={7} Bz={8} T={9}",
+    ),
     "label": ("P{n:02d}: Inc={0},Azi={1},TF={2},Gx={3},Gy={4},Gz={5},Bx={6},By={7},Bz={8},T={9}",),
     "lines": (
         *("Station {n}", "  Inclination: {0} deg", "  Azimuth: {1} deg", "  Toolface: {2} deg"),
@@ -448,7 +507,8 @@ def test_records_of_stations_are_rows(tmp_path, form):
 
 
 @pytest.mark.parametrize("title", ["Toolface", "Visier (Toolface)"])
-def test_minutes_below_a_title_are_those_of_its_angle(tmp_path, title):
+@pytest.mark.parametrize("signs", [("°", "'", '"'), ("grader °", "min '", 'sek "')])
+def test_minutes_below_a_title_are_those_of_its_angle(tmp_path, title, signs):
     """In columns below °, ', ": brackets behind the title are no unit."""
     seconds = [[round(3600 * angle) for angle in row[:3]] for row in stations()]
     channels_of = [row[3:] for row in stations()]
@@ -460,7 +520,7 @@ def test_minutes_below_a_title_are_those_of_its_angle(tmp_path, title):
     channels = ["Gx (V)", "Gy (V)", "Gz (V)", "Bx (V)", "By (V)", "Bz (V)", "T (°C)"]
     head = [
         [w for name in ("Inc", "Azi", title) for w in (name, "", "")] + channels,
-        ["°", "'", '"'] * 3,
+        [*signs] * 3,
     ]
     path = workbook(tmp_path / "run.xlsx", [TITLES[0], [], *head, *parts])
     assert same(taken(path), rows)

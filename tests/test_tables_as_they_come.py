@@ -59,6 +59,12 @@ def calibrated(folder, path, *options):
 PLACE = {"ref_field_nt": 48_912.0, "ref_dip_deg": 66.25, "ref_gravity_g": 9.8123 / 9.80665}
 TITLES = {
     "English": [["Local field: 48912 nT", "Dip 66.25 deg", "g = 9.8123 m/s2"]],
+    "scales": [
+        ["Skalierung Magnetfeld", "0,5 Digit/nT"],
+        ["Feldstärke", "48912 nT"],
+        ["Dip", "66-15-00"],
+        ["g", "9,8123 m/s²"],
+    ],
     "sentences": [
         [
             "Accelerometer scale 2.5 V/g nominal. 1 V = 20 uT. Field 48912 nT, dip 66.25 deg, g = 9.8123 m/s2."

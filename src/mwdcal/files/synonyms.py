@@ -129,6 +129,7 @@ _BYWORDS = _STATED | {
 """Words that do not change what a column resembles."""
 _CALLED_G = ("ref_field_nt", "mx", "my", "mz")
 """Columns beside whose names G is Gauss, no unit of gravity."""
+_MEANS = {"mean", "avg", "median"}
 _SPREADS = {"sd", "sigma", "std", "stdev", "unc", "uncertainty"}
 _ACCELEROMETERS = "acc accel acceleration accelerometer accelerometers g a gravity grav"
 _MAGNETOMETERS = "mag magnetometer magnetometers b h flux fluxgate m magfield magneticfield magn fg"
@@ -301,9 +302,9 @@ def resembled(name: str) -> Resemblance | None:
 def _resembled(name: str) -> Resemblance | None:
     """The column that a name resembles; nothing where it has words from elsewhere."""
     every = _words(name)
-    words, unit = _without_unit(every)
-    spread = not _SPREADS.isdisjoint(words)
-    words = [word for word in words if word not in _SPREADS]
+    spread = not _SPREADS.isdisjoint(every)
+    aside = _SPREADS | _MEANS
+    words, unit = _without_unit([word for word in every if word not in aside] or every)
     whole = "".join(words)
     bare = "".join(word for word in words if word not in _BYWORDS)
     column = _column(whole, bare, set(words), unit)

@@ -80,7 +80,7 @@ _SYMBOL = re.compile(r"[^\W\d_]")
 _DEGREES_OF = re.compile(
     r"(?P<of>.*?)(?:^|[\s,(\[_]+)(?:(?P<d>deg(r[eé]e?s?)?|gra[du]s?|grad(er|en|os|us|i)|гр|град(ус\w*)?|[°º]|度)|"
     r"(?P<s>(arc[- ]?)?sec(onds?|ondes)?|sek(unden|under)?|seg(undos)?|s|сек(унд\w*)?|\"|″|”|''|′′|’’|秒)|"
-    r"(?P<m>(arc[- ]?)?min(utes?|uten|utter|utos)?|мин(ут\w*)?|['′’]|分)|(?P<largest>max|макс))[\s.,)\]]*",
+    r"(?P<m>(arc[- ]?)?min(utes?|uten|utter|utos)?|мин(ут\w*)?|['′’]|分)|(?P<largest>max|макс))[\s.,)\]°º'′’\"″]*",
     re.IGNORECASE,
 )
 """The name of a column of degrees, of minutes or of seconds of an angle, or of a largest value beside the least."""
@@ -117,7 +117,7 @@ _OF_ROLL_TEST = re.compile(
     r"(?<![^\W\d_])(roll[\s_-]*(test|over|check)|rt|verif\w*|check|valid\w*|(roll)?pr(ue|ü)fung|"
     r"[ck]ontrol\w*[- ]?(run|shot|test|roll|messung|dreh|måling|rull)\w*|rulletest|prueba|"
     r"(essai|test)s? (en|de) (roulis|rotation)|провер\w*|повер\w*|"
-    r"контрольн\w* (вращ|замер|измер)\w*)(?![^\W\d_])|验证|检验|複測|复测",
+    r"контрольн\w* (вращ|замер|измер)\w*)(?![^\W\d_])|验证|检验|複測|复测|复核|(滚动|滚转|旋转)(测试|试验)",
     re.IGNORECASE,
 )
 """Words of a sheet whose rows are to check a calibration."""
@@ -287,12 +287,18 @@ def _with_same_stations(tables: Sequence[Layout]) -> list[Layout]:
 
 
 def _with_stand(tables: Sequence[Layout]) -> list[Layout]:
-    """Tables, each of channels alone with the angles of the one other that has the same stations and no channels.
+    """Tables, each of channels alone with the angles of the one other that has the same stations.
 
-    A column of one name in which no two rows are alike tells the stations of both.
+    It has no channels, or those of another triad alone. A column of one name in which no two rows are alike tells the
+    stations of both.
     """
-    stands = [t for t in tables if angles_among(t.names) and not _has_axes(t.names)]
+    angled = [t for t in tables if angles_among(t.names)]
     tools = [t for t in tables if _has_axes(t.names) and not angles_among(t.names)]
+    axes = {name for t in tools for name in t.names if _axis(name)}
+    one_triad = [t for t in angled if sum(map(bool, map(_axis, t.names))) == len("xyz")]
+    stands = [t for t in angled if not _has_axes(t.names)] or [
+        t for t in one_triad if axes.isdisjoint(t.names)
+    ]
     if len(stands) != 1 or not tools:
         return [*tables]
     (stand,) = stands
@@ -310,10 +316,9 @@ def _of_stations(tool: Layout, stand: Layout) -> Layout | None:
         if len(places) == len(theirs) and {*ours} <= {*places} and len({*ours}) == len(ours):
             rows = [places[station] for station in ours]
             more = [k for k, other in enumerate(stand.names) if other not in tool.names]
-            said = (
-                f"the angles of the stand are those of {shown(stand.sheet or stand.heading)} at the same "
-                f"{shown(name)}."
-            )
+            what = "the other columns" if _has_axes(stand.names) else "the angles of the stand"
+            where = shown(stand.sheet or stand.heading)
+            said = f"{what} are those of {where} at the same {shown(name)}."
             return replace(
                 tool,
                 names=plain_names([*tool.names, *(stand.names[k] for k in more)]),
@@ -853,7 +858,9 @@ def _spelling(row: Cells) -> list[str]:
 
 
 def _texts(row: Cells) -> int:
-    return sum(isinstance(cell, str) and bool(cell) and not figures.is_figure(cell) for cell in row)
+    """Texts of a row but for dashes and other signs that say that there is no value."""
+    texts = (cell for cell in row if isinstance(cell, str) and re.search(r"[^\s–—-]", cell))
+    return sum(not figures.is_figure(cell) for cell in texts)
 
 
 def _is_reading(row: Cells) -> bool:
@@ -874,12 +881,14 @@ def _is_without_reading(row: Cells) -> bool:
     True
     >>> _is_without_reading(["Stn", "Inc", "-", "-", "-", "Ax", "Ay"])
     False
+    >>> _is_without_reading(["-", "-", "-", "–", "power cut"]), _is_without_reading(["-", "-", "-", "°C"])
+    (True, False)
     """
     cells = [as_text(cell).strip() for cell in row]
     filled = [cell for cell in cells if cell and not NO_READING.fullmatch(cell)]
     lacking = sum(map(bool, cells)) - len(filled)
     worded = sum(not re.search(r"\d", cell) for cell in filled)
-    alone = worded == 0 or (worded == 1 and len(filled) > 1)
+    alone = worded == 0 or (worded == 1 and (len(filled) > 1 or not unit_of(filled[0])))
     return lacking >= LEAST_COLUMNS - 1 and alone and not _is_reading(row)
 
 

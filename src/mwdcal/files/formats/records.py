@@ -22,7 +22,8 @@ Rows = list[tuple[int, list[object]]]
 _LEAST_PAIRS, _LEAST_RECORDS = 4, 5
 """Names with values in a record at least, and records of the same names."""
 _PAIR_IN_LINE = re.compile(
-    r"(?<![^\s,;|])([^\W\d_][\w./°-]*)\s*[=:]\s*([+−-]?[\w.,+−-]*\w)(?=[\s,;|]|$)"
+    r"(?<![^\s,;|])([^\W\d_][\w./°-]*)\s*[=:]\s*"
+    r"(\d{1,2}:\d{2}(?::\d{2})?|[+−-]?[\w.,+−-]*\w)(?=[\s,;|]|$)"
 )
 _TIME_BEFORE = re.compile(
     r"\W*(\d{1,4}([-./])\d{1,2}\2\d{1,4})?[T ,;]*(\d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?)?Z?[\s,;|\]]+"

@@ -110,12 +110,21 @@ def _in_columns(lines: Sequence[str], rows: Sequence[list[str]]) -> list[list[st
     usual = Counter(map(len, numbered)).most_common(1)
     width = usual[0][0] if usual else 0
     whole = [s for s in numbered if len(s) == width]
-    columns = [
-        (min(a for a, _ in each), max(b for _, b in each)) for each in zip(*whole, strict=True)
-    ]
-    if len(whole) < _LEAST_ROWS or any(one[1] > two[0] for one, two in pairwise(columns)):
+    columns = _common(whole)
+    if len(whole) < _LEAST_ROWS or _overlap(columns):
         return [*rows]
+    named = _common([s for s in spans if len(s) == width])
+    columns = columns if _overlap(named) else named
     return [_placed(row, each, columns) for row, each in zip(rows, spans, strict=True)]
+
+
+def _common(rows: Sequence[Sequence[tuple[int, int]]]) -> list[tuple[int, int]]:
+    """Where the columns of rows begin and end, by those of their cells."""
+    return [(min(a for a, _ in each), max(b for _, b in each)) for each in zip(*rows, strict=True)]
+
+
+def _overlap(columns: Sequence[tuple[int, int]]) -> bool:
+    return any(one[1] > two[0] for one, two in pairwise(columns))
 
 
 def _spans(line: str, row: Sequence[str]) -> list[tuple[int, int]]:

@@ -192,11 +192,15 @@ _OF_UNCERTAINTY = re.compile(
 )
 """The beginning of a line of uncertainties."""
 
+_COUNTED = (
+    r"(?:m?v(?:olts?)?|в|мв|lsb|cnts?|counts?|digits?|bits?|cuentas?|contage[mn]s?|zahlwert\w*|ink\w*|tell\w*|"
+    r"отсч\w*|код\w*|ед\w*|码\w?|计数)"
+)
+"""Volts and counts, of which a channel has so many to a unit, or a unit so many."""
 _OF_A_UNIT = re.compile(
     r"(?:(?:^|[(\[,;:])\s*1|(?<![^\W\d_])(?:unit\w*|unidade?|einheit|enhet|enhed|eenheid|jednostka|единиц\w*)|单位)"
     rf"\s*(?:{_WRITTEN_UNIT}|[gг])\s*[=≙≈]\s*(?:{_WRITTEN_NUMBER})\s*(?:{_WRITTEN_UNIT})|"
-    r"(?<![\w.,])1\s*(?:m?v(?:olts?)?|в|мв|lsb|cnts?|counts?|digits?|bits?|cuentas?|contage[mn]s?|"
-    r"zahlwert\w*|ink\w*|tell\w*|отсч\w*|код\w*|ед\w*|码\w?|计数)\.?\s*"
+    rf"(?<![\w.,])1\s*{_COUNTED}\.?\s*"
     rf"[=≙≈:]\s*(?:{_WRITTEN_NUMBER})\s*(?:{_WRITTEN_UNIT})"
 )
 """Definition of a unit: 1 g = 9.80665 m/s²; the size of a volt or of a count: 1 V = 20 µT."""
@@ -252,7 +256,8 @@ _UNIT_ALONE = re.compile(rf"(?<![^\W\d_])({_WRITTEN_UNIT})(?![^\W\d_])")
 _NO_PLACE = re.compile(
     rf"{_UNSURE.pattern}|"
     r"horizont\w*|poziom\w*|pionow\w*|skladow\w*|slozk\w*|vertical\w*|vertik\w*|compon\w*|kompon\w*|north|nord|"
-    r"south|sud|coil\w*|spule\w*|scale|sens\w*|full|"
+    r"south|sud|coil\w*|spule\w*|scale|scaling|sens\w*|full|skal\w*|empfind\w*|escala|følsom\w*|folsom\w*|"
+    r"масштаб\w*|чувств\w*|коэфф\w*|比例|"
     r"measured|\bmeas\b|mean|average|\bavg|mittel|gemessen|malt|medid\w*|mesur\w*|media|medio|moyen\w*|средн\w*|"
     r"измер\w*|"
     r"vibr\w*|shock|\brms\b|"
@@ -642,7 +647,7 @@ def _line(row: Sequence[object]) -> str:
 def _clauses(row: Sequence[object]) -> str:
     """The cells of a row in small letters, a semicolon behind each that ends a statement: a number with its unit."""
     text, ends = "", False
-    each = (_SENTENCE.sub("; ", as_text(cell)) for cell in row)
+    each = (_IN_SIXTIETHS.sub(_with_signs, _SENTENCE.sub("; ", as_text(cell))) for cell in row)
     cells = [*filter(None, (_DAY_OR_MODEL.sub(" ", _plain(text)).strip() for text in each))]
     if len(cells) == 2 and re.fullmatch(r"[fbi]", cells[0]):
         cells.insert(1, "=")
@@ -664,6 +669,17 @@ _SENTENCE = re.compile(
     r"(?:(?<=[^\W\d_]{5})|(?<=\d)|(?<=\d [^\W\d_]{2}))\.\s+(?=[^\W\d_a-zа-яß-ÿ])"
 )
 """The end of a sentence: a point behind a whole word or a number with its unit, and a capital letter."""
+
+
+_IN_SIXTIETHS = re.compile(
+    r"(?<![\w.,+-])(?=\d\d[-:](?:1[3-9]|[2-5]\d)|(?:3[2-9]|[4-8]\d)[-:]\d\d)"
+    r"(?P<d>[0-8]\d)[-:](?P<m>[0-5]\d)(?:[-:](?P<s>[0-5]\d(?:[.,]\d+)?))?(?![\w:-])"
+)
+"""Degrees, minutes and seconds between dashes, which are no day: 70-24-00."""
+
+
+def _with_signs(match: re.Match[str]) -> str:
+    return f"{match['d']}° {match['m']}' {match['s'] or '00'}\""
 
 
 def _said_once(match: re.Match[str]) -> str:
@@ -774,6 +790,7 @@ def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
     """The value that a text states, in the unit of the run file, if it is one, and another right behind it."""
     between, behind = match["between"], match["behind"]
     rough = re.match(r"\W*(nomin|номин|标称|nenn|k\s?g\b)", behind) and not match["next"]
+    rough = rough or re.match(rf"\s*{_COUNTED}\s?/\s?(?=[gnuµmгнм])", behind)
     letter = "letter" in match.groupdict()
     if (
         rough
