@@ -351,6 +351,11 @@ def test_a_roll_test_on_another_sheet_of_the_run_is_that_of_the_run(tmp_path):
         (["Equipo", "MX-12"], {"serial": "MX-12"}),
         (["Roll stand cal. Tool S/N: HT-0092. Field 46510 nT"], {"serial": "HT-0092"}),
         (["Sensor: 24 V"], {}),
+        (["MWD sonde T-2209 tumble. Field 49830 nT"], {"serial": "T-2209"}),
+        (["Tool: DS 5 / 071  Tech: Ph. Ayre"], {"serial": "DS 5 / 071"}),
+        (["Журнал калибровки прибора ТС-12/3"], {"serial": "ТС-12/3"}),
+        (["Kalibrering H-90, Oslo"], {"serial": "H-90"}),
+        (["Calibration of tool MWD 2026"], {}),
         (["Calibration, tool serial MWD-5533, stand B"], {"serial": "MWD-5533"}),
     ],
 )

@@ -789,11 +789,12 @@ def _plain(text: str) -> str:
 def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
     """The value that a text states, in the unit of the run file, if it is one, and another right behind it."""
     between, behind = match["between"], match["behind"]
-    rough = re.match(r"\W*(nomin|номин|标称|nenn|k\s?g\b)", behind) and not match["next"]
-    rough = rough or re.match(rf"\s*{_COUNTED}\s?/\s?(?=[gnuµmгнм])", behind)
+    rough = bool(re.match(r"\W*(nomin|номин|标称|nenn|k\s?g\b)", behind)) and not match["next"]
+    counted = re.match(rf"\s*{_COUNTED}\s?/\s?(?=[gnuµmгнм])", behind)
     letter = "letter" in match.groupdict()
     if (
         rough
+        or counted
         or _OF_COMPONENT.search(between)
         or _UNSURE.search(between if letter else f"{match['word']} {between}")
     ):

@@ -115,6 +115,15 @@ _BEHIND_MODEL = re.compile(
     re.IGNORECASE,
 )
 """The word for the tool, its model, and its serial behind a mark: Sonde SD-9 n° 112."""
+_OF_CAPITALS = r"[A-ZА-Я]{1,5}\d{0,3}[-/]?\d[\w/-]*"
+_BY_NAME = re.compile(
+    rf"(?i:{_OF_TOOLS}|modul)(?i:[a-zа-яё]{{0,3}})\s*:?\s+"
+    rf"(?P<tool>{_OF_CAPITALS}|[A-ZА-Я]{{1,5}} (?!(?:19|20)\d\d\b)\d{{1,6}}(?:(?: / |-)\d+)?)(?![\w.,°-])"
+    r"(?!\s*(?i:n[°ºr]|no\b|№|s/?n))|"
+    r"^\W*(?i:\w*(?:kalibr|calibra|justier)\w*|(?:калибр|тариров|градуиров)\w*|标定|校准)\s+"
+    rf"(?P<run>{_OF_CAPITALS})(?![\w.°])"
+)
+"""A serial of capitals and digits behind a word for the tool or, where a line begins, for its calibration."""
 _WITH_MARK = re.compile(
     r"(?:(?<![^\W\d_])|(?<=[\u4e00-\u9fff]))(?:(?P<word>serial(?:[ -]?(?:number|num|no|nr))?|"
     r"(?:[^\W\d_]+-?)?serien?-?(?:nummer|nr)|"
@@ -198,7 +207,7 @@ def titles(rows: Sequence[Sequence[object]]) -> Titles:
         declination = _rotation(_DECLINATION, text) if declination is None else declination
         convergence = _rotation(_CONVERGENCE, text) if convergence is None else convergence
         true = true or bool(_TRUE_NORTH.search(text))
-        marked = _marked_in(" ; ".join(whole)) or _BEHIND_MODEL.findall(text)
+        marked = _marked_in(" ; ".join(whole)) or _BEHIND_MODEL.findall(text) or _named_in(text)
         for place, cell in enumerate(cells):
             key, value = _pair(cell, cells[place + 1 :])
             days |= dict.fromkeys(filter(None, [day_of(cell)]))
@@ -267,6 +276,16 @@ def _marked_in(text: str) -> list[str]:
         if not _OF_EQUIPMENT.search(re.split(r"[;,]|\.\s", text[: m.start()].rstrip(" ;,"))[-1])
     ]
     return [m["serial"] for m in every if m["word"]] or [m["serial"] for m in every]
+
+
+def _named_in(text: str) -> list[str]:
+    """The serials by which a line names the tool, where no mark says so.
+
+    >>> _named_in("MWD sonde T-2209 tumble"), _named_in("Kalibrering H-90, Oslo"), _named_in("Calibration 2026")
+    (['T-2209'], ['H-90'], [])
+    """
+    each = (m for m in _BY_NAME.finditer(text) if not _OF_EQUIPMENT.search(text[: m.start()]))
+    return [m["tool"] or m["run"] for m in each]
 
 
 def _tool(cell: str, right: Sequence[str]) -> str:
