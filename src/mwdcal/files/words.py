@@ -167,7 +167,7 @@ TRANSLATIONS = (
     (
         r"sollwerte?|sollwinkel|soll|\brig\b|referenz|referanse|(\b(de|di|do) )?(referencia|riferimento)|"
         r"(\bde )?reference|stand( settings?)?|"
-        r"(angulos? )?d[ae] (la )?(mesa|bancada)|эталон\w*|стенд|задан\w*|标准|参考|转台",
+        r"(angulos? )?d[ae] (la )?(mesa|bancada)|^(bancada|mesa|banco)\b|эталон\w*|стенд|задан\w*|标准|参考|转台",
         "ref ",
     ),
     (
