@@ -466,8 +466,9 @@ def test_a_triad_on_a_sheet_of_its_own_is_that_of_the_same_stations(tmp_path):
     """Angles and one triad on one sheet, the station and the other triad on the next."""
     rows = stations()
     book = openpyxl.Workbook()
-    book.active.append(TITLES[0])
+    book.active.append(["Field (nT)", 50000, "", "Serial", "AB-12"])
     first, other = book.create_sheet("Acc"), book.create_sheet("Mag")
+    other.append(["Dip (deg)", 63])  # of the references one sheet states one
     first.append(
         ["Station", "Inc (°)", "Azi (°)", "TF (°)", "Gx (V)", "Gy (V)", "Gz (V)", "Temp (°C)"]
     )
@@ -478,6 +479,7 @@ def test_a_triad_on_a_sheet_of_its_own_is_that_of_the_same_stations(tmp_path):
         other.append([n, *row[6:9]])
     book.save(tmp_path / "run.xlsx")
     run = taken(tmp_path / "run.xlsx")
+    assert run.metadata["ref_dip_deg"] == 63
     order = np.argsort(tables.numbers(run, "station"))
     assert np.allclose(
         [tables.numbers(run, name)[order] for name in COLUMNS],

@@ -391,7 +391,8 @@ WORDS_OF_THE_FIELD = {
     "Accelerometers Gx (V)": "ax", "Magnetometers Hy (nT)": "my", "Accéléromètre Z (g)": "az", "Z (mg)": "az",
     "X (nT)": "mx", "Mag. X (G)": "mx", "Température (°С)": "temperature_c", "Face outil (°)": "ref_toolface_deg",
     "Mergulho (°)": "ref_dip_deg", "Feltinklinasjon (grader)": "ref_dip_deg", "地磁倾角(°)": "ref_dip_deg",
-    "Т, град С": "temperature_c", "Bancada Azimute mag. (graus)": "ref_azimuth_deg", "ax_mg_mean": "ax", "mx_uT_std": "sd_mx", "mag_x_cuentas": "mx",
+    "Т, град С": "temperature_c", "Gref": "ref_gravity_g", "Bancada Azimute mag. (graus)": "ref_azimuth_deg",
+    "ax_mg_mean": "ax", "mx_uT_std": "sd_mx", "mag_x_cuentas": "mx",
     "参考总磁场/Gs": "ref_field_nt",
 
 

@@ -62,7 +62,7 @@ TITLES = {
     "scales": [
         ["Skalierung Magnetfeld", "0,5 Digit/nT"],
         ["Feldstärke", "48912 nT"],
-        ["Dip", "66-15-00"],
+        ["Feldneigung", "66-15-00"],
         ["g", "9,8123 m/s²"],
     ],
     "sentences": [

@@ -138,7 +138,8 @@ _INSTEAD = {
     "ref_azimuth_deg": "azi azm azim azimut azimuth hdg heading bearing",
     "ref_toolface_deg": "tf gtf hs hstf tface toolface highside highsidetoolface highsidetf "
     "gravitytoolface roll rollangle hsg rotation",
-    "ref_gravity_g": "gravity gtotal gtot totalg totalgravity gravitytotal gravityfield tgf gt localg localgravity",
+    "ref_gravity_g": "gravity gtotal gtot totalg totalgravity gravitytotal gravityfield tgf gt gref localg "
+    "localgravity",
     "ref_field_nt": "btotal btot totalb htotal htot totalh bt tmf tfield bfield hfield totalfield "
     "fieldtotal fieldstrength magtotal totalmag tmi bref href fref",
     "ref_dip_deg": "dip magdip mdip",

@@ -196,6 +196,8 @@ def apart(name: str, cells: Sequence[object]) -> tuple[list[str], list[list[str]
 
     >>> apart("Inc/Azi (deg)", ["30/90", "45/180"]), apart("G xyz", ["(0.1, 0.2, 0.9)"])[0], apart("Day", ["1/2"])
     ((['Inc (deg)', 'Azi (deg)'], [['30', '45'], ['90', '180']]), ['G x', 'G y', 'G z'], (['Day'], []))
+    >>> apart("Stand (inc/azi), °", ["30/90"])
+    (['inc °', 'azi °'], [['30'], ['90']])
     """
     if not any(_names_apart(name, count) for count in (2, 3)):
         return [name], []
@@ -219,6 +221,10 @@ def _names_apart(name: str, count: int) -> list[str]:
     if count == 3 and (axes := _OF_AXES.fullmatch(name)):
         return [f"{axes[1]} {axis}{axes[2]}".strip() for axis in "xyz"]
     head, unit = _UNIT_LAST.fullmatch(name).groups("")  # type: ignore[union-attr]
+    if inner := re.fullmatch(
+        r"[^()\[\]]*[(\[]([^()\[\]]*[/;|][^()\[\]]*)[)\]],?\s*(\S{0,4})", name
+    ):
+        head, unit = inner.groups()
     each = [part.strip() for part in re.split(r"[/;|,]", head)]
     named = len(each) == count and all(each) and not any(map(unit_of, each))
     return [f"{part} {unit}".strip() for part in each] if named else []

@@ -325,9 +325,15 @@ def _of_stations(tool: Layout, stand: Layout) -> Layout | None:
                 units=[*tool.units, *(stand.units[k] for k in more)],
                 cells=[*tool.cells, *([stand.cells[k][row] for row in rows] for k in more)],
                 texts=[*tool.texts, *([stand.texts[k][row] for row in rows] for k in more)],
+                titles=_titles_of_both(tool, stand),
                 remarks=(*tool.remarks, said),
             )
     return None
+
+
+def _titles_of_both(one: Layout, other: Layout) -> Titles:
+    """What stands above the first of two tables that are one, and what the other adds to it."""
+    return one.titles._replace(metadata={**other.titles.metadata, **one.titles.metadata})
 
 
 def _shared(one: Layout, other: Layout) -> tuple[set[str], set[str]]:
@@ -373,6 +379,7 @@ def _side_by_side(one: Layout, other: Layout) -> Layout:
         cells=[*one.cells, *(other.cells[k] for k in more)],
         texts=[*one.texts, *(other.texts[k] for k in more)],
         fractions=tuple(dict.fromkeys([*one.fractions, *other.fractions])),
+        titles=_titles_of_both(one, other),
         left_out=(*one.left_out, *other.left_out),
         remarks=(*one.remarks, *other.remarks, said),
     )

@@ -61,7 +61,7 @@ _OF_PLACES = (
         r"(mag\w*|local|field) (dip|inclination)( angle)?|dip( angle)?|dipref|복각|magn\w* kaltevuus|inklinaatio|"
         r"magn\w* inklinace|manyetik egim|magn\w* inklinacio|伏角|"
         r"inklinacja( pola)?|inclinazione (magn\w*|del campo)|plongement|pendage|magn\w* inclinatie|"
-        r"(feld|feld-|magn\w* ?)?inklination|"
+        r"(feld|feld-|magn\w* ?)?inklination|(feld-?|magn\w* )neigung|"
         r"(felt|magn\w* ?)?inklinasjon|(felt|magn\w* ?)helning|mergulho( magn\w*)?|inclinaca?o (magn?\w*|do campo)|"
         r"inclinacion (magn\w*|del campo)|echado|buzamiento|inclinaison( magn\w*| du champ)?|"
         r"(магн\w* |угол )?накл(онени[ея])?\.?( мпз)?|(地)?磁倾角",
