@@ -82,7 +82,8 @@ def verdict(result: Diagnosis) -> str:
             return "no single fault explains these readings, and none is named"
         return "still fine: the readings are as the calibration says"
     if unexplained:
-        closest = [f"{each.fault}{_where(each)}" for each in (result, *result.rivals)]
+        suspects: list[Diagnosis | Rival] = [result, *result.rivals]
+        closest = [f"{each.fault}{_where(each)}" for each in suspects]
         return f"no single fault explains these readings; closest: {' or '.join(closest)}"
     causes = [_cause(result), *map(_cause, result.rivals)]
     if result.rivals:

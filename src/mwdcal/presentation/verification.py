@@ -56,8 +56,9 @@ def screen(
     lines = [
         "   ".join(first),
         f"limits {result.limits}{source}",
-        f"rule: {result.rule}{raw_rule(result)}",
+        f"rule: {result.rule}",
     ]
+    lines += filter(None, [raw_rule(result)])
     lines += [SETTING_PRACTICES[result.settings]] if result.settings in SETTING_PRACTICES else []
     if result.risk is not None:
         lines.append(f"{VERDICT_RISK}: {chance(result.risk)}")
