@@ -13,7 +13,7 @@ from mwdcal.calibration.record import Finding, SignatureCheck
 from mwdcal.presentation.numbers import capital, measured, quantity, unit
 from mwdcal.presentation.signature import signature_status
 from mwdcal.presentation.text import NOT_STATED, chance, one_line, table
-from mwdcal.use.verification import SETTING_PRACTICES, JudgedSet, Verdict, VerdictRow
+from mwdcal.use.verification import COVERAGE, SETTING_PRACTICES, JudgedSet, Verdict, VerdictRow
 
 FREEDOM = "DoF"
 """Title of a column of degrees of freedom."""
@@ -29,7 +29,7 @@ VERDICT_RISK = "risk of a wrong verdict, all roll sets and limits together"
 RAW_RULE = ". Marked raw: the raw figure counts, as readings are not smooth over toolface"
 """Addition to the decision rule where a raw figure was judged."""
 FAR = 3.0
-"""Values of more than this times their limit, in every roll set, point at the tool rather than at one station."""
+"""Values of more than this times their limit, in every roll set, point to the tool rather than to one station."""
 WHOSE = "first check: is it this tool, and was it knocked or changed since?"
 
 
@@ -108,10 +108,14 @@ def after_failure(
 
 
 def _far_everywhere(row: VerdictRow) -> bool:
-    """Whether a value is far beyond its limit in every roll set: no single station explains that."""
-    values = [each.value for each in row.sets]
-    smooth = len(values) > 1 or not row.judged_raw
-    return smooth and bool(values) and min(values) > FAR * row.limit
+    """Whether a value is far and clearly beyond its limit in every roll set: no single station explains that."""
+
+    def far(each: JudgedSet) -> bool:
+        doubt = 0.0 if each.judged_raw else COVERAGE * each.uncertainty
+        return each.value > max(FAR * row.limit, row.limit + doubt)
+
+    several = len(row.sets) > 1 or not row.judged_raw
+    return several and bool(row.sets) and all(map(far, row.sets))
 
 
 def _sets(result: Verdict) -> list[str]:
