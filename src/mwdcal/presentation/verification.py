@@ -28,7 +28,7 @@ VERDICT_RISK = "risk of a wrong verdict, all roll sets and limits together"
 
 RAW_RULE = ". Marked raw: the raw figure counts, as readings are not smooth over toolface"
 """Addition to the decision rule where a raw figure was judged."""
-FAR = 3.0
+FAR_BEYOND = 3.0
 """Values of more than this times their limit, in every roll set, point to the tool rather than to one station."""
 WHOSE = "first check: is it this tool, and was it knocked or changed since?"
 
@@ -112,7 +112,7 @@ def _far_everywhere(row: VerdictRow) -> bool:
 
     def far(each: JudgedSet) -> bool:
         doubt = 0.0 if each.judged_raw else COVERAGE * each.uncertainty
-        return each.value > max(FAR * row.limit, row.limit + doubt)
+        return each.value > max(FAR_BEYOND * row.limit, row.limit + doubt)
 
     several = len(row.sets) > 1 or not row.judged_raw
     return several and bool(row.sets) and all(map(far, row.sets))

@@ -441,20 +441,22 @@ def largest(value: Array, uncertainty: Array, errors: Array, rough: Bools | None
     bias, off = change.mean(-1), np.sqrt(np.mean(change**2, -1))
     place = np.argmax(np.where(smooth, value, -np.inf), -1)
     noise_free = np.maximum(_at(value, place) - bias, 0.0)
-    found = Largest(noise_free, off, place, change - bias[..., None])
-    return _or_raw(found, value, uncertainty, errors, raw) if raw.any() else found
+    without = Largest(noise_free, off, place, change - bias[..., None])
+    return _or_raw(without, value, uncertainty, errors, raw) if raw.any() else without
 
 
-def _or_raw(found: Largest, value: Array, uncertainty: Array, errors: Array, raw: Bools) -> Largest:
+def _or_raw(
+    without: Largest, value: Array, uncertainty: Array, errors: Array, raw: Bools
+) -> Largest:
     """The largest raw figure as it is, where it is larger than the one found among the others."""
     place = np.argmax(np.where(raw, value, -np.inf), -1)
-    more = raw.any(-1) & (raw.all(-1) | (_at(value, place) >= found.value))
+    more = raw.any(-1) & (raw.all(-1) | (_at(value, place) >= without.value))
     there = np.take_along_axis(errors, place[..., None, None], -1)[..., 0]
     return Largest(
-        np.where(more, _at(value, place), found.value),
-        np.where(more, _at(uncertainty, place), found.uncertainty),
-        np.where(more, place, found.place),
-        np.where(more[..., None], there, found.errors),
+        np.where(more, _at(value, place), without.value),
+        np.where(more, _at(uncertainty, place), without.uncertainty),
+        np.where(more, place, without.place),
+        np.where(more[..., None], there, without.errors),
     )
 
 
