@@ -403,7 +403,7 @@ def render(plans: Sequence[Planned]) -> str:
         rows=rows,
         soaks=any(begins for _, begins in rows),
         settings=SETTING_WORDS.get(str(first.calibration.settings), ""),
-        asks_settings=first.calibration.settings in ("", ASSUMED_PRACTICE),
+        asks_settings=not first.calibration.profile.stand.practice,
         compared=comparison_rows(summaries),
         plans=[each.plan for each in summaries],
         accuracy=accuracy_rows(summaries[0]),

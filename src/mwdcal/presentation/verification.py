@@ -26,8 +26,8 @@ REFERENCES_OF = {
 BETWEEN_SETS = "stations outside of roll sets"
 VERDICT_RISK = "risk of a wrong verdict, all roll sets and limits together"
 
-RAW_RULE = ". Marked raw: the raw figure counts, as readings are not smooth over toolface"
-"""Addition to the decision rule where a raw figure was judged."""
+RAW_RULE = "Marked raw: the raw figure counts, as readings are not smooth over toolface"
+"""The line under the decision rule where a raw figure was judged."""
 FAR_BEYOND = 3.0
 """Values of more than this times their limit, in every roll set, point to the tool rather than to one station."""
 WHOSE = "first check: is it this tool, and was it knocked or changed since?"
@@ -135,7 +135,7 @@ def _sets(result: Verdict) -> list[str]:
 
 
 def raw_rule(result: Verdict) -> str:
-    """The addition to the decision rule if a raw figure was judged, else nothing."""
+    """The line under the decision rule if a raw figure was judged, else nothing."""
     return RAW_RULE * any(row.judged_raw for row in result.rows)
 
 
