@@ -193,12 +193,15 @@ def _gauges(
 
 
 def _judged(row: VerdictRow) -> AngleGauge:
-    """The gauge of a limit that was tested; a raw figure has no ±, as scatter that is not noise has no U."""
-    known = row.uncertainty is not None and not row.judged_raw
+    """The gauge of a limit that was tested; a raw figure beyond it has no ±, as its scatter is not noise."""
+    beyond = row.judged_raw and not row.passed
+    known = row.uncertainty is not None and not beyond
     expanded = coverage_of(row.freedom) * (row.uncertainty or 0.0) if known else None
     shown = "not stated" if row.value is None else estimate(row.value, expanded, row.unit)
-    if row.judged_raw:
+    if beyond:
         shown, _ = noise_free(row, row.unit)
+    elif row.judged_raw:
+        shown += " raw"
     outcome = ("good", "pass") if row.passed else ("bad", "FAIL")
     return _gauge(row.name, shown, row.value, expanded, row.limit, row.unit, outcome)
 
