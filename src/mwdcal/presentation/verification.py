@@ -114,8 +114,9 @@ def _far_everywhere(row: VerdictRow) -> bool:
         doubt = 0.0 if each.judged_raw else COVERAGE * each.uncertainty
         return each.value > max(FAR_BEYOND * row.limit, row.limit + doubt)
 
+    rolled = bool(row.sets) and all(each.coefficients is not None for each in row.sets)
     several = len(row.sets) > 1 or not row.judged_raw
-    return several and bool(row.sets) and all(map(far, row.sets))
+    return rolled and several and all(map(far, row.sets))
 
 
 def _sets(result: Verdict) -> list[str]:
