@@ -314,6 +314,8 @@ def test_a_single_reading_and_many(tmp_path, calibration):
     ran, path = applied(tmp_path, calibration, many, name="many.csv")
     assert ran.out.startswith("20000 rows corrected")
     np.testing.assert_allclose(numbers(read_csv(path)["inclination_deg"]), inc / DEG, atol=1e-5)
+    least, largest = inc.min() / DEG, inc.max() / DEG
+    assert f"inclination {least:.2f}° to {largest:.2f}°" in ran.out
 
 
 def test_zero_readings_give_no_numbers_out_of_thin_air(tmp_path, perfect):

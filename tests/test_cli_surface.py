@@ -290,8 +290,13 @@ def test_json_of_calibrate_holds_the_numbers_of_the_text(tmp_path):
 def test_json_of_apply_holds_the_numbers_of_the_text(tmp_path, files):
     arguments = ("apply", *files, "-o", tmp_path / "out.csv")
     said, told = mwdcal(*arguments), mwdcal(*arguments, "--json").json
+    ranges = "   ".join(
+        f"{name} {each['least_deg']:.2f}° to {each['largest_deg']:.2f}°, 1σ at most {each['sd_deg']:#.2g}°"
+        for name, each in told["angles"].items()
+    )
     assert said.out == (
         f"{told['rows']} rows corrected   wrote {told['output']}   unsigned calibration\n"
+        f"{ranges}\n"
         f"1σ: {', '.join(told['error_terms'])}. Not in it: {', '.join(told['not_included'])}.\n"
     )
     assert said.err == "".join(f"! {f['text']}\n" for f in told["findings"])

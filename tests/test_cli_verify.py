@@ -191,12 +191,24 @@ def test_the_guarded_rule_takes_twice_the_uncertainty_off(tmp_path, fitted):
 NUMBERS = ("raw", "value", "uncertainty", "limit")
 
 
+@pytest.mark.parametrize(("knock", "asked"), [(40e-3, True), (3.5e-3, False)])
+def test_a_tool_far_beyond_its_limits_is_doubted_before_the_readings(
+    tmp_path, fitted, knock, asked
+):
+    """Across the axis at 45°: a spread of 2 · 40 mg · cos 45° = 3.2°, or 0.28°, where the limit is 0.1°."""
+    said = mwdcal("verify", fitted[0], roll(tmp_path, ax=lambda r: r["ax"] + knock * SCALE[0]))
+    first = next(line for line in said.out.splitlines() if "measure again: " in line)
+    assert said.code == 1
+    assert first.startswith("first check: is it this tool") is asked
+
+
 def test_the_text_holds_the_numbers_of_the_json(tmp_path, fitted):
     run = roll(tmp_path, ax=lambda r: r["ax"] + 5e-3 * SCALE[0])
     said = mwdcal("verify", fitted[0], run)
     assert said.code == 1
     assert said.out.startswith("FAIL   roll.csv   12 stations")
-    lines = [" ".join(line.split()) for line in said.out.splitlines()]
+    text = " ".join(said.out.split())
+    assert max(map(len, said.out.partition("where")[2].partition("\n\n")[0].splitlines())) <= 100
     for name, row in judged(fitted[0], run).items():
         gap = "" if row["unit"] == "°" else " "
         numbers = [f"{row[k]:.3g}{gap}{row['unit']}" for k in NUMBERS]
@@ -205,7 +217,8 @@ def test_the_text_holds_the_numbers_of_the_json(tmp_path, fitted):
             numbers[where] = f"{row[key]:.{places}f}{gap}{row['unit']}"
         numbers.insert(3, "∞")  # degrees of freedom of a declared noise
         word = "pass" if row["passed"] else "FAIL"
-        assert f"{name} {' '.join(numbers)} {word} {row['note']}" in lines
+        assert f"{name} {' '.join(numbers)} {word}" in text
+        assert f"{name} {row['note']}" in text
 
 
 @pytest.mark.parametrize("toolfaces", [[40] * 12, [0, 5, 10]], ids=["one", "three close ones"])

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from importlib import resources
 
 import numpy as np
 import pytest
@@ -31,7 +32,7 @@ from mwdcal.geometry.vectors import reference_vectors, tool_from_earth
 from mwdcal.planning import plans
 from mwdcal.planning.plans import Effects, FaultEffect, load_effects
 from mwdcal.sensor.profile import Datasheet, Profile, TriadProfile
-from simulation import Tool
+from simulation import DEG, Tool
 
 PLAN = plans.grid([5, 45, 90, 135], 6, [0, 90, 180, 270], [20.0, 90.0])
 ROLL = plans.grid([5, 45, 90], 4, [0, 120, 240], [90.0])
@@ -446,6 +447,28 @@ def test_channels_have_their_own_names_and_signs(tmp_path):
     assert abs(bias["size"] + 1e3 * truth["fault"]["bias"][0]) < 4 * bias["uncertainty"]
 
 
+def test_a_turned_axis_is_named_by_the_channel_towards_which_it_turned(tmp_path):
+    """A tool whose ax measures y and whose ay measures -x: ay then reads a part of what ax reads."""
+    profile = (resources.files("mwdcal.profiles") / "servo.toml").read_text("utf-8")
+    odd = profile.replace('axes = ["+x", "+y", "+z"]', 'axes = ["+y", "-x", "+z"]', 1)
+    (tmp_path / "odd.toml").write_text(odd, "utf-8")
+    tool, share = Tool.random(1, noise=SERVO_NOISE), np.sin(0.5 * DEG)
+
+    def exchanged(columns, turn=0.0):
+        ax, ay = columns["ay"], -columns["ax"]
+        return {**columns, "ax": ax, "ay": ay + turn * ax}
+
+    write_csv(tmp_path / "run.csv", exchanged(servo_run(1, tool=tool)), "serial = A")
+    later = exchanged(servo_run(2, (30, 80), 6, tool=tool), share)
+    write_csv(tmp_path / "later.csv", later, "serial = A")
+    fit = ("calibrate", tmp_path / "run.csv", "--tool", tmp_path / "odd.toml")
+    assert command(*fit, "-o", tmp_path / "cal.json").code == 0
+    ran = command("diagnose", tmp_path / "cal.json", tmp_path / "later.csv", "--json")
+    turned = {row["parameter"]: row["size"] for row in ran.json["parameters"]}
+    assert (ran.json["fault"], ran.json["channel"]) == ("impact", "ay")
+    assert turned["axis turned towards ax"] == pytest.approx(0.5, rel=0.1)
+
+
 @pytest.mark.parametrize(
     "text", ['kind = "heat"\nchannel = "ax"', 'kind = "dead-channel"\nchannel = "accelerometer"']
 )
@@ -469,5 +492,7 @@ def test_a_run_of_the_tests_own_model_is_still_fine(tmp_path):
     ran = command("diagnose", tmp_path / "cal.json", tmp_path / "other.csv")
     assert ran.code == 1
     assert ran.out.startswith("no single fault explains these readings; closest: ")
+    assert "±" not in ran.out.partition("\n")[0]
+    assert "if it were one of these alone" in ran.out
     assert "do not use" not in ran.out
     assert "no single fault explains" in ran.err

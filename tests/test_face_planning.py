@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import mwdcal
-from cli_support import EXAMPLE, numbers, read_csv, refused
+from cli_support import EXAMPLE, numbers, read_csv, refused, servo_run, write_csv
 from cli_support import mwdcal as command
 from mwdcal.calibration.options import FitChoices, Options, SeedlessFitChoices
 from mwdcal.files.formats import table as tables
@@ -306,3 +306,22 @@ def test_a_plan_that_gives_no_calibration_is_refused_as_by_the_command():
     with pytest.raises(mwdcal.FitError) as caught:
         mwdcal.plan("servo", plan="roll-test", method="scalar")
     assert str(caught.value).split("`")[0] in refused(ran, 3)
+
+
+def test_a_plan_from_a_calibration_is_at_its_place_and_temperature_and_says_what_was_asked(
+    tmp_path,
+):
+    """The gravity of the sheet has six digits; the file keeps all of them."""
+    columns = servo_run(1, (5, 45, 90), 8, temperatures=(21.8,))
+    columns["ref_gravity_g"] = np.full(len(columns["ax"]), 0.997853497372)
+    run = write_csv(tmp_path / "run.csv", columns, "serial = A")
+    command("calibrate", run, "--tool", "servo", "-o", tmp_path / "cal.json")
+    files = "-o", tmp_path / "plan.csv", "--report", tmp_path / "sheet.html"
+    command("plan", "--stations", 24, "--tool", tmp_path / "cal.json", *files)
+    assert (tmp_path / "plan.csv").read_text("utf-8").startswith('# plan = "best 24 stations"\n')
+    rows = read_csv(tmp_path / "plan.csv")
+    assert set(rows["temperature_c"]) == {"22.0"}
+    assert set(rows["ref_gravity_g"]) == {"0.997853497372"}
+    sheet = (tmp_path / "sheet.html").read_text("utf-8")
+    assert "<dd>0.997853</dd>" in sheet
+    assert "per direction / at every station" in sheet

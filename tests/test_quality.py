@@ -316,7 +316,24 @@ def test_a_station_that_moved_is_judged_as_it_is(record):
         "spread of inclination"
     ]
     assert row.value == row.raw > 0.2
+    assert row.judged_raw
     assert "raw figure judged" in row.note
+
+
+def test_nothing_is_taken_off_the_raw_figure_of_two_sets_that_are_not_smooth(record):
+    """One reading of each set off by 0.3°. Neither set alone passes 0.25°, so both together do not."""
+    test = several(2, 1, 0.0, record)
+    bent = test.accelerometer.copy()
+    bent[[4, 16], 2] += 0.4 * DEG
+    spread = Limits(name="t", spread=Bounds(inclination_deg=0.25))
+    result = verify(record, msgspec_replace(test, accelerometer=bent), spread)
+    (row,) = result.rows
+    assert [each.judged_raw for each in row.sets] == [True, True]
+    assert row.value == max(each.raw for each in row.sets) > row.limit
+    assert not row.passed
+    assert "taken off" not in row.note
+    assert "not-smooth" in ids(result)
+    assert "weak-test" not in ids(result)
 
 
 def test_a_test_too_noisy_for_its_limit_is_a_finding(record):

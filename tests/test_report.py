@@ -106,6 +106,7 @@ class Row:
     note: str = "roll set 1; stations 3 to 9"
     sets: list = field(default_factory=list)
     degrees_of_freedom: float | None = 8.0
+    judged_raw: bool = False
 
     @property
     def freedom(self):
@@ -262,6 +263,17 @@ def test_gauges_show_value_and_expanded_uncertainty_against_the_limit(whole):
     assert azimuth.span[1] / azimuth.bound == pytest.approx(0.9 + 0.2776, rel=1e-3)
     assert {each.word for each in (inclination, toolface)} == {"not tested"}
     assert inclination.bound is None
+
+
+def test_a_raw_figure_beyond_its_limit_has_a_gauge_without_uncertainty(whole):
+    """Beyond its limit: scatter that is not noise has no U, and 13 times 1σ would hide the decision."""
+    row = Row(value=0.73, uncertainty=0.6, limit=0.1, degrees_of_freedom=1.0, judged_raw=True)
+    *_, azimuth = calibration_page._gauges(whole, Outcome(False, [row]), None)
+    assert azimuth.shown == "0.73° raw"
+    assert azimuth.span == pytest.approx((azimuth.value, azimuth.value))
+    met = replace(row, value=0.05, uncertainty=0.006, passed=True)
+    *_, azimuth = calibration_page._gauges(whole, Outcome(True, [met]), None)
+    assert azimuth.shown == "0.050 ± 0.076° raw"  # t(95 %, 1) = 12.71 of a table
 
 
 def test_every_limit_that_is_not_met_has_a_gauge(whole):

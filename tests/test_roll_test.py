@@ -220,6 +220,26 @@ def test_the_largest_of_equal_figures_has_little_bias_left(count):
     assert 0.85 < np.sqrt(np.mean(departure**2)) < 1.15
 
 
+def test_a_raw_figure_stays_as_it_is_and_changes_no_other():
+    """By hand: without the raw figure of 1σ = 0.5 the others are what they are alone."""
+    rng = np.random.default_rng(3)
+    value, sd = np.array([1.0, 1.0, 0.98]), np.array([0.05, 0.05, 0.5])
+    errors = sd * rng.normal(size=(1000, 3))
+    errors -= errors.mean(0)
+    rough = np.array([False, False, True])
+    alone = largest(value[:2], sd[:2], errors[:, :2])
+    found = largest(value, sd, errors, rough)
+    assert (found.value, found.uncertainty) == (0.98, 0.5)  # alone: less than 0.98
+    assert alone.value < 0.98
+    smaller = np.array([1.0, 1.0, 0.5])
+    found = largest(smaller, sd, errors, rough)
+    assert (found.value, found.uncertainty) == (alone.value, alone.uncertainty)
+    batch = largest(np.stack([value, smaller]), np.stack([sd, sd]), np.stack([errors] * 2),
+                    np.stack([rough, rough]))  # fmt: skip
+    assert batch.value == pytest.approx([0.98, alone.value])
+    assert batch.place.tolist() == [2, 0]
+
+
 def test_the_largest_of_figures_far_apart_is_the_largest():
     rng = np.random.default_rng(8)
     errors = 0.01 * rng.normal(size=(1000, 3))

@@ -315,7 +315,7 @@ class _Worker:
             rows, corrected.beyond, (), rows - table.count, self._serials(part.carried),
             strengths.judged(self.calibration, columns, known),
             correction.warmth(*channels.get("temperature", [None])), {}, valueless,
-            correction.scatters(self.calibration, readings, columns),
+            correction.scatters(self.calibration, readings, columns), correction.angle_ranges(columns),
         )  # fmt: skip
         return rendered, part.size, tally
 
@@ -452,13 +452,14 @@ WHOLE = (".xlsx", *EXCHANGED)
 class Applied(msgspec.Struct, frozen=True, kw_only=True):
     """The result for a table: its rows, those without results, and the table that was written.
 
-    `error_terms` are in the standard uncertainties of the table, `not_included` are not; both are empty where it
-    has none.
+    `angles`: ranges of inclination and azimuth. `error_terms` are in the standard uncertainties of the table,
+    `not_included` are not; both are empty where it has none.
     """
 
     rows: int
     blank: int
     output: str
+    angles: dict[str, correction.AngleRange] = {}
     error_terms: list[str] = []
     not_included: list[str] = []
     findings: list[Finding]

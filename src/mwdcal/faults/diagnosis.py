@@ -543,8 +543,9 @@ def _moved(
         spread = float(np.sqrt(variance))
         if spread > BLIND:
             continue
+        towards = channel_name(calibration, term.towards)
         row = Moved(
-            parameter=term.name,
+            parameter=" ".join(filter(None, [term.name, towards])),
             channel=channel_name(calibration, term.channel),
             size=float(_polarity(calibration, term) * value * usual),
             uncertainty=float(spread * usual),
@@ -582,8 +583,12 @@ def channel_name(calibration: Calibration, component: int | None) -> str | None:
 
 
 def _polarity(calibration: Calibration, term: FaultTerm) -> float:
-    """Sign of a channel along its tool axis, for sizes that change with it."""
-    if term.channel is None or not term.name.startswith(("bias", "constant")):
+    """Sign of a channel along its tool axis, for sizes that change with it; of a turn, times that of the other."""
+
+    def sign(component: int) -> float:
+        triad = list(CHANNELS)[component // 3]
+        return float(getattr(calibration.profile, triad).permutation[component % 3].sum())
+
+    if term.channel is None or not term.name.startswith(("axis", "bias", "constant")):
         return 1.0
-    triad = list(CHANNELS)[term.channel // 3]
-    return float(getattr(calibration.profile, triad).permutation[term.channel % 3].sum())
+    return sign(term.channel) * (1.0 if term.towards is None else sign(term.towards))

@@ -72,13 +72,14 @@ SIZE_RANGE = (0.5, 1.5)
 class FaultTerm(NamedTuple):
     """One size that a fault has: its name, unit, what one of our units is in it, and the channel, if it has one.
 
-    `channel` counts components of both triads from 0.
+    `channel` counts components of both triads from 0; so does `towards`, the component to which an axis turns.
     """
 
     name: str
     unit: str
     factor: float
     channel: int | None = None
+    towards: int | None = None
 
 
 @dataclass(frozen=True)
@@ -184,9 +185,7 @@ def _term(name: str, place: int, field_unit: float) -> FaultTerm:
     """Name and unit of one elementary departure."""
     if name == "turn":
         channel, towards = ACROSS[place]
-        return FaultTerm(
-            f"axis turned towards {AXIS_NAMES[towards % 3]}", "°", np.degrees(1.0), channel
-        )
+        return FaultTerm("axis turned towards", "°", np.degrees(1.0), channel, towards)
     if name in ("iron", "disturbance"):
         axis = AXIS_NAMES[place] if name == "iron" else ("north", "east", "down")[place]
         return FaultTerm(f"field {'along ' if name == 'iron' else ''}{axis}", "nT", 1 / field_unit)

@@ -161,7 +161,7 @@ def plan(
     """
     from mwdcal.planning import planned
     from mwdcal.planning.planned import Stand
-    from mwdcal.planning.plans import at_place_of
+    from mwdcal.planning.plans import at_place_of, at_temperature_of
 
     several = plan if isinstance(plan, list | tuple) else [] if plan is None else [plan]
     if len(several) > 1 and (accuracy_deg or stations or measured is not None):
@@ -176,7 +176,8 @@ def plan(
     done = None if measured is None else _measured(measured, profile)
     if isinstance(tool, Calibration) and done is None:
         usual = "candidates" if accuracy_deg or stations else "twenty-four-state"
-        tables = [at_place_of(each, tool) for each in tables or [plan_table(usual)]]
+        tables = tables or [at_temperature_of(plan_table(usual), tool)]
+        tables = [at_place_of(each, tool) for each in tables]
     candidates = tables[0] if tables else None
     if accuracy_deg:
         result = [

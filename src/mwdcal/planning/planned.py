@@ -519,9 +519,9 @@ class Search:
         new = new[np.argsort(soak_numbers(taken(self.plan, new)), kind="stable")]
         some = taken(self.plan, new)
         new = new[measuring_order(self.stand.settings(attitudes(some)), soak_numbers(some))]
-        plan = replace(
-            taken(self.plan, new), source=f"Best {len(new)} station{'s' * (len(new) > 1)}"
-        )
+        chosen, count = taken(self.plan, new), f"{len(new)} station{'s' * (len(new) > 1)}"
+        stated = {**chosen.metadata, "plan": f"best {count}"}
+        plan = replace(chosen, source=f"Best {count}", metadata=stated)
         whole = taken(self.plan, np.append(design.chosen[: self.before], new))
         options = replace(self.options or Options(), order=self.choice.options.order)
         return Planned.of(

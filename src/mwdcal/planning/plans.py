@@ -264,6 +264,14 @@ def at_place_of(plan: Table, calibration: Calibration) -> Table:
     return replace(plan, columns={**plan.columns, **place})
 
 
+def at_temperature_of(plan: Table, calibration: Calibration) -> Table:
+    """A plan at the temperature, in whole degrees, of a calibration that has no temperature terms."""
+    if calibration.thermal or calibration.temperature_c is None:
+        return plan
+    warmth = np.full(plan.count, float(round(np.mean(calibration.temperature_c))))
+    return replace(plan, columns={**plan.columns, "temperature_c": warmth})
+
+
 def soak_temperatures(plan: Table) -> Array:
     """The mean temperatures of the soaks of a plan, ascending, °C."""
     temperature = np.asarray(plan.columns.get("temperature_c", ()), float)

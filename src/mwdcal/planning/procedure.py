@@ -414,7 +414,8 @@ class _Seen:
             one = roll_test.figure(part, curve, noise, error, roll_test.drawn(curve, name, first))
             common = self.nominal.common_errors(name, references[k], first)
             errors = one.errors + one.side[:, None] * common
-            figures.append((one.value, np.hypot(one.uncertainty, references[k].shared), errors))
+            whole = np.hypot(one.uncertainty, references[k].shared)
+            figures.append((one.value, whole, errors, one.rough))
         worst = roll_test.largest(*(np.stack(each, -1) for each in zip(*figures, strict=True)))
         return worst.value * limit.factor, worst.uncertainty * limit.factor
 

@@ -45,7 +45,13 @@ from mwdcal.presentation.numbers import (
 from mwdcal.presentation.page import banner, environment
 from mwdcal.presentation.text import plural, raised
 from mwdcal.presentation.typed import findings_with_option_names, leading_findings
-from mwdcal.presentation.verification import BETWEEN_SETS, after_failure, freedom, noise_free
+from mwdcal.presentation.verification import (
+    BETWEEN_SETS,
+    after_failure,
+    freedom,
+    noise_free,
+    raw_rule,
+)
 from mwdcal.use import plots
 from mwdcal.use.notation import Notation, convert
 from mwdcal.use.verification import SETTING_PRACTICES, fewest_degrees_of_freedom
@@ -106,6 +112,7 @@ def render(
         kinds=_kinds(verdict),
         drifts=list(map(capital, unseen_remarks(calibration))),
         settings=SETTING_PRACTICES,
+        raw_rule=raw_rule(verdict) if verdict else "",
         outside=BETWEEN_SETS,
         titles=TITLES,
         large=LARGE_RATIO,
@@ -186,9 +193,15 @@ def _gauges(
 
 
 def _judged(row: VerdictRow) -> AngleGauge:
-    """The gauge of a limit that was tested."""
-    expanded = None if row.uncertainty is None else coverage_of(row.freedom) * row.uncertainty
+    """The gauge of a limit that was tested; a raw figure beyond it has no ±, as its scatter is not noise."""
+    beyond = row.judged_raw and not row.passed
+    known = row.uncertainty is not None and not beyond
+    expanded = coverage_of(row.freedom) * (row.uncertainty or 0.0) if known else None
     shown = "not stated" if row.value is None else estimate(row.value, expanded, row.unit)
+    if beyond:
+        shown, _ = noise_free(row, row.unit)
+    elif row.judged_raw:
+        shown += " raw"
     outcome = ("good", "pass") if row.passed else ("bad", "FAIL")
     return _gauge(row.name, shown, row.value, expanded, row.limit, row.unit, outcome)
 

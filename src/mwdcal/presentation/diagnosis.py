@@ -37,8 +37,10 @@ NOT_YET = "do not judge the tool by these readings alone"
 """The advice where no single fault explains readings, of surveys, and where a sound tool is not excluded."""
 LEAST_LIKELIHOOD = 0.0005
 """Likelihoods below are shown as less than this."""
-MOVED_TITLES = ["moved", "channel", "by", "1σ", "unit"]
-"""Titles of the table of sizes of a fault."""
+MOVED_TITLES = ["channel", "by", "1σ", "unit"]
+"""Titles of the table of sizes of a fault, but for the first."""
+IF_ALONE = ", if it were one of these alone"
+"""Addition to the title of likelihoods and sizes where no single fault explains the readings."""
 
 
 def screen(result: Diagnosis, *metadata: Mapping[str, object]) -> str:
@@ -46,8 +48,8 @@ def screen(result: Diagnosis, *metadata: Mapping[str, object]) -> str:
     head = [verdict(result), result.run, plural(result.stations, "station"), *simulated(*metadata)]
     parts = ["   ".join(one_line(text) for text in head)]
     if result.parameters:
-        parts.append(table(_moved(result), MOVED_TITLES))
-    parts.append(table(_likelihoods(result), ["", "likelihood"]))
+        parts.append(table(_moved(result), _moved_titles(result)))
+    parts.append(table(_likelihoods(result), ["", f"likelihood{_if_alone(result)}"]))
     parts.append("\n".join(one_line(line) for line in _last(result)))
     return "\n\n".join(parts)
 
@@ -55,7 +57,7 @@ def screen(result: Diagnosis, *metadata: Mapping[str, object]) -> str:
 def render(result: Diagnosis, sha256: Mapping[str, str], *metadata: Mapping[str, object]) -> str:
     """The diagnosis as HTML; `sha256` of the calibration and the readings, `metadata` as of the screen."""
     sound = result.fault == NONE
-    certain = sound and not any(finding.id == "unexplained" for finding in result.findings)
+    certain = sound and not _unexplained(result)
     word, level = ("OK", "good") if certain else ("Attention", "attention" if sound else "bad")
     return rendered(
         "diagnosis.html",
@@ -64,7 +66,8 @@ def render(result: Diagnosis, sha256: Mapping[str, str], *metadata: Mapping[str,
         banner=banner(level, word, capital(verdict(result)), f"{capital(next_step(result))}."),
         findings=result.findings,
         moved=_moved(result),
-        moved_titles=MOVED_TITLES,
+        moved_titles=_moved_titles(result),
+        if_alone=_if_alone(result),
         likelihoods=_likelihoods(result),
         last=_last(result)[:-1],
         sha256=sha256,
@@ -73,22 +76,42 @@ def render(result: Diagnosis, sha256: Mapping[str, str], *metadata: Mapping[str,
 
 def verdict(result: Diagnosis) -> str:
     """One sentence: still fine, or the fault, where, and by how much; and what else it may be."""
-    unexplained = any(finding.id == "unexplained" for finding in result.findings)
+    unexplained = _unexplained(result)
     if result.fault == NONE:
         if unexplained:
             return "no single fault explains these readings, and none is named"
         return "still fine: the readings are as the calibration says"
-    causes = [_cause(result), *map(_cause, result.rivals)]
     if unexplained:
-        return f"no single fault explains these readings; closest: {' or '.join(causes)}"
+        suspects: list[Diagnosis | Rival] = [result, *result.rivals]
+        closest = [f"{each.fault}{_where(each)}" for each in suspects]
+        return f"no single fault explains these readings; closest: {' or '.join(closest)}"
+    causes = [_cause(result), *map(_cause, result.rivals)]
     if result.rivals:
         return f"cannot tell {' from '.join(causes)}"
     return causes[0]
 
 
+def _unexplained(result: Diagnosis) -> bool:
+    """Whether even the closest fault leaves more than noise."""
+    return any(finding.id == "unexplained" for finding in result.findings)
+
+
+def _if_alone(result: Diagnosis) -> str:
+    return IF_ALONE if _unexplained(result) else ""
+
+
+def _moved_titles(result: Diagnosis) -> list[str]:
+    """Titles of the table of sizes of the fault."""
+    return [f"moved, if {result.fault} alone" if _unexplained(result) else "moved", *MOVED_TITLES]
+
+
+def _where(cause: Diagnosis | Rival) -> str:
+    return f" on {_place(cause.channel)}" if cause.channel else ""
+
+
 def _cause(cause: Diagnosis | Rival) -> str:
     """A fault, where it shows, and its largest size."""
-    where = f" on {_place(cause.channel)}" if cause.channel else ""
+    where = _where(cause)
     if cause.size is None:
         return f"{cause.fault}{where}"
     size = _size(cause.size, cause.size_uncertainty, cause.unit)
@@ -146,7 +169,7 @@ def _last(result: Diagnosis) -> list[str]:
 
 def next_step(result: Diagnosis) -> str:
     """The advice: a tool is taken out of use only where readings exclude that it is sound."""
-    if any(finding.id == "unexplained" for finding in result.findings):
+    if _unexplained(result):
         return CHECK_FIRST
     steps = [IN_HOLE if result.fault == "magnetised" and result.surveys else ADVICE[result.fault]]
     if result.fault in SURROUNDINGS and result.rivals:

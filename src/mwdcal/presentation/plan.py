@@ -403,6 +403,7 @@ def render(plans: Sequence[Planned]) -> str:
         rows=rows,
         soaks=any(begins for _, begins in rows),
         settings=SETTING_WORDS.get(str(first.calibration.settings), ""),
+        asks_settings=not first.calibration.profile.stand.practice,
         compared=comparison_rows(summaries),
         plans=[each.plan for each in summaries],
         accuracy=accuracy_rows(summaries[0]),
@@ -441,7 +442,7 @@ def _place(planned: Planned) -> list[tuple[str, str]]:
     rows = []
     for name, word in (("gravity", "Gravity, g"), ("field", "Field, nT"), ("dip", "Dip, °")):
         values = np.unique(np.asarray(planned.plan.columns.get(REFERENCES[name].column, ()), float))
-        rows.append((word, f"{values[0]:.12g}" if len(values) == 1 else ""))
+        rows.append((word, f"{values[0]:.6g}" if len(values) == 1 else ""))
     return rows
 
 

@@ -17,8 +17,8 @@ NARROWEST, WIDEST = 80, 160
 """Columns for which a terminal gets its tables and lines, however many it has."""
 NOT_STATED = "not stated"
 """In place of what a document must have room for, and does not say."""
-WIDE = 300
-"""Width of a table in a file whose last column holds remarks, which are never cut."""
+FILE_WIDTH = 100
+"""Columns to which a table with remarks is folded in a file."""
 UNCUT = 1_000_000
 """Width that no table has."""
 BETWEEN = 3
@@ -186,18 +186,26 @@ def fold(line: str, width: int, indent: str = "") -> str:
     return "\n".join(lines)
 
 
-def table(rows: list[list[str]], header: list[str], width: int = WIDEST, names: int = 1) -> str:
+def table(
+    rows: list[list[str]],
+    header: list[str],
+    width: int = WIDEST,
+    names: int = 1,
+    remarks: bool = False,
+) -> str:
     """Columns aligned: the first to the left, the others to the right.
 
     Cells are shown as they are, on one line, in characters that stdout has. On a terminal too narrow for
     it words are folded and the columns stand in several tables, which all begin with those that name the
-    rows: the first, or several. Elsewhere the table has at most a `width`.
+    rows: the first, or several. Elsewhere the table has at most a `width`, or with `remarks` is folded to
+    `FILE_WIDTH`.
     """
     cells = [
         [transliterate(one_line(cell), sys.stdout.encoding) for cell in row]
         for row in [header, *rows]
     ]
-    whole, room = list(zip(*cells, strict=True)), columns(sys.stdout)
+    whole = list(zip(*cells, strict=True))
+    room = columns(sys.stdout) or (FILE_WIDTH if remarks else None)
     if room is None:
         return _render_table(whole, width)
     return "\n\n".join(_render_table(some, UNCUT) for some in _split_columns(whole, room, names))

@@ -12,8 +12,8 @@ from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import Finding, SignatureCheck
 from mwdcal.presentation.numbers import capital, measured, quantity, unit
 from mwdcal.presentation.signature import signature_status
-from mwdcal.presentation.text import NOT_STATED, WIDE, chance, one_line, table
-from mwdcal.use.verification import SETTING_PRACTICES, JudgedSet, Verdict, VerdictRow
+from mwdcal.presentation.text import NOT_STATED, chance, one_line, table
+from mwdcal.use.verification import COVERAGE, SETTING_PRACTICES, JudgedSet, Verdict, VerdictRow
 
 FREEDOM = "DoF"
 """Title of a column of degrees of freedom."""
@@ -25,6 +25,12 @@ REFERENCES_OF = {
 """The references of a calibration run that determine a direction, by a word of its name."""
 BETWEEN_SETS = "stations outside of roll sets"
 VERDICT_RISK = "risk of a wrong verdict, all roll sets and limits together"
+
+RAW_RULE = "Marked raw: the raw figure counts, as readings are not smooth over toolface"
+"""The line under the decision rule where a raw figure was judged."""
+FAR_BEYOND = 3.0
+"""Values of more than this times their limit, in every roll set, point to the tool rather than to one station."""
+WHOSE = "first check: is it this tool, and was it knocked or changed since?"
 
 
 def screen(
@@ -47,12 +53,17 @@ def screen(
     first += [signature_status(signature)] if signature else []
     first += simulated(*metadata)
     source = f" ({result.source})" if result.source else ""
-    lines = ["   ".join(first), f"limits {result.limits}{source}", f"rule: {result.rule}"]
+    lines = [
+        "   ".join(first),
+        f"limits {result.limits}{source}",
+        f"rule: {result.rule}",
+    ]
+    lines += filter(None, [raw_rule(result)])
     lines += [SETTING_PRACTICES[result.settings]] if result.settings in SETTING_PRACTICES else []
     if result.risk is not None:
         lines.append(f"{VERDICT_RISK}: {chance(result.risk)}")
     header = ["", "raw", "noise-free", "1σ", FREEDOM, "limit", "", "where"]
-    blocks = ["\n".join(map(one_line, lines)), table(rows, header, WIDE), *_sets(result)]
+    blocks = ["\n".join(map(one_line, lines)), table(rows, header, remarks=True), *_sets(result)]
     return "\n\n".join(blocks)
 
 
@@ -84,13 +95,28 @@ def after_failure(
     places = dict.fromkeys(row.note.partition(";")[0] for row in failed)
     if places:
         command = f"mwdcal diagnose {one_line(calibration)} {one_line(run)}"
-        return f"measure again: {'; '.join(places)}", command, "what it looks like"
+        again = f"measure again: {'; '.join(places)}"
+        if any(map(_far_everywhere, failed)):
+            again = f"{WHOSE} Then {again}"
+        return again, command, "what it looks like"
     if free := result.left_open:
         missing = [word for direction, word in REFERENCES_OF.items() if direction in free]
         again = f"not determined: {free}. Give {' and '.join(missing)} in the calibration run"
         return again, f"mwdcal calibrate RUN -o {one_line(calibration)}", "with these references"
     again = "measure again: the roll test, with what is missing in it"
     return again, f"mwdcal verify {one_line(calibration)} ROLLTEST.csv", "the new roll test"
+
+
+def _far_everywhere(row: VerdictRow) -> bool:
+    """Whether a value is far and clearly beyond its limit in every roll set: no single station explains that."""
+
+    def far(each: JudgedSet) -> bool:
+        doubt = 0.0 if each.judged_raw else COVERAGE * each.uncertainty
+        return each.value > max(FAR_BEYOND * row.limit, row.limit + doubt)
+
+    rolled = bool(row.sets) and all(each.coefficients is not None for each in row.sets)
+    several = len(row.sets) > 1 or not row.judged_raw
+    return rolled and several and all(map(far, row.sets))
 
 
 def _sets(result: Verdict) -> list[str]:
@@ -109,12 +135,20 @@ def _sets(result: Verdict) -> list[str]:
     )
 
 
+def raw_rule(result: Verdict) -> str:
+    """The line under the decision rule if a raw figure was judged, else nothing."""
+    return RAW_RULE * any(row.judged_raw for row in result.rows)
+
+
 def noise_free(judged: VerdictRow | JudgedSet, symbol: str) -> tuple[str, str]:
-    """Value and 1σ of a limit or roll set, both to two digits of the latter; or that it is not stated."""
+    """Value and 1σ of a limit or roll set, both to two digits of the latter; or that it is not stated.
+
+    A raw figure that was judged is marked.
+    """
     if judged.uncertainty is None or judged.value is None:
         return quantity(judged.value, symbol), NOT_STATED
     value, sd = measured(judged.value, judged.uncertainty)
-    return value + unit(symbol), sd + unit(symbol)
+    return value + unit(symbol) + " raw" * judged.judged_raw, sd + unit(symbol)
 
 
 def freedom(judged: VerdictRow | JudgedSet) -> str:

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from mwdcal.calibration.diagnosis.identity import doubts, other_tool
@@ -224,12 +225,25 @@ COMPILED_ROWS = 300_000
 """Number of rows from which the compiled loops repay their loading."""
 
 
+RANGED_ANGLES = ("inclination", "azimuth")
+"""Angles whose ranges are reported."""
+
+
+class AngleRange(msgspec.Struct, frozen=True):
+    """Least and largest of an angle in corrected rows, and its largest standard uncertainty; null without one."""
+
+    least_deg: float
+    largest_deg: float
+    sd_deg: float | None
+
+
 class RowCounts(NamedTuple):
     """Rows of a table, counted by what the findings report of them.
 
     `beyond`: outside the calibrated temperatures; `moved`: outputs that rest on a free direction;
     `lacking`: without a reading; `warmth`: lowest and highest temperature, °C; `metadata`: what the
-    table says of itself; `valueless`: with a direction that has no value.
+    table says of itself; `valueless`: with a direction that has no value; `angles`: ranges of
+    inclination and azimuth, where there are any.
     """
 
     rows: int
@@ -242,6 +256,7 @@ class RowCounts(NamedTuple):
     metadata: Mapping[str, object] = {}
     valueless: int = 0
     scatter: Mapping[str, Scatter] = {}
+    angles: Mapping[str, AngleRange] = {}
 
     def blank(self, outside: str) -> int:
         """Number of rows without results: without a reading, or `outside` the temperatures."""
@@ -301,6 +316,7 @@ def tallied(
         readings.count + lacking, int(beyond.sum()), undetermined(calibration, readings), lacking, (),
         strengths.judged(calibration, columns, readings.known), warmth(readings.temperature),
         readings.metadata, valueless, scatters(calibration, readings, columns) if whole else {},
+        angle_ranges(columns) if whole else {},
     )  # fmt: skip
     if outside == "extrapolate":
         columns[EXTRAPOLATED] = beyond
@@ -318,7 +334,35 @@ def joined(tallies: Sequence[RowCounts]) -> RowCounts:
         lacking=lacking, strengths=strengths.total(tally.strengths for tally in tallies),
         warmth=(min(lows), max(highs)), valueless=valueless,
         scatter=total(tally.scatter for tally in tallies),
+        angles=_joined_ranges([tally.angles for tally in tallies]),
     )  # fmt: skip
+
+
+def angle_ranges(columns: Mapping[str, AnyArray]) -> dict[str, AngleRange]:
+    """Ranges of inclination and azimuth over rows (n,) that have them; columns by the names of files."""
+    ranges = {}
+    for name in RANGED_ANGLES:
+        values = columns[f"{name}_deg"]
+        least = float(np.fmin.reduce(values, initial=np.inf))
+        sd = float(np.fmax.reduce(columns.get(f"sd_{name}_deg", values[:0]), initial=-np.inf))
+        if np.isfinite(least):
+            largest = float(np.fmax.reduce(values, initial=-np.inf))
+            ranges[name] = AngleRange(least, largest, sd if np.isfinite(sd) else None)
+    return ranges
+
+
+def _joined_ranges(parts: Sequence[Mapping[str, AngleRange]]) -> dict[str, AngleRange]:
+    """Ranges over all parts of a table."""
+    ranges = {}
+    for name in RANGED_ANGLES:
+        if each := [part[name] for part in parts if name in part]:
+            sd = max((one.sd_deg for one in each if one.sd_deg is not None), default=None)
+            least, largest = (
+                min(one.least_deg for one in each),
+                max(one.largest_deg for one in each),
+            )
+            ranges[name] = AngleRange(least, largest, sd)
+    return ranges
 
 
 def warmth(temperature: Array | None) -> tuple[float, float]:

@@ -362,7 +362,7 @@ class Figure:
     """Spread of an observable in roll sets (...), or its largest error: without noise, its 1σ, and `raw` with it.
 
     `freedom`: degrees of freedom of the 1σ; `errors` (..., d) in tests like this one, on average zero. `side`: sign
-    of the curve where it is farthest from zero.
+    of the curve where it is farthest from zero. `rough`: the error is not smooth, `value` is the raw figure.
     """
 
     value: Array
@@ -371,6 +371,7 @@ class Figure:
     freedom: Array
     errors: Array
     side: Array
+    rough: Bools
 
 
 def figure(
@@ -394,7 +395,7 @@ def figure(
     value, errors = np.where(rough, raw, value), errors * wider[..., None]
     course = curve.at(CIRCLE)
     side = np.where(course.max(-1) > -course.min(-1), 1.0, -1.0)
-    return Figure(value, sd * wider, raw, freedom, errors, side)
+    return Figure(value, sd * wider, raw, freedom, errors, side, rough)
 
 
 @dataclass(frozen=True)
@@ -410,30 +411,58 @@ class Largest:
     errors: Array
 
 
-def largest(value: Array, uncertainty: Array, errors: Array) -> Largest:
+def largest(value: Array, uncertainty: Array, errors: Array, rough: Bools | None = None) -> Largest:
     """The largest of noise-free figures (..., k), of which `errors` (..., d, k) are drawn together.
 
     Definition (parametric bootstrap): noise drives the figures apart, so they are first drawn together to the
     scatter that they have beyond their uncertainties (DerSimonian and Laird's variance). About these the
     test is repeated; by as much as the largest figure then lies above the largest of these on average, that of
     the test is too large. The root mean square of that distance is its standard uncertainty.
+
+    `rough` (..., k): raw figures, whose scatter is not known to be noise. They change no other figure, and nothing
+    is taken off one that is the largest.
     """
-    place = np.argmax(value, -1)
-    most = np.take_along_axis(value, place[..., None], -1)[..., 0]
     if value.shape[-1] == 1:
-        return Largest(most, uncertainty[..., 0], place, errors[..., 0])
-    least = uncertainty.min(-1, keepdims=True)
-    root = least / uncertainty
+        place = np.argmax(value, -1)
+        return Largest(value[..., 0], uncertainty[..., 0], place, errors[..., 0])
+    raw = np.zeros(value.shape, bool) if rough is None else rough
+    smooth = ~raw | raw.all(-1, keepdims=True)
+    least = np.where(smooth, uncertainty, np.inf).min(-1, keepdims=True)
+    root = np.where(smooth, least / uncertainty, 0.0)
     total = np.sum(root**2, -1)
     excess = _about_mean(value, root) - _about_mean(errors, root[..., None, :]).mean(-1)
-    between = np.maximum(excess, 0.0) / (total - np.sum(root**4, -1) / total)
+    free = total - np.sum(root**4, -1) / total
+    between = np.maximum(excess, 0.0) / np.maximum(free, TINY)
     sd = np.hypot(uncertainty, np.sqrt(between)[..., None])
-    centre = _mean(value, least / sd)
+    centre = _mean(value, np.where(smooth, least / sd, 0.0))
     centre = centre + np.sqrt(between)[..., None] / sd * (value - centre)
+    centre = np.where(smooth, centre, -np.inf)
     change = (centre[..., None, :] + errors).max(-1) - centre.max(-1, keepdims=True)
-    bias = change.mean(-1)
-    sd = np.sqrt(np.mean(change**2, -1))
-    return Largest(np.maximum(most - bias, 0.0), sd, place, change - bias[..., None])
+    bias, off = change.mean(-1), np.sqrt(np.mean(change**2, -1))
+    place = np.argmax(np.where(smooth, value, -np.inf), -1)
+    noise_free = np.maximum(_at(value, place) - bias, 0.0)
+    without = Largest(noise_free, off, place, change - bias[..., None])
+    return _or_raw(without, value, uncertainty, errors, raw) if raw.any() else without
+
+
+def _or_raw(
+    without: Largest, value: Array, uncertainty: Array, errors: Array, raw: Bools
+) -> Largest:
+    """The largest raw figure as it is, where it is larger than the one found among the others."""
+    place = np.argmax(np.where(raw, value, -np.inf), -1)
+    more = raw.any(-1) & (raw.all(-1) | (_at(value, place) >= without.value))
+    there = np.take_along_axis(errors, place[..., None, None], -1)[..., 0]
+    return Largest(
+        np.where(more, _at(value, place), without.value),
+        np.where(more, _at(uncertainty, place), without.uncertainty),
+        np.where(more, place, without.place),
+        np.where(more[..., None], there, without.errors),
+    )
+
+
+def _at(values: Array, place: Ints) -> Array:
+    """Those of values (..., k) at a place (...)."""
+    return np.asarray(np.take_along_axis(values, place[..., None], -1)[..., 0])
 
 
 def _mean(value: Array, root: Array) -> Array:
@@ -563,6 +592,7 @@ class Statistic:
     `part` (k,): what the stations `index` show, noise included: errors, or departures from the
     middle of the set. `freedom`: degrees of freedom of the uncertainty, infinite where all of it is
     declared; `errors` (d,): what `value` would be off by in tests like this one.
+    `rough`: the error is not smooth, `value` is the raw figure.
     """
 
     value: float
@@ -575,6 +605,7 @@ class Statistic:
     curve: Curve | None = None
     freedom: float = UNLIMITED
     errors: Array = field(default_factory=lambda: np.zeros(0))
+    rough: bool = False
 
 
 @dataclass(frozen=True)
@@ -925,7 +956,9 @@ class RollTest:
         where = f"{roll_set.label}; curve at toolface{at}"
         if curve.rough(noise.known):
             left = float(f"{curve.scale:.2g}")
-            where += f"; raw figure judged: {left:g} × the noise is left about a smooth curve"
+            where += (
+                f"; raw figure judged: the readings leave a smooth curve by {left:g} × their noise"
+            )
         if not error:
             curve, middle = about_middle(curve)
             part = part - middle
@@ -935,6 +968,7 @@ class RollTest:
         return Statistic(
             float(judged.value), sd, float(judged.raw), where, roll_set.index, part, roll_set.label,
             curve, freedom, judged.errors + judged.side * self.common_errors(name, reference, first),
+            bool(judged.rough),
         )  # fmt: skip
 
     def reference_errors(self, name: str, roll_set: RollSet, error: bool) -> ReferenceErrors:

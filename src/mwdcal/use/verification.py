@@ -157,7 +157,10 @@ VERDICT_FINDINGS = {
     "the stand (then give them one group: it is counted once). The 1σ rests on the stated noise.",
     "settings-doubted": "{title}: the readings scatter about the curves as if the stand was set at every station. Its "
     "error is counted both ways. State [stand] settings in the profile.",
-    "weak-test": "{row.name}: its 1σ of {size} is more than half of the limit: this "
+    "not-smooth": "{title}: the readings leave a smooth curve over toolface by far more than their noise. So the raw "
+    "figure is judged, nothing is taken off it, and its 1σ rests on that scatter. A station was misread or moved, or "
+    "the tool has an error that these toolfaces do not resolve.",
+    "weak-test": "{row.name}: its 1σ of {size} is more than half of the limit: by this limit alone the "
     "test can hardly tell a good tool from a bad one. Average longer at each station, or take more toolfaces.",
     "roll-harmonics": "{row.name} over a turn of toolface: {causes}.",
 }
@@ -215,6 +218,11 @@ class JudgedSet(msgspec.Struct, frozen=True, kw_only=True):
     degrees_of_freedom: float | None = None
     raw: float | None = None
 
+    @property
+    def judged_raw(self) -> bool:
+        """Whether `value` is the raw figure of a rolled set, whose error is not smooth."""
+        return self.coefficients is not None and self.value == self.raw
+
 
 class VerifiedStation(msgspec.Struct, frozen=True, kw_only=True):
     """One station of the test: attitude as corrected, and what it shows of each limit, noise included.
@@ -269,6 +277,11 @@ class VerdictRow(msgspec.Struct, frozen=True, kw_only=True):
         """Degrees of freedom of the uncertainty; None: unlimited, or not stated."""
         stated = self.degrees_of_freedom
         return None if isinstance(stated, msgspec.UnsetType) else stated
+
+    @property
+    def judged_raw(self) -> bool:
+        """Whether `value` is the raw figure of a rolled set, whose error is not smooth."""
+        return any(each.judged_raw and each.value == self.value for each in self.sets)
 
     @property
     def two_sided(self) -> bool:
@@ -584,15 +597,18 @@ def _judged(title: str, name: str, limit: float, outcome: Departures, guarded: b
         stated_freedom(worst.freedom),
     )
     passed = value + guard(guarded, freedom) * sd <= limit
-    note = worst.where + _choice(outcome, (worst.value - float(overall.value)) * factor, unit)
+    taken = (worst.value - float(overall.value)) * factor
+    note = worst.where + ("" if worst.rough else _choice(outcome, taken, unit))
     row = VerdictRow(
         name=title, unit=unit, value=value, uncertainty=sd, limit=limit, passed=passed,
-        note=note + _remark(value, sd, limit, passed), raw=most,
+        note=note + _remark(value, 0.0 if worst.rough else sd, limit, passed), raw=most,
         harmonics=_harmonics(worst, factor), sets=sets, degrees_of_freedom=freedom,
     )  # fmt: skip
     within = probability_within(value, sd, limit, row.two_sided, freedom)
     row = msgspec.structs.replace(row, probability_within=within)
-    if sd > WEAK * limit:
+    if worst.rough:
+        remarks = (*remarks, "not-smooth")
+    elif sd > WEAK * limit:
         size = f"{sd:.2g}{'' if row.unit == '°' else ' '}{row.unit}"
         findings.append(_finding("weak-test", row=row, size=size))
     if causes := _causes(row, name, worst):
@@ -609,7 +625,8 @@ def _largest(outcome: Departures) -> Largest:
     """The largest of all statistics, without the bias of the choice."""
     each = outcome.statistics
     values, sds = (np.array([getattr(x, n) for x in each]) for n in ("value", "uncertainty"))
-    return largest(values, sds, np.stack([x.errors for x in each], -1))
+    errors, rough = np.stack([x.errors for x in each], -1), np.array([x.rough for x in each])
+    return largest(values, sds, errors, rough)
 
 
 def stated_freedom(freedom: float) -> float | None:
@@ -618,12 +635,13 @@ def stated_freedom(freedom: float) -> float | None:
 
 
 def _choice(outcome: Departures, taken: float, unit: str) -> str:
-    """The amount taken off the largest of several figures."""
-    count, single = len(outcome.statistics), any(not each.label for each in outcome.statistics)
-    if count == 1:
+    """The amount taken off the largest of several noise-free figures."""
+    each = [one for one in outcome.statistics if not one.rough]
+    if len(each) == 1:
         return ""
+    kind = "values" if any(not one.label for one in each) else "roll sets"
     size = f"{taken:.2g}{'' if unit == '°' else ' '}{unit}"
-    return f"; the largest of {count} {'values' if single else 'roll sets'}: {size} taken off for the choice"
+    return f"; the largest of {len(each)} {kind}: {size} taken off for the choice"
 
 
 def _scale(unit: str) -> float:

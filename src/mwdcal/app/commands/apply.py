@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import offering_blank, print_result
 from mwdcal.presentation.text import one_line
+
+if TYPE_CHECKING:
+    from mwdcal.use.correction import AngleRange
 
 
 @options.command()
@@ -62,6 +67,7 @@ def command(
             rows=tally.rows,
             blank=blank,
             output=str(output),
+            angles=dict(tally.angles),
             findings=findings,
             **(terms.stated if uncertainty else {}),
         ),
@@ -73,5 +79,17 @@ def command(
     signed = one_line(signature_status(loaded.signature))
     said = [corrected, f"wrote {one_line(output)}", signed, *simulated(fitted.tool)]
     document = with_signature(document, loaded.signature)
-    lines = ["   ".join(said), *([terms.sentence] if uncertainty else [])]
+    angles = filter(None, [_angles_in_words(tally.angles)])
+    lines = ["   ".join(said), *angles, *([terms.sentence] if uncertainty else [])]
     print_result(document if as_json else "\n".join(lines), findings)
+
+
+def _angles_in_words(angles: Mapping[str, AngleRange]) -> str:
+    """Ranges of angles with their largest 1σ, or empty."""
+    from mwdcal.presentation.numbers import fixed, uncertainty
+
+    def in_words(name: str, angle: AngleRange) -> str:
+        sd = "" if angle.sd_deg is None else f", 1σ at most {uncertainty(angle.sd_deg)}°"
+        return f"{name} {fixed(angle.least_deg, 2)}° to {fixed(angle.largest_deg, 2)}°{sd}"
+
+    return "   ".join(in_words(name, each) for name, each in angles.items())

@@ -116,7 +116,8 @@ FREE_DIRECTIONS = {
     "reference inclinations, or roll sets at three or more directions",
     "rotation-y": "rotation about the tool's y axis is undetermined: no evidence fixes it; kept at nominal. Give "
     "reference inclinations, or roll sets at three or more directions",
-    "scale": "overall scale is undetermined: no evidence fixes it; kept at nominal. Give a reference strength",
+    "scale": "overall scale is undetermined: no evidence fixes it; kept at nominal. Give a reference "
+    "strength: ref_gravity_g or ref_field_nt",
 }
 
 REMARKS = {
