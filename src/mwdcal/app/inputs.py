@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import click
 
@@ -15,9 +16,8 @@ from mwdcal.calibration.prior import DATASHEET, profile_for
 from mwdcal.calibration.readings import Readings
 from mwdcal.errors import InputError
 from mwdcal.files import profiles, runs
-from mwdcal.files.formats.table import Table
-from mwdcal.files.parting import parted
 from mwdcal.files.profiles import source_of_settings
+from mwdcal.identification.roll_tests import RollTest, Said, beside, parted_run
 from mwdcal.presentation.calibration_source import calibration_of
 from mwdcal.presentation.text import one_line
 from mwdcal.sensor.profile import Profile
@@ -71,35 +71,35 @@ def load_run(
     return replace(readings, profile_sha256=digest, settings_source=source_of_settings()), profile
 
 
+class LoadedRun(NamedTuple):
+    """A run with its tool profile, its roll test, and whether its file has one beside it."""
+
+    readings: Readings
+    profile: Profile
+    roll_test: RollTest | None
+    beside: bool
+
+
 def load_runs(
-    run: Path,
-    rolltest: Path | None,
-    tool: str | None,
-    decimal: str,
-    prior: Prior,
-    statements: Mapping[str, str],
-) -> tuple[Readings, Readings | None, Profile, bool]:
-    """A run and its roll test, if there is one, the tool profile, and whether the file of the run has a roll test.
+    run: Path, rolltest: Path | None, tool: str | None, prior: Prior, said: Said
+) -> LoadedRun:
+    """A run and its roll test, which is still to be read; `said` as of `roll_tests.read_roll_test`.
 
     Both may be in one file: on two sheets, or in one table with a column that marks the roll test.
     """
     stated, digest = profiles.load_profile(tool)
     stated = profile_for(prior, stated)
     first = runs.read_export(
-        run, stated, decimal=decimal, rows=runs.MOST_ROWS, statements=statements
+        run, stated, decimal=said.decimal, rows=runs.MOST_ROWS, statements=said.statements
     )
-    same = rolltest is not None and rolltest.exists() and run.exists() and run.samefile(rolltest)
-    beside = None
-    if same or (rolltest is None and stated.form.find):
-        beside = runs.read_roll_test(run, first, stated, statements)
-    second: Path | Table | None = beside if same else rolltest
-    if same and beside is None:
-        first, second = parted(first)
+    test = RollTest(rolltest, said) if rolltest else None
+    if rolltest is not None and rolltest.exists() and run.exists() and run.samefile(rolltest):
+        first, test = parted_run(run, first, stated, said)
+    has_test = test is None and stated.form.find and bool(beside(run, first, stated))
     readings, profile = runs.read_run(first, stated)
-    test = second and runs.read_run(second, profile, decimal=decimal, statements=statements)[0]
     source = source_of_settings()
     readings = replace(readings, profile_sha256=digest, settings_source=source)
-    return readings, test or None, profile, beside is not None
+    return LoadedRun(readings, profile, test, has_test)
 
 
 def prior_of(word: str | None) -> tuple[Prior, str]:

@@ -354,7 +354,7 @@ def propose(
         FitError: columns and units that names and readings leave open, or readings that no axes explain.
     """
     where = tables.laid_out(path, sheet=sheet, header_row=header_row, decimal=decimal)
-    table, form = _as_written(path, where, bool(sheet or header_row or decimal))
+    table, form = as_written(path, where, bool(sheet or header_row or decimal))
     table = replace(table, metadata={**table.metadata, **(stated or {}), **(north or {})})
     check_columns_of_rows(table, {**(leave_out or {}), **(keep or {})})
     place = {"header_line": header_row} if header_row else {}
@@ -402,31 +402,17 @@ def _proposal(
 ) -> Proposal:
     """The proposal for a table that was read, with what the user says of its columns."""
     whole = table
-    formulas = [name for name in table.columns if _is_formulas(labels_of(table, name))]
-    table = replace(table, columns={n: c for n, c in table.columns.items() if n not in formulas})
-    units_by_name = dict(zip(where.names, where.units, strict=True)) if where else {}
-    names = [*table.columns]
-    units = [units_by_name.get(name, "") for name in names]
-    above = where.above if where else ()
-    table, form, open_rows = _without_rejected(table, form, names, units, above)
-    problems: dict[str, QuestionError] = {}
-    values = partial(_numbers_of, table, problems)
-    columns, by_value, ignored = proposed(
-        names, units, values, table.source, above, table.metadata, answers, problems, open_rows
-    )
+    table, form, columns, by_value, ignored = named_columns(table, form, where, answers)
     if filled := _with_angles_filled(path, where, (table, whole), columns, form, stated, answers):
         return filled
     check_cells(table, columns)
     blank = _blank_references(table, columns)
-    table, form = _with_north(table, form, columns, above)
-    ignored |= dict.fromkeys(
-        formulas, "its formulas have no value, as no spreadsheet program has saved them"
-    )
+    table, form = with_north(table, form, columns, where.above if where else ())
     denied = [c for c, name in answers.items() if not name and c in table.metadata]
     form = _with(form, {"ignore": (*ignored, *denied)} if ignored or denied else {})
     columns |= _stacked_tools(table, columns, stated, answers)
     table = _of_one_tool(table, columns, stated)
-    columns |= _station(table, columns, answers)
+    columns |= station_column(table, columns, answers)
     sets = repeats(table, columns)
     if sets and not sets.numbered:
         table = means(table, columns, sets)
@@ -444,6 +430,49 @@ def _proposal(
     )  # fmt: skip
 
 
+class Named(NamedTuple):
+    """A table with the rows that count, how it is written, and its columns by the names of a run file.
+
+    `by_value` and `ignored` as of `Proposal`.
+    """
+
+    table: Table
+    form: TableFormat | None
+    columns: dict[str, ColumnSource]
+    by_value: set[str]
+    ignored: dict[str, str]
+
+
+def named_columns(
+    table: Table,
+    form: TableFormat | None,
+    where: Layout | None,
+    answers: Mapping[str, str],
+    asks_of_rows: bool = True,
+) -> Named:
+    """What the columns of a table are by their names, units and values; raises as `columns.proposed`.
+
+    Unless it `asks_of_rows`, rows count of which it is doubtful whether they are rejected; a remark names them.
+    """
+    formulas = [name for name in table.columns if _is_formulas(labels_of(table, name))]
+    table = replace(table, columns={n: c for n, c in table.columns.items() if n not in formulas})
+    units_by_name = dict(zip(where.names, where.units, strict=True)) if where else {}
+    names = [*table.columns]
+    units = [units_by_name.get(name, "") for name in names]
+    above = where.above if where else ()
+    table, form, open_rows = _without_rejected(table, form, names, units, above)
+    problems: dict[str, QuestionError] = {}
+    values = partial(_numbers_of, table, problems)
+    columns, by_value, ignored = proposed(
+        names, units, values, table.source, above, table.metadata, answers, problems,
+        open_rows if asks_of_rows else (),
+    )  # fmt: skip
+    ignored |= dict.fromkeys(
+        formulas, "its formulas have no value, as no spreadsheet program has saved them"
+    )
+    return Named(table, form, columns, by_value, ignored)
+
+
 def _with_angles_filled(
     path: str | os.PathLike[str],
     where: Layout | None,
@@ -458,7 +487,7 @@ def _with_angles_filled(
     `pair`: the table as it is judged, and as it was read.
     """
     table, whole = pair
-    if once := _once_for_setting(table, columns) or _written_once(table, columns):
+    if once := once_for_setting(table, columns) or written_once(table, columns):
         form = _with(form, {"fill_down": once})
         with suppress(InputError, FitError):
             proposal = _proposal(path, where, filled_down(whole, once), form, stated, answers)
@@ -548,7 +577,7 @@ def _is_confirmed(proposal: Proposal) -> bool:
     return not proposal.open_axes and max(unexplained, default=1.0) < _CONFIRMED
 
 
-def _written_once(table: Table, columns: Mapping[str, ColumnSource]) -> tuple[str, ...]:
+def written_once(table: Table, columns: Mapping[str, ColumnSource]) -> tuple[str, ...]:
     """Angles of the stand that may be written once for a series of rolls: filled in above blanks, beside toolfaces."""
     *directions, roll = ANGLES_OF_STAND
     rolls = labels_of(table, columns[roll].name) if roll in columns else [""]
@@ -561,7 +590,7 @@ def _written_once(table: Table, columns: Mapping[str, ColumnSource]) -> tuple[st
     )
 
 
-def _once_for_setting(table: Table, columns: Mapping[str, ColumnSource]) -> tuple[str, ...]:
+def once_for_setting(table: Table, columns: Mapping[str, ColumnSource]) -> tuple[str, ...]:
     """Angles and labels that are written once for all readings of a setting: the rows below, filled, are such."""
     names = [columns[c].name for c in ("station", *ANGLES_OF_STAND) if c in columns]
     blank = {name: np.array([not cell for cell in labels_of(table, name)]) for name in names}
@@ -573,7 +602,7 @@ def _once_for_setting(table: Table, columns: Mapping[str, ColumnSource]) -> tupl
     return tuple(once) if sets and np.array_equal(sets.starts, np.flatnonzero(~last)) else ()
 
 
-def _station(
+def station_column(
     table: Table, columns: Mapping[str, ColumnSource], answers: Mapping[str, str]
 ) -> dict[str, ColumnSource]:
     """The column of stations that the angles of the stand tell, where none has a name that tells those apart."""
@@ -659,7 +688,7 @@ def _with(form: TableFormat | None, fields: Mapping[str, Any]) -> TableFormat | 
     return msgspec.structs.replace(form or TableFormat(find=True), **fields) if fields else form
 
 
-def _with_north(
+def with_north(
     table: Table,
     form: TableFormat | None,
     columns: Mapping[str, ColumnSource],
@@ -1101,7 +1130,7 @@ def _is_left_handed(result: Wiring) -> bool:
     return bool(np.linalg.det(permutation) < 0)
 
 
-def _as_written(
+def as_written(
     path: str | os.PathLike[str], where: Layout | None, placed: bool
 ) -> tuple[Table, TableFormat | None]:
     """The table of a file, and how a profile says it is written: not at all where it is written as documented.

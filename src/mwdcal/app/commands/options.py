@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from unicodedata import normalize
 
 import click
@@ -19,6 +19,9 @@ from mwdcal.app.messages import Command
 from mwdcal.calibration.fit_options import FIT_OPTIONS
 from mwdcal.calibration.fit_options import FitArguments as FitArguments
 from mwdcal.errors import InputError
+
+if TYPE_CHECKING:
+    from mwdcal.identification.roll_tests import Said
 
 Function = Callable[..., Any]
 Decorator = Callable[[Function], Function]
@@ -167,6 +170,8 @@ RESULT = output(
 
 SAID_OF_RUN = "mwdcal.statements"
 """Where the context of a command has what the user says of a run."""
+SAID_OF_ROLL_TEST = "mwdcal.roll_test"
+"""Where it has what he says of a roll test."""
 
 
 def _note(context: click.Context, option: click.Parameter, typed: Any) -> None:
@@ -200,6 +205,37 @@ def of_run(function: Function) -> Function:
 def statements() -> dict[str, str]:
     """Serial, date and operator as the user says."""
     return dict(click.get_current_context().meta.get(SAID_OF_RUN, {}))
+
+
+def of_roll_test(function: Function) -> Function:
+    """The options that answer what the table of a roll test, or of later readings, leaves open."""
+    noted = partial(click.option, callback=_note_of_roll_test, expose_value=False)
+    for option in (
+        noted(
+            "--column",
+            multiple=True,
+            metavar="OURS=THEIRS",
+            help="Which column of the roll test is which: ref_toolface_deg='Cara 2'. Repeatable.",
+        ),
+        noted("--sheet", default="", metavar="NAME", help="Sheet of the roll test."),
+    ):
+        function = option(function)
+    return function
+
+
+def _note_of_roll_test(context: click.Context, option: click.Parameter, typed: Any) -> None:
+    """Note what the user says of the table of a roll test."""
+    context.meta.setdefault(SAID_OF_ROLL_TEST, {})[str(option.name)] = typed
+
+
+def said(decimal: str) -> Said:
+    """What the user says of tables: decimal sign, serial, date and operator, sheet and columns of the roll test."""
+    from mwdcal.identification.roll_tests import Said
+    from mwdcal.library.answers import by_column
+
+    noted = click.get_current_context().meta.get(SAID_OF_ROLL_TEST, {})
+    columns = by_column("column", noted.get("column"))
+    return Said(decimal, statements(), noted.get("sheet", ""), columns)
 
 
 def number(name: str, metavar: str, text: str, *variable: str) -> Decorator:
