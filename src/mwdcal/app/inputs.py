@@ -17,6 +17,7 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.errors import InputError
 from mwdcal.files import profiles, runs
 from mwdcal.files.profiles import source_of_settings
+from mwdcal.identification.beside import has_roll_test
 from mwdcal.identification.roll_tests import RollTest, Said, beside, parted_run
 from mwdcal.presentation.calibration_source import calibration_of
 from mwdcal.presentation.text import one_line
@@ -95,7 +96,7 @@ def load_runs(
     test = RollTest(rolltest, said) if rolltest else None
     if rolltest is not None and rolltest.exists() and run.exists() and run.samefile(rolltest):
         first, test = parted_run(run, first, stated, said)
-    has_test = test is None and stated.form.find and bool(beside(run, first, stated))
+    has_test = test is None and stated.form.find and has_roll_test(beside(run, first, stated))
     readings, profile = runs.read_run(first, stated)
     source = source_of_settings()
     readings = replace(readings, profile_sha256=digest, settings_source=source)

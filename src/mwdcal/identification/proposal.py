@@ -59,6 +59,7 @@ from mwdcal.files.statements import stated_table
 from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW, FACTORS, WARMTH
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
+from mwdcal.identification.beside import findings_beside, has_roll_test, roll_tests_beside
 from mwdcal.identification.columns import (
     answers_of_north,
     in_units,
@@ -314,7 +315,8 @@ class Proposal(NamedTuple):
     `by_value` columns of a run file whose
     unit no name states; `metadata` what the table says of itself; `where` the table was, if it was looked for;
     `open_axes` the triads of which the run does not tell the axes, `ignored` columns that are called as references
-    but hold no references, each with the reason; `by_readings` what the names leave open and the readings answer.
+    but hold no references, each with the reason; `by_readings` what the names leave open and the readings answer;
+    `source` the name of the file.
     """
 
     profile: Profile
@@ -329,6 +331,7 @@ class Proposal(NamedTuple):
     open_axes: Mapping[str, OpenAxes] = {}
     ignored: Mapping[str, str] = {}
     by_readings: tuple[str, ...] = ()
+    source: str = ""
 
 
 def propose(
@@ -426,7 +429,7 @@ def _proposal(
         remarks.append(sets.advice() if sets.numbered else sets.sentence(scales))
     return Proposal(
         _without_the_usual(profile), wirings, readings.count, readings.unused, tuple(remarks), by_value,
-        readings.metadata, readings.run_sha256, where, open_axes, ignored,
+        readings.metadata, readings.run_sha256, where, open_axes, ignored, source=table.source,
     )  # fmt: skip
 
 
@@ -1486,7 +1489,22 @@ def findings_on(proposal: Proposal) -> list[Finding]:
         stated = {*proposal.profile.columns, *proposal.metadata}
         known += magnetometer_absent(n for n in STATED_REFERENCES if REFERENCES[n].column in stated)
     known += answers_by_readings(proposal) + warmth_around(proposal) + units_contradicted(proposal)
+    known += tables_beside(proposal)
     return known + ignored + unused_columns(proposal.unused)
+
+
+def tables_beside(proposal: Proposal) -> list[Finding]:
+    """The other tables of readings in the file, and the roll test that may be among them."""
+    if proposal.where is None:
+        return []
+    serial = proposal.metadata.get("serial", "")
+    return findings_beside(proposal.where, proposal.profile, serial, proposal.source)
+
+
+def has_test_beside(proposal: Proposal) -> bool:
+    """Whether the file has the roll test of the run in another table."""
+    where, serial = proposal.where, proposal.metadata.get("serial", "")
+    return where is not None and has_roll_test(roll_tests_beside(where, proposal.profile, serial))
 
 
 def as_toml(proposal: Proposal, source: str) -> str:

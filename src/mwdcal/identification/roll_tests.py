@@ -12,6 +12,7 @@ from unicodedata import normalize
 import msgspec
 import numpy as np
 
+from mwdcal.calibration.diagnosis.findings import OF_ROLL_TEST
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import (
@@ -31,6 +32,7 @@ from mwdcal.files.formats.table import Table
 from mwdcal.files.parting import HOW_TO_MARK, parted, roll_test_marks
 from mwdcal.files.statements import stated_table
 from mwdcal.files.synonyms import ABOVE, BELOW, FACTORS, unit_of
+from mwdcal.identification.beside import has_channels, of_roll_tests
 from mwdcal.identification.columns import meanings_of
 from mwdcal.identification.proposal import (
     as_written,
@@ -96,7 +98,7 @@ def _under_other_names(
         every = tables.every_table(path, decimal=_sign(profile, said))
     except InputError:
         raise problem from None
-    if not any(_has_channels(each, profile) for each in every):
+    if not any(has_channels(each, profile) for each in every):
         raise problem from None
     return read_roll_test(path, profile, said)
 
@@ -139,24 +141,13 @@ def beside(
     every = tables.every_table(path, decimal=_sign(profile, said or Said()))
     sheet = run.sheet or next((each.sheet for each in every), "")
     others = [t for t in every if not is_part_of(t, sheet, run.parts, run.lines)]
-    return _of_roll_tests([t for t in others if _has_channels(t, profile)])
-
-
-def _of_roll_tests(every: Sequence[Layout]) -> list[Layout]:
-    """The tables that are called roll tests; else those that are called nothing else."""
-    return [t for t in every if t.kind == ROLL_TEST] or [t for t in every if not t.kind]
+    serial = run.metadata.get("serial", "")
+    return of_roll_tests([t for t in others if has_channels(t, profile)], serial)
 
 
 def _sign(profile: Profile, said: Said) -> str:
     """The decimal sign of text where it is known to be the comma."""
     return "," if "," in (profile.form.decimal, said.decimal) else ""
-
-
-def _has_channels(table: Layout, profile: Profile) -> bool:
-    """Whether a table has three channels of accelerometers, by the names of a profile or its own."""
-    wanted = {*runs.channels_of(profile), *CHANNELS["accelerometer"]}
-    meant = {m.column for m in meanings_of(table.names, table.units, table.above).values()}
-    return len(wanted & {*table.names}) >= 3 or {*CHANNELS["accelerometer"]} <= meant
 
 
 def read_roll_test(
@@ -207,8 +198,8 @@ def _chosen(
                 f"{name}: there is no table on a sheet {shown(said.sheet)}; found {found or 'none'}."
             )
         every = [t for t in every if said.sheet in ("", t.sheet)]
-        tests = [t for t in every if _has_channels(t, profile)]
-        tests = _of_roll_tests(tests) or tests or sorted(every, key=lambda t: t.size)[-1:]
+        tests = [t for t in every if has_channels(t, profile)]
+        tests = of_roll_tests(tests) or tests or sorted(every, key=lambda t: t.size)[-1:]
     if len(tests) > 1 and len({t.sheet for t in tests}) == 1:
         tests = [max(tests, key=lambda t: t.size)]
     if len(tests) > 1:
@@ -383,8 +374,8 @@ def _sentences(
     listed = ", ".join(f"{column} = {shown(each.name)}" for column, each in columns.items())
     absent = _lacking(columns, profile)
     return [
-        f"the roll test was read{place} by its own names: {listed}.",
-        *([f"the roll test has no column for {', '.join(absent)}."] if absent else []),
+        f"{OF_ROLL_TEST} was read{place} by its own names: {listed}.",
+        *([f"{OF_ROLL_TEST} has no column for {', '.join(absent)}."] if absent else []),
     ]
 
 

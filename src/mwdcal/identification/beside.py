@@ -1,0 +1,67 @@
+"""The other tables in the file of a run: which of them may be its roll test."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from mwdcal.calibration.record import Finding
+from mwdcal.files import runs
+from mwdcal.files.contract import CHANNELS
+from mwdcal.files.formats.columns import shown
+from mwdcal.files.formats.layout import ROLL_TEST, Layout
+from mwdcal.identification.columns import meanings_of
+from mwdcal.sensor.profile import Profile
+
+NOT_READ = "tables-not-read"
+"""The id of findings on the tables beside that of a run."""
+
+
+def has_channels(table: Layout, profile: Profile) -> bool:
+    """Whether a table has three channels of accelerometers, by the names of a profile or its own."""
+    triad = {*CHANNELS["accelerometer"]}
+    theirs = {*runs.channels_of(profile)[:3]}
+    if triad <= {*table.names} or (theirs and theirs <= {*table.names}):
+        return True
+    meant = {m.column for m in meanings_of(table.names, table.units, table.above).values()}
+    return triad <= meant
+
+
+def of_roll_tests(every: Sequence[Layout], serial: object = "") -> list[Layout]:
+    """The tables that are called roll tests; else those that are called nothing else, and are of no other serial."""
+    return [t for t in every if t.kind == ROLL_TEST] or [
+        t for t in every if not t.kind and t.titles.metadata.get("serial", serial) == serial
+    ]
+
+
+def has_roll_test(tables: Sequence[Layout]) -> bool:
+    """Whether it is clear which of some tables is a roll test: it is called so, or the only one."""
+    return len(tables) == 1 or any(t.kind == ROLL_TEST for t in tables)
+
+
+def roll_tests_beside(where: Layout, profile: Profile, serial: object) -> list[Layout]:
+    """The tables beside that of a run which may be its roll test."""
+    return of_roll_tests([t for t in where.beside if has_channels(t, profile)], serial)
+
+
+def findings_beside(where: Layout, profile: Profile, serial: object, file: str) -> list[Finding]:
+    """A sentence on each other table of readings in the `file` of a run, but for those that its layout names."""
+    every = [t for t in where.beside if has_channels(t, profile)]
+    tests = of_roll_tests(every, serial)
+    clear = has_roll_test(tests)
+    return [
+        Finding(id=NOT_READ, text=_sentence(t, clear and t in tests, where.sheet, file))
+        for t in every
+        if not any(t.form.header_line == n and why.startswith(t.kind or "-") for n, why in where.left_out)
+    ]
+
+
+def _sentence(table: Layout, is_test: bool, sheet: str, file: str) -> str:
+    """What is to be known of a table beside that of a run, on which `sheet` it is if on another."""
+    line = f"below line {table.form.header_line}"
+    place = f"on sheet {shown(table.sheet)}" if table.sheet != sheet else line
+    what = f"{table.kind or 'other readings'} {place}, {len(table.lines)} rows"
+    if is_test:
+        return f"{what}: `mwdcal calibrate … --rolltest {file}` judges by it."
+    if table.kind and table.kind != ROLL_TEST:
+        return f"{what}: not read."
+    return f"{what}: if they are the roll test, add --rolltest {file} --sheet {shown(table.sheet)}."
