@@ -18,7 +18,7 @@ from mwdcal.errors import InputError
 from mwdcal.files import profiles, runs
 from mwdcal.files.profiles import source_of_settings
 from mwdcal.identification.beside import has_roll_test
-from mwdcal.identification.roll_tests import RollTest, Said, beside, parted_run
+from mwdcal.identification.roll_tests import RollTestTable, Said, beside, parted_run
 from mwdcal.presentation.calibration_source import calibration_of
 from mwdcal.presentation.text import one_line
 from mwdcal.sensor.profile import Profile
@@ -77,7 +77,7 @@ class LoadedRun(NamedTuple):
 
     readings: Readings
     profile: Profile
-    roll_test: RollTest | None
+    roll_test: RollTestTable | None
     beside: bool
 
 
@@ -93,7 +93,7 @@ def load_runs(
     first = runs.read_export(
         run, stated, decimal=said.decimal, rows=runs.MOST_ROWS, statements=said.statements
     )
-    test = RollTest(rolltest, said) if rolltest else None
+    test = RollTestTable(rolltest, said) if rolltest else None
     if rolltest is not None and rolltest.exists() and run.exists() and run.samefile(rolltest):
         first, test = parted_run(run, first, stated, said)
     has_test = test is None and stated.form.find and has_roll_test(beside(run, first, stated))

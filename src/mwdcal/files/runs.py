@@ -314,6 +314,7 @@ def _same_place(one: TableFormat, other: TableFormat) -> bool:
 
 
 def channels_of(profile: Profile) -> list[str]:
+    """The channels by the names of a profile's tables."""
     return [each.name for column, each in sources_of(profile).items() if column in RAW]
 
 
@@ -460,9 +461,9 @@ def renamed(table: Table, profile: Profile) -> Table:
     others = [name for name in table.columns if name not in theirs]
     absent = {s.name: c for c, s in sources.items() if c in RAW and s.name not in table.columns}
     if absent:
-        columns = ", ".join(f"{shown(name)} ({column})" for name, column in absent.items())
+        listed = ", ".join(f"{shown(name)} ({column})" for name, column in absent.items())
         raise InputError(
-            f"{table.source}: the table has no {'column' if len(absent) == 1 else 'columns'} {columns} of the tool "
+            f"{table.source}: the table has no {'column' if len(absent) == 1 else 'columns'} {listed} of the tool "
             f"profile; its others are {', '.join(map(shown, others[:8])) or 'none'}. Rename them, or correct [columns] "
             "in the profile."
         )

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from mwdcal.calibration.record import Finding
 from mwdcal.files import runs
-from mwdcal.files.contract import CHANNELS
+from mwdcal.files.contract import RAW
 from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.layout import ROLL_TEST, Layout
 from mwdcal.identification.columns import meanings_of
@@ -14,16 +14,17 @@ from mwdcal.sensor.profile import Profile
 
 NOT_READ = "tables-not-read"
 """The id of findings on the tables beside that of a run."""
+LEAST_CHANNELS = 3
+"""Channels from which on a table is one of readings of a tool."""
 
 
 def has_channels(table: Layout, profile: Profile) -> bool:
-    """Whether a table has three channels of accelerometers, by the names of a profile or its own."""
-    triad = {*CHANNELS["accelerometer"]}
-    theirs = {*runs.channels_of(profile)[:3]}
-    if triad <= {*table.names} or (theirs and theirs <= {*table.names}):
+    """Whether a table has three channels or more, by the names of a profile or its own, or is called a roll test."""
+    called = {*RAW, *runs.channels_of(profile)} & {*table.names}
+    if table.kind == ROLL_TEST or len(called) >= LEAST_CHANNELS:
         return True
     meant = {m.column for m in meanings_of(table.names, table.units, table.above).values()}
-    return triad <= meant
+    return len(meant & {*RAW}) >= LEAST_CHANNELS
 
 
 def of_roll_tests(every: Sequence[Layout], serial: object = "") -> list[Layout]:
@@ -51,7 +52,9 @@ def findings_beside(where: Layout, profile: Profile, serial: object, file: str) 
     return [
         Finding(id=NOT_READ, text=_sentence(t, clear and t in tests, where.sheet, file))
         for t in every
-        if not any(t.form.header_line == n and why.startswith(t.kind or "-") for n, why in where.left_out)
+        if not any(
+            t.form.header_line == n and why.startswith(t.kind or "-") for n, why in where.left_out
+        )
     ]
 
 
@@ -61,7 +64,7 @@ def _sentence(table: Layout, is_test: bool, sheet: str, file: str) -> str:
     place = f"on sheet {shown(table.sheet)}" if table.sheet != sheet else line
     what = f"{table.kind or 'other readings'} {place}, {len(table.lines)} rows"
     if is_test:
-        return f"{what}: `mwdcal calibrate … --rolltest {file}` judges by it."
+        return f"{what}: mwdcal calibrate judges by it where `rolltest` is {file} too."
     if table.kind and table.kind != ROLL_TEST:
         return f"{what}: not read."
-    return f"{what}: if they are the roll test, add --rolltest {file} --sheet {shown(table.sheet)}."
+    return f"{what}: not read. If it is the roll test, name {file} by `rolltest`, and {shown(table.sheet)} by `sheet`."

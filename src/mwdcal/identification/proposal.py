@@ -451,11 +451,11 @@ def named_columns(
     form: TableFormat | None,
     where: Layout | None,
     answers: Mapping[str, str],
-    asks_of_rows: bool = True,
+    of_run: bool = True,
 ) -> Named:
     """What the columns of a table are by their names, units and values; raises as `columns.proposed`.
 
-    Unless it `asks_of_rows`, rows count of which it is doubtful whether they are rejected; a remark names them.
+    Unless the table is `of_run`, rows count of which it is doubtful whether they are rejected; a remark names them.
     """
     formulas = [name for name in table.columns if _is_formulas(labels_of(table, name))]
     table = replace(table, columns={n: c for n, c in table.columns.items() if n not in formulas})
@@ -468,7 +468,7 @@ def named_columns(
     values = partial(_numbers_of, table, problems)
     columns, by_value, ignored = proposed(
         names, units, values, table.source, above, table.metadata, answers, problems,
-        open_rows if asks_of_rows else (),
+        open_rows if of_run else (), of_run,
     )  # fmt: skip
     ignored |= dict.fromkeys(
         formulas, "its formulas have no value, as no spreadsheet program has saved them"

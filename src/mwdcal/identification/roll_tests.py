@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import NoReturn
 from unicodedata import normalize
 
@@ -29,7 +30,7 @@ from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, shown
 from mwdcal.files.formats.layout import ROLL_TEST, Layout, is_part_of
 from mwdcal.files.formats.table import Table
-from mwdcal.files.parting import HOW_TO_MARK, parted, roll_test_marks
+from mwdcal.files.parting import parted, roll_test_marks
 from mwdcal.files.statements import stated_table
 from mwdcal.files.synonyms import ABOVE, BELOW, FACTORS, unit_of
 from mwdcal.identification.beside import has_channels, of_roll_tests
@@ -61,9 +62,15 @@ class Said:
 
 
 def read_later(
-    path: str | os.PathLike[str], calibration: Calibration, said: Said | None = None
+    path: str | os.PathLike[str],
+    calibration: Calibration,
+    said: Said | None = None,
+    is_test: bool = True,
 ) -> Readings:
     """The readings after a calibration in a file; of that of its own run the roll test in it, if there is one.
+
+    Unless it surely `is_test`, angles under other names than the run's may be the tool's own: they are no references
+    beside channels of the run's names.
 
     Raises:
         InputError: the file cannot be read, or has no table of readings.
@@ -79,8 +86,8 @@ def read_later(
     except UnreadableFileError:
         raise
     except (InputError, FitError) as error:
-        return _under_other_names(path, profile, said, error)
-    if not _has_names(table.columns, {}, profile):
+        return _of_other_table(path, profile, said, error)
+    if not _has_names(table.columns, {}, profile, is_test):
         return read_roll_test(path, profile, said)
     readings = runs.read_run(table, profile)[0]
     if not any(calibration.used(readings.digest)):
@@ -90,7 +97,7 @@ def read_later(
     return readings
 
 
-def _under_other_names(
+def _of_other_table(
     path: str | os.PathLike[str], profile: Profile, said: Said, problem: InputError | FitError
 ) -> Readings:
     """The readings of a file without the table of a profile; the problem where it holds no other table."""
@@ -104,24 +111,27 @@ def _under_other_names(
 
 
 @dataclass(frozen=True)
-class RollTest:
-    """A roll test that is to be read once its run has given the scales: rows of the run's table, or a table of a file."""
+class RollTestTable:
+    """A roll test that is to be read once its run has given the scales: rows of the run's table, or a file.
+
+    `tables` of the file that may be meant.
+    """
 
     path: str | os.PathLike[str]
     said: Said
     rows: Table | None = None
-    run: Table | None = None
+    tables: Sequence[Layout] | None = None
 
     def readings(self, profile: Profile) -> Readings:
         """The readings, by the profile with the scales of the run; errors as of `read_later`."""
         if self.rows is not None:
             return runs.read_run(self.rows, profile)[0]
-        return read_roll_test(self.path, profile, self.said, self.run)
+        return read_roll_test(self.path, profile, self.said, self.tables)
 
 
 def parted_run(
     path: str | os.PathLike[str], table: Table, profile: Profile, said: Said
-) -> tuple[Table, RollTest]:
+) -> tuple[Table, RollTestTable]:
     """The rows of the run in a file, and the roll test beside them: a table that is called so, rows, or the only other.
 
     Raises:
@@ -129,9 +139,9 @@ def parted_run(
     """
     others = beside(path, table, profile, said)
     if said.sheet or (others and (others[0].kind == ROLL_TEST or not roll_test_marks(table))):
-        return table, RollTest(path, said, run=table)
+        return table, RollTestTable(path, said, tables=None if said.sheet else others)
     run, rows = parted(table)
-    return run, RollTest(path, said, rows=rows)
+    return run, RollTestTable(path, said, rows=rows)
 
 
 def beside(
@@ -151,19 +161,26 @@ def _sign(profile: Profile, said: Said) -> str:
 
 
 def read_roll_test(
-    path: str | os.PathLike[str], profile: Profile, said: Said, run: Table | None = None
+    path: str | os.PathLike[str],
+    profile: Profile,
+    said: Said,
+    meant: Sequence[Layout] | None = None,
 ) -> Readings:
-    """The readings of a roll test by the axes and scales of a profile; `run`: the table of the run in its file.
+    """The readings of a roll test by the axes and scales of a profile; `meant`: tables of the file that may be it.
 
     Raises:
         InputError: there is no such sheet, or no table of readings, or a channel is missing.
         FitError: which table, or which columns, are meant is open.
     """
-    where = _chosen(path, profile, said, run)
+    where = _chosen(path, profile, said, meant)
     try:
-        if where is not None and _has_names(where.names, _units(where), profile):
+        if (
+            where is not None
+            and not said.columns
+            and _has_names(where.names, _units(where), profile)
+        ):
             return _under_names_of_run(path, where, profile, said)
-        return _under_own_names(path, where, profile, said)
+        return _by_meaning(path, where, profile, said)
     except (QuestionError, QuestionsError) as error:
         _raise_answerable(error)
 
@@ -171,35 +188,26 @@ def read_roll_test(
 def _raise_answerable(error: QuestionError | QuestionsError) -> NoReturn:
     """Raise questions with the answers that a roll test takes."""
     every = error.questions if isinstance(error, QuestionsError) else (error,)
-    asked = [
+    questions = [
         QuestionError(
             each.text,
             [a for a in each.answers if all(name in _ANSWERED for name, _ in a.arguments)],
         )
         for each in every
     ]
-    raise (QuestionsError(error.source, asked) if isinstance(error, QuestionsError) else asked[0])
+    raise (
+        QuestionsError(error.source, questions)
+        if isinstance(error, QuestionsError)
+        else questions[0]
+    )
 
 
 def _chosen(
-    path: str | os.PathLike[str], profile: Profile, said: Said, run: Table | None
+    path: str | os.PathLike[str], profile: Profile, said: Said, meant: Sequence[Layout] | None
 ) -> Layout | None:
     """The table of the roll test in a file; None of a format that has but one table."""
-    name = os.path.basename(path)
-    if run is not None and not said.sheet:
-        tests = beside(path, run, profile, said)
-        if not tests:
-            raise InputError(f"{name} has no other table of readings than the run. {HOW_TO_MARK}")
-    else:
-        every = tables.every_table(path, decimal=_sign(profile, said))
-        if said.sheet and said.sheet not in {t.sheet for t in every}:
-            found = ", ".join(dict.fromkeys(shown(t.sheet) for t in every))
-            raise InputError(
-                f"{name}: there is no table on a sheet {shown(said.sheet)}; found {found or 'none'}."
-            )
-        every = [t for t in every if said.sheet in ("", t.sheet)]
-        tests = [t for t in every if has_channels(t, profile)]
-        tests = of_roll_tests(tests) or tests or sorted(every, key=lambda t: t.size)[-1:]
+    name = Path(path).name
+    tests = _all_meant(path, profile, said) if meant is None else meant
     if len(tests) > 1 and len({t.sheet for t in tests}) == 1:
         tests = [max(tests, key=lambda t: t.size)]
     if len(tests) > 1:
@@ -209,13 +217,31 @@ def _chosen(
     return tests[0] if tests else None
 
 
+def _all_meant(path: str | os.PathLike[str], profile: Profile, said: Said) -> Sequence[Layout]:
+    """The tables of a file that may be a roll test, those on the sheet that the user says."""
+    every = tables.every_table(path, decimal=_sign(profile, said))
+    on_sheet = [t for t in every if said.sheet in ("", t.sheet)]
+    if said.sheet and not on_sheet:
+        names = ", ".join(dict.fromkeys(shown(t.sheet) for t in every))
+        raise InputError(
+            f"{Path(path).name}: there is no table on a sheet {shown(said.sheet)}; found {names or 'none'}."
+        )
+    tests = [t for t in on_sheet if has_channels(t, profile)]
+    return of_roll_tests(tests) or tests or sorted(on_sheet, key=lambda t: t.size)[-1:]
+
+
 def _units(where: Layout) -> dict[str, str]:
     """The units that a table states apart from the names of its columns."""
     return dict(zip(where.names, map(unit_of, where.units), strict=True))
 
 
-def _has_names(names: Iterable[str], units: Mapping[str, str], profile: Profile) -> bool:
-    """Whether columns are called as by a profile, in its units, and none under another name is one that it names."""
+def _has_names(
+    names: Iterable[str], units: Mapping[str, str], profile: Profile, by_meaning: bool = True
+) -> bool:
+    """Whether columns are called as by a profile, in its units, and none under another name is one that it names.
+
+    One is that by its name alone, or `by_meaning`.
+    """
     names, sources = [*names], runs.sources_of(profile)
     if {*CHANNELS["accelerometer"]} <= {*names} and not runs.is_export(names, profile):
         return True
@@ -224,7 +250,9 @@ def _has_names(names: Iterable[str], units: Mapping[str, str], profile: Profile)
         return False
     others = [n for n in names if n not in theirs]
     absent = {c for c, each in sources.items() if each.name not in names}
-    meant = {m.column for m in meanings_of(others, ["" for _ in others]).values()}
+    meant = set[str]()
+    if by_meaning:
+        meant = {m.column for m in meanings_of(others, [""] * len(others)).values()}
     meant |= {c for c in absent for n in others if _plain(n) == _plain(sources[c].name)}
     return not absent & meant and all(
         not units.get(s.name) or not s.unit or runs.alike_units(units[s.name], s.unit)
@@ -250,7 +278,7 @@ def _under_names_of_run(
     return runs.read_run(table, profile)[0]
 
 
-def _under_own_names(
+def _by_meaning(
     path: str | os.PathLike[str], where: Layout | None, profile: Profile, said: Said
 ) -> Readings:
     """The readings of a table by the names that it has, as a profile would be proposed for it."""
@@ -266,13 +294,13 @@ def _under_own_names(
     columns = _with_sense(columns, profile)
     if form is not None:
         form = msgspec.structs.replace(form, ignore=tuple(ignored))
-    own = _scaled(
+    theirs = _scaled(
         msgspec.structs.replace(profile, table=form or msgspec.UNSET, columns=columns),
         runs.sources_of(profile),
     )
     table = replace(table, remarks=(*table.remarks, *_sentences(where, columns, profile)))
-    table = stated_table(table, said.statements, runs.serial_column(table, own))
-    readings = runs.read_run(table, own)[0]
+    table = stated_table(table, said.statements, runs.serial_column(table, theirs))
+    readings = runs.read_run(table, theirs)[0]
     _check_strengths(readings, columns, runs.sources_of(profile))
     return readings
 
@@ -290,9 +318,7 @@ def _known_columns(table: Table, where: Layout | None, profile: Profile) -> dict
     return known
 
 
-def _check_channels(
-    table: Table, columns: Mapping[str, ColumnSource], profile: Profile
-) -> None:
+def _check_channels(table: Table, columns: Mapping[str, ColumnSource], profile: Profile) -> None:
     """Refuse a table without channels of the run, all of which are named."""
     wanted = [c for c in runs.sources_of(profile) if c in RAW] or CHANNELS["accelerometer"]
     absent = [column for column in wanted if column not in columns]
@@ -306,9 +332,7 @@ def _check_channels(
         )
 
 
-def _with_sense(
-    columns: Mapping[str, ColumnSource], profile: Profile
-) -> dict[str, ColumnSource]:
+def _with_sense(columns: Mapping[str, ColumnSource], profile: Profile) -> dict[str, ColumnSource]:
     """The columns; an elevation counts as that of the run, whose readings told its sense."""
     name = REFERENCES["inclination"].column
     run, test = runs.sources_of(profile).get(name), columns.get(name)
@@ -361,8 +385,8 @@ def _check_strengths(
         if not low <= strength <= high:
             word = "g" if kind == "accelerometer" else "nT"
             raise InputError(
-                f"{readings.source}: by the scale of the run the {kind} reads {strength:.3g} {word}: the roll test is in "
-                "another unit. State the unit in its names and in [columns] of the run's tool profile."
+                f"{readings.source}: by the scale of the run the {kind} reads {strength:.3g} {word}: the roll test is "
+                "in another unit. State the unit in its names and in [columns] of the run's tool profile."
             )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any, Literal, Protocol, Unpack, cast, runtime_checkable
 
@@ -300,7 +300,7 @@ def _later(
     from mwdcal.identification import roll_tests
 
     said = roll_tests.Said(sheet=sheet, columns=by_column("column", column))
-    return roll_tests.read_later(source, calibration, said)
+    return roll_tests.read_later(source, calibration, said, is_test=name == "rolltest")
 
 
 def verify(
@@ -375,7 +375,7 @@ class Corrected:
     magnetic_toolface: Array
     columns: dict[str, AnyArray]
     findings: list[Finding]
-    stations: Mapping[str, AnyArray] = field(default_factory=dict)
+    stations: Mapping[str, AnyArray]
 
     def __repr__(self) -> str:
         return brief(self, self.summary)

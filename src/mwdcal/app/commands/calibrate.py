@@ -15,7 +15,7 @@ from mwdcal.errors import InputError, MwdcalError
 if TYPE_CHECKING:
     from mwdcal.calibration.readings import Readings
     from mwdcal.calibration.record import Calibration
-    from mwdcal.identification.roll_tests import RollTest
+    from mwdcal.identification.roll_tests import RollTestTable
     from mwdcal.use.verification import Verdict
 
 
@@ -98,7 +98,10 @@ def command(
 
 
 def _judged(
-    calibration: Calibration, test: RollTest | None, limits: str, files: tuple[Path, Path | None]
+    calibration: Calibration,
+    test: RollTestTable | None,
+    limits: str,
+    files: tuple[Path, Path | None],
 ) -> tuple[Readings | None, Verdict | None, str, MwdcalError | None]:
     """The readings of a roll test, if there is one, their verdict and its screen, or why there is none.
 

@@ -43,7 +43,7 @@ def command(
 
     options.check_outputs([output], [calibration, readings], page=report, form=".json")
     fitted, digest = calibration_of(calibration)
-    later = read_later(readings, fitted, options.said(decimal))
+    later = read_later(readings, fitted, options.said(decimal), is_test=False)
     result = diagnose(fitted, later)
     findings = findings_with_option_names(
         [*fitted.change_findings(), *result.findings, *of_table(later)]

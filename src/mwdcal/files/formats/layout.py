@@ -228,7 +228,7 @@ def laid_out(
         InputError: no such sheet, row or columns, or no table.
         FitError: two tables that may both be meant, or a decimal sign that the numbers leave open.
     """
-    every, covers = _found(sheets, source, sheet, header_line, decimal)
+    every, covers = _every(sheets, source, sheet, header_line, decimal)
     tables = [t for t in every if {*wanted} <= {*t.names}]
     tables = [t for t in tables if not kind or _kind(f"{t.sheet} {t.heading}") == kind]
     if not tables:
@@ -251,15 +251,17 @@ def laid_out(
 
 def every_table(sheets: Sequence[Sheet], source: str, decimal: str = "") -> list[Layout]:
     """All tables in the sheets of a file, those of the same stations joined; errors as of `laid_out`."""
-    return _found(sheets, source, "", 0, decimal)[0]
+    return _every(sheets, source, "", 0, decimal)[0]
 
 
 def is_part_of(table: Layout, sheet: str, parts: Sequence[str], lines: Sequence[int]) -> bool:
     """Whether a table is that of a run in some lines of a sheet, or one of its `parts` on several sheets."""
-    return (table.sheet, table.lines[0]) in {*zip(parts or [sheet] * len(lines), lines, strict=True)}
+    return (table.sheet, table.lines[0]) in {
+        *zip(parts or [sheet] * len(lines), lines, strict=True)
+    }
 
 
-def _found(
+def _every(
     sheets: Sequence[Sheet], source: str, sheet: str, header_line: int, decimal: str
 ) -> tuple[list[Layout], list[Sheet]]:
     """The tables of all sheets or of one, of all header lines or of one, and the sheets without numbers."""
@@ -383,7 +385,7 @@ def _side_by_side(one: Layout, other: Layout) -> Layout:
 def _beside_other_sheets(
     table: Layout, others: Sequence[Sheet], source: str, decimal: str
 ) -> tuple[Layout, list[Layout]]:
-    """A table of the sheet that the user names, with a remark on those of the same stations, and the tables of others."""
+    """A table of the sheet that is named, with a remark on those of the same stations, and the tables of others."""
     unread, beside = [], []
     for each in others:
         with suppress(InputError, FitError):
