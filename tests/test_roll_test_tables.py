@@ -218,11 +218,12 @@ def test_a_roll_test_that_cannot_be_read_does_not_lose_the_calibration(tmp_path,
     assert "accuracy to expect" in ran.out
     assert "wrote" in ran.out
     assert ran.err.splitlines()[-1].startswith("mwdcal: T.xlsx: ")
-    assert "ay" in ran.err
+    assert "--rolltest-column ay=NAME --rolltest-column mz=NAME" in ran.err
     assert library.load(cal).stations == 48
     said = ("--column", "ay=Kanal A", "--column", "mz=Kanal B (gauss)")
     assert mwdcal("verify", cal, book, *said).code == 0
-    assert mwdcal("calibrate", book, *tool, *said).code == 0
+    beside = [each.replace("--column", "--rolltest-column") for each in said]
+    assert mwdcal("calibrate", book, *tool, *beside).code == 0
 
 
 def test_verify_and_calibrate_agree_on_a_file_without_a_roll_test(tmp_path, laboratory):
@@ -266,9 +267,9 @@ def test_all_missing_columns_are_listed_at_once(tmp_path, laboratory):
     columns = rolled({n: SPANISH_RUN[n] for n in TESTS["Rolltest"]})
     less = {n: c for n, c in columns.items() if n not in (SPANISH_RUN["ay"], SPANISH_RUN["mz"])}
     path = workbook(tmp_path / "less.xlsx", run=False, Hoja1=less)
-    message = refused(mwdcal("verify", laboratory[0] / "cal.json", path), 2, 3)
-    assert "ay" in message
-    assert "mz" in message
+    message = refused(mwdcal("verify", laboratory[0] / "cal.json", path), 3)
+    assert "no column for ay, mz" in message
+    assert "--column ay=NAME --column mz=NAME" in message
 
 
 @pytest.mark.parametrize("unit", ["counts", ""])

@@ -246,8 +246,8 @@ def test_the_only_other_sheet_like_that_of_the_run_is_its_roll_test(tmp_path):
     both = ("calibrate", more, "--tool", tool, "--rolltest", more, "-o", cal)
     ran = mwdcal(*both)
     assert ran.code == 2, ran
-    assert "--sheet A or --sheet B" in ran.err
-    assert mwdcal(*both, "--sheet", "A").code == 0
+    assert "--rolltest-sheet A or --rolltest-sheet B" in ran.err
+    assert mwdcal(*both, "--rolltest-sheet", "A").code == 0
 
 
 # -------------------------------------------------------------------------- one file for another

@@ -10,7 +10,7 @@ import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import lines, print_result, say
-from mwdcal.errors import InputError, MwdcalError
+from mwdcal.errors import InputError, MwdcalError, QuestionError, QuestionsError
 
 if TYPE_CHECKING:
     from mwdcal.calibration.readings import Readings
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     help="Enter calibration, run, tool profile and verdict in this registry.",
 )
 @options.report()
-@options.of_roll_test
+@options.of_roll_test(beside_run=True)
 @options.of_run
 @options.DECIMAL
 @options.JSON
@@ -117,11 +117,28 @@ def _judged(
     try:
         rolltest = test.readings(calibration.profile)
         verdict = verify(calibration, rolltest, Path(limits))
-    except MwdcalError as problem:
+    except MwdcalError as error:
+        problem = _with_options_on_roll_test(error)
         problem.exit_code = InputError.exit_code
         return None, None, "", problem
     shown = screen(verdict, None) + next_step(verdict, files[0], files[1])
     return rolltest, verdict, shown, None
+
+
+def _with_options_on_roll_test(error: MwdcalError) -> MwdcalError:
+    """An error; of questions on a roll test with the options that answer them beside a run."""
+    if isinstance(error, QuestionsError):
+        each = [_with_options_on_roll_test(question) for question in error.questions]
+        return QuestionsError(error.source, [q for q in each if isinstance(q, QuestionError)])
+    if not isinstance(error, QuestionError):
+        return error
+    answers = [
+        answer._replace(
+            arguments=tuple((options.BESIDE_RUN + name, v) for name, v in answer.arguments)
+        )
+        for answer in error.answers
+    ]
+    return QuestionError(error.text, answers)
 
 
 def _for_machines(

@@ -171,7 +171,9 @@ RESULT = output(
 SAID_OF_RUN = "mwdcal.statements"
 """Where the context of a command has what the user says of a run."""
 SAID_OF_ROLL_TEST = "mwdcal.roll_test"
-"""Where it has what he says of a roll test."""
+"""Where it has what the user says of a roll test."""
+BESIDE_RUN = "rolltest_"
+"""How options on the table of a roll test begin beside those on the run's."""
 
 
 def _note(context: click.Context, option: click.Parameter, typed: Any) -> None:
@@ -207,25 +209,34 @@ def statements() -> dict[str, str]:
     return dict(click.get_current_context().meta.get(SAID_OF_RUN, {}))
 
 
-def of_roll_test(function: Function) -> Function:
-    """The options that answer what the table of a roll test, or of later readings, leaves open."""
+def of_roll_test(beside_run: bool = False) -> Decorator:
+    """The options that answer what the table of a roll test, or of later readings, leaves open.
+
+    Those of a command that also has a table of a run begin with `BESIDE_RUN`.
+    """
     noted = partial(click.option, callback=_note_of_roll_test, expose_value=False)
-    for option in (
-        noted(
-            "--column",
-            multiple=True,
-            metavar="OURS=THEIRS",
-            help="Which column of the roll test is which: ref_toolface_deg='Cara 2'. Repeatable.",
-        ),
-        noted("--sheet", default="", metavar="NAME", help="Sheet of the roll test."),
-    ):
-        function = option(function)
-    return function
+    prefix = f"--{BESIDE_RUN.replace('_', '-')}" if beside_run else "--"
+
+    def decorated(function: Function) -> Function:
+        for option in (
+            noted(
+                f"{prefix}column",
+                multiple=True,
+                metavar="OURS=THEIRS",
+                help="Which column of the roll test is which: ref_toolface_deg='Cara 2'. Repeatable.",
+            ),
+            noted(f"{prefix}sheet", default="", metavar="NAME", help="Sheet of the roll test."),
+        ):
+            function = option(function)
+        return function
+
+    return decorated
 
 
 def _note_of_roll_test(context: click.Context, option: click.Parameter, typed: Any) -> None:
     """Note what the user says of the table of a roll test."""
-    context.meta.setdefault(SAID_OF_ROLL_TEST, {})[str(option.name)] = typed
+    name = str(option.name).removeprefix(BESIDE_RUN)
+    context.meta.setdefault(SAID_OF_ROLL_TEST, {})[name] = typed
 
 
 def said(decimal: str) -> Said:
