@@ -67,4 +67,7 @@ def _sentence(table: Layout, is_test: bool, sheet: str, file: str) -> str:
         return f"{what}: mwdcal calibrate judges by it where `rolltest` is {file} too."
     if table.kind and table.kind != ROLL_TEST:
         return f"{what}: not read."
-    return f"{what}: not read. If it is the roll test, name {file} by `rolltest`, and {shown(table.sheet)} by `rolltest_sheet`."
+    if table.sheet == sheet:
+        return f"{what}: not read. If it is the roll test, write it to a file of its own."
+    named = f"{file} by `rolltest`, and {shown(table.sheet)} by `rolltest_sheet`"
+    return f"{what}: not read. If it is the roll test, name {named}."

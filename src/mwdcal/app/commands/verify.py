@@ -30,7 +30,7 @@ def command(
 
     \b
     Example: mwdcal verify tool.json rolltest.csv --limits roll-test
-    Exit: 0 pass, 1 fail, 2 input cannot be read or is not independent.
+    Exit: 0 pass, 1 fail, 2 input cannot be read or is not independent, 3 it leaves a question open.
     """
     from msgspec.structs import replace
 
