@@ -59,7 +59,7 @@ def findings_beside(where: Layout, profile: Profile, serial: object, file: str) 
 
 
 def _sentence(table: Layout, is_test: bool, sheet: str, file: str) -> str:
-    """What is to be known of a table beside that of a run, on which `sheet` it is if on another."""
+    """A sentence on a table beside that of a run on a `sheet`."""
     line = f"below line {table.form.header_line}"
     place = f"on sheet {shown(table.sheet)}" if table.sheet != sheet else line
     what = f"{table.kind or 'other readings'} {place}, {len(table.lines)} rows"

@@ -453,7 +453,7 @@ def named_columns(
     answers: Mapping[str, str],
     of_run: bool = True,
 ) -> Named:
-    """What the columns of a table are by their names, units and values; raises as `columns.proposed`.
+    """The columns of a table by their names, units and values; raises as `columns.proposed`.
 
     Unless the table is `of_run`, rows count of which it is doubtful whether they are rejected; a remark names them.
     """

@@ -53,7 +53,7 @@ _ANSWERED = ("sheet", "column")
 
 @dataclass(frozen=True)
 class Said:
-    """What the user says of the table of a roll test: as of `runs.read_export`, its sheet, and its columns."""
+    """Statements of the user on the table of a roll test: as of `runs.read_export`, its sheet, and its columns."""
 
     decimal: str = "."
     statements: Mapping[str, str] = field(default_factory=dict)
@@ -393,7 +393,7 @@ def _check_strengths(
 def _sentences(
     where: Layout | None, columns: Mapping[str, ColumnSource], profile: Profile
 ) -> list[str]:
-    """What was read, and which references of the run are not there."""
+    """The names by which a roll test was read, and the references of the run that it has not."""
     place = f" from sheet {shown(where.sheet)}" if where and where.sheet else ""
     listed = ", ".join(f"{column} = {shown(each.name)}" for column, each in columns.items())
     absent = _lacking(columns, profile)

@@ -240,7 +240,7 @@ def _note_of_roll_test(context: click.Context, option: click.Parameter, typed: A
 
 
 def said(decimal: str) -> Said:
-    """What the user says of tables: decimal sign, serial, date and operator, sheet and columns of the roll test."""
+    """Statements of the user on tables: decimal sign, serial, date and operator, sheet and columns of the roll test."""
     from mwdcal.identification.roll_tests import Said
     from mwdcal.library.answers import by_column
 
