@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NoReturn
 from unicodedata import normalize
@@ -31,7 +31,7 @@ from mwdcal.files.formats.columns import LABELS, shown
 from mwdcal.files.formats.layout import ROLL_TEST, Layout, is_part_of
 from mwdcal.files.formats.table import Table
 from mwdcal.files.parting import parted, roll_test_marks
-from mwdcal.files.statements import stated_table
+from mwdcal.files.statements import Said, stated_table
 from mwdcal.files.synonyms import ABOVE, BELOW, FACTORS, unit_of
 from mwdcal.identification.beside import has_channels, of_roll_tests
 from mwdcal.identification.columns import meanings_of
@@ -49,16 +49,6 @@ _STRENGTHS = {"accelerometer": (1 / 3, 3.0), "magnetometer": (7_000.0, 210_000.0
 """Strengths, g and nT, outside which readings are in another unit than the scale of a triad."""
 _ANSWERED = ("sheet", "column")
 """Arguments that answer questions about a roll test."""
-
-
-@dataclass(frozen=True)
-class Said:
-    """Statements of the user on the table of a roll test: as of `runs.read_export`, its sheet, and its columns."""
-
-    decimal: str = "."
-    statements: Mapping[str, str] = field(default_factory=dict)
-    sheet: str = ""
-    columns: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_later(

@@ -21,7 +21,7 @@ from mwdcal.comparison.compare import compare as compare_methods
 from mwdcal.errors import InputError
 from mwdcal.faults.diagnosis import Diagnosis
 from mwdcal.faults.diagnosis import diagnose as explain
-from mwdcal.files import documents, logs, profiles, runs
+from mwdcal.files import documents, logs, profiles, runs, statements
 from mwdcal.files import metadata as meta
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, Column, as_text
@@ -299,7 +299,7 @@ def _later(
         return readings_of(source, name, calibration.profile)
     from mwdcal.identification import roll_tests
 
-    said = roll_tests.Said(sheet=sheet, columns=by_column("column", column))
+    said = statements.Said(sheet=sheet, columns=by_column("column", column))
     return roll_tests.read_later(source, calibration, said, is_test=name == "rolltest")
 
 

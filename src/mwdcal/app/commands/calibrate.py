@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Unpack
 
@@ -45,7 +46,7 @@ if TYPE_CHECKING:
     help="Enter calibration, run, tool profile and verdict in this registry.",
 )
 @options.report()
-@options.of_roll_test(beside_run=True)
+@partial(options.of_roll_test, beside_run=True)
 @options.of_run
 @options.DECIMAL
 @options.JSON

@@ -16,7 +16,7 @@ from mwdcal.presentation.typed import findings_with_option_names
 @options.argument("readings")
 @options.RESULT
 @options.report()
-@options.of_roll_test()
+@options.of_roll_test
 @options.DECIMAL
 @options.JSON
 def command(

@@ -17,7 +17,7 @@ from mwdcal.presentation.typed import findings_with_option_names
 @options.LIMITS
 @options.RESULT
 @options.report(help="Also write the report, with this verdict.")
-@options.of_roll_test()
+@options.of_roll_test
 @options.of_run
 @options.DECIMAL
 @options.TRUSTED_KEYS
