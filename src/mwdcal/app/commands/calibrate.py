@@ -74,7 +74,9 @@ def command(
     readings, profile, test, beside = load_runs(run, rolltest, tool, prior, options.said(decimal))
     choice, result = chosen_fit(readings, profile, options_of(typed, prior, exclude, digest), say)
     calibration = recorded(choice, result)
-    turned, verdict, judged, problem = _judged(calibration, test, limits, (output, rolltest))
+    turned, verdict, judged, problem = None, None, "", None
+    if test and rolltest:
+        turned, verdict, judged, problem = _judged(calibration, test, limits, (output, rolltest))
     rendered = ""
     if report:
         from mwdcal.files.limits import load_limits
@@ -99,17 +101,12 @@ def command(
 
 
 def _judged(
-    calibration: Calibration,
-    test: RollTestTable | None,
-    limits: str,
-    files: tuple[Path, Path | None],
+    calibration: Calibration, test: RollTestTable, limits: str, files: tuple[Path, Path]
 ) -> tuple[Readings | None, Verdict | None, str, MwdcalError | None]:
-    """The readings of a roll test, if there is one, their verdict and its screen, or why there is none.
+    """The readings of a roll test, their verdict and its screen, or why there is none.
 
     `files` of calibration and roll test.
     """
-    if test is None or files[1] is None:
-        return None, None, "", None
     from mwdcal.files.limits import load_limits
     from mwdcal.library.tasks import verify
     from mwdcal.presentation.verification import next_step, screen
