@@ -572,7 +572,7 @@ def aberdeen_workbook() -> Laboratory:
         truth,
         sheets=(cover,),
         at=1,
-        sheet="Roll test",
+        sheet="Calibration",
         merged=merged,
     )
 

@@ -50,7 +50,7 @@ def sheet_in_front(book):
 
 
 def column_behind(book):
-    sheet = book["Roll test"]
+    sheet = book.worksheets[1]
     sheet.cell(8, sheet.max_column + 1, "Shift")
     for row in range(10, sheet.max_row + 1):
         if sheet.cell(row, 2).value is not None:
@@ -63,7 +63,7 @@ CHANGES = {
     "remark row": (
         "aberdeen_job_0117",
         ".xlsx",
-        with_rows(lambda b: b["Roll test"].insert_rows(2)),
+        with_rows(lambda b: b.worksheets[1].insert_rows(2)),
     ),
     "column behind": ("aberdeen_job_0117", ".xlsx", with_rows(column_behind)),
     "other order of sheets": ("aberdeen_job_0117", ".xlsx", with_rows(first_sheet_last)),

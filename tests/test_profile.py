@@ -519,7 +519,7 @@ def test_a_missing_channel_is_named_and_a_line_more_makes_no_difference(german, 
     text = run.read_bytes()
     (tmp_path / "less.csv").write_bytes(text.replace(b"Gx", b"Gq", 1))
     output = ("--tool", tool, "-o", tmp_path / "cal.json")
-    assert "'Gx', which is 'ax'" in refused(mwdcal("calibrate", tmp_path / "less.csv", *output), 2)
+    assert "no column 'Gx' (ax)" in refused(mwdcal("calibrate", tmp_path / "less.csv", *output), 2)
     (tmp_path / "shifted.csv").write_bytes(b"one more line\r\n" + text)
     moved = mwdcal("calibrate", tmp_path / "shifted.csv", *output, "--json").json
     plain = mwdcal("calibrate", run, "--tool", tool, "-o", tmp_path / "plain.json", "--json").json

@@ -243,8 +243,11 @@ def test_the_only_other_sheet_like_that_of_the_run_is_its_roll_test(tmp_path):
     more = workbook(
         tmp_path / "b.xlsx", Cal=named(servo_run()), A=named(rolled()), B=named(rolled(noise=3))
     )
-    message = refused(mwdcal("calibrate", more, "--tool", tool, "--rolltest", more, "-o", cal), 2)
-    assert "call its sheet 'Roll test'" in message
+    both = ("calibrate", more, "--tool", tool, "--rolltest", more, "-o", cal)
+    ran = mwdcal(*both)
+    assert ran.code == 2, ran
+    assert "--rolltest-sheet A or --rolltest-sheet B" in ran.err
+    assert mwdcal(*both, "--rolltest-sheet", "A").code == 0
 
 
 # -------------------------------------------------------------------------- one file for another
@@ -261,7 +264,7 @@ def test_a_file_of_another_kind_is_named_with_what_is_wanted(laboratory, tmp_pat
         ("calibrate", book, "--tool", book, *output): "mwdcal profile book.xlsx -o tool.toml",
         ("calibrate", run, "--tool", cal, *output): "cal.json is no tool profile",
         ("apply", tool, run, "-o", tmp_path / "o.csv"): "Calibrate a run with it first",
-        ("verify", cal, run): "mwdcal calibrate judges one",
+        ("verify", cal, run): "on another sheet of this one",
         ("survey", cal, run, "--date", "28.11.2026", "-o", tmp_path / "o.csv"): "such as 2026-11-28",
     }  # fmt: skip
     for arguments, words in asked.items():

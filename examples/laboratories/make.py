@@ -45,7 +45,7 @@ def rolled(each: Laboratory) -> dict[str, np.ndarray]:
 
 
 def retested(each: Laboratory) -> Laboratory:
-    """The laboratory's table with the readings of a roll test in its first twelve rows, and no others."""
+    """The laboratory's table with the readings of a roll test in its first twelve rows alone, on a sheet called so."""
     form, values = each.form, {**rolled(each), **ANGLES}
     grid = [list(row) for row in form.sheets[form.at].grid]
     for place, line in enumerate(form.rows[:12]):
@@ -53,7 +53,10 @@ def retested(each: Laboratory) -> Laboratory:
             if key in values:
                 grid[line][column] = like(grid[line][column], values[key][place])
     kept = tuple(tuple(row) for line, row in enumerate(grid) if line <= form.rows[11])
-    sheets = [s._replace(grid=kept) if k == form.at else s for k, s in enumerate(form.sheets)]
+    name = "Roll test" if form.sheets[form.at].name else ""
+    sheets = [
+        s._replace(grid=kept, name=name) if k == form.at else s for k, s in enumerate(form.sheets)
+    ]
     return replace(
         each, content=rendered(replace(form, sheets=tuple(sheets), rows=form.rows[:12]), each.file)
     )

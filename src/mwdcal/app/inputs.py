@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -16,11 +17,14 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.errors import InputError
 from mwdcal.files import profiles, runs
 from mwdcal.files.formats.table import Table
-from mwdcal.files.parting import parted
 from mwdcal.files.profiles import source_of_settings
+from mwdcal.files.statements import Said
 from mwdcal.presentation.calibration_source import calibration_of
 from mwdcal.presentation.text import one_line
 from mwdcal.sensor.profile import Profile
+
+if TYPE_CHECKING:
+    from mwdcal.identification.roll_tests import RollTestTable
 
 # --------------------------------------------------------------------------
 # Questions on a terminal: one line each, with what is believed first.
@@ -72,34 +76,39 @@ def load_run(
 
 
 def load_runs(
-    run: Path,
-    rolltest: Path | None,
-    tool: str | None,
-    decimal: str,
-    prior: Prior,
-    statements: Mapping[str, str],
-) -> tuple[Readings, Readings | None, Profile, bool]:
-    """A run and its roll test, if there is one, the tool profile, and whether the file of the run has a roll test.
+    run: Path, rolltest: Path | None, tool: str | None, prior: Prior, said: Said
+) -> tuple[Readings, Profile, RollTestTable | None, bool]:
+    """A run, its tool profile and its roll test, which is still to be read, and whether its file has one unnamed.
 
-    Both may be in one file: on two sheets, or in one table with a column that marks the roll test.
+    `said` as of `roll_tests.read_roll_test`. Both may be in one file: on two sheets, or in one table with a column that
+    marks the roll test.
     """
     stated, digest = profiles.load_profile(tool)
     stated = profile_for(prior, stated)
     first = runs.read_export(
-        run, stated, decimal=decimal, rows=runs.MOST_ROWS, statements=statements
+        run, stated, decimal=said.decimal, rows=runs.MOST_ROWS, statements=said.statements
     )
-    same = rolltest is not None and rolltest.exists() and run.exists() and run.samefile(rolltest)
-    beside = None
-    if same or (rolltest is None and stated.form.find):
-        beside = runs.read_roll_test(run, first, stated, statements)
-    second: Path | Table | None = beside if same else rolltest
-    if same and beside is None:
-        first, second = parted(first)
+    test, has_test = None, False
+    if rolltest is not None or stated.form.find:
+        first, test, has_test = _with_roll_test(run, rolltest, first, stated, said)
     readings, profile = runs.read_run(first, stated)
-    test = second and runs.read_run(second, profile, decimal=decimal, statements=statements)[0]
     source = source_of_settings()
     readings = replace(readings, profile_sha256=digest, settings_source=source)
-    return readings, test or None, profile, beside is not None
+    return readings, profile, test, has_test
+
+
+def _with_roll_test(
+    run: Path, rolltest: Path | None, table: Table, profile: Profile, said: Said
+) -> tuple[Table, RollTestTable | None, bool]:
+    """The rows of a run in its table, its roll test, and whether the file has one where none is named."""
+    from mwdcal.identification.beside import has_roll_test
+    from mwdcal.identification.roll_tests import RollTestTable, beside, parted_run
+
+    if rolltest is None:
+        return table, None, has_roll_test(beside(run, table, profile))
+    if rolltest.exists() and run.exists() and run.samefile(rolltest):
+        return *parted_run(run, table, profile, said), False
+    return table, RollTestTable(rolltest, said), False
 
 
 def prior_of(word: str | None) -> tuple[Prior, str]:

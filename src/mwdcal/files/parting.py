@@ -35,24 +35,33 @@ def parted(table: Table) -> tuple[Table, Table]:
     Raises:
         InputError: no column marks it, or several do and differ.
     """
-    marks = {
-        name: rows
-        for name in table.columns
-        if name not in COLUMNS and (rows := marked_rows(table, name))
-    }
-    if len({tuple(rows) for rows in marks.values()}) != 1:
-        which = (
-            f"{' and '.join(map(shown, marks))} mark different rows"
-            if marks
-            else "no column marks it: its stations were in the fit"
-        )
+    marks = roll_test_marks(table)
+    if not marks:
         raise InputError(
-            f"{table.source} holds both run and roll test, and {which}. Mark the roll test in one column, such as "
-            "'Roll test' with yes at its rows, call its sheet 'Roll test', or name another table by `rolltest`."
+            f"{table.source} has one table of readings, and no column marks a roll test in it: all its stations are of "
+            f"the run. {HOW_TO_MARK}"
+        )
+    if len({tuple(rows) for rows in marks.values()}) > 1:
+        raise InputError(
+            f"{table.source} holds both run and roll test, and {' and '.join(map(shown, marks))} mark different rows. "
+            "Correct one of them."
         )
     rows = next(iter(marks.values()))
     others = [row for row in range(table.count) if row not in {*rows}]
     return rows_of(table, others), rows_of(table, rows)
+
+
+HOW_TO_MARK = (
+    "Mark a roll test in one column, such as 'Roll test' with yes at its rows, put it on a sheet of its own, or name "
+    "its file by `rolltest`."
+)
+"""How a roll test in the file of the run is told."""
+
+
+def roll_test_marks(table: Table) -> dict[str, list[int]]:
+    """The rows that columns mark as roll test, by the name of the column."""
+    marks = {name: marked_rows(table, name) for name in table.columns if name not in COLUMNS}
+    return {name: rows for name, rows in marks.items() if rows}
 
 
 def marked_rows(table: Table, name: str) -> list[int]:

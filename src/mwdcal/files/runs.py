@@ -54,7 +54,6 @@ from mwdcal.files.formats.columns import LABELS, Column, looks_numeric, plain_na
 from mwdcal.files.formats.table import Table, labels
 from mwdcal.files.formats.text import holds_numbers, is_formula
 from mwdcal.files.marks import UNMARKED, without_rejected
-from mwdcal.files.parting import parted
 from mwdcal.files.repeats import means, repeats
 from mwdcal.files.statements import stated_table
 from mwdcal.geometry.observables import OBSERVABLES
@@ -62,7 +61,6 @@ from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import ColumnSource, Profile, TableFormat, TriadProfile
 
 if TYPE_CHECKING:
-    from mwdcal.calibration.record import Calibration
     from mwdcal.files.formats.layout import Layout
 
 # --------------------------------------------------------------------------
@@ -154,28 +152,6 @@ def read_stations(stations: Table, profile: Profile) -> tuple[Readings, Profile]
     return replace(readings, others=_other_numbers(table)), profile
 
 
-def read_later(
-    path: str | os.PathLike[str],
-    calibration: Calibration,
-    *,
-    decimal: str = ".",
-    statements: Mapping[str, str] | None = None,
-) -> Table:
-    """The table of readings after a calibration: of the file of its own run the roll test in it, if there is one.
-
-    `decimal` and `statements` as for `read_export`.
-    """
-    profile, said = calibration.profile, statements or {}
-    table = read_export(path, profile, decimal=decimal, rows=MOST_ROWS, statements=said)
-    if not any(calibration.used(read_run(table, profile)[0].digest)):
-        return table
-    test = read_roll_test(path, table, profile, said)
-    if test is None:
-        with suppress(InputError):
-            test = parted(table)[1]
-    return test or table
-
-
 def _other_numbers(table: Table) -> dict[str, Array]:
     """The numbers (n,) in columns that are not used and have one at every station."""
     others: dict[str, Array] = {}
@@ -209,8 +185,8 @@ def read_export(
     else:
         table = _exported(path, form, profile, decimal, rows)
         if is_export(table.columns, profile):
-            table = _with_form(table, form)
-    return stated_table(table, statements or {}, _serial_column(table, profile))
+            table = with_form(table, form)
+    return stated_table(table, statements or {}, serial_column(table, profile))
 
 
 def _undocumented(path: str | os.PathLike[str], error: InputError) -> InputError:
@@ -234,44 +210,7 @@ def _undocumented(path: str | os.PathLike[str], error: InputError) -> InputError
     )
 
 
-def read_roll_test(
-    path: str | os.PathLike[str], run: Table, profile: Profile, statements: Mapping[str, str]
-) -> Table | None:
-    """The roll test in the file of a run: on a sheet or below a line that says so, or on the only other sheet like it.
-
-    None without one.
-    """
-    from mwdcal.files.formats.layout import ROLL_TEST
-
-    form = profile.form
-    decimal = "," if form.decimal == "," else ""
-    wanted = _channels_of(profile) or CHANNELS["accelerometer"]
-    with suppress(InputError, FitError):
-        try:
-            where = tables.laid_out(path, wanted=wanted, decimal=decimal, kind=ROLL_TEST)
-        except InputError:
-            where = _other_sheet(path, run, wanted, decimal) if run.sheet else None
-        if where and (where.sheet, where.lines[0]) != (run.sheet, run.lines[0]):
-            table = _with_form(_of_layout(where, path, profile), form)
-            return stated_table(table, statements, _serial_column(table, profile))
-    return None
-
-
-def _other_sheet(
-    path: str | os.PathLike[str], run: Table | Layout, wanted: Sequence[str], decimal: str
-) -> Layout | None:
-    """The table on the only sheet of columns like those of a run beside it; None of several, or without one."""
-    try:
-        return tables.laid_out(path, wanted=wanted, decimal=decimal)
-    except QuestionError as question:
-        said = [value for answer in question.answers for _, value in answer.arguments]
-        others = [sheet for sheet in said if sheet != run.sheet]
-    if len(others) != 1:
-        return None
-    return tables.laid_out(path, sheet=others[0], wanted=wanted, decimal=decimal)
-
-
-def _with_form(table: Table, form: TableFormat) -> Table:
+def with_form(table: Table, form: TableFormat) -> Table:
     """An export with the cells and the north that the form of its tables adds."""
     table = filled_down(table, form.fill_down)
     return replace(table, metadata={**form.north, **table.metadata})
@@ -291,9 +230,9 @@ def filled_down(table: Table, names: Collection[str]) -> Table:
     return replace(table, columns=columns, remarks=(*table.remarks, *remarks))
 
 
-def _serial_column(table: Table, profile: Profile) -> str:
+def serial_column(table: Table, profile: Profile) -> str:
     """The column of serials in a table."""
-    name = _sources(profile).get("serial", ColumnSource(name="serial")).name
+    name = sources_of(profile).get("serial", ColumnSource(name="serial")).name
     return name if name in table.columns else "serial"
 
 
@@ -304,14 +243,14 @@ def _exported(
     if form.find:
         sign = "," if form.decimal == "," else ""
         try:
-            where = _laid_out(path, form, _channels_of(profile), sign)
+            where = _laid_out(path, form, channels_of(profile), sign)
         except InputError as error:
             if table := _as_documented(path, decimal, rows):
                 return table
             raise _unlike_profile(error) from None
-        return _of_layout(where, path, profile) if where else tables.read(path)
+        return of_layout(where, path, profile) if where else tables.read(path)
     try:
-        serial = _sources(profile).get("serial", ColumnSource(name="serial")).name
+        serial = sources_of(profile).get("serial", ColumnSource(name="serial")).name
         table = tables.read(path, rows=rows, export=form, serial=serial)
         if is_export(table.columns, profile):
             _check_below_names(path, form, profile)
@@ -322,7 +261,7 @@ def _exported(
     if documented := _as_documented(path, decimal, rows):
         return documented
     if moved := _moved(path, form, profile):
-        return _of_layout(moved, path, profile)
+        return of_layout(moved, path, profile)
     raise _unlike_profile(problem)
 
 
@@ -362,7 +301,7 @@ def _laid_out(
 def _moved(path: str | os.PathLike[str], form: TableFormat, profile: Profile) -> Layout | None:
     """Where a file has the table of a profile, if elsewhere than the profile says."""
     with suppress(InputError, FitError):
-        where = tables.laid_out(path, wanted=_channels_of(profile))
+        where = tables.laid_out(path, wanted=channels_of(profile))
         if where and (where.number > 0 or not _same_place(where.form, form)):
             return where
     return None
@@ -374,21 +313,22 @@ def _same_place(one: TableFormat, other: TableFormat) -> bool:
     return all(getattr(one, name) == getattr(other, name) for name in written)
 
 
-def _channels_of(profile: Profile) -> list[str]:
-    return [each.name for column, each in _sources(profile).items() if column in RAW]
+def channels_of(profile: Profile) -> list[str]:
+    """The channels by the names of a profile's tables."""
+    return [each.name for column, each in sources_of(profile).items() if column in RAW]
 
 
-def _of_layout(where: Layout, path: str | os.PathLike[str], profile: Profile) -> Table:
+def of_layout(where: Layout, path: str | os.PathLike[str], profile: Profile) -> Table:
     """The table of a layout that has the channels of a profile.
 
     Raises:
         InputError: a column is in another unit than the profile says.
     """
-    named = {each.name: column for column, each in _sources(profile).items()}
+    named = {each.name: column for column, each in sources_of(profile).items()}
     for name, unit in zip(where.names, map(synonyms.unit_of, where.units), strict=True):
-        source = _sources(profile)[named[name]] if name in named else ColumnSource(name=name)
+        source = sources_of(profile)[named[name]] if name in named else ColumnSource(name=name)
         stated = source.unit
-        if unit and stated and unit != source.instead_of and not _alike_units(unit, stated):
+        if unit and stated and unit != source.instead_of and not alike_units(unit, stated):
             raise InputError(
                 f"{Path(path).name}: {shown(name)} is in {unit}, by the tool profile in {stated}. Correct "
                 "[columns] there, or propose a profile for this table: mwdcal profile."
@@ -401,8 +341,8 @@ def _check_below_names(path: str | os.PathLike[str], form: TableFormat, profile:
     if form.first_line == form.header_line + 1:
         return
     (_, names), *skipped = tables.below_names(path, form) or [(0, [])]
-    theirs = {each.name: each.unit for each in _sources(profile).values() if each.unit}
-    wrong = {(each.name, each.instead_of) for each in _sources(profile).values()}
+    theirs = {each.name: each.unit for each in sources_of(profile).values() if each.unit}
+    wrong = {(each.name, each.instead_of) for each in sources_of(profile).values()}
     for line, cells in skipped:
         where = f"{Path(path).name}, line {line}"
         if holds_numbers(cells):
@@ -412,14 +352,14 @@ def _check_below_names(path: str | os.PathLike[str], form: TableFormat, profile:
         for name, unit in zip(names, map(synonyms.unit_of, cells), strict=False):
             if (name.strip(), unit) in wrong:
                 continue
-            if unit and not _alike_units(unit, theirs.get(name.strip(), unit)):
+            if unit and not alike_units(unit, theirs.get(name.strip(), unit)):
                 raise InputError(
                     f"{where}: {shown(name.strip())} is in {unit}, by the tool profile in "
                     f"{theirs[name.strip()]}."
                 )
 
 
-def _alike_units(written: str, stated: str) -> bool:
+def alike_units(written: str, stated: str) -> bool:
     """Whether a unit as it is written may be the one of a profile: G is also Gauss, and ° any sense of an angle."""
     return (
         written == stated
@@ -428,19 +368,19 @@ def _alike_units(written: str, stated: str) -> bool:
     )
 
 
-def _sources(profile: Profile) -> dict[str, ColumnSource]:
+def sources_of(profile: Profile) -> dict[str, ColumnSource]:
     """The columns that a profile names, by the name of the run file."""
     return {} if isinstance(profile.columns, msgspec.UnsetType) else profile.columns
 
 
 def is_export(names: Iterable[str], profile: Profile) -> bool:
     """Whether columns of these names are those of the channels that the profile states."""
-    stated = {s.name for column, s in _sources(profile).items() if column in RAW}
+    stated = {s.name for column, s in sources_of(profile).items() if column in RAW}
     return not stated.isdisjoint(names)
 
 
 def _not_as_stated(table: Table, profile: Profile) -> InputError:
-    stated = [s.name for column, s in _sources(profile).items() if column in RAW]
+    stated = [s.name for column, s in sources_of(profile).items() if column in RAW]
     return InputError(
         f"{table.source}: none of the columns {', '.join(map(shown, stated))} that [columns] of the tool "
         f"profile names; found {', '.join(shown(name) for name in [*table.columns][:12])}."
@@ -457,7 +397,7 @@ def station_table(table: Table, profile: Profile) -> Table:
 
     Its `remarks` say which rows are left out, and of which the means are taken.
     """
-    sources = _sources(profile) if is_export(table.columns, profile) else {}
+    sources = sources_of(profile) if is_export(table.columns, profile) else {}
     named = {each.name: column for column, each in sources.items()}
     used = [n for n in table.columns if named.get(n, n) in UNMARKED]
     _check_names(table, sources)
@@ -512,18 +452,22 @@ def renamed(table: Table, profile: Profile) -> Table:
         columns={n: c for n, c in table.columns.items() if n not in ignored},
         metadata={n: c for n, c in table.metadata.items() if n not in ignored},
     )
+    sources = sources_of(profile)
     if not is_export(table.columns, profile):
+        if sources and {*CHANNELS["accelerometer"]}.isdisjoint(table.columns):
+            raise _not_as_stated(table, profile)
         return _with_stated_references(table)
-    sources = _sources(profile)
     theirs = {s.name: column for column, s in sources.items() if s.name in table.columns}
     others = [name for name in table.columns if name not in theirs]
+    absent = {s.name: c for c, s in sources.items() if c in RAW and s.name not in table.columns}
+    if absent:
+        listed = ", ".join(f"{shown(name)} ({column})" for name, column in absent.items())
+        raise InputError(
+            f"{table.source}: the table has no {'column' if len(absent) == 1 else 'columns'} {listed} of the tool "
+            f"profile; its others are {', '.join(map(shown, others[:8])) or 'none'}. Rename them, or correct [columns] "
+            "in the profile."
+        )
     for column, source in sources.items():
-        if column in RAW and source.name not in table.columns:
-            raise InputError(
-                f"{table.source}: the table has no column {shown(source.name)}, which is '{column}' by the tool "
-                f"profile; its others are {', '.join(map(shown, others[:8])) or 'none'}. Rename one of them, or "
-                "correct [columns] in the profile."
-            )
         if column in table.columns and source.name != column and column not in theirs:
             raise InputError(
                 f"{table.source}: '{column}' is a column of the table, and {shown(source.name)} is '{column}' by "

@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 from mwdcal.calibration.readings import IN_TABLE
 from mwdcal.errors import InputError
 from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.table import Table, labels
+
+
+@dataclass(frozen=True)
+class Said:
+    """Statements of the user on the table of a roll test: as of `runs.read_export`, its sheet, and its columns."""
+
+    decimal: str = "."
+    statements: Mapping[str, str] = field(default_factory=dict)
+    sheet: str = ""
+    columns: Mapping[str, str] = field(default_factory=dict)
 
 
 def with_statements(

@@ -100,7 +100,7 @@ TRANSLATIONS = (
         r"verktoy(flate|vinkel)\w*|(face|angulo) d[ae] ferramenta|(face|angle)( d[e'])? ?(l'?)?outil|"
         r"ghsf?\b|угол установки( отклонител\w*)?|визир\w*( угол)?|"
         r"angulo de giro|giro|rotacion|отклонител\w*|откл\b\.?|визирн\w* угол|поворот|工具面角?|"
-        r"cara de (la )?herr(amienta|\b\.?)|gravity tool ?face|h\.?s\.?[ _-]*tool ?face|"
+        r"\bcara\b(?! *mag)( (de (la )?)?herr(amienta|\b\.?))?|tf grav\w*|gravity tool ?face|h\.?s\.?[ _-]*tool ?face|"
         r"tool[ _-]*face( (d[ae] )?(la )?grav\w*| ?\(grav\w*\.?\))?",
         "toolface ",
     ),

@@ -797,6 +797,7 @@ def proposed(
     answers: Mapping[str, str] | None = None,
     problems: Mapping[str, QuestionError] | None = None,
     besides: Sequence[QuestionError] = (),
+    of_run: bool = True,
 ) -> tuple[dict[str, ColumnSource], set[str], dict[str, str]]:
     """The columns of a table by the name that they have in a run file, and those with a unit by their values.
 
@@ -804,7 +805,8 @@ def proposed(
 
     `above`: lines above the names. `stated`: what the table says of itself, as metadata. `answers`: columns of the
     table by the name of the run file, as the user says. `problems`: what is wrong with columns of which `values` gave
-    none although most of their cells are numbers. `besides`: questions that are open as well.
+    none although most of their cells are numbers. `besides`: questions that are open as well. Channels of a table that
+    is not `of_run` may be missing or unsound.
 
     Raises:
         InputError: an answer that names no column.
@@ -813,9 +815,8 @@ def proposed(
     """
     meanings = _with_whole_vectors(meanings_of(names, units, above))
     _tell_by_values(meanings, names, units, values)
-    said, known = answers or {}, stated or {}
+    said, known, every = answers or {}, stated or {}, dict(zip(names, units, strict=True))
     _tell_numbers(meanings, values, said)
-    every = dict(zip(names, units, strict=True))
     ignored = _no_evidence(meanings, values, said, known, above, every)
     _answered(said, names, meanings, source)
     questions = Questions(besides)
@@ -831,7 +832,7 @@ def proposed(
             questions.ask(_check_hidden, triad, channels, others, values, source)
     hidden = any("channels of the accelerometer" in each.text for each in questions)
     if not hidden and not any(n in damaged for n, m in meanings.items() if m.column in RAW):
-        questions.ask(_check_triads, names, values, chosen, said, source)
+        questions.ask(_check_triads, names, values, chosen, said, source, of_run)
     questions.ask(_check_units_of_triads, chosen, source)
     angles = {c: chosen[c].name for c in _ANGLES_AND_WARMTH[:3] if c in chosen and c not in said}
     for column in angles:
@@ -1175,8 +1176,9 @@ def _check_triads(
     chosen: Mapping[str, ColumnSource],
     said: Collection[str],
     source: str,
+    of_run: bool,
 ) -> None:
-    """Refuse a table without accelerometers, with a part of the magnetometers, or with a wrong channel said."""
+    """Refuse a table without accelerometers; of a run with a part of the magnetometers, or a wrong channel said."""
     others = [n for n in names if n not in {each.name for each in chosen.values()}]
     listed = f"the names are {', '.join(map(shown, names[:20]))}"
     if {*RAW[:3]}.isdisjoint(chosen):
@@ -1186,7 +1188,7 @@ def _check_triads(
             triples_for(RAW[:3], others, values, OF_ONE_SPHERE)
             or triples_for(RAW[:3], others, values),
         )
-    for triad, channels in CHANNELS.items():
+    for triad, channels in CHANNELS.items() if of_run else ():
         names_of = {c: chosen[c].name for c in channels if c in chosen}
         absent = [c for c in channels if c not in names_of]
         if names_of and absent:

@@ -60,6 +60,7 @@ from mwdcal.files.statements import stated_table
 from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW, FACTORS, WARMTH
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
+from mwdcal.identification.beside import findings_beside, has_roll_test, roll_tests_beside
 from mwdcal.identification.columns import (
     answers_of_north,
     in_units,
@@ -332,7 +333,8 @@ class Proposal(NamedTuple):
     `by_value` columns of a run file whose
     unit no name states; `metadata` what the table says of itself; `where` the table was, if it was looked for;
     `open_axes` the triads of which the run does not tell the axes, `ignored` columns that are called as references
-    but hold no references, each with the reason; `by_readings` what the names leave open and the readings answer.
+    but hold no references, each with the reason; `by_readings` what the names leave open and the readings answer;
+    `source` the name of the file.
     """
 
     profile: Profile
@@ -347,6 +349,7 @@ class Proposal(NamedTuple):
     open_axes: Mapping[str, OpenAxes] = {}
     ignored: Mapping[str, str] = {}
     by_readings: tuple[str, ...] = ()
+    source: str = ""
 
 
 def propose(
@@ -373,7 +376,7 @@ def propose(
         FitError: columns and units that names and readings leave open, or readings that no axes explain.
     """
     where = tables.laid_out(path, sheet=sheet, header_row=header_row, decimal=decimal)
-    table, form = _as_written(path, where, bool(sheet or header_row or decimal))
+    table, form = as_written(path, where, bool(sheet or header_row or decimal))
     given = stated_numbers(answers or {}, table.columns)
     names = {column: name for column, name in (answers or {}).items() if column not in given}
     stated = {**(stated or {}), **given}
@@ -428,30 +431,18 @@ def _proposal(
 ) -> Proposal:
     """The proposal for a table that was read, with what the user says of its columns."""
     whole = table
-    formulas = [name for name in table.columns if _is_formulas(labels_of(table, name))]
-    table = replace(table, columns={n: c for n, c in table.columns.items() if n not in formulas})
-    units_by_name = dict(zip(where.names, where.units, strict=True)) if where else {}
-    names = [*table.columns]
-    units = [units_by_name.get(name, "") for name in names]
-    above = where.above if where else ()
-    table, form, open_rows = _without_rejected(table, form, names, units, above)
-    problems: dict[str, QuestionError] = {}
-    values = partial(_numbers_of, table, problems)
-    columns, by_value, ignored = proposed(
-        names, units, values, table.source, above, table.metadata, answers, problems, open_rows
-    )
+    table, form, columns, by_value, ignored = named_columns(table, form, where, answers)
     if filled := _with_angles_filled(path, where, (table, whole), columns, form, stated, answers):
         return filled
     _check_choices(where, {*columns, *table.metadata, *answers}, table.source)
     check_cells(table, columns)
     blank = _blank_references(table, columns)
-    table, form = _with_north(table, form, columns, above)
-    ignored |= dict.fromkeys(formulas, _WITHOUT_RESULT)
+    table, form = with_north(table, form, columns, where.above if where else ())
     denied = [c for c, name in answers.items() if not name and c in table.metadata]
     form = _with(form, {"ignore": (*ignored, *denied)} if ignored or denied else {})
     columns |= _stacked_tools(table, columns, stated, answers)
     table = _of_one_tool(table, columns, stated)
-    columns |= _station(table, columns, answers)
+    columns |= station_column(table, columns, answers)
     columns |= {c: ColumnSource(name=f"{stated[c]}") for c in _OF_THE_PLACE if c in stated}
     sets = repeats(table, columns)
     if sets and not sets.numbered:
@@ -467,7 +458,7 @@ def _proposal(
         remarks.append(sets.advice() if sets.numbered else sets.sentence(scales))
     return Proposal(
         _without_the_usual(profile), wirings, readings.count, readings.unused, tuple(remarks), by_value,
-        readings.metadata, readings.run_sha256, where, open_axes, ignored,
+        readings.metadata, readings.run_sha256, where, open_axes, ignored, source=table.source,
     )  # fmt: skip
 
 
@@ -491,6 +482,47 @@ def _check_choices(where: Layout | None, known: Collection[str], source: str) ->
         raise QuestionsError(source, questions)
 
 
+class Named(NamedTuple):
+    """A table with the rows that count, how it is written, and its columns by the names of a run file.
+
+    `by_value` and `ignored` as of `Proposal`.
+    """
+
+    table: Table
+    form: TableFormat | None
+    columns: dict[str, ColumnSource]
+    by_value: set[str]
+    ignored: dict[str, str]
+
+
+def named_columns(
+    table: Table,
+    form: TableFormat | None,
+    where: Layout | None,
+    answers: Mapping[str, str],
+    of_run: bool = True,
+) -> Named:
+    """The columns of a table by their names, units and values; raises as `columns.proposed`.
+
+    Unless the table is `of_run`, rows count of which it is doubtful whether they are rejected; a remark names them.
+    """
+    formulas = [name for name in table.columns if _is_formulas(labels_of(table, name))]
+    table = replace(table, columns={n: c for n, c in table.columns.items() if n not in formulas})
+    units_by_name = dict(zip(where.names, where.units, strict=True)) if where else {}
+    names = [*table.columns]
+    units = [units_by_name.get(name, "") for name in names]
+    above = where.above if where else ()
+    table, form, open_rows = _without_rejected(table, form, names, units, above)
+    problems: dict[str, QuestionError] = {}
+    values = partial(_numbers_of, table, problems)
+    columns, by_value, ignored = proposed(
+        names, units, values, table.source, above, table.metadata, answers, problems,
+        open_rows if of_run else (), of_run,
+    )  # fmt: skip
+    ignored |= dict.fromkeys(formulas, _WITHOUT_RESULT)
+    return Named(table, form, columns, by_value, ignored)
+
+
 def _with_angles_filled(
     path: str | os.PathLike[str],
     where: Layout | None,
@@ -505,7 +537,7 @@ def _with_angles_filled(
     `pair`: the table as it is judged, and as it was read.
     """
     table, whole = pair
-    if once := _once_for_setting(table, columns) or _written_once(table, columns):
+    if once := once_for_setting(table, columns) or written_once(table, columns):
         form = _with(form, {"fill_down": once})
         with suppress(InputError, FitError):
             proposal = _proposal(path, where, filled_down(whole, once), form, stated, answers)
@@ -595,7 +627,7 @@ def _is_confirmed(proposal: Proposal) -> bool:
     return not proposal.open_axes and max(unexplained, default=1.0) < _CONFIRMED
 
 
-def _written_once(table: Table, columns: Mapping[str, ColumnSource]) -> tuple[str, ...]:
+def written_once(table: Table, columns: Mapping[str, ColumnSource]) -> tuple[str, ...]:
     """Angles of the stand that may be written once for a series of rolls: filled in above blanks, beside toolfaces."""
     *directions, roll = ANGLES_OF_STAND
     rolls = labels_of(table, columns[roll].name) if roll in columns else [""]
@@ -608,7 +640,7 @@ def _written_once(table: Table, columns: Mapping[str, ColumnSource]) -> tuple[st
     )
 
 
-def _once_for_setting(table: Table, columns: Mapping[str, ColumnSource]) -> tuple[str, ...]:
+def once_for_setting(table: Table, columns: Mapping[str, ColumnSource]) -> tuple[str, ...]:
     """Angles and labels that are written once for all readings of a setting: the rows below, filled, are such."""
     names = [columns[c].name for c in ("station", *ANGLES_OF_STAND) if c in columns]
     blank = {name: np.array([not cell for cell in labels_of(table, name)]) for name in names}
@@ -620,7 +652,7 @@ def _once_for_setting(table: Table, columns: Mapping[str, ColumnSource]) -> tupl
     return tuple(once) if sets and np.array_equal(sets.starts, np.flatnonzero(~last)) else ()
 
 
-def _station(
+def station_column(
     table: Table, columns: Mapping[str, ColumnSource], answers: Mapping[str, str]
 ) -> dict[str, ColumnSource]:
     """The column of stations that the angles of the stand tell, where none has a name that tells those apart."""
@@ -706,7 +738,7 @@ def _with(form: TableFormat | None, fields: Mapping[str, Any]) -> TableFormat | 
     return msgspec.structs.replace(form or TableFormat(find=True), **fields) if fields else form
 
 
-def _with_north(
+def with_north(
     table: Table,
     form: TableFormat | None,
     columns: Mapping[str, ColumnSource],
@@ -1148,7 +1180,7 @@ def _is_left_handed(result: Wiring) -> bool:
     return bool(np.linalg.det(permutation) < 0)
 
 
-def _as_written(
+def as_written(
     path: str | os.PathLike[str], where: Layout | None, placed: bool
 ) -> tuple[Table, TableFormat | None]:
     """The table of a file, and how a profile says it is written: not at all where it is written as documented.
@@ -1504,7 +1536,22 @@ def findings_on(proposal: Proposal) -> list[Finding]:
         stated = {*proposal.profile.columns, *proposal.metadata}
         known += magnetometer_absent(n for n in STATED_REFERENCES if REFERENCES[n].column in stated)
     known += answers_by_readings(proposal) + warmth_around(proposal) + units_contradicted(proposal)
+    known += tables_beside(proposal)
     return known + ignored + unused_columns(proposal.unused)
+
+
+def tables_beside(proposal: Proposal) -> list[Finding]:
+    """The other tables of readings in the file, and the roll test that may be among them."""
+    if proposal.where is None:
+        return []
+    serial = proposal.metadata.get("serial", "")
+    return findings_beside(proposal.where, proposal.profile, serial, proposal.source)
+
+
+def has_test_beside(proposal: Proposal) -> bool:
+    """Whether the file has the roll test of the run in another table."""
+    where, serial = proposal.where, proposal.metadata.get("serial", "")
+    return where is not None and has_roll_test(roll_tests_beside(where, proposal.profile, serial))
 
 
 def as_toml(proposal: Proposal, source: str) -> str:

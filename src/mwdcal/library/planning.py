@@ -321,11 +321,10 @@ class ProposedProfile(Result):
         self.files["output"] = Path(path)
 
     def _text(self) -> str:
-        from mwdcal.files.formats.layout import ROLL_TEST
+        from mwdcal.identification.proposal import has_test_beside
         from mwdcal.presentation.proposal import screen
 
-        where = self.proposal.where
-        test = where is not None and any(why.startswith(ROLL_TEST) for _, why in where.left_out)
+        test = has_test_beside(self.proposal)
         return screen(self.proposal, self.path, self.files.get("output"), test)
 
     def _document(self) -> dict[str, Any]:

@@ -21,13 +21,14 @@ from mwdcal.comparison.compare import compare as compare_methods
 from mwdcal.errors import InputError
 from mwdcal.faults.diagnosis import Diagnosis
 from mwdcal.faults.diagnosis import diagnose as explain
-from mwdcal.files import documents, logs, profiles, runs
+from mwdcal.files import documents, logs, profiles, runs, statements
 from mwdcal.files import metadata as meta
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, Column, as_text
 from mwdcal.files.formats.table import Table
 from mwdcal.files.limits import load_limits
 from mwdcal.geometry.vectors import AnyArray, Array
+from mwdcal.library.answers import Said, by_column
 from mwdcal.library.arrays import nearest, readings, without_mask
 from mwdcal.library.results import arrays_of, brief, frame
 from mwdcal.library.shown import digest_of, with_inputs
@@ -242,6 +243,10 @@ def with_choices(options: Options | None, choices: Mapping[str, Any]) -> Options
     """Options with choices by name; None where nothing was chosen."""
     names = [field.name for field in fields(Options)]
     for name in choices:
+        if name == "rolltest":
+            raise InputError(
+                "a calibration is judged by a roll test in a step of its own: mwdcal.verify(cal, FILE)."
+            )
         if name == "tool":
             raise InputError("a run's tool profile is given as `profile`, not as `tool`.")
         if name not in names:
@@ -282,18 +287,35 @@ def calibration_of(source: object) -> Calibration:
     )
 
 
-def _later(source: RunSource, calibration: Calibration) -> RunSource:
-    """Readings after a calibration as they are given; the table of a file, of that of the run its roll test."""
-    file = isinstance(source, str | os.PathLike)
-    return runs.read_later(cast(Path, source), calibration) if file else source
+def _later(
+    source: RunSource,
+    name: str,
+    calibration: Calibration,
+    sheet: str,
+    column: Mapping[str, str] | Said | None,
+) -> Readings:
+    """Readings after a calibration as they are given; those of a file, of that of the run those of its roll test."""
+    if not isinstance(source, str | os.PathLike):
+        return readings_of(source, name, calibration.profile)
+    from mwdcal.identification import roll_tests
+
+    said = statements.Said(sheet=sheet, columns=by_column("column", column))
+    return roll_tests.read_later(source, calibration, said, is_test=name == "rolltest")
 
 
 def verify(
-    calibration: Calibration | Path, rolltest: RunSource, limits: Path | Limits = "roll-test"
+    calibration: Calibration | Path,
+    rolltest: RunSource,
+    limits: Path | Limits = "roll-test",
+    *,
+    sheet: str = "",
+    column: Mapping[str, str] | Said | None = None,
 ) -> Verdict:
     """Judge a calibration by readings that its fit has not seen: `.passed`, and `.rows` with each figure.
 
-    `calibration` may be its file, and `rolltest` the file of its run, where that has a roll test too.
+    `calibration` may be its file, and `rolltest` the file of its run, where that has a roll test too. A table with
+    other names than the run's is read by those that it has; `sheet` and `column`, as of `propose_profile`, answer what
+    it leaves open.
     `limits` is a shipped limits profile by name, a TOML file by path, or `Limits`.
 
     Raises:
@@ -301,7 +323,7 @@ def verify(
             which no limit applies.
     """
     calibration = calibration_of(calibration)
-    rolltest = readings_of(_later(rolltest, calibration), "rolltest", calibration.profile)
+    rolltest = _later(rolltest, "rolltest", calibration, sheet, column)
     bounds, digest = (limits, "") if isinstance(limits, Limits) else load_limits(limits)
     verdict = judge(calibration, rolltest, bounds)
     findings = [*verdict.findings, *of_table(rolltest)]
@@ -311,17 +333,24 @@ def verify(
     return with_inputs(verdict, *stated, of=calibration, run=rolltest.run_sha256, **digests)
 
 
-def diagnose(calibration: Calibration | Path, later: RunSource) -> Diagnosis:
+def diagnose(
+    calibration: Calibration | Path,
+    later: RunSource,
+    *,
+    sheet: str = "",
+    column: Mapping[str, str] | Said | None = None,
+) -> Diagnosis:
     """Say which fault explains later readings of a calibrated tool best: `.fault` is "none" where none is needed.
 
     Definition: faults are compared by the density of the readings, all that is uncertain being integrated out;
-    one is named where a sound tool gives as much evidence with a probability of at most 1 %.
+    one is named where a sound tool gives as much evidence with a probability of at most 1 %. `sheet` and `column` as of
+    `verify`.
 
     Raises:
         InputError: readings of another tool or of the fit itself, or none that can be used.
     """
     calibration = calibration_of(calibration)
-    later = readings_of(_later(later, calibration), "later", calibration.profile)
+    later = _later(later, "later", calibration, sheet, column)
     result = explain(calibration, later)
     findings = [*calibration.change_findings(), *result.findings, *of_table(later)]
     result = msgspec.structs.replace(result, findings=findings)
@@ -334,7 +363,7 @@ class Corrected:
     """Corrected readings: vectors (n, 3) in g and nT, angles (n,) in radians, or NaN.
 
     `columns` are all results by the names of files, with their units (`inclination_deg`, `gx_g`, …),
-    ready for a table; `findings` are what the reader should know.
+    ready for a table; `findings` are what the reader should know. `stations` are labels and temperatures of the rows.
     """
 
     gravity: Array
@@ -346,6 +375,7 @@ class Corrected:
     magnetic_toolface: Array
     columns: dict[str, AnyArray]
     findings: list[Finding]
+    stations: Mapping[str, AnyArray]
 
     def __repr__(self) -> str:
         return brief(self, self.summary)
@@ -369,8 +399,8 @@ class Corrected:
         return {"columns": lists, "findings": msgspec.to_builtins(self.findings)}
 
     def to_pandas(self) -> Any:
-        """The columns as a table of pandas, which must be installed."""
-        return frame(self.columns)
+        """The columns as a table of pandas, which must be installed, behind the stations where there are labels."""
+        return frame({**self.stations, **self.columns})
 
 
 def _range(values: AnyArray) -> tuple[str, str]:
@@ -402,7 +432,17 @@ def apply(
         **{name: np.radians(columns[f"{name}_deg"]) for name in CORRECTED_ANGLES},
         columns=columns,
         findings=findings,
+        stations=_stations_of(survey),
     )
+
+
+def _stations_of(survey: Readings) -> dict[str, AnyArray]:
+    """Labels and temperatures of the rows of one run, where it has them."""
+    if survey.accelerometer.ndim != 2:
+        return {}
+    labels = {"station": np.array(survey.station)} if survey.station else {}
+    warmth = survey.temperature
+    return labels | ({} if warmth is None else {"temperature_c": np.asarray(warmth, float)})
 
 
 @runtime_checkable

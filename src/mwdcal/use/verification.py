@@ -544,7 +544,7 @@ def _check_independent(calibration: Calibration, readings: Readings) -> None:
     raise InputError(
         f"{readings.name}: {used.size} of {readings.count} stations were in the fit (first: "
         f"station {readings.labels[used[0]]}){again}. Verification needs data that the fit has not seen: take a roll "
-        "test of its own. mwdcal calibrate judges one that is in the file of the run."
+        "test of its own: in another file, on another sheet of this one, or rows that a column marks as roll test."
     )
 
 

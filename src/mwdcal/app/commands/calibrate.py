@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Unpack
 
@@ -10,10 +11,12 @@ import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import lines, print_result, say
+from mwdcal.errors import InputError, MwdcalError, QuestionError, QuestionsError
 
 if TYPE_CHECKING:
     from mwdcal.calibration.readings import Readings
     from mwdcal.calibration.record import Calibration
+    from mwdcal.identification.roll_tests import RollTestTable
     from mwdcal.use.verification import Verdict
 
 
@@ -43,6 +46,7 @@ if TYPE_CHECKING:
     help="Enter calibration, run, tool profile and verdict in this registry.",
 )
 @options.report()
+@partial(options.of_roll_test, beside_run=True)
 @options.of_run
 @options.DECIMAL
 @options.JSON
@@ -67,12 +71,12 @@ def command(
     options.check_outputs([output], inputs, page=report, calibration=True, form=".json")
     _enter(registry)
     prior, digest = prior_of(typed["prior"])
-    readings, turned, profile, beside = load_runs(
-        run, rolltest, tool, decimal, prior, options.statements()
-    )
+    readings, profile, test, beside = load_runs(run, rolltest, tool, prior, options.said(decimal))
     choice, result = chosen_fit(readings, profile, options_of(typed, prior, exclude, digest), say)
     calibration = recorded(choice, result)
-    verdict, judged = _judged(calibration, turned, limits, (output, rolltest))
+    turned, verdict, judged, problem = None, None, "", None
+    if test and rolltest:
+        turned, verdict, judged, problem = _judged(calibration, test, limits, (output, rolltest))
     rendered = ""
     if report:
         from mwdcal.files.limits import load_limits
@@ -89,25 +93,50 @@ def command(
         else screen.screen(calibration, choice.curves, *files, judged, run if beside else None)
     )
     atomic.write_all([(output, documents.encode(calibration)), (report, rendered)])
-    _enter(registry, output, run, tool, rolltest, verdict)
+    _enter(registry, output, run, tool, None if problem else rolltest, verdict)
     print_result(shown, calibration.findings + (verdict.findings if verdict else []))
+    if problem:
+        raise problem
     sys.exit(0 if verdict is None or verdict.passed else 1)
 
 
 def _judged(
-    calibration: Calibration,
-    rolltest: Readings | None,
-    limits: str,
-    files: tuple[Path, Path | None],
-) -> tuple[Verdict | None, str]:
-    """The verdict of a roll test, if there is one, and its screen; `files` of calibration and roll test."""
-    if rolltest is None or files[1] is None:
-        return None, ""
+    calibration: Calibration, test: RollTestTable, limits: str, files: tuple[Path, Path]
+) -> tuple[Readings | None, Verdict | None, str, MwdcalError | None]:
+    """The readings of a roll test, their verdict and its screen, or why there is none.
+
+    `files` of calibration and roll test.
+    """
+    from mwdcal.files.limits import load_limits
     from mwdcal.library.tasks import verify
     from mwdcal.presentation.verification import next_step, screen
 
-    verdict = verify(calibration, rolltest, Path(limits))
-    return verdict, screen(verdict, None) + next_step(verdict, files[0], files[1])
+    load_limits(limits)
+    try:
+        rolltest = test.readings(calibration.profile)
+        verdict = verify(calibration, rolltest, Path(limits))
+    except MwdcalError as error:
+        problem = _with_options_on_roll_test(error)
+        problem.exit_code = InputError.exit_code
+        return None, None, "", problem
+    shown = screen(verdict, None) + next_step(verdict, files[0], files[1])
+    return rolltest, verdict, shown, None
+
+
+def _with_options_on_roll_test(error: MwdcalError) -> MwdcalError:
+    """An error; of questions on a roll test with the options that answer them beside a run."""
+    if isinstance(error, QuestionsError):
+        each = [_with_options_on_roll_test(question) for question in error.questions]
+        return QuestionsError(error.source, [q for q in each if isinstance(q, QuestionError)])
+    if not isinstance(error, QuestionError):
+        return error
+    answers = [
+        answer._replace(
+            arguments=tuple((options.BESIDE_RUN + name, v) for name, v in answer.arguments)
+        )
+        for answer in error.answers
+    ]
+    return QuestionError(error.text, answers)
 
 
 def _for_machines(

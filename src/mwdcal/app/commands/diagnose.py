@@ -16,6 +16,7 @@ from mwdcal.presentation.typed import findings_with_option_names
 @options.argument("readings")
 @options.RESULT
 @options.report()
+@options.of_roll_test
 @options.DECIMAL
 @options.JSON
 def command(
@@ -27,23 +28,22 @@ def command(
 
     \b
     Example: mwdcal diagnose tool.json rolltest.csv
-    Exit: 0 still fine, 1 a fault is named, 2 input cannot be read or is of the fit itself.
+    Exit: 0 still fine, 1 a fault is named, 2 input cannot be read or is of the fit itself, 3 it leaves a question open.
     """
     from msgspec.structs import replace
 
     from mwdcal.calibration.diagnosis.findings import of_table
     from mwdcal.faults.diagnosis import diagnose
     from mwdcal.faults.likelihood import NONE
-    from mwdcal.files import runs
     from mwdcal.files.formats import atomic
+    from mwdcal.identification.roll_tests import read_later
     from mwdcal.presentation.calibration_source import calibration_of
     from mwdcal.presentation.diagnosis import render, screen
     from mwdcal.presentation.envelope import json_document
 
     options.check_outputs([output], [calibration, readings], page=report, form=".json")
     fitted, digest = calibration_of(calibration)
-    table = runs.read_later(readings, fitted, decimal=decimal)
-    later, _ = runs.read_run(table, fitted.profile)
+    later = read_later(readings, fitted, options.said(decimal), is_test=False)
     result = diagnose(fitted, later)
     findings = findings_with_option_names(
         [*fitted.change_findings(), *result.findings, *of_table(later)]

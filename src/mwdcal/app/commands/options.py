@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from unicodedata import normalize
 
 import click
@@ -19,6 +20,9 @@ from mwdcal.app.messages import Command
 from mwdcal.calibration.fit_options import FIT_OPTIONS
 from mwdcal.calibration.fit_options import FitArguments as FitArguments
 from mwdcal.errors import InputError
+
+if TYPE_CHECKING:
+    from mwdcal.files.statements import Said
 
 Function = Callable[..., Any]
 Decorator = Callable[[Function], Function]
@@ -167,13 +171,19 @@ RESULT = output(
 
 SAID_OF_RUN = "mwdcal.statements"
 """Where the context of a command has what the user says of a run."""
+OPTIONS_OF_RUN = ("serial", "date", "operator")
+"""Options that say of a run what its table does not."""
+BESIDE_RUN = "rolltest_"
+"""How options on the table of a roll test begin beside those on the run's."""
 
 
 def _note(context: click.Context, option: click.Parameter, typed: Any) -> None:
-    """Note what the user says of a run."""
+    """Note what the user says of a run or a roll test."""
     if typed is not None:
-        said = typed.date().isoformat() if isinstance(typed, datetime) else str(typed).strip()
-        context.meta.setdefault(SAID_OF_RUN, {})[str(option.name)] = said
+        name = str(option.name).removeprefix(BESIDE_RUN)
+        said = typed.date().isoformat() if isinstance(typed, datetime) else typed
+        said = said.strip() if isinstance(said, str) else said
+        context.meta.setdefault(SAID_OF_RUN, {})[name] = said
 
 
 def of_run(function: Function) -> Function:
@@ -199,7 +209,42 @@ def of_run(function: Function) -> Function:
 
 def statements() -> dict[str, str]:
     """Serial, date and operator as the user says."""
-    return dict(click.get_current_context().meta.get(SAID_OF_RUN, {}))
+    noted = click.get_current_context().meta.get(SAID_OF_RUN, {})
+    return {name: noted[name] for name in OPTIONS_OF_RUN if name in noted}
+
+
+def of_roll_test(function: Function, beside_run: bool = False) -> Function:
+    """The options that answer what the table of a roll test, or of later readings, leaves open.
+
+    Those of a command that also has a table of a run begin with `BESIDE_RUN`.
+    """
+    noted = partial(click.option, callback=_note, expose_value=False)
+    prefix = f"--{BESIDE_RUN.replace('_', '-')}" if beside_run else "--"
+    for option in (
+        noted(
+            f"{prefix}column",
+            multiple=True,
+            metavar="OURS=THEIRS",
+            help="Which column of the roll test is which: ref_toolface_deg='Cara 2'. Repeatable.",
+        ),
+        noted(f"{prefix}sheet", metavar="NAME", help="Sheet of the roll test."),
+    ):
+        function = option(function)
+    return function
+
+
+def said(decimal: str) -> Said:
+    """Statements of the user on tables: decimal sign, serial, date and operator, sheet and columns of the roll test."""
+    from mwdcal.files.statements import Said
+
+    noted = click.get_current_context().meta.get(SAID_OF_RUN, {})
+    sheet, columns = noted.get("sheet", ""), noted.get("column")
+    said = Said(decimal, {n: v for n, v in noted.items() if n in OPTIONS_OF_RUN}, sheet)
+    if not columns:
+        return said
+    from mwdcal.library.answers import by_column
+
+    return replace(said, columns=by_column("column", columns))
 
 
 def number(name: str, metavar: str, text: str, *variable: str) -> Decorator:

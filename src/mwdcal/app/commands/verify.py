@@ -17,6 +17,7 @@ from mwdcal.presentation.typed import findings_with_option_names
 @options.LIMITS
 @options.RESULT
 @options.report(help="Also write the report, with this verdict.")
+@options.of_roll_test
 @options.of_run
 @options.DECIMAL
 @options.TRUSTED_KEYS
@@ -29,16 +30,16 @@ def command(
 
     \b
     Example: mwdcal verify tool.json rolltest.csv --limits roll-test
-    Exit: 0 pass, 1 fail, 2 input cannot be read or is not independent.
+    Exit: 0 pass, 1 fail, 2 input cannot be read or is not independent, 3 it leaves a question open.
     """
     from msgspec.structs import replace
 
     from mwdcal.calibration.diagnosis.findings import of_table
     from mwdcal.calibration.diagnosis.identity import overdue
-    from mwdcal.files import runs
     from mwdcal.files.formats import atomic
     from mwdcal.files.limits import load_limits
     from mwdcal.files.profiles import standards_of
+    from mwdcal.identification.roll_tests import read_later
     from mwdcal.presentation.envelope import json_document, with_signature
     from mwdcal.presentation.signature import load_calibration
     from mwdcal.presentation.verification import next_step, screen, with_next_step
@@ -47,8 +48,7 @@ def command(
     options.check_outputs([output], [calibration, run, limits, *key], page=report, form=".json")
     loaded = load_calibration(calibration, key)
     fitted = loaded.calibration
-    table = runs.read_later(run, fitted, decimal=decimal, statements=options.statements())
-    readings, _ = runs.read_run(table, fitted.profile)
+    readings = read_later(run, fitted, options.said(decimal))
     bounds, limits_digest = load_limits(limits)
     result = verify(fitted, readings, bounds)
     late = overdue(standards_of(fitted.profile), readings.metadata)

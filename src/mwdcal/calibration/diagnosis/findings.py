@@ -103,7 +103,9 @@ LARGEST_DEVIATION = 37.0
 """Larger deviations have no figure: a normal variable's chance is then below 1e-300."""
 FOLLOWED = 0.9
 """Share of a drift within the run that goes with a column, from which the column is named."""
-UNUSED, MARKED_ROWS = "unused-columns", "marked-rows"
+UNUSED, MARKED_ROWS, ROLL_TEST_READ = "unused-columns", "marked-rows", "roll-test-read"
+OF_ROLL_TEST = "the roll test"
+"""How remarks begin on a roll test that was read by names of its own."""
 COLUMNS_NAMED = 20
 """Most columns that the finding names."""
 STATIONS_NAMED = 8
@@ -231,7 +233,10 @@ def magnetometer_absent(references: Iterable[str]) -> list[Finding]:
 
 def of_table(readings: Readings) -> list[Finding]:
     """Rows of the table that its laboratory has marked, references that are not read, and columns not used."""
-    marked = [Finding(id=MARKED_ROWS, text=text) for text in readings.remarks]
+    marked = [
+        Finding(id=ROLL_TEST_READ if text.startswith(OF_ROLL_TEST) else MARKED_ROWS, text=text)
+        for text in readings.remarks
+    ]
     unread = references_not_taken(readings.not_taken)
     known = [name for name, values in readings.known.items() if not np.isnan(values).all()]
     absent = magnetometer_absent(known) if readings.magnetometer is None else []

@@ -115,9 +115,10 @@ _OF_PAST_RUN = re.compile(
 """Words of a run that another one superseded."""
 _OF_ROLL_TEST = re.compile(
     r"(?<![^\W\d_])(roll[\s_-]*(test|over|check)|rt|verif\w*|check|valid\w*|(roll)?pr(ue|ü)fung|"
-    r"[ck]ontrol\w*[- ]?(run|shot|test|roll|messung|dreh|måling|rull)\w*|rulletest|prueba|"
-    r"(essai|test)s? (en|de) (roulis|rotation)|провер\w*|повер\w*|"
-    r"контрольн\w* (вращ|замер|измер)\w*)(?![^\W\d_])|验证|检验|複測|复测|复核|(滚动|滚转|旋转)(测试|试验)",
+    r"[ck]ontrol\w*[- ]?(run|shot|test|roll|messung|dreh|måling|rull)\w*|rull(e|ings)test|rulleprøve|prueba|"
+    r"(essai|teste?|ensa[iy]o|prova)s? (en|de|di) (roulis|rotation|rota[cç][aã]o|rotaci[oó]n|rotazione|giro|rolagem)|"
+    r"провер\w*|повер\w*|контрольн\w* (вращ|замер|измер)\w*)(?![^\W\d_])|验证|检验|複測|复测|复核|滚转|回転試験|"
+    r"(滚动|旋转)(测试|试验)",
     re.IGNORECASE,
 )
 """Words of a sheet whose rows are to check a calibration."""
@@ -182,7 +183,7 @@ class Layout:
     `parts` the sheet of each row where several are one table; `heading` the text right above the names;
     `titles` what the title block says of the tool, the day and the place; `places` letters of the columns in a
     workbook; `remarks` are sentences on what is taken from other places than the columns. Of a table that goes `across`
-    the stations stand in columns, and `lines` are these.
+    the stations stand in columns, and `lines` are these. `beside` are the other tables of its file.
     """
 
     sheet: str
@@ -202,6 +203,13 @@ class Layout:
     heading: str = ""
     remarks: tuple[str, ...] = ()
     across: bool = False
+    beside: tuple[Layout, ...] = ()
+
+    @property
+    def kind(self) -> str:
+        """Whether it is called a void or superseded run, a run before or after an adjustment, or a roll test."""
+        words = f"{self.sheet} {self.heading}"
+        return _kind(words, self.above) or (ADJUSTED.search(words) and "adjusted run") or ""
 
     @property
     def size(self) -> int:
@@ -228,6 +236,44 @@ def laid_out(
         InputError: no such sheet, row or columns, or no table.
         FitError: two tables that may both be meant, or a decimal sign that the numbers leave open.
     """
+    every, covers, unread = _every(sheets, source, sheet, header_line, decimal)
+    tables = [t for t in every if {*wanted} <= {*t.names}]
+    tables = [t for t in tables if not kind or _kind(f"{t.sheet} {t.heading}") == kind]
+    if not tables:
+        raise _no_table(source, header_line, wanted, every)
+    best = max(tables, key=lambda layout: layout.size)
+    alike = _alike_among(tables, best)
+    if len(alike) > 1 and not header_line and not kind:
+        run = _the_run(alike)
+        if run is None:
+            raise _several(alike, source, sheet)
+        best = run
+    beside = [t for t in every if not is_part_of(t, best.sheet, best.parts, best.lines)]
+    if sheet:
+        best, others = _beside_other_sheets(
+            best, [s for s in sheets if s.name != sheet], source, decimal
+        )
+        beside += others
+    best = replace(best, beside=tuple(beside), remarks=(*best.remarks, *unread))
+    return _with_covers(best, covers)
+
+
+def every_table(sheets: Sequence[Sheet], source: str, decimal: str = "") -> list[Layout]:
+    """All tables in the sheets of a file, those of the same stations joined; errors as of `laid_out`."""
+    return _every(sheets, source, "", 0, decimal)[0]
+
+
+def is_part_of(table: Layout, sheet: str, parts: Sequence[str], lines: Sequence[int]) -> bool:
+    """Whether a table is that of a run in some lines of a sheet, or one of its `parts` on several sheets."""
+    return (table.sheet, table.lines[0]) in {
+        *zip(parts or [sheet] * len(lines), lines, strict=True)
+    }
+
+
+def _every(
+    sheets: Sequence[Sheet], source: str, sheet: str, header_line: int, decimal: str
+) -> tuple[list[Layout], list[Sheet], list[str]]:
+    """The tables of all sheets or of one, of all header lines or of one; sheets without numbers; remarks."""
     candidates = [each for each in sheets if each.name == sheet] if sheet else list(sheets)
     if not candidates:
         names = ", ".join(shown(each.name) for each in sheets)
@@ -244,23 +290,7 @@ def laid_out(
         covers += [] if layouts or any(_is_reading(row) for _, row in each.rows) else [each]
         tables += [t for t in layouts if header_line in (0, t.form.header_line)]
     tables, unread = _of_shown_sheets(tables, {s.name for s in candidates if s.hidden})
-    every = _with_same_stations(tables)
-    tables = [t for t in every if {*wanted} <= {*t.names}]
-    tables = [t for t in tables if not kind or _kind(f"{t.sheet} {t.heading}") == kind]
-    if not tables:
-        raise _no_table(source, header_line, wanted, every)
-    best = max(tables, key=lambda layout: layout.size)
-    alike = _alike_among(tables, best)
-    if len(alike) > 1 and not header_line and not kind:
-        run = _the_run(alike)
-        if run is None:
-            raise _several(alike, source, sheet)
-        best = run
-    if sheet:
-        best = _beside_other_sheets(
-            best, [s for s in sheets if s not in candidates], source, decimal
-        )
-    return _with_covers(replace(best, remarks=(*best.remarks, *unread)), covers)
+    return _with_same_stations(tables), covers, unread
 
 
 def _of_shown_sheets(
@@ -387,15 +417,17 @@ def _side_by_side(one: Layout, other: Layout) -> Layout:
 
 def _beside_other_sheets(
     table: Layout, others: Sequence[Sheet], source: str, decimal: str
-) -> Layout:
-    """A table of the sheet that the user names, with a remark on those of the same stations that are not read."""
-    unread = []
+) -> tuple[Layout, list[Layout]]:
+    """A table of the sheet that is named, with a remark on those of the same stations, and the tables of others."""
+    unread, beside = [], []
     for each in others:
         with suppress(InputError, FitError):
             layouts = list(_tables(each, source, decimal))
-            unread += [shown(each.name)] * any(_have_same_stations(table, t) for t in layouts)
+            same = [t for t in layouts if _have_same_stations(table, t)]
+            unread += [shown(each.name)] * bool(same)
+            beside += [t for t in layouts if t not in same]
     said = f"channels of the same stations on {', '.join(unread)} are not read: without `sheet` they are joined."
-    return replace(table, remarks=(*table.remarks, said)) if unread else table
+    return (replace(table, remarks=(*table.remarks, said)) if unread else table), beside
 
 
 def _the_run(tables: Sequence[Layout]) -> Layout | None:

@@ -277,6 +277,16 @@ def laid_out(
     )
 
 
+def every_table(path: str | os.PathLike[str], *, decimal: str = "") -> list[Layout]:
+    """All tables in a text or workbook, as `laid_out` finds them; none in a format without a layout."""
+    from mwdcal.files.formats import layout, sheets
+
+    file = Path(path)
+    if file.suffix.lower() not in LAID_OUT:
+        return []
+    return layout.every_table(sheets.sheets_of(_content(file), file.name), file.name, decimal)
+
+
 def of_layout(where: Layout, path: str | os.PathLike[str], kept: Collection[str]) -> Table:
     """The table of a layout in a file; the cells of the columns `kept` as they stand, of labels and serials."""
     from mwdcal.files.formats import layout
