@@ -287,9 +287,8 @@ def test_all_missing_columns_are_listed_at_once(tmp_path, laboratory):
     columns = rolled({n: SPANISH_RUN[n] for n in TESTS["Rolltest"]})
     less = {n: c for n, c in columns.items() if n not in (SPANISH_RUN["ay"], SPANISH_RUN["mz"])}
     path = workbook(tmp_path / "less.xlsx", run=False, Hoja1=less)
-    message = refused(mwdcal("verify", laboratory[0] / "cal.json", path), 3)
+    message = refused(mwdcal("verify", laboratory[0] / "cal.json", path), 2)
     assert "no column for ay, mz" in message
-    assert "--column ay=NAME --column mz=NAME" in message
 
 
 @pytest.mark.parametrize("unit", ["counts", ""])

@@ -204,7 +204,7 @@ def _raise_answerable(error: QuestionError | QuestionsError) -> NoReturn:
         QuestionsError(error.source, questions)
         if isinstance(error, QuestionsError)
         else questions[0]
-    )
+    ) from None
 
 
 def _chosen(
@@ -330,9 +330,11 @@ def _check_channels(table: Table, columns: Mapping[str, ColumnSource], profile: 
     if absent:
         used = {each.name for each in columns.values()}
         others = [shown(name) for name in table.columns if name not in used]
+        problem = f"{table.source}: the roll test has no column for {', '.join(absent)}"
+        if len(others) < len(absent):
+            raise InputError(f"{problem}. Add what is missing.")
         raise QuestionError(
-            f"{table.source}: the roll test has no column for {', '.join(absent)}; its others are "
-            f"{', '.join(others[:12]) or 'none'}. Which are they?",
+            f"{problem}; its others are {', '.join(others[:12])}. Which are they?",
             [Answer("", tuple(("column", f"{column}=NAME") for column in absent))],
         )
 
