@@ -239,6 +239,26 @@ def test_verify_and_calibrate_agree_on_a_file_without_a_roll_test(tmp_path, labo
     assert not any("mwdcal calibrate" in each or "mwdcal verify" in each for each in messages)
 
 
+def test_a_roll_test_of_angles_alone_judges_nothing_and_is_named(tmp_path, laboratory):
+    """Inclinations and toolfaces that the tool has computed, without its readings."""
+    angles = {
+        name: np.arange(8.0) * k
+        for k, name in enumerate(("Inc set", "TF set", "Inc read", "TF read"), 3)
+    }
+    book = workbook(tmp_path / "T.xlsx", **{"Roll Test": angles})
+    ran = mwdcal("profile", book, "-o", tmp_path / "t.toml")
+    assert "the roll test of sheet 'Roll Test' has no columns called as channels" in ran.err, ran
+    assert "--rolltest" not in ran.out
+    cal = tmp_path / "c.json"
+    tool = ("--tool", tmp_path / "t.toml", "-o", cal)
+    assert mwdcal("calibrate", book, *tool).code == 0
+    for message in (
+        refused(mwdcal("verify", cal, book), 2),
+        refused(mwdcal("calibrate", book, *tool, "--rolltest", book), 2),
+    ):
+        assert "'Roll Test' has no columns called as channels" in message
+
+
 def test_names_that_differ_in_brackets_blanks_case_and_accents_are_the_same(tmp_path, laboratory):
     """Also those that say nothing by themselves."""
     run = {**SPANISH_RUN, "ref_toolface_deg": "P-2 (°)", "ax": "Canál uno (g)"}
@@ -267,9 +287,8 @@ def test_all_missing_columns_are_listed_at_once(tmp_path, laboratory):
     columns = rolled({n: SPANISH_RUN[n] for n in TESTS["Rolltest"]})
     less = {n: c for n, c in columns.items() if n not in (SPANISH_RUN["ay"], SPANISH_RUN["mz"])}
     path = workbook(tmp_path / "less.xlsx", run=False, Hoja1=less)
-    message = refused(mwdcal("verify", laboratory[0] / "cal.json", path), 3)
+    message = refused(mwdcal("verify", laboratory[0] / "cal.json", path), 2)
     assert "no column for ay, mz" in message
-    assert "--column ay=NAME --column mz=NAME" in message
 
 
 @pytest.mark.parametrize("unit", ["counts", ""])

@@ -19,9 +19,8 @@ LEAST_CHANNELS = 3
 
 
 def has_channels(table: Layout, profile: Profile) -> bool:
-    """Whether a table has three channels or more, by the names of a profile or its own, or is called a roll test."""
-    called = {*RAW, *runs.channels_of(profile)} & {*table.names}
-    if table.kind == ROLL_TEST or len(called) >= LEAST_CHANNELS:
+    """Whether a table has three channels or more, by the names of a profile or its own."""
+    if len({*RAW, *runs.channels_of(profile)} & {*table.names}) >= LEAST_CHANNELS:
         return True
     meant = {m.column for m in meanings_of(table.names, table.units, table.above).values()}
     return len(meant & {*RAW}) >= LEAST_CHANNELS
@@ -49,13 +48,23 @@ def findings_beside(where: Layout, profile: Profile, serial: object, file: str) 
     every = [t for t in where.beside if has_channels(t, profile)]
     tests = of_roll_tests(every, serial)
     clear = has_roll_test(tests)
+    bare = [t for t in where.beside if t not in every and t.kind == ROLL_TEST]
     return [
         Finding(id=NOT_READ, text=_sentence(t, clear and t in tests, where.sheet, file))
         for t in every
         if not any(
             t.form.header_line == n and why.startswith(t.kind or "-") for n, why in where.left_out
         )
-    ]
+    ] + [Finding(id=NOT_READ, text=without_channels(t)) for t in bare]
+
+
+def without_channels(table: Layout) -> str:
+    """A sentence on a roll test that has no readings of the tool."""
+    place = f"sheet {shown(table.sheet)}" if table.sheet else f"line {table.form.header_line}"
+    return (
+        f"the roll test of {place} has no columns called as channels: mwdcal judges readings of the tool, not angles "
+        "that were computed from them."
+    )
 
 
 def _sentence(table: Layout, is_test: bool, sheet: str, file: str) -> str:

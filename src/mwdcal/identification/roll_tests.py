@@ -33,7 +33,7 @@ from mwdcal.files.formats.table import Table
 from mwdcal.files.parting import parted, roll_test_marks
 from mwdcal.files.statements import Said, stated_table
 from mwdcal.files.synonyms import ABOVE, BELOW, FACTORS, unit_of
-from mwdcal.identification.beside import has_channels, of_roll_tests
+from mwdcal.identification.beside import has_channels, of_roll_tests, without_channels
 from mwdcal.identification.columns import meanings_of
 from mwdcal.identification.proposal import (
     as_written,
@@ -82,7 +82,9 @@ def read_later(
     readings = runs.read_run(table, profile)[0]
     if not any(calibration.used(readings.digest)):
         return readings
-    if beside(path, table, profile, said) or roll_test_marks(table):
+    others = _others(path, table, profile, said)
+    named = any(t.kind == ROLL_TEST for t in others) or _tests_among(others, table, profile)
+    if named or roll_test_marks(table):
         return parted_run(path, table, profile, said)[1].readings(profile)
     return readings
 
@@ -127,9 +129,13 @@ def parted_run(
     Raises:
         InputError: the file has neither another table nor rows that one column marks.
     """
-    others = beside(path, table, profile, said)
-    if said.sheet or (others and (others[0].kind == ROLL_TEST or not roll_test_marks(table))):
-        return table, RollTestTable(path, said, tables=None if said.sheet else others)
+    others = _others(path, table, profile, said)
+    tests = _tests_among(others, table, profile)
+    if said.sheet or (tests and (tests[0].kind == ROLL_TEST or not roll_test_marks(table))):
+        return table, RollTestTable(path, said, tables=None if said.sheet else tests)
+    bare = [t for t in others if t.kind == ROLL_TEST]
+    if bare and not roll_test_marks(table):
+        raise InputError(f"{table.source}: {without_channels(bare[0])}")
     run, rows = parted(table)
     return run, RollTestTable(path, said, rows=rows)
 
@@ -138,11 +144,20 @@ def beside(
     path: str | os.PathLike[str], run: Table, profile: Profile, said: Said | None = None
 ) -> list[Layout]:
     """The tables in the file of a run that may be its roll test: those that are called so, or all other readings."""
-    every = tables.every_table(path, decimal=_sign(profile, said or Said()))
-    sheet = run.sheet or next((each.sheet for each in every), "")
-    others = [t for t in every if not is_part_of(t, sheet, run.parts, run.lines)]
+    return _tests_among(_others(path, run, profile, said or Said()), run, profile)
+
+
+def _tests_among(others: Sequence[Layout], run: Table, profile: Profile) -> list[Layout]:
+    """The tables beside a run that may be its roll test."""
     serial = run.metadata.get("serial", "")
     return of_roll_tests([t for t in others if has_channels(t, profile)], serial)
+
+
+def _others(path: str | os.PathLike[str], run: Table, profile: Profile, said: Said) -> list[Layout]:
+    """The tables in the file of a run beside it."""
+    every = tables.every_table(path, decimal=_sign(profile, said))
+    sheet = run.sheet or next((each.sheet for each in every), "")
+    return [t for t in every if not is_part_of(t, sheet, run.parts, run.lines)]
 
 
 def _sign(profile: Profile, said: Said) -> str:
@@ -189,7 +204,7 @@ def _raise_answerable(error: QuestionError | QuestionsError) -> NoReturn:
         QuestionsError(error.source, questions)
         if isinstance(error, QuestionsError)
         else questions[0]
-    )
+    ) from None
 
 
 def _chosen(
@@ -315,9 +330,11 @@ def _check_channels(table: Table, columns: Mapping[str, ColumnSource], profile: 
     if absent:
         used = {each.name for each in columns.values()}
         others = [shown(name) for name in table.columns if name not in used]
+        problem = f"{table.source}: the roll test has no column for {', '.join(absent)}"
+        if len(others) < len(absent):
+            raise InputError(f"{problem}. Add what is missing.")
         raise QuestionError(
-            f"{table.source}: the roll test has no column for {', '.join(absent)}; its others are "
-            f"{', '.join(others[:12]) or 'none'}. Which are they?",
+            f"{problem}; its others are {', '.join(others[:12])}. Which are they?",
             [Answer("", tuple(("column", f"{column}=NAME") for column in absent))],
         )
 
