@@ -455,7 +455,7 @@ def renamed(table: Table, profile: Profile) -> Table:
     sources = sources_of(profile)
     if not is_export(table.columns, profile):
         if sources and {*CHANNELS["accelerometer"]}.isdisjoint(table.columns):
-            raise _not_as_stated(table, profile)
+            raise _unlike_profile(_not_as_stated(table, profile))
         return _with_stated_references(table)
     theirs = {s.name: column for column, s in sources.items() if s.name in table.columns}
     others = [name for name in table.columns if name not in theirs]

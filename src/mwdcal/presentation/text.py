@@ -17,8 +17,6 @@ NARROWEST, WIDEST = 80, 160
 """Columns for which a terminal gets its tables and lines, however many it has."""
 NOT_STATED = "not stated"
 """In place of what a document must have room for, and does not say."""
-FILE_WIDTH = 100
-"""Columns to which a table with remarks is folded in a file."""
 UNCUT = 1_000_000
 """Width that no table has."""
 BETWEEN = 3
@@ -33,7 +31,7 @@ TWINS = {chr(0xA0): " ", chr(0x2009): " ", chr(0x202F): " ", "‰": "per mille"}
     re.findall(
         r"(\S) (\S+)",
         "° deg  º deg  µ u  ± +/-  × x  ÷ /  · *  √ sqrt  ∞ inf  ≤ <=  ≥ >=  ≈ ~  ≠ !=  → ->  ← <-  ⁄ /  "
-        "– -  — -  − -  ─ -  ━ -  │ |  … ...  • *  ‘ '  ’ '  “ \"  ” \"  ′ '  ″ \"  ✓ ok  ✗ x  ▲ ^  ▸ >  ◂ <  ½ 1/2  "
+        "– -  — -  − -  ： :  ─ -  ━ -  │ |  … ...  • *  ‘ '  ’ '  “ \"  ” \"  ′ '  ″ \"  ✓ ok  ✗ x  ▲ ^  ▸ >  ◂ <  ½ 1/2  "
         "α alpha  β beta  γ gamma  δ delta  θ theta  κ kappa  λ lambda  μ u  ν nu  π pi  ρ rho  σ sigma  "
         "τ tau  φ phi  χ chi  ω omega  Δ Delta  Θ Theta  Λ Lambda  Σ Sigma  Φ Phi  ∂ d  ∇ grad  "
         "₀ _0  ₁ _1  ₂ _2  ₃ _3  ₄ _4  ₅ _5  ₆ _6  ₇ _7  ₈ _8  ₉ _9  ᵢ _i  ⱼ _j  ᵏ ^k",
@@ -197,17 +195,15 @@ def table(
 
     Cells are shown as they are, on one line, in characters that stdout has. On a terminal too narrow for
     it words are folded and the columns stand in several tables, which all begin with those that name the
-    rows: the first, or several. Elsewhere the table has at most a `width`, or with `remarks` is folded to
-    `FILE_WIDTH`.
+    rows: the first, or several. Elsewhere the table has at most a `width`; with `remarks` nothing is cut.
     """
     cells = [
         [transliterate(one_line(cell), sys.stdout.encoding) for cell in row]
         for row in [header, *rows]
     ]
-    whole = list(zip(*cells, strict=True))
-    room = columns(sys.stdout) or (FILE_WIDTH if remarks else None)
+    whole, room = list(zip(*cells, strict=True)), columns(sys.stdout)
     if room is None:
-        return _render_table(whole, width)
+        return _render_table(whole, UNCUT if remarks else width)
     return "\n\n".join(_render_table(some, UNCUT) for some in _split_columns(whole, room, names))
 
 
