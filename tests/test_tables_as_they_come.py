@@ -641,6 +641,24 @@ def test_a_roll_test_below_the_run_is_set_aside_and_named(tmp_path, heading):
     assert "(roll test, 12 rows)" in proposal.summary()
 
 
+@pytest.mark.parametrize(
+    "remark", ["проверен уровень", "checked the bubble", "check of the bubble"]
+)
+@pytest.mark.parametrize("station", ["Pos", None])
+def test_a_remark_on_a_check_between_rows_begins_no_roll_test(tmp_path, remark, station):
+    columns = table(**({} if station else {"Pos": None, "station": None}))
+    lines = write_csv(tmp_path / "a.csv", columns).read_text().splitlines()
+    path = tmp_path / "b.csv"
+    path.write_text("\n".join(["Calibration", *lines[:25], remark, *lines[25:]]), "utf-8")
+    assert read(path).count == 48
+
+
+def test_a_line_of_endless_words_states_nothing(tmp_path):
+    """It would take minutes to be searched."""
+    path = written(tmp_path / "a.csv", table(), "# " + "a." * 50_000)
+    assert read(path).count == 48
+
+
 def test_a_sheet_of_a_roll_test_is_set_aside_and_named(tmp_path):
     path = workbook_of(
         tmp_path / "a.xlsx", table(station=[*range(1, 49)]), ["Calibration", "Roll test"]

@@ -162,7 +162,8 @@ def _is_off_norm(values: Mapping[str, Array], column: str) -> Bools:
     if triad is None:
         return np.ones(values[column].size, bool)
     norms = np.linalg.norm([values[name] for name in triad], axis=0)
-    return np.asarray(~(np.abs(norms - np.nanmedian(norms)) <= _OFF_NORM * np.nanmedian(norms)))
+    usual = np.median(norms[np.isfinite(norms)]) if np.isfinite(norms).any() else np.nan
+    return np.asarray(~(np.abs(norms - usual) <= _OFF_NORM * usual))
 
 
 def _far_out(values: Mapping[str, Array], column: str) -> Bools:

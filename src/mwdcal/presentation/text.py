@@ -30,8 +30,8 @@ _HANDLER = "mwdcal.twins"
 TWINS = {chr(0xA0): " ", chr(0x2009): " ", chr(0x202F): " ", "‰": "per mille"} | dict(
     re.findall(
         r"(\S) (\S+)",
-        "° deg  º deg  µ u  ± +/-  × x  ÷ /  · *  √ sqrt  ∞ inf  ≤ <=  ≥ >=  ≈ ~  ≠ !=  → ->  ← <-  ⁄ /  "
-        "– -  — -  − -  ： :  ─ -  ━ -  │ |  … ...  • *  ‘ '  ’ '  “ \"  ” \"  ′ '  ″ \"  ✓ ok  ✗ x  ▲ ^  ▸ >  ◂ <  ½ 1/2  "
+        "• *  ° deg  º deg  µ u  ± +/-  × x  ÷ /  · *  √ sqrt  ∞ inf  ≤ <=  ≥ >=  ≈ ~  ≠ !=  → ->  ← <-  ⁄ /  "
+        "– -  — -  − -  ： :  ─ -  ━ -  │ |  … ...  ‘ '  ’ '  “ \"  ” \"  ′ '  ″ \"  ✓ ok  ✗ x  ▲ ^  ▸ >  ◂ <  ½ 1/2  "
         "α alpha  β beta  γ gamma  δ delta  θ theta  κ kappa  λ lambda  μ u  ν nu  π pi  ρ rho  σ sigma  "
         "τ tau  φ phi  χ chi  ω omega  Δ Delta  Θ Theta  Λ Lambda  Σ Sigma  Φ Phi  ∂ d  ∇ grad  "
         "₀ _0  ₁ _1  ₂ _2  ₃ _3  ₄ _4  ₅ _5  ₆ _6  ₇ _7  ₈ _8  ₉ _9  ᵢ _i  ⱼ _j  ᵏ ^k",

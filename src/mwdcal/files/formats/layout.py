@@ -56,7 +56,7 @@ _SHARED = 0.6
 _SUMMARY = re.compile(
     r"\W*(mean|average|avg|median|std\w*|st\.?\s?dev\w*|standard deviation|rms|min(imum)?|max(imum)?|sum|total|range|"
     r"span|mittel(wert)?|mw|durchschnitt|stabw\w*|standardabw\w*\.?|summe|snitt|gjennomsnitt|standardavvik|media|"
-    r"promedio|desv\w*( est\w*)?|m[eé]dia|desvio( padr[aã]o)?|moyenne|[eé]cart[- ]type|среднее|ско|мин|макс|сумма|"
+    r"promedio|desv\w*( est\w*)?|m[eé]d(ia|\.)|prom\.|moy\.|gj\.? ?snitt|ср\.?|desvio( padr[aã]o)?|moyenne|[eé]cart[- ]type|среднее|ско|мин|макс|сумма|"
     r"平均(值)?|均值|标准差|最大值?|最小值?|合计|spread|σ|µ)\W*",
     re.IGNORECASE,
 )
@@ -122,6 +122,14 @@ _OF_ROLL_TEST = re.compile(
     re.IGNORECASE,
 )
 """Words of a sheet whose rows are to check a calibration."""
+_OF_ROLLS = re.compile(
+    r"roll|rull|rot|dreh|giro|вращ|回転|滚|旋转|(calib|kalib|калиб|标定)", re.IGNORECASE
+)
+_OF_DONE = re.compile(
+    r"(check|verifi|validat|kontrollier)ed|verificad|validad|gepr(ü|ue)ft|kontrollert|sjekket|провер(ен|или|ил\b)",
+    re.IGNORECASE,
+)
+"""Words of what was done between two rows."""
 ROLL_TEST = "roll test"
 """The kind of such a table."""
 _OF_SETTING = re.compile(
@@ -1173,11 +1181,26 @@ def _beside(
 def _another_part(rows: Sequence[tuple[int, Cells]], head: int, end: int) -> int:
     """The place of a line below the names, above rows of a check; else the end."""
     for place in range(head + 1, end - 1):
-        row = rows[place][1]
-        between = _is_reading(rows[place + 1][1]) and not _is_reading(row)
-        if between and _OF_ROLL_TEST.search(" ".join(map(as_text, row))):
+        between = _is_reading(rows[place + 1][1]) and not _is_reading(rows[place][1])
+        if between and _stands_over_check(rows[head + 1 : place], *rows[place : place + 2]):
             return place
     return end
+
+
+def _stands_over_check(
+    above: Sequence[tuple[int, Cells]], line: tuple[int, Cells], below: tuple[int, Cells]
+) -> bool:
+    """Whether a line without names begins the rows of a check: it says so, and no row above is numbered on below.
+
+    A remark does not: it says what was done, or is longer, such as check of the bubble.
+    """
+    text = _text(line[1])
+    if not _OF_ROLL_TEST.search(text) or _OF_DONE.search(text):
+        return False
+    last = next((row for _, row in reversed(above) if _is_reading(row)), ())
+    pairs = zip(map(_number, last), map(_number, below[1]), strict=False)
+    steps = [b - a for a, b in pairs if a is not None and b is not None][:2]
+    return 1.0 not in steps and bool(_OF_ROLLS.search(text) or len(text.split()) <= 2)
 
 
 def _both(unit: str, by_cells: str) -> str:

@@ -33,6 +33,8 @@ _STATEMENTS = (
     re.compile(rf"{_NUMBER_OF_SETTING}\s*{_WORDS_BEFORE.format(more='')}", re.IGNORECASE),
 )
 """A number with its unit behind words, and before them: Inclination 30°, 30° inclination."""
+LONGEST_STATEMENT = 2000
+"""Characters of a line that may state something; a longer one would take minutes."""
 _TO = re.compile(r"\s*(?:to|bis|til|до|[-–…]|\.\.)\s*[\d+]", re.IGNORECASE)
 """The end of a range behind a number."""
 _CODE_OF_STATION = re.compile(r"(?:[^\W\d_]{1,3}[ ._=-]?-?\d{1,3}(?:\.\d+)?[°]?[ _,;/-]?){2,4}")
@@ -67,7 +69,7 @@ def settings_in(text: str) -> dict[str, tuple[str, str]]:
     ({}, {'ref_inclination_deg': ('inclination (°)', '30')})
     """
     settings: dict[str, tuple[str, str]] = {}
-    for form in _STATEMENTS:
+    for form in _STATEMENTS if len(text) <= LONGEST_STATEMENT else ():
         behind = form is _STATEMENTS[1]
         each = [(match, _angle(match["words"], behind)) for match in form.finditer(text)]
         each = [(m, angle) for m, angle in each if angle and not _TO.match(text, m.end("number"))]

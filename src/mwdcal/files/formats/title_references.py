@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from mwdcal.calibration.readings import EARTH_GRAVITY
 from mwdcal.files.formats.columns import as_text, looks_numeric, without_marks
-from mwdcal.files.formats.settings import settings_in
+from mwdcal.files.formats.settings import LONGEST_STATEMENT, settings_in
 from mwdcal.files.formats.titles import Titles, titles
 from mwdcal.files.synonyms import FACTORS, unit_of
 
@@ -87,7 +87,7 @@ _OF_PLACES = (
     ),
 )
 _WRITTEN_UNIT = (
-    r"k?γ|(?:(?<=\d)|(?<=\d )|(?<=[(\[]))k?gammas?\b(?! ?ray)|"
+    r"мгс\b|см/с[²2]?|k?γ|(?:(?<=\d)|(?<=\d )|(?<=[(\[]))k?gammas?\b(?! ?ray)|"
     r"n\s?t\b|[uµμ]\s?t\b|m\s?t\b|milli ?gauss|m\s?g(al|auss)?\b|gauss|gs\b|oe\b|a\s?/\s?m\b|gals?\b|gons?\b|"
     r"nano ?teslas?\b|micro ?teslas?\b|нтл|мктл|мтл|м?гал|гс\b|э\b|м/с²?|м/с2|"
     r"m\s?/\s?s\s?(?:²|\^?2)?|[gг]\b(?!\s*[=:(\[]?\s*(?:[+-]?\d|m\s?/))|°|deg\w*|gra[ud]\w*|rad\b|град\w*|"
@@ -306,7 +306,8 @@ _SPELT = {
     "град": "°", "度": "°", "fok": "°", "derece": "°", "stopni": "°", "gal": "gal",
     "γ": "nT", "gammas": "nT", "kγ": "µT", "kgamma": "µT",
     "nanotesla": "nT", "nanoteslas": "nT", "microtesla": "µT", "microteslas": "µT",
-    "a/m": "A/m", "oe": "gauss", "э": "gauss", "гс": "gauss", "gs": "gauss", "gals": "gal", "гал": "gal",
+    "a/m": "A/m", "oe": "gauss", "э": "gauss", "гс": "gauss", "мгс": "mG", "см/с": "gal", "см/с²": "gal", "см/с2": "gal",
+    "gs": "gauss", "gals": "gal", "гал": "gal",
     "mgal": "mGal", "мгал": "mGal", "mg": "mg", "mgauss": "mG", "milligauss": "mG",
 }  # fmt: skip
 """Units in small letters, where `unit_of` does not know them or goes by capitals."""
@@ -334,6 +335,9 @@ def stated_above(
 
     Words `elsewhere` in the file may name the place, of a list of several.
     """
+    rows, besides = (
+        [row for row in each if len(_line(row)) <= LONGEST_STATEMENT] for each in (rows, besides)
+    )
     rows = [_unsplit(row) for row in rows]
     block = titles(rows)
     above, beside = ([r for r in each if not _is_of_settings(r)] for each in (rows, besides))
