@@ -38,7 +38,15 @@ from mwdcal.files.formats.settings import (
     settings_in,
 )
 from mwdcal.files.formats.title_references import stated_above
-from mwdcal.files.formats.titles import ADJUSTED, OF_REFUSAL, Titles, dated, titles, tool_in
+from mwdcal.files.formats.titles import (
+    ADJUSTED,
+    NOT_TO_USE,
+    OF_REFUSAL,
+    Titles,
+    dated,
+    titles,
+    tool_in,
+)
 from mwdcal.files.synonyms import resembled, unit_of
 from mwdcal.files.words import LATIN_AXES, spelled
 from mwdcal.geometry.vectors import Array
@@ -56,7 +64,8 @@ _SHARED = 0.6
 _SUMMARY = re.compile(
     r"\W*(mean|average|avg|median|std\w*|st\.?\s?dev\w*|standard deviation|rms|min(imum)?|max(imum)?|sum|total|range|"
     r"span|mittel(wert)?|mw|durchschnitt|stabw\w*|standardabw\w*\.?|summe|snitt|gjennomsnitt|standardavvik|media|"
-    r"promedio|desv\w*( est\w*)?|m[eé]d(ia|\.)|prom\.|moy\.|gj\.? ?snitt|ср\.?|desvio( padr[aã]o)?|moyenne|[eé]cart[- ]type|среднее|ско|мин|макс|сумма|"
+    r"promedio|desv\w*( est\w*)?|m[eé]d(ia|\.)|prom\.|moy\.|gj\.? ?snitt|ср\.?|desvio( padr[aã]o)?|"
+    r"moyenne|[eé]cart[- ]type|среднее|ско|мин|макс|сумма|"
     r"平均(值)?|均值|标准差|最大值?|最小值?|合计|spread|σ|µ)\W*",
     re.IGNORECASE,
 )
@@ -1192,11 +1201,14 @@ def _stands_over_check(
 ) -> bool:
     """Whether a line without names begins the rows of a check: it says so, and no row above is numbered on below.
 
-    A remark does not: it says what was done, or is longer, such as check of the bubble.
+    A remark does not: it says what was done, or is longer, such as check of the bubble; but for one that says that
+    they do not count.
     """
     text = _text(line[1])
     if not _OF_ROLL_TEST.search(text) or _OF_DONE.search(text):
         return False
+    if re.search(NOT_TO_USE, text, re.IGNORECASE):
+        return True
     last = next((row for _, row in reversed(above) if _is_reading(row)), ())
     pairs = zip(map(_number, last), map(_number, below[1]), strict=False)
     steps = [b - a for a, b in pairs if a is not None and b is not None][:2]

@@ -306,7 +306,8 @@ _SPELT = {
     "град": "°", "度": "°", "fok": "°", "derece": "°", "stopni": "°", "gal": "gal",
     "γ": "nT", "gammas": "nT", "kγ": "µT", "kgamma": "µT",
     "nanotesla": "nT", "nanoteslas": "nT", "microtesla": "µT", "microteslas": "µT",
-    "a/m": "A/m", "oe": "gauss", "э": "gauss", "гс": "gauss", "мгс": "mG", "см/с": "gal", "см/с²": "gal", "см/с2": "gal",
+    "a/m": "A/m", "oe": "gauss", "э": "gauss", "гс": "gauss", "мгс": "mG",
+    "см/с": "gal", "см/с²": "gal", "см/с2": "gal",
     "gs": "gauss", "gals": "gal", "гал": "gal",
     "mgal": "mGal", "мгал": "mGal", "mg": "mg", "mgauss": "mG", "milligauss": "mG",
 }  # fmt: skip
