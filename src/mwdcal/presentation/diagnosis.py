@@ -39,8 +39,8 @@ LEAST_LIKELIHOOD = 0.0005
 """Likelihoods below are shown as less than this."""
 MOVED_TITLES = ["channel", "by", "1σ", "unit"]
 """Titles of the table of sizes of a fault, but for the first."""
-IF_ALONE = ", if it were one of these alone"
-"""Addition to the title of likelihoods and sizes where no single fault explains the readings."""
+NONE_FITS = "none fits; the closest first"
+"""In place of likelihoods where no single fault explains the readings: they would compare poor explanations."""
 
 
 def screen(result: Diagnosis, *metadata: Mapping[str, object]) -> str:
@@ -49,7 +49,7 @@ def screen(result: Diagnosis, *metadata: Mapping[str, object]) -> str:
     parts = ["   ".join(one_line(text) for text in head)]
     if result.parameters:
         parts.append(table(_moved(result), _moved_titles(result)))
-    parts.append(table(_likelihoods(result), ["", f"likelihood{_if_alone(result)}"]))
+    parts.append(table(_likelihoods(result), ["", _likelihood_title(result)]))
     parts.append("\n".join(one_line(line) for line in _last(result)))
     return "\n\n".join(parts)
 
@@ -67,7 +67,7 @@ def render(result: Diagnosis, sha256: Mapping[str, str], *metadata: Mapping[str,
         findings=result.findings,
         moved=_moved(result),
         moved_titles=_moved_titles(result),
-        if_alone=_if_alone(result),
+        likelihood_title=_likelihood_title(result),
         likelihoods=_likelihoods(result),
         last=_last(result)[:-1],
         sha256=sha256,
@@ -96,8 +96,8 @@ def _unexplained(result: Diagnosis) -> bool:
     return any(finding.id == "unexplained" for finding in result.findings)
 
 
-def _if_alone(result: Diagnosis) -> str:
-    return IF_ALONE if _unexplained(result) else ""
+def _likelihood_title(result: Diagnosis) -> str:
+    return NONE_FITS if _unexplained(result) else "likelihood"
 
 
 def _moved_titles(result: Diagnosis) -> list[str]:
@@ -143,7 +143,8 @@ def _moved(result: Diagnosis) -> list[list[str]]:
 def _likelihoods(result: Diagnosis) -> list[list[str]]:
     """All faults, the most likely first."""
     ordered = sorted(result.likelihoods.items(), key=lambda pair: -pair[1])
-    return [[f"{name}: {MEANINGS[name]}", _share(share)] for name, share in ordered]
+    poor = _unexplained(result)
+    return [[f"{n}: {MEANINGS[n]}", "" if poor else _share(share)] for n, share in ordered]
 
 
 def _share(share: float) -> str:
