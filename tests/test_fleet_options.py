@@ -404,7 +404,8 @@ def test_an_option_that_both_commands_have_is_one():
     own = {"runs", "workers", "scheduler", "records", "calibrations"}
     assert set(fleet) - set(calibrate) == own
     assert set(calibrate) - set(fleet) == {
-        "run", "exclude", "decimal", "rolltest", "limits", "serial", "date", "operator", "registry",
+        "run", "exclude", "decimal", "rolltest", "rolltest_sheet",
+        "rolltest_column", "limits", "serial", "date", "operator", "registry",
     }  # fmt: skip
     for name in ("method", "robust", "estimate", "ignore", "parameters", "order", "nonlinearity"):
         assert fleet[name].help == calibrate[name].help

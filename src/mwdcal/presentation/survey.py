@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -115,8 +115,8 @@ def interference_screen(result: Interference, *metadata: Mapping[str, object]) -
     return "\n".join([*parts, *([f"… and {more} more"] if more > 0 else [])])
 
 
-FIRST_SURVEYS, LAST_SURVEYS = 20, 10
-"""Surveys of a table on screen, at its beginning and at its end."""
+MOST_SURVEYS = 30
+"""Surveys of a table on screen."""
 OFF_IN_WORDS = "\noff: how far |g|, |b| and dip together are from their references"
 """The meaning of a column."""
 OUTCOMES = {"true": "accepted", "false": "REJECTED", "": "not judged"}
@@ -519,19 +519,16 @@ def end_in_words(end: EndOfPath, north: str, unit: str = "m") -> str:
     return f"at {fixed(end.md_m / metres, 2)} {unit} MD, from {north} north: {', '.join(parts)}{closure}"
 
 
-def survey_table(well: Well, count: int) -> str:
-    """The first and the last of so many surveys, each angle with its standard uncertainty."""
-    more = count - FIRST_SURVEYS - LAST_SURVEYS
-    places = [i for i in range(count) if i < FIRST_SURVEYS or i >= count - LAST_SURVEYS]
-    header, rows = survey_rows(well, places)
-    if more > 0:
-        rows.insert(FIRST_SURVEYS, [f"… {more} more", *[""] * (len(header) - 1)])
+def survey_table(well: Well, count: int, most: int = MOST_SURVEYS) -> str:
+    """The first of so many surveys, each angle with its standard uncertainty."""
+    header, rows = survey_rows(well, most)
+    more = count - len(rows)
     note = OFF_IN_WORDS if "off, σ" in header and well.judgement.judged.any() else ""
-    return table(rows, header) + note
+    return table(rows, header) + (f"\n… and {more} more" if more > 0 else "") + note
 
 
-def survey_rows(well: Well, places: Iterable[int]) -> tuple[list[str], list[list[str]]]:
-    """Header and cells of the surveys at some places, from 0."""
+def survey_rows(well: Well, most: int) -> tuple[list[str], list[list[str]]]:
+    """Header and cells of the first surveys."""
     columns = well.columns
     azimuth = f"azimuth_{well.north.name}_deg"
     angles, relative = ["inclination_deg", azimuth, "toolface_deg"], well.calibration.relative
@@ -545,8 +542,7 @@ def survey_rows(well: Well, places: Iterable[int]) -> tuple[list[str], list[list
         header += [title, "1σ"] if name in angles else [title]
     modelled, rows = well.limits.probability is not None, []
     metres = LENGTH_UNITS[well.length_unit]
-    for i in places:
-        label = well.readings.labels[i]
+    for i, label in enumerate(well.readings.labels[:most]):
         row = [label, *([fixed(well.position.md[i] / metres, 2)] if well.position else [])]
         for name in shown:
             row.append(fixed(columns[name][i], digits.get(name, 2)))
