@@ -374,18 +374,3 @@ def test_tables_in_memory_keep_serial_and_simulated(library, way, tool):
     readings = mwdcal.read_run(frame, tool, metadata=stated if way == "metadata" else None)
     calibration = mwdcal.calibrate(readings)
     assert (calibration.serial, calibration.simulated) == ("12.10", True)
-
-
-def test_a_calibration_does_not_replace_that_of_another_tool(tmp_path):
-    """The tutorials write tool.json, and so did whoever calibrated a tool of his own before."""
-    run = (EXAMPLE / "run.csv").read_text("utf-8")
-    serial = mwdcal.read_run(EXAMPLE / "run.csv", EXAMPLE / "tool.toml").metadata["serial"]
-    (tmp_path / "other.csv").write_text(run.replace(str(serial), "OTHER-1"), "utf-8")
-    fit = ("--tool", EXAMPLE / "tool.toml", "-o", tmp_path / "tool.json")
-    assert command("calibrate", EXAMPLE / "run.csv", *fit).code == 0
-    before = (tmp_path / "tool.json").read_bytes()
-    refused = command("calibrate", tmp_path / "other.csv", *fit)
-    assert refused.code == 2
-    assert f"is the calibration of the tool '{serial}', and this run is of 'OTHER-1'" in refused.err
-    assert (tmp_path / "tool.json").read_bytes() == before
-    assert command("calibrate", EXAMPLE / "run.csv", *fit).code == 0

@@ -25,7 +25,6 @@ from mwdcal.calibration.record import (
 from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import atomic, members
-from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.table import EXCHANGED, LAID_OUT
 from mwdcal.files.profiles import PACKAGE, check_profile
 
@@ -99,24 +98,6 @@ _DIGITS = 30
 """Digits of the longest whole number that a calibration file may have."""
 _AS_WRITTEN = "The file was changed by hand or damaged: use it as mwdcal calibrate wrote it, or calibrate again."
 _UNREADABLE = "No command would read such a file: calibrate again, or correct the record."
-
-
-def check_same_tool(path: Path, calibration: Calibration) -> None:
-    """Refuse to write a calibration over that of another tool.
-
-    Raises:
-        InputError: the file is a calibration of another serial.
-    """
-    data = _content(path)
-    if not _is_calibration(path, data):
-        return
-    before = msgspec.json.decode(data).get("tool")
-    old, new = (str(each.get("serial", "")) for each in (before or {}, calibration.tool))
-    if old and new and old != new:
-        raise InputError(
-            f"'{path}' is the calibration of the tool {shown(old)}, and this run is of {shown(new)}. Name another file "
-            "by `output`, or put that one elsewhere."
-        )
 
 
 def encode(calibration: Calibration) -> bytes:
