@@ -261,7 +261,7 @@ def test_two_triads_on_two_sheets_of_the_same_stations_are_one_table(tmp_path):
 
 
 def test_an_answer_is_given_in_python_as_the_error_says_it(tmp_path):
-    """What stands behind *Answer by* are keywords; texts as the command takes them say the same as a mapping."""
+    """Answers are named as keyword arguments; strings in the form of the command equal a mapping."""
     rows = stations()
     for row in rows:
         row[1] = (row[1] + 8) % 360

@@ -119,7 +119,7 @@ def laboratory(tmp_path_factory):
 
 
 def read_of(document):
-    """What a result says of how the roll test was read."""
+    """The findings on how a roll test was read."""
     (said,) = [f["text"] for f in document["findings"] if f["text"].startswith("the roll test was")]
     return said
 

@@ -55,7 +55,7 @@ HOW_TO_MARK = (
     "Mark a roll test in one column, such as 'Roll test' with yes at its rows, put it on a sheet of its own, or name "
     "its file by `rolltest`."
 )
-"""How a roll test in the file of the run is told."""
+"""The remark on a roll test in the file of the run."""
 
 
 def roll_test_marks(table: Table) -> dict[str, list[int]]:

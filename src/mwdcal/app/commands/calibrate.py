@@ -103,7 +103,7 @@ def command(
 def _judged(
     calibration: Calibration, test: RollTestTable, limits: str, files: tuple[Path, Path]
 ) -> tuple[Readings | None, Verdict | None, str, MwdcalError | None]:
-    """The readings of a roll test, their verdict and its screen, or why there is none.
+    """The readings of a roll test, their verdict and its text on screen, or the error.
 
     `files` of calibration and roll test.
     """

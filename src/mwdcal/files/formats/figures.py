@@ -25,7 +25,7 @@ _PARTS_OF_DEGREES = re.compile(
 )
 """The same with other signs, or none: 30-15-36, 30:15:36, 30 15 36, 30d15m."""
 _PACKED = re.compile(r"(?<![^\W\d_])[dg]{1,3}[.,]mm(ss)?(?![^\W\d_])", re.IGNORECASE)
-"""What says that minutes and seconds are the decimals of degrees: D.MMSS."""
+"""The notation D.MMSS: minutes and seconds written as decimals of degrees."""
 _FIRST_DAY = datetime(1899, 12, 31)
 """The day 0 of workbooks."""
 _BEARING = re.compile(r"([NS])\s*(\d+(?:[.,]\d+)?)\s*°?\s*([EWO])", re.IGNORECASE)

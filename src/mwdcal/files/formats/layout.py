@@ -379,7 +379,7 @@ def _of_stations(tool: Layout, stand: Layout) -> Layout | None:
 
 
 def _titles_of_both(one: Layout, other: Layout) -> Titles:
-    """What stands above the first of two tables that are one, and what the other adds to it."""
+    """The title block of the first of two joined tables, completed by that of the other."""
     return one.titles._replace(metadata={**other.titles.metadata, **one.titles.metadata})
 
 
