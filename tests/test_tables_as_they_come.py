@@ -5,6 +5,7 @@ import datetime
 import json
 import re
 
+import msgspec
 import numpy as np
 import openpyxl
 import pandas
@@ -13,6 +14,7 @@ import pytest
 import mwdcal as library
 from cli_support import channels, mwdcal, refused, servo_run, stations, write_csv
 from mwdcal.errors import FitError
+from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.title_references import references_in
 from mwdcal.files.formats.titles import titles
 from simulation import Tool, plan
@@ -1173,3 +1175,13 @@ def test_a_fleet_leaves_rejected_rows_out_too_and_says_so(tmp_path):
     assert ran.json["stations"] == 95
     assert "A1.csv: rows that are rejected" in ran.err
     assert "line 8 ('Status': REJECT)" in ran.err
+
+
+def test_a_profile_of_a_workbook_reads_it_once(tmp_path, monkeypatch):
+    opened, whole = [], openpyxl.load_workbook
+    tables.write(tmp_path / "run.xlsx", tables.read("examples/servo/run.csv"))
+    monkeypatch.setattr(
+        openpyxl, "load_workbook", lambda *a, **k: opened.append(a) or whole(*a, **k)
+    )
+    assert library.propose_profile(tmp_path / "run.xlsx").profile.table == msgspec.UNSET
+    assert len(opened) == 1

@@ -55,7 +55,7 @@ def is_figure(cell: object) -> bool:
     [True, True, True, True, False, False, False]
     """
     if not isinstance(cell, str):
-        return isinstance(cell, int | float) and not isinstance(cell, bool)
+        return type(cell) is float or (isinstance(cell, int | float) and type(cell) is not bool)
     if _POINTED_DAY.fullmatch(cell):
         return False
     text = _SPACES.sub("", cell)
