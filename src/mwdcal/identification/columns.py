@@ -69,6 +69,8 @@ _SAME_DIP = 0.2
 """By how much the dip of a place varies at most, degrees."""
 _FOLLOWS = 0.9
 """Correlation from which on a column follows what is computed."""
+_COPIES = 0.99
+"""Correlation from which on a column is another one, corrected: fields near the vertical follow gravity to 0.95."""
 _STEADY_DIP, _STEADY_FIELD = 3.0, 0.1
 """A dip varies by less at one place, degrees, and a field by a smaller share."""
 STEADY_NORM = 0.15
@@ -77,7 +79,7 @@ OF_ONE_SPHERE = 0.05
 """The same of three channels that belong together by their readings alone."""
 _OFF_SPHERE = 0.05
 """By how much the squares of norms of a triad differ from a sphere's, as a share of the channels' range squared."""
-_TURNS = 0.2
+_LEAST_RANGE = 0.2
 """Least range of a channel of a tool that is turned about every axis, as a share of the largest."""
 _LEAST_TURN = 20.0
 """By how much an angle of the stand varies at least, degrees."""
@@ -382,7 +384,7 @@ _OF_SAMPLES = re.compile(
 )
 """How many samples a mean is of, in a line or as the name of a column."""
 _SPREADS_OF_CHANNELS = tuple(f"sd_{name}" for name in RAW)
-_IN_UNIT = re.compile(r"(.*\w) (?:in|en|i|w|в) (\S+)", re.IGNORECASE)
+_IN_UNIT = re.compile(r"(.*[\w)\]]) (?:in|en|i|w|в) (\S+)", re.IGNORECASE)
 """A name with its unit behind a preposition: Gx in mg."""
 _BARE_T = re.compile(r"t\W*(°|deg)?\W*", re.IGNORECASE)
 _CCW = re.compile(
@@ -480,7 +482,10 @@ def _bracketed(name: str) -> str:
     logged = _OF_LOGGER.fullmatch(name)
     name = f"{logged[1]}{logged[2] or ''}" if logged else name
     worded = _IN_UNIT.fullmatch(name)
-    return f"{worded[1]} ({worded[2]})" if worded and unit_of(spelled(worded[2])) else name
+    if not worded or not unit_of(spelled(worded[2])):
+        return name
+    words = re.sub(r"[()\[\]]", "", worded[1])
+    return f"{words} ({worded[2]})"
 
 
 def _elevation(name: str, plain: str, unit: str) -> Resemblance | None:
@@ -780,6 +785,10 @@ class Questions(list[QuestionError]):
         """The columns of a table that the first answers to open questions take."""
         return {name for each in self if each.answers for name in _names_of(each.answers[0])}
 
+    def hold(self, *texts: str) -> bool:
+        """Whether there is a question with one of some texts in it."""
+        return any(text in each.text for each in self for text in texts)
+
     def settle(self, words: str) -> bool:
         """Whether there is a question of these words; others on columns that each of its answers takes are left out."""
         question = next((each for each in self if words in each.text), None)
@@ -842,23 +851,21 @@ def proposed(
         if not {*channels} & {*chosen, *said}:
             others = [n for n in names if n not in meanings]
             questions.ask(_check_hidden, triad, channels, others, values, source)
-    hidden = any("channels of the accelerometer" in each.text for each in questions)
+    hidden = questions.hold("channels of the accelerometer")
     if not hidden and not any(n in damaged for n, m in meanings.items() if m.column in RAW):
         questions.ask(_check_triads, names, values, chosen, said, source, of_run)
     questions.ask(_check_units_of_triads, chosen, source)
     angles = {c: chosen[c].name for c in _ANGLES_AND_WARMTH[:3] if c in chosen and c not in said}
     for column in angles:
         questions.ask(_check_nominal, column, angles, names, values, source)
-    beside = questions.settle("side by side")
-    hidden = any("channels of the magnetometer" in each.text for each in questions)
-    if not beside and not hidden and not {*RAW[3:]} & {*chosen, *said}:
+    beside = questions.settle("side by side") or questions.hold("channels of the magnetometer")
+    if not beside and not {*RAW[3:]} & {*chosen, *said}:
         # Without accelerometers either triad may be either.
         believed = questions.believed() if {*RAW[:3]} & {*chosen} else ()
         others = [n for n in names if n not in meanings and n not in believed]
         questions.ask(_check_nameless, others, values, chosen, known, source)
-    rest = {n: u for n, u in every.items() if n not in meanings}
     present = {*chosen, *said, *known, *of_vectors(chosen)}
-    _ask_lacking(present, rest, names, values, questions, source)
+    _ask_lacking(present, every, meanings, values, questions, source)
     questions.raise_any(source)
     by_value = {c for c, each in chosen.items() if each.unit and not meanings[each.name].unit}
     used = {each.name for each in chosen.values()}
@@ -882,18 +889,18 @@ def _with_wrong_units(
 
 def _ask_lacking(
     present: Collection[str],
-    others: Mapping[str, str],
-    names: Sequence[str],
+    units: Mapping[str, str],
+    meanings: Collection[str],
     values: Values,
     questions: Questions,
     source: str,
 ) -> None:
-    """Questions on references and a temperature that are absent, among other columns with their units."""
-    asked = ("Are these the magnetometers", "channels of the magnetometer")
-    magnetic = any(words in each.text for each in questions for words in asked)
+    """Questions on references and a temperature that are absent, among columns that are not understood."""
+    others = {n: u for n, u in units.items() if n not in meanings}
+    magnetic = questions.hold("Are these the magnetometers", "channels of the magnetometer")
     lacking = [*lacking_references({*present, *(RAW[3:] if magnetic else ())}), *BY_NAME_ALONE]
     for column in (each for each in lacking if each not in present):
-        questions.ask(_check_lacking, column, others, names, values, source)
+        questions.ask(_check_lacking, column, others, [*units], values, source)
 
 
 def _with_whole_vectors(meanings: dict[str, Resemblance]) -> dict[str, Resemblance]:
@@ -1315,7 +1322,7 @@ def _check_nameless(
         sensed = [
             cells for c in RAW[:3] if c in chosen and (cells := values(chosen[c].name)) is not None
         ]
-        triples = [each for each in triples if _is_of_its_own(_names_of(each), sensed, values)]
+        triples = [each for each in triples if _is_another_triad(_names_of(each), sensed, values)]
         why = "three columns turn as one would"
     else:
         triples = triples or triples_for(RAW[3:], unused, values, STEADY_NORM)
@@ -1326,14 +1333,14 @@ def _check_nameless(
         )
 
 
-def _is_of_its_own(names: Sequence[str], others: Sequence[Array], values: Values) -> bool:
+def _is_another_triad(names: Sequence[str], others: Sequence[Array], values: Values) -> bool:
     """Whether three columns are vectors that turn about every axis, and none follows one of the others."""
     columns = [cells for n in names if not is_of_tool(n) and (cells := values(n)) is not None]
     if len(columns) < len(names) or not is_of_one_sphere(names, values):
         return False
     spread = np.ptp(columns, axis=-1)
     alike = [abs(np.corrcoef(one, other)[0, 1]) for one in columns for other in others]
-    return bool(spread.min() > _TURNS * spread.max() and max(alike, default=0.0) < _FOLLOWS)
+    return bool(spread.min() > _LEAST_RANGE * spread.max() and max(alike, default=0.0) < _COPIES)
 
 
 def _check_units_of_triads(chosen: Mapping[str, ColumnSource], source: str) -> None:

@@ -69,6 +69,7 @@ from mwdcal.identification.columns import (
     is_of_tool,
     meaning,
     meanings_of,
+    none_of,
     north_of,
     proposed,
 )
@@ -859,6 +860,14 @@ def _numbers_of(table: Table, problems: dict[str, QuestionError], name: str) -> 
         ]
         if wrong and 2 * sum(map(is_figure, cells)) > table.count:
             problems[name] = question_on_cells(table, name, cells.index(wrong[0]), wrong)
+        elif wrong and 2 * sum(any(map(str.isdecimal, cell)) for cell in cells) > table.count:
+            called = meaning(name)
+            if called and called.column in _OF_READINGS:
+                problems[name] = QuestionError(
+                    f"{table.source}: {shown(name)} is called '{called.column}', and its cells, such as "
+                    f"{shown(wrong[0])}, are no numbers that are understood. Write them as numbers in another column.",
+                    [none_of(called.column)],
+                )
         return None
 
 

@@ -803,8 +803,15 @@ def _is_name(cell: object) -> bool:
 
 
 def _is_ruler(row: Cells) -> bool:
-    """Whether a row is a line of dashes or the like."""
-    return all(isinstance(cell, str) and re.fullmatch(r"[-=_*+|\s]*", cell) for cell in row)
+    """Whether a row is a line of dashes or the like, or numbers the columns.
+
+    >>> _is_ruler(["----", ""]), _is_ruler([1, 2, 3, 4, 5, 6]), _is_ruler([1, 2, 3, 4, 5, 7])
+    (True, True, False)
+    """
+    if all(isinstance(cell, str) and re.fullmatch(r"[-=_*+|\s]*", cell) for cell in row):
+        return True
+    filled = [as_text(cell).strip("()[] ") for cell in row if cell != ""]
+    return len(filled) > LEAST_COLUMNS and filled == [str(k + 1) for k in range(len(filled))]
 
 
 _NUMBER_OF_COLUMN = re.compile(r"(?<![\w.,])(\d{1,2})(?:\s*[-–]\s*(\d{1,2}))?[\s:=.)]+(?=[^\W\d_])")
