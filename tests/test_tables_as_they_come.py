@@ -1259,3 +1259,22 @@ def test_an_angle_whose_cells_are_not_understood_is_asked_about(tmp_path):
     path = written(tmp_path / "a.csv", columns)
     message = refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
     assert "'TF (deg)' is called 'ref_toolface_deg', and its cells" in message
+
+
+@pytest.mark.parametrize("sense", [1, -1])
+def test_a_dip_that_turns_is_that_of_the_hole(tmp_path, sense):
+    """Up or down: the sense is the one by which the channels are a right-handed set."""
+    columns = table(ref_dip_deg=None)
+    inclination = np.asarray(columns.pop("Inc (deg)"))
+    path = written(tmp_path / "a.csv", {**columns, "Dip": sense * (90 - inclination)})
+    run, plain = read(path), read(written(tmp_path / "b.csv", table()))
+    np.testing.assert_allclose(run.reference("inclination"), plain.reference("inclination"))
+
+
+@pytest.mark.parametrize("heading", ["Тест вращением (только контроль)", "Айналдыру сынағы"])
+def test_rows_below_a_heading_of_a_roll_test_are_none_of_the_run(tmp_path, heading):
+    columns = table()
+    path = written(tmp_path / "a.csv", columns)
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines, "", heading, lines[0], *lines[1:13]]))
+    assert len(read(path)) == len(lines) - 1

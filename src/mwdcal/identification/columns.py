@@ -1020,8 +1020,15 @@ def _tell_by_values(
 
 
 def _tell_dip(meanings: dict[str, Resemblance], values: Values) -> None:
-    """Of several inclinations the one that hardly varies is the dip, where no column is called so."""
+    """Of several inclinations the one that hardly varies is the dip, where no column is called so.
+
+    And a dip that turns, beside no inclination, is that of the hole: from the horizontal.
+    """
     inclined = [n for n, m in meanings.items() if m.column == REFERENCES["inclination"].column]
+    for name in [n for n, m in meanings.items() if m.column == REFERENCES["dip"].column]:
+        cells = values(name)
+        if not inclined and cells is not None and np.nanmax(cells) - np.nanmin(cells) > _LEAST_TURN:
+            meanings[name] = Resemblance(REFERENCES["inclination"].column, ABOVE)
     if len(inclined) < 2 or any(m.column == REFERENCES["dip"].column for m in meanings.values()):
         return
     steady = [

@@ -126,7 +126,8 @@ _OF_ROLL_TEST = re.compile(
     r"(?<![^\W\d_])(roll[\s_-]*(test|over|check)|rt|verif\w*|check|valid\w*|(roll)?pr(ue|ü)fung|"
     r"[ck]ontrol\w*[- ]?(run|shot|test|roll|messung|dreh|måling|rull)\w*|rull(e|ings)test|rulleprøve|prueba|"
     r"(essai|teste?|ensa[iy]o|prova)s? (en|de|di) (roulis|rotation|rota[cç][aã]o|rotaci[oó]n|rotazione|giro|rolagem)|"
-    r"провер\w*|повер\w*|контрольн\w* (вращ|замер|измер)\w*)(?![^\W\d_])|验证|检验|複測|复测|复核|滚转|回転試験|"
+    r"провер\w*|повер\w*|контрольн\w* (вращ|замер|измер)\w*|тест\w* вращ\w*|"
+    r"айналдыру сына\w*)(?![^\W\d_])|验证|检验|複測|复测|复核|滚转|回転試験|"
     r"(滚动|旋转)(测试|试验)",
     re.IGNORECASE,
 )
