@@ -340,12 +340,14 @@ def _column(whole: str, bare: str, words: set[str], unit: str) -> str | None:
         or (bare in ("b", "h") and stated)
         or (bare == "t" and unit in _MAGNETIC_UNITS),
         "ref_azimuth_deg": bare == "az" and (stated or unit in ("°", "rad", "gon")),
-        "temperature_c": bare in ("t", "deg", "") and unit in _WARM,
+        "temperature_c": bare in ("t", "ts", "deg", "") and unit in _WARM,
         "ref_gravity_g": bare == "g" and stated,
     }
     short = (s.removeprefix("ref").removesuffix("deg") for s in (whole, bare))
     if bare in ("tx", "ty", "tz", "fx", "fy", "fz") and unit in _MAGNETIC_UNITS:
         return f"m{bare[1]}"
+    if bare in ("x", "y", "z") and words & {"mag", "magnetic"}:
+        return f"m{bare}"
     if whole in ("x", "y", "z") and unit in (*_MAGNETIC_UNITS, *_GRAVITY_UNITS):
         return f"{'m' if unit in _MAGNETIC_UNITS else 'a'}{whole}"
     known = [_SYNONYMS[stem] for stem in (whole, bare, *short) if stem in _SYNONYMS]

@@ -76,7 +76,9 @@ _OF_LOGGERS = re.compile(
     r"(avg|smp|min|max|std|tot|float|double|int\d*|real|string|-+|=+)", re.IGNORECASE
 )
 """What loggers write below names and units: how a value was sampled, of what type it is, rules."""
-_UNIT_BEHIND = re.compile(r"(.*?)\s*([(\[][^)\]]*[)\]]|,\s*[^\s,]{1,5})")
+_UNIT_BEHIND = re.compile(
+    r"(.*?)\s*([(\[][^)\]]*[)\]]|,\s*([^\s,]{1,5}|grader|gra[du]os|degrees)|(?<=\s)(mV|mg|nT|[uµμ]T|mG|m/s[2²]))"
+)
 _AXIS = re.compile(r"\W*([xyz123ху])\W*([(\[].*)?", re.IGNORECASE)
 """A name that is an axis alone, and says nothing without the title above it."""
 _OF_AXIS = re.compile(
@@ -95,10 +97,10 @@ _DEGREES_OF = re.compile(
 """The name of a column of degrees, of minutes or of seconds of an angle, or of a largest value beside the least."""
 _PART_OF_ANGLE = (
     re.compile(r"(?P<part>deg|min|sec|[dms])[._ ]+(?P<of>[^\W\d_][^()\[\]]*)", re.IGNORECASE),
-    re.compile(r"(?P<of>[^\W\d_][^()\[\]]*?)[._ ]+\(?(?P<part>[dms])\)?", re.IGNORECASE),
+    re.compile(r"(?P<of>[^\W\d_][^()\[\]]*?)[._ ]+\(?(?P<part>[dgms])\)?(?P<sign>\s*[(\[]?[°º'′\"″]+[)\]]?)?", re.IGNORECASE),
 )
 """The name of a part of an angle: deg Inc, Inc_D."""
-_PARTS_OF_ANGLE = {"d": "deg", "m": "min", "s": "sec"}
+_PARTS_OF_ANGLE = {"d": "deg", "g": "deg", "m": "min", "s": "sec"}
 WITHOUT_VALUE = re.compile(r"n/?a|n\.a\.?|nan|null|none|[\W_]*", re.IGNORECASE)
 """A cell that says that there is no value."""
 NO_READING = re.compile(
@@ -687,7 +689,11 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
             last = rows[end][0] if end < len(rows) else math.inf
             below = [row for row in remarks if rows[head][0] < row[0] < layout.lines[0]]
             void = [(n, _words(row)) for n, row in without if rows[head][0] < n < last]
-            layout = replace(layout, left_out=tuple(sorted([*layout.left_out, *void])))
+            layout = replace(
+                layout,
+                left_out=tuple(sorted([*layout.left_out, *void])),
+                above=(*layout.above, *(" ".join(map(as_text, row)).strip() for _, row in below)),
+            )
             between = [*below, *rows[head + 1 : end]]
             above = rows[max(0, head - 4) : head]
             layout = _with_settings(_with_warmth_of_lines(layout, between), [*above, *between])
@@ -1407,6 +1413,7 @@ def _with_part_last(names: Sequence[str]) -> list[str]:
     for place, match in parts.items():
         angle = match["of"]
         known = angle.lower() in ("az", "a", "i") or angles_among([angle])
+        known = known or bool(match.groupdict().get("sign"))
         if known and counts[angle.lower()] in (2, 3):
             whole[place] = f"{angle} {_PARTS_OF_ANGLE[match['part'][0].lower()]}"
     return whole
@@ -1539,7 +1546,8 @@ def _with_title(title: str, name: str) -> str:
     """A name behind its title; a unit behind the title comes last, and so does a name that is a unit."""
     if _is_unit(name):
         return f"{title} ({name.strip(' []()')})"
-    match = _UNIT_BEHIND.fullmatch(title) if "(" not in name and "[" not in name else None
+    bracketed = any(unit_of(text.strip("()[]")) for text in _BRACKETS.findall(name))
+    match = _UNIT_BEHIND.fullmatch(title) if not bracketed else None
     serial = match and re.search(r"\d{2}", match[2])
     if not match or serial or _DEGREES_OF.fullmatch(name):
         return f"{title} {name}".strip()
