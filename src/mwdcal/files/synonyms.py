@@ -262,6 +262,8 @@ _CALCULATED = re.compile(
 )
 """Words of columns that a program has computed from the readings: no evidence."""
 _BRACKETED = re.compile(r"(.*\S)\s*[(\[{]([^(\[{]*)[)\]}]", re.DOTALL)
+OF_TIME = re.compile(r"\s*temps\W+(ms|s(ec\w*)?|min\w*|h+(\W.*)?)\W*", re.IGNORECASE)
+"""The French name of a time."""
 _CASED = {
     "mV": " mv ",
     "nT": " nt ",
@@ -289,7 +291,7 @@ def resembled(name: str) -> Resemblance | None:
     >>> resembled("HX [steps]")
     Resemblance(column='mx', unit='steps')
     """
-    if name in _CHANNELS:
+    if name in _CHANNELS or OF_TIME.fullmatch(name):
         return None
     whole, bracketed = _resembled(name), _BRACKETED.fullmatch(name.strip())
     if whole or not bracketed or not (bare := resembled(bracketed[1])):

@@ -117,7 +117,7 @@ TRANSLATIONS = (
         r"przysp(ieszenie)?\b\.?|gyorsulas(mero)?|ivme\w*|versn(elling)?\b\.?|accelerazione|"
         r"accelerometro|percepatan|加速度|γ|"
         r"beschleunigung\w*|beschl\b\.?|akselerasjon|akselerometer|akselero|aceleracion|acelerometros?|acel\b|"
-        r"aceleracao|accelerometre|acceleration|\bac\.|ускорен\w*|акселерометр\w*|акс\b|\baks\b|加速度计?|加计|加表",
+        r"aceleracao|accelerometres?|acceleration|\bac\.|ускорен\w*|акселерометр\w*|акс\b|\baks\b|加速度计?|加计|加表",
         "acc ",
     ),
     (
@@ -175,7 +175,8 @@ TRANSLATIONS = (
         r"sollwerte?|sollwinkel|soll|\b(desejad[oa]|desead[oa]|gewunschte?r?|onske[td]|onskade|zadan[aey]|fixture|stativ(et)?|stol(u|ika)?)\b|"
         r"设定(值|角)?|\brig\b|referenz|referanse|(\b(de|di|do) )?(referencia|riferimento)|"
         r"(\bde )?reference|stand( settings?)?|"
-        r"(angulos? )?d[ae] (la )?(mesa|bancada)|^(bancada|mesa|banco)\b|эталон\w*|стенд|задан\w*|标准|参考|转台",
+        r"(angulos? )?d[ae] (la )?(mesa|bancada)|^(bancada|mesa|banco)\b|"
+        r"\b(du|del|do) banco?\b|эталон\w*|стенд|задан\w*|标准|参考|转台",
         "ref ",
     ),
     (

@@ -29,6 +29,7 @@ from mwdcal.files.synonyms import (
     ABOVE,
     ANTICLOCKWISE,
     BELOW,
+    OF_TIME,
     WARMTH,
     Resemblance,
     begins_as,
@@ -232,7 +233,9 @@ def is_near(column: str, name: str) -> bool:
     [True, True, False]
     """
     words = re.findall(r"[^\W\d_]{3,}", spelled(IN_BRACKETS.sub("", name)).lower())
-    return any(_is_mistyped(word, each) for word in words for each in _words_of(column))
+    return not OF_TIME.fullmatch(name) and any(
+        _is_mistyped(word, each) for word in words for each in _words_of(column)
+    )
 
 
 @cache
@@ -303,13 +306,16 @@ _NO_STAND = re.compile(
 )
 """Words of columns of angles that do not belong to the stand."""
 _NOMINAL = re.compile(
-    r"\b(nominale?|target|set|dese[aj]ad[oa]|gew[üu]nscht\w*|[øo]nske[dt]|set ?point|soll\w*|eingestellt\w*|vorgabe|satt|innstilt|ajustad[oa]|fijad[oa]|"
+    r"\b(nominale?|target|set|dese[aj]ad[oa]|gew[üu]nscht\w*|[øo]nske[dt]|"
+    r"set ?point|soll\w*|eingestellt\w*|vorgabe|satt|innstilt|ajustad[oa]|"
+    r"fijad[oa]|"
     r"definid[oa]|programad[oa]|te[óo]ric[oa]|th[ée]orique|r[ée]gl[ée]e?|vis[ée]e?|установ(ка|лен\w*)|уставк\w*|cmd|command(ed)?|demand(ed)?|required|nom|consign[ea]|comandad[oa]|"
     r"zadan\w*|b[öo]rv[äa]rde|задан\w*|номинал\w*)\b|[设给]定|设置|理论|名义|目标|指令値?|目標値?|設定値?",
     re.IGNORECASE,
 )
 _ACTUAL = re.compile(
-    r"\b(actual|act|achieved|as read|read ?back|read ?out|observed|(ab)?gelesen\w*|avlest|odczyt\w*|le[íi]d[oa]|lid[oa]|lue?|"
+    r"\b(actual|act|achieved|as read|read ?back|read ?out|observed|(ab)?gelesen\w*|avlest|odczyt\w*|"
+    r"le[íi]d[oa]|lid[oa]|lue?|"
     r"relev[ée]e?|r[ée]el(le)?|efetiv[oa]|efectiv[oa]|отсч[её]т\w*|read|reading|encoder|ist|istwert|effettiv[oa]|mesur[ée]e?s?|medid[oa]|zmierzon\w*|"
     r"[äa]rv[äa]rde|действит\w*|фактич\w*|измер\w*|real|faktisk)\b|实际|实测|测得|读数|编码器|実測値?|実際",
     re.IGNORECASE,
@@ -353,7 +359,8 @@ _OF_TOOL = re.compile(
     r"(?<![^\W\d_])(tool|probe|sonde|sonda|mwd|firmware|fw)(?![^\W\d_])", re.IGNORECASE
 )
 _TITLE = re.compile(
-    r"(?:(?P<a>acc|accelerometers?|grav\w*)|(?P<m>mag\w*|(total )?field))?(?:s|ref| ?sensors?)? +", re.IGNORECASE
+    r"(?:(?P<a>acc|accelerometers?|grav\w*)|(?P<m>mag\w*|(total )?field))?(?:s|ref| ?sensors?)? +",
+    re.IGNORECASE,
 )
 """The title of a group of columns before the name of one."""
 _BARE_AZ = re.compile(r"az\W*(deg|°)?\W*(mag(netic)?|true|grid)?\W*", re.IGNORECASE)
@@ -402,7 +409,8 @@ _ANGLE_ALONE = re.compile(
 )
 """The word for an angle and none of which, before that of the horizontal."""
 _DOWNWARDS = re.compile(
-    r"below|abaixo|\b((por )?debajo|unter(halb)?|under|sous|poni[żz]ej|ниже)\b|下方|以下|\b(down(wards?)?|nach unten|abwärts|ned(over)?|hacia abajo|para baixo|vers le bas|вниз)\b|向下|俯角",
+    r"below|abaixo|\b((por )?debajo|unter(halb)?|under|sous|poni[żz]ej|ниже)\b|下方|以下|"
+    r"\b(down(wards?)?|nach unten|abwärts|ned(over)?|hacia abajo|para baixo|vers le bas|вниз)\b|向下|俯角",
     re.IGNORECASE,
 )
 """Words of angles from the horizontal that count downwards."""
@@ -639,7 +647,9 @@ def _says_anticlockwise(line: str) -> bool:
     return bool(of_toolface and _CCW.search(text)) and not _UPHOLE.search(text)
 
 
-_OF_AXIS = re.compile(r"axis|achse|\bakse|\baxe\b|\beje\b|\beixo\b|asse\b|\bos(i|ią)?\b|ось|оси|轴|軸", re.IGNORECASE)
+_OF_AXIS = re.compile(
+    r"axis|achse|\bakse|\baxe\b|\beje\b|\beixo\b|asse\b|\bos(i|ią)?\b|ось|оси|轴|軸", re.IGNORECASE
+)
 """Words of the axis of the tool."""
 _WEAK = {
     "inclination": re.compile(r"(ref )?(desvio|desv\.?|dev\.?)(,? deg)?", re.IGNORECASE),
@@ -765,7 +775,9 @@ def _follows(
 def _axes_of_numbers(above: Sequence[str]) -> str:
     """The axes that a line says 1, 2 and 3 to be, or 0, 1 and 2: 1 = X, 2 = Y, 3 = Z; empty where none does."""
     for line in above:
-        axes = "".join(re.findall(r"(?<![\w.])[0-3]\s*[=:]\s*([xyz])\b", line, re.IGNORECASE)).lower()
+        axes = "".join(
+            re.findall(r"(?<![\w.])[0-3]\s*[=:]\s*([xyz])\b", line, re.IGNORECASE)
+        ).lower()
         if sorted(axes) == [*"xyz"]:
             return axes
     return ""
@@ -779,10 +791,11 @@ def _numbered(names: Sequence[str], axes: str = "") -> dict[str, str]:
     parts = {name: match for name in names if (match := _NUMBERED.fullmatch(name))}
     stems = {(m[1], m[3]) for m in parts.values()}
     numbers = {s: "".join(sorted(m[2] for m in parts.values() if (m[1], m[3]) == s)) for s in stems}
+    whole = {name: m for name, m in parts.items() if numbers[m[1], m[3]] in ("123", "012")}
+    axis = {name: (axes or "xyz")[numbers[m[1], m[3]].index(m[2])] for name, m in whole.items()}
     return {
-        name: f"{_VOLTAGE.sub('', m[1]) if axes else m[1]} {(axes or 'xyz')[numbers[m[1], m[3]].index(m[2])]} {m[3]}".strip()
-        for name, m in parts.items()
-        if numbers[m[1], m[3]] in ("123", "012")
+        name: f"{_VOLTAGE.sub('', m[1]) if axes else m[1]} {axis[name]} {m[3]}".strip()
+        for name, m in whole.items()
     }
 
 

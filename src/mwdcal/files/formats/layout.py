@@ -97,7 +97,10 @@ _DEGREES_OF = re.compile(
 """The name of a column of degrees, of minutes or of seconds of an angle, or of a largest value beside the least."""
 _PART_OF_ANGLE = (
     re.compile(r"(?P<part>deg|min|sec|[dms])[._ ]+(?P<of>[^\W\d_][^()\[\]]*)", re.IGNORECASE),
-    re.compile(r"(?P<of>[^\W\d_][^()\[\]]*?)[._ ]+\(?(?P<part>[dgms])\)?(?P<sign>\s*[(\[]?[°º'′\"″]+[)\]]?)?", re.IGNORECASE),
+    re.compile(
+        r"(?P<of>[^\W\d_][^()\[\]]*?)[._ ]+\(?(?P<part>[dgms])\)?(?P<sign>\s*[(\[]?[°º'′\"″]+[)\]]?)?",
+        re.IGNORECASE,
+    ),
 )
 """The name of a part of an angle: deg Inc, Inc_D."""
 _PARTS_OF_ANGLE = {"d": "deg", "g": "deg", "m": "min", "s": "sec"}
@@ -815,6 +818,15 @@ def _is_ruler(row: Cells) -> bool:
 
 _NUMBER_OF_COLUMN = re.compile(r"(?<![\w.,])(\d{1,2})(?:\s*[-–]\s*(\d{1,2}))?[\s:=.)]+(?=[^\W\d_])")
 """The number of a column in a line that says what each is, or the first and the last of several: 4-6 acc x y z."""
+_LINE_OF_COLUMN = re.compile(
+    r"\W*(?:(?:columns?|cols?|field|colonnes?|columnas?|colunas?|colonn[ae]|spalten?|kolonner?|kolumn\w*|kolom|"
+    r"столб\w*|колонк\w*|列|第)\W*)?(\d{1,2})(?:\s*(?:[-–…]|\.\.|to|bis|à|a|al?|til|до|至|到)\s*(\d{1,2}))?\s*列?\s*"
+    r"[:：=.)–-]\s*(?=[^\W\d_])",
+    re.IGNORECASE,
+)
+"""The beginning of a line that says what one column is, or several."""
+_BETWEEN_AXES = re.compile(r"[,;/、]|\b(and|et|und|og|e|i|и|和)\b|(?<=[yY])\s+y(?=\s+[zZ])")
+"""What stands between axes in a line."""
 
 
 def _with_legend(rows: list[tuple[int, Cells]]) -> list[tuple[int, Cells]]:
@@ -833,7 +845,22 @@ def _with_legend(rows: list[tuple[int, Cells]]) -> list[tuple[int, Cells]]:
             names = [*(f"Text {k}" for k in range(1, 1 + len(before))), *names]
         if len(names) == len(rows[first][1]):
             return [*rows[:k], *rows[k + 1 : first], (rows[k][0], names), *rows[first:]]
-    return rows
+    return _with_lines_of_columns(rows, first)
+
+
+def _with_lines_of_columns(rows: list[tuple[int, Cells]], first: int) -> list[tuple[int, Cells]]:
+    """The rows with names above the first readings, where a line for each column says what it is, and no row does."""
+    texts = {k: " ".join(map(as_text, rows[k][1])) for k in range(first)}
+    marks = {k: mark for k, text in texts.items() if (mark := _LINE_OF_COLUMN.match(text))}
+    names: list[str] = []
+    for k, mark in marks.items():
+        names += _named(mark, texts[k][mark.end() :], len(names))
+    if len(names) < LEAST_COLUMNS or len(names) != len(rows[first][1]):
+        return rows
+    if first - 1 not in marks and _texts(rows[first - 1][1]) >= LEAST_COLUMNS:
+        return rows
+    above = [row for k, row in enumerate(rows[:first]) if k not in marks]
+    return [*above, (rows[max(marks)][0], names), *rows[first:]]
 
 
 def _legend(text: str) -> list[str]:
@@ -842,14 +869,25 @@ def _legend(text: str) -> list[str]:
     marks = [*_NUMBER_OF_COLUMN.finditer(text)]
     for mark, behind in zip_longest(marks, marks[1:]):
         end = behind.start() if behind else len(text)
-        head, bracket, unit = text[mark.end() : end].strip(" ,;").partition("(")
-        words, count = head.split(), int(mark[2] or mark[1]) - int(mark[1]) + 1
-        if int(mark[1]) != len(names) + 1 or not 0 < count <= len(words):
+        named = _named(mark, text[mark.end() : end], len(names))
+        if not named:
             return []
-        names += [
-            " ".join([*words[:-count], each, bracket + unit]).strip() for each in words[-count:]
-        ]
+        names += named
     return names
+
+
+def _named(mark: re.Match[str], text: str, before: int) -> list[str]:
+    """The names of columns that a text lists behind its number, or the first and last; empty out of order.
+
+    >>> _named(re.match("(.)-(.)", "5-7"), "fluxgates x, y and z (V)", 4)
+    ['fluxgates x (V)', 'fluxgates y (V)', 'fluxgates z (V)']
+    """
+    head, bracket, unit = text.strip(" ,;").partition("(")
+    count = int(mark[2] or mark[1]) - int(mark[1]) + 1
+    words = (head if count == 1 else _BETWEEN_AXES.sub(" ", head)).split()
+    if int(mark[1]) != before + 1 or not 0 < count <= len(words):
+        return []
+    return [" ".join([*words[:-count], each, bracket + unit]).strip() for each in words[-count:]]
 
 
 _LIST_OF_COLUMNS = re.compile(
