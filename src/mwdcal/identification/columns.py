@@ -613,12 +613,12 @@ def _explained(names: Sequence[str], above: Sequence[str]) -> dict[str, Resembla
     for line in above:
         match = re.match(r"\W*([^\W\d_]+)\s*[:：=]\s*([^;(]+)", line)
         name = bare.get(match[1].lower()) if match else None
-        if not match or not name or not _OF_AXIS.search(match[2]):
+        if not match or not name or not _TOOL_AXIS.search(match[2]):
             continue
         if _FROM_HORIZONTAL.search(match[2]):
             sense = BELOW if _DOWNWARDS.search(match[2]) else ABOVE
             results[name] = Resemblance(REFERENCES["inclination"].column, sense)
-        elif re.search(r"vert[iy][kc]al|lot\b|lodd|вертикал|铅垂|垂直", match[2], re.IGNORECASE):
+        elif _OF_VERTICAL.search(match[2]):
             results[name] = Resemblance(REFERENCES["inclination"].column)
     return results
 
@@ -629,7 +629,7 @@ def _beside_others(
     """Columns whose names say an angle of the stand only where no other column is this angle: Face, Desvio."""
     called = {m.column for m in meanings.values()}
     results: dict[str, Resemblance] = {}
-    for angle, words in _WEAK.items():
+    for angle, words in _LONE_ANGLES.items():
         column = REFERENCES[angle].column
         bare = {n: " ".join(_UNIT_BEHIND_NAME.sub("", spelled(n)).split()) for n in names}
         fits = [n for n, text in bare.items() if n not in meanings and words.fullmatch(text)]
@@ -647,11 +647,12 @@ def _says_anticlockwise(line: str) -> bool:
     return bool(of_toolface and _CCW.search(text)) and not _UPHOLE.search(text)
 
 
-_OF_AXIS = re.compile(
+_TOOL_AXIS = re.compile(
     r"axis|achse|\bakse|\baxe\b|\beje\b|\beixo\b|asse\b|\bos(i|ią)?\b|ось|оси|轴|軸", re.IGNORECASE
 )
 """Words of the axis of the tool."""
-_WEAK = {
+_OF_VERTICAL = re.compile(r"vert[iy][kc]al|lot\b|lodd|вертикал|铅垂|垂直", re.IGNORECASE)
+_LONE_ANGLES = {
     "inclination": re.compile(r"(ref )?(desvio|desv\.?|dev\.?)(,? deg)?", re.IGNORECASE),
     "azimuth": re.compile(
         r"(ref )?(kompass|brujula|bussola|boussole|компас|phi m(ag)?)(,? deg)?", re.IGNORECASE

@@ -1450,8 +1450,8 @@ def _with_part_last(names: Sequence[str]) -> list[str]:
     whole = [*names]
     for place, match in parts.items():
         angle = match["of"]
-        known = angle.lower() in ("az", "a", "i") or angles_among([angle])
-        known = known or bool(match.groupdict().get("sign"))
+        signed = match.groupdict().get("sign")
+        known = signed or angle.lower() in ("az", "a", "i") or angles_among([angle])
         if known and counts[angle.lower()] in (2, 3):
             whole[place] = f"{angle} {_PARTS_OF_ANGLE[match['part'][0].lower()]}"
     return whole
