@@ -30,8 +30,12 @@ def numbers(path, column):
         ("Drehtisch (°)", "ref_azimuth_deg", "°"),
         ("stativ_verktøyside_grader", "ref_toolface_deg", "°"),
         ("Stativ vinkel fra lodd (grader)", "ref_inclination_deg", "°"),
+        ("Stativ rulling (grader)", "ref_toolface_deg", "°"),
         ("Winkel vom Lot", "ref_inclination_deg", ""),
         ("inclinaison du banc (deg)", "ref_inclination_deg", "°"),
+        ("Odch. (°)", "ref_inclination_deg", "°"),
+        ("鉛直からの角度(deg)", "ref_inclination_deg", "°"),
+        ("磁北からの角度(deg)", "ref_azimuth_deg", "°"),
         ("stol_inkl", "ref_inclination_deg", ""),
         ("stol_azym", "ref_azimuth_deg", ""),
         ("stol_obrót", "ref_toolface_deg", ""),
@@ -64,6 +68,11 @@ def test_stands_and_channels_in_other_words(name, column, unit):
 def test_a_sum_is_computed_and_no_reference(name):
     assert meaning(name) is None
     assert is_of_tool(name)
+
+
+@pytest.mark.parametrize("name", ["Odch. std. (°)", "odchylenie standardowe (°)"])
+def test_a_standard_deviation_is_no_inclination(name):
+    assert meaning(name) is None
 
 
 def test_the_french_word_for_a_time_is_no_temperature():

@@ -76,8 +76,9 @@ TRANSLATIONS = (
         rf"(angul[oe]|angle|ang\.|winkel|vinkel|угол|dip|abweichung|avvik|desvio|ecart|отклонение) {_FROM_VERTICAL}|"
         r"(angulo |angle )?(zenithal|cenital|zenital)|hole angle|zenitwinkel|bohrlochneigung|kippung|schwenkwinkel|"
         r"hel+ningsvinkel|hellning|天?顶角|kallistus(kulma)?|kallistuma(kulma)?|경사각?|inclinare|naklon\b|nagib\b|sklon\b|klison\b|\bdevi\b|"
-        r"kipp(achse|winkel)|schwenkachse|\btilt\b|inclinazione|inclinatie|helling|\bodch\b\.?|haeldning|hældning|lutning|"
-        r"(kat )?odchyleni[ae]( od pionu)?|(kat )?nachyleni[ae]|ferdeseg|dolesszog|egim|kemiringan|傾斜角?|"
+        r"kipp(achse|winkel)|schwenkachse|\btilt\b|inclinazione|inclinatie|helling|\bodch\b\.?(?!\W*st)|haeldning|hældning|lutning|"
+        r"(kat )?odchyleni[ae](?!\W*st)( od pionu)?|(kat )?nachyleni[ae]|ferdeseg|dolesszog|egim|kemiringan|傾斜角?|"
+        r"鉛直(線)?からの角度?|"
         r"зен\w*\.?( угол\w*)?|"
         r"neigung(swinkel)?|desviacion|sapma( acisi)?|inklination|inclinaison|inclinaca?o|"
         r"inclinacion|zenith( angle)?|drift angle|deviation angle|(?<![a-z])inkl?\b\.?|"
@@ -87,7 +88,7 @@ TRANSLATIONS = (
     (_FROM_VERTICAL, ""),
     (
         r"azimutwinkel|\bkurs\b|\bdire(ccion|cao|ction)\b|\brumo\b|\bcap\b|\bаз(им)?\b\.?|направление|"
-        r"курс|方向角?|"
+        r"курс|方向角?|磁北からの角度?|"
         r"atsimuutti|suuntakulma|방위각?|\bhazi\b|drehtisch|turn ?table|rotary table|baring|azymut|yonelim|азимут|"
         r"asimut|azym\b\.?|azimute?(?!h)|acimut|方位角?|"
         r"rumbo|richtung(?!swinkel)|retning|peilung",
@@ -100,7 +101,7 @@ TRANSLATIONS = (
         r"(重力)?高边(工具面)?角?|[滚自旋]转角?|横滚角?|面向角|"
         r"\brol(le?|lio|lo)?\b|kierto(kulma)?\b|natoceni|rotire|vridning|툴페이스|공구면각?|롤각?|\brb\b|^t/f\b|rollachse|"
         r"roll axis|(kat )?obrotu?\b|(kat )?skret\w*|\bуво\b|(угол )?верхней образующей|^面角|"
-        r"\brulle?\b|rullning|rotasi|(kat )?ustawienia narzedzia|takim yuzu|szerszamallas|"
+        r"\brull(e|ing)?\b|rullning|rotasi|(kat )?ustawienia narzedzia|takim yuzu|szerszamallas|"
         r"gereedschapsvlak|v(ae|æ)rkt(o|ø)jsflade|faccia utensile|ツールフェ(ー|イ)ス|тулфейс|回転角|угол поворота|"
         r"roll[vw]inkel|roll angle|"
         r"(werkzeug|roll)(winkel|lage|flache)|verdrehung|verdrehwinkel|drehwinkel|rotasjon|rulle?vinkel|"

@@ -653,7 +653,7 @@ _TOOL_AXIS = re.compile(
 """Words of the axis of the tool."""
 _OF_VERTICAL = re.compile(r"vert[iy][kc]al|lot\b|lodd|вертикал|铅垂|垂直", re.IGNORECASE)
 _LONE_ANGLES = {
-    "inclination": re.compile(r"(ref )?(desvio|desv\.?|dev\.?)(,? deg)?", re.IGNORECASE),
+    "inclination": re.compile(r"(ref )?(desvio|desv\.?)(,? deg)?", re.IGNORECASE),
     "azimuth": re.compile(
         r"(ref )?(kompass|brujula|bussola|boussole|компас|phi m(ag)?)(,? deg)?", re.IGNORECASE
     ),
