@@ -262,6 +262,8 @@ _CALCULATED = re.compile(
 )
 """Words of columns that a program has computed from the readings: no evidence."""
 _BRACKETED = re.compile(r"(.*\S)\s*[(\[{]([^(\[{]*)[)\]}]", re.DOTALL)
+OF_TIME = re.compile(r"\s*temps\W+(ms|s(ec\w*)?|min\w*|h+(\W.*)?)\W*", re.IGNORECASE)
+"""The French name of a time."""
 _CASED = {
     "mV": " mv ",
     "nT": " nt ",
@@ -289,7 +291,7 @@ def resembled(name: str) -> Resemblance | None:
     >>> resembled("HX [steps]")
     Resemblance(column='mx', unit='steps')
     """
-    if name in _CHANNELS:
+    if name in _CHANNELS or OF_TIME.fullmatch(name):
         return None
     whole, bracketed = _resembled(name), _BRACKETED.fullmatch(name.strip())
     if whole or not bracketed or not (bare := resembled(bracketed[1])):
@@ -340,12 +342,14 @@ def _column(whole: str, bare: str, words: set[str], unit: str) -> str | None:
         or (bare in ("b", "h") and stated)
         or (bare == "t" and unit in _MAGNETIC_UNITS),
         "ref_azimuth_deg": bare == "az" and (stated or unit in ("°", "rad", "gon")),
-        "temperature_c": bare in ("t", "deg", "") and unit in _WARM,
+        "temperature_c": bare in ("t", "ts", "deg", "") and unit in _WARM,
         "ref_gravity_g": bare == "g" and stated,
     }
     short = (s.removeprefix("ref").removesuffix("deg") for s in (whole, bare))
     if bare in ("tx", "ty", "tz", "fx", "fy", "fz") and unit in _MAGNETIC_UNITS:
         return f"m{bare[1]}"
+    if bare in ("x", "y", "z") and words & {"mag", "magnetic"}:
+        return f"m{bare}"
     if whole in ("x", "y", "z") and unit in (*_MAGNETIC_UNITS, *_GRAVITY_UNITS):
         return f"{'m' if unit in _MAGNETIC_UNITS else 'a'}{whole}"
     known = [_SYNONYMS[stem] for stem in (whole, bare, *short) if stem in _SYNONYMS]

@@ -26,8 +26,8 @@ _CROSSWISE = (
 )
 """Words of an axis across the tool, before its number."""
 _FROM_VERTICAL = (
-    r"(from|to|zur|von der|fra|av|de la|a la|da|par rapport a la|от) (the )?"
-    r"(vertical\w*|vertikal\w*|lotrechten|lotlini?e|loddlinjen?|вертикали)"
+    r"(from|to|zur|vo[nm]( der)?|fra|av|de la|a la|da|par rapport a la|от) (the )?"
+    r"(vertical\w*|vertikal\w*|lotrechten|lotlini?e|lot|loddlinjen?|lodd(et)?|вертикали|pionu)\b"
 )
 """Words of an angle that counts from the vertical, as an inclination does."""
 TRANSLATIONS = (
@@ -41,6 +41,13 @@ TRANSLATIONS = (
     (r"(?<=[°º] )[СсC]\b|(?<=[°º])[СсC]\b", "C"),
     (r"(?<![^\W\d_])([CF])°", r"°\1"),
     (r"\bm(illi)?gauss\b", "mG"),
+    (r"\bmgn\b\.?", "mag"),
+    (r"合成?(?=磁|重力|加速度)|\b(betrag|summe|somme|suma|soma|сумм\w*)\b", "sum "),
+    (
+        r"(drehtisch|turn ?table|rotary table)"
+        r"(?=[ _:,-]*(magn?\b\.?|magn\w*)?[ _-]*(zen|neig|in[ck]|kipp|roll|azi|(ver)?dreh|tool|tf|hoch|schwenk))",
+        "ref ",
+    ),
     (r"grav(?=axial|tran)", "acc "),
     (r"axiale?|aksial|longitudinal\w*|langsachse|осев\w*|轴向", "Z "),
     (rf"{_CROSSWISE}1", "X "),
@@ -69,8 +76,9 @@ TRANSLATIONS = (
         rf"(angul[oe]|angle|ang\.|winkel|vinkel|угол|dip|abweichung|avvik|desvio|ecart|отклонение) {_FROM_VERTICAL}|"
         r"(angulo |angle )?(zenithal|cenital|zenital)|hole angle|zenitwinkel|bohrlochneigung|kippung|schwenkwinkel|"
         r"hel+ningsvinkel|hellning|天?顶角|kallistus(kulma)?|kallistuma(kulma)?|경사각?|inclinare|naklon\b|nagib\b|sklon\b|klison\b|\bdevi\b|"
-        r"kipp(achse|winkel)|schwenkachse|\btilt\b|inclinazione|inclinatie|helling|haeldning|hældning|lutning|"
-        r"(kat )?odchyleni[ae]( od pionu)?|(kat )?nachyleni[ae]|ferdeseg|dolesszog|egim|kemiringan|傾斜角?|"
+        r"kipp(achse|winkel)|schwenkachse|\btilt\b|inclinazione|inclinatie|helling|\bodch\b\.?(?!\W*st)|haeldning|hældning|lutning|"
+        r"(kat )?odchyleni[ae](?!\W*st)( od pionu)?|(kat )?nachyleni[ae]|ferdeseg|dolesszog|egim|kemiringan|傾斜角?|"
+        r"鉛直(線)?からの角度?|"
         r"зен\w*\.?( угол\w*)?|"
         r"neigung(swinkel)?|desviacion|sapma( acisi)?|inklination|inclinaison|inclinaca?o|"
         r"inclinacion|zenith( angle)?|drift angle|deviation angle|(?<![a-z])inkl?\b\.?|"
@@ -80,9 +88,9 @@ TRANSLATIONS = (
     (_FROM_VERTICAL, ""),
     (
         r"azimutwinkel|\bkurs\b|\bdire(ccion|cao|ction)\b|\brumo\b|\bcap\b|\bаз(им)?\b\.?|направление|"
-        r"курс|方向角?|"
+        r"курс|方向角?|磁北からの角度?|"
         r"atsimuutti|suuntakulma|방위각?|\bhazi\b|drehtisch|turn ?table|rotary table|baring|azymut|yonelim|азимут|"
-        r"asimut|azimute?(?!h)|acimut|方位角?|"
+        r"asimut|azym\b\.?|azimute?(?!h)|acimut|方位角?|"
         r"rumbo|richtung(?!swinkel)|retning|peilung",
         "azimuth ",
     ),
@@ -92,12 +100,12 @@ TRANSLATIONS = (
         r"roulis|rotation propre|orientation (de l')?outil|апсид\w*( угол)?|виз\b\.?( угол)?|(угол )?крена?\b|"
         r"(重力)?高边(工具面)?角?|[滚自旋]转角?|横滚角?|面向角|"
         r"\brol(le?|lio|lo)?\b|kierto(kulma)?\b|natoceni|rotire|vridning|툴페이스|공구면각?|롤각?|\brb\b|^t/f\b|rollachse|"
-        r"roll axis|(kat )?obrotu|"
-        r"\brulle?\b|rullning|rotasi|(kat )?ustawienia narzedzia|takim yuzu|szerszamallas|"
+        r"roll axis|(kat )?obrotu?\b|(kat )?skret\w*|\bуво\b|(угол )?верхней образующей|^面角|"
+        r"\brull(e|ing)?\b|rullning|rotasi|(kat )?ustawienia narzedzia|takim yuzu|szerszamallas|"
         r"gereedschapsvlak|v(ae|æ)rkt(o|ø)jsflade|faccia utensile|ツールフェ(ー|イ)ス|тулфейс|回転角|угол поворота|"
         r"roll[vw]inkel|roll angle|"
-        r"werkzeug(winkel|lage|flache)|verdrehung|verdrehwinkel|drehwinkel|rotasjon|rulle?vinkel|"
-        r"verktoy(flate|vinkel)\w*|(face|angulo) d[ae] ferramenta|(face|angle)( d[e'])? ?(l'?)?outil|"
+        r"(werkzeug|roll)(winkel|lage|flache)|verdrehung|verdrehwinkel|drehwinkel|rotasjon|rulle?vinkel|"
+        r"verktoy(flate|vinkel|side)\w*|(face|angulo) d[ae] ferramenta|(face|angle)( d[e'])? ?(l'?)?outil|"
         r"ghsf?\b|угол установки( отклонител\w*)?|визир\w*( угол)?|"
         r"angulo de giro|giro|rotacion|отклонител\w*|откл\b\.?|визирн\w* угол|поворот|工具面角?|"
         r"\bcara\b(?! *mag)( (de (la )?)?herr(amienta|\b\.?))?|tf grav\w*|gravity tool ?face|h\.?s\.?[ _-]*tool ?face|"
@@ -105,12 +113,12 @@ TRANSLATIONS = (
         "toolface ",
     ),
     (
-        r"重力(加速度计?|分量|传感器)(?=[ (（_]*[xyz])|аксел\w*\.?|\bуск\b\.?|\bграв\b\.?(?=[ _]*[xyz]\b)|"
+        r"重力(加速度计?|分量|传感器)(?=[ (（_]*[xyz])|重力[计仪]|аксел\w*\.?|\bуск\b\.?|\bграв\b\.?(?=[ _]*[xyz]\b)|"
         r"kiiht\b\.?|kiihtyvyys|zrychl(eni)?\b\.?|가속도계?|acceleratie|acceleratia|akcelerometry?\b|accelero\b\.?|"
         r"przysp(ieszenie)?\b\.?|gyorsulas(mero)?|ivme\w*|versn(elling)?\b\.?|accelerazione|"
         r"accelerometro|percepatan|加速度|γ|"
         r"beschleunigung\w*|beschl\b\.?|akselerasjon|akselerometer|akselero|aceleracion|acelerometros?|acel\b|"
-        r"aceleracao|accelerometre|acceleration|\bac\.|ускорен\w*|акселерометр\w*|акс\b|\baks\b|加速度计?|加计|加表",
+        r"aceleracao|accelerometres?|acceleration|\bac\.|ускорен\w*|акселерометр\w*|акс\b|\baks\b|加速度计?|加计|加表",
         "acc ",
     ),
     (
@@ -123,7 +131,7 @@ TRANSLATIONS = (
         r"\bmagneto\b\.?|magnetometre|magn\b\.?(?=[ _]*[xyz]\b)|magnet(feld|felt)(?=[ _]*[bhm]?[xyz]\b)|"
         r"(magnetic|магнитн\w*) (field|поле)(?=[ _]*[bhm]?[xyz]\b)|champ( magn\w*)?(?=[ _]*[bhm]?[xyz]\b)|"
         r"magnetometry|magnetometros?|"
-        r"magnetometr(?=[ _]*[xyz])|magnetometers?|магнитометр\w*|магн\b|феррозонд\w*|磁力计|"
+        r"magnetometr(?=[ _]*[xyz])|magnetometers?|магнитометр\w*|магн\b|феррозонд\w*|磁力[计仪]|\bfluks(gate)?\b|"
         r"磁通门|磁强计|campo magnetico(?=[ _]*[bhm]?[xyz]\b)|campo mag(?=[ _]*[xyz])|"
         r"\bmtm\b|磁(?=[ _]*[xyz])|flux[ _-]*gates?|磁场(?=[ (（_]*[bhm]?[xyz])",
         "mag ",
@@ -165,9 +173,11 @@ TRANSLATIONS = (
         "temperature ",
     ),
     (
-        r"sollwerte?|sollwinkel|soll|\brig\b|referenz|referanse|(\b(de|di|do) )?(referencia|riferimento)|"
+        r"sollwerte?|sollwinkel|soll|\b(desejad[oa]|desead[oa]|gewunschte?r?|onske[td]|onskade|zadan[aey]|fixture|stativ(et)?|stol(u|ika)?)\b|"
+        r"设定(值|角)?|\brig\b|referenz|referanse|(\b(de|di|do) )?(referencia|riferimento)|"
         r"(\bde )?reference|stand( settings?)?|"
-        r"(angulos? )?d[ae] (la )?(mesa|bancada)|^(bancada|mesa|banco)\b|эталон\w*|стенд|задан\w*|标准|参考|转台",
+        r"(angulos? )?d[ae] (la )?(mesa|bancada)|^(bancada|mesa|banco)\b|"
+        r"\b(du|del|do) banco?\b|эталон\w*|стенд|задан\w*|标准|参考|转台",
         "ref ",
     ),
     (
@@ -176,7 +186,8 @@ TRANSLATIONS = (
         "serial ",
     ),
     (r"(\bgeogr\w*|географічн\w*)\.?|cografi( kuzey\w*)?", "true "),
-    (r"(?<![a-z])u ?(?=[gabhm][xyz]\b)", ""),
+    (r"(?<![a-z])[uv] ?(?=[gabhm][xyz]\b)", ""),
+    (r"输出(电压|信号|值)?", " output "),
     (r"gerat|sonde", "tool "),
     (r"(de|da) [qc]uadr[ií]cula( utm)?|gitter|kartesisch", "grid "),
     (r"achse|aksen?|eje|ось|轴", ""),

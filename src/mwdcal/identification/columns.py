@@ -30,6 +30,7 @@ from mwdcal.files.synonyms import (
     ABOVE,
     ANTICLOCKWISE,
     BELOW,
+    OF_TIME,
     WARMTH,
     Resemblance,
     begins_as,
@@ -242,7 +243,9 @@ def is_near(column: str, name: str) -> bool:
     [True, True, False]
     """
     words = re.findall(r"[^\W\d_]{3,}", spelled(IN_BRACKETS.sub("", name)).lower())
-    return any(_is_mistyped(word, each) for word in words for each in _words_of(column))
+    return not OF_TIME.fullmatch(name) and any(
+        _is_mistyped(word, each) for word in words for each in _words_of(column)
+    )
 
 
 @cache
@@ -302,7 +305,7 @@ _LABELS = {
 _CALLED_REFERENCE = re.compile(r"\b(ref|reference|nominal|target|set)\b", re.IGNORECASE)
 _REFERRED = re.compile(r"\b(ref|reference)\b", re.IGNORECASE)
 _MEASURED = re.compile(
-    r"\b(measured|meas|calc|calculated|computed|corr|corrected|gemessen|berechnet|ist|mwd|survey)\b",
+    r"\b(measured|meas|calc|calculated|computed|corr|corrected|gemessen|berechnet|m[åa]lt|sum|ist|mwd|survey)\b",
     re.IGNORECASE,
 )
 """Words of angles that the tool itself has measured: no references."""
@@ -313,13 +316,16 @@ _NO_STAND = re.compile(
 )
 """Words of columns of angles that do not belong to the stand."""
 _NOMINAL = re.compile(
-    r"\b(nominale?|target|set|set ?point|soll\w*|eingestellt\w*|vorgabe|satt|innstilt|ajustad[oa]|fijad[oa]|"
+    r"\b(nominale?|target|set|dese[aj]ad[oa]|gew[üu]nscht\w*|[øo]nske[dt]|"
+    r"set ?point|soll\w*|eingestellt\w*|vorgabe|satt|innstilt|ajustad[oa]|"
+    r"fijad[oa]|"
     r"definid[oa]|programad[oa]|te[óo]ric[oa]|th[ée]orique|r[ée]gl[ée]e?|vis[ée]e?|установ(ка|лен\w*)|уставк\w*|cmd|command(ed)?|demand(ed)?|required|nom|consign[ea]|comandad[oa]|"
     r"zadan\w*|b[öo]rv[äa]rde|задан\w*|номинал\w*)\b|[设给]定|设置|理论|名义|目标|指令値?|目標値?|設定値?",
     re.IGNORECASE,
 )
 _ACTUAL = re.compile(
-    r"\b(actual|act|achieved|as read|read ?back|read ?out|observed|abgelesen\w*|avlest|le[íi]d[oa]|lid[oa]|lue?|"
+    r"\b(actual|act|achieved|as read|read ?back|read ?out|observed|(ab)?gelesen\w*|avlest|odczyt\w*|"
+    r"le[íi]d[oa]|lid[oa]|lue?|"
     r"relev[ée]e?|r[ée]el(le)?|efetiv[oa]|efectiv[oa]|отсч[её]т\w*|read|reading|encoder|ist|istwert|effettiv[oa]|mesur[ée]e?s?|medid[oa]|zmierzon\w*|"
     r"[äa]rv[äa]rde|действит\w*|фактич\w*|измер\w*|real|faktisk)\b|实际|实测|测得|读数|编码器|実測値?|実際",
     re.IGNORECASE,
@@ -336,7 +342,7 @@ _BY_TOOL = re.compile(
     re.IGNORECASE,
 )
 """Words of an angle that a stand shows, and of one that the tool tells."""
-_OF_CHANNELS = re.compile(r"\b(measured|meas|gemessen|ist)\b", re.IGNORECASE)
+_OF_CHANNELS = re.compile(r"\b(measured|meas|gemessen|m[åa]lt|ist)\b", re.IGNORECASE)
 """Those that say nothing more of a channel."""
 _OTHER_NORTH = re.compile(
     r"true|grid|geogr|wahr|gitter|rechtweisend|[qc]uadr[ií]cula|verdadero|verdadeiro|istinn|kartnord|истин|сетк|географ|géogr|真|坐标北|网格",
@@ -363,7 +369,8 @@ _OF_TOOL = re.compile(
     r"(?<![^\W\d_])(tool|probe|sonde|sonda|mwd|firmware|fw)(?![^\W\d_])", re.IGNORECASE
 )
 _TITLE = re.compile(
-    r"(acc|mag|accelerometers?|magnetometers?)?(?:s|ref|sensors?)? +", re.IGNORECASE
+    r"(?:(?P<a>acc|accelerometers?|grav\w*)|(?P<m>mag\w*|(total )?field))?(?:s|ref| ?sensors?)? +",
+    re.IGNORECASE,
 )
 """The title of a group of columns before the name of one."""
 _BARE_AZ = re.compile(r"az\W*(deg|°)?\W*(mag(netic)?|true|grid)?\W*", re.IGNORECASE)
@@ -388,13 +395,17 @@ _IN_UNIT = re.compile(r"(.*[\w)\]]) (?:in|en|i|w|в) (\S+)", re.IGNORECASE)
 """A name with its unit behind a preposition: Gx in mg."""
 _BARE_T = re.compile(r"t\W*(°|deg)?\W*", re.IGNORECASE)
 _CCW = re.compile(
-    r"\(?(counter|anti)[ -]?clockwise\)?|\bccw\b|gegen (den )?uhrzeiger\w*|против час\w*|"
-    r"mot(urs| ?klok\w*)|anti-?hor[aá]ri\w*|antihoraire|antiorari\w*|inverse des aiguilles|逆时针|反時計",
+    r"\(?\b((in|sens|sentido|senso|im) )*((counter|anti)[ -]?clockwise\)?|ccw\b|gegen (den )?uhrzeiger\w*|"
+    r"против (хода )?час\w*( стрелк\w*)?|mot(urs| ?(klok|urvis)\w*)|anti-? ?hor[aá]ri[oa]s?|anti-? ?horaires?|"
+    r"antiorari\w*|trigonom[ée]tri(que|co)|inverse des aiguilles( d'une montre)?|tegen de klok( in)?|"
+    r"contrari\w+ a(l reloj| las (agujas|manecillas)( del reloj)?)|contr[aá]rio ao(s ponteiros)?( do)? rel[oó]gio|"
+    r"przeciwn\w* do (ruchu )?wskaz[oó]wek( zegara)?)|逆时针(方向)?|反時計(回り|方向)?",
     re.IGNORECASE,
 )
 """Words of angles that count anticlockwise."""
 _UPHOLE = re.compile(
-    r"look\w* up|up ?hole|from (the )?(below|bottom)|von unten|nedenfra|desde abajo|снизу|向上看",
+    r"look\w* up|up ?hole|from (the )?(below|bottom)|von unten|nedenfra|desde abajo|visto de baixo|d'en bas|du bas|"
+    r"z dołu|od dołu|снизу|向上看|从下",
     re.IGNORECASE,
 )
 """Words of one who looks up the hole, to whom a clockwise angle is an anticlockwise one."""
@@ -408,7 +419,8 @@ _ANGLE_ALONE = re.compile(
 )
 """The word for an angle and none of which, before that of the horizontal."""
 _DOWNWARDS = re.compile(
-    r"below|\b(down(wards?)?|nach unten|abwärts|ned(over)?|hacia abajo|para baixo|vers le bas|вниз)\b|向下|俯角",
+    r"below|abaixo|\b((por )?debajo|unter(halb)?|under|sous|poni[żz]ej|ниже)\b|下方|以下|"
+    r"\b(down(wards?)?|nach unten|abwärts|ned(over)?|hacia abajo|para baixo|vers le bas|вниз)\b|向下|俯角",
     re.IGNORECASE,
 )
 """Words of angles from the horizontal that count downwards."""
@@ -473,7 +485,8 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     if alike and alike.column == REFERENCES["azimuth"].column and alike.unit.startswith("mag"):
         return alike._replace(unit="")
     if not alike and not spelt:
-        return _by_axis_and_unit(name, unit or (stated[1] if stated else ""))
+        read = _measured_channel(plain)
+        return read or _by_axis_and_unit(name, unit or (stated[1] if stated else ""))
     return alike or Resemblance(spelt or "", unit_of(stated[1]) if stated else "")
 
 
@@ -524,8 +537,8 @@ def _bare(name: str, level: re.Match[str]) -> str:
 
 
 def _measured_channel(name: str) -> Resemblance | None:
-    """The channel that a name is but for a word that says so: meas_gx."""
-    bare = _OF_CHANNELS.sub("", name)
+    """The channel that a name is but for a word that says so: meas_gx, Gx read."""
+    bare = _ACTUAL.sub("", _OF_CHANNELS.sub("", name))
     alike = resembled(bare) if bare != name else None
     return alike if alike and alike.column in RAW else None
 
@@ -563,8 +576,8 @@ def _without_title(name: str) -> Resemblance | None:
     alike = resembled(name[title.end() :]) if title else None
     if not title or not alike:
         return None
-    triad = begins_as(f"{title[1].rstrip('s')} x y") if title[1] else ""
-    return None if triad and alike.column[0] != triad[0] else alike
+    triad = title.lastgroup
+    return None if triad and alike.column[0] != triad else alike
 
 
 def meanings_of(
@@ -575,7 +588,7 @@ def meanings_of(
     Channels may be numbered: G1, G2, G3. `AZ` without `AX` and `AY` is the azimuth. Inklination is the dip where
     there is a Neigung.
     """
-    numbered = _numbered(names)
+    numbered = _numbered(names, _axes_of_numbers(above))
     bare = {name: _TWICE.sub("", name) for name in names}
     once = {
         name: numbered.get(name, base if base in names else name) for name, base in bare.items()
@@ -583,10 +596,11 @@ def meanings_of(
     results = {
         name: m for name, unit in zip(names, units, strict=True) if (m := meaning(once[name], unit))
     }
-    results = _by_legend(names, above) | results
+    results = _by_legend(names, above) | results | _explained(names, above)
     results |= _behind_titles(names, units, results)
     results |= _beside_nominal(names, units, results)
     results |= _beside_tool(names, units, results)
+    results |= _beside_others(names, units, results)
     every = [n for n, m in results.items() if m.column == "az"]
     lone = [n for n in every if _BARE_AZ.fullmatch(n)]
     triad = [n for n in every if n not in lone[:1]] or any(_BARE_AX.fullmatch(n) for n in names)
@@ -605,15 +619,63 @@ def meanings_of(
     return results
 
 
+def _explained(names: Sequence[str], above: Sequence[str]) -> dict[str, Resemblance]:
+    """Angles that a line says to be the tool axis's from the vertical or the horizontal: theta: axis from vertical."""
+    bare = {_UNIT_BEHIND_NAME.sub("", name).lower(): name for name in names}
+    results = {}
+    for line in above:
+        match = re.match(r"\W*([^\W\d_]+)\s*[:：=]\s*([^;(]+)", line)
+        name = bare.get(match[1].lower()) if match else None
+        if not match or not name or not _TOOL_AXIS.search(match[2]):
+            continue
+        if _FROM_HORIZONTAL.search(match[2]):
+            sense = BELOW if _DOWNWARDS.search(match[2]) else ABOVE
+            results[name] = Resemblance(REFERENCES["inclination"].column, sense)
+        elif _OF_VERTICAL.search(match[2]):
+            results[name] = Resemblance(REFERENCES["inclination"].column)
+    return results
+
+
+def _beside_others(
+    names: Sequence[str], units: Sequence[str], meanings: Mapping[str, Resemblance]
+) -> dict[str, Resemblance]:
+    """Columns whose names say an angle of the stand only where no other column is this angle: Face, Desvio."""
+    called = {m.column for m in meanings.values()}
+    results: dict[str, Resemblance] = {}
+    for angle, words in _LONE_ANGLES.items():
+        column = REFERENCES[angle].column
+        bare = {n: " ".join(_UNIT_BEHIND_NAME.sub("", spelled(n)).split()) for n in names}
+        fits = [n for n, text in bare.items() if n not in meanings and words.fullmatch(text)]
+        if len(fits) == 1 and column not in called:
+            stated = IN_BRACKETS.search(spelled(fits[0]))
+            unit = units[names.index(fits[0])] or (stated[1] if stated else "")
+            results[fits[0]] = Resemblance(column, unit_of(spelled(unit)))
+    return results
+
+
 def _says_anticlockwise(line: str) -> bool:
     """Whether a line says that toolfaces count anticlockwise, looking down the hole."""
     text = spelled(line)
-    of_toolface = re.search(r"toolface|\broll|\btf\b", text, re.IGNORECASE)
+    of_toolface = re.search(r"toolface|\broll|\btf\b|angle de rotation", text, re.IGNORECASE)
     return bool(of_toolface and _CCW.search(text)) and not _UPHOLE.search(text)
 
 
+_TOOL_AXIS = re.compile(
+    r"axis|achse|\bakse|\baxe\b|\beje\b|\beixo\b|asse\b|\bos(i|ią)?\b|ось|оси|轴|軸", re.IGNORECASE
+)
+"""Words of the axis of the tool."""
+_OF_VERTICAL = re.compile(r"vert[iy][kc]al|lot\b|lodd|вертикал|铅垂|垂直", re.IGNORECASE)
+_LONE_ANGLES = {
+    "inclination": re.compile(r"(ref )?(desvio|desv\.?)(,? deg)?", re.IGNORECASE),
+    "azimuth": re.compile(
+        r"(ref )?(kompass|brujula|bussola|boussole|компас|phi m(ag)?)(,? deg)?", re.IGNORECASE
+    ),
+    "toolface": re.compile(r"(ref )?(face|cara|lado)(,? deg)?", re.IGNORECASE),
+}
+"""Names that say an angle where no other column is this angle, as `spelled` gives them without their unit."""
 _UNIT_BEHIND_NAME = re.compile(r"\s*[(\[][^)\]]*[)\]]\s*$")
 """The unit behind the name of a channel."""
+_VOLTAGE = re.compile(r"[uv](?=[abghm]$)", re.IGNORECASE)
 _SENSITIVITY = re.compile(r"[(\[][^)\]]*\d[^)\]]*[)\]]")
 """Brackets with a number in a legend: the sensitivity of a channel."""
 
@@ -724,15 +786,30 @@ def _follows(
     return not behind[lone] and all(behind[name] for name in every if name != lone)
 
 
-def _numbered(names: Sequence[str]) -> dict[str, str]:
-    """Names that end in 1, 2 and 3, or 0, 1 and 2, where all three are there, with x, y and z instead."""
+def _axes_of_numbers(above: Sequence[str]) -> str:
+    """The axes that a line says 1, 2 and 3 to be, or 0, 1 and 2: 1 = X, 2 = Y, 3 = Z; empty where none does."""
+    for line in above:
+        axes = "".join(
+            re.findall(r"(?<![\w.])[0-3]\s*[=:]\s*([xyz])\b", line, re.IGNORECASE)
+        ).lower()
+        if sorted(axes) == [*"xyz"]:
+            return axes
+    return ""
+
+
+def _numbered(names: Sequence[str], axes: str = "") -> dict[str, str]:
+    """Names that end in 1, 2 and 3, or 0, 1 and 2, where all three are there, with x, y and z instead.
+
+    Where a line says the `axes` of the numbers, Va and Vb are the voltages of both triads.
+    """
     parts = {name: match for name in names if (match := _NUMBERED.fullmatch(name))}
     stems = {(m[1], m[3]) for m in parts.values()}
     numbers = {s: "".join(sorted(m[2] for m in parts.values() if (m[1], m[3]) == s)) for s in stems}
+    whole = {name: m for name, m in parts.items() if numbers[m[1], m[3]] in ("123", "012")}
+    axis = {name: (axes or "xyz")[numbers[m[1], m[3]].index(m[2])] for name, m in whole.items()}
     return {
-        name: f"{m[1]} {'xyz'[numbers[m[1], m[3]].index(m[2])]} {m[3]}".strip()
-        for name, m in parts.items()
-        if numbers[m[1], m[3]] in ("123", "012")
+        name: f"{_VOLTAGE.sub('', m[1]) if axes else m[1]} {axis[name]} {m[3]}".strip()
+        for name, m in whole.items()
     }
 
 

@@ -76,7 +76,9 @@ _OF_LOGGERS = re.compile(
     r"(avg|smp|min|max|std|tot|float|double|int\d*|real|string|-+|=+)", re.IGNORECASE
 )
 """What loggers write below names and units: how a value was sampled, of what type it is, rules."""
-_UNIT_BEHIND = re.compile(r"(.*?)\s*([(\[][^)\]]*[)\]]|,\s*[^\s,]{1,5})")
+_UNIT_BEHIND = re.compile(
+    r"(.*?)\s*([(\[][^)\]]*[)\]]|,\s*([^\s,]{1,5}|grader|gra[du]os|degrees)|(?<=\s)(mV|mg|nT|[uµμ]T|mG|m/s[2²]))"
+)
 _AXIS = re.compile(r"\W*([xyz123ху])\W*([(\[].*)?", re.IGNORECASE)
 """A name that is an axis alone, and says nothing without the title above it."""
 _OF_AXIS = re.compile(
@@ -95,10 +97,13 @@ _DEGREES_OF = re.compile(
 """The name of a column of degrees, of minutes or of seconds of an angle, or of a largest value beside the least."""
 _PART_OF_ANGLE = (
     re.compile(r"(?P<part>deg|min|sec|[dms])[._ ]+(?P<of>[^\W\d_][^()\[\]]*)", re.IGNORECASE),
-    re.compile(r"(?P<of>[^\W\d_][^()\[\]]*?)[._ ]+\(?(?P<part>[dms])\)?", re.IGNORECASE),
+    re.compile(
+        r"(?P<of>[^\W\d_][^()\[\]]*?)[._ ]+\(?(?P<part>[dgms])\)?(?P<sign>\s*[(\[]?[°º'′\"″]+[)\]]?)?",
+        re.IGNORECASE,
+    ),
 )
 """The name of a part of an angle: deg Inc, Inc_D."""
-_PARTS_OF_ANGLE = {"d": "deg", "m": "min", "s": "sec"}
+_PARTS_OF_ANGLE = {"d": "deg", "g": "deg", "m": "min", "s": "sec"}
 WITHOUT_VALUE = re.compile(r"n/?a|n\.a\.?|nan|null|none|[\W_]*", re.IGNORECASE)
 """A cell that says that there is no value."""
 NO_READING = re.compile(
@@ -688,7 +693,11 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
             last = rows[end][0] if end < len(rows) else math.inf
             below = [row for row in remarks if rows[head][0] < row[0] < layout.lines[0]]
             void = [(n, _words(row)) for n, row in without if rows[head][0] < n < last]
-            layout = replace(layout, left_out=tuple(sorted([*layout.left_out, *void])))
+            layout = replace(
+                layout,
+                left_out=tuple(sorted([*layout.left_out, *void])),
+                above=(*layout.above, *(" ".join(map(as_text, row)).strip() for _, row in below)),
+            )
             between = [*below, *rows[head + 1 : end]]
             above = rows[max(0, head - 4) : head]
             layout = _with_settings(_with_warmth_of_lines(layout, between), [*above, *between])
@@ -817,6 +826,15 @@ def _is_ruler(row: Cells) -> bool:
 
 _NUMBER_OF_COLUMN = re.compile(r"(?<![\w.,])(\d{1,2})(?:\s*[-–]\s*(\d{1,2}))?[\s:=.)]+(?=[^\W\d_])")
 """The number of a column in a line that says what each is, or the first and the last of several: 4-6 acc x y z."""
+_LINE_OF_COLUMN = re.compile(
+    r"\W*(?:(?:columns?|cols?|field|colonnes?|columnas?|colunas?|colonn[ae]|spalten?|kolonner?|kolumn\w*|kolom|"
+    r"столб\w*|колонк\w*|列|第)\W*)?(\d{1,2})(?:\s*(?:[-–…]|\.\.|to|bis|à|a|al?|til|до|至|到)\s*(\d{1,2}))?\s*列?\s*"
+    r"[:：=.)–-]\s*(?=[^\W\d_])",
+    re.IGNORECASE,
+)
+"""The beginning of a line that says what one column is, or several."""
+_BETWEEN_AXES = re.compile(r"[,;/、]|\b(and|et|und|og|e|i|и|和)\b|(?<=[yY])\s+y(?=\s+[zZ])")
+"""What stands between axes in a line."""
 
 
 def _with_legend(rows: list[tuple[int, Cells]]) -> list[tuple[int, Cells]]:
@@ -835,7 +853,22 @@ def _with_legend(rows: list[tuple[int, Cells]]) -> list[tuple[int, Cells]]:
             names = [*(f"Text {k}" for k in range(1, 1 + len(before))), *names]
         if len(names) == len(rows[first][1]):
             return [*rows[:k], *rows[k + 1 : first], (rows[k][0], names), *rows[first:]]
-    return rows
+    return _with_lines_of_columns(rows, first)
+
+
+def _with_lines_of_columns(rows: list[tuple[int, Cells]], first: int) -> list[tuple[int, Cells]]:
+    """The rows with names above the first readings, where a line for each column says what it is, and no row does."""
+    texts = {k: " ".join(map(as_text, rows[k][1])) for k in range(first)}
+    marks = {k: mark for k, text in texts.items() if (mark := _LINE_OF_COLUMN.match(text))}
+    names: list[str] = []
+    for k, mark in marks.items():
+        names += _named(mark, texts[k][mark.end() :], len(names))
+    if len(names) < LEAST_COLUMNS or len(names) != len(rows[first][1]):
+        return rows
+    if first - 1 not in marks and _texts(rows[first - 1][1]) >= LEAST_COLUMNS:
+        return rows
+    above = [row for k, row in enumerate(rows[:first]) if k not in marks]
+    return [*above, (rows[max(marks)][0], names), *rows[first:]]
 
 
 def _legend(text: str) -> list[str]:
@@ -844,14 +877,25 @@ def _legend(text: str) -> list[str]:
     marks = [*_NUMBER_OF_COLUMN.finditer(text)]
     for mark, behind in zip_longest(marks, marks[1:]):
         end = behind.start() if behind else len(text)
-        head, bracket, unit = text[mark.end() : end].strip(" ,;").partition("(")
-        words, count = head.split(), int(mark[2] or mark[1]) - int(mark[1]) + 1
-        if int(mark[1]) != len(names) + 1 or not 0 < count <= len(words):
+        named = _named(mark, text[mark.end() : end], len(names))
+        if not named:
             return []
-        names += [
-            " ".join([*words[:-count], each, bracket + unit]).strip() for each in words[-count:]
-        ]
+        names += named
     return names
+
+
+def _named(mark: re.Match[str], text: str, before: int) -> list[str]:
+    """The names of columns that a text lists behind its number, or the first and last; empty out of order.
+
+    >>> _named(re.match("(.)-(.)", "5-7"), "fluxgates x, y and z (V)", 4)
+    ['fluxgates x (V)', 'fluxgates y (V)', 'fluxgates z (V)']
+    """
+    head, bracket, unit = text.strip(" ,;").partition("(")
+    count = int(mark[2] or mark[1]) - int(mark[1]) + 1
+    words = (head if count == 1 else _BETWEEN_AXES.sub(" ", head)).split()
+    if int(mark[1]) != before + 1 or not 0 < count <= len(words):
+        return []
+    return [" ".join([*words[:-count], each, bracket + unit]).strip() for each in words[-count:]]
 
 
 _LIST_OF_COLUMNS = re.compile(
@@ -1414,7 +1458,8 @@ def _with_part_last(names: Sequence[str]) -> list[str]:
     whole = [*names]
     for place, match in parts.items():
         angle = match["of"]
-        known = angle.lower() in ("az", "a", "i") or angles_among([angle])
+        signed = match.groupdict().get("sign")
+        known = signed or angle.lower() in ("az", "a", "i") or angles_among([angle])
         if known and counts[angle.lower()] in (2, 3):
             whole[place] = f"{angle} {_PARTS_OF_ANGLE[match['part'][0].lower()]}"
     return whole
@@ -1547,7 +1592,8 @@ def _with_title(title: str, name: str) -> str:
     """A name behind its title; a unit behind the title comes last, and so does a name that is a unit."""
     if _is_unit(name):
         return f"{title} ({name.strip(' []()')})"
-    match = _UNIT_BEHIND.fullmatch(title) if "(" not in name and "[" not in name else None
+    bracketed = any(unit_of(text.strip("()[]")) for text in _BRACKETS.findall(name))
+    match = _UNIT_BEHIND.fullmatch(title) if not bracketed else None
     serial = match and re.search(r"\d{2}", match[2])
     if not match or serial or _DEGREES_OF.fullmatch(name):
         return f"{title} {name}".strip()

@@ -140,16 +140,36 @@ def _without_end(line: str, delimiter: str, ends: int) -> str:
 def cells_of(
     lines: Sequence[str], delimiter: str, source: str, *, skip_blanks: bool = False
 ) -> Rows:
-    """The cells of each line; `skip_blanks` before a cell, which may be in quotes behind them."""
+    """The cells of each line; `skip_blanks` before a cell, which may be in quotes behind them.
+
+    A cell that is nothing but a quote is the unit of seconds.
+
+    >>> cells_of(["deg;';\\";V"], ";", "run.csv")
+    [['deg', "'", '"', 'V']]
+    """
     try:
         return [
-            next(csv.reader([line], delimiter=delimiter, skipinitialspace=skip_blanks), [])
+            next(
+                csv.reader(
+                    [_with_seconds(line, delimiter) if '"' in line else line],
+                    delimiter=delimiter,
+                    skipinitialspace=skip_blanks,
+                ),
+                [],
+            )
             for line in lines
         ]
     except csv.Error as error:
         raise InputError(
             f"{source}: the file is no table of text ({error}). Name the file with the readings."
         ) from None
+
+
+def _with_seconds(line: str, delimiter: str) -> str:
+    """The line with each cell that is nothing but a quote in quotes; as it is where such quotes may be of a cell."""
+    sign = re.escape(delimiter)
+    lone = re.compile(rf'(?<![^{sign}])"(?![^{sign}])(?!{sign}"(?![^{sign}]))')
+    return lone.sub('""""', line) if lone.sub("", line).count('"') % 2 == 0 else line
 
 
 def _is_number(cell: str) -> bool:
