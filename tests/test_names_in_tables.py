@@ -194,3 +194,24 @@ def test_lines_that_say_what_each_column_is(tmp_path, word, words, axes, between
     (tmp_path / "run.txt").write_text("\n".join(["% tool : F-23", *legend, *rows]), "utf-8")
     whole = taken(tmp_path / "run.txt")
     assert all(np.allclose(tables.numbers(whole, name), run[name]) for name in order[1:])
+
+
+def test_a_unit_behind_a_title_is_that_of_its_columns(tmp_path):
+    """A unit behind a number is that of the number, in a line above the names."""
+    run = {n: v for n, v in table().items() if n not in ("Local G (g)", "Btotal (nT)")}
+    rename = {f"{c} (V)": f"{c[1].upper()}轴" for c in ("Gx", "Gy", "Gz")}
+    names = [rename.get(n, f"{n[1].upper()}轴" if n[0] == "H" else n) for n in run]
+    titles = [
+        "重力计输出 mV" if n == "Gx (V)" else "磁力计输出 mV" if n == "Hx (V)" else "" for n in run
+    ]
+    stated = ["Campo: 44.900 nT", "Gravedad: 9,7998 m/s2", "Fecha: 27/06/2024"]
+    path = tmp_path / "run.csv"
+    write_csv(path, run)
+    rows = path.read_text("utf-8").splitlines()[1:]
+    path.write_text(
+        "\n".join([";".join(stated), ",".join(titles), ",".join(names), *rows]), "utf-8"
+    )
+    columns = library.propose_profile(path).profile.columns
+    assert (columns["ay"].name, columns["mz"].name) == ("重力计输出 Y轴 mV", "磁力计输出 Z轴 mV")
+    above = written(tmp_path / "above.csv", table(), "Campo: 44.900 nT,Gravedad: 9,7998 m/s2")
+    assert library.propose_profile(above).profile.columns["ay"].name == "Gy (V)"

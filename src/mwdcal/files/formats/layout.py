@@ -77,7 +77,7 @@ _OF_LOGGERS = re.compile(
 )
 """What loggers write below names and units: how a value was sampled, of what type it is, rules."""
 _UNIT_BEHIND = re.compile(
-    r"(.*?)\s*([(\[][^)\]]*[)\]]|,\s*([^\s,]{1,5}|grader|gra[du]os|degrees)|(?<=\s)(mV|mg|nT|[uµμ]T|mG|m/s[2²]))"
+    r"(.*?)\s*([(\[][^)\]]*[)\]]|,\s*([^\s,]{1,5}|grader|gra[du]os|degrees)|(?<=[^\d\s]\s)(mV|mg|nT|[uµμ]T|mG|m/s[2²]))"
 )
 _AXIS = re.compile(r"\W*([xyz123ху])\W*([(\[].*)?", re.IGNORECASE)
 """A name that is an axis alone, and says nothing without the title above it."""
