@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, Unpack, cast
 import numpy as np
 
 from mwdcal.calibration.options import FitChoices, Options
-from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.readings import Readings, serial_of
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import FitError, InputError
 from mwdcal.files import documents, runs
@@ -46,6 +46,7 @@ class PlanResult(Result):
     plans: Sequence[Planned]
     digests: Mapping[str, str]
     files: dict[str, Path] = field(default_factory=dict)
+    serial: str = ""
 
     @property
     def table(self) -> Table:
@@ -78,6 +79,8 @@ class PlanResult(Result):
 
     def save(self, path: FilePath) -> None:
         """Write the plan to be filled in: a run file with blank readings (CSV, TSV, Parquet or XLSX).
+
+        It ends with the first station once more, to show drift, as the run sheet does.
 
         Raises:
             InputError: the file cannot be written.
@@ -114,7 +117,7 @@ class PlanResult(Result):
     def _page(self) -> str:
         from mwdcal.presentation.plan import render
 
-        return render(self.plans)
+        return render(self.plans, self.serial)
 
 
 PlanSource = Tabular | PlanResult
@@ -191,7 +194,10 @@ def plan(
         for each in tables or [plan_table("twenty-four-state")]:
             result.append(planned.judged(each, profile, chosen, stand))
             progress(len(result), len(tables))
-    return PlanResult(result, {"profile": digest, "measured": done.digest if done else ""})
+    stated = [tool.tool] if isinstance(tool, Calibration) else [done.metadata] if done else []
+    serial = next(filter(None, map(serial_of, stated)), "")
+    digests = {"profile": digest, "measured": done.digest if done else ""}
+    return PlanResult(result, digests, serial=serial)
 
 
 def _check_wanted(stations: int | None, accuracy_deg: Mapping[str, float]) -> None:

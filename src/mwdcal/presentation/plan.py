@@ -18,8 +18,8 @@ from mwdcal.files.contract import CHANNELS, REFERENCES
 from mwdcal.files.formats.table import Table
 from mwdcal.geometry.vectors import Array, Ints, reference_vectors
 from mwdcal.planning.expected import left_undetermined, planned_earth
-from mwdcal.planning.planned import WORKING_INCLINATIONS, Planned, station_names
-from mwdcal.planning.plans import attitudes, soak_numbers
+from mwdcal.planning.planned import WORKING_INCLINATIONS, Planned
+from mwdcal.planning.plans import attitudes, repeated, soak_numbers, station_names
 from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.numbers import files_written, quantity
 from mwdcal.presentation.page import banner, rendered
@@ -256,7 +256,8 @@ def screen(
         one_line(head),
         table(comparison_rows(summaries), ["", *(one_line(each.plan) for each in summaries)]),
     ]
-    blocks += filter(None, ["\n".join([*_assumed(plans[0]), *_practice(summaries)])])
+    lines = [*_assumed(plans[0]), *_practice(summaries), *_inclinations(plans[0])]
+    blocks += filter(None, ["\n".join(lines)])
     if len(plans) == 1:
         blocks += [accuracy(summaries[0]), detectable(summaries[0]), stations(plans[0])]
     if output or html:
@@ -279,6 +280,22 @@ def _assumed(planned: Planned) -> list[str]:
 def _practice(facts: Sequence[PlanSummary]) -> list[str]:
     """The assumption on the stand's settings as a line, if there is one."""
     return [ASSUMED] if any(each.settings == ASSUMED_PRACTICE for each in facts) else []
+
+
+def _inclinations(planned: Planned) -> list[str]:
+    """Why a best plan has few inclinations, and the cost of more, as a line, if it has."""
+    levels = planned.compared()
+    if levels is None:
+        return []
+    *others, last = [f"{each:g}°" for each in levels.used]
+    used = f"{', '.join(others)} and {last}" if others else last
+    aim = "the angles" if levels.criterion == "I" else "the parameters"
+    bent = " They would also show an accelerometer that is not linear along the tool axis."
+    return [
+        f"Only {used} of {len(levels.offered)} inclinations to choose from: stations tell most where readings differ "
+        f"most. As many stations evenly at all {len(levels.offered)} have {levels.cost:.2f} times the 1σ of {aim}."
+        + bent * (len(levels.used) <= 2)
+    ]
 
 
 def _is_blank(plan: Table, name: str) -> bool:
@@ -385,14 +402,15 @@ SOAK_MARKERS = "os^Dv"
 """Markers of stations by soak."""
 
 
-def render(plans: Sequence[Planned]) -> str:
-    """The sheet of the first plan, and the others beside it, as HTML."""
+def render(plans: Sequence[Planned], serial: str = "") -> str:
+    """The sheet of the first plan for the tool of a serial, and the others beside it, as HTML."""
     first, summaries = plans[0], [facts(each) for each in plans]
-    titles, rows = _sheet(first.plan)
+    titles, rows = _sheet(repeated(first.plan))
     return rendered(
         "plan.html",
         plan=first.plan.source,
         profile=first.calibration.profile.name,
+        serial=serial,
         summary=summaries[0],
         banner=_banner(first),
         findings=[*left_undetermined(first.calibration), *first.findings],
@@ -406,6 +424,7 @@ def render(plans: Sequence[Planned]) -> str:
         asks_settings=not first.calibration.profile.stand.practice,
         compared=comparison_rows(summaries),
         plans=[each.plan for each in summaries],
+        inclinations=_inclinations(first),
         accuracy=accuracy_rows(summaries[0]),
         detectable=detectable_rows(summaries[0]),
         detectable_titles=DETECTABLE_TITLES,
@@ -415,18 +434,10 @@ def render(plans: Sequence[Planned]) -> str:
 
 
 def _sheet(plan: Table) -> tuple[list[str], list[tuple[list[str], bool]]]:
-    """Titles and cells of the stations in order, and where another soak begins.
-
-    The last row is the first station of the last soak again: what has changed since is drift.
-    """
+    """Titles and cells of the stations in order, as in the file, and where another soak begins."""
     titles, rows = station_rows(plan)
-    if titles[0] != STATION_TITLES["station"]:
-        titles = [STATION_TITLES["station"], *titles]
-        rows = [[name, *row] for name, row in zip(station_names(plan), rows, strict=True)]
     begins = np.diff(soak_numbers(plan), prepend=soak_numbers(plan)[:1]) != 0
-    first, *others = rows[int(np.flatnonzero(begins)[-1]) if begins.any() else 0]
-    stations = [*rows, [f"{first} again", *others]]
-    return titles, list(zip(stations, [*begins.tolist(), False], strict=True))
+    return titles, list(zip(rows, begins.tolist(), strict=True))
 
 
 def _channels(calibration: Calibration) -> list[str]:
