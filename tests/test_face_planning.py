@@ -83,8 +83,9 @@ def test_a_plan_is_written_as_by_the_command(tmp_path):
     sheet = read_csv(theirs / "plan.csv")
     for name, values in result.columns.items():
         if name != "station":
-            np.testing.assert_array_equal(values, numbers(sheet[name]))
-    assert result.columns["station"].tolist() == sheet["station"]
+            again = np.append(values, values[0])
+            np.testing.assert_array_equal(again, numbers(sheet[name]))
+    assert [*result.columns["station"].tolist(), "1 again"] == sheet["station"]
 
 
 def test_plans_from_files_columns_and_results_are_one():
@@ -324,4 +325,8 @@ def test_a_plan_from_a_calibration_is_at_its_place_and_temperature_and_says_what
     assert set(rows["ref_gravity_g"]) == {"0.997853497372"}
     sheet = (tmp_path / "sheet.html").read_text("utf-8")
     assert "<dd>0.997853</dd>" in sheet
+    assert "<dt>Serial</dt><dd>A</dd>" in sheet
+    more = mwdcal.plan("servo", stations=2, measured=run)
+    more.report(tmp_path / "more.html")
+    assert "<dt>Serial</dt><dd>A</dd>" in (tmp_path / "more.html").read_text("utf-8")
     assert "per direction / at every station" in sheet

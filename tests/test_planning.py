@@ -13,6 +13,7 @@ import pytest
 from msgspec.structs import replace as with_changes
 from scipy.stats import chi2
 
+import mwdcal as library
 from cli_support import mwdcal, read_csv, refused
 from mwdcal.calibration import results
 from mwdcal.calibration.diagnosis.detection import detections
@@ -26,7 +27,15 @@ from mwdcal.files.profiles import built_in, load_profile
 from mwdcal.geometry.vectors import reference_vectors
 from mwdcal.planning import planned
 from mwdcal.planning.expected import expected, nominal_run, planned_earth, planned_fit
-from mwdcal.planning.optimal import Design, Information, best, least_count, least_worst
+from mwdcal.planning.optimal import (
+    Design,
+    Information,
+    best,
+    evenly,
+    least_count,
+    least_worst,
+    typical_sd,
+)
 from mwdcal.planning.planned import (
     WORKING_INCLINATIONS,
     Stand,
@@ -655,7 +664,7 @@ def test_a_sheet_has_room_for_six_readings_and_no_banner_of_simulated_data(tmp_p
     assert visits == [key for key, _ in groupby(planned_ones)]  # there and back, as the plan has it
 
 
-def test_file_screen_and_sheet_have_one_order_and_the_sheet_repeats_the_first_station(tmp_path):
+def test_file_screen_and_sheet_have_one_order_file_and_sheet_repeat_the_first_station(tmp_path):
     profile, plan, sheet = (tmp_path / name for name in ("p.toml", "plan.csv", "sheet.html"))
     text = (files("mwdcal") / "profiles" / "servo.toml").read_text("utf-8")
     columns = "".join(f'{c} = {{name = "{c}", unit = "V"}}\n' for c in ("ax", "ay", "az"))
@@ -668,17 +677,78 @@ def test_file_screen_and_sheet_have_one_order_and_the_sheet_repeats_the_first_st
         [name, "25", *(f"{float(cell):g}" for cell in cells)]
         for name, *cells in zip(written["station"], *angles, strict=True)
     ]
-    assert [row[0] for row in stations] == [str(k) for k in range(1, 25)]
+    assert [row[0] for row in stations] == [*(str(k) for k in range(1, 25)), "1 again"]
+    assert stations[-1][1:] == stations[0][1:]
     shown = ran.out[ran.out.index("station   T") :].splitlines()[2:26]
-    assert [line.split() for line in shown] == stations
+    assert [line.split() for line in shown] == stations[:-1]
     page = sheet.read_text("utf-8")
     rows = re.findall(r'<td class="tick"></td>' + r"<td>([^<]*)</td>" * 5, page)
-    assert [list(row) for row in rows] == [*stations, ["1 again", *stations[0][1:]]]
+    assert [list(row) for row in rows] == stations
     assert re.findall(r"<th>([am][xyz], [^<]+)</th>", page) == [
         "ax, V", "ay, V", "az, V", "mx, raw", "my, raw", "mz, raw"
     ]  # fmt: skip
     blocks = [float(key) for key, _ in groupby(row[3] for row in stations)]
     assert sorted(blocks) != blocks != sorted(blocks, reverse=True)
+
+
+def test_a_plan_that_ends_where_its_last_soak_begins_repeats_nothing():
+    soaks = load_plan("laboratory-thermal")
+    ended = run_sheet(soaks)
+    assert ended.columns["station"][-1] == "37 again"
+    assert ended.columns["temperature_c"][-1] == 21
+    assert run_sheet(ended).columns["station"] == ended.columns["station"]
+    bare = {k: v for k, v in load_plan("six-state").columns.items() if k != "station"}
+    named = replace(load_plan("six-state"), columns={**bare, "group": list("aabbcc")})
+    sheet = run_sheet(named).columns
+    assert sheet["station"] == ["1", "2", "3", "4", "5", "6", "1 again"]
+    assert sheet["group"][-1] == "a again"  # the stand has moved: another setting
+
+
+def test_the_last_row_shows_a_drift_that_the_inclinations_would_hide():
+    """All of 5°, then all of 90°: one of 0.5 mg along the tool axis over the run is found by the row."""
+    stand = Stand(reach={"inclination": (0, 90)})
+    plan = best_plan(None, 24, SERVO, criterion="I", stand=stand).plan
+    found = dict.fromkeys((24, 25), 0)
+    for stations in (plan, run_sheet(plan)):
+        for seed in range(4):
+            run = library.simulate(stations, SERVO, seed=seed)
+            drifting = run.accelerometer.copy()
+            drifting[:, 2] += 0.5e-3 * np.linspace(-0.5, 0.5, run.count)
+            made = library.calibrate(replace(run, accelerometer=drifting), SERVO)
+            found[run.count] += "accelerometer-drift" in {each.id for each in made.findings}
+    assert found[24] <= 1
+    assert found[25] >= 3
+
+
+def test_a_plan_of_few_inclinations_says_why_and_what_more_would_cost(tmp_path):
+    """The figure is that of the angles of a plan with six stations at each of four inclinations."""
+    sheet = tmp_path / "sheet.html"
+    line = ("plan", "--stations", 24, "--tool", "servo")
+    ran = mwdcal(*line, "--reach", "inclination=0:90", "--report", sheet)
+    said = next(each for each in ran.out.splitlines() if each.startswith("Only "))
+    assert said.startswith("Only 5° and 90° of 4 inclinations to choose from")
+    assert "not linear along the tool axis" in said
+    assert said in sheet.read_text("utf-8")
+    cost = float(re.search(r"([\d.]+) times the 1σ of the angles", said)[1])
+    assert 1.0 < cost < 1.2
+    assert "\nOnly " not in mwdcal(*line).out  # six of seven
+    three = mwdcal(*line, "--reach", "inclination=0:120", "--criterion", "D").out
+    assert "Only 5°, 90° and 120° of 5" in three
+    assert "times the 1σ of the parameters.\n" in three
+
+
+def test_an_even_plan_is_even_and_no_better_than_the_best():
+    """Straight line by 8 of 3 × 8 places: at the ends 1, evenly sqrt(3/2) of the slope (by hand); D is between."""
+    information, x = regression((0, 1), (-1, 0, 1), repeated=8)
+    ends = best(information, 6).members
+    assert set(x[ends]) == {-1, 1}
+    even = evenly(information, ends, None, x.astype(int) + 1)
+    assert np.bincount(x[even].astype(int) + 1).tolist() == [2, 2, 2]
+    ratio = typical_sd(information, even, None) / typical_sd(information, ends, None)
+    assert ratio == pytest.approx(1.5**0.25)
+    slope = np.diag([0.0, 1.0])
+    ratio = typical_sd(information, even, slope) / typical_sd(information, ends, slope)
+    assert ratio == pytest.approx(1.5**0.5)
 
 
 def test_the_screen_says_what_is_assumed_and_how_long_the_soak_is(tmp_path):

@@ -194,10 +194,14 @@ def plan(
         for each in tables or [plan_table("twenty-four-state")]:
             result.append(planned.judged(each, profile, chosen, stand))
             progress(len(result), len(tables))
-    stated = [tool.tool] if isinstance(tool, Calibration) else [done.metadata] if done else []
-    serial = next(filter(None, map(serial_of, stated)), "")
     digests = {"profile": digest, "measured": done.digest if done else ""}
-    return PlanResult(result, digests, serial=serial)
+    return PlanResult(result, digests, serial=_serial(tool, done))
+
+
+def _serial(tool: object, done: Table | None) -> str:
+    """The serial of the tool by its calibration, else by the run that is measured already; blank where unknown."""
+    stated = [tool.tool] if isinstance(tool, Calibration) else [done.metadata] if done else []
+    return next(filter(None, map(serial_of, stated)), "")
 
 
 def _check_wanted(stations: int | None, accuracy_deg: Mapping[str, float]) -> None:

@@ -563,8 +563,8 @@ class Search:
             return None
         wanted = self.wanted[self.criterion]
         even = evenly(self.information, members, wanted, group)
-        own, spread = (typical_sd(self.information, some, wanted) for some in (members, even))
-        return Levels(offered[used].tolist(), offered.tolist(), self.criterion, spread / own)
+        least, spread = (typical_sd(self.information, some, wanted) for some in (members, even))
+        return Levels(offered[used].tolist(), offered.tolist(), self.criterion, spread / least)
 
 
 def check_criterion(criterion: str) -> None:
