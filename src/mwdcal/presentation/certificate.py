@@ -673,6 +673,7 @@ def _decision_cells(decision: LimitDecision | None, guarded: bool) -> list[Cell]
     if decision is None:
         return [Cell(["–"])] * (4 if guarded else 3)
     value, expanded = _judged(decision)
+    unknown = expanded in (UNDETERMINED, NOT_STATED)
     within, risk = decision.probability_within, decision.risk
     odds = [
         NOT_STATED if within is None else probability(within),
@@ -683,7 +684,7 @@ def _decision_cells(decision: LimitDecision | None, guarded: bool) -> list[Cell]
     if most is not None and most >= 0:
         accepted = measured(most, decision.quantity.expanded_uncertainty)[0] + symbol
     return [
-        Cell([value, f"U {NOT_STATED}" if expanded in (UNDETERMINED, NOT_STATED) else f"± {expanded}"]),
+        Cell([value, f"U {NOT_STATED}" if unknown else f"± {expanded}"]),
         *([_cell(accepted)] if guarded else []),
         Cell(["PASS" if decision.passed else "FAIL"], "good" if decision.passed else "bad"),
         Cell(odds if within is not None or risk is not None else [NOT_STATED]),

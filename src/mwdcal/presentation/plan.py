@@ -291,10 +291,11 @@ def _inclinations(planned: Planned) -> list[str]:
     used = f"{', '.join(others)} and {last}" if others else last
     aim = "the angles" if levels.criterion == "I" else "the parameters"
     bent = " They would also show an accelerometer that is not linear along the tool axis."
+    more = bent if len(levels.used) <= 2 else ""
     return [
         f"Only {used} of {len(levels.offered)} inclinations to choose from: stations tell most where readings differ "
         f"most. As many stations evenly at all {len(levels.offered)} have {levels.cost:.2f} times the 1σ of {aim}."
-        + bent * (len(levels.used) <= 2)
+        f"{more}"
     ]
 
 
