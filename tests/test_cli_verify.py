@@ -202,6 +202,17 @@ def test_a_tool_far_beyond_its_limits_is_doubted_before_the_readings(
     assert first.startswith("first check: is it this tool") is asked
 
 
+@pytest.mark.parametrize(("toolfaces", "more"), [(4, True), (6, False)])
+def test_too_few_toolfaces_are_not_asked_for_again(tmp_path, fitted, toolfaces, more):
+    """Four do not show the second harmonic; the six that are asked for instead do."""
+    run = simulated(plans.grid([45], toolfaces, [60], [25.0]), 2)
+    run["ax"] = run["ax"] + 5e-3 * SCALE[0]
+    said = mwdcal("verify", fitted[0], write_csv(tmp_path / "roll.csv", run))
+    (again,) = (line for line in said.out.splitlines() if "measure again: " in line)
+    assert again.endswith(", at six or more toolfaces, evenly spread") is more
+    assert ("add toolfaces between them" in said.err) is more
+
+
 def test_the_text_holds_the_numbers_of_the_json(tmp_path, fitted):
     run = roll(tmp_path, ax=lambda r: r["ax"] + 5e-3 * SCALE[0])
     said = mwdcal("verify", fitted[0], run)

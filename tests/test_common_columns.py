@@ -1,11 +1,13 @@
 """What tools at the same exact references have in common gives what each of them gives by itself."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from mwdcal.calibration.automatic.drift import by_drift, with_drift
+from mwdcal.calibration.automatic import drift
+from mwdcal.calibration.automatic.drift import by_drift, chances, with_drift
 from mwdcal.calibration.diagnosis import structure
 from mwdcal.calibration.diagnosis.plausibility import freedom_of
 from mwdcal.calibration.diagnosis.structure import may_show
@@ -98,3 +100,30 @@ def test_what_a_bound_leaves_out_would_not_show(error, monkeypatch):
         assert np.delete(near, slice(None, None, 10)).mean() < 0.1
     elif error == 1e-3:
         assert shown.mean() > 0.5
+
+
+def test_scores_of_long_runs_are_those_of_each_residual(monkeypatch):
+    result = fit(imperfect(runs(8, 4, field=40.0)), OPTIONS)
+    by_units, hidden = chances(result)
+    monkeypatch.setattr(drift, "MOST_UNITS", 0)
+    np.testing.assert_allclose(chances(result)[0], by_units, rtol=1e-7)
+    np.testing.assert_array_equal(chances(result)[1], hidden)
+
+
+def test_memory_of_a_drift_search_grows_with_the_stations_not_with_their_square():
+    short = imperfect(runs(8, 1))
+    times = 25
+    long = replace(
+        short,
+        accelerometer=np.tile(short.accelerometer, (1, times, 1)),
+        magnetometer=np.tile(short.magnetometer, (1, times, 1)),
+        known={name: np.tile(values, times) for name, values in short.known.items()},
+    )
+    result = fit(long, OPTIONS)
+    tracemalloc.start()
+    chances(result)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    residuals = result.analysis.residual.size
+    assert residuals > drift.MOST_UNITS
+    assert peak < residuals**2 * 8 / 3

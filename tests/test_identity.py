@@ -374,3 +374,20 @@ def test_tables_in_memory_keep_serial_and_simulated(library, way, tool):
     readings = mwdcal.read_run(frame, tool, metadata=stated if way == "metadata" else None)
     calibration = mwdcal.calibrate(readings)
     assert (calibration.serial, calibration.simulated) == ("12.10", True)
+
+
+def test_a_calibration_says_whose_it_replaces(tmp_path):
+    """Of the same tool, or of a file that is no calibration, it says no more than that it replaces an earlier file."""
+    run, target = (EXAMPLE / "run.csv").read_text("utf-8"), tmp_path / "tool.json"
+    (tmp_path / "other.csv").write_text(run.replace("SIM-0001", "OTHER-1"), "utf-8")
+
+    def said(name):
+        ran = command("calibrate", name, "--tool", EXAMPLE / "tool.toml", "-o", target)
+        return ran.out.rpartition("wrote ")[2].partition(" (")[2].partition(")")[0]
+
+    assert said(EXAMPLE / "run.csv") == "calibration"
+    assert said(tmp_path / "other.csv") == "calibration, in place of that of SIM-0001"
+    assert said(tmp_path / "other.csv") == "calibration, in place of an earlier file"
+    for text in ("{", "[1]", '{"command": "calibrate", "tool": 3}', '{"tool": {"serial": "A"}}'):
+        target.write_text(text)
+        assert said(EXAMPLE / "run.csv") == "calibration, in place of an earlier file"

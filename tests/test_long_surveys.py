@@ -152,6 +152,12 @@ def place(folder):
     return path
 
 
+def shown_last(screen):
+    """Whether the last of the surveys stands behind the first thirty, by its label or number."""
+    last = screen.partition(f"\n… {ROWS - 31} more")[2].partition("\n")[2]
+    return last.split()[0] in (f"S{ROWS - 1}", str(ROWS))
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_a_table_in_parts_gives_the_same_bytes(tool, tmp_path, in_parts, name):
     change, metadata, options = CASES[name]
@@ -169,6 +175,7 @@ def test_a_table_in_parts_gives_the_same_bytes(tool, tmp_path, in_parts, name):
     assert (whole.code, whole.out, whole.err) == (parts.code, parts.out, parts.err)
     assert parts.code == 0
     assert out.read_bytes() == before
+    assert "--json" in options or shown_last(parts.out)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
@@ -184,6 +191,7 @@ def test_parquet_in_parts_has_the_same_values(tool, tmp_path, in_parts, suffix):
     in_parts()
     parts = cli("survey", tool, source, "-o", out)
     assert (parts.code, parts.out, parts.err) == (0, whole.out, whole.err)
+    assert shown_last(parts.out)
     if suffix == ".csv":
         assert out.read_bytes() == before
     else:

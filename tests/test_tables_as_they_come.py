@@ -5,6 +5,7 @@ import datetime
 import json
 import re
 
+import msgspec
 import numpy as np
 import openpyxl
 import pandas
@@ -13,8 +14,10 @@ import pytest
 import mwdcal as library
 from cli_support import channels, mwdcal, refused, servo_run, stations, write_csv
 from mwdcal.errors import FitError
+from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.title_references import references_in
 from mwdcal.files.formats.titles import titles
+from mwdcal.identification.columns import is_numbering
 from simulation import Tool, plan
 
 NAMES = {
@@ -1173,3 +1176,86 @@ def test_a_fleet_leaves_rejected_rows_out_too_and_says_so(tmp_path):
     assert ran.json["stations"] == 95
     assert "A1.csv: rows that are rejected" in ran.err
     assert "line 8 ('Status': REJECT)" in ran.err
+
+
+def test_a_profile_of_a_workbook_reads_it_once(tmp_path, monkeypatch):
+    opened, whole = [], openpyxl.load_workbook
+    tables.write(tmp_path / "run.xlsx", tables.read("examples/servo/run.csv"))
+    monkeypatch.setattr(
+        openpyxl, "load_workbook", lambda *a, **k: opened.append(a) or whole(*a, **k)
+    )
+    assert library.propose_profile(tmp_path / "run.xlsx").profile.table == msgspec.UNSET
+    assert len(opened) == 1
+
+
+@pytest.mark.parametrize("columns", [("ref_azimuth_deg", "ref_field_nt", "ref_dip_deg"), ()])
+def test_a_triad_of_unknown_names_is_told_by_the_readings(tmp_path, columns):
+    """With or without a reference of the field: magnetometers are never left out in silence."""
+    renamed = {"Hx (V)": "Kolbo 1", "Hy (V)": "Kolbo 2", "Hz (V)": "Kolbo 3"}
+    whole = mixed(table(**dict.fromkeys(columns)))
+    unknown = {renamed.get(name, name): values for name, values in whole.items()}
+    path = written(tmp_path / "a.csv", unknown)
+    if columns:
+        assert "Are these the magnetometers" in refused(
+            mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3
+        )
+    else:
+        np.testing.assert_allclose(
+            read(path).magnetometer, read(written(tmp_path / "b.csv", whole)).magnetometer
+        )
+
+
+def test_toolfaces_in_steps_from_another_start_each_time_are_no_numbers_of_rows(tmp_path):
+    starts = np.repeat([0.0, 7.0, 14.0, 21.0], 12)
+    face = (np.asarray(servo_run()["ref_toolface_deg"]) + starts) % 360
+    assert is_numbering(np.arange(1.0, 49))
+    assert is_numbering(np.tile(np.arange(1.0, 11), 5))
+    assert not is_numbering(face)
+
+
+@pytest.mark.parametrize("total", ["Betrag", "Kolbo", "Summe"])
+def test_a_total_in_whatever_words_is_no_reference_of_the_field(tmp_path, total):
+    run = servo_run()
+    norm = np.linalg.norm([run[n] for n in ("mx", "my", "mz")], axis=0) / 5e-5
+    columns = table(ref_field_nt=None, **{f"{total} (nT)": np.round(norm, 1)})
+    assert (
+        "ref_field_nt"
+        not in library.propose_profile(written(tmp_path / "a.csv", columns)).profile.columns
+    )
+
+
+def test_a_column_that_turns_is_no_gravity_by_a_name_that_is_near(tmp_path):
+    columns = {
+        ("Stand gtf (deg)" if n == "TF (deg)" else n): v
+        for n, v in mixed(table(ref_gravity_g=None)).items()
+    }
+    proposal = library.propose_profile(written(tmp_path / "a.csv", columns))
+    assert proposal.profile.columns["ref_toolface_deg"].name == "Stand gtf (deg)"
+
+
+def test_columns_that_old_programs_frame_and_number(tmp_path):
+    plain = read(written(tmp_path / "a.csv", table()))
+    lines = (tmp_path / "a.csv").read_text().splitlines()
+    numbers = ",".join(str(k + 1) for k in range(lines[0].count(",") + 1))
+    rows = [lines[0], numbers, *lines[1:]]
+    drawn = ["! " + " ! ".join(row.split(",")) + " !" for row in rows]
+    (tmp_path / "b.txt").write_text("\n".join(["=" * 80, *drawn, "=" * 80]))
+    framed = read(tmp_path / "b.txt")
+    np.testing.assert_array_equal(framed.accelerometer, plain.accelerometer)
+    np.testing.assert_array_equal(framed.magnetometer, plain.magnetometer)
+
+
+def test_degrees_and_minutes_in_chinese_are_angles(tmp_path):
+    columns = table()
+    face = np.round(np.asarray(columns["TF (deg)"])).astype(int)
+    columns["TF (deg)"] = [f"{value}度30分" for value in face]
+    run = read(written(tmp_path / "a.csv", columns))
+    np.testing.assert_allclose(np.degrees(run.reference("toolface")), face + 0.5)
+
+
+def test_an_angle_whose_cells_are_not_understood_is_asked_about(tmp_path):
+    columns = table()
+    columns["TF (deg)"] = [f"{value:.0f} and a bit" for value in columns["TF (deg)"]]
+    path = written(tmp_path / "a.csv", columns)
+    message = refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
+    assert "'TF (deg)' is called 'ref_toolface_deg', and its cells" in message

@@ -70,13 +70,13 @@ ITEMS = (
         "report.html",
         (
             "mwdcal example demo",
-            f"mwdcal calibrate {RUN} -o tool.json --report report.html",
+            f"mwdcal calibrate {RUN} -o demo/tool.json --report report.html",
         ),
     ),
     Item(
         "Roll test",
         "rolltest.html",
-        ("mwdcal verify tool.json demo/rolltest.csv --report rolltest.html",),
+        ("mwdcal verify demo/tool.json demo/rolltest.csv --report rolltest.html",),
     ),
     Item(
         "Calibration over temperature",
@@ -113,31 +113,32 @@ ITEMS = (
     Item(
         "Surveys of a well",
         "well.html",
-        ("mwdcal survey tool.json demo/well.csv -o well.csv --report well.html",),
+        ("mwdcal survey demo/tool.json demo/well.csv -o well.csv --report well.html",),
     ),
     Item(
         "Interference of the drill string",
         "msa.html",
-        ("mwdcal survey tool.json demo/well.csv --msa -o msa.csv --report msa.html",),
+        ("mwdcal survey demo/tool.json demo/well.csv --msa -o msa.csv --report msa.html",),
     ),
     Item(
         "Diagnosis",
         "diagnosis.html",
-        ("mwdcal diagnose tool.json demo/rolltest.csv --report diagnosis.html",),
+        ("mwdcal diagnose demo/tool.json demo/rolltest.csv --report diagnosis.html",),
     ),
     Item(
         "Certificate, page",
         "C.html",
         (
-            "mwdcal verify tool.json demo/rolltest.csv --json > test.json",
-            "mwdcal certificate tool.json --verification test.json --laboratory demo/laboratory.toml -o C.html",
+            "mwdcal verify demo/tool.json demo/rolltest.csv --json > test.json",
+            "mwdcal certificate demo/tool.json --verification test.json --laboratory demo/laboratory.toml -o C.html",
         ),
     ),
     Item(
         "Certificate, PDF",
         "sheets.pdf",
         (
-            "mwdcal certificate tool.json --verification test.json --laboratory demo/laboratory.toml -o sheets.pdf",
+            "mwdcal certificate demo/tool.json --verification test.json --laboratory demo/laboratory.toml "
+            "-o sheets.pdf",
         ),
     ),
     Item(

@@ -165,8 +165,8 @@ def freedom(calibration: Calibration, readings: Readings) -> float:
     return max(1.0, min(estimated)) if estimated else np.inf
 
 
-QUARTERS = np.arange(4) * np.pi / 2
-"""Toolfaces of a further roll."""
+FURTHER_ROLL = np.arange(6) * np.pi / 3
+"""Toolfaces of a further roll: as many as a roll test needs to show both harmonics."""
 SETTING = float(np.radians(0.02))
 """Standard uncertainty of the angles of a further roll, where the readings do not state a larger one."""
 COLD, HOT = 20.0, 100.0
@@ -182,7 +182,7 @@ class NextReading(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Further(NamedTuple):
-    """A roll of four toolfaces that could be read as well: its inclination, temperature, and what it is without."""
+    """A roll of `FURTHER_ROLL` that could be read as well: its inclination, temperature, and what it is without."""
 
     text: str
     inclination: float
@@ -194,8 +194,8 @@ class Further(NamedTuple):
         """The further measurement in words."""
         inclination, azimuth = np.degrees(self.inclination), np.degrees(self.azimuth) % 360
         return (
-            f"four stations {self.text}, at {inclination:.0f}° inclination, {azimuth:.0f}° azimuth and toolfaces of "
-            "0°, 90°, 180° and 270°,"
+            f"six stations {self.text}, at {inclination:.0f}° inclination, {azimuth:.0f}° azimuth "
+            "and toolfaces 60° apart,"
         )
 
 
@@ -337,34 +337,35 @@ def _extended(calibration: Calibration, readings: Readings, offer: Further) -> R
         n: np.mean(known[n][np.isfinite(known[n])] if np.isfinite(known[n]).any() else np.nan)
         for n in CONSTANTS
     }
-    turns = np.broadcast_arrays(offer.inclination, offer.azimuth, QUARTERS)
-    more = dict(zip(ANGLES, turns, strict=True)) | {n: np.full(4, here[n]) for n in CONSTANTS}
+    count = len(FURTHER_ROLL)
+    turns = np.broadcast_arrays(offer.inclination, offer.azimuth, FURTHER_ROLL)
+    more = dict(zip(ANGLES, turns, strict=True)) | {n: np.full(count, here[n]) for n in CONSTANTS}
     warmth, usual = readings.temperature, calibration.reference_temperature
     if warmth is not None:
         usual = float(np.mean(warmth)) if offer.temperature is None else offer.temperature
-        warmth = np.append(warmth, np.full(4, usual))
+        warmth = np.append(warmth, np.full(count, usual))
     dip = (
         np.radians(calibration.earth.get("dip_deg", 0.0)) if np.isnan(here["dip"]) else here["dip"]
     )
     inclination, azimuth, toolface = turns
     vectors = reference_vectors(inclination, azimuth, toolface, here["gravity"], here["field"], dip)
-    raw, sd = _rolled(calibration, readings, vectors, np.full(4, usual))
+    raw, sd = _rolled(calibration, readings, vectors, np.full(count, usual))
     for name in readings.sd.keys() - {*TRIADS} | set(ANGLES):
         stated = readings.uncertainty(name)
         least = SETTING if name in ANGLES else 0.0
-        sd[name] = np.append(stated, np.full(4, max(stated.max(), least)))
+        sd[name] = np.append(stated, np.full(count, max(stated.max(), least)))
     return replace(
         readings, accelerometer=raw[TRIADS[0]], magnetometer=raw.get(TRIADS[1]), temperature=warmth,
         sd=sd, station=(), digest=(),
         known={name: np.append(known[name], more[name]) for name in known},
-        group=np.append(readings.groups, np.full(4, -1)),
+        group=np.append(readings.groups, np.full(count, -1)),
     )  # fmt: skip
 
 
 def _rolled(
     calibration: Calibration, readings: Readings, vectors: tuple[Array, Array], warmth: Array
 ) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Readings and their noise (n + 4, 3) by triad, those of a sound tool at `vectors` (4, 3) after the others."""
+    """Readings and their noise (n + k, 3) by triad, those of a sound tool at `vectors` (k, 3) after the others."""
     raw, sd = {}, {}
     for triad, vector in zip(calibration.triads[: len(readings.triads)], vectors, strict=False):
         model, before = (
@@ -374,7 +375,7 @@ def _rolled(
         added = raw_reading(model, np.array(triad.parameters), vector, warmth)
         stated = np.broadcast_to(triad.noise_of(readings), before.shape)
         raw[triad.name] = np.concatenate([before, added])
-        sd[triad.name] = np.concatenate([stated, np.tile(stated.mean(0), (4, 1))])
+        sd[triad.name] = np.concatenate([stated, np.tile(stated.mean(0), (len(warmth), 1))])
     return raw, sd
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import msgspec
 
 from mwdcal.calibration.diagnosis.plausibility import check
+from mwdcal.calibration.readings import serial_of
 from mwdcal.calibration.record import (
     SCHEMA_VERSION,
     Calibration,
@@ -48,6 +49,7 @@ class _Document(msgspec.Struct):
 
     command: str = ""
     files: list[_Listed] = []
+    tool: Any = None
 
 
 def why_kept(file: Path, inputs: Iterable[Path], calibration: bool) -> str:
@@ -68,6 +70,13 @@ def why_kept(file: Path, inputs: Iterable[Path], calibration: bool) -> str:
             if atomic.identity(members.split(path.parent / each.name)[0]) == identity:
                 return f"the certificate '{path.name}' lists it, and would no longer hold"
     return ""
+
+
+def serial_in(file: Path) -> str | None:
+    """Serial of the tool in a calibration file; None where it states none, or the file is something else."""
+    document = _document(_content(file))
+    is_one = document.command == "calibrate" and isinstance(document.tool, dict)
+    return serial_of(document.tool) if is_one else None
 
 
 def _content(file: Path) -> bytes:

@@ -55,7 +55,8 @@ _REJECTS_PREVIOUS = re.compile(
 )
 """A cell that rejects the row before its own: repeated, the previous one is bad."""
 _ACCEPTED = re.compile(
-    r"ok(ay)?|good|valid|accept(ed)?|pass(ed)?|use(d)?|i\.? ?o\.?|gut|gultig|bestanden|godkjent|gyldig|bra|bien|bueno|"
+    r"(re-?test(ed)? |repeat(ed)? )?ok(ay)?|good|valid|accept(ed)?|pass(ed)?|use(d)?|i\.? ?o\.?|"
+    r"gut|gultig|bestanden|godkjent|gyldig|bra|bien|bueno|"
     r"buena|aceptad[oa]|valid[oa]|bom|boa|aceit[oa]|bon(ne)?|годен|годна|хорошо|норма|да|ок|合格|正常|有效|良好?"
 )
 _REMARK_BEHIND = re.compile(r"\s*[(\[][^)\]]*[)\]]$|\s*[,;–-]\s+.*$")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cache
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -68,6 +69,8 @@ _SAME_DIP = 0.2
 """By how much the dip of a place varies at most, degrees."""
 _FOLLOWS = 0.9
 """Correlation from which on a column follows what is computed."""
+_COPIES = 0.99
+"""Correlation from which on a column is another one, corrected: fields near the vertical follow gravity to 0.95."""
 _STEADY_DIP, _STEADY_FIELD = 3.0, 0.1
 """A dip varies by less at one place, degrees, and a field by a smaller share."""
 STEADY_NORM = 0.15
@@ -76,8 +79,12 @@ OF_ONE_SPHERE = 0.05
 """The same of three channels that belong together by their readings alone."""
 _OFF_SPHERE = 0.05
 """By how much the squares of norms of a triad differ from a sphere's, as a share of the channels' range squared."""
+_LEAST_RANGE = 0.2
+"""Least range of a channel of a tool that is turned about every axis, as a share of the largest."""
 _LEAST_TURN = 20.0
 """By how much an angle of the stand varies at least, degrees."""
+_MOST_SUMMED = 24
+"""First columns of numbers among which the three of a total are looked for."""
 _MOST_TRIPLES = 6
 """Neighbouring columns that a question offers as a triad."""
 
@@ -128,10 +135,13 @@ def is_numbering(values: Array) -> bool:
 
     >>> is_numbering(np.array([1.0, 2, 3, 3, 4, 5, 6])), is_numbering(np.array([*range(0, 360, 45)] * 2))
     (True, False)
+    >>> is_numbering(np.array([*range(0, 360, 45), *range(15, 360, 45)]))
+    False
     """
-    steps, different = np.diff(values), np.unique(values).size
+    steps = np.diff(values)
     usual = float(np.median(steps)) if steps.size else 0.0
-    turns = different < values.size and np.isclose(abs(usual) * different, 360)
+    back = steps * usual < 0
+    turns = back.any() and abs(np.ptp(values) + abs(usual) - 360) <= abs(usual)
     return usual != 0.0 and not turns and float(np.isclose(steps, usual).mean()) > _REGULAR
 
 
@@ -374,7 +384,7 @@ _OF_SAMPLES = re.compile(
 )
 """How many samples a mean is of, in a line or as the name of a column."""
 _SPREADS_OF_CHANNELS = tuple(f"sd_{name}" for name in RAW)
-_IN_UNIT = re.compile(r"(.*\w) (?:in|en|i|w|в) (\S+)", re.IGNORECASE)
+_IN_UNIT = re.compile(r"(.*[\w)\]]) (?:in|en|i|w|в) (\S+)", re.IGNORECASE)
 """A name with its unit behind a preposition: Gx in mg."""
 _BARE_T = re.compile(r"t\W*(°|deg)?\W*", re.IGNORECASE)
 _CCW = re.compile(
@@ -472,7 +482,10 @@ def _bracketed(name: str) -> str:
     logged = _OF_LOGGER.fullmatch(name)
     name = f"{logged[1]}{logged[2] or ''}" if logged else name
     worded = _IN_UNIT.fullmatch(name)
-    return f"{worded[1]} ({worded[2]})" if worded and unit_of(spelled(worded[2])) else name
+    if not worded or not unit_of(spelled(worded[2])):
+        return name
+    words = re.sub(r"[()\[\]]", "", worded[1])
+    return f"{words} ({worded[2]})"
 
 
 def _elevation(name: str, plain: str, unit: str) -> Resemblance | None:
@@ -752,6 +765,11 @@ def _columns_of(answer: Answer) -> set[str]:
     return {value.partition("=")[0] for _, value in answer.arguments}
 
 
+def _names_of(answer: Answer) -> list[str]:
+    """The columns of the table that an answer takes."""
+    return [value.partition("=")[2] for _, value in answer.arguments]
+
+
 class Questions(list[QuestionError]):
     """Open questions about names and readings, each with the option that answers it."""
 
@@ -765,8 +783,11 @@ class Questions(list[QuestionError]):
 
     def believed(self) -> set[str]:
         """The columns of a table that the first answers to open questions take."""
-        first = [each.answers[0].arguments for each in self if each.answers]
-        return {value.partition("=")[2] for arguments in first for _, value in arguments}
+        return {name for each in self if each.answers for name in _names_of(each.answers[0])}
+
+    def hold(self, *texts: str) -> bool:
+        """Whether there is a question with one of some texts in it."""
+        return any(text in each.text for each in self for text in texts)
 
     def settle(self, words: str) -> bool:
         """Whether there is a question of these words; others on columns that each of its answers takes are left out."""
@@ -830,21 +851,21 @@ def proposed(
         if not {*channels} & {*chosen, *said}:
             others = [n for n in names if n not in meanings]
             questions.ask(_check_hidden, triad, channels, others, values, source)
-    hidden = any("channels of the accelerometer" in each.text for each in questions)
+    hidden = questions.hold("channels of the accelerometer")
     if not hidden and not any(n in damaged for n, m in meanings.items() if m.column in RAW):
         questions.ask(_check_triads, names, values, chosen, said, source, of_run)
     questions.ask(_check_units_of_triads, chosen, source)
     angles = {c: chosen[c].name for c in _ANGLES_AND_WARMTH[:3] if c in chosen and c not in said}
     for column in angles:
         questions.ask(_check_nominal, column, angles, names, values, source)
-    beside = questions.settle("side by side")
+    beside = questions.settle("side by side") or questions.hold("channels of the magnetometer")
     if not beside and not {*RAW[3:]} & {*chosen, *said}:
         # Without accelerometers either triad may be either.
         believed = questions.believed() if {*RAW[:3]} & {*chosen} else ()
         others = [n for n in names if n not in meanings and n not in believed]
-        questions.ask(_check_nameless, others, values, {*chosen, *known}, source)
-    rest = {n: u for n, u in every.items() if n not in meanings}
-    _ask_lacking({*chosen, *said, *known, *of_vectors(chosen)}, rest, values, questions, source)
+        questions.ask(_check_nameless, others, values, chosen, known, source)
+    present = {*chosen, *said, *known, *of_vectors(chosen)}
+    _ask_lacking(present, every, meanings, values, questions, source)
     questions.raise_any(source)
     by_value = {c for c, each in chosen.items() if each.unit and not meanings[each.name].unit}
     used = {each.name for each in chosen.values()}
@@ -868,16 +889,18 @@ def _with_wrong_units(
 
 def _ask_lacking(
     present: Collection[str],
-    others: Mapping[str, str],
+    units: Mapping[str, str],
+    meanings: Collection[str],
     values: Values,
     questions: Questions,
     source: str,
 ) -> None:
-    """Questions on references and a temperature that are absent, among other columns with their units."""
-    magnetic = any("Are these the magnetometers" in each.text for each in questions)
+    """Questions on references and a temperature that are absent, among columns that are not understood."""
+    others = {n: u for n, u in units.items() if n not in meanings}
+    magnetic = questions.hold("Are these the magnetometers", "channels of the magnetometer")
     lacking = [*lacking_references({*present, *(RAW[3:] if magnetic else ())}), *BY_NAME_ALONE]
     for column in (each for each in lacking if each not in present):
-        questions.ask(_check_lacking, column, others, values, source)
+        questions.ask(_check_lacking, column, others, [*units], values, source)
 
 
 def _with_whole_vectors(meanings: dict[str, Resemblance]) -> dict[str, Resemblance]:
@@ -956,7 +979,7 @@ def _no_evidence(
             continue
         elif sampled and m.column in _SPREADS_OF_CHANNELS and name != m.column:
             ignored[name] = "it is the spread of samples, not the uncertainty of their mean"
-        elif _is_total(m.column, name, meanings, values) or _is_dip_of(
+        elif _is_total(m.column, values(name), m.unit, [*units], values) or _is_dip_of(
             m.column, name, meanings, values
         ):
             ignored[name] = "it is computed from the channels"
@@ -1059,19 +1082,21 @@ def _tell_references(
             )
 
 
-def _is_total(column: str, name: str, meanings: Mapping[str, Resemblance], values: Values) -> bool:
-    """Whether a column of a strength is computed from the channels: in their raw unit, or equal to their norm."""
-    triad = {"ref_gravity_g": "accelerometer", "ref_field_nt": "magnetometer"}.get(column)
-    if triad is None:
+def _is_total(
+    column: str, total: Array | None, unit: str, names: Sequence[str], values: Values
+) -> bool:
+    """Whether values of a strength are computed from the channels: in their raw unit, or the norms of three columns."""
+    if total is None or column not in (REFERENCES[name].column for name in ("gravity", "field")):
         return False
-    if meanings[name].unit in ("V", "mV", "counts", "raw"):
+    if unit in ("V", "mV", "counts", "raw"):
         return True
-    channels = [n for n, m in meanings.items() if m.column in CHANNELS[triad]]
-    columns = [v for n in channels if (v := values(n)) is not None]
-    total = values(name)
-    if len(columns) != 3 or total is None:
-        return False
-    with np.errstate(over="ignore"):
+    numbers = [cells for n in names if (cells := values(n)) is not None]
+    return any(_are_norms(total, three) for three in combinations(numbers[:_MOST_SUMMED], 3))
+
+
+def _are_norms(total: Array, columns: Sequence[Array]) -> bool:
+    """Whether values (n,) are the norms of three columns (n,) but for a factor."""
+    with np.errstate(over="ignore", invalid="ignore"):
         norm = np.linalg.norm(columns, axis=0)
     if not np.all((norm > 0) & (norm < np.inf)) or not np.ptp(norm):
         return False
@@ -1097,17 +1122,43 @@ def _is_dip_of(column: str, name: str, meanings: Mapping[str, Resemblance], valu
     return bool(alike > _FOLLOWS)
 
 
-def _check_lacking(column: str, others: Mapping[str, str], values: Values, source: str) -> None:
+def _may_hold(column: str, values: Array) -> bool:
+    """Whether values may be those of a reference, whatever they are called: of a place they hardly vary.
+
+    >>> turning, steady = np.arange(0.0, 360, 30), np.full(12, 66.2)
+    >>> _may_hold("ref_dip_deg", turning), _may_hold("ref_dip_deg", steady)
+    (False, True)
+    """
+    known = values[np.isfinite(values)]
+    if not known.size or np.ptp(known) == 0:
+        return True
+    if column == REFERENCES["dip"].column:
+        return bool(np.ptp(known) < _STEADY_DIP)
+    if column in _OF_PLACE_ALONE:
+        return bool(np.ptp(known) < _STEADY_FIELD * np.abs(known).max())
+    return column == WARMTH or not is_numbering(known)
+
+
+def _check_lacking(
+    column: str, others: Mapping[str, str], names: Sequence[str], values: Values, source: str
+) -> None:
     """Ask whether columns that are not understood are one that is absent, by a mistyped name or by unit and values."""
-    numbers = {n: values(n) for n in others if not is_of_tool(n)}
-    named = [n for n, cells in numbers.items() if cells is not None and _ends_as(n, column)]
+    every = {n: cells for n in others if (cells := values(n)) is not None}
+    numbers = {
+        n: cells
+        for n, cells in every.items()
+        if not is_of_tool(n)
+        and _may_hold(column, cells)
+        and not _is_total(column, cells, "", names, values)
+    }
+    named = [n for n in numbers if _ends_as(n, column)]
     if named:
         raise QuestionError(
             f"{source}: {' and '.join(map(shown, named))} may be '{column}' by the end of the name, behind a title "
             "that is not understood. Which one does the stand show?",
             candidates_for(column, named, values),
         )
-    near = [n for n, cells in numbers.items() if cells is not None and is_near(column, n)]
+    near = [n for n in numbers if is_near(column, n)]
     by_values = column not in BY_NAME_ALONE
     fits = near + [
         n
@@ -1254,19 +1305,42 @@ def _check_hidden(
 
 
 def _check_nameless(
-    unused: Sequence[str], values: Values, known: Collection[str], source: str
+    unused: Sequence[str],
+    values: Values,
+    chosen: Mapping[str, ColumnSource],
+    known: Collection[str],
+    source: str,
 ) -> None:
-    """Ask whether three unused columns of a steady norm are magnetometers, in a table with references of a field."""
-    of_field = [REFERENCES[name].column for name in ("field", "dip", "azimuth")]
-    if not {*of_field} & {*known}:
-        return
+    """Ask whether three unused columns are magnetometers.
+
+    Those of a steady norm in a table with references of a field, or in any table that turn as no other triad does.
+    """
+    of_field = {REFERENCES[name].column for name in ("field", "dip", "azimuth")}
+    why = "the table states the field"
     triples = triples_for(RAW[3:], unused, values, OF_ONE_SPHERE)
-    if triples := triples or triples_for(RAW[3:], unused, values, STEADY_NORM):
+    if of_field.isdisjoint({*chosen, *known}):
+        sensed = [
+            cells for c in RAW[:3] if c in chosen and (cells := values(chosen[c].name)) is not None
+        ]
+        triples = [each for each in triples if _is_another_triad(_names_of(each), sensed, values)]
+        why = "three columns turn as one would"
+    else:
+        triples = triples or triples_for(RAW[3:], unused, values, STEADY_NORM)
+    if triples:
         raise QuestionError(
-            f"{source}: no column is a magnetometer by its name, and the table states the field. Are these the "
-            "magnetometers?",
+            f"{source}: no column is a magnetometer by its name, and {why}. Are these the magnetometers?",
             [*triples, none_of(*RAW[3:])],
         )
+
+
+def _is_another_triad(names: Sequence[str], others: Sequence[Array], values: Values) -> bool:
+    """Whether three columns are vectors that turn about every axis, and none follows one of the others."""
+    columns = [cells for n in names if not is_of_tool(n) and (cells := values(n)) is not None]
+    if len(columns) < len(names) or not is_of_one_sphere(names, values):
+        return False
+    spread = np.ptp(columns, axis=-1)
+    alike = [abs(np.corrcoef(one, other)[0, 1]) for one in columns for other in others]
+    return bool(spread.min() > _LEAST_RANGE * spread.max() and max(alike, default=0.0) < _COPIES)
 
 
 def _check_units_of_triads(chosen: Mapping[str, ColumnSource], source: str) -> None:

@@ -69,6 +69,7 @@ from mwdcal.identification.columns import (
     is_of_tool,
     meaning,
     meanings_of,
+    none_of,
     north_of,
     proposed,
 )
@@ -616,7 +617,10 @@ def _answer_by_readings(
     if len(fits) != 1:
         return None
     proposal, chosen = fits[0]
-    if any(_has_twin(table, text) for answer in chosen for _, text in answer.arguments):
+    columns = proposal.profile.columns or {}
+    sensed = {each.name for column, each in columns.items() if column in RAW}
+    beside = [name for name in table.columns if name not in sensed]
+    if any(_has_twin(table, text, beside) for answer in chosen for _, text in answer.arguments):
         return None
     texts = [", ".join(text for _, text in answer.arguments) for answer in chosen]
     return proposal._replace(by_readings=tuple(texts))
@@ -678,13 +682,13 @@ def _is_of_different_columns(answers: Sequence[Answer]) -> bool:
     return len({*names}) == len(names)
 
 
-def _has_twin(table: Table, answer: str) -> bool:
-    """Whether another column follows the angle of an answer but for unit, sense and zero."""
+def _has_twin(table: Table, answer: str, names: Collection[str]) -> bool:
+    """Whether another of some columns follows the angle of an answer but for unit, sense and zero."""
     column, _, name = answer.partition("=")
     if column not in ANGLES_OF_STAND:
         return False
     columns = {}
-    for each in table.columns:
+    for each in names:
         with suppress(InputError):  # of text
             columns[each] = numbers(table, each)
     taken = max((each for each in columns if name.startswith(each)), key=len, default=None)
@@ -856,6 +860,14 @@ def _numbers_of(table: Table, problems: dict[str, QuestionError], name: str) -> 
         ]
         if wrong and 2 * sum(map(is_figure, cells)) > table.count:
             problems[name] = question_on_cells(table, name, cells.index(wrong[0]), wrong)
+        elif wrong and 2 * sum(any(map(str.isdecimal, cell)) for cell in cells) > table.count:
+            called = meaning(name)
+            if called and called.column in _OF_READINGS:
+                problems[name] = QuestionError(
+                    f"{table.source}: {shown(name)} is called '{called.column}', and its cells, such as "
+                    f"{shown(wrong[0])}, are no numbers that are understood. Write them as numbers in another column.",
+                    [none_of(called.column)],
+                )
         return None
 
 

@@ -11,7 +11,7 @@ from mwdcal.calibration.automatic.auto import CurveScore
 from mwdcal.calibration.diagnosis.flags import listed
 from mwdcal.calibration.fit_options import unusual
 from mwdcal.calibration.options import ASSUMED, ASSUMED_PRACTICE
-from mwdcal.calibration.readings import simulated
+from mwdcal.calibration.readings import serial_of, simulated
 from mwdcal.calibration.record import (
     ALIGNMENT,
     LEAN,
@@ -32,6 +32,7 @@ from mwdcal.calibration.record import (
     exact_and_steady,
 )
 from mwdcal.calibration.results import typical_accuracy, without_temperature
+from mwdcal.files import documents
 from mwdcal.geometry.observables import TITLES
 from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.numbers import (
@@ -159,7 +160,11 @@ def screen(
     rolltest: Path | None = None,
 ) -> str:
     """The result for people, the files that were written, and what to do next or what `judged` says of it."""
-    what = "calibration, in place of an earlier file" if output.exists() else "calibration"
+    what = "calibration"
+    if output.exists():
+        serial = documents.serial_in(output)
+        other = serial and serial != serial_of(calibration.tool)
+        what += f", in place of {f'that of {serial}' if other else 'an earlier file'}"
     files = files_written(**{what: output, "report": report})
     command = f"mwdcal verify {one_line(output)} {one_line(rolltest or NEXT_ROLL_TEST)}"
     after = f"\n\n{judged}" if judged else f"   next: {command}"

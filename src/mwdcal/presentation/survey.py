@@ -115,8 +115,8 @@ def interference_screen(result: Interference, *metadata: Mapping[str, object]) -
     return "\n".join([*parts, *([f"… and {more} more"] if more > 0 else [])])
 
 
-MOST_SURVEYS = 30
-"""Surveys of a table on screen."""
+FIRST_SURVEYS = 30
+"""Surveys at the beginning of a table on screen; the last comes behind them."""
 OFF_IN_WORDS = "\noff: how far |g|, |b| and dip together are from their references"
 """The meaning of a column."""
 OUTCOMES = {"true": "accepted", "false": "REJECTED", "": "not judged"}
@@ -298,7 +298,7 @@ def whole_screen(
     stated = result.inputs.stated
     analyses = [run.analysis for run in result.runs] or [result.analysis]
     parts = [interference_screen(each, *stated) for each in analyses if each]
-    parts.append(screen(result.well, facts, signature, *stated))
+    parts.append(screen(result.well, facts, signature, *stated, last=result.last))
     if result.contributions and facts.blank < facts.rows:
         unit = result.well.length_unit
         parts.append(contribution_screen(result.contributions, station, unit))
@@ -388,9 +388,13 @@ def end_of_path(last: LastStation) -> EndOfPath:
 
 
 def screen(
-    well: Well, facts: SurveySummary, signature: SignatureCheck, *metadata: Mapping[str, object]
-) -> str:
-    """The surveys for people; `signature` of the calibration, `metadata` of it and of the readings."""
+    well: Well, facts: SurveySummary, signature: SignatureCheck, *metadata: Mapping[str, object],
+    last: Well | None = None,
+) -> str:  # fmt: skip
+    """The surveys for people; `signature` of the calibration, `metadata` of it and of the readings.
+
+    `last`: the end of a long table, of which `well` is the beginning.
+    """
     counts = [f"{facts.accepted} accepted", f"{facts.rejected} rejected"]
     counts += without_verdict(facts)
     if facts.blind:
@@ -414,7 +418,11 @@ def screen(
     return "\n".join(
         [
             *map(one_line, lines),
-            *(["", survey_table(well, facts.rows)] if facts.blank < facts.rows else []),
+            *(
+                ["", survey_table(well, facts.rows, last or well)]
+                if facts.blank < facts.rows
+                else []
+            ),
         ]
     )
 
@@ -519,16 +527,20 @@ def end_in_words(end: EndOfPath, north: str, unit: str = "m") -> str:
     return f"at {fixed(end.md_m / metres, 2)} {unit} MD, from {north} north: {', '.join(parts)}{closure}"
 
 
-def survey_table(well: Well, count: int, most: int = MOST_SURVEYS) -> str:
-    """The first of so many surveys, each angle with its standard uncertainty."""
-    header, rows = survey_rows(well, most)
-    more = count - len(rows)
+def survey_table(well: Well, count: int, last: Well) -> str:
+    """The first of so many surveys, and the last one, each angle with its standard uncertainty."""
+    header, rows = survey_rows(well, slice(FIRST_SURVEYS))
+    between = count - len(rows) - 1
+    if between > 0:
+        rows.append([f"… {between} more", *[""] * (len(header) - 1)])
+    if between >= 0:
+        rows += survey_rows(last, slice(-1, None))[1]
     note = OFF_IN_WORDS if "off, σ" in header and well.judgement.judged.any() else ""
-    return table(rows, header) + (f"\n… and {more} more" if more > 0 else "") + note
+    return table(rows, header) + note
 
 
-def survey_rows(well: Well, most: int) -> tuple[list[str], list[list[str]]]:
-    """Header and cells of the first surveys."""
+def survey_rows(well: Well, places: slice) -> tuple[list[str], list[list[str]]]:
+    """Header and cells of the surveys at some places."""
     columns = well.columns
     azimuth = f"azimuth_{well.north.name}_deg"
     angles, relative = ["inclination_deg", azimuth, "toolface_deg"], well.calibration.relative
@@ -542,8 +554,9 @@ def survey_rows(well: Well, most: int) -> tuple[list[str], list[list[str]]]:
         header += [title, "1σ"] if name in angles else [title]
     modelled, rows = well.limits.probability is not None, []
     metres = LENGTH_UNITS[well.length_unit]
-    for i, label in enumerate(well.readings.labels[:most]):
-        row = [label, *([fixed(well.position.md[i] / metres, 2)] if well.position else [])]
+    labels = well.readings.labels
+    for i in range(len(labels))[places]:
+        row = [labels[i], *([fixed(well.position.md[i] / metres, 2)] if well.position else [])]
         for name in shown:
             row.append(fixed(columns[name][i], digits.get(name, 2)))
             if name in angles:

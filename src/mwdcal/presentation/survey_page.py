@@ -356,7 +356,7 @@ def render(surveyed: SurveyedWell, findings: list[Finding]) -> str:
             f"{name} {i}": run.inputs.named.get(name, "") for name in digests if " " not in name
         }
     stated = well.readings.metadata, well.calibration.tool
-    header, rows = survey_rows(well, MOST_ROWS_OF_PAGE)
+    header, rows = survey_rows(well, slice(MOST_ROWS_OF_PAGE))
     located = has_path(well.position)
     return rendered(
         "survey.html",

@@ -96,6 +96,8 @@ def after_failure(
     if places:
         command = f"mwdcal diagnose {one_line(calibration)} {one_line(run)}"
         again = f"measure again: {'; '.join(places)}"
+        if any(finding.id == "harmonic-unseen" for finding in result.findings):
+            again += ", at six or more toolfaces, evenly spread"
         if any(map(_far_everywhere, failed)):
             again = f"{WHOSE} Then {again}"
         return again, command, "what it looks like"

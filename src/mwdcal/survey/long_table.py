@@ -134,6 +134,7 @@ class _PartsSeen:
 
     before: Before
     first: Well | None = None
+    last: Well | None = None
     depth: float = -np.inf
     simulated: bool = False
     tallies: list[RowCounts] = field(default_factory=list)
@@ -325,6 +326,7 @@ class _LongTable:
     def _surveyed(self, stations: _Stations) -> dict[str, Column]:
         """The results of the stations of a part."""
         settings, seen, readings = self.settings, self.seen, stations.readings
+        seen.last = None  # one part at a time in memory
         calibration, md = settings.calibration, stations.md
         self._note(readings, md)
         if settings.reference:
@@ -337,7 +339,7 @@ class _LongTable:
             settings.outside, model=settings.model, whole=False,
         )  # fmt: skip
         well = replace(well, length_unit=settings.shown_unit)
-        seen.before = well.after
+        seen.before, seen.last = well.after, well
         seen.tallies.append(tally)
         seen.counts.append(well.counts)
         if seen.first is None:
@@ -388,7 +390,7 @@ class _LongTable:
             first,
             findings=[*inputs.findings, *exchanged, *with_stated_unit(first.findings, self.head)],
         )
-        return SurveyedWell(inputs, first, counts, None)
+        return SurveyedWell(inputs, first, counts, last=seen.last)
 
     def _scatter(self) -> dict[str, Scatter]:
         """How strengths and dip scatter in windows over the whole table, whose rows are read once more."""

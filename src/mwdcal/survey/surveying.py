@@ -506,8 +506,9 @@ class WellInputs:
 class SurveyedWell:
     """The surveys of a well with what they rest on; `analysis` is None without multi-station analysis.
 
-    Of a long table that was surveyed in parts `well` has the first stations only, and `counts` is of all. `runs` are
-    those of a well in several, whose surveys `well` has together. `axial`: each survey corrected by itself; None: not.
+    Of a long table that was surveyed in parts `well` has the first stations only, `last` the last ones, and `counts` is
+    of all. `runs` are those of a well in several, whose surveys `well` has together. `axial`: each survey corrected by
+    itself; None: not.
     """
 
     inputs: WellInputs
@@ -516,6 +517,7 @@ class SurveyedWell:
     analysis: Interference | None = None
     runs: tuple[SurveyedWell, ...] = ()
     axial: AxialCorrection | None = None
+    last: Well | None = None
 
     @cached_property
     def contributions(self) -> Contributions | None:

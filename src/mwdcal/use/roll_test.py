@@ -753,8 +753,7 @@ class RollTest:
         if circle.rolled:
             return ""
         return _gap(circle, WIDEST_GAP) or (
-            "the toolfaces do not determine a mean and a harmonic. Add toolfaces between them: four "
-            "at right angles, or more"
+            "the toolfaces do not determine a mean and a harmonic. Take six or more, evenly spread"
         )
 
     def off_plane(self, index: Ints) -> float:

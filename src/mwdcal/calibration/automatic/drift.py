@@ -61,6 +61,8 @@ TOGETHER = 320
 """Most fits whose drifts are fitted together: few enough for the cache."""
 LARGEST_DRIFT = 0.02
 """Largest drift within a run (1σ), as a share of gravity or of the field."""
+MOST_UNITS = 2000
+"""Most residuals of a run whose scores are kept for each of them: their memory grows with the square."""
 REDUNDANCY = 36.0
 """Fewest degrees of freedom of a triad that can tell a drift from noise."""
 
@@ -99,8 +101,12 @@ def _scores(result: Fit) -> Iterator[tuple[drift.WalkScores, dict[str, Array]]]:
     """
     problem, analysis = result.problem, result.analysis
     if closed_form.applies(problem) and are_common(problem):
-        residual = analysis.residual
-        units, trends = _of_units(Alike.of(problem, result.state), residual.shape[-1])
+        residual, design = analysis.residual, Alike.of(problem, result.state)
+        if residual[0].size > MOST_UNITS:
+            scores = drift.common_scores(*perfect(design), residual)
+            yield scores, {name: scores.shown(name) for name in scores.places}
+            return
+        units, trends = _of_units(design, residual.shape[-1])
         yield replace(units, score=residual.reshape(len(residual), -1) @ units.score), trends
         return
     names = drift.families(problem)

@@ -170,8 +170,9 @@ class CommonColumns:
 
 def products_of(first: Array, second: Array) -> Array:
     """Sums (16, k q) over the stations of products of columns (n, 6, k) and (n, 6, q)."""
-    flat = np.moveaxis(first, 0, 2)[:, None] @ np.moveaxis(second, 1, 0)
-    return _by_response(flat)
+    one, other = (columns.reshape(len(columns), -1) for columns in (first, second))
+    shape = (*first.shape[1:], *second.shape[1:])
+    return _by_response((one.transpose() @ other).reshape(shape).swapaxes(1, 2))
 
 
 def _by_response(sums: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import unicodedata
 from collections.abc import Iterable, Iterator, Sequence
@@ -232,12 +233,12 @@ def as_text(value: object) -> str:
     >>> [as_text(v) for v in (None, "A", 7.0, 0.1, True)]
     ['', 'A', '7', '0.1', 'true']
     """
+    if isinstance(value, float):
+        return number(value).removesuffix(".0")
     if value is None:
         return ""
     if isinstance(value, bool):
         return str(value).lower()
-    if isinstance(value, float):
-        return number(value).removesuffix(".0")
     if isinstance(value, date | time):
         return value.isoformat()
     if isinstance(value, bytes):
@@ -247,4 +248,4 @@ def as_text(value: object) -> str:
 
 def number(value: float) -> str:
     """The shortest text that reads back as the same number; blank for NaN."""
-    return "" if np.isnan(value) else repr(float(value))
+    return "" if math.isnan(value) else repr(float(value))

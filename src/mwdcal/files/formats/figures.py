@@ -16,7 +16,7 @@ _WRITTEN = r"[+\-−]?(?:\d+(?:[.,]\d+)*[.,]?|[.,]\d+)(?:[eE][+\-−]?\d+)?"
 _FIGURE = re.compile(rf"({_WRITTEN})\s*([°º%]?\s?[A-Za-zµμ²/°º]{{0,6}})")
 _BARE_FIGURE = re.compile(_WRITTEN)
 _DEGREES = re.compile(
-    r"([+\-−]?)(\d+)\s*[°º]\s*(\d+(?:[.,]\d+)?)\s*['′’]\s*(?:(\d+(?:[.,]\d+)?)\s*(?:[\"″”]|''))?"
+    r"([+\-−]?)(\d+)\s*[°º度]\s*(\d+(?:[.,]\d+)?)\s*['′’分]\s*(?:(\d+(?:[.,]\d+)?)\s*(?:[\"″”秒]|''))?"
 )
 """Degrees, minutes and seconds."""
 _PARTS_OF_DEGREES = re.compile(
@@ -55,7 +55,7 @@ def is_figure(cell: object) -> bool:
     [True, True, True, True, False, False, False]
     """
     if not isinstance(cell, str):
-        return isinstance(cell, int | float) and not isinstance(cell, bool)
+        return type(cell) is float or (isinstance(cell, int | float) and type(cell) is not bool)
     if _POINTED_DAY.fullmatch(cell):
         return False
     text = _SPACES.sub("", cell)

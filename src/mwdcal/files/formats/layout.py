@@ -803,8 +803,15 @@ def _is_name(cell: object) -> bool:
 
 
 def _is_ruler(row: Cells) -> bool:
-    """Whether a row is a line of dashes or the like."""
-    return all(isinstance(cell, str) and re.fullmatch(r"[-=_*+|\s]*", cell) for cell in row)
+    """Whether a row is a line of dashes or the like, or numbers the columns.
+
+    >>> _is_ruler(["----", ""]), _is_ruler([1, 2, 3, 4, 5, 6]), _is_ruler([1, 2, 3, 4, 5, 7])
+    (True, True, False)
+    """
+    if all(isinstance(cell, str) and re.fullmatch(r"[-=_*+|\s]*", cell) for cell in row):
+        return True
+    filled = [as_text(cell).strip("()[] ") for cell in row if cell != ""]
+    return len(filled) > LEAST_COLUMNS and filled == [str(k + 1) for k in range(len(filled))]
 
 
 _NUMBER_OF_COLUMN = re.compile(r"(?<![\w.,])(\d{1,2})(?:\s*[-–]\s*(\d{1,2}))?[\s:=.)]+(?=[^\W\d_])")
@@ -940,12 +947,14 @@ def _is_without_reading(row: Cells) -> bool:
     >>> _is_without_reading(["-", "-", "-", "–", "power cut"]), _is_without_reading(["-", "-", "-", "°C"])
     (True, False)
     """
+    if _is_reading(row):
+        return False
     cells = [as_text(cell).strip() for cell in row]
     filled = [cell for cell in cells if cell and not NO_READING.fullmatch(cell)]
     lacking = sum(map(bool, cells)) - len(filled)
     worded = sum(not re.search(r"\d", cell) for cell in filled)
     alone = worded == 0 or (worded == 1 and (len(filled) > 1 or not unit_of(filled[0])))
-    return lacking >= LEAST_COLUMNS - 1 and alone and not _is_reading(row)
+    return lacking >= LEAST_COLUMNS - 1 and alone
 
 
 def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layout | None:
@@ -1585,10 +1594,10 @@ def _rows_among_readings(rows: Sequence[Cells]) -> set[int]:
     """Rows of statistics by a column that numbers the readings of a station: 1, 2, 3, mean."""
     statistics = set[int]()
     for column in zip_longest(*rows, fillvalue=""):
-        cells = [as_text(cell).strip() for cell in column]
-        places = {k for k, cell in enumerate(cells) if _SUMMARY.fullmatch(cell)}
-        others = [cell for k, cell in enumerate(cells) if k not in places]
-        if places and len(others) >= len(places) and all(map(_READING.fullmatch, others)):
+        texts = ((k, cell.strip()) for k, cell in enumerate(column) if isinstance(cell, str))
+        places = {k for k, text in texts if _SUMMARY.fullmatch(text)}
+        others = (as_text(cell).strip() for k, cell in enumerate(column) if k not in places)
+        if 0 < 2 * len(places) <= len(column) and all(map(_READING.fullmatch, others)):
             statistics |= places
     return statistics
 

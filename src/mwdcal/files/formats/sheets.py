@@ -19,6 +19,8 @@ from mwdcal.files.formats.layout import LEAST_COLUMNS, Cells, Sheet, is_units
 from mwdcal.sensor.profile import TableFormat
 
 DELIMITERS = (";", "\t", ",", "|")
+_FRAME = "!"
+"""What old programs draw between columns."""
 _BLANKS, _RUNS = "blanks", "runs of blanks"
 _LOOKED_AT = 400
 """Most lines that tell the delimiter of a text, and most characters that tell a page."""
@@ -78,9 +80,10 @@ def _plain(row: Cells) -> list[object]:
 def _delimited(lines: Sequence[str], source: str) -> tuple[str, list[tuple[int, Cells]]]:
     """The delimiter of a text by which most numbers show, and its rows by it."""
     looked_at = lines[:_LOOKED_AT]
-    marks = (*DELIMITERS, _RUNS, _BLANKS)
+    drawn = (*DELIMITERS, _FRAME)
+    marks = (*drawn, _RUNS, _BLANKS)
     counts = {mark: _numbers(_split(looked_at, mark, source)) for mark in marks}
-    best = max(DELIMITERS, key=lambda mark: counts[mark])
+    best = max(drawn, key=lambda mark: counts[mark])
     if 2 * counts[best] < max(counts.values()):  # blanks may stand within cells
         best = max(marks, key=lambda mark: counts[mark])
     cells = _split(lines, best, source)

@@ -8,10 +8,10 @@ import re
 import warnings
 import zipfile
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from itertools import takewhile
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 from xml.etree.ElementTree import iterparse
 from xml.parsers import expat
 
@@ -158,6 +158,8 @@ _TIMES = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ")
 _EXPECTED = "an Excel workbook (.xlsx)", "Save it again as .xlsx, or as CSV UTF-8."
 """The expected form of a damaged file, and the remedy."""
 LONGEST_CELL = 32_767
+_LARGEST_KEPT = 4_000_000
+"""Bytes of a workbook."""
 _MOST_DIGITS = 15
 _FORMULA = re.compile(rb"<(\w+:)?f[\s/>]")
 _MERGED = re.compile(
@@ -177,7 +179,7 @@ def parse(
 
     `serial` is the name of the column of serials, which are read as the workbook shows them.
     """
-    every = list(read_rows(data, source))
+    every = read_rows(data, source)
     rows = [row for row in every if form is None or _belongs(*row, form)]
     comments = list(takewhile(_is_comment, rows))
     table = rows[len(comments) :]
@@ -298,26 +300,74 @@ def _check_formulas(without: Mapping[str, str], source: str) -> None:
         )
 
 
-def read_rows(data: bytes, source: str) -> Iterator[Row]:
+def read_rows(data: bytes, source: str) -> Sequence[Row]:
     """Row numbers and cells of the first sheet, without blank cells at the end and blank rows."""
-    with _opened(data, source) as (archive, book):
-        page = book.worksheets[0]
-        yield from _rows(archive, page, source, _merged(archive, page))
+    page = _book(data, source).page(0)
+    _check_formulas(page.formulas, source)
+    return page.rows
 
 
 def read_sheets(data: bytes, source: str) -> Iterator[tuple[str, Iterator[Row], Merged, bool]]:
     """The names of all sheets, their rows as `read_rows` gives them, their merged cells, and whether each is hidden.
 
-    Each is to be read in turn. A formula without a value is its text, which is no number: it may stand in a column
-    that no one needs. A row that is struck out is one text.
+    A formula without a value is its text, which is no number: it may stand in a column that no one needs. A row that
+    is struck out is one text.
     """
-    with _opened(data, source) as (archive, book):
-        for page in book.worksheets:
-            merged = _merged(archive, page)
-            rows = _rows(archive, page, source, merged, as_text=True)
-            struck = _struck_out(archive, page._worksheet_path, book._fonts, book._cell_styles)
-            each = ((n, _as_one_text(row) if n in struck else row) for n, row in rows)
-            yield page.title, each, merged, page.sheet_state != "visible"
+    book = _book(data, source)
+    for place in range(book.count):
+        page = book.page(place)
+        each = ((n, _as_one_text(row) if n in page.struck else row) for n, row in page.rows)
+        yield page.title, each, page.merged, page.hidden
+
+
+class _ReadSheet(NamedTuple):
+    """A sheet: its name, rows, merged cells, formulas without a value, rows struck out, and whether it is hidden."""
+
+    title: str
+    rows: Sequence[Row]
+    merged: Merged
+    formulas: Mapping[str, str]
+    struck: Collection[int]
+    hidden: bool
+
+
+class _Book:
+    """A workbook that is small enough; each of its sheets is read once."""
+
+    def __init__(self, data: bytes, source: str) -> None:
+        openpyxl = _module(source)
+        with damaged_unless_read(source, *_EXPECTED), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            self._archive = zipfile.ZipFile(io.BytesIO(data))
+            check(self._archive, source)
+            self._book = openpyxl.load_workbook(io.BytesIO(data), read_only=True, data_only=True)
+        self.count = len(self._book.worksheets)
+        self._source = source
+        self._pages: dict[int, _ReadSheet] = {}
+
+    def page(self, place: int) -> _ReadSheet:
+        """The sheet at a place from 0."""
+        if place not in self._pages:
+            with damaged_unless_read(self._source, *_EXPECTED), warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                self._pages[place] = self._read(self._book.worksheets[place])
+        return self._pages[place]
+
+    def _read(self, page: Any) -> _ReadSheet:
+        path, book = page._worksheet_path, self._book
+        merged = _merged(self._archive, path)
+        formulas = _formulas_without_value(self._archive, path)
+        rows = list(_rows(page, merged, formulas))
+        struck = _struck_out(self._archive, path, book._fonts, book._cell_styles)
+        return _ReadSheet(page.title, rows, merged, formulas, struck, page.sheet_state != "visible")
+
+
+_last = lru_cache(maxsize=1)(_Book)
+
+
+def _book(data: bytes, source: str) -> _Book:
+    """A workbook; the last one is kept, unless it is large: a profile is proposed by all sheets and the first alone."""
+    return (_last if len(data) <= _LARGEST_KEPT else _Book)(data, source)
 
 
 def _as_one_text(row: Sequence[object]) -> Sequence[object]:
@@ -342,11 +392,11 @@ def _struck_out(
     return rows
 
 
-def _merged(archive: zipfile.ZipFile, page: Any) -> Merged:
+def _merged(archive: zipfile.ZipFile, sheet: str) -> Merged:
     """The merged cells of a sheet."""
     return [
         ((int(top), _place(first)), (int(bottom), _place(last)))
-        for first, top, last, bottom in _MERGED.findall(archive.read(page._worksheet_path))
+        for first, top, last, bottom in _MERGED.findall(archive.read(sheet))
     ]
 
 
@@ -356,36 +406,16 @@ def _place(letters: str | bytes) -> int:
     return sum((ord(x) - 64) * int(26**i) for i, x in enumerate(reversed(text))) - 1
 
 
-@contextmanager
-def _opened(data: bytes, source: str) -> Iterator[tuple[zipfile.ZipFile, Any]]:
-    """The archive of a workbook that is small enough, and the workbook."""
-    openpyxl = _module(source)
-    with (
-        damaged_unless_read(source, *_EXPECTED),
-        warnings.catch_warnings(),
-        zipfile.ZipFile(io.BytesIO(data)) as archive,
-    ):
-        warnings.simplefilter("ignore")
-        check(archive, source)
-        yield archive, openpyxl.load_workbook(io.BytesIO(data), read_only=True, data_only=True)
-
-
-def _rows(
-    archive: zipfile.ZipFile, page: Any, source: str, merged: Merged, *, as_text: bool = False
-) -> Iterator[Row]:
-    """Row numbers and cells of a sheet that are not blank; a formula without a value is refused, or its text."""
-    with damaged_unless_read(source, *_EXPECTED):
-        formulas = _formulas_without_value(archive, page._worksheet_path)
-        if not as_text:
-            _check_formulas(formulas, source)
-        by_row = _by_row(formulas)
-        page.reset_dimensions()
-        rows = enumerate(page.iter_rows(values_only=True), 1)
-        calculated = ((line, _with_formulas(row, by_row.get(line, {}))) for line, row in rows)
-        for line, row in with_merged(calculated, merged):
-            cells = _trimmed([_read(value) for value in row])
-            if cells:
-                yield line, cells
+def _rows(page: Any, merged: Merged, formulas: Mapping[str, str]) -> Iterator[Row]:
+    """Row numbers and cells of a sheet that are not blank; a formula without a value is its text."""
+    by_row = _by_row(formulas)
+    page.reset_dimensions()
+    rows = enumerate(page.iter_rows(values_only=True), 1)
+    calculated = ((line, _with_formulas(row, by_row.get(line, {}))) for line, row in rows)
+    for line, row in with_merged(calculated, merged):
+        cells = _trimmed([_read(value) for value in row])
+        if cells:
+            yield line, cells
 
 
 def _by_row(formulas: Mapping[str, str]) -> dict[int, dict[int, str]]:
