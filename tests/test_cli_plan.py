@@ -125,7 +125,7 @@ def test_a_search_keeps_to_what_the_stand_reaches(tmp_path):
     ).json
     with sheet.open(encoding="utf-8") as stream:
         rows = list(csv.DictReader(line for line in stream if not line.startswith("#")))
-    assert len(rows) == 12 + 1  # the first once more
+    assert len(rows) == 12
     assert {float(row["ref_azimuth_deg"]) for row in rows} == {0.0}
     assert max(float(row["ref_inclination_deg"]) for row in rows) <= 90
     free = mwdcal("plan", "--stations", 12, "--tool", "servo", "--json").json

@@ -80,8 +80,6 @@ class PlanResult(Result):
     def save(self, path: FilePath) -> None:
         """Write the plan to be filled in: a run file with blank readings (CSV, TSV, Parquet or XLSX).
 
-        It ends with the first station once more, to show drift, as the run sheet does.
-
         Raises:
             InputError: the file cannot be written.
         """

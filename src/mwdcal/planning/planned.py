@@ -28,7 +28,7 @@ from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.calibration.results import TWELFTHS, accuracy_at, angles, readings_at
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.problem import ANGLES
-from mwdcal.files.formats.table import Table
+from mwdcal.files.formats.table import Table, labels
 from mwdcal.geometry.vectors import Array, Bools, Ints
 from mwdcal.planning.expected import carried_out, expected, left_undetermined, planned_fit
 from mwdcal.planning.optimal import (
@@ -48,7 +48,6 @@ from mwdcal.planning.plans import (
     joined,
     load_plan,
     soak_numbers,
-    station_names,
     taken,
 )
 from mwdcal.sensor.profile import PRACTICES, Profile
@@ -573,6 +572,11 @@ def check_criterion(criterion: str) -> None:
         raise InputError(
             f"`criterion` must be one of {', '.join(CRITERIA)}; got {criterion!r}. Choose one of them."
         )
+
+
+def station_names(plan: Table) -> list[str]:
+    """The labels of the stations of a plan, their numbers where it has none."""
+    return labels(plan, "station") or [str(k + 1) for k in range(plan.count)]
 
 
 def _set_anew(profile: Profile) -> Profile:

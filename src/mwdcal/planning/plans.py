@@ -307,32 +307,8 @@ def attitudes(plan: Table) -> Array:
     return angles
 
 
-def station_names(plan: Table) -> list[str]:
-    """The labels of the stations of a plan, their numbers where it has none."""
-    return labels(plan, "station") or [str(k + 1) for k in range(plan.count)]
-
-
-def repeated(plan: Table) -> Table:
-    """A plan with the first station of its last soak once more at its end: what has changed since is drift.
-
-    Nothing is added where it ends at that attitude. The stations are labelled.
-    """
-    soak, columns = soak_numbers(plan), {"station": station_names(plan), **plan.columns}
-    first = int(np.flatnonzero(np.diff(soak, prepend=-1))[-1])
-    if np.array_equal(attitudes(plan)[first], attitudes(plan)[-1]):
-        return replace(plan, columns=columns)
-    for name, cells in columns.items():
-        again = cells[first]
-        if isinstance(cells, np.ndarray):
-            columns[name] = np.append(cells, again)
-        else:
-            columns[name] = [*cells, f"{again} again" if again else ""]
-    return replace(plan, columns=columns, lines=range(1, plan.count + 2))
-
-
 def run_sheet(plan: Table, magnetometer: bool = True) -> Table:
-    """The run file of a plan to be filled in: its stations, the first repeated, and blank readings and place."""
-    plan = repeated(plan)
+    """The run file of a plan to be filled in: its columns, and blank ones for readings and place."""
     raw = chain(*channels(magnetometer).values())
     head = {
         name: cells for name, cells in plan.columns.items() if name in ("station", "temperature_c")

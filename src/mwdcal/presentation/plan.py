@@ -18,8 +18,8 @@ from mwdcal.files.contract import CHANNELS, REFERENCES
 from mwdcal.files.formats.table import Table
 from mwdcal.geometry.vectors import Array, Ints, reference_vectors
 from mwdcal.planning.expected import left_undetermined, planned_earth
-from mwdcal.planning.planned import WORKING_INCLINATIONS, Planned
-from mwdcal.planning.plans import attitudes, repeated, soak_numbers, station_names
+from mwdcal.planning.planned import WORKING_INCLINATIONS, Planned, station_names
+from mwdcal.planning.plans import attitudes, soak_numbers
 from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.numbers import files_written, quantity
 from mwdcal.presentation.page import banner, rendered
@@ -406,7 +406,7 @@ SOAK_MARKERS = "os^Dv"
 def render(plans: Sequence[Planned], serial: str = "") -> str:
     """The sheet of the first plan for the tool of a serial, and the others beside it, as HTML."""
     first, summaries = plans[0], [facts(each) for each in plans]
-    titles, rows = _sheet(repeated(first.plan))
+    titles, rows = _sheet(first.plan)
     return rendered(
         "plan.html",
         plan=first.plan.source,
@@ -435,10 +435,18 @@ def render(plans: Sequence[Planned], serial: str = "") -> str:
 
 
 def _sheet(plan: Table) -> tuple[list[str], list[tuple[list[str], bool]]]:
-    """Titles and cells of the stations in order, as in the file, and where another soak begins."""
+    """Titles and cells of the stations in order, and where another soak begins.
+
+    The last row is the first station of the last soak again: what has changed since is drift.
+    """
     titles, rows = station_rows(plan)
+    if titles[0] != STATION_TITLES["station"]:
+        titles = [STATION_TITLES["station"], *titles]
+        rows = [[name, *row] for name, row in zip(station_names(plan), rows, strict=True)]
     begins = np.diff(soak_numbers(plan), prepend=soak_numbers(plan)[:1]) != 0
-    return titles, list(zip(rows, begins.tolist(), strict=True))
+    first, *others = rows[int(np.flatnonzero(begins)[-1]) if begins.any() else 0]
+    stations = [*rows, [f"{first} again", *others]]
+    return titles, list(zip(stations, [*begins.tolist(), False], strict=True))
 
 
 def _channels(calibration: Calibration) -> list[str]:
