@@ -28,6 +28,7 @@ from mwdcal.certificate.document import (
     Recalibration,
 )
 from mwdcal.files import verifications
+from mwdcal.presentation import certificate as presented
 from mwdcal.sensor.profile import MeasurementStandard
 from mwdcal.use.verification import JudgedSet, VerdictRow
 
@@ -464,6 +465,27 @@ def test_few_degrees_of_freedom_widen_the_guard_band_the_coverage_and_the_risk(s
     assert not wide.passed
     edge = replace(judged, value=wide.acceptance_limit)
     assert guarded.decision(edge).risk == pytest.approx(0.02275, abs=1e-5)
+
+
+def test_a_raw_figure_is_marked_and_has_no_uncertainty_beyond_its_limit(servo):
+    """t(95 %, 1) = 12.71 of a table: within the limit the U decides, beyond it 7.6° would say nothing of 1.3°."""
+    words = "curve at toolface 90°; raw figure judged: the readings leave a smooth curve by 6.5 × their noise"
+    raw = replace(row(1.3, 0.6, 1.0), note=words, raw=1.3, degrees_of_freedom=1.0, passed=False)
+    within = replace(raw, name="error of azimuth", value=0.7, raw=0.7, limit=1.0)
+    smooth = row(name="error of inclination")
+    test = verification(servo, raw, within, smooth, rule="guarded")
+    paper = issued(servo, verification=test)
+    beyond = paper.as_left.decisions[0]
+    assert beyond.quantity.expanded_uncertainty == pytest.approx(12.71 * 0.6, abs=0.01)
+    lines = [" ".join(line.split()) for line in presented.screen(paper, []).splitlines()]
+    assert any("inclination 1.30° 1.30° raw not stated 1° none FAIL" in line for line in lines)
+    assert any("azimuth 0.7° 0.7° raw 7.6° 1° none FAIL" in line for line in lines)
+    page = presented.render_page(paper)
+    assert "± 7.6°" in page
+    assert page.count("1.30° raw") == 2
+    assert "Marked raw" in page
+    usual = issued(servo, verification=verification(servo, smooth))
+    assert "Marked raw" not in presented.render_page(usual)
 
 
 def test_a_limit_that_cannot_be_judged_is_not_passed(servo):

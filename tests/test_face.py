@@ -4,6 +4,7 @@ import json
 import re
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -64,6 +65,21 @@ def test_a_verdict_and_a_diagnosis_say_what_the_commands_print(calibrated):
         assert result.summary() == shown.replace("   unsigned calibration", "")
         printed = command(name, path, EXAMPLE / "rolltest.csv", "--json").json
         same(result.to_dict(), printed, ("calibration_signature",))
+
+
+def test_a_verdict_has_the_corrected_roll_test_as_columns(calibrated):
+    made, *_ = calibrated
+    verdict = mwdcal.verify(made, EXAMPLE / "rolltest.csv")
+    corrected = mwdcal.apply(made, EXAMPLE / "rolltest.csv")
+    for name, values in corrected.columns.items():
+        np.testing.assert_array_equal(verdict.columns[name], values)
+    assert verdict.columns["sd_azimuth_deg"].min() > 0
+    shown = [row.azimuth_deg for row in verdict.station_rows]
+    np.testing.assert_allclose(verdict.columns["azimuth_deg"], shown)
+    pytest.importorskip("pandas")
+    assert verdict.to_pandas().equals(corrected.to_pandas())
+    with pytest.raises(mwdcal.InputError, match="read from a file has no columns"):
+        _ = msgspec.structs.replace(verdict).columns
 
 
 @pytest.mark.usefixtures("without_pictures")

@@ -324,4 +324,8 @@ def test_a_plan_from_a_calibration_is_at_its_place_and_temperature_and_says_what
     assert set(rows["ref_gravity_g"]) == {"0.997853497372"}
     sheet = (tmp_path / "sheet.html").read_text("utf-8")
     assert "<dd>0.997853</dd>" in sheet
+    assert "<dt>Serial</dt><dd>A</dd>" in sheet
+    more = mwdcal.plan("servo", stations=2, measured=run)
+    more.report(tmp_path / "more.html")
+    assert "<dt>Serial</dt><dd>A</dd>" in (tmp_path / "more.html").read_text("utf-8")
     assert "per direction / at every station" in sheet

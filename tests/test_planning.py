@@ -13,6 +13,7 @@ import pytest
 from msgspec.structs import replace as with_changes
 from scipy.stats import chi2
 
+import mwdcal as library
 from cli_support import mwdcal, read_csv, refused
 from mwdcal.calibration import results
 from mwdcal.calibration.diagnosis.detection import detections
@@ -26,7 +27,15 @@ from mwdcal.files.profiles import built_in, load_profile
 from mwdcal.geometry.vectors import reference_vectors
 from mwdcal.planning import planned
 from mwdcal.planning.expected import expected, nominal_run, planned_earth, planned_fit
-from mwdcal.planning.optimal import Design, Information, best, least_count, least_worst
+from mwdcal.planning.optimal import (
+    Design,
+    Information,
+    best,
+    evenly,
+    least_count,
+    least_worst,
+    typical_sd,
+)
 from mwdcal.planning.planned import (
     WORKING_INCLINATIONS,
     Stand,
@@ -674,11 +683,59 @@ def test_file_screen_and_sheet_have_one_order_and_the_sheet_repeats_the_first_st
     page = sheet.read_text("utf-8")
     rows = re.findall(r'<td class="tick"></td>' + r"<td>([^<]*)</td>" * 5, page)
     assert [list(row) for row in rows] == [*stations, ["1 again", *stations[0][1:]]]
+    assert page.count("not in the file: add it to the run's end under its own label, <i>1 ag") == 1
     assert re.findall(r"<th>([am][xyz], [^<]+)</th>", page) == [
         "ax, V", "ay, V", "az, V", "mx, raw", "my, raw", "mz, raw"
     ]  # fmt: skip
     blocks = [float(key) for key, _ in groupby(row[3] for row in stations)]
     assert sorted(blocks) != blocks != sorted(blocks, reverse=True)
+
+
+def test_the_last_row_shows_a_drift_that_the_inclinations_would_hide():
+    """All of 5°, then all of 90°: one of 0.5 mg along the tool axis over the run is found by the row."""
+    stand = Stand(reach={"inclination": (0, 90)})
+    plan = best_plan(None, 24, SERVO, criterion="I", stand=stand).plan
+    found = dict.fromkeys((24, 25), 0)
+    for stations in (plan, taken(plan, np.append(np.arange(24), 0))):
+        for seed in range(4):
+            run = library.simulate(stations, SERVO, seed=seed)
+            drifting = run.accelerometer.copy()
+            drifting[:, 2] += 0.5e-3 * np.linspace(-0.5, 0.5, run.count)
+            made = library.calibrate(replace(run, accelerometer=drifting), SERVO)
+            found[run.count] += "accelerometer-drift" in {each.id for each in made.findings}
+    assert found[24] <= 1
+    assert found[25] >= 3
+
+
+def test_a_plan_of_few_inclinations_says_why_and_what_more_would_cost(tmp_path):
+    """The figure is that of the angles of a plan with six stations at each of four inclinations."""
+    sheet = tmp_path / "sheet.html"
+    line = ("plan", "--stations", 24, "--tool", "servo")
+    ran = mwdcal(*line, "--reach", "inclination=0:90", "--report", sheet)
+    said = next(each for each in ran.out.splitlines() if each.startswith("Only "))
+    assert said.startswith("Only 5° and 90° of 4 inclinations to choose from")
+    assert "not linear along the tool axis" in said
+    assert said in sheet.read_text("utf-8")
+    cost = float(re.search(r"([\d.]+) times the 1σ of the angles", said)[1])
+    assert 1.0 < cost < 1.2
+    assert "\nOnly " not in mwdcal(*line).out  # six of seven
+    three = mwdcal(*line, "--reach", "inclination=0:120", "--criterion", "D").out
+    assert "Only 5°, 90° and 120° of 5" in three
+    assert "times the 1σ of the parameters.\n" in three
+
+
+def test_an_even_plan_is_even_and_no_better_than_the_best():
+    """Straight line by 8 of 3 × 8 places: at the ends 1, evenly sqrt(3/2) of the slope (by hand); D is between."""
+    information, x = regression((0, 1), (-1, 0, 1), repeated=8)
+    ends = best(information, 6).members
+    assert set(x[ends]) == {-1, 1}
+    even = evenly(information, ends, None, x.astype(int) + 1)
+    assert np.bincount(x[even].astype(int) + 1).tolist() == [2, 2, 2]
+    ratio = typical_sd(information, even, None) / typical_sd(information, ends, None)
+    assert ratio == pytest.approx(1.5**0.25)
+    slope = np.diag([0.0, 1.0])
+    ratio = typical_sd(information, even, slope) / typical_sd(information, ends, slope)
+    assert ratio == pytest.approx(1.5**0.5)
 
 
 def test_the_screen_says_what_is_assumed_and_how_long_the_soak_is(tmp_path):

@@ -274,6 +274,9 @@ def test_a_raw_figure_beyond_its_limit_has_a_gauge_without_uncertainty(whole):
     met = replace(row, value=0.05, uncertainty=0.006, passed=True)
     *_, azimuth = calibration_page._gauges(whole, Outcome(True, [met]), None)
     assert azimuth.shown == "0.050 ± 0.076° raw"  # t(95 %, 1) = 12.71 of a table
+    guarded = replace(met, value=0.07, passed=False)  # U alone makes it fail
+    *_, azimuth = calibration_page._gauges(whole, Outcome(False, [guarded]), None)
+    assert azimuth.shown == "0.070 ± 0.076° raw"
 
 
 def test_every_limit_that_is_not_met_has_a_gauge(whole):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, Unpack, cast
 import numpy as np
 
 from mwdcal.calibration.options import FitChoices, Options
-from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.readings import Readings, serial_of
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import FitError, InputError
 from mwdcal.files import documents, runs
@@ -46,6 +46,7 @@ class PlanResult(Result):
     plans: Sequence[Planned]
     digests: Mapping[str, str]
     files: dict[str, Path] = field(default_factory=dict)
+    serial: str = ""
 
     @property
     def table(self) -> Table:
@@ -114,7 +115,7 @@ class PlanResult(Result):
     def _page(self) -> str:
         from mwdcal.presentation.plan import render
 
-        return render(self.plans)
+        return render(self.plans, self.serial)
 
 
 PlanSource = Tabular | PlanResult
@@ -191,7 +192,14 @@ def plan(
         for each in tables or [plan_table("twenty-four-state")]:
             result.append(planned.judged(each, profile, chosen, stand))
             progress(len(result), len(tables))
-    return PlanResult(result, {"profile": digest, "measured": done.digest if done else ""})
+    digests = {"profile": digest, "measured": done.digest if done else ""}
+    return PlanResult(result, digests, serial=_serial(tool, done))
+
+
+def _serial(tool: object, done: Table | None) -> str:
+    """The serial of the tool by its calibration, else by the run that is measured already; blank where unknown."""
+    stated = [tool.tool] if isinstance(tool, Calibration) else [done.metadata] if done else []
+    return next(filter(None, map(serial_of, stated)), "")
 
 
 def _check_wanted(stations: int | None, accuracy_deg: Mapping[str, float]) -> None:

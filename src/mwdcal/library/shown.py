@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
+
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration, html_table
 from mwdcal.comparison.compare import Comparison
@@ -25,6 +27,7 @@ from mwdcal.logs.noise import Noise
 from mwdcal.logs.stations import Stations
 from mwdcal.presentation.text import to_json
 from mwdcal.sensor.profile import NOMINAL
+from mwdcal.use.correction import tallied
 from mwdcal.use.verification import Verdict
 
 _Shown = TypeVar("_Shown")
@@ -37,16 +40,18 @@ class Inputs(NamedTuple):
     metadata: tuple[Mapping[str, object], ...] = ()
     digests: Mapping[str, str] = {}
     calibration: Calibration | None = None
+    test: Readings | None = None
 
 
 def with_inputs(
     result: _Shown,
     *metadata: Mapping[str, object],
     of: Calibration | None = None,
+    test: Readings | None = None,
     **digests: str,
 ) -> _Shown:
-    """A result that knows its inputs, and the calibration that its page shows; equal to the one without."""
-    result.__dict__[_INPUTS] = Inputs(metadata, digests, of)
+    """A result that knows its inputs, the calibration and the roll test that it shows; equal to the one without."""
+    result.__dict__[_INPUTS] = Inputs(metadata, digests, of, test)
     return result
 
 
@@ -63,7 +68,7 @@ def _inputs(result: Any) -> Inputs:
 def _enveloped(command: str, result: Any, content: object) -> dict[str, Any]:
     from mwdcal.presentation.envelope import json_document
 
-    metadata, digests, _ = _inputs(result)
+    metadata, digests, *_ = _inputs(result)
     return json_document(command, content, *metadata, **digests)
 
 
@@ -98,12 +103,32 @@ def _verdict_document(verdict: Verdict) -> dict[str, Any]:
 def _verdict_page(verdict: Verdict) -> str:
     from mwdcal.presentation.calibration_page import render
 
-    metadata, _, calibration = _inputs(verdict)
+    metadata, _, calibration, _ = _inputs(verdict)
     if calibration is None:
         raise InputError(
             "a verdict read from a file has no page. Verify again by mwdcal.verify(…)."
         )
     return render(calibration, verdict, *metadata)
+
+
+def _verdict_columns(verdict: Verdict) -> dict[str, AnyArray]:
+    """The stations of the roll test, corrected by the calibration, with 1σ, by the names of `apply`."""
+    *_, calibration, test = _inputs(verdict)
+    if calibration is None or test is None:
+        raise InputError(
+            "a verdict read from a file has no columns. Verify again by mwdcal.verify(…)."
+        )
+    corrected, _ = tallied(calibration, test, "blank", uncertainty=True)
+    return {**stations_of(test), **corrected}
+
+
+def stations_of(readings: Readings) -> dict[str, AnyArray]:
+    """Labels and temperatures of the rows of one run, where it has them."""
+    if readings.accelerometer.ndim != 2:
+        return {}
+    labels = {"station": np.array(readings.station)} if readings.station else {}
+    warmth = readings.temperature
+    return labels | ({} if warmth is None else {"temperature_c": np.asarray(warmth, float)})
 
 
 def _diagnosis_text(diagnosis: Diagnosis) -> str:
@@ -119,7 +144,7 @@ def _diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
 def _diagnosis_page(diagnosis: Diagnosis) -> str:
     from mwdcal.presentation.diagnosis import render
 
-    metadata, digests, _ = _inputs(diagnosis)
+    metadata, digests, *_ = _inputs(diagnosis)
     return render(diagnosis, digests, *metadata)
 
 
@@ -192,6 +217,11 @@ def _to_pandas(readings: Readings) -> Any:
     return frame(readings.columns, readings.metadata)
 
 
+def _verdict_to_pandas(verdict: Verdict) -> Any:
+    """The columns as a table of pandas, which must be installed."""
+    return frame(verdict.columns)
+
+
 @dataclass(frozen=True)
 class VerdictFile:
     """A verdict as the file that `verify` writes of it."""
@@ -252,6 +282,8 @@ def _readings_html(readings: Readings) -> str:
 Readings._repr_html_ = _readings_html  # type: ignore[attr-defined]
 Readings.columns = property(_columns)  # type: ignore[assignment]
 Readings.to_pandas = _to_pandas  # type: ignore[attr-defined]
+Verdict.columns = property(_verdict_columns)  # type: ignore[assignment]
+Verdict.to_pandas = _verdict_to_pandas
 _show(Calibration, _calibration_text, _calibration_document, _calibration_page)
 _show(Verdict, _verdict_text, _verdict_document, _verdict_page)
 _show(Diagnosis, _diagnosis_text, _diagnosis_document, _diagnosis_page)

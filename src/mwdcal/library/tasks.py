@@ -31,7 +31,7 @@ from mwdcal.geometry.vectors import AnyArray, Array
 from mwdcal.library.answers import Said, by_column
 from mwdcal.library.arrays import nearest, readings, without_mask
 from mwdcal.library.results import arrays_of, brief, frame
-from mwdcal.library.shown import digest_of, with_inputs
+from mwdcal.library.shown import digest_of, stations_of, with_inputs
 from mwdcal.logs.noise import Noise, find_noise
 from mwdcal.logs.stations import Stations, find_stations
 from mwdcal.sensor.profile import NOMINAL as NOMINAL
@@ -330,7 +330,9 @@ def verify(
     verdict = msgspec.structs.replace(verdict, findings=findings)
     digests = {"calibration": digest_of(calibration), "limits": digest}
     stated = calibration.tool, rolltest.metadata
-    return with_inputs(verdict, *stated, of=calibration, run=rolltest.run_sha256, **digests)
+    return with_inputs(
+        verdict, *stated, of=calibration, test=rolltest, run=rolltest.run_sha256, **digests
+    )
 
 
 def diagnose(
@@ -432,17 +434,8 @@ def apply(
         **{name: np.radians(columns[f"{name}_deg"]) for name in CORRECTED_ANGLES},
         columns=columns,
         findings=findings,
-        stations=_stations_of(survey),
+        stations=stations_of(survey),
     )
-
-
-def _stations_of(survey: Readings) -> dict[str, AnyArray]:
-    """Labels and temperatures of the rows of one run, where it has them."""
-    if survey.accelerometer.ndim != 2:
-        return {}
-    labels = {"station": np.array(survey.station)} if survey.station else {}
-    warmth = survey.temperature
-    return labels | ({} if warmth is None else {"temperature_c": np.asarray(warmth, float)})
 
 
 @runtime_checkable

@@ -33,6 +33,8 @@ WEIGHT_STEPS = 300
 """Steps at most by which the weights of the bound are improved."""
 CLOSE = 2e-3
 """The bound on the D-value per parameter is looked for to this share of it."""
+ROUNDS = 3
+"""Times that the stations of each group are chosen anew."""
 GAIN = 1e-9
 """Smallest improvement of a criterion that counts."""
 LITTLE = 1e-6
@@ -253,6 +255,29 @@ def _slopes(information: Information, whole: Array) -> Array:
 def _squares(rows: Array, whole: Array) -> Array:
     """Trace (n,) of R M⁻¹ Rᵀ for the rows of each candidate."""
     return np.asarray(np.sum(rows @ inverse(whole) * rows, (-2, -1)))
+
+
+def evenly(information: Information, members: Bools, wanted: Array | None, group: Ints) -> Bools:
+    """As many good candidates (n,) as `members`, of each group (n,) as many as of the others.
+
+    Method: those of one group after the other are chosen anew, as the best beside the others.
+    """
+    taken, sizes = members.copy(), np.bincount(group)
+    each, more = divmod(np.count_nonzero(members), len(sizes))
+    for place in ROUNDS * list(range(len(sizes))):
+        inside = group == place
+        others = information.of((taken & ~inside).astype(np.float64))
+        part = replace(information, rows=information.rows[inside], prior=others)
+        taken[inside] = best(part, min(each + (place < more), sizes[place]), wanted).members
+    return taken
+
+
+def typical_sd(information: Information, members: Bools, wanted: Array | None) -> float:
+    """The 1σ that a criterion is about, in a unit of its own: of all parameters, or the root of tr(W V)."""
+    if wanted is None:
+        whole = information.of(members.astype(np.float64))
+        return float(np.exp(-_log_det(whole, information.size) / (2 * information.size)))
+    return float(np.sqrt(variances(information, members, wanted[None])[0]))
 
 
 WEIGHINGS = 8

@@ -31,7 +31,16 @@ from mwdcal.estimation.problem import ANGLES
 from mwdcal.files.formats.table import Table, labels
 from mwdcal.geometry.vectors import Array, Bools, Ints
 from mwdcal.planning.expected import carried_out, expected, left_undetermined, planned_fit
-from mwdcal.planning.optimal import Design, Information, best, exchanged, least_count, least_worst
+from mwdcal.planning.optimal import (
+    Design,
+    Information,
+    best,
+    evenly,
+    exchanged,
+    least_count,
+    least_worst,
+    typical_sd,
+)
 from mwdcal.planning.plans import (
     at_place,
     at_temperatures,
@@ -179,10 +188,25 @@ LEAP = 50
 """A search for the smallest plan adds one station at a time, beyond this many a share of one in as many."""
 MOST_SEARCHED = 1_000_000
 """Product of stations and candidates in a search: a minute."""
+FEW_LEVELS = 3
+"""So many inclinations are few."""
 OUT_NAMED = 5
 """Stations out of reach that are named."""
 CRITERIA = ("D", "A", "I")
 """Aim of a best plan: all parameters together, each of them, the angles."""
+
+
+@dataclass(frozen=True)
+class Levels:
+    """The few inclinations of a best plan, of those that the candidates have, degrees.
+
+    `cost`: how many times its 1σ, by its `criterion`, as many stations have that are evenly at all of them.
+    """
+
+    used: list[float]
+    offered: list[float]
+    criterion: str
+    cost: float
 
 
 @dataclass(frozen=True)
@@ -194,7 +218,7 @@ class Planned:
     freedom of each triad's s, and `detections` (1, n) the errors of one station that `calibrate` will report, those
     `measured` already before the plan's. No plan of fewer than `bound` stations gives the wanted accuracy, if one is;
     `search` says what the search has to say. `set_anew` works out the calibration on a stand that is set at every
-    station.
+    station, `compared` the inclinations of a best plan, if they are few.
     """
 
     plan: Table
@@ -208,6 +232,7 @@ class Planned:
     measured: int = 0
     bound: int | None = None
     search: list[Finding] = field(default_factory=list)
+    compared: Callable[[], Levels | None] = lambda: None
 
     @classmethod
     def of(
@@ -524,9 +549,21 @@ class Search:
         plan = replace(chosen, source=f"Best {count}", metadata=stated)
         whole = taken(self.plan, np.append(design.chosen[: self.before], new))
         options = replace(self.options or Options(), order=self.choice.options.order)
-        return Planned.of(
+        result = Planned.of(
             plan, whole, self.profile, options, design.efficiency, self.stand, self.before
         )
+        return replace(result, compared=partial(self._levels, design.members))
+
+    def _levels(self, members: Bools) -> Levels | None:
+        """The inclinations of a plan and the cost of more of them, where they are few and there are more."""
+        offered, group = np.unique(attitudes(self.plan)[:, 0], return_inverse=True)
+        used, count = np.unique(group[members]), np.count_nonzero(members)
+        if self.before or len(used) > FEW_LEVELS or not len(used) < len(offered) <= count:
+            return None
+        wanted = self.wanted[self.criterion]
+        even = evenly(self.information, members, wanted, group)
+        least, spread = (typical_sd(self.information, some, wanted) for some in (members, even))
+        return Levels(offered[used].tolist(), offered.tolist(), self.criterion, spread / least)
 
 
 def check_criterion(criterion: str) -> None:

@@ -194,7 +194,7 @@ def _gauges(
 
 def _judged(row: VerdictRow) -> AngleGauge:
     """The gauge of a limit that was tested; a raw figure beyond it has no ±, as its scatter is not noise."""
-    beyond = row.judged_raw and not row.passed
+    beyond = row.judged_raw and row.value is not None and row.value > row.limit
     known = row.uncertainty is not None and not beyond
     expanded = coverage_of(row.freedom) * (row.uncertainty or 0.0) if known else None
     shown = "not stated" if row.value is None else estimate(row.value, expanded, row.unit)

@@ -47,9 +47,10 @@ from mwdcal.presentation.numbers import (
 from mwdcal.presentation.numbers import quantity as in_unit
 from mwdcal.presentation.page import environment, picture, require
 from mwdcal.presentation.text import NOT_STATED, chance, escape_controls, one_line, plural, table
-from mwdcal.presentation.verification import VERDICT_RISK
+from mwdcal.presentation.verification import RAW_RULE, VERDICT_RISK
 from mwdcal.sensor.profile import Person
 from mwdcal.use import plots as plots
+from mwdcal.use.roll_test import RAW_JUDGED
 from mwdcal.use.verification import Verdict
 
 if TYPE_CHECKING:
@@ -177,17 +178,35 @@ def _test(test: ConformityTest) -> str:
 
 def _decision(decision: LimitDecision) -> list[str]:
     quantity = decision.quantity
-    value, _, expanded = quantity_numbers(quantity)
+    value, expanded = _judged(decision)
     limits = (decision.limit, decision.acceptance_limit)
     shown = [in_unit(limit, quantity.unit) for limit in limits]
-    raw = (
-        NOT_STATED
-        if decision.raw is None
-        else measured(decision.raw, quantity.expanded_uncertainty)[0] + unit(quantity.unit)
-    )
+    shown[1] = "none" if _accepts_none(decision) else shown[1]
     verdict = "pass" if decision.passed else "FAIL"
     chances = [chance(p) for p in (decision.probability_within, decision.risk)]
-    return [quantity.name, raw, value, expanded, *shown, verdict, *chances]
+    return [quantity.name, _raw(decision), value, expanded, *shown, verdict, *chances]
+
+
+def _judged(decision: LimitDecision) -> tuple[str, str]:
+    """The figure that was judged and its U, which a raw figure beyond its limit has not: its scatter is no noise."""
+    quantity = decision.quantity
+    value, _, expanded = quantity_numbers(quantity)
+    if not _is_raw(decision):
+        return value, expanded
+    if quantity.value is not None and quantity.value > decision.limit:
+        value = measured(quantity.value, quantity.standard_uncertainty)[0] + unit(quantity.unit)
+        expanded = NOT_STATED
+    return f"{value} raw", expanded
+
+
+def _accepts_none(decision: LimitDecision) -> bool:
+    """Whether the guard band is wider than the limit, so that no value is accepted."""
+    return decision.acceptance_limit is not None and decision.acceptance_limit < 0
+
+
+def _is_raw(decision: LimitDecision) -> bool:
+    """Whether the raw figure was judged, as the readings are not smooth over toolface."""
+    return RAW_JUDGED in decision.note
 
 
 def _budget(budget: Budget) -> str:
@@ -545,7 +564,7 @@ def _limits(test: ConformityTest) -> TableBlock:
     ]
     rows = []
     for each in test.decisions:
-        value, _, expanded = quantity_numbers(each.quantity)
+        value, expanded = _judged(each)
         passed = Cell(["PASS" if each.passed else "FAIL"], "good" if each.passed else "bad")
         limit = plain(each.limit) + unit(each.quantity.unit)
         rows.append(
@@ -554,13 +573,25 @@ def _limits(test: ConformityTest) -> TableBlock:
     covered = _coverages([each.quantity for each in test.decisions])
     noted = f"Roll test of {test.date or 'a day that is not stated'}, {test.stations} stations. "
     meant = "Raw: with the noise of the readings in it; the noise-free value is judged"
-    return TableBlock(columns, rows, capital(test.when), notes=[f"{noted}{meant}; U: {covered}."])
+    notes = [f"{noted}{meant}; U: {covered}.", *_raw_rule([test])]
+    return TableBlock(columns, rows, capital(test.when), notes=notes)
+
+
+def _raw_rule(tests: Sequence[ConformityTest]) -> list[str]:
+    """The note on raw figures that were judged, if there are any."""
+    said = (
+        f"{RAW_RULE}. Its U has the few degrees of freedom of this scatter, hence a large k; beyond its limit it has "
+        "no U, as this scatter is not noise."
+    )
+    return [said] * any(_is_raw(each) for test in tests for each in test.decisions)
 
 
 def _raw(decision: LimitDecision) -> str:
     """The figure with the noise in it, to the digits of the value."""
     if decision.raw is None:
         return NOT_STATED
+    if _is_raw(decision):
+        return _judged(decision)[0].removesuffix(" raw")
     shown = measured(decision.raw, decision.quantity.expanded_uncertainty)[0]
     return shown + unit(decision.quantity.unit)
 
@@ -641,21 +672,19 @@ def _decision_cells(decision: LimitDecision | None, guarded: bool) -> list[Cell]
     """Cells of one decision: value, acceptance limit, decision, probability and risk."""
     if decision is None:
         return [Cell(["–"])] * (4 if guarded else 3)
-    value, _, expanded = quantity_numbers(decision.quantity)
+    value, expanded = _judged(decision)
+    unknown = expanded in (UNDETERMINED, NOT_STATED)
     within, risk = decision.probability_within, decision.risk
     odds = [
         NOT_STATED if within is None else probability(within),
         f"risk {NOT_STATED if risk is None else chance(risk)}",
     ]
-    shown = [f"± {expanded}"] if decision.quantity.expanded_uncertainty is not None else []
     symbol, most = unit(decision.quantity.unit), decision.acceptance_limit
-    accepted = (
-        NOT_STATED
-        if most is None
-        else measured(most, decision.quantity.expanded_uncertainty)[0] + symbol
-    )
+    accepted = "none" if _accepts_none(decision) else NOT_STATED
+    if most is not None and most >= 0:
+        accepted = measured(most, decision.quantity.expanded_uncertainty)[0] + symbol
     return [
-        Cell([value, *(shown or [f"U {NOT_STATED}"])]),
+        Cell([value, f"U {NOT_STATED}" if unknown else f"± {expanded}"]),
         *([_cell(accepted)] if guarded else []),
         Cell(["PASS" if decision.passed else "FAIL"], "good" if decision.passed else "bad"),
         Cell(odds if within is not None or risk is not None else [NOT_STATED]),
@@ -674,6 +703,7 @@ def _decision_notes(tests: Sequence[ConformityTest]) -> list[str]:
         "values that are not rounded. P within: probability that the true value is within the limit, given "
         "the value and its uncertainty; risk: of a wrong decision."
     ]
+    notes += _raw_rule(tests)
     notes += [f"{capital(when)}, {d.quantity.name}: {d.note}" for when, d in each if d.note]
     return notes
 

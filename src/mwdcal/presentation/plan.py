@@ -256,7 +256,8 @@ def screen(
         one_line(head),
         table(comparison_rows(summaries), ["", *(one_line(each.plan) for each in summaries)]),
     ]
-    blocks += filter(None, ["\n".join([*_assumed(plans[0]), *_practice(summaries)])])
+    lines = [*_assumed(plans[0]), *_practice(summaries), *_inclinations(plans[0])]
+    blocks += filter(None, ["\n".join(lines)])
     if len(plans) == 1:
         blocks += [accuracy(summaries[0]), detectable(summaries[0]), stations(plans[0])]
     if output or html:
@@ -279,6 +280,23 @@ def _assumed(planned: Planned) -> list[str]:
 def _practice(facts: Sequence[PlanSummary]) -> list[str]:
     """The assumption on the stand's settings as a line, if there is one."""
     return [ASSUMED] if any(each.settings == ASSUMED_PRACTICE for each in facts) else []
+
+
+def _inclinations(planned: Planned) -> list[str]:
+    """Why a best plan has few inclinations, and the cost of more, as a line, if it has."""
+    levels = planned.compared()
+    if levels is None:
+        return []
+    *others, last = [f"{each:g}°" for each in levels.used]
+    used = f"{', '.join(others)} and {last}" if others else last
+    aim = "the angles" if levels.criterion == "I" else "the parameters"
+    bent = " They would also show an accelerometer that is not linear along the tool axis."
+    more = bent if len(levels.used) <= 2 else ""
+    return [
+        f"Only {used} of {len(levels.offered)} inclinations to choose from: stations tell most where readings differ "
+        f"most. As many stations evenly at all {len(levels.offered)} have {levels.cost:.2f} times the 1σ of {aim}."
+        f"{more}"
+    ]
 
 
 def _is_blank(plan: Table, name: str) -> bool:
@@ -385,14 +403,15 @@ SOAK_MARKERS = "os^Dv"
 """Markers of stations by soak."""
 
 
-def render(plans: Sequence[Planned]) -> str:
-    """The sheet of the first plan, and the others beside it, as HTML."""
+def render(plans: Sequence[Planned], serial: str = "") -> str:
+    """The sheet of the first plan for the tool of a serial, and the others beside it, as HTML."""
     first, summaries = plans[0], [facts(each) for each in plans]
     titles, rows = _sheet(first.plan)
     return rendered(
         "plan.html",
         plan=first.plan.source,
         profile=first.calibration.profile.name,
+        serial=serial,
         summary=summaries[0],
         banner=_banner(first),
         findings=[*left_undetermined(first.calibration), *first.findings],
@@ -406,6 +425,7 @@ def render(plans: Sequence[Planned]) -> str:
         asks_settings=not first.calibration.profile.stand.practice,
         compared=comparison_rows(summaries),
         plans=[each.plan for each in summaries],
+        inclinations=_inclinations(first),
         accuracy=accuracy_rows(summaries[0]),
         detectable=detectable_rows(summaries[0]),
         detectable_titles=DETECTABLE_TITLES,

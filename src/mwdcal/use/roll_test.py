@@ -115,6 +115,8 @@ CARRIED = 2.0
 """Largest standard uncertainty of the curve anywhere on the circle, in noises of one reading."""
 DEPARTURE_CHANCE = 1e-3
 """Residuals from the curve that are less likely than this are not noise alone."""
+RAW_JUDGED = "raw figure judged"
+"""The remark on a figure whose residuals are not: nothing is taken off it."""
 UNLIMITED = np.inf
 """Degrees of freedom of a noise that was declared, not estimated."""
 CLOSED_FORM = 100
@@ -955,9 +957,7 @@ class RollTest:
         where = f"{roll_set.label}; curve at toolface{at}"
         if curve.rough(noise.known):
             left = float(f"{curve.scale:.2g}")
-            where += (
-                f"; raw figure judged: the readings leave a smooth curve by {left:g} × their noise"
-            )
+            where += f"; {RAW_JUDGED}: the readings leave a smooth curve by {left:g} × their noise"
         if not error:
             curve, middle = about_middle(curve)
             part = part - middle

@@ -17,7 +17,7 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import MARGIN, Calibration, Finding, html_table, stated
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
-from mwdcal.geometry.vectors import Array, eigen
+from mwdcal.geometry.vectors import AnyArray, Array, eigen
 from mwdcal.use.correction import UNKNOWN_TEMPERATURE
 from mwdcal.use.roll_test import (
     DEPARTURE_CHANCE,
@@ -323,6 +323,9 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     summary: ClassVar[Callable[..., str]]
     to_dict: ClassVar[Callable[..., dict[str, Any]]]
     """As of `Calibration`."""
+    columns: ClassVar[dict[str, AnyArray]]
+    """The corrected stations with 1σ, by the names of `apply`; not of a verdict read from a file."""
+    to_pandas: ClassVar[Callable[..., Any]]
 
     @property
     def left_open(self) -> str:
