@@ -17,7 +17,7 @@ from mwdcal.errors import FitError
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.title_references import references_in
 from mwdcal.files.formats.titles import titles
-from mwdcal.identification.columns import is_numbering
+from mwdcal.identification.columns import is_numbering, meanings_of
 from simulation import Tool, plan
 
 NAMES = {
@@ -1278,3 +1278,38 @@ def test_rows_below_a_heading_of_a_roll_test_are_none_of_the_run(tmp_path, headi
     lines = path.read_text().splitlines()
     path.write_text("\n".join([*lines, "", heading, lines[0], *lines[1:13]]))
     assert len(read(path)) == len(lines) - 1
+
+
+def test_channels_by_axes_in_turn_are_told_by_the_readings(tmp_path):
+    """Acc, Mag, Acc, Mag: each second column, in whatever words."""
+    columns, turned = mixed(table()), {}
+    for axis in "xyz":
+        turned |= {f"Voie {axis} ga": columns.pop(f"G{axis} (V)")}
+        turned |= {f"Voie {axis} ma": columns.pop(f"H{axis} (V)")}
+    run = read(written(tmp_path / "a.csv", {**turned, **columns}))
+    plain = read(written(tmp_path / "b.csv", mixed(table())))
+    np.testing.assert_array_equal(run.accelerometer, plain.accelerometer)
+    np.testing.assert_array_equal(run.magnetometer, plain.magnetometer)
+
+
+def test_three_names_of_one_stem_and_a_unit_of_one_triad_are_its_channels():
+    names = ["acx mg", "acy mg", "acz mg", "Kolbo-x [nT]", "Kolbo-y [nT]", "Kolbo-z [nT]"]
+    found = {name: m.column for name, m in meanings_of(names, [""] * len(names)).items()}
+    assert found == dict(zip(names, ("ax", "ay", "az", "mx", "my", "mz"), strict=True))
+    others = ["Density g", "Delta x g", "Delta y g", "Delta z g"]
+    assert not meanings_of(others, [""] * len(others))
+
+
+def test_drift_is_the_inclination_where_no_other_column_is(tmp_path):
+    columns = {("DRIFT" if n == "Inc (deg)" else n): v for n, v in table().items()}
+    assert (
+        library.propose_profile(written(tmp_path / "a.csv", columns))
+        .profile.columns["ref_inclination_deg"]
+        .name
+        == "DRIFT"
+    )
+
+
+def test_a_reference_standard_is_no_standard_deviation():
+    stated = references_in([["Ref. std.: g = 978.86 Gal, F = 459.2 mGauss"]])
+    assert stated == pytest.approx({"ref_gravity_g": 9.7886 / 9.80665, "ref_field_nt": 45_920.0})

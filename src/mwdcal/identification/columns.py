@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from itertools import combinations
 from typing import Any
@@ -142,7 +142,7 @@ def is_numbering(values: Array) -> bool:
     steps = np.diff(values)
     usual = float(np.median(steps)) if steps.size else 0.0
     back = steps * usual < 0
-    turns = back.any() and abs(np.ptp(values) + abs(usual) - 360) <= abs(usual)
+    turns = back.any() and abs(usual) != 1  # numbers that begin anew count by ones
     return usual != 0.0 and not turns and float(np.isclose(steps, usual).mean()) > _REGULAR
 
 
@@ -192,8 +192,7 @@ def triples_for(
     """
     numbers = {n: v for n in names if (v := values(n)) is not None and np.isfinite(v).all()}
     triples = []
-    for place in range(len(numbers) - 2):
-        three = [*numbers][place : place + 3]
+    for three in _neighbours([*numbers]):
         columns = np.stack([numbers[n] for n in three], -1)
         spread = np.ptp(columns, axis=0)
         if spread.min() > 0:
@@ -208,6 +207,13 @@ def triples_for(
         ]
         if variation <= most * largest
     ]
+
+
+def _neighbours(names: Sequence[str]) -> Iterator[Sequence[str]]:
+    """Every three columns side by side, then every three of which each second one is left out: Acc, Mag, Acc, Mag."""
+    for step in (1, 2):
+        for place in range(len(names) - 2 * step):
+            yield names[place : place + 2 * step + 1 : step]
 
 
 def _variation(columns: Array) -> float:
@@ -517,16 +523,15 @@ def _elevation(name: str, plain: str, unit: str) -> Resemblance | None:
 def _by_axis_and_unit(name: str, unit: str) -> Resemblance | None:
     """The channel that a name in whatever words is by its axis and a unit that one triad alone has."""
     axes = _LONE_AXIS.findall(IN_BRACKETS.sub("", name))
-    kinds = {"g": "a", "mg": "a", "m/s²": "a", "nT": "m", "µT": "m", "gauss": "m", "mG": "m"}
     known = unit_of(spelled(unit))
     if (
         len(axes) != 1
-        or known not in kinds
+        or known not in _OF_UNITS
         or unit.strip() in ("G", "mG")
         or _CALLED_REFERENCE.search(spelled(name))
     ):
         return None
-    return Resemblance(f"{kinds[known]}{axes[0].lower()}", known)
+    return Resemblance(f"{_OF_UNITS[known]}{axes[0].lower()}", known)
 
 
 def _bare(name: str, level: re.Match[str]) -> str:
@@ -601,6 +606,7 @@ def meanings_of(
     results |= _beside_nominal(names, units, results)
     results |= _beside_tool(names, units, results)
     results |= _beside_others(names, units, results)
+    results |= _by_axes(names, units, results)
     every = [n for n, m in results.items() if m.column == "az"]
     lone = [n for n in every if _BARE_AZ.fullmatch(n)]
     triad = [n for n in every if n not in lone[:1]] or any(_BARE_AX.fullmatch(n) for n in names)
@@ -653,6 +659,34 @@ def _beside_others(
     return results
 
 
+def _by_axes(
+    names: Sequence[str], units: Sequence[str], meanings: Mapping[str, Resemblance]
+) -> dict[str, Resemblance]:
+    """Channels by three names that differ in the letter of their axis alone, and a unit that one triad alone has."""
+    called = {m.column for m in meanings.values()}
+    stems: dict[tuple[str, str], dict[str, str]] = {}
+    for name, unit in zip(names, units, strict=True):
+        plain = spelled(name)
+        behind = _WITH_UNIT.fullmatch(plain)
+        stated = unit_of(spelled(unit)) or (unit_of(behind[2]) if behind else "")
+        bare = behind[1] if behind and not unit else plain
+        kind = _OF_UNITS.get(stated, "")
+        if name in meanings or not kind or f"{kind}x" in called or _NO_STAND.search(plain):
+            continue
+        for place, letter in enumerate(bare.lower()):
+            if letter in "xyz":
+                stem = f"{bare[:place]} {bare[place + 1 :]}".lower()
+                stems.setdefault((stem, stated), {})[letter] = name
+    whole = {key: each for key, each in stems.items() if len(each) == len("xyz")}
+    kinds = [_OF_UNITS[stated] for _, stated in whole]
+    return {
+        name: Resemblance(f"{_OF_UNITS[stated]}{axis}", stated)
+        for (_, stated), each in whole.items()
+        if kinds.count(_OF_UNITS[stated]) == 1
+        for axis, name in each.items()
+    }
+
+
 def _says_anticlockwise(line: str) -> bool:
     """Whether a line says that toolfaces count anticlockwise, looking down the hole."""
     text = spelled(line)
@@ -666,13 +700,17 @@ _TOOL_AXIS = re.compile(
 """Words of the axis of the tool."""
 _OF_VERTICAL = re.compile(r"vert[iy][kc]al|lot\b|lodd|вертикал|铅垂|垂直", re.IGNORECASE)
 _LONE_ANGLES = {
-    "inclination": re.compile(r"(ref )?(desvio|desv\.?)(,? deg)?", re.IGNORECASE),
+    "inclination": re.compile(r"(ref )?(desvio|desv\.?|drift)(,? deg)?", re.IGNORECASE),
     "azimuth": re.compile(
         r"(ref )?(kompass|brujula|bussola|boussole|компас|phi m(ag)?)(,? deg)?", re.IGNORECASE
     ),
     "toolface": re.compile(r"(ref )?(face|cara|lado)(,? deg)?", re.IGNORECASE),
 }
 """Names that say an angle where no other column is this angle, as `spelled` gives them without their unit."""
+_OF_UNITS = {"g": "a", "mg": "a", "m/s²": "a", "nT": "m", "µT": "m", "gauss": "m", "mG": "m"}
+"""The triad that alone has a unit, by its letter."""
+_WITH_UNIT = re.compile(r"(.*\S)[\s(\[]+([^\s()\[\]]+)[)\]]?")
+"""A name and the unit behind it, in brackets or not."""
 _UNIT_BEHIND_NAME = re.compile(r"\s*[(\[][^)\]]*[)\]]\s*$")
 """The unit behind the name of a channel."""
 _VOLTAGE = re.compile(r"[uv](?=[abghm]$)", re.IGNORECASE)

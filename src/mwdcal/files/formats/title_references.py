@@ -770,8 +770,9 @@ def _is_called(quantity: _Quantity, figure: _Figure) -> bool:
 
 def _plain(text: str) -> str:
     """Small letters without marks; the signs of units stay."""
+    apart = re.sub(r"(?<=[a-z]{2})(?=[A-Z][a-z]{2})", " ", text)
     kept = (
-        re.sub(r"(?<=[a-z]{2})(?=[A-Z][a-z]{2})", " ", text)
+        re.sub(r"\bref(erence)?\.? std\b", "reference", apart, flags=re.IGNORECASE)
         .replace("_", " ")
         .replace("°", "\0")
         .replace("º", "\0")
