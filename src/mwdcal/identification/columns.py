@@ -1142,7 +1142,8 @@ def _tell_dip(meanings: dict[str, Resemblance], values: Values) -> None:
     inclined = [n for n, m in meanings.items() if m.column == REFERENCES["inclination"].column]
     for name in [n for n, m in meanings.items() if m.column == REFERENCES["dip"].column]:
         cells = values(name)
-        if not inclined and cells is not None and np.nanmax(cells) - np.nanmin(cells) > _LEAST_TURN:
+        known = cells[np.isfinite(cells)] if cells is not None else np.empty(0)
+        if not inclined and known.size and np.ptp(known) > _LEAST_TURN:
             meanings[name] = Resemblance(REFERENCES["inclination"].column, ABOVE)
     if len(inclined) < 2 or any(m.column == REFERENCES["dip"].column for m in meanings.values()):
         return
