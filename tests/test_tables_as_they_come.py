@@ -1313,3 +1313,80 @@ def test_drift_is_the_inclination_where_no_other_column_is(tmp_path):
 def test_a_reference_standard_is_no_standard_deviation():
     stated = references_in([["Ref. std.: g = 978.86 Gal, F = 459.2 mGauss"]])
     assert stated == pytest.approx({"ref_gravity_g": 9.7886 / 9.80665, "ref_field_nt": 45_920.0})
+
+
+def test_a_reference_field_of_each_row_is_no_total(tmp_path):
+    """It follows no norm of channels, though it is its own norm beside small numbers."""
+    drift = 48_000 + 3 * np.sin(np.arange(48) / 5)
+    columns = table(ref_field_nt=None, **{"F_ref (nT)": np.round(drift, 1)})
+    path = written(tmp_path / "a.csv", columns)
+    assert library.propose_profile(path).profile.columns["ref_field_nt"].name == "F_ref (nT)"
+
+
+def test_of_two_temperatures_the_panel_of_the_logger_is_not_the_tool(tmp_path):
+    columns = {("ToolTemp_Avg" if n == "Temp (C)" else n): v for n, v in table().items()}
+    path = written(tmp_path / "a.csv", {"PTemp_C": np.linspace(20, 21, 48), **columns})
+    assert library.propose_profile(path).profile.columns["temperature_c"].name == "ToolTemp_Avg"
+
+
+def test_letters_of_series_below_a_serial_are_no_tools(tmp_path):
+    columns = {"Serie": np.repeat([*"ABCD"], 12), **table()}
+    path = written(tmp_path / "a.csv", columns, "Serienummer 4410-N")
+    assert len(read(path)) == 48
+    with pytest.raises(FitError, match="Are these tools"):
+        read(written(tmp_path / "b.csv", columns))
+
+
+def test_triads_on_two_sheets_with_axes_in_chinese_are_one_run(tmp_path):
+    columns, book = table(), openpyxl.Workbook()
+    book.remove(book.active)
+    stand = {
+        "编号": "Pos",
+        "井斜角 °": "Inc (deg)",
+        "方位角 °": "Azi (deg)",
+        "工具面 °": "TF (deg)",
+    }
+    for sheet, letter, unit in (("加表", "G", "V"), ("磁表", "H", "V")):
+        page = book.create_sheet(sheet)
+        axes = {f"{axis.upper()}轴 {unit}": f"{letter}{axis} (V)" for axis in "xyz"}
+        names = {**stand, **axes}
+        page.append([*names])
+        for row in zip(*(columns[each] for each in names.values()), strict=True):
+            page.append([v.item() if hasattr(v, "item") else v for v in row])
+    book.save(tmp_path / "a.xlsx")
+    run, plain = read(tmp_path / "a.xlsx"), read(written(tmp_path / "b.csv", columns))
+    np.testing.assert_array_equal(run.magnetometer, plain.magnetometer)
+
+
+def test_a_sheet_whose_title_is_a_roll_test_is_none_of_the_run(tmp_path):
+    columns, book = table(), openpyxl.Workbook()
+    book.remove(book.active)
+    for sheet, title, count in (
+        ("Calibração", "Planilha", 48),
+        ("Rolagem", "TESTE DE ROLAGEM (verificação)", 12),
+    ):
+        page = book.create_sheet(sheet)
+        for row in (
+            [title],
+            ["Ferramenta no berço"],
+            [*columns],
+            *[*zip(*columns.values(), strict=True)][:count],
+        ):
+            page.append([v.item() if hasattr(v, "item") else v for v in row])
+    book.save(tmp_path / "a.xlsx")
+    assert len(read(tmp_path / "a.xlsx")) == 48
+
+
+def test_blanks_and_bars_part_columns_and_the_last_units_stand_right(tmp_path):
+    run = table(ref_gravity_g=None, ref_field_nt=None, ref_dip_deg=None)
+    names = [each.split()[0] for each in run]
+    rows = [
+        f"│ {k + 1:>2} │ " + " ".join(f"{value:9.4f}" for value in row)
+        for k, row in enumerate(zip(*[*run.values()][1:], strict=True))
+    ]
+    head = "│  N │ " + " ".join(f"{name:>9}" for name in names[1:])
+    (tmp_path / "a.txt").write_text("\n".join([head, "├────┼─────", *rows]))
+    found = read(tmp_path / "a.txt")
+    np.testing.assert_allclose(
+        found.accelerometer, read(written(tmp_path / "b.csv", run)).accelerometer, atol=1e-4
+    )

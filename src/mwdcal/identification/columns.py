@@ -444,7 +444,7 @@ _SPOKEN_WARMTH = {
 }
 """Units of temperatures in a line above a table, not those of a number."""
 _SURROUNDINGS = re.compile(
-    r"oven|chamber|ambient|kamer\b|(?<![a-z])(air|room|bath|lab)(?![a-z])|ofen|kammer|umgebung|raum|ovn|rom|horno|ambiente|"
+    r"oven|chamber|ambient|panel|logger|(?<![a-z])p_?temp(?![a-z])|kamer\b|(?<![a-z])(air|room|bath|lab)(?![a-z])|ofen|kammer|umgebung|raum|ovn|rom|horno|ambiente|"
     r"камер|печ|термостат|环境|烘箱|室温",
     re.IGNORECASE,
 )
@@ -662,27 +662,29 @@ def _beside_others(
 def _by_axes(
     names: Sequence[str], units: Sequence[str], meanings: Mapping[str, Resemblance]
 ) -> dict[str, Resemblance]:
-    """Channels by three names that differ in the letter of their axis alone, and a unit that one triad alone has."""
+    """Channels by three names that differ in the letter of their axis alone.
+
+    Their unit is one that one triad alone has, or their first letter says which: Akx, Aky, Akz.
+    """
     called = {m.column for m in meanings.values()}
     stems: dict[tuple[str, str], dict[str, str]] = {}
     for name, unit in zip(names, units, strict=True):
         plain = spelled(name)
         behind = _WITH_UNIT.fullmatch(plain)
         stated = unit_of(spelled(unit)) or (unit_of(behind[2]) if behind else "")
-        bare = behind[1] if behind and not unit else plain
-        kind = _OF_UNITS.get(stated, "")
-        if name in meanings or not kind or f"{kind}x" in called or _NO_STAND.search(plain):
+        bare = (behind[1] if behind and not unit else plain).lower()
+        if name in meanings or _NO_STAND.search(plain) or is_of_tool(name):
             continue
-        for place, letter in enumerate(bare.lower()):
+        for place, letter in enumerate(bare):
             if letter in "xyz":
-                stem = f"{bare[:place]} {bare[place + 1 :]}".lower()
+                stem = f"{bare[:place]} {bare[place + 1 :]}"
                 stems.setdefault((stem, stated), {})[letter] = name
-    whole = {key: each for key, each in stems.items() if len(each) == len("xyz")}
-    kinds = [_OF_UNITS[stated] for _, stated in whole]
+    whole = [(stem, unit, each) for (stem, unit), each in stems.items() if len(each) == 3]
+    kinds = [_OF_UNITS.get(unit) or _OF_LETTERS.get(stem[0], "") for stem, unit, _ in whole]
     return {
-        name: Resemblance(f"{_OF_UNITS[stated]}{axis}", stated)
-        for (_, stated), each in whole.items()
-        if kinds.count(_OF_UNITS[stated]) == 1
+        name: Resemblance(f"{kind}{axis}", unit)
+        for kind, (_, unit, each) in zip(kinds, whole, strict=True)
+        if kind and kinds.count(kind) == 1 and f"{kind}x" not in called
         for axis, name in each.items()
     }
 
@@ -709,6 +711,8 @@ _LONE_ANGLES = {
 """Names that say an angle where no other column is this angle, as `spelled` gives them without their unit."""
 _OF_UNITS = {"g": "a", "mg": "a", "m/s²": "a", "nT": "m", "µT": "m", "gauss": "m", "mG": "m"}
 """The triad that alone has a unit, by its letter."""
+_OF_LETTERS = {"a": "a", "g": "a", "m": "m", "h": "m", "b": "m", "f": "m"}
+"""The triad whose names begin with a letter."""
 _WITH_UNIT = re.compile(r"(.*\S)[\s(\[]+([^\s()\[\]]+)[)\]]?")
 """A name and the unit behind it, in brackets or not."""
 _UNIT_BEHIND_NAME = re.compile(r"\s*[(\[][^)\]]*[)\]]\s*$")
@@ -1213,8 +1217,19 @@ def _is_total(
         return False
     if unit in ("V", "mV", "counts", "raw"):
         return True
-    numbers = [cells for n in names if (cells := values(n)) is not None]
-    return any(_are_norms(total, three) for three in combinations(numbers[:_MOST_SUMMED], 3))
+    numbers = [
+        cells
+        for n in names
+        if (cells := values(n)) is not None and not np.array_equal(cells, total)
+    ]
+    triples = combinations(numbers[:_MOST_SUMMED], 3)
+    return any(_turn(three) and _are_norms(total, three) for three in triples)
+
+
+def _turn(columns: Sequence[Array]) -> bool:
+    """Whether two of three columns or more change their sign, and a second one is of some size beside the largest."""
+    sizes = sorted(float(np.abs(cells).max()) for cells in columns)
+    return sum(cells.min() < 0 < cells.max() for cells in columns) > 1 and sizes[1] > 0.1 * sizes[2]
 
 
 def _are_norms(total: Array, columns: Sequence[Array]) -> bool:

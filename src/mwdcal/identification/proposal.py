@@ -580,6 +580,8 @@ def _is_formulas(cells: Sequence[str]) -> bool:
 
 _OF_READINGS = (*RAW, *(REFERENCES[name].column for name in ("inclination", "azimuth", "toolface")))
 """Columns that readings tell."""
+_LONGEST_LETTER = 2
+"""Characters of the letter or number of a series of rolls."""
 _MOST_TRIES, _MOST_COMBINED = 40, 100_000
 """Answers to open questions, in combinations that name no column twice, that are tried, and those looked at."""
 _CONFIRMED = 0.1
@@ -786,6 +788,8 @@ def _stacked_tools(
         if stated.get("serial") in tools:
             return {"serial": ColumnSource(name=name)}
         many = min(tools.values()) >= LEAST_STATIONS and _WORDS_OF_TOOLS.search(name)
+        if "serial" in table.metadata and max(map(len, tools)) <= _LONGEST_LETTER:
+            continue  # series of one tool
         stacked = len([*groupby(cells)]) == len(tools)
         numbered = _numbers_of(table, {}, name) is not None
         anew = stacked and not meaning(name) and _begins_again(table, cells)

@@ -138,7 +138,7 @@ _OF_ROLL_TEST = re.compile(
 )
 """Words of a sheet whose rows are to check a calibration."""
 _OF_ROLLS = re.compile(
-    r"roll|rull|rot|dreh|giro|вращ|回転|滚|旋转|(calib|kalib|калиб|标定)", re.IGNORECASE
+    r"roll|rull|rola[gm]|rot|dreh|giro|вращ|回転|滚|旋转|(calib|kalib|калиб|标定)", re.IGNORECASE
 )
 _OF_DONE = re.compile(
     r"(check|verifi|validat|kontrollier)ed|verificad|validad|gepr(ü|ue)ft|kontrollert|sjekket|провер(ен|или|ил\b)",
@@ -232,7 +232,7 @@ class Layout:
     def kind(self) -> str:
         """Whether it is called a void or superseded run, a run before or after an adjustment, or a roll test."""
         words = f"{self.sheet} {self.heading}"
-        return _kind(words, self.above) or (ADJUSTED.search(words) and "adjusted run") or ""
+        return _kind_of(self) or (ADJUSTED.search(words) and "adjusted run") or ""
 
     @property
     def size(self) -> int:
@@ -261,7 +261,7 @@ def laid_out(
     """
     every, covers, unread = _every(sheets, source, sheet, header_line, decimal)
     tables = [t for t in every if {*wanted} <= {*t.names}]
-    tables = [t for t in tables if not kind or _kind(f"{t.sheet} {t.heading}") == kind]
+    tables = [t for t in tables if kind in ("", _kind_of(t))]
     if not tables:
         raise _no_table(source, header_line, wanted, every)
     best = max(tables, key=lambda layout: layout.size)
@@ -457,7 +457,7 @@ def _the_run(tables: Sequence[Layout]) -> Layout | None:
     """The run among alike tables: their sheets joined, or the one beside which the others are void or roll tests."""
     if _is_one_run(tables):
         return _joined_sheets(tables)
-    kinds = [_kind(f"{t.sheet} {t.heading}", t.above) for t in tables]
+    kinds = [*map(_kind_of, tables)]
     runs = [t for t, kind in zip(tables, kinds, strict=True) if not kind]
     if 1 < len(runs) < len(tables) and _is_one_run(runs):
         runs = [_joined_sheets(runs)]
@@ -471,13 +471,22 @@ def _the_run(tables: Sequence[Layout]) -> Layout | None:
     return replace(runs[0], left_out=(*runs[0].left_out, *aside))
 
 
+def _kind_of(table: Layout) -> str:
+    """A void run or a roll test, by the sheet of a table and the line above it; empty for a run."""
+    return _kind(f"{table.sheet} {table.heading}", table.above)
+
+
 def _kind(words: str, above: Sequence[str] = ()) -> str:
-    """A void run or a roll test, by the sheet of a table and the line above it; empty for a run.
+    """The kind that words say; of the lines `above` one that begins as a title of rolls says it too.
 
     A run is one of the past where any line `above` says that another superseded it.
     """
     if any(map(_OF_PAST_RUN.search, above)):
         return "superseded run"
+    if any(
+        _OF_ROLL_TEST.match(line) and _OF_ROLLS.search(line.partition("(")[0]) for line in above
+    ):
+        return ROLL_TEST
     kinds = (("void run", _OF_VOID_RUN), (ROLL_TEST, _OF_ROLL_TEST))
     return next((kind for kind, pattern in kinds if pattern.search(words)), "")
 
@@ -615,7 +624,7 @@ def _with_covers(layout: Layout, covers: Sequence[Sheet]) -> Layout:
 def _alike_among(tables: Sequence[Layout], best: Layout) -> list[Layout]:
     """The tables that may be meant as well as the largest, `best`: those of some size, or all that are one run."""
     alike = [t for t in tables if t is best or _alike(t, best)]
-    runs = [t for t in alike if not _kind(f"{t.sheet} {t.heading}", t.above)]
+    runs = [t for t in alike if not _kind_of(t)]
     if len(runs) > 1 and _is_one_run(runs):
         return alike
     return [t for t in alike if t is best or len(t.lines) >= _BESIDES]
@@ -804,7 +813,7 @@ def _axis(name: object) -> str:
     """
     words = as_text(name).rsplit(maxsplit=1)
     bare = words[0] if len(words) > 1 and unit_of(words[1]) else " ".join(words)
-    match = _OF_AXIS.fullmatch(as_text(name)) or _OF_AXIS.fullmatch(bare)
+    match = _OF_AXIS.fullmatch(as_text(name)) or _OF_AXIS.fullmatch(re.sub(r"轴$", "", bare))
     return match["axis"].lower().translate(LATIN_AXES) if match else ""
 
 

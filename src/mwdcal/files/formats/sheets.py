@@ -16,9 +16,12 @@ from mwdcal.errors import InputError
 from mwdcal.files.formats import figures, records, text
 from mwdcal.files.formats.columns import WORKBOOKS, at_most, damaged_unless_read, with_merged
 from mwdcal.files.formats.layout import LEAST_COLUMNS, Cells, Sheet, is_units
+from mwdcal.files.synonyms import unit_of
 from mwdcal.sensor.profile import TableFormat
 
 DELIMITERS = (";", "\t", ",", "|")
+_DRAWN = str.maketrans("│┃║", "|||")
+_BAR = re.compile(r"(?<!\S)\|(?!\S)")
 _FRAME = "!"
 """What old programs draw between columns."""
 _BLANKS, _RUNS = "blanks", "runs of blanks"
@@ -60,7 +63,7 @@ def sheets_of(data: bytes, name: str) -> list[Sheet]:
     content = text.decoded(data, encoding, name)
     if _IS_PAGE.search(content[:_LOOKED_AT]):
         return [Sheet("", _rows(records.rows_of_page(content)))]
-    lines = content.split("\n")
+    lines = content.translate(_DRAWN).split("\n")
     if rows_of_records := records.rows_of_records(lines):
         return [Sheet("", _rows(rows_of_records))]
     mark, rows = _delimited(lines, name)
@@ -164,8 +167,15 @@ def _placed(
     for (place,), cell in zip(places, row, strict=True):
         by_place.setdefault(place, []).append(cell)
     placed = [" ".join(by_place.get(place, ())) for place in range(len(columns))]
+    if any(map(_are_two_units, by_place.values())):  # the first columns have none
+        return [""] * (len(columns) - len(row)) + [*row]
     apart = len(by_place) == len(row) < len(columns)
     return placed if apart or is_units(placed) or _is_of_words(row, spans, places) else row
+
+
+def _are_two_units(cells: Sequence[str]) -> bool:
+    """Whether cells below one name are units that are none together: nT C, but not DEG C."""
+    return len(cells) > 1 and all(map(unit_of, cells)) and unit_of(cells[0]) != "°"
 
 
 def _is_of_words(
@@ -208,7 +218,8 @@ def _split(lines: Sequence[str], mark: str, source: str) -> list[list[str]]:
     """The cells of each line, without blanks around."""
     if mark in (_BLANKS, _RUNS):  # a unit in brackets belongs to the name before it
         apart = r"\s{2,}|\t" if mark == _RUNS else r"\s+(?![\[(])(?![^\[(]*[\])])"
-        return [re.split(apart, line.strip()) if line.strip() else [] for line in lines]
+        bare = (_BAR.sub(" ", line).strip() for line in lines)
+        return [re.split(apart, line) if line else [] for line in bare]
     rows = text.cells_of(lines, mark, source, skip_blanks=True)
     return [[cell.strip() for cell in row] for row in rows]
 
