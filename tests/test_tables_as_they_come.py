@@ -1346,7 +1346,7 @@ def test_triads_on_two_sheets_with_axes_in_chinese_are_one_run(tmp_path):
         "方位角 °": "Azi (deg)",
         "工具面 °": "TF (deg)",
     }
-    for sheet, letter, unit in (("加表", "G", "V"), ("磁表", "H", "V")):
+    for sheet, letter, unit in (("加表", "G", "mV"), ("磁表", "H", "V")):
         page = book.create_sheet(sheet)
         axes = {f"{axis.upper()}轴 {unit}": f"{letter}{axis} (V)" for axis in "xyz"}
         names = {**stand, **axes}
