@@ -15,7 +15,7 @@ import mwdcal as library
 from cli_support import channels, mwdcal, refused, servo_run, stations, write_csv
 from mwdcal.errors import FitError
 from mwdcal.files.formats import table as tables
-from mwdcal.files.formats.title_references import references_in
+from mwdcal.files.formats.title_references import doubtful_in, references_in
 from mwdcal.files.formats.titles import titles
 from mwdcal.identification.columns import is_numbering, meanings_of
 from simulation import Tool, plan
@@ -1310,6 +1310,10 @@ def test_drift_is_the_inclination_where_no_other_column_is(tmp_path):
     )
 
 
+def test_a_mean_in_a_title_is_named_as_no_reference():
+    assert doubtful_in([["mean dip 65.9 degrees"]]) == {"ref_dip_deg": "mean dip 65.9 degrees"}
+
+
 def test_a_reference_standard_is_no_standard_deviation():
     stated = references_in([["Ref. std.: g = 978.86 Gal, F = 459.2 mGauss"]])
     assert stated == pytest.approx({"ref_gravity_g": 9.7886 / 9.80665, "ref_field_nt": 45_920.0})
@@ -1345,6 +1349,8 @@ def test_triads_on_two_sheets_with_axes_in_chinese_are_one_run(tmp_path):
         "井斜角 °": "Inc (deg)",
         "方位角 °": "Azi (deg)",
         "工具面 °": "TF (deg)",
+        "Btotal (nT)": "Btotal (nT)",
+        "Dip (deg)": "Dip (deg)",
     }
     for sheet, letter, unit in (("加表", "G", "mV"), ("磁表", "H", "V")):
         page = book.create_sheet(sheet)

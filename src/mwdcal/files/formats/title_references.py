@@ -105,12 +105,15 @@ _ROUGH = re.compile(
     r"номин\w*|约|标称",
 )
 """Words of a value that is a reference but for them."""
+_OF_MEANS = re.compile(
+    r"(?<![^\W\d_])(mean|average|avg|mittelwert|moyenne|promedio|media|medio)(?![^\W\d_])|средн\w*|平均"
+)
+"""Words of the mean of a run, which may be that of a place."""
 _UNSURE = re.compile(
-    rf"{_ROUGH.pattern}|"
+    rf"{_ROUGH.pattern}|{_OF_MEANS.pattern}|"
     r"uncert|\bunc\b|unsicher|usikker|incert|погреш|不确定|toler|limit|grenz|range|bereich|диапазон|范围|量程|"
     r"\bmin\b|\bmax\b|\bstd|\bsd\b|sigma|σ|±|spec|resol|correct|korrek|offset|drift|gradient|noise|"
-    r"toolface|survey|tool face|"
-    r"(?<![^\W\d_])(mean|average|avg|mittelwert|moyenne|promedio|media|medio)(?![^\W\d_])|средн\w*|平均",
+    r"toolface|survey|tool face",
 )
 """Words by which a value is no reference."""
 _BEFORE = re.compile(r"[^\W\d_]*\W{0,2}[^\W\d_]*\W*$")
@@ -743,7 +746,7 @@ def doubtful_in(rows: Rows, besides: Rows = ()) -> dict[str, str]:
     lines: dict[str, str] = {}
     for row in [*_with_columns(rows), *besides]:
         line, plain = _line(row), _clauses(row)
-        bare = _ROUGH.sub(" ", plain)
+        bare = _OF_MEANS.sub(" ", _ROUGH.sub(" ", plain))
         for column in references_in([[bare]]) if bare != plain else ():
             lines.setdefault(column, line)
         for column, each in _values_in([row]).items():
