@@ -36,7 +36,7 @@ _SUPERSEDED = re.compile(
 )
 """A cell that names the row instead of its own: superseded by line 12."""
 _MAY_REJECT = re.compile(
-    rf"(?<![^\W\d_])({OF_REFUSAL}|{NOT_TO_USE}|fail(ed)?|outlier|suspect|questionable|doubtful|ausreißer|ausreisser|fehler|avvik|"
+    rf"(?<![^\W\d_])({OF_REFUSAL}|{NOT_TO_USE}|fail(ed)?|error|ng|gestort|unstable|instabil|vibrat\w*|outlier|suspect|questionable|doubtful|ausreißer|ausreisser|fehler|avvik|"
     r"moved|bumped|disturbed|slipped|knocked|bewegt|verrutscht|gestossen|flyttet|movi(o|do)|mexeu|bouge|сдвин\w*|"
     r"толкн\w*|"
     r"nicht bestanden|falha|fallo|выброс|сбой)(?![^\W\d_])|异常|可疑|移动|碰到"

@@ -38,7 +38,7 @@ from mwdcal.files.synonyms import (
     synonyms_of,
     unit_of,
 )
-from mwdcal.files.words import STATIONS_ELSEWHERE, letters, spelled, translated
+from mwdcal.files.words import LATIN_AXES, STATIONS_ELSEWHERE, letters, spelled, translated
 from mwdcal.geometry.vectors import Array, Bools
 from mwdcal.sensor.profile import ColumnSource
 
@@ -193,6 +193,7 @@ def triples_for(
     numbers = {n: v for n in names if (v := values(n)) is not None and np.isfinite(v).all()}
     triples = []
     for three in _neighbours([*numbers]):
+        three = _in_order_of_axes(three)
         columns = np.stack([numbers[n] for n in three], -1)
         spread = np.ptp(columns, axis=0)
         if spread.min() > 0:
@@ -214,6 +215,19 @@ def _neighbours(names: Sequence[str]) -> Iterator[Sequence[str]]:
     for step in (1, 2):
         for place in range(len(names) - 2 * step):
             yield names[place : place + 2 * step + 1 : step]
+
+
+def _in_order_of_axes(names: Sequence[str]) -> Sequence[str]:
+    """Three names in the order x, y, z of the letters in which alone they differ, or else as they are.
+
+    >>> _in_order_of_axes(["Fy (V)", "Fx (V)", "Fz (V)"]), _in_order_of_axes(["B3", "B1", "B2"])
+    (['Fx (V)', 'Fy (V)', 'Fz (V)'], ['B3', 'B1', 'B2'])
+    """
+    for place in range(min(map(len, names))):
+        letters = [name[place].lower().translate(LATIN_AXES) for name in names]
+        if sorted(letters) == ["x", "y", "z"]:
+            return [name for _, name in sorted(zip(letters, names, strict=True))]
+    return names
 
 
 def _variation(columns: Array) -> float:

@@ -86,6 +86,7 @@ _OF_AXIS = re.compile(
     re.IGNORECASE,
 )
 """A name that ends in an axis, but for its unit."""
+_WORD_AXIS = re.compile("轴$")
 _SYMBOL = re.compile(r"[^\W\d_]")
 """A name that is the symbol of a quantity."""
 _DEGREES_OF = re.compile(
@@ -130,6 +131,7 @@ _OF_PAST_RUN = re.compile(
 _OF_ROLL_TEST = re.compile(
     r"(?<![^\W\d_])(roll[\s_-]*(test|over|check)|rt|verif\w*|check|valid\w*|(roll)?pr(ue|ü)fung|"
     r"[ck]ontrol\w*[- ]?(run|shot|test|roll|messung|dreh|måling|rull)\w*|rull(e|ings)test|rulleprøve|prueba|"
+    r"ролл-?тест\w*|nachkontrolle|"
     r"(essai|teste?|ensa[iy]o|prova)s? (en|de|di) (roulis|rotation|rota[cç][aã]o|rotaci[oó]n|rotazione|giro|rolagem)|"
     r"провер\w*|повер\w*|контрольн\w* (вращ|замер|измер)\w*|тест\w* вращ\w*|"
     r"айналдыру сына\w*)(?![^\W\d_])|验证|检验|複測|复测|复核|滚转|回転試験|"
@@ -138,7 +140,8 @@ _OF_ROLL_TEST = re.compile(
 )
 """Words of a sheet whose rows are to check a calibration."""
 _OF_ROLLS = re.compile(
-    r"roll|rull|rola[gm]|rot|dreh|giro|вращ|回転|滚|旋转|(calib|kalib|калиб|标定)", re.IGNORECASE
+    r"roll|rull|rola[gm]|roul|ролл|rot|dreh|giro|вращ|回転|滚|旋转|(calib|kalib|калиб|标定)",
+    re.IGNORECASE,
 )
 _OF_DONE = re.compile(
     r"(check|verifi|validat|kontrollier)ed|verificad|validad|gepr(ü|ue)ft|kontrollert|sjekket|провер(ен|или|ил\b)",
@@ -813,7 +816,7 @@ def _axis(name: object) -> str:
     """
     words = as_text(name).rsplit(maxsplit=1)
     bare = words[0] if len(words) > 1 and unit_of(words[1]) else " ".join(words)
-    match = _OF_AXIS.fullmatch(as_text(name)) or _OF_AXIS.fullmatch(re.sub(r"轴$", "", bare))
+    match = _OF_AXIS.fullmatch(as_text(name)) or _OF_AXIS.fullmatch(_WORD_AXIS.sub("", bare))
     return match["axis"].lower().translate(LATIN_AXES) if match else ""
 
 
@@ -824,13 +827,13 @@ def _is_name(cell: object) -> bool:
 def _is_ruler(row: Cells) -> bool:
     """Whether a row is a line of dashes or the like, or numbers the columns.
 
-    >>> _is_ruler(["----", ""]), _is_ruler([1, 2, 3, 4, 5, 6]), _is_ruler([1, 2, 3, 4, 5, 7])
+    >>> _is_ruler(["----", ""]), _is_ruler([1, 2, 3, 4, 5, 6, 7]), _is_ruler([1, 2, 3, 4, 5, 6, 8])
     (True, True, False)
     """
     if all(isinstance(cell, str) and re.fullmatch(r"[-=_*+|\s]*", cell) for cell in row):
         return True
     filled = [as_text(cell).strip("()[] ") for cell in row if cell != ""]
-    return len(filled) > LEAST_COLUMNS and filled == [str(k + 1) for k in range(len(filled))]
+    return len(filled) > 2 * len("xyz") and filled == [str(k + 1) for k in range(len(filled))]
 
 
 _NUMBER_OF_COLUMN = re.compile(r"(?<![\w.,])(\d{1,2})(?:\s*[-–]\s*(\d{1,2}))?[\s:=.)]+(?=[^\W\d_])")
@@ -1351,10 +1354,12 @@ def _check_cut(
         and _form(r[1][0]) == form
         and any(map(figures.is_figure, r[1][1:]))
         and not any(_SUMMARY.fullmatch(as_text(cell).strip()) for cell in r[1])
+        and _texts(r[1]) <= max(_texts(cells) for _, cells in kept)
     ]
     *before, (last, row) = kept
     width = min(len(cells) for _, cells in before)
-    if len(row) < width and all(figures.is_figure(cells[width - 1]) for _, cells in before):
+    numbered = all(figures.is_figure(cells[width - 1]) for _, cells in before)
+    if len(row) < width and numbered and _form(row[0]) == form:
         cut.append((last, row))
     if cut:
         line, row = cut[0]

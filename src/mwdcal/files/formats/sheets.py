@@ -20,7 +20,7 @@ from mwdcal.files.synonyms import unit_of
 from mwdcal.sensor.profile import TableFormat
 
 DELIMITERS = (";", "\t", ",", "|")
-_DRAWN = str.maketrans("│┃║", "|||")
+_DRAWN = re.compile("[│┃║]")
 _BAR = re.compile(r"(?<!\S)\|(?!\S)")
 _FRAME = "!"
 """What old programs draw between columns."""
@@ -63,7 +63,7 @@ def sheets_of(data: bytes, name: str) -> list[Sheet]:
     content = text.decoded(data, encoding, name)
     if _IS_PAGE.search(content[:_LOOKED_AT]):
         return [Sheet("", _rows(records.rows_of_page(content)))]
-    lines = content.translate(_DRAWN).split("\n")
+    lines = _DRAWN.sub("|", content).split("\n")
     if rows_of_records := records.rows_of_records(lines):
         return [Sheet("", _rows(rows_of_records))]
     mark, rows = _delimited(lines, name)
@@ -174,7 +174,7 @@ def _placed(
 
 
 def _are_two_units(cells: Sequence[str]) -> bool:
-    """Whether cells below one name are units that are none together: nT C, but not DEG C."""
+    """Whether cells below one name are two units, such as nT C, and not one of two words: DEG C."""
     return len(cells) > 1 and all(map(unit_of, cells)) and unit_of(cells[0]) != "°"
 
 

@@ -101,10 +101,15 @@ _MINUTES = (
     r"(?:\s*(?P<seconds>\d+(?:[.,]\d+)?)\s*(?:[\"″”]|''|sec\w*))?)?"
 )
 _ROUGH = re.compile(
-    r"nomin\w*|approx\w*|about|circa|\bca\b|\bcca\b|≈|~|\bnenn|ungefahr|omtrent|aprox\w*|environ|пример\w*|около|"
-    r"номин\w*|约|标称",
+    r"nomin\w*|approx\w*|about|[cz]irka|circa|\bca\b|\bcca\b|≈|~|\bnenn|ungefahr|\betwa\b|\brund\b|omtrent|omkring|"
+    r"aprox\w*|alrededor|\bcerca\b|environ|пример\w*|приблиз\w*|ориентир\w*|около|okolo|номин\w*|约|左右|标称",
 )
 """Words of a value that is a reference but for them."""
+_ROUGH_VALUES = re.compile(
+    rf"({_ROUGH.pattern})\W*(values?|werte?n?|verdi\w*|valeurs?|valor\w*|значен\w*|wartos\w*|值)|"
+    rf"(values?|valeurs?|valor\w*|wartos\w*)\W*({_ROUGH.pattern})"
+)
+"""Words that say it of all values of a line."""
 _OF_MEANS = re.compile(
     r"(?<![^\W\d_])(mean|average|avg|mittelwert|moyenne|promedio|media|medio)(?![^\W\d_])|средн\w*|平均"
 )
@@ -471,7 +476,8 @@ def _only(values: Mapping[str, Collection[float]]) -> dict[str, float]:
 
 def _values_in(rows: Rows, besides: Rows = ()) -> dict[str, dict[float, None]]:
     """The different values of each reference that rows above a table and lines `besides` state."""
-    texts = [_clauses(row) for row in [*_with_columns(rows), *besides]]
+    every_text = map(_clauses, [*_with_columns(rows), *besides])
+    texts = [text for text in every_text if not _ROUGH_VALUES.search(text)]
     if any(map(_TOTAL_ALONE.match, texts)):
         texts = [text for text in texts if not _COMPONENT_ALONE.match(text)]
     by_word, of_places, by_unit = (dict[str, dict[float, None]]() for _ in range(3))
@@ -798,7 +804,7 @@ def _plain(text: str) -> str:
 def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
     """The value that a text states, in the unit of the run file, if it is one, and another right behind it."""
     between, behind = match["between"], match["behind"]
-    rough = bool(re.match(r"\W*(nomin|номин|标称|nenn|k\s?g\b)", behind)) and not match["next"]
+    rough = bool(re.match(rf"\W*({_ROUGH.pattern}|k\s?g\b)", behind)) and not match["next"]
     counted = re.match(rf"\s*{_COUNTED}\s?/\s?(?=[gnuµmгнм])", behind)
     letter = "letter" in match.groupdict()
     if (
