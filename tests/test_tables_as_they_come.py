@@ -1396,3 +1396,37 @@ def test_blanks_and_bars_part_columns_and_the_last_units_stand_right(tmp_path):
     np.testing.assert_allclose(
         found.accelerometer, read(written(tmp_path / "b.csv", run)).accelerometer, atol=1e-4
     )
+
+
+def test_channels_of_unknown_words_are_in_the_order_of_their_letters(tmp_path):
+    columns = mixed(table())
+    for axis in "yxz":
+        columns[f"Kolbo. {axis.upper()}"] = columns.pop(f"H{axis} (V)")
+    found = library.propose_profile(written(tmp_path / "a.csv", columns)).profile.columns
+    assert [found[f"m{axis}"].name for axis in "xyz"] == ["Kolbo. X", "Kolbo. Y", "Kolbo. Z"]
+
+
+@pytest.mark.parametrize(
+    "line", ["Feld etwa 49,5 µT", "Campo 460 mG aprox.", "campo 460 mG (valores nominales)"]
+)
+def test_a_rough_value_is_no_reference_and_is_named(line):
+    assert references_in([[line]]) == {}
+    assert [*doubtful_in([[line]])] == ["ref_field_nt"]
+
+
+def test_a_count_of_stations_below_the_last_is_no_station_that_was_cut(tmp_path):
+    columns = {n.split()[0]: v for n, v in table(ref_gravity_g=None).items()}
+    path = written(tmp_path / "a.txt", columns, delimiter=" ")
+    path.write_text(path.read_text() + "\n48 POINTS ACCEPTED 0 REJECTED\n")
+    assert len(read(path)) == 48
+
+
+@pytest.mark.parametrize(("remark", "asked"), [("ausgeschlossen", False), ("gestört", True)])
+def test_rejections_in_german(tmp_path, remark, asked):
+    remarks = [remark if row == 7 else "" for row in range(48)]
+    path = written(tmp_path / "a.csv", {**table(), "Bemerkung": remarks})
+    if asked:
+        with pytest.raises(FitError, match="rejected station"):
+            read(path)
+    else:
+        assert len(read(path)) == 47

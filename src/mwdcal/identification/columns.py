@@ -191,43 +191,47 @@ def triples_for(
     `most`: by how much it may vary, as a share of the channels' range.
     """
     numbers = {n: v for n in names if (v := values(n)) is not None and np.isfinite(v).all()}
-    triples = []
-    for three in _neighbours([*numbers]):
-        three = _in_order_of_axes(three)
-        columns = np.stack([numbers[n] for n in three], -1)
-        spread = np.ptp(columns, axis=0)
-        if spread.min() > 0:
-            triples.append((_variation(columns), float(spread.max()), float(spread.min()), three))
+    triples = [each for step in (1, 2) for each in _triples(numbers, step, most)]
     return [
         Answer(
             with_values(", ".join(three), values, *three),
             tuple(("column", f"{c}={n}") for c, n in zip(channels, three, strict=True)),
         )
-        for variation, largest, _, three in sorted(triples, key=lambda each: each[0] / each[2])[
-            :_MOST_TRIPLES
-        ]
-        if variation <= most * largest
+        for _, three in sorted(triples, key=lambda each: each[0])[:_MOST_TRIPLES]
     ]
 
 
-def _neighbours(names: Sequence[str]) -> Iterator[Sequence[str]]:
-    """Every three columns side by side, then every three of which each second one is left out: Acc, Mag, Acc, Mag."""
-    for step in (1, 2):
-        for place in range(len(names) - 2 * step):
-            yield names[place : place + 2 * step + 1 : step]
+def _triples(
+    numbers: Mapping[str, Array], step: int, most: float
+) -> Iterator[tuple[float, Sequence[str]]]:
+    """Three columns, each a `step` behind the one before, with how far their norm varies beside a channel.
+
+    By steps of two, Acc, Mag, Acc, Mag, only those whose names differ in the letters of their axes alone.
+    """
+    names = [*numbers]
+    for place in range(len(names) - 2 * step):
+        beside = names[place : place + 2 * step + 1 : step]
+        three = _in_order_of_axes(beside) or (beside if step == 1 else [])
+        if not three:
+            continue
+        columns = np.stack([numbers[n] for n in three], -1)
+        spread, variation = np.ptp(columns, axis=0), _variation(columns)
+        if spread.min() > 0 and variation <= most * spread.max():
+            yield variation / float(spread.min()), three
 
 
 def _in_order_of_axes(names: Sequence[str]) -> Sequence[str]:
-    """Three names in the order x, y, z of the letters in which alone they differ, or else as they are.
+    """Three names in the order x, y, z of the letters in which alone they differ; none where they differ otherwise.
 
     >>> _in_order_of_axes(["Fy (V)", "Fx (V)", "Fz (V)"]), _in_order_of_axes(["B3", "B1", "B2"])
-    (['Fx (V)', 'Fy (V)', 'Fz (V)'], ['B3', 'B1', 'B2'])
+    (['Fx (V)', 'Fy (V)', 'Fz (V)'], [])
     """
     for place in range(min(map(len, names))):
         letters = [name[place].lower().translate(LATIN_AXES) for name in names]
-        if sorted(letters) == ["x", "y", "z"]:
+        rest = {f"{name[:place]} {name[place + 1 :]}" for name in names}
+        if sorted(letters) == ["x", "y", "z"] and len(rest) == 1:
             return [name for _, name in sorted(zip(letters, names, strict=True))]
-    return names
+    return []
 
 
 def _variation(columns: Array) -> float:
