@@ -230,6 +230,7 @@ def _doubts(choice: Choice, prior: PriorInformation | None) -> list[Finding]:
 def _identity(readings: Readings, simulated: bool) -> dict[str, str]:
     """The statements of the run about the tool, of whom and where it was measured; `simulated`: so is its prior."""
     tool = {k: str(v) for k, v in readings.metadata.items() if k in IDENTITY}
+    tool |= {k: str(v).lower() for k, v in readings.north.items()}
     return {**tool, "simulated": str(True)} if simulated else tool
 
 
