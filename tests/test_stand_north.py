@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 
 import numpy as np
+import openpyxl
 import pandas as pd
 import pytest
 
 import mwdcal as library
-from cli_support import SERVO_NOISE, mwdcal, read_csv, servo_run, write_csv
+from cli_support import SERVO_NOISE, mwdcal, read_csv, refused, servo_run, write_csv
 from simulation import Tool
+from test_roll_test_tables import run_in_gauss
 from test_wrong_inputs import measured
 
 DECLINATION = 5.2
@@ -63,7 +65,8 @@ def test_the_reference_of_the_well_counts(stand, tmp_path):
     options = ("--latitude", 60, "--longitude", 5, "--altitude-m", 0, "--date", "2026-06-01")
     place.write_text(mwdcal("reference", *options, "--json").out)
     out = tmp_path / "out.csv"
-    ran = mwdcal("survey", stand / "cal.json", stand / "well.csv", "-o", out, "--reference", place, "--json")  # fmt: skip
+    options = ("-o", out, "--reference", place, "--json")
+    ran = mwdcal("survey", stand / "cal.json", stand / "well.csv", *options)
     expected = json.loads(place.read_text())["declination_deg"]
     assert ran.json["declination_deg"] == pytest.approx(expected)
     sources = ran.json["reference_sources"]
@@ -119,3 +122,104 @@ def test_a_run_is_written_with_the_north_of_its_stand(stand, tmp_path):
     assert again.metadata["declination_deg"] == DECLINATION
     written = np.array(read_csv(tmp_path / "again.csv")["ref_azimuth_deg"], float)
     np.testing.assert_allclose(written, np.asarray(pd.read_csv(stand / "run.csv")["Azi true [°]"]))
+
+
+ANGLES = ("ref_inclination_deg", "ref_azimuth_deg", "ref_toolface_deg")
+NAMES = {
+    **dict(zip(ANGLES, ("Inc (deg)", "Azi (true) (deg)", "TF (deg)"), strict=True)),
+    "temperature_c": "Temp (°C)", **{f"a{i}": f"G{i} (g)" for i in "xyz"},
+    **{f"m{i}": f"B{i} (nT)" for i in "xyz"},
+}  # fmt: skip
+OTHERS = {
+    **NAMES, **dict(zip(ANGLES, ("Incl [deg]", "Heading [deg]", "Roll [deg]"), strict=True)),
+    **{f"a{i}": f"Acc {i.upper()} (g)" for i in "xyz"}, **{f"m{i}": f"Mag {i.upper()} (nT)" for i in "xyz"},
+}  # fmt: skip
+TITLE = (
+    ("Serial", "A7"),
+    ("Date", "2026-05-04"),
+    ("Declination", "5.20 deg E"),
+    ("Total field", "50000 nT"),
+    ("Dip", "65.00 deg"),
+)
+
+
+def sheet_of(book, title, rows, names, above=(), offset=DECLINATION):
+    """A sheet with lines above a table, whose azimuths are so much more than magnetic ones."""
+    sheet = book.create_sheet(title)
+    rows = {**rows, "ref_azimuth_deg": (np.asarray(rows["ref_azimuth_deg"]) + offset) % 360}
+    for line in (*above, [*names.values()]):
+        sheet.append(line)
+    for cells in zip(*(run_in_gauss(rows, names)[name] for name in names.values()), strict=True):
+        sheet.append([float(cell) for cell in cells])
+
+
+def book_of(path, **sheets):
+    """A workbook of sheets as of `sheet_of`."""
+    book = openpyxl.Workbook()
+    book.remove(book.active)
+    for title, arguments in sheets.items():
+        sheet_of(book, title, *arguments)
+    book.save(path)
+    return path
+
+
+def in_a_workbook(folder, names=OTHERS, above=(), offset=DECLINATION, title="Roll test"):
+    """A workbook with a run and its roll test, its profile and its calibration."""
+    test = measured((45,), 12, noise=3, azimuth=1.0)
+    run = (servo_run(), NAMES, TITLE)
+    book = book_of(folder / "A7.xlsx", Run=run, **{title: (test, names, above, offset)})
+    ran = mwdcal("profile", book, "-o", folder / "tool.toml")
+    assert ran.code == 0, ran
+    ran = mwdcal("calibrate", book, "--tool", folder / "tool.toml", "-o", folder / "cal.json")
+    assert ran.code == 0, ran
+    return book
+
+
+ROLLS = {
+    "other names": (OTHERS, (), DECLINATION),
+    "names of the run": (NAMES, (), DECLINATION),
+    "its own declination": (OTHERS, (("Declination", "4.10 deg E"),), 4.1),
+    "magnetic": ({**OTHERS, "ref_azimuth_deg": "Magnetic azimuth [deg]"}, (), 0.0),
+}
+
+
+@pytest.mark.parametrize("case", ROLLS)
+def test_a_roll_test_takes_from_its_run_what_its_sheet_does_not_state(tmp_path, case):
+    names, above, offset = ROLLS[case]
+    book = in_a_workbook(tmp_path, names, above, offset)
+    options = ("--tool", tmp_path / "tool.toml", "-o", tmp_path / "cal.json", "--rolltest", book)
+    ran = mwdcal("calibrate", book, *options, "--json")
+    assert ran.code == 0, ran
+    for result in (
+        ran.json["verification"],
+        mwdcal("verify", tmp_path / "cal.json", book, "--json").json,
+        mwdcal("verify", tmp_path / "cal.json", book, "--sheet", "Roll test", "--json").json,
+        library.verify(library.load(tmp_path / "cal.json"), book).to_dict(),
+    ):
+        (worst,) = [r["value"] for r in result["rows"] if r["name"] == "error of azimuth"]
+        assert worst < 0.5
+        said = " ".join(f["text"] for f in result["findings"])
+        assert ("declination_deg 5.2" in said) == (offset == DECLINATION)
+        assert "ref_field_nt 50000" in said
+        assert result["passed"]
+
+
+def test_a_roll_test_of_its_own_file_takes_it_too(tmp_path):
+    in_a_workbook(tmp_path)
+    test = measured((45,), 12, noise=3, azimuth=1.0)
+    roll = book_of(tmp_path / "roll.xlsx", Sheet=(test, OTHERS))
+    options = ("--tool", tmp_path / "tool.toml", "-o", tmp_path / "cal.json", "--rolltest", roll)
+    ran = mwdcal("calibrate", tmp_path / "A7.xlsx", *options)
+    assert ran.code == 0, ran
+    assert mwdcal("verify", tmp_path / "cal.json", roll).code == 0
+
+
+def test_a_true_azimuth_without_a_declination_names_its_sheet(tmp_path):
+    rows = servo_run()
+    book = book_of(tmp_path / "A7.xlsx", Run=(rows, NAMES, TITLE), Later=(rows, NAMES))
+    ran = mwdcal("profile", book, "--sheet", "Run", "-o", tmp_path / "tool.toml")
+    assert ran.code == 0, ran
+    text = (tmp_path / "tool.toml").read_text().replace('"Run"', '"Later"')
+    (tmp_path / "tool.toml").write_text(text)
+    said = mwdcal("calibrate", book, "--tool", tmp_path / "tool.toml", "-o", tmp_path / "c.json")
+    assert "A7.xlsx, sheet 'Later': true azimuths need" in refused(said, 2)
