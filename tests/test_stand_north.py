@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import openpyxl
@@ -223,3 +224,29 @@ def test_a_true_azimuth_without_a_declination_names_its_sheet(tmp_path):
     (tmp_path / "tool.toml").write_text(text)
     said = mwdcal("calibrate", book, "--tool", tmp_path / "tool.toml", "-o", tmp_path / "c.json")
     assert "A7.xlsx, sheet 'Later': true azimuths need" in refused(said, 2)
+
+
+def test_the_declination_that_was_used_is_shown(stand, tmp_path):
+    book = in_a_workbook(tmp_path)
+    ran = mwdcal("profile", book, "-o", tmp_path / "tool.toml")
+    assert re.search(r"\ndeclination_deg +above the names +5\.2° E\n", ran.out)
+    page = tmp_path / "page.html"
+    options = ("--tool", tmp_path / "tool.toml", "-o", tmp_path / "cal.json")
+    ran = mwdcal("calibrate", book, *options, "--rolltest", book, "--report", page)
+    assert "azimuths of the run from true north: declination 5.2° E (run)" in ran.out
+    assert ", magnetic azimuth 57.296°" in ran.out
+    text = page.read_text("utf-8")
+    assert '<td>declination</td><td>5.2° E</td><td class="text">run: turns' in text
+    assert "<th>magnetic azimuth</th>" in text
+    again = ("--tool", stand / "tool.toml", "-o", tmp_path / "again.json")
+    ran = mwdcal("calibrate", stand / "run.csv", *again)
+    assert "azimuths of the run from true north: declination 5.2° E (tool profile)" in ran.out
+
+
+def test_a_plan_says_that_its_azimuths_are_magnetic(tmp_path):
+    options = ("--stations", 24, "--tool", "servo", "-o", tmp_path / "plan.csv")
+    ran = mwdcal("plan", *options, "--report", tmp_path / "plan.html")
+    assert ran.code == 0, ran
+    assert re.search(r"inclination, ° +magnetic azimuth, ° +toolface, °", ran.out)
+    assert "<th>magnetic azimuth, °</th>" in (tmp_path / "plan.html").read_text("utf-8")
+    assert "ref_azimuth_deg" in read_csv(tmp_path / "plan.csv")

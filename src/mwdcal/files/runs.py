@@ -615,9 +615,6 @@ def to_readings(
         refuse(table, faults(cells, np.array([0, table.count]), profile))
     offset = _azimuth_offset(table)
     readings, scales = convert(cells, (table.count,), profile, offset)
-    north = {**table.north, **table.metadata}
-    if REFERENCES["azimuth"].column not in table.columns or "azimuth_reference" not in north:
-        north = {}
     raw = [_stacked(cells, kind) for kind in scales]
     readings = replace(
         readings,
@@ -627,7 +624,7 @@ def to_readings(
         if recognised
         else (),
         metadata=identified(_marked(table), labels(table, "serial")),
-        north={key: north[key] for key in AZIMUTH_KEYS if key in north},
+        north=_north(table) if offset or table.north else {},
         source=table.source,
         run_sha256=table.digest,
         unused=synonyms.unused(list(table.columns), COLUMNS),
@@ -654,6 +651,15 @@ def _azimuth_offset(table: Table) -> float:
     stated = REFERENCES["azimuth"].column in table.columns
     source = f"{table.source}, sheet {shown(table.sheet)}" if table.sheet else table.source
     return magnetic_offset({**table.north, **table.metadata}, source) if stated else 0.0
+
+
+def _north(table: Table) -> dict[str, object]:
+    """The north that the azimuths of a table count from, as metadata state it; empty where it is magnetic."""
+    stated = {**table.north, **table.metadata}
+    azimuths = REFERENCES["azimuth"].column in table.columns
+    if not azimuths or stated.get(AZIMUTH_KEYS[0], "magnetic") == "magnetic":
+        return {}
+    return {k: "true" if stated[k] is True else stated[k] for k in AZIMUTH_KEYS if k in stated}
 
 
 def convert(

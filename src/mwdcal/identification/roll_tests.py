@@ -47,11 +47,11 @@ from mwdcal.sensor.profile import ColumnSource, Profile, TriadProfile
 
 _STRENGTHS = {"accelerometer": (1 / 3, 3.0), "magnetometer": (7_000.0, 210_000.0)}
 """Strengths, g and nT, outside which readings are in another unit than the scale of a triad."""
-_OF_PLACE = tuple(REFERENCES[name].column for name in runs.STATED_REFERENCES)
-_OF_RUN = (*AZIMUTH_KEYS, *_OF_PLACE, "date")
+_PLACE = tuple(REFERENCES[name].column for name in runs.STATED_REFERENCES)
+_OF_RUN = (*AZIMUTH_KEYS, *_PLACE, "date")
 """Statements of a run that hold for its roll test too."""
-_NORTH = AZIMUTH_KEYS[0]
-_MAGNETIC = re.compile(r"\bmag|missweisend|магн|磁", re.IGNORECASE)
+_AZIMUTH_REFERENCE = AZIMUTH_KEYS[0]
+_CALLED_MAGNETIC = re.compile(r"\bmag|missweisend|магн|磁", re.IGNORECASE)
 """Words of azimuths that count from magnetic north."""
 _ANSWERED = ("sheet", "column")
 """Arguments that answer questions about a roll test."""
@@ -85,7 +85,7 @@ def read_later(
         return _of_other_table(path, profile, said, error)
     if not _has_names(table.columns, {}, profile, is_test):
         return read_roll_test(path, profile, said)
-    angles = {k: v for k, v in said.of_run.items() if is_test and k != _NORTH}
+    angles = {k: v for k, v in said.of_run.items() if is_test and k != _AZIMUTH_REFERENCE}
     table = replace(table, metadata={**angles, **table.metadata})
     readings = runs.read_run(table, profile)[0]
     if not any(calibration.used(readings.digest)):
@@ -100,7 +100,9 @@ def read_later(
 def _north_of(calibration: Calibration) -> dict[str, object]:
     """The north of the azimuths of a calibration's run, as metadata state it; empty where it is magnetic."""
     tool = calibration.tool
-    return {k: tool[k] if k == _NORTH else float(tool[k]) for k in AZIMUTH_KEYS if k in tool}
+    return {
+        k: tool[k] if k == _AZIMUTH_REFERENCE else float(tool[k]) for k in AZIMUTH_KEYS if k in tool
+    }
 
 
 def _of_other_table(
@@ -296,7 +298,7 @@ def _under_names_of_run(
     table = runs.filled_down(runs.of_layout(where, path, profile), profile.form.fill_down)
     sources = runs.sources_of(profile).items()
     columns = {*table.columns, *(c for c, each in sources if each.name in table.columns)}
-    table = _told(_with_run(table, profile, said), table.metadata, columns)
+    table = _with_remark(_with_run(table, profile, said), table.metadata, columns)
     table = _stated(table, said, runs.serial_column(table, profile))
     return runs.read_run(table, profile)[0]
 
@@ -306,17 +308,18 @@ def _by_meaning(
 ) -> Readings:
     """The readings of a table by the names that it has, as a profile would be proposed for it."""
     table, form = as_written(path, where, True)
-    own = table.metadata
+    of_table = table.metadata
     table = _with_run(table, profile, said)
     answers = {**_known_columns(table, where, profile), **said.columns}
     table, form, columns, _, ignored = named_columns(table, form, where, answers, False)
     _check_channels(table, columns, profile)
     if once := once_for_setting(table, columns) or written_once(table, columns):
         table = runs.filled_down(table, once)
-    if _NORTH not in own and (
-        (azimuth := columns.get(REFERENCES["azimuth"].column)) and _MAGNETIC.search(azimuth.name)
+    if _AZIMUTH_REFERENCE not in of_table and (
+        (azimuth := columns.get(REFERENCES["azimuth"].column))
+        and _CALLED_MAGNETIC.search(azimuth.name)
     ):
-        table = replace(table, metadata={**table.metadata, _NORTH: "magnetic"})
+        table = replace(table, metadata={**table.metadata, _AZIMUTH_REFERENCE: "magnetic"})
     table, form = with_north(table, form, columns, where.above if where else ())
     columns |= station_column(table, columns, answers)
     columns = _with_sense(columns, profile)
@@ -327,7 +330,7 @@ def _by_meaning(
         runs.sources_of(profile),
     )
     table = replace(table, remarks=(*table.remarks, *_sentences(where, columns, profile)))
-    table = _stated(_told(table, own, columns), said, runs.serial_column(table, theirs))
+    table = _stated(_with_remark(table, of_table, columns), said, runs.serial_column(table, theirs))
     readings = runs.read_run(table, theirs)[0]
     _check_strengths(readings, columns, runs.sources_of(profile))
     return readings
@@ -340,12 +343,17 @@ def _with_run(table: Table, profile: Profile, said: Said) -> Table:
     return replace(table, metadata={**taken, **table.metadata})
 
 
-def _told(table: Table, own: Mapping[str, object], columns: Collection[str]) -> Table:
-    """The roll test with a remark on what it takes from its run, beyond its `own` statements and its columns."""
-    turned = REFERENCES["azimuth"].column in columns and table.metadata.get(_NORTH) != "magnetic"
-    turned = turned and _NORTH in table.metadata
-    wanted = (*(AZIMUTH_KEYS if turned else ()), *(c for c in _OF_PLACE if c not in columns))
-    taken = [f"{k} {table.metadata[k]}" for k in wanted if k in table.metadata and k not in own]
+def _with_remark(table: Table, of_table: Mapping[str, object], columns: Collection[str]) -> Table:
+    """The roll test with a remark on what it takes from its run, beyond what is `of_table`: metadata, and columns."""
+    turned = (
+        REFERENCES["azimuth"].column in columns
+        and table.metadata.get(_AZIMUTH_REFERENCE) != "magnetic"
+    )
+    turned = turned and _AZIMUTH_REFERENCE in table.metadata
+    wanted = (*(AZIMUTH_KEYS if turned else ()), *(c for c in _PLACE if c not in columns))
+    taken = [
+        f"{k} {table.metadata[k]}" for k in wanted if k in table.metadata and k not in of_table
+    ]
     text = (
         f"{OF_ROLL_TEST} takes from its run what its own table does not state: {', '.join(taken)}."
     )
