@@ -44,7 +44,7 @@ from mwdcal.files.formats.columns import as_text, check_names, no_stations
 from mwdcal.files.formats.sinks import ParquetSink, Sink, TextSink
 from mwdcal.files.formats.table import EXCHANGED, Table
 from mwdcal.files.formats.table import numbers as as_numbers
-from mwdcal.files.runs import is_export, read_export, renamed, to_readings
+from mwdcal.files.runs import away_from_stand, is_export, read_export, renamed, to_readings
 from mwdcal.files.statements import with_statements
 from mwdcal.files.streams import Part, StreamedTable
 from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, UNCERTAINTIES
@@ -548,6 +548,7 @@ def apply_to_table(
         raise nothing(source.source)
     kept = chosen(table, whole)
     readings, _ = to_readings(kept, calibration.profile)
+    readings = away_from_stand(readings, calibration.profile)
     results, tally, findings = correct_and_count(
         calibration, readings, outside, source.count - kept.count, uncertainty
     )

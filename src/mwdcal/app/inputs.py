@@ -108,7 +108,7 @@ def _with_roll_test(
         return table, None, has_roll_test(beside(run, table, profile))
     if rolltest.exists() and run.exists() and run.samefile(rolltest):
         return *parted_run(run, table, profile, said), False
-    return table, RollTestTable(rolltest, said), False
+    return table, RollTestTable(rolltest, replace(said, of_run=table.metadata)), False
 
 
 def prior_of(word: str | None) -> tuple[Prior, str]:

@@ -229,7 +229,9 @@ def _doubts(choice: Choice, prior: PriorInformation | None) -> list[Finding]:
 
 def _identity(readings: Readings, simulated: bool) -> dict[str, str]:
     """The statements of the run about the tool, of whom and where it was measured; `simulated`: so is its prior."""
-    tool = {k: str(v) for k, v in readings.metadata.items() if k in IDENTITY}
+    north = readings.north
+    stated = {**readings.metadata, **north}
+    tool = {k: str(v) for k, v in stated.items() if k in IDENTITY or k in north}
     return {**tool, "simulated": str(True)} if simulated else tool
 
 

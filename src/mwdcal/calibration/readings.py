@@ -154,6 +154,7 @@ class Readings:
         digest: `fingerprints` of the raw readings: they tell verification data from the fit's.
         copies: label and fingerprint of each station that was left out as a copy of an earlier one.
         metadata: serial, date, operator, …, as the file states them.
+        north: what turned stated azimuths magnetic, under the keys of metadata; the tool profile may state it too.
         source: name of the file.
         unused: columns of the file that are not used, each with what it resembles.
         remarks: sentences on rows of the file that are left out.
@@ -176,6 +177,7 @@ class Readings:
     digest: tuple[str, ...] = ()
     copies: tuple[tuple[str, str], ...] = ()
     metadata: Mapping[str, object] = field(default_factory=dict)
+    north: Mapping[str, object] = field(default_factory=dict)
     source: str = ""
     unused: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()

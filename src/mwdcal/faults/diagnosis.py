@@ -45,6 +45,7 @@ from mwdcal.faults.likelihood import (
     raw_of,
 )
 from mwdcal.files.contract import CHANNELS
+from mwdcal.files.runs import away_from_stand
 from mwdcal.geometry.vectors import Array, reference_vectors
 
 NOMINAL_FIELD = 50_000.0
@@ -446,6 +447,8 @@ def diagnose(calibration: Calibration, readings: Readings, *, draws: int = DRAWS
     Raises:
         InputError: readings of another tool or of the fit itself, or none that can be used.
     """
+    if not any(readings.states(name) for name in ANGLES):
+        readings = away_from_stand(readings, calibration.profile)
     usable, findings = prepared(calibration, readings)
     unit = 1.0
     if calibration.relative:

@@ -29,6 +29,7 @@ from mwdcal.errors import FitError, InputError, QuestionError, UnreadableFileErr
 from mwdcal.estimation.problem import ANGLES, WALKS
 from mwdcal.files import synonyms
 from mwdcal.files.contract import (
+    AZIMUTH_KEYS,
     CHANNELS,
     COLUMNS,
     RANGES,
@@ -185,7 +186,7 @@ def read_export(
     else:
         table = _exported(path, form, profile, decimal, rows)
         if is_export(table.columns, profile):
-            table = with_form(table, form)
+            table = filled_down(table, form.fill_down)
     return stated_table(table, statements or {}, serial_column(table, profile))
 
 
@@ -208,12 +209,6 @@ def _undocumented(path: str | os.PathLike[str], error: InputError) -> InputError
         f"{name} holds {where}, not written as a run file is. Propose a tool profile for it first, `mwdcal profile "
         f"{name} -o tool.toml`, and name that by `tool`."
     )
-
-
-def with_form(table: Table, form: TableFormat) -> Table:
-    """An export with the cells and the north that the form of its tables adds."""
-    table = filled_down(table, form.fill_down)
-    return replace(table, metadata={**form.north, **table.metadata})
 
 
 def filled_down(table: Table, names: Collection[str]) -> Table:
@@ -389,7 +384,8 @@ def _not_as_stated(table: Table, profile: Profile) -> InputError:
 
 def run_table(table: Table, profile: Profile) -> Table:
     """The stations of a run, as `station_table` has them, under the names and in the units of the run file."""
-    return renamed(station_table(table, profile), profile)
+    run = renamed(station_table(table, profile), profile)
+    return replace(run, metadata={**run.north, **run.metadata})
 
 
 def station_table(table: Table, profile: Profile) -> Table:
@@ -490,7 +486,23 @@ def renamed(table: Table, profile: Profile) -> Table:
     }
     places = {theirs.get(name, name): place for name, place in table.places.items()}
     columns = _with_angles(columns)
-    return _with_stated_references(replace(table, columns=columns, places=places))
+    north = profile.form.north
+    return _with_stated_references(replace(table, columns=columns, places=places, north=north))
+
+
+def away_from_stand(readings: Readings, profile: Profile) -> Readings:
+    """The readings without what only their tool profile states of its stand's place: north, gravity, field and dip."""
+    sources = sources_of(readings.profile or profile)
+    stated = stated_numbers({c: each.name for c, each in sources.items()}, readings.table)
+    known = dict(readings.known)
+    if readings.north:
+        known.pop("azimuth", None)
+    for name in STATED_REFERENCES:
+        column, factor = REFERENCES[name].column, REFERENCES[name].factor
+        if column in stated and known.pop(name, None) is not None and column in readings.metadata:
+            value = float(str(readings.metadata[column])) * factor
+            known[name] = np.full(readings.count, value)
+    return replace(readings, known=known, north={})
 
 
 def stated_numbers(sources: Mapping[str, str], names: Collection[str]) -> dict[str, float]:
@@ -601,7 +613,8 @@ def to_readings(
         _check_serials(table)
         check_columns(list(table.columns), table.source)
         refuse(table, faults(cells, np.array([0, table.count]), profile))
-    readings, scales = convert(cells, (table.count,), profile, _azimuth_offset(table))
+    offset = _azimuth_offset(table)
+    readings, scales = convert(cells, (table.count,), profile, offset)
     raw = [_stacked(cells, kind) for kind in scales]
     readings = replace(
         readings,
@@ -611,6 +624,7 @@ def to_readings(
         if recognised
         else (),
         metadata=identified(_marked(table), labels(table, "serial")),
+        north=_north(table) if offset or table.north else {},
         source=table.source,
         run_sha256=table.digest,
         unused=synonyms.unused(list(table.columns), COLUMNS),
@@ -635,7 +649,17 @@ def check_references(table: Table, profile: Profile, kinds: list[str]) -> dict[s
 def _azimuth_offset(table: Table) -> float:
     """Stated azimuth minus magnetic azimuth, degrees; 0 where no azimuths are stated."""
     stated = REFERENCES["azimuth"].column in table.columns
-    return magnetic_offset(table.metadata, table.source) if stated else 0.0
+    source = f"{table.source}, sheet {shown(table.sheet)}" if table.sheet else table.source
+    return magnetic_offset({**table.north, **table.metadata}, source) if stated else 0.0
+
+
+def _north(table: Table) -> dict[str, object]:
+    """The north that the azimuths of a table count from, as metadata state it; empty where it is magnetic."""
+    stated = {**table.north, **table.metadata}
+    azimuths = REFERENCES["azimuth"].column in table.columns
+    if not azimuths or stated.get(AZIMUTH_KEYS[0], "magnetic") == "magnetic":
+        return {}
+    return {k: "true" if stated[k] is True else stated[k] for k in AZIMUTH_KEYS if k in stated}
 
 
 def convert(
@@ -793,7 +817,7 @@ def from_readings(
     Uncertainties that the profile would fill in on reading are left to it. Without
     `metadata` it is that of the readings.
     """
-    metadata = readings.metadata if metadata is None else metadata
+    metadata = {**readings.north, **(readings.metadata if metadata is None else metadata)}
     source = readings.source or "run"
     offset = magnetic_offset(metadata, source) if "azimuth" in readings.known else 0.0
     columns: dict[str, Column] = {"station": list(readings.labels)}

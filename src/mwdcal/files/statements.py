@@ -13,12 +13,16 @@ from mwdcal.files.formats.table import Table, labels
 
 @dataclass(frozen=True)
 class Said:
-    """Statements of the user on the table of a roll test: as of `runs.read_export`, its sheet, and its columns."""
+    """Statements of the user on the table of a roll test: as of `runs.read_export`, its sheet, and its columns.
+
+    `of_run`: metadata of its run.
+    """
 
     decimal: str = "."
     statements: Mapping[str, str] = field(default_factory=dict)
     sheet: str = ""
     columns: Mapping[str, str] = field(default_factory=dict)
+    of_run: Mapping[str, object] = field(default_factory=dict)
 
 
 def with_statements(

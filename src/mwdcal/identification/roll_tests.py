@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from mwdcal.calibration.diagnosis.findings import OF_ROLL_TEST
-from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.calibration.readings import TRIADS, Readings, serial_of
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import (
     Answer,
@@ -25,11 +25,11 @@ from mwdcal.errors import (
     UnreadableFileError,
 )
 from mwdcal.files import runs
-from mwdcal.files.contract import CHANNELS, RAW, REFERENCES, units_of
+from mwdcal.files.contract import AZIMUTH_KEYS, CHANNELS, RAW, REFERENCES, units_of
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, shown
 from mwdcal.files.formats.layout import ROLL_TEST, Layout, is_part_of
-from mwdcal.files.formats.table import Table
+from mwdcal.files.formats.table import Table, labels
 from mwdcal.files.parting import parted, roll_test_marks
 from mwdcal.files.statements import Said, stated_table
 from mwdcal.files.synonyms import ABOVE, BELOW, FACTORS, unit_of
@@ -47,6 +47,12 @@ from mwdcal.sensor.profile import ColumnSource, Profile, TriadProfile
 
 _STRENGTHS = {"accelerometer": (1 / 3, 3.0), "magnetometer": (7_000.0, 210_000.0)}
 """Strengths, g and nT, outside which readings are in another unit than the scale of a triad."""
+_PLACE = tuple(REFERENCES[name].column for name in runs.STATED_REFERENCES)
+_OF_RUN = (*AZIMUTH_KEYS, *_PLACE, "date")
+"""Statements of a run that hold for its roll test too."""
+_AZIMUTH_REFERENCE = AZIMUTH_KEYS[0]
+_CALLED_MAGNETIC = re.compile(r"\bmag|missweisend|магн|磁", re.IGNORECASE)
+"""Words of azimuths that count from magnetic north."""
 _ANSWERED = ("sheet", "column")
 """Arguments that answer questions about a roll test."""
 
@@ -66,8 +72,8 @@ def read_later(
         InputError: the file cannot be read, or has no table of readings.
         FitError: it leaves something open.
     """
-    said, profile = said or Said(), calibration.profile
-    if said.sheet or said.columns:
+    said, profile = replace(said or Said(), of_run=_north_of(calibration)), calibration.profile
+    if said.columns or (said.sheet and Path(path).name != calibration.run):
         return read_roll_test(path, profile, said)
     try:
         table = runs.read_export(
@@ -79,14 +85,24 @@ def read_later(
         return _of_other_table(path, profile, said, error)
     if not _has_names(table.columns, {}, profile, is_test):
         return read_roll_test(path, profile, said)
+    angles = {k: v for k, v in said.of_run.items() if is_test and k != _AZIMUTH_REFERENCE}
+    table = replace(table, metadata={**angles, **table.metadata})
     readings = runs.read_run(table, profile)[0]
     if not any(calibration.used(readings.digest)):
-        return readings
+        return read_roll_test(path, profile, said) if said.sheet else readings
     others = _others(path, table, profile, said)
     named = any(t.kind == ROLL_TEST for t in others) or _tests_among(others, table, profile)
-    if named or roll_test_marks(table):
+    if named or said.sheet or roll_test_marks(table):
         return parted_run(path, table, profile, said)[1].readings(profile)
     return readings
+
+
+def _north_of(calibration: Calibration) -> dict[str, object]:
+    """The north of the azimuths of a calibration's run, as metadata state it; empty where it is magnetic."""
+    tool = calibration.tool
+    return {
+        k: tool[k] if k == _AZIMUTH_REFERENCE else float(tool[k]) for k in AZIMUTH_KEYS if k in tool
+    }
 
 
 def _of_other_table(
@@ -131,6 +147,7 @@ def parted_run(
     """
     others = _others(path, table, profile, said)
     tests = _tests_among(others, table, profile)
+    said = replace(said, of_run=table.metadata)
     if said.sheet or (tests and (tests[0].kind == ROLL_TEST or not roll_test_marks(table))):
         return table, RollTestTable(path, said, tables=None if said.sheet else tests)
     bare = [t for t in others if t.kind == ROLL_TEST]
@@ -278,8 +295,11 @@ def _under_names_of_run(
     path: str | os.PathLike[str], where: Layout, profile: Profile, said: Said
 ) -> Readings:
     """The readings of a table under the names of the run's profile."""
-    table = runs.with_form(runs.of_layout(where, path, profile), profile.form)
-    table = stated_table(table, said.statements, runs.serial_column(table, profile))
+    table = runs.filled_down(runs.of_layout(where, path, profile), profile.form.fill_down)
+    sources = runs.sources_of(profile).items()
+    columns = {*table.columns, *(c for c, each in sources if each.name in table.columns)}
+    table = _with_remark(_with_run(table, profile, said), table.metadata, columns)
+    table = _stated(table, said, runs.serial_column(table, profile))
     return runs.read_run(table, profile)[0]
 
 
@@ -288,12 +308,18 @@ def _by_meaning(
 ) -> Readings:
     """The readings of a table by the names that it has, as a profile would be proposed for it."""
     table, form = as_written(path, where, True)
-    table = replace(table, metadata={**profile.form.north, **table.metadata})
+    of_table = table.metadata
+    table = _with_run(table, profile, said)
     answers = {**_known_columns(table, where, profile), **said.columns}
     table, form, columns, _, ignored = named_columns(table, form, where, answers, False)
     _check_channels(table, columns, profile)
     if once := once_for_setting(table, columns) or written_once(table, columns):
         table = runs.filled_down(table, once)
+    if _AZIMUTH_REFERENCE not in of_table and (
+        (azimuth := columns.get(REFERENCES["azimuth"].column))
+        and _CALLED_MAGNETIC.search(azimuth.name)
+    ):
+        table = replace(table, metadata={**table.metadata, _AZIMUTH_REFERENCE: "magnetic"})
     table, form = with_north(table, form, columns, where.above if where else ())
     columns |= station_column(table, columns, answers)
     columns = _with_sense(columns, profile)
@@ -304,10 +330,43 @@ def _by_meaning(
         runs.sources_of(profile),
     )
     table = replace(table, remarks=(*table.remarks, *_sentences(where, columns, profile)))
-    table = stated_table(table, said.statements, runs.serial_column(table, theirs))
+    table = _stated(_with_remark(table, of_table, columns), said, runs.serial_column(table, theirs))
     readings = runs.read_run(table, theirs)[0]
     _check_strengths(readings, columns, runs.sources_of(profile))
     return readings
+
+
+def _with_run(table: Table, profile: Profile, said: Said) -> Table:
+    """A roll test with the north, the place and the day of its run where its own table does not state them."""
+    of_run = {**profile.form.north, **said.of_run}
+    taken = {key: of_run[key] for key in _OF_RUN if key in of_run}
+    return replace(table, metadata={**taken, **table.metadata})
+
+
+def _with_remark(table: Table, of_table: Mapping[str, object], columns: Collection[str]) -> Table:
+    """The roll test with a remark on what it takes from its run, beyond what is `of_table`: metadata, and columns."""
+    turned = (
+        REFERENCES["azimuth"].column in columns
+        and table.metadata.get(_AZIMUTH_REFERENCE) != "magnetic"
+    )
+    turned = turned and _AZIMUTH_REFERENCE in table.metadata
+    wanted = (*(AZIMUTH_KEYS if turned else ()), *(c for c in _PLACE if c not in columns))
+    taken = [
+        f"{k} {table.metadata[k]}" for k in wanted if k in table.metadata and k not in of_table
+    ]
+    text = (
+        f"{OF_ROLL_TEST} takes from its run what its own table does not state: {', '.join(taken)}."
+    )
+    return replace(table, remarks=(*table.remarks, *[text] * bool(taken)))
+
+
+def _stated(table: Table, said: Said, column: str) -> Table:
+    """A roll test with what the user says of it, else with the serial of its run; `column` has serials."""
+    known = serial_of(table.metadata) or any(labels(table, column))
+    serial = "" if known else str(said.of_run.get("serial", ""))
+    return stated_table(
+        table, {**({"serial": serial} if serial else {}), **said.statements}, column
+    )
 
 
 def _known_columns(table: Table, where: Layout | None, profile: Profile) -> dict[str, str]:

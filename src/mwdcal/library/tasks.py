@@ -426,6 +426,7 @@ def apply(
     """
     calibration = calibration_of(calibration)
     survey = readings_of(survey, "survey", calibration.profile, single=False)
+    survey = runs.away_from_stand(survey, calibration.profile)
     columns, findings = correct(calibration, survey, outside)
     warn_if_blank(columns, findings)
     return Corrected(

@@ -674,7 +674,7 @@ def _survey_table(readings: Tabular | Readings, calibration: Calibration, decima
 
 def _table_of(readings: Readings, profile: Profile) -> Table:
     """The table of readings in the raw units of a profile, with the columns of their own table that it lacks."""
-    table = runs.from_readings(readings, profile)
+    table = runs.from_readings(runs.away_from_stand(readings, profile), profile)
     beside = {
         name: [as_text(cell) for cell in values.tolist()] if values.dtype.kind in "OUS" else values
         for name, values in readings.table.items()

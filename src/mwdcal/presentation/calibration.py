@@ -33,12 +33,14 @@ from mwdcal.calibration.record import (
 )
 from mwdcal.calibration.results import typical_accuracy, without_temperature
 from mwdcal.files import documents
+from mwdcal.files.contract import AZIMUTH_KEYS
 from mwdcal.geometry.observables import TITLES
 from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.numbers import (
     degrees_of_freedom,
     estimate,
     files_written,
+    norths,
     number,
     quantity,
     uncertainty,
@@ -178,6 +180,7 @@ def remarks(calibration: Calibration) -> list[str]:
     exact = ", ".join(names)
     return [
         *residuals(calibration),
+        *(north_in_words(calibration) if AZIMUTH_KEYS[0] in calibration.tool else []),
         f"accuracy to expect (1σ, calibration alone, typical): {'  '.join(accuracy)}",
         *([VALID.format(*valid)] if (valid := calibration.valid_temperatures) else []),
         *([f"Assumed exact; this run cannot check it: {exact}{PROFILE}"] if exact else []),
@@ -190,6 +193,14 @@ def remarks(calibration: Calibration) -> list[str]:
         ),
         *stand(calibration),
     ]
+
+
+def north_in_words(calibration: Calibration) -> list[str]:
+    """A line on the declination, and the convergence, that turned the azimuths of the run magnetic."""
+    stated = norths(calibration.tool, calibration.profile.form.north)
+    angles = ", ".join(f"{name} {angle} ({source})" for name, angle, source in stated)
+    kind = calibration.tool.get(AZIMUTH_KEYS[0])
+    return [f"azimuths of the run from {kind} north: {angles}"]
 
 
 def unseen_remarks(calibration: Calibration) -> list[str]:

@@ -39,6 +39,7 @@ from mwdcal.presentation.numbers import (
     estimate,
     exponent,
     factor_places,
+    norths,
     quantity,
     uncertainty,
 )
@@ -110,6 +111,7 @@ def render(
         accuracy=_accuracy(calibration),
         soaked=_soaked(calibration),
         kinds=_kinds(verdict),
+        norths=norths(calibration.tool, calibration.profile.form.north),
         drifts=list(map(capital, unseen_remarks(calibration))),
         settings=SETTING_PRACTICES,
         raw_rule=raw_rule(verdict) if verdict else "",

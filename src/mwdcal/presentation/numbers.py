@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mwdcal.files.contract import CHANNELS
+from mwdcal.files.contract import AZIMUTH_KEYS, CHANNELS
 from mwdcal.geometry.vectors import Array
 from mwdcal.presentation.text import one_line, raised, superscript
 
@@ -67,6 +67,23 @@ def signed(value: float | None, decimals: int) -> str:
     """As `fixed`, with a plus sign too."""
     text = fixed(value, decimals)
     return text if text[0] in "−–" or not float(text) else f"+{text}"
+
+
+def norths(
+    stated: Mapping[str, object], profile: Mapping[str, object]
+) -> list[tuple[str, str, str]]:
+    """Declination and convergence of azimuths that are not magnetic: name, angle, and which one of both states it."""
+    if stated.get(AZIMUTH_KEYS[0], "magnetic") == "magnetic":
+        return []
+    angles = {key: float(str(stated[key])) for key in AZIMUTH_KEYS[1:] if key in stated}
+    return [
+        (
+            key.removesuffix("_deg"),
+            f"{abs(angle):g}° {'W' if angle < 0 else 'E'}",
+            "tool profile" if profile.get(key) == angle else "run",
+        )
+        for key, angle in angles.items()
+    ]
 
 
 def measured(value: float, uncertainty: float | None) -> tuple[str, str]:

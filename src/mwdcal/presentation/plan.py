@@ -43,7 +43,7 @@ SETTING_WORDS = {
 """Instructions to the operator by the practice on which a plan rests."""
 STATION_TITLES = {
     "station": "station", "temperature_c": "T, °C", "ref_inclination_deg": "inclination, °",
-    "ref_azimuth_deg": "azimuth, °", "ref_toolface_deg": "toolface, °",
+    "ref_azimuth_deg": "magnetic azimuth, °", "ref_toolface_deg": "toolface, °",
 }  # fmt: skip
 """Columns of the table of stations, and how they are headed."""
 

@@ -23,7 +23,7 @@ from mwdcal.identification.proposal import (
     stated_references,
 )
 from mwdcal.presentation.envelope import json_document
-from mwdcal.presentation.numbers import files_written
+from mwdcal.presentation.numbers import files_written, norths
 from mwdcal.presentation.text import one_line, plural, table
 from mwdcal.presentation.typed import findings_with_option_names
 from mwdcal.sensor.profile import Axis, Profile, TableFormat, TriadProfile
@@ -92,10 +92,7 @@ def screen(proposal: Proposal, run: Path, output: Path | None, has_roll_test: bo
             [c, each.name, (each.unit or "–") + guesses.get(c, "")]
             for c, each in in_order(profile.columns)
         ]
-        rows += [
-            [column, "above the names", f"{value:.8g} {RANGES[column].unit}"]
-            for column, value in stated_references(proposal).items()
-        ]
+        rows += _of_place(proposal)
         blocks.append(table(rows, ["column of a run file", "column here", "unit here"]))
     rows = [
         [
@@ -128,6 +125,22 @@ def screen(proposal: Proposal, run: Path, output: Path | None, has_roll_test: bo
         )
         blocks.append(f"{exact}{files_written(profile=output)}   next: {command}")
     return "\n\n".join(blocks)
+
+
+def _of_place(proposal: Proposal) -> list[list[str]]:
+    """Rows of what is stated once for all stations: references, and what turns azimuths magnetic."""
+    given = proposal.profile.form.north
+    words = {"tool profile": "given", "run": "above the names"}
+    return [
+        *(
+            [column, "above the names", f"{value:.8g} {RANGES[column].unit}"]
+            for column, value in stated_references(proposal).items()
+        ),
+        *(
+            [f"{name}_deg", words[source], angle]
+            for name, angle, source in norths({**given, **proposal.metadata}, given)
+        ),
+    ]
 
 
 def _scale(scale: float | None, unit: str) -> str:

@@ -33,7 +33,7 @@ from mwdcal.files.contract import (
 )
 from mwdcal.files.formats.table import Table, cell_error, numbers
 from mwdcal.files.profiles import setting
-from mwdcal.files.runs import renamed, to_readings
+from mwdcal.files.runs import away_from_stand, renamed, to_readings
 from mwdcal.geometry.units import LENGTH_UNITS
 from mwdcal.geometry.vectors import AnyArray, Array, Bools
 from mwdcal.sensor.profile import StandProfile
@@ -143,7 +143,7 @@ def station_readings(
     if calibration.thermal:
         synonyms.check_evidence(list(table.columns), table.source, ("temperature_c",))
     in_a_well = replace_struct(calibration.profile, stand=StandProfile())
-    readings, _ = to_readings(table, in_a_well, recognised)
+    readings = away_from_stand(to_readings(table, in_a_well, recognised)[0], in_a_well)
     columns = by_row(table).items()
     alone = {RANDOM_COLUMNS[name]: values for name, values in columns if name in RANDOM_COLUMNS}
     if alone:

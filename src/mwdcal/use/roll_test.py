@@ -75,14 +75,14 @@ def _directions(readings: Readings) -> Iterator[tuple[str, Bools, bool, bool]]:
     for number in range(int(group.max(initial=-1)) + 1):
         yield f"roll set {number + 1}", np.asarray(group == number), True, True
     inclination, azimuth = (np.degrees(readings.reference(n)) for n in ("inclination", "azimuth"))
-    known = ~np.isnan(inclination)
+    known, turned = ~np.isnan(inclination), "magnetic " if readings.north else ""
     if not known.any() and (group < 0).all():
         yield "all stations", np.ones(readings.count, bool), True, True
         return
     key = np.round(np.stack([inclination, np.nan_to_num(azimuth, nan=_BLANK)], -1), _ANGLE_DIGITS)
     for pair in np.unique(key[(group < 0) & known], axis=0):
         given = bool(pair[1] != _BLANK)
-        where = f"azimuth {pair[1]:g}°" if given else "azimuth not given"
+        where = f"{turned}azimuth {pair[1]:g}°" if given else "azimuth not given"
         members = np.all(key == pair, -1) & (group < 0)
         yield f"inclination {pair[0]:g}°, {where}", members, False, given
 

@@ -71,6 +71,7 @@ class Table:
         across: whether its stations stand in columns of the file; `lines` are these.
         remarks: sentences on rows that were left out, for findings.
         not_taken: lines with a reference that is not read, by column of a run file.
+        north: the north of the stand's azimuths by the tool profile, where the metadata do not state it.
     """
 
     columns: Mapping[str, Column]
@@ -85,6 +86,7 @@ class Table:
     across: bool = False
     remarks: tuple[str, ...] = ()
     not_taken: Mapping[str, str] = field(default_factory=dict)
+    north: Mapping[str, object] = field(default_factory=dict)
 
     @property
     def count(self) -> int:
