@@ -311,7 +311,8 @@ def depth_column(table: Table, length_unit: str = "") -> tuple[str, float]:
             return name, LENGTH_UNITS[unit]
     for name in table.columns:
         if _DEPTH_NAMES.fullmatch(name.strip().lower()):
-            stated = _DEPTH_UNIT.search(name.strip().lower())
+            parts = (name, table.units.get(name, ""))
+            stated = next(filter(None, (_DEPTH_UNIT.search(p.strip().lower()) for p in parts)), None)
             unit = stated[1] if stated else ""
             if not length_unit and not unit:
                 raise InputError(

@@ -71,6 +71,7 @@ class Table:
         across: whether its stations stand in columns of the file; `lines` are these.
         remarks: sentences on rows that were left out, for findings.
         not_taken: lines with a reference that is not read, by column of a run file.
+        units: of columns, where they stand in a row of their own.
     """
 
     columns: Mapping[str, Column]
@@ -85,6 +86,7 @@ class Table:
     across: bool = False
     remarks: tuple[str, ...] = ()
     not_taken: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def count(self) -> int:
@@ -305,6 +307,7 @@ def of_layout(where: Layout, path: str | os.PathLike[str], kept: Collection[str]
         across=where.across,
         remarks=where.remarks,
         not_taken=where.titles.not_taken,
+        units=dict(zip(where.names, where.units, strict=True)),
     )
 
 

@@ -1,0 +1,165 @@
+"""A table of readings in the well, under the names of the run's profile or its own."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from msgspec.structs import replace as replace_struct
+
+from mwdcal.calibration.diagnosis.findings import COLUMNS_READ
+from mwdcal.calibration.record import Calibration, Finding, with_checksum
+from mwdcal.errors import FitError, InputError, QuestionError, QuestionsError, UnreadableFileError
+from mwdcal.files import runs
+from mwdcal.files.contract import CHANNELS, MAPPED, RAW
+from mwdcal.files.formats.columns import shown
+from mwdcal.files.formats.layout import Layout
+from mwdcal.files.formats.table import Table
+from mwdcal.files.statements import Said, stated_table
+from mwdcal.files.synonyms import WARMTH
+from mwdcal.identification.beside import LEAST_CHANNELS, has_channels
+from mwdcal.identification.columns import meanings_of
+from mwdcal.identification.proposal import as_written, named_columns
+from mwdcal.identification.roll_tests import (
+    check_channels,
+    known_columns,
+    one_of,
+    raise_answerable,
+    scaled,
+    tables_on_sheet,
+)
+from mwdcal.sensor.profile import ColumnSource, Profile, TableFormat
+
+_TAKEN = (*RAW, WARMTH, "station", "serial")
+"""Columns that surveys take by the meaning of their names: angles and totals may be the tool's own."""
+
+
+@dataclass(frozen=True)
+class SurveyTable:
+    """A table of readings, and the calibration with the profile that reads it; `findings` on names that it took."""
+
+    table: Table
+    calibration: Calibration
+    findings: list[Finding] = field(default_factory=list)
+
+
+def read_surveys(
+    source: str | os.PathLike[str] | Table,
+    calibration: Calibration,
+    said: Said | None = None,
+    rows: int = runs.MOST_ROWS,
+) -> SurveyTable:
+    """The readings in a file or table, by the names of the calibration's run where it has these, else by its own.
+
+    `rows` as of `runs.read_export`.
+
+    Raises:
+        InputError: the file cannot be read, or has no table of readings.
+        FitError: which table, or which columns, are meant is open.
+    """
+    said, profile = said or Said(), calibration.profile
+    answered = bool(said.sheet or said.columns)
+    table: Table | None = None
+    problem: Exception | None = None
+    if isinstance(source, Table):
+        table = source
+    else:
+        try:
+            table = runs.read_export(
+                source, profile, decimal=said.decimal, rows=rows, statements=said.statements
+            )
+        except UnreadableFileError:
+            raise
+        except (InputError, FitError) as error:
+            problem = error
+    if table and not answered and (_has_names(table, profile) or not _has_channels(table)):
+        return SurveyTable(table, calibration)
+    try:
+        where = None if isinstance(source, Table) else _table_in(source, profile, said, problem)
+        if where is not None:
+            table, form = as_written(source, where, True)
+            return _by_meaning(table, form, where, calibration, said)
+        assert table is not None
+        return _by_meaning(table, None, None, calibration, said)
+    except (QuestionError, QuestionsError) as error:
+        raise_answerable(error)
+
+
+def _has_names(table: Table, profile: Profile) -> bool:
+    """Whether a table has all channels by the names of a profile, or the accelerometer's by those of a run file."""
+    wanted = runs.channels_of(profile)
+    names = {*table.columns}
+    return {*CHANNELS["accelerometer"]} <= names or (bool(wanted) and {*wanted} <= names)
+
+
+def _has_channels(table: Table) -> bool:
+    """Whether a table has three channels or more by names of its own."""
+    names = [*table.columns]
+    units = [table.units.get(name, "") for name in names]
+    meant = {m.column for m in meanings_of(names, units).values()}
+    return len(meant & {*RAW}) >= LEAST_CHANNELS
+
+
+def _table_in(
+    path: str | os.PathLike[str], profile: Profile, said: Said, problem: Exception | None
+) -> Layout | None:
+    """The table of readings in a file; None of a format that has but one. The problem where there is none."""
+    try:
+        every = tables_on_sheet(path, profile, said)
+    except InputError as error:
+        raise error if said.sheet or problem is None else problem from None
+    meant = [t for t in every if has_channels(t, profile)]
+    if problem and not meant and not said.columns:
+        raise problem
+    meant = [t for t in meant if not t.kind] or meant or sorted(every, key=lambda t: t.size)[-1:]
+    if problem and not meant:
+        raise problem
+    return one_of(meant, f"{Path(path).name}: which one has the surveys")
+
+
+def _by_meaning(
+    table: Table,
+    form: TableFormat | None,
+    where: Layout | None,
+    calibration: Calibration,
+    said: Said,
+) -> SurveyTable:
+    """The readings of a table by the names that it has, in the units that it states."""
+    profile = calibration.profile
+    answers = {
+        column: name
+        for column, name in known_columns(table, where, profile).items()
+        if column not in runs.ANGLES_OF_STAND
+    }
+    answers |= said.columns
+    columns, others = _channels(table, form, where, answers)
+    magnetic = CHANNELS["magnetometer"] if {*RAW[3:]} & {*columns} else ()
+    check_channels(table, columns, profile, (*CHANNELS["accelerometer"], *magnetic), "this table")
+    form = replace_struct(form or TableFormat(), ignore=tuple(others))
+    theirs = replace_struct(profile, table=form, columns=columns)
+    theirs = scaled(theirs, runs.sources_of(profile))
+    table = stated_table(table, said.statements, runs.serial_column(table, theirs))
+    place = f", sheet {shown(where.sheet)}" if where and where.sheet else ""
+    listed = ", ".join(f"{column} = {shown(each.name)}" for column, each in columns.items())
+    text = f"{table.source}{place}: read by the names of this table: {listed}."
+    reads = replace_struct(calibration, profile=theirs)
+    reads = reads if calibration.changed else with_checksum(reads)
+    return SurveyTable(table, reads, [Finding(id=COLUMNS_READ, text=text)])
+
+
+def _channels(
+    table: Table, form: TableFormat | None, where: Layout | None, answers: Mapping[str, str]
+) -> tuple[dict[str, ColumnSource], list[str]]:
+    """The columns of channels, temperature, labels and answers by their names in a run file, and those of others."""
+    names = [*table.columns]
+    units = [table.units.get(name, "") for name in names]
+    meanings = meanings_of(names, units, where.above if where else ())
+    said = {name for name in names for a in answers.values() if a == name or a.startswith(f"{name} (")}
+    candidates = said | {name for name, m in meanings.items() if m.column in _TAKEN}
+    some = replace(table, columns={n: c for n, c in table.columns.items() if n in candidates})
+    columns = named_columns(some, form, where, answers, False).columns
+    columns = {c: each for c, each in columns.items() if c in _TAKEN or c in answers}
+    used = {each.name for each in columns.values()}
+    return columns, [name for name in meanings if name not in used and name not in MAPPED]
