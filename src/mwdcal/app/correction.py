@@ -484,8 +484,7 @@ def apply_to_any(
     text that comes of it is written as it is. With `uncertainty` columns of standard uncertainties. `said`: as of
     `read_surveys`.
     """
-    answered = bool(said.sheet or said.columns)
-    exported = answered or _is_exported(readings, calibration.profile, said.decimal)
+    exported = said.answers or _is_exported(readings, calibration.profile, said.decimal)
     if in_parts(readings, output) and not exported:
         streamed = apply_to_file(
             calibration, readings, output, outside, advance,

@@ -13,12 +13,17 @@ from mwdcal.files.formats.table import Table, labels
 
 @dataclass(frozen=True)
 class Said:
-    """Statements of the user on the table of a roll test: as of `runs.read_export`, its sheet, and its columns."""
+    """Statements of the user on a later table: as of `runs.read_export`, its sheet, and its columns."""
 
     decimal: str = "."
     statements: Mapping[str, str] = field(default_factory=dict)
     sheet: str = ""
     columns: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def answers(self) -> bool:
+        """Whether it says which sheet or columns are meant."""
+        return bool(self.sheet or self.columns)
 
 
 def with_statements(

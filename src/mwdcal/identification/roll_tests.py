@@ -67,7 +67,7 @@ def read_later(
         FitError: it leaves something open.
     """
     said, profile = said or Said(), calibration.profile
-    if said.sheet or said.columns:
+    if said.answers:
         return read_roll_test(path, profile, said)
     try:
         table = runs.read_export(
@@ -231,9 +231,7 @@ def one_of(meant: Sequence[Layout], question: str) -> Layout | None:
     return max(meant, key=lambda t: t.size, default=None)
 
 
-def tables_on_sheet(
-    path: str | os.PathLike[str], profile: Profile, said: Said
-) -> Sequence[Layout]:
+def tables_on_sheet(path: str | os.PathLike[str], profile: Profile, said: Said) -> Sequence[Layout]:
     """The tables of a file, those on the sheet that the user says; none of a format that has but one."""
     every = tables.every_table(path, decimal=sign_of(profile, said))
     on_sheet = [t for t in every if said.sheet in ("", t.sheet)]
@@ -341,12 +339,15 @@ def check_channels(
     word: str,
 ) -> None:
     """Refuse a table, called by a word, without channels of the run; the `usual` ones where its profile names none."""
-    wanted = [c for c in runs.sources_of(profile) if c in RAW] or usual
+    theirs = runs.sources_of(profile)
+    wanted = [c for c in theirs if c in RAW] or usual
     absent = [column for column in wanted if column not in columns]
     if absent:
+        names = ", ".join(shown(theirs[c].name) for c in absent if c in theirs)
         used = {each.name for each in columns.values()}
         others = [shown(name) for name in table.columns if name not in used]
         problem = f"{table.source}: {word} has no column for {', '.join(absent)}"
+        problem += f" (in the run {names})" if names else ""
         if len(others) < len(absent):
             raise InputError(f"{problem}. Add what is missing.")
         raise QuestionError(

@@ -60,7 +60,6 @@ def read_surveys(
         FitError: which table, or which columns, are meant is open.
     """
     said, profile = said or Said(), calibration.profile
-    answered = bool(said.sheet or said.columns)
     table: Table | None = None
     problem: Exception | None = None
     if isinstance(source, Table):
@@ -74,24 +73,23 @@ def read_surveys(
             raise
         except (InputError, FitError) as error:
             problem = error
-    if table and not answered and (_has_names(table, profile) or not _has_channels(table)):
+    if table and not said.answers and (_has_names(table, profile) or not _has_channels(table)):
         return SurveyTable(table, calibration)
+    form = where = None
     try:
-        where = None if isinstance(source, Table) else _table_in(source, profile, said, problem)
-        if where is not None:
+        if not isinstance(source, Table) and (where := _table_in(source, profile, said, problem)):
             table, form = as_written(source, where, True)
-            return _by_meaning(table, form, where, calibration, said)
         assert table is not None
-        return _by_meaning(table, None, None, calibration, said)
+        return _by_meaning(table, form, where, calibration, said)
     except (QuestionError, QuestionsError) as error:
         raise_answerable(error)
 
 
 def _has_names(table: Table, profile: Profile) -> bool:
-    """Whether a table has all channels by the names of a profile, or the accelerometer's by those of a run file."""
-    wanted = runs.channels_of(profile)
-    names = {*table.columns}
-    return {*CHANNELS["accelerometer"]} <= names or (bool(wanted) and {*wanted} <= names)
+    """Whether a table has all channels by the names of a profile, or one of the accelerometer's by a run file's."""
+    wanted, names = runs.channels_of(profile), {*table.columns}
+    named = bool(wanted) and {*wanted} <= names
+    return named or not names.isdisjoint(CHANNELS["accelerometer"])
 
 
 def _has_channels(table: Table) -> bool:
@@ -156,7 +154,9 @@ def _channels(
     names = [*table.columns]
     units = [table.units.get(name, "") for name in names]
     meanings = meanings_of(names, units, where.above if where else ())
-    said = {name for name in names for a in answers.values() if a == name or a.startswith(f"{name} (")}
+    said = {
+        name for name in names for a in answers.values() if a == name or a.startswith(f"{name} (")
+    }
     candidates = said | {name for name, m in meanings.items() if m.column in _TAKEN}
     some = replace(table, columns={n: c for n, c in table.columns.items() if n in candidates})
     columns = named_columns(some, form, where, answers, False).columns

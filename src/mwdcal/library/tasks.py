@@ -109,7 +109,7 @@ def table_of(source: Tabular, name: str, read: Callable[[Path], Table]) -> Table
     return table_in_memory(source, name)
 
 
-def table_in_memory(source: Tabular, name: str) -> Table:
+def table_in_memory(source: Any, name: str) -> Table:
     """The table of columns that are in memory."""
     if isinstance(source, Table):
         return source
@@ -238,7 +238,7 @@ def readings_of(
     elif _is_tabular(source):
         source = read_run(cast(Tabular, source), profile)
     else:
-        array = as_readings(source)
+        array = as_readings(cast(ReadingsLike, source))
         source = readings(array.accelerometer, array.magnetometer, temperature=array.temperature)
     _check_readings(source, name, single)
     return source

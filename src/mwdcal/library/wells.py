@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from mwdcal.calibration.record import SignatureCheck
     from mwdcal.identification.surveys import SurveyTable
     from mwdcal.presentation.conversion import Converted, Exported
+    from mwdcal.presentation.signature import LoadedCalibration
     from mwdcal.presentation.survey import SurveySummary
     from mwdcal.survey.acceptance import SurveyLimits
     from mwdcal.survey.error_model import ErrorModel
@@ -520,7 +521,7 @@ def survey(
     """
     from mwdcal.presentation.signature import load_calibration
     from mwdcal.survey.runs import survey_runs
-    from mwdcal.survey.surveying import analysed, check_drift, start_of, well_inputs
+    from mwdcal.survey.surveying import analysed, check_drift, start_of
 
     check_drift(sensor_drift, msa)
     ends: Any = tuple(np.radians(_finite("switch", switch, 2)).tolist())
@@ -531,19 +532,10 @@ def survey(
         for tool in (cal, *(tool for tool, _ in runs))
     ]
     said = Said(decimal, sheet=sheet, columns=by_column("column", column))
-    tables = [
-        _survey_table(table, tool.calibration, said)
-        for tool, table in zip(loaded, (readings, *(table for _, table in runs)), strict=True)
-    ]
-    inputs = [
-        well_inputs(
-            named.calibration, named.table, _earth(reference), limits, msa, tool.digest,
-            [*tool.findings, *named.findings], error_model, missing,
-            _number("section_azimuth", section_azimuth), length_unit,
-        )
-        for tool, named in zip(loaded, tables, strict=True)
-    ]  # fmt: skip
-    inputs = [_with_walk(each, registry) for each in inputs]
+    azimuth = _number("section_azimuth", section_azimuth)
+    how = (_earth(reference), limits, msa, error_model, missing, azimuth, length_unit, registry)
+    tables = (readings, *(table for _, table in runs))
+    inputs = [_inputs(tool, table, said, how) for tool, table in zip(loaded, tables, strict=True)]
     analyses = [analysed(each, sensor_drift) if msa else None for each in inputs]
     for analysis in filter(None, analyses):
         analysis.check()
@@ -642,6 +634,21 @@ def _with_walk(inputs: WellInputs, registry: FilePath | None) -> WellInputs:
     from mwdcal.library.drifts import with_walk
 
     return with_walk(inputs, os.fspath(registry))
+
+
+def _inputs(
+    tool: LoadedCalibration, readings: Tabular | Readings, said: Said, how: Any
+) -> WellInputs:
+    """The inputs of a run: its calibration and its table."""
+    from mwdcal.survey.surveying import well_inputs
+
+    reference, limits, msa, error_model, missing, azimuth, unit, registry = how
+    named = _survey_table(readings, tool.calibration, said)
+    inputs = well_inputs(
+        named.calibration, named.table, reference, limits, msa, tool.digest,
+        [*tool.findings, *named.findings], error_model, missing, azimuth, unit,
+    )  # fmt: skip
+    return _with_walk(inputs, registry)
 
 
 def _source(cal: object) -> Calibration | FilePath:

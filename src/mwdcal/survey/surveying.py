@@ -312,7 +312,9 @@ def depth_column(table: Table, length_unit: str = "") -> tuple[str, float]:
     for name in table.columns:
         if _DEPTH_NAMES.fullmatch(name.strip().lower()):
             parts = (name, table.units.get(name, ""))
-            stated = next(filter(None, (_DEPTH_UNIT.search(p.strip().lower()) for p in parts)), None)
+            stated = next(
+                filter(None, (_DEPTH_UNIT.search(p.strip().lower()) for p in parts)), None
+            )
             unit = stated[1] if stated else ""
             if not length_unit and not unit:
                 raise InputError(

@@ -182,9 +182,8 @@ def command(
     start, ends = _tie_in(tie_in, unit), _switch(switch)
     loaded = [load_calibration(tool, key) for tool, _ in pairs]
     said = options.said(decimal)
-    wanted = report, contributions, listing, station, covariance
-    answers = said.statements, said.sheet, said.columns
-    whole = any((msa, axial_correction, missing == "blank", run, registry, *answers, *wanted))
+    wanted = report, contributions, listing, station, covariance, said.statements, said.answers
+    whole = any((msa, axial_correction, missing == "blank", run, registry, *wanted))
     if not whole and long_table.in_parts(readings, output, loaded[0].calibration.profile):
         result = long_table.survey_file(
             loaded[0].calibration, readings, output, reference, limits, start, ends, outside, decimal,
@@ -211,9 +210,7 @@ def command(
     _print(result, loaded[0].signature, files, as_json, station, **more)
 
 
-def _inputs(
-    tool: LoadedCalibration, readings: Path, said: Said, how: Any
-) -> WellInputs:
+def _inputs(tool: LoadedCalibration, readings: Path, said: Said, how: Any) -> WellInputs:
     """The inputs of a run: its calibration and its table."""
     from mwdcal.identification.surveys import read_surveys
     from mwdcal.survey.surveying import well_inputs
