@@ -19,7 +19,7 @@ from mwdcal.files.formats.layout import Layout
 from mwdcal.files.formats.table import Table
 from mwdcal.files.statements import Said, stated_table
 from mwdcal.files.synonyms import WARMTH
-from mwdcal.identification.beside import LEAST_CHANNELS, has_channels
+from mwdcal.identification.beside import has_channels
 from mwdcal.identification.columns import meanings_of
 from mwdcal.identification.proposal import as_written, named_columns
 from mwdcal.identification.roll_tests import (
@@ -73,7 +73,7 @@ def read_surveys(
             raise
         except (InputError, FitError) as error:
             problem = error
-    if table and not said.answers and (_has_names(table, profile) or not _has_channels(table)):
+    if table and not said.answers and _has_names(table, profile):
         return SurveyTable(table, calibration)
     form = where = None
     try:
@@ -92,14 +92,6 @@ def _has_names(table: Table, profile: Profile) -> bool:
     return named or not names.isdisjoint(CHANNELS["accelerometer"])
 
 
-def _has_channels(table: Table) -> bool:
-    """Whether a table has three channels or more by names of its own."""
-    names = [*table.columns]
-    units = [table.units.get(name, "") for name in names]
-    meant = {m.column for m in meanings_of(names, units).values()}
-    return len(meant & {*RAW}) >= LEAST_CHANNELS
-
-
 def _table_in(
     path: str | os.PathLike[str], profile: Profile, said: Said, problem: Exception | None
 ) -> Layout | None:
@@ -109,8 +101,6 @@ def _table_in(
     except InputError as error:
         raise error if said.sheet or problem is None else problem from None
     meant = [t for t in every if has_channels(t, profile)]
-    if problem and not meant and not said.columns:
-        raise problem
     meant = [t for t in meant if not t.kind] or meant or sorted(every, key=lambda t: t.size)[-1:]
     if problem and not meant:
         raise problem
@@ -159,7 +149,9 @@ def _channels(
     }
     candidates = said | {name for name, m in meanings.items() if m.column in _TAKEN}
     some = replace(table, columns={n: c for n, c in table.columns.items() if n in candidates})
-    columns = named_columns(some, form, where, answers, False).columns
+    columns = {}
+    if {*RAW} & {*answers, *(meanings[name].column for name in candidates - said)}:
+        columns = named_columns(some, form, where, answers, False).columns
     columns = {c: each for c, each in columns.items() if c in _TAKEN or c in answers}
     used = {each.name for each in columns.values()}
     return columns, [name for name in meanings if name not in used and name not in MAPPED]
