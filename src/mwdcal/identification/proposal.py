@@ -1565,7 +1565,8 @@ def findings_on(proposal: Proposal) -> list[Finding]:
 
 def depths_of_surveys(proposal: Proposal) -> str:
     """The column of measured depths in a table without the angles that a calibration needs; empty without one."""
-    return next(filter(is_depth, proposal.unused if proposal.open_axes else ()), "")
+    names = (each.strip("'") for each in proposal.unused) if proposal.open_axes else ()
+    return next(filter(is_depth, names), "")
 
 
 def of_surveys(proposal: Proposal) -> list[Finding]:

@@ -516,6 +516,7 @@ def survey(
         FitError: a column leaves a question open; with `msa`, the surveys do not separate interference from azimuth.
 
     Example:
+        `here = mwdcal.reference(latitude=60.4, longitude=5.3, date="2026-11-23")`, then
         `well = mwdcal.survey(cal, "well.csv", reference=here, msa=True)`, then
         `well.columns["azimuth_true_deg"]` and `well.interference.axial_nt`.
     """
