@@ -49,7 +49,7 @@ from mwdcal.files.statements import Said, with_statements
 from mwdcal.files.streams import Part, StreamedTable
 from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, UNCERTAINTIES
 from mwdcal.geometry.vectors import Array, Bools
-from mwdcal.identification.surveys import read_surveys
+from mwdcal.presentation.readings import read_surveys
 from mwdcal.sensor.profile import Profile
 from mwdcal.use import correction, correction_numba, strengths
 from mwdcal.use.correction import JUDGED, RowCounts, correct_and_count

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from mwdcal.calibration.readings import IN_TABLE
+from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.table import Table, labels
@@ -24,6 +25,15 @@ class Said:
     def answers(self) -> bool:
         """Whether it says which sheet or columns are meant."""
         return bool(self.sheet or self.columns)
+
+
+@dataclass(frozen=True)
+class SurveyTable:
+    """A table of readings, and the calibration with the profile that reads it; `findings` on names that it took."""
+
+    table: Table
+    calibration: Calibration
+    findings: list[Finding] = field(default_factory=list)
 
 
 def with_statements(

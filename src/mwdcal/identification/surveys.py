@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 from msgspec.structs import replace as replace_struct
 
 from mwdcal.calibration.diagnosis.findings import COLUMNS_READ
 from mwdcal.calibration.record import Calibration, Finding, with_checksum
-from mwdcal.errors import FitError, InputError, QuestionError, QuestionsError, UnreadableFileError
+from mwdcal.errors import FitError, InputError, QuestionError, QuestionsError
 from mwdcal.files import runs
 from mwdcal.files.contract import CHANNELS, MAPPED, RAW
 from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.layout import Layout
 from mwdcal.files.formats.table import Table
-from mwdcal.files.statements import Said, stated_table
+from mwdcal.files.statements import Said, SurveyTable, stated_table
 from mwdcal.files.synonyms import WARMTH
 from mwdcal.identification.beside import has_channels
 from mwdcal.identification.columns import meanings_of
@@ -36,60 +36,31 @@ _TAKEN = (*RAW, WARMTH, "station", "serial")
 """Columns that surveys take by the meaning of their names: angles and totals may be the tool's own."""
 
 
-@dataclass(frozen=True)
-class SurveyTable:
-    """A table of readings, and the calibration with the profile that reads it; `findings` on names that it took."""
-
-    table: Table
-    calibration: Calibration
-    findings: list[Finding] = field(default_factory=list)
-
-
-def read_surveys(
+def table_of_other_names(
     source: str | os.PathLike[str] | Table,
+    table: Table | None,
+    problem: InputError | FitError | None,
     calibration: Calibration,
-    said: Said | None = None,
-    rows: int = runs.MOST_ROWS,
+    said: Said,
 ) -> SurveyTable:
-    """The readings in a file or table, by the names of the calibration's run where it has these, else by its own.
+    """The readings in a file, or in a `table`, by names that are not those of the calibration's run.
 
-    `rows` as of `runs.read_export`.
+    `table`: as it was read by the run's profile, if there was no `problem`.
 
     Raises:
-        InputError: the file cannot be read, or has no table of readings.
+        InputError: there is no table of readings.
         FitError: which table, or which columns, are meant is open.
     """
-    said, profile = said or Said(), calibration.profile
-    table: Table | None = None
-    problem: Exception | None = None
-    if isinstance(source, Table):
-        table = source
-    else:
-        try:
-            table = runs.read_export(
-                source, profile, decimal=said.decimal, rows=rows, statements=said.statements
-            )
-        except UnreadableFileError:
-            raise
-        except (InputError, FitError) as error:
-            problem = error
-    if table and not said.answers and _has_names(table, profile):
-        return SurveyTable(table, calibration)
     form = where = None
     try:
-        if not isinstance(source, Table) and (where := _table_in(source, profile, said, problem)):
+        if not isinstance(source, Table):
+            where = _table_in(source, calibration.profile, said, problem)
+        if where is not None and not isinstance(source, Table):
             table, form = as_written(source, where, True)
         assert table is not None
         return _by_meaning(table, form, where, calibration, said)
     except (QuestionError, QuestionsError) as error:
         raise_answerable(error)
-
-
-def _has_names(table: Table, profile: Profile) -> bool:
-    """Whether a table has all channels by the names of a profile, or one of the accelerometer's by a run file's."""
-    wanted, names = runs.channels_of(profile), {*table.columns}
-    named = bool(wanted) and {*wanted} <= names
-    return named or not names.isdisjoint(CHANNELS["accelerometer"])
 
 
 def _table_in(

@@ -460,7 +460,7 @@ def _named(
     """Readings by the names of a calibration's run or those of their table, and the finding on these."""
     profile, findings = calibration.profile, list[Finding]()
     if not isinstance(survey, Readings) and _is_tabular(survey):
-        from mwdcal.identification.surveys import read_surveys
+        from mwdcal.presentation.readings import read_surveys
 
         given = cast(Tabular, survey)
         table = given if isinstance(given, str | os.PathLike) else table_in_memory(given, "the run")

@@ -21,7 +21,7 @@ from mwdcal.files.formats import atomic
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, as_text
 from mwdcal.files.formats.table import Table
-from mwdcal.files.statements import Said
+from mwdcal.files.statements import Said, SurveyTable
 from mwdcal.geometry.vectors import AnyArray, Array, Bools
 from mwdcal.library.answers import Said as Answered
 from mwdcal.library.answers import by_column
@@ -33,7 +33,6 @@ from mwdcal.use.correction import warn_if_blank
 
 if TYPE_CHECKING:
     from mwdcal.calibration.record import SignatureCheck
-    from mwdcal.identification.surveys import SurveyTable
     from mwdcal.presentation.conversion import Converted, Exported
     from mwdcal.presentation.signature import LoadedCalibration
     from mwdcal.presentation.survey import SurveySummary
@@ -679,7 +678,7 @@ def _survey_table(
     readings: Tabular | Readings, calibration: Calibration, said: Said
 ) -> SurveyTable:
     """The table of readings, under its own names."""
-    from mwdcal.identification.surveys import SurveyTable, read_surveys
+    from mwdcal.presentation.readings import read_surveys
 
     if isinstance(readings, Readings):
         _check_readings(readings, "readings")

@@ -212,7 +212,7 @@ def command(
 
 def _inputs(tool: LoadedCalibration, readings: Path, said: Said, how: Any) -> WellInputs:
     """The inputs of a run: its calibration and its table."""
-    from mwdcal.identification.surveys import read_surveys
+    from mwdcal.presentation.readings import read_surveys
     from mwdcal.survey.surveying import well_inputs
 
     reference, limits, msa, error_model, missing, section_azimuth, unit, registry = how
