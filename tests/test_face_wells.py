@@ -229,6 +229,28 @@ def test_surveys_as_a_table_of_pandas(cal):
     )
 
 
+def test_true_and_false_are_booleans_in_pandas(cal):
+    pandas = pytest.importorskip("pandas")
+    columns = {name: [*cells] for name, cells in read_csv(WELL).items()}
+    columns["ref_gravity_g"][1] = "1.05"
+    columns["temperature_c"][3] = "90"
+    words = {True: "true", False: "false", pandas.NA: ""}
+    for axial in (True, False):
+        for name in () if axial else ("ref_gravity_g", "ref_field_nt", "ref_dip_deg"):
+            columns[name][2] = ""
+        well = mc.survey(cal, columns, outside="extrapolate", axial_correction=axial)
+        frame = well.to_pandas()
+        flags = {"accepted", "axial_no_go", "extrapolated"} & {*frame.columns}
+        assert len(flags) == 2 + axial
+        for name in flags:
+            assert str(frame[name].dtype) == "boolean"
+            assert [words[cell] for cell in frame[name]] == well.columns[name].tolist()
+        assert well.accepted.tolist() == frame["accepted"].fillna(False).tolist()
+    assert {*well.columns["accepted"]} == {"true", "false", ""}
+    run = mc.read_run(WELL, cal.profile)
+    assert str(mc.apply(cal, run, "extrapolate").to_pandas()["extrapolated"].dtype) == "boolean"
+
+
 def test_surveys_without_references_are_not_judged_and_a_serial_is_a_column(cal, tmp_path):
     names = ("md_m", "temperature_c", "ax", "ay", "az", "mx", "my", "mz")
     table = {name: read_csv(EXAMPLE / "well.csv")[name] for name in names}

@@ -302,7 +302,9 @@ def test_findings_are_grouped_by_cause_and_the_most_important_come_first():
     assert left == 0
     many = [finding("reshoot", "moved", str(i)) for i in range(20)]
     assert leading_findings(many)[0][0].text.endswith(", 12 and 7 more")
-    shown, left = leading_findings([finding(f"cause-{i}") for i in range(9)])
+    causes = [finding(f"cause-{i}") for i in range(9)]
+    assert leading_findings([*causes, finding("path-from-first")])[0][0].id == "path-from-first"
+    shown, left = leading_findings(causes)
     assert (len(shown), left) == (6, 3)
 
 

@@ -310,7 +310,8 @@ def test_python_says_where_a_roll_test_goes_and_which_names_it_expects(tmp_path,
     cal = library.load(laboratory[0] / "cal.json")
     frame = {"gx": np.ones(3), "gy": np.zeros(3), "gz": np.zeros(3)}
     with pytest.raises(
-        library.InputError, match=r"'Acelerómetros X \(g\)'.*'Magnetómetros Z \(G\)'"
+        library.InputError,
+        match=r"for mx, my, mz \(in the run 'Mag.* X \(G\)'.*'Magnetómetros Z \(G\)'",
     ):
         library.apply(cal, frame)
     pytest.importorskip("pandas")

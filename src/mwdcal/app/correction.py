@@ -44,11 +44,12 @@ from mwdcal.files.formats.columns import as_text, check_names, no_stations
 from mwdcal.files.formats.sinks import ParquetSink, Sink, TextSink
 from mwdcal.files.formats.table import EXCHANGED, Table
 from mwdcal.files.formats.table import numbers as as_numbers
-from mwdcal.files.runs import away_from_stand, is_export, read_export, renamed, to_readings
-from mwdcal.files.statements import with_statements
+from mwdcal.files.runs import away_from_stand, is_export, renamed, to_readings
+from mwdcal.files.statements import Said, with_statements
 from mwdcal.files.streams import Part, StreamedTable
 from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, UNCERTAINTIES
 from mwdcal.geometry.vectors import Array, Bools
+from mwdcal.presentation.readings import read_surveys
 from mwdcal.sensor.profile import Profile
 from mwdcal.use import correction, correction_numba, strengths
 from mwdcal.use.correction import JUDGED, RowCounts, correct_and_count
@@ -471,34 +472,36 @@ def apply_to_any(
     output: Path,
     outside: str,
     missing: str,
-    decimal: str,
+    said: Said,
     uncertainty: bool,
     advance: Callable[[int, int], None],
-    statements: Mapping[str, str],
 ) -> tuple[RowCounts, list[Finding], str]:
     """Correct a file into another: part by part, or whole where it is short text or a workbook.
 
     Counts of the rows, what the reader should know, and the SHA-256 of the readings, empty
     where they were not read as a whole. `advance` gets how much of a long
     table is done, and the whole. An export as the calibration's profile describes it is taken whole, and
-    text that comes of it is written as it is. With `uncertainty` columns of standard uncertainties. `statements`:
-    serial, date and operator as the user says.
+    text that comes of it is written as it is. With `uncertainty` columns of standard uncertainties. `said`: as of
+    `read_surveys`.
     """
-    profile = calibration.profile
-    exported = _is_exported(readings, profile, decimal)
+    exported = said.answers or _is_exported(readings, calibration.profile, said.decimal)
     if in_parts(readings, output) and not exported:
         streamed = apply_to_file(
             calibration, readings, output, outside, advance,
-            missing=missing, decimal=decimal, uncertainty=uncertainty, statements=statements,
+            missing=missing, decimal=said.decimal, uncertainty=uncertainty, statements=said.statements,
         )  # fmt: skip
         return *streamed, ""
     if readings.suffix.lower() in TEXT and (exported or output.suffix.lower() in WHOLE):
         _check_size(readings)
-    source = read_export(readings, profile, decimal=decimal, rows=WHOLE_ROWS, statements=statements)
-    result, tally, findings = apply_to_table(calibration, source, outside, missing, uncertainty)
+    named = read_surveys(readings, calibration, said, WHOLE_ROWS)
+    source, profile = named.table, named.calibration.profile
+    result, tally, findings = apply_to_table(
+        named.calibration, source, outside, missing, uncertainty, named.findings
+    )
     if EXTRAPOLATED in result.columns and output.suffix.lower() != ".parquet":
         words = [as_text(bool(mark)) for mark in result.columns[EXTRAPOLATED]]
         result = replace(result, columns={**result.columns, EXTRAPOLATED: words})
+    exported = exported and not named.findings
     form = profile.table if exported and readings.suffix.lower() in TEXT else msgspec.UNSET
     tables.write(output, result, None if isinstance(form, msgspec.UnsetType) else form)
     formulas = runs.with_formulas(source.columns) if output.suffix.lower() in TEXT else []
@@ -508,8 +511,6 @@ def apply_to_any(
 
 def _is_exported(readings: Path, profile: Profile, decimal: str) -> bool:
     """Whether a table is written, or names its columns, as the profile says and not as documented."""
-    if isinstance(profile.columns, msgspec.UnsetType):
-        return False
     if readings.suffix.lower() in WHOLE:
         return True
     opened = streams.open_parquet if readings.suffix.lower() == ".parquet" else streams.open_text
@@ -536,8 +537,9 @@ def apply_to_table(
     outside: str,
     missing: str = "refuse",
     uncertainty: bool = True,
+    about: Iterable[Finding] = (),
 ) -> tuple[Table, RowCounts, list[Finding]]:
-    """The input's columns and metadata, the results, and what the calibration was."""
+    """The input's columns and metadata, the results, and what the calibration was; findings after those `about` it."""
     table = renamed(source, calibration.profile)
     check_columns(list(table.columns), source.source)
     check_warmth(calibration, list(table.columns), source.source)
@@ -552,6 +554,7 @@ def apply_to_table(
     results, tally, findings = correct_and_count(
         calibration, readings, outside, source.count - kept.count, uncertainty
     )
+    findings = [*about, *findings]
     check_free(source.columns, list(results), source.source)
     columns = {name: spread(values, whole) for name, values in results.items()}
     metadata = {**source.metadata, **described(calibration, [*results])}

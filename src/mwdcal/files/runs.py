@@ -248,8 +248,7 @@ def _exported(
         serial = sources_of(profile).get("serial", ColumnSource(name="serial")).name
         table = tables.read(path, rows=rows, export=form, serial=serial)
         if is_export(table.columns, profile):
-            _check_below_names(path, form, profile)
-            return table
+            return replace(table, units=_units_below_names(path, form, profile))
         problem = _not_as_stated(table, profile)
     except InputError as error:
         problem = error
@@ -331,10 +330,17 @@ def of_layout(where: Layout, path: str | os.PathLike[str], profile: Profile) -> 
     return tables.of_layout(where, path, [n for n, column in named.items() if column in LABELS])
 
 
-def _check_below_names(path: str | os.PathLike[str], form: TableFormat, profile: Profile) -> None:
-    """Refuse readings in a line that is not read, and units other than the profile's in a line of units."""
+def _units_below_names(
+    path: str | os.PathLike[str], form: TableFormat, profile: Profile
+) -> dict[str, str]:
+    """The units of columns in lines below the names.
+
+    Raises:
+        InputError: readings in a line that is not read, or units other than the profile's.
+    """
+    units: dict[str, str] = {}
     if form.first_line == form.header_line + 1:
-        return
+        return units
     (_, names), *skipped = tables.below_names(path, form) or [(0, [])]
     theirs = {each.name: each.unit for each in sources_of(profile).values() if each.unit}
     wrong = {(each.name, each.instead_of) for each in sources_of(profile).values()}
@@ -352,6 +358,8 @@ def _check_below_names(path: str | os.PathLike[str], form: TableFormat, profile:
                     f"{where}: {shown(name.strip())} is in {unit}, by the tool profile in "
                     f"{theirs[name.strip()]}."
                 )
+        units |= {n.strip(): cell for n, cell in zip(names, cells, strict=False)}
+    return units
 
 
 def alike_units(written: str, stated: str) -> bool:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from mwdcal.calibration.readings import IN_TABLE
+from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.table import Table, labels
@@ -13,9 +14,9 @@ from mwdcal.files.formats.table import Table, labels
 
 @dataclass(frozen=True)
 class Said:
-    """Statements of the user on the table of a roll test: as of `runs.read_export`, its sheet, and its columns.
+    """Statements of the user on a later table: as of `runs.read_export`, its sheet, and its columns.
 
-    `of_run`: metadata of its run.
+    `of_run`: metadata of the run, for a roll test.
     """
 
     decimal: str = "."
@@ -23,6 +24,20 @@ class Said:
     sheet: str = ""
     columns: Mapping[str, str] = field(default_factory=dict)
     of_run: Mapping[str, object] = field(default_factory=dict)
+
+    @property
+    def answers(self) -> bool:
+        """Whether it says which sheet or columns are meant."""
+        return bool(self.sheet or self.columns)
+
+
+@dataclass(frozen=True)
+class SurveyTable:
+    """A table of readings, and the calibration with the profile that reads it; `findings` on names that it took."""
+
+    table: Table
+    calibration: Calibration
+    findings: list[Finding] = field(default_factory=list)
 
 
 def with_statements(

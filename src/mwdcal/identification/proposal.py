@@ -57,7 +57,7 @@ from mwdcal.files.runs import (
     to_readings,
 )
 from mwdcal.files.statements import stated_table
-from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW, FACTORS, WARMTH
+from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW, FACTORS, WARMTH, is_depth
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
 from mwdcal.identification.beside import findings_beside, has_roll_test, roll_tests_beside
@@ -1548,13 +1548,37 @@ def findings_on(proposal: Proposal) -> list[Finding]:
         for name, reason in proposal.ignored.items()
     ]
     marked = [Finding(id=MARKED_ROWS, text=text) for text in proposal.remarks]
-    known = axes_open(proposal) + left_handed(proposal) + lines_not_taken(proposal) + marked
+    known = (
+        of_surveys(proposal)
+        + axes_open(proposal)
+        + left_handed(proposal)
+        + lines_not_taken(proposal)
+        + marked
+    )
     if proposal.profile.columns is not msgspec.UNSET and RAW[3] not in proposal.profile.columns:
         stated = {*proposal.profile.columns, *proposal.metadata}
         known += magnetometer_absent(n for n in STATED_REFERENCES if REFERENCES[n].column in stated)
     known += answers_by_readings(proposal) + warmth_around(proposal) + units_contradicted(proposal)
     known += tables_beside(proposal)
     return known + ignored + unused_columns(proposal.unused)
+
+
+def depths_of_surveys(proposal: Proposal) -> str:
+    """The column of measured depths in a table without the angles that a calibration needs; empty without one."""
+    names = (each.strip("'") for each in proposal.unused) if proposal.open_axes else ()
+    return next(filter(is_depth, names), "")
+
+
+def of_surveys(proposal: Proposal) -> list[Finding]:
+    """A finding on a table of surveys, of which no profile is made."""
+    depths = depths_of_surveys(proposal)
+    if not depths:
+        return []
+    text = (
+        f"{proposal.source} has measured depths ({shown(depths)}) and no angles of a stand: it looks like surveys of a "
+        "well, not a calibration run. Survey it by the calibration of its tool: mwdcal survey."
+    )
+    return [Finding(id="looks-like-surveys", text=text)]
 
 
 def tables_beside(proposal: Proposal) -> list[Finding]:

@@ -110,7 +110,7 @@ def _of_other_table(
 ) -> Readings:
     """The readings of a file without the table of a profile; the problem where it holds no other table."""
     try:
-        every = tables.every_table(path, decimal=_sign(profile, said))
+        every = tables.every_table(path, decimal=sign_of(profile, said))
     except InputError:
         raise problem from None
     if not any(has_channels(each, profile) for each in every):
@@ -172,12 +172,12 @@ def _tests_among(others: Sequence[Layout], run: Table, profile: Profile) -> list
 
 def _others(path: str | os.PathLike[str], run: Table, profile: Profile, said: Said) -> list[Layout]:
     """The tables in the file of a run beside it."""
-    every = tables.every_table(path, decimal=_sign(profile, said))
+    every = tables.every_table(path, decimal=sign_of(profile, said))
     sheet = run.sheet or next((each.sheet for each in every), "")
     return [t for t in every if not is_part_of(t, sheet, run.parts, run.lines)]
 
 
-def _sign(profile: Profile, said: Said) -> str:
+def sign_of(profile: Profile, said: Said) -> str:
     """The decimal sign of text where it is known to be the comma."""
     return "," if "," in (profile.form.decimal, said.decimal) else ""
 
@@ -204,11 +204,11 @@ def read_roll_test(
             return _under_names_of_run(path, where, profile, said)
         return _by_meaning(path, where, profile, said)
     except (QuestionError, QuestionsError) as error:
-        _raise_answerable(error)
+        raise_answerable(error)
 
 
-def _raise_answerable(error: QuestionError | QuestionsError) -> NoReturn:
-    """Raise questions with the answers that a roll test takes."""
+def raise_answerable(error: QuestionError | QuestionsError) -> NoReturn:
+    """Raise questions with the answers that a later table takes."""
     every = error.questions if isinstance(error, QuestionsError) else (error,)
     questions = [
         QuestionError(
@@ -228,28 +228,36 @@ def _chosen(
     path: str | os.PathLike[str], profile: Profile, said: Said, meant: Sequence[Layout] | None
 ) -> Layout | None:
     """The table of the roll test in a file; None of a format that has but one table."""
-    name = Path(path).name
-    tests = _all_meant(path, profile, said) if meant is None else meant
-    if len(tests) > 1 and len({t.sheet for t in tests}) == 1:
-        tests = [max(tests, key=lambda t: t.size)]
-    if len(tests) > 1:
-        places = ", ".join(f"sheet {shown(t.sheet)} ({len(t.lines)} rows)" for t in tests)
-        answers = [Answer(shown(t.sheet), (("sheet", t.sheet),)) for t in tests]
-        raise QuestionError(f"{name}: which one is the roll test: {places}?", answers)
-    return tests[0] if tests else None
+    if meant is None:
+        on_sheet = tables_on_sheet(path, profile, said)
+        tests = [t for t in on_sheet if has_channels(t, profile)]
+        meant = of_roll_tests(tests) or tests or sorted(on_sheet, key=lambda t: t.size)[-1:]
+    return one_of(meant, f"{Path(path).name}: which one is the roll test")
 
 
-def _all_meant(path: str | os.PathLike[str], profile: Profile, said: Said) -> Sequence[Layout]:
-    """The tables of a file that may be a roll test, those on the sheet that the user says."""
-    every = tables.every_table(path, decimal=_sign(profile, said))
+def one_of(meant: Sequence[Layout], question: str) -> Layout | None:
+    """The only one of tables that may be meant, the largest of one sheet; None of no tables.
+
+    Raises:
+        QuestionError: they are on several sheets.
+    """
+    if len({t.sheet for t in meant}) > 1:
+        places = ", ".join(f"sheet {shown(t.sheet)} ({len(t.lines)} rows)" for t in meant)
+        answers = [Answer(shown(t.sheet), (("sheet", t.sheet),)) for t in meant]
+        raise QuestionError(f"{question}: {places}?", answers)
+    return max(meant, key=lambda t: t.size, default=None)
+
+
+def tables_on_sheet(path: str | os.PathLike[str], profile: Profile, said: Said) -> Sequence[Layout]:
+    """The tables of a file, those on the sheet that the user says; none of a format that has but one."""
+    every = tables.every_table(path, decimal=sign_of(profile, said))
     on_sheet = [t for t in every if said.sheet in ("", t.sheet)]
     if said.sheet and not on_sheet:
         names = ", ".join(dict.fromkeys(shown(t.sheet) for t in every))
         raise InputError(
             f"{Path(path).name}: there is no table on a sheet {shown(said.sheet)}; found {names or 'none'}."
         )
-    tests = [t for t in on_sheet if has_channels(t, profile)]
-    return of_roll_tests(tests) or tests or sorted(on_sheet, key=lambda t: t.size)[-1:]
+    return on_sheet
 
 
 def _units(where: Layout) -> dict[str, str]:
@@ -310,9 +318,9 @@ def _by_meaning(
     table, form = as_written(path, where, True)
     of_table = table.metadata
     table = _with_run(table, profile, said)
-    answers = {**_known_columns(table, where, profile), **said.columns}
+    answers = {**known_columns(table, where, profile), **said.columns}
     table, form, columns, _, ignored = named_columns(table, form, where, answers, False)
-    _check_channels(table, columns, profile)
+    check_channels(table, columns, profile, CHANNELS["accelerometer"], OF_ROLL_TEST)
     if once := once_for_setting(table, columns) or written_once(table, columns):
         table = runs.filled_down(table, once)
     if _AZIMUTH_REFERENCE not in of_table and (
@@ -325,7 +333,7 @@ def _by_meaning(
     columns = _with_sense(columns, profile)
     if form is not None:
         form = msgspec.structs.replace(form, ignore=tuple(ignored))
-    theirs = _scaled(
+    theirs = scaled(
         msgspec.structs.replace(profile, table=form or msgspec.UNSET, columns=columns),
         runs.sources_of(profile),
     )
@@ -369,7 +377,7 @@ def _stated(table: Table, said: Said, column: str) -> Table:
     )
 
 
-def _known_columns(table: Table, where: Layout | None, profile: Profile) -> dict[str, str]:
+def known_columns(table: Table, where: Layout | None, profile: Profile) -> dict[str, str]:
     """The columns that are called as by the run's profile but for blanks, brackets, case and accents."""
     names = {_plain(name): name for name in table.columns}
     units = _units(where) if where else {}
@@ -382,14 +390,23 @@ def _known_columns(table: Table, where: Layout | None, profile: Profile) -> dict
     return known
 
 
-def _check_channels(table: Table, columns: Mapping[str, ColumnSource], profile: Profile) -> None:
-    """Refuse a table without channels of the run, all of which are named."""
-    wanted = [c for c in runs.sources_of(profile) if c in RAW] or CHANNELS["accelerometer"]
+def check_channels(
+    table: Table,
+    columns: Mapping[str, ColumnSource],
+    profile: Profile,
+    usual: Collection[str],
+    word: str,
+) -> None:
+    """Refuse a table, called by a word, without channels of the run; the `usual` ones where its profile names none."""
+    theirs = runs.sources_of(profile)
+    wanted = [c for c in theirs if c in RAW] or usual
     absent = [column for column in wanted if column not in columns]
     if absent:
+        names = ", ".join(shown(theirs[c].name) for c in absent if c in theirs)
         used = {each.name for each in columns.values()}
         others = [shown(name) for name in table.columns if name not in used]
-        problem = f"{table.source}: the roll test has no column for {', '.join(absent)}"
+        problem = f"{table.source}: {word} has no column for {', '.join(absent)}"
+        problem += f" (in the run {names})" if names else ""
         if len(others) < len(absent):
             raise InputError(f"{problem}. Add what is missing.")
         raise QuestionError(
@@ -407,8 +424,8 @@ def _with_sense(columns: Mapping[str, ColumnSource], profile: Profile) -> dict[s
     return {**columns}
 
 
-def _scaled(profile: Profile, run: Mapping[str, ColumnSource]) -> Profile:
-    """The profile of a roll test with the scales of its run in the units of the test's channels."""
+def scaled(profile: Profile, run: Mapping[str, ColumnSource]) -> Profile:
+    """The profile of a later table with the scales of its run in the units of the table's channels."""
     triads = {}
     for kind in TRIADS:
         theirs, ours = (_unit(kind, each) for each in (run, runs.sources_of(profile)))
@@ -416,7 +433,7 @@ def _scaled(profile: Profile, run: Mapping[str, ColumnSource]) -> Profile:
         if theirs and ours and theirs != ours:
             if not {theirs, ours} <= {*units_of("ref_gravity_g"), *units_of("ref_field_nt")}:
                 raise InputError(
-                    f"the {kind} reads in {ours} in the roll test, and in {theirs} in the run. Convert one of them."
+                    f"the {kind} reads in {ours} in this table, and in {theirs} in the run. Convert one of them."
                 )
             triads[kind] = _times(getattr(profile, kind), factors[0] / factors[1])
     return msgspec.structs.replace(profile, **triads)

@@ -12,11 +12,16 @@ import numpy as np
 
 from mwdcal.calibration.record import Finding
 from mwdcal.errors import InputError
+from mwdcal.files.formats.columns import as_text
 from mwdcal.files.formats.table import Table
+from mwdcal.geometry.observables import EXTRAPOLATED
 from mwdcal.geometry.vectors import AnyArray
 
 LONGEST_LINE = 300
 """Most characters of a `repr`."""
+FLAGS = ("accepted", "axial_no_go", EXTRAPOLATED)
+"""Columns of results that are true, false or blank."""
+_FLAG_WORDS = {"true": True, "false": False, "": None}
 
 
 class Result:
@@ -90,7 +95,7 @@ def arrays_of(table: Table) -> dict[str, AnyArray]:
 
 
 def frame(columns: Mapping[str, AnyArray], stated: Mapping[str, object] | None = None) -> Any:
-    """Columns as a table of pandas, with what is `stated` of them in its `attrs`.
+    """Columns as a table of pandas, with what is `stated` of them in its `attrs`; `FLAGS` are nullable booleans.
 
     Raises:
         InputError: pandas is not installed.
@@ -101,6 +106,11 @@ def frame(columns: Mapping[str, AnyArray], stated: Mapping[str, object] | None =
         raise InputError(
             "`to_pandas` needs pandas, which is not installed: pip install pandas."
         ) from error
-    whole = pandas.DataFrame(dict(columns))
+    flags = {}
+    for name in {*FLAGS}.intersection(columns):
+        words = [*map(as_text, columns[name].tolist())]
+        if {*words} <= {*_FLAG_WORDS}:
+            flags[name] = pandas.array([_FLAG_WORDS[word] for word in words], dtype="boolean")
+    whole = pandas.DataFrame({**columns, **flags})
     whole.attrs.update(stated or {})
     return whole

@@ -104,10 +104,15 @@ def read_run(
 
 def table_of(source: Tabular, name: str, read: Callable[[Path], Table]) -> Table:
     """The table of a file, or of columns that are in memory."""
-    if isinstance(source, Table):
-        return source
     if isinstance(source, str | os.PathLike):
         return read(source)
+    return table_in_memory(source, name)
+
+
+def table_in_memory(source: Any, name: str) -> Table:
+    """The table of columns that are in memory."""
+    if isinstance(source, Table):
+        return source
     names = getattr(
         source, "column_names", getattr(source, "columns", source)
     )  # of pyarrow, of pandas
@@ -230,13 +235,18 @@ def readings_of(
     """The readings of a run: as they are, of an array as `as_readings` takes it, or by `read_run` of a table."""
     if isinstance(source, Readings):
         pass
-    elif isinstance(source, str | os.PathLike | Table | Mapping) or hasattr(source, "columns"):
+    elif _is_tabular(source):
         source = read_run(cast(Tabular, source), profile)
     else:
-        array = as_readings(source)
+        array = as_readings(cast(ReadingsLike, source))
         source = readings(array.accelerometer, array.magnetometer, temperature=array.temperature)
     _check_readings(source, name, single)
     return source
+
+
+def _is_tabular(source: object) -> bool:
+    """Whether readings are a file, a table, or columns by name."""
+    return isinstance(source, str | os.PathLike | Table | Mapping) or hasattr(source, "columns")
 
 
 def with_choices(options: Options | None, choices: Mapping[str, Any]) -> Options | None:
@@ -415,19 +425,25 @@ def apply(
     calibration: Calibration | Path,
     survey: RunSource,
     outside: Literal["blank", "refuse", "extrapolate"] = "blank",
+    *,
+    sheet: str = "",
+    column: Mapping[str, str] | Said | None = None,
 ) -> Corrected:
     """Correct readings by a calibration or its file: vectors and angles.
 
-    `outside`: what becomes of readings outside the calibrated temperatures. Singular: azimuth and
-    toolface are NaN exactly at vertical; the magnetic toolface is not.
+    `outside`: what becomes of readings outside the calibrated temperatures. `sheet` and `column` as of `survey`.
+    Singular: azimuth and toolface are NaN exactly at vertical; the magnetic toolface is not.
 
     Raises:
         InputError: readings that do not belong to the calibration.
+        FitError: a column leaves a question open.
     """
     calibration = calibration_of(calibration)
-    survey = readings_of(survey, "survey", calibration.profile, single=False)
+    said = statements.Said(sheet=sheet, columns=by_column("column", column))
+    survey, about = _named(survey, calibration, said)
     survey = runs.away_from_stand(survey, calibration.profile)
     columns, findings = correct(calibration, survey, outside)
+    findings = [*about, *findings]
     warn_if_blank(columns, findings)
     return Corrected(
         gravity=np.stack([columns[f"g{axis}_g"] for axis in "xyz"], -1),
@@ -437,6 +453,21 @@ def apply(
         findings=findings,
         stations=stations_of(survey),
     )
+
+
+def _named(
+    survey: RunSource, calibration: Calibration, said: statements.Said
+) -> tuple[Readings, list[Finding]]:
+    """Readings by the names of a calibration's run or those of their table, and the finding on these."""
+    profile, findings = calibration.profile, list[Finding]()
+    if not isinstance(survey, Readings) and _is_tabular(survey):
+        from mwdcal.presentation.readings import read_surveys
+
+        given = cast(Tabular, survey)
+        table = given if isinstance(given, str | os.PathLike) else table_in_memory(given, "the run")
+        named = read_surveys(table, calibration, said)
+        survey, profile, findings = named.table, named.calibration.profile, named.findings
+    return readings_of(survey, "survey", profile, single=False), findings
 
 
 @runtime_checkable

@@ -21,16 +21,20 @@ from mwdcal.files.formats import atomic
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, as_text
 from mwdcal.files.formats.table import Table
+from mwdcal.files.statements import Said, SurveyTable
 from mwdcal.geometry.vectors import AnyArray, Array, Bools
+from mwdcal.library.answers import Said as Answered
+from mwdcal.library.answers import by_column
 from mwdcal.library.arrays import nearest
 from mwdcal.library.results import Result, frame
-from mwdcal.library.tasks import Tabular, _check_readings, table_of
+from mwdcal.library.tasks import Tabular, _check_readings, table_in_memory, table_of
 from mwdcal.sensor.profile import Profile
 from mwdcal.use.correction import warn_if_blank
 
 if TYPE_CHECKING:
     from mwdcal.calibration.record import SignatureCheck
     from mwdcal.presentation.conversion import Converted, Exported
+    from mwdcal.presentation.signature import LoadedCalibration
     from mwdcal.presentation.survey import SurveySummary
     from mwdcal.survey.acceptance import SurveyLimits
     from mwdcal.survey.error_model import ErrorModel
@@ -465,6 +469,8 @@ def survey(
     tie_in: Sequence[float] | None = None,
     section_azimuth: float = 0.0,
     length_unit: Literal["", "m", "ft", "usft"] = "",
+    column: Mapping[str, str] | Answered | None = None,
+    sheet: str = "",
     outside: Literal["blank", "refuse", "extrapolate"] = "blank",
     missing: Literal["refuse", "blank"] = "refuse",
     decimal: str = ".",
@@ -497,6 +503,8 @@ def survey(
         section_azimuth: of the vertical section, degrees from the north of the path.
         length_unit: of the results and of `tie_in`, and of depths whose column states none: m (the default), ft, or
             usft (1200/3937 m).
+        column: answers which column is which, as of `propose_profile`: `{"ax": "Gx 1"}`.
+        sheet: of a workbook.
         outside: what becomes of readings outside the calibrated temperatures.
         missing: rows without a reading, such as a tie-in station: refuse the table, or leave their results blank.
         decimal: decimal sign of a text file.
@@ -504,15 +512,16 @@ def survey(
 
     Raises:
         InputError: an input that cannot be read or does not belong to the calibration, or an unknown word.
-        FitError: with `msa`, the surveys do not separate interference from azimuth.
+        FitError: a column leaves a question open; with `msa`, the surveys do not separate interference from azimuth.
 
     Example:
+        `here = mwdcal.reference(latitude=60.4, longitude=5.3, date="2026-11-23")`, then
         `well = mwdcal.survey(cal, "well.csv", reference=here, msa=True)`, then
         `well.columns["azimuth_true_deg"]` and `well.interference.axial_nt`.
     """
     from mwdcal.presentation.signature import load_calibration
     from mwdcal.survey.runs import survey_runs
-    from mwdcal.survey.surveying import analysed, check_drift, start_of, well_inputs
+    from mwdcal.survey.surveying import analysed, check_drift, start_of
 
     check_drift(sensor_drift, msa)
     ends: Any = tuple(np.radians(_finite("switch", switch, 2)).tolist())
@@ -522,15 +531,11 @@ def survey(
         load_calibration(_source(tool), [Path(key) for key in keys])
         for tool in (cal, *(tool for tool, _ in runs))
     ]
-    inputs = [
-        well_inputs(
-            tool.calibration, _survey_table(table, tool.calibration, decimal), _earth(reference), limits, msa,
-            tool.digest, tool.findings, error_model, missing, _number("section_azimuth", section_azimuth),
-            length_unit,
-        )
-        for tool, table in zip(loaded, (readings, *(table for _, table in runs)), strict=True)
-    ]  # fmt: skip
-    inputs = [_with_walk(each, registry) for each in inputs]
+    said = Said(decimal, sheet=sheet, columns=by_column("column", column))
+    azimuth = _number("section_azimuth", section_azimuth)
+    how = (_earth(reference), limits, msa, error_model, missing, azimuth, length_unit, registry)
+    tables = (readings, *(table for _, table in runs))
+    inputs = [_inputs(tool, table, said, how) for tool, table in zip(loaded, tables, strict=True)]
     analyses = [analysed(each, sensor_drift) if msa else None for each in inputs]
     for analysis in filter(None, analyses):
         analysis.check()
@@ -631,6 +636,21 @@ def _with_walk(inputs: WellInputs, registry: FilePath | None) -> WellInputs:
     return with_walk(inputs, os.fspath(registry))
 
 
+def _inputs(
+    tool: LoadedCalibration, readings: Tabular | Readings, said: Said, how: Any
+) -> WellInputs:
+    """The inputs of a run: its calibration and its table."""
+    from mwdcal.survey.surveying import well_inputs
+
+    reference, limits, msa, error_model, missing, azimuth, unit, registry = how
+    named = _survey_table(readings, tool.calibration, said)
+    inputs = well_inputs(
+        named.calibration, named.table, reference, limits, msa, tool.digest,
+        [*tool.findings, *named.findings], error_model, missing, azimuth, unit,
+    )  # fmt: skip
+    return _with_walk(inputs, registry)
+
+
 def _source(cal: object) -> Calibration | FilePath:
     """A calibration or its file; refuses anything else."""
     if isinstance(cal, Calibration | str | os.PathLike):
@@ -654,22 +674,23 @@ def _earth(reference: object) -> EarthReference | FilePath | None:
     )
 
 
-def _survey_table(readings: Tabular | Readings, calibration: Calibration, decimal: str) -> Table:
+def _survey_table(
+    readings: Tabular | Readings, calibration: Calibration, said: Said
+) -> SurveyTable:
     """The table of readings, under its own names."""
-    profile = calibration.profile
+    from mwdcal.presentation.readings import read_surveys
+
     if isinstance(readings, Readings):
         _check_readings(readings, "readings")
-        return _table_of(readings, profile)
+        return SurveyTable(_table_of(readings, calibration.profile), calibration)
     if not isinstance(readings, str | os.PathLike | Mapping) and not hasattr(readings, "columns"):
         raise InputError(
             f"`readings` must be a file, columns by name, or readings; got {type(readings).__name__}. Make some by "
             "mwdcal.read_run(…)."
         )
-    return table_of(
-        readings,
-        "the readings",
-        lambda path: runs.read_export(path, profile, decimal=decimal, rows=runs.MOST_ROWS),
-    )
+    if not isinstance(readings, str | os.PathLike):
+        readings = table_in_memory(readings, "the readings")
+    return read_surveys(readings, calibration, said)
 
 
 def _table_of(readings: Readings, profile: Profile) -> Table:

@@ -17,6 +17,7 @@ from mwdcal.files.formats.layout import Layout
 from mwdcal.files.profiles import stand_in_settings
 from mwdcal.identification.proposal import (
     Proposal,
+    depths_of_surveys,
     findings_on,
     has_angles,
     in_order,
@@ -116,7 +117,9 @@ def screen(proposal: Proposal, run: Path, output: Path | None, has_roll_test: bo
             f"mwdcal calibrate {one_line(str(run))} --tool {one_line(str(output))} -o tool.json"
         )
         command += f" --rolltest {one_line(str(run))}" if has_roll_test else ""
-        if proposal.open_axes:
+        if depths_of_surveys(proposal):
+            command = f"mwdcal survey TOOL.json {one_line(str(run))} -o well.csv"
+        elif proposal.open_axes:
             command = f"fill in the axes in {one_line(str(output))}, then {command}"
         exact = (
             f"The angles of the stand count as exact until [stand] in {one_line(str(output))} states their 1σ.\n"

@@ -20,7 +20,7 @@ IMPORTANT = (
     "too-few", "channel", "missing-reference", "weak-geometry", "temperature-span",
     "altered", "revoked", "unsound", "contradicted", "not-judged", "partly-judged", "reshoot", "repeated-readings",
     "misfit", "accelerometer-residuals", "magnetometer-residuals", "looks-like", "column-explains",
-    "outside-temperature", "changed", "standard-overdue", "roll-test-read",
+    "outside-temperature", "changed", "standard-overdue", "roll-test-read", "columns-read", "path-from-first",
 )  # fmt: skip
 """Beginnings of the ids of findings that come first, the most important first."""
 MINOR = ("not-used", "renamed-columns", "reference-unused", "settings-assumed", "unsigned")

@@ -75,11 +75,8 @@ MOST_CONTRIBUTED = 2000
 """Surveys of a table whose contributions are computed."""
 LARGEST_DEPTH = 20_000.0
 """No hole is longer, m."""
-_DEPTH_NAMES = re.compile(
-    r"(md|dept|((measured|bit|survey|hole|along[ _-]?hole)[ _]?)?depth)[ _]*[\[(]?(m|(us)?ft|feet|met(re|er)s?)?[\])]?"
-)
 _DEPTH_UNIT = re.compile(r"(?<![a-z])(m|(us)?ft|feet|met(re|er)s?)[\])]?$")
-"""The unit at the end of such a name."""
+"""The unit at the end of the name of a depth."""
 
 
 @dataclass(frozen=True)
@@ -310,8 +307,11 @@ def depth_column(table: Table, length_unit: str = "") -> tuple[str, float]:
         if name in table.columns:
             return name, LENGTH_UNITS[unit]
     for name in table.columns:
-        if _DEPTH_NAMES.fullmatch(name.strip().lower()):
-            stated = _DEPTH_UNIT.search(name.strip().lower())
+        if synonyms.is_depth(name):
+            parts = (name, table.units.get(name, ""))
+            stated = next(
+                filter(None, (_DEPTH_UNIT.search(p.strip().lower()) for p in parts)), None
+            )
             unit = stated[1] if stated else ""
             if not length_unit and not unit:
                 raise InputError(

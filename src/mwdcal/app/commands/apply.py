@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     default=True,
     help="Columns with the standard uncertainty of each angle and strength. Without them long tables are faster.",
 )
+@options.of_readings
 @options.of_run
 @options.DECIMAL
 @options.TRUSTED_KEYS
@@ -42,7 +43,7 @@ def command(
 
     \b
     Example: mwdcal apply tool.json surveys.csv -o corrected.csv
-    Exit: 0 written, 2 input cannot be read, or does not belong to the calibration.
+    Exit: 0 written, 2 input cannot be read, or does not belong to the calibration, 3 a question is open.
     """
     from mwdcal.app.correction import Applied, apply_to_any
     from mwdcal.app.messages import bar
@@ -56,8 +57,7 @@ def command(
     fitted = loaded.calibration
     with offering_blank(), bar("correcting") as advance:
         tally, findings, readings_digest = apply_to_any(
-            fitted, readings, output, outside, missing, decimal, uncertainty, advance,
-            options.statements(),
+            fitted, readings, output, outside, missing, options.said(decimal), uncertainty, advance,
         )  # fmt: skip
     findings = loaded.findings + findings
     blank, terms = tally.blank(outside), reading_terms(fitted)

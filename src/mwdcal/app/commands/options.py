@@ -213,10 +213,15 @@ def statements() -> dict[str, str]:
     return {name: noted[name] for name in OPTIONS_OF_RUN if name in noted}
 
 
-def of_roll_test(function: Function, beside_run: bool = False) -> Function:
+def of_roll_test(
+    function: Function,
+    beside_run: bool = False,
+    words: str = "the roll test",
+    example: str = "ref_toolface_deg='Cara 2'",
+) -> Function:
     """The options that answer what the table of a roll test, or of later readings, leaves open.
 
-    Those of a command that also has a table of a run begin with `BESIDE_RUN`.
+    Those of a command that also has a table of a run begin with `BESIDE_RUN`. `words` for the table, and an example.
     """
     noted = partial(click.option, callback=_note, expose_value=False)
     prefix = f"--{BESIDE_RUN.replace('_', '-')}" if beside_run else "--"
@@ -225,12 +230,17 @@ def of_roll_test(function: Function, beside_run: bool = False) -> Function:
             f"{prefix}column",
             multiple=True,
             metavar="OURS=THEIRS",
-            help="Which column of the roll test is which: ref_toolface_deg='Cara 2'. Repeatable.",
+            help=f"Which column of {words} is which: {example}. Repeatable.",
         ),
-        noted(f"{prefix}sheet", metavar="NAME", help="Sheet of the roll test."),
+        noted(f"{prefix}sheet", metavar="NAME", help=f"Sheet of {words}."),
     ):
         function = option(function)
     return function
+
+
+def of_readings(function: Function) -> Function:
+    """The same options of a command that corrects readings."""
+    return of_roll_test(function, words="the readings", example="ax='Gx 1'")
 
 
 def said(decimal: str) -> Said:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from math import radians
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,7 @@ from mwdcal.presentation.typed import findings_with_option_names
 
 if TYPE_CHECKING:
     from mwdcal.calibration.record import SignatureCheck
+    from mwdcal.files.statements import Said
     from mwdcal.presentation.signature import LoadedCalibration
     from mwdcal.survey.interference import Interference
     from mwdcal.survey.path import TieIn
@@ -141,6 +143,7 @@ Outputs = list[tuple[Path, Any]]
     old=("--html",),
     help="Also write a page with the pictures; with --msa it shows the analysis too.",
 )
+@options.of_readings
 @options.of_run
 @options.DECIMAL
 @options.TRUSTED_KEYS
@@ -160,8 +163,8 @@ def command(
 
     \b
     Example: mwdcal survey tool.json surveys.csv --reference here.json -o well.csv --report well.html
-    Exit: 0 written, 2 input cannot be read, or does not belong to the calibration, 3 with --msa: the surveys do not
-    separate interference from azimuth.
+    Exit: 0 written, 2 input cannot be read, or does not belong to the calibration, 3 a question is open, or with --msa:
+    the surveys do not separate interference from azimuth.
     """
     from mwdcal.files.formats import atomic
     from mwdcal.presentation.signature import load_calibration
@@ -178,9 +181,9 @@ def command(
     unit = length_unit or ""
     start, ends = _tie_in(tie_in, unit), _switch(switch)
     loaded = [load_calibration(tool, key) for tool, _ in pairs]
-    said = options.statements()
-    wanted = report, contributions, listing, station, covariance
-    whole = any((msa, axial_correction, missing == "blank", said, run, registry, *wanted))
+    said = options.said(decimal)
+    wanted = report, contributions, listing, station, covariance, said.statements, said.answers
+    whole = any((msa, axial_correction, missing == "blank", run, registry, *wanted))
     if not whole and long_table.in_parts(readings, output, loaded[0].calibration.profile):
         result = long_table.survey_file(
             loaded[0].calibration, readings, output, reference, limits, start, ends, outside, decimal,
@@ -190,7 +193,7 @@ def command(
         return
     how = (reference, limits, msa, error_model, missing, section_azimuth, unit, registry)
     inputs = [
-        _inputs(tool, table, decimal, {} if i else said, how)
+        _inputs(tool, table, replace(said, statements={}) if i else said, how)
         for i, (tool, (_, table)) in enumerate(zip(loaded, pairs, strict=True))
     ]
     analyses = [analysed(each, sensor_drift) if msa else None for each in inputs]
@@ -207,20 +210,17 @@ def command(
     _print(result, loaded[0].signature, files, as_json, station, **more)
 
 
-def _inputs(
-    tool: LoadedCalibration, readings: Path, decimal: str, said: Mapping[str, str], how: Any
-) -> WellInputs:
+def _inputs(tool: LoadedCalibration, readings: Path, said: Said, how: Any) -> WellInputs:
     """The inputs of a run: its calibration and its table."""
-    from mwdcal.files.runs import MOST_ROWS, read_export
+    from mwdcal.presentation.readings import read_surveys
     from mwdcal.survey.surveying import well_inputs
 
     reference, limits, msa, error_model, missing, section_azimuth, unit, registry = how
-    profile = tool.calibration.profile
-    table = read_export(readings, profile, decimal=decimal, rows=MOST_ROWS, statements=said)
+    named = read_surveys(readings, tool.calibration, said)
     with offering_blank():
         inputs = well_inputs(
-            tool.calibration, table, reference, limits, msa, tool.digest, tool.findings, error_model,
-            missing, section_azimuth, unit,
+            named.calibration, named.table, reference, limits, msa, tool.digest,
+            [*tool.findings, *named.findings], error_model, missing, section_azimuth, unit,
         )  # fmt: skip
     if not registry:
         return inputs

@@ -104,6 +104,8 @@ LARGEST_DEVIATION = 37.0
 FOLLOWED = 0.9
 """Share of a drift within the run that goes with a column, from which the column is named."""
 UNUSED, MARKED_ROWS, ROLL_TEST_READ = "unused-columns", "marked-rows", "roll-test-read"
+COLUMNS_READ = "columns-read"
+"""The id of the finding with the names by which surveys were read."""
 OF_ROLL_TEST = "the roll test"
 """How remarks begin on a roll test that was read by names of its own."""
 COLUMNS_NAMED = 20

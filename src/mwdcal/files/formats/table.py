@@ -72,6 +72,7 @@ class Table:
         remarks: sentences on rows that were left out, for findings.
         not_taken: lines with a reference that is not read, by column of a run file.
         north: the north of the stand's azimuths by the tool profile, where the metadata do not state it.
+        units: of columns, where they stand in a row of their own.
     """
 
     columns: Mapping[str, Column]
@@ -87,6 +88,7 @@ class Table:
     remarks: tuple[str, ...] = ()
     not_taken: Mapping[str, str] = field(default_factory=dict)
     north: Mapping[str, object] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def count(self) -> int:
@@ -307,6 +309,7 @@ def of_layout(where: Layout, path: str | os.PathLike[str], kept: Collection[str]
         across=where.across,
         remarks=where.remarks,
         not_taken=where.titles.not_taken,
+        units=dict(zip(where.names, where.units, strict=True)),
     )
 
 

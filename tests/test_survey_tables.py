@@ -1,0 +1,201 @@
+"""Tables of surveys under other names than those of the calibration's run, and in other units."""
+
+from __future__ import annotations
+
+import numpy as np
+import openpyxl
+import pytest
+from msgspec.structs import replace
+
+import mwdcal as mc
+from cli_support import EXAMPLE, read_csv, refused
+from cli_support import mwdcal as cli
+from mwdcal.errors import FitError
+from mwdcal.sensor.profile import TableFormat
+
+RAW = ("ax", "ay", "az", "mx", "my", "mz")
+PER = dict(zip(RAW, [1000 / 3] * 3 + [1 / 5e-5] * 3, strict=True))
+"""Of mg and nT in a volt of the example."""
+RUN = dict(zip(RAW, ("Ax", "Ay", "Az", "Mx", "My", "Mz"), strict=True))
+LOGGER = dict(zip(RAW, ("Gx", "Gy", "Gz", "Bx", "By", "Bz"), strict=True))
+UNITS = {"mg": 1.0, "g": 1e-3, "nT": 1.0, "µT": 1e-3}
+ANGLES = {
+    "ref_inclination_deg": "Inclination ref",
+    "ref_azimuth_deg": "Azimuth ref",
+    "ref_toolface_deg": "Toolface ref",
+}
+
+
+def measured(file, names, units, **others):
+    """Columns of the example's table, each with its unit: channels in `units` under other names."""
+    cells = {name: np.array(column, float) for name, column in read_csv(EXAMPLE / file).items()}
+    each = dict(zip(RAW, [units[0]] * 3 + [units[1]] * 3, strict=True))
+    columns = {names[c]: (each[c], cells[c] * PER[c] * UNITS[each[c]]) for c in RAW}
+    return {**columns, **{theirs: (unit, cells[ours]) for ours, (theirs, unit) in others.items()}}
+
+
+def workbook(path, **sheets):
+    """A workbook with the names, a row of units and the rows of each sheet."""
+    book = openpyxl.Workbook()
+    book.remove(book.active)
+    for title, columns in sheets.items():
+        sheet = book.create_sheet(title)
+        sheet.append([*columns])
+        sheet.append([unit for unit, _ in columns.values()])
+        for row in zip(*(cells for _, cells in columns.values()), strict=True):
+            sheet.append([*map(float, row)])
+    book.save(path)
+    return path
+
+
+def well_table(units=("mg", "nT"), names=LOGGER, **more):
+    """Surveys as a logger writes them, with angles and a total of its own."""
+    columns = measured("well.csv", names, units, md_m=("MD", "m"), temperature_c=("Temp", "°C"))
+    count = len(columns["MD"][1])
+    own = {
+        "INC": ("deg", np.linspace(1, 50, count)),
+        "AZI": ("deg", np.linspace(1, 90, count)),
+        "Btotal": ("nT", np.linspace(40_000, 44_000, count)),
+    }
+    return {**columns, **own, **more}
+
+
+@pytest.fixture(scope="module")
+def laboratory(tmp_path_factory):
+    """A calibration file of a run in mg and nT, and the calibration."""
+    folder = tmp_path_factory.mktemp("laboratory")
+    angles = {ours: (theirs, "deg") for ours, theirs in ANGLES.items()}
+    run = measured("run.csv", RUN, ("mg", "nT"), temperature_c=("Temp", "°C"), **angles)
+    count = len(run["Temp"][1])
+    path = workbook(folder / "run.xlsx", run={**run, "F ref": ("nT", np.full(count, 48_000.0))})
+    profile = mc.propose_profile(path).profile
+    cal = mc.calibrate(path, profile)
+    mc.save(cal, folder / "tool.json")
+    return folder / "tool.json", cal
+
+
+@pytest.mark.parametrize("units", [("mg", "nT"), ("g", "µT")])
+def test_surveys_are_read_by_the_names_and_units_of_their_table(tmp_path, laboratory, units):
+    file, cal = laboratory
+    wanted = mc.survey(cal, workbook(tmp_path / "run.xlsx", W=well_table(names=RUN)))
+    assert "columns-read" not in {f.id for f in wanted.findings}
+    path = workbook(tmp_path / "WELL.xlsx", W=well_table(units))
+    out = tmp_path / "well.csv"
+    ran = cli("survey", file, path, "-o", out, "--json")
+    assert ran.code == 0, ran.err
+    [text] = [f["text"] for f in ran.json["findings"] if f["id"] == "columns-read"]
+    assert "ax = 'Gx'" in text
+    assert "mz = 'Bz'" in text
+    found = {f["id"] for f in ran.json["findings"]}
+    assert "not-judged" in found
+    assert "changed" not in found
+    result = read_csv(out)
+    assert {"Gx", "INC", "Btotal", "MD"} <= {*result}
+    for name in ("inclination_deg", "azimuth_magnetic_deg", "tvd_m", "sd_tvd_m"):
+        assert np.array(result[name], float) == pytest.approx(
+            wanted.columns[name], rel=1e-9, abs=1e-6, nan_ok=True
+        )
+    assert {*result["accepted"]} == {""}
+
+
+def test_apply_reads_them_so_too(tmp_path, laboratory):
+    file, cal = laboratory
+    path = workbook(tmp_path / "WELL.xlsx", W=well_table(("g", "µT")))
+    ran = cli("apply", file, path, "-o", tmp_path / "out.csv", "--json")
+    assert ran.code == 0, ran.err
+    found = {f["id"] for f in ran.json["findings"]}
+    assert "columns-read" in found
+    assert "changed" not in found
+    corrected = mc.apply(cal, path)
+    assert [f.id for f in corrected.findings if f.id == "columns-read"] == ["columns-read"]
+    wanted = mc.survey(cal, path).columns["inclination_deg"]
+    for given in (
+        corrected.columns["inclination_deg"],
+        read_csv(tmp_path / "out.csv")["inclination_deg"],
+    ):
+        assert np.array(given, float) == pytest.approx(wanted, abs=1e-6)
+
+
+def test_columns_in_memory_and_a_run_file_take_other_names(laboratory):
+    """A calibration of a run file has no names but those of the contract."""
+    profile = mc.load_profile(EXAMPLE / "tool.toml")
+    cal = mc.calibrate(EXAMPLE / "run.csv", profile)
+    given = read_csv(EXAMPLE / "well.csv")
+    other = {LOGGER.get(name, name): cells for name, cells in given.items()}
+    columns = [mc.survey(cal, each).columns["azimuth_magnetic_deg"] for each in (given, other)]
+    assert columns[0] == pytest.approx(columns[1], nan_ok=True)
+    angles = [mc.apply(cal, each).columns["dip_deg"] for each in (given, other)]
+    assert angles[0] == pytest.approx(angles[1])
+    del other["Bz"]
+    with pytest.raises(FitError, match="no column for mz; .*column"):
+        mc.survey(cal, other)
+
+
+def test_a_channel_without_a_name_is_asked_for(tmp_path, laboratory):
+    file, cal = laboratory
+    path = workbook(tmp_path / "WELL.xlsx", W=well_table(names={**LOGGER, "mz": "chan 9"}))
+    message = refused(cli("survey", file, path, "-o", tmp_path / "well.csv"), 3)
+    assert "no column for mz (in the run 'Mz')" in message
+    assert "'chan 9'" in message
+    assert "--column mz=NAME" in message
+    assert "mwdcal profile" not in message
+    ran = cli("survey", file, path, "-o", tmp_path / "well.csv", "--column", "mz=chan 9")
+    assert ran.code == 0, ran.err
+    well = mc.survey(cal, path, column={"mz": "chan 9"})
+    assert well.columns["inclination_deg"].size == len(read_csv(tmp_path / "well.csv")["MD"])
+    assert mc.apply(cal, path, column="mz=chan 9").gravity.shape[0] == well.accepted.size
+    bare = {name: f"chan {k}" for k, name in enumerate(RAW)}
+    path = workbook(tmp_path / "BARE.xlsx", W=well_table(names=bare))
+    assert "--column ax=NAME" in refused(cli("apply", file, path, "-o", tmp_path / "o.csv"), 3)
+
+
+def test_of_two_sheets_the_user_says_which(tmp_path, laboratory):
+    file, cal = laboratory
+    short = {name: (unit, cells[:20]) for name, (unit, cells) in well_table().items()}
+    path = workbook(
+        tmp_path / "WELL.xlsx", First=well_table(), Second={**short, "QC": ("", short["INC"][1])}
+    )
+    message = refused(cli("survey", file, path, "-o", tmp_path / "well.csv"), 3)
+    assert "--sheet Second" in message
+    assert mc.survey(cal, path, sheet="Second").accepted.size == 20
+    assert "found 'First', 'Second'" in refused(
+        cli("survey", file, path, "-o", tmp_path / "well.csv", "--sheet", "Third"), 2
+    )
+
+
+def test_readings_in_no_unit_of_the_run_are_refused(tmp_path, laboratory):
+    table = {
+        n: ("" if n in LOGGER.values() else u, c) for n, (u, c) in well_table(("g", "nT")).items()
+    }
+    path = workbook(tmp_path / "WELL.xlsx", W=table)
+    message = refused(cli("survey", laboratory[0], path, "-o", tmp_path / "well.csv"), 2)
+    assert "no place on Earth" in message
+
+
+@pytest.mark.parametrize(("unit", "metres"), [("m", 1.0), ("(ft)", 0.3048)])
+def test_the_unit_of_depths_is_read_below_their_name(tmp_path, laboratory, unit, metres):
+    """In a workbook, and in text whose place a profile states."""
+    _, cal = laboratory
+    depths = well_table()["MD"][1]
+    table = well_table(names=RUN, MD=(unit, depths / metres))
+    path = workbook(tmp_path / "WELL.xlsx", W=table)
+    assert mc.survey(cal, path).path.md == pytest.approx(depths)
+    lines = [";".join(table), ";".join(unit for unit, _ in table.values())]
+    cells = zip(*(cells for _, cells in table.values()), strict=True)
+    lines += [";".join(f"{cell:.6f}" for cell in row) for row in cells]
+    (tmp_path / "WELL.csv").write_text("\n".join(lines) + "\n", "utf-8")
+    placed = replace(cal.profile, table=TableFormat(delimiter=";", first_line=3))
+    text = replace(cal, profile=placed)
+    assert mc.survey(text, tmp_path / "WELL.csv").path.md == pytest.approx(depths, abs=1e-5)
+
+
+def test_profile_of_surveys_names_survey(tmp_path):
+    table = {n: each for n, each in well_table().items() if n not in ("INC", "AZI", "Btotal")}
+    path = workbook(tmp_path / "WELL.xlsx", W=table)
+    ran = cli("profile", path, "-o", tmp_path / "tool.toml")
+    assert "next: mwdcal survey TOOL.json" in ran.out
+    assert "mwdcal calibrate" not in ran.out
+    assert "measured depths ('MD') and no angles of a stand" in ran.err
+    del table["MD"]
+    path = workbook(tmp_path / "RUN.xlsx", W=table)
+    assert "mwdcal calibrate" in cli("profile", path, "-o", tmp_path / "run.toml").out
