@@ -58,9 +58,22 @@ def quantity(value: float | None, symbol: str, digits: int | None = None) -> str
     ['0.25°', '3 nT', '0.030°', '1.0×10⁻⁹\\xa0°', '–']
     """
     shown = number(value, digits)
-    if value is None:
-        return shown
+    return shown if value is None else _with_unit(shown, symbol)
+
+
+def _with_unit(shown: str, symbol: str) -> str:
     return f"{shown}\u00a0°" if symbol == "°" and "×" in shown else shown + unit(symbol)
+
+
+def beside(value: float | None, uncertainty: float | None, symbol: str) -> str:
+    """A number with its unit, to two digits of the uncertainty that stands beside it, if there is one.
+
+    >>> [beside(0.00888, 0.0042, "°"), beside(0.009, 0.0042, "°"), beside(0.00888, None, "°"), beside(None, 1.0, "nT")]
+    ['0.0089°', '0.0090°', '0.00888°', '–']
+    """
+    if value is None or not uncertainty:
+        return quantity(value, symbol)
+    return _with_unit(measured(value, uncertainty)[0], symbol)
 
 
 def signed(value: float | None, decimals: int) -> str:

@@ -20,6 +20,7 @@ from mwdcal.geometry.vectors import Array, Ints, reference_vectors
 from mwdcal.planning.expected import left_undetermined, planned_earth
 from mwdcal.planning.planned import WORKING_INCLINATIONS, Planned, station_names
 from mwdcal.planning.plans import attitudes, soak_numbers
+from mwdcal.presentation.calibration import PLACE
 from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.numbers import files_written, quantity
 from mwdcal.presentation.page import banner, rendered
@@ -31,8 +32,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-PLACE = "1σ, calibration alone, at 45° inclination"
-"""The conditions of the accuracy of a plan."""
 SETTING_WORDS = {
     "per-station": "Set inclination and azimuth anew at every station, also where they stay the same.",
     **dict.fromkeys(
