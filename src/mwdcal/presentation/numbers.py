@@ -66,7 +66,7 @@ def _with_unit(shown: str, symbol: str) -> str:
 
 
 def beside(value: float | None, uncertainty: float | None, symbol: str) -> str:
-    """A number with its unit, to two digits of the uncertainty that stands beside it, if there is one.
+    """A number with its unit, to two digits of its uncertainty, if there is one.
 
     >>> [beside(0.00888, 0.0042, "°"), beside(0.009, 0.0042, "°"), beside(0.00888, None, "°"), beside(None, 1.0, "nT")]
     ['0.0089°', '0.0090°', '0.00888°', '–']
