@@ -1447,7 +1447,7 @@ def test_random_uncertainty_of_a_reference_widens_the_limits_of_its_row(example,
 
 def test_a_survey_beyond_one_limit_that_all_three_together_accept_says_so(example, tmp_path):
     field = np.full(36, 47_060.0)
-    columns, document = surveyed_file(example, tmp_path, {"ref_field_nt": field})
+    columns, _ = surveyed_file(example, tmp_path, {"ref_field_nt": field})
     rows = zip(columns["accepted"], columns["finding"], strict=True)
     together = [text for accepted, text in rows if accepted == "true" and text]
     assert any(

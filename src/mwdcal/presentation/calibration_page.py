@@ -190,7 +190,11 @@ def _gauges(
             yield _judged(judged[0])
         else:
             expanded = None if sd is None else k * sd
-            expected = UNDETERMINED if sd is None else f"± {uncertainty(expanded)}° expected (U, k = {k:.2g})"
+            expected = (
+                UNDETERMINED
+                if sd is None
+                else f"± {uncertainty(expanded)}° expected (U, k = {k:.2g})"
+            )
             yield _gauge(
                 name, expected, 0.0, expanded, bounds.get(name), "°", ("open", "not tested")
             )

@@ -122,7 +122,9 @@ OFF_IN_WORDS = "\noff: how far |g|, |b| and dip together are from their referenc
 OUTCOMES = {"true": "accepted", "false": "REJECTED", "": "not judged"}
 """The column `accepted` in words."""
 TOGETHER = "accepted together"
-JOINTLY = f"{TOGETHER}: one of |g|, |b| and dip is beyond its own limit, the three as one are within"
+JOINTLY = (
+    f"{TOGETHER}: one of |g|, |b| and dip is beyond its own limit, the three as one are within"
+)
 """The meaning of an outcome."""
 
 

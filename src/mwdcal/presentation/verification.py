@@ -128,7 +128,13 @@ def _sets(result: Verdict) -> list[str]:
         for row in result.rows
         if len(row.sets) > 1 and row.uncertainty is not None
         for each in row.sets
-        for cells in [[beside(each.raw, each.uncertainty, row.unit), *noise_free(each, row.unit), freedom(each)]]
+        for cells in [
+            [
+                beside(each.raw, each.uncertainty, row.unit),
+                *noise_free(each, row.unit),
+                freedom(each),
+            ]
+        ]
     ]
     return (
         [table(rows, ["each roll set by itself", "", "raw", "noise-free", "1σ", FREEDOM])]
