@@ -27,7 +27,7 @@ SCALE = (3.0, 5e-5)
 SERVO_NOISE = (1e-4, 15.0)
 
 
-messages.UNSEEN = 3600.0  # what a command says does not depend on how fast the machine is
+messages.LINE_AFTER = 3600.0  # what a command says does not depend on how fast the machine is
 
 
 @dataclass(frozen=True)

@@ -759,7 +759,7 @@ def test_progress_is_shown_on_a_terminal_and_only_to_the_patient(
 
 @pytest.mark.parametrize("patience", [0.0, 60.0])
 def test_without_a_terminal_a_line_says_what_is_being_done(monkeypatch, patience):
-    monkeypatch.setattr(messages, "UNSEEN", patience)
+    monkeypatch.setattr(messages, "LINE_AFTER", patience)
     monkeypatch.setattr(sys, "stderr", shown := io.StringIO())
     limit = time.monotonic() + 20
     with messages.bar("planning") as advance:

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 MOMENT = 0.1
 """Seconds after which a bar moves."""
-UNSEEN = 5.0
+LINE_AFTER = 5.0
 """Seconds after which a line says what is being done, where no terminal shows a bar."""
 
 
@@ -88,7 +88,7 @@ def _show(label: str, known: Mapping[str, Any], over: threading.Event) -> None:
 
 def _say_once(label: str, known: Mapping[str, Any], over: threading.Event) -> None:
     """Say what is being done, unless it is over soon."""
-    if not over.wait(UNSEEN):
+    if not over.wait(LINE_AFTER):
         share = f": {known['completed']} of {known['total']}" if known["total"] else ""
         say(f"{label}{share} …")
 

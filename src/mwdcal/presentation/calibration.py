@@ -36,7 +36,6 @@ from mwdcal.files import documents
 from mwdcal.geometry.observables import TITLES
 from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.numbers import (
-    beside,
     degrees_of_freedom,
     estimate,
     files_written,
@@ -268,7 +267,7 @@ def errors(rows: list[ErrorRow]) -> str:
     """Errors before and after, with what was to be expected."""
     cells = [
         [f"{TITLES.get(row.observable, row.observable)} error, rms"]
-        + [beside(value, row.expected, row.unit) for value in (row.before, row.after)]
+        + [quantity(value, row.unit, uncertainty=row.expected) for value in (row.before, row.after)]
         + [quantity(row.expected, row.unit, 2)]
         for row in rows
     ]

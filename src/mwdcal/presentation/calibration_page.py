@@ -37,7 +37,6 @@ from mwdcal.presentation.calibration import (
 from mwdcal.presentation.numbers import (
     HELD,
     UNDETERMINED,
-    beside,
     capital,
     estimate,
     exponent,
@@ -87,7 +86,7 @@ def render(
     and `rolltest` are the names of the calibration and of a roll test in the next commands.
     """
     pages = environment()
-    pages.filters |= {"beside": beside, "freedom": freedom, "noise_free": noise_free}
+    pages.filters |= {"freedom": freedom, "noise_free": noise_free}
     template = pages.get_template("report.html")
     findings = _findings(calibration, verdict)
     first, left = leading_findings(findings)

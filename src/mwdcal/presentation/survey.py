@@ -121,10 +121,8 @@ OFF_IN_WORDS = "\noff: how far |g|, |b| and dip together are from their referenc
 """The meaning of a column."""
 OUTCOMES = {"true": "accepted", "false": "REJECTED", "": "not judged"}
 """The column `accepted` in words."""
-TOGETHER = "accepted together"
-JOINTLY = (
-    f"{TOGETHER}: one of |g|, |b| and dip is beyond its own limit, the three as one are within"
-)
+ACCEPTED_TOGETHER = "accepted together"
+JOINTLY = f"{ACCEPTED_TOGETHER}: one of |g|, |b| and dip is beyond its own limit, the three as one are within"
 """The meaning of an outcome."""
 
 
@@ -541,7 +539,7 @@ def survey_table(well: Well, count: int, last: Well) -> str:
     if between >= 0:
         rows += survey_rows(last, slice(-1, None))[1]
     note = OFF_IN_WORDS if "off, σ" in header and well.judgement.judged.any() else ""
-    if any(row[-1].startswith(TOGETHER) for row in rows):
+    if any(row[-1].startswith(ACCEPTED_TOGETHER) for row in rows):
         note += f"\n{JOINTLY}"
     return table(rows, header) + note
 
@@ -578,7 +576,7 @@ def survey_rows(
         kind = str(columns["toolface_kind"][i])
         distance = well.judgement.distance[i]
         model = [fixed(distance, 1) if well.judgement.judged[i] else "–"] if modelled else []
-        outcome = TOGETHER if jointly[i] else OUTCOMES[str(columns["accepted"][i])]
+        outcome = ACCEPTED_TOGETHER if jointly[i] else OUTCOMES[str(columns["accepted"][i])]
         outcome += ", blind" if well.blind[i] else ""
         rows.append([*row, kind, *model, outcome])
     return [*header, "toolface from", *(["off, σ"] if modelled else []), ""], rows

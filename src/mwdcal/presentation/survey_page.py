@@ -17,8 +17,8 @@ from mwdcal.presentation.interference_page import LARGEST_DRAWN_SD, sections
 from mwdcal.presentation.numbers import capital
 from mwdcal.presentation.page import banner, rendered
 from mwdcal.presentation.survey import (
+    ACCEPTED_TOGETHER,
     JOINTLY,
-    TOGETHER,
     SurveySummary,
     declination_in_words,
     end_in_words,
@@ -385,7 +385,9 @@ def render(surveyed: SurveyedWell, findings: list[Finding]) -> str:
         end=end_in_words(facts.end, facts.north, facts.length_unit) if facts.end else "",
         header=header,
         rows=rows,
-        jointly=capital(JOINTLY) if any(row[-1].startswith(TOGETHER) for row in rows) else "",
+        jointly=capital(JOINTLY)
+        if any(row[-1].startswith(ACCEPTED_TOGETHER) for row in rows)
+        else "",
         analysis=sections(analysis) if analysis else None,
         more=facts.rows - len(rows),
         calibration=well.calibration.run_name,

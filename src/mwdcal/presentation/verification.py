@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import Finding, SignatureCheck
-from mwdcal.presentation.numbers import beside, capital, measured, quantity, unit
+from mwdcal.presentation.numbers import capital, measured, quantity, unit
 from mwdcal.presentation.signature import signature_status
 from mwdcal.presentation.text import NOT_STATED, chance, one_line, table
 from mwdcal.use.verification import COVERAGE, SETTING_PRACTICES, JudgedSet, Verdict, VerdictRow
@@ -43,7 +43,7 @@ def screen(
     rows = []
     for row in result.rows:
         (value, sd), limit = noise_free(row, row.unit), quantity(row.limit, row.unit)
-        raw = beside(row.raw, row.uncertainty, row.unit)
+        raw = quantity(row.raw, row.unit, uncertainty=row.uncertainty)
         verdict = "pass" if row.passed else "FAIL"
         rows.append([row.name, raw, value, sd, freedom(row), limit, verdict, row.note])
     outcome = "PASS" if result.passed else "FAIL"
@@ -130,7 +130,7 @@ def _sets(result: Verdict) -> list[str]:
         for each in row.sets
         for cells in [
             [
-                beside(each.raw, each.uncertainty, row.unit),
+                quantity(each.raw, row.unit, uncertainty=each.uncertainty),
                 *noise_free(each, row.unit),
                 freedom(each),
             ]
