@@ -16,7 +16,7 @@ from typing import Any
 import click
 import numpy as np
 
-from mwdcal.app import cli
+from mwdcal.app import cli, messages
 from simulation import DEG, Tool, plan
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -25,6 +25,9 @@ RAW = ("ax", "ay", "az", "mx", "my", "mz")
 SCALE = (3.0, 5e-5)
 """Nominal scales of the shipped profile `servo`: V per g, V per nT."""
 SERVO_NOISE = (1e-4, 15.0)
+
+
+messages.LINE_AFTER = 3600.0  # what a command says does not depend on how fast the machine is
 
 
 @dataclass(frozen=True)

@@ -263,22 +263,18 @@ def test_json_of_calibrate_holds_the_numbers_of_the_text(tmp_path):
         "field": "|b|",
     }
 
-    def shown(value, unit):
-        digits = f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
-        return digits + ("" if unit == "°" else " ") + unit
-
     for row in told["errors"]:
-        cells = [shown(row[k], row["unit"]) for k in ("before", "after")]
         places = max(1 - int(f"{row['expected']:.1e}".partition("e")[2]), 0)  # two digits
-        cells.append(
-            f"{row['expected']:.{places}f}{'' if row['unit'] == '°' else ' '}{row['unit']}"
-        )
+        cells = [
+            f"{row[k]:.{places}f}{'' if row['unit'] == '°' else ' '}{row['unit']}"
+            for k in ("before", "after", "expected")
+        ]
         assert (
             f"{names.get(row['observable'], row['observable'])} error, rms {' '.join(cells)}"
             in lines
         )
     accuracy = "  ".join(f"{n} {v:.2g}°" for n, v in told["accuracy_1sigma_deg"].items())
-    assert f"accuracy to expect (1σ, calibration alone, typical): {accuracy}" in said.out
+    assert f"accuracy to expect (1σ, calibration alone, at 45° inclination): {accuracy}" in said.out
     for name, triad in told["triads"].items():
         assert f"{name} {triad['rank']} of {triad['size']} determined" in said.out
     assert told["calibration"] == str(tmp_path / "cal.json")

@@ -223,7 +223,7 @@ def test_the_text_holds_the_numbers_of_the_json(tmp_path, fitted):
         gap = "" if row["unit"] == "°" else " "
         numbers = [f"{row[k]:.3g}{gap}{row['unit']}" for k in NUMBERS]
         places = 1 - int(f"{row['uncertainty']:.1e}".partition("e")[2])
-        for where, key in ((1, "value"), (2, "uncertainty")):  # two digits of the uncertainty
+        for where, key in enumerate(NUMBERS[:3]):  # two digits of the uncertainty
             numbers[where] = f"{row[key]:.{places}f}{gap}{row['unit']}"
         numbers.insert(3, "∞")  # degrees of freedom of a declared noise
         word = "pass" if row["passed"] else "FAIL"

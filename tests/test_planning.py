@@ -779,6 +779,28 @@ def test_a_plan_says_on_which_practice_of_the_stand_it_rests(tmp_path):
     assert open_["accuracy_deg"] != open_["accuracy_per_station_deg"]
 
 
+def test_a_plan_lists_the_inclinations_in_reach_and_the_time_of_a_station(tmp_path):
+    sheet, line = tmp_path / "sheet.html", ("plan", "--tool", "servo", "--stations", 12)
+    reach = ("--reach", "inclination_deg=0:90")
+    document = mwdcal(*line, *reach, "--report", sheet, "--json").json
+    assert document["inclinations_deg"] == [5.0, 30.0, 60.0, 90.0]
+    assert {len(sd) for sd in document["accuracy_by_inclination_deg"].values()} == {4}
+    assert mwdcal(*line, "--json").json["inclinations_deg"][-1] == 120.0
+    seconds = 3600 * (document["session_hours"] - document["soak_hours"]) / 12
+    assert f"{seconds:.0f} s a station and 1.5 h of soak" in sheet.read_text("utf-8")
+    said = " ".join(mwdcal(*line, *reach).out.split())
+    assert f"per station (--speed, --settle) {seconds:.0f} s" in said
+
+
+@pytest.mark.parametrize(("stations", "whole"), [(24, True), (25, False)])
+def test_a_sheet_of_25_rows_is_one_page(tmp_path, stations, whole):
+    sheet = tmp_path / "sheet.html"
+    assert mwdcal("plan", "--tool", "servo", "--stations", stations, "--report", sheet).code == 0
+    page = sheet.read_text("utf-8")
+    assert ('<section id="sheet" class="page">' in page) == whole
+    assert page.count("@page { size: A4 landscape") == 1
+
+
 def test_a_sheet_asks_for_the_place(tmp_path):
     """Without field and dip `calibrate` would give another accuracy than the plan has stated."""
     bare = run_sheet(load_plan("six-state")).columns

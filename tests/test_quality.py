@@ -598,3 +598,16 @@ def test_an_estimated_noise_has_degrees_of_freedom_and_its_risk_is_never_certain
     row = rows_of(verify(bare, undeclared, SPREADS))["spread of inclination"]
     assert row.degrees_of_freedom == pytest.approx(bare.accelerometer.degrees_of_freedom + 1)
     assert rows_of(verify(record, run, SPREADS))["spread of inclination"].degrees_of_freedom is None
+
+
+@pytest.mark.parametrize(("noise", "word"), [(NOISE, "stated"), ({}, "estimated")])
+def test_readings_that_scatter_too_little_name_the_noise_they_are_compared_with(noise, word):
+    made = calibrate(make(sd=noise), PROFILE)
+    quiet = roll(45, sd=noise)
+    mean, turn = quiet.accelerometer.mean(0), plan((45,))[2]
+    waves = np.stack([np.ones(12), *(f(k * turn) for k in (1, 2) for f in (np.cos, np.sin))], -1)
+    smooth = waves @ np.linalg.lstsq(waves, quiet.accelerometer - mean, rcond=None)[0] + mean
+    result = verify(made, msgspec_replace(quiet, accelerometer=smooth), BOTH)
+    (text,) = (each.text for each in result.findings if each.id == "little-scatter")
+    assert f"less about the curves than the {word} noise explains" in text
+    assert text.endswith(f"The 1σ rests on the {word} noise.")

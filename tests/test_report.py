@@ -308,6 +308,17 @@ def test_findings_are_grouped_by_cause_and_the_most_important_come_first():
     assert (len(shown), left) == (6, 3)
 
 
+def test_an_edge_with_more_behind_it_is_shaded(page):
+    style = page[: page.index("</style>")]
+    assert "var(--shade), transparent) 100% 0" in style
+    assert style.count("--shade: #") == 2  # light and dark
+
+
+def test_where_a_well_path_starts_is_never_among_the_findings_left_out():
+    shown, _ = leading_findings([*map(finding, "abcdefgh"), finding("path-from-first")])
+    assert shown[0].id == "path-from-first"
+
+
 def test_every_section_is_present(page):
     assert set(SECTIONS) <= set(parsed(page).ids)
     for words in (
@@ -337,7 +348,7 @@ def test_clean_fit_says_so(words):
     page = words(calibrated(moved=False))
     assert '<p class="headline">Calibrated – not yet verified</p>' in page
     assert (
-        "<p>Fit accepted – no temperature recorded. Accuracy to expect (1σ, calibration alone, typical): "
+        "<p>Fit accepted – no temperature recorded. Accuracy to expect (1σ, calibration alone, at 45° inclination): "
         "inclination 0.0" in page
     )
     assert "No findings" in page
@@ -390,11 +401,18 @@ def test_undetermined_toolface_shows(words):
     assert '<td class="free">undetermined</td>' in page
     assert "Not shown, for want of a reference: toolface·sin I." in page
     assert "Not stated: these measures need" in page
+    assert '<span class="value"><a href="#undetermined">undetermined</a></span>' in page
+    assert "Undetermined: this run cannot tell it" in page
+    assert "Undetermined: this run cannot" not in words(calibrated(moved=False))
+    assert '<td>30 °C</td><td class="text">default of a profile</td>' in page
+    assert '<td class="text">1</td>' not in page
+    assert re.search(r"± 0\.0\d+° expected \(U, k = 2(\.\d)?\)", page)
 
 
 def test_undetermined_parameters_are_those_of_the_free_turn(words):
     page = words(calibrated(("toolface",), moved=False))
-    rows = re.findall(r"<td>(\w+)<sub>(\w+)</sub></td><td>[^<]*</td><td class=\"free\">", page)
+    in_brackets = r"<td class=\"soft\">\([^<]*\)</td><td class=\"free\">undetermined</td>"
+    rows = re.findall(rf"<td>(\w+)<sub>(\w+)</sub></td>{in_brackets}", page)
     assert rows[:2] == [("m", "xy"), ("m", "yx")]
     assert {name for name, _ in rows} <= {"m", "B"}
 
@@ -425,7 +443,7 @@ def test_verdict_comes_first(whole, words):
     assert failed.index("Verification failed") < failed.index("Fit accepted")
     assert "1.230°" in failed  # two digits of the uncertainty…
     assert "0.040°" in failed  # …and that
-    assert "1.45°" in failed
+    assert "1.450°" in failed
     assert "0.040°</td><td>8</td>" in failed
     assert "Risk of a wrong verdict, all roll sets and limits together: 0.02." in failed
     assert "&lt;b&gt;" in failed

@@ -757,6 +757,19 @@ def test_progress_is_shown_on_a_terminal_and_only_to_the_patient(
     assert all(thread.daemon for thread in {*threading.enumerate()} - before)
 
 
+@pytest.mark.parametrize("patience", [0.0, 60.0])
+def test_without_a_terminal_a_line_says_what_is_being_done(monkeypatch, patience):
+    monkeypatch.setattr(messages, "LINE_AFTER", patience)
+    monkeypatch.setattr(sys, "stderr", shown := io.StringIO())
+    limit = time.monotonic() + 20
+    with messages.bar("planning") as advance:
+        advance(1, 4)
+        while not patience and not shown.getvalue() and time.monotonic() < limit:
+            time.sleep(0.01)
+    assert shown.getvalue().startswith("planning") == (not patience)
+    assert shown.getvalue().count("\n") == (not patience)
+
+
 def test_progress_begins_with_what_was_told_before_it_was_seen(monkeypatch):
     monkeypatch.setattr(messages, "PATIENCE", 0.1)
     monkeypatch.setattr(sys, "stderr", shown := Terminal())

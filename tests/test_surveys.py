@@ -1443,3 +1443,32 @@ def test_random_uncertainty_of_a_reference_widens_the_limits_of_its_row(example,
     )  # fmt: skip
     assert set(columns["accepted"][:18]) == {"true"}
     assert "false" in columns["accepted"][18:]
+
+
+def test_a_survey_beyond_one_limit_that_all_three_together_accept_says_so(example, tmp_path):
+    field = np.full(36, 47_060.0)
+    columns, _ = surveyed_file(example, tmp_path, {"ref_field_nt": field})
+    rows = zip(columns["accepted"], columns["finding"], strict=True)
+    together = [text for accepted, text in rows if accepted == "true" and text]
+    assert any(
+        re.fullmatch(r"field \+\d+ nT \(at most \d+\); accepted by all three together", text)
+        for text in together
+    )
+    page = tmp_path / "well.html"
+    ran = cli("survey", example, tmp_path / "in.csv", "-o", tmp_path / "n.csv", "--report", page)
+    for shown in (ran.out, page.read_text("utf-8")):
+        assert "accepted together" in shown
+        assert "ccepted together: one of |g|, |b| and dip" in shown
+
+
+def test_the_page_lists_positions_before_the_contributions(example, tmp_path):
+    page = tmp_path / "well.html"
+    ran = cli("survey", example, EXAMPLE / "well.csv", "-o", tmp_path / "n.csv", "--report", page)
+    assert ran.code == 0
+    text = page.read_text("utf-8")
+    assert text.index('id="path"') < text.index('id="surveys"') < text.index('id="contributions"')
+    table = text[text.index('id="surveys"') : text.index('id="contributions"')]
+    assert "<th>md m</th><th>north m</th><th>east m</th><th>tvd m</th>" in table
+    last = read_csv(tmp_path / "n.csv")
+    for name in ("north_m", "east_m", "tvd_m"):
+        assert f"<td>{float(last[name][-1]):.2f}</td>" in table

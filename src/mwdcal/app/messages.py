@@ -46,20 +46,23 @@ if TYPE_CHECKING:
 
 MOMENT = 0.1
 """Seconds after which a bar moves."""
+LINE_AFTER = 5.0
+"""Seconds after which a line says what is being done, where no terminal shows a bar."""
 
 
 @contextmanager
 def bar(label: str) -> Iterator[Callable[[int, int], None]]:
     """A function to call with how much is done, and of how much.
 
-    The bar also moves while that is not known.
+    The bar also moves while that is not known. Without a terminal a line says once what is being done.
     """
-    if quiet() or not sys.stderr.isatty():
+    if quiet():
         yield lambda done, total: None
         return
     known: dict[str, Any] = {"completed": 0, "total": None}
     over = threading.Event()
-    shows = threading.Thread(target=_show, args=(label, known, over))
+    show = _show if sys.stderr.isatty() else _say_once
+    shows = threading.Thread(target=show, args=(label, known, over))
     shows.start()
     try:
         yield lambda done, total: known.update(completed=done, total=total)
@@ -81,6 +84,13 @@ def _show(label: str, known: Mapping[str, Any], over: threading.Event) -> None:
         while not over.wait(MOMENT):
             shown.update(task, **known)
         shown.update(task, **known)
+
+
+def _say_once(label: str, known: Mapping[str, Any], over: threading.Event) -> None:
+    """Say what is being done, unless it is over soon."""
+    if not over.wait(LINE_AFTER):
+        share = f": {known['completed']} of {known['total']}" if known["total"] else ""
+        say(f"{label}{share} …")
 
 
 LONGEST_MESSAGE = 2000

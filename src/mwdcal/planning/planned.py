@@ -229,6 +229,7 @@ class Planned:
     soaking: float
     detections: Mapping[str, Detection]
     set_anew: Callable[[], Calibration]
+    stand: Stand
     measured: int = 0
     bound: int | None = None
     search: list[Finding] = field(default_factory=list)
@@ -252,6 +253,7 @@ class Planned:
             soaking=soak_seconds(soak, stand),
             detections=detections(result),
             set_anew=partial(expected, whole, anew, options),
+            stand=stand,
             measured=measured,
         )
 
@@ -259,6 +261,15 @@ class Planned:
     def per_station(self) -> Calibration | None:
         """The calibration on a stand that is set at every station, where nobody says how often it is."""
         return self.set_anew() if self.calibration.settings == ASSUMED_PRACTICE else None
+
+    @property
+    def inclinations(self) -> Array:
+        """Working inclinations within the stand's reach, radians; all of them where none is."""
+        low, high = self.stand.reach.get(ANGLES[0], (0.0, 180.0))
+        inside = (np.radians(low) <= WORKING_INCLINATIONS) & (
+            np.radians(high) >= WORKING_INCLINATIONS
+        )
+        return WORKING_INCLINATIONS[inside] if inside.any() else WORKING_INCLINATIONS
 
     @property
     def hidden(self) -> dict[str, list[int]]:

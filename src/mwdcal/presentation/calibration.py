@@ -57,6 +57,8 @@ VALID = "good for {:.1f}…{:.1f} °C: beyond, results are blank (--outside of a
 """The temperatures of readings."""
 NEXT_ROLL_TEST = "ROLLTEST.csv"
 """The file of a roll test that is still to be made, in the next commands."""
+PLACE = "1σ, calibration alone, at 45° inclination"
+"""The conditions of the accuracy to expect."""
 PROFILE = " (see [stand] of the tool profile)"
 ORDERS = "error: rms per axis, with the noise; inside: interpolation, at the ends: extrapolation"
 COMPARED = """
@@ -181,7 +183,7 @@ def remarks(calibration: Calibration) -> list[str]:
     return [
         *residuals(calibration),
         *(north_in_words(calibration) if AZIMUTH_KEYS[0] in calibration.tool else []),
-        f"accuracy to expect (1σ, calibration alone, typical): {'  '.join(accuracy)}",
+        f"accuracy to expect ({PLACE}): {'  '.join(accuracy)}",
         *([VALID.format(*valid)] if (valid := calibration.valid_temperatures) else []),
         *([f"Assumed exact; this run cannot check it: {exact}{PROFILE}"] if exact else []),
         *([steady] if steady else []),
@@ -276,7 +278,7 @@ def errors(rows: list[ErrorRow]) -> str:
     """Errors before and after, with what was to be expected."""
     cells = [
         [f"{TITLES.get(row.observable, row.observable)} error, rms"]
-        + [quantity(value, row.unit) for value in (row.before, row.after)]
+        + [quantity(value, row.unit, uncertainty=row.expected) for value in (row.before, row.after)]
         + [quantity(row.expected, row.unit, 2)]
         for row in rows
     ]

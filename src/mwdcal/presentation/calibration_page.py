@@ -28,6 +28,7 @@ from mwdcal.estimation.solvers import RANK_TOLERANCE
 from mwdcal.geometry.observables import TITLES
 from mwdcal.presentation.calibration import (
     NEXT_ROLL_TEST,
+    PLACE,
     accuracy_in_words,
     how,
     known_inclinations,
@@ -35,6 +36,7 @@ from mwdcal.presentation.calibration import (
 )
 from mwdcal.presentation.numbers import (
     HELD,
+    UNDETERMINED,
     capital,
     estimate,
     exponent,
@@ -53,6 +55,7 @@ from mwdcal.presentation.verification import (
     noise_free,
     raw_rule,
 )
+from mwdcal.sensor.profile import NOMINAL
 from mwdcal.use import plots
 from mwdcal.use.notation import Notation, convert
 from mwdcal.use.verification import SETTING_PRACTICES, fewest_degrees_of_freedom
@@ -119,6 +122,7 @@ def render(
         titles=TITLES,
         large=LARGE_RATIO,
         tolerance=RANK_TOLERANCE,
+        usual_temperature=NOMINAL.reference_temperature_c,
         when=_when(calibration.time),
     )
 
@@ -129,7 +133,7 @@ def outcome(calibration: Calibration, verdict: Verdict | None) -> dict[str, str]
     word = "OK" if level == "good" else "Attention"
     if verdict is None:
         expected = ", ".join(accuracy_in_words(calibration))
-        after = f"{fit}. Accuracy to expect (1σ, calibration alone, typical): {expected or 'not stated'}."
+        after = f"{fit}. Accuracy to expect ({PLACE}): {expected or 'not stated'}."
         unverified = "Calibrated – not yet verified"
         return banner("open" if level == "good" else level, "Not verified", unverified, after)
     missed = [row.name for row in verdict.rows if not row.passed]
@@ -187,7 +191,11 @@ def _gauges(
             yield _judged(judged[0])
         else:
             expanded = None if sd is None else k * sd
-            expected = f"± {uncertainty(expanded)}{'°' * (sd is not None)} expected"
+            expected = (
+                UNDETERMINED
+                if sd is None
+                else f"± {uncertainty(expanded)}° expected (U, k = {k:.2g})"
+            )
             yield _gauge(
                 name, expected, 0.0, expanded, bounds.get(name), "°", ("open", "not tested")
             )
@@ -220,7 +228,7 @@ def _gauge(
     """A gauge on which the limit stands at four fifths, unless the value needs the room."""
     low, high = ((value or 0.0) + sign * (expanded or 0.0) for sign in (-1, 1))
     whole = max((limit or 0.0) / 0.8, high * 1.05) or 1.0
-    said = f"limit {quantity(limit, symbol)}" if limit else "no limit"
+    said = f"limit {quantity(limit, symbol)}" if limit else "no limit given"
     span = max(100 * low / whole, 0.0), 100 * high / whole
     bound = 100 * limit / whole if limit else None
     return AngleGauge(name, shown, said, *outcome, 100 * (value or 0.0) / whole, span, bound)

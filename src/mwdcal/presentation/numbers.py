@@ -19,6 +19,8 @@ HELD = "held"
 """In place of the uncertainty of a parameter that a model of 9 or 6 keeps at zero."""
 LEAST_CONTRIBUTION = 1e-3
 """Share of a combined uncertainty below which a contribution is 0."""
+MOST_DECIMALS = 7
+"""Decimals of a number by its uncertainty; smaller ones have a power of ten."""
 UNDETERMINED = "undetermined"
 """In place of an uncertainty that no reading determines."""
 
@@ -51,15 +53,22 @@ def fixed(value: float | None, decimals: int) -> str:
     return f"{round(value, decimals) + 0.0:.{max(decimals, 0)}f}".replace("-", "−")
 
 
-def quantity(value: float | None, symbol: str, digits: int | None = None) -> str:
-    """A number with its unit, which is apart from a power of ten.
+def quantity(
+    value: float | None, symbol: str, digits: int | None = None, uncertainty: float | None = None
+) -> str:
+    """A number with its unit, which is apart from a power of ten; to two digits of an uncertainty, if there is one.
 
     >>> [quantity(0.25, "°"), quantity(3, "nT"), quantity(0.03, "°", 2), quantity(1e-9, "°", 2), quantity(None, "nT")]
-    ['0.25°', '3 nT', '0.030°', '1.0×10⁻⁹\\xa0°', '–']
+    ['0.25°', '3 nT', '0.030°', '1.0×10⁻⁹\xa0°', '–']
+    >>> [quantity(each, "°", uncertainty=0.0042) for each in (0.00888, 0.009)]
+    ['0.0089°', '0.0090°']
     """
     shown = number(value, digits)
     if value is None:
         return shown
+    if uncertainty and 0 < uncertainty < np.inf:
+        decimals = 1 - int(f"{uncertainty:.1e}".partition("e")[2])
+        shown = fixed(value, decimals) if decimals <= MOST_DECIMALS else shown
     return f"{shown}\u00a0°" if symbol == "°" and "×" in shown else shown + unit(symbol)
 
 
@@ -94,7 +103,7 @@ def measured(value: float, uncertainty: float | None) -> tuple[str, str]:
         return number(value, 9), "0"
     decimals = 1 - exponent(uncertainty)
     power = exponent(max(abs(value), uncertainty))
-    if power == 0 or (decimals <= 7 and power < 7):
+    if power == 0 or (decimals <= MOST_DECIMALS and power < 7):
         return fixed(value, decimals), fixed(uncertainty, decimals)
     scaled = (fixed(v * 10.0**-power, decimals + power) for v in (value, uncertainty))
     first, second = (f"{text}×10{superscript(power)}" for text in scaled)

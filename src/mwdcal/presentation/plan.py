@@ -18,8 +18,9 @@ from mwdcal.files.contract import CHANNELS, REFERENCES
 from mwdcal.files.formats.table import Table
 from mwdcal.geometry.vectors import Array, Ints, reference_vectors
 from mwdcal.planning.expected import left_undetermined, planned_earth
-from mwdcal.planning.planned import WORKING_INCLINATIONS, Planned, station_names
+from mwdcal.planning.planned import Planned, station_names
 from mwdcal.planning.plans import attitudes, soak_numbers
+from mwdcal.presentation.calibration import PLACE
 from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.numbers import files_written, quantity
 from mwdcal.presentation.page import banner, rendered
@@ -31,8 +32,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-PLACE = "1σ, calibration alone, at 45° inclination"
-"""The conditions of the accuracy of a plan."""
 SETTING_WORDS = {
     "per-station": "Set inclination and azimuth anew at every station, also where they stay the same.",
     **dict.fromkeys(
@@ -165,8 +164,8 @@ def _fields(each: Planned) -> dict[str, Any]:
         "accuracy_per_station_deg": typical_accuracy(each.per_station)
         if each.per_station
         else msgspec.UNSET,
-        "inclinations_deg": np.degrees(WORKING_INCLINATIONS).round(9).tolist(),
-        "accuracy_by_inclination_deg": _by_inclination(calibration),
+        "inclinations_deg": np.degrees(each.inclinations).round(9).tolist(),
+        "accuracy_by_inclination_deg": _by_inclination(each),
         "rank": sum(triad.rank for triad in calibration.triads),
         "size": sum(triad.size for triad in calibration.triads),
         "undetermined": list(free.values()),
@@ -208,9 +207,9 @@ def _triad(triad: TriadCalibration, freedom: float) -> PlannedTriad:
     )
 
 
-def _by_inclination(calibration: Calibration) -> dict[str, list[float | None]]:
-    """1σ by angle at the working inclinations, degrees; None: undetermined."""
-    each = accuracy_at(calibration, WORKING_INCLINATIONS.tolist())
+def _by_inclination(planned: Planned) -> dict[str, list[float | None]]:
+    """1σ by angle at the working inclinations that the stand reaches, degrees; None: undetermined."""
+    each = accuracy_at(planned.calibration, planned.inclinations.tolist())
     return {
         name: [None if np.isnan(sd) else float(np.degrees(sd)) for sd in values]
         for name, values in each.items()
@@ -312,6 +311,7 @@ def comparison_rows(facts: Sequence[PlanSummary]) -> list[list[str]]:
         ["stations", *(str(each.stations) for each in facts)],
         ["at the stand", *(f"{each.session_hours:.1f} h" for each in facts)],
         ["of which soak (--soak)", *(f"{each.soak_hours:.1f} h" for each in facts)],
+        ["per station (--speed, --settle)", *(f"{_seconds_each(each):.0f} s" for each in facts)],
         ["temperature order", *(_orders(each) for each in facts)],
         ["determined", *(f"{each.rank} of {each.size}" for each in facts)],
         ["degrees of freedom", *(_freedom(each) for each in facts)],
@@ -326,6 +326,11 @@ def comparison_rows(facts: Sequence[PlanSummary]) -> list[list[str]]:
             cells = [quantity(each[name], "°", 2) if each else "–" for each in anew]
             lines.append([f"{name}, 1σ if set at every station", *cells])
     return lines
+
+
+def _seconds_each(facts: PlanSummary) -> float:
+    """Mean time of a station, from the move to it to its reading."""
+    return 3600 * (facts.session_hours - facts.soak_hours) / facts.stations
 
 
 def accuracy_rows(each: PlanSummary) -> list[list[str]]:
@@ -403,6 +408,10 @@ SOAK_MARKERS = "os^Dv"
 """Markers of stations by soak."""
 
 
+ROWS_OF_A_SHEET = 25
+"""A table of no more rows is printed on one sheet."""
+
+
 def render(plans: Sequence[Planned], serial: str = "") -> str:
     """The sheet of the first plan for the tool of a serial, and the others beside it, as HTML."""
     first, summaries = plans[0], [facts(each) for each in plans]
@@ -420,6 +429,7 @@ def render(plans: Sequence[Planned], serial: str = "") -> str:
         titles=titles,
         channels=_channels(first.calibration),
         rows=rows,
+        whole=len(rows) <= ROWS_OF_A_SHEET,
         soaks=any(begins for _, begins in rows),
         settings=SETTING_WORDS.get(str(first.calibration.settings), ""),
         asks_settings=not first.calibration.profile.stand.practice,
@@ -475,7 +485,8 @@ def _banner(planned: Planned) -> dict[str, str]:
         if sd is not None
     )
     headline = (
-        f"{plural(summary.stations, 'station')} – about {summary.session_hours:.1f} h at the stand"
+        f"{plural(summary.stations, 'station')} – about {summary.session_hours:.1f} h at the stand, "
+        f"{_seconds_each(summary):.0f} s a station and {summary.soak_hours:.1f} h of soak"
     )
     after = (
         f"{summary.rank} of {summary.size} parameters determined. Accuracy to expect ({PLACE}): "

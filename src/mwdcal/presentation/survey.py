@@ -30,7 +30,7 @@ from mwdcal.survey.path import PathEnd, TieIn
 from mwdcal.survey.references import NO_SOURCE
 from mwdcal.survey.stations import North
 from mwdcal.survey.surveying import SurveyedWell, WellInputs, used_in_surveys
-from mwdcal.survey.well import LastStation, Well, WellCounts, WellErrors
+from mwdcal.survey.well import AXES_OF_EARTH, LastStation, Well, WellCounts, WellErrors
 from mwdcal.use.uncertainty import ErrorTerms, error_terms
 
 MOST_CORRECTED = 30
@@ -121,6 +121,9 @@ OFF_IN_WORDS = "\noff: how far |g|, |b| and dip together are from their referenc
 """The meaning of a column."""
 OUTCOMES = {"true": "accepted", "false": "REJECTED", "": "not judged"}
 """The column `accepted` in words."""
+ACCEPTED_TOGETHER = "accepted together"
+JOINTLY = f"{ACCEPTED_TOGETHER}: one of |g|, |b| and dip is beyond its own limit, the three as one are within"
+"""The meaning of an outcome."""
 
 
 class EndOfPath(msgspec.Struct, frozen=True, kw_only=True):
@@ -536,11 +539,15 @@ def survey_table(well: Well, count: int, last: Well) -> str:
     if between >= 0:
         rows += survey_rows(last, slice(-1, None))[1]
     note = OFF_IN_WORDS if "off, σ" in header and well.judgement.judged.any() else ""
+    if any(row[-1].startswith(ACCEPTED_TOGETHER) for row in rows):
+        note += f"\n{JOINTLY}"
     return table(rows, header) + note
 
 
-def survey_rows(well: Well, places: slice) -> tuple[list[str], list[list[str]]]:
-    """Header and cells of the surveys at some places."""
+def survey_rows(
+    well: Well, places: slice, located: bool = False
+) -> tuple[list[str], list[list[str]]]:
+    """Header and cells of the surveys at some places; `located`: with their position."""
     columns = well.columns
     azimuth = f"azimuth_{well.north.name}_deg"
     angles, relative = ["inclination_deg", azimuth, "toolface_deg"], well.calibration.relative
@@ -549,14 +556,19 @@ def survey_rows(well: Well, places: slice) -> tuple[list[str], list[list[str]]]:
         "gravity_g": "|g| g", "field_nt": "|b| (relative)" if relative else "|b| nT", "dip_deg": "dip °",
     }  # fmt: skip
     digits = {"gravity_g": 5, "field_nt": 5 if relative else 0, "dip_deg": 2}
-    header = ["station", *([f"md {well.length_unit}"] if well.position else [])]
+    position, unit = well.position, well.length_unit
+    header = ["station", *([f"md {unit}"] if position else [])]
+    header += [f"{axis} {unit}" for axis in AXES_OF_EARTH] if position and located else []
     for name, title in shown.items():
         header += [title, "1σ"] if name in angles else [title]
     modelled, rows = well.limits.probability is not None, []
     metres = LENGTH_UNITS[well.length_unit]
-    labels = well.readings.labels
+    labels, jointly = well.readings.labels, well.judgement.jointly
     for i in range(len(labels))[places]:
-        row = [labels[i], *([fixed(well.position.md[i] / metres, 2)] if well.position else [])]
+        row, place = [labels[i]], []
+        if position:
+            place = [position.md[i], *(position.place[i] if located else ())]
+        row += [fixed(value / metres, 2) for value in place]
         for name in shown:
             row.append(fixed(columns[name][i], digits.get(name, 2)))
             if name in angles:
@@ -564,6 +576,7 @@ def survey_rows(well: Well, places: slice) -> tuple[list[str], list[list[str]]]:
         kind = str(columns["toolface_kind"][i])
         distance = well.judgement.distance[i]
         model = [fixed(distance, 1) if well.judgement.judged[i] else "–"] if modelled else []
-        outcome = OUTCOMES[str(columns["accepted"][i])] + (", blind" if well.blind[i] else "")
+        outcome = ACCEPTED_TOGETHER if jointly[i] else OUTCOMES[str(columns["accepted"][i])]
+        outcome += ", blind" if well.blind[i] else ""
         rows.append([*row, kind, *model, outcome])
     return [*header, "toolface from", *(["off, σ"] if modelled else []), ""], rows

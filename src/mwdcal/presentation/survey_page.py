@@ -14,8 +14,11 @@ from mwdcal.geometry.units import LENGTH_UNITS
 from mwdcal.geometry.vectors import Array, Bools, wrap
 from mwdcal.presentation.contributions import SHARE_TITLES, share_rows, station_row
 from mwdcal.presentation.interference_page import LARGEST_DRAWN_SD, sections
+from mwdcal.presentation.numbers import capital
 from mwdcal.presentation.page import banner, rendered
 from mwdcal.presentation.survey import (
+    ACCEPTED_TOGETHER,
+    JOINTLY,
     SurveySummary,
     declination_in_words,
     end_in_words,
@@ -356,8 +359,8 @@ def render(surveyed: SurveyedWell, findings: list[Finding]) -> str:
             f"{name} {i}": run.inputs.named.get(name, "") for name in digests if " " not in name
         }
     stated = well.readings.metadata, well.calibration.tool
-    header, rows = survey_rows(well, slice(MOST_ROWS_OF_PAGE))
     located = has_path(well.position)
+    header, rows = survey_rows(well, slice(MOST_ROWS_OF_PAGE), located)
     return rendered(
         "survey.html",
         *stated,
@@ -382,6 +385,9 @@ def render(surveyed: SurveyedWell, findings: list[Finding]) -> str:
         end=end_in_words(facts.end, facts.north, facts.length_unit) if facts.end else "",
         header=header,
         rows=rows,
+        jointly=capital(JOINTLY)
+        if any(row[-1].startswith(ACCEPTED_TOGETHER) for row in rows)
+        else "",
         analysis=sections(analysis) if analysis else None,
         more=facts.rows - len(rows),
         calibration=well.calibration.run_name,

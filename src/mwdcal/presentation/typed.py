@@ -18,9 +18,10 @@ MOST_ALSO = 12
 """Most stations that a finding names besides its own."""
 IMPORTANT = (
     "too-few", "channel", "missing-reference", "weak-geometry", "temperature-span",
-    "altered", "revoked", "unsound", "contradicted", "not-judged", "partly-judged", "reshoot", "repeated-readings",
-    "misfit", "accelerometer-residuals", "magnetometer-residuals", "looks-like", "column-explains",
-    "outside-temperature", "changed", "standard-overdue", "roll-test-read", "columns-read", "path-from-first",
+    "altered", "revoked", "unsound", "contradicted", "not-judged", "partly-judged", "axes-exchanged", "rejected",
+    "path-from", "tie-in", "no-path", "long-courses", "calibration-later", "magnetic-north", "reshoot",
+    "repeated-readings", "misfit", "accelerometer-residuals", "magnetometer-residuals", "looks-like", "column-explains",
+    "outside-temperature", "changed", "standard-overdue", "roll-test-read", "columns-read",
 )  # fmt: skip
 """Beginnings of the ids of findings that come first, the most important first."""
 MINOR = ("not-used", "renamed-columns", "reference-unused", "settings-assumed", "unsigned")

@@ -43,7 +43,7 @@ def screen(
     rows = []
     for row in result.rows:
         (value, sd), limit = noise_free(row, row.unit), quantity(row.limit, row.unit)
-        raw = quantity(row.raw, row.unit)
+        raw = quantity(row.raw, row.unit, uncertainty=row.uncertainty)
         verdict = "pass" if row.passed else "FAIL"
         rows.append([row.name, raw, value, sd, freedom(row), limit, verdict, row.note])
     outcome = "PASS" if result.passed else "FAIL"
@@ -128,7 +128,13 @@ def _sets(result: Verdict) -> list[str]:
         for row in result.rows
         if len(row.sets) > 1 and row.uncertainty is not None
         for each in row.sets
-        for cells in [[quantity(each.raw, row.unit), *noise_free(each, row.unit), freedom(each)]]
+        for cells in [
+            [
+                quantity(each.raw, row.unit, uncertainty=each.uncertainty),
+                *noise_free(each, row.unit),
+                freedom(each),
+            ]
+        ]
     ]
     return (
         [table(rows, ["each roll set by itself", "", "raw", "noise-free", "1σ", FREEDOM])]

@@ -171,12 +171,17 @@ class Judgement:
         """Stations (n,) of which anything is judged."""
         return np.asarray((~np.isnan(self.departure)).any(-1))
 
+    @property
+    def jointly(self) -> Bools:
+        """Accepted stations (n,) of which one strength is beyond its own bound: all three together are within."""
+        return np.asarray(self.accepted & (np.abs(self.departure) > self.bound).any(-1))
+
     def findings(self, rows: slice = slice(None)) -> list[str]:
         """The fault of each station of some rows; empty if it has none."""
-        pairs = zip(self.judged[rows].tolist(), self.accepted[rows].tolist(), strict=True)
+        plain, judged = (self.accepted & ~self.jointly)[rows].tolist(), self.judged[rows].tolist()
         return [
-            "" if accepted else self._finding(i) if judged else "not judged: no reference"
-            for i, (judged, accepted) in enumerate(pairs, rows.start or 0)
+            "" if good else self._finding(i) if some else "not judged: no reference"
+            for i, (good, some) in enumerate(zip(plain, judged, strict=True), rows.start or 0)
         ]
 
     def _finding(self, i: int) -> str:
@@ -188,7 +193,7 @@ class Judgement:
         ]
         if self.distance[i] > self.largest[i]:
             parts.append(f"distance {self.distance[i]:.2f} (at most {self.largest[i]:.2f})")
-        return ", ".join(parts)
+        return ", ".join(parts) + "; accepted by all three together" * bool(self.accepted[i])
 
 
 def load_survey_limits(

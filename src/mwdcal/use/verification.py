@@ -152,9 +152,9 @@ VERDICT_FINDINGS = {
     "harmonic-unseen": "{title}: the toolfaces hardly show the second harmonic of a turn, a difference of scales or a "
     "misalignment of x and y (four at right angles fit a mean and the first harmonic alone). The value may be "
     "too small by it: add toolfaces between them.",
-    "little-scatter": "{title}: the readings scatter less about the curves than the stated noise explains (chance "
-    "below {chance:g}). It is overstated, readings are repeated, or stations apart in the table share one setting of "
-    "the stand (then give them one group: it is counted once). The 1σ rests on the stated noise.",
+    "little-scatter": "{title}: the readings scatter less about the curves than the {noise} noise explains (chance "
+    "below {chance:g}). It is too large, readings are repeated, or stations apart in the table share one setting of "
+    "the stand (then give them one group: it is counted once). The 1σ rests on the {noise} noise.",
     "settings-doubted": "{title}: the readings scatter about the curves as if the stand was set at every station. Its "
     "error is counted both ways. State [stand] settings in the profile.",
     "not-smooth": "{title}: the readings leave a smooth curve over toolface by far more than their noise. So the raw "
@@ -422,8 +422,10 @@ class _Judged:
 def _remarks(judged: Sequence[_Judged]) -> Iterator[Finding]:
     """Findings that several limits share, each once."""
     for name in dict.fromkeys(chain(*(each.remarks for each in judged))):
-        titles = ", ".join(each.row.name for each in judged if name in each.remarks)
-        yield _finding(name, title=titles, chance=DEPARTURE_CHANCE)
+        rows = [each.row for each in judged if name in each.remarks]
+        noise = dict.fromkeys("stated" if row.freedom is None else "estimated" for row in rows)
+        title, whose = ", ".join(row.name for row in rows), " or ".join(noise)
+        yield _finding(name, title=title, noise=whose, chance=DEPARTURE_CHANCE)
 
 
 def _risk(judged: Sequence[_Judged], passed: bool) -> float | None:
