@@ -13,6 +13,7 @@ from cli_support import EXAMPLE
 from cli_support import mwdcal as command
 from mwdcal.app.cli import SECTIONS, cli
 from mwdcal.calibration.methods import EVIDENCE
+from mwdcal.library.tasks import table_in_memory
 
 PROFILE = EXAMPLE / "tool.toml"
 ROOT = Path(__file__).resolve().parents[1]
@@ -217,3 +218,11 @@ def test_stations_left_out_may_be_given_as_numbers():
         assert mwdcal.calibrate(run, exclude=exclude).excluded == left
     with pytest.raises(mwdcal.InputError, match="no such station in the readings; .*by itself"):
         mwdcal.calibrate(run, exclude="8,21")
+
+
+def test_a_header_of_two_rows_in_pandas_is_one_name(tmp_path):
+    pandas = pytest.importorskip("pandas")
+    path = tmp_path / "run.csv"
+    path.write_text("Gx,Note\nV,\n1.5,a\n2.5,b\n")
+    frame = pandas.read_csv(path, header=[0, 1])
+    assert [*table_in_memory(frame, "run").columns] == ["Gx V", "Note"]

@@ -1430,3 +1430,11 @@ def test_rejections_in_german(tmp_path, remark, asked):
             read(path)
     else:
         assert len(read(path)) == 47
+
+
+@pytest.mark.parametrize("column", [True, False])
+def test_a_temperature_above_the_names_alone_is_named_as_not_used(tmp_path, column):
+    columns = table(**({} if column else {"temperature_c": None}))
+    path = written(tmp_path / "a.csv", columns, "Stand temperature,22.5 degC")
+    texts = findings_of(library.propose_profile(path))
+    assert ("22.5 degC' is not used" in texts.get("not-used", "")) == (not column)

@@ -31,7 +31,7 @@ from mwdcal.files.contract import CHANNELS, MAPPED, RANGES, RAW, REFERENCES, uni
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, WORKBOOKS, looks_numeric, shown
 from mwdcal.files.formats.figures import is_figure
-from mwdcal.files.formats.layout import NO_READING, WITHOUT_VALUE, Layout
+from mwdcal.files.formats.layout import NO_READING, WITHOUT_VALUE, Layout, warmth_in
 from mwdcal.files.formats.table import Table, cell_error, labels, numbers
 from mwdcal.files.formats.table import labels as labels_of
 from mwdcal.files.formats.text import is_preamble
@@ -1529,9 +1529,14 @@ def units_contradicted(proposal: Proposal) -> list[Finding]:
 
 
 def warmth_around(proposal: Proposal) -> list[Finding]:
-    """A finding on a temperature that is by its name that of the oven or the room, not of the sensors."""
-    columns = proposal.profile.columns
-    source = None if isinstance(columns, msgspec.UnsetType) else columns.get(WARMTH)
+    """A finding on a temperature of the oven or the room by its name, or on one that stands above the names alone."""
+    columns = proposal.profile.columns or {}
+    lines = proposal.where.above if proposal.where else ()
+    stated = next(filter(warmth_in, lines), "")
+    if stated and WARMTH not in columns:
+        text = f"{shown(stated)} is not used: the temperature of a run is read from a column alone."
+        return [Finding(id="not-used", text=text)]
+    source = columns.get(WARMTH)
     if source is None or not is_of_surroundings(source.name):
         return []
     text = (

@@ -109,6 +109,14 @@ def table_of(source: Tabular, name: str, read: Callable[[Path], Table]) -> Table
     return table_in_memory(source, name)
 
 
+def _name_of(key: object) -> str:
+    """The name of a column; one of a header of several rows is joined: ("MD", "m") is MD m."""
+    if not isinstance(key, tuple):
+        return str(key)
+    parts = (str(part) for part in key if not str(part).startswith("Unnamed: "))
+    return " ".join(filter(None, parts)) or str(key)
+
+
 def table_in_memory(source: Any, name: str) -> Table:
     """The table of columns that are in memory."""
     if isinstance(source, Table):
@@ -116,7 +124,7 @@ def table_in_memory(source: Any, name: str) -> Table:
     names = getattr(
         source, "column_names", getattr(source, "columns", source)
     )  # of pyarrow, of pandas
-    columns = {str(key): _column(str(key), source[key]) for key in names}
+    columns = {_name_of(key): _column(_name_of(key), source[key]) for key in names}
     count = max(map(len, columns.values()), default=0)
     for key, column in columns.items():
         if len(column) != count:

@@ -1072,7 +1072,7 @@ def _with_warmth_of_lines(layout: Layout, lines: Sequence[tuple[int, Cells]]) ->
     readings = {*layout.lines}
     texts = {n: " ".join(map(as_text, row)) for n, row in lines if n not in readings}
     texts = {0: layout.heading} | texts
-    stated = {n: each for n, text in texts.items() if (each := _warmth_in(text))}
+    stated = {n: each for n, text in texts.items() if (each := warmth_in(text))}
     above = [max((n for n in stated if n < line), default=-1) for line in layout.lines]
     if (
         -1 in above
@@ -1228,10 +1228,10 @@ def _are_near(column: Cells, stated: Sequence[str]) -> bool:
     return all(value is not None and abs(value - number) < _SAME_WARMTH for value, number in pairs)
 
 
-def _warmth_in(text: str) -> tuple[str, str] | None:
+def warmth_in(text: str) -> tuple[str, str] | None:
     """The one temperature that a line states, and its unit.
 
-    >>> [_warmth_in(t) for t in ("温度点：80℃", "Set 2: T = 20,5 ± 0.5 °C", "Oven 176 F", "20 to 80 °C", "Run C")]
+    >>> [warmth_in(t) for t in ("温度点：80℃", "Set 2: T = 20,5 ± 0.5 °C", "Oven 176 F", "20 to 80 °C", "Run C")]
     [('80', '°C'), ('20.5', '°C'), ('176', '°F'), None, None]
     """
     word = _WARMTH_IN_WORDS.search(text)
