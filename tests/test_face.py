@@ -226,3 +226,13 @@ def test_a_header_of_two_rows_in_pandas_is_one_name(tmp_path):
     path.write_text("Gx,Note\nV,\n1.5,a\n2.5,b\n")
     frame = pandas.read_csv(path, header=[0, 1])
     assert [*table_in_memory(frame, "run").columns] == ["Gx V", "Note"]
+
+
+def test_a_row_of_units_below_the_names_in_pandas_is_no_station(tmp_path):
+    pandas = pytest.importorskip("pandas")
+    path = tmp_path / "run.csv"
+    path.write_text("Gx,Gy,MD,Note\nV,V,m,\n1.5,0.5,10,a\n2.5,0.25,20,b\n")
+    table = table_in_memory(pandas.read_csv(path), "run")
+    assert table.units == {"Gx": "V", "Gy": "V", "MD": "m"}
+    assert [*table.columns["Gx"]] == ["1.5", "2.5"]
+    assert [*table.lines] == [1, 2]

@@ -133,7 +133,18 @@ def table_in_memory(source: Any, name: str) -> Table:
                 "value for each row, blank or NaN where unknown."
             )
     metadata = meta.plain(getattr(source, "attrs", {}), name)
-    return Table(columns, metadata, name, range(1, count + 1))
+    units = _units_below(columns)
+    if units:
+        columns = {key: column[1:] for key, column in columns.items()}
+    return Table(columns, metadata, name, range(1, count + 1 - bool(units)), units=units)
+
+
+def _units_below(columns: Mapping[str, Column]) -> dict[str, str]:
+    """The units in a first row that holds nothing else, as a spreadsheet has them below the names."""
+    from mwdcal.files.formats.layout import is_units
+
+    first = {name: cells[0] for name, cells in columns.items() if isinstance(cells, list) and cells}
+    return {n: cell for n, cell in first.items() if cell} if is_units([*first.values()]) else {}
 
 
 def _is_missing(cell: Any) -> bool:
