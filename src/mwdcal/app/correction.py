@@ -511,7 +511,7 @@ def apply_to_any(
 
 def _is_exported(readings: Path, profile: Profile, decimal: str) -> bool:
     """Whether a table is written, or names its columns, as the profile says and not as documented."""
-    if readings.suffix.lower() in WHOLE:
+    if readings.suffix.lower() in WHOLE or not readings.is_file():
         return True
     opened = streams.open_parquet if readings.suffix.lower() == ".parquet" else streams.open_text
     try:
