@@ -281,7 +281,7 @@ def test_only_colours_change_in_the_dark(sheet):
     declared = re.findall(r"([\w-]+):\s*([^;]+);", dark)
     assert len(declared) > 8
     for name, value in declared:
-        is_colour = name.startswith("--") and re.fullmatch(r"#[0-9a-f]{3,6}", value)
+        is_colour = name.startswith("--") and re.fullmatch(r"#[0-9a-f]{3,8}", value)
         assert is_colour or name in ("filter", "mix-blend-mode", "color-scheme"), name
 
 

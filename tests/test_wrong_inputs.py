@@ -123,13 +123,20 @@ def test_a_channel_that_was_said_is_tested_by_the_strength_of_gravity(tmp_path, 
 
 
 @pytest.mark.parametrize("command", ["survey", "apply"])
-@pytest.mark.parametrize(("new", "others"), [(None, "'Depth (m)'"), ("Gx [V]", "'Gx [V]'")])
-def test_a_missing_channel_of_a_well_is_named_with_the_other_columns(laboratory, command, new, others):  # fmt: skip
-    well = changed(laboratory, "lacking", ax=new)
-    message = refused(mwdcal(command, laboratory / "cal.json", well, "-o", laboratory / "o.csv"), 2)
-    assert "no column 'Accel X (V)'" in message
-    assert others in message
+def test_a_missing_channel_of_a_well_is_named_with_the_other_columns(laboratory, command):
+    well = changed(laboratory, "lacking", ax=None)
+    message = refused(mwdcal(command, laboratory / "cal.json", well, "-o", laboratory / "o.csv"), 3)
+    assert "no column for ax (in the run 'Accel X (V)')" in message
+    assert "its others are 'Depth (m)'" in message
     assert "Accel Y" not in message
+
+
+@pytest.mark.parametrize("command", ["survey", "apply"])
+def test_a_channel_of_another_name_in_a_well_is_read_and_named(laboratory, command):
+    well = changed(laboratory, "renamed", ax="Gx [V]")
+    ran = mwdcal(command, laboratory / "cal.json", well, "-o", laboratory / "o.csv")
+    assert ran.code == 0, ran
+    assert "ax = 'Gx [V]'" in ran.err
 
 
 # ------------------------------------------------------- what a table lacks without being refused
