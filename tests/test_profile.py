@@ -633,7 +633,7 @@ def test_units_that_only_the_values_tell_are_said(tmp_path):
 @pytest.mark.parametrize("triad", ["A", "M"])
 @pytest.mark.parametrize("unit", ["(mV)", "[ADC]", "_mV", "(1e-3 V)", "_adc", " digits", " uV"])
 def test_no_unit_hides_a_channel(tmp_path, triad, unit):
-    """Known, in brackets or neither, it is a note: the scale is told by the readings."""
+    """Whether the unit is known or not, the readings give the scale."""
     run = servo_run(seed=2)
     names = {f"{t.lower()}{i}": f"{'GH'[t == 'M']}{i.upper()}" for t in "AM" for i in "xyz"}
     names = {k: v + unit * (k[0] == triad.lower()) for k, v in names.items()}

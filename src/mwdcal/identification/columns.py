@@ -226,12 +226,22 @@ def _in_order_of_axes(names: Sequence[str]) -> Sequence[str]:
     >>> _in_order_of_axes(["Fy (V)", "Fx (V)", "Fz (V)"]), _in_order_of_axes(["B3", "B1", "B2"])
     (['Fx (V)', 'Fy (V)', 'Fz (V)'], [])
     """
-    for place in range(min(map(len, names))):
-        letters = [name[place].lower().translate(LATIN_AXES) for name in names]
-        rest = {f"{name[:place]} {name[place + 1 :]}" for name in names}
-        if sorted(letters) == ["x", "y", "z"] and len(rest) == 1:
-            return [name for _, name in sorted(zip(letters, names, strict=True))]
-    return []
+    whole = _but_for_axes((name, name) for name in names)
+    return next(([each[axis] for axis in "xyz"] for each in whole.values()), [])
+
+
+def _but_for_axes(texts: Iterable[tuple[str, str]]) -> dict[str, dict[str, str]]:
+    """What three texts have in common that differ in the letter of an axis alone, with the name of each by its axis.
+
+    `texts`: each with its name.
+    """
+    stems: dict[str, dict[str, str]] = {}
+    for text, name in texts:
+        for place, letter in enumerate(text):
+            if (axis := letter.lower().translate(LATIN_AXES)) in "xyz":
+                stem = f"{text[:place]} {text[place + 1 :]}"
+                stems.setdefault(stem, {})[axis] = name
+    return {stem: each for stem, each in stems.items() if len(each) == len("xyz")}
 
 
 def _variation(columns: Array) -> float:
@@ -685,19 +695,19 @@ def _by_axes(
     Their unit is one that one triad alone has, or their first letter says which: Akx, Aky, Akz.
     """
     called = {m.column for m in meanings.values()}
-    stems: dict[tuple[str, str], dict[str, str]] = {}
+    texts: dict[str, list[tuple[str, str]]] = {}
     for name, unit in zip(names, units, strict=True):
         plain = spelled(name)
         behind = _WITH_UNIT.fullmatch(plain)
         stated = unit_of(spelled(unit)) or (unit_of(behind[2]) if behind else "")
         bare = (behind[1] if behind and not unit else plain).lower()
-        if name in meanings or _NO_STAND.search(plain) or is_of_tool(name):
-            continue
-        for place, letter in enumerate(bare):
-            if letter in "xyz":
-                stem = f"{bare[:place]} {bare[place + 1 :]}"
-                stems.setdefault((stem, stated), {})[letter] = name
-    whole = [(stem, unit, each) for (stem, unit), each in stems.items() if len(each) == 3]
+        if not (name in meanings or _NO_STAND.search(plain) or is_of_tool(name)):
+            texts.setdefault(stated, []).append((bare, name))
+    whole = [
+        (stem, unit, each)
+        for unit, pairs in texts.items()
+        for stem, each in _but_for_axes(pairs).items()
+    ]
     kinds = [_OF_UNITS.get(unit) or _OF_LETTERS.get(stem[0], "") for stem, unit, _ in whole]
     return {
         name: Resemblance(f"{kind}{axis}", unit)

@@ -353,11 +353,8 @@ def _with_run(table: Table, profile: Profile, said: Said) -> Table:
 
 def _with_remark(table: Table, of_table: Mapping[str, object], columns: Collection[str]) -> Table:
     """The roll test with a remark on what it takes from its run, beyond what is `of_table`: metadata, and columns."""
-    turned = (
-        REFERENCES["azimuth"].column in columns
-        and table.metadata.get(_AZIMUTH_REFERENCE) != "magnetic"
-    )
-    turned = turned and _AZIMUTH_REFERENCE in table.metadata
+    north = table.metadata.get(_AZIMUTH_REFERENCE, "magnetic")
+    turned = REFERENCES["azimuth"].column in columns and north != "magnetic"
     wanted = (*(AZIMUTH_KEYS if turned else ()), *(c for c in _PLACE if c not in columns))
     taken = [
         f"{k} {table.metadata[k]}" for k in wanted if k in table.metadata and k not in of_table

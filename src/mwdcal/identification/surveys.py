@@ -66,7 +66,7 @@ def table_of_other_names(
 def _table_in(
     path: str | os.PathLike[str], profile: Profile, said: Said, problem: Exception | None
 ) -> Layout | None:
-    """The table of readings in a file; None of a format that has but one. The problem where there is none."""
+    """The table of readings in a file; None of a format with one table only. Raises the problem if there is none."""
     try:
         every = tables_on_sheet(path, profile, said)
     except InputError as error:

@@ -640,15 +640,11 @@ def _inputs(
     tool: LoadedCalibration, readings: Tabular | Readings, said: Said, how: Any
 ) -> WellInputs:
     """The inputs of a run: its calibration and its table."""
-    from mwdcal.survey.surveying import well_inputs
+    from mwdcal.presentation.readings import inputs_of_run
 
-    reference, limits, msa, error_model, missing, azimuth, unit, registry = how
+    *how, registry = how
     named = _survey_table(readings, tool.calibration, said)
-    inputs = well_inputs(
-        named.calibration, named.table, reference, limits, msa, tool.digest,
-        [*tool.findings, *named.findings], error_model, missing, azimuth, unit,
-    )  # fmt: skip
-    return _with_walk(inputs, registry)
+    return _with_walk(inputs_of_run(tool, named, how), registry)
 
 
 def _source(cal: object) -> Calibration | FilePath:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import FitError, InputError, UnreadableFileError
@@ -11,6 +13,10 @@ from mwdcal.files.contract import CHANNELS
 from mwdcal.files.formats.table import Table
 from mwdcal.files.statements import Said, SurveyTable
 from mwdcal.sensor.profile import Profile
+
+if TYPE_CHECKING:
+    from mwdcal.presentation.signature import LoadedCalibration
+    from mwdcal.survey.surveying import WellInputs
 
 
 def read_surveys(
@@ -46,6 +52,21 @@ def read_surveys(
     from mwdcal.identification.surveys import table_of_other_names
 
     return table_of_other_names(source, table, problem, calibration, said)
+
+
+def inputs_of_run(tool: LoadedCalibration, named: SurveyTable, how: Sequence[Any]) -> WellInputs:
+    """The inputs of a run in a well: its calibration, its table, and `how` it is surveyed.
+
+    `how`: reference, limits, whether by `msa`, error model, rows without a reading, azimuth of the vertical section and
+    unit of lengths, as of `well_inputs`.
+    """
+    from mwdcal.survey.surveying import well_inputs
+
+    reference, limits, msa, error_model, missing, azimuth, unit = how
+    return well_inputs(
+        named.calibration, named.table, reference, limits, msa, tool.digest,
+        [*tool.findings, *named.findings], error_model, missing, azimuth, unit,
+    )  # fmt: skip
 
 
 def _has_names(table: Table, profile: Profile) -> bool:

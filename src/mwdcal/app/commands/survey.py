@@ -212,16 +212,12 @@ def command(
 
 def _inputs(tool: LoadedCalibration, readings: Path, said: Said, how: Any) -> WellInputs:
     """The inputs of a run: its calibration and its table."""
-    from mwdcal.presentation.readings import read_surveys
-    from mwdcal.survey.surveying import well_inputs
+    from mwdcal.presentation.readings import inputs_of_run, read_surveys
 
-    reference, limits, msa, error_model, missing, section_azimuth, unit, registry = how
+    *how, registry = how
     named = read_surveys(readings, tool.calibration, said)
     with offering_blank():
-        inputs = well_inputs(
-            named.calibration, named.table, reference, limits, msa, tool.digest,
-            [*tool.findings, *named.findings], error_model, missing, section_azimuth, unit,
-        )  # fmt: skip
+        inputs = inputs_of_run(tool, named, how)
     if not registry:
         return inputs
     from mwdcal.library.drifts import with_walk

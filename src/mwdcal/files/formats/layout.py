@@ -87,6 +87,7 @@ _OF_AXIS = re.compile(
 )
 """A name that ends in an axis, but for its unit."""
 _WORD_AXIS = re.compile("轴$")
+"""The word for an axis behind its letter."""
 _SYMBOL = re.compile(r"[^\W\d_]")
 """A name that is the symbol of a quantity."""
 _DEGREES_OF = re.compile(
@@ -846,7 +847,7 @@ _LINE_OF_COLUMN = re.compile(
 )
 """The beginning of a line that says what one column is, or several."""
 _BETWEEN_AXES = re.compile(r"[,;/、]|\b(and|et|und|og|e|i|и|和)\b|(?<=[yY])\s+y(?=\s+[zZ])")
-"""What stands between axes in a line."""
+"""Signs and words between the axes that a line lists."""
 
 
 def _with_legend(rows: list[tuple[int, Cells]]) -> list[tuple[int, Cells]]:

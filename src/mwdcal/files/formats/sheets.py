@@ -23,7 +23,7 @@ DELIMITERS = (";", "\t", ",", "|")
 _DRAWN = re.compile("[│┃║]")
 _BAR = re.compile(r"(?<!\S)\|(?!\S)")
 _FRAME = "!"
-"""What old programs draw between columns."""
+"""The sign that old programs draw between columns."""
 _BLANKS, _RUNS = "blanks", "runs of blanks"
 _LOOKED_AT = 400
 """Most lines that tell the delimiter of a text, and most characters that tell a page."""
