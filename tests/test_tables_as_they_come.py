@@ -1438,3 +1438,17 @@ def test_a_temperature_above_the_names_alone_is_named_as_not_used(tmp_path, colu
     path = written(tmp_path / "a.csv", columns, "Stand temperature,22.5 degC")
     texts = findings_of(library.propose_profile(path))
     assert ("22.5 degC' is not used" in texts.get("not-used", "")) == (not column)
+
+
+def test_blanks_between_thousands_part_no_column(tmp_path):
+    """Names with a comma before their unit, and counts as people write them: -32 011."""
+    codes = {n: np.round(1e5 * v) for n, v in table().items() if n[0] in "GH"}
+    grouped = {
+        f"АЦП {'a' if n[0] == 'G' else 'm'}{n[1]}, код": [f"{v:,.0f}".replace(",", " ") for v in c]
+        for n, c in codes.items()
+    }
+    others = {n: v for n, v in table().items() if n[0] not in "GH"}
+    one = read(written(tmp_path / "a.csv", {**others, **grouped}, delimiter=";"))
+    other = read(written(tmp_path / "b.csv", {**others, **codes}))
+    np.testing.assert_array_equal(one.accelerometer, other.accelerometer)
+    np.testing.assert_array_equal(one.magnetometer, other.magnetometer)

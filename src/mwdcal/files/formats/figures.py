@@ -187,6 +187,8 @@ _OF_AXES = re.compile(r"(.*?)[\s_(\[]*x\W*y\W*z[)\]]*(?![^\W\d_])(.*)", re.IGNOR
 """A name of all three axes: G xyz (g), B (x, y, z)."""
 _UNIT_LAST = re.compile(r"(.*?)\s*([(\[][^()\[\]]*[)\]])?\s*")
 _SEPARATORS = ("/", ";", "|", ", ", " ")
+_PARTED_BY_BLANKS = re.compile(r"[+\-−]?[1-9]\d{0,2}(?:\s\d{3})+(?:[.,]\d+)?")
+"""One number whose thousands blanks separate: -32 011."""
 
 
 def apart(name: str, cells: Sequence[object]) -> tuple[list[str], list[list[str]]]:
@@ -204,7 +206,8 @@ def apart(name: str, cells: Sequence[object]) -> tuple[list[str], list[list[str]
     texts = [
         re.sub(r"[\[\](){}°º]", "", cell).strip() if isinstance(cell, str) else "" for cell in cells
     ]
-    for separator in _SEPARATORS if all(texts) else ():
+    thousands = all(_PARTED_BY_BLANKS.fullmatch(text) for text in texts)
+    for separator in (_SEPARATORS[:-1] if thousands else _SEPARATORS) if all(texts) else ():
         parts = [[part.strip() for part in text.split(separator)] for text in texts]
         parts = [[*filter(None, each)] for each in parts] if separator == " " else parts
         names = _names_apart(name, len(parts[0])) if 1 < len(parts[0]) < 4 else []

@@ -116,7 +116,7 @@ _OF_MEANS = re.compile(
 """Words of the mean of a run, which may be that of a place."""
 _UNSURE = re.compile(
     rf"{_ROUGH.pattern}|{_OF_MEANS.pattern}|"
-    r"uncert|\bunc\b|unsicher|usikker|incert|погреш|不确定|toler|limit|grenz|range|bereich|диапазон|范围|量程|"
+    r"uncert|\bunc\b|unsicher|usikker|incert|погреш|不确定|toler|limit|grenz|range|\bspan|bereich|диапазон|范围|量程|"
     r"\bmin\b|\bmax\b|\bstd|\bsd\b|sigma|σ|±|spec|resol|correct|korrek|offset|drift|gradient|noise|"
     r"toolface|survey|tool face",
 )
@@ -201,7 +201,7 @@ _OF_UNCERTAINTY = re.compile(
 """The beginning of a line of uncertainties."""
 
 _COUNTED = (
-    r"(?:m?v(?:olts?)?|в|мв|lsb|cnts?|counts?|digits?|bits?|cuentas?|contage[mn]s?|zahlwert\w*|ink\w*|tell\w*|"
+    r"(?:m?v(?:olts?)?|в|мв|lsb|cnts?|counts?|digits?|bits?|cuentas?|contage[mn]s?|zahlwert\w*|inkr\w*|tell\w*|"
     r"отсч\w*|код\w*|ед\w*|码\w?|计数)"
 )
 """Volts and counts, of which a channel has so many to a unit, or a unit so many."""
@@ -218,6 +218,19 @@ _IN_OTHER_UNIT = re.compile(
     rf"=)\s*(?P<again>{_WRITTEN_NUMBER})\s*(?P<other>{_WRITTEN_UNIT})(?:[^()\[\]\d;]*[)\]]|(?![^\W\d_]))"
 )
 """A value, and in brackets the same in another unit."""
+_RATIO = (
+    rf"(?:{_COUNTED}\.?\s*(?:/|per|pro|par|por|na|на|每)\s*(?:{_WRITTEN_UNIT})|"
+    rf"(?:{_WRITTEN_UNIT})\s*(?:/|per|pro|par|por|na|на|每)\s*{_COUNTED}(?![^\W\d_]))"
+)
+_OF_SENSITIVITY = re.compile(
+    rf"(?:(?:{_ROUGH.pattern})\W*)?(?:{_WRITTEN_NUMBER})\s*[(\[]?\s*{_RATIO}|{_RATIO}\W*(?:{_WRITTEN_NUMBER})?"
+)
+"""A sensitivity or its inverse: 16384 LSB/g, 0.5 counts per nT, µT/V = 50."""
+_OF_ANOTHER = re.compile(
+    rf"\s*(?:{_COUNTED}|-?bits?|[km]?hz|k?sps|ppm|%|m?a|[mkh]?pa|[kmc]?m|kg|k?ohm)(?![^\W\d_])|"
+    r"\W*(?:fs|f\.s|full[ -]?scale|span|range|s/n)(?![^\W\d_])"
+)
+"""Units of something else behind a number, and words of a range: 24 bit, 50 µT FS."""
 _ROUNDED = 5e-4
 """By how much these differ at most, as a share: half a digit in the third place."""
 _ANOTHER_UNIT = re.compile(r"\s*[^\W\d_]{1,3}(?![^\W\d_])(?!\W*\d)")
@@ -309,6 +322,8 @@ _UPWARDS = re.compile(
     r"(s(?! ?/)|south\w*|sud|sul|sur|syd|sor|zuid|юг|ю|южн\w*)(?![^\W\d_])",
 )
 """Words of a dip whose number is that of a field that points up, and behind it those of the south, where it does."""
+_ALWAYS_WRITTEN = ("gon", "A/m", "mT", "gauss", "mG")
+"""Units in which no bare number is read: 0.5 may be any factor."""
 _SPELT = {
     "нтл": "nT", "мктл": "µT", "мтл": "mT", "м/с": "m/s²", "м/с²": "m/s²", "м/с2": "m/s²", "m/s": "m/s²", "г": "g",
     "град": "°", "度": "°", "fok": "°", "derece": "°", "stopni": "°", "gal": "gal",
@@ -674,7 +689,7 @@ def _clauses(row: Sequence[object]) -> str:
         text = _OF_INSTRUMENT.sub(" ", text)
     if _TOTAL.search(text):
         text = _COMPONENT.sub(" ", text)
-    text = _IN_OTHER_UNIT.sub(_said_once, _OF_A_UNIT.sub("", text))
+    text = _IN_OTHER_UNIT.sub(_said_once, _OF_A_UNIT.sub("", _OF_SENSITIVITY.sub(" ", text)))
     text = _WITH_SPREAD.sub(r"\1 \4 \2 \3 \4", text)
     return _RANGE.sub("range ", _UNCERTAIN.sub(r"\g<value> ", text)).strip()
 
@@ -805,7 +820,7 @@ def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
     """The value that a text states, in the unit of the run file, if it is one, and another right behind it."""
     between, behind = match["between"], match["behind"]
     rough = bool(re.match(rf"\W*({_ROUGH.pattern}|k\s?g\b)", behind)) and not match["next"]
-    counted = re.match(rf"\s*{_COUNTED}\s?/\s?(?=[gnuµmгнм])", behind)
+    counted = _OF_ANOTHER.match(behind)
     letter = "letter" in match.groupdict()
     if (
         rough
@@ -835,7 +850,9 @@ def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
     numbers = [*_numbers(match["number"], _minutes(match))]
     if quantity.low < 0 and _UPWARDS.search(match[0]):
         numbers = [-abs(number) for number in numbers]
-    units = (stated,) if stated else [unit for unit in quantity.units if unit not in ("gon", "A/m")]
+    units = (
+        (stated,) if stated else [unit for unit in quantity.units if unit not in _ALWAYS_WRITTEN]
+    )
     units = units[:1] if letter and not stated and quantity.low > EARTH_FIELD[0] - 1 else units
     inside = [*_inside(quantity, numbers, units)]
     other = _ANOTHER.match(match.string, match.end("unit" if match["unit"] else "number"))
