@@ -841,7 +841,9 @@ def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
         or ("=" in bare and (decimals or len(match["number"]) > 4))
         or (quantity.column == "ref_gravity_g" and decimals > 2)
     )
-    if (letter and not (direct and sure)) or not (direct or stated):
+    alone = not re.search(r"dip|grav|in[ck]l", match.string)
+    short = letter or (alone and match["word"] == "mag")
+    if (short and not (direct and sure)) or not (direct or stated):
         return
     if letter and not stated and _ANOTHER_UNIT.match(match.string, match.end("number")):
         return
