@@ -62,6 +62,7 @@ STATED = [
     ([['Mag 24 bit, Acc 16 bit']], (None, None, None)),
     ([['Mag: 65000 counts'], ['Mag 50 µT FS'], ['Mag 30000 Hz']], (None, None, None)),
     ([['Field 0.512']], (None, None, None)),
+    ([['Dip angle of table 45°'], ['Field at factory 47900 nT']], (None, None, None)),
     ([['Acc', '1203'], ['Mag', '48213']], (None, None, None)),
     ([['Mag: 48213 nT']], (None, 48213, None)),
     ([['# Acc 16384 LSB/g, Mag 0.4 LSB/nT']], (None, None, None)),

@@ -338,11 +338,11 @@ _SPELT = {
 
 
 _NO_LONGER = re.compile(
-    r"(?<![^\W\d_])(prev(ious)?|former(ly)?|old|obsolete|superseded|no longer|last (cal\w*|site|year)|gammel\w*|gamle|"
+    r"(?<![^\W\d_])(prev(ious)?|former(ly)?|old|obsolete|superseded|no longer|last (cal\w*|site|year)|factory|fabrica|usine|завод\w*|gammel\w*|gamle|"
     r"utgatt|tidligere|forrige|alte[rsn]?|ehemalig\w*|vorherig\w*|fruher\w*|antigu[oa]|antig[oa]|anterior|ancien\w*|"
     r"precedent\w*|vecchi[oa]|precedente|dawn\w*|poprzedni\w*|stary|stara|стар\w*|прежн\w*|прошл\w*|"
     r"предыдущ\w*)(?![^\W\d_])|"
-    r"旧|以前|上次",
+    r"旧|以前|上次|出厂",
 )
 """Words of a place or a calibration whose references no longer hold."""
 _OF_LIMITS = re.compile(
@@ -826,6 +826,7 @@ def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
         rough
         or counted
         or _OF_COMPONENT.search(between)
+        or (quantity.low < 0 and _OF_STAND.search(between))
         or _UNSURE.search(between if letter else f"{match['word']} {between}")
     ):
         return
