@@ -338,7 +338,8 @@ _SPELT = {
 
 
 _NO_LONGER = re.compile(
-    r"(?<![^\W\d_])(prev(ious)?|former(ly)?|old|obsolete|superseded|no longer|last (cal\w*|site|year)|factory|fabrica|usine|завод\w*|gammel\w*|gamle|"
+    r"(?<![^\W\d_])(prev(ious)?|former(ly)?|old|obsolete|superseded|no longer|last (cal\w*|site|year)|factory|fabrica|"
+    r"usine|завод\w*|gammel\w*|gamle|"
     r"utgatt|tidligere|forrige|alte[rsn]?|ehemalig\w*|vorherig\w*|fruher\w*|antigu[oa]|antig[oa]|anterior|ancien\w*|"
     r"precedent\w*|vecchi[oa]|precedente|dawn\w*|poprzedni\w*|stary|stara|стар\w*|прежн\w*|прошл\w*|"
     r"предыдущ\w*)(?![^\W\d_])|"
