@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 from mwdcal.errors import InputError
 from mwdcal.files.contract import COLUMNS
@@ -10,19 +11,22 @@ from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.table import Table, labels
 from mwdcal.files.statements import rows_of
 
-_OF_CHECKS = re.compile(
-    r"ver(if(y|ication|iziert)?)?|verifikation|check|validation|control|kontrolle|pr(ue|ü)fung|kontroll|"
-    r"verificaci[oó]n|verifica[cç][aã]o|проверка|поверка|контроль|验证|检验"
+_TESTS = (
+    r"ver(if(y|ication|iziert)?)?|verifikation|verifisering|check|validation|control|kontrolle|pr(ue|ü)fung|kontroll|"
+    r"verificaci[oó]n|verifica[cç][aã]o|проверка|поверка|контроль|验证|检验|检查|test"
 )
-_BEHIND = r"[\s_-]*(run|shot|station|row|test|\d*)\W*"
-_CHECK = re.compile(rf"\W*({_OF_CHECKS.pattern}){_BEHIND}", re.IGNORECASE)
-"""A cell of a row that is to check a calibration, and is no part of it."""
+_ROLLS = (
+    r"roll(ing)?|rotation|dreh(ung)?|rull(e|ering)?|giro|rotaci[oó]n|rola(gem|mento)|rota[cç][aã]o|roulis|вращени[ея]|"
+    r"滚转|滚动|旋转|转动"
+)
 _ROLL_TEST = re.compile(
-    rf"\W*(roll([\s_-]*(test|over|check|set))|rt|rollpr(ue|ü)fung|rulletest|prueba( de giro)?|"
-    rf"{_OF_CHECKS.pattern}){_BEHIND}",
+    rf"\W*((roll|rull|rollen)[\s_-]*(over|set|serie)|rt|rollpr(ue|ü)fung|prueba|"
+    rf"({_ROLLS})?[\s_-]*({_TESTS})([\s_-]*(d[aeo] )?({_ROLLS}))?|"
+    rf"(prueba|prova|ensaio|teste|essai)[\s_-]*d[aeo] ({_ROLLS}))"
+    r"[\s_-]*(run|shot|station|row|point|rows?|点|\d*)\W*",
     re.IGNORECASE,
 )
-"""Names of the roll test, in a cell or as the name of a column."""
+"""Names of what checks a calibration and is no part of it, in a cell or as the name of a column."""
 _YES = re.compile(r"(x|yes|y|ja|si|sí|sim|да|是|true|1|1\.0|✓|✔|√)", re.IGNORECASE)
 _NO = re.compile(r"(|no|n|nei|nein|não|нет|否|false|0|0\.0|-|–)", re.IGNORECASE)
 
@@ -71,11 +75,15 @@ def marked_rows(table: Table, name: str) -> list[int]:
     if called and all(_YES.fullmatch(cell) or _NO.fullmatch(cell) for cell in cells):
         rows = [row for row, cell in enumerate(cells) if _YES.fullmatch(cell)]
     else:
-        rows = [row for row, cell in enumerate(cells) if cell and _ROLL_TEST.fullmatch(cell)]
+        rows = _named_in(cells)
     return rows if len(rows) < len(cells) else []
 
 
 def check_rows(table: Table, name: str) -> list[int]:
     """The rows that a cell in a column calls a check of the calibration; none where they are half of all or more."""
-    rows = [row for row, cell in enumerate(labels(table, name)) if cell and _CHECK.fullmatch(cell)]
+    rows = _named_in(labels(table, name))
     return rows if 2 * len(rows) < table.count else []
+
+
+def _named_in(cells: Sequence[str]) -> list[int]:
+    return [row for row, cell in enumerate(cells) if cell and _ROLL_TEST.fullmatch(cell)]

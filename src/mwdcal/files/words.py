@@ -38,6 +38,12 @@ TRANSLATIONS = (
     (r"\|\s*b\s*\|", "Btotal"),
     (r"\|\s*g\s*\|", "Gtotal"),
     (r"pruf(?=stand)|mess(?=stand)", ""),
+    (
+        r"\b(raw( values?| data| readings?)?|rohwerte?|rohdaten|rohsignale?|(ra)verdi(er)?|radata|"
+        r"valor(es)? (bruto|crudo)s?|сыр\w*|исходн\w*)\b[\W_]*(?=[^\W\d_]{3})|原始(数据|值)?(?=.)",
+        "",
+    ),
+    (r"(?<![^\W\d_])(bohrloch|borehull?s?|boreh(ole)?\b|wellbore)[ ._-]*(?=[^\W\d_])", ""),
     (r"(?<=[°º] )[СсC]\b|(?<=[°º])[СсC]\b", "C"),
     (r"(?<![^\W\d_])([CF])°", r"°\1"),
     (r"\bm(illi)?gauss\b", "mG"),
@@ -68,7 +74,7 @@ TRANSLATIONS = (
         r"복각|magneettinen kaltevuus|magn\w* kaltevuus|magneticka inklinace|manyetik egim|inklinacja( pola|"
         r" magn\w*)?|magn\w* inklinacio|inclinazione magn\w*|magn\w* inclinatie|"
         r"magn\w* (inklination|lutning)|inklinasi( magnet\w*)?|伏角|"
-        r"(угол )?(магнитн\w* )?наклонени[ея]|(地磁|磁)倾角?|incl\w*\.? magn\w*\.?|"
+        r"(угол )?(магнитн\w* )?наклонени[ея]|\bдип\b|(地磁|磁)倾角?|incl\w*\.? magn\w*\.?|"
         r"(magn\w*|felt|feld|field) ?[-_ ]?inkl\w*|mergulho( magn\w*)?|echado|buzamiento|(field|magnetic) inclination",
         "dip ",
     ),
@@ -80,7 +86,7 @@ TRANSLATIONS = (
         r"(kat )?odchyleni[ae](?!\W*st)( od pionu)?|(kat )?nachyleni[ae]|ferdeseg|dolesszog|egim|kemiringan|傾斜角?|"
         r"鉛直(線)?からの角度?|"
         r"зен\w*\.?( угол\w*)?|"
-        r"neigung(swinkel)?|desviacion|sapma( acisi)?|inklination|inclinaison|inclinaca?o|"
+        r"neigung(swinkel)?|\bneig\b\.?|\bzenit\b|desviacion|sapma( acisi)?|inklination|inclinaison|inclinaca?o|"
         r"inclinacion|zenith( angle)?|drift angle|deviation angle|(?<![a-z])inkl?\b\.?|"
         r"inklinasjon|helning|инклинация|зенит\w*( угол)?|наклон(?!ен)|井斜角?|倾角|顶角|天顶角",
         "inclination ",
@@ -90,7 +96,7 @@ TRANSLATIONS = (
         r"azimutwinkel|\bkurs\b|\bdire(ccion|cao|ction)\b|\brumo\b|\bcap\b|\bаз(им)?\b\.?|направление|"
         r"курс|方向角?|磁北からの角度?|"
         r"atsimuutti|suuntakulma|방위각?|\bhazi\b|drehtisch|turn ?table|rotary table|baring|azymut|yonelim|азимут|"
-        r"asimut|azym\b\.?|azimute?(?!h)|acimut|方位角?|"
+        r"asimut|\basi\b\.?|azym\b\.?|azimute?(?!h)|acimut|方位角?|"
         r"rumbo|richtung(?!swinkel)|retning|peilung",
         "azimuth ",
     ),
@@ -154,6 +160,7 @@ TRANSLATIONS = (
     ),
     (r"(град\w*\.?|°)\s?[сc](?![а-яa-z])", "degc"),
     (r"^т(?=\W)", "T"),
+    (r"м/с\s?(²|\^?2)", "m/s2"),
     (r"нтл", "nT"),
     (r"мктл", "uT"),
     (r"м[gг](?![а-яa-z])", "mg"),
@@ -167,7 +174,8 @@ TRANSLATIONS = (
     (r"код\w* ацп|ацп|отсч\w*|(?<![а-я])код(а|ы|ов)?(?![а-я])|码值|码数|计数值?", "adc"),
     (r"мв(?![а-я])", "mV"),
     (
-        r"\bttmp\b|lampotila|teplota|درجة الحرارة|θερμοκρασια|온도|nhiet do|"
+        r"\bttmp\b|termopar|thermocouple|th?ermoelement|термопара|热电偶|"
+        r"lampotila|teplota|درجة الحرارة|θερμοκρασια|온도|nhiet do|"
         r"temp-ra|темп-ра|sicaklik|homerseklet|temperatuur|suhu|pt100(0)?\b|temperatura|"
         r"temperature?n?|температура|темп\b\.?|温度",
         "temperature ",

@@ -309,12 +309,8 @@ def may_be(column: str, name: str, unit: str, values: Array | None) -> bool:
     known = values[np.isfinite(values)] if values is not None else np.empty(0)
     if known.size < LEAST_ROLLS:
         return False
-    plain = spelled(name)
-    bracketed = IN_BRACKETS.search(plain)
-    stated = unit_of(spelled(unit)) or unit_of(
-        bracketed[1] if bracketed else plain.rpartition(" ")[2]
-    )
-    foreign = bool(unit or bracketed) and not stated
+    stated = _unit_beside(name, unit)
+    foreign = bool(unit or IN_BRACKETS.search(spelled(name))) and not stated
     low, high = float(known.min()), float(known.max())
     if column == REFERENCES["dip"].column:
         steep = min(abs(low), abs(high)) > 5 and max(abs(low), abs(high)) < 90
@@ -337,14 +333,24 @@ _LABELS = {
 }
 """Names of columns of labels; a column is one only where no other is."""
 _CALLED_REFERENCE = re.compile(r"\b(ref|reference|nominal|target|set)\b", re.IGNORECASE)
-_REFERRED = re.compile(r"\b(ref|reference)\b", re.IGNORECASE)
+_REFERRED = re.compile(
+    r"\b(ref|reference|referenz|referanse|referencia|эталон\w*|опорн\w*)\b|基准|参考", re.IGNORECASE
+)
+_OF_RESIDUALS = re.compile(
+    r"residu|restfehler|restabw|abweichung|(?<![^\W\d_])(err|error|fehler|feil|avvik)|остат|невяз|погрешн|残差|误差",
+    re.IGNORECASE,
+)
+"""Words of what a fit has left of a channel."""
+_OF_FIELD = re.compile(r"field|fel[dt]|campo|champ|поле|磁场|proton|overhauser", re.IGNORECASE)
 _MEASURED = re.compile(
-    r"\b(measured|meas|calc|calculated|computed|corr|corrected|gemessen|berechnet|m[åa]lt|sum|ist|mwd|survey)\b",
+    r"\b(measured|meas|calc|calculated|computed|corr|corrected|gemessen|m[åa]lt|sum|ist|mwd|survey|"
+    r"(be|er)rechnet\w*|beregnet|berekend\w*|calculad[oa]|computad[oa]|calcul[ée]e?|calcolat[oa]|расч[её]?т\w*|"
+    r"рассчит\w*|вычисл\w*)\b|计算|解算",
     re.IGNORECASE,
 )
 """Words of angles that the tool itself has measured: no references."""
 _NO_STAND = re.compile(
-    rf"{_MEASURED.pattern}|\b(err\w*|delta|diff\w*|dev\w*|res\w*|sd|std\w*|unc\w*|sigma|rate|last|previous|old|"
+    rf"({_MEASURED.pattern})|\b(err\w*|delta|diff\w*|dev\w*|res\w*|sd|std\w*|unc\w*|sigma|rate|last|previous|old|"
     r"check|fehler|abw\w*|feil|avvik|desv\w*|erro\w*|ecart|погрешн\w*|откл\w*)\b|误差|偏差",
     re.IGNORECASE,
 )
@@ -494,7 +500,7 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     if both := _two_units(name, unit):
         once = meaning(name)
         return once and once._replace(unit=both if units_of(once.column) else unit)
-    if _SCATTER.match(name):
+    if _SCATTER.match(name) or _OF_RESIDUALS.search(name):
         return None
     name = _bracketed(name)
     plain = spelled(f"{name} ({unit})" if unit else name)
@@ -780,11 +786,13 @@ def _beside_nominal(
     """
     dip, inclination = (REFERENCES[name].column for name in ("dip", "inclination"))
     nominal, shown_ones = set[str](), dict[str, dict[str, Resemblance]]()
+    stems = {shown: stem for _, shown, stem in shown_beside_set(names)}
     for name, unit in zip(names, units, strict=True):
         is_nominal = bool(_NOMINAL.search(name))
         words = _NOMINAL if is_nominal else _ACTUAL
         bare = _OF_CHANNELS.sub("", " ".join(words.sub(" ", name).split())).strip()
         bare = re.sub(r"^\([^)]*\)\s*", "", bare)
+        bare = stems.get(name, bare).strip("() ") if is_nominal or name in stems else bare
         alike = meaning(bare, unit) if bare not in ("", name) else None
         if alike and alike.column == dip:
             alike = alike._replace(column=inclination)
@@ -800,6 +808,25 @@ def _beside_nominal(
         for name, alike in each.items()
         if name not in meanings or meanings[name].column == dip
     }
+
+
+def shown_beside_set(names: Sequence[str]) -> list[tuple[str, str, str]]:
+    """Columns of what a stand was to be set to, each with that of what it shows, and the end of both names.
+
+    >>> shown_beside_set(["Set (Inc)", "Read on cradle (Inc)", "Azi"])
+    [('Set (Inc)', 'Read on cradle (Inc)', '(Inc)')]
+    """
+    stems = {n: " ".join(_NOMINAL.sub(" ", n).split()).lstrip("-_ ") for n in names}
+    return [
+        (name, other, stem)
+        for name, stem in stems.items()
+        if stem not in ("", name)
+        for other in names
+        if other != name
+        and re.search(rf"(?<!\w){re.escape(stem)}$", other)
+        and _ACTUAL.search(other)
+        and not _NOMINAL.search(other)
+    ]
 
 
 def _beside_tool(
@@ -1219,22 +1246,58 @@ def _tell_temperature(
 def _tell_references(
     meanings: dict[str, Resemblance], names: Sequence[str], units: Sequence[str], values: Values
 ) -> None:
-    """A column in whatever words that is called a reference is field or dip by its unit and its steady values."""
-    for column in (REFERENCES[name].column for name in ("field", "dip")):
+    """A column in whatever words is gravity, field or dip by its unit and its steady values.
+
+    It is called a reference, or the field; or it is of one value throughout, as nothing that a tool measures is.
+    """
+    for column in _OF_PLACE_ALONE:
         named = [
             (n, unit)
             for n, unit in zip(names, units, strict=True)
             if n not in meanings
-            and _REFERRED.search(spelled(n))
             and not is_of_tool(n)
-            and may_be(column, n, unit, values(n))
+            and not _NO_STAND.search(spelled(n))
+            and not _NOMINAL.search(n)
+            and _is_steady(column, n, unit, values(n), names, values)
         ]
-        if len(named) == 1 and all(m.column != column for m in meanings.values()):
+        called = [n for n, m in meanings.items() if m.column == column]
+        computed = all(
+            _is_total(column, values(n), meanings[n].unit, names, values) for n in called
+        )
+        if len(named) == 1 and computed:
             ((name, unit),) = named
-            bracketed = IN_BRACKETS.search(spelled(name))
-            meanings[name] = Resemblance(
-                column, unit_of(unit or (bracketed[1] if bracketed else ""))
-            )
+            meanings[name] = Resemblance(column, _unit_beside(name, unit))
+
+
+def _is_steady(
+    column: str,
+    name: str,
+    unit: str,
+    cells: Array | None,
+    names: Sequence[str],
+    values: Values,
+) -> bool:
+    """Whether a column may be what a place has, called so or of one value throughout."""
+    if cells is None or not cells.size or not np.isfinite(cells).all():
+        return False
+    if _REFERRED.search(spelled(name)) and may_be(column, name, unit, cells):
+        return True
+    ranges = {u: (low, high) for u, low, high in RANGES_BY_UNIT.get(column, ())}
+    low, high = ranges.get(_unit_beside(name, unit), (np.inf, -np.inf))
+    varies = float(np.ptp(cells))
+    called = column == REFERENCES["field"].column and _OF_FIELD.search(name)
+    steady = varies < _OF_PLACE * high if called else varies == 0
+    inside = low <= cells.min() and cells.max() <= high
+    return bool(steady and inside) and not _is_total(column, cells, "", names, values)
+
+
+def _unit_beside(name: str, unit: str) -> str:
+    """The unit that is stated beside a name or ends it, behind a blank or in brackets, or tesla within it."""
+    plain = spelled(name)
+    bracketed = IN_BRACKETS.search(plain)
+    ends = unit_of(spelled(unit)) or unit_of(bracketed[1] if bracketed else plain.split(" ")[-1])
+    within = re.search(r"(?<![^\W_])[nµu]T(?![^\W_])", plain)
+    return ends or (unit_of(within[0]) if within else "")
 
 
 def _is_total(
@@ -1309,11 +1372,14 @@ def _check_lacking(
     column: str, others: Mapping[str, str], names: Sequence[str], values: Values, source: str
 ) -> None:
     """Ask whether columns that are not understood are one that is absent, by a mistyped name or by unit and values."""
+    pairs = shown_beside_set([*others])
+    nominal, shows = {n for n, _, _ in pairs}, {n for _, n, _ in pairs}
     every = {n: cells for n in others if (cells := values(n)) is not None}
     numbers = {
         n: cells
         for n, cells in every.items()
-        if not is_of_tool(n)
+        if n not in nominal
+        and (n in shows or not is_of_tool(n))
         and _may_hold(column, cells)
         and not _is_total(column, cells, "", names, values)
     }

@@ -72,6 +72,7 @@ from mwdcal.identification.columns import (
     none_of,
     north_of,
     proposed,
+    shown_beside_set,
 )
 from mwdcal.sensor.profile import ColumnSource, Profile, TableFormat, TriadProfile
 
@@ -621,7 +622,8 @@ def _answer_by_readings(
     proposal, chosen = fits[0]
     columns = proposal.profile.columns or {}
     sensed = {each.name for column, each in columns.items() if column in RAW}
-    beside = [name for name in table.columns if name not in sensed]
+    nominal = {name for name, _, _ in shown_beside_set([*table.columns])}
+    beside = [name for name in table.columns if name not in sensed | nominal]
     if any(_has_twin(table, text, beside) for answer in chosen for _, text in answer.arguments):
         return None
     texts = [", ".join(text for _, text in answer.arguments) for answer in chosen]

@@ -121,7 +121,12 @@ def _in_columns(lines: Sequence[str], rows: Sequence[list[str]]) -> list[list[st
         return [*rows]
     named = _common([s for s in spans if len(s) == width])
     columns = columns if _overlap(named) else named
-    return [_placed(row, each, columns) for row, each in zip(rows, spans, strict=True)]
+    placed = [_placed(row, each, columns) for row, each in zip(rows, spans, strict=True)]
+    first = next(k for k, row in enumerate(rows) if _is_of_numbers(row))
+    words = " ".join(placed[first - 1]).split() if first else []
+    if len(words) == width and not any(map(figures.is_figure, words)):
+        placed[first - 1] = words  # names above the first row, not all two blanks apart
+    return placed
 
 
 def _common(rows: Sequence[Sequence[tuple[int, int]]]) -> list[tuple[int, int]]:

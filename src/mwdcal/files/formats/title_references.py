@@ -117,7 +117,7 @@ _OF_MEANS = re.compile(
 _UNSURE = re.compile(
     rf"{_ROUGH.pattern}|{_OF_MEANS.pattern}|"
     r"uncert|\bunc\b|unsicher|usikker|incert|погреш|不确定|toler|limit|grenz|range|\bspan|bereich|диапазон|范围|量程|"
-    r"\bmin\b|\bmax\b|\bstd|\bsd\b|sigma|σ|±|spec|resol|correct|korrek|offset|drift|gradient|noise|"
+    r"\bmin\b|\bmax\b|\bstd|\bsd\b|sigma|σ|±|spec|resol|correct(?!ed)|korrek|offset|drift|gradient|noise|"
     r"toolface|survey|tool face",
 )
 """Words by which a value is no reference."""
@@ -228,7 +228,7 @@ _OF_SENSITIVITY = re.compile(
 """A sensitivity or its inverse: 16384 LSB/g, 0.5 counts per nT, µT/V = 50."""
 _OF_ANOTHER = re.compile(
     rf"\s*(?:{_COUNTED}|-?bits?|[km]?hz|k?sps|ppm|%|m?a|[mkh]?pa|[kmc]?m|kg|k?ohm)(?![^\W\d_])|"
-    r"\W*(?:fs|f\.s|full[ -]?scale|span|range|s/n)(?![^\W\d_])"
+    r"\W*(?:fs|f\.s|full[ -]?scale|span|range)(?![^\W\d_])"
 )
 """Units of something else behind a number, and words of a range: 24 bit, 50 µT FS."""
 _ROUNDED = 5e-4
@@ -306,6 +306,7 @@ _INCLINED = re.compile(
     r"(?<![^\W\d_])fall(?:vinkel)?(?![^\W\d_])|hajlas\w*|lutning|kallistuma|helling|mergulho|buzamiento|echado",
 )
 """Words of an inclination, which is the field's in a line about a place."""
+_OF_TABLE = re.compile(r"\bof (the )?(table|rig|cradle|fixture|tool|hole|well)\b")
 _OF_STAND = re.compile(
     r"cradle|stand|rig|table|tool|bench|fixture|setting|setup|hole|well|plat|banco|banc\b|mesa|cuna|stativ|sonde|probe|"
     r"стенд|стол|скваж|зенит|转台|台|井|(?<![^\W\d_])azi\w*|decl\w*|error|acc?uracy|genau\w*|resid\w*",
@@ -339,11 +340,12 @@ _SPELT = {
 
 _NO_LONGER = re.compile(
     r"(?<![^\W\d_])(prev(ious)?|former(ly)?|old|obsolete|superseded|no longer|last (cal\w*|site|year)|factory|fabrica|"
-    r"usine|завод\w*|gammel\w*|gamle|"
+    r"usine|завод\w*|hos kunde\w*|(at|of) (the )?(customer|client|well ?site|rig ?site)|customer('s)? (site|place)|"
+    r"(beim|des) kunden|kundenort|(del?|no|do|en el|chez le|du) client[e]?|заказчик\w*|gammel\w*|gamle|"
     r"utgatt|tidligere|forrige|alte[rsn]?|ehemalig\w*|vorherig\w*|fruher\w*|antigu[oa]|antig[oa]|anterior|ancien\w*|"
     r"precedent\w*|vecchi[oa]|precedente|dawn\w*|poprzedni\w*|stary|stara|стар\w*|прежн\w*|прошл\w*|"
     r"предыдущ\w*)(?![^\W\d_])|"
-    r"旧|以前|上次|出厂",
+    r"旧|以前|上次|出厂|客户",
 )
 """Words of a place or a calibration whose references no longer hold."""
 _OF_LIMITS = re.compile(
@@ -827,7 +829,7 @@ def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
         rough
         or counted
         or _OF_COMPONENT.search(between)
-        or (quantity.low < 0 and _OF_STAND.search(between))
+        or _OF_TABLE.search(between)
         or _UNSURE.search(between if letter else f"{match['word']} {between}")
     ):
         return
