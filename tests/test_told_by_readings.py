@@ -468,8 +468,11 @@ def test_components_ranges_and_corrections_are_no_references(line):
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("Type", ("CAL", "VER")), ("Status", ("OK", "CHECK")), ("Art", ("", "Prüfung"))],
-)
+    [
+        ("Type", ("CAL", "VER")), ("Status", ("OK", "CHECK")), ("Art", ("", "Prüfung")),
+        ("Mode", ("CAL", "ROLLTEST")), ("用途", ("标定", "滚转检验")), ("Formål", ("kal", "rulletest")),
+    ],
+)  # fmt: skip
 def test_rows_that_check_a_calibration_are_no_part_of_it_and_are_named(tmp_path, name, words):
     columns = {name: [words[k >= 42] for k in range(48)], **table()}
     path = written(tmp_path / "a.csv", columns)
@@ -540,3 +543,64 @@ def test_an_angle_that_was_set_beside_one_that_was_measured_is_asked_about(tmp_p
     assert "Measured Inc (deg)" in stated
     answer = ("--column", "ref_inclination_deg=Measured Inc (deg)")
     assert mwdcal("profile", path, "-o", tmp_path / "t.toml", *answer).code == 0
+
+
+def test_angles_that_the_stand_shows_count_beside_those_it_was_set_to(tmp_path):
+    """In whatever words: the ends of their names are alike."""
+    shown = {"Inc (deg)": "Avlest på bukk (Ink)", "Azi (deg)": "Ist-Asi", "TF (deg)": "Ist Rull"}
+    asked = ("Innstilt (Ink)", "Soll-Asi", "Soll Rull")
+    run = table()
+    columns = {n: np.round(run[o], -1) for n, o in zip(asked, shown, strict=True)}
+    columns |= {shown.get(n, n): v for n, v in run.items()}
+    used = library.propose_profile(written(tmp_path / "a.csv", columns)).profile.columns
+    assert [used[f"ref_{n}_deg"].name for n in ("inclination", "azimuth", "toolface")] == [
+        *shown.values()
+    ]
+
+
+def test_strengths_of_the_place_in_columns_of_other_names(tmp_path):
+    """One value throughout, in a unit of gravity; and the field beside the totals that a program computed."""
+    run = table()
+    raw = [np.asarray(run[f"H{n} (V)"]) for n in "xyz"]
+    proton = np.asarray(run["Btotal (nT)"]) / 1000 + 0.001 * np.arange(48)
+    columns = {n: v for n, v in run.items() if n not in ("Local G (g)", "Btotal (nT)")}
+    columns |= {"g, м/с²": [9.8054] * 48, "Proton total field (µT)": proton}
+    columns |= {"B total (nT)": 5e4 * np.linalg.norm(raw, axis=0)}
+    proposal = library.propose_profile(written(tmp_path / "a.csv", columns))
+    used = proposal.profile.columns
+    assert used["ref_gravity_g"].name == "g, м/с²"
+    assert used["ref_field_nt"].name == "Proton total field (µT)"
+    gravity = library.read_run(tmp_path / "a.csv", proposal.profile).reference("gravity")
+    assert gravity == pytest.approx(9.8054 / 9.80665, rel=1e-12)
+
+
+def test_residuals_of_an_older_calibration_are_no_channels(tmp_path):
+    run = table()
+    noise = np.random.default_rng(1).normal(size=(6, 48))
+    old = [f"Restfehler alte Kal., {t} {n}" for t in ("Beschl.", "Magn.") for n in "XYZ"]
+    units = dict.fromkeys(old[:3], " (mg)") | dict.fromkeys(old[3:], " (nT)")
+    names = {"G": "Rohwerte Beschleunigungsmesser", "H": "Rohwerte Magnetometer"}
+    raw = {n: f"{names[n[0]]} {n[1].upper()} (V)" for n in run if n[0] in names}
+    columns = {n + units[n]: v for n, v in zip(old, noise, strict=True)}
+    columns |= {raw.get(n, n): v for n, v in run.items()}
+    used = library.propose_profile(written(tmp_path / "a.csv", columns)).profile.columns
+    assert [used[c].name for c in ("ax", "mz")] == [raw["Gx (V)"], raw["Hz (V)"]]
+
+
+def test_names_one_blank_apart_above_columns_more_blanks_apart(tmp_path):
+    run = {n: v for n, v in servo_run().items() if n not in ("station", "group")}
+    rows = [[f"  {v:14.6f}" for v in row] for row in zip(*run.values(), strict=True)]
+    names = [n.replace("ref_", "") for n in run]
+    head = f"{' '.join(names[:4])}  {' '.join(names[4:])}"
+    path = tmp_path / "a.txt"
+    path.write_text("\n".join(["Laboratory of the university", "", head, *map("".join, rows)]))
+    plain = read(written(tmp_path / "b.csv", dict(zip(names, np.transpose(rows), strict=True))))
+    np.testing.assert_array_equal(read(path).accelerometer, plain.accelerometer)
+
+
+@pytest.mark.parametrize(
+    "line", ["Felt hos kunde, Hammerfest: 53800 nT", "Field at customer 53800 nT", "Campo do cliente 53800 nT"]
+)  # fmt: skip
+def test_references_of_another_place_do_not_count(line):
+    field = stated_above([[line], ["Field here in the lab 50550 nT"]]).metadata
+    assert field == {"ref_field_nt": 50_550.0}
