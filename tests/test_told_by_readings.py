@@ -604,3 +604,32 @@ def test_names_one_blank_apart_above_columns_more_blanks_apart(tmp_path):
 def test_references_of_another_place_do_not_count(line):
     field = stated_above([[line], ["Field here in the lab 50550 nT"]]).metadata
     assert field == {"ref_field_nt": 50_550.0}
+
+
+def test_angles_called_a_survey_are_the_stands_where_they_are_whole_and_asked_about_else(tmp_path):
+    """A tool measures no whole degrees at all stations; what it measures fits its readings whatever the stand shows."""
+    names = {"Inc (deg)": "Survey Inc", "Azi (deg)": "Survey Azi", "TF (deg)": "Survey TF"}
+    columns = {names.get(n, n): np.round(v) if n in names else v for n, v in table().items()}
+    path = written(tmp_path / "a.csv", columns)
+    assert library.propose_profile(path).profile.columns["ref_azimuth_deg"].name == "Survey Azi"
+    measured = {n: v + 0.013 * np.arange(48) * (n in names.values()) for n, v in columns.items()}
+    with pytest.raises(
+        FitError, match=r"the tool has measured 'Survey Inc'.*ref_inclination_deg=' or"
+    ):
+        library.propose_profile(written(tmp_path / "b.csv", measured))
+
+
+def test_channels_named_by_axis_and_triad_in_two_blocks_of_the_same_stations(tmp_path):
+    run = table()
+    names = {
+        f"{t}{n} (V)": f"{n.upper()}{m} (V)" for t, m in (("G", "A"), ("H", "M")) for n in "xyz"
+    }
+    angles = {n: v for n, v in run.items() if n in ("Pos", "Inc (deg)", "Azi (deg)", "TF (deg)")}
+    blocks = [
+        written(tmp_path / f"{t}.csv", angles | {names[n]: run[n] for n in names if n[0] == t})
+        for t in "GH"
+    ]
+    path = tmp_path / "a.csv"
+    path.write_text("\n\n".join(f"{p.stem} sensors\n{p.read_text()}" for p in blocks))
+    used = library.propose_profile(path).profile.columns
+    assert [used[c].name for c in ("ax", "mz")] == ["XA (V)", "ZM (V)"]

@@ -38,6 +38,9 @@ TRANSLATIONS = (
     (r"\|\s*b\s*\|", "Btotal"),
     (r"\|\s*g\s*\|", "Gtotal"),
     (r"pruf(?=stand)|mess(?=stand)", ""),
+    (r"\binc['’]n\b", "inclination "),
+    (r"\baz['’](th|m)\b", "azimuth "),
+    (r"\brot['’]n\b", "toolface "),
     (
         r"\b(raw( values?| data| readings?)?|rohwerte?|rohdaten|rohsignale?|(ra)verdi(er)?|radata|"
         r"valor(es)? (bruto|crudo)s?|сыр\w*|исходн\w*)\b[\W_]*(?=[^\W\d_]{3})|原始(数据|值)?(?=.)",

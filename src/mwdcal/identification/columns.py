@@ -478,7 +478,7 @@ _SPOKEN_WARMTH = {
 }
 """Units of temperatures in a line above a table, not those of a number."""
 _SURROUNDINGS = re.compile(
-    r"oven|chamber|ambient|panel|logger|(?<![a-z])p_?temp(?![a-z])|kamer\b|(?<![a-z])(air|room|bath|lab)(?![a-z])|ofen|kammer|umgebung|raum|ovn|rom|horno|ambiente|"
+    r"oven|chamber|ambient|panel|logger|(?<![a-z])p_?temp(?![a-z])|kamer\b|(?<![a-z])(air|room|bath|lab)(?![a-z])|ofen|kammer|sala|habitaci|oficina|umgebung|raum|ovn|rom|horno|ambiente|"
     r"камер|печ|термостат|环境|烘箱|室温",
     re.IGNORECASE,
 )
@@ -736,7 +736,7 @@ _TOOL_AXIS = re.compile(
 """Words of the axis of the tool."""
 _OF_VERTICAL = re.compile(r"vert[iy][kc]al|lot\b|lodd|вертикал|铅垂|垂直", re.IGNORECASE)
 _LONE_ANGLES = {
-    "inclination": re.compile(r"(ref )?(desvio|desv\.?|drift)(,? deg)?", re.IGNORECASE),
+    "inclination": re.compile(r"(ref )?(desvio|desv\.?|dev\.?|drift)(,? deg)?", re.IGNORECASE),
     "azimuth": re.compile(
         r"(ref )?(kompass|brujula|bussola|boussole|компас|phi m(ag)?)(,? deg)?", re.IGNORECASE
     ),
@@ -1280,8 +1280,8 @@ def _is_steady(
     """Whether a column may be what a place has, called so or of one value throughout."""
     if cells is None or not cells.size or not np.isfinite(cells).all():
         return False
-    if _REFERRED.search(spelled(name)) and may_be(column, name, unit, cells):
-        return True
+    if column != REFERENCES["gravity"].column and _REFERRED.search(spelled(name)):
+        return may_be(column, name, unit, cells)
     ranges = {u: (low, high) for u, low, high in RANGES_BY_UNIT.get(column, ())}
     low, high = ranges.get(_unit_beside(name, unit), (np.inf, -np.inf))
     varies = float(np.ptp(cells))
@@ -1379,7 +1379,7 @@ def _check_lacking(
         n: cells
         for n, cells in every.items()
         if n not in nominal
-        and (n in shows or not is_of_tool(n))
+        and (n in shows or not is_of_tool(n) or _is_whole(cells))
         and _may_hold(column, cells)
         and not _is_total(column, cells, "", names, values)
     }
@@ -1401,6 +1401,14 @@ def _check_lacking(
         raise QuestionError(
             f"{source}: no column is '{column}' by its name. Is it one of these?",
             candidates_for(column, fits, values),
+        )
+    of_tool = [n for n in every if n not in numbers and _is_but(_MEASURED, n, column)]
+    if of_tool and column in _ANGLES_AND_WARMTH[:3]:
+        *taken, none = candidates_for(column, of_tool, values)
+        raise QuestionError(
+            f"{source}: by its name the tool has measured {' and '.join(map(shown, of_tool))}, and no column states "
+            f"'{column}'. Does the stand show it after all?",
+            [none, *taken],
         )
 
 

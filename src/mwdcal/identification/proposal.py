@@ -607,7 +607,9 @@ def _answer_by_readings(
     the stand, and the one that fits that of the tool.
     """
     questions = error.questions if isinstance(error, QuestionsError) else (error,)
-    choices = [[answer for answer in each.answers if _is_of_readings(answer)] for each in questions]
+    choices = [
+        [answer for answer in each.answers if _is_of_readings(answer, each)] for each in questions
+    ]
     if not all(choices) or prod(map(len, choices)) > _MOST_COMBINED:
         return None
     fits, tries = [], [*filter(_is_of_different_columns, product(*choices))]
@@ -715,8 +717,13 @@ def _alike(angles: Array) -> float:
     return float(abs(np.nanmean(np.exp(1j * np.radians(angles)))))
 
 
-def _is_of_readings(answer: Answer) -> bool:
-    """Whether an answer names columns that the readings tell; of azimuths they tell the north as well."""
+def _is_of_readings(answer: Answer, question: QuestionError) -> bool:
+    """Whether an answer names columns that the readings tell; of azimuths they tell the north as well.
+
+    Angles that the tool itself may have measured fit its readings whatever the stand shows.
+    """
+    if "the tool has measured" in question.text:
+        return False
     pairs = [text.partition("=") for argument, text in answer.arguments if argument == "column"]
     return len(pairs) == len(answer.arguments) and all(
         name and column in _OF_READINGS for column, _, name in pairs

@@ -86,6 +86,8 @@ _OF_AXIS = re.compile(
     re.IGNORECASE,
 )
 """A name that ends in an axis, but for its unit."""
+_AXIS_FIRST = re.compile(r"(?P<axis>[xyz])[abghm]", re.IGNORECASE)
+"""A name whose axis stands before the letter of its triad."""
 _WORD_AXIS = re.compile("轴$")
 """The word for an axis behind its letter."""
 _SYMBOL = re.compile(r"[^\W\d_]")
@@ -817,7 +819,11 @@ def _axis(name: object) -> str:
     """
     words = as_text(name).rsplit(maxsplit=1)
     bare = words[0] if len(words) > 1 and unit_of(words[1]) else " ".join(words)
-    match = _OF_AXIS.fullmatch(as_text(name)) or _OF_AXIS.fullmatch(_WORD_AXIS.sub("", bare))
+    match = (
+        _OF_AXIS.fullmatch(as_text(name))
+        or _OF_AXIS.fullmatch(_WORD_AXIS.sub("", bare))
+        or _AXIS_FIRST.fullmatch(bare)
+    )
     return match["axis"].lower().translate(LATIN_AXES) if match else ""
 
 
