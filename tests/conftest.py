@@ -93,12 +93,12 @@ def remembered(function, results):
         key = function.__qualname__, pickle.dumps((given, named))
         if key not in results:
             said = []
-            listeners = dict.fromkeys(speakers, said.append)
+            listeners = dict.fromkeys(speakers, lambda *each: said.append(each))
             results[key] = function(*given, **named, **listeners), said
         result, said = results[key]
         for speaker in speakers.values():
             for each in said:
-                speaker(each)
+                speaker(*each)
         return result
 
     return once

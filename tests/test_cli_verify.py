@@ -52,6 +52,15 @@ def roll(folder, *metadata, name="roll.csv", **changes):
     return write_csv(folder / name, {**run, **changed}, *metadata)
 
 
+def test_rows_fit_a_page_where_no_terminal_folds_them(fitted, tmp_path):
+    """Notes go on below; nothing is cut."""
+    (calibration, _), few = fitted, {k: v[:4] for k, v in simulated(ROLL, 2).items()}
+    shown = mwdcal("verify", calibration, write_csv(tmp_path / "few.csv", few)).out
+    assert max(map(len, shown.splitlines())) <= 120
+    assert "…" not in shown
+    assert shown.split().count("toolfaces") >= 5
+
+
 def judged(calibration, run, *options):
     ran = mwdcal("verify", calibration, run, "--json", *options)
     assert ran.code in (0, 1), ran
@@ -218,7 +227,7 @@ def test_the_text_holds_the_numbers_of_the_json(tmp_path, fitted):
     said = mwdcal("verify", fitted[0], run)
     assert said.code == 1
     assert said.out.startswith("FAIL   roll.csv   12 stations")
-    lines = [" ".join(line.split()) for line in said.out.splitlines()]
+    shown = " ".join(said.out.split())  # notes go on below
     for name, row in judged(fitted[0], run).items():
         gap = "" if row["unit"] == "°" else " "
         numbers = [f"{row[k]:.3g}{gap}{row['unit']}" for k in NUMBERS]
@@ -227,7 +236,7 @@ def test_the_text_holds_the_numbers_of_the_json(tmp_path, fitted):
             numbers[where] = f"{row[key]:.{places}f}{gap}{row['unit']}"
         numbers.insert(3, "∞")  # degrees of freedom of a declared noise
         word = "pass" if row["passed"] else "FAIL"
-        assert f"{name} {' '.join(numbers)} {word} {row['note']}" in lines
+        assert f"{name} {' '.join(numbers)} {word} {row['note']}" in shown
 
 
 @pytest.mark.parametrize("toolfaces", [[40] * 12, [0, 5, 10]], ids=["one", "three close ones"])
@@ -247,9 +256,10 @@ def test_a_knocked_tool_that_was_not_rolled_never_exits_with_0(
     ran = mwdcal("verify", fitted[0], write_csv(tmp_path / "still.csv", run))
     assert ran.code == 1
     assert ran.out.startswith("FAIL   still.csv")
-    assert ran.out.count("cannot be passed") == (5 if references else 3)
-    assert "Add toolfaces there" in ran.out
-    assert "nan" not in ran.out
+    shown = " ".join(ran.out.split())
+    assert shown.count("cannot be passed") == (5 if references else 3)
+    assert "Add toolfaces there" in shown
+    assert "nan" not in shown
 
 
 COPIES = {
@@ -365,7 +375,8 @@ def test_a_calibration_without_reference_inclinations_leaves_rotations_open(tmp_
     assert said.out.startswith(
         "FAIL: nothing wrong was found; the calibration leaves rotation about x and y open"
     )
-    assert "cannot be passed: the calibration does not determine rotation about x and y" in said.out
+    shown = " ".join(said.out.split())
+    assert "cannot be passed: the calibration does not determine rotation about x and y" in shown
     assert "not determined: rotation about x and y. Give reference inclinations in the" in said.out
     knocked = {**roll, "ax": roll["ax"] + 30e-3 * SCALE[0]}
     said = mwdcal("verify", calibration, write_csv(tmp_path / "k.csv", knocked))

@@ -37,7 +37,8 @@ def straight(folder):
 def at_end(well, cause, propagation):
     """1σ of one cause at the last station by column, radians and metres."""
     columns = well.contributions
-    rows = (columns["cause"] == cause) & (columns["propagation"] == propagation)
+    rows = columns["cause"] == cause
+    assert {*columns["propagation"][rows]} == {propagation}
     return {
         name: np.radians(values[rows][-1]) if name.endswith("_deg") else values[rows][-1]
         for name, values in columns.items()
@@ -72,7 +73,7 @@ def test_causes_in_a_straight_hole_are_their_formulas_times_its_length(tool, tmp
         np.radians(well.columns[f"{name}_deg"][-1]) for name in ("inclination", "azimuth_magnetic")
     )
     sine, cosine, across = np.sin(inclination), np.cos(inclination), 48_000 * np.cos(np.radians(63))
-    sag = at_end(well, "sag", "systematic")
+    sag = at_end(well, "sag, whole run", "systematic")
     upward = np.radians(0.2) * sine**0.25
     assert sag["sd_inclination_deg"] == pytest.approx(upward)
     assert sag["sd_highside_m"] == pytest.approx(length * upward)
@@ -82,14 +83,14 @@ def test_causes_in_a_straight_hole_are_their_formulas_times_its_length(tool, tmp
     turn = 220 * sine * np.sin(azimuth) / across
     assert axial["sd_azimuth_deg"] == pytest.approx(turn, rel=2e-3)  # field and dip as measured
     assert axial["sd_lateral_m"] == pytest.approx(length * sine * turn, rel=2e-3)
-    depth = at_end(well, "measured depth", "systematic")
+    depth = at_end(well, "measured depth, whole run", "systematic")
     assert depth["sd_along_hole_m"] == pytest.approx(0.00056 * length)
-    declination = at_end(well, "declination", "well")
+    declination = at_end(well, "declination, whole well", "well")
     assert declination["sd_lateral_m"] == pytest.approx(
         length * sine * declination["sd_azimuth_deg"]
     )
     # errors new at every station: half a course at both ends, a whole one between
-    random = at_end(well, "misalignment in the hole", "random")
+    random = at_end(well, "misalignment in the hole, each station", "random")
     courses = STEP * np.sqrt(STEPS - 1 + 2 * 0.25)
     assert random["sd_highside_m"] == pytest.approx(courses * np.radians(0.3) * cosine)
     assert random["sd_lateral_m"] == pytest.approx(courses * np.radians(0.3) * cosine)
@@ -101,7 +102,8 @@ def test_table_screen_and_json_of_the_command(tool, tmp_path):
     document = cli(*typed, "--json").json["contributions"]
     columns = read_csv(table)
     causes = [(each["cause"], each["propagation"]) for each in document["causes"]]
-    assert ("declination", "well") in causes
+    assert ("declination, whole well", "well") in causes
+    assert len({name for name, _ in causes}) == len(causes)
     assert list(zip(columns["cause"], columns["propagation"], strict=True)) == causes * (STEPS + 1)
     assert columns["station"][:: len(causes)] == document["station"]
     last = [float(cell) for cell in columns["sd_highside_m"][-len(causes) :]]
@@ -122,7 +124,7 @@ def test_without_depths_there_are_contributions_to_angles_alone(tool, tmp_path):
     source = write_csv(tmp_path / "o.csv", {k: v for k, v in given.items() if k != "md_m"})
     columns = mwdcal.survey(tool, source).contributions
     assert np.isnan(columns["sd_north_m"]).all()
-    assert (columns["sd_inclination_deg"][columns["cause"] == "sag"] > 0.1).all()
+    assert (columns["sd_inclination_deg"][columns["cause"] == "sag, whole run"] > 0.1).all()
 
 
 def test_stretches_reach_half_a_course_beyond_their_stations():

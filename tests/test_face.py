@@ -83,6 +83,23 @@ def test_a_verdict_has_the_corrected_roll_test_as_columns(calibrated):
         _ = msgspec.structs.replace(verdict).columns
 
 
+def test_a_verdict_has_its_limits_as_a_table(calibrated):
+    pytest.importorskip("pandas")
+    made, *_ = calibrated
+    verdict = mwdcal.verify(made, EXAMPLE / "rolltest.csv")
+    table = msgspec.structs.replace(verdict).to_pandas("limits")  # of one read from a file too
+    assert table.columns.tolist() == ["name", "value", "U", "limit", "unit", "verdict"]
+    for row, shown in zip(verdict.rows, table.itertuples(), strict=True):
+        assert shown[1:3] + shown[4:] == (row.name, row.value, row.limit, row.unit, "pass")
+        assert pytest.approx(2 * row.uncertainty) == shown.U  # the noise is declared
+    part = mwdcal.read_run(EXAMPLE / "rolltest.csv", made.profile).select(np.arange(12) < 4)
+    open_ones = mwdcal.verify(made, part).to_pandas("limits")
+    assert open_ones["U"].isna().all()
+    assert (open_ones["verdict"] == "FAIL").all()
+    with pytest.raises(mwdcal.InputError, match="`rows` must be stations or limits; got 'limit'"):
+        verdict.to_pandas("limit")
+
+
 @pytest.mark.usefixtures("without_pictures")
 def test_pages_of_a_verdict_and_a_diagnosis_are_those_of_the_commands(calibrated, tmp_path):
     _, path, _ = calibrated

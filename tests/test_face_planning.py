@@ -223,6 +223,17 @@ def test_a_procedure_is_that_of_the_command(tmp_path, monkeypatch):
     np.testing.assert_array_equal(many.columns["passed"], backwards.columns["passed"])
 
 
+@pytest.mark.parametrize(
+    "wanted", [{"accuracy_deg": {"azimuth": 0.1}}, {"stations": 8}, {"plan": "six-state"}]
+)
+def test_a_plan_tells_the_share_that_is_done(wanted):
+    steps = []
+    mwdcal.plan("servo", **wanted, progress=lambda *each: steps.append(each))
+    assert steps == sorted(steps)
+    assert all(0 <= done <= total for done, total in steps)
+    assert "plan" in wanted or len({done for done, _ in steps}) > 1
+
+
 def test_a_procedure_takes_options_of_the_fit_and_says_no_more_than_it_wrote(tmp_path):
     line = ("simulate", "--plan", "moosavi-12", "--repeat", 3, "--method", "least-squares")
     ran = command(*line, "--limits", "moradi", "-o", tmp_path / "tools.csv")

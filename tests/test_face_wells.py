@@ -132,6 +132,11 @@ def test_a_bad_reference_is_refused(changed, message):
     assert message in str(refusal.value)
 
 
+def test_a_reference_needs_an_altitude_as_the_command_does():
+    with pytest.raises(TypeError, match="altitude_m"):
+        mc.reference(**{name: value for name, value in PLACE.items() if name != "altitude_m"})
+
+
 def test_a_reference_is_json(here, tmp_path):
     with pytest.raises(mc.InputError, match=r"ends in \.json"):
         mc.save(here, tmp_path / "here.csv")

@@ -131,13 +131,13 @@ def test_terms_last_over_a_run_or_the_well_as_the_model_says(tools, tmp_path):
     _, one, two = parts(tmp_path, straight(10), 5)
     columns, document = surveyed(tmp_path, tool, one, "--run", tool, two)
     inclination = np.radians(float(columns["inclination_deg"][-1]))
-    causes = {(c["cause"], c["propagation"]): c for c in document["contributions"]["causes"]}
+    causes = {c["cause"]: c for c in document["contributions"]["causes"]}
     upward = np.radians(0.2) * np.sin(inclination) ** 0.25
     sag = upward * STEP * np.hypot(5 - 0.5, 6 - 0.5)
-    assert causes["sag", "systematic"]["sd_highside_m"][-1] == pytest.approx(sag, rel=1e-5)
+    assert causes["sag, whole run"]["sd_highside_m"][-1] == pytest.approx(sag, rel=1e-5)
     turned = 10 * STEP * np.sin(inclination) * np.radians(0.3)
-    assert causes["declination", "well"]["sd_lateral_m"][-1] == pytest.approx(turned, rel=1e-5)
-    depth = causes["measured depth", "systematic"]["sd_along_hole_m"][-1]
+    assert causes["declination, whole well"]["sd_lateral_m"][-1] == pytest.approx(turned, rel=1e-5)
+    depth = causes["measured depth, whole run"]["sd_along_hole_m"][-1]
     # in proportion to the depth: where the path starts by the first run's, where it ends by the second's
     assert depth == pytest.approx(0.00056 * np.hypot(1000, 1300), rel=1e-5)
     for k, name in enumerate(("north", "east", "tvd")):

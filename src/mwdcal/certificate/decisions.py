@@ -57,6 +57,14 @@ def coverage_of(freedom: float | None) -> float:
     return COVERAGE if freedom is None else max(COVERAGE, float(student_factor(freedom)))
 
 
+def expanded_of(row: VerdictRow) -> float | None:
+    """U of a limit that was tested; None of a raw figure beyond it, whose scatter is not noise."""
+    beyond = row.judged_raw and row.value is not None and row.value > row.limit
+    if row.uncertainty is None or beyond:
+        return None
+    return coverage_of(row.freedom) * row.uncertainty
+
+
 @dataclass(frozen=True)
 class Rule:
     """A rule of decision: a guard band of some expanded uncertainties, none for simple acceptance.

@@ -181,15 +181,14 @@ def plan(
         tables = [at_place_of(each, tool) for each in tables]
     candidates = tables[0] if tables else None
     if accuracy_deg:
-        result = [
-            planned.smallest_plan(candidates, accuracy_deg, profile, chosen, stand, done, stations)
-        ]
+        wanted = accuracy_deg, profile, chosen, stand, done, stations
+        result = [planned.smallest_plan(candidates, *wanted, progress=progress)]
     elif stations or done:
         search = profile, chosen, criterion, stand, done
-        result = [planned.best_plan(candidates, stations or 1, *search)]
+        result = [planned.best_plan(candidates, stations or 1, *search, progress=progress)]
     else:
-        result = []
-        for each in tables or [plan_table("twenty-four-state")]:
+        result, tables = [], tables or [plan_table("twenty-four-state")]
+        for each in tables:
             result.append(planned.judged(each, profile, chosen, stand))
             progress(len(result), len(tables))
     digests = {"profile": digest, "measured": done.digest if done else ""}

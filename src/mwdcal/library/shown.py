@@ -9,7 +9,7 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from html import escape
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -217,9 +217,27 @@ def _to_pandas(readings: Readings) -> Any:
     return frame(readings.columns, readings.metadata)
 
 
-def _verdict_to_pandas(verdict: Verdict) -> Any:
-    """The columns as a table of pandas, which must be installed."""
-    return frame(verdict.columns)
+def _limit_columns(verdict: Verdict) -> dict[str, AnyArray]:
+    """A row for each limit: the value judged with its U (95 %; NaN: not stated), limit, unit and verdict."""
+    from mwdcal.certificate.decisions import expanded_of
+
+    rows = verdict.rows
+    return {
+        "name": np.array([row.name for row in rows]),
+        "value": np.array([row.value for row in rows], float),
+        "U": np.array([expanded_of(row) for row in rows], float),
+        "limit": np.array([row.limit for row in rows]),
+        "unit": np.array([row.unit for row in rows]),
+        "verdict": np.array(["pass" if row.passed else "FAIL" for row in rows]),
+    }
+
+
+def _verdict_to_pandas(verdict: Verdict, rows: Literal["stations", "limits"] = "stations") -> Any:
+    """The corrected stations, or a row for each limit, as a table of pandas, which must be installed."""
+    tables = {"stations": _verdict_columns, "limits": _limit_columns}
+    if rows not in tables:
+        raise InputError(f"`rows` must be {' or '.join(tables)}; got {rows!r}. Correct it.")
+    return frame(tables[rows](verdict))
 
 
 @dataclass(frozen=True)

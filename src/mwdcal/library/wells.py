@@ -392,7 +392,7 @@ def reference(
     *,
     latitude: float,
     longitude: float,
-    altitude_m: float = 0.0,
+    altitude_m: float,
     date: str | datetime.date,
     model: Literal["wmm2025", "igrf14"] = "wmm2025",
     crs: str | None = None,
@@ -430,7 +430,7 @@ def reference(
         InputError: a value that no place on Earth has, a date that cannot be read, an unknown model or grid.
 
     Example:
-        `mwdcal.reference(latitude=60.4, longitude=5.3, date="2026-11-23").declination_deg`
+        `mwdcal.reference(latitude=60.4, longitude=5.3, altitude_m=40, date="2026-11-23").declination_deg`
     """
     from mwdcal.survey.references import MEASURABLE, reference_at
 
@@ -515,7 +515,7 @@ def survey(
         FitError: a column leaves a question open; with `msa`, the surveys do not separate interference from azimuth.
 
     Example:
-        `here = mwdcal.reference(latitude=60.4, longitude=5.3, date="2026-11-23")`, then
+        `here = mwdcal.reference(latitude=60.4, longitude=5.3, altitude_m=40, date="2026-11-23")`, then
         `well = mwdcal.survey(cal, "well.csv", reference=here, msa=True)`, then
         `well.columns["azimuth_true_deg"]` and `well.interference.axial_nt`.
     """

@@ -21,6 +21,7 @@ Reference: V. V. Fedorov, Theory of Optimal Experiments (1972), sections 2.9 and
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -301,14 +302,16 @@ def variances(information: Information, members: Bools, wanted: Array) -> Array:
 
 
 def least_worst(
-    information: Information, count: int, wanted: Array, kept: Bools
-) -> tuple[Bools, float]:
+    information: Information, count: int, wanted: Array, kept: Bools,
+    tell: Callable[[int], None] = lambda done: None,
+) -> tuple[Bools, float]:  # fmt: skip
     """Such `count` candidates (n,), `kept` ones among them, that the largest variance is small, and that variance.
 
-    A mean is weighed anew only while it is above 1.
+    A mean is weighed anew only while it is above 1. `tell` is called with the number of weighings done.
     """
     weight, chosen, least = np.full(len(wanted), 1 / len(wanted)), kept, np.inf
-    for _ in range(WEIGHINGS):
+    for done in range(WEIGHINGS):
+        tell(done)
         mean = np.einsum("c,cij->ij", weight, wanted)
         members = best(information, count, mean, kept).members
         each = variances(information, members, wanted)

@@ -32,6 +32,7 @@ from mwdcal.files.formats.table import Table, labels
 from mwdcal.geometry.vectors import Array, Bools, Ints
 from mwdcal.planning.expected import carried_out, expected, left_undetermined, planned_fit
 from mwdcal.planning.optimal import (
+    WEIGHINGS,
     Design,
     Information,
     best,
@@ -179,7 +180,7 @@ def _serpentine(keys: Array, soak: Ints) -> Ints:
 
 
 WORKING_INCLINATIONS = np.radians([5.0, 30.0, 60.0, 90.0, 120.0])
-"""Inclinations over which an I-optimal plan makes the angles accurate."""
+"""Inclinations over which an I-optimal plan makes the angles accurate; at 0° azimuth and toolface are undefined."""
 WORKING_TEMPERATURES = 7
 """Temperatures, evenly from the coldest to the hottest soak, at which a wanted accuracy holds."""
 ACCURACY_MARGIN = 1e-6
@@ -194,6 +195,8 @@ OUT_NAMED = 5
 """Stations out of reach that are named."""
 CRITERIA = ("D", "A", "I")
 """Aim of a best plan: all parameters together, each of them, the angles."""
+SEARCH_STEPS = WEIGHINGS + 2 * len(CRITERIA)
+"""Steps in which a number of stations is tried: weighings, then exchanges by each criterion, then plans of these."""
 
 
 @dataclass(frozen=True)
@@ -330,6 +333,7 @@ def best_plan(
     criterion: str = "D",
     stand: Stand = USUAL_STAND,
     measured: Table | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Planned:
     """The best stations out of candidates that the stand reaches, `count` of them beside those already `measured`.
 
@@ -337,7 +341,10 @@ def best_plan(
     moves. Raises as `judged`.
     """
     search = Search.of(candidates, profile, options, criterion, stand, measured)
-    return search.planned(search.best(count))
+    progress(1, 3)
+    design = search.best(count)
+    progress(2, 3)
+    return search.planned(design)
 
 
 def smallest_plan(
@@ -348,6 +355,7 @@ def smallest_plan(
     stand: Stand = USUAL_STAND,
     measured: Table | None = None,
     count: int | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Planned:
     """The plan of the fewest stations that gives wanted accuracies, 1σ in degrees by angle, and is redundant.
 
@@ -359,27 +367,34 @@ def smallest_plan(
     _check_determined(search.calibration, accuracy_deg)
     wanted = search.variances(accuracy_deg)
     if count:
-        return search.least_worst(count, wanted)
+        return search.least_worst(count, wanted, partial(_tell, progress, 0))
     if not _reaches(search.calibration, accuracy_deg):
         raise InputError(
             f"all {search.most} candidates together do not give the wanted accuracy. Add candidates, "
             "average longer at each, or use a more exact stand."
         )
     bound = least_count(search.information, wanted, search.kept, search.plan.count) - search.before
-    result, enough = _grown(search, max(bound, search.fewest(0)), wanted, accuracy_deg)
+    least = max(bound, search.fewest(0))
+    result, enough = _grown(search, least, wanted, accuracy_deg, progress)
     bound = max(bound, search.fewest(FEW_FREEDOM))
     return replace(result, bound=bound, search=_of_search(bound, enough, result.plan.count))
 
 
+def _tell(progress: Callable[[int, int], None], tried: int, done: int) -> None:
+    """Tell how much of a search is done after a number of counts `tried`, and of how much known so far."""
+    progress(SEARCH_STEPS * tried + done, SEARCH_STEPS * (tried + 1))
+
+
 def _grown(
-    search: Search, count: int, wanted: Array, accuracy_deg: Mapping[str, float]
-) -> tuple[Planned, int]:
+    search: Search, count: int, wanted: Array, accuracy_deg: Mapping[str, float],
+    progress: Callable[[int, int], None],
+) -> tuple[Planned, int]:  # fmt: skip
     """The first plan from a `count` of stations on that is accurate and redundant, and how many are accurate."""
-    enough = 0
+    enough = tried = 0
     while True:
         count = min(count, search.most)
         try:
-            result = search.least_worst(count, wanted)
+            result = search.least_worst(count, wanted, partial(_tell, progress, tried))
         except FitError:  # too few for a calibration
             if count == search.most:
                 raise
@@ -390,6 +405,7 @@ def _grown(
                 return result, enough or count
         count += 1 + count // LEAP
         count = max(count, search.fewest(FEW_FREEDOM)) if enough else count
+        tried += 1
 
 
 def _of_search(bound: int, enough: int, count: int) -> list[Finding]:
@@ -514,21 +530,27 @@ class Search:
         self._check_size(count)
         return best(self.information, self.before + count, self.wanted[self.criterion], self.kept)
 
-    def least_worst(self, count: int, wanted: Array) -> Planned:
+    def least_worst(self, count: int, wanted: Array, tell: Callable[[int], None]) -> Planned:
         """The best so many stations by the largest of variances.
 
         Where all are within 1 there is freedom left: of plans that use it, each for another criterion, that is taken
         which hides the fewest errors. Raises `FitError` where no calibration can come of so few.
         """
         self._check_size(count)
-        start, largest = least_worst(self.information, self.before + count, wanted, self.kept)
+        start, largest = least_worst(self.information, self.before + count, wanted, self.kept, tell)
         choices = [start]
         if largest <= 1:
-            every = [self.wanted[criterion] for criterion in CRITERIA]
-            choices = [exchanged(self.information, start, w, self.kept, wanted) for w in every]
+            choices = []
+            for done, criterion in enumerate(CRITERIA, WEIGHINGS):
+                tell(done)
+                aim = self.wanted[criterion]
+                choices.append(exchanged(self.information, start, aim, self.kept, wanted))
         elif not np.isfinite(largest):
             raise FitError(f"{count} stations cannot give a calibration. Add stations.")
-        plans = [self.planned(Design(self.information, members)) for members in choices]
+        plans = []
+        for done, members in enumerate(choices, SEARCH_STEPS - len(choices)):
+            tell(done)
+            plans.append(self.planned(Design(self.information, members)))
         return min(plans, key=Planned.hides)
 
     def fewest(self, freedom: float) -> int:

@@ -22,7 +22,7 @@ from mwdcal.calibration.results import (
     typical_accuracy,
     without_temperature,
 )
-from mwdcal.certificate.decisions import coverage_of
+from mwdcal.certificate.decisions import coverage_of, expanded_of
 from mwdcal.errors import InputError
 from mwdcal.estimation.solvers import RANK_TOLERANCE
 from mwdcal.geometry.observables import TITLES
@@ -203,12 +203,10 @@ def _gauges(
 
 
 def _judged(row: VerdictRow) -> AngleGauge:
-    """The gauge of a limit that was tested; a raw figure beyond it has no ±, as its scatter is not noise."""
-    beyond = row.judged_raw and row.value is not None and row.value > row.limit
-    known = row.uncertainty is not None and not beyond
-    expanded = coverage_of(row.freedom) * (row.uncertainty or 0.0) if known else None
+    """The gauge of a limit that was tested; a raw figure beyond it has no ±."""
+    expanded = expanded_of(row)
     shown = "not stated" if row.value is None else estimate(row.value, expanded, row.unit)
-    if beyond:
+    if expanded is None and row.judged_raw:
         shown, _ = noise_free(row, row.unit)
     elif row.judged_raw:
         shown += " raw"

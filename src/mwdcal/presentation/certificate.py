@@ -21,6 +21,7 @@ import msgspec
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.calibration.record import Calibration
 from mwdcal.calibration.results import STATED_ANGLES
+from mwdcal.certificate.decisions import PROBABILITY
 from mwdcal.certificate.document import (
     Budget,
     BudgetLine,
@@ -118,6 +119,8 @@ def probability(value: float) -> str:
 
 ACCURACY_TABLE = "accuracy"
 """The id of the results that the first pages show."""
+UNCERTAINTY = f"U {100 * PROBABILITY:.0f} %"
+"""Title of expanded uncertainties on the screen."""
 ASSUMED_EXACT = "exact"
 """In place of the share of a source that is assumed exact."""
 
@@ -171,7 +174,17 @@ def _test(test: ConformityTest) -> str:
         *([test.settings] if test.settings else []),
         *([f"{VERDICT_RISK}: {chance(test.risk)}"] if test.risk is not None else []),
     ]
-    header = ["", "raw", "value", "U", "limit", "accepted up to", "", "P within", "risk"]
+    header = [
+        "",
+        "raw",
+        "value",
+        UNCERTAINTY,
+        "limit",
+        "accepted up to",
+        "",
+        "P within limit",
+        "risk",
+    ]
     rows = [_decision(decision) for decision in test.decisions]
     return "\n".join(map(one_line, lines)) + "\n\n" + table(rows, header)
 
@@ -220,7 +233,7 @@ def _budget(budget: Budget) -> str:
     rows = [_source(line, names, budget.combined) for line in lines]
     covered = f"k = {budget.coverage_factor:.3g}, {_percent(budget.coverage_probability)}"
     head = f"uncertainty budget (1σ), {budget.at}; {covered}"
-    return f"{one_line(head)}\n{table(rows, ['', 'kind', *names])}"
+    return f"{one_line(head)}\n{table(rows, ['', 'type', *names])}"
 
 
 def _source(line: BudgetLine, names: Sequence[str], combined: BudgetLine) -> list[str]:

@@ -68,7 +68,10 @@ def contribution_summary(result: Contributions) -> ContributionSummary:
     return ContributionSummary(
         station=[*result.station],
         md_m=_stated(result.md),
-        causes=[_cause(*cause, sd) for cause, sd in zip(result.causes, result.sd, strict=True)],
+        causes=[
+            _cause(name, cause.propagation, sd)
+            for name, cause, sd in zip(result.names, result.causes, result.sd, strict=True)
+        ],
         total=_cause("all", "", result.total),
     )
 
@@ -95,7 +98,7 @@ def contribution_columns(result: Contributions, unit: str = "m") -> Mapping[str,
     columns: dict[str, Column] = {
         "station": [label for label in result.station for _ in range(count)],
         f"md_{unit}": np.repeat(result.md / LENGTH_UNITS[unit], count),
-        "cause": [cause.name for cause in result.causes] * stations,
+        "cause": [*result.names] * stations,
         "propagation": [cause.propagation for cause in result.causes] * stations,
     }
     sd, share = (
@@ -129,7 +132,11 @@ def share_rows(result: Contributions, row: int, unit: str = "m") -> list[list[st
     share, shown = result.share[:, row], len(SHARE_TITLES) - 2
     order = np.argsort(-np.nan_to_num(share[:, :shown]).max(-1), kind="stable")
     rows = [
-        [*result.causes[k], *(fixed(100 * part, 1) for part in share[k, :shown].tolist())]
+        [
+            result.names[k],
+            result.causes[k].propagation,
+            *(fixed(100 * part, 1) for part in share[k, :shown].tolist()),
+        ]
         for k in order.tolist()
     ]
     total = (result.total[row] * _factors(unit))[:shown].tolist()

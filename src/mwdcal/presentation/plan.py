@@ -47,6 +47,10 @@ STATION_TITLES = {
 """Columns of the table of stations, and how they are headed."""
 
 
+WITHOUT_VERTICAL = "not at 0°: at the vertical, azimuth and toolface are undefined"
+"""The line below accuracies by inclination."""
+
+
 class PlannedTriad(msgspec.Struct, frozen=True, kw_only=True):
     """The result of a plan for a triad: uncertainties (1σ) by parameter of the calibration file."""
 
@@ -344,7 +348,8 @@ def accuracy_rows(each: PlanSummary) -> list[list[str]]:
 
 def accuracy(each: PlanSummary) -> str:
     """1σ of the angles at the working inclinations."""
-    return table(accuracy_rows(each), ["1σ at inclination", *each.accuracy_by_inclination_deg])
+    rows = table(accuracy_rows(each), ["1σ at inclination", *each.accuracy_by_inclination_deg])
+    return f"{rows}\n{WITHOUT_VERTICAL}"
 
 
 DETECTABLE_TITLES = ["error of one station (80 % of runs)", "noticed from", "station named from"]

@@ -15,6 +15,8 @@ PATIENCE = 2.0
 """Seconds before there is any progress to see."""
 NARROWEST, WIDEST = 80, 160
 """Columns for which a terminal gets its tables and lines, however many it has."""
+REMARKS_WIDTH = 120
+"""Columns to which a table with remarks is folded where no terminal says how many there are."""
 NOT_STATED = "not stated"
 """In place of what a document must have room for, and does not say."""
 UNCUT = 1_000_000
@@ -195,15 +197,16 @@ def table(
 
     Cells are shown as they are, on one line, in characters that stdout has. On a terminal too narrow for
     it words are folded and the columns stand in several tables, which all begin with those that name the
-    rows: the first, or several. Elsewhere the table has at most a `width`; with `remarks` nothing is cut.
+    rows: the first, or several. Elsewhere the table is cut to a `width`; with `remarks` it is folded as on a terminal.
     """
     cells = [
         [transliterate(one_line(cell), sys.stdout.encoding) for cell in row]
         for row in [header, *rows]
     ]
     whole, room = list(zip(*cells, strict=True)), columns(sys.stdout)
-    if room is None:
-        return _render_table(whole, UNCUT if remarks else width)
+    if room is None and not remarks:
+        return _render_table(whole, width)
+    room = room or REMARKS_WIDTH
     return "\n\n".join(_render_table(some, UNCUT) for some in _split_columns(whole, room, names))
 
 

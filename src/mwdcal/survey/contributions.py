@@ -31,8 +31,15 @@ from mwdcal.use.uncertainty import AXIAL_INTERFERENCE, CORRECTED, DRIFT, OF_MODE
 
 CORRECTION = "calibration and multi-station analysis"
 COURSE_ERRORS = "course between stations"
+DECLINATION = "declination"
+PARTED = (DECLINATION, *OF_MODELS.values())
+"""Causes that may propagate in several ways."""
 RANDOM_ERRORS, SYSTEMATIC, OF_WELL = "random", "systematic", "well"
 """Ways of propagation; a fourth one, of error models alone, is global."""
+SHARED_BY = {
+    RANDOM_ERRORS: "each station", SYSTEMATIC: "whole run", OF_WELL: "whole well", "global": "all wells",
+}  # fmt: skip
+"""The stations that share an error, by the way that it propagates."""
 CONTRIBUTED = (
     "inclination", "azimuth", "north", "east", "tvd", "along_hole", "lateral", "highside",
 )  # fmt: skip
@@ -58,6 +65,14 @@ class Contributions:
     md: Array
     causes: tuple[Cause, ...]
     variance: Array
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """A name of each cause (c,) that no other has: of those that propagate in several ways with their reach."""
+        return tuple(
+            f"{name}, {SHARED_BY[propagation]}" if name in PARTED else name
+            for name, propagation in self.causes
+        )
 
     @cached_property
     def sd(self) -> Array:
@@ -265,8 +280,8 @@ def _causes(
             count, lasting[:, :-1]
         ),
         Cause("noise", RANDOM_ERRORS): _Errors.of(count, random=noise),
-        Cause("declination", OF_WELL): _Errors.of(count, turn * shared),
-        Cause("declination", RANDOM_ERRORS): _Errors.of(count, random=daily),
+        Cause(DECLINATION, OF_WELL): _Errors.of(count, turn * shared),
+        Cause(DECLINATION, RANDOM_ERRORS): _Errors.of(count, random=daily),
     }
     if well.errors is not None:
         result |= _modelled(well.errors, seen.direction, hole)
