@@ -87,7 +87,7 @@ _OF_AXIS = re.compile(
 )
 """A name that ends in an axis, but for its unit."""
 _AXIS_FIRST = re.compile(r"(?P<axis>[xyz])[abghm]", re.IGNORECASE)
-"""A name whose axis stands before the letter of its triad."""
+"""A name of two letters, of its axis and its triad."""
 _WORD_AXIS = re.compile("轴$")
 """The word for an axis behind its letter."""
 _SYMBOL = re.compile(r"[^\W\d_]")
