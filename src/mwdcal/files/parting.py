@@ -27,6 +27,12 @@ _ROLL_TEST = re.compile(
     re.IGNORECASE,
 )
 """Names of what checks a calibration and is no part of it, in a cell or as the name of a column."""
+_ROLLS_ALONE = re.compile(rf"\W*({_ROLLS})[\s_-]*\d*\W*", re.IGNORECASE)
+_CALIBRATION = re.compile(
+    r"\W*([ck]al(ib\w*)?|calibra[cç][aã]o|calibraci[oó]n|калибр\w*|标定|校准)\W*\d*\W*",
+    re.IGNORECASE,
+)
+"""Cells of rows of rolls, beside those of the calibration."""
 _YES = re.compile(r"(x|yes|y|ja|si|sí|sim|да|是|true|1|1\.0|✓|✔|√)", re.IGNORECASE)
 _NO = re.compile(r"(|no|n|nei|nein|não|нет|否|false|0|0\.0|-|–)", re.IGNORECASE)
 
@@ -86,4 +92,9 @@ def check_rows(table: Table, name: str) -> list[int]:
 
 
 def _named_in(cells: Sequence[str]) -> list[int]:
-    return [row for row, cell in enumerate(cells) if cell and _ROLL_TEST.fullmatch(cell)]
+    beside = any(map(_CALIBRATION.fullmatch, cells))
+    return [
+        row
+        for row, cell in enumerate(cells)
+        if _ROLL_TEST.fullmatch(cell) or (beside and _ROLLS_ALONE.fullmatch(cell))
+    ]

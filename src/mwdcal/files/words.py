@@ -99,7 +99,7 @@ TRANSLATIONS = (
         r"azimutwinkel|\bkurs\b|\bdire(ccion|cao|ction)\b|\brumo\b|\bcap\b|\bаз(им)?\b\.?|направление|"
         r"курс|方向角?|磁北からの角度?|"
         r"atsimuutti|suuntakulma|방위각?|\bhazi\b|drehtisch|turn ?table|rotary table|baring|azymut|yonelim|азимут|"
-        r"asimut|\basi\b\.?|azym\b\.?|azimute?(?!h)|acimut|方位角?|"
+        r"asimut|\basim?\b\.?|azym\b\.?|azimute?(?!h)|acimut|方位角?|"
         r"rumbo|richtung(?!swinkel)|retning|peilung",
         "azimuth ",
     ),
@@ -164,6 +164,9 @@ TRANSLATIONS = (
     (r"(град\w*\.?|°)\s?[сc](?![а-яa-z])", "degc"),
     (r"^т(?=\W)", "T"),
     (r"м/с\s?(²|\^?2)", "m/s2"),
+    (r"(?<![а-я])а/м(?![а-я])", "A/m"),
+    (r"(?<![а-я])мэ(?![а-я])", "mG"),
+    (r"(?<![а-я])э(?![а-я])", "gauss"),
     (r"нтл", "nT"),
     (r"мктл", "uT"),
     (r"м[gг](?![а-яa-z])", "mg"),

@@ -30,6 +30,7 @@ from mwdcal.files.synonyms import (
     ABOVE,
     ANTICLOCKWISE,
     BELOW,
+    FACTORS,
     OF_TIME,
     WARMTH,
     Resemblance,
@@ -54,6 +55,7 @@ RANGES_BY_UNIT: dict[str, tuple[tuple[str, float, float], ...]] = {
     ),
     "ref_field_nt": (
         ("nT", *EARTH_FIELD), ("µT", 15.0, 80.0), ("gauss", 0.15, 0.8), ("mT", 0.015, 0.08),
+        ("mG", 150.0, 800.0),
     ),
 }  # fmt: skip
 """Units of quantities of which the Earth has but one range of values; 980 may be milli-g or gal."""
@@ -120,6 +122,15 @@ def is_filler(values: Array) -> Bools:
 def is_of_tool(name: str) -> bool:
     """Whether a column is called what the tool has measured, or a program computed."""
     return bool(_MEASURED.search(spelled(name)))
+
+
+def is_computed(name: str) -> bool:
+    """Whether a column is called what the tool has measured, and not what its stand shows.
+
+    >>> is_computed("Inc calc"), is_computed("Ist Inc")
+    (True, False)
+    """
+    return is_of_tool(name) and not _ACTUAL.search(name)
 
 
 def is_of_surroundings(name: str) -> bool:
@@ -334,7 +345,8 @@ _LABELS = {
 """Names of columns of labels; a column is one only where no other is."""
 _CALLED_REFERENCE = re.compile(r"\b(ref|reference|nominal|target|set)\b", re.IGNORECASE)
 _REFERRED = re.compile(
-    r"\b(ref|reference|referenz|referanse|referencia|эталон\w*|опорн\w*)\b|基准|参考", re.IGNORECASE
+    r"\b(ref|reference|referenz|referanse|referencia|obs|observatory|эталон\w*|опорн\w*)\b|基准|参考|\bref(?=[a-z]\b)",
+    re.IGNORECASE,
 )
 _OF_RESIDUALS = re.compile(
     r"residu|restfehler|restabw|abweichung|(?<![^\W\d_])(err|error|fehler|feil|avvik)|остат|невяз|погрешн|残差|误差",
@@ -360,14 +372,14 @@ _NOMINAL = re.compile(
     r"set ?point|soll\w*|eingestellt\w*|vorgabe|satt|innstilt|ajustad[oa]|"
     r"fijad[oa]|"
     r"definid[oa]|programad[oa]|te[óo]ric[oa]|th[ée]orique|r[ée]gl[ée]e?|vis[ée]e?|установ(ка|лен\w*)|уставк\w*|cmd|command(ed)?|demand(ed)?|required|nom|consign[ea]|comandad[oa]|"
-    r"zadan\w*|b[öo]rv[äa]rde|задан\w*|номинал\w*)\b|[设给]定|设置|理论|名义|目标|指令値?|目標値?|設定値?",
+    r"зад|zadan\w*|b[öo]rv[äa]rde|задан\w*|номинал\w*)\b|[设给]定|设置|理论|名义|目标|指令値?|目標値?|設定値?",
     re.IGNORECASE,
 )
 _ACTUAL = re.compile(
     r"\b(actual|act|achieved|as read|read ?back|read ?out|observed|(ab)?gelesen\w*|avlest|odczyt\w*|"
     r"le[íi]d[oa]|lid[oa]|lue?|"
     r"relev[ée]e?|r[ée]el(le)?|efetiv[oa]|efectiv[oa]|отсч[её]т\w*|read|reading|encoder|ist|istwert|effettiv[oa]|mesur[ée]e?s?|medid[oa]|zmierzon\w*|"
-    r"[äa]rv[äa]rde|действит\w*|фактич\w*|измер\w*|real|faktisk)\b|实际|实测|测得|读数|编码器|実測値?|実際",
+    r"[äa]rv[äa]rde|действит\w*|факт|фактич\w*|измер\w*|real|faktisk)\b|实际|实测|测得|读数|编码器|実測値?|実際",
     re.IGNORECASE,
 )
 """Words of angles to which a stand was to be set, and of those that it shows."""
@@ -514,7 +526,7 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     alike = (
         resembled(plain) or _without_title(plain) or resembled(f"{name} ({unit})" if unit else name)
     )
-    alike = alike or _twice(plain)
+    alike = alike or _twice(plain) or _at_stand(plain)
     if alike and alike.column in RAW and _CALLED_REFERENCE.search(plain):
         return alike._replace(column=REFERENCE_VECTORS[RAW.index(alike.column)])
     if _MEASURED.search(plain) and not (alike and alike.column == WARMTH):
@@ -592,6 +604,13 @@ def _twice(name: str) -> Resemblance | None:
     one, two = (resembled(f"{text} {unit}".strip()) for text in (" ".join(words[:-1]), words[-1]))
     same = one and two and one.column == two.column
     return one if same or (one and _is_symbol(words[-1], one.column)) else None
+
+
+def _at_stand(name: str) -> Resemblance | None:
+    """The angle that a name says beside a word of the stand: Inc mesa (º)."""
+    bare = " ".join(_BY_STAND.sub(" ", name).split())
+    alike = resembled(bare) if bare not in ("", name) and not _BY_TOOL.search(name) else None
+    return alike if alike and alike.column in _ANGLES_AND_WARMTH[:3] else None
 
 
 def _is_symbol(word: str, column: str) -> bool:
@@ -810,20 +829,27 @@ def _beside_nominal(
     }
 
 
+def _without(words: re.Pattern[str], name: str) -> str:
+    """A name without some words, and the points behind them."""
+    return " ".join(re.sub(rf"({words.pattern})\.?", " ", name, flags=words.flags).split()).strip(
+        "-_ ,"
+    )
+
+
 def shown_beside_set(names: Sequence[str]) -> list[tuple[str, str, str]]:
     """Columns of what a stand was to be set to, each with that of what it shows, and the end of both names.
 
     >>> shown_beside_set(["Set (Inc)", "Read on cradle (Inc)", "Azi"])
     [('Set (Inc)', 'Read on cradle (Inc)', '(Inc)')]
     """
-    stems = {n: " ".join(_NOMINAL.sub(" ", n).split()).lstrip("-_ ") for n in names}
+    stems = {n: _without(_NOMINAL, n) for n in names}
     return [
         (name, other, stem)
         for name, stem in stems.items()
         if stem not in ("", name)
         for other in names
         if other != name
-        and re.search(rf"(?<!\w){re.escape(stem)}$", other)
+        and (re.search(rf"(?<!\w){re.escape(stem)}$", other) or _without(_ACTUAL, other) == stem)
         and _ACTUAL.search(other)
         and not _NOMINAL.search(other)
     ]
@@ -1282,13 +1308,24 @@ def _is_steady(
         return False
     if column != REFERENCES["gravity"].column and _REFERRED.search(spelled(name)):
         return may_be(column, name, unit, cells)
-    ranges = {u: (low, high) for u, low, high in RANGES_BY_UNIT.get(column, ())}
-    low, high = ranges.get(_unit_beside(name, unit), (np.inf, -np.inf))
+    low, high = _range_in(column, _unit_beside(name, unit))
     varies = float(np.ptp(cells))
     called = column == REFERENCES["field"].column and _OF_FIELD.search(name)
     steady = varies < _OF_PLACE * high if called else varies == 0
     inside = low <= cells.min() and cells.max() <= high
     return bool(steady and inside) and not _is_total(column, cells, "", names, values)
+
+
+def _range_in(column: str, unit: str) -> tuple[float, float]:
+    """The least and the largest value that gravity or field have on the Earth in a unit; none of another unit."""
+    ranges = {
+        REFERENCES["gravity"].column: EARTH_GRAVITY,
+        REFERENCES["field"].column: EARTH_FIELD,
+    }
+    if column not in ranges or unit not in units_of(column):
+        return np.inf, -np.inf
+    low, high = (value / FACTORS.get(unit, (1.0, 0.0))[0] for value in ranges[column])
+    return low, high
 
 
 def _unit_beside(name: str, unit: str) -> str:

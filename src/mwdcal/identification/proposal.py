@@ -64,6 +64,7 @@ from mwdcal.identification.beside import findings_beside, has_roll_test, roll_te
 from mwdcal.identification.columns import (
     answers_of_north,
     in_units,
+    is_computed,
     is_filler,
     is_of_surroundings,
     is_of_tool,
@@ -625,7 +626,8 @@ def _answer_by_readings(
     columns = proposal.profile.columns or {}
     sensed = {each.name for column, each in columns.items() if column in RAW}
     nominal = {name for name, _, _ in shown_beside_set([*table.columns])}
-    beside = [name for name in table.columns if name not in sensed | nominal]
+    aside = sensed | nominal | {name for name in table.columns if is_computed(name)}
+    beside = [name for name in table.columns if name not in aside]
     if any(_has_twin(table, text, beside) for answer in chosen for _, text in answer.arguments):
         return None
     texts = [", ".join(text for _, text in answer.arguments) for answer in chosen]

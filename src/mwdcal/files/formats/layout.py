@@ -717,7 +717,7 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
             above = rows[max(0, head - 4) : head]
             layout = _with_settings(_with_warmth_of_lines(layout, between), [*above, *between])
             layout = _with_serials(layout, [*above, *between])
-            yield _with_triads_beside(_with_rows_of_headings(layout))
+            yield _with_triads_beside(_with_triad_above(_with_rows_of_headings(layout)))
 
 
 def _with_side_blocks_above(rows: list[tuple[int, Cells]]) -> list[tuple[int, Cells]]:
@@ -1162,6 +1162,30 @@ def _with_rows_of_headings(layout: Layout) -> Layout:
         lines=[layout.lines[row] for row, _ in rows],
         remarks=(*layout.remarks, said),
     )
+
+
+_OF_TRIAD = re.compile(
+    r"(?<![^\W\d_])(acc|mag)(elerometers?|netometers?)?(?![^\W\d_])", re.IGNORECASE
+)
+
+
+def _with_triad_above(layout: Layout) -> Layout:
+    """A table whose names of axes alone have the triad and the unit of the line above the names."""
+    triads = {match[1].lower() for match in _OF_TRIAD.finditer(spelled(layout.heading))}
+    axes = [k for k, name in enumerate(layout.names) if _AXIS.fullmatch(name)]
+    if len(triads) != 1 or len(axes) != len("xyz"):
+        return layout
+    title = triads.pop().title()
+    stated = [
+        unit
+        for text in _BRACKETS.findall(layout.heading)
+        if (unit := text[1:-1].strip()) and unit_of(unit)
+    ]
+    units = [
+        unit or (stated[0] if stated and k in axes else "") for k, unit in enumerate(layout.units)
+    ]
+    names = [_with_title(title, n) if k in axes else n for k, n in enumerate(layout.names)]
+    return replace(layout, names=plain_names(names), units=units)
 
 
 def _with_triads_beside(layout: Layout) -> Layout:
