@@ -291,7 +291,7 @@ def test_json_of_apply_holds_the_numbers_of_the_text(tmp_path, files):
         for name, each in told["angles"].items()
     )
     assert said.out == (
-        f"{told['rows']} rows corrected   wrote {told['output']}   unsigned calibration\n"
+        f"{told['rows']} rows corrected   wrote {told['output']}\n"
         f"{ranges}\n"
         f"1σ: {', '.join(told['error_terms'])}. Not in it: {', '.join(told['not_included'])}.\n"
     )

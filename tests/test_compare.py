@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import cache
 from html.parser import HTMLParser
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.linalg import polar
@@ -24,7 +25,7 @@ from mwdcal.geometry.vectors import group_scatter
 from mwdcal.planning import plans
 from mwdcal.presentation import comparison as command
 from mwdcal.presentation.comparison import render
-from mwdcal.sensor.profile import Profile, TriadProfile
+from mwdcal.sensor.profile import ColumnSource, Profile, TriadProfile
 from simulation import Tool, attitude, plan
 from test_calibrate import NOISE, PROFILE, make
 
@@ -257,6 +258,20 @@ def test_order_is_chosen_and_shown_and_the_swarm_says_why_it_cannot():
     assert "SF x·τ, raw/g/°C" in text
     assert "swarm refused: " in text
     assert "SIMULATED DATA" in text
+
+
+def test_scales_are_in_the_unit_of_the_channels_where_the_profile_names_it(whole):
+    text, meaning = command.text(whole, parameters=True), "raw: the unit of the readings in the run"
+    assert text.count("SF x, raw/") == 2
+    assert text.count(meaning) == 1
+    units = {"a": "mV", "m": "V"}
+    columns = {
+        f"{k}{i}": ColumnSource(name=f"{k} {i}", unit=units[k]) for k in units for i in "xyz"
+    }
+    named = replace(whole, profile=msgspec.structs.replace(whole.profile, columns=columns))
+    text = command.text(named, parameters=True)
+    assert {"SF x, mV/g", "SF x, V/nT"} <= {line.split("  ")[0] for line in text.splitlines()}
+    assert meaning not in text
 
 
 def test_methods_that_do_not_apply_say_why():

@@ -107,6 +107,15 @@ def test_the_python_tutorial_calibrates_a_table_with_its_own_names(tmp_path, mon
     np.testing.assert_allclose(again.accelerometer.parameters, seen["cal"].accelerometer.parameters)
 
 
+def test_the_next_commands_are_those_of_the_first_page(tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib")
+    monkeypatch.chdir(tmp_path)
+    lines = (ROOT / "README.md").read_text("utf-8").splitlines()
+    for command in ("example demo", "profile demo/export.csv -o export.toml"):
+        following = mwdcal(*command.split()).out.rpartition("next: ")[2].strip()
+        assert following in [line.removeprefix("$ ") for line in lines]
+
+
 def test_a_page_that_shows_another_line_is_noticed():
     printed = "one\ntwo\nthree\nfour"
     assert follow_each_other(["one", "…", "three", "four"], printed)
@@ -155,6 +164,8 @@ def test_without_extras_all_commands_on_text_tables_run(tmp_path):
     options = {"cwd": tmp_path, "env": environment, "capture_output": True, "text": True}
     done = subprocess.run(command, input="\n".join(lines), check=False, **options)
     assert done.returncode == 0, done.stderr[-2000:]
+    assert "-o demo/tool.json\n" in done.stdout
+    assert "--report" not in done.stdout
     done = subprocess.run(
         command, input="registry --database tools.sqlite init", check=False, **options
     )

@@ -179,7 +179,7 @@ def test_a_plan_is_at_the_place_of_the_calibration_unless_it_states_one():
         assert set(columns["ref_field_nt"]) == {51_000.0}
         assert set(columns["ref_gravity_g"]) == {0.998}
         assert np.isnan(columns.get("ref_dip_deg", [np.nan])).all()
-        assert "assumed: dip_deg 63" in made.summary()
+        assert "assumed: dip 63°" in made.summary()
     stated = {**mwdcal.plan(place).columns, "ref_field_nt": np.full(24, 45_000.0)}
     assert set(mwdcal.plan(place, plan=stated).columns["ref_field_nt"]) == {45_000.0}
 

@@ -167,6 +167,20 @@ def test_an_unknown_scale_is_taken_from_the_readings():
     assert profile.magnetometer.scale == pytest.approx(25.0 / 5e4)
 
 
+@pytest.mark.parametrize("inclinations", [(5, 45, 90, 135), (0, 45, 90), (60, 90, 120), (40, 50)])
+def test_an_unknown_scale_is_that_of_a_sphere_wherever_its_middle_is(inclinations):
+    """The middle of the ranges is none of the sphere: half way between the least and the largest of a channel."""
+    inc = np.repeat(np.radians(inclinations), 8)
+    face = np.tile(np.arange(8) * np.pi / 4, len(inclinations))
+    unit = np.stack([-np.sin(inc) * np.sin(face), -np.sin(inc) * np.cos(face), np.cos(inc)], -1)
+    raw = 3.0 * unit + [2.5, 2.4, 2.6]
+    columns = {
+        name: list(map(repr, values.tolist())) for name, values in zip(RAW, raw.T, strict=False)
+    }
+    _, profile = to_readings(run(**columns), Profile(name="x"))
+    assert profile.accelerometer.scale == pytest.approx(3.0, rel=1e-9)
+
+
 def test_a_stated_scale_is_kept_also_where_the_field_is_unknown():
     columns = {name: ["1", "2"] for name in ("mx", "my", "mz")}
     assert to_readings(run(**columns), BARE)[1] == BARE

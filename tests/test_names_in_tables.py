@@ -56,6 +56,9 @@ def numbers(path, column):
         ("Hx gelesen (nT)", "mx", "nT"),
         ("Gx målt (mg)", "ax", "mg"),
         ("Ts(C)", "temperature_c", "°C"),
+        ("Giro (toolface) graus", "ref_toolface_deg", "°"),
+        ("Azimute (mag) graus", "ref_azimuth_deg", "°"),
+        ("Inclinação (dev) graus", "ref_inclination_deg", "°"),
     ],
 )
 def test_stands_and_channels_in_other_words(name, column, unit):

@@ -743,12 +743,21 @@ def test_the_screen_says_what_is_assumed_and_how_long_the_soak_is(tmp_path):
     plan.write_text('name = "p"\ndip_deg = 60\n[[stations]]\ninclination_deg = [5, 60, 120]\n'
                     "azimuth_deg = [0, 120]\ntoolface_deg = [0, 90, 180, 270]\n", "utf-8")  # fmt: skip
     shown = mwdcal("plan", "--plan", plan, "--tool", "servo", "--soak", 90).out
-    assert "the plan does not state the place; assumed: field_nt 48,000\n" in shown
+    assert "the plan does not state the place; assumed: field 48,000 nT\n" in shown
     assert re.search(r"of which soak \(--soak\) +1\.5 h", shown)
     assert "SIMULATED" not in shown
-    assert "the plan does not state the place; assumed: field_nt 48,000, dip_deg 63\n" in mwdcal(
+    assert "the plan does not state the place; assumed: field 48,000 nT, dip 63°\n" in mwdcal(
         "plan", "--plan", "six-state", "--tool", "servo"
     ).out  # fmt: skip
+
+
+def test_the_place_of_a_plan_is_shown_with_names_and_units(tmp_path):
+    plan = tmp_path / "p.toml"
+    place = "gravity_g = 1.0003\nfield_nt = 51000\ndip_deg = 66.2\n"
+    angles = "inclination_deg = [5, 60, 120]\nazimuth_deg = [0, 120]\ntoolface_deg = [0, 90, 180]\n"
+    plan.write_text(f'name = "p"\n{place}[[stations]]\n{angles}', "utf-8")
+    shown = mwdcal("plan", "--plan", plan, "--tool", "servo").out
+    assert "place: field 51,000 nT, dip 66.2°, gravity 1.0003 g\n" in shown
 
 
 @pytest.mark.usefixtures("without_pictures")

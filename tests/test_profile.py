@@ -2,12 +2,13 @@
 
 import itertools
 import os
+import re
 
 import numpy as np
 import pytest
 
 import exports
-from cli_support import mwdcal, numbers, read_csv, refused, servo_run, write_csv
+from cli_support import EXAMPLE, mwdcal, numbers, read_csv, refused, servo_run, write_csv
 from mwdcal import propose_profile, read_run
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.errors import FitError
@@ -654,3 +655,17 @@ def test_a_channel_of_a_run_file_with_any_unit_is_not_left_out(tmp_path):
     path = write_csv(tmp_path / "run.csv", columns)
     message = refused(mwdcal("calibrate", path, "--tool", "servo", "-o", tmp_path / "c.json"), 2)
     assert "'mx [ADC]' must be spelled exactly as documented. Did you mean 'mx'?" in message
+
+
+def test_scales_are_in_the_unit_of_the_columns(tmp_path):
+    pytest.importorskip("matplotlib")
+    table, tool, made = EXAMPLE / "export.csv", tmp_path / "e.toml", tmp_path / "e.json"
+    assert re.search(r"\d mg per g .*\n.*\d nT per nT ", mwdcal("profile", table, "-o", tool).out)
+    page = tmp_path / "e.html"
+    assert mwdcal("calibrate", table, "--tool", tool, "-o", made, "--report", page).code == 0
+    text = page.read_text("utf-8")
+    assert ">mg/g</td>" in text
+    assert ">988.4 mg/g</td>" in text
+    assert "raw/" not in text
+    shown = mwdcal("convert", made, "--notation", "forward").out
+    assert "accelerometer mg per g (nominal 988.4)" in shown

@@ -117,12 +117,27 @@ def test_the_size_of_a_drift_is_stated():
     assert "drift of the accelerometer during the run" in {row.source for row in record.budget}
 
 
+def test_a_drift_is_stated_with_the_share_of_steady_runs_that_show_as_much():
+    """Run 43 of these, all without drift, is beyond the threshold by chance; a drift of 40 nT is far beyond."""
+    for field, member, share in ((0.0, 43, "0.9 %"), (40.0, 0, "under 0.01 %")):
+        readings = runs(11, 120, field=field)
+        raw = readings.accelerometer[member], readings.magnetometer[member]
+        one = Readings(*raw, known=readings.known, sd={})
+        record = calibrate(one, Profile(name="x"), Options(order=0))
+        [finding] = [each for each in record.findings if each.id.endswith("-drift")]
+        first, *_ = finding.text.split(". ")
+        assert first.startswith("Readings follow the order of the stations as if")
+        assert first.endswith(f"noise alone shows as much in {share} of steady runs")
+
+
 def test_a_drift_that_no_finding_names_is_on_the_screen_too():
     """Small ones may be noise, and widen the uncertainty beyond what a plan has said."""
     steady = expected(load_plan("twelve-state"), load_profile("servo")[0])
     drift = Drift(name="field", change=31.0, standard_uncertainty=11.0, unit="nT")
     finding = Finding(id="field-drift", text="readings follow the order")
-    possible = "a possible drift within the run"
+    possible = (
+        "a possible drift within the run (noise alone shows one in about a fifth of steady runs)"
+    )
     for more, shown in (
         ({"drift": []}, False),
         ({"drift": [drift]}, True),

@@ -56,7 +56,7 @@ OTHERS = [
         "declination_deg ref_notes sd_temp temp_notes temp_rate template attempt T1 mag_t total",
     )
     for name in line.split()
-]
+] + ["Roll (azimuth) deg", "Inclination (desired) deg"]
 
 
 @pytest.mark.parametrize(("name", "column"), PAIRS, ids=[name for name, _ in PAIRS])

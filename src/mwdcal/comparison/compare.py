@@ -281,6 +281,7 @@ class Comparison:
     """As of `Calibration`."""
 
     run: str
+    profile: Profile
     stations: int
     labels: tuple[str, ...]
     simulated: bool
@@ -331,14 +332,17 @@ def compare(
     gauge = Gauge.of(entry for one in usable for entry in one.free)
     judge = _Judge(readings, usable[0].record.earth if usable else {})
     rows = [one if isinstance(one, Row) else _row(one, judge, gauge, progress) for one in results]
-    return _compared(judge, options, gauge, tuple(rows))
+    return _compared(judge, profile, options, gauge, tuple(rows))
 
 
-def _compared(judge: _Judge, options: Options, gauge: Gauge, rows: tuple[Row, ...]) -> Comparison:
+def _compared(
+    judge: _Judge, profile: Profile, options: Options, gauge: Gauge, rows: tuple[Row, ...]
+) -> Comparison:
     """The rows with what they have in common."""
     readings, bare = judge.readings, nominal(judge.readings)
     return Comparison(
         run=readings.source,
+        profile=profile,
         stations=readings.count,
         labels=readings.labels,
         simulated=is_simulated(readings.metadata),

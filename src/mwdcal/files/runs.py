@@ -58,7 +58,7 @@ from mwdcal.files.marks import UNMARKED, without_rejected
 from mwdcal.files.repeats import means, repeats
 from mwdcal.files.statements import stated_table
 from mwdcal.geometry.observables import OBSERVABLES
-from mwdcal.geometry.vectors import Array
+from mwdcal.geometry.vectors import Array, eigen, quotient
 from mwdcal.sensor.profile import ColumnSource, Profile, TableFormat, TriadProfile
 
 if TYPE_CHECKING:
@@ -124,6 +124,8 @@ MOST_OTHERS = 20
 ANGLES_OF_STAND = tuple(REFERENCES[name].column for name in ANGLES)
 STATED_REFERENCES = ("gravity", "field", "dip")
 """References that may be the same at all stations, and be stated once."""
+LEAST_VARIED = 0.03
+"""Readings vary in a direction if their spread there is at least this share of the largest."""
 _TURN = 360.0
 
 
@@ -772,12 +774,21 @@ def _strength(known: Mapping[str, Array], kind: str) -> Array:
 def _scale(raw: Array, strength: Array) -> Array:
     """Nominal scale (..., 1, 1) of raw readings (..., n, 3) of a field of this strength (...).
 
-    Definition: median distance from the midpoint of the channels' ranges, over the strength.
+    Definition: median distance from the centre of the sphere nearest to the readings, over the strength; in directions
+    in which they hardly vary the centre is their mean.
     Singular: where nothing moves (a single station) it is the distance from zero; readings that are
     all zero count as one: whether the channels are alive is decided where they are fitted.
     """
-    midpoint = (raw.min(-2, keepdims=True) + raw.max(-2, keepdims=True)) / 2.0
-    radius, still = (np.median(np.linalg.norm(v, axis=-1), -1) for v in (raw - midpoint, raw))
+    centred = raw - raw.mean(-2, keepdims=True)
+    size = np.abs(centred).max((-2, -1))[..., None, None]
+    unit = quotient(centred, size, size > 0)
+    count, square = raw.shape[-2], np.sum(unit**2, -1)
+    values, vectors = eigen(np.einsum("...ni,...nj->...ij", unit, unit) / count)
+    pull = np.einsum("...ni,...n,...ij->...j", unit, square, vectors) / count
+    along = quotient(pull / 2, values, values > LEAST_VARIED**2 * values[..., -1:])
+    beyond = unit - np.einsum("...ij,...j->...i", vectors, along)[..., None, :]
+    radius = np.median(np.linalg.norm(beyond, axis=-1), -1) * size[..., 0, 0]
+    still = np.median(np.linalg.norm(raw, axis=-1), -1)
     radius = np.where(radius > 0, radius, np.where(still > 0, still, 1.0))
     return np.asarray(radius / strength)[..., None, None]
 

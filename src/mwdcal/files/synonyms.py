@@ -264,7 +264,7 @@ _CALCULATED = re.compile(
     r"(?<![A-Za-z])(calc|calculated|computed|berechnet)(?![A-Za-z])", re.IGNORECASE
 )
 """Words of columns that a program has computed from the readings: no evidence."""
-_BRACKETED = re.compile(r"(.*\S)\s*[(\[{]([^(\[{]*)[)\]}]", re.DOTALL)
+_BRACKETED = re.compile(r"(.*\S)\s*[(\[{]([^(\[{]*)[)\]}](\s+\S+)?", re.DOTALL)
 OF_TIME = re.compile(r"\s*temps\W+(ms|s(ec\w*)?|min\w*|h+(\W.*)?)\W*", re.IGNORECASE)
 """The French name of a time."""
 _CASED = {
@@ -298,20 +298,23 @@ def is_depth(name: str) -> bool:
 def resembled(name: str) -> Resemblance | None:
     """The column that a name resembles, with a unit behind it that is known or, in brackets, is not.
 
+    Brackets may say the same again, at the end or before the unit.
+
     >>> [resembled(n) for n in ("Azi (°)", "Temp (°F)", "comment")]
     [Resemblance(column='ref_azimuth_deg', unit='°'), Resemblance(column='temperature_c', unit='°F'), None]
-    >>> resembled("HX [steps]")
-    Resemblance(column='mx', unit='steps')
+    >>> resembled("HX [steps]"), resembled("Roll (toolface) deg")
+    (Resemblance(column='mx', unit='steps'), Resemblance(column='ref_toolface_deg', unit='°'))
     """
     if name in _CHANNELS or OF_TIME.fullmatch(name):
         return None
     whole, bracketed = _resembled(name), _BRACKETED.fullmatch(name.strip())
-    if whole or not bracketed or not (bare := resembled(bracketed[1])):
+    behind = (bracketed and bracketed[3]) or ""
+    if whole or not bracketed or not (bare := resembled(bracketed[1] + behind)):
         return whole
     again = _resembled(bracketed[2])  # Roll angle (TF): no unit
     if again and again.column == bare.column:
         return bare
-    return bare._replace(unit=unit_of(bracketed[2]) or bracketed[2].strip())
+    return None if behind else bare._replace(unit=unit_of(bracketed[2]) or bracketed[2].strip())
 
 
 def _resembled(name: str) -> Resemblance | None:

@@ -95,6 +95,7 @@ TRANSLATIONS = (
         "inclination ",
     ),
     (_FROM_VERTICAL, ""),
+    (r"(?<=inclination) *\((dev(iation)?|desv(io)?)\.?\)", ""),
     (
         r"azimutwinkel|\bkurs\b|\bdire(ccion|cao|ction)\b|\brumo\b|\bcap\b|\bаз(им)?\b\.?|направление|"
         r"курс|方向角?|磁北からの角度?|"

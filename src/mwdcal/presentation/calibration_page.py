@@ -36,6 +36,7 @@ from mwdcal.presentation.calibration import (
 )
 from mwdcal.presentation.numbers import (
     HELD,
+    RAW_MEANING,
     UNDETERMINED,
     capital,
     estimate,
@@ -43,6 +44,7 @@ from mwdcal.presentation.numbers import (
     factor_places,
     norths,
     quantity,
+    raw_unit,
     uncertainty,
 )
 from mwdcal.presentation.page import banner, environment
@@ -110,6 +112,8 @@ def render(
         decimals=_decimals(calibration),
         long_table=LONG_TABLE,
         parameters=_parameters(calibration),
+        raw={t.name: raw_unit(calibration.profile, t.name) for t in calibration.triads},
+        raw_meaning=RAW_MEANING,
         held=HELD,
         accuracy=_accuracy(calibration),
         soaked=_soaked(calibration),
@@ -314,7 +318,12 @@ def _parameters(calibration: Calibration) -> dict[str, Any]:
     except InputError:
         rows = {triad.name: _record_rows(triad) for triad in calibration.triads}
         return {"notation": "record", "rows": rows}
-    rows = {triad.name: _factor_rows(triad, notations[triad.name]) for triad in calibration.triads}
+    rows = {
+        triad.name: _factor_rows(
+            triad, notations[triad.name], raw_unit(calibration.profile, triad.name)
+        )
+        for triad in calibration.triads
+    }
     return {"notation": "factors", "rows": rows}
 
 
@@ -331,11 +340,11 @@ def _record_rows(triad: TriadCalibration) -> list[tuple[Any, ...]]:
     return rows
 
 
-def _factor_rows(triad: TriadCalibration, factors: Notation) -> list[tuple[Any, ...]]:
+def _factor_rows(triad: TriadCalibration, factors: Notation, raw: str) -> list[tuple[Any, ...]]:
     values, sd = factors.values, factors.uncertainty
     return [
         (name, axes, power, float(values[name][at]), float(sd[name][at]), symbol)
-        for name, at, axes, power, symbol in factor_places(values, _unit(triad), "1")
+        for name, at, axes, power, symbol in factor_places(values, raw, _unit(triad), "1")
     ]
 
 

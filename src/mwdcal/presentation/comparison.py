@@ -17,7 +17,16 @@ from mwdcal.comparison.compare import SCALE, Comparison, Row, able
 from mwdcal.estimation.uncertainty import ROTATIONS
 from mwdcal.geometry.observables import TITLES
 from mwdcal.geometry.vectors import Array
-from mwdcal.presentation.numbers import UNDETERMINED, capital, factor_places, measured, number
+from mwdcal.presentation.numbers import (
+    RAW_MEANING,
+    RAW_UNIT,
+    UNDETERMINED,
+    capital,
+    factor_places,
+    measured,
+    number,
+    raw_unit,
+)
 from mwdcal.presentation.numbers import unit as spaced
 from mwdcal.presentation.page import banner, rendered
 from mwdcal.presentation.text import one_line, raised, superscript, table
@@ -183,6 +192,9 @@ def marks(comparison: Comparison) -> list[str]:
 def gauge(comparison: Comparison) -> str:
     """The convention that all parameters were brought to, in words."""
     meaning = "Factors of the raw channels (u = V / SF - B, field = P (1 - m) u)"
+    triads = able(comparison.rows)[0].parameters
+    if RAW_UNIT in [raw_unit(comparison.profile, triad) for triad in triads]:
+        meaning += f"; {RAW_MEANING}"
     if any(comparison.orders):
         meaning += ", by power of τ, temperature - reference"
     if comparison.curved:
@@ -227,7 +239,9 @@ def parameters_of(comparison: Comparison, triad: str) -> list[ComparedParameter]
     strength = "g" if triad == "accelerometer" else "nT" if "field" in comparison.units else ""
     result = [
         _parameter(f"{key} {axes}{raised('·τ', power)}", unit, factors, key, at)
-        for key, at, axes, power, unit in factor_places(factors[0].values, strength)
+        for key, at, axes, power, unit in factor_places(
+            factors[0].values, raw_unit(comparison.profile, triad), strength
+        )
     ]
     for name in comparison.gauge.get(triad, []):
         turn = name != SCALE

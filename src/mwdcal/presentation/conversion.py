@@ -20,7 +20,15 @@ from mwdcal.firmware.export import DEFAULT_BITS, FIXED_POINT, FirmwareSources, e
 from mwdcal.firmware.quantisation import SHARE_OF
 from mwdcal.presentation.calibration_source import calibration_of
 from mwdcal.presentation.envelope import json_document
-from mwdcal.presentation.numbers import HELD, UNDETERMINED, files_written, number
+from mwdcal.presentation.numbers import (
+    HELD,
+    RAW_MEANING,
+    RAW_UNIT,
+    UNDETERMINED,
+    files_written,
+    number,
+    raw_unit,
+)
 from mwdcal.presentation.text import one_line, raised, table
 from mwdcal.sensor.profile import Axis
 from mwdcal.survey.tool_model import SensorTerm, sensor_terms, tool_model_text
@@ -284,7 +292,7 @@ def screen(converted: Converted) -> str:
     lines = [
         *_heading(converted),
         [f"notation {converted.notation}", f"temperature {shown}", _calibrated(converted)],
-        [f"{t.name} raw per {t.unit}{_nominal(calibration, t.name)}" for t in calibration.triads],
+        _units(calibration),
     ]
     values = notation(converted.triads, reference if at == COURSE else None)
     return "\n".join(one_line("   ".join(line)) for line in lines) + "\n\n" + values
@@ -307,6 +315,16 @@ def _calibrated(converted: Converted) -> str:
     beyond = any(finding.id == "outside-temperature" for finding in converted.findings)
     outside = "extrapolated: " if beyond else ""
     return f"{outside}calibrated at {_range(converted.calibration)}"
+
+
+def _units(calibration: Calibration) -> list[str]:
+    """The unit of each triad's scale, and the meaning of "raw" where the profile does not name a unit."""
+    raw = {t.name: raw_unit(calibration.profile, t.name) for t in calibration.triads}
+    each = [
+        f"{t.name} {raw[t.name]} per {t.unit}{_nominal(calibration, t.name)}"
+        for t in calibration.triads
+    ]
+    return [*each, *([RAW_MEANING] if RAW_UNIT in raw.values() else [])]
 
 
 def _nominal(calibration: Calibration, name: str) -> str:

@@ -9,11 +9,13 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from mwdcal.files.contract import AZIMUTH_KEYS, CHANNELS
 from mwdcal.geometry.vectors import Array
 from mwdcal.presentation.text import one_line, raised, superscript
+from mwdcal.sensor.profile import Profile
 
 HELD = "held"
 """In place of the uncertainty of a parameter that a model of 9 or 6 keeps at zero."""
@@ -21,6 +23,10 @@ LEAST_CONTRIBUTION = 1e-3
 """Share of a combined uncertainty below which a contribution is 0."""
 MOST_DECIMALS = 7
 """Decimals of a number by its uncertainty; smaller ones have a power of ten."""
+RAW_UNIT = "raw"
+"""The unit of readings of which the profile does not name it…"""
+RAW_MEANING = "raw: the unit of the readings in the run"
+"""…and its meaning."""
 UNDETERMINED = "undetermined"
 """In place of an uncertainty that no reading determines."""
 
@@ -148,14 +154,21 @@ def exponent(value: float) -> int:
     return int(f"{value:.1e}".split("e")[1])
 
 
+def raw_unit(profile: Profile, triad: str) -> str:
+    """The unit of a triad's channels, such as mV, where the profile names it for all three; else "raw"."""
+    columns = {} if isinstance(profile.columns, msgspec.UnsetType) else profile.columns
+    units = {columns[name].unit if name in columns else "" for name in CHANNELS[triad]}
+    return (len(units) == 1 and units.pop()) or RAW_UNIT
+
+
 def factor_places(
-    values: Mapping[str, Array], strength: str, one: str = ""
+    values: Mapping[str, Array], raw: str, strength: str, one: str = ""
 ) -> Iterator[tuple[str, tuple[int, int], str, int, str]]:
     """Name, index, axes, power of τ and unit of each factor; the diagonal of m is not one.
 
-    `strength` is the unit of the field, empty if it has none, and `one` stands for no unit.
+    `raw` is the unit of the readings, `strength` that of the field, empty if it has none; `one` stands for no unit.
     """
-    units = {"SF": f"raw/{strength}" if strength else "raw", "B": strength or one, "m": one}
+    units = {"SF": f"{raw}/{strength}" if strength else raw, "B": strength or one, "m": one}
     for name, value in values.items():
         for i, j in np.ndindex(value.shape):
             if name != "m":

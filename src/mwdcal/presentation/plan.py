@@ -269,15 +269,16 @@ def screen(
 
 
 def _assumed(planned: Planned) -> list[str]:
-    """Field and dip of the prediction as a line: those that the plan does not state, if there are any."""
+    """Field, dip and gravity of the prediction as a line: field or dip that the plan does not state, if any."""
     if not planned.calibration.has_field:
         return []
-    _, field, dip = (float(values[0]) for values in planned_earth(planned.plan))
-    words = {"field": f"field_nt {field:,.0f}", "dip": f"dip_deg {np.degrees(dip):g}"}
+    gravity, field, dip = (float(values[0]) for values in planned_earth(planned.plan))
+    words = {"field": f"field {field:,.0f} nT", "dip": f"dip {np.degrees(dip):g}°"}
     blank = [word for name, word in words.items() if _is_blank(planned.plan, name)]
     if blank:
         return [f"the plan does not state the place; assumed: {', '.join(blank)}"]
-    return [f"place: {', '.join(words.values())}"]
+    stated = [] if _is_blank(planned.plan, "gravity") else [f"gravity {gravity:.5g} g"]
+    return [f"place: {', '.join([*words.values(), *stated])}"]
 
 
 def _practice(facts: Sequence[PlanSummary]) -> list[str]:

@@ -24,8 +24,8 @@ from mwdcal.identification.proposal import (
     stated_references,
 )
 from mwdcal.presentation.envelope import json_document
-from mwdcal.presentation.numbers import files_written, norths
-from mwdcal.presentation.text import one_line, plural, table
+from mwdcal.presentation.numbers import RAW_UNIT, files_written, norths, raw_unit
+from mwdcal.presentation.text import one_line, page_option, plural, table
 from mwdcal.presentation.typed import findings_with_option_names
 from mwdcal.sensor.profile import Axis, Profile, TableFormat, TriadProfile
 
@@ -99,30 +99,31 @@ def screen(proposal: Proposal, run: Path, output: Path | None, has_roll_test: bo
         [
             kind,
             " ".join(result.axes),
-            _scale(getattr(profile, kind).scale, SCALE_UNITS[kind]),
+            _scale(getattr(profile, kind).scale, profile, kind),
             f"{result.unexplained:.1%}",
             f"{result.next_best:.0%}",
         ]
         for kind, result in proposal.wirings.items()
     ]
     rows += [
-        [kind, "open: fill in", _scale(each.scale, SCALE_UNITS[kind]), "–", "–"]
+        [kind, "open: fill in", _scale(each.scale, profile, kind), "–", "–"]
         for kind, each in proposal.open_axes.items()
     ]
     blocks.append(
         table(rows, ["triad", "axes", "nominal scale", "variation left", "by the next best axes"])
     )
     if output:
-        command = (
-            f"mwdcal calibrate {one_line(str(run))} --tool {one_line(str(output))} -o tool.json"
-        )
-        command += f" --rolltest {one_line(str(run))}" if has_roll_test else ""
+        result = one_line(output.with_suffix(".json"))
+        command = f"mwdcal calibrate {one_line(run)} --tool {one_line(output)} -o {result}"
+        command += f" --rolltest {one_line(run)}" if has_roll_test else ""
+        command += page_option(output.with_suffix(".html"))
         if depths_of_surveys(proposal):
-            command = f"mwdcal survey TOOL.json {one_line(str(run))} -o well.csv"
+            command = f"mwdcal survey TOOL.json {one_line(run)} -o well.csv"
+            command += page_option("well.html")
         elif proposal.open_axes:
-            command = f"fill in the axes in {one_line(str(output))}, then {command}"
+            command = f"fill in the axes in {one_line(output)}, then {command}"
         exact = (
-            f"The angles of the stand count as exact until [stand] in {one_line(str(output))} states their 1σ.\n"
+            f"The angles of the stand count as exact until [stand] in {one_line(output)} states their 1σ.\n"
             if has_angles(proposal) and not stand_in_settings()
             else ""
         )
@@ -146,8 +147,11 @@ def _of_place(proposal: Proposal) -> list[list[str]]:
     ]
 
 
-def _scale(scale: float | None, unit: str) -> str:
-    return f"{scale:g} raw units per {unit}" if scale else "left open: no field strength"
+def _scale(scale: float | None, profile: Profile, kind: str) -> str:
+    if not scale:
+        return "left open: no field strength"
+    unit = raw_unit(profile, kind)
+    return f"{scale:g} {'raw units' if unit == RAW_UNIT else unit} per {SCALE_UNITS[kind]}"
 
 
 def _layout(proposal: Proposal, form: TableFormat, run: Path) -> str:

@@ -37,7 +37,6 @@ from mwdcal.presentation.numbers import files_written
 from mwdcal.presentation.text import one_line, table
 
 IN_SHORT = {
-    "unsigned": "unsigned calibration",
     "intact": "signature intact, key {key}",
     "altered": "signature ALTERED",
     "unknown": "signed by unknown key {key}",
@@ -45,7 +44,7 @@ IN_SHORT = {
     "retired": "signed by RETIRED key {key}",
     "unchecked": "signature not checked, key {key}",
 }
-"""The states of a calibration's signature, as part of a line."""
+"""The states of a calibration's signature, as part of a line; an unsigned one is a finding where keys are named."""
 PDF_UNSIGNED = (
     "{name} carries no signature that can be checked: nothing shows that the pages are those of the JSON in it. "
     "Issue it with the private key: mwdcal certificate … --private-key."
@@ -85,10 +84,11 @@ class KeysDocument(msgspec.Struct, frozen=True, kw_only=True):
     keys: list[TrustedKey]
 
 
-def signature_status(check: SignatureCheck) -> str:
-    """The state of a calibration's signature, as part of a line."""
+def signature_status(check: SignatureCheck) -> list[str]:
+    """The state of a calibration's signature as a part of a line, if it has one."""
     name = f"{check.key} ({check.owner})" if check.owner else check.key
-    return one_line(IN_SHORT[check.state].format(key=name))
+    words = IN_SHORT.get(check.state)
+    return [one_line(words.format(key=name))] if words else []
 
 
 def signed_document(data: bytes, path: Path, folder: Path) -> tuple[SignedDocument, dict[str, Any]]:

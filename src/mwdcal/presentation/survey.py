@@ -403,7 +403,7 @@ def screen(
     if facts.blind:
         counts.append(f"{facts.blind} blind to interference")
     heading = [well.readings.source, plural(facts.rows, "survey"), *counts]
-    heading += [signature_status(signature), *simulated(*metadata)]
+    heading += [*signature_status(signature), *simulated(*metadata)]
     lines = [
         "   ".join(heading),
         f"azimuths from {facts.north} north{declination_in_words(facts)}   limits {limits_in_words(well, facts)}",

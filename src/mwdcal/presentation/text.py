@@ -8,6 +8,7 @@ import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
+from importlib.util import find_spec
 from itertools import zip_longest
 from typing import Any, TypeAlias
 
@@ -62,6 +63,12 @@ def one_line(text: object) -> str:
     ['S[a1]', 'A\\x1b[2JPASS', 'a\\nb']
     """
     return _UNSAFE.sub(_escape, str(text))
+
+
+def page_option(page: object) -> str:
+    """The option with which a next command writes a page too; blank where what draws it is not installed."""
+    drawn = all(map(find_spec, ("jinja2", "matplotlib")))
+    return f" --report {one_line(page)}" if drawn else ""
 
 
 def escape_controls(text: str) -> str:

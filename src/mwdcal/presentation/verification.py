@@ -50,7 +50,7 @@ def screen(
     if free := result.left_open:
         outcome += f": nothing wrong was found; the calibration leaves {free} open"
     first = [outcome, result.run, f"{result.stations} stations"]
-    first += [signature_status(signature)] if signature else []
+    first += signature_status(signature) if signature else []
     first += simulated(*metadata)
     source = f" ({result.source})" if result.source else ""
     lines = [

@@ -76,8 +76,8 @@ def command(
         readings=readings_digest,
     )
     corrected = f"{tally.rows} rows corrected" + (f", {blank} of them blank" if blank else "")
-    signed = one_line(signature_status(loaded.signature))
-    said = [corrected, f"wrote {one_line(output)}", signed, *simulated(fitted.tool)]
+    signed = signature_status(loaded.signature)
+    said = [corrected, f"wrote {one_line(output)}", *signed, *simulated(fitted.tool)]
     document = with_signature(document, loaded.signature)
     angles = filter(None, [_angles_in_words(tally.angles)])
     lines = ["   ".join(said), *angles, *([terms.sentence] if uncertainty else [])]

@@ -43,7 +43,7 @@ def command(folder: Path, as_json: bool) -> None:
     from mwdcal.calibration.readings import SIMULATED
     from mwdcal.files.formats import atomic
     from mwdcal.presentation.envelope import ExampleDocument, json_document
-    from mwdcal.presentation.text import one_line, table
+    from mwdcal.presentation.text import one_line, page_option, table
 
     if folder.exists() and not folder.is_dir():
         raise InputError(f"cannot write into '{folder}': it is not a folder. Name another one.")
@@ -55,10 +55,13 @@ def command(folder: Path, as_json: bool) -> None:
     contents = [source.joinpath(name).read_bytes() for name in CONTENTS]
     folder.mkdir(parents=True, exist_ok=True)
     atomic.write_all(zip(files, contents, strict=True))
-    run, tool = (one_line(folder / name) for name in ("run.csv", "tool.toml"))
+    names = ("run.csv", "tool.toml", "tool.json")
+    run, tool, result = (one_line(folder / name) for name in names)
     rows = [[str(file), what] for file, what in zip(files, CONTENTS.values(), strict=True)]
     screen = f"{table(rows, [f'wrote, all {SIMULATED}', ''])}\n\n"
-    screen += f"next: mwdcal calibrate {run} --tool {tool} -o tool.json"
+    screen += (
+        f"next: mwdcal calibrate {run} --tool {tool} -o {result}{page_option(folder / 'tool.html')}"
+    )
     written = ExampleDocument(folder=str(folder), files=[str(file) for file in files])
     document = json_document("example", written, {"simulated": True})
     print_result(document if as_json else screen)

@@ -94,6 +94,13 @@ def chances(result: Fit) -> tuple[Array, Bools]:
     return least, hidden
 
 
+def chances_without_drift(result: Fit, options: Options) -> Array:
+    """The probabilities (B, t) of fits without the drifts that they have; NaN where no drift is looked for."""
+    if _apart(result, options):
+        return np.full(result.analysis.freedom.shape, np.nan)
+    return chances(_without_drift(result, options))[0]
+
+
 def _scores(result: Fit) -> Iterator[tuple[drift.WalkScores, dict[str, Array]]]:
     """Scores of all walks, and how much of the trend of each is `shown`.
 

@@ -16,6 +16,7 @@ from mwdcal.calibration.automatic.courses import (
     terms_beyond,
     untested,
 )
+from mwdcal.calibration.automatic.drift import chances_without_drift
 from mwdcal.calibration.copies import AGREEING, repeated
 from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag, listed, spaced
 from mwdcal.calibration.diagnosis.plausibility import (
@@ -41,6 +42,7 @@ from mwdcal.calibration.results import (
     reading_noise,
     unconfirmed_dip,
 )
+from mwdcal.estimation.batch import take
 from mwdcal.estimation.problem import WALK_AXES, Prior
 from mwdcal.estimation.solvers import Determined
 from mwdcal.estimation.uncertainty import fisher_tail, free_directions, per_freedom
@@ -103,6 +105,8 @@ LARGEST_DEVIATION = 37.0
 """Larger deviations have no figure: a normal variable's chance is then below 1e-300."""
 FOLLOWED = 0.9
 """Share of a drift within the run that goes with a column, from which the column is named."""
+RARE_CHANCE = 1e-4
+"""The share of runs below which a chance has no figure in words."""
 UNUSED, MARKED_ROWS, ROLL_TEST_READ = "unused-columns", "marked-rows", "roll-test-read"
 COLUMNS_READ = "columns-read"
 """The id of the finding with the names by which surveys were read."""
@@ -142,11 +146,12 @@ REMARKS = {
     "the model is wrong. The uncertainty is scaled up as if each station had an error of its own; an error that "
     "stations share may be larger than it says.",
     "field-drift": "Readings follow the order of the stations as if the field drifted by {change:.2g} {unit} (1σ "
-    "{sd:.1g} {unit}) during the run. The fit allows for this drift, and the uncertainty includes it. Give "
+    "{sd:.2g} {unit}) during the run{by_noise}. The fit allows for this drift, and the uncertainty includes it. Give "
     "ref_field_nt and ref_dip_deg of each station from a reference magnetometer, or repeat the run at a quiet time.",
     "drift": "Readings follow the order of the stations as if the offsets of the {triad} drifted by "
-    "{change:.2g} {unit} (1σ {sd:.1g} {unit}) during the run. The fit allows for this drift, and the uncertainty "
-    "includes it. Let the tool warm up, and change inclination and azimuth in another order than from end to end.",
+    "{change:.2g} {unit} (1σ {sd:.2g} {unit}) during the run{by_noise}. The fit allows for this drift, and the "
+    "uncertainty includes it. Let the tool warm up, and change inclination and azimuth in another order than "
+    "from end to end.",
     "column-explains": "The drift within the run goes with the column {column!r}, which is not used. If it is the "
     "temperature of the tool, name it 'temperature_c' (°C), or under [columns] of the tool profile; else find out what "
     "it stands for.",
@@ -438,14 +443,30 @@ def _gravity(fitted: FittedRuns) -> Flag:
 
 def _drifts(fitted: FittedRuns) -> Iterator[Flag]:
     """Drifts that are larger than what may be noise."""
-    for name, (change, sd) in drifts(fitted.result).items():
+    sizes = drifts(fitted.result)
+    shown = {name: change > SHOWN_DRIFT * sd for name, (change, sd) in sizes.items()}
+    chance = np.full(fitted.result.analysis.freedom.shape, np.nan)
+    places = np.flatnonzero(np.any([np.zeros(fitted.count, bool), *shown.values()], 0))
+    if places.size:
+        chance[places] = chances_without_drift(take(fitted.result, places), fitted.options)
+    for name, (change, sd) in sizes.items():
         triad = name.removesuffix("-drift")
         scale, unit = shown_in(
             "gravity" if triad == TRIADS[0] else "field", fitted.readings.relative
         )
         words = REMARKS["drift" if triad in TRIADS else name]
         values = {"triad": triad, "change": change * scale, "sd": sd * scale, "unit": unit}
-        yield Flag(name, change > SHOWN_DRIFT * sd, words, values)
+        by_noise = partial(_by_noise, chance[:, 0 if triad == TRIADS[0] else 1])
+        yield Flag(name, shown[name], words, {**values, "by_noise": by_noise})
+
+
+def _by_noise(chance: Array, place: int) -> str:
+    """How often noise leaves a member's evidence of a drift in runs without one; blank where it was not tested."""
+    if np.isnan(chance[place]):
+        return ""
+    rare = chance[place] < RARE_CHANCE
+    share = f"under {100 * RARE_CHANCE:g} %" if rare else f"{100 * chance[place]:.2g} %"
+    return f"; noise alone shows as much in {share} of steady runs"
 
 
 def _followed(fitted: FittedRuns) -> Iterator[Flag]:
