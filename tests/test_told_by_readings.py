@@ -14,6 +14,7 @@ from cli_support import mwdcal, refused, servo_run, write_csv
 from mwdcal.errors import FitError
 from mwdcal.files.formats.title_references import doubtful_in, references_in, stated_above
 from mwdcal.files.formats.titles import titles
+from mwdcal.identification.columns import meaning
 from test_tables_as_they_come import calibrated, findings_of, mixed, read, table, written
 
 FIELD, DIP, GRAVITY = 50_123.0, 66.12, 9.8123 / 9.80665
@@ -633,3 +634,67 @@ def test_channels_named_by_axis_and_triad_in_two_blocks_of_the_same_stations(tmp
     path.write_text("\n\n".join(f"{p.stem} sensors\n{p.read_text()}" for p in blocks))
     used = library.propose_profile(path).profile.columns
     assert [used[c].name for c in ("ax", "mz")] == ["XA (V)", "ZM (V)"]
+
+
+def test_a_row_with_a_remark_counts_where_its_readings_fit_and_is_asked_about_else(tmp_path):
+    note = ["forklift moved, waited" if k == 20 else "" for k in range(48)]
+    path = written(tmp_path / "a.csv", table(Note=note))
+    proposal = library.propose_profile(path)
+    assert library.read_run(path, proposal.profile).count == 48
+    assert "'Note' says 'forklift moved, waited'" in findings_of(proposal)["marked-rows"]
+    left_out = read(path, leave_out={"Note": [note[20]]})
+    assert left_out.count == 47
+    run = table(Note=note)
+    run["Hx (V)"] = np.array(run["Hx (V)"])
+    run["Hx (V)"][20] += 0.3
+    with pytest.raises(FitError, match="keep='Note=forklift moved, waited'"):
+        library.propose_profile(written(tmp_path / "b.csv", run))
+
+
+@pytest.mark.parametrize(
+    ("lines", "stated"),
+    [
+        (["Tyngde i Stavanger (brukssted) 9,81873 m/s²", "Tyngde i Trondheim (lab, målt) 9,82152 m/s²"],
+         {"ref_gravity_g": 9.82152 / 9.80665}),
+        (["Field at stand, 2016 survey 48655 nT", "Field at stand, today (Overhauser) 48890 nT"],
+         {"ref_field_nt": 48_890}),
+        (["Calibrated at: Midland TX", "Gravity Houston (office) 9.7930 m/s2", "Gravity Midland 9.7914 m/s2"],
+         {"ref_gravity_g": 9.7914 / 9.80665}),
+        (["Ref field 57.480 uT", "spec: Gtot 9.81 +/-0.03, Btot 57.5 +/-0.3"], {"ref_field_nt": 57_480}),
+    ],
+)  # fmt: skip
+def test_of_two_references_the_one_of_here_and_today_holds(lines, stated):
+    found = stated_above([[line] for line in lines]).metadata
+    assert {k: v for k, v in found.items() if k.startswith("ref_")} == pytest.approx(
+        stated, rel=1e-9
+    )
+
+
+def test_blocks_below_the_names_of_the_triads_are_one_table(tmp_path):
+    """Accelerometers, then magnetometers at the same points, both called X, Y and Z."""
+    run = table()
+    angles = {n: v for n, v in run.items() if n[0] not in "GHT" or n == "TF (deg)"}
+    text = ["Tool shop"]
+    for title, triad in (
+        ("BLOCK 1 - ACCELEROMETERS (V)", "G"),
+        ("BLOCK 2 - MAGNETOMETERS (V), same points", "H"),
+    ):
+        block = angles | {n.upper(): run[f"{triad}{n} (V)"] for n in "xyz"}
+        text += [f'"{title}"', written(tmp_path / "b.csv", block).read_text()]
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(text))
+    one, whole = read(path), read(written(tmp_path / "c.csv", table(temperature_c=None)))
+    np.testing.assert_array_equal(one.accelerometer, whole.accelerometer)
+    np.testing.assert_array_equal(one.magnetometer, whole.magnetometer)
+
+
+@pytest.mark.parametrize(
+    ("name", "column"),
+    [("Inc mesa (º)", "ref_inclination_deg"), ("Roll (Teilkopf) °", "ref_toolface_deg"),
+     ("Bohrlochrichtung", "ref_azimuth_deg"), ("Boreh.inkl. (°)", "ref_inclination_deg"),
+     ("Inc'n", "ref_inclination_deg"), ("Az'th", "ref_azimuth_deg"), ("Дип, °", "ref_dip_deg"),
+     ("Termopar", "temperature_c"), ("Inc (desired) deg", None), ("Roll (previous) °", None)],
+)  # fmt: skip
+def test_more_names_of_angles(name, column):
+    alike = meaning(name)
+    assert (alike.column if alike else None) == column

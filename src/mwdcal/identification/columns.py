@@ -371,7 +371,7 @@ _NOMINAL = re.compile(
     r"\b(nominale?|target|set|dese[aj]ad[oa]|gew[üu]nscht\w*|[øo]nske[dt]|"
     r"set ?point|soll\w*|eingestellt\w*|vorgabe|satt|innstilt|ajustad[oa]|"
     r"fijad[oa]|"
-    r"definid[oa]|programad[oa]|te[óo]ric[oa]|th[ée]orique|r[ée]gl[ée]e?|vis[ée]e?|установ(ка|лен\w*)|уставк\w*|cmd|command(ed)?|demand(ed)?|required|nom|consign[ea]|comandad[oa]|"
+    r"definid[oa]|programad[oa]|desired|intended|planned|requested|te[óo]ric[oa]|th[ée]orique|r[ée]gl[ée]e?|vis[ée]e?|установ(ка|лен\w*)|уставк\w*|cmd|command(ed)?|demand(ed)?|required|nom|consign[ea]|comandad[oa]|"
     r"зад|zadan\w*|b[öo]rv[äa]rde|задан\w*|номинал\w*)\b|[设给]定|设置|理论|名义|目标|指令値?|目標値?|設定値?",
     re.IGNORECASE,
 )
@@ -607,9 +607,13 @@ def _twice(name: str) -> Resemblance | None:
 
 
 def _at_stand(name: str) -> Resemblance | None:
-    """The angle that a name says beside a word of the stand: Inc mesa (º)."""
-    bare = " ".join(_BY_STAND.sub(" ", name).split())
-    alike = resembled(bare) if bare not in ("", name) and not _BY_TOOL.search(name) else None
+    """The angle that a name says beside a word of the stand, or of a part in brackets: Inc mesa, Roll (disc)."""
+    if _BY_TOOL.search(name) or _NO_STAND.search(name) or _NOMINAL.search(name):
+        return None
+    aside = re.search(r"\s*\(([^()]*)\)(?=\s*\S)", name)
+    part = aside[0] if aside and not unit_of(aside[1]) and not resembled(aside[1]) else ""
+    bare = " ".join(_BY_STAND.sub(" ", name.replace(part, " ") if part else name).split())
+    alike = resembled(bare) if bare not in ("", name) else None
     return alike if alike and alike.column in _ANGLES_AND_WARMTH[:3] else None
 
 

@@ -338,7 +338,7 @@ class Proposal(NamedTuple):
     unit no name states; `metadata` what the table says of itself; `where` the table was, if it was looked for;
     `open_axes` the triads of which the run does not tell the axes, `ignored` columns that are called as references
     but hold no references, each with the reason; `by_readings` what the names leave open and the readings answer;
-    `source` the name of the file.
+    `source` the name of the file; `all_fit`: no station is far from what the others tell.
     """
 
     profile: Profile
@@ -354,6 +354,7 @@ class Proposal(NamedTuple):
     ignored: Mapping[str, str] = {}
     by_readings: tuple[str, ...] = ()
     source: str = ""
+    all_fit: bool = False
 
 
 def propose(
@@ -398,18 +399,55 @@ def propose(
                 path, sheet=sheet, header_row=header_row, decimal=decimal, answers=answers, stated=stated,
                 north=north, leave_out=blank, keep=keep,
             )  # fmt: skip
+        if kept := _remarked_rows(error, keep or {}):
+            with suppress(InputError, FitError):
+                proposal = propose(
+                    path, sheet=sheet, header_row=header_row, decimal=decimal, answers=answers, stated=stated,
+                    north=north, leave_out=leave_out, keep=kept,
+                )  # fmt: skip
+                if proposal.all_fit:
+                    return proposal._replace(remarks=(*proposal.remarks, _said_of_kept(error)))
         if proposal := _answer_by_readings(error, with_answers, names, table):
             return proposal
         raise
+
+
+def _questions_of(error: QuestionError | QuestionsError) -> Sequence[QuestionError]:
+    return error.questions if isinstance(error, QuestionsError) else (error,)
+
+
+def _remarked_rows(
+    error: QuestionError | QuestionsError, keep: Mapping[str, Sequence[str]]
+) -> dict[str, list[str]]:
+    """Rows to keep besides, by column, with a remark that may speak of something else; empty where none has."""
+    every = {name: [*cells] for name, cells in keep.items()}
+    for each in _questions_of(error):
+        for option, text in each.answers[0].arguments if each.answers else ():
+            if option == "keep":
+                name, _, cell = text.partition("=")
+                every.setdefault(name, []).append(cell)
+    return {} if every == {**keep} else every
+
+
+def _said_of_kept(error: QuestionError | QuestionsError) -> str:
+    """The sentence on rows with remarks whose readings fit those of the others."""
+    asked = [
+        e for e in _questions_of(error) if e.answers and e.answers[0].arguments[0][0] == "keep"
+    ]
+    rows = [e.text.partition(": ")[2].partition(". Is that")[0] for e in asked]
+    said = asked[0].answers[0].arguments[0][1]
+    return (
+        f"used, as the readings fit those of the others: {'; '.join(rows)}. If it is to be left out, say so by "
+        f"`leave_out` {said!r}."
+    )
 
 
 def _cells_without_reading(
     error: QuestionError | QuestionsError, leave_out: Mapping[str, Sequence[str]]
 ) -> dict[str, list[str]]:
     """Rows to leave out besides, by column, for cells that are blank or say that there is no reading."""
-    questions = error.questions if isinstance(error, QuestionsError) else (error,)
     every = {name: [*cells] for name, cells in leave_out.items()}
-    only = (each.answers[0].arguments for each in questions if len(each.answers) == 1)
+    only = (each.answers[0].arguments for each in _questions_of(error) if len(each.answers) == 1)
     for arguments in only:
         pairs = [text.partition("=") for option, text in arguments if option == "leave_out"]
         if len(pairs) == len(arguments) and all(
@@ -463,6 +501,7 @@ def _proposal(
     return Proposal(
         _without_the_usual(profile), wirings, readings.count, readings.unused, tuple(remarks), by_value,
         readings.metadata, readings.run_sha256, where, open_axes, ignored, source=table.source,
+        all_fit=_all_fit(readings, wirings),
     )  # fmt: skip
 
 
@@ -607,7 +646,7 @@ def _answer_by_readings(
     None too where another answer is a column of the same angle, in whatever unit, sense or zero: it may be that of
     the stand, and the one that fits that of the tool.
     """
-    questions = error.questions if isinstance(error, QuestionsError) else (error,)
+    questions = _questions_of(error)
     choices = [
         [answer for answer in each.answers if _is_of_readings(answer, each)] for each in questions
     ]
@@ -1063,16 +1102,46 @@ def _left(readings: Readings, wirings: Mapping[str, Wiring], angles: Mapping[str
         return 1.0
     known = {c.removeprefix("ref_").removesuffix("_deg"): np.radians(v) for c, v in angles.items()}
     turned = replace(readings, known={**readings.known, **known})
-    whole = np.all([~np.isnan(turned.reference(n)) for n in NEEDED[kind]], 0)
-    parts = np.concatenate(_parts(kind, turned, whole), -1)
+    parts, raw = _regressors(turned, kind)
+    if len(raw) < _MOST_COLUMNS * parts.shape[-1]:
+        return 1.0
+    return float(np.sqrt(np.mean(_line(parts - parts.mean(0), raw - raw.mean(0))[1] ** 2)))
+
+
+def _regressors(readings: Readings, kind: str) -> tuple[Array, Array]:
+    """What the readings of a triad depend on at stations of known attitude (n, K), and the readings (n, 3)."""
+    whole = np.all([~np.isnan(readings.reference(n)) for n in NEEDED[kind]], 0)
+    parts = np.concatenate(_parts(kind, readings, whole), -1)
     if readings.temperature is not None:
         warmth = readings.temperature[whole, None]
         if np.ptp(warmth) > 0 and np.isfinite(warmth).all():
             parts = np.concatenate([parts, warmth, (warmth - warmth.mean()) * parts], -1)
-    raw = getattr(readings, kind)[whole]
-    if len(raw) < _MOST_COLUMNS * parts.shape[-1]:
-        return 1.0
-    return float(np.sqrt(np.mean(_line(parts - parts.mean(0), raw - raw.mean(0))[1] ** 2)))
+    return parts, getattr(readings, kind)[whole]
+
+
+def _all_fit(readings: Readings, wirings: Mapping[str, Wiring]) -> bool:
+    """Whether no reading lies far from the line of all, by the median of the distances, and all stations tell.
+
+    The distances are those of each reading from the line, divided by how much less they scatter as it pulls the line.
+    """
+    for kind in wirings:
+        parts, raw = _regressors(readings, kind)
+        design = np.column_stack([parts - parts.mean(0), np.ones(len(parts))])
+        if len(raw) < readings.count or len(raw) < _MOST_COLUMNS * design.shape[-1]:
+            return False
+        basis = np.linalg.qr(design)[0]
+        left = raw - basis @ (basis.T @ raw)
+        free = np.sqrt(np.maximum(1 - np.sum(basis**2, -1), 1e-9))[:, None]
+        usual = np.median(np.abs(left / free), 0) / _MEDIAN_OF_NORMAL
+        if np.any(np.abs(left / free) > _FAR_OFF * usual):
+            return False
+    return bool(wirings)
+
+
+_MEDIAN_OF_NORMAL = 0.6745
+"""Median of the absolute value of a normal variable of variance 1."""
+_FAR_OFF = 5.0
+"""Standard deviations beyond which a reading does not fit the others."""
 
 
 _MOST_COLUMNS = 2

@@ -956,13 +956,16 @@ def _is_short(row: Cells) -> bool:
 
 
 def _begins_anew(rows: Sequence[tuple[int, Cells]], heads: Sequence[int], place: int) -> bool:
-    """Whether a head is that of another table: of other names, or below the serial of another tool."""
+    """Whether a head is that of another table: of other names, or below another triad or the serial of another tool."""
     if not _repeats(rows[place][1], rows, heads[0]):
         return True
     between = [
         " ".join(map(as_text, row)) for _, row in rows[heads[-1] : place] if not _is_reading(row)
     ]
     if any(ADJUSTED.search(text) or _OF_ROLL_TEST.search(text) for text in between[1:]):
+        return True
+    first = " ".join(_text(row) for _, row in rows[max(0, heads[-1] - 1) : heads[-1]])
+    if _triads_in(first) and _triads_in(" ".join(between[1:])) - _triads_in(first):
         return True
     ours, theirs = (
         {tool for _, row in part if not _is_reading(row) and (tool := tool_in(row))}
@@ -1169,9 +1172,14 @@ _OF_TRIAD = re.compile(
 )
 
 
+def _triads_in(text: str) -> set[str]:
+    """The triads of which a line speaks, in short: acc, mag."""
+    return {match[1].lower() for match in _OF_TRIAD.finditer(spelled(text))}
+
+
 def _with_triad_above(layout: Layout) -> Layout:
     """A table whose names of axes alone have the triad and the unit of the line above the names."""
-    triads = {match[1].lower() for match in _OF_TRIAD.finditer(spelled(layout.heading))}
+    triads = _triads_in(layout.heading)
     axes = [k for k, name in enumerate(layout.names) if _AXIS.fullmatch(name)]
     if len(triads) != 1 or len(axes) != len("xyz"):
         return layout

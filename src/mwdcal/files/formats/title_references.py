@@ -353,6 +353,7 @@ _OF_LIMITS = re.compile(
     r"toleranser?|limites?|tolerancias?|limiti|tolleranze|допуск\w*|пределы|限差|公差)\W*"
 )
 """A line above limits, which are no references."""
+_LIMITS_STATED = re.compile(rf"(specs?|specifications?|{_OF_LIMITS.pattern})\s*[:=]")
 
 
 def stated_above(
@@ -370,11 +371,41 @@ def stated_above(
     above, beside = ([r for r in each if not _is_of_settings(r)] for each in (rows, besides))
     here = _of_this_place(_without_limits(above), elsewhere)
     values = _values_in(here, _without_limits(beside))
+    for column in [c for c, each in values.items() if len(each) > 1]:
+        values[column] = _of_the_stand(column, values[column], here, elsewhere)
     references = _only(values)
     rough = {c: text for c, text in doubtful_in(rows, besides).items() if c not in references}
     choices = {c: tuple(each) for c, each in values.items() if len(each) > 1}
     metadata = {**references, **block.metadata}
     return block._replace(metadata=metadata, not_taken=rough, choices=choices)
+
+
+def _of_the_stand(
+    column: str, values: dict[float, None], rows: Rows, elsewhere: str
+) -> dict[float, None]:
+    """Of different values of a reference the one of here or today; or of the place that another line names."""
+    every = {_plain(_line(row)): _values_in([row]) for row in rows}
+    stating = {line: each[column] for line, each in every.items() if each.get(column)}
+    beside = [_plain(elsewhere), *(line for line, each in every.items() if not any(each.values()))]
+    others = {*re.findall(_LONG_WORD, " ".join(beside))}
+    words = {line: {*re.findall(_LONG_WORD, line)} for line in stating}
+    shared = set[str].intersection(*words.values()) if words else set()
+    for marked in (
+        [line for line in words if _HERE.search(line)],
+        [line for line, each in words.items() if (each - shared) & others],
+    ):
+        here = {v: None for line in marked for v in stating[line] if v in values}
+        if len(here) == 1:
+            return here
+    return values
+
+
+_LONG_WORD = r"[^\W\d_]{4,}"
+_HERE = re.compile(
+    r"(?<![^\W\d_])(lab\w*|here|this (site|place)|stand|bench|today|hier|messplatz|prufstand|heute|her|i ?dag|aqui|"
+    r"hoy|hoje|здесь|сегодня|стенд\w*)(?![^\W\d_])|本地|本站|今天|实验室",
+)
+"""Words of the place and the day of a calibration."""
 
 
 def _without_limits(rows: Rows) -> list[Sequence[object]]:
@@ -384,7 +415,7 @@ def _without_limits(rows: Rows) -> list[Sequence[object]]:
         text = _plain(_line(row)).strip()
         numbered = bool(re.search(r"\d", text))
         limits = bool(_OF_LIMITS.fullmatch(text)) or (limits and numbered)
-        kept += [] if limits else [row]
+        kept += [] if limits or _LIMITS_STATED.match(text) else [row]
     return kept
 
 
