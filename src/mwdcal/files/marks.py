@@ -144,6 +144,15 @@ def is_the_repeat(table: Table, row: int, cell: str) -> bool:
     return True
 
 
+def refuses(text: str) -> bool:
+    """Whether a remark has a word that rejects a row, be it its own or another one.
+
+    >>> refuses("repeat of rejected 6"), refuses("stand bumped, waited")
+    (True, False)
+    """
+    return bool(_REFUSED.search(_plain(text)))
+
+
 def _verdicts(name: str, cells: Sequence[str]) -> dict[str, bool]:
     """The cells of a column that reject their rows (true), or may do so (false)."""
     different = {*cells}

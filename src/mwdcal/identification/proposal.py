@@ -42,6 +42,7 @@ from mwdcal.files.marks import (
     is_the_repeat,
     marks_in,
     place,
+    refuses,
     without_rejected,
 )
 from mwdcal.files.metadata import toml
@@ -401,12 +402,12 @@ def propose(
             )  # fmt: skip
         if kept := _remarked_rows(error, keep or {}):
             with suppress(InputError, FitError):
-                proposal = propose(
+                with_rows = propose(
                     path, sheet=sheet, header_row=header_row, decimal=decimal, answers=answers, stated=stated,
                     north=north, leave_out=leave_out, keep=kept,
                 )  # fmt: skip
-                if proposal.all_fit:
-                    return proposal._replace(remarks=(*proposal.remarks, _said_of_kept(error)))
+                if with_rows.all_fit:
+                    return with_rows._replace(remarks=(*with_rows.remarks, _said_of_kept(error)))
         if proposal := _answer_by_readings(error, with_answers, names, table):
             return proposal
         raise
@@ -423,19 +424,20 @@ def _remarked_rows(
     every = {name: [*cells] for name, cells in keep.items()}
     for each in _questions_of(error):
         for option, text in each.answers[0].arguments if each.answers else ():
-            if option == "keep":
-                name, _, cell = text.partition("=")
+            name, _, cell = text.partition("=")
+            if option == "keep" and not refuses(cell):
                 every.setdefault(name, []).append(cell)
     return {} if every == {**keep} else every
 
 
 def _said_of_kept(error: QuestionError | QuestionsError) -> str:
     """The sentence on rows with remarks whose readings fit those of the others."""
-    asked = [
-        e for e in _questions_of(error) if e.answers and e.answers[0].arguments[0][0] == "keep"
-    ]
-    rows = [e.text.partition(": ")[2].partition(". Is that")[0] for e in asked]
-    said = asked[0].answers[0].arguments[0][1]
+    rows, said = [], ""
+    for each in _questions_of(error):
+        option, text = each.answers[0].arguments[0] if each.answers else ("", "")
+        if option == "keep":
+            rows.append(each.text.partition(": ")[2].partition(". Is that")[0])
+            said = said or text
     return (
         f"used, as the readings fit those of the others: {'; '.join(rows)}. If it is to be left out, say so by "
         f"`leave_out` {said!r}."

@@ -391,7 +391,7 @@ def _of_the_stand(
     words = {line: {*re.findall(_LONG_WORD, line)} for line in stating}
     shared = set[str].intersection(*words.values()) if words else set()
     for marked in (
-        [line for line in words if _HERE.search(line)],
+        [line for line in words if _OF_HERE.search(line)],
         [line for line, each in words.items() if (each - shared) & others],
     ):
         here = {v: None for line in marked for v in stating[line] if v in values}
@@ -401,7 +401,7 @@ def _of_the_stand(
 
 
 _LONG_WORD = r"[^\W\d_]{4,}"
-_HERE = re.compile(
+_OF_HERE = re.compile(
     r"(?<![^\W\d_])(lab\w*|here|this (site|place)|stand|bench|today|hier|messplatz|prufstand|heute|her|i ?dag|aqui|"
     r"hoy|hoje|здесь|сегодня|стенд\w*)(?![^\W\d_])|本地|本站|今天|实验室",
 )
