@@ -353,7 +353,9 @@ _OF_RESIDUALS = re.compile(
     re.IGNORECASE,
 )
 """Words of what a fit has left of a channel."""
-_OF_FIELD = re.compile(r"field|fel[dt]|campo|champ|поле|磁场|proton|overhauser", re.IGNORECASE)
+_OF_FIELD = re.compile(
+    r"field|fel[dt]|base ?mag|campo|champ|поле|磁场|proton|overhauser", re.IGNORECASE
+)
 _MEASURED = re.compile(
     r"\b(measured|meas|calc|calculated|computed|corr|corrected|gemessen|m[åa]lt|sum|ist|mwd|survey|"
     r"(be|er)rechnet\w*|beregnet|berekend\w*|calculad[oa]|computad[oa]|calcul[ée]e?|calcolat[oa]|расч[её]?т\w*|"
@@ -369,7 +371,7 @@ _NO_STAND = re.compile(
 """Words of columns of angles that do not belong to the stand."""
 _NOMINAL = re.compile(
     r"\b(nominale?|target|set|dese[aj]ad[oa]|gew[üu]nscht\w*|[øo]nske[dt]|"
-    r"set ?point|soll\w*|eingestellt\w*|vorgabe|satt|innstilt|ajustad[oa]|"
+    r"set ?point|soll\w*|eingestellt\w*|vorgabe|satt|innstilt|innst|ajustad[oa]|"
     r"fijad[oa]|"
     r"definid[oa]|programad[oa]|desired|intended|planned|requested|te[óo]ric[oa]|th[ée]orique|r[ée]gl[ée]e?|vis[ée]e?|установ(ка|лен\w*)|уставк\w*|cmd|command(ed)?|demand(ed)?|required|nom|consign[ea]|comandad[oa]|"
     r"зад|zadan\w*|b[öo]rv[äa]rde|задан\w*|номинал\w*)\b|[设给]定|设置|理论|名义|目标|指令値?|目標値?|設定値?",
@@ -378,7 +380,7 @@ _NOMINAL = re.compile(
 _ACTUAL = re.compile(
     r"\b(actual|act|achieved|as read|read ?back|read ?out|observed|(ab)?gelesen\w*|avlest|odczyt\w*|"
     r"le[íi]d[oa]|lid[oa]|lue?|"
-    r"relev[ée]e?|r[ée]el(le)?|efetiv[oa]|efectiv[oa]|отсч[её]т\w*|read|reading|encoder|ist|istwert|effettiv[oa]|mesur[ée]e?s?|medid[oa]|zmierzon\w*|"
+    r"relev[ée]e?|r[ée]el(le)?|efetiv[oa]|efectiv[oa]|отсч[её]т\w*|read|reading|encoder|ist|istwerte?|effettiv[oa]|mesur[ée]e?s?|medid[oa]|zmierzon\w*|"
     r"[äa]rv[äa]rde|действит\w*|факт|фактич\w*|измер\w*|real|faktisk)\b|实际|实测|测得|读数|编码器|実測値?|実際",
     re.IGNORECASE,
 )
@@ -677,7 +679,7 @@ def meanings_of(
         results |= {
             n: m._replace(unit=ANTICLOCKWISE)
             for n, m in results.items()
-            if m.column == REFERENCES["toolface"].column and m.unit in ("", "°")
+            if m.column == REFERENCES["toolface"].column and unit_of(m.unit) in ("", "°")
         }
     return results
 
@@ -846,17 +848,22 @@ def shown_beside_set(names: Sequence[str]) -> list[tuple[str, str, str]]:
     >>> shown_beside_set(["Set (Inc)", "Read on cradle (Inc)", "Azi"])
     [('Set (Inc)', 'Read on cradle (Inc)', '(Inc)')]
     """
-    stems = {n: _without(_NOMINAL, n) for n in names}
-    return [
-        (name, other, stem)
-        for name, stem in stems.items()
-        if stem not in ("", name)
-        for other in names
-        if other != name
-        and (re.search(rf"(?<!\w){re.escape(stem)}$", other) or _without(_ACTUAL, other) == stem)
-        and _ACTUAL.search(other)
-        and not _NOMINAL.search(other)
-    ]
+    shown_ones = {
+        n: _without(_ACTUAL, n) for n in names if _ACTUAL.search(n) and not _NOMINAL.search(n)
+    }
+    pairs = []
+    for name in names:
+        stem = _without(_NOMINAL, name)
+        for other, bare in shown_ones.items():
+            ends = re.search(rf"[^\W\d_].*(?<!\w){re.escape(bare)}$", name) if bare else None
+            apart = other != name and not is_computed(name) and not _BY_TOOL.search(name)
+            if stem not in ("", name) and (
+                bare == stem or re.search(rf"(?<!\w){re.escape(stem)}$", other)
+            ):
+                pairs.append((name, other, stem))
+            elif apart and ends and name not in shown_ones:
+                pairs.append((name, other, bare))
+    return pairs
 
 
 def _beside_tool(

@@ -1110,11 +1110,14 @@ def _left(readings: Readings, wirings: Mapping[str, Wiring], angles: Mapping[str
     return float(np.sqrt(np.mean(_line(parts - parts.mean(0), raw - raw.mean(0))[1] ** 2)))
 
 
-def _regressors(readings: Readings, kind: str) -> tuple[Array, Array]:
-    """What the readings of a triad depend on at stations of known attitude (n, K), and the readings (n, 3)."""
+def _regressors(readings: Readings, kind: str, warm: bool = True) -> tuple[Array, Array]:
+    """What the readings of a triad depend on at stations of known attitude (n, K), and the readings (n, 3).
+
+    `warm`: on temperature too.
+    """
     whole = np.all([~np.isnan(readings.reference(n)) for n in NEEDED[kind]], 0)
     parts = np.concatenate(_parts(kind, readings, whole), -1)
-    if readings.temperature is not None:
+    if warm and readings.temperature is not None:
         warmth = readings.temperature[whole, None]
         if np.ptp(warmth) > 0 and np.isfinite(warmth).all():
             parts = np.concatenate([parts, warmth, (warmth - warmth.mean()) * parts], -1)
@@ -1128,6 +1131,8 @@ def _all_fit(readings: Readings, wirings: Mapping[str, Wiring]) -> bool:
     """
     for kind in wirings:
         parts, raw = _regressors(readings, kind)
+        if len(raw) < _MOST_COLUMNS * (parts.shape[-1] + 1):
+            parts, raw = _regressors(readings, kind, warm=False)
         design = np.column_stack([parts - parts.mean(0), np.ones(len(parts))])
         if len(raw) < readings.count or len(raw) < _MOST_COLUMNS * design.shape[-1]:
             return False

@@ -172,6 +172,10 @@ _DAY_OR_MODEL = re.compile(
     r"(?<=igrf|bggm|hdgm)[- ]?(?:\d{1,2}(?![\d.,])|\d{4}(?:\.\d+)?)|(?<=wmm|ifr)[- ]?\d{1,4}(?![\d.,])"
 )
 """A day, and the number of a model of the field."""
+_YEAR = re.compile(
+    rf"(?<=[^\W\d_][ ,.(])\s*(?:19[89]|20[0-3])\d(?![\d.,]|\s*(?:{_WRITTEN_UNIT})|[^\W\d_])"
+)
+"""A year behind a word, which is no number of a reference: May 2023."""
 _TOTAL = re.compile(
     r"(?<![^\W\d_])f\s*[=:]?\s*\d{2}.*(?<![^\W\d_])[hxyz]\s*[=:]?\s*[-−]?\d|"
     r"(?<![^\W\d_])[hxyz]\s*[=:]?\s*[-−]?\d.*(?<![^\W\d_])f\s*[=:]?\s*\d{2}"
@@ -388,11 +392,11 @@ def _of_the_stand(
     stating = {line: each[column] for line, each in every.items() if each.get(column)}
     beside = [_plain(elsewhere), *(line for line, each in every.items() if not any(each.values()))]
     others = {*re.findall(_LONG_WORD, " ".join(beside))}
-    words = {line: {*re.findall(_LONG_WORD, line)} for line in stating}
-    shared = set[str].intersection(*words.values()) if words else set()
+    named = {line: {word for word in others if word in line} for line in stating}
+    shared = set[str].intersection(*named.values()) if named else set()
     for marked in (
-        [line for line in words if _OF_HERE.search(line)],
-        [line for line, each in words.items() if (each - shared) & others],
+        [line for line in stating if _OF_HERE.search(line)],
+        [line for line, each in named.items() if each - shared],
     ):
         here = {v: None for line in marked for v in stating[line] if v in values}
         if len(here) == 1:
@@ -400,7 +404,7 @@ def _of_the_stand(
     return values
 
 
-_LONG_WORD = r"[^\W\d_]{4,}"
+_LONG_WORD = rf"{_CHINESE}{{2,}}|(?:(?!{_CHINESE})[^\W\d_]){{4,}}"
 _OF_HERE = re.compile(
     r"(?<![^\W\d_])(lab\w*|here|this (site|place)|stand|bench|today|hier|messplatz|prufstand|heute|her|i ?dag|aqui|"
     r"hoy|hoje|здесь|сегодня|стенд\w*)(?![^\W\d_])|本地|本站|今天|实验室",
@@ -463,7 +467,7 @@ def _is_of_place(row: Sequence[object]) -> bool:
     return bool(re.match(r"[^\W\d_]", first)) and len(filled) > 1 and numbers
 
 
-_SPLIT_BEFORE = re.compile(r"(?P<words>.*?)(?P<digits>(?<![\d.,])\d+)$")
+_SPLIT_BEFORE = re.compile(r"(?P<words>.*?)(?P<digits>(?<![\w.,])\d+)$")
 _SPLIT_BEHIND = re.compile(r"(?P<digits>\d+)(?P<point>\.\d+)?(?!\d)(?P<text>.*)")
 
 
@@ -567,7 +571,7 @@ def _with_columns(rows: Rows) -> list[Sequence[object]]:
             words = texts
         cells = [as_text(cell).strip() for cell in below]
         if (
-            not any(re.match(r"[-−+]?\d", word) for word in words)
+            not any(re.match(r"[-−+]?\d|.*(\d{3}|:\s*\S)", word) for word in words)
             and len([*filter(None, words)]) > 1
         ):
             paired += [
@@ -711,7 +715,8 @@ def _clauses(row: Sequence[object]) -> str:
     """The cells of a row in small letters, a semicolon behind each that ends a statement: a number with its unit."""
     text, ends = "", False
     each = (_IN_SIXTIETHS.sub(_with_signs, _SENTENCE.sub("; ", as_text(cell))) for cell in row)
-    cells = [*filter(None, (_DAY_OR_MODEL.sub(" ", _plain(text)).strip() for text in each))]
+    days = (_YEAR.sub(" ", _DAY_OR_MODEL.sub(" ", _plain(text))).strip() for text in each)
+    cells = [*filter(None, days)]
     if len(cells) == 2 and re.fullmatch(r"[fbi]", cells[0]):
         cells.insert(1, "=")
     for cell in cells:
