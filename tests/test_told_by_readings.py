@@ -690,7 +690,8 @@ def test_blocks_below_the_names_of_the_triads_are_one_table(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "column"),
-    [("Inc mesa (º)", "ref_inclination_deg"), ("Roll (Teilkopf) °", "ref_toolface_deg"),
+    [("Verdr. (°)", "ref_toolface_deg"), ("Peil.", "ref_azimuth_deg"), ("Rot.", None), ("Pos.", None),
+     ("Inc mesa (º)", "ref_inclination_deg"), ("Roll (Teilkopf) °", "ref_toolface_deg"),
      ("Bohrlochrichtung", "ref_azimuth_deg"), ("Boreh.inkl. (°)", "ref_inclination_deg"),
      ("Inc'n", "ref_inclination_deg"), ("Az'th", "ref_azimuth_deg"), ("Дип, °", "ref_dip_deg"),
      ("Termopar", "temperature_c"), ("Inc (desired) deg", None), ("Roll (previous) °", None)],

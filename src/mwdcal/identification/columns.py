@@ -528,7 +528,7 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     alike = (
         resembled(plain) or _without_title(plain) or resembled(f"{name} ({unit})" if unit else name)
     )
-    alike = alike or _twice(plain) or _at_stand(plain)
+    alike = alike or _twice(plain) or _at_stand(plain) or _abbreviated(plain)
     if alike and alike.column in RAW and _CALLED_REFERENCE.search(plain):
         return alike._replace(column=REFERENCE_VECTORS[RAW.index(alike.column)])
     if _MEASURED.search(plain) and not (alike and alike.column == WARMTH):
@@ -617,6 +617,19 @@ def _at_stand(name: str) -> Resemblance | None:
     bare = " ".join(_BY_STAND.sub(" ", name.replace(part, " ") if part else name).split())
     alike = resembled(bare) if bare not in ("", name) else None
     return alike if alike and alike.column in _ANGLES_AND_WARMTH[:3] else None
+
+
+def _abbreviated(name: str) -> Resemblance | None:
+    """The angle or temperature of which words alone a name is the beginning, with a point behind it: Verdr. (°)."""
+    short = re.fullmatch(r"([^\W\d_]{3,})\.\s*(?:[(\[]?([^()\[\]]*)[)\]]?)", name.lower())
+    if not short or unit_of(short[1]) or _NO_STAND.search(name):
+        return None
+    meant = [
+        column
+        for column in (*_ANGLES_AND_WARMTH, REFERENCES["dip"].column)
+        if any(word.startswith(short[1]) for word in _words_of(column))
+    ]
+    return Resemblance(meant[0], unit_of(short[2])) if len(meant) == 1 else None
 
 
 def _is_symbol(word: str, column: str) -> bool:
