@@ -1111,7 +1111,7 @@ def _left(readings: Readings, wirings: Mapping[str, Wiring], angles: Mapping[str
 
 
 def _regressors(readings: Readings, kind: str, warm: bool = True) -> tuple[Array, Array]:
-    """What the readings of a triad depend on at stations of known attitude (n, K), and the readings (n, 3).
+    """Regressors (n, K) of the readings of a triad at stations of known attitude, and the readings (n, 3).
 
     `warm`: on temperature too.
     """
