@@ -886,7 +886,7 @@ def test_a_verification_leaves_rejected_rows_out_too(tmp_path):
     [
         ("Status", {7: "N"}, "OK", "N"), ("Flag", {7: "1"}, "0", "1"),
         ("Remarks", {7: "repeat of rejected 6"}, "", "repeat of rejected 6"),
-        ("Obs", {7: "se movió"}, "", "se movió"), ("Result", {7: "FAIL"}, "PASS", "FAIL"),
+        ("Obs", {7: "Fehler"}, "", "Fehler"), ("Result", {7: "FAIL"}, "PASS", "FAIL"),
     ],
 )  # fmt: skip
 def test_a_doubtful_mark_is_asked_about(tmp_path, name, cells, usual, text):

@@ -699,3 +699,37 @@ def test_blocks_below_the_names_of_the_triads_are_one_table(tmp_path):
 def test_more_names_of_angles(name, column):
     alike = meaning(name)
     assert (alike.column if alike else None) == column
+
+
+def test_letters_that_tell_the_readings_of_a_station_are_no_groups(tmp_path):
+    """Station 1 A, 1 B, 2 A, 2 B: the means are the stations, without groups."""
+    run = table()
+    twice = {n: np.repeat(v, 2) for n, v in run.items()}
+    twice["Gx (V)"] = twice["Gx (V)"] + 1e-4 * np.tile([-1, 1], 48)
+    path = written(tmp_path / "a.csv", {"серия": [*"AB"] * 48, **twice})
+    one, whole = read(path), read(written(tmp_path / "b.csv", run))
+    assert one.count == 48
+    assert one.group is None or len({*one.group}) == len({*(whole.group or [0])})
+    np.testing.assert_allclose(one.accelerometer, whole.accelerometer, rtol=0, atol=1e-9)
+
+
+def test_names_between_single_blanks_behind_the_mark_of_a_comment(tmp_path):
+    """Day and time are two columns, by the names above them."""
+    run = {n: v for n, v in table().items() if n[0] not in "DBL"}
+    head = "# Datum Zeit " + " ".join(n.replace(" (", "[").replace(")", "]") for n in run)
+    rows = [
+        f"2023-03-08 08:{k:02d}:00   " + "  ".join(f"{v:12.6f}" for v in row)
+        for k, row in enumerate(zip(*run.values(), strict=True))
+    ]
+    path = tmp_path / "a.dat"
+    path.write_text("\n".join(["# g = 9.8070 m/s2", head, *rows]))
+    one = read(path)
+    assert one.count == 48
+    assert one.reference("gravity") == pytest.approx(9.807 / 9.80665)
+
+
+def test_a_supply_of_some_volts_is_no_reference(tmp_path):
+    run = table(**{"Vref": [5.001] * 24 + [5.002] * 24, "Btotal (nT)": None, "Local G (g)": None})
+    run = {n: v for n, v in run.items() if n not in ("Btotal (nT)", "Local G (g)")}
+    used = library.propose_profile(written(tmp_path / "a.csv", run)).profile.columns
+    assert not {"ref_field_nt", "ref_gravity_g"} & {*used}

@@ -35,11 +35,13 @@ _SUPERSEDED = re.compile(
     r"замен[еи]н[оаы]?) (by|with|durch|av|por|pel[oa]|par|на)\D{0,15}\d{1,3}\W*)"
 )
 """A cell that names the row instead of its own: superseded by line 12."""
+_DISTURBANCES = (
+    r"moved|bumped|disturbed|slipped|knocked|bewegt|verrutscht|gestossen|flyttet|movi(o|do)|mexeu|bouge|сдвин\w*|"
+    r"толкн\w*|vibrat\w*"
+)
 _MAY_REJECT = re.compile(
     rf"(?<![^\W\d_])({OF_REFUSAL}|{NOT_TO_USE}|fail(ed)?|error|ng|gestort|unstable|instabil|vibrat\w*|outlier|suspect|questionable|doubtful|ausreißer|ausreisser|fehler|avvik|"
-    r"moved|bumped|disturbed|slipped|knocked|bewegt|verrutscht|gestossen|flyttet|movi(o|do)|mexeu|bouge|сдвин\w*|"
-    r"толкн\w*|"
-    r"nicht bestanden|falha|fallo|выброс|сбой)(?![^\W\d_])|异常|可疑|移动|碰到"
+    rf"{_DISTURBANCES}|nicht bestanden|falha|fallo|выброс|сбой)(?![^\W\d_])|异常|可疑|移动|碰到"
 )
 """A cell that may reject its row, or speak of another one."""
 _MEASURED_AGAIN = re.compile(
@@ -144,13 +146,15 @@ def is_the_repeat(table: Table, row: int, cell: str) -> bool:
     return True
 
 
-def refuses(text: str) -> bool:
-    """Whether a remark has a word that rejects a row, be it its own or another one.
+def is_disturbance(text: str) -> bool:
+    """Whether a remark tells of a disturbance, and rejects no row, be it its own or another one.
 
-    >>> refuses("repeat of rejected 6"), refuses("stand bumped, waited")
-    (True, False)
+    >>> is_disturbance("repeat of rejected 6"), is_disturbance("stand bumped, waited")
+    (False, True)
     """
-    return bool(_REFUSED.search(_plain(text)))
+    plain = _plain(text)
+    disturbed = re.search(rf"(?<![^\W\d_])({_DISTURBANCES})(?![^\W\d_])|移动|碰到", plain)
+    return bool(disturbed) and not _REFUSED.search(plain)
 
 
 def _verdicts(name: str, cells: Sequence[str]) -> dict[str, bool]:

@@ -111,11 +111,13 @@ def repeats(table: Table, sources: Mapping[str, ColumnSource]) -> Repeats | None
         if (c := REFERENCES[n].column) in names
     }
     same = np.ones(table.count - 1, bool)
-    for name in ("group", "serial"):
-        if name in names:
-            same &= _equal(np.array(labels(table, names[name])))
     station = _without_readings(station, angles)
     alike = _equal(station) & (station[1:] != "")
+    for name in ("group", "serial"):
+        if name in names:
+            equal = _equal(np.array(labels(table, names[name])))
+            of_readings = name == "group" and alike.any() and not (alike & equal).any()
+            same &= equal | of_readings  # A and B are the readings of each station
     labelled = bool(alike.any())
     numbered = len({*station.tolist()}) == table.count
     if labelled:

@@ -370,7 +370,7 @@ _NO_STAND = re.compile(
 )
 """Words of columns of angles that do not belong to the stand."""
 _NOMINAL = re.compile(
-    r"\b(nominale?|target|set|dese[aj]ad[oa]|gew[üu]nscht\w*|[øo]nske[dt]|"
+    r"\b(nominale?|target|set( ?-?point)?|dese[aj]ad[oa]|gew[üu]nscht\w*|[øo]nske[dt]|"
     r"set ?point|soll\w*|eingestellt\w*|vorgabe|satt|innstilt|innst|ajustad[oa]|"
     r"fijad[oa]|"
     r"definid[oa]|programad[oa]|desired|intended|planned|requested|te[óo]ric[oa]|th[ée]orique|r[ée]gl[ée]e?|vis[ée]e?|установ(ка|лен\w*)|уставк\w*|cmd|command(ed)?|demand(ed)?|required|nom|consign[ea]|comandad[oa]|"
@@ -380,7 +380,7 @@ _NOMINAL = re.compile(
 _ACTUAL = re.compile(
     r"\b(actual|act|achieved|as read|read ?back|read ?out|observed|(ab)?gelesen\w*|avlest|odczyt\w*|"
     r"le[íi]d[oa]|lid[oa]|lue?|"
-    r"relev[ée]e?|r[ée]el(le)?|efetiv[oa]|efectiv[oa]|отсч[её]т\w*|read|reading|encoder|ist|istwerte?|effettiv[oa]|mesur[ée]e?s?|medid[oa]|zmierzon\w*|"
+    r"relev[ée]e?|r[ée]el(le)?|efetiv[oa]|efectiv[oa]|отсч[её]т\w*|read|reading|encoders?|ist|istwerte?|effettiv[oa]|mesur[ée]e?s?|medid[oa]|zmierzon\w*|"
     r"[äa]rv[äa]rde|действит\w*|факт|фактич\w*|измер\w*|real|faktisk)\b|实际|实测|测得|读数|编码器|実測値?|実際",
     re.IGNORECASE,
 )
@@ -1429,6 +1429,14 @@ def _may_hold(column: str, values: Array) -> bool:
     return column == WARMTH or not is_numbering(known)
 
 
+def _may_be_in_a_unit(column: str, values: Array) -> bool:
+    """Whether values are those that gravity or field have on the Earth in some unit; any others may be any."""
+    known = values[np.isfinite(values)]
+    ranges = [(low, high) for _, low, high in RANGES_BY_UNIT.get(column, ())]
+    inside = (low <= known.min() and known.max() <= high for low, high in ranges if known.size)
+    return any(inside) or not ranges
+
+
 def _check_lacking(
     column: str, others: Mapping[str, str], names: Sequence[str], values: Values, source: str
 ) -> None:
@@ -1441,6 +1449,7 @@ def _check_lacking(
         for n, cells in every.items()
         if n not in nominal
         and (n in shows or not is_of_tool(n) or _is_whole(cells))
+        and _may_be_in_a_unit(column, cells)
         and _may_hold(column, cells)
         and not _is_total(column, cells, "", names, values)
     }

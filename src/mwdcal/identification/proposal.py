@@ -39,10 +39,10 @@ from mwdcal.files.marks import (
     MARKS_NAMED,
     UNMARKED,
     by_legend,
+    is_disturbance,
     is_the_repeat,
     marks_in,
     place,
-    refuses,
     without_rejected,
 )
 from mwdcal.files.metadata import toml
@@ -422,22 +422,27 @@ def _remarked_rows(
 ) -> dict[str, list[str]]:
     """Rows to keep besides, by column, with a remark that may speak of something else; empty where none has."""
     every = {name: [*cells] for name, cells in keep.items()}
-    for each in _questions_of(error):
-        for option, text in each.answers[0].arguments if each.answers else ():
-            name, _, cell = text.partition("=")
-            if option == "keep" and not refuses(cell):
-                every.setdefault(name, []).append(cell)
+    for option, text in _arguments(error):
+        name, _, cell = text.partition("=")
+        if option == "keep" and is_disturbance(cell):
+            every.setdefault(name, []).append(cell)
     return {} if every == {**keep} else every
+
+
+def _arguments(error: QuestionError | QuestionsError) -> Iterator[tuple[str, str]]:
+    """The arguments of all answers to open questions."""
+    answers = (answer for each in _questions_of(error) for answer in each.answers)
+    return (argument for answer in answers for argument in answer.arguments)
 
 
 def _said_of_kept(error: QuestionError | QuestionsError) -> str:
     """The sentence on rows with remarks whose readings fit those of the others."""
-    rows, said = [], ""
-    for each in _questions_of(error):
-        option, text = each.answers[0].arguments[0] if each.answers else ("", "")
-        if option == "keep":
-            rows.append(each.text.partition(": ")[2].partition(". Is that")[0])
-            said = said or text
+    said = next(text for option, text in _arguments(error) if option == "keep")
+    rows = [
+        each.text.partition(": ")[2].partition(". Is that")[0]
+        for each in _questions_of(error)
+        if any(argument == ("keep", said) for a in each.answers for argument in a.arguments)
+    ]
     return (
         f"used, as the readings fit those of the others: {'; '.join(rows)}. If it is to be left out, say so by "
         f"`leave_out` {said!r}."
@@ -491,6 +496,8 @@ def _proposal(
     sets = repeats(table, columns)
     if sets and not sets.numbered:
         table = means(table, columns, sets)
+        if "group" in columns and len({*labels_of(table, columns["group"].name)}) < 2:
+            del columns["group"]  # it tells the readings of a station apart
     profile = Profile(name=Path(path).stem, table=form or msgspec.UNSET, columns=columns)
     said = {*answers, *stated}
     profile, readings, wirings, open_axes = _wired_and_checked(table, profile, by_value, said)

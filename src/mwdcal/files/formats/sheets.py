@@ -90,9 +90,24 @@ def _delimited(lines: Sequence[str], source: str) -> tuple[str, list[tuple[int, 
     if 2 * counts[best] < max(counts.values()):  # blanks may stand within cells
         best = max(marks, key=lambda mark: counts[mark])
     cells = _split(lines, best, source)
+    if (
+        best == _RUNS
+        and _is_named(single := _split(lines, _BLANKS, source))
+        and not _is_named(cells)
+    ):
+        best, cells = _BLANKS, single
     if best in (_BLANKS, _RUNS):
         cells = _in_columns(lines, _without_marks(cells))
     return best, [(line, _trimmed(row)) for line, row in enumerate(cells, 1) if any(row)]
+
+
+def _is_named(rows: Sequence[list[str]]) -> bool:
+    """Whether the row above the first numbers is of as many texts as most rows have cells."""
+    rows = [row for row in _without_marks(rows) if row]
+    widths = Counter(len(row) for row in rows if _is_of_numbers(row)).most_common(1)
+    first = next((k for k, row in enumerate(rows) if _is_of_numbers(row)), 0)
+    head = rows[first - 1] if first else []
+    return bool(widths) and len(head) == widths[0][0] and not any(map(figures.is_figure, head))
 
 
 def _without_marks(rows: Sequence[list[str]]) -> list[list[str]]:

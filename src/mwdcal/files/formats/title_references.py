@@ -176,6 +176,8 @@ _YEAR = re.compile(
     rf"(?<=[^\W\d_][ ,.(])\s*(?:19[89]|20[0-3])\d(?![\d.,]|\s*(?:{_WRITTEN_UNIT})|[^\W\d_])"
 )
 """A year behind a word, which is no number of a reference: May 2023."""
+_NUMBER_OF_TOOL = re.compile(r"(?<![^\W\d_])[a-z]{1,6}-\d{3,}(?![\d.,])")
+"""Letters and a number of a tool, a form or an order: MG-0417."""
 _TOTAL = re.compile(
     r"(?<![^\W\d_])f\s*[=:]?\s*\d{2}.*(?<![^\W\d_])[hxyz]\s*[=:]?\s*[-−]?\d|"
     r"(?<![^\W\d_])[hxyz]\s*[=:]?\s*[-−]?\d.*(?<![^\W\d_])f\s*[=:]?\s*\d{2}"
@@ -212,8 +214,8 @@ _COUNTED = (
 _OF_A_UNIT = re.compile(
     r"(?:(?:^|[(\[,;:])\s*1|(?<![^\W\d_])(?:unit\w*|unidade?|einheit|enhet|enhed|eenheid|jednostka|единиц\w*)|单位)"
     rf"\s*(?:{_WRITTEN_UNIT}|[gг])\s*[=≙≈]\s*(?:{_WRITTEN_NUMBER})\s*(?:{_WRITTEN_UNIT})|"
-    rf"(?<![\w.,])1\s*{_COUNTED}\.?\s*"
-    rf"[=≙≈:]\s*(?:{_WRITTEN_NUMBER})\s*(?:{_WRITTEN_UNIT})"
+    rf"(?<![\w.,])(?:1\s*{_COUNTED}\.?\s*[=≙≈:]|(?:{_WRITTEN_NUMBER})\s*{_COUNTED}\.?\s*[=≙≈])\s*"
+    rf"(?:{_WRITTEN_NUMBER})\s*(?:{_WRITTEN_UNIT})"
 )
 """Definition of a unit: 1 g = 9.80665 m/s²; the size of a volt or of a count: 1 V = 20 µT."""
 _IN_OTHER_UNIT = re.compile(
@@ -302,7 +304,9 @@ _STANDARD = re.compile(
     r"стандарт\w*|норм\w*|единиц\w*)(?![^\W\d_])|标准|单位"
 )
 """Words of the standard gravity, which is a unit."""
-_AT = re.compile(r"\bat\b|\bbei\b")
+_AT = re.compile(
+    r"\bat\b(?! (the )?(test |calibration )?(site|stand|lab\w*|bench|hut|place|pillar|yard))|\bbei\b"
+)
 """Words before a strength at which something was checked, unless it is one of several places."""
 _INCLINED = re.compile(
     r"dip|(?<![^\W\d_])[iеe]n[ck]l\w*|inklin\w*|inclin\w*|наклон\w*|нахил\w*|倾|伏角|傾|egim|duzalimi|sklon\w*|"
@@ -344,7 +348,8 @@ _SPELT = {
 
 _NO_LONGER = re.compile(
     r"(?<![^\W\d_])(prev(ious)?|former(ly)?|old|obsolete|superseded|no longer|last (cal\w*|site|year)|factory|fabrica|"
-    r"usine|завод\w*|hos kunde\w*|(at|of) (the )?(customer|client|well ?site|rig ?site)|customer('s)? (site|place)|"
+    r"usine|завод\w*|hos kunde\w*|(at|of) (the )?(customer|client|well ?site|rig ?site)|"
+    r"customer('s)? (base|site|place)|"
     r"(beim|des) kunden|kundenort|(del?|no|do|en el|chez le|du) client[e]?|заказчик\w*|gammel\w*|gamle|"
     r"utgatt|tidligere|forrige|alte[rsn]?|ehemalig\w*|vorherig\w*|fruher\w*|antigu[oa]|antig[oa]|anterior|ancien\w*|"
     r"precedent\w*|vecchi[oa]|precedente|dawn\w*|poprzedni\w*|stary|stara|стар\w*|прежн\w*|прошл\w*|"
@@ -406,7 +411,8 @@ def _of_the_stand(
 
 _LONG_WORD = rf"{_CHINESE}{{2,}}|(?:(?!{_CHINESE})[^\W\d_]){{4,}}"
 _OF_HERE = re.compile(
-    r"(?<![^\W\d_])(lab\w*|here|this (site|place)|stand|bench|today|hier|messplatz|prufstand|heute|her|i ?dag|aqui|"
+    r"(?<![^\W\d_])(lab\w*|here|(this|test) (site|place)|stand|bench|today|hier|messplatz|prufstand|heute|her|"
+    r"i ?dag|aqui|"
     r"hoy|hoje|здесь|сегодня|стенд\w*)(?![^\W\d_])|本地|本站|今天|实验室",
 )
 """Words of the place and the day of a calibration."""
@@ -715,7 +721,10 @@ def _clauses(row: Sequence[object]) -> str:
     """The cells of a row in small letters, a semicolon behind each that ends a statement: a number with its unit."""
     text, ends = "", False
     each = (_IN_SIXTIETHS.sub(_with_signs, _SENTENCE.sub("; ", as_text(cell))) for cell in row)
-    days = (_YEAR.sub(" ", _DAY_OR_MODEL.sub(" ", _plain(text))).strip() for text in each)
+    days = (
+        _NUMBER_OF_TOOL.sub(" ", _YEAR.sub(" ", _DAY_OR_MODEL.sub(" ", _plain(text)))).strip()
+        for text in each
+    )
     cells = [*filter(None, days)]
     if len(cells) == 2 and re.fullmatch(r"[fbi]", cells[0]):
         cells.insert(1, "=")
