@@ -176,7 +176,7 @@ _YEAR = re.compile(
     rf"(?<=[^\W\d_][ ,.(])\s*(?:19[89]|20[0-3])\d(?![\d.,]|\s*(?:{_WRITTEN_UNIT})|[^\W\d_])"
 )
 """A year behind a word, which is no number of a reference: May 2023."""
-_NUMBER_OF_TOOL = re.compile(r"(?<![^\W\d_])[a-z]{1,6}-\d{3,}(?![\d.,])")
+_TOKEN_OF_LETTERS_AND_DIGITS = re.compile(r"(?<![^\W\d_])[a-z]{1,6}-\d{3,}(?![\d.,])")
 """Letters and a number of a tool, a form or an order: MG-0417."""
 _TOTAL = re.compile(
     r"(?<![^\W\d_])f\s*[=:]?\s*\d{2}.*(?<![^\W\d_])[hxyz]\s*[=:]?\s*[-−]?\d|"
@@ -722,7 +722,9 @@ def _clauses(row: Sequence[object]) -> str:
     text, ends = "", False
     each = (_IN_SIXTIETHS.sub(_with_signs, _SENTENCE.sub("; ", as_text(cell))) for cell in row)
     days = (
-        _NUMBER_OF_TOOL.sub(" ", _YEAR.sub(" ", _DAY_OR_MODEL.sub(" ", _plain(text)))).strip()
+        _TOKEN_OF_LETTERS_AND_DIGITS.sub(
+            " ", _YEAR.sub(" ", _DAY_OR_MODEL.sub(" ", _plain(text)))
+        ).strip()
         for text in each
     )
     cells = [*filter(None, days)]
