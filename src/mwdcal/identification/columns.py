@@ -1330,11 +1330,14 @@ def _is_steady(
     """Whether a column may be what a place has, called so or of one value throughout."""
     if cells is None or not cells.size or not np.isfinite(cells).all():
         return False
-    if column != REFERENCES["gravity"].column and _REFERRED.search(spelled(name)):
+    ends = _ends_as(name, column) and not _BY_TOOL.search(spelled(name))
+    if column == REFERENCES["dip"].column:
+        return bool(ends or _REFERRED.search(spelled(name))) and may_be(column, name, unit, cells)
+    if column == REFERENCES["field"].column and _REFERRED.search(spelled(name)):
         return may_be(column, name, unit, cells)
     low, high = _range_in(column, _unit_beside(name, unit))
     varies = float(np.ptp(cells))
-    called = column == REFERENCES["field"].column and _OF_FIELD.search(name)
+    called = column == REFERENCES["field"].column and (ends or _OF_FIELD.search(name))
     steady = varies < _OF_PLACE * high if called else varies == 0
     inside = low <= cells.min() and cells.max() <= high
     return bool(steady and inside) and not _is_total(column, cells, "", names, values)

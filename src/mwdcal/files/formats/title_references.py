@@ -116,7 +116,7 @@ _OF_MEANS = re.compile(
 """Words of the mean of a run, which may be that of a place."""
 _UNSURE = re.compile(
     rf"{_ROUGH.pattern}|{_OF_MEANS.pattern}|"
-    r"uncert|\bunc\b|unsicher|usikker|incert|погреш|不确定|toler|limit|grenz|range|\bspan|bereich|диапазон|范围|量程|"
+    r"uncert|\bunc\b|unsicher|usikker|incert|погреш|不确定|toler|limit|grenz|range|\bspan|bereich|rango|faixa|\bgama\b|omrade|plage|alcance|escala|portata|диапазон|范围|量程|"
     r"\bmin\b|\bmax\b|\bstd|\bsd\b|sigma|σ|±|spec|resol|correct(?!ed)|korrek|offset|drift|gradient|noise|"
     r"toolface|survey|tool face",
 )
@@ -381,7 +381,7 @@ def stated_above(
     here = _of_this_place(_without_limits(above), elsewhere)
     values = _values_in(here, _without_limits(beside))
     for column in [c for c, each in values.items() if len(each) > 1]:
-        values[column] = _of_the_stand(column, values[column], here, elsewhere)
+        values[column] = _of_the_stand(column, values[column], here)
     references = _only(values)
     rough = {c: text for c, text in doubtful_in(rows, besides).items() if c not in references}
     choices = {c: tuple(each) for c, each in values.items() if len(each) > 1}
@@ -389,14 +389,15 @@ def stated_above(
     return block._replace(metadata=metadata, not_taken=rough, choices=choices)
 
 
-def _of_the_stand(
-    column: str, values: dict[float, None], rows: Rows, elsewhere: str
-) -> dict[float, None]:
+def _of_the_stand(column: str, values: dict[float, None], rows: Rows) -> dict[float, None]:
     """Of different values of a reference the one of here or today; or of the place that another line names."""
     every = {_plain(_line(row)): _values_in([row]) for row in rows}
     stating = {line: each[column] for line, each in every.items() if each.get(column)}
-    beside = [_plain(elsewhere), *(line for line, each in every.items() if not any(each.values()))]
-    others = {*re.findall(_LONG_WORD, " ".join(beside))}
+    beside = [line for line, each in every.items() if not any(each.values())]
+    places = [
+        line.partition(_OF_SITE.search(line)[0])[2] for line in beside if _OF_SITE.search(line)
+    ]  # type: ignore[index]
+    others = {*re.findall(_LONG_WORD, " ".join(places))}
     named = {line: {word for word in others if word in line} for line in stating}
     shared = set[str].intersection(*named.values()) if named else set()
     for marked in (
@@ -410,6 +411,11 @@ def _of_the_stand(
 
 
 _LONG_WORD = rf"{_CHINESE}{{2,}}|(?:(?!{_CHINESE})[^\W\d_]){{4,}}"
+_OF_SITE = re.compile(
+    r"(?<![^\W\d_])(site|place|location|calibrated (at|in)|ort|pruf ?ort|messort|standort|sted|lugar|local|"
+    r"ciudad|cidade|lieu|luogo|место|город)(?![^\W\d_])|地点|地址|地區"
+)
+"""Words before the name of the place of a calibration."""
 _OF_HERE = re.compile(
     r"(?<![^\W\d_])(lab\w*|here|(this|test) (site|place)|stand|bench|today|hier|messplatz|prufstand|heute|her|"
     r"i ?dag|aqui|"
