@@ -471,7 +471,8 @@ def test_components_ranges_and_corrections_are_no_references(line):
     ("name", "words"),
     [
         ("Type", ("CAL", "VER")), ("Status", ("OK", "CHECK")), ("Art", ("", "Prüfung")),
-        ("Mode", ("CAL", "ROLLTEST")), ("用途", ("标定", "滚转检验")), ("Formål", ("kal", "rulletest")),
+        ("Mode", ("CAL", "ROLLTEST")), ("Test", ("CAL", "ROLL")), ("用途", ("标定", "滚转检验")),
+        ("Formål", ("kal", "rulletest")),
     ],
 )  # fmt: skip
 def test_rows_that_check_a_calibration_are_no_part_of_it_and_are_named(tmp_path, name, words):
@@ -481,6 +482,13 @@ def test_rows_that_check_a_calibration_are_no_part_of_it_and_are_named(tmp_path,
     assert f"'{name}': {words[1]}" in findings_of(proposal)["marked-rows"]
     assert library.read_run(path, proposal.profile).count == 42
     assert read(path, keep={name: [words[1]]}).count == 48
+
+
+def test_codes_of_check_rows_by_a_legend(tmp_path):
+    columns = {"Art": ["KR"[k >= 42] for k in range(48)], **table()}
+    line = "# Art: K = Kalibrierlage, R = Rolltest (Kontrolle)"
+    assert read(written(tmp_path / "a.csv", columns, line)).count == 42
+    assert read(written(tmp_path / "b.csv", columns)).count == 48
 
 
 def test_rows_below_a_line_that_calls_them_check_shots_are_no_part_of_the_run(tmp_path):
@@ -733,3 +741,19 @@ def test_a_supply_of_some_volts_is_no_reference(tmp_path):
     run = {n: v for n, v in run.items() if n not in ("Btotal (nT)", "Local G (g)")}
     used = library.propose_profile(written(tmp_path / "a.csv", run)).profile.columns
     assert not {"ref_field_nt", "ref_gravity_g"} & {*used}
+
+
+def test_az_is_the_azimuth_beside_an_acceleration_called_so(tmp_path):
+    names = {"Azi (deg)": "az", "Gx (V)": "ax", "Gy (V)": "ay", "Gz (V)": "az_acel"}
+    columns = {names.get(n, n): v for n, v in table().items()}
+    used = library.propose_profile(written(tmp_path / "a.csv", columns)).profile.columns
+    assert [used[c].name for c in ("az", "ref_azimuth_deg")] == ["az_acel", "az"]
+
+
+def test_a_field_in_amperes_per_metre_at_the_stand(tmp_path):
+    field = np.asarray(servo_run()["ref_field_nt"]) / (400 * np.pi)
+    run = {n: v for n, v in table().items() if n != "Btotal (nT)"} | {"Поле на стенде, А/м": field}
+    proposal = library.propose_profile(written(tmp_path / "a.csv", run))
+    assert proposal.profile.columns["ref_field_nt"].name == "Поле на стенде, А/м"
+    stated = library.read_run(tmp_path / "a.csv", proposal.profile).reference("field")
+    assert stated == pytest.approx(servo_run()["ref_field_nt"], rel=1e-9)

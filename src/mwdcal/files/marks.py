@@ -21,7 +21,7 @@ from mwdcal.errors import Answer, InputError, QuestionError
 from mwdcal.files.formats.columns import Column, looks_numeric, shown
 from mwdcal.files.formats.table import Table, labels, numbers, row_word
 from mwdcal.files.formats.titles import ADJUSTED, NOT_TO_USE, OF_REFUSAL
-from mwdcal.files.parting import check_rows, marked_rows
+from mwdcal.files.parting import check_rows, is_check, marked_rows
 from mwdcal.files.statements import rows_of
 from mwdcal.files.synonyms import OURS
 from mwdcal.sensor.profile import TableFormat
@@ -200,10 +200,23 @@ def by_legend(
     """
     leave_out, keep = ({n: [*c] for n, c in each.items()} for each in (form.leave_out, form.keep))
     doubtful = marks_in(table, form, used).doubtful if lines else {}
-    for name in dict.fromkeys(name for name, _ in doubtful):
+    coded = (
+        [n for n in table.columns if n not in used and _holds_words(table.columns[n])]
+        if lines
+        else []
+    )
+    for name in dict.fromkeys([*(name for name, _ in doubtful), *coded]):
         codes = {*labels(table, name)} - {""}
         meanings = {c: _meaning(c, lines) for c in codes if len(codes) <= _MOST_VALUES}
-        out = [c for c, m in meanings.items() if _REJECTED.fullmatch(m) or _does_not_count(m)]
+        out = [
+            c
+            for c, m in meanings.items()
+            if (_REJECTED.fullmatch(m) or _does_not_count(m))
+            or (
+                is_check(_REMARK_BEHIND.sub("", m))
+                and 2 * labels(table, name).count(c) < table.count
+            )
+        ]
         if out:
             leave_out.setdefault(name, []).extend(sorted(out))
             keep.setdefault(name, []).extend(c for c in sorted({*meanings} - {*out}) if meanings[c])

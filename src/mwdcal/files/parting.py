@@ -91,6 +91,15 @@ def check_rows(table: Table, name: str) -> list[int]:
     return rows if 2 * len(rows) < table.count else []
 
 
+def is_check(text: str) -> bool:
+    """Whether a text calls something a roll test or another check of a calibration.
+
+    >>> is_check("Rolltest"), is_check("rotation")
+    (True, False)
+    """
+    return bool(_ROLL_TEST.fullmatch(text))
+
+
 def _named_in(cells: Sequence[str]) -> list[int]:
     beside = any(map(_CALIBRATION.fullmatch, cells))
     return [

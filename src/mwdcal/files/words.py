@@ -38,6 +38,7 @@ TRANSLATIONS = (
     (r"\|\s*b\s*\|", "Btotal"),
     (r"\|\s*g\s*\|", "Gtotal"),
     (r"pruf(?=stand)|mess(?=stand)", ""),
+    (r"(?<=\b[ag][xyz])[ _]+acc?el\w*\b", ""),
     (r"\binc['’]n\b", "inclination "),
     (r"\baz['’](th|m)\b", "azimuth "),
     (r"\brot['’]n\b", "toolface "),
@@ -117,7 +118,7 @@ TRANSLATIONS = (
         r"(werkzeug|roll)(winkel|lage|flache)|verdrehung|verdrehwinkel|drehwinkel|rotasjon|rulle?vinkel|"
         r"verktoy(flate|vinkel|side)\w*|(face|angulo) d[ae] ferramenta|(face|angle)( d[e'])? ?(l'?)?outil|"
         r"ghsf?\b|угол установки( отклонител\w*)?|визир\w*( угол)?|"
-        r"angulo de giro|giro|rotacion|отклонител\w*|откл\b\.?|визирн\w* угол|поворот|工具面角?|"
+        r"angulo de giro|giro|вращени[ея]|rotacion|отклонител\w*|откл\b\.?|визирн\w* угол|поворот|工具面角?|"
         r"\bcara\b(?! *mag)( (de (la )?)?herr(amienta|\b\.?))?|tf grav\w*|gravity tool ?face|h\.?s\.?[ _-]*tool ?face|"
         r"tool[ _-]*face( (d[ae] )?(la )?grav\w*| ?\(grav\w*\.?\))?",
         "toolface ",

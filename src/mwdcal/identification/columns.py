@@ -327,8 +327,7 @@ def may_be(column: str, name: str, unit: str, values: Array | None) -> bool:
         steep = min(abs(low), abs(high)) > 5 and max(abs(low), abs(high)) < 90
         return stated == "°" and high - low < _STEADY_DIP and steep
     if column == REFERENCES["field"].column:
-        ranges = {unit: (least, most) for unit, least, most in RANGES_BY_UNIT[column]}
-        least, most = ranges.get("nT" if not stated and not foreign else stated, (np.inf, -np.inf))
+        least, most = _range_in(column, "nT" if not stated and not foreign else stated)
         return least <= low and high <= most and high - low < _STEADY_FIELD * high
     if stated not in ("", "°", "rad", "gon") or high - low < _LEAST_TURN:
         return False
@@ -1849,6 +1848,9 @@ def _check_range(column: str, name: str, unit: str, values: Array | None, source
         return
     ranges = {u: (low, high) for u, low, high in RANGES_BY_UNIT.get(column, ())}
     fits = [u for u, (low, high) in ranges.items() if low <= known.min() and known.max() <= high]
+    low, high = _range_in(column, unit)
+    if low <= known.min() and known.max() <= high:
+        return
     turns = column in (REFERENCES["azimuth"].column, REFERENCES["toolface"].column)
     if unit == "°" and turns and known.size > LEAST_ROLLS and _maybe_radians(known):
         fits = ["rad"] if np.ptp(known) > 3 else []

@@ -58,7 +58,7 @@ _OF_PLACES = (
     ),
     _Quantity(
         "ref_dip_deg",
-        r"(mag\w*|local|field) (dip|inclination)( angle)?|dip( angle)?|dipref|복각|magn\w* kaltevuus|inklinaatio|"
+        r"(mag\w*|local|field) (dips?|inclination)( angle)?|dip( angle)?|dipref|복각|magn\w* kaltevuus|inklinaatio|"
         r"magn\w* inklinace|manyetik egim|magn\w* inklinacio|伏角|"
         r"inklinacja( pola)?|inclinazione (magn\w*|del campo)|plongement|pendage|magn\w* inclinatie|"
         r"(feld|feld-|magn\w* ?)?inklination|(feld-?|magn\w* )neigung|"
@@ -394,9 +394,7 @@ def _of_the_stand(column: str, values: dict[float, None], rows: Rows) -> dict[fl
     every = {_plain(_line(row)): _values_in([row]) for row in rows}
     stating = {line: each[column] for line, each in every.items() if each.get(column)}
     beside = [line for line, each in every.items() if not any(each.values())]
-    places = [
-        line.partition(_OF_SITE.search(line)[0])[2] for line in beside if _OF_SITE.search(line)
-    ]  # type: ignore[index]
+    places = [line[match.end() :] for line in beside if (match := _OF_SITE.search(line))]
     others = {*re.findall(_LONG_WORD, " ".join(places))}
     named = {line: {word for word in others if word in line} for line in stating}
     shared = set[str].intersection(*named.values()) if named else set()
@@ -450,7 +448,7 @@ def _of_this_place(rows: Rows, elsewhere: str = "") -> list[Sequence[object]]:
     """
     valid = [
         row
-        for row in rows
+        for row in map(_without_asides, rows)
         if not _NO_LONGER.search(_plain(_line(row)))
         and not _OF_UNCERTAINTY.match(_plain(_line(row)))
     ]
@@ -463,6 +461,14 @@ def _of_this_place(rows: Rows, elsewhere: str = "") -> list[Sequence[object]]:
         if len(block) > 1 and len(named) == 1:
             kept = [row for row in kept if row not in block or row in named]
     return kept
+
+
+def _without_asides(row: Sequence[object]) -> Sequence[object]:
+    """A row without the cells behind its first that state by themselves what no longer holds, or of another place."""
+    first, *cells = row or [""]
+    plain = [_plain(as_text(cell)) for cell in cells]
+    aside = [bool(re.search(r"\d", text) and _NO_LONGER.search(text)) for text in plain]
+    return [first, *(cell for cell, out in zip(cells, aside, strict=True) if not out)]
 
 
 def _first_word(row: Sequence[object]) -> str:
@@ -876,7 +882,7 @@ def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
     """The value that a text states, in the unit of the run file, if it is one, and another right behind it."""
     between, behind = match["between"], match["behind"]
     rough = bool(re.match(rf"\W*({_ROUGH.pattern}|k\s?g\b)", behind)) and not match["next"]
-    counted = _OF_ANOTHER.match(behind)
+    counted = _OF_ANOTHER.match(behind) or re.match(r"\s*=\s*[^\W\d_]", behind)
     letter = "letter" in match.groupdict()
     if (
         rough
