@@ -1568,7 +1568,7 @@ def _is_of_names(
     That is a column of readings without a name, a symbol, or the units; and a title that is merged over columns is
     one of their group.
     """
-    marked = as_text(row[0]).startswith("#") and not as_text(names[0]).startswith("#")
+    marked = re.match(r"#+\s*\w", as_text(row[0])) and not as_text(names[0]).startswith("#")
     if marked or _is_of_facts(row):
         return False
     if _need_titles(names) or _stands_over_units(row, names):

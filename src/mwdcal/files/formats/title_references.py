@@ -395,7 +395,8 @@ def _of_the_stand(column: str, values: dict[float, None], rows: Rows) -> dict[fl
     stating = {line: each[column] for line, each in every.items() if each.get(column)}
     beside = [line for line, each in every.items() if not any(each.values())]
     places = [line[match.end() :] for line in beside if (match := _OF_SITE.search(line))]
-    others = {*re.findall(_LONG_WORD, " ".join(places))}
+    first = beside[:1] if rows and beside[:1] == [_plain(_line(rows[0]))] else []
+    others = {*re.findall(_LONG_WORD, " ".join([*first, *places]))}
     named = {line: {word for word in others if word in line} for line in stating}
     shared = set[str].intersection(*named.values()) if named else set()
     for marked in (
@@ -415,9 +416,8 @@ _OF_SITE = re.compile(
 )
 """Words before the name of the place of a calibration."""
 _OF_HERE = re.compile(
-    r"(?<![^\W\d_])(lab\w*|here|(this|test) (site|place)|stand|bench|today|hier|messplatz|prufstand|heute|her|"
-    r"i ?dag|aqui|"
-    r"hoy|hoje|здесь|сегодня|стенд\w*)(?![^\W\d_])|本地|本站|今天|实验室",
+    r"(?<![^\W\d_])(lab\w*|here|(this|test) (site|place)|stand|bench|banco|bancada|today|hier|messplatz|prufstand|"
+    r"heute|her|i ?dag|aqui|hoy|hoje|здесь|сегодня|стенд\w*)(?![^\W\d_])|本地|本站|今天|实验室",
 )
 """Words of the place and the day of a calibration."""
 
