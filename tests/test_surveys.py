@@ -1171,6 +1171,17 @@ def test_drift_grows_with_the_time_since_the_calibration(example, years, share):
     assert errors.sensors.axial_interference_nt == 220.0
 
 
+def test_norths_in_results_are_those_that_the_table_states(example, tmp_path):
+    given = "declination_deg = 1.5", "sd_declination_deg = 0.35", "convergence_deg = -0.7"
+    source = write_csv(
+        tmp_path / "in.csv", read_csv(EXAMPLE / "well.csv"), "simulated = true", *given
+    )
+    document = cli("survey", example, source, "-o", tmp_path / "out.csv", "--json").json
+    lines = (tmp_path / "out.csv").read_text("utf-8").splitlines()
+    assert {f"# {each}" for each in given} <= {*lines}
+    assert [document[each.split()[0]] for each in given] == [1.5, 0.35, -0.7]
+
+
 def test_dates_that_are_not_known_are_asked_for(example, tmp_path):
     calibration, given = mwdcal.load(example), read_csv(EXAMPLE / "well.csv")
     tool = replace_struct(calibration, tool={**calibration.tool, "date": "2025-01-01"})

@@ -353,20 +353,7 @@ def summary(
 
 def _stated(north: North, terms: ErrorTerms) -> dict[str, Any]:
     """The causes that turn azimuths, degrees, and what their uncertainty holds."""
-    north = north.typical
-    sd = None if north.declination is None else north.declination_sd
-    angles = {
-        "declination_deg": north.declination,
-        "sd_declination_deg": sd,
-        "convergence_deg": north.convergence,
-    }
-    return {
-        **{
-            key: None if angle is None else float(np.degrees(angle))
-            for key, angle in angles.items()
-        },
-        **terms.stated,
-    }
+    return {**north.in_degrees, **terms.stated}
 
 
 def end_of_path(last: LastStation) -> EndOfPath:
