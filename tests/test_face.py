@@ -88,13 +88,15 @@ def test_a_verdict_has_its_limits_as_a_table(calibrated):
     made, *_ = calibrated
     verdict = mwdcal.verify(made, EXAMPLE / "rolltest.csv")
     table = msgspec.structs.replace(verdict).to_pandas("limits")  # of one read from a file too
-    assert table.columns.tolist() == ["name", "value", "U", "limit", "unit", "verdict"]
-    for row, shown in zip(verdict.rows, table.itertuples(), strict=True):
-        assert shown[1:3] + shown[4:] == (row.name, row.value, row.limit, row.unit, "pass")
+    for row, shown in zip(verdict.rows, table.itertuples(index=False), strict=True):
+        expected = (row.name, row.raw, row.value, row.uncertainty, shown.U)  # as on the screen
+        expected += (np.inf, row.limit, row.unit, "pass", row.note)
+        assert tuple(shown) == expected
         assert pytest.approx(2 * row.uncertainty) == shown.U  # the noise is declared
+    assert table.columns[5:].tolist() == ["degrees_of_freedom", "limit", "unit", "verdict", "where"]
     part = mwdcal.read_run(EXAMPLE / "rolltest.csv", made.profile).select(np.arange(12) < 4)
     open_ones = mwdcal.verify(made, part).to_pandas("limits")
-    assert open_ones["U"].isna().all()
+    assert open_ones[["value", "sd", "U", "degrees_of_freedom"]].isna().all(axis=None)
     assert (open_ones["verdict"] == "FAIL").all()
     with pytest.raises(mwdcal.InputError, match="`rows` must be stations or limits; got 'limit'"):
         verdict.to_pandas("limit")
