@@ -94,12 +94,15 @@ def test_the_python_tutorial_calibrates_a_table_with_its_own_names(tmp_path, mon
     assert mwdcal("example", "demo").code == 0
     seen = {}
     exec(lines, seen)
-    printed = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert [row[:2] for row in printed] == [
-        [f"{triad}", name] for triad in ("accelerometer", "magnetometer")
-        for name in (*(f"gain-{a}{b}" for a in "xyz" for b in "xyz"), *(f"offset-{a}" for a in "xyz"))
-    ]  # fmt: skip
-    assert all(float(sd) > 0 for *_, sd in printed)
+    assert capsys.readouterr().out.splitlines() == [each.text for each in seen["cal"].findings]
+    factors = seen["factors"].set_index(["triad", "name"])
+    assert factors.unit["accelerometer"][["SFx", "Bx", "mxy"]].tolist() == ["mg/g", "g", "1"]
+    assert factors.unit["magnetometer"][["SFx", "Bx", "mxy"]].tolist() == ["nT/nT", "nT", "1"]
+    assert len(factors) == 24
+    assert (factors["sd"] > 0).all()
+    for triad in seen["cal"].triads:  # channel x measures the tool's z axis
+        offsets = dict(zip(triad.parameter_names, triad.parameters, strict=True))
+        assert offsets["offset-z"] == pytest.approx(-factors.value[triad.name, "Bx"], rel=0.02)
     angles = seen["angles"]
     assert angles["Messpunkt"].tolist() == list(range(1, 49))
     assert (angles["inclination_deg"] - angles["Neigung Soll (°)"]).abs().max() < 0.1

@@ -88,13 +88,15 @@ def test_a_verdict_has_its_limits_as_a_table(calibrated):
     made, *_ = calibrated
     verdict = mwdcal.verify(made, EXAMPLE / "rolltest.csv")
     table = msgspec.structs.replace(verdict).to_pandas("limits")  # of one read from a file too
-    assert table.columns.tolist() == ["name", "value", "U", "limit", "unit", "verdict"]
-    for row, shown in zip(verdict.rows, table.itertuples(), strict=True):
-        assert shown[1:3] + shown[4:] == (row.name, row.value, row.limit, row.unit, "pass")
+    for row, shown in zip(verdict.rows, table.itertuples(index=False), strict=True):
+        expected = (row.name, row.raw, row.value, row.uncertainty, shown.U)  # as on the screen
+        expected += (np.inf, row.limit, row.unit, "pass", row.note)
+        assert tuple(shown) == expected
         assert pytest.approx(2 * row.uncertainty) == shown.U  # the noise is declared
+    assert table.columns[5:].tolist() == ["degrees_of_freedom", "limit", "unit", "verdict", "where"]
     part = mwdcal.read_run(EXAMPLE / "rolltest.csv", made.profile).select(np.arange(12) < 4)
     open_ones = mwdcal.verify(made, part).to_pandas("limits")
-    assert open_ones["U"].isna().all()
+    assert open_ones[["value", "sd", "U", "degrees_of_freedom"]].isna().all(axis=None)
     assert (open_ones["verdict"] == "FAIL").all()
     with pytest.raises(mwdcal.InputError, match="`rows` must be stations or limits; got 'limit'"):
         verdict.to_pandas("limit")
@@ -243,6 +245,33 @@ def test_a_header_of_two_rows_in_pandas_is_one_name(tmp_path):
     path.write_text("Gx,Note\nV,\n1.5,a\n2.5,b\n")
     frame = pandas.read_csv(path, header=[0, 1])
     assert [*table_in_memory(frame, "run").columns] == ["Gx V", "Note"]
+
+
+def test_a_column_that_is_no_number_is_text_and_refused_only_where_it_is_needed(calibrated):
+    made, *_ = calibrated
+    run = mwdcal.read_run(EXAMPLE / "run.csv", PROFILE)
+    table, count = {**run.columns}, len(run)
+    seconds = np.arange(count).astype("m8[s]")
+    moments = np.datetime64("2026-01-31T10:00") + seconds
+    moments[1] = np.datetime64("NaT")
+    beside = {
+        "Time": moments.astype("M8[ns]"),
+        "Day": moments.astype("M8[D]"),
+        "Clock": [moment.time() for moment in (moments[:1].tolist() * count)],
+        "Since": seconds,
+        "Good": np.ones(count, bool),
+        "Trace": [np.ones(3)] * count,
+    }
+    read = mwdcal.read_run({**table, **beside}, PROFILE).columns
+    assert read["Time"].tolist()[:3] == ["2026-01-31T10:00:00", "", "2026-01-31T10:00:02"]
+    assert read["Day"].tolist()[:2] == ["2026-01-31", ""]
+    assert [read[n][1] for n in ("Clock", "Since", "Good")] == ["10:00:00", "0:00:01", "true"]
+    (unused,) = mwdcal.calibrate({**table, **beside}, PROFILE).findings[:1]
+    assert unused.text == f"columns not used: {', '.join(map(repr, beside))}."
+    for task in (mwdcal.apply, mwdcal.survey):
+        assert np.isfinite(task(made, {**table, **beside}).columns["inclination_deg"]).all()
+    with pytest.raises(mwdcal.InputError, match=r"row 1, column 'ax': expected a number; .*Write"):
+        mwdcal.read_run({**table, "ax": beside["Time"]}, PROFILE)
 
 
 def test_a_row_of_units_below_the_names_in_pandas_is_no_station(tmp_path):

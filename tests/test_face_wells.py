@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from datetime import date, datetime
 
 import numpy as np
@@ -344,6 +345,34 @@ def test_a_notation_is_that_of_the_command(folder, cal, notation, tmp_path):
         assert len(in_memory.covariance[triad]) == len(document[triad]["covariance"])
     assert in_memory.to_dict()["calibration_sha256"] is None
     assert "SHA-256" not in in_memory.summary()
+
+
+def test_factors_in_pandas_are_those_of_the_report(cal, tmp_path):
+    pytest.importorskip("pandas")
+    cal.report(tmp_path / "tool.html")
+    page = (tmp_path / "tool.html").read_text("utf-8")
+    made = mc.convert(cal, "factors")
+    table = made.to_pandas().set_index(["triad", "name"])
+    names = re.findall(r"<td>(SF|B|m)<sub>([xyz]+)</sub>", page)
+    assert [*dict.fromkeys(name for _, name in table.index)] == [
+        *dict.fromkeys(map("".join, names))
+    ]
+    assert table.unit["accelerometer"][["SFx", "By", "mxy"]].tolist() == ["raw/g", "g", "1"]
+    assert table.unit["magnetometer"][["SFx", "By", "mxy"]].tolist() == ["raw/nT", "nT", "1"]
+    assert table.value["magnetometer", "mxy"] == made.magnetometer["m"][0, 1]
+    assert table.sd["magnetometer", "By"] == made.uncertainty["magnetometer"]["B"][1, 0]
+
+
+def test_values_of_a_course_name_their_power_in_pandas():
+    pytest.importorskip("pandas")
+    cal = mc.calibrate(mc.simulate("laboratory-thermal", "servo", seed=1), order=1)
+    for notation, temperature, names, units in (
+        ("factors", None, ["SFx·τ", "Bz·τ", "mxy"], ["raw/nT/°C", "nT/°C", "1"]),
+        ("forward", "course", ["Sxy·τ", "oz·τ²", "ox"], ["raw/nT/°C", "raw/°C²", "raw"]),
+    ):
+        table = mc.convert(cal, notation, temperature=temperature).to_pandas()
+        unit = table.set_index(["triad", "name"]).unit["magnetometer"]
+        assert unit[names].tolist() == units
 
 
 @pytest.mark.parametrize(("form", "typed"), [("c", "c-header"), ("fixed-point", "fixed-point")])

@@ -687,12 +687,13 @@ def test_what_is_not_judged_is_named(example, tmp_path):
     columns, document = surveyed_file(example, tmp_path, blank)
     assert set(columns["accepted"]) == {"true"}
     [text] = [f["text"] for f in document["findings"] if f["id"] == "partly-judged"]
-    assert text.startswith("field and dip of 36 of 36 surveys are not judged")
+    assert text.startswith("no reference for field and dip at 36 of 36 surveys: `accepted` says")
+    assert text.endswith("Give `reference`, or state ref_field_nt and ref_dip_deg above the table.")
     one = ["48000"] * 36
     one[3] = ""
     _, document = surveyed_file(example, tmp_path, {"ref_field_nt": one})
     [text] = [f["text"] for f in document["findings"] if f["id"] == "partly-judged"]
-    assert text.startswith("field of 1 of 36 surveys")
+    assert text.startswith("no reference for field at 1 of 36 surveys:")
     _, document = surveyed_file(example, tmp_path)
     assert "partly-judged" not in {f["id"] for f in document["findings"]}
 
@@ -737,7 +738,7 @@ def test_a_relative_magnetometer_is_judged_by_dip_alone(example, relative, tmp_p
     assert not (tmp_path / "none.csv").exists()
     _, document = surveyed_file(relative, tmp_path, blank, "--error-model", "none")
     [text] = [f["text"] for f in document["findings"] if f["id"] == "partly-judged"]
-    assert text.startswith("dip of 36 of 36")
+    assert text.startswith("no reference for dip at 36 of 36")
 
 
 def test_without_magnetic_readings_the_toolface_is_the_gravity_one(example, tmp_path):
@@ -1168,6 +1169,38 @@ def test_drift_grows_with_the_time_since_the_calibration(example, years, share):
     assert errors.years == pytest.approx(years, abs=0.002)
     assert errors.sensors.magnetometer_bias_nt == pytest.approx(70.0 * share, rel=0.005)
     assert errors.sensors.axial_interference_nt == 220.0
+
+
+def test_norths_in_results_are_those_that_the_table_states(example, tmp_path):
+    given = "declination_deg = 1.5", "sd_declination_deg = 0.35", "convergence_deg = -0.7"
+    source = write_csv(
+        tmp_path / "in.csv", read_csv(EXAMPLE / "well.csv"), "simulated = true", *given
+    )
+    document = cli("survey", example, source, "-o", tmp_path / "out.csv", "--json").json
+    lines = (tmp_path / "out.csv").read_text("utf-8").splitlines()
+    assert {f"# {each}" for each in given} <= {*lines}
+    assert [document[each.split()[0]] for each in given] == [1.5, 0.35, -0.7]
+
+
+def test_dates_that_are_not_known_are_asked_for(example, tmp_path):
+    calibration, given = mwdcal.load(example), read_csv(EXAMPLE / "well.csv")
+    tool = replace_struct(calibration, tool={**calibration.tool, "date": "2025-01-01"})
+    for cal, above, words in (
+        (calibration, (), "a year: date the surveys and the calibration run, by a line Date above"),
+        (
+            tool,
+            (),
+            "taken as a year: date the surveys, by a line Date above the table or by --date",
+        ),
+        (tool, ("Date: 2025-07-02",), "drift of the sensors over 0.50 years since the calibration"),
+        (
+            tool,
+            ("Date: 2024-07-02",),
+            "over an unknown time since the calibration, taken as a year\n",
+        ),
+    ):
+        source = write_csv(tmp_path / "in.csv", given, "simulated = true", *above)
+        assert words in mwdcal.survey(cal, source).summary()
 
 
 # ------------------------------------------------------------------ a well as it is drilled

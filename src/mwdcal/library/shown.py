@@ -12,6 +12,7 @@ from html import escape
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
+from msgspec import UNSET
 
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration, html_table
@@ -28,7 +29,7 @@ from mwdcal.logs.stations import Stations
 from mwdcal.presentation.text import to_json
 from mwdcal.sensor.profile import NOMINAL
 from mwdcal.use.correction import tallied
-from mwdcal.use.verification import Verdict
+from mwdcal.use.verification import Verdict, VerdictRow
 
 _Shown = TypeVar("_Shown")
 _INPUTS = "_inputs"
@@ -218,18 +219,29 @@ def _to_pandas(readings: Readings) -> Any:
 
 
 def _limit_columns(verdict: Verdict) -> dict[str, AnyArray]:
-    """A row for each limit: the value judged with its U (95 %; NaN: not stated), limit, unit and verdict."""
+    """A row for each limit: the columns of the screen, with U, the expanded uncertainty (95 %); NaN: not stated."""
     from mwdcal.certificate.decisions import expanded_of
 
     rows = verdict.rows
     return {
         "name": np.array([row.name for row in rows]),
+        "raw": np.array([row.raw for row in rows], float),
         "value": np.array([row.value for row in rows], float),
+        "sd": np.array([row.uncertainty for row in rows], float),
         "U": np.array([expanded_of(row) for row in rows], float),
+        "degrees_of_freedom": np.array([_freedom(row) for row in rows]),
         "limit": np.array([row.limit for row in rows]),
         "unit": np.array([row.unit for row in rows]),
         "verdict": np.array(["pass" if row.passed else "FAIL" for row in rows]),
+        "where": np.array([row.note for row in rows]),
     }
+
+
+def _freedom(row: VerdictRow) -> float:
+    """Degrees of freedom of the uncertainty of a limit: infinite where the noise is declared; NaN: not stated."""
+    if row.uncertainty is None or row.degrees_of_freedom is UNSET:
+        return np.nan
+    return np.inf if row.freedom is None else row.freedom
 
 
 def _verdict_to_pandas(verdict: Verdict, rows: Literal["stations", "limits"] = "stations") -> Any:

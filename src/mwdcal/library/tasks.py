@@ -153,18 +153,22 @@ def _is_missing(cell: Any) -> bool:
         return cell is None or bool(cell != cell)
     except TypeError:
         return True
+    except ValueError:  # an array
+        return False
 
 
 def _column(name: str, values: Any) -> Column:
-    """Numbers, or the text of a column of labels; other text stays text, and a serial that is a number a number."""
+    """Numbers, or the text of labels and of any other values; a serial that is a number with a point stays one."""
     array = np.ma.array(values)
-    if array.ndim != 1 or (array.dtype.kind in "bcmM" and name != "simulated"):
+    kind = array.dtype.kind
+    if not array.ndim:
         raise InputError(
-            f"column '{name}' must be numbers or text, one for each row; got {array.dtype} of shape "
-            f"{array.shape}."
+            f"column '{name}' must be numbers or text, one for each row; got {array.item()!r}. Give a list."
         )
-    decimals = array.dtype.kind == "f" and name == "serial"
-    if (name in LABELS and not decimals) or array.dtype.kind in "OUS":
+    if array.dtype.name.endswith("s]"):  # datetimes; those in ns would be whole numbers
+        array = np.ma.array(array, dtype=f"{kind}8[us]")
+    numbers = array.ndim == 1 and kind in "fiu"
+    if not numbers or (name in LABELS and not (kind == "f" and name == "serial")):
         return ["" if _is_missing(cell) else as_text(cell) for cell in array.tolist()]
     return without_mask(array.astype(float))
 

@@ -283,6 +283,13 @@ class Conversion(Result):
         return self.converted.findings
 
     @property
+    def columns(self) -> Mapping[str, AnyArray]:
+        """A row for each value: triad, name (as in the report: SFx, mxy), value, sd (NaN: undetermined) and unit."""
+        from mwdcal.presentation.conversion import value_table
+
+        return value_table(self.converted)
+
+    @property
     def accelerometer(self) -> Mapping[str, Array]:
         """Arrays of the accelerometer: S and o, M and b, or SF, B and m."""
         return self._values("accelerometer")

@@ -41,11 +41,12 @@ from mwdcal.presentation.numbers import (
     capital,
     estimate,
     exponent,
-    factor_places,
     norths,
     quantity,
     raw_unit,
+    strength_unit,
     uncertainty,
+    value_places,
 )
 from mwdcal.presentation.page import banner, environment
 from mwdcal.presentation.text import plural, raised
@@ -334,7 +335,7 @@ def _record_rows(triad: TriadCalibration) -> list[tuple[Any, ...]]:
     for full, value, sd in zip(*columns, strict=True):
         base, _, power = full.partition("·")
         name, _, axes = base.rpartition("-")
-        symbol = "1" if name in ("gain", "scale", "misalignment") else _unit(triad) or "1"
+        symbol = "1" if name in ("gain", "scale", "misalignment") else strength_unit(triad) or "1"
         per = raised("/°C", int(power or 0))
         rows.append((name, axes, int(power or 0), value, sd, symbol + per))
     return rows
@@ -344,13 +345,8 @@ def _factor_rows(triad: TriadCalibration, factors: Notation, raw: str) -> list[t
     values, sd = factors.values, factors.uncertainty
     return [
         (name, axes, power, float(values[name][at]), float(sd[name][at]), symbol)
-        for name, at, axes, power, symbol in factor_places(values, raw, _unit(triad), "1")
+        for name, at, axes, power, symbol in value_places(values, raw, strength_unit(triad), "1")
     ]
-
-
-def _unit(triad: TriadCalibration) -> str:
-    """The unit of a triad's field, empty if it has none."""
-    return triad.unit if triad.unit in ("g", "nT") else ""
 
 
 def _kinds(verdict: Verdict | None) -> list[tuple[str, list[tuple[VerdictRow, int]]]]:

@@ -22,10 +22,10 @@ from mwdcal.presentation.numbers import (
     RAW_UNIT,
     UNDETERMINED,
     capital,
-    factor_places,
     measured,
     number,
     raw_unit,
+    value_places,
 )
 from mwdcal.presentation.numbers import unit as spaced
 from mwdcal.presentation.page import banner, rendered
@@ -239,7 +239,7 @@ def parameters_of(comparison: Comparison, triad: str) -> list[ComparedParameter]
     strength = "g" if triad == "accelerometer" else "nT" if "field" in comparison.units else ""
     result = [
         _parameter(f"{key} {axes}{raised('·τ', power)}", unit, factors, key, at)
-        for key, at, axes, power, unit in factor_places(
+        for key, at, axes, power, unit in value_places(
             factors[0].values, raw_unit(comparison.profile, triad), strength
         )
     ]

@@ -18,6 +18,7 @@ from mwdcal.files.formats import members
 from mwdcal.firmware.c_source import stated_errors
 from mwdcal.firmware.export import DEFAULT_BITS, FIXED_POINT, FirmwareSources, export
 from mwdcal.firmware.quantisation import SHARE_OF
+from mwdcal.geometry.vectors import AnyArray
 from mwdcal.presentation.calibration_source import calibration_of
 from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.numbers import (
@@ -28,6 +29,8 @@ from mwdcal.presentation.numbers import (
     files_written,
     number,
     raw_unit,
+    strength_unit,
+    value_places,
 )
 from mwdcal.presentation.text import one_line, raised, table
 from mwdcal.sensor.profile import Axis
@@ -348,6 +351,22 @@ def notation(triads: dict[str, Notation], reference: float | None = None) -> str
         ]
         blocks.append(f"{triad}\n" + table(rows, ["", "value", "1σ"]))
     return "\n\n".join(blocks)
+
+
+def value_table(converted: Converted) -> dict[str, AnyArray]:
+    """A row for each value: triad, name, value, 1σ (NaN: undetermined) and unit; factors are named as in the report."""
+    calibration, columns = converted.calibration, ("triad", "name", "value", "sd", "unit")
+    rows = [
+        (t.name, name + axes + raised("·τ", power), values[name][at], sd[name][at], unit)
+        for t in calibration.triads
+        for values, sd in [(converted.triads[t.name].values, converted.triads[t.name].uncertainty)]
+        for name, at, axes, power, unit in value_places(
+            values, raw_unit(calibration.profile, t.name), strength_unit(t), "1"
+        )
+    ]
+    return {
+        name: np.array(cells) for name, cells in zip(columns, zip(*rows, strict=True), strict=True)
+    }
 
 
 def _stated(notation: Notation, name: str, index: tuple[int, ...]) -> tuple[str, str]:

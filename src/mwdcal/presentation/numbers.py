@@ -12,10 +12,12 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from mwdcal.calibration.record import TriadCalibration
 from mwdcal.files.contract import AZIMUTH_KEYS, CHANNELS
 from mwdcal.geometry.vectors import Array
 from mwdcal.presentation.text import one_line, raised, superscript
 from mwdcal.sensor.profile import Profile
+from mwdcal.use.notation import VALUE_AXES, powers
 
 HELD = "held"
 """In place of the uncertainty of a parameter that a model of 9 or 6 keeps at zero."""
@@ -161,20 +163,29 @@ def raw_unit(profile: Profile, triad: str) -> str:
     return (len(units) == 1 and units.pop()) or RAW_UNIT
 
 
-def factor_places(
+def strength_unit(triad: TriadCalibration) -> str:
+    """The unit of a triad's field, empty if it has none."""
+    return triad.unit if triad.unit in ("g", "nT") else ""
+
+
+def value_places(
     values: Mapping[str, Array], raw: str, strength: str, one: str = ""
-) -> Iterator[tuple[str, tuple[int, int], str, int, str]]:
-    """Name, index, axes, power of τ and unit of each factor; the diagonal of m is not one.
+) -> Iterator[tuple[str, tuple[int, ...], str, int, str]]:
+    """Name, index, axes, power of τ and unit of each value of a notation; the diagonal of m is not one.
 
     `raw` is the unit of the readings, `strength` that of the field, empty if it has none; `one` stands for no unit.
     """
-    units = {"SF": f"{raw}/{strength}" if strength else raw, "B": strength or one, "m": one}
+    scale = f"{raw}/{strength}" if strength else raw
+    units = {
+        "SF": scale, "B": strength or one, "m": one, "S": scale, "o": raw,
+        "M": f"{strength or '1'}/{raw}", "b": strength or one,
+    }  # fmt: skip
     for name, value in values.items():
-        for i, j in np.ndindex(value.shape):
-            if name != "m":
-                yield name, (i, j), "xyz"[i], j, units[name] + raised("/°C", j)
-            elif i != j:
-                yield name, (i, j), "xyz"[i] + "xyz"[j], 0, units[name]
+        for at, power in np.ndenumerate(powers(name, value)):
+            place = at[:1] if name in ("SF", "B") else at[-VALUE_AXES[name] :]
+            if name != "m" or at[0] != at[1]:
+                axes = "".join("xyz"[axis] for axis in place)
+                yield name, at, axes, int(power), units[name] + raised("/°C", int(power))
 
 
 def uncertainty(value: float | None) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from mwdcal.calibration.diagnosis.findings import unused_columns
-from mwdcal.calibration.readings import serial_of, simulated
+from mwdcal.calibration.readings import serial_of, simulated, stated_day
 from mwdcal.calibration.record import Finding, SignatureCheck, stated
 from mwdcal.files.formats.columns import shown
 from mwdcal.geometry.units import LENGTH_UNITS, USUAL_COURSES
@@ -353,20 +353,7 @@ def summary(
 
 def _stated(north: North, terms: ErrorTerms) -> dict[str, Any]:
     """The causes that turn azimuths, degrees, and what their uncertainty holds."""
-    north = north.typical
-    sd = None if north.declination is None else north.declination_sd
-    angles = {
-        "declination_deg": north.declination,
-        "sd_declination_deg": sd,
-        "convergence_deg": north.convergence,
-    }
-    return {
-        **{
-            key: None if angle is None else float(np.degrees(angle))
-            for key, angle in angles.items()
-        },
-        **terms.stated,
-    }
+    return {**north.in_degrees, **terms.stated}
 
 
 def end_of_path(last: LastStation) -> EndOfPath:
@@ -417,7 +404,7 @@ def screen(
         lines.append(end_in_words(facts.end, facts.north, facts.length_unit))
     lines.append(well.terms.sentence)
     if well.errors:
-        lines.append(model_in_words(well.errors, bool(facts.runs)))
+        lines.append(model_in_words(well, well.errors, bool(facts.runs)))
     return "\n".join(
         [
             *map(one_line, lines),
@@ -443,13 +430,13 @@ def without_verdict(facts: SurveySummary) -> list[str]:
     return [f"{count} {word}" for word, count in words.items() if count]
 
 
-def model_in_words(errors: WellErrors, runs: bool = False) -> str:
+def model_in_words(well: Well, errors: WellErrors, runs: bool = False) -> str:
     """The error model, and the time over which the sensors may have drifted; that of several runs stands with these."""
     if runs:
         walk = "; drift by the random walk of each tool" if errors.by_walk else ""
         return f"error model {errors.model.name} ({errors.model.source}); no sag is corrected{walk}"
     time = (
-        "an unknown time since the calibration, taken as a year"
+        f"an unknown time since the calibration, taken as a year{_undated(well)}"
         if errors.years is None
         else (f"{fixed(errors.years, 2)} years since the calibration")
     )
@@ -460,6 +447,13 @@ def model_in_words(errors: WellErrors, runs: bool = False) -> str:
     )
     model = f"error model {errors.model.name} ({errors.model.source})"
     return f"{model}; no sag is corrected; {drift} over {time}"
+
+
+def _undated(well: Well) -> str:
+    """The request for the dates that are not known; empty if both are."""
+    stated = {"the surveys": well.readings.metadata, "the calibration run": well.calibration.tool}
+    lacking = " and ".join(name for name, each in stated.items() if stated_day(each) is None)
+    return f": date {lacking}, by a line Date above the table or by --date" if lacking else ""
 
 
 def declination_in_words(facts: SurveySummary) -> str:

@@ -91,6 +91,22 @@ class North:
         """With one value for all stations."""
         return self if self.base is None else replace(self.base, section=self.section)
 
+    @property
+    def in_degrees(self) -> dict[str, float | None]:
+        """Declination with its 1σ that stations share, and convergence, typical, by metadata key; None: not known.
+
+        They have 12 significant digits: 1.5° that a table states is 1.5° in its results.
+        """
+        north = self.typical
+        sd = None if north.declination is None else north.declination_sd
+        angles = {
+            "declination_deg": north.declination, SD_KEY: sd, "convergence_deg": north.convergence
+        }  # fmt: skip
+        return {
+            key: None if angle is None else float(f"{np.degrees(angle):.12g}")
+            for key, angle in angles.items()
+        }
+
     def by_row(self, columns: Mapping[str, Array]) -> North:
         """The same with the columns (n,) of `DECLINATIONS` that a table has, degrees; blank cells keep what it has."""
         parts = self.declination, self.declination_sd, self.declination_noise

@@ -449,13 +449,7 @@ def described(well: Well) -> Mapping[str, object]:
         **({} if well.length_unit == "m" else {"length_unit": well.length_unit}),
         **well.terms.stated,
     }
-    for key, angle in (
-        ("declination_deg", north.declination),
-        (SD_KEY, None if north.declination is None else north.declination_sd),
-        ("convergence_deg", north.convergence),
-    ):
-        if angle is not None:
-            stated[key] = float(np.degrees(angle))
+    stated |= {key: angle for key, angle in north.in_degrees.items() if angle is not None}
     if north.scale is not None:
         stated["grid_scale"] = north.scale
     if well.sources:

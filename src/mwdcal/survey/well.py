@@ -18,6 +18,7 @@ from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.calibration.results import UNKNOWN_GRAVITY, unknown_gravity
 from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError
+from mwdcal.files.contract import REFERENCES
 from mwdcal.geometry.observables import EXTRAPOLATED, OBSERVABLES, RESULTS, VECTORS
 from mwdcal.geometry.units import LENGTH_UNITS, STANDARD_GRAVITY, USUAL_COURSES
 from mwdcal.geometry.vectors import AnyArray, Array, ArrayLike, Bools, Ints, diagonal, wrap
@@ -328,8 +329,8 @@ WELL_FINDINGS = {
     "survey again.",
     "not-judged": "{unjudged} of {rows} surveys are not judged: no reference for |g|, |b| or dip. Give `reference`, or "
     "columns ref_gravity_g, ref_field_nt, ref_dip_deg.",
-    "partly-judged": "{names} of {partly} of {rows} surveys are not judged: no reference. `accepted` says nothing "
-    "about them.",
+    "partly-judged": "no reference for {names} at {partly} of {rows} surveys: `accepted` says nothing about {names}. "
+    "Give `reference`, or state {references} above the table.",
     "laboratory-gravity": "gravity at the laboratory is unknown (1 g was assumed), so |g| is judged 1.5 mg more "
     "loosely. To tighten this, give ref_gravity_g in the calibration run.",
     "calibration-old": "the tool was calibrated {years:.1f} years before, and 1σ {drift}",
@@ -873,6 +874,7 @@ def _findings(result: Well, counts: WellCounts, from_first: bool) -> list[Findin
         stated_day(each) for each in (result.calibration.tool, result.readings.metadata)
     )
     years, course = _years(calibrated, day) or 0.0, _usual_course(result.position)
+    lacking = [n for n, lacks in zip(STRENGTH_NAMES, counts.lacking, strict=True) if lacks]
     walks = result.errors is not None and result.errors.by_walk
     applies = {
         "rejected": counts.rejected,
@@ -893,7 +895,7 @@ def _findings(result: Well, counts: WellCounts, from_first: bool) -> list[Findin
     words = {
         "rejected": counts.rejected, "judged": counts.judged, "limits": result.limits.name, "rows": counts.rows,
         "first": first, "why": why, "start": label, "blind": counts.blind, "accepted": counts.accepted,
-        "names": " and ".join(n for n, lacks in zip(STRENGTH_NAMES, counts.lacking, strict=True) if lacks),
+        "names": " and ".join(lacking), "references": " and ".join(REFERENCES[n].column for n in lacking),
         "blindest": blindest, "worst": worst, "partly": counts.partly, "unjudged": counts.unjudged,
         "count": counts.rows - counts.on_path, "years": years, "day": day, "calibrated": calibrated, "course": course,
         "usual": USUAL_COURSE, "lacking_path": LACKING_PATH[counts.located],
