@@ -300,6 +300,7 @@ def screen(width, *arguments, **variables):
         "[0-9a-f]{64}",
         r"(?<=\d{8}-)[0-9a-f]{12}\b",
         r"(?<= )[0-9a-f]{12}\b",
+        r"(?<=probability of 0\.\d)\d",  # of fixed draws, of which one may lie on the edge
         today,
         *libraries,
     ):
