@@ -168,7 +168,7 @@ def factor_places(
 
     `raw` is the unit of the readings, `strength` that of the field, empty if it has none; `one` stands for no unit.
     """
-    units = {"SF": f"{raw}/{strength}" if strength else raw, "B": strength or one, "m": one}
+    units = {"SF": f"{raw}/{strength}" if strength else raw, "B": strength or one, "m": "rad"}
     for name, value in values.items():
         for i, j in np.ndindex(value.shape):
             if name != "m":
