@@ -492,7 +492,7 @@ def common_source(name: str) -> str:
 
 
 def assumed_exact(
-    result: Fit, relative: bool, exact_angles: Bools | None = None
+    result: Fit, relative: bool, exact_angles: Bools | bool = False
 ) -> list[list[str]]:
     """References and conditions that each run assumes exact whose error moves no residual, but the calibration.
 
@@ -510,10 +510,7 @@ def assumed_exact(
     if relative:
         declared.add("field")
     aligned = evidence.is_known("inclination").any(-1) & ("tool-axis-x" not in declared)
-    holds: dict[str, Array] = {}
-    if exact_angles is not None:
-        holds[STAND_ANGLES_EXACT] = exact_angles
-    holds |= {
+    holds = {
         "toolface zero of the stand" if name == "toolface" else f"{name} reference": (
             evidence.is_known(name).any(-1)
         )
@@ -529,6 +526,7 @@ def assumed_exact(
     one_way = np.asarray(np.minimum(rise, fall) < LEAST_RETURN * np.ptp(temperature, -1))
     holds[THERMOMETER] = one_way & any(orders_of(result))
     holds |= {STEADINESS[name]: members for name, members in unseen_drifts(result).items()}
+    holds = {STAND_ANGLES_EXACT: np.broadcast_to(exact_angles, aligned.shape), **holds}
     return [[*compress(holds, each)] for each in np.stack([*holds.values()], -1).tolist()]
 
 
