@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
@@ -177,7 +178,18 @@ def test_tables_to_a_verdict_in_one_command_are_the_two_commands(tmp_path, fitte
     assert (tmp_path / "page.html").read_bytes() == (tmp_path / "verified.html").read_bytes()
     shown = mwdcal("calibrate", run, "--tool", "servo", "-o", both, "--rolltest", test)
     assert ("FAIL" in shown.out) == ("next: mwdcal diagnose" in shown.out) == (bias_g > 0)
-    assert "PASS" in shown.out or bias_g
+    assert shown.out.startswith("FAIL" if bias_g else "PASS")
+    assert shown.out.rstrip().splitlines()[-1].startswith("next: " if bias_g else "wrote ")
+
+
+def test_a_toolface_zero_that_is_left_open_stands_in_the_table_of_a_pass(tmp_path, fitted):
+    bare = {n: v for n, v in fitted[1].items() if n != "ref_toolface_deg"}
+    run = write_csv(tmp_path / "run.csv", bare)
+    command = ("--tool", "servo", "-o", tmp_path / "a.json", "--rolltest", roll(tmp_path))
+    ran = mwdcal("calibrate", run, *command)
+    assert ran.code == 0
+    assert re.search(r"^toolface .* open +zero undetermined$", ran.out, re.MULTILINE)
+    assert "zero undetermined" not in mwdcal("calibrate", write_csv(run, fitted[1]), *command).out
 
 
 def test_a_roll_test_of_the_fit_itself_leaves_no_file(tmp_path, fitted):

@@ -8,6 +8,7 @@ import pytest
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.record import STATE_STAND
 from mwdcal.errors import InputError
 from mwdcal.use.verification import Bounds, Limits, verify
 from simulation import DEG, Tool, plan
@@ -609,5 +610,6 @@ def test_readings_that_scatter_too_little_name_the_noise_they_are_compared_with(
     smooth = waves @ np.linalg.lstsq(waves, quiet.accelerometer - mean, rcond=None)[0] + mean
     result = verify(made, msgspec_replace(quiet, accelerometer=smooth), BOTH)
     (text,) = (each.text for each in result.findings if each.id == "little-scatter")
+    assert STATE_STAND in text
     assert f"less about the curves than the {word} noise explains" in text
     assert text.endswith(f"The 1σ rests on the {word} noise.")

@@ -120,6 +120,7 @@ class Outcome:
     rule: str = "simple acceptance"
     limits: str = "moosavi"
     source: str = ""
+    data: str = "roll.csv"
     run: str = "roll.csv"
     stations: int = 12
     risk: float | None = 0.02
@@ -342,6 +343,21 @@ def test_station_to_reshoot_is_first_and_marked(page):
     assert re.search(
         r'<tr class="mark" data-point="station P7"><td>P7</td>.*?re-shoot', page, re.DOTALL
     )
+
+
+def test_facts_that_nobody_stated_are_not_given(words):
+    """Gravity is assumed; a profile that is named by the serial is no type; misalignments are radians."""
+    page = words(calibrated(moved=False))
+    stated = '1 g</td><td class="text">'
+    record = calibrated(moved=False)
+    for known, word in ((False, "assumed"), (True, "given")):
+        of_run = msgspec.structs.replace(record, gravity_stated=known)
+        assert f"{stated}{word}</td>" in words(of_run)
+    assert "<dt>Type</dt><dd>servo</dd>" in page
+    named = msgspec.structs.replace(record.profile, name="MWD-123")
+    assert "<dt>Type</dt>" not in words(msgspec.structs.replace(record, profile=named))
+    assert re.search(r"<td>m<sub>xy</sub></td>.*?<td class=\"text\">rad</td>", page)
+    assert "Degrees of freedom: readings that check the fit" in page
 
 
 def test_clean_fit_says_so(words):

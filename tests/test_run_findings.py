@@ -22,6 +22,7 @@ from mwdcal.calibration.diagnosis.structure import shown_effects
 from mwdcal.calibration.estimate import fit, solve
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings, fingerprints
+from mwdcal.calibration.record import STATE_STAND
 from mwdcal.calibration.residuals import chances
 from mwdcal.errors import FitError
 from mwdcal.estimation.uncertainty import analyse, left_out_variances
@@ -386,6 +387,18 @@ def test_an_axis_of_another_noise_is_named(triad, times, sd):
     assert np.log(float(chance)) == pytest.approx(np.log(6 * stats.f.sf(ratio, 44, 44)), rel=0.1)
     other = {"accelerometer": "magnetometer", "magnetometer": "accelerometer"}[triad]
     assert f"{other}-axis-noise" not in found(data)
+
+
+def test_an_unstated_stand_is_named_before_other_causes():
+    """Of unequal axes, of residuals beyond the declared noise, and among what is assumed exact."""
+    data = with_noise(run(sd=NOISE), 1, accelerometer=(1, 1, 4))
+    stated = replace(data, sd={**data.sd, "toolface": np.full(48, 1e-6)})
+    for each, named in ((data, True), (stated, False)):
+        texts = found(each)
+        for name in ("axis-noise", "residuals"):
+            assert (STATE_STAND in texts[f"accelerometer-{name}"]) == named
+        assumed = calibrate(each, PROFILE).assumed_exact
+        assert (assumed[0] == "angles of the stand") == named
 
 
 def test_axes_of_one_noise_are_not_named():

@@ -74,8 +74,13 @@ def test_runs_of_a_batch_have_patterns_of_their_own():
     [({}, True), ({"settings": "per-direction"}, False), ({"group": ["x", "x"]}, False)],
 )
 def test_the_assumption_is_one_where_nobody_states_the_practice(more, expected):
-    assert is_assumed(run([5, 5], [0, 0], **more)) is expected
-    assert not is_assumed(run([5, 45], [0, 0], **more))
+    uncertain = {"inclination": np.full(2, 1e-3)}
+    assert is_assumed(replace(run([5, 5], [0, 0], **more), sd=uncertain)) is expected
+    assert not is_assumed(replace(run([5, 45], [0, 0], **more), sd=uncertain))
+
+
+def test_nothing_is_assumed_of_an_exact_direction():
+    assert not is_assumed(run([5, 5], [0, 0]))
 
 
 def test_an_unknown_practice_is_refused():

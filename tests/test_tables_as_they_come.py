@@ -588,7 +588,7 @@ def test_sheets_of_temperatures_beside_one_of_a_roll_test(tmp_path):
     path = workbook_of(tmp_path / "a.xlsx", run, ["20 C", "60 C", "Rulletest"])
     proposal = library.propose_profile(path)
     assert library.read_run(path, proposal.profile).count == 32
-    assert "roll test on sheet 'Rulletest', 16 rows" in proposal.summary()
+    assert "roll test below this row of sheet 'Rulletest', 16 rows" in proposal.summary()
 
 
 def test_toolfaces_to_the_right_and_left_of_the_high_side(tmp_path):
@@ -641,7 +641,7 @@ def test_a_roll_test_below_the_run_is_set_aside_and_named(tmp_path, heading):
     path.write_text("\n".join(["Calibration", *lines, "", heading, *lines[:13]]))
     proposal = library.propose_profile(path)
     assert library.read_run(path, proposal.profile).count == 48
-    assert "(roll test, 12 rows)" in proposal.summary()
+    assert "(roll test, 12 rows, not part of the run)" in proposal.summary()
 
 
 @pytest.mark.parametrize(
@@ -669,7 +669,27 @@ def test_a_sheet_of_a_roll_test_is_set_aside_and_named(tmp_path):
     proposal = library.propose_profile(path)
     assert library.read_run(path, proposal.profile).count == 24
     assert "sheet 'Calibration'" in proposal.summary()
-    assert "(roll test on sheet 'Roll test', 24 rows)" in proposal.summary()
+    aside = "roll test below this row of sheet 'Roll test', 24 rows, not part of the run"
+    assert f"row 1 ({aside})" in proposal.summary()
+    tool = tmp_path / "tool.toml"
+    proposal.save(tool)
+    ran = mwdcal("calibrate", path, "--tool", tool, "-o", tmp_path / "a.json", "--rolltest", path)
+    assert ", sheet 'Roll test'   24 stations" in ran.out.splitlines()[0], ran
+
+
+def test_a_table_of_one_inclination_says_what_a_calibration_lacks(tmp_path):
+    columns = {name: values[:12] for name, values in table().items()}
+    ran = mwdcal("profile", write_csv(tmp_path / "a.csv", columns), "-o", tmp_path / "a.toml")
+    assert "! all stations are at inclination 5°: mwdcal calibrate will refuse this run." in ran.err
+    assert "next: add stations at other inclinations" in ran.out
+    whole = mwdcal("profile", write_csv(tmp_path / "b.csv", table()), "-o", tmp_path / "b.toml")
+    assert "all stations" not in whole.err
+    assert "next: mwdcal calibrate" in whole.out
+
+
+def test_a_proposed_profile_says_which_practice_of_the_stand_is_assumed(tmp_path):
+    text = library.propose_profile(write_csv(tmp_path / "a.csv", table())).to_toml()
+    assert '# settings =   # "per-direction" (assumed until stated)' in text
 
 
 @pytest.mark.parametrize(("other", "named"), [("Roll test", True), ("Old void", False)])

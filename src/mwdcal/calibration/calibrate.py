@@ -188,7 +188,9 @@ class Records:
             "stand": [StandErrors(**errors) for errors in stand],
             "earth": _by_run(results.earth(result), count),
             "budget": _budget(fitted),
-            "assumed_exact": results.assumed_exact(result, fitted.readings.relative),
+            "assumed_exact": results.assumed_exact(
+                result, fitted.readings.relative, fitted.readings.exact_angles
+            ),
             "unseen": _unseen(fitted),
             "errors": error_rows(fitted.residuals),
             "measures": measure_rows(fitted.residuals),

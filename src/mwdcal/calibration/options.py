@@ -64,13 +64,14 @@ def numbered(group: Ints, angles: Sequence[Array], practice: str) -> Ints:
 
 
 def is_assumed(readings: Readings) -> bool:
-    """Whether stations are taken as one setting although neither profile nor run says so."""
+    """Whether stations of uncertain directions are taken as one setting though neither profile nor run says so."""
     number, group = (
         settings_of(readings),
         np.broadcast_to(readings.groups, readings.accelerometer.shape[:-1]),
     )
     together = (np.diff(number, axis=-1) == 0) & (group[..., 1:] < 0)
-    return not readings.settings and bool(together.any())
+    uncertain = any(readings.uncertainty(name).any() for name in DIRECTION)
+    return not readings.settings and uncertain and bool(together.any())
 
 
 def _equal(group: Sequence[Ints], angles: Sequence[Sequence[Array]]) -> Bools:

@@ -19,6 +19,7 @@ import numpy as np
 
 from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError
+from mwdcal.estimation.problem import ANGLES
 from mwdcal.geometry.vectors import AnyArray, Array, ArrayLike, Bools, Ints
 from mwdcal.sensor.profile import Profile
 
@@ -156,6 +157,7 @@ class Readings:
         metadata: serial, date, operator, …, as the file states them.
         north: what turned stated azimuths magnetic, under the keys of metadata; the tool profile may state it too.
         source: name of the file.
+        sheet: name of its sheet, of a workbook.
         unused: columns of the file that are not used, each with what it resembles.
         remarks: sentences on rows of the file that are left out.
         not_taken: lines of the file with a reference that is not read, by column of a run file.
@@ -179,6 +181,7 @@ class Readings:
     metadata: Mapping[str, object] = field(default_factory=dict)
     north: Mapping[str, object] = field(default_factory=dict)
     source: str = ""
+    sheet: str = ""
     unused: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     not_taken: Mapping[str, str] = field(default_factory=dict)
@@ -258,6 +261,13 @@ class Readings:
         if name not in self.sd:
             return np.zeros(self.accelerometer.shape[:-1])
         return self._per_station(np.nan_to_num(np.asarray(self.sd[name], float)))
+
+    @property
+    def exact_angles(self) -> Bools:
+        """Whether some angles of the stand are known (...), and none of them has an uncertainty."""
+        known = ~np.isnan([self.reference(name) for name in ANGLES])
+        uncertain = known & (np.array([self.uncertainty(name) for name in ANGLES]) > 0)
+        return np.asarray(known.any((0, -1)) & ~uncertain.any((0, -1)))
 
     def common_uncertainty(self, name: str, inclination: Array) -> Array:
         """Standard uncertainty of the reference `name` (..., n) by what all stations of a stand share.

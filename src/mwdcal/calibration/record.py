@@ -218,6 +218,10 @@ STEADINESS = {
 """Assumption of a calibration whose run could not show a drift, by the name of the drift."""
 
 
+STAND_ANGLES_EXACT = "angles of the stand"
+"""The name of reference angles without any uncertainty…"""
+STATE_STAND = "The angles of the stand count as exact: first state their 1σ under [stand] in the tool profile. "
+"""…and what findings say of it that their errors may explain."""
 ALIGNMENT = "alignment of the tool in the stand"
 """The name of what a tool's axis that is not the one it is rolled about does."""
 LEAN = "A tool that leans by 0.05° in the stand is off by up to 0.05° in inclination, 0.07° in azimuth at 45°"
@@ -721,6 +725,12 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     def run_name(self) -> str:
         """The name of the run in messages: its file, if it had one."""
         return self.run or "unnamed readings"
+
+    @property
+    def tool_type(self) -> str:
+        """The type of the tool as its run states it, else the name of its profile; blank if that is its serial."""
+        named = "" if self.profile.name == self.tool.get("serial") else self.profile.name
+        return self.tool.get("tool") or named
 
     @property
     def has_field(self) -> bool:

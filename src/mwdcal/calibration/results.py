@@ -30,6 +30,7 @@ from mwdcal.calibration.record import (
     ORDER,
     REPEATABILITY,
     SETTINGS,
+    STAND_ANGLES_EXACT,
     STEADINESS,
     THERMOMETER,
     Calibration,
@@ -490,9 +491,12 @@ def common_source(name: str) -> str:
     return error_name(name).partition(" about ")[0]
 
 
-def assumed_exact(result: Fit, relative: bool) -> list[list[str]]:
+def assumed_exact(
+    result: Fit, relative: bool, exact_angles: Bools | bool = False
+) -> list[list[str]]:
     """References and conditions that each run assumes exact whose error moves no residual, but the calibration.
 
+    And first the angles of the stand in runs with `exact_angles` (B,): their errors pass for noise.
     A toolface zero, or a tool that leans in the stand, turns both triads, and a strength scales one, as sensors of
     other mounting or scale would have it. The field = 1 of a `relative` magnetometer is no reference. The signs of the
     magnetometer are assumed where nothing confirms the hemisphere: see `unconfirmed_dip`. The sensors of a
@@ -516,16 +520,14 @@ def assumed_exact(result: Fit, relative: bool) -> list[list[str]]:
     holds[ALIGNMENT] = aligned
     dip = unconfirmed_dip(result)
     holds |= {SIGNS[0]: dip >= 0, SIGNS[1]: dip < 0}
-    holds[THERMOMETER] = _goes_one_way(result.problem.temperature) & any(orders_of(result))
-    holds |= {STEADINESS[name]: members for name, members in unseen_drifts(result).items()}
-    return [[*compress(holds, each)] for each in np.stack([*holds.values()], -1).tolist()]
-
-
-def _goes_one_way(temperature: Array) -> Bools:
-    """Whether temperatures (B, n) of stations in their order go no way back worth `LEAST_RETURN` of their span."""
+    temperature = result.problem.temperature
     fall = np.max(np.maximum.accumulate(temperature, -1) - temperature, -1)
     rise = np.max(temperature - np.minimum.accumulate(temperature, -1), -1)
-    return np.asarray(np.minimum(rise, fall) < LEAST_RETURN * np.ptp(temperature, -1))
+    one_way = np.asarray(np.minimum(rise, fall) < LEAST_RETURN * np.ptp(temperature, -1))
+    holds[THERMOMETER] = one_way & any(orders_of(result))
+    holds |= {STEADINESS[name]: members for name, members in unseen_drifts(result).items()}
+    holds = {STAND_ANGLES_EXACT: np.broadcast_to(exact_angles, aligned.shape), **holds}
+    return [[*compress(holds, each)] for each in np.stack([*holds.values()], -1).tolist()]
 
 
 def unseen_drifts(result: Fit) -> dict[str, Bools]:

@@ -17,6 +17,7 @@ from mwdcal.calibration.record import (
     ORDER,
     REPEATABILITY,
     SETTINGS,
+    STAND_ANGLES_EXACT,
     BudgetRow,
     Calibration,
     TriadCalibration,
@@ -177,7 +178,10 @@ def assumed_exact(calibration: Calibration) -> list[str]:
 
 def _exact_lines(calibration: Calibration) -> list[BudgetLine]:
     """A line for each reference without a declared uncertainty."""
-    invisible = [(name, INVISIBLE) for name in calibration.assumed_exact]
+    invisible = [
+        (name, VISIBLE if name == STAND_ANGLES_EXACT else INVISIBLE)
+        for name in calibration.assumed_exact
+    ]
     visible = [(name, VISIBLE) for name in _undeclared(calibration)]
     zeros = {f"{name}_deg": 0.0 for name in angles(calibration)}
     return [

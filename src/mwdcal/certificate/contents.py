@@ -536,7 +536,7 @@ def _item(calibration: Calibration, order: CertificateRequest, laboratory: Labor
     details = laboratory.item
     received = order.received or details.received
     return Item(
-        type=details.type or calibration.tool.get("tool", "") or calibration.profile.name,
+        type=details.type or calibration.tool_type,
         serial=calibration.tool.get("serial", ""),
         manufacturer=details.manufacturer,
         identification=details.identification,

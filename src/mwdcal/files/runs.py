@@ -636,6 +636,7 @@ def to_readings(
         metadata=identified(_marked(table), labels(table, "serial")),
         north=_north(table) if offset or table.north else {},
         source=table.source,
+        sheet=table.sheet,
         run_sha256=table.digest,
         unused=synonyms.unused(list(table.columns), COLUMNS),
         remarks=table.remarks,

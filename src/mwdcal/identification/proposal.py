@@ -24,6 +24,7 @@ from mwdcal.calibration.diagnosis.findings import (
     unused_columns,
 )
 from mwdcal.calibration.diagnosis.flags import listed
+from mwdcal.calibration.diagnosis.refusals import MOTION_RANGE
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import Finding
 from mwdcal.errors import Answer, FitError, InputError, QuestionError, QuestionsError
@@ -339,7 +340,8 @@ class Proposal(NamedTuple):
     unit no name states; `metadata` what the table says of itself; `where` the table was, if it was looked for;
     `open_axes` the triads of which the run does not tell the axes, `ignored` columns that are called as references
     but hold no references, each with the reason; `by_readings` what the names leave open and the readings answer;
-    `source` the name of the file; `all_fit`: no station is far from what the others tell.
+    `source` the name of the file; `all_fit`: no station is far from what the others tell;
+    `level`: the least and the largest inclination, degrees, where they are too close for a calibration.
     """
 
     profile: Profile
@@ -356,6 +358,7 @@ class Proposal(NamedTuple):
     by_readings: tuple[str, ...] = ()
     source: str = ""
     all_fit: bool = False
+    level: tuple[float, float] | None = None
 
 
 def propose(
@@ -510,8 +513,16 @@ def _proposal(
     return Proposal(
         _without_the_usual(profile), wirings, readings.count, readings.unused, tuple(remarks), by_value,
         readings.metadata, readings.run_sha256, where, open_axes, ignored, source=table.source,
-        all_fit=_all_fit(readings, wirings),
+        all_fit=_all_fit(readings, wirings), level=_level(readings),
     )  # fmt: skip
+
+
+def _level(readings: Readings) -> tuple[float, float] | None:
+    """The ends of inclinations, degrees, that are too close to calibrate the accelerometer along the tool."""
+    known = readings.reference("inclination")
+    if np.isnan(known).any() or np.ptp(np.cos(known)) >= MOTION_RANGE[0]:
+        return None
+    return float(np.degrees(known.min())), float(np.degrees(known.max()))
 
 
 def _check_choices(where: Layout | None, known: Collection[str], source: str) -> None:
@@ -1528,6 +1539,18 @@ def axes_open(proposal: Proposal) -> list[Finding]:
     ]
 
 
+def one_inclination(proposal: Proposal) -> list[Finding]:
+    """A finding on a table whose inclinations are too close to each other for a calibration."""
+    if proposal.level is None:
+        return []
+    ends = " to ".join(dict.fromkeys(f"{end:.0f}°" for end in proposal.level))
+    text = (
+        f"all stations are at inclination {ends}: mwdcal calibrate will refuse this run. Add stations at other "
+        "inclinations: at least three, well apart, up and down, with six or more toolfaces each."
+    )
+    return [Finding(id="one-inclination", text=text)]
+
+
 def _alternatives(axes: OpenAxes) -> str:
     """Axes that fit about as well, in words; empty where all are open."""
     if not axes.alternatives:
@@ -1649,6 +1672,7 @@ def findings_on(proposal: Proposal) -> list[Finding]:
     marked = [Finding(id=MARKED_ROWS, text=text) for text in proposal.remarks]
     known = (
         of_surveys(proposal)
+        + one_inclination(proposal)
         + axes_open(proposal)
         + left_handed(proposal)
         + lines_not_taken(proposal)
@@ -1753,7 +1777,7 @@ _STAND = [
     "",
     "# [stand]   # 1σ of one setting, degrees, by the stand's certificate; until stated its angles count as exact",
     *(f"# {name} =" for name in ("inclination_deg", "azimuth_deg", "toolface_deg")),
-    '# settings = "per-station"   # or "per-direction": set once, then the tool is rolled',
+    '# settings =   # "per-direction" (assumed until stated): set once, then the tool is rolled; or "per-station"',
 ]
 """Lines to fill in: uncertainty and practice of the stand, which no table states."""
 

@@ -160,10 +160,13 @@ def screen(
     tried: list[CurveScore],
     output: Path,
     report: Path | None,
-    judged: str = "",
+    judged: tuple[str, str] = ("", ""),
     rolltest: Path | None = None,
 ) -> str:
-    """The result for people, the files that were written, and what to do next or what `judged` says of it."""
+    """The result for people, the files that were written, and what to do next.
+
+    `judged`: the verdict of a roll test, which comes first, and what to do after it.
+    """
     what = "calibration"
     if output.exists():
         serial = documents.serial_in(output)
@@ -171,8 +174,9 @@ def screen(
         what += f", in place of {f'that of {serial}' if other else 'an earlier file'}"
     files = files_written(**{what: output, "report": report})
     command = f"mwdcal verify {one_line(output)} {one_line(rolltest or NEXT_ROLL_TEST)}"
-    after = f"\n\n{judged}" if judged else f"   next: {command}"
-    return f"{body(calibration, tried)}\n{files}{after}"
+    verdict, step = judged
+    after = step if verdict else f"   next: {command}"
+    return "\n\n".join([*filter(None, [verdict]), f"{body(calibration, tried)}\n{files}{after}"])
 
 
 def remarks(calibration: Calibration) -> list[str]:

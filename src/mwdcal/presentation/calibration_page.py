@@ -335,7 +335,8 @@ def _record_rows(triad: TriadCalibration) -> list[tuple[Any, ...]]:
     for full, value, sd in zip(*columns, strict=True):
         base, _, power = full.partition("·")
         name, _, axes = base.rpartition("-")
-        symbol = "1" if name in ("gain", "scale", "misalignment") else strength_unit(triad) or "1"
+        symbol = "1" if name in ("gain", "scale") else strength_unit(triad) or "1"
+        symbol = "rad" if name == "misalignment" else symbol
         per = raised("/°C", int(power or 0))
         rows.append((name, axes, int(power or 0), value, sd, symbol + per))
     return rows

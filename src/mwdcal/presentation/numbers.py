@@ -177,7 +177,7 @@ def value_places(
     """
     scale = f"{raw}/{strength}" if strength else raw
     units = {
-        "SF": scale, "B": strength or one, "m": one, "S": scale, "o": raw,
+        "SF": scale, "B": strength or one, "m": "rad", "S": scale, "o": raw,
         "M": f"{strength or '1'}/{raw}", "b": strength or one,
     }  # fmt: skip
     for name, value in values.items():

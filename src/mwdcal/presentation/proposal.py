@@ -120,8 +120,10 @@ def screen(proposal: Proposal, run: Path, output: Path | None, has_roll_test: bo
         if depths_of_surveys(proposal):
             command = f"mwdcal survey TOOL.json {one_line(run)} -o well.csv"
             command += page_option("well.html")
-        elif proposal.open_axes:
-            command = f"fill in the axes in {one_line(output)}, then {command}"
+        else:
+            first = ["add stations at other inclinations"] if proposal.level else []
+            first += [f"fill in the axes in {one_line(output)}"] if proposal.open_axes else []
+            command = f"{', '.join(first)}, then {command}" if first else command
         exact = (
             f"The angles of the stand count as exact until [stand] in {one_line(output)} states their 1σ.\n"
             if has_angles(proposal) and not stand_in_settings()

@@ -46,10 +46,12 @@ def screen(
         raw = quantity(row.raw, row.unit, uncertainty=row.uncertainty)
         verdict = "pass" if row.passed else "FAIL"
         rows.append([row.name, raw, value, sd, freedom(row), limit, verdict, row.note])
+    if _free_toolface(result):
+        rows.append(["toolface", *["–"] * 5, "open", "zero undetermined"])
     outcome = "PASS" if result.passed else "FAIL"
     if free := result.left_open:
         outcome += f": nothing wrong was found; the calibration leaves {free} open"
-    first = [outcome, result.run, f"{result.stations} stations"]
+    first = [outcome, result.data, f"{result.stations} stations"]
     first += signature_status(signature) if signature else []
     first += simulated(*metadata)
     source = f" ({result.source})" if result.source else ""
@@ -65,6 +67,12 @@ def screen(
     header = ["", "raw", "noise-free", "1σ", FREEDOM, "limit", "", "where"]
     blocks = ["\n".join(map(one_line, lines)), table(rows, header, remarks=True), *_sets(result)]
     return "\n\n".join(blocks)
+
+
+def _free_toolface(result: Verdict) -> bool:
+    """Whether the calibration leaves the toolface zero undetermined, and no limit says so."""
+    judged = any(row.name == "error of toolface" for row in result.rows)
+    return not judged and any(finding.id == "toolface-zero" for finding in result.findings)
 
 
 def next_step(result: Verdict, calibration: Path, run: Path) -> str:

@@ -14,7 +14,15 @@ from mwdcal.calibration.copies import in_fit
 from mwdcal.calibration.diagnosis.identity import doubts, other_tool
 from mwdcal.calibration.options import ASSUMED, is_assumed
 from mwdcal.calibration.readings import Readings
-from mwdcal.calibration.record import MARGIN, Calibration, Finding, html_table, stated
+from mwdcal.calibration.record import (
+    MARGIN,
+    STAND_ANGLES_EXACT,
+    STATE_STAND,
+    Calibration,
+    Finding,
+    html_table,
+    stated,
+)
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import AnyArray, Array, eigen
@@ -153,8 +161,8 @@ VERDICT_FINDINGS = {
     "misalignment of x and y (four at right angles fit a mean and the first harmonic alone). The value may be "
     "too small by it: add toolfaces between them.",
     "little-scatter": "{title}: the readings scatter less about the curves than the {noise} noise explains (chance "
-    "below {chance:g}). It is too large, readings are repeated, or stations apart in the table share one setting of "
-    "the stand (then give them one group: it is counted once). The 1σ rests on the {noise} noise.",
+    "below {chance:g}). {stand}This noise is too large, readings are repeated, or stations apart in the table share "
+    "one setting of the stand (then give them one group: it is counted once). The 1σ rests on the {noise} noise.",
     "settings-doubted": "{title}: the readings scatter about the curves as if the stand was set at every station. Its "
     "error is counted both ways. State [stand] settings in the profile.",
     "not-smooth": "{title}: the readings leave a smooth curve over toolface by far more than their noise. So the raw "
@@ -295,7 +303,7 @@ class VerdictRow(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Verdict(msgspec.Struct, frozen=True, kw_only=True, dict=True):
-    """The outcome of a verification; `date` as the run states it.
+    """The outcome of a verification; `sheet` of the workbook `run`, blank of other files; `date` as the run states it.
 
     `degrees_of_freedom`: of the triad of the calibration with the fewest. None: a document of an earlier version.
     `risk`: probability that the verdict is wrong, all sets and limits together: that a true value is beyond
@@ -309,6 +317,7 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     limits: str
     source: str
     run: str
+    sheet: str = ""
     date: str = ""
     stations: int
     rows: list[VerdictRow]
@@ -326,6 +335,11 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     columns: ClassVar[dict[str, AnyArray]]
     """The corrected stations with 1σ, by the names of `apply`; not of a verdict read from a file."""
     to_pandas: ClassVar[Callable[..., Any]]
+
+    @property
+    def data(self) -> str:
+        """The file of the roll test, and its sheet."""
+        return f"{self.run}, sheet '{self.sheet}'" if self.sheet else self.run
 
     @property
     def left_open(self) -> str:
@@ -390,13 +404,14 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
         limits=limits.name,
         source=limits.source,
         run=readings.source,
+        sheet=readings.sheet,
         date=str(readings.metadata.get("date", "")),
         stations=readings.count,
         rows=rows,
         findings=[
             *_findings(test, skipped),
             *_contradicted(test, limits),
-            *_remarks(judged),
+            *_remarks(judged, STATE_STAND * (STAND_ANGLES_EXACT in calibration.assumed_exact)),
             *chain(*(j.findings for j in judged)),
         ],
         station_rows=_station_rows(test, rows, [outcome[-1] for outcome in outcomes]),
@@ -419,13 +434,13 @@ class _Judged:
     errors: Array | None = None
 
 
-def _remarks(judged: Sequence[_Judged]) -> Iterator[Finding]:
-    """Findings that several limits share, each once."""
+def _remarks(judged: Sequence[_Judged], stand: str) -> Iterator[Finding]:
+    """Findings that several limits share, each once; `stand`: of a calibration that took its angles as exact."""
     for name in dict.fromkeys(chain(*(each.remarks for each in judged))):
         rows = [each.row for each in judged if name in each.remarks]
         noise = dict.fromkeys("stated" if row.freedom is None else "estimated" for row in rows)
         title, whose = ", ".join(row.name for row in rows), " or ".join(noise)
-        yield _finding(name, title=title, noise=whose, chance=DEPARTURE_CHANCE)
+        yield _finding(name, title=title, noise=whose, chance=DEPARTURE_CHANCE, stand=stand)
 
 
 def _risk(judged: Sequence[_Judged], passed: bool) -> float | None:

@@ -74,7 +74,7 @@ def command(
     readings, profile, test, beside = load_runs(run, rolltest, tool, prior, options.said(decimal))
     choice, result = chosen_fit(readings, profile, options_of(typed, prior, exclude, digest), say)
     calibration = recorded(choice, result)
-    turned, verdict, judged, problem = None, None, "", None
+    turned, verdict, judged, problem = None, None, ("", ""), None
     if test and rolltest:
         turned, verdict, judged, problem = _judged(calibration, test, limits, (output, rolltest))
     rendered = ""
@@ -102,8 +102,8 @@ def command(
 
 def _judged(
     calibration: Calibration, test: RollTestTable, limits: str, files: tuple[Path, Path]
-) -> tuple[Readings | None, Verdict | None, str, MwdcalError | None]:
-    """The readings of a roll test, their verdict and its text on screen, or the error.
+) -> tuple[Readings | None, Verdict | None, tuple[str, str], MwdcalError | None]:
+    """The readings of a roll test, their verdict, its text on screen and what to do next, or the error.
 
     `files` of calibration and roll test.
     """
@@ -118,8 +118,8 @@ def _judged(
     except MwdcalError as error:
         problem = _with_options_on_roll_test(error)
         problem.exit_code = InputError.exit_code
-        return None, None, "", problem
-    shown = screen(verdict, None) + next_step(verdict, files[0], files[1])
+        return None, None, ("", ""), problem
+    shown = screen(verdict, None), next_step(verdict, files[0], files[1])
     return rolltest, verdict, shown, None
 
 

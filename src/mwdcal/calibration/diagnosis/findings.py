@@ -33,7 +33,7 @@ from mwdcal.calibration.diagnosis.structure import described as seen_as
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import DIRECTION
 from mwdcal.calibration.readings import EARTH_GRAVITY, EARTH_RANGES, HIGHEST, TRIADS, Readings
-from mwdcal.calibration.record import MISFIT_CHANCE, SHOWN_DRIFT, Finding
+from mwdcal.calibration.record import MISFIT_CHANCE, SHOWN_DRIFT, STATE_STAND, Finding
 from mwdcal.calibration.residuals import REASONS, shown_in, tail
 from mwdcal.calibration.results import (
     common_source,
@@ -133,8 +133,9 @@ REMARKS = {
     "{small:.0e}): the declared noise is too large, readings are copies of each other, or they were corrected by a "
     "fit before. Uncertainties stay as declared; check the noise of the profile and the columns sd_.",
     "axis-noise": "{triad}: residuals along {of[most]} are {of[times]:.1f} times those along {of[least]} (chance in "
-    "equal noise {of[chance]:.0e}). Uncertainties take the axes as equal: they are too small where {of[most]} counts "
-    "most. State the noise of each axis in the columns sd_ of run and readings, or find what acts along it.",
+    "equal noise {of[chance]:.0e}). {stand}Uncertainties take the axes as equal: they are too small where "
+    "{of[most]} counts most. State the noise of each axis in the columns sd_ of run and readings, "
+    "or find what acts along it.",
     "settings": "the stand at {where}: {angle} is off by {size:.1f} σ of a setting ({value:+.3g}°). Check this "
     "reference, or declare a larger σ.",
     "settings-apart": "stations of one direction scatter by {share:.0%} of the stand's σ, as if the stand had been set "
@@ -142,9 +143,9 @@ REMARKS = {
     "toolface-shared": "errors of the stand's toolface agree within each {by} (chance in noise {chance:.0e}), as if it "
     "had been set {groups} times in all. The stated uncertainty of toolface counts one error a station, and is too "
     "small: declare toolface_zero_deg = {size:.2g} under [stand] of the profile beside toolface_deg.",
-    "residuals": "{triad}: residuals are {times:.2f} times the declared noise{rare}: the noise figure, a reference, or "
-    "the model is wrong. The uncertainty is scaled up as if each station had an error of its own; an error that "
-    "stations share may be larger than it says.",
+    "residuals": "{triad}: residuals are {times:.2f} times the declared noise{rare}. {stand}The noise figure, a "
+    "reference, or the model is wrong. The uncertainty is scaled up as if each station had an error of its own; an "
+    "error that stations share may be larger than it says.",
     "field-drift": "Readings follow the order of the stations as if the field drifted by {change:.2g} {unit} (1σ "
     "{sd:.2g} {unit}) during the run{by_noise}. The fit allows for this drift, and the uncertainty includes it. Give "
     "ref_field_nt and ref_dip_deg of each station from a reference magnetometer, or repeat the run at a quiet time.",
@@ -320,6 +321,7 @@ def _noise(fitted: FittedRuns) -> Iterator[Flag]:
     large = weighed & (factor > NOISE_RATIO**2) | (chances < MISFIT_CHANCE)
 
     times = np.sqrt(factor)
+    stand = np.where(fitted.readings.exact_angles, STATE_STAND, "")
 
     def rare(place: int, index: int) -> str:
         chance = chances[place, index]
@@ -328,7 +330,12 @@ def _noise(fitted: FittedRuns) -> Iterator[Flag]:
     for end, holds in (("noise", calm), ("residuals", large)):
         for index, triad in enumerate(TRIADS[: factor.shape[-1]]):
             of_triad = {"times": times[:, index], "small": small[:, index]}
-            values = {"triad": triad, "rare": partial(rare, index=index), **of_triad}
+            values = {
+                "triad": triad,
+                "rare": partial(rare, index=index),
+                **of_triad,
+                "stand": stand,
+            }
             yield Flag(f"{triad}-{end}", holds[:, index], REMARKS[end], values)
 
 
@@ -358,8 +365,9 @@ def _axis_noise(fitted: FittedRuns) -> Iterator[Flag]:
         times, rare = np.sqrt(ratio[place, index]), chance[place, index]
         return dict(zip(("most", "least", "times", "chance"), (*names, times, rare), strict=True))
 
+    stand = np.where(fitted.readings.exact_angles, STATE_STAND, "")
     for index, triad in enumerate(TRIADS[: variance.shape[1]]):
-        values = {"triad": triad, "of": partial(of, index)}
+        values = {"triad": triad, "of": partial(of, index), "stand": stand}
         yield Flag(f"{triad}-axis-noise", unequal[:, index], REMARKS["axis-noise"], values)
 
 

@@ -470,7 +470,10 @@ def _the_run(tables: Sequence[Layout]) -> Layout | None:
     if len(runs) != 1 or ADJUSTED.search(runs[0].heading):
         return None
     aside = tuple(
-        (t.form.header_line, f"{kind}{_on_sheet(t, runs[0])}, {len(t.lines)} rows")
+        (
+            t.form.header_line,
+            f"{kind}{_of_sheet(t, runs[0])}, {len(t.lines)} rows, not part of the run",
+        )
         for t, kind in zip(tables, kinds, strict=True)
         if kind
     )
@@ -585,9 +588,9 @@ def _are_numbered_on(tables: Sequence[Layout]) -> bool:
     )
 
 
-def _on_sheet(table: Layout, run: Layout) -> str:
+def _of_sheet(table: Layout, run: Layout) -> str:
     """The sheet of a table in words, where it is another than that of the run."""
-    return f" on sheet {shown(table.sheet)}" if table.sheet != run.sheet else ""
+    return f" below this row of sheet {shown(table.sheet)}" if table.sheet != run.sheet else ""
 
 
 def _joined_sheets(tables: Sequence[Layout]) -> Layout:
