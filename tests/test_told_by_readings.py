@@ -698,7 +698,9 @@ def test_blocks_below_the_names_of_the_triads_are_one_table(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "column"),
-    [("Verdr. (°)", "ref_toolface_deg"), ("Peil.", "ref_azimuth_deg"), ("Rot.", None), ("Pos.", None),
+    [("Stand setting T/F (deg)", "ref_toolface_deg"), ("Cara hta.", "ref_toolface_deg"), ("IncCalc", None),
+     ("K1 AccX/V", "ax"), ("TFH", "ref_toolface_deg"), ("Verdr. (°)", "ref_toolface_deg"),
+     ("Peil.", "ref_azimuth_deg"), ("Rot.", None), ("Pos.", None),
      ("Inc mesa (º)", "ref_inclination_deg"), ("Roll (Teilkopf) °", "ref_toolface_deg"),
      ("Bohrlochrichtung", "ref_azimuth_deg"), ("Boreh.inkl. (°)", "ref_inclination_deg"),
      ("Inc'n", "ref_inclination_deg"), ("Az'th", "ref_azimuth_deg"), ("Дип, °", "ref_dip_deg"),
@@ -757,3 +759,14 @@ def test_a_field_in_amperes_per_metre_at_the_stand(tmp_path):
     assert proposal.profile.columns["ref_field_nt"].name == "Поле на стенде, А/м"
     stated = library.read_run(tmp_path / "a.csv", proposal.profile).reference("field")
     assert stated == pytest.approx(servo_run()["ref_field_nt"], rel=1e-9)
+
+
+def test_az_is_the_azimuth_where_residuals_stand_between_the_channels(tmp_path):
+    run = {("Az." if n == "Azi (deg)" else n): v for n, v in table().items()}
+    columns = {}
+    for name, values in run.items():
+        if name[0] in "GH":
+            columns[f"res. {name}"] = np.random.default_rng(1).normal(size=48)
+        columns[name] = values
+    used = library.propose_profile(written(tmp_path / "a.csv", columns)).profile.columns
+    assert [used[c].name for c in ("az", "ref_azimuth_deg")] == ["Gz (V)", "Az."]

@@ -107,10 +107,11 @@ TRANSLATIONS = (
     ),
     (
         r"\bg?tf[oa]\b|tool ?face orientation|relative bearing|\brot\.? angle|toolface[- ]winkel|hochseite(nwinkel)?|"
-        r"hoyside(vinkel)?|cara herr(amienta|\b\.?)|rolido|alabeo|lado alto|face ferramenta|rolagem|rolamento|rotacao|"
+        r"hoyside(vinkel)?|cara (herr(amienta|\b\.?)|hta\b\.?)|rolido|"
+        r"alabeo|lado alto|face ferramenta|rolagem|rolamento|rotacao|"
         r"roulis|rotation propre|orientation (de l')?outil|апсид\w*( угол)?|виз\b\.?( угол)?|(угол )?крена?\b|"
         r"(重力)?高边(工具面)?角?|[滚自旋]转角?|横滚角?|面向角|"
-        r"\brol(le?|lio|lo)?\b|kierto(kulma)?\b|natoceni|rotire|vridning|툴페이스|공구면각?|롤각?|\brb\b|^t/f\b|rollachse|"
+        r"\brol(le?|lio|lo)?\b|kierto(kulma)?\b|natoceni|rotire|vridning|툴페이스|공구면각?|롤각?|\brb\b|\bt/f\b|\btfh\b|rollachse|"
         r"roll axis|(kat )?obrotu?\b|(kat )?skret\w*|\bуво\b|(угол )?верхней образующей|^面角|"
         r"\brull(e|ing)?\b|rullning|rotasi|(kat )?ustawienia narzedzia|takim yuzu|szerszamallas|"
         r"gereedschapsvlak|v(ae|æ)rkt(o|ø)jsflade|faccia utensile|ツールフェ(ー|イ)ス|тулфейс|回転角|угол поворота|"

@@ -358,7 +358,7 @@ _OF_FIELD = re.compile(
 _MEASURED = re.compile(
     r"\b(measured|meas|calc|calculated|computed|corr|corrected|gemessen|m[åa]lt|sum|ist|mwd|survey|"
     r"(be|er)rechnet\w*|beregnet|berekend\w*|calculad[oa]|computad[oa]|calcul[ée]e?|calcolat[oa]|расч[её]?т\w*|"
-    r"рассчит\w*|вычисл\w*)\b|计算|解算",
+    r"рассчит\w*|вычисл\w*)\b|计算|解算|(?<=[^\W\d_])calc\b",
     re.IGNORECASE,
 )
 """Words of angles that the tool itself has measured: no references."""
@@ -545,6 +545,7 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
 
 def _bracketed(name: str) -> str:
     """A name without what a logger writes before it, and with its unit in brackets."""
+    name = re.sub(r"^(k|ch|ai|kanal|canal) ?\d{1,2}[\s_]+(?=\S{2})", "", name, flags=re.IGNORECASE)
     logged = _OF_LOGGER.fullmatch(name)
     name = f"{logged[1]}{logged[2] or ''}" if logged else name
     worded = _IN_UNIT.fullmatch(name)
@@ -924,10 +925,10 @@ def _follows(
     names: Sequence[str], every: Sequence[str], lone: str, meanings: Mapping[str, Resemblance]
 ) -> bool:
     """Whether of two columns that may be az the other one stands behind ax and ay, and the `lone` one does not."""
+    known = [n for n in names if n in meanings]
     behind = {
-        name: [meanings[n].column for n in names[max(k - 2, 0) : k] if n in meanings]
-        == ["ax", "ay"]
-        for k, name in enumerate(names)
+        name: [meanings[n].column for n in known[max(k - 2, 0) : k]] == ["ax", "ay"]
+        for k, name in enumerate(known)
     }
     return not behind[lone] and all(behind[name] for name in every if name != lone)
 
@@ -1359,7 +1360,7 @@ def _unit_beside(name: str, unit: str) -> str:
     plain = spelled(name)
     bracketed = IN_BRACKETS.search(plain)
     ends = unit_of(spelled(unit)) or unit_of(bracketed[1] if bracketed else plain.split(" ")[-1])
-    within = re.search(r"(?<![^\W_])[nµu]T(?![^\W_])", plain)
+    within = re.search(r"(?<![^\W_])([nµu]T|[Gg]auss)(?![^\W_])", plain)
     return ends or (unit_of(within[0]) if within else "")
 
 

@@ -237,6 +237,8 @@ _OF_ANOTHER = re.compile(
     r"\W*(?:fs|f\.s|full[ -]?scale|span|range)(?![^\W\d_])"
 )
 """Units of something else behind a number, and words of a range: 24 bit, 50 µT FS."""
+_ROUNDING = 1e-9
+"""By how much a standard gravity in another unit differs from 1 g by rounding."""
 _ROUNDED = 5e-4
 """By how much these differ at most, as a share: half a digit in the third place."""
 _ANOTHER_UNIT = re.compile(r"\s*[^\W\d_]{1,3}(?![^\W\d_])(?!\W*\d)")
@@ -305,7 +307,7 @@ _STANDARD = re.compile(
 )
 """Words of the standard gravity, which is a unit."""
 _AT = re.compile(
-    r"\bat\b(?! (the )?(test |calibration )?(site|stand|lab\w*|bench|hut|place|pillar|yard))|\bbei\b"
+    r"\bat\b(?! (the )?(test |calibration )?(site|stand|lab\w*|bench|hut|place|pillar|pier|yard))|\bbei\b"
 )
 """Words before a strength at which something was checked, unless it is one of several places."""
 _INCLINED = re.compile(
@@ -416,7 +418,8 @@ _OF_SITE = re.compile(
 )
 """Words before the name of the place of a calibration."""
 _OF_HERE = re.compile(
-    r"(?<![^\W\d_])(lab\w*|here|(this|test) (site|place)|stand|bench|banco|bancada|today|hier|messplatz|prufstand|"
+    r"(?<![^\W\d_])(lab\w*|kalibrier(raum|halle|labor)|"
+    r"here|(this|test) (site|place)|stand|bench|banco|bancada|today|hier|messplatz|prufstand|"
     r"heute|her|i ?dag|aqui|hoy|hoje|здесь|сегодня|стенд\w*)(?![^\W\d_])|本地|本站|今天|实验室",
 )
 """Words of the place and the day of a calibration."""
@@ -589,7 +592,7 @@ def _with_columns(rows: Rows) -> list[Sequence[object]]:
             words = texts
         cells = [as_text(cell).strip() for cell in below]
         if (
-            not any(re.match(r"[-−+]?\d|.*(\d{3}|:\s*\S)", word) for word in words)
+            not any(re.match(r"[-−+]?\d|.*(\d{3}|:)", word) for word in words)
             and len([*filter(None, words)]) > 1
         ):
             paired += [
@@ -968,6 +971,7 @@ def _numbers(text: str, minutes: float = 0.0) -> Iterator[float]:
 
 
 def _converted(number: float, unit: str) -> float:
-    """A number in the unit of the run file."""
+    """A number in the unit of the run file; the standard gravity is 1 g in any unit."""
     factor, _ = FACTORS.get(unit, (1.0, 0.0))
-    return number * factor
+    value = number * factor
+    return 1.0 if abs(value - 1) < _ROUNDING else value
