@@ -471,7 +471,8 @@ def test_components_ranges_and_corrections_are_no_references(line):
     ("name", "words"),
     [
         ("Type", ("CAL", "VER")), ("Status", ("OK", "CHECK")), ("Art", ("", "Prüfung")),
-        ("Mode", ("CAL", "ROLLTEST")), ("Test", ("CAL", "ROLL")), ("用途", ("标定", "滚转检验")),
+        ("Mode", ("CAL", "ROLLTEST")), ("Test", ("CAL", "ROLL")),
+        ("Вид", ("калибровка", "контроль (вращение)")), ("用途", ("标定", "滚转检验")),
         ("Formål", ("kal", "rulletest")),
     ],
 )  # fmt: skip
@@ -698,7 +699,8 @@ def test_blocks_below_the_names_of_the_triads_are_one_table(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "column"),
-    [("Stand setting T/F (deg)", "ref_toolface_deg"), ("Cara hta.", "ref_toolface_deg"), ("IncCalc", None),
+    [("Toolface, a/cw (deg)", "ref_toolface_deg"), ("Зенит расч., град", None),
+     ("Stand setting T/F (deg)", "ref_toolface_deg"), ("Cara hta.", "ref_toolface_deg"), ("IncCalc", None),
      ("K1 AccX/V", "ax"), ("TFH", "ref_toolface_deg"), ("Verdr. (°)", "ref_toolface_deg"),
      ("Peil.", "ref_azimuth_deg"), ("Rot.", None), ("Pos.", None),
      ("Inc mesa (º)", "ref_inclination_deg"), ("Roll (Teilkopf) °", "ref_toolface_deg"),
@@ -770,3 +772,73 @@ def test_az_is_the_azimuth_where_residuals_stand_between_the_channels(tmp_path):
         columns[name] = values
     used = library.propose_profile(written(tmp_path / "a.csv", columns)).profile.columns
     assert [used[c].name for c in ("az", "ref_azimuth_deg")] == ["Gz (V)", "Az."]
+
+
+def test_set_and_shown_angles_of_a_logger(tmp_path):
+    run = table()
+    names = {"Inc (deg)": "inc", "Azi (deg)": "azi", "TF (deg)": "tf"}
+    columns = {f"{names[n]}_set": np.round(run[n], -1) for n in names}
+    columns |= {(f"{names[n]}_act" if n in names else n): v for n, v in run.items()}
+    used = library.propose_profile(written(tmp_path / "a.csv", columns)).profile.columns
+    assert [used[f"ref_{n}_deg"].name for n in ("inclination", "azimuth", "toolface")] == [
+        "inc_act",
+        "azi_act",
+        "tf_act",
+    ]
+
+
+def test_temperatures_that_many_stations_lack_are_asked_about(tmp_path):
+    warm = ["" if k % 3 else 25.0 for k in range(48)]
+    path = written(tmp_path / "a.csv", table(temperature_c=warm))
+    with pytest.raises(FitError, match="at 32 of 48 stations.*column='temperature_c='"):
+        library.propose_profile(path)
+    run = read(path, column={"temperature_c": ""})
+    assert (run.count, run.temperature) == (48, None)
+
+
+def test_units_of_which_the_first_column_has_none_stand_below_their_names(tmp_path):
+    names = ("inc", "mag az", "toolface", "Gx", "Gy", "Gz", "Hx", "Hy", "Hz", "probe temp")
+    units = (*["deg"] * 3, *"ggg", *["gauss"] * 3, "deg F")
+    lines = [
+        "sta " + "".join(f"{n:>13}" for n in names),
+        "    " + "".join(f"{u:>13}" for u in units),
+    ]
+    run = servo_run()
+    scales = {"ax": 1 / 3, "ay": 1 / 3, "az": 1 / 3}
+    kept = (
+        "ref_inclination_deg",
+        "ref_azimuth_deg",
+        "ref_toolface_deg",
+        "ax",
+        "ay",
+        "az",
+        "mx",
+        "my",
+        "mz",
+    )
+    for k in range(48):
+        values = "".join(f"{run[n][k] * scales.get(n, 1):13.4f}" for n in kept)
+        lines.append(f"{k + 1:<4d}{values}{75.0 + k / 100:13.1f}")
+    path = tmp_path / "a.txt"
+    path.write_text("\n".join(["Survey tools, Casper", "", *lines]))
+    used = library.propose_profile(path).profile.columns
+    assert [used[n].unit for n in ("ref_toolface_deg", "az", "mx", "temperature_c")] == [
+        "°",
+        "g",
+        "gauss",
+        "°F",
+    ]
+
+
+def test_the_dip_is_what_is_called_so_beside_inclinations_of_blocks():
+    rows = [
+        ["Lokal B (nT)", 51100, "Dip (°)", 72.7],
+        ["Serie 1: inklinasjon 30,0°"],
+        ["Serie 2: inklinasjon 75,0°"],
+    ]
+    assert stated_above(rows).metadata["ref_dip_deg"] == 72.7
+
+
+def test_a_declination_at_a_place():
+    rows = [["Pier azimuths from TRUE north. Mag declination at pier 8.62 deg E (May 2024)"]]
+    assert titles(rows).metadata == {"declination_deg": 8.62, "azimuth_reference": "true"}

@@ -97,7 +97,7 @@ def is_check(text: str) -> bool:
     >>> is_check("Rolltest"), is_check("rotation")
     (True, False)
     """
-    return bool(_ROLL_TEST.fullmatch(text))
+    return bool(_ROLL_TEST.fullmatch(re.sub(r"[()\[\]]", " ", text)))
 
 
 def _named_in(cells: Sequence[str]) -> list[int]:
@@ -105,5 +105,5 @@ def _named_in(cells: Sequence[str]) -> list[int]:
     return [
         row
         for row, cell in enumerate(cells)
-        if _ROLL_TEST.fullmatch(cell) or (beside and _ROLLS_ALONE.fullmatch(cell))
+        if is_check(cell) or (beside and _ROLLS_ALONE.fullmatch(cell))
     ]

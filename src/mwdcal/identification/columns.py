@@ -124,13 +124,23 @@ def is_of_tool(name: str) -> bool:
     return bool(_MEASURED.search(spelled(name)))
 
 
+def _is_nominal(name: str) -> bool:
+    """Whether a column is called what a stand was to be set to."""
+    return bool(_NOMINAL.search(name.replace("_", " ")))
+
+
+def _is_shown(name: str) -> bool:
+    """Whether a column is called what a stand shows."""
+    return bool(_ACTUAL.search(name.replace("_", " ")))
+
+
 def is_computed(name: str) -> bool:
     """Whether a column is called what the tool has measured, and not what its stand shows.
 
     >>> is_computed("Inc calc"), is_computed("Ist Inc")
     (True, False)
     """
-    return is_of_tool(name) and not _ACTUAL.search(name)
+    return is_of_tool(name) and not _is_shown(name)
 
 
 def is_of_surroundings(name: str) -> bool:
@@ -357,7 +367,7 @@ _OF_FIELD = re.compile(
 )
 _MEASURED = re.compile(
     r"\b(measured|meas|calc|calculated|computed|corr|corrected|gemessen|m[åa]lt|sum|ist|mwd|survey|"
-    r"(be|er)rechnet\w*|beregnet|berekend\w*|calculad[oa]|computad[oa]|calcul[ée]e?|calcolat[oa]|расч[её]?т\w*|"
+    r"(be|er)rechnet\w*|beregnet|berekend\w*|calculad[oa]|computad[oa]|calcul[ée]e?|calcolat[oa]|расч|расч[её]?т\w*|"
     r"рассчит\w*|вычисл\w*)\b|计算|解算|(?<=[^\W\d_])calc\b",
     re.IGNORECASE,
 )
@@ -448,7 +458,7 @@ _IN_UNIT = re.compile(r"(.*[\w)\]]) (?:in|en|i|w|в) (\S+)", re.IGNORECASE)
 """A name with its unit behind a preposition: Gx in mg."""
 _BARE_T = re.compile(r"t\W*(°|deg)?\W*", re.IGNORECASE)
 _CCW = re.compile(
-    r"\(?\b((in|sens|sentido|senso|im) )*((counter|anti)[ -]?clockwise\)?|ccw\b|gegen (den )?uhrzeiger\w*|"
+    r"\(?\b((in|sens|sentido|senso|im) )*((counter|anti)[ -]?clockwise\)?|ccw\b|a/?cw\b|gegen (den )?uhrzeiger\w*|"
     r"против (хода )?час\w*( стрелк\w*)?|mot(urs| ?(klok|urvis)\w*)|anti-? ?hor[aá]ri[oa]s?|anti-? ?horaires?|"
     r"antiorari\w*|trigonom[ée]tri(que|co)|inverse des aiguilles( d'une montre)?|tegen de klok( in)?|"
     r"contrari\w+ a(l reloj| las (agujas|manecillas)( del reloj)?)|contr[aá]rio ao(s ponteiros)?( do)? rel[oó]gio|"
@@ -610,7 +620,7 @@ def _twice(name: str) -> Resemblance | None:
 
 def _at_stand(name: str) -> Resemblance | None:
     """The angle that a name says beside a word of the stand, or of a part in brackets: Inc mesa, Roll (disc)."""
-    if _BY_TOOL.search(name) or _NO_STAND.search(name) or _NOMINAL.search(name):
+    if _BY_TOOL.search(name) or _NO_STAND.search(name) or _is_nominal(name):
         return None
     aside = re.search(r"\s*\(([^()]*)\)(?=\s*\S)", name)
     part = aside[0] if aside and not unit_of(aside[1]) and not resembled(aside[1]) else ""
@@ -826,9 +836,10 @@ def _beside_nominal(
     nominal, shown_ones = set[str](), dict[str, dict[str, Resemblance]]()
     stems = {shown: stem for _, shown, stem in shown_beside_set(names)}
     for name, unit in zip(names, units, strict=True):
-        is_nominal = bool(_NOMINAL.search(name))
+        is_nominal = _is_nominal(name)
         words = _NOMINAL if is_nominal else _ACTUAL
-        bare = _OF_CHANNELS.sub("", " ".join(words.sub(" ", name).split())).strip()
+        bare = " ".join(words.sub(" ", name.replace("_", " ")).split())
+        bare = _OF_CHANNELS.sub("", bare).strip()
         bare = re.sub(r"^\([^)]*\)\s*", "", bare)
         bare = stems.get(name, bare).strip("() ") if is_nominal or name in stems else bare
         alike = meaning(bare, unit) if bare not in ("", name) else None
@@ -861,18 +872,20 @@ def shown_beside_set(names: Sequence[str]) -> list[tuple[str, str, str]]:
     >>> shown_beside_set(["Set (Inc)", "Read on cradle (Inc)", "Azi"])
     [('Set (Inc)', 'Read on cradle (Inc)', '(Inc)')]
     """
+    spaced = {name: name.replace("_", " ") for name in names}
     shown_ones = {
-        n: _without(_ACTUAL, n) for n in names if _ACTUAL.search(n) and not _NOMINAL.search(n)
+        n: _without(_ACTUAL, text)
+        for n, text in spaced.items()
+        if _is_shown(n) and not _is_nominal(n)
     }
     pairs = []
-    for name in names:
-        stem = _without(_NOMINAL, name)
+    for name, text in spaced.items():
+        stem = _without(_NOMINAL, text)
         for other, bare in shown_ones.items():
-            ends = re.search(rf"[^\W\d_].*(?<!\w){re.escape(bare)}$", name) if bare else None
-            apart = other != name and not is_computed(name) and not _BY_TOOL.search(name)
-            if stem not in ("", name) and (
-                bare == stem or re.search(rf"(?<!\w){re.escape(stem)}$", other)
-            ):
+            ends = re.search(rf"[^\W\d_].*(?<!\w){re.escape(bare)}$", text) if bare else None
+            apart = other != name and not is_computed(name) and not _BY_TOOL.search(text)
+            behind = re.search(rf"(?<!\w){re.escape(stem)}$", spaced[other])
+            if stem not in ("", text) and (bare == stem or behind):
                 pairs.append((name, other, stem))
             elif apart and ends and name not in shown_ones:
                 pairs.append((name, other, bare))
@@ -1307,7 +1320,7 @@ def _tell_references(
             if n not in meanings
             and not is_of_tool(n)
             and not _NO_STAND.search(spelled(n))
-            and not _NOMINAL.search(n)
+            and not _is_nominal(n)
             and _is_steady(column, n, unit, values(n), names, values)
         ]
         called = [n for n, m in meanings.items() if m.column == column]
@@ -1682,16 +1695,16 @@ def _check_nominal(
     `angles`: the names of all angles of the stand.
     """
     name = angles[column]
-    shows = [n for n in angles.values() if _ACTUAL.search(n) and not _NOMINAL.search(n)]
-    if shows and _NOMINAL.search(name) and not _ACTUAL.search(name):
+    shows = [n for n in angles.values() if _is_shown(n) and not _is_nominal(n)]
+    if shows and _is_nominal(name) and not _is_shown(name):
         raise QuestionError(
             f"{source}: {shown(name)} is what the stand was to be set to, and {shown(shows[0])} what it shows. Is "
             f"there no column of what it shows as '{column}'?",
             candidates_for(column, [name], values),
         )
-    nominal = [n for n in names if _NOMINAL.search(n) and _is_but(_NOMINAL, n, column)]
+    nominal = [n for n in names if _is_nominal(n) and _is_but(_NOMINAL, n, column)]
     measured = [n for n in names if _is_but(_OF_CHANNELS, n, column)]
-    unclear = name in measured and not _ACTUAL.search(name)
+    unclear = name in measured and not _is_shown(name)
     if nominal and measured and (name in nominal or unclear):
         raise QuestionError(
             f"{source}: {shown(nominal[0])} is what the stand was to be set to. Did the stand measure "
@@ -1752,9 +1765,9 @@ def _one(column: str, candidates: Sequence[str], values: Values, source: str) ->
         of_tool = [n for n in candidates if not is_of_surroundings(n)] or candidates
         candidates = [n for n in of_tool if not _CALLED_REFERENCE.search(spelled(n))] or of_tool
     stated = [name for name in candidates if _CALLED_REFERENCE.search(spelled(name))]
-    shows = [name for name in candidates if _ACTUAL.search(name) and not _NOMINAL.search(name)]
+    shows = [name for name in candidates if _is_shown(name) and not _is_nominal(name)]
     others = [name for name in candidates if name not in shows]
-    if len(shows) == 1 and all(map(_NOMINAL.search, others)):
+    if len(shows) == 1 and all(map(_is_nominal, others)):
         return shows[0]
     by_tool = [name for name in candidates if _BY_TOOL.search(spelled(name))]
     by_stand = [n for n in candidates if n not in by_tool and _BY_STAND.search(spelled(n))]

@@ -145,6 +145,24 @@ def check_cells(table: Table, columns: Mapping[str, ColumnSource]) -> None:
             cells = labels(table, columns[column].name)
             each = [*dict.fromkeys(cells[row] for row in rows)]
             questions.append(question_on_cells(table, columns[column].name, rows[0], each))
+        if (
+            column == WARMTH
+            and not wrong.all()
+            and wrong.sum() > max(_FEW_ROWS, _FEW_SHARE * wrong.size)
+        ):
+            cells = labels(table, columns[column].name)
+            each = [*dict.fromkeys(cells[row] for row in np.flatnonzero(wrong).tolist())]
+            name = columns[column].name
+            out = Answer(
+                "leave those stations out", tuple(("leave_out", f"{name}={c}") for c in each)
+            )
+            questions.append(
+                QuestionError(
+                    f"{table.source}: {shown(name)} is blank or no temperature at {wrong.sum()} of {wrong.size} "
+                    "stations. Is the run to do without temperature?",
+                    [none_of(WARMTH), out],
+                )
+            )
     if questions:
         raise QuestionsError(table.source, questions)
 

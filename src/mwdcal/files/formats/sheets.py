@@ -102,12 +102,14 @@ def _delimited(lines: Sequence[str], source: str) -> tuple[str, list[tuple[int, 
 
 
 def _is_named(rows: Sequence[list[str]]) -> bool:
-    """Whether the row above the first numbers is of as many texts as most rows have cells."""
+    """Whether one of the two rows above the first numbers is of as many texts as most rows have cells."""
     rows = [row for row in _without_marks(rows) if row]
     widths = Counter(len(row) for row in rows if _is_of_numbers(row)).most_common(1)
     first = next((k for k, row in enumerate(rows) if _is_of_numbers(row)), 0)
-    head = rows[first - 1] if first else []
-    return bool(widths) and len(head) == widths[0][0] and not any(map(figures.is_figure, head))
+    return any(
+        bool(widths) and len(row) == widths[0][0] and not any(map(figures.is_figure, row))
+        for row in rows[max(0, first - 2) : first]
+    )
 
 
 def _without_marks(rows: Sequence[list[str]]) -> list[list[str]]:
@@ -139,7 +141,7 @@ def _in_columns(lines: Sequence[str], rows: Sequence[list[str]]) -> list[list[st
     placed = [_placed(row, each, columns) for row, each in zip(rows, spans, strict=True)]
     first = next(k for k, row in enumerate(rows) if _is_of_numbers(row))
     words = " ".join(placed[first - 1]).split() if first else []
-    if len(words) == width and not any(map(figures.is_figure, words)):
+    if len(placed[first - 1]) < len(words) == width and not any(map(figures.is_figure, words)):
         placed[first - 1] = words  # names above the first row, not all two blanks apart
     return placed
 

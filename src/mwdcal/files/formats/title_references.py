@@ -237,7 +237,7 @@ _OF_ANOTHER = re.compile(
     r"\W*(?:fs|f\.s|full[ -]?scale|span|range)(?![^\W\d_])"
 )
 """Units of something else behind a number, and words of a range: 24 bit, 50 µT FS."""
-_ROUNDING = 1e-9
+_OF_ROUNDING = 1e-9
 """By how much a standard gravity in another unit differs from 1 g by rounding."""
 _ROUNDED = 5e-4
 """By how much these differ at most, as a share: half a digit in the third place."""
@@ -401,7 +401,13 @@ def _of_the_stand(column: str, values: dict[float, None], rows: Rows) -> dict[fl
     others = {*re.findall(_LONG_WORD, " ".join([*first, *places]))}
     named = {line: {word for word in others if word in line} for line in stating}
     shared = set[str].intersection(*named.values()) if named else set()
+    of_field = column == _OF_PLACES[1].column
     for marked in (
+        [
+            line
+            for line in stating
+            if of_field and re.search(r"\bdip\b|magn|fel[dt]|campo|磁", line)
+        ],
         [line for line in stating if _OF_HERE.search(line)],
         [line for line, each in named.items() if each - shared],
     ):
@@ -974,4 +980,4 @@ def _converted(number: float, unit: str) -> float:
     """A number in the unit of the run file; the standard gravity is 1 g in any unit."""
     factor, _ = FACTORS.get(unit, (1.0, 0.0))
     value = number * factor
-    return 1.0 if abs(value - 1) < _ROUNDING else value
+    return 1.0 if abs(value - 1) < _OF_ROUNDING else value
