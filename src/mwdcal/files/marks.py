@@ -154,7 +154,7 @@ def is_disturbance(text: str) -> bool:
     """
     plain = _plain(text)
     disturbed = re.search(rf"(?<![^\W\d_])({_DISTURBANCES})(?![^\W\d_])|移动|碰到", plain)
-    return bool(disturbed) and not _REFUSED.search(plain)
+    return bool(disturbed) and not _REFUSED.search(plain) and not _MEASURED_AGAIN.search(plain)
 
 
 def _verdicts(name: str, cells: Sequence[str]) -> dict[str, bool]:
