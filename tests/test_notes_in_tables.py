@@ -86,13 +86,13 @@ def test_a_ditto_mark_is_the_cell_above(tmp_path, mark):
 
 
 def test_a_line_of_settings_is_no_dip():
-    """The inclination beside an azimuth is the stand's; alone it may be the field's, and differs from the dip."""
+    """The inclination beside an azimuth is the stand's; alone it may be the field's, where no line names its dip."""
     above = [["Champ total : 46195 nT", "Inclinaison magnétique (dip) : 59,71°"]]
     settings = [["Inclinaison 10° – Azimut 20°"], ["Inclinaison 50° – Azimut 20°"]]
     metadata = stated_above([*above, settings[0]], settings[1:]).metadata
     assert metadata["ref_dip_deg"] == 59.71
     assert metadata["ref_field_nt"] == 46195
-    assert "ref_dip_deg" not in stated_above([*above, ["Inclinaison 10°"]]).metadata
+    assert stated_above([*above, ["Inclinaison 10°"]]).metadata["ref_dip_deg"] == 59.71
     assert "ref_dip_deg" in stated_above(settings).not_taken
 
 
