@@ -96,8 +96,8 @@ def test_the_python_tutorial_calibrates_a_table_with_its_own_names(tmp_path, mon
     exec(lines, seen)
     assert capsys.readouterr().out.splitlines() == [each.text for each in seen["cal"].findings]
     factors = seen["factors"].set_index(["triad", "name"])
-    assert factors.unit["accelerometer"][["SFx", "Bx", "mxy"]].tolist() == ["mg/g", "g", "1"]
-    assert factors.unit["magnetometer"][["SFx", "Bx", "mxy"]].tolist() == ["nT/nT", "nT", "1"]
+    assert factors.unit["accelerometer"][["SFx", "Bx", "mxy"]].tolist() == ["mg/g", "g", "rad"]
+    assert factors.unit["magnetometer"][["SFx", "Bx", "mxy"]].tolist() == ["nT/nT", "nT", "rad"]
     assert len(factors) == 24
     assert (factors["sd"] > 0).all()
     for triad in seen["cal"].triads:  # channel x measures the tool's z axis

@@ -357,8 +357,8 @@ def test_factors_in_pandas_are_those_of_the_report(cal, tmp_path):
     assert [*dict.fromkeys(name for _, name in table.index)] == [
         *dict.fromkeys(map("".join, names))
     ]
-    assert table.unit["accelerometer"][["SFx", "By", "mxy"]].tolist() == ["raw/g", "g", "1"]
-    assert table.unit["magnetometer"][["SFx", "By", "mxy"]].tolist() == ["raw/nT", "nT", "1"]
+    assert table.unit["accelerometer"][["SFx", "By", "mxy"]].tolist() == ["raw/g", "g", "rad"]
+    assert table.unit["magnetometer"][["SFx", "By", "mxy"]].tolist() == ["raw/nT", "nT", "rad"]
     assert table.value["magnetometer", "mxy"] == made.magnetometer["m"][0, 1]
     assert table.sd["magnetometer", "By"] == made.uncertainty["magnetometer"]["B"][1, 0]
 
@@ -367,7 +367,7 @@ def test_values_of_a_course_name_their_power_in_pandas():
     pytest.importorskip("pandas")
     cal = mc.calibrate(mc.simulate("laboratory-thermal", "servo", seed=1), order=1)
     for notation, temperature, names, units in (
-        ("factors", None, ["SFx·τ", "Bz·τ", "mxy"], ["raw/nT/°C", "nT/°C", "1"]),
+        ("factors", None, ["SFx·τ", "Bz·τ", "mxy"], ["raw/nT/°C", "nT/°C", "rad"]),
         ("forward", "course", ["Sxy·τ", "oz·τ²", "ox"], ["raw/nT/°C", "raw/°C²", "raw"]),
     ):
         table = mc.convert(cal, notation, temperature=temperature).to_pandas()

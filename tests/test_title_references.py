@@ -62,6 +62,7 @@ STATED = [
     ([['Mag 24 bit, Acc 16 bit']], (None, None, None)),
     ([['Mag: 65000 counts'], ['Mag 50 µT FS'], ['Mag 30000 Hz']], (None, None, None)),
     ([['Field 0.512']], (None, None, None)),
+    ([['g here 9.8139, field 49580 nT, dip 68.5 (BGS)']], (9.8139, 49580, 68.5)),
     ([['Técnico:', 'Josué'], ['Gravidade nominal:', '9,81 m/s²']], (None, None, None)),
     ([['GRAVITY AT LAB:', '979.29 gal', 'STANDARD G (1.0000 g):', '980.665 gal']], (9.7929, None, None)),
     ([['g at pier 9.8172 m/s². Field/dip see monthly sheet.']], (9.8172, None, None)),

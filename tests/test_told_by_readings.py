@@ -839,6 +839,22 @@ def test_the_dip_is_what_is_called_so_beside_inclinations_of_blocks():
     assert stated_above(rows).metadata["ref_dip_deg"] == 72.7
 
 
+def test_names_of_a_field_and_a_toolface_that_look_like_channels(tmp_path):
+    """ВУ is not By: it is in degrees."""
+    names = {"TF (deg)": "ВУ, °", "Btotal (nT)": "F_nT", "Dip (deg)": "Накл. эт., °"}
+    columns = {names.get(n, n): v for n, v in table().items()}
+    columns |= {f"B{n} (V)": columns.pop(f"H{n} (V)") for n in "xyz"}
+    used = library.propose_profile(written(tmp_path / "a.csv", columns)).profile.columns
+    assert [used[f"ref_{n}"].name for n in ("toolface_deg", "field_nt", "dip_deg")] == [
+        *names.values()
+    ]
+
+
+def test_a_declination_to_the_west_by_its_whole_word():
+    rows = [["Declinación magnética", "1.25° W"], ["Acimut geográfico (norte verdadero)"]]
+    assert titles(rows).metadata["declination_deg"] == -1.25
+
+
 def test_a_declination_at_a_place():
     rows = [["Pier azimuths from TRUE north. Mag declination at pier 8.62 deg E (May 2024)"]]
     assert titles(rows).metadata == {"declination_deg": 8.62, "azimuth_reference": "true"}

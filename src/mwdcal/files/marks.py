@@ -35,13 +35,13 @@ _SUPERSEDED = re.compile(
     r"замен[еи]н[оаы]?) (by|with|durch|av|por|pel[oa]|par|на)\D{0,15}\d{1,3}\W*)"
 )
 """A cell that names the row instead of its own: superseded by line 12."""
-_DISTURBANCES = (
+_DISTURBANCES = re.compile(
     r"moved|bumped|disturbed|slipped|knocked|bewegt|verrutscht|gestossen|flyttet|movi(o|do)|mexeu|bouge|сдвин\w*|"
     r"толкн\w*|vibrat\w*"
 )
 _MAY_REJECT = re.compile(
     rf"(?<![^\W\d_])({OF_REFUSAL}|{NOT_TO_USE}|fail(ed)?|error|ng|gestort|unstable|instabil|vibrat\w*|outlier|suspect|questionable|doubtful|ausreißer|ausreisser|fehler|avvik|"
-    rf"{_DISTURBANCES}|nicht bestanden|falha|fallo|выброс|сбой)(?![^\W\d_])|异常|可疑|移动|碰到"
+    rf"{_DISTURBANCES.pattern}|nicht bestanden|falha|fallo|выброс|сбой)(?![^\W\d_])|异常|可疑|移动|碰到"
 )
 """A cell that may reject its row, or speak of another one."""
 _MEASURED_AGAIN = re.compile(
@@ -153,7 +153,7 @@ def is_disturbance(text: str) -> bool:
     (False, True)
     """
     plain = _plain(text)
-    disturbed = re.search(rf"(?<![^\W\d_])({_DISTURBANCES})(?![^\W\d_])|移动|碰到", plain)
+    disturbed = re.search(rf"(?<![^\W\d_])({_DISTURBANCES.pattern})(?![^\W\d_])|移动|碰到", plain)
     return bool(disturbed) and not _REFUSED.search(plain) and not _MEASURED_AGAIN.search(plain)
 
 

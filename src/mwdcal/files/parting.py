@@ -11,23 +11,23 @@ from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.table import Table, labels
 from mwdcal.files.statements import rows_of
 
-_TESTS = (
+_TESTS = re.compile(
     r"ver(if(y|ication|iziert)?)?|verifikation|verifisering|check|validation|control|kontrolle|pr(ue|ü)fung|kontroll|"
     r"verificaci[oó]n|verifica[cç][aã]o|проверка|поверка|контроль|验证|检验|检查|test"
 )
-_ROLLS = (
+_ROLLS = re.compile(
     r"roll(ing)?|rotation|dreh(ung)?|rull(e|ering)?|giro|rotaci[oó]n|rola(gem|mento)|rota[cç][aã]o|roulis|вращени[ея]|"
     r"滚转|滚动|旋转|转动"
 )
 _ROLL_TEST = re.compile(
     rf"\W*((roll|rull|rollen)[\s_-]*(over|set|serie)|rt|rollpr(ue|ü)fung|prueba|"
-    rf"({_ROLLS})?[\s_-]*({_TESTS})([\s_-]*(d[aeo] )?({_ROLLS}))?|"
-    rf"(prueba|prova|ensaio|teste|essai)[\s_-]*d[aeo] ({_ROLLS}))"
+    rf"({_ROLLS.pattern})?[\s_-]*({_TESTS.pattern})([\s_-]*(d[aeo] )?({_ROLLS.pattern}))?|"
+    rf"(prueba|prova|ensaio|teste|essai)[\s_-]*d[aeo] ({_ROLLS.pattern}))"
     r"[\s_-]*(run|shot|station|row|point|rows?|点|\d*)\W*",
     re.IGNORECASE,
 )
 """Names of what checks a calibration and is no part of it, in a cell or as the name of a column."""
-_ROLLS_ALONE = re.compile(rf"\W*({_ROLLS})[\s_-]*\d*\W*", re.IGNORECASE)
+_ROLLS_ALONE = re.compile(rf"\W*({_ROLLS.pattern})[\s_-]*\d*\W*", re.IGNORECASE)
 _CALIBRATION = re.compile(
     r"\W*([ck]al(ib\w*)?|calibra[cç][aã]o|calibraci[oó]n|калибр\w*|标定|校准)\W*\d*\W*",
     re.IGNORECASE,

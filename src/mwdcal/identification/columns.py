@@ -354,7 +354,7 @@ _LABELS = {
 """Names of columns of labels; a column is one only where no other is."""
 _CALLED_REFERENCE = re.compile(r"\b(ref|reference|nominal|target|set)\b", re.IGNORECASE)
 _REFERRED = re.compile(
-    r"\b(ref|reference|referenz|referanse|referencia|obs|observatory|эталон\w*|опорн\w*)\b|基准|参考|\bref(?=[a-z]\b)",
+    r"\b(ref|reference|referenz|referanse|referencia|obs|observatory|эт|эталон\w*|опорн\w*)\b|基准|参考|\bref(?=[a-z]\b)",
     re.IGNORECASE,
 )
 _OF_RESIDUALS = re.compile(
@@ -363,7 +363,8 @@ _OF_RESIDUALS = re.compile(
 )
 """Words of what a fit has left of a channel."""
 _OF_FIELD = re.compile(
-    r"field|fel[dt]|base ?mag|campo|champ|поле|磁场|proton|overhauser", re.IGNORECASE
+    r"^[FBT][\s_(\[]+([nuµ]T|gauss)\b|field|fel[dt]|base ?mag|campo|champ|поле|磁场|proton|overhauser",
+    re.IGNORECASE,
 )
 _MEASURED = re.compile(
     r"\b(measured|meas|calc|calculated|computed|corr|corrected|gemessen|m[åa]lt|sum|ist|mwd|survey|"
@@ -379,7 +380,7 @@ _NO_STAND = re.compile(
 )
 """Words of columns of angles that do not belong to the stand."""
 _NOMINAL = re.compile(
-    r"\b(nominale?|target|set( ?-?point)?|dese[aj]ad[oa]|gew[üu]nscht\w*|[øo]nske[dt]|"
+    r"\b(nominale?|target|set( ?-?point)?|sett?punkt\w*|dese[aj]ad[oa]|gew[üu]nscht\w*|[øo]nske[dt]|"
     r"set ?point|soll\w*|eingestellt\w*|vorgabe|satt|innstilt|innst|ajustad[oa]|"
     r"fijad[oa]|"
     r"definid[oa]|programad[oa]|desired|intended|planned|requested|te[óo]ric[oa]|th[ée]orique|r[ée]gl[ée]e?|vis[ée]e?|установ(ка|лен\w*)|уставк\w*|cmd|command(ed)?|demand(ed)?|required|nom|consign[ea]|comandad[oa]|"
@@ -681,7 +682,10 @@ def meanings_of(
         name: numbered.get(name, base if base in names else name) for name, base in bare.items()
     }
     results = {
-        name: m for name, unit in zip(names, units, strict=True) if (m := meaning(once[name], unit))
+        name: m
+        for name, unit in zip(names, units, strict=True)
+        if (m := meaning(once[name], unit))
+        and not (m.column in RAW and m.unit in ("°", "rad", "gon"))
     }
     results = _by_legend(names, above) | results | _explained(names, above)
     results |= _behind_titles(names, units, results)

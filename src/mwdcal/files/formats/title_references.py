@@ -130,7 +130,7 @@ _OF_COMPONENT = re.compile(
 """Words of a part of a field between its word and a number."""
 _BETWEEN = r"(?P<between>[^\d+\-−;]{0,30}?)"
 _REFERRING = re.compile(
-    r"(?<![^\W\d_])(ref|reference|local|lokal|value|wert|t|f|i|g|т)(?![^\W\d_])"
+    r"(?<![^\W\d_])(ref|reference|local|lokal|here|hier|her|aqui|aca|value|wert|t|f|i|g|т)(?![^\W\d_])"
 )
 """Words and letters behind the word of a quantity that say nothing more."""
 _CHINESE = r"[\u4e00-\u9fff]"
@@ -263,7 +263,7 @@ def _statements() -> list[tuple[_Quantity, re.Pattern[str]]]:
         for q in _OF_PLACES
         for head in (
             rf"(?P<word>{q.words})",
-            rf"(?P<letter>[{q.letters}]0?)(?=\W*(?:{_WRITTEN_UNIT}|ref\w*|lo[ck]al\w*)?\W*\d)",
+            rf"(?P<letter>[{q.letters}]0?)(?=\W*(?:{_WRITTEN_UNIT}|ref\w*|lo[ck]al\w*|here|hier|her|aqui|aca)?\W*\d)",
         )
     ]
 

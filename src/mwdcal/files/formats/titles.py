@@ -153,7 +153,7 @@ _TRUE_NORTH = re.compile(
     r"true\s+north|geographic north|nord géographique|rechtweisend", re.IGNORECASE
 )
 _TURN_EAST = (
-    r"(?:\s+(?:at|am|ved|en|in|on)\s+(?:the\s+)?[^\W\d_]+)?"
+    r"(?:\s+mag[^\W\d_]*)?(?:\s+(?:at|am|ved|en|in|on)\s+(?:the\s+)?[^\W\d_]+)?"
     r"(?:\s*\((?P<note>[^)]*)\))?[^\w+−-]*(?P<degrees>[+−-]?\d+[.,]?\d*)\s*(?:°|deg\w*)?"
     r"(?:\s*(?P<minutes>\d+(?:[.,]\d+)?)\s*(?:['′’]|min\w*))?\s*\(?(?P<sense>[EWO](?!\s*[+(])|west|зап|vest|oest)?"
 )
