@@ -211,6 +211,19 @@ def test_field_known_nowhere_is_calibrated_to_one_and_said_so():
     assert any(f.id == "field-unknown" for f in record.findings)
 
 
+def test_gravity_stated_nowhere_is_taken_as_1_g_and_said_so():
+    data = make()
+    (said,) = [f.text for f in calibrate(data, PROFILE).findings if f.id == "gravity-unknown"]
+    assert said.startswith("no station states gravity: 1 g (9.80665 m/s²) is assumed")
+    assert said.endswith("Give ref_gravity_g.")
+    once = np.where(np.arange(48) == 3, 1.0, np.nan)
+    stated = msgspec_replace(data, known={**data.known, "gravity": once})
+    for given, options in ((stated, Options()), (data, Options(ignore=("gravity",)))):
+        assert not any(
+            f.id == "gravity-unknown" for f in calibrate(given, PROFILE, options).findings
+        )
+
+
 def test_unknown_dip_is_a_constant_with_uncertainty():
     found = [calibrate(make(seed, unknown=("dip",)), PROFILE).constants[0] for seed in range(60)]
     errors = np.array([c.value - 65.0 for c in found])

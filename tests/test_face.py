@@ -168,6 +168,13 @@ def test_verdicts_and_diagnoses_are_written_as_they_are_printed(calibrated, tmp_
         assert written == command(*words, "--json").json
 
 
+def test_verify_says_what_its_third_argument_is(calibrated):
+    with pytest.raises(
+        mwdcal.InputError, match="`limits` must be the name .* got Profile. Leave it out"
+    ):
+        mwdcal.verify(calibrated[0], EXAMPLE / "rolltest.csv", mwdcal.Profile(name="x"))
+
+
 @pytest.mark.parametrize("kind", ["plans", "profiles", "limits", "methods"])
 def test_all_that_is_built_in_is_listed(kind):
     shown, listed = command("list", kind), command("list", kind, "--json").json["entries"]

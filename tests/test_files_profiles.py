@@ -76,6 +76,10 @@ REFUSALS = {
     "blank name": ('name = " "', "key 'name': must not be blank"),
     "name of wrong type": ("name = 1", "key 'name': must be text; got a whole number"),
     "unknown key": (A + "scal = 1", "key 'accelerometer.scal': must be one of axes, scale"),
+    "values below # [stand]": (
+        A + "# [stand]\ninclination_deg = 0.01",
+        "key 'accelerometer.inclination_deg': it belongs below a line [stand]. Take the # away",
+    ),
     "its near match": (A + "scal = 1", "Did you mean 'scale'?"),
     "unknown section": ('name = "a"\n[accelerometers]', "Did you mean 'accelerometer'?"),
     "unknown letter": (A + 'axes = ["+w", "+y", "+z"]', "key 'accelerometer.axes[0]': must be"),

@@ -41,6 +41,7 @@ def troubled():
         "named": {**spoiled(5), "station": [f"p{i}" if i % 2 else "" for i in range(28)]},
         "copies": again,
         "relative": short_run(6, ref_field_nt=np.full(28, np.nan)),
+        "weightless": short_run(9, ref_gravity_g=np.full(28, np.nan)),
         "bare": servo_run(7, inclinations=(10, 80, 110, 140), toolfaces=1),
         "alone": spoiled(8, mx=None, my=None, mz=None),
     }

@@ -55,7 +55,7 @@ def run(drop=(), magnetometer=True, moved=True, **metadata):
         a[6] += [3e-4, 6e-4, 0]
     known = {
         "inclination": inc, "azimuth": azi, "toolface": face,
-        "field": np.full(48, tool.field), "dip": np.full(48, tool.dip),
+        "field": np.full(48, tool.field), "dip": np.full(48, tool.dip), "gravity": np.ones(48),
     }  # fmt: skip
     return Readings(
         a,

@@ -401,6 +401,17 @@ def test_an_unstated_stand_is_named_before_other_causes():
         assert (assumed[0] == "angles of the stand") == named
 
 
+def test_angles_without_uncertainty_beside_uncertain_ones_are_assumed_exact():
+    data = run(sd={**NOISE, "inclination": np.full(48, 1e-4)})
+    assert calibrate(data, PROFILE).assumed_exact[:2] == [
+        "azimuth of the stand",
+        "toolface of the stand",
+    ]
+    without = calibrate(replace(data, magnetometer=None), PROFILE).assumed_exact
+    assert "azimuth of the stand" not in without
+    assert "toolface of the stand" in without
+
+
 def test_axes_of_one_noise_are_not_named():
     for seed in range(10):
         for sd in (NOISE, {}):

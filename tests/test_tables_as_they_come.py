@@ -588,7 +588,7 @@ def test_sheets_of_temperatures_beside_one_of_a_roll_test(tmp_path):
     path = workbook_of(tmp_path / "a.xlsx", run, ["20 C", "60 C", "Rulletest"])
     proposal = library.propose_profile(path)
     assert library.read_run(path, proposal.profile).count == 32
-    assert "roll test below this row of sheet 'Rulletest', 16 rows" in proposal.summary()
+    assert "\nroll test: sheet 'Rulletest', 16 rows below row 1; not part" in proposal.summary()
 
 
 def test_toolfaces_to_the_right_and_left_of_the_high_side(tmp_path):
@@ -641,7 +641,7 @@ def test_a_roll_test_below_the_run_is_set_aside_and_named(tmp_path, heading):
     path.write_text("\n".join(["Calibration", *lines, "", heading, *lines[:13]]))
     proposal = library.propose_profile(path)
     assert library.read_run(path, proposal.profile).count == 48
-    assert "(roll test, 12 rows, not part of the run)" in proposal.summary()
+    assert "roll test: 12 rows below line " in proposal.summary()
 
 
 @pytest.mark.parametrize(
@@ -669,8 +669,8 @@ def test_a_sheet_of_a_roll_test_is_set_aside_and_named(tmp_path):
     proposal = library.propose_profile(path)
     assert library.read_run(path, proposal.profile).count == 24
     assert "sheet 'Calibration'" in proposal.summary()
-    aside = "roll test below this row of sheet 'Roll test', 24 rows, not part of the run"
-    assert f"row 1 ({aside})" in proposal.summary()
+    aside = "roll test: sheet 'Roll test', 24 rows below row 1; not part of the run"
+    assert f"\n{aside}\n" in proposal.summary()
     tool = tmp_path / "tool.toml"
     proposal.save(tool)
     ran = mwdcal("calibrate", path, "--tool", tool, "-o", tmp_path / "a.json", "--rolltest", path)

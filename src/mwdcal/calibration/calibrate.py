@@ -159,7 +159,7 @@ class Records:
             excluded=[*choice.excluded, *(label for label, _ in readings.copies)],
             copies=[digest for _, digest in readings.copies] or msgspec.UNSET,
             singular_values=figures(result.analysis.determined.values[place]),
-            gravity_stated=readings.states("gravity"),
+            gravity_stated=bool(readings.states("gravity")),
             settings=self._practice(place, readings),
             orders=[*map(rounded, choice.orders)],
             station_rows=self.fitted.stations(place),

@@ -30,6 +30,9 @@ EARTH_RANGES = {"gravity": (0.9, 1.1), "field": (15_000.0, 80_000.0)}
 """Least and greatest strength of any place on Earth, with room for a doubtful unit: g, nT."""
 EARTH_GRAVITY = (0.995, 1.004)
 """The least and the largest gravity on land, in standard gravity: 9.764 to 9.834 m/s², and a little more."""
+STAND_EXACT = "{} of the stand"
+STAND_ANGLES_EXACT = STAND_EXACT.format("angles")
+"""The name of reference angles without any uncertainty; of a single one beside uncertain ones by its own name."""
 DIGEST_LENGTH = 16
 NANOTESLA = "nT"
 RELATIVE = "relative (field = 1)"
@@ -237,9 +240,9 @@ class Readings:
         """Unit in which a magnetometer is calibrated from these readings."""
         return RELATIVE if self.relative else NANOTESLA
 
-    def states(self, name: str) -> bool:
-        """Whether the value `name` is given at any station."""
-        return bool((~np.isnan(np.asarray(self.known.get(name, np.nan), float))).any())
+    def states(self, name: str) -> Bools:
+        """Whether the value `name` is given at any station (...)."""
+        return np.asarray(~np.isnan(self._per_station(self.known.get(name, np.nan))).all(-1))
 
     def reference(self, name: str) -> Array:
         """The known value `name` (..., n), NaN where blank.
@@ -263,11 +266,15 @@ class Readings:
         return self._per_station(np.nan_to_num(np.asarray(self.sd[name], float)))
 
     @property
-    def exact_angles(self) -> Bools:
-        """Whether some angles of the stand are known (...), and none of them has an uncertainty."""
-        known = ~np.isnan([self.reference(name) for name in ANGLES])
-        uncertain = known & (np.array([self.uncertainty(name) for name in ANGLES]) > 0)
-        return np.asarray(known.any((0, -1)) & ~uncertain.any((0, -1)))
+    def exact_angles(self) -> dict[str, Bools]:
+        """Whether angles of the stand are known (...) without any uncertainty, by `STAND_EXACT`: all, or just one."""
+        seen = [name for name in ANGLES if name != "azimuth" or self.magnetometer is not None]
+        known = ~np.isnan([self.reference(name) for name in seen])
+        certain = ~(known & (np.array([self.uncertainty(name) for name in seen]) > 0)).any(-1)
+        exact = known.any(-1) & certain
+        every = np.asarray(exact.any(0) & certain.all(0))
+        of_one = zip(map(STAND_EXACT.format, seen), exact & ~every, strict=True)
+        return {STAND_ANGLES_EXACT: every, **dict(of_one)}
 
     def common_uncertainty(self, name: str, inclination: Array) -> Array:
         """Standard uncertainty of the reference `name` (..., n) by what all stations of a stand share.

@@ -218,10 +218,8 @@ STEADINESS = {
 """Assumption of a calibration whose run could not show a drift, by the name of the drift."""
 
 
-STAND_ANGLES_EXACT = "angles of the stand"
-"""The name of reference angles without any uncertainty…"""
 STATE_STAND = "The angles of the stand count as exact: first state their 1σ under [stand] in the tool profile. "
-"""…and what findings say of it that their errors may explain."""
+"""Of angles without uncertainty findings say so, where their errors may explain what is found."""
 ALIGNMENT = "alignment of the tool in the stand"
 """The name of what a tool's axis that is not the one it is rolled about does."""
 LEAN = "A tool that leans by 0.05° in the stand is off by up to 0.05° in inclination, 0.07° in azimuth at 45°"

@@ -11,7 +11,7 @@ beyond the order are added to both.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import compress
@@ -30,7 +30,6 @@ from mwdcal.calibration.record import (
     ORDER,
     REPEATABILITY,
     SETTINGS,
-    STAND_ANGLES_EXACT,
     STEADINESS,
     THERMOMETER,
     Calibration,
@@ -492,11 +491,11 @@ def common_source(name: str) -> str:
 
 
 def assumed_exact(
-    result: Fit, relative: bool, exact_angles: Bools | bool = False
+    result: Fit, relative: bool, exact_angles: Mapping[str, Bools] | None = None
 ) -> list[list[str]]:
     """References and conditions that each run assumes exact whose error moves no residual, but the calibration.
 
-    And first the angles of the stand in runs with `exact_angles` (B,): their errors pass for noise.
+    And first the `exact_angles` of the stand (B,), by name: their errors pass for noise.
     A toolface zero, or a tool that leans in the stand, turns both triads, and a strength scales one, as sensors of
     other mounting or scale would have it. The field = 1 of a `relative` magnetometer is no reference. The signs of the
     magnetometer are assumed where nothing confirms the hemisphere: see `unconfirmed_dip`. The sensors of a
@@ -526,7 +525,7 @@ def assumed_exact(
     one_way = np.asarray(np.minimum(rise, fall) < LEAST_RETURN * np.ptp(temperature, -1))
     holds[THERMOMETER] = one_way & any(orders_of(result))
     holds |= {STEADINESS[name]: members for name, members in unseen_drifts(result).items()}
-    holds = {STAND_ANGLES_EXACT: np.broadcast_to(exact_angles, aligned.shape), **holds}
+    holds = {**(exact_angles or {}), **holds}
     return [[*compress(holds, each)] for each in np.stack([*holds.values()], -1).tolist()]
 
 

@@ -12,12 +12,12 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from mwdcal.calibration.readings import STAND_ANGLES_EXACT, STAND_EXACT
 from mwdcal.calibration.record import (
     NOISE,
     ORDER,
     REPEATABILITY,
     SETTINGS,
-    STAND_ANGLES_EXACT,
     BudgetRow,
     Calibration,
     TriadCalibration,
@@ -178,9 +178,9 @@ def assumed_exact(calibration: Calibration) -> list[str]:
 
 def _exact_lines(calibration: Calibration) -> list[BudgetLine]:
     """A line for each reference without a declared uncertainty."""
+    angles_exact = {STAND_ANGLES_EXACT, *map(STAND_EXACT.format, angles(calibration))}
     invisible = [
-        (name, VISIBLE if name == STAND_ANGLES_EXACT else INVISIBLE)
-        for name in calibration.assumed_exact
+        (name, VISIBLE if name in angles_exact else INVISIBLE) for name in calibration.assumed_exact
     ]
     visible = [(name, VISIBLE) for name in _undeclared(calibration)]
     zeros = {f"{name}_deg": 0.0 for name in angles(calibration)}

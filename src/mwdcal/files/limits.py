@@ -17,6 +17,11 @@ def load_limits(name_or_path: str | os.PathLike[str] = "roll-test") -> tuple[Lim
 
     In a command with settings of the laboratory their rule of decision counts, unless a limits file states another.
     """
+    if not isinstance(name_or_path, str | os.PathLike):
+        raise InputError(
+            f"`limits` must be the name of a limits profile, its file, or Limits; got {type(name_or_path).__name__}. "
+            "Leave it out for the roll test's limits: no tool profile is needed, the calibration has it."
+        )
     name = os.fspath(name_or_path)
     limits, digest = decoded_toml(name, Limits, "limits", "limits profile", "Files")
     bounds = [*limits.spread.items(), *limits.error.items()]

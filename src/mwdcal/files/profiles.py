@@ -294,6 +294,10 @@ def _unknown_key(key: str, section: str, source: str) -> InputError:
     near = difflib.get_close_matches(key.lower(), known, n=1)
     meant = f" Did you mean '{near[0]}'?" if near else ""
     full = f"{section}.{key}" if section else key
+    if key in StandProfile.__struct_fields__:
+        return InputError(
+            f"{source}, key '{full}': it belongs below a line [stand]. Take the # away from that line, or write it."
+        )
     return InputError(
         f"{source}, key '{full[:80]}': must be one of {', '.join(known)}; got an unknown "
         f"key.{meant} Rename or remove it."

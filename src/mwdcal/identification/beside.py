@@ -48,13 +48,12 @@ def findings_beside(where: Layout, profile: Profile, serial: object, file: str) 
     every = [t for t in where.beside if has_channels(t, profile)]
     tests = of_roll_tests(every, serial)
     clear = has_roll_test(tests)
+    named = {(t.form.header_line, t.kind) for t in where.aside}
     bare = [t for t in where.beside if t not in every and t.kind == ROLL_TEST]
     return [
         Finding(id=NOT_READ, text=_sentence(t, clear and t in tests, where.sheet, file))
         for t in every
-        if not any(
-            t.form.header_line == n and why.startswith(t.kind or "-") for n, why in where.left_out
-        )
+        if (t.form.header_line, t.kind) not in named
     ] + [Finding(id=NOT_READ, text=without_channels(t)) for t in bare]
 
 

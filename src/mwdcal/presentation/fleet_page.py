@@ -100,6 +100,7 @@ REMARKED = {
     "prior-only": "some parameters rest on the prior alone",
     "prior-conflict": "the run departs from the prior",
     "nonlinearity-ignored": "the model leaves out a nonlinearity that the profile declares",
+    "gravity-unknown": "gravity is unknown, and 1 g assumed: scale factors of the accelerometer are off by up to 0.3 %",
     "field-unknown": "the strength of the field is unknown: the magnetometer is calibrated to field = 1",
     "no-magnetometer": "field or dip is stated, and the table has no magnetometers",
     "restricted": "the model leaves out misalignments",

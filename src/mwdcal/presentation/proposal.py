@@ -171,6 +171,7 @@ def _layout(proposal: Proposal, form: TableFormat, run: Path) -> str:
         place += "; looked for by its names whenever it is read"
     if where and where.left_out:
         place += f"\nleft out: {_left_out(where.left_out, word)}"
+    place += "".join(_aside(t, where, word) for t in where.aside) if where else ""
     if workbook:
         return f"{_sheets(where)}, {place}" if where else place
     sign = "tab" if written_so.delimiter == "\t" else f"'{written_so.delimiter}'"
@@ -183,6 +184,13 @@ def _sheets(where: Layout) -> str:
     if len(sheets) == 1:
         return f"sheet {sheets[0]}"
     return f"sheets {', '.join(sheets[:-1])} and {sheets[-1]} joined as one run"
+
+
+def _aside(table: Layout, run: Layout, word: str) -> str:
+    """A line on a roll test, or a void run, in the file of a run."""
+    sheet = f"sheet '{one_line(table.sheet)}', " if table.sheet != run.sheet else ""
+    rows = f"{len(table.lines)} rows below {word} {table.form.header_line}"
+    return f"\n{table.kind}: {sheet}{rows}; not part of the run"
 
 
 def _left_out(rows: Sequence[tuple[int, str]], word: str) -> str:

@@ -13,10 +13,9 @@ import numpy as np
 from mwdcal.calibration.copies import in_fit
 from mwdcal.calibration.diagnosis.identity import doubts, other_tool
 from mwdcal.calibration.options import ASSUMED, is_assumed
-from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.readings import STAND_ANGLES_EXACT, Readings
 from mwdcal.calibration.record import (
     MARGIN,
-    STAND_ANGLES_EXACT,
     STATE_STAND,
     Calibration,
     Finding,

@@ -32,7 +32,14 @@ from mwdcal.calibration.diagnosis.structure import COLUMN, is_shown, suspected
 from mwdcal.calibration.diagnosis.structure import described as seen_as
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import DIRECTION
-from mwdcal.calibration.readings import EARTH_GRAVITY, EARTH_RANGES, HIGHEST, TRIADS, Readings
+from mwdcal.calibration.readings import (
+    EARTH_GRAVITY,
+    EARTH_RANGES,
+    HIGHEST,
+    STAND_ANGLES_EXACT,
+    TRIADS,
+    Readings,
+)
 from mwdcal.calibration.record import MISFIT_CHANCE, SHOWN_DRIFT, STATE_STAND, Finding
 from mwdcal.calibration.residuals import REASONS, shown_in, tail
 from mwdcal.calibration.results import (
@@ -189,6 +196,8 @@ REMARKS = {
     "`model` polynomial for it.",
     "field-unknown": "no station states the strength of the field, so the magnetometer is calibrated to field = 1 "
     "instead of nT. Give ref_field_nt to have nT.",
+    "gravity-unknown": "no station states gravity: 1 g (9.80665 m/s²) is assumed, and the scale factors of the "
+    "accelerometer are off as gravity at the stand is, by up to 0.3 %; angles are not. Give ref_gravity_g.",
     "restricted": "{parameters} parameters: {lost} of the sensors in the tool is taken as none, and no uncertainty "
     "here includes it. Use `parameters` 12 to fit it.",
     "reshoot": "station {of[station]}: residual {of[size]}σ, most in {of[worst]} ({of[value]:+.3g}{of[unit]}; "
@@ -321,7 +330,7 @@ def _noise(fitted: FittedRuns) -> Iterator[Flag]:
     large = weighed & (factor > NOISE_RATIO**2) | (chances < MISFIT_CHANCE)
 
     times = np.sqrt(factor)
-    stand = np.where(fitted.readings.exact_angles, STATE_STAND, "")
+    stand = np.where(fitted.readings.exact_angles[STAND_ANGLES_EXACT], STATE_STAND, "")
 
     def rare(place: int, index: int) -> str:
         chance = chances[place, index]
@@ -365,7 +374,7 @@ def _axis_noise(fitted: FittedRuns) -> Iterator[Flag]:
         times, rare = np.sqrt(ratio[place, index]), chance[place, index]
         return dict(zip(("most", "least", "times", "chance"), (*names, times, rare), strict=True))
 
-    stand = np.where(fitted.readings.exact_angles, STATE_STAND, "")
+    stand = np.where(fitted.readings.exact_angles[STAND_ANGLES_EXACT], STATE_STAND, "")
     for index, triad in enumerate(TRIADS[: variance.shape[1]]):
         values = {"triad": triad, "of": partial(of, index), "stand": stand}
         yield Flag(f"{triad}-axis-noise", unequal[:, index], REMARKS["axis-noise"], values)
@@ -654,6 +663,8 @@ def _model(fitted: FittedRuns) -> Iterator[Flag]:
     ]
     every = np.ones(fitted.count, bool)
     yield _remark("nonlinearity-ignored", every & bool(ignored), triads=" and ".join(ignored))
+    used = "gravity" not in fitted.result.problem.evidence.absent
+    yield _remark("gravity-unknown", ~fitted.readings.states("gravity") & used)
     yield _remark("field-unknown", every & fitted.readings.relative)
     lost = {6: "any misalignment", 9: "mounting rotation"}.get(options.parameters, "")
     yield _remark("restricted", every & bool(lost), parameters=options.parameters, lost=lost)

@@ -212,7 +212,8 @@ class Layout:
     `parts` the sheet of each row where several are one table; `heading` the text right above the names;
     `titles` what the title block says of the tool, the day and the place; `places` letters of the columns in a
     workbook; `remarks` are sentences on what is taken from other places than the columns. Of a table that goes `across`
-    the stations stand in columns, and `lines` are these. `beside` are the other tables of its file.
+    the stations stand in columns, and `lines` are these. `beside` are the other tables of its file,
+    `aside` void runs and roll tests with the columns of this run.
     """
 
     sheet: str
@@ -233,6 +234,7 @@ class Layout:
     remarks: tuple[str, ...] = ()
     across: bool = False
     beside: tuple[Layout, ...] = ()
+    aside: tuple[Layout, ...] = ()
 
     @property
     def kind(self) -> str:
@@ -469,15 +471,8 @@ def _the_run(tables: Sequence[Layout]) -> Layout | None:
         runs = [_joined_sheets(runs)]
     if len(runs) != 1 or ADJUSTED.search(runs[0].heading):
         return None
-    aside = tuple(
-        (
-            t.form.header_line,
-            f"{kind}{_of_sheet(t, runs[0])}, {len(t.lines)} rows, not part of the run",
-        )
-        for t, kind in zip(tables, kinds, strict=True)
-        if kind
-    )
-    return replace(runs[0], left_out=(*runs[0].left_out, *aside))
+    aside = tuple(t for t, kind in zip(tables, kinds, strict=True) if kind)
+    return replace(runs[0], aside=aside)
 
 
 def _kind_of(table: Layout) -> str:
@@ -586,11 +581,6 @@ def _are_numbered_on(tables: Sequence[Layout]) -> bool:
         all(map(str.isdecimal, cells)) and all(int(b) == int(a) + 1 for a, b in pairwise(cells))
         for cells in columns
     )
-
-
-def _of_sheet(table: Layout, run: Layout) -> str:
-    """The sheet of a table in words, where it is another than that of the run."""
-    return f" below this row of sheet {shown(table.sheet)}" if table.sheet != run.sheet else ""
 
 
 def _joined_sheets(tables: Sequence[Layout]) -> Layout:
