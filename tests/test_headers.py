@@ -187,13 +187,13 @@ def test_a_unit_of_two_words_is_that_of_the_column_above_it(tmp_path):
 def test_words_behind_the_last_column_are_one_remark(tmp_path):
     """A question on it names its column, of which there is no name."""
     units = ["DEG", "DEG", "DEG", *["V"] * 6, "DEGC"]
-    remarks = [(3, "table bumped here")]
+    remarks = [(3, "bad contact here")]
     path = listing(tmp_path / "run.txt", WORDS, units, stations(), remarks)
-    with pytest.raises(mwdcal.FitError, match="'column 11' says 'table bumped here'") as error:
+    with pytest.raises(mwdcal.FitError, match="'column 11' says 'bad contact here'") as error:
         mwdcal.propose_profile(path)
     first, *_ = error.value.questions[0].answers[0].arguments
-    assert first == ("keep", "column 11=table bumped here")
-    assert same(taken(path, keep={"column 11": ["table bumped here"]}), stations())
+    assert first == ("keep", "column 11=bad contact here")
+    assert same(taken(path, keep={"column 11": ["bad contact here"]}), stations())
 
 
 @pytest.mark.parametrize("answers", [{}, {"column": {"ref_toolface_deg": "TF (°)"}}])
