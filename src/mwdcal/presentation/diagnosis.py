@@ -57,7 +57,7 @@ def screen(result: Diagnosis, *metadata: Mapping[str, object]) -> str:
 
 def render(result: Diagnosis, sha256: Mapping[str, str], *metadata: Mapping[str, object]) -> str:
     """The diagnosis as HTML; `sha256` of the calibration and the readings, `metadata` as of the screen."""
-    sound = result.fault == NONE
+    sound = result.fault == NONE or _by_stand(result)
     certain = is_fine(result)
     word, level = ("OK", "good") if certain else ("Attention", "attention" if sound else "bad")
     return rendered(
