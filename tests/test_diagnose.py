@@ -31,6 +31,7 @@ from mwdcal.faults.likelihood import (
 from mwdcal.geometry.vectors import reference_vectors, tool_from_earth
 from mwdcal.planning import plans
 from mwdcal.planning.plans import Effects, FaultEffect, load_effects
+from mwdcal.presentation.diagnosis import is_fine, screen
 from mwdcal.sensor.profile import Datasheet, Profile, TriadProfile
 from simulation import DEG, Tool
 
@@ -497,3 +498,52 @@ def test_a_run_of_the_tests_own_model_is_still_fine(tmp_path):
     assert "100.0 %" not in ran.out
     assert "do not use" not in ran.out
     assert "no single fault explains" in ran.err
+
+
+OFFSETS = {"inclination": 0.4, "azimuth": -0.6, "toolface": 0.5}
+
+
+def on_uncertain_stand(readings, size, zero=0.0):
+    """The readings of a stand whose settings of direction, set once for a roll, have this standard uncertainty."""
+    sd = {n: np.full(readings.count, size * DEG) for n in ("inclination", "azimuth")}
+    sd |= {"inclination-zero": np.full(readings.count, zero * DEG)} if zero else {}
+    return replace(readings, sd={**readings.sd, **sd}, settings="per-direction")
+
+
+@pytest.mark.parametrize("angle", OFFSETS)
+def test_an_offset_of_the_stand_is_named_with_its_size_and_never_still_fine(angle):
+    """Three rolls set to 0.1°: a common offset is known to 0.1°/√3, toolface to the noise."""
+    readings, _ = later(3)
+    known = {**readings.known, angle: readings.known[angle] + OFFSETS[angle] * DEG}
+    result = diagnose(tool(3)[0], on_uncertain_stand(replace(readings, known=known), 0.1))
+    offset = result.stand_offset
+    assert offset.parameter == angle
+    assert abs(offset.size - OFFSETS[angle]) < 3 * max(offset.uncertainty, 0.01)
+    assert offset.uncertainty == pytest.approx(0.1 / np.sqrt(3), rel=0.15) or angle == "toolface"
+    assert not is_fine(result)
+    assert f"offset of the stand's {angle}" in screen(result)
+
+
+@pytest.mark.parametrize("zero", [0.0, 0.3])
+def test_a_sound_roll_test_has_no_offset_and_a_stated_zero_of_the_stand_counts(zero):
+    readings, _ = later(3)
+    shift = {"inclination": readings.known["inclination"] + zero * DEG}
+    later_on = replace(readings, known={**readings.known, **shift})
+    assert is_fine(diagnose(tool(3)[0], on_uncertain_stand(later_on, 0.1, zero)))
+
+
+def test_a_blow_is_no_offset_of_the_stand():
+    readings, _ = later(3, kind="impact", channel="ax", size=3.0)
+    result = diagnose(tool(3)[0], on_uncertain_stand(readings, 0.01))
+    assert (result.fault, result.stand_offset) == ("impact", None)
+
+
+def test_the_command_blames_the_stand_for_a_roll_test_that_fails(files, tmp_path):
+    columns = read_csv(files / "demo" / "rolltest.csv")
+    angles = [float(value) + 0.4 for value in columns["ref_inclination_deg"]]
+    write_csv(tmp_path / "high.csv", columns | {"ref_inclination_deg": angles})
+    assert "FAIL" in command("verify", files / "tool.json", tmp_path / "high.csv").out
+    ran = command("diagnose", files / "tool.json", tmp_path / "high.csv")
+    assert ran.code == 1
+    assert ran.out.startswith("an offset of the stand's inclination of 0.39")
+    assert "next: check the zero of the stand" in ran.out

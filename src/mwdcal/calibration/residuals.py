@@ -23,6 +23,7 @@ from mwdcal.estimation.uncertainty import (
     normal_quantile,
     per_freedom,
     station_misfit,
+    whole_covariance,
     without_station,
 )
 from mwdcal.geometry.observables import OBSERVABLES
@@ -213,13 +214,27 @@ class Residuals:
         """Standard deviations of `errors` after the fit that noise and stand alone would give.
 
         NaN if the fit did not use an observable. Declared noise is not scaled by what the residuals
-        come to: the two are compared.
+        come to: the two are compared. A reference keeps the error of its setting of the stand, of which
+        the residual lacks what the fit estimates, X_s ŝ: with Cov(ŝ) = I - V_ss it adds
+        X V_·s X_sᵀ + X_s V_s· Xᵀ + X_s (I - V_ss) X_sᵀ.
         """
         fit, problem, expected = self.fit, self.fit.problem, {}
-        private = problem.linear(fit.state).private
-        total = np.eye(private.shape[-2]) + private @ private.mT
+        linear, trust = problem.linear(fit.state), fit.trust[..., None, None]
+        total = np.eye(linear.private.shape[-2]) + linear.private @ linear.private.mT
         # Covariance (B, n, m, m) of the whitened misfit, in units of the noise whatever the weights.
         misfit = total @ _judged(fit).spread @ total
+        if count := fit.state.settings.shape[-1]:
+            design = linear.design
+            settings = design[..., -count:]
+            if fit.analysis.influence is not None:
+                params = design[..., : linear.size]
+                left = settings - params @ fit.analysis.of_settings[:, None]
+                misfit = misfit + left @ left.mT
+            else:
+                whole = whole_covariance(linear, fit.analysis.determined)[:, None, :, -count:]
+                scatter = np.eye(count) - whole[..., -count:, :]
+                part = (trust * design @ whole + settings @ scatter / 2) @ settings.mT
+                misfit = misfit + (part + part.mT) / trust
         noise = [triad.sd * np.sqrt(fit.trust)[..., None] for triad in problem.triads]
         slopes = [
             triad.model.slope(fit.state.params[:, where], triad.raw, problem.temperature)

@@ -43,6 +43,7 @@ from mwdcal.faults.likelihood import (
     hypotheses,
     over_forms,
     raw_of,
+    stand_offsets,
 )
 from mwdcal.files.contract import CHANNELS
 from mwdcal.files.runs import away_from_stand
@@ -412,7 +413,8 @@ class Diagnosis(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     readings that speak so much for a fault. `likelihoods` are the shares of all faults, each as likely
     beforehand. `confounded_with` are faults that these readings cannot tell from the one named, `rivals` their sizes,
     `tell_apart` what would; `unseen` are faults of the usual size that they would not show. `surveys`: no station has
-    an attitude given, as in a hole.
+    an attitude given, as in a hole. `stand_offset` is an error that all references of an angle share, where that
+    explains the readings as well as `fault` or better.
     """
 
     summary: ClassVar[Callable[..., str]]
@@ -437,6 +439,7 @@ class Diagnosis(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     run: str
     stations: int
     surveys: bool
+    stand_offset: Moved | None = None
     findings: list[Finding]
 
 
@@ -459,6 +462,7 @@ def diagnose(calibration: Calibration, readings: Readings, *, draws: int = DRAWS
     shares = evidence.likelihoods()
     fault = max(FAULTS, key=lambda name: shares[name]) if probability <= FALSE_ALARMS else NONE
     findings += _unexplained(evidence, fault, freedom(calibration, usable))
+    offset = _stand_offset(evidence, fault, freedom(calibration, usable))
     confounded, remedies = apart(calibration, usable, evidence, fault, shares)
     if (other := innocent(fault, confounded, shares)) != fault:
         fault = other
@@ -477,18 +481,41 @@ def diagnose(calibration: Calibration, readings: Readings, *, draws: int = DRAWS
         run=readings.name,
         stations=usable.count,
         surveys=not any(np.isfinite(usable.reference(name)).any() for name in ANGLES),
+        stand_offset=offset,
         findings=findings,
     )
 
 
-def _unexplained(evidence: FaultEvidence, fault: str, freedom: float) -> list[Finding]:
-    """A finding if even the best explanation leaves more than the noise does."""
+def _chance(square: float, count: int, freedom: float) -> float:
+    """Chance of a larger χ² of `count` degrees of freedom, the noise being known with those of `freedom`."""
     from scipy.special import chdtrc, fdtrc
 
+    if np.isinf(freedom):
+        return float(chdtrc(count, square))
+    return float(fdtrc(count, freedom, square / count))
+
+
+def _stand_offset(evidence: FaultEvidence, fault: str, freedom: float) -> Moved | None:
+    """The common error of the references of one angle that explains readings no worse than `fault` does."""
+    information, offsets = stand_offsets(evidence.suspect, evidence.none)
+    square = information * offsets**2
+    best = int(np.argmax(square))
+    left = evidence.misfit(NONE) - float(square[best])
+    count = raw_of(evidence.suspect.problem).size
+    if (
+        len(square) * _chance(float(square[best]), 1, freedom) > FALSE_ALARMS
+        or _chance(left, count, freedom) < UNEXPLAINED
+        or (fault != NONE and left > evidence.misfit(fault) + 2 * DISTINCT)
+    ):
+        return None
+    size, spread = np.degrees([offsets[best], information[best] ** -0.5]).tolist()
+    return Moved(parameter=ANGLES[best], channel=None, size=size, uncertainty=spread, unit="°")
+
+
+def _unexplained(evidence: FaultEvidence, fault: str, freedom: float) -> list[Finding]:
+    """A finding if even the best explanation leaves more than the noise does."""
     misfit, count = evidence.misfit(fault), raw_of(evidence.suspect.problem).size
-    known = np.isinf(freedom)
-    chance = chdtrc(count, misfit) if known else fdtrc(count, freedom, misfit / count)
-    if not chance < UNEXPLAINED:
+    if not _chance(misfit, count, freedom) < UNEXPLAINED:
         return []
     text = (
         f"no single fault explains these readings: the best leaves {misfit / count:.3g} times the variance of the "

@@ -23,10 +23,19 @@ from mwdcal.calibration.readings import LEAST_TEMPERATURE_SPAN, TRIADS, Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
 from mwdcal.estimation.batch import batch_of_one, mapped, put, take
-from mwdcal.estimation.problem import Prior, Problem, State, Triad
+from mwdcal.estimation.problem import ANGLES, Prior, Problem, State, Triad
 from mwdcal.estimation.solvers import Linear
 from mwdcal.estimation.start import oriented
-from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, inverse, outer, square_root
+from mwdcal.geometry.vectors import (
+    Array,
+    Bools,
+    Ints,
+    diagonal,
+    inverse,
+    outer,
+    quotient,
+    square_root,
+)
 from mwdcal.sensor.profile import Profile, tolerance
 
 # --------------------------------------------------------------------------
@@ -299,6 +308,8 @@ FREE_SIZE = 0.3
 """Standard uncertainty of a direction that the calibration has left free: it turns or stretches by as much."""
 LEAST_SD = 1e-7
 """Smallest noise of a reading that counts, as a share of the field."""
+LEAST_INFORMATION = 1e-9
+"""Share of the information on an offset of the stand that is more than rounding leaves of none."""
 IGNORED = 1e6
 """Factor on the noise of a channel that is taken to be dead: its readings then say nothing of anything else."""
 STEPS, STEPS_FROM_NEAR = 5, 2
@@ -531,6 +542,28 @@ class _System:
         information = weighed.mT @ _rows(self.seen) - inner @ cross.mT
         gradient = np.einsum("bij,bj->bi", inner, self.gradient) - pulled
         return (information + information.mT) / 2, gradient
+
+
+def stand_offsets(suspect: Suspect, none: Explanation) -> tuple[Array, Array]:
+    """Information (3,) on an error that all references of each of the `ANGLES` share, and its best size (3,), radians.
+
+    Each alone, beside all that explains the readings without a fault; positive where references are too high. Zero
+    where no reference, or nothing but it, tells of the angle.
+    """
+    nothing = np.zeros((1, SIZE, 0))
+    system = _System.at(suspect, nothing, none.state, none.scores, np.zeros((1, 0)), 1.0)
+    problem = system.problem
+    turns, _ = problem.station_columns(none.state)
+    columns = [
+        problem.stand_column(none.state, f"{name}-zero", turns)
+        * np.isfinite(problem.evidence.known[name])[..., None]
+        for name in ANGLES
+    ]
+    alone = np.sum(np.square(columns), (1, 2, 3))
+    beside, gradient = replace(system, seen=np.stack(columns, -1)).beside()
+    information = diagonal(beside)[0]
+    information = np.where(information > LEAST_INFORMATION * alone, information, 0.0)
+    return information, quotient(gradient[0], information, information > 0)
 
 
 def _rows(columns: Array) -> Array:

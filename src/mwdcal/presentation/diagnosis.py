@@ -17,7 +17,7 @@ MEANINGS = {
     "dead-channel": "a channel that stands still",
     "heat": "bias and scale drift with temperature beyond the calibration",
     "magnetised": "interference of a string or collar, fixed in the tool",
-    "casing": "casing or steel nearby, or references that are off",
+    "casing": "casing or steel nearby, or a field reference that is off",
     "turn-on": "biases of all channels after switching on",
 }
 """Each fault in words."""
@@ -32,6 +32,7 @@ ADVICE = {
 }
 """The advice for each."""
 CHECK_FIRST = "check tool, units and references, then repeat the readings on a stand"
+CHECK_STAND = "check the zero of the stand and the references, then repeat the roll test"
 IN_HOLE = "run mwdcal survey --msa on these surveys: it estimates a field fixed in the tool and corrects for it"
 NOT_YET = "do not judge the tool by these readings alone"
 """The advice where no single fault explains readings, of surveys, and where a sound tool is not excluded."""
@@ -56,8 +57,8 @@ def screen(result: Diagnosis, *metadata: Mapping[str, object]) -> str:
 
 def render(result: Diagnosis, sha256: Mapping[str, str], *metadata: Mapping[str, object]) -> str:
     """The diagnosis as HTML; `sha256` of the calibration and the readings, `metadata` as of the screen."""
-    sound = result.fault == NONE
-    certain = sound and not _unexplained(result)
+    sound = result.fault == NONE or _by_stand(result)
+    certain = is_fine(result)
     word, level = ("OK", "good") if certain else ("Attention", "attention" if sound else "bad")
     return rendered(
         "diagnosis.html",
@@ -77,6 +78,8 @@ def render(result: Diagnosis, sha256: Mapping[str, str], *metadata: Mapping[str,
 def verdict(result: Diagnosis) -> str:
     """One sentence: still fine, or the fault, where, and by how much; and what else it may be."""
     unexplained = _unexplained(result)
+    if _by_stand(result):
+        return f"{_offset(result)} explains these readings; the tool may be as calibrated"
     if result.fault == NONE:
         if unexplained:
             return "no single fault explains these readings, and none is named"
@@ -89,6 +92,26 @@ def verdict(result: Diagnosis) -> str:
     if result.rivals:
         return f"cannot tell {' from '.join(causes)}"
     return causes[0]
+
+
+def is_fine(result: Diagnosis) -> bool:
+    """Whether nothing has changed: no fault, nothing left to explain, no offset of the stand."""
+    return result.fault == NONE and not _unexplained(result) and result.stand_offset is None
+
+
+def _by_stand(result: Diagnosis) -> bool:
+    """Whether an offset of the stand explains what no fault does."""
+    return result.stand_offset is not None and (result.fault == NONE or _unexplained(result))
+
+
+def _offset(result: Diagnosis) -> str:
+    """The offset of the stand and its size."""
+    offset = result.stand_offset
+    return (
+        f"an offset of the stand's {offset.parameter} of {estimate(offset.size, offset.uncertainty, '°')}"
+        if offset
+        else ""
+    )
 
 
 def _unexplained(result: Diagnosis) -> bool:
@@ -159,6 +182,8 @@ def _last(result: Diagnosis) -> list[str]:
         f"rule: a healthy tool looks this bad with a probability of {chance(result.probability)}; a fault is reported "
         f"at {100 * FALSE_ALARMS:g} % or less"
     ]
+    if result.stand_offset and not _by_stand(result):
+        lines.append(f"{_offset(result)} explains these readings as well")
     if result.unseen:
         lines.append(f"not shown by these readings, at its usual size: {', '.join(result.unseen)}")
     for name in result.confounded_with:
@@ -170,6 +195,8 @@ def _last(result: Diagnosis) -> list[str]:
 
 def next_step(result: Diagnosis) -> str:
     """The advice: a tool is taken out of use only where readings exclude that it is sound."""
+    if _by_stand(result):
+        return CHECK_STAND
     if _unexplained(result):
         return CHECK_FIRST
     steps = [IN_HOLE if result.fault == "magnetised" and result.surveys else ADVICE[result.fault]]

@@ -34,11 +34,10 @@ def command(
 
     from mwdcal.calibration.diagnosis.findings import of_table
     from mwdcal.faults.diagnosis import diagnose
-    from mwdcal.faults.likelihood import NONE
     from mwdcal.files.formats import atomic
     from mwdcal.identification.roll_tests import read_later
     from mwdcal.presentation.calibration_source import calibration_of
-    from mwdcal.presentation.diagnosis import render, screen
+    from mwdcal.presentation.diagnosis import is_fine, render, screen
     from mwdcal.presentation.envelope import json_document
 
     options.check_outputs([output], [calibration, readings], page=report, form=".json")
@@ -55,4 +54,4 @@ def command(
     page = render(result, digests, *stated) if report else ""
     atomic.write_all([(output, to_json(document) + "\n"), (report, page)])
     print_result(document if as_json else screen(result, *stated), findings)
-    sys.exit(0 if result.fault == NONE else 1)
+    sys.exit(0 if is_fine(result) else 1)
