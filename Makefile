@@ -124,7 +124,8 @@ check-types: $(INSTALLED)
 
 check-code: $(INSTALLED)
 	@$(CLOCK); $(BIN)/python -m pytest -q tests/test_architecture.py; \
-	$(ONE_THREAD) $(BIN)/python -m pytest -q --doctest-modules src --doctest-glob='*.md' docs
+	$(ONE_THREAD) $(BIN)/python -m pytest -q --doctest-modules src; \
+	$(ONE_THREAD) $(BIN)/python -m pytest -q --doctest-glob='*.md' docs
 
 check-words: $(INSTALLED)
 	@$(CLOCK); $(BIN)/python tests/words.py; $(BIN)/python examples/gallery/gallery.py --check
