@@ -342,7 +342,7 @@ def test_short_representations(cal, rolltest):
         assert len(repr(thing)) < 400
         assert "\n" not in repr(thing)
     assert "accelerometer 12 of 12" in repr(cal)
-    assert "findings no-serial" in repr(cal)
+    assert "findings gravity-unknown, no-serial" in repr(cal)
     assert repr(verdict).startswith("<Verdict: passed, ")
     for html in (cal._repr_html_(), verdict._repr_html_()):
         assert html.startswith("<table>")
