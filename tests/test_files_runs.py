@@ -169,7 +169,7 @@ def test_an_unknown_scale_is_taken_from_the_readings():
 
 @pytest.mark.parametrize("inclinations", [(5, 45, 90, 135), (0, 45, 90), (60, 90, 120), (40, 50)])
 def test_an_unknown_scale_is_that_of_a_sphere_wherever_its_middle_is(inclinations):
-    """The middle of the ranges is none of the sphere: half way between the least and the largest of a channel."""
+    """Half way between the least and the largest reading of a channel lies off the centre of their sphere."""
     inc = np.repeat(np.radians(inclinations), 8)
     face = np.tile(np.arange(8) * np.pi / 4, len(inclinations))
     unit = np.stack([-np.sin(inc) * np.sin(face), -np.sin(inc) * np.cos(face), np.cos(inc)], -1)

@@ -10,12 +10,20 @@ import pytest
 from openpyxl import Workbook
 
 import mwdcal as library
-from cli_support import mwdcal, refused, servo_run, write_csv
+from cli_support import RAW, mwdcal, refused, servo_run, write_csv
 from mwdcal.errors import FitError
 from mwdcal.files.formats.title_references import doubtful_in, references_in, stated_above
 from mwdcal.files.formats.titles import titles
 from mwdcal.identification.columns import meaning
-from test_tables_as_they_come import calibrated, findings_of, mixed, read, table, written
+from test_tables_as_they_come import (
+    ANGLES,
+    calibrated,
+    findings_of,
+    mixed,
+    read,
+    table,
+    written,
+)
 
 FIELD, DIP, GRAVITY = 50_123.0, 66.12, 9.8123 / 9.80665
 WORDS = (
@@ -805,17 +813,7 @@ def test_units_of_which_the_first_column_has_none_stand_below_their_names(tmp_pa
     ]
     run = servo_run()
     scales = {"ax": 1 / 3, "ay": 1 / 3, "az": 1 / 3}
-    kept = (
-        "ref_inclination_deg",
-        "ref_azimuth_deg",
-        "ref_toolface_deg",
-        "ax",
-        "ay",
-        "az",
-        "mx",
-        "my",
-        "mz",
-    )
+    kept = (*ANGLES, *RAW)
     for k in range(48):
         values = "".join(f"{run[n][k] * scales.get(n, 1):13.4f}" for n in kept)
         lines.append(f"{k + 1:<4d}{values}{75.0 + k / 100:13.1f}")
