@@ -690,7 +690,6 @@ def meanings_of(
     results = _by_legend(names, above) | results | _explained(names, above)
     results |= _behind_titles(names, units, results)
     results |= _beside_nominal(names, units, results)
-    results |= _beside_tool(names, units, results)
     results |= _beside_others(names, units, results)
     results |= _by_axes(names, units, results)
     every = [n for n, m in results.items() if m.column == "az"]
@@ -894,24 +893,6 @@ def shown_beside_set(names: Sequence[str]) -> list[tuple[str, str, str]]:
             elif apart and ends and name not in shown_ones:
                 pairs.append((name, other, bare))
     return pairs
-
-
-def _beside_tool(
-    names: Sequence[str], units: Sequence[str], meanings: Mapping[str, Resemblance]
-) -> dict[str, Resemblance]:
-    """Angles that the stand shows, each beside one that the tool tells: Bench Inc beside Probe Inc."""
-    of_tool = {n for n in meanings if _BY_TOOL.search(spelled(n))}
-    alone = {meanings[n].column for n in of_tool} - {
-        m.column for n, m in meanings.items() if n not in of_tool
-    }
-    results = {}
-    for name, unit in zip(names, units, strict=True):
-        plain = spelled(name)
-        if name not in meanings and _BY_STAND.search(plain) and not _BY_TOOL.search(plain):
-            alike = meaning(" ".join(_BY_STAND.sub(" ", plain).split()), unit)
-            if alike and alike.column in alone & {*_ANGLES_AND_WARMTH[:3]}:
-                results[name] = alike
-    return results
 
 
 def _behind_titles(
