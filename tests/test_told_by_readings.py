@@ -659,6 +659,13 @@ def test_a_row_with_a_remark_counts_where_its_readings_fit_and_is_asked_about_el
     proposal = library.propose_profile(path)
     assert library.read_run(path, proposal.profile).count == 48
     assert "'Note' says 'forklift moved, waited'" in findings_of(proposal)["marked-rows"]
+    note[30] = "table knocked, went on"
+    proposal = library.propose_profile(written(tmp_path / "two.csv", table(Note=note)))
+    told = findings_of(proposal)["marked-rows"]
+    assert (
+        "'Note' says 'forklift moved, waited'; line 32: 'Note' says 'table knocked, went on'"
+        in told
+    )
     left_out = read(path, leave_out={"Note": [note[20]]})
     assert left_out.count == 47
     run = table(Note=note)

@@ -46,6 +46,8 @@ from mwdcal.sensor.profile import ColumnSource
 # --------------------------------------------------------------------------
 # Answers to what a table leaves open: columns, units and triads that may be meant, what is believed first.
 
+MEASURED_BY_TOOL = "the tool has measured"
+"""What a question says of angles that fit the readings whatever the stand shows."""
 BOTH_UNITS = " and "
 """What stands between two units of one column, of which one is wrong."""
 IN_BRACKETS = re.compile(r"[(\[]([^)\]]*)[)\]]\s*$")
@@ -381,7 +383,7 @@ _NO_STAND = re.compile(
 """Words of columns of angles that do not belong to the stand."""
 _NOMINAL = re.compile(
     r"\b(nominale?|target|set( ?-?point)?|sett?punkt\w*|dese[aj]ad[oa]|gew[üu]nscht\w*|[øo]nske[dt]|"
-    r"set ?point|soll\w*|eingestellt\w*|vorgabe|satt|innstilt|innst|ajustad[oa]|"
+    r"soll\w*|eingestellt\w*|vorgabe|satt|innstilt|innst|ajustad[oa]|"
     r"fijad[oa]|"
     r"definid[oa]|programad[oa]|desired|intended|planned|requested|te[óo]ric[oa]|th[ée]orique|r[ée]gl[ée]e?|vis[ée]e?|установ(ка|лен\w*)|уставк\w*|cmd|command(ed)?|demand(ed)?|required|nom|consign[ea]|comandad[oa]|"
     r"зад|zadan\w*|b[öo]rv[äa]rde|задан\w*|номинал\w*)\b|[设给]定|设置|理论|名义|目标|指令値?|目標値?|設定値?",
@@ -445,6 +447,8 @@ _OF_LOGGER = re.compile(
     re.IGNORECASE,
 )
 """A channel of a logger, with what it is in brackets or behind a colon."""
+_NUMBER_OF_CHANNEL = re.compile(r"^(k|ch|ai|kanal|canal) ?\d{1,2}[\s_]+(?=\S{2})", re.IGNORECASE)
+"""The number of a channel of a logger before its name: K1 AccX."""
 _SCATTER = re.compile(r"s (?=[gabhm][xyz]\b)|[sσ] ?\(|σ|ско\b", re.IGNORECASE)
 """How the name of the scatter of the samples of a channel begins, which is no channel."""
 _OF_SAMPLES = re.compile(
@@ -556,7 +560,7 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
 
 def _bracketed(name: str) -> str:
     """A name without what a logger writes before it, and with its unit in brackets."""
-    name = re.sub(r"^(k|ch|ai|kanal|canal) ?\d{1,2}[\s_]+(?=\S{2})", "", name, flags=re.IGNORECASE)
+    name = _NUMBER_OF_CHANNEL.sub("", name)
     logged = _OF_LOGGER.fullmatch(name)
     name = f"{logged[1]}{logged[2] or ''}" if logged else name
     worded = _IN_UNIT.fullmatch(name)
@@ -844,7 +848,8 @@ def _beside_nominal(
         bare = " ".join(words.sub(" ", name.replace("_", " ")).split())
         bare = _OF_CHANNELS.sub("", bare).strip()
         bare = re.sub(r"^\([^)]*\)\s*", "", bare)
-        bare = stems.get(name, bare).strip("() ") if is_nominal or name in stems else bare
+        if is_nominal or name in stems:
+            bare = stems.get(name, bare).strip("() ")
         alike = meaning(bare, unit) if bare not in ("", name) else None
         if alike and alike.column == dip:
             alike = alike._replace(column=inclination)
@@ -1309,10 +1314,9 @@ def _tell_references(
             and _is_steady(column, n, unit, values(n), names, values)
         ]
         called = [n for n, m in meanings.items() if m.column == column]
-        computed = all(
+        if len(named) == 1 and all(
             _is_total(column, values(n), meanings[n].unit, names, values) for n in called
-        )
-        if len(named) == 1 and computed:
+        ):
             ((name, unit),) = named
             meanings[name] = Resemblance(column, _unit_beside(name, unit))
 
@@ -1328,17 +1332,27 @@ def _is_steady(
     """Whether a column may be what a place has, called so or of one value throughout."""
     if cells is None or not cells.size or not np.isfinite(cells).all():
         return False
-    ends = _ends_as(name, column) and not _BY_TOOL.search(spelled(name))
+    referred = bool(_REFERRED.search(spelled(name)))
     if column == REFERENCES["dip"].column:
-        return bool(ends or _REFERRED.search(spelled(name))) and may_be(column, name, unit, cells)
-    if column == REFERENCES["field"].column and _REFERRED.search(spelled(name)):
+        return may_be(column, name, unit, cells) and (referred or _is_behind_title(name, column))
+    of_field = column == REFERENCES["field"].column
+    if of_field and referred:
         return may_be(column, name, unit, cells)
     low, high = _range_in(column, _unit_beside(name, unit))
+    if not (low <= cells.min() and cells.max() <= high):
+        return False
     varies = float(np.ptp(cells))
-    called = column == REFERENCES["field"].column and (ends or _OF_FIELD.search(name))
-    steady = varies < _OF_PLACE * high if called else varies == 0
-    inside = low <= cells.min() and cells.max() <= high
-    return bool(steady and inside) and not _is_total(column, cells, "", names, values)
+    steady = varies == 0 or (
+        of_field
+        and varies < _OF_PLACE * high
+        and bool(_OF_FIELD.search(name) or _is_behind_title(name, column))
+    )
+    return steady and not _is_total(column, cells, "", names, values)
+
+
+def _is_behind_title(name: str, column: str) -> bool:
+    """Whether a name ends as that of a column, behind a title that does not speak of a tool."""
+    return _ends_as(name, column) and not _BY_TOOL.search(spelled(name))
 
 
 def _range_in(column: str, unit: str) -> tuple[float, float]:
@@ -1477,7 +1491,7 @@ def _check_lacking(
     if of_tool and column in _ANGLES_AND_WARMTH[:3]:
         *taken, none = candidates_for(column, of_tool, values)
         raise QuestionError(
-            f"{source}: by its name the tool has measured {' and '.join(map(shown, of_tool))}, and no column states "
+            f"{source}: by its name {MEASURED_BY_TOOL} {' and '.join(map(shown, of_tool))}, and no column states "
             f"'{column}'. Does the stand show it after all?",
             [none, *taken],
         )

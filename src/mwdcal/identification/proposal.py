@@ -64,6 +64,7 @@ from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
 from mwdcal.identification.beside import findings_beside, has_roll_test, roll_tests_beside
 from mwdcal.identification.columns import (
+    MEASURED_BY_TOOL,
     answers_of_north,
     in_units,
     is_computed,
@@ -119,6 +120,16 @@ def question_on_cells(table: Table, name: str, row: int, cells: Sequence[str]) -
     )
 
 
+def _question_on_warmth(table: Table, name: str, count: int, cells: Sequence[str]) -> QuestionError:
+    """Ask whether a run of which many stations have no temperature does without; their `cells` say what is there."""
+    out = tuple(("leave_out", f"{name}={cell}") for cell in cells)
+    return QuestionError(
+        f"{table.source}: {shown(name)} is blank or no temperature at {count} of {table.count} stations. Is the run to "
+        "do without temperature?",
+        [none_of(WARMTH), Answer("leave those stations out", out)],
+    )
+
+
 def check_cells(table: Table, columns: Mapping[str, ColumnSource]) -> None:
     """Ask whether rows are left out that have no reading, a number that stands for none, or one that cannot be.
 
@@ -140,29 +151,17 @@ def check_cells(table: Table, columns: Mapping[str, ColumnSource]) -> None:
             wrong |= np.isnan(values)
         if column in RAW:
             wrong |= _far_out(raw, column)
-        if 0 < wrong.sum() <= max(_FEW_ROWS, _FEW_SHARE * wrong.size):
-            rows = np.flatnonzero(wrong).tolist()
-            cells = labels(table, columns[column].name)
-            each = [*dict.fromkeys(cells[row] for row in rows)]
-            questions.append(question_on_cells(table, columns[column].name, rows[0], each))
-        if (
-            column == WARMTH
-            and not wrong.all()
-            and wrong.sum() > max(_FEW_ROWS, _FEW_SHARE * wrong.size)
-        ):
-            cells = labels(table, columns[column].name)
-            each = [*dict.fromkeys(cells[row] for row in np.flatnonzero(wrong).tolist())]
-            name = columns[column].name
-            out = Answer(
-                "leave those stations out", tuple(("leave_out", f"{name}={c}") for c in each)
-            )
-            questions.append(
-                QuestionError(
-                    f"{table.source}: {shown(name)} is blank or no temperature at {wrong.sum()} of {wrong.size} "
-                    "stations. Is the run to do without temperature?",
-                    [none_of(WARMTH), out],
-                )
-            )
+        few = wrong.sum() <= max(_FEW_ROWS, _FEW_SHARE * wrong.size)
+        if not wrong.any() or not (few or (column == WARMTH and not wrong.all())):
+            continue
+        name, rows = columns[column].name, np.flatnonzero(wrong).tolist()
+        cells = labels(table, name)
+        each = [*dict.fromkeys(cells[row] for row in rows)]
+        questions.append(
+            question_on_cells(table, name, rows[0], each)
+            if few
+            else _question_on_warmth(table, name, len(rows), each)
+        )
     if questions:
         raise QuestionsError(table.source, questions)
 
@@ -413,24 +412,23 @@ def propose(
     said = {**place, **(north or {}), "leave_out": leave_out or {}, "keep": keep or {}}
     form = _with(form, {key: value for key, value in said.items() if value not in ({}, None)})
     with_answers = partial(_proposal, path, where, table, form, stated)
+    again = partial(
+        propose, path, sheet=sheet, header_row=header_row, decimal=decimal, answers=answers, stated=stated, north=north
+    )  # fmt: skip
     try:
         return with_answers(names)
     except (QuestionError, QuestionsError) as error:
         if blank := _cells_without_reading(error, leave_out or {}):
-            return propose(
-                path, sheet=sheet, header_row=header_row, decimal=decimal, answers=answers, stated=stated,
-                north=north, leave_out=blank, keep=keep,
-            )  # fmt: skip
-        if kept := _remarked_rows(error, keep or {}):
+            return again(leave_out=blank, keep=keep)
+        if disturbed := _disturbed_rows(error):
             with suppress(InputError, FitError):
-                with_rows = propose(
-                    path, sheet=sheet, header_row=header_row, decimal=decimal, answers=answers, stated=stated,
-                    north=north, leave_out=leave_out, keep=kept,
-                )  # fmt: skip
-                if with_rows.all_fit:
-                    return with_rows._replace(remarks=(*with_rows.remarks, _said_of_kept(error)))
-        if proposal := _answer_by_readings(error, with_answers, names, table):
-            return proposal
+                proposal = again(leave_out=leave_out, keep=_with_rows(keep or {}, disturbed))
+                if proposal.all_fit:
+                    return proposal._replace(
+                        remarks=(*proposal.remarks, _sentence_on_kept(disturbed))
+                    )
+        if by_readings := _answer_by_readings(error, with_answers, names, table):
+            return by_readings
         raise
 
 
@@ -438,35 +436,31 @@ def _questions_of(error: QuestionError | QuestionsError) -> Sequence[QuestionErr
     return error.questions if isinstance(error, QuestionsError) else (error,)
 
 
-def _remarked_rows(
-    error: QuestionError | QuestionsError, keep: Mapping[str, Sequence[str]]
-) -> dict[str, list[str]]:
-    """Rows to keep besides, by column, with a remark that may speak of something else; empty where none has."""
-    every = {name: [*cells] for name, cells in keep.items()}
-    for option, text in _arguments(error):
-        name, _, cell = text.partition("=")
-        if option == "keep" and is_disturbance(cell):
-            every.setdefault(name, []).append(cell)
-    return {} if every == {**keep} else every
-
-
-def _arguments(error: QuestionError | QuestionsError) -> Iterator[tuple[str, str]]:
-    """The arguments of all answers to open questions."""
-    answers = (answer for each in _questions_of(error) for answer in each.answers)
-    return (argument for answer in answers for argument in answer.arguments)
-
-
-def _said_of_kept(error: QuestionError | QuestionsError) -> str:
-    """The sentence on rows with remarks whose readings fit those of the others."""
-    said = next(text for option, text in _arguments(error) if option == "keep")
-    rows = [
-        each.text.partition(": ")[2].partition(". Is that")[0]
+def _disturbed_rows(error: QuestionError | QuestionsError) -> dict[str, str]:
+    """What questions say of rows with a remark on a disturbance, by COLUMN=TEXT."""
+    return {
+        text: each.text.partition(": ")[2].partition(". Is that")[0]
         for each in _questions_of(error)
-        if any(argument == ("keep", said) for a in each.answers for argument in a.arguments)
-    ]
+        for answer in each.answers
+        for option, text in answer.arguments
+        if option == "keep" and is_disturbance(text.partition("=")[2])
+    }
+
+
+def _with_rows(rows: Mapping[str, Sequence[str]], texts: Iterable[str]) -> dict[str, list[str]]:
+    """Rows to keep, or to leave out, by the texts of a column, and those of COLUMN=TEXT besides."""
+    every = {name: [*cells] for name, cells in rows.items()}
+    for text in texts:
+        name, _, cell = text.partition("=")
+        every.setdefault(name, []).append(cell)
+    return every
+
+
+def _sentence_on_kept(disturbed: Mapping[str, str]) -> str:
+    """The sentence on rows with remarks whose readings fit those of the others."""
     return (
-        f"used, as the readings fit those of the others: {'; '.join(rows)}. If it is to be left out, say so by "
-        f"`leave_out` {said!r}."
+        f"used, as the readings fit those of the others: {'; '.join(disturbed.values())}. If it is to be left out, say "
+        f"so by `leave_out` {', '.join(map(repr, disturbed))}."
     )
 
 
@@ -474,17 +468,17 @@ def _cells_without_reading(
     error: QuestionError | QuestionsError, leave_out: Mapping[str, Sequence[str]]
 ) -> dict[str, list[str]]:
     """Rows to leave out besides, by column, for cells that are blank or say that there is no reading."""
-    every = {name: [*cells] for name, cells in leave_out.items()}
     only = (each.answers[0].arguments for each in _questions_of(error) if len(each.answers) == 1)
+    out = list[str]()
     for arguments in only:
-        pairs = [text.partition("=") for option, text in arguments if option == "leave_out"]
-        if len(pairs) == len(arguments) and all(
+        texts = [text for option, text in arguments if option == "leave_out"]
+        cells = [text.partition("=")[2] for text in texts]
+        if len(texts) == len(arguments) and all(
             WITHOUT_VALUE.fullmatch(cell) or (cell[:1] != "#" and NO_READING.fullmatch(cell))
-            for *_, cell in pairs
+            for cell in cells
         ):
-            for name, _, cell in pairs:
-                every.setdefault(name, []).append(cell)
-    return {} if every == {**leave_out} else every
+            out += texts
+    return _with_rows(leave_out, out) if out else {}
 
 
 _OF_THE_PLACE = tuple(REFERENCES[name].column for name in STATED_REFERENCES)
@@ -801,7 +795,7 @@ def _is_of_readings(answer: Answer, question: QuestionError) -> bool:
 
     Angles that the tool itself may have measured fit its readings whatever the stand shows.
     """
-    if "the tool has measured" in question.text:
+    if MEASURED_BY_TOOL in question.text:
         return False
     pairs = [text.partition("=") for argument, text in answer.arguments if argument == "column"]
     return len(pairs) == len(answer.arguments) and all(
