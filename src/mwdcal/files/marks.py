@@ -35,13 +35,15 @@ _SUPERSEDED = re.compile(
     r"замен[еи]н[оаы]?) (by|with|durch|av|por|pel[oa]|par|на)\D{0,15}\d{1,3}\W*)"
 )
 """A cell that names the row instead of its own: superseded by line 12."""
-_DISTURBANCES = re.compile(
-    r"moved|bumped|disturbed|slipped|knocked|bewegt|verrutscht|gestossen|flyttet|movi(o|do)|mexeu|bouge|сдвин\w*|"
-    r"толкн\w*|vibrat\w*"
+_DISTURBED = re.compile(
+    r"(?<![^\W\d_])(moved|bumped|disturbed|slipped|knocked|bewegt|verrutscht|gestossen|flyttet|movi(o|do)|mexeu|bouge|"
+    r"сдвин\w*|толкн\w*|vibrat\w*)(?![^\W\d_])|移动|碰到"
 )
+"""Words of a disturbance."""
 _MAY_REJECT = re.compile(
-    rf"(?<![^\W\d_])({OF_REFUSAL}|{NOT_TO_USE}|fail(ed)?|error|ng|gestort|unstable|instabil|vibrat\w*|outlier|suspect|questionable|doubtful|ausreißer|ausreisser|fehler|avvik|"
-    rf"{_DISTURBANCES.pattern}|nicht bestanden|falha|fallo|выброс|сбой)(?![^\W\d_])|异常|可疑|移动|碰到"
+    rf"{_DISTURBED.pattern}|(?<![^\W\d_])({OF_REFUSAL}|{NOT_TO_USE}|fail(ed)?|error|ng|gestort|unstable|instabil|"
+    r"outlier|suspect|questionable|doubtful|ausreißer|ausreisser|fehler|avvik|nicht bestanden|falha|fallo|выброс|сбой)"
+    r"(?![^\W\d_])|异常|可疑"
 )
 """A cell that may reject its row, or speak of another one."""
 _MEASURED_AGAIN = re.compile(
@@ -153,8 +155,8 @@ def is_disturbance(text: str) -> bool:
     (False, True)
     """
     plain = _plain(text)
-    disturbed = re.search(rf"(?<![^\W\d_])({_DISTURBANCES.pattern})(?![^\W\d_])|移动|碰到", plain)
-    return bool(disturbed) and not _REFUSED.search(plain) and not _MEASURED_AGAIN.search(plain)
+    others = _REFUSED.search(plain) or _MEASURED_AGAIN.search(plain)
+    return bool(_DISTURBED.search(plain)) and not others
 
 
 def _verdicts(name: str, cells: Sequence[str]) -> dict[str, bool]:
@@ -200,22 +202,16 @@ def by_legend(
     """
     leave_out, keep = ({n: [*c] for n, c in each.items()} for each in (form.leave_out, form.keep))
     doubtful = marks_in(table, form, used).doubtful if lines else {}
-    coded = (
-        [n for n in table.columns if n not in used and _holds_words(table.columns[n])]
-        if lines
-        else []
-    )
-    for name in dict.fromkeys([*(name for name, _ in doubtful), *coded]):
-        codes = {*labels(table, name)} - {""}
+    coded = [n for n in table.columns if n not in used and _holds_words(table.columns[n])]
+    for name in dict.fromkeys([*(name for name, _ in doubtful), *(coded if lines else ())]):
+        cells = labels(table, name)
+        codes = {*cells} - {""}
         meanings = {c: _meaning(c, lines) for c in codes if len(codes) <= _MOST_VALUES}
         out = [
             c
             for c, m in meanings.items()
             if (_REJECTED.fullmatch(m) or _does_not_count(m))
-            or (
-                is_check(_REMARK_BEHIND.sub("", m))
-                and 2 * labels(table, name).count(c) < table.count
-            )
+            or (is_check(_REMARK_BEHIND.sub("", m)) and 2 * cells.count(c) < table.count)
         ]
         if out:
             leave_out.setdefault(name, []).extend(sorted(out))

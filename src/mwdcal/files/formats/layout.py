@@ -957,8 +957,8 @@ def _begins_anew(rows: Sequence[tuple[int, Cells]], heads: Sequence[int], place:
     ]
     if any(ADJUSTED.search(text) or _OF_ROLL_TEST.search(text) for text in between[1:]):
         return True
-    first = " ".join(_text(row) for _, row in rows[max(0, heads[-1] - 1) : heads[-1]])
-    if _triads_in(first) and _triads_in(" ".join(between[1:])) - _triads_in(first):
+    first = _triads_in(" ".join(_text(row) for _, row in rows[max(0, heads[-1] - 1) : heads[-1]]))
+    if first and _triads_in(" ".join(between[1:])) - first:
         return True
     ours, theirs = (
         {tool for _, row in part if not _is_reading(row) and (tool := tool_in(row))}

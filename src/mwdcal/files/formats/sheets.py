@@ -85,17 +85,14 @@ def _delimited(lines: Sequence[str], source: str) -> tuple[str, list[tuple[int, 
     looked_at = lines[:_LOOKED_AT]
     drawn = (*DELIMITERS, _FRAME)
     marks = (*drawn, _RUNS, _BLANKS)
-    counts = {mark: _numbers(_split(looked_at, mark, source)) for mark in marks}
+    first = {mark: _split(looked_at, mark, source) for mark in marks}
+    counts = {mark: _numbers(rows) for mark, rows in first.items()}
     best = max(drawn, key=lambda mark: counts[mark])
     if 2 * counts[best] < max(counts.values()):  # blanks may stand within cells
         best = max(marks, key=lambda mark: counts[mark])
+    if best == _RUNS and _is_named(first[_BLANKS]) and not _is_named(first[_RUNS]):
+        best = _BLANKS
     cells = _split(lines, best, source)
-    if (
-        best == _RUNS
-        and _is_named(single := _split(lines, _BLANKS, source))
-        and not _is_named(cells)
-    ):
-        best, cells = _BLANKS, single
     if best in (_BLANKS, _RUNS):
         cells = _in_columns(lines, _without_marks(cells))
     return best, [(line, _trimmed(row)) for line, row in enumerate(cells, 1) if any(row)]

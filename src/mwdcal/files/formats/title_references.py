@@ -224,9 +224,10 @@ _IN_OTHER_UNIT = re.compile(
     rf"=)\s*(?P<again>{_WRITTEN_NUMBER})\s*(?P<other>{_WRITTEN_UNIT})(?:[^()\[\]\d;]*[)\]]|(?![^\W\d_]))"
 )
 """A value, and in brackets the same in another unit."""
+_FOR_EACH = r"\s*(?:/|per|pro|par|por|na|на|每)\s*"
 _RATIO = (
-    rf"(?:{_COUNTED}\.?\s*(?:/|per|pro|par|por|na|на|每)\s*(?:{_WRITTEN_UNIT})|"
-    rf"(?:{_WRITTEN_UNIT})\s*(?:/|per|pro|par|por|na|на|每)\s*{_COUNTED}(?![^\W\d_]))"
+    rf"(?:{_COUNTED}\.?{_FOR_EACH}(?:{_WRITTEN_UNIT})|"
+    rf"(?:{_WRITTEN_UNIT}){_FOR_EACH}{_COUNTED}(?![^\W\d_]))"
 )
 _OF_SENSITIVITY = re.compile(
     rf"(?:(?:{_ROUGH.pattern})\W*)?(?:{_WRITTEN_NUMBER})\s*[(\[]?\s*{_RATIO}|{_RATIO}\W*(?:{_WRITTEN_NUMBER})?"
@@ -401,14 +402,9 @@ def _of_the_stand(column: str, values: dict[float, None], rows: Rows) -> dict[fl
     others = {*re.findall(_LONG_WORD, " ".join([*first, *places]))}
     named = {line: {word for word in others if word in line} for line in stating}
     shared = set[str].intersection(*named.values()) if named else set()
-    of_field = column == _OF_PLACES[1].column
+    of_dip = [_CALLED_DIP] if column == _OF_PLACES[1].column else []
     for marked in (
-        [
-            line
-            for line in stating
-            if of_field and re.search(r"\bdip\b|magn|fel[dt]|campo|磁", line)
-        ],
-        [line for line in stating if _OF_HERE.search(line)],
+        *([line for line in stating if words.search(line)] for words in (*of_dip, _OF_HERE)),
         [line for line, each in named.items() if each - shared],
     ):
         here = {v: None for line in marked for v in stating[line] if v in values}
@@ -417,6 +413,8 @@ def _of_the_stand(column: str, values: dict[float, None], rows: Rows) -> dict[fl
     return values
 
 
+_CALLED_DIP = re.compile(r"\bdip\b|magn|fel[dt]|campo|磁")
+"""Words of a dip, beside an inclination that may be the stand's."""
 _LONG_WORD = rf"{_CHINESE}{{2,}}|(?:(?!{_CHINESE})[^\W\d_]){{4,}}"
 _OF_SITE = re.compile(
     r"(?<![^\W\d_])(site|place|location|calibrated (at|in)|ort|pruf ?ort|messort|standort|sted|lugar|local|"
@@ -742,13 +740,7 @@ def _clauses(row: Sequence[object]) -> str:
     """The cells of a row in small letters, a semicolon behind each that ends a statement: a number with its unit."""
     text, ends = "", False
     each = (_IN_SIXTIETHS.sub(_with_signs, _SENTENCE.sub("; ", as_text(cell))) for cell in row)
-    days = (
-        _TOKEN_OF_LETTERS_AND_DIGITS.sub(
-            " ", _YEAR.sub(" ", _DAY_OR_MODEL.sub(" ", _plain(text)))
-        ).strip()
-        for text in each
-    )
-    cells = [*filter(None, days)]
+    cells = [*filter(None, (_without_names(_plain(text)).strip() for text in each))]
     if len(cells) == 2 and re.fullmatch(r"[fbi]", cells[0]):
         cells.insert(1, "=")
     for cell in cells:
@@ -763,6 +755,13 @@ def _clauses(row: Sequence[object]) -> str:
     text = _IN_OTHER_UNIT.sub(_said_once, _OF_A_UNIT.sub("", _OF_SENSITIVITY.sub(" ", text)))
     text = _WITH_SPREAD.sub(r"\1 \4 \2 \3 \4", text)
     return _RANGE.sub("range ", _UNCERTAIN.sub(r"\g<value> ", text)).strip()
+
+
+def _without_names(text: str) -> str:
+    """A text without numbers that are part of a name: of days, years, models, tools and forms."""
+    for pattern in (_DAY_OR_MODEL, _YEAR, _TOKEN_OF_LETTERS_AND_DIGITS):
+        text = pattern.sub(" ", text)
+    return text
 
 
 _SENTENCE = re.compile(
