@@ -47,7 +47,7 @@ from mwdcal.sensor.profile import ColumnSource
 # Answers to what a table leaves open: columns, units and triads that may be meant, what is believed first.
 
 MEASURED_BY_TOOL = "the tool has measured"
-"""What a question says of angles that fit the readings whatever the stand shows."""
+"""In questions on angles that fit the readings whatever the stand shows."""
 BOTH_UNITS = " and "
 """What stands between two units of one column, of which one is wrong."""
 IN_BRACKETS = re.compile(r"[(\[]([^)\]]*)[)\]]\s*$")
@@ -64,6 +64,7 @@ RANGES_BY_UNIT: dict[str, tuple[tuple[str, float, float], ...]] = {
 LEAST_ROLLS = 5
 """Toolfaces from which on their range decides the unit."""
 _FILLER = re.compile(r"-?9{3,}(\.9+|\.25)?")
+_LEAST_FILLER = 999.0
 _REGULAR = 0.8
 """Share of equal steps of numbered rows."""
 _FEW = 4
@@ -118,7 +119,9 @@ def is_filler(values: Array) -> Bools:
     >>> is_filler(np.array([9999.99, -999.25, 99.0, 1000.0])).tolist()
     [True, True, False, False]
     """
-    return np.asarray([_FILLER.fullmatch(f"{value:.12g}") is not None for value in values], bool)
+    fills = np.abs(values) >= _LEAST_FILLER
+    fills[fills] = [_FILLER.fullmatch(f"{value:.12g}") is not None for value in values[fills]]
+    return np.asarray(fills)
 
 
 def is_of_tool(name: str) -> bool:

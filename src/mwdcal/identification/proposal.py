@@ -145,7 +145,9 @@ def check_cells(table: Table, columns: Mapping[str, ColumnSource]) -> None:
         factor, offset = (
             FACTORS.get(columns[column].unit, (1.0, 0.0)) if units_of(column) else (1.0, 0.0)
         )
-        filler = is_filler(values) & (_is_unlike_others(values) | _is_off_norm(raw, column))
+        filler = is_filler(values)
+        if filler.any():
+            filler &= _is_unlike_others(values) | _is_off_norm(raw, column)
         wrong = filler | RANGES[column].outside(values * factor + offset)
         if column in (*RAW, WARMTH) and not np.isnan(values).all():
             wrong |= np.isnan(values)

@@ -115,14 +115,13 @@ def as_they_stand(cells: Sequence[object]) -> list[str]:
     return [cell.strip() if isinstance(cell, str) else as_text(cell) for cell in cells]
 
 
-def column(cells: Sequence[object], sign: str) -> tuple[list[str], str]:
+def column(cells: Sequence[object], texts: Sequence[str], sign: str) -> tuple[list[str], str]:
     """The cells as text whose numbers have a decimal point, and the unit that stands behind all of them.
 
-    A column of which any cell is no number stays as it is, except where numbers stand in it.
+    A column of which any cell is no number stays as its `texts` are, except where numbers stand in it.
     """
-    texts = as_they_stand(cells)
     if not any(isinstance(cell, str) and cell for cell in cells):
-        return texts, ""
+        return [*texts], ""
     filled = [_SPACES.sub("", text) for text in texts if text]
     if filled and all(map(_DEGREES.fullmatch, filled)):
         return [_degrees(text, sign) for text in texts], "°"

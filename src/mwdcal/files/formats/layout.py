@@ -832,8 +832,9 @@ def _is_ruler(row: Cells) -> bool:
     """
     if all(isinstance(cell, str) and re.fullmatch(r"[-=_*+|\s]*", cell) for cell in row):
         return True
-    filled = [as_text(cell).strip("()[] ") for cell in row if cell != ""]
-    return len(filled) > 2 * len("xyz") and filled == [str(k + 1) for k in range(len(filled))]
+    filled = [cell for cell in row if cell != ""]
+    numbered = (as_text(cell).strip("()[] ") == str(k) for k, cell in enumerate(filled, 1))
+    return len(filled) > 2 * len("xyz") and all(numbered)
 
 
 _NUMBER_OF_COLUMN = re.compile(r"(?<![\w.,])(\d{1,2})(?:\s*[-–]\s*(\d{1,2}))?[\s:=.)]+(?=[^\W\d_])")
@@ -1427,7 +1428,7 @@ def _read(
     (['Inc (°)', 'Time'], [(['30.26'], '°'), (['08:15'], '')])
     """
     whole = [*names]
-    read = [*map(figures.column, columns, figures.signs_of(columns, sign))]
+    read = [*map(figures.column, columns, texts, figures.signs_of(columns, sign))]
     for place, (name, cells) in enumerate(zip(names, texts, strict=True)):
         bare = _BRACKETS.sub("", name).strip()
         if (bare.lower() == "az" or angles_among([bare])) and _are_sexagesimal(cells):
