@@ -59,6 +59,11 @@ def numbers(path, column):
         ("Giro (toolface) graus", "ref_toolface_deg", "°"),
         ("Azimute (mag) graus", "ref_azimuth_deg", "°"),
         ("Inclinação (dev) graus", "ref_inclination_deg", "°"),
+        ("maz_deg", "ref_azimuth_deg", "°"),
+        ("maz/deg", "ref_azimuth_deg", "°"),
+        ("Orient. cara alta", "ref_toolface_deg", ""),
+        ("GX axial (g)", "ax", "g"),
+        ("HX axial (nT)", "mx", "nT"),
     ],
 )
 def test_stands_and_channels_in_other_words(name, column, unit):

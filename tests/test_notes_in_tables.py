@@ -2,10 +2,13 @@
 
 import math
 
+import numpy as np
 import openpyxl
 import pytest
 
 import mwdcal
+from mwdcal.files.formats import table as tables
+from mwdcal.files.formats.figures import is_figure
 from mwdcal.files.formats.title_references import stated_above
 from test_arrangements import CHANNELS, NAMES, lines_of, written
 from test_headers import same, stations, taken
@@ -55,13 +58,23 @@ def in_motion(tmp_path, *legend):
     return written(tmp_path / "run.csv", [*legend, "", *lines]), rows
 
 
-def test_a_legend_says_which_rows_do_not_count(tmp_path):
-    path, rows = in_motion(tmp_path, "S = stable", "State M = stand moving, not for calibration")
+@pytest.mark.parametrize(
+    "legend",
+    [
+        ["S = stable", "State M = stand moving, not for calibration"],
+        ["M = bad, S = good"],
+        ["State: S = good, M = stand moving (reject), D = duplicate line of a retry"],
+        ["State: S = good, M = duplicate line of a retry"],
+    ],
+)
+def test_a_legend_says_which_rows_do_not_count(tmp_path, legend):
+    path, rows = in_motion(tmp_path, *legend)
     assert same(taken(path), rows)
 
 
 @pytest.mark.parametrize(
-    "legend", ["State M = perhaps not for calibration", "M = manual", "M = bad, S = good"]
+    "legend",
+    ["State M = perhaps not for calibration", "M = manual", "M = repeat of rejected, S = good"],
 )
 def test_another_legend_leaves_the_question(tmp_path, legend):
     path, _ = in_motion(tmp_path, legend)
@@ -210,3 +223,58 @@ def test_tools_by_number_one_below_the_other_are_asked_about(tmp_path):
     on = [[2301 + (k > len(rows)), k, *row[2:]] for k, row in enumerate(tools, 1)]
     path = written(tmp_path / "on.csv", lines_of(on[: len(rows)], ["Sonda", "Station", *NAMES]))
     assert taken(path).count == len(rows)
+
+
+@pytest.mark.parametrize("mark", ["NODATA", "keine Daten", "sin datos", "нет данных"])
+def test_a_row_without_data_is_left_out(tmp_path, mark):
+    rows = stations()
+    empty = [*rows[0][:3], *[-999.25] * 7]
+    lines = noted([empty, *rows], "status", [mark, *["OK"] * len(rows)])
+    assert same(taken(written(tmp_path / "run.csv", lines)), rows)
+
+
+def test_one_question_on_a_number_that_stands_for_none_in_many_columns(tmp_path):
+    rows = stations()
+    lines = lines_of([[*rows[0][:3], *[-9999] * 6, rows[0][9]], *rows], NAMES)
+    path = written(tmp_path / "run.csv", lines)
+    with pytest.raises(mwdcal.FitError, match="left out") as caught:
+        mwdcal.propose_profile(path)
+    ((answer,),) = [question.answers for question in caught.value.questions]
+    assert len(answer.arguments) == 6
+    leave_out = {name: [cell] for each in answer.arguments for name, cell in [each[1].split("=")]}
+    assert same(taken(path, leave_out=leave_out), rows)
+
+
+@pytest.mark.parametrize(
+    ("line", "kelvin"),
+    [
+        ("温度为K", True),
+        ("All temperatures in K", True),
+        ("temperatures in kelvin", True),
+        ("", False),
+    ],
+)
+def test_a_line_says_that_temperatures_are_in_kelvin(tmp_path, line, kelvin):
+    rows = stations()
+    names = [*NAMES[:-1], "温度"]
+    lines = lines_of([[*row[:9], row[9] + 273.15] for row in rows], names)
+    path = written(tmp_path / "run.csv", [line, "", *lines])
+    if kelvin:
+        assert same(taken(path), rows)
+    else:
+        with pytest.raises(mwdcal.FitError, match="°F or K"):
+            mwdcal.propose_profile(path)
+
+
+def test_a_number_with_a_unit_in_cyrillic_letters_is_no_name():
+    assert is_figure("53500 нТл")
+    assert not is_figure("Поле 53500")
+
+
+def test_a_constant_inclination_of_the_reference_is_the_dip(tmp_path):
+    rows = stations()
+    lines = [",".join([*NAMES, "Fref/nT", "Iref/deg"])]
+    lines += [",".join(map(str, [*row, 50000, 63.0])) for row in rows]
+    run = taken(written(tmp_path / "run.csv", lines))
+    assert np.all(tables.numbers(run, "ref_dip_deg") == 63.0)
+    assert same(run, rows)

@@ -30,6 +30,10 @@ _REJECTED = re.compile(rf"\W*({OF_REFUSAL})\W*|\W*({OF_REFUSAL})\s*[-–—:;,.(
 """A cell that rejects its row, whatever reason follows."""
 _DOES_NOT_COUNT = re.compile(rf"(\D*[,;:–(/-]\s*)?({NOT_TO_USE})\W*")
 """A cell that says so, behind a reason without the number of another row: warm-up, not used."""
+_REJECTS_BEHIND = re.compile(
+    rf"(\D*[,;:–(/-]\s*)({OF_REFUSAL})\W*|(duplicate|duplikat|duplicad[oa]|doublon|дубл\w*|重复).*"
+)
+"""A meaning in a legend that does so behind a reason, or is that of a copy."""
 _SUPERSEDED = re.compile(
     r"\W*(superseded.*|(replaced|ersetzt|erstattet|reemplazad[oa]|sustituid[oa]|substituid[oa]|remplacee?|"
     r"замен[еи]н[оаы]?) (by|with|durch|av|por|pel[oa]|par|на)\D{0,15}\d{1,3}\W*)"
@@ -78,6 +82,8 @@ _OF_STATUS = re.compile(
 """Names of columns whose values judge rows, one by one."""
 _AFFIRMED = {"y", "yes", "true", "1", "x", "ja", "j", "si", "s", "sim", "oui", "o", "да", "д", "是"}
 _DENIED = {"n", "no", "false", "0", "nein", "nei", "nao", "non", "нет", "н", "否"}
+_ENTRIES = re.compile(r"[,;|]\s*(?=\w{1,6}\s*=)")
+"""What stands between the entries of a legend."""
 MARKS_NAMED = 8
 """Rows that a sentence names."""
 _MARK_NUMBERS = frozenset("0123456789+-−eE.,:;/ ")
@@ -210,7 +216,7 @@ def by_legend(
         out = [
             c
             for c, m in meanings.items()
-            if (_REJECTED.fullmatch(m) or _does_not_count(m))
+            if (_REJECTED.fullmatch(m) or _REJECTS_BEHIND.fullmatch(m) or _does_not_count(m))
             or (is_check(_REMARK_BEHIND.sub("", m)) and 2 * cells.count(c) < table.count)
         ]
         if out:
@@ -227,10 +233,11 @@ def _meaning(cell: str, lines: Collection[str]) -> str:
     """The meaning of a cell by a legend in one of some lines, in small letters; empty where none or several have it.
 
     >>> _meaning("M", ["S = stable", "State M = moving, not used"]), _meaning("M", ["M = a, S = b"])
-    ('moving, not used', '')
+    ('moving, not used', 'a')
     """
     mark = re.compile(rf"(?<!\w){re.escape(cell)}\s*[=:]\s*([^;|=:]*)(?![^;|]*[=:])")
-    meanings = [_plain(m[1]) for m in map(mark.search, lines) if m]
+    entries = [entry for line in lines for entry in _ENTRIES.split(line)]
+    meanings = [_plain(m[1]) for m in map(mark.search, entries) if m]
     return meanings[0] if len(meanings) == 1 else ""
 
 

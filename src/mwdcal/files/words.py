@@ -59,6 +59,7 @@ TRANSLATIONS = (
         "ref ",
     ),
     (r"grav(?=axial|tran)", "acc "),
+    (r"(?<=\b[abghm][xyz])[ _]+(axial|trans\w*|quer|tverr|trv)\b\.?", ""),
     (r"axiale?|aksial|longitudinal\w*|langsachse|осев\w*|轴向", "Z "),
     (rf"{_CROSSWISE}1", "X "),
     (rf"{_CROSSWISE}2", "Y "),
@@ -98,7 +99,7 @@ TRANSLATIONS = (
     (_FROM_VERTICAL, ""),
     (r"(?<=inclination) *\((dev(iation)?|desv(io)?)\.?\)", ""),
     (
-        r"azimutwinkel|\bkurs\b|\bdire(ccion|cao|ction)\b|\brumo\b|\bcap\b|\bаз(им)?\b\.?|направление|"
+        r"azimutwinkel|\bmaz(?![^\W\d_])|\bkurs\b|\bdire(ccion|cao|ction)\b|\brumo\b|\bcap\b|\bаз(им)?\b\.?|направление|"
         r"курс|方向角?|磁北からの角度?|"
         r"atsimuutti|suuntakulma|방위각?|\bhazi\b|drehtisch|turn ?table|rotary table|baring|azymut|yonelim|азимут|"
         r"asimut|\basim?\b\.?|azym\b\.?|azimute?(?!h)|acimut|方位角?|"
@@ -108,6 +109,7 @@ TRANSLATIONS = (
     (
         r"\bg?tf[oa]\b|tool ?face orientation|relative bearing|\brot\.? angle|toolface[- ]winkel|hochseite(nwinkel)?|"
         r"hoyside(vinkel)?|cara (herr(amienta|\b\.?)|hta\b\.?)|rolido|"
+        r"(orient\w*\.? (de )?(la )?)?cara alta|"
         r"alabeo|lado alto|face ferramenta|rolagem|rolamento|rotacao|"
         r"roulis|rotation propre|orientation (de l')?outil|апсид\w*( угол)?|виз\b\.?( угол)?|(угол )?крена?\b|"
         r"(重力)?高边(工具面)?角?|[滚自旋]转角?|横滚角?|面向角|"

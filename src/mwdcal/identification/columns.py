@@ -359,7 +359,7 @@ _LABELS = {
 """Names of columns of labels; a column is one only where no other is."""
 _CALLED_REFERENCE = re.compile(r"\b(ref|reference|nominal|target|set)\b", re.IGNORECASE)
 _REFERRED = re.compile(
-    r"\b(ref|reference|referenz|referanse|referencia|obs|observatory|эт|эталон\w*|опорн\w*)\b|基准|参考|\bref(?=[a-z]\b)",
+    r"\b(ref|iref|reference|referenz|referanse|referencia|obs|observatory|эт|эталон\w*|опорн\w*)\b|基准|参考|\bref(?=[a-z]\b)",
     re.IGNORECASE,
 )
 _OF_RESIDUALS = re.compile(
@@ -501,11 +501,16 @@ _SPOKEN = {
 }
 """Units of angles in a line above a table, not those of a number."""
 _SPOKEN_WARMTH = {
-    f"°{letter}": re.compile(
-        rf"(?<![\d.,])(?<![\d.,] )(°\s*{letter}|\bdeg(rees)? ?{letter}|\b(in|en|em|i|в) {letter}|{word})(?![^\W\d_])",
+    unit: re.compile(
+        rf"(?<![\d.,])(?<![\d.,] )(°\s*{letter}|\bdeg(rees)? ?{letter}|(\b(in|en|em|i|в) |为\s?){letter}|"
+        rf"{word})(?![^\W\d_])",
         re.IGNORECASE,
     )
-    for letter, word in (("C", "celsius"), ("F", "fahrenheit"))
+    for unit, letter, word in (
+        ("°C", "C", "celsius"),
+        ("°F", "F", "fahrenheit"),
+        ("K", "K", "kelvins?"),
+    )
 }
 """Units of temperatures in a line above a table, not those of a number."""
 _SURROUNDINGS = re.compile(
@@ -1371,10 +1376,11 @@ def _range_in(column: str, unit: str) -> tuple[float, float]:
 
 
 def _unit_beside(name: str, unit: str) -> str:
-    """The unit that is stated beside a name or ends it, behind a blank or in brackets, or tesla within it."""
+    """The unit that is stated beside a name or ends it, in brackets, behind a blank or a slash, or tesla within it."""
     plain = spelled(name)
     bracketed = IN_BRACKETS.search(plain)
-    ends = unit_of(spelled(unit)) or unit_of(bracketed[1] if bracketed else plain.split(" ")[-1])
+    behind = bracketed[1] if bracketed else plain.split(" ")[-1]
+    ends = unit_of(spelled(unit)) or unit_of(behind) or unit_of(behind.partition("/")[2])
     within = re.search(r"(?<![^\W_])([nµu]T|[Gg]auss)(?![^\W_])", plain)
     return ends or (unit_of(within[0]) if within else "")
 

@@ -110,13 +110,15 @@ def question_on_mark(table: Table, name: str, cell: str, rows: Sequence[int]) ->
     )
 
 
-def question_on_cells(table: Table, name: str, row: int, cells: Sequence[str]) -> QuestionError:
-    """Ask whether the rows with some cells that are no numbers are left out; `row` is the first of them."""
+def question_on_cells(table: Table, rows: Mapping[str, int], cells: Sequence[str]) -> QuestionError:
+    """Ask whether rows with some cells that are no readings are left out; the first row of them in each column."""
+    (name, row), *others = rows.items()
     got = shown(cells[0]) if cells[0] else "a blank cell"
-    problem = f"expected a reading; got {got}. Is its row to be left out?"
+    also = f", and in {listed([shown(n) for n, _ in others], len(RAW))}" if others else ""
+    problem = f"expected a reading; got {got}{also}. Are such rows to be left out?"
+    out = tuple(("leave_out", f"{name}={cell}") for name in rows for cell in cells)
     return QuestionError(
-        str(cell_error(table, name, row, problem)),
-        [Answer("leave such rows out", tuple(("leave_out", f"{name}={cell}") for cell in cells))],
+        str(cell_error(table, name, row, problem)), [Answer("leave such rows out", out)]
     )
 
 
@@ -140,7 +142,8 @@ def check_cells(table: Table, columns: Mapping[str, ColumnSource]) -> None:
         for column, source in columns.items()
         if column in RANGES
     }
-    questions = []
+    questions = list[QuestionError]()
+    alike: dict[tuple[str, ...], dict[str, int]] = {}
     for column, values in raw.items():
         factor, offset = (
             FACTORS.get(columns[column].unit, (1.0, 0.0)) if units_of(column) else (1.0, 0.0)
@@ -159,11 +162,11 @@ def check_cells(table: Table, columns: Mapping[str, ColumnSource]) -> None:
         name, rows = columns[column].name, np.flatnonzero(wrong).tolist()
         cells = labels(table, name)
         each = [*dict.fromkeys(cells[row] for row in rows)]
-        questions.append(
-            question_on_cells(table, name, rows[0], each)
-            if few
-            else _question_on_warmth(table, name, len(rows), each)
-        )
+        if few:
+            alike.setdefault(tuple(each), {})[name] = rows[0]
+        else:
+            questions.append(_question_on_warmth(table, name, len(rows), each))
+    questions += [question_on_cells(table, first, cells) for cells, first in alike.items()]
     if questions:
         raise QuestionsError(table.source, questions)
 
@@ -947,7 +950,7 @@ def _numbers_of(table: Table, problems: dict[str, QuestionError], name: str) -> 
             cell for cell in dict.fromkeys(cells) if cell and not looks_numeric(cell, table.decimal)
         ]
         if wrong and 2 * sum(map(is_figure, cells)) > table.count:
-            problems[name] = question_on_cells(table, name, cells.index(wrong[0]), wrong)
+            problems[name] = question_on_cells(table, {name: cells.index(wrong[0])}, wrong)
         elif wrong and 2 * sum(any(map(str.isdecimal, cell)) for cell in cells) > table.count:
             called = meaning(name)
             if called and called.column in _OF_READINGS:

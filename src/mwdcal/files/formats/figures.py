@@ -13,7 +13,7 @@ from mwdcal.files.synonyms import unit_of
 _SPACES = re.compile(r"(?<=\d)[ '’\u00a0\u202f\u2009](?=\d{3}(\D|$))")
 """What separates thousands and is never a decimal sign."""
 _WRITTEN = r"[+\-−]?(?:\d+(?:[.,]\d+)*[.,]?|[.,]\d+)(?:[eE][+\-−]?\d+)?"
-_FIGURE = re.compile(rf"({_WRITTEN})\s*([°º%]?\s?[A-Za-zµμ²/°º]{{0,6}})")
+_FIGURE = re.compile(rf"({_WRITTEN})\s*([°º%]?\s?[A-Za-zа-яА-Яµμ²/°º]{{0,6}})")
 _BARE_FIGURE = re.compile(_WRITTEN)
 _DEGREES = re.compile(
     r"([+\-−]?)(\d+)\s*[°º度]\s*(\d+(?:[.,]\d+)?)\s*['′’分]\s*(?:(\d+(?:[.,]\d+)?)\s*(?:[\"″”秒]|''))?"

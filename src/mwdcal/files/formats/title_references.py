@@ -102,7 +102,7 @@ _MINUTES = (
 )
 _ROUGH = re.compile(
     r"nomin\w*|approx\w*|about|[cz]irka|circa|\bca\b|\bcca\b|≈|~|\bnenn|ungefahr|\betwa\b|\brund\b|omtrent|omkring|"
-    r"aprox\w*|alrededor|\bcerca\b|environ|пример\w*|приблиз\w*|ориентир\w*|около|okolo|номин\w*|约|左右|标称",
+    r"aprox\w*|alrededor|\bcerca\b|environ\b|пример\w*|приблиз\w*|ориентир\w*|около|okolo|номин\w*|约|左右|标称",
 )
 """Words of a value that is a reference but for them."""
 _ROUGH_VALUES = re.compile(
