@@ -631,6 +631,36 @@ def test_units_that_only_the_values_tell_are_said(tmp_path):
     ] == ["ref_field_nt"]
 
 
+SAID = ("--column", "ref_inclination_deg={}")
+
+
+@pytest.mark.parametrize("below", [True, False])
+@pytest.mark.parametrize(
+    ("unit", "ours", "size", "answers"),
+    [("deg", "°", 1.0, ()), ("deg", "°", 1.0, SAID), ("rad", "rad", np.pi / 180, SAID)],
+)
+def test_the_unit_that_a_table_states_holds_for_a_column_that_an_answer_names(
+    tmp_path, below, unit, ours, size, answers
+):
+    """The answer may be the user's or that of the readings; the unit is in the name or in a row of units."""
+    name = "Deviation" if below else f"Deviation ({unit})"
+    run = {k: v for k, v in servo_run().items() if "field" not in k and "dip" not in k}
+    run["ref_inclination_deg"] = np.asarray(run["ref_inclination_deg"], float) * size
+    names = dict(zip(exports.RAW, ("Gx", "Gy", "Gz", "Bx", "By", "Bz"), strict=True))
+    angles = {f"ref_{each}_deg": each.capitalize() for each in ("azimuth", "toolface")}
+    table = renamed(run, ref_inclination_deg=name, **names, **angles)
+    units = {**dict.fromkeys(angles.values(), "deg"), **dict.fromkeys(names.values(), "V")}
+    units |= {"ref_gravity_g": "g", "Deviation": unit}
+    rows = {k: [units.get(k, ""), *v] for k, v in table.items()} if below else table
+    path = write_csv(tmp_path / "run.csv", rows)
+    typed = (each.format(name) for each in answers)
+    ran = mwdcal("profile", path, "-o", tmp_path / "tool.toml", *typed, "--json")
+    assert ran.code == 0, ran
+    assert ran.json["columns"]["ref_inclination_deg"]["name"] == name
+    assert ran.json["columns"]["ref_inclination_deg"]["unit"] == ours
+    assert "ref_inclination_deg" not in ran.json["unit_by_values"]
+
+
 @pytest.mark.parametrize("triad", ["A", "M"])
 @pytest.mark.parametrize("unit", ["(mV)", "[ADC]", "_mV", "(1e-3 V)", "_adc", " digits", " uV"])
 def test_no_unit_hides_a_channel(tmp_path, triad, unit):

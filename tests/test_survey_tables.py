@@ -11,6 +11,7 @@ import mwdcal as mc
 from cli_support import EXAMPLE, read_csv, refused
 from cli_support import mwdcal as cli
 from mwdcal.errors import FitError
+from mwdcal.files.depths import is_depth
 from mwdcal.sensor.profile import TableFormat
 
 RAW = ("ax", "ay", "az", "mx", "my", "mz")
@@ -187,6 +188,142 @@ def test_the_unit_of_depths_is_read_below_their_name(tmp_path, laboratory, unit,
     placed = replace(cal.profile, table=TableFormat(delimiter=";", first_line=3))
     text = replace(cal, profile=placed)
     assert mc.survey(text, tmp_path / "WELL.csv").path.md == pytest.approx(depths, abs=1e-5)
+
+
+DEPTHS = (
+    "MD;md_usft;M.D.;DEPT;Depth MD;Measured Depth (ft);Meas. depth;Hole depth [m];Bit depth;Survey depth;MD RKB (m);"
+    "Along-hole depth;Depth (mMD);Depth ftUS;Tiefe;Messtiefe, m;Meßtiefe;Teufe;Gemessene Tiefe;Bohrlochtiefe;Tiefe MD;"
+    "Dybde;Målt dybde (m);Målt dyp;Hulldybde;Borehullsdybde;Profundidad;Prof. medida;Profundidad medida (m);Prof.;"
+    "Profundidad del pozo;Profundidade;Profundidade medida;Profundidade da broca;Profondeur mesurée;Profondeur (m);"
+    "Глубина, м;Глубина по стволу;Измеренная глубина;Глубина скважины;井深;测深;测量深度(m);斜深;井深（米）;钻头深度"
+)
+"""Names of measured depth in English, German, Norwegian, Spanish, Portuguese, French, Russian and Chinese."""
+NO_DEPTHS = (
+    "TVD;Depth TVD;True vertical depth;Immersion depth;Water depth (m);Depth error;Delta depth;Vertikale Tiefe;"
+    "Profundidad vertical;Глубина по вертикали;垂深;Department;Hole;Bit;m;Survey;sd_md"
+)
+
+
+def test_measured_depths_are_known_by_their_names():
+    assert [name for name in DEPTHS.split(";") if not is_depth(name)] == []
+    assert [name for name in NO_DEPTHS.split(";") if is_depth(name)] == []
+
+
+@pytest.mark.parametrize(
+    ("name", "metres"),
+    [("Глубина по стволу, м", 1.0), ("Profundidad (pies)", 0.3048), ("Depth ftUS", 1200 / 3937)],
+)
+def test_depths_of_other_languages_count_in_the_unit_of_their_name(
+    tmp_path, laboratory, name, metres
+):
+    path = workbook(tmp_path / "WELL.xlsx", W=deep(name, METRES / metres))
+    assert mc.survey(laboratory[1], path).path.md == pytest.approx(METRES, rel=1e-12)
+
+
+def deep(name, cells, unit=""):
+    """Surveys whose measured depths have another name, and dates and times as text beside them."""
+    table = {n: each for n, each in well_table(names=RUN).items() if n != "MD"}
+    return {name: (unit, cells), **table}
+
+
+def text_table(path, columns):
+    """A table of text with a row of units, and the time of each survey."""
+    stamps = [f"2026-03-01T{k // 2:02d}:{k % 2 * 30:02d}" for k in range(36)]
+    lines = [
+        ",".join(["Date and time", *columns]),
+        ",".join(["", *(u for u, _ in columns.values())]),
+    ]
+    rows = zip(
+        stamps, *(map(repr, map(float, cells)) for _, cells in columns.values()), strict=True
+    )
+    path.write_text("\n".join([*lines, *map(",".join, rows)]) + "\n", "utf-8")
+    return path
+
+
+METRES = np.array(read_csv(EXAMPLE / "well.csv")["md_m"], float)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "typed", "metres"),
+    [
+        ("Strekning", "", "md_m=Strekning", 1.0),
+        ("Strekning", "ft", "md_m=Strekning", 0.3048),
+        ("Strekning", "", "md_ft=Strekning", 0.3048),
+        ("Strekning", "", "md_usft=Strekning", 1200 / 3937),
+        ("Strekning", "ft", "md_usft=Strekning", 1200 / 3937),
+        ("Strekning", "m", "md_ft=Strekning", 1.0),
+        ("Strekning", "", "md_m=Strekning (ft)", 0.3048),
+        ("Strekning (ft)", "", "md_m=Strekning (ft)", 0.3048),
+        ("Hole depth", "", "md_m=Hole depth", 1.0),
+    ],
+)
+def test_the_user_names_the_measured_depth(tmp_path, laboratory, name, unit, typed, metres):
+    """The path is that of the true depths; the table keeps the column, and times that no command reads."""
+    file, cal = laboratory
+    path = text_table(tmp_path / "WELL.csv", deep(name, METRES / metres, unit))
+    ran = cli("survey", file, path, "-o", tmp_path / "out.csv", "--column", typed, "--json")
+    assert ran.code == 0, ran.err
+    assert ran.json["end"]["md_m"] == pytest.approx(METRES[-1])
+    texts = {f["id"]: f["text"] for f in ran.json["findings"]}
+    assert "no-path" not in texts
+    assert name not in texts["unused-columns"]
+    assert "'Date and time'" in texts["unused-columns"]
+    result = read_csv(tmp_path / "out.csv")
+    assert np.array(result[name], float) == pytest.approx(METRES / metres)
+    assert result["Date and time"][3] == "2026-03-01T01:30"
+    column, _, theirs = typed.partition("=")
+    assert mc.survey(cal, path, column={column: theirs}).path.md == pytest.approx(METRES)
+    assert cli("apply", file, path, "-o", tmp_path / "corrected.csv").code == 0
+    corrected = (tmp_path / "corrected.csv").read_text("utf-8")
+    assert all(f"\n{stamp}," in corrected for stamp in result["Date and time"])
+
+
+def test_the_name_that_the_user_gives_comes_before_others(tmp_path, laboratory):
+    """Of several depths by name the user says which: none is taken by its place in the table."""
+    _, cal = laboratory
+    table = {**deep("Bit depth (m)", METRES + 15), "Survey depth (m)": ("", METRES)}
+    path = text_table(tmp_path / "WELL.csv", table)
+    message = refused(cli("survey", laboratory[0], path, "-o", tmp_path / "out.csv"), 2)
+    assert "'Bit depth (m)', 'Survey depth (m)'" in message
+    assert '--column "md_m=Bit depth (m)"' in message
+    for column in ("md_m", "md_ft"):
+        well = mc.survey(cal, path, column={column: "Survey depth (m)"})
+        assert well.path.md == pytest.approx(METRES)
+    table = {**deep("md_m", METRES + 15), "Other": ("", METRES / 0.3048)}
+    path = text_table(tmp_path / "WELL.csv", table)
+    assert mc.survey(cal, path, column="md_ft=Other").path.md == pytest.approx(METRES)
+    assert mc.survey(cal, path, column="md_m=").path is None
+
+
+@pytest.mark.parametrize(
+    ("typed", "message"),
+    [
+        ("md_m=Foo", "there is no column 'Foo'; found"),
+        ("md_m=Strekning (fathom)", "the unit must be m, ft or usft; got 'fathom'"),
+        ("md=Strekning", "of surveys md_m"),
+    ],
+)
+def test_an_answer_that_is_no_measured_depth_is_refused(tmp_path, laboratory, typed, message):
+    path = text_table(tmp_path / "WELL.csv", deep("Strekning", METRES))
+    ran = cli("survey", laboratory[0], path, "-o", tmp_path / "out.csv", "--column", typed)
+    assert message in refused(ran, 2)
+
+
+def test_a_table_without_a_depth_by_its_name_names_the_option_and_what_may_be_it(
+    tmp_path, laboratory
+):
+    """Columns that never decrease may be depths; text, a constant and what goes up and down may not."""
+    count = len(METRES)
+    table = deep("Strekning", METRES)
+    table |= {"pump": ("", np.full(count, 7.0)), "flow": ("", np.cos(np.arange(count)))}
+    for more, others in ({}, ""), ({"ticks": ("", np.arange(count) + 5.0)}, " or 'ticks'"):
+        path = text_table(tmp_path / "WELL.csv", {**table, **more})
+        ran = cli("survey", laboratory[0], path, "-o", tmp_path / "out.csv")
+        assert ran.code == 0, ran.err
+        [line] = [line for line in ran.err.splitlines() if "no well path" in line]
+        assert '--column "md_m=Strekning"' in line
+        assert ("It may be 'Strekning'" + others in line) is bool(others)
+        assert not {"pump", "flow", "Date", "NAME"} & {*line.replace("'", " ").split()}
 
 
 def test_profile_of_surveys_names_survey(tmp_path):

@@ -15,6 +15,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from mwdcal.errors import InputError
+from mwdcal.files.depths import MEASURED_DEPTHS
 from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.titles import UNITS_BY_SIGN
 from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, UNCERTAINTIES
@@ -90,9 +91,6 @@ _WARM = ("°C", "°F", "K")
 _MAGNETIC_UNITS = ("nT", "µT", "mT", "gauss", "mG", "A/m")
 _GRAVITY_UNITS = ("g", "mg", "m/s²", "gal", "mGal")
 WARMTH = "temperature_c"
-_DEPTH = re.compile(
-    r"(md|dept|((measured|bit|survey|hole|along[ _-]?hole)[ _]?)?depth)[ _]*[\[(]?(m|(us)?ft|feet|met(re|er)s?)?[\])]?"
-)
 _STATED = {"ref", "reference", "local", "model", "igrf", "bggm", "wmm"}
 """Words of columns that are known, not measured."""
 _BYWORDS = _STATED | {
@@ -253,9 +251,7 @@ OURS = (
     "drifting",
     "serial",
     "simulated",
-    "md_m",
-    "md_ft",
-    "md_usft",
+    *MEASURED_DEPTHS,
 )
 """Columns beyond the contract that mwdcal itself reads or writes in run files."""
 _COPIED = ("drift_", "witsml ")
@@ -284,15 +280,6 @@ class Resemblance(NamedTuple):
 
     column: str
     unit: str = ""
-
-
-def is_depth(name: str) -> bool:
-    """Whether a column has measured depths by its name.
-
-    >>> is_depth("MD [m]"), is_depth("Bit depth"), is_depth("md_usft"), is_depth("Immersion depth")
-    (True, True, True, False)
-    """
-    return bool(_DEPTH.fullmatch(name.strip().lower()))
 
 
 def resembled(name: str) -> Resemblance | None:

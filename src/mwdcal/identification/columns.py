@@ -971,27 +971,45 @@ def _numbered(names: Sequence[str], axes: str = "") -> dict[str, str]:
     }
 
 
+def column_said(theirs: str, names: Collection[str], source: str) -> tuple[str, str]:
+    """The column that an answer names, and the unit in brackets behind its name; both empty of an empty answer.
+
+    Raises:
+        InputError: there is no such column.
+    """
+    name, unit = theirs, ""
+    match = IN_BRACKETS.search(theirs)
+    if theirs not in names and match:
+        name, unit = theirs[: match.start()].strip(), match[1].strip()
+    if name and name not in names:
+        raise InputError(
+            f"{source}: there is no column {shown(name)}; found {', '.join(map(shown, [*names][:24]))}."
+        )
+    return name, unit
+
+
 def _answered(
-    answers: Mapping[str, str], names: Sequence[str], meanings: dict[str, Resemblance], source: str
+    answers: Mapping[str, str],
+    units: Mapping[str, str],
+    meanings: dict[str, Resemblance],
+    source: str,
 ) -> None:
-    """Replace what columns hold by what the user says: the name of a column, with its unit in brackets behind it."""
+    """Replace what columns hold by what the user says: the name of a column, with its unit in brackets behind it.
+
+    Without brackets it is in the unit that the table states: `units` by name.
+    """
     for ours, theirs in answers.items():
         if ours not in MAPPED:
             raise InputError(
-                f"`column` {shown(ours)}: expected one of {', '.join(MAPPED[:14])} and their sd_…."
+                f"`column` {shown(ours)}: expected one of {', '.join(MAPPED[:14])} and their sd_…, and of surveys md_m."
             )
-        name, unit = theirs, ""
-        match = IN_BRACKETS.search(theirs)
-        if theirs not in names and match:
-            name, unit = theirs[: match.start()].strip(), match[1].strip()
-        if name and name not in names:
-            raise InputError(
-                f"{source}: there is no column {shown(name)}; found {', '.join(map(shown, names[:24]))}."
-            )
+        name, unit = column_said(theirs, units, source)
         stated = meanings[name].unit if name in meanings else ""
         for other in [n for n, m in meanings.items() if m.column == ours or n == name]:
             del meanings[other]
         if name:
+            beside = units[name] or "".join(IN_BRACKETS.findall(name))
+            stated = stated or unit_of(spelled(beside))
             meanings[name] = Resemblance(ours, unit_of(unit) or unit or stated)
 
 
@@ -1074,7 +1092,7 @@ def proposed(
     said, known, every = answers or {}, stated or {}, dict(zip(names, units, strict=True))
     _tell_numbers(meanings, values, said)
     ignored = _no_evidence(meanings, values, said, known, above, every)
-    _answered(said, names, meanings, source)
+    _answered(said, every, meanings, source)
     questions = Questions(besides)
     damaged = {} if problems is None else problems  # filled while values are read
     spoken = _spoken(meanings, values, above)

@@ -29,6 +29,7 @@ from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import Finding
 from mwdcal.errors import Answer, FitError, InputError, QuestionError, QuestionsError
 from mwdcal.files.contract import CHANNELS, MAPPED, RANGES, RAW, REFERENCES, units_of
+from mwdcal.files.depths import is_depth
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, WORKBOOKS, looks_numeric, shown
 from mwdcal.files.formats.figures import is_figure
@@ -59,7 +60,7 @@ from mwdcal.files.runs import (
     to_readings,
 )
 from mwdcal.files.statements import stated_table
-from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW, FACTORS, WARMTH, is_depth
+from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW, FACTORS, WARMTH
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
 from mwdcal.identification.beside import findings_beside, has_roll_test, roll_tests_beside

@@ -14,13 +14,14 @@ from mwdcal.calibration.record import Calibration, Finding, with_checksum
 from mwdcal.errors import FitError, InputError, QuestionError, QuestionsError
 from mwdcal.files import runs
 from mwdcal.files.contract import CHANNELS, MAPPED, RAW
+from mwdcal.files.depths import MEASURED_DEPTHS, chosen_length, is_depth, unit_of_length
 from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.layout import Layout
 from mwdcal.files.formats.table import Table
 from mwdcal.files.statements import Said, SurveyTable, stated_table
 from mwdcal.files.synonyms import WARMTH
 from mwdcal.identification.beside import has_channels
-from mwdcal.identification.columns import meanings_of
+from mwdcal.identification.columns import column_said, meanings_of
 from mwdcal.identification.proposal import as_written, named_columns
 from mwdcal.identification.roll_tests import (
     check_channels,
@@ -92,8 +93,12 @@ def _by_meaning(
         for column, name in known_columns(table, where, profile).items()
         if column not in runs.ANGLES_OF_STAND
     }
-    answers |= said.columns
-    columns, others = _channels(table, form, where, answers)
+    answers |= {c: name for c, name in said.columns.items() if c not in MEASURED_DEPTHS}
+    depth, not_depth = _depth(table, said.columns)
+    taken = {each.name for each in depth.values()}
+    rest = replace(table, columns={n: c for n, c in table.columns.items() if n not in taken})
+    columns, others = _channels(rest, form, where, answers)
+    columns, others = columns | depth, [*others, *not_depth]
     magnetic = CHANNELS["magnetometer"] if {*RAW[3:]} & {*columns} else ()
     check_channels(table, columns, profile, (*CHANNELS["accelerometer"], *magnetic), "this table")
     form = replace_struct(form or TableFormat(), ignore=tuple(others))
@@ -106,6 +111,26 @@ def _by_meaning(
     reads = replace_struct(calibration, profile=theirs)
     reads = reads if calibration.changed else with_checksum(reads)
     return SurveyTable(table, reads, [Finding(id=COLUMNS_READ, text=text)])
+
+
+def _depth(table: Table, answers: Mapping[str, str]) -> tuple[dict[str, ColumnSource], list[str]]:
+    """The measured depth where the user names its column, and the columns that are called so and are not it.
+
+    The column counts in the unit that it states, else in that of the answer: md_m, md_ft, md_usft.
+
+    Raises:
+        InputError: there is no such column, or it is in no unit of length.
+    """
+    said = next((column for column in MEASURED_DEPTHS if column in answers), "")
+    if not said:
+        return {}, []
+    name, unit = column_said(answers[said], table.columns, table.source)
+    stated = unit_of_length(unit, name, table.units.get(name, ""))
+    if unit and not unit_of_length(unit):
+        raise InputError(f"`column` {said}: the unit must be m, ft or usft; got {shown(unit)}.")
+    others = [each for each in table.columns if is_depth(each) and each != name]
+    column = f"md_{chosen_length(stated, MEASURED_DEPTHS[said])}"
+    return ({column: ColumnSource(name=name)} if name else {}), others
 
 
 def _channels(

@@ -510,7 +510,7 @@ def survey(
         section_azimuth: of the vertical section, degrees from the north of the path.
         length_unit: of the results and of `tie_in`, and of depths whose column states none: m (the default), ft, or
             usft (1200/3937 m).
-        column: answers which column is which, as of `propose_profile`: `{"ax": "Gx 1"}`.
+        column: answers which column is which, as of `propose_profile`: `{"ax": "Gx 1", "md_m": "Hole depth"}`.
         sheet: of a workbook.
         outside: what becomes of readings outside the calibrated temperatures.
         missing: rows without a reading, such as a tie-in station: refuse the table, or leave their results blank.

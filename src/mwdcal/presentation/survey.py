@@ -29,7 +29,7 @@ from mwdcal.survey.interference import Interference, InterferenceSize, MultiStat
 from mwdcal.survey.path import PathEnd, TieIn
 from mwdcal.survey.references import NO_SOURCE
 from mwdcal.survey.stations import North
-from mwdcal.survey.surveying import SurveyedWell, WellInputs, used_in_surveys
+from mwdcal.survey.surveying import SurveyedWell, WellInputs
 from mwdcal.survey.well import AXES_OF_EARTH, LastStation, Well, WellCounts, WellErrors
 from mwdcal.use.uncertainty import ErrorTerms, error_terms
 
@@ -240,7 +240,7 @@ def result_summary(result: SurveyedWell, output: str = "", html: str = "") -> Su
     """The result for machines; `output` and `html` are the files that were written, if any."""
     msa = result.analysis.summary if result.analysis else None
     others = result.inputs.surveys.readings.unused
-    used = (*map(shown, used_in_surveys(result.inputs.table)),)
+    used = (*map(shown, result.inputs.surveys.others_used),)
     unused = unused_columns(tuple(text for text in others if not text.startswith(used)))
     facts = summary(result.well, result.counts, output, html, msa, unused)
     budget = result.contributions and contribution_summary(result.contributions)

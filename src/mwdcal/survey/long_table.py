@@ -31,6 +31,7 @@ from mwdcal.files.contract import (
     is_blank,
     wholly_blank,
 )
+from mwdcal.files.depths import MEASURED_DEPTHS
 from mwdcal.files.formats import atomic, parquet
 from mwdcal.files.formats.columns import LABELS, Column, check_names, no_stations
 from mwdcal.files.formats.sinks import ParquetSink, SpooledSink
@@ -47,7 +48,6 @@ from mwdcal.survey.references import Claim, EarthReference
 from mwdcal.survey.stations import DECLINATIONS, horizontal_field, norths_of
 from mwdcal.survey.surveying import (
     BY_ROW,
-    MEASURED_DEPTHS,
     SurveyedWell,
     SurveyReadings,
     WellInputs,
@@ -192,6 +192,7 @@ class _LongTable:
     Attributes:
         head: the table without rows.
         absent: groups of columns that are blank on all rows.
+        depth: the column of measured depths.
         located: whether any station has a measured depth.
     """
 
@@ -206,9 +207,9 @@ class _LongTable:
             raise no_stations(self.source.name)
         self.opening = first
         self.absent = wholly_blank([first])
-        depth, _ = depth_column(self.head, settings.unit)
-        self.located = depth in MEASURED_DEPTHS and any(
-            not is_blank(table, depth) for table in self._tables()
+        self.depth, _ = depth_column(self.head, settings.unit)
+        self.located = self.depth in MEASURED_DEPTHS and any(
+            not is_blank(table, self.depth) for table in self._tables()
         )
         metadata = {**self.source.metadata, **typical_north(self._by_row())}
         self.north = norths_of(
@@ -374,7 +375,7 @@ class _LongTable:
             seen.first.readings, metadata=identified(marked, [*seen.serials]),
             unused=synonyms.unused(self.source.names, COLUMNS), run_sha256=digests["readings"],
         )  # fmt: skip
-        surveys = SurveyReadings(readings, None, self.north, sources, about)
+        surveys = SurveyReadings(readings, None, self.north, sources, about, self.depth)
         if not surveys.uses_reference:
             digests.pop("reference", None)
         inputs = WellInputs(
@@ -386,10 +387,8 @@ class _LongTable:
         first = replace(seen.first, readings=readings, sources=sources)
         first = with_findings(first, tally, counts, settings.outside, settings.tie_in is None)
         exchanged = exchanged_axes(settings.calibration, readings)
-        first = replace(
-            first,
-            findings=[*inputs.findings, *exchanged, *with_stated_unit(first.findings, self.head)],
-        )
+        others = with_stated_unit(first.findings, self.depth)
+        first = replace(first, findings=[*inputs.findings, *exchanged, *others])
         return SurveyedWell(inputs, first, counts, last=seen.last)
 
     def _scatter(self) -> dict[str, Scatter]:

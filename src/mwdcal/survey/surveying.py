@@ -6,8 +6,8 @@ Surveys from a table of readings, and the table with the results beside its colu
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -31,6 +31,8 @@ from mwdcal.files.contract import (
     wholly_blank,
     without_reading,
 )
+from mwdcal.files.depths import MEASURED_DEPTHS, chosen_length, is_depth, unit_of_length
+from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.table import Table, cell_error, numbers
 from mwdcal.files.profiles import setting
 from mwdcal.files.runs import away_from_stand, renamed, to_readings
@@ -61,8 +63,6 @@ from mwdcal.survey.well import AXES_OF_EARTH, Before, Well, WellCounts, well
 
 NO_MODEL = "none"
 """The word for standard uncertainties of calibration, noise and declination alone."""
-MEASURED_DEPTHS = {f"md_{unit}": unit for unit in LENGTH_UNITS}
-"""The columns of measured depths, with their unit."""
 RANDOM_COLUMNS = {f"sd_random_{REFERENCES[name].column}": RANDOM + name for name in CONSTANTS}
 """Columns of what gravity, field and dip are uncertain by anew at every row, by their names in `Readings.sd`."""
 BY_ROW = {
@@ -75,13 +75,11 @@ MOST_CONTRIBUTED = 2000
 """Surveys of a table whose contributions are computed."""
 LARGEST_DEPTH = 20_000.0
 """No hole is longer, m."""
-_DEPTH_UNIT = re.compile(r"(?<![a-z])(m|(us)?ft|feet|met(re|er)s?)[\])]?$")
-"""The unit at the end of the name of a depth."""
 
 
 @dataclass(frozen=True)
 class SurveyReadings:
-    """The readings of a table, measured depths (n,) if it has them, and the norths that azimuths may count from.
+    """The readings of a table, measured depths (n,) in the column `depth`, and the norths that azimuths may count from.
 
     `sources`: where gravity, field, dip, declination and convergence come from, by name. `findings`: what of the
     reference contradicts the table, or is not used.
@@ -92,6 +90,12 @@ class SurveyReadings:
     north: North
     sources: Mapping[str, str]
     findings: list[Finding]
+    depth: str = ""
+
+    @property
+    def others_used(self) -> tuple[str, ...]:
+        """Columns that a survey uses and a run of calibration does not: references by row, and the measured depth."""
+        return (*BY_ROW, self.depth)
 
     @property
     def uses_reference(self) -> bool:
@@ -116,7 +120,8 @@ def survey_readings(
         InputError: a table that cannot be read, depths under another name or in another unit.
     """
     readings, md = station_readings(table, calibration, recognised, length_unit)
-    rows = by_row(renamed(table, calibration.profile))
+    named = renamed(table, calibration.profile)
+    rows = by_row(named)
     stated = {**table.metadata, **typical_north(rows)}
     north = norths_of(stated, table.source, lambda: [readings], calibration, reference)
     north = north.by_row(rows)
@@ -128,7 +133,8 @@ def survey_readings(
     if reference is not None:
         findings += of_another_day(reference, readings.metadata)
     referenced = readings if reference is None else with_reference(readings, reference)
-    return SurveyReadings(referenced, md, north, sources, findings)
+    depth, _ = depth_column(named, "m")
+    return SurveyReadings(referenced, md, north, sources, findings, depth)
 
 
 def station_readings(
@@ -301,47 +307,50 @@ def depth_column(table: Table, length_unit: str = "") -> tuple[str, float]:
     """The column of measured depths, and metres per its unit, or blank.
 
     Raises:
-        InputError: the column has another name without a unit in it, and no unit of length was chosen.
+        InputError: several columns of other names may be it, or its unit is neither in the table nor chosen.
     """
-    for name, unit in MEASURED_DEPTHS.items():
-        if name in table.columns:
-            return name, LENGTH_UNITS[unit]
-    for name in table.columns:
-        if synonyms.is_depth(name):
-            parts = (name, table.units.get(name, ""))
-            stated = next(
-                filter(None, (_DEPTH_UNIT.search(p.strip().lower()) for p in parts)), None
-            )
-            unit = stated[1] if stated else ""
-            if not length_unit and not unit:
-                raise InputError(
-                    f"{table.source}: column '{name}' does not state the unit of measured depths. Rename it, as in "
-                    f"'{name} (m)' or '{name} (ft)', or give `length_unit`."
-                )
-            return name, LENGTH_UNITS[_unit_of(unit, length_unit)]
-    return "", 1.0
+    names = [name for name in MEASURED_DEPTHS if name in table.columns][:1]
+    names = names or [*filter(is_depth, table.columns)]
+    if not names:
+        return "", 1.0
+    which = f'as in `column` "md_m={names[0]}" (in feet md_ft or md_usft)'
+    if len(names) > 1:
+        raise InputError(
+            f"{table.source}: each of {', '.join(map(shown, names))} may be the measured depth of the surveys. Name "
+            f"the right one, {which}."
+        )
+    name = names[0]
+    stated = MEASURED_DEPTHS.get(name) or unit_of_length(name, table.units.get(name, ""))
+    if not stated and not length_unit:
+        raise InputError(
+            f"{table.source}: column {shown(name)} does not state the unit of measured depths. State it, {which}, "
+            f"rename it '{name} (m)' or '{name} (ft)', or give `length_unit`."
+        )
+    unit = stated if name in MEASURED_DEPTHS else chosen_length(stated, length_unit)
+    return name, LENGTH_UNITS[unit]
 
 
-def with_stated_unit(findings: Iterable[Finding], table: Table) -> list[Finding]:
-    """The findings without the question for feet, where the title of the depths or `length_unit` answers it."""
-    if depth_column(table, "m")[0] == "md_m":
-        return [*findings]
-    return [finding for finding in findings if finding.id != "long-courses"]
+def _with_depths_of(
+    findings: Iterable[Finding], table: Table, unused: Collection[str]
+) -> list[Finding]:
+    """The findings; that on a path without depths names the `unused` columns of the table that never decrease."""
+    rising = []
+    for name in (n for n in table.columns if shown(n) in unused):
+        with suppress(InputError):
+            steps = np.diff(numbers(table, name))
+            rising += [name] * bool((steps >= 0).all() and steps.any())
+    listed = f" It may be {' or '.join(map(shown, rising))}." if rising[1:] else ""
+    return [
+        replace_struct(f, text=f.text.replace("NAME", rising[0]) + listed)
+        if rising and f.id == "no-path"
+        else f
+        for f in findings
+    ]
 
 
-def used_in_surveys(table: Table) -> list[str]:
-    """Columns that a survey uses and a run of calibration does not: references by row, and the measured depth."""
-    depth, _ = depth_column(table, "m")
-    return [*BY_ROW, depth] if depth else [*BY_ROW]
-
-
-def _unit_of(stated: str, chosen: str) -> str:
-    """The unit of depths whose title states one, or none; feet without more words are those that were chosen."""
-    if stated.startswith("m"):
-        return "m"
-    if stated in LENGTH_UNITS and (stated, chosen) != ("ft", "usft"):
-        return stated
-    return "ft" if stated and chosen in ("", "m") else chosen
+def with_stated_unit(findings: Iterable[Finding], depth: str) -> list[Finding]:
+    """The findings without the question for feet, where the title of the `depth` or `length_unit` answers it."""
+    return [finding for finding in findings if depth == "md_m" or finding.id != "long-courses"]
 
 
 def length_unit_of(given: str) -> tuple[str, str]:
@@ -754,7 +763,9 @@ def survey_well(
     said = alone.findings(result.readings.labels, result.north.name) if alone else []
     used = surveys.readings if inputs.unused is None else surveys.readings.select(~inputs.unused)
     exchanged = exchanged_axes(inputs.calibration, used)
-    others = with_stated_unit(result.findings, inputs.table)
+    others = with_stated_unit(result.findings, surveys.depth)
+    if not surveys.depth:
+        others = _with_depths_of(others, inputs.table, surveys.readings.unused)
     findings = [*inputs.findings, *about, *exchanged, *others, *said]
     result = replace(
         result, findings=findings, sources=surveys.sources, length_unit=inputs.length_unit

@@ -344,12 +344,13 @@ WELL_FINDINGS = {
     "`tie_in` gives the position of station {start}.",
     "left-out": "left out of the well path, without a result, without a measured depth, or at the depth of the "
     "station before: {count} of {rows} stations.",
-    "no-path": "no well path: {lacking_path}.",
+    "no-path": "no well path: {lacking_path}",
 }
 """The texts of the findings about a well, in their order."""
 LACKING_PATH = {
-    True: "no station has both a measured depth and a direction with azimuth",
-    False: "no column has the measured depth (md_m, md_ft or md_usft)",
+    True: "no station has both a measured depth and a direction with azimuth.",
+    False: 'no column has the measured depth. Add it, or name yours by `column` "md_m=NAME" (in feet '
+    "md_ft or md_usft).",
 }
 """Lack that leaves a well without a path, where stations have depths and where none has."""
 OLD_DRIFT = {

@@ -240,7 +240,7 @@ def of_roll_test(
 
 def of_readings(function: Function) -> Function:
     """The same options of a command that corrects readings."""
-    return of_roll_test(function, words="the readings", example="ax='Gx 1'")
+    return of_roll_test(function, words="the readings", example="ax='Gx 1', md_m='Hole depth'")
 
 
 def said(decimal: str) -> Said:

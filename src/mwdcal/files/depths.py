@@ -1,0 +1,69 @@
+"""Columns of measured depths: how they are called in the field, and their units of length."""
+
+from __future__ import annotations
+
+import re
+
+from mwdcal.files.formats.columns import without_marks
+from mwdcal.geometry.units import LENGTH_UNITS
+
+MEASURED_DEPTHS = {f"md_{unit}": unit for unit in LENGTH_UNITS}
+"""The columns of measured depths, with their unit."""
+_ALONG = (
+    r"(md|measured|meas|bit|survey|station|along|ah|(bore ?)?hole|tool|sensor|drilled|"
+    r"gemessene?|malt|medida|med|mesuree?|mes|misurata|del?|d[aou]|la|pozo|sondeo|barrena|poco|broca|forage|puits|"
+    r"по|стволу?|измер\w*|замера|скважины|долота)"
+)
+"""Words beside depth that leave it a measured one, as `_plain` spells them."""
+_NOUN = (
+    r"(md|m d|md ?(b?rt|r?kb|df)|dept|ahd|depth|(mess|bohr|bohrloch|meissel)?(tiefe|teufe)|"
+    r"((bore)?hull?s?|bit|borekrone|male)?(dybde|dyp)|prof(undidade?|ondeur|ondita)?|глуб(ина)?|"
+    r"(测量?|斜|井眼?|孔|测点|钻头)+深度?|深度)"
+)
+_WORDS_OF_LENGTH = {
+    "usft": r"us ?ft|ft ?us|us survey (foot|feet)|s ?ft",
+    "ft": r"ft|feet|foot|fuss|fot|pies?|pes|pieds?|фут\w*|英尺",
+    "m": r"m|met(re|er|ro)s?|м|米",
+}
+"""Words for each unit of length."""
+_UNIT_OF_DEPTH = rf"({'|'.join(_WORDS_OF_LENGTH.values())})( ?(md|rt|rkb))?"
+_DEPTH = re.compile(rf"({_ALONG} )*{_NOUN}( {_ALONG})*( ?{_UNIT_OF_DEPTH})?")
+_AT_END = {
+    unit: re.compile(rf"(?<![a-zа-я])({words})( ?(md|rt|rkb))?$")
+    for unit, words in _WORDS_OF_LENGTH.items()
+}
+
+
+def _plain(text: str) -> str:
+    """A text in small letters without accents, its words with single blanks between them."""
+    return " ".join(re.findall(r"[^\W_]+", without_marks(text).casefold()))
+
+
+def is_depth(name: str) -> bool:
+    """Whether a column has measured depths by its name.
+
+    >>> [is_depth(n) for n in ("MD [m]", "Bit depth", "md_usft", "Prof. medida", "Глубина по стволу, м")]
+    [True, True, True, True, True]
+    >>> [is_depth(n) for n in ("Immersion depth", "Depth TVD", "TVD (m)")]
+    [False, False, False]
+    """
+    return bool(_DEPTH.fullmatch(_plain(name)))
+
+
+def unit_of_length(*texts: str) -> str:
+    """The unit of length at the end of the first text that has one, else blank.
+
+    >>> unit_of_length("Hole depth (ft)"), unit_of_length("MD", "[м]"), unit_of_length("Tiefe")
+    ('ft', 'm', '')
+    """
+    plain = map(_plain, texts)
+    return next((u for text in plain for u, words in _AT_END.items() if words.search(text)), "")
+
+
+def chosen_length(stated: str, chosen: str) -> str:
+    """The unit of depths that state one, or none; feet without more words are those that were chosen.
+
+    >>> chosen_length("ft", "usft"), chosen_length("", "ft"), chosen_length("m", "ft")
+    ('usft', 'ft', 'm')
+    """
+    return chosen if not stated or (stated, chosen) == ("ft", "usft") else stated
