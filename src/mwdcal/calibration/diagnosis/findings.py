@@ -427,7 +427,7 @@ def _setting(fitted: FittedRuns, columns: Ints, seen: Array, place: int) -> str:
 
 
 def _redundancy(fitted: FittedRuns) -> Iterator[Flag]:
-    """Triads whose residuals are none, or too few to know s from, and runs in two directions of the tool axis."""
+    """Triads without redundancy, or with too little to know s from, and runs in two directions of the tool axis."""
     bare, freedom = unchecked(fitted.result), fitted.freedom
     yield _remark("no-redundancy", np.any(bare, -1), triads=partial(_joined, bare))
     few = (freedom < FEW_FREEDOM) & ~bare
