@@ -693,10 +693,13 @@ def _culprits(fitted: FittedRuns) -> Iterator[Flag]:
     chance, seen = setting_chances(result)
     off, worst = chance < MISFIT_CHANCE / max(chance.shape[-1], 1), np.argsort(chance, -1)
     again = stations_to_reshoot(result)
-    if not (off.any() or again.any()):
+    places = np.flatnonzero(off.any(-1) | again.any(-1))
+    if not places.size:
         return
-    of_stations = np.where(again, chances(result), 1.0)
-    square = station_misfit(result.analysis)[0]
+    some = result if places.size == fitted.count else take(result, places)
+    of_stations, square = np.ones(again.shape), np.zeros(again.shape)
+    of_stations[places], square[places] = chances(some), station_misfit(some.analysis)[0]
+    of_stations[~again] = 1.0
     order = np.lexsort((-square, of_stations, ~again), -1)
     surer = chance.min(-1, initial=1.0) < of_stations.min(-1)
     each = np.arange(fitted.count)
