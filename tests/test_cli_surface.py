@@ -283,6 +283,25 @@ def test_json_of_calibrate_holds_the_numbers_of_the_text(tmp_path):
     assert all(f"! {finding['text']}" in shown for finding in told["findings"])
 
 
+@pytest.mark.parametrize("toolface", [True, False])
+def test_the_screen_of_a_calibration_ends_with_the_files_and_the_next_command(tmp_path, toolface):
+    """A line for each; *undetermined* is explained where it is printed, and a page of the documentation named."""
+    columns = servo_run()
+    if not toolface:
+        del columns["ref_toolface_deg"]
+    made = {"calibration": tmp_path / "cal.json", "report": tmp_path / "page.html"}
+    run = write_csv(tmp_path / "run.csv", columns)
+    outputs = ("-o", made["calibration"], "--report", made["report"])
+    lines = mwdcal("calibrate", run, "--tool", "servo", *outputs).out.splitlines()
+    files = [f"wrote {path} ({name})" for name, path in made.items()]
+    assert lines[-4:] == ["", *files, f"next: mwdcal verify {made['calibration']} ROLLTEST.csv"]
+    [*meaning] = [line for line in lines if line.startswith("Undetermined: ")]
+    assert len(meaning) == (not toolface)
+    for page in re.findall(r"docs/\S+", "".join(meaning)):
+        words = (Path(__file__).parents[1] / page).read_text("utf-8")
+        assert "\nundetermined\n" in words
+
+
 def test_json_of_apply_holds_the_numbers_of_the_text(tmp_path, files):
     arguments = ("apply", *files, "-o", tmp_path / "out.csv")
     said, told = mwdcal(*arguments), mwdcal(*arguments, "--json").json

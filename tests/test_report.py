@@ -296,11 +296,14 @@ def finding(name, text="words", station=None):
 def test_findings_are_grouped_by_cause_and_the_most_important_come_first():
     again = [finding("reshoot", f"station {i} moved. Re-shoot it", str(i)) for i in range(3)]
     shown, left = leading_findings(
-        [finding("not-used"), finding("settings"), *again, finding("altered")]
+        [finding("not-used"), finding("settings-apart"), *again, finding("altered")]
     )
-    assert [each.id for each in shown] == ["altered", "reshoot", "settings", "not-used"]
+    assert [each.id for each in shown] == ["altered", "reshoot", "settings-apart", "not-used"]
     assert shown[1].text == "station 0 moved. Re-shoot it. Also stations 1, 2"
     assert left == 0
+    for suspects in ([finding("settings"), *again], [*again, finding("settings")]):
+        shown, _ = leading_findings([finding("magnetometer-residuals"), *suspects])
+        assert [each.id for each in shown[:2]] == [suspects[0].id, suspects[-1].id]
     many = [finding("reshoot", "moved", str(i)) for i in range(20)]
     assert leading_findings(many)[0][0].text.endswith(", 12 and 7 more")
     causes = [finding(f"cause-{i}") for i in range(9)]

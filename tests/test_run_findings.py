@@ -27,6 +27,7 @@ from mwdcal.calibration.residuals import chances
 from mwdcal.errors import FitError
 from mwdcal.estimation.uncertainty import analyse, left_out_variances
 from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.presentation.typed import leading_findings
 from mwdcal.sensor.profile import Profile
 from mwdcal.survey.well import unknown_gravity
 from simulation import DEG, Tool, attitude, plan
@@ -551,3 +552,80 @@ def test_a_gravity_that_no_place_on_land_has_is_named(gravity):
     data = replace(data, known={**data.known, "gravity": np.full(data.count, gravity)})
     outside = not 9.764 <= 9.80665 * gravity <= 9.834
     assert ("gravity-reference" in found(data)) == (outside and gravity != 1.0036)
+
+
+UNSTATED = {"gravity-unknown", "no-serial"}
+"""Findings on what the runs here do not state."""
+
+
+def on_directions(data, azimuths=(0, 90, 180, 270)):
+    """The run with one azimuth for the toolfaces of each inclination; the tool is read where it stands."""
+    tool, count = Tool.random(3), data.count // len(azimuths)
+    inc, face = data.known["inclination"], data.known["toolface"]
+    azi = np.repeat(np.asarray(azimuths) * DEG, count)
+    triads = [each[0] for each in tool.readings(np.random.default_rng(1), 1, inc, azi, face)]
+    return replace(
+        data,
+        accelerometer=triads[0],
+        magnetometer=triads[1],
+        known={
+            **data.known,
+            "azimuth": azi,
+            "field": np.full(data.count, tool.field),
+            "dip": np.full(data.count, tool.dip),
+        },
+    )
+
+
+def misread(data, error, of, angle="azimuth"):
+    """The run with the stand's `angle` of some stations typed wrong by an `error`, degrees."""
+    wrong = data.known[angle].copy()
+    wrong[of] += error * DEG
+    return replace(data, known={**data.known, angle: wrong})
+
+
+def test_of_several_stations_to_take_again_the_worst_comes_first():
+    data = misread(misread(run(), 1.5, 9), 2.0, 40)
+    again = [f.station for f in calibrate(data, PROFILE).findings if f.id == "reshoot"]
+    assert again == ["41", "10"]
+
+
+@pytest.mark.parametrize("sd", [NOISE, {}], ids=["declared", "estimated"])
+@pytest.mark.parametrize("error", [0.5, 1.0, 10.0])
+def test_a_wrong_setting_is_named_first_with_its_error(error, sd):
+    """A setting declared to 0.06° and typed wrong at all of its twelve stations, or at one of them."""
+    stand = {name: np.full(48, 1e-3) for name in ("inclination", "azimuth")}
+    data = replace(run(), sd={**sd, **stand}, settings="per-direction")
+    turned = on_directions(data)
+    whole = calibrate(misread(turned, error, slice(24, 36)), PROFILE).findings
+    first = leading_findings(whole)[0][0]
+    assert first.id == "settings"
+    [value] = re.findall(r"azimuth of stations 25 to 36 (\S+)° from", first.text)
+    assert float(value) == pytest.approx(-error, rel=0.15)
+    one = calibrate(misread(turned, error, 30), PROFILE).findings
+    assert leading_findings(one)[0][0].station == "31"
+
+
+@pytest.mark.parametrize("angle", ["azimuth", "inclination"])
+def test_residuals_that_look_like_settings_name_the_one_to_check(angle):
+    data = run(sd={}, inclinations=(5, 40, 75, 110, 145))
+    turned = on_directions(data, (0, 72, 144, 216, 288))
+    assert (
+        f"Check the {angle} of stations 25 to 36 first."
+        in found(misread(turned, 0.5, slice(24, 36), angle))["looks-like-settings"]
+    )
+
+
+@pytest.mark.parametrize("error", [0.0, 1.0])
+def test_two_directions_hide_a_wrong_angle_and_the_run_says_so(error):
+    """At 45° and at 90° inclination, a quarter of a turn apart, the sensors take up a wrong setting."""
+    data = on_directions(run(inclinations=(45, 90)), (0, 90))
+    for angle in ("azimuth", "inclination"):
+        named = found(misread(data, error, slice(12, 24), angle)).keys()
+        assert named - UNSTATED == {"few-directions"}
+
+
+@pytest.mark.parametrize("inclinations", [(5, 60, 120), (5, 45, 90, 135)])
+def test_more_directions_are_not_few(inclinations):
+    data = on_directions(run(inclinations=inclinations), 90 * np.arange(len(inclinations)))
+    assert found(data).keys() <= UNSTATED

@@ -264,11 +264,11 @@ class _Batch:
             for place in np.flatnonzero(flag.members).tolist():
                 ids[place][flag.id] = None
                 if flag.station is not None:
-                    stations[place].append(flag.station)
+                    stations[place].append(int(flag.station[place]))
         for tool, kinds, again, free in zip(tools, ids, stations, fitted.free, strict=True):
             undetermined = {entry.id for entry in free}
             lists["findings"][tool] = [name for name in kinds if name not in undetermined]
-            lists["reshoot"][tool] = again
+            lists["reshoot"][tool] = sorted(again)
             for index, triad in enumerate(TRIADS):
                 free_here = [entry.id for entry in free if index in entry.triads]
                 lists[f"{triad}_undetermined"][tool] = free_here

@@ -59,6 +59,11 @@ NEXT_ROLL_TEST = "ROLLTEST.csv"
 """The file of a roll test that is still to be made, in the next commands."""
 PLACE = "1σ, calibration alone, at 45° inclination"
 """The conditions of the accuracy to expect."""
+MEANING = (
+    "Undetermined: any value of it fits this run equally well, so it has no uncertainty, and no limit that needs it "
+    "passes. More: docs/reference/glossary.md"
+)
+"""The meaning of the word on the lines above."""
 PROFILE = " (see [stand] of the tool profile)"
 ORDERS = "error: rms per axis, with the noise; inside: interpolation, at the ends: extrapolation"
 COMPARED = """
@@ -150,7 +155,7 @@ def body(calibration: Calibration, tried: list[CurveScore]) -> str:
         *([orders(calibration.orders)] if calibration.orders else []),
         *([curves(tried)] if tried else []),
         errors(calibration.errors),
-        "\n".join(remarks(calibration)),
+        *remarks(calibration),
     ]
     return "\n\n".join(blocks)
 
@@ -172,33 +177,42 @@ def screen(
         serial = documents.serial_in(output)
         other = serial and serial != serial_of(calibration.tool)
         what += f", in place of {f'that of {serial}' if other else 'an earlier file'}"
-    files = files_written(**{what: output, "report": report})
-    command = f"mwdcal verify {one_line(output)} {one_line(rolltest or NEXT_ROLL_TEST)}"
+    files = [files_written(**{what: output})]
+    if report:
+        files.append(files_written(report=report))
     verdict, step = judged
-    after = step if verdict else f"   next: {command}"
-    return "\n\n".join([*filter(None, [verdict]), f"{body(calibration, tried)}\n{files}{after}"])
+    if not verdict:
+        step = f"\nnext: mwdcal verify {one_line(output)} {one_line(rolltest or NEXT_ROLL_TEST)}"
+    ending = "\n".join(files) + step
+    return "\n\n".join([*filter(None, [verdict]), body(calibration, tried), ending])
 
 
 def remarks(calibration: Calibration) -> list[str]:
-    """Size of the residuals, accuracy to expect, what was taken as exact, and estimated constants."""
-    accuracy = accuracy_in_words(calibration)
+    """Size of the residuals, accuracy to expect, and estimated constants; below, what the run cannot show."""
     names, steady = exact_and_steady(calibration.assumed_exact)
     exact = ", ".join(names)
-    return [
+    lean, unseen, *included = unseen_remarks(calibration)
+    shown = [
         *residuals(calibration),
         *(north_in_words(calibration) if AZIMUTH_KEYS[0] in calibration.tool else []),
-        f"accuracy to expect ({PLACE}): {'  '.join(accuracy)}",
+        f"accuracy to expect ({PLACE}): {'  '.join(accuracy_in_words(calibration))}",
+        *([MEANING] if any(t.undetermined for t in calibration.triads) else []),
         *([VALID.format(*valid)] if (valid := calibration.valid_temperatures) else []),
-        *([f"Assumed exact; this run cannot check it: {exact}{PROFILE}"] if exact else []),
-        *([steady] if steady else []),
-        *unseen_remarks(calibration),
-        *([ASSUMED] if calibration.settings == ASSUMED_PRACTICE else []),
+        *included,
         *(
             f"estimated constant of the run: {c.name} {estimate(c.value, c.standard_uncertainty, c.unit)}"
             for c in calibration.constants
         ),
         *stand(calibration),
     ]
+    hidden = [
+        f"Assumed exact; this run cannot check it: {exact}{PROFILE}" if exact else "",
+        lean,
+        steady.replace(". ", ".\n  "),
+        unseen.replace(": ", ":\n  ", 1).replace("; ", "\n  "),
+        ASSUMED if calibration.settings == ASSUMED_PRACTICE else "",
+    ]
+    return ["\n".join(filter(None, lines)) for lines in (shown, hidden) if any(lines)]
 
 
 def north_in_words(calibration: Calibration) -> list[str]:
@@ -210,14 +224,14 @@ def north_in_words(calibration: Calibration) -> list[str]:
 
 
 def unseen_remarks(calibration: Calibration) -> list[str]:
-    """Lines on a tool that leans and a drift, which no residual shows, and on drifts declared or possible."""
+    """Lines on a tool that leans and a drift, which no residual shows, and on drifts declared or possible; or blank."""
     lean = LEAN if ALIGNMENT in calibration.assumed_exact else ""
     drifts = (
         blindness(calibration.unseen),
         declared_drift(calibration.drift),
         _possible(calibration),
     )
-    return [*filter(None, (lean, *drifts))]
+    return [lean, *drifts]
 
 
 def _possible(calibration: Calibration) -> str:

@@ -120,7 +120,7 @@ def render(
         soaked=_soaked(calibration),
         kinds=_kinds(verdict),
         norths=norths(calibration.tool, calibration.profile.form.north),
-        drifts=list(map(capital, unseen_remarks(calibration))),
+        drifts=list(map(capital, filter(None, unseen_remarks(calibration)))),
         settings=SETTING_PRACTICES,
         raw_rule=raw_rule(verdict) if verdict else "",
         outside=BETWEEN_SETS,

@@ -88,6 +88,7 @@ REMARKED = {
     "column-explains": "the drift goes with a column that is not used",
     "no-redundancy": "nothing in the run checks the fit",
     "few-degrees-of-freedom": "the residuals are too few to know the uncertainties better than to a quarter",
+    "few-directions": "the tool axis has only two directions: a wrong angle of the stand may show nowhere",
     "hemisphere": "the dip is negative: a southern site, or a magnetometer with reversed signs",
     "gravity-reference": "the reference of gravity is one that no place on land has",
     "scatter": "strengths, dip or directions vary from station to station beyond the noise",

@@ -16,14 +16,15 @@ MOST_FINDINGS = 6
 """Most findings that a screen, or the first page of a report, shows."""
 MOST_ALSO = 12
 """Most stations that a finding names besides its own."""
-IMPORTANT = (
+IMPORTANT: tuple[str | tuple[str, ...], ...] = (
     "too-few", "channel", "missing-reference", "weak-geometry", "temperature-span",
     "altered", "revoked", "unsound", "contradicted", "not-judged", "partly-judged", "axes-exchanged", "rejected",
-    "path-from", "tie-in", "no-path", "long-courses", "calibration-later", "magnetic-north", "reshoot",
+    "path-from", "tie-in", "no-path", "long-courses", "calibration-later", "magnetic-north",
+    ("reshoot", "settings "),
     "repeated-readings", "misfit", "accelerometer-residuals", "magnetometer-residuals", "looks-like", "column-explains",
     "outside-temperature", "changed", "standard-overdue", "roll-test-read", "columns-read",
 )  # fmt: skip
-"""Beginnings of the ids of findings that come first, the most important first."""
+"""Beginnings of the ids of findings that come first, the most important first; together: of equal importance."""
 MINOR = ("not-used", "renamed-columns", "reference-unused", "settings-assumed", "unsigned")
 """Beginnings of the ids of findings that come last."""
 
@@ -63,7 +64,7 @@ def leading_findings(findings: Iterable[Finding]) -> tuple[list[Finding], int]:
 def _rank(name: str) -> int:
     """The place of a finding in the order of importance."""
     for place, start in enumerate(IMPORTANT):
-        if name.startswith(start):
+        if f"{name} ".startswith(start):
             return place - len(IMPORTANT)
     return int(name.startswith(MINOR))
 

@@ -28,7 +28,7 @@ from mwdcal.calibration.diagnosis.plausibility import (
     toolface_agreement,
     unchecked,
 )
-from mwdcal.calibration.diagnosis.structure import COLUMN, is_shown, suspected
+from mwdcal.calibration.diagnosis.structure import COLUMN, farthest_setting, is_shown, suspected
 from mwdcal.calibration.diagnosis.structure import described as seen_as
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import DIRECTION
@@ -41,7 +41,7 @@ from mwdcal.calibration.readings import (
     Readings,
 )
 from mwdcal.calibration.record import MISFIT_CHANCE, SHOWN_DRIFT, STATE_STAND, Finding
-from mwdcal.calibration.residuals import REASONS, shown_in, tail
+from mwdcal.calibration.residuals import REASONS, chances, shown_in, tail
 from mwdcal.calibration.results import (
     common_source,
     drift_shares,
@@ -52,8 +52,13 @@ from mwdcal.calibration.results import (
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.problem import WALK_AXES, Prior
 from mwdcal.estimation.solvers import Determined
-from mwdcal.estimation.uncertainty import fisher_tail, free_directions, per_freedom
-from mwdcal.geometry.vectors import Array, Bools, diagonal, quotient
+from mwdcal.estimation.uncertainty import (
+    fisher_tail,
+    free_directions,
+    per_freedom,
+    station_misfit,
+)
+from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, quotient
 
 # --------------------------------------------------------------------------
 # Stations that repeat the readings of an earlier one more closely than noise allows: copies, not measurements.
@@ -104,6 +109,8 @@ LEAST_UNEQUAL = 1.5
 """A smaller ratio of the noises of two axes is no finding: a 95 % interval then still holds 88 %."""
 FEW_FREEDOM = 8.0
 """Fewer degrees of freedom are reported: from them s is known no better than to a quarter."""
+ONE_DIRECTION = 0.996
+"""Tool axes have one direction where the cosine between them is larger: they differ by less than 5°."""
 LOW_WEIGHT = 0.1
 """A station of less weight than this in a robust fit is reported."""
 SCATTER_SHARE = 3e-4
@@ -143,8 +150,8 @@ REMARKS = {
     "equal noise {of[chance]:.0e}). {stand}Uncertainties take the axes as equal: they are too small where "
     "{of[most]} counts most. State the noise of each axis in the columns sd_ of run and readings, "
     "or find what acts along it.",
-    "settings": "the stand at {where}: {angle} is off by {size:.1f} σ of a setting ({value:+.3g}°). Check this "
-    "reference, or declare a larger σ.",
+    "settings": "readings put the {angle} of {where} {value:+.3g}° from its reference: {size:.1f} σ of a setting of "
+    "the stand. Check this reference, or declare a larger σ.",
     "settings-apart": "stations of one direction scatter by {share:.0%} of the stand's σ, as if the stand had been set "
     'anew at each. If so, state settings = "per-station" in [stand] of the profile.',
     "toolface-shared": "errors of the stand's toolface agree within each {by} (chance in noise {chance:.0e}), as if it "
@@ -166,6 +173,8 @@ REMARKS = {
     "no-redundancy": "{triads}: no redundancy, so nothing in this run checks the fit. Add stations.",
     "few-degrees-of-freedom": "the {few}: another run like this one may state {share:.0f} % more or less (1σ), and an "
     "error of a single station is hard to see. Add stations.",
+    "few-directions": "the tool axis has only two directions in this run, so a wrong angle of the stand at one of them "
+    "may show nowhere. Add stations at a third inclination and azimuth.",
     "scatter": "beyond sensor noise, these vary from station to station: {what} (1σ, estimated; weights and "
     "uncertainties include it). Look for iron near the stand and play in the tool holder; or the model lacks "
     "something.",
@@ -266,7 +275,7 @@ def findings(flags: Iterable[Flag], place: int, labels: Sequence[str]) -> list[F
         Finding(
             id=flag.id,
             text=flag.sentence(place),
-            station=None if flag.station is None else labels[flag.station],
+            station=None if flag.station is None else labels[flag.station[place]],
         )
         for flag in flags
         if flag.members[place]
@@ -277,9 +286,7 @@ def finding_flags(fitted: FittedRuns) -> Iterator[Flag]:
     """All findings of a batch, in order of weight: some ids come more than once."""
     yield from _noise(fitted)
     yield from _axis_noise(fitted)
-    bare = unchecked(fitted.result)
-    yield _remark("no-redundancy", np.any(bare, -1), triads=partial(_joined, bare))
-    yield _few_degrees(fitted)
+    yield from _redundancy(fitted)
     yield from _settings(fitted)
     yield _hemisphere(fitted)
     yield _gravity(fitted)
@@ -296,7 +303,7 @@ def finding_flags(fitted: FittedRuns) -> Iterator[Flag]:
     yield from _model(fitted)
     for each in of_table(fitted.readings):
         yield _common(fitted, each.id, each.text, range(fitted.count))
-    yield from _reshoot(fitted)
+    yield from _culprits(fitted)
     yield _distrusted(fitted)
 
 
@@ -381,18 +388,10 @@ def _axis_noise(fitted: FittedRuns) -> Iterator[Flag]:
 
 
 def _settings(fitted: FittedRuns) -> Iterator[Flag]:
-    """Settings of the stand that are off by far more than declared, and stations that were set one by one."""
-    result = fitted.result
-    chance = setting_chances(result)
-    for column in np.flatnonzero(
-        (chance < MISFIT_CHANCE / max(chance.shape[-1], 1)).any(0)
-    ).tolist():
-        members = chance[:, column] < MISFIT_CHANCE / chance.shape[-1]
-        words = partial(_setting, fitted, column)
-        yield Flag("settings", members, "{of}", {"of": words})
-    share = result.problem.evidence.apart
+    """Stations of one direction that were set one by one, and toolfaces that were not."""
+    share = fitted.result.problem.evidence.apart
     yield _remark("settings-apart", share > LEAST_SHOWN, share=share)
-    yield from _toolfaces(result)
+    yield from _toolfaces(fitted.result)
 
 
 def _toolfaces(result: Fit) -> Iterator[Flag]:
@@ -413,34 +412,41 @@ def _toolfaces(result: Fit) -> Iterator[Flag]:
         yield _remark("toolface-shared", members, **words)
 
 
-def _setting(fitted: FittedRuns, column: int, place: int) -> str:
-    """The statements about one setting's angle, a column of the settings' unknowns."""
+def _setting(fitted: FittedRuns, columns: Ints, seen: Array, place: int) -> str:
+    """The statements about one setting's angle, of which `columns` has the unknown and `seen` the share seen of it."""
     evidence, state = fitted.result.problem.evidence, fitted.result.state
+    column = int(columns[place])
     sd = evidence.set_together[place, :, column]
     second = column >= evidence.set_together.shape[-1] // 2
     angle, sign = DIRECTION[second], -1 if second else 1
-    stations = np.flatnonzero(sd)
-    labels = fitted.alone(place)[0].labels
-    sigmas = float(state.settings[place, column])
+    sigmas = float(state.settings[place, column] / seen[place, column])
     return REMARKS["settings"].format(
-        where=f"stations {labels[stations[0]]} to {labels[stations[-1]]}",
-        angle=angle, size=abs(sigmas), value=sign * np.degrees(sigmas * sd.max()),
+        where=f"stations {_from_to(fitted, place, np.flatnonzero(sd))}", angle=angle,
+        size=abs(sigmas), value=sign * np.degrees(sigmas * sd.max()),
     )  # fmt: skip
 
 
-def _few_degrees(fitted: FittedRuns) -> Flag:
-    """Triads whose residuals are too few to know s from."""
-    freedom = fitted.freedom
-    few = (freedom < FEW_FREEDOM) & ~unchecked(fitted.result)
+def _redundancy(fitted: FittedRuns) -> Iterator[Flag]:
+    """Triads without redundancy, or with too little to know s from, and runs in two directions of the tool axis."""
+    bare, freedom = unchecked(fitted.result), fitted.freedom
+    yield _remark("no-redundancy", np.any(bare, -1), triads=partial(_joined, bare))
+    few = (freedom < FEW_FREEDOM) & ~bare
 
     def named(place: int) -> str:
         each = [f"{TRIADS[t]} has {freedom[place, t]:.0f}" for t in np.flatnonzero(few[place])]
         return f"{' and the '.join(each)} degrees of freedom"
 
     least = np.where(few, np.maximum(freedom, 1.0), np.inf).min(-1)
-    return _remark(
-        "few-degrees-of-freedom", np.any(few, -1), few=named, share=100 / np.sqrt(2 * least)
-    )
+    share = 100 / np.sqrt(2 * least)
+    yield _remark("few-degrees-of-freedom", np.any(few, -1), few=named, share=share)
+
+    evidence, axis = fitted.result.problem.evidence, fitted.result.state.attitude[..., 2, :]
+    each, used = np.arange(fitted.count), evidence.include > 0
+    along = np.einsum("bni,bi->bn", axis, axis[each, used.argmax(-1)])
+    other = axis[each, np.where(used, along, np.inf).argmin(-1)]
+    near = np.maximum(along, np.einsum("bni,bi->bn", axis, other))
+    referenced = (evidence.is_known("inclination") & used).any(-1)
+    yield _remark("few-directions", referenced & np.all((near > ONE_DIRECTION) | ~used, -1))
 
 
 def _hemisphere(fitted: FittedRuns) -> Flag:
@@ -523,7 +529,18 @@ def _structure(fitted: FittedRuns) -> Iterator[Flag]:
 def _looks(fitted: FittedRuns, name: str, unit: str, place: int) -> str:
     """An effect that the residuals of one run show, in words."""
     [effect] = (each for each in fitted.effects(place) if each.name == name)
-    return seen_as(effect, unit)
+    looks = seen_as(effect, unit)
+    if name == "settings":
+        member = fitted.member(place)
+        angle, stations = farthest_setting(member.problem, member.state, effect)
+        looks += f" Check the {angle} of stations {_from_to(fitted, place, stations)} first."
+    return looks
+
+
+def _from_to(fitted: FittedRuns, place: int, stations: Ints) -> str:
+    """The labels of the first and the last of some stations of one run."""
+    labels = fitted.alone(place)[0].labels
+    return f"{labels[stations[0]]} to {labels[stations[-1]]}"
 
 
 def _scatter(fitted: FittedRuns) -> Flag:
@@ -670,17 +687,41 @@ def _model(fitted: FittedRuns) -> Iterator[Flag]:
     yield _remark("restricted", every & bool(lost), parameters=options.parameters, lost=lost)
 
 
-def _reshoot(fitted: FittedRuns) -> Iterator[Flag]:
-    """Stations to take again, with the reason."""
-    again = stations_to_reshoot(fitted.result)
-    for station in np.flatnonzero(again.any(0)).tolist():
+def _culprits(fitted: FittedRuns) -> Iterator[Flag]:
+    """Stations to take again, and settings of the stand that are off by more than declared: the surest first."""
+    result = fitted.result
+    chance, seen = setting_chances(result)
+    off, worst = chance < MISFIT_CHANCE / max(chance.shape[-1], 1), np.argsort(chance, -1)
+    again = stations_to_reshoot(result)
+    places = np.flatnonzero(off.any(-1) | again.any(-1))
+    if not places.size:
+        return
+    some = result if places.size == fitted.count else take(result, places)
+    of_stations, square = np.ones(again.shape), np.zeros(again.shape)
+    of_stations[places], square[places] = chances(some), station_misfit(some.analysis)[0]
+    of_stations[~again] = 1.0
+    order = np.lexsort((-square, of_stations, ~again), -1)
+    surer = chance.min(-1, initial=1.0) < of_stations.min(-1)
+    each = np.arange(fitted.count)
+    settings = [
+        Flag(
+            "settings",
+            off[each, columns],
+            "{of}",
+            {"of": partial(_setting, fitted, columns, seen)},
+        )
+        for columns in worst.mT[: off.sum(-1).max(initial=0)]
+    ]
+    yield from (replace(flag, members=flag.members & surer) for flag in settings)
+    for station in order.mT[: again.sum(-1).max()]:
         values = {"of": partial(_misfit, fitted, station)}
-        yield Flag("reshoot", again[:, station], REMARKS["reshoot"], values, station)
+        yield Flag("reshoot", again[each, station], REMARKS["reshoot"], values, station)
+    yield from (replace(flag, members=flag.members & ~surer) for flag in settings)
 
 
-def _misfit(fitted: FittedRuns, station: int, place: int) -> dict[str, Any]:
-    """The misfit of a station, where it is worst, and why that may be."""
-    row = fitted.stations(place)[station]
+def _misfit(fitted: FittedRuns, stations: Ints, place: int) -> dict[str, Any]:
+    """The misfit of a member's station, where it is worst, and why that may be."""
+    row = fitted.stations(place)[stations[place]]
     worst = row.worst or "gravity"
     measurable = row.deviation < LARGEST_DEVIATION
     return {

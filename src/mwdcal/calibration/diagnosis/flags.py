@@ -36,14 +36,14 @@ class Flag:
 
     The `words` have the names of `values` in braces: of an array (B, ...) the member's value is meant, of
     a function what it returns for the member's place, and anything else is common to all members.
-    `station` is the number of the station that it is about, if it is about one.
+    `station` (B,) is the number of the station that it is about, if it is about one.
     """
 
     id: str
     members: Bools
     words: str
     values: Mapping[str, Any] = field(default_factory=dict)
-    station: int | None = None
+    station: Ints | None = None
 
     def sentence(self, place: int) -> str:
         """The sentence of the flag for one member."""

@@ -450,22 +450,22 @@ def misfit_chances(result: Fit, freedom: Array | None = None, small: bool = Fals
     return np.where(untested, np.nan, chi_chance(square, freedom, small))
 
 
-def setting_chances(result: Fit) -> Array:
-    """Chance (B, s) of so large an error of each setting of the stand as is estimated.
+def setting_chances(result: Fit) -> tuple[Array, Array]:
+    """Chance (B, s) of so large an error of each setting of the stand as is estimated, and the share that is seen.
 
     Definition: the estimate z of an error of unit variance, known to v, has the variance 1 - v where all is
-    as declared. Settings that nothing tests have a chance of 1.
+    as declared, and the readings alone give z / (1 - v). Settings that nothing tests have a chance of 1.
     """
     settings = result.state.settings
     if not settings.size:
-        return np.ones(settings.shape)
+        return np.ones(settings.shape), np.ones(settings.shape)
     linear = result.problem.linear(result.state)
     whole = whole_covariance(linear, result.analysis.determined)
     expected = 1 - diagonal(whole)[:, -settings.shape[-1] :]
     tested = expected > TESTED
     scale = np.maximum(variance_scales(result).max(-1, keepdims=True), 1.0)
     square = quotient(settings**2, expected * scale, tested)
-    return tail(square, np.where(tested, 1, 0))
+    return tail(square, np.where(tested, 1, 0)), expected
 
 
 def toolface_agreement(result: Fit, by: str) -> tuple[Array, Ints]:

@@ -950,6 +950,15 @@ def suspected(result: Fit, chance: Array) -> Bools:
     return np.asarray(estimated | (np.nan_to_num(chance, nan=1.0) < STRUCTURE_CHANCE).any(-1))
 
 
+def farthest_setting(problem: Problem, state: State, effect: Effect) -> tuple[str, Ints]:
+    """The angle and the stations of the setting that an effect of settings shows most clearly, of a single run."""
+    turns = _turns(problem, state, problem.station_columns(state)[0])
+    angles, sets = [name for name in SET_TURNS if name in turns], _sets(problem)[0]
+    sizes = quotient(np.abs(effect.values), effect.uncertainties, effect.uncertainties > 0)
+    angle, number = divmod(int(np.argmax(sizes)), sets.shape[-1])
+    return angles[angle].removesuffix("-zero"), np.flatnonzero(sets[:, number])
+
+
 def described(effect: Effect, unit: str) -> str:
     """An effect in words; `unit` is that of the magnetometer."""
     if effect.name.startswith(COLUMN):
