@@ -73,11 +73,12 @@ def command(
     _enter(registry)
     prior, digest = prior_of(typed["prior"])
     readings, profile, test, beside = load_runs(run, rolltest, tool, prior, options.said(decimal))
-    with _roll_test_as_input():
-        turned = test.readings(profile) if test else None
+    turned, verdict, judged = None, None, ("", "")
+    if test:
+        with _roll_test_as_input():
+            turned = test.readings(profile)
     choice, result = chosen_fit(readings, profile, options_of(typed, prior, exclude, digest), say)
     calibration = recorded(choice, result)
-    verdict, judged = None, ("", "")
     if turned is not None and rolltest:
         with _roll_test_as_input():
             verdict, judged = _judged(calibration, turned, limits, (output, rolltest))
