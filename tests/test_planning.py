@@ -779,7 +779,7 @@ def test_a_plan_file_names_the_tool_and_so_does_its_calibration(tmp_path, suffix
     assert library.plan("servo", plan="six-state").serial == ""
     assert mwdcal(*line).code == 0
     assert read_table(sheet).metadata["serial"] == ""
-    assert mwdcal(*line, "--serial", "12.10", "--report", page).code == 0
+    assert mwdcal(*line, "--serial", "12.10", "--report", page, "--json").json["serial"] == "12.10"
     assert "<dt>Serial</dt><dd>12.10</dd>" in page.read_text("utf-8")
     assert library.plan("servo", plan=sheet).serial == "12.10"
     table, run = read_table(sheet), library.simulate(sheet, "servo", seed=1)

@@ -110,7 +110,7 @@ class PlanResult(Result):
     def _document(self) -> dict[str, Any]:
         from mwdcal.presentation.plan import document
 
-        return document(*self._named())
+        return document(*self._named(), self.serial)
 
     def _page(self) -> str:
         from mwdcal.presentation.plan import render

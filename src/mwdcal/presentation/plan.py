@@ -241,8 +241,9 @@ def findings(plans: Sequence[Planned]) -> list[Finding]:
 
 
 def document(
-    plans: Sequence[Planned], digests: Mapping[str, str], output: Path | None, html: Path | None
-) -> dict[str, Any]:
+    plans: Sequence[Planned], digests: Mapping[str, str], output: Path | None, html: Path | None,
+    serial: str,
+) -> dict[str, Any]:  # fmt: skip
     """The result for machines."""
     first, *others = map(_fields, plans)
     content = PlanDocument(
@@ -251,7 +252,7 @@ def document(
         output=str(output or ""),
         html=str(html or ""),
     )
-    return json_document("plan", content, {"simulated": True}, **digests)
+    return json_document("plan", content, {"simulated": True, "serial": serial}, **digests)
 
 
 def screen(
