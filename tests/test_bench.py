@@ -378,6 +378,17 @@ def test_the_fewest_stations_reach_the_accuracy():
     assert len(rougher.columns["ref_inclination_deg"]) <= len(plan.columns["ref_inclination_deg"])
 
 
+def test_a_profile_without_noise_has_best_stations_and_no_accuracy():
+    """The page could not say that the noise is assumed."""
+    known = load_profile(SERVO)
+    change, triads = msgspec.structs.replace, ("accelerometer", "magnetometer")
+    bare = change(known, **{name: change(getattr(known, name), noise=None) for name in triads})
+    plan = opening.session_plan(bare, "best-12")
+    assert len(plan.columns["ref_inclination_deg"]) == 12
+    assert not plan.accuracy_deg
+    assert opening.session_plan(known, "best-12").accuracy_deg
+
+
 # ------------------------------------------------------------------ decisions
 
 

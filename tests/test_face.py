@@ -84,19 +84,24 @@ def test_a_verdict_has_the_corrected_roll_test_as_columns(calibrated):
 
 
 def test_a_verdict_has_its_limits_as_a_table(calibrated):
-    pytest.importorskip("pandas")
+    """Printed by pandas, no column is left out in 80 columns, and no text is cut."""
+    pandas = pytest.importorskip("pandas")
     made, *_ = calibrated
     verdict = mwdcal.verify(made, EXAMPLE / "rolltest.csv")
     table = msgspec.structs.replace(verdict).to_pandas("limits")  # of one read from a file too
     for row, shown in zip(verdict.rows, table.itertuples(index=False), strict=True):
-        expected = (row.name, row.raw, row.value, row.uncertainty, shown.U)  # as on the screen
-        expected += (np.inf, row.limit, row.unit, "pass", row.note)
+        expected = (row.name, row.raw, row.value, shown.U, row.limit, row.unit, "pass")
         assert tuple(shown) == expected
         assert pytest.approx(2 * row.uncertainty) == shown.U  # the noise is declared
-    assert table.columns[5:].tolist() == ["degrees_of_freedom", "limit", "unit", "verdict", "where"]
+        rest = {name: values[row.name] for name, values in table.attrs.items()}
+        assert rest == {"sd": row.uncertainty, "degrees_of_freedom": np.inf, "where": row.note}
+    assert table.columns[3:].tolist() == ["U", "limit", "unit", "verdict"]
+    with pandas.option_context("display.width", 80, "display.max_columns", 0):
+        assert "..." not in str(table)
     part = mwdcal.read_run(EXAMPLE / "rolltest.csv", made.profile).select(np.arange(12) < 4)
     open_ones = mwdcal.verify(made, part).to_pandas("limits")
-    assert open_ones[["value", "sd", "U", "degrees_of_freedom"]].isna().all(axis=None)
+    assert open_ones[["value", "U"]].isna().all(axis=None)
+    assert np.isnan([*open_ones.attrs["degrees_of_freedom"].values()]).all()
     assert (open_ones["verdict"] == "FAIL").all()
     with pytest.raises(mwdcal.InputError, match="`rows` must be stations or limits; got 'limit'"):
         verdict.to_pandas("limit")

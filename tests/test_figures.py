@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import replace
 from functools import cache, partial
 
@@ -391,6 +392,25 @@ def test_more_roll_sets_than_looks_show_the_worst():
     result = verify(sound(), readings(plan, 4, knock=0.004), LIMITS)
     assert len(result.rows[0].sets) == 7
     assert {"worst roll set", "other roll sets"} <= set(curves(result.plot.toolface().axes[0]))
+
+
+@pytest.mark.filterwarnings("error")
+def test_long_names_of_a_verdict_leave_the_panels_their_room():
+    result = verdict("sets", 0.005)
+    plain = result.plot.toolface()
+    rows = [
+        msgspec.structs.replace(
+            row,
+            name="N" * 300 + row.name,
+            sets=[msgspec.structs.replace(each, label="L" * 300) for each in row.sets],
+        )
+        for row in result.rows
+    ]
+    long = msgspec.structs.replace(result, rows=rows).plot.toolface()
+    for figure in (plain, long):
+        figure.savefig(io.BytesIO())
+    for axes, usual in zip(long.axes, plain.axes, strict=True):
+        assert axes.get_position().width > 0.5 * usual.get_position().width
 
 
 @pytest.mark.usefixtures("without_layout")

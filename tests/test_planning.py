@@ -23,6 +23,8 @@ from mwdcal.calibration.options import ASSUMED, settings_of
 from mwdcal.calibration.results import accuracy_at, readings_at
 from mwdcal.errors import FitError, InputError
 from mwdcal.files.documents import read
+from mwdcal.files.formats.table import read as read_table
+from mwdcal.files.formats.table import write
 from mwdcal.files.profiles import built_in, load_profile
 from mwdcal.geometry.vectors import reference_vectors
 from mwdcal.planning import planned
@@ -751,6 +753,41 @@ def test_the_screen_says_what_is_assumed_and_how_long_the_soak_is(tmp_path):
     ).out  # fmt: skip
 
 
+def test_a_profile_without_noise_is_planned_with_that_of_a_servo_instrument(tmp_path):
+    """The same as with the noise of the built-in servo tool, 0.1 mg and 15 nT, stated in the profile's raw units."""
+    path, plan = tmp_path / "p.toml", ("plan", "--plan", "moosavi-12", "--json", "--tool")
+    text = 'name = "p"\n[accelerometer]\nscale = 988.4\n{}\n[magnetometer]\nscale = 1.018\n{}\n'
+    path.write_text(text.format("", ""), "utf-8")
+    assumed = mwdcal(*plan, path)
+    said = "the noise of the accelerometer and magnetometer; assumed is that of a servo instrument, 0.1 mg and 15 nT"
+    assert said in " ".join(assumed.err.split())
+    assert "noise-assumed" in {each["id"] for each in assumed.json["findings"]}
+    servo = load_profile("servo")[0]
+    stated = [each.noise / each.scale for each in (servo.accelerometer, servo.magnetometer)]
+    raw = [f"noise = {x * k!r}" for x, k in zip(stated, (988.4, 1.018), strict=True)]
+    path.write_text(text.format(*raw), "utf-8")
+    known = mwdcal(*plan, path).json
+    assert "noise-assumed" not in {each["id"] for each in known["findings"]}
+    for angle, sd in assumed.json["accuracy_deg"].items():
+        assert sd == pytest.approx(known["accuracy_deg"][angle], rel=1e-6)
+
+
+@pytest.mark.parametrize("suffix", ["csv", "xlsx"])
+def test_a_plan_file_names_the_tool_and_so_does_its_calibration(tmp_path, suffix):
+    sheet, page = tmp_path / f"plan.{suffix}", tmp_path / "sheet.html"
+    line = ("plan", "--plan", "twenty-four-state", "--tool", "servo", "-o", sheet)
+    assert library.plan("servo", plan="six-state").serial == ""
+    assert mwdcal(*line).code == 0
+    assert read_table(sheet).metadata["serial"] == ""
+    assert mwdcal(*line, "--serial", "12.10", "--report", page, "--json").json["serial"] == "12.10"
+    assert "<dt>Serial</dt><dd>12.10</dd>" in page.read_text("utf-8")
+    assert library.plan("servo", plan=sheet).serial == "12.10"
+    table, run = read_table(sheet), library.simulate(sheet, "servo", seed=1)
+    cells = {name: run.columns[name] for name in table.columns}
+    write(tmp_path / "run.csv", replace(table, columns=cells))
+    assert library.calibrate(tmp_path / "run.csv", "servo").tool["serial"] == "12.10"
+
+
 def test_the_place_of_a_plan_is_shown_with_names_and_units(tmp_path):
     plan = tmp_path / "p.toml"
     place = "gravity_g = 1.0003\nfield_nt = 51000\ndip_deg = 66.2\n"
@@ -799,6 +836,9 @@ def test_a_plan_lists_the_inclinations_in_reach_and_the_time_of_a_station(tmp_pa
     assert f"{seconds:.0f} s a station and 1.5 h of soak" in sheet.read_text("utf-8")
     said = " ".join(mwdcal(*line, *reach).out.split())
     assert f"per station (--speed, --settle) {seconds:.0f} s" in said
+    by_hand = document["session_hours"] + 12 * 2 / 60
+    assert f"by hand, 2 min a station more {by_hand:.1f} h" in said
+    assert f"h of soak; {by_hand:.1f} h by hand" in sheet.read_text("utf-8")
 
 
 @pytest.mark.parametrize(("stations", "whole"), [(24, True), (25, False)])

@@ -207,19 +207,22 @@ def test_the_only_other_table_of_channels_is_the_roll_test_and_of_two_the_sheet_
     assert "--rolltest" not in shown.out
 
 
-def test_a_roll_test_that_cannot_be_read_does_not_lose_the_calibration(tmp_path, laboratory):
+def test_a_roll_test_that_cannot_be_read_is_refused_before_anything_is_written(
+    tmp_path, laboratory
+):
     columns = rolled(TESTS["Prueba de giro"])
     columns["Kanal A"], columns["Kanal B"] = columns.pop("Gy (g)"), columns.pop("Bz (G)")
     book = workbook(tmp_path / "T.xlsx", **{"Prueba de giro": columns})
     cal = tmp_path / "c.json"
     tool = ("--tool", laboratory[0] / "tool.toml", "-o", cal, "--rolltest", book)
-    ran = mwdcal("calibrate", book, *tool)
-    assert ran.code == 2, ran
-    assert "accuracy to expect" in ran.out
-    assert "wrote" in ran.out
-    assert ran.err.splitlines()[-1].startswith("mwdcal: T.xlsx: ")
-    assert "--rolltest-column ay=NAME --rolltest-column mz=NAME" in ran.err
-    assert library.load(cal).stations == 48
+    message = refused(mwdcal("calibrate", book, *tool), 2)
+    assert message.startswith("mwdcal: T.xlsx: ")
+    assert "--rolltest-column ay=NAME --rolltest-column mz=NAME" in message
+    plan = tmp_path / "plan.toml"
+    plan.write_text('name = "p"\n[[stations]]\ninclination_deg = 45\n', "utf-8")
+    assert "the suffix must be" in refused(mwdcal("calibrate", book, *tool[:-1], plan), 2)
+    assert not cal.exists()
+    assert mwdcal("calibrate", book, *tool[:-2]).code == 0
     said = ("--column", "ay=Kanal A", "--column", "mz=Kanal B (gauss)")
     assert mwdcal("verify", cal, book, *said).code == 0
     beside = [each.replace("--column", "--rolltest-column") for each in said]

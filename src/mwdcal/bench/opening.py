@@ -157,7 +157,9 @@ def session_plan(profile: Profile, name: str) -> SessionPlan:
         if best or wanted:
             raise
         return SessionPlan(name, planned_columns(arrays_of(plan_table(name))))
-    return SessionPlan(name, planned_columns(result.columns), result.accuracy_deg)
+    assumed = any(each.id == "noise-assumed" for each in result.findings)
+    accuracy = {} if assumed else result.accuracy_deg  # the page cannot say what is assumed
+    return SessionPlan(name, planned_columns(result.columns), accuracy)
 
 
 def _accuracy(name: str) -> dict[str, float]:

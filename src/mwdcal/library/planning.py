@@ -78,7 +78,7 @@ class PlanResult(Result):
         return findings(self.plans)
 
     def save(self, path: FilePath) -> None:
-        """Write the plan to be filled in: a run file with blank readings (CSV, TSV, Parquet or XLSX).
+        """Write the plan to be filled in: a run file with blank readings (CSV, TSV, Parquet or XLSX), and the serial.
 
         Raises:
             InputError: the file cannot be written.
@@ -87,7 +87,7 @@ class PlanResult(Result):
         from mwdcal.planning.plans import run_sheet
 
         has_magnetometer = self.calibration.profile.has_magnetometer
-        table.write(path, run_sheet(self.table, has_magnetometer))
+        table.write(path, run_sheet(self.table, has_magnetometer, self.serial))
         self.files["output"] = Path(path)
 
     def report(self, path: FilePath) -> None:
@@ -110,7 +110,7 @@ class PlanResult(Result):
     def _document(self) -> dict[str, Any]:
         from mwdcal.presentation.plan import document
 
-        return document(*self._named())
+        return document(*self._named(), self.serial)
 
     def _page(self) -> str:
         from mwdcal.presentation.plan import render
@@ -134,6 +134,7 @@ def plan(
     speed: float = 5.0,
     settle: float = 30.0,
     soak: float = 90.0,
+    serial: str = "",
     options: Options | None = None,
     progress: Callable[[int, int], None] = silent,
     **choices: Unpack[FitChoices],
@@ -143,14 +144,15 @@ def plan(
     Definition: the calibration of a nominal `tool` that reads without noise, at the stations of a `plan`; several
     plans are compared. With `stations` the best so many out of the candidates in `plan`, with `accuracy_deg` (1σ)
     the fewest that give it, with `measured` the best to add to a run that exists. `criterion` says what `stations`
-    are best in: "D", all parameters together; "A", each of them; "I", the angles. `options` and `choices` are those
+    are best in: "D", all parameters together; "A", each of them; "I", the angles. `serial` is the tool's, for the
+    sheet; by default that of the calibration or run behind the plan. `options` and `choices` are those
     of `calibrate`. Where the plan does not state the place, it is that of the run of a calibration given as `tool`.
 
     Units: degrees for accuracies and for `reach` of the stand, degrees per second for its `speed`; `settle` in
     seconds from the end of a move to the reading, `soak` in minutes to reach a temperature.
 
     Raises:
-        InputError: a plan, profile or keyword that cannot be read, or a profile that does not state the noise.
+        InputError: a plan, profile or keyword that cannot be read, or a profile without scale and noise.
         FitError: the stations cannot give a calibration; the message says what to add.
 
     >>> import mwdcal
@@ -192,13 +194,12 @@ def plan(
             result.append(planned.judged(each, profile, chosen, stand))
             progress(len(result), len(tables))
     digests = {"profile": digest, "measured": done.digest if done else ""}
-    return PlanResult(result, digests, serial=_serial(tool, done))
+    return PlanResult(result, digests, serial=serial or _serial(tool, done or result[0].plan))
 
 
-def _serial(tool: object, done: Table | None) -> str:
-    """The serial of the tool by its calibration, else by the run that is measured already; blank where unknown."""
-    stated = [tool.tool] if isinstance(tool, Calibration) else [done.metadata] if done else []
-    return next(filter(None, map(serial_of, stated)), "")
+def _serial(tool: object, run: Table) -> str:
+    """The serial of the tool by its calibration, else by a run; blank where unknown."""
+    return serial_of(tool.tool if isinstance(tool, Calibration) else run.metadata) or ""
 
 
 def _check_wanted(stations: int | None, accuracy_deg: Mapping[str, float]) -> None:

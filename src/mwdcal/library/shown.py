@@ -219,7 +219,7 @@ def _to_pandas(readings: Readings) -> Any:
 
 
 def _limit_columns(verdict: Verdict) -> dict[str, AnyArray]:
-    """A row for each limit: the columns of the screen, with U, the expanded uncertainty (95 %); NaN: not stated."""
+    """A row for each limit, as narrow as a screen, with U, the expanded uncertainty (95 %); NaN: not stated."""
     from mwdcal.certificate.decisions import expanded_of
 
     rows = verdict.rows
@@ -227,13 +227,19 @@ def _limit_columns(verdict: Verdict) -> dict[str, AnyArray]:
         "name": np.array([row.name for row in rows]),
         "raw": np.array([row.raw for row in rows], float),
         "value": np.array([row.value for row in rows], float),
-        "sd": np.array([row.uncertainty for row in rows], float),
         "U": np.array([expanded_of(row) for row in rows], float),
-        "degrees_of_freedom": np.array([_freedom(row) for row in rows]),
         "limit": np.array([row.limit for row in rows]),
         "unit": np.array([row.unit for row in rows]),
         "verdict": np.array(["pass" if row.passed else "FAIL" for row in rows]),
-        "where": np.array([row.note for row in rows]),
+    }
+
+
+def _limits_stated(verdict: Verdict) -> dict[str, dict[str, object]]:
+    """The rest of each limit, by name of the limit: 1σ, its degrees of freedom, and the set and curve judged."""
+    return {
+        "sd": {row.name: row.uncertainty for row in verdict.rows},
+        "degrees_of_freedom": {row.name: _freedom(row) for row in verdict.rows},
+        "where": {row.name: row.note for row in verdict.rows},
     }
 
 
@@ -249,7 +255,7 @@ def _verdict_to_pandas(verdict: Verdict, rows: Literal["stations", "limits"] = "
     tables = {"stations": _verdict_columns, "limits": _limit_columns}
     if rows not in tables:
         raise InputError(f"`rows` must be {' or '.join(tables)}; got {rows!r}. Correct it.")
-    return frame(tables[rows](verdict))
+    return frame(tables[rows](verdict), _limits_stated(verdict) if rows == "limits" else None)
 
 
 @dataclass(frozen=True)

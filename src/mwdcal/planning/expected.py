@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import msgspec
 import numpy as np
+from msgspec.structs import replace as with_fields
 
 from mwdcal.calibration.automatic.auto import Choice, choose
 from mwdcal.calibration.calibrate import recorded
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.options import AUTO, Options
-from mwdcal.calibration.readings import HIGHEST, Readings
+from mwdcal.calibration.readings import HIGHEST, TRIADS, Readings
 from mwdcal.calibration.readings import highest_order as carried_order
-from mwdcal.calibration.record import Calibration, Undetermined
+from mwdcal.calibration.record import Calibration, Finding, Undetermined
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.problem import ANGLES, EARTH
 from mwdcal.files.contract import REFERENCES, channels
@@ -21,7 +21,7 @@ from mwdcal.files.formats.table import Table
 from mwdcal.files.runs import check_references, from_readings, to_readings
 from mwdcal.geometry.vectors import Array, reference_vectors
 from mwdcal.planning.plans import Earth, attitudes
-from mwdcal.sensor.profile import Profile, TriadProfile
+from mwdcal.sensor.profile import USUAL_NOISE, Profile, TriadProfile
 
 STILL = 1e-6
 """A channel that moves by no more than this share of gravity or field over a plan does not move."""
@@ -29,16 +29,32 @@ NOISE_RANGE = {"accelerometer": (1e-9, 1.0, "g"), "magnetometer": (1e-4, 1e5, "n
 """Noise that a sensor of these can have, and its unit: not less than the best one, not more than what it measures."""
 
 
-def _check_noise(profile: Profile, kind: str) -> None:
-    """Refuse a triad without noise."""
+def _with_noise(profile: Profile, kind: str) -> Profile:
+    """A profile with noise of a triad: its own, else that of a servo instrument; refuses without scale and noise."""
     triad: TriadProfile = getattr(profile, kind)
-    if triad.noise is None:
+    if triad.noise is None and triad.scale is None:
         default = " (the default without `tool`)" if profile.name == "generic" else ""
         raise InputError(
             f"the profile '{profile.name}'{default} does not state the noise of the {kind}, on which every "
             f"uncertainty rests. Add 'noise' to its [{kind}], which mwdcal noise measures; or name a calibration of "
             "the tool by `tool`, which has estimated it."
         )
+    noise = USUAL_NOISE[kind] * (triad.scale or 1.0) if triad.noise is None else triad.noise
+    return with_fields(profile, **{kind: with_fields(triad, noise=noise)})
+
+
+def assumed_noise(profile: Profile) -> list[Finding]:
+    """That a plan takes the noise of a servo instrument, where the profile does not state it."""
+    kinds = [k for k in channels(profile.has_magnetometer) if getattr(profile, k).noise is None]
+    sizes = [
+        f"{1e3 * USUAL_NOISE[k]:g} mg" if k == TRIADS[0] else f"{USUAL_NOISE[k]:g} nT"
+        for k in kinds
+    ]
+    text = (
+        f"the profile '{profile.name}' does not state the noise of the {' and '.join(kinds)}; assumed is that of a "
+        f"servo instrument, {' and '.join(sizes)}. A calibration of the tool as `tool` brings the tool's own."
+    )
+    return [Finding(id="noise-assumed", text=text)] if kinds else []
 
 
 def _check_scale(profile: Profile, kind: str) -> None:
@@ -57,13 +73,13 @@ def nominal_run(plan: Table, profile: Profile) -> tuple[Readings, Profile]:
     """The readings of a nominal tool at the stations of a plan, with the noise and the stand of a profile.
 
     Where the plan does not state gravity, field or dip they are those of `Earth`. A profile that says nothing of a
-    magnetometer is of a tool without one.
+    magnetometer is of a tool without one; noise that it does not state is that of a servo instrument.
 
     Raises:
-        InputError: the plan does not state an attitude, or the profile not the noise of a triad.
+        InputError: the plan does not state an attitude, or the profile neither scale nor noise of a triad.
     """
     for kind in channels(profile.has_magnetometer):
-        _check_noise(profile, kind)
+        profile = _with_noise(profile, kind)
     known = check_references(plan, profile, [])
     attitudes(plan)
     known |= dict(zip(EARTH, planned_earth(plan), strict=True))
@@ -136,7 +152,7 @@ def expected(plan: Table, profile: Profile, options: Options | None = None) -> C
     `calibrate`.
 
     Raises:
-        InputError: the plan does not state an attitude, or the profile not the noise.
+        InputError: the plan does not state an attitude, or the profile neither scale nor noise of a triad.
         FitError: no calibration can come of the plan; the message says what to add.
     """
     return carried_out(plan, profile, options)[0]
@@ -156,7 +172,4 @@ def left_undetermined(calibration: Calibration) -> list[Undetermined]:
     if calibration.method == "joint":
         return entries
     advice = f"Method {calibration.method} does not use the reference that would fix it; joint does"
-    return [
-        msgspec.structs.replace(each, text=f"{each.text.partition('. ')[0]}. {advice}")
-        for each in entries
-    ]
+    return [with_fields(each, text=f"{each.text.partition('. ')[0]}. {advice}") for each in entries]

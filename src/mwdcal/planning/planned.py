@@ -30,7 +30,13 @@ from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.problem import ANGLES
 from mwdcal.files.formats.table import Table, labels
 from mwdcal.geometry.vectors import Array, Bools, Ints
-from mwdcal.planning.expected import carried_out, expected, left_undetermined, planned_fit
+from mwdcal.planning.expected import (
+    assumed_noise,
+    carried_out,
+    expected,
+    left_undetermined,
+    planned_fit,
+)
 from mwdcal.planning.optimal import (
     WEIGHINGS,
     Design,
@@ -220,8 +226,8 @@ class Planned:
     could have; `seconds` the session at the stand, `soaking` those of them in soaks. `freedom` (t,) are the degrees of
     freedom of each triad's s, and `detections` (1, n) the errors of one station that `calibrate` will report, those
     `measured` already before the plan's. No plan of fewer than `bound` stations gives the wanted accuracy, if one is;
-    `search` says what the search has to say. `set_anew` works out the calibration on a stand that is set at every
-    station, `compared` the inclinations of a best plan, if they are few.
+    `search` says what the search has to say, `assumed` which noise the profile does not state. `set_anew` works out
+    the calibration on a stand that is set at every station, `compared` the inclinations of a best plan, if few.
     """
 
     plan: Table
@@ -236,6 +242,7 @@ class Planned:
     measured: int = 0
     bound: int | None = None
     search: list[Finding] = field(default_factory=list)
+    assumed: list[Finding] = field(default_factory=list)
     compared: Callable[[], Levels | None] = lambda: None
 
     @classmethod
@@ -258,6 +265,7 @@ class Planned:
             set_anew=partial(expected, whole, anew, options),
             stand=stand,
             measured=measured,
+            assumed=assumed_noise(profile),
         )
 
     @cached_property
@@ -300,7 +308,7 @@ class Planned:
         )
         hidden = [Finding(id="hidden-errors", text=text)] if stations else []
         expected = [f for f in self.calibration.findings if f.id != UNIDENTIFIED]  # of no tool yet
-        return [*expected, *hidden, *self.search]
+        return [*expected, *hidden, *self.assumed, *self.search]
 
 
 def judged(
@@ -313,8 +321,8 @@ def judged(
     """The result of a plan; its efficiency is among its own stations and the `candidates` at its temperatures.
 
     Raises:
-        InputError: the plan does not state an attitude, or one that the stand cannot reach, or the profile not
-            the noise.
+        InputError: the plan does not state an attitude, or one that the stand cannot reach, or the profile
+            neither scale nor noise of a triad.
         FitError: no calibration can come of the plan; the message says what to add.
     """
     _check_reached(plan, stand)

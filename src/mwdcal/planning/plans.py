@@ -307,17 +307,17 @@ def attitudes(plan: Table) -> Array:
     return angles
 
 
-def run_sheet(plan: Table, magnetometer: bool = True) -> Table:
-    """The run file of a plan to be filled in: its columns, and blank ones for readings and place."""
+def run_sheet(plan: Table, magnetometer: bool = True, serial: str = "") -> Table:
+    """The run file of a plan to be filled in: its columns, blank ones for readings and place, and the tool's serial."""
     raw = chain(*channels(magnetometer).values())
     head = {
         name: cells for name, cells in plan.columns.items() if name in ("station", "temperature_c")
     }
     place = [REFERENCES[name].column for name in CONSTANTS[: len(CONSTANTS) if magnetometer else 1]]
     order = dict.fromkeys([*head, *raw, *plan.columns, *place])
-    return replace(
-        plan, columns={n: plan.columns.get(n, np.full(plan.count, np.nan)) for n in order}
-    )
+    blank = np.full(plan.count, np.nan)
+    columns = {name: plan.columns.get(name, blank) for name in order}
+    return replace(plan, columns=columns, metadata={**plan.metadata, "serial": serial})
 
 
 # --------------------------------------------------------------------------

@@ -52,7 +52,7 @@ class Session:
         """The session of a plan.
 
         Raises:
-            InputError: the plan does not state an attitude, or the profile not the noise of a triad.
+            InputError: the plan does not state an attitude, or the profile neither scale nor noise of a triad.
         """
         readings, scaled = nominal_run(plan, profile)
         readings = replace(readings, profile=scaled)

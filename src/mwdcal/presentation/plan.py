@@ -51,6 +51,10 @@ WITHOUT_VERTICAL = "not at 0°: at the vertical, azimuth and toolface are undefi
 """The line below accuracies by inclination."""
 
 
+BY_HAND = 120.0
+"""Seconds that a person takes for a station beyond move and settling: to set each scale, and to read and note."""
+
+
 class PlannedTriad(msgspec.Struct, frozen=True, kw_only=True):
     """The result of a plan for a triad: uncertainties (1σ) by parameter of the calibration file."""
 
@@ -79,7 +83,8 @@ class DetectableError(msgspec.Struct, frozen=True, kw_only=True):
 class PlanSummary(msgspec.Struct, frozen=True, kw_only=True):
     """The output of `plan` for one plan.
 
-    `soak_hours` are part of `session_hours`. `accuracy_deg` at 45° inclination, as `calibrate` states it without drift;
+    `session_hours` are moves, settling and soaks of a driven stand, `soak_hours` part of them.
+    `accuracy_deg` at 45° inclination, as `calibrate` states it without drift;
     `settings`: the practice of the stand that it rests on, as in a calibration file, and where that is "assumed"
     `accuracy_per_station_deg`, the same on a stand that is set at every station;
     `accuracy_by_inclination_deg` by angle at `inclinations_deg`. `efficiency_bound`: at least this share of the best
@@ -236,8 +241,9 @@ def findings(plans: Sequence[Planned]) -> list[Finding]:
 
 
 def document(
-    plans: Sequence[Planned], digests: Mapping[str, str], output: Path | None, html: Path | None
-) -> dict[str, Any]:
+    plans: Sequence[Planned], digests: Mapping[str, str], output: Path | None, html: Path | None,
+    serial: str,
+) -> dict[str, Any]:  # fmt: skip
     """The result for machines."""
     first, *others = map(_fields, plans)
     content = PlanDocument(
@@ -246,7 +252,7 @@ def document(
         output=str(output or ""),
         html=str(html or ""),
     )
-    return json_document("plan", content, {"simulated": True}, **digests)
+    return json_document("plan", content, {"simulated": True, "serial": serial}, **digests)
 
 
 def screen(
@@ -314,9 +320,13 @@ def comparison_rows(facts: Sequence[PlanSummary]) -> list[list[str]]:
     """The results of the plans, a plan in each column."""
     lines = [
         ["stations", *(str(each.stations) for each in facts)],
-        ["at the stand", *(f"{each.session_hours:.1f} h" for each in facts)],
+        ["at the stand, driven", *(f"{each.session_hours:.1f} h" for each in facts)],
         ["of which soak (--soak)", *(f"{each.soak_hours:.1f} h" for each in facts)],
         ["per station (--speed, --settle)", *(f"{_seconds_each(each):.0f} s" for each in facts)],
+        [
+            f"by hand, {BY_HAND / 60:g} min a station more",
+            *(f"{_by_hand(each):.1f} h" for each in facts),
+        ],
         ["temperature order", *(_orders(each) for each in facts)],
         ["determined", *(f"{each.rank} of {each.size}" for each in facts)],
         ["degrees of freedom", *(_freedom(each) for each in facts)],
@@ -331,6 +341,11 @@ def comparison_rows(facts: Sequence[PlanSummary]) -> list[list[str]]:
             cells = [quantity(each[name], "°", 2) if each else "–" for each in anew]
             lines.append([f"{name}, 1σ if set at every station", *cells])
     return lines
+
+
+def _by_hand(facts: PlanSummary) -> float:
+    """Hours at a stand that a person sets and reads."""
+    return facts.session_hours + facts.stations * BY_HAND / 3600
 
 
 def _seconds_each(facts: PlanSummary) -> float:
@@ -491,8 +506,9 @@ def _banner(planned: Planned) -> dict[str, str]:
         if sd is not None
     )
     headline = (
-        f"{plural(summary.stations, 'station')} – about {summary.session_hours:.1f} h at the stand, "
-        f"{_seconds_each(summary):.0f} s a station and {summary.soak_hours:.1f} h of soak"
+        f"{plural(summary.stations, 'station')} – about {summary.session_hours:.1f} h at a driven stand, "
+        f"{_seconds_each(summary):.0f} s a station and {summary.soak_hours:.1f} h of soak; "
+        f"{_by_hand(summary):.1f} h by hand"
     )
     after = (
         f"{summary.rank} of {summary.size} parameters determined. Accuracy to expect ({PLACE}): "

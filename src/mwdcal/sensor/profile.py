@@ -4,7 +4,7 @@ Instrument polarity and raw units live here and nowhere else: `files.runs` turns
 raw channels into nominal readings along the tool axes with it, and `notation`
 turns fitted parameters back into the instrument's own channels.
 
-The datasheet of a servo instrument: what tolerances are where a profile states none.
+The datasheet of a servo instrument: what tolerances are where a profile states none; and its noise, for plans.
 """
 
 from __future__ import annotations
@@ -290,6 +290,8 @@ SERVO = {
 Scale ± 5 %, bias ± 10 mg, axis alignment ± 2 mrad, scale drift ± 180 ppm/°C, bias drift ± 100 µg/°C.
 The magnetometer: scale ± 2 %, hard iron ± 1 % of 50 µT, alignment ± 4 mrad.
 """
+USUAL_NOISE = {"accelerometer": 1e-4, "magnetometer": 15.0}
+"""Noise of one station's reading of a servo instrument, g and nT, 1σ."""
 AGEING = ("turn_on", "bias_walk", "scale_walk")
 """The changes of a tool between calibrations."""
 USUAL_AGEING = {

@@ -55,6 +55,8 @@ TEMPERATURES = 41
 """Points of a curve over temperature."""
 WIDTH = 7.1
 """Of a figure, inches."""
+LONGEST_LABEL = 40
+"""Characters of a name that a file gives; a longer one would leave its panel no room."""
 NOTE: dict[str, Any] = {"textcoords": "offset points", "color": "#9a3d00", "fontsize": 7}
 """Look of a remark at something marked."""
 STYLE: dict[Any, Any] = {
@@ -661,7 +663,7 @@ class VerdictPlots:
         look: dict[str, Any] = {"color": "#111827" if row.passed else "#9a3d00"}
         value = "not stated" if row.value is None else quantity(row.value, row.unit)
         outcome = f"{value} of {quantity(row.limit, row.unit)}: {'pass' if row.passed else 'FAIL'}"
-        axes.set_title(row.name, **look)
+        axes.set_title(row.name[:LONGEST_LABEL], **look)
         axes.set_title(outcome, loc="right", fontsize=7, **look)
 
     def _look(self, each: JudgedSet, worst: bool) -> tuple[str, tuple[str, str, Any]]:
@@ -671,7 +673,7 @@ class VerdictPlots:
         if not each.label:
             return "stations outside of roll sets", (BEFORE, "p", "-")
         if len(labels) <= len(SERIES):
-            return each.label, SERIES[labels.index(each.label)]
+            return each.label[:LONGEST_LABEL], SERIES[labels.index(each.label)]
         return ("worst roll set", SERIES[0]) if worst else ("other roll sets", OTHER_SETS)
 
     def _draw_set(self, axes: Axes, row: VerdictRow, each: JudgedSet, worst: bool) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Unpack
@@ -16,7 +18,6 @@ from mwdcal.errors import InputError, MwdcalError, QuestionError, QuestionsError
 if TYPE_CHECKING:
     from mwdcal.calibration.readings import Readings
     from mwdcal.calibration.record import Calibration
-    from mwdcal.identification.roll_tests import RollTestTable
     from mwdcal.use.verification import Verdict
 
 
@@ -72,11 +73,15 @@ def command(
     _enter(registry)
     prior, digest = prior_of(typed["prior"])
     readings, profile, test, beside = load_runs(run, rolltest, tool, prior, options.said(decimal))
+    turned, verdict, judged = None, None, ("", "")
+    if test:
+        with _roll_test_as_input():
+            turned = test.readings(profile)
     choice, result = chosen_fit(readings, profile, options_of(typed, prior, exclude, digest), say)
     calibration = recorded(choice, result)
-    turned, verdict, judged, problem = None, None, ("", ""), None
-    if test and rolltest:
-        turned, verdict, judged, problem = _judged(calibration, test, limits, (output, rolltest))
+    if turned is not None and rolltest:
+        with _roll_test_as_input():
+            verdict, judged = _judged(calibration, turned, limits, (output, rolltest))
     rendered = ""
     if report:
         from mwdcal.files.limits import load_limits
@@ -93,34 +98,31 @@ def command(
         else screen.screen(calibration, choice.curves, *files, judged, run if beside else None)
     )
     atomic.write_all([(output, documents.encode(calibration)), (report, rendered)])
-    _enter(registry, output, run, tool, None if problem else rolltest, verdict)
+    _enter(registry, output, run, tool, rolltest, verdict)
     print_result(shown, calibration.findings + (verdict.findings if verdict else []))
-    if problem:
-        raise problem
     sys.exit(0 if verdict is None or verdict.passed else 1)
 
 
 def _judged(
-    calibration: Calibration, test: RollTestTable, limits: str, files: tuple[Path, Path]
-) -> tuple[Readings | None, Verdict | None, tuple[str, str], MwdcalError | None]:
-    """The readings of a roll test, their verdict, its text on screen and what to do next, or the error.
-
-    `files` of calibration and roll test.
-    """
-    from mwdcal.files.limits import load_limits
+    calibration: Calibration, rolltest: Readings, limits: str, files: tuple[Path, Path]
+) -> tuple[Verdict, tuple[str, str]]:
+    """The verdict of a roll test, its text on screen and what to do next; `files` of calibration and roll test."""
     from mwdcal.library.tasks import verify
     from mwdcal.presentation.verification import next_step, screen
 
-    load_limits(limits)
+    verdict = verify(calibration, rolltest, Path(limits))
+    return verdict, (screen(verdict, None), next_step(verdict, *files))
+
+
+@contextmanager
+def _roll_test_as_input() -> Iterator[None]:
+    """Refuse a roll test as an input that cannot be read, before anything is written."""
     try:
-        rolltest = test.readings(calibration.profile)
-        verdict = verify(calibration, rolltest, Path(limits))
+        yield
     except MwdcalError as error:
         problem = _with_options_on_roll_test(error)
         problem.exit_code = InputError.exit_code
-        return None, None, ("", ""), problem
-    shown = screen(verdict, None), next_step(verdict, files[0], files[1])
-    return rolltest, verdict, shown, None
+        raise problem from None
 
 
 def _with_options_on_roll_test(error: MwdcalError) -> MwdcalError:

@@ -71,6 +71,12 @@ from mwdcal.app.messages import print_result
     help="Tool profile: a name that mwdcal list profiles shows, or a TOML file. Or a calibration (JSON): its profile, "
     "the place of its run, and the noise that it estimated if the profile states none."
 )
+@click.option(
+    "--serial",
+    default="",
+    metavar="S",
+    help="Serial of the tool, for plan file and run sheet. Default: that of the calibration, or of the run measured.",
+)
 @options.fit_options("auto", "none", "datasheet", "the tolerances in the tool profile")
 @click.option(
     "-o",
@@ -86,7 +92,8 @@ from mwdcal.app.messages import print_result
 def command(
     plans: tuple[str, ...], stations: int | None, accuracy: tuple[str, ...], measured: Path | None,
     reach: tuple[str, ...], criterion: Literal["D", "A", "I"], speed: float, settle: float, soak: float,
-    tool: str | None, output: Path | None, report: Path | None, as_json: bool, **typed: Unpack[options.FitArguments],
+    tool: str | None, serial: str, output: Path | None, report: Path | None, as_json: bool,
+    **typed: Unpack[options.FitArguments],
 ) -> None:  # fmt: skip
     """Predict a calibration from planned stations: uncertainty, rank, accuracy, hours at the stand.
 
@@ -107,8 +114,8 @@ def command(
         result = planning.plan(
             tool or "generic", plan=plans, stations=stations, measured=measured,
             accuracy_deg=screen.wanted_accuracy(accuracy), reach=screen.reach(reach), criterion=criterion,
-            speed=speed, settle=settle, soak=soak, options=options_of(typed, prior_of(typed["prior"])[0]),
-            progress=show,
+            speed=speed, settle=settle, soak=soak, serial=serial,
+            options=options_of(typed, prior_of(typed["prior"])[0]), progress=show,
         )  # fmt: skip
     if output:
         result.save(output)
