@@ -246,19 +246,15 @@ def test_sheets_that_are_parts_of_one_run_are_joined(tmp_path, sheets, first):
 PLACE = ["Field", "50,000 nT", "Dip", "65.0°", "Tool S/N", "DM-17"]
 
 
-def pages_of(path, sheets, *above, numbers=range(1, 49)):
-    """A workbook of two pages of a run without references in columns; a title block above the first, lines above both."""
-    columns = table(station=[*numbers], **{name: None for name in NAMES if "ref_" in name[:4]})
-    columns |= {
-        NAMES[n]: servo_run()[n] for n in NAMES if n.endswith(("ation_deg", "muth_deg", "face_deg"))
-    }
-    workbook_of(path, columns, sheets)
+def pages_of(path, sheets, line, numbers=range(1, 49)):
+    """A workbook of two pages of a run: a title block with the place on the first, and a line on the other."""
+    references = dict.fromkeys(("ref_gravity_g", "ref_field_nt", "ref_dip_deg"))
+    workbook_of(path, table(station=[*numbers], **references), sheets)
     book = openpyxl.load_workbook(path)
-    for sheet, lines in zip(book, [[PLACE], above], strict=True):
-        sheet.insert_rows(1, len(lines))
-        for row, line in enumerate(lines, 1):
-            for column, value in enumerate(line, 1):
-                sheet.cell(row, column, value)
+    for sheet, above in zip(book, (PLACE, line), strict=True):
+        sheet.insert_rows(1)
+        for column, value in enumerate(above, 1):
+            sheet.cell(1, column, value)
     book.save(path)
     return path
 

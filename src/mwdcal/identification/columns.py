@@ -261,13 +261,17 @@ def _but_for_axes(texts: Iterable[tuple[str, str]]) -> dict[str, dict[str, str]]
 
     `texts`: each with its name.
     """
-    stems: dict[str, dict[str, str]] = {}
+    stems: dict[str, list[tuple[str, str]]] = {}
     for text, name in texts:
         for place, letter in enumerate(text):
             if (axis := letter.lower().translate(LATIN_AXES)) in "xyz":
                 stem = f"{text[:place]} {text[place + 1 :]}"
-                stems.setdefault(stem, {})[axis] = name
-    return {stem: each for stem, each in stems.items() if len(each) == len("xyz")}
+                stems.setdefault(stem, []).append((axis, name))
+    return {
+        stem: dict(each)
+        for stem, each in stems.items()
+        if sorted(axis for axis, _ in each) == [*"xyz"]  # of two triads neither is meant
+    }
 
 
 def _variation(columns: Array) -> float:
@@ -1652,16 +1656,21 @@ def _check_hidden(
     triad: str, channels: Sequence[str], others: Sequence[str], values: Values, source: str
 ) -> None:
     """Refuse a table without a triad of which columns that are not understood begin as its channels do."""
-    hidden = {channel: n for n in others if (channel := begins_as(n)) in channels}
-    if hidden:
-        whole = tuple(
-            ("column", f"{channel}={hidden.get(channel, 'NAME')}") for channel in channels
-        )
-        taken = Answer(with_values(", ".join(hidden.values()), values, *hidden.values()), whole)
+    hidden = [[n for n in others if begins_as(n) == channel] for channel in channels]
+    if any(hidden):
+        whole = zip(*hidden, strict=True) if len({*map(len, hidden)}) == 1 else ()
+        taken = [
+            Answer(
+                with_values(", ".join(each), values, *each),
+                tuple(("column", f"{c}={n}") for c, n in zip(channels, each, strict=True)),
+            )
+            for each in whole
+        ]
+        every = ", ".join(shown(n) for each in hidden for n in each[:2])
         raise QuestionError(
-            f"{source}: {', '.join(map(shown, [*hidden.values()][:6]))} begin as channels of the {triad} do, and end "
-            "in what is no known unit. Are they the channels?",
-            [*([taken] if len(hidden) == len(channels) else []), none_of(*channels)],
+            f"{source}: {every} begin as channels of the {triad} do, and end in what is no known unit. Are they the "
+            "channels?",
+            [*taken, none_of(*channels)],
         )
 
 
