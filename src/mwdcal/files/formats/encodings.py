@@ -58,13 +58,15 @@ def _evidence(data: bytes, encoding: str) -> tuple[int, float]:
         text = data.decode(encoding)
     except UnicodeDecodeError:
         return -1, 0.0
-    found = {match[0].lower() for match in _FIELD_WORDS.finditer(text) if not match[0].isascii()}
+    words_of_field = {
+        match[0].lower() for match in _FIELD_WORDS.finditer(text) if not match[0].isascii()
+    }
     words = set(_OF_ANY_LETTERS.findall(_BEFORE_SYMBOL.sub(" ", text)))
     units = {word for word in words if _UNIT_OR_NUMBER.fullmatch(word)}
     bare = {word.strip(_SIGNS_AROUND) for word in words - units}
     others = [word for word in bare if not word.isascii()]
     of_one = max(sum(_as_word(word, letters) for word in others) for letters in _ALPHABETS)
-    return len(found), len(units) + of_one
+    return len(words_of_field), len(units) + of_one
 
 
 def _as_word(text: str, letters: str) -> float:

@@ -530,9 +530,9 @@ def _is_one_run(tables: Sequence[Layout]) -> bool:
 
 def _continues(table: Layout, first: Layout) -> bool:
     """Whether a sheet calls itself a further page, and states nothing that the first one does not."""
-    own = [x for x in table.above if x not in first.above and not titles([[x]]).metadata]
+    lines = [x for x in table.above if x not in first.above and not titles([[x]]).metadata]
     less = table.titles.metadata.items() <= first.titles.metadata.items()
-    return less and all(map(_OF_PAGE.search, own or [table.sheet]))
+    return less and all(map(_OF_PAGE.search, lines or [table.sheet]))
 
 
 def _has_its_warmth(table: Layout) -> bool:
