@@ -599,3 +599,52 @@ def test_one_question_asks_which_of_two_tools_side_by_side_is_meant(tmp_path):
     assert {("column", "temperature_c=Cradle S/N 12 Temp"), ("serial", "12")} < {
         *question.answers[1].arguments
     }
+
+
+def pairs_of_channels(first, second, name):
+    """A table of channels as measured and, behind them, corrected: in other values, under these words."""
+    names = [*NAMES[:3], *(name.format(word, end) for word in (first, second) for end in CHANNELS)]
+    return [
+        names,
+        *([*row[:9], *(1.02 * value + 0.01 for value in row[3:9])] for row in stations()),
+    ]
+
+
+CORRECTIONS = [
+    ("Uncorrected", "Corrected with previous coefficients"),
+    ("Raw", "Calibrated"),
+    ("Before correction", "After correction"),
+    ("Roh", "Kalibriert"),
+    ("Unkorrigierte", "Korrigierte"),
+    ("Rå", "Korrigert"),
+    ("Ukompensert", "Kompensert"),
+    ("Crudo", "Corregido"),
+    ("Sin corregir", "Corregido"),
+    ("Bruto", "Corrigido"),
+    ("Sem correção", "Com correção"),
+    ("Non corrigé", "Corrigé"),
+    ("Сырые", "Скорректированные"),
+    ("Без поправок", "С поправками"),
+    ("原始值", "修正值"),
+    ("校正前", "校正后"),
+]
+
+
+@pytest.mark.parametrize(("first", "second"), CORRECTIONS)
+@pytest.mark.parametrize("name", ["{0} {1}", "{1} {0}"])
+def test_channels_called_raw_are_taken_beside_those_called_corrected(tmp_path, first, second, name):
+    path = text(tmp_path / "run.csv", [*TITLES, *pairs_of_channels(first, second, name)])
+    proposal = mwdcal.propose_profile(path)
+    columns = [proposal.profile.columns[c].name for c in ("ax", "ay", "az", "mx", "my", "mz")]
+    assert columns == [name.format(first, end) for end in CHANNELS]
+    assert "columns not used" in proposal.findings[-1].text
+    assert name.format(second, CHANNELS[0]) in proposal.findings[-1].text
+
+
+@pytest.mark.parametrize("name", ["{0} {1}", "{1} {0}"])
+def test_neither_of_two_triads_is_taken_by_unknown_words(tmp_path, name):
+    path = text(tmp_path / "run.csv", [*TITLES, *pairs_of_channels("Foo", "Bar", name)])
+    with pytest.raises(mwdcal.FitError) as error:
+        mwdcal.propose_profile(path)
+    offered = [a.arguments[0][1] for a in error.value.questions[0].answers]
+    assert offered[:2] == [f"ax={name.format(word, CHANNELS[0])}" for word in ("Foo", "Bar")]

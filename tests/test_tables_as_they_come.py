@@ -243,6 +243,64 @@ def test_sheets_that_are_parts_of_one_run_are_joined(tmp_path, sheets, first):
     assert read(path, sheet=sheets[0]).count == 16
 
 
+PLACE = ["Field", "50,000 nT", "Dip", "65.0°", "Tool S/N", "DM-17"]
+
+
+def pages_of(path, sheets, line, numbers=range(1, 49)):
+    """A workbook of two pages of a run: a title block with the place on the first, and a line on the other."""
+    references = dict.fromkeys(("ref_gravity_g", "ref_field_nt", "ref_dip_deg"))
+    workbook_of(path, table(station=[*numbers], **references), sheets)
+    book = openpyxl.load_workbook(path)
+    for sheet, above in zip(book, (PLACE, line), strict=True):
+        sheet.insert_rows(1)
+        for column, value in enumerate(above, 1):
+            sheet.cell(1, column, value)
+    book.save(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("sheets", "line"),
+    [
+        (("Page 1", "Page 2"), []),
+        (("стр.1", "стр.2"), ["Протокол, стр. 2 из 2 (продолжение)"]),
+        (("Seite 1", "Seite 2"), ["Tool S/N", "DM-17"]),
+        (("Run A", "Run B"), ["Calibration sheet (continued)"]),
+    ],
+)
+def test_a_further_page_without_a_title_block_is_of_the_run_that_it_numbers_on(
+    tmp_path, sheets, line
+):
+    path = pages_of(tmp_path / "a.xlsx", sheets, line)
+    whole = read(written(tmp_path / "b.csv", table()))
+    np.testing.assert_allclose(read(path).accelerometer, whole.accelerometer, rtol=0, atol=1e-9)
+    ran = mwdcal("profile", path, "-o", tmp_path / "c.toml")
+    assert f"'{sheets[0]}' and '{sheets[1]}' joined as one run" in ran.out
+
+
+@pytest.mark.parametrize(
+    ("sheets", "line", "numbers"),
+    [
+        (("Page 1", "Page 2"), [], [*range(1, 25), *range(1, 25)]),
+        (("Page 1", "Page 2"), [], [*range(1, 25), *range(20, 44)]),
+        (("Page 1", "Page 2"), ["Tool S/N", "DM-18"], range(1, 49)),
+        (("Page 1", "Page 2"), ["Field", "51,000 nT"], range(1, 49)),
+        (("Page 1", "Page 2"), ["another tool"], range(1, 49)),
+        (("DM-17", "DM-18"), [], range(1, 49)),
+        (("Page 1", "Page 2"), ["page 2, as left"], range(1, 49)),
+    ],
+)
+def test_a_further_page_that_may_be_of_another_run_is_asked_about(tmp_path, sheets, line, numbers):
+    path = pages_of(tmp_path / "a.xlsx", sheets, line, numbers=numbers)
+    message = refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
+    assert all(f"--sheet '{name}'" in message or f"--sheet {name}" in message for name in sheets)
+
+
+def test_a_further_page_of_verification_is_no_part_of_the_run(tmp_path):
+    path = pages_of(tmp_path / "a.xlsx", ("Page 1", "Page 2"), ["Verification, page 2"])
+    assert read(path).count == 24
+
+
 @pytest.mark.parametrize(
     ("sheets", "numbers"),
     [

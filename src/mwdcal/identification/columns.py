@@ -261,13 +261,17 @@ def _but_for_axes(texts: Iterable[tuple[str, str]]) -> dict[str, dict[str, str]]
 
     `texts`: each with its name.
     """
-    stems: dict[str, dict[str, str]] = {}
+    stems: dict[str, list[tuple[str, str]]] = {}
     for text, name in texts:
         for place, letter in enumerate(text):
             if (axis := letter.lower().translate(LATIN_AXES)) in "xyz":
                 stem = f"{text[:place]} {text[place + 1 :]}"
-                stems.setdefault(stem, {})[axis] = name
-    return {stem: each for stem, each in stems.items() if len(each) == len("xyz")}
+                stems.setdefault(stem, []).append((axis, name))
+    return {
+        stem: dict(each)
+        for stem, each in stems.items()
+        if sorted(axis for axis, _ in each) == [*"xyz"]  # of two triads neither is meant
+    }
 
 
 def _variation(columns: Array) -> float:
@@ -413,6 +417,19 @@ _BY_TOOL = re.compile(
 """Words of an angle that a stand shows, and of one that the tool tells."""
 _OF_CHANNELS = re.compile(r"\b(measured|meas|gemessen|m[åa]lt|ist)\b", re.IGNORECASE)
 """Those that say nothing more of a channel."""
+_CORRECTION = (
+    r"(corr|korr|[ck]alib|[ck]ompens|[ée]talonn|скорр|откорр|корр|исправ|поправ|калибр|компенс|обработ)[^\W\d_]*|"
+    "校正|修正|标定|校准|补偿"
+)
+_CORRECTED = re.compile(rf"(?<![^\W\d_])({_CORRECTION})|校正|修正|标定|校准|补偿", re.IGNORECASE)
+_UNCORRECTED = re.compile(
+    r"(?<![^\W\d_])((raw|roh|rå)(werte?|daten|data|signale?|verdi(er)?|v[æä]rd[^\W\d_]*)?|crud[oa]s?|brut[oae]?s?|"
+    r"сыр[^\W\d_]*|исходн[^\W\d_]*|(un|u|o|не|(not|nicht|ikke|icke|inte|no|n[ãa]o|non|sin|sem|sans|without|ohne|uten|"
+    rf"utan|без|до|before|vor|f[øö]r|antes d[ea]|avant)( (the|der|la|a))? )({_CORRECTION}))(?![^\W\d_])|"
+    rf"原始(数据|值)?|未经?({_CORRECTION})|({_CORRECTION})前",
+    re.IGNORECASE,
+)
+"""Words of channels that the tool or a laboratory has corrected, and of those beside them that are as measured."""
 _OTHER_NORTH = re.compile(
     r"true|grid|geogr|wahr|gitter|rechtweisend|[qc]uadr[ií]cula|verdadero|verdadeiro|istinn|kartnord|истин|сетк|географ|géogr|真|坐标北|网格",
     re.IGNORECASE,
@@ -704,6 +721,7 @@ def meanings_of(
     results |= _beside_nominal(names, units, results)
     results |= _beside_others(names, units, results)
     results |= _by_axes(names, units, results)
+    results = _with_raw_channels(once, units, results)
     every = [n for n, m in results.items() if m.column == "az"]
     lone = [n for n in every if _BARE_AZ.fullmatch(n)]
     triad = [n for n in every if n not in lone[:1]] or any(_BARE_AX.fullmatch(n) for n in names)
@@ -720,6 +738,25 @@ def meanings_of(
             if m.column == REFERENCES["toolface"].column and unit_of(m.unit) in ("", "°")
         }
     return results
+
+
+def _with_raw_channels(
+    names: Mapping[str, str], units: Sequence[str], meanings: Mapping[str, Resemblance]
+) -> dict[str, Resemblance]:
+    """The meanings with channels that are called raw, and without those called corrected beside them."""
+    called = {
+        n: meaning(_without(_UNCORRECTED, text), unit)
+        for (n, text), unit in zip(names.items(), units, strict=True)
+        if _UNCORRECTED.search(text)
+    }
+    raw = {n: meanings.get(n, m) for n, m in called.items() if m and m.column in RAW}
+    measured = {m.column for m in raw.values()}
+    others = {
+        n: m
+        for n, m in meanings.items()
+        if not (n not in called and m.column in measured and _CORRECTED.search(n))
+    }
+    return others | raw
 
 
 def _explained(names: Sequence[str], above: Sequence[str]) -> dict[str, Resemblance]:
@@ -1643,16 +1680,21 @@ def _check_hidden(
     triad: str, channels: Sequence[str], others: Sequence[str], values: Values, source: str
 ) -> None:
     """Refuse a table without a triad of which columns that are not understood begin as its channels do."""
-    hidden = {channel: n for n in others if (channel := begins_as(n)) in channels}
-    if hidden:
-        whole = tuple(
-            ("column", f"{channel}={hidden.get(channel, 'NAME')}") for channel in channels
-        )
-        taken = Answer(with_values(", ".join(hidden.values()), values, *hidden.values()), whole)
+    hidden = [[n for n in others if begins_as(n) == channel] for channel in channels]
+    if any(hidden):
+        whole = zip(*hidden, strict=True) if len({*map(len, hidden)}) == 1 else ()
+        taken = [
+            Answer(
+                with_values(", ".join(each), values, *each),
+                tuple(("column", f"{c}={n}") for c, n in zip(channels, each, strict=True)),
+            )
+            for each in whole
+        ]
+        every = ", ".join(shown(n) for each in hidden for n in each[:2])
         raise QuestionError(
-            f"{source}: {', '.join(map(shown, [*hidden.values()][:6]))} begin as channels of the {triad} do, and end "
-            "in what is no known unit. Are they the channels?",
-            [*([taken] if len(hidden) == len(channels) else []), none_of(*channels)],
+            f"{source}: {every} begin as channels of the {triad} do, and end in what is no known unit. Are they the "
+            "channels?",
+            [*taken, none_of(*channels)],
         )
 
 

@@ -143,6 +143,8 @@ class TableFormat(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     encoding: Literal[
         "utf-8",
         "utf-16",
+        "utf-16-le",
+        "utf-16-be",
         "cp1252",
         "cp1251",
         "gb18030",
@@ -151,6 +153,9 @@ class TableFormat(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         "cp1254",
         "cp850",
         "cp866",
+        "koi8-r",
+        "iso8859-5",
+        "mac-roman",
     ] = "utf-8"
     delimiter: Literal[",", ";", "\t", "|"] = ","
     decimal: Literal[".", ","] = "."

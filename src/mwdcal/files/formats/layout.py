@@ -161,6 +161,13 @@ _OF_SETTING = re.compile(
     re.IGNORECASE,
 )
 """The name of a sheet that is a setting of the stand or the oven: 77F, Inc 45, Cold."""
+_OF_PAGE = re.compile(
+    r"(?<![^\W\d_])((page|pg|sheet|part|seite|blatt|tabelle|teil|side|ark|del|hoja|p[áa]g(ina)?|parte|folha|planilha|"
+    r"feuille|feuil|partie|стр(аница)?|лист|часть|st(atio)?ns?|punkte?|puntos?|pontos?|точки)\W*\d|"
+    r"(cont(inued|d|inuaci[óo]n|inua[çc][ãa]o)?|forts(etzung|att|ettelse)?|suite|продолж\w*)(?![^\W\d_]))|[页頁续續]",
+    re.IGNORECASE,
+)
+"""Words of a sheet that continues another one, in its name or in a line above its table."""
 _OF_WARMTH = re.compile(r"\W*?([+−-]?\d+(?:[.,]\d+)?)\s*(?:°|deg)?\s*[cf℃]\W*", re.IGNORECASE)
 """The name of a sheet that is a temperature with its unit."""
 _WARMTH_IN_WORDS = re.compile(
@@ -498,16 +505,16 @@ def _kind(words: str, above: Sequence[str] = ()) -> str:
 def _is_one_run(tables: Sequence[Layout]) -> bool:
     """Whether tables of different sheets are parts of one run: alike in names, units and what stands above them.
 
-    Their rows are numbered on from sheet to sheet, or their names are settings of the stand or the oven. A sheet of a
-    roll test, or of a run after an adjustment, is no part.
+    Their rows are numbered on from sheet to sheet, or their names are settings of the stand or the oven. A sheet that
+    continues another one may lack its title block. A sheet of a roll test, or of a run after an adjustment, is no part.
     """
     sheets = [table.sheet for table in tables]
     first = tables[0]
     same = all(
         (t.names, t.units, t.form.decimal) == (first.names, first.units, first.form.decimal)
-        and {**t.titles.metadata, "date": ""} == {**first.titles.metadata, "date": ""}
         for t in tables
     )
+    stated = [{**t.titles.metadata, "date": ""} for t in tables]
     words = [" ".join([t.sheet, *t.above]) for t in tables]
     past = any(_kind("", t.above) for t in tables)
     apart = past or any(ADJUSTED.search(each) or _kind(each) for each in words)
@@ -516,7 +523,16 @@ def _is_one_run(tables: Sequence[Layout]) -> bool:
         return False
     if not all(map(_has_its_warmth, tables)) and not _is_warmth_above(tables):
         return False
+    if stated.count(stated[0]) < len(stated):
+        return _are_numbered_on(tables) and all(_continues(t, first) for t in tables[1:])
     return all(map(_OF_SETTING.fullmatch, sheets)) or _are_numbered_on(tables)
+
+
+def _continues(table: Layout, first: Layout) -> bool:
+    """Whether a sheet calls itself a further page, and states nothing that the first one does not."""
+    lines = [x for x in table.above if x not in first.above and not titles([[x]]).metadata]
+    less = table.titles.metadata.items() <= first.titles.metadata.items()
+    return less and all(map(_OF_PAGE.search, lines or [table.sheet]))
 
 
 def _has_its_warmth(table: Layout) -> bool:

@@ -15,6 +15,7 @@ from mwdcal import extras
 from mwdcal.errors import InputError
 from mwdcal.files.formats import figures, records, text
 from mwdcal.files.formats.columns import WORKBOOKS, at_most, damaged_unless_read, with_merged
+from mwdcal.files.formats.encodings import encoding_of
 from mwdcal.files.formats.layout import LEAST_COLUMNS, Cells, Sheet, is_units
 from mwdcal.files.synonyms import unit_of
 from mwdcal.sensor.profile import TableFormat
@@ -59,7 +60,7 @@ def sheets_of(data: bytes, name: str) -> list[Sheet]:
     if suffix in WORKBOOKS and (suffix != ".xls" or data.startswith(_ARCHIVES)):
         return list(_by_calamine(data, name))
     text.refuse_foreign(data, name, allowed=text.UTF_16)
-    encoding = text.encoding_of(data)
+    encoding = encoding_of(data)
     content = text.decoded(data, encoding, name)
     if _IS_PAGE.search(content[:_LOOKED_AT]):
         return [Sheet("", _rows(records.rows_of_page(content)))]

@@ -33,32 +33,6 @@ from mwdcal.sensor.profile import TableFormat
 # column names, and a line of units below them. `layout` finds this out; `plain` makes of an export the text of a
 # run file whose lines keep their numbers.
 
-_FOREIGN_WORDS = {
-    "cp1251": re.compile(
-        "азимут|зенит|темп|прибор|дата|угол|ускор|магн|поле|точк|номер|град|станц", re.IGNORECASE
-    ),
-    "cp866": re.compile(
-        "азимут|зенит|темп|прибор|дата|угол|ускор|магн|поле|точк|номер|град|станц", re.IGNORECASE
-    ),
-    "cp850": re.compile(
-        r"numéro|série|opérateur|étalonn|gerät|prüf|größe|übers|número|medición|calibración|ângulo|calibração|"
-        r"(?<=\d)°|(?<=[(\[ ])°[CF]?(?=[)\] ]|$)",
-        re.IGNORECASE,
-    ),
-    "gb18030": re.compile("角|温度|磁|加速度|日期|序|编号|工具|方位|井斜|重力|标定|仪器"),
-    "cp932": re.compile("角|温度|磁|加速度|日付|番号|センサ|ツール|方位|傾斜|重力|校正|機器|測定"),
-    "cp1250": re.compile(
-        "kąt|narzędz|świadec|całkow|przyśp|ciąż|położ|ferdeség|térerő|nehézségi|hőmérs|jegyző|gyorsulás|mágnes|"
-        "szerszám|úhel|sklon|zrychlen|teplot|měř|číslo|înclin|unghi|câmp|ubrzan|kut|mjer|naklon",
-        re.IGNORECASE,
-    ),
-    "cp1254": re.compile(
-        "eğim|sıra|sıcaklık|takım|açıklama|ivme|yüzü|yönelim|ölçüm|kalibrasyon|yerçekimi",
-        re.IGNORECASE,
-    ),
-}
-"""Encodings without a mark, and words of the field that show them: single bytes may be ° or ü of another."""
-
 Rows = Sequence[Sequence[str]]
 
 
@@ -74,37 +48,6 @@ def decoded(data: bytes, encoding: str, source: str) -> str:
     if "\0" in text:
         raise InputError(f"{source}: expected text; got a NUL byte. Save the table as text.")
     return text.replace("\r\n", "\n").replace("\r", "\n")
-
-
-def encoding_of(data: bytes) -> str:
-    """The encoding of a text: UTF-16 by its mark, UTF-8 where it is valid, else by its words; cp1252 by default."""
-    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
-        return "utf-16"
-    try:
-        data.decode("utf-8")
-    except UnicodeDecodeError:
-        counts = {e: _words_in(data, e, words) for e, words in _FOREIGN_WORDS.items()}
-        best = max(counts, key=lambda e: counts[e])
-        return best if counts[best] else "cp1252" if _is_text(data, "cp1252") else "cp850"
-    return "utf-8"
-
-
-def _is_text(data: bytes, encoding: str) -> bool:
-    """Whether bytes are text in an encoding."""
-    try:
-        data.decode(encoding)
-    except UnicodeDecodeError:
-        return False
-    return True
-
-
-def _words_in(data: bytes, encoding: str, words: re.Pattern[str]) -> int:
-    """The different words of the field that some bytes hold in an encoding, of which some are no ASCII."""
-    if not _is_text(data, encoding):
-        return 0
-    text = data.decode(encoding)
-    every = {word.lower() for word in words.findall(text)}
-    return len(every) if any(not word.isascii() for word in every) else 0
 
 
 def plain(data: bytes, form: TableFormat, source: str) -> bytes:
