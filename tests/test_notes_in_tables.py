@@ -233,16 +233,38 @@ def test_a_row_without_data_is_left_out(tmp_path, mark):
     assert same(taken(written(tmp_path / "run.csv", lines)), rows)
 
 
-def test_one_question_on_a_number_that_stands_for_none_in_many_columns(tmp_path):
+@pytest.mark.parametrize("cell", ["-9999", "-999.25", "99999.0", "S/L", "k.A."])
+@pytest.mark.parametrize("places", [range(3, 9), range(3, 6), [7], [9]])
+def test_a_row_with_a_number_or_a_code_for_no_reading_is_left_out_and_named(tmp_path, cell, places):
     rows = stations()
-    lines = lines_of([[*rows[0][:3], *[-9999] * 6, rows[0][9]], *rows], NAMES)
-    path = written(tmp_path / "run.csv", lines)
-    with pytest.raises(mwdcal.FitError, match="left out") as caught:
-        mwdcal.propose_profile(path)
-    ((answer,),) = [question.answers for question in caught.value.questions]
-    assert len(answer.arguments) == 6
-    leave_out = {name: [cell] for each in answer.arguments for name, cell in [each[1].split("=")]}
-    assert same(taken(path, leave_out=leave_out), rows)
+    lost = [cell if k in places else value for k, value in enumerate(rows[0])]
+    path = written(tmp_path / "run.csv", lines_of([lost, *rows], NAMES))
+    proposal = mwdcal.propose_profile(path)
+    assert same(taken(path), rows)
+    assert cell in f"{proposal.summary()} {proposal.findings}"
+
+
+@pytest.mark.parametrize(
+    "note",
+    ["bumped, rejected", "støtte borti stativet, forkastet - omtatt under", "mobil i lomma!! forkastet",
+     "受干扰，作废", "помеха, брак"],
+)  # fmt: skip
+def test_a_row_that_is_rejected_behind_a_reason_is_left_out(tmp_path, note):
+    rows = stations()
+    lines = noted([WARM_UP, *rows], "Remark", [note, *[""] * len(rows)])
+    assert same(taken(written(tmp_path / "run.csv", lines)), rows)
+
+
+@pytest.mark.parametrize("note", ["gestört, LKW", "PERTURBADO - pasó montacargas", "受干扰"])
+def test_a_row_said_to_be_disturbed_is_left_out_where_its_readings_show_it(tmp_path, note):
+    rows = stations()
+    disturbed = [*rows[0][:3], *(value + 0.05 for value in rows[0][3:6]), *rows[0][6:]]
+    notes = [note, *[""] * len(rows)]
+    bad = written(tmp_path / "bad.csv", noted([disturbed, *rows], "Remark", notes))
+    assert same(taken(bad), rows)
+    good = written(tmp_path / "good.csv", noted(rows, "Remark", notes[:-1]))
+    with pytest.raises(mwdcal.FitError, match="rejected station"):
+        taken(good)
 
 
 @pytest.mark.parametrize(

@@ -243,7 +243,7 @@ def test_sheets_that_are_parts_of_one_run_are_joined(tmp_path, sheets, first):
     assert read(path, sheet=sheets[0]).count == 16
 
 
-PLACE = ["Field", "50,000 nT", "Dip", "65.0°", "Tool S/N", "DM-17"]
+ABOVE_PAGES = ["Field", "50,000 nT", "Dip", "65.0°", "Tool S/N", "DM-17"]
 
 
 def pages_of(path, sheets, line, numbers=range(1, 49)):
@@ -251,7 +251,7 @@ def pages_of(path, sheets, line, numbers=range(1, 49)):
     references = dict.fromkeys(("ref_gravity_g", "ref_field_nt", "ref_dip_deg"))
     workbook_of(path, table(station=[*numbers], **references), sheets)
     book = openpyxl.load_workbook(path)
-    for sheet, above in zip(book, (PLACE, line), strict=True):
+    for sheet, above in zip(book, (ABOVE_PAGES, line), strict=True):
         sheet.insert_rows(1)
         for column, value in enumerate(above, 1):
             sheet.cell(1, column, value)
@@ -533,7 +533,7 @@ def test_a_number_of_nines_among_others_like_it_is_a_reading(tmp_path):
     assert read(written(tmp_path / "c.csv", table(**mg))).count == 48
     mg["az"][5] = 9999
     path = written(tmp_path / "b.csv", table(**mg))
-    assert "got '9999" in refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
+    assert read(path).count == 47
 
 
 def test_blank_angles_of_the_stand_are_named(tmp_path):
@@ -1128,7 +1128,7 @@ def test_values_that_contradict_their_unit_are_asked_about(tmp_path, column, fac
     assert f"are those of {fits}" in message
 
 
-@pytest.mark.parametrize("text", ["#N/A", "74..95", "9999.99", "-999.25"])
+@pytest.mark.parametrize("text", ["#N/A", "74..95", "see note"])
 @pytest.mark.parametrize("column", ["ref_azimuth_deg", "ay"])
 def test_a_cell_without_a_reading_is_named_with_the_option_that_leaves_its_row_out(
     tmp_path, column, text

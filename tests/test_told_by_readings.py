@@ -404,7 +404,7 @@ def test_the_temperature_of_the_oven_is_named(tmp_path):
     assert "oven-temperature" not in findings_of(plain)
 
 
-def test_a_number_that_stands_for_no_reading_is_asked_about_among_readings_of_its_size(tmp_path):
+def test_a_number_that_stands_for_no_reading_is_left_out_among_readings_of_its_size(tmp_path):
     columns = table()
     columns["Hy (V)"] = np.round(np.asarray(columns["Hy (V)"]) * 20_000, 1)
     columns["Hx (V)"], columns["Hz (V)"] = (
@@ -412,7 +412,8 @@ def test_a_number_that_stands_for_no_reading_is_asked_about_among_readings_of_it
     )
     columns["Hy (V)"][5] = 9999.99
     path = written(tmp_path / "a.csv", columns)
-    assert "got '9999.99'" in refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
+    assert "line 7 ('Hy (V)': 9999.99)" in findings_of(library.propose_profile(path))["marked-rows"]
+    assert read(path).count == 47
 
 
 @pytest.mark.parametrize("indices", ["XYZ", "123", "012"])
@@ -653,7 +654,9 @@ def test_channels_named_by_axis_and_triad_in_two_blocks_of_the_same_stations(tmp
     assert [used[c].name for c in ("ax", "mz")] == ["XA (V)", "ZM (V)"]
 
 
-def test_a_row_with_a_remark_counts_where_its_readings_fit_and_is_asked_about_else(tmp_path):
+def test_a_row_with_a_remark_counts_where_its_readings_fit_and_is_left_out_where_it_alone_does_not(
+    tmp_path,
+):
     note = ["forklift moved, waited" if k == 20 else "" for k in range(48)]
     path = written(tmp_path / "a.csv", table(Note=note))
     proposal = library.propose_profile(path)
@@ -671,8 +674,10 @@ def test_a_row_with_a_remark_counts_where_its_readings_fit_and_is_asked_about_el
     run = table(Note=note)
     run["Hx (V)"] = np.array(run["Hx (V)"])
     run["Hx (V)"][20] += 0.3
+    assert read(written(tmp_path / "b.csv", run)).count == 46
+    run["Hx (V)"][25] += 0.3
     with pytest.raises(FitError, match="keep='Note=forklift moved, waited'"):
-        library.propose_profile(written(tmp_path / "b.csv", run))
+        library.propose_profile(written(tmp_path / "c.csv", run))
 
 
 @pytest.mark.parametrize(

@@ -30,10 +30,10 @@ _REJECTED = re.compile(rf"\W*({OF_REFUSAL})\W*|\W*({OF_REFUSAL})\s*[-–—:;,.(
 """A cell that rejects its row, whatever reason follows."""
 _DOES_NOT_COUNT = re.compile(rf"(\D*[,;:–(/-]\s*)?({NOT_TO_USE})\W*")
 """A cell that says so, behind a reason without the number of another row: warm-up, not used."""
-_REJECTS_BEHIND = re.compile(
-    rf"(\D*[,;:–(/-]\s*)({OF_REFUSAL})\W*|(duplicate|duplikat|duplicad[oa]|doublon|дубл\w*|重复).*"
-)
-"""A meaning in a legend that does so behind a reason, or is that of a copy."""
+_REJECTS_BEHIND = re.compile(rf"(\D*[,;:–(/!.，；：。！（-]\s*)({OF_REFUSAL})(\W+\D*)?")
+"""A cell that does so behind a reason, without the number of another row: bumped, rejected."""
+_OF_COPIES = re.compile(r"(duplicate|duplikat|duplicad[oa]|doublon|дубл\w*|重复).*")
+"""A meaning in a legend that is that of copies of rows."""
 _SUPERSEDED = re.compile(
     r"\W*(superseded.*|(replaced|ersetzt|erstattet|reemplazad[oa]|sustituid[oa]|substituid[oa]|remplacee?|"
     r"замен[еи]н[оаы]?) (by|with|durch|av|por|pel[oa]|par|на)\D{0,15}\d{1,3}\W*)"
@@ -45,9 +45,9 @@ _DISTURBED = re.compile(
 )
 """Words of a disturbance."""
 _MAY_REJECT = re.compile(
-    rf"{_DISTURBED.pattern}|(?<![^\W\d_])({OF_REFUSAL}|{NOT_TO_USE}|fail(ed)?|error|ng|gestort|unstable|instabil|"
+    rf"{_DISTURBED.pattern}|(?<![^\W\d_])({OF_REFUSAL}|{NOT_TO_USE}|fail(ed)?|error|ng|gestort|unstable|instabil|perturbad[oa]|forstyrret|помех\w*|"
     r"outlier|suspect|questionable|doubtful|ausreißer|ausreisser|fehler|avvik|nicht bestanden|falha|fallo|выброс|сбой)"
-    r"(?![^\W\d_])|异常|可疑"
+    r"(?![^\W\d_])|异常|可疑|干扰"
 )
 """A cell that may reject its row, or speak of another one."""
 _MEASURED_AGAIN = re.compile(
@@ -178,11 +178,7 @@ def _verdicts(name: str, cells: Sequence[str]) -> dict[str, bool]:
         return dict.fromkeys(filled & _DENIED, True)
     if judges and _OF_REJECTION.fullmatch(name) and filled <= _AFFIRMED | _DENIED:
         return dict.fromkeys(filled & _AFFIRMED, True)
-    verdicts = {
-        c: True
-        for c in filled
-        if _REJECTED.fullmatch(c) or _SUPERSEDED.fullmatch(c) or _does_not_count(c)
-    }
+    verdicts = {c: True for c in filled if _rejects(c) or _SUPERSEDED.fullmatch(c)}
     verdicts |= {c: False for c in filled if c not in verdicts and _MAY_REJECT.search(c)}
     accepted = {c for c in filled if _ACCEPTED.fullmatch(_REMARK_BEHIND.sub("", c))}
     if 2 * sum(map(accepted.__contains__, cells)) < len(cells):
@@ -194,8 +190,15 @@ def _verdicts(name: str, cells: Sequence[str]) -> dict[str, bool]:
     return verdicts
 
 
-def _does_not_count(text: str) -> bool:
-    """Whether a text says that its row does not count, and nothing of one that was measured again."""
+def _rejects(text: str) -> bool:
+    """Whether a text rejects its row: at once, or behind a reason other than that it was measured again.
+
+    >>> [_rejects(text) for text in ("bad; door open", "bumped, rejected", "repeat of the one before, rejected")]
+    [True, True, False]
+    """
+    behind = _REJECTS_BEHIND.fullmatch(text)
+    if _REJECTED.fullmatch(text) or (behind and not _MEASURED_AGAIN.search(behind[1])):
+        return True
     return bool(_DOES_NOT_COUNT.fullmatch(text)) and not _MEASURED_AGAIN.search(text)
 
 
@@ -216,7 +219,7 @@ def by_legend(
         out = [
             c
             for c, m in meanings.items()
-            if (_REJECTED.fullmatch(m) or _REJECTS_BEHIND.fullmatch(m) or _does_not_count(m))
+            if (_rejects(m) or _OF_COPIES.fullmatch(m))
             or (is_check(_REMARK_BEHIND.sub("", m)) and 2 * cells.count(c) < table.count)
         ]
         if out:

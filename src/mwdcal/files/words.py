@@ -78,7 +78,7 @@ TRANSLATIONS = (
         r"inklination( des)? (erd)?(magnet)?felde?s?|"
         r"복각|magneettinen kaltevuus|magn\w* kaltevuus|magneticka inklinace|manyetik egim|inklinacja( pola|"
         r" magn\w*)?|magn\w* inklinacio|inclinazione magn\w*|magn\w* inclinatie|"
-        r"magn\w* (inklination|lutning)|inklinasi( magnet\w*)?|伏角|"
+        r"\bfall(vinkel)?\b|magn\w* (inklination|lutning)|inklinasi( magnet\w*)?|伏角|"
         r"(угол )?(магнитн\w* )?наклонени[ея]|\bдип\b|(地磁|磁)倾角?|incl\w*\.? magn\w*\.?|"
         r"(magn\w*|felt|feld|field) ?[-_ ]?inkl\w*|mergulho( magn\w*)?|echado|buzamiento|(field|magnetic) inclination",
         "dip ",

@@ -23,6 +23,7 @@ from mwdcal.files.contract import (
     units_of,
 )
 from mwdcal.files.formats.columns import LABELS, shown
+from mwdcal.files.formats.layout import OF_CHECKS, OF_ROLLS
 from mwdcal.files.formats.title_references import EARTH_FIELD
 from mwdcal.files.formats.titles import titles
 from mwdcal.files.profiles import setting
@@ -423,6 +424,7 @@ _CORRECTION = (
 )
 _CORRECTED = re.compile(rf"(?<![^\W\d_])({_CORRECTION})|校正|修正|标定|校准|补偿", re.IGNORECASE)
 _UNCORRECTED = re.compile(
+    r"((leituras?|lecturas?|avlesning|ablesung|valor(es)?|valeurs?|показания?|значения?)[ _]+)?"
     r"(?<![^\W\d_])((raw|roh|rå)(werte?|daten|data|signale?|verdi(er)?|v[æä]rd[^\W\d_]*)?|crud[oa]s?|brut[oae]?s?|"
     r"сыр[^\W\d_]*|исходн[^\W\d_]*|(un|u|o|не|(not|nicht|ikke|icke|inte|no|n[ãa]o|non|sin|sem|sans|without|ohne|uten|"
     rf"utan|без|до|before|vor|f[øö]r|antes d[ea]|avant)( (the|der|la|a))? )({_CORRECTION}))(?![^\W\d_])|"
@@ -531,8 +533,8 @@ _SPOKEN_WARMTH = {
 }
 """Units of temperatures in a line above a table, not those of a number."""
 _SURROUNDINGS = re.compile(
-    r"oven|chamber|ambient|panel|logger|(?<![a-z])p_?temp(?![a-z])|kamer\b|(?<![a-z])(air|room|bath|lab)(?![a-z])|ofen|kammer|sala|habitaci|oficina|umgebung|raum|ovn|rom|horno|ambiente|"
-    r"камер|печ|термостат|环境|烘箱|室温",
+    r"oven|chamber|ambient|panel|logger|(?<![a-z])p_?temp(?![a-z])|kamer\b|(?<![a-z])(air|aire|ar|luft|room|bath|lab)(?![a-z])|ofen|kammer|sala|habitaci|oficina|umgebung|raum|ovn|rom|horno|ambiente|"
+    r"камер|печ|термостат|воздух|空气|环境|烘箱|室温",
     re.IGNORECASE,
 )
 """What has a temperature of its own that is not the tool's."""
@@ -721,7 +723,7 @@ def meanings_of(
     results |= _beside_nominal(names, units, results)
     results |= _beside_others(names, units, results)
     results |= _by_axes(names, units, results)
-    results = _with_raw_channels(once, units, results)
+    results = _without_roll_test(_with_raw_channels(once, units, results))
     every = [n for n, m in results.items() if m.column == "az"]
     lone = [n for n in every if _BARE_AZ.fullmatch(n)]
     triad = [n for n in every if n not in lone[:1]] or any(_BARE_AX.fullmatch(n) for n in names)
@@ -757,6 +759,13 @@ def _with_raw_channels(
         if not (n not in called and m.column in measured and _CORRECTED.search(n))
     }
     return others | raw
+
+
+def _without_roll_test(meanings: Mapping[str, Resemblance]) -> dict[str, Resemblance]:
+    """The meanings without columns below the title of a roll test, where another column has what each has."""
+    tests = {n for n in meanings if OF_CHECKS.search(n) and OF_ROLLS.search(n)}
+    of_run = {m.column for n, m in meanings.items() if n not in tests}
+    return {n: m for n, m in meanings.items() if n not in tests or m.column not in of_run}
 
 
 def _explained(names: Sequence[str], above: Sequence[str]) -> dict[str, Resemblance]:

@@ -111,15 +111,13 @@ def question_on_mark(table: Table, name: str, cell: str, rows: Sequence[int]) ->
     )
 
 
-def question_on_cells(table: Table, rows: Mapping[str, int], cells: Sequence[str]) -> QuestionError:
-    """Ask whether rows with some cells that are no readings are left out; the first row of them in each column."""
-    (name, row), *others = rows.items()
+def question_on_cells(table: Table, name: str, row: int, cells: Sequence[str]) -> QuestionError:
+    """Ask whether the rows with some cells that are no numbers are left out; `row` is the first of them."""
     got = shown(cells[0]) if cells[0] else "a blank cell"
-    also = f", and in {listed([shown(n) for n, _ in others], len(RAW))}" if others else ""
-    problem = f"expected a reading; got {got}{also}. Are such rows to be left out?"
-    out = tuple(("leave_out", f"{name}={cell}") for name in rows for cell in cells)
+    problem = f"expected a reading; got {got}. Is its row to be left out?"
     return QuestionError(
-        str(cell_error(table, name, row, problem)), [Answer("leave such rows out", out)]
+        str(cell_error(table, name, row, problem)),
+        [Answer("leave such rows out", tuple(("leave_out", f"{name}={cell}") for cell in cells))],
     )
 
 
@@ -143,8 +141,7 @@ def check_cells(table: Table, columns: Mapping[str, ColumnSource]) -> None:
         for column, source in columns.items()
         if column in RANGES
     }
-    questions = list[QuestionError]()
-    alike: dict[tuple[str, ...], dict[str, int]] = {}
+    questions = []
     for column, values in raw.items():
         factor, offset = (
             FACTORS.get(columns[column].unit, (1.0, 0.0)) if units_of(column) else (1.0, 0.0)
@@ -163,11 +160,11 @@ def check_cells(table: Table, columns: Mapping[str, ColumnSource]) -> None:
         name, rows = columns[column].name, np.flatnonzero(wrong).tolist()
         cells = labels(table, name)
         each = [*dict.fromkeys(cells[row] for row in rows)]
-        if few:
-            alike.setdefault(tuple(each), {})[name] = rows[0]
-        else:
-            questions.append(_question_on_warmth(table, name, len(rows), each))
-    questions += [question_on_cells(table, first, cells) for cells, first in alike.items()]
+        questions.append(
+            question_on_cells(table, name, rows[0], each)
+            if few
+            else _question_on_warmth(table, name, len(rows), each)
+        )
     if questions:
         raise QuestionsError(table.source, questions)
 
@@ -426,13 +423,15 @@ def propose(
     except (QuestionError, QuestionsError) as error:
         if blank := _cells_without_reading(error, leave_out or {}):
             return again(leave_out=blank, keep=keep)
-        if disturbed := _disturbed_rows(error):
+        if doubtful := _doubtful_rows(error):
             with suppress(InputError, FitError):
-                proposal = again(leave_out=leave_out, keep=_with_rows(keep or {}, disturbed))
-                if proposal.all_fit:
-                    return proposal._replace(
-                        remarks=(*proposal.remarks, _sentence_on_kept(disturbed))
-                    )
+                proposal = again(leave_out=leave_out, keep=_with_rows(keep or {}, doubtful))
+                if proposal.all_fit and all(is_disturbance(t.partition("=")[2]) for t in doubtful):
+                    remarks = (*proposal.remarks, _sentence_on_kept(doubtful))
+                    return proposal._replace(remarks=remarks)
+                others = again(leave_out=_with_rows(leave_out or {}, doubtful), keep=keep)
+                if others.all_fit and not proposal.all_fit:
+                    return others
         if by_readings := _answer_by_readings(error, with_answers, names, table):
             return by_readings
         raise
@@ -442,14 +441,14 @@ def _questions_of(error: QuestionError | QuestionsError) -> Sequence[QuestionErr
     return error.questions if isinstance(error, QuestionsError) else (error,)
 
 
-def _disturbed_rows(error: QuestionError | QuestionsError) -> dict[str, str]:
-    """What questions say of rows with a remark on a disturbance, by COLUMN=TEXT."""
+def _doubtful_rows(error: QuestionError | QuestionsError) -> dict[str, str]:
+    """What questions say of rows with a remark that may reject them, by COLUMN=TEXT."""
     return {
         text: each.text.partition(": ")[2].partition(". Is that")[0]
         for each in _questions_of(error)
         for answer in each.answers
         for option, text in answer.arguments
-        if option == "keep" and is_disturbance(text.partition("=")[2])
+        if option == "keep"
     }
 
 
@@ -479,14 +478,28 @@ def _cells_without_reading(
     for arguments in only:
         texts = [text for option, text in arguments if option == "leave_out"]
         cells = [text.partition("=")[2] for text in texts]
-        if len(texts) == len(arguments) and all(
-            WITHOUT_VALUE.fullmatch(cell) or (cell[:1] != "#" and NO_READING.fullmatch(cell))
-            for cell in cells
-        ):
+        if len(texts) == len(arguments) and all(map(_says_no_reading, cells)):
             out += texts
     return _with_rows(leave_out, out) if out else {}
 
 
+def _says_no_reading(cell: str) -> bool:
+    """Whether a cell is blank, says that there is no reading, or is a number of nines that stands for none.
+
+    >>> [_says_no_reading(cell) for cell in ("", "n/a", "S/L", "-999.25", "-9999.00")]
+    [True, True, True, True, True]
+    >>> [_says_no_reading(cell) for cell in ("#N/A", "0.98x", "991", "see note")]
+    [False, False, False, False]
+    """
+    if WITHOUT_VALUE.fullmatch(cell) or _NINES.fullmatch(cell):
+        return True
+    return cell[:1] != "#" and bool(NO_READING.fullmatch(cell) or _TWO_LETTERS.fullmatch(cell))
+
+
+_NINES = re.compile(r"-?9{3,}(\.0+|\.9+|\.25)?")
+"""A number by which loggers say that there is none."""
+_TWO_LETTERS = re.compile(r"[^\W\d_]\W?[^\W\d_]\W?")
+"""Two letters in place of a number: S/L, k.A."""
 _OF_THE_PLACE = tuple(REFERENCES[name].column for name in STATED_REFERENCES)
 _WITHOUT_RESULT = "its formulas have no value, as no spreadsheet program has saved them"
 
@@ -951,7 +964,7 @@ def _numbers_of(table: Table, problems: dict[str, QuestionError], name: str) -> 
             cell for cell in dict.fromkeys(cells) if cell and not looks_numeric(cell, table.decimal)
         ]
         if wrong and 2 * sum(map(is_figure, cells)) > table.count:
-            problems[name] = question_on_cells(table, {name: cells.index(wrong[0])}, wrong)
+            problems[name] = question_on_cells(table, name, cells.index(wrong[0]), wrong)
         elif wrong and 2 * sum(any(map(str.isdecimal, cell)) for cell in cells) > table.count:
             called = meaning(name)
             if called and called.column in _OF_READINGS:

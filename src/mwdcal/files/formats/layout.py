@@ -131,7 +131,7 @@ _OF_PAST_RUN = re.compile(
     re.IGNORECASE,
 )
 """Words of a run that another one superseded."""
-_OF_ROLL_TEST = re.compile(
+OF_CHECKS = re.compile(
     r"(?<![^\W\d_])(roll[\s_-]*(test|over|check)|rt|verif\w*|check|valid\w*|(roll)?pr(ue|ü)fung|"
     r"[ck]ontrol\w*[- ]?(run|shot|test|roll|messung|dreh|måling|rull)\w*|rull(e|ings)test|rulleprøve|prueba|"
     r"ролл-?тест\w*|nachkontrolle|"
@@ -142,7 +142,7 @@ _OF_ROLL_TEST = re.compile(
     re.IGNORECASE,
 )
 """Words of a sheet whose rows are to check a calibration."""
-_OF_ROLLS = re.compile(
+OF_ROLLS = re.compile(
     r"roll|rull|rola[gm]|roul|ролл|rot|dreh|giro|вращ|回転|滚|旋转|(calib|kalib|калиб|标定)",
     re.IGNORECASE,
 )
@@ -494,11 +494,9 @@ def _kind(words: str, above: Sequence[str] = ()) -> str:
     """
     if any(map(_OF_PAST_RUN.search, above)):
         return "superseded run"
-    if any(
-        _OF_ROLL_TEST.match(line) and _OF_ROLLS.search(line.partition("(")[0]) for line in above
-    ):
+    if any(OF_CHECKS.match(line) and OF_ROLLS.search(line.partition("(")[0]) for line in above):
         return ROLL_TEST
-    kinds = (("void run", _OF_VOID_RUN), (ROLL_TEST, _OF_ROLL_TEST))
+    kinds = (("void run", _OF_VOID_RUN), (ROLL_TEST, OF_CHECKS))
     return next((kind for kind, pattern in kinds if pattern.search(words)), "")
 
 
@@ -745,7 +743,8 @@ def _with_side_blocks_above(rows: list[tuple[int, Cells]]) -> list[tuple[int, Ce
         if not filled or len(block) < 2 or 2 * max(counts[k] for k in block) >= len(readings):
             continue
         stated = [(-1, [row[k] for k in block if k < len(row)]) for _, row in rows[first:]]
-        if stated_above([row for _, row in stated]).metadata:
+        table = any(_is_reading(row) for _, row in stated)
+        if not table and stated_above([row for _, row in stated]).metadata:
             above += [each for each in stated if any(each[1])]
             rows = rows[:first] + [
                 (n, ["" if k in block else c for k, c in enumerate(row)]) for n, row in rows[first:]
@@ -972,7 +971,10 @@ def _begins_anew(rows: Sequence[tuple[int, Cells]], heads: Sequence[int], place:
     between = [
         " ".join(map(as_text, row)) for _, row in rows[heads[-1] : place] if not _is_reading(row)
     ]
-    if any(ADJUSTED.search(text) or _OF_ROLL_TEST.search(text) for text in between[1:]):
+    of_check = heads[-1] and OF_CHECKS.search(_text(rows[heads[-1] - 1][1]))
+    if (of_check and between[1:]) or any(
+        ADJUSTED.search(text) or OF_CHECKS.search(text) for text in between[1:]
+    ):
         return True
     first = _triads_in(" ".join(_text(row) for _, row in rows[max(0, heads[-1] - 1) : heads[-1]]))
     if first and _triads_in(" ".join(between[1:])) - first:
@@ -1320,14 +1322,14 @@ def _stands_over_check(
     they do not count.
     """
     text = _text(line[1])
-    if not _OF_ROLL_TEST.search(text) or _OF_DONE.search(text):
+    if not OF_CHECKS.search(text) or _OF_DONE.search(text):
         return False
     if re.search(NOT_TO_USE, text, re.IGNORECASE):
         return True
     last = next((row for _, row in reversed(above) if _is_reading(row)), ())
     pairs = zip(map(_number, last), map(_number, below[1]), strict=False)
     steps = [b - a for a, b in pairs if a is not None and b is not None][:2]
-    return 1.0 not in steps and bool(_OF_ROLLS.search(text) or len(text.split()) <= 2)
+    return 1.0 not in steps and bool(OF_ROLLS.search(text) or len(text.split()) <= 2)
 
 
 def _both(unit: str, by_cells: str) -> str:

@@ -121,7 +121,7 @@ _UNSURE = re.compile(
     r"toolface|survey|tool face",
 )
 """Words by which a value is no reference."""
-_BEFORE = re.compile(r"[^\W\d_]*\W{0,2}[^\W\d_]*\W*$")
+_BEFORE = re.compile(r"[^\W\d_]*[^\w/|]{0,2}[^\W\d_]*[^\w/|]*$")
 """The two words before a quantity, of which one may say that its value is no reference."""
 _OF_COMPONENT = re.compile(
     r"horizont\w*|vertical\w*|vertik\w*|compon\w*|kompon\w*|poziom\w*|pionow\w*|skladow\w*|горизонт\w*|верти\w*|"
