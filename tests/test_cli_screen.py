@@ -213,7 +213,7 @@ def test_plain_twins_of_what_an_encoding_lacks():
 
 
 VOCABULARIES = (
-    "words.py", "titles.py", "title_references.py", "settings.py", "marks.py", "depths.py",
+    "words.py", "titles.py", "title_references.py", "settings.py", "marks.py", "depths.py", "encodings.py",
 )  # fmt: skip
 
 

@@ -247,7 +247,7 @@ def test_a_row_with_a_number_or_a_code_for_no_reading_is_left_out_and_named(tmp_
 @pytest.mark.parametrize(
     "note",
     ["bumped, rejected", "støtte borti stativet, forkastet - omtatt under", "mobil i lomma!! forkastet",
-     "受干扰，作废", "помеха, брак"],
+     "受干扰，作废", "помеха, брак", "DESCARTAR: pasó un camión", "отбросить"],
 )  # fmt: skip
 def test_a_row_that_is_rejected_behind_a_reason_is_left_out(tmp_path, note):
     rows = stations()
@@ -300,3 +300,63 @@ def test_a_constant_inclination_of_the_reference_is_the_dip(tmp_path):
     run = taken(written(tmp_path / "run.csv", lines))
     assert np.all(tables.numbers(run, "ref_dip_deg") == 63.0)
     assert same(run, rows)
+
+
+@pytest.mark.parametrize("marks", ["AB", ["front", "rear"]])
+def test_readings_of_two_tools_in_turn_are_asked_about(tmp_path, marks):
+    """The second tool reads 1 % more, with other offsets; repeats of one tool differ by noise alone."""
+    rows = stations()
+    other = [[*row[:3], *(1.01 * v + 0.02 for v in row[3:9]), row[9]] for row in rows]
+    noise = np.random.default_rng(5).normal(0, 1e-3, (len(rows), 6))
+    again = [[*row[:3], *(np.add(row[3:9], e)), row[9]] for row, e in zip(rows, noise, strict=True)]
+
+    def table_of(second):
+        pairs = [
+            [k, mark, *row]
+            for k, both in enumerate(zip(rows, second, strict=True))
+            for mark, row in zip(marks, both, strict=True)
+        ]
+        return written(tmp_path / "run.csv", lines_of(pairs, ["Pos", "Unit", *NAMES]))
+
+    path = table_of(other)
+    with pytest.raises(mwdcal.FitError, match="differ by 'Unit'") as caught:
+        taken(path)
+    assert [answer.name for answer in caught.value.answers][:2] == [*marks]
+    assert same(taken(path, leave_out={"Unit": [marks[1]]}), rows)
+    assert taken(path, keep={"Unit": [marks[0]]}).count == len(rows)
+    assert taken(table_of(again)).count == len(rows)
+
+
+def test_a_roll_test_above_the_run_is_no_part_of_it(tmp_path):
+    rows = stations()
+    lines = lines_of(rows, NAMES)
+    path = written(
+        tmp_path / "run.csv",
+        ["一、滚转测试（仅检查，不参加标定）", *lines[:9], "", "二、标定数据", *lines],
+    )
+    assert same(taken(path), rows)
+
+
+def test_a_roll_test_to_the_right_of_the_run_is_no_part_of_it(tmp_path):
+    rows, names = stations(), [*NAMES]
+    blank = [""] * len(names)
+    head = [["标定数据(静态)", *blank, "滚转试验(仅供检验,不参与标定)"], [*names, "", *names]]
+    both = [[*row, "", *(rows[k] if k < 12 else blank)] for k, row in enumerate(rows)]
+    lines = [";".join(map(str, row)) for row in [*head, *both]]
+    assert same(taken(written(tmp_path / "run.csv", lines)), rows)
+
+
+def test_raw_channels_are_taken_beside_those_of_a_previous_calibration(tmp_path):
+    rows = stations()
+    titles = [
+        "",
+        "",
+        "",
+        *["Leitura bruta"] * 6,
+        "",
+        *["Valor corrigido (calibração anterior)"] * 6,
+    ]
+    names = [*NAMES, *NAMES[3:9]]
+    corrected = [[*row, *(v * 1.01 for v in row[3:9])] for row in rows]
+    lines = [";".join(map(str, row)) for row in [titles, names, *corrected]]
+    assert same(taken(written(tmp_path / "run.csv", lines)), rows)

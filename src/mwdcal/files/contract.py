@@ -106,7 +106,7 @@ MAPPED = (*COLUMNS, "serial", *REFERENCE_VECTORS)
 """Columns that a table may have under another name."""
 _UNITS_BY_END = {
     "deg": ("°", "rad", "gon"),
-    "g": ("g", "mg", "m/s²", "gal", "mGal"),
+    "g": ("g", "mg", "m/s²", "gal", "mGal", "ft/s²"),
     "nt": ("nT", "µT", "mT", "gauss", "mG", "A/m"),
     "c": ("°C", "°F", "K"),
 }

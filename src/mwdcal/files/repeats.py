@@ -28,6 +28,8 @@ _ONE_SETTING = 0.05
 """Degrees by which an encoder of the stand shows one setting differently at most."""
 _ONE_READING = 0.03
 """Share of a triad's range by which readings of one station depart from their mean at most."""
+_OF_ANOTHER_TOOL, _SURE = 0.002, 8.0
+"""Share of a triad's range from which a departure may be that of another tool; and as a multiple of its scatter."""
 _MOSTLY = 0.75
 """Share of rows in sets at equal angles from which these are stations of several readings."""
 _OF_READING = re.compile(r"(.*\d)(?:[ ._/-]?[A-Za-z]|[ ._/-]\d{1,2})")
@@ -252,6 +254,40 @@ def _scatters(table: Table, names: Mapping[str, str], starts: Ints) -> dict[str,
         kind: float(np.sqrt((_departures(raw, starts) ** 2).sum() / freedom))
         for kind, raw in _triads(table, names).items()
     }
+
+
+def tools_in_turn(
+    table: Table, sources: Mapping[str, ColumnSource], sets: Repeats
+) -> tuple[str, list[str]] | None:
+    """The unused column, and its texts, by which the readings at one setting differ as those of several tools do.
+
+    Each text stands at most once in a set. The departures of its readings from the means of their sets are a line of
+    these means, far beyond what is left, and a share of the range of the triad.
+    """
+    names = {c: sources[c].name for c in RAW if c in sources}
+    used = {each.name for each in sources.values()}
+    place = np.repeat(np.arange(len(sets.starts)), sets.sizes)
+    for name in (each for each in table.columns if each not in used):
+        texts, which = np.unique(labels(table, name), return_inverse=True)
+        once = len({*zip(place.tolist(), which.tolist(), strict=True)}) == sets.rows
+        if 1 < len(texts) <= sets.sizes.max() and once:
+            for raw in _triads(table, names).values():
+                apart = _departures(raw, sets.starts)
+                each = (which == k for k in range(len(texts)))
+                if any(_are_of_another(raw[rows], apart[rows]) for rows in each):
+                    return name, texts.tolist()
+    return None
+
+
+def _are_of_another(raw: Array, apart: Array) -> bool:
+    """Whether readings (n, 3) depart from those of their sets by `apart` (n, 3) as those of another tool do."""
+    design = np.column_stack([raw - apart, np.ones(len(raw))])
+    if len(raw) <= 2 * design.shape[-1]:
+        return False
+    line = design @ np.linalg.lstsq(design, apart, rcond=None)[0]
+    size, left = np.sqrt(np.mean(line**2)), np.sqrt(np.mean((apart - line) ** 2))
+    sure = _SURE * left * np.sqrt(design.shape[-1] / len(raw))
+    return bool(size > max(sure, _OF_ANOTHER_TOOL * np.ptp(raw, axis=0).max() / 2))
 
 
 def means(table: Table, sources: Mapping[str, ColumnSource], sets: Repeats) -> Table:

@@ -19,7 +19,7 @@ from mwdcal.files.depths import MEASURED_DEPTHS
 from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.titles import UNITS_BY_SIGN
 from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, UNCERTAINTIES
-from mwdcal.geometry.units import STANDARD_GRAVITY
+from mwdcal.geometry.units import FOOT, STANDARD_GRAVITY
 
 _SPELLINGS = {
     "°": "deg degree degrees grad",
@@ -32,6 +32,7 @@ _SPELLINGS = {
     "m/s²": "mss mps",
     "gal": "gal gals",
     "mGal": "mgal",
+    "ft/s²": "ftss",
     "nT": "nt gamma",
     "µT": "ut",
     "mT": "millit",
@@ -57,6 +58,7 @@ CONVERSIONS = {
     "m/s²": "g = m/s² / 9.80665",
     "gal": "g = gal / 980.665",
     "mGal": "g = mGal / 980665",
+    "ft/s²": f"g = ft/s² · {FOOT} / {STANDARD_GRAVITY}",
     "µT": "nT = µT · 1000",
     "mT": "nT = mT · 1e6",
     "gauss": "nT = gauss · 1e5",
@@ -76,6 +78,7 @@ FACTORS = {
     "m/s²": (1 / STANDARD_GRAVITY, 0.0),
     "gal": (1e-2 / STANDARD_GRAVITY, 0.0),
     "mGal": (1e-5 / STANDARD_GRAVITY, 0.0),
+    "ft/s²": (FOOT / STANDARD_GRAVITY, 0.0),
     "µT": (1e3, 0.0),
     "mT": (1e6, 0.0),
     "gauss": (1e5, 0.0),
@@ -89,7 +92,7 @@ FACTORS = {
 """The same in numbers: factor, and what is added to the product."""
 _WARM = ("°C", "°F", "K")
 _MAGNETIC_UNITS = ("nT", "µT", "mT", "gauss", "mG", "A/m")
-_GRAVITY_UNITS = ("g", "mg", "m/s²", "gal", "mGal")
+_GRAVITY_UNITS = ("g", "mg", "m/s²", "gal", "mGal", "ft/s²")
 WARMTH = "temperature_c"
 _STATED = {"ref", "reference", "local", "model", "igrf", "bggm", "wmm"}
 """Words of columns that are known, not measured."""
@@ -376,6 +379,7 @@ def _is_warmth(words: Sequence[str], whole: str) -> bool:
 def _words(name: str) -> list[str]:
     """The words of a name in lower case, its units spelled without signs."""
     text = unicodedata.normalize("NFKC", name.replace("º", "°"))
+    text = re.sub(r"ft\s*/\s*s\s*(\^\s*)?2", " ftss ", text)
     text = re.sub(r"m\s*/\s*s\s*(\^\s*)?2|(?<![A-Za-z])mp?s\^?-?2", " mss ", text)
     for sign, word in UNITS_BY_SIGN.items():
         text = text.replace(sign, word if len(word) == 1 else f" {word} ")
@@ -408,8 +412,8 @@ _OF_MINUTES = re.compile(r"[°º]\s*['′’]\s*([\"″”]|'')?")
 def unit_of(text: str) -> str:
     """The unit that a text is, empty if it is not a unit.
 
-    >>> [unit_of(text) for text in ("deg", "°F", "m/s²", "mg", "мg", "A/m", "x")]
-    ['°', '°F', 'm/s²', 'mg', 'mg', 'A/m', '']
+    >>> [unit_of(text) for text in ("deg", "°F", "m/s²", "ft/s^2", "мg", "A/m", "x")]
+    ['°', '°F', 'm/s²', 'ft/s²', 'mg', 'A/m', '']
     """
     if _OF_MINUTES.fullmatch(text):
         return "°"

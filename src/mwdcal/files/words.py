@@ -32,6 +32,11 @@ _FROM_VERTICAL = (
 """Words of an angle that counts from the vertical, as an inclination does."""
 TRANSLATIONS = (
     (r"(roll|rulle|dreh)[ _-]?(sett?|gruppe|satz)|\bsett\b|serie de giro|серия|组号", "group "),
+    (
+        r"serien?-?(n|numme)r\b\.?|serienumm?er|\bser\. ?n[ro]\b\.?|\bn[.º°]? ?(de )?serie\b|numero (de )?serie|"
+        r"\bзав(одской)?\b\.? ?(№|no|номер)|\bn/s\b|(仪器|工具|探管)编?号",
+        "serial ",
+    ),
     (r"\bdeg(rees|\.)? ?(m|mag)\b", "deg"),
     (r"\bdeg(rees|\.)? ?(t|true)\b", "true deg"),
     (r"\bdeg(rees|\.)? ?(g|grid)\b", "grid deg"),
@@ -64,7 +69,10 @@ TRANSLATIONS = (
     (rf"{_CROSSWISE}1", "X "),
     (rf"{_CROSSWISE}2", "Y "),
     (rf"{_CROSSWISE}(?=[xyz]\b)|\baxe(?=[ _]*[xyz]\b)", ""),
-    (r"\b(angulo|angle|ang)\b\.?( d[ae]l?\b)?( d')? *(?=inclin|azim|acim|rot|rol|roul|giro)", ""),
+    (
+        r"\b(angulo|angle|ang)\b\.?( d[ae]l?\b)?( d')? *(?=inclin|azim|acim|rot|rol|roul|giro|cara|face)",
+        "",
+    ),
     (
         r"(?<=[xyz][ -])(magnet(feld|felt)|magn\b\.?)|(?<=[xyz])轴?磁(场强度|场|通门|力计|力|强计)?",
         " mag ",

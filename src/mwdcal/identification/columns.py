@@ -55,6 +55,7 @@ IN_BRACKETS = re.compile(r"[(\[]([^)\]]*)[)\]]\s*$")
 RANGES_BY_UNIT: dict[str, tuple[tuple[str, float, float], ...]] = {
     "ref_gravity_g": (
         ("g", *EARTH_GRAVITY), ("m/s²", 9.757, 9.846), ("mg", 995.0, 1004.0), ("mGal", 975_700.0, 984_600.0),
+        ("ft/s²", 32.01, 32.30),
     ),
     "ref_field_nt": (
         ("nT", *EARTH_FIELD), ("µT", 15.0, 80.0), ("gauss", 0.15, 0.8), ("mT", 0.015, 0.08),

@@ -49,7 +49,7 @@ from mwdcal.files.marks import (
 )
 from mwdcal.files.metadata import toml
 from mwdcal.files.profiles import CHOICE_OF_AXES
-from mwdcal.files.repeats import means, repeats, station_by_angles
+from mwdcal.files.repeats import Repeats, means, repeats, station_by_angles, tools_in_turn
 from mwdcal.files.runs import (
     ANGLES_OF_STAND,
     STATED_REFERENCES,
@@ -529,6 +529,7 @@ def _proposal(
     columns |= {c: ColumnSource(name=f"{stated[c]}") for c in _OF_THE_PLACE if c in stated}
     sets = repeats(table, columns)
     if sets and not sets.numbered:
+        _check_tools(table, columns, sets, form)
         table = means(table, columns, sets)
         if "group" in columns and len({*labels_of(table, columns["group"].name)}) < 2:
             del columns["group"]  # it tells the readings of a station apart
@@ -1325,6 +1326,25 @@ def _check_repeats(table: Table, columns: Mapping[str, ColumnSource], form: Tabl
             Answer("the first", (("leave_out", f"{name}={two}"),)),
             Answer("both", (("keep", f"{name}={one}"),)),
         ],
+    )
+
+
+def _check_tools(
+    table: Table, columns: Mapping[str, ColumnSource], sets: Repeats, form: TableFormat | None
+) -> None:
+    """Ask which tool is meant where the readings at each setting are of several by a column."""
+    apart = tools_in_turn(table, columns, sets)
+    if not apart or (form and apart[0] in form.keep):
+        return
+    name, texts = apart
+    tools = [
+        Answer(text, tuple(("leave_out", f"{name}={other}") for other in texts if other != text))
+        for text in texts
+    ]
+    raise QuestionError(
+        f"{table.source}: the readings at each setting of the stand differ by {shown(name)} "
+        f"({listed(texts, len(texts))}) as those of several tools do. Which one is meant?",
+        [*tools, Answer("all are of one tool", (("keep", f"{name}={texts[0]}"),))],
     )
 
 

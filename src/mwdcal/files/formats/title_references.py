@@ -82,12 +82,12 @@ _OF_PLACES = (
         r"tyngde(akselerasjon|kraft)?\w*|(aceleracion de la )?gravedad|(aceleraca?o da )?gravidade|pesanteur|"
         r"ускорение свободного падения|сил\w тяжести|(当地)?重力(加速度)?",
         "g",
-        ("g", "mg", "m/s²", "gal", "mGal"),
+        ("g", "mg", "m/s²", "gal", "mGal", "ft/s²"),
         *EARTH_GRAVITY,
     ),
 )
 _WRITTEN_UNIT = (
-    r"мгс\b|см/с[²2]?|k?γ|(?:(?<=\d)|(?<=\d )|(?<=[(\[]))k?gammas?\b(?! ?ray)|"
+    r"ft\s?/\s?s\s?(?:²|\^?2)|мгс\b|см/с[²2]?|k?γ|(?:(?<=\d)|(?<=\d )|(?<=[(\[]))k?gammas?\b(?! ?ray)|"
     r"n\s?t\b|[uµμ]\s?t\b|m\s?t\b|milli ?gauss|m\s?g(al|auss)?\b|gauss|gs\b|oe\b|a\s?/\s?m\b|gals?\b|gons?\b|"
     r"nano ?teslas?\b|micro ?teslas?\b|нтл|мктл|мтл|м?гал|гс\b|э\b|м/с²?|м/с2|"
     r"m\s?/\s?s\s?(?:²|\^?2)?|[gг]\b(?!\s*[=:(\[]?\s*(?:[+-]?\d|m\s?/))|°|deg\w*|gra[ud]\w*|rad\b|град\w*|"
@@ -344,6 +344,7 @@ _SPELT = {
     "a/m": "A/m", "oe": "gauss", "э": "gauss", "гс": "gauss", "мгс": "mG",
     "см/с": "gal", "см/с²": "gal", "см/с2": "gal",
     "gs": "gauss", "gals": "gal", "гал": "gal",
+    "ft/s": "ft/s²", "ft/s²": "ft/s²", "ft/s2": "ft/s²",
     "mgal": "mGal", "мгал": "mGal", "mg": "mg", "mgauss": "mG", "milligauss": "mG",
 }  # fmt: skip
 """Units in small letters, where `unit_of` does not know them or goes by capitals."""
