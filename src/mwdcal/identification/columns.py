@@ -419,17 +419,19 @@ _BY_TOOL = re.compile(
 """Words of an angle that a stand shows, and of one that the tool tells."""
 _OF_CHANNELS = re.compile(r"\b(measured|meas|gemessen|m[åa]lt|ist)\b", re.IGNORECASE)
 """Those that say nothing more of a channel."""
-_CORRECTION = (
+_CORRECTION = re.compile(
     r"(corr|korr|[ck]alib|[ck]ompens|[ée]talonn|скорр|откорр|корр|исправ|поправ|калибр|компенс|обработ)[^\W\d_]*|"
     "校正|修正|标定|校准|补偿"
 )
-_CORRECTED = re.compile(rf"(?<![^\W\d_])({_CORRECTION})|校正|修正|标定|校准|补偿", re.IGNORECASE)
+_CORRECTED = re.compile(
+    rf"(?<![^\W\d_])({_CORRECTION.pattern})|校正|修正|标定|校准|补偿", re.IGNORECASE
+)
 _UNCORRECTED = re.compile(
     r"((leituras?|lecturas?|avlesning|ablesung|valor(es)?|valeurs?|показания?|значения?)[ _]+)?"
     r"(?<![^\W\d_])((raw|roh|rå)(werte?|daten|data|signale?|verdi(er)?|v[æä]rd[^\W\d_]*)?|crud[oa]s?|brut[oae]?s?|"
     r"сыр[^\W\d_]*|исходн[^\W\d_]*|(un|u|o|не|(not|nicht|ikke|icke|inte|no|n[ãa]o|non|sin|sem|sans|without|ohne|uten|"
-    rf"utan|без|до|before|vor|f[øö]r|antes d[ea]|avant)( (the|der|la|a))? )({_CORRECTION}))(?![^\W\d_])|"
-    rf"原始(数据|值)?|未经?({_CORRECTION})|({_CORRECTION})前",
+    rf"utan|без|до|before|vor|f[øö]r|antes d[ea]|avant)( (the|der|la|a))? )({_CORRECTION.pattern}))(?![^\W\d_])|"
+    rf"原始(数据|值)?|未经?({_CORRECTION.pattern})|({_CORRECTION.pattern})前",
     re.IGNORECASE,
 )
 """Words of channels that the tool or a laboratory has corrected, and of those beside them that are as measured."""
