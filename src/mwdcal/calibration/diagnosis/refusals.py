@@ -630,7 +630,7 @@ def _alike(readings: Readings) -> dict[str, str]:
             same[name] = f"{degrees:.4g}°" if by_stand else f"about {degrees:.0f}°"
     if not same:
         ways = f"{OTHER_ANGLES['inclination']} with six or more toolfaces each"
-        return {"cause": "", "ways": ways, "other": ", or give more reference angles"}
+        return {"cause": "", "ways": ways, "other": ", or more reference angles"}
     shared = " and ".join(f"{name} {angle}" for name, angle in same.items())
     ways = " and ".join(OTHER_ANGLES[name] for name in same)
     return {"cause": f" (all {count} stations have {shared})", "ways": ways, "other": ""}
@@ -640,14 +640,14 @@ def _in_words(name: str) -> str:
     """A parameter in words: the scale or offset of an axis, the misalignment of two.
 
     >>> [_in_words(n) for n in ("gain-yy", "gain-zy", "offset-x", "gain-xx-temperature-1")]
-    ['scale of y', 'misalignment of z and y', 'offset of x', 'scale of x over temperature']
+    ['y scale', 'z-y misalignment', 'x offset', 'x scale over temperature']
     """
     steady, _, power = name.partition("-temperature-")
     kind, _, axes = steady.partition("-")
     if kind == "gain":
         kind = "scale" if axes[:1] == axes[1:] else "misalignment"
-    axis = " and ".join(dict.fromkeys(axes))
-    return f"{kind} of {axis}{' over temperature' if power else ''}"
+    axis = "-".join(dict.fromkeys(axes))
+    return f"{axis} {kind}{' over temperature' if power else ''}"
 
 
 def _too_weak(fitted: FittedRuns) -> Flag:
