@@ -149,6 +149,13 @@ CELLS = [
     ("ax", "1.2.3", "Write a plain number"),
     ("ax", "0.98 g", "Write the number without its unit"),
     ("ax", "0.98g", "Write the number without its unit"),
+    ("ax", "0.98 m/s2", "Write the number without its unit"),
+    ("ax", "12e4x", "Write a plain number"),
+    (
+        "ax",
+        "n/a?",
+        "leave such rows out by leave_out in [table] of the tool profile: leave_out = {'ax' = ['n/a?']}.",
+    ),
     ("ax", "--1", "Write a plain number"),
     ("ax", "١٢", "Write a plain number"),
     ("ax", "true", "Write a plain number"),

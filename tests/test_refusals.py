@@ -6,10 +6,23 @@ references, dead and swapped channels (test_cli_ugly); few stations, no redundan
 accepted, and what its message names (test_ranks).
 """
 
+import re
+
 import numpy as np
 import pytest
 
-from cli_support import RAW, SCALE, SERVO_NOISE, channels, mwdcal, refused, servo_run, write_csv
+from cli_support import (
+    RAW,
+    SCALE,
+    SERVO_NOISE,
+    Tool,
+    channels,
+    mwdcal,
+    refused,
+    servo_run,
+    stations,
+    write_csv,
+)
 from simulation import DEG, attitude
 
 METHODS = ("joint", "least-squares", "swarm", "newton", "toolface-inclination", "scalar")
@@ -43,7 +56,51 @@ def one_attitude(station=20):
 def test_one_attitude_does_not_move_the_channels(tmp_path, method):
     message = said(tmp_path, one_attitude(), "--method", method)
     assert "accelerometer channel on tool axis x moves by 0.0" in message
-    assert "too little to calibrate it. Add stations at other inclinations" in message
+    assert (
+        "too little to calibrate it (all 48 stations have inclination 45° and toolface" in message
+    )
+    assert "Add stations at other inclinations" in message
+    assert "and other toolfaces" in message
+
+
+ANGLES_OF_STAND = {"inclination": (10.0, 170.0), "azimuth": (0.0, 360.0), "toolface": (0.0, 360.0)}
+
+
+def at_one_angle(name, degrees):
+    """Thirty-six noisy readings at angles of the stand that all vary but one."""
+    tool, rng = Tool.random(1, noise=SERVO_NOISE), np.random.default_rng(3)
+    angles = {each: rng.uniform(*limits, 36) for each, limits in ANGLES_OF_STAND.items()}
+    angles[name] = np.full(36, degrees)
+    turned = [np.radians(each) for each in angles.values()]
+    g, b = (each[0] for each in tool.readings(rng, 1, *turned))
+    earth = (tool.gravity, tool.field, np.degrees(tool.dip))
+    return {**stations(*turned, earth=earth), **channels(g, b)}
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_one_toolface_is_named_and_asked_for_alone(tmp_path, known):
+    """Thirty-six inclinations need no others. Without a reference the readings show the toolface."""
+    run = at_one_angle("toolface", 40.0)
+    run = {name: each for name, each in run.items() if known or name != "ref_toolface_deg"}
+    message = said(tmp_path, run)
+    cause = r"\(all 36 stations have toolface (about )?(\d+)°\): nothing determines accelerometer"
+    about, angle = re.search(cause, message).groups()
+    assert abs(float(angle) - 40) <= (0 if known else 5)
+    assert (about is None) == known
+    assert "Add stations at other toolfaces (six or more)." in message
+    assert "gain" not in message
+    assert "inclinations" not in message
+
+
+def test_one_inclination_is_named_and_asked_for_alone(tmp_path):
+    message = said(tmp_path, at_one_angle("inclination", 60.0))
+    assert "on tool axis z" in message
+    assert "(all 36 stations have inclination 60°). Add stations at other inclinations" in message
+    assert "toolface" not in message
+
+
+def test_one_azimuth_alone_is_enough(tmp_path):
+    assert calibrate(tmp_path, at_one_angle("azimuth", 30.0)).code == 0
 
 
 @pytest.mark.parametrize("model", ["polynomial", "factors"])

@@ -2,6 +2,8 @@
 
 import pytest
 
+import mwdcal as mc
+from cli_support import EXAMPLE
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.titles import titles
 from test_headers import COLUMNS, TITLES, same, stations, taken, workbook
@@ -68,3 +70,20 @@ def test_an_elevation_is_one_in_the_languages_of_the_laboratories(tmp_path, name
     rows = [[90 - inclination, *rest] for inclination, *rest in stations()]
     file = workbook(tmp_path / "run.xlsx", [*TITLES, [f"{name} (°)", *UNLIKE], *rows])
     assert same(taken(file), stations())
+
+
+def test_the_remedy_of_a_cell_that_is_no_number_leaves_its_row_out(tmp_path):
+    """The entry that the message has is pasted into the tool profile as it is."""
+    run, tool = tmp_path / "run.csv", tmp_path / "tool.toml"
+    lines = (EXAMPLE / "run.csv").read_text("utf-8").splitlines()
+    start = next(i for i, line in enumerate(lines) if not line.startswith("#"))
+    cells = lines[start + 5].split(",")
+    cells[lines[start].split(",").index("mx")] = "n/a?"
+    lines[start + 5] = ",".join(cells)
+    run.write_text("\n".join(lines), "utf-8")
+    profile = (EXAMPLE / "tool.toml").read_text("utf-8")
+    with pytest.raises(mc.InputError, match=r"'n/a\?'") as refusal:
+        mc.read_run(run, EXAMPLE / "tool.toml")
+    tool.write_text(f"{profile}\n[table]\n{str(refusal.value).rpartition(': ')[2].rstrip('.')}\n")
+    read, whole = mc.read_run(run, tool), mc.read_run(EXAMPLE / "run.csv", tool)
+    assert read.count == whole.count - 1

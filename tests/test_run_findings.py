@@ -402,6 +402,37 @@ def test_an_unstated_stand_is_named_before_other_causes():
         assert (assumed[0] == "angles of the stand") == named
 
 
+ERROR, PER = 0.02, np.degrees(1.0)
+
+
+@pytest.mark.parametrize("sd", [NOISE, {}], ids=["declared", "estimated"])
+@pytest.mark.parametrize("name", ["inclination", "azimuth", "toolface"])
+def test_degrees_that_were_given_as_radians_are_named(name, sd):
+    """A stand with errors of 0.02° at every station, of which one σ is 0.02 rad: 57 times too much."""
+    data, errors = run(sd=sd), np.random.default_rng(7)
+    known = {n: each.copy() for n, each in data.known.items()}
+    angles = ("inclination", "azimuth", "toolface")
+    for each in angles:
+        known[each] += errors.normal(0, ERROR / PER, 48)
+    known["inclination"] = np.abs(known["inclination"])
+    right = {**data.sd, **{each: np.full(48, ERROR / PER) for each in angles}}
+    data = replace(data, known=known, settings="per-station")
+    assert "stand-too-large" not in found(replace(data, sd=right))
+    text = found(replace(data, sd={**right, name: np.full(48, ERROR)}))["stand-too-large"]
+    assert f"{name} {ERROR * PER:.2g}° (errors 0.0" in text
+    assert f"'{name}' is in radians: 0.02 rad is 1.15°" in text
+    assert [each for each in angles if f"{each} 1.1°" in text] == [name]
+
+
+def test_a_coarse_stand_whose_errors_are_as_large_is_not_too_large():
+    for seed in range(5):
+        data, rng = run(seed, sd=NOISE), np.random.default_rng(seed)
+        known, size = dict(data.known), 1.0 / PER
+        known["toolface"] = known["toolface"] + rng.normal(0, size, 48)
+        sd = {**data.sd, "toolface": np.full(48, size)}
+        assert "stand-too-large" not in found(replace(data, known=known, sd=sd))
+
+
 def test_angles_without_uncertainty_beside_uncertain_ones_are_assumed_exact():
     data = run(sd={**NOISE, "inclination": np.full(48, 1e-4)})
     assert calibrate(data, PROFILE).assumed_exact[:2] == [

@@ -316,14 +316,55 @@ def test_a_table_without_a_depth_by_its_name_names_the_option_and_what_may_be_it
     count = len(METRES)
     table = deep("Strekning", METRES)
     table |= {"pump": ("", np.full(count, 7.0)), "flow": ("", np.cos(np.arange(count)))}
-    for more, others in ({}, ""), ({"ticks": ("", np.arange(count) + 5.0)}, " or 'ticks'"):
-        path = text_table(tmp_path / "WELL.csv", {**table, **more})
+    number = {"Svy": ("", np.arange(count) + 1.0)}
+    for more, others in ({}, ""), ({"ticks": ("", np.arange(count) * 5.0)}, " or 'ticks'"):
+        path = text_table(tmp_path / "WELL.csv", {**number, **table, **more})
         ran = cli("survey", laboratory[0], path, "-o", tmp_path / "out.csv")
         assert ran.code == 0, ran.err
         [line] = [line for line in ran.err.splitlines() if "no well path" in line]
         assert '--column "md_m=Strekning"' in line
         assert ("It may be 'Strekning'" + others in line) is bool(others)
-        assert not {"pump", "flow", "Date", "NAME"} & {*line.replace("'", " ").split()}
+        assert not {"pump", "flow", "Date", "NAME", "Svy"} & {*line.replace("'", " ").split()}
+
+
+@pytest.mark.parametrize(("name", "unit"), [("Strekning (ft)", ""), ("Strekning", "m")])
+def test_a_column_in_a_unit_of_length_is_offered_alone(tmp_path, laboratory, name, unit):
+    rising = {"ticks": ("", np.arange(len(METRES)) * 5.0)}
+    path = text_table(tmp_path / "WELL.csv", {**rising, **deep(name, METRES, unit)})
+    ran = cli("survey", laboratory[0], path, "-o", tmp_path / "out.csv")
+    [line] = [line for line in ran.err.splitlines() if "no well path" in line]
+    assert f'--column "md_m={name}"' in line
+    assert "ticks" not in line
+
+
+def test_numbers_of_surveys_named_as_depths_raise_a_question(tmp_path, laboratory):
+    """They make a well of as many metres as it has surveys."""
+    count = len(METRES)
+    number = {"Svy": ("", np.arange(count) + 1.0)}
+    path = text_table(tmp_path / "WELL.csv", {**number, **deep("Strekning", METRES)})
+    for column, asks in ("md_m=Svy", True), ("md_ft=Svy", True), ("md_m=Strekning", False):
+        texts = {f.id: f.text for f in mc.survey(laboratory[1], path, column=column).findings}
+        assert ("depths-count" in texts) is asks
+        assert not asks or '"md_m=Strekning"' in texts["depths-count"]
+
+
+@pytest.mark.parametrize(
+    ("more", "end"),
+    [
+        ({"Hole length": ("m", METRES)}, METRES[-1]),
+        ({"Length (ft)": ("", METRES / 0.3048)}, METRES[-1]),
+        ({"Length (m)": ("", METRES), "Hole length (m)": ("", METRES)}, None),
+        ({"Length (m)": ("", np.full(len(METRES), 9.1))}, None),
+        ({"Length (m)": ("", METRES), "MD (m)": ("", METRES + 15)}, METRES[-1] + 15),
+    ],
+)
+def test_a_length_of_hole_is_the_measured_depth_where_nothing_else_may_be(
+    tmp_path, laboratory, more, end
+):
+    table = {name: each for name, each in deep("gone", METRES).items() if name != "gone"}
+    path = text_table(tmp_path / "WELL.csv", {**table, **more})
+    well = mc.survey(laboratory[1], path)
+    assert (None if well.path is None else pytest.approx(well.path.md[-1])) == end
 
 
 def test_profile_of_surveys_names_survey(tmp_path):

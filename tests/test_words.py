@@ -1,5 +1,6 @@
 """The documentation: its words, its patterns, its search index."""
 
+import ast
 import json
 import re
 import shutil
@@ -143,3 +144,12 @@ def test_links_between_pages_lead_to_files():
     ]
     assert dead == []
     assert len(pages) > 80
+
+
+def test_no_message_points_to_a_file_of_the_repository():
+    """After `pip install` there is none: messages name a page by its title, as in (docs, 'Glossary')."""
+    for path in (ROOT / "src").rglob("*.py"):
+        nodes = [*ast.walk(ast.parse(path.read_text("utf-8")))]
+        docstrings = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+        texts = (n for n in nodes if isinstance(n, ast.Constant) and id(n) not in docstrings)
+        assert [n.value for n in texts if "docs/" in str(n.value)] == [], path

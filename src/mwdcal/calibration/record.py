@@ -218,7 +218,10 @@ STEADINESS = {
 """Assumption of a calibration whose run could not show a drift, by the name of the drift."""
 
 
-STATE_STAND = "The angles of the stand count as exact: first state their 1σ under [stand] in the tool profile. "
+STATE_STAND = (
+    "The angles of the stand count as exact: first state their 1σ, under [stand] in the tool profile or by `sd` of "
+    "mwdcal.readings. "
+)
 """Of angles without uncertainty findings say so, where their errors may explain what is found."""
 ALIGNMENT = "alignment of the tool in the stand"
 """The name of what a tool's axis that is not the one it is rolled about does."""

@@ -20,7 +20,7 @@ import numpy as np
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.errors import InputError
 from mwdcal.files.formats.columns import LABELS
-from mwdcal.files.formats.table import Table, cell_error, numbers, shown
+from mwdcal.files.formats.table import LEAVE_OUT, Table, cell_error, numbers, shown
 from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW, CONVERSIONS, resembled
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints
 from mwdcal.sensor.profile import Profile
@@ -263,8 +263,6 @@ Cells = Callable[[str], Array | None]
 """The numbers (R,) of a column by its name, NaN where blank; None where there is no such column."""
 
 
-LEAVE_OUT = "leave such rows out by leave_out in [table] of the tool profile"
-"""The remedy for rows without a reading in a table that stays as it is."""
 OPTIONAL = {
     CHANNELS["magnetometer"]: f"Fill it in, or {LEAVE_OUT}.",
     ("temperature_c",): f"Fill it in, {LEAVE_OUT}, or leave the whole column blank.",

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import re
 
+import numpy as np
+
 from mwdcal.files.formats.columns import without_marks
 from mwdcal.geometry.units import LENGTH_UNITS
+from mwdcal.geometry.vectors import Array
 
 MEASURED_DEPTHS = {f"md_{unit}": unit for unit in LENGTH_UNITS}
 """The columns of measured depths, with their unit."""
@@ -27,6 +30,7 @@ _WORDS_OF_LENGTH = {
 }
 """Words for each unit of length."""
 _UNIT_OF_DEPTH = rf"({'|'.join(_WORDS_OF_LENGTH.values())})( ?(md|rt|rkb))?"
+_LENGTH = re.compile(rf"(((bore ?)?hole|drilled|along hole|ah) )?length ?{_UNIT_OF_DEPTH}")
 _DEPTH = re.compile(rf"({_ALONG} )*{_NOUN}( {_ALONG})*( ?{_UNIT_OF_DEPTH})?")
 _AT_END = {
     unit: re.compile(rf"(?<![a-zа-я])({words})( ?(md|rt|rkb))?$")
@@ -48,6 +52,26 @@ def is_depth(name: str) -> bool:
     [False, False, False]
     """
     return bool(_DEPTH.fullmatch(_plain(name)))
+
+
+def is_length(name: str, unit: str = "") -> bool:
+    """Whether a column is called a length of hole, in a unit of length; it may be that of something else.
+
+    >>> is_length("Hole length (m)"), is_length("Length", "ft"), is_length("Length"), is_length("Collar length (m)")
+    (True, True, False, False)
+    """
+    return bool(_LENGTH.fullmatch(_plain(f"{name} {unit}")))
+
+
+def counts_stations(values: Array) -> bool:
+    """Whether most of some numbers (n,) go on by one from whole number to whole number, as those of stations do.
+
+    >>> counts_stations(np.array([1.0, 2, 3, 5])), counts_stations(np.array([0.0, 30, 60]))
+    (True, False)
+    """
+    there = values[~np.isnan(values)]
+    whole = there.size > 1 and bool((there == np.round(there)).all())
+    return whole and float(np.mean(np.diff(there) == 1)) > 0.5
 
 
 def unit_of_length(*texts: str) -> str:

@@ -65,7 +65,8 @@ def readings(
         temperature: needed for models with temperature terms.
         sd: standard uncertainties by name, in the same units: of `accelerometer` and `magnetometer`
             (scalar, (3,) per axis or (n, 3)), of references, and of errors that all stations share:
-            `azimuth_zero`, `toolface_zero`, `inclination_zero`, `tilt` and `tool_axis`. Names may end in `_deg`.
+            `azimuth_zero`, `toolface_zero`, `inclination_zero`, `tilt` and `tool_axis`. Angles are in radians;
+            names that end in `_deg`, such as `inclination_deg`, take degrees.
             `accelerometer_drift`, `magnetometer_drift` and `field_drift`: of the change from the first station
             to the last, of an axis.
             The noise of a triad that is not named is estimated from the residuals.

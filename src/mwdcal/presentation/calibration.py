@@ -61,7 +61,7 @@ PLACE = "1σ, calibration alone, at 45° inclination"
 """The conditions of the accuracy to expect."""
 MEANING = (
     "Undetermined: any value of it fits this run equally well, so it has no uncertainty, and no limit that needs it "
-    "passes. More: docs/reference/glossary.md"
+    "passes (docs, 'Glossary')."
 )
 """The meaning of the word on the lines above."""
 PROFILE = " (see [stand] of the tool profile)"

@@ -80,6 +80,7 @@ REMARKED = {
     "noise": "residuals of the {triad} are far below the declared noise",
     "residuals": "residuals of the {triad} are larger than the declared noise explains",
     "settings": "the stand at one or more of its settings is off by far more than declared",
+    "stand-too-large": "the stated σ of the stand is far larger than its errors",
     "toolface-shared": "errors of the stand's toolface agree as if it had been set less often than at every station",
     "axis-noise": "residuals along one axis are far larger than along another",
     "settings-apart": "stations of one direction scatter as if the stand had been set anew at each",

@@ -19,7 +19,7 @@ MOST_ALSO = 12
 IMPORTANT: tuple[str | tuple[str, ...], ...] = (
     "too-few", "channel", "missing-reference", "weak-geometry", "temperature-span",
     "altered", "revoked", "unsound", "contradicted", "not-judged", "partly-judged", "axes-exchanged", "rejected",
-    "path-from", "tie-in", "no-path", "long-courses", "calibration-later", "magnetic-north",
+    "path-from", "tie-in", "no-path", "depths-count", "long-courses", "calibration-later", "magnetic-north",
     ("reshoot", "settings "),
     "repeated-readings", "misfit", "accelerometer-residuals", "magnetometer-residuals", "looks-like", "column-explains",
     "outside-temperature", "changed", "standard-overdue", "roll-test-read", "columns-read",

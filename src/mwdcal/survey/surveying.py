@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -31,7 +30,14 @@ from mwdcal.files.contract import (
     wholly_blank,
     without_reading,
 )
-from mwdcal.files.depths import MEASURED_DEPTHS, chosen_length, is_depth, unit_of_length
+from mwdcal.files.depths import (
+    MEASURED_DEPTHS,
+    chosen_length,
+    counts_stations,
+    is_depth,
+    is_length,
+    unit_of_length,
+)
 from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.table import Table, cell_error, numbers
 from mwdcal.files.profiles import setting
@@ -73,6 +79,11 @@ BY_ROW = {
 """Columns of references that surveys alone have, with the values they take."""
 MOST_CONTRIBUTED = 2000
 """Surveys of a table whose contributions are computed."""
+DEPTHS_COUNT = (
+    "the measured depths go on by one, as numbers of surveys do. Is it the right column? Name another by `column` "
+    '"md_m=NAME".'
+)
+"""The finding that depths are a numbering."""
 LARGEST_DEPTH = 20_000.0
 """No hole is longer, m."""
 
@@ -133,7 +144,9 @@ def survey_readings(
     if reference is not None:
         findings += of_another_day(reference, readings.metadata)
     referenced = readings if reference is None else with_reference(readings, reference)
-    depth, _ = depth_column(named, "m")
+    depth, factor = depth_column(named, length_unit or "m")
+    if md is not None and depth in MEASURED_DEPTHS and counts_stations(np.round(md / factor, 6)):
+        findings.append(Finding(id="depths-count", text=DEPTHS_COUNT))
     return SurveyReadings(referenced, md, north, sources, findings, depth)
 
 
@@ -312,6 +325,9 @@ def depth_column(table: Table, length_unit: str = "") -> tuple[str, float]:
     names = [name for name in MEASURED_DEPTHS if name in table.columns][:1]
     names = names or [*filter(is_depth, table.columns)]
     if not names:
+        lengths = [name for name in table.columns if is_length(name, table.units.get(name, ""))]
+        names = lengths if len(lengths) == 1 and _may_be_depths(table, lengths[0]) else []
+    if not names:
         return "", 1.0
     which = f'as in `column` "md_m={names[0]}" (in feet md_ft or md_usft)'
     if len(names) > 1:
@@ -330,19 +346,29 @@ def depth_column(table: Table, length_unit: str = "") -> tuple[str, float]:
     return name, LENGTH_UNITS[unit]
 
 
+def _may_be_depths(table: Table, name: str) -> bool:
+    """Whether the numbers of a column never decrease, change, and do not count the stations."""
+    try:
+        values = numbers(table, name)
+    except InputError:
+        return False
+    steps = np.diff(values)
+    return bool((steps >= 0).all() and steps.any()) and not counts_stations(values)
+
+
 def _with_depths_of(
     findings: Iterable[Finding], table: Table, unused: Collection[str]
 ) -> list[Finding]:
-    """The findings; that on a path without depths names the `unused` columns of the table that never decrease."""
-    rising = []
-    for name in (n for n in table.columns if shown(n) in unused):
-        with suppress(InputError):
-            steps = np.diff(numbers(table, name))
-            rising += [name] * bool((steps >= 0).all() and steps.any())
+    """The findings; those that lack a measured depth name the `unused` columns that may be it.
+
+    Of these a column with a unit of length comes alone.
+    """
+    rising = [n for n in table.columns if shown(n) in unused and _may_be_depths(table, n)]
+    rising = [n for n in rising if unit_of_length(n, table.units.get(n, ""))] or rising
     listed = f" It may be {' or '.join(map(shown, rising))}." if rising[1:] else ""
     return [
         replace_struct(f, text=f.text.replace("NAME", rising[0]) + listed)
-        if rising and f.id == "no-path"
+        if rising and "md_m=NAME" in f.text
         else f
         for f in findings
     ]
@@ -764,9 +790,8 @@ def survey_well(
     used = surveys.readings if inputs.unused is None else surveys.readings.select(~inputs.unused)
     exchanged = exchanged_axes(inputs.calibration, used)
     others = with_stated_unit(result.findings, surveys.depth)
-    if not surveys.depth:
-        others = _with_depths_of(others, inputs.table, surveys.readings.unused)
     findings = [*inputs.findings, *about, *exchanged, *others, *said]
+    findings = _with_depths_of(findings, inputs.table, surveys.readings.unused)
     result = replace(
         result, findings=findings, sources=surveys.sources, length_unit=inputs.length_unit
     )

@@ -41,7 +41,7 @@ from mwdcal.calibration.readings import (
     Readings,
 )
 from mwdcal.calibration.record import MISFIT_CHANCE, SHOWN_DRIFT, STATE_STAND, Finding
-from mwdcal.calibration.residuals import REASONS, chances, shown_in, tail
+from mwdcal.calibration.residuals import REASONS, chances, rms, shown_in, tail
 from mwdcal.calibration.results import (
     common_source,
     drift_shares,
@@ -50,7 +50,7 @@ from mwdcal.calibration.results import (
     unconfirmed_dip,
 )
 from mwdcal.estimation.batch import take
-from mwdcal.estimation.problem import WALK_AXES, Prior
+from mwdcal.estimation.problem import ANGLES, WALK_AXES, Prior
 from mwdcal.estimation.solvers import Determined
 from mwdcal.estimation.uncertainty import (
     fisher_tail,
@@ -105,6 +105,12 @@ AGREEMENT_CHANCE = 1e-4
 """Chance of as much agreement between errors of toolface, below which it is reported."""
 LEAST_SHOWN = 0.1
 """A smaller share of the stand's σ by which stations of one setting scatter is no finding."""
+COARSE_STAND = 3e-3
+"""A σ of the stand of less, radians, is never called too large: 0.17°."""
+COARSE_RATIO = 10.0
+"""So many times its errors a stated σ of the stand is called too large."""
+LEAST_ANGLES = 4
+"""Fewest different angles that show so."""
 LEAST_UNEQUAL = 1.5
 """A smaller ratio of the noises of two axes is no finding: a 95 % interval then still holds 88 %."""
 FEW_FREEDOM = 8.0
@@ -154,6 +160,9 @@ REMARKS = {
     "the stand. Check this reference, or declare a larger σ.",
     "settings-apart": "stations of one direction scatter by {share:.0%} of the stand's σ, as if the stand had been set "
     'anew at each. If so, state settings = "per-station" in [stand] of the profile.',
+    "stand-too-large": "the stated σ of the stand is far larger than its errors in this run: {angles}. Uncertainties "
+    "are too large. State it in degrees: as {first}_deg under [stand] of the profile, or in `sd` of Python, where "
+    "'{first}' is in radians: {rad:.2g} rad is {deg:.3g}°.",
     "toolface-shared": "errors of the stand's toolface agree within each {by} (chance in noise {chance:.0e}), as if it "
     "had been set {groups} times in all. The stated uncertainty of toolface counts one error a station, and is too "
     "small: declare toolface_zero_deg = {size:.2g} under [stand] of the profile beside toolface_deg.",
@@ -392,6 +401,36 @@ def _settings(fitted: FittedRuns) -> Iterator[Flag]:
     share = fitted.result.problem.evidence.apart
     yield _remark("settings-apart", share > LEAST_SHOWN, share=share)
     yield from _toolfaces(fitted.result)
+    stated = {name: fitted.readings.uncertainty(name).max(-1) for name in ANGLES}
+    if max(sd.max() for sd in stated.values()) > COARSE_STAND:
+        yield _coarse_stand(fitted, stated)
+
+
+def _coarse_stand(fitted: FittedRuns, stated: Mapping[str, Array]) -> Flag:
+    """Angles of the stand whose `stated` σ (B,) is far larger than their errors: radians that were meant as degrees.
+
+    Few angles may agree by chance: four different ones do so in 0.02 % of runs.
+    """
+    residuals = fitted.residuals
+    left = {n: rms(each) for n, each in residuals.errors_after.items() if n in stated}
+    coarse = np.zeros((fitted.count, len(ANGLES)), bool)
+    for index, name in enumerate(ANGLES):
+        if name in left and name not in residuals.fit.problem.evidence.absent:
+            angles = np.sort(np.round(residuals.known[name], 6), -1)
+            several = np.count_nonzero(np.diff(angles) > 0, -1) >= LEAST_ANGLES - 1
+            expected = rms(residuals.expected[name])
+            coarse[:, index] = several & (stated[name] > COARSE_STAND)
+            coarse[:, index] &= expected > COARSE_RATIO * left[name]
+
+    def angles_of(place: int) -> str:
+        each = [name for name, far in zip(ANGLES, coarse[place], strict=True) if far]
+        degrees = ((n, np.degrees([stated[n][place], left[n][place]])) for n in each)
+        return ", ".join(f"{n} {sd:.2g}° (errors {error:.2g}°)" for n, (sd, error) in degrees)
+
+    first = [ANGLES[index] for index in coarse.argmax(-1)]
+    sd = np.array([stated[name][place] for place, name in enumerate(first)])
+    words = {"angles": angles_of, "first": np.array(first), "rad": sd, "deg": np.degrees(sd)}
+    return _remark("stand-too-large", np.any(coarse, -1), **words)
 
 
 def _toolfaces(result: Fit) -> Iterator[Flag]:

@@ -40,13 +40,14 @@ from mwdcal.calibration.readings import (
     highest_order,
     soaks,
 )
-from mwdcal.calibration.residuals import shown_in
+from mwdcal.calibration.residuals import nominal, shown_in
 from mwdcal.calibration.results import temperature_range
 from mwdcal.errors import FitError, InputError, MwdcalError
 from mwdcal.estimation.batch import batch_of_one
 from mwdcal.estimation.problem import WALKS
 from mwdcal.estimation.solvers import LOSSES, Status
 from mwdcal.estimation.uncertainty import free_directions, station_misfit
+from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, length
 from mwdcal.sensor.models import Basis, Factors, Polynomial, Whole, restricted
 from mwdcal.sensor.profile import COMMON, Profile
@@ -216,6 +217,13 @@ STRENGTH_COLUMNS = {
     "field": ("ref_field_nt", 1e-3, "µT", "; of a run in a coil, say coil = true under [stand]"),
 }
 """Column of each strength, factor and unit in which a message has it, and a remedy besides."""
+OTHER_ANGLES = {
+    "inclination": "other inclinations (at least three, well apart, up and down)",
+    "toolface": "other toolfaces (six or more)",
+}
+"""The stations to add where all have one angle; one azimuth alone leaves nothing undetermined."""
+ONE_ANGLE = 0.9998, 0.985
+"""Mean resultant length of angles that are one: of references within 1°, by raw readings within 10°."""
 TOOL_AXES = np.array([*"xyz"])
 Run = Callable[[int], Readings]
 """Readings of one member of a batch, without leading axis: their labels and source."""
@@ -264,7 +272,7 @@ OF_READINGS = {
     "dead": "{source}: the {triad} channel on tool axis {axis} does not move: the same value at all {count} stations. "
     "A dead sensor, a wrong column, or all stations in one attitude; check the wiring and the columns.",
     "little": "{source}: the {triad} channel on tool axis {axis} moves by {moved:.3g} {unit} over the run, too little "
-    "to calibrate it. Add stations at other inclinations and toolfaces; if there are, look for a dead sensor, a wrong "
+    "to calibrate it{alike[cause]}. Add stations at {alike[ways]}; if there are, look for a dead sensor, a wrong "
     "column, or a wrong 'scale' of [{triad}] in the tool profile.",
     "much": "{source}: the {triad} channel on tool axis {axis} moves by {moved:.3g} {unit} over the run, more than any "
     "field explains. Look for a wrong column or cell, or a wrong 'scale' of [{triad}] in the tool profile.",
@@ -291,9 +299,8 @@ OF_FITS = {
     "profile.{column}{culprit}{axes}",
     "temperature": "the {triad}'s residuals are {much}, because its readings vary with temperature more than `order` "
     "{order} follows: this run spans {span:.0f} °C. {remedy}.",
-    "weak-geometry": "the stations are too weak to fit the model: nothing determines {names}. Add stations at other "
-    "inclinations (at least three, well apart, up and down) with six or more toolfaces each, or give more reference "
-    "angles{lower}.{axes}",
+    "weak-geometry": "the stations are too weak to fit the model{alike[cause]}: nothing determines {names}. Add "
+    "stations at {alike[ways]}{alike[other]}{lower}.{axes}",
     "no-redundancy": "the {triad} has no redundancy ({freedom:.1f} degrees of freedom): its noise cannot be estimated. "
     "Add stations, or declare 'noise' in the tool profile.",
     "gain": "the {triad}'s gain on tool axis {axis} comes out at {gain} times nominal and {wrong} (accepted: "
@@ -377,7 +384,7 @@ def reading_refusals(readings: Readings, options: Options, run: Run) -> Iterator
     def source(place: int) -> str:
         return run(place).source or "the run"
 
-    words = {"source": source, "count": readings.count}
+    words = {"source": source, "count": readings.count, "alike": lambda place: _alike(run(place))}
     yield _few_stations(readings, options, words)
     yield _many_settings(readings, words)
     yield _common_errors(readings, options)
@@ -609,17 +616,61 @@ def _bounded(ratio: float, form: str) -> str:
     return f"{'less than -' if ratio < 0 else 'more than '}{form.format(MOST_SHOWN)}"
 
 
+def _alike(readings: Readings) -> dict[str, str]:
+    """The angles of the stand that all stations of a run share, and the stations to add, in words."""
+    same: dict[str, str] = {}
+    count, raw = readings.count, nominal(readings)
+    for name in OTHER_ANGLES:
+        known = readings.reference(name)
+        by_stand = bool(~np.isnan(known).any())
+        angles = known if by_stand else OBSERVABLES[name].value(*raw)
+        mean = np.mean(np.exp(1j * angles))
+        if abs(mean) > ONE_ANGLE[not by_stand]:
+            degrees = np.degrees(np.angle(mean)) % 360
+            same[name] = f"{degrees:.4g}°" if by_stand else f"about {degrees:.0f}°"
+    if not same:
+        ways = f"{OTHER_ANGLES['inclination']} with six or more toolfaces each"
+        return {"cause": "", "ways": ways, "other": ", or more reference angles"}
+    shared = " and ".join(f"{name} {angle}" for name, angle in same.items())
+    ways = " and ".join(OTHER_ANGLES[name] for name in same)
+    return {"cause": f" (all {count} stations have {shared})", "ways": ways, "other": ""}
+
+
+def _in_words(name: str) -> str:
+    """A parameter in words: the scale or offset of an axis, the misalignment of two.
+
+    >>> [_in_words(n) for n in ("gain-yy", "gain-zy", "offset-x", "gain-xx-temperature-1")]
+    ['y scale', 'z-y misalignment', 'x offset', 'x scale over temperature']
+    """
+    steady, _, power = name.partition("-temperature-")
+    kind, _, axes = steady.partition("-")
+    if kind == "gain":
+        kind = "scale" if axes[:1] == axes[1:] else "misalignment"
+    axis = "-".join(dict.fromkeys(axes))
+    return f"{axis} {kind}{' over temperature' if power else ''}"
+
+
 def _too_weak(fitted: FittedRuns) -> Flag:
     """Rotations and scales may stay free; anything else is a design too weak to fit."""
     bad = [[entry for entry in free if is_bad(entry)] for free in fitted.free]
 
     def names(place: int) -> str:
-        each = [f"{TRIADS[t]} {e.id.removeprefix('weak-')}" for e in bad[place] for t in e.triads]
+        each = [
+            f"{TRIADS[t]} {_in_words(e.id.removeprefix('weak-'))}"
+            for e in bad[place]
+            for t in e.triads
+        ]
         return listed([*dict.fromkeys(each)], PARAMETERS_NAMED)
 
     thermal = any(orders_of(fitted.result))
     lower = ", or repeat attitudes at other temperatures, or lower `order`" if thermal else ""
-    return _refusal(fitted, "weak-geometry", np.array([*map(bool, bad)]), names=names, lower=lower)
+    members = np.array([*map(bool, bad)])
+    values: Words = {
+        "names": names,
+        "lower": lower,
+        "alike": lambda place: _alike(fitted.alone(place)[0]),
+    }
+    return _refusal(fitted, "weak-geometry", members, **values)
 
 
 def _odd_gain(fitted: FittedRuns, index: int) -> Flag:

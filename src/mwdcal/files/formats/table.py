@@ -15,6 +15,7 @@ import numpy as np
 from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError, UnreadableFileError, reason
 from mwdcal.files import metadata as meta
+from mwdcal.files.depths import unit_of_length
 from mwdcal.files.formats import atomic, text
 from mwdcal.files.formats.columns import (
     LABELS,
@@ -29,6 +30,7 @@ from mwdcal.files.formats.columns import (
 )
 from mwdcal.files.formats.columns import shown as shown
 from mwdcal.files.formats.titles import Titles, dated
+from mwdcal.files.synonyms import unit_of
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import TableFormat
 
@@ -409,7 +411,7 @@ def _one_by_one(table: Table, name: str, cells: Sequence[str]) -> Array:
             advice = (
                 _SINGLE
                 if several and _is_other_sign(stripped, table.decimal)
-                else _advice(stripped, table.decimal)
+                else _advice(name, stripped, table.decimal)
             )
             problem = f"expected a number; got {shown(cell)}. {advice}"
             raise cell_error(table, name, row, problem)
@@ -428,8 +430,12 @@ def _is_other_sign(cell: str, decimal: str) -> bool:
     return looks_numeric(cell, "," if decimal == "." else ".")
 
 
-def _advice(cell: str, decimal: str) -> str:
-    """The remedy for a cell that is not a number."""
+LEAVE_OUT = "leave such rows out by leave_out in [table] of the tool profile"
+"""The remedy for rows without a reading in a table that stays as it is."""
+
+
+def _advice(name: str, cell: str, decimal: str) -> str:
+    """The remedy for a cell of the column `name` that is not a number."""
     if decimal == "." and looks_numeric(cell, ","):
         return "Is the decimal comma intended? Use `decimal` ','."
     if decimal == "," and looks_numeric(cell, "."):
@@ -440,9 +446,11 @@ def _advice(cell: str, decimal: str) -> str:
         return "Write numbers without thousands separators."
     if re.match(r"0[xXbBoO]", cell):
         return "Write decimal numbers."
-    if re.fullmatch(r"[+-]?[\d.,]+([eE][+-]?\d+)?\s*[^\d\s.,+-][^\d]*", cell):
+    behind = re.fullmatch(r"[+-]?[\d.,]+([eE][+-]?\d+)?\s*([^\d\s.,+-].*)", cell)
+    if behind and (unit_of(behind[2]) or unit_of_length(behind[2])):
         return "Write the number without its unit; the column name states it."
-    return "Write a plain number, such as 0.998 or 9.98e-1."
+    rows = f"leave_out = {{{shown(name)} = [{shown(cell)}]}}"
+    return f"Write a plain number, such as 0.998 or 9.98e-1, or {LEAVE_OUT}: {rows}."
 
 
 def pointed(table: Table) -> dict[str, Column]:
