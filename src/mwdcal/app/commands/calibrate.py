@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING, TypeAlias, Unpack
 
 import click
 
@@ -19,6 +19,11 @@ if TYPE_CHECKING:
     from mwdcal.calibration.readings import Readings
     from mwdcal.calibration.record import Calibration
     from mwdcal.use.verification import Verdict
+
+
+_Judgement: TypeAlias = "tuple[Verdict | None, tuple[str, str], MwdcalError | None]"
+NOT_JUDGED: _Judgement = (None, ("", ""), None)
+"""A calibration without a verdict."""
 
 
 @options.command()
@@ -81,7 +86,9 @@ def command(
             turned = test.readings(profile)
     choice, result = chosen_fit(readings, profile, options_of(typed, prior, exclude, digest), say)
     calibration = recorded(choice, result)
-    verdict, judged, refusal = _judged(calibration, turned, limits, (output, rolltest))
+    verdict, judged, refusal = NOT_JUDGED
+    if turned is not None and rolltest:
+        verdict, judged, refusal = _judged(calibration, turned, limits, (output, rolltest))
     rendered = ""
     if report:
         from mwdcal.presentation.calibration_page import render
@@ -104,18 +111,12 @@ def command(
 
 
 def _judged(
-    calibration: Calibration,
-    rolltest: Readings | None,
-    limits: str,
-    files: tuple[Path, Path | None],
-) -> tuple[Verdict | None, tuple[str, str], MwdcalError | None]:
+    calibration: Calibration, rolltest: Readings, limits: str, files: tuple[Path, Path]
+) -> _Judgement:
     """The verdict of a roll test, its text on screen with what to do next, and why there is none.
 
     `files` of calibration and roll test.
     """
-    output, test = files
-    if rolltest is None or test is None:
-        return None, ("", ""), None
     from mwdcal.library.tasks import verify
     from mwdcal.presentation.verification import next_step, screen
 
@@ -123,8 +124,8 @@ def _judged(
         verdict = verify(calibration, rolltest, Path(limits))
     except MwdcalError as error:
         error.args = (f"not verified: {error}",)
-        return None, ("", ""), error
-    return verdict, (screen(verdict, None), next_step(verdict, output, test)), None
+        return *NOT_JUDGED[:2], error
+    return verdict, (screen(verdict, None), next_step(verdict, *files)), None
 
 
 @contextmanager
