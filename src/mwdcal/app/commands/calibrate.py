@@ -71,7 +71,6 @@ def command(
     from mwdcal.calibration.options import options_of
     from mwdcal.files import documents
     from mwdcal.files.formats import atomic
-    from mwdcal.files.limits import load_limits
     from mwdcal.presentation import calibration as screen
 
     inputs = [run, tool, typed["prior"], rolltest, limits, registry]
@@ -79,8 +78,11 @@ def command(
     _enter(registry)
     prior, digest = prior_of(typed["prior"])
     readings, profile, test, beside = load_runs(run, rolltest, tool, prior, options.said(decimal))
-    bounds = load_limits(limits)[0] if rolltest or report else None
-    turned = None
+    bounds, turned = None, None
+    if rolltest or report:
+        from mwdcal.files.limits import load_limits
+
+        bounds = load_limits(limits)[0]
     if test:
         with _roll_test_as_input():
             turned = test.readings(profile)
