@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import csv
+import re
 
 import numpy as np
 import pytest
 
-from cli_support import EXAMPLE, RAW, SCALE, SERVO_NOISE, mwdcal, refused, write_csv
+from cli_support import EXAMPLE, RAW, SCALE, SERVO_NOISE, mwdcal, refused, servo_run, write_csv
 from simulation import DEG, Tool
 
 ATTITUDE = ("ref_inclination_deg", "ref_azimuth_deg", "ref_toolface_deg")
@@ -235,3 +236,33 @@ def test_a_plan_without_an_attitude_is_refused(tmp_path, name):
 
 def test_a_profile_without_noise_cannot_be_planned_with():
     assert "'noise'" in refused(mwdcal("plan", "--tool", "generic"), 2)
+
+
+def test_a_plan_says_its_temperatures_and_what_it_lacks_of_the_calibration(tmp_path):
+    """Of order 1 over 30…70 °C, as the plan file that the finding names has it again."""
+    run = write_csv(tmp_path / "run.csv", servo_run(temperatures=(30.0, 50.0, 70.0)))
+    cal = tmp_path / "cal.json"
+    assert mwdcal("calibrate", run, "--tool", "servo", "--order", 1, "-o", cal).code == 0
+    ran = mwdcal("plan", "--tool", cal)
+    assert "\nplanned at 25 °C; the calibration will be good for 20…30 °C\n" in ran.out
+    assert ran.out.count("D-efficiency: how close the plan is to the best possible one") == 1
+    assert "30.0…70.0 °C, and this plan gives none" in ran.err
+    levels = re.search(r"temperature_c = \[.*?\]", ran.err)[0]
+    assert levels == "temperature_c = [30, 50, 70]"
+    plan = tmp_path / "mine.toml"
+    stations = (
+        "inclination_deg = [30, 90, 150]\nazimuth_deg = [0, 90]\ntoolface_deg = [0, 90, 180, 270]"
+    )
+    plan.write_text(f'name = "mine"\n{levels}\n[[stations]]\n{stations}\n', "utf-8")
+    again = mwdcal("plan", "--tool", cal, "--plan", plan, "--order", 1)
+    assert "\nplanned at 30, 50, 70 °C; the calibration will be good for 29…71 °C\n" in again.out
+    assert "gives none" not in again.err
+    single = calibrated(tmp_path)
+    assert "gives none" not in mwdcal("plan", "--tool", single).err
+
+
+def calibrated(tmp_path):
+    """A calibration without temperature terms."""
+    run, cal = write_csv(tmp_path / "cold.csv", servo_run()), tmp_path / "cold.json"
+    assert mwdcal("calibrate", run, "--tool", "servo", "-o", cal).code == 0
+    return cal

@@ -439,7 +439,37 @@ def test_a_test_of_the_same_soak_is_not_refused(tmp_path, fitted):
 def test_a_test_outside_the_calibrated_temperatures_is_refused(tmp_path, fitted):
     run = {**simulated(ROLL, 2), "temperature_c": np.full(12, 40.0)}
     message = refused(mwdcal("verify", fitted[0], write_csv(tmp_path / "r.csv", run)), 2)
-    assert "outside the calibrated range 25.0…25.0 °C" in message
+    assert "outside the calibrated range, good for 20.0…30.0 °C" in message
+
+
+def test_a_roll_test_outside_the_calibrated_temperatures_leaves_the_calibration(tmp_path, fitted):
+    """Files and screen are those of the fit alone; the reason ends the command as it ends `verify`."""
+    run = write_csv(tmp_path / "run.csv", fitted[1])
+    test = write_csv(tmp_path / "r.csv", {**simulated(ROLL, 2), "temperature_c": np.full(12, 40.0)})
+    alone, both, page = (tmp_path / name for name in ("alone.json", "both.json", "page.html"))
+    fit = mwdcal("calibrate", run, "--tool", "servo", "-o", alone)
+    command = ("calibrate", run, "--tool", "servo", "-o", both, "--rolltest", test)
+    ran = mwdcal(*command, "--report", page)
+    verified = mwdcal("verify", both, test)
+    assert ran.code == verified.code == 2
+    reason = verified.err.strip().removeprefix("mwdcal: ")
+    assert f"mwdcal: not verified: {reason}" in ran.err
+    assert "good for 20.0…30.0 °C" in ran.out
+    assert "good for 20.0…30.0 °C" in reason
+    assert fit.out.partition("\nwrote")[0] == ran.out.partition("\nwrote")[0]
+    assert "<html" in page.read_text("utf-8")
+    first, second = (json.loads(path.read_text()) for path in (alone, both))
+    assert {**first, "time": "", "sha256": ""} == {**second, "time": "", "sha256": ""}
+    document = mwdcal(*command, "--json")
+    assert document.code == 2
+    assert "verification" not in document.json
+
+
+def test_limits_that_cannot_be_read_are_refused_before_the_fit(tmp_path, fitted):
+    run, out = write_csv(tmp_path / "run.csv", fitted[1]), tmp_path / "c.json"
+    command = ("--tool", "servo", "-o", out, "--rolltest", roll(tmp_path), "--limits", "no.toml")
+    assert "no.toml" in refused(mwdcal("calibrate", run, *command), 2)
+    assert not out.exists()
 
 
 def test_a_test_without_temperatures_cannot_verify_temperature_terms(tmp_path):

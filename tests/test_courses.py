@@ -19,6 +19,8 @@ from mwdcal.errors import FitError
 from mwdcal.estimation.batch import mapped, take
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.planning.plans import servo
+from mwdcal.presentation.calibration_page import outcome
+from mwdcal.presentation.typed import leading_findings
 from mwdcal.sensor.profile import Profile
 from simulation import DEG, attitude, factor_readings, factors_within_limits, plan
 
@@ -365,6 +367,20 @@ def test_a_column_that_a_drift_within_the_run_goes_with_is_named(levels):
     found = calibrate(replace(one, temperature=None, others=others), Profile(name="x")).findings
     assert "accelerometer-drift" in {f.id for f in found}
     assert ["'X17'" in f.text for f in found if f.id == "column-explains"] == [True]
+    assert found[0].id == "column-explains"
+
+
+def test_a_column_that_explains_the_misfit_comes_first_and_in_the_banner():
+    """Before the drifts that it causes; the report does not call the fit accepted."""
+    made = calibrate(unrecorded(1), Profile(name="x"))
+    others = [f for f in made.findings if f.id != "column-explains"]
+    assert [made.findings[0], *others] == made.findings
+    assert others
+    banner = outcome(made, None)
+    assert banner["level"] == "attention"
+    assert "Fit doubtful" in banner["after"]
+    assert "a column that is not used explains" in banner["after"]
+    assert leading_findings([*others, made.findings[0]])[0][0].id == "column-explains"
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3, 4])

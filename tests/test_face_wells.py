@@ -375,6 +375,21 @@ def test_values_of_a_course_name_their_power_in_pandas():
         assert unit[names].tolist() == units
 
 
+@pytest.mark.parametrize(
+    ("notation", "temperature"),
+    [("factors", None), ("forward", 60.0), ("forward", None), ("forward", "course")],
+)
+def test_values_in_pandas_name_the_temperature_that_the_screen_names(notation, temperature):
+    pytest.importorskip("pandas")
+    cal = mc.calibrate(mc.simulate("laboratory-thermal", "servo", seed=1), order=1)
+    made = mc.convert(cal, notation, temperature=temperature)
+    stated = made.to_pandas().attrs["temperature_c"]
+    assert stated == {"course": "course", 60.0: 60.0}.get(temperature, cal.reference_temperature)
+    assert stated == made.to_dict()["temperature_c"]
+    words = stated if isinstance(stated, str) else f"{stated:g} °C"
+    assert f"temperature {words} " in made.summary()
+
+
 @pytest.mark.parametrize(("form", "typed"), [("c", "c-header"), ("fixed-point", "fixed-point")])
 def test_sources_are_those_of_the_command(folder, cal, tmp_path, form, typed):
     to = ("convert", folder / "tool.json", "--to", typed, "-o", tmp_path / "typed", "--json")

@@ -61,6 +61,7 @@ def numbers(path, column):
         ("Inclinação (dev) graus", "ref_inclination_deg", "°"),
         ("maz_deg", "ref_azimuth_deg", "°"),
         ("maz/deg", "ref_azimuth_deg", "°"),
+        ("mag az", "ref_azimuth_deg", ""),
         ("Orient. cara alta", "ref_toolface_deg", ""),
         ("Áng. de cara °", "ref_toolface_deg", "°"),
         ("Fall (°)", "ref_dip_deg", "°"),

@@ -404,6 +404,50 @@ def test_the_temperature_of_the_oven_is_named(tmp_path):
     assert "oven-temperature" not in findings_of(plain)
 
 
+def test_the_only_column_in_degrees_celsius_is_the_temperature_and_is_named(tmp_path):
+    """Whatever it is called; not if the user says otherwise, nor with a blank cell."""
+    columns = {("Probe heat (C)" if n == "Temp (C)" else n): v for n, v in table().items()}
+    path = written(tmp_path / "a.csv", columns)
+    proposal = library.propose_profile(path)
+    assert "'Probe heat (C)' is taken" in findings_of(proposal)["temperature-by-unit"]
+    assert read(path).temperature == pytest.approx(np.asarray(table()["Temp (C)"]))
+    said = library.propose_profile(path, column="temperature_c=Probe heat (C)")
+    assert "temperature-by-unit" not in findings_of(said)
+    assert said.profile.columns["temperature_c"] == proposal.profile.columns["temperature_c"]
+    none = library.propose_profile(path, column="temperature_c=")
+    assert "temperature_c" not in none.profile.columns
+    assert "temperature-by-unit" not in findings_of(none)
+    columns["Probe heat (C)"] = ["", *list(columns["Probe heat (C)"])[1:]]
+    blank = library.propose_profile(written(tmp_path / "b.csv", columns))
+    assert "temperature_c" not in blank.profile.columns
+    assert "temperature_c=Probe heat (C)" in findings_of(blank)["temperature-by-unit"]
+
+
+@pytest.mark.parametrize("names", [("Air (C)",), ("Heat (F)",), ("Top (C)", "Bottom (C)")])
+def test_a_column_in_a_unit_of_temperatures_is_named_with_the_option_that_takes_it(tmp_path, names):
+    """That of the air, one whose unit has another meaning, or two: the run has no temperature by itself."""
+    columns = table()
+    columns |= dict.fromkeys(names, columns.pop("Temp (C)"))
+    path = written(tmp_path / "a.csv", columns)
+    ran = mwdcal("profile", path, "-o", tmp_path / "t.toml")
+    assert ran.code == 0, ran
+    for name in names:
+        assert f"--column 'temperature_c={name}'" in ran.err
+    taken = mwdcal(
+        "profile", path, "-o", tmp_path / "u.toml", "--column", f"temperature_c={names[0]}"
+    )
+    assert f'temperature_c = {{name = "{names[0]}"' in (tmp_path / "u.toml").read_text("utf-8")
+    assert "--column" not in taken.err
+
+
+@pytest.mark.parametrize("name", ["Dew point (C)", "Probe heat SD (C)", "Set point (C)"])
+def test_another_thing_in_degrees_celsius_is_no_temperature_of_the_tool(tmp_path, name):
+    columns = {(name if n == "Temp (C)" else n): v for n, v in table().items()}
+    proposal = library.propose_profile(written(tmp_path / "a.csv", columns))
+    assert "temperature_c" not in proposal.profile.columns
+    assert "temperature-by-unit" not in findings_of(proposal)
+
+
 def test_a_number_that_stands_for_no_reading_is_left_out_among_readings_of_its_size(tmp_path):
     columns = table()
     columns["Hy (V)"] = np.round(np.asarray(columns["Hy (V)"]) * 20_000, 1)

@@ -107,7 +107,8 @@ TRANSLATIONS = (
     (_FROM_VERTICAL, ""),
     (r"(?<=inclination) *\((dev(iation)?|desv(io)?)\.?\)", ""),
     (
-        r"azimutwinkel|\bmaz(?![^\W\d_])|\bkurs\b|\bdire(ccion|cao|ction)\b|\brumo\b|\bcap\b|\bаз(им)?\b\.?|направление|"
+        r"azimutwinkel|\bmaz(?![^\W\d_])|\bmag[ ._-]*az(?![^\W\d_])|"
+        r"\bkurs\b|\bdire(ccion|cao|ction)\b|\brumo\b|\bcap\b|\bаз(им)?\b\.?|направление|"
         r"курс|方向角?|磁北からの角度?|"
         r"atsimuutti|suuntakulma|방위각?|\bhazi\b|drehtisch|turn ?table|rotary table|baring|azymut|yonelim|азимут|"
         r"asimut|\basim?\b\.?|azym\b\.?|azimute?(?!h)|acimut|方位角?|"

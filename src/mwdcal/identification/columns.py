@@ -159,6 +159,20 @@ def is_of_surroundings(name: str) -> bool:
     return bool(_SURROUNDINGS.search(name))
 
 
+def warm_unit(name: str, unit: str) -> str:
+    """The unit of temperatures in brackets in a name or in the row of units; empty if the name says another thing.
+
+    >>> [warm_unit(name, "") for name in ("Probe heat (C)", "Probe heat SD (C)", "Gauge C", "Heat (mV)")]
+    ['°C', '', '', '']
+    """
+    bracketed = IN_BRACKETS.search(spelled(name))
+    stated = unit_of(spelled(unit)) or (unit_of(bracketed[1]) if bracketed else "")
+    other = _is_nominal(name) or any(
+        words.search(name) for words in (_SCATTER, _OF_RESIDUALS, _OF_OTHER_WARMTH)
+    )
+    return stated if stated in units_of(WARMTH) and not other else ""
+
+
 def is_numbering(values: Array) -> bool:
     """Whether numbers go on in equal steps but for a few, as those of rows and times do, and do not run round a turn.
 
@@ -541,6 +555,11 @@ _SURROUNDINGS = re.compile(
     re.IGNORECASE,
 )
 """What has a temperature of its own that is not the tool's."""
+_OF_OTHER_WARMTH = re.compile(
+    r"(?<![^\W\d_])(sd|std|stdev|dev|sigma|unc|delta|diff|dew|rate|grad\w*|min|max|limit|range|offset|coeff\w*)(?![^\W\d_])",
+    re.IGNORECASE,
+)
+"""Words of a column in a unit of temperatures that has no temperature of the tool."""
 COOLEST_FAHRENHEIT = 45.0
 """Numbers below it are degrees Celsius: no tool is calibrated below 7 °C alone."""
 COLDEST_KELVIN = 200.0
@@ -1356,19 +1375,20 @@ def _tell_numbers(
 def _tell_temperature(
     meanings: dict[str, Resemblance], names: Sequence[str], units: Sequence[str], values: Values
 ) -> None:
-    """A column T is the temperature by its values, where no other is called so."""
+    """A column T is the temperature by its values, or the only one in °C, where no other is called so."""
     if any(m.column == WARMTH for m in meanings.values()):
         return
-    lone = [
-        n
-        for n, unit in zip(names, units, strict=True)
-        if n not in meanings and _BARE_T.fullmatch(f"{n} {unit}".strip())
-    ]
-    cells = values(lone[0]) if len(lone) == 1 else None
+    others = {n: unit for n, unit in zip(names, units, strict=True) if n not in meanings}
+    lone = [n for n, unit in others.items() if _BARE_T.fullmatch(f"{n} {unit}".strip())]
+    warm = {} if lone else {n: w for n, unit in others.items() if (w := warm_unit(n, unit))}
+    lone += [n for n, unit in warm.items() if unit == "°C" and not is_of_surroundings(n)]
+    cells = values(lone[0]) if len(lone) == 1 >= len(warm) else None
+    if warm and cells is not None and not np.isfinite(cells).all():
+        return
     known = cells[np.isfinite(cells)] if cells is not None else np.empty(0)
     known = known[~is_filler(known)]
     if known.size and np.all((known >= -60) & (known <= 500)) and not is_numbering(known):
-        meanings[lone[0]] = Resemblance(WARMTH)
+        meanings[lone[0]] = Resemblance(WARMTH, warm.get(lone[0], ""))
 
 
 def _tell_references(

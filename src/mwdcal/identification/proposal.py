@@ -78,6 +78,7 @@ from mwdcal.identification.columns import (
     north_of,
     proposed,
     shown_beside_set,
+    warm_unit,
 )
 from mwdcal.sensor.profile import ColumnSource, Profile, TableFormat, TriadProfile
 
@@ -361,7 +362,8 @@ class Proposal(NamedTuple):
     `open_axes` the triads of which the run does not tell the axes, `ignored` columns that are called as references
     but hold no references, each with the reason; `by_readings` what the names leave open and the readings answer;
     `source` the name of the file; `all_fit`: no station is far from what the others tell;
-    `level`: the least and the largest inclination, degrees, where they are too close for a calibration.
+    `level`: the least and the largest inclination, degrees, where they are too close for a calibration; `said` what
+    the user says of columns and settings, by name.
     """
 
     profile: Profile
@@ -379,6 +381,7 @@ class Proposal(NamedTuple):
     source: str = ""
     all_fit: bool = False
     level: tuple[float, float] | None = None
+    said: Collection[str] = ()
 
 
 def propose(
@@ -545,7 +548,7 @@ def _proposal(
     return Proposal(
         _without_the_usual(profile), wirings, readings.count, readings.unused, tuple(remarks), by_value,
         readings.metadata, readings.run_sha256, where, open_axes, ignored, source=table.source,
-        all_fit=_all_fit(readings, wirings), level=_level(readings),
+        all_fit=_all_fit(readings, wirings), level=_level(readings), said=said,
     )  # fmt: skip
 
 
@@ -1696,8 +1699,26 @@ def units_contradicted(proposal: Proposal) -> list[Finding]:
     return findings
 
 
+def warmth_by_unit(proposal: Proposal) -> list[Finding]:
+    """A finding on a column that its unit alone makes the temperature of the tool, or may make it."""
+    if WARMTH in proposal.said:
+        return []
+    where, source = proposal.where, (proposal.profile.columns or {}).get(WARMTH)
+    units = dict(zip(where.names, where.units, strict=True)) if where else {}
+    names = [source.name] if source else [each.strip("'") for each in proposal.unused]
+    warm = [n for n in names if warm_unit(n, units.get(n, "")) and not meaning(n, units.get(n, ""))]
+    text = (
+        "{} is taken as the temperature of the tool, as the only column in a unit of temperatures. If it is not, say "
+        "so: `column` 'temperature_c='."
+        if source
+        else "no column is called a temperature, and {} is in a unit of temperatures. If it is the tool's, say so: "
+        "`column` 'temperature_c={}'."
+    )
+    return [Finding(id="temperature-by-unit", text=text.format(shown(n), n)) for n in warm]
+
+
 def warmth_around(proposal: Proposal) -> list[Finding]:
-    """A finding on a temperature of the oven or the room by its name, or on one that stands above the names alone."""
+    """A finding on a temperature by its unit, of the oven or the room by its name, or above the names alone."""
     columns = proposal.profile.columns or {}
     lines = proposal.where.above if proposal.where else ()
     stated = next(filter(warmth_in, lines), "")
@@ -1706,7 +1727,7 @@ def warmth_around(proposal: Proposal) -> list[Finding]:
         return [Finding(id="not-used", text=text)]
     source = columns.get(WARMTH)
     if source is None or not is_of_surroundings(source.name):
-        return []
+        return warmth_by_unit(proposal)
     text = (
         f"{shown(source.name)} is taken as the temperature of the tool, of which there is no other column. It lags "
         "behind the sensors: wait until it is steady, or state the tool's own."

@@ -171,8 +171,7 @@ def plan(
         raise InputError("`plan`: one plan holds the candidates to choose from. Name it alone.")
     _check_wanted(stations, accuracy_deg or {})
     planned.check_criterion(criterion)
-    tool = _loaded(tool)
-    profile, digest = profile_of(tool)
+    profile, digest = profile_of(tool := _loaded(tool))
     chosen, ends = with_choices(options, choices), _ends(reach or {})
     stand = Stand(speed, settle, soak, ends)
     tables = [plan_table(cast(PlanSource, each)) for each in several]
@@ -193,6 +192,7 @@ def plan(
         for each in tables:
             result.append(planned.judged(each, profile, chosen, stand))
             progress(len(result), len(tables))
+    result = [planned.with_tool(each, tool) for each in result]
     digests = {"profile": digest, "measured": done.digest if done else ""}
     return PlanResult(result, digests, serial=serial or _serial(tool, done or result[0].plan))
 

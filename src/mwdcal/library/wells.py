@@ -289,6 +289,12 @@ class Conversion(Result):
 
         return value_table(self.converted)
 
+    def to_pandas(self) -> Any:
+        """The columns as a table of pandas, with the temperature of the values, `temperature_c`, in `attrs`."""
+        from mwdcal.presentation.conversion import stated_temperature
+
+        return frame(self.columns, {"temperature_c": stated_temperature(self.converted)})
+
     @property
     def accelerometer(self) -> Mapping[str, Array]:
         """Arrays of the accelerometer: S and o, M and b, or SF, B and m."""

@@ -57,6 +57,20 @@ def assumed_noise(profile: Profile) -> list[Finding]:
     return [Finding(id="noise-assumed", text=text)] if kinds else []
 
 
+def temperature_terms_lost(tool: Calibration, planned: Calibration) -> list[Finding]:
+    """That a plan gives no temperature terms, where the calibration of the tool has them; and the plan that does."""
+    if not tool.thermal or planned.thermal or tool.temperature_c is None:
+        return []
+    low, high = tool.temperature_c
+    levels = np.linspace(low, high, max(triad.order for triad in tool.triads) + 2)
+    text = (
+        f"the calibration as `tool` has temperature terms, {low:.1f}…{high:.1f} °C, and this plan gives none. A plan "
+        f"file with temperature_c = [{', '.join(f'{each:.0f}' for each in levels)}], as `plan`, gives them: "
+        "docs/howto/planning.md, Plans."
+    )
+    return [Finding(id="temperature-terms-lost", text=text)]
+
+
 def _check_scale(profile: Profile, kind: str) -> None:
     """Refuse noise that no sensor has, as by a scale that is upside down."""
     triad: TriadProfile = getattr(profile, kind)

@@ -36,6 +36,7 @@ from mwdcal.planning.expected import (
     expected,
     left_undetermined,
     planned_fit,
+    temperature_terms_lost,
 )
 from mwdcal.planning.optimal import (
     WEIGHINGS,
@@ -309,6 +310,14 @@ class Planned:
         hidden = [Finding(id="hidden-errors", text=text)] if stations else []
         expected = [f for f in self.calibration.findings if f.id != UNIDENTIFIED]  # of no tool yet
         return [*expected, *hidden, *self.assumed, *self.search]
+
+
+def with_tool(planned: Planned, tool: object) -> Planned:
+    """A plan that says so if its calibration will lack temperature terms that the tool, a calibration, has."""
+    if not isinstance(tool, Calibration):
+        return planned
+    lost = temperature_terms_lost(tool, planned.calibration)
+    return replace(planned, assumed=[*planned.assumed, *lost])
 
 
 def judged(

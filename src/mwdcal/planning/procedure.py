@@ -131,10 +131,10 @@ class Procedure:
         """
         readings, calibration = self.testing.readings, self.calibration
         if calibration.outside(readings).any():
-            low, high = calibration.temperature_c or (np.nan, np.nan)
+            low, high = calibration.valid_temperatures or (np.nan, np.nan)
             raise InputError(
-                f"{self.testing.plan.source} lies outside the calibrated range {low:.1f}…{high:.1f} °C. Choose a "
-                "`rolltest` within it."
+                f"{self.testing.plan.source} lies outside the calibrated range, good for {low:.1f}…{high:.1f} °C. "
+                "Choose a `rolltest` within it."
             )
         test, judged = RollTest(calibration, readings), []
         for kind in ("spread", "error"):

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mwdcal.calibration.diagnosis.findings import MISFIT_BY_COLUMN
 from mwdcal.calibration.readings import is_simulated, soaks
 from mwdcal.calibration.record import MAGNETIC, Calibration, Finding, TriadCalibration
 from mwdcal.calibration.results import (
@@ -68,6 +69,8 @@ if TYPE_CHECKING:
 
 SHOWN_DEPARTURES = {"spread": "departure from the middle of the roll set", "error": "error"}
 """Departures of a roll test's stations for each kind of limit."""
+UNUSED_COLUMN = "a column that is not used explains the misfit or a drift"
+"""A doubt of the fit in the banner."""
 LONG_TABLE = 60
 """A run of more stations has its station table at the end, as an annex."""
 LARGE_RATIO = 2.0
@@ -261,8 +264,13 @@ def _steps(
 def _fit_outcome(calibration: Calibration) -> tuple[str, str]:
     """The outcome of the fit in one line, and its level."""
     ids = [finding.id for finding in calibration.findings]
-    doubts = [i.removesuffix("-residuals") for i in ids if i.endswith("-residuals")]
-    parts = [f"{name} residuals exceed the declared noise" for name in doubts]
+    doubts = [
+        f"{i.removesuffix('-residuals')} residuals exceed the declared noise"
+        for i in ids
+        if i.endswith("-residuals")
+    ]
+    doubts += [UNUSED_COLUMN] * (MISFIT_BY_COLUMN in ids)
+    parts = [*doubts]
     free = dict.fromkeys(entry.id.replace("-", " ") for entry in calibration.undetermined())
     undetermined = f"{', '.join(free)} undetermined"
     if free and doubts:

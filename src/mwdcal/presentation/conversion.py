@@ -234,19 +234,24 @@ def _range(calibration: Calibration) -> str:
 
 def document(converted: Converted) -> dict[str, Any]:
     """The result for machines: identity, units and conditions, then the values of each triad."""
-    calibration, at = converted.calibration, converted.temperature
-    course = isinstance(at, str)
-    if at is None or (converted.notation == "factors" and not course):
-        at = calibration.reference_temperature
+    course = isinstance(converted.temperature, str)
     triads: dict[str, Any] = {name: _triad(converted, name) for name in converted.triads}
     content = ConversionSummary(
         **_identity(converted),
         **triads,
         notation=converted.notation,
-        temperature_c=at,
+        temperature_c=stated_temperature(converted),
         powers_of="T - reference_temperature_c" if course else msgspec.UNSET,
     )
     return _enveloped(converted, content)
+
+
+def stated_temperature(converted: Converted) -> float | str:
+    """The temperature of the values, °C: factors are those at the reference temperature; or that they are a course."""
+    at = converted.temperature
+    if at is None or (converted.notation == "factors" and not isinstance(at, str)):
+        return converted.calibration.reference_temperature
+    return at
 
 
 def _identity(converted: Converted | Exported) -> dict[str, Any]:
@@ -290,7 +295,7 @@ def screen(converted: Converted) -> str:
     """The result for people: whose calibration it is, in which units, then the values."""
     calibration, at = converted.calibration, converted.temperature
     reference = calibration.reference_temperature
-    stated = reference if at is None or converted.notation == "factors" else at
+    stated = stated_temperature(converted)
     shown = "course" if isinstance(stated, str) else f"{stated:g} °C"
     lines = [
         *_heading(converted),

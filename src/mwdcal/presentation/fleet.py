@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 
 from mwdcal.calibration import fit_options
+from mwdcal.calibration.diagnosis.findings import MISFIT_BY_COLUMN
 from mwdcal.calibration.fit_options import FIT_OPTIONS, FitArguments
 from mwdcal.calibration.readings import HIGHEST, TRIADS
 from mwdcal.calibration.record import Finding, FitSettings
@@ -28,7 +29,7 @@ from mwdcal.presentation.typed import with_option_names
 
 SERIALS_SHOWN = 5
 """Most serials that a line names."""
-DOUBTFUL_FITS = ("no-redundancy", "repeated-readings", "prior-conflict")
+DOUBTFUL_FITS = ("no-redundancy", "repeated-readings", "prior-conflict", MISFIT_BY_COLUMN)
 """Findings of a doubtful fit, besides residuals beyond the declared noise."""
 ERRORS = [name for columns in STAND_COLUMNS.values() for name in columns]
 """Columns of errors of the stand."""

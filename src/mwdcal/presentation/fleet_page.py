@@ -86,7 +86,7 @@ REMARKED = {
     "settings-apart": "stations of one direction scatter as if the stand had been set anew at each",
     "field-drift": "the field drifted during the run: fit and uncertainty include it",
     "drift": "offsets of the {triad} drifted during the run: fit and uncertainty include it",
-    "column-explains": "the drift goes with a column that is not used",
+    "column-explains": "the misfit or the drift goes with a column that is not used",
     "no-redundancy": "nothing in the run checks the fit",
     "few-degrees-of-freedom": "the residuals are too few to know the uncertainties better than to a quarter",
     "few-directions": "the tool axis has only two directions: a wrong angle of the stand may show nowhere",

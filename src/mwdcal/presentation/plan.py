@@ -19,7 +19,7 @@ from mwdcal.files.formats.table import Table
 from mwdcal.geometry.vectors import Array, Ints, reference_vectors
 from mwdcal.planning.expected import left_undetermined, planned_earth
 from mwdcal.planning.planned import Planned, station_names
-from mwdcal.planning.plans import attitudes, soak_numbers
+from mwdcal.planning.plans import attitudes, soak_numbers, soak_temperatures
 from mwdcal.presentation.calibration import PLACE
 from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.numbers import files_written, quantity
@@ -51,6 +51,10 @@ WITHOUT_VERTICAL = "not at 0°: at the vertical, azimuth and toolface are undefi
 """The line below accuracies by inclination."""
 
 
+GOOD_FOR = "the calibration will be good for {:.0f}…{:.0f} °C"
+"""The temperatures that a plan gives."""
+EFFICIENCY = "D-efficiency: how close the plan is to the best possible one of as many stations, which has 100 %"
+"""The meaning of the word in the table."""
 BY_HAND = 120.0
 """Seconds that a person takes for a station beyond move and settling: to set each scale, and to read and note."""
 
@@ -265,7 +269,8 @@ def screen(
         one_line(head),
         table(comparison_rows(summaries), ["", *(one_line(each.plan) for each in summaries)]),
     ]
-    lines = [*_assumed(plans[0]), *_practice(summaries), *_inclinations(plans[0])]
+    lines = [*_assumed(plans[0]), *_temperatures(plans), *_practice(summaries)]
+    lines += [*_inclinations(plans[0]), EFFICIENCY]
     blocks += filter(None, ["\n".join(lines)])
     if len(plans) == 1:
         blocks += [accuracy(summaries[0]), detectable(summaries[0]), stations(plans[0])]
@@ -285,6 +290,17 @@ def _assumed(planned: Planned) -> list[str]:
         return [f"the plan does not state the place; assumed: {', '.join(blank)}"]
     stated = [] if _is_blank(planned.plan, "gravity") else [f"gravity {gravity:.5g} g"]
     return [f"place: {', '.join([*words.values(), *stated])}"]
+
+
+def _temperatures(plans: Sequence[Planned]) -> list[str]:
+    """The temperatures of each plan, and those that its calibration will be good for, as a line."""
+    lines = []
+    for each in plans:
+        if valid := each.calibration.valid_temperatures:
+            at = ", ".join(f"{soak:.0f}" for soak in soak_temperatures(each.plan))
+            whose = f"{one_line(each.plan.source)}: " if len(plans) > 1 else ""
+            lines.append(f"{whose}planned at {at} °C; {GOOD_FOR.format(*valid)}")
+    return lines
 
 
 def _practice(facts: Sequence[PlanSummary]) -> list[str]:

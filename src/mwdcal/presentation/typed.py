@@ -20,8 +20,8 @@ IMPORTANT: tuple[str | tuple[str, ...], ...] = (
     "too-few", "channel", "missing-reference", "weak-geometry", "temperature-span",
     "altered", "revoked", "unsound", "contradicted", "not-judged", "partly-judged", "axes-exchanged", "rejected",
     "path-from", "tie-in", "no-path", "depths-count", "long-courses", "calibration-later", "magnetic-north",
-    ("reshoot", "settings "),
-    "repeated-readings", "misfit", "accelerometer-residuals", "magnetometer-residuals", "looks-like", "column-explains",
+    "column-explains", ("reshoot", "settings "),
+    "repeated-readings", "misfit", "accelerometer-residuals", "magnetometer-residuals", "looks-like",
     "outside-temperature", "changed", "standard-overdue", "roll-test-read", "columns-read",
 )  # fmt: skip
 """Beginnings of the ids of findings that come first, the most important first; together: of equal importance."""

@@ -568,12 +568,12 @@ def _check_independent(calibration: Calibration, readings: Readings) -> None:
 
 
 def _check_temperature(calibration: Calibration, readings: Readings) -> None:
-    outside = np.flatnonzero(calibration.outside(readings))
-    if outside.size and calibration.temperature_c is not None:
-        low, high = calibration.temperature_c
+    outside, valid = np.flatnonzero(calibration.outside(readings)), calibration.valid_temperatures
+    if outside.size and valid:
+        low, high = valid
         lie = "station lies" if outside.size == 1 else "stations lie"
         raise InputError(
-            f"{readings.name}: {outside.size} {lie} outside the calibrated range {low:.1f}…{high:.1f} °C "
+            f"{readings.name}: {outside.size} {lie} outside the calibrated range, good for {low:.1f}…{high:.1f} °C "
             f"(first: station {readings.labels[outside[0]]}). Verify within the range, or calibrate over a wider one."
         )
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING, TypeAlias, Unpack
 
 import click
 
@@ -19,6 +19,11 @@ if TYPE_CHECKING:
     from mwdcal.calibration.readings import Readings
     from mwdcal.calibration.record import Calibration
     from mwdcal.use.verification import Verdict
+
+
+_Judgement: TypeAlias = "tuple[Verdict | None, tuple[str, str], MwdcalError | None]"
+NOT_JUDGED: _Judgement = (None, ("", ""), None)
+"""A calibration without a verdict."""
 
 
 @options.command()
@@ -59,7 +64,7 @@ def command(
 
     \b
     Example: mwdcal calibrate run.csv --tool servo -o tool.json --rolltest roll.csv
-    Exit: 0 calibrated (and passed), 1 the roll test fails, 2 input cannot be read, 3 fit failed or refused.
+    Exit: 0 calibrated (and passed), 1 the roll test fails, 2 input cannot be read or not verified, 3 fit failed.
     """
     from mwdcal.app.inputs import load_runs, prior_of
     from mwdcal.calibration.calibrate import chosen_fit, recorded
@@ -73,22 +78,24 @@ def command(
     _enter(registry)
     prior, digest = prior_of(typed["prior"])
     readings, profile, test, beside = load_runs(run, rolltest, tool, prior, options.said(decimal))
-    turned, verdict, judged = None, None, ("", "")
+    bounds, turned = None, None
+    if rolltest or report:
+        from mwdcal.files.limits import load_limits
+
+        bounds = load_limits(limits)[0]
     if test:
         with _roll_test_as_input():
             turned = test.readings(profile)
     choice, result = chosen_fit(readings, profile, options_of(typed, prior, exclude, digest), say)
     calibration = recorded(choice, result)
+    verdict, judged, refusal = NOT_JUDGED
     if turned is not None and rolltest:
-        with _roll_test_as_input():
-            verdict, judged = _judged(calibration, turned, limits, (output, rolltest))
+        verdict, judged, refusal = _judged(calibration, turned, limits, (output, rolltest))
     rendered = ""
     if report:
-        from mwdcal.files.limits import load_limits
         from mwdcal.presentation.calibration_page import render
 
         tested = [turned.metadata] if turned else []
-        bounds = load_limits(limits)[0]
         names = {"file": output.name, "rolltest": run.name if beside else screen.NEXT_ROLL_TEST}
         rendered = render(calibration, verdict, *tested, limits=bounds, **names)
     files = output, report
@@ -100,18 +107,27 @@ def command(
     atomic.write_all([(output, documents.encode(calibration)), (report, rendered)])
     _enter(registry, output, run, tool, rolltest, verdict)
     print_result(shown, calibration.findings + (verdict.findings if verdict else []))
+    if refusal:
+        raise refusal
     sys.exit(0 if verdict is None or verdict.passed else 1)
 
 
 def _judged(
     calibration: Calibration, rolltest: Readings, limits: str, files: tuple[Path, Path]
-) -> tuple[Verdict, tuple[str, str]]:
-    """The verdict of a roll test, its text on screen and what to do next; `files` of calibration and roll test."""
+) -> _Judgement:
+    """The verdict of a roll test, its text on screen with what to do next, and why there is none.
+
+    `files` of calibration and roll test.
+    """
     from mwdcal.library.tasks import verify
     from mwdcal.presentation.verification import next_step, screen
 
-    verdict = verify(calibration, rolltest, Path(limits))
-    return verdict, (screen(verdict, None), next_step(verdict, *files))
+    try:
+        verdict = verify(calibration, rolltest, Path(limits))
+    except MwdcalError as error:
+        error.args = (f"not verified: {error}",)
+        return *NOT_JUDGED[:2], error
+    return verdict, (screen(verdict, None), next_step(verdict, *files)), None
 
 
 @contextmanager

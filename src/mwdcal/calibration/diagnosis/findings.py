@@ -128,8 +128,8 @@ FOLLOWED = 0.9
 RARE_CHANCE = 1e-4
 """The share of runs below which a chance has no figure in words."""
 UNUSED, MARKED_ROWS, ROLL_TEST_READ = "unused-columns", "marked-rows", "roll-test-read"
-COLUMNS_READ = "columns-read"
-"""The id of the finding with the names by which surveys were read."""
+COLUMNS_READ, MISFIT_BY_COLUMN = "columns-read", "column-explains"
+"""The ids of the findings with the names by which surveys were read, and on a column that explains misfit or drift."""
 OF_ROLL_TEST = "the roll test"
 """How remarks begin on a roll test that was read by names of its own."""
 COLUMNS_NAMED = 20
@@ -293,6 +293,8 @@ def findings(flags: Iterable[Flag], place: int, labels: Sequence[str]) -> list[F
 
 def finding_flags(fitted: FittedRuns) -> Iterator[Flag]:
     """All findings of a batch, in order of weight: some ids come more than once."""
+    causes = [*_followed(fitted), *_structure(fitted)]
+    yield from [flag for flag in causes if flag.id == MISFIT_BY_COLUMN]
     yield from _noise(fitted)
     yield from _axis_noise(fitted)
     yield from _redundancy(fitted)
@@ -300,8 +302,7 @@ def finding_flags(fitted: FittedRuns) -> Iterator[Flag]:
     yield _hemisphere(fitted)
     yield _gravity(fitted)
     yield from _drifts(fitted)
-    yield from _followed(fitted)
-    yield from _structure(fitted)
+    yield from [flag for flag in causes if flag.id != MISFIT_BY_COLUMN]
     yield _scatter(fitted)
     yield _repeated(fitted)
     yield from _beyond_order(fitted)
@@ -550,7 +551,7 @@ def _followed(fitted: FittedRuns) -> Iterator[Flag]:
         known = COLUMN + column
         named = [place for place, each in shown.items() if known in each and is_shown(each, known)]
         members[named] = False
-        yield _remark("column-explains", members, column=column)
+        yield _remark(MISFIT_BY_COLUMN, members, column=column)
 
 
 def _structure(fitted: FittedRuns) -> Iterator[Flag]:
@@ -561,7 +562,7 @@ def _structure(fitted: FittedRuns) -> Iterator[Flag]:
         for name in filter(partial(is_shown, shown), shown):
             column = name.startswith(COLUMN)
             words = partial(_looks, fitted, name, unit)
-            finding = "column-explains" if column else f"looks-like-{name}"
+            finding = MISFIT_BY_COLUMN if column else f"looks-like-{name}"
             yield Flag(finding, np.arange(fitted.count) == place, "{looks}", {"looks": words})
 
 
