@@ -489,7 +489,7 @@ def _cells_without_reading(
 def _says_no_reading(cell: str) -> bool:
     """Whether a cell is blank, says that there is no reading, or is a number of nines that stands for none.
 
-    >>> [_says_no_reading(cell) for cell in ("", "n/a", "S/L", "-999.25", "-9999.00")]
+    >>> [_says_no_reading(cell) for cell in ("", "n/a", "S/L", "-999,25", "-9999.00")]
     [True, True, True, True, True]
     >>> [_says_no_reading(cell) for cell in ("#N/A", "0.98x", "991", "see note")]
     [False, False, False, False]
@@ -499,7 +499,7 @@ def _says_no_reading(cell: str) -> bool:
     return cell[:1] != "#" and bool(NO_READING.fullmatch(cell) or _TWO_LETTERS.fullmatch(cell))
 
 
-_NINES = re.compile(r"-?9{3,}(\.0+|\.9+|\.25)?")
+_NINES = re.compile(r"[-−]?9{3,}([.,](0+|9+|25))?")
 """A number by which loggers say that there is none."""
 _TWO_LETTERS = re.compile(r"[^\W\d_]\W?[^\W\d_]\W?")
 """Two letters in place of a number: S/L, k.A."""
