@@ -297,6 +297,15 @@ def test_three_groups_leave_toolface_zero(tmp_path, order, rank):
         assert [u.id for u in triad.undetermined] == ["toolface-zero"]
 
 
+def parameters_in(message):
+    """Triad and id of each parameter that a message names in words: y scale, z-y misalignment, x offset."""
+    words = r"(accelerometer|magnetometer) ([xyz])(?:-([xyz]))? (scale|misalignment|offset)"
+    return [
+        (triad, f"offset-{one}" if kind == "offset" else f"gain-{one}{other or one}")
+        for triad, one, other, kind in re.findall(words, message)
+    ]
+
+
 def test_two_groups_are_refused_and_what_they_leave_free_is_named(tmp_path):
     angles, group = rolls((35, 100))
     run = run_file(tmp_path, IDEAL, SOAKS[0], angles, UNKNOWN, group=[f"roll {k}" for k in group])
@@ -304,7 +313,7 @@ def test_two_groups_are_refused_and_what_they_leave_free_is_named(tmp_path):
     message = refused(ran, 3)
     assert "too weak" in message
     assert "Add stations" in message
-    named = re.findall(r"(accelerometer|magnetometer) ((?:gain|offset)-\w+)", message)
+    named = parameters_in(message)
     free = free_of_groups((35, 100))
     assert {triad for triad, _ in named} == set(TRIADS)
     for triad, name in named:
@@ -388,7 +397,7 @@ def test_what_a_refusal_names_is_free_indeed(tmp_path, angles):
     for seed in range(20):
         run = run_file(tmp_path, IDEAL, SOAKS[0], angles, lone=True, seed=seed)
         ran = mwdcal("calibrate", run, *asked)
-        named = set(re.findall(r"accelerometer (\S+?)[,.] ", ran.err))
+        named = {name for _, name in parameters_in(ran.err)}
         if ran.code != 3 or not named or named - adds:
             wrong.append((seed, ran.code, named))
     assert wrong == []
@@ -439,7 +448,7 @@ def test_imucals_six_faces_are_too_weak_for_angles_alone(tmp_path):
     path = write_csv(tmp_path / "run.csv", run)
     message = refused(mwdcal("calibrate", path, *asked, "toolface-inclination"), 3)
     assert "too weak" in message
-    named = set(re.findall(r"accelerometer (\S+?)[,.] ", message))
+    named = {name for _, name in parameters_in(message)}
     assert named < {"gain-xx", "gain-yy", "gain-zz"}
     assert len(named) == 2
     assert mwdcal("calibrate", path, *asked, "least-squares").code == 0

@@ -65,8 +65,8 @@ def temperature_terms_lost(tool: Calibration, planned: Calibration) -> list[Find
     levels = np.linspace(low, high, max(triad.order for triad in tool.triads) + 2)
     text = (
         f"the calibration as `tool` has temperature terms, {low:.1f}…{high:.1f} °C, and this plan gives none. A plan "
-        f"file with temperature_c = [{', '.join(f'{each:.0f}' for each in levels)}], as `plan`, gives them: "
-        "docs/howto/planning.md, Plans."
+        f"file with temperature_c = [{', '.join(f'{each:.0f}' for each in levels)}], as `plan`, gives them "
+        "(docs, 'Planning')."
     )
     return [Finding(id="temperature-terms-lost", text=text)]
 
