@@ -360,3 +360,50 @@ def test_raw_channels_are_taken_beside_those_of_a_previous_calibration(tmp_path)
     corrected = [[*row, *(v * 1.01 for v in row[3:9])] for row in rows]
     lines = [";".join(map(str, row)) for row in [titles, names, *corrected]]
     assert same(taken(written(tmp_path / "run.csv", lines)), rows)
+
+
+@pytest.mark.parametrize(
+    "note",
+    ["ok - removed clamp", "row before: bad", "shot above - bad", "earlier shot (rejected)", "ok, bad weather",
+     "second attempt, discarded first", "fixed (bad cable replaced)", "opened door (removed cap)",
+     "checked: no data lost", "stable; bad light outside"],
+)  # fmt: skip
+def test_a_remark_on_another_row_or_thing_rejects_no_row_by_itself(tmp_path, note):
+    rows = stations()
+    lines = noted(rows, "Remark", [*[""] * 7, note, *[""] * (len(rows) - 8)])
+    path, asked = written(tmp_path / "run.csv", lines), ""
+    try:
+        run = taken(path)
+    except mwdcal.FitError as error:
+        asked = str(error)
+    assert "rejected station" in asked if asked else same(run, rows)
+
+
+def test_points_of_the_compass_between_two_are_no_codes_for_no_reading(tmp_path):
+    rows = stations()
+    cells = [["NE" if k == 0 else row[1], *row[2:]] for k, row in enumerate(rows)]
+    lines = lines_of([[row[0], *each] for row, each in zip(rows, cells, strict=True)], NAMES)
+    with pytest.raises(mwdcal.FitError, match="'NE'"):
+        taken(written(tmp_path / "run.csv", lines))
+
+
+def test_labels_in_turn_are_of_tools_and_number_no_stations(tmp_path):
+    rows = stations()
+    other = [[*row[:3], *(1.01 * v + 0.02 for v in row[3:9]), row[9]] for row in rows]
+    pairs = [
+        [label, *row]
+        for both in zip(rows, other, strict=True)
+        for label, row in zip(("S1", "S2"), both, strict=True)
+    ]
+    path = written(tmp_path / "run.csv", lines_of(pairs, ["ID", *NAMES]))
+    with pytest.raises(mwdcal.FitError, match="differ by 'ID'"):
+        taken(path)
+    assert same(taken(path, leave_out={"ID": ["S2"]}), rows)
+
+
+def test_uncal_channels_are_taken_beside_cal_ones(tmp_path):
+    rows = stations()
+    names = [*NAMES[:3], *(f"{n.split()[0]} uncal {n.split()[1]}" for n in NAMES[3:9]), NAMES[9]]
+    names += [f"{n.split()[0]} cal {n.split()[1]}" for n in NAMES[3:9]]
+    corrected = [[*row, *(v * 1.01 for v in row[3:9])] for row in rows]
+    assert same(taken(written(tmp_path / "run.csv", lines_of(corrected, names))), rows)

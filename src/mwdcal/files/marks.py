@@ -26,12 +26,26 @@ from mwdcal.files.statements import rows_of
 from mwdcal.files.synonyms import OURS
 from mwdcal.sensor.profile import TableFormat
 
-_REJECTED = re.compile(rf"\W*({OF_REFUSAL})\W*|\W*({OF_REFUSAL})\s*[-–—:;,.(/!].*", re.DOTALL)
+_REJECTED = re.compile(
+    rf"\W*({OF_REFUSAL}|deleted?|removed?|no ?data|keine daten|ingen data|s[ei][nm] d(at|ad)os|нет данных|无数据)\W*|"
+    rf"\W*({OF_REFUSAL})\s*[-–—:;,.(/!].*",
+    re.DOTALL,
+)
 """A cell that rejects its row, whatever reason follows."""
 _DOES_NOT_COUNT = re.compile(rf"(\D*[,;:–(/-]\s*)?({NOT_TO_USE})\W*")
 """A cell that says so, behind a reason without the number of another row: warm-up, not used."""
-_REJECTS_BEHIND = re.compile(rf"(\D*[,;:–(/!.，；：。！（-]\s*)({OF_REFUSAL})(\W+\D*)?")
-"""A cell that does so behind a reason, without the number of another row: bumped, rejected."""
+_REJECTS_BEHIND = re.compile(
+    rf"(?P<reason>\D*[,;:–(/!.，；：。！（-]\s*)({OF_REFUSAL})\W*"
+    r"(?P<then>[-–—,;(，；（]\s*(re-?\w+|repeat\w*|omt\w+|wiederh\w*|repet\w*|повтор\w*|重\w*)\D*)?"
+)
+"""A cell that does so behind a reason, and may add that the row was measured again: bumped, rejected - retaken."""
+_OF_OTHERS = re.compile(
+    r"(?<![^\W\d_])(ok|okay|good|fine|stable|steady|gut|bra|bien|bom|before|above|below|previous|prior|earlier|old|"
+    r"older|first|last|next|second|one|replaces?|instead|attempt|davor|vorher\w*|oben|alte[rns]?|erste[rns]?|forrige|"
+    r"over|gammel|forste|anterior|primer[oa]?|arriba|acima|primeir[oa]|precedent\w*|предыдущ\w*|выше|перв\w*|стар\w*|"
+    r"хорошо|норма)(?![^\W\d_])|上|前|旧|正常|合格"
+)
+"""Words of a reason that speaks of another row, or finds nothing wrong with its own."""
 _OF_COPIES = re.compile(r"(duplicate|duplikat|duplicad[oa]|doublon|дубл\w*|重复).*")
 """A meaning in a legend that is that of copies of rows."""
 _SUPERSEDED = re.compile(
@@ -191,13 +205,18 @@ def _verdicts(name: str, cells: Sequence[str]) -> dict[str, bool]:
 
 
 def _rejects(text: str) -> bool:
-    """Whether a text rejects its row: at once, or behind a reason other than that it was measured again.
+    """Whether a text rejects its row: at once, or behind a reason that speaks of nothing else.
 
-    >>> [_rejects(text) for text in ("bad; door open", "bumped, rejected", "repeat of the one before, rejected")]
-    [True, True, False]
+    >>> [_rejects(text) for text in ("bad; door open", "bumped, rejected", "truck passed, rejected - retaken")]
+    [True, True, True]
+    >>> [_rejects(text) for text in ("row before: bad", "ok; skip", "retake (bad clamp fixed)", "opened (removed cap)")]
+    [False, False, False, False]
     """
     behind = _REJECTS_BEHIND.fullmatch(text)
-    if _REJECTED.fullmatch(text) or (behind and not _MEASURED_AGAIN.search(behind[1])):
+    others = behind and (
+        _MEASURED_AGAIN.search(behind["reason"]) or _OF_OTHERS.search(behind["reason"])
+    )
+    if _REJECTED.fullmatch(text) or (behind and not others):
         return True
     return bool(_DOES_NOT_COUNT.fullmatch(text)) and not _MEASURED_AGAIN.search(text)
 
@@ -325,7 +344,8 @@ def _remarks(table: Table, marks: Marks) -> Iterator[str]:
     """A sentence on the rows that are left out, and one on those that may have to be."""
     if marks.left_out:
         each = [f"{place(table, row)} ({said})" for row, said in sorted(marks.left_out.items())]
-        yield f"rows that are rejected, for a check, or copies of others, are left out: {listed(each, MARKS_NAMED)}."
+        why = "rejected, without a reading, for a check, or copies of others"
+        yield f"rows that are {why}, are left out: {listed(each, MARKS_NAMED)}."
     doubtful = {
         row: f"{shown(name)}: {cell}"
         for (name, cell), rows in marks.doubtful.items()

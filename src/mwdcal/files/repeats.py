@@ -30,6 +30,8 @@ _ONE_READING = 0.03
 """Share of a triad's range by which readings of one station depart from their mean at most."""
 _OF_ANOTHER_TOOL, _SURE = 0.002, 8.0
 """Share of a triad's range from which a departure may be that of another tool; and as a multiple of its scatter."""
+_FEW_LABELS = 8
+"""Rows to each label, of labels that change from row to row, from which these are of readings or tools."""
 _MOSTLY = 0.75
 """Share of rows in sets at equal angles from which these are stations of several readings."""
 _OF_READING = re.compile(r"(.*\d)(?:[ ._/-]?[A-Za-z]|[ ._/-]\d{1,2})")
@@ -114,6 +116,8 @@ def repeats(table: Table, sources: Mapping[str, ColumnSource]) -> Repeats | None
     }
     same = np.ones(table.count - 1, bool)
     station = _without_readings(station, angles)
+    if _FEW_LABELS * len({*station.tolist()}) <= table.count and not _equal(station).any():
+        station = np.full(table.count, "")  # labels in turn number no stations
     alike = _equal(station) & (station[1:] != "")
     for name in ("group", "serial"):
         if name in names:
@@ -265,7 +269,7 @@ def tools_in_turn(
     these means, far beyond what is left, and a share of the range of the triad.
     """
     names = {c: sources[c].name for c in RAW if c in sources}
-    used = {each.name for each in sources.values()}
+    used = {each.name for column, each in sources.items() if column not in LABELS}
     place = np.repeat(np.arange(len(sets.starts)), sets.sizes)
     for name in (each for each in table.columns if each not in used):
         texts, which = np.unique(labels(table, name), return_inverse=True)

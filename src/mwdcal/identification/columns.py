@@ -435,7 +435,7 @@ _OF_CHANNELS = re.compile(r"\b(measured|meas|gemessen|m[åa]lt|ist)\b", re.IGNOR
 """Those that say nothing more of a channel."""
 _CORRECTION = re.compile(
     r"(corr|korr|[ck]alib|[ck]ompens|[ée]talonn|скорр|откорр|корр|исправ|поправ|калибр|компенс|обработ)[^\W\d_]*|"
-    "校正|修正|标定|校准|补偿"
+    r"cal(?![^\W\d_])|校正|修正|标定|校准|补偿"
 )
 _CORRECTED = re.compile(
     rf"(?<![^\W\d_])({_CORRECTION.pattern})|校正|修正|标定|校准|补偿", re.IGNORECASE

@@ -501,8 +501,8 @@ def _says_no_reading(cell: str) -> bool:
 
 _NINES = re.compile(r"[-−]?9{3,}([.,](0+|9+|25))?")
 """A number by which loggers say that there is none."""
-_TWO_LETTERS = re.compile(r"[^\W\d_]\W?[^\W\d_]\W?")
-"""Two letters in place of a number: S/L, k.A."""
+_TWO_LETTERS = re.compile(r"(?!(?i:[nsewo]\W[nsewo]))[^\W\d_]\W[^\W\d_]\W?")
+"""Two letters in place of a number, that are no points of the compass: S/L, k.A."""
 _OF_THE_PLACE = tuple(REFERENCES[name].column for name in STATED_REFERENCES)
 _WITHOUT_RESULT = "its formulas have no value, as no spreadsheet program has saved them"
 

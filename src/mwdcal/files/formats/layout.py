@@ -162,12 +162,16 @@ _OF_SETTING = re.compile(
 )
 """The name of a sheet that is a setting of the stand or the oven: 77F, Inc 45, Cold."""
 _OF_PAGE = re.compile(
-    r"(?<![^\W\d_])((page|pg|sheet|part|seite|blatt|tabelle|teil|side|ark|del|hoja|p[áa]g(ina)?|parte|folha|planilha|"
-    r"feuille|feuil|partie|стр(аница)?|лист|часть|st(atio)?ns?|punkte?|puntos?|pontos?|точки)\W*\d|"
+    r"(?<![^\W\d_])((page|pg|part|seite|teil|side|del|p[áa]g(ina)?|parte|partie|стр(аница)?|часть|st(atio)?ns?|punkte?|puntos?|pontos?|точки)\W*\d|"
     r"(cont(inued|d|inuaci[óo]n|inua[çc][ãa]o)?|forts(etzung|att|ettelse)?|suite|продолж\w*)(?![^\W\d_]))|[页頁续續]",
     re.IGNORECASE,
 )
 """Words of a sheet that continues another one, in its name or in a line above its table."""
+_OF_CHANGE = re.compile(
+    r"(?<![^\W\d_])(after|swap\w*|new|other|replac\w*|nach|neue?r?|getauscht|etter|ny|byttet|despu[eé]s|nuev[oa]|"
+    r"depois|nov[oa]|trocad\w*|apr[eè]s|nouve\w*|после|нов\w*|замен\w*)(?![^\W\d_])|后|换|新"
+)
+"""Words of what is no longer the same."""
 _OF_WARMTH = re.compile(r"\W*?([+−-]?\d+(?:[.,]\d+)?)\s*(?:°|deg)?\s*[cf℃]\W*", re.IGNORECASE)
 """The name of a sheet that is a temperature with its unit."""
 _WARMTH_IN_WORDS = re.compile(
@@ -530,7 +534,8 @@ def _continues(table: Layout, first: Layout) -> bool:
     """Whether a sheet calls itself a further page, and states nothing that the first one does not."""
     lines = [x for x in table.above if x not in first.above and not titles([[x]]).metadata]
     less = table.titles.metadata.items() <= first.titles.metadata.items()
-    return less and all(map(_OF_PAGE.search, lines or [table.sheet]))
+    changed = any(map(_OF_CHANGE.search, map(str.lower, [table.sheet, *lines])))
+    return less and not changed and all(map(_OF_PAGE.search, lines or [table.sheet]))
 
 
 def _has_its_warmth(table: Layout) -> bool:

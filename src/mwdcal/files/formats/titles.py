@@ -50,9 +50,8 @@ _DAYS = (
 OF_REFUSAL = (
     r"reject(ed)?|bad|invalid|void|voided|discard(ed)?|unusable|omit(ted)?|excluded?|scrap(ped)?|do not use|dnu|"
     r"n\.? ?ok|nok|not ok|no good|n\.o\.k\.?|verworfen|ungultig|schlecht|fehlmessung|unbrauchbar|gestrichen|"
-    r"ausgeschlossen|skip(ped)?|dele?ted?|removed?|verwerfen|streichen|"
-    r"desc[ae]rt(ar|e)|exclu(ir|ye)|rechazar|rejeitar|anular|eliminar|forkastes?|strykes?|отбросить|исключить|"
-    r"no ?data|keine daten|ingen data|s[ei][nm] d(at|ad)os|нет данных|无数据|"
+    r"ausgeschlossen|skip(ped)?|verwerfen|streichen|"
+    r"desc[ae]rt(ar|e)|exclu(ir|ye)|rechazar|rejeitar|anular|forkastes?|strykes?|отбросить|исключить|"
     r"nicht (ok|verwenden|verwertbar)|n\.? ?i\.? ?o\.?|forkastet|ugyldig|darlig|underkjent|avvist|kassert|"
     r"strøket|stroket|feilmaling|"
     r"ikke (ok|bruk|brukes)|rechazad[oa]|invalid[oa]|descartad[oa]|anulad[oa]|no (ok|usar|valid[oa])|mal[oa]?|"
