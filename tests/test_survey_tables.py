@@ -352,10 +352,11 @@ def test_numbers_of_surveys_named_as_depths_raise_a_question(tmp_path, laborator
     ("more", "end"),
     [
         ({"Hole length": ("m", METRES)}, METRES[-1]),
-        ({"Length (ft)": ("", METRES / 0.3048)}, METRES[-1]),
-        ({"Length (m)": ("", METRES), "Hole length (m)": ("", METRES)}, None),
-        ({"Length (m)": ("", np.full(len(METRES), 9.1))}, None),
-        ({"Length (m)": ("", METRES), "MD (m)": ("", METRES + 15)}, METRES[-1] + 15),
+        ({"Borehole length (ft)": ("", METRES / 0.3048)}, METRES[-1]),
+        ({"Well length (m)": ("", METRES)}, METRES[-1]),
+        ({"Well length (m)": ("", METRES), "Hole length (m)": ("", METRES)}, None),
+        ({"Hole length (m)": ("", np.full(len(METRES), 9.1))}, None),
+        ({"Hole length (m)": ("", METRES), "MD (m)": ("", METRES + 15)}, METRES[-1] + 15),
     ],
 )
 def test_a_length_of_hole_is_the_measured_depth_where_nothing_else_may_be(
@@ -365,6 +366,20 @@ def test_a_length_of_hole_is_the_measured_depth_where_nothing_else_may_be(
     path = text_table(tmp_path / "WELL.csv", {**table, **more})
     well = mc.survey(laboratory[1], path)
     assert (None if well.path is None else pytest.approx(well.path.md[-1])) == end
+
+
+@pytest.mark.parametrize(
+    "cells",
+    [9 + 0.013 * np.arange(len(METRES)), np.where(np.arange(len(METRES)) < 6, 15.2, 15.6), METRES],
+    ids=["joints", "sensor", "hole"],
+)
+def test_a_bare_length_is_offered_and_not_taken(tmp_path, laboratory, cells):
+    """It may be that of a joint, or from bit to sensor."""
+    path = text_table(tmp_path / "WELL.csv", deep("Length (m)", cells))
+    well = mc.survey(laboratory[1], path)
+    assert well.path is None
+    [text] = [f.text for f in well.findings if f.id == "no-path"]
+    assert '"md_m=Length (m)"' in text
 
 
 def test_profile_of_surveys_names_survey(tmp_path):

@@ -30,7 +30,9 @@ _WORDS_OF_LENGTH = {
 }
 """Words for each unit of length."""
 _UNIT_OF_DEPTH = rf"({'|'.join(_WORDS_OF_LENGTH.values())})( ?(md|rt|rkb))?"
-_LENGTH = re.compile(rf"(((bore ?)?hole|drilled|along hole|ah) )?length ?{_UNIT_OF_DEPTH}")
+_LENGTH = re.compile(
+    rf"((bore ?)?hole|well( ?bore)?|drilled|along hole|ah) length ?{_UNIT_OF_DEPTH}"
+)
 _DEPTH = re.compile(rf"({_ALONG} )*{_NOUN}( {_ALONG})*( ?{_UNIT_OF_DEPTH})?")
 _AT_END = {
     unit: re.compile(rf"(?<![a-zа-я])({words})( ?(md|rt|rkb))?$")
@@ -55,9 +57,9 @@ def is_depth(name: str) -> bool:
 
 
 def is_length(name: str, unit: str = "") -> bool:
-    """Whether a column is called a length of hole, in a unit of length; it may be that of something else.
+    """Whether a column is called a length of hole, in a unit of length; a bare length may be that of anything.
 
-    >>> is_length("Hole length (m)"), is_length("Length", "ft"), is_length("Length"), is_length("Collar length (m)")
+    >>> is_length("Hole length (m)"), is_length("Well length", "ft"), is_length("Hole length"), is_length("Length (m)")
     (True, True, False, False)
     """
     return bool(_LENGTH.fullmatch(_plain(f"{name} {unit}")))
